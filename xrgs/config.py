@@ -1,0 +1,173 @@
+"""The schema of an experiment: every field, its type and its default-less meaning.
+
+The values live in `conf/`: `conf/config.yaml` is the baseline with every component present and off.
+The model's own fields are in `xrgs.splat.settings`, which knows nothing of experiments.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from hydra.core.config_store import ConfigStore
+from omegaconf import MISSING, DictConfig, OmegaConf
+
+from xrgs.splat.settings import DensifySettings, OptimizerSettings, RasterSettings
+
+_HERE = Path(__file__).parent
+#: `conf/` is inside the package in a wheel and beside it in a checkout.
+CONF_DIR = _HERE / "conf" if (_HERE / "conf").is_dir() else _HERE.parent / "conf"
+
+
+@dataclass
+class SceneConf:
+    """Where the photographs come from."""
+
+    name: str = MISSING
+    """Label in tables."""
+    kind: str = MISSING
+    """`procedural`, `motorcycle` or `folder` (a module of `xrgs.scenes`)."""
+    path: str | None = None
+    """Of `folder`: the folder of images, or an LLFF scene (images/, images_4/, images_8/)."""
+    views: int = 24
+    """Of `procedural`: how many."""
+
+
+@dataclass
+class SfmConf:
+    """How COLMAP is run on the mixed images."""
+
+    lr_images: str = MISSING
+    """`upsampled`: LR images are brought to HR size for SIFT only. `native`: files as they are."""
+    max_num_features: int = MISSING
+    """Per image; 0 chooses by the number of images so that exhaustive matching stays quick."""
+    init_min_tri_angle: float = MISSING
+    """Degrees between the first two views; COLMAP's 16 fails on forward-facing scenes."""
+    min_registered: float = MISSING
+    """Share of the views that must register, else the scene fails."""
+    seed: int = MISSING
+
+
+@dataclass
+class VariantConf:
+    """The mixed-resolution dataset made of a scene."""
+
+    long_side: int = MISSING
+    """Longer side of an HR view, px; 0 keeps the photographs' size."""
+    factor: int = MISSING
+    """How many times smaller an LR view is."""
+    hr_fraction: float = MISSING
+    """Share of the training views kept HR."""
+    min_hr: int = MISSING
+    """At least this many of them."""
+    selection: str = MISSING
+    """`random` (seeded) or `uniform` (evenly spaced)."""
+    test_every: int = MISSING
+    """Every n-th view is held out, from the first; 0 trains on all and tests on the same poses."""
+    seed: int = MISSING
+    """Of the selection. Not the training's: all seeds of a study share one variant."""
+    sfm: SfmConf = field(default_factory=SfmConf)
+
+
+@dataclass
+class SplatConf:
+    """The model and its optimisation."""
+
+    raster: RasterSettings = field(default_factory=RasterSettings)
+    optimizer: OptimizerSettings = field(default_factory=OptimizerSettings)
+    densify: DensifySettings = field(default_factory=DensifySettings)
+    sh_every: int = MISSING
+    """Steps of a 30,000-step run after which one more SH band is switched on."""
+    init_opacity: float = MISSING
+    ssim_weight: float = MISSING
+    """Weight of 1 - SSIM in the loss; L1 has the rest."""
+    backend: str = MISSING
+    """`native`, `torch`, or `auto`: native where the extension was built."""
+
+
+@dataclass
+class TrainConf:
+    """How long to train."""
+
+    steps: int = MISSING
+    """One view a step. Every schedule is written for 30,000 steps and scales with this."""
+
+
+@dataclass
+class LossWeightingConf:
+    """Resolution-aware loss weighting (paper 5.2)."""
+
+    lr_weight: float = MISSING
+    """Factor of the whole loss of an LR view; 1 is off."""
+
+
+@dataclass
+class GradientScalingConf:
+    """Gradient scaling for Gaussian radii (paper 5.3)."""
+
+    lr_scale: float = MISSING
+    """Factor of the gradient of the log-scales in LR views; 1 is off."""
+
+
+@dataclass
+class ConsistencyConf:
+    """Cross-resolution consistency loss (paper 5.6)."""
+
+    weight: float = MISSING
+    """w of the paper; 0 is off."""
+    l1: float = MISSING
+    ssim: float = MISSING
+    lr_mode: str = MISSING
+    """LR views: `exact` (both upsampled), `fold` (its L1 part by weight alone) or `off`."""
+
+
+@dataclass
+class ComponentsConf:
+    """The components of XR-GS, each the identity in the baseline."""
+
+    loss_weighting: LossWeightingConf = field(default_factory=LossWeightingConf)
+    gradient_scaling: GradientScalingConf = field(default_factory=GradientScalingConf)
+    consistency: ConsistencyConf = field(default_factory=ConsistencyConf)
+
+
+@dataclass
+class Conf:
+    """One cell of a study, and how to run it."""
+
+    scene: SceneConf = field(default_factory=SceneConf)
+    variant: VariantConf = field(default_factory=VariantConf)
+    splat: SplatConf = field(default_factory=SplatConf)
+    train: TrainConf = field(default_factory=TrainConf)
+    components: ComponentsConf = field(default_factory=ComponentsConf)
+    seed: int = MISSING
+    store: str = MISSING
+    """Folder of everything that is kept: variants, cells, reports."""
+    data_root: str = MISSING
+    """Folder that `scene=llff/...` looks in."""
+    threads: int = MISSING
+    """Of a cell; 0 takes every core this process may use."""
+    dry_run: bool = MISSING
+    """Print the plan and stop."""
+
+
+def register() -> None:
+    """Give Hydra the schema that `conf/config.yaml` is checked against."""
+    ConfigStore.instance().store(name="xrgs_schema", node=Conf)
+
+
+def to_conf(cfg: DictConfig) -> Conf:
+    """A composed Hydra config as plain dataclasses, every value present and of its type."""
+    conf = OmegaConf.to_object(OmegaConf.masked_copy(cfg, list(Conf.__dataclass_fields__)))
+    if not isinstance(conf, Conf):
+        raise TypeError(f"expected a config of schema Conf, got {type(conf).__name__}")
+    return conf
+
+
+def from_dict(values: dict[str, Any]) -> Conf:
+    """The config that `dataclasses.asdict` wrote."""
+    merged = OmegaConf.merge(OmegaConf.structured(Conf), values)
+    conf = OmegaConf.to_object(merged)
+    if not isinstance(conf, Conf):
+        raise TypeError(f"expected a config of schema Conf, got {type(conf).__name__}")
+    return conf
