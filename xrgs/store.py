@@ -1,0 +1,264 @@
+"""What is on disk, and is it done.
+
+A store is a folder: `scenes/`, `variants/`, `cells/<cell id>/`, `sweeps/<sweep id>.json`,
+`reports/<sweep id>/`. A cell's `status.json` is written last, by atomic rename, and lists every
+other file of the cell: a cell is done when it says so and the files are those that it lists.
+"""
+
+from __future__ import annotations
+
+import csv
+import json
+import os
+import tempfile
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from xrgs.errors import XrgsError
+from xrgs.identity import digest, file_digest
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Mapping, Sequence
+
+    import pandas as pd
+
+#: A report rests on these, so they are verified byte for byte; the others by their size.
+_VERIFIED_BY_HASH = frozenset(
+    {"config.json", "identity.json", "scores.csv", "summary.json", "history.csv"}
+)
+_RECORD_VERSION = 1
+
+
+class StoreError(XrgsError):
+    """The store's folder can't be used, or does not hold what was asked for."""
+
+
+def write_text(path: Path, text: str) -> None:
+    """Write a file so that a reader sees the old or the new content, never half of one."""
+    descriptor, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
+    temporary = Path(name)
+    try:
+        with os.fdopen(descriptor, "w", encoding="utf-8", newline="") as stream:
+            stream.write(text)
+            stream.flush()
+            os.fsync(stream.fileno())
+        temporary.replace(path)
+    except BaseException:
+        temporary.unlink(missing_ok=True)
+        raise
+
+
+def write_json(path: Path, value: object) -> None:
+    """Write `value` as indented JSON with sorted keys, atomically."""
+    write_text(path, json.dumps(value, indent=1, sort_keys=True, ensure_ascii=False) + "\n")
+
+
+def read_json(path: Path) -> Any:  # noqa: ANN401
+    """The JSON in a file.
+
+    Raises:
+        StoreError: the file is missing, unreadable or not JSON; the message names it.
+    """
+    try:
+        return json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError) as error:
+        raise StoreError(f"{path}: {error}") from error
+
+
+@dataclass(frozen=True)
+class State:
+    """Where a cell stands: `absent`, `unfinished`, `failed`, `corrupt` or `done`, and why."""
+
+    name: str
+    reason: str = ""
+
+
+@dataclass(frozen=True)
+class CellFolder:
+    """One cell's folder in the store."""
+
+    path: Path
+
+    @property
+    def id(self) -> str:
+        """The cell's id."""
+        return self.path.name
+
+    def state(self) -> State:
+        """Whether this cell's result is there and can be trusted."""
+        if not self.path.is_dir():
+            return State("absent")
+        status_file = self.path / "status.json"
+        if not status_file.exists():
+            return State("unfinished", "it was stopped before it ended")
+        try:
+            status = read_json(status_file)
+            if status["state"] == "failed":
+                return State("failed", str(status["reason"]))
+            self._verify(status)
+        except (StoreError, KeyError, TypeError, ValueError, OSError) as error:
+            return State("corrupt", str(error))
+        return State("done")
+
+    def _verify(self, status: Mapping[str, Any]) -> None:
+        if status["state"] != "done":
+            raise StoreError(f"status.json: unknown state {status['state']!r}")
+        for name, entry in status["files"].items():
+            file = self.path / name
+            if not file.is_file() or file.stat().st_size != entry["bytes"]:
+                raise StoreError(f"{name} is missing or has another size")
+            if name in _VERIFIED_BY_HASH and file_digest(file) != entry["sha256"]:
+                raise StoreError(f"{name} has changed since the cell finished")
+        with (self.path / "scores.csv").open(encoding="utf-8", newline="") as stream:
+            views = [row["view"] for row in csv.DictReader(stream)]
+        if views != status["views"]:
+            raise StoreError("scores.csv lacks rows of the views that were to be scored")
+
+    def begin(self, config: Mapping[str, Any], identity: Mapping[str, Any]) -> None:
+        """An empty folder with the cell's config; what an earlier try left is set aside."""
+        if self.path.exists():
+            self.path.rename(_free_name(self.path))
+        self.path.mkdir(parents=True)
+        write_json(self.path / "config.json", config)
+        write_json(self.path / "identity.json", identity)
+
+    def finish(self, views: Sequence[str], protocol: int) -> None:
+        """Declare the cell done: its files are those that lie here now."""
+        files = {
+            file.relative_to(self.path).as_posix(): {
+                "bytes": file.stat().st_size,
+                "sha256": file_digest(file),
+            }
+            for file in sorted(self.path.rglob("*"))
+            if file.is_file() and file.name != "log.txt"
+        }
+        self._set_status(
+            {
+                "state": "done",
+                "reason": "",
+                "views": list(views),
+                "protocol": protocol,
+                "files": files,
+            }
+        )
+
+    def fail(self, reason: str) -> None:
+        """Declare the cell failed."""
+        self._set_status({"state": "failed", "reason": reason, "views": [], "files": {}})
+
+    def _set_status(self, status: Mapping[str, Any]) -> None:
+        write_json(self.path / "status.json", status)
+
+    def config(self) -> dict[str, Any]:
+        """The resolved config."""
+        return dict(read_json(self.path / "config.json"))
+
+    def identity(self) -> dict[str, Any]:
+        """What the cell's id is the digest of."""
+        return dict(read_json(self.path / "identity.json"))
+
+    def summary(self) -> dict[str, Any]:
+        """The efficiency figures of the whole cell."""
+        return dict(read_json(self.path / "summary.json"))
+
+    def provenance(self) -> dict[str, Any]:
+        """Where, when and with what the cell was run."""
+        return dict(read_json(self.path / "provenance.json"))
+
+    def protocol(self) -> int:
+        """Version of the evaluation protocol that scored it."""
+        return int(read_json(self.path / "status.json")["protocol"])
+
+    def scores(self) -> pd.DataFrame:
+        """One row a test view: `view` and a column a metric, NaN where there is none."""
+        import pandas as pd
+
+        return pd.read_csv(self.path / "scores.csv", dtype={"view": str}, keep_default_na=True)
+
+    def history(self) -> pd.DataFrame:
+        """One row a logged step."""
+        import pandas as pd
+
+        return pd.read_csv(self.path / "history.csv")
+
+
+def _free_name(path: Path) -> Path:
+    """A sibling that does not exist: `<name>.aside-1`, `-2`, ..."""
+    number = 1
+    while (free := path.with_name(f"{path.name}.aside-{number}")).exists():
+        number += 1
+    return free
+
+
+@dataclass(frozen=True)
+class Store:
+    """Everything that is kept, under one folder."""
+
+    path: Path
+
+    @property
+    def scenes(self) -> Path:
+        """Embedded scenes, rendered."""
+        return self.path / "scenes"
+
+    @property
+    def variants(self) -> Path:
+        """Frozen variants."""
+        return self.path / "variants"
+
+    @property
+    def reports(self) -> Path:
+        """Tables and figures."""
+        return self.path / "reports"
+
+    def prepare(self) -> None:
+        """Make the folders.
+
+        Raises:
+            StoreError: the folder can't be written; the message names it and the `store` key.
+        """
+        try:
+            for folder in (self.scenes, self.variants, self.path / "cells", self.path / "sweeps"):
+                folder.mkdir(parents=True, exist_ok=True)
+            with tempfile.TemporaryFile(dir=self.path):
+                pass
+        except OSError as error:
+            raise StoreError(
+                f"store={self.path} can't be written ({error}): choose another folder with store=..."
+            ) from error
+
+    def cell(self, cell_id: str) -> CellFolder:
+        """The folder of a cell, which need not exist."""
+        return CellFolder(self.path / "cells" / cell_id)
+
+    def write_sweep(self, command: Sequence[str], cells: Iterable[Mapping[str, Any]]) -> str:
+        """Keep what a sweep compared, for its report. The same comparison gives the same id."""
+        rows = [dict(cell) for cell in cells]
+        sweep_id = digest(rows)
+        record = {"version": _RECORD_VERSION, "command": list(command), "cells": rows}
+        write_json(self.path / "sweeps" / f"{sweep_id}.json", record)
+        return sweep_id
+
+    def latest_sweep(self) -> str:
+        """The id of the sweep recorded last.
+
+        Raises:
+            StoreError: there is none.
+        """
+        records = list((self.path / "sweeps").glob("*.json"))
+        if not records:
+            raise StoreError(f"store={self.path} holds no sweep: run xrgs-sweep first")
+        return max(records, key=lambda file: (file.stat().st_mtime_ns, file.name)).stem
+
+    def sweep_record(self, sweep_id: str | None = None) -> dict[str, Any]:
+        """What a sweep compared; the latest one where no id is given.
+
+        Raises:
+            StoreError: there is no such sweep, or its record is of another version.
+        """
+        file = self.path / "sweeps" / f"{sweep_id or self.latest_sweep()}.json"
+        record = read_json(file)
+        if not isinstance(record, dict) or record.get("version") != _RECORD_VERSION:
+            raise StoreError(f"{file}: not a sweep record of version {_RECORD_VERSION}")
+        return record
