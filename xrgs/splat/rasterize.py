@@ -1,0 +1,101 @@
+"""The face of rendering: one call, whichever backend does the work."""
+
+from __future__ import annotations
+
+import importlib
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from xrgs.splat.backend import resolve_backend
+from xrgs.splat.cameras import Camera
+from xrgs.splat.settings import RasterSettings
+
+_MODULES = {"torch": "xrgs.splat.torch_rasterizer", "native": "xrgs.splat.native"}
+
+
+@dataclass(frozen=True)
+class Render:
+    """An image and what it took."""
+
+    image: Tensor  # [H, W, 3], 0 and up: not clamped at 1
+    alpha: Tensor  # [H, W], 1 - transmittance
+    visible: Tensor  # [N] bool
+    evaluations: int
+    """Pixels that a Gaussian's alpha was computed at."""
+    buffer_bytes: int
+    """What the renderer allocates beside the parameters and their gradients, at its peak."""
+
+
+def rasterize(
+    means: Tensor,
+    quats: Tensor,
+    scales: Tensor,
+    opacities: Tensor,
+    sh0: Tensor,
+    shN: Tensor,
+    camera: Camera,
+    settings: RasterSettings,
+    *,
+    sh_degree: int,
+    means2d_offset: Tensor | None = None,
+    backend: str = "torch",
+) -> Render:
+    """Render Gaussians into one view (3D Gaussian Splatting, with gsplat's constants).
+
+    A Gaussian is visible if it is in front of `settings.near`, its opacity reaches
+    `settings.alpha_min` and the box around all it can colour overlaps the image.
+
+    Args:
+        means: [N, 3] world units.
+        quats: [N, 4] wxyz, any length; zero is no rotation.
+        scales: [N, 3] world units, at least 0.
+        opacities: [N] in 0..1.
+        sh0: [N, 1, 3]
+        shN: [N, K - 1, 3]
+        camera: the view.
+        settings: how Gaussians become pixels.
+        sh_degree: highest band that is on, at most the bands of shN.
+        means2d_offset: [N, 2] px, added to the projected means: its gradient is the image-plane
+            gradient that densification reads.
+        backend: `torch`, `native` or `auto` (`resolve_backend`).
+
+    Returns:
+        The render, differentiable in every float argument.
+
+    Raises:
+        ValueError: a parameter has the wrong shape or type, or values that are not finite or out
+            of range; the message names it.
+    """
+    parameters = {
+        "means": (means, (3,)),
+        "quats": (quats, (4,)),
+        "scales": (scales, (3,)),
+        "opacities": (opacities, ()),
+        "sh0": (sh0, (1, 3)),
+        "shN": (shN, (*shN.shape[1:2], 3)),
+    }
+    if means2d_offset is not None:
+        parameters["means2d_offset"] = (means2d_offset, (2,))
+    count = means.shape[0] if means.ndim else 0
+    for name, (value, shape) in parameters.items():
+        _check(name, value, (count, *shape), means.dtype)
+    if (scales < 0).any():
+        raise ValueError("scales has values below 0")
+    if ((opacities < 0) | (opacities > 1)).any():
+        raise ValueError("opacities has values outside 0..1")
+    module = importlib.import_module(_MODULES[resolve_backend(backend)])
+    render: Render = module.render(
+        means, quats, scales, opacities, sh0, shN, camera, settings, sh_degree, means2d_offset
+    )
+    return render
+
+
+def _check(name: str, value: Tensor, shape: tuple[int, ...], dtype: torch.dtype) -> None:
+    if value.shape != shape:
+        raise ValueError(f"{name} must be {list(shape)}, got {list(value.shape)}")
+    if not value.is_floating_point() or value.dtype != dtype:
+        raise ValueError(f"{name} must be of the floating type of means, got {value.dtype}")
+    if not torch.isfinite(value).all():
+        raise ValueError(f"{name} has values that are not finite")

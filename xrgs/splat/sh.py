@@ -1,0 +1,96 @@
+"""Colour that depends on the direction of view: real spherical harmonics, degree 0 to 3.
+
+The basis is the one of 3D Gaussian Splatting and gsplat: orthonormal, Condon-Shortley phase
+included, index l^2 + l + m; a colour is the sum over bands plus 0.5, clamped at 0. Any viewer of
+.ply files expects the same.
+"""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import Tensor
+
+MAX_DEGREE = 3
+C0 = 0.5 / math.sqrt(math.pi)
+
+
+def bases(degree: int) -> int:
+    """How many basis functions degree 0 to `degree` have."""
+    return (degree + 1) ** 2
+
+
+def sh_basis(degree: int, dirs: Tensor) -> Tensor:
+    """The real spherical harmonics of degree 0 to `degree`.
+
+    Args:
+        degree: 0 to 3.
+        dirs: [..., 3], unit length.
+
+    Returns:
+        [..., (degree + 1)^2]
+
+    Raises:
+        ValueError: degree is not 0 to 3.
+    """
+    if not 0 <= degree <= MAX_DEGREE:
+        raise ValueError(f"sh_degree must be 0 to {MAX_DEGREE}, got {degree}")
+    x, y, z = dirs.unbind(-1)
+    basis = [torch.full_like(x, C0)]
+    if degree >= 1:
+        c1 = math.sqrt(3 / (4 * math.pi))
+        basis += [-c1 * y, c1 * z, -c1 * x]
+    if degree >= 2:
+        c2 = math.sqrt(15 / (4 * math.pi))
+        basis += [
+            c2 * x * y,
+            -c2 * y * z,
+            math.sqrt(5 / (16 * math.pi)) * (3 * z * z - 1),
+            -c2 * x * z,
+            c2 / 2 * (x * x - y * y),
+        ]
+    if degree >= 3:
+        c31 = math.sqrt(21 / (32 * math.pi))
+        c32 = math.sqrt(105 / (4 * math.pi))
+        c33 = math.sqrt(35 / (32 * math.pi))
+        basis += [
+            -c33 * y * (3 * x * x - y * y),
+            c32 * x * y * z,
+            -c31 * y * (5 * z * z - 1),
+            math.sqrt(7 / (16 * math.pi)) * z * (5 * z * z - 3),
+            -c31 * x * (5 * z * z - 1),
+            c32 / 2 * z * (x * x - y * y),
+            -c33 * x * (x * x - 3 * y * y),
+        ]
+    return torch.stack(basis, dim=-1)
+
+
+def sh_to_colors(degree: int, dirs: Tensor, sh0: Tensor, shN: Tensor) -> Tensor:
+    """The colours of Gaussians seen along `dirs`.
+
+    Args:
+        degree: highest band that is on; bands stored above it are left out.
+        dirs: [N, 3], unit length, camera to Gaussian.
+        sh0: [N, 1, 3]
+        shN: [N, K - 1, 3] with K - 1 >= (degree + 1)^2 - 1.
+
+    Returns:
+        [N, 3], at least 0.
+
+    Raises:
+        ValueError: degree is not 0 to 3, or shN has fewer bands than degree asks for.
+    """
+    rest = bases(degree) - 1
+    if shN.shape[1] < rest:
+        raise ValueError(f"sh_degree {degree} needs shN of [N, {rest}, 3], got {list(shN.shape)}")
+    basis = sh_basis(degree, dirs)  # [N, K]
+    colors = basis[:, :1] * sh0[:, 0]  # [N, 3]
+    if rest:
+        colors = colors + torch.einsum("nk,nkc->nc", basis[:, 1:], shN[:, :rest])
+    return (colors + 0.5).clamp_min(0.0)
+
+
+def colors_to_sh0(colors: Tensor) -> Tensor:
+    """The band-0 coefficients that show `colors` [N, 3] (0..1) from everywhere: [N, 1, 3]."""
+    return ((colors - 0.5) / C0)[:, None]
