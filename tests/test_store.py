@@ -1,0 +1,134 @@
+"""A store: what is on disk, and is it done."""
+
+from __future__ import annotations
+
+import json
+import os
+from pathlib import Path
+
+import pytest
+
+from xrgs.store import CellFolder, Store, StoreError, write_json
+
+
+@pytest.fixture
+def done(tmp_path: Path) -> CellFolder:
+    folder = CellFolder(tmp_path / "cells" / "abc")
+    folder.begin({"seed": 0}, {"seed": 0})
+    (folder.path / "scores.csv").write_text("view,psnr,ssim,lpips\na,20.5,0.75,\nb,30.0,0.5,\n")
+    write_json(folder.path / "summary.json", {"gaussians": 7})
+    (folder.path / "renders").mkdir()
+    (folder.path / "renders" / "a.png").write_bytes(b"1234")
+    folder.finish(["a", "b"], protocol=1)
+    return folder
+
+
+def test_a_finished_cell_is_done_and_gives_back_what_was_written(done: CellFolder) -> None:
+    assert done.state().name == "done"
+    assert done.summary() == {"gaussians": 7}
+    assert done.config() == {"seed": 0}
+    assert done.protocol() == 1
+    scores = done.scores()
+    assert scores["psnr"].tolist() == [20.5, 30.0]
+    assert scores["lpips"].isna().all()
+
+
+def test_a_cell_without_status_is_unfinished_and_an_absent_one_absent(done: CellFolder) -> None:
+    (done.path / "status.json").unlink()
+    assert done.state().name == "unfinished"
+    assert CellFolder(done.path.with_name("other")).state().name == "absent"
+
+
+@pytest.mark.parametrize(
+    ("name", "content"),
+    [
+        ("scores.csv", "view,psnr,ssim,lpips\na,99.9,0.75,\nb,30.0,0.5,\n"),
+        ("scores.csv", "view,psnr,ssim,lpips\na,20.5,0.75,\n"),
+        ("config.json", '{"seed": 1}'),
+        ("renders/a.png", "12345"),
+        ("status.json", "{"),
+        ("status.json", '{"state": "done"}'),
+        ("status.json", "[]"),
+    ],
+)
+def test_a_cell_that_was_tampered_with_is_corrupt(
+    done: CellFolder, name: str, content: str
+) -> None:
+    (done.path / name).write_text(content)
+    assert done.state().name == "corrupt"
+    assert done.state().reason
+
+
+def test_a_missing_file_is_named(done: CellFolder) -> None:
+    (done.path / "renders" / "a.png").unlink()
+    state = done.state()
+    assert state.name == "corrupt"
+    assert "renders/a.png" in state.reason
+
+
+def test_a_failed_cell_says_why(done: CellFolder) -> None:
+    done.fail("out of luck")
+    assert done.state().name == "failed"
+    assert done.state().reason == "out of luck"
+
+
+def test_beginning_again_sets_the_old_folder_aside(done: CellFolder) -> None:
+    done.begin({"seed": 1}, {})
+    done.begin({"seed": 2}, {})
+    assert done.state().name == "unfinished"
+    aside = sorted(path.name for path in done.path.parent.iterdir())
+    assert aside == ["abc", "abc.aside-1", "abc.aside-2"]
+    assert CellFolder(done.path.with_name("abc.aside-1")).config() == {"seed": 0}
+
+
+def test_the_same_comparison_has_the_same_sweep_id(tmp_path: Path) -> None:
+    store = Store(tmp_path)
+    store.prepare()
+    first = store.write_sweep(["a=1"], [{"cell_id": "x"}])
+    second = store.write_sweep(["a=1"], [{"cell_id": "y"}])
+    assert store.write_sweep(["b=2"], [{"cell_id": "x"}]) == first != second
+    os.utime(tmp_path / "sweeps" / f"{second}.json", ns=(0, 0))
+    assert store.latest_sweep() == first
+    assert store.sweep_record()["cells"] == [{"cell_id": "x"}]
+
+
+def test_a_store_without_sweeps_says_so(tmp_path: Path) -> None:
+    store = Store(tmp_path)
+    store.prepare()
+    with pytest.raises(StoreError, match="holds no sweep"):
+        store.sweep_record()
+
+
+def test_an_unknown_sweep_is_named(tmp_path: Path) -> None:
+    with pytest.raises(StoreError, match=r"nope\.json"):
+        Store(tmp_path).sweep_record("nope")
+
+
+def test_a_record_of_another_version_is_refused(tmp_path: Path) -> None:
+    store = Store(tmp_path)
+    store.prepare()
+    (tmp_path / "sweeps" / "old.json").write_text(json.dumps({"version": 0}))
+    with pytest.raises(StoreError, match="version"):
+        store.sweep_record("old")
+
+
+def test_an_unwritable_store_names_folder_and_key(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("in the way")
+    with pytest.raises(StoreError, match=r"store=.*file.*can't be written.*store="):
+        Store(tmp_path / "file").prepare()
+
+
+def test_an_interrupted_write_leaves_the_old_file(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    file = tmp_path / "value.json"
+    write_json(file, 1)
+
+    def stop(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(os, "fsync", stop)
+    with pytest.raises(KeyboardInterrupt):
+        write_json(file, 2)
+    assert json.loads(file.read_text()) == 1
+    assert list(tmp_path.iterdir()) == [file]
