@@ -1,0 +1,72 @@
+"""One cell: a variant, a config and a seed become Gaussians, scores and their provenance."""
+
+from __future__ import annotations
+
+import csv
+import io
+import resource
+import traceback
+from typing import TYPE_CHECKING, Any
+
+from xrgs import dataset, evaluate, provenance
+from xrgs.splat import ply
+from xrgs.splat.backend import resolve_backend
+from xrgs.store import write_json, write_text
+from xrgs.train import train
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+
+    from xrgs.config import Conf
+    from xrgs.store import CellFolder
+    from xrgs.variant import Variant
+
+
+def run(conf: Conf, variant: Variant, folder: CellFolder) -> None:
+    """Train, evaluate and write a cell into its begun folder; its status is written last.
+
+    Raises:
+        Exception: whatever went wrong, after `error.txt` and the status say so.
+    """
+    try:
+        _run(conf, variant, folder)
+    except Exception as error:
+        write_text(folder.path / "error.txt", traceback.format_exc())
+        folder.fail(f"{type(error).__name__}: {error}")
+        raise
+
+
+def _run(conf: Conf, variant: Variant, folder: CellFolder) -> None:
+    threads = dataset.use_threads(conf.threads)
+    backend = resolve_backend(conf.splat.backend)
+    write_json(folder.path / "provenance.json", provenance.collect(threads, backend))
+    data = dataset.load(variant)
+    trained = train(data, conf)
+    ply.save(folder.path / "splats.ply", trained.gaussians)
+    write_text(folder.path / "history.csv", _csv(trained.history))
+    scores = evaluate.score(trained.gaussians, data.test, conf.splat, folder.path / "renders")
+    write_text(folder.path / "scores.csv", _csv(scores))
+    write_json(
+        folder.path / "summary.json",
+        {
+            "training_time_s": trained.seconds,
+            "gaussians": len(trained.gaussians),
+            "memory_bytes": trained.memory_bytes,
+            "peak_rss_bytes": _peak_rss_bytes(),
+            "evaluations": trained.evaluations,
+            "steps": conf.train.steps,
+        },
+    )
+    folder.finish([view.name for view in data.test], evaluate.PROTOCOL)
+
+
+def _peak_rss_bytes() -> int:
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
+
+
+def _csv(rows: Sequence[Mapping[str, Any]]) -> str:
+    text = io.StringIO()
+    writer = csv.DictWriter(text, fieldnames=list(rows[0]), lineterminator="\n")
+    writer.writeheader()
+    writer.writerows(rows)
+    return text.getvalue()
