@@ -85,9 +85,8 @@ def structural_similarity(image: Tensor, target: Target) -> Tensor:
         ValueError: `image` hasn't the target's shape.
     """
     y = _same_shape(image, target)
-    mean, square, product = _blur(torch.cat([image, image * image, image * y.image], dim=-1)).split(
-        3, dim=-1
-    )  # 3 x [H - 10, W - 10, 3]
+    products = torch.cat([image, image * image, image * y.image], dim=-1)  # [H, W, 9]
+    mean, square, product = _blur(products).chunk(3, dim=-1)  # [H - 10, W - 10, 3] each
     # Rounding makes the variance of a flat image negative; far outside 0..1 that could outgrow C2.
     variance = (square - mean * mean).clamp_min(0)
     covariance = product - mean * y.mean
@@ -105,7 +104,7 @@ def _same_shape(image: Tensor, target: Target) -> Target:
 
 
 def _moments(image: Tensor) -> tuple[Tensor, Tensor]:
-    mean, square = _blur(torch.cat([image, image * image], dim=-1)).split(3, dim=-1)
+    mean, square = _blur(torch.cat([image, image * image], dim=-1)).chunk(2, dim=-1)
     return mean, (square - mean * mean).clamp_min(0)
 
 
