@@ -1,0 +1,128 @@
+"""Stores made by writing files: no cell is trained."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from xrgs.store import CellFolder, Store
+
+SUMMARY = {
+    "training_time_s": 100.0,
+    "gaussians": 5000,
+    "memory_bytes": 2**26,
+    "peak_rss_bytes": 2**29,
+    "evaluations": 10**9,
+    "steps": 500,
+}
+SCORES = {"psnr": 20.0, "ssim": 0.8, "lpips": 0.25}
+VIEWS = ("IMG_001", "IMG_009")
+
+
+class MadeStore:
+    """A store, and the rows of the sweep that is being written into it."""
+
+    def __init__(self, path: Path) -> None:
+        self.store = Store(path)
+        self.store.prepare()
+        self.rows: list[dict[str, Any]] = []
+
+    def add(
+        self,
+        label: str = "baseline",
+        *,
+        scene: str = "fern",
+        condition: str = "",
+        seed: int = 0,
+        factors: dict[str, float] | None = None,
+        values: dict[str, Any] | None = None,
+        variant: str | None = None,
+        protocol: int = 1,
+        state: str = "done",
+        pictures: bool = False,
+        cpu: str = "a processor",
+    ) -> CellFolder:
+        """One cell: the made-up baseline's values times `factors`, or `values` outright."""
+        cell_id = f"cell{len(self.rows):05d}"
+        variant = variant or f"variant-of-{len(scene)}-{scene[:3]}"
+        found = SUMMARY | SCORES | (values or {})
+        found |= {key: found[key] * factor for key, factor in (factors or {}).items()}
+        folder = self.store.cell(cell_id)
+        folder.begin({}, {"variant": variant, "seed": seed, "protocol": protocol})
+        base = [
+            row["cell_id"]
+            for row in self.rows
+            if (row["label"], row["scene"], row["condition"], row["seed"])
+            == ("baseline", scene, condition, seed)
+        ]
+        self.rows.append(
+            {
+                "cell_id": cell_id,
+                "label": label,
+                "condition": condition,
+                "scene": scene,
+                "seed": seed,
+                "variant_id": variant,
+                "baseline_id": (base or [cell_id])[0],
+                "error": None,
+            }
+        )
+        if state == "failed":
+            folder.fail("RuntimeError: out of luck")
+            return folder
+        self._fill(folder, found, cpu)
+        if pictures:
+            self._draw(folder, variant, noise=0.02 * len(self.rows))
+        folder.finish(VIEWS, protocol)
+        return folder
+
+    def add_error(self, scene: str, label: str = "baseline", seed: int = 0) -> None:
+        """A cell of a scene that could not be registered."""
+        keys = dict.fromkeys(("cell_id", "variant_id", "baseline_id"))
+        self.rows.append(
+            keys
+            | {"label": label, "condition": "", "scene": scene, "seed": seed}
+            | {"error": f"{scene}: 3 of 24 views registered"}
+        )
+
+    def write(self, command: tuple[str, ...] = ("+ablation=consistency",)) -> str:
+        """Record the sweep; returns its id."""
+        return self.store.write_sweep(command, self.rows)
+
+    @staticmethod
+    def _fill(folder: CellFolder, found: dict[str, Any], cpu: str) -> None:
+        summary = {key: found[key] for key in SUMMARY}
+        (folder.path / "summary.json").write_text(json.dumps(summary))
+        provenance = {"cpu": cpu, "threads": 2, "backend": "torch", "started": str(folder.path)}
+        (folder.path / "provenance.json").write_text(json.dumps(provenance))
+        # The views differ, their mean is the value asked for.
+        lines = ["view,psnr,ssim,lpips"]
+        for view, offset in zip(VIEWS, (0.05, -0.05), strict=True):
+            scores = ["" if found[key] is None else repr(found[key] + offset) for key in SCORES]
+            lines.append(",".join([view, *scores]))
+        (folder.path / "scores.csv").write_text("\n".join(lines) + "\n")
+        rows = [f"{step},{0.3 / (1 + step)},{100 * step}" for step in range(5)]
+        (folder.path / "history.csv").write_text("\n".join(["step,loss,gaussians", *rows]) + "\n")
+
+    def _draw(self, folder: CellFolder, variant: str, noise: float) -> None:
+        photographs = self.store.variants / variant / "images"
+        photographs.mkdir(parents=True, exist_ok=True)
+        (folder.path / "renders").mkdir()
+        for number, view in enumerate(VIEWS):
+            rng = np.random.default_rng(number)
+            image = np.kron(rng.uniform(0.2, 0.8, (6, 8, 3)), np.ones((10, 10, 1)))
+            worse = image.copy()
+            worse[20:40, 40:60] += rng.uniform(-1, 1, (20, 20, 3)) * noise
+            for path, pixels in (
+                (photographs / f"{view}.png", image),
+                (folder.path / "renders" / f"{view}.png", worse),
+            ):
+                Image.fromarray((pixels.clip(0, 1) * 255).astype(np.uint8)).save(path)
+
+
+@pytest.fixture
+def made(tmp_path: Path) -> MadeStore:
+    return MadeStore(tmp_path / "store")

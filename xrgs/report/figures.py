@@ -1,0 +1,158 @@
+"""Pictures of a comparison: photograph, baseline and ablation side by side; curves of training.
+
+The same inputs give the same bytes: matplotlib's own defaults whatever the user's style, no dates
+and no version in the file. Nothing goes through pyplot, which keeps figures alive.
+"""
+
+from __future__ import annotations
+
+import io
+import warnings
+from contextlib import contextmanager
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+from matplotlib import style
+from matplotlib.figure import Figure
+from matplotlib.patches import Rectangle
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator, Mapping, Sequence
+
+    import pandas as pd
+    from matplotlib.axes import Axes
+    from numpy.typing import NDArray
+
+    Image = NDArray[np.float32]
+
+#: Okabe and Ito's orange and blue: told apart by colour-blind readers and in grey.
+_ABLATION, _BASELINE, _FRAME = "#D55E00", "#0072B2", "#FFD400"
+_DPI = 150
+_PANEL = 3.4  # inches
+_ZOOM = 5
+
+
+class Panel(NamedTuple):
+    """One image and the line under it."""
+
+    image: Image  # [H, W, 3] 0..1
+    title: str
+    caption: str
+
+
+@contextmanager
+def _default_style() -> Iterator[None]:
+    """Matplotlib's own style, and no warning for a script that its font lacks.
+
+    Such characters are drawn as boxes; the tables beside the picture have the name.
+    """
+    with style.context("default"), warnings.catch_warnings():
+        warnings.filterwarnings("ignore", message="Glyph .* missing from")
+        yield
+
+
+def differing_crop(first: Image, second: Image, zoom: int = _ZOOM) -> tuple[slice, slice]:
+    """The window, `zoom` times smaller than the images, in which they differ most.
+
+    Args:
+        first: [H, W, 3]
+        second: [H, W, 3]
+        zoom: how many times smaller its sides are; the topmost, leftmost of equals wins.
+
+    Returns:
+        Rows and columns.
+    """
+    difference = np.abs(first.astype(np.float64) - second).mean(axis=2)  # [H, W]
+    height, width = (max(1, side // zoom) for side in difference.shape)
+    sums = np.pad(difference, ((1, 0), (1, 0))).cumsum(0).cumsum(1)  # [H + 1, W + 1]
+    boxes = (
+        sums[height:, width:] - sums[:-height, width:] - sums[height:, :-width]
+        + sums[:-height, :-width]
+    )  # fmt: skip
+    top, left = np.unravel_index(int(np.argmax(boxes.round(9))), boxes.shape)
+    return slice(int(top), int(top) + height), slice(int(left), int(left) + width)
+
+
+@_default_style()
+def side_by_side(
+    title: str, panels: Sequence[Panel], crop: tuple[slice, slice], note: str
+) -> bytes:
+    """The panels in a row with `crop` framed, and below each its crop enlarged.
+
+    Args:
+        title: above all.
+        panels: images of one size, e.g. photograph, baseline and ablation.
+        crop: rows and columns, as `differing_crop` gives them.
+        note: what the window is, e.g. "where the two differ most".
+
+    Returns:
+        A PNG.
+    """
+    rows, columns = crop
+    height, width = panels[0].image.shape[:2]
+    cut_ratio = (rows.stop - rows.start) / (columns.stop - columns.start)
+    ratios = [height / width, cut_ratio]
+    figure = _figure(_PANEL * len(panels), _PANEL * sum(ratios) + 1.1)
+    figure.suptitle(title, fontsize=11, parse_math=False)
+    figure.supxlabel(f"below: the framed window, {note}", fontsize=9, parse_math=False)
+    axes = figure.subplots(2, len(panels), height_ratios=ratios)
+    corner = (columns.start - 0.5, rows.start - 0.5)
+    size = (columns.stop - columns.start, rows.stop - rows.start)
+    for (upper, lower), panel in zip(axes.T, panels, strict=True):
+        _show(upper, panel.image, "antialiased")
+        upper.add_patch(Rectangle(corner, *size, fill=False, edgecolor=_FRAME, linewidth=1.5))
+        upper.set_title(panel.title, fontsize=10, parse_math=False)
+        upper.set_xlabel(panel.caption, fontsize=9, parse_math=False)
+        _show(lower, panel.image[rows, columns], "nearest")
+        for spine in lower.spines.values():
+            spine.set(edgecolor=_FRAME, linewidth=1.5)
+    return _png(figure)
+
+
+@_default_style()
+def curves(
+    title: str, runs: Sequence[tuple[str, pd.DataFrame]], columns: Mapping[str, str]
+) -> bytes:
+    """Training curves over steps, one panel a column, one line a run.
+
+    Args:
+        title: above all.
+        runs: label and history (`step` and `columns`) of the baseline, then of the ablation.
+        columns: what to draw, and what to write above it.
+
+    Returns:
+        A PNG.
+    """
+    figure = _figure(_PANEL * 1.5 * len(columns), _PANEL)
+    figure.suptitle(title, fontsize=11, parse_math=False)
+    axes = figure.subplots(1, len(columns), squeeze=False)[0]
+    styles = ({"color": _BASELINE}, {"color": _ABLATION, "linestyle": "--"})
+    for axis, (column, name) in zip(axes, columns.items(), strict=True):
+        lines = [
+            axis.plot(history["step"], history[column], linewidth=1.2, **look)[0]
+            for (_, history), look in zip(runs, styles, strict=True)
+        ]
+        axis.set_xlabel("step")
+        axis.set_title(name, fontsize=10)
+        axis.grid(alpha=0.3)
+        axis.spines[["top", "right"]].set_visible(False)
+    legend = axes[0].legend(lines, [label for label, _ in runs], frameon=False, fontsize=9)
+    for text in legend.get_texts():
+        text.set_parse_math(False)
+    return _png(figure)
+
+
+def _figure(width: float, height: float) -> Figure:
+    """An empty figure of so many inches."""
+    return Figure(figsize=(width, height), dpi=_DPI, layout="constrained")
+
+
+def _show(axes: Axes, image: Image, interpolation: str) -> None:
+    axes.imshow(np.clip(image, 0, 1), interpolation=interpolation)
+    axes.set(xticks=[], yticks=[])
+
+
+def _png(figure: Figure) -> bytes:
+    stream = io.BytesIO()
+    figure.savefig(stream, format="png", metadata={"Software": None})
+    return stream.getvalue()

@@ -1,0 +1,146 @@
+"""Which pictures a report has, and where their images lie in the store."""
+
+from __future__ import annotations
+
+import hashlib
+import re
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from PIL import Image
+from tqdm import tqdm
+
+from xrgs.report.collect import BASELINE
+from xrgs.report.figures import Panel, curves, differing_crop, side_by_side
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    import pandas as pd
+    from numpy.typing import NDArray
+
+    from xrgs.report.compare import Comparison
+    from xrgs.store import Store
+
+_CURVES = {"gaussians": "Gaussians", "loss": "loss of the step's view, as each run weighs it"}
+
+
+@dataclass(frozen=True)
+class Picture:
+    """A figure's file, or why there is none."""
+
+    title: str
+    file: Path | None
+    why: str = ""
+
+
+def draw(store: Store, comparison: Comparison, views: pd.DataFrame, folder: Path) -> list[Picture]:
+    """One comparison and one picture of training curves for every scene and ablation.
+
+    Of several conditions and seeds the first is drawn; the title says which.
+
+    Args:
+        store: where photographs, renders and histories lie.
+        comparison: the pairs.
+        views: `Sweep.views`.
+        folder: where the files go; it exists.
+
+    Returns:
+        The pictures in the order of the tables.
+    """
+    pairs = comparison.pairs.drop_duplicates("cell_id").sort_values("seed", kind="stable")
+    wanted = [
+        pairs[(pairs["scene"] == scene) & (pairs["label"] == label)].iloc[0]
+        for scene, label in _scenes_and_labels(pairs)
+    ]
+    psnr = {cell: rows.set_index("view")["psnr"] for cell, rows in views.groupby("cell_id")}
+    variants = comparison.cells.drop_duplicates("cell_id").set_index("cell_id")["variant_id"]
+    drawn = []
+    for pair in tqdm(wanted, desc="drawing", unit="picture", delay=2, leave=False):
+        scores = psnr[pair["baseline_id"]], psnr[pair["cell_id"]]
+        photographs = store.variants / variants[pair["cell_id"]] / "images"
+        drawn += [
+            _views(store, pair, scores, photographs, folder),
+            _training(store, pair, folder),
+        ]
+    return drawn
+
+
+def _scenes_and_labels(pairs: pd.DataFrame) -> list[tuple[str, str]]:
+    found = pairs.drop_duplicates(["scene", "label"])
+    return sorted(zip(found["scene"], found["label"], strict=True))
+
+
+def median_view(baseline: pd.Series, ablation: pd.Series) -> str:
+    """The view whose change of PSNR is the (lower) median: neither the best nor the worst case.
+
+    Args:
+        baseline: PSNR in dB, indexed by view.
+        ablation: likewise.
+    """
+    change = (ablation - baseline.reindex(ablation.index)).fillna(0.0).sort_index()
+    return str(change.sort_values(kind="stable").index[(len(change) - 1) // 2])
+
+
+def _views(
+    store: Store,
+    pair: pd.Series,
+    psnr: tuple[pd.Series, pd.Series],
+    photographs: Path,
+    folder: Path,
+) -> Picture:
+    view = median_view(*psnr)
+    title = f"{_title(pair)}: view {view}, by change of PSNR the median of {len(psnr[0])}"
+    try:
+        truth = _image(photographs / f"{view}.png")
+        baseline = _image(store.cell(pair["baseline_id"]).path / "renders" / f"{view}.png")
+        ablation = _image(store.cell(pair["cell_id"]).path / "renders" / f"{view}.png")
+    except (OSError, ValueError) as error:
+        return Picture(title, None, str(error))
+    panels = (
+        Panel(truth, "photograph", f"{truth.shape[1]} × {truth.shape[0]} px"),
+        Panel(baseline, BASELINE, f"PSNR {psnr[0][view]:.2f} dB"),
+        Panel(ablation, str(pair["label"]), f"PSNR {psnr[1][view]:.2f} dB"),
+    )
+    if len({panel.image.shape for panel in panels}) > 1:
+        return Picture(title, None, f"{view}: photograph and renders differ in size")
+    file = folder / f"{_stem(pair)}.png"
+    note = f"where baseline and {pair['label']} differ most"
+    file.write_bytes(side_by_side(title, panels, differing_crop(baseline, ablation), note))
+    return Picture(title, file)
+
+
+def _training(store: Store, pair: pd.Series, folder: Path) -> Picture:
+    title = f"{_title(pair)}: training"
+    runs: list[tuple[str, Any]] = []
+    try:
+        for name, key in ((BASELINE, "baseline_id"), (str(pair["label"]), "cell_id")):
+            runs.append((name, store.cell(pair[key]).history()[["step", *_CURVES]]))
+    except (OSError, ValueError, KeyError) as error:
+        return Picture(title, None, f"history.csv: {error}")
+    file = folder / f"{_stem(pair)}--training.png"
+    file.write_bytes(curves(title, runs, _CURVES))
+    return Picture(title, file)
+
+
+def _title(pair: pd.Series) -> str:
+    parts = (pair["scene"], pair["label"], pair["condition"], f"seed {pair['seed']}")
+    return ", ".join(str(part) for part in parts if part)
+
+
+def _image(path: Path) -> NDArray[np.float32]:
+    with Image.open(path) as image:
+        return np.asarray(image.convert("RGB")).astype(np.float32) / np.float32(255)
+
+
+def _stem(pair: pd.Series) -> str:
+    return f"{slug(pair['scene'])}--{slug(pair['label'])}"
+
+
+def slug(text: str) -> str:
+    """`text` as part of a file name on any system; different texts give different names."""
+    plain = re.sub(r"[^A-Za-z0-9_.]+", "-", text).strip("-.")[:60]
+    if plain == text:
+        return text
+    return f"{plain}-{hashlib.sha256(text.encode()).hexdigest()[:6]}".lstrip("-")

@@ -1,0 +1,293 @@
+"""The tables of a comparison: what stands in which row and column, and how a number is written."""
+
+from __future__ import annotations
+
+import math
+from functools import cached_property
+from typing import TYPE_CHECKING, NamedTuple
+
+import pandas as pd
+
+from xrgs.report.collect import BASELINE
+from xrgs.report.render import Grid
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable
+
+    from xrgs.metrics import Metric
+    from xrgs.report.compare import Comparison
+
+#: An arrow tells improvement from degradation, as in the paper's tables, not larger from smaller.
+BETTER, WORSE, SAME = "↑", "↓", "="
+ARROWS_NOTE = f"{BETTER} improvement, {WORSE} degradation, {SAME} no change at this precision"
+
+
+class Change(NamedTuple):
+    """One row of `Comparison.means` or `.per_scene`."""
+
+    baseline: float
+    value: float
+    change: float
+    difference: float
+    spread: float
+    n: int
+    low: float
+    high: float
+    unit: str
+    why: str
+
+
+def number(value: float, unit: str) -> str:
+    """A value with its unit, at a precision that fits its size."""
+    if math.isnan(value):
+        return "n/a"
+    if unit == "bytes":
+        return f"{value / 2**20:,.1f} MiB"
+    if math.isinf(value) or abs(value) >= 1000:
+        text = f"{value:,.0f}"
+    elif unit:
+        text = f"{value:.2f}"
+    else:
+        text = f"{value:.4f}" if value % 1 else f"{value:.0f}"
+    return f"{text} {unit}".rstrip()
+
+
+def signed(value: float) -> str:
+    """Two decimals with a sign, zero without; n/a for NaN."""
+    if math.isnan(value):
+        return "n/a"
+    text = f"{value:+,.2f}"
+    return "0.00" if text in {"+0.00", "-0.00"} else text
+
+
+def arrow(change: float, metric: Metric) -> str:
+    """Whether the printed change is an improvement, in the metric's own direction."""
+    if math.isnan(change):
+        return " "
+    if signed(change) == "0.00":
+        return SAME
+    return BETTER if (change > 0) == metric.higher_is_better else WORSE
+
+
+def percent(change: float, metric: Metric) -> str:
+    """A change as the paper's tables print it: `-44.57 ↑`."""
+    return f"{signed(change)} {arrow(change, metric)}"
+
+
+def reading(row: Change, metric: Metric) -> str:
+    """What the interval allows to be said."""
+    if math.isnan(row.change):
+        return f"n/a: {row.why}"
+    if math.isnan(row.low):
+        return "one seed: no interval"
+    if row.low == row.high == 0:
+        return "unchanged"
+    if row.low <= 0 <= row.high:
+        return "inside noise"
+    return "better" if (row.change > 0) == metric.higher_is_better else "worse"
+
+
+def interval(row: Change) -> str:
+    """The 95 % interval of the change."""
+    return "" if math.isnan(row.low) else f"{signed(row.low)} to {signed(row.high)}"
+
+
+class Tables:
+    """Builds every table of one comparison."""
+
+    def __init__(self, comparison: Comparison) -> None:
+        self.comparison = comparison
+
+    @cached_property
+    def _means(self) -> dict[tuple[str, ...], Change]:
+        return _by_key(self.comparison.means)
+
+    @cached_property
+    def _per_scene(self) -> dict[tuple[str, ...], Change]:
+        return _by_key(self.comparison.per_scene)
+
+    @cached_property
+    def _seeds(self) -> dict[tuple[str, str, str], list[int]]:
+        """Seeds of the pairs, by (label, condition, scene)."""
+        pairs = self.comparison.pairs
+        keys = zip(pairs["label"], pairs["condition"], pairs["scene"], strict=True)
+        found: dict[tuple[str, str, str], set[int]] = {}
+        for key, seed in zip(keys, pairs["seed"], strict=True):
+            found.setdefault(key, set()).add(seed)
+        return {key: sorted(seeds) for key, seeds in found.items()}
+
+    def scenes_of(self, label: str, condition: str) -> list[str]:
+        """The scenes that gave at least one pair."""
+        return [s for s in self.comparison.scenes if (label, condition, s) in self._seeds]
+
+    def overviews(self) -> list[Grid]:
+        """Every ablation beside the others, one table a condition, where there are several."""
+        grids = []
+        for condition in dict.fromkeys(condition for _, condition in self.comparison.groups):
+            labels = [name for name, other in self.comparison.groups if other == condition]
+            if len(labels) > 1:
+                grids.append(self._overview(labels, condition))
+        return grids
+
+    def _overview(self, labels: list[str], condition: str) -> Grid:
+        rows = tuple(
+            (metric.label, *(self._cell(self._means.get((name, condition, metric.name)), metric)
+                             for name in labels))
+            for metric in self.comparison.metrics
+        )  # fmt: skip
+        return Grid(
+            title=_title("Change from baseline, %, mean over scenes", condition),
+            columns=("Metric", *labels),
+            rows=rows,
+            align="l" + "r" * len(labels),
+            notes=(ARROWS_NOTE,),
+        )
+
+    @staticmethod
+    def _cell(row: Change | None, metric: Metric) -> str:
+        return "failed  " if row is None else percent(row.change, metric)
+
+    def mean(self, label: str, condition: str) -> Grid:
+        """The paper's Table 1 for one ablation, and beside it what it leaves out."""
+        rows = []
+        notes = [ARROWS_NOTE]
+        for metric in self.comparison.metrics:
+            row = self._means.get((label, condition, metric.name))
+            if row is None:
+                continue
+            rows.append(
+                (
+                    metric.label,
+                    number(row.baseline, metric.unit),
+                    number(row.value, metric.unit),
+                    percent(row.change, metric),
+                    signed(row.difference) if metric.unit == "dB" else "",
+                    interval(row),
+                    reading(row, metric),
+                )
+            )
+            if row.why and not math.isnan(row.change):
+                notes.append(f"{metric.label}: pairs left out ({row.why})")
+        return Grid(
+            title=_title(f"{label} against baseline: {self._extent(label, condition)}", condition),
+            columns=("Metric", BASELINE, label, "change, %", "dB", "95 % interval, %", "reading"),
+            rows=tuple(rows),
+            align="lrrrrrl",
+            notes=(*notes, *self._interval_note(label, condition)) if rows else (),
+        )
+
+    def _extent(self, label: str, condition: str) -> str:
+        """How many scenes and which seeds a mean is over."""
+        scenes = self.scenes_of(label, condition)
+        seeds = sorted({n for s in scenes for n in self._seeds[label, condition, s]})
+        of = "" if len(scenes) == len(self.comparison.scenes) else (
+            f" of {len(self.comparison.scenes)}"
+        )  # fmt: skip
+        names = f"{len(scenes)}{of} scenes" if len(scenes) != 1 or of else f"scene {scenes[0]}"
+        return f"{names}, {_list('seed', seeds)}"
+
+    def _interval_note(self, label: str, condition: str) -> tuple[str, ...]:
+        units = [
+            row.unit
+            for metric in self.comparison.metrics
+            if (row := self._means.get((label, condition, metric.name))) and not math.isnan(row.low)
+        ]
+        if not units:
+            return ()
+        if "scenes" not in units:
+            return ("interval: Student's t over the seeds",)
+        seeds = {len(self._seeds[label, condition, s]) for s in self.scenes_of(label, condition)}
+        alone = "; one seed: how runs differ is not told from how scenes do" * (seeds == {1})
+        return (f"interval: Student's t over the scenes' means{alone}",)
+
+    def per_scene(self, label: str, condition: str) -> Grid:
+        """One column a scene, failed ones too, and their mean."""
+        scenes = self.comparison.scenes
+        rows: list[tuple[str, ...]] = []
+        for metric in self.comparison.metrics:
+            found = [self._per_scene.get((label, condition, s, metric.name)) for s in scenes]
+            mean = self._means.get((label, condition, metric.name))
+            cells = [self._cell(row, metric) for row in (*found, mean)]
+            rows.append((f"{metric.label}, %", *cells))
+            if metric.unit == "dB":
+                absolute = [
+                    "failed  " if row is None else f"{signed(row.difference)}  "
+                    for row in (*found, mean)
+                ]
+                rows.append((f"{metric.label}, dB", *absolute))
+        return Grid(
+            title=_title(f"{label}: change from baseline, scene by scene", condition),
+            columns=("Metric", *scenes, "mean"),
+            rows=tuple(rows),
+            align="l" + "r" * (len(scenes) + 1),
+            notes=(ARROWS_NOTE,),
+        )
+
+    def values(self, condition: str) -> Grid:
+        """Every label's own values, means over the seeds that are done."""
+        cells = self.comparison.cells
+        done = cells[(cells["state"] == "done") & (cells["condition"] == condition)]
+        labels = list(dict.fromkeys(cells.loc[cells["condition"] == condition, "label"]))
+        names = [metric.name for metric in self.comparison.metrics]
+        means = done.groupby(["scene", "label"])[names].mean().to_dict("index")
+        rows = []
+        for scene in self.comparison.scenes:
+            for metric in self.comparison.metrics:
+                found = [means.get((scene, label)) for label in labels]
+                texts = ["failed" if v is None else number(v[metric.name], metric.unit)
+                         for v in found]  # fmt: skip
+                rows.append((scene, metric.label, *texts))
+        return Grid(
+            title=_title("Values, means over the seeds that are done", condition),
+            columns=("Scene", "Metric", *labels),
+            rows=tuple(rows),
+            align="ll" + "r" * len(labels),
+        )
+
+    def missing(self) -> Grid | None:
+        """The cells that gave no number, and why; None where there are none."""
+        rows = self.comparison.missing()
+        if rows.empty:
+            return None
+        keys = ["scene", "label", "condition", "seed", "state", "reason"]
+        return Grid(
+            title=f"{len(rows)} of {len(self.comparison.cells)} cells gave no number",
+            columns=("Scene", "Label", "Condition", "Seed", "State", "Reason"),
+            rows=tuple(tuple(map(str, row)) for row in rows[keys].itertuples(index=False)),
+            align="lllrll",
+        )
+
+    def long(self) -> pd.DataFrame:
+        """Every change at full precision, one row a number: `table.csv`."""
+        metrics = {metric.name: metric for metric in self.comparison.metrics}
+        scenes = self.comparison.per_scene.reset_index()
+        means = self.comparison.means.reset_index()
+        table = pd.concat([means.assign(level="mean", scene=""), scenes.assign(level="scene")])
+        rows = [Change(*row) for row in table[list(Change._fields)].itertuples(index=False)]
+        of = [metrics[name] for name in table["metric"]]
+        table["printed"] = [percent(r.change, m).rstrip() for r, m in zip(rows, of, strict=True)]
+        table["reading"] = [reading(r, m) for r, m in zip(rows, of, strict=True)]
+        table["metric_unit"] = [m.unit for m in of]
+        table["higher_is_better"] = [m.higher_is_better for m in of]
+        table = table.rename(columns={"n": "n_values", "unit": "n_of", "change": "change_percent"})
+        return table[
+            ["level", "label", "condition", "scene", "metric", "metric_unit", "higher_is_better",
+             "baseline", "value", "change_percent", "difference", "low", "high", "spread",
+             "n_values", "n_of", "printed", "reading", "why"]
+        ]  # fmt: skip
+
+
+def _by_key(table: pd.DataFrame) -> dict[tuple[str, ...], Change]:
+    rows = table[list(Change._fields)].itertuples(index=False)
+    return {key: Change(*row) for key, row in zip(table.index, rows, strict=True)}
+
+
+def _title(text: str, condition: str) -> str:
+    return f"{text} ({condition})" if condition else text
+
+
+def _list(word: str, values: Iterable[int]) -> str:
+    texts = [str(value) for value in values]
+    if len(texts) > 8:
+        return f"{len(texts)} {word}s"
+    return f"{word}{'s' * (len(texts) > 1)} {', '.join(texts)}"
