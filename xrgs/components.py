@@ -148,10 +148,10 @@ class Consistency(Component):
     `lr_mode` chooses: `exact` does it as the paper has it; `off` leaves LR views alone; `fold`
     takes phi for an isometry of L1 and adds `weight * l1 * mean |render - photograph|` at the
     view's own size, which is what a larger weight of the photometric L1 would be, and leaves the
-    SSIM part out. Away from borders the rows of phi sum to 1 and its columns to factor^2, so the
-    two are equal for errors of one sign; for others `fold` is at least 1 / (7/6)^2 = 0.73 of the
-    exact L1 (7/6: the integral of |Keys' kernel|, a = -0.5), and above it where signs alternate
-    from pixel to pixel and phi averages them out (white noise: about 1.3 times at factor 5).
+    SSIM part out. phi's rows sum to 1 and its columns to factor^2 (to 3 % at a corner), so the two
+    are equal where the error keeps its sign. Elsewhere `fold` is more than the exact L1 where signs
+    alternate from pixel to pixel and phi averages them out (1.23 times for white noise, factor 5),
+    and never less than 0.7 of it, since absolute columns sum to at most 1.19 factor an axis.
     """
 
     def __init__(self, conf: ConsistencyConf, views: Sequence[TrainingView], factor: int) -> None:

@@ -35,8 +35,8 @@ def psnr(image: Tensor, target: Tensor) -> float:
 
     Example:
         >>> import torch
-        >>> psnr(torch.zeros(2, 2, 3), torch.full((2, 2, 3), 0.1))
-        20.0
+        >>> round(psnr(torch.zeros(2, 2, 3), torch.full((2, 2, 3), 0.5)), 4)
+        6.0206
     """
     _check(image, target)
     error = float((image.double() - target.double()).square().mean())

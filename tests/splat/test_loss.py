@@ -1,0 +1,168 @@
+"""The loss against kornia, scikit-image and finite differences."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from torch import Tensor
+
+from xrgs.splat.loss import photometric_loss, prepare_target, structural_similarity
+
+
+def noise(height: int, width: int, seed: int, dtype: torch.dtype = torch.float64) -> Tensor:
+    return torch.rand(height, width, 3, generator=torch.Generator().manual_seed(seed), dtype=dtype)
+
+
+def similar_pair(height: int, width: int, seed: int = 0) -> tuple[Tensor, Tensor]:
+    """An image of waves and noise, and it again with other noise: SSIM in the middle."""
+    y, x = torch.meshgrid(torch.arange(height), torch.arange(width), indexing="ij")
+    waves = 0.5 + 0.3 * torch.sin(x / 5.0 + y / 3.0)[..., None].expand(-1, -1, 3).double()
+    return (
+        waves + 0.2 * (noise(height, width, seed) - 0.5),
+        waves + 0.2 * (noise(height, width, seed + 1) - 0.5),
+    )
+
+
+@pytest.mark.parametrize("size", [(11, 11), (11, 30), (40, 13), (52, 67)])
+def test_ssim_is_kornias(size: tuple[int, int]) -> None:
+    from kornia.losses import ssim_loss
+    from kornia.metrics import ssim
+
+    image, target = similar_pair(*size)
+    batch, reference = (x.permute(2, 0, 1)[None] for x in (image, target))
+    # eps: kornia adds it to the denominator.
+    expected = ssim(batch, reference, 11, eps=0.0, padding="valid").mean()
+    value = structural_similarity(image, prepare_target(target))
+    torch.testing.assert_close(value, expected, rtol=1e-12, atol=0)
+    half = ssim_loss(batch, reference, 11, eps=0.0, padding="valid")
+    torch.testing.assert_close(1 - value, 2 * half, rtol=1e-12, atol=0)
+
+
+def test_ssim_is_scikit_images() -> None:
+    from skimage.metrics import structural_similarity as skimage_ssim
+
+    image, target = similar_pair(52, 67)
+    # Its mean leaves out the border that the window doesn't fit in.
+    expected = skimage_ssim(
+        image.numpy(),
+        target.numpy(),
+        gaussian_weights=True,
+        sigma=1.5,
+        use_sample_covariance=False,
+        data_range=1.0,
+        channel_axis=-1,
+    )
+    value = structural_similarity(image, prepare_target(target))
+    assert 0.2 < expected < 0.9
+    assert value.item() == pytest.approx(expected, rel=1e-10)
+
+
+@pytest.mark.parametrize(("l1", "ssim"), [(0.8, 0.2), (1.0, 0.0), (0.0, 1.0), (0.3, 2.0)])
+def test_the_loss_is_its_formula(l1: float, ssim: float) -> None:
+    image, photograph = similar_pair(20, 24)
+    target = prepare_target(photograph)
+    absolute = np.abs(image.numpy() - photograph.numpy()).mean()
+    similarity = structural_similarity(image, target).item()
+    loss = photometric_loss(image, target, l1=l1, ssim=ssim).item()
+    assert loss == pytest.approx(l1 * absolute + ssim * (1 - similarity), rel=1e-12)
+
+
+def test_gradients_are_those_of_finite_differences() -> None:
+    image, photograph = similar_pair(13, 12)
+    target = prepare_target(photograph)
+    image.requires_grad_()
+    assert torch.autograd.gradcheck(
+        lambda x: photometric_loss(x, target, l1=0.8, ssim=0.2), image, rtol=1e-6, atol=1e-9
+    )
+
+
+def test_float32_is_float64_rounded() -> None:
+    image, photograph = similar_pair(52, 67)
+    results = []
+    for dtype in (torch.float32, torch.float64):
+        x = image.to(dtype).requires_grad_()
+        loss = photometric_loss(x, prepare_target(photograph.to(dtype)), l1=0.8, ssim=0.2)
+        loss.backward()
+        assert loss.dtype == dtype
+        assert x.grad is not None
+        results.append((loss.item(), x.grad.double()))
+    (loss32, grad32), (loss64, grad64) = results
+    assert loss32 == pytest.approx(loss64, rel=1e-6)
+    # Where |image - target| is within rounding of 0 its sign, and L1's gradient, may differ.
+    certain = (image - photograph).abs() > 1e-6
+    torch.testing.assert_close(
+        grad32[certain], grad64[certain], rtol=1e-4, atol=1e-4 * grad64.abs().max().item()
+    )
+
+
+@settings(max_examples=25, deadline=None)
+@given(
+    size=st.tuples(st.integers(11, 24), st.integers(11, 24)),
+    seeds=st.tuples(st.integers(0, 10**6), st.integers(0, 10**6)),
+)
+def test_ssim_is_symmetric_and_bounded(size: tuple[int, int], seeds: tuple[int, int]) -> None:
+    a, b = noise(*size, seeds[0]), noise(*size, seeds[1])
+    ab = structural_similarity(a, prepare_target(b)).item()
+    assert ab == pytest.approx(structural_similarity(b, prepare_target(a)).item(), abs=1e-12)
+    assert abs(ab) <= 1 + 1e-12
+    assert structural_similarity(a, prepare_target(a)).item() == pytest.approx(1, abs=1e-12)
+
+
+@settings(max_examples=50, deadline=None)
+@given(
+    levels=st.tuples(*[st.floats(-1e4, 1e4, width=32)] * 2),
+    noisy=st.booleans(),
+)
+def test_flat_images_stay_finite(levels: tuple[float, float], noisy: bool) -> None:
+    # E[x^2] - E[x]^2 of a flat image is often below 0 in float32.
+    image = torch.full((12, 15, 3), levels[0]).requires_grad_()
+    photograph = torch.full((12, 15, 3), levels[1]) + noisy * noise(12, 15, 0, torch.float32)
+    target = prepare_target(photograph)
+    assert (target.variance >= 0).all()
+    loss = photometric_loss(image, target, l1=0.8, ssim=0.2)
+    loss.backward()
+    assert image.grad is not None
+    assert loss.isfinite()
+    assert image.grad.isfinite().all()
+
+
+def test_flat_images_have_the_ssim_of_their_levels() -> None:
+    image, target = torch.full((2, 12, 15, 3), 0.0, dtype=torch.float64)
+    image, target = image + 0.25, target + 0.5
+    expected = (2 * 0.25 * 0.5 + 1e-4) / (0.25**2 + 0.5**2 + 1e-4)
+    value = structural_similarity(image, prepare_target(target)).item()
+    assert value == pytest.approx(expected, rel=1e-9)
+
+
+def test_a_strided_image_counts_the_same() -> None:
+    image, photograph = similar_pair(20, 24)
+    target = prepare_target(photograph)
+    planar = image.permute(2, 0, 1).contiguous().permute(1, 2, 0)
+    assert not planar.is_contiguous()
+    loss = photometric_loss(image, target, l1=0.8, ssim=0.2)
+    torch.testing.assert_close(
+        photometric_loss(planar, target, l1=0.8, ssim=0.2), loss, rtol=1e-12, atol=0
+    )
+
+
+def test_a_target_keeps_no_graph() -> None:
+    target = prepare_target(noise(12, 12, 0).requires_grad_())
+    assert not any(x.requires_grad for x in (target.image, target.mean, target.variance))
+
+
+@pytest.mark.parametrize("size", [(10, 30), (30, 10), (1, 1)])
+def test_an_image_smaller_than_the_window_is_refused(size: tuple[int, int]) -> None:
+    with pytest.raises(ValueError, match=f"{size[1]} x {size[0]} px.*11 px"):
+        prepare_target(torch.zeros(*size, 3))
+
+
+def test_wrong_shapes_are_refused() -> None:
+    with pytest.raises(ValueError, match=r"image must be \[H, W, 3\], got \[20, 20\]"):
+        prepare_target(torch.zeros(20, 20))
+    with pytest.raises(ValueError, match=r"image is \[20, 21, 3\], its target \[20, 20, 3\]"):
+        photometric_loss(
+            torch.zeros(20, 21, 3), prepare_target(torch.zeros(20, 20, 3)), l1=1, ssim=0
+        )

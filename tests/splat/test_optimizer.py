@@ -1,0 +1,214 @@
+"""The optimizer against torch's own, one Adam a parameter as gsplat has it."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from torch import Tensor
+
+from xrgs.splat.gaussians import PARAMETERS, Gaussians
+from xrgs.splat.optimizer import SplatOptimizer
+from xrgs.splat.settings import OptimizerSettings
+
+# gsplat 1.5.3, examples/simple_trainer.py; means before the scene's scale.
+GSPLAT_RATES = {
+    "means": 1.6e-4,
+    "scales": 5e-3,
+    "quats": 1e-3,
+    "opacities": 5e-2,
+    "sh0": 2.5e-3,
+    "shN": 2.5e-3 / 20,
+}
+SHAPES = {"means": 3, "quats": 4, "scales": 3, "opacities": (), "sh0": (1, 3), "shN": (15, 3)}
+
+
+def random_values(count: int, seed: int, dtype: torch.dtype = torch.float64) -> dict[str, Tensor]:
+    generator = torch.Generator().manual_seed(seed)
+    return {
+        name: torch.randn(
+            (count, *((shape,) if isinstance(shape, int) else shape)),
+            generator=generator,
+            dtype=dtype,
+        )
+        for name, shape in SHAPES.items()
+    }
+
+
+def gaussians_of(values: dict[str, Tensor]) -> Gaussians:
+    return Gaussians(**{name: value.clone().requires_grad_() for name, value in values.items()})
+
+
+def optimizer_of(
+    count: int = 5, *, steps: int = 100, dtype: torch.dtype = torch.float64
+) -> SplatOptimizer:
+    gaussians = gaussians_of(random_values(count, 0, dtype))
+    return SplatOptimizer(gaussians, OptimizerSettings(), scene_scale=2.0, steps=steps)
+
+
+def take_step(optimizer: SplatOptimizer, seed: int) -> dict[str, Tensor]:
+    gradients = random_values(len(optimizer.gaussians), seed, optimizer.gaussians.means.dtype)
+    optimizer.zero_grad()
+    for name in PARAMETERS:
+        optimizer.gaussians[name].grad = gradients[name].clone()
+    optimizer.step()
+    return gradients
+
+
+def moments(optimizer: SplatOptimizer, name: str) -> tuple[Tensor, Tensor]:
+    state = optimizer.adam.state[optimizer.gaussians[name]]
+    return state["exp_avg"], state["exp_avg_sq"]
+
+
+@pytest.mark.parametrize(
+    ("dtype", "fused", "tolerance"),
+    [(torch.float64, False, 1e-13), (torch.float32, True, 1e-7), (torch.float32, False, 1e-6)],
+)
+def test_it_is_one_adam_a_parameter(dtype: torch.dtype, fused: bool, tolerance: float) -> None:
+    steps = 40
+    optimizer = optimizer_of(steps=steps, dtype=dtype)
+    expected = gaussians_of(random_values(5, 0, dtype))
+    theirs = {
+        name: torch.optim.Adam(
+            [expected[name]],
+            lr=rate * (2.0 if name == "means" else 1.0),
+            betas=(0.9, 0.999),
+            eps=1e-15,
+            foreach=False,
+            fused=fused,
+        )
+        for name, rate in GSPLAT_RATES.items()
+    }
+    decay = torch.optim.lr_scheduler.ExponentialLR(theirs["means"], gamma=0.01 ** (1.0 / steps))
+    for seed in range(steps):
+        gradients = take_step(optimizer, seed)
+        for name, adam in theirs.items():
+            expected[name].grad = gradients[name]
+            adam.step()
+        decay.step()
+    for name in PARAMETERS:
+        start = random_values(5, 0, dtype)[name]
+        ours, reference = optimizer.gaussians[name].detach(), expected[name].detach()
+        assert (ours != start).all()
+        torch.testing.assert_close(ours, reference, rtol=tolerance, atol=tolerance)
+
+
+def test_the_rate_of_means_decays_to_a_hundredth() -> None:
+    optimizer = optimizer_of(steps=8)
+    rates = []
+    for seed in range(8):
+        rates.append(optimizer.adam.param_groups[0]["lr"])
+        take_step(optimizer, seed)
+    rates.append(optimizer.adam.param_groups[0]["lr"])
+    assert rates == pytest.approx([1.6e-4 * 2.0 * 0.01 ** (step / 8) for step in range(9)])
+    assert rates[-1] == pytest.approx(1.6e-4 * 2.0 * 0.01)
+    others = {group["name"]: group["lr"] for group in optimizer.adam.param_groups[1:]}
+    assert others == pytest.approx({k: v for k, v in GSPLAT_RATES.items() if k != "means"})
+
+
+def test_appended_gaussians_start_without_momentum() -> None:
+    optimizer = optimizer_of(5)
+    take_step(optimizer, 1)
+    old = {name: optimizer.gaussians[name].detach().clone() for name in PARAMETERS}
+    before = {name: [m.clone() for m in moments(optimizer, name)] for name in PARAMETERS}
+    new = random_values(3, 2)
+    optimizer.append(new)
+    assert len(optimizer.gaussians) == 8
+    for name in PARAMETERS:
+        leaf = optimizer.gaussians[name]
+        assert leaf.is_leaf
+        assert leaf.requires_grad
+        assert torch.equal(leaf, torch.cat([old[name], new[name]]))
+        for moment, start in zip(moments(optimizer, name), before[name], strict=True):
+            assert torch.equal(moment[:5], start)
+            assert (start != 0).all()
+            assert (moment[5:] == 0).all()
+            assert moment.shape == leaf.shape
+
+
+@pytest.mark.parametrize("index", [torch.tensor([4, 0, 2]), torch.arange(5) % 2 == 0])
+def test_kept_gaussians_keep_their_momentum(index: Tensor) -> None:
+    optimizer = optimizer_of(5)
+    take_step(optimizer, 1)
+    old = {name: optimizer.gaussians[name].detach().clone() for name in PARAMETERS}
+    before = {name: [m.clone() for m in moments(optimizer, name)] for name in PARAMETERS}
+    optimizer.keep(index)
+    for name in PARAMETERS:
+        assert torch.equal(optimizer.gaussians[name], old[name][index])
+        for moment, start in zip(moments(optimizer, name), before[name], strict=True):
+            assert torch.equal(moment, start[index])
+
+
+def test_a_reset_touches_one_parameter() -> None:
+    optimizer = optimizer_of(5)
+    take_step(optimizer, 1)
+    optimizer.reset("opacities", torch.full((5,), -2.0, dtype=torch.float64))
+    assert (optimizer.gaussians.opacities == -2).all()
+    assert all((moment == 0).all() for moment in moments(optimizer, "opacities"))
+    assert all((moment != 0).all() for moment in moments(optimizer, "scales"))
+
+
+def test_training_goes_on_after_a_change() -> None:
+    optimizer = optimizer_of(5)
+    take_step(optimizer, 1)
+    optimizer.append(random_values(2, 3))
+    optimizer.keep(torch.tensor([6, 1]))
+    first = optimizer.gaussians.scales.detach().clone()
+    gradients = take_step(optimizer, 4)
+    # A new Gaussian's first update, by hand, at the old ones' second step.
+    g = gradients["scales"][0]
+    mean, square = 0.1 * g / (1 - 0.9**2), 0.001 * g**2 / (1 - 0.999**2)
+    expected = first[0] - 5e-3 * mean / (square.sqrt() + 1e-15)
+    torch.testing.assert_close(optimizer.gaussians.scales.detach()[0], expected)
+
+
+def test_changes_before_the_first_step() -> None:
+    optimizer = optimizer_of(5)
+    optimizer.keep(torch.tensor([1, 2]))
+    optimizer.append(random_values(1, 1))
+    optimizer.reset("opacities", torch.zeros(3, dtype=torch.float64))
+    assert optimizer.state_bytes() == 0
+    take_step(optimizer, 2)
+    assert moments(optimizer, "means")[0].shape == (3, 3)
+
+
+def test_no_gaussians_left() -> None:
+    optimizer = optimizer_of(5)
+    take_step(optimizer, 1)
+    optimizer.keep(torch.zeros(5, dtype=torch.bool))
+    take_step(optimizer, 2)
+    assert len(optimizer.gaussians) == 0
+    optimizer.append(random_values(2, 3))
+    take_step(optimizer, 4)
+    assert optimizer.gaussians.means.isfinite().all()
+
+
+def test_state_is_counted_in_bytes() -> None:
+    optimizer = optimizer_of(5, dtype=torch.float32)
+    take_step(optimizer, 1)
+    steps = 6 * 4
+    assert optimizer.state_bytes() == 2 * 5 * (3 + 4 + 3 + 1 + 3 + 45) * 4 + steps
+    optimizer.keep(torch.arange(3))
+    assert optimizer.state_bytes() == 2 * 3 * (3 + 4 + 3 + 1 + 3 + 45) * 4 + steps
+
+
+def test_zero_grad_forgets() -> None:
+    optimizer = optimizer_of(5)
+    take_step(optimizer, 1)
+    optimizer.zero_grad()
+    assert all(optimizer.gaussians[name].grad is None for name in PARAMETERS)
+
+
+@pytest.mark.parametrize("scene_scale", [0.0, -1.0, float("nan"), float("inf")])
+def test_a_scale_without_meaning_is_refused(scene_scale: float) -> None:
+    with pytest.raises(ValueError, match="scene_scale"):
+        SplatOptimizer(
+            gaussians_of(random_values(2, 0)),
+            OptimizerSettings(),
+            scene_scale=scene_scale,
+            steps=10,
+        )
+
+
+def test_no_steps_are_refused() -> None:
+    with pytest.raises(ValueError, match="steps"):
+        optimizer_of(steps=0)
