@@ -1,50 +1,218 @@
 """A mixed-resolution variant of a scene: built once, frozen, hashed, shared by every cell.
 
-On disk, in a folder of its own: `variant.json` (what `Variant` holds), `images/*.png`, and
-`report.json` (how SfM went). Nothing here imports torch, so that a plan can read it.
+On disk, in a folder named by its id: `variant.json` (what `Variant` holds, and the hash of every
+other file), `images/<split>/<view>.png`, `points.npz`, `report.json` (how SfM went) and
+`colmap.log`. Nothing here imports torch before a variant is built, so that a plan can read it.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import fcntl
+import hashlib
+import json
+import logging
+import shutil
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import asdict
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
+from zipfile import BadZipFile
 
 import numpy as np
-from numpy.typing import NDArray
+
+from xrgs import scenes
+from xrgs.errors import XrgsError
+from xrgs.views import SceneFailed, Variant, View
+
+if TYPE_CHECKING:
+    from xrgs.config import SceneConf, VariantConf
+
+__all__ = [
+    "CorruptVariant",
+    "SceneFailed",
+    "Variant",
+    "View",
+    "build",
+    "ensure",
+    "find",
+    "key",
+    "load",
+]
+
+_log = logging.getLogger(__name__)
+
+#: Their code decides what a variant is: a change of it makes a new one.
+_CODE = ("alignment.py", "images.py", "mixing.py", "sfm.py", "split.py", "variant.py")
 
 
-@dataclass(frozen=True)
-class View:
-    """One undistorted photograph and its pinhole camera."""
-
-    name: str
-    """The photograph's file name without its ending."""
-    file: Path
-    """PNG, 8-bit RGB, exactly `width` x `height`."""
-    split: str
-    """`train` or `test`."""
-    tag: str
-    """`HR` or `LR`."""
-    width: int
-    height: int
-    K: NDArray[np.float64]  # [3, 3] px; pixel centres at +0.5
-    viewmat: NDArray[np.float64]  # [4, 4] world to camera, OpenCV axes
+class CorruptVariant(XrgsError):  # noqa: N818
+    """A frozen variant that is not what was written; the message names the file."""
 
 
-@dataclass(frozen=True)
-class Variant:
-    """What a cell trains and is tested on."""
+def key(scene: SceneConf, conf: VariantConf) -> str:
+    """What a variant is made from, 16 hex digits: photographs, variant config, code. No SfM is run.
 
-    id: str
-    """Hash of the source images, the variant's config and SfM's output."""
-    path: Path
-    scene: str
-    factor: int
-    held_out: bool
-    """False where there are too few views to hold any out: the tests are the trained poses, HR."""
-    views: tuple[View, ...]  # train and test, sorted by (split, name)
-    points: NDArray[np.float64]  # [P, 3] SfM points, world units of SfM
-    colors: NDArray[np.uint8]  # [P, 3]
-    report: dict[str, Any]
-    """How SfM went: views registered, points, reprojection error, the recipe that worked."""
+    Raises:
+        XrgsError: the photographs are not there.
+    """
+    return _key(scenes.fingerprint(scene, conf.long_side), conf)
+
+
+def find(variants: Path, wanted: str) -> Variant | None:
+    """The frozen variant of a key, verified; a corrupt one is reported and passed over."""
+    for folder in sorted(variants.glob(f"{wanted}-*")):
+        try:
+            return load(folder)
+        except CorruptVariant as error:
+            _log.warning("%s; the variant will be built anew", error)
+    return None
+
+
+def load(folder: Path) -> Variant:
+    """A frozen variant, after checking every hash.
+
+    Raises:
+        CorruptVariant: a file is missing, or is not the one that was frozen.
+    """
+    try:
+        content = json.loads((folder / "variant.json").read_text(encoding="utf-8"))
+        if content["id"] != _id(content):
+            raise CorruptVariant(f"{folder / 'variant.json'}: not what was written")
+        for name, digest in content["files"].items():
+            if _sha256(folder / name) != digest:
+                raise CorruptVariant(f"{folder / name}: not what was written")
+        with np.load(folder / "points.npz") as stored:
+            points, colors = stored["points"], stored["colors"]
+        report = json.loads((folder / "report.json").read_text(encoding="utf-8"))
+        views = tuple(_view(folder, entry) for entry in content["views"])
+        return Variant(
+            content["id"],
+            folder,
+            content["scene"],
+            content["factor"],
+            content["held_out"],
+            views,
+            points,
+            colors,
+            report,
+        )
+    except (OSError, ValueError, KeyError, TypeError, AttributeError, BadZipFile) as error:
+        raise CorruptVariant(f"{folder}: not a whole variant ({error!r})") from error
+
+
+def ensure(scene: SceneConf, conf: VariantConf, store: Path) -> Variant:
+    """The variant of a scene: the frozen one, or built now. Any number of processes may ask.
+
+    Args:
+        scene: Where the photographs are from.
+        conf: What is made of them.
+        store: Has the folders `scenes` and `variants`.
+
+    Raises:
+        SceneFailed: SfM can't place enough views.
+        XrgsError: something of the config or the photographs is wrong; the message names it.
+    """
+    wanted, variants = key(scene, conf), store / "variants"
+    variants.mkdir(parents=True, exist_ok=True)
+    with _locked(variants / f".{wanted}.lock"):
+        found = find(variants, wanted)
+        if found is not None:
+            return found
+        for stale in (*variants.glob(f"{wanted}-*"), *variants.glob(f".{wanted}.building*")):
+            shutil.rmtree(stale)
+        return build(scenes.resolve(scene, store / "scenes", conf.long_side), conf, variants)
+
+
+def build(scene: scenes.Scene, conf: VariantConf, variants: Path) -> Variant:
+    """Make and freeze a variant in a new folder of `variants`. One process at a time: see `ensure`.
+
+    Raises:
+        SceneFailed: SfM can't place enough views; its report stays in `variants/failed-<key>`.
+        XrgsError: something of the config or the photographs is wrong; the message names it.
+    """
+    from xrgs import mixing  # noqa: PLC0415  brings pycolmap
+
+    wanted = _key(scene.fingerprint, conf)
+    work, failed = variants / f".{wanted}.building", variants / f"failed-{wanted}"
+    shutil.rmtree(work, ignore_errors=True)
+    shutil.rmtree(failed, ignore_errors=True)
+    frozen = work / "frozen"
+    frozen.mkdir(parents=True)
+    try:
+        made = mixing.mix(scene, conf, work, frozen)
+    except SceneFailed as error:
+        _write_json(frozen / "report.json", error.report)
+        frozen.rename(failed)
+        raise SceneFailed(f"{error} Report: {failed}", error.report) from None
+    else:
+        return _freeze(made, wanted, frozen, variants)
+    finally:
+        shutil.rmtree(work, ignore_errors=True)
+
+
+def _freeze(made: Variant, wanted: str, folder: Path, variants: Path) -> Variant:
+    """Write what `made` holds beside its images, and rename the folder to its id."""
+    np.savez(folder / "points.npz", points=made.points, colors=made.colors)
+    _write_json(folder / "report.json", made.report)
+    files = [folder / "points.npz", *sorted({view.file for view in made.views})]
+    content: dict[str, Any] = {
+        "key": wanted,
+        "scene": made.scene,
+        "factor": made.factor,
+        "held_out": made.held_out,
+        "views": [_entry(folder, view) for view in made.views],
+        "files": {f.relative_to(folder).as_posix(): _sha256(f) for f in files},
+    }
+    content["id"] = _id(content)
+    _write_json(folder / "variant.json", content)
+    home = variants / content["id"]
+    folder.rename(home)
+    return load(home)
+
+
+def _key(fingerprint: str, conf: VariantConf) -> str:
+    here = Path(__file__).parent
+    code = [hashlib.sha256((here / name).read_bytes()).hexdigest() for name in _CODE]
+    made_from = json.dumps([fingerprint, asdict(conf), code], sort_keys=True)
+    return hashlib.sha256(made_from.encode()).hexdigest()[:16]
+
+
+def _id(content: dict[str, Any]) -> str:
+    """Hash of everything in `variant.json` but the id and the label, after the key."""
+    hashed = {k: v for k, v in content.items() if k not in ("id", "scene")}
+    digest = hashlib.sha256(json.dumps(hashed, sort_keys=True).encode()).hexdigest()
+    return f"{content['key']}-{digest[:16]}"
+
+
+def _entry(folder: Path, view: View) -> dict[str, Any]:
+    file = view.file.relative_to(folder).as_posix()
+    arrays = {"K": view.K.tolist(), "viewmat": view.viewmat.tolist()}
+    return asdict(view) | {"file": file} | arrays
+
+
+def _view(folder: Path, entry: dict[str, Any]) -> View:
+    arrays = {name: np.array(entry[name], dtype=np.float64) for name in ("K", "viewmat")}
+    return View(**(entry | {"file": folder / entry["file"]} | arrays))
+
+
+def _sha256(file: Path) -> str:
+    with file.open("rb") as stream:
+        return hashlib.file_digest(stream, "sha256").hexdigest()
+
+
+def _write_json(file: Path, content: dict[str, Any]) -> None:
+    text = json.dumps(content, indent=1, ensure_ascii=False)
+    file.write_text(text + "\n", encoding="utf-8")
+
+
+@contextmanager
+def _locked(file: Path) -> Iterator[None]:
+    """Hold an exclusive lock; the system lets go of it if this process dies."""
+    with file.open("w") as handle:
+        try:
+            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            _log.warning("another process is building this variant: waiting for it")
+            fcntl.flock(handle, fcntl.LOCK_EX)
+        yield

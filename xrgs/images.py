@@ -1,0 +1,154 @@
+"""Photographs: read, resize, save, and straighten. float32 [H, W, 3] in 0..1 in memory.
+
+Nothing here imports torch or scikit-image before it is called.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image, ImageOps
+
+from xrgs.errors import XrgsError
+
+Photo = NDArray[np.float32]  # [H, W, 3]
+
+_EXIF_ORIENTATION = 0x0112
+
+
+class ImageError(XrgsError):
+    """A file that can't be read as a photograph; the message begins with its path."""
+
+
+@dataclass(frozen=True)
+class Lens:
+    """A camera of one radial term, COLMAP's SIMPLE_RADIAL with its own focal length per axis.
+
+    A point at (x, y) on the plane z = 1 falls on pixel (fx x (1 + k r²) + cx, fy y (1 + k r²) + cy)
+    with r² = x² + y². Pixel centres are at +0.5.
+    """
+
+    width: int
+    height: int
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+    k: float = 0.0
+
+    def at(self, width: int, height: int) -> Lens:
+        """The same camera behind an image resized to `width` x `height`."""
+        sx, sy = width / self.width, height / self.height
+        return Lens(width, height, self.fx * sx, self.fy * sy, self.cx * sx, self.cy * sy, self.k)
+
+    @property
+    def K(self) -> NDArray[np.float64]:  # noqa: N802
+        """[3, 3] px, the distortion left out."""
+        return np.array([[self.fx, 0, self.cx], [0, self.fy, self.cy], [0, 0, 1]])
+
+    def straightened(self) -> Lens:
+        """The pinhole camera of the same size, zoomed so that no pixel lacks a source.
+
+        The zoom is the smallest that keeps the whole border inside the photograph; it depends on
+        the border alone, so that an image and its resized copy get the same one.
+        """
+        if self.k == 0:
+            return self
+        t = np.linspace(0.0, 1.0, 257)
+        edge = np.concatenate(
+            [np.stack([t, 0 * t + s], -1) for s in (0.0, 1.0)]
+            + [np.stack([0 * t + s, t], -1) for s in (0.0, 1.0)]
+        )  # [B, 2] in fractions of the image
+        border = edge * (self.width, self.height)
+        low, high = 0.5, 2.0
+        for _ in range(50):
+            zoom = (low + high) / 2
+            source = self._distorted(border, zoom)
+            inside = np.all((source >= -1e-9) & (source <= (self.width, self.height)))
+            low, high = (low, zoom) if inside else (zoom, high)
+        return Lens(self.width, self.height, self.fx * high, self.fy * high, self.cx, self.cy)
+
+    def _distorted(self, pixels: NDArray[np.float64], zoom: float) -> NDArray[np.float64]:
+        """Where pixels [..., 2] of the pinhole camera of `zoom` are in the photograph."""
+        centre = np.array([self.cx, self.cy])
+        focal = np.array([self.fx, self.fy])
+        x = (pixels - centre) / (focal * zoom)
+        r2 = np.sum(x**2, axis=-1, keepdims=True)
+        source: NDArray[np.float64] = focal * x * (1 + self.k * r2) + centre
+        return source
+
+
+def size(path: Path) -> tuple[int, int]:
+    """Width and height as `read` would give them, from the header alone.
+
+    Raises:
+        ImageError: the header can't be read.
+    """
+    try:
+        with Image.open(path) as image:
+            turned = image.getexif().get(_EXIF_ORIENTATION, 1) >= 5
+            return (image.height, image.width) if turned else (image.width, image.height)
+    except (OSError, SyntaxError, ValueError, Image.DecompressionBombError) as error:
+        raise ImageError(f"{path}: not a readable image ({error})") from error
+
+
+def read(path: Path) -> Photo:
+    """A photograph, upright (EXIF orientation applied), as RGB.
+
+    Raises:
+        ImageError: unreadable, truncated, or of more than 8 bits a channel.
+    """
+    try:
+        with Image.open(path) as image:
+            image.load()
+            if image.mode[0] in "IF":
+                raise ImageError(f"{path}: {image.mode} pixels; only 8 bits a channel are read")
+            upright = ImageOps.exif_transpose(image).convert("RGB")
+    except (OSError, SyntaxError, ValueError, Image.DecompressionBombError) as error:
+        raise ImageError(f"{path}: unreadable or truncated image ({error})") from error
+    photo: Photo = np.asarray(upright, dtype=np.float32) / np.float32(255)
+    return photo
+
+
+def save(path: Path, image: Photo) -> None:
+    """Write an 8-bit RGB PNG, rounded to nearest and clamped to 0..1; the folder is made."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    pixels = np.round(np.clip(image, 0, 1) * 255).astype(np.uint8)
+    Image.fromarray(pixels).save(path, compress_level=4)
+
+
+def resize(image: Photo, width: int, height: int) -> Photo:
+    """Antialiased bicubic to an exact size, not clamped (torch's kernel, PIL's to 5e-5)."""
+    import torch  # noqa: PLC0415
+    from torch.nn.functional import interpolate  # noqa: PLC0415
+
+    if image.shape[:2] == (height, width):
+        return image
+    batch = torch.from_numpy(image).movedim(-1, 0)[None]  # [1, 3, H, W]
+    small = interpolate(
+        batch, size=(height, width), mode="bicubic", antialias=True, align_corners=False
+    )
+    return np.ascontiguousarray(small[0].movedim(0, -1).numpy())
+
+
+def straighten(image: Photo, lens: Lens) -> Photo:
+    """The photograph that `lens.straightened()` would have taken; cubic spline interpolation.
+
+    Raises:
+        ValueError: the image is not of the lens's size.
+    """
+    if image.shape[:2] != (lens.height, lens.width):
+        raise ValueError(f"image {image.shape[:2]}, lens {(lens.height, lens.width)}")
+    if lens.k == 0:
+        return image
+    from skimage.transform import warp  # noqa: PLC0415
+
+    columns, rows = np.meshgrid(np.arange(lens.width) + 0.5, np.arange(lens.height) + 0.5)
+    zoom = lens.straightened().fx / lens.fx
+    source = lens._distorted(np.stack([columns, rows], -1), zoom) - 0.5  # [H, W, 2]
+    coords = source[..., ::-1].transpose(2, 0, 1)  # [2, H, W] row, column
+    bands = [warp(image[..., c], coords, order=3, mode="edge") for c in range(3)]
+    return np.stack(bands, axis=-1).astype(np.float32)
