@@ -15,8 +15,8 @@ from torch import Tensor
 
 from xrgs.splat.gaussians import PARAMETERS
 from xrgs.splat.optimizer import SplatOptimizer
+from xrgs.splat.projection import rotations
 from xrgs.splat.settings import DensifySettings
-from xrgs.splat.torch_rasterizer import rotations
 
 SPLIT_SHRINK = 1.6
 """How many times smaller than the Gaussian it replaces each of a split's two is."""
