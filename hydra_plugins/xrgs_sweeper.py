@@ -1,23 +1,21 @@
 """Hydra loads plugins from this namespace package only: the sweeper and where `sweeps/` lies.
 
-Hydra imports every plugin at start, so this file stays light: the work is in `xrgs.sweep`.
+Hydra imports every plugin at start, so this file stays light: the work is in `xrgs.sweep`. It
+executes the file before it is in `sys.modules`, where a dataclass can't resolve annotations that
+are strings: hence no `from __future__ import annotations`.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
+from hydra.core.config_search_path import ConfigSearchPath
 from hydra.core.config_store import ConfigStore
 from hydra.plugins.search_path_plugin import SearchPathPlugin
 from hydra.plugins.sweeper import Sweeper
+from hydra.types import HydraContext, TaskFunction
+from omegaconf import DictConfig
 
 from xrgs.config import CONF_DIR
-
-if TYPE_CHECKING:
-    from hydra.core.config_search_path import ConfigSearchPath
-    from hydra.types import HydraContext, TaskFunction
-    from omegaconf import DictConfig
 
 
 @dataclass

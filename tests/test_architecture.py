@@ -26,8 +26,9 @@ ONLY_IN = {
 }
 #: Rooms in the order that data walks through them: an import never points to a later one.
 FLOW = (
-    ("errors", "splat", "images"),
+    ("errors", "hashing", "splat", "images", "alignment", "split", "views"),
     ("config", "scenes", "sfm"),
+    ("mixing",),
     ("variant",),
     ("dataset", "metrics", "components"),
     ("train", "evaluate"),

@@ -157,17 +157,18 @@ def register() -> None:
 
 
 def to_conf(cfg: DictConfig) -> Conf:
-    """A composed Hydra config as plain dataclasses, every value present and of its type."""
-    conf = OmegaConf.to_object(OmegaConf.masked_copy(cfg, list(Conf.__dataclass_fields__)))
-    if not isinstance(conf, Conf):
-        raise TypeError(f"expected a config of schema Conf, got {type(conf).__name__}")
-    return conf
+    """A composed Hydra config as plain dataclasses, every value present and of its type.
+
+    Raises:
+        OmegaConfBaseException: a value is missing or of another type; the message names its key.
+    """
+    known = OmegaConf.masked_copy(cfg, list(Conf.__dataclass_fields__))
+    return from_dict(OmegaConf.to_container(known, resolve=True, throw_on_missing=True))
 
 
-def from_dict(values: dict[str, Any]) -> Conf:
+def from_dict(values: Any) -> Conf:  # noqa: ANN401
     """The config that `dataclasses.asdict` wrote."""
-    merged = OmegaConf.merge(OmegaConf.structured(Conf), values)
-    conf = OmegaConf.to_object(merged)
+    conf = OmegaConf.to_object(OmegaConf.merge(OmegaConf.structured(Conf), values))
     if not isinstance(conf, Conf):
         raise TypeError(f"expected a config of schema Conf, got {type(conf).__name__}")
     return conf

@@ -9,15 +9,16 @@ from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
 import torch
-from PIL import Image
 from tqdm import tqdm
 
+from xrgs import images
 from xrgs.splat.cameras import Camera
 from xrgs.splat.normalize import normalize
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
-    from pathlib import Path
+
+    from numpy.typing import NDArray
 
     from xrgs.variant import Variant, View
 
@@ -52,7 +53,7 @@ def load(variant: Variant) -> Dataset:
     """Read a variant's images and normalise its world.
 
     Raises:
-        OSError: an image is missing or unreadable; the message names it.
+        ImageError: an image is missing or unreadable; the message names it.
     """
     viewmats = np.stack([view.viewmat for view in variant.views])
     world = normalize(viewmats, variant.points)
@@ -71,26 +72,19 @@ def load(variant: Variant) -> Dataset:
     )
 
 
-def _load_view(view: View, viewmat: np.ndarray) -> LoadedView:
-    with Image.open(view.file) as photograph:
-        pixels = np.array(photograph.convert("RGB"))
+def _load_view(view: View, viewmat: NDArray[np.float64]) -> LoadedView:
     camera = Camera(
         viewmat=torch.from_numpy(viewmat).float(),
         K=torch.from_numpy(view.K).float(),
         width=view.width,
         height=view.height,
     )
-    return LoadedView(view.name, view.tag, camera, torch.from_numpy(pixels).float() / 255.0)
+    return LoadedView(view.name, view.tag, camera, torch.from_numpy(images.read(view.file)))
 
 
-def save_image(path: Path, image: torch.Tensor) -> None:
-    """Write an image [H, W, 3] in 0..1 as an 8-bit PNG."""
-    Image.fromarray((image * 255.0).round().to(torch.uint8).numpy()).save(path)
-
-
-def progress(items: Iterable[_T], what: str, unit: str) -> tqdm[_T]:
-    """A progress bar on stderr, with the time left; silent where nobody watches."""
-    return tqdm(items, desc=what, unit=unit, mininterval=0.5, delay=2.0, file=sys.stderr)
+def progress(items: Iterable[_T], what: str, unit: str, total: int | None = None) -> tqdm[_T]:
+    """A progress bar on stderr with the time left, for what takes longer than two seconds."""
+    return tqdm(items, what, total, unit=unit, mininterval=0.5, delay=2.0, file=sys.stderr)
 
 
 def use_threads(wanted: int) -> int:

@@ -30,8 +30,8 @@ def score(
     """
     import torch
 
-    from xrgs import metrics
-    from xrgs.dataset import progress, save_image
+    from xrgs import images, metrics
+    from xrgs.dataset import progress
     from xrgs.splat.backend import resolve_backend
     from xrgs.splat.rasterize import rasterize
 
@@ -50,5 +50,5 @@ def score(
             image = render.image.clamp(0.0, 1.0)
             scores = {name: fn(image, view.image) for name, fn in metrics.VIEW_METRICS.items()}
             rows.append({"view": view.name} | scores)
-            save_image(renders / f"{view.name}.png", image)
+            images.save(renders / f"{view.name}.png", image.numpy())
     return rows

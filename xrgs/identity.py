@@ -6,8 +6,6 @@ another name, in another folder or on another machine.
 
 from __future__ import annotations
 
-import hashlib
-import json
 from dataclasses import asdict
 from functools import cache
 from importlib.util import find_spec
@@ -15,6 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from xrgs.evaluate import PROTOCOL
+from xrgs.hashing import file_digest
 from xrgs.splat.backend import resolve_backend
 
 if TYPE_CHECKING:
@@ -25,22 +24,6 @@ if TYPE_CHECKING:
 _PACKAGE = Path(__file__).parent
 #: Files of the package whose change can change a trained number (folders: every .py inside).
 TRAINING_CODE = ("splat", "components.py", "dataset.py", "evaluate.py", "metrics.py", "train.py")
-
-
-def canonical(value: object) -> str:
-    """`value` as JSON with sorted keys and no spaces: equal values give equal text."""
-    return json.dumps(value, sort_keys=True, separators=(",", ":"), ensure_ascii=False)
-
-
-def digest(value: object) -> str:
-    """The first 16 hexadecimal digits of the SHA-256 of `canonical(value)`."""
-    return hashlib.sha256(canonical(value).encode()).hexdigest()[:16]
-
-
-def file_digest(path: Path) -> str:
-    """SHA-256 of a file's bytes, in hexadecimal."""
-    with path.open("rb") as stream:
-        return hashlib.file_digest(stream, "sha256").hexdigest()
 
 
 def code_digests(names: Iterable[str] = TRAINING_CODE) -> dict[str, str]:

@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from xrgs.errors import XrgsError
-from xrgs.identity import digest, file_digest
+from xrgs.hashing import digest, file_digest
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping, Sequence

@@ -19,7 +19,8 @@ from omegaconf.errors import OmegaConfBaseException
 from xrgs import variant, worker
 from xrgs.config import to_conf
 from xrgs.errors import XrgsError
-from xrgs.identity import cell_identity, digest
+from xrgs.hashing import digest
+from xrgs.identity import cell_identity
 from xrgs.store import State, Store
 
 if TYPE_CHECKING:

@@ -1,0 +1,156 @@
+"""The training loop: gsplat's default training, with the hooks of the XR-GS components."""
+
+from __future__ import annotations
+
+import dataclasses
+import time
+from collections import Counter
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import torch
+
+from xrgs import components
+from xrgs.dataset import progress
+from xrgs.hashing import digest
+from xrgs.splat import gaussians as splats
+from xrgs.splat.backend import resolve_backend
+from xrgs.splat.densify import Densifier, Refinement
+from xrgs.splat.loss import photometric_loss, prepare_target
+from xrgs.splat.optimizer import SplatOptimizer
+from xrgs.splat.rasterize import rasterize
+from xrgs.splat.settings import NOMINAL_STEPS
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    from xrgs.config import Conf
+    from xrgs.dataset import Dataset, LoadedView
+    from xrgs.splat.gaussians import Gaussians
+    from xrgs.splat.rasterize import Render
+
+_LOGGED_ROWS = 200
+
+
+@dataclass(frozen=True)
+class Trained:
+    """What training gave, and what it took."""
+
+    gaussians: Gaussians
+    history: list[dict[str, Any]]
+    """One row a logged step: the step done, its view and loss, Gaussians, and what each rule of
+    densification has done since the start."""
+    seconds: float
+    """Of training alone: no loading, no evaluation."""
+    memory_bytes: int
+    """Model, gradients, optimizer and renderer buffers at the step where they were largest."""
+    evaluations: int
+    """Alpha evaluations of all forward passes: the work done, whatever the machine."""
+
+
+def train(data: Dataset, conf: Conf) -> Trained:
+    """Train one cell. The same dataset, config and seed give the same Gaussians, bit for bit.
+
+    Raises:
+        XrgsError: a component's value is out of range, or a view is too small for it.
+    """
+    steps, splat = conf.train.steps, conf.splat
+    backend = resolve_backend(splat.backend)
+    gaussians = splats.from_points(
+        data.points,
+        data.colors,
+        init_opacity=splat.init_opacity,
+        sh_degree=splat.raster.sh_degree,
+        generator=stream(conf.seed, "init"),
+    )
+    optimizer = SplatOptimizer(
+        gaussians, splat.optimizer, scene_scale=data.scene_scale, steps=steps
+    )
+    densifier = Densifier(
+        optimizer,
+        splat.densify.scaled(steps),
+        scene_scale=data.scene_scale,
+        generator=stream(conf.seed, "densify"),
+    )
+    parts = components.build(conf.components, data.train, data.factor)
+    targets = {view.name: prepare_target(view.image) for view in data.train}
+    sh_every = max(1, int(splat.sh_every * steps / NOMINAL_STEPS))
+    ledger = _Ledger(steps)
+
+    start = time.perf_counter()
+    for step, view in progress(endless(data.train, conf.seed, steps), "training", "step", steps):
+        offset = torch.zeros(len(gaussians), 2, requires_grad=True)
+        render = rasterize(
+            *gaussians.activated(),
+            view.camera,
+            splat.raster,
+            sh_degree=min(step // sh_every, splat.raster.sh_degree),
+            means2d_offset=offset,
+            backend=backend,
+        )
+        loss = photometric_loss(
+            render.image, targets[view.name], l1=1 - splat.ssim_weight, ssim=splat.ssim_weight
+        )
+        loss = parts.loss(loss, render.image, view)
+        optimizer.zero_grad()
+        loss.backward()
+        parts.after_backward(view, gaussians)
+        ledger.note(step, view, loss, render, optimizer)
+        optimizer.step()
+        done = densifier.after_step(
+            step, offset.grad, render.visible, width=view.camera.width, height=view.camera.height
+        )
+        ledger.refined(done)
+    return ledger.close(gaussians, time.perf_counter() - start)
+
+
+def stream(seed: int, axis: str) -> torch.Generator:
+    """A generator of its own for each use of chance, so that what one draws moves no other."""
+    return torch.Generator().manual_seed(int(digest([seed, axis])[:15], 16))
+
+
+def endless(
+    views: tuple[LoadedView, ...], seed: int, steps: int
+) -> Iterator[tuple[int, LoadedView]]:
+    """`steps` times (step, view): all views in a new order each time round."""
+    generator = stream(seed, "views")
+    order: list[int] = []
+    for step in range(steps):
+        if not order:
+            order = torch.randperm(len(views), generator=generator).tolist()
+        yield step, views[order.pop()]
+
+
+class _Ledger:
+    """Keeps what a report wants to know of a run."""
+
+    def __init__(self, steps: int) -> None:
+        self.every = max(1, steps // _LOGGED_ROWS)
+        self.last = steps - 1
+        self.counts = Counter({field.name: 0 for field in dataclasses.fields(Refinement)})
+        self.history: list[dict[str, Any]] = []
+        self.memory_bytes = 0
+        self.evaluations = 0
+
+    def note(
+        self,
+        step: int,
+        view: LoadedView,
+        loss: torch.Tensor,
+        render: Render,
+        optimizer: SplatOptimizer,
+    ) -> None:
+        gaussians = optimizer.gaussians
+        model = sum(gaussians[name].nbytes for name in splats.PARAMETERS)
+        used = 2 * model + optimizer.state_bytes() + render.buffer_bytes  # 2: and its gradients
+        self.memory_bytes = max(self.memory_bytes, used)
+        self.evaluations += render.evaluations
+        if step % self.every == 0 or step == self.last:
+            row = {"step": step, "view": view.name, "loss": loss.item()}
+            self.history.append(row | {"gaussians": len(gaussians)} | self.counts)
+
+    def refined(self, done: Refinement) -> None:
+        self.counts.update(dataclasses.asdict(done))
+
+    def close(self, gaussians: Gaussians, seconds: float) -> Trained:
+        return Trained(gaussians, self.history, seconds, self.memory_bytes, self.evaluations)
