@@ -104,13 +104,13 @@ class MadeStore:
             scores = ["" if found[key] is None else repr(found[key] + offset) for key in SCORES]
             lines.append(",".join([view, *scores]))
         (folder.path / "scores.csv").write_text("\n".join(lines) + "\n")
-        rows = [f"{step},{0.3 / (1 + step)},{100 * step}" for step in range(5)]
-        (folder.path / "history.csv").write_text("\n".join(["step,loss,gaussians", *rows]) + "\n")
 
     def _draw(self, folder: CellFolder, variant: str, noise: float) -> None:
         photographs = self.store.variants / variant / "images"
         photographs.mkdir(parents=True, exist_ok=True)
         (folder.path / "renders").mkdir()
+        rows = [f"{step},{0.3 / (1 + step)},{100 * step}" for step in range(5)]
+        (folder.path / "history.csv").write_text("\n".join(["step,loss,gaussians", *rows]) + "\n")
         for number, view in enumerate(VIEWS):
             rng = np.random.default_rng(number)
             image = np.kron(rng.uniform(0.2, 0.8, (6, 8, 3)), np.ones((10, 10, 1)))

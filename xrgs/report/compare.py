@@ -189,9 +189,8 @@ def _pairs(cells: pd.DataFrame, metrics: Sequence[Metric]) -> pd.DataFrame:
     ablations = cells["label"] != BASELINE
     lost = baselines[baselines["state"] != "done"]
     orphans = ablations & (cells["state"] == "done") & cells["baseline_id"].isin(lost.index)
-    cells.loc[orphans, "reason"] = "no baseline: " + cells.loc[orphans, "baseline_id"].map(
-        lost["reason"]
-    )
+    reasons = "no baseline: " + lost["reason"].astype(str)
+    cells.loc[orphans, "reason"] = cells.loc[orphans, "baseline_id"].map(reasons).astype(str)
     paired = cells[ablations & (cells["state"] == "done") & ~orphans]
     matched = baselines.loc[paired["baseline_id"]]
     parts = []

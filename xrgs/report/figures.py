@@ -94,7 +94,9 @@ def side_by_side(
     ratios = [height / width, cut_ratio]
     figure = _figure(_PANEL * len(panels), _PANEL * sum(ratios) + 1.1)
     figure.suptitle(title, fontsize=11, parse_math=False)
-    figure.supxlabel(f"below: the framed window, {note}", fontsize=9, parse_math=False)
+    figure.supxlabel(
+        f"framed, and enlarged in the second row: {note}", fontsize=9, parse_math=False
+    )
     axes = figure.subplots(2, len(panels), height_ratios=ratios)
     corner = (columns.start - 0.5, rows.start - 0.5)
     size = (columns.stop - columns.start, rows.stop - rows.start)

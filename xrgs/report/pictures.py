@@ -5,13 +5,13 @@ from __future__ import annotations
 import hashlib
 import re
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from PIL import Image
 from tqdm import tqdm
 
-from xrgs.report.collect import BASELINE
+from xrgs.report.collect import BASELINE, PROGRESS, ReportError
 from xrgs.report.figures import Panel, curves, differing_crop, side_by_side
 
 if TYPE_CHECKING:
@@ -49,27 +49,21 @@ def draw(store: Store, comparison: Comparison, views: pd.DataFrame, folder: Path
     Returns:
         The pictures in the order of the tables.
     """
-    pairs = comparison.pairs.drop_duplicates("cell_id").sort_values("seed", kind="stable")
-    wanted = [
-        pairs[(pairs["scene"] == scene) & (pairs["label"] == label)].iloc[0]
-        for scene, label in _scenes_and_labels(pairs)
-    ]
-    psnr = {cell: rows.set_index("view")["psnr"] for cell, rows in views.groupby("cell_id")}
+    first = comparison.pairs.sort_values("seed", kind="stable")
+    wanted = first.drop_duplicates(["scene", "label"]).sort_values(["scene", "label"])
+    shown = {*wanted["cell_id"], *wanted["baseline_id"]}
+    scores = views[views["cell_id"].isin(shown)].groupby("cell_id")
+    psnr = {cell_id: rows.set_index("view")["psnr"] for cell_id, rows in scores}
     variants = comparison.cells.drop_duplicates("cell_id").set_index("cell_id")["variant_id"]
     drawn = []
-    for pair in tqdm(wanted, desc="drawing", unit="picture", delay=2, leave=False):
-        scores = psnr[pair["baseline_id"]], psnr[pair["cell_id"]]
+    for _, pair in tqdm(wanted.iterrows(), "drawing", len(wanted), unit="picture", **PROGRESS):
+        both = psnr[pair["baseline_id"]], psnr[pair["cell_id"]]
         photographs = store.variants / variants[pair["cell_id"]] / "images"
         drawn += [
-            _views(store, pair, scores, photographs, folder),
+            _views(store, pair, both, photographs, folder),
             _training(store, pair, folder),
         ]
     return drawn
-
-
-def _scenes_and_labels(pairs: pd.DataFrame) -> list[tuple[str, str]]:
-    found = pairs.drop_duplicates(["scene", "label"])
-    return sorted(zip(found["scene"], found["label"], strict=True))
 
 
 def median_view(baseline: pd.Series, ablation: pd.Series) -> str:
@@ -92,11 +86,12 @@ def _views(
 ) -> Picture:
     view = median_view(*psnr)
     title = f"{_title(pair)}: view {view}, by change of PSNR the median of {len(psnr[0])}"
+    name = f"{view}.png"
     try:
-        truth = _image(photographs / f"{view}.png")
-        baseline = _image(store.cell(pair["baseline_id"]).path / "renders" / f"{view}.png")
-        ablation = _image(store.cell(pair["cell_id"]).path / "renders" / f"{view}.png")
-    except (OSError, ValueError) as error:
+        truth = _image(store, photographs / name)
+        baseline = _image(store, store.cell(pair["baseline_id"]).path / "renders" / name)
+        ablation = _image(store, store.cell(pair["cell_id"]).path / "renders" / name)
+    except ReportError as error:
         return Picture(title, None, str(error))
     panels = (
         Panel(truth, "photograph", f"{truth.shape[1]} × {truth.shape[0]} px"),
@@ -113,12 +108,12 @@ def _views(
 
 def _training(store: Store, pair: pd.Series, folder: Path) -> Picture:
     title = f"{_title(pair)}: training"
-    runs: list[tuple[str, Any]] = []
-    try:
-        for name, key in ((BASELINE, "baseline_id"), (str(pair["label"]), "cell_id")):
+    runs = []
+    for name, key in ((BASELINE, "baseline_id"), (str(pair["label"]), "cell_id")):
+        try:
             runs.append((name, store.cell(pair[key]).history()[["step", *_CURVES]]))
-    except (OSError, ValueError, KeyError) as error:
-        return Picture(title, None, f"history.csv: {error}")
+        except (OSError, ValueError, KeyError):
+            return Picture(title, None, f"cells/{pair[key]}/history.csv can't be read")
     file = folder / f"{_stem(pair)}--training.png"
     file.write_bytes(curves(title, runs, _CURVES))
     return Picture(title, file)
@@ -129,9 +124,14 @@ def _title(pair: pd.Series) -> str:
     return ", ".join(str(part) for part in parts if part)
 
 
-def _image(path: Path) -> NDArray[np.float32]:
-    with Image.open(path) as image:
-        return np.asarray(image.convert("RGB")).astype(np.float32) / np.float32(255)
+def _image(store: Store, path: Path) -> NDArray[np.float32]:
+    try:
+        with Image.open(path) as image:
+            return np.asarray(image.convert("RGB")).astype(np.float32) / np.float32(255)
+    except (OSError, ValueError) as error:
+        # Named inside the store: the report is the same wherever the store lies.
+        inside = path.relative_to(store.path).as_posix()
+        raise ReportError(f"{inside} can't be read") from error
 
 
 def _stem(pair: pd.Series) -> str:
@@ -141,6 +141,6 @@ def _stem(pair: pd.Series) -> str:
 def slug(text: str) -> str:
     """`text` as part of a file name on any system; different texts give different names."""
     plain = re.sub(r"[^A-Za-z0-9_.]+", "-", text).strip("-.")[:60]
-    if plain == text:
+    if text and plain == text:
         return text
     return f"{plain}-{hashlib.sha256(text.encode()).hexdigest()[:6]}".lstrip("-")

@@ -80,10 +80,10 @@ def reading(row: Change, metric: Metric) -> str:
         return f"n/a: {row.why}"
     if math.isnan(row.low):
         return "one seed: no interval"
-    if row.low == row.high == 0:
-        return "unchanged"
-    if row.low <= 0 <= row.high:
+    if row.low <= 0 <= row.high and row.low < row.high:
         return "inside noise"
+    if arrow(row.change, metric) == SAME:
+        return "unchanged"
     return "better" if (row.change > 0) == metric.higher_is_better else "worse"
 
 

@@ -1,0 +1,197 @@
+"""A report of a store: whole, the same each time, and made without torch."""
+
+import csv
+import json
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+import xrgs
+from xrgs.report import build
+from xrgs.report.collect import ReportError
+from xrgs.store import StoreError
+
+
+@pytest.fixture
+def study(made: Any) -> Any:
+    """A scene with pictures, one without, and one that failed."""
+    for scene, pictures in (("fern", True), ("room|_&%$ 部屋", False)):
+        made.add(scene=scene, pictures=pictures)
+        made.add("consistency", scene=scene, pictures=pictures, factors={"psnr": 1.02})
+    made.add_error("leaves")
+    made.add_error("leaves", "consistency")
+    return made
+
+
+def content(folder: Path) -> dict[str, bytes]:
+    return {
+        file.relative_to(folder).as_posix(): file.read_bytes()
+        for file in folder.rglob("*")
+        if file.is_file()
+    }
+
+
+def test_a_report_is_the_same_byte_for_byte(study: Any) -> None:
+    sweep_id = study.write()
+    first = build(study.store.path)
+    assert first.folder == study.store.reports / sweep_id
+    before = content(first.folder)
+    shutil.rmtree(first.folder)
+    assert build(study.store.path, sweep_id) == first
+    assert content(first.folder) == before
+
+
+def test_a_copied_store_gives_the_same_report(study: Any, tmp_path: Path) -> None:
+    study.write()
+    (study.store.cell("cell00003").path / "status.json").write_text("no JSON")
+    before = content(build(study.store.path).folder)
+    copy = tmp_path / "elsewhere"
+    shutil.copytree(study.store.path, copy)
+    assert content(build(copy).folder) == before  # written over the files that lie there
+
+
+def test_an_odd_name_has_its_picture(made: Any) -> None:
+    made.add(scene="../部屋 $x$", pictures=True)
+    made.add("consistency", scene="../部屋 $x$", pictures=True)
+    made.write()
+    report = build(made.store.path)
+    pictures = [file for file in report.files if file.suffix == ".png"]
+    assert len(pictures) == 2
+    assert all(file.parent == report.folder / "figures" for file in pictures)
+
+
+def test_every_file_is_there_and_named(study: Any) -> None:
+    study.write()
+    report = build(study.store.path)
+    assert {file.relative_to(report.folder).as_posix() for file in report.files} == set(
+        content(report.folder)
+    )
+    names = {file.name for file in report.files}
+    assert {"table.md", "table.tex", "table.csv", "cells.csv", "views.csv"} <= names
+    assert {"fern--consistency.png", "fern--consistency--training.png"} <= names
+    page = (report.folder / "table.md").read_text()
+    assert "figures/fern--consistency.png" in page
+    assert "room\\|\\_\\&%\\$ 部屋" in page
+
+
+def test_the_terminal_has_table_failures_and_folder(study: Any) -> None:
+    study.write()
+    report = build(study.store.path)
+    assert "consistency against baseline: 2 of 3 scenes, seed 0" in report.text
+    assert "+2.00 ↑" in report.text
+    assert "leaves: 3 of 24 views registered" in report.text
+    assert report.text.endswith(f"Written to {report.folder}")
+
+
+def test_scores_are_kept_view_by_view(study: Any) -> None:
+    study.write()
+    with (build(study.store.path).folder / "views.csv").open(newline="") as stream:
+        rows = list(csv.DictReader(stream))
+    assert len(rows) == 4 * 2
+    assert rows[0]["view"] == "IMG_001"
+    assert float(rows[0]["psnr"]) == 20.05
+
+
+def test_provenance_is_gathered_without_its_moment(study: Any) -> None:
+    study.write()
+    found = json.loads((build(study.store.path).folder / "provenance.json").read_text())
+    assert found == {"backend": ["torch"], "cpu": ["a processor"], "threads": ["2"]}
+
+
+def test_times_of_different_machines_are_warned_of(made: Any) -> None:
+    made.add()
+    made.add("consistency", cpu="another processor")
+    made.write()
+    report = build(made.store.path)
+    warning = "The cells differ in cpu: their training times do not compare."
+    assert warning in report.text
+    assert warning in (report.folder / "table.md").read_text()
+
+
+def test_a_corrupt_cell_is_not_trusted(study: Any) -> None:
+    study.write()
+    scores = study.store.cell("cell00001").path / "scores.csv"
+    scores.write_text(scores.read_text().replace("20.", "90."))
+    text = build(study.store.path).text
+    assert "corrupt" in text
+    assert "consistency against baseline: 1 of 3 scenes" in text
+
+
+def test_a_missing_render_costs_its_picture_alone(study: Any) -> None:
+    study.write()
+    shutil.rmtree(study.store.variants)
+    report = build(study.store.path)
+    page = (report.folder / "table.md").read_text()
+    assert "No picture of fern, consistency, seed 0" in page
+    assert "fern--consistency.png" not in page
+    assert "+2.00 ↑" in page
+
+
+def test_baselines_alone_have_their_values(made: Any) -> None:
+    made.add()
+    made.write(("scene=fern",))
+    assert "100.00 s" in build(made.store.path).text
+
+
+def test_a_sweep_of_which_everything_failed(made: Any) -> None:
+    made.add_error("leaves")
+    made.add_error("leaves", "consistency")
+    made.write()
+    report = build(made.store.path)
+    assert "2 of 2 cells gave no number" in report.text
+
+
+def test_another_folder_can_be_asked_for(study: Any, tmp_path: Path) -> None:
+    study.write()
+    report = build(study.store.path, out=tmp_path / "out")
+    assert (tmp_path / "out" / "table.md").exists()
+    assert report.folder == tmp_path / "out"
+    assert not study.store.reports.exists()
+
+
+def test_a_folder_that_cannot_be_written_is_named(made: Any, tmp_path: Path) -> None:
+    made.add()
+    made.write()
+    (tmp_path / "file").write_text("")
+    with pytest.raises(ReportError, match="file/out"):
+        build(made.store.path, out=tmp_path / "file" / "out")
+
+
+def test_an_unknown_sweep_is_named(made: Any) -> None:
+    with pytest.raises(StoreError, match="nosuch"):
+        build(made.store.path, "nosuch")
+
+
+def test_a_record_that_contradicts_its_cell_is_refused(made: Any) -> None:
+    made.add()
+    made.rows[0]["seed"] = 3
+    made.write()
+    with pytest.raises(ReportError, match=r"seed 3 of cell cell00000.*says 0"):
+        build(made.store.path)
+
+
+def test_a_record_that_lacks_a_key_is_named(made: Any) -> None:
+    made.add()
+    del made.rows[0]["condition"]
+    sweep_id = made.write()
+    with pytest.raises(ReportError, match=rf"{sweep_id}.json: a cell lacks condition"):
+        build(made.store.path)
+
+
+def test_a_report_needs_no_torch(study: Any) -> None:
+    study.write()
+    code = (
+        "import sys; from pathlib import Path; from xrgs.report import build; "
+        "build(Path(sys.argv[1])); assert 'torch' not in sys.modules; "
+        "assert 'matplotlib.pyplot' not in sys.modules"
+    )
+    subprocess.run(  # noqa: S603
+        [sys.executable, "-W", "error", "-c", code, str(study.store.path)],
+        check=True,
+        env={"PYTHONPATH": str(Path(xrgs.__file__).parents[1])},
+    )
+    assert (study.store.reports).is_dir()

@@ -1,0 +1,182 @@
+"""What a number looks like in a table, and what is said of it."""
+
+import csv
+import io
+import math
+from typing import Any
+
+import pytest
+
+from xrgs.metrics import METRICS, Metric
+from xrgs.report.collect import read_sweep
+from xrgs.report.compare import compare
+from xrgs.report.tables import Change, Tables, arrow, number, percent, reading, signed
+
+BY_NAME = {metric.name: metric for metric in METRICS}
+#: Whether more of it is better, from the metrics' own papers and common sense, not from the code.
+MORE_IS_BETTER = {
+    "training_time_s": False,
+    "gaussians": False,
+    "memory_bytes": False,
+    "peak_rss_bytes": False,
+    "lpips": False,
+    "ssim": True,
+    "psnr": True,
+    "evaluations": False,
+}
+
+
+def tables(made: Any) -> Tables:
+    return Tables(compare(read_sweep(made.store, made.write(), METRICS).cells, METRICS))
+
+
+def change(mean: float, low: float = math.nan, high: float = math.nan, why: str = "") -> Change:
+    return Change(1.0, 1.0, mean, 0.0, 0.0, 2, low, high, "seeds", why)
+
+
+@pytest.mark.parametrize("metric", METRICS, ids=lambda metric: metric.name)
+def test_arrows_point_up_where_it_got_better(metric: Metric) -> None:
+    more = MORE_IS_BETTER[metric.name]
+    assert arrow(5.0, metric) == ("↑" if more else "↓")
+    assert arrow(-5.0, metric) == ("↓" if more else "↑")
+    assert arrow(0.0, metric) == "="
+    assert arrow(-0.004, metric) == "="  # what is printed is 0.00
+    assert arrow(math.nan, metric) == " "
+
+
+@pytest.mark.parametrize(
+    ("value", "text"),
+    [(-44.566, "-44.57"), (0.45, "+0.45"), (-0.001, "0.00"), (0.0, "0.00"), (-0.0, "0.00"),
+     (12345.678, "+12,345.68"), (math.nan, "n/a")],
+)  # fmt: skip
+def test_changes_are_signed(value: float, text: str) -> None:
+    assert signed(value) == text
+
+
+@pytest.mark.parametrize(
+    ("value", "unit", "text"),
+    [
+        (83.456, "s", "83.46 s"),
+        (1234.5, "s", "1,234 s"),
+        (123456.0, "", "123,456"),
+        (7.0, "", "7"),
+        (0.81234, "", "0.8123"),
+        (24.0, "dB", "24.00 dB"),
+        (3 * 2**20, "bytes", "3.0 MiB"),
+        (math.inf, "dB", "inf dB"),
+        (math.nan, "dB", "n/a"),
+    ],
+)
+def test_values_have_their_unit(value: float, unit: str, text: str) -> None:
+    assert number(value, unit) == text
+
+
+@pytest.mark.parametrize(
+    ("row", "text"),
+    [
+        (change(5.0), "one seed: no interval"),
+        (change(5.0, 1.0, 9.0), "better"),
+        (change(-5.0, -9.0, -1.0), "worse"),
+        (change(5.0, -1.0, 11.0), "inside noise"),
+        (change(5.0, 0.0, 10.0), "inside noise"),
+        (change(0.0, 0.0, 0.0), "unchanged"),
+        (change(0.0, -1.0, 1.0), "inside noise"),
+        (change(0.002, 0.001, 0.003), "unchanged"),
+        (change(math.nan, why="not measured"), "n/a: not measured"),
+    ],
+)
+def test_what_an_interval_allows_to_be_said_of_psnr(row: Change, text: str) -> None:
+    assert reading(row, BY_NAME["psnr"]) == text
+
+
+def test_less_gaussians_outside_noise_are_better() -> None:
+    assert reading(change(-5.0, -9.0, -1.0), BY_NAME["gaussians"]) == "better"
+
+
+def test_psnr_has_decibels_beside_its_percentage(made: Any) -> None:
+    made.add()
+    made.add("consistency", factors={"psnr": 0.99})
+    grid = tables(made).mean("consistency", "")
+    rows = {row[0]: row for row in grid.rows}
+    assert rows["PSNR"] == (
+        "PSNR", "20.00 dB", "19.80 dB", "-1.00 ↓", "-0.20", "", "one seed: no interval",
+    )  # fmt: skip
+    assert rows["SSIM"][4] == ""
+    assert grid.title == "consistency against baseline: scene fern, seed 0"
+
+
+def test_failed_scenes_are_shown_as_failed(made: Any) -> None:
+    made.add()
+    made.add("consistency", factors={"gaussians": 0.5})
+    made.add_error("leaves")
+    made.add_error("leaves", "consistency")
+    made.add(scene="room")
+    made.add("consistency", scene="room", state="failed")
+    built = tables(made)
+    grid = built.per_scene("consistency", "")
+    assert grid.columns == ("Metric", "fern", "leaves", "room", "mean")
+    rows = {row[0]: [text.strip() for text in row[1:]] for row in grid.rows}
+    assert rows["Gaussians, %"] == ["-50.00 ↑", "failed", "failed", "-50.00 ↑"]
+    assert rows["PSNR, dB"] == ["0.00", "failed", "failed", "0.00"]
+    assert "1 of 3 scenes" in built.mean("consistency", "").title
+    missing = built.missing()
+    assert missing is not None
+    assert missing.title == "3 of 6 cells gave no number"
+    assert ("leaves", "baseline", "", "0", "failed", "leaves: 3 of 24 views registered") in (
+        missing.rows
+    )
+
+
+def test_nothing_missing_is_no_table(made: Any) -> None:
+    made.add()
+    assert tables(made).missing() is None
+
+
+def test_several_ablations_stand_beside_each_other(made: Any) -> None:
+    made.add()
+    made.add("consistency", factors={"gaussians": 0.5})
+    made.add("loss_weighting", state="failed")
+    (grid,) = tables(made).overviews()
+    assert grid.columns == ("Metric", "consistency", "loss_weighting")
+    assert ("Gaussians", "-50.00 ↑", "failed  ") in grid.rows
+
+
+def test_one_ablation_needs_no_overview(made: Any) -> None:
+    made.add()
+    made.add("consistency")
+    assert tables(made).overviews() == []
+
+
+def test_values_side_by_side(made: Any) -> None:
+    for seed, size in enumerate((1.0, 3.0)):
+        made.add(seed=seed, factors={"gaussians": size})
+        made.add("consistency", seed=seed, factors={"gaussians": size / 2})
+    grid = tables(made).values("")
+    assert grid.columns == ("Scene", "Metric", "baseline", "consistency")
+    assert ("fern", "Gaussians", "10,000", "5,000") in grid.rows
+
+
+def test_pairs_left_out_of_a_mean_are_named(made: Any) -> None:
+    made.add(values={"gaussians": 0})
+    made.add("consistency")
+    made.add(scene="room")
+    made.add("consistency", scene="room", factors={"gaussians": 2.0})
+    grid = tables(made).mean("consistency", "")
+    assert "Gaussians: pairs left out (the baseline is zero)" in grid.notes
+    assert next(row for row in grid.rows if row[0] == "Gaussians")[3] == "+100.00 ↓"
+
+
+def test_the_long_table_has_every_number_at_full_precision(made: Any) -> None:
+    for scene, factor in (("fern", 1 / 3), ("room", 1 / 7)):
+        made.add(scene=scene)
+        made.add("consistency", scene=scene, factors={"training_time_s": factor})
+    text = tables(made).long().to_csv(index=False)
+    rows = [r for r in csv.DictReader(io.StringIO(text)) if r["metric"] == "training_time_s"]
+    assert [row["level"] for row in rows] == ["mean", "scene", "scene"]
+    assert [row["scene"] for row in rows] == ["", "fern", "room"]
+    fern, room = (100 * (100 * factor - 100) / 100 for factor in (1 / 3, 1 / 7))
+    assert float(rows[1]["change_percent"]) == fern
+    assert float(rows[0]["change_percent"]) == pytest.approx((fern + room) / 2, rel=1e-15)
+    assert rows[1]["printed"] == percent(fern, BY_NAME["training_time_s"]) == "-66.67 ↑"
+    assert rows[1]["reading"] == "one seed: no interval"
+    assert rows[0]["n_of"] == "scenes"
