@@ -56,7 +56,8 @@ class Batch:
 def list_pairs(flat: Projected, grid: Grid, settings: RasterSettings) -> tuple[Tensor, Tensor]:
     """Every (tile, Gaussian) pair in which some pixel's alpha reaches the cut.
 
-    A superset that is exact up to a margin: the ellipse's horizontal span is found for each row of tiles.
+    A superset, exact but for a margin: the ellipse's horizontal span is found for each row of
+    tiles.
 
     Returns:
         tile [P], ascending, row-major; gaussian [P], ascending (front to back) within a tile.

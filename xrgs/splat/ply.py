@@ -1,0 +1,152 @@
+"""Gaussians as the .ply that every viewer of 3D Gaussian Splatting opens (INRIA's layout).
+
+Binary little endian float32, one vertex a Gaussian, raw parameters (logit opacities, log scales);
+the SH rest is channel-major: all coefficients of red, then green, then blue.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import BinaryIO
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from xrgs.errors import XrgsError
+from xrgs.splat.gaussians import Gaussians
+from xrgs.splat.sh import MAX_DEGREE, bases
+
+MAX_HEADER_LINES = 512
+MAX_LINE_BYTES = 1024
+_MAGIC = b"ply\n"
+_FORMAT = "format binary_little_endian 1.0"
+
+
+def save_ply(path: Path, gaussians: Gaussians) -> None:
+    """Write Gaussians to `path`, replacing it.
+
+    Raises:
+        OSError: the file cannot be written.
+    """
+    count = len(gaussians)
+    columns = [
+        gaussians.means,
+        torch.zeros_like(gaussians.means),  # normals, which viewers expect and no one reads
+        gaussians.sh0[:, 0],
+        gaussians.shN.transpose(1, 2).reshape(count, -1),
+        gaussians.opacities[:, None],
+        gaussians.scales,
+        gaussians.quats,
+    ]
+    table = torch.cat([column.detach().float() for column in columns], dim=1)
+    names = _properties(gaussians.shN.shape[1])
+    header = [_FORMAT, f"element vertex {count}", *(f"property float {n}" for n in names)]
+    with path.open("wb") as file:
+        file.write(_MAGIC + "".join(f"{line}\n" for line in [*header, "end_header"]).encode())
+        file.write(table.numpy().astype("<f4").tobytes())
+
+
+def load_ply(path: Path) -> Gaussians:
+    """Read Gaussians that `save_ply`, or any 3D Gaussian Splatting trainer, wrote.
+
+    Properties may come in any order; others than float32 ones are not read.
+
+    Returns:
+        float32 leaf tensors with gradients on.
+
+    Raises:
+        XrgsError: the file is missing, truncated or not such a .ply; the message names it.
+    """
+    try:
+        with path.open("rb") as file:
+            count, names = _read_header(file, path)
+            body = file.read()
+    except OSError as error:
+        raise XrgsError(f"{path}: cannot be read: {error.strerror}") from error
+    if len(body) != count * len(names) * 4:
+        raise XrgsError(
+            f"{path}: {count} vertices of {len(names)} floats need {count * len(names) * 4} bytes, "
+            f"{len(body)} follow the header"
+        )
+    table = np.frombuffer(body, dtype="<f4").reshape(count, len(names))
+    if not np.isfinite(table).all():
+        raise XrgsError(f"{path}: has values that are not finite")
+    return _gaussians({name: table[:, i] for i, name in enumerate(names)}, path)
+
+
+def _properties(rest: int) -> list[str]:
+    """Names of a vertex's columns, with `rest` SH coefficients a channel above band 0."""
+    return [
+        *("x", "y", "z", "nx", "ny", "nz"),
+        *(f"f_dc_{i}" for i in range(3)),
+        *(f"f_rest_{i}" for i in range(3 * rest)),
+        "opacity",
+        *(f"scale_{i}" for i in range(3)),
+        *(f"rot_{i}" for i in range(4)),
+    ]
+
+
+def _read_header(file: BinaryIO, path: Path) -> tuple[int, list[str]]:
+    """Number of vertices and names of their columns; leaves `file` at the first vertex."""
+    if file.readline(len(_MAGIC)) != _MAGIC:
+        raise XrgsError(f"{path}: is not a .ply file")
+    count = -1
+    names: list[str] = []
+    for _ in range(MAX_HEADER_LINES):
+        line = file.readline(MAX_LINE_BYTES)
+        words = line.decode("ascii", errors="replace").split()
+        match words:
+            case ["end_header"] if count >= 0:
+                if len(set(names)) != len(names):
+                    raise XrgsError(f"{path}: the header names a property twice")
+                return count, names
+            case ["comment" | "obj_info", *_]:
+                pass
+            case ["format", *_] if " ".join(words) == _FORMAT:
+                pass
+            case ["element", "vertex", digits] if count < 0 and _is_count(digits):
+                count = int(digits)
+            case ["property", "float" | "float32", name] if count >= 0:
+                names.append(name)
+            case _:
+                shown = line[:80].decode("ascii", errors="replace").rstrip()
+                raise XrgsError(f"{path}: unexpected line in the .ply header: {shown!r}")
+    raise XrgsError(f"{path}: the .ply header has no end")
+
+
+def _is_count(digits: str) -> bool:
+    """Whether it is a number of vertices that memory could hold."""
+    return digits.isascii() and digits.isdigit() and len(digits) <= 12
+
+
+def _gaussians(columns: dict[str, NDArray[np.float32]], path: Path) -> Gaussians:
+    """The parameters that the named columns [N] hold."""
+    stored = sum(name.startswith("f_rest_") for name in columns)
+    if stored not in {3 * (bases(degree) - 1) for degree in range(MAX_DEGREE + 1)}:
+        raise XrgsError(f"{path}: {stored} f_rest properties are no whole number of SH bands")
+    missing = [name for name in _properties(stored // 3) if name not in columns and name[0] != "n"]
+    if missing:
+        raise XrgsError(f"{path}: properties are missing: {', '.join(missing)}")
+
+    def gather(*names: str) -> torch.Tensor:
+        return torch.from_numpy(np.stack([columns[name] for name in names], axis=1).copy())
+
+    def numbered(prefix: str, number: int) -> torch.Tensor:
+        return gather(*(f"{prefix}_{i}" for i in range(number)))
+
+    count = len(columns["x"])
+    rest = (
+        numbered("f_rest", stored).reshape(count, 3, -1).transpose(1, 2).contiguous()
+        if stored
+        else torch.zeros((count, 0, 3))
+    )
+    tensors = {
+        "means": gather("x", "y", "z"),
+        "quats": numbered("rot", 4),
+        "scales": numbered("scale", 3),
+        "opacities": gather("opacity")[:, 0],
+        "sh0": numbered("f_dc", 3)[:, None],
+        "shN": rest,
+    }
+    return Gaussians(**{name: value.requires_grad_() for name, value in tensors.items()})
