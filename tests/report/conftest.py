@@ -106,7 +106,7 @@ class MadeStore:
         (folder.path / "scores.csv").write_text("\n".join(lines) + "\n")
 
     def _draw(self, folder: CellFolder, variant: str, noise: float) -> None:
-        photographs = self.store.variants / variant / "images"
+        photographs = self.store.variants / variant / "images" / "test"
         photographs.mkdir(parents=True, exist_ok=True)
         (folder.path / "renders").mkdir()
         rows = [f"{step},{0.3 / (1 + step)},{100 * step}" for step in range(5)]

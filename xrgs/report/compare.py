@@ -77,8 +77,7 @@ def half_width(spread: Floats, n: Floats) -> Floats:
         n: [N] how many values each is of.
     """
     with np.errstate(all="ignore"):
-        width = stdtrit(n - 1, 0.5 + CONFIDENCE / 2) * spread / np.sqrt(n)
-    return np.where(n > 1, width, np.nan)
+        return np.asarray(stdtrit(n - 1, 0.5 + CONFIDENCE / 2) * spread / np.sqrt(n))
 
 
 @dataclass(frozen=True)

@@ -58,7 +58,7 @@ def draw(store: Store, comparison: Comparison, views: pd.DataFrame, folder: Path
     drawn = []
     for _, pair in tqdm(wanted.iterrows(), "drawing", len(wanted), unit="picture", **PROGRESS):
         both = psnr[pair["baseline_id"]], psnr[pair["cell_id"]]
-        photographs = store.variants / variants[pair["cell_id"]] / "images"
+        photographs = store.variants / variants[pair["cell_id"]] / "images" / "test"
         drawn += [
             _views(store, pair, both, photographs, folder),
             _training(store, pair, folder),
