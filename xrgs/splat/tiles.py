@@ -36,9 +36,11 @@ class Grid:
         """Tiles in a column."""
         return -(-self.height // self.tile)
 
-    def tile_of(self, pixel: Tensor) -> Tensor:
-        """Column (or row) of tiles that a column (or row) of pixels is in."""
-        return torch.div(pixel, self.tile, rounding_mode="floor")
+    def span(self, first: Tensor, last: Tensor) -> tuple[Tensor, Tensor]:
+        """Columns (or rows) of tiles, first and last, of pixels first..last; none of none."""
+        begin = torch.div(first, self.tile, rounding_mode="floor")
+        end = torch.div(last, self.tile, rounding_mode="floor")
+        return begin, torch.where(last < first, begin - 1, end)
 
     def corners(self, tiles: Tensor) -> Tensor:
         """Top left [B, 2] x, y in px of tiles [B], numbered row by row."""
@@ -72,7 +74,7 @@ def list_pairs(flat: Projected, grid: Grid, settings: RasterSettings) -> tuple[T
     top = _first_pixel(y - reach, grid.height)
     bottom = _last_pixel(y + reach, grid.height)
     # [R], one entry a (Gaussian, row of tiles)
-    owner, tile_row = _ranges(grid.tile_of(top), grid.tile_of(bottom))
+    owner, tile_row = _ranges(*grid.span(top, bottom))
 
     # The span's ends are the ellipse's leftmost and rightmost points, or as near to them as the
     # row allows (the boundary is concave).
@@ -84,8 +86,10 @@ def list_pairs(flat: Projected, grid: Grid, settings: RasterSettings) -> tuple[T
     slope, narrow = (xy / yy)[owner], (flat.det.double() / yy)[owner]
     half_left = (narrow * (r2[owner] - left * left / yy[owner]).clamp_min(0)).sqrt()
     half_right = (narrow * (r2[owner] - right * right / yy[owner]).clamp_min(0)).sqrt()
-    begin = grid.tile_of(_first_pixel(x[owner] + slope * left - half_left, grid.width))
-    end = grid.tile_of(_last_pixel(x[owner] + slope * right + half_right, grid.width))
+    begin, end = grid.span(
+        _first_pixel(x[owner] + slope * left - half_left, grid.width),
+        _last_pixel(x[owner] + slope * right + half_right, grid.width),
+    )
     pairs = int((end - begin + 1).clamp_min(0).sum())
     if pairs > MAX_PAIRS:
         raise MemoryError(f"{pairs} (tile, Gaussian) pairs in one view, more than {MAX_PAIRS}")

@@ -1,0 +1,82 @@
+"""Small random scenes for the model's tests."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+
+import pytest
+import torch
+from torch import Tensor
+
+from xrgs.splat.cameras import Camera
+
+Scene = dict[str, Tensor]
+
+
+@pytest.fixture(autouse=True, scope="session")
+def one_thread() -> Iterator[None]:
+    # The arrays are tiny: more threads only wait for one another.
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(threads)
+
+
+@pytest.fixture(scope="session")
+def make_camera() -> Callable[..., Camera]:
+    def make(
+        width: int = 20, height: int = 14, *, focal: float = 18.0, turned: bool = False
+    ) -> Camera:
+        """At the origin, or turned and moved; the principal point is off the centre."""
+        K = torch.tensor(
+            [[focal, 0, 0.45 * width], [0, 1.1 * focal, 0.6 * height], [0, 0, 1]],
+            dtype=torch.float64,
+        )
+        viewmat = torch.eye(4, dtype=torch.float64)
+        if turned:
+            generator = torch.Generator().manual_seed(5)
+            q, _ = torch.linalg.qr(torch.randn(3, 3, generator=generator, dtype=torch.float64))
+            viewmat[:3, :3] = q * torch.linalg.det(q)
+            viewmat[:3, 3] = torch.tensor([0.3, -0.2, 0.5])
+        return Camera(viewmat, K, width, height)
+
+    return make
+
+
+@pytest.fixture(scope="session")
+def make_scene() -> Callable[..., Scene]:
+    def make(
+        count: int,
+        camera: Camera,
+        *,
+        seed: int = 0,
+        dtype: torch.dtype = torch.float64,
+        degree: int = 3,
+        size: float = 2.0,
+    ) -> Scene:
+        """Activated parameters of Gaussians some `size` px large, in and around the image."""
+        g = torch.Generator().manual_seed(seed)
+
+        def uniform(*shape: int) -> Tensor:
+            return torch.rand(*shape, generator=g, dtype=torch.float64)
+
+        def normal(*shape: int) -> Tensor:
+            return torch.randn(*shape, generator=g, dtype=torch.float64)
+
+        z = 2 + 3 * uniform(count)
+        pixel = (uniform(count, 2) * 1.3 - 0.15) * torch.tensor([camera.width, camera.height])
+        K = camera.K.double()
+        x = (pixel[:, 0] - K[0, 2]) / K[0, 0] * z
+        y = (pixel[:, 1] - K[1, 2]) / K[1, 1] * z
+        rotation, shift = camera.viewmat[:3, :3].double(), camera.viewmat[:3, 3].double()
+        scene = {
+            "means": (torch.stack([x, y, z], dim=-1) - shift) @ rotation,
+            "quats": normal(count, 4),
+            "scales": torch.exp(0.5 * normal(count, 3)) * size * z[:, None] / K[0, 0],
+            "opacities": 0.05 + 0.9 * uniform(count),
+            "sh0": normal(count, 1, 3),
+            "shN": 0.3 * normal(count, (degree + 1) ** 2 - 1, 3),
+        }
+        return {name: value.to(dtype) for name, value in scene.items()}
+
+    return make

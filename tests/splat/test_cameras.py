@@ -1,0 +1,32 @@
+import pytest
+import torch
+
+from xrgs.splat.cameras import Camera
+
+
+def test_position_is_where_the_camera_sees_the_origin_of_its_axes(make_camera):
+    camera = make_camera(turned=True)
+    seen = camera.viewmat[:3, :3] @ camera.position + camera.viewmat[:3, 3]
+    torch.testing.assert_close(seen, torch.zeros(3, dtype=torch.float64), atol=1e-14, rtol=0)
+
+
+@pytest.mark.parametrize(
+    ("field", "value", "message"),
+    [
+        ("width", 0, "width and height"),
+        ("height", -1, "width and height"),
+        ("viewmat", torch.eye(3), "viewmat must be"),
+        ("K", torch.eye(4), "K must be"),
+        ("viewmat", torch.full((4, 4), float("nan")), "viewmat has values"),
+        ("K", torch.full((3, 3), float("inf")), "K has values"),
+        ("K", torch.diag(torch.tensor([-1.0, 1.0, 1.0])), "focal lengths"),
+        ("K", torch.tensor([[1.0, 0.1, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]), "skew"),
+        ("viewmat", torch.diag(torch.tensor([2.0, 2.0, 2.0, 1.0])), "without scale"),
+        ("viewmat", torch.diag(torch.tensor([-1.0, 1.0, 1.0, 1.0])), "rotation"),
+    ],
+)
+def test_bad_input_is_named(field, value, message):
+    good = {"viewmat": torch.eye(4), "K": torch.eye(3), "width": 4, "height": 3}
+    Camera(**good)
+    with pytest.raises(ValueError, match=message):
+        Camera(**(good | {field: value}))

@@ -1,0 +1,101 @@
+import numpy as np
+import pytest
+import torch
+
+from xrgs.splat.gaussians import MIN_SPACING, PARAMETERS, from_points
+from xrgs.splat.sh import sh_to_colors
+
+
+@pytest.fixture
+def cloud():
+    rng = np.random.default_rng(0)
+    return rng.normal(size=(30, 3)), rng.integers(0, 256, (30, 3), dtype=np.uint8)
+
+
+def start(points, colors, *, init_opacity=0.1, sh_degree=3, seed=0):
+    generator = torch.Generator().manual_seed(seed)
+    return from_points(
+        points, colors, init_opacity=init_opacity, sh_degree=sh_degree, generator=generator
+    )
+
+
+def test_start_is_gsplats(cloud):
+    points, colors = cloud
+    gaussians = start(points, colors)
+    assert len(gaussians) == 30
+    distances = np.linalg.norm(points[:, None] - points[None], axis=-1)
+    nearest = np.sort(distances, axis=1)[:, 1:4]
+    expected = np.sqrt((nearest**2).mean(axis=1))
+    means, quats, scales, opacities, sh0, shN = gaussians.activated()
+    np.testing.assert_allclose(means.detach(), points, rtol=1e-6)
+    np.testing.assert_allclose(scales.detach(), np.repeat(expected[:, None], 3, 1), rtol=1e-5)
+    np.testing.assert_allclose(opacities.detach(), 0.1, rtol=1e-5)
+    assert ((quats >= 0) & (quats < 1)).all()
+    dirs = torch.nn.functional.normalize(means, dim=-1)
+    np.testing.assert_allclose(sh_to_colors(3, dirs, sh0, shN).detach(), colors / 255.0, atol=1e-6)
+
+
+def test_parameters_are_leaves_reached_by_name(cloud):
+    gaussians = start(*cloud)
+    for name in PARAMETERS:
+        assert gaussians[name].is_leaf
+        assert gaussians[name].requires_grad
+        assert gaussians[name].dtype == torch.float32
+        assert gaussians[name] is getattr(gaussians, name)
+    other = torch.zeros(1, 3)
+    gaussians["means"] = other
+    assert gaussians.means is other
+    assert len(gaussians) == 1
+    with pytest.raises(KeyError):
+        gaussians["colour"]
+    with pytest.raises(KeyError):
+        gaussians["colour"] = other
+
+
+@pytest.mark.parametrize(("degree", "rest"), [(0, 0), (1, 3), (2, 8), (3, 15)])
+def test_bands_stored(cloud, degree, rest):
+    assert start(*cloud, sh_degree=degree).shN.shape == (30, rest, 3)
+
+
+def test_float_colors_are_as_8_bit_ones(cloud):
+    points, colors = cloud
+    floats = start(points, torch.from_numpy(colors).double() / 255)
+    torch.testing.assert_close(floats.sh0, start(points, colors).sh0)
+
+
+def test_seed_decides_the_quaternions(cloud):
+    same, other = start(*cloud, seed=0), start(*cloud, seed=1)
+    assert torch.equal(start(*cloud, seed=0).quats, same.quats)
+    assert not torch.equal(other.quats, same.quats)
+
+
+def test_points_on_one_another_have_a_finite_scale(cloud):
+    _, colors = cloud
+    gaussians = start(np.zeros((30, 3)), colors)
+    torch.testing.assert_close(torch.exp(gaussians.scales), torch.full((30, 3), MIN_SPACING))
+
+
+def test_the_callers_points_are_not_shared():
+    points = torch.randn(5, 3)
+    gaussians = start(points, torch.rand(5, 3))
+    before = gaussians.means.detach().clone()
+    points += 1
+    assert torch.equal(gaussians.means, before)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"points": np.zeros((30, 2))}, "points and colors"),
+        ({"colors": np.zeros((29, 3), np.uint8)}, "points and colors"),
+        ({"points": np.zeros((3, 3)), "colors": np.zeros((3, 3), np.uint8)}, "at least 4"),
+        ({"points": np.full((30, 3), np.nan)}, "points has values"),
+        ({"colors": np.full((30, 3), np.inf)}, "colors has values"),
+        ({"init_opacity": 1.0}, "init_opacity"),
+        ({"init_opacity": 0.0}, "init_opacity"),
+    ],
+)
+def test_bad_input_is_named(cloud, change, message):
+    points, colors = cloud
+    with pytest.raises(ValueError, match=message):
+        start(**({"points": points, "colors": colors} | change))
