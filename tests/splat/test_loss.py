@@ -129,6 +129,16 @@ def test_flat_images_stay_finite(levels: tuple[float, float], noisy: bool) -> No
     assert image.grad.isfinite().all()
 
 
+def test_a_variance_below_zero_counts_as_zero() -> None:
+    # At these levels E[x^2] - E[x]^2 in float32 is as often below -C2 as above C2.
+    target = prepare_target(torch.ones(12, 15, 3))
+    for level in torch.linspace(200, 400, 100):
+        image = torch.full((12, 15, 3), level.item())
+        luminance = (2 * level + 1e-4) / (level**2 + 1 + 1e-4)
+        value = structural_similarity(image, target)
+        assert 0 <= value <= 1.2 * luminance
+
+
 def test_flat_images_have_the_ssim_of_their_levels() -> None:
     image, target = torch.full((2, 12, 15, 3), 0.0, dtype=torch.float64)
     image, target = image + 0.25, target + 0.5
