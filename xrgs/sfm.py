@@ -17,6 +17,7 @@ import pycolmap
 from numpy.typing import NDArray
 from tqdm import tqdm
 
+from xrgs import images
 from xrgs.images import Lens
 
 if TYPE_CHECKING:
@@ -25,6 +26,8 @@ if TYPE_CHECKING:
 #: Features over all images that keep exhaustive matching at minutes on two cores.
 _FEATURES_IN_ALL = 100_000
 _MOST_FEATURES = 8192
+#: Longer side, px, up to which features are sought at twice the resolution.
+_SMALL = 640
 #: Two views of a narrow baseline: the angle (degrees) below which a point tells nothing of depth.
 _TWO_VIEW_ANGLE = 0.2
 #: Where a PINHOLE camera's parameters stand in K.
@@ -54,9 +57,18 @@ class Reconstruction:
     report: dict[str, Any]
 
 
-def features_for(images: int, asked: int) -> int:
+def features_for(count: int, asked: int) -> int:
     """Features an image: what was asked for, or (0) what keeps exhaustive matching quick."""
-    return asked or min(_MOST_FEATURES, _FEATURES_IN_ALL // max(images, 1))
+    return asked or min(_MOST_FEATURES, _FEATURES_IN_ALL // max(count, 1))
+
+
+def first_octave(long_side: int) -> int:
+    """SIFT's first octave: 0, the recipe's, or -1 (twice as fine) for small images.
+
+    On the embedded scene, mixed, -1 gave 1.7 to 2 times the points and 4 to 20% less position
+    error at 250 and at 500 px.
+    """
+    return -1 if long_side <= _SMALL else 0
 
 
 def reconstruct(shots: Sequence[Shot], folder: Path, work: Path, conf: SfmConf) -> Reconstruction:
@@ -79,6 +91,7 @@ def reconstruct(shots: Sequence[Shot], folder: Path, work: Path, conf: SfmConf) 
     _match(shots, database, work, threads or 1)
     models = _map(shots, folder, database, work, conf, threads or 1)
     report = {
+        "first_octave": first_octave(max(images.size(folder / shots[0].file))),
         "images": len(shots),
         "lr_images": conf.lr_images,
         "max_num_features": max_features,
@@ -108,7 +121,7 @@ def _extract(
     options = pycolmap.FeatureExtractionOptions()
     options.num_threads = threads
     options.sift.max_num_features = max_features
-    options.sift.first_octave = globals().get("_FIRST", 0)
+    options.sift.first_octave = first_octave(max(images.size(folder / shots[0].file)))
     cameras: dict[str, int] = {}
     with _bar(len(shots), "SfM: features") as bar:
         for camera, batch in _batches(shots, 2 * threads):
@@ -180,20 +193,20 @@ def _map(
     return list(models.values())
 
 
-def mapping_options(conf: SfmConf, images: int, *, known: bool) -> Any:
+def mapping_options(conf: SfmConf, count: int, *, known: bool) -> Any:
     """COLMAP's `IncrementalPipelineOptions` for so many images, intrinsics known or not."""
     options = pycolmap.IncrementalPipelineOptions()
     options.random_seed = conf.seed
     options.mapper.init_min_tri_angle = conf.init_min_tri_angle
-    options.min_model_size = min(images, options.min_model_size)
-    if images == 2:
+    options.min_model_size = min(count, options.min_model_size)
+    if count == 2:
         # By default every point that only two images see is dropped: here that is all of them.
         options.triangulation.ignore_two_view_tracks = False
         options.triangulation.min_angle = _TWO_VIEW_ANGLE
         options.mapper.filter_min_tri_angle = _TWO_VIEW_ANGLE
         options.mapper.init_min_tri_angle = _TWO_VIEW_ANGLE
         options.mapper.init_max_forward_motion = 1.0
-    if known or images == 2:  # two views can't tell a focal length from a depth
+    if known or count == 2:  # two views can't tell a focal length from a depth
         options.ba_refine_focal_length = False
         options.ba_refine_extra_params = False
         options.mapper.abs_pose_refine_focal_length = False

@@ -8,7 +8,6 @@ other file), `images/<split>/<view>.png`, `points.npz`, `report.json` (how SfM w
 from __future__ import annotations
 
 import fcntl
-import hashlib
 import json
 import logging
 import shutil
@@ -21,8 +20,9 @@ from zipfile import BadZipFile
 
 import numpy as np
 
-from xrgs import scenes
+from xrgs import scenes, split
 from xrgs.errors import XrgsError
+from xrgs.hashing import digest, file_digest
 from xrgs.views import SceneFailed, Variant, View
 
 if TYPE_CHECKING:
@@ -34,7 +34,6 @@ __all__ = [
     "Variant",
     "View",
     "build",
-    "ensure",
     "find",
     "key",
     "load",
@@ -79,8 +78,8 @@ def load(folder: Path) -> Variant:
         content = json.loads((folder / "variant.json").read_text(encoding="utf-8"))
         if content["id"] != _id(content):
             raise CorruptVariant(f"{folder / 'variant.json'}: not what was written")
-        for name, digest in content["files"].items():
-            if _sha256(folder / name) != digest:
+        for name, expected in content["files"].items():
+            if file_digest(folder / name) != expected:
                 raise CorruptVariant(f"{folder / name}: not what was written")
         with np.load(folder / "points.npz") as stored:
             points, colors = stored["points"], stored["colors"]
@@ -101,52 +100,47 @@ def load(folder: Path) -> Variant:
         raise CorruptVariant(f"{folder}: not a whole variant ({error!r})") from error
 
 
-def ensure(scene: SceneConf, conf: VariantConf, store: Path) -> Variant:
-    """The variant of a scene: the frozen one, or built now. Any number of processes may ask.
+def build(scene: SceneConf, conf: VariantConf, variants: Path, cache: Path) -> Variant:
+    """The variant of a scene: the frozen one, or made now. Any number of processes may ask.
 
     Args:
         scene: Where the photographs are from.
         conf: What is made of them.
-        store: Has the folders `scenes` and `variants`.
-
-    Raises:
-        SceneFailed: SfM can't place enough views.
-        XrgsError: something of the config or the photographs is wrong; the message names it.
-    """
-    wanted, variants = key(scene, conf), store / "variants"
-    variants.mkdir(parents=True, exist_ok=True)
-    with _locked(variants / f".{wanted}.lock"):
-        found = find(variants, wanted)
-        if found is not None:
-            return found
-        for stale in (*variants.glob(f"{wanted}-*"), *variants.glob(f".{wanted}.building*")):
-            shutil.rmtree(stale)
-        return build(scenes.resolve(scene, store / "scenes", conf.long_side), conf, variants)
-
-
-def build(scene: scenes.Scene, conf: VariantConf, variants: Path) -> Variant:
-    """Make and freeze a variant in a new folder of `variants`. One process at a time: see `ensure`.
+        variants: Folder of frozen variants.
+        cache: Folder of rendered scenes.
 
     Raises:
         SceneFailed: SfM can't place enough views; its report stays in `variants/failed-<key>`.
         XrgsError: something of the config or the photographs is wrong; the message names it.
     """
-    from xrgs import mixing  # noqa: PLC0415  brings pycolmap
+    split.check(conf)
+    wanted = key(scene, conf)
+    variants.mkdir(parents=True, exist_ok=True)
+    with _locked(variants / f".{wanted}.lock"):
+        found = find(variants, wanted)
+        if found is not None:
+            return found
+        for corrupt in variants.glob(f"{wanted}-*"):
+            shutil.rmtree(corrupt)
+        resolved = scenes.resolve(scene, cache, conf.long_side)
+        return _make(resolved, conf, wanted, variants)
 
-    wanted = _key(scene.fingerprint, conf)
+
+def _make(scene: scenes.Scene, conf: VariantConf, wanted: str, variants: Path) -> Variant:
+    """Mix and freeze; whatever a killed process left of it is cleared first."""
+    from xrgs import mixing
+
     work, failed = variants / f".{wanted}.building", variants / f"failed-{wanted}"
     shutil.rmtree(work, ignore_errors=True)
     shutil.rmtree(failed, ignore_errors=True)
     frozen = work / "frozen"
     frozen.mkdir(parents=True)
     try:
-        made = mixing.mix(scene, conf, work, frozen)
+        return _freeze(mixing.mix(scene, conf, work, frozen), wanted, frozen, variants)
     except SceneFailed as error:
         _write_json(frozen / "report.json", error.report)
         frozen.rename(failed)
         raise SceneFailed(f"{error} Report: {failed}", error.report) from None
-    else:
-        return _freeze(made, wanted, frozen, variants)
     finally:
         shutil.rmtree(work, ignore_errors=True)
 
@@ -162,7 +156,7 @@ def _freeze(made: Variant, wanted: str, folder: Path, variants: Path) -> Variant
         "factor": made.factor,
         "held_out": made.held_out,
         "views": [_entry(folder, view) for view in made.views],
-        "files": {f.relative_to(folder).as_posix(): _sha256(f) for f in files},
+        "files": {f.relative_to(folder).as_posix(): file_digest(f) for f in files},
     }
     content["id"] = _id(content)
     _write_json(folder / "variant.json", content)
@@ -173,16 +167,14 @@ def _freeze(made: Variant, wanted: str, folder: Path, variants: Path) -> Variant
 
 def _key(fingerprint: str, conf: VariantConf) -> str:
     here = Path(__file__).parent
-    code = [hashlib.sha256((here / name).read_bytes()).hexdigest() for name in _CODE]
-    made_from = json.dumps([fingerprint, asdict(conf), code], sort_keys=True)
-    return hashlib.sha256(made_from.encode()).hexdigest()[:16]
+    code = [file_digest(here / name) for name in _CODE]
+    return digest([fingerprint, asdict(conf), code])
 
 
 def _id(content: dict[str, Any]) -> str:
     """Hash of everything in `variant.json` but the id and the label, after the key."""
     hashed = {k: v for k, v in content.items() if k not in ("id", "scene")}
-    digest = hashlib.sha256(json.dumps(hashed, sort_keys=True).encode()).hexdigest()
-    return f"{content['key']}-{digest[:16]}"
+    return f"{content['key']}-{digest(hashed)}"
 
 
 def _entry(folder: Path, view: View) -> dict[str, Any]:
@@ -194,11 +186,6 @@ def _entry(folder: Path, view: View) -> dict[str, Any]:
 def _view(folder: Path, entry: dict[str, Any]) -> View:
     arrays = {name: np.array(entry[name], dtype=np.float64) for name in ("K", "viewmat")}
     return View(**(entry | {"file": folder / entry["file"]} | arrays))
-
-
-def _sha256(file: Path) -> str:
-    with file.open("rb") as stream:
-        return hashlib.file_digest(stream, "sha256").hexdigest()
 
 
 def _write_json(file: Path, content: dict[str, Any]) -> None:

@@ -87,7 +87,7 @@ def _render(conf: SceneConf, home: Path, long_side: int) -> None:
     home.parent.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(dir=home.parent, prefix=".rendering-") as temporary:
         made = Path(temporary) / "images"
-        from xrgs.scenes import still_life  # noqa: PLC0415  brings torch
+        from xrgs.scenes import still_life
 
         still_life.render(made, long_side, conf.views)
         try:

@@ -19,7 +19,7 @@ from xrgs.scenes.bundled import photograph
 FULL_SIDE = 1008
 _FOCAL = 0.9  # image widths
 _FOCUS = np.array([0.0, 0.1, 5.5])  # every camera looks here
-_REACH = np.array([0.75, 0.45, 0.25])  # half size of the box the cameras stand in
+_REACH = np.array([1.1, 0.7, 0.4])  # half size of the box the cameras stand in
 
 #: Name in the scene: file in scikit-image's wheel, and the tint of the grey ones.
 TEXTURES: dict[str, tuple[str, tuple[float, float, float]]] = {

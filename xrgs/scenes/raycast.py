@@ -19,7 +19,7 @@ from torch.nn.functional import avg_pool2d, grid_sample
 _NEAR = 0.05
 #: The light comes from above, the left and the cameras' side (y points down).
 _LIGHT = torch.tensor([-0.35, -0.75, -0.56])
-_AMBIENT = 0.6
+_AMBIENT = 0.75
 #: A ball's texture is centred on its -z pole and reaches the border this far round, in radians.
 _BALL_REACH = 0.6 * math.pi
 

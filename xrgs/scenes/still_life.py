@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from tqdm import tqdm
 
 from xrgs import images
@@ -24,9 +28,9 @@ def _wall(texture: str, left: float, top: float, width: float, height: float, z:
     return Quad(texture, corner, torch.tensor([width, 0.0, 0.0]), torch.tensor([0.0, height, 0.0]))
 
 
-def _floor(texture: str, left: float, y: float, width: float, far: float) -> Quad:
-    """A level rectangle from `far` to nearly below the cameras."""
-    depth = torch.tensor([0.0, 0.0, 1.5 - far])
+def _floor(texture: str, left: float, y: float, width: float, far: float, length: float) -> Quad:
+    """A level rectangle from `far` towards the cameras; a negative width mirrors its texture."""
+    depth = torch.tensor([0.0, 0.0, -length])
     return Quad(texture, torch.tensor([left, y, far]), torch.tensor([width, 0.0, 0.0]), depth)
 
 
@@ -48,19 +52,23 @@ def _box(
 def solids() -> list[Quad | Ball]:
     """Everything in the scene, world units."""
     floor = 1.5
-    placed: list[Quad | Ball] = [
-        # Mirrored copies: finer bricks, and no two alike a fixed step apart for SfM to confuse.
-        _wall("brick", 0.0, -1.5, -7.0, -4.0, 8.0),
-        _wall("brick", 0.0, -1.5, 7.0, -4.0, 8.0),
-        _wall("brick", 0.0, -1.5, -7.0, 4.0, 8.0),
-        _wall("brick", 0.0, -1.5, 7.0, 4.0, 8.0),
-        _floor("gravel", 0.0, floor, -6.0, 8.0),
-        _floor("gravel", 0.0, floor, 6.0, 8.0),
-        _wall("astronaut", -4.1, -2.9, 2.0, 2.0, 7.9),
-        _wall("stars", 1.1, -3.0, 2.6, 2.27, 7.9),
-        _wall("page", -1.5, -2.6, 2.0, 1.0, 7.9),
-        _wall("tissue", -1.3, -0.9, 1.5, 1.5, 7.6),
-        Ball("retina", torch.tensor([0.9, -0.75, 6.1]), 0.55),
+    placed: list[Quad | Ball] = []
+    # Mirrored tiles: fine texture, and no two alike a fixed step apart for SfM to confuse.
+    for x, y in itertools.product((-7.0, 7.0), (-4.0, 4.0)):
+        placed.append(_wall("brick", 0.0, -1.5, x, y, 8.0))
+    for left, width, far in itertools.product((-3.0, 3.0), (-3.0, 3.0), (8.0, 4.5)):
+        placed.append(_floor("gravel", left, floor, width, far, 3.5))
+    placed += [
+        _wall("astronaut", -4.3, -3.1, 2.0, 2.0, 7.9),
+        _wall("coins", -2.0, -3.3, 1.5, 1.18, 7.9),
+        _wall("page", -0.2, -3.2, 1.6, 0.8, 7.9),
+        _wall("stars", 1.7, -3.2, 2.4, 2.09, 7.9),
+        _wall("leaves", -4.5, -0.5, 2.0, 2.0, 7.4),
+        _wall("leaves", -0.5, -0.5, -2.0, 2.0, 7.4),
+        _wall("leaves", -0.5, -0.5, 2.0, 2.0, 7.4),
+        _wall("leaves", 3.5, -0.5, -2.0, 2.0, 7.4),
+        _wall("tissue", -1.75, -1.6, 1.3, 1.3, 6.9),
+        Ball("retina", torch.tensor([0.9, -0.9, 6.1]), 0.55),
         Ball("moon", torch.tensor([0.15, 0.95, 4.6]), 0.55),
         Ball("leaves", torch.tensor([3.2, 0.75, 6.6]), 0.9),
         Ball("coins", torch.tensor([1.15, 1.2, 3.9]), 0.3),
@@ -70,9 +78,8 @@ def solids() -> list[Quad | Ball]:
     placed += _box("cat", (-3.1, floor, 6.6), (1.5, 2.0, 0.6), 20.0)
     placed += _box("page", (-0.6, floor, 3.7), (0.5, 0.25, 0.7), -20.0)
     for k in range(6):  # thin rails in front of everything: edges that hide and uncover
-        placed += _box(
-            "bark", (-2.1 + 0.16 * k, floor, 3.4 + 0.12 * k), (0.05, 1.6, 0.05), 15.0 * k
-        )
+        foot = (-2.1 + 0.16 * k, floor, 3.4 + 0.12 * k)
+        placed += _box("bark", foot, (0.05, 1.6, 0.05), 15.0 * k)
     return placed
 
 
@@ -93,9 +100,26 @@ def render(folder: Path, long_side: int, views: int) -> None:
     width, height = procedural.camera_size(long_side)
     K = torch.from_numpy(procedural.intrinsics(width, height))
     scene, skins = solids(), textures()
-    todo = list(zip(procedural.names(views), procedural.viewmats(views), strict=True))
-    for name, viewmat in tqdm(todo, desc="rendering the scene", delay=2, leave=False):
-        image = raycast.render(
-            scene, skins, K, torch.from_numpy(viewmat), width, height, SUPERSAMPLE
-        )
+
+    def take(name: str, viewmat: NDArray[np.float64]) -> None:
+        pose = torch.from_numpy(viewmat)
+        image = raycast.render(scene, skins, K, pose, width, height, SUPERSAMPLE)
         images.save(folder / f"{name}.png", image.numpy())
+
+    names, poses = procedural.names(views), procedural.viewmats(views)
+    with _a_thread_a_view() as pool:
+        done = pool.map(take, names, poses)
+        for _ in tqdm(done, total=views, desc="rendering the scene", delay=2, leave=False):
+            pass
+
+
+@contextmanager
+def _a_thread_a_view() -> Iterator[ThreadPoolExecutor]:
+    """Threads over views, none inside them: on a busy machine torch's own wait for each other."""
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        with ThreadPoolExecutor(threads) as pool:
+            yield pool
+    finally:
+        torch.set_num_threads(threads)
