@@ -385,6 +385,14 @@ def test_the_same_seed_splits_the_same() -> None:
     assert not torch.equal(first, other)
 
 
+def test_a_view_that_depends_on_no_gaussian_is_not_noted() -> None:
+    ours = Ours(uniform(2), DensifySettings(), 0)
+    ours.densify(599, seen(2, norm=1.0))
+    nothing = torch.zeros(2, dtype=torch.bool)
+    done = ours.densifier.after_step(600, None, nothing, width=WIDTH, height=HEIGHT)
+    assert done == Refinement(duplicated=2)
+
+
 def test_statistics_start_again_after_a_refinement() -> None:
     config = replace(DensifySettings(), grow_grad2d=10.0)
     ours = Ours(uniform(2), config, 0)

@@ -88,13 +88,14 @@ class Densifier:
         self._forget()
 
     def after_step(
-        self, step: int, means2d_grad: Tensor, visible: Tensor, *, width: int, height: int
+        self, step: int, means2d_grad: Tensor | None, visible: Tensor, *, width: int, height: int
     ) -> Refinement:
         """Note a step's statistics and, when it is time, refine and reset.
 
         Args:
             step: From 0, after the optimizer's step.
-            means2d_grad: [N, 2] gradient of the loss by the projected means, per px.
+            means2d_grad: [N, 2] gradient of the loss by the projected means, per px; None where
+                the render depends on no Gaussian, and then nothing is noted.
             visible: [N] bool, seen by this step's view.
             width: Of the view, px.
             height: Of the view, px.
@@ -105,7 +106,8 @@ class Densifier:
         settings = self.settings
         if step >= settings.stop:
             return Refinement()
-        self._observe(means2d_grad, visible, width, height)
+        if means2d_grad is not None:
+            self._observe(means2d_grad, visible, width, height)
         counts: dict[str, int] = {}
         if step > settings.start and step % settings.every == 0:
             counts |= self._drop_non_finite()
