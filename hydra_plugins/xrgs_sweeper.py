@@ -55,7 +55,7 @@ class XrgsSweeper(Sweeper):
         self._task = task_function
         self._config = config
 
-    def sweep(self, arguments: list[str]) -> Any:  # noqa: ANN401
+    def sweep(self, arguments: list[str]) -> Any:
         """Run the study."""
         from xrgs.sweep import Study
 

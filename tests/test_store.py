@@ -16,6 +16,7 @@ def done(tmp_path: Path) -> CellFolder:
     folder = CellFolder(tmp_path / "cells" / "abc")
     folder.begin({"seed": 0}, {"seed": 0})
     (folder.path / "scores.csv").write_text("view,psnr,ssim,lpips\na,20.5,0.75,\nb,30.0,0.5,\n")
+    (folder.path / "history.csv").write_text("step,loss\n0,0.5\n")
     write_json(folder.path / "summary.json", {"gaussians": 7})
     (folder.path / "renders").mkdir()
     (folder.path / "renders" / "a.png").write_bytes(b"1234")
@@ -26,11 +27,13 @@ def done(tmp_path: Path) -> CellFolder:
 def test_a_finished_cell_is_done_and_gives_back_what_was_written(done: CellFolder) -> None:
     assert done.state().name == "done"
     assert done.summary() == {"gaussians": 7}
-    assert done.config() == {"seed": 0}
-    assert done.protocol() == 1
-    scores = done.scores()
-    assert scores["psnr"].tolist() == [20.5, 30.0]
-    assert scores["lpips"].isna().all()
+    assert done.identity() == {"seed": 0}
+    assert done.history()["loss"].tolist() == [0.5]
+
+
+def test_declaring_a_cell_done_twice_keeps_it_done(done: CellFolder) -> None:
+    done.finish(["a", "b"], protocol=1)
+    assert done.state().name == "done"
 
 
 def test_a_cell_without_status_is_unfinished_and_an_absent_one_absent(done: CellFolder) -> None:
@@ -78,7 +81,7 @@ def test_beginning_again_sets_the_old_folder_aside(done: CellFolder) -> None:
     assert done.state().name == "unfinished"
     aside = sorted(path.name for path in done.path.parent.iterdir())
     assert aside == ["abc", "abc.aside-1", "abc.aside-2"]
-    assert CellFolder(done.path.with_name("abc.aside-1")).config() == {"seed": 0}
+    assert CellFolder(done.path.with_name("abc.aside-1")).identity() == {"seed": 0}
 
 
 def test_the_same_comparison_has_the_same_sweep_id(tmp_path: Path) -> None:

@@ -9,8 +9,8 @@ import traceback
 from typing import TYPE_CHECKING, Any
 
 from xrgs import dataset, evaluate, provenance
-from xrgs.splat import ply
 from xrgs.splat.backend import resolve_backend
+from xrgs.splat.ply import save_ply
 from xrgs.store import write_json, write_text
 from xrgs.train import train
 
@@ -26,13 +26,12 @@ def run(conf: Conf, variant: Variant, folder: CellFolder) -> None:
     """Train, evaluate and write a cell into its begun folder; its status is written last.
 
     Raises:
-        Exception: whatever went wrong, after `error.txt` and the status say so.
+        Exception: whatever went wrong, after `error.txt` says where.
     """
     try:
         _run(conf, variant, folder)
-    except Exception as error:
+    except Exception:
         write_text(folder.path / "error.txt", traceback.format_exc())
-        folder.fail(f"{type(error).__name__}: {error}")
         raise
 
 
@@ -42,7 +41,7 @@ def _run(conf: Conf, variant: Variant, folder: CellFolder) -> None:
     write_json(folder.path / "provenance.json", provenance.collect(threads, backend))
     data = dataset.load(variant)
     trained = train(data, conf)
-    ply.save(folder.path / "splats.ply", trained.gaussians)
+    save_ply(folder.path / "splats.ply", trained.gaussians)
     write_text(folder.path / "history.csv", _csv(trained.history))
     scores = evaluate.score(trained.gaussians, data.test, conf.splat, folder.path / "renders")
     write_text(folder.path / "scores.csv", _csv(scores))

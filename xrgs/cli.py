@@ -21,8 +21,35 @@ def _sweep(cfg: DictConfig) -> str:
     return run_job(cfg)
 
 
+_HELP = """\
+xrgs-sweep [+ablation=NAME[,NAME...]] [scene=NAME] [preset=NAME] [KEY=VALUE[,VALUE...]]...
+
+Trains the baseline and the ablations on mixed-resolution scenes; prints what changed, in percent.
+Commas make axes, +ablation=[a,b] stacks. Finished cells are found in the store and not run again.
+
+  +ablation=  {ablation}
+  scene=      {scene}
+  preset=     {preset}
+  +sweeps=    {sweeps}
+  seed=0,1    store=FOLDER    data_root=FOLDER    threads=N    dry_run=true
+
+--cfg job prints every key with its value; --hydra-help tells of Hydra's own flags.
+"""
+
+
+def _choices(group: str) -> str:
+    folder = config.CONF_DIR / group
+    folder = folder if folder.is_dir() else config.CONF_DIR.parent / group
+    files = sorted(folder.rglob("*.yaml"))
+    return ", ".join(file.relative_to(folder).with_suffix("").as_posix() for file in files)
+
+
 def sweep() -> None:
     """`xrgs-sweep [+ablation=NAME] [KEY=VALUE[,VALUE...]]...`."""
+    if {"-h", "--help"} & set(sys.argv[1:]):  # Hydra's own takes seconds to list its groups
+        groups = ("ablation", "scene", "preset", "sweeps")
+        print(_HELP.format(**{group: _choices(group) for group in groups}))  # noqa: T201
+        return
     config.register()
     # `ablation` is not in the defaults list, so Hydra wants the plus; people forget it.
     sys.argv[1:] = ["+" + a if a.startswith("ablation=") else a for a in sys.argv[1:]]

@@ -166,7 +166,7 @@ def to_conf(cfg: DictConfig) -> Conf:
     return from_dict(OmegaConf.to_container(known, resolve=True, throw_on_missing=True))
 
 
-def from_dict(values: Any) -> Conf:  # noqa: ANN401
+def from_dict(values: Any) -> Conf:
     """The config that `dataclasses.asdict` wrote."""
     conf = OmegaConf.to_object(OmegaConf.merge(OmegaConf.structured(Conf), values))
     if not isinstance(conf, Conf):

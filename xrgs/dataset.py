@@ -13,7 +13,7 @@ from tqdm import tqdm
 
 from xrgs import images
 from xrgs.splat.cameras import Camera
-from xrgs.splat.normalize import normalize
+from xrgs.splat.normalize import normalize_scene
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
@@ -56,7 +56,7 @@ def load(variant: Variant) -> Dataset:
         ImageError: an image is missing or unreadable; the message names it.
     """
     viewmats = np.stack([view.viewmat for view in variant.views])
-    world = normalize(viewmats, variant.points)
+    world = normalize_scene(viewmats, variant.points)
     loaded = [
         _load_view(view, viewmat)
         for view, viewmat in zip(variant.views, world.viewmats, strict=True)

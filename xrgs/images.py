@@ -122,8 +122,8 @@ def save(path: Path, image: Photo) -> None:
 
 def resize(image: Photo, width: int, height: int) -> Photo:
     """Antialiased bicubic to an exact size, not clamped (torch's kernel, PIL's to 5e-5)."""
-    import torch  # noqa: PLC0415
-    from torch.nn.functional import interpolate  # noqa: PLC0415
+    import torch
+    from torch.nn.functional import interpolate
 
     if image.shape[:2] == (height, width):
         return image
@@ -144,7 +144,7 @@ def straighten(image: Photo, lens: Lens) -> Photo:
         raise ValueError(f"image {image.shape[:2]}, lens {(lens.height, lens.width)}")
     if lens.k == 0:
         return image
-    from skimage.transform import warp  # noqa: PLC0415
+    from skimage.transform import warp
 
     columns, rows = np.meshgrid(np.arange(lens.width) + 0.5, np.arange(lens.height) + 0.5)
     zoom = lens.straightened().fx / lens.fx

@@ -27,6 +27,7 @@ if TYPE_CHECKING:
 _VERIFIED_BY_HASH = frozenset(
     {"config.json", "identity.json", "scores.csv", "summary.json", "history.csv"}
 )
+_NOT_RESULTS = frozenset({"log.txt", "status.json"})
 _RECORD_VERSION = 1
 
 
@@ -54,7 +55,7 @@ def write_json(path: Path, value: object) -> None:
     write_text(path, json.dumps(value, indent=1, sort_keys=True, ensure_ascii=False) + "\n")
 
 
-def read_json(path: Path) -> Any:  # noqa: ANN401
+def read_json(path: Path) -> Any:
     """The JSON in a file.
 
     Raises:
@@ -131,7 +132,7 @@ class CellFolder:
                 "sha256": file_digest(file),
             }
             for file in sorted(self.path.rglob("*"))
-            if file.is_file() and file.name != "log.txt"
+            if file.is_file() and file.name not in _NOT_RESULTS
         }
         self._set_status(
             {
@@ -150,10 +151,6 @@ class CellFolder:
     def _set_status(self, status: Mapping[str, Any]) -> None:
         write_json(self.path / "status.json", status)
 
-    def config(self) -> dict[str, Any]:
-        """The resolved config."""
-        return dict(read_json(self.path / "config.json"))
-
     def identity(self) -> dict[str, Any]:
         """What the cell's id is the digest of."""
         return dict(read_json(self.path / "identity.json"))
@@ -165,16 +162,6 @@ class CellFolder:
     def provenance(self) -> dict[str, Any]:
         """Where, when and with what the cell was run."""
         return dict(read_json(self.path / "provenance.json"))
-
-    def protocol(self) -> int:
-        """Version of the evaluation protocol that scored it."""
-        return int(read_json(self.path / "status.json")["protocol"])
-
-    def scores(self) -> pd.DataFrame:
-        """One row a test view: `view` and a column a metric, NaN where there is none."""
-        import pandas as pd
-
-        return pd.read_csv(self.path / "scores.csv", dtype={"view": str}, keep_default_na=True)
 
     def history(self) -> pd.DataFrame:
         """One row a logged step."""
@@ -225,7 +212,7 @@ class Store:
                 pass
         except OSError as error:
             raise StoreError(
-                f"store={self.path} can't be written ({error}): choose another folder with store=..."
+                f"store={self.path} can't be written ({error}): name another with store=..."
             ) from error
 
     def cell(self, cell_id: str) -> CellFolder:

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import itertools
 import sys
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -116,7 +116,7 @@ class Planned:
     conf: Conf
     variant_id: str | None = None
     cell_id: str | None = None
-    state: State = State("absent")
+    state: State = field(default_factory=lambda: State("absent"))
     error: str | None = None
     """Why the cell can't be run: its scene failed."""
 
@@ -275,7 +275,6 @@ def run_job(cfg: DictConfig) -> str:
     try:
         worker.run("cell", request)
     except XrgsError as error:
-        if folder.state().name != "failed":
-            folder.fail(str(error))
+        folder.fail(str(error))
         _say(f"{folder.id} failed: {error}")
     return folder.state().name

@@ -6,7 +6,7 @@ import dataclasses
 import time
 from collections import Counter
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 import torch
 
@@ -79,10 +79,11 @@ def train(data: Dataset, conf: Conf) -> Trained:
 
     start = time.perf_counter()
     for step, view in progress(endless(data.train, conf.seed, steps), "training", "step", steps):
+        camera = view.camera
         offset = torch.zeros(len(gaussians), 2, requires_grad=True)
         render = rasterize(
             *gaussians.activated(),
-            view.camera,
+            camera,
             splat.raster,
             sh_degree=min(step // sh_every, splat.raster.sh_degree),
             means2d_offset=offset,
@@ -93,12 +94,13 @@ def train(data: Dataset, conf: Conf) -> Trained:
         )
         loss = parts.loss(loss, render.image, view)
         optimizer.zero_grad()
-        loss.backward()
+        torch.autograd.backward(loss)
         parts.after_backward(view, gaussians)
         ledger.note(step, view, loss, render, optimizer)
         optimizer.step()
+        means2d_grad = cast("torch.Tensor", offset.grad)
         done = densifier.after_step(
-            step, offset.grad, render.visible, width=view.camera.width, height=view.camera.height
+            step, means2d_grad, render.visible, width=camera.width, height=camera.height
         )
         ledger.refined(done)
     return ledger.close(gaussians, time.perf_counter() - start)

@@ -11,6 +11,7 @@ import signal
 import subprocess
 import sys
 import tempfile
+import traceback
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -21,7 +22,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
 
 
-class WorkerFailed(XrgsError):
+class WorkerError(XrgsError):
     """The child said why it failed, or died without a word."""
 
 
@@ -33,7 +34,7 @@ def run(job: str, request: Mapping[str, Any]) -> dict[str, Any]:
         request: what it is to do, as plain JSON values.
 
     Raises:
-        WorkerFailed: the job failed; the message is its reason.
+        WorkerError: the job failed; the message is its reason.
     """
     with tempfile.TemporaryDirectory(prefix="xrgs-") as folder:
         request_file, answer_file = Path(folder) / "request.json", Path(folder) / "answer.json"
@@ -41,10 +42,10 @@ def run(job: str, request: Mapping[str, Any]) -> dict[str, Any]:
         command = [sys.executable, "-m", "xrgs.worker", job, str(request_file), str(answer_file)]
         code = subprocess.run(command, check=False).returncode  # noqa: S603
         if not answer_file.exists():
-            raise WorkerFailed(_death(code))
+            raise WorkerError(_death(code))
         answer = dict(read_json(answer_file))
     if "error" in answer:
-        raise WorkerFailed(str(answer["error"]))
+        raise WorkerError(str(answer["error"]))
     return answer
 
 
@@ -86,12 +87,15 @@ _JOBS: dict[str, Callable[[Mapping[str, Any]], dict[str, Any]]] = {
 
 
 def main(job: str, request: str, answer: str) -> None:
-    """The child: do the job, write the answer or the user's error; other errors raise."""
+    """The child: do the job and write the answer, or what went wrong."""
     faulthandler.enable()
     try:
         result = _JOBS[job](json.loads(Path(request).read_text(encoding="utf-8")))
     except XrgsError as error:
         result = {"error": str(error)}
+    except Exception as error:
+        traceback.print_exc()
+        result = {"error": f"{type(error).__name__}: {error}"}
     write_json(Path(answer), result)
 
 

@@ -189,7 +189,7 @@ def test_a_report_needs_no_torch(study: Any) -> None:
         "build(Path(sys.argv[1])); assert 'torch' not in sys.modules; "
         "assert 'matplotlib.pyplot' not in sys.modules"
     )
-    subprocess.run(  # noqa: S603
+    subprocess.run(
         [sys.executable, "-W", "error", "-c", code, str(study.store.path)],
         check=True,
         env={"PYTHONPATH": str(Path(xrgs.__file__).parents[1])},

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import copy
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from types import SimpleNamespace
 from typing import Any
 
@@ -314,7 +314,6 @@ def test_each_rule_is_counted_once() -> None:
     assert early.densify(600, seen(5)) == Refinement(pruned_non_finite=1, pruned_opacity=2)
     did = late.densify(3100, seen(5))
     assert did == Refinement(pruned_non_finite=1, pruned_opacity=2, pruned_scale=1)
-    assert did.removed == 4
     assert torch.equal(late.gaussians.means.detach(), values["means"][4:])
 
 
@@ -375,14 +374,12 @@ def test_the_halves_of_a_split_follow_the_old_gaussians_shape() -> None:
 
 
 def test_the_same_seed_splits_the_same() -> None:
-    values = uniform(30, scale=0.1)
-    runs = [Ours(values, DensifySettings(), seed) for seed in (5, 5, 6)]
+    runs = [Ours(uniform(30, scale=0.1), DensifySettings(), seed) for seed in (5, 5, 6)]
     for run in runs:
         torch.rand(3)  # the global generator is another
         run.densify(600, seen(30, norm=1.0))
-    first, again, other = (run.gaussians.means for run in runs)
-    assert torch.equal(first, again)
-    assert not torch.equal(first, other)
+    assert torch.equal(runs[0].gaussians.means, runs[1].gaussians.means)
+    assert not torch.equal(runs[0].gaussians.means, runs[2].gaussians.means)
 
 
 def test_a_view_that_depends_on_no_gaussian_is_not_noted() -> None:
@@ -394,8 +391,7 @@ def test_a_view_that_depends_on_no_gaussian_is_not_noted() -> None:
 
 
 def test_statistics_start_again_after_a_refinement() -> None:
-    config = replace(DensifySettings(), grow_grad2d=10.0)
-    ours = Ours(uniform(2), config, 0)
+    ours = Ours(uniform(2), DensifySettings(grow_grad2d=10.0), 0)
     ours.densify(599, seen(2, norm=1.0))
     assert (ours.densifier.seen == 1).all()
     assert (ours.densifier.gradient == 1).all()

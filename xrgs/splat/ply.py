@@ -34,7 +34,7 @@ def save_ply(path: Path, gaussians: Gaussians) -> None:
         gaussians.means,
         torch.zeros_like(gaussians.means),  # normals, which viewers expect and no one reads
         gaussians.sh0[:, 0],
-        gaussians.shN.transpose(1, 2).reshape(count, -1),
+        gaussians.shN.transpose(1, 2).flatten(1),
         gaussians.opacities[:, None],
         gaussians.scales,
         gaussians.quats,

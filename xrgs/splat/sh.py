@@ -86,8 +86,8 @@ def sh_to_colors(degree: int, dirs: Tensor, sh0: Tensor, shN: Tensor) -> Tensor:
         raise ValueError(f"sh_degree {degree} needs shN of [N, {rest}, 3], got {list(shN.shape)}")
     basis = sh_basis(degree, dirs)  # [N, K]
     colors = basis[:, :1] * sh0[:, 0]  # [N, 3]
-    if rest:
-        colors = colors + torch.einsum("nk,nkc->nc", basis[:, 1:], shN[:, :rest])
+    # Also with no band on, so that shN has a gradient (0) and its Adam steps count, as in gsplat.
+    colors = colors + torch.einsum("nk,nkc->nc", basis[:, 1:], shN[:, :rest])
     return (colors + 0.5).clamp_min(0.0)
 
 
