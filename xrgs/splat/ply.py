@@ -19,6 +19,7 @@ from xrgs.splat.sh import MAX_DEGREE, bases
 
 MAX_HEADER_LINES = 512
 MAX_LINE_BYTES = 1024
+_NORMALS = ("nx", "ny", "nz")
 _MAGIC = b"ply\n"
 _FORMAT = "format binary_little_endian 1.0"
 
@@ -72,13 +73,14 @@ def load_ply(path: Path) -> Gaussians:
     table = np.frombuffer(body, dtype="<f4").reshape(count, len(names))
     if not np.isfinite(table).all():
         raise XrgsError(f"{path}: has values that are not finite")
-    return _gaussians({name: table[:, i] for i, name in enumerate(names)}, path)
+    return _gaussians(table, names, path)
 
 
 def _properties(rest: int) -> list[str]:
     """Names of a vertex's columns, with `rest` SH coefficients a channel above band 0."""
     return [
-        *("x", "y", "z", "nx", "ny", "nz"),
+        *("x", "y", "z"),
+        *_NORMALS,
         *(f"f_dc_{i}" for i in range(3)),
         *(f"f_rest_{i}" for i in range(3 * rest)),
         "opacity",
@@ -120,33 +122,22 @@ def _is_count(digits: str) -> bool:
     return digits.isascii() and digits.isdigit() and len(digits) <= 12
 
 
-def _gaussians(columns: dict[str, NDArray[np.float32]], path: Path) -> Gaussians:
-    """The parameters that the named columns [N] hold."""
-    stored = sum(name.startswith("f_rest_") for name in columns)
+def _gaussians(table: NDArray[np.float32], names: list[str], path: Path) -> Gaussians:
+    """The parameters that a table [N, columns] of named columns holds."""
+    stored = sum(name.startswith("f_rest_") for name in names)
     if stored not in {3 * (bases(degree) - 1) for degree in range(MAX_DEGREE + 1)}:
         raise XrgsError(f"{path}: {stored} f_rest properties are no whole number of SH bands")
-    missing = [name for name in _properties(stored // 3) if name not in columns and name[0] != "n"]
+    needed = [name for name in _properties(stored // 3) if name not in _NORMALS]
+    missing = [name for name in needed if name not in names]
     if missing:
         raise XrgsError(f"{path}: properties are missing: {', '.join(missing)}")
-
-    def gather(*names: str) -> torch.Tensor:
-        return torch.from_numpy(np.stack([columns[name] for name in names], axis=1).copy())
-
-    def numbered(prefix: str, number: int) -> torch.Tensor:
-        return gather(*(f"{prefix}_{i}" for i in range(number)))
-
-    count = len(columns["x"])
-    rest = (
-        numbered("f_rest", stored).reshape(count, 3, -1).transpose(1, 2).contiguous()
-        if stored
-        else torch.zeros((count, 0, 3))
-    )
-    tensors = {
-        "means": gather("x", "y", "z"),
-        "quats": numbered("rot", 4),
-        "scales": numbered("scale", 3),
-        "opacities": gather("opacity")[:, 0],
-        "sh0": numbered("f_dc", 3)[:, None],
-        "shN": rest,
-    }
-    return Gaussians(**{name: value.requires_grad_() for name, value in tensors.items()})
+    # In a fixed order whatever the file's, so that the parameters can be cut out one by one.
+    ordered = torch.from_numpy(table[:, [names.index(name) for name in needed]])
+    widths = {"means": 3, "sh0": 3, "shN": stored, "opacities": 1, "scales": 3, "quats": 4}
+    parts = dict(zip(widths, ordered.split(list(widths.values()), dim=1), strict=True))
+    parts["opacities"] = parts["opacities"][:, 0]
+    parts["sh0"] = parts["sh0"][:, None]
+    parts["shN"] = parts["shN"].reshape(len(table), 3, stored // 3).transpose(1, 2)
+    contiguous = torch.contiguous_format
+    leaves = {name: value.clone(memory_format=contiguous) for name, value in parts.items()}
+    return Gaussians(**{name: value.requires_grad_() for name, value in leaves.items()})

@@ -1,0 +1,194 @@
+import numpy as np
+import pytest
+import torch
+
+from xrgs.splat.cameras import Camera
+from xrgs.splat.normalize import (
+    camera_positions,
+    normalize_scene,
+    principal_axes,
+    rotation_between,
+    similarity_from_cameras,
+    transform_points,
+    transform_viewmats,
+)
+from xrgs.splat.rasterize import rasterize
+from xrgs.splat.settings import RasterSettings
+
+
+def turn(rng):
+    q, _ = np.linalg.qr(rng.normal(size=(3, 3)))
+    return q * np.linalg.det(q)
+
+
+def similarity(rng, scale):
+    matrix = np.eye(4)
+    matrix[:3, :3] = scale * turn(rng)
+    matrix[:3, 3] = rng.normal(size=3)
+    return matrix
+
+
+@pytest.fixture
+def world():
+    """Seven cameras that look at a cloud, more or less forward-facing; up is -y, roughly."""
+    rng = np.random.default_rng(0)
+    points = rng.normal(size=(300, 3)) * (2.0, 1.0, 0.3) + (0.5, 0.2, 6.0)
+    viewmats = np.tile(np.eye(4), (7, 1, 1))
+    for viewmat in viewmats:
+        small = rotation_between(
+            np.array([0.0, 0, 1]), (d := rng.normal(size=3) * 0.1 + (0, 0, 1)) / np.linalg.norm(d)
+        )
+        viewmat[:3, :3] = small
+        viewmat[:3, 3] = -small @ (rng.normal(size=3) * (1.0, 0.5, 0.2))
+    return viewmats, points
+
+
+def seen(viewmats, points):
+    """Coordinates of all points in all cameras: [C, P, 3]."""
+    return np.einsum("cij,pj->cpi", viewmats[:, :3, :3], points) + viewmats[:, None, :3, 3]
+
+
+def test_what_cameras_see_only_changes_its_scale(world):
+    normalized = normalize_scene(*world)
+    scale = np.cbrt(np.linalg.det(normalized.transform[:3, :3]))
+    np.testing.assert_allclose(
+        seen(normalized.viewmats, normalized.points), scale * seen(*world), atol=1e-10
+    )
+    rotations = normalized.viewmats[:, :3, :3]
+    np.testing.assert_allclose(
+        rotations @ rotations.transpose(0, 2, 1), np.tile(np.eye(3), (7, 1, 1)), atol=1e-12
+    )
+    np.testing.assert_allclose(
+        transform_points(normalized.transform, world[1]), normalized.points, atol=1e-12
+    )
+
+
+def test_similarity_turns_up_and_puts_the_median_camera_at_one(world):
+    viewmats, _ = world
+    moved = transform_viewmats(similarity_from_cameras(viewmats), viewmats)
+    up = -moved[:, 1, :3].mean(0)
+    np.testing.assert_allclose(up / np.linalg.norm(up), [0, -1, 0], atol=1e-12)
+    assert np.median(np.linalg.norm(camera_positions(moved), axis=1)) == pytest.approx(1)
+
+
+def test_focus_is_where_the_optical_axes_meet():
+    """Cameras on a circle that look at the world's origin: it stays, and they are at 1."""
+    viewmats = []
+    for angle in np.linspace(0, 2, 5):
+        c, s = np.cos(angle), np.sin(angle)
+        viewmat = np.eye(4)
+        viewmat[:3, :3] = [[c, 0, s], [0, 1, 0], [-s, 0, c]]
+        viewmat[2, 3] = 4.0
+        viewmats.append(viewmat)
+    expected = np.diag([0.25, 0.25, 0.25, 1])
+    np.testing.assert_allclose(similarity_from_cameras(np.stack(viewmats)), expected, atol=1e-12)
+
+
+def test_points_end_on_their_principal_axes(world):
+    points = normalize_scene(*world).points
+    np.testing.assert_allclose(np.median(points @ np.eye(3), axis=0), 0, atol=0.2)
+    covariance = np.cov(points, rowvar=False)
+    np.testing.assert_allclose(covariance - np.diag(np.diag(covariance)), 0, atol=1e-12)
+    assert (np.diff(np.diag(covariance)) < 0).all(), "x the widest, z the thinnest"
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_principal_axes_are_a_rigid_motion_of_the_median_to_zero(seed):
+    rng = np.random.default_rng(seed)
+    points = (rng.normal(size=(50, 3)) * (3, 2, 1)) @ turn(rng).T + rng.normal(size=3)
+    transform = principal_axes(points)
+    rotation = transform[:3, :3]
+    np.testing.assert_allclose(rotation @ rotation.T, np.eye(3), atol=1e-12)
+    assert np.linalg.det(rotation) == pytest.approx(1)
+    median = np.median(points, axis=0)
+    np.testing.assert_allclose(transform_points(transform, median[None]), [[0, 0, 0]], atol=1e-12)
+
+
+def test_scene_scale_is_the_cameras_reach(world):
+    normalized = normalize_scene(*world)
+    positions = [-v[:3, :3].T @ v[:3, 3] for v in normalized.viewmats]
+    reach = max(np.linalg.norm(p - np.mean(positions, axis=0)) for p in positions)
+    assert normalized.scene_scale == pytest.approx(1.1 * reach)
+
+
+@pytest.mark.parametrize("scale", [1e-3, 0.2, 50.0])
+def test_the_worlds_scale_does_not_matter(world, scale):
+    viewmats, points = world
+    scaled = transform_viewmats(np.diag([scale, scale, scale, 1]), viewmats)
+    ours, theirs = normalize_scene(scaled, points * scale), normalize_scene(viewmats, points)
+    np.testing.assert_allclose(ours.viewmats, theirs.viewmats, atol=1e-9)
+    np.testing.assert_allclose(ours.points, theirs.points, atol=1e-9)
+    assert ours.scene_scale == pytest.approx(theirs.scene_scale)
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_any_world_is_normalised_to_a_similar_one(world, seed):
+    """Whatever similarity the world came by, only the size of what is seen may differ."""
+    viewmats, points = world
+    matrix = similarity(np.random.default_rng(seed), scale=3.0)
+    ours = normalize_scene(transform_viewmats(matrix, viewmats), transform_points(matrix, points))
+    theirs = normalize_scene(viewmats, points)
+    ratio = ours.scene_scale / theirs.scene_scale
+    np.testing.assert_allclose(
+        seen(ours.viewmats, ours.points), ratio * seen(theirs.viewmats, theirs.points), atol=1e-8
+    )
+
+
+def test_renders_of_both_worlds_are_equal(world):
+    viewmats, points = world
+    normalized = normalize_scene(viewmats, points)
+    scale = np.cbrt(np.linalg.det(normalized.transform[:3, :3]))
+    K = torch.tensor([[30.0, 0, 16], [0, 30, 12], [0, 0, 1]], dtype=torch.float64)
+    count = len(points)
+    colors = torch.rand(count, 1, 3, dtype=torch.float64)
+
+    def draw(viewmat, means, size):
+        return rasterize(
+            torch.from_numpy(means),
+            torch.ones(count, 4, dtype=torch.float64),
+            torch.full((count, 3), 0.1 * size, dtype=torch.float64),
+            torch.full((count,), 0.7, dtype=torch.float64),
+            colors,
+            torch.zeros(count, 0, 3, dtype=torch.float64),
+            Camera(torch.from_numpy(viewmat), K, 32, 24),
+            RasterSettings(),
+            sh_degree=0,
+        ).image
+
+    for before, after in zip(viewmats[:2], normalized.viewmats[:2], strict=True):
+        image = draw(before, points, 1.0)
+        torch.testing.assert_close(draw(after, normalized.points, scale), image, atol=1e-8, rtol=0)
+        assert image.std() > 0.05
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_rotation_between(seed):
+    rng = np.random.default_rng(seed)
+    start, end = (v / np.linalg.norm(v) for v in rng.normal(size=(2, 3)))
+    for target in (end, start, -start):
+        rotation = rotation_between(start, target)
+        np.testing.assert_allclose(rotation @ start, target, atol=1e-12)
+        np.testing.assert_allclose(rotation @ rotation.T, np.eye(3), atol=1e-12)
+        assert np.linalg.det(rotation) == pytest.approx(1)
+
+
+def test_one_camera_on_its_own_focus_keeps_the_scale(world):
+    _, points = world
+    normalized = normalize_scene(np.eye(4)[None], points)
+    assert np.isfinite(normalized.points).all()
+    assert np.linalg.det(normalized.transform[:3, :3]) == pytest.approx(1)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"viewmats": np.zeros((0, 4, 4))}, "0 viewmats"),
+        ({"points": np.zeros((2, 3))}, "2 points"),
+        ({"points": np.zeros((5, 2))}, "points must be finite"),
+        ({"viewmats": np.zeros((5, 3, 4))}, "viewmats must be finite"),
+        ({"points": np.full((5, 3), np.nan)}, "points must be finite"),
+    ],
+)
+def test_bad_input_is_named(world, change, message):
+    with pytest.raises(ValueError, match=message):
+        normalize_scene(**({"viewmats": world[0], "points": world[1]} | change))
