@@ -6,6 +6,7 @@
 
 #include "arrays.h"
 #include "isa.h"
+#include "raster/bind.h"
 #include "vector_math_kernels.h"
 
 namespace nb = nanobind;
@@ -30,6 +31,8 @@ xrgs::Output log2_of(Vector x) {
 
 NB_MODULE(_native, m) {
   using namespace xrgs;
+  // torch keeps graphs alive past the end of the interpreter, and with them frames.
+  nb::set_leak_warnings(false);
   m.doc() = "The compiled kernels of xrgs.";
   xrgs::active_isa();  // a wrong XRGS_ISA fails here, at the import
   m.def("isa", [] { return isa_name(active_isa()); }, "The instruction set in use.");
@@ -37,4 +40,5 @@ NB_MODULE(_native, m) {
   m.def("available_isas", &available_isas, "What this machine can run, narrowest first.");
   m.def("exp2", &exp2_of, nb::arg("x"), "2^x, float32 [N], by the kernels' polynomial.");
   m.def("log2", &log2_of, nb::arg("x"), "Base-2 logarithm, float32 [N], by the kernels' series.");
+  bind_raster(m);
 }

@@ -435,6 +435,71 @@ XRGS_INLINE void transpose(Floats (&r)[16]) {
 #undef XRGS_EACH
 #endif
 
+// Sixteen triples or quadruples side by side, to and from a vector for each part.
+#if defined(__AVX512F__)
+XRGS_INLINE void load_triples(const float* p, Floats& x, Floats& y, Floats& z) {
+  const __m512 a = _mm512_loadu_ps(p), b = _mm512_loadu_ps(p + 16), c = _mm512_loadu_ps(p + 32);
+  // Lanes 0-10 or so come from a and b, the rest from c.
+  const __m512i x1 = _mm512_setr_epi32(0, 3, 6, 9, 12, 15, 18, 21, 24, 27, 30, 0, 0, 0, 0, 0);
+  const __m512i x2 = _mm512_setr_epi32(0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 17, 20, 23, 26, 29);
+  const __m512i y1 = _mm512_setr_epi32(1, 4, 7, 10, 13, 16, 19, 22, 25, 28, 31, 0, 0, 0, 0, 0);
+  const __m512i y2 = _mm512_setr_epi32(0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 18, 21, 24, 27, 30);
+  const __m512i z1 = _mm512_setr_epi32(2, 5, 8, 11, 14, 17, 20, 23, 26, 29, 0, 0, 0, 0, 0, 0);
+  const __m512i z2 = _mm512_setr_epi32(0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 16, 19, 22, 25, 28, 31);
+  x = {_mm512_permutex2var_ps(_mm512_permutex2var_ps(a, x1, b), x2, c)};
+  y = {_mm512_permutex2var_ps(_mm512_permutex2var_ps(a, y1, b), y2, c)};
+  z = {_mm512_permutex2var_ps(_mm512_permutex2var_ps(a, z1, b), z2, c)};
+}
+XRGS_INLINE void store_triples(float* p, Floats x, Floats y, Floats z) {
+  const __m512i a1 = _mm512_setr_epi32(0, 16, 0, 1, 17, 0, 2, 18, 0, 3, 19, 0, 4, 20, 0, 5);
+  const __m512i a2 = _mm512_setr_epi32(0, 1, 16, 3, 4, 17, 6, 7, 18, 9, 10, 19, 12, 13, 20, 15);
+  const __m512i b1 = _mm512_setr_epi32(21, 0, 6, 22, 0, 7, 23, 0, 8, 24, 0, 9, 25, 0, 10, 26);
+  const __m512i b2 = _mm512_setr_epi32(0, 21, 2, 3, 22, 5, 6, 23, 8, 9, 24, 11, 12, 25, 14, 15);
+  const __m512i c1 = _mm512_setr_epi32(0, 11, 27, 0, 12, 28, 0, 13, 29, 0, 14, 30, 0, 15, 31, 0);
+  const __m512i c2 = _mm512_setr_epi32(26, 1, 2, 27, 4, 5, 28, 7, 8, 29, 10, 11, 30, 13, 14, 31);
+  const __m512 a = _mm512_permutex2var_ps(x.v, a1, y.v), b = _mm512_permutex2var_ps(x.v, b1, y.v);
+  const __m512 c = _mm512_permutex2var_ps(x.v, c1, y.v);
+  _mm512_storeu_ps(p, _mm512_permutex2var_ps(a, a2, z.v));
+  _mm512_storeu_ps(p + 16, _mm512_permutex2var_ps(b, b2, z.v));
+  _mm512_storeu_ps(p + 32, _mm512_permutex2var_ps(c, c2, z.v));
+}
+#else
+XRGS_INLINE void load_triples(const float* p, Floats& x, Floats& y, Floats& z) {
+  float part[3][16];
+  for (int i = 0; i < 16; ++i)
+    for (int k = 0; k < 3; ++k) part[k][i] = p[3 * i + k];
+  x = load(part[0]);
+  y = load(part[1]);
+  z = load(part[2]);
+}
+XRGS_INLINE void store_triples(float* p, Floats x, Floats y, Floats z) {
+  float part[3][16];
+  store(part[0], x);
+  store(part[1], y);
+  store(part[2], z);
+  for (int i = 0; i < 16; ++i)
+    for (int k = 0; k < 3; ++k) p[3 * i + k] = part[k][i];
+}
+#endif
+XRGS_INLINE void load_quadruples(const float* p, Floats& w, Floats& x, Floats& y, Floats& z) {
+  float part[4][16];
+  for (int i = 0; i < 16; ++i)
+    for (int k = 0; k < 4; ++k) part[k][i] = p[4 * i + k];
+  w = load(part[0]);
+  x = load(part[1]);
+  y = load(part[2]);
+  z = load(part[3]);
+}
+XRGS_INLINE void store_quadruples(float* p, Floats w, Floats x, Floats y, Floats z) {
+  float part[4][16];
+  store(part[0], w);
+  store(part[1], x);
+  store(part[2], y);
+  store(part[3], z);
+  for (int i = 0; i < 16; ++i)
+    for (int k = 0; k < 4; ++k) p[4 * i + k] = part[k][i];
+}
+
 XRGS_INLINE Floats operator-(Floats a) { return splat(0.0f) - a; }
 XRGS_INLINE Floats& operator+=(Floats& a, Floats b) { return a = a + b; }
 XRGS_INLINE Floats clamp(Floats a, Floats low, Floats high) { return min(max(a, low), high); }

@@ -1,0 +1,10 @@
+// The rasterizer in Python.
+#pragma once
+
+#include <nanobind/nanobind.h>
+
+namespace xrgs {
+
+void bind_raster(nanobind::module_& m);
+
+}  // namespace xrgs
