@@ -85,17 +85,18 @@ def reconstruct(shots: Sequence[Shot], folder: Path, work: Path, conf: SfmConf) 
     _log_to(work)
     pycolmap.set_random_seed(conf.seed)
     database = work / "database.db"
-    threads = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
+    threads = usable_threads()
     max_features = features_for(len(shots), conf.max_num_features)
-    _extract(shots, folder, database, max_features, threads or 1)
-    _match(shots, database, work, threads or 1)
-    models = _map(shots, folder, database, work, conf, threads or 1)
+    _extract(shots, folder, database, max_features, threads)
+    _match(shots, database, work, threads)
+    models = _map(shots, folder, database, work, conf, threads)
     report = {
         "first_octave": first_octave(max(images.size(folder / shots[0].file))),
         "images": len(shots),
         "lr_images": conf.lr_images,
         "max_num_features": max_features,
         "pycolmap": pycolmap.__version__,
+        "registered": 0,
         "models": sorted((model.num_reg_images() for model in models), reverse=True),
     }
     if not models:
@@ -104,6 +105,13 @@ def reconstruct(shots: Sequence[Shot], folder: Path, work: Path, conf: SfmConf) 
     return _as_plain(
         max(models, key=lambda m: (m.num_reg_images(), m.num_points3D())), shots, report
     )
+
+
+def usable_threads() -> int:
+    """Processors that this process may run on, not those of the machine."""
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
 
 
 def _log_to(work: Path) -> None:

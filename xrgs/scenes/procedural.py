@@ -19,6 +19,7 @@ from xrgs.scenes.bundled import photograph
 FULL_SIDE = 1008
 _FOCAL = 0.9  # image widths
 _FOCUS = np.array([0.0, 0.1, 5.5])  # every camera looks here
+_START = np.array([0.7, 0.55, 0.5])  # of the sequence of positions, as a share of the box
 _REACH = np.array([1.1, 0.7, 0.4])  # half size of the box the cameras stand in
 
 #: Name in the scene: file in scikit-image's wheel, and the tint of the grey ones.
@@ -55,12 +56,12 @@ def intrinsics(width: int, height: int) -> NDArray[np.float64]:
 def viewmats(views: int) -> NDArray[np.float64]:
     """World-to-camera matrices [views, 4, 4] of cameras spread over a box, forward-facing.
 
-    Positions follow the R3 sequence (Roberts 2018) from the middle of the box, so that every n-th
-    view is again spread over it: held-out views lie among the others, not at the rim.
+    Positions follow the R3 sequence (Roberts 2018), which fills the box evenly for any number;
+    its start puts every 8th view of the first 24 among the others, none at the rim.
     """
     g = 1.2207440846057596  # the real root of x⁴ = x + 1
     steps = np.arange(views)[:, None] * np.array([1 / g, 1 / g**2, 1 / g**3])
-    positions = (2 * ((0.5 + steps) % 1) - 1) * _REACH
+    positions = (2 * ((_START + steps) % 1) - 1) * _REACH
     return np.stack([_look_at(position) for position in positions])
 
 

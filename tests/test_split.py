@@ -1,0 +1,117 @@
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from xrgs.config import SfmConf, VariantConf
+from xrgs.errors import XrgsError
+from xrgs.split import SSIM_WINDOW, check, frame, split
+
+BASE = VariantConf(
+    long_side=504,
+    factor=5,
+    hr_fraction=0.3,
+    min_hr=2,
+    selection="random",
+    test_every=8,
+    seed=0,
+    sfm=SfmConf("upsampled", 0, 4.0, 0.75, 0),
+)
+
+confs = st.builds(
+    replace,
+    st.just(BASE),
+    hr_fraction=st.floats(0, 1),
+    min_hr=st.integers(0, 5),
+    selection=st.sampled_from(["random", "uniform"]),
+    test_every=st.sampled_from([0, 2, 3, 8]),
+    seed=st.integers(0, 1000),
+)
+
+
+@given(st.integers(2, 200), confs)
+def test_the_parts_are_disjoint_ordered_and_cover_all(views: int, conf: VariantConf) -> None:
+    parts = split(views, conf)
+    assert sorted(parts.test + parts.hr + parts.lr) == list(range(views))
+    for part in (parts.test, parts.hr, parts.lr):
+        assert list(part) == sorted(part)
+
+
+@given(st.integers(2, 200), confs)
+def test_the_share_that_stays_hr_is_exact(views: int, conf: VariantConf) -> None:
+    parts = split(views, conf)
+    train = len(parts.hr) + len(parts.lr)
+    wanted = max(conf.min_hr, round(conf.hr_fraction * train))
+    assert len(parts.hr) == min(train, wanted)
+
+
+@given(st.integers(2, 200), confs)
+def test_every_nth_view_is_held_out_and_none_where_it_is_zero(
+    views: int, conf: VariantConf
+) -> None:
+    expected = [i for i in range(views) if conf.test_every and i % conf.test_every == 0]
+    assert list(split(views, conf).test) == expected
+
+
+@given(st.integers(2, 200), confs)
+def test_the_split_is_a_function_of_its_config(views: int, conf: VariantConf) -> None:
+    assert split(views, conf) == split(views, replace(conf))
+
+
+def test_another_seed_chooses_other_views_and_holds_out_the_same() -> None:
+    a, b = split(40, BASE), split(40, replace(BASE, seed=1))
+    assert a.test == b.test == (0, 8, 16, 24, 32)
+    assert a.hr != b.hr
+
+
+def test_a_uniform_selection_is_evenly_spaced() -> None:
+    conf = replace(BASE, selection="uniform", test_every=0, hr_fraction=0.25, min_hr=0)
+    assert split(16, conf).hr == (2, 6, 10, 14)
+
+
+@given(st.integers(60, 5000), st.integers(60, 5000), st.integers(0, 3000), st.integers(1, 8))
+def test_an_hr_view_is_a_whole_number_of_lr_pixels_and_never_enlarged(
+    width: int, height: int, side: int, factor: int
+) -> None:
+    scale = min(1, (side or max(width, height)) / max(width, height))
+    if min(round(width * scale), round(height * scale)) // factor < SSIM_WINDOW:
+        with pytest.raises(XrgsError, match=r"variant\.factor"):
+            frame(width, height, replace(BASE, long_side=side, factor=factor))
+        return
+    made = frame(width, height, replace(BASE, long_side=side, factor=factor))
+    assert made.width % factor == made.height % factor == 0
+    assert made.width <= made.resized[0] <= width
+    assert made.height <= made.resized[1] <= height
+    assert made.resized[0] - made.width < factor
+    assert max(made.resized) == min(side or 10**9, max(width, height))
+    left, top = made.corner
+    assert abs(made.resized[0] - made.width - 2 * left) <= 1
+    assert abs(made.resized[1] - made.height - 2 * top) <= 1
+
+
+def test_a_factor_too_large_for_the_ssim_window_is_named() -> None:
+    with pytest.raises(XrgsError, match=r"variant\.factor=40: LR views of 12x9 px .*SSIM window"):
+        frame(504, 378, replace(BASE, factor=40))
+
+
+@pytest.mark.parametrize(
+    ("change", "key"),
+    [
+        ({"factor": 0}, "variant.factor=0"),
+        ({"hr_fraction": 1.5}, "variant.hr_fraction=1.5"),
+        ({"min_hr": -1}, "variant.min_hr=-1"),
+        ({"long_side": -1}, "variant.long_side=-1"),
+        ({"test_every": 1}, "variant.test_every=1"),
+        ({"selection": "best"}, "variant.selection=best"),
+        ({"sfm": replace(BASE.sfm, lr_images="raw")}, "variant.sfm.lr_images=raw"),
+        ({"sfm": replace(BASE.sfm, min_registered=2)}, "variant.sfm.min_registered=2"),
+        ({"sfm": replace(BASE.sfm, max_num_features=-1)}, "variant.sfm.max_num_features=-1"),
+    ],
+)
+def test_a_variant_that_cannot_be_made_is_refused_by_key(change: dict, key: str) -> None:
+    with pytest.raises(XrgsError, match=key):
+        check(replace(BASE, **change))
+    check(BASE)
