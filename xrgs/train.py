@@ -6,7 +6,7 @@ import dataclasses
 import time
 from collections import Counter
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, cast
+from typing import TYPE_CHECKING, Any
 
 import torch
 
@@ -98,9 +98,8 @@ def train(data: Dataset, conf: Conf) -> Trained:
         parts.after_backward(view, gaussians)
         ledger.note(step, view, loss, render, optimizer)
         optimizer.step()
-        means2d_grad = cast("torch.Tensor", offset.grad)
         done = densifier.after_step(
-            step, means2d_grad, render.visible, width=camera.width, height=camera.height
+            step, offset.grad, render.visible, width=camera.width, height=camera.height
         )
         ledger.refined(done)
     return ledger.close(gaussians, time.perf_counter() - start)

@@ -1,0 +1,142 @@
+"""The training loop: deterministic, and the baseline is the program without components."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import pytest
+import torch
+
+from xrgs import components, train
+from xrgs.config import Conf
+from xrgs.dataset import Dataset, LoadedView
+from xrgs.splat.cameras import Camera
+from xrgs.splat.gaussians import PARAMETERS, Gaussians
+from xrgs.splat.settings import RasterSettings
+from xrgs.train import endless
+
+
+def camera(width: int, height: int, shift: float) -> Camera:
+    viewmat = torch.eye(4)
+    viewmat[0, 3] = shift
+    focal = 1.2 * width
+    K = torch.tensor([[focal, 0.0, width / 2], [0.0, focal, height / 2], [0.0, 0.0, 1.0]])
+    return Camera(viewmat, K, width, height)
+
+
+@pytest.fixture
+def data() -> Dataset:
+    """Four views, two of them LR, of a smooth picture; 60 points in front."""
+    generator = torch.Generator().manual_seed(3)
+    points = torch.rand(60, 3, generator=generator) - 0.5 + torch.tensor([0.0, 0.0, 2.0])
+    views = []
+    for number, (tag, width, height) in enumerate(
+        [("HR", 60, 60), ("LR", 12, 12), ("HR", 60, 60), ("LR", 12, 12)]
+    ):
+        ramp = torch.linspace(0, 1, width).expand(height, width)
+        image = torch.stack([ramp, ramp.flip(1), torch.full_like(ramp, 0.5)], dim=-1)
+        views.append(LoadedView(f"v{number}", tag, camera(width, height, 0.1 * number), image))
+    colors = torch.rand(60, 3, generator=generator)
+    return Dataset(tuple(views), tuple(views[:1]), points, colors, scene_scale=1.0, factor=5)
+
+
+def test_the_same_seed_gives_the_same_bits_and_another_does_not(
+    data: Dataset, baseline: Conf
+) -> None:
+    first, second = train.train(data, baseline), train.train(data, baseline)
+    assert same(first.gaussians, second.gaussians)
+    assert first.history == second.history
+    other = train.train(data, dataclasses.replace(baseline, seed=1))
+    assert not same(first.gaussians, other.gaussians)
+
+
+def test_training_lowers_the_loss_and_logs_what_densification_did(
+    data: Dataset, baseline: Conf
+) -> None:
+    baseline.train.steps = 120
+    baseline.splat.densify.reset_every = 30_000  # a reset would lift the loss at the end
+    trained = train.train(data, baseline)
+    losses = [row["loss"] for row in trained.history]
+    assert sum(losses[-8:]) < 0.7 * sum(losses[:8])
+    last = trained.history[-1]
+    assert last["step"] == 119
+    grown = last["duplicated"] + last["split"]
+    removed = last["pruned_opacity"] + last["pruned_scale"] + last["pruned_non_finite"]
+    # The last refinement comes before the last logged step, so the ledger must balance.
+    assert last["gaussians"] == 60 + grown - removed == len(trained.gaussians)
+    assert trained.evaluations > 0
+    model = sum(trained.gaussians[name].nbytes for name in PARAMETERS)
+    assert trained.memory_bytes > 4 * model  # parameters, gradients, two moments, and buffers
+
+
+def test_the_baseline_is_the_program_without_component_code(
+    data: Dataset, baseline: Conf, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with_code = train.train(data, baseline)
+
+    class Nothing:
+        def loss(self, loss: torch.Tensor, *_: object) -> torch.Tensor:
+            return loss
+
+        def after_backward(self, *_: object) -> None:
+            return None
+
+    monkeypatch.setattr(components, "build", lambda *_: Nothing())
+    assert same(with_code.gaussians, train.train(data, baseline).gaussians)
+
+
+@pytest.mark.parametrize("component", ["loss_weighting", "gradient_scaling", "consistency"])
+def test_each_component_changes_the_result(
+    data: Dataset, baseline: Conf, component: str
+) -> None:
+    plain = train.train(data, baseline)
+    changed = dataclasses.replace(baseline)
+    match component:
+        case "loss_weighting":
+            changed.components.loss_weighting.lr_weight = 0.25
+        case "gradient_scaling":
+            changed.components.gradient_scaling.lr_scale = 0.3
+        case "consistency":
+            changed.components.consistency.weight = 0.1
+    assert not same(plain.gaussians, train.train(data, changed).gaussians)
+
+
+def test_training_goes_on_when_every_gaussian_is_pruned(data: Dataset, baseline: Conf) -> None:
+    baseline.splat.densify.prune_opacity = 2.0
+    trained = train.train(data, baseline)
+    assert len(trained.gaussians) == 0
+    assert trained.history[-1]["step"] == baseline.train.steps - 1
+
+
+def test_the_sh_bands_come_on_in_turn(
+    data: Dataset, baseline: Conf, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    degrees = []
+    real = train.rasterize
+
+    def spy(*arguments: object, sh_degree: int, **rest: object) -> object:
+        degrees.append(sh_degree)
+        return real(*arguments, sh_degree=sh_degree, **rest)  # type: ignore[arg-type]
+
+    monkeypatch.setattr(train, "rasterize", spy)
+    baseline.train.steps = 60
+    train.train(data, baseline)
+    assert degrees == [min(step // 2, 3) for step in range(60)]
+
+
+def test_every_view_is_seen_once_before_any_is_seen_twice(data: Dataset) -> None:
+    names = [view.name for _, view in endless(data.train, seed=0, steps=40)]
+    rounds = [tuple(names[start : start + 4]) for start in range(0, 40, 4)]
+    assert all(sorted(r) == ["v0", "v1", "v2", "v3"] for r in rounds)
+    assert len(set(rounds)) > 1
+
+
+def test_a_splat_keeps_its_activated_ranges(data: Dataset, baseline: Conf) -> None:
+    _, _, scales, opacities, _, _ = train.train(data, baseline).gaussians.activated()
+    assert (scales > 0).all()
+    assert ((opacities >= 0) & (opacities <= 1)).all()
+    assert RasterSettings().sh_degree == 3
+
+
+def same(first: Gaussians, second: Gaussians) -> bool:
+    return all(torch.equal(first[name], second[name]) for name in PARAMETERS)
