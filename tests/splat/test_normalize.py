@@ -84,9 +84,20 @@ def test_focus_is_where_the_optical_axes_meet():
     np.testing.assert_allclose(similarity_from_cameras(np.stack(viewmats)), expected, atol=1e-12)
 
 
+def test_focus_and_scale_are_medians():
+    """Cameras in a row, two units behind the origin, that look along z; one stands far off."""
+    viewmats = np.tile(np.eye(4), (3, 1, 1))
+    viewmats[:, 0, 3] = (0.0, -1.0, -10.0)
+    viewmats[:, 2, 3] = 2.0
+    expected = np.eye(4) / np.sqrt(5)
+    expected[0, 3] = -1 / np.sqrt(5)
+    expected[3, 3] = 1
+    np.testing.assert_allclose(similarity_from_cameras(viewmats), expected, atol=1e-12)
+
+
 def test_points_end_on_their_principal_axes(world):
     points = normalize_scene(*world).points
-    np.testing.assert_allclose(np.median(points @ np.eye(3), axis=0), 0, atol=0.2)
+    np.testing.assert_allclose(np.median(points, axis=0), 0, atol=0.2)
     covariance = np.cov(points, rowvar=False)
     np.testing.assert_allclose(covariance - np.diag(np.diag(covariance)), 0, atol=1e-12)
     assert (np.diff(np.diag(covariance)) < 0).all(), "x the widest, z the thinnest"
