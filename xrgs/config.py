@@ -13,6 +13,7 @@ from typing import Any
 from hydra.core.config_store import ConfigStore
 from omegaconf import MISSING, DictConfig, OmegaConf
 
+from xrgs.errors import XrgsError
 from xrgs.splat.settings import DensifySettings, OptimizerSettings, RasterSettings
 
 _HERE = Path(__file__).parent
@@ -161,9 +162,14 @@ def to_conf(cfg: DictConfig) -> Conf:
 
     Raises:
         OmegaConfBaseException: a value is missing or of another type; the message names its key.
+        XrgsError: a value is out of its range; the message names its key.
     """
     known = OmegaConf.masked_copy(cfg, list(Conf.__dataclass_fields__))
-    return from_dict(OmegaConf.to_container(known, resolve=True, throw_on_missing=True))
+    conf = from_dict(OmegaConf.to_container(known, resolve=True, throw_on_missing=True))
+    for key, value, least in (("train.steps", conf.train.steps, 1), ("threads", conf.threads, 0)):
+        if value < least:
+            raise XrgsError(f"{key}={value}: must be at least {least}")
+    return conf
 
 
 def from_dict(values: Any) -> Conf:

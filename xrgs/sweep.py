@@ -16,7 +16,7 @@ from hydra.core.plugins import Plugins
 from hydra.errors import CompactHydraException
 from omegaconf.errors import OmegaConfBaseException
 
-from xrgs import variant, worker
+from xrgs import scenes, variant, worker
 from xrgs.config import to_conf
 from xrgs.errors import XrgsError
 from xrgs.hashing import digest
@@ -123,13 +123,8 @@ class Planned:
     @property
     def name(self) -> str:
         """For people."""
-        parts = (scene_name(self.conf), self.wish.label, self.wish.condition)
+        parts = (scenes.label(self.conf.scene), self.wish.label, self.wish.condition)
         return " / ".join(part for part in parts if part) + f" / seed {self.conf.seed}"
-
-
-def scene_name(conf: Conf) -> str:
-    """The scene's label in tables: its name, or that of its folder."""
-    return conf.scene.name or Path(conf.scene.path or "").name
 
 
 def _say(text: str) -> None:
@@ -187,10 +182,10 @@ class Study:
         found: dict[str, tuple[str | None, str | None]] = {}
         cells = []
         for cell in plan:
-            scene = digest(asdict(cell.conf.scene) | asdict(cell.conf.variant))
-            if scene not in found:
-                found[scene] = _variant_of(cell.conf, store, build=build)
-            variant_id, error = found[scene]
+    wanted = digest([asdict(cell.conf.scene), asdict(cell.conf.variant)])
+            if wanted not in found:
+                found[wanted] = _variant_of(cell.conf, store, build=build)
+            variant_id, error = found[wanted]
             cells.append(replace(cell, variant_id=variant_id, error=error))
         return cells
 
@@ -210,10 +205,10 @@ def _variant_of(conf: Conf, store: Store, *, build: bool) -> tuple[str | None, s
         found = variant.find(store.variants, variant.key(conf.scene, conf.variant))
         if found is not None or not build:
             return (found.id if found else None), None
-        _say(f"{scene_name(conf)}: building the mixed-resolution variant")
+        _say(f"{scenes.label(conf.scene)}: building the mixed-resolution variant")
         return worker.run("variant", {"conf": asdict(conf), "store": conf.store})["variant"], None
     except XrgsError as error:
-        _say(f"{scene_name(conf)}: {error}")
+        _say(f"{scenes.label(conf.scene)}: {error}")
         return None, str(error)
 
 
@@ -245,7 +240,7 @@ def _record(plan: Sequence[Planned]) -> list[dict[str, Any]]:
             "cell_id": cell.cell_id,
             "label": cell.wish.label,
             "condition": cell.wish.condition,
-            "scene": scene_name(cell.conf),
+            "scene": scenes.label(cell.conf.scene),
             "seed": cell.conf.seed,
             "variant_id": cell.variant_id,
             "baseline_id": baselines[cell.wish.shared],
@@ -266,11 +261,11 @@ def run_job(cfg: DictConfig) -> str:
     store = Store(Path(conf.store))
     found = variant.find(store.variants, variant.key(conf.scene, conf.variant))
     if found is None:
-        raise XrgsError(f"{scene_name(conf)}: its variant is gone from {store.variants}")
+        raise XrgsError(f"{scenes.label(conf.scene)}: its variant is gone from {store.variants}")
     identity = cell_identity(conf, found.id)
     folder = store.cell(digest(identity))
     folder.begin(asdict(conf), identity)
-    _say(f"{scene_name(conf)} / seed {conf.seed}: training cell {folder.id}")
+    _say(f"{scenes.label(conf.scene)} / seed {conf.seed}: training cell {folder.id}")
     request = {"conf": asdict(conf), "variant": str(found.path), "cell": str(folder.path)}
     try:
         worker.run("cell", request)
