@@ -86,9 +86,7 @@ def test_the_baseline_is_the_program_without_component_code(
 
 
 @pytest.mark.parametrize("component", ["loss_weighting", "gradient_scaling", "consistency"])
-def test_each_component_changes_the_result(
-    data: Dataset, baseline: Conf, component: str
-) -> None:
+def test_each_component_changes_the_result(data: Dataset, baseline: Conf, component: str) -> None:
     plain = train.train(data, baseline)
     changed = dataclasses.replace(baseline)
     match component:

@@ -182,7 +182,7 @@ class Study:
         found: dict[str, tuple[str | None, str | None]] = {}
         cells = []
         for cell in plan:
-    wanted = digest([asdict(cell.conf.scene), asdict(cell.conf.variant)])
+            wanted = digest([asdict(cell.conf.scene), asdict(cell.conf.variant)])
             if wanted not in found:
                 found[wanted] = _variant_of(cell.conf, store, build=build)
             variant_id, error = found[wanted]
