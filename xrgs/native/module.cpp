@@ -6,6 +6,8 @@
 
 #include "arrays.h"
 #include "isa.h"
+#include "loss/bind.h"
+#include "optim/bind.h"
 #include "raster/bind.h"
 #include "vector_math_kernels.h"
 
@@ -41,4 +43,6 @@ NB_MODULE(_native, m) {
   m.def("exp2", &exp2_of, nb::arg("x"), "2^x, float32 [N], by the kernels' polynomial.");
   m.def("log2", &log2_of, nb::arg("x"), "Base-2 logarithm, float32 [N], by the kernels' series.");
   bind_raster(m);
+  bind_loss(m);
+  bind_optim(m);
 }

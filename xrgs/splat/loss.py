@@ -8,6 +8,8 @@ import torch
 from torch import Tensor
 from torch.nn.functional import conv2d
 
+from xrgs.splat.backend import resolve_backend
+
 WINDOW = 11
 """Taps of the SSIM window along each axis."""
 SIGMA = 1.5
@@ -42,12 +44,15 @@ def prepare_target(image: Tensor) -> Target:
         raise ValueError(
             f"image of {width} x {height} px is smaller than the SSIM window of {WINDOW} px"
         )
-    image = image.detach()
-    mean, variance = _moments(image)
-    return Target(image, mean, variance)
+    image = image.detach().contiguous()
+    # In double, since a variance is a small difference of squares, and this is done once a view.
+    mean, variance = (x.to(image.dtype) for x in _moments(image.double()))
+    return Target(image, mean.contiguous(), variance.contiguous())
 
 
-def photometric_loss(image: Tensor, target: Target, *, l1: float, ssim: float) -> Tensor:
+def photometric_loss(
+    image: Tensor, target: Target, *, l1: float, ssim: float, backend: str = "torch"
+) -> Tensor:
     """`l1 * mean |image - target| + ssim * (1 - SSIM(image, target))`.
 
     gsplat's trainer has l1 0.8 and ssim 0.2 (`ssim_lambda`).
@@ -57,13 +62,19 @@ def photometric_loss(image: Tensor, target: Target, *, l1: float, ssim: float) -
         target: What it should look like.
         l1: Weight of the absolute difference.
         ssim: Weight of the structural dissimilarity.
+        backend: `torch`, `native` or `auto` (`resolve_backend`). The native one is for float32 on
+            the CPU, and computes the gradient along with the value.
 
     Returns:
         A scalar.
 
     Raises:
-        ValueError: `image` hasn't the target's shape.
+        ValueError: `image` hasn't the target's shape, or isn't what the native backend is for.
     """
+    if resolve_backend(backend) == "native":
+        from xrgs.splat import native_loss
+
+        return native_loss.photometric_loss(image, _same_shape(image, target), l1, ssim)
     difference = (image - _same_shape(image, target).image).abs().mean()
     return l1 * difference + ssim * (1 - structural_similarity(image, target))
 

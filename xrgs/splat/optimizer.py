@@ -8,6 +8,7 @@ from collections.abc import Callable, Mapping
 import torch
 from torch import Tensor
 
+from xrgs.splat.backend import resolve_backend
 from xrgs.splat.gaussians import PARAMETERS, Gaussians
 from xrgs.splat.settings import OptimizerSettings
 
@@ -25,7 +26,13 @@ class SplatOptimizer:
     """
 
     def __init__(
-        self, gaussians: Gaussians, settings: OptimizerSettings, *, scene_scale: float, steps: int
+        self,
+        gaussians: Gaussians,
+        settings: OptimizerSettings,
+        *,
+        scene_scale: float,
+        steps: int,
+        backend: str = "torch",
     ) -> None:
         """Start with no state.
 
@@ -34,6 +41,7 @@ class SplatOptimizer:
             settings: Rates and Adam's constants.
             scene_scale: World units, above 0.
             steps: Of the whole run.
+            backend: `torch`, `native` or `auto` (`resolve_backend`): who computes a step.
 
         Raises:
             ValueError: `scene_scale` or `steps` isn't above 0.
@@ -47,6 +55,7 @@ class SplatOptimizer:
         self.means_final = settings.means_final
         self.steps = steps
         self.steps_done = 0
+        self.native = resolve_backend(backend) == "native"
         rates = {name: getattr(settings, name) for name in PARAMETERS}
         rates["means"] = self.means_rate
         self.adam = torch.optim.Adam(
@@ -58,7 +67,12 @@ class SplatOptimizer:
 
     def step(self) -> None:
         """Move every parameter that has a gradient, then decay the rate of `means`."""
-        self.adam.step()
+        if self.native:
+            from xrgs.splat import native_adam
+
+            native_adam.step(self.adam)
+        else:
+            self.adam.step()
         self.steps_done += 1
         decay: float = self.means_final ** (self.steps_done / self.steps)
         self._group("means")["lr"] = self.means_rate * decay

@@ -1,0 +1,234 @@
+"""The compiled Adam against torch's own, on the same state."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from torch import Tensor
+
+from xrgs.splat.gaussians import PARAMETERS, Gaussians
+from xrgs.splat.optimizer import SplatOptimizer
+from xrgs.splat.settings import OptimizerSettings
+
+native = pytest.importorskip("xrgs._native")
+
+SHAPES = {
+    "means": (3,),
+    "quats": (4,),
+    "scales": (3,),
+    "opacities": (),
+    "sh0": (1, 3),
+    "shN": (15, 3),
+}
+MOMENTS = ("exp_avg", "exp_avg_sq")
+ULP = 2.0**-23
+
+
+@pytest.fixture(params=native.available_isas())
+def isa(request: pytest.FixtureRequest) -> Iterator[str]:
+    """Each instruction set that this machine has."""
+    before = native.isa()
+    native.set_isa(request.param)
+    yield request.param
+    native.set_isa(before)
+
+
+@pytest.fixture
+def threads() -> Iterator[None]:
+    """Puts torch's thread count back."""
+    before = torch.get_num_threads()
+    yield
+    torch.set_num_threads(before)
+
+
+def values(count: int, seed: int, size: float = 1.0) -> dict[str, Tensor]:
+    generator = torch.Generator().manual_seed(seed)
+    return {
+        name: size * torch.randn(count, *shape, generator=generator)
+        for name, shape in SHAPES.items()
+    }
+
+
+def optimizer(count: int, backend: str) -> SplatOptimizer:
+    gaussians = Gaussians(**{k: v.requires_grad_() for k, v in values(count, 0).items()})
+    return SplatOptimizer(
+        gaussians, OptimizerSettings(), scene_scale=2.0, steps=100, backend=backend
+    )
+
+
+def take_step(of: SplatOptimizer, gradients: dict[str, Tensor]) -> None:
+    of.zero_grad()
+    for name, gradient in gradients.items():
+        of.gaussians[name].grad = gradient.clone()
+    of.step()
+
+
+def moment(of: SplatOptimizer, name: str, which: str) -> Tensor:
+    value: Tensor = of.adam.state[of.gaussians[name]][which]
+    return value
+
+
+def assert_same(ours: SplatOptimizer, theirs: SplatOptimizer, steps: int) -> None:
+    """Equal but for rounding: an ulp a step of the moments, and of the distance gone.
+
+    A moment's error shrinks by its beta each step and gains the roundings of one step; a parameter
+    gains a rounding of itself and four of its step's length, the rate at most.
+    """
+    for name in PARAMETERS:
+        for which, memory in (("exp_avg", 10), ("exp_avg_sq", 1000)):
+            a, b = moment(ours, name, which), moment(theirs, name, which)
+            # Of a first moment, whose terms may cancel, relative to the root of the second.
+            scale = b if which == "exp_avg_sq" else moment(theirs, name, "exp_avg_sq").sqrt() * 32
+            assert ((a - b).abs() <= 2 * min(steps, memory) * ULP * scale).all(), (name, which)
+        a, b = ours.gaussians[name].detach(), theirs.gaussians[name].detach()
+        rate = ours.means_rate if name == "means" else ours._group(name)["lr"]
+        bound = steps * ULP * (b.abs() + 8 * rate)
+        assert ((a - b).abs() <= bound).all(), name
+        assert ours.adam.state[ours.gaussians[name]]["step"] == steps
+
+
+@pytest.mark.parametrize("count", [1, 5, 16, 37, 400])
+def test_it_is_torchs_adam_but_for_rounding(isa: str, count: int) -> None:
+    ours, theirs = optimizer(count, "native"), optimizer(count, "torch")
+    for step in range(1, 41):
+        # Sizes as in training, and changing fast.
+        gradients = values(count, step, 10.0 ** -(step % 7))
+        take_step(ours, gradients)
+        take_step(theirs, gradients)
+        assert_same(ours, theirs, step)
+
+
+def test_a_first_step_is_within_two_ulp(isa: str) -> None:
+    ours, theirs = optimizer(400, "native"), optimizer(400, "torch")
+    gradients = values(400, 1)
+    take_step(ours, gradients)
+    take_step(theirs, gradients)
+    for name in PARAMETERS:
+        for which in MOMENTS:
+            a, b = moment(ours, name, which), moment(theirs, name, which)
+            assert ((a - b).abs() <= 2 * ULP * b.abs()).all()
+        a, b = ours.gaussians[name].detach(), theirs.gaussians[name].detach()
+        assert ((a - b).abs() <= ULP * (b.abs() + 2 * ours._group(name)["lr"])).all()
+
+
+def change(of: SplatOptimizer, what: str, seed: int) -> None:
+    """What densification does to an optimizer."""
+    generator = torch.Generator().manual_seed(seed)
+    count = len(of.gaussians)
+    if what == "append":
+        of.append(values(1 + seed % 5, seed))
+    elif what == "keep":
+        of.keep(torch.rand(count, generator=generator) < 0.7)
+    elif what == "reset":
+        of.reset("opacities", of.gaussians.opacities.detach().clamp_max(-1.0))
+
+
+@settings(max_examples=30, deadline=None)
+@given(
+    plan=st.lists(
+        st.tuples(
+            st.sampled_from(["nothing", "append", "keep", "reset", "no gradient", "band 0"]),
+            st.integers(0, 10**6),
+            st.integers(-12, 3),
+        ),
+        min_size=1,
+        max_size=25,
+    )
+)
+def test_it_is_torchs_as_gaussians_come_and_go(plan: list[tuple[str, int, int]]) -> None:
+    ours, theirs = optimizer(6, "native"), optimizer(6, "torch")
+    for step, (what, seed, exponent) in enumerate(plan, start=1):
+        gradients = values(len(ours.gaussians), seed, 10.0**exponent)
+        if what == "no gradient":
+            for gradient in gradients.values():
+                gradient[::2] = 0
+        elif what == "band 0":
+            gradients["shN"].zero_()
+        for each in (ours, theirs):
+            take_step(each, gradients)
+        assert_same(ours, theirs, step)
+        for each in (ours, theirs):
+            change(each, what, seed)
+
+
+@pytest.mark.usefixtures("threads")
+def test_threads_change_no_bit(isa: str) -> None:
+    results = []
+    for count in (1, 2, 3, 4):
+        torch.set_num_threads(count)
+        of = optimizer(2000, "native")
+        for step in range(3):
+            take_step(of, values(2000, step))
+        results.append(of)
+    for other in results[1:]:
+        for name in PARAMETERS:
+            assert torch.equal(other.gaussians[name], results[0].gaussians[name])
+            for which in MOMENTS:
+                assert torch.equal(moment(other, name, which), moment(results[0], name, which))
+
+
+def test_what_has_no_gradient_yet_stays_to_the_bit(isa: str) -> None:
+    of = optimizer(20, "native")
+    before = of.gaussians.shN.detach().clone()
+    gradients = values(20, 1)
+    gradients["shN"][:, 3:] = 0
+    take_step(of, gradients)
+    assert torch.equal(of.gaussians.shN[:, 3:], before[:, 3:])
+    assert (of.gaussians.shN[:, :3] != before[:, :3]).all()
+    assert (moment(of, "shN", "exp_avg")[:, 3:] == 0).all()
+    # What had one goes on by its momentum.
+    after = of.gaussians.shN.detach().clone()
+    take_step(of, {name: torch.zeros_like(g) for name, g in gradients.items()})
+    assert (of.gaussians.shN[:, :3] != after[:, :3]).any()
+    assert torch.equal(of.gaussians.shN[:, 3:], before[:, 3:])
+
+
+def test_a_parameter_without_gradient_is_left_alone() -> None:
+    of = optimizer(5, "native")
+    before = of.gaussians.sh0.detach().clone()
+    gradients = values(5, 1)
+    del gradients["sh0"]
+    take_step(of, gradients)
+    assert torch.equal(of.gaussians.sh0, before)
+    assert of.gaussians.sh0 not in of.adam.state
+
+
+def test_torch_goes_on_from_our_state_and_we_from_its() -> None:
+    mixed, theirs = optimizer(9, "native"), optimizer(9, "torch")
+    for step in range(1, 11):
+        mixed.native = step % 3 != 0
+        gradients = values(9, step)
+        take_step(mixed, gradients)
+        take_step(theirs, gradients)
+        assert_same(mixed, theirs, step)
+
+
+def test_no_gaussians() -> None:
+    of = optimizer(4, "native")
+    take_step(of, values(4, 1))
+    of.keep(torch.zeros(4, dtype=torch.bool))
+    take_step(of, values(0, 2))
+    assert len(of.gaussians) == 0
+    assert of.adam.state[of.gaussians.means]["step"] == 2
+
+
+def test_nan_shows_where_it_is(isa: str) -> None:
+    of = optimizer(20, "native")
+    gradients = values(20, 1)
+    gradients["scales"][3, 1] = float("nan")
+    take_step(of, gradients)
+    wrong = of.gaussians.scales.isnan()
+    assert wrong[3, 1]
+    assert wrong.sum() == 1
+
+
+def test_it_is_for_float32() -> None:
+    gaussians = Gaussians(**{k: v.double().requires_grad_() for k, v in values(3, 0).items()})
+    of = SplatOptimizer(gaussians, OptimizerSettings(), scene_scale=1.0, steps=10, backend="native")
+    gaussians.means.grad = torch.zeros(3, 3, dtype=torch.float64)
+    with pytest.raises(ValueError, match="means and its gradient must be float32"):
+        of.step()

@@ -1,0 +1,233 @@
+"""The compiled loss against the torch one in double, whose own tests are in test_loss.py."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from torch import Tensor
+from torch.nn.functional import interpolate
+
+from xrgs.splat.loss import photometric_loss, prepare_target
+
+native = pytest.importorskip("xrgs._native")
+
+WEIGHTS = {"l1": 0.8, "ssim": 0.2}
+
+
+@pytest.fixture(params=native.available_isas())
+def isa(request: pytest.FixtureRequest) -> Iterator[str]:
+    """Each instruction set that this machine has."""
+    before = native.isa()
+    native.set_isa(request.param)
+    yield request.param
+    native.set_isa(before)
+
+
+@pytest.fixture
+def threads() -> Iterator[None]:
+    """Puts torch's thread count back."""
+    before = torch.get_num_threads()
+    yield
+    torch.set_num_threads(before)
+
+
+def pair(height: int, width: int, seed: int = 0) -> tuple[Tensor, Tensor]:
+    """Two float32 images of the same smooth shapes, each with noise of its own."""
+    generator = torch.Generator().manual_seed(seed)
+    coarse = torch.rand(1, 3, height // 8 + 2, width // 8 + 2, generator=generator)
+    smooth = interpolate(coarse, size=(height, width), mode="bicubic")[0].permute(1, 2, 0)
+    noise = torch.rand(2, height, width, 3, generator=generator)
+    image, photograph = smooth + 0.1 * noise
+    return image, photograph
+
+
+def value_and_gradient(
+    image: Tensor, photograph: Tensor, backend: str, **weights: float
+) -> tuple[float, Tensor]:
+    leaf = image.clone().requires_grad_()
+    loss = photometric_loss(
+        leaf, prepare_target(photograph), backend=backend, **(WEIGHTS | weights)
+    )
+    loss.backward()
+    assert leaf.grad is not None
+    return loss.item(), leaf.grad
+
+
+# Sizes around the window, the vectors (16 floats), the groups of rows and the chunks of columns.
+SIZES = [(11, 11), (11, 30), (40, 13), (12, 16), (13, 32), (52, 67), (33, 64), (75, 133), (131, 65)]
+
+
+@pytest.mark.parametrize("size", SIZES)
+def test_it_is_the_torch_loss_in_double(isa: str, size: tuple[int, int]) -> None:
+    image, photograph = pair(*size)
+    exact, exact_gradient = value_and_gradient(image.double(), photograph.double(), "torch")
+    _, torch_gradient = value_and_gradient(image, photograph, "torch")
+    loss, gradient = value_and_gradient(image, photograph, "native")
+    assert abs(loss - exact) <= 1e-6
+
+    def error(of: Tensor) -> float:
+        return (of.double() - exact_gradient).abs().max().item()
+
+    assert gradient.shape == image.shape
+    assert error(gradient) <= error(torch_gradient)
+    assert error(gradient) <= 1e-5 * exact_gradient.abs().max().item()
+
+
+@pytest.mark.parametrize(("l1", "ssim"), [(1.0, 0.0), (0.0, 1.0), (0.3, 2.0)])
+def test_any_weights(l1: float, ssim: float) -> None:
+    image, photograph = pair(30, 41)
+    exact, exact_gradient = value_and_gradient(
+        image.double(), photograph.double(), "torch", l1=l1, ssim=ssim
+    )
+    loss, gradient = value_and_gradient(image, photograph, "native", l1=l1, ssim=ssim)
+    assert loss == pytest.approx(exact, abs=1e-6)
+    torch.testing.assert_close(
+        gradient.double(), exact_gradient, rtol=0, atol=1e-5 * exact_gradient.abs().max().item()
+    )
+
+
+def test_ssim_is_kornias() -> None:
+    from kornia.losses import ssim_loss
+
+    image, photograph = pair(52, 67)
+    batch, reference = (x.double().permute(2, 0, 1)[None] for x in (image, photograph))
+    expected = 2 * ssim_loss(batch, reference, 11, eps=0.0, padding="valid").item()
+    loss, _ = value_and_gradient(image, photograph, "native", l1=0.0, ssim=1.0)
+    assert loss == pytest.approx(expected, abs=1e-6)
+
+
+@settings(max_examples=25, deadline=None)
+@given(size=st.tuples(st.integers(11, 60), st.integers(11, 90)), seed=st.integers(0, 10**6))
+def test_any_size(size: tuple[int, int], seed: int) -> None:
+    image, photograph = pair(*size, seed)
+    exact, exact_gradient = value_and_gradient(image.double(), photograph.double(), "torch")
+    loss, gradient = value_and_gradient(image, photograph, "native")
+    assert loss == pytest.approx(exact, abs=1e-6)
+    # Where the two images are within rounding of one another L1's gradient may have either sign.
+    certain = (image - photograph).abs() > 1e-7
+    torch.testing.assert_close(
+        gradient.double()[certain],
+        exact_gradient[certain],
+        rtol=0,
+        atol=2e-5 * exact_gradient.abs().max().item(),
+    )
+
+
+@pytest.mark.usefixtures("threads")
+@pytest.mark.parametrize("size", [(11, 40), (200, 90), (257, 33)])
+def test_threads_change_no_bit(isa: str, size: tuple[int, int]) -> None:
+    image, photograph = pair(*size)
+    results = []
+    for count in (1, 2, 3, 4, 1):
+        torch.set_num_threads(count)
+        results.append(value_and_gradient(image, photograph, "native"))
+    for loss, gradient in results[1:]:
+        assert loss == results[0][0]
+        assert torch.equal(gradient, results[0][1])
+
+
+@pytest.mark.parametrize("levels", [(0.0, 0.0), (1.0, 0.0), (0.25, 0.5), (3.0, 3.0), (-700.0, 1e4)])
+def test_flat_images_stay_finite(isa: str, levels: tuple[float, float]) -> None:
+    image, photograph = (torch.full((25, 31, 3), level) for level in levels)
+    exact, _ = value_and_gradient(image.double(), photograph.double(), "torch")
+    loss, gradient = value_and_gradient(image, photograph, "native")
+    assert gradient.isfinite().all()
+    # A variance beside C2: sums over eleven taps down and eleven across round 22 times.
+    spread = max(abs(level - 0.5) for level in levels)
+    assert loss == pytest.approx(exact, rel=1e-6, abs=0.2 * 22 * 2**-24 * spread**2 / 0.03**2)
+
+
+def test_the_same_image_has_no_loss_and_hardly_a_gradient(isa: str) -> None:
+    image, _ = pair(40, 50)
+    loss, gradient = value_and_gradient(image, image, "native")
+    _, other = value_and_gradient(image, image + 0.1, "native")
+    assert abs(loss) <= 1e-6
+    assert gradient.abs().max() <= 1e-3 * other.abs().max()
+
+
+@pytest.mark.parametrize("where", [(0, 0, 0), (20, 13, 2), (29, 40, 1)])
+def test_nan_shows(isa: str, where: tuple[int, int, int]) -> None:
+    image, photograph = pair(30, 41)
+    image[where] = float("nan")
+    loss, gradient = value_and_gradient(image, photograph, "native")
+    assert math.isnan(loss)
+    assert gradient[where].isnan()
+    # A window reaches ten pixels, and only its own channel.
+    y, x, channel = where
+    rows, columns = (torch.arange(n) for n in (30, 41))
+    far = ((rows - y).abs() > 10)[:, None] | ((columns - x).abs() > 10)[None]
+    assert gradient[far].isfinite().all()
+    assert gradient[..., [c for c in range(3) if c != channel]].isfinite().all()
+
+
+def test_nan_in_the_target_shows() -> None:
+    image, photograph = pair(30, 41)
+    photograph[3, 4, 1] = float("nan")
+    loss, gradient = value_and_gradient(image, photograph, "native")
+    assert math.isnan(loss)
+    assert gradient[3, 4, 1].isnan()
+
+
+def test_a_strided_image_counts_the_same() -> None:
+    image, photograph = pair(20, 24)
+    target = prepare_target(photograph)
+    planar = image.permute(2, 0, 1).contiguous().permute(1, 2, 0)
+    assert not planar.is_contiguous()
+    same = photometric_loss(image, target, **WEIGHTS, backend="native")
+    assert torch.equal(photometric_loss(planar, target, **WEIGHTS, backend="native"), same)
+
+
+def test_a_strided_photograph_counts_the_same() -> None:
+    image, photograph = pair(20, 24)
+    planar = photograph.permute(2, 0, 1).contiguous().permute(1, 2, 0)
+    losses = [
+        photometric_loss(image, prepare_target(p), **WEIGHTS, backend="native")
+        for p in (photograph, planar)
+    ]
+    torch.testing.assert_close(losses[1], losses[0], rtol=1e-7, atol=0)
+
+
+def test_weighted_and_summed_losses_add_up() -> None:
+    image, first = pair(20, 24)
+    _, second = pair(20, 24, seed=1)
+    _, by_first = value_and_gradient(image, first, "native")
+    _, by_second = value_and_gradient(image, second, "native")
+    leaf = image.clone().requires_grad_()
+    losses = [
+        photometric_loss(leaf, prepare_target(p), **WEIGHTS, backend="native")
+        for p in (first, second, first)
+    ]
+    total = losses[0] + 0.25 * losses[1] + losses[2]
+    total.backward(retain_graph=True)
+    assert leaf.grad is not None
+    expected = 2 * by_first + 0.25 * by_second
+    torch.testing.assert_close(leaf.grad, expected, rtol=1e-6, atol=1e-9)
+    total.backward()  # what the first time gave out must still be there
+    torch.testing.assert_close(leaf.grad, 2 * expected, rtol=1e-6, atol=1e-9)
+
+
+def test_an_image_without_gradient_has_the_same_loss() -> None:
+    image, photograph = pair(30, 41)
+    loss, _ = value_and_gradient(image, photograph, "native")
+    value = photometric_loss(image, prepare_target(photograph), **WEIGHTS, backend="native")
+    assert value.item() == loss
+    assert not value.requires_grad
+
+
+def test_it_is_for_float32() -> None:
+    image, photograph = pair(20, 24)
+    with pytest.raises(ValueError, match="image must be float32"):
+        photometric_loss(image.double(), prepare_target(photograph), **WEIGHTS, backend="native")
+    with pytest.raises(ValueError, match="target must be float32"):
+        photometric_loss(image, prepare_target(photograph.double()), **WEIGHTS, backend="native")
+
+
+def test_shapes_are_checked() -> None:
+    image, photograph = pair(20, 24)
+    with pytest.raises(ValueError, match=r"image is \[19, 24, 3\], its target \[20, 24, 3\]"):
+        photometric_loss(image[:19], prepare_target(photograph), **WEIGHTS, backend="native")
