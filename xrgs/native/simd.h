@@ -40,12 +40,6 @@ XRGS_INLINE void store_first(float* p, Floats a, int count) {
 }
 // Past the cache, to a place on a 64-byte boundary that nobody reads soon.
 XRGS_INLINE void stream(float* p, Floats a) { _mm512_stream_ps(p, a.v); }
-// p[0], p[1], p[0], p[1], ...
-XRGS_INLINE Floats splat_pair(const float* p) {
-  double pair;
-  std::memcpy(&pair, p, 8);
-  return {_mm512_castpd_ps(_mm512_set1_pd(pair))};
-}
 
 XRGS_INLINE Floats operator+(Floats a, Floats b) { return {_mm512_add_ps(a.v, b.v)}; }
 XRGS_INLINE Floats operator-(Floats a, Floats b) { return {_mm512_sub_ps(a.v, b.v)}; }
@@ -56,6 +50,11 @@ XRGS_INLINE Floats fma(Floats a, Floats b, Floats c) { return {_mm512_fmadd_ps(a
 XRGS_INLINE Floats fnma(Floats a, Floats b, Floats c) { return {_mm512_fnmadd_ps(a.v, b.v, c.v)}; }
 XRGS_INLINE Floats min(Floats a, Floats b) { return {_mm512_min_ps(a.v, b.v)}; }
 XRGS_INLINE Floats max(Floats a, Floats b) { return {_mm512_max_ps(a.v, b.v)}; }
+// Of positive numbers (of others, anything): compared as integers, which more units can do.
+XRGS_INLINE Floats min_positive(Floats a, Floats b) {
+  return {_mm512_castsi512_ps(
+      _mm512_min_epi32(_mm512_castps_si512(a.v), _mm512_castps_si512(b.v)))};
+}
 XRGS_INLINE Floats abs(Floats a) { return {_mm512_abs_ps(a.v)}; }
 XRGS_INLINE Floats sqrt(Floats a) { return {_mm512_sqrt_ps(a.v)}; }
 XRGS_INLINE Floats floor(Floats a) {
@@ -96,6 +95,29 @@ XRGS_INLINE void interleave(Floats a, Floats b, Floats& low, Floats& high) {
   const __m512i second = _mm512_add_epi32(first, _mm512_set1_epi32(8));
   low = {_mm512_permutex2var_ps(a.v, first, b.v)};
   high = {_mm512_permutex2var_ps(a.v, second, b.v)};
+}
+
+// The inverse: a0 a1 ... and b0 b1 ...
+XRGS_INLINE void deinterleave(Floats low, Floats high, Floats& a, Floats& b) {
+  const __m512i even = _mm512_setr_epi32(0, 2, 4, 6, 8, 10, 12, 14, 16, 18, 20, 22, 24, 26, 28, 30);
+  const __m512i odd = _mm512_add_epi32(even, _mm512_set1_epi32(1));
+  a = {_mm512_permutex2var_ps(low.v, even, high.v)};
+  b = {_mm512_permutex2var_ps(low.v, odd, high.v)};
+}
+
+// The lanes as a 4x4 matrix, row by row: every row its own column C; row R in every row; and the
+// sum of the rows in every row.
+template <int C>
+XRGS_INLINE Floats splat_column(Floats a) { return {_mm512_permute_ps(a.v, C * 0x55)}; }
+template <int R>
+XRGS_INLINE Floats splat_row(Floats a) { return {_mm512_shuffle_f32x4(a.v, a.v, R * 0x55)}; }
+XRGS_INLINE Floats sum_rows(Floats a) {
+  a = {_mm512_add_ps(a.v, _mm512_shuffle_f32x4(a.v, a.v, 0x4e))};
+  return {_mm512_add_ps(a.v, _mm512_shuffle_f32x4(a.v, a.v, 0xb1))};
+}
+// a, but a + b in the last row.
+XRGS_INLINE Floats add_last_row(Floats a, Floats b) {
+  return {_mm512_mask_add_ps(a.v, 0xf000, a.v, b.v)};
 }
 
 XRGS_INLINE float sum(Floats a) {
@@ -167,13 +189,6 @@ XRGS_INLINE void stream(float* p, Floats a) {
   _mm256_stream_ps(p, a.lo);
   _mm256_stream_ps(p + 8, a.hi);
 }
-// p[0], p[1], p[0], p[1], ...
-XRGS_INLINE Floats splat_pair(const float* p) {
-  double pair;
-  std::memcpy(&pair, p, 8);
-  const __m256 all = _mm256_castpd_ps(_mm256_set1_pd(pair));
-  return {all, all};
-}
 
 XRGS_INLINE Floats operator+(Floats a, Floats b) {
   return {_mm256_add_ps(a.lo, b.lo), _mm256_add_ps(a.hi, b.hi)};
@@ -200,6 +215,8 @@ XRGS_INLINE Floats min(Floats a, Floats b) {
 XRGS_INLINE Floats max(Floats a, Floats b) {
   return {_mm256_max_ps(a.lo, b.lo), _mm256_max_ps(a.hi, b.hi)};
 }
+// Of positive numbers (of others, anything).
+XRGS_INLINE Floats min_positive(Floats a, Floats b) { return min(a, b); }
 XRGS_INLINE Floats abs(Floats a) {
   const __m256 sign = _mm256_set1_ps(-0.0f);
   return {_mm256_andnot_ps(sign, a.lo), _mm256_andnot_ps(sign, a.hi)};
@@ -284,6 +301,39 @@ XRGS_INLINE void interleave(Floats a, Floats b, Floats& low, Floats& high) {
   high = half(a.hi, b.hi);
 }
 
+// The inverse: a0 a1 ... and b0 b1 ...
+XRGS_INLINE void deinterleave(Floats low, Floats high, Floats& a, Floats& b) {
+  const auto ordered = [](__m256 x) {
+    return _mm256_castpd_ps(_mm256_permute4x64_pd(_mm256_castps_pd(x), 0xd8));
+  };
+  a = {ordered(_mm256_shuffle_ps(low.lo, low.hi, 0x88)),
+       ordered(_mm256_shuffle_ps(high.lo, high.hi, 0x88))};
+  b = {ordered(_mm256_shuffle_ps(low.lo, low.hi, 0xdd)),
+       ordered(_mm256_shuffle_ps(high.lo, high.hi, 0xdd))};
+}
+
+// The lanes as a 4x4 matrix, row by row: every row its own column C; row R in every row; and the
+// sum of the rows in every row.
+template <int C>
+XRGS_INLINE Floats splat_column(Floats a) {
+  return {_mm256_permute_ps(a.lo, C * 0x55), _mm256_permute_ps(a.hi, C * 0x55)};
+}
+template <int R>
+XRGS_INLINE Floats splat_row(Floats a) {
+  const __m256 half = R < 2 ? a.lo : a.hi;
+  const __m256 row = _mm256_permute2f128_ps(half, half, (R & 1) * 0x11);
+  return {row, row};
+}
+XRGS_INLINE Floats sum_rows(Floats a) {
+  const __m256 pairs = _mm256_add_ps(a.lo, a.hi);
+  const __m256 all = _mm256_add_ps(pairs, _mm256_permute2f128_ps(pairs, pairs, 0x01));
+  return {all, all};
+}
+// a, but a + b in the last row.
+XRGS_INLINE Floats add_last_row(Floats a, Floats b) {
+  return {a.lo, _mm256_blend_ps(a.hi, _mm256_add_ps(a.hi, b.hi), 0xf0)};
+}
+
 XRGS_INLINE float sum(Floats a) {
   const __m256 half = _mm256_add_ps(a.lo, a.hi);
   const __m128 quarter = _mm_add_ps(_mm256_castps256_ps128(half), _mm256_extractf128_ps(half, 1));
@@ -348,8 +398,6 @@ XRGS_INLINE void store_first(float* p, Floats a, int count) {
   for (int i = 0; i < count; ++i) p[i] = a.v[i];
 }
 XRGS_INLINE void stream(float* p, Floats a) { store(p, a); }
-// p[0], p[1], p[0], p[1], ...
-XRGS_INLINE Floats splat_pair(const float* p) { XRGS_EACH(Floats, p[i & 1]); }
 
 XRGS_INLINE Floats operator+(Floats a, Floats b) { XRGS_EACH(Floats, a.v[i] + b.v[i]); }
 XRGS_INLINE Floats operator-(Floats a, Floats b) { XRGS_EACH(Floats, a.v[i] - b.v[i]); }
@@ -360,6 +408,8 @@ XRGS_INLINE Floats fma(Floats a, Floats b, Floats c) { XRGS_EACH(Floats, a.v[i] 
 XRGS_INLINE Floats fnma(Floats a, Floats b, Floats c) { XRGS_EACH(Floats, c.v[i] - a.v[i] * b.v[i]); }
 XRGS_INLINE Floats min(Floats a, Floats b) { XRGS_EACH(Floats, a.v[i] < b.v[i] ? a.v[i] : b.v[i]); }
 XRGS_INLINE Floats max(Floats a, Floats b) { XRGS_EACH(Floats, a.v[i] > b.v[i] ? a.v[i] : b.v[i]); }
+// Of positive numbers (of others, anything).
+XRGS_INLINE Floats min_positive(Floats a, Floats b) { return min(a, b); }
 XRGS_INLINE Floats abs(Floats a) { XRGS_EACH(Floats, __builtin_fabsf(a.v[i])); }
 XRGS_INLINE Floats sqrt(Floats a) { XRGS_EACH(Floats, __builtin_sqrtf(a.v[i])); }
 XRGS_INLINE Floats floor(Floats a) { XRGS_EACH(Floats, __builtin_floorf(a.v[i])); }
@@ -414,6 +464,30 @@ XRGS_INLINE void interleave(Floats a, Floats b, Floats& low, Floats& high) {
     high.v[2 * i] = a.v[i + 8];
     high.v[2 * i + 1] = b.v[i + 8];
   }
+}
+
+// The inverse: a0 a1 ... and b0 b1 ...
+XRGS_INLINE void deinterleave(Floats low, Floats high, Floats& a, Floats& b) {
+  for (int i = 0; i < 8; ++i) {
+    a.v[i] = low.v[2 * i];
+    b.v[i] = low.v[2 * i + 1];
+    a.v[i + 8] = high.v[2 * i];
+    b.v[i + 8] = high.v[2 * i + 1];
+  }
+}
+
+// The lanes as a 4x4 matrix, row by row: every row its own column C; row R in every row; and the
+// sum of the rows in every row.
+template <int C>
+XRGS_INLINE Floats splat_column(Floats a) { XRGS_EACH(Floats, a.v[i / 4 * 4 + C]); }
+template <int R>
+XRGS_INLINE Floats splat_row(Floats a) { XRGS_EACH(Floats, a.v[4 * R + i % 4]); }
+XRGS_INLINE Floats sum_rows(Floats a) {
+  XRGS_EACH(Floats, (a.v[i % 4] + a.v[8 + i % 4]) + (a.v[4 + i % 4] + a.v[12 + i % 4]));
+}
+// a, but a + b in the last row.
+XRGS_INLINE Floats add_last_row(Floats a, Floats b) {
+  XRGS_EACH(Floats, i < 12 ? a.v[i] : a.v[i] + b.v[i]);
 }
 
 XRGS_INLINE float sum(Floats a) {
@@ -482,22 +556,19 @@ XRGS_INLINE void store_triples(float* p, Floats x, Floats y, Floats z) {
 }
 #endif
 XRGS_INLINE void load_quadruples(const float* p, Floats& w, Floats& x, Floats& y, Floats& z) {
-  float part[4][16];
-  for (int i = 0; i < 16; ++i)
-    for (int k = 0; k < 4; ++k) part[k][i] = p[4 * i + k];
-  w = load(part[0]);
-  x = load(part[1]);
-  y = load(part[2]);
-  z = load(part[3]);
+  Floats wy[2], xz[2];
+  deinterleave(load(p), load(p + 16), wy[0], xz[0]);
+  deinterleave(load(p + 32), load(p + 48), wy[1], xz[1]);
+  deinterleave(wy[0], wy[1], w, y);
+  deinterleave(xz[0], xz[1], x, z);
 }
 XRGS_INLINE void store_quadruples(float* p, Floats w, Floats x, Floats y, Floats z) {
-  float part[4][16];
-  store(part[0], w);
-  store(part[1], x);
-  store(part[2], y);
-  store(part[3], z);
-  for (int i = 0; i < 16; ++i)
-    for (int k = 0; k < 4; ++k) p[4 * i + k] = part[k][i];
+  Floats wy[2], xz[2], out[4];
+  interleave(w, y, wy[0], wy[1]);
+  interleave(x, z, xz[0], xz[1]);
+  interleave(wy[0], xz[0], out[0], out[1]);
+  interleave(wy[1], xz[1], out[2], out[3]);
+  for (int i = 0; i < 4; ++i) store(p + 16 * i, out[i]);
 }
 
 XRGS_INLINE Floats operator-(Floats a) { return splat(0.0f) - a; }

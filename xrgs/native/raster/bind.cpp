@@ -6,8 +6,10 @@
 #include <nanobind/stl/optional.h>
 #include <nanobind/stl/tuple.h>
 
+#include <algorithm>
 #include <array>
 #include <cmath>
+#include <limits>
 #include <memory>
 #include <optional>
 #include <stdexcept>
@@ -202,7 +204,8 @@ View make_view(const Matrix4& viewmat, const std::array<float, 4>& intrinsics, i
   v.height = height;
   v.near = near;
   v.eps2d = eps2d;
-  v.alpha_min = alpha_min;
+  v.alpha_min = std::max(alpha_min, std::numeric_limits<float>::min());
+  v.level_min = std::log2(v.alpha_min);
   v.alpha_max = alpha_max;
   v.transmittance_min = transmittance_min;
   v.antialiased = antialiased;

@@ -7,7 +7,6 @@
 #include "raster/batch.h"
 #include "raster/ellipse.h"
 #include "raster/stages.h"
-#include "vector_math.h"
 
 namespace xrgs {
 namespace XRGS_NS {
@@ -74,10 +73,6 @@ void load_batch(const Frame& frame, const Tile& tile, const Entry* entries, int 
   }
 }
 
-struct Cuts {
-  Floats alpha_min, alpha_max, transmittance_min;
-};
-
 // Composite a block's list. Returns how far it went: to the end, or to where no pixel is left.
 int composite_block(const Rows& rows, const std::uint8_t* list, int count, int index,
                     const Cuts& cuts, Block& block) {
@@ -86,23 +81,17 @@ int composite_block(const Rows& rows, const std::uint8_t* list, int count, int i
   Floats red = load(block.red), green = load(block.green), blue = load(block.blue);
   int at = 0;
   while (at < count) {
-    const int end = at + kCheckEvery < count ? at + kCheckEvery : count;
-    for (; at < end; ++at) {
-      const float* g = rows[list[at]];
-      const Floats dx = x - splat(g[kX]), dy = y - splat(g[kY]);
-      const Floats u = fnma(splat(g[kS]), dy, splat(g[kP]) * dx), v = splat(g[kQ]) * dy;
-      Floats alpha = exp2(fnma(u, u, fnma(v, v, splat(g[kLevel]))));
-      alpha = keep(cuts.alpha_min <= alpha, min(alpha, cuts.alpha_max));
-      const Floats after = fnma(alpha, t, t);
-      const Mask kept = cuts.transmittance_min < after;
-      const Floats weight = keep(kept, alpha * t);
-      red = fma(weight, splat(g[kRed]), red);
-      green = fma(weight, splat(g[kGreen]), green);
-      blue = fma(weight, splat(g[kBlue]), blue);
-      left = select(kept, after, left);
-      t = after;
-    }
-    if (!any(cuts.transmittance_min < t)) break;
+    const float* g = rows[list[at]];
+    const Floats alpha = alpha_at(g, x, y, cuts);
+    const Floats gain = alpha * t;
+    t = t - gain;
+    const Mask kept = cuts.transmittance_min < t;
+    const Floats weight = keep(kept, gain);
+    red = fma(weight, splat(g[kRed]), red);
+    green = fma(weight, splat(g[kGreen]), green);
+    blue = fma(weight, splat(g[kBlue]), blue);
+    left = select(kept, t, left);
+    if (++at % kCheckEvery == 0 && !any(kept)) break;
   }
   store(block.t, t);
   store(block.left, left);
@@ -132,18 +121,18 @@ std::uint32_t start_blocks(const Tile& tile, const View& view, Block* blocks) {
 
 void write_blocks(const Tile& tile, const View& view, const Block* blocks, float* image, float* alpha) {
   const float* back = view.background;
-  for (int b = 0; b < kBlocks; ++b)
-    for (int i = 0; i < 16; ++i) {
-      const int x = tile.column * kTile + 4 * (b % 4) + i % 4;
-      const int y = tile.row * kTile + 4 * (b / 4) + i / 4;
-      if (x >= view.width || y >= view.height) continue;
-      const std::int64_t pixel = std::int64_t{y} * view.width + x;
-      const float left = blocks[b].left[i];
-      image[3 * pixel] = blocks[b].red[i] + left * back[0];
-      image[3 * pixel + 1] = blocks[b].green[i] + left * back[1];
-      image[3 * pixel + 2] = blocks[b].blue[i] + left * back[2];
-      alpha[pixel] = 1.0f - left;
-    }
+  for (int b = 0; b < kBlocks; ++b) {
+    const BlockPlace place(tile, view, b);
+    if (!place.inside()) continue;
+    const Floats left = load(blocks[b].left);
+    alignas(64) float colors[48], opaque[16];
+    store_triples(colors, fma(left, splat(back[0]), load(blocks[b].red)),
+                  fma(left, splat(back[1]), load(blocks[b].green)),
+                  fma(left, splat(back[2]), load(blocks[b].blue)));
+    store(opaque, splat(1.0f) - left);
+    copy_rows<3>(colors, 12, image + 3 * place.pixel, 3 * std::int64_t{view.width}, place);
+    copy_rows<1>(opaque, 4, alpha + place.pixel, view.width, place);
+  }
 }
 
 }  // namespace
@@ -151,7 +140,7 @@ void write_blocks(const Tile& tile, const View& view, const Block* blocks, float
 void composite(Frame& frame, int index, float* image, float* alpha) {
   const View& view = frame.view;
   const Tile tile(frame, index);
-  const Cuts cuts{splat(view.alpha_min), splat(view.alpha_max), splat(view.transmittance_min)};
+  const Cuts cuts(view);
   Block blocks[kBlocks];
   alignas(64) Rows rows;
   std::uint32_t alive = start_blocks(tile, view, blocks);
@@ -163,8 +152,7 @@ void composite(Frame& frame, int index, float* image, float* alpha) {
     const Entry* entries = frame.entries.data() + at;
     std::uint16_t hits[kBlocks][kBatch / 16];
     load_batch(frame, tile, entries, count, rows, hits);
-    for (std::uint32_t i = at + kBatch; i < tile.end && i < at + 2 * kBatch; ++i)
-      prefetch(&frame.records[frame.entries[i].gaussian]);
+    prefetch_records(frame, at + kBatch);  // the next batch's, or the next tile's
     for (int b = 0; b < kBlocks; ++b) {
       batch->counts[b] = 0;
       if ((alive >> b & 1u) == 0) continue;

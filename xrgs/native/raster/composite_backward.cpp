@@ -8,57 +8,54 @@
 // to front, R needs no division by 1 - alpha, and never loses digits to subtraction.
 //
 // For each batch, last to first, and each block: walk the forward pass's list front to back from
-// the T it left at the batch's start, noting alpha and w; then back to front for R; then sum over
-// the block's pixels, one matrix product: (g, w) of 16 pixels times, for each pixel, 1, x, y, x^2,
-// xy, y^2 from the tile's centre in even lanes and v in odd ones. At the batch's end the moments
-// are moved from the tile's centre to each Gaussian's mean.
+// the T it left at the batch's start, noting alpha and w; then back to front for R, summing over
+// the block's pixels as 4x4 matrices: with g a matrix, X = (1, x, x^2) in each column and
+// Y = (1, y, y^2) in each row, both from the tile's centre, Y^T g X has the nine moments; with w,
+// the sum of w v. At the batch's end the moments are moved to each Gaussian's mean.
 #include "raster/batch.h"
 #include "raster/stages.h"
-#include "vector_math.h"
 
 namespace xrgs {
 namespace XRGS_NS {
 namespace {
 
-// Pixel gradients of a tile.
+// Pixel gradients of a block. The four `colors` have, for each column of its pixels, that column's
+// red, green, blue and 0, row by row.
 struct Incoming {
-  alignas(64) float red[kBlocks][16], green[kBlocks][16], blue[kBlocks][16];
-  alignas(64) float constant[kBlocks][16];  // v_alpha - background . v
-  alignas(64) float factors[kBlocks][16][16];  // of each pixel, the product's row
+  alignas(64) float red[16], green[16], blue[16];
+  alignas(64) float constant[16];  // v_alpha - background . v
+  alignas(64) float colors[4][16];
 };
 
-// Two vectors for each entry of a block's list: alpha and w at first, then g and w, interleaved.
+// For each entry of a block's list: alpha and w.
 using Notes = float[kBatch][32];
 
 void load_incoming(const Tile& tile, const View& view, const float* image_gradient,
-                   const float* alpha_gradient, Incoming& in) {
+                   const float* alpha_gradient, Incoming* incoming) {
   const float* back = view.background;
-  for (int b = 0; b < kBlocks; ++b)
-    for (int i = 0; i < 16; ++i) {
-      const int x = tile.column * kTile + 4 * (b % 4) + i % 4;
-      const int y = tile.row * kTile + 4 * (b / 4) + i / 4;
-      float red = 0.0f, green = 0.0f, blue = 0.0f, alpha = 0.0f;
-      if (x < view.width && y < view.height) {
-        const std::int64_t pixel = std::int64_t{y} * view.width + x;
-        red = image_gradient[3 * pixel];
-        green = image_gradient[3 * pixel + 1];
-        blue = image_gradient[3 * pixel + 2];
-        alpha = alpha_gradient[pixel];
+  for (int b = 0; b < kBlocks; ++b) {
+    const BlockPlace place(tile, view, b);
+    if (!place.inside()) continue;
+    Incoming& in = incoming[b];
+    alignas(64) float colors[48] = {}, opaque[16] = {};
+    copy_rows<3>(image_gradient + 3 * place.pixel, 3 * std::int64_t{view.width}, colors, 12, place);
+    copy_rows<1>(alpha_gradient + place.pixel, view.width, opaque, 4, place);
+    Floats red, green, blue;
+    load_triples(colors, red, green, blue);
+    store(in.red, red);
+    store(in.green, green);
+    store(in.blue, blue);
+    Floats constant = fnma(splat(back[0]), red, load(opaque));
+    constant = fnma(splat(back[1]), green, constant);
+    store(in.constant, fnma(splat(back[2]), blue, constant));
+    for (int row = 0; row < 4; ++row)
+      for (int column = 0; column < 4; ++column) {
+        const float* from = colors + 12 * row + 3 * column;
+        const float part[4] = {from[0], from[1], from[2], 0.0f};
+        std::memcpy(in.colors[column] + 4 * row, part, sizeof part);
       }
-      in.red[b][i] = red;
-      in.green[b][i] = green;
-      in.blue[b][i] = blue;
-      in.constant[b][i] = alpha - (back[0] * red + back[1] * green + back[2] * blue);
-      const float dx = static_cast<float>(4 * (b % 4) + i % 4) - 7.5f;
-      const float dy = static_cast<float>(4 * (b / 4) + i / 4) - 7.5f;
-      const float row[16] = {1.0f, red, dx, green, dy, blue, dx * dx, 0.0f, dx * dy, 0.0f, dy * dy};
-      store(in.factors[b][i], load(row));
-    }
+  }
 }
-
-struct Cuts {
-  Floats alpha_min, alpha_max, transmittance_min;
-};
 
 // Front to back, as the forward pass went: alpha (zero where it was not composited) and w.
 XRGS_INLINE void walk_forward(const Rows& rows, const std::uint8_t* list, int count, int block,
@@ -66,24 +63,55 @@ XRGS_INLINE void walk_forward(const Rows& rows, const std::uint8_t* list, int co
   const Floats x = pixels_x(block), y = pixels_y(block);
   Floats t = load(before);
   for (int at = 0; at < count; ++at) {
-    const float* g = rows[list[at]];
-    const Floats dx = x - splat(g[kX]), dy = y - splat(g[kY]);
-    const Floats u = fnma(splat(g[kS]), dy, splat(g[kP]) * dx), v = splat(g[kQ]) * dy;
-    Floats alpha = exp2(fnma(u, u, fnma(v, v, splat(g[kLevel]))));
-    alpha = keep(cuts.alpha_min <= alpha, min(alpha, cuts.alpha_max));
-    const Floats after = fnma(alpha, t, t);
-    alpha = keep(cuts.transmittance_min < after, alpha);
-    store(notes[at], alpha);
-    store(notes[at] + 16, alpha * t);
-    t = after;
+    const Floats alpha = alpha_at(rows[list[at]], x, y, cuts);
+    const Floats gain = alpha * t;
+    t = t - gain;
+    const Mask kept = cuts.transmittance_min < t;
+    store(notes[at], keep(kept, alpha));
+    store(notes[at] + 16, keep(kept, gain));
   }
 }
 
-// Back to front: g and w, interleaved.
+// The powers 1, x, x^2, 0 of the four columns' positions, the same in every row, and 1, y, y^2, 0
+// of the four rows', each the whole of a row of its own.
+struct Powers {
+  Floats x[4], y[4];
+
+  explicit Powers(int block) {
+    for (int i = 0; i < 4; ++i) {
+      const float at_x = static_cast<float>(4 * (block % 4) + i) - 7.5f;
+      const float at_y = static_cast<float>(4 * (block / 4) + i) - 7.5f;
+      alignas(64) float by_column[16], by_row[16];
+      for (int k = 0; k < 4; ++k) {
+        const float power_x[4] = {1.0f, at_x, at_x * at_x, 0.0f};
+        const float power_y[4] = {1.0f, at_y, at_y * at_y, 0.0f};
+        for (int j = 0; j < 4; ++j) {
+          by_column[4 * k + j] = power_x[j];
+          by_row[4 * k + j] = power_y[k];
+        }
+      }
+      x[i] = load(by_column);
+      y[i] = load(by_row);
+    }
+  }
+};
+
+// Sum over columns: of each row, its four values times the rows of the four factors.
+XRGS_INLINE Floats times_columns(Floats a, const Floats (&factors)[4]) {
+  const Floats even = fma(splat_column<2>(a), factors[2], splat_column<0>(a) * factors[0]);
+  return fma(splat_column<3>(a), factors[3], fma(splat_column<1>(a), factors[1], even));
+}
+
+// Back to front: each entry's sums over the block's pixels are added to its row of sums, which has
+// in row i < 3, column j < 3 the sum of g y^i x^j, and in row 3 that of w v.
 XRGS_INLINE void walk_back(const Rows& rows, const std::uint8_t* list, int count, int block,
-                           const Cuts& cuts, const Incoming& in, float* behind, Notes& notes) {
-  const Floats red = load(in.red[block]), green = load(in.green[block]);
-  const Floats blue = load(in.blue[block]), constant = load(in.constant[block]);
+                           const Cuts& cuts, const Incoming& in, const Notes& notes, float* behind,
+                           Rows& sums) {
+  const Floats red = load(in.red), green = load(in.green), blue = load(in.blue);
+  const Floats constant = load(in.constant);
+  const Floats colors[4] = {load(in.colors[0]), load(in.colors[1]), load(in.colors[2]),
+                            load(in.colors[3])};
+  const Powers powers(block);
   Floats r = load(behind);
   for (int at = count - 1; at >= 0; --at) {
     const float* g = rows[list[at]];
@@ -94,29 +122,15 @@ XRGS_INLINE void walk_back(const Rows& rows, const std::uint8_t* list, int count
     r = fma(alpha, gain, r);
     // A capped alpha does not move with its Gaussian.
     const Floats gradient = keep(alpha < cuts.alpha_max, weight * gain);
-    Floats low, high;
-    interleave(gradient, weight, low, high);
-    store(notes[at], low);
-    store(notes[at] + 16, high);
+    const Floats by_row = times_columns(gradient, powers.x);
+    float* place = sums[list[at]];
+    Floats even = fma(splat_row<0>(by_row), powers.y[0], load(place));
+    Floats odd = splat_row<1>(by_row) * powers.y[1];
+    even = fma(splat_row<2>(by_row), powers.y[2], even);
+    odd = fma(splat_row<3>(by_row), powers.y[3], odd);
+    store(place, add_last_row(even + odd, sum_rows(times_columns(weight, colors))));
   }
   store(behind, r);
-}
-
-// Add each entry's sums over the block's pixels to its row of sums.
-XRGS_INLINE void sum_pixels(const std::uint8_t* list, int count, int block, const Incoming& in,
-                            const Notes& notes, Rows& sums) {
-  Floats factors[16];
-  for (int i = 0; i < 16; ++i) factors[i] = load(in.factors[block][i]);
-  for (int at = 0; at < count; ++at) {
-    float* sum = sums[list[at]];
-    Floats even = load(sum), odd = splat_pair(notes[at] + 2) * factors[1];
-    even = fma(splat_pair(notes[at]), factors[0], even);
-    for (int i = 2; i < 16; i += 2) {
-      even = fma(splat_pair(notes[at] + 2 * i), factors[i], even);
-      odd = fma(splat_pair(notes[at] + 2 * i + 2), factors[i + 1], odd);
-    }
-    store(sum, even + odd);
-  }
 }
 
 // From sums about the tile's centre to sums about the Gaussians' means, into their slots.
@@ -130,7 +144,7 @@ void write_slots(const Rows& rows, const Rows& sums, const Entry* entries, int c
     transpose(means);
     transpose(m);
     const Floats a = means[kX], b = means[kY];
-    const Floats g = m[0], gx = m[2], gy = m[4], gxx = m[6], gxy = m[8], gyy = m[10];
+    const Floats g = m[0], gx = m[1], gxx = m[2], gy = m[4], gxy = m[5], gyy = m[8];
     const Floats to_x = fnma(a, g, gx), to_y = fnma(b, g, gy);
     out[kG] = g;
     out[kGx] = to_x;
@@ -138,9 +152,9 @@ void write_slots(const Rows& rows, const Rows& sums, const Entry* entries, int c
     out[kGxx] = fnma(a, gx + to_x, gxx);
     out[kGxy] = fnma(a, gy, fnma(b, to_x, gxy));
     out[kGyy] = fnma(b, gy + to_y, gyy);
-    out[kWr] = m[1];
-    out[kWg] = m[3];
-    out[kWb] = m[5];
+    out[kWr] = m[12];
+    out[kWg] = m[13];
+    out[kWb] = m[14];
     for (int i = kSlotFields; i < 16; ++i) out[i] = splat(0.0f);
     transpose(out);
     for (int i = 0; i < 16 && at + i < count; ++i)
@@ -170,12 +184,12 @@ void composite_backward(const Frame& frame, int index, const float* image_gradie
   const View& view = frame.view;
   const Tile tile(frame, index);
   if (tile.begin == tile.end) return;
-  const Cuts cuts{splat(view.alpha_min), splat(view.alpha_max), splat(view.transmittance_min)};
+  const Cuts cuts(view);
   alignas(64) Rows rows, sums;
   alignas(64) Notes notes;
   alignas(64) float behind[kBlocks][16] = {};
-  Incoming in;
-  load_incoming(tile, view, image_gradient, alpha_gradient, in);
+  Incoming incoming[kBlocks];
+  load_incoming(tile, view, image_gradient, alpha_gradient, incoming);
   const std::uint32_t batches = (tile.end - tile.begin + kBatch - 1) / kBatch;
   const std::uint32_t done = frame.batches_done[tile.index];
   const Entry* entries = frame.entries.data() + tile.begin;
@@ -186,14 +200,13 @@ void composite_backward(const Frame& frame, int index, const float* image_gradie
     const int count = left < kBatch ? static_cast<int>(left) : kBatch;
     const Batch& batch = frame.batches[frame.batch_begin[tile.index] + n];
     load_batch(frame, tile, entries + at, count, rows, sums);
-    if (n > 0)
-      for (std::uint32_t i = at - kBatch; i < at; ++i) prefetch(&frame.records[entries[i].gaussian]);
+    // The batch that comes next: the one before, or about one of the next tile.
+    prefetch_records(frame, n > 0 ? tile.begin + at - kBatch : tile.end);
     for (int b = 0; b < kBlocks; ++b) {
       const int listed = batch.counts[b];
       if (listed == 0) continue;
       walk_forward(rows, batch.lists[b], listed, b, cuts, batch.before[b], notes);
-      walk_back(rows, batch.lists[b], listed, b, cuts, in, behind[b], notes);
-      sum_pixels(batch.lists[b], listed, b, in, notes, sums);
+      walk_back(rows, batch.lists[b], listed, b, cuts, incoming[b], notes, behind[b], sums);
     }
     write_slots(rows, sums, entries + at, count, slots);
   }

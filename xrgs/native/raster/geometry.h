@@ -59,14 +59,8 @@ XRGS_INLINE Inputs load_inputs(const Parameters& p, std::int64_t group, int lane
   in.opacity = load(padded.of(p.opacities, group, lanes, 1));
   in.offset_x = in.offset_y = splat(0.0f);
   if (p.offsets != nullptr) {
-    alignas(64) float x[16], y[16];
     const float* both = padded.of(p.offsets, group, lanes, 2);
-    for (int i = 0; i < 16; ++i) {
-      x[i] = both[2 * i];
-      y[i] = both[2 * i + 1];
-    }
-    in.offset_x = load(x);
-    in.offset_y = load(y);
+    deinterleave(load(both), load(both + 16), in.offset_x, in.offset_y);
   }
   return in;
 }

@@ -49,7 +49,7 @@ XRGS_INLINE Vector3 colors_of(const Parameters& p, std::int64_t group, int lanes
   return color;
 }
 
-XRGS_INLINE Mask is_visible(const Projected& o, const View& v, Floats reach2, Floats opacity_floor) {
+XRGS_INLINE Mask is_visible(const Projected& o, const View& v, Floats reach2) {
   // reach2 is in units of log2: 2 ln(opacity / alpha_min) = 2 ln 2 reach2.
   const Floats r2 = splat(2.0f / kLog2e) * reach2, zero = splat(0.0f), huge = splat(1e18f);
   const Floats extent_x = sqrt(r2 * o.xx), extent_y = sqrt(r2 * o.yy);
@@ -57,7 +57,7 @@ XRGS_INLINE Mask is_visible(const Projected& o, const View& v, Floats reach2, Fl
   const Mask overlaps = (zero < o.mean_x + extent_x) & (zero < o.mean_y + extent_y) &
                         (o.mean_x - extent_x < splat(static_cast<float>(v.width))) &
                         (o.mean_y - extent_y < splat(static_cast<float>(v.height)));
-  return o.front & (opacity_floor <= o.opacity) & usable & overlaps;
+  return o.front & (splat(v.alpha_min) <= o.opacity) & usable & overlaps;
 }
 
 XRGS_INLINE void store_records(const Projected& o, Floats level, Floats reach2, const Vector3& color,
@@ -98,11 +98,10 @@ std::uint32_t project_sixteen(const Parameters& p, const View& v, std::int64_t g
   const Floats zero = splat(0.0f);
   if (bits(finite_times_zero(in) == zero) != 0xffffu) *finite = false;
   const Projected o = project_inputs(in, v);
-  const float alpha_floor = v.alpha_min > kSmallest ? v.alpha_min : kSmallest;
   const Floats level = log2(max(o.opacity, splat(kSmallest)));
-  const Floats reach2 = max(level - log2(splat(alpha_floor)), zero);
+  const Floats reach2 = max(level - splat(v.level_min), zero);
   const std::uint32_t inside = lanes == 16 ? 0xffffu : (1u << lanes) - 1u;
-  const std::uint32_t visible = bits(is_visible(o, v, reach2, splat(alpha_floor))) & inside;
+  const std::uint32_t visible = bits(is_visible(o, v, reach2)) & inside;
   if (visible == 0) return 0;
   const Vector3 from_camera{in.mean.x - splat(v.position[0]), in.mean.y - splat(v.position[1]),
                             in.mean.z - splat(v.position[2])};

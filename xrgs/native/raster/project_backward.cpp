@@ -23,6 +23,16 @@ XRGS_INLINE void sum_slots(const Frame& frame, const float* sums, std::int64_t g
   transpose(out);
 }
 
+// Ask for a group's slots: they lie anywhere, by depth.
+XRGS_INLINE void prefetch_slots(const Frame& frame, const float* sums, std::int64_t group) {
+  for (std::uint32_t left = frame.visible[static_cast<std::size_t>(group / 16)]; left != 0;
+       left &= left - 1) {
+    const Slots slots = frame.slots[static_cast<std::size_t>(group + __builtin_ctz(left))];
+    for (std::uint32_t k = 0; k < slots.count && k < 4; ++k)
+      prefetch(sums + (std::size_t{slots.first} + k) * kSlotSize);
+  }
+}
+
 // Gradients of what whitening reads.
 struct CovarianceGradient {
   Floats xx, xy, yy, det;
@@ -127,22 +137,38 @@ XRGS_INLINE ShapeGradient projection_backward(const Projected& o, const View& vi
   return out;
 }
 
-// Columns of sixteen rows of `Width` floats to rows `stride` apart; only the first `lanes`.
+// The gradients of sixteen Gaussians' harmonics, row by row, before they are streamed out. Bands
+// that are not on stay zero.
+struct Harmonics {
+  alignas(64) float rows[16 * 3 * rest_of(3) + 16] = {};
+};
+
+// Columns to rows `stride` apart. Each row is written to a multiple of sixteen: what that adds is
+// zero, and where it reaches into the next row it is overwritten.
 template <int Width>
-XRGS_INLINE void store_columns(float* p, std::int64_t stride, int lanes, const Floats* columns) {
+XRGS_INLINE void store_columns(const Floats* columns, std::int64_t stride, Harmonics& out) {
+  Floats r[(Width + 15) / 16][16];
   for (int c = 0; c < Width; c += 16) {
-    const int width = Width - c < 16 ? Width - c : 16;
-    Floats r[16];
-    for (int i = 0; i < 16; ++i) r[i] = i < width ? columns[c + i] : splat(0.0f);
-    transpose(r);
-    for (int i = 0; i < lanes; ++i) store_first(p + i * stride + c, r[i], width);
+    for (int i = 0; i < 16; ++i) r[c / 16][i] = c + i < Width ? columns[c + i] : splat(0.0f);
+    transpose(r[c / 16]);
   }
+  for (int i = 0; i < 16; ++i)
+    for (int c = 0; c < Width; c += 16) store(out.rows + i * stride + c, r[c / 16][i]);
 }
 
-// `width` floats of each of `lanes` Gaussians, from sixteen.
-XRGS_INLINE void copy_out(const float* from, float* to, int lanes, int width) {
-  for (int i = 0; i < lanes * width; ++i) to[i] = from[i];
-}
+// Where sixteen Gaussians' gradients of `width` floats go: to their place, or for a group that is
+// not whole to a buffer, and from there with `copy_out`.
+struct Sixteen {
+  std::int64_t group;
+  int lanes;
+  float buffer[64];
+
+  float* of(float* all, int width) { return lanes == 16 ? all + group * width : buffer; }
+  void copy_out(float* all, int width) {
+    if (lanes == 16) return;
+    for (int i = 0; i < lanes * width; ++i) all[group * width + i] = buffer[i];
+  }
+};
 
 void zero_floats(float* p, std::int64_t count) { std::memset(p, 0, static_cast<std::size_t>(count) * 4); }
 
@@ -150,7 +176,8 @@ void zero_floats(float* p, std::int64_t count) { std::memset(p, 0, static_cast<s
 template <int Degree>
 XRGS_INLINE Vector3 color_backward(const Parameters& p, const View& view, const Inputs& in,
                                    const Floats (&sum)[16], std::int64_t group, int lanes,
-                                   std::uint32_t visible, const Gradients& out) {
+                                   std::uint32_t visible, const Gradients& out,
+                                   Harmonics& harmonics) {
   constexpr int kRest = rest_of(Degree);
   const Floats zero = splat(0.0f), half = splat(0.5f);
   const Vector3 from_camera{in.mean.x - splat(view.position[0]), in.mean.y - splat(view.position[1]),
@@ -170,9 +197,9 @@ XRGS_INLINE Vector3 color_backward(const Parameters& p, const View& view, const 
   }
   const Vector3 v{keep(zero <= color.x, sum[kWr]), keep(zero <= color.y, sum[kWg]),
                   keep(zero <= color.z, sum[kWb])};
-  float sh0[48];
-  store_triples(sh0, splat(kC0) * v.x, splat(kC0) * v.y, splat(kC0) * v.z);
-  copy_out(sh0, out.sh0 + group * 3, lanes, 3);
+  Sixteen to{group, lanes, {}};
+  store_triples(to.of(out.sh0, 3), splat(kC0) * v.x, splat(kC0) * v.y, splat(kC0) * v.z);
+  to.copy_out(out.sh0, 3);
   Vector3 v_mean{zero, zero, zero};
   if constexpr (kRest > 0) {
     Floats along[kRest], vc[3 * kRest];
@@ -184,11 +211,14 @@ XRGS_INLINE Vector3 color_backward(const Parameters& p, const View& view, const 
     }
     const Vector3 v_d = sh_gradient<Degree>(d, along);
     v_mean = times(inv, add(v_d, -dot(v_d, d), d));
-    store_columns<3 * kRest>(out.shN + group * p.rest * 3, p.rest * 3, lanes, vc);
+    store_columns<3 * kRest>(vc, p.rest * 3, harmonics);
   }
-  if (p.rest > kRest)
-    for (int i = 0; i < lanes; ++i)
-      zero_floats(out.shN + ((group + i) * p.rest + kRest) * 3, (p.rest - kRest) * 3);
+  float* place = out.shN + group * p.rest * 3;
+  const int count = lanes * p.rest * 3;
+  if (lanes == 16)  // on a 64-byte boundary, as the array and sixteen rows of any width are
+    for (int i = 0; i < count; i += 16) stream(place + i, load(harmonics.rows + i));
+  else
+    for (int i = 0; i < count; ++i) place[i] = harmonics.rows[i];
   return v_mean;
 }
 
@@ -204,26 +234,30 @@ void write_zeros(const Parameters& p, std::int64_t group, int lanes, const Gradi
 
 void write_shape(const ShapeGradient& v, Floats v_opacity, Floats v_x2d, Floats v_y2d, Mask visible,
                  std::int64_t group, int lanes, const Gradients& out) {
-  float buffer[64];
-  store_triples(buffer, keep(visible, v.mean.x), keep(visible, v.mean.y), keep(visible, v.mean.z));
-  copy_out(buffer, out.means + group * 3, lanes, 3);
-  store_triples(buffer, keep(visible, v.scale.x), keep(visible, v.scale.y), keep(visible, v.scale.z));
-  copy_out(buffer, out.scales + group * 3, lanes, 3);
-  store_quadruples(buffer, keep(visible, v.quat[0]), keep(visible, v.quat[1]),
+  Sixteen to{group, lanes, {}};
+  store_triples(to.of(out.means, 3), keep(visible, v.mean.x), keep(visible, v.mean.y),
+                keep(visible, v.mean.z));
+  to.copy_out(out.means, 3);
+  store_triples(to.of(out.scales, 3), keep(visible, v.scale.x), keep(visible, v.scale.y),
+                keep(visible, v.scale.z));
+  to.copy_out(out.scales, 3);
+  store_quadruples(to.of(out.quats, 4), keep(visible, v.quat[0]), keep(visible, v.quat[1]),
                    keep(visible, v.quat[2]), keep(visible, v.quat[3]));
-  copy_out(buffer, out.quats + group * 4, lanes, 4);
-  store_first(out.opacities + group, keep(visible, v_opacity), lanes);
+  to.copy_out(out.quats, 4);
+  store(to.of(out.opacities, 1), keep(visible, v_opacity));
+  to.copy_out(out.opacities, 1);
   if (out.offsets == nullptr) return;
   Floats low, high;
   interleave(keep(visible, v_x2d), keep(visible, v_y2d), low, high);
-  store(buffer, low);
-  store(buffer + 16, high);
-  copy_out(buffer, out.offsets + group * 2, lanes, 2);
+  float* offsets = to.of(out.offsets, 2);
+  store(offsets, low);
+  store(offsets + 16, high);
+  to.copy_out(out.offsets, 2);
 }
 
 template <int Degree>
 void backward_sixteen(const Parameters& p, const Frame& frame, const float* sums, std::int64_t group,
-                      int lanes, std::uint32_t visible, const Gradients& out) {
+                      int lanes, std::uint32_t visible, const Gradients& out, Harmonics& harmonics) {
   const View& view = frame.view;
   Floats sum[16];
   sum_slots(frame, sums, group, visible, sum);
@@ -234,7 +268,7 @@ void backward_sixteen(const Parameters& p, const Frame& frame, const float* sums
   Vector3 v_m1, v_m2;
   covariance_backward(o, view, in, v, v_opacity, v_m1, v_m2);
   ShapeGradient shape = projection_backward(o, view, in, v_m1, v_m2, v.mean_x, v.mean_y);
-  const Vector3 by_color = color_backward<Degree>(p, view, in, sum, group, lanes, visible, out);
+  const Vector3 by_color = color_backward<Degree>(p, view, in, sum, group, lanes, visible, out, harmonics);
   shape.mean = add(shape.mean, splat(1.0f), by_color);
   write_shape(shape, v_opacity, v.mean_x, v.mean_y, mask_of(visible), group, lanes, out);
 }
@@ -242,14 +276,17 @@ void backward_sixteen(const Parameters& p, const Frame& frame, const float* sums
 template <int Degree>
 void backward_degree(const Parameters& p, const Frame& frame, const float* sums, std::int64_t first,
                      std::int64_t last, const Gradients& out) {
+  Harmonics harmonics;
   for (std::int64_t group = first; group < last; group += 16) {
     const int lanes = last - group < 16 ? static_cast<int>(last - group) : 16;
     const std::uint32_t visible = frame.visible[static_cast<std::size_t>(group / 16)];
+    if (group + 32 <= last) prefetch_slots(frame, sums, group + 16);
     if (visible == 0)
       write_zeros(p, group, lanes, out);
     else
-      backward_sixteen<Degree>(p, frame, sums, group, lanes, visible, out);
+      backward_sixteen<Degree>(p, frame, sums, group, lanes, visible, out, harmonics);
   }
+  stream_fence();
 }
 
 }  // namespace

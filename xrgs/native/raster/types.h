@@ -22,7 +22,10 @@ struct View {
   float position[3];  // of the camera, world units
   float fx, fy, cx, cy;
   int width, height;
-  float near, eps2d, alpha_min, alpha_max, transmittance_min;
+  float near, eps2d;
+  float alpha_min;  // at least the smallest normal number
+  float level_min;  // log2 of alpha_min
+  float alpha_max, transmittance_min;
   float background[3];
   bool antialiased;
   int degree;  // highest band of the spherical harmonics that is on
