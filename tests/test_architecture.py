@@ -37,6 +37,7 @@ FLOW = (
     ("cell",),
     ("worker",),
     ("report",),
+    ("bench",),
     ("sweep",),
     ("cli",),
 )

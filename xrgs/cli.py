@@ -1,16 +1,18 @@
-"""The commands: `xrgs-sweep` and `xrgs-report`."""
+"""The commands: `xrgs-sweep`, `xrgs-report` and `xrgs-bench`."""
 
 from __future__ import annotations
 
 import sys
 from dataclasses import dataclass
 from pathlib import Path
+from typing import cast
 
 import hydra
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from xrgs import config
+from xrgs.bench.settings import Settings
 from xrgs.errors import XrgsError
 
 
@@ -56,6 +58,12 @@ def sweep() -> None:
     _sweep()
 
 
+def _line(error: Exception) -> str:
+    """What is wrong, in one line that names the argument."""
+    line, key = str(error).splitlines()[0], getattr(error, "full_key", None)
+    return line if not key or key in line else f"{key}: {line}"
+
+
 @dataclass
 class ReportConf:
     """Arguments of `xrgs-report`."""
@@ -74,4 +82,16 @@ def report() -> None:
         conf = OmegaConf.merge(OmegaConf.structured(ReportConf), given)
         print(build(Path(conf.store), conf.sweep).text)  # noqa: T201
     except (XrgsError, OmegaConfBaseException) as error:
-        sys.exit(f"xrgs-report: {str(error).splitlines()[0]}")
+        sys.exit(f"xrgs-report: {_line(error)}")
+
+
+def bench() -> None:
+    """`xrgs-bench [KEY=VALUE]...`: run time against error (`xrgs.bench.settings.Settings`)."""
+    try:
+        given = OmegaConf.from_dotlist(sys.argv[1:])
+        settings = OmegaConf.to_object(OmegaConf.merge(OmegaConf.structured(Settings), given))
+        from xrgs.bench.run import run
+
+        print(run(cast("Settings", settings)))  # noqa: T201
+    except (XrgsError, OmegaConfBaseException) as error:
+        sys.exit(f"xrgs-bench: {_line(error)}")

@@ -5,6 +5,7 @@
 #include <nanobind/stl/vector.h>
 
 #include "arrays.h"
+#include "bench/bind.h"
 #include "isa.h"
 #include "loss/bind.h"
 #include "optim/bind.h"
@@ -45,4 +46,5 @@ NB_MODULE(_native, m) {
   bind_raster(m);
   bind_loss(m);
   bind_optim(m);
+  bind_bench(m);
 }

@@ -1,0 +1,118 @@
+"""What is benchmarked: random loads, loads from files and from trained cells."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from xrgs.bench import loads
+from xrgs.bench.loads import Load
+from xrgs.errors import XrgsError
+from xrgs.splat.rasterize import rasterize
+from xrgs.splat.settings import RasterSettings
+
+
+def render(load: Load) -> torch.Tensor:
+    return rasterize(*load.parameters, load.camera, RasterSettings(), sh_degree=3).image
+
+
+def rewritten(file: Path, **changes: object) -> Path:
+    with np.load(file) as stored:
+        arrays = {key: stored[key] for key in stored.files}
+    kept = {key: value for key, value in (arrays | changes).items() if value is not None}
+    np.savez(file, **kept)
+    return file
+
+
+def test_a_file_gives_back_what_was_written(load: Load, file: Path) -> None:
+    again = loads.read(file)
+    for name in ("means", "quats", "scales", "opacities", "sh"):
+        assert torch.equal(getattr(again, name), getattr(load, name))
+    assert torch.equal(again.camera.viewmat, load.camera.viewmat)
+    assert torch.equal(again.camera.K, load.camera.K)
+    assert (again.camera.width, again.camera.height) == (40, 30)
+    assert again.name == "load"
+
+
+def test_doubles_and_whole_numbers_are_read_too(load: Load, file: Path) -> None:
+    rewritten(file, means=load.means.double().numpy(), viewmat=np.eye(4, dtype=np.int64))
+    again = loads.read(file)
+    assert again.means.dtype == again.camera.viewmat.dtype == torch.float32
+    assert torch.equal(again.means, load.means)
+
+
+@pytest.mark.parametrize("key", loads._SHAPES)
+def test_a_missing_key_is_named(file: Path, key: str) -> None:
+    rewritten(file, **{key: None})
+    with pytest.raises(XrgsError, match=rf"load\.npz: .*\b{key}\b"):
+        loads.read(file)
+
+
+@pytest.mark.parametrize(
+    ("key", "value", "message"),
+    [
+        ("means", np.zeros((150, 2)), r"means must be \['N', 3\], got \[150, 2\]"),
+        ("quats", np.zeros((149, 4)), r"quats must be \['N', 4\], got \[149, 4\]"),
+        ("sh", np.zeros((150, 9, 3)), r"sh must be \['N', 16, 3\], got \[150, 9, 3\]"),
+        ("viewmat", np.eye(3), r"viewmat must be \[4, 4\], got \[3, 3\]"),
+        ("width", np.array([40]), r"width must be \[\], got \[1\]"),
+        ("width", np.array(0), "width and height must be at least 1"),
+        ("means", np.full((150, 3), np.nan), "means has values that are not finite"),
+        ("K", np.full((3, 3), np.inf), "K has values that are not finite"),
+        ("scales", np.full((150, 3), -1.0), "scales has values below 0"),
+        ("opacities", np.full(150, 1.5), "opacities has values outside 0..1"),
+        ("means", np.full((150, 3), "x"), "means must be numbers"),
+        ("viewmat", 2 * np.eye(4), "viewmat must be a rotation"),
+    ],
+)
+def test_wrong_values_are_named(file: Path, key: str, value: object, message: str) -> None:
+    rewritten(file, **{key: value})
+    with pytest.raises(XrgsError, match=rf"load\.npz: {message}"):
+        loads.read(file)
+
+
+def test_what_is_no_npz_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(XrgsError, match=r"none\.npz: cannot be read"):
+        loads.read(tmp_path / "none.npz")
+    for content in (b"", b"PK\x03\x04 and no more", b"text"):
+        (tmp_path / "bad.npz").write_bytes(content)
+        with pytest.raises(XrgsError, match=r"bad\.npz: cannot be read as \.npz"):
+            loads.read(tmp_path / "bad.npz")
+    np.save(tmp_path / "array.npy", np.zeros(3))
+    (tmp_path / "array.npy").rename(tmp_path / "array.npz")
+    with pytest.raises(XrgsError, match=r"array\.npz: cannot be read as \.npz"):
+        loads.read(tmp_path / "array.npz")
+
+
+def test_random_loads_are_those_of_their_seed() -> None:
+    first, again, other = (loads.random_load(50, 40, 30, seed) for seed in (1, 1, 2))
+    assert torch.equal(first.means, again.means)
+    assert not torch.equal(first.means, other.means)
+
+
+@pytest.mark.parametrize("count", [300, 3000])
+def test_random_loads_put_as_many_gaussians_on_a_pixel_as_trained_ones(count: int) -> None:
+    load = loads.random_load(count, 80, 60, seed=0)
+    done = rasterize(*load.parameters, load.camera, RasterSettings(), sh_degree=3)
+    assert 20 <= done.evaluations / load.pixels <= 150
+    assert done.alpha.mean() > 0.9
+
+
+def test_a_crop_is_the_middle_of_the_view(load: Load) -> None:
+    crop = load.cropped(20, 10)
+    whole, middle = render(load), render(crop)
+    # The Jacobian's clamp follows the field of view, so that the two are not quite the same.
+    assert (middle - whole[10:20, 10:30]).abs().mean() < 0.005
+    assert (middle - whole[11:21, 11:31]).abs().mean() > 0.02
+    same = load.cropped(400, 400)
+    assert (same.camera.width, same.camera.height) == (40, 30)
+
+
+def test_a_smaller_view_shows_the_same(load: Load) -> None:
+    small = load.smaller(5)
+    assert (small.camera.width, small.camera.height) == (8, 6)
+    corner = load.camera.K.inverse() @ torch.tensor([40.0, 30.0, 1.0])
+    torch.testing.assert_close(small.camera.K @ corner, torch.tensor([8.0, 6.0, 1.0]))

@@ -1,0 +1,190 @@
+"""The benchmark as a user runs it, and the figures that it works out."""
+
+from __future__ import annotations
+
+import csv
+import json
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+
+from xrgs.bench import rendering, run, training
+from xrgs.bench.loads import Load, random_load
+from xrgs.bench.rendering import Rendering, Way
+from xrgs.bench.settings import Settings
+from xrgs.splat.backend import resolve_backend
+from xrgs.splat.settings import RasterSettings
+
+
+def command(cwd: Path, *arguments: str) -> tuple[int, str, str]:
+    """Exit code, stdout and stderr of `xrgs-bench`."""
+    script = "from xrgs.cli import bench; bench()"
+    done = subprocess.run(
+        [sys.executable, "-c", script, *arguments],
+        cwd=cwd, capture_output=True, text=True, check=False,
+    )  # fmt: skip
+    return done.returncode, done.stdout, done.stderr
+
+
+@pytest.fixture(scope="module")
+def smoke(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str, dict[str, Any]]:
+    """A folder with a smoke benchmark's files, what was printed, and its JSON."""
+    folder = tmp_path_factory.mktemp("bench")
+    code, out, err = command(folder, "smoke=true", "repeats=1", "out=o", "json=all.json")
+    assert code == 0, err
+    return folder, out, json.loads((folder / "all.json").read_text())
+
+
+def test_every_backend_is_timed_in_every_part(smoke: tuple[Path, str, dict[str, Any]]) -> None:
+    _, out, found = smoke
+    backends = {"torch"} if resolve_backend("auto") == "torch" else {"native", "torch"}
+    loads = len(run.SMOKE.gaussians) * len(run.SMOKE.sizes)
+    for backend in backends:
+        rows = [row for row in found["rows"] if row["way"] == backend]
+        counts = {row["threads"] for row in rows}
+        assert 1 in counts
+        assert len(rows) == loads * len(counts)
+        for row in rows:
+            assert min(row["forward_ms"], row["backward_ms"], row["memory_bytes"]) > 0
+            assert row["evaluations"] > row["width"] * row["height"]
+            assert row["error"]["image_mean"] < 1e-6
+            assert row["error"]["gradient"] < 1e-2
+    assert {row["kind"] for row in found["losses"]} == backends | {"kornia"}
+    assert {row["kind"] for row in found["optimizers"]} == backends | {"default"}
+    assert {row["view"] for row in found["steps"]} == {"HR", "LR"}
+    assert {row["views"] for row in found["views"]} == set(run.SMOKE.views)
+    assert set(found["growth"]) == {"gaussians", "pixels"}
+    for title in ("gradient error", "loss, value and gradient", "Adam, one step", "densify"):
+        assert title in out
+
+
+def test_cutting_off_more_costs_accuracy(smoke: tuple[Path, str, dict[str, Any]]) -> None:
+    rows = smoke[2]["rows"]
+    first = rows[0]["backend"]
+    ways = {way["name"]: way for way in smoke[2]["ways"]}
+    assert ways[f"{first}, stop at 1e-2"]["settings"]["transmittance_min"] == 1e-2
+    largest = [row for row in rows if row["gaussians"] == max(run.SMOKE.gaussians)]
+    by_way = {row["way"]: row for row in largest}
+    assert by_way[f"{first}, alpha cut 4/255"]["error"]["image_mean"] > 1e-4
+    fewer, usual = by_way[f"{first}, alpha cut 4/255"], by_way[first]
+    assert fewer["evaluations"] < usual["evaluations"]
+
+
+def test_stages_add_up_to_no_more_than_the_pass(smoke: tuple[Path, str, dict[str, Any]]) -> None:
+    native = [row for row in smoke[2]["rows"] if row["backend"] == "native"]
+    if not native:
+        pytest.skip("the native backend was not built")
+    for row in native:
+        stages = row["stages_ms"]
+        back = {name: ms for name, ms in stages.items() if name.endswith("backward")}
+        assert 0 < sum(back.values()) <= row["backward_ms"]
+        assert 0 < sum(stages.values()) - sum(back.values()) <= row["forward_ms"]
+    assert smoke[2]["machine"]["multiply_adds_per_s"]["1"] > 1e8
+
+
+def test_files_are_left(smoke: tuple[Path, str, dict[str, Any]]) -> None:
+    folder, _, found = smoke
+    with (folder / "o" / "bench.csv").open(newline="") as file:
+        rows = list(csv.DictReader(file))
+    assert len(rows) == len(found["rows"])
+    assert float(rows[0]["forward_ms"]) == found["rows"][0]["forward_ms"]
+    assert float(rows[0]["image_mean_error"]) == found["rows"][0]["error"]["image_mean"]
+    assert (folder / "o" / "bench.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_a_file_is_timed(file: Path, tmp_path: Path) -> None:
+    settings = Settings(load=str(file), out=str(tmp_path / "o"), json=str(tmp_path / "a.json"))
+    settings.repeats = settings.threads = 1
+    text = run.run(settings)
+    found = json.loads((tmp_path / "a.json").read_text())
+    assert {row["gaussians"] for row in found["rows"]} == {150}
+    assert {(row["width"], row["height"]) for row in found["rows"]} == {(40, 30)}
+    assert {row["load"] for row in found["rows"]} == {"load"}
+    assert "40x30" in text
+    assert "steps" not in found
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["load=none.npz"], "none.npz: cannot be read"),
+        (["save=a.npz"], "save=FILE.npz needs cell=FOLDER and view=NAME"),
+        (["save=a.npz", "cell=nowhere", "view=a"], "cell=nowhere: is absent"),
+        (["repeats=0"], "repeats must be at least 1"),
+        (["repeats=many"], "repeats"),
+        (["lod=a.npz"], "lod"),
+    ],
+)
+def test_bad_arguments_end_in_one_line(tmp_path: Path, arguments: list[str], message: str) -> None:
+    code, out, err = command(tmp_path, *arguments)
+    assert code != 0
+    assert not out
+    assert err.startswith("xrgs-bench: ")
+    assert message in err
+    assert err.count("\n") == 1
+
+
+def test_growth_finds_the_exponents() -> None:
+    rows = [
+        {
+            "way": "native", "threads": 1, "gaussians": count, "width": side, "height": side,
+            "forward_ms": 1e-3 * count**0.8 * side, "backward_ms": 2e-3 * count**0.8 * side,
+        }
+        for count in (10, 100, 1000) for side in (10, 20)
+    ]  # fmt: skip
+    found = run.growth(rows, "native", 1)
+    assert found["gaussians"] == pytest.approx(0.8)
+    assert found["pixels"] == pytest.approx(0.5)
+    assert run.growth(rows[:1], "native", 1) == {}
+    assert run.growth(rows, "torch", 1) == {}
+
+
+def test_errors_see_a_difference(load: Load) -> None:
+    wrong = RasterSettings(eps2d=0.6)
+    found = rendering.errors(load, [Way("right", "torch"), Way("wrong", "torch", wrong)])
+    for name, most, least in (("image_mean", 1e-6, 1e-3), ("gradient", 1e-3, 1e-2)):
+        assert found["right"][name] < most
+        assert found["wrong"][name] > least
+
+
+def test_torch_is_not_asked_for_what_takes_it_minutes() -> None:
+    large = random_load(10, 600, 500, seed=0)
+    assert rendering.time_load(large, [Way("torch", "torch")], [1], repeats=1) == []
+
+
+def test_a_rendering_gives_six_gradients(load: Load) -> None:
+    one = Rendering(load, Way("torch", "torch"), 1)
+    one.forward()
+    gradients = one.backward()
+    assert [g.shape for g in gradients] == [p.shape for p in load.parameters]
+    assert all(g.abs().max() > 0 for g in gradients)
+
+
+def test_a_step_trains_and_keeps_its_gaussians(load: Load) -> None:
+    step = training.Step(load, "torch", 1)
+    losses = []
+    for _ in range(3):
+        before = step.gaussians.means.detach().clone()
+        for part in step.parts():
+            part()
+        losses.append(step.value.item())
+        assert len(step.gaussians) == len(load)
+        assert not torch.equal(step.gaussians.means, before)
+    assert losses[0] > losses[-1]
+
+
+def test_ours_and_kornias_loss_are_the_same_thing() -> None:
+    image, photograph = torch.rand(2, 20, 24, 3, generator=torch.Generator().manual_seed(0))
+    image.requires_grad_()
+    (ours,), (theirs,) = (
+        make()
+        for make in (
+            training._our_loss(image, photograph, "torch", 1),
+            training._kornias_loss(image, photograph, 1),
+        )
+    )
+    torch.testing.assert_close(ours, theirs, rtol=1e-3, atol=1e-7)

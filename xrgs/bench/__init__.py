@@ -1,0 +1,1 @@
+"""Run time against error, from small loads to large: `xrgs-bench`."""

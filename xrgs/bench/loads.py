@@ -1,0 +1,209 @@
+"""What is rendered in a benchmark: Gaussians and a view, random, from a file or from a cell."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+from zipfile import BadZipFile
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from xrgs.errors import XrgsError
+from xrgs.splat.cameras import Camera
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+#: Standard deviation, in units of the spacing of N Gaussians spread over the image: about 40 of
+#: them then contribute to a pixel, whatever N and the size, as in a trained scene.
+_SPREAD = 1.5
+_DEPTHS = (2.0, 6.0)  # world units
+_BEYOND = 1.15  # how far, in half images, means reach: a tenth of them or so are out of view
+
+_SHAPES = {
+    "means": ("N", 3),
+    "quats": ("N", 4),
+    "scales": ("N", 3),
+    "opacities": ("N",),
+    "sh": ("N", 16, 3),
+    "viewmat": (4, 4),
+    "K": (3, 3),
+    "width": (),
+    "height": (),
+}
+
+
+@dataclass(frozen=True)
+class Load:
+    """Gaussians with activated parameters, float32, and the view they are rendered into."""
+
+    name: str
+    means: Tensor  # [N, 3] world units
+    quats: Tensor  # [N, 4] wxyz
+    scales: Tensor  # [N, 3] world units
+    opacities: Tensor  # [N] 0..1
+    sh: Tensor  # [N, 16, 3]
+    camera: Camera
+
+    def __len__(self) -> int:
+        return len(self.means)
+
+    @property
+    def parameters(self) -> tuple[Tensor, ...]:
+        """As `rasterize` takes them."""
+        sh0, rest = self.sh[:, :1].contiguous(), self.sh[:, 1:].contiguous()
+        return self.means, self.quats, self.scales, self.opacities, sh0, rest
+
+    @property
+    def pixels(self) -> int:
+        """Of the view."""
+        return self.camera.width * self.camera.height
+
+    def seen_by(self, camera: Camera) -> Load:
+        """The same Gaussians in another view."""
+        return replace(self, camera=camera)
+
+    def smaller(self, factor: int) -> Load:
+        """The same view, its sides `factor` times smaller."""
+        camera = self.camera
+        width, height = max(1, camera.width // factor), max(1, camera.height // factor)
+        scale = torch.tensor([width / camera.width, height / camera.height, 1.0])
+        return self.seen_by(
+            replace(camera, K=camera.K * scale[:, None], width=width, height=height)
+        )
+
+    def cropped(self, width: int, height: int) -> Load:
+        """The middle of the view, as a view of its own."""
+        camera = self.camera
+        width, height = min(width, camera.width), min(height, camera.height)
+        K = camera.K.clone()
+        K[0, 2] -= (camera.width - width) // 2
+        K[1, 2] -= (camera.height - height) // 2
+        return self.seen_by(replace(camera, K=K, width=width, height=height))
+
+
+def random_load(count: int, width: int, height: int, seed: int) -> Load:
+    """Gaussians all over the view and a little beyond, anisotropic, a few of them opaque."""
+    generator = torch.Generator().manual_seed(seed)
+
+    def uniform(*shape: int, low: float, high: float) -> Tensor:
+        return low + (high - low) * torch.rand(*shape, generator=generator)
+
+    focal = 0.9 * width
+    depth = uniform(count, low=_DEPTHS[0], high=_DEPTHS[1])
+    plane = _BEYOND * torch.tensor([width, height]) / 2 / focal * uniform(count, 2, low=-1, high=1)
+    means = torch.cat([plane * depth[:, None], depth[:, None]], dim=1)
+    spacing = math.sqrt(width * height / count) / focal * depth  # [N] world units
+    spread = torch.exp(0.5 * torch.randn(count, 3, generator=generator) - 0.25)
+    sh = 0.1 * torch.randn(count, 16, 3, generator=generator)
+    sh[:, 0] = uniform(count, 3, low=-1.5, high=1.5)
+    K = torch.tensor([[focal, 0.0, width / 2], [0.0, focal, height / 2], [0.0, 0.0, 1.0]])
+    return Load(
+        name="random",
+        means=means,
+        quats=torch.randn(count, 4, generator=generator),
+        scales=_SPREAD * spacing[:, None] * spread,
+        opacities=torch.sigmoid(1.5 * torch.randn(count, generator=generator) - 1.5),
+        sh=sh,
+        camera=Camera(viewmat=torch.eye(4), K=K, width=width, height=height),
+    )
+
+
+def read(path: Path) -> Load:
+    """A load from a .npz (its keys: see `_SHAPES`; opacities 0..1, scales in world units).
+
+    Raises:
+        XrgsError: the file is missing or not a .npz, or a key is missing, of the wrong shape, not
+            finite or out of range; the message names the file and the key.
+    """
+    try:
+        with path.open("rb") as file, np.load(file, allow_pickle=False) as stored:
+            missing = [key for key in _SHAPES if key not in stored.files]
+            if missing:
+                raise XrgsError(f"{path}: lacks {', '.join(missing)}")
+            arrays = {key: stored[key] for key in _SHAPES}
+    except (OSError, ValueError, TypeError, EOFError, BadZipFile) as error:
+        raise XrgsError(f"{path}: cannot be read as .npz: {error}") from error
+    count = len(arrays["means"]) if arrays["means"].ndim else 0
+    for key, shape in _SHAPES.items():
+        _check(path, key, arrays[key], tuple(count if side == "N" else side for side in shape))
+    _check_range(path, "scales", arrays["scales"] >= 0, "below 0")
+    opacities = arrays["opacities"]
+    _check_range(path, "opacities", (opacities >= 0) & (opacities <= 1), "outside 0..1")
+    tensors = {
+        key: torch.from_numpy(np.ascontiguousarray(arrays[key], dtype=np.float32))
+        for key in _SHAPES
+        if key not in {"width", "height"}
+    }
+    width, height = (int(arrays[key]) for key in ("width", "height"))
+    try:
+        camera = Camera(tensors.pop("viewmat"), tensors.pop("K"), width, height)
+    except ValueError as error:
+        raise XrgsError(f"{path}: {error}") from error
+    return Load(name=path.stem, camera=camera, **tensors)
+
+
+def write(path: Path, load: Load) -> None:
+    """Write a load so that `read` gives it back.
+
+    Raises:
+        XrgsError: the file cannot be written.
+    """
+    camera = load.camera
+    arrays = {key: getattr(load, key).numpy() for key in list(_SHAPES)[:5]}
+    arrays |= {"viewmat": camera.viewmat.numpy(), "K": camera.K.numpy()}
+    try:
+        with path.open("wb") as file:
+            np.savez(file, **arrays, width=camera.width, height=camera.height)
+    except OSError as error:
+        raise XrgsError(f"{path}: cannot be written: {error.strerror}") from error
+
+
+def from_cell(folder: Path, view_name: str) -> Load:
+    """A trained cell's Gaussians, seen from one of its views at that view's size.
+
+    Args:
+        folder: The cell's, within its store.
+        view_name: A training or a test view.
+
+    Raises:
+        XrgsError: the cell isn't done, its variant isn't in the store, or it has no such view.
+    """
+    from xrgs import dataset, variant
+    from xrgs.splat.ply import load_ply
+    from xrgs.store import CellFolder, read_json
+
+    state = CellFolder(folder).state()
+    if state.name != "done":
+        raise XrgsError(f"cell={folder}: is {state.name} {state.reason}".rstrip())
+    variant_id = read_json(folder / "identity.json")["variant"]
+    data = dataset.load(variant.load(folder.parents[1] / "variants" / variant_id))
+    views = {view.name: view for view in (*data.train, *data.test)}
+    if view_name not in views:
+        raise XrgsError(f"view={view_name}: {folder} has {', '.join(sorted(views))}")
+    means, quats, scales, opacities, sh0, rest = (
+        value.detach() for value in load_ply(folder / "splats.ply").activated()
+    )
+    sh = torch.zeros(len(means), 16, 3)
+    sh[:, : 1 + rest.shape[1]] = torch.cat([sh0, rest], dim=1)
+    camera = views[view_name].camera
+    return Load(f"{folder.name}:{view_name}", means, quats, scales, opacities, sh, camera)
+
+
+def _check(path: Path, key: str, value: NDArray[np.generic], shape: tuple[object, ...]) -> None:
+    if value.shape != shape:
+        wanted = [side if side != "N" else "N" for side in _SHAPES[key]]
+        raise XrgsError(f"{path}: {key} must be {wanted}, got {list(value.shape)}")
+    if value.dtype.kind not in "fiu":
+        raise XrgsError(f"{path}: {key} must be numbers, got {value.dtype}")
+    if not np.isfinite(value).all():
+        raise XrgsError(f"{path}: {key} has values that are not finite")
+
+
+def _check_range(path: Path, key: str, inside: NDArray[np.bool_], outside: str) -> None:
+    if not inside.all():
+        raise XrgsError(f"{path}: {key} has values {outside}")

@@ -1,0 +1,193 @@
+"""Rendering a load forward and back: its time by stage, its work and memory, and its error."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, field, replace
+from functools import partial
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from xrgs.bench.loads import Load
+from xrgs.bench.timing import Times, alternate, threads
+from xrgs.splat.rasterize import Render, rasterize
+from xrgs.splat.settings import RasterSettings
+
+#: Size of the view in which a render is compared to one in double.
+ERROR_CROP = (96, 72)
+#: Loads that the torch backend renders in seconds, not minutes.
+_TORCH_GAUSSIANS, _TORCH_PIXELS, _TORCH_REPEATS = 100_000, 504 * 378, 2
+
+
+@dataclass(frozen=True)
+class Way:
+    """A backend, with settings that trade error for time."""
+
+    name: str
+    backend: str
+    settings: RasterSettings = field(default_factory=RasterSettings)
+
+
+def ways(backends: Sequence[str]) -> list[Way]:
+    """Each backend as it is, and the fastest of them cutting off more than gsplat does."""
+    first, usual = backends[0], RasterSettings()
+    return [Way(name, name) for name in backends] + [
+        Way(f"{first}, alpha cut 4/255", first, replace(usual, alpha_min=4 / 255)),
+        Way(f"{first}, alpha cut 1/1020", first, replace(usual, alpha_min=1 / 1020)),
+        Way(f"{first}, stop at 1e-2", first, replace(usual, transmittance_min=1e-2)),
+    ]
+
+
+class Rendering:
+    """One load rendered one way by some threads, again and again."""
+
+    def __init__(
+        self, load: Load, way: Way, count: int, dtype: torch.dtype = torch.float32
+    ) -> None:
+        self.camera, self.way, self.threads = load.camera, way, count
+        self.leaves = [p.to(dtype).clone().requires_grad_() for p in load.parameters]
+        generator = torch.Generator().manual_seed(0)
+        shape = (load.camera.height, load.camera.width, 3)
+        self.slope = torch.randn(shape, generator=generator).to(dtype)  # of a loss, by the image
+        self.render: Render | None = None
+        self.stages: dict[str, float] = {}
+
+    def forward(self) -> None:
+        """Keep the render for `backward`."""
+        means, quats, scales, opacities, sh0, rest = self.leaves
+        with threads(self.threads):
+            self.render = rasterize(
+                means,
+                quats,
+                scales,
+                opacities,
+                sh0,
+                rest,
+                self.camera,
+                self.way.settings,
+                sh_degree=3,
+                backend=self.way.backend,
+            )
+
+    def backward(self) -> tuple[Tensor, ...]:
+        """Gradients of the six parameters, of the last render."""
+        assert self.render is not None, "render first"  # noqa: S101 - a mistake of ours
+        graph: Any = self.render.image.grad_fn
+        with threads(self.threads):
+            gradients = torch.autograd.grad(self.render.image, self.leaves, self.slope)
+        if self.way.backend == "native":
+            for stage, ms in graph.frame.timings.items():
+                self.stages[stage] = min(ms, self.stages.get(stage, ms))
+        return gradients
+
+
+def time_load(load: Load, chosen: Sequence[Way], counts: Sequence[int], repeats: int) -> list[Any]:
+    """A row for each way and number of threads, timed in turn.
+
+    The torch backend is left out of loads too large for it, and makes the repeats fewer.
+    """
+    fits = len(load) <= _TORCH_GAUSSIANS and load.pixels <= _TORCH_PIXELS
+    used = [way for way in chosen if fits or way.backend != "torch"]
+    if any(way.backend == "torch" for way in used):
+        repeats = min(repeats, _TORCH_REPEATS)
+    renderings = {
+        f"{way.name} {count}": Rendering(load, way, count) for way in used for count in counts
+    }
+    things: dict[str, Any] = {}
+    for name, rendering in renderings.items():
+        things |= {f"{name} forward": rendering.forward, f"{name} backward": rendering.backward}
+    times = alternate(things, repeats)
+    return [
+        _row(load, rendering, times[f"{name} forward"], times[f"{name} backward"])
+        for name, rendering in renderings.items()
+    ]
+
+
+def _row(load: Load, rendering: Rendering, forward: Times, backward: Times) -> dict[str, Any]:
+    render, stages = rendering.render, rendering.stages
+    assert render is not None, "render first"  # noqa: S101 - a mistake of ours
+    model = sum(leaf.nbytes for leaf in rendering.leaves)
+    compositing = stages.get("composite", forward.least)
+    return {
+        "load": load.name,
+        "way": rendering.way.name,
+        "backend": rendering.way.backend,
+        "threads": rendering.threads,
+        "gaussians": len(load),
+        "visible": int(render.visible.sum()),
+        "width": load.camera.width,
+        "height": load.camera.height,
+        "forward_ms": forward.least,
+        "backward_ms": backward.least,
+        "forward_median_ms": forward.median,
+        "backward_median_ms": backward.median,
+        "stages_ms": dict(stages),
+        "evaluations": render.evaluations,
+        "evaluations_per_s": 1e3 * render.evaluations / compositing,
+        "memory_bytes": 2 * model + render.buffer_bytes,  # 2: parameters and gradients
+    }
+
+
+def errors(load: Load, chosen: Sequence[Way]) -> dict[str, dict[str, float]]:
+    """How far each way, in float32, is from the torch backend at gsplat's settings in double.
+
+    Over the middle of the view alone (`ERROR_CROP`), rendered as a view of its own: in double the
+    whole of a large one would take minutes.
+
+    Returns:
+        For each way `image_mean` and `image_max`, absolute; `gradient`, the norm of the error
+        over the norm of the gradient, of the worst of the six parameters.
+    """
+    crop = load.cropped(*ERROR_CROP)
+    exact = Rendering(crop, Way("exact", "torch"), torch.get_num_threads(), torch.float64)
+    exact.forward()
+    expected = exact.backward()
+    found = {}
+    for way in chosen:
+        rendering = Rendering(crop, way, torch.get_num_threads())
+        rendering.forward()
+        gradients = rendering.backward()
+        difference = (_image(rendering).double() - _image(exact)).abs()
+        found[way.name] = {
+            "image_mean": difference.mean().item(),
+            "image_max": difference.max().item(),
+            "gradient": max(map(_relative, gradients, expected)),
+        }
+    return found
+
+
+def _image(rendering: Rendering) -> Tensor:
+    assert rendering.render is not None, "render first"  # noqa: S101 - a mistake of ours
+    return rendering.render.image.detach()
+
+
+def _relative(value: Tensor, exact: Tensor) -> float:
+    norm = exact.norm()
+    return ((value.double() - exact).norm() / norm).item() if norm > 0 else 0.0
+
+
+def time_views(load: Load, backend: str, counts: Sequence[int], repeats: int) -> list[Any]:
+    """How time grows with views: one forward and backward pass of each, one after the other."""
+    step = 0.02 * load.means[:, 2].median().item()  # world units, from one camera to the next
+    renderings = []
+    for number in range(max(counts)):
+        viewmat = load.camera.viewmat.clone()
+        viewmat[0, 3] += step * number
+        view = load.seen_by(replace(load.camera, viewmat=viewmat))
+        renderings.append(Rendering(view, Way(backend, backend), torch.get_num_threads()))
+
+    def walk(count: int) -> None:
+        for rendering in renderings[:count]:
+            rendering.forward()
+            rendering.backward()
+            rendering.render = None
+
+    times = alternate({str(count): partial(walk, count) for count in counts}, repeats)
+    return [{"views": count, "ms": times[str(count)].least} for count in counts]
+
+
+def describe(way: Way) -> Mapping[str, Any]:
+    """A way and all of its settings, for a program to read."""
+    return {"name": way.name, "backend": way.backend, "settings": asdict(way.settings)}

@@ -1,0 +1,168 @@
+"""What `xrgs-bench` does: time, compare, and leave a table, a .csv, a plot and a .json."""
+
+from __future__ import annotations
+
+import csv
+import os
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+
+from xrgs import provenance
+from xrgs.bench import loads, rendering, tables, training
+from xrgs.errors import XrgsError
+from xrgs.splat.backend import resolve_backend
+from xrgs.store import write_json
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from xrgs.bench.loads import Load
+    from xrgs.bench.settings import Settings
+    from xrgs.bench.tables import Row
+
+
+class Grid(NamedTuple):
+    """Which random loads, and at which sizes the rest is timed."""
+
+    gaussians: tuple[int, ...]
+    sizes: tuple[tuple[int, int], ...]
+    step: tuple[int, int, int]  # Gaussians, width and height of the training step
+    views: tuple[int, ...]
+
+
+FULL = Grid(
+    gaussians=(10_000, 100_000, 300_000, 1_000_000),
+    sizes=((252, 189), (504, 378), (1008, 756)),
+    step=(100_000, 504, 378),
+    views=(1, 2, 4, 8),
+)
+SMOKE = Grid(gaussians=(200, 400), sizes=((32, 24), (48, 36)), step=(300, 80, 60), views=(1, 2))
+_LR_FACTOR = 5
+
+
+def run(settings: Settings) -> str:
+    """Run the benchmark, or save a load; returns what to print.
+
+    Raises:
+        XrgsError: an argument is wrong, or a file cannot be read or written.
+    """
+    if settings.save is not None:
+        return _save(settings)
+    if settings.repeats < 1 or settings.threads < 0:
+        raise XrgsError("repeats must be at least 1 and threads at least 0")
+    counts = sorted({1, settings.threads or _cores()})
+    backends = ["native", "torch"] if resolve_backend("auto") == "native" else ["torch"]
+    found: dict[str, Any] = {"machine": _machine(backends, counts)}
+    if settings.load is not None:
+        found |= _time_loads([loads.read(Path(settings.load))], settings, counts, backends)
+    else:
+        grid = SMOKE if settings.smoke else FULL
+        chosen = [
+            loads.random_load(count, *size, settings.seed)
+            for size in grid.sizes
+            for count in grid.gaussians
+        ]
+        found |= _time_loads(chosen, settings, counts, backends)
+        found |= _time_training(grid, settings, counts, backends)
+    _write(found, settings)
+    return tables.text(found)
+
+
+def _save(settings: Settings) -> str:
+    if settings.save is None or settings.cell is None or settings.view is None:
+        raise XrgsError("save=FILE.npz needs cell=FOLDER and view=NAME")
+    load = loads.from_cell(Path(settings.cell), settings.view)
+    loads.write(Path(settings.save), load)
+    size = f"{load.camera.width} x {load.camera.height} px"
+    return f"{settings.save}: {len(load)} Gaussians, {size}"
+
+
+def _cores() -> int:
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
+
+
+def _machine(backends: Sequence[str], counts: Sequence[int]) -> dict[str, Any]:
+    machine = provenance.collect(counts[-1], backends[0])
+    if "native" in backends:
+        from xrgs import _native
+
+        machine["instruction_set"] = _native.isa()
+        machine["multiply_adds_per_s"] = {
+            str(count): _native.multiply_adds_per_second(count) for count in counts
+        }
+    return machine
+
+
+def _time_loads(
+    chosen: Sequence[Load], settings: Settings, counts: Sequence[int], backends: Sequence[str]
+) -> dict[str, Any]:
+    ways = rendering.ways(backends)
+    rows: list[Row] = []
+    for load in chosen:
+        error = rendering.errors(load, ways)
+        timed = rendering.time_load(load, ways, counts, settings.repeats)
+        rows += [row | {"error": error[row["way"]]} for row in timed]
+    return {"rows": rows, "ways": [rendering.describe(way) for way in ways]}
+
+
+def _time_training(
+    grid: Grid, settings: Settings, counts: Sequence[int], backends: Sequence[str]
+) -> dict[str, Any]:
+    count, width, height = grid.step
+    load = loads.random_load(count, width, height, settings.seed)
+    views = {"HR": load, "LR": load.smaller(_LR_FACTOR)}
+    repeats = settings.repeats
+    return {
+        "views": rendering.time_views(load, backends[0], grid.views, repeats),
+        "losses": training.time_losses(grid.sizes[1:], backends, counts, repeats),
+        "optimizers": training.time_optimizers(grid.gaussians[1:3], backends, counts, repeats),
+        "steps": training.time_steps(views, backends[0], counts, repeats),
+    }
+
+
+def growth(rows: Sequence[Row], way: str, count: int) -> dict[str, float]:
+    """Exponents of forward and backward time: 1 where twice as many take twice as long.
+
+    Args:
+        rows: Of random loads.
+        way: Which of them.
+        count: Threads.
+
+    Returns:
+        `gaussians` and `pixels`: a fit of log time to the logarithms of both; empty where the loads
+        differ in neither.
+    """
+    used = [row for row in rows if row["way"] == way and row["threads"] == count]
+    numbers = np.array([(row["gaussians"], row["width"] * row["height"]) for row in used], float)
+    numbers = numbers.reshape(-1, 2)  # of none too
+    if len(np.unique(numbers[:, 0])) < 2 or len(np.unique(numbers[:, 1])) < 2:
+        return {}
+    times = np.array([row["forward_ms"] + row["backward_ms"] for row in used])
+    design = np.column_stack([np.log(numbers), np.ones(len(used))])
+    exponents = np.linalg.lstsq(design, np.log(times), rcond=None)[0]
+    return {"gaussians": float(exponents[0]), "pixels": float(exponents[1])}
+
+
+def _write(found: dict[str, Any], settings: Settings) -> None:
+    from xrgs.report.bench_plot import time_against_error
+
+    rows = found["rows"]
+    found["growth"] = growth(rows, rows[0]["way"], rows[0]["threads"])
+    flat = [tables.flat(row) for row in rows]
+    folder = Path(settings.out)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        with (folder / "bench.csv").open("w", encoding="utf-8", newline="") as file:
+            fields = list(dict.fromkeys(key for row in flat for key in row))
+            writer = csv.DictWriter(file, fields, lineterminator="\n")
+            writer.writeheader()
+            writer.writerows(flat)
+        (folder / "bench.png").write_bytes(time_against_error(flat))
+        if settings.json is not None:
+            write_json(Path(settings.json).absolute(), found)
+    except OSError as error:
+        raise XrgsError(f"{error.filename}: cannot be written: {error.strerror}") from error
