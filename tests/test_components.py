@@ -314,3 +314,13 @@ def test_a_value_out_of_range_names_its_key(conf: ComponentsConf, key: str) -> N
     with pytest.raises(XrgsError) as caught:
         built(conf)
     assert str(caught.value).startswith(key)
+
+
+@pytest.mark.parametrize(("height", "width"), [(15, 20), (75, 100), (100, 37)])
+def test_phi_is_torchs_antialiased_bicubic(height: int, width: int) -> None:
+    image = torch.rand(45, 60, 3, dtype=torch.float64)
+    planes = image.permute(2, 0, 1)[None]
+    expected = torch.nn.functional.interpolate(
+        planes, size=(height, width), mode="bicubic", antialias=True
+    )[0].permute(1, 2, 0)
+    torch.testing.assert_close(components.resize(image, height, width), expected, rtol=0, atol=1e-9)

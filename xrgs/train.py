@@ -64,7 +64,7 @@ def train(data: Dataset, conf: Conf) -> Trained:
         generator=stream(conf.seed, "init"),
     )
     optimizer = SplatOptimizer(
-        gaussians, splat.optimizer, scene_scale=data.scene_scale, steps=steps
+        gaussians, splat.optimizer, scene_scale=data.scene_scale, steps=steps, backend=backend
     )
     densifier = Densifier(
         optimizer,
@@ -72,8 +72,9 @@ def train(data: Dataset, conf: Conf) -> Trained:
         scene_scale=data.scene_scale,
         generator=stream(conf.seed, "densify"),
     )
-    parts = components.build(conf.components, data.train, data.factor)
+    parts = components.build(conf.components, data.train, data.factor, backend)
     targets = {view.name: prepare_target(view.image) for view in data.train}
+    weights = {"l1": 1 - splat.ssim_weight, "ssim": splat.ssim_weight}
     sh_every = max(1, int(splat.sh_every * steps / NOMINAL_STEPS))
     ledger = _Ledger(steps)
 
@@ -89,9 +90,7 @@ def train(data: Dataset, conf: Conf) -> Trained:
             means2d_offset=offset,
             backend=backend,
         )
-        loss = photometric_loss(
-            render.image, targets[view.name], l1=1 - splat.ssim_weight, ssim=splat.ssim_weight
-        )
+        loss = photometric_loss(render.image, targets[view.name], **weights, backend=backend)
         loss = parts.loss(loss, render.image, view)
         optimizer.zero_grad()
         torch.autograd.backward(loss)
