@@ -1,0 +1,513 @@
+"""The compiled renderer against the torch one in double, whose own tests are in test_torch_*.py.
+
+Both read the same float32 numbers. A pixel where some alpha or transmittance is within 1e-4 of a
+threshold may fall on either side of it: these pixels (the band) are found by moving the thresholds
+in the oracle. Outside it images must agree to rounding, and gradients are compared with no weight
+on it.
+"""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+from collections.abc import Iterator
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from xrgs.splat.cameras import Camera
+from xrgs.splat.rasterize import rasterize
+from xrgs.splat.settings import RasterSettings
+
+native = pytest.importorskip("xrgs._native")
+
+NAMES = ("means", "quats", "scales", "opacities", "sh0", "shN")
+BAND = 1e-4
+GRADIENT_FACTOR = 5.0
+"""Gradients may err by this much more than torch's own float32 (norms over all Gaussians)."""
+GRADIENT_FLOOR = 2e-6
+"""Of a gradient's norm: below this an error is rounding, whoever makes it."""
+
+
+@pytest.fixture(params=native.available_isas())
+def isa(request: pytest.FixtureRequest) -> Iterator[str]:
+    """Each instruction set that this machine has."""
+    before = native.isa()
+    native.set_isa(request.param)
+    yield request.param
+    native.set_isa(before)
+
+
+@pytest.fixture
+def threads() -> Iterator[None]:
+    """Puts torch's thread count back."""
+    before = torch.get_num_threads()
+    yield
+    torch.set_num_threads(before)
+
+
+def rounded(camera):
+    """The camera in numbers that float32 has."""
+    return Camera(camera.viewmat.float(), camera.K.float(), camera.width, camera.height)
+
+
+def single(scene):
+    return {name: value.float() for name, value in scene.items()}
+
+
+def run(scene, camera, raster, backend, dtype, v_image=None, v_alpha=None, *, sh_degree=3):
+    """The render, and the gradients of <image, v_image> + <alpha, v_alpha> by name."""
+    leaves = {name: scene[name].to(dtype).requires_grad_() for name in NAMES}
+    offset = torch.zeros(len(leaves["means"]), 2, dtype=dtype, requires_grad=True)
+    render = rasterize(
+        *leaves.values(),
+        camera,
+        raster,
+        sh_degree=sh_degree,
+        means2d_offset=offset,
+        backend=backend,
+    )
+    if v_image is None:
+        return render, {}
+    value = (render.image * v_image.to(dtype)).sum() + (render.alpha * v_alpha.to(dtype)).sum()
+    if value.requires_grad:
+        value.backward()
+    leaves["means2d_offset"] = offset
+    return render, {name: leaf.grad for name, leaf in leaves.items() if leaf.grad is not None}
+
+
+def band_of(scene, camera, raster, exact, sh_degree):
+    """Pixels [H, W] that a small move of a threshold changes."""
+    band = torch.zeros(camera.height, camera.width, dtype=torch.bool)
+    for factor in (1 - BAND, 1 + BAND):
+        for name in ("alpha_min", "transmittance_min"):
+            moved = replace(raster, **{name: getattr(raster, name) * factor})
+            render, _ = run(scene, camera, moved, "torch", torch.float64, sh_degree=sh_degree)
+            band |= (render.image != exact).any(-1)
+        # Uncapped or not, an image hardly changes, but its gradient does.
+        capped = replace(raster, alpha_max=raster.alpha_max * factor)
+        render, _ = run(scene, camera, capped, "torch", torch.float64, sh_degree=sh_degree)
+        band |= (render.image - exact).abs().amax(-1) > 1e-9
+    return band
+
+
+def check(scene, camera, raster=None, *, sh_degree=3, seed=0):
+    """Compare image, alpha, visibility and gradients with the oracle's."""
+    raster = raster or RasterSettings()
+    camera, scene = rounded(camera), single(scene)
+    exact, _ = run(scene, camera, raster, "torch", torch.float64, sh_degree=sh_degree)
+    band = band_of(scene, camera, raster, exact.image, sh_degree)
+    generator = torch.Generator().manual_seed(seed)
+    outside = (~band).float()
+    v_image = torch.randn(camera.height, camera.width, 3, generator=generator) * outside[..., None]
+    v_alpha = torch.randn(camera.height, camera.width, generator=generator) * outside
+    results = {
+        dtype: run(scene, camera, raster, backend, dtype, v_image, v_alpha, sh_degree=sh_degree)
+        for backend, dtype in (("torch", torch.float64), ("torch", torch.float32))
+    }
+    theirs, exact_gradients = results[torch.float64]
+    _, single_gradients = results[torch.float32]
+    ours, gradients = run(
+        scene, camera, raster, "native", torch.float32, v_image, v_alpha, sh_degree=sh_degree
+    )
+
+    error = (ours.image.double() - theirs.image).abs().detach()
+    scale = max(1.0, float(theirs.image.detach().max()))
+    assert error.mean() <= 1e-6 * scale
+    assert error.max() <= raster.alpha_min * scale + 1e-5  # one Gaussian more or less
+    assert (error.amax(-1)[~band] <= 1e-5 * scale).all()
+    assert ((ours.alpha.double() - theirs.alpha).abs().detach()[~band] <= 1e-5).all()
+    assert torch.equal(ours.visible, theirs.visible)
+    for name, expected in exact_gradients.items():
+        got = gradients[name]
+        assert torch.isfinite(got).all(), name
+        allowed = (
+            GRADIENT_FACTOR * (single_gradients[name] - expected).norm()
+            + GRADIENT_FLOOR * expected.norm()
+        )
+        assert (got - expected).norm() <= allowed, name
+        assert (got[~ours.visible] == 0).all(), name
+    return ours, gradients, band
+
+
+# --- against the oracle -------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("sh_degree", [0, 1, 2, 3])
+def test_a_scene_of_every_degree(isa, make_camera, make_scene, sh_degree):
+    camera = make_camera(50, 37, turned=True)
+    ours, _, band = check(make_scene(300, camera, seed=1), camera, sh_degree=sh_degree)
+    assert band.float().mean() < 0.1
+    assert ours.image.max() > 0.3
+    assert 0 < ours.evaluations < 300 * 50 * 37
+    assert ours.buffer_bytes > 300 * 64
+
+
+def test_bands_above_the_degree_have_no_gradient(isa, make_camera, make_scene):
+    camera = make_camera()
+    scene = make_scene(40, camera, degree=3)
+    _, gradients, _ = check(scene, camera, sh_degree=1)
+    assert (gradients["shN"][:, 3:] == 0).all()
+    assert (gradients["shN"][:, :3] != 0).any()
+
+
+def test_antialiased_before_a_background(isa, make_camera, make_scene):
+    camera = make_camera(40, 30)
+    raster = RasterSettings(antialiased=True, background=(0.2, 0.5, 0.9))
+    scene = make_scene(300, camera, seed=2, size=0.7)
+    scene["scales"][::5] *= 1e-3  # the compensation leaves little or nothing of these
+    check(scene, camera, raster)
+
+
+@pytest.mark.parametrize("opacity", [0.02, 0.9, 1.0])
+def test_many_layers(isa, make_camera, make_scene, opacity):
+    # More than two batches of Gaussians in a tile; where opaque, pixels end and alphas are capped.
+    camera = make_camera(16, 16, focal=15.0)
+    scene = make_scene(600, camera, seed=3, size=4.0)
+    scene["opacities"][:] = opacity
+    check(scene, camera)
+
+
+def test_without_cuts(isa, make_camera, make_scene):
+    camera = make_camera()
+    raster = RasterSettings(alpha_min=0.0, alpha_max=1.0, transmittance_min=0.0)
+    check(make_scene(30, camera, seed=4), camera, raster)
+
+
+def test_near_and_behind(isa, make_camera, make_scene):
+    camera = make_camera()
+    scene = make_scene(60, camera, seed=5)
+    depths = torch.tensor([-2.0, -1e-3, 0.0, 0.0099, 0.0101, 0.02], dtype=torch.float64)
+    scene["means"][: len(depths), 2] = depths
+    scene["means"][: len(depths), :2] *= 0.01
+    ours, _, _ = check(scene, camera)
+    assert not ours.visible[:4].any()
+
+
+def test_beyond_the_field_of_view(isa, make_camera, make_scene):
+    # Large ones whose centres are far outside, where the Jacobian is held.
+    camera = make_camera(turned=True)
+    scene = make_scene(200, camera, seed=6, size=12.0)
+    inward = scene["means"] - camera.position
+    scene["means"] = camera.position + inward * torch.tensor([1.8, 1.9, 1.0], dtype=torch.float64)
+    ours, _, _ = check(scene, camera)
+    assert ours.visible.sum() > 20
+
+
+@pytest.mark.parametrize("stretch", [30.0, 3000.0])
+def test_needles(isa, make_camera, make_scene, stretch):
+    camera = make_camera(60, 40, turned=True)
+    scene = make_scene(60, camera, seed=7, size=1.0)
+    scene["scales"][:, 0] *= stretch
+    scene["scales"][:, 1:] *= 1e-3
+    check(scene, camera)
+
+
+def test_quaternions_of_any_length(isa, make_camera, make_scene):
+    camera = make_camera()
+    scene = make_scene(50, camera, seed=8)
+    scene["quats"][::5] = 0
+    scene["quats"][1::5] *= 1e-18
+    scene["quats"][2::5] *= 1e18
+    _, gradients, _ = check(scene, camera)
+    assert (gradients["quats"][::5] == 0).all()
+
+
+def test_flat_and_huge(isa, make_camera, make_scene):
+    camera = make_camera()
+    scene = make_scene(50, camera, seed=9)
+    scene["scales"][::4] = 0
+    scene["scales"][3::8] = 1e4
+    scene["opacities"][::10] = 0
+    check(scene, camera)
+
+
+def test_a_covariance_that_overflows_is_dropped(isa, make_camera, make_scene):
+    camera = rounded(make_camera())
+    scene = single(make_scene(50, camera, seed=9))
+    scene["scales"][1::8] = 1e25
+    v_image = torch.ones(camera.height, camera.width, 3)
+    ours, gradients = run(
+        scene, camera, RasterSettings(), "native", torch.float32, v_image, v_image[..., 0]
+    )
+    assert not ours.visible[1::8].any()
+    keep = torch.ones(50, dtype=torch.bool)
+    keep[1::8] = False
+    others = {name: value[keep] for name, value in scene.items()}
+    without, _ = run(others, camera, RasterSettings(), "native", torch.float32)
+    assert torch.equal(ours.image, without.image)
+    assert all((gradients[name][1::8] == 0).all() for name in NAMES)
+
+
+def test_equal_depths_go_by_index(isa, make_camera, make_scene):
+    camera = make_camera()
+    scene = make_scene(80, camera, seed=10)
+    scene["means"][:, 2] = 3.0
+    check(scene, camera)
+
+
+@pytest.mark.parametrize("count", [0, 5])
+def test_none_visible(isa, make_camera, make_scene, count):
+    camera = make_camera()
+    scene = make_scene(count, camera)
+    scene["means"][:, 2] = -5
+    raster = RasterSettings(background=(0.1, 0.2, 0.3))
+    ours, gradients, _ = check(scene, camera, raster)
+    assert torch.equal(ours.image, torch.tensor(raster.background).expand(14, 20, 3))
+    assert not ours.alpha.any()
+    assert ours.evaluations == 0
+    assert all((gradient == 0).all() for gradient in gradients.values())
+
+
+@pytest.mark.parametrize(("width", "height"), [(1, 1), (1, 33), (33, 1), (16, 16), (17, 15)])
+@pytest.mark.parametrize("count", [1, 15, 16, 17])
+def test_sizes(isa, make_camera, make_scene, width, height, count):
+    camera = make_camera(width, height)
+    check(make_scene(count, camera, seed=width + count), camera)
+
+
+@given(
+    seed=st.integers(0, 2**31),
+    count=st.integers(0, 80),
+    width=st.integers(1, 40),
+    height=st.integers(1, 40),
+    size=st.floats(0.1, 20.0),
+    stretch=st.floats(0.05, 20.0),
+    antialiased=st.booleans(),
+)
+@settings(max_examples=25, deadline=None)
+def test_random_scenes(
+    make_camera, make_scene, seed, count, width, height, size, stretch, antialiased
+):
+    camera = make_camera(width, height, turned=bool(seed % 2))
+    scene = make_scene(count, camera, seed=seed, size=size)
+    scene["scales"][::2, 0] *= stretch
+    scene["means"][1::7] -= 2 * (scene["means"][1::7] - camera.position)  # behind
+    check(scene, camera, RasterSettings(antialiased=antialiased, background=(0.3, 0.6, 0.1)))
+
+
+# --- the same each time -------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def large(make_camera, make_scene):
+    """Enough Gaussians and tiles for every stage to be cut into several tasks."""
+    camera = rounded(make_camera(150, 110, focal=120.0, turned=True))
+    return single(make_scene(20_000, camera, seed=12, size=2.0)), camera
+
+
+def everything(large, count):
+    torch.set_num_threads(count)
+    scene, camera = large
+    v_image = torch.linspace(-1, 1, camera.height * camera.width * 3).reshape(camera.height, -1, 3)
+    render, gradients = run(
+        scene, camera, RasterSettings(), "native", torch.float32, v_image, v_image[..., 0]
+    )
+    return render, [render.image, render.alpha, render.visible, *gradients.values()]
+
+
+def test_any_number_of_threads_gives_the_same_bits(threads, isa, large):
+    first, expected = everything(large, 1)
+    for count in (1, 2, 4, 3):
+        render, results = everything(large, count)
+        assert all(torch.equal(a, b) for a, b in zip(expected, results, strict=True))
+        assert render.evaluations == first.evaluations
+
+
+def test_a_large_scene_is_within_the_bounds(large):
+    scene, camera = large
+    exact = run(scene, camera, RasterSettings(), "torch", torch.float64)[0].image.detach()
+    error = (everything(large, 1)[0].image.double() - exact).abs().detach()
+    assert error.mean() <= 1e-6
+    assert error.max() <= 2e-3
+
+
+def test_instruction_sets_agree(large):
+    before = native.isa()
+    images = []
+    try:
+        for name in native.available_isas():
+            native.set_isa(name)
+            images.append(everything(large, 1)[0].image)
+    finally:
+        native.set_isa(before)
+    for image in images[1:]:
+        error = (image - images[0]).abs()
+        assert error.mean() < 1e-6
+        assert error.max() < 2e-3
+
+
+def test_renders_alive_at_once_keep_apart(make_camera, make_scene):
+    camera = make_camera(40, 30)
+    scenes = [single(make_scene(100, camera, seed=seed)) for seed in range(3)]
+
+    def gradient(leaf, image):
+        image.sum().backward()
+        return leaf.grad
+
+    def forward(scene):
+        leaves = {name: value.clone().requires_grad_() for name, value in scene.items()}
+        render = rasterize(
+            *leaves.values(), camera, RasterSettings(), sh_degree=3, backend="native"
+        )
+        return leaves["means"], render.image
+
+    alone = [gradient(*forward(scene)) for scene in scenes]
+    together = [forward(scene) for scene in scenes]
+    for expected, parts in zip(reversed(alone), reversed(together), strict=True):
+        assert torch.equal(gradient(*parts), expected)
+
+
+def test_gradients_are_handed_over_without_a_copy(make_camera, make_scene):
+    camera = make_camera()
+    scene = single(make_scene(50, camera))
+    places = []
+    for _ in range(3):
+        leaves = {name: value.clone().requires_grad_() for name, value in scene.items()}
+        image = rasterize(
+            *leaves.values(), camera, RasterSettings(), sh_degree=3, backend="native"
+        ).image
+        image.sum().backward()
+        places.append(leaves["shN"].grad.data_ptr())
+    # A copy would lie where torch's allocator puts it; ours are on cache lines, and come again.
+    assert all(place % 64 == 0 for place in places)
+
+
+def test_a_forked_child_renders(large):
+    scene, camera = large
+    values, view = [scene[name] for name in NAMES], make_view(camera)
+
+    def render():
+        # Only our threads: torch's own do not outlive a fork.
+        return native.Frame().forward(view, *values, None, 2)[0].numpy().tobytes()
+
+    expected = render()
+    child = os.fork()
+    if child == 0:
+        signal.alarm(20)
+        os._exit(0 if render() == expected else 1)
+    assert os.waitpid(child, 0)[1] == 0
+
+
+# --- bad input ----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("bad", [float("nan"), float("inf"), -float("inf")])
+@pytest.mark.parametrize("name", [*NAMES, "means2d_offset"])
+def test_a_value_that_is_not_finite_is_named(isa, make_camera, make_scene, name, bad):
+    camera = rounded(make_camera())
+    scene = single(make_scene(40, camera))
+    scene["means2d_offset"] = torch.zeros(40, 2)
+    scene["means"][33] = torch.tensor([0.0, 0.0, 3.0])  # in view: its harmonics are read
+    scene[name][33] = bad
+    frame, view = native.Frame(), make_view(camera)
+    values = [scene[key] for key in (*NAMES, "means2d_offset")]
+    with pytest.raises(ValueError, match=f"^{name} has values that are not finite"):
+        frame.forward(view, *values, 1)
+
+
+def make_view(camera, **changes):
+    options = {
+        "viewmat": camera.viewmat.flatten().tolist(),
+        "intrinsics": [camera.K[0, 0], camera.K[1, 1], camera.K[0, 2], camera.K[1, 2]],
+        "width": camera.width,
+        "height": camera.height,
+        "near": 0.01,
+        "eps2d": 0.3,
+        "alpha_min": 1 / 255,
+        "alpha_max": 0.99,
+        "transmittance_min": 1e-4,
+        "antialiased": False,
+        "background": (0.0, 0.0, 0.0),
+        "sh_degree": 3,
+    }
+    options["intrinsics"] = [float(value) for value in options["intrinsics"]]
+    return native.View.make(**(options | changes))
+
+
+def test_shapes_are_checked(make_camera, make_scene):
+    camera = rounded(make_camera())
+    scene = single(make_scene(10, camera))
+    values = [scene[key] for key in NAMES]
+    frame = native.Frame()
+    with pytest.raises(ValueError, match="opacities must have 10 rows, got 9"):
+        frame.forward(make_view(camera), *values[:3], values[3][:9], *values[4:], None, 1)
+    with pytest.raises(ValueError, match="shN has fewer bands"):
+        frame.forward(make_view(camera), *values[:5], values[5][:, :8].contiguous(), None, 1)
+    with pytest.raises(ValueError, match="sh_degree"):
+        make_view(camera, sh_degree=4)
+    with pytest.raises(ValueError, match="at least 1"):
+        make_view(camera, width=0)
+    frame.forward(make_view(camera), *values, None, 1)
+    with pytest.raises(ValueError, match="image's size"):
+        frame.backward(torch.zeros(3, 3, 3), torch.zeros(3, 3), *values, None, 1)
+
+
+def test_float64_is_refused(make_camera, make_scene):
+    camera = make_camera()
+    with pytest.raises(ValueError, match="float32"):
+        run(make_scene(3, camera), camera, RasterSettings(), "native", torch.float64)
+
+
+CROWD = """
+import resource, torch
+from xrgs.splat.cameras import Camera
+from xrgs.splat.rasterize import rasterize
+from xrgs.splat.settings import RasterSettings
+
+n = 30_000
+means = torch.tensor([0.0, 0.0, 1.0]).repeat(n, 1)
+scene = [means, torch.ones(n, 4), torch.full((n, 3), 100.0), torch.ones(n)]
+scene += [torch.zeros(n, 1, 3), torch.zeros(n, 0, 3)]
+side = 1600
+K = torch.tensor([[800.0, 0, 800], [0, 800, 800], [0, 0, 1]])
+camera = Camera(torch.eye(4), K, side, side)
+used = int(open("/proc/self/statm").read().split()[0]) * resource.getpagesize()
+resource.setrlimit(resource.RLIMIT_AS, (used + (400 << 20), resource.RLIM_INFINITY))
+try:
+    rasterize(*scene, camera, RasterSettings(), sh_degree=0, backend="native")
+except MemoryError as error:
+    print(error)
+"""
+
+
+@pytest.mark.skipif(not os.path.exists("/proc/self/statm"), reason="reads Linux's /proc")  # noqa: PTH110
+def test_lists_beyond_memory_are_a_clear_error():
+    # 30,000 Gaussians over 10,000 tiles each: 300 million pairs.
+    result = subprocess.run(
+        [sys.executable, "-c", CROWD], capture_output=True, text=True, timeout=60, check=False
+    )
+    assert "the lists of 30000 visible Gaussians in 1600x1600 px do not fit" in result.stdout, (
+        result.stderr
+    )
+
+
+@pytest.mark.parametrize(("value", "says"), [("portable", "portable"), ("sse9", "XRGS_ISA")])
+def test_the_environment_chooses_the_instruction_set(value, says):
+    result = subprocess.run(
+        [sys.executable, "-c", "from xrgs import _native; print(_native.isa())"],
+        env=os.environ | {"XRGS_ISA": value},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert says in (result.stdout if value == "portable" else result.stderr)
+
+
+# --- the vector functions -----------------------------------------------------------------------
+
+
+def test_exp2_and_log2(isa):
+    x = np.linspace(-126, 126, 200_001).astype(np.float32)
+    exact = np.exp2(x.astype(np.float64))
+    assert np.abs(native.exp2(torch.from_numpy(x)).numpy() / exact - 1).max() < 3e-7
+    y = np.exp2(np.linspace(-126, 126, 200_001)).astype(np.float32)
+    logs = np.log2(y.astype(np.float64))
+    error = np.abs(native.log2(torch.from_numpy(y)).numpy() - logs)
+    assert (error <= 1e-7 + 1.2e-7 * np.abs(logs)).all()
