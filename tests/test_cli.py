@@ -248,3 +248,23 @@ def test_a_report_that_cannot_be_made_says_why(
     assert code == 1
     assert named in err
     assert "Traceback" not in err
+
+
+def test_a_trained_cell_becomes_a_load_of_the_benchmark(swept: tuple[Path, str]) -> None:
+    folder, _ = swept
+    cell = sorted((folder / "s" / "cells").iterdir())[0]
+    view = json.loads((cell / "status.json").read_text())["views"][0]
+    code, out, err = run("bench", folder, "save=a.npz", f"cell={cell}", f"view={view}")
+    assert code == 0, err
+    with np.load(folder / "a.npz") as stored:
+        count = json.loads((cell / "summary.json").read_text())["gaussians"]
+        assert stored["means"].shape == (count, 3)
+        assert stored["sh"].shape == (count, 16, 3)
+        assert ((stored["opacities"] > 0) & (stored["opacities"] < 1)).all()
+        with Image.open(cell / "renders" / f"{view}.png") as picture:
+            assert picture.size == (stored["width"], stored["height"])
+    assert f"{count} Gaussians" in out
+    code, _, err = run("bench", folder, "save=a.npz", f"cell={cell}", "view=none")
+    assert code != 0
+    assert "view=none" in err
+    assert view in err

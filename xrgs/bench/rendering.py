@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from functools import partial
 from typing import Any
@@ -86,23 +86,48 @@ class Rendering:
 def time_load(load: Load, chosen: Sequence[Way], counts: Sequence[int], repeats: int) -> list[Any]:
     """A row for each way and number of threads, timed in turn.
 
-    The torch backend is left out of loads too large for it, and makes the repeats fewer.
+    The torch backend is left out of loads too large for it. Else it takes its turns with the first
+    of the others, fewer of them, and its rows say `times_slower` than that one it was.
     """
-    fits = len(load) <= _TORCH_GAUSSIANS and load.pixels <= _TORCH_PIXELS
-    used = [way for way in chosen if fits or way.backend != "torch"]
-    if any(way.backend == "torch" for way in used):
-        repeats = min(repeats, _TORCH_REPEATS)
+    fast = [way for way in chosen if way.backend != "torch"]
+    rows = list(_time(load, fast, counts, repeats).values())
+    if len(load) > _TORCH_GAUSSIANS or load.pixels > _TORCH_PIXELS:
+        return rows
+    slow = [way for way in chosen if way.backend == "torch"]
+    timed = _time(load, [*fast[:1], *slow], counts, min(repeats, _TORCH_REPEATS))
+    for way in slow:
+        for count in counts:
+            row = timed[way.name, count]
+            if fast:
+                row["times_slower"] = _whole(row) / _whole(timed[fast[0].name, count])
+            rows.append(row)
+    return rows
+
+
+def _whole(row: dict[str, Any]) -> float:
+    return float(row["forward_median_ms"] + row["backward_median_ms"])
+
+
+def _time(
+    load: Load, chosen: Sequence[Way], counts: Sequence[int], repeats: int
+) -> dict[tuple[str, int], dict[str, Any]]:
     renderings = {
-        f"{way.name} {count}": Rendering(load, way, count) for way in used for count in counts
+        (way.name, count): Rendering(load, way, count) for way in chosen for count in counts
     }
-    things: dict[str, Any] = {}
-    for name, rendering in renderings.items():
-        things |= {f"{name} forward": rendering.forward, f"{name} backward": rendering.backward}
+    things: dict[str, Callable[[], object]] = {}
+    for (name, count), rendering in renderings.items():
+        things[f"{name} {count} forward"] = rendering.forward
+        things[f"{name} {count} backward"] = rendering.backward
     times = alternate(things, repeats)
-    return [
-        _row(load, rendering, times[f"{name} forward"], times[f"{name} backward"])
-        for name, rendering in renderings.items()
-    ]
+    return {
+        (name, count): _row(
+            load,
+            rendering,
+            times[f"{name} {count} forward"],
+            times[f"{name} {count} backward"],
+        )
+        for (name, count), rendering in renderings.items()
+    }
 
 
 def _row(load: Load, rendering: Rendering, forward: Times, backward: Times) -> dict[str, Any]:

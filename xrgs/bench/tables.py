@@ -67,14 +67,15 @@ def _renders(found: Row) -> str:
                 f"{row['error']['image_mean']:.1e}",
                 f"{row['error']['image_max']:.1e}",
                 f"{row['error']['gradient']:.1e}",
+                f"{row['times_slower']:.0f}x" if "times_slower" in row else "",
             ]
         )
     head = "way|threads|Gaussians|size|forward ms|backward ms|M alphas|G alphas/s|FMA/alpha|MB"
-    head += "|mean error|max error|gradient error"
+    head += "|mean error|max error|gradient error|slower"
     note = (
         "least of the repeats; alphas/s of compositing alone, FMA/alpha: multiply-adds that the\n"
         "measured peak has time for in one; MB: parameters, gradients and buffers; errors against\n"
-        "the torch backend in double, over the middle of the view"
+        "the torch backend in double, over the middle of the view; slower: than native, in turn"
     )
     return f"{_table(head.split('|'), lines)}\n{note}"
 
