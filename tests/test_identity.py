@@ -75,13 +75,15 @@ def test_naming_the_backend_that_auto_chooses_is_no_change(baseline: Conf) -> No
     assert cell_id(auto) == cell_id(named)
 
 
-def test_a_changed_file_of_the_training_code_is_another_cell(
+def test_a_changed_file_of_thetraining_code_is_another_cell(
     baseline: Conf, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     before = cell_id(baseline)
     names = set(cell_identity(baseline, "v")["code"])
     assert {"train.py", "components.py", "metrics.py", "splat/densify.py"} <= names
     assert "report/tables.py" not in names
+    assert not any(name.startswith("native/") for name in names)
+    assert "native/simd.h" in identity.training_code("native")
 
     package = Path(identity.__file__).parent
     for name in names:
@@ -89,11 +91,11 @@ def test_a_changed_file_of_the_training_code_is_another_cell(
         file.parent.mkdir(parents=True, exist_ok=True)
         file.write_bytes((package / name).read_bytes())
     monkeypatch.setattr(identity, "_PACKAGE", tmp_path)
-    identity._training_code.cache_clear()
+    identity.training_code.cache_clear()
     assert cell_id(baseline) == before
 
     with (tmp_path / "splat" / "densify.py").open("a") as file:
         file.write("\n# changed\n")
-    identity._training_code.cache_clear()
+    identity.training_code.cache_clear()
     assert cell_id(baseline) != before
-    identity._training_code.cache_clear()
+    identity.training_code.cache_clear()

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from dataclasses import asdict
 from functools import cache
-from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -17,33 +16,28 @@ from xrgs.hashing import file_digest
 from xrgs.splat.backend import resolve_backend
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable
-
     from xrgs.config import Conf
 
 _PACKAGE = Path(__file__).parent
-#: Files of the package whose change can change a trained number (folders: every .py inside).
-TRAINING_CODE = ("splat", "components.py", "dataset.py", "evaluate.py", "metrics.py", "train.py")
-
-
-def code_digests(names: Iterable[str] = TRAINING_CODE) -> dict[str, str]:
-    """SHA-256 of each source file under `names`, keyed by its path inside the package."""
-    found: dict[str, str] = {}
-    for name in names:
-        path = _PACKAGE / name
-        files = sorted(path.rglob("*.py")) if path.is_dir() else [path]
-        found |= {file.relative_to(_PACKAGE).as_posix(): file_digest(file) for file in files}
-    return found
+#: Files whose change can change a trained number; of folders, every source file inside.
+_TRAINING_CODE = ("splat", "components.py", "dataset.py", "evaluate.py", "metrics.py", "train.py")
+#: What the native backend is compiled from, shipped beside it: two builds of it are not the same
+#: bytes, and not another program.
+_NATIVE_CODE = "native"
+_SOURCES = frozenset({".py", ".cpp", ".h", ".txt"})
 
 
 @cache
-def _training_code(backend: str) -> dict[str, str]:
-    code = code_digests()
-    if backend == "native":
-        spec = find_spec("xrgs._native")
-        if spec is not None and spec.origin is not None:
-            code["_native"] = file_digest(Path(spec.origin))
-    return code
+def training_code(backend: str) -> dict[str, str]:
+    """SHA-256 of each source file that trains with a backend, keyed by its path in the package."""
+    names = (*_TRAINING_CODE, _NATIVE_CODE) if backend == "native" else _TRAINING_CODE
+    roots = [_PACKAGE / name for name in names]
+    files = [f for root in roots for f in ([root] if root.is_file() else root.rglob("*"))]
+    return {
+        file.relative_to(_PACKAGE).as_posix(): file_digest(file)
+        for file in sorted(files)
+        if file.suffix in _SOURCES
+    }
 
 
 def cell_identity(conf: Conf, variant_id: str) -> dict[str, Any]:
@@ -56,5 +50,5 @@ def cell_identity(conf: Conf, variant_id: str) -> dict[str, Any]:
         "seed": conf.seed,
         "variant": variant_id,
         "protocol": PROTOCOL,
-        "code": _training_code(backend),
+        "code": training_code(backend),
     }
