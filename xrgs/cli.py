@@ -71,16 +71,19 @@ class ReportConf:
     store: str = "xrgs-store"
     sweep: str | None = None
     """Id of the sweep; the latest where none is given."""
+    out: str | None = None
+    """Folder to write to; `<store>/reports/<sweep>` where none is given."""
 
 
 def report() -> None:
-    """`xrgs-report [store=FOLDER] [sweep=ID]`: the tables again, from the store alone."""
+    """`xrgs-report [store=FOLDER] [sweep=ID] [out=FOLDER]`: the tables, from the store alone."""
     from xrgs.report import build
 
     try:
         given = OmegaConf.from_dotlist(sys.argv[1:])
         conf = OmegaConf.merge(OmegaConf.structured(ReportConf), given)
-        print(build(Path(conf.store), conf.sweep).text)  # noqa: T201
+        out = Path(conf.out) if conf.out else None
+        print(build(Path(conf.store), conf.sweep, out).text)  # noqa: T201
     except (XrgsError, OmegaConfBaseException) as error:
         sys.exit(f"xrgs-report: {_line(error)}")
 
