@@ -26,7 +26,7 @@ ONLY_IN = {
 }
 #: Rooms in the order that data walks through them: an import never points to a later one.
 FLOW = (
-    ("errors", "hashing", "splat", "images", "alignment", "split", "views"),
+    ("errors", "hashing", "machine", "splat", "images", "alignment", "split", "views"),
     ("config", "scenes", "sfm"),
     ("mixing",),
     ("variant",),

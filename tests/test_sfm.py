@@ -1,6 +1,5 @@
 from __future__ import annotations
 
-import os
 from pathlib import Path
 
 import numpy as np
@@ -100,15 +99,3 @@ def test_images_without_anything_in_common_give_no_model(
     assert model.report["models"] == []
     assert model.report["registered"] == 0
     assert capfd.readouterr().err == ""
-
-
-def test_threads_are_those_this_process_may_use() -> None:
-    if not hasattr(os, "sched_getaffinity"):
-        pytest.skip("the system has no processor affinity")
-    allowed = os.sched_getaffinity(0)
-    try:
-        os.sched_setaffinity(0, {min(allowed)})
-        assert sfm.usable_threads() == 1
-    finally:
-        os.sched_setaffinity(0, allowed)
-    assert sfm.usable_threads() == len(allowed)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import sys
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, TypeVar
@@ -12,6 +11,7 @@ import torch
 from tqdm import tqdm
 
 from xrgs import images
+from xrgs.machine import usable_cores
 from xrgs.splat.cameras import Camera
 from xrgs.splat.normalize import normalize_scene
 
@@ -89,6 +89,5 @@ def progress(items: Iterable[_T], what: str, unit: str, total: int | None = None
 
 def use_threads(wanted: int) -> int:
     """Set torch's threads; 0 takes every core that this process may use. Returns the number."""
-    allowed = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
-    torch.set_num_threads(wanted or allowed or 1)
+    torch.set_num_threads(wanted or usable_cores())
     return torch.get_num_threads()

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import os
 import platform
 import subprocess
 import sys
@@ -13,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import xrgs
+from xrgs.machine import usable_cores
 
 _PACKAGES = ("torch", "numpy", "pycolmap", "kornia", "scikit-image", "hydra-core", "pandas")
 
@@ -51,9 +51,7 @@ def collect(threads: int, backend: str) -> dict[str, Any]:
         "packages": {name: metadata.version(name) for name in _PACKAGES},
         "platform": platform.platform(),
         "cpu": _cpu(),
-        "cores": len(os.sched_getaffinity(0))
-        if hasattr(os, "sched_getaffinity")
-        else os.cpu_count(),
+        "cores": usable_cores(),
         "threads": threads,
         "backend": backend,
         "started": datetime.now(UTC).isoformat(timespec="seconds"),

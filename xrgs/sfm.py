@@ -5,7 +5,6 @@ COLMAP's own log goes to a file in the work folder; what the user sees is one pr
 
 from __future__ import annotations
 
-import os
 import zlib  # noqa: F401  as a first import pycolmap 4.2.1 corrupts the heap
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -19,6 +18,7 @@ from tqdm import tqdm
 
 from xrgs import images
 from xrgs.images import Lens
+from xrgs.machine import usable_cores
 
 if TYPE_CHECKING:
     from xrgs.config import SfmConf
@@ -85,7 +85,7 @@ def reconstruct(shots: Sequence[Shot], folder: Path, work: Path, conf: SfmConf) 
     _log_to(work)
     pycolmap.set_random_seed(conf.seed)
     database = work / "database.db"
-    threads = usable_threads()
+    threads = usable_cores()
     max_features = features_for(len(shots), conf.max_num_features)
     _extract(shots, folder, database, max_features, threads)
     _match(shots, database, work, threads)
@@ -105,13 +105,6 @@ def reconstruct(shots: Sequence[Shot], folder: Path, work: Path, conf: SfmConf) 
     return _as_plain(
         max(models, key=lambda m: (m.num_reg_images(), m.num_points3D())), shots, report
     )
-
-
-def usable_threads() -> int:
-    """Processors that this process may run on, not those of the machine."""
-    if hasattr(os, "sched_getaffinity"):
-        return len(os.sched_getaffinity(0))
-    return os.cpu_count() or 1
 
 
 def _log_to(work: Path) -> None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import csv
-import os
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -12,6 +11,7 @@ import numpy as np
 from xrgs import provenance
 from xrgs.bench import loads, rendering, tables, training
 from xrgs.errors import XrgsError
+from xrgs.machine import usable_cores
 from xrgs.splat.backend import resolve_backend
 from xrgs.store import write_json
 
@@ -52,7 +52,7 @@ def run(settings: Settings) -> str:
         return _save(settings)
     if settings.repeats < 1 or settings.threads < 0:
         raise XrgsError("repeats must be at least 1 and threads at least 0")
-    counts = sorted({1, settings.threads or _cores()})
+    counts = sorted({1, settings.threads or usable_cores()})
     backends = ["native", "torch"] if resolve_backend("auto") == "native" else ["torch"]
     found: dict[str, Any] = {"machine": _machine(backends, counts)}
     if settings.load is not None:
@@ -77,12 +77,6 @@ def _save(settings: Settings) -> str:
     loads.write(Path(settings.save), load)
     size = f"{load.camera.width} x {load.camera.height} px"
     return f"{settings.save}: {len(load)} Gaussians, {size}"
-
-
-def _cores() -> int:
-    if hasattr(os, "sched_getaffinity"):
-        return len(os.sched_getaffinity(0))
-    return os.cpu_count() or 1
 
 
 def _machine(backends: Sequence[str], counts: Sequence[int]) -> dict[str, Any]:
