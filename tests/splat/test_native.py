@@ -412,6 +412,22 @@ def test_a_value_that_is_not_finite_is_named(isa, make_camera, make_scene, name,
         frame.forward(view, *values, 1)
 
 
+@pytest.mark.parametrize(
+    ("name", "bad", "says"),
+    [
+        ("scales", -1e-3, "scales has values below 0"),
+        ("opacities", 1.01, "opacities has values outside 0..1"),
+        ("opacities", -0.01, "opacities has values outside 0..1"),
+    ],
+)
+def test_a_value_out_of_range_is_named(isa, make_camera, make_scene, name, bad, says):
+    camera = make_camera()
+    scene = single(make_scene(21, camera))
+    scene[name][20] = bad
+    with pytest.raises(ValueError, match=f"^{says}"):
+        run(scene, rounded(camera), RasterSettings(), "native", torch.float32)
+
+
 def make_view(camera, **changes):
     options = {
         "viewmat": camera.viewmat.flatten().tolist(),

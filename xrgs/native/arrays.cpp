@@ -8,6 +8,8 @@
 #include <unordered_map>
 #include <vector>
 
+#include "memory.h"
+
 namespace xrgs {
 namespace {
 
@@ -55,7 +57,7 @@ void* take_block(std::size_t bytes) {
     found->second.pop_back();
     s.kept -= size;
   } else {
-    block = std::aligned_alloc(kAlignment, size);
+    block = allocate(size);
     if (block == nullptr) throw std::bad_alloc();
   }
   s.lent.emplace(block, size);

@@ -81,11 +81,10 @@ def rasterize(
     count = means.shape[0] if means.ndim else 0
     for name, (value, shape) in parameters.items():
         _check(name, value, (count, *shape), means.dtype)
-    if (scales < 0).any():
-        raise ValueError("scales has values below 0")
-    if ((opacities < 0) | (opacities > 1)).any():
-        raise ValueError("opacities has values outside 0..1")
-    module = importlib.import_module(_MODULES[resolve_backend(backend)])
+    backend = resolve_backend(backend)
+    if backend == "torch":  # the native one looks at values as it reads them
+        _check_values({name: value for name, (value, _) in parameters.items()})
+    module = importlib.import_module(_MODULES[backend])
     render: Render = module.render(
         means, quats, scales, opacities, sh0, shN, camera, settings, sh_degree, means2d_offset
     )
@@ -97,5 +96,13 @@ def _check(name: str, value: Tensor, shape: tuple[int, ...], dtype: torch.dtype)
         raise ValueError(f"{name} must be {list(shape)}, got {list(value.shape)}")
     if not value.is_floating_point() or value.dtype != dtype:
         raise ValueError(f"{name} must be of the floating type of means, got {value.dtype}")
-    if not torch.isfinite(value).all():
-        raise ValueError(f"{name} has values that are not finite")
+
+
+def _check_values(parameters: dict[str, Tensor]) -> None:
+    for name, value in parameters.items():
+        if not torch.isfinite(value).all():
+            raise ValueError(f"{name} has values that are not finite")
+    if (parameters["scales"] < 0).any():
+        raise ValueError("scales has values below 0")
+    if ((parameters["opacities"] < 0) | (parameters["opacities"] > 1)).any():
+        raise ValueError("opacities has values outside 0..1")

@@ -92,7 +92,7 @@ bool all_finite(const float* p, std::size_t count) {
 }
 
 // Which parameter was it?
-[[noreturn]] void throw_not_finite(const Tensors& t) {
+[[noreturn]] void throw_bad_value(const Tensors& t) {
   const auto check = [](const char* name, const auto& array) {
     if (!all_finite(array.data(), array.size()))
       throw nb::value_error((std::string(name) + " has values that are not finite").c_str());
@@ -104,6 +104,11 @@ bool all_finite(const float* p, std::size_t count) {
   check("sh0", t.sh0);
   check("shN", t.shN);
   if (t.offsets) check("means2d_offset", *t.offsets);
+  for (std::size_t i = 0; i < t.scales.size(); ++i)
+    if (t.scales.data()[i] < 0.0f) throw nb::value_error("scales has values below 0");
+  for (std::size_t i = 0; i < t.opacities.size(); ++i)
+    if (t.opacities.data()[i] < 0.0f || t.opacities.data()[i] > 1.0f)
+      throw nb::value_error("opacities has values outside 0..1");
   throw nb::value_error("sh0 and shN overflow: a colour is not finite");
 }
 
@@ -126,18 +131,18 @@ std::tuple<Output, Output> forward(LentFrame& frame, const View& view, const Vec
     throw nb::value_error("shN has fewer bands than sh_degree asks for");
   const auto height = static_cast<std::size_t>(view.height), width = static_cast<std::size_t>(view.width);
   Output image = new_array<float>({height, width, 3}), alpha = new_array<float>({height, width});
-  bool finite = true, enough = true;
+  bool good = true, enough = true;
   {
     nb::gil_scoped_release release;
     try {
-      finite = render(threads, parameters, view, *frame, static_cast<float*>(image.data()),
+      good = render(threads, parameters, view, *frame, static_cast<float*>(image.data()),
                       static_cast<float*>(alpha.data()));
     } catch (const std::bad_alloc&) {
       enough = false;
     }
   }
   if (!enough) throw_memory(*frame);
-  if (!finite) throw_not_finite(tensors);
+  if (!good) throw_bad_value(tensors);
   return {std::move(image), std::move(alpha)};
 }
 

@@ -51,13 +51,13 @@ bool project_all(int threads, const RasterKernels& kernels, const Parameters& p,
   frame.spare.resize(count);
   const std::int64_t chunks = (p.count + kChunk - 1) / kChunk;
   std::int32_t* seen = workspace.chunk_seen.resize(static_cast<std::size_t>(chunks));
-  std::atomic<bool> finite{true};
+  std::atomic<bool> all_good{true};
   parallel_for(threads, chunks, [&](std::int64_t c) {
     const std::int64_t first = c * kChunk, last = std::min(p.count, first + kChunk);
     bool good = true;
     seen[c] = static_cast<std::int32_t>(
         kernels.project(p, frame.view, first, last, frame, frame.spare.data() + first, &good));
-    if (!good) finite = false;
+    if (!good) all_good = false;
   });
   frame.seen = 0;
   for (std::int64_t c = 0; c < chunks; ++c) {
@@ -65,7 +65,7 @@ bool project_all(int threads, const RasterKernels& kernels, const Parameters& p,
                 static_cast<std::size_t>(seen[c]) * sizeof(std::uint64_t));
     frame.seen += seen[c];
   }
-  return finite;
+  return all_good;
 }
 
 }  // namespace

@@ -7,7 +7,7 @@
 namespace xrgs {
 
 // Renders into image [H, W, 3] and alpha [H, W]. Returns false, with nothing rendered, where a
-// parameter is not finite. Throws std::bad_alloc.
+// parameter is not finite or out of range. Throws std::bad_alloc.
 bool render(int threads, const Parameters& parameters, const View& view, Frame& frame, float* image,
             float* alpha);
 

@@ -5,6 +5,8 @@
 #include <mutex>
 #include <new>
 
+#include "memory.h"
+
 namespace xrgs {
 namespace {
 
@@ -41,7 +43,7 @@ Store<T>& store() {
 
 void* grow_block(void* block, std::size_t bytes) {
   std::free(block);
-  void* grown = std::aligned_alloc(64, (bytes + 63) / 64 * 64);
+  void* grown = allocate(bytes);
   if (grown == nullptr) throw std::bad_alloc();
   return grown;
 }

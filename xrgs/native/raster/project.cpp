@@ -42,7 +42,7 @@ XRGS_INLINE Vector3 colors_of(const Parameters& p, std::int64_t group, int lanes
   if constexpr (kRest > 0) {
     Floats basis[kRest], c[3 * kRest];
     sh_basis<Degree>(direction, basis);
-    load_columns<3 * kRest>(p.shN + group * p.rest * 3, p.rest * 3, visible, c);
+    load_columns<3 * kRest>(p.shN + group * p.rest * 3, p.rest * 3, rows_to_load(visible, lanes), c);
     for (int k = 0; k < kRest; ++k)
       color = add(color, basis[k], {c[3 * k], c[3 * k + 1], c[3 * k + 2]});
   }
@@ -93,10 +93,13 @@ XRGS_INLINE void store_records(const Projected& o, Floats level, Floats reach2, 
 
 template <int Degree>
 std::uint32_t project_sixteen(const Parameters& p, const View& v, std::int64_t group, int lanes,
-                              Frame& frame, float* depths, bool* finite) {
+                              Frame& frame, float* depths, bool* good) {
   const Inputs in = load_inputs(p, group, lanes);
   const Floats zero = splat(0.0f);
-  if (bits(finite_times_zero(in) == zero) != 0xffffu) *finite = false;
+  const Mask good_input = (finite_times_zero(in) == zero) & (zero <= in.opacity) &
+                          (in.opacity <= splat(1.0f)) &
+                          (zero <= min(in.scale.x, min(in.scale.y, in.scale.z)));
+  if (bits(good_input) != 0xffffu) *good = false;
   const Projected o = project_inputs(in, v);
   const Floats level = log2(max(o.opacity, splat(kSmallest)));
   const Floats reach2 = max(level - splat(v.level_min), zero);
@@ -107,8 +110,8 @@ std::uint32_t project_sixteen(const Parameters& p, const View& v, std::int64_t g
                             in.mean.z - splat(v.position[2])};
   const Floats inv = splat(1.0f) / sqrt(max(dot(from_camera, from_camera), splat(kSmallest)));
   const Vector3 color = colors_of<Degree>(p, group, lanes, visible, times(inv, from_camera));
-  const Mask good = (color.x * zero == zero) & (color.y * zero == zero) & (color.z * zero == zero);
-  if ((visible & ~bits(good)) != 0) *finite = false;
+  const Mask finite = (color.x * zero == zero) & (color.y * zero == zero) & (color.z * zero == zero);
+  if ((visible & ~bits(finite)) != 0) *good = false;
   store_records(o, level, reach2, color, visible, frame.records.data() + group);
   store(depths, o.z);
   return visible;
@@ -123,12 +126,12 @@ std::uint32_t key_of(float depth) {
 
 template <int Degree>
 std::int64_t project_degree(const Parameters& p, const View& v, std::int64_t first,
-                            std::int64_t last, Frame& frame, std::uint64_t* order, bool* finite) {
+                            std::int64_t last, Frame& frame, std::uint64_t* order, bool* good) {
   std::int64_t seen = 0;
   for (std::int64_t group = first; group < last; group += 16) {
     const int lanes = last - group < 16 ? static_cast<int>(last - group) : 16;
     alignas(64) float depths[16];
-    const std::uint32_t visible = project_sixteen<Degree>(p, v, group, lanes, frame, depths, finite);
+    const std::uint32_t visible = project_sixteen<Degree>(p, v, group, lanes, frame, depths, good);
     frame.visible[static_cast<std::size_t>(group / 16)] = static_cast<std::uint16_t>(visible);
     for (std::uint32_t left = visible; left != 0; left &= left - 1) {
       const int i = __builtin_ctz(left);
@@ -143,12 +146,12 @@ std::int64_t project_degree(const Parameters& p, const View& v, std::int64_t fir
 }  // namespace
 
 std::int64_t project(const Parameters& p, const View& v, std::int64_t first, std::int64_t last,
-                     Frame& frame, std::uint64_t* order, bool* finite) {
+                     Frame& frame, std::uint64_t* order, bool* good) {
   switch (v.degree) {
-    case 0: return project_degree<0>(p, v, first, last, frame, order, finite);
-    case 1: return project_degree<1>(p, v, first, last, frame, order, finite);
-    case 2: return project_degree<2>(p, v, first, last, frame, order, finite);
-    default: return project_degree<3>(p, v, first, last, frame, order, finite);
+    case 0: return project_degree<0>(p, v, first, last, frame, order, good);
+    case 1: return project_degree<1>(p, v, first, last, frame, order, good);
+    case 2: return project_degree<2>(p, v, first, last, frame, order, good);
+    default: return project_degree<3>(p, v, first, last, frame, order, good);
   }
 }
 

@@ -11,24 +11,34 @@ namespace xrgs {
 namespace XRGS_NS {
 namespace {
 
+// How many slots of a Gaussian are added without a branch, those it lacks being zeros: most have no
+// more, and how many is nothing that a processor could predict.
+constexpr std::uint32_t kFewSlots = 4;
+alignas(64) constexpr float kNoSlot[kSlotSize] = {};
+
 XRGS_INLINE void sum_slots(const Frame& frame, const float* sums, std::int64_t group,
                            std::uint32_t visible, Floats (&out)[16]) {
   for (int i = 0; i < 16; ++i) {
-    out[i] = splat(0.0f);
-    if ((visible >> i & 1u) == 0) continue;
-    const Slots slots = frame.slots[static_cast<std::size_t>(group + i)];
+    Slots slots{0, 0};
+    if ((visible >> i & 1u) != 0) slots = frame.slots[static_cast<std::size_t>(group + i)];
     const float* slot = sums + std::size_t{slots.first} * kSlotSize;
-    for (std::uint32_t k = 0; k < slots.count; ++k) out[i] += load(slot + k * kSlotSize);
+    Floats sum = load(slots.count > 0 ? slot : kNoSlot);
+    for (std::uint32_t k = 1; k < kFewSlots; ++k)
+      sum += load(k < slots.count ? slot + k * kSlotSize : kNoSlot);
+    for (std::uint32_t k = kFewSlots; k < slots.count; ++k) sum += load(slot + std::size_t{k} * kSlotSize);
+    out[i] = sum;
   }
   transpose(out);
 }
+
+constexpr std::int64_t kAhead = 2;  // groups between asking for memory and using it
 
 // Ask for a group's slots: they lie anywhere, by depth.
 XRGS_INLINE void prefetch_slots(const Frame& frame, const float* sums, std::int64_t group) {
   for (std::uint32_t left = frame.visible[static_cast<std::size_t>(group / 16)]; left != 0;
        left &= left - 1) {
     const Slots slots = frame.slots[static_cast<std::size_t>(group + __builtin_ctz(left))];
-    for (std::uint32_t k = 0; k < slots.count && k < 4; ++k)
+    for (std::uint32_t k = 0; k < slots.count && k < kFewSlots; ++k)
       prefetch(sums + (std::size_t{slots.first} + k) * kSlotSize);
   }
 }
@@ -163,6 +173,7 @@ struct Sixteen {
   int lanes;
   float buffer[64];
 
+  Sixteen(std::int64_t first, int count) : group(first), lanes(count) {}
   float* of(float* all, int width) { return lanes == 16 ? all + group * width : buffer; }
   void copy_out(float* all, int width) {
     if (lanes == 16) return;
@@ -191,13 +202,13 @@ XRGS_INLINE Vector3 color_backward(const Parameters& p, const View& view, const 
   Floats basis[kRest + 1], c[3 * kRest + 1];
   if constexpr (kRest > 0) {
     sh_basis<Degree>(d, basis);
-    load_columns<3 * kRest>(p.shN + group * p.rest * 3, p.rest * 3, visible, c);
+    load_columns<3 * kRest>(p.shN + group * p.rest * 3, p.rest * 3, rows_to_load(visible, lanes), c);
     for (int k = 0; k < kRest; ++k)
       color = add(color, basis[k], {c[3 * k], c[3 * k + 1], c[3 * k + 2]});
   }
   const Vector3 v{keep(zero <= color.x, sum[kWr]), keep(zero <= color.y, sum[kWg]),
                   keep(zero <= color.z, sum[kWb])};
-  Sixteen to{group, lanes, {}};
+  Sixteen to(group, lanes);
   store_triples(to.of(out.sh0, 3), splat(kC0) * v.x, splat(kC0) * v.y, splat(kC0) * v.z);
   to.copy_out(out.sh0, 3);
   Vector3 v_mean{zero, zero, zero};
@@ -234,7 +245,7 @@ void write_zeros(const Parameters& p, std::int64_t group, int lanes, const Gradi
 
 void write_shape(const ShapeGradient& v, Floats v_opacity, Floats v_x2d, Floats v_y2d, Mask visible,
                  std::int64_t group, int lanes, const Gradients& out) {
-  Sixteen to{group, lanes, {}};
+  Sixteen to(group, lanes);
   store_triples(to.of(out.means, 3), keep(visible, v.mean.x), keep(visible, v.mean.y),
                 keep(visible, v.mean.z));
   to.copy_out(out.means, 3);
@@ -280,7 +291,11 @@ void backward_degree(const Parameters& p, const Frame& frame, const float* sums,
   for (std::int64_t group = first; group < last; group += 16) {
     const int lanes = last - group < 16 ? static_cast<int>(last - group) : 16;
     const std::uint32_t visible = frame.visible[static_cast<std::size_t>(group / 16)];
-    if (group + 32 <= last) prefetch_slots(frame, sums, group + 16);
+    const std::int64_t ahead = group + 16 * kAhead;
+    if (ahead + 16 <= last && frame.visible[static_cast<std::size_t>(ahead / 16)] != 0) {
+      prefetch_slots(frame, sums, ahead);
+      if (Degree > 0) prefetch_harmonics(p, ahead);
+    }
     if (visible == 0)
       write_zeros(p, group, lanes, out);
     else

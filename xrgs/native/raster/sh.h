@@ -93,5 +93,17 @@ XRGS_INLINE void load_columns(const float* p, std::int64_t stride, std::uint32_t
   }
 }
 
+// Whose harmonics to load: where most of the sixteen are visible those of all, as a test of each one
+// would cost more than what it spares.
+XRGS_INLINE std::uint32_t rows_to_load(std::uint32_t visible, int lanes) {
+  return __builtin_popcount(visible) >= 8 ? (1u << lanes) - 1u : visible;
+}
+
+// Ask for the harmonics of the sixteen Gaussians from `group` on.
+XRGS_INLINE void prefetch_harmonics(const Parameters& p, std::int64_t group) {
+  const char* rows = reinterpret_cast<const char*>(p.shN + group * p.rest * 3);
+  for (int byte = 0; byte < 16 * p.rest * 3 * 4; byte += 64) prefetch(rows + byte);
+}
+
 }  // namespace XRGS_NS
 }  // namespace xrgs

@@ -1,0 +1,30 @@
+#include "memory.h"
+
+#include <cstdlib>
+
+#if defined(__linux__)
+#include <sys/mman.h>
+#endif
+
+namespace xrgs {
+namespace {
+
+constexpr std::size_t kLine = 64;
+[[maybe_unused]] constexpr std::size_t kHugePage = std::size_t{2} << 20;
+
+}  // namespace
+
+void* allocate(std::size_t bytes) noexcept {
+#if defined(__linux__) && defined(MADV_HUGEPAGE) && !defined(__SANITIZE_ADDRESS__)
+  if (bytes >= 2 * kHugePage) {
+    const std::size_t size = (bytes + kHugePage - 1) / kHugePage * kHugePage;
+    void* block = std::aligned_alloc(kHugePage, size);
+    // A wish: without huge pages the block is as good as any.
+    if (block != nullptr) (void)madvise(block, size, MADV_HUGEPAGE);
+    return block;
+  }
+#endif
+  return std::aligned_alloc(kLine, (bytes + kLine - 1) / kLine * kLine);
+}
+
+}  // namespace xrgs
