@@ -52,10 +52,12 @@ class Rendering:
         shape = (load.camera.height, load.camera.width, 3)
         self.slope = torch.randn(shape, generator=generator).to(dtype)  # of a loss, by the image
         self.render: Render | None = None
+        self.image: Tensor | None = None
+        self.work: dict[str, int] = {}
         self.stages: dict[str, float] = {}
 
     def forward(self) -> None:
-        """Keep the render for `backward`."""
+        """Render, for one `backward`."""
         means, quats, scales, opacities, sh0, rest = self.leaves
         with threads(self.threads):
             self.render = rasterize(
@@ -72,11 +74,18 @@ class Rendering:
             )
 
     def backward(self) -> tuple[Tensor, ...]:
-        """Gradients of the six parameters, of the last render."""
-        assert self.render is not None, "render first"  # noqa: S101 - a mistake of ours
-        graph: Any = self.render.image.grad_fn
+        """Gradients of the six parameters, of the last render, which is then let go."""
+        render, self.render = self.render, None
+        assert render is not None, "render first"  # noqa: S101 - a mistake of ours
+        graph: Any = render.image.grad_fn
         with threads(self.threads):
-            gradients = torch.autograd.grad(self.render.image, self.leaves, self.slope)
+            gradients = torch.autograd.grad(render.image, self.leaves, self.slope)
+        self.image = render.image.detach()
+        self.work = {
+            "visible": int(render.visible.sum()),
+            "evaluations": render.evaluations,
+            "buffer_bytes": render.buffer_bytes,
+        }
         if self.way.backend == "native":
             for stage, ms in graph.frame.timings.items():
                 self.stages[stage] = min(ms, self.stages.get(stage, ms))
@@ -131,8 +140,7 @@ def _time(
 
 
 def _row(load: Load, rendering: Rendering, forward: Times, backward: Times) -> dict[str, Any]:
-    render, stages = rendering.render, rendering.stages
-    assert render is not None, "render first"  # noqa: S101 - a mistake of ours
+    work, stages = rendering.work, rendering.stages
     model = sum(leaf.nbytes for leaf in rendering.leaves)
     compositing = stages.get("composite", forward.least)
     return {
@@ -141,7 +149,7 @@ def _row(load: Load, rendering: Rendering, forward: Times, backward: Times) -> d
         "backend": rendering.way.backend,
         "threads": rendering.threads,
         "gaussians": len(load),
-        "visible": int(render.visible.sum()),
+        "visible": work["visible"],
         "width": load.camera.width,
         "height": load.camera.height,
         "forward_ms": forward.least,
@@ -149,9 +157,9 @@ def _row(load: Load, rendering: Rendering, forward: Times, backward: Times) -> d
         "forward_median_ms": forward.median,
         "backward_median_ms": backward.median,
         "stages_ms": dict(stages),
-        "evaluations": render.evaluations,
-        "evaluations_per_s": 1e3 * render.evaluations / compositing,
-        "memory_bytes": 2 * model + render.buffer_bytes,  # 2: parameters and gradients
+        "evaluations": work["evaluations"],
+        "evaluations_per_s": 1e3 * work["evaluations"] / compositing,
+        "memory_bytes": 2 * model + work["buffer_bytes"],  # 2: parameters and gradients
     }
 
 
@@ -184,8 +192,8 @@ def errors(load: Load, chosen: Sequence[Way]) -> dict[str, dict[str, float]]:
 
 
 def _image(rendering: Rendering) -> Tensor:
-    assert rendering.render is not None, "render first"  # noqa: S101 - a mistake of ours
-    return rendering.render.image.detach()
+    assert rendering.image is not None, "render first"  # noqa: S101 - a mistake of ours
+    return rendering.image
 
 
 def _relative(value: Tensor, exact: Tensor) -> float:
@@ -207,7 +215,6 @@ def time_views(load: Load, backend: str, counts: Sequence[int], repeats: int) ->
         for rendering in renderings[:count]:
             rendering.forward()
             rendering.backward()
-            rendering.render = None
 
     times = alternate({str(count): partial(walk, count) for count in counts}, repeats)
     return [{"views": count, "ms": times[str(count)].least} for count in counts]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import resource
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -10,6 +11,7 @@ import numpy as np
 
 from xrgs import provenance
 from xrgs.bench import loads, rendering, tables, training
+from xrgs.dataset import progress
 from xrgs.errors import XrgsError
 from xrgs.machine import usable_cores
 from xrgs.splat.backend import resolve_backend
@@ -66,6 +68,7 @@ def run(settings: Settings) -> str:
         ]
         found |= _time_loads(chosen, settings, counts, backends)
         found |= _time_training(grid, settings, counts, backends)
+    found["peak_rss_bytes"] = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
     _write(found, settings)
     return tables.text(found)
 
@@ -96,7 +99,7 @@ def _time_loads(
 ) -> dict[str, Any]:
     ways = rendering.ways(backends)
     rows: list[Row] = []
-    for load in chosen:
+    for load in progress(chosen, "rendering", "load", len(chosen)):
         error = rendering.errors(load, ways)
         timed = rendering.time_load(load, ways, counts, settings.repeats)
         rows += [row | {"error": error[row["way"]]} for row in timed]
