@@ -78,4 +78,3 @@ class DensifySettings:
             every=max(1, int(self.every * factor)),
             reset_every=max(1, int(self.reset_every * factor)),
         )
-
