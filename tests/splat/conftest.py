@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib.util
 from collections.abc import Callable, Iterator
 
 import pytest
@@ -80,3 +81,31 @@ def make_scene() -> Callable[..., Scene]:
         return {name: value.to(dtype) for name, value in scene.items()}
 
     return make
+
+
+def _isas() -> list[str]:
+    """The instruction sets that the compiled backend can use on this machine."""
+    if importlib.util.find_spec("xrgs._native") is None:
+        return []
+    from xrgs import _native
+
+    return list(_native.available_isas())
+
+
+@pytest.fixture(params=_isas())
+def isa(request: pytest.FixtureRequest) -> Iterator[str]:
+    """Each instruction set that this machine has."""
+    from xrgs import _native
+
+    before = _native.isa()
+    _native.set_isa(request.param)
+    yield request.param
+    _native.set_isa(before)
+
+
+@pytest.fixture
+def threads() -> Iterator[None]:
+    """Puts torch's thread count back."""
+    before = torch.get_num_threads()
+    yield
+    torch.set_num_threads(before)

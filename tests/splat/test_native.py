@@ -12,7 +12,6 @@ import os
 import signal
 import subprocess
 import sys
-from collections.abc import Iterator
 from dataclasses import replace
 
 import numpy as np
@@ -33,23 +32,6 @@ GRADIENT_FACTOR = 5.0
 """Gradients may err by this much more than torch's own float32 (norms over all Gaussians)."""
 GRADIENT_FLOOR = 2e-6
 """Of a gradient's norm: below this an error is rounding, whoever makes it."""
-
-
-@pytest.fixture(params=native.available_isas())
-def isa(request: pytest.FixtureRequest) -> Iterator[str]:
-    """Each instruction set that this machine has."""
-    before = native.isa()
-    native.set_isa(request.param)
-    yield request.param
-    native.set_isa(before)
-
-
-@pytest.fixture
-def threads() -> Iterator[None]:
-    """Puts torch's thread count back."""
-    before = torch.get_num_threads()
-    yield
-    torch.set_num_threads(before)
 
 
 def rounded(camera):

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-
 import pytest
 import torch
 from hypothesis import given, settings
@@ -26,23 +24,6 @@ SHAPES = {
 }
 MOMENTS = ("exp_avg", "exp_avg_sq")
 ULP = 2.0**-23
-
-
-@pytest.fixture(params=native.available_isas())
-def isa(request: pytest.FixtureRequest) -> Iterator[str]:
-    """Each instruction set that this machine has."""
-    before = native.isa()
-    native.set_isa(request.param)
-    yield request.param
-    native.set_isa(before)
-
-
-@pytest.fixture
-def threads() -> Iterator[None]:
-    """Puts torch's thread count back."""
-    before = torch.get_num_threads()
-    yield
-    torch.set_num_threads(before)
 
 
 def values(count: int, seed: int, size: float = 1.0) -> dict[str, Tensor]:

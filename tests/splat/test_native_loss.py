@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
 
 import pytest
 import torch
@@ -17,23 +16,6 @@ from xrgs.splat.loss import photometric_loss, prepare_target
 native = pytest.importorskip("xrgs._native")
 
 WEIGHTS = {"l1": 0.8, "ssim": 0.2}
-
-
-@pytest.fixture(params=native.available_isas())
-def isa(request: pytest.FixtureRequest) -> Iterator[str]:
-    """Each instruction set that this machine has."""
-    before = native.isa()
-    native.set_isa(request.param)
-    yield request.param
-    native.set_isa(before)
-
-
-@pytest.fixture
-def threads() -> Iterator[None]:
-    """Puts torch's thread count back."""
-    before = torch.get_num_threads()
-    yield
-    torch.set_num_threads(before)
 
 
 def pair(height: int, width: int, seed: int = 0) -> tuple[Tensor, Tensor]:
