@@ -104,6 +104,6 @@ def test_planning_and_reporting_run_without_torch(module: str) -> None:
     heavy = {"torch", "pycolmap", "kornia", "skimage"}
     script = f"import sys, {module}; print(sorted({heavy!r} & set(sys.modules)))"
     done = subprocess.run(
-        [sys.executable, "-c", script], capture_output=True, text=True, check=True
+        [sys.executable, "-P", "-c", script], capture_output=True, text=True, check=True
     )
     assert done.stdout.strip() == "[]"

@@ -165,6 +165,22 @@ def test_a_scene_that_fails_does_not_take_the_sweep_with_it(store: Path) -> None
     assert "Training time" in out  # the other scene's table
 
 
+def test_the_child_imports_what_its_parent_did_and_not_the_folder_it_stands_in(
+    tmp_path: Path,
+) -> None:
+    (tmp_path / "xrgs").mkdir()
+    (tmp_path / "xrgs" / "__init__.py").write_text("raise ImportError('the wrong package')")
+    script = "import sys; sys.path.remove(''); from xrgs.cli import sweep; sweep()"
+    done = subprocess.run(
+        [sys.executable, "-c", script, *SMOKE, "train.steps=2", "store=s"],
+        cwd=tmp_path,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
+
+
 def test_a_dry_run_plans_without_torch_and_writes_nothing(tmp_path: Path) -> None:
     (tmp_path / "torch.py").write_text("raise ImportError('torch was imported')")
     path = os.pathsep.join([str(tmp_path), os.environ.get("PYTHONPATH", "")])

@@ -21,6 +21,7 @@ from xrgs.config import to_conf
 from xrgs.errors import XrgsError
 from xrgs.hashing import digest
 from xrgs.identity import cell_identity
+from xrgs.splat.backend import resolve_backend
 from xrgs.store import State, Store
 
 if TYPE_CHECKING:
@@ -262,6 +263,8 @@ def run_job(cfg: DictConfig) -> str:
     found = variant.find(store.variants, variant.key(conf.scene, conf.variant))
     if found is None:
         raise XrgsError(f"{scenes.label(conf.scene)}: its variant is gone from {store.variants}")
+    # Named, so that the child can't choose another one than the identity says.
+    conf.splat.backend = resolve_backend(conf.splat.backend)
     identity = cell_identity(conf, found.id)
     folder = store.cell(digest(identity))
     folder.begin(asdict(conf), identity)

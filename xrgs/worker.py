@@ -39,7 +39,9 @@ def run(job: str, request: Mapping[str, Any]) -> dict[str, Any]:
     with tempfile.TemporaryDirectory(prefix="xrgs-") as folder:
         request_file, answer_file = Path(folder) / "request.json", Path(folder) / "answer.json"
         write_json(request_file, dict(request))
-        command = [sys.executable, "-m", "xrgs.worker", job, str(request_file), str(answer_file)]
+        # -P: run from a checkout, the child must import the installed package as its parent does.
+        child = [sys.executable, "-P", "-m", "xrgs.worker"]
+        command = [*child, job, str(request_file), str(answer_file)]
         code = subprocess.run(command, check=False).returncode  # noqa: S603
         if not answer_file.exists():
             raise WorkerError(_death(code))
