@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 
 #: Okabe and Ito's orange and blue: told apart by colour-blind readers and in grey.
 _ABLATION, _BASELINE, _FRAME = "#D55E00", "#0072B2", "#FFD400"
-_DPI = 150
+_DPI = 130
 _PANEL = 3.4  # inches
 _ZOOM = 5
 
