@@ -64,7 +64,7 @@ def from_points(
     sh_degree: int,
     generator: torch.Generator,
 ) -> Gaussians:
-    """Gaussians on SfM points, as gsplat's `simple_trainer.py` starts (METHOD.md, baseline).
+    """Gaussians on SfM points, as gsplat's `simple_trainer.py` starts.
 
     Isotropic, as large as the RMS distance to the three nearest neighbours; random quaternions;
     band 0 shows the point's colour, the rest is 0.

@@ -1,8 +1,7 @@
 """Gaussians in space to ellipses on the image plane, and which of them are seen.
 
 Elliptical weighted averaging as in gsplat 1.5's `_torch_impl.py`. The one difference is that the
-determinant and the quadratic form are written so that nothing cancels in float32 (RASTERIZER.md,
-numerical cases).
+determinant and the quadratic form are written so that nothing cancels in float32.
 """
 
 from __future__ import annotations
