@@ -113,7 +113,7 @@ def test_each_is_on_alone() -> None:
 
 def test_training_needs_no_hydra() -> None:
     code = "import sys, xrgs.components; sys.exit('hydra' in sys.modules)"
-    run = subprocess.run([sys.executable, "-c", code], check=False)
+    run = subprocess.run([sys.executable, "-P", "-c", code], check=False)
     assert run.returncode == 0
 
 

@@ -166,5 +166,5 @@ def test_the_examples_in_the_docstrings() -> None:
 
 def test_plans_and_reports_need_no_torch() -> None:
     code = "import sys, xrgs.metrics; sys.exit(bool({'torch', 'kornia'} & set(sys.modules)))"
-    run = subprocess.run([sys.executable, "-c", code], check=False)
+    run = subprocess.run([sys.executable, "-P", "-c", code], check=False)
     assert run.returncode == 0

@@ -198,6 +198,6 @@ def test_fingerprints_need_neither_torch_nor_scikit_image() -> None:
         "print(sorted({'torch', 'skimage', 'pycolmap'} & set(sys.modules)))"
     )
     done = subprocess.run(
-        [sys.executable, "-c", script], capture_output=True, text=True, check=True
+        [sys.executable, "-P", "-c", script], capture_output=True, text=True, check=True
     )
     assert done.stdout.strip() == "[]"

@@ -16,17 +16,15 @@ from xrgs.splat.settings import RasterSettings
 from xrgs.train import endless
 
 
-def camera(width: int, height: int, shift: float) -> Camera:
-    viewmat = torch.eye(4)
-    viewmat[0, 3] = shift
+def camera(width: int, height: int) -> Camera:
     focal = 1.2 * width
     K = torch.tensor([[focal, 0.0, width / 2], [0.0, focal, height / 2], [0.0, 0.0, 1.0]])
-    return Camera(viewmat, K, width, height)
+    return Camera(torch.eye(4), K, width, height)
 
 
 @pytest.fixture
 def data() -> Dataset:
-    """Four views, two of them LR, of a smooth picture; 60 points in front."""
+    """Four views, two of them LR, of one smooth picture; 60 points in front."""
     generator = torch.Generator().manual_seed(3)
     points = torch.rand(60, 3, generator=generator) - 0.5 + torch.tensor([0.0, 0.0, 2.0])
     views = []
@@ -35,7 +33,7 @@ def data() -> Dataset:
     ):
         ramp = torch.linspace(0, 1, width).expand(height, width)
         image = torch.stack([ramp, ramp.flip(1), torch.full_like(ramp, 0.5)], dim=-1)
-        views.append(LoadedView(f"v{number}", tag, camera(width, height, 0.1 * number), image))
+        views.append(LoadedView(f"v{number}", tag, camera(width, height), image))
     colors = torch.rand(60, 3, generator=generator)
     return Dataset(tuple(views), tuple(views[:1]), points, colors, scene_scale=1.0, factor=5)
 
@@ -53,13 +51,13 @@ def test_the_same_seed_gives_the_same_bits_and_another_does_not(
 def test_training_lowers_the_loss_and_logs_what_densification_did(
     data: Dataset, baseline: Conf
 ) -> None:
-    baseline.train.steps = 120
+    baseline.train.steps = 80
     baseline.splat.densify.reset_every = 30_000  # a reset would lift the loss at the end
     trained = train.train(data, baseline)
     losses = [row["loss"] for row in trained.history]
     assert sum(losses[-8:]) < 0.7 * sum(losses[:8])
     last = trained.history[-1]
-    assert last["step"] == 119
+    assert last["step"] == 79
     grown = last["duplicated"] + last["split"]
     removed = last["pruned_opacity"] + last["pruned_scale"] + last["pruned_non_finite"]
     # The last refinement comes before the last logged step, so the ledger must balance.

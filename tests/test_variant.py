@@ -271,7 +271,7 @@ def test_two_processes_at_once_share_one_variant(store: Store) -> None:
         f"conf = {PAIR_CONF!r}; root = Path({str(store.root)!r});"
         f"print(variant.build({PAIR!r}, conf, root / 'variants', root / 'scenes').id)"
     )
-    run = [sys.executable, "-c", script]
+    run = [sys.executable, "-P", "-c", script]
     both = [subprocess.Popen(run, stdout=subprocess.PIPE, text=True) for _ in range(2)]
     ids = {process.communicate()[0].strip() for process in both}
     assert [process.returncode for process in both] == [0, 0]

@@ -190,7 +190,7 @@ def test_a_report_needs_no_torch(study: Any) -> None:
         "assert 'matplotlib.pyplot' not in sys.modules"
     )
     subprocess.run(
-        [sys.executable, "-W", "error", "-c", code, str(study.store.path)],
+        [sys.executable, "-P", "-W", "error", "-c", code, str(study.store.path)],
         check=True,
         env={"PYTHONPATH": str(Path(xrgs.__file__).parents[1])},
     )

@@ -479,7 +479,7 @@ except MemoryError as error:
 def test_lists_beyond_memory_are_a_clear_error():
     # 30,000 Gaussians over 10,000 tiles each: 300 million pairs.
     result = subprocess.run(
-        [sys.executable, "-c", CROWD], capture_output=True, text=True, timeout=60, check=False
+        [sys.executable, "-P", "-c", CROWD], capture_output=True, text=True, timeout=60, check=False
     )
     assert "the lists of 30000 visible Gaussians in 1600x1600 px do not fit" in result.stdout, (
         result.stderr
@@ -489,7 +489,7 @@ def test_lists_beyond_memory_are_a_clear_error():
 @pytest.mark.parametrize(("value", "says"), [("portable", "portable"), ("sse9", "XRGS_ISA")])
 def test_the_environment_chooses_the_instruction_set(value, says):
     result = subprocess.run(
-        [sys.executable, "-c", "from xrgs import _native; print(_native.isa())"],
+        [sys.executable, "-P", "-c", "from xrgs import _native; print(_native.isa())"],
         env=os.environ | {"XRGS_ISA": value},
         capture_output=True,
         text=True,
