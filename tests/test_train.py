@@ -48,18 +48,20 @@ def test_the_same_seed_gives_the_same_bits_and_another_does_not(
     assert not same(first.gaussians, other.gaussians)
 
 
-def test_training_lowers_the_loss_and_logs_what_densification_did(
-    data: Dataset, baseline: Conf
-) -> None:
+def test_training_lowers_the_loss(data: Dataset, baseline: Conf) -> None:
     baseline.train.steps = 80
-    baseline.splat.densify.reset_every = 30_000  # a reset would lift the loss at the end
+    baseline.splat.densify.stop = 0  # the optimizer alone
+    losses = [row["loss"] for row in train.train(data, baseline).history]
+    assert sum(losses[-8:]) < 0.5 * sum(losses[:8])
+
+
+def test_the_history_balances_what_densification_did(data: Dataset, baseline: Conf) -> None:
     trained = train.train(data, baseline)
-    losses = [row["loss"] for row in trained.history]
-    assert sum(losses[-8:]) < 0.7 * sum(losses[:8])
     last = trained.history[-1]
-    assert last["step"] == 79
+    assert last["step"] == baseline.train.steps - 1
     grown = last["duplicated"] + last["split"]
     removed = last["pruned_opacity"] + last["pruned_scale"] + last["pruned_non_finite"]
+    assert grown > 0
     # The last refinement comes before the last logged step, so the ledger must balance.
     assert last["gaussians"] == 60 + grown - removed == len(trained.gaussians)
     assert trained.evaluations > 0
