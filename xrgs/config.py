@@ -1,4 +1,4 @@
-"""The schema of an experiment: every field, its type and its default-less meaning.
+"""The schema of an experiment: every field, its type and its meaning.
 
 The values live in `conf/`: `conf/config.yaml` is the baseline with every component present and off.
 The model's own fields are in `xrgs.splat.settings`, which knows nothing of experiments.
@@ -14,6 +14,7 @@ from hydra.core.config_store import ConfigStore
 from omegaconf import MISSING, DictConfig, OmegaConf
 
 from xrgs.errors import XrgsError
+from xrgs.splat.backend import CHOICES
 from xrgs.splat.settings import DensifySettings, OptimizerSettings, RasterSettings
 
 _HERE = Path(__file__).parent
@@ -169,6 +170,8 @@ def to_conf(cfg: DictConfig) -> Conf:
     for key, value, least in (("train.steps", conf.train.steps, 1), ("threads", conf.threads, 0)):
         if value < least:
             raise XrgsError(f"{key}={value}: must be at least {least}")
+    if conf.splat.backend not in CHOICES:
+        raise XrgsError(f"splat.backend={conf.splat.backend}: must be one of {', '.join(CHOICES)}")
     return conf
 
 
