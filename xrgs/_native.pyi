@@ -26,6 +26,15 @@ def adam(
     eps: float,
     threads: int,
 ) -> None: ...
+def resample(
+    image: Tensor,
+    row_first: Tensor,
+    row_weights: Tensor,
+    column_first: Tensor,
+    column_weights: Tensor,
+    scale: float,
+    threads: int,
+) -> Tensor: ...
 def multiply_adds_per_second(threads: int) -> float: ...
 
 class View:

@@ -9,15 +9,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from functools import cache
 from typing import TYPE_CHECKING, Protocol
 
-import torch
 from torch import Tensor
-from torch.nn.functional import interpolate
 
 from xrgs.errors import XrgsError
 from xrgs.splat.loss import WINDOW, Target, photometric_loss, prepare_target
+from xrgs.splat.resample import resize
 
 if TYPE_CHECKING:  # xrgs.config loads Hydra, which training does without
     from xrgs.config import ComponentsConf, ConsistencyConf, GradientScalingConf, LossWeightingConf
@@ -183,7 +181,8 @@ class Consistency(Component):
         """`loss` and the view's consistency."""
         if view.tag == "HR" or self.lr_mode == "exact":
             pair = self.pairs[view.name]
-            projected = resize(image, pair.image.shape[0], pair.image.shape[1])
+            height, width = pair.image.shape[:2]
+            projected = resize(image, height, width, backend=self.backend)
             consistency = photometric_loss(
                 projected, pair, l1=self.l1, ssim=self.ssim, backend=self.backend
             )
@@ -191,24 +190,6 @@ class Consistency(Component):
         if self.lr_mode == "fold":
             return loss + self.weight * self.l1 * (image - view.image).abs().mean()
         return loss
-
-
-def resize(image: Tensor, height: int, width: int) -> Tensor:
-    """The phi of paper 5.6: [H, W, 3] to [height, width, 3], antialiased bicubic, unclamped.
-
-    torch's `interpolate(mode="bicubic", antialias=True)` to rounding, written as the two matrices
-    that it is: forward and backward take a quarter of its time.
-    """
-    rows = _kernel(image.shape[0], height, image.dtype)
-    columns = _kernel(image.shape[1], width, image.dtype)
-    return torch.einsum("ih,hwc,jw->ijc", rows, image, columns)
-
-
-@cache
-def _kernel(old: int, new: int, dtype: torch.dtype) -> Tensor:
-    """[new, old]: what each of `new` samples takes from each of `old`."""
-    identity = torch.eye(old, dtype=dtype)[None, None]  # [1, 1, old, old]
-    return interpolate(identity, size=(new, old), mode="bicubic", antialias=True)[0, 0]
 
 
 def _pair(view: TrainingView, factor: int) -> Target:

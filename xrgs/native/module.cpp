@@ -10,6 +10,7 @@
 #include "loss/bind.h"
 #include "optim/bind.h"
 #include "raster/bind.h"
+#include "resample/bind.h"
 #include "vector_math_kernels.h"
 
 namespace nb = nanobind;
@@ -46,5 +47,6 @@ NB_MODULE(_native, m) {
   bind_raster(m);
   bind_loss(m);
   bind_optim(m);
+  bind_resample(m);
   bind_bench(m);
 }

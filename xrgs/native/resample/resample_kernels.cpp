@@ -1,0 +1,102 @@
+// Down the rows a vector is sixteen floats of a row as they lie. Across the columns it is the same
+// float of sixteen rows: a tap then weighs whole vectors, whatever the distance between taps.
+#include "resample/resample.h"
+#include "simd.h"
+
+namespace xrgs {
+namespace XRGS_NS {
+namespace {
+
+constexpr int kStep = 3;    // floats of a pixel
+constexpr int kUnroll = 4;  // vectors of a row that share a weight
+
+template <int Count>
+XRGS_INLINE void down_vectors(const float* weights, int taps, float scale, const float* in,
+                              std::size_t columns, int lanes, float* out) {
+  Floats sum[Count];
+  for (Floats& s : sum) s = splat(0.0f);
+  for (int tap = 0; tap < taps; ++tap) {
+    const Floats weight = splat(weights[tap] * scale);
+    const float* row = in + tap * columns;
+    for (int i = 0; i < Count; ++i) {
+      const Floats value = lanes == kLanes ? load(row + i * kLanes) : load_first(row, lanes);
+      sum[i] = fma(weight, value, sum[i]);
+    }
+  }
+  for (int i = 0; i < Count; ++i)
+    if (lanes == kLanes)
+      store(out + i * kLanes, sum[i]);
+    else
+      store_first(out, sum[i], lanes);
+}
+
+void down(const Bands& rows, float scale, const float* in, std::size_t columns, int first,
+          int last, float* out) {
+  constexpr std::size_t wide = kUnroll * kLanes;
+  for (int y = first; y < last; ++y) {
+    const float* weights = rows.weights + static_cast<std::size_t>(y) * rows.taps;
+    const float* from = in + rows.first[y] * columns;
+    float* to = out + y * columns;
+    std::size_t c = 0;
+    for (; c + wide <= columns; c += wide)
+      down_vectors<kUnroll>(weights, rows.taps, scale, from + c, columns, kLanes, to + c);
+    for (; c < columns; c += kLanes) {
+      const int lanes = columns - c < kLanes ? static_cast<int>(columns - c) : kLanes;
+      down_vectors<1>(weights, rows.taps, scale, from + c, columns, lanes, to + c);
+    }
+  }
+}
+
+std::size_t scratch(int width) {
+  const std::size_t floats = static_cast<std::size_t>(kStep) * width;
+  return (floats + kLanes - 1) / kLanes * kLanes * kLanes;
+}
+
+void across(const Bands& columns, const float* in, int width, int rows, float* out,
+            float* turned) {
+  const int in_floats = kStep * width, out_floats = kStep * columns.count;
+  for (int c = 0; c < in_floats; c += kLanes) {
+    const int lanes = in_floats - c < kLanes ? in_floats - c : kLanes;
+    Floats block[kLanes];
+    for (int row = 0; row < kLanes; ++row) {
+      const float* at = in + static_cast<std::size_t>(row) * in_floats + c;
+      block[row] = row >= rows ? splat(0.0f) : lanes == kLanes ? load(at) : load_first(at, lanes);
+    }
+    transpose(block);
+    for (int i = 0; i < kLanes; ++i) store(turned + (c + i) * kLanes, block[i]);
+  }
+  // Sixteen pixels are three vectors of each row.
+  for (int x = 0; x < columns.count; x += kLanes) {
+    Floats block[kStep][kLanes];
+    for (int i = 0; i < kLanes; ++i) {
+      Floats sum[kStep] = {splat(0.0f), splat(0.0f), splat(0.0f)};
+      const int taps = x + i < columns.count ? columns.taps : 0;
+      const float* weights = columns.weights + static_cast<std::size_t>(x + i) * columns.taps;
+      const float* from = taps == 0 ? turned : turned + kStep * kLanes * columns.first[x + i];
+      for (int tap = 0; tap < taps; ++tap) {
+        const Floats weight = splat(weights[tap]);
+        for (int k = 0; k < kStep; ++k)
+          sum[k] = fma(weight, load(from + (kStep * tap + k) * kLanes), sum[k]);
+      }
+      for (int k = 0; k < kStep; ++k) {
+        const int place = kStep * i + k;
+        block[place / kLanes][place % kLanes] = sum[k];
+      }
+    }
+    for (int part = 0; part < kStep; ++part) {
+      const int c = kStep * x + part * kLanes;
+      if (c >= out_floats) break;
+      const int lanes = out_floats - c < kLanes ? out_floats - c : kLanes;
+      transpose(block[part]);
+      for (int row = 0; row < rows; ++row)
+        store_first(out + static_cast<std::size_t>(row) * out_floats + c, block[part][row], lanes);
+    }
+  }
+}
+
+}  // namespace
+
+extern const ResampleKernels resample_kernels{down, across, scratch};
+
+}  // namespace XRGS_NS
+}  // namespace xrgs
