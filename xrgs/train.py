@@ -11,7 +11,9 @@ from typing import TYPE_CHECKING, Any
 import torch
 
 from xrgs import components
+from xrgs.components import Step
 from xrgs.dataset import progress
+from xrgs.errors import XrgsError
 from xrgs.hashing import digest
 from xrgs.splat import gaussians as splats
 from xrgs.splat.backend import resolve_backend
@@ -22,7 +24,7 @@ from xrgs.splat.rasterize import rasterize
 from xrgs.splat.settings import NOMINAL_STEPS
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Callable, Iterator
 
     from xrgs.config import Conf
     from xrgs.dataset import Dataset, LoadedView
@@ -79,28 +81,34 @@ def train(data: Dataset, conf: Conf) -> Trained:
     ledger = _Ledger(steps)
 
     start = time.perf_counter()
-    for step, view in progress(endless(data.train, conf.seed, steps), "training", "step", steps):
-        camera = view.camera
+    parts.refined(gaussians)
+    drawn = endless(data.train, conf.seed, steps, parts.trains_on)
+    for step in progress(drawn, "training", "step", steps):
+        view, camera = step.view, step.view.camera
         offset = torch.zeros(len(gaussians), 2, requires_grad=True)
         render = rasterize(
-            *gaussians.activated(),
+            *parts.activated(gaussians.activated(), step),
             camera,
             splat.raster,
-            sh_degree=min(step // sh_every, splat.raster.sh_degree),
+            sh_degree=min(step.number // sh_every, splat.raster.sh_degree),
             means2d_offset=offset,
             backend=backend,
         )
         loss = photometric_loss(render.image, targets[view.name], **weights, backend=backend)
-        loss = parts.loss(loss, render.image, view)
+        loss = parts.loss(loss, render.image, step)
         optimizer.zero_grad()
         torch.autograd.backward(loss)
-        parts.after_backward(view, gaussians)
-        ledger.note(step, view, loss, render, optimizer)
+        parts.after_backward(gaussians, step)
+        ledger.note(step, loss, render, optimizer)
         optimizer.step()
+        statistic = None if offset.grad is None else parts.statistic(offset.grad, step)
         done = densifier.after_step(
-            step, offset.grad, render.visible, width=camera.width, height=camera.height
+            step.number, statistic, render.visible, width=camera.width, height=camera.height
         )
         ledger.refined(done)
+        if done != Refinement():
+            parts.refined(gaussians)
+    parts.finish(gaussians)
     return ledger.close(gaussians, time.perf_counter() - start)
 
 
@@ -110,15 +118,26 @@ def stream(seed: int, axis: str) -> torch.Generator:
 
 
 def endless(
-    views: tuple[LoadedView, ...], seed: int, steps: int
-) -> Iterator[tuple[int, LoadedView]]:
-    """`steps` times (step, view): all views in a new order each time round."""
+    views: tuple[LoadedView, ...], seed: int, steps: int, trains_on: Callable[[Step], bool]
+) -> Iterator[Step]:
+    """`steps` steps, each time round all views in a new order.
+
+    A view that `trains_on` refuses is passed over; one that it newly allows joins the next round.
+
+    Raises:
+        XrgsError: it refuses every view.
+    """
     generator = stream(seed, "views")
-    order: list[int] = []
-    for step in range(steps):
+    order: list[LoadedView] = []
+    for number in range(steps):
+        while order and not trains_on(Step(number, steps, order[-1])):
+            order.pop()
         if not order:
-            order = torch.randperm(len(views), generator=generator).tolist()
-        yield step, views[order.pop()]
+            allowed = [view for view in views if trains_on(Step(number, steps, view))]
+            if not allowed:
+                raise XrgsError(f"step {number}: the components leave no view to train on")
+            order = [allowed[i] for i in torch.randperm(len(allowed), generator=generator).tolist()]
+        yield Step(number, steps, order.pop())
 
 
 class _Ledger:
@@ -134,8 +153,7 @@ class _Ledger:
 
     def note(
         self,
-        step: int,
-        view: LoadedView,
+        step: Step,
         loss: torch.Tensor,
         render: Render,
         optimizer: SplatOptimizer,
@@ -145,8 +163,8 @@ class _Ledger:
         used = 2 * model + optimizer.state_bytes() + render.buffer_bytes  # 2: and its gradients
         self.memory_bytes = max(self.memory_bytes, used)
         self.evaluations += render.evaluations
-        if step % self.every == 0 or step == self.last:
-            row = {"step": step, "view": view.name, "loss": loss.item()}
+        if step.number % self.every == 0 or step.number == self.last:
+            row = {"step": step.number, "view": step.view.name, "loss": loss.item()}
             self.history.append(row | {"gaussians": len(gaussians)} | self.counts)
 
     def refined(self, done: Refinement) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -17,6 +18,17 @@ PARAMETERS = ("means", "quats", "scales", "opacities", "sh0", "shN")
 
 MIN_SPACING = 1e-7
 """World units; the smallest initial scale, for points that lie on one another (log 0 else)."""
+
+
+class Activated(NamedTuple):
+    """What `rasterize` takes: the Gaussians in their natural units, in `PARAMETERS`' order."""
+
+    means: Tensor  # [N, 3] world units
+    quats: Tensor  # [N, 4] wxyz, any length
+    scales: Tensor  # [N, 3] world units
+    opacities: Tensor  # [N] 0..1
+    sh0: Tensor  # [N, 1, 3]
+    shN: Tensor  # [N, K - 1, 3]  # noqa: N815 - the field's name
 
 
 @dataclass
@@ -44,9 +56,9 @@ class Gaussians:
             raise KeyError(name)
         setattr(self, name, value)
 
-    def activated(self) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]:
-        """What `rasterize` takes: scales in world units, opacities in 0..1, the rest as it is."""
-        return (
+    def activated(self) -> Activated:
+        """Scales in world units, opacities in 0..1, the rest as it is."""
+        return Activated(
             self.means,
             self.quats,
             torch.exp(self.scales),

@@ -1,0 +1,140 @@
+"""What a component of XR-GS is: the hooks by which training calls it, in the order of a step."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Protocol
+
+from xrgs.errors import XrgsError
+from xrgs.splat.settings import NOMINAL_STEPS
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+    from xrgs.splat.cameras import Camera
+    from xrgs.splat.gaussians import Activated, Gaussians
+
+
+class TrainingView(Protocol):
+    """What a component may know of a view."""
+
+    @property
+    def name(self) -> str:
+        """Its photograph's, unique among the views."""
+
+    @property
+    def tag(self) -> str:
+        """`HR` or `LR`."""
+
+    @property
+    def camera(self) -> Camera:
+        """In the normalised world."""
+
+    @property
+    def image(self) -> Tensor:
+        """The photograph [H, W, 3] at the size it is rendered at."""
+
+
+@dataclass(frozen=True)
+class Step:
+    """One step of training: where it is in the run, and the view it is of."""
+
+    number: int
+    """From 0."""
+    of: int
+    """Steps of the whole run."""
+    view: TrainingView
+
+    @property
+    def nominal(self) -> float:
+        """Where it would be in a run of 30,000 steps, for which schedules are written."""
+        return self.number * NOMINAL_STEPS / self.of
+
+
+class Component:
+    """One change to training. Each hook is the identity until a component overrides it."""
+
+    def trains_on(self, step: Step) -> bool:
+        """Whether the view may be drawn at that step."""
+        del step
+        return True
+
+    def activated(self, activated: Activated, step: Step) -> Activated:
+        """The Gaussians to render in place of those given, differentiable in them."""
+        del step
+        return activated
+
+    def loss(self, loss: Tensor, image: Tensor, step: Step) -> Tensor:
+        """The loss to go on with, before backward.
+
+        Args:
+            loss: Scalar, what the components before this one made of the photometric loss.
+            image: [H, W, 3] render of the view, unclamped.
+            step: With its view.
+        """
+        del image, step
+        return loss
+
+    def after_backward(self, gaussians: Gaussians, step: Step) -> None:
+        """Change the parameters' gradients in place, before the optimizer reads them."""
+
+    def statistic(self, gradient: Tensor, step: Step) -> Tensor:
+        """The image-plane gradient [N, 2] that densification is to read, in place of that given."""
+        del step
+        return gradient
+
+    def refined(self, gaussians: Gaussians) -> None:
+        """Gaussians came or went, or training begins."""
+
+    def finish(self, gaussians: Gaussians) -> None:
+        """Training is over: make the Gaussians, in place, those that are to be shown and kept."""
+
+
+class Components(tuple[Component, ...]):
+    """The components that are on, in the order that their hooks run; none is the baseline."""
+
+    __slots__ = ()
+
+    def trains_on(self, step: Step) -> bool:
+        """Whether all of them allow the step's view."""
+        return all(component.trains_on(step) for component in self)
+
+    def activated(self, activated: Activated, step: Step) -> Activated:
+        """`Component.activated` of each in turn."""
+        for component in self:
+            activated = component.activated(activated, step)
+        return activated
+
+    def loss(self, loss: Tensor, image: Tensor, step: Step) -> Tensor:
+        """`Component.loss` of each in turn; the very `loss` given where none is on."""
+        for component in self:
+            loss = component.loss(loss, image, step)
+        return loss
+
+    def after_backward(self, gaussians: Gaussians, step: Step) -> None:
+        """`Component.after_backward` of each in turn."""
+        for component in self:
+            component.after_backward(gaussians, step)
+
+    def statistic(self, gradient: Tensor, step: Step) -> Tensor:
+        """`Component.statistic` of each in turn."""
+        for component in self:
+            gradient = component.statistic(gradient, step)
+        return gradient
+
+    def refined(self, gaussians: Gaussians) -> None:
+        """`Component.refined` of each in turn."""
+        for component in self:
+            component.refined(gaussians)
+
+    def finish(self, gaussians: Gaussians) -> None:
+        """`Component.finish` of each in turn."""
+        for component in self:
+            component.finish(gaussians)
+
+
+def not_negative(key: str, value: float) -> None:
+    """Raise `XrgsError`, naming the key, unless its value is finite and 0 or more."""
+    if not (math.isfinite(value) and value >= 0):
+        raise XrgsError(f"{key}={value}: must be a finite number, 0 or more")
