@@ -80,7 +80,7 @@ def test_a_changed_file_of_thetraining_code_is_another_cell(
 ) -> None:
     before = cell_id(baseline)
     names = set(cell_identity(baseline, "v")["code"])
-    assert {"train.py", "components.py", "metrics.py", "splat/densify.py"} <= names
+    assert {"train.py", "components/base.py", "metrics.py", "splat/densify.py"} <= names
     assert "report/tables.py" not in names
     assert not any(name.startswith("native/") for name in names)
     assert "native/simd.h" in identity.training_code("native")

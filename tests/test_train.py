@@ -3,15 +3,18 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Callable
 
 import pytest
 import torch
 
 from xrgs import components, train
+from xrgs.components import Step
 from xrgs.config import Conf
 from xrgs.dataset import Dataset, LoadedView
+from xrgs.errors import XrgsError
 from xrgs.splat.cameras import Camera
-from xrgs.splat.gaussians import PARAMETERS, Gaussians
+from xrgs.splat.gaussians import PARAMETERS, Activated, Gaussians
 from xrgs.splat.settings import RasterSettings
 from xrgs.train import endless
 
@@ -69,20 +72,77 @@ def test_the_history_balances_what_densification_did(data: Dataset, baseline: Co
     assert trained.memory_bytes > 4 * model  # parameters, gradients, two moments, and buffers
 
 
-def test_the_baseline_is_the_program_without_component_code(
+def test_components_that_change_nothing_change_no_bit(
     data: Dataset, baseline: Conf, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    with_code = train.train(data, baseline)
+    plain = train.train(data, baseline)
+    idle = components.Components([components.Component()])
+    monkeypatch.setattr(components, "build", lambda *_: idle)
+    assert same(plain.gaussians, train.train(data, baseline).gaussians)
 
-    class Nothing:
-        def loss(self, loss: torch.Tensor, *_: object) -> torch.Tensor:
-            return loss
 
-        def after_backward(self, *_: object) -> None:
-            return None
+class Recorder(components.Component):
+    """Writes down which hook was called, at which step, over how many Gaussians."""
 
-    monkeypatch.setattr(components, "build", lambda *_: Nothing())
-    assert same(with_code.gaussians, train.train(data, baseline).gaussians)
+    def __init__(self) -> None:
+        self.calls: list[tuple[str, int | None]] = []
+        self.sizes: list[int] = []
+
+    def activated(self, activated: Activated, step: Step) -> Activated:
+        self.calls.append(("activated", step.number))
+        assert len(activated.means) == self.sizes[-1]
+        return activated
+
+    def loss(self, loss: torch.Tensor, image: torch.Tensor, step: Step) -> torch.Tensor:
+        self.calls.append(("loss", step.number))
+        assert image.shape == step.view.image.shape
+        return loss
+
+    def after_backward(self, gaussians: Gaussians, step: Step) -> None:
+        self.calls.append(("after_backward", step.number))
+        assert gaussians.scales.grad is not None
+
+    def statistic(self, gradient: torch.Tensor, step: Step) -> torch.Tensor:
+        self.calls.append(("statistic", step.number))
+        assert len(gradient) == self.sizes[-1]
+        return gradient
+
+    def refined(self, gaussians: Gaussians) -> None:
+        self.calls.append(("refined", None))
+        self.sizes.append(len(gaussians))
+
+    def finish(self, gaussians: Gaussians) -> None:
+        self.calls.append(("finish", None))
+        gaussians.sh0.data.zero_()
+
+
+def test_hooks_are_called_in_the_order_of_a_step(
+    data: Dataset, baseline: Conf, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    recorder = Recorder()
+    monkeypatch.setattr(components, "build", lambda *_: components.Components([recorder]))
+    trained = train.train(data, baseline)
+    each = ("activated", "loss", "after_backward", "statistic")
+    steps = baseline.train.steps
+    in_steps = [call for call in recorder.calls if call[1] is not None]
+    assert in_steps == [(name, number) for number in range(steps) for name in each]
+    assert recorder.calls[0] == ("refined", None)
+    assert recorder.calls[-1] == ("finish", None)
+    assert len(set(recorder.sizes)) > 3  # told of every refinement, or the sizes above are wrong
+    assert (trained.gaussians.sh0 == 0).all()  # what `finish` makes is what is kept
+
+
+def test_a_statistic_of_nothing_grows_nothing(
+    data: Dataset, baseline: Conf, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    class Blind(components.Component):
+        def statistic(self, gradient: torch.Tensor, step: Step) -> torch.Tensor:
+            del step
+            return torch.zeros_like(gradient)
+
+    monkeypatch.setattr(components, "build", lambda *_: components.Components([Blind()]))
+    last = train.train(data, baseline).history[-1]
+    assert last["duplicated"] == last["split"] == 0
 
 
 @pytest.mark.parametrize("component", ["loss_weighting", "gradient_scaling", "consistency"])
@@ -114,7 +174,7 @@ def test_the_sh_bands_come_on_in_turn(
 
     def spy(*arguments: object, sh_degree: int, **rest: object) -> object:
         degrees.append(sh_degree)
-        return real(*arguments, sh_degree=sh_degree, **rest)  # type: ignore[arg-type]
+        return real(*arguments, sh_degree=sh_degree, **rest)
 
     monkeypatch.setattr(train, "rasterize", spy)
     baseline.train.steps = 60
@@ -122,11 +182,34 @@ def test_the_sh_bands_come_on_in_turn(
     assert degrees == [min(step // 2, 3) for step in range(60)]
 
 
+def names_of(data: Dataset, steps: int, trains_on: Callable[[Step], bool]) -> list[str]:
+    drawn = list(endless(data.train, 0, steps, trains_on))
+    assert [(step.number, step.of) for step in drawn] == [(n, steps) for n in range(steps)]
+    return [step.view.name for step in drawn]
+
+
 def test_every_view_is_seen_once_before_any_is_seen_twice(data: Dataset) -> None:
-    names = [view.name for _, view in endless(data.train, seed=0, steps=40)]
+    names = names_of(data, 40, lambda _: True)
     rounds = [tuple(names[start : start + 4]) for start in range(0, 40, 4)]
     assert all(sorted(r) == ["v0", "v1", "v2", "v3"] for r in rounds)
     assert len(set(rounds)) > 1
+
+
+def test_a_view_that_is_refused_is_not_drawn(data: Dataset) -> None:
+    names = names_of(data, 40, lambda step: step.number >= 20 or step.view.name in {"v1", "v3"})
+    assert all(sorted(names[start : start + 2]) == ["v1", "v3"] for start in range(0, 20, 2))
+    assert all(sorted(names[s : s + 4]) == ["v0", "v1", "v2", "v3"] for s in range(20, 40, 4))
+
+
+def test_a_view_refused_in_the_middle_of_a_round_is_passed_over(data: Dataset) -> None:
+    names = names_of(data, 40, lambda step: step.number < 2 or step.view.name != "v2")
+    assert "v2" not in names[2:]
+    assert len(set(names[:5])) >= 3
+
+
+def test_where_every_view_is_refused_it_is_an_error(data: Dataset) -> None:
+    with pytest.raises(XrgsError, match=r"step 7: the components leave no view to train on"):
+        names_of(data, 40, lambda step: step.number < 7)
 
 
 def test_a_splat_keeps_its_activated_ranges(data: Dataset, baseline: Conf) -> None:
