@@ -11,9 +11,10 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from xrgs.components import Components, Step, TrainingView
-from xrgs.components.consistency import Consistency, resize
+from xrgs.components.consistency import Consistency
 from xrgs.config import ComponentsConf
 from xrgs.errors import XrgsError
+from xrgs.splat.resample import resize
 
 HR_SIZE, LR_SIZE = (60, 75), (12, 15)
 
@@ -180,24 +181,6 @@ def test_how_far_fold_is_from_exact(
         parts = build(on, step.view)
         value[on.consistency.lr_mode] = loss_of(parts, step.view.image + error, step)
     assert low < value["fold"] / value["exact"] < high
-
-
-@pytest.mark.parametrize(("height", "width"), [(15, 20), (75, 100), (100, 37)])
-def test_phi_is_torchs_antialiased_bicubic(height: int, width: int) -> None:
-    image = torch.rand(45, 60, 3, dtype=torch.float64)
-    planes = image.permute(2, 0, 1)[None]
-    expected = torch.nn.functional.interpolate(
-        planes, size=(height, width), mode="bicubic", antialias=True
-    )[0].permute(1, 2, 0)
-    torch.testing.assert_close(resize(image, height, width), expected, rtol=0, atol=1e-9)
-
-
-def test_phi_is_not_clamped() -> None:
-    edge = torch.zeros(20, 20, 3)
-    edge[:, 10:] = 1.0
-    up = resize(edge, 100, 100)
-    assert up.min() < -0.01
-    assert up.max() > 1.01
 
 
 @pytest.mark.parametrize("size", [(10, 15), (15, 10)])
