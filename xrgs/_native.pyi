@@ -26,13 +26,21 @@ def adam(
     eps: float,
     threads: int,
 ) -> None: ...
+def observe(
+    slope: Tensor,
+    visible: Tensor,
+    scale_x: float,
+    scale_y: float,
+    gradient: Tensor,
+    seen: Tensor,
+    threads: int,
+) -> None: ...
 def resample(
     image: Tensor,
     row_first: Tensor,
     row_weights: Tensor,
     column_first: Tensor,
     column_weights: Tensor,
-    scale: float,
     threads: int,
 ) -> Tensor: ...
 def multiply_adds_per_second(threads: int) -> float: ...

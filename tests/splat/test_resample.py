@@ -194,6 +194,6 @@ def test_bands_out_of_the_image_are_refused() -> None:
     for first in ([0, 4], [-1, 0]):
         outside = torch.tensor(first, dtype=torch.int32)
         with pytest.raises(ValueError, match="a band reaches out of the image"):
-            _native.resample(image, outside, one, inside, one, 1.0, 1)
+            _native.resample(image, outside, one, inside, one, 1)
     with pytest.raises(ValueError, match="weights that do not fit"):
-        _native.resample(image, inside, torch.ones(3, 2), inside, one, 1.0, 1)
+        _native.resample(image, inside, torch.ones(3, 2), inside, one, 1)

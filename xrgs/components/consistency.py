@@ -61,10 +61,9 @@ class Consistency(Component):
             pair = self.pairs[view.name]
             height, width = pair.image.shape[:2]
             projected = resize(image, height, width, backend=self.backend)
-            consistency = photometric_loss(
-                projected, pair, l1=self.l1, ssim=self.ssim, backend=self.backend
-            )
-            return loss + self.weight * consistency
+            # Its weight goes into the loss's own: a factor outside is one more pass over the image.
+            l1, ssim = self.weight * self.l1, self.weight * self.ssim
+            return loss + photometric_loss(projected, pair, l1=l1, ssim=ssim, backend=self.backend)
         if self.lr_mode == "fold":
             return loss + self.weight * self.l1 * (image - view.image).abs().mean()
         return loss

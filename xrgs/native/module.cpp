@@ -6,6 +6,7 @@
 
 #include "arrays.h"
 #include "bench/bind.h"
+#include "densify/bind.h"
 #include "isa.h"
 #include "loss/bind.h"
 #include "optim/bind.h"
@@ -44,6 +45,7 @@ NB_MODULE(_native, m) {
   m.def("available_isas", &available_isas, "What this machine can run, narrowest first.");
   m.def("exp2", &exp2_of, nb::arg("x"), "2^x, float32 [N], by the kernels' polynomial.");
   m.def("log2", &log2_of, nb::arg("x"), "Base-2 logarithm, float32 [N], by the kernels' series.");
+  bind_densify(m);
   bind_raster(m);
   bind_loss(m);
   bind_optim(m);

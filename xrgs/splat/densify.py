@@ -121,7 +121,13 @@ class Densifier:
     @torch.no_grad()
     def _observe(self, means2d_grad: Tensor, visible: Tensor, width: int, height: int) -> None:
         # gsplat's units: an image is 2 wide and 2 high, whatever its size in pixels.
-        scaled = means2d_grad * means2d_grad.new_tensor([width / 2, height / 2])
+        units = width / 2, height / 2
+        if self.optimizer.native:
+            from xrgs.splat import native_densify
+
+            native_densify.observe(means2d_grad, visible, units, self.gradient, self.seen)
+            return
+        scaled = means2d_grad * means2d_grad.new_tensor(units)
         self.gradient += torch.where(visible, scaled.norm(dim=-1), 0)
         self.seen += visible
 

@@ -76,4 +76,4 @@ class _Resize(torch.autograd.Function):
 
 def _resample(image: Tensor, rows: Bands, columns: Bands) -> Tensor:
     plain = image.detach().contiguous()
-    return _native.resample(plain, *rows, *columns, 1.0, torch.get_num_threads())
+    return _native.resample(plain, *rows, *columns, torch.get_num_threads())

@@ -34,13 +34,12 @@ Bands checked(const First& first, const Weights& weights, std::size_t old) {
   return {first.data(), weights.data(), static_cast<int>(count), static_cast<int>(taps)};
 }
 
-void run_down(const Bands& rows, float scale, const float* in, std::size_t columns, float* out,
-              int threads) {
+void run_down(const Bands& rows, const float* in, std::size_t columns, float* out, int threads) {
   const ResampleKernels& kernels = XRGS_PICK(resample_kernels);
   parallel_for(threads, (rows.count + kRows - 1) / kRows, [&](std::int64_t task) {
     const int first = static_cast<int>(task) * kRows;
     const int last = first + kRows < rows.count ? first + kRows : rows.count;
-    kernels.down(rows, scale, in, columns, first, last, out);
+    kernels.down(rows, in, columns, first, last, out);
   });
 }
 
@@ -60,14 +59,13 @@ void run_across(const Bands& columns, const float* in, int height, int width, fl
 }
 
 Output resample(Image image, First row_first, Weights row_weights, First column_first,
-                Weights column_weights, double scale, int threads) {
+                Weights column_weights, int threads) {
   const std::size_t height = image.shape(0), width = image.shape(1);
   constexpr std::size_t most = std::numeric_limits<int>::max() / 64;
   if (height > most || width > most || row_first.shape(0) > most || column_first.shape(0) > most)
     throw nb::value_error("resample: an image of more than 33 million rows or columns");
   const Bands rows = checked(row_first, row_weights, height);
   const Bands columns = checked(column_first, column_weights, width);
-  const float factor = static_cast<float>(scale);
   const std::size_t new_height = rows.count, new_width = columns.count;
   Output out = new_array<float>({new_height, new_width, 3});
   float* to = static_cast<float*>(out.data());
@@ -76,14 +74,14 @@ Output resample(Image image, First row_first, Weights row_weights, First column_
   if (new_height <= height) {
     Scratch middle(take_block(3 * new_height * width * sizeof(float)));
     float* half = static_cast<float*>(middle.get());
-    run_down(rows, factor, image.data(), 3 * width, half, threads);
+    run_down(rows, image.data(), 3 * width, half, threads);
     run_across(columns, half, rows.count, static_cast<int>(width), to, threads);
   } else {
     Scratch middle(take_block(3 * height * new_width * sizeof(float)));
     float* half = static_cast<float*>(middle.get());
     run_across(columns, image.data(), static_cast<int>(height), static_cast<int>(width), half,
                threads);
-    run_down(rows, factor, half, 3 * new_width, to, threads);
+    run_down(rows, half, 3 * new_width, to, threads);
   }
   return out;
 }
@@ -92,8 +90,8 @@ Output resample(Image image, First row_first, Weights row_weights, First column_
 
 void bind_resample(nb::module_& m) {
   m.def("resample", &resample, nb::arg("image"), nb::arg("row_first"), nb::arg("row_weights"),
-        nb::arg("column_first"), nb::arg("column_weights"), nb::arg("scale"), nb::arg("threads"),
-        "scale times an image [H, W, 3] by a banded matrix down and another across: [h, w, 3].\n"
+        nb::arg("column_first"), nb::arg("column_weights"), nb::arg("threads"),
+        "An image [H, W, 3] by a banded matrix down and another across: [h, w, 3].\n"
         "Output i takes weights [i, t] of input first [i] + t.");
 }
 

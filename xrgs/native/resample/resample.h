@@ -16,9 +16,9 @@ struct Bands {
 };
 
 struct ResampleKernels {
-  // Rows first..last-1 of out [rows.count, columns], from in [., columns], times scale.
-  void (*down)(const Bands& rows, float scale, const float* in, std::size_t columns, int first,
-               int last, float* out);
+  // Rows first..last-1 of out [rows.count, columns], from in [., columns].
+  void (*down)(const Bands& rows, const float* in, std::size_t columns, int first, int last,
+               float* out);
   // At most 16 rows of out [., columns.count, 3] from as many of in [., width, 3].
   void (*across)(const Bands& columns, const float* in, int width, int rows, float* out,
                  float* scratch);

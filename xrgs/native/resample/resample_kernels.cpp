@@ -11,12 +11,12 @@ constexpr int kStep = 3;    // floats of a pixel
 constexpr int kUnroll = 4;  // vectors of a row that share a weight
 
 template <int Count>
-XRGS_INLINE void down_vectors(const float* weights, int taps, float scale, const float* in,
-                              std::size_t columns, int lanes, float* out) {
+XRGS_INLINE void down_vectors(const float* weights, int taps, const float* in, std::size_t columns,
+                              int lanes, float* out) {
   Floats sum[Count];
   for (Floats& s : sum) s = splat(0.0f);
   for (int tap = 0; tap < taps; ++tap) {
-    const Floats weight = splat(weights[tap] * scale);
+    const Floats weight = splat(weights[tap]);
     const float* row = in + tap * columns;
     for (int i = 0; i < Count; ++i) {
       const Floats value = lanes == kLanes ? load(row + i * kLanes) : load_first(row, lanes);
@@ -30,8 +30,8 @@ XRGS_INLINE void down_vectors(const float* weights, int taps, float scale, const
       store_first(out, sum[i], lanes);
 }
 
-void down(const Bands& rows, float scale, const float* in, std::size_t columns, int first,
-          int last, float* out) {
+void down(const Bands& rows, const float* in, std::size_t columns, int first, int last,
+          float* out) {
   constexpr std::size_t wide = kUnroll * kLanes;
   for (int y = first; y < last; ++y) {
     const float* weights = rows.weights + static_cast<std::size_t>(y) * rows.taps;
@@ -39,10 +39,10 @@ void down(const Bands& rows, float scale, const float* in, std::size_t columns, 
     float* to = out + y * columns;
     std::size_t c = 0;
     for (; c + wide <= columns; c += wide)
-      down_vectors<kUnroll>(weights, rows.taps, scale, from + c, columns, kLanes, to + c);
+      down_vectors<kUnroll>(weights, rows.taps, from + c, columns, kLanes, to + c);
     for (; c < columns; c += kLanes) {
       const int lanes = columns - c < kLanes ? static_cast<int>(columns - c) : kLanes;
-      down_vectors<1>(weights, rows.taps, scale, from + c, columns, lanes, to + c);
+      down_vectors<1>(weights, rows.taps, from + c, columns, lanes, to + c);
     }
   }
 }
