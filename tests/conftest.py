@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Callable
 from pathlib import Path
 
+import hydra
 import pytest
 import torch
 
@@ -18,14 +20,21 @@ def _one_thread() -> None:
 
 
 @pytest.fixture
-def baseline() -> config.Conf:
-    """The baseline's config as `conf/` gives it, 40 steps on the torch backend."""
-    from hydra import compose, initialize_config_dir
+def compose() -> Callable[..., config.Conf]:
+    """(*overrides) -> the config that `conf/` gives with them."""
 
-    config.register()
-    with initialize_config_dir(str(config.CONF_DIR), version_base="1.3"):
-        composed = compose("config", ["train.steps=40", "splat.backend=torch"])
-    return config.to_conf(composed)
+    def composed(*overrides: str) -> config.Conf:
+        config.register()
+        with hydra.initialize_config_dir(str(config.CONF_DIR), version_base="1.3"):
+            return config.to_conf(hydra.compose("config", list(overrides)))
+
+    return composed
+
+
+@pytest.fixture
+def baseline(compose: Callable[..., config.Conf]) -> config.Conf:
+    """The baseline's config as `conf/` gives it, 40 steps on the torch backend."""
+    return compose("train.steps=40", "splat.backend=torch")
 
 
 @pytest.fixture(scope="session")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import itertools
 from collections.abc import Callable
 
 import pytest
@@ -10,13 +11,16 @@ import torch
 
 from xrgs import components, train
 from xrgs.components import Step
-from xrgs.config import Conf
+from xrgs.config import CONF_DIR, Conf
 from xrgs.dataset import Dataset, LoadedView
 from xrgs.errors import XrgsError
 from xrgs.splat.cameras import Camera
 from xrgs.splat.gaussians import PARAMETERS, Activated, Gaussians
 from xrgs.splat.settings import RasterSettings
 from xrgs.train import endless
+
+#: All of `conf/ablation` that changes how training goes.
+ABLATIONS = sorted({path.stem for path in (CONF_DIR / "ablation").glob("*.yaml")} - {"baseline"})
 
 
 def camera(width: int, height: int) -> Camera:
@@ -132,6 +136,31 @@ def test_hooks_are_called_in_the_order_of_a_step(
     assert (trained.gaussians.sh0 == 0).all()  # what `finish` makes is what is kept
 
 
+def test_the_history_has_the_mean_of_what_components_note(
+    data: Dataset, baseline: Conf, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    class Noting(components.Component):
+        def loss(self, loss: torch.Tensor, image: torch.Tensor, step: Step) -> torch.Tensor:
+            del image
+            if step.number >= 300 and step.view.tag == "LR":
+                step.log["noting.number"] = step.number
+            return loss
+
+    monkeypatch.setattr(components, "build", lambda *_: components.Components([Noting()]))
+    baseline.train.steps, baseline.splat.densify.stop = 400, 0
+    baseline.splat.backend = "auto"
+    history = train.train(data, baseline).history
+    assert len({tuple(row) for row in history}) == 1
+    lr = {view.name for view in data.train if view.tag == "LR"}
+    drawn = endless(data.train, baseline.seed, 400, lambda _: True)
+    noted = [step.number for step in drawn if step.view.name in lr and step.number >= 300]
+    for last, row in itertools.pairwise(history):
+        numbers = [number for number in noted if last["step"] < number <= row["step"]]
+        mean = sum(numbers) / len(numbers) if numbers else None
+        assert row["noting.number"] == mean
+    assert history[-1]["steps_HR"] == history[-1]["steps_LR"] == 200
+
+
 def test_a_statistic_of_nothing_grows_nothing(
     data: Dataset, baseline: Conf, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -145,18 +174,14 @@ def test_a_statistic_of_nothing_grows_nothing(
     assert last["duplicated"] == last["split"] == 0
 
 
-@pytest.mark.parametrize("component", ["loss_weighting", "gradient_scaling", "consistency"])
-def test_each_component_changes_the_result(data: Dataset, baseline: Conf, component: str) -> None:
-    plain = train.train(data, baseline)
-    changed = dataclasses.replace(baseline)
-    match component:
-        case "loss_weighting":
-            changed.components.loss_weighting.lr_weight = 0.25
-        case "gradient_scaling":
-            changed.components.gradient_scaling.lr_scale = 0.3
-        case "consistency":
-            changed.components.consistency.weight = 0.1
-    assert not same(plain.gaussians, train.train(data, changed).gaussians)
+@pytest.mark.parametrize("ablation", ABLATIONS)
+def test_each_ablation_changes_the_result(
+    data: Dataset, compose: Callable[..., Conf], ablation: str
+) -> None:
+    short = ["train.steps=20", "splat.backend=auto"]
+    plain = train.train(data, compose(*short))
+    changed = train.train(data, compose(*short, f"+ablation={ablation}"))
+    assert not same(plain.gaussians, changed.gaussians)
 
 
 def test_training_goes_on_when_every_gaussian_is_pruned(data: Dataset, baseline: Conf) -> None:

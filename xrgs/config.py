@@ -102,6 +102,9 @@ class LossWeightingConf:
 
     lr_weight: float = MISSING
     """Factor of the whole loss of an LR view; 1 is off."""
+    stat_from: str = MISSING
+    """What densification reads of an LR view's image-plane gradient: `weighted`, as the weighted
+    loss gives it, or `unweighted`. Open in the paper, whose formula gives the former."""
 
 
 @dataclass
@@ -110,6 +113,24 @@ class GradientScalingConf:
 
     lr_scale: float = MISSING
     """Factor of the gradient of the log-scales in LR views; 1 is off."""
+
+
+@dataclass
+class CurriculumConf:
+    """LR-only warm-up (paper 5.5)."""
+
+    lr_only: float = MISSING
+    """Steps of a 30,000-step run in which LR views alone are trained on; 0 is off. Open in the
+    paper whether densification rests meanwhile: here it goes on."""
+
+
+@dataclass
+class RenderScaleConf:
+    """Resolution-aware rendering (paper 5.7 and 6.3)."""
+
+    gamma: float = MISSING
+    """Scales of LR views x (R_max / R)^gamma, R the view's longer side in px; 0 is off. Open in the
+    paper are k(R), its values, and what R is."""
 
 
 @dataclass
@@ -130,6 +151,8 @@ class ComponentsConf:
 
     loss_weighting: LossWeightingConf = field(default_factory=LossWeightingConf)
     gradient_scaling: GradientScalingConf = field(default_factory=GradientScalingConf)
+    curriculum: CurriculumConf = field(default_factory=CurriculumConf)
+    render_scale: RenderScaleConf = field(default_factory=RenderScaleConf)
     consistency: ConsistencyConf = field(default_factory=ConsistencyConf)
 
 

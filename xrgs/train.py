@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import dataclasses
 import time
-from collections import Counter
+from collections import Counter, defaultdict
 from dataclasses import dataclass
+from statistics import fmean
 from typing import TYPE_CHECKING, Any
 
 import torch
@@ -40,8 +41,9 @@ class Trained:
 
     gaussians: Gaussians
     history: list[dict[str, Any]]
-    """One row a logged step: the step done, its view and loss, Gaussians, and what each rule of
-    densification has done since the start."""
+    """One row a logged step: the step done, its view and loss, Gaussians; since the start, the
+    steps on views of each tag and what each rule of densification did; since the row before, the
+    mean of what components noted, None where none did. Every row has every column."""
     seconds: float
     """Of training alone: no loading, no evaluation."""
     memory_bytes: int
@@ -146,7 +148,10 @@ class _Ledger:
     def __init__(self, steps: int) -> None:
         self.every = max(1, steps // _LOGGED_ROWS)
         self.last = steps - 1
-        self.counts = Counter({field.name: 0 for field in dataclasses.fields(Refinement)})
+        names = [f"steps_{tag}" for tag in ("HR", "LR")]
+        names += [field.name for field in dataclasses.fields(Refinement)]
+        self.counts = Counter(dict.fromkeys(names, 0))
+        self.notes: defaultdict[str, list[float]] = defaultdict(list)
         self.history: list[dict[str, Any]] = []
         self.memory_bytes = 0
         self.evaluations = 0
@@ -163,12 +168,19 @@ class _Ledger:
         used = 2 * model + optimizer.state_bytes() + render.buffer_bytes  # 2: and its gradients
         self.memory_bytes = max(self.memory_bytes, used)
         self.evaluations += render.evaluations
+        self.counts[f"steps_{step.view.tag}"] += 1
+        for name, value in step.log.items():
+            self.notes[name].append(value)
         if step.number % self.every == 0 or step.number == self.last:
             row = {"step": step.number, "view": step.view.name, "loss": loss.item()}
-            self.history.append(row | {"gaussians": len(gaussians)} | self.counts)
+            means = {name: fmean(values) for name, values in self.notes.items()}
+            self.history.append(row | {"gaussians": len(gaussians)} | self.counts | means)
+            self.notes.clear()
 
     def refined(self, done: Refinement) -> None:
         self.counts.update(dataclasses.asdict(done))
 
     def close(self, gaussians: Gaussians, seconds: float) -> Trained:
-        return Trained(gaussians, self.history, seconds, self.memory_bytes, self.evaluations)
+        columns = dict.fromkeys(name for row in self.history for name in row)
+        history = [{name: row.get(name) for name in columns} for row in self.history]
+        return Trained(gaussians, history, seconds, self.memory_bytes, self.evaluations)

@@ -12,8 +12,10 @@ import torch
 
 from xrgs.components import Component, Components, Step
 from xrgs.components.consistency import Consistency
+from xrgs.components.curriculum import Curriculum
 from xrgs.components.gradient_scaling import GradientScaling
 from xrgs.components.loss_weighting import LossWeighting
+from xrgs.components.render_scale import RenderScale
 from xrgs.config import ComponentsConf
 from xrgs.errors import XrgsError
 from xrgs.splat.gaussians import PARAMETERS, Gaussians
@@ -24,6 +26,8 @@ Build = Callable[..., Components]
 ON: dict[str, tuple[Any, type[Component]]] = {
     "loss_weighting.lr_weight": (0.25, LossWeighting),
     "gradient_scaling.lr_scale": (0.3, GradientScaling),
+    "curriculum.lr_only": (5000, Curriculum),
+    "render_scale.gamma": (0.25, RenderScale),
     "consistency.weight": (0.1, Consistency),
 }
 
@@ -84,6 +88,8 @@ def test_training_needs_no_hydra() -> None:
         ("loss_weighting.lr_weight", -0.1),
         ("loss_weighting.lr_weight", float("nan")),
         ("gradient_scaling.lr_scale", float("inf")),
+        ("curriculum.lr_only", -1),
+        ("render_scale.gamma", -0.25),
         ("consistency.weight", -1.0),
         ("consistency.l1", -1.0),
         ("consistency.ssim", -1.0),

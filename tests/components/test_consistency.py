@@ -88,6 +88,7 @@ def test_it_is_the_papers_formula(
     on.consistency.l1, on.consistency.ssim = l1, ssim
     value = loss_of(build(on), image, step, base=0.5)
     assert value == pytest.approx(0.5 + expected, rel=1e-9)
+    assert step.log == {f"consistency.{tag}": pytest.approx(expected)}
 
 
 @pytest.mark.parametrize("tag", ["HR", "LR"])

@@ -28,6 +28,8 @@ def test_only_the_scales_gradient_is_scaled(
         expected = before[name] * (factor if name == "scales" else 1.0)
         assert torch.equal(gaussians[name].grad, expected), name
     assert (before["scales"] != 0).all()
+    norm = before["scales"].norm().item()
+    assert steps[tag].log == {f"gradient_scaling.norm_{tag}": pytest.approx(norm)}
 
 
 def test_without_a_gradient_there_is_nothing_to_scale(

@@ -13,8 +13,10 @@ from typing import TYPE_CHECKING
 
 from xrgs.components.base import Component, Components, Step, TrainingView, not_negative
 from xrgs.components.consistency import Consistency
+from xrgs.components.curriculum import Curriculum
 from xrgs.components.gradient_scaling import GradientScaling
 from xrgs.components.loss_weighting import LossWeighting
+from xrgs.components.render_scale import RenderScale
 
 if TYPE_CHECKING:  # xrgs.config loads Hydra, which training does without
     from xrgs.config import ComponentsConf
@@ -34,10 +36,13 @@ def build(
         backend: `torch` or `native`, who computes losses.
 
     Raises:
-        XrgsError: A value is out of its range, or a view is too small for its paired target.
+        XrgsError: A value is out of its range, a view is too small for its paired target, or there
+            is no view that a component is for.
     """
     not_negative("components.loss_weighting.lr_weight", conf.loss_weighting.lr_weight)
     not_negative("components.gradient_scaling.lr_scale", conf.gradient_scaling.lr_scale)
+    not_negative("components.curriculum.lr_only", conf.curriculum.lr_only)
+    not_negative("components.render_scale.gamma", conf.render_scale.gamma)
     for name in ("weight", "l1", "ssim"):
         not_negative(f"components.consistency.{name}", getattr(conf.consistency, name))
     components: list[Component] = []
@@ -49,4 +54,8 @@ def build(
         components.append(LossWeighting(conf.loss_weighting))
     if conf.gradient_scaling.lr_scale != 1:
         components.append(GradientScaling(conf.gradient_scaling))
+    if conf.curriculum.lr_only != 0:
+        components.append(Curriculum(conf.curriculum, views))
+    if conf.render_scale.gamma != 0:
+        components.append(RenderScale(conf.render_scale, views))
     return Components(components)

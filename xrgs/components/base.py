@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Protocol
 
 from xrgs.errors import XrgsError
@@ -45,6 +45,9 @@ class Step:
     of: int
     """Steps of the whole run."""
     view: TrainingView
+    log: dict[str, float] = field(default_factory=dict, compare=False)
+    """What components note of the step, by a column of the history, `<component>.<what>`. A row of
+    the history has the mean over the steps, since the row before, that noted it."""
 
     @property
     def nominal(self) -> float:

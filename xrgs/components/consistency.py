@@ -56,17 +56,24 @@ class Consistency(Component):
 
     def loss(self, loss: Tensor, image: Tensor, step: Step) -> Tensor:
         """`loss` and the view's consistency."""
-        view = step.view
+        added = self._of(image, step.view)
+        if added is None:
+            return loss
+        step.log[f"consistency.{step.view.tag}"] = added.item()
+        return loss + added
+
+    def _of(self, image: Tensor, view: TrainingView) -> Tensor | None:
+        """Scalar; None where the view has none."""
         if view.tag == "HR" or self.lr_mode == "exact":
             pair = self.pairs[view.name]
             height, width = pair.image.shape[:2]
             projected = resize(image, height, width, backend=self.backend)
             # Its weight goes into the loss's own: a factor outside is one more pass over the image.
             l1, ssim = self.weight * self.l1, self.weight * self.ssim
-            return loss + photometric_loss(projected, pair, l1=l1, ssim=ssim, backend=self.backend)
+            return photometric_loss(projected, pair, l1=l1, ssim=ssim, backend=self.backend)
         if self.lr_mode == "fold":
-            return loss + self.weight * self.l1 * (image - view.image).abs().mean()
-        return loss
+            return self.weight * self.l1 * (image - view.image).abs().mean()
+        return None
 
 
 def _pair(view: TrainingView, factor: int) -> Target:

@@ -23,5 +23,10 @@ class GradientScaling(Component):
 
     def after_backward(self, gaussians: Gaussians, step: Step) -> None:
         """`scales.grad * lr_scale` in an LR view."""
-        if step.view.tag == "LR" and gaussians.scales.grad is not None:
-            gaussians.scales.grad.mul_(self.lr_scale)
+        gradient = gaussians.scales.grad
+        if gradient is None:
+            return
+        # Before scaling: how much of what moves the scales comes from which views.
+        step.log[f"gradient_scaling.norm_{step.view.tag}"] = gradient.norm().item()
+        if step.view.tag == "LR":
+            gradient.mul_(self.lr_scale)
