@@ -3,20 +3,54 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import hydra
+import numpy as np
 import pytest
 import torch
 
-from xrgs import config
+from xrgs import config, weights
 
 
 @pytest.fixture(scope="session", autouse=True)
 def _one_thread() -> None:
     """Tensors of a test are small: two threads wait for each other longer than they work."""
     torch.set_num_threads(1)
+
+
+@pytest.fixture(scope="session", autouse=True)
+def lpips_weights(tmp_path_factory: pytest.TempPathFactory) -> Iterator[weights.Weights | None]:
+    """This machine's weights of LPIPS; hidden from all that don't ask, so that CI sees the same."""
+    found = weights.published()
+    with pytest.MonkeyPatch.context() as patch:
+        patch.delenv(weights.EXPLICIT, raising=False)
+        patch.setenv("XRGS_CACHE", str(tmp_path_factory.mktemp("cache")))
+        yield found
+
+
+@pytest.fixture
+def published(lpips_weights: weights.Weights | None) -> weights.Weights:
+    """The published weights of LPIPS."""
+    if lpips_weights is None:
+        pytest.skip("no weights of LPIPS on this machine: xrgs-data lpips")
+    return lpips_weights
+
+
+@pytest.fixture
+def random_weights() -> weights.Weights:
+    """Weights of the network's shapes, and of no use."""
+    rng = np.random.default_rng(0)
+    made: dict[str, np.ndarray] = {}
+    channels, kernels = (3, 64, 192, 384, 256, 256), (11, 5, 3, 3, 3)
+    for i, k in enumerate(kernels):
+        inputs, outputs = channels[i : i + 2]
+        scale = (2 / (inputs * k * k)) ** 0.5
+        made[f"conv{i}.weight"] = scale * rng.normal(size=(outputs, inputs, k, k))
+        made[f"conv{i}.bias"] = 0.1 * rng.normal(size=outputs)
+        made[f"head{i}"] = rng.random(outputs)
+    return {name: array.astype(np.float32) for name, array in made.items()}
 
 
 @pytest.fixture

@@ -26,16 +26,17 @@ ONLY_IN = {
 }
 #: Rooms in the order that data walks through them: an import never points to a later one.
 FLOW = (
-    ("errors", "hashing", "machine", "splat", "images", "alignment", "split", "views"),
+    ("errors", "hashing", "machine", "splat", "images", "alignment", "split", "views", "weights"),
     ("config", "scenes", "sfm"),
     ("mixing",),
     ("variant",),
-    ("dataset", "metrics", "components"),
+    ("dataset", "lpips", "metrics", "components"),
     ("train", "evaluate"),
     ("identity", "provenance"),
     ("store",),
     ("cell",),
     ("worker",),
+    ("data",),
     ("report",),
     ("bench",),
     ("sweep",),

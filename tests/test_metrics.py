@@ -14,7 +14,7 @@ import torch
 from numpy.lib.stride_tricks import sliding_window_view
 from torch import Tensor
 
-from xrgs import metrics
+from xrgs import metrics, weights
 
 
 def pair(height: int = 40, width: int = 53) -> tuple[Tensor, Tensor]:
@@ -104,8 +104,23 @@ def test_psnr_of_identical_images_is_infinite() -> None:
     assert metrics.psnr(image, image) == math.inf
 
 
-def test_lpips_has_no_network_in_this_version() -> None:
-    assert metrics.VIEW_METRICS["lpips"](*pair()) is None
+def test_lpips_is_none_where_there_are_no_weights() -> None:
+    assert metrics.lpips(*pair()) is None
+
+
+def test_lpips_is_the_networks_distance_where_there_are(
+    random_weights: weights.Weights, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from xrgs.lpips import distance
+
+    monkeypatch.setattr(weights, "published", lambda: random_weights)
+    image, target = pair()
+    tensors = {name: torch.from_numpy(array) for name, array in random_weights.items()}
+    value = metrics.VIEW_METRICS["lpips"](image, target)
+    assert isinstance(value, float)
+    assert value == distance(image, target, tensors).item() > 0.01
+    # The network shrinks an image to nothing: a cell of tiny views is no failed cell.
+    assert metrics.lpips(*pair(30, 53)) is None
 
 
 def test_the_rows_of_the_tables() -> None:

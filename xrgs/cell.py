@@ -41,6 +41,7 @@ def _run(conf: Conf, variant: Variant, folder: CellFolder) -> None:
     write_json(folder.path / "provenance.json", provenance.collect(threads, backend))
     data = dataset.load(variant)
     trained = train(data, conf)
+    peak_rss_bytes = _peak_rss_bytes()  # before evaluation, which may load LPIPS's network
     save_ply(folder.path / "splats.ply", trained.gaussians)
     write_text(folder.path / "history.csv", _csv(trained.history))
     scores = evaluate.score(trained.gaussians, data.test, conf.splat, folder.path / "renders")
@@ -51,7 +52,7 @@ def _run(conf: Conf, variant: Variant, folder: CellFolder) -> None:
             "training_time_s": trained.seconds,
             "gaussians": len(trained.gaussians),
             "memory_bytes": trained.memory_bytes,
-            "peak_rss_bytes": _peak_rss_bytes(),
+            "peak_rss_bytes": peak_rss_bytes,
             "evaluations": trained.evaluations,
             "steps": conf.train.steps,
         },

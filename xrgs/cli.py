@@ -1,4 +1,4 @@
-"""The commands: `xrgs-sweep`, `xrgs-report` and `xrgs-bench`."""
+"""The commands: `xrgs-sweep`, `xrgs-report`, `xrgs-bench` and `xrgs-data`."""
 
 from __future__ import annotations
 
@@ -98,3 +98,53 @@ def bench() -> None:
         print(run(cast("Settings", settings)))  # noqa: T201
     except (XrgsError, OmegaConfBaseException) as error:
         sys.exit(f"xrgs-bench: {_line(error)}")
+
+
+_DATA_HELP = """\
+xrgs-data download DATASET [SCENE...] [data_root=FOLDER] [url=URL] [sha256=HEX]
+    Fetches published scenes and unpacks them into data_root; run again, it continues.
+    DATASET: {data}
+xrgs-data lpips [from=FILE_OR_URL]
+    Fetches the weights of LPIPS; without them its row of the tables is n/a.
+"""
+
+
+def data() -> None:
+    """`xrgs-data COMMAND [WORD...] [KEY=VALUE...]`."""
+    words = [a for a in sys.argv[1:] if "=" not in a]
+    values = dict(a.split("=", 1) for a in sys.argv[1:] if "=" in a)
+    if not sys.argv[1:] or {"-h", "--help"} & set(words):
+        print(_DATA_HELP.format(data=_choices("data")), end="")  # noqa: T201
+        return
+    try:
+        if words[:1] == ["download"]:
+            print(_download(words[1:], values))  # noqa: T201
+        elif words == ["lpips"]:
+            from xrgs.data import lpips
+
+            source = values.pop("from", None)
+            _none_left(values)
+            print(lpips.get(source))  # noqa: T201
+        else:
+            raise XrgsError(f"{' '.join(words)}: unknown; xrgs-data --help lists what there is")
+    except (XrgsError, OmegaConfBaseException) as error:
+        sys.exit(f"xrgs-data: {_line(error)}")
+
+
+def _none_left(values: dict[str, str]) -> None:
+    if values:
+        raise XrgsError(f"{next(iter(values))}=: unknown here; see xrgs-data --help")
+
+
+def _download(words: list[str], values: dict[str, str]) -> str:
+    from xrgs.data import scenes
+    from xrgs.data.settings import DatasetConf
+
+    file = config.CONF_DIR / "data" / f"{words[0] if words else ''}.yaml"
+    if not words or words[0] not in _choices("data").split(", "):
+        raise XrgsError(f"download {' '.join(words)}: choose one of {_choices('data')}")
+    root = (
+        values.pop("data_root", None) or OmegaConf.load(config.CONF_DIR / "config.yaml").data_root
+    )
+    conf = OmegaConf.merge(OmegaConf.structured(DatasetConf), OmegaConf.load(file), values)
+    return scenes.get(cast("DatasetConf", OmegaConf.to_object(conf)), words[1:], Path(root))

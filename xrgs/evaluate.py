@@ -2,6 +2,8 @@
 
 Version 1: render with the training's settings and all SH bands, clamp to 0..1, score the float32
 image against the 8-bit photograph / 255 with every metric of `xrgs.metrics.VIEW_METRICS`.
+LPIPS needs weights that are not shipped. Only one file of them is accepted, so whether they are
+there is not in a cell's identity: a cell scored without them is whole, and has no LPIPS.
 """
 
 from __future__ import annotations

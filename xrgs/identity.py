@@ -20,7 +20,16 @@ if TYPE_CHECKING:
 
 _PACKAGE = Path(__file__).parent
 #: Files whose change can change a trained number; of folders, every source file inside.
-_TRAINING_CODE = ("splat", "components", "dataset.py", "evaluate.py", "metrics.py", "train.py")
+_TRAINING_CODE = (
+    "splat",
+    "components",
+    "dataset.py",
+    "evaluate.py",
+    "lpips.py",
+    "metrics.py",
+    "train.py",
+    "weights.py",
+)
 #: What the native backend is compiled from, shipped beside it: two builds of it are not the same
 #: bytes, and not another program.
 _NATIVE_CODE = "native"

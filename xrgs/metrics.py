@@ -12,6 +12,8 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
+from xrgs import weights
+
 if TYPE_CHECKING:
     from torch import Tensor
 
@@ -72,9 +74,32 @@ def ssim(image: Tensor, target: Tensor) -> float:
     return float(metrics.ssim(planes, reference, window_size=WINDOW).mean())
 
 
-def lpips(image: Tensor, target: Tensor) -> None:
-    """LPIPS (Zhang et al. 2018) has no network in this version: no score, `n/a` in the tables."""
+def lpips(image: Tensor, target: Tensor) -> float | None:
+    """Perceptual distance (Zhang et al. 2018), AlexNet, version 0.1: gsplat's `alex`.
+
+    Args:
+        image: [H, W, 3] in 0..1.
+        target: [H, W, 3] in 0..1.
+
+    Returns:
+        0 where the images are identical; None (n/a in the tables) where this machine has no
+        weights, or a side of the image is too short for the network.
+
+    Raises:
+        ValueError: the shapes differ or aren't [H, W, 3].
+        WeightsError: the weights that are there aren't the published ones.
+    """
     _check(image, target)
+    published = weights.published()
+    if published is None:
+        return None
+    import torch
+
+    from xrgs.lpips import SMALLEST, distance
+
+    if min(image.shape[:2]) < SMALLEST:
+        return None
+    return float(distance(image, target, {k: torch.from_numpy(v) for k, v in published.items()}))
 
 
 @dataclass(frozen=True)

@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import xrgs
+from xrgs import weights
 from xrgs.machine import usable_cores
 
 _PACKAGES = ("torch", "numpy", "pycolmap", "kornia", "scikit-image", "hydra-core", "pandas")
@@ -41,6 +42,10 @@ def collect(threads: int, backend: str) -> dict[str, Any]:
     Args:
         threads: how many the cell uses.
         backend: the rasterizer in use, `native` or `torch`.
+
+    Raises:
+        WeightsError: the weights of LPIPS that are there aren't the published ones. A cell that
+            can't be scored is better stopped here than after its training.
     """
     diff = _git("diff", "HEAD", "--", ".")
     return {
@@ -54,5 +59,6 @@ def collect(threads: int, backend: str) -> dict[str, Any]:
         "cores": usable_cores(),
         "threads": threads,
         "backend": backend,
+        "lpips_weights_sha256": None if weights.published() is None else weights.CONTENT_SHA256,
         "started": datetime.now(UTC).isoformat(timespec="seconds"),
     }

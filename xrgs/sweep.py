@@ -16,7 +16,7 @@ from hydra.core.plugins import Plugins
 from hydra.errors import CompactHydraException
 from omegaconf.errors import OmegaConfBaseException
 
-from xrgs import scenes, variant, worker
+from xrgs import scenes, variant, weights, worker
 from xrgs.config import to_conf
 from xrgs.errors import XrgsError
 from xrgs.hashing import digest
@@ -163,6 +163,8 @@ class Study:
         plan = self._with_variants(plan, store, build=not dry)
         plan = [_identify(cell, store) for cell in plan]
         _say(describe(plan))
+        if weights.find() is None:
+            _say(f"no LPIPS in what is run now (n/a in the tables): {weights.HINT}")
         if dry:
             return False
         self._launch([cell for cell in plan if cell.error is None and cell.state.name != "done"])

@@ -1,0 +1,74 @@
+"""A web server on the loopback interface that misbehaves as it is told."""
+
+from __future__ import annotations
+
+import contextlib
+import threading
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from typing import Any
+
+import pytest
+
+
+@dataclass
+class Server:
+    """What is served, how badly, and what was asked for."""
+
+    content: bytes = b""
+    ranges: bool = True
+    cuts: list[int] = field(default_factory=list)
+    """Bytes after which each of the first answers breaks off."""
+    status: int | None = None
+    content_type: str = "application/zip"
+    shift: int = 0
+    """Added to where a range is said to start."""
+    asked: list[str | None] = field(default_factory=list)
+    """The Range header of every request."""
+    url: str = ""
+
+
+class _Handler(BaseHTTPRequestHandler):
+    state: Server
+
+    def do_GET(self) -> None:
+        state, wanted = self.state, self.headers.get("Range")
+        state.asked.append(wanted)
+        if state.status is not None:
+            self.send_error(state.status)
+            return
+        start, size = 0, len(state.content)
+        if wanted and state.ranges:
+            start = int(wanted.removeprefix("bytes=").removesuffix("-"))
+            if start >= size:
+                self.send_response(416)
+                self.send_header("Content-Range", f"bytes */{size}")
+                self.end_headers()
+                return
+            self.send_response(206)
+            self.send_header("Content-Range", f"bytes {start + state.shift}-{size - 1}/{size}")
+        else:
+            self.send_response(200)
+        body = state.content[start:]
+        self.send_header("Content-Type", state.content_type)
+        self.send_header("Content-Length", str(len(body)))
+        self.end_headers()
+        with contextlib.suppress(ConnectionError):  # the client may have heard enough
+            self.wfile.write(body[: state.cuts.pop(0)] if state.cuts else body)
+
+    def log_message(self, format: str, *args: Any) -> None:  # noqa: A002
+        pass
+
+
+@pytest.fixture
+def server() -> Iterator[Server]:
+    state = Server()
+    handler = type("Handler", (_Handler,), {"state": state})
+    with ThreadingHTTPServer(("127.0.0.1", 0), handler) as listening:
+        state.url = f"http://127.0.0.1:{listening.server_port}/scenes.zip"
+        thread = threading.Thread(target=listening.serve_forever, kwargs={"poll_interval": 0.02})
+        thread.start()
+        yield state
+        listening.shutdown()
+        thread.join()
