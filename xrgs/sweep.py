@@ -163,7 +163,7 @@ class Study:
         plan = self._with_variants(plan, store, build=not dry)
         plan = [_identify(cell, store) for cell in plan]
         _say(describe(plan))
-        if weights.find() is None:
+        if weights.find() is None and any(cell.state.name != "done" for cell in plan):
             _say(f"no LPIPS in what is run now (n/a in the tables): {weights.HINT}")
         if dry:
             return False
