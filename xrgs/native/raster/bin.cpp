@@ -75,7 +75,7 @@ void emit_tall(const Record& record, std::uint32_t gaussian, int first, int last
   }
 }
 
-void emit_sixteen(const Frame& frame, const std::uint64_t* order, int lanes, Emitter& out) {
+void emit_sixteen(Frame& frame, const std::uint64_t* order, int lanes, Emitter& out) {
   std::uint32_t gaussian[16];
   Floats fields[16];
   for (int i = 0; i < 16; ++i) {
@@ -99,18 +99,19 @@ void emit_sixteen(const Frame& frame, const std::uint64_t* order, int lanes, Emi
     columns_of(e, load(row) + splat(static_cast<float>(k)), frame.view, columns[k]);
   for (int i = 0; i < lanes; ++i) {
     const int count = rows.last[i] - rows.first[i] + 1;
-    if (count > kFewRows) {
+    const std::int64_t before = out.count;
+    if (count > kFewRows)
       emit_tall(frame.records[gaussian[i]], gaussian[i], rows.first[i], rows.last[i], frame.view, out);
-      continue;
-    }
-    for (int k = 0; k < count; ++k)
-      out.row(gaussian[i], rows.first[i] + k, columns[k].begin[i], columns[k].end[i]);
+    else
+      for (int k = 0; k < count; ++k)
+        out.row(gaussian[i], rows.first[i] + k, columns[k].begin[i], columns[k].end[i]);
+    frame.slots[gaussian[i]].count = static_cast<std::uint32_t>(out.count - before);
   }
 }
 
 }  // namespace
 
-std::int64_t emit(const Frame& frame, std::int64_t* next, std::int64_t last, Pair* pairs,
+std::int64_t emit(Frame& frame, std::int64_t* next, std::int64_t last, Pair* pairs,
                   std::int64_t room, std::uint32_t* tile_counts) {
   const int columns = frame.view.columns();
   const std::int64_t group_room = std::int64_t{16} * columns * frame.view.rows();

@@ -46,6 +46,7 @@ bool project_all(int threads, const RasterKernels& kernels, const Parameters& p,
   frame.gaussians = p.count;
   frame.records.resize(count);
   frame.visible.resize((count + 15) / 16);
+  frame.shades.resize((count + 15) / 16);
   frame.slots.resize(count);
   frame.order.resize(count);
   frame.spare.resize(count);

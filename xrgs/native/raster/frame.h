@@ -72,6 +72,7 @@ struct Frame {
   std::int64_t gaussians = 0;
   Buffer<Record> records;                // [N], of visible Gaussians only
   Buffer<std::uint16_t> visible;         // [N / 16] a bit a Gaussian
+  Buffer<Shade> shades;                  // [N / 16], where one of them is visible
   Buffer<Slots> slots;                   // [N]
   Buffer<std::uint64_t> order, spare;    // depth key << 32 | Gaussian; visible ones, front to back
   std::int64_t seen = 0;                 // how many are visible

@@ -18,9 +18,10 @@ struct RasterKernels {
   std::int64_t (*project)(const Parameters& parameters, const View& view, std::int64_t first,
                           std::int64_t last, Frame& frame, std::uint64_t* order, bool* good);
 
-  // Emit the (tile, Gaussian) pairs of order[*next..last-1], counting them by tile; returns how
-  // many. Stops where `room` (at least 16 pairs a tile) may not hold more: *next says where.
-  std::int64_t (*emit)(const Frame& frame, std::int64_t* next, std::int64_t last, Pair* pairs,
+  // Emit the (tile, Gaussian) pairs of order[*next..last-1], counting them by tile and by Gaussian
+  // (in frame.slots); returns how many. Stops where `room` (at least 16 pairs a tile) may not hold
+  // more: *next says where.
+  std::int64_t (*emit)(Frame& frame, std::int64_t* next, std::int64_t last, Pair* pairs,
                        std::int64_t room, std::uint32_t* tile_counts);
 
   // Composite one tile into image [H, W, 3] and alpha [H, W].

@@ -1,6 +1,6 @@
 // A stable counting sort of the pairs by tile: they come front to back, so each list is, too.
 //
-// A pair's place in the order of emission is its slot: a Gaussian's slots lie side by side.
+// A pair has a slot, too: those of a Gaussian lie side by side, in the order of the Gaussians.
 #include "raster/lists.h"
 
 #include <algorithm>
@@ -17,7 +17,7 @@ constexpr std::int64_t kChunkLeast = 4096;
 constexpr std::int64_t kPiece = 1 << 16;  // pairs
 
 // Emit a chunk's pairs, piece by piece. False where memory ran out.
-bool emit_chunk(const RasterKernels& kernels, const Frame& frame, std::int64_t first,
+bool emit_chunk(const RasterKernels& kernels, Frame& frame, std::int64_t first,
                 std::int64_t last, std::vector<Buffer<Pair>>& pieces, std::uint32_t* counts) {
   const std::int64_t tiles = std::int64_t{frame.view.columns()} * frame.view.rows();
   std::size_t used = 0;
@@ -37,7 +37,7 @@ bool emit_chunk(const RasterKernels& kernels, const Frame& frame, std::int64_t f
 }
 
 // Turn counts [chunks, tiles] into each chunk's first place in each tile's list.
-std::int64_t sum_counts(std::int64_t chunks, std::int64_t tiles, std::uint32_t* counts, Frame& frame) {
+void sum_counts(std::int64_t chunks, std::int64_t tiles, std::uint32_t* counts, Frame& frame) {
   std::int64_t place = 0, batch = 0;
   for (std::int64_t tile = 0; tile < tiles; ++tile) {
     frame.tile_begin[static_cast<std::size_t>(tile)] = static_cast<std::uint32_t>(place);
@@ -53,24 +53,32 @@ std::int64_t sum_counts(std::int64_t chunks, std::int64_t tiles, std::uint32_t* 
   }
   frame.tile_begin[static_cast<std::size_t>(tiles)] = static_cast<std::uint32_t>(place);
   frame.batch_begin[static_cast<std::size_t>(tiles)] = static_cast<std::uint32_t>(batch);
-  return place;
 }
 
-// Send a chunk's pairs to their lists, the first one's slot being `slot`.
-void scatter_chunk(const std::vector<Buffer<Pair>>& pieces, std::uint32_t slot,
-                   std::uint32_t* places, Frame& frame) {
-  Slots* slots = frame.slots.data();
+// Give each Gaussian its slots, as many as it has pairs. Returns how many there are.
+std::int64_t assign_slots(Frame& frame) {
+  std::int64_t next = 0;
+  for (std::size_t i = 0; i < frame.slots.size(); ++i) {
+    frame.slots[i].first = static_cast<std::uint32_t>(next);
+    next += frame.slots[i].count;
+  }
+  return next;
+}
+
+// Send a chunk's pairs to their lists.
+void scatter_chunk(const std::vector<Buffer<Pair>>& pieces, std::uint32_t* places, Frame& frame) {
+  const Slots* slots = frame.slots.data();
   Entry* entries = frame.entries.data();
   std::int64_t current = -1;
+  std::uint32_t slot = 0;
   for (const Buffer<Pair>& piece : pieces)
-    for (std::size_t i = 0; i < piece.size(); ++i, ++slot) {
+    for (std::size_t i = 0; i < piece.size(); ++i) {
       const Pair pair = piece[i];
       if (pair.gaussian != current) {
         current = pair.gaussian;
-        slots[current] = {slot, 0};
+        slot = slots[current].first;
       }
-      ++slots[current].count;
-      entries[places[pair.tile]++] = {pair.gaussian, slot};
+      entries[places[pair.tile]++] = {pair.gaussian, slot++};
     }
 }
 
@@ -94,27 +102,20 @@ void make_lists(int threads, const RasterKernels& kernels, Frame& frame, Workspa
   });
   if (!enough) throw std::bad_alloc();
 
-  std::vector<std::int64_t> first(static_cast<std::size_t>(chunks) + 1, 0);  // of each chunk
-  for (std::size_t c = 0; c < static_cast<std::size_t>(chunks); ++c) {
-    first[c + 1] = first[c];
-    for (const Buffer<Pair>& piece : workspace.emitted[c])
-      first[c + 1] += static_cast<std::int64_t>(piece.size());
-  }
   // Places are 32-bit; far below that bound the sums of the backward pass (64 bytes a pair) and
   // the lists end the memory, which their own allocation says.
-  if (first.back() > std::numeric_limits<std::uint32_t>::max()) throw std::bad_alloc();
+  const std::int64_t pairs = assign_slots(frame);
+  if (pairs > std::numeric_limits<std::uint32_t>::max()) throw std::bad_alloc();
 
   frame.tile_begin.resize(static_cast<std::size_t>(tiles) + 1);
   frame.batch_begin.resize(static_cast<std::size_t>(tiles) + 1);
   frame.batches_done.resize(static_cast<std::size_t>(tiles));
   frame.tile_evaluations.resize(static_cast<std::size_t>(tiles));
-  const std::int64_t pairs = sum_counts(chunks, tiles, counts, frame);
+  sum_counts(chunks, tiles, counts, frame);
   frame.entries.resize(static_cast<std::size_t>(pairs));
   frame.batches.resize(frame.batch_begin[static_cast<std::size_t>(tiles)]);
   parallel_for(threads, chunks, [&](std::int64_t c) {
-    scatter_chunk(workspace.emitted[static_cast<std::size_t>(c)],
-                  static_cast<std::uint32_t>(first[static_cast<std::size_t>(c)]),
-                  counts + c * tiles, frame);
+    scatter_chunk(workspace.emitted[static_cast<std::size_t>(c)], counts + c * tiles, frame);
   });
 }
 

@@ -32,7 +32,7 @@ XRGS_INLINE Floats finite_times_zero(const Inputs& in) {
 // Colours before the clamp at zero.
 template <int Degree>
 XRGS_INLINE Vector3 colors_of(const Parameters& p, std::int64_t group, int lanes,
-                              std::uint32_t visible, const Vector3& direction) {
+                              std::uint32_t visible, const Vector3& direction, Shade& shade) {
   Padded padded;
   Vector3 c0;
   load_triples(padded.of(p.sh0, group, lanes, 3), c0.x, c0.y, c0.z);
@@ -45,7 +45,17 @@ XRGS_INLINE Vector3 colors_of(const Parameters& p, std::int64_t group, int lanes
     load_columns<3 * kRest>(p.shN + group * p.rest * 3, p.rest * 3, rows_to_load(visible, lanes), c);
     for (int k = 0; k < kRest; ++k)
       color = add(color, basis[k], {c[3 * k], c[3 * k + 1], c[3 * k + 2]});
+    for (int channel = 0; channel < 3; ++channel) {
+      const Vector3 slope = sh_gradient<Degree>(direction, c + channel, 3);
+      store(shade.slope[3 * channel], slope.x);
+      store(shade.slope[3 * channel + 1], slope.y);
+      store(shade.slope[3 * channel + 2], slope.z);
+    }
   }
+  const Floats zero = splat(0.0f);
+  shade.open[0] = static_cast<std::uint16_t>(bits(zero <= color.x));
+  shade.open[1] = static_cast<std::uint16_t>(bits(zero <= color.y));
+  shade.open[2] = static_cast<std::uint16_t>(bits(zero <= color.z));
   return color;
 }
 
@@ -109,7 +119,8 @@ std::uint32_t project_sixteen(const Parameters& p, const View& v, std::int64_t g
   const Vector3 from_camera{in.mean.x - splat(v.position[0]), in.mean.y - splat(v.position[1]),
                             in.mean.z - splat(v.position[2])};
   const Floats inv = splat(1.0f) / sqrt(max(dot(from_camera, from_camera), splat(kSmallest)));
-  const Vector3 color = colors_of<Degree>(p, group, lanes, visible, times(inv, from_camera));
+  const Vector3 color = colors_of<Degree>(p, group, lanes, visible, times(inv, from_camera),
+                                          frame.shades[static_cast<std::size_t>(group / 16)]);
   const Mask finite = (color.x * zero == zero) & (color.y * zero == zero) & (color.z * zero == zero);
   if ((visible & ~bits(finite)) != 0) *good = false;
   store_records(o, level, reach2, color, visible, frame.records.data() + group);
@@ -137,8 +148,8 @@ std::int64_t project_degree(const Parameters& p, const View& v, std::int64_t fir
       const int i = __builtin_ctz(left);
       order[seen++] = static_cast<std::uint64_t>(key_of(depths[i])) << 32 |
                       static_cast<std::uint64_t>(group + i);
-      frame.slots[static_cast<std::size_t>(group + i)] = {0, 0};
     }
+    for (int i = 0; i < lanes; ++i) frame.slots[static_cast<std::size_t>(group + i)] = {0, 0};
   }
   return seen;
 }

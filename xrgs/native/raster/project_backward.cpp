@@ -3,7 +3,7 @@
 // A Gaussian's slots are added in the order in which its tiles were emitted, so the result does not
 // depend on the threads. Then the chain rule back through whitening, covariance, projection,
 // rotation and harmonics (geometry.h, sh.h), sixteen Gaussians in lanes; what is not visible gets
-// zeros.
+// zeros. The harmonics themselves, three quarters of a Gaussian, are not read: see Shade.
 #include "raster/sh.h"
 #include "raster/stages.h"
 
@@ -29,18 +29,6 @@ XRGS_INLINE void sum_slots(const Frame& frame, const float* sums, std::int64_t g
     out[i] = sum;
   }
   transpose(out);
-}
-
-constexpr std::int64_t kAhead = 2;  // groups between asking for memory and using it
-
-// Ask for a group's slots: they lie anywhere, by depth.
-XRGS_INLINE void prefetch_slots(const Frame& frame, const float* sums, std::int64_t group) {
-  for (std::uint32_t left = frame.visible[static_cast<std::size_t>(group / 16)]; left != 0;
-       left &= left - 1) {
-    const Slots slots = frame.slots[static_cast<std::size_t>(group + __builtin_ctz(left))];
-    for (std::uint32_t k = 0; k < slots.count && k < kFewSlots; ++k)
-      prefetch(sums + (std::size_t{slots.first} + k) * kSlotSize);
-  }
 }
 
 // Gradients of what whitening reads.
@@ -186,42 +174,32 @@ void zero_floats(float* p, std::int64_t count) { std::memset(p, 0, static_cast<s
 // The colour's part: writes the gradients of the harmonics, returns that of the mean.
 template <int Degree>
 XRGS_INLINE Vector3 color_backward(const Parameters& p, const View& view, const Inputs& in,
-                                   const Floats (&sum)[16], std::int64_t group, int lanes,
-                                   std::uint32_t visible, const Gradients& out,
-                                   Harmonics& harmonics) {
+                                   const Shade& shade, const Floats (&sum)[16], std::int64_t group,
+                                   int lanes, const Gradients& out, Harmonics& harmonics) {
   constexpr int kRest = rest_of(Degree);
-  const Floats zero = splat(0.0f), half = splat(0.5f);
   const Vector3 from_camera{in.mean.x - splat(view.position[0]), in.mean.y - splat(view.position[1]),
                             in.mean.z - splat(view.position[2])};
   const Floats inv = splat(1.0f) / sqrt(max(dot(from_camera, from_camera), splat(1.17549435e-38f)));
   const Vector3 d = times(inv, from_camera);
-  Padded padded;
-  Vector3 c0;
-  load_triples(padded.of(p.sh0, group, lanes, 3), c0.x, c0.y, c0.z);
-  Vector3 color = add({half, half, half}, splat(kC0), c0);
-  Floats basis[kRest + 1], c[3 * kRest + 1];
-  if constexpr (kRest > 0) {
-    sh_basis<Degree>(d, basis);
-    load_columns<3 * kRest>(p.shN + group * p.rest * 3, p.rest * 3, rows_to_load(visible, lanes), c);
-    for (int k = 0; k < kRest; ++k)
-      color = add(color, basis[k], {c[3 * k], c[3 * k + 1], c[3 * k + 2]});
-  }
-  const Vector3 v{keep(zero <= color.x, sum[kWr]), keep(zero <= color.y, sum[kWg]),
-                  keep(zero <= color.z, sum[kWb])};
+  const Vector3 v{keep(mask_of(shade.open[0]), sum[kWr]), keep(mask_of(shade.open[1]), sum[kWg]),
+                  keep(mask_of(shade.open[2]), sum[kWb])};
   Sixteen to(group, lanes);
   store_triples(to.of(out.sh0, 3), splat(kC0) * v.x, splat(kC0) * v.y, splat(kC0) * v.z);
   to.copy_out(out.sh0, 3);
-  Vector3 v_mean{zero, zero, zero};
+  Vector3 v_mean{splat(0.0f), splat(0.0f), splat(0.0f)};
   if constexpr (kRest > 0) {
-    Floats along[kRest], vc[3 * kRest];
+    const auto slope = [&](int axis) {
+      return Vector3{load(shade.slope[axis]), load(shade.slope[3 + axis]), load(shade.slope[6 + axis])};
+    };
+    const Vector3 v_d{dot(slope(0), v), dot(slope(1), v), dot(slope(2), v)};
+    v_mean = times(inv, add(v_d, -dot(v_d, d), d));
+    Floats basis[kRest], vc[3 * kRest];
+    sh_basis<Degree>(d, basis);
     for (int k = 0; k < kRest; ++k) {
-      along[k] = dot({c[3 * k], c[3 * k + 1], c[3 * k + 2]}, v);
       vc[3 * k] = basis[k] * v.x;
       vc[3 * k + 1] = basis[k] * v.y;
       vc[3 * k + 2] = basis[k] * v.z;
     }
-    const Vector3 v_d = sh_gradient<Degree>(d, along);
-    v_mean = times(inv, add(v_d, -dot(v_d, d), d));
     store_columns<3 * kRest>(vc, p.rest * 3, harmonics);
   }
   float* place = out.shN + group * p.rest * 3;
@@ -279,7 +257,8 @@ void backward_sixteen(const Parameters& p, const Frame& frame, const float* sums
   Vector3 v_m1, v_m2;
   covariance_backward(o, view, in, v, v_opacity, v_m1, v_m2);
   ShapeGradient shape = projection_backward(o, view, in, v_m1, v_m2, v.mean_x, v.mean_y);
-  const Vector3 by_color = color_backward<Degree>(p, view, in, sum, group, lanes, visible, out, harmonics);
+  const Shade& shade = frame.shades[static_cast<std::size_t>(group / 16)];
+  const Vector3 by_color = color_backward<Degree>(p, view, in, shade, sum, group, lanes, out, harmonics);
   shape.mean = add(shape.mean, splat(1.0f), by_color);
   write_shape(shape, v_opacity, v.mean_x, v.mean_y, mask_of(visible), group, lanes, out);
 }
@@ -291,11 +270,6 @@ void backward_degree(const Parameters& p, const Frame& frame, const float* sums,
   for (std::int64_t group = first; group < last; group += 16) {
     const int lanes = last - group < 16 ? static_cast<int>(last - group) : 16;
     const std::uint32_t visible = frame.visible[static_cast<std::size_t>(group / 16)];
-    const std::int64_t ahead = group + 16 * kAhead;
-    if (ahead + 16 <= last && frame.visible[static_cast<std::size_t>(ahead / 16)] != 0) {
-      prefetch_slots(frame, sums, ahead);
-      if (Degree > 0) prefetch_harmonics(p, ahead);
-    }
     if (visible == 0)
       write_zeros(p, group, lanes, out);
     else

@@ -47,20 +47,21 @@ XRGS_INLINE void sh_basis(const Vector3& d, Floats* basis) {
   }
 }
 
-// Sum over k of a[k] times the gradient of basis[k].
+// Sum over k of a[k stride] times the gradient of basis[k].
 template <int Degree>
-XRGS_INLINE Vector3 sh_gradient(const Vector3& d, const Floats* a) {
+XRGS_INLINE Vector3 sh_gradient(const Vector3& d, const Floats* coefficients, int stride) {
+  const auto a = [=](int k) { return coefficients[k * stride]; };
   const Floats x = d.x, y = d.y, z = d.z;
   const Floats zero = splat(0.0f);
   Vector3 g{zero, zero, zero};
   if constexpr (Degree >= 1) {
-    g.y = splat(-kC1) * a[0];
-    g.z = splat(kC1) * a[1];
-    g.x = splat(-kC1) * a[2];
+    g.y = splat(-kC1) * a(0);
+    g.z = splat(kC1) * a(1);
+    g.x = splat(-kC1) * a(2);
   }
   if constexpr (Degree >= 2) {
-    const Floats a3 = splat(kC2) * a[3], a4 = splat(-kC2) * a[4], a6 = splat(-kC2) * a[6];
-    const Floats a5 = splat(6.0f * kC20) * a[5], a7 = splat(kC2) * a[7];
+    const Floats a3 = splat(kC2) * a(3), a4 = splat(-kC2) * a(4), a6 = splat(-kC2) * a(6);
+    const Floats a5 = splat(6.0f * kC20) * a(5), a7 = splat(kC2) * a(7);
     g.x += fma(a3, y, fma(a6, z, a7 * x));
     g.y += fma(a3, x, fma(a4, z, -(a7 * y)));
     g.z += fma(a4, y, fma(a5, z, a6 * x));
@@ -69,9 +70,9 @@ XRGS_INLINE Vector3 sh_gradient(const Vector3& d, const Floats* a) {
     const Floats xx = x * x, yy = y * y, zz = z * z, xy = x * y, yz = y * z, xz = x * z;
     const Floats five = fma(splat(5.0f), zz, splat(-1.0f));
     const Floats three = splat(3.0f) * (xx - yy);
-    const Floats a8 = splat(-kC33) * a[8], a9 = splat(kC32) * a[9], a10 = splat(-kC31) * a[10];
-    const Floats a11 = splat(3.0f * kC30) * a[11], a12 = splat(-kC31) * a[12];
-    const Floats a13 = splat(kC32) * a[13], a14 = splat(-kC33) * a[14];
+    const Floats a8 = splat(-kC33) * a(8), a9 = splat(kC32) * a(9), a10 = splat(-kC31) * a(10);
+    const Floats a11 = splat(3.0f * kC30) * a(11), a12 = splat(-kC31) * a(12);
+    const Floats a13 = splat(kC32) * a(13), a14 = splat(-kC33) * a(14);
     const Floats half = splat(0.5f) * (xx - yy), six = splat(6.0f), ten = splat(10.0f);
     g.x += fma(a8 * six, xy, fma(a9, yz, fma(a12, five, fma(a13, xz, a14 * three))));
     g.y += fma(a8, three, fma(a9, xz, fma(a10, five, -fma(a13, yz, a14 * six * xy))));
@@ -97,12 +98,6 @@ XRGS_INLINE void load_columns(const float* p, std::int64_t stride, std::uint32_t
 // would cost more than what it spares.
 XRGS_INLINE std::uint32_t rows_to_load(std::uint32_t visible, int lanes) {
   return __builtin_popcount(visible) >= 8 ? (1u << lanes) - 1u : visible;
-}
-
-// Ask for the harmonics of the sixteen Gaussians from `group` on.
-XRGS_INLINE void prefetch_harmonics(const Parameters& p, std::int64_t group) {
-  const char* rows = reinterpret_cast<const char*>(p.shN + group * p.rest * 3);
-  for (int byte = 0; byte < 16 * p.rest * 3 * 4; byte += 64) prefetch(rows + byte);
 }
 
 }  // namespace XRGS_NS

@@ -75,7 +75,15 @@ struct Entry {
   std::uint32_t slot;  // where the backward pass leaves this pair's sums
 };
 
-// The slots of a Gaussian: first, first + 1, ..., first + count - 1.
+// How the colours of sixteen Gaussians move with the direction that they are seen from, kept from the
+// forward pass so that the backward pass need not read the harmonics again.
+struct alignas(64) Shade {
+  float slope[9][16];     // d(red)/dx, d(red)/dy, d(red)/dz, d(green)/dx, ... before the clamp at 0
+  std::uint16_t open[3];  // for red, green, blue: a bit where the clamp does not hold it
+};
+
+// The slots of a Gaussian: first, first + 1, ..., first + count - 1. They lie in the order of the
+// Gaussians, so that the projection's backward pass reads them one after the other.
 struct Slots {
   std::uint32_t first;
   std::uint32_t count;
