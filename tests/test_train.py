@@ -97,6 +97,10 @@ class Recorder(components.Component):
         assert len(activated.means) == self.sizes[-1]
         return activated
 
+    def pixel_weight(self, step: Step) -> torch.Tensor:
+        self.calls.append(("pixel_weight", step.number))
+        return torch.ones(step.view.image.shape[:2])
+
     def loss(self, loss: torch.Tensor, image: torch.Tensor, step: Step) -> torch.Tensor:
         self.calls.append(("loss", step.number))
         assert image.shape == step.view.image.shape
@@ -126,7 +130,7 @@ def test_hooks_are_called_in_the_order_of_a_step(
     recorder = Recorder()
     monkeypatch.setattr(components, "build", lambda *_: components.Components([recorder]))
     trained = train.train(data, baseline)
-    each = ("activated", "loss", "after_backward", "statistic")
+    each = ("activated", "pixel_weight", "loss", "after_backward", "statistic")
     steps = baseline.train.steps
     in_steps = [call for call in recorder.calls if call[1] is not None]
     assert in_steps == [(name, number) for number in range(steps) for name in each]
@@ -182,6 +186,32 @@ def test_each_ablation_changes_the_result(
     plain = train.train(data, compose(*short))
     changed = train.train(data, compose(*short, f"+ablation={ablation}"))
     assert not same(plain.gaussians, changed.gaussians)
+
+
+@pytest.mark.parametrize(
+    "relief",
+    ["adaptive_weighting.texture=0.3", "region_weighting.texture=0.3", "hybrid_schedule.ramp=5000"],
+)
+def test_each_relief_changes_what_weighting_does(
+    data: Dataset, compose: Callable[..., Conf], relief: str
+) -> None:
+    short = ["train.steps=20", "splat.backend=auto", "components.loss_weighting.lr_weight=0.25"]
+    weighted = train.train(data, compose(*short))
+    relieved = train.train(data, compose(*short, f"components.{relief}"))
+    assert not same(weighted.gaussians, relieved.gaussians)
+
+
+def test_what_is_kept_is_no_smaller_than_its_filter(
+    data: Dataset, compose: Callable[..., Conf]
+) -> None:
+    smallest = {}
+    for variance in (0.0, 2.0):
+        conf = compose(
+            "train.steps=20", "splat.backend=auto", f"components.mip.variance={variance}"
+        )
+        smallest[variance] = train.train(data, conf).gaussians.activated().scales.min().item()
+    # The finest view has a focal length of 72 px, and sees none nearer than 1.
+    assert smallest[0.0] < 2**0.5 / 72 < smallest[2.0]
 
 
 def test_training_goes_on_when_every_gaussian_is_pruned(data: Dataset, baseline: Conf) -> None:

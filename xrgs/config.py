@@ -103,8 +103,8 @@ class LossWeightingConf:
     lr_weight: float = MISSING
     """Factor of the whole loss of an LR view; 1 is off."""
     stat_from: str = MISSING
-    """What densification reads of an LR view's image-plane gradient: `weighted`, as the weighted
-    loss gives it, or `unweighted`. Open in the paper, whose formula gives the former."""
+    """What densification reads of a view's image-plane gradient: `weighted`, as the weighted loss
+    gives it, or `unweighted`. Open in the paper, whose formula gives the former."""
 
 
 @dataclass
@@ -146,6 +146,42 @@ class ConsistencyConf:
 
 
 @dataclass
+class AdaptiveWeightingConf:
+    """LR views weigh the more, the less texture the scene has (paper 7.2, 1)."""
+
+    texture: float = MISSING
+    """Mean gradient of the LR views, intensity a px, from which they weigh no more than loss
+    weighting has it; 0 is off."""
+
+
+@dataclass
+class RegionWeightingConf:
+    """Smooth or HR-less regions of LR views keep their full weight (paper 7.2, 2)."""
+
+    texture: float = MISSING
+    """Gradient, intensity a px, from which a region that an HR view covers weighs no more than loss
+    weighting has it; 0 is off."""
+
+
+@dataclass
+class HybridScheduleConf:
+    """LR views come back to their full weight after densification (paper 7.2, 3)."""
+
+    ramp: int = MISSING
+    """Steps of a 30,000-step run that it takes them, from `splat.densify.stop` on; 0 is off."""
+
+
+@dataclass
+class MipConf:
+    """Mip-Splatting's 3D smoothing filter; not in the paper."""
+
+    variance: float = MISSING
+    """Of the filter, px^2 of the finest view that sees a Gaussian; 0 is off."""
+    every: int = MISSING
+    """Steps after which the rates are found anew."""
+
+
+@dataclass
 class ComponentsConf:
     """The components of XR-GS, each the identity in the baseline."""
 
@@ -154,6 +190,10 @@ class ComponentsConf:
     curriculum: CurriculumConf = field(default_factory=CurriculumConf)
     render_scale: RenderScaleConf = field(default_factory=RenderScaleConf)
     consistency: ConsistencyConf = field(default_factory=ConsistencyConf)
+    adaptive_weighting: AdaptiveWeightingConf = field(default_factory=AdaptiveWeightingConf)
+    region_weighting: RegionWeightingConf = field(default_factory=RegionWeightingConf)
+    hybrid_schedule: HybridScheduleConf = field(default_factory=HybridScheduleConf)
+    mip: MipConf = field(default_factory=MipConf)
 
 
 @dataclass

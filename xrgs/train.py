@@ -76,9 +76,8 @@ def train(data: Dataset, conf: Conf) -> Trained:
         scene_scale=data.scene_scale,
         generator=stream(conf.seed, "densify"),
     )
-    parts = components.build(conf.components, data.train, data.factor, backend)
+    parts = components.build(conf.components, data, splat, backend)
     targets = {view.name: prepare_target(view.image) for view in data.train}
-    weights = {"l1": 1 - splat.ssim_weight, "ssim": splat.ssim_weight}
     sh_every = max(1, int(splat.sh_every * steps / NOMINAL_STEPS))
     ledger = _Ledger(steps)
 
@@ -96,7 +95,14 @@ def train(data: Dataset, conf: Conf) -> Trained:
             means2d_offset=offset,
             backend=backend,
         )
-        loss = photometric_loss(render.image, targets[view.name], **weights, backend=backend)
+        loss = photometric_loss(
+            render.image,
+            targets[view.name],
+            l1=1 - splat.ssim_weight,
+            ssim=splat.ssim_weight,
+            pixel_weight=parts.pixel_weight(step),
+            backend=backend,
+        )
         loss = parts.loss(loss, render.image, step)
         optimizer.zero_grad()
         torch.autograd.backward(loss)

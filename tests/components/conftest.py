@@ -11,7 +11,7 @@ from torch import Tensor
 from xrgs import components
 from xrgs.components import Components, Step, TrainingView
 from xrgs.config import ComponentsConf, Conf
-from xrgs.dataset import LoadedView
+from xrgs.dataset import Dataset, LoadedView
 from xrgs.splat.cameras import Camera
 from xrgs.splat.gaussians import PARAMETERS, Gaussians
 
@@ -66,11 +66,13 @@ def off(baseline: Conf) -> ComponentsConf:
 
 
 @pytest.fixture
-def build(hr: Step, lr: Step) -> Callable[..., Components]:
+def build(baseline: Conf, hr: Step, lr: Step) -> Callable[..., Components]:
     """(config, *views) -> its components; the views are `hr`'s and `lr`'s where none is given."""
 
-    def built(conf: ComponentsConf, *views: TrainingView) -> Components:
-        return components.build(conf, views or (hr.view, lr.view), FACTOR)
+    def built(conf: ComponentsConf, *views: LoadedView) -> Components:
+        points = torch.rand(50, 3, generator=torch.Generator().manual_seed(2)) + 1
+        data = Dataset(views or (hr.view, lr.view), (), points, points, 1.0, FACTOR)
+        return components.build(conf, data, baseline.splat)
 
     return built
 

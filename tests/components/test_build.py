@@ -14,8 +14,9 @@ from xrgs.components import Component, Components, Step
 from xrgs.components.consistency import Consistency
 from xrgs.components.curriculum import Curriculum
 from xrgs.components.gradient_scaling import GradientScaling
-from xrgs.components.loss_weighting import LossWeighting
+from xrgs.components.mip import Mip
 from xrgs.components.render_scale import RenderScale
+from xrgs.components.weighting import Weighting
 from xrgs.config import ComponentsConf
 from xrgs.errors import XrgsError
 from xrgs.splat.gaussians import PARAMETERS, Gaussians
@@ -24,11 +25,12 @@ Build = Callable[..., Components]
 
 #: What switches each component on, as `components.<key>`, and its class.
 ON: dict[str, tuple[Any, type[Component]]] = {
-    "loss_weighting.lr_weight": (0.25, LossWeighting),
+    "loss_weighting.lr_weight": (0.25, Weighting),
     "gradient_scaling.lr_scale": (0.3, GradientScaling),
     "curriculum.lr_only": (5000, Curriculum),
     "render_scale.gamma": (0.25, RenderScale),
     "consistency.weight": (0.1, Consistency),
+    "mip.variance": (0.2, Mip),
 }
 
 
@@ -53,6 +55,7 @@ def test_a_component_that_overrides_nothing_is_the_identity(
     activated = gaussians.activated()
     assert parts.trains_on(step)
     assert parts.activated(activated, step) is activated
+    assert parts.pixel_weight(step) is None
     assert parts.loss(loss, step.view.image, step) is loss
     assert parts.statistic(gradient, step) is gradient
     parts.after_backward(gaussians, step)
@@ -93,6 +96,11 @@ def test_training_needs_no_hydra() -> None:
         ("consistency.weight", -1.0),
         ("consistency.l1", -1.0),
         ("consistency.ssim", -1.0),
+        ("adaptive_weighting.texture", -0.1),
+        ("region_weighting.texture", float("nan")),
+        ("hybrid_schedule.ramp", -1),
+        ("mip.variance", -0.2),
+        ("mip.every", 0),
     ],
 )
 def test_a_value_out_of_range_names_its_key(

@@ -22,7 +22,7 @@ def test_the_loss_of_an_lr_view_is_weighted(weighting: Components, hr: Step, lr:
     loss = torch.tensor(0.8)
     assert weighting.loss(loss, lr.view.image, lr) == 0.2
     assert weighting.loss(loss, hr.view.image, hr) is loss
-    assert (lr.log, hr.log) == ({"loss_weighting.lr_weight": 0.25}, {})
+    assert (lr.log, hr.log) == ({"weighting.LR": 0.25}, {})
 
 
 def test_its_gradients_are_weighted_with_it(weighting: Components, lr: Step) -> None:

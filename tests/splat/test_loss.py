@@ -176,3 +176,72 @@ def test_wrong_shapes_are_refused() -> None:
         photometric_loss(
             torch.zeros(20, 21, 3), prepare_target(torch.zeros(20, 20, 3)), l1=1, ssim=0
         )
+
+
+# --- a weight for each pixel --------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("weight", [1.0, 0.25])
+def test_one_weight_for_every_pixel_weighs_the_loss(weight: float) -> None:
+    image, photograph = similar_pair(20, 24)
+    target = prepare_target(photograph)
+    plain = photometric_loss(image, target, l1=0.8, ssim=0.2).item()
+    weights = torch.full((20, 24), weight, dtype=torch.float64)
+    weighted = photometric_loss(image, target, l1=0.8, ssim=0.2, pixel_weight=weights).item()
+    assert weighted == pytest.approx(weight * plain, rel=1e-12)
+
+
+@pytest.mark.parametrize(("l1", "ssim"), [(0.8, 0.2), (1.0, 0.0), (0.0, 1.0)])
+def test_the_weighted_loss_is_its_formula(l1: float, ssim: float) -> None:
+    from skimage.metrics import structural_similarity as skimage_ssim
+
+    image, photograph = similar_pair(20, 24)
+    weights = noise(20, 24, seed=9)[..., 0]
+    _, similarity = skimage_ssim(
+        image.numpy(),
+        photograph.numpy(),
+        gaussian_weights=True,
+        sigma=1.5,
+        use_sample_covariance=False,
+        data_range=1.0,
+        channel_axis=-1,
+        full=True,
+    )
+    w = weights.numpy()
+    absolute = (w[..., None] * np.abs(image.numpy() - photograph.numpy())).mean()
+    lacking = (w[5:-5, 5:-5, None] * (1 - similarity[5:-5, 5:-5])).mean()
+    target = prepare_target(photograph)
+    loss = photometric_loss(image, target, l1=l1, ssim=ssim, pixel_weight=weights).item()
+    assert loss == pytest.approx(l1 * absolute + ssim * lacking, rel=1e-9)
+
+
+def test_a_pixel_without_weight_has_no_gradient() -> None:
+    image, photograph = similar_pair(30, 40)
+    weights = torch.ones(30, 40, dtype=torch.float64)
+    weights[:, :20] = 0
+    image.requires_grad_()
+    target = prepare_target(photograph)
+    photometric_loss(image, target, l1=0.8, ssim=0.2, pixel_weight=weights).backward()
+    assert image.grad is not None
+    assert (image.grad[:, :15] == 0).all()  # beyond the windows around pixels with weight
+    assert (image.grad[:, 20:] != 0).all()
+
+
+def test_gradients_of_the_weighted_loss_are_those_of_finite_differences() -> None:
+    image, photograph = similar_pair(13, 12)
+    target, weights = prepare_target(photograph), noise(13, 12, seed=4)[..., 0]
+    image.requires_grad_()
+    assert torch.autograd.gradcheck(
+        lambda x: photometric_loss(x, target, l1=0.8, ssim=0.2, pixel_weight=weights),
+        image,
+        rtol=1e-6,
+        atol=1e-9,
+    )
+
+
+def test_a_weight_map_of_another_size_is_refused() -> None:
+    image, photograph = similar_pair(13, 12)
+    with pytest.raises(ValueError, match=r"pixel_weight must be \[13, 12\] .*got \[12, 13\]"):
+        photometric_loss(
+            image, prepare_target(photograph), l1=1, ssim=1, pixel_weight=torch.ones(12, 13)
+        )

@@ -8,54 +8,104 @@ components' docstrings.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
+from xrgs.components.adaptive_weighting import AdaptiveWeighting
 from xrgs.components.base import Component, Components, Step, TrainingView, not_negative
 from xrgs.components.consistency import Consistency
 from xrgs.components.curriculum import Curriculum
 from xrgs.components.gradient_scaling import GradientScaling
+from xrgs.components.hybrid_schedule import HybridSchedule
 from xrgs.components.loss_weighting import LossWeighting
+from xrgs.components.mip import Mip
+from xrgs.components.region_weighting import region_shares
 from xrgs.components.render_scale import RenderScale
+from xrgs.components.weighting import Base, Share, Weighting
+from xrgs.errors import XrgsError
 
 if TYPE_CHECKING:  # xrgs.config loads Hydra, which training does without
-    from xrgs.config import ComponentsConf
+    from xrgs.config import ComponentsConf, SplatConf
+    from xrgs.dataset import Dataset
 
 __all__ = ["Component", "Components", "Step", "TrainingView", "build"]
 
+#: Values that must be finite and 0 or more, as `components.<key>`.
+_NOT_NEGATIVE = (
+    "loss_weighting.lr_weight",
+    "gradient_scaling.lr_scale",
+    "curriculum.lr_only",
+    "render_scale.gamma",
+    "consistency.weight",
+    "consistency.l1",
+    "consistency.ssim",
+    "adaptive_weighting.texture",
+    "region_weighting.texture",
+    "hybrid_schedule.ramp",
+    "mip.variance",
+)
+
 
 def build(
-    conf: ComponentsConf, views: Sequence[TrainingView], factor: int, backend: str = "torch"
+    conf: ComponentsConf, data: Dataset, splat: SplatConf, backend: str = "torch"
 ) -> Components:
     """The components that a config switches on.
 
     Args:
         conf: `components` of the config.
-        views: Every training view.
-        factor: `variant.factor`, how many times smaller an LR view is.
+        data: What is trained on.
+        splat: `splat` of the config.
         backend: `torch` or `native`, who computes losses.
 
     Raises:
-        XrgsError: A value is out of its range, a view is too small for its paired target, or there
-            is no view that a component is for.
+        XrgsError: A value is out of its range, a view is too small for its paired target, or a
+            component has no view or weight to work on.
     """
-    not_negative("components.loss_weighting.lr_weight", conf.loss_weighting.lr_weight)
-    not_negative("components.gradient_scaling.lr_scale", conf.gradient_scaling.lr_scale)
-    not_negative("components.curriculum.lr_only", conf.curriculum.lr_only)
-    not_negative("components.render_scale.gamma", conf.render_scale.gamma)
-    for name in ("weight", "l1", "ssim"):
-        not_negative(f"components.consistency.{name}", getattr(conf.consistency, name))
+    for key in _NOT_NEGATIVE:
+        group, name = key.split(".")
+        not_negative(f"components.{key}", getattr(getattr(conf, group), name))
+    if conf.mip.every < 1:
+        raise XrgsError(f"components.mip.every={conf.mip.every}: must be at least 1")
     components: list[Component] = []
     if conf.consistency.weight != 0:
-        components.append(Consistency(conf.consistency, views, factor, backend))
+        components.append(Consistency(conf.consistency, data.train, data.factor, backend))
     # After consistency: a view's weight multiplies its consistency loss too, which would otherwise
     # give back to LR views what weighting took from them.
-    if conf.loss_weighting.lr_weight != 1:
-        components.append(LossWeighting(conf.loss_weighting))
+    components += _weighting(conf, data, splat)
     if conf.gradient_scaling.lr_scale != 1:
         components.append(GradientScaling(conf.gradient_scaling))
     if conf.curriculum.lr_only != 0:
-        components.append(Curriculum(conf.curriculum, views))
+        components.append(Curriculum(conf.curriculum, data.train))
+    if conf.mip.variance != 0:
+        components.append(Mip(conf.mip, data.train, splat.raster.near))
     if conf.render_scale.gamma != 0:
-        components.append(RenderScale(conf.render_scale, views))
+        components.append(RenderScale(conf.render_scale, data.train))
     return Components(components)
+
+
+def _weighting(conf: ComponentsConf, data: Dataset, splat: SplatConf) -> list[Weighting]:
+    """All that weighs views, as the one component that it is; none where nothing does."""
+    base: Base | None = None
+    if conf.loss_weighting.lr_weight != 1:
+        base = LossWeighting(conf.loss_weighting)
+    relieved = {
+        "adaptive_weighting.texture": conf.adaptive_weighting.texture,
+        "region_weighting.texture": conf.region_weighting.texture,
+        "hybrid_schedule.ramp": conf.hybrid_schedule.ramp,
+    }
+    if base is None:
+        for key, value in relieved.items():
+            if value != 0:
+                raise XrgsError(
+                    f"components.{key}={value}: gives back what a weight takes from LR views, and"
+                    " components.loss_weighting.lr_weight takes none"
+                )
+        return []
+    shares: list[Share] = []
+    if conf.adaptive_weighting.texture != 0:
+        shares.append(AdaptiveWeighting(conf.adaptive_weighting, data.train))
+    if conf.hybrid_schedule.ramp != 0:
+        shares.append(HybridSchedule(conf.hybrid_schedule, splat.densify.stop))
+    regions = None
+    if conf.region_weighting.texture != 0:
+        regions = region_shares(conf.region_weighting, data.train, data.points, splat.raster.near)
+    return [Weighting(base, shares, regions, stat_from=conf.loss_weighting.stat_from)]

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import functools
 import math
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Protocol
+
+import torch
 
 from xrgs.errors import XrgsError
 from xrgs.splat.settings import NOMINAL_STEPS
@@ -68,6 +71,11 @@ class Component:
         del step
         return activated
 
+    def pixel_weight(self, step: Step) -> Tensor | None:
+        """What each pixel [H, W] weighs in the photometric loss; None where all weigh 1."""
+        del step
+        return None
+
     def loss(self, loss: Tensor, image: Tensor, step: Step) -> Tensor:
         """The loss to go on with, before backward.
 
@@ -108,6 +116,11 @@ class Components(tuple[Component, ...]):
         for component in self:
             activated = component.activated(activated, step)
         return activated
+
+    def pixel_weight(self, step: Step) -> Tensor | None:
+        """The product of `Component.pixel_weight` of each that has one; None where none has."""
+        weights = [weight for c in self if (weight := c.pixel_weight(step)) is not None]
+        return functools.reduce(torch.mul, weights) if weights else None
 
     def loss(self, loss: Tensor, image: Tensor, step: Step) -> Tensor:
         """`Component.loss` of each in turn; the very `loss` given where none is on."""

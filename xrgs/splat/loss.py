@@ -51,26 +51,39 @@ def prepare_target(image: Tensor) -> Target:
 
 
 def photometric_loss(
-    image: Tensor, target: Target, *, l1: float, ssim: float, backend: str = "torch"
+    image: Tensor,
+    target: Target,
+    *,
+    l1: float,
+    ssim: float,
+    pixel_weight: Tensor | None = None,
+    backend: str = "torch",
 ) -> Tensor:
     """`l1 * mean |image - target| + ssim * (1 - SSIM(image, target))`.
 
-    gsplat's trainer has l1 0.8 and ssim 0.2 (`ssim_lambda`).
+    gsplat's trainer has l1 0.8 and ssim 0.2 (`ssim_lambda`). With `pixel_weight` both means, of the
+    absolute differences and of what each window's SSIM lacks to 1, are those of the values times
+    the weight of their pixel, the window's centre: a weight of w everywhere is w times the loss.
 
     Args:
         image: [H, W, 3] render, of the target's dtype.
         target: What it should look like.
         l1: Weight of the absolute difference.
         ssim: Weight of the structural dissimilarity.
+        pixel_weight: [H, W]; None weighs all pixels 1.
         backend: `torch`, `native` or `auto` (`resolve_backend`). The native one is for float32 on
-            the CPU, and computes the gradient along with the value.
+            the CPU, and computes the gradient along with the value; it has no pixel weights, with
+            which torch computes the loss whatever the backend.
 
     Returns:
         A scalar.
 
     Raises:
-        ValueError: `image` hasn't the target's shape, or isn't what the native backend is for.
+        ValueError: `image` hasn't the target's shape, `pixel_weight` isn't of its size, or `image`
+            isn't what the native backend is for.
     """
+    if pixel_weight is not None:
+        return _weighted_loss(image, _same_shape(image, target), l1, ssim, pixel_weight)
     if resolve_backend(backend) == "native":
         from xrgs.splat import native_loss
 
@@ -95,7 +108,23 @@ def structural_similarity(image: Tensor, target: Target) -> Tensor:
     Raises:
         ValueError: `image` hasn't the target's shape.
     """
-    y = _same_shape(image, target)
+    return _similarity(image, _same_shape(image, target)).mean()
+
+
+def _weighted_loss(image: Tensor, target: Target, l1: float, ssim: float, weight: Tensor) -> Tensor:
+    if weight.shape != image.shape[:2]:
+        raise ValueError(
+            f"pixel_weight must be {list(image.shape[:2])} [H, W], got {list(weight.shape)}"
+        )
+    difference = (image - target.image).abs().mean(dim=-1)  # [H, W]
+    lacking = 1 - _similarity(image, target).mean(dim=-1)  # [H - 10, W - 10]
+    border = WINDOW // 2
+    centres = weight[border:-border, border:-border]
+    return l1 * (weight * difference).mean() + ssim * (centres * lacking).mean()
+
+
+def _similarity(image: Tensor, y: Target) -> Tensor:
+    """SSIM of the windows around the pixels that they fit around: [H - 10, W - 10, 3]."""
     products = torch.cat([image, image * image, image * y.image], dim=-1)  # [H, W, 9]
     mean, square, product = _blur(products).chunk(3, dim=-1)  # [H - 10, W - 10, 3] each
     # Rounding makes the variance of a flat image negative; far outside 0..1 that could outgrow C2.
@@ -103,7 +132,7 @@ def structural_similarity(image: Tensor, target: Target) -> Tensor:
     covariance = product - mean * y.mean
     luminance = (2 * mean * y.mean + C1) / (mean * mean + y.mean * y.mean + C1)
     structure = (2 * covariance + C2) / (variance + y.variance + C2)
-    return (luminance * structure).mean()
+    return luminance * structure
 
 
 def _same_shape(image: Tensor, target: Target) -> Target:
