@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import os
+import subprocess
+import sys
+from pathlib import Path
 
 import pytest
 
-from xrgs.machine import usable_cores
+from xrgs.machine import let_openmp_sleep, usable_cores
 
 
 def test_cores_are_those_this_process_may_use() -> None:
@@ -19,3 +22,37 @@ def test_cores_are_those_this_process_may_use() -> None:
     finally:
         os.sched_setaffinity(0, allowed)
     assert usable_cores() == len(allowed)
+
+
+def test_openmps_threads_are_told_to_sleep(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv("OMP_WAIT_POLICY", raising=False)
+    let_openmp_sleep()
+    assert os.environ["OMP_WAIT_POLICY"] == "passive"
+    monkeypatch.setenv("OMP_WAIT_POLICY", "active")
+    let_openmp_sleep()
+    assert os.environ["OMP_WAIT_POLICY"] == "active"
+
+
+@pytest.mark.parametrize(
+    "command",
+    [
+        "from xrgs.worker import main; main('none', 'request.json', 'answer.json')",
+        "from xrgs.cli import bench; bench()",
+    ],
+)
+def test_before_torch_is_there(tmp_path: Path, command: str) -> None:
+    (tmp_path / "request.json").write_text("{}")
+    script = f"""
+import os, sys, xrgs.machine
+def note():
+    assert "torch" not in sys.modules
+    print("told")
+xrgs.machine.let_openmp_sleep = note
+sys.argv[1:] = ["repeats=none"]
+{command}
+"""
+    done = subprocess.run(
+        [sys.executable, "-P", "-c", script],
+        cwd=tmp_path, capture_output=True, text=True, check=False,
+    )  # fmt: skip
+    assert done.stdout.startswith("told\n"), done.stderr

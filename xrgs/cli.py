@@ -14,6 +14,7 @@ from omegaconf.errors import OmegaConfBaseException
 from xrgs import config
 from xrgs.bench.settings import Settings
 from xrgs.errors import XrgsError
+from xrgs.machine import let_openmp_sleep
 
 
 @hydra.main(version_base="1.3", config_path=str(config.CONF_DIR), config_name="config")
@@ -90,6 +91,7 @@ def report() -> None:
 
 def bench() -> None:
     """`xrgs-bench [KEY=VALUE]...`: run time against error (`xrgs.bench.settings.Settings`)."""
+    let_openmp_sleep()  # as training does
     try:
         given = OmegaConf.from_dotlist(sys.argv[1:])
         settings = OmegaConf.to_object(OmegaConf.merge(OmegaConf.structured(Settings), given))

@@ -10,3 +10,13 @@ def usable_cores() -> int:
     if hasattr(os, "sched_getaffinity"):
         return len(os.sched_getaffinity(0))
     return os.cpu_count() or 1
+
+
+def let_openmp_sleep() -> None:
+    """Have OpenMP's threads sleep between their loops. To be called before torch is imported.
+
+    torch's own threads are OpenMP's, and spin for milliseconds after each loop in case there is
+    another, on the cores that the native kernels' threads want meanwhile: on two busy cores a
+    training step took three times as long. Who has set OMP_WAIT_POLICY is left alone.
+    """
+    os.environ.setdefault("OMP_WAIT_POLICY", "passive")

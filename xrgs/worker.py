@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from xrgs.errors import XrgsError
+from xrgs.machine import let_openmp_sleep
 from xrgs.store import read_json, write_json
 
 if TYPE_CHECKING:
@@ -91,6 +92,7 @@ _JOBS: dict[str, Callable[[Mapping[str, Any]], dict[str, Any]]] = {
 def main(job: str, request: str, answer: str) -> None:
     """The child: do the job and write the answer, or what went wrong."""
     faulthandler.enable()
+    let_openmp_sleep()
     try:
         result = _JOBS[job](json.loads(Path(request).read_text(encoding="utf-8")))
     except XrgsError as error:
