@@ -26,8 +26,11 @@ ONLY_IN = {
 }
 #: Rooms in the order that data walks through them: an import never points to a later one.
 FLOW = (
-    ("errors", "hashing", "machine", "splat", "images", "alignment", "split", "views", "weights"),
+    ("errors", "files", "hashing", "machine", "splat", "weights"),
+    ("images", "alignment", "split", "views", "degrade"),
     ("config", "scenes", "sfm"),
+    ("photographs", "tagging"),
+    ("placing",),
     ("mixing",),
     ("variant",),
     ("dataset", "lpips", "metrics", "components"),

@@ -10,7 +10,7 @@ from xrgs.config import SceneConf, SfmConf
 from xrgs.scenes import motorcycle
 from xrgs.scenes.bundled import photograph
 
-CONF = SfmConf("upsampled", 0, 4.0, 0.75, 0)
+CONF = SfmConf("upsampled", 0, 4.0, 0.75, 0, "auto", None, 30, fallbacks=True, reference=False)
 
 
 @pytest.mark.parametrize(
@@ -21,8 +21,8 @@ def test_features_fall_with_the_number_of_images(count: int, asked: int, expecte
 
 
 def test_small_images_are_searched_at_twice_their_size() -> None:
-    assert sfm.first_octave(252) == -1
-    assert sfm.first_octave(1008) == 0
+    assert sfm.octave_for(252, None) == -1
+    assert sfm.octave_for(1008, None) == 0
 
 
 def test_two_views_keep_the_points_that_only_two_see() -> None:

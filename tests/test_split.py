@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 
 from xrgs.config import SfmConf, VariantConf
 from xrgs.errors import XrgsError
-from xrgs.split import SSIM_WINDOW, check, frame, split
+from xrgs.split import SSIM_WINDOW, check, frame, scale, split
 
 BASE = VariantConf(
     long_side=504,
@@ -18,7 +18,11 @@ BASE = VariantConf(
     selection="random",
     test_every=8,
     seed=0,
-    sfm=SfmConf("upsampled", 0, 4.0, 0.75, 0),
+    tags="flag",
+    hr_above=0.0,
+    degradation="auto",
+    jpeg_quality=10,
+    sfm=SfmConf("upsampled", 0, 4.0, 0.75, 0, "auto", None, 30, fallbacks=True, reference=False),
 )
 
 confs = st.builds(
@@ -76,12 +80,13 @@ def test_a_uniform_selection_is_evenly_spaced() -> None:
 def test_an_hr_view_is_a_whole_number_of_lr_pixels_and_never_enlarged(
     width: int, height: int, side: int, factor: int
 ) -> None:
-    scale = min(1, (side or max(width, height)) / max(width, height))
-    if min(round(width * scale), round(height * scale)) // factor < SSIM_WINDOW:
+    conf = replace(BASE, long_side=side, factor=factor)
+    shrink = min(1, (side or max(width, height)) / max(width, height))
+    if min(round(width * shrink), round(height * shrink)) // factor < SSIM_WINDOW:
         with pytest.raises(XrgsError, match=r"variant\.factor"):
-            frame(width, height, replace(BASE, long_side=side, factor=factor))
+            frame((width, height), scale([(width, height)], conf), conf)
         return
-    made = frame(width, height, replace(BASE, long_side=side, factor=factor))
+    made = frame((width, height), scale([(width, height)], conf), conf)
     assert made.width % factor == made.height % factor == 0
     assert made.width <= made.resized[0] <= width
     assert made.height <= made.resized[1] <= height
@@ -94,7 +99,7 @@ def test_an_hr_view_is_a_whole_number_of_lr_pixels_and_never_enlarged(
 
 def test_a_factor_too_large_for_the_ssim_window_is_named() -> None:
     with pytest.raises(XrgsError, match=r"variant\.factor=40: LR views of 12x9 px .*SSIM window"):
-        frame(504, 378, replace(BASE, factor=40))
+        frame((504, 378), 1.0, replace(BASE, factor=40))
 
 
 @pytest.mark.parametrize(

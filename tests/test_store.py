@@ -8,7 +8,8 @@ from pathlib import Path
 
 import pytest
 
-from xrgs.store import CellFolder, Store, StoreError, write_json
+from xrgs.files import write_json
+from xrgs.store import CellFolder, Store, StoreError
 
 
 @pytest.fixture

@@ -9,9 +9,9 @@ import traceback
 from typing import TYPE_CHECKING, Any
 
 from xrgs import dataset, evaluate, provenance
+from xrgs.files import write_json, write_text
 from xrgs.splat.backend import resolve_backend
 from xrgs.splat.ply import save_ply
-from xrgs.store import write_json, write_text
 from xrgs.train import train
 
 if TYPE_CHECKING:

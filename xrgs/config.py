@@ -47,8 +47,20 @@ class SfmConf:
     init_min_tri_angle: float = MISSING
     """Degrees between the first two views; COLMAP's 16 fails on forward-facing scenes."""
     min_registered: float = MISSING
-    """Share of the views that must register, else the scene fails."""
+    """Share of the views that must register, else the next fallback is tried."""
     seed: int = MISSING
+    camera: str = MISSING
+    """`single`, `per_image`, or `auto`: one for photographs of the same size, make, model and focal
+    length; those without EXIF share one where all have one size, and else have one each."""
+    first_octave: int | None = MISSING
+    """Of SIFT: 0, -1 for twice the resolution; null takes -1 up to 640 px."""
+    min_inliers: int = MISSING
+    """Points that place a view; the first pair needs 10/3 of it, as in COLMAP (30 and 100)."""
+    fallbacks: bool = MISSING
+    """Try other recipes, in the order of `xrgs.placing`, where this one places too few views."""
+    reference: bool = MISSING
+    """Place the undegraded photographs too, to tell how far off the mixed poses are; not where
+    exact cameras are known or nothing is degraded."""
 
 
 @dataclass
@@ -56,19 +68,31 @@ class VariantConf:
     """The mixed-resolution dataset made of a scene."""
 
     long_side: int = MISSING
-    """Longer side of an HR view, px; 0 keeps the photographs' size."""
+    """Longer side of the largest HR view, px; 0 keeps the photographs' size. All are shrunk by one
+    scale, so that differing photographs keep their relative sampling rates."""
     factor: int = MISSING
     """How many times smaller an LR view is."""
     hr_fraction: float = MISSING
-    """Share of the training views kept HR."""
+    """Share of the training views that are HR."""
     min_hr: int = MISSING
     """At least this many of them."""
     selection: str = MISSING
-    """`random` (seeded) or `uniform` (evenly spaced)."""
+    """Of `tags=flag`: `random` (seeded) or `uniform` (evenly spaced)."""
     test_every: int = MISSING
     """Every n-th view is held out, from the first; 0 trains on all and tests on the same poses."""
     seed: int = MISSING
     """Of the selection. Not the training's: all seeds of a study share one variant."""
+    tags: str = MISSING
+    """Which views are HR: `flag` (the selection's), or those of most `megapixels`, of least
+    `distance` from what they show, or of the highest `sampling_rate` (focal px over depth)."""
+    hr_above: float = MISSING
+    """Of the latter three: HR from this share of the best view's value on; 0 goes by hr_fraction.
+    Values: pixels, 1 / distance, sampling rate."""
+    degradation: str = MISSING
+    """Of LR views: `downsample`, `digital_zoom` (down, then up again: same size, no detail),
+    `jpeg` or `none`; `auto` is downsample with `tags=flag` and none with the others."""
+    jpeg_quality: int = MISSING
+    """Of `jpeg`: 1 to 95."""
     sfm: SfmConf = field(default_factory=SfmConf)
 
 

@@ -11,6 +11,7 @@ import torch
 from tqdm import tqdm
 
 from xrgs import images
+from xrgs.errors import XrgsError
 from xrgs.machine import usable_cores
 from xrgs.splat.cameras import Camera
 from xrgs.splat.normalize import normalize_scene
@@ -24,6 +25,9 @@ if TYPE_CHECKING:
 
 _T = TypeVar("_T")
 
+#: Which training views a cell may use.
+USES = ("mixed", "all_hr", "hr_only", "lr_only")
+
 
 @dataclass(frozen=True)
 class LoadedView:
@@ -34,6 +38,8 @@ class LoadedView:
     """`HR` or `LR`."""
     camera: Camera
     image: torch.Tensor  # [H, W, 3] float32, 0..1
+    rho: float = 1.0
+    """Relative sampling rate in (0, 1], see `xrgs.views.View`."""
 
 
 @dataclass(frozen=True)
@@ -49,27 +55,60 @@ class Dataset:
     factor: int
 
 
-def load(variant: Variant) -> Dataset:
+def load(variant: Variant, use: str = "mixed") -> Dataset:
     """Read a variant's images and normalise its world.
+
+    Args:
+        variant: What was frozen.
+        use: Which training views: `mixed` takes all as they are, `all_hr` the originals in place
+            of the degraded ones, `hr_only` and `lr_only` those of one tag. Poses, points, world
+            and tests are the same in each: the controls differ in what is trained on alone.
 
     Raises:
         ImageError: an image is missing or unreadable; the message names it.
+        XrgsError: `use` is none of these, or the variant has no such views.
     """
-    viewmats = np.stack([view.viewmat for view in variant.views])
-    world = normalize_scene(viewmats, variant.points)
-    loaded = [
-        _load_view(view, viewmat)
-        for view, viewmat in zip(variant.views, world.viewmats, strict=True)
-    ]
-    pairs = list(zip(variant.views, loaded, strict=True))
+    chosen = _training_views(variant, use)
+    placed = [view for view in variant.views if view.split != "original"]
+    world = normalize_scene(np.stack([view.viewmat for view in placed]), variant.points)
+    viewmats = {
+        (view.split, view.name): viewmat
+        for view, viewmat in zip(placed, world.viewmats, strict=True)
+    }
     return Dataset(
-        train=tuple(image for view, image in pairs if view.split == "train"),
-        test=tuple(image for view, image in pairs if view.split == "test"),
+        train=tuple(_load_view(view, viewmats["train", view.name]) for view in chosen),
+        test=tuple(
+            _load_view(view, viewmats["test", view.name]) for view in placed if view.split == "test"
+        ),
         points=torch.from_numpy(world.points).float(),
         colors=torch.from_numpy(variant.colors).float() / 255.0,
         scene_scale=world.scene_scale,
         factor=variant.factor,
     )
+
+
+def _training_views(variant: Variant, use: str) -> list[View]:
+    """Those of the variant that `use` names, in the variant's order."""
+    if use not in USES:
+        raise XrgsError(f"training views {use!r}: must be one of {', '.join(USES)}")
+    views = [view for view in variant.views if view.split == "train"]
+    if use == "mixed":
+        return views
+    if use == "all_hr":
+        originals = {view.name: view for view in variant.views if view.split == "original"}
+        views = [originals.get(view.name, view) for view in views]
+        low = [view.name for view in views if view.tag == "LR"]
+        if low:
+            raise XrgsError(
+                f"variant {variant.id} has no original of {low[0]} (LR by nature): "
+                "all_hr is for variants whose LR views were made"
+            )
+        return views
+    tag = "HR" if use == "hr_only" else "LR"
+    views = [view for view in views if view.tag == tag]
+    if not views:
+        raise XrgsError(f"variant {variant.id} has no {tag} view to train on: not for {use}")
+    return views
 
 
 def _load_view(view: View, viewmat: NDArray[np.float64]) -> LoadedView:
@@ -79,7 +118,8 @@ def _load_view(view: View, viewmat: NDArray[np.float64]) -> LoadedView:
         width=view.width,
         height=view.height,
     )
-    return LoadedView(view.name, view.tag, camera, torch.from_numpy(images.read(view.file)))
+    image = torch.from_numpy(images.read(view.file))
+    return LoadedView(view.name, view.tag, camera, image, view.rho)
 
 
 def progress(items: Iterable[_T], what: str, unit: str, total: int | None = None) -> tqdm[_T]:

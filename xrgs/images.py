@@ -5,6 +5,7 @@ Nothing here imports torch or scikit-image before it is called.
 
 from __future__ import annotations
 
+import io
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -17,6 +18,9 @@ from xrgs.errors import XrgsError
 Photo = NDArray[np.float32]  # [H, W, 3]
 
 _EXIF_ORIENTATION = 0x0112
+_EXIF_CAMERA = (0x010F, 0x0110)  # make, model
+_EXIF_DETAILS = 0x8769
+_EXIF_FOCAL = (0x920A, 0xA405)  # focal length in mm, and as of a 35 mm film
 
 
 class ImageError(XrgsError):
@@ -63,11 +67,14 @@ class Lens:
             + [np.stack([0 * t + s, t], -1) for s in (0.0, 1.0)]
         )  # [B, 2] in fractions of the image
         border = edge * (self.width, self.height)
-        low, high = 0.5, 2.0
+        low, high = 0.25, 8.0
         for _ in range(50):
             zoom = (low + high) / 2
             source = self._distorted(border, zoom)
             inside = np.all((source >= -1e-9) & (source <= (self.width, self.height)))
+            # Beyond this radius a barrel lens's formula turns back, and would fold the picture.
+            x = (border - (self.cx, self.cy)) / (self.fx * zoom, self.fy * zoom)
+            inside &= np.all(1 + 3 * self.k * np.sum(x**2, axis=-1) > 0)
             low, high = (low, zoom) if inside else (zoom, high)
         return Lens(self.width, self.height, self.fx * high, self.fy * high, self.cx, self.cy)
 
@@ -95,6 +102,22 @@ def size(path: Path) -> tuple[int, int]:
         raise ImageError(f"{path}: not a readable image ({error})") from error
 
 
+def camera_mark(path: Path) -> str:
+    """What EXIF says of the camera: make, model, focal length; empty where it says none of it.
+
+    Raises:
+        ImageError: the header can't be read.
+    """
+    try:
+        with Image.open(path) as image:
+            exif = image.getexif()
+            details = exif.get_ifd(_EXIF_DETAILS)
+            told = [exif.get(tag) for tag in _EXIF_CAMERA] + [details.get(t) for t in _EXIF_FOCAL]
+    except (OSError, SyntaxError, ValueError, Image.DecompressionBombError) as error:
+        raise ImageError(f"{path}: not a readable image ({error})") from error
+    return "/".join("" if value is None else str(value).strip("\0 ") for value in told).strip("/")
+
+
 def read(path: Path) -> Photo:
     """A photograph, upright (EXIF orientation applied), as RGB.
 
@@ -118,6 +141,16 @@ def save(path: Path, image: Photo) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
     pixels = np.round(np.clip(image, 0, 1) * 255).astype(np.uint8)
     Image.fromarray(pixels).save(path, compress_level=4)
+
+
+def through_jpeg(image: Photo, quality: int) -> Photo:
+    """What a JPEG of that quality (1 to 95, libjpeg's scale, chroma halved) keeps of an image."""
+    pixels = np.round(np.clip(image, 0, 1) * 255).astype(np.uint8)
+    stream = io.BytesIO()
+    Image.fromarray(pixels).save(stream, "JPEG", quality=quality, subsampling="4:2:0")
+    with Image.open(stream) as decoded:
+        kept: Photo = np.asarray(decoded, dtype=np.float32) / np.float32(255)
+    return kept
 
 
 def resize(image: Photo, width: int, height: int) -> Photo:

@@ -1,50 +1,46 @@
-"""The recipe of a variant, step by step: photographs, split, LR copies, SfM, straightening.
+"""The recipe of a variant, step by step: photographs, tags, LR copies, SfM, straightening.
 
-COLMAP is re-run on the mixed-resolution content (paper section 4). With `sfm.lr_images: upsampled`
-LR views are brought back to HR size for SfM alone, one camera for all, which registers the small
-images several times more accurately; `native` gives SfM the files as they are, a camera a class.
+COLMAP is re-run on the mixed-resolution content (paper section 4). Where the tags follow from
+depth they are only known after it: then SfM sees the photographs as they are.
 """
 
 from __future__ import annotations
 
-import logging
 import time
+from collections import Counter
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 from tqdm import tqdm
 
-from xrgs import images, sfm
+from xrgs import degrade, images, placing, tagging
 from xrgs.alignment import pose_error
-from xrgs.errors import XrgsError
-from xrgs.images import Lens
-from xrgs.split import Frame, Split, check, frame, split
+from xrgs.photographs import Photographs, prepare, write_degraded
+from xrgs.split import Split, check, split
 from xrgs.views import SceneFailed, Variant, View
 
 if TYPE_CHECKING:
     from xrgs.config import VariantConf
     from xrgs.scenes import Scene
-
-_log = logging.getLogger(__name__)
+    from xrgs.sfm import Reconstruction
 
 
 @dataclass(frozen=True)
-class _Photos:
-    """The readable photographs as HR views in `folder/hr`, one frame for all."""
+class _Mixture:
+    """What is being mixed, and how."""
 
-    names: list[str]
-    folder: Path
-    original: tuple[int, int]
-    frame: Frame
-    unreadable: list[str] = field(default_factory=list)
+    scene: Scene
+    conf: VariantConf
+    photos: Photographs
+    parts: Split
 
-    def file(self, size: str, index: int) -> str:
-        """Relative path of a copy; numbered, for COLMAP need not cope with people's file names."""
-        return f"{size}/{index:05d}.png"
+    @property
+    def degraded(self) -> tuple[int, ...]:
+        """Indices of the views that are trained on with less in them than was taken."""
+        return () if degrade.kind(self.conf) == "none" else self.parts.lr
 
 
 def mix(scene: Scene, conf: VariantConf, work: Path, out: Path) -> Variant:
@@ -62,14 +58,25 @@ def mix(scene: Scene, conf: VariantConf, work: Path, out: Path) -> Variant:
     """
     check(conf)
     start = time.perf_counter()
-    photos = _high(scene, conf, work)
-    parts = split(len(photos.names), conf)
-    _low(photos, parts, conf)
-    model = sfm.reconstruct(_shots(scene, photos, parts, conf), work, work, conf.sfm)
+    photos = prepare(scene, conf, work)
+    mixture = _Mixture(scene, conf, photos, _tags_before(photos, conf))
+    write_degraded(photos, mixture.degraded, conf)
+    placed = placing.place(
+        photos, mixture.degraded, conf.sfm, work, lambda model: _refusal(mixture, model)
+    )
+    model = placed.model
     _keep_log(work, out)
-    report = _report(scene, photos, parts, model)
-    _judge(scene, photos, parts, conf, model, report)
-    views = _straighten(photos, parts, model, out)
+    report = _report(mixture, model) | {"attempts": placed.attempts}
+    if placed.refused:
+        raise SceneFailed(f"scene {scene.name} failed: {placed.refused}", report)
+    depth = tagging.depths(model)
+    if conf.tags in tagging.NEED_DEPTH:
+        mixture = replace(mixture, parts=_tags_after(mixture, model, depth))
+        write_degraded(photos, mixture.degraded, conf)
+    else:
+        report |= _pose_error(mixture, model, work)
+    views = _straighten(mixture, model, depth, out)
+    report |= _tags_report(mixture, views)
     report["seconds"] = round(time.perf_counter() - start, 1)
     held_out = conf.test_every > 0
     return Variant(
@@ -77,147 +84,124 @@ def mix(scene: Scene, conf: VariantConf, work: Path, out: Path) -> Variant:
     )
 
 
-def _high(scene: Scene, conf: VariantConf, work: Path) -> _Photos:
-    """Read every photograph, drop what can't be read, shrink and crop the rest to HR views."""
-    names: list[str] = []
-    unreadable: list[str] = []
-    first: tuple[Path, tuple[int, int]] | None = None
-    target: Frame | None = None
-    photos = None
-    for file in tqdm(scene.files, desc="HR views", delay=2, leave=False):
-        try:
-            photo = images.read(file)
-        except images.ImageError as error:
-            _log.warning("%s; left out", error)
-            unreadable.append(str(error))
-            continue
-        size = photo.shape[1], photo.shape[0]
-        if first is None or target is None:
-            first, target = (file, size), frame(*size, conf)
-            photos = _Photos(names, work, size, target, unreadable)
-        elif size != first[1]:
-            a, b = (f"{f} is {s[0]}x{s[1]}" for f, s in (first, (file, size)))
-            raise XrgsError(f"images of differing sizes: {a}, {b}; one size a scene is supported")
-        shrunk = images.resize(photo, *target.resized)
-        left, top = target.corner
-        cut = shrunk[top : top + target.height, left : left + target.width]
-        images.save(work / "hr" / f"{len(names):05d}.png", cut)
-        names.append(file.stem)
-    if photos is None or len(names) < 2:
-        raise XrgsError(f"scene {scene.name}: {len(names)} readable image(s): {unreadable}")
-    return photos
+def _tags_before(photos: Photographs, conf: VariantConf) -> Split:
+    """HR and LR as far as the photographs alone tell; where depth decides, all HR for now."""
+    if conf.tags == "megapixels":
+        return split(len(photos), conf, tagging.megapixels([p.size for p in photos.all]))
+    if conf.tags in tagging.NEED_DEPTH:
+        return split(len(photos), replace(conf, hr_fraction=1.0))
+    return split(len(photos), conf)
 
 
-def _low(photos: _Photos, parts: Split, conf: VariantConf) -> None:
-    """LR copies in `lr`, and for SfM their enlargements in `up`."""
-    width, height = photos.frame.width, photos.frame.height
-    for i in tqdm(parts.lr, desc="LR views", delay=2, leave=False):
-        high = images.read(photos.folder / photos.file("hr", i))
-        low_file = photos.folder / photos.file("lr", i)
-        images.save(low_file, images.resize(high, width // conf.factor, height // conf.factor))
-        if conf.sfm.lr_images == "upsampled":
-            enlarged = images.resize(images.read(low_file), width, height)
-            images.save(photos.folder / photos.file("up", i), enlarged)
+def _tags_after(mixture: _Mixture, model: Reconstruction, depth: Mapping[int, float]) -> Split:
+    lenses = {i: lens.straightened() for i, lens in model.lenses.items()}
+    conf, views = mixture.conf, len(mixture.photos)
+    return split(views, conf, tagging.by_depth(conf.tags, views, lenses, depth))
 
 
-def _shots(scene: Scene, photos: _Photos, parts: Split, conf: VariantConf) -> list[sfm.Shot]:
-    """What SfM sees of every view, with its camera where that is known."""
-    native = conf.sfm.lr_images == "native"
-    shots = []
-    for i, name in enumerate(photos.names):
-        low = i in parts.lr
-        folder = ("lr" if native else "up") if low else "hr"
-        lens = _known_lens(scene.intrinsics, name, photos)
-        if lens is None:
-            shots.append(sfm.Shot(photos.file(folder, i), folder if native else "all"))
-            continue
-        if low and native:
-            lens = lens.at(lens.width // conf.factor, lens.height // conf.factor)
-        shots.append(sfm.Shot(photos.file(folder, i), name, lens.K))
-    return shots
-
-
-def _known_lens(
-    intrinsics: Mapping[str, NDArray[np.float64]], name: str, photos: _Photos
-) -> Lens | None:
-    """The camera of an HR view, from that of its photograph: resized, then cropped."""
-    K = intrinsics.get(name)
-    if K is None:
-        return None
-    lens = Lens(*photos.original, K[0, 0], K[1, 1], K[0, 2], K[1, 2]).at(*photos.frame.resized)
-    left, top = photos.frame.corner
-    width, height = photos.frame.width, photos.frame.height
-    return Lens(width, height, lens.fx, lens.fy, lens.cx - left, lens.cy - top)
+def _refusal(mixture: _Mixture, model: Reconstruction) -> str:
+    """Why too few views are placed to train on and to test; empty where they are enough."""
+    parts, names, conf = mixture.parts, mixture.photos.names, mixture.conf
+    placed = model.viewmats.keys()
+    hr, lr = placed & set(parts.hr), placed & set(parts.lr)
+    tests = placed & set(parts.test) if conf.test_every else placed
+    missing = [name for i, name in enumerate(names) if i not in placed]
+    summary = f"COLMAP placed {len(placed)} of {len(names)} views"
+    if missing:
+        summary += f" (not {', '.join(missing[:6])}{', ...' if len(missing) > 6 else ''})"
+    summary += f" and {len(model.points)} points"
+    if len(placed) < conf.sfm.min_registered * len(names):
+        share = conf.sfm.min_registered
+        return f"{summary}; variant.sfm.min_registered={share} asks for more."
+    lost = (parts.hr and not hr) or (parts.lr and not lr)
+    if lost or len(hr) + len(lr) < 2 or not tests:
+        left = f"{len(hr)} HR, {len(lr)} LR and {len(tests)} test views"
+        return f"{summary}: {left}; 1 of each, 2 to train on are needed."
+    return ""
 
 
 def _keep_log(work: Path, out: Path) -> None:
     """COLMAP's log files as one; each begins with a name of its own making."""
-    parts = sorted(work.glob("colmap-*"))
+    parts = sorted(work.rglob("colmap-*"))
     text = "".join(part.read_text(encoding="utf-8", errors="replace") for part in parts)
     (out / "colmap.log").write_text(text, encoding="utf-8")
 
 
-def _report(
-    scene: Scene, photos: _Photos, parts: Split, model: sfm.Reconstruction
-) -> dict[str, Any]:
-    names = photos.names
-    found = {names[i]: matrix for i, matrix in model.viewmats.items()}
-    lenses = sorted({repr(lens) for lens in model.lenses.values()})
+def _report(mixture: _Mixture, model: Reconstruction) -> dict[str, Any]:
+    """What is known before the tags are: the photographs, and how SfM went."""
+    scene, photos = mixture.scene, mixture.photos
+    sizes = Counter(f"{p.frame.width}x{p.frame.height}" for p in photos.all)
     return model.report | {
         "scene": scene.name,
         "fingerprint": scene.fingerprint,
-        "hr_size": [photos.frame.width, photos.frame.height],
-        "tests": len(parts.test),
-        "hr": [names[i] for i in parts.hr],
-        "lr": [names[i] for i in parts.lr],
-        "unreadable": photos.unreadable,
-        "not_registered": [n for i, n in enumerate(names) if i not in model.viewmats],
-        "lenses": lenses,
-        "pose_error": pose_error(found, scene.viewmats),
+        "hr_sizes": dict(sizes),
+        "cameras": len({photo.camera for photo in photos.all}),
+        "unreadable": list(photos.unreadable),
+        "not_registered": [n for i, n in enumerate(photos.names) if i not in model.viewmats],
+        "lenses": sorted({repr(lens) for lens in model.lenses.values()}),
     }
 
 
-def _judge(
-    scene: Scene,
-    photos: _Photos,
-    parts: Split,
-    conf: VariantConf,
-    model: sfm.Reconstruction,
-    report: dict[str, Any],
-) -> None:
-    """Raise `SceneFailed` unless enough views are placed to train on and to test."""
-    placed = model.viewmats.keys()
-    hr, lr = placed & set(parts.hr), placed & set(parts.lr)
-    tests = placed & set(parts.test) if conf.test_every else placed
-    missing = report["not_registered"]
-    summary = f"scene {scene.name} failed: COLMAP placed {len(placed)} of {len(photos.names)} views"
-    if missing:
-        summary += f" (not {', '.join(missing[:6])}{', ...' if len(missing) > 6 else ''})"
-    summary += f" and {len(model.points)} points"
-    wanted = conf.sfm.min_registered * len(photos.names)
-    if len(placed) < wanted:
-        share = conf.sfm.min_registered
-        raise SceneFailed(f"{summary}; variant.sfm.min_registered={share} asks for more.", report)
-    if len(hr) < 1 or len(hr) + len(lr) < 2 or not tests:
-        left = f"{len(hr)} HR, {len(lr)} LR and {len(tests)} test views"
-        raise SceneFailed(f"{summary}: {left}; 1 HR, 2 to train on, 1 test are needed.", report)
+def _pose_error(mixture: _Mixture, model: Reconstruction, work: Path) -> dict[str, Any]:
+    """How far the poses are from exact ones, or else from those of the undegraded photographs."""
+    photos, exact = mixture.photos, mixture.scene.viewmats
+    found = {photos.names[i]: matrix for i, matrix in model.viewmats.items()}
+    if exact:
+        return {"pose_error": pose_error(found, exact), "pose_error_against": "exact cameras"}
+    if not mixture.conf.sfm.reference or not mixture.degraded:
+        return {"pose_error": {}, "pose_error_against": ""}
+    start = time.perf_counter()
+    best = placing.reference(photos, mixture.conf.sfm, work)
+    exact = {photos.names[i]: matrix for i, matrix in best.viewmats.items()}
+    told = ("registered", "points", "reprojection_error_px")
+    seconds = round(time.perf_counter() - start, 1)
+    return {
+        "pose_error": pose_error(found, exact),
+        "pose_error_against": "SfM of the undegraded photographs",
+        "reference": {k: best.report[k] for k in told if k in best.report} | {"seconds": seconds},
+    }
+
+
+def _tags_report(mixture: _Mixture, views: tuple[View, ...]) -> dict[str, Any]:
+    """Who is what, and how finely each class samples the scene."""
+    names, parts = mixture.photos.names, mixture.parts
+    rates = {
+        tag: [view.rho for view in views if (view.split, view.tag) == ("train", tag)]
+        for tag in ("HR", "LR")
+    }
+    return {
+        "tags": mixture.conf.tags,
+        "degradation": degrade.kind(mixture.conf),
+        "tests": len(parts.test),
+        "hr": [names[i] for i in parts.hr],
+        "lr": [names[i] for i in parts.lr],
+        "rho": {
+            tag: [min(found), float(np.median(found)), max(found)]
+            for tag, found in rates.items()
+            if found
+        },
+    }
 
 
 def _straighten(
-    photos: _Photos, parts: Split, model: sfm.Reconstruction, out: Path
+    mixture: _Mixture, model: Reconstruction, depth: Mapping[int, float], out: Path
 ) -> tuple[View, ...]:
     """Undistort what is trained on and what is tested on, each at its own size."""
-    low = set(parts.lr)
+    photos, parts = mixture.photos, mixture.parts
+    degraded, low = set(mixture.degraded), set(parts.lr)
     train = [("train", i, "LR" if i in low else "HR") for i in sorted((*parts.hr, *parts.lr))]
-    test = [("test", i, "HR") for i in (parts.test or range(len(photos.names)))]
-    todo = [entry for entry in (*train, *test) if entry[1] in model.viewmats]
-    views = []
+    test = [("test", i, "HR") for i in (parts.test or range(len(photos)))]
+    original = [("original", i, "HR") for i in sorted(degraded)]
+    todo = [entry for entry in (*train, *test, *original) if entry[1] in model.viewmats]
+    views, rates = [], []
     for part, i, tag in tqdm(todo, desc="undistorting", delay=2, leave=False):
-        image = images.read(photos.folder / photos.file(tag.lower(), i))
+        image = photos.read("lr" if part == "train" and i in degraded else "hr", i)
         height, width = image.shape[:2]
         lens = model.lenses[i].at(width, height)
         file = out / "images" / part / f"{photos.names[i]}.png"
         images.save(file, images.straighten(image, lens))
         K, name = lens.straightened().K, photos.names[i]
-        views.append(View(name, file, part, tag, width, height, K, model.viewmats[i]))
+        views.append(View(name, file, part, tag, width, height, K, model.viewmats[i], 1.0))
+        rates.append(tagging.rate(K, depth[i]))
+    views = [replace(v, rho=rho) for v, rho in zip(views, tagging.of_best(rates), strict=True)]
     return tuple(sorted(views, key=lambda view: (view.split, view.name)))

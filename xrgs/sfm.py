@@ -5,6 +5,7 @@ COLMAP's own log goes to a file in the work folder; what the user sees is one pr
 
 from __future__ import annotations
 
+import tempfile
 import zlib  # noqa: F401  as a first import pycolmap 4.2.1 corrupts the heap
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -30,6 +31,8 @@ _MOST_FEATURES = 8192
 _SMALL = 640
 #: Two views of a narrow baseline: the angle (degrees) below which a point tells nothing of depth.
 _TWO_VIEW_ANGLE = 0.2
+#: COLMAP asks the first pair for 100 inliers, a later view for 30.
+_FIRST_PAIR = 100 / 30
 #: Where a PINHOLE camera's parameters stand in K.
 _PINHOLE = ((0, 0), (1, 1), (0, 2), (1, 2))
 
@@ -54,6 +57,8 @@ class Reconstruction:
     viewmats: dict[int, NDArray[np.float64]]  # [4, 4] world to camera
     points: NDArray[np.float64]  # [P, 3]
     colors: NDArray[np.uint8]  # [P, 3]
+    tracked: dict[int, NDArray[np.intp]]
+    """Indices of the points found in each shot, ascending."""
     report: dict[str, Any]
 
 
@@ -62,12 +67,14 @@ def features_for(count: int, asked: int) -> int:
     return asked or min(_MOST_FEATURES, _FEATURES_IN_ALL // max(count, 1))
 
 
-def first_octave(long_side: int) -> int:
-    """SIFT's first octave: 0, the recipe's, or -1 (twice as fine) for small images.
+def octave_for(long_side: int, asked: int | None) -> int:
+    """SIFT's first octave: what was asked for; else 0, the recipe's, or -1 for small images.
 
     On the embedded scene, mixed, -1 gave 1.7 to 2 times the points and 3 to 21% less position
     error at 250 and at 500 px.
     """
+    if asked is not None:
+        return asked
     return -1 if long_side <= _SMALL else 0
 
 
@@ -77,7 +84,9 @@ def reconstruct(shots: Sequence[Shot], folder: Path, work: Path, conf: SfmConf) 
     Args:
         shots: The images; those without `K` get one SIMPLE_RADIAL camera per `camera` name.
         folder: What `Shot.file` is relative to.
-        work: An existing folder for COLMAP's database, models and log (`colmap.log`).
+        work: An existing folder for COLMAP's database, models and logs. Features and matches that
+            an earlier call left there are taken as they are: it must have been of the same shots,
+            features and octave.
         conf: The recipe.
 
     Not reproducible across machines, nor quite between runs: keep what it returned.
@@ -87,21 +96,27 @@ def reconstruct(shots: Sequence[Shot], folder: Path, work: Path, conf: SfmConf) 
     database = work / "database.db"
     threads = usable_cores()
     max_features = features_for(len(shots), conf.max_num_features)
-    _extract(shots, folder, database, max_features, threads)
-    _match(shots, database, work, threads)
+    longest = max(max(images.size(folder / shot.file)) for shot in shots)
+    octave = octave_for(longest, conf.first_octave)
+    if not database.exists():
+        _extract(shots, folder, database, max_features, octave, threads)
+        _match(shots, database, work, threads)
     models = _map(shots, folder, database, work, conf, threads)
     report = {
-        "first_octave": first_octave(max(images.size(folder / shots[0].file))),
+        "first_octave": octave,
         "images": len(shots),
+        "init_min_tri_angle": conf.init_min_tri_angle,
         "lr_images": conf.lr_images,
         "max_num_features": max_features,
+        "min_inliers": conf.min_inliers,
+        "points": 0,
         "pycolmap": pycolmap.__version__,
         "registered": 0,
         "models": sorted((model.num_reg_images() for model in models), reverse=True),
     }
     if not models:
         nothing = np.zeros((0, 3))
-        return Reconstruction({}, {}, nothing, nothing.astype(np.uint8), report)
+        return Reconstruction({}, {}, nothing, nothing.astype(np.uint8), {}, report)
     return _as_plain(
         max(models, key=lambda m: (m.num_reg_images(), m.num_points3D())), shots, report
     )
@@ -117,12 +132,17 @@ def _log_to(work: Path) -> None:
 
 
 def _extract(
-    shots: Sequence[Shot], folder: Path, database: Path, max_features: int, threads: int
+    shots: Sequence[Shot],
+    folder: Path,
+    database: Path,
+    max_features: int,
+    octave: int,
+    threads: int,
 ) -> None:
     options = pycolmap.FeatureExtractionOptions()
     options.num_threads = threads
     options.sift.max_num_features = max_features
-    options.sift.first_octave = first_octave(max(images.size(folder / shots[0].file)))
+    options.sift.first_octave = octave
     cameras: dict[str, int] = {}
     with _bar(len(shots), "SfM: features") as bar:
         for camera, batch in _batches(shots, 2 * threads):
@@ -183,11 +203,12 @@ def _map(
 ) -> list[Any]:
     options = mapping_options(conf, len(shots), known=all(s.K is not None for s in shots))
     options.num_threads = threads
+    out = Path(tempfile.mkdtemp(prefix="models-", dir=work))
     with _bar(len(shots), "SfM: cameras") as bar:
         models = pycolmap.incremental_mapping(
             database,
             folder,
-            work,
+            out,
             options=options,
             next_image_callback=lambda: bar.update(int(bar.n < len(shots))),
         )
@@ -199,6 +220,8 @@ def mapping_options(conf: SfmConf, count: int, *, known: bool) -> Any:
     options = pycolmap.IncrementalPipelineOptions()
     options.random_seed = conf.seed
     options.mapper.init_min_tri_angle = conf.init_min_tri_angle
+    options.mapper.abs_pose_min_num_inliers = conf.min_inliers
+    options.mapper.init_min_num_inliers = round(conf.min_inliers * _FIRST_PAIR)
     options.min_model_size = min(count, options.min_model_size)
     if count == 2:
         # By default every point that only two images see is dropped: here that is all of them.
@@ -218,14 +241,17 @@ def mapping_options(conf: SfmConf, count: int, *, known: bool) -> Any:
 def _as_plain(model: Any, shots: Sequence[Shot], report: dict[str, Any]) -> Reconstruction:
     """Pycolmap's model as numpy arrays, points in the order of their ids."""
     index = {shot.file: i for i, shot in enumerate(shots)}
-    lenses, viewmats = {}, {}
+    order = sorted(model.points3D)
+    number = {point: p for p, point in enumerate(order)}
+    lenses, viewmats, tracked = {}, {}, {}
     for image in model.images.values():
         if not image.has_pose:
             continue
         i = index[image.name]
         viewmats[i] = np.vstack([image.cam_from_world().matrix(), [0.0, 0.0, 0.0, 1.0]])
         lenses[i] = _lens(model.cameras[image.camera_id])
-    order = sorted(model.points3D)
+        own = {number[p.point3D_id] for p in image.points2D if p.has_point3D()}
+        tracked[i] = np.array(sorted(own), dtype=np.intp)
     points = np.array([model.points3D[p].xyz for p in order], dtype=np.float64).reshape(-1, 3)
     colors = np.array([model.points3D[p].color for p in order], dtype=np.uint8).reshape(-1, 3)
     report |= {
@@ -233,7 +259,7 @@ def _as_plain(model: Any, shots: Sequence[Shot], report: dict[str, Any]) -> Reco
         "points": len(order),
         "reprojection_error_px": float(model.compute_mean_reprojection_error()),
     }
-    return Reconstruction(lenses, viewmats, points, colors, report)
+    return Reconstruction(lenses, viewmats, points, colors, tracked, report)
 
 
 def _lens(camera: Any) -> Lens:

@@ -9,14 +9,13 @@ from __future__ import annotations
 
 import csv
 import json
-import os
-import secrets
 import tempfile
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from xrgs.errors import XrgsError
+from xrgs.files import write_json
 from xrgs.hashing import digest, file_digest
 
 if TYPE_CHECKING:
@@ -34,26 +33,6 @@ _RECORD_VERSION = 1
 
 class StoreError(XrgsError):
     """The store's folder can't be used, or does not hold what was asked for."""
-
-
-def write_text(path: Path, text: str) -> None:
-    """Write a file so that a reader sees the old or the new content, never half of one."""
-    # Not mkstemp: its files are for their owner alone, and a store is for a team.
-    temporary = path.with_name(f".{path.name}.{os.getpid()}-{secrets.token_hex(4)}")
-    try:
-        with temporary.open("x", encoding="utf-8", newline="") as stream:
-            stream.write(text)
-            stream.flush()
-            os.fsync(stream.fileno())
-        temporary.replace(path)
-    except BaseException:
-        temporary.unlink(missing_ok=True)
-        raise
-
-
-def write_json(path: Path, value: object) -> None:
-    """Write `value` as indented JSON with sorted keys, atomically."""
-    write_text(path, json.dumps(value, indent=1, sort_keys=True, ensure_ascii=False) + "\n")
 
 
 def read_json(path: Path) -> Any:

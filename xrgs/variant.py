@@ -22,6 +22,7 @@ import numpy as np
 
 from xrgs import scenes, split
 from xrgs.errors import XrgsError
+from xrgs.files import write_json
 from xrgs.hashing import digest, file_digest
 from xrgs.views import SceneFailed, Variant, View
 
@@ -42,7 +43,19 @@ __all__ = [
 _log = logging.getLogger(__name__)
 
 #: Their code decides what a variant is: a change of it makes a new one.
-_CODE = ("alignment.py", "images.py", "mixing.py", "sfm.py", "split.py", "variant.py")
+_CODE = (
+    "alignment.py",
+    "degrade.py",
+    "images.py",
+    "mixing.py",
+    "photographs.py",
+    "placing.py",
+    "sfm.py",
+    "split.py",
+    "tagging.py",
+    "variant.py",
+    "views.py",
+)
 
 
 class CorruptVariant(XrgsError):  # noqa: N818
@@ -138,7 +151,7 @@ def _make(scene: scenes.Scene, conf: VariantConf, wanted: str, variants: Path) -
     try:
         return _freeze(mixing.mix(scene, conf, work, frozen), wanted, frozen, variants)
     except SceneFailed as error:
-        _write_json(frozen / "report.json", error.report)
+        write_json(frozen / "report.json", error.report)
         frozen.rename(failed)
         raise SceneFailed(f"{error} Report: {failed}", error.report) from None
     finally:
@@ -148,7 +161,7 @@ def _make(scene: scenes.Scene, conf: VariantConf, wanted: str, variants: Path) -
 def _freeze(made: Variant, wanted: str, folder: Path, variants: Path) -> Variant:
     """Write what `made` holds beside its images, and rename the folder to its id."""
     np.savez(folder / "points.npz", points=made.points, colors=made.colors)
-    _write_json(folder / "report.json", made.report)
+    write_json(folder / "report.json", made.report)
     files = [folder / "points.npz", *sorted({view.file for view in made.views})]
     content: dict[str, Any] = {
         "key": wanted,
@@ -159,7 +172,7 @@ def _freeze(made: Variant, wanted: str, folder: Path, variants: Path) -> Variant
         "files": {f.relative_to(folder).as_posix(): file_digest(f) for f in files},
     }
     content["id"] = _id(content)
-    _write_json(folder / "variant.json", content)
+    write_json(folder / "variant.json", content)
     home = variants / content["id"]
     folder.rename(home)
     return load(home)
@@ -186,11 +199,6 @@ def _entry(folder: Path, view: View) -> dict[str, Any]:
 def _view(folder: Path, entry: dict[str, Any]) -> View:
     arrays = {name: np.array(entry[name], dtype=np.float64) for name in ("K", "viewmat")}
     return View(**(entry | {"file": folder / entry["file"]} | arrays))
-
-
-def _write_json(file: Path, content: dict[str, Any]) -> None:
-    text = json.dumps(content, indent=1, ensure_ascii=False)
-    file.write_text(text + "\n", encoding="utf-8")
 
 
 @contextmanager

@@ -16,8 +16,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from xrgs.errors import XrgsError
+from xrgs.files import write_json
 from xrgs.machine import let_openmp_sleep
-from xrgs.store import read_json, write_json
+from xrgs.store import read_json
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping

@@ -13,9 +13,9 @@ from xrgs import provenance
 from xrgs.bench import loads, rendering, tables, training
 from xrgs.dataset import progress
 from xrgs.errors import XrgsError
+from xrgs.files import write_json
 from xrgs.machine import usable_cores
 from xrgs.splat.backend import resolve_backend
-from xrgs.store import write_json
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

@@ -7,13 +7,14 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from xrgs.files import write_json, write_text
 from xrgs.metrics import METRICS
 from xrgs.report.collect import RECORD_KEYS, ReportError, Sweep, read_sweep
 from xrgs.report.compare import compare
 from xrgs.report.pictures import Picture, draw
 from xrgs.report.render import Grid, markdown, one_line, to_latex, to_markdown, to_text
 from xrgs.report.tables import Tables
-from xrgs.store import Store, write_json, write_text
+from xrgs.store import Store
 
 if TYPE_CHECKING:
     import pandas as pd

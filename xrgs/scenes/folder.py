@@ -67,8 +67,19 @@ def _images_in(folder: Path) -> tuple[Path, ...]:
 
 def _smallest(copies: list[tuple[Path, ...]], long_side: int) -> tuple[Path, ...]:
     """The copies of an LLFF scene to read; empty where there are none."""
-    sides = sorted(((max(images.size(files[0])), files) for files in copies), key=lambda c: c[0])
+    sides = sorted(((_side(files), files) for files in copies), key=lambda c: c[0])
     if not sides:
         return ()
     enough = [files for side, files in sides if long_side and side >= long_side]
     return enough[0] if enough else sides[-1][1]
+
+
+def _side(files: tuple[Path, ...]) -> int:
+    """Longest side of the photographs of a folder; what can't be read is left to the reader."""
+    sides = [0]
+    for file in files:
+        try:
+            sides.append(max(images.size(file)))
+        except images.ImageError:
+            continue
+    return max(sides)
