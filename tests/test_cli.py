@@ -225,7 +225,7 @@ def test_help_names_every_choice(tmp_path: Path) -> None:
         (["scene=folder", "scene.path=gone"], ["gone"]),
         (["scene=folder", "scene.path=empty"], ["empty"]),
         (["scene=folder", "scene.path=one"], ["one"]),
-        (["scene=folder", "scene.path=sizes"], ["sizes", "90"]),
+        (["scene=folder", "scene.path=sizes", "variant.sfm.camera=single"], ["sizes", "90"]),
         (["scene=folder", "scene.path=broken"], ["broken"]),
         (["scene=folder", "scene.path=small"], ["variant.factor"]),
         (["store=in-the-way"], ["in-the-way", "store="]),
