@@ -59,8 +59,10 @@ class View:
         alpha_max: float,
         transmittance_min: float,
         antialiased: bool,
+        absgrad: bool,
         background: Sequence[float],
         sh_degree: int,
+        skips: Sequence[bool],
     ) -> View: ...
 
 class Frame:

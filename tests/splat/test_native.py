@@ -12,7 +12,7 @@ import os
 import signal
 import subprocess
 import sys
-from dataclasses import replace
+from dataclasses import fields, replace
 
 import numpy as np
 import pytest
@@ -22,7 +22,7 @@ from hypothesis import strategies as st
 
 from xrgs.splat.cameras import Camera
 from xrgs.splat.rasterize import rasterize
-from xrgs.splat.settings import RasterSettings
+from xrgs.splat.settings import RasterSettings, Skips
 
 native = pytest.importorskip("xrgs._native")
 
@@ -32,6 +32,10 @@ GRADIENT_FACTOR = 5.0
 """Gradients may err by this much more than torch's own float32 (norms over all Gaussians)."""
 GRADIENT_FLOOR = 2e-6
 """Of a gradient's norm: below this an error is rounding, whoever makes it."""
+SHAPE_FLOOR = 1e-3
+"""The same of scales and quaternions, in needles and in views of a few pixels: they come of second
+moments about the tile's centre, in float32, whose larger parts cancel (2e-4 was seen). In a scene
+of hundreds of Gaussians this is lost in what torch's float32 loses, too."""
 
 
 def rounded(camera):
@@ -45,7 +49,7 @@ def single(scene):
 
 def run(scene, camera, raster, backend, dtype, v_image=None, v_alpha=None, *, sh_degree=3):
     """The render, and the gradients of <image, v_image> + <alpha, v_alpha> by name."""
-    leaves = {name: scene[name].to(dtype).requires_grad_() for name in NAMES}
+    leaves = {name: scene[name].detach().to(dtype, copy=True).requires_grad_() for name in NAMES}
     offset = torch.zeros(len(leaves["means"]), 2, dtype=dtype, requires_grad=True)
     render = rasterize(
         *leaves.values(),
@@ -79,7 +83,7 @@ def band_of(scene, camera, raster, exact, sh_degree):
     return band
 
 
-def check(scene, camera, raster=None, *, sh_degree=3, seed=0):
+def check(scene, camera, raster=None, *, sh_degree=3, seed=0, shape_floor=SHAPE_FLOOR):
     """Compare image, alpha, visibility and gradients with the oracle's."""
     raster = raster or RasterSettings()
     camera, scene = rounded(camera), single(scene)
@@ -108,10 +112,10 @@ def check(scene, camera, raster=None, *, sh_degree=3, seed=0):
     assert torch.equal(ours.visible, theirs.visible)
     for name, expected in exact_gradients.items():
         got = gradients[name]
+        floor = shape_floor if name in ("scales", "quats") else GRADIENT_FLOOR
         assert torch.isfinite(got).all(), name
         allowed = (
-            GRADIENT_FACTOR * (single_gradients[name] - expected).norm()
-            + GRADIENT_FLOOR * expected.norm()
+            GRADIENT_FACTOR * (single_gradients[name] - expected).norm() + floor * expected.norm()
         )
         assert (got - expected).norm() <= allowed, name
         assert (got[~ours.visible] == 0).all(), name
@@ -124,7 +128,8 @@ def check(scene, camera, raster=None, *, sh_degree=3, seed=0):
 @pytest.mark.parametrize("sh_degree", [0, 1, 2, 3])
 def test_a_scene_of_every_degree(isa, make_camera, make_scene, sh_degree):
     camera = make_camera(50, 37, turned=True)
-    ours, _, band = check(make_scene(300, camera, seed=1), camera, sh_degree=sh_degree)
+    scene = make_scene(300, camera, seed=1)
+    ours, _, band = check(scene, camera, sh_degree=sh_degree, shape_floor=GRADIENT_FLOOR)
     assert band.float().mean() < 0.1
     assert ours.image.max() > 0.3
     assert 0 < ours.evaluations < 300 * 50 * 37
@@ -254,6 +259,20 @@ def test_sizes(isa, make_camera, make_scene, width, height, count):
     check(make_scene(count, camera, seed=width + count), camera)
 
 
+@pytest.mark.parametrize("antialiased", [False, True])
+def test_absgrad(isa, make_camera, make_scene, antialiased):
+    camera = make_camera(50, 37, turned=True)
+    scene = make_scene(300, camera, seed=13, size=3.0)
+    raster = RasterSettings(antialiased=antialiased, background=(0.3, 0.6, 0.1))
+    _, plain, _ = check(scene, camera, raster)
+    _, absolute, _ = check(scene, camera, replace(raster, absgrad=True))
+    for name in NAMES:
+        assert torch.equal(absolute[name], plain[name]), name
+    offset = plain["means2d_offset"].abs()
+    assert (absolute["means2d_offset"] >= offset - 1e-4 * offset.max()).all()
+    assert absolute["means2d_offset"].sum() > 1.5 * offset.sum()
+
+
 @given(
     seed=st.integers(0, 2**31),
     count=st.integers(0, 80),
@@ -272,6 +291,52 @@ def test_random_scenes(
     scene["scales"][::2, 0] *= stretch
     scene["means"][1::7] -= 2 * (scene["means"][1::7] - camera.position)  # behind
     check(scene, camera, RasterSettings(antialiased=antialiased, background=(0.3, 0.6, 0.1)))
+
+
+# --- what may be skipped ------------------------------------------------------------------------
+
+
+def render_with(skips, scene, camera):
+    """The render, its gradients, and what each skip is there to lessen."""
+    from xrgs.splat.native import render
+
+    leaves = {name: scene[name].clone().requires_grad_() for name in NAMES}
+    done = render(*leaves.values(), camera, RasterSettings(), 3, None, skips)
+    frame = done.image.grad_fn.frame
+    work = {
+        "out_of_view": int(done.visible.sum()),
+        "sub_threshold": int(done.visible.sum()),
+        "tiles": frame.pairs,
+        "blocks": done.evaluations,
+        "saturated": done.evaluations,
+    }
+    done.image.square().sum().backward()
+    return done, {name: leaf.grad for name, leaf in leaves.items()}, work
+
+
+@pytest.mark.parametrize("name", [*(field.name for field in fields(Skips)), "all"])
+def test_what_is_skipped_makes_no_difference(isa, make_camera, make_scene, name):
+    camera = rounded(make_camera(60, 50, focal=60.0, turned=True))
+    scene = single(make_scene(1500, camera, seed=14, size=3.0))
+    scene["opacities"][::3] = 0.99
+    scene["opacities"][1::9] = torch.linspace(0, 1 / 255, 167)
+    scene["scales"][::4, 0] *= 8
+    scene["means"][::50] -= 100 * camera.viewmat[0, :3]  # far to the left
+    names = [field.name for field in fields(Skips)] if name == "all" else [name]
+    usual, usual_gradients, usual_work = render_with(None, scene, camera)
+    done, gradients, work = render_with(Skips(**dict.fromkeys(names, False)), scene, camera)
+    assert torch.equal(done.image, usual.image)
+    assert torch.equal(done.alpha, usual.alpha)
+    for key, gradient in gradients.items():
+        error = (gradient - usual_gradients[key]).norm()
+        assert error <= 1e-5 * usual_gradients[key].norm(), key
+        assert (gradient[~usual.visible] == 0).all(), key
+    for skipped in names:
+        assert work[skipped] > usual_work[skipped], skipped
+    exact, _ = run(scene, camera, RasterSettings(), "torch", torch.float64)
+    error = (done.image.double() - exact.image).abs().detach()
+    assert error.mean() <= 1e-6
+    assert error.max() <= 2e-3
 
 
 # --- the same each time -------------------------------------------------------------------------
@@ -422,8 +487,10 @@ def make_view(camera, **changes):
         "alpha_max": 0.99,
         "transmittance_min": 1e-4,
         "antialiased": False,
+        "absgrad": False,
         "background": (0.0, 0.0, 0.0),
         "sh_degree": 3,
+        "skips": (True,) * 5,
     }
     options["intrinsics"] = [float(value) for value in options["intrinsics"]]
     return native.View.make(**(options | changes))

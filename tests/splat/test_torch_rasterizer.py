@@ -229,6 +229,35 @@ def test_offset_moves_the_means_and_gathers_the_image_plane_gradient(make_camera
     assert (offset.grad[~by_offset.visible] == 0).all()
 
 
+def test_absgrad_sums_the_absolute_gradients_of_single_pixels(make_camera, make_scene):
+    camera = make_camera(11, 9)  # two tiles by two
+    scene = make_scene(12, camera, seed=5, size=3.0)
+    generator = torch.Generator().manual_seed(0)
+    v_image = torch.randn(9, 11, 3, generator=generator, dtype=torch.float64)
+    v_alpha = torch.randn(9, 11, generator=generator, dtype=torch.float64)
+
+    def values(*, absgrad):
+        leaves = with_gradients(scene)
+        leaves["means2d_offset"] = torch.full((12, 2), 0.3, dtype=torch.float64).requires_grad_()
+        raster = RasterSettings(absgrad=absgrad)
+        render = draw(leaves, camera, raster, means2d_offset=leaves["means2d_offset"])
+        return leaves, (render.image * v_image).sum(-1) + render.alpha * v_alpha  # [H, W]
+
+    leaves, plain = values(absgrad=False)
+    expected = torch.zeros(12, 2, dtype=torch.float64)
+    for pixel in plain.flatten():
+        (gradient,) = torch.autograd.grad(pixel, leaves["means2d_offset"], retain_graph=True)
+        expected += gradient.abs()
+    plain.sum().backward()
+    absolute, total = values(absgrad=True)
+    torch.testing.assert_close(total, plain)
+    total.sum().backward()
+    torch.testing.assert_close(absolute["means2d_offset"].grad, expected)
+    assert (expected.sum() > 1.5 * leaves["means2d_offset"].grad.abs().sum()).all()
+    for name in NAMES:
+        torch.testing.assert_close(absolute[name].grad, leaves[name].grad)
+
+
 # --- compositing's rules, on one pixel ----------------------------------------------------------
 
 
@@ -447,9 +476,10 @@ def test_evaluations_are_list_lengths_times_pixels(pixel):
     assert render.evaluations == 3 * torch_rasterizer.TILE**2
 
 
+@pytest.mark.parametrize("absgrad", [False, True])
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_bytes_of_a_batch_are_what_autograd_keeps(dtype):
-    entries = torch.rand(3, 50, 9, dtype=dtype).requires_grad_()
+def test_bytes_of_a_batch_are_what_autograd_keeps(dtype, absgrad):
+    entries = torch.rand(3, 50, 11 if absgrad else 9, dtype=dtype).requires_grad_()
     corner = torch.zeros(3, 2, dtype=dtype)
     kept = {}
 
@@ -460,8 +490,9 @@ def test_bytes_of_a_batch_are_what_autograd_keeps(dtype):
         return tensor
 
     with torch.autograd.graph.saved_tensors_hooks(keep, lambda tensor: tensor):
-        torch_rasterizer.composite(entries, corner, 8, RasterSettings())
-    assert sum(kept.values()) == 3 * 50 * 64 * torch_rasterizer.alpha_bytes(dtype.itemsize)
+        torch_rasterizer.composite(entries, corner, 8, RasterSettings(absgrad=absgrad))
+    per_alpha = torch_rasterizer.alpha_bytes(dtype.itemsize, absgrad=absgrad)
+    assert sum(kept.values()) == 3 * 50 * 64 * per_alpha
 
 
 def test_buffer_bytes_grow_with_the_lists(make_camera, make_scene):

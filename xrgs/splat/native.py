@@ -6,6 +6,7 @@ leaves for its backward pass lives in a `Frame`, whose memory is used again by t
 
 from __future__ import annotations
 
+from dataclasses import astuple
 from typing import Any
 
 import torch
@@ -15,7 +16,7 @@ from torch.autograd.function import once_differentiable
 from xrgs import _native
 from xrgs.splat.cameras import Camera
 from xrgs.splat.rasterize import Render
-from xrgs.splat.settings import RasterSettings
+from xrgs.splat.settings import RasterSettings, Skips
 from xrgs.splat.sh import MAX_DEGREE, bases
 
 
@@ -30,8 +31,12 @@ def render(
     settings: RasterSettings,
     sh_degree: int,
     means2d_offset: Tensor | None,
+    skips: Skips | None = None,
 ) -> Render:
     """`rasterize` on the compiled kernels. Shapes, units and result as there.
+
+    With some `skips` off (None: all on) the image is the same and takes longer; without
+    `out_of_view` or `sub_threshold` what these would drop counts as visible.
 
     Uses as many threads as torch (`torch.set_num_threads`); the result is bitwise the same for any
     number of them.
@@ -51,7 +56,7 @@ def render(
     if shN.shape[1] < rest:
         raise ValueError(f"sh_degree {sh_degree} needs shN of [N, {rest}, 3], got {[*shN.shape]}")
     frame = _native.Frame()
-    view = _view(camera, settings, sh_degree)
+    view = _view(camera, settings, sh_degree, skips or Skips())
     image, alpha = _Rasterize.apply(frame, view, *parameters, means2d_offset)
     return Render(
         image=image,
@@ -62,7 +67,7 @@ def render(
     )
 
 
-def _view(camera: Camera, settings: RasterSettings, sh_degree: int) -> _native.View:
+def _view(camera: Camera, settings: RasterSettings, sh_degree: int, skips: Skips) -> _native.View:
     K = camera.K
     return _native.View.make(
         viewmat=camera.viewmat.flatten().tolist(),
@@ -75,8 +80,10 @@ def _view(camera: Camera, settings: RasterSettings, sh_degree: int) -> _native.V
         alpha_max=settings.alpha_max,
         transmittance_min=settings.transmittance_min,
         antialiased=settings.antialiased,
+        absgrad=settings.absgrad,
         background=settings.background,
         sh_degree=sh_degree,
+        skips=astuple(skips),
     )
 
 

@@ -58,7 +58,7 @@ def rasterize(
         settings: how Gaussians become pixels.
         sh_degree: highest band that is on, at most the bands of shN.
         means2d_offset: [N, 2] px, added to the projected means: its gradient is the image-plane
-            gradient that densification reads.
+            gradient that densification reads (with `settings.absgrad`, of absolute values).
         backend: `torch`, `native` or `auto` (`resolve_backend`).
 
     Returns:

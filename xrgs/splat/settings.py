@@ -31,6 +31,29 @@ class RasterSettings:
     """Compensate the opacity for `eps2d`, as Mip-Splatting's 2D filter does."""
     background: tuple[float, float, float] = (0.0, 0.0, 0.0)
     """Colour behind the last Gaussian."""
+    absgrad: bool = False
+    """The gradient of `means2d_offset` is, per axis, the sum of its absolute values over pixels, so
+    that pixels which pull a Gaussian apart do not cancel (AbsGS; gsplat's `absgrad`)."""
+
+
+@dataclass(frozen=True)
+class Skips:
+    """Work that the compiled renderer leaves out, each kind as long as it is true.
+
+    The image is the same with any of them off, to rounding at the cuts; they are here to be
+    measured.
+    """
+
+    out_of_view: bool = True
+    """Gaussians whose box of reach does not overlap the image."""
+    sub_threshold: bool = True
+    """Gaussians whose opacity is below `alpha_min`."""
+    tiles: bool = True
+    """16x16 px tiles that a Gaussian's box of reach overlaps, but not its ellipse."""
+    blocks: bool = True
+    """4x4 px blocks of a tile that a Gaussian does not reach."""
+    saturated: bool = True
+    """What lies behind the last Gaussian that any pixel of a block composites."""
 
 
 @dataclass

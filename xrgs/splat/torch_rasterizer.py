@@ -9,6 +9,8 @@ the Gaussians that reach it -> composite tiles in padded batches of similar list
 
 from __future__ import annotations
 
+from typing import Any
+
 import torch
 from torch import Tensor
 from torch.nn.functional import embedding, normalize, pad
@@ -50,11 +52,13 @@ def render(
     if means2d_offset is None:
         means2d_offset = means.new_zeros((len(means), 2))
     grid = Grid(camera.width, camera.height, tile)
+    # With absgrad the means hold the offset's value, and pixels its gradient: see `_PixelOffset`.
+    mean_offset = means2d_offset.detach() if settings.absgrad else means2d_offset
 
     def project_some(chosen: Tensor) -> Projected:
         shape = (means[chosen], quats[chosen], scales[chosen], opacities[chosen])
         flat = project(*shape, camera, settings)
-        return flat._replace(means2d=flat.means2d + means2d_offset[chosen])
+        return flat._replace(means2d=flat.means2d + mean_offset[chosen])
 
     with torch.no_grad():
         in_front = torch.nonzero(depths(means, camera) > settings.near)[:, 0]
@@ -64,7 +68,10 @@ def render(
     flat = project_some(chosen)
     dirs = normalize(means[chosen] - camera.position.to(means), dim=-1)
     colors = sh_to_colors(sh_degree, dirs, sh0[chosen], shN[chosen])
-    records = torch.cat([whitened(flat), colors], dim=-1)  # [M, 9]
+    columns = [whitened(flat), colors]
+    if settings.absgrad:
+        columns.append(means2d_offset[chosen] - mean_offset[chosen])
+    records = torch.cat(columns, dim=-1)  # [M, 9], or [M, 11] with absgrad
 
     with torch.no_grad():
         pairs = list_pairs(flat, grid, settings)
@@ -89,8 +96,9 @@ def _composite_batches(
     records: Tensor, batches: list[Batch], index: Tensor, grid: Grid, settings: RasterSettings
 ) -> tuple[Tensor, int]:
     """Composite every tile: [tiles, tile^2, 4] in row-major order, and the bytes that took."""
-    null = records.new_tensor([[0.0, 0.0, 0.0, 0.0, 0.0, float("-inf"), 0.0, 0.0, 0.0]])
-    listed = embedding(index, torch.cat([records, null]))  # [sum of B K, 9]
+    null = records.new_zeros((1, records.shape[1]))
+    null[:, 5] = float("-inf")  # the log of its opacity
+    listed = embedding(index, torch.cat([records, null]))  # [sum of B K, 9 or 11]
     parts = listed.split([len(batch.tiles) * batch.longest for batch in batches])
     outputs = []
     for batch, part in zip(batches, parts, strict=True):
@@ -108,16 +116,34 @@ def _composite_batches(
         outputs.append(rgba)
     order = torch.argsort(torch.cat([batch.tiles for batch in batches]))
     canvas = torch.cat(outputs)[order]
-    peak = max(part.shape[0] for part in parts) * grid.tile**2 * alpha_bytes(records.itemsize)
+    an_alpha = alpha_bytes(records.itemsize, absgrad=settings.absgrad)
+    peak = max(part.shape[0] for part in parts) * grid.tile**2 * an_alpha
     return canvas, _bytes(listed, canvas) + peak
 
 
-def alpha_bytes(itemsize: int) -> int:
+def alpha_bytes(itemsize: int, *, absgrad: bool = False) -> int:
     """What `composite` keeps for its backward pass, bytes an alpha value.
 
-    u, the exponential, alpha, 1 - alpha, after, before and weights, and two masks.
+    u, the exponential, alpha, 1 - alpha, after, before and weights, and two masks; with absgrad v
+    and the offset, too.
     """
-    return 7 * itemsize + 2
+    return (10 if absgrad else 7) * itemsize + 2
+
+
+class _PixelOffset(torch.autograd.Function):
+    """An offset [B, K, 2] handed to every pixel: x and y, [B, K, tile, tile] each.
+
+    The offset's gradient is the sum of the absolute values of its pixels' gradients.
+    """
+
+    @staticmethod
+    def forward(_ctx: Any, offset: Tensor, tile: int) -> tuple[Tensor, Tensor]:
+        x, y = offset[..., None, None].expand(-1, -1, -1, tile, tile).unbind(2)
+        return x.clone(), y.clone()
+
+    @staticmethod
+    def backward(_ctx: Any, v_x: Tensor, v_y: Tensor) -> tuple[Tensor, None]:
+        return torch.stack([v.abs().sum((-2, -1)) for v in (v_x, v_y)], dim=-1), None
 
 
 def composite(entries: Tensor, corner: Tensor, tile: int, settings: RasterSettings) -> Tensor:
@@ -127,7 +153,8 @@ def composite(entries: Tensor, corner: Tensor, tile: int, settings: RasterSettin
     pixel ends before the Gaussian that would leave it transmittance_min or less.
 
     Args:
-        entries: [B, K, 9] a tile's Gaussians: `whitened` and colour.
+        entries: [B, K, 9] a tile's Gaussians: `whitened` and colour; with absgrad [B, K, 11], the
+            offset, whose value is zero, behind them.
         corner: [B, 2] each tile's top left, px.
         tile: side of a tile, px.
         settings: the cut-offs.
@@ -140,7 +167,12 @@ def composite(entries: Tensor, corner: Tensor, tile: int, settings: RasterSettin
     dx = corner[:, None, :1] + centre - x  # [B, K, tile]
     dy = corner[:, None, 1:] + centre - y
     u = (p * dx)[:, :, None, :] - (s * dy)[:, :, :, None]  # [B, K, tile, tile]
-    row = (log_opacity - (q * dy).square())[:, :, :, None]
+    v = (q * dy)[:, :, :, None]  # [B, K, tile, 1]
+    if settings.absgrad:
+        offset_x, offset_y = _PixelOffset.apply(entries[..., 9:], tile)
+        u = u - p[..., None] * offset_x + s[..., None] * offset_y
+        v = v - q[..., None] * offset_y
+    row = log_opacity[..., None] - v.square()
     alpha = torch.exp(torch.addcmul(row, u, u, value=-1)).clamp_max(settings.alpha_max)
     alpha = alpha.flatten(2)  # [B, K, tile^2]
     alpha = torch.where(alpha < settings.alpha_min, 0.0, alpha)
@@ -149,7 +181,7 @@ def composite(entries: Tensor, corner: Tensor, tile: int, settings: RasterSettin
     after = torch.cumprod(1 - alpha, dim=1)  # [B, K, tile^2] transmittance behind each
     before = torch.cat([torch.ones_like(after[:, :1]), after[:, :-1]], dim=1)
     weights = torch.where(after > settings.transmittance_min, alpha * before, 0.0)
-    colors = pad(entries[..., 6:], (0, 1), value=1.0)  # [B, K, 4]
+    colors = pad(entries[..., 6:9], (0, 1), value=1.0)  # [B, K, 4]
     return weights.transpose(1, 2) @ colors
 
 

@@ -30,9 +30,11 @@ XRGS_INLINE Ints last_tile(Floats position, int size) {
 }
 
 XRGS_INLINE void columns_of(const Ellipse& e, Floats row, const View& view, Columns& out) {
-  const Floats top = fma(row, splat(static_cast<float>(kTile)), splat(0.5f));
+  // In a strip without end the ellipse's span is that of its box.
+  const float beyond = view.skips.tiles ? 0.0f : 1e9f;
+  const Floats top = fma(row, splat(static_cast<float>(kTile)), splat(0.5f - beyond));
   Floats left, right;
-  const Mask reached = span(e, top, top + splat(kTile - 1.0f), left, right);
+  const Mask reached = span(e, top, top + splat(kTile - 1.0f + 2.0f * beyond), left, right);
   // Kept within what an integer holds.
   left = min(left, splat(static_cast<float>(view.width) + kTile));
   store(out.begin, first_tile(left));

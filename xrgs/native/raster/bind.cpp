@@ -186,7 +186,8 @@ Outputs backward(LentFrame& frame, const Image& image_gradient, const Plane& alp
 
 View make_view(const Matrix4& viewmat, const std::array<float, 4>& intrinsics, int width, int height,
                float near, float eps2d, float alpha_min, float alpha_max, float transmittance_min,
-               bool antialiased, const std::array<float, 3>& background, int degree) {
+               bool antialiased, bool absgrad, const std::array<float, 3>& background, int degree,
+               const std::array<bool, 5>& skips) {
   if (width < 1 || height < 1) throw nb::value_error("width and height must be at least 1");
   if (degree < 0 || degree > 3) throw nb::value_error("sh_degree must be 0 to 3");
   View v;
@@ -214,7 +215,9 @@ View make_view(const Matrix4& viewmat, const std::array<float, 4>& intrinsics, i
   v.alpha_max = alpha_max;
   v.transmittance_min = transmittance_min;
   v.antialiased = antialiased;
+  v.absgrad = absgrad;
   v.degree = degree;
+  v.skips = {skips[0], skips[1], skips[2], skips[3], skips[4]};
   return v;
 }
 
@@ -244,7 +247,9 @@ void bind_raster(nb::module_& m) {
   nb::class_<View>(m, "View", "A camera and the settings of the rasterizer.")
       .def_static("make", &make_view, nb::kw_only(), "viewmat"_a, "intrinsics"_a, "width"_a,
                   "height"_a, "near"_a, "eps2d"_a, "alpha_min"_a, "alpha_max"_a,
-                  "transmittance_min"_a, "antialiased"_a, "background"_a, "sh_degree"_a);
+                  "transmittance_min"_a, "antialiased"_a, "absgrad"_a, "background"_a,
+                  "sh_degree"_a, "skips"_a,
+                  "skips: out_of_view, sub_threshold, tiles, blocks, saturated.");
   nb::class_<LentFrame>(m, "Frame", "One rendered view's memory, from forward to backward.")
       .def(nb::init<>())
       .def("forward", &forward, "view"_a, "means"_a, "quats"_a, "scales"_a, "opacities"_a, "sh0"_a,

@@ -4,6 +4,8 @@
 // gains alpha T color, and its transmittance T becomes T (1 - alpha), unless that is
 // transmittance_min or less: then this Gaussian is not composited and the pixel is finished.
 // T is never frozen: it only falls, so the test stays failed, and what was kept is a prefix.
+//
+// With the view's skips off, every block goes through the tile's list, and to its end.
 #include "raster/batch.h"
 #include "raster/ellipse.h"
 #include "raster/stages.h"
@@ -73,7 +75,17 @@ void load_batch(const Frame& frame, const Tile& tile, const Entry* entries, int 
   }
 }
 
-// Composite a block's list. Returns how far it went: to the end, or to where no pixel is left.
+// As if each Gaussian reached every block.
+void hit_all(int count, std::uint16_t (&hits)[kBlocks][kBatch / 16]) {
+  for (int at = 0; at < count; at += 16) {
+    const int lanes = count - at < 16 ? count - at : 16;
+    for (auto& block : hits) block[at / 16] = static_cast<std::uint16_t>((1u << lanes) - 1u);
+  }
+}
+
+// Composite a block's list. Returns how far it went: to the end, or (with Stop) to where no pixel
+// is left.
+template <bool Stop>
 int composite_block(const Rows& rows, const std::uint8_t* list, int count, int index,
                     const Cuts& cuts, Block& block) {
   const Floats x = pixels_x(index), y = pixels_y(index);
@@ -91,7 +103,7 @@ int composite_block(const Rows& rows, const std::uint8_t* list, int count, int i
     green = fma(weight, splat(g[kGreen]), green);
     blue = fma(weight, splat(g[kBlue]), blue);
     left = select(kept, t, left);
-    if (++at % kCheckEvery == 0 && !any(kept)) break;
+    if (++at % kCheckEvery == 0 && Stop && !any(kept)) break;
   }
   store(block.t, t);
   store(block.left, left);
@@ -141,6 +153,7 @@ void composite(Frame& frame, int index, float* image, float* alpha) {
   const View& view = frame.view;
   const Tile tile(frame, index);
   const Cuts cuts(view);
+  const bool stop = view.skips.saturated;
   Block blocks[kBlocks];
   alignas(64) Rows rows;
   std::uint32_t alive = start_blocks(tile, view, blocks);
@@ -152,16 +165,18 @@ void composite(Frame& frame, int index, float* image, float* alpha) {
     const Entry* entries = frame.entries.data() + at;
     std::uint16_t hits[kBlocks][kBatch / 16];
     load_batch(frame, tile, entries, count, rows, hits);
+    if (!view.skips.blocks) hit_all(count, hits);
     prefetch_records(frame, at + kBatch);  // the next batch's, or the next tile's
     for (int b = 0; b < kBlocks; ++b) {
       batch->counts[b] = 0;
       if ((alive >> b & 1u) == 0) continue;
       store(batch->before[b], load(blocks[b].t));
       const int listed = compact(hits[b], count, batch->lists[b]);
-      const int went = composite_block(rows, batch->lists[b], listed, b, cuts, blocks[b]);
+      const int went = stop ? composite_block<true>(rows, batch->lists[b], listed, b, cuts, blocks[b])
+                            : composite_block<false>(rows, batch->lists[b], listed, b, cuts, blocks[b]);
       batch->counts[b] = static_cast<std::uint8_t>(went);
       entries_done += went;
-      if (!any(cuts.transmittance_min < load(blocks[b].t))) alive &= ~(1u << b);
+      if (stop && !any(cuts.transmittance_min < load(blocks[b].t))) alive &= ~(1u << b);
     }
   }
   frame.batches_done[tile.index] = done;

@@ -11,7 +11,8 @@
 // the T it left at the batch's start, noting alpha and w; then back to front for R, summing over
 // the block's pixels as 4x4 matrices: with g a matrix, X = (1, x, x^2) in each column and
 // Y = (1, y, y^2) in each row, both from the tile's centre, Y^T g X has the nine moments; with w,
-// the sum of w v. At the batch's end the moments are moved to each Gaussian's mean.
+// the sum of w v. At the batch's end the moments are moved to each Gaussian's mean. Absolute values
+// have no moments: with absgrad the derivatives by the mean are taken pixel by pixel.
 #include "raster/batch.h"
 #include "raster/stages.h"
 
@@ -102,8 +103,13 @@ XRGS_INLINE Floats times_columns(Floats a, const Floats (&factors)[4]) {
   return fma(splat_column<3>(a), factors[3], fma(splat_column<1>(a), factors[1], even));
 }
 
+// Places of a row of sums that no moment needs.
+constexpr int kAbsU = 3, kAbsV = 7;
+
 // Back to front: each entry's sums over the block's pixels are added to its row of sums, which has
-// in row i < 3, column j < 3 the sum of g y^i x^j, and in row 3 that of w v.
+// in row i < 3, column j < 3 the sum of g y^i x^j, and in row 3 that of w v; with Absolute in the
+// last column of rows 0 and 1 those of |g u| and |g (q v - s u)|.
+template <bool Absolute>
 XRGS_INLINE void walk_back(const Rows& rows, const std::uint8_t* list, int count, int block,
                            const Cuts& cuts, const Incoming& in, const Notes& notes, float* behind,
                            Rows& sums) {
@@ -112,6 +118,7 @@ XRGS_INLINE void walk_back(const Rows& rows, const std::uint8_t* list, int count
   const Floats colors[4] = {load(in.colors[0]), load(in.colors[1]), load(in.colors[2]),
                             load(in.colors[3])};
   const Powers powers(block);
+  const Floats x = pixels_x(block), y = pixels_y(block);  // unused unless Absolute
   Floats r = load(behind);
   for (int at = count - 1; at >= 0; --at) {
     const float* g = rows[list[at]];
@@ -129,6 +136,12 @@ XRGS_INLINE void walk_back(const Rows& rows, const std::uint8_t* list, int count
     even = fma(splat_row<2>(by_row), powers.y[2], even);
     odd = fma(splat_row<3>(by_row), powers.y[3], odd);
     store(place, add_last_row(even + odd, sum_rows(times_columns(weight, colors))));
+    if constexpr (Absolute) {
+      const Floats dx = x - splat(g[kX]), dy = y - splat(g[kY]);
+      const Floats u = fnma(splat(g[kS]), dy, splat(g[kP]) * dx), v = splat(g[kQ]) * dy;
+      place[kAbsU] += sum(abs(gradient * u));
+      place[kAbsV] += sum(abs(gradient * fnma(splat(g[kS]), u, splat(g[kQ]) * v)));
+    }
   }
   store(behind, r);
 }
@@ -155,6 +168,10 @@ void write_slots(const Rows& rows, const Rows& sums, const Entry* entries, int c
     out[kWr] = m[12];
     out[kWg] = m[13];
     out[kWb] = m[14];
+    // ln alpha = ln 2 (level - u^2 - v^2), and du/dx = -p, du/dy = s, dv/dy = -q by the mean.
+    const Floats twice = splat(2.0f * 0.693147181f);
+    out[kAbsX] = twice * means[kP] * m[kAbsU];
+    out[kAbsY] = twice * m[kAbsV];
     for (int i = kSlotFields; i < 16; ++i) out[i] = splat(0.0f);
     transpose(out);
     for (int i = 0; i < 16 && at + i < count; ++i)
@@ -177,10 +194,9 @@ void load_batch(const Frame& frame, const Tile& tile, const Entry* entries, int 
   }
 }
 
-}  // namespace
-
-void composite_backward(const Frame& frame, int index, const float* image_gradient,
-                        const float* alpha_gradient, float* slots) {
+template <bool Absolute>
+void backward_tile(const Frame& frame, int index, const float* image_gradient,
+                   const float* alpha_gradient, float* slots) {
   const View& view = frame.view;
   const Tile tile(frame, index);
   if (tile.begin == tile.end) return;
@@ -206,11 +222,21 @@ void composite_backward(const Frame& frame, int index, const float* image_gradie
       const int listed = batch.counts[b];
       if (listed == 0) continue;
       walk_forward(rows, batch.lists[b], listed, b, cuts, batch.before[b], notes);
-      walk_back(rows, batch.lists[b], listed, b, cuts, incoming[b], notes, behind[b], sums);
+      walk_back<Absolute>(rows, batch.lists[b], listed, b, cuts, incoming[b], notes, behind[b], sums);
     }
     write_slots(rows, sums, entries + at, count, slots);
   }
   stream_fence();
+}
+
+}  // namespace
+
+void composite_backward(const Frame& frame, int tile, const float* image_gradient,
+                        const float* alpha_gradient, float* slots) {
+  if (frame.view.absgrad)
+    backward_tile<true>(frame, tile, image_gradient, alpha_gradient, slots);
+  else
+    backward_tile<false>(frame, tile, image_gradient, alpha_gradient, slots);
 }
 
 }  // namespace XRGS_NS

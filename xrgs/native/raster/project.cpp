@@ -1,7 +1,8 @@
 // Projection, forward: parameters -> records, sixteen Gaussians in lanes.
 //
 // A Gaussian is visible if it is in front of the near plane, its opacity reaches alpha_min, and the
-// box of its ellipse of reach (where opacity exp(-r^2 / 2) = alpha_min) overlaps the image.
+// box of its ellipse of reach (where opacity exp(-r^2 / 2) = alpha_min) overlaps the image. With
+// the view's skips off, Gaussians that fail one of the last two are projected all the same.
 #include "raster/sh.h"
 #include "raster/stages.h"
 #include "vector_math.h"
@@ -64,10 +65,14 @@ XRGS_INLINE Mask is_visible(const Projected& o, const View& v, Floats reach2) {
   const Floats r2 = splat(2.0f / kLog2e) * reach2, zero = splat(0.0f), huge = splat(1e18f);
   const Floats extent_x = sqrt(r2 * o.xx), extent_y = sqrt(r2 * o.yy);
   const Mask usable = (zero < o.det) & (o.det < splat(3e38f)) & (extent_x < huge) & (extent_y < huge);
-  const Mask overlaps = (zero < o.mean_x + extent_x) & (zero < o.mean_y + extent_y) &
-                        (o.mean_x - extent_x < splat(static_cast<float>(v.width))) &
-                        (o.mean_y - extent_y < splat(static_cast<float>(v.height)));
-  return o.front & (splat(v.alpha_min) <= o.opacity) & usable & overlaps;
+  const bool anywhere = !v.skips.out_of_view;  // then only what overflows is dropped
+  const Floats left = anywhere ? -huge : zero;
+  const Floats right = anywhere ? huge : splat(static_cast<float>(v.width));
+  const Floats bottom = anywhere ? huge : splat(static_cast<float>(v.height));
+  const Mask overlaps = (left < o.mean_x + extent_x) & (left < o.mean_y + extent_y) &
+                        (o.mean_x - extent_x < right) & (o.mean_y - extent_y < bottom);
+  const Floats opacity_min = splat(v.skips.sub_threshold ? v.alpha_min : kSmallest);
+  return o.front & (opacity_min <= o.opacity) & usable & overlaps;
 }
 
 XRGS_INLINE void store_records(const Projected& o, Floats level, Floats reach2, const Vector3& color,

@@ -260,7 +260,9 @@ void backward_sixteen(const Parameters& p, const Frame& frame, const float* sums
   const Shade& shade = frame.shades[static_cast<std::size_t>(group / 16)];
   const Vector3 by_color = color_backward<Degree>(p, view, in, shade, sum, group, lanes, out, harmonics);
   shape.mean = add(shape.mean, splat(1.0f), by_color);
-  write_shape(shape, v_opacity, v.mean_x, v.mean_y, mask_of(visible), group, lanes, out);
+  const Floats v_x2d = view.absgrad ? sum[kAbsX] : v.mean_x;
+  const Floats v_y2d = view.absgrad ? sum[kAbsY] : v.mean_y;
+  write_shape(shape, v_opacity, v_x2d, v_y2d, mask_of(visible), group, lanes, out);
 }
 
 template <int Degree>

@@ -15,6 +15,15 @@ constexpr int kBlocks = 16;       // of a tile, row by row
 constexpr int kBatch = 128;       // Gaussians of a tile that are composited at once
 constexpr int kChunk = 1024;      // Gaussians that a task projects; a multiple of 16
 
+// Work that is left out, each kind as long as it is true; the image is the same without.
+struct Skips {
+  bool out_of_view;    // Gaussians whose box of reach does not overlap the image
+  bool sub_threshold;  // Gaussians whose opacity is below alpha_min
+  bool tiles;          // tiles that the box of reach overlaps, but not the ellipse
+  bool blocks;         // blocks of a tile that the ellipse does not reach
+  bool saturated;      // what lies behind the last Gaussian that a block's pixels composite
+};
+
 // The camera and the settings, as the kernels need them.
 struct View {
   float rotation[9];  // world to camera, row by row
@@ -28,7 +37,9 @@ struct View {
   float alpha_max, transmittance_min;
   float background[3];
   bool antialiased;
+  bool absgrad;  // the offsets' gradient is of each pixel's gradient the absolute value, summed
   int degree;  // highest band of the spherical harmonics that is on
+  Skips skips;
 
   int columns() const { return (width + kTile - 1) / kTile; }
   int rows() const { return (height + kTile - 1) / kTile; }
@@ -96,8 +107,9 @@ struct Pair {
 };
 
 // A pair's sums over its pixels, with g = dL/d(ln alpha), w = the weight of its colour and
-// v = dL/d(image): g, g dx, g dy, g dx^2, g dx dy, g dy^2, and w v for each colour.
-enum SlotField { kG, kGx, kGy, kGxx, kGxy, kGyy, kWr, kWg, kWb, kSlotFields };
+// v = dL/d(image): g, g dx, g dy, g dx^2, g dx dy, g dy^2, and w v for each colour; with absgrad
+// also |g d(ln alpha)/dx| and |g d(ln alpha)/dy|, x and y the mean's, else zeros.
+enum SlotField { kG, kGx, kGy, kGxx, kGxy, kGyy, kWr, kWg, kWb, kAbsX, kAbsY, kSlotFields };
 constexpr int kSlotSize = 16;  // floats: one cache line
 
 // Work of one batch of one tile, kept from the forward pass for the backward pass.
