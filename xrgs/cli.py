@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import cast
 
 import hydra
+from hydra.errors import HydraException
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
@@ -108,6 +109,9 @@ xrgs-data download DATASET [SCENE...] [data_root=FOLDER] [url=URL] [sha256=HEX]
     DATASET: {data}
 xrgs-data lpips [from=FILE_OR_URL]
     Fetches the weights of LPIPS; without them its row of the tables is n/a.
+xrgs-data inspect VARIANT_FOLDER | scene=NAME [KEY=VALUE...]  [out=FILE.png]
+    Tables a variant's views and how SfM went, and draws every view on one sheet. The keys are
+    xrgs-sweep's; a variant that is not in the store yet is built.
 """
 
 
@@ -127,9 +131,11 @@ def data() -> None:
             source = values.pop("from", None)
             _none_left(values)
             print(lpips.get(source))  # noqa: T201
+        elif words[:1] == ["inspect"]:
+            print(_inspect(words[1:], values))  # noqa: T201
         else:
             raise XrgsError(f"{' '.join(words)}: unknown; xrgs-data --help lists what there is")
-    except (XrgsError, OmegaConfBaseException) as error:
+    except (XrgsError, OmegaConfBaseException, HydraException) as error:
         sys.exit(f"xrgs-data: {_line(error)}")
 
 
@@ -150,3 +156,19 @@ def _download(words: list[str], values: dict[str, str]) -> str:
     )
     conf = OmegaConf.merge(OmegaConf.structured(DatasetConf), OmegaConf.load(file), values)
     return scenes.get(cast("DatasetConf", OmegaConf.to_object(conf)), words[1:], Path(root))
+
+
+def _inspect(words: list[str], values: dict[str, str]) -> str:
+    from xrgs.data import inspect
+
+    out = values.pop("out", None)
+    if bool(words) == bool(values) or len(words) > 1:
+        raise XrgsError("inspect: give a variant's folder, or scene=NAME and other keys")
+    if words:
+        folder = Path(words[0]).expanduser()
+    else:
+        config.register()
+        with hydra.initialize_config_dir(str(config.CONF_DIR), version_base="1.3"):
+            composed = hydra.compose("config", [f"{key}={value}" for key, value in values.items()])
+        folder = inspect.folder_of(config.to_conf(composed))
+    return inspect.describe(folder, Path(out) if out else None)

@@ -3,13 +3,17 @@
 from __future__ import annotations
 
 import contextlib
+import sys
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from pathlib import Path
 from typing import Any
 
 import pytest
+
+from xrgs import cli
 
 
 @dataclass
@@ -72,3 +76,21 @@ def server() -> Iterator[Server]:
         yield state
         listening.shutdown()
         thread.join()
+
+
+@pytest.fixture
+def data(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> Callable[..., tuple[int, str, str]]:
+    """`xrgs-data ARGUMENT...` in an empty folder: exit code, standard output, what is wrong."""
+
+    def run(*arguments: str) -> tuple[int, str, str]:
+        monkeypatch.chdir(tmp_path)
+        monkeypatch.setattr(sys, "argv", ["xrgs-data", *arguments])
+        try:
+            cli.data()
+        except SystemExit as end:
+            return 1, capsys.readouterr().out, str(end.code)
+        return 0, capsys.readouterr().out, ""
+
+    return run

@@ -15,27 +15,9 @@ from typing import Any
 import pytest
 from PIL import Image
 
-from xrgs import cli, config
+from xrgs import config
 
 Run = Callable[..., tuple[int, str, str]]
-
-
-@pytest.fixture
-def data(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> Run:
-    """`xrgs-data ARGUMENT...` in an empty folder: exit code, standard output, what is wrong."""
-
-    def run(*arguments: str) -> tuple[int, str, str]:
-        monkeypatch.chdir(tmp_path)
-        monkeypatch.setattr(sys, "argv", ["xrgs-data", *arguments])
-        try:
-            cli.data()
-        except SystemExit as end:
-            return 1, capsys.readouterr().out, str(end.code)
-        return 0, capsys.readouterr().out, ""
-
-    return run
 
 
 @pytest.fixture(scope="module")
@@ -144,6 +126,14 @@ def test_a_folder_in_the_way_is_left_alone(
         (["data_root=x"], "--help"),
         (["lpips", "form=x"], "form"),
         (["lpips", "from=gone"], "gone"),
+        (["inspect"], "scene=NAME"),
+        (["inspect", "out=x.png"], "scene=NAME"),
+        (["inspect", "gone"], "gone"),
+        (["inspect", "gone", "scene=motorcycle"], "scene=NAME"),
+        (["inspect", "scene=nope"], "scene/nope"),
+        (["inspect", "scene=motorcycle", "variant.fctor=3"], "variant.fctor"),
+        (["inspect", "scene=folder", "scene.path=gone"], "gone"),
+        (["inspect", "scene=motorcycle", "variant.factor=99"], "variant.factor"),
     ],
     ids=str,
 )
@@ -163,7 +153,7 @@ def test_help_needs_no_torch(tmp_path: Path, arguments: list[str]) -> None:
     done = subprocess.run(
         [sys.executable, "-P", "-c", script, *arguments], capture_output=True, text=True, check=True
     )
-    for text in ("download", "llff", "lpips"):
+    for text in ("download", "llff", "lpips", "inspect"):
         assert text in done.stdout
 
 
