@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import sys
 import threading
+import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
@@ -28,6 +29,8 @@ class Server:
     content_type: str = "application/zip"
     shift: int = 0
     """Added to where a range is said to start."""
+    stall: float = 0
+    """Seconds before the content."""
     asked: list[str | None] = field(default_factory=list)
     """The Range header of every request."""
     url: str = ""
@@ -58,6 +61,7 @@ class _Handler(BaseHTTPRequestHandler):
         self.send_header("Content-Type", state.content_type)
         self.send_header("Content-Length", str(len(body)))
         self.end_headers()
+        time.sleep(state.stall)
         with contextlib.suppress(ConnectionError):  # the client may have heard enough
             self.wfile.write(body[: state.cuts.pop(0)] if state.cuts else body)
 

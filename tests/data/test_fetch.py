@@ -11,6 +11,7 @@ from typing import Any
 
 import pytest
 
+from xrgs.data import fetch
 from xrgs.data.fetch import DownloadError, download
 
 CONTENT = random.Random(0).randbytes(700_000)
@@ -100,6 +101,15 @@ def test_another_content_is_not_kept(server: Any, target: Path) -> None:
     with pytest.raises(DownloadError, match=f"sha256 is [0-9a-f]{{64}}, expected {SHA256}"):
         download(server.url, target, SHA256)
     assert list(target.parent.iterdir()) == []
+
+
+def test_a_server_that_falls_silent_is_left(
+    server: Any, target: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    server.content, server.stall = CONTENT, 0.6
+    monkeypatch.setattr(fetch, "_TIMEOUT", 0.1)
+    with pytest.raises(DownloadError, match="timed out"):
+        download(server.url, target)
 
 
 @pytest.mark.parametrize("status", [403, 404, 500])

@@ -76,7 +76,7 @@ def views_table(found: Variant) -> Grid:
         split = "train" if name in trained else "test"
         rows.append((name, split, "LR" if name in low else "HR", "", "", _LOST))
     columns = ("View", "Split", "Tag", "Size, px", "rho", "Placed")
-    title = f"{found.scene}, variant {found.id}: LR is {found.factor} times smaller"
+    title = f"{found.scene}, variant {found.id}, factor {found.factor}"
     return Grid(title, columns, tuple(sorted(rows)), "lllrrl", tuple(_counts(found)))
 
 
@@ -86,7 +86,7 @@ def _counts(found: Variant) -> Iterator[str]:
     kind = "held out" if found.held_out else "tests, at the trained poses"
     yield f"{train.count('HR')} HR and {train.count('LR')} LR to train on, {tests} {kind}"
     if originals := sum(view.split == "original" for view in found.views):
-        yield f"{originals} originals of degraded views are kept beside them"
+        yield f"originals of degraded views kept beside them: {originals}"
 
 
 def _sfm(report: Mapping[str, Any]) -> Iterator[str]:
@@ -100,6 +100,8 @@ def _sfm(report: Mapping[str, Any]) -> Iterator[str]:
     for attempt in report.get("attempts", ()):
         verdict = attempt.get("refused") or f"accepted, {attempt.get('registered')} placed"
         yield f"  recipe {attempt.get('attempt')}: {verdict}"
+    if "tags" in report:
+        yield f"  tags by {report['tags']}, degradation {report.get('degradation')}"
     if error := report.get("pose_error"):
         against = report.get("pose_error_against", "exact cameras")
         yield f"  poses against {against}: " + "; ".join(_pose(error))
