@@ -196,6 +196,14 @@ class HybridScheduleConf:
 
 
 @dataclass
+class ContinuousWeightingConf:
+    """A view's weight from its sampling rate, in place of loss weighting's (paper, conclusion)."""
+
+    gamma: float = MISSING
+    """Power of the view's rate over the finest view's; 0 is off. Open in the paper."""
+
+
+@dataclass
 class MipConf:
     """Mip-Splatting's 3D smoothing filter; not in the paper."""
 
@@ -217,6 +225,7 @@ class ComponentsConf:
     adaptive_weighting: AdaptiveWeightingConf = field(default_factory=AdaptiveWeightingConf)
     region_weighting: RegionWeightingConf = field(default_factory=RegionWeightingConf)
     hybrid_schedule: HybridScheduleConf = field(default_factory=HybridScheduleConf)
+    continuous_weighting: ContinuousWeightingConf = field(default_factory=ContinuousWeightingConf)
     mip: MipConf = field(default_factory=MipConf)
 
 

@@ -99,6 +99,7 @@ def test_training_needs_no_hydra() -> None:
         ("adaptive_weighting.texture", -0.1),
         ("region_weighting.texture", float("nan")),
         ("hybrid_schedule.ramp", -1),
+        ("continuous_weighting.gamma", -0.43),
         ("mip.variance", -0.2),
         ("mip.every", 0),
     ],

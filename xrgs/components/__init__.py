@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING
 from xrgs.components.adaptive_weighting import AdaptiveWeighting
 from xrgs.components.base import Component, Components, Step, TrainingView, not_negative
 from xrgs.components.consistency import Consistency
+from xrgs.components.continuous_weighting import ContinuousWeighting
 from xrgs.components.curriculum import Curriculum
 from xrgs.components.gradient_scaling import GradientScaling
 from xrgs.components.hybrid_schedule import HybridSchedule
@@ -41,6 +42,7 @@ _NOT_NEGATIVE = (
     "adaptive_weighting.texture",
     "region_weighting.texture",
     "hybrid_schedule.ramp",
+    "continuous_weighting.gamma",
     "mip.variance",
 )
 
@@ -85,7 +87,9 @@ def build(
 def _weighting(conf: ComponentsConf, data: Dataset, splat: SplatConf) -> list[Weighting]:
     """All that weighs views, as the one component that it is; none where nothing does."""
     base: Base | None = None
-    if conf.loss_weighting.lr_weight != 1:
+    if conf.continuous_weighting.gamma != 0:  # in place of the tag, where both are set
+        base = ContinuousWeighting(conf.continuous_weighting)
+    elif conf.loss_weighting.lr_weight != 1:
         base = LossWeighting(conf.loss_weighting)
     relieved = {
         "adaptive_weighting.texture": conf.adaptive_weighting.texture,
@@ -97,7 +101,7 @@ def _weighting(conf: ComponentsConf, data: Dataset, splat: SplatConf) -> list[We
             if value != 0:
                 raise XrgsError(
                     f"components.{key}={value}: gives back what a weight takes from LR views, and"
-                    " components.loss_weighting.lr_weight takes none"
+                    " neither loss_weighting.lr_weight nor continuous_weighting.gamma takes any"
                 )
         return []
     shares: list[Share] = []

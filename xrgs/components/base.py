@@ -31,6 +31,10 @@ class TrainingView(Protocol):
         """`HR` or `LR`."""
 
     @property
+    def rho(self) -> float:
+        """Its sampling rate over the finest of all views', in (0, 1]."""
+
+    @property
     def camera(self) -> Camera:
         """In the normalised world."""
 

@@ -1,4 +1,4 @@
-"""What a view weighs at a step, whatever weighs it (paper 5.2, 7.2)."""
+"""What a view weighs at a step, whatever weighs it (paper 5.2, 7.2, conclusion)."""
 
 from __future__ import annotations
 
@@ -19,10 +19,10 @@ Share = Callable[[Step], float]
 class Weighting(Component):
     """A view's weight multiplies its whole loss, and with it all that its gradients move.
 
-    `weight = base + (1 - base) * (1 - share)`. The base is loss weighting's. Each of adaptive,
-    hybrid and region weighting has a share in 0..1 of the base's attenuation that stays, 1 for all
-    of it; shares multiply. So any of them may stand together, none takes a view below its base, and
-    none lifts it above 1.
+    `weight = base + (1 - base) * (1 - share)`. The base is loss weighting's (by tag) or continuous
+    weighting's (by sampling rate). Each of adaptive, hybrid and region weighting has a share in
+    0..1 of the base's attenuation that stays, 1 for all of it; shares multiply. So any of them may
+    stand together, none takes a view below its base, and none lifts it above 1.
 
     Region weighting has a share for every pixel: `weight` is then the mean over the view, and
     `pixel_weight` how it is spread. The history has the weights below 1, by the views' tags.
