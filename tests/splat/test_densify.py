@@ -50,6 +50,7 @@ class Observed:
 
     gradient: Tensor  # [N, 2] per px
     visible: Tensor  # [N]
+    absgrad: Tensor | None = None  # [N, 2], what gsplat also has of a render with absgrad
 
 
 def random_view(count: int, rng: np.random.Generator, size: float = 2e-5) -> Observed:
@@ -133,6 +134,8 @@ class Theirs:
             "radii": view.visible[None, :, None].expand(-1, -1, 2).int(),
             "means2d": SimpleNamespace(grad=view.gradient[None]),
         }
+        if view.absgrad is not None:
+            info["means2d"].absgrad = view.absgrad[None]
         with torch.random.fork_rng(devices=[]):
             torch.set_rng_state(self.random)
             self.strategy.step_post_backward(self.params, self.optimizers, self.state, step, info)
@@ -183,6 +186,28 @@ def test_a_refinement_is_gsplats(count: int, views: int, step: int, seed: int) -
     theirs.densify(step, view)
     assert_same(ours, theirs)
     assert len(ours.gaussians) == count + did.duplicated + did.split - did.removed
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_with_absgrad_a_refinement_is_gsplats(seed: int) -> None:
+    """Its recommended threshold, on what `RasterSettings.absgrad` makes the offset's gradient."""
+    rng = np.random.default_rng(seed)
+    values, config = random_values(80, rng), DensifySettings(grow_grad2d=8e-4)
+    ours, theirs = Ours(values, config, seed), Theirs(values, config, seed)
+    theirs.strategy.absgrad = True
+    gradients = random_values(80, rng)
+    ours.descend(gradients)
+    theirs.descend(gradients)
+    grown = 0
+    for step in (1, 600):
+        plain, absolute = random_view(80, rng), random_view(80, rng, size=1e-4)
+        absolute.visible = plain.visible
+        absolute.gradient = absolute.gradient.abs() * plain.visible[:, None]
+        did = ours.densify(step, absolute)
+        theirs.densify(step, Observed(plain.gradient, plain.visible, absolute.gradient))
+        grown += did.duplicated + did.split
+    assert 0 < grown < 80
+    assert_same(ours, theirs)
 
 
 def test_a_run_of_3000_steps_is_gsplats() -> None:
