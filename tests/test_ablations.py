@@ -41,7 +41,7 @@ def test_each_is_another_cell(name: str, compose: Compose) -> None:
     baseline, ablation = compose(), compose(f"+ablation={name}")
     assert cell_id(ablation) != cell_id(baseline)
     changed = delta(ablation, baseline)
-    assert {key.split(".")[0] for key in changed} <= {"components", "splat"}
+    assert {key.split(".")[0] for key in changed} <= {"components", "splat", "train"}
 
 
 def test_the_one_called_baseline_is_the_baseline(compose: Compose) -> None:

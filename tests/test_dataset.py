@@ -104,5 +104,7 @@ def test_a_use_that_the_variant_has_no_views_for_is_told(variant: Variant) -> No
     low = replace(without, views=tuple(v for v in without.views if v.name != "v1"))
     with pytest.raises(XrgsError, match="no HR view to train on: not for hr_only"):
         dataset.load(low, "hr_only")
-    with pytest.raises(XrgsError, match="'best': must be one of mixed, all_hr, hr_only, lr_only"):
+    with pytest.raises(
+        XrgsError, match=r"train\.views=best: must be one of mixed, all_hr, hr_only, lr_only"
+    ):
         dataset.load(variant, "best")

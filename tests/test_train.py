@@ -12,15 +12,17 @@ import torch
 from xrgs import components, train
 from xrgs.components import Step
 from xrgs.config import CONF_DIR, Conf
-from xrgs.dataset import Dataset, LoadedView
+from xrgs.dataset import USES, Dataset, LoadedView
 from xrgs.errors import XrgsError
 from xrgs.splat.cameras import Camera
 from xrgs.splat.gaussians import PARAMETERS, Activated, Gaussians
 from xrgs.splat.settings import RasterSettings
 from xrgs.train import endless
 
-#: All of `conf/ablation` that changes how training goes.
-ABLATIONS = sorted({path.stem for path in (CONF_DIR / "ablation").glob("*.yaml")} - {"baseline"})
+#: All of `conf/ablation` that changes how training goes, and not what is trained on.
+ABLATIONS = sorted(
+    {path.stem for path in (CONF_DIR / "ablation").glob("*.yaml")} - {"baseline"} - set(USES)
+)
 
 
 def camera(width: int, height: int) -> Camera:

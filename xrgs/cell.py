@@ -39,7 +39,7 @@ def _run(conf: Conf, variant: Variant, folder: CellFolder) -> None:
     threads = dataset.use_threads(conf.threads)
     backend = resolve_backend(conf.splat.backend)
     write_json(folder.path / "provenance.json", provenance.collect(threads, backend))
-    data = dataset.load(variant)
+    data = dataset.load(variant, conf.train.views)
     trained = train(data, conf)
     peak_rss_bytes = _peak_rss_bytes()  # before evaluation, which may load LPIPS's network
     save_ply(folder.path / "splats.ply", trained.gaussians)

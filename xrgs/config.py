@@ -118,6 +118,9 @@ class TrainConf:
 
     steps: int = MISSING
     """One view a step. Every schedule is written for 30,000 steps and scales with this."""
+    views: str = MISSING
+    """`mixed`: all, as the variant has them. The controls: `all_hr`, the originals in place of the
+    degraded ones; `hr_only` and `lr_only`, those of one tag."""
 
 
 @dataclass

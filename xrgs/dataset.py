@@ -90,7 +90,7 @@ def load(variant: Variant, use: str = "mixed") -> Dataset:
 def _training_views(variant: Variant, use: str) -> list[View]:
     """Those of the variant that `use` names, in the variant's order."""
     if use not in USES:
-        raise XrgsError(f"training views {use!r}: must be one of {', '.join(USES)}")
+        raise XrgsError(f"train.views={use}: must be one of {', '.join(USES)}")
     views = [view for view in variant.views if view.split == "train"]
     if use == "mixed":
         return views
