@@ -59,8 +59,11 @@ def test_every_backend_is_timed_in_every_part(smoke: tuple[Path, str, dict[str, 
     assert {row["kind"] for row in found["optimizers"]} == backends | {"default"}
     assert {row["view"] for row in found["steps"]} == {"HR", "LR"}
     assert {row["views"] for row in found["views"]} == set(run.SMOKE.views)
+    assert {row["kind"] for row in found["resizes"]} == backends | {"interpolate"}
     assert set(found["growth"]) == {"gaussians", "pixels"}
-    for title in ("gradient error", "loss, value and gradient", "Adam, one step", "densify"):
+    titles = ["gradient error", "loss, value and gradient", "Adam, one step", "densify"]
+    titles += ["an LR view's step takes", "phi, up", "skipped in a step", "process grew MB"]
+    for title in titles:
         assert title in out
 
 
@@ -95,6 +98,11 @@ def test_files_are_left(smoke: tuple[Path, str, dict[str, Any]]) -> None:
     assert len(rows) == len(found["rows"])
     assert float(rows[0]["forward_ms"]) == found["rows"][0]["forward_ms"]
     assert float(rows[0]["image_mean_error"]) == found["rows"][0]["error"]["image_mean"]
+    with (folder / "o" / "skips.csv").open(newline="") as file:
+        rows = list(csv.DictReader(file))
+    skips = found["skips"]["renders"]
+    assert len(rows) == len(skips) + len(found["skips"]["steps"])
+    assert float(rows[0]["off_forward_ms"]) == skips[0]["off"]["forward_ms"]
     assert (folder / "o" / "bench.png").read_bytes().startswith(b"\x89PNG")
 
 
@@ -108,6 +116,8 @@ def test_a_file_is_timed(file: Path, tmp_path: Path) -> None:
     assert {row["load"] for row in found["rows"]} == {"load"}
     assert "40x30" in text
     assert "steps" not in found
+    sizes = {(row["width"], row["height"]) for row in found["skips"]["renders"]}
+    assert sizes == {(40, 30), (8, 6)}  # at the file's size, and as an LR view
 
 
 @pytest.mark.parametrize(
@@ -116,6 +126,8 @@ def test_a_file_is_timed(file: Path, tmp_path: Path) -> None:
         (["load=none.npz"], "none.npz: cannot be read"),
         (["save=a.npz"], "save=FILE.npz needs cell=FOLDER and view=NAME"),
         (["save=a.npz", "cell=nowhere", "view=a"], "cell=nowhere: is absent"),
+        (["quality=true"], "quality=true needs cell=FOLDER"),
+        (["quality=true", "cell=nowhere"], "cell=nowhere: is absent"),
         (["repeats=0"], "repeats must be at least 1"),
         (["repeats=many"], "repeats"),
         (["lod=a.npz"], "lod"),

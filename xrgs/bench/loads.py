@@ -18,6 +18,8 @@ from xrgs.splat.cameras import Camera
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
+    from xrgs.dataset import Dataset
+
 #: Standard deviation, in units of the spacing of N Gaussians spread over the image: about 40 of
 #: them then contribute to a pixel, whatever N and the size, as in a trained scene.
 _SPREAD = 1.5
@@ -173,15 +175,9 @@ def from_cell(folder: Path, view_name: str) -> Load:
     Raises:
         XrgsError: the cell isn't done, its variant isn't in the store, or it has no such view.
     """
-    from xrgs import dataset, variant
     from xrgs.splat.ply import load_ply
-    from xrgs.store import CellFolder, read_json
 
-    state = CellFolder(folder).state()
-    if state.name != "done":
-        raise XrgsError(f"cell={folder}: is {state.name} {state.reason}".rstrip())
-    variant_id = read_json(folder / "identity.json")["variant"]
-    data = dataset.load(variant.load(folder.parents[1] / "variants" / variant_id))
+    data = data_of(folder)
     views = {view.name: view for view in (*data.train, *data.test)}
     if view_name not in views:
         raise XrgsError(f"view={view_name}: {folder} has {', '.join(sorted(views))}")
@@ -192,6 +188,22 @@ def from_cell(folder: Path, view_name: str) -> Load:
     sh[:, : 1 + rest.shape[1]] = torch.cat([sh0, rest], dim=1)
     camera = views[view_name].camera
     return Load(f"{folder.name}:{view_name}", means, quats, scales, opacities, sh, camera)
+
+
+def data_of(folder: Path) -> Dataset:
+    """What a cell was trained and tested on.
+
+    Raises:
+        XrgsError: the cell isn't done, or its variant isn't in the store.
+    """
+    from xrgs import dataset, variant
+    from xrgs.store import CellFolder, read_json
+
+    state = CellFolder(folder).state()
+    if state.name != "done":
+        raise XrgsError(f"cell={folder}: is {state.name} {state.reason}".rstrip())
+    variant_id = read_json(folder / "identity.json")["variant"]
+    return dataset.load(variant.load(folder.parents[1] / "variants" / variant_id))
 
 
 def _check(path: Path, key: str, value: NDArray[np.generic], shape: tuple[object, ...]) -> None:

@@ -13,7 +13,7 @@ from torch import Tensor
 from xrgs.bench.loads import Load
 from xrgs.bench.timing import Times, alternate, threads
 from xrgs.splat.rasterize import Render, rasterize
-from xrgs.splat.settings import RasterSettings
+from xrgs.splat.settings import RasterSettings, Skips
 
 #: Size of the view in which a render is compared to one in double.
 ERROR_CROP = (96, 72)
@@ -28,6 +28,9 @@ class Way:
     name: str
     backend: str
     settings: RasterSettings = field(default_factory=RasterSettings)
+    sh_degree: int = 3
+    skips: Skips | None = None
+    """Of the native backend alone; None leaves out all that it can."""
 
 
 def ways(backends: Sequence[str]) -> list[Way]:
@@ -59,19 +62,16 @@ class Rendering:
     def forward(self) -> None:
         """Render, for one `backward`."""
         means, quats, scales, opacities, sh0, rest = self.leaves
+        parameters = means, quats, scales, opacities, sh0, rest
+        view, degree = (self.camera, self.way.settings), self.way.sh_degree
         with threads(self.threads):
-            self.render = rasterize(
-                means,
-                quats,
-                scales,
-                opacities,
-                sh0,
-                rest,
-                self.camera,
-                self.way.settings,
-                sh_degree=3,
-                backend=self.way.backend,
-            )
+            if self.way.skips is None:
+                backend = self.way.backend
+                self.render = rasterize(*parameters, *view, sh_degree=degree, backend=backend)
+            else:
+                from xrgs.splat import native
+
+                self.render = native.render(*parameters, *view, degree, None, skips=self.way.skips)
 
     def backward(self) -> tuple[Tensor, ...]:
         """Gradients of the six parameters, of the last render, which is then let go."""
@@ -99,11 +99,11 @@ def time_load(load: Load, chosen: Sequence[Way], counts: Sequence[int], repeats:
     of the others, fewer of them, and its rows say `times_slower` than that one it was.
     """
     fast = [way for way in chosen if way.backend != "torch"]
-    rows = list(_time(load, fast, counts, repeats).values())
+    rows = list(time_ways(load, fast, counts, repeats).values())
     if len(load) > _TORCH_GAUSSIANS or load.pixels > _TORCH_PIXELS:
         return rows
     slow = [way for way in chosen if way.backend == "torch"]
-    timed = _time(load, [*fast[:1], *slow], counts, min(repeats, _TORCH_REPEATS))
+    timed = time_ways(load, [*fast[:1], *slow], counts, min(repeats, _TORCH_REPEATS))
     for way in slow:
         for count in counts:
             row = timed[way.name, count]
@@ -117,9 +117,10 @@ def _whole(row: dict[str, Any]) -> float:
     return float(row["forward_median_ms"] + row["backward_median_ms"])
 
 
-def _time(
+def time_ways(
     load: Load, chosen: Sequence[Way], counts: Sequence[int], repeats: int
 ) -> dict[tuple[str, int], dict[str, Any]]:
+    """A row for each way (by its name) and number of threads, all timed in turn."""
     renderings = {
         (way.name, count): Rendering(load, way, count) for way in chosen for count in counts
     }
@@ -174,7 +175,8 @@ def errors(load: Load, chosen: Sequence[Way]) -> dict[str, dict[str, float]]:
         over the norm of the gradient, of the worst of the six parameters.
     """
     crop = load.cropped(*ERROR_CROP)
-    exact = Rendering(crop, Way("exact", "torch"), torch.get_num_threads(), torch.float64)
+    reference = Way("exact", "torch", sh_degree=chosen[0].sh_degree)
+    exact = Rendering(crop, reference, torch.get_num_threads(), torch.float64)
     exact.forward()
     expected = exact.backward()
     found = {}

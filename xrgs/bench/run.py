@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from xrgs import provenance
-from xrgs.bench import loads, rendering, tables, training
+from xrgs.bench import loads, memory, rendering, skips, tables, training
 from xrgs.dataset import progress
 from xrgs.errors import XrgsError
 from xrgs.files import write_json
@@ -32,6 +32,7 @@ class Grid(NamedTuple):
     sizes: tuple[tuple[int, int], ...]
     step: tuple[int, int, int]  # Gaussians, width and height of the training step
     views: tuple[int, ...]
+    memory: tuple[int, int, int]  # of the step whose memory is measured
 
 
 FULL = Grid(
@@ -39,8 +40,15 @@ FULL = Grid(
     sizes=((252, 189), (504, 378), (1008, 756)),
     step=(100_000, 504, 378),
     views=(1, 2, 4, 8),
+    memory=(300_000, 1008, 756),
 )
-SMOKE = Grid(gaussians=(200, 400), sizes=((32, 24), (48, 36)), step=(300, 80, 60), views=(1, 2))
+SMOKE = Grid(
+    gaussians=(200, 400),
+    sizes=((32, 24), (48, 36)),
+    step=(300, 80, 60),
+    views=(1, 2),
+    memory=(300, 80, 60),
+)
 _LR_FACTOR = 5
 
 
@@ -52,13 +60,17 @@ def run(settings: Settings) -> str:
     """
     if settings.save is not None:
         return _save(settings)
+    if settings.quality:
+        return _quality(settings)
     if settings.repeats < 1 or settings.threads < 0:
         raise XrgsError("repeats must be at least 1 and threads at least 0")
     counts = sorted({1, settings.threads or usable_cores()})
     backends = ["native", "torch"] if resolve_backend("auto") == "native" else ["torch"]
     found: dict[str, Any] = {"machine": _machine(backends, counts)}
     if settings.load is not None:
-        found |= _time_loads([loads.read(Path(settings.load))], settings, counts, backends)
+        load = loads.read(Path(settings.load))
+        found |= _time_loads([load], settings, counts, backends)
+        found["skips"] = _time_skips(load, settings, backends)
     else:
         grid = SMOKE if settings.smoke else FULL
         chosen = [
@@ -68,6 +80,7 @@ def run(settings: Settings) -> str:
         ]
         found |= _time_loads(chosen, settings, counts, backends)
         found |= _time_training(grid, settings, counts, backends)
+        found["memory"] = [memory.measure(*grid.memory, backends[0], counts[-1], settings.seed)]
     found["peak_rss_bytes"] = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
     _write(found, settings)
     return tables.text(found)
@@ -80,6 +93,19 @@ def _save(settings: Settings) -> str:
     loads.write(Path(settings.save), load)
     size = f"{load.camera.width} x {load.camera.height} px"
     return f"{settings.save}: {len(load)} Gaussians, {size}"
+
+
+def _quality(settings: Settings) -> str:
+    from xrgs.bench import quality
+    from xrgs.bench.timing import threads
+
+    if settings.cell is None or settings.steps < 1:
+        raise XrgsError("quality=true needs cell=FOLDER and steps of at least 1")
+    with threads(settings.threads or usable_cores()):
+        rows = quality.compare(Path(settings.cell), settings.steps)
+    if settings.json is not None:
+        _write_json(settings.json, {"quality": rows})
+    return tables.quality(rows)
 
 
 def _machine(backends: Sequence[str], counts: Sequence[int]) -> dict[str, Any]:
@@ -116,8 +142,20 @@ def _time_training(
     return {
         "views": rendering.time_views(load, backends[0], grid.views, repeats),
         "losses": training.time_losses(grid.sizes[1:], backends, counts, repeats),
+        "resizes": training.time_resizes((width, height), _LR_FACTOR, backends, counts, repeats),
         "optimizers": training.time_optimizers(grid.gaussians[1:3], backends, counts, repeats),
         "steps": training.time_steps(views, backends[0], counts, repeats),
+        "skips": _time_skips(load, settings, backends),
+    }
+
+
+def _time_skips(load: Load, settings: Settings, backends: Sequence[str]) -> dict[str, Any]:
+    """Of a view and of the same view at low resolution."""
+    views = (load, load.smaller(_LR_FACTOR))
+    backend, repeats = backends[0], settings.repeats
+    return {
+        "renders": [row for view in views for row in skips.time_renders(view, backend, repeats)],
+        "steps": skips.time_steps(load, backend, repeats),
     }
 
 
@@ -150,16 +188,29 @@ def _write(found: dict[str, Any], settings: Settings) -> None:
     rows = found["rows"]
     found["growth"] = growth(rows, rows[0]["way"], rows[0]["threads"])
     flat = [tables.flat(row) for row in rows]
+    without = [tables.flat_skip(row) for row in found["skips"]["renders"]]
     folder = Path(settings.out)
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        with (folder / "bench.csv").open("w", encoding="utf-8", newline="") as file:
-            fields = list(dict.fromkeys(key for row in flat for key in row))
-            writer = csv.DictWriter(file, fields, lineterminator="\n")
-            writer.writeheader()
-            writer.writerows(flat)
-        (folder / "bench.png").write_bytes(time_against_error(flat))
-        if settings.json is not None:
-            write_json(Path(settings.json).absolute(), found)
+        _write_csv(folder / "bench.csv", flat)
+        _write_csv(folder / "skips.csv", without + found["skips"]["steps"])
+        (folder / "bench.png").write_bytes(time_against_error(flat + tables.skip_points(found)))
+    except OSError as error:
+        raise XrgsError(f"{error.filename}: cannot be written: {error.strerror}") from error
+    if settings.json is not None:
+        _write_json(settings.json, found)
+
+
+def _write_csv(path: Path, rows: Sequence[Row]) -> None:
+    with path.open("w", encoding="utf-8", newline="") as file:
+        fields = list(dict.fromkeys(key for row in rows for key in row))
+        writer = csv.DictWriter(file, fields, lineterminator="\n")
+        writer.writeheader()
+        writer.writerows(rows)
+
+
+def _write_json(name: str, found: dict[str, Any]) -> None:
+    try:
+        write_json(Path(name).absolute(), found)
     except OSError as error:
         raise XrgsError(f"{error.filename}: cannot be written: {error.strerror}") from error

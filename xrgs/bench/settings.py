@@ -14,7 +14,7 @@ class Settings:
     save: str | None = None
     """Make such a file instead of timing anything, from `cell` and `view`."""
     cell: str | None = None
-    """Folder of a trained cell, in its store."""
+    """Folder of a trained cell, in its store: of `save` and `quality`."""
     view: str | None = None
     """Name of one of its views, trained on or held out."""
     out: str = "xrgs-bench"
@@ -27,5 +27,9 @@ class Settings:
     """Beside 1; 0 takes every core."""
     smoke: bool = False
     """Tiny loads: does everything run?"""
+    quality: bool = False
+    """Train `cell` again with each cut changed and compare pictures, instead of timing."""
+    steps: int = 600
+    """Of `quality`."""
     seed: int = 0
     """Of the random loads."""

@@ -21,6 +21,32 @@ def flat(row: Row) -> Row:
     return plain
 
 
+def flat_skip(row: Row) -> Row:
+    """A row of `skips.time_renders` without dictionaries: `on.forward_ms` to `on_forward_ms`."""
+    plain: Row = {}
+    for key, value in row.items():
+        if isinstance(value, dict):
+            plain |= {f"{key}_{name}": inner for name, inner in value.items()}
+        else:
+            plain[key] = value
+    return plain
+
+
+def skip_points(found: Row) -> list[Row]:
+    """What the plot needs of each skip switched off."""
+    return [
+        {
+            "way": f"{row['backend']} without skipping {row['skip']}",
+            "threads": row["threads"],
+            "gaussians": row["gaussians"],
+            "forward_ms": row["off"]["forward_ms"],
+            "backward_ms": row["off"]["backward_ms"],
+            "image_mean_error": row["off"]["image_mean"],
+        }
+        for row in found["skips"]["renders"]
+    ]
+
+
 def text(found: Row) -> str:
     """All tables, the widest first."""
     parts = [_machine(found["machine"]), _renders(found), _stages(found["rows"])]
@@ -32,7 +58,11 @@ def text(found: Row) -> str:
         )
     if "views" in found:
         parts += [_views(found["views"]), _kinds("loss, value and gradient", found["losses"])]
+        parts += [_kinds("phi, up and the gradient back", found["resizes"])]
         parts += [_kinds("Adam, one step", found["optimizers"]), _steps(found["steps"])]
+    parts += [_skips(found["skips"]["renders"]), _step_skips(found["skips"]["steps"])]
+    if "memory" in found:
+        parts.append(_memory(found["memory"]))
     return "\n\n".join(parts)
 
 
@@ -120,7 +150,79 @@ def _steps(rows: Sequence[Row]) -> str:
         + [f"{row['step_ms']:.2f}"]
         for row in rows
     ]
-    return _table(["step", "threads", "Gaussians", "size", *names, "all ms"], lines)
+    table = _table(["step", "threads", "Gaussians", "size", *names, "all ms"], lines)
+    return "\n".join([table, *_lr_shares(rows)])
+
+
+def _lr_shares(rows: Sequence[Row]) -> list[str]:
+    ms = {(row["view"], row["threads"]): row["step_ms"] for row in rows}
+    return [
+        f"{count} thread(s): an LR view's step takes {ms['LR', count] / ms['HR', count]:.2f} of an"
+        " HR view's (bar: below 0.33)"
+        for count in sorted({row["threads"] for row in rows})
+    ]
+
+
+def _skips(rows: Sequence[Row]) -> str:
+    lines = []
+    for row in rows:
+        on, off = row["on"], row["off"]
+        both = [(on[key], off[key]) for key in ("forward_ms", "backward_ms")]
+        lines.append(
+            [row["skip"], str(row["gaussians"]), f"{row['width']}x{row['height']}"]
+            + [f"{value:.1f}" for pair in both for value in pair]
+            + [f"{row['times']:.2f}x"]
+            + [f"{side['evaluations'] / 1e6:.2f}" for side in (on, off)]
+            + [f"{side['image_mean']:.1e}" for side in (on, off)]
+            + [f"{side['gradient']:.1e}" for side in (on, off)]
+            + ["no bit" if row["same_bits"] else "rounding or cuts"]
+        )
+    head = "skipped|Gaussians|size|forward ms on|off|backward ms on|off|off / on|M alphas on|off"
+    head += "|mean error on|off|gradient error on|off|changes"
+    return f"{_table(head.split('|'), lines)}\none thread; on: skipped, as the program is"
+
+
+def _step_skips(rows: Sequence[Row]) -> str:
+    lines = []
+    for row in rows:
+        load = [str(row["gaussians"]), f"{row['width']}x{row['height']}"]
+        times = [f"{row['on_ms']:.2f}", f"{row['off_ms']:.2f}", f"{row['times']:.2f}x"]
+        lines.append([row["skip"], row["part"], *load, *times, "no bit"])
+    head = "skipped in a step|part|Gaussians|size|ms on|off|off / on|changes"
+    return _table(head.split("|"), lines)
+
+
+def _memory(rows: Sequence[Row]) -> str:
+    def megabytes(count: int | None) -> str:
+        return "" if count is None else f"{count / 2**20:.0f}"
+
+    keys = ("counted_bytes", "growth_bytes", "base_rss_bytes", "peak_rss_bytes")
+    lines = []
+    for row in rows:
+        load = [str(row["threads"]), str(row["gaussians"]), f"{row['width']}x{row['height']}"]
+        lines.append(["training step", *load, *(megabytes(row[key]) for key in keys)])
+    head = "memory|threads|Gaussians|size|counted MB|process grew MB|from|to"
+    note = (
+        "counted: parameters, gradients, Adam's state, the renderer's buffers; grew: resident at\n"
+        "its highest, less what torch and the program take once loaded\n"
+        "(bar: 300,000 Gaussians at 1008x756 below 1000 MB)"
+    )
+    return f"{_table(head.split('|'), lines)}\n{note}"
+
+
+def quality(rows: Sequence[Row]) -> str:
+    """The table of `xrgs.bench.quality`."""
+    lines = []
+    for row in rows:
+        picture = [f"{row['psnr']:.3f}", f"{row['difference']:+.3f}"]
+        work = [str(row["gaussians"]), f"{row['evaluations'] / 1e6:.0f}", f"{row['seconds']:.1f}"]
+        lines.append([row["change"], str(row["steps"]), *picture, *work])
+    head = "trained|steps|PSNR dB|difference|Gaussians|M alphas|seconds"
+    note = (
+        "another seed: what chance does; skips that are not here change no bit, or rounding at a\n"
+        "cut, as the last column of their table says"
+    )
+    return f"{_table(head.split('|'), lines)}\n{note}"
 
 
 def _table(head: Sequence[str], lines: Sequence[Sequence[str]]) -> str:

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
+from functools import partial
 from typing import Any
 
 import torch
 from torch import Tensor
+from torch.nn.functional import interpolate
 
 from xrgs.bench.loads import Load
 from xrgs.bench.timing import Times, alternate, threads
@@ -16,9 +18,10 @@ from xrgs.splat.gaussians import PARAMETERS, Gaussians
 from xrgs.splat.loss import photometric_loss, prepare_target
 from xrgs.splat.optimizer import SplatOptimizer
 from xrgs.splat.rasterize import rasterize
+from xrgs.splat.resample import resize
 from xrgs.splat.settings import DensifySettings, OptimizerSettings, RasterSettings
 
-_L1, _SSIM = 0.8, 0.2
+L1, SSIM = 0.8, 0.2
 PARTS = ("render", "loss", "backward", "optimizer", "densify")
 
 
@@ -48,7 +51,7 @@ def _our_loss(image: Tensor, photograph: Tensor, backend: str, count: int) -> Ca
 
     def run() -> object:
         with threads(count):
-            loss = photometric_loss(image, target, l1=_L1, ssim=_SSIM, backend=backend)
+            loss = photometric_loss(image, target, l1=L1, ssim=SSIM, backend=backend)
             return torch.autograd.grad(loss, image)
 
     return run
@@ -63,10 +66,49 @@ def _kornias_loss(image: Tensor, photograph: Tensor, count: int) -> Callable[[],
         with threads(count):
             # kornia's loss is (1 - SSIM) / 2.
             half = ssim_loss(image.permute(2, 0, 1)[None], reference, 11, padding="valid")
-            loss = _L1 * (image - photograph).abs().mean() + 2 * _SSIM * half
+            loss = L1 * (image - photograph).abs().mean() + 2 * SSIM * half
             return torch.autograd.grad(loss, image)
 
     return run
+
+
+def time_resizes(
+    size: tuple[int, int],
+    factor: int,
+    backends: Sequence[str],
+    counts: Sequence[int],
+    repeats: int,
+) -> list[Any]:
+    """An LR view brought up to (width, height), as the consistency loss does, and its gradient.
+
+    `interpolate` is torch's own function, of the same values.
+    """
+    width, height = size
+    generator = torch.Generator().manual_seed(0)
+    image = torch.rand(height // factor, width // factor, 3, generator=generator)
+    slope = torch.rand(height, width, 3, generator=generator)
+    image.requires_grad_()
+
+    def ours(backend: str, count: int) -> object:
+        with threads(count):
+            resized = resize(image, height, width, backend=backend)
+            return torch.autograd.grad(resized, image, slope)
+
+    def torchs(count: int) -> object:
+        with threads(count):
+            planes = image.permute(2, 0, 1)[None]
+            resized = interpolate(planes, (height, width), mode="bicubic", antialias=True)
+            return torch.autograd.grad(resized, image, slope.permute(2, 0, 1)[None])
+
+    things: dict[str, Callable[[], object]] = {}
+    for count in counts:
+        things |= {f"{backend}/{count}": partial(ours, backend, count) for backend in backends}
+        things[f"interpolate/{count}"] = partial(torchs, count)
+    times = alternate(things, repeats)
+    return [
+        _named(name, time) | {"width": width, "height": height, "factor": factor}
+        for name, time in times.items()
+    ]
 
 
 def time_optimizers(
@@ -170,7 +212,7 @@ class Step:
         """Its value, and natively its gradient too."""
         with threads(self.threads):
             self.value = photometric_loss(
-                self.rendered.image, self.target, l1=_L1, ssim=_SSIM, backend=self.backend
+                self.rendered.image, self.target, l1=L1, ssim=SSIM, backend=self.backend
             )
 
     def backward(self) -> None:
@@ -189,6 +231,19 @@ class Step:
         with threads(self.threads):
             for step in range(1, self.settings.every + 1):
                 self.densifier.after_step(step, self.offset.grad, self.rendered.visible, **size)
+
+    def all(self) -> None:
+        """One whole step, its share of densification's bookkeeping included."""
+        for part in (self.render, self.loss, self.backward, self.optimize):
+            part()
+        size = {"width": self.camera.width, "height": self.camera.height}
+        with threads(self.threads):
+            self.densifier.after_step(1, self.offset.grad, self.rendered.visible, **size)
+
+    def counted_bytes(self) -> int:
+        """Parameters, gradients, Adam's state and the renderer's buffers, as training counts."""
+        model = sum(self.gaussians[name].nbytes for name in PARAMETERS)
+        return 2 * model + self.optimizer.state_bytes() + self.rendered.buffer_bytes
 
     def parts(self) -> list[Callable[[], None]]:
         """One for each of `PARTS`."""

@@ -31,7 +31,7 @@ def time_against_error(rows: Sequence[Mapping[str, Any]]) -> bytes:
     names = list(dict.fromkeys(row["way"] for row in rows))
     most = max(row["gaussians"] for row in rows)
     with style.context("default"):
-        figure = Figure(figsize=(7.0, 5.0), layout="constrained")
+        figure = Figure(figsize=(8.0, 5.5), layout="constrained")
         axes = figure.add_subplot()
         for place, name in enumerate(names):
             used = [row for row in rows if row["way"] == name and row["threads"] == 1]
@@ -40,7 +40,8 @@ def time_against_error(rows: Sequence[Mapping[str, Any]]) -> bytes:
                 [row["forward_ms"] + row["backward_ms"] for row in used],
                 s=[20 + 100 * (row["gaussians"] / most) ** 0.5 for row in used],
                 c=_COLORS[place % len(_COLORS)],
-                marker=_MARKERS[place % len(_MARKERS)],
+                # Ways of the same colour differ by their mark.
+                marker=_MARKERS[(place + place // len(_COLORS)) % len(_MARKERS)],
                 alpha=0.7,
                 label=name,
             )
@@ -51,7 +52,7 @@ def time_against_error(rows: Sequence[Mapping[str, Any]]) -> bytes:
             ylabel="forward + backward, ms (one thread)",
         )
         axes.grid(visible=True, which="major", alpha=0.3)
-        axes.legend()
+        axes.legend(fontsize="x-small")
         stream = io.BytesIO()
         figure.savefig(stream, format="png", dpi=_DPI, metadata={"Software": None})
     return stream.getvalue()

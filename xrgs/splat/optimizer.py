@@ -79,8 +79,7 @@ class SplatOptimizer:
 
     def zero_grad(self) -> None:
         """Forget the gradients."""
-        for name in PARAMETERS:  # what adam.zero_grad does, without its profiler's hooks
-            self.gaussians[name].grad = None
+        self.adam.zero_grad()
 
     def state_bytes(self) -> int:
         """Bytes of Adam's state."""
