@@ -131,6 +131,24 @@ def test_a_changed_value_is_another_cell(store: Path, change: str) -> None:
         assert "0 done" in err
 
 
+def test_a_cell_that_takes_its_count_from_another_is_trained_after_it(store: Path) -> None:
+    control = ("+ablation=count_matched", "matched_to=gradient_scaling", *SMOKE, f"store={store}")
+    code, _, err = run("sweep", store.parent, *control, "dry_run=true")
+    assert code == 0, err
+    states = [line.split()[0] for line in err.splitlines() if "motorcycle /" in line]
+    assert states == ["done", "absent", "waits"], err
+    code, out, err = run("sweep", store.parent, *control)
+    assert code == 0, err
+    assert err.count("training cell") == 2
+    assert "count_matched" in out
+    configs = [json.loads(f.read_text()) for f in store.glob("cells/*/config.json")]
+    wanted = [c["components"]["count_matched"]["gaussians"] for c in configs]
+    counts = [json.loads(f.read_text())["gaussians"] for f in store.glob("cells/*/summary.json")]
+    assert max(wanted) in counts
+    _, _, err = run("sweep", store.parent, *control)
+    assert "plan: 3 cells, 3 done" in err
+
+
 def test_paths_threads_and_labels_are_no_change(store: Path) -> None:
     store.rename(store.with_name("moved"))
     arguments = ("+ablation=consistency", *SMOKE, "threads=1", "data_root=x", "scene.name=y")

@@ -167,6 +167,18 @@ def test_the_history_has_the_mean_of_what_components_note(
     assert history[-1]["steps_HR"] == history[-1]["steps_LR"] == 200
 
 
+def test_the_threshold_that_gives_a_count_is_found_and_kept(data: Dataset, baseline: Conf) -> None:
+    plain = train.train(data, baseline)
+    wanted = round(0.8 * len(plain.gaussians))
+    baseline.components.count_matched.gaussians = wanted
+    matched = train.train(data, baseline)
+    assert abs(len(matched.gaussians) / wanted - 1) <= 0.05
+    assert matched.grow_grad2d > plain.grow_grad2d == baseline.splat.densify.grow_grad2d
+    baseline.components.count_matched.gaussians = 0
+    baseline.splat.densify.grow_grad2d = matched.grow_grad2d
+    assert same(train.train(data, baseline).gaussians, matched.gaussians)
+
+
 def test_a_statistic_of_nothing_grows_nothing(
     data: Dataset, baseline: Conf, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -186,7 +198,10 @@ def test_each_ablation_changes_the_result(
 ) -> None:
     short = ["train.steps=20", "splat.backend=auto"]
     plain = train.train(data, compose(*short))
-    changed = train.train(data, compose(*short, f"+ablation={ablation}"))
+    conf = compose(*short, f"+ablation={ablation}")
+    if conf.matched_to is not None:  # as a sweep would
+        conf.components.count_matched.gaussians = round(0.8 * len(plain.gaussians))
+    changed = train.train(data, conf)
     assert not same(plain.gaussians, changed.gaussians)
 
 

@@ -55,6 +55,7 @@ def _run(conf: Conf, variant: Variant, folder: CellFolder) -> None:
             "peak_rss_bytes": peak_rss_bytes,
             "evaluations": trained.evaluations,
             "steps": conf.train.steps,
+            "grow_grad2d": trained.grow_grad2d,
         },
     )
     folder.finish([view.name for view in data.test], evaluate.PROTOCOL)

@@ -217,6 +217,16 @@ class MipConf:
 
 
 @dataclass
+class CountMatchedConf:
+    """The baseline with as many Gaussians as another cell (`conf/ablation/count_matched.yaml`)."""
+
+    gaussians: int = MISSING
+    """How many; 0 is off. A sweep fills it in from the cell that `matched_to` names."""
+    tolerance: float = MISSING
+    """Relative, of that number."""
+
+
+@dataclass
 class ComponentsConf:
     """The components of XR-GS, each the identity in the baseline."""
 
@@ -230,6 +240,7 @@ class ComponentsConf:
     hybrid_schedule: HybridScheduleConf = field(default_factory=HybridScheduleConf)
     continuous_weighting: ContinuousWeightingConf = field(default_factory=ContinuousWeightingConf)
     mip: MipConf = field(default_factory=MipConf)
+    count_matched: CountMatchedConf = field(default_factory=CountMatchedConf)
 
 
 @dataclass
@@ -241,6 +252,8 @@ class Conf:
     splat: SplatConf = field(default_factory=SplatConf)
     train: TrainConf = field(default_factory=TrainConf)
     components: ComponentsConf = field(default_factory=ComponentsConf)
+    matched_to: str | None = None
+    """Ablation whose number of Gaussians a sweep puts in `components.count_matched.gaussians`."""
     seed: int = MISSING
     store: str = MISSING
     """Folder of everything that is kept: variants, cells, reports."""

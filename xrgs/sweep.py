@@ -1,6 +1,9 @@
 """The plan of a study, and the way its cells go to Hydra's launcher.
 
 expand (axes, matching baselines) -> compose -> variants -> identities -> launch -> record -> table
+
+A cell with `matched_to` takes a number from another cell, so it has no identity before that one is
+done: cells are launched as they become ready, those that wait for others after them.
 """
 
 from __future__ import annotations
@@ -25,7 +28,7 @@ from xrgs.splat.backend import resolve_backend
 from xrgs.store import State, Store
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Sequence
+    from collections.abc import Container, Iterable, Mapping, Sequence
 
     from hydra.core.override_parser.types import Override
     from hydra.types import HydraContext, TaskFunction
@@ -65,7 +68,7 @@ def _values(override: Override) -> list[str]:
 
 
 def _is_change(key: str) -> bool:
-    return key == "ablation" or key.startswith("components.")
+    return key in {"ablation", "matched_to"} or key.startswith("components.")
 
 
 def _label(changes: Iterable[tuple[str, str]]) -> str:
@@ -119,13 +122,24 @@ class Planned:
     cell_id: str | None = None
     state: State = field(default_factory=lambda: State("absent"))
     error: str | None = None
-    """Why the cell can't be run: its scene failed."""
+    """Why the cell can't be run: its scene failed, or the cell that it takes a number from."""
 
     @property
     def name(self) -> str:
         """For people."""
         parts = (scenes.label(self.conf.scene), self.wish.label, self.wish.condition)
         return " / ".join(part for part in parts if part) + f" / seed {self.conf.seed}"
+
+    @property
+    def reference(self) -> Wish | None:
+        """The cell whose number of Gaussians this one is to have."""
+        name = self.conf.matched_to
+        return replace(self.wish, label=name, changes=(f"+ablation={name}",)) if name else None
+
+    @property
+    def waits(self) -> bool:
+        """Whether that number is still to come."""
+        return self.reference is not None and not self.conf.components.count_matched.gaussians
 
 
 def _say(text: str) -> None:
@@ -155,25 +169,59 @@ class Study:
             raise SystemExit(1)
 
     def _run(self, arguments: Sequence[str]) -> bool:
-        plan = [Planned(wish, self._compose(wish)) for wish in expand(arguments)]
+        plan = self._plan(arguments)
         store = Store(Path(plan[0].conf.store))
         dry = plan[0].conf.dry_run
         if not dry:
             store.prepare()
         plan = self._with_variants(plan, store, build=not dry)
-        plan = [_identify(cell, store) for cell in plan]
+        plan = self._identified(plan, store)
         _say(describe(plan))
         if weights.find() is None and any(cell.state.name != "done" for cell in plan):
             _say(f"no LPIPS in what is run now (n/a in the tables): {weights.HINT}")
         if dry:
             return False
-        self._launch([cell for cell in plan if cell.error is None and cell.state.name != "done"])
-        plan = [_identify(cell, store) for cell in plan]
+        launched: set[str] = set()
+        while ready := _ready(plan, launched):
+            self._launch(ready.values())
+            launched |= ready.keys()
+            plan = self._identified(plan, store)
+        plan = [_without_reference(cell) for cell in plan]
         sweep_id = store.write_sweep(arguments, _record(plan))
         from xrgs.report import build
 
         print(build(store.path, sweep_id).text)  # noqa: T201
         return any(cell.error is not None or cell.state.name != "done" for cell in plan)
+
+    def _plan(self, arguments: Sequence[str]) -> list[Planned]:
+        """Every cell that is asked for, behind the one it takes a number from."""
+        plan: dict[Wish, Planned] = {}
+        for wish in expand(arguments):
+            cell = Planned(wish, self._compose(wish))
+            if cell.reference is not None:
+                plan.setdefault(
+                    cell.reference, Planned(cell.reference, self._compose(cell.reference))
+                )
+            plan.setdefault(wish, cell)
+        return list(plan.values())
+
+    def _identified(self, plan: Sequence[Planned], store: Store) -> list[Planned]:
+        """Every cell with its number, its identity and its state, as far as they are known."""
+        found: dict[Wish, Planned] = {}
+        for cell in plan:
+            known = _identify(self._with_count(cell, found, store), store)
+            found[known.wish] = known
+        return list(found.values())
+
+    def _with_count(self, cell: Planned, found: Mapping[Wish, Planned], store: Store) -> Planned:
+        """The cell with the number that it waits for, if the cell that has it is done."""
+        reference = found.get(cell.reference) if cell.waits and cell.reference else None
+        if reference is None or reference.cell_id is None or reference.state.name != "done":
+            return cell
+        count = store.cell(reference.cell_id).summary()["gaussians"]
+        changes = (*cell.wish.changes, f"components.count_matched.gaussians={count}")
+        wish = replace(cell.wish, changes=changes)
+        return replace(cell, wish=wish, conf=self._compose(wish))
 
     def _compose(self, wish: Wish) -> Conf:
         return to_conf(self._context.config_loader.load_sweep_config(self._config, wish.overrides))
@@ -192,14 +240,11 @@ class Study:
             cells.append(replace(cell, variant_id=variant_id, error=error))
         return cells
 
-    def _launch(self, cells: Sequence[Planned]) -> None:
-        unique = {cell.cell_id: cell for cell in cells}
-        if not unique:
-            return
+    def _launch(self, cells: Iterable[Planned]) -> None:
         launcher = Plugins.instance().instantiate_launcher(
             hydra_context=self._context, task_function=self._task, config=self._config
         )
-        launcher.launch([cell.wish.overrides for cell in unique.values()], initial_job_idx=0)
+        launcher.launch([cell.wish.overrides for cell in cells], initial_job_idx=0)
 
 
 def _variant_of(conf: Conf, store: Store, *, build: bool) -> tuple[str | None, str | None]:
@@ -216,19 +261,38 @@ def _variant_of(conf: Conf, store: Store, *, build: bool) -> tuple[str | None, s
 
 
 def _identify(cell: Planned, store: Store) -> Planned:
-    if cell.variant_id is None:
+    if cell.variant_id is None or cell.waits:
         return cell
     cell_id = digest(cell_identity(cell.conf, cell.variant_id))
     return replace(cell, cell_id=cell_id, state=store.cell(cell_id).state())
+
+
+def _ready(plan: Sequence[Planned], launched: Container[str]) -> dict[str, Planned]:
+    """The cells that can be run now and are not done, by their identity."""
+    return {
+        cell.cell_id: cell
+        for cell in plan
+        if cell.cell_id is not None
+        and cell.cell_id not in launched
+        and cell.error is None
+        and cell.state.name != "done"
+    }
+
+
+def _without_reference(cell: Planned) -> Planned:
+    """Nothing is left to be launched: a cell that still waits has waited in vain."""
+    if cell.error is not None or not cell.waits:
+        return cell
+    return replace(cell, error=f"matched_to={cell.conf.matched_to}: that cell is not done")
 
 
 def describe(plan: Sequence[Planned]) -> str:
     """The plan as lines: state, identity, name, and why where it is not plain."""
     lines = [f"plan: {len(plan)} cells, {sum(c.state.name == 'done' for c in plan)} done"]
     for cell in plan:
-        state = "failed" if cell.error else cell.state.name
+        state = "failed" if cell.error else "waits" if cell.waits else cell.state.name
         reason = (cell.error or cell.state.reason or "").partition("\n")[0]
-        identity = cell.cell_id or "variant not built"
+        identity = cell.cell_id or ("no count yet" if cell.waits else "variant not built")
         lines.append(
             f"  {state:<10} {identity:<18} {cell.name}" + (f"  ({reason})" if reason else "")
         )

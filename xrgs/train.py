@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 import torch
 
 from xrgs import components
-from xrgs.components import Step
+from xrgs.components import Step, count_matched
 from xrgs.dataset import progress
 from xrgs.errors import XrgsError
 from xrgs.hashing import digest
@@ -50,6 +50,8 @@ class Trained:
     """Model, gradients, optimizer and renderer buffers at the step where they were largest."""
     evaluations: int
     """Alpha evaluations of all forward passes: the work done, whatever the machine."""
+    grow_grad2d: float
+    """The threshold of growth that it was trained with."""
 
 
 def train(data: Dataset, conf: Conf) -> Trained:
@@ -58,6 +60,20 @@ def train(data: Dataset, conf: Conf) -> Trained:
     Raises:
         XrgsError: a component's value is out of range, or a view is too small for it.
     """
+    wanted = conf.components.count_matched.gaussians
+    if not wanted:
+        return _run(data, conf)
+
+    def run(threshold: float) -> Trained:
+        densify = dataclasses.replace(conf.splat.densify, grow_grad2d=threshold)
+        splat = dataclasses.replace(conf.splat, densify=densify)
+        return _run(data, dataclasses.replace(conf, splat=splat))
+
+    return count_matched.search(run, conf.splat.densify.grow_grad2d, wanted)
+
+
+def _run(data: Dataset, conf: Conf) -> Trained:
+    """One run from its first step to its last."""
     steps, splat = conf.train.steps, conf.splat
     backend = resolve_backend(splat.backend)
     gaussians = splats.from_points(
@@ -79,7 +95,7 @@ def train(data: Dataset, conf: Conf) -> Trained:
     parts = components.build(conf.components, data, splat, backend)
     targets = {view.name: prepare_target(view.image) for view in data.train}
     sh_every = max(1, int(splat.sh_every * steps / NOMINAL_STEPS))
-    ledger = _Ledger(steps)
+    ledger = _Ledger(steps, splat.densify.grow_grad2d)
 
     start = time.perf_counter()
     parts.refined(gaussians)
@@ -151,7 +167,8 @@ def endless(
 class _Ledger:
     """Keeps what a report wants to know of a run."""
 
-    def __init__(self, steps: int) -> None:
+    def __init__(self, steps: int, grow_grad2d: float) -> None:
+        self.grow_grad2d = grow_grad2d
         self.every = max(1, steps // _LOGGED_ROWS)
         self.last = steps - 1
         names = [f"steps_{tag}" for tag in ("HR", "LR")]
@@ -189,4 +206,11 @@ class _Ledger:
     def close(self, gaussians: Gaussians, seconds: float) -> Trained:
         columns = dict.fromkeys(name for row in self.history for name in row)
         history = [{name: row.get(name) for name in columns} for row in self.history]
-        return Trained(gaussians, history, seconds, self.memory_bytes, self.evaluations)
+        return Trained(
+            gaussians,
+            history,
+            seconds,
+            self.memory_bytes,
+            self.evaluations,
+            self.grow_grad2d,
+        )

@@ -14,6 +14,7 @@ from xrgs.components.adaptive_weighting import AdaptiveWeighting
 from xrgs.components.base import Component, Components, Step, TrainingView, not_negative
 from xrgs.components.consistency import Consistency
 from xrgs.components.continuous_weighting import ContinuousWeighting
+from xrgs.components.count_matched import CountMatched
 from xrgs.components.curriculum import Curriculum
 from xrgs.components.gradient_scaling import GradientScaling
 from xrgs.components.hybrid_schedule import HybridSchedule
@@ -44,6 +45,8 @@ _NOT_NEGATIVE = (
     "hybrid_schedule.ramp",
     "continuous_weighting.gamma",
     "mip.variance",
+    "count_matched.gaussians",
+    "count_matched.tolerance",
 )
 
 
@@ -81,6 +84,8 @@ def build(
         components.append(Mip(conf.mip, data.train, splat.raster.near))
     if conf.render_scale.gamma != 0:
         components.append(RenderScale(conf.render_scale, data.train))
+    if conf.count_matched.gaussians != 0:
+        components.append(CountMatched(conf.count_matched, splat.densify.stop))
     return Components(components)
 
 
