@@ -4,6 +4,8 @@
 #include <atomic>
 #include <chrono>
 #include <cstring>
+#include <numeric>
+#include <vector>
 
 #include "pool.h"
 #include "raster/kernels.h"
@@ -39,6 +41,20 @@ class Borrowed {
   std::unique_ptr<Workspace> workspace_;
 };
 
+// Close up the sort keys: chunk c's seen[c] from its own place in `spare` to `order`.
+void close_up(int threads, std::int64_t chunks, const std::int32_t* seen, Frame& frame) {
+  constexpr std::int64_t kTogether = 32;  // chunks a task
+  std::vector<std::int64_t> place(static_cast<std::size_t>(chunks) + 1, 0);
+  for (std::size_t c = 0; c < static_cast<std::size_t>(chunks); ++c) place[c + 1] = place[c] + seen[c];
+  frame.seen = place.back();
+  parallel_for(threads, (chunks + kTogether - 1) / kTogether, [&](std::int64_t task) {
+    for (std::int64_t c = task * kTogether; c < std::min(chunks, (task + 1) * kTogether); ++c)
+      std::memcpy(frame.order.data() + place[static_cast<std::size_t>(c)],
+                  frame.spare.data() + c * kChunk,
+                  static_cast<std::size_t>(seen[c]) * sizeof(std::uint64_t));
+  });
+}
+
 // Chunks project into places of their own in `spare`, which are then closed up.
 bool project_all(int threads, const RasterKernels& kernels, const Parameters& p, Frame& frame,
                  Workspace& workspace) {
@@ -60,13 +76,28 @@ bool project_all(int threads, const RasterKernels& kernels, const Parameters& p,
         kernels.project(p, frame.view, first, last, frame, frame.spare.data() + first, &good));
     if (!good) all_good = false;
   });
-  frame.seen = 0;
-  for (std::int64_t c = 0; c < chunks; ++c) {
-    std::memcpy(frame.order.data() + frame.seen, frame.spare.data() + c * kChunk,
-                static_cast<std::size_t>(seen[c]) * sizeof(std::uint64_t));
-    frame.seen += seen[c];
-  }
+  close_up(threads, chunks, seen, frame);
   return all_good;
+}
+
+// body(tile) for every tile. Where each thread has few of them, those with the longest lists go
+// first, so that no thread is left with one when the others are done.
+template <class Body>
+void for_each_tile(int threads, const Frame& frame, Body&& body) {
+  constexpr std::int64_t kFewTiles = 128;  // a thread
+  const std::int64_t tiles = std::int64_t{frame.view.columns()} * frame.view.rows();
+  if (threads == 1 || tiles > kFewTiles * threads) {
+    parallel_for(threads, tiles, [&](std::int64_t tile) { body(static_cast<int>(tile)); });
+    return;
+  }
+  const auto length = [&](int tile) {
+    const auto i = static_cast<std::size_t>(tile);
+    return frame.tile_begin[i + 1] - frame.tile_begin[i];
+  };
+  std::vector<int> order(static_cast<std::size_t>(tiles));
+  std::iota(order.begin(), order.end(), 0);
+  std::sort(order.begin(), order.end(), [&](int a, int b) { return length(a) > length(b); });
+  parallel_for(threads, tiles, [&](std::int64_t i) { body(order[static_cast<std::size_t>(i)]); });
 }
 
 }  // namespace
@@ -83,10 +114,7 @@ bool render(int threads, const Parameters& parameters, const View& view, Frame& 
   frame.timings.sort = clock.lap();
   make_lists(threads, kernels, frame, *workspace);
   frame.timings.bin = clock.lap();
-  const std::int64_t tiles = std::int64_t{view.columns()} * view.rows();
-  parallel_for(threads, tiles, [&](std::int64_t tile) {
-    kernels.composite(frame, static_cast<int>(tile), image, alpha);
-  });
+  for_each_tile(threads, frame, [&](int tile) { kernels.composite(frame, tile, image, alpha); });
   frame.timings.composite = clock.lap();
   return true;
 }
@@ -98,9 +126,8 @@ void render_backward(int threads, const Parameters& parameters, Frame& frame,
   Borrowed workspace;
   Clock clock;
   float* sums = (*workspace).sums.resize(frame.entries.size() * kSlotSize);
-  const std::int64_t tiles = std::int64_t{frame.view.columns()} * frame.view.rows();
-  parallel_for(threads, tiles, [&](std::int64_t tile) {
-    kernels.composite_backward(frame, static_cast<int>(tile), image_gradient, alpha_gradient, sums);
+  for_each_tile(threads, frame, [&](int tile) {
+    kernels.composite_backward(frame, tile, image_gradient, alpha_gradient, sums);
   });
   frame.timings.composite_backward = clock.lap();
   const std::int64_t chunks = (parameters.count + kChunk - 1) / kChunk;

@@ -56,13 +56,27 @@ void sum_counts(std::int64_t chunks, std::int64_t tiles, std::uint32_t* counts, 
 }
 
 // Give each Gaussian its slots, as many as it has pairs. Returns how many there are.
-std::int64_t assign_slots(Frame& frame) {
-  std::int64_t next = 0;
-  for (std::size_t i = 0; i < frame.slots.size(); ++i) {
-    frame.slots[i].first = static_cast<std::uint32_t>(next);
-    next += frame.slots[i].count;
-  }
-  return next;
+std::int64_t assign_slots(int threads, Frame& frame) {
+  constexpr std::int64_t kTogether = 1 << 15;  // Gaussians a task
+  const auto count = static_cast<std::int64_t>(frame.slots.size());
+  const std::int64_t tasks = (count + kTogether - 1) / kTogether;
+  std::vector<std::int64_t> first(static_cast<std::size_t>(tasks) + 1, 0);  // slot of each task
+  parallel_for(threads, tasks, [&](std::int64_t t) {
+    std::int64_t sum = 0;
+    for (std::int64_t i = t * kTogether; i < std::min(count, (t + 1) * kTogether); ++i)
+      sum += frame.slots[static_cast<std::size_t>(i)].count;
+    first[static_cast<std::size_t>(t) + 1] = sum;
+  });
+  for (std::size_t t = 0; t < static_cast<std::size_t>(tasks); ++t) first[t + 1] += first[t];
+  parallel_for(threads, tasks, [&](std::int64_t t) {
+    std::int64_t next = first[static_cast<std::size_t>(t)];
+    for (std::int64_t i = t * kTogether; i < std::min(count, (t + 1) * kTogether); ++i) {
+      Slots& slots = frame.slots[static_cast<std::size_t>(i)];
+      slots.first = static_cast<std::uint32_t>(next);
+      next += slots.count;
+    }
+  });
+  return first.back();
 }
 
 // Send a chunk's pairs to their lists.
@@ -104,7 +118,7 @@ void make_lists(int threads, const RasterKernels& kernels, Frame& frame, Workspa
 
   // Places are 32-bit; far below that bound the sums of the backward pass (64 bytes a pair) and
   // the lists end the memory, which their own allocation says.
-  const std::int64_t pairs = assign_slots(frame);
+  const std::int64_t pairs = assign_slots(threads, frame);
   if (pairs > std::numeric_limits<std::uint32_t>::max()) throw std::bad_alloc();
 
   frame.tile_begin.resize(static_cast<std::size_t>(tiles) + 1);
