@@ -1,5 +1,8 @@
 // The pool: one job at a time, tasks handed out by an atomic counter.
 //
+// A render is a dozen jobs of a fraction of a millisecond each, and waking a sleeper takes a tenth
+// of one: whoever waits looks about for a moment before it sleeps.
+//
 // The pool is never destroyed (threads asleep at exit are simply ended with the process), and a
 // forked child, which has none of its parent's threads, starts a new one.
 #include "pool.h"
@@ -7,6 +10,7 @@
 #include <pthread.h>
 
 #include <atomic>
+#include <chrono>
 #include <condition_variable>
 #include <mutex>
 #include <system_error>
@@ -34,8 +38,12 @@ class Pool {
     }
     wake_.notify_all();
     work();
+    {
+      std::lock_guard<std::mutex> lock(mutex_);
+      seats_ = 0;  // whoever has not woken yet need not
+    }
+    look_about([this] { return working_ == 0; });
     std::unique_lock<std::mutex> lock(mutex_);
-    seats_ = 0;  // whoever has not woken yet need not
     done_.wait(lock, [this] { return working_ == 0; });
     busy_.clear(std::memory_order_release);
   }
@@ -48,6 +56,20 @@ class Pool {
     } catch (const std::system_error&) {
       // Fewer threads than asked for: the work gets done all the same.
     }
+  }
+
+  // Until `ready`, but no longer than some 50 us: too short to be felt by others on a busy machine.
+  template <class Ready>
+  static void look_about(Ready ready) {
+    const auto end = std::chrono::steady_clock::now() + std::chrono::microseconds(50);
+    while (!ready() && std::chrono::steady_clock::now() < end)
+      for (int i = 0; i < 16; ++i) pause();
+  }
+
+  static void pause() {
+#ifdef XRGS_X86
+    __builtin_ia32_pause();
+#endif
   }
 
   void work() {
@@ -70,19 +92,22 @@ class Pool {
       work();
       lock.lock();
       if (--working_ == 0) done_.notify_one();
+      lock.unlock();
+      look_about([&] { return generation_ != seen; });
+      lock.lock();
     }
   }
 
   std::atomic_flag busy_ = ATOMIC_FLAG_INIT;  // set for the whole of a job
-  std::mutex mutex_;                          // guards what follows, but for next_
+  std::mutex mutex_;                          // guards what follows, but for the atomic ones' reads
   std::condition_variable wake_, done_;
   Task task_ = nullptr;
   void* context_ = nullptr;
   std::int64_t count_ = 0;
   std::atomic<std::int64_t> next_{0};
-  std::uint64_t generation_ = 0;
-  int seats_ = 0;    // workers that may still join the job
-  int working_ = 0;  // workers inside it
+  std::atomic<std::uint64_t> generation_{0};
+  int seats_ = 0;                // workers that may still join the job
+  std::atomic<int> working_{0};  // workers inside it
   int started_ = 0;
 };
 
