@@ -56,6 +56,7 @@ def test_no_two_are_the_same_cell(compose: Compose) -> None:
     ("names", "whole"),
     [
         (("loss_weighting", "gradient_scaling"), "loss_gradient"),
+        (("loss_weighting", "gradient_scaling", "densify", "consistency"), "xrgs"),
         (("curriculum", "render_scale"), None),
         (("loss_weighting", "consistency"), None),
     ],

@@ -179,6 +179,17 @@ def test_the_threshold_that_gives_a_count_is_found_and_kept(data: Dataset, basel
     assert same(train.train(data, baseline).gaussians, matched.gaussians)
 
 
+def test_the_history_counts_by_group(data: Dataset, compose: Callable[..., Conf]) -> None:
+    history = train.train(data, compose("train.steps=40", "+ablation=densify")).history
+    assert len({tuple(row) for row in history}) == 1
+    last = history[-1]
+    assert last["grown_HR"] > 0
+    assert last["grown_LR"] > 0
+    grown = last["duplicated"] + last["split"]
+    assert max(last["grown_HR"], last["grown_LR"]) <= grown <= last["grown_HR"] + last["grown_LR"]
+    assert last["pruned_opacity_HR"] + last["pruned_opacity_LR"] == last["pruned_opacity"]
+
+
 def test_a_statistic_of_nothing_grows_nothing(
     data: Dataset, baseline: Conf, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -229,6 +240,31 @@ def test_what_is_kept_is_no_smaller_than_its_filter(
         smallest[variance] = train.train(data, conf).gaussians.activated().scales.min().item()
     # The finest view has a focal length of 72 px, and sees none nearer than 1.
     assert smallest[0.0] < 2**0.5 / 72 < smallest[2.0]
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        ["+ablation=loss_gradient", "components.loss_weighting.stat_from=unweighted"],
+        ["+ablation=densify", "components.densify.lr_prune=1"],
+        [
+            "+ablation=densify",
+            "components.densify.decide=current_view",
+            "components.densify.lr_prune=1",
+        ],
+        ["+ablation=render_scale"],
+    ],
+    ids=["loss_gradient", "per_class", "current_view", "render_scale"],
+)
+def test_what_is_for_lr_views_leaves_hr_views_alone(
+    data: Dataset, compose: Callable[..., Conf], changes: list[str]
+) -> None:
+    # With lr_prune 1: else what no HR view draws is pruned sooner, and the reset is higher.
+    views = tuple(view for view in data.train if view.tag == "HR")
+    data = dataclasses.replace(data, train=views)
+    short = ["train.steps=20", "splat.backend=auto"]
+    plain = train.train(data, compose(*short))
+    assert same(plain.gaussians, train.train(data, compose(*short, *changes)).gaussians)
 
 
 def test_training_goes_on_when_every_gaussian_is_pruned(data: Dataset, baseline: Conf) -> None:

@@ -143,6 +143,20 @@ class GradientScalingConf:
 
 
 @dataclass
+class DensifyConf:
+    """Resolution-aware densification and pruning (paper 5.4)."""
+
+    decide: str = MISSING
+    """Who sets the thresholds: `nobody` (off: all views alike), `per_class` or `current_view`. Open
+    in the paper; see `xrgs.components.densify`."""
+    lr_grow: float = MISSING
+    """Times `splat.densify.grow_grad2d`: the threshold of LR views; HR views have that itself. The
+    paper has threshold_HR < threshold_LR, and leaves both open."""
+    lr_prune: float = MISSING
+    """Times `splat.densify.prune_opacity`, likewise."""
+
+
+@dataclass
 class CurriculumConf:
     """LR-only warm-up (paper 5.5)."""
 
@@ -232,6 +246,7 @@ class ComponentsConf:
 
     loss_weighting: LossWeightingConf = field(default_factory=LossWeightingConf)
     gradient_scaling: GradientScalingConf = field(default_factory=GradientScalingConf)
+    densify: DensifyConf = field(default_factory=DensifyConf)
     curriculum: CurriculumConf = field(default_factory=CurriculumConf)
     render_scale: RenderScaleConf = field(default_factory=RenderScaleConf)
     consistency: ConsistencyConf = field(default_factory=ConsistencyConf)

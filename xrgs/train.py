@@ -86,13 +86,14 @@ def _run(data: Dataset, conf: Conf) -> Trained:
     optimizer = SplatOptimizer(
         gaussians, splat.optimizer, scene_scale=data.scene_scale, steps=steps, backend=backend
     )
+    parts = components.build(conf.components, data, splat, backend)
     densifier = Densifier(
         optimizer,
         splat.densify.scaled(steps),
         scene_scale=data.scene_scale,
         generator=stream(conf.seed, "densify"),
+        groups=parts.groups(splat.densify),
     )
-    parts = components.build(conf.components, data, splat, backend)
     targets = {view.name: prepare_target(view.image) for view in data.train}
     sh_every = max(1, int(splat.sh_every * steps / NOMINAL_STEPS))
     ledger = _Ledger(steps, splat.densify.grow_grad2d)
@@ -127,7 +128,12 @@ def _run(data: Dataset, conf: Conf) -> Trained:
         optimizer.step()
         statistic = None if offset.grad is None else parts.statistic(offset.grad, step)
         done = densifier.after_step(
-            step.number, statistic, render.visible, width=camera.width, height=camera.height
+            step.number,
+            statistic,
+            render.visible,
+            width=camera.width,
+            height=camera.height,
+            group=view.tag,
         )
         ledger.refined(done)
         if done != Refinement():
@@ -171,9 +177,7 @@ class _Ledger:
         self.grow_grad2d = grow_grad2d
         self.every = max(1, steps // _LOGGED_ROWS)
         self.last = steps - 1
-        names = [f"steps_{tag}" for tag in ("HR", "LR")]
-        names += [field.name for field in dataclasses.fields(Refinement)]
-        self.counts = Counter(dict.fromkeys(names, 0))
+        self.counts = Counter({"steps_HR": 0, "steps_LR": 0} | Refinement().counts())
         self.notes: defaultdict[str, list[float]] = defaultdict(list)
         self.history: list[dict[str, Any]] = []
         self.memory_bytes = 0
@@ -201,11 +205,11 @@ class _Ledger:
             self.notes.clear()
 
     def refined(self, done: Refinement) -> None:
-        self.counts.update(dataclasses.asdict(done))
+        self.counts.update(done.counts())
 
     def close(self, gaussians: Gaussians, seconds: float) -> Trained:
-        columns = dict.fromkeys(name for row in self.history for name in row)
-        history = [{name: row.get(name) for name in columns} for row in self.history]
+        blank = {name: None for row in self.history for name in row} | dict.fromkeys(self.counts, 0)
+        history = [blank | row for row in self.history]
         return Trained(
             gaussians,
             history,

@@ -13,6 +13,7 @@ import torch
 from xrgs.components import Component, Components, Step
 from xrgs.components.consistency import Consistency
 from xrgs.components.curriculum import Curriculum
+from xrgs.components.densify import Densify
 from xrgs.components.gradient_scaling import GradientScaling
 from xrgs.components.mip import Mip
 from xrgs.components.render_scale import RenderScale
@@ -20,6 +21,7 @@ from xrgs.components.weighting import Weighting
 from xrgs.config import ComponentsConf
 from xrgs.errors import XrgsError
 from xrgs.splat.gaussians import PARAMETERS, Gaussians
+from xrgs.splat.settings import DensifySettings
 
 Build = Callable[..., Components]
 
@@ -27,6 +29,7 @@ Build = Callable[..., Components]
 ON: dict[str, tuple[Any, type[Component]]] = {
     "loss_weighting.lr_weight": (0.25, Weighting),
     "gradient_scaling.lr_scale": (0.3, GradientScaling),
+    "densify.decide": ("per_class", Densify),
     "curriculum.lr_only": (5000, Curriculum),
     "render_scale.gamma": (0.25, RenderScale),
     "consistency.weight": (0.1, Consistency),
@@ -58,6 +61,7 @@ def test_a_component_that_overrides_nothing_is_the_identity(
     assert parts.pixel_weight(step) is None
     assert parts.loss(loss, step.view.image, step) is loss
     assert parts.statistic(gradient, step) is gradient
+    assert parts.groups(DensifySettings()) is None
     parts.after_backward(gaussians, step)
     parts.refined(gaussians)
     parts.finish(gaussians)
@@ -91,6 +95,8 @@ def test_training_needs_no_hydra() -> None:
         ("loss_weighting.lr_weight", -0.1),
         ("loss_weighting.lr_weight", float("nan")),
         ("gradient_scaling.lr_scale", float("inf")),
+        ("densify.lr_grow", -2.0),
+        ("densify.lr_prune", float("nan")),
         ("curriculum.lr_only", -1),
         ("render_scale.gamma", -0.25),
         ("consistency.weight", -1.0),

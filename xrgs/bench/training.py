@@ -227,10 +227,15 @@ class Step:
 
     def densify(self) -> None:
         """All steps from one refinement to the next."""
-        size = {"width": self.camera.width, "height": self.camera.height}
         with threads(self.threads):
             for step in range(1, self.settings.every + 1):
-                self.densifier.after_step(step, self.offset.grad, self.rendered.visible, **size)
+                self.densifier.after_step(
+                    step,
+                    self.offset.grad,
+                    self.rendered.visible,
+                    width=self.camera.width,
+                    height=self.camera.height,
+                )
 
     def all(self) -> None:
         """One whole step, its share of densification's bookkeeping included."""

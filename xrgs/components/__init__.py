@@ -16,6 +16,7 @@ from xrgs.components.consistency import Consistency
 from xrgs.components.continuous_weighting import ContinuousWeighting
 from xrgs.components.count_matched import CountMatched
 from xrgs.components.curriculum import Curriculum
+from xrgs.components.densify import Densify
 from xrgs.components.gradient_scaling import GradientScaling
 from xrgs.components.hybrid_schedule import HybridSchedule
 from xrgs.components.loss_weighting import LossWeighting
@@ -35,6 +36,8 @@ __all__ = ["Component", "Components", "Step", "TrainingView", "build"]
 _NOT_NEGATIVE = (
     "loss_weighting.lr_weight",
     "gradient_scaling.lr_scale",
+    "densify.lr_grow",
+    "densify.lr_prune",
     "curriculum.lr_only",
     "render_scale.gamma",
     "consistency.weight",
@@ -78,6 +81,8 @@ def build(
     components += _weighting(conf, data, splat)
     if conf.gradient_scaling.lr_scale != 1:
         components.append(GradientScaling(conf.gradient_scaling))
+    if conf.densify.decide != "nobody":
+        components.append(Densify(conf.densify))
     if conf.curriculum.lr_only != 0:
         components.append(Curriculum(conf.curriculum, data.train))
     if conf.mip.variance != 0:

@@ -16,7 +16,9 @@ if TYPE_CHECKING:
     from torch import Tensor
 
     from xrgs.splat.cameras import Camera
+    from xrgs.splat.densify import Groups
     from xrgs.splat.gaussians import Activated, Gaussians
+    from xrgs.splat.settings import DensifySettings
 
 
 class TrainingView(Protocol):
@@ -99,6 +101,14 @@ class Component:
         del step
         return gradient
 
+    def groups(self, settings: DensifySettings) -> Groups | None:
+        """The views that densification tells apart, by their tags; None where it is to tell none.
+
+        Asked once, before training; at most one of the components may have an answer.
+        """
+        del settings
+        return None
+
     def refined(self, gaussians: Gaussians) -> None:
         """Gaussians came or went, or training begins."""
 
@@ -142,6 +152,11 @@ class Components(tuple[Component, ...]):
         for component in self:
             gradient = component.statistic(gradient, step)
         return gradient
+
+    def groups(self, settings: DensifySettings) -> Groups | None:
+        """`Component.groups` of the one that has an answer."""
+        answers = (component.groups(settings) for component in self)
+        return next((answer for answer in answers if answer is not None), None)
 
     def refined(self, gaussians: Gaussians) -> None:
         """`Component.refined` of each in turn."""
