@@ -18,7 +18,6 @@ from xrgs.bench.loads import Load
 from xrgs.bench.rendering import Rendering, Way, errors, time_ways
 from xrgs.bench.timing import alternate, threads
 from xrgs.bench.training import L1, SSIM, Step
-from xrgs.splat.gaussians import PARAMETERS
 from xrgs.splat.loss import photometric_loss, prepare_target
 from xrgs.splat.settings import Skips
 from xrgs.splat.sh import bases
@@ -145,10 +144,9 @@ def _statistics(load: Load, backend: str) -> tuple[Callable[[], Tensor], Callabl
 
 
 def before_and_after_bands(load: Load, backend: str) -> tuple[Step, Step]:
-    """Steps whose higher harmonics have had no gradient yet, and that have one."""
-    steps = Step(load, backend, 1), Step(load, backend, 1)
-    for step, slope in zip(steps, (0.0, 1e-6), strict=True):
-        for name in PARAMETERS:
-            value = step.gaussians[name]
-            value.grad = torch.full_like(value, slope if name == "shN" else 1e-6)
-    return steps
+    """Steps ready to optimize, before higher harmonics are on and once they are."""
+    before, after = (Step(load, backend, 1, sh_degree=degree) for degree in (0, 3))
+    for step in (before, after):
+        step.loss()
+        step.backward()
+    return before, after

@@ -172,8 +172,9 @@ class Step:
     reaches the thresholds of densification, whose bookkeeping is timed all the same.
     """
 
-    def __init__(self, load: Load, backend: str, count: int) -> None:
+    def __init__(self, load: Load, backend: str, count: int, *, sh_degree: int = 3) -> None:
         self.camera, self.backend, self.threads = load.camera, backend, count
+        self.sh_degree = sh_degree
         means, quats, scales, opacities, sh0, rest = load.parameters
         raw = (
             means,
@@ -203,7 +204,7 @@ class Step:
                 *self.gaussians.activated(),
                 self.camera,
                 RasterSettings(),
-                sh_degree=3,
+                sh_degree=self.sh_degree,
                 means2d_offset=self.offset,
                 backend=self.backend,
             )
@@ -247,8 +248,10 @@ class Step:
 
     def counted_bytes(self) -> int:
         """Parameters, gradients, Adam's state and the renderer's buffers, as training counts."""
-        model = sum(self.gaussians[name].nbytes for name in PARAMETERS)
-        return 2 * model + self.optimizer.state_bytes() + self.rendered.buffer_bytes
+        model = [self.gaussians[name] for name in PARAMETERS]
+        gradients = [value.grad for value in model if value.grad is not None]
+        held = sum(value.nbytes for value in model + gradients)
+        return held + self.optimizer.state_bytes() + self.rendered.buffer_bytes
 
     def parts(self) -> list[Callable[[], None]]:
         """One for each of `PARTS`."""
