@@ -11,7 +11,7 @@ python=$(command -v python)
 
 cmake -S "$root/xrgs/native" -B "$folder" -DXRGS_SANITIZE=ON -DCMAKE_BUILD_TYPE=RelWithDebInfo \
   -DPython_EXECUTABLE="$python"
-cmake --build "$folder" --parallel
+cmake --build "$folder" --parallel "$(getconf _NPROCESSORS_ONLN)"
 
 # The package as it stands, with this module in the place of an installed one.
 package=$folder/package/xrgs
