@@ -69,12 +69,11 @@ def mix(scene: Scene, conf: VariantConf, work: Path, out: Path) -> Variant:
     report = _report(mixture, model) | {"attempts": placed.attempts}
     if placed.refused:
         raise SceneFailed(f"scene {scene.name} failed: {placed.refused}", report)
+    report |= _pose_error(mixture, model, work)
     depth = tagging.depths(model)
     if conf.tags in tagging.NEED_DEPTH:
         mixture = replace(mixture, parts=_tags_after(mixture, model, depth))
         write_degraded(photos, mixture.degraded, conf)
-    else:
-        report |= _pose_error(mixture, model, work)
     views = _straighten(mixture, model, depth, out)
     report |= _tags_report(mixture, views)
     report["seconds"] = round(time.perf_counter() - start, 1)
