@@ -44,6 +44,19 @@ def test_any_8_bit_photograph_is_read_as_rgb(tmp_path: Path, mode: str) -> None:
     assert images.read(tmp_path / "a.tif").shape == (10, 20, 3)
 
 
+def test_exif_tells_the_camera_where_it_is_told(tmp_path: Path) -> None:
+    Image.new("RGB", (20, 10)).save(tmp_path / "plain.jpg")
+    assert images.camera_mark(tmp_path / "plain.jpg") == ""
+    exif = Image.Exif()
+    exif[0x010F], exif[0x0110] = "Maker ", "X 100"
+    exif.get_ifd(0x8769)[0x920A] = 23.0
+    Image.new("RGB", (20, 10)).save(tmp_path / "told.jpg", exif=exif)
+    assert images.camera_mark(tmp_path / "told.jpg") == "Maker/X 100/23.0"
+    (tmp_path / "no.jpg").write_text("hello")
+    with pytest.raises(ImageError, match=r"no\.jpg"):
+        images.camera_mark(tmp_path / "no.jpg")
+
+
 def test_a_truncated_file_is_named(tmp_path: Path, noise: np.ndarray) -> None:
     images.save(tmp_path / "a b.png", noise)
     whole = (tmp_path / "a b.png").read_bytes()
@@ -113,6 +126,19 @@ def test_the_straightened_view_fills_its_frame_and_no_more(k: float) -> None:
     outside = np.maximum(-source, source - (100, 80)).max()
     assert -0.01 < outside < 1e-3
     assert (flat.fx > 90) == (k > 0)
+
+
+def test_a_strong_barrel_lens_does_not_fold_the_picture() -> None:
+    """Its formula turns back at r² = 1/(3 · 0.9): no pixel of the view may come from beyond."""
+    lens = Lens(100, 80, 60.0, 60.0, 50.0, 40.0, -0.9)
+    flat = lens.straightened()
+    corner = np.array([0.0, 0.0])
+    r2 = (((corner - (50, 40)) / flat.fx) ** 2).sum()
+    assert r2 < 1 / (3 * 0.9)
+    source = corner - (50, 40)
+    source = source / flat.fx * (1 - 0.9 * r2) * 60 + (50, 40)
+    assert (source >= 0).all()
+    assert (source <= (100, 80)).all()
 
 
 def test_an_image_and_its_copy_are_straightened_by_one_zoom() -> None:

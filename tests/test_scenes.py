@@ -79,6 +79,16 @@ def test_an_llff_scene_gives_the_smallest_copies_that_suffice(
     assert images.size(scene.files[0])[0] == width
 
 
+def test_copies_are_measured_by_their_largest_photograph(tmp_path: Path) -> None:
+    """Where sizes differ the first alone tells little; what can't be read tells nothing."""
+    fill(tmp_path / "images", "a.png", "b.png", size=(400, 300))
+    fill(tmp_path / "images_4", "a.png", size=(60, 45))
+    fill(tmp_path / "images_4", "b.png", size=(100, 75))
+    (tmp_path / "images_4" / "c.png").write_text("no image")
+    scene = scenes.resolve(SceneConf("x", "folder", str(tmp_path)), tmp_path, 100)
+    assert scene.files[0].parent.name == "images_4"
+
+
 @pytest.mark.parametrize(
     ("names", "message"),
     [

@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -23,6 +24,19 @@ def test_features_fall_with_the_number_of_images(count: int, asked: int, expecte
 def test_small_images_are_searched_at_twice_their_size() -> None:
     assert sfm.octave_for(252, None) == -1
     assert sfm.octave_for(1008, None) == 0
+    assert sfm.octave_for(252, 0) == 0
+    assert sfm.octave_for(1008, -1) == -1
+
+
+def test_the_default_inliers_are_colmaps_own() -> None:
+    import pycolmap
+
+    colmap = pycolmap.IncrementalPipelineOptions().mapper
+    made = sfm.mapping_options(CONF, 24, known=False).mapper
+    assert made.abs_pose_min_num_inliers == colmap.abs_pose_min_num_inliers
+    assert made.init_min_num_inliers == colmap.init_min_num_inliers
+    fewer = sfm.mapping_options(replace(CONF, min_inliers=15), 24, known=False).mapper
+    assert (fewer.abs_pose_min_num_inliers, fewer.init_min_num_inliers) == (15, 50)
 
 
 def test_two_views_keep_the_points_that_only_two_see() -> None:
@@ -64,6 +78,17 @@ def test_its_cameras_are_parallel_and_side_by_side(pair) -> None:
     step = b[:3, 3] - turn @ a[:3, 3]  # of the right camera, in the left one's axes
     assert np.degrees(np.arccos((np.trace(turn) - 1) / 2)) < 0.5
     assert -step[0] / np.linalg.norm(step) > 0.995
+
+
+def test_each_view_knows_which_points_were_found_in_it(pair) -> None:
+    """Two views: every point was found in both, and falls inside both images."""
+    model = pair[1]
+    for i, lens in model.lenses.items():
+        assert np.array_equal(model.tracked[i], np.arange(len(model.points)))
+        camera = model.points @ model.viewmats[i][:3, :3].T + model.viewmats[i][:3, 3]
+        pixels = camera @ lens.K.T
+        pixels = pixels[:, :2] / pixels[:, 2:]
+        assert ((pixels > -4) & (pixels < (lens.width + 4, lens.height + 4))).all()
 
 
 def test_its_points_lie_at_the_depths_of_the_published_disparity(pair) -> None:

@@ -76,6 +76,48 @@ def test_a_uniform_selection_is_evenly_spaced() -> None:
     assert split(16, conf).hr == (2, 6, 10, 14)
 
 
+scored = st.lists(st.floats(0.01, 1), min_size=2, max_size=60, unique=True)
+RATE = replace(BASE, tags="sampling_rate", min_hr=0)
+
+
+@given(scored, st.floats(0, 1))
+def test_of_scored_views_the_best_share_is_hr(scores: list[float], fraction: float) -> None:
+    """Test views (every 2nd) are never among them, however good."""
+    conf = replace(RATE, hr_fraction=fraction, test_every=2)
+    train = range(1, len(scores), 2)
+    count = round(fraction * len(train))
+    if 0 < fraction < 1 and count in (0, len(train)):
+        with pytest.raises(XrgsError, match=r"variant\.hr_fraction"):
+            split(len(scores), conf, scores)
+        return
+    parts = split(len(scores), conf, scores)
+    best = sorted(train, key=lambda i: scores[i], reverse=True)[:count]
+    assert parts.hr == tuple(sorted(best))
+    assert parts.lr == tuple(i for i in train if i not in best)
+
+
+def test_views_of_equal_score_are_of_one_class() -> None:
+    conf = replace(RATE, hr_fraction=0.5, test_every=0)
+    assert split(6, conf, [1, 0.5, 0.5, 0.5, 0.5, 0.2]).hr == (0, 1, 2, 3, 4)
+
+
+def test_a_view_without_a_score_is_lr_and_not_counted() -> None:
+    conf = replace(RATE, hr_fraction=0.5, test_every=0)
+    assert split(5, conf, [0.5, float("nan"), 1, float("nan"), float("nan")]).hr == (2,)
+
+
+def test_a_threshold_of_the_score_is_inclusive() -> None:
+    conf = replace(RATE, hr_above=0.75, test_every=0)
+    assert split(4, conf, [1, 0.75, 0.7499, 0.1]).hr == (0, 1)
+
+
+def test_one_scale_brings_the_largest_photograph_to_the_long_side() -> None:
+    sizes = [(2000, 1500), (1000, 4000), (640, 480)]
+    assert scale(sizes, replace(BASE, long_side=1000)) == 0.25
+    assert scale(sizes, replace(BASE, long_side=0)) == 1
+    assert scale(sizes, replace(BASE, long_side=9000)) == 1
+
+
 @given(st.integers(60, 5000), st.integers(60, 5000), st.integers(0, 3000), st.integers(1, 8))
 def test_an_hr_view_is_a_whole_number_of_lr_pixels_and_never_enlarged(
     width: int, height: int, side: int, factor: int
@@ -111,6 +153,14 @@ def test_a_factor_too_large_for_the_ssim_window_is_named() -> None:
         ({"long_side": -1}, "variant.long_side=-1"),
         ({"test_every": 1}, "variant.test_every=1"),
         ({"selection": "best"}, "variant.selection=best"),
+        ({"tags": "best"}, "variant.tags=best"),
+        ({"tags": "distance", "hr_above": 1.5}, "variant.hr_above=1.5"),
+        ({"hr_above": 0.5}, "variant.hr_above=0.5: not read with variant.tags=flag"),
+        ({"degradation": "blur"}, "variant.degradation=blur"),
+        ({"jpeg_quality": 0}, "variant.jpeg_quality=0"),
+        ({"sfm": replace(BASE.sfm, camera="both")}, "variant.sfm.camera=both"),
+        ({"sfm": replace(BASE.sfm, first_octave=-2)}, "variant.sfm.first_octave=-2"),
+        ({"sfm": replace(BASE.sfm, min_inliers=5)}, "variant.sfm.min_inliers=5"),
         ({"sfm": replace(BASE.sfm, lr_images="raw")}, "variant.sfm.lr_images=raw"),
         ({"sfm": replace(BASE.sfm, min_registered=2)}, "variant.sfm.min_registered=2"),
         ({"sfm": replace(BASE.sfm, max_num_features=-1)}, "variant.sfm.max_num_features=-1"),
