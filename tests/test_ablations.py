@@ -59,6 +59,9 @@ def test_no_two_are_the_same_cell(compose: Compose) -> None:
         (("loss_weighting", "gradient_scaling", "densify", "consistency"), "xrgs"),
         (("curriculum", "render_scale"), None),
         (("loss_weighting", "consistency"), None),
+        (("loss_weighting", "mip"), None),
+        (("xrgs", "mip"), None),
+        (("densify", "absgrad"), None),
     ],
 )
 def test_they_stack(names: tuple[str, ...], whole: str | None, compose: Compose) -> None:
