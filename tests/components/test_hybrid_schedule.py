@@ -29,8 +29,10 @@ def test_the_weight_of_lr_views_rises_after_densification(
 ) -> None:
     loss = torch.tensor(1.0, dtype=torch.float64)
     number = nominal * of // 30_000
-    weighted = parts.loss(loss, lr.view.image, Step(number, of, lr.view)).item()
+    step = Step(number, of, lr.view)
+    weighted = parts.loss(loss, lr.view.image, step).item()
     assert weighted == pytest.approx(expected, rel=1e-12)
+    assert step.log == {"weighting.LR": weighted}
     assert parts.loss(loss, hr.view.image, Step(number, of, hr.view)) is loss
 
 

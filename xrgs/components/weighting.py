@@ -25,7 +25,8 @@ class Weighting(Component):
     stand together, none takes a view below its base, and none lifts it above 1.
 
     Region weighting has a share for every pixel: `weight` is then the mean over the view, and
-    `pixel_weight` how it is spread. The history has the weights below 1, by the views' tags.
+    `pixel_weight` how it is spread. The history has the weights of views whose base is
+    not 1, by their tags.
     """
 
     def __init__(
@@ -75,10 +76,9 @@ class Weighting(Component):
         """`loss * weight`; the very loss where the weight is 1."""
         del image
         weight = self.weight(step)
-        if weight == 1:
-            return loss
-        step.log[f"weighting.{step.view.tag}"] = weight
-        return loss * weight
+        if self.base(step.view) != 1:
+            step.log[f"weighting.{step.view.tag}"] = weight
+        return loss if weight == 1 else loss * weight
 
     def statistic(self, gradient: Tensor, step: Step) -> Tensor:
         """The gradient over the view's weight, where densification is not to see it."""
