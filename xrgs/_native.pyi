@@ -43,6 +43,21 @@ def resample(
     column_weights: Tensor,
     threads: int,
 ) -> Tensor: ...
+def adam_harmonics(
+    parameter: Tensor,
+    mean: Tensor,
+    square: Tensor,
+    means: Tensor,
+    sh0_gradient: Tensor,
+    position: Sequence[float],
+    degree: int,
+    lr: float,
+    step: float,
+    beta1: float,
+    beta2: float,
+    eps: float,
+    threads: int,
+) -> None: ...
 def multiply_adds_per_second(threads: int) -> float: ...
 
 class View:
@@ -69,7 +84,8 @@ class Frame:
     def __init__(self) -> None: ...
     # The six parameters, the offsets or None, and the number of threads.
     def forward(self, view: View, *inputs: Tensor | int | None) -> tuple[Tensor, Tensor]: ...
-    # The gradients of image and alpha, and then the same.
+    # The gradients of image and alpha, and then the same, with shN's gradient or without before the
+    # number of threads.
     def backward(self, *inputs: Tensor | int | None) -> tuple[Tensor | None, ...]: ...
     def visible(self) -> Tensor: ...
     @property

@@ -103,12 +103,13 @@ def _run(data: Dataset, conf: Conf) -> Trained:
     drawn = endless(data.train, conf.seed, steps, parts.trains_on)
     for step in progress(drawn, "training", "step", steps):
         view, camera = step.view, step.view.camera
+        degree = min(step.number // sh_every, splat.raster.sh_degree)
         offset = torch.zeros(len(gaussians), 2, requires_grad=True)
         render = rasterize(
             *parts.activated(gaussians.activated(), step),
             camera,
             splat.raster,
-            sh_degree=min(step.number // sh_every, splat.raster.sh_degree),
+            sh_degree=degree,
             means2d_offset=offset,
             backend=backend,
         )
@@ -124,8 +125,8 @@ def _run(data: Dataset, conf: Conf) -> Trained:
         optimizer.zero_grad()
         torch.autograd.backward(loss)
         parts.after_backward(gaussians, step)
+        optimizer.step(camera, sh_degree=degree)
         ledger.note(step, loss, render, optimizer)
-        optimizer.step()
         statistic = None if offset.grad is None else parts.statistic(offset.grad, step)
         done = densifier.after_step(
             step.number,
@@ -191,8 +192,10 @@ class _Ledger:
         optimizer: SplatOptimizer,
     ) -> None:
         gaussians = optimizer.gaussians
-        model = sum(gaussians[name].nbytes for name in splats.PARAMETERS)
-        used = 2 * model + optimizer.state_bytes() + render.buffer_bytes  # 2: and its gradients
+        model = [gaussians[name] for name in splats.PARAMETERS]
+        gradients = [value.grad for value in model if value.grad is not None]
+        used = sum(value.nbytes for value in model + gradients)
+        used += optimizer.state_bytes() + render.buffer_bytes
         self.memory_bytes = max(self.memory_bytes, used)
         self.evaluations += render.evaluations
         self.counts[f"steps_{step.view.tag}"] += 1

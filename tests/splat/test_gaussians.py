@@ -31,6 +31,7 @@ def test_start_is_gsplats(cloud):
     np.testing.assert_allclose(scales.detach(), np.repeat(expected[:, None], 3, 1), rtol=1e-5)
     np.testing.assert_allclose(opacities.detach(), 0.1, rtol=1e-5)
     assert ((quats >= 0) & (quats < 1)).all()
+    assert not shN.requires_grad  # the optimizer has its gradient from sh0's
     dirs = torch.nn.functional.normalize(means, dim=-1)
     np.testing.assert_allclose(sh_to_colors(3, dirs, sh0, shN).detach(), colors / 255.0, atol=1e-6)
 

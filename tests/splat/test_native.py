@@ -144,6 +144,24 @@ def test_bands_above_the_degree_have_no_gradient(isa, make_camera, make_scene):
     assert (gradients["shN"][:, :3] != 0).any()
 
 
+def test_harmonics_whose_gradient_is_not_wanted_cost_none(isa, make_camera, make_scene):
+    camera = rounded(make_camera(turned=True))
+    scene = single(make_scene(45, camera))
+    gradients = {}
+    for wanted in (True, False):
+        leaves = {name: scene[name].clone().requires_grad_() for name in NAMES}
+        leaves["shN"].requires_grad_(wanted)
+        render = rasterize(
+            *leaves.values(), camera, RasterSettings(), sh_degree=3, backend="native"
+        )
+        render.image.square().sum().backward()
+        gradients[wanted] = {name: leaf.grad for name, leaf in leaves.items()}
+    assert gradients[True].pop("shN") is not None
+    assert gradients[False].pop("shN") is None
+    for name, gradient in gradients[True].items():
+        assert torch.equal(gradients[False][name], gradient), name
+
+
 def test_antialiased_before_a_background(isa, make_camera, make_scene):
     camera = make_camera(40, 30)
     raster = RasterSettings(antialiased=True, background=(0.2, 0.5, 0.9))

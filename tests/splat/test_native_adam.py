@@ -8,6 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor
 
+from xrgs.splat.cameras import Camera
 from xrgs.splat.gaussians import PARAMETERS, Gaussians
 from xrgs.splat.optimizer import SplatOptimizer
 from xrgs.splat.settings import OptimizerSettings
@@ -213,3 +214,63 @@ def test_it_is_for_float32() -> None:
     gaussians.means.grad = torch.zeros(3, 3, dtype=torch.float64)
     with pytest.raises(ValueError, match="means and its gradient must be float32"):
         of.step()
+
+
+def camera() -> Camera:
+    viewmat = torch.eye(4)
+    viewmat[:3, 3] = torch.tensor([0.3, -0.2, 2.0])
+    K = torch.tensor([[50.0, 0.0, 20.0], [0.0, 50.0, 15.0], [0.0, 0.0, 1.0]])
+    return Camera(viewmat, K, width=40, height=30)
+
+
+def take_step_of_a_view(of: SplatOptimizer, gradients: dict[str, Tensor], degree: int) -> None:
+    of.zero_grad()
+    for name in PARAMETERS[:-1]:
+        of.gaussians[name].grad = gradients[name].clone()
+    of.step(camera(), sh_degree=degree)
+
+
+@pytest.mark.parametrize("degree", [0, 1, 2, 3])
+@pytest.mark.parametrize("count", [1, 16, 37])
+def test_harmonics_move_by_the_gradient_that_sh0_implies(isa: str, count: int, degree: int) -> None:
+    ours, theirs = optimizer(count, "native"), optimizer(count, "torch")
+    before = ours.gaussians.shN.detach().clone()
+    gradients = values(count, 1, 1e-3)
+    for each in (ours, theirs):
+        take_step_of_a_view(each, gradients, degree)
+    on = (degree + 1) ** 2 - 1
+    for which, power in (("exp_avg", 1), ("exp_avg_sq", 2)):
+        a, b = moment(ours, "shN", which), moment(theirs, "shN", which)
+        # A basis function is a small sum of products: some roundings of its largest term, below 3.
+        scale = (gradients["sh0"].abs() * 12) ** power * (1 - (0.9, 0.999)[power - 1])
+        assert ((a - b).abs() <= 16 * ULP * scale).all()
+        assert (a[:, :on] != 0).all()
+        assert (a[:, on:] == 0).all()
+    assert torch.equal(ours.gaussians.shN[:, on:], before[:, on:])
+    assert (ours.gaussians.shN[:, :on] != before[:, :on]).all()
+    assert ours.gaussians.shN.grad is None
+    assert ours.adam.state[ours.gaussians.shN]["step"] == 1
+    for name in PARAMETERS[:-1]:  # as without the view
+        alone = optimizer(count, "native")
+        take_step(alone, {name: gradients[name] for name in PARAMETERS[:-1]})
+        assert torch.equal(ours.gaussians[name], alone.gaussians[name])
+
+
+@pytest.mark.usefixtures("threads")
+def test_threads_change_no_bit_of_harmonics(isa: str) -> None:
+    results = []
+    for count in (1, 2, 3, 4):
+        torch.set_num_threads(count)
+        of = optimizer(2000, "native")
+        for step in range(3):
+            take_step_of_a_view(of, values(2000, step), 3)
+        results.append(of.gaussians.shN)
+    for other in results[1:]:
+        assert torch.equal(other, results[0])
+
+
+def test_harmonics_need_the_bands_that_are_on() -> None:
+    of = optimizer(5, "native")
+    of.reset("shN", of.gaussians.shN.detach()[:, :3].contiguous())
+    with pytest.raises(ValueError, match="bands of sh_degree"):
+        take_step_of_a_view(of, values(5, 1), 2)

@@ -57,14 +57,18 @@ class Gaussians:
         setattr(self, name, value)
 
     def activated(self) -> Activated:
-        """Scales in world units, opacities in 0..1, the rest as it is."""
+        """Scales in world units, opacities in 0..1, the rest as it is.
+
+        shN is cut off from its leaf: its gradient, three quarters of all, is never made. The
+        optimizer has it from sh0's (`SplatOptimizer.step`).
+        """
         return Activated(
             self.means,
             self.quats,
             torch.exp(self.scales),
             torch.sigmoid(self.opacities),
             self.sh0,
-            self.shN,
+            self.shN.detach(),
         )
 
 

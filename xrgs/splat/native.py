@@ -109,6 +109,10 @@ class _Rasterize(torch.autograd.Function):
     def backward(ctx: Any, v_image: Tensor, v_alpha: Tensor) -> tuple[Tensor | None, ...]:
         threads = torch.get_num_threads()
         gradients = ctx.frame.backward(
-            v_image.contiguous(), v_alpha.contiguous(), *ctx.saved_tensors, threads
+            v_image.contiguous(),
+            v_alpha.contiguous(),
+            *ctx.saved_tensors,
+            ctx.needs_input_grad[7],  # shN's, as large as all others three times over
+            threads,
         )
         return (None, None, *gradients)

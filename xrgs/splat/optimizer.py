@@ -7,10 +7,13 @@ from collections.abc import Callable, Mapping
 
 import torch
 from torch import Tensor
+from torch.nn.functional import normalize
 
 from xrgs.splat.backend import resolve_backend
+from xrgs.splat.cameras import Camera
 from xrgs.splat.gaussians import PARAMETERS, Gaussians
 from xrgs.splat.settings import OptimizerSettings
+from xrgs.splat.sh import C0, sh_basis
 
 
 class SplatOptimizer:
@@ -65,17 +68,37 @@ class SplatOptimizer:
             fused=True,  # a fifth of the default's time, and as exact
         )
 
-    def step(self) -> None:
-        """Move every parameter that has a gradient, then decay the rate of `means`."""
+    def step(self, camera: Camera | None = None, *, sh_degree: int = 0) -> None:
+        """Move every parameter that has a gradient, then decay the rate of `means`.
+
+        With a camera shN moves, too, by the gradient that sh0's implies: seen from one place, all
+        harmonics of a Gaussian change one colour, so their gradient is that of the colour times
+        the basis in the direction of view, and sh0's has the constant C0 in the basis' place.
+
+        Args:
+            camera: The view that the gradients come from, as the Gaussians were rendered in it.
+            sh_degree: Highest band that was on.
+        """
         if self.native:
             from xrgs.splat import native_adam
 
-            native_adam.step(self.adam)
+            native_adam.step(self.adam, camera, sh_degree)
         else:
+            if camera is not None:
+                self._give_harmonics_gradient(camera, sh_degree)
             self.adam.step()
         self.steps_done += 1
         decay: float = self.means_final ** (self.steps_done / self.steps)
         self._group("means")["lr"] = self.means_rate * decay
+
+    @torch.no_grad()
+    def _give_harmonics_gradient(self, camera: Camera, sh_degree: int) -> None:
+        means, sh0, shN = self.gaussians.means, self.gaussians.sh0, self.gaussians.shN
+        if sh0.grad is not None:
+            dirs = normalize(means - camera.position.to(means), dim=-1)
+            basis = sh_basis(sh_degree, dirs)[:, 1:, None]  # [N, K - 1, 1]
+            shN.grad = torch.zeros_like(shN)
+            shN.grad[:, : basis.shape[1]] = basis * (sh0.grad / C0)
 
     def zero_grad(self) -> None:
         """Forget the gradients."""

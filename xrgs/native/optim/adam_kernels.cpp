@@ -1,4 +1,5 @@
 #include "optim/adam.h"
+#include "raster/sh.h"
 #include "simd.h"
 
 namespace xrgs {
@@ -45,9 +46,42 @@ void step(const AdamGroup& group, std::int64_t first, std::int64_t last) {
   if (i < last) at(i, static_cast<int>(last - i));
 }
 
+template <int Degree>
+void step_harmonics_degree(const HarmonicsGroup& group, std::int64_t first, std::int64_t last) {
+  const AdamGroup& adam = group.adam;
+  const Constants k(adam);
+  const std::int64_t width = std::int64_t{group.rest} * 3;
+  Harmonics gradient;
+  for (std::int64_t i = first; i < last; i += kLanes) {
+    const int lanes = last - i < kLanes ? static_cast<int>(last - i) : kLanes;
+    Padded means, slopes;
+    Vector3 mean, v;
+    load_triples(means.of(group.means, i, lanes, 3), mean.x, mean.y, mean.z);
+    load_triples(slopes.of(group.sh0_gradient, i, lanes, 3), v.x, v.y, v.z);
+    Floats inv;
+    const Vector3 direction = direction_of(mean, group.position, inv);
+    harmonics_gradient<Degree>(direction, times(splat(1.0f / kC0), v), group.rest, gradient);
+    const std::int64_t begin = i * width, size = lanes * width;
+    for (std::int64_t at = 0; at < size; at += kLanes) {
+      const int some = size - at < kLanes ? static_cast<int>(size - at) : kLanes;
+      const std::int64_t place = begin + at;
+      move(k, adam.parameter + place, gradient.rows + at, adam.mean + place, adam.square + place, some);
+    }
+  }
+}
+
+void step_harmonics(const HarmonicsGroup& group, std::int64_t first, std::int64_t last) {
+  switch (group.degree) {
+    case 0: return step_harmonics_degree<0>(group, first, last);
+    case 1: return step_harmonics_degree<1>(group, first, last);
+    case 2: return step_harmonics_degree<2>(group, first, last);
+    default: return step_harmonics_degree<3>(group, first, last);
+  }
+}
+
 }  // namespace
 
-extern const AdamKernels adam_kernels{step};
+extern const AdamKernels adam_kernels{step, step_harmonics};
 
 }  // namespace XRGS_NS
 }  // namespace xrgs

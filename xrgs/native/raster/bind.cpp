@@ -146,12 +146,13 @@ std::tuple<Output, Output> forward(LentFrame& frame, const View& view, const Vec
   return {std::move(image), std::move(alpha)};
 }
 
-using Outputs = std::tuple<Output, Output, Output, Output, Output, Output, std::optional<Output>>;
+using Outputs = std::tuple<Output, Output, Output, Output, Output, std::optional<Output>,
+                           std::optional<Output>>;
 
 Outputs backward(LentFrame& frame, const Image& image_gradient, const Plane& alpha_gradient,
                  const Vectors& means, const Quaternions& quats, const Vectors& scales,
                  const Scalars& opacities, const Harmonics& sh0, const Harmonics& shN,
-                 const std::optional<Offsets>& offsets, int threads) {
+                 const std::optional<Offsets>& offsets, bool with_rest, int threads) {
   const Tensors tensors{means, quats, scales, opacities, sh0, shN, offsets};
   const Parameters parameters = tensors.checked();
   check_size("means", means.shape(0), static_cast<std::size_t>(frame->gaussians));
@@ -162,13 +163,15 @@ Outputs backward(LentFrame& frame, const Image& image_gradient, const Plane& alp
     throw nb::value_error("the gradients must have the image's size");
   const std::size_t n = means.shape(0), rest = shN.shape(1);
   Outputs out{new_array<float>({n, 3}),    new_array<float>({n, 4}),       new_array<float>({n, 3}),
-              new_array<float>({n}),       new_array<float>({n, 1, 3}),    new_array<float>({n, rest, 3}),
+              new_array<float>({n}),       new_array<float>({n, 1, 3}),    std::nullopt,
               std::nullopt};
+  if (with_rest) std::get<5>(out) = new_array<float>({n, rest, 3});
   if (offsets) std::get<6>(out) = new_array<float>({n, 2});
   const auto pointer = [](Output& array) { return static_cast<float*>(array.data()); };
   const Gradients gradients{pointer(std::get<0>(out)), pointer(std::get<1>(out)),
                             pointer(std::get<2>(out)), pointer(std::get<3>(out)),
-                            pointer(std::get<4>(out)), pointer(std::get<5>(out)),
+                            pointer(std::get<4>(out)),
+                            with_rest ? pointer(*std::get<5>(out)) : nullptr,
                             offsets ? pointer(*std::get<6>(out)) : nullptr};
   bool enough = true;
   {
@@ -255,8 +258,10 @@ void bind_raster(nb::module_& m) {
       .def("forward", &forward, "view"_a, "means"_a, "quats"_a, "scales"_a, "opacities"_a, "sh0"_a,
            "shN"_a, "offsets"_a.none(), "threads"_a, "Render: image [H, W, 3], alpha [H, W].")
       .def("backward", &backward, "image_gradient"_a, "alpha_gradient"_a, "means"_a, "quats"_a,
-           "scales"_a, "opacities"_a, "sh0"_a, "shN"_a, "offsets"_a.none(), "threads"_a,
-           "Gradients of the parameters, in their order, and of the offsets if there are any.")
+           "scales"_a, "opacities"_a, "sh0"_a, "shN"_a, "offsets"_a.none(), "with_rest"_a,
+           "threads"_a,
+           "Gradients of the parameters, in their order (shN's if with_rest), and of the offsets if\n"
+           "there are any.")
       .def("visible", &visible_of, "Which Gaussians are visible: [N] bool.")
       .def_prop_ro("pairs", [](LentFrame& f) { return f->pairs(); }, "(tile, Gaussian) pairs.")
       .def_prop_ro("evaluations", [](LentFrame& f) { return f->evaluations(); },

@@ -121,10 +121,9 @@ std::uint32_t project_sixteen(const Parameters& p, const View& v, std::int64_t g
   const std::uint32_t inside = lanes == 16 ? 0xffffu : (1u << lanes) - 1u;
   const std::uint32_t visible = bits(is_visible(o, v, reach2)) & inside;
   if (visible == 0) return 0;
-  const Vector3 from_camera{in.mean.x - splat(v.position[0]), in.mean.y - splat(v.position[1]),
-                            in.mean.z - splat(v.position[2])};
-  const Floats inv = splat(1.0f) / sqrt(max(dot(from_camera, from_camera), splat(kSmallest)));
-  const Vector3 color = colors_of<Degree>(p, group, lanes, visible, times(inv, from_camera),
+  Floats inv;
+  const Vector3 direction = direction_of(in.mean, v.position, inv);
+  const Vector3 color = colors_of<Degree>(p, group, lanes, visible, direction,
                                           frame.shades[static_cast<std::size_t>(group / 16)]);
   const Mask finite = (color.x * zero == zero) & (color.y * zero == zero) & (color.z * zero == zero);
   if ((visible & ~bits(finite)) != 0) *good = false;

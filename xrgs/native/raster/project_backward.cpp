@@ -135,25 +135,6 @@ XRGS_INLINE ShapeGradient projection_backward(const Projected& o, const View& vi
   return out;
 }
 
-// The gradients of sixteen Gaussians' harmonics, row by row, before they are streamed out. Bands
-// that are not on stay zero.
-struct Harmonics {
-  alignas(64) float rows[16 * 3 * rest_of(3) + 16] = {};
-};
-
-// Columns to rows `stride` apart. Each row is written to a multiple of sixteen: what that adds is
-// zero, and where it reaches into the next row it is overwritten.
-template <int Width>
-XRGS_INLINE void store_columns(const Floats* columns, std::int64_t stride, Harmonics& out) {
-  Floats r[(Width + 15) / 16][16];
-  for (int c = 0; c < Width; c += 16) {
-    for (int i = 0; i < 16; ++i) r[c / 16][i] = c + i < Width ? columns[c + i] : splat(0.0f);
-    transpose(r[c / 16]);
-  }
-  for (int i = 0; i < 16; ++i)
-    for (int c = 0; c < Width; c += 16) store(out.rows + i * stride + c, r[c / 16][i]);
-}
-
 // Where sixteen Gaussians' gradients of `width` floats go: to their place, or for a group that is
 // not whole to a buffer, and from there with `copy_out`.
 struct Sixteen {
@@ -171,16 +152,15 @@ struct Sixteen {
 
 void zero_floats(float* p, std::int64_t count) { std::memset(p, 0, static_cast<std::size_t>(count) * 4); }
 
-// The colour's part: writes the gradients of the harmonics, returns that of the mean.
+// The colour's part: writes the gradients of the harmonics (of those above band 0 if they are wanted),
+// returns that of the mean.
 template <int Degree>
 XRGS_INLINE Vector3 color_backward(const Parameters& p, const View& view, const Inputs& in,
                                    const Shade& shade, const Floats (&sum)[16], std::int64_t group,
                                    int lanes, const Gradients& out, Harmonics& harmonics) {
   constexpr int kRest = rest_of(Degree);
-  const Vector3 from_camera{in.mean.x - splat(view.position[0]), in.mean.y - splat(view.position[1]),
-                            in.mean.z - splat(view.position[2])};
-  const Floats inv = splat(1.0f) / sqrt(max(dot(from_camera, from_camera), splat(1.17549435e-38f)));
-  const Vector3 d = times(inv, from_camera);
+  Floats inv;
+  const Vector3 d = direction_of(in.mean, view.position, inv);
   const Vector3 v{keep(mask_of(shade.open[0]), sum[kWr]), keep(mask_of(shade.open[1]), sum[kWg]),
                   keep(mask_of(shade.open[2]), sum[kWb])};
   Sixteen to(group, lanes);
@@ -193,15 +173,9 @@ XRGS_INLINE Vector3 color_backward(const Parameters& p, const View& view, const 
     };
     const Vector3 v_d{dot(slope(0), v), dot(slope(1), v), dot(slope(2), v)};
     v_mean = times(inv, add(v_d, -dot(v_d, d), d));
-    Floats basis[kRest], vc[3 * kRest];
-    sh_basis<Degree>(d, basis);
-    for (int k = 0; k < kRest; ++k) {
-      vc[3 * k] = basis[k] * v.x;
-      vc[3 * k + 1] = basis[k] * v.y;
-      vc[3 * k + 2] = basis[k] * v.z;
-    }
-    store_columns<3 * kRest>(vc, p.rest * 3, harmonics);
   }
+  if (out.shN == nullptr) return v_mean;
+  harmonics_gradient<Degree>(d, v, p.rest, harmonics);
   float* place = out.shN + group * p.rest * 3;
   const int count = lanes * p.rest * 3;
   if (lanes == 16)  // on a 64-byte boundary, as the array and sixteen rows of any width are
@@ -217,7 +191,7 @@ void write_zeros(const Parameters& p, std::int64_t group, int lanes, const Gradi
   zero_floats(out.scales + group * 3, lanes * 3);
   zero_floats(out.opacities + group, lanes);
   zero_floats(out.sh0 + group * 3, lanes * 3);
-  zero_floats(out.shN + group * p.rest * 3, std::int64_t{lanes} * p.rest * 3);
+  if (out.shN != nullptr) zero_floats(out.shN + group * p.rest * 3, std::int64_t{lanes} * p.rest * 3);
   if (out.offsets != nullptr) zero_floats(out.offsets + group * 2, lanes * 2);
 }
 

@@ -100,5 +100,49 @@ XRGS_INLINE std::uint32_t rows_to_load(std::uint32_t visible, int lanes) {
   return __builtin_popcount(visible) >= 8 ? (1u << lanes) - 1u : visible;
 }
 
+// The unit vector from the camera to each mean, and 1 / its length before.
+XRGS_INLINE Vector3 direction_of(const Vector3& mean, const float* position, Floats& inv) {
+  const Vector3 from_camera{mean.x - splat(position[0]), mean.y - splat(position[1]),
+                            mean.z - splat(position[2])};
+  inv = splat(1.0f) / sqrt(max(dot(from_camera, from_camera), splat(1.17549435e-38f)));
+  return times(inv, from_camera);
+}
+
+// The gradients of sixteen Gaussians' harmonics, row by row. Bands that are not on stay zero.
+struct Harmonics {
+  alignas(64) float rows[16 * 3 * rest_of(3) + 16] = {};
+};
+
+// Columns to rows `stride` apart. Each row is written to a multiple of sixteen: what that adds is
+// zero, and where it reaches into the next row it is overwritten.
+template <int Width>
+XRGS_INLINE void store_columns(const Floats* columns, std::int64_t stride, Harmonics& out) {
+  Floats r[(Width + 15) / 16][16];
+  for (int c = 0; c < Width; c += 16) {
+    for (int i = 0; i < 16; ++i) r[c / 16][i] = c + i < Width ? columns[c + i] : splat(0.0f);
+    transpose(r[c / 16]);
+  }
+  for (int i = 0; i < 16; ++i)
+    for (int c = 0; c < Width; c += 16) store(out.rows + i * stride + c, r[c / 16][i]);
+}
+
+// From the gradient v of their colours, before the clamp, that of `rest` harmonics above band 0: a
+// column of numbers times a row.
+template <int Degree>
+XRGS_INLINE void harmonics_gradient(const Vector3& direction, const Vector3& v, int rest,
+                                    Harmonics& out) {
+  constexpr int kRest = rest_of(Degree);
+  if constexpr (kRest > 0) {
+    Floats basis[kRest], columns[3 * kRest];
+    sh_basis<Degree>(direction, basis);
+    for (int k = 0; k < kRest; ++k) {
+      columns[3 * k] = basis[k] * v.x;
+      columns[3 * k + 1] = basis[k] * v.y;
+      columns[3 * k + 2] = basis[k] * v.z;
+    }
+    store_columns<3 * kRest>(columns, std::int64_t{rest} * 3, out);
+  }
+}
+
 }  // namespace XRGS_NS
 }  // namespace xrgs

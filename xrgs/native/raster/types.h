@@ -60,7 +60,8 @@ struct Parameters {
 
 // Where their gradients go.
 struct Gradients {
-  float *means, *quats, *scales, *opacities, *sh0, *shN;
+  float *means, *quats, *scales, *opacities, *sh0;
+  float* shN;      // or null
   float* offsets;  // or null
 };
 
