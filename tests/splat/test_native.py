@@ -529,7 +529,7 @@ def test_shapes_are_checked(make_camera, make_scene):
         make_view(camera, width=0)
     frame.forward(make_view(camera), *values, None, 1)
     with pytest.raises(ValueError, match="image's size"):
-        frame.backward(torch.zeros(3, 3, 3), torch.zeros(3, 3), *values, None, 1)
+        frame.backward(torch.zeros(3, 3, 3), torch.zeros(3, 3), *values, None, True, 1)
 
 
 def test_float64_is_refused(make_camera, make_scene):

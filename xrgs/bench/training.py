@@ -224,7 +224,7 @@ class Step:
     def optimize(self) -> None:
         """One step of Adam."""
         with threads(self.threads):
-            self.optimizer.step(self.camera, sh_degree=3)
+            self.optimizer.step(self.camera, sh_degree=self.sh_degree)
 
     def densify(self) -> None:
         """All steps from one refinement to the next."""
