@@ -8,12 +8,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from hydra import compose, initialize_config_dir
 
-from xrgs import images, mixing, placing, scenes, sfm, variant
+from xrgs import config, degrade, images, mixing, placing, scenes, sfm, variant
 from xrgs.config import SceneConf, SfmConf, VariantConf
 from xrgs.errors import XrgsError
 from xrgs.scenes import Scene, procedural
 from xrgs.sfm import Reconstruction, Shot
+from xrgs.split import check
 from xrgs.views import SceneFailed, Variant, View
 
 VIEWS = 12
@@ -259,6 +261,35 @@ def test_where_every_recipe_fails_the_report_has_them_all(
     tried = [a["attempt"] for a in caught.value.report["attempts"]]
     assert tried == [name for name, _, _ in placing.recipes(CONF.sfm, VIEWS, smaller=True)]
     assert tried[-1] == "native"
+
+
+# the choices in conf/
+
+
+@pytest.mark.parametrize(
+    ("name", "tags", "degradation"),
+    [
+        ("digital_zoom", "flag", "digital_zoom"),
+        ("distance", "distance", "none"),
+        ("jpeg", "flag", "jpeg"),
+        ("megapixels", "megapixels", "none"),
+        ("sampling_rate", "sampling_rate", "none"),
+        ("null", "flag", "downsample"),
+    ],
+)
+def test_every_choice_of_variant_is_one_that_can_be_made(
+    name: str, tags: str, degradation: str
+) -> None:
+    config.register()
+    with initialize_config_dir(str(config.CONF_DIR), version_base="1.3"):
+        conf = config.to_conf(compose("config", [f"variant={name}"])).variant
+    check(conf)
+    assert (conf.tags, degrade.kind(conf)) == (tags, degradation)
+
+
+def test_every_choice_of_variant_is_tested() -> None:
+    files = {file.stem for file in (config.CONF_DIR / "variant").iterdir()}
+    assert files == {"digital_zoom", "distance", "jpeg", "megapixels", "sampling_rate"}
 
 
 # identity

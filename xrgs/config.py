@@ -71,7 +71,8 @@ class VariantConf:
     """Longer side of the largest HR view, px; 0 keeps the photographs' size. All are shrunk by one
     scale, so that differing photographs keep their relative sampling rates."""
     factor: int = MISSING
-    """How many times smaller an LR view is."""
+    """How many times smaller an LR view is, and across what the consistency loss compares; HR
+    views are cropped to a multiple of it."""
     hr_fraction: float = MISSING
     """Share of the training views that are HR."""
     min_hr: int = MISSING
