@@ -170,6 +170,21 @@ def test_one_class_alone_where_that_is_what_was_asked(mix: Mix, fraction: float,
 # degradations
 
 
+def test_each_degraded_view_has_its_original_from_the_same_pose(mix: Mix) -> None:
+    made = mix(CONF)
+    low = of(made, "train", "LR")
+    originals = {view.name: view for view in of(made, "original", "HR")}
+    assert sorted(originals) == [view.name for view in low]
+    for view in low:
+        high = originals[view.name]
+        assert np.array_equal(high.viewmat, view.viewmat)
+        assert (high.width, high.height) == (160, 120) == (view.width * 5, view.height * 5)
+        assert high.K[:2] == pytest.approx(view.K[:2] * 5)
+        shrunk = images.resize(images.read(high.file), view.width, view.height)
+        # The lens is all but straight: straightening and shrinking change places.
+        assert np.abs(shrunk - images.read(view.file)).mean() < 0.01
+
+
 @pytest.mark.parametrize("how", ["digital_zoom", "jpeg"])
 def test_a_degradation_may_keep_the_size(mix: Mix, given: list[list[str]], how: str) -> None:
     made = mix(replace(CONF, degradation=how, hr_fraction=0.5))

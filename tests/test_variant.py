@@ -137,20 +137,6 @@ def test_points_have_the_colour_of_the_pixels_they_fall_on(made: Variant) -> Non
         assert np.median(np.abs(seen - expected)) < 0.5 * np.median(np.abs(seen - other))
 
 
-def test_each_degraded_view_has_its_original_from_the_same_pose(made: Variant) -> None:
-    low = of(made, "train", "LR")
-    originals = {view.name: view for view in of(made, "original", "HR")}
-    assert sorted(originals) == [view.name for view in low]
-    for view in low:
-        high = originals[view.name]
-        assert np.array_equal(high.viewmat, view.viewmat)
-        assert (high.width, high.height) == (250, 185)
-        assert high.K[:2] == pytest.approx(view.K[:2] * 5)
-        shrunk = images.resize(images.read(high.file), view.width, view.height)
-        # The lens is all but straight: straightening and shrinking change places.
-        assert np.abs(shrunk - images.read(view.file)).mean() < 0.01
-
-
 def test_rho_is_the_sampling_rate_over_the_largest(made: Variant) -> None:
     rho = {(view.split, view.name): view.rho for view in made.views}
     assert max(rho.values()) == 1
