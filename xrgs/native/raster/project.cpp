@@ -48,9 +48,9 @@ XRGS_INLINE Vector3 colors_of(const Parameters& p, std::int64_t group, int lanes
       color = add(color, basis[k], {c[3 * k], c[3 * k + 1], c[3 * k + 2]});
     for (int channel = 0; channel < 3; ++channel) {
       const Vector3 slope = sh_gradient<Degree>(direction, c + channel, 3);
-      store(shade.slope[3 * channel], slope.x);
-      store(shade.slope[3 * channel + 1], slope.y);
-      store(shade.slope[3 * channel + 2], slope.z);
+      stream(shade.slope[3 * channel], slope.x);
+      stream(shade.slope[3 * channel + 1], slope.y);
+      stream(shade.slope[3 * channel + 2], slope.z);
     }
   }
   const Floats zero = splat(0.0f);
@@ -103,7 +103,7 @@ XRGS_INLINE void store_records(const Projected& o, Floats level, Floats reach2, 
                      zero};
   transpose(rows);
   for (int i = 0; i < 16; ++i)
-    if ((visible >> i & 1u) != 0) store(&records[i].x, rows[i]);
+    if ((visible >> i & 1u) != 0) stream(&records[i].x, rows[i]);
 }
 
 template <int Degree>
@@ -155,6 +155,7 @@ std::int64_t project_degree(const Parameters& p, const View& v, std::int64_t fir
     }
     for (int i = 0; i < lanes; ++i) frame.slots[static_cast<std::size_t>(group + i)] = {0, 0};
   }
+  stream_fence();
   return seen;
 }
 
