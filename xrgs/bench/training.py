@@ -228,23 +228,25 @@ class Step:
 
     def densify(self) -> None:
         """All steps from one refinement to the next."""
-        with threads(self.threads):
-            for step in range(1, self.settings.every + 1):
-                self.densifier.after_step(
-                    step,
-                    self.offset.grad,
-                    self.rendered.visible,
-                    width=self.camera.width,
-                    height=self.camera.height,
-                )
+        for step in range(1, self.settings.every + 1):
+            self._after_step(step)
 
     def all(self) -> None:
         """One whole step, its share of densification's bookkeeping included."""
         for part in (self.render, self.loss, self.backward, self.optimize):
             part()
-        size = {"width": self.camera.width, "height": self.camera.height}
+        self._after_step(1)
+
+    def _after_step(self, step: int) -> None:
+        camera = self.camera
         with threads(self.threads):
-            self.densifier.after_step(1, self.offset.grad, self.rendered.visible, **size)
+            self.densifier.after_step(
+                step,
+                self.offset.grad,
+                self.rendered.visible,
+                width=camera.width,
+                height=camera.height,
+            )
 
     def counted_bytes(self) -> int:
         """Parameters, gradients, Adam's state and the renderer's buffers, as training counts."""
