@@ -5,7 +5,7 @@
 # dependencies, in the Python that `python` names.
 set -euo pipefail
 root=$(cd "$(dirname "$0")/../.." && pwd)
-folder=${1:-$root/build/sanitize}
+folder=$(realpath -m "${1:-$root/build/sanitize}")
 shift || true
 python=$(command -v python)
 

@@ -432,8 +432,14 @@ XRGS_INLINE Mask mask_of(std::uint32_t bits) {
 XRGS_INLINE Floats select(Mask m, Floats a, Floats b) { XRGS_EACH(Floats, m.v[i] ? a.v[i] : b.v[i]); }
 XRGS_INLINE Floats keep(Mask m, Floats a) { XRGS_EACH(Floats, m.v[i] ? a.v[i] : 0.0f); }
 
-XRGS_INLINE Ints operator+(Ints a, Ints b) { XRGS_EACH(Ints, a.v[i] + b.v[i]); }
-XRGS_INLINE Ints operator-(Ints a, Ints b) { XRGS_EACH(Ints, a.v[i] - b.v[i]); }
+// Sums wrap around, as those of the vectors do.
+XRGS_INLINE std::uint32_t unsigned_of(std::int32_t a) { return static_cast<std::uint32_t>(a); }
+XRGS_INLINE Ints operator+(Ints a, Ints b) {
+  XRGS_EACH(Ints, static_cast<std::int32_t>(unsigned_of(a.v[i]) + unsigned_of(b.v[i])));
+}
+XRGS_INLINE Ints operator-(Ints a, Ints b) {
+  XRGS_EACH(Ints, static_cast<std::int32_t>(unsigned_of(a.v[i]) - unsigned_of(b.v[i])));
+}
 XRGS_INLINE Ints operator&(Ints a, Ints b) { XRGS_EACH(Ints, a.v[i] & b.v[i]); }
 XRGS_INLINE Ints operator|(Ints a, Ints b) { XRGS_EACH(Ints, a.v[i] | b.v[i]); }
 template <int Count>
