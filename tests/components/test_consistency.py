@@ -197,3 +197,13 @@ def test_an_unknown_mode_is_refused(build: Build, on: ComponentsConf) -> None:
     on.consistency.lr_mode = "folded"
     with pytest.raises(XrgsError, match=r"^components\.consistency\.lr_mode=folded"):
         build(on)
+
+
+def test_an_lr_view_of_full_size_is_compared_below_it(
+    build: Build, on: ComponentsConf, hr: Step, make_view: MakeView, noise: Noise
+) -> None:
+    zoomed = make_view("LR", noise(*HR_SIZE, 3))
+    as_hr = make_view("HR", zoomed.image)
+    image = zoomed.image * 0.9
+    value = loss_of(build(on, hr.view, zoomed), image, Step(0, 30_000, zoomed))
+    assert value == pytest.approx(paper_5_6(image, as_hr, weight=0.1, l1=0.8, ssim=0.2), rel=1e-9)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
@@ -22,6 +23,8 @@ class Consistency(Component):
     `loss + weight * (l1 * |phi(render) - pair|_1 + ssim * (1 - SSIM(phi(render), pair)))`, where
     `pair` is phi of the photograph, made once here and kept: of an HR view `factor` times smaller,
     of an LR view `factor` times larger. phi is antialiased bicubic to an exact size, unclamped.
+    An LR view that is not small (zoomed, compressed, or tagged by what it shows) has its other
+    resolution below it, too: its longer side is nearer to the HR views' than to 1 / `factor` of it.
 
     phi is linear: phi(render) - phi(photograph) = phi(render - photograph). An LR view's branch
     therefore knows nothing that the photometric loss doesn't, and costs factor^2 times the pixels.
@@ -48,8 +51,9 @@ class Consistency(Component):
         self.weight, self.l1, self.ssim = conf.weight, conf.l1, conf.ssim
         self.lr_mode = conf.lr_mode
         self.backend = backend
+        largest = max((max(v.image.shape) for v in views if v.tag == "HR"), default=math.inf)
         self.pairs = {
-            view.name: _pair(view, factor)
+            view.name: _pair(view, factor, largest)
             for view in views
             if view.tag == "HR" or conf.lr_mode == "exact"
         }
@@ -76,10 +80,10 @@ class Consistency(Component):
         return None
 
 
-def _pair(view: TrainingView, factor: int) -> Target:
-    """The view's photograph at the opposite resolution."""
+def _pair(view: TrainingView, factor: int, largest: float) -> Target:
+    """The view's photograph at the opposite resolution; `largest` is the HR views' longest side."""
     height, width = view.image.shape[:2]
-    if view.tag == "HR":
+    if view.tag == "HR" or max(height, width) > largest / math.sqrt(factor):
         height, width = round(height / factor), round(width / factor)
     else:
         height, width = height * factor, width * factor
