@@ -295,7 +295,7 @@ def test_absgrad(isa, make_camera, make_scene, antialiased):
 
 
 def test_gradients_are_nearly_as_exact_as_float32_in_torch(make_camera, make_scene):
-    """In the median of many small scenes: 2.5 times torch's for scales, 1.3 for the others."""
+    """In the median of many small scenes: 2.5 times torch's for scales, up to 1.6 for others."""
     errors = {"native": {}, "torch": {}}
     for seed in range(40):
         camera = rounded(make_camera(9 + seed % 30, 7 + seed % 20, turned=bool(seed % 2)))
