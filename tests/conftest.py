@@ -12,6 +12,8 @@ import pytest
 import torch
 
 from xrgs import config, weights
+from xrgs.dataset import Dataset, LoadedView
+from xrgs.splat.cameras import Camera
 
 
 @pytest.fixture(scope="session", autouse=True)
@@ -69,6 +71,28 @@ def compose() -> Callable[..., config.Conf]:
 def baseline(compose: Callable[..., config.Conf]) -> config.Conf:
     """The baseline's config as `conf/` gives it, 40 steps on the torch backend."""
     return compose("train.steps=40", "splat.backend=torch")
+
+
+def _camera(width: int, height: int) -> Camera:
+    focal = 1.2 * width
+    K = torch.tensor([[focal, 0.0, width / 2], [0.0, focal, height / 2], [0.0, 0.0, 1.0]])
+    return Camera(torch.eye(4), K, width, height)
+
+
+@pytest.fixture
+def data() -> Dataset:
+    """Four views, two of them LR, of one smooth picture; 60 points in front."""
+    generator = torch.Generator().manual_seed(3)
+    points = torch.rand(60, 3, generator=generator) - 0.5 + torch.tensor([0.0, 0.0, 2.0])
+    views = []
+    for number, (tag, width, height) in enumerate(
+        [("HR", 60, 60), ("LR", 12, 12), ("HR", 60, 60), ("LR", 12, 12)]
+    ):
+        ramp = torch.linspace(0, 1, width).expand(height, width)
+        image = torch.stack([ramp, ramp.flip(1), torch.full_like(ramp, 0.5)], dim=-1)
+        views.append(LoadedView(f"v{number}", tag, _camera(width, height), image, rho=width / 60))
+    colors = torch.rand(60, 3, generator=generator)
+    return Dataset(tuple(views), tuple(views[:1]), points, colors, scene_scale=1.0, factor=5)
 
 
 @pytest.fixture(scope="session")

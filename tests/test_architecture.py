@@ -27,6 +27,7 @@ ONLY_IN = {
 #: Rooms in the order that data walks through them: an import never points to a later one.
 FLOW = (
     ("errors", "files", "hashing", "machine", "splat", "weights"),
+    ("checkpoint",),
     ("images", "alignment", "split", "views", "degrade"),
     ("config", "scenes", "sfm"),
     ("photographs", "tagging"),

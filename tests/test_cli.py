@@ -260,6 +260,7 @@ def test_help_names_every_choice(tmp_path: Path) -> None:
         (["store=in-the-way"], ["in-the-way", "store="]),
         (["components.loss_weighting.lr_weight=-1"], ["components.loss_weighting.lr_weight"]),
         (["train.steps=0"], ["train.steps"]),
+        (["checkpoint_s=nan"], ["checkpoint_s"]),
         (["splat.backend=cuda"], ["splat.backend=cuda", "native"]),
     ],
     ids=" ".join,

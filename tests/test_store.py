@@ -85,6 +85,73 @@ def test_beginning_again_sets_the_old_folder_aside(done: CellFolder) -> None:
     assert CellFolder(done.path.with_name("abc.aside-1")).identity() == {"seed": 0}
 
 
+@pytest.fixture
+def stopped(done: CellFolder) -> CellFolder:
+    """A folder of a try that was stopped after a checkpoint, with all that may lie about."""
+    (done.path / "status.json").unlink()
+    done.checkpoint.write_bytes(b"state")
+    (done.path / "log.txt").write_text("begun\n")
+    (done.path / ".checkpoint.npz.1-abcd").write_bytes(b"half")
+    return done
+
+
+@pytest.mark.parametrize("failed", [False, True])
+def test_beginning_a_stopped_cell_keeps_its_checkpoint_and_no_result(
+    stopped: CellFolder, failed: bool
+) -> None:
+    if failed:
+        stopped.fail("its process was ended by SIGKILL")
+    else:
+        assert stopped.state().name == "unfinished"
+        assert "goes on from its checkpoint" in stopped.state().reason
+    stopped.begin({"seed": 0, "store": "elsewhere"}, {"seed": 0})
+    assert sorted(entry.name for entry in stopped.path.iterdir()) == [
+        "checkpoint.npz",
+        "config.json",
+        "identity.json",
+        "log.txt",
+    ]
+    assert stopped.checkpoint.read_bytes() == b"state"
+    assert json.loads((stopped.path / "config.json").read_text())["store"] == "elsewhere"
+    assert [entry.name for entry in stopped.path.parent.iterdir()] == ["abc"]
+
+
+def test_beginning_another_cell_does_not_take_the_checkpoint(stopped: CellFolder) -> None:
+    stopped.begin({"seed": 0}, {"seed": 0, "code": {"train.py": "changed"}})
+    assert not stopped.checkpoint.exists()
+    aside = CellFolder(stopped.path.with_name("abc.aside-1"))
+    assert aside.checkpoint.read_bytes() == b"state"
+
+
+@pytest.mark.parametrize("identity", [None, "{", "[]"])
+def test_beginning_a_cell_of_unknown_identity_does_not_take_the_checkpoint(
+    stopped: CellFolder, identity: str | None
+) -> None:
+    file = stopped.path / "identity.json"
+    file.unlink()
+    if identity is not None:
+        file.write_text(identity)
+    stopped.begin({"seed": 0}, {"seed": 0})
+    assert not stopped.checkpoint.exists()
+
+
+def test_what_a_link_points_to_is_not_cleared(stopped: CellFolder, tmp_path: Path) -> None:
+    (tmp_path / "mine").mkdir()
+    (tmp_path / "mine" / "file").write_text("kept")
+    (stopped.path / "linked").symlink_to(tmp_path / "mine")
+    stopped.begin({"seed": 0}, {"seed": 0})
+    assert not (stopped.path / "linked").exists()
+    assert (tmp_path / "mine" / "file").read_text() == "kept"
+
+
+def test_a_finished_cell_has_no_checkpoint(stopped: CellFolder) -> None:
+    stopped.finish(["a", "b"], protocol=1)
+    assert stopped.state().name == "done"
+    assert not stopped.checkpoint.exists()
+    stopped.checkpoint.write_bytes(b"killed before it was removed")
+    assert stopped.state().name == "done"
+
+
 def test_the_same_comparison_has_the_same_sweep_id(tmp_path: Path) -> None:
     store = Store(tmp_path)
     store.prepare()

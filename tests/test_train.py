@@ -12,39 +12,16 @@ import torch
 from xrgs import components, train
 from xrgs.components import Step
 from xrgs.config import CONF_DIR, Conf
-from xrgs.dataset import USES, Dataset, LoadedView
+from xrgs.dataset import USES, Dataset
 from xrgs.errors import XrgsError
-from xrgs.splat.cameras import Camera
 from xrgs.splat.gaussians import PARAMETERS, Activated, Gaussians
 from xrgs.splat.settings import RasterSettings
-from xrgs.train import endless
+from xrgs.train import Rounds
 
 #: All of `conf/ablation` that changes how training goes, and not what is trained on.
 ABLATIONS = sorted(
     {path.stem for path in (CONF_DIR / "ablation").glob("*.yaml")} - {"baseline"} - set(USES)
 )
-
-
-def camera(width: int, height: int) -> Camera:
-    focal = 1.2 * width
-    K = torch.tensor([[focal, 0.0, width / 2], [0.0, focal, height / 2], [0.0, 0.0, 1.0]])
-    return Camera(torch.eye(4), K, width, height)
-
-
-@pytest.fixture
-def data() -> Dataset:
-    """Four views, two of them LR, of one smooth picture; 60 points in front."""
-    generator = torch.Generator().manual_seed(3)
-    points = torch.rand(60, 3, generator=generator) - 0.5 + torch.tensor([0.0, 0.0, 2.0])
-    views = []
-    for number, (tag, width, height) in enumerate(
-        [("HR", 60, 60), ("LR", 12, 12), ("HR", 60, 60), ("LR", 12, 12)]
-    ):
-        ramp = torch.linspace(0, 1, width).expand(height, width)
-        image = torch.stack([ramp, ramp.flip(1), torch.full_like(ramp, 0.5)], dim=-1)
-        views.append(LoadedView(f"v{number}", tag, camera(width, height), image, rho=width / 60))
-    colors = torch.rand(60, 3, generator=generator)
-    return Dataset(tuple(views), tuple(views[:1]), points, colors, scene_scale=1.0, factor=5)
 
 
 def test_the_same_seed_gives_the_same_bits_and_another_does_not(
@@ -158,7 +135,7 @@ def test_the_history_has_the_mean_of_what_components_note(
     history = train.train(data, baseline).history
     assert len({tuple(row) for row in history}) == 1
     lr = {view.name for view in data.train if view.tag == "LR"}
-    drawn = endless(data.train, baseline.seed, 400, lambda _: True)
+    drawn = Rounds(data.train, baseline.seed, 400, lambda _: True)
     noted = [step.number for step in drawn if step.view.name in lr and step.number >= 300]
     for last, row in itertools.pairwise(history):
         numbers = [number for number in noted if last["step"] < number <= row["step"]]
@@ -291,7 +268,7 @@ def test_the_sh_bands_come_on_in_turn(
 
 
 def names_of(data: Dataset, steps: int, trains_on: Callable[[Step], bool]) -> list[str]:
-    drawn = list(endless(data.train, 0, steps, trains_on))
+    drawn = list(Rounds(data.train, 0, steps, trains_on))
     assert [(step.number, step.of) for step in drawn] == [(n, steps) for n in range(steps)]
     return [step.view.name for step in drawn]
 

@@ -4,22 +4,28 @@ from __future__ import annotations
 
 import csv
 import io
+import logging
 import resource
 import traceback
 from typing import TYPE_CHECKING, Any
 
 from xrgs import dataset, evaluate, provenance
+from xrgs.checkpoint import Checkpoint, CheckpointError
 from xrgs.files import write_json, write_text
+from xrgs.hashing import digest
 from xrgs.splat.backend import resolve_backend
 from xrgs.splat.ply import save_ply
-from xrgs.train import train
+from xrgs.train import Trained, train
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
     from xrgs.config import Conf
+    from xrgs.dataset import Dataset
     from xrgs.store import CellFolder
     from xrgs.variant import Variant
+
+_log = logging.getLogger(__name__)
 
 
 def run(conf: Conf, variant: Variant, folder: CellFolder) -> None:
@@ -40,7 +46,7 @@ def _run(conf: Conf, variant: Variant, folder: CellFolder) -> None:
     backend = resolve_backend(conf.splat.backend)
     write_json(folder.path / "provenance.json", provenance.collect(threads, backend))
     data = dataset.load(variant, conf.train.views)
-    trained = train(data, conf)
+    trained = _train(data, conf, folder)
     peak_rss_bytes = _peak_rss_bytes()  # before evaluation, which may load LPIPS's network
     save_ply(folder.path / "splats.ply", trained.gaussians)
     write_text(folder.path / "history.csv", _csv(trained.history))
@@ -59,6 +65,20 @@ def _run(conf: Conf, variant: Variant, folder: CellFolder) -> None:
         },
     )
     folder.finish([view.name for view in data.test], evaluate.PROTOCOL)
+
+
+def _train(data: Dataset, conf: Conf, folder: CellFolder) -> Trained:
+    """Train from the cell's checkpoint, or from the start where there is none of any use."""
+    checkpoint = Checkpoint(folder.checkpoint, digest(folder.identity()), conf.checkpoint_s)
+    try:
+        steps = checkpoint.read()
+        if steps is not None:
+            _log.info("going on from the checkpoint, %d steps done", steps)
+        return train(data, conf, checkpoint)
+    except CheckpointError as error:
+        _log.warning("training starts over: %s", error)
+        checkpoint.refuse()
+    return train(data, conf, checkpoint)
 
 
 def _peak_rss_bytes() -> int:

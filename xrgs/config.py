@@ -277,6 +277,9 @@ class Conf:
     """Folder that `scene=llff/...` looks in."""
     threads: int = MISSING
     """Of a cell; 0 takes every core this process may use."""
+    checkpoint_s: float = MISSING
+    """Seconds between two checkpoints of a cell in training, from which it goes on where it was
+    killed; 0 writes none."""
     dry_run: bool = MISSING
     """Print the plan and stop."""
 
@@ -295,8 +298,13 @@ def to_conf(cfg: DictConfig) -> Conf:
     """
     known = OmegaConf.masked_copy(cfg, list(Conf.__dataclass_fields__))
     conf = from_dict(OmegaConf.to_container(known, resolve=True, throw_on_missing=True))
-    for key, value, least in (("train.steps", conf.train.steps, 1), ("threads", conf.threads, 0)):
-        if value < least:
+    least_values = (
+        ("train.steps", conf.train.steps, 1),
+        ("threads", conf.threads, 0),
+        ("checkpoint_s", conf.checkpoint_s, 0),
+    )
+    for key, value, least in least_values:
+        if not value >= least:
             raise XrgsError(f"{key}={value}: must be at least {least}")
     if conf.splat.backend not in CHOICES:
         raise XrgsError(f"splat.backend={conf.splat.backend}: must be one of {', '.join(CHOICES)}")

@@ -122,9 +122,16 @@ def _load_view(view: View, viewmat: NDArray[np.float64]) -> LoadedView:
     return LoadedView(view.name, view.tag, camera, image, view.rho)
 
 
-def progress(items: Iterable[_T], what: str, unit: str, total: int | None = None) -> tqdm[_T]:
-    """A progress bar on stderr with the time left, for what takes longer than two seconds."""
-    return tqdm(items, what, total, unit=unit, mininterval=0.5, delay=2.0, file=sys.stderr)
+def progress(
+    items: Iterable[_T], what: str, unit: str, total: int | None = None, *, done: int = 0
+) -> tqdm[_T]:
+    """A progress bar on stderr with the time left, for what takes longer than two seconds.
+
+    Of `total` items `done` were behind us before; `items` are the others.
+    """
+    return tqdm(
+        items, what, total, unit=unit, initial=done, mininterval=0.5, delay=2.0, file=sys.stderr
+    )
 
 
 def use_threads(wanted: int) -> int:

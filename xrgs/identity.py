@@ -23,6 +23,7 @@ _PACKAGE = Path(__file__).parent
 _TRAINING_CODE = (
     "splat",
     "components",
+    "checkpoint.py",
     "dataset.py",
     "evaluate.py",
     "lpips.py",

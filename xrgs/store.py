@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import csv
 import json
+import shutil
 import tempfile
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,7 +17,7 @@ from typing import TYPE_CHECKING, Any
 
 from xrgs.errors import XrgsError
 from xrgs.files import write_json
-from xrgs.hashing import digest, file_digest
+from xrgs.hashing import canonical, digest, file_digest
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping, Sequence
@@ -27,7 +28,10 @@ if TYPE_CHECKING:
 _VERIFIED_BY_HASH = frozenset(
     {"config.json", "identity.json", "scores.csv", "summary.json", "history.csv"}
 )
-_NOT_RESULTS = frozenset({"log.txt", "status.json"})
+_CHECKPOINT = "checkpoint.npz"
+_NOT_RESULTS = frozenset({"log.txt", "status.json", _CHECKPOINT, f"refused-{_CHECKPOINT}"})
+#: What a cell that goes on from its checkpoint keeps of the try that was stopped.
+_GOES_ON_WITH = frozenset({_CHECKPOINT, "identity.json", "log.txt"})
 _RECORD_VERSION = 1
 
 
@@ -66,13 +70,19 @@ class CellFolder:
         """The cell's id."""
         return self.path.name
 
+    @property
+    def checkpoint(self) -> Path:
+        """State of the training, while it is not done."""
+        return self.path / _CHECKPOINT
+
     def state(self) -> State:
         """Whether this cell's result is there and can be trusted."""
         if not self.path.is_dir():
             return State("absent")
         status_file = self.path / "status.json"
         if not status_file.exists():
-            return State("unfinished", "it was stopped before it ended")
+            goes_on = "; it goes on from its checkpoint" if self.checkpoint.exists() else ""
+            return State("unfinished", f"it was stopped before it ended{goes_on}")
         try:
             status = read_json(status_file)
             if status["state"] == "failed":
@@ -97,15 +107,38 @@ class CellFolder:
             raise StoreError("scores.csv lacks rows of the views that were to be scored")
 
     def begin(self, config: Mapping[str, Any], identity: Mapping[str, Any]) -> None:
-        """An empty folder with the cell's config; what an earlier try left is set aside."""
-        if self.path.exists():
+        """A folder with the cell's config, and nothing else that could be taken for a result.
+
+        An earlier try of the very same cell that left a checkpoint leaves that and its log; any
+        other is set aside.
+        """
+        if self._can_go_on(identity):
+            self._clear()
+        elif self.path.exists():
             self.path.rename(_free_name(self.path))
-        self.path.mkdir(parents=True)
+        self.path.mkdir(parents=True, exist_ok=True)
         write_json(self.path / "config.json", config)
         write_json(self.path / "identity.json", identity)
 
+    def _can_go_on(self, identity: Mapping[str, Any]) -> bool:
+        if not self.checkpoint.is_file() or self.state().name not in {"unfinished", "failed"}:
+            return False
+        try:
+            return canonical(self.identity()) == canonical(identity)
+        except (StoreError, TypeError, ValueError):
+            return False
+
+    def _clear(self) -> None:
+        for entry in self.path.iterdir():
+            if entry.name in _GOES_ON_WITH:
+                continue
+            if entry.is_dir() and not entry.is_symlink():
+                shutil.rmtree(entry)
+            else:
+                entry.unlink()
+
     def finish(self, views: Sequence[str], protocol: int) -> None:
-        """Declare the cell done: its files are those that lie here now."""
+        """Declare the cell done: its files are those that lie here now, without the checkpoint."""
         files = {
             file.relative_to(self.path).as_posix(): {
                 "bytes": file.stat().st_size,
@@ -123,6 +156,7 @@ class CellFolder:
                 "files": files,
             }
         )
+        self.checkpoint.unlink(missing_ok=True)  # last: until it is done, the cell may need it
 
     def fail(self, reason: str) -> None:
         """Declare the cell failed."""

@@ -12,7 +12,9 @@ from typing import TYPE_CHECKING, Any
 import torch
 
 from xrgs import components
-from xrgs.components import Step, count_matched
+from xrgs.checkpoint import Checkpoint, State
+from xrgs.components import Step
+from xrgs.components.count_matched import Search
 from xrgs.dataset import progress
 from xrgs.errors import XrgsError
 from xrgs.hashing import digest
@@ -54,25 +56,34 @@ class Trained:
     """The threshold of growth that it was trained with."""
 
 
-def train(data: Dataset, conf: Conf) -> Trained:
+def train(data: Dataset, conf: Conf, checkpoint: Checkpoint | None = None) -> Trained:
     """Train one cell. The same dataset, config and seed give the same Gaussians, bit for bit.
 
+    Args:
+        data: What to train on.
+        conf: The cell's config.
+        checkpoint: Where the run keeps its state; it goes on from what was read there.
+
     Raises:
+        CheckpointError: what was read there does not fit this cell.
         XrgsError: a component's value is out of range, or a view is too small for it.
     """
+    checkpoint = checkpoint or Checkpoint()
     wanted = conf.components.count_matched.gaussians
     if not wanted:
-        return _run(data, conf)
+        return _run(data, conf, checkpoint)
 
     def run(threshold: float) -> Trained:
         densify = dataclasses.replace(conf.splat.densify, grow_grad2d=threshold)
         splat = dataclasses.replace(conf.splat, densify=densify)
-        return _run(data, dataclasses.replace(conf, splat=splat))
+        return _run(data, dataclasses.replace(conf, splat=splat), checkpoint)
 
-    return count_matched.search(run, conf.splat.densify.grow_grad2d, wanted)
+    search = Search(conf.splat.densify.grow_grad2d, wanted)
+    checkpoint.keep(search=search)
+    return search(run)
 
 
-def _run(data: Dataset, conf: Conf) -> Trained:
+def _run(data: Dataset, conf: Conf, checkpoint: Checkpoint) -> Trained:
     """One run from its first step to its last."""
     steps, splat = conf.train.steps, conf.splat
     backend = resolve_backend(splat.backend)
@@ -96,12 +107,15 @@ def _run(data: Dataset, conf: Conf) -> Trained:
     )
     targets = {view.name: prepare_target(view.image) for view in data.train}
     sh_every = max(1, int(splat.sh_every * steps / NOMINAL_STEPS))
-    ledger = _Ledger(steps, splat.densify.grow_grad2d)
+    drawn = Rounds(data.train, conf.seed, steps, parts.trains_on)
 
-    start = time.perf_counter()
+    ledger = _Ledger(steps, splat.densify.grow_grad2d)
     parts.refined(gaussians)
-    drawn = endless(data.train, conf.seed, steps, parts.trains_on)
-    for step in progress(drawn, "training", "step", steps):
+    # All that a step changes. The optimizer has the Gaussians, so it is the first to take its own.
+    checkpoint.keep(
+        optimizer=optimizer, densifier=densifier, components=parts, drawn=drawn, ledger=ledger
+    )
+    for step in progress(drawn, "training", "step", steps, done=drawn.number):
         view, camera = step.view, step.view.camera
         degree = min(step.number // sh_every, splat.raster.sh_degree)
         offset = torch.zeros(len(gaussians), 2, requires_grad=True)
@@ -139,8 +153,9 @@ def _run(data: Dataset, conf: Conf) -> Trained:
         ledger.refined(done)
         if done != Refinement():
             parts.refined(gaussians)
+        ledger.leave_out(checkpoint.after_step(step.number))
     parts.finish(gaussians)
-    return ledger.close(gaussians, time.perf_counter() - start)
+    return ledger.close(gaussians)
 
 
 def stream(seed: int, axis: str) -> torch.Generator:
@@ -148,33 +163,70 @@ def stream(seed: int, axis: str) -> torch.Generator:
     return torch.Generator().manual_seed(int(digest([seed, axis])[:15], 16))
 
 
-def endless(
-    views: tuple[LoadedView, ...], seed: int, steps: int, trains_on: Callable[[Step], bool]
-) -> Iterator[Step]:
+class Rounds:
     """`steps` steps, each time round all views in a new order.
 
     A view that `trains_on` refuses is passed over; one that it newly allows joins the next round.
-
-    Raises:
-        XrgsError: it refuses every view.
     """
-    generator = stream(seed, "views")
-    order: list[LoadedView] = []
-    for number in range(steps):
-        while order and not trains_on(Step(number, steps, order[-1])):
-            order.pop()
-        if not order:
-            allowed = [view for view in views if trains_on(Step(number, steps, view))]
+
+    def __init__(
+        self,
+        views: tuple[LoadedView, ...],
+        seed: int,
+        steps: int,
+        trains_on: Callable[[Step], bool],
+    ) -> None:
+        self.views = views
+        self.steps = steps
+        self.trains_on = trains_on
+        self.number = 0
+        """Of the next step."""
+        self.generator = stream(seed, "views")
+        self.order: list[LoadedView] = []
+        """What is left of the round, last first."""
+
+    def __iter__(self) -> Iterator[Step]:
+        return self
+
+    def __next__(self) -> Step:
+        """The next step.
+
+        Raises:
+            XrgsError: `trains_on` refuses every view.
+        """
+        if self.number >= self.steps:
+            raise StopIteration
+        while self.order and not self._allows(self.order[-1]):
+            self.order.pop()
+        if not self.order:
+            allowed = [view for view in self.views if self._allows(view)]
             if not allowed:
-                raise XrgsError(f"step {number}: the components leave no view to train on")
-            order = [allowed[i] for i in torch.randperm(len(allowed), generator=generator).tolist()]
-        yield Step(number, steps, order.pop())
+                raise XrgsError(f"step {self.number}: the components leave no view to train on")
+            order = torch.randperm(len(allowed), generator=self.generator).tolist()
+            self.order = [allowed[i] for i in order]
+        self.number += 1
+        return Step(self.number - 1, self.steps, self.order.pop())
+
+    def _allows(self, view: LoadedView) -> bool:
+        return self.trains_on(Step(self.number, self.steps, view))
+
+    def state_dict(self) -> State:
+        """The next step's number, the rest of the round, and where chance stands."""
+        order = [view.name for view in self.order]
+        return {"number": self.number, "order": order, "generator": self.generator.get_state()}
+
+    def load_state_dict(self, state: State) -> None:
+        """Go on where `state_dict` was asked."""
+        by_name = {view.name: view for view in self.views}
+        self.number, self.order = int(state["number"]), [by_name[name] for name in state["order"]]
+        self.generator.set_state(state["generator"])
 
 
 class _Ledger:
-    """Keeps what a report wants to know of a run."""
+    """Keeps what a report wants to know of a run; its clock runs from the moment it is made."""
 
     def __init__(self, steps: int, grow_grad2d: float) -> None:
+        self.started = time.perf_counter()
         self.grow_grad2d = grow_grad2d
         self.every = max(1, steps // _LOGGED_ROWS)
         self.last = steps - 1
@@ -210,7 +262,32 @@ class _Ledger:
     def refined(self, done: Refinement) -> None:
         self.counts.update(done.counts())
 
-    def close(self, gaussians: Gaussians, seconds: float) -> Trained:
+    def leave_out(self, seconds: float) -> None:
+        """Just now, something else than training took so long."""
+        self.started += seconds
+
+    def state_dict(self) -> State:
+        """All of it, with the seconds of training so far."""
+        return {
+            "seconds": time.perf_counter() - self.started,
+            "counts": dict(self.counts),
+            "notes": dict(self.notes),
+            "history": self.history,
+            "memory_bytes": self.memory_bytes,
+            "evaluations": self.evaluations,
+        }
+
+    def load_state_dict(self, state: State) -> None:
+        """Go on where `state_dict` was asked: the time between doesn't count."""
+        self.started = time.perf_counter() - float(state["seconds"])
+        self.counts = Counter(state["counts"])
+        self.notes = defaultdict(list, state["notes"])
+        self.history = list(state["history"])
+        self.memory_bytes = int(state["memory_bytes"])
+        self.evaluations = int(state["evaluations"])
+
+    def close(self, gaussians: Gaussians) -> Trained:
+        seconds = time.perf_counter() - self.started
         blank = {name: None for row in self.history for name in row} | dict.fromkeys(self.counts, 0)
         history = [blank | row for row in self.history]
         return Trained(

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import faulthandler
 import json
+import logging
 import signal
 import subprocess
 import sys
@@ -79,6 +80,11 @@ def _run_cell(request: Mapping[str, Any]) -> dict[str, Any]:
     folder = CellFolder(Path(request["cell"]))
     with (folder.path / "log.txt").open("a", encoding="utf-8") as log:
         faulthandler.enable(log)
+        logging.basicConfig(
+            format="%(asctime)s %(message)s",
+            level=logging.INFO,
+            handlers=[logging.StreamHandler(log), logging.StreamHandler()],
+        )
         cell.run(from_dict(request["conf"]), variant.load(Path(request["variant"])), folder)
         faulthandler.disable()
     return {}

@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from xrgs.components import Step
-from xrgs.components.count_matched import CountMatched, CountOff, search
+from xrgs.components.count_matched import CountMatched, CountOff, Search
 from xrgs.config import CountMatchedConf
 from xrgs.errors import XrgsError
 
@@ -42,7 +42,7 @@ def test_a_threshold_is_found_in_few_runs(
 ) -> None:
     wanted = round(at_start * share)
     run, thresholds = trainer(power, at_start, wanted, ripple)
-    found = search(run, 2e-4, wanted)
+    found = Search(2e-4, wanted)(run)
     assert found == thresholds[-1]
     assert len(thresholds) <= 8
     assert (found > 2e-4) == (len(thresholds) > 1 and share < 1)
@@ -50,7 +50,7 @@ def test_a_threshold_is_found_in_few_runs(
 
 def test_the_first_threshold_is_kept_where_it_suits() -> None:
     run, thresholds = trainer(1.5, 1000, 1010)
-    assert search(run, 2e-4, 1010) == 2e-4
+    assert Search(2e-4, 1010)(run) == 2e-4
     assert thresholds == [2e-4]
 
 
@@ -59,7 +59,7 @@ def test_a_number_out_of_reach_is_said() -> None:
         raise CountOff(500 if threshold > 3e-4 else 50_000)
 
     with pytest.raises(XrgsError, match=r"count_matched\.gaussians=5000.*0\.0002: 50000"):
-        search(run, 2e-4, 5000)
+        Search(2e-4, 5000)(run)
 
 
 class Many:

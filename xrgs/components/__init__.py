@@ -2,8 +2,9 @@
 
 A component that is switched off isn't built, so a baseline runs none of their code. To add one: its
 fields in `xrgs.config` with their off values in `conf/config.yaml`, a file here with a `Component`
-that overrides the hooks it needs, its lines in `build`. What the paper leaves open is fixed in the
-components' docstrings.
+that overrides the hooks it needs, its lines in `build`; one that changes from step to step has
+`state_dict` and `load_state_dict`, too. What the paper leaves open is fixed in the components'
+docstrings.
 """
 
 from __future__ import annotations

@@ -5,7 +5,7 @@ from __future__ import annotations
 import functools
 import math
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING, Any, Protocol
 
 import torch
 
@@ -13,6 +13,8 @@ from xrgs.errors import XrgsError
 from xrgs.splat.settings import NOMINAL_STEPS
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping
+
     from torch import Tensor
 
     from xrgs.splat.cameras import Camera
@@ -115,6 +117,18 @@ class Component:
     def finish(self, gaussians: Gaussians) -> None:
         """Training is over: make the Gaussians, in place, those that are to be shown and kept."""
 
+    def state_dict(self) -> dict[str, Any]:
+        """What the steps so far have made of it, for a checkpoint; nothing where none did."""
+        return {}
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Become what `state_dict` told of; not called where that was nothing.
+
+        Raises:
+            KeyError: Something is missing.
+            ValueError: Something does not fit.
+        """
+
 
 class Components(tuple[Component, ...]):
     """The components that are on, in the order that their hooks run; none is the baseline."""
@@ -167,6 +181,18 @@ class Components(tuple[Component, ...]):
         """`Component.finish` of each in turn."""
         for component in self:
             component.finish(gaussians)
+
+    def state_dict(self) -> dict[str, Any]:
+        """`Component.state_dict` of those that have one, by their classes' names."""
+        states = {type(component).__name__: component.state_dict() for component in self}
+        return {name: state for name, state in states.items() if state}
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """`Component.load_state_dict` of those that are in `state`."""
+        for component in self:
+            name = type(component).__name__
+            if name in state:
+                component.load_state_dict(state[name])
 
 
 def not_negative(key: str, value: float) -> None:

@@ -8,8 +8,8 @@ from __future__ import annotations
 
 import logging
 import math
-from collections.abc import Callable
-from typing import TYPE_CHECKING, TypeVar
+from collections.abc import Callable, Mapping
+from typing import TYPE_CHECKING, Any, TypeVar
 
 from xrgs.components.base import Component, Step
 from xrgs.errors import XrgsError
@@ -57,31 +57,50 @@ class CountMatched(Component):
             raise CountOff(len(gaussians))
 
 
-def search(run: Callable[[float], _T], start: float, wanted: int) -> _T:
-    """What `run` gives at a threshold that suits it: a secant of log counts, kept in its bracket.
+class Search:
+    """Finds a threshold that suits: a secant of log counts, kept in its bracket."""
 
-    Args:
-        run: Trains with a threshold; raises `CountOff` where that gives too many or too few.
-        start: The first threshold.
-        wanted: Number of Gaussians.
+    def __init__(self, start: float, wanted: int) -> None:
+        """Nothing is tried yet.
 
-    Raises:
-        XrgsError: ten thresholds gave other counts; the message lists them.
-    """
-    tried: list[tuple[float, int]] = []
-    threshold = start
-    for _ in range(_ATTEMPTS):
-        try:
-            return run(threshold)
-        except CountOff as off:
-            tried.append((threshold, off.count))
-            _log.info("threshold %.3g: %d Gaussians, %d wanted", threshold, off.count, wanted)
-        threshold = _next(tried, wanted)
-    counts = ", ".join(f"{threshold:.3g}: {count}" for threshold, count in tried)
-    raise XrgsError(
-        f"components.count_matched.gaussians={wanted}: no threshold gave it within the tolerance"
-        f" ({counts})"
-    )
+        Args:
+            start: The first threshold.
+            wanted: Number of Gaussians.
+        """
+        self.start, self.wanted = start, wanted
+        self.tried: list[tuple[float, int]] = []
+
+    def __call__(self, run: Callable[[float], _T]) -> _T:
+        """What `run` gives at the threshold that suits it.
+
+        Args:
+            run: Trains with a threshold; raises `CountOff` where that gives too many or too few.
+
+        Raises:
+            XrgsError: ten thresholds gave other counts; the message lists them.
+        """
+        while len(self.tried) < _ATTEMPTS:
+            threshold = _next(self.tried, self.wanted) if self.tried else self.start
+            try:
+                return run(threshold)
+            except CountOff as off:
+                self.tried.append((threshold, off.count))
+                _log.info(
+                    "threshold %.3g: %d Gaussians, %d wanted", threshold, off.count, self.wanted
+                )
+        counts = ", ".join(f"{threshold:.3g}: {count}" for threshold, count in self.tried)
+        raise XrgsError(
+            f"components.count_matched.gaussians={self.wanted}: no threshold gave it within the"
+            f" tolerance ({counts})"
+        )
+
+    def state_dict(self) -> dict[str, Any]:
+        """What was tried, and with that the threshold that is being tried."""
+        return {"tried": self.tried}
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Go on behind what `state_dict` told of."""
+        self.tried = [(float(threshold), int(count)) for threshold, count in state["tried"]]
 
 
 def _next(tried: list[tuple[float, int]], wanted: int) -> float:

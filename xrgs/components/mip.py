@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import TYPE_CHECKING
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any
 
 import torch
 from torch import Tensor
@@ -67,6 +67,14 @@ class Mip(Component):
         logits = torch.logit(opacities.clamp(bounds.tiny, 1 - bounds.eps))
         gaussians.scales = scales.log().to(gaussians.scales).requires_grad_()
         gaussians.opacities = logits.to(gaussians.opacities).requires_grad_()
+
+    def state_dict(self) -> dict[str, Any]:
+        """The filter: it is of the means as they were when they were last measured."""
+        return {"variance": self.variance, "unseen": self.unseen}
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """The filter that `state_dict` told of."""
+        self.variance, self.unseen = state["variance"], state["unseen"]
 
     def _measure(self, means: Tensor) -> None:
         rate = sampling_rates(means.detach(), self.cameras, self.near)

@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -133,6 +134,8 @@ class Densifier:
         self.apart = groups is not None and not groups.pooled
         #: Which of the G statistics a view of each group adds to.
         self.rows = {name: row if self.apart else 0 for row, name in enumerate(self.thresholds)}
+        self.gradient: Tensor
+        self.seen: Tensor
         self._forget()
 
     def after_step(
@@ -174,6 +177,26 @@ class Densifier:
         if step > 0 and step % settings.reset_every == 0:
             done = replace(done, reset=self._reset_opacities())
         return done
+
+    def state_dict(self) -> dict[str, Any]:
+        """The statistics so far, and where chance stands."""
+        generator = self.generator.get_state()
+        return {"gradient": self.gradient, "seen": self.seen, "generator": generator}
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Statistics and chance as `state_dict` told of them; the Gaussians are there already.
+
+        Raises:
+            KeyError: One is missing.
+            ValueError: The statistics are not of these groups and Gaussians.
+        """
+        self._forget()
+        for name in ("gradient", "seen"):
+            value, here = state[name], self.gradient
+            if value.shape != here.shape or value.dtype != here.dtype:
+                raise ValueError(f"{name}: {value.dtype} {list(value.shape)} does not fit")
+        self.gradient, self.seen = state["gradient"], state["seen"]
+        self.generator.set_state(state["generator"])
 
     def _deciding(self, group: str) -> dict[str, Thresholds]:
         """Thresholds for each of the G statistics, at the refinement after a view of a group."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -88,6 +89,9 @@ class SplatOptimizer:
                 self._give_harmonics_gradient(camera, sh_degree)
             self.adam.step()
         self.steps_done += 1
+        self._decay()
+
+    def _decay(self) -> None:
         decay: float = self.means_final ** (self.steps_done / self.steps)
         self._group("means")["lr"] = self.means_rate * decay
 
@@ -107,6 +111,37 @@ class SplatOptimizer:
     def state_bytes(self) -> int:
         """Bytes of Adam's state."""
         return sum(value.nbytes for state in self.adam.state.values() for value in state.values())
+
+    def state_dict(self) -> dict[str, Any]:
+        """The Gaussians, Adam's state of each parameter that has one, and the steps done."""
+        values = {name: self.gaussians[name].detach() for name in PARAMETERS}
+        adam = {name: dict(self.adam.state.get(self.gaussians[name], {})) for name in PARAMETERS}
+        return {"gaussians": values, "adam": adam, "steps_done": self.steps_done}
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Gaussians, moments and rates as `state_dict` told of them; gradients are forgotten.
+
+        Raises:
+            KeyError: A parameter or moment is missing.
+            ValueError: One has another shape or type than its place; nothing is changed then.
+        """
+        values, adam = state["gaussians"], state["adam"]
+        count = len(values["means"])
+        for name in PARAMETERS:
+            here = self.gaussians[name]
+            moments = [adam[name][key] for key in ("exp_avg", "exp_avg_sq") if adam[name]]
+            for value in (values[name], *moments):
+                if value.shape != (count, *here.shape[1:]) or value.dtype != here.dtype:
+                    raise ValueError(f"{name}: {value.dtype} {list(value.shape)} does not fit")
+            if adam[name] and adam[name]["step"].shape != ():
+                raise ValueError(f"{name}: its count of steps is not one number")
+        for name in PARAMETERS:
+            self._replace(name, values[name], torch.zeros_like)
+            self.adam.state.pop(self.gaussians[name], None)
+            if adam[name]:
+                self.adam.state[self.gaussians[name]] = dict(adam[name])
+        self.steps_done = int(state["steps_done"])
+        self._decay()
 
     def keep(self, index: Tensor) -> None:
         """Only these Gaussians remain, in this order.
