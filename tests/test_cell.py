@@ -160,7 +160,7 @@ def test_a_checkpoint_of_no_use_is_said_and_training_starts_over(
 def test_a_worker_that_is_killed_goes_on_in_another(
     compose: Callable[..., Conf], tmp_path: Path
 ) -> None:
-    changes = ("scene=motorcycle", "preset=smoke", "train.steps=300", "threads=1")
+    changes = ("scene=motorcycle", "preset=smoke", "train.steps=100", "threads=1")
     conf = compose(*changes, "checkpoint_s=0.05")
     conf.splat.backend = resolve_backend(conf.splat.backend)
     store = Store(tmp_path / "s")
@@ -176,7 +176,7 @@ def test_a_worker_that_is_killed_goes_on_in_another(
     child = subprocess.Popen([sys.executable, "-P", "-m", "xrgs.worker", "cell", *files])
     while not folder.checkpoint.exists() and child.poll() is None:
         time.sleep(0.005)
-    time.sleep(random.uniform(0, 0.3))
+    time.sleep(random.uniform(0, 0.1))
     child.kill()
     assert child.wait() == -9
     folder.fail("its process was ended by SIGKILL")  # what a sweep that outlives it says
