@@ -1,4 +1,4 @@
-"""The commands: `xrgs-sweep`, `xrgs-report`, `xrgs-bench` and `xrgs-data`."""
+"""The commands: `xrgs-sweep`, `xrgs-status`, `xrgs-report`, `xrgs-bench` and `xrgs-data`."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import cast
 
 import hydra
+from hydra.core.hydra_config import HydraConfig
 from hydra.errors import HydraException
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
@@ -20,9 +21,9 @@ from xrgs.machine import let_openmp_sleep
 
 @hydra.main(version_base="1.3", config_path=str(config.CONF_DIR), config_name="config")
 def _sweep(cfg: DictConfig) -> str:
-    from xrgs.sweep import run_job
+    from xrgs.job import run_job
 
-    return run_job(cfg)
+    return run_job(config.to_conf(cfg), Path(HydraConfig.get().sweep.dir))
 
 
 _HELP = """\
@@ -36,6 +37,8 @@ Commas make axes, +ablation=[a,b] stacks. Finished cells are found in the store 
   preset=     {preset}
   +sweeps=    {sweeps}
   seed=0,1    store=FOLDER    data_root=FOLDER    threads=N    dry_run=true
+  limits.minutes=N  limits.memory_gb=N    a cell beyond is ended and failed
+  retry=failed      fail_fast=true        run failed cells again; stop after the first
 
 --cfg job prints every key with its value; --hydra-help tells of Hydra's own flags.
 """
@@ -88,6 +91,27 @@ def report() -> None:
         print(build(Path(conf.store), conf.sweep, out).text)  # noqa: T201
     except (XrgsError, OmegaConfBaseException) as error:
         sys.exit(f"xrgs-report: {_line(error)}")
+
+
+@dataclass
+class StatusConf:
+    """Arguments of `xrgs-status`."""
+
+    store: str = "xrgs-store"
+    verify: bool = False
+    """Hash what reports rest on too; sizes alone are compared without."""
+
+
+def status() -> None:
+    """`xrgs-status [store=FOLDER] [verify=true]`: what a store holds, at a glance."""
+    from xrgs.status import describe, read
+
+    try:
+        given = OmegaConf.from_dotlist(sys.argv[1:])
+        conf = OmegaConf.merge(OmegaConf.structured(StatusConf), given)
+        print(describe(read(Path(conf.store), verify=conf.verify)))  # noqa: T201
+    except (XrgsError, OmegaConfBaseException) as error:
+        sys.exit(f"xrgs-status: {_line(error)}")
 
 
 def bench() -> None:

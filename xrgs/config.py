@@ -21,6 +21,8 @@ _HERE = Path(__file__).parent
 #: `conf/` is inside the package in a wheel and beside it in a checkout.
 CONF_DIR = _HERE / "conf" if (_HERE / "conf").is_dir() else _HERE.parent / "conf"
 
+_RETRY = ("none", "failed")
+
 
 @dataclass
 class SceneConf:
@@ -260,6 +262,16 @@ class ComponentsConf:
 
 
 @dataclass
+class LimitsConf:
+    """What a cell may take before it is ended and counts as failed; 0 is no limit."""
+
+    minutes: float = MISSING
+    """From its start to its end, training and evaluation."""
+    memory_gb: float = MISSING
+    """Resident, of its process and the children of that; 1 GB is 10^9 bytes."""
+
+
+@dataclass
 class Conf:
     """One cell of a study, and how to run it."""
 
@@ -280,6 +292,11 @@ class Conf:
     checkpoint_s: float = MISSING
     """Seconds between two checkpoints of a cell in training, from which it goes on where it was
     killed; 0 writes none."""
+    limits: LimitsConf = field(default_factory=LimitsConf)
+    retry: str = MISSING
+    """`failed` runs failed cells again; `none` reports them and leaves them."""
+    fail_fast: bool = MISSING
+    """Start no further cell after the first that fails."""
     dry_run: bool = MISSING
     """Print the plan and stop."""
 
@@ -302,12 +319,16 @@ def to_conf(cfg: DictConfig) -> Conf:
         ("train.steps", conf.train.steps, 1),
         ("threads", conf.threads, 0),
         ("checkpoint_s", conf.checkpoint_s, 0),
+        ("limits.minutes", conf.limits.minutes, 0),
+        ("limits.memory_gb", conf.limits.memory_gb, 0),
     )
     for key, value, least in least_values:
         if not value >= least:
             raise XrgsError(f"{key}={value}: must be at least {least}")
     if conf.splat.backend not in CHOICES:
         raise XrgsError(f"splat.backend={conf.splat.backend}: must be one of {', '.join(CHOICES)}")
+    if conf.retry not in _RETRY:
+        raise XrgsError(f"retry={conf.retry}: must be one of {', '.join(_RETRY)}")
     return conf
 
 

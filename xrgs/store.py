@@ -1,6 +1,6 @@
 """What is on disk, and is it done.
 
-A store is a folder: `scenes/`, `variants/`, `cells/<cell id>/`, `sweeps/<sweep id>.json`,
+A store is a folder: `scenes/`, `variants/`, `cells/<cell id>/`, `locks/`, `sweeps/<sweep id>.json`,
 `reports/<sweep id>/`. A cell's `status.json` is written last, by atomic rename, and lists every
 other file of the cell: a cell is done when it says so and the files are those that it lists.
 """
@@ -9,14 +9,16 @@ from __future__ import annotations
 
 import csv
 import json
+import os
 import shutil
+import stat
 import tempfile
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from xrgs.errors import XrgsError
-from xrgs.files import write_json
+from xrgs.files import write_json, write_text
 from xrgs.hashing import canonical, digest, file_digest
 
 if TYPE_CHECKING:
@@ -75,8 +77,12 @@ class CellFolder:
         """State of the training, while it is not done."""
         return self.path / _CHECKPOINT
 
-    def state(self) -> State:
-        """Whether this cell's result is there and can be trusted."""
+    def state(self, *, verify: bool = True) -> State:
+        """Whether this cell's result is there and can be trusted.
+
+        Args:
+            verify: hash what reports rest on too; else sizes alone are compared.
+        """
         if not self.path.is_dir():
             return State("absent")
         status_file = self.path / "status.json"
@@ -87,20 +93,22 @@ class CellFolder:
             status = read_json(status_file)
             if status["state"] == "failed":
                 return State("failed", str(status["reason"]))
-            self._verify(status)
+            self._check(status, verify=verify)
         except (StoreError, KeyError, TypeError, ValueError, OSError) as error:
             return State("corrupt", str(error))
         return State("done")
 
-    def _verify(self, status: Mapping[str, Any]) -> None:
+    def _check(self, status: Mapping[str, Any], *, verify: bool) -> None:
         if status["state"] != "done":
             raise StoreError(f"status.json: unknown state {status['state']!r}")
         for name, entry in status["files"].items():
-            file = self.path / name
-            if not file.is_file() or file.stat().st_size != entry["bytes"]:
+            if _size(f"{self.path}/{name}") != entry["bytes"]:
                 raise StoreError(f"{name} is missing or has another size")
-            if name in _VERIFIED_BY_HASH and file_digest(file) != entry["sha256"]:
+            hashed = verify and name in _VERIFIED_BY_HASH
+            if hashed and file_digest(self.path / name) != entry["sha256"]:
                 raise StoreError(f"{name} has changed since the cell finished")
+        if not verify:
+            return
         with (self.path / "scores.csv").open(encoding="utf-8", newline="") as stream:
             views = [row["view"] for row in csv.DictReader(stream)]
         if views != status["views"]:
@@ -159,7 +167,10 @@ class CellFolder:
         self.checkpoint.unlink(missing_ok=True)  # last: until it is done, the cell may need it
 
     def fail(self, reason: str) -> None:
-        """Declare the cell failed."""
+        """Declare the cell failed; `error.txt` is there even where it died without a word."""
+        error = self.path / "error.txt"
+        if not error.exists():
+            write_text(error, f"{reason}\n")
         self._set_status({"state": "failed", "reason": reason, "views": [], "files": {}})
 
     def _set_status(self, status: Mapping[str, Any]) -> None:
@@ -182,6 +193,15 @@ class CellFolder:
         import pandas as pd
 
         return pd.read_csv(self.path / "history.csv")
+
+
+def _size(file: str) -> int:
+    """Bytes of a regular file, -1 of anything else. A text, for a store asks it of thousands."""
+    try:
+        found = os.stat(file)  # noqa: PTH116
+    except OSError:
+        return -1
+    return found.st_size if stat.S_ISREG(found.st_mode) else -1
 
 
 def _free_name(path: Path) -> Path:
@@ -209,6 +229,16 @@ class Store:
         return self.path / "variants"
 
     @property
+    def cells(self) -> Path:
+        """Results."""
+        return self.path / "cells"
+
+    @property
+    def locks(self) -> Path:
+        """Of the cells that are being trained."""
+        return self.path / "locks"
+
+    @property
     def reports(self) -> Path:
         """Tables and figures."""
         return self.path / "reports"
@@ -220,7 +250,8 @@ class Store:
             StoreError: the folder can't be written; the message names it and the `store` key.
         """
         try:
-            for folder in (self.scenes, self.variants, self.path / "cells", self.path / "sweeps"):
+            folders = (self.scenes, self.variants, self.cells, self.locks, self.path / "sweeps")
+            for folder in folders:
                 folder.mkdir(parents=True, exist_ok=True)
             with tempfile.TemporaryFile(dir=self.path):
                 pass
@@ -231,7 +262,7 @@ class Store:
 
     def cell(self, cell_id: str) -> CellFolder:
         """The folder of a cell, which need not exist."""
-        return CellFolder(self.path / "cells" / cell_id)
+        return CellFolder(self.cells / cell_id)
 
     def write_sweep(self, command: Sequence[str], cells: Iterable[Mapping[str, Any]]) -> str:
         """Keep what a sweep compared, for its report. The same comparison gives the same id."""

@@ -3,59 +3,59 @@
 expand (axes, matching baselines) -> compose -> variants -> identities -> launch -> record -> table
 
 A cell with `matched_to` takes a number from another cell, so it has no identity before that one is
-done: cells are launched as they become ready, those that wait for others after them.
+done: cells are launched as they become ready, those that wait for others after them. A cell that
+another sweep trains is left to that, and waited for when nothing else is to do.
 """
 
 from __future__ import annotations
 
 import itertools
-import sys
-from dataclasses import asdict, dataclass, field, replace
+import re
+import time
+from dataclasses import asdict, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.plugins import Plugins
 from hydra.errors import CompactHydraException
+from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from xrgs import scenes, variant, weights, worker
+from xrgs import locks, scenes, variant, weights, worker
 from xrgs.config import to_conf
 from xrgs.errors import XrgsError
+from xrgs.estimate import Past
 from xrgs.hashing import digest
-from xrgs.identity import cell_identity
-from xrgs.splat.backend import resolve_backend
-from xrgs.store import State, Store
+from xrgs.job import LOCKED, STOPPED, UNWRITABLE
+from xrgs.job import say as _say
+from xrgs.plan import (
+    BASELINE,
+    Planned,
+    Wish,
+    describe,
+    estimated,
+    identified,
+    length,
+    ready,
+    record,
+)
+from xrgs.store import Store, StoreError
 
 if TYPE_CHECKING:
-    from collections.abc import Container, Iterable, Mapping, Sequence
+    from collections.abc import Iterable, Mapping, Sequence
 
     from hydra.core.override_parser.types import Override
+    from hydra.core.utils import JobReturn
     from hydra.types import HydraContext, TaskFunction
     from omegaconf import DictConfig
 
     from xrgs.config import Conf
 
-BASELINE = "baseline"
-
-
-@dataclass(frozen=True)
-class Wish:
-    """One combination of the command line's axes."""
-
-    label: str
-    """What is compared: the ablation and the component values set by hand."""
-    condition: str
-    """The other axes' values, beside scene and seed: what label and baseline share."""
-    shared: tuple[str, ...]
-    """Overrides that the matching baseline has too."""
-    changes: tuple[str, ...]
-    """Overrides that make it another program than the baseline."""
-
-    @property
-    def overrides(self) -> list[str]:
-        """All of it, for Hydra to compose."""
-        return [*self.shared, *self.changes]
+_SEED = re.compile(r"seed=(\d+)")
+_NOTHING_LOST = "What is done is kept: with room to write, the same command goes on from there."
+#: Seconds between looks at what other sweeps do.
+_LOOK_S = 2.0
 
 
 def _values(override: Override) -> list[str]:
@@ -112,40 +112,6 @@ def expand(arguments: Sequence[str]) -> list[Wish]:
     return list(wishes)
 
 
-@dataclass(frozen=True)
-class Planned:
-    """A cell of the study: what it is, and where it stands."""
-
-    wish: Wish
-    conf: Conf
-    variant_id: str | None = None
-    cell_id: str | None = None
-    state: State = field(default_factory=lambda: State("absent"))
-    error: str | None = None
-    """Why the cell can't be run: its scene failed, or the cell that it takes a number from."""
-
-    @property
-    def name(self) -> str:
-        """For people."""
-        parts = (scenes.label(self.conf.scene), self.wish.label, self.wish.condition)
-        return " / ".join(part for part in parts if part) + f" / seed {self.conf.seed}"
-
-    @property
-    def reference(self) -> Wish | None:
-        """The cell whose number of Gaussians this one is to have."""
-        name = self.conf.matched_to
-        return replace(self.wish, label=name, changes=(f"+ablation={name}",)) if name else None
-
-    @property
-    def waits(self) -> bool:
-        """Whether that number is still to come."""
-        return self.reference is not None and not self.conf.components.count_matched.gaussians
-
-
-def _say(text: str) -> None:
-    print(text, file=sys.stderr, flush=True)  # noqa: T201
-
-
 class Study:
     """One call of `xrgs-sweep`."""
 
@@ -153,6 +119,7 @@ class Study:
         self._context = context
         self._task = task
         self._config = config
+        self._composed: dict[tuple[str, ...], Conf] = {}
 
     def run(self, arguments: Sequence[str]) -> None:
         """Plan, build the variants, run what is not done, record and report.
@@ -165,6 +132,10 @@ class Study:
             failed = self._run(arguments)
         except (XrgsError, OmegaConfBaseException) as error:
             raise CompactHydraException(str(error)) from error
+        except OSError as error:
+            if not worker.unwritable(error):
+                raise
+            raise CompactHydraException(f"{error}. {_NOTHING_LOST}") from error
         if failed:
             raise SystemExit(1)
 
@@ -176,22 +147,47 @@ class Study:
             store.prepare()
         plan = self._with_variants(plan, store, build=not dry)
         plan = self._identified(plan, store)
+        plan = estimated(plan, Past(store))
         _say(describe(plan))
         if weights.find() is None and any(cell.state.name != "done" for cell in plan):
             _say(f"no LPIPS in what is run now (n/a in the tables): {weights.HINT}")
         if dry:
             return False
-        launched: set[str] = set()
-        while ready := _ready(plan, launched):
-            self._launch(ready.values())
-            launched |= ready.keys()
-            plan = self._identified(plan, store)
+        plan = self._worked_off(plan, store)
         plan = [_without_reference(cell) for cell in plan]
-        sweep_id = store.write_sweep(arguments, _record(plan))
+        sweep_id = store.write_sweep(arguments, record(plan))
         from xrgs.report import build
 
         print(build(store.path, sweep_id).text)  # noqa: T201
         return any(cell.error is not None or cell.state.name != "done" for cell in plan)
+
+    def _worked_off(self, plan: Sequence[Planned], store: Store) -> list[Planned]:
+        """The plan when there is nothing left to do: run here, or by another sweep meanwhile.
+
+        Raises:
+            StoreError: the store takes no more.
+        """
+        conf = plan[0].conf
+        retry, told, tried = conf.retry == "failed", False, set[str]()
+        while True:
+            wanted = ready(plan, tried, retry=retry)
+            others = [cell for cell in plan if cell.state.name == "running"]
+            if not wanted and not others:
+                return list(plan)
+            outcomes = self._launch(wanted.values()) if wanted else {}
+            begun = {cell_id for cell_id in wanted if outcomes[cell_id] != LOCKED}
+            tried |= begun
+            plan = self._identified(plan, store)
+            if UNWRITABLE in outcomes.values():
+                raise StoreError(f"store={store.path} can't be written. {_NOTHING_LOST}")
+            if STOPPED in outcomes.values() or (conf.fail_fast and "failed" in outcomes.values()):
+                _say("fail_fast: nothing more is started")
+                return list(plan)
+            if not wanted and not told:
+                _say(f"waiting for {len(others)} cells: {others[0].name} {others[0].state.reason}")
+                told = True
+            if not begun:
+                time.sleep(_LOOK_S)
 
     def _plan(self, arguments: Sequence[str]) -> list[Planned]:
         """Every cell that is asked for, behind the one it takes a number from."""
@@ -208,8 +204,9 @@ class Study:
     def _identified(self, plan: Sequence[Planned], store: Store) -> list[Planned]:
         """Every cell with its number, its identity and its state, as far as they are known."""
         found: dict[Wish, Planned] = {}
+        held = locks.holders(store.locks)
         for cell in plan:
-            known = _identify(self._with_count(cell, found, store), store)
+            known = identified(self._with_count(cell, found, store), store, held)
             found[known.wish] = known
         return list(found.values())
 
@@ -224,7 +221,17 @@ class Study:
         return replace(cell, wish=wish, conf=self._compose(wish))
 
     def _compose(self, wish: Wish) -> Conf:
-        return to_conf(self._context.config_loader.load_sweep_config(self._config, wish.overrides))
+        """The wish's config. Seeds share one: composing takes Hydra tens of milliseconds."""
+        seeds = [found[1] for text in wish.overrides if (found := _SEED.fullmatch(text))]
+        others = tuple(text for text in wish.overrides if not _SEED.fullmatch(text))
+        known = self._composed.get(others)
+        if len(seeds) == 1 and known is not None:
+            return replace(known, seed=int(seeds[0]))
+        composed = self._context.config_loader.load_sweep_config(self._config, wish.overrides)
+        conf = to_conf(composed)
+        if "${seed" not in str(OmegaConf.to_container(composed, resolve=False)):
+            self._composed[others] = conf
+        return conf
 
     def _with_variants(
         self, plan: Sequence[Planned], store: Store, *, build: bool
@@ -240,11 +247,23 @@ class Study:
             cells.append(replace(cell, variant_id=variant_id, error=error))
         return cells
 
-    def _launch(self, cells: Iterable[Planned]) -> None:
+    def _launch(self, cells: Iterable[Planned]) -> dict[str, str]:
+        """Run cells, the longest first; what each job ended with, by the cell's id."""
+        cells = sorted(cells, key=length, reverse=True)
         launcher = Plugins.instance().instantiate_launcher(
             hydra_context=self._context, task_function=self._task, config=self._config
         )
-        launcher.launch([cell.wish.overrides for cell in cells], initial_job_idx=0)
+        done = launcher.launch([cell.wish.overrides for cell in cells], initial_job_idx=0)
+        return {str(cell.cell_id): _outcome(job) for cell, job in zip(cells, done, strict=True)}
+
+
+def _outcome(job: JobReturn) -> str:
+    """What `run_job` returned; a failure where it raised, which is then its cell's alone."""
+    try:
+        return str(job.return_value)
+    except Exception as error:
+        _say(str(error))
+        return "failed"
 
 
 def _variant_of(conf: Conf, store: Store, *, build: bool) -> tuple[str | None, str | None]:
@@ -255,28 +274,11 @@ def _variant_of(conf: Conf, store: Store, *, build: bool) -> tuple[str | None, s
             return (found.id if found else None), None
         _say(f"{scenes.label(conf.scene)}: building the mixed-resolution variant")
         return worker.run("variant", {"conf": asdict(conf), "store": conf.store})["variant"], None
+    except worker.UnwritableError as error:
+        raise StoreError(f"store={store.path}: {error}. {_NOTHING_LOST}") from error
     except XrgsError as error:
         _say(f"{scenes.label(conf.scene)}: {error}")
         return None, str(error)
-
-
-def _identify(cell: Planned, store: Store) -> Planned:
-    if cell.variant_id is None or cell.waits:
-        return cell
-    cell_id = digest(cell_identity(cell.conf, cell.variant_id))
-    return replace(cell, cell_id=cell_id, state=store.cell(cell_id).state())
-
-
-def _ready(plan: Sequence[Planned], launched: Container[str]) -> dict[str, Planned]:
-    """The cells that can be run now and are not done, by their identity."""
-    return {
-        cell.cell_id: cell
-        for cell in plan
-        if cell.cell_id is not None
-        and cell.cell_id not in launched
-        and cell.error is None
-        and cell.state.name != "done"
-    }
 
 
 def _without_reference(cell: Planned) -> Planned:
@@ -284,61 +286,3 @@ def _without_reference(cell: Planned) -> Planned:
     if cell.error is not None or not cell.waits:
         return cell
     return replace(cell, error=f"matched_to={cell.conf.matched_to}: that cell is not done")
-
-
-def describe(plan: Sequence[Planned]) -> str:
-    """The plan as lines: state, identity, name, and why where it is not plain."""
-    lines = [f"plan: {len(plan)} cells, {sum(c.state.name == 'done' for c in plan)} done"]
-    for cell in plan:
-        state = "failed" if cell.error else "waits" if cell.waits else cell.state.name
-        reason = (cell.error or cell.state.reason or "").partition("\n")[0]
-        identity = cell.cell_id or ("no count yet" if cell.waits else "variant not built")
-        lines.append(
-            f"  {state:<10} {identity:<18} {cell.name}" + (f"  ({reason})" if reason else "")
-        )
-    return "\n".join(lines)
-
-
-def _record(plan: Sequence[Planned]) -> list[dict[str, Any]]:
-    """The rows that a report is made from: each cell with its matching baseline's id."""
-    baselines = {c.wish.shared: c.cell_id for c in plan if c.wish.label == BASELINE}
-    return [
-        {
-            "cell_id": cell.cell_id,
-            "label": cell.wish.label,
-            "condition": cell.wish.condition,
-            "scene": scenes.label(cell.conf.scene),
-            "seed": cell.conf.seed,
-            "variant_id": cell.variant_id,
-            "baseline_id": baselines[cell.wish.shared],
-            "error": cell.error,
-        }
-        for cell in plan
-    ]
-
-
-def run_job(cfg: DictConfig) -> str:
-    """What a launcher runs, perhaps on another machine: one cell, in a process of its own.
-
-    Returns:
-        The cell's state; a failed cell is a state, not an exception, so that no launcher drops
-        the rest of its batch.
-    """
-    conf = to_conf(cfg)
-    store = Store(Path(conf.store))
-    found = variant.find(store.variants, variant.key(conf.scene, conf.variant))
-    if found is None:
-        raise XrgsError(f"{scenes.label(conf.scene)}: its variant is gone from {store.variants}")
-    # Named, so that the child can't choose another one than the identity says.
-    conf.splat.backend = resolve_backend(conf.splat.backend)
-    identity = cell_identity(conf, found.id)
-    folder = store.cell(digest(identity))
-    folder.begin(asdict(conf), identity)
-    _say(f"{scenes.label(conf.scene)} / seed {conf.seed}: training cell {folder.id}")
-    request = {"conf": asdict(conf), "variant": str(found.path), "cell": str(folder.path)}
-    try:
-        worker.run("cell", request)
-    except XrgsError as error:
-        folder.fail(str(error))
-        _say(f"{folder.id} failed: {error}")
-    return folder.state().name

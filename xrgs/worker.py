@@ -5,17 +5,19 @@ The parent (`run`) stays without torch; the child is `python -m xrgs.worker JOB 
 
 from __future__ import annotations
 
+import errno
 import faulthandler
 import json
 import logging
+import os
 import signal
-import subprocess
 import sys
 import tempfile
 import traceback
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from xrgs import supervise
 from xrgs.errors import XrgsError
 from xrgs.files import write_json
 from xrgs.machine import let_openmp_sleep
@@ -23,20 +25,37 @@ from xrgs.store import read_json
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
+    from typing import TextIO
+
+#: What says that a file system takes no more, whatever the job does.
+_UNWRITABLE = frozenset({errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EIO})
+_NO_LIMITS = supervise.Limits()
 
 
 class WorkerError(XrgsError):
     """The child said why it failed, or died without a word."""
 
 
-def run(job: str, request: Mapping[str, Any]) -> dict[str, Any]:
+class UnwritableError(WorkerError):
+    """The child could not write: the disk is full, or read-only, or broken."""
+
+
+def run(
+    job: str,
+    request: Mapping[str, Any],
+    limits: supervise.Limits = _NO_LIMITS,
+    objection: Callable[[], str] = lambda: "",
+) -> dict[str, Any]:
     """Run one job in a child process and return its answer.
 
     Args:
         job: a name in `_JOBS`.
         request: what it is to do, as plain JSON values.
+        limits: the child is ended where it goes beyond.
+        objection: asked while it runs; a text ends it, and is the reason.
 
     Raises:
+        UnwritableError: it could not write its files; nothing else is wrong with it.
         WorkerError: the job failed; the message is its reason.
     """
     with tempfile.TemporaryDirectory(prefix="xrgs-") as folder:
@@ -45,13 +64,23 @@ def run(job: str, request: Mapping[str, Any]) -> dict[str, Any]:
         # -P: run from a checkout, the child must import the installed package as its parent does.
         child = [sys.executable, "-P", "-m", "xrgs.worker"]
         command = [*child, job, str(request_file), str(answer_file)]
-        code = subprocess.run(command, check=False).returncode  # noqa: S603
+        ended = supervise.run(command, limits, objection)
+        if ended.reason:
+            raise WorkerError(ended.reason)
+        if not answer_file.exists() and ended.code == os.EX_IOERR:
+            raise UnwritableError(f"it had no room for its answer in {folder}: is the disk full?")
         if not answer_file.exists():
-            raise WorkerError(_death(code))
+            raise WorkerError(_death(ended.code))
         answer = dict(read_json(answer_file))
     if "error" in answer:
-        raise WorkerError(str(answer["error"]))
+        unwritable = answer.get("errno") in _UNWRITABLE
+        raise (UnwritableError if unwritable else WorkerError)(str(answer["error"]))
     return answer
+
+
+def unwritable(error: OSError) -> bool:
+    """Whether an error is the file system's, that nothing more can be written."""
+    return error.errno in _UNWRITABLE
 
 
 def _death(code: int) -> str:
@@ -79,15 +108,25 @@ def _run_cell(request: Mapping[str, Any]) -> dict[str, Any]:
 
     folder = CellFolder(Path(request["cell"]))
     with (folder.path / "log.txt").open("a", encoding="utf-8") as log:
-        faulthandler.enable(log)
-        logging.basicConfig(
-            format="%(asctime)s %(message)s",
-            level=logging.INFO,
-            handlers=[logging.StreamHandler(log), logging.StreamHandler()],
-        )
-        cell.run(from_dict(request["conf"]), variant.load(Path(request["variant"])), folder)
-        faulthandler.disable()
+        _keep_output(log)
+        # A cell that is ended from outside says where it was. To the descriptor, which stays open.
+        faulthandler.register(signal.SIGTERM, 2, chain=True)
+        logging.basicConfig(format="%(asctime)s %(message)s", level=logging.INFO)
+        frozen = variant.load(Path(request["variant"]))
+        if frozen.id != frozen.path.name:
+            raise variant.CorruptVariant(f"{frozen.path}: this is variant {frozen.id}, renamed")
+        cell.run(from_dict(request["conf"]), frozen, folder)
     return {}
+
+
+def _keep_output(log: TextIO) -> None:
+    """Have the log keep what libraries, children and faulthandler print, to the last words.
+
+    `sys.stderr` stays the terminal, where the progress bar is.
+    """
+    sys.stderr = os.fdopen(os.dup(2), "w", encoding="utf-8", errors="replace", buffering=1)
+    for descriptor in (1, 2):
+        os.dup2(log.fileno(), descriptor)
 
 
 _JOBS: dict[str, Callable[[Mapping[str, Any]], dict[str, Any]]] = {
@@ -99,6 +138,8 @@ _JOBS: dict[str, Callable[[Mapping[str, Any]], dict[str, Any]]] = {
 def main(job: str, request: str, answer: str) -> None:
     """The child: do the job and write the answer, or what went wrong."""
     faulthandler.enable()
+    supervise.follow_parent()
+    supervise.offer_to_oom_killer()
     let_openmp_sleep()
     try:
         result = _JOBS[job](json.loads(Path(request).read_text(encoding="utf-8")))
@@ -106,8 +147,13 @@ def main(job: str, request: str, answer: str) -> None:
         result = {"error": str(error)}
     except Exception as error:
         traceback.print_exc()
-        result = {"error": f"{type(error).__name__}: {error}"}
-    write_json(Path(answer), result)
+        number = error.errno if isinstance(error, OSError) else None
+        result = {"error": f"{type(error).__name__}: {error}", "errno": number}
+    try:
+        write_json(Path(answer), result)
+    except OSError:
+        traceback.print_exc()
+        sys.exit(os.EX_IOERR)
 
 
 if __name__ == "__main__":

@@ -1,0 +1,108 @@
+"""What a launcher runs, perhaps on another machine: one cell, in a process of its own.
+
+A cell's failure is a state and no exception, so that no launcher drops the rest of its batch.
+"""
+
+from __future__ import annotations
+
+import sys
+from contextlib import suppress
+from dataclasses import asdict
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from xrgs import locks, scenes, variant, worker
+from xrgs.errors import XrgsError
+from xrgs.hashing import digest
+from xrgs.identity import cell_identity
+from xrgs.splat.backend import resolve_backend
+from xrgs.store import Store
+from xrgs.supervise import Limits
+
+if TYPE_CHECKING:
+    from xrgs.config import Conf
+    from xrgs.store import CellFolder
+
+#: What a job ends with beside a cell's states: another sweep trains the cell; the sweep was told to
+#: start nothing more; the store takes no more.
+LOCKED, STOPPED, UNWRITABLE = "locked", "stopped", "unwritable"
+
+
+def say(text: str) -> None:
+    """A line for who watches the sweep."""
+    print(text, file=sys.stderr, flush=True)  # noqa: T201
+
+
+def run_job(conf: Conf, sweep_folder: Path) -> str:
+    """Run one cell of a sweep, unless there is a reason not to.
+
+    Args:
+        conf: the cell's.
+        sweep_folder: of this call of `xrgs-sweep` alone, seen by all its jobs: a file `stopped` in
+            it keeps those that have not begun from beginning.
+
+    Returns:
+        The cell's state, or `LOCKED`, `STOPPED` or `UNWRITABLE`.
+    """
+    stopped = sweep_folder / "stopped"
+    if stopped.exists():
+        return STOPPED
+    store = Store(Path(conf.store))
+    try:
+        outcome = _run_alone(conf, store)
+    except OSError as error:
+        if not worker.unwritable(error):
+            raise
+        say(f"store={store.path}: {error}")
+        outcome = UNWRITABLE
+    if outcome == UNWRITABLE or (conf.fail_fast and outcome == "failed"):
+        with suppress(OSError):  # a full disk may have room for a name
+            stopped.touch()
+    return outcome
+
+
+def _run_alone(conf: Conf, store: Store) -> str:
+    """Run the cell if nobody else does, and nobody has meanwhile."""
+    # The plan has verified it, and the child does, which reads it anyway.
+    wanted = variant.key(conf.scene, conf.variant)
+    found = min(store.variants.glob(f"{wanted}-*"), default=None)
+    if found is None:
+        raise XrgsError(f"{scenes.label(conf.scene)}: its variant is gone from {store.variants}")
+    # Named, so that the child can't choose another one than the identity says.
+    conf.splat.backend = resolve_backend(conf.splat.backend)
+    identity = cell_identity(conf, found.name)
+    folder = store.cell(digest(identity))
+    lock = locks.acquire(store.locks, folder.id)
+    if lock is None:
+        say(f"{folder.id}: another sweep is training it; left to that")
+        return LOCKED
+    try:
+        if folder.state().name == "done":  # by another sweep, since this one was planned
+            return "done"
+        folder.begin(asdict(conf), identity)
+        say(f"{scenes.label(conf.scene)} / seed {conf.seed}: training cell {folder.id}")
+        return _train(conf, found, folder, lock)
+    finally:
+        lock.release()
+
+
+def _train(conf: Conf, found: Path, folder: CellFolder, lock: locks.Lock) -> str:
+    request = {"conf": asdict(conf), "variant": str(found), "cell": str(folder.path)}
+    lost = f"{folder.id}: this process was away too long, and another has taken the cell over"
+    try:
+        worker.run(
+            "cell", request, Limits(**asdict(conf.limits)), lambda: "" if lock.beat() else lost
+        )
+    except worker.UnwritableError as error:
+        # No fault of the cell's: it stays unfinished, and is run again without being asked for.
+        say(f"{folder.id} stopped: {error}")
+        return UNWRITABLE
+    except XrgsError as error:
+        if str(error) == lost:
+            say(lost)
+            return LOCKED
+        state = folder.state().name
+        if state != "done":  # it may have ended, and its process died on the way out
+            folder.fail(str(error))
+            say(f"{folder.id} failed: {error}")
+    return folder.state().name
