@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from xrgs import provenance
-from xrgs.bench import loads, memory, rendering, skips, tables, training
+from xrgs.bench import loads, memory, rendering, scale, skips, tables, training
 from xrgs.dataset import progress
 from xrgs.errors import XrgsError
 from xrgs.files import write_json
@@ -62,6 +62,8 @@ def run(settings: Settings) -> str:
         return _save(settings)
     if settings.quality:
         return _quality(settings)
+    if settings.store_cells:
+        return _scale(settings)
     if settings.repeats < 1 or settings.threads < 0:
         raise XrgsError("repeats must be at least 1 and threads at least 0")
     counts = sorted({1, settings.threads or usable_cores()})
@@ -93,6 +95,13 @@ def _save(settings: Settings) -> str:
     loads.write(Path(settings.save), load)
     size = f"{load.camera.width} x {load.camera.height} px"
     return f"{settings.save}: {len(load)} Gaussians, {size}"
+
+
+def _scale(settings: Settings) -> str:
+    rows = scale.measure(settings.store_cells, Path(settings.out))
+    if settings.json is not None:
+        _write_json(settings.json, {"scale": rows})
+    return scale.text(rows)
 
 
 def _quality(settings: Settings) -> str:

@@ -31,5 +31,7 @@ class Settings:
     """Train `cell` again with each cut changed and compare pictures, instead of timing."""
     steps: int = 600
     """Of `quality`."""
+    store_cells: int = 0
+    """Time planning, reporting and status over a store of so many cells, instead."""
     seed: int = 0
     """Of the random loads."""
