@@ -20,6 +20,8 @@ SUMMARY = {
 }
 SCORES = {"psnr": 20.0, "ssim": 0.8, "lpips": 0.25}
 VIEWS = ("IMG_001", "IMG_009")
+_STEPS = [f"{step},{0.3 / (1 + step)},{100 * step}" for step in range(5)]
+HISTORY = "\n".join(["step,loss,gaussians", *_STEPS]) + "\n"
 
 
 class MadeStore:
@@ -44,6 +46,7 @@ class MadeStore:
         state: str = "done",
         pictures: bool = False,
         cpu: str = "a processor",
+        history: str = HISTORY,
     ) -> CellFolder:
         """One cell: the made-up baseline's values times `factors`, or `values` outright."""
         cell_id = f"cell{len(self.rows):05d}"
@@ -74,6 +77,7 @@ class MadeStore:
             folder.fail("RuntimeError: out of luck")
             return folder
         self._fill(folder, found, cpu)
+        (folder.path / "history.csv").write_text(history)
         if pictures:
             self._draw(folder, variant, noise=0.02 * len(self.rows))
         folder.finish(VIEWS, protocol)
@@ -109,8 +113,6 @@ class MadeStore:
         photographs = self.store.variants / variant / "images" / "test"
         photographs.mkdir(parents=True, exist_ok=True)
         (folder.path / "renders").mkdir()
-        rows = [f"{step},{0.3 / (1 + step)},{100 * step}" for step in range(5)]
-        (folder.path / "history.csv").write_text("\n".join(["step,loss,gaussians", *rows]) + "\n")
         for number, view in enumerate(VIEWS):
             rng = np.random.default_rng(number)
             image = np.kron(rng.uniform(0.2, 0.8, (6, 8, 3)), np.ones((10, 10, 1)))

@@ -14,6 +14,8 @@ from xrgs.report.compare import compare
 from xrgs.report.pictures import Picture, draw
 from xrgs.report.render import Grid, markdown, one_line, to_latex, to_markdown, to_text
 from xrgs.report.tables import Tables
+from xrgs.report.training import table as training_table
+from xrgs.report.training import totals
 from xrgs.store import Store
 
 if TYPE_CHECKING:
@@ -59,7 +61,7 @@ def build(store_path: Path, sweep_id: str | None = None, out: Path | None = None
     try:
         (folder / "figures").mkdir(parents=True, exist_ok=True)
         pictures = draw(store, comparison, sweep.views, folder / "figures")
-        _write_files(folder, sweep, tables, pictures)
+        _write_files(folder, sweep, tables, pictures, totals(store, comparison.cells))
     except OSError as error:
         raise ReportError(f"the report can't be written to {folder}: {error}") from error
     written = {p.file for p in pictures if p.file} | {folder / name for name in _FILES}
@@ -67,21 +69,36 @@ def build(store_path: Path, sweep_id: str | None = None, out: Path | None = None
     return Report(text=text, folder=folder, files=tuple(sorted(written)))
 
 
-_FILES = ("table.md", "table.tex", "table.csv", "cells.csv", "views.csv", "provenance.json")
+_FILES = (
+    "table.md",
+    "table.tex",
+    "table.csv",
+    "cells.csv",
+    "views.csv",
+    "training.csv",
+    "provenance.json",
+)
 
 
-def _write_files(folder: Path, sweep: Sweep, tables: Tables, pictures: list[Picture]) -> None:
+def _write_files(
+    folder: Path,
+    sweep: Sweep,
+    tables: Tables,
+    pictures: list[Picture],
+    training: pd.DataFrame,
+) -> None:
     cells = tables.comparison.cells
     names = cells.drop_duplicates("cell_id")[["cell_id", "scene", "label", "condition", "seed"]]
     views = names.merge(sweep.views, on="cell_id")
     metrics = [metric.name for metric in tables.comparison.metrics]
     order = [*RECORD_KEYS, "state", "reason", "protocol", *metrics]
-    write_text(folder / "table.md", _page(sweep, tables, pictures, folder))
+    write_text(folder / "table.md", _page(sweep, tables, pictures, folder, training))
     grids = [grid for grid in _grids(tables) if grid.rows]
     write_text(folder / "table.tex", "\n".join(map(to_latex, grids)))
     write_text(folder / "table.csv", _csv(tables.long()))
     write_text(folder / "cells.csv", _csv(cells[order]))
     write_text(folder / "views.csv", _csv(views))
+    write_text(folder / "training.csv", _csv(training))
     write_json(folder / "provenance.json", sweep.provenance)
 
 
@@ -102,12 +119,26 @@ def _grids(tables: Tables) -> list[Grid]:
     return grids + ([missing] if missing else [])
 
 
-def _page(sweep: Sweep, tables: Tables, pictures: list[Picture], folder: Path) -> str:
+def _training(tables: Tables, training: pd.DataFrame) -> list[Grid]:
+    """What training did, for each condition."""
+    cells = tables.comparison.cells
+    labels = cells.groupby("condition", sort=False)["label"].unique()
+    return [training_table(training, list(of), str(name)) for name, of in labels.items()]
+
+
+def _page(
+    sweep: Sweep,
+    tables: Tables,
+    pictures: list[Picture],
+    folder: Path,
+    training: pd.DataFrame,
+) -> str:
     command = one_line(shlex.join(["xrgs-sweep", *sweep.command]))
     parts = [
         f"# Change from baseline\n\nSweep {markdown(sweep.id)}: {markdown(command)}\n",
         *(f"**{markdown(line)}**\n" for line in _warnings(sweep)),
         *(to_markdown(grid) for grid in _grids(tables) if grid.rows),
+        *(to_markdown(grid) for grid in _training(tables, training) if grid.rows),
         *(_picture(picture, folder) for picture in pictures),
         to_markdown(_made_with(sweep)),
     ]
