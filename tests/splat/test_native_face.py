@@ -1,0 +1,258 @@
+"""What the compiled renderer promises beside its numbers, which test_native.py judges.
+
+The same bits each time and on any number of threads, errors that name what is wrong, and renders
+that keep apart.
+"""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+import torch
+
+from xrgs.splat.rasterize import rasterize
+from xrgs.splat.settings import RasterSettings
+
+native = pytest.importorskip("xrgs._native")
+
+NAMES = ("means", "quats", "scales", "opacities", "sh0", "shN")
+
+
+def render(scene, camera):
+    """The render, and the leaves that its gradients go to."""
+    leaves = {name: scene[name].clone().requires_grad_() for name in NAMES}
+    offset = torch.zeros(len(leaves["means"]), 2, requires_grad=True)
+    made = rasterize(
+        *leaves.values(),
+        camera,
+        RasterSettings(),
+        sh_degree=3,
+        means2d_offset=offset,
+        backend="native",
+    )
+    return made, [*leaves.values(), offset]
+
+
+# --- the same each time -------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def large(make_camera, make_scene):
+    """Enough Gaussians and tiles for every stage to be cut into several tasks."""
+    camera = make_camera(150, 110, focal=120.0, turned=True)
+    return make_scene(20_000, camera, seed=12, size=2.0, dtype=torch.float32), camera
+
+
+def everything(large, count):
+    torch.set_num_threads(count)
+    scene, camera = large
+    v_image = torch.linspace(-1, 1, camera.height * camera.width * 3).reshape(camera.height, -1, 3)
+    made, leaves = render(scene, camera)
+    ((made.image * v_image).sum() + (made.alpha * v_image[..., 0]).sum()).backward()
+    return made, [made.image, made.alpha, made.visible, *(leaf.grad for leaf in leaves)]
+
+
+def test_any_number_of_threads_gives_the_same_bits(threads, isa, large):
+    first, expected = everything(large, 1)
+    for count in (1, 2, 4, 3):
+        again, results = everything(large, count)
+        assert all(torch.equal(a, b) for a, b in zip(expected, results, strict=True))
+        assert again.evaluations == first.evaluations
+
+
+def test_instruction_sets_agree(large):
+    before = native.isa()
+    images = []
+    try:
+        for name in native.available_isas():
+            native.set_isa(name)
+            images.append(everything(large, 1)[0].image)
+    finally:
+        native.set_isa(before)
+    for image in images[1:]:
+        error = (image - images[0]).abs()
+        assert error.mean() < 1e-6
+        assert error.max() < 2e-3
+
+
+def test_renders_alive_at_once_keep_apart(make_camera, make_scene):
+    camera = make_camera(40, 30)
+    scenes = [make_scene(100, camera, seed=seed, dtype=torch.float32) for seed in range(3)]
+
+    def gradient(made, leaves):
+        made.image.sum().backward()
+        return leaves[0].grad
+
+    alone = [gradient(*render(scene, camera)) for scene in scenes]
+    together = [render(scene, camera) for scene in scenes]
+    for expected, parts in zip(reversed(alone), reversed(together), strict=True):
+        assert torch.equal(gradient(*parts), expected)
+
+
+def test_gradients_are_handed_over_without_a_copy(make_camera, make_scene):
+    camera = make_camera()
+    scene = make_scene(50, camera, dtype=torch.float32)
+    places = []
+    for _ in range(3):
+        made, leaves = render(scene, camera)
+        made.image.sum().backward()
+        places.append(leaves[NAMES.index("shN")].grad.data_ptr())
+    # A copy would lie where torch's allocator puts it; ours are on cache lines, and come again.
+    assert all(place % 64 == 0 for place in places)
+
+
+def test_a_forked_child_renders(large):
+    scene, camera = large
+    values, view = [scene[name] for name in NAMES], make_view(camera)
+
+    def image():
+        # Only our threads: torch's own do not outlive a fork.
+        return native.Frame().forward(view, *values, None, 2)[0].numpy().tobytes()
+
+    expected = image()
+    child = os.fork()
+    if child == 0:
+        signal.alarm(20)
+        os._exit(0 if image() == expected else 1)
+    assert os.waitpid(child, 0)[1] == 0
+
+
+# --- bad input ----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("bad", [float("nan"), float("inf"), -float("inf")])
+@pytest.mark.parametrize("name", [*NAMES, "means2d_offset"])
+def test_a_value_that_is_not_finite_is_named(isa, make_camera, make_scene, name, bad):
+    camera = make_camera()
+    scene = make_scene(40, camera, dtype=torch.float32)
+    scene["means2d_offset"] = torch.zeros(40, 2)
+    scene["means"][33] = torch.tensor([0.0, 0.0, 3.0])  # in view: its harmonics are read
+    scene[name][33] = bad
+    frame, view = native.Frame(), make_view(camera)
+    values = [scene[key] for key in (*NAMES, "means2d_offset")]
+    with pytest.raises(ValueError, match=f"^{name} has values that are not finite"):
+        frame.forward(view, *values, 1)
+
+
+@pytest.mark.parametrize(
+    ("name", "bad", "says"),
+    [
+        ("scales", -1e-3, "scales has values below 0"),
+        ("opacities", 1.01, "opacities has values outside 0..1"),
+        ("opacities", -0.01, "opacities has values outside 0..1"),
+    ],
+)
+def test_a_value_out_of_range_is_named(isa, make_camera, make_scene, name, bad, says):
+    camera = make_camera()
+    scene = make_scene(21, camera, dtype=torch.float32)
+    scene[name][20] = bad
+    with pytest.raises(ValueError, match=f"^{says}"):
+        render(scene, camera)
+
+
+def make_view(camera, **changes):
+    options = {
+        "viewmat": camera.viewmat.flatten().tolist(),
+        "intrinsics": [camera.K[0, 0], camera.K[1, 1], camera.K[0, 2], camera.K[1, 2]],
+        "width": camera.width,
+        "height": camera.height,
+        "near": 0.01,
+        "eps2d": 0.3,
+        "alpha_min": 1 / 255,
+        "alpha_max": 0.99,
+        "transmittance_min": 1e-4,
+        "antialiased": False,
+        "absgrad": False,
+        "background": (0.0, 0.0, 0.0),
+        "sh_degree": 3,
+        "skips": (True,) * 5,
+    }
+    options["intrinsics"] = [float(value) for value in options["intrinsics"]]
+    return native.View.make(**(options | changes))
+
+
+def test_shapes_are_checked(make_camera, make_scene):
+    camera = make_camera()
+    scene = make_scene(10, camera, dtype=torch.float32)
+    values = [scene[key] for key in NAMES]
+    frame = native.Frame()
+    with pytest.raises(ValueError, match="opacities must have 10 rows, got 9"):
+        frame.forward(make_view(camera), *values[:3], values[3][:9], *values[4:], None, 1)
+    with pytest.raises(ValueError, match="shN has fewer bands"):
+        frame.forward(make_view(camera), *values[:5], values[5][:, :8].contiguous(), None, 1)
+    with pytest.raises(ValueError, match="sh_degree"):
+        make_view(camera, sh_degree=4)
+    with pytest.raises(ValueError, match="at least 1"):
+        make_view(camera, width=0)
+    frame.forward(make_view(camera), *values, None, 1)
+    with pytest.raises(ValueError, match="image's size"):
+        frame.backward(torch.zeros(3, 3, 3), torch.zeros(3, 3), *values, None, True, 1)
+
+
+def test_float64_is_refused(make_camera, make_scene):
+    camera = make_camera()
+    with pytest.raises(ValueError, match="float32"):
+        render(make_scene(3, camera), camera)
+
+
+CROWD = """
+import resource, torch
+from xrgs.splat.cameras import Camera
+from xrgs.splat.rasterize import rasterize
+from xrgs.splat.settings import RasterSettings
+
+n = 30_000
+means = torch.tensor([0.0, 0.0, 1.0]).repeat(n, 1)
+scene = [means, torch.ones(n, 4), torch.full((n, 3), 100.0), torch.ones(n)]
+scene += [torch.zeros(n, 1, 3), torch.zeros(n, 0, 3)]
+side = 1600
+K = torch.tensor([[800.0, 0, 800], [0, 800, 800], [0, 0, 1]])
+camera = Camera(torch.eye(4), K, side, side)
+used = int(open("/proc/self/statm").read().split()[0]) * resource.getpagesize()
+resource.setrlimit(resource.RLIMIT_AS, (used + (400 << 20), resource.RLIM_INFINITY))
+try:
+    rasterize(*scene, camera, RasterSettings(), sh_degree=0, backend="native")
+except MemoryError as error:
+    print(error)
+"""
+
+
+@pytest.mark.skipif(not os.path.exists("/proc/self/statm"), reason="reads Linux's /proc")  # noqa: PTH110
+def test_lists_beyond_memory_are_a_clear_error():
+    # 30,000 Gaussians over 10,000 tiles each: 300 million pairs.
+    result = subprocess.run(
+        [sys.executable, "-P", "-c", CROWD], capture_output=True, text=True, timeout=60, check=False
+    )
+    assert "the lists of 30000 visible Gaussians in 1600x1600 px do not fit" in result.stdout, (
+        result.stderr
+    )
+
+
+@pytest.mark.parametrize(("value", "says"), [("portable", "portable"), ("sse9", "XRGS_ISA")])
+def test_the_environment_chooses_the_instruction_set(value, says):
+    result = subprocess.run(
+        [sys.executable, "-P", "-c", "from xrgs import _native; print(_native.isa())"],
+        env=os.environ | {"XRGS_ISA": value},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert says in (result.stdout if value == "portable" else result.stderr)
+
+
+# --- the vector functions -----------------------------------------------------------------------
+
+
+def test_exp2_and_log2(isa):
+    x = np.linspace(-126, 126, 200_001).astype(np.float32)
+    exact = np.exp2(x.astype(np.float64))
+    assert np.abs(native.exp2(torch.from_numpy(x)).numpy() / exact - 1).max() < 3e-7
+    y = np.exp2(np.linspace(-126, 126, 200_001)).astype(np.float32)
+    logs = np.log2(y.astype(np.float64))
+    error = np.abs(native.log2(torch.from_numpy(y)).numpy() - logs)
+    assert (error <= 1e-7 + 1.2e-7 * np.abs(logs)).all()
