@@ -6,13 +6,12 @@ another name, in another folder or on another machine.
 
 from __future__ import annotations
 
-from dataclasses import asdict
 from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from xrgs.evaluate import PROTOCOL
-from xrgs.hashing import file_digest
+from xrgs.hashing import file_digest, plain
 from xrgs.splat.backend import resolve_backend
 
 if TYPE_CHECKING:
@@ -54,9 +53,9 @@ def cell_identity(conf: Conf, variant_id: str) -> dict[str, Any]:
     """Everything that decides a cell's numbers, as plain JSON values."""
     backend = resolve_backend(conf.splat.backend)
     return {
-        "splat": asdict(conf.splat) | {"backend": backend},
-        "train": asdict(conf.train),
-        "components": asdict(conf.components),
+        "splat": plain(conf.splat) | {"backend": backend},
+        "train": plain(conf.train),
+        "components": plain(conf.components),
         "seed": conf.seed,
         "variant": variant_id,
         "protocol": PROTOCOL,

@@ -26,7 +26,7 @@ from xrgs import locks, scenes, variant, weights, worker
 from xrgs.config import to_conf
 from xrgs.errors import XrgsError
 from xrgs.estimate import Past
-from xrgs.hashing import digest
+from xrgs.hashing import digest, plain
 from xrgs.job import LOCKED, STOPPED, UNWRITABLE
 from xrgs.job import say as _say
 from xrgs.plan import (
@@ -240,7 +240,7 @@ class Study:
         found: dict[str, tuple[str | None, str | None]] = {}
         cells = []
         for cell in plan:
-            wanted = digest([asdict(cell.conf.scene), asdict(cell.conf.variant)])
+            wanted = digest([plain(cell.conf.scene), plain(cell.conf.variant)])
             if wanted not in found:
                 found[wanted] = _variant_of(cell.conf, store, build=build)
             variant_id, error = found[wanted]

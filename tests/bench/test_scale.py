@@ -11,11 +11,14 @@ from xrgs.errors import XrgsError
 
 
 def test_every_command_is_timed_over_cells_that_count_as_done(tmp_path: Path) -> None:
-    rows = scale.measure(12, tmp_path)
-    assert [row["cells"] for row in rows] == [10] * len(rows)
-    assert len({row["command"] for row in rows}) == len(rows) == 5
-    assert all(row["seconds"] > 0 for row in rows)
-    assert "10 cells" in scale.text(rows)
+    found = scale.measure(12, tmp_path)
+    assert found["cells"] == 10
+    commands = found["commands"]
+    assert len({row["command"] for row in commands}) == len(commands) == 5
+    assert all(row["seconds"] > 0 and row["ms_per_cell"] > 0 for row in commands)
+    assert found["inodes"] - found["files"] == 2  # the cell's folder, and its renders'
+    assert all(size > 0 for size in found["bytes"].values())
+    assert "10 cells; one is 11 files, 13 inodes" in scale.text(found)
     assert not list(tmp_path.iterdir())
 
 

@@ -98,10 +98,10 @@ def _save(settings: Settings) -> str:
 
 
 def _scale(settings: Settings) -> str:
-    rows = scale.measure(settings.store_cells, Path(settings.out))
+    found = scale.measure(settings.store_cells, Path(settings.out))
     if settings.json is not None:
-        _write_json(settings.json, {"scale": rows})
-    return scale.text(rows)
+        _write_json(settings.json, {"scale": found})
+    return scale.text(found)
 
 
 def _quality(settings: Settings) -> str:

@@ -10,6 +10,7 @@ import hashlib
 import json
 import os
 import re
+import resource
 import subprocess
 import sys
 import tempfile
@@ -25,10 +26,10 @@ if TYPE_CHECKING:
 _LABELS = ("loss_weighting", "gradient_scaling", "curriculum", "consistency")
 _CELL = ("scene=motorcycle", "preset=smoke", "train.steps=2", "store=store")
 _LINE = re.compile(r"^  \w+ +([0-9a-f]{16}) .*/ seed (\d+)$", re.MULTILINE)
-_LINKED = {".ply", ".png"}
+_LINKED = {".png": "renders", ".ply": "splats"}
 
 
-def measure(cells: int, out: Path) -> list[dict[str, Any]]:
+def measure(cells: int, out: Path) -> dict[str, Any]:
     """Time each command over so many cells.
 
     Args:
@@ -36,7 +37,8 @@ def measure(cells: int, out: Path) -> list[dict[str, Any]]:
         out: folder in which the store is made, and cleared away again.
 
     Returns:
-        Rows of `command`, `seconds` and `ms_per_cell`.
+        `cells`, how many; `commands`, rows of `command`, `seconds`, `cpu_seconds` (of it and of all
+        that it started) and `ms_per_cell`; and of a cell `files`, `inodes` and `bytes`, by kind.
 
     Raises:
         XrgsError: fewer than 5 cells, or a command failed; the message is what it printed.
@@ -62,24 +64,33 @@ def measure(cells: int, out: Path) -> list[dict[str, Any]]:
             "status": ("status", "store=store"),
         }.items():
             _, timed[what] = _run(folder, *command)
-        bookkeeping = sum(f.stat().st_size for f in template.glob("*.json"))
-        # `kept` is what a cell costs beside its results.
-        return [
+        count = len(wanted)
+        rows = [
             {
                 "command": what,
-                "cells": len(wanted),
-                "seconds": seconds,
-                "ms_per_cell": 1000 * seconds / len(wanted),
-                "kept_bytes_per_cell": bookkeeping,
+                "seconds": wall,
+                "cpu_seconds": cpu,
+                "ms_per_cell": 1000 * cpu / count,
             }
-            for what, seconds in timed.items()
+            for what, (wall, cpu) in timed.items()
         ]
+        return {"cells": count, "commands": rows} | _cost(template)
 
 
-def _run(folder: Path, command: str, *arguments: str) -> tuple[str, float]:
-    """What `xrgs-<command>` said on stderr, and how long it took from start to end."""
+def _cost(cell: Path) -> dict[str, Any]:
+    """What a cell takes of the store, by kind; renders and splats depend on the scene alone."""
+    files = [file for file in cell.rglob("*") if file.is_file()]
+    sizes = dict.fromkeys(("renders", "splats", "the rest"), 0)
+    for file in files:
+        sizes[_LINKED.get(file.suffix, "the rest")] += file.stat().st_size
+    folders = 1 + sum(entry.is_dir() for entry in cell.rglob("*"))
+    return {"files": len(files), "inodes": len(files) + folders, "bytes": sizes}
+
+
+def _run(folder: Path, command: str, *arguments: str) -> tuple[str, tuple[float, float]]:
+    """What `xrgs-<command>` said on stderr, and what it took: seconds, and seconds of CPU."""
     script = f"from xrgs.cli import {command}; {command}()"
-    start = time.perf_counter()
+    start, before = time.perf_counter(), _cpu_seconds()
     done = subprocess.run(  # noqa: S603
         [sys.executable, "-P", "-c", script, *arguments],
         cwd=folder,
@@ -87,10 +98,16 @@ def _run(folder: Path, command: str, *arguments: str) -> tuple[str, float]:
         text=True,
         check=False,
     )
-    seconds = time.perf_counter() - start
+    took = time.perf_counter() - start, _cpu_seconds() - before
     if done.returncode:
         raise XrgsError(f"xrgs-{command} {' '.join(arguments)}: {done.stderr.strip()}")
-    return done.stderr, seconds
+    return done.stderr, took
+
+
+def _cpu_seconds() -> float:
+    """Of every child that has ended."""
+    used = resource.getrusage(resource.RUSAGE_CHILDREN)
+    return used.ru_utime + used.ru_stime
 
 
 def _copy(template: Path, cell: Path, seed: int) -> None:
@@ -113,13 +130,18 @@ def _copy(template: Path, cell: Path, seed: int) -> None:
     (cell / "status.json").write_text(json.dumps(status), encoding="utf-8")
 
 
-def text(rows: list[dict[str, Any]]) -> str:
-    """The rows as a table."""
-    return "\n".join(_lines(rows))
+def text(found: dict[str, Any]) -> str:
+    """What was measured, as a table."""
+    return "\n".join(_lines(found))
 
 
-def _lines(rows: list[dict[str, Any]]) -> Iterator[str]:
-    yield f"{rows[0]['cells']} cells, each with {rows[0]['kept_bytes_per_cell']} bytes of JSON"
-    yield f"{'':<42} {'seconds':>8} {'ms a cell':>10}"
-    for row in rows:
-        yield f"{row['command']:<42} {row['seconds']:>8.2f} {row['ms_per_cell']:>10.2f}"
+def _lines(found: dict[str, Any]) -> Iterator[str]:
+    sizes = ", ".join(f"{kind} {size}" for kind, size in found["bytes"].items())
+    yield f"{found['cells']} cells; one is {found['files']} files, {found['inodes']} inodes"
+    yield f"bytes of a cell: {sum(found['bytes'].values())} ({sizes})"
+    yield f"{'':<42} {'seconds':>8} {'of CPU':>8} {'ms a cell':>10}"
+    for row in found["commands"]:
+        yield (
+            f"{row['command']:<42} {row['seconds']:>8.2f} {row['cpu_seconds']:>8.2f} "
+            f"{row['ms_per_cell']:>10.2f}"
+        )
