@@ -27,7 +27,7 @@ ONLY_IN = {
 #: Rooms in the order that data walks through them: an import never points to a later one.
 FLOW = (
     ("errors", "files", "hashing", "locks", "machine", "splat", "supervise", "weights"),
-    ("checkpoint",),
+    ("checkpoint", "progress"),
     ("images", "alignment", "split", "views", "degrade"),
     ("config", "scenes", "sfm"),
     ("photographs", "tagging"),
@@ -42,6 +42,7 @@ FLOW = (
     ("worker",),
     ("estimate", "job", "status"),
     ("plan",),
+    ("live",),
     ("report",),
     ("data",),
     ("bench",),

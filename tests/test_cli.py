@@ -140,6 +140,8 @@ def test_a_cell_that_takes_its_count_from_another_is_trained_after_it(store: Pat
     code, out, err = run("sweep", store.parent, *control)
     assert code == 0, err
     assert err.count("training cell") == 2
+    assert "3 of 3 cells done" in err
+    assert "\r" not in err
     assert "count_matched" in out
     configs = [json.loads(f.read_text()) for f in store.glob("cells/*/config.json")]
     wanted = [c["components"]["count_matched"]["gaussians"] for c in configs]

@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-from xrgs.estimate import Past, as_text
+from xrgs.estimate import Past
 from xrgs.files import write_json
 from xrgs.store import Store
 
@@ -58,18 +58,3 @@ def test_the_most_like_it_count(past: Past, asked: dict[str, Any], seconds: floa
 
 def test_a_store_without_cells_knows_nothing(tmp_path: Path) -> None:
     assert Past(Store(tmp_path)).seconds(identity("v", 10)) is None
-
-
-@pytest.mark.parametrize(
-    ("seconds", "text"),
-    [
-        (None, "?"),
-        (0.4, "~0 s"),
-        (99, "~99 s"),
-        (100, "~2 min"),
-        (5400, "~90 min"),
-        (9000, "~2.5 h"),
-    ],
-)
-def test_as_text(seconds: float | None, text: str) -> None:
-    assert as_text(seconds) == text

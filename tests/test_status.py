@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
+from dataclasses import asdict
 from pathlib import Path
 
 import pytest
@@ -12,6 +13,7 @@ import pytest
 from xrgs import identity, locks
 from xrgs.errors import XrgsError
 from xrgs.files import write_json
+from xrgs.progress import Progress
 from xrgs.status import describe, read
 from xrgs.store import CellFolder, Store
 
@@ -44,7 +46,8 @@ def store(tmp_path: Path) -> Store:
     done(store, "twice")
     cell(store, "stopped")
     cell(store, "failed").fail("ended by SIGKILL\nand more")
-    cell(store, "busy")
+    busy = cell(store, "busy")
+    write_json(busy.progress, asdict(Progress("training", "step", 20, 80, 3.0)))
     assert locks.acquire(store.locks, "busy") is not None
     (store.variants / "aa-bb").mkdir()
     (store.variants / "failed-aa").mkdir()
@@ -67,6 +70,7 @@ def test_every_cell_is_counted_and_told_why(store: Store) -> None:
     assert "1 variants, 1 sweeps" in text
     assert "failed  room / ?  ended by SIGKILL\n" in text
     assert f"process {os.getpid()} on" in text
+    assert ": training 20 of 80 steps, 3 steps/s, ~20 s left" in text
     assert "scores.csv is missing or has another size" in text
     lines = [line.split() for line in text.splitlines()]
     assert ["room", "baseline", "1"] in lines

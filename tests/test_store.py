@@ -92,6 +92,7 @@ def stopped(done: CellFolder) -> CellFolder:
     done.checkpoint.write_bytes(b"state")
     (done.path / "log.txt").write_text("begun\n")
     (done.path / ".checkpoint.npz.1-abcd").write_bytes(b"half")
+    done.progress.write_text("{}")
     return done
 
 
@@ -101,6 +102,7 @@ def test_beginning_a_stopped_cell_keeps_its_checkpoint_and_no_result(
 ) -> None:
     if failed:
         stopped.fail("its process was ended by SIGKILL")
+        assert not stopped.progress.exists()
     else:
         assert stopped.state().name == "unfinished"
         assert "goes on from its checkpoint" in stopped.state().reason
@@ -146,6 +148,7 @@ def test_what_a_link_points_to_is_not_cleared(stopped: CellFolder, tmp_path: Pat
 
 def test_a_finished_cell_has_no_checkpoint(stopped: CellFolder) -> None:
     stopped.finish(["a", "b"], protocol=1)
+    stopped.progress.unlink()  # of a process that is no more: no part of the result
     assert stopped.state().name == "done"
     assert not stopped.checkpoint.exists()
     stopped.checkpoint.write_bytes(b"killed before it was removed")

@@ -9,7 +9,7 @@ import resource
 import traceback
 from typing import TYPE_CHECKING, Any
 
-from xrgs import dataset, evaluate, provenance
+from xrgs import dataset, evaluate, progress, provenance
 from xrgs.checkpoint import Checkpoint, CheckpointError
 from xrgs.files import write_json, write_text
 from xrgs.hashing import digest
@@ -35,13 +35,16 @@ def run(conf: Conf, variant: Variant, folder: CellFolder) -> None:
         Exception: whatever went wrong, after `error.txt` says where.
     """
     try:
-        _run(conf, variant, folder)
+        with progress.kept_in(folder.progress):
+            views = _run(conf, variant, folder)
+        folder.finish(views, evaluate.PROTOCOL)
     except Exception:
         write_text(folder.path / "error.txt", traceback.format_exc())
         raise
 
 
-def _run(conf: Conf, variant: Variant, folder: CellFolder) -> None:
+def _run(conf: Conf, variant: Variant, folder: CellFolder) -> list[str]:
+    """All but the status; the names of the views that were scored."""
     threads = dataset.use_threads(conf.threads)
     backend = resolve_backend(conf.splat.backend)
     write_json(folder.path / "provenance.json", provenance.collect(threads, backend))
@@ -64,7 +67,7 @@ def _run(conf: Conf, variant: Variant, folder: CellFolder) -> None:
             "grow_grad2d": trained.grow_grad2d,
         },
     )
-    folder.finish([view.name for view in data.test], evaluate.PROTOCOL)
+    return [view.name for view in data.test]
 
 
 def _train(data: Dataset, conf: Conf, folder: CellFolder) -> Trained:

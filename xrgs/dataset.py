@@ -2,28 +2,23 @@
 
 from __future__ import annotations
 
-import sys
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, TypeVar
+from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
-from tqdm import tqdm
 
 from xrgs import images
 from xrgs.errors import XrgsError
 from xrgs.machine import usable_cores
+from xrgs.progress import progress
 from xrgs.splat.cameras import Camera
 from xrgs.splat.normalize import normalize_scene
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable
-
     from numpy.typing import NDArray
 
     from xrgs.variant import Variant, View
-
-_T = TypeVar("_T")
 
 #: Which training views a cell may use.
 USES = ("mixed", "all_hr", "hr_only", "lr_only")
@@ -75,11 +70,15 @@ def load(variant: Variant, use: str = "mixed") -> Dataset:
         (view.split, view.name): viewmat
         for view, viewmat in zip(placed, world.viewmats, strict=True)
     }
+    tests = [view for view in placed if view.split == "test"]
+    wanted = [("train", view) for view in chosen] + [("test", view) for view in tests]
+    loaded = tuple(
+        _load_view(view, viewmats[split, view.name])
+        for split, view in progress(wanted, "loading", "view")
+    )
     return Dataset(
-        train=tuple(_load_view(view, viewmats["train", view.name]) for view in chosen),
-        test=tuple(
-            _load_view(view, viewmats["test", view.name]) for view in placed if view.split == "test"
-        ),
+        train=loaded[: len(chosen)],
+        test=loaded[len(chosen) :],
         points=torch.from_numpy(world.points).float(),
         colors=torch.from_numpy(variant.colors).float() / 255.0,
         scene_scale=world.scene_scale,
@@ -120,18 +119,6 @@ def _load_view(view: View, viewmat: NDArray[np.float64]) -> LoadedView:
     )
     image = torch.from_numpy(images.read(view.file))
     return LoadedView(view.name, view.tag, camera, image, view.rho)
-
-
-def progress(
-    items: Iterable[_T], what: str, unit: str, total: int | None = None, *, done: int = 0
-) -> tqdm[_T]:
-    """A progress bar on stderr with the time left, for what takes longer than two seconds.
-
-    Of `total` items `done` were behind us before; `items` are the others.
-    """
-    return tqdm(
-        items, what, total, unit=unit, initial=done, mininterval=0.5, delay=2.0, file=sys.stderr
-    )
 
 
 def use_threads(wanted: int) -> int:

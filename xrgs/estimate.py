@@ -69,14 +69,3 @@ def _newest(store: Store) -> list[CellFolder]:
     except OSError:
         return []
     return [store.cell(name) for _, name in heapq.nlargest(_READ, ids)]
-
-
-def as_text(seconds: float | None) -> str:
-    """For people: `~40 s`, `~12 min`, `~3.5 h`, `?`."""
-    if seconds is None:
-        return "?"
-    if seconds < 99.5:
-        return f"~{seconds:.0f} s"
-    if seconds < 99.5 * 60:
-        return f"~{seconds / 60:.0f} min"
-    return f"~{seconds / 3600:.1f} h"

@@ -33,7 +33,7 @@ def score(
     import torch
 
     from xrgs import images, metrics
-    from xrgs.dataset import progress
+    from xrgs.progress import progress
     from xrgs.splat.backend import resolve_backend
     from xrgs.splat.rasterize import rasterize
 

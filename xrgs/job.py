@@ -5,7 +5,6 @@ A cell's failure is a state and no exception, so that no launcher drops the rest
 
 from __future__ import annotations
 
-import sys
 from contextlib import suppress
 from dataclasses import asdict
 from pathlib import Path
@@ -15,6 +14,7 @@ from xrgs import locks, scenes, variant, worker
 from xrgs.errors import XrgsError
 from xrgs.hashing import digest
 from xrgs.identity import cell_identity
+from xrgs.progress import say
 from xrgs.splat.backend import resolve_backend
 from xrgs.store import Store
 from xrgs.supervise import Limits
@@ -26,11 +26,6 @@ if TYPE_CHECKING:
 #: What a job ends with beside a cell's states: another sweep trains the cell; the sweep was told to
 #: start nothing more; the store takes no more.
 LOCKED, STOPPED, UNWRITABLE = "locked", "stopped", "unwritable"
-
-
-def say(text: str) -> None:
-    """A line for who watches the sweep."""
-    print(text, file=sys.stderr, flush=True)  # noqa: T201
 
 
 def run_job(conf: Conf, sweep_folder: Path) -> str:

@@ -14,11 +14,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from tqdm import tqdm
 
 from xrgs import degrade, images, placing, tagging
 from xrgs.alignment import pose_error
 from xrgs.photographs import Photographs, prepare, write_degraded
+from xrgs.progress import progress
 from xrgs.split import Split, check, split
 from xrgs.views import SceneFailed, Variant, View
 
@@ -193,7 +193,7 @@ def _straighten(
     original = [("original", i, "HR") for i in sorted(degraded)]
     todo = [entry for entry in (*train, *test, *original) if entry[1] in model.viewmats]
     views, rates = [], []
-    for part, i, tag in tqdm(todo, desc="undistorting", delay=2, leave=False):
+    for part, i, tag in progress(todo, "undistorting", "view"):
         image = photos.read("lr" if part == "train" and i in degraded else "hr", i)
         height, width = image.shape[:2]
         lens = model.lenses[i].at(width, height)

@@ -10,11 +10,11 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
-from tqdm import tqdm
 
 from xrgs import degrade, images
 from xrgs.errors import XrgsError
 from xrgs.images import Lens
+from xrgs.progress import progress
 from xrgs.split import Frame, frame, scale
 
 if TYPE_CHECKING:
@@ -101,7 +101,7 @@ def prepare(scene: Scene, conf: VariantConf, work: Path) -> Photographs:
     sizes, unreadable = _sizes(scene.files)
     shrink = scale(list(sizes.values()), conf) if sizes else 1.0
     kept: dict[Path, Frame] = {}
-    for file, size in tqdm(sizes.items(), desc="HR views", delay=2, leave=False):
+    for file, size in progress(sizes.items(), "HR views", "view"):
         try:
             photo = images.read(file)
         except images.ImageError as error:
@@ -173,6 +173,6 @@ def share_cameras(files: Sequence[Path], sizes: Sequence[tuple[int, int]], how: 
 
 def write_degraded(photos: Photographs, which: Sequence[int], conf: VariantConf) -> None:
     """The degraded copies of some photographs, in `lr`."""
-    for i in tqdm(which, desc="LR views", delay=2, leave=False):
+    for i in progress(which, "LR views", "view"):
         low = degrade.degrade(photos.read("hr", i), conf)
         images.save(photos.folder / photos.file("lr", i), low)

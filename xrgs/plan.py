@@ -6,9 +6,9 @@ from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 
 from xrgs import scenes
-from xrgs.estimate import as_text
 from xrgs.hashing import digest
 from xrgs.identity import cell_identity
+from xrgs.progress import duration
 from xrgs.store import State
 
 if TYPE_CHECKING:
@@ -80,7 +80,7 @@ def identified(cell: Planned, store: Store, held: Mapping[str, Owner | None]) ->
     cell_id = cell.cell_id or digest(cell_identity(cell.conf, cell.variant_id))
     state = store.cell(cell_id).state()
     if state.name != "done" and cell_id in held:
-        state = State("running", f"by {held[cell_id]}")
+        state = store.cell(cell_id).running(held[cell_id])
     return replace(cell, cell_id=cell_id, state=state)
 
 
@@ -125,7 +125,7 @@ def describe(plan: Sequence[Planned]) -> str:
         reason = (cell.error or cell.state.reason or "").partition("\n")[0]
         identity = cell.cell_id or ("no count yet" if cell.waits else "variant not built")
         wanted = not cell.error and state != "done"
-        time_left = as_text(cell.seconds) if wanted else ""
+        time_left = duration(cell.seconds) if wanted else ""
         lines.append(
             f"  {state:<10} {identity:<18} {time_left:>8}  {cell.name}"
             + (f"  ({reason})" if reason else "")
@@ -145,7 +145,7 @@ def _left(plan: Sequence[Planned]) -> str:
         return ""
     unknown = len(left) - len(known)
     more = f" and {unknown} cells that no past one tells of" if unknown else ""
-    return f"; left to train, one after another: {as_text(sum(known))}{more}"
+    return f"; left to train, one after another: {duration(sum(known))}{more}"
 
 
 def record(plan: Sequence[Planned]) -> list[dict[str, Any]]:

@@ -1,6 +1,6 @@
 """Structure from motion with pycolmap, and nothing else: cameras and points of a set of images.
 
-COLMAP's own log goes to a file in the work folder; what the user sees is one progress bar a stage.
+COLMAP's own log goes to a file in the work folder; what the user sees is one bar a stage.
 """
 
 from __future__ import annotations
@@ -15,11 +15,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import pycolmap
 from numpy.typing import NDArray
-from tqdm import tqdm
 
 from xrgs import images
 from xrgs.images import Lens
 from xrgs.machine import usable_cores
+from xrgs.progress import Bar
 
 if TYPE_CHECKING:
     from xrgs.config import SfmConf
@@ -144,7 +144,7 @@ def _extract(
     options.sift.max_num_features = max_features
     options.sift.first_octave = octave
     cameras: dict[str, int] = {}
-    with _bar(len(shots), "SfM: features") as bar:
+    with Bar("SfM: features", "view", len(shots)) as bar:
         for camera, batch in _batches(shots, 2 * threads):
             reader = pycolmap.ImageReaderOptions()
             if camera in cameras:
@@ -185,7 +185,7 @@ def _match(shots: Sequence[Shot], database: Path, work: Path, threads: int) -> N
     pairing = pycolmap.ImportedPairingOptions()
     pairing.match_list_path = work / "pairs.txt"
     pairs = len(shots) * (len(shots) - 1) // 2
-    with _bar(pairs, "SfM: matches") as bar:
+    with Bar("SfM: matches", "pair", pairs) as bar:
         for i in range(1, len(shots)):
             lines = [f"{shot.file} {shots[i].file}\n" for shot in shots[:i]]
             (work / "pairs.txt").write_text("".join(lines), encoding="utf-8")
@@ -204,7 +204,7 @@ def _map(
     options = mapping_options(conf, len(shots), known=all(s.K is not None for s in shots))
     options.num_threads = threads
     out = Path(tempfile.mkdtemp(prefix="models-", dir=work))
-    with _bar(len(shots), "SfM: cameras") as bar:
+    with Bar("SfM: cameras", "view", len(shots)) as bar:
         models = pycolmap.incremental_mapping(
             database,
             folder,
@@ -268,7 +268,3 @@ def _lens(camera: Any) -> Lens:
         return Lens(camera.width, camera.height, fx, fy, cx, cy)
     f, cx, cy, k = (float(p) for p in camera.params)  # SIMPLE_RADIAL
     return Lens(camera.width, camera.height, f, f, cx, cy, k)
-
-
-def _bar(total: int, label: str) -> tqdm[Any]:
-    return tqdm(total=total, desc=label, delay=2, leave=False)

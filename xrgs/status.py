@@ -100,7 +100,7 @@ def _see(
 ) -> Seen:
     state = cell.state(verify=verify)
     if state.name != "done" and cell.id in held:
-        state = State("running", f"by {held[cell.id]}")
+        state = cell.running(held[cell.id])
     scene, label = name or (_scene(cell), "?")
     return Seen(cell.id, scene, label, state, _stale(cell) if state.name == "done" else ())
 

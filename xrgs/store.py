@@ -17,6 +17,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from xrgs import progress
 from xrgs.errors import XrgsError
 from xrgs.files import write_json, write_text
 from xrgs.hashing import canonical, digest, file_digest
@@ -26,12 +27,17 @@ if TYPE_CHECKING:
 
     import pandas as pd
 
+    from xrgs.locks import Owner
+
 #: A report rests on these, so they are verified byte for byte; the others by their size.
 _VERIFIED_BY_HASH = frozenset(
     {"config.json", "identity.json", "scores.csv", "summary.json", "history.csv"}
 )
 _CHECKPOINT = "checkpoint.npz"
-_NOT_RESULTS = frozenset({"log.txt", "status.json", _CHECKPOINT, f"refused-{_CHECKPOINT}"})
+_PROGRESS = "progress.json"
+_NOT_RESULTS = frozenset(
+    {"log.txt", "status.json", _PROGRESS, _CHECKPOINT, f"refused-{_CHECKPOINT}"}
+)
 #: What a cell that goes on from its checkpoint keeps of the try that was stopped.
 _GOES_ON_WITH = frozenset({_CHECKPOINT, "identity.json", "log.txt"})
 _RECORD_VERSION = 1
@@ -77,6 +83,16 @@ class CellFolder:
         """State of the training, while it is not done."""
         return self.path / _CHECKPOINT
 
+    @property
+    def progress(self) -> Path:
+        """How far it is, while its process runs; a killed one leaves it behind."""
+        return self.path / _PROGRESS
+
+    @property
+    def status(self) -> Path:
+        """Written last: what it says is the end."""
+        return self.path / "status.json"
+
     def state(self, *, verify: bool = True) -> State:
         """Whether this cell's result is there and can be trusted.
 
@@ -85,18 +101,22 @@ class CellFolder:
         """
         if not self.path.is_dir():
             return State("absent")
-        status_file = self.path / "status.json"
-        if not status_file.exists():
+        if not self.status.exists():
             goes_on = "; it goes on from its checkpoint" if self.checkpoint.exists() else ""
             return State("unfinished", f"it was stopped before it ended{goes_on}")
         try:
-            status = read_json(status_file)
+            status = read_json(self.status)
             if status["state"] == "failed":
                 return State("failed", str(status["reason"]))
             self._check(status, verify=verify)
         except (StoreError, KeyError, TypeError, ValueError, OSError) as error:
             return State("corrupt", str(error))
         return State("done")
+
+    def running(self, owner: Owner | None) -> State:
+        """What a cell's state is while somebody holds its lock."""
+        now = progress.read(self.progress)
+        return State("running", f"by {owner}" + (f": {now}" if now else ""))
 
     def _check(self, status: Mapping[str, Any], *, verify: bool) -> None:
         if status["state"] != "done":
@@ -171,10 +191,11 @@ class CellFolder:
         error = self.path / "error.txt"
         if not error.exists():
             write_text(error, f"{reason}\n")
+        self.progress.unlink(missing_ok=True)
         self._set_status({"state": "failed", "reason": reason, "views": [], "files": {}})
 
     def _set_status(self, status: Mapping[str, Any]) -> None:
-        write_json(self.path / "status.json", status)
+        write_json(self.status, status)
 
     def identity(self) -> dict[str, Any]:
         """What the cell's id is the digest of."""

@@ -28,7 +28,7 @@ from xrgs.errors import XrgsError
 from xrgs.estimate import Past
 from xrgs.hashing import digest, plain
 from xrgs.job import LOCKED, STOPPED, UNWRITABLE
-from xrgs.job import say as _say
+from xrgs.live import View
 from xrgs.plan import (
     BASELINE,
     Planned,
@@ -40,6 +40,7 @@ from xrgs.plan import (
     ready,
     record,
 )
+from xrgs.progress import say as _say
 from xrgs.store import Store, StoreError
 
 if TYPE_CHECKING:
@@ -153,7 +154,8 @@ class Study:
             _say(f"no LPIPS in what is run now (n/a in the tables): {weights.HINT}")
         if dry:
             return False
-        plan = self._worked_off(plan, store)
+        with View(store) as view:
+            plan = self._worked_off(plan, store, view)
         plan = [_without_reference(cell) for cell in plan]
         sweep_id = store.write_sweep(arguments, record(plan))
         from xrgs.report import build
@@ -161,7 +163,7 @@ class Study:
         print(build(store.path, sweep_id).text)  # noqa: T201
         return any(cell.error is not None or cell.state.name != "done" for cell in plan)
 
-    def _worked_off(self, plan: Sequence[Planned], store: Store) -> list[Planned]:
+    def _worked_off(self, plan: Sequence[Planned], store: Store, view: View) -> list[Planned]:
         """The plan when there is nothing left to do: run here, or by another sweep meanwhile.
 
         Raises:
@@ -170,6 +172,7 @@ class Study:
         conf = plan[0].conf
         retry, told, tried = conf.retry == "failed", False, set[str]()
         while True:
+            view.watch(plan)
             wanted = ready(plan, tried, retry=retry)
             others = [cell for cell in plan if cell.state.name == "running"]
             if not wanted and not others:

@@ -15,9 +15,9 @@ from xrgs import components
 from xrgs.checkpoint import Checkpoint, State
 from xrgs.components import Step
 from xrgs.components.count_matched import Search
-from xrgs.dataset import progress
 from xrgs.errors import XrgsError
 from xrgs.hashing import digest
+from xrgs.progress import progress
 from xrgs.splat import gaussians as splats
 from xrgs.splat.backend import resolve_backend
 from xrgs.splat.densify import Densifier, Refinement

@@ -25,7 +25,6 @@ from xrgs.store import read_json
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
-    from typing import TextIO
 
 #: What says that a file system takes no more, whatever the job does.
 _UNWRITABLE = frozenset({errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EIO})
@@ -108,7 +107,10 @@ def _run_cell(request: Mapping[str, Any]) -> dict[str, Any]:
 
     folder = CellFolder(Path(request["cell"]))
     with (folder.path / "log.txt").open("a", encoding="utf-8") as log:
-        _keep_output(log)
+        # All that the cell, libraries and children print, to the last words. How far it is, it
+        # leaves in a file: on a terminal the bars of several cells would run into each other.
+        for descriptor in (1, 2):
+            os.dup2(log.fileno(), descriptor)
         # A cell that is ended from outside says where it was. To the descriptor, which stays open.
         faulthandler.register(signal.SIGTERM, 2, chain=True)
         logging.basicConfig(
@@ -121,16 +123,6 @@ def _run_cell(request: Mapping[str, Any]) -> dict[str, Any]:
             raise variant.CorruptVariant(f"{frozen.path}: this is variant {frozen.id}, renamed")
         cell.run(from_dict(request["conf"]), frozen, folder)
     return {}
-
-
-def _keep_output(log: TextIO) -> None:
-    """Have the log keep what libraries, children and faulthandler print, to the last words.
-
-    `sys.stderr` stays the terminal, where the progress bar is.
-    """
-    sys.stderr = os.fdopen(os.dup(2), "w", encoding="utf-8", errors="replace", buffering=1)
-    for descriptor in (1, 2):
-        os.dup2(log.fileno(), descriptor)
 
 
 _JOBS: dict[str, Callable[[Mapping[str, Any]], dict[str, Any]]] = {

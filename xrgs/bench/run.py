@@ -11,10 +11,10 @@ import numpy as np
 
 from xrgs import provenance
 from xrgs.bench import loads, memory, rendering, scale, skips, tables, training
-from xrgs.dataset import progress
 from xrgs.errors import XrgsError
 from xrgs.files import write_json
 from xrgs.machine import usable_cores
+from xrgs.progress import progress
 from xrgs.splat.backend import resolve_backend
 
 if TYPE_CHECKING:

@@ -6,15 +6,14 @@ import fcntl
 import re
 from contextlib import contextmanager
 from http.client import HTTPException
-from typing import IO, TYPE_CHECKING, Any
+from typing import IO, TYPE_CHECKING
 from urllib.error import HTTPError, URLError
 from urllib.parse import urlsplit
 from urllib.request import Request, urlopen
 
-from tqdm import tqdm
-
 from xrgs.errors import XrgsError
 from xrgs.hashing import file_digest
+from xrgs.progress import Bar
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -129,7 +128,7 @@ def _append(url: str, response: HTTPResponse, stream: IO[bytes], label: str) -> 
         raise DownloadError(f"{url}: asked for what follows {stream.tell()}, given {start}")
     else:
         _empty(stream)  # the server knows no ranges: from the beginning
-    with _bar(label, stream.tell(), total) as bar:
+    with Bar(label, "byte", total, done=stream.tell()) as bar:
         while chunk := _read(response):
             stream.write(chunk)
             bar.update(len(chunk))
@@ -156,9 +155,3 @@ def _span(header: str | None) -> tuple[int | None, int | None]:
         return None, None
     start, whole = match.groups()
     return (int(start) if start else None), (int(whole) if whole.isdigit() else None)
-
-
-def _bar(label: str, initial: int, total: int | None) -> tqdm[Any]:
-    return tqdm(
-        desc=label, initial=initial, total=total, unit="B", unit_scale=True, delay=1, leave=False
-    )

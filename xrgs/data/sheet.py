@@ -6,9 +6,9 @@ import math
 from typing import TYPE_CHECKING
 
 from PIL import Image, ImageDraw, ImageFont
-from tqdm import tqdm
 
 from xrgs.errors import XrgsError
+from xrgs.progress import progress
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -47,7 +47,7 @@ def contact_sheet(variant: Variant) -> Image.Image:
     top = _TEXT + 2 * _GAP
     sheet = Image.new("RGB", (_GAP + columns * step[0], top + rows * step[1]), _PAPER)
     _legend(sheet, variant, views)
-    for index, view in enumerate(tqdm(views, "contact sheet", delay=2, leave=False)):
+    for index, view in enumerate(progress(views, "contact sheet", "view")):
         row, column = divmod(index, columns)
         sheet.paste(_tile(view, finest), (_GAP + column * step[0], top + row * step[1]))
     return sheet

@@ -9,9 +9,8 @@ import tempfile
 import zipfile
 from pathlib import Path, PurePosixPath
 
-from tqdm import tqdm
-
 from xrgs.errors import XrgsError
+from xrgs.progress import progress
 
 #: Of one folder, unpacked. The largest LLFF scene is a fraction of it.
 _MOST_BYTES = 8 << 30
@@ -47,7 +46,7 @@ def unpack(archive: Path, folder: str, target: Path) -> None:
             # Beside the target, so that a rename moves it; inside, as the umask leaves it.
             with tempfile.TemporaryDirectory(dir=target.parent, prefix=".unpacking-") as temporary:
                 made = Path(temporary) / target.name
-                for member in tqdm(members, desc=f"unpacking {folder}", delay=1, leave=False):
+                for member in progress(members, f"unpacking {folder}", "file"):
                     inside = PurePosixPath(member.filename).relative_to(folder)
                     _write(opened, member, made.joinpath(*inside.parts))
                 made.rename(target)

@@ -11,9 +11,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pandas as pd
-from tqdm import tqdm
 
 from xrgs.errors import XrgsError
+from xrgs.progress import progress
 from xrgs.store import StoreError
 
 if TYPE_CHECKING:
@@ -23,8 +23,6 @@ if TYPE_CHECKING:
     from xrgs.store import CellFolder, Store
 
 BASELINE = "baseline"
-#: Of a bar: none where it would be gone at once, and none where nobody watches.
-PROGRESS: Any = {"delay": 2.0, "leave": False, "disable": None}
 #: What the rows of a sweep's record hold.
 RECORD_KEYS = (
     "scene",
@@ -74,7 +72,7 @@ def read_sweep(store: Store, sweep_id: str, metrics: Sequence[Metric]) -> Sweep:
     facts: dict[str, dict[str, Any]] = {}
     scores: list[dict[str, str]] = []
     made_with: dict[str, set[str]] = {}
-    for cell_id in tqdm(ids, "reading cells", unit="cell", **PROGRESS):
+    for cell_id in progress(ids, "reading cells", "cell"):
         cell = store.cell(cell_id)
         facts[cell_id] = _facts(cell)
         if facts[cell_id]["state"] == "done":

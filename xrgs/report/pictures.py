@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 from PIL import Image
-from tqdm import tqdm
 
-from xrgs.report.collect import BASELINE, PROGRESS, ReportError
+from xrgs.progress import progress
+from xrgs.report.collect import BASELINE, ReportError
 from xrgs.report.figures import Panel, curves, differing_crop, side_by_side
 
 if TYPE_CHECKING:
@@ -56,7 +56,7 @@ def draw(store: Store, comparison: Comparison, views: pd.DataFrame, folder: Path
     psnr = {cell_id: rows.set_index("view")["psnr"] for cell_id, rows in scores}
     variants = comparison.cells.drop_duplicates("cell_id").set_index("cell_id")["variant_id"]
     drawn = []
-    for _, pair in tqdm(wanted.iterrows(), "drawing", len(wanted), unit="picture", **PROGRESS):
+    for _, pair in progress(wanted.iterrows(), "drawing", "picture", len(wanted)):
         both = psnr[pair["baseline_id"]], psnr[pair["cell_id"]]
         photographs = store.variants / variants[pair["cell_id"]] / "images" / "test"
         drawn += [

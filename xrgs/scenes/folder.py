@@ -6,10 +6,9 @@ import hashlib
 import re
 from pathlib import Path
 
-from tqdm import tqdm
-
 from xrgs import images
 from xrgs.errors import XrgsError
+from xrgs.progress import progress
 
 SUFFIXES = frozenset({".bmp", ".jpeg", ".jpg", ".png", ".tif", ".tiff", ".webp"})
 _LLFF_FOLDER = re.compile(r"images(_\d+)?")
@@ -49,7 +48,7 @@ def photographs(path: str | None, long_side: int) -> tuple[Path, ...]:
 def digest(files: tuple[Path, ...]) -> str:
     """Hash of the files' names and bytes, hex."""
     total = hashlib.sha256()
-    for file in tqdm(files, desc="hashing photographs", delay=2, leave=False):
+    for file in progress(files, "hashing photographs", "file"):
         with file.open("rb") as stream:
             content = hashlib.file_digest(stream, "sha256").hexdigest()
         total.update(f"{file.name}\0{content}\n".encode())

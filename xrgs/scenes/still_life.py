@@ -12,9 +12,9 @@ from pathlib import Path
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from tqdm import tqdm
 
 from xrgs import images
+from xrgs.progress import progress
 from xrgs.scenes import procedural, raycast
 from xrgs.scenes.bundled import photograph
 from xrgs.scenes.raycast import Ball, Pyramid, Quad, pyramid
@@ -109,7 +109,7 @@ def render(folder: Path, long_side: int, views: int) -> None:
     names, poses = procedural.names(views), procedural.viewmats(views)
     with _a_thread_a_view() as pool:
         done = pool.map(take, names, poses)
-        for _ in tqdm(done, total=views, desc="rendering the scene", delay=2, leave=False):
+        for _ in progress(done, "rendering the scene", "view", views):
             pass
 
 
