@@ -113,11 +113,7 @@ def _run_cell(request: Mapping[str, Any]) -> dict[str, Any]:
             os.dup2(log.fileno(), descriptor)
         # A cell that is ended from outside says where it was. To the descriptor, which stays open.
         faulthandler.register(signal.SIGTERM, 2, chain=True)
-        logging.basicConfig(
-            format="%(asctime)s %(message)s",
-            level=logging.INFO,
-            handlers=[logging.StreamHandler(log), logging.StreamHandler()],
-        )
+        logging.basicConfig(format="%(asctime)s %(message)s", level=logging.INFO)
         frozen = variant.load(Path(request["variant"]))
         if frozen.id != frozen.path.name:
             raise variant.CorruptVariant(f"{frozen.path}: this is variant {frozen.id}, renamed")
