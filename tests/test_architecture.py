@@ -26,7 +26,7 @@ ONLY_IN = {
 }
 #: Rooms in the order that data walks through them: an import never points to a later one.
 FLOW = (
-    ("errors", "files", "hashing", "locks", "machine", "splat", "supervise", "weights"),
+    ("errors", "files", "hashing", "locks", "machine", "splat", "stop", "supervise", "weights"),
     ("checkpoint", "progress"),
     ("images", "alignment", "split", "views", "degrade"),
     ("config", "scenes", "sfm"),

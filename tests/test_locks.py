@@ -24,6 +24,14 @@ from xrgs import locks
 print(locks.acquire(Path(sys.argv[1]), "cell") is not None, flush=True)
 time.sleep(600)
 """
+_TAKE_FOR_A_WORKER = """
+import subprocess, sys
+from pathlib import Path
+from xrgs import locks
+worker = subprocess.Popen(["sleep", "600"], stdout=subprocess.DEVNULL)
+assert locks.acquire(Path(sys.argv[1]), "cell").beat(worker.pid)
+print(worker.pid)
+"""
 _TAKE_AND_GIVE = """
 import sys, time
 from pathlib import Path
@@ -95,19 +103,56 @@ def test_a_process_number_that_was_given_again_is_another_process(tmp_path: Path
     assert locks.acquire(tmp_path, "cell") is not None
 
 
-@pytest.mark.parametrize("text", [None, "", "{"])
-def test_an_owner_out_of_sight_is_alive_as_long_as_it_gives_signs(
-    tmp_path: Path, text: str | None
-) -> None:
+def test_an_owner_out_of_sight_is_alive_as_long_as_it_gives_signs(tmp_path: Path) -> None:
     lock = locks.acquire(tmp_path, "cell")
     assert lock is not None
     elsewhere(lock.path, locks.SILENT_S - 60)
-    if text is not None:  # or one that was stopped before it could say who it is
-        lock.path.write_text(text)
     assert locks.acquire(tmp_path, "cell") is None
-    then = time.time() - locks.SILENT_S - 60
-    os.utime(lock.path, (then, then))
+    elsewhere(lock.path, locks.SILENT_S + 60)
     assert locks.acquire(tmp_path, "cell") is not None
+
+
+@pytest.mark.parametrize("text", ["", "{"])
+def test_who_was_killed_before_it_said_its_name_is_not_waited_for_long(
+    tmp_path: Path, text: str
+) -> None:
+    file = tmp_path / "cell.0"
+    file.write_text(text)
+    assert locks.acquire(tmp_path, "cell") is None  # it may be about to
+    then = time.time() - 31
+    os.utime(file, (then, then))
+    assert locks.acquire(tmp_path, "cell") is not None
+
+
+def test_an_interrupted_owner_leaves_no_nameless_lock(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def interrupted(*_: object) -> str:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(json, "dumps", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        locks.acquire(tmp_path, "cell")
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_worker_that_outlives_its_owner_holds_the_lock_until_it_ends(tmp_path: Path) -> None:
+    command = [sys.executable, "-c", _TAKE_FOR_A_WORKER, str(tmp_path)]
+    done = subprocess.run(command, stdout=subprocess.PIPE, text=True, check=True)
+    worker = int(done.stdout)
+    try:
+        assert locks.acquire(tmp_path, "cell") is None  # its owner is no more
+        assert locks.holders(tmp_path)
+    finally:
+        os.kill(worker, signal.SIGKILL)
+    end = time.monotonic() + 10
+    while locks.holders(tmp_path) and time.monotonic() < end:
+        time.sleep(0.01)
+    lock = locks.acquire(tmp_path, "cell")
+    assert lock is not None
+    assert lock.beat(os.getpid())
+    lock.release()
+    assert not list(tmp_path.iterdir())
 
 
 def test_a_sign_of_life_is_given_and_a_lost_lock_noticed(

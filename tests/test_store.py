@@ -8,6 +8,7 @@ from pathlib import Path
 
 import pytest
 
+from xrgs import store
 from xrgs.files import write_json
 from xrgs.store import CellFolder, Store, StoreError
 
@@ -76,9 +77,9 @@ def test_a_failed_cell_says_why(done: CellFolder) -> None:
     assert done.state().reason == "out of luck"
 
 
-def test_beginning_again_sets_the_old_folder_aside(done: CellFolder) -> None:
-    done.begin({"seed": 1}, {})
-    done.begin({"seed": 2}, {})
+def test_beginning_another_cell_sets_the_old_folder_aside(done: CellFolder) -> None:
+    done.begin({"seed": 1}, {"seed": 1})
+    done.begin({"seed": 2}, {"seed": 2})
     assert done.state().name == "unfinished"
     aside = sorted(path.name for path in done.path.parent.iterdir())
     assert aside == ["abc", "abc.aside-1", "abc.aside-2"]
@@ -116,6 +117,41 @@ def test_beginning_a_stopped_cell_keeps_its_checkpoint_and_no_result(
     assert stopped.checkpoint.read_bytes() == b"state"
     assert json.loads((stopped.path / "config.json").read_text())["store"] == "elsewhere"
     assert [entry.name for entry in stopped.path.parent.iterdir()] == ["abc"]
+
+
+@pytest.mark.parametrize("at", ["identity.json", "config.json"])
+def test_a_cell_killed_before_its_first_checkpoint_leaves_no_folder_aside(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, at: str
+) -> None:
+    folder = CellFolder(tmp_path / "cells" / "abc")
+
+    def killed(file: Path, value: object) -> None:
+        if file.name == at:
+            raise KeyboardInterrupt
+        write_json(file, value)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(store, "write_json", killed)
+        with pytest.raises(KeyboardInterrupt):
+            folder.begin({"seed": 0}, {"seed": 0})
+    folder.begin({"seed": 0}, {"seed": 0})
+    (folder.path / "log.txt").write_text("begun\n")
+    (folder.path / "splats.ply").write_text("of the try that was killed")
+    folder.begin({"seed": 0}, {"seed": 0})
+    assert sorted(entry.name for entry in folder.path.iterdir()) == [
+        "config.json",
+        "identity.json",
+        "log.txt",
+    ]
+    assert [entry.name for entry in folder.path.parent.iterdir()] == ["abc"]
+
+
+def test_a_failed_cell_without_checkpoint_is_set_aside_with_its_error(tmp_path: Path) -> None:
+    folder = CellFolder(tmp_path / "cells" / "abc")
+    folder.begin({"seed": 0}, {"seed": 0})
+    folder.fail("out of luck")
+    folder.begin({"seed": 0}, {"seed": 0})
+    assert "out of luck" in (tmp_path / "cells" / "abc.aside-1" / "error.txt").read_text()
 
 
 def test_beginning_another_cell_does_not_take_the_checkpoint(stopped: CellFolder) -> None:

@@ -94,7 +94,7 @@ def test_memory_that_nobody_tells_of_is_not_limited_in_silence(
 
 
 def test_an_objection_ends_it() -> None:
-    ended = supervise.run(python("import time; time.sleep(600)"), Limits(), lambda: "enough")
+    ended = supervise.run(python("import time; time.sleep(600)"), Limits(), lambda _: "enough")
     assert ended == supervise.Ended(-signal.SIGTERM, "enough")
 
 

@@ -17,6 +17,7 @@ from xrgs import config
 from xrgs.bench.settings import Settings
 from xrgs.errors import XrgsError
 from xrgs.machine import let_openmp_sleep
+from xrgs.stop import stoppable
 
 
 @hydra.main(version_base="1.3", config_path=str(config.CONF_DIR), config_name="config")
@@ -60,7 +61,8 @@ def sweep() -> None:
     config.register()
     # `ablation` is not in the defaults list, so Hydra wants the plus; people forget it.
     sys.argv[1:] = ["+" + a if a.startswith("ablation=") else a for a in sys.argv[1:]]
-    _sweep()
+    with stoppable("What is done is kept: the same command goes on from there."):
+        _sweep()
 
 
 def _line(error: Exception) -> str:

@@ -86,7 +86,10 @@ def _train(conf: Conf, found: Path, folder: CellFolder, lock: locks.Lock) -> str
     lost = f"{folder.id}: this process was away too long, and another has taken the cell over"
     try:
         worker.run(
-            "cell", request, Limits(**asdict(conf.limits)), lambda: "" if lock.beat() else lost
+            "cell",
+            request,
+            Limits(**asdict(conf.limits)),
+            lambda pid: "" if lock.beat(pid) else lost,
         )
     except worker.UnwritableError as error:
         # No fault of the cell's: it stays unfinished, and is run again without being asked for.

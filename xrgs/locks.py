@@ -19,14 +19,19 @@ import secrets
 import socket
 import time
 from contextlib import suppress
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from functools import cache
 from pathlib import Path
+
+from xrgs.files import write_json
 
 #: Seconds from one sign of life to the next, and after how many without one an owner elsewhere is
 #: taken for dead.
 BEAT_S = 30.0
 SILENT_S = 600.0
+#: Seconds that a lock may be without an owner's name. Who makes one writes it at once, and looks
+#: for others after that: one that was killed or suspended in between holds nothing yet.
+_NAMELESS_S = 30.0
 
 
 @dataclass(frozen=True)
@@ -39,6 +44,17 @@ class Owner:
     pid: int
     started: int
     """Of the process, clock ticks since boot: numbers are given again. 0 where it is not known."""
+    worker: int = 0
+    """The process that works under the lock, 0 where there is none: it may outlive for a moment
+    the one that holds it, and write to what the next one has begun."""
+    worker_started: int = 0
+
+    @property
+    def lives(self) -> bool:
+        """Whether one of its processes runs, stopped or not; to be asked where they would run."""
+        if _start(self.pid) == self.started:
+            return True
+        return bool(self.worker) and _start(self.worker) == self.worker_started
 
     def __str__(self) -> str:
         return f"process {self.pid} on {self.host}"
@@ -50,31 +66,40 @@ class Lock:
 
     path: Path
     beaten: float
+    owner: Owner
 
-    def beat(self) -> bool:
+    def beat(self, worker: int = 0) -> bool:
         """Give a sign of life if one is due.
+
+        Args:
+            worker: the process that works under the lock, if any; from now on it holds it as well.
 
         Returns:
             False where the lock is lost: this process gave none for so long, suspended or cut off
             from the store, that another has taken over.
         """
-        if time.monotonic() - self.beaten < BEAT_S:
+        known = worker == self.owner.worker
+        if known and time.monotonic() - self.beaten < BEAT_S:
             return True
         self.beaten = time.monotonic()
         name, generation = _parts(self.path)
         try:
             os.utime(self.path)
+            if not known:
+                owner = replace(self.owner, worker=worker, worker_started=_start(worker) or 0)
+                write_json(self.path, asdict(owner))
+                self.owner = owner
             last = max(_generations(self.path.parent, name), default=generation)
         except FileNotFoundError:
             return False
         except OSError:  # the store is out of reach for now: whether for too long, it will tell
             return True
-        return last == generation and _owner(self.path) in {None, _self()}
+        return last == generation and _owner(self.path) in {None, self.owner}
 
     def release(self) -> None:
         """Let the next one have it."""
         with suppress(OSError):  # left behind, it dies with this process
-            if _owner(self.path) == _self():  # not the next one's, where this one was lost
+            if _owner(self.path) == self.owner:  # not the next one's, where this one was lost
                 self.path.unlink()
 
 
@@ -90,7 +115,7 @@ def acquire(folder: Path, name: str) -> Lock | None:
             return None
         file = folder / f"{name}.{max(found, default=-1) + 1}"
         try:
-            _make(file)
+            owner = _make(file)
         except FileExistsError:
             continue  # another was quicker: look again
         # What was listed above may be long past: whoever came meanwhile is seen here, and of two
@@ -101,7 +126,7 @@ def acquire(folder: Path, name: str) -> Lock | None:
             return None
         for dead in others:
             dead.unlink(missing_ok=True)
-        return Lock(file, time.monotonic())
+        return Lock(file, time.monotonic(), owner)
 
 
 def holders(folder: Path) -> dict[str, Owner | None]:
@@ -126,19 +151,21 @@ def _generations(folder: Path, name: str) -> dict[int, Path]:
     return {_parts(file)[1]: file for file in found if file.suffix[1:].isdecimal()}
 
 
-def _make(file: Path) -> None:
-    """Make the file and say in it whose it is; an empty one is no lock for ever, but for a while.
+def _make(file: Path) -> Owner:
+    """Make the file and say in it whose it is: this process's.
 
     Raises:
         FileExistsError: it is there.
     """
+    owner = _self()
     with file.open("x", encoding="utf-8") as stream:
         try:
-            stream.write(json.dumps(asdict(_self())))
+            stream.write(json.dumps(asdict(owner)))
             stream.flush()
-        except OSError:
+        except BaseException:
             file.unlink(missing_ok=True)
             raise
+    return owner
 
 
 def _owner(file: Path) -> Owner | None:
@@ -151,9 +178,10 @@ def _owner(file: Path) -> Owner | None:
 def _living(file: Path) -> bool:
     owner, here = _owner(file), _self()
     if owner is not None and (owner.host, owner.boot) == (here.host, here.boot):
-        return _start(owner.pid) == owner.started
+        return owner.lives
+    silent = _NAMELESS_S if owner is None else SILENT_S
     try:
-        return _now(file.parent) - file.stat().st_mtime < SILENT_S
+        return _now(file.parent) - file.stat().st_mtime < silent
     except OSError:
         return False
 

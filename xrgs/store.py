@@ -137,8 +137,8 @@ class CellFolder:
     def begin(self, config: Mapping[str, Any], identity: Mapping[str, Any]) -> None:
         """A folder with the cell's config, and nothing else that could be taken for a result.
 
-        An earlier try of the very same cell that left a checkpoint leaves that and its log; any
-        other is set aside.
+        An earlier try of the very same cell leaves its checkpoint and its log. What can't be that,
+        and what failed or is corrupt and has no checkpoint, is set aside to be looked at.
         """
         if self._can_go_on(identity):
             self._clear()
@@ -149,12 +149,15 @@ class CellFolder:
         write_json(self.path / "identity.json", identity)
 
     def _can_go_on(self, identity: Mapping[str, Any]) -> bool:
-        if not self.checkpoint.is_file() or self.state().name not in {"unfinished", "failed"}:
+        state = self.state().name
+        if state != "unfinished" and not (state == "failed" and self.checkpoint.is_file()):
             return False
         try:
             return canonical(self.identity()) == canonical(identity)
         except (StoreError, TypeError, ValueError):
-            return False
+            # Killed before it had said what it is: nothing in it has begun yet.
+            begun = (self.path / "identity.json", self.checkpoint)
+            return not any(file.exists() for file in begun)
 
     def _clear(self) -> None:
         for entry in self.path.iterdir():
@@ -184,7 +187,11 @@ class CellFolder:
                 "files": files,
             }
         )
-        self.checkpoint.unlink(missing_ok=True)  # last: until it is done, the cell may need it
+        self.drop_checkpoint()  # last: until it is done, the cell may need it
+
+    def drop_checkpoint(self) -> None:
+        """Remove what a finished cell needs no more, whoever was killed before doing so."""
+        self.checkpoint.unlink(missing_ok=True)
 
     def fail(self, reason: str) -> None:
         """Declare the cell failed; `error.txt` is there even where it died without a word."""

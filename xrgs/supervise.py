@@ -43,7 +43,9 @@ class Ended:
     """Why it was ended from here; empty where it ended by itself."""
 
 
-def run(command: Sequence[str], limits: Limits, objection: Callable[[], str] = lambda: "") -> Ended:
+def run(
+    command: Sequence[str], limits: Limits, objection: Callable[[int], str] = lambda _: ""
+) -> Ended:
     """Run a command to its end, or to its limit, with a session of its own.
 
     Its standard input is a pipe that ends when this process does (`follow_parent`).
@@ -51,7 +53,8 @@ def run(command: Sequence[str], limits: Limits, objection: Callable[[], str] = l
     Args:
         command: program and arguments.
         limits: it and its children are ended where they go beyond.
-        objection: asked again and again while it runs; a text ends it, and is the reason.
+        objection: asked again and again while it runs, with its process number; a text ends it, and
+            is the reason.
 
     Raises:
         XrgsError: memory is limited on a system that doesn't tell how much a process has.
@@ -66,7 +69,7 @@ def run(command: Sequence[str], limits: Limits, objection: Callable[[], str] = l
     return Ended(child.returncode, reason)
 
 
-def _watch(child: subprocess.Popen[bytes], limits: Limits, objection: Callable[[], str]) -> str:
+def _watch(child: subprocess.Popen[bytes], limits: Limits, objection: Callable[[int], str]) -> str:
     """Wait for its end; why it has to be ended, or empty."""
     start, pause = time.monotonic(), 0.01
     while child.poll() is None:
@@ -78,7 +81,7 @@ def _watch(child: subprocess.Popen[bytes], limits: Limits, objection: Callable[[
                 f"out of memory: it used {used:.2f} GB, more than "
                 f"limits.memory_gb={limits.memory_gb:g}, and was ended"
             )
-        if reason := objection():
+        if reason := objection(child.pid):
             return reason
         time.sleep(pause)
         pause = min(_LOOK_S, 1.5 * pause)

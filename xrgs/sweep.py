@@ -154,6 +154,9 @@ class Study:
             _say(f"no LPIPS in what is run now (n/a in the tables): {weights.HINT}")
         if dry:
             return False
+        for cell in plan:
+            if cell.state.name == "done" and cell.cell_id is not None:
+                store.cell(cell.cell_id).drop_checkpoint()
         with View(store) as view:
             plan = self._worked_off(plan, store, view)
         plan = [_without_reference(cell) for cell in plan]

@@ -43,7 +43,7 @@ def run(
     job: str,
     request: Mapping[str, Any],
     limits: supervise.Limits = _NO_LIMITS,
-    objection: Callable[[], str] = lambda: "",
+    objection: Callable[[int], str] = lambda _: "",
 ) -> dict[str, Any]:
     """Run one job in a child process and return its answer.
 
@@ -51,7 +51,7 @@ def run(
         job: a name in `_JOBS`.
         request: what it is to do, as plain JSON values.
         limits: the child is ended where it goes beyond.
-        objection: asked while it runs; a text ends it, and is the reason.
+        objection: asked while it runs, with the child's number; a text ends it, and is the reason.
 
     Raises:
         UnwritableError: it could not write its files; nothing else is wrong with it.
