@@ -2,8 +2,15 @@
 
 from __future__ import annotations
 
+import json
 import os
+import subprocess
+import sys
+import tempfile
+import time
 from collections.abc import Callable, Iterator
+from contextlib import suppress
+from dataclasses import dataclass
 from pathlib import Path
 
 import hydra
@@ -93,6 +100,87 @@ def data() -> Dataset:
         views.append(LoadedView(f"v{number}", tag, _camera(width, height), image, rho=width / 60))
     colors = torch.rand(60, 3, generator=generator)
     return Dataset(tuple(views), tuple(views[:1]), points, colors, scene_scale=1.0, factor=5)
+
+
+@dataclass(frozen=True)
+class Sweep:
+    """One call of `xrgs-sweep`."""
+
+    process: subprocess.Popen[bytes]
+    printed: Path
+    """Folder of the files `out` and `err`."""
+
+    def end(self) -> tuple[int, str, str]:
+        """Wait for it; exit code, stdout and stderr."""
+        code = self.process.wait(300)
+        return code, *((self.printed / name).read_text() for name in ("out", "err"))
+
+
+@dataclass(frozen=True)
+class Sweeps:
+    """Sweeps of real processes in a folder of their own, which holds their store `s`."""
+
+    folder: Path
+    faults: str = ""
+    """Python that every process runs at its start, the cells' too."""
+
+    def start(self, *arguments: str, faults: bool = True) -> Sweep:
+        """Start one."""
+        printed = Path(tempfile.mkdtemp(prefix="printed-", dir=self.folder))
+        (self.folder / "tmp").mkdir(exist_ok=True)
+        changes = {"TMPDIR": str(self.folder / "tmp"), "SWEEPS_OF": str(self.folder)}
+        if faults and self.faults:
+            (self.folder / "site").mkdir(exist_ok=True)
+            (self.folder / "site" / "sitecustomize.py").write_text(self.faults)
+            path = [str(self.folder / "site"), os.environ.get("PYTHONPATH", "")]
+            changes["PYTHONPATH"] = os.pathsep.join(filter(None, path))
+        command = [sys.executable, "-c", "from xrgs.cli import sweep; sweep()", *arguments]
+        with (printed / "out").open("wb") as out, (printed / "err").open("wb") as err:
+            process = subprocess.Popen(
+                [*command, "store=s", "threads=1"],
+                cwd=self.folder,
+                env=os.environ | changes,
+                stdout=out,
+                stderr=err,
+            )
+        return Sweep(process, printed)
+
+    def run(self, *arguments: str, faults: bool = True) -> tuple[int, str, str]:
+        """One from its start to its end: exit code, stdout and stderr."""
+        ended = self.start(*arguments, faults=faults).end()
+        self.leave_nothing_running()
+        return ended
+
+    def leave_nothing_running(self) -> None:
+        """Assert that these sweeps, and all that they started, come to an end now."""
+        end = time.monotonic() + 20
+        while left := self.processes():
+            assert time.monotonic() < end, left
+            time.sleep(0.01)
+
+    def processes(self) -> dict[int, str]:
+        """Number and command line of each process that these sweeps have started and that runs."""
+        mark = f"SWEEPS_OF={self.folder}".encode()
+        found = {}
+        for process in Path("/proc").glob("[0-9]*"):
+            with suppress(OSError):  # it may end while it is looked at
+                if mark in (process / "environ").read_bytes().split(b"\0"):
+                    line = (process / "cmdline").read_bytes().replace(b"\0", b" ")
+                    found[int(process.name)] = line.decode()
+        return found
+
+    def cells(self) -> dict[int, Path]:
+        """The folder of every cell by its seed."""
+        found = (self.folder / "s" / "cells").glob("*/identity.json")
+        return {
+            json.loads(f.read_text())["seed"]: f.parent for f in found if "." not in f.parent.name
+        }
+
+
+@pytest.fixture(scope="session")
+def sweeps_in() -> Callable[..., Sweeps]:
+    """(folder, faults) -> sweeps in that folder."""
+    return Sweeps
 
 
 @pytest.fixture(scope="session")

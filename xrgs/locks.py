@@ -129,6 +129,11 @@ def acquire(folder: Path, name: str) -> Lock | None:
         return Lock(file, time.monotonic(), owner)
 
 
+def names(folder: Path) -> set[str]:
+    """Of the locks in a folder, of the living and the dead."""
+    return {file.stem for file in folder.iterdir() if file.suffix[1:].isdecimal()}
+
+
 def holders(folder: Path) -> dict[str, Owner | None]:
     """The living owner of every lock in a folder; None where it has not said yet who it is."""
     try:

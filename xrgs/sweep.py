@@ -154,9 +154,7 @@ class Study:
             _say(f"no LPIPS in what is run now (n/a in the tables): {weights.HINT}")
         if dry:
             return False
-        for cell in plan:
-            if cell.state.name == "done" and cell.cell_id is not None:
-                store.cell(cell.cell_id).drop_checkpoint()
+        _tidy({cell.cell_id for cell in plan if cell.cell_id and cell.state.name == "done"}, store)
         with View(store) as view:
             plan = self._worked_off(plan, store, view)
         plan = [_without_reference(cell) for cell in plan]
@@ -285,6 +283,16 @@ def _variant_of(conf: Conf, store: Store, *, build: bool) -> tuple[str | None, s
     except XrgsError as error:
         _say(f"{scenes.label(conf.scene)}: {error}")
         return None, str(error)
+
+
+def _tidy(done: set[str], store: Store) -> None:
+    """Remove what a killed sweep left of cells that are done: a checkpoint, a lock."""
+    for cell_id in done:
+        store.cell(cell_id).drop_checkpoint()
+    for cell_id in done & locks.names(store.locks):
+        lock = locks.acquire(store.locks, cell_id)
+        if lock is not None:
+            lock.release()
 
 
 def _without_reference(cell: Planned) -> Planned:
