@@ -33,6 +33,7 @@ def score(
     import torch
 
     from xrgs import images, metrics
+    from xrgs.machine import one_thread
     from xrgs.progress import progress
     from xrgs.splat.backend import resolve_backend
     from xrgs.splat.rasterize import rasterize
@@ -50,7 +51,8 @@ def score(
                 backend=backend,
             )
             image = render.image.clamp(0.0, 1.0)
-            scores = {name: fn(image, view.image) for name, fn in metrics.VIEW_METRICS.items()}
+            with one_thread():  # torch's sum over several differs in the last digit
+                scores = {name: fn(image, view.image) for name, fn in metrics.VIEW_METRICS.items()}
             rows.append({"view": view.name} | scores)
             images.save(renders / f"{view.name}.png", image.numpy())
     return rows

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Iterator
+from contextlib import contextmanager
 
 
 def usable_cores() -> int:
@@ -20,3 +22,20 @@ def let_openmp_sleep() -> None:
     training step took three times as long. Who has set OMP_WAIT_POLICY is left alone.
     """
     os.environ.setdefault("OMP_WAIT_POLICY", "passive")
+
+
+@contextmanager
+def one_thread() -> Iterator[int]:
+    """Have torch work with one thread for a while.
+
+    Yields:
+        How many it had, and has again afterwards.
+    """
+    import torch
+
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield threads
+    finally:
+        torch.set_num_threads(threads)

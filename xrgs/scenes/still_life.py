@@ -6,7 +6,6 @@ import itertools
 import math
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
@@ -14,6 +13,7 @@ import torch
 from numpy.typing import NDArray
 
 from xrgs import images
+from xrgs.machine import one_thread
 from xrgs.progress import progress
 from xrgs.scenes import procedural, raycast
 from xrgs.scenes.bundled import photograph
@@ -107,19 +107,8 @@ def render(folder: Path, long_side: int, views: int) -> None:
         images.save(folder / f"{name}.png", image.numpy())
 
     names, poses = procedural.names(views), procedural.viewmats(views)
-    with _a_thread_a_view() as pool:
+    # A thread a view, and none inside it: on a busy machine torch's own wait for each other.
+    with one_thread() as threads, ThreadPoolExecutor(threads) as pool:
         done = pool.map(take, names, poses)
         for _ in progress(done, "rendering the scene", "view", views):
             pass
-
-
-@contextmanager
-def _a_thread_a_view() -> Iterator[ThreadPoolExecutor]:
-    """Threads over views, none inside them: on a busy machine torch's own wait for each other."""
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    try:
-        with ThreadPoolExecutor(threads) as pool:
-            yield pool
-    finally:
-        torch.set_num_threads(threads)
