@@ -6,6 +6,7 @@ are strings: hence no `from __future__ import annotations`.
 """
 
 from dataclasses import dataclass
+from importlib.util import find_spec
 from typing import Any
 
 from hydra.core.config_search_path import ConfigSearchPath
@@ -13,7 +14,7 @@ from hydra.core.config_store import ConfigStore
 from hydra.plugins.search_path_plugin import SearchPathPlugin
 from hydra.plugins.sweeper import Sweeper
 from hydra.types import HydraContext, TaskFunction
-from omegaconf import DictConfig
+from omegaconf import DictConfig, OmegaConf
 
 from xrgs.config import CONF_DIR
 
@@ -30,6 +31,19 @@ class XrgsSweeperConf:
 ConfigStore.instance().store(
     group="hydra/sweeper", name="xrgs", node=XrgsSweeperConf, provider="xrgs"
 )
+
+_EXTRAS = {
+    "joblib": ("joblib",),
+    "submitit": ("submitit_local", "submitit_slurm"),
+    "ray": ("ray",),
+}
+for _extra, _launchers in _EXTRAS.items():
+    if find_spec(f"hydra_plugins.hydra_{_extra}_launcher") is not None:
+        continue
+    for _name in _launchers:
+        # In the launcher's place, and open to its settings, so that the sweep can say what to do.
+        _node = OmegaConf.create({"install": f"xrgs[{_extra}]"}, flags={"struct": False})
+        ConfigStore.instance().store(_name, _node, group="hydra/launcher", provider="xrgs")
 
 
 class XrgsSearchPath(SearchPathPlugin):

@@ -17,8 +17,8 @@ FILES = {
 }
 #: Libraries that only these rooms may import (a folder stands for its files).
 ONLY_IN = {
-    "hydra": ("config", "sweep", "cli"),
-    "omegaconf": ("config", "sweep", "cli"),
+    "hydra": ("config", "launchers", "sweep", "cli"),
+    "omegaconf": ("config", "launchers", "sweep", "cli"),
     "pycolmap": ("sfm",),
     "matplotlib": ("report",),
     "pandas": ("store", "report"),
@@ -46,6 +46,7 @@ FLOW = (
     ("report",),
     ("data",),
     ("bench",),
+    ("launchers",),
     ("sweep",),
     ("cli",),
 )

@@ -17,12 +17,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from hydra.core.override_parser.overrides_parser import OverridesParser
-from hydra.core.plugins import Plugins
 from hydra.errors import CompactHydraException
 from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from xrgs import locks, scenes, variant, weights, worker
+from xrgs import launchers, locks, scenes, variant, weights, worker
 from xrgs.config import to_conf
 from xrgs.errors import XrgsError
 from xrgs.estimate import Past
@@ -36,7 +35,6 @@ from xrgs.plan import (
     describe,
     estimated,
     identified,
-    length,
     ready,
     record,
 )
@@ -47,7 +45,6 @@ if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping, Sequence
 
     from hydra.core.override_parser.types import Override
-    from hydra.core.utils import JobReturn
     from hydra.types import HydraContext, TaskFunction
     from omegaconf import DictConfig
 
@@ -141,6 +138,7 @@ class Study:
             raise SystemExit(1)
 
     def _run(self, arguments: Sequence[str]) -> bool:
+        launchers.check(self._config)
         plan = self._plan(arguments)
         store = Store(Path(plan[0].conf.store))
         dry = plan[0].conf.dry_run
@@ -172,14 +170,16 @@ class Study:
         """
         conf = plan[0].conf
         retry, told, tried = conf.retry == "failed", False, set[str]()
+        launches = launchers.Launches(self._context, self._task, self._config)
         while True:
             view.watch(plan)
             wanted = ready(plan, tried, retry=retry)
             others = [cell for cell in plan if cell.state.name == "running"]
             if not wanted and not others:
                 return list(plan)
-            outcomes = self._launch(wanted.values()) if wanted else {}
-            begun = {cell_id for cell_id in wanted if outcomes[cell_id] != LOCKED}
+            outcomes = launches.run(wanted.values(), store) if wanted else {}
+            left = {LOCKED, launchers.LOST}
+            begun = {cell_id for cell_id in wanted if outcomes[cell_id] not in left}
             tried |= begun
             plan = self._identified(plan, store)
             if UNWRITABLE in outcomes.values():
@@ -232,6 +232,7 @@ class Study:
         if len(seeds) == 1 and known is not None:
             return replace(known, seed=int(seeds[0]))
         composed = self._context.config_loader.load_sweep_config(self._config, wish.overrides)
+        launchers.check(self._config, composed)
         conf = to_conf(composed)
         if "${seed" not in str(OmegaConf.to_container(composed, resolve=False)):
             self._composed[others] = conf
@@ -250,24 +251,6 @@ class Study:
             variant_id, error = found[wanted]
             cells.append(replace(cell, variant_id=variant_id, error=error))
         return cells
-
-    def _launch(self, cells: Iterable[Planned]) -> dict[str, str]:
-        """Run cells, the longest first; what each job ended with, by the cell's id."""
-        cells = sorted(cells, key=length, reverse=True)
-        launcher = Plugins.instance().instantiate_launcher(
-            hydra_context=self._context, task_function=self._task, config=self._config
-        )
-        done = launcher.launch([cell.wish.overrides for cell in cells], initial_job_idx=0)
-        return {str(cell.cell_id): _outcome(job) for cell, job in zip(cells, done, strict=True)}
-
-
-def _outcome(job: JobReturn) -> str:
-    """What `run_job` returned; a failure where it raised, which is then its cell's alone."""
-    try:
-        return str(job.return_value)
-    except Exception as error:
-        _say(str(error))
-        return "failed"
 
 
 def _variant_of(conf: Conf, store: Store, *, build: bool) -> tuple[str | None, str | None]:

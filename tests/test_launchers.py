@@ -1,0 +1,298 @@
+"""Cells by way of Hydra's launchers: real sweeps, and launchers that break."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import subprocess
+import sys
+from collections.abc import Callable, Sequence
+from importlib.util import find_spec
+from pathlib import Path
+
+import hydra
+import pytest
+from hydra.core.plugins import Plugins
+from hydra.core.utils import JobReturn, JobStatus
+from hydra.types import HydraContext
+from omegaconf import DictConfig
+
+from xrgs import config, launchers
+from xrgs.errors import XrgsError
+from xrgs.files import write_json
+from xrgs.launchers import LOST, Launches, capacity
+from xrgs.plan import Planned, Wish
+from xrgs.store import Store
+
+SMOKE = ("scene=motorcycle", "preset=smoke", "train.steps=4", "store=s", "seed=0,1")
+#: Python loads it in every process of a sweep: each sees two cores, and a cell's process waits for
+#: another cell to have begun; one of them then kills the launcher's worker where that is asked for.
+SITE = """
+import os, sys, time
+from pathlib import Path
+
+os.sched_getaffinity = lambda pid: {0, 1}
+if "xrgs.worker" in sys.orig_argv and "cell" in sys.orig_argv:
+    folder = Path(os.environ["XRGS_TEST_FOLDER"])
+    end = time.monotonic() + 90
+    while len(list((folder / "s" / "cells").glob("*/identity.json"))) < 2:
+        if time.monotonic() > end:
+            os._exit(3)
+        time.sleep(0.05)
+    try:
+        (folder / "kill").unlink()
+    except FileNotFoundError:
+        pass
+    else:
+        os.kill(os.getppid(), 9)
+        os._exit(3)
+"""
+
+
+def sweep(folder: Path, *arguments: str, together: bool = False) -> tuple[int, str, str]:
+    """Exit code, stdout and stderr of a sweep with the store `s` in a folder.
+
+    Args:
+        together: no cell goes on before another has begun.
+    """
+    environment = os.environ | {"RAY_USAGE_STATS_ENABLED": "0"}
+    if together:
+        (folder / "site").mkdir()
+        (folder / "site" / "sitecustomize.py").write_text(SITE)
+        path = os.pathsep.join([str(folder / "site"), os.environ.get("PYTHONPATH", "")])
+        environment |= {"PYTHONPATH": path, "XRGS_TEST_FOLDER": str(folder)}
+    done = subprocess.run(
+        [sys.executable, "-c", "from xrgs.cli import sweep; sweep()", *SMOKE, *arguments],
+        cwd=folder,
+        env=environment,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    return done.returncode, done.stdout, done.stderr
+
+
+def results(folder: Path) -> dict[str, list[bytes]]:
+    """What must be the same however a cell was run, by its id."""
+    names = ("scores.csv", "splats.ply", "identity.json")
+    done = sorted((folder / "s" / "cells").glob("*/status.json"))
+    return {file.parent.name: [(file.parent / n).read_bytes() for n in names] for file in done}
+
+
+@pytest.fixture(scope="module")
+def basic(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder whose store `s` holds the cells as the basic launcher runs them."""
+    folder = tmp_path_factory.mktemp("basic")
+    code, _, err = sweep(folder)
+    assert code == 0, err
+    return folder
+
+
+@pytest.fixture
+def folder(basic: Path, tmp_path: Path) -> Path:
+    """A folder with its variant, and no cell."""
+    shutil.copytree(basic / "s" / "variants", tmp_path / "s" / "variants")
+    return tmp_path
+
+
+@pytest.mark.parametrize(
+    ("launcher", "package", "settings"),
+    [
+        ("submitit_local", "submitit", ()),
+        ("ray", "ray", ("+hydra.launcher.ray.init={num_cpus:2,include_dashboard:false}",)),
+    ],
+)
+def test_a_launcher_runs_two_cells_at_once_to_the_results_of_basic(
+    basic: Path, folder: Path, launcher: str, package: str, settings: tuple[str, ...]
+) -> None:
+    if find_spec(f"hydra_plugins.hydra_{package}_launcher") is None:
+        pytest.skip(f"pip install 'xrgs[{package}]', which is large")
+    code, _, err = sweep(folder, f"hydra/launcher={launcher}", *settings, together=True)
+    assert code == 0, err
+    assert results(folder) == results(basic)
+    for cell in (folder / "s" / "cells").iterdir():
+        assert json.loads((cell / "provenance.json").read_text())["threads"] == 1
+
+
+def test_joblib_runs_two_cells_at_once_and_a_killed_worker_costs_nothing(
+    basic: Path, folder: Path
+) -> None:
+    (folder / "kill").touch()
+    two = ("hydra/launcher=joblib", "hydra.launcher.n_jobs=2")
+    code, _, err = sweep(folder, *two, together=True)
+    assert code == 0, err
+    assert not (folder / "kill").exists()
+    assert "TerminatedWorkerError" in err
+    assert "of its 2 cells are left:" in err
+    assert err.count("training cell") == 4
+    assert results(folder) == results(basic)
+
+
+def test_a_launcher_that_is_not_installed_is_named_with_its_extra(tmp_path: Path) -> None:
+    if find_spec("hydra_plugins.hydra_ray_launcher") is not None:
+        pytest.skip("ray is installed")
+    ray = ("hydra/launcher=ray", "hydra.launcher.ray.remote.num_cpus=2")
+    code, _, err = sweep(tmp_path, *ray, "dry_run=true")
+    assert code == 1
+    assert "pip install 'xrgs[ray]'" in err
+
+
+def test_a_launcher_named_in_an_ablation_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "mine" / "ablation").mkdir(parents=True)
+    for name in ("here", "there"):
+        file = tmp_path / "mine" / "ablation" / f"{name}.yaml"
+        file.write_text("# @package _global_\ndefaults:\n  - override /hydra/launcher: joblib\n")
+    mine = ("dry_run=true", "--config-dir", "mine")
+    code, _, err = sweep(tmp_path, "+ablation=here,there", *mine)
+    assert code == 1
+    assert "a launcher is chosen once for a sweep" in err
+
+
+@pytest.mark.parametrize(
+    ("arguments", "threads", "at_once", "cores"),
+    [
+        (["hydra/launcher=basic"], 0, 1, 8),
+        (["hydra/launcher=basic"], 3, 1, 3),
+        (["hydra/launcher=joblib"], 0, 8, 1),
+        (["hydra/launcher=joblib"], 4, 2, 4),
+        (["hydra/launcher=joblib", "hydra.launcher.n_jobs=2"], 0, 2, 4),
+        (["hydra/launcher=joblib", "hydra.launcher.n_jobs=-3"], 0, 6, 1),
+        (["hydra/launcher=joblib", "hydra.launcher.n_jobs=99"], 0, 99, 1),
+        (["hydra/launcher=submitit_local"], 0, 8, 1),
+        (["hydra/launcher=submitit_local"], 3, 2, 3),
+        (["hydra/launcher=submitit_local", "hydra.launcher.cpus_per_task=4"], 0, 2, 4),
+        (["hydra/launcher=submitit_local", "hydra.launcher.cpus_per_task=16"], 0, 1, 16),
+        (["hydra/launcher=submitit_slurm"], 0, None, 1),
+        (["hydra/launcher=submitit_slurm"], 4, None, 4),
+        (["hydra/launcher=submitit_slurm", "hydra.launcher.cpus_per_task=2"], 0, None, 2),
+    ],
+)
+def test_cores_are_divided_among_the_cells_that_run_at_once(
+    composed: Callable[..., DictConfig],
+    arguments: list[str],
+    threads: int,
+    at_once: int | None,
+    cores: int,
+) -> None:
+    allowed = capacity(composed(*arguments).hydra.launcher, threads, machine=8)
+    assert allowed.at_once == at_once
+    assert allowed.threads(1000, machine=8) == cores
+
+
+def test_a_last_cell_has_the_machine_to_itself(composed: Callable[..., DictConfig]) -> None:
+    allowed = capacity(composed("hydra/launcher=joblib").hydra.launcher, 0, machine=8)
+    assert allowed.threads(1, machine=8) == 8
+    assert allowed.threads(3, machine=8) == 2
+
+
+def test_no_jobs_at_all_are_refused(composed: Callable[..., DictConfig]) -> None:
+    launcher = composed("hydra/launcher=joblib", "hydra.launcher.n_jobs=0").hydra.launcher
+    with pytest.raises(XrgsError, match="n_jobs=0"):
+        capacity(launcher, 0, machine=8)
+
+
+@pytest.fixture
+def composed(tmp_path: Path) -> Callable[..., DictConfig]:
+    """(*overrides) -> a sweep's config with Hydra's own part, its store in the test's folder."""
+
+    def compose(*overrides: str) -> DictConfig:
+        config.register()
+        with hydra.initialize_config_dir(str(config.CONF_DIR), version_base="1.3"):
+            store = f"store={launchers._quoted(tmp_path / 's')}"
+            return hydra.compose("config", [store, *overrides], return_hydra_config=True)
+
+    return compose
+
+
+class Fake:
+    """A launcher that begins two jobs at a time, and breaks where one of them is a fatal one."""
+
+    def __init__(self, store: Store, fatal: set[str]) -> None:
+        self.store, self.fatal = store, fatal
+        self.launches: list[list[str]] = []
+        self.given: list[Sequence[str]] = []
+
+    def launch(self, jobs: Sequence[Sequence[str]], first: int) -> list[JobReturn]:
+        assert first == len(self.given)
+        names = [job[0].partition("=")[2] for job in jobs]
+        self.launches.append(names)
+        self.given += jobs
+        for start in range(0, len(names), 2):
+            pair = names[start : start + 2]
+            if "nothing" in self.fatal:
+                raise RuntimeError("no such cluster\nand more")
+            for name in pair:
+                self.store.cell(name).begin({}, {})
+            if self.fatal & set(pair):
+                raise RuntimeError("a worker was killed")
+            for name in pair:
+                finish(self.store, name)
+        return [JobReturn(status=JobStatus.COMPLETED, _return_value="done") for _ in jobs]
+
+
+def finish(store: Store, name: str) -> None:
+    cell = store.cell(name)
+    (cell.path / "scores.csv").write_text("view\na\n")
+    write_json(cell.path / "summary.json", {})
+    cell.finish(["a"], 1)
+
+
+@pytest.fixture
+def launch(
+    composed: Callable[..., DictConfig],
+    compose: Callable[..., config.Conf],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> Callable[..., tuple[dict[str, str], Fake, list[Planned]]]:
+    """(names, fatal, *overrides) -> outcomes when nothing is left to launch, and the launcher."""
+
+    def launched(
+        names: Sequence[str], fatal: set[str], *overrides: str
+    ) -> tuple[dict[str, str], Fake, list[Planned]]:
+        store = Store(tmp_path / "s")
+        store.prepare()
+        fake = Fake(store, fatal)
+        monkeypatch.setattr(Plugins, "instantiate_launcher", lambda *_, **__: fake)
+        conf = compose(f"store={launchers._quoted(tmp_path / 's')}")
+        cells = [Planned(Wish(n, "", (f"x={n}",), ()), conf, "v", n) for n in names]
+        launches = Launches(HydraContext(None, None), len, composed(*overrides))
+        outcomes = launches.run(cells, store)
+        while left := [cell for cell in cells if outcomes[str(cell.cell_id)] == LOST]:
+            assert len(fake.launches) < 20
+            outcomes |= launches.run(left, store)
+        return outcomes, fake, cells
+
+    return launched
+
+
+def test_what_a_broken_launcher_drops_is_launched_again(
+    launch: Callable[..., tuple[dict[str, str], Fake, list[Planned]]],
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    outcomes, fake, _ = launch("abcdef", {"c"})
+    assert outcomes == dict.fromkeys("abdef", "done") | {"c": "unfinished"}
+    # What was begun with the fatal one comes again after all others, and alone.
+    assert fake.launches == [list("abcdef"), list("ef"), ["c"], ["d"], ["c"]]
+    err = capsys.readouterr().err
+    assert "RuntimeError: a worker was killed" in err
+    assert "of its 6 cells are left:" in err
+    assert "lost 3 times, not tried again" in err
+
+
+def test_a_launcher_that_begins_nothing_ends_the_sweep_with_its_own_words(
+    launch: Callable[..., tuple[dict[str, str], Fake, list[Planned]]],
+) -> None:
+    with pytest.raises(XrgsError, match="RuntimeError: no such cluster"):
+        launch("abc", {"nothing"})
+
+
+def test_submitit_has_no_more_jobs_at_a_time_than_there_are_cores(
+    launch: Callable[..., tuple[dict[str, str], Fake, list[Planned]]],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(launchers, "usable_cores", lambda: 4)
+    local = ("hydra/launcher=submitit_local", "hydra.launcher.cpus_per_task=2")
+    _, fake, _ = launch("abcde", set(), *local)
+    assert fake.launches == [["a", "b"], ["c", "d"], ["e"]]
+    assert all("threads=2" in job for job in fake.given)
