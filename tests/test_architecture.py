@@ -43,6 +43,7 @@ FLOW = (
     ("estimate", "job", "status"),
     ("plan",),
     ("live",),
+    ("rerun",),
     ("report",),
     ("data",),
     ("bench",),
@@ -109,11 +110,11 @@ def test_the_model_knows_nothing_of_experiments() -> None:
 
 
 @pytest.mark.parametrize(
-    "module", [f"xrgs.{name}" for name in ("cli", "job", "report", "status", "sweep", "variant")]
+    "name", ["cli", "job", "live", "report", "rerun", "status", "sweep", "variant"]
 )
-def test_planning_and_reporting_run_without_torch(module: str) -> None:
+def test_planning_and_reporting_run_without_torch(name: str) -> None:
     heavy = {"torch", "pycolmap", "kornia", "skimage"}
-    script = f"import sys, {module}; print(sorted({heavy!r} & set(sys.modules)))"
+    script = f"import sys, xrgs.{name}; print(sorted({heavy!r} & set(sys.modules)))"
     done = subprocess.run(
         [sys.executable, "-P", "-c", script], capture_output=True, text=True, check=True
     )

@@ -54,7 +54,7 @@ def cells(compose: Callable[..., Conf], tmp_path: Path) -> Cells:
 def test_cells_are_told_from_their_files_alone(cells: Cells) -> None:
     cells.begin("failed")
     cells.store.cell("failed").fail("it raised")
-    view = View(cells.store)
+    view = View(cells.store.cells)
     names = ("a", "b", "c")
     plan = [cells.plan(name) for name in names] + [
         cells.plan("failed", "failed"),
@@ -82,7 +82,7 @@ def test_cells_are_told_from_their_files_alone(cells: Cells) -> None:
 
 
 def test_another_sweeps_cell_is_waited_for(cells: Cells) -> None:
-    view = View(cells.store)
+    view = View(cells.store.cells)
     view.watch([cells.plan("a"), cells.plan("b", "running")])
     cells.begin("b")
     cells.step("b", 90, 0.1)
@@ -100,7 +100,7 @@ def test_what_is_tried_again_is_not_over_before_it_is(cells: Cells) -> None:
         cells.store.cell(name).fail("once")
     conf = replace(cells.conf, retry="failed")
     plan = [replace(cells.plan(name, name), conf=conf) for name in ("failed", "corrupt")]
-    view = View(cells.store)
+    view = View(cells.store.cells)
     view.watch(plan)
     assert str(view.look()) == "0 of 2 cells done"
     cells.begin("failed")
@@ -118,7 +118,7 @@ def test_what_a_killed_process_left_is_no_sign_of_life(
     for name in ("before", "now"):
         cells.begin(name)
     cells.step("before", 5, 1.0)
-    view = View(cells.store)
+    view = View(cells.store.cells)
     view.watch([cells.plan("before", "unfinished"), cells.plan("now")])
     assert not view.look().running
     cells.step("now", 5, 1.0)
@@ -146,7 +146,7 @@ def test_a_log_has_a_line_when_a_cell_is_over_and_the_last_at_the_end(
     cells: Cells, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setattr(live, "_LOOK_S", 0.01)
-    with View(cells.store) as view:
+    with View(cells.store.cells) as view:
         view.watch([cells.plan("a"), cells.plan("b"), cells.plan("old", "done")])
         for name in ("a", "b"):
             cells.begin(name)
@@ -163,9 +163,9 @@ def test_a_log_has_a_line_when_a_cell_is_over_and_the_last_at_the_end(
 def test_a_finished_plan_is_told_nothing_of(
     cells: Cells, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    with View(cells.store) as view:
+    with View(cells.store.cells) as view:
         view.watch([cells.plan("a", "done"), cells.plan("b", "failed")])
-    with View(cells.store):
+    with View(cells.store.cells):
         pass
     assert capsys.readouterr().err == ""
 
@@ -180,7 +180,7 @@ def test_a_terminal_has_one_line_which_is_gone_at_the_end(
     terminal = Terminal()
     monkeypatch.setattr("sys.stderr", terminal)
     monkeypatch.setattr(live, "_LOOK_S", 0.01)
-    with View(cells.store) as view:
+    with View(cells.store.cells) as view:
         view.watch([cells.plan("a"), cells.plan("b")])
         cells.begin("a")
         cells.step("a", 50, 1.0)
@@ -195,7 +195,7 @@ def test_a_terminal_has_one_line_which_is_gone_at_the_end(
 
 
 def test_a_store_out_of_reach_is_looked_at_again(cells: Cells) -> None:
-    view = View(cells.store)
+    view = View(cells.store.cells)
     view.watch([cells.plan("a")])
     gone = cells.store.path.with_name("gone")
     cells.store.path.rename(gone)

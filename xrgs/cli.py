@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import sys
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import cast
 
 import hydra
 from hydra.core.hydra_config import HydraConfig
 from hydra.errors import HydraException
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import MISSING, DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from xrgs import config
@@ -41,6 +41,9 @@ Commas make axes, +ablation=[a,b] stacks. Finished cells are found in the store 
   limits.minutes=N  limits.memory_gb=N    a cell beyond is ended and failed
   retry=failed      fail_fast=true        run failed cells again; stop after the first
 
+xrgs-sweep rerun=CELL_FOLDER [out=FOLDER] [store=FOLDER] [threads=N] [scene.path=FOLDER]
+  trains a finished cell again, beside it: says "the same, bit for bit", or what differs
+
 --cfg job prints every key with its value; --hydra-help tells of Hydra's own flags.
 """
 
@@ -58,6 +61,9 @@ def sweep() -> None:
         groups = ("ablation", "scene", "preset", "sweeps")
         print(_HELP.format(**{group: _choices(group) for group in groups}))  # noqa: T201
         return
+    if any(argument.startswith("rerun=") for argument in sys.argv[1:]):
+        _rerun(sys.argv[1:])
+        return
     config.register()
     # `ablation` is not in the defaults list, so Hydra wants the plus; people forget it.
     sys.argv[1:] = ["+" + a if a.startswith("ablation=") else a for a in sys.argv[1:]]
@@ -65,10 +71,40 @@ def sweep() -> None:
         _sweep()
 
 
-def _line(error: Exception) -> str:
-    """What is wrong, in one line that names the argument."""
-    line, key = str(error).splitlines()[0], getattr(error, "full_key", None)
-    return line if not key or key in line else f"{key}: {line}"
+@dataclass
+class PhotographsConf:
+    """Where photographs are now."""
+
+    path: str | None = None
+
+
+@dataclass
+class RerunConf:
+    """Arguments of `xrgs-sweep rerun=...`; with any other value it would be another cell."""
+
+    rerun: str = MISSING
+    out: str | None = None
+    store: str | None = None
+    threads: int | None = None
+    scene: PhotographsConf = field(default_factory=PhotographsConf)
+
+
+def _rerun(arguments: list[str]) -> None:
+    from xrgs.rerun import rerun
+
+    try:
+        given = OmegaConf.from_dotlist(arguments)
+        conf = OmegaConf.merge(OmegaConf.structured(RerunConf), given)
+        out, store = (Path(path) if path else None for path in (conf.out, conf.store))
+        again = rerun(Path(conf.rerun), out, store, conf.threads, conf.scene.path)
+    except OmegaConfBaseException as error:
+        taken = "rerun= takes out=, store=, threads= and scene.path="
+        sys.exit(f"xrgs-sweep: {config.one_line(error)} ({taken})")
+    except XrgsError as error:
+        sys.exit(f"xrgs-sweep: {error}")
+    print(again)  # noqa: T201
+    if again.differences:
+        sys.exit(1)
 
 
 @dataclass
@@ -92,7 +128,7 @@ def report() -> None:
         out = Path(conf.out) if conf.out else None
         print(build(Path(conf.store), conf.sweep, out).text)  # noqa: T201
     except (XrgsError, OmegaConfBaseException) as error:
-        sys.exit(f"xrgs-report: {_line(error)}")
+        sys.exit(f"xrgs-report: {config.one_line(error)}")
 
 
 @dataclass
@@ -113,7 +149,7 @@ def status() -> None:
         conf = OmegaConf.merge(OmegaConf.structured(StatusConf), given)
         print(describe(read(Path(conf.store), verify=conf.verify)))  # noqa: T201
     except (XrgsError, OmegaConfBaseException) as error:
-        sys.exit(f"xrgs-status: {_line(error)}")
+        sys.exit(f"xrgs-status: {config.one_line(error)}")
 
 
 def bench() -> None:
@@ -126,7 +162,7 @@ def bench() -> None:
 
         print(run(cast("Settings", settings)))  # noqa: T201
     except (XrgsError, OmegaConfBaseException) as error:
-        sys.exit(f"xrgs-bench: {_line(error)}")
+        sys.exit(f"xrgs-bench: {config.one_line(error)}")
 
 
 _DATA_HELP = """\
@@ -162,7 +198,7 @@ def data() -> None:
         else:
             raise XrgsError(f"{' '.join(words)}: unknown; xrgs-data --help lists what there is")
     except (XrgsError, OmegaConfBaseException, HydraException) as error:
-        sys.exit(f"xrgs-data: {_line(error)}")
+        sys.exit(f"xrgs-data: {config.one_line(error)}")
 
 
 def _none_left(values: dict[str, str]) -> None:

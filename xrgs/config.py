@@ -6,12 +6,14 @@ The model's own fields are in `xrgs.splat.settings`, which knows nothing of expe
 
 from __future__ import annotations
 
+import json
 from dataclasses import dataclass, field, is_dataclass
 from pathlib import Path
 from typing import Any
 
 from hydra.core.config_store import ConfigStore
 from omegaconf import MISSING, DictConfig, OmegaConf
+from omegaconf.errors import OmegaConfBaseException
 
 from xrgs.errors import XrgsError
 from xrgs.splat.backend import CHOICES
@@ -358,3 +360,23 @@ def from_dict(values: Any) -> Conf:
     if not isinstance(conf, Conf):
         raise TypeError(f"expected a config of schema Conf, got {type(conf).__name__}")
     return conf
+
+
+def from_file(file: Path) -> Conf:
+    """The config that a cell's folder holds, as JSON.
+
+    Raises:
+        XrgsError: it can't be read, or is of another schema; the message names the file and key.
+    """
+    try:
+        return from_dict(json.loads(file.read_text(encoding="utf-8")))
+    except OmegaConfBaseException as error:
+        raise XrgsError(f"{file}: {one_line(error)} (another version's config?)") from error
+    except (OSError, ValueError, TypeError) as error:
+        raise XrgsError(f"{file}: no config ({error})") from error
+
+
+def one_line(error: Exception) -> str:
+    """What is wrong, in one line that names the key."""
+    line, key = str(error).splitlines()[0], getattr(error, "full_key", None)
+    return line if not key or key in line else f"{key}: {line}"

@@ -20,13 +20,14 @@ from tqdm import tqdm
 
 from xrgs import progress
 from xrgs.progress import duration, say
+from xrgs.store import CellFolder
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
+    from pathlib import Path
 
     from xrgs.plan import Planned
     from xrgs.progress import Progress
-    from xrgs.store import Store
 
 #: Seconds between looks; of the time, looking takes no more than one part in so many, however slow
 #: the store is.
@@ -132,8 +133,13 @@ class Look:
 class View:
     """Shows a sweep as long as `with` lasts: a bar on a terminal, in a log a line now and then."""
 
-    def __init__(self, store: Store) -> None:
-        self._store = store
+    def __init__(self, cells: Path) -> None:
+        """Nothing is shown before `watch`.
+
+        Args:
+            cells: the folder that their folders are in.
+        """
+        self._cells = cells
         self._plan: tuple[Planned, ...] = ()
         self._retry = False
         self._before: dict[str, _Mark] = {}
@@ -156,7 +162,7 @@ class View:
             name, state = cell.cell_id, cell.state.name
             if name is None or name in self._before:
                 continue
-            folder = self._store.cell(name)
+            folder = self._folder(name)
             self._before[name] = None if state == "absent" else _mark(folder.status)
             if state not in {"absent", "running"}:  # what a killed try left is no sign of life
                 self._moved[name] = (_mark(folder.progress), -math.inf)
@@ -177,10 +183,13 @@ class View:
             if look.over != self._told:
                 say(str(look))
 
+    def _folder(self, name: str) -> CellFolder:
+        return CellFolder(self._cells / name)
+
     def look(self) -> Look:
         """Where the cells stand now."""
         try:
-            with os.scandir(self._store.cells) as entries:
+            with os.scandir(self._cells) as entries:
                 begun = {entry.name for entry in entries}
         except OSError:
             begun = set()
@@ -222,7 +231,7 @@ class View:
         if name is None or name not in begun:
             return ""
         if name not in self._over:
-            folder = self._store.cell(name)
+            folder = self._folder(name)
             if (now := _mark(folder.status)) is None or now == self._before[name]:
                 return ""
             self._over[name] = "done" if folder.state(verify=False).name == "done" else "failed"
@@ -231,7 +240,7 @@ class View:
     def _progress(self, cell: Planned, begun: set[str]) -> Progress | None:
         if cell.cell_id is None or cell.cell_id not in begun:
             return None
-        file = self._store.cell(cell.cell_id).progress
+        file = self._folder(cell.cell_id).progress
         mark, known = _mark(file), self._moved.get(cell.cell_id)
         if mark is None:
             return None

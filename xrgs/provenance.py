@@ -36,6 +36,15 @@ def _cpu() -> str:
     return names[0] if names else platform.machine()
 
 
+def _instruction_set(backend: str) -> str | None:
+    """Of the native kernels; torch's own follow the processor."""
+    if backend != "native":
+        return None
+    from xrgs import _native
+
+    return str(_native.isa())
+
+
 def collect(threads: int, backend: str) -> dict[str, Any]:
     """The program, its libraries, the machine and the moment, as plain JSON values.
 
@@ -59,6 +68,7 @@ def collect(threads: int, backend: str) -> dict[str, Any]:
         "cores": usable_cores(),
         "threads": threads,
         "backend": backend,
+        "instruction_set": _instruction_set(backend),
         "lpips_weights_sha256": None if weights.published() is None else weights.CONTENT_SHA256,
         "started": datetime.now(UTC).isoformat(timespec="seconds"),
     }

@@ -43,7 +43,7 @@ class Status:
     path: Path
     cells: tuple[Seen, ...]
     aside: int
-    """Folders that a later try of the same cell has set aside."""
+    """Folders that a later try of the same cell has set aside, and those of reruns."""
     variants: tuple[str, ...]
     sweeps: int
     sizes: Mapping[str, int]
@@ -66,7 +66,7 @@ def read(path: Path, *, verify: bool = False) -> Status:
     names, sweeps = _names(path / "sweeps")
     held = locks.holders(store.locks)
     ids = sorted(entry.name for entry in os.scandir(store.cells) if entry.is_dir())
-    cells = [name for name in ids if ".aside-" not in name]
+    cells = [name for name in ids if "." not in name]
     return Status(
         path,
         tuple(_see(store.cell(cell), names.get(cell), held, verify=verify) for cell in cells),
@@ -157,7 +157,7 @@ def describe(status: Status) -> str:
     parts = [f"{counts[state]} {state}" for state in _STATES if counts[state]]
     lines = [f"store {status.path}: {len(status.cells)} cells", "  " + (", ".join(parts) or "none")]
     if status.aside:
-        lines.append(f"  {status.aside} folders of earlier tries set aside (*.aside-N)")
+        lines.append(f"  {status.aside} folders of earlier tries and reruns (*.*)")
     lines.append(f"  {len(status.variants)} variants, {status.sweeps} sweeps recorded")
     sizes = ", ".join(f"{name} {_size(size)}" for name, size in sorted(status.sizes.items()))
     lines += [f"  {_size(sum(status.sizes.values()))} on disk: {sizes}", ""]

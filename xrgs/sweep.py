@@ -153,7 +153,7 @@ class Study:
         if dry:
             return False
         _tidy({cell.cell_id for cell in plan if cell.cell_id and cell.state.name == "done"}, store)
-        with View(store) as view:
+        with View(store.cells) as view:
             plan = self._worked_off(plan, store, view)
         plan = [_without_reference(cell) for cell in plan]
         sweep_id = store.write_sweep(arguments, record(plan))
