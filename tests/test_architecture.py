@@ -26,8 +26,8 @@ ONLY_IN = {
 }
 #: Rooms in the order that data walks through them: an import never points to a later one.
 FLOW = (
-    ("errors", "files", "hashing", "locks", "machine", "splat", "stop", "supervise", "weights"),
-    ("checkpoint", "progress"),
+    ("errors", "files", "foreign", "hashing", "machine", "npz", "splat", "stop"),
+    ("checkpoint", "locks", "progress", "records", "supervise", "weights"),
     ("images", "alignment", "split", "views", "degrade"),
     ("config", "scenes", "sfm"),
     ("photographs", "tagging"),

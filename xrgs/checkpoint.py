@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any, Protocol
 import numpy as np
 import torch
 
+from xrgs import foreign, npz
 from xrgs.errors import XrgsError
 from xrgs.files import replacing
 
@@ -164,18 +165,9 @@ def _without_tensors(state: State, path: str, arrays: dict[str, NDArray[Any]]) -
 
 
 def _load(file: Path) -> State:
-    with zipfile.ZipFile(file) as archive:
-        # Stored, so that the file's size bounds the memory that a stranger's can ask for.
-        if any(member.compress_type != zipfile.ZIP_STORED for member in archive.infolist()):
-            raise ValueError("a member is compressed")
-        damaged = archive.testzip()  # every checksum, before any of it is believed
-        if damaged is not None:
-            raise ValueError(f"{damaged} is damaged")
-        arrays: dict[str, NDArray[Any]] = {}
-        for name in archive.namelist():
-            with archive.open(name) as member:
-                arrays[name] = np.lib.format.read_array(member, allow_pickle=False)
-    state: State = json.loads(arrays.pop(_PLAIN).tobytes())
+    with foreign.open_regular(file) as stream:
+        arrays = npz.read(stream)
+    state: State = foreign.parse_json(arrays.pop(_PLAIN).tobytes())
     _with_tensors(state, arrays)
     return state
 

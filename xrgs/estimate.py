@@ -9,7 +9,7 @@ from statistics import fmean
 from typing import TYPE_CHECKING, Any
 
 from xrgs.hashing import canonical
-from xrgs.store import StoreError
+from xrgs.records import StoreError
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping
@@ -30,7 +30,7 @@ class Past:
                 identity, summary = cell.identity(), cell.summary()
                 a_step = summary["training_time_s"] / identity["train"]["steps"]
                 names = _likenesses(identity)
-            except (StoreError, KeyError, TypeError, ValueError, ZeroDivisionError):
+            except (StoreError, ArithmeticError, KeyError, TypeError, ValueError):
                 continue
             for name in names:
                 self._times[name].append(a_step)

@@ -27,6 +27,7 @@ _TRAINING_CODE = (
     "evaluate.py",
     "lpips.py",
     "metrics.py",
+    "npz.py",
     "train.py",
     "weights.py",
 )

@@ -17,6 +17,9 @@ from xrgs.errors import XrgsError
 
 Photo = NDArray[np.float32]  # [H, W, 3]
 
+#: PIL goes by the content and not by the ending, and some of the formats that it knows are programs
+#: for others to run.
+_FORMATS = ("BMP", "JPEG", "PNG", "TIFF", "WEBP")
 _EXIF_ORIENTATION = 0x0112
 _EXIF_CAMERA = (0x010F, 0x0110)  # make, model
 _EXIF_DETAILS = 0x8769
@@ -88,6 +91,10 @@ class Lens:
         return source
 
 
+def _header(path: Path) -> Image.Image:
+    return Image.open(path, formats=_FORMATS)
+
+
 def size(path: Path) -> tuple[int, int]:
     """Width and height as `read` would give them, from the header alone.
 
@@ -95,10 +102,10 @@ def size(path: Path) -> tuple[int, int]:
         ImageError: the header can't be read.
     """
     try:
-        with Image.open(path) as image:
+        with _header(path) as image:
             turned = image.getexif().get(_EXIF_ORIENTATION, 1) >= 5
             return (image.height, image.width) if turned else (image.width, image.height)
-    except (OSError, SyntaxError, ValueError, Image.DecompressionBombError) as error:
+    except Exception as error:  # of a damaged file PIL raises nearly any
         raise ImageError(f"{path}: not a readable image ({error})") from error
 
 
@@ -109,11 +116,11 @@ def camera_mark(path: Path) -> str:
         ImageError: the header can't be read.
     """
     try:
-        with Image.open(path) as image:
+        with _header(path) as image:
             exif = image.getexif()
             details = exif.get_ifd(_EXIF_DETAILS)
             told = [exif.get(tag) for tag in _EXIF_CAMERA] + [details.get(t) for t in _EXIF_FOCAL]
-    except (OSError, SyntaxError, ValueError, Image.DecompressionBombError) as error:
+    except Exception as error:  # of a damaged file PIL raises nearly any
         raise ImageError(f"{path}: not a readable image ({error})") from error
     return "/".join("" if value is None else str(value).strip("\0 ") for value in told).strip("/")
 
@@ -124,16 +131,24 @@ def read(path: Path) -> Photo:
     Raises:
         ImageError: unreadable, truncated, or of more than 8 bits a channel.
     """
+    photo: Photo = np.asarray(opened(path), dtype=np.float32) / np.float32(255)
+    return photo
+
+
+def opened(path: Path) -> Image.Image:
+    """What `read` reads, as PIL has it.
+
+    Raises:
+        ImageError: as of `read`.
+    """
     try:
-        with Image.open(path) as image:
+        with _header(path) as image:
             image.load()
             if image.mode[0] in "IF":
-                raise ImageError(f"{path}: {image.mode} pixels; only 8 bits a channel are read")
-            upright = ImageOps.exif_transpose(image).convert("RGB")
-    except (OSError, SyntaxError, ValueError, Image.DecompressionBombError) as error:
+                raise ValueError(f"{image.mode} pixels; only 8 bits a channel are read")
+            return ImageOps.exif_transpose(image).convert("RGB")
+    except Exception as error:  # of a damaged file PIL raises nearly any
         raise ImageError(f"{path}: unreadable or truncated image ({error})") from error
-    photo: Photo = np.asarray(upright, dtype=np.float32) / np.float32(255)
-    return photo
 
 
 def save(path: Path, image: Photo) -> None:

@@ -23,6 +23,7 @@ from dataclasses import asdict, dataclass, replace
 from functools import cache
 from pathlib import Path
 
+from xrgs import foreign
 from xrgs.files import write_json
 
 #: Seconds from one sign of life to the next, and after how many without one an owner elsewhere is
@@ -175,9 +176,12 @@ def _make(file: Path) -> Owner:
 
 def _owner(file: Path) -> Owner | None:
     try:
-        return Owner(**json.loads(file.read_text(encoding="utf-8")))
+        owner = Owner(**foreign.parse_json(foreign.read_bytes(file)))
     except (OSError, ValueError, TypeError):
         return None
+    texts = {"host", "boot"}
+    right = all(type(v) is (str if k in texts else int) for k, v in vars(owner).items())
+    return owner if right else None
 
 
 def _living(file: Path) -> bool:

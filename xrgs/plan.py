@@ -6,6 +6,7 @@ from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 
 from xrgs import scenes
+from xrgs.foreign import printable
 from xrgs.hashing import digest
 from xrgs.identity import cell_identity
 from xrgs.progress import duration
@@ -122,7 +123,7 @@ def describe(plan: Sequence[Planned]) -> str:
     lines = [f"plan: {len(plan)} cells, {done} done{_left(plan)}"]
     for cell in plan:
         state = "failed" if cell.error else "waits" if cell.waits else cell.state.name
-        reason = (cell.error or cell.state.reason or "").partition("\n")[0]
+        reason = printable((cell.error or cell.state.reason or "").partition("\n")[0])
         identity = cell.cell_id or ("no count yet" if cell.waits else "variant not built")
         wanted = not cell.error and state != "done"
         time_left = duration(cell.seconds) if wanted else ""

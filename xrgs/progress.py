@@ -8,7 +8,6 @@ cells may be on other machines, and many of them are shown in one line.
 from __future__ import annotations
 
 import io
-import json
 import math
 import sys
 from contextlib import contextmanager, suppress
@@ -18,6 +17,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 from tqdm import tqdm
 
+from xrgs import foreign
 from xrgs.files import write_json
 
 if TYPE_CHECKING:
@@ -34,6 +34,8 @@ _T = TypeVar("_T")
 _BAR_S, _FILE_S, _LINE_S = 0.5, 2.0, 60.0
 #: What is over sooner, s, gets no bar.
 _SHORT_S = 2.0
+#: Of what is read of such a file.
+_MOST_BYTES = 1 << 12
 
 _file: ContextVar[Path | None] = ContextVar("file", default=None)
 
@@ -159,7 +161,7 @@ def kept_in(file: Path) -> Iterator[None]:
 def read(file: Path) -> Progress | None:
     """What a process left in a file; None where there is nothing, or nothing that makes sense."""
     try:
-        found = json.loads(file.read_text(encoding="utf-8"))
+        found = foreign.parse_json(foreign.read_bytes(file, _MOST_BYTES))
         total, rate = found["total"], found["rate"]
         return Progress(
             str(found["what"]),

@@ -8,8 +8,11 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 from xrgs import locks
+from xrgs.errors import XrgsError
+from xrgs.foreign import printable
 from xrgs.identity import training_code
-from xrgs.store import State, Store, StoreError, read_json
+from xrgs.records import StoreError, read_json
+from xrgs.store import State, Store
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -63,7 +66,7 @@ def read(path: Path, *, verify: bool = False) -> Status:
     store = Store(path)
     if not store.cells.is_dir():
         raise StoreError(f"store={path}: no store; xrgs-sweep makes one")
-    names, sweeps = _names(path / "sweeps")
+    names, sweeps = _names(store)
     held = locks.holders(store.locks)
     ids = sorted(entry.name for entry in os.scandir(store.cells) if entry.is_dir())
     cells = [name for name in ids if "." not in name]
@@ -77,16 +80,16 @@ def read(path: Path, *, verify: bool = False) -> Status:
     )
 
 
-def _names(sweeps: Path) -> tuple[dict[str, tuple[str, str]], int]:
+def _names(store: Store) -> tuple[dict[str, tuple[str, str]], int]:
     """Scene and label of every cell that a sweep recorded, the latest sweep's; and the sweeps."""
     names: dict[str, tuple[str, str]] = {}
-    files = sorted(sweeps.glob("*.json"), key=lambda file: file.stat().st_mtime_ns)
+    files = sorted((store.path / "sweeps").glob("*.json"), key=lambda file: file.stat().st_mtime_ns)
     for file in files:
         try:
-            for row in read_json(file)["cells"]:
+            for row in store.sweep_record(file.stem)["cells"]:
                 label = " ".join(part for part in (row["label"], row["condition"]) if part)
                 names[row["cell_id"]] = (row["scene"], label)
-        except (StoreError, KeyError, TypeError):
+        except (StoreError, KeyError):
             continue
     return names, len(files)
 
@@ -119,13 +122,13 @@ def _stale(cell: CellFolder) -> tuple[str, ...]:
         identity = cell.identity()
         then: dict[str, Any] = identity["code"]
         now = training_code(identity["splat"]["backend"])
-    except (StoreError, KeyError, TypeError):
+        if then == now:
+            return ()
+        return tuple(
+            sorted(file for file in then.keys() | now.keys() if then.get(file) != now.get(file))
+        )
+    except (XrgsError, AttributeError, KeyError, TypeError, ValueError):
         return ("identity.json",)
-    if then == now:
-        return ()
-    return tuple(
-        sorted(file for file in then.keys() | now.keys() if then.get(file) != now.get(file))
-    )
 
 
 def _bytes(folder: str) -> int:
@@ -181,7 +184,7 @@ def _table(cells: Sequence[Seen]) -> list[str]:
     columns = [c for c in (*_STATES, "stale") if any(row[c] for row in counts.values())]
     rows = [("scene", "label", *columns)]
     rows += [
-        (*key, *(str(row[column] or "") for column in columns))
+        (*map(printable, key), *(str(row[column] or "") for column in columns))
         for key, row in sorted(counts.items())
     ]
     return _aligned(rows) if cells else []
@@ -205,7 +208,7 @@ def _named(state: str, cells: Sequence[Seen]) -> list[str]:
     lines = ["", f"{state}:"]
     for cell in cells[:_NAMED]:
         reason = cell.state.reason.partition("\n")[0]
-        lines.append(f"  {cell.id}  {cell.scene} / {cell.label}  {reason}")
+        lines.append(printable(f"  {cell.id}  {cell.scene} / {cell.label}  {reason}"))
     if len(cells) > _NAMED:
         lines.append(f"  and {len(cells) - _NAMED} more")
     return lines

@@ -7,20 +7,18 @@ other file of the cell: a cell is done when it says so and the files are those t
 
 from __future__ import annotations
 
-import csv
-import json
+import io
 import os
-import shutil
 import stat
 import tempfile
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from xrgs import progress
-from xrgs.errors import XrgsError
+from xrgs import foreign, progress
 from xrgs.files import write_json, write_text
 from xrgs.hashing import canonical, digest, file_digest
+from xrgs.records import StoreError, as_number, read_json, read_object, read_table
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping, Sequence
@@ -41,22 +39,7 @@ _NOT_RESULTS = frozenset(
 #: What a cell that goes on from its checkpoint keeps of the try that was stopped.
 _GOES_ON_WITH = frozenset({_CHECKPOINT, "identity.json", "log.txt"})
 _RECORD_VERSION = 1
-
-
-class StoreError(XrgsError):
-    """The store's folder can't be used, or does not hold what was asked for."""
-
-
-def read_json(path: Path) -> Any:
-    """The JSON in a file.
-
-    Raises:
-        StoreError: the file is missing, unreadable or not JSON; the message names it.
-    """
-    try:
-        return json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError) as error:
-        raise StoreError(f"{path}: {error}") from error
+_MOST_SEED = (1 << 63) - 1
 
 
 @dataclass(frozen=True)
@@ -101,6 +84,8 @@ class CellFolder:
         """
         if not self.path.is_dir():
             return State("absent")
+        if self.path.is_symlink():
+            return State("corrupt", "it is a link: a cell is a folder of its own")
         if not self.status.exists():
             goes_on = "; it goes on from its checkpoint" if self.checkpoint.exists() else ""
             return State("unfinished", f"it was stopped before it ended{goes_on}")
@@ -109,7 +94,7 @@ class CellFolder:
             if status["state"] == "failed":
                 return State("failed", str(status["reason"]))
             self._check(status, verify=verify)
-        except (StoreError, KeyError, TypeError, ValueError, OSError) as error:
+        except (StoreError, AttributeError, KeyError, TypeError, ValueError, OSError) as error:
             return State("corrupt", str(error))
         return State("done")
 
@@ -122,17 +107,33 @@ class CellFolder:
         if status["state"] != "done":
             raise StoreError(f"status.json: unknown state {status['state']!r}")
         for name, entry in status["files"].items():
+            if not foreign.is_inside(name):
+                raise StoreError(f"status.json: {name!r:.80} is no file of this cell")
             if _size(f"{self.path}/{name}") != entry["bytes"]:
                 raise StoreError(f"{name} is missing or has another size")
             hashed = verify and name in _VERIFIED_BY_HASH
             if hashed and file_digest(self.path / name) != entry["sha256"]:
                 raise StoreError(f"{name} has changed since the cell finished")
-        if not verify:
-            return
-        with (self.path / "scores.csv").open(encoding="utf-8", newline="") as stream:
-            views = [row["view"] for row in csv.DictReader(stream)]
-        if views != status["views"]:
+        if verify and [view for view, _ in self.scores()] != status["views"]:
             raise StoreError("scores.csv lacks rows of the views that were to be scored")
+
+    def scores(self) -> list[tuple[str, dict[str, float]]]:
+        """Every test view's name and scores, NaN where there is none.
+
+        Raises:
+            StoreError: they are not there, or are no such table.
+        """
+        file = self.path / "scores.csv"
+        header, rows = read_table(file)
+        views = [row[0] for row in rows]
+        if header[:1] != ["view"] or not all(map(foreign.is_name, views)):
+            raise StoreError(f"{file}: the names of the views can't be")
+        try:
+            values = [map(as_number, row[1:]) for row in rows]
+            found = [dict(zip(header[1:], row, strict=True)) for row in values]
+        except ValueError as error:
+            raise StoreError(f"{file}: {error}") from error
+        return list(zip(views, found, strict=True))
 
     def begin(self, config: Mapping[str, Any], identity: Mapping[str, Any]) -> None:
         """A folder with the cell's config, and nothing else that could be taken for a result.
@@ -161,12 +162,8 @@ class CellFolder:
 
     def _clear(self) -> None:
         for entry in self.path.iterdir():
-            if entry.name in _GOES_ON_WITH:
-                continue
-            if entry.is_dir() and not entry.is_symlink():
-                shutil.rmtree(entry)
-            else:
-                entry.unlink()
+            if entry.name not in _GOES_ON_WITH or entry.is_symlink():
+                foreign.remove(entry)
 
     def finish(self, views: Sequence[str], protocol: int) -> None:
         """Declare the cell done: its files are those that lie here now, without the checkpoint."""
@@ -206,27 +203,32 @@ class CellFolder:
 
     def identity(self) -> dict[str, Any]:
         """What the cell's id is the digest of."""
-        return dict(read_json(self.path / "identity.json"))
+        return read_object(self.path / "identity.json")
 
     def summary(self) -> dict[str, Any]:
         """The efficiency figures of the whole cell."""
-        return dict(read_json(self.path / "summary.json"))
+        return read_object(self.path / "summary.json")
 
     def provenance(self) -> dict[str, Any]:
         """Where, when and with what the cell was run."""
-        return dict(read_json(self.path / "provenance.json"))
+        return read_object(self.path / "provenance.json")
 
     def history(self) -> pd.DataFrame:
-        """One row a logged step."""
+        """One row a logged step.
+
+        Raises:
+            OSError: it can't be read.
+            ValueError: it is no table.
+        """
         import pandas as pd
 
-        return pd.read_csv(self.path / "history.csv")
+        return pd.read_csv(io.BytesIO(foreign.read_bytes(self.path / "history.csv")))
 
 
 def _size(file: str) -> int:
     """Bytes of a regular file, -1 of anything else. A text, for a store asks it of thousands."""
     try:
-        found = os.stat(file)  # noqa: PTH116
+        found = os.lstat(file)
     except OSError:
         return -1
     return found.st_size if stat.S_ISREG(found.st_mode) else -1
@@ -289,7 +291,13 @@ class Store:
             ) from error
 
     def cell(self, cell_id: str) -> CellFolder:
-        """The folder of a cell, which need not exist."""
+        """The folder of a cell, which need not exist.
+
+        Raises:
+            StoreError: that can't be the id of a cell.
+        """
+        if not foreign.is_name(cell_id):
+            raise StoreError(f"{cell_id!r:.80}: no id of a cell")
         return CellFolder(self.cells / cell_id)
 
     def write_sweep(self, command: Sequence[str], cells: Iterable[Mapping[str, Any]]) -> str:
@@ -317,8 +325,36 @@ class Store:
         Raises:
             StoreError: there is no such sweep, or its record is of another version.
         """
-        file = self.path / "sweeps" / f"{sweep_id or self.latest_sweep()}.json"
+        sweep_id = sweep_id or self.latest_sweep()
+        if not foreign.is_name(sweep_id):
+            raise StoreError(f"{sweep_id!r:.80}: no id of a sweep")
+        file = self.path / "sweeps" / f"{sweep_id}.json"
         record = read_json(file)
         if not isinstance(record, dict) or record.get("version") != _RECORD_VERSION:
             raise StoreError(f"{file}: not a sweep record of version {_RECORD_VERSION}")
+        command, cells = record.get("command"), record.get("cells")
+        if not _is_list(command, str) or not isinstance(cells, list):
+            raise StoreError(f"{file}: no command or no cells")
+        wrong = [number for number, row in enumerate(cells) if not _is_row(row)]
+        if wrong:
+            raise StoreError(f"{file}: its cell {wrong[0] + 1} has a value that can't be")
         return record
+
+
+def _is_list(value: object, kind: type) -> bool:
+    return isinstance(value, list) and all(isinstance(inner, kind) for inner in value)
+
+
+def _is_row(row: object) -> bool:
+    """Whether what a sweep's record says of a cell is of the right types, as far as it does."""
+    if not isinstance(row, dict):
+        return False
+    texts = [row.get(key, "") for key in ("scene", "label", "condition")]
+    ids = [row.get(key) for key in ("cell_id", "variant_id", "baseline_id")]
+    seed, error = row.get("seed", 0), row.get("error")
+    return (
+        _is_list([*texts, error or ""], str)
+        and all(one is None or foreign.is_name(one) for one in ids)
+        and type(seed) is int
+        and 0 <= seed <= _MOST_SEED
+    )

@@ -39,7 +39,8 @@ from xrgs.plan import (
     record,
 )
 from xrgs.progress import say as _say
-from xrgs.store import Store, StoreError
+from xrgs.records import StoreError
+from xrgs.store import Store
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping, Sequence

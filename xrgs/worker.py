@@ -21,7 +21,7 @@ from xrgs import supervise
 from xrgs.errors import XrgsError
 from xrgs.files import write_json
 from xrgs.machine import let_openmp_sleep
-from xrgs.store import read_json
+from xrgs.records import read_json
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping

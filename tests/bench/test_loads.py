@@ -64,7 +64,8 @@ def test_a_missing_key_is_named(file: Path, key: str) -> None:
         ("K", np.full((3, 3), np.inf), "K has values that are not finite"),
         ("scales", np.full((150, 3), -1.0), "scales has values below 0"),
         ("opacities", np.full(150, 1.5), "opacities has values outside 0..1"),
-        ("means", np.full((150, 3), "x"), "means must be numbers"),
+        ("means", np.full((150, 3), True), "means must be numbers"),
+        ("means", np.full((150, 3), "x"), "cannot be read as .npz: means.npy: <U1"),
         ("viewmat", 2 * np.eye(4), "viewmat must be a rotation"),
     ],
 )

@@ -184,5 +184,5 @@ def test_names_that_are_too_long_or_of_another_script_are_drawn(
 
 def test_a_view_that_is_gone_is_named(mixed: Variant) -> None:
     mixed.views[2].file.unlink()
-    with pytest.raises(XrgsError, match=r"a\.png: can't be read"):
+    with pytest.raises(XrgsError, match=r"a\.png: unreadable or truncated"):
         contact_sheet(mixed)

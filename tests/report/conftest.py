@@ -50,7 +50,7 @@ class MadeStore:
     ) -> CellFolder:
         """One cell: the made-up baseline's values times `factors`, or `values` outright."""
         cell_id = f"cell{len(self.rows):05d}"
-        variant = variant or f"variant-of-{len(scene)}-{scene[:3]}"
+        variant = variant or f"variant-of-{len(scene)}-{scene[:3]}".replace("/", "_")
         found = SUMMARY | SCORES | (values or {})
         found |= {key: found[key] * factor for key, factor in (factors or {}).items()}
         folder = self.store.cell(cell_id)

@@ -6,12 +6,12 @@ import math
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
-from zipfile import BadZipFile
 
 import numpy as np
 import torch
 from torch import Tensor
 
+from xrgs import foreign, npz
 from xrgs.errors import XrgsError
 from xrgs.splat.cameras import Camera
 
@@ -123,13 +123,13 @@ def read(path: Path) -> Load:
             finite or out of range; the message names the file and the key.
     """
     try:
-        with path.open("rb") as file, np.load(file, allow_pickle=False) as stored:
-            missing = [key for key in _SHAPES if key not in stored.files]
-            if missing:
-                raise XrgsError(f"{path}: lacks {', '.join(missing)}")
-            arrays = {key: stored[key] for key in _SHAPES}
-    except (OSError, ValueError, TypeError, EOFError, BadZipFile) as error:
+        with foreign.open_regular(path) as file:
+            arrays = npz.read(file)
+    except (OSError, ValueError) as error:
         raise XrgsError(f"{path}: cannot be read as .npz: {error}") from error
+    missing = [key for key in _SHAPES if key not in arrays]
+    if missing:
+        raise XrgsError(f"{path}: lacks {', '.join(missing)}")
     count = len(arrays["means"]) if arrays["means"].ndim else 0
     for key, shape in _SHAPES.items():
         _check(path, key, arrays[key], tuple(count if side == "N" else side for side in shape))
@@ -197,7 +197,8 @@ def data_of(folder: Path) -> Dataset:
         XrgsError: the cell isn't done, or its variant isn't in the store.
     """
     from xrgs import dataset, variant
-    from xrgs.store import CellFolder, read_json
+    from xrgs.records import read_json
+    from xrgs.store import CellFolder
 
     state = CellFolder(folder).state()
     if state.name != "done":

@@ -13,9 +13,9 @@ import torch
 
 from xrgs import config, metrics
 from xrgs.bench.loads import data_of
+from xrgs.records import read_json
 from xrgs.splat.backend import resolve_backend
 from xrgs.splat.rasterize import rasterize
-from xrgs.store import read_json
 from xrgs.train import Trained, train
 
 if TYPE_CHECKING:

@@ -9,11 +9,13 @@ from typing import TYPE_CHECKING, Any
 from xrgs import variant, worker
 from xrgs.data.sheet import contact_sheet
 from xrgs.errors import XrgsError
+from xrgs.foreign import printable
+from xrgs.records import read_json
 from xrgs.report.render import Grid, to_text
-from xrgs.store import Store, read_json
+from xrgs.store import Store
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Mapping
+    from collections.abc import Callable, Iterator, Mapping
 
     from xrgs.config import Conf
     from xrgs.views import Variant
@@ -53,14 +55,29 @@ def describe(folder: Path, out: Path | None = None) -> str:
         raise XrgsError(f"{folder}: no such folder; variants are in <store>/variants/")
     if folder.name.startswith("failed-"):
         report = read_json(folder / "report.json")
-        return "\n".join([f"{report.get('scene')}: failed, so there are no views", *_sfm(report)])
+        return _lines(
+            folder, report, lambda: f"{report.get('scene')}: failed, so there are no views"
+        )
     found = variant.load(folder)
     file = out or Path(f"{found.id}.png")
     try:
         contact_sheet(found).save(file, "PNG")
     except OSError as error:
         raise XrgsError(f"out={file}: can't be written ({error})") from error
-    return "\n".join([to_text(views_table(found)), *_sfm(found.report), f"Contact sheet: {file}"])
+    text = _lines(folder, found.report, lambda: to_text(views_table(found)))
+    return f"{text}\nContact sheet: {file}"
+
+
+def _lines(folder: Path, report: Mapping[str, Any], first: Callable[[], str]) -> str:
+    """What there is to say, with how SfM went.
+
+    Raises:
+        XrgsError: the report is none of ours.
+    """
+    try:
+        return "\n".join([first(), *map(printable, _sfm(report))])
+    except (AttributeError, KeyError, TypeError, ValueError) as error:
+        raise XrgsError(f"{folder / 'report.json'}: not a variant's report ({error!r})") from error
 
 
 def views_table(found: Variant) -> Grid:

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 from PIL import Image, ImageDraw, ImageFont
 
-from xrgs.errors import XrgsError
+from xrgs import images
 from xrgs.progress import progress
 
 if TYPE_CHECKING:
@@ -64,11 +64,7 @@ def _tile(view: View, finest: int) -> Image.Image:
     draw = ImageDraw.Draw(tile)
     framed = (0, 0, _TILE[0] - 1, _BOX[1] + 2 * _BORDER - 1)
     draw.rectangle(framed, fill=COLOURS[kind(view)])
-    try:
-        with Image.open(view.file) as opened:
-            image = opened.convert("RGB")
-    except (OSError, ValueError) as error:
-        raise XrgsError(f"{view.file}: can't be read ({error})") from error
+    image = images.opened(view.file)
     whole = _fit(image)
     left = _BORDER + (_BOX[0] - whole.width) // 2
     tile.paste(whole, (left, _BORDER + (_BOX[1] - whole.height) // 2))

@@ -50,10 +50,12 @@ def unpack(archive: Path, folder: str, target: Path) -> None:
                     inside = PurePosixPath(member.filename).relative_to(folder)
                     _write(opened, member, made.joinpath(*inside.parts))
                 made.rename(target)
-    except (zipfile.BadZipFile, EOFError, NotImplementedError, RuntimeError) as error:
-        raise UnpackError(f"{archive}: not a whole zip archive ({error}); delete it") from error
+    except UnpackError:
+        raise
     except OSError as error:
         raise UnpackError(f"{archive}: can't be unpacked into {target} ({error})") from error
+    except Exception as error:  # a damaged archive leads zipfile to nearly any
+        raise UnpackError(f"{archive}: not a whole zip archive ({error}); delete it") from error
 
 
 def _members(opened: zipfile.ZipFile, archive: Path, folder: str) -> list[zipfile.ZipInfo]:

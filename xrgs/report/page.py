@@ -8,11 +8,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from xrgs.files import write_json, write_text
+from xrgs.foreign import one_line
 from xrgs.metrics import METRICS
 from xrgs.report.collect import RECORD_KEYS, ReportError, Sweep, read_sweep
 from xrgs.report.compare import compare
 from xrgs.report.pictures import Picture, draw
-from xrgs.report.render import Grid, markdown, one_line, to_latex, to_markdown, to_text
+from xrgs.report.render import Grid, markdown, to_latex, to_markdown, to_text
 from xrgs.report.tables import Tables
 from xrgs.report.training import table as training_table
 from xrgs.report.training import totals
@@ -58,6 +59,9 @@ def build(store_path: Path, sweep_id: str | None = None, out: Path | None = None
     comparison = compare(sweep.cells, METRICS)
     tables = Tables(comparison)
     folder = out or store.reports / sweep_id
+    links = [place for place in (folder, folder / "figures") if place.is_symlink()]
+    if links and out is None:
+        raise ReportError(f"{links[0]} is a link: remove it, or name a folder with out=...")
     try:
         (folder / "figures").mkdir(parents=True, exist_ok=True)
         pictures = draw(store, comparison, sweep.views, folder / "figures")

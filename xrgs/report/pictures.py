@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import hashlib
+import math
 import re
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-import numpy as np
-from PIL import Image
+import pandas as pd
 
+from xrgs import images
+from xrgs.files import replacing
+from xrgs.images import ImageError
 from xrgs.progress import progress
 from xrgs.report.collect import BASELINE, ReportError
 from xrgs.report.figures import Panel, curves, differing_crop, side_by_side
@@ -17,13 +20,15 @@ from xrgs.report.figures import Panel, curves, differing_crop, side_by_side
 if TYPE_CHECKING:
     from pathlib import Path
 
-    import pandas as pd
+    import numpy as np
     from numpy.typing import NDArray
 
     from xrgs.report.compare import Comparison
     from xrgs.store import Store
 
 _CURVES = {"gaussians": "Gaussians", "loss": "loss of the step's view, as each run weighs it"}
+#: Of a photograph in a picture that is a thousand pixels wide; three are in memory at a time.
+_MOST_PIXELS = 50_000_000
 
 
 @dataclass(frozen=True)
@@ -102,7 +107,8 @@ def _views(
         return Picture(title, None, f"{view}: photograph and renders differ in size")
     file = folder / f"{_stem(pair)}.png"
     note = f"where baseline and {pair['label']} differ most"
-    file.write_bytes(side_by_side(title, panels, differing_crop(baseline, ablation), note))
+    with replacing(file) as stream:
+        stream.write(side_by_side(title, panels, differing_crop(baseline, ablation), note))
     return Picture(title, file)
 
 
@@ -111,11 +117,13 @@ def _training(store: Store, pair: pd.Series, folder: Path) -> Picture:
     runs = []
     for name, key in ((BASELINE, "baseline_id"), (str(pair["label"]), "cell_id")):
         try:
-            runs.append((name, store.cell(pair[key]).history()[["step", *_CURVES]]))
-        except (OSError, ValueError, KeyError):
+            history = store.cell(pair[key]).history()[["step", *_CURVES]]
+            runs.append((name, history.apply(pd.to_numeric)))
+        except (OSError, ValueError, TypeError, KeyError):
             return Picture(title, None, f"cells/{pair[key]}/history.csv can't be read")
     file = folder / f"{_stem(pair)}--training.png"
-    file.write_bytes(curves(title, runs, _CURVES))
+    with replacing(file) as stream:
+        stream.write(curves(title, runs, _CURVES))
     return Picture(title, file)
 
 
@@ -125,13 +133,17 @@ def _title(pair: pd.Series) -> str:
 
 
 def _image(store: Store, path: Path) -> NDArray[np.float32]:
+    inside = path.relative_to(store.path)
+    home = (store.path / inside.parts[0]).resolve()
     try:
-        with Image.open(path) as image:
-            return np.asarray(image.convert("RGB")).astype(np.float32) / np.float32(255)
-    except (OSError, ValueError) as error:
+        if not path.resolve().is_relative_to(home):
+            raise ImageError("a link leads out of the store")
+        if math.prod(images.size(path)) > _MOST_PIXELS:
+            raise ImageError("too large to be drawn")
+        return images.read(path)
+    except (OSError, ImageError) as error:
         # Named inside the store: the report is the same wherever the store lies.
-        inside = path.relative_to(store.path).as_posix()
-        raise ReportError(f"{inside} can't be read") from error
+        raise ReportError(f"{inside.as_posix()} can't be read") from error
 
 
 def _stem(pair: pd.Series) -> str:

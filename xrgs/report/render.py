@@ -6,6 +6,8 @@ import re
 import unicodedata
 from dataclasses import dataclass
 
+from xrgs.foreign import one_line
+
 _MARKDOWN = str.maketrans({char: f"\\{char}" for char in "\\`*_{}[]<>#|~$&"})
 _LATEX = str.maketrans(
     {char: f"\\{char}" for char in "&%$#_{}"}
@@ -35,12 +37,6 @@ class Grid:
     """`l` or `r`, one a column."""
     notes: tuple[str, ...] = ()
     """Lines below the table."""
-
-
-def one_line(text: str) -> str:
-    """`text` without line breaks and characters that can't be printed."""
-    shown = (char if char.isprintable() else " " for char in text)
-    return " ".join("".join(shown).split())
 
 
 def markdown(text: str) -> str:

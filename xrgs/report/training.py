@@ -5,12 +5,12 @@ Steps on views of each tag, what each rule of densification did, and what compon
 
 from __future__ import annotations
 
-import csv
 from statistics import fmean
 from typing import TYPE_CHECKING
 
 import pandas as pd
 
+from xrgs.records import as_number, read_table
 from xrgs.report.render import Grid
 
 if TYPE_CHECKING:
@@ -50,8 +50,7 @@ def totals(store: Store, cells: pd.DataFrame) -> pd.DataFrame:
 
 
 def _totals(cell: CellFolder) -> dict[str, float]:
-    with (cell.path / "history.csv").open(encoding="utf-8", newline="") as stream:
-        header, *rows = csv.reader(stream)
+    header, rows = read_table(cell.path / "history.csv")
     if not rows:
         return {}
     found = {}
@@ -59,11 +58,11 @@ def _totals(cell: CellFolder) -> dict[str, float]:
         if name in _OF_ONE_STEP:
             continue
         if _is_note(name):
-            values = [float(row[at]) for row in rows if row[at]]
+            values = [as_number(row[at]) for row in rows if row[at]]
             if values:
                 found[name] = fmean(values)
         else:
-            found[name] = float(rows[-1][at])  # counted from the first step on
+            found[name] = as_number(rows[-1][at])  # counted from the first step on
     return found
 
 

@@ -6,6 +6,7 @@ the SH rest is channel-major: all coefficients of red, then green, then blue.
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 from typing import BinaryIO
 
@@ -59,17 +60,22 @@ def load_ply(path: Path) -> Gaussians:
     Raises:
         XrgsError: the file is missing, truncated or not such a .ply; the message names it.
     """
+    if not path.is_file():  # a named pipe would be waited for
+        raise XrgsError(f"{path}: cannot be read: there is no such file")
     try:
         with path.open("rb") as file:
             count, names = _read_header(file, path)
-            body = file.read()
+            follow = os.fstat(file.fileno()).st_size - file.tell()
+            if follow != count * len(names) * 4:  # before any of it is read: the file may be huge
+                raise XrgsError(
+                    f"{path}: {count} vertices of {len(names)} floats need "
+                    f"{count * len(names) * 4} bytes, {follow} follow the header"
+                )
+            body = file.read(follow)
     except OSError as error:
         raise XrgsError(f"{path}: cannot be read: {error.strerror}") from error
-    if len(body) != count * len(names) * 4:
-        raise XrgsError(
-            f"{path}: {count} vertices of {len(names)} floats need {count * len(names) * 4} bytes, "
-            f"{len(body)} follow the header"
-        )
+    if len(body) != follow:
+        raise XrgsError(f"{path}: grew shorter while it was read")
     table = np.frombuffer(body, dtype="<f4").reshape(count, len(names))
     if not np.isfinite(table).all():
         raise XrgsError(f"{path}: has values that are not finite")
