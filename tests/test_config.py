@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import asdict, replace
 
 import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
 from omegaconf.errors import OmegaConfBaseException
 
-from xrgs.config import Conf
+from xrgs.config import Conf, from_dict
 from xrgs.errors import XrgsError
 
 
@@ -31,3 +34,14 @@ def test_values_are_of_their_types_and_interpolations_resolved(
     assert type(conf.limits.minutes) is float
     assert conf.scene.path == "data/llff/a"
     assert conf.store == "7"
+
+
+@settings(
+    max_examples=25, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
+)
+@given(text=st.text(alphabet="${}\\\\ab':.,é"))
+def test_a_text_is_taken_as_it_is(baseline: Conf, text: str) -> None:
+    conf = replace(
+        baseline, store=text, scene=replace(baseline.scene, name="${oc.env:HOME}", path=text)
+    )
+    assert from_dict(asdict(conf)) == conf

@@ -6,7 +6,7 @@ The model's own fields are in `xrgs.splat.settings`, which knows nothing of expe
 
 from __future__ import annotations
 
-import json
+import re
 from dataclasses import dataclass, field, is_dataclass
 from pathlib import Path
 from typing import Any
@@ -15,6 +15,7 @@ from hydra.core.config_store import ConfigStore
 from omegaconf import MISSING, DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
+from xrgs import foreign
 from xrgs.errors import XrgsError
 from xrgs.splat.backend import CHOICES
 from xrgs.splat.settings import DensifySettings, OptimizerSettings, RasterSettings
@@ -23,6 +24,8 @@ _HERE = Path(__file__).parent
 #: `conf/` is inside the package in a wheel and beside it in a checkout.
 CONF_DIR = _HERE / "conf" if (_HERE / "conf").is_dir() else _HERE.parent / "conf"
 
+#: Backslashes before it are an escape.
+_INTERPOLATION = re.compile(r"(\\*)\$\{")
 _RETRY = ("none", "failed")
 
 
@@ -355,11 +358,26 @@ def _check_known(value: Any, path: str) -> None:
 
 
 def from_dict(values: Any) -> Conf:
-    """The config that `dataclasses.asdict` wrote."""
-    conf = OmegaConf.to_object(OmegaConf.merge(OmegaConf.structured(Conf), values))
+    """The config that `dataclasses.asdict` wrote, its texts as they are.
+
+    A path may hold a `${`; and what a stranger writes there is not to be looked up in this
+    process's environment.
+    """
+    conf = OmegaConf.to_object(OmegaConf.merge(OmegaConf.structured(Conf), _literal(values)))
     if not isinstance(conf, Conf):
         raise TypeError(f"expected a config of schema Conf, got {type(conf).__name__}")
     return conf
+
+
+def _literal(value: Any) -> Any:
+    """Values in which OmegaConf finds nothing to be resolved."""
+    if isinstance(value, dict):
+        return {name: _literal(inner) for name, inner in value.items()}
+    if isinstance(value, list):
+        return [_literal(inner) for inner in value]
+    if not isinstance(value, str):
+        return value
+    return _INTERPOLATION.sub(lambda found: 2 * found[1] + r"\${", value)
 
 
 def from_file(file: Path) -> Conf:
@@ -369,7 +387,7 @@ def from_file(file: Path) -> Conf:
         XrgsError: it can't be read, or is of another schema; the message names the file and key.
     """
     try:
-        return from_dict(json.loads(file.read_text(encoding="utf-8")))
+        return from_dict(foreign.parse_json(foreign.read_bytes(file)))
     except OmegaConfBaseException as error:
         raise XrgsError(f"{file}: {one_line(error)} (another version's config?)") from error
     except (OSError, ValueError, TypeError) as error:

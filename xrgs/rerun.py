@@ -22,8 +22,9 @@ from xrgs.live import View
 from xrgs.machine import usable_cores
 from xrgs.plan import Planned, Wish
 from xrgs.progress import say
+from xrgs.records import StoreError
 from xrgs.splat.backend import resolve_backend
-from xrgs.store import CellFolder, Store, StoreError
+from xrgs.store import CellFolder, Store
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping
