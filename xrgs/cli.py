@@ -5,7 +5,7 @@ from __future__ import annotations
 import sys
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import cast
+from typing import TYPE_CHECKING, Any, cast
 
 import hydra
 from hydra.core.hydra_config import HydraConfig
@@ -17,6 +17,9 @@ from xrgs import config
 from xrgs.bench.settings import Settings
 from xrgs.errors import XrgsError
 from xrgs.machine import let_openmp_sleep
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
 from xrgs.stop import stoppable
 
 
@@ -107,6 +110,20 @@ def _rerun(arguments: list[str]) -> None:
         sys.exit(1)
 
 
+def _arguments(schema: type[Any], command: Callable[[], None]) -> DictConfig:
+    """What the command line gives; where it asks for help, that is printed and all there is.
+
+    Raises:
+        OmegaConfBaseException: a key that the schema has not, or a value of another type.
+    """
+    known = OmegaConf.structured(schema)
+    if {"-h", "--help"} & set(sys.argv[1:]):
+        usage = (command.__doc__ or "").replace("`", "")
+        print(f"{usage}\n\n{OmegaConf.to_yaml(known)}", end="")  # noqa: T201
+        sys.exit()
+    return cast("DictConfig", OmegaConf.merge(known, OmegaConf.from_dotlist(sys.argv[1:])))
+
+
 @dataclass
 class ReportConf:
     """Arguments of `xrgs-report`."""
@@ -120,11 +137,10 @@ class ReportConf:
 
 def report() -> None:
     """`xrgs-report [store=FOLDER] [sweep=ID] [out=FOLDER]`: the tables, from the store alone."""
-    from xrgs.report import build
-
     try:
-        given = OmegaConf.from_dotlist(sys.argv[1:])
-        conf = OmegaConf.merge(OmegaConf.structured(ReportConf), given)
+        conf = _arguments(ReportConf, report)
+        from xrgs.report import build
+
         out = Path(conf.out) if conf.out else None
         print(build(Path(conf.store), conf.sweep, out).text)  # noqa: T201
     except (XrgsError, OmegaConfBaseException) as error:
@@ -145,19 +161,17 @@ def status() -> None:
     from xrgs.status import describe, read
 
     try:
-        given = OmegaConf.from_dotlist(sys.argv[1:])
-        conf = OmegaConf.merge(OmegaConf.structured(StatusConf), given)
+        conf = _arguments(StatusConf, status)
         print(describe(read(Path(conf.store), verify=conf.verify)))  # noqa: T201
     except (XrgsError, OmegaConfBaseException) as error:
         sys.exit(f"xrgs-status: {config.one_line(error)}")
 
 
 def bench() -> None:
-    """`xrgs-bench [KEY=VALUE]...`: run time against error (`xrgs.bench.settings.Settings`)."""
+    """`xrgs-bench [KEY=VALUE]...`: run time against error. See `xrgs/bench/settings.py`."""
     let_openmp_sleep()  # as training does
     try:
-        given = OmegaConf.from_dotlist(sys.argv[1:])
-        settings = OmegaConf.to_object(OmegaConf.merge(OmegaConf.structured(Settings), given))
+        settings = OmegaConf.to_object(_arguments(Settings, bench))
         from xrgs.bench.run import run
 
         print(run(cast("Settings", settings)))  # noqa: T201
