@@ -49,7 +49,7 @@ def store(tmp_path: Path) -> Store:
     busy = cell(store, "busy")
     write_json(busy.progress, asdict(Progress("training", "step", 20, 80, 3.0)))
     assert locks.acquire(store.locks, "busy") is not None
-    (store.variants / "aa-bb").mkdir()
+    (store.variants / "fa-bb").mkdir()
     (store.variants / "failed-aa").mkdir()
     rows = [("good", "room", "baseline"), ("stale", "room", "consistency"), (None, "fern", "x")]
     store.write_sweep(

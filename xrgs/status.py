@@ -74,10 +74,17 @@ def read(path: Path, *, verify: bool = False) -> Status:
         path,
         tuple(_see(store.cell(cell), names.get(cell), held, verify=verify) for cell in cells),
         len(ids) - len(cells),
-        tuple(sorted(folder.name for folder in store.variants.glob("[!.f]*-*"))),
+        tuple(sorted(_variants(store))),
         sweeps,
         {folder.name: _bytes(folder.path) for folder in os.scandir(path) if folder.is_dir()},
     )
+
+
+def _variants(store: Store) -> Iterator[str]:
+    """Those that are frozen; not what is being built, and not the reports of those that failed."""
+    for folder in store.variants.glob("[!.]*-*"):
+        if not folder.name.startswith("failed-"):
+            yield folder.name
 
 
 def _names(store: Store) -> tuple[dict[str, tuple[str, str]], int]:
