@@ -200,6 +200,8 @@ def test_a_cell_out_of_its_store_takes_its_variant_from_the_one_that_is_named(
     copied = tmp_path / "home" / "mine"
     shutil.copytree(cell.path, copied)
     train()
+    with pytest.raises(XrgsError, match="store="):
+        rerun(copied)
     assert not rerun(copied, store=tmp_path / "s").differences
 
 

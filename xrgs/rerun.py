@@ -6,7 +6,6 @@ its libraries, the machine) is said first; it is why numbers differ, if they do.
 
 from __future__ import annotations
 
-import csv
 import math
 import re
 from dataclasses import asdict, dataclass
@@ -16,6 +15,7 @@ from typing import TYPE_CHECKING, Any
 
 from xrgs import config, provenance, worker
 from xrgs.errors import XrgsError
+from xrgs.foreign import printable
 from xrgs.hashing import digest, file_digest
 from xrgs.identity import cell_identity
 from xrgs.live import View
@@ -71,8 +71,8 @@ def rerun(
     Args:
         folder: the cell's, in a store or not.
         out: where to; `<folder>.rerun-1` (or the next number) where none is given.
-        store: where its variant lies, or is built; the store that the folder is in, else the one
-            that its config names.
+        store: where its variant lies, or is built; the store that the folder is in, where none is
+            given. Its config names one too, but may be a stranger's.
         threads: in place of as many as it was trained with. No number is meant to depend on them.
         photographs: in place of the config's `scene.path`, where the variant has to be built.
 
@@ -82,6 +82,7 @@ def rerun(
     """
     original = CellFolder(folder)
     conf, identity = _read(original)
+    home = Store(store or _store_of(folder))
     conf.threads = conf.threads if threads is None else threads
     conf.scene.path = photographs or conf.scene.path
     if conf.threads < 0:
@@ -93,10 +94,9 @@ def rerun(
     before = [*_own_contradictions(original, identity, now), *_other_program(original, conf, now)]
     for line in _listed(before, "what differs from when it was trained") or ["nothing differs yet"]:
         say(line)
-    home = store or _store_of(folder, conf)
-    _provide(str(identity["variant"]), conf, Store(home))
+    _provide(str(identity["variant"]), conf, home)
     again = CellFolder(out or _next_to(folder))
-    _train(conf, Store(home).variants / str(identity["variant"]), again, now, original)
+    _train(conf, home.variants / str(identity["variant"]), again, now, original)
     return Again(again, before, [*_differences(original, again)])
 
 
@@ -166,13 +166,15 @@ def _changes(then: Any, now: Any, path: str = "") -> Iterator[str]:
 
 
 def _short(value: object) -> str:
-    text = str(value)
+    text = printable(str(value))
     return text if len(text) < 60 else f"{text[:16]}..."
 
 
-def _store_of(folder: Path, conf: Conf) -> Path:
-    above = folder.resolve().parent.parent
-    return above if (above / "variants").is_dir() else Path(conf.store)
+def _store_of(folder: Path) -> Path:
+    cells = folder.resolve().parent
+    if cells.name != "cells":
+        raise XrgsError(f"rerun={folder}: not in a store: name one that has its variant, store=...")
+    return cells.parent
 
 
 def _provide(wanted: str, conf: Conf, store: Store) -> None:
@@ -270,29 +272,21 @@ def _scores(original: CellFolder, again: CellFolder) -> Iterator[str]:
     apart: dict[str, list[float]] = {}
     for view, metric in then.keys() & now.keys():
         a, b = then[view, metric], now[view, metric]
-        if a != b:
-            apart.setdefault(metric, []).append(_apart(a, b))
-    for metric in sorted(apart):
-        most = max(apart[metric])
-        how = f"by at most {most:.3g}" if math.isfinite(most) else "and one of the two has none"
-        yield f"{metric}: differs in {len(apart[metric])} views, {how}"
+        if a != b and not (math.isnan(a) and math.isnan(b)):
+            apart.setdefault(metric, []).append(abs(a - b))
+    for metric, differences in sorted(apart.items()):
+        known = [difference for difference in differences if not math.isnan(difference)]
+        how = f"by at most {max(known):.3g}" if known else "and one of the two has none"
+        yield f"{metric}: differs in {len(differences)} views, {how}"
 
 
-def _apart(a: str, b: str) -> float:
+def _table(cell: CellFolder) -> dict[tuple[str, str], float]:
+    """(view, metric) -> value, NaN where there is none; empty where it can't be read."""
     try:
-        return abs(float(a) - float(b))
-    except ValueError:
-        return math.inf
-
-
-def _table(cell: CellFolder) -> dict[tuple[str, str], str]:
-    """(view, metric) -> value as it is written; empty where it can't be read."""
-    try:
-        with (cell.path / "scores.csv").open(encoding="utf-8", newline="") as stream:
-            rows = list(csv.DictReader(stream))
-        return {(row["view"], name): text for row in rows for name, text in row.items()}
-    except (OSError, ValueError, KeyError, csv.Error):
+        scores = cell.scores()
+    except StoreError:
         return {}
+    return {(view, name): value for view, row in scores for name, value in row.items()}
 
 
 def _number(value: object) -> str:
