@@ -26,7 +26,7 @@ ONLY_IN = {
 }
 #: Rooms in the order that data walks through them: an import never points to a later one.
 FLOW = (
-    ("errors", "files", "foreign", "hashing", "machine", "npz", "splat", "stop"),
+    ("errors", "files", "foreign", "hashing", "machine", "npz", "splat", "stop", "streams"),
     ("checkpoint", "locks", "progress", "records", "supervise", "weights"),
     ("images", "alignment", "split", "views", "degrade"),
     ("config", "scenes", "sfm"),

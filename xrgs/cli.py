@@ -21,6 +21,7 @@ from xrgs.machine import let_openmp_sleep
 if TYPE_CHECKING:
     from collections.abc import Callable
 from xrgs.stop import stoppable
+from xrgs.streams import outlive_readers
 
 
 @hydra.main(version_base="1.3", config_path=str(config.CONF_DIR), config_name="config")
@@ -70,6 +71,7 @@ def sweep() -> None:
     config.register()
     # `ablation` is not in the defaults list, so Hydra wants the plus; people forget it.
     sys.argv[1:] = ["+" + a if a.startswith("ablation=") else a for a in sys.argv[1:]]
+    outlive_readers()
     with stoppable("What is done is kept: the same command goes on from there."):
         _sweep()
 

@@ -22,6 +22,7 @@ from xrgs.errors import XrgsError
 from xrgs.files import write_json
 from xrgs.machine import let_openmp_sleep
 from xrgs.records import read_json
+from xrgs.streams import outlive_readers
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
@@ -130,6 +131,7 @@ _JOBS: dict[str, Callable[[Mapping[str, Any]], dict[str, Any]]] = {
 def main(job: str, request: str, answer: str) -> None:
     """The child: do the job and write the answer, or what went wrong."""
     faulthandler.enable()
+    outlive_readers()
     supervise.follow_parent()
     supervise.offer_to_oom_killer()
     let_openmp_sleep()
