@@ -23,6 +23,7 @@ ONLY_IN = {
     "matplotlib": ("report",),
     "pandas": ("store", "report"),
     "gsplat": (),
+    "tqdm": ("progress", "live"),
 }
 #: Rooms in the order that data walks through them: an import never points to a later one.
 FLOW = (
