@@ -134,10 +134,10 @@ class Sweeps:
             (self.folder / "site" / "sitecustomize.py").write_text(self.faults)
             path = [str(self.folder / "site"), os.environ.get("PYTHONPATH", "")]
             changes["PYTHONPATH"] = os.pathsep.join(filter(None, path))
-        command = [sys.executable, "-c", "from xrgs.cli import sweep; sweep()", *arguments]
+        command = [sys.executable, "-c", "from xrgs.cli import sweep; sweep()"]
         with (printed / "out").open("wb") as out, (printed / "err").open("wb") as err:
             process = subprocess.Popen(
-                [*command, "store=s", "threads=1"],
+                [*command, "store=s", "threads=1", *arguments],
                 cwd=self.folder,
                 env=os.environ | changes,
                 stdout=out,

@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 import json
-import os
 import shutil
-import subprocess
-import sys
 from collections.abc import Callable, Sequence
 from importlib.util import find_spec
 from pathlib import Path
+from typing import Any
 
 import hydra
 import pytest
@@ -25,7 +23,7 @@ from xrgs.launchers import LOST, Launches, capacity
 from xrgs.plan import Planned, Wish
 from xrgs.store import Store
 
-SMOKE = ("scene=motorcycle", "preset=smoke", "train.steps=4", "store=s", "seed=0,1")
+SMOKE = ("scene=motorcycle", "preset=smoke", "train.steps=4", "seed=0,1")
 #: Python loads it in every process of a sweep: each sees two cores, and a cell's process waits for
 #: another cell to have begun; one of them then kills the launcher's worker where that is asked for.
 SITE = """
@@ -34,7 +32,7 @@ from pathlib import Path
 
 os.sched_getaffinity = lambda pid: {0, 1}
 if "xrgs.worker" in sys.orig_argv and "cell" in sys.orig_argv:
-    folder = Path(os.environ["XRGS_TEST_FOLDER"])
+    folder = Path(os.environ["SWEEPS_OF"])
     end = time.monotonic() + 90
     while len(list((folder / "s" / "cells").glob("*/identity.json"))) < 2:
         if time.monotonic() > end:
@@ -50,29 +48,6 @@ if "xrgs.worker" in sys.orig_argv and "cell" in sys.orig_argv:
 """
 
 
-def sweep(folder: Path, *arguments: str, together: bool = False) -> tuple[int, str, str]:
-    """Exit code, stdout and stderr of a sweep with the store `s` in a folder.
-
-    Args:
-        together: no cell goes on before another has begun.
-    """
-    environment = os.environ | {"RAY_USAGE_STATS_ENABLED": "0"}
-    if together:
-        (folder / "site").mkdir()
-        (folder / "site" / "sitecustomize.py").write_text(SITE)
-        path = os.pathsep.join([str(folder / "site"), os.environ.get("PYTHONPATH", "")])
-        environment |= {"PYTHONPATH": path, "XRGS_TEST_FOLDER": str(folder)}
-    done = subprocess.run(
-        [sys.executable, "-c", "from xrgs.cli import sweep; sweep()", *SMOKE, *arguments],
-        cwd=folder,
-        env=environment,
-        capture_output=True,
-        text=True,
-        check=False,
-    )
-    return done.returncode, done.stdout, done.stderr
-
-
 def results(folder: Path) -> dict[str, list[bytes]]:
     """What must be the same however a cell was run, by its id."""
     names = ("scores.csv", "splats.ply", "identity.json")
@@ -81,10 +56,10 @@ def results(folder: Path) -> dict[str, list[bytes]]:
 
 
 @pytest.fixture(scope="module")
-def basic(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def basic(tmp_path_factory: pytest.TempPathFactory, sweeps_in: Callable[..., Any]) -> Path:
     """A folder whose store `s` holds the cells as the basic launcher runs them."""
     folder = tmp_path_factory.mktemp("basic")
-    code, _, err = sweep(folder)
+    code, _, err = sweeps_in(folder).run(*SMOKE)
     assert code == 0, err
     return folder
 
@@ -104,11 +79,17 @@ def folder(basic: Path, tmp_path: Path) -> Path:
     ],
 )
 def test_a_launcher_runs_two_cells_at_once_to_the_results_of_basic(
-    basic: Path, folder: Path, launcher: str, package: str, settings: tuple[str, ...]
+    basic: Path,
+    folder: Path,
+    sweeps_in: Callable[..., Any],
+    launcher: str,
+    package: str,
+    settings: tuple[str, ...],
 ) -> None:
     if find_spec(f"hydra_plugins.hydra_{package}_launcher") is None:
         pytest.skip(f"pip install 'xrgs[{package}]', which is large")
-    code, _, err = sweep(folder, f"hydra/launcher={launcher}", *settings, together=True)
+    given = (f"hydra/launcher={launcher}", *settings, "threads=0")
+    code, _, err = sweeps_in(folder, SITE).run(*SMOKE, *given)
     assert code == 0, err
     assert results(folder) == results(basic)
     for cell in (folder / "s" / "cells").iterdir():
@@ -116,11 +97,11 @@ def test_a_launcher_runs_two_cells_at_once_to_the_results_of_basic(
 
 
 def test_joblib_runs_two_cells_at_once_and_a_killed_worker_costs_nothing(
-    basic: Path, folder: Path
+    basic: Path, folder: Path, sweeps_in: Callable[..., Any]
 ) -> None:
     (folder / "kill").touch()
-    two = ("hydra/launcher=joblib", "hydra.launcher.n_jobs=2")
-    code, _, err = sweep(folder, *two, together=True)
+    two = ("hydra/launcher=joblib", "hydra.launcher.n_jobs=2", "threads=0")
+    code, _, err = sweeps_in(folder, SITE).run(*SMOKE, *two)
     assert code == 0, err
     assert not (folder / "kill").exists()
     assert "TerminatedWorkerError" in err
@@ -129,22 +110,26 @@ def test_joblib_runs_two_cells_at_once_and_a_killed_worker_costs_nothing(
     assert results(folder) == results(basic)
 
 
-def test_a_launcher_that_is_not_installed_is_named_with_its_extra(tmp_path: Path) -> None:
+def test_a_launcher_that_is_not_installed_is_named_with_its_extra(
+    tmp_path: Path, sweeps_in: Callable[..., Any]
+) -> None:
     if find_spec("hydra_plugins.hydra_ray_launcher") is not None:
         pytest.skip("ray is installed")
     ray = ("hydra/launcher=ray", "hydra.launcher.ray.remote.num_cpus=2")
-    code, _, err = sweep(tmp_path, *ray, "dry_run=true")
+    code, _, err = sweeps_in(tmp_path).run(*ray, "dry_run=true")
     assert code == 1
     assert "pip install 'xrgs[ray]'" in err
 
 
-def test_a_launcher_named_in_an_ablation_is_refused(tmp_path: Path) -> None:
+def test_a_launcher_named_in_an_ablation_is_refused(
+    tmp_path: Path, sweeps_in: Callable[..., Any]
+) -> None:
     (tmp_path / "mine" / "ablation").mkdir(parents=True)
     for name in ("here", "there"):
         file = tmp_path / "mine" / "ablation" / f"{name}.yaml"
         file.write_text("# @package _global_\ndefaults:\n  - override /hydra/launcher: joblib\n")
     mine = ("dry_run=true", "--config-dir", "mine")
-    code, _, err = sweep(tmp_path, "+ablation=here,there", *mine)
+    code, _, err = sweeps_in(tmp_path).run("+ablation=here,there", *mine)
     assert code == 1
     assert "a launcher is chosen once for a sweep" in err
 

@@ -6,7 +6,8 @@ A cell's failure is a state and no exception, so that no launcher drops the rest
 from __future__ import annotations
 
 from contextlib import suppress
-from dataclasses import asdict
+from dataclasses import asdict, dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -23,9 +24,39 @@ if TYPE_CHECKING:
     from xrgs.config import Conf
     from xrgs.store import CellFolder
 
-#: What a job ends with beside a cell's states: another sweep trains the cell; the sweep was told to
-#: start nothing more; the store takes no more.
+#: What a job ends with beside a cell's states: another sweep trains the cell; the sweep is over, or
+#: was told to start nothing more; the store takes no more.
 LOCKED, STOPPED, UNWRITABLE = "locked", "stopped", "unwritable"
+
+
+@dataclass(frozen=True)
+class Call:
+    """One call of `xrgs-sweep`, as its jobs know it: by a folder of its own."""
+
+    folder: Path
+
+    def begin(self) -> None:
+        """Say which process it is."""
+        locks.sign(self.folder / "sweep")
+
+    def stop(self) -> None:
+        """Have no job begin any more."""
+        with suppress(OSError):  # a full disk may have room for a name
+            (self.folder / "stopped").touch()
+
+    @cached_property
+    def _owner(self) -> locks.Owner | None:
+        return locks.signature(self.folder / "sweep")
+
+    @property
+    def gone(self) -> bool:
+        """Whether its process is no more; from another machine that can't be told, and is False."""
+        return self._owner is not None and self._owner.here and not self._owner.lives
+
+    @property
+    def over(self) -> bool:
+        """Whether no job is to begin any more."""
+        return (self.folder / "stopped").exists() or self.gone
 
 
 def run_job(conf: Conf, sweep_folder: Path) -> str:
@@ -33,30 +64,28 @@ def run_job(conf: Conf, sweep_folder: Path) -> str:
 
     Args:
         conf: the cell's.
-        sweep_folder: of this call of `xrgs-sweep` alone, seen by all its jobs: a file `stopped` in
-            it keeps those that have not begun from beginning.
+        sweep_folder: of this `Call` alone, seen by all its jobs.
 
     Returns:
         The cell's state, or `LOCKED`, `STOPPED` or `UNWRITABLE`.
     """
-    stopped = sweep_folder / "stopped"
-    if stopped.exists():
+    call = Call(sweep_folder)
+    if call.over:
         return STOPPED
     store = Store(Path(conf.store))
     try:
-        outcome = _run_alone(conf, store)
+        outcome = _run_alone(conf, store, call)
     except OSError as error:
         if not worker.unwritable(error):
             raise
         say(f"store={store.path}: {error}")
         outcome = UNWRITABLE
     if outcome == UNWRITABLE or (conf.fail_fast and outcome == "failed"):
-        with suppress(OSError):  # a full disk may have room for a name
-            stopped.touch()
+        call.stop()
     return outcome
 
 
-def _run_alone(conf: Conf, store: Store) -> str:
+def _run_alone(conf: Conf, store: Store, call: Call) -> str:
     """Run the cell if nobody else does, and nobody has meanwhile."""
     # The plan has verified it, and the child does, which reads it anyway.
     wanted = variant.key(conf.scene, conf.variant)
@@ -76,29 +105,31 @@ def _run_alone(conf: Conf, store: Store) -> str:
             return "done"
         folder.begin(asdict(conf), identity)
         say(f"{scenes.label(conf.scene)} / seed {conf.seed}: training cell {folder.id}")
-        return _train(conf, found, folder, lock)
+        return _train(conf, found, folder, lock, call)
     finally:
         lock.release()
 
 
-def _train(conf: Conf, found: Path, folder: CellFolder, lock: locks.Lock) -> str:
+def _train(conf: Conf, found: Path, folder: CellFolder, lock: locks.Lock, call: Call) -> str:
     request = {"conf": asdict(conf), "variant": str(found), "cell": str(folder.path)}
     lost = f"{folder.id}: this process was away too long, and another has taken the cell over"
+    left = f"{folder.id}: the sweep that started it is gone"
+
+    def objection(pid: int) -> str:
+        if not lock.beat(pid):
+            return lost
+        return left if call.gone else ""
+
     try:
-        worker.run(
-            "cell",
-            request,
-            Limits(**asdict(conf.limits)),
-            lambda pid: "" if lock.beat(pid) else lost,
-        )
+        worker.run("cell", request, Limits(**asdict(conf.limits)), objection)
     except worker.UnwritableError as error:
         # No fault of the cell's: it stays unfinished, and is run again without being asked for.
         say(f"{folder.id} stopped: {error}")
         return UNWRITABLE
     except XrgsError as error:
-        if str(error) == lost:
-            say(lost)
-            return LOCKED
+        if str(error) in {lost, left}:
+            say(str(error))
+            return LOCKED if str(error) == lost else STOPPED
         state = folder.state().name
         if state != "done":  # it may have ended, and its process died on the way out
             folder.fail(str(error))

@@ -21,7 +21,7 @@ from omegaconf import OmegaConf, flag_override
 
 from xrgs import locks
 from xrgs.errors import XrgsError
-from xrgs.job import STOPPED
+from xrgs.job import STOPPED, Call
 from xrgs.machine import usable_cores
 from xrgs.plan import length
 from xrgs.progress import say
@@ -129,12 +129,12 @@ class Launches:
         self._name = str(config.hydra.runtime.choices["hydra/launcher"])
         self._context, self._task = context, task
         self._config = copy.deepcopy(config)
-        self._folder: Path | None = None
+        self._call: Call | None = None
         self._jobs = 0
         self._losses: Counter[str] = Counter()
 
-    def _begin(self) -> Path:
-        """The folder that the jobs of this call share, by a name that is the same everywhere.
+    def _begin(self) -> Call:
+        """This call, in a folder whose name is the same everywhere.
 
         A job composes its config anew: `now` is another time there, and `.` another folder.
         """
@@ -142,7 +142,9 @@ class Launches:
         self._set("sweep.dir", str(folder))
         given = self._config.hydra.overrides.hydra
         self._set("overrides.hydra", [*given, f"hydra.sweep.dir={_quoted(folder)}"])
-        return folder
+        call = Call(folder)
+        call.begin()
+        return call
 
     def _set(self, key: str, value: Any) -> None:
         with flag_override(self._config.hydra, ["readonly", "struct"], False):
@@ -158,7 +160,7 @@ class Launches:
         Raises:
             XrgsError: the launcher can't be used, or begins nothing.
         """
-        self._folder = folder = self._folder or self._begin()
+        self._call = call = self._call or self._begin()
         cells = sorted(cells, key=length, reverse=True)
         threads, machine = max(cell.conf.threads for cell in cells), usable_cores()
         allowed = capacity(self._config.hydra.launcher, threads, machine)
@@ -166,7 +168,7 @@ class Launches:
             self._set(f"launcher.{key}", value)
         outcomes: dict[str, str] = {}
         for batch in self._batches(cells, allowed.batch or len(cells)):
-            if (folder / "stopped").exists():
+            if call.over:
                 outcomes |= {str(cell.cell_id): STOPPED for cell in batch}
                 continue
             outcomes |= self._launch(batch, allowed.threads(len(batch), machine), store)

@@ -57,6 +57,11 @@ class Owner:
             return True
         return bool(self.worker) and _start(self.worker) == self.worker_started
 
+    @property
+    def here(self) -> bool:
+        """Whether its processes would run in this place."""
+        return (self.host, self.boot) == (socket.gethostname(), _boot())
+
     def __str__(self) -> str:
         return f"process {self.pid} on {self.host}"
 
@@ -95,12 +100,12 @@ class Lock:
             return False
         except OSError:  # the store is out of reach for now: whether for too long, it will tell
             return True
-        return last == generation and _owner(self.path) in {None, self.owner}
+        return last == generation and signature(self.path) in {None, self.owner}
 
     def release(self) -> None:
         """Let the next one have it."""
         with suppress(OSError):  # left behind, it dies with this process
-            if _owner(self.path) == self.owner:  # not the next one's, where this one was lost
+            if signature(self.path) == self.owner:  # not the next one's, where this one was lost
                 self.path.unlink()
 
 
@@ -116,7 +121,7 @@ def acquire(folder: Path, name: str) -> Lock | None:
             return None
         file = folder / f"{name}.{max(found, default=-1) + 1}"
         try:
-            owner = _make(file)
+            owner = sign(file)
         except FileExistsError:
             continue  # another was quicker: look again
         # What was listed above may be long past: whoever came meanwhile is seen here, and of two
@@ -142,22 +147,13 @@ def holders(folder: Path) -> dict[str, Owner | None]:
     except OSError:
         return {}
     return {
-        _parts(file)[0]: _owner(file)
+        _parts(file)[0]: signature(file)
         for file in files
         if file.suffix[1:].isdecimal() and _living(file)
     }
 
 
-def _parts(file: Path) -> tuple[str, int]:
-    return file.stem, int(file.suffix[1:])
-
-
-def _generations(folder: Path, name: str) -> dict[int, Path]:
-    found = (file for file in folder.iterdir() if file.stem == name)
-    return {_parts(file)[1]: file for file in found if file.suffix[1:].isdecimal()}
-
-
-def _make(file: Path) -> Owner:
+def sign(file: Path) -> Owner:
     """Make the file and say in it whose it is: this process's.
 
     Raises:
@@ -174,7 +170,8 @@ def _make(file: Path) -> Owner:
     return owner
 
 
-def _owner(file: Path) -> Owner | None:
+def signature(file: Path) -> Owner | None:
+    """Whose file it is; None where it does not say."""
     try:
         owner = Owner(**foreign.parse_json(foreign.read_bytes(file)))
     except (OSError, ValueError, TypeError):
@@ -184,9 +181,18 @@ def _owner(file: Path) -> Owner | None:
     return owner if right else None
 
 
+def _parts(file: Path) -> tuple[str, int]:
+    return file.stem, int(file.suffix[1:])
+
+
+def _generations(folder: Path, name: str) -> dict[int, Path]:
+    found = (file for file in folder.iterdir() if file.stem == name)
+    return {_parts(file)[1]: file for file in found if file.suffix[1:].isdecimal()}
+
+
 def _living(file: Path) -> bool:
-    owner, here = _owner(file), _self()
-    if owner is not None and (owner.host, owner.boot) == (here.host, here.boot):
+    owner = signature(file)
+    if owner is not None and owner.here:
         return owner.lives
     silent = _NAMELESS_S if owner is None else SILENT_S
     try:

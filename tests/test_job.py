@@ -1,0 +1,76 @@
+"""What a job does when its sweep is over."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from xrgs import locks, variant, worker
+from xrgs.config import Conf
+from xrgs.job import STOPPED, Call, run_job
+from xrgs.store import Store
+
+
+@pytest.fixture
+def store(tmp_path: Path) -> Store:
+    """An empty one."""
+    store = Store(tmp_path / "s")
+    store.prepare()
+    return store
+
+
+@pytest.fixture
+def conf(compose: Callable[..., Conf], store: Store) -> Conf:
+    """A cell's, whose variant is there as far as a job looks."""
+    conf = compose("scene=motorcycle", "splat.backend=torch", f"store={store.path}")
+    (store.variants / f"{variant.key(conf.scene, conf.variant)}-0").mkdir()
+    return conf
+
+
+@pytest.fixture
+def call(tmp_path: Path) -> Call:
+    """A call of this process."""
+    (tmp_path / "call").mkdir()
+    call = Call(tmp_path / "call")
+    call.begin()
+    return call
+
+
+def signed_by(call: Call, **changes: object) -> Call:
+    """The call as another process's."""
+    file = call.folder / "sweep"
+    file.write_text(json.dumps(json.loads(file.read_text()) | changes))
+    return Call(call.folder)
+
+
+def test_a_call_is_over_when_it_is_stopped_or_its_process_is_no_more(call: Call) -> None:
+    assert not call.over
+    assert signed_by(call, started=1).over
+    assert not signed_by(call, host="elsewhere").over  # there it may run
+    assert not signed_by(call, boot="another").over
+    call.stop()
+    assert call.over
+
+
+def test_no_job_begins_for_a_sweep_that_is_gone(conf: Conf, call: Call, store: Store) -> None:
+    signed_by(call, started=1)
+    assert run_job(conf, call.folder) == STOPPED
+    assert not list(store.cells.iterdir())
+
+
+def test_a_cell_ends_with_its_sweep_and_is_unfinished(
+    conf: Conf, call: Call, store: Store, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def run(_: str, __: object, ___: object, objection: Callable[[int], str]) -> None:
+        assert not objection(0)
+        monkeypatch.setattr(locks.Owner, "lives", False)
+        raise worker.WorkerError(objection(0))
+
+    monkeypatch.setattr(worker, "run", run)
+    assert run_job(conf, call.folder) == STOPPED
+    (cell,) = store.cells.iterdir()
+    assert store.cell(cell.name).state().name == "unfinished"
+    assert not list(store.locks.iterdir())
