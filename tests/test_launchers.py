@@ -14,7 +14,7 @@ import pytest
 from hydra.core.plugins import Plugins
 from hydra.core.utils import JobReturn, JobStatus
 from hydra.types import HydraContext
-from omegaconf import DictConfig
+from omegaconf import DictConfig, OmegaConf
 
 from xrgs import config, launchers
 from xrgs.errors import XrgsError
@@ -198,6 +198,10 @@ class Fake:
         self.launches: list[list[str]] = []
         self.given: list[Sequence[str]] = []
 
+    def configured(self, *, config: DictConfig, **_: object) -> Fake:
+        self.config = config
+        return self
+
     def launch(self, jobs: Sequence[Sequence[str]], first: int) -> list[JobReturn]:
         assert first == len(self.given)
         names = [job[0].partition("=")[2] for job in jobs]
@@ -229,16 +233,16 @@ def launch(
     compose: Callable[..., config.Conf],
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
-) -> Callable[..., tuple[dict[str, str], Fake, list[Planned]]]:
+) -> Callable[..., tuple[dict[str, str], Fake]]:
     """(names, fatal, *overrides) -> outcomes when nothing is left to launch, and the launcher."""
 
     def launched(
         names: Sequence[str], fatal: set[str], *overrides: str
-    ) -> tuple[dict[str, str], Fake, list[Planned]]:
+    ) -> tuple[dict[str, str], Fake]:
         store = Store(tmp_path / "s")
         store.prepare()
         fake = Fake(store, fatal)
-        monkeypatch.setattr(Plugins, "instantiate_launcher", lambda *_, **__: fake)
+        monkeypatch.setattr(Plugins, "instantiate_launcher", fake.configured)
         conf = compose(f"store={launchers._quoted(tmp_path / 's')}")
         cells = [Planned(Wish(n, "", (f"x={n}",), ()), conf, "v", n) for n in names]
         launches = Launches(HydraContext(None, None), len, composed(*overrides))
@@ -246,16 +250,16 @@ def launch(
         while left := [cell for cell in cells if outcomes[str(cell.cell_id)] == LOST]:
             assert len(fake.launches) < 20
             outcomes |= launches.run(left, store)
-        return outcomes, fake, cells
+        return outcomes, fake
 
     return launched
 
 
 def test_what_a_broken_launcher_drops_is_launched_again(
-    launch: Callable[..., tuple[dict[str, str], Fake, list[Planned]]],
+    launch: Callable[..., tuple[dict[str, str], Fake]],
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    outcomes, fake, _ = launch("abcdef", {"c"})
+    outcomes, fake = launch("abcdef", {"c"})
     assert outcomes == dict.fromkeys("abdef", "done") | {"c": "unfinished"}
     # What was begun with the fatal one comes again after all others, and alone.
     assert fake.launches == [list("abcdef"), list("ef"), ["c"], ["d"], ["c"]]
@@ -266,18 +270,54 @@ def test_what_a_broken_launcher_drops_is_launched_again(
 
 
 def test_a_launcher_that_begins_nothing_ends_the_sweep_with_its_own_words(
-    launch: Callable[..., tuple[dict[str, str], Fake, list[Planned]]],
+    launch: Callable[..., tuple[dict[str, str], Fake]],
 ) -> None:
     with pytest.raises(XrgsError, match="RuntimeError: no such cluster"):
         launch("abc", {"nothing"})
 
 
 def test_submitit_has_no_more_jobs_at_a_time_than_there_are_cores(
-    launch: Callable[..., tuple[dict[str, str], Fake, list[Planned]]],
+    launch: Callable[..., tuple[dict[str, str], Fake]],
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr(launchers, "usable_cores", lambda: 4)
     local = ("hydra/launcher=submitit_local", "hydra.launcher.cpus_per_task=2")
-    _, fake, _ = launch("abcde", set(), *local)
+    _, fake = launch("abcde", set(), *local)
     assert fake.launches == [["a", "b"], ["c", "d"], ["e"]]
     assert all("threads=2" in job for job in fake.given)
+
+
+@pytest.fixture
+def odd(tmp_path: Path) -> Path:
+    """A folder whose name needs quoting everywhere."""
+    folder = tmp_path / "an odd, 'quoted' ${name} = [ü] {x}"
+    folder.mkdir()
+    return folder
+
+
+def test_a_job_finds_its_folders_wherever_it_runs(
+    compose: Callable[..., config.Conf], odd: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    conf = compose("scene=folder", "scene.path=p", "store=s")
+    cell = Planned(Wish("a", "", ("seed=1",), ()), conf, "v", "a")
+    monkeypatch.chdir(odd)
+    overrides = launchers._overrides(cell, threads=3)
+    monkeypatch.chdir(odd.parent)
+    there = compose("scene=folder", *overrides)
+    assert (there.store, there.scene.path) == (str(odd / "s"), str(odd / "p"))
+    assert (there.seed, there.threads) == (1, 3)
+    assert there.splat.backend in {"native", "torch"}
+
+
+def test_two_calls_never_share_a_folder(
+    launch: Callable[..., tuple[dict[str, str], Fake]],
+    composed: Callable[..., DictConfig],
+    odd: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.chdir(odd)
+    for name in ("out", "out-2"):
+        _, fake = launch("a", set(), "hydra.sweep.dir=out")
+        told = OmegaConf.to_container(fake.config.hydra.overrides.hydra)
+        assert fake.config.hydra.sweep.dir == composed(*told).hydra.sweep.dir == str(odd / name)
+        assert (odd / name / "sweep").is_file()

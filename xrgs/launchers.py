@@ -19,7 +19,7 @@ from hydra.core.override_parser.types import Quote, QuotedString
 from hydra.core.plugins import Plugins
 from omegaconf import OmegaConf, flag_override
 
-from xrgs import locks
+from xrgs import locks, worker
 from xrgs.errors import XrgsError
 from xrgs.job import STOPPED, Call
 from xrgs.machine import usable_cores
@@ -139,7 +139,7 @@ class Launches:
         A job composes its config anew: `now` is another time there, and `.` another folder.
         """
         folder = _folder_of_its_own(Path(self._config.hydra.sweep.dir).absolute())
-        self._set("sweep.dir", str(folder))
+        self._set("sweep.dir", _literal(folder))
         given = self._config.hydra.overrides.hydra
         self._set("overrides.hydra", [*given, f"hydra.sweep.dir={_quoted(folder)}"])
         call = Call(folder)
@@ -233,14 +233,21 @@ def _folder_of_its_own(wanted: Path) -> Path:
             number += 1
             folder = wanted.with_name(f"{wanted.name}-{number}")
         except OSError as error:
+            if worker.unwritable(error):
+                raise
             raise XrgsError(f"hydra.sweep.dir={wanted}: {error}") from error
         else:
             return folder
 
 
+def _literal(path: Path) -> str:
+    """A path as a value of a config, where `${` would begin an interpolation."""
+    return str(path).replace("${", r"\${")
+
+
 def _quoted(path: Path) -> str:
     """A path as a value of Hydra's command line."""
-    return QuotedString(str(path), Quote.single).with_quotes()
+    return QuotedString(_literal(path), Quote.single).with_quotes()
 
 
 def _overrides(cell: Planned, threads: int) -> list[str]:

@@ -134,7 +134,8 @@ class Study:
         except OSError as error:
             if not worker.unwritable(error):
                 raise
-            raise CompactHydraException(f"{error}. {_NOTHING_LOST}") from error
+            store = self._config.store
+            raise CompactHydraException(f"store={store}: {error}. {_NOTHING_LOST}") from error
         if failed:
             raise SystemExit(1)
 
