@@ -367,7 +367,11 @@ def test_photographs_of_nothing_in_common_fail_as_a_scene(store: Store, tmp_path
     failed = store.variants / f"failed-{variant.key(scene, CONF)}"
     assert str(failed) in message
     report = json.loads((failed / "report.json").read_text())
+    reason = report.pop("reason")
     assert report == caught.value.report
+    assert message == f"{reason} Report: {failed}"
+    assert variant.failure(store.variants, failed.name.removeprefix("failed-")) == reason
+    assert variant.failure(store.variants, "another") is None
     assert report["not_registered"] == ["0", "1", "2", "3", "4"]
     assert "Feature extraction" in (failed / "colmap.log").read_text()
     assert variant.find(store.variants, variant.key(scene, CONF)) is None

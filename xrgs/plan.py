@@ -131,7 +131,8 @@ def describe(plan: Sequence[Planned]) -> str:
             f"  {state:<10} {identity:<18} {time_left:>8}  {cell.name}"
             + (f"  ({reason})" if reason else "")
         )
-    if plan[0].conf.retry != "failed" and any(cell.state.name == "failed" for cell in plan):
+    failed = any(cell.error or cell.state.name == "failed" for cell in plan)
+    if plan[0].conf.retry != "failed" and failed:
         lines.append("failed cells are left as they are: retry=failed runs them again")
     return "\n".join(lines)
 

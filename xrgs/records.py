@@ -13,6 +13,9 @@ from xrgs.errors import XrgsError
 if TYPE_CHECKING:
     from pathlib import Path
 
+#: Begins the name of a folder in `variants/` that has a report of what was tried, and no variant.
+FAILED = "failed-"
+
 
 class StoreError(XrgsError):
     """The store's folder can't be used, or does not hold what was asked for."""
@@ -72,3 +75,20 @@ def as_number(value: object) -> float:
         return float(value)
     except OverflowError as error:
         raise ValueError("a number is too large") from error
+
+
+def failed_scenes(variants: Path, key: str = "*") -> dict[str, tuple[str, str]]:
+    """Scene and reason of every scene that could not be made into a variant, by the variant's key.
+
+    Args:
+        variants: the store's folder of them.
+        key: of the only one that is wanted.
+    """
+    found = {}
+    for folder in sorted(variants.glob(f"{FAILED}{key}")):
+        try:
+            report = read_object(folder / "report.json")
+            found[folder.name.removeprefix(FAILED)] = str(report["scene"]), str(report["reason"])
+        except (StoreError, KeyError):
+            continue
+    return found

@@ -11,7 +11,7 @@ from xrgs import locks
 from xrgs.errors import XrgsError
 from xrgs.foreign import printable
 from xrgs.identity import training_code
-from xrgs.records import StoreError, read_json
+from xrgs.records import FAILED, StoreError, failed_scenes, read_json
 from xrgs.store import State, Store
 
 if TYPE_CHECKING:
@@ -48,6 +48,8 @@ class Status:
     aside: int
     """Folders that a later try of the same cell has set aside, and those of reruns."""
     variants: tuple[str, ...]
+    failed_scenes: tuple[tuple[str, str, str], ...]
+    """Key of the variant that can't be made, scene, and why."""
     sweeps: int
     sizes: Mapping[str, int]
     """Bytes of each folder of the store."""
@@ -75,6 +77,7 @@ def read(path: Path, *, verify: bool = False) -> Status:
         tuple(_see(store.cell(cell), names.get(cell), held, verify=verify) for cell in cells),
         len(ids) - len(cells),
         tuple(sorted(_variants(store))),
+        tuple((key, *why) for key, why in failed_scenes(store.variants).items()),
         sweeps,
         {folder.name: _bytes(folder.path) for folder in os.scandir(path) if folder.is_dir()},
     )
@@ -83,7 +86,7 @@ def read(path: Path, *, verify: bool = False) -> Status:
 def _variants(store: Store) -> Iterator[str]:
     """Those that are frozen; not what is being built, and not the reports of those that failed."""
     for folder in store.variants.glob("[!.]*-*"):
-        if not folder.name.startswith("failed-"):
+        if not folder.name.startswith(FAILED):
             yield folder.name
 
 
@@ -174,6 +177,12 @@ def describe(status: Status) -> str:
     lines += _table(status.cells)
     for state in ("running", "failed", "corrupt", "unfinished"):
         lines += _named(state, [cell for cell in status.cells if cell.state.name == state])
+    if status.failed_scenes:
+        lines += ["", "failed scenes, left as they are: retry=failed tries them again"]
+        lines += [
+            printable(f"  {key}  {scene}  {reason.partition(chr(10))[0]}")
+            for key, scene, reason in status.failed_scenes[:_NAMED]
+        ]
     if stale:
         files = Counter(file for cell in stale for file in cell.stale)
         lines += ["", f"stale: {len(stale)} done cells are of other code than what is installed"]

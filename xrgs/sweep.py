@@ -256,18 +256,25 @@ class Study:
 
 
 def _variant_of(conf: Conf, store: Store, *, build: bool) -> tuple[str | None, str | None]:
-    """The id of the frozen variant, or why there is none."""
+    """The id of the frozen variant, or why there is none: like a cell, a failed scene stays so."""
+    wanted = None
     try:
-        found = variant.find(store.variants, variant.key(conf.scene, conf.variant))
-        if found is not None or not build:
-            return (found.id if found else None), None
+        wanted = variant.key(conf.scene, conf.variant)
+        found = variant.find(store.variants, wanted)
+        if found is not None:
+            return found.id, None
+        failed = None if conf.retry == "failed" else variant.failure(store.variants, wanted)
+        if failed or not build:
+            return None, failed
         _say(f"{scenes.label(conf.scene)}: building the mixed-resolution variant")
         return worker.run("variant", {"conf": asdict(conf), "store": conf.store})["variant"], None
     except worker.UnwritableError as error:
         raise StoreError(f"store={store.path}: {error}. {_NOTHING_LOST}") from error
     except XrgsError as error:
         _say(f"{scenes.label(conf.scene)}: {error}")
-        return None, str(error)
+        # As it is remembered: the record of a sweep is the same, whichever time it is planned.
+        remembered = variant.failure(store.variants, wanted) if wanted else None
+        return None, remembered or str(error)
 
 
 def _tidy(done: set[str], store: Store) -> None:

@@ -23,6 +23,7 @@ from xrgs import foreign, npz, scenes, split
 from xrgs.errors import XrgsError
 from xrgs.files import write_json
 from xrgs.hashing import digest, file_digest
+from xrgs.records import FAILED, failed_scenes
 from xrgs.views import SceneFailed, Variant, View
 
 if TYPE_CHECKING:
@@ -34,6 +35,7 @@ __all__ = [
     "Variant",
     "View",
     "build",
+    "failure",
     "find",
     "key",
     "load",
@@ -80,6 +82,15 @@ def find(variants: Path, wanted: str) -> Variant | None:
         except CorruptVariant as error:
             _log.warning("%s; the variant will be built anew", error)
     return None
+
+
+def failure(variants: Path, wanted: str) -> str | None:
+    """Why the scene of a key failed when it was last tried; None where it did not.
+
+    The key has the photographs, the config and the code: of others, this says nothing.
+    """
+    found = failed_scenes(variants, wanted)
+    return found[wanted][1] if found else None
 
 
 def load(folder: Path) -> Variant:
@@ -165,21 +176,33 @@ def build(scene: SceneConf, conf: VariantConf, variants: Path, cache: Path) -> V
     split.check(conf)
     wanted = key(scene, conf)
     variants.mkdir(parents=True, exist_ok=True)
+    report = variants / f"{FAILED}{wanted}" / "report.json"
+    before = _written(report)
     with _locked(variants / f".{wanted}.lock"):
         found = find(variants, wanted)
         if found is not None:
             return found
+        reason = failure(variants, wanted)
+        if reason and _written(report) != before:  # tried by another process while we waited
+            raise SceneFailed(f"{reason} Report: {report}", {})
         for corrupt in variants.glob(f"{wanted}-*"):
             foreign.remove(corrupt)
         resolved = scenes.resolve(scene, cache, conf.long_side)
         return _make(resolved, conf, wanted, variants)
 
 
+def _written(file: Path) -> int | None:
+    try:
+        return file.stat().st_mtime_ns
+    except OSError:
+        return None
+
+
 def _make(scene: scenes.Scene, conf: VariantConf, wanted: str, variants: Path) -> Variant:
     """Mix and freeze; whatever a killed process left of it is cleared first."""
     from xrgs import mixing
 
-    work, failed = variants / f".{wanted}.building", variants / f"failed-{wanted}"
+    work, failed = variants / f".{wanted}.building", variants / f"{FAILED}{wanted}"
     foreign.remove(work)
     foreign.remove(failed)
     frozen = work / "frozen"
@@ -187,7 +210,7 @@ def _make(scene: scenes.Scene, conf: VariantConf, wanted: str, variants: Path) -
     try:
         return _freeze(mixing.mix(scene, conf, work, frozen), wanted, frozen, variants)
     except SceneFailed as error:
-        write_json(frozen / "report.json", error.report)
+        write_json(frozen / "report.json", error.report | {"reason": str(error)})
         frozen.rename(failed)
         raise SceneFailed(f"{error} Report: {failed}", error.report) from None
     finally:
