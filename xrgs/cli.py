@@ -17,11 +17,11 @@ from xrgs import config
 from xrgs.bench.settings import Settings
 from xrgs.errors import XrgsError
 from xrgs.machine import let_openmp_sleep
+from xrgs.stop import stoppable
+from xrgs.streams import outlive_readers
 
 if TYPE_CHECKING:
     from collections.abc import Callable
-from xrgs.stop import stoppable
-from xrgs.streams import outlive_readers
 
 
 @hydra.main(version_base="1.3", config_path=str(config.CONF_DIR), config_name="config")
@@ -65,13 +65,14 @@ def sweep() -> None:
         groups = ("ablation", "scene", "preset", "sweeps")
         print(_HELP.format(**{group: _choices(group) for group in groups}))  # noqa: T201
         return
+    outlive_readers()
     if any(argument.startswith("rerun=") for argument in sys.argv[1:]):
-        _rerun(sys.argv[1:])
+        with stoppable("The cell is as it was; what was begun beside it is no result."):
+            _rerun(sys.argv[1:])
         return
     config.register()
     # `ablation` is not in the defaults list, so Hydra wants the plus; people forget it.
     sys.argv[1:] = ["+" + a if a.startswith("ablation=") else a for a in sys.argv[1:]]
-    outlive_readers()
     with stoppable("What is done is kept: the same command goes on from there."):
         _sweep()
 
