@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import json
+import os
 from collections.abc import Callable
 from pathlib import Path
 
+import hydra
 import pytest
+from hydra.core.hydra_config import HydraConfig
 
-from xrgs import locks, variant, worker
+from xrgs import cli, config, locks, variant, worker
 from xrgs.config import Conf
 from xrgs.job import STOPPED, Call, run_job
 from xrgs.store import Store
@@ -56,8 +59,7 @@ def test_a_call_is_over_when_it_is_stopped_or_its_process_is_no_more(call: Call)
 
 
 def test_no_job_begins_for_a_sweep_that_is_gone(conf: Conf, call: Call, store: Store) -> None:
-    signed_by(call, started=1)
-    assert run_job(conf, call.folder) == STOPPED
+    assert run_job(conf, signed_by(call, started=1)) == STOPPED
     assert not list(store.cells.iterdir())
 
 
@@ -70,7 +72,28 @@ def test_a_cell_ends_with_its_sweep_and_is_unfinished(
         raise worker.WorkerError(objection(0))
 
     monkeypatch.setattr(worker, "run", run)
-    assert run_job(conf, call.folder) == STOPPED
+    assert run_job(conf, call) == STOPPED
     (cell,) = store.cells.iterdir()
     assert store.cell(cell.name).state().name == "unfinished"
     assert not list(store.locks.iterdir())
+
+
+class Ended(Exception):  # noqa: N818
+    """In place of a process's end."""
+
+
+def test_a_worker_whose_sweep_is_gone_ends_without_an_answer(
+    call: Call, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def end(_: int) -> None:
+        raise Ended
+
+    signed_by(call, started=1)
+    config.register()
+    with hydra.initialize_config_dir(str(config.CONF_DIR), version_base="1.3"):
+        folder = f"hydra.sweep.dir={call.folder}"
+        composed = hydra.compose("config", [folder], return_hydra_config=True)
+    monkeypatch.setattr(HydraConfig.instance(), "cfg", composed)
+    monkeypatch.setattr(os, "_exit", end)
+    with pytest.raises(Ended):
+        cli._sweep(composed)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import sys
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -26,9 +27,13 @@ if TYPE_CHECKING:
 
 @hydra.main(version_base="1.3", config_path=str(config.CONF_DIR), config_name="config")
 def _sweep(cfg: DictConfig) -> str:
-    from xrgs.job import run_job
+    from xrgs.job import Call, run_job
 
-    return run_job(config.to_conf(cfg), Path(HydraConfig.get().sweep.dir))
+    call = Call(Path(HydraConfig.get().sweep.dir))
+    outcome = run_job(config.to_conf(cfg), call)
+    if call.gone:  # a worker of joblib's would wait for ever to hand its answer over
+        os._exit(os.EX_TEMPFAIL)
+    return outcome
 
 
 _HELP = """\

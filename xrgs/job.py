@@ -59,17 +59,16 @@ class Call:
         return (self.folder / "stopped").exists() or self.gone
 
 
-def run_job(conf: Conf, sweep_folder: Path) -> str:
+def run_job(conf: Conf, call: Call) -> str:
     """Run one cell of a sweep, unless there is a reason not to.
 
     Args:
         conf: the cell's.
-        sweep_folder: of this `Call` alone, seen by all its jobs.
+        call: of `xrgs-sweep`, that the job belongs to.
 
     Returns:
         The cell's state, or `LOCKED`, `STOPPED` or `UNWRITABLE`.
     """
-    call = Call(sweep_folder)
     if call.over:
         return STOPPED
     store = Store(Path(conf.store))
