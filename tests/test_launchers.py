@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
+import tempfile
 from collections.abc import Callable, Sequence
 from importlib.util import find_spec
 from pathlib import Path
@@ -24,6 +25,8 @@ from xrgs.plan import Planned, Wish
 from xrgs.store import Store
 
 SMOKE = ("scene=motorcycle", "preset=smoke", "train.steps=4", "seed=0,1")
+#: Ray's files: the names of its sockets may have no more than 107 bytes.
+RAY = Path(tempfile.gettempdir(), "xrgs-ray")
 #: Python loads it in every process of a sweep: each sees two cores, and a cell's process waits for
 #: another cell to have begun; one of them then kills the launcher's worker where that is asked for.
 SITE = """
@@ -75,7 +78,7 @@ def folder(basic: Path, tmp_path: Path) -> Path:
     ("launcher", "package", "settings"),
     [
         ("submitit_local", "submitit", ()),
-        ("ray", "ray", ("+hydra.launcher.ray.init={num_cpus:2,include_dashboard:false}",)),
+        ("ray", "ray", (f"+hydra.launcher.ray.init={{num_cpus:2,_temp_dir:{RAY}}}",)),
     ],
 )
 def test_a_launcher_runs_two_cells_at_once_to_the_results_of_basic(
