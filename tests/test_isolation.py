@@ -6,17 +6,24 @@ cell's child it stands in for `xrgs.cell`, and does to cells of some seeds what 
 
 from __future__ import annotations
 
+import errno
 import json
+import os
 import shutil
 import signal
 import subprocess
 import sys
+import tempfile
 import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import pytest
+
+from xrgs import sweep, worker
+from xrgs.config import Conf
+from xrgs.store import Store, StoreError
 
 #: Folder and faults -> `tests.conftest.Sweeps`.
 SweepsIn = Callable[..., Any]
@@ -291,3 +298,21 @@ def test_a_disk_that_takes_no_more_is_said_and_loses_nothing(sweeps: Any) -> Non
     healthy = sweeps.folder / "before" / "cells"
     for cell in healthy.iterdir():
         assert files(sweeps.folder / "after" / "cells" / cell.name).keys() == files(cell).keys()
+
+
+def test_a_library_that_dies_of_a_full_disk_is_no_fault_of_the_scene_s(
+    compose: Callable[..., Conf], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    store = Store(tmp_path / "s")
+    store.prepare()
+
+    def full(**_: object) -> None:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    def dies(*_: object) -> dict[str, Any]:
+        monkeypatch.setattr(tempfile, "TemporaryFile", full)
+        raise worker.WorkerError("its process was ended by SIGABRT")
+
+    monkeypatch.setattr(worker, "run", dies)
+    with pytest.raises(StoreError, match="No space left"):
+        sweep._variant_of(compose("scene=motorcycle"), store, build=True)

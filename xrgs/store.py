@@ -39,6 +39,8 @@ _NOT_RESULTS = frozenset(
 #: What a cell that goes on from its checkpoint keeps of the try that was stopped.
 _GOES_ON_WITH = frozenset({_CHECKPOINT, "identity.json", "log.txt"})
 _RECORD_VERSION = 1
+#: Bytes without which a disk is full: less than the files of any cell.
+_ROOM = 1 << 15
 _MOST_SEED = (1 << 63) - 1
 
 
@@ -274,7 +276,7 @@ class Store:
         return self.path / "reports"
 
     def prepare(self) -> None:
-        """Make the folders.
+        """Make the folders, and see that there is room to write.
 
         Raises:
             StoreError: the folder can't be written; the message names it and the `store` key.
@@ -283,8 +285,8 @@ class Store:
             folders = (self.scenes, self.variants, self.cells, self.locks, self.path / "sweeps")
             for folder in folders:
                 folder.mkdir(parents=True, exist_ok=True)
-            with tempfile.TemporaryFile(dir=self.path):
-                pass
+            with tempfile.TemporaryFile(dir=self.path) as file:
+                file.write(bytes(_ROOM))
         except OSError as error:
             raise StoreError(
                 f"store={self.path} can't be written ({error}): name another with store=..."

@@ -272,6 +272,8 @@ def _variant_of(conf: Conf, store: Store, *, build: bool) -> tuple[str | None, s
         raise StoreError(f"store={store.path}: {error}. {_NOTHING_LOST}") from error
     except XrgsError as error:
         _say(f"{scenes.label(conf.scene)}: {error}")
+        if build:
+            store.prepare()  # COLMAP dies of a full disk without a word: no fault of the scene's
         # As it is remembered: the record of a sweep is the same, whichever time it is planned.
         remembered = variant.failure(store.variants, wanted) if wanted else None
         return None, remembered or str(error)

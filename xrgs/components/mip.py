@@ -70,11 +70,11 @@ class Mip(Component):
 
     def state_dict(self) -> dict[str, Any]:
         """The filter: it is of the means as they were when they were last measured."""
-        return {"variance": self.variance, "unseen": self.unseen}
+        return {"variance": self.variance}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """The filter that `state_dict` told of."""
-        self.variance, self.unseen = state["variance"], state["unseen"]
+        self.variance = state["variance"]
 
     def _measure(self, means: Tensor) -> None:
         rate = sampling_rates(means.detach(), self.cameras, self.near)
