@@ -219,8 +219,17 @@ class Fake:
             if self.fatal & set(pair):
                 raise RuntimeError("a worker was killed")
             for name in pair:
-                finish(self.store, name)
-        return [JobReturn(status=JobStatus.COMPLETED, _return_value="done") for _ in jobs]
+                if {f"late {name}", f"raise {name}"}.isdisjoint(self.fatal):
+                    finish(self.store, name)
+        return [self.answer(name) for name in names]
+
+    def answer(self, name: str) -> JobReturn:
+        if f"late {name}" in self.fatal:
+            return JobReturn(status=JobStatus.FAILED, _return_value=RuntimeError("timed out"))
+        if f"raise {name}" in self.fatal:
+            shutil.rmtree(self.store.cell(name).path)
+            return JobReturn(status=JobStatus.FAILED, _return_value=RuntimeError("no variant"))
+        return JobReturn(status=JobStatus.COMPLETED, _return_value="done")
 
 
 def finish(store: Store, name: str) -> None:
@@ -270,6 +279,14 @@ def test_what_a_broken_launcher_drops_is_launched_again(
     assert "RuntimeError: a worker was killed" in err
     assert "of its 6 cells are left:" in err
     assert "lost 3 times, not tried again" in err
+
+
+def test_a_job_out_of_its_time_is_launched_again_and_another_s_failure_is_final(
+    launch: Callable[..., tuple[dict[str, str], Fake]],
+) -> None:
+    outcomes, fake = launch("abc", {"late a", "raise b"})
+    assert outcomes == {"a": "unfinished", "b": "failed", "c": "done"}
+    assert fake.launches == [["a", "b", "c"], ["a"], ["a"]]
 
 
 def test_a_launcher_that_begins_nothing_ends_the_sweep_with_its_own_words(

@@ -132,6 +132,7 @@ class Launches:
         self._call: Call | None = None
         self._jobs = 0
         self._losses: Counter[str] = Counter()
+        self._suspects: set[str] = set()
 
     def _begin(self) -> Call:
         """This call, in a folder whose name is the same everywhere.
@@ -175,12 +176,12 @@ class Launches:
         return outcomes
 
     def _batches(self, cells: Sequence[Planned], size: int) -> list[Sequence[Planned]]:
-        """Those that were lost come last and alone: one may have been the others' undoing."""
-        fresh = [cell for cell in cells if not self._losses[str(cell.cell_id)]]
-        lost = [cell for cell in cells if self._losses[str(cell.cell_id)]]
+        """Suspects come last and alone: one of them may have been the others' undoing."""
+        others = [cell for cell in cells if cell.cell_id not in self._suspects]
+        suspects = [cell for cell in cells if cell.cell_id in self._suspects]
         return [
-            *(fresh[start : start + size] for start in range(0, len(fresh), size)),
-            *([cell] for cell in lost),
+            *(others[start : start + size] for start in range(0, len(others), size)),
+            *([cell] for cell in suspects),
         ]
 
     def _launch(self, cells: Sequence[Planned], threads: int, store: Store) -> dict[str, str]:
@@ -194,7 +195,28 @@ class Launches:
             done = launcher.launch([_overrides(cell, threads) for cell in cells], first)
         except Exception as error:
             return self._lost(cells, error, store)
-        return {str(cell.cell_id): _outcome(job) for cell, job in zip(cells, done, strict=True)}
+        return {
+            str(cell.cell_id): self._outcome(cell, job, store)
+            for cell, job in zip(cells, done, strict=True)
+        }
+
+    def _outcome(self, cell: Planned, job: JobReturn, store: Store) -> str:
+        """What `run_job` returned. Where it raised, that is its cell's alone.
+
+        submitit raises in a job at the end of its time, when it has started it again often enough.
+        """
+        try:
+            return str(job.return_value)
+        except Exception as error:
+            say(f"{cell.name}: {_line(error)}")
+        state = store.cell(str(cell.cell_id)).state().name
+        return self._unanswered(str(cell.cell_id), state) if state == "unfinished" else "failed"
+
+    def _unanswered(self, cell_id: str, state: str) -> str:
+        """What a cell's job ended with, by the state that it left the cell in."""
+        self._losses[cell_id] += state == "unfinished"
+        ended = state in {"done", "failed"} or self._losses[cell_id] >= _LOSSES
+        return state if ended else LOST
 
     def _lost(self, cells: Sequence[Planned], error: Exception, store: Store) -> dict[str, str]:
         """What has become of cells whose launcher broke: it dropped those it had not begun too."""
@@ -203,19 +225,16 @@ class Launches:
         while were.keys() & locks.holders(store.locks).keys():
             time.sleep(_LOOK_S)  # jobs that outlive it have their cores still
         states = {cell_id: store.cell(cell_id).state().name for cell_id in were}
-        self._losses.update(cell_id for cell_id in states if states[cell_id] == "unfinished")
         if all(states[cell_id] in {were[cell_id], "absent"} - {"unfinished"} for cell_id in were):
             raise XrgsError(f"{reason}\nIt began no cell.") from error
+        self._suspects |= {cell_id for cell_id in states if states[cell_id] == "unfinished"}
+        outcomes = {cell_id: self._unanswered(cell_id, state) for cell_id, state in states.items()}
         say(f"{reason}\nof its {len(cells)} cells are left:")
-        outcomes = {}
         for cell in cells:
-            cell_id = str(cell.cell_id)
-            given_up = self._losses[cell_id] >= _LOSSES
-            ended = states[cell_id] in {"done", "failed"}
-            outcomes[cell_id] = states[cell_id] if ended or given_up else LOST
-            if not ended:
-                way = f"lost {_LOSSES} times, not tried again" if given_up else states[cell_id]
-                say(f"  {cell_id}  {cell.name}  ({way})")
+            outcome, state = outcomes[str(cell.cell_id)], states[str(cell.cell_id)]
+            if state not in {"done", "failed"}:
+                way = state if outcome == LOST else f"lost {_LOSSES} times, not tried again"
+                say(f"  {cell.cell_id}  {cell.name}  ({way})")
         return outcomes
 
 
@@ -261,12 +280,3 @@ def _overrides(cell: Planned, threads: int) -> list[str]:
     if conf.scene.path:
         told["scene.path"] = _quoted(Path(conf.scene.path).expanduser().absolute())
     return [*cell.wish.overrides, *(f"{key}={value}" for key, value in told.items())]
-
-
-def _outcome(job: JobReturn) -> str:
-    """What `run_job` returned; a failure where it raised, which is then its cell's alone."""
-    try:
-        return str(job.return_value)
-    except Exception as error:
-        say(str(error))
-        return "failed"
