@@ -149,11 +149,11 @@ def contents(cell: Path) -> dict[str, tuple[int, ...]]:
 
 
 def results(cell: Path) -> dict[str, Any]:
-    """All that a cell gives but times and this machine's memory."""
+    """All that a cell gives but where its store is, times and this machine's memory."""
     summary = json.loads((cell / "summary.json").read_text())
     del summary["training_time_s"], summary["peak_rss_bytes"]
     names = sorted(json.loads((cell / "status.json").read_text())["files"])
-    told = {"provenance.json", "summary.json"}
+    told = {"config.json", "provenance.json", "summary.json"}
     return {"names": names, "summary": summary} | {
         name: (cell / name).read_bytes() for name in names if name not in told
     }
