@@ -17,8 +17,8 @@ FILES = {
 }
 #: Libraries that only these rooms may import (a folder stands for its files).
 ONLY_IN = {
-    "hydra": ("config", "launchers", "sweep", "cli"),
-    "omegaconf": ("config", "launchers", "sweep", "cli"),
+    "hydra": ("arguments", "config", "launchers", "sweep", "cli"),
+    "omegaconf": ("arguments", "config", "launchers", "sweep", "cli"),
     "pycolmap": ("sfm",),
     "matplotlib": ("report",),
     "pandas": ("store", "report"),
@@ -30,7 +30,7 @@ FLOW = (
     ("errors", "files", "foreign", "hashing", "machine", "npz", "splat", "stop", "streams"),
     ("checkpoint", "locks", "progress", "records", "supervise", "weights"),
     ("images", "alignment", "split", "views", "degrade"),
-    ("config", "scenes", "sfm"),
+    ("arguments", "config", "scenes", "sfm"),
     ("photographs", "tagging"),
     ("placing",),
     ("mixing",),

@@ -15,6 +15,7 @@ from omegaconf import MISSING, DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from xrgs import config
+from xrgs.arguments import dotlist, with_quotes
 from xrgs.bench.settings import Settings
 from xrgs.errors import XrgsError
 from xrgs.machine import let_openmp_sleep
@@ -77,7 +78,11 @@ def sweep() -> None:
         return
     config.register()
     # `ablation` is not in the defaults list, so Hydra wants the plus; people forget it.
-    sys.argv[1:] = ["+" + a if a.startswith("ablation=") else a for a in sys.argv[1:]]
+    words = ["+" + a if a.startswith("ablation=") else a for a in sys.argv[1:]]
+    try:
+        sys.argv[1:] = with_quotes(words)
+    except XrgsError as error:
+        sys.exit(f"xrgs-sweep: {error}")
     with stoppable("What is done is kept: the same command goes on from there."):
         _sweep()
 
@@ -104,7 +109,7 @@ def _rerun(arguments: list[str]) -> None:
     from xrgs.rerun import rerun
 
     try:
-        given = OmegaConf.from_dotlist(arguments)
+        given = dotlist(arguments)
         conf = OmegaConf.merge(OmegaConf.structured(RerunConf), given)
         out, store = (Path(path) if path else None for path in (conf.out, conf.store))
         again = rerun(Path(conf.rerun), out, store, conf.threads, conf.scene.path)
@@ -129,7 +134,7 @@ def _arguments(schema: type[Any], command: Callable[[], None]) -> DictConfig:
         usage = (command.__doc__ or "").replace("`", "")
         print(f"{usage}\n\n{OmegaConf.to_yaml(known)}", end="")  # noqa: T201
         sys.exit()
-    return cast("DictConfig", OmegaConf.merge(known, OmegaConf.from_dotlist(sys.argv[1:])))
+    return cast("DictConfig", OmegaConf.merge(known, dotlist(sys.argv[1:])))
 
 
 @dataclass
@@ -253,6 +258,7 @@ def _inspect(words: list[str], values: dict[str, str]) -> str:
     else:
         config.register()
         with hydra.initialize_config_dir(str(config.CONF_DIR), version_base="1.3"):
-            composed = hydra.compose("config", [f"{key}={value}" for key, value in values.items()])
+            words = with_quotes([f"{key}={value}" for key, value in values.items()])
+            composed = hydra.compose("config", words)
         folder = inspect.folder_of(config.to_conf(composed))
     return inspect.describe(folder, Path(out) if out else None)

@@ -363,18 +363,18 @@ def from_dict(values: Any) -> Conf:
     A path may hold a `${`; and what a stranger writes there is not to be looked up in this
     process's environment.
     """
-    conf = OmegaConf.to_object(OmegaConf.merge(OmegaConf.structured(Conf), _literal(values)))
+    conf = OmegaConf.to_object(OmegaConf.merge(OmegaConf.structured(Conf), literal(values)))
     if not isinstance(conf, Conf):
         raise TypeError(f"expected a config of schema Conf, got {type(conf).__name__}")
     return conf
 
 
-def _literal(value: Any) -> Any:
+def literal(value: Any) -> Any:
     """Values in which OmegaConf finds nothing to be resolved."""
     if isinstance(value, dict):
-        return {name: _literal(inner) for name, inner in value.items()}
+        return {name: literal(inner) for name, inner in value.items()}
     if isinstance(value, list):
-        return [_literal(inner) for inner in value]
+        return [literal(inner) for inner in value]
     if not isinstance(value, str):
         return value
     return _INTERPOLATION.sub(lambda found: 2 * found[1] + r"\${", value)

@@ -43,3 +43,11 @@ def write_json(path: Path, value: object, *, durable: bool = True) -> None:
     """Write `value` as indented JSON with sorted keys, atomically."""
     text = json.dumps(value, indent=1, sort_keys=True, ensure_ascii=False) + "\n"
     write_text(path, text, durable=durable)
+
+
+def path_of(text: str) -> Path:
+    """The path that a person wrote: `~` is a home, and where nobody has that name, itself."""
+    try:
+        return Path(text).expanduser()
+    except RuntimeError:
+        return Path(text)

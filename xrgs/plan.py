@@ -123,14 +123,12 @@ def describe(plan: Sequence[Planned]) -> str:
     lines = [f"plan: {len(plan)} cells, {done} done{_left(plan)}"]
     for cell in plan:
         state = "failed" if cell.error else "waits" if cell.waits else cell.state.name
-        reason = printable((cell.error or cell.state.reason or "").partition("\n")[0])
+        reason = (cell.error or cell.state.reason or "").partition("\n")[0]
         identity = cell.cell_id or ("no count yet" if cell.waits else "variant not built")
         wanted = not cell.error and state != "done"
         time_left = duration(cell.seconds) if wanted else ""
-        lines.append(
-            f"  {state:<10} {identity:<18} {time_left:>8}  {cell.name}"
-            + (f"  ({reason})" if reason else "")
-        )
+        line = f"  {state:<10} {identity:<18} {time_left:>8}  {cell.name}"
+        lines.append(printable(f"{line}  ({reason})" if reason else line))
     failed = any(cell.error or cell.state.name == "failed" for cell in plan)
     if plan[0].conf.retry != "failed" and failed:
         lines.append("failed cells are left as they are: retry=failed runs them again")

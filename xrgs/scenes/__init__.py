@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from xrgs.errors import XrgsError
+from xrgs.files import path_of
 from xrgs.scenes import folder, motorcycle, procedural
 from xrgs.scenes.scene import Scene
 
@@ -24,7 +25,7 @@ def label(conf: SceneConf) -> str:
     """The scene's name in tables: `scene.name`, or where that is empty the folder's own name."""
     if conf.name:
         return conf.name
-    return Path(conf.path).expanduser().resolve().name if conf.path else conf.kind
+    return path_of(conf.path).resolve().name if conf.path else conf.kind
 
 
 def fingerprint(conf: SceneConf, long_side: int = 0) -> str:

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import hashlib
 import re
+import unicodedata
 from pathlib import Path
 
-from xrgs import images
+from xrgs import foreign, images
 from xrgs.errors import XrgsError
+from xrgs.files import path_of
 from xrgs.progress import progress
 
 SUFFIXES = frozenset({".bmp", ".jpeg", ".jpg", ".png", ".tif", ".tiff", ".webp"})
@@ -26,7 +28,7 @@ def photographs(path: str | None, long_side: int) -> tuple[Path, ...]:
     """
     if not path:
         raise XrgsError("scene.path is empty: give the folder of photographs, scene.path=...")
-    folder = Path(path).expanduser()
+    folder = path_of(path)
     if not folder.is_dir():
         raise XrgsError(f"scene.path={folder}: no such folder (scene=llff/... looks in data_root)")
     copies = [_images_in(f) for f in sorted(folder.iterdir()) if _is_llff(f)]
@@ -37,11 +39,16 @@ def photographs(path: str | None, long_side: int) -> tuple[Path, ...]:
         raise XrgsError(f"scene.path={folder}: {count} in it; two or more are needed ({wanted})")
     seen: dict[str, Path] = {}
     for file in files:
-        if file.stem in seen:
+        if not foreign.is_name(file.stem):
             raise XrgsError(
-                f"{seen[file.stem]} and {file.name}: two images of one name; rename one"
+                f"{str(file)!r}: a name with a backslash, a control character or bytes that are "
+                "no Unicode; rename it"
             )
-        seen[file.stem] = file
+        # A store may lie where A and a, or an accent as one character or two, are one name.
+        name = unicodedata.normalize("NFC", file.stem).casefold()
+        if name in seen:
+            raise XrgsError(f"{seen[name]} and {file.name}: two images of one name; rename one")
+        seen[name] = file
     return files
 
 
