@@ -17,12 +17,13 @@ from typing import Any
 
 import pytest
 
-from xrgs import cell, dataset, evaluate, train, variant, worker
+from xrgs import cell, dataset, evaluate, train, variant
 from xrgs.config import Conf
 from xrgs.dataset import Dataset
 from xrgs.files import write_json
 from xrgs.hashing import digest
 from xrgs.identity import cell_identity
+from xrgs.jobs import worker
 from xrgs.splat.backend import resolve_backend
 from xrgs.store import CellFolder, Store
 
@@ -173,7 +174,7 @@ def test_a_worker_that_is_killed_goes_on_in_another(
     folder = begin(conf, tmp_path / "killed", built.id)
     write_json(tmp_path / "request.json", request(folder))
     files = [str(tmp_path / "request.json"), str(tmp_path / "answer.json")]
-    child = subprocess.Popen([sys.executable, "-P", "-m", "xrgs.worker", "cell", *files])
+    child = subprocess.Popen([sys.executable, "-P", "-m", "xrgs.jobs.worker", "cell", *files])
     while not folder.checkpoint.exists() and child.poll() is None:
         time.sleep(0.005)
     time.sleep(random.uniform(0, 0.1))

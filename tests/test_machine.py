@@ -36,7 +36,7 @@ def test_openmps_threads_are_told_to_sleep(monkeypatch: pytest.MonkeyPatch) -> N
 @pytest.mark.parametrize(
     "command",
     [
-        "from xrgs.worker import main; main('none', 'request.json', 'answer.json')",
+        "from xrgs.jobs.worker import main; main('none', 'request.json', 'answer.json')",
         "from xrgs.cli import bench; bench()",
     ],
 )

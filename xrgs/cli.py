@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 
 @hydra.main(version_base="1.3", config_path=str(config.CONF_DIR), config_name="config")
 def _sweep(cfg: DictConfig) -> str:
-    from xrgs.job import Call, run_job
+    from xrgs.jobs.job import Call, run_job
 
     call = Call(Path(HydraConfig.get().sweep.dir))
     outcome = run_job(config.to_conf(cfg), call)
@@ -106,7 +106,7 @@ class RerunConf:
 
 
 def _rerun(arguments: list[str]) -> None:
-    from xrgs.rerun import rerun
+    from xrgs.study.rerun import rerun
 
     try:
         given = dotlist(arguments)
@@ -171,7 +171,7 @@ class StatusConf:
 
 def status() -> None:
     """`xrgs-status [store=FOLDER] [verify=true]`: what a store holds, at a glance."""
-    from xrgs.status import describe, read
+    from xrgs.study.status import describe, read
 
     try:
         conf = _arguments(StatusConf, status)

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
     import pandas as pd
 
-    from xrgs.locks import Owner
+    from xrgs.jobs.locks import Owner
 
 #: A report rests on these, so they are verified byte for byte; the others by their size.
 _VERIFIED_BY_HASH = frozenset(

@@ -14,10 +14,10 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from xrgs.errors import XrgsError
-from xrgs.estimate import Past
 from xrgs.report import build, page
-from xrgs.status import describe, read
 from xrgs.store import CellFolder, Store, StoreError
+from xrgs.study.estimate import Past
+from xrgs.study.status import describe, read
 
 VALUES = st.recursive(
     st.none()

@@ -6,10 +6,11 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from xrgs import variant, worker
+from xrgs import variant
 from xrgs.data.sheet import contact_sheet
 from xrgs.errors import XrgsError
 from xrgs.foreign import printable
+from xrgs.jobs import worker
 from xrgs.records import read_json
 from xrgs.report.render import Grid, to_text
 from xrgs.store import Store

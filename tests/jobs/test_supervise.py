@@ -13,15 +13,15 @@ from pathlib import Path
 
 import pytest
 
-from xrgs import supervise
 from xrgs.errors import XrgsError
-from xrgs.supervise import Limits
+from xrgs.jobs import supervise
+from xrgs.jobs.supervise import Limits
 
 #: Starts a child of its own, writes both their numbers, refuses to end, and hangs.
 _STUBBORN = """
 import json, os, signal, subprocess, sys, time
 from pathlib import Path
-from xrgs import supervise
+from xrgs.jobs import supervise
 supervise.follow_parent()
 signal.signal(signal.SIGTERM, signal.SIG_IGN)
 child = subprocess.Popen([sys.executable, "-c", "import time; time.sleep(600)"])

@@ -16,9 +16,9 @@ if TYPE_CHECKING:
     from collections.abc import Container, Mapping, Sequence
 
     from xrgs.config import Conf
-    from xrgs.estimate import Past
-    from xrgs.locks import Owner
+    from xrgs.jobs.locks import Owner
     from xrgs.store import Store
+    from xrgs.study.estimate import Past
 
 BASELINE = "baseline"
 

@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from xrgs.errors import XrgsError
-from xrgs.sweep import BASELINE, expand
+from xrgs.study.sweep import BASELINE, expand
 
 
 def named(*arguments: str) -> list[tuple[str, str]]:

@@ -11,9 +11,10 @@ import hydra
 import pytest
 from hydra.core.hydra_config import HydraConfig
 
-from xrgs import cli, config, locks, variant, worker
+from xrgs import cli, config, variant
 from xrgs.config import Conf
-from xrgs.job import STOPPED, Call, run_job
+from xrgs.jobs import locks, worker
+from xrgs.jobs.job import STOPPED, Call, run_job
 from xrgs.store import Store
 
 

@@ -108,7 +108,9 @@ class Story:
         time.sleep(moment.later)
         if sweep.process.poll() is not None:
             return ""
-        workers = [pid for pid, line in self.sweeps.processes().items() if "xrgs.worker" in line]
+        workers = [
+            pid for pid, line in self.sweeps.processes().items() if "xrgs.jobs.worker" in line
+        ]
         victim = workers[0] if moment.worker and workers else sweep.process.pid
         with suppress(ProcessLookupError):
             os.kill(victim, signal.SIGKILL)

@@ -21,9 +21,10 @@ from typing import Any
 
 import pytest
 
-from xrgs import sweep, worker
 from xrgs.config import Conf
+from xrgs.jobs import worker
 from xrgs.store import Store, StoreError
+from xrgs.study import sweep
 
 #: Folder and faults -> `tests.conftest.Sweeps`.
 SweepsIn = Callable[..., Any]
@@ -32,7 +33,7 @@ Ended = tuple[int, str, str]
 SMOKE = ("scene=motorcycle", "preset=smoke", "train.steps=4")
 FAULTS = """
 import sys
-if "xrgs.worker" in sys.orig_argv and "cell" in sys.orig_argv:
+if "xrgs.jobs.worker" in sys.orig_argv and "cell" in sys.orig_argv:
     import ctypes, errno, importlib, os, signal, subprocess, time, types
     from pathlib import Path
 

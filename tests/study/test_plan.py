@@ -10,8 +10,8 @@ import pytest
 
 from xrgs.config import Conf
 from xrgs.files import write_json
-from xrgs.plan import Planned, Wish, describe, identified, length, ready
 from xrgs.store import State, Store
+from xrgs.study.plan import Planned, Wish, describe, identified, length, ready
 
 
 @pytest.fixture

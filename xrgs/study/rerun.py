@@ -13,18 +13,19 @@ from itertools import count
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from xrgs import config, provenance, worker
+from xrgs import config, provenance
 from xrgs.errors import XrgsError
 from xrgs.foreign import printable
 from xrgs.hashing import digest, file_digest
 from xrgs.identity import cell_identity
-from xrgs.live import View
+from xrgs.jobs import worker
 from xrgs.machine import usable_cores
-from xrgs.plan import Planned, Wish
 from xrgs.progress import say
 from xrgs.records import StoreError
 from xrgs.splat.backend import resolve_backend
 from xrgs.store import CellFolder, Store
+from xrgs.study.live import View
+from xrgs.study.plan import Planned, Wish
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping

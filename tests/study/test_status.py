@@ -10,12 +10,13 @@ from pathlib import Path
 
 import pytest
 
-from xrgs import identity, locks
+from xrgs import identity
 from xrgs.errors import XrgsError
 from xrgs.files import write_json
+from xrgs.jobs import locks
 from xrgs.progress import Progress
-from xrgs.status import describe, read
 from xrgs.store import CellFolder, Store
+from xrgs.study.status import describe, read
 
 
 def cell(store: Store, name: str, code: dict[str, str] | None = None) -> CellFolder:

@@ -11,14 +11,15 @@ from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from xrgs import locks, scenes, variant, worker
+from xrgs import scenes, variant
 from xrgs.errors import XrgsError
 from xrgs.hashing import digest
 from xrgs.identity import cell_identity
+from xrgs.jobs import locks, worker
+from xrgs.jobs.supervise import Limits
 from xrgs.progress import say
 from xrgs.splat.backend import resolve_backend
 from xrgs.store import Store
-from xrgs.supervise import Limits
 
 if TYPE_CHECKING:
     from xrgs.config import Conf

@@ -19,13 +19,13 @@ from hydra.core.override_parser.types import Quote, QuotedString
 from hydra.core.plugins import Plugins
 from omegaconf import OmegaConf, flag_override
 
-from xrgs import locks, worker
 from xrgs.errors import XrgsError
-from xrgs.job import STOPPED, Call
+from xrgs.jobs import locks, worker
+from xrgs.jobs.job import STOPPED, Call
 from xrgs.machine import usable_cores
-from xrgs.plan import length
 from xrgs.progress import say
 from xrgs.splat.backend import resolve_backend
+from xrgs.study.plan import length
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping, Sequence
@@ -34,10 +34,10 @@ if TYPE_CHECKING:
     from hydra.types import HydraContext, TaskFunction
     from omegaconf import DictConfig
 
-    from xrgs.plan import Planned
     from xrgs.store import Store
+    from xrgs.study.plan import Planned
 
-#: What a job ends with beside what `xrgs.job` says: its launcher gave no answer for it.
+#: What a job ends with beside what `xrgs.jobs.job` says: its launcher gave no answer for it.
 LOST = "lost"
 #: A cell that was begun and lost so many times is left.
 _LOSSES = 3
@@ -155,8 +155,8 @@ class Launches:
         """Run cells that have an identity, the longest first.
 
         Returns:
-            What each cell's job ended with, by the cell's id: what `xrgs.job.run_job` returned, or
-            `LOST` where it may be tried again, or the state in which its last loss left it.
+            What each cell's job ended with, by the cell's id: what `run_job` returned, or `LOST`
+            where it may be tried again, or the state in which its last loss left it.
 
         Raises:
             XrgsError: the launcher can't be used, or begins nothing.

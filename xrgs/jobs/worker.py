@@ -1,6 +1,7 @@
 """Work in a process of its own: a kill, an out-of-memory or a segfault ends that work alone.
 
-The parent (`run`) stays without torch; the child is `python -m xrgs.worker JOB REQUEST ANSWER`.
+The parent (`run`) stays without torch; the child is
+`python -m xrgs.jobs.worker JOB REQUEST ANSWER`.
 """
 
 from __future__ import annotations
@@ -17,9 +18,9 @@ import traceback
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from xrgs import supervise
 from xrgs.errors import XrgsError
 from xrgs.files import write_json
+from xrgs.jobs import supervise
 from xrgs.machine import let_openmp_sleep
 from xrgs.records import read_json
 from xrgs.streams import outlive_readers
@@ -62,7 +63,7 @@ def run(
         request_file, answer_file = Path(folder) / "request.json", Path(folder) / "answer.json"
         write_json(request_file, dict(request))
         # -P: run from a checkout, the child must import the installed package as its parent does.
-        child = [sys.executable, "-P", "-m", "xrgs.worker"]
+        child = [sys.executable, "-P", "-m", "xrgs.jobs.worker"]
         command = [*child, job, str(request_file), str(answer_file)]
         ended = supervise.run(command, limits, objection)
         if ended.reason:

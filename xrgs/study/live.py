@@ -26,8 +26,8 @@ if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
     from pathlib import Path
 
-    from xrgs.plan import Planned
     from xrgs.progress import Progress
+    from xrgs.study.plan import Planned
 
 #: Seconds between looks; of the time, looking takes no more than one part in so many, however slow
 #: the store is.

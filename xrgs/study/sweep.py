@@ -21,14 +21,19 @@ from hydra.errors import CompactHydraException
 from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from xrgs import launchers, locks, scenes, variant, weights, worker
+from xrgs import scenes, variant, weights
 from xrgs.config import to_conf
 from xrgs.errors import XrgsError
-from xrgs.estimate import Past
 from xrgs.hashing import digest, plain
-from xrgs.job import LOCKED, STOPPED, UNWRITABLE
-from xrgs.live import View
-from xrgs.plan import (
+from xrgs.jobs import locks, worker
+from xrgs.jobs.job import LOCKED, STOPPED, UNWRITABLE
+from xrgs.progress import say as _say
+from xrgs.records import StoreError
+from xrgs.store import Store
+from xrgs.study import launchers
+from xrgs.study.estimate import Past
+from xrgs.study.live import View
+from xrgs.study.plan import (
     BASELINE,
     Planned,
     Wish,
@@ -38,9 +43,6 @@ from xrgs.plan import (
     ready,
     record,
 )
-from xrgs.progress import say as _say
-from xrgs.records import StoreError
-from xrgs.store import Store
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping, Sequence

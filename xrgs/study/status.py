@@ -7,10 +7,10 @@ from collections import Counter
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
-from xrgs import locks
 from xrgs.errors import XrgsError
 from xrgs.foreign import printable
 from xrgs.identity import training_code
+from xrgs.jobs import locks
 from xrgs.records import FAILED, StoreError, failed_scenes, read_json
 from xrgs.store import State, Store
 

@@ -10,13 +10,13 @@ from pathlib import Path
 
 import pytest
 
-from xrgs import live
 from xrgs.config import Conf
 from xrgs.files import write_json
-from xrgs.live import Running, View
-from xrgs.plan import Planned, Wish
 from xrgs.progress import Progress
 from xrgs.store import State, Store
+from xrgs.study import live
+from xrgs.study.live import Running, View
+from xrgs.study.plan import Planned, Wish
 
 
 class Cells:

@@ -15,19 +15,19 @@ from pathlib import Path
 
 import pytest
 
-from xrgs import locks
+from xrgs.jobs import locks
 
 _TAKE = """
 import sys, time
 from pathlib import Path
-from xrgs import locks
+from xrgs.jobs import locks
 print(locks.acquire(Path(sys.argv[1]), "cell") is not None, flush=True)
 time.sleep(600)
 """
 _TAKE_FOR_A_WORKER = """
 import subprocess, sys
 from pathlib import Path
-from xrgs import locks
+from xrgs.jobs import locks
 worker = subprocess.Popen(["sleep", "600"], stdout=subprocess.DEVNULL)
 assert locks.acquire(Path(sys.argv[1]), "cell").beat(worker.pid)
 print(worker.pid)
@@ -35,7 +35,7 @@ print(worker.pid)
 _TAKE_AND_GIVE = """
 import sys, time
 from pathlib import Path
-from xrgs import locks
+from xrgs.jobs import locks
 folder, log = Path(sys.argv[1]), Path(sys.argv[2])
 end = time.monotonic() + 3
 while time.monotonic() < end:

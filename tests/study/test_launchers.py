@@ -17,12 +17,13 @@ from hydra.core.utils import JobReturn, JobStatus
 from hydra.types import HydraContext
 from omegaconf import DictConfig, OmegaConf
 
-from xrgs import config, launchers
+from xrgs import config
 from xrgs.errors import XrgsError
 from xrgs.files import write_json
-from xrgs.launchers import LOST, Launches, capacity
-from xrgs.plan import Planned, Wish
 from xrgs.store import Store
+from xrgs.study import launchers
+from xrgs.study.launchers import LOST, Launches, capacity
+from xrgs.study.plan import Planned, Wish
 
 SMOKE = ("scene=motorcycle", "preset=smoke", "train.steps=4", "seed=0,1")
 #: Ray's files: the names of its sockets may have no more than 107 bytes.
@@ -34,7 +35,7 @@ import os, sys, time
 from pathlib import Path
 
 os.sched_getaffinity = lambda pid: {0, 1}
-if "xrgs.worker" in sys.orig_argv and "cell" in sys.orig_argv:
+if "xrgs.jobs.worker" in sys.orig_argv and "cell" in sys.orig_argv:
     folder = Path(os.environ["SWEEPS_OF"])
     end = time.monotonic() + 90
     while len(list((folder / "s" / "cells").glob("*/identity.json"))) < 2:

@@ -7,9 +7,9 @@ from typing import Any
 
 import pytest
 
-from xrgs.estimate import Past
 from xrgs.files import write_json
 from xrgs.store import Store
+from xrgs.study.estimate import Past
 
 
 def identity(variant: str, steps: int, weight: float = 1.0, seed: int = 0) -> dict[str, Any]:

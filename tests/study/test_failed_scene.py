@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
-from xrgs.status import describe, read
+from xrgs.study.status import describe, read
 
 TRIED = "building the mixed-resolution variant"
 CONF = ("variant.factor=1", "variant.sfm.fallbacks=false")

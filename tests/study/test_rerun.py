@@ -13,12 +13,12 @@ from typing import Any
 
 import pytest
 
-from xrgs import worker
 from xrgs.errors import XrgsError
 from xrgs.files import write_json
-from xrgs.rerun import Again, rerun
-from xrgs.status import read
+from xrgs.jobs import worker
 from xrgs.store import CellFolder
+from xrgs.study.rerun import Again, rerun
+from xrgs.study.status import read
 
 
 def sweep(folder: Path, *arguments: str) -> tuple[int, str, str]:
