@@ -102,7 +102,7 @@ def test_an_objection_ends_it() -> None:
 def test_no_child_outlives_its_parent(tmp_path: Path, how: signal.Signals) -> None:
     pids = tmp_path / "pids"
     script = (
-        "import sys; from xrgs import supervise; supervise._GRACE_S = 0.1;"
+        "import sys; from xrgs.jobs import supervise; supervise._GRACE_S = 0.1;"
         "supervise.run(sys.argv[1:], supervise.Limits())"
     )
     command = python(script, *python(_STUBBORN, str(pids)))
