@@ -1,6 +1,6 @@
 """`kill -9` at random moments of a sweep: run again, it ends as if it had not been killed.
 
-`XRGS_KILLS=20 pytest tests/test_kill.py --log-cli-level=info` kills so often and tells of it;
+`XRGS_KILLS=20 pytest tests/jobs/test_kill.py --log-cli-level=info` kills so often and tells of it;
 `XRGS_KILL_SEED=N` draws the moments again that a failure names.
 """
 
