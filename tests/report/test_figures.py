@@ -8,7 +8,14 @@ import pandas as pd
 import pytest
 from PIL import Image
 
-from xrgs.report.figures import Panel, curves, differing_crop, side_by_side
+from xrgs.report.figures import (
+    Panel,
+    Quality,
+    curves,
+    differing_crop,
+    side_by_side,
+    trade_off,
+)
 from xrgs.report.pictures import median_view, slug
 
 RNG = np.random.default_rng(0)
@@ -72,6 +79,28 @@ def test_curves_are_drawn_for_both_runs() -> None:
     shown = picture(png)
     for colour in ((0x00, 0x72, 0xB2), (0xD5, 0x5E, 0x00)):
         assert (shown == colour).all(axis=2).sum() > 100
+
+
+ORANGE, BLUE = (0xD5, 0x5E, 0x00), (0x00, 0x72, 0xB2)
+
+
+@pytest.mark.parametrize("higher_is_better", [True, False])
+@pytest.mark.parametrize("better", [True, False])
+def test_a_trade_off_has_the_better_up_and_the_smaller_left(
+    higher_is_better: bool, better: bool
+) -> None:
+    quality = Quality("q", "quality", higher_is_better)
+    change = 2.0 if better == higher_is_better else -2.0
+    means = pd.DataFrame({"gaussians": [0.5], "q": [change]}, index=["_odd $"])
+    scenes = pd.DataFrame({"gaussians": [0.4, 0.6], "q": [0.0, 2 * change]}, index=["_odd $"] * 2)
+    png = trade_off("t", means, scenes, [quality])
+    assert png == trade_off("t", means, scenes, [quality])
+    shown = picture(png)
+    dot = np.argwhere((shown == ORANGE).all(axis=2)).mean(axis=0)
+    lines = np.argwhere((shown == BLUE).all(axis=2))
+    crossing = [np.bincount(lines[:, axis]).argmax() for axis in (0, 1)]
+    assert (dot[0] < crossing[0]) == better
+    assert dot[1] < crossing[1]
 
 
 def test_the_view_shown_is_neither_the_best_nor_the_worst() -> None:

@@ -64,6 +64,25 @@ def test_an_odd_name_has_its_picture(made: Any) -> None:
     assert all(file.parent == report.folder / "figures" for file in pictures)
 
 
+def test_several_ablations_have_a_picture_of_what_they_trade(made: Any) -> None:
+    for condition in ("", "factor=8/x"):
+        made.add(condition=condition, values={"lpips": None})
+        made.add("densify", condition=condition, factors={"gaussians": 2}, values={"lpips": None})
+        made.add("mip", condition=condition, factors={"psnr": 1.1}, values={"lpips": None})
+    made.write()
+    report = build(made.store.path)
+    names = [file.name for file in report.files if file.name.startswith("trade-off")]
+    assert len(names) == 2
+    assert "trade-off.png" in names
+    page = (report.folder / "table.md").read_text()
+    assert all(f"figures/{name}" in page for name in names)
+
+
+def test_one_ablation_has_no_such_picture(study: Any) -> None:
+    study.write()
+    assert not [file for file in build(study.store.path).files if "trade-off" in file.name]
+
+
 def test_every_file_is_there_and_named(study: Any) -> None:
     study.write()
     report = build(study.store.path)

@@ -1,4 +1,4 @@
-"""Pictures of a comparison: photograph, baseline and ablation side by side; curves of training.
+"""Pictures of a comparison: renders side by side, curves of training, Gaussians against quality.
 
 The same inputs give the same bytes: matplotlib's own defaults whatever the user's style, no dates
 and no version in the file. Nothing goes through pyplot, which keeps figures alive.
@@ -15,6 +15,7 @@ import numpy as np
 from matplotlib import style
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
+from matplotlib.ticker import StrMethodFormatter
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping, Sequence
@@ -142,6 +143,66 @@ def curves(
     for text in legend.get_texts():
         text.set_parse_math(False)
     return _png(figure)
+
+
+class Quality(NamedTuple):
+    """An axis of a trade-off: what is got for the Gaussians."""
+
+    name: str
+    label: str
+    higher_is_better: bool
+
+
+@_default_style()
+def trade_off(
+    title: str, means: pd.DataFrame, scenes: pd.DataFrame, axes: Sequence[Quality]
+) -> bytes:
+    """Every ablation by its Gaussians and its quality, one panel a quality; better is up and left.
+
+    A numbered dot is an ablation's mean, the thin lines from it lead to its scenes.
+
+    Args:
+        title: above all.
+        means: one row a label, in order: `gaussians`, as a multiple of the baseline's, above 0;
+            and for each of `axes` its change from the baseline, in a column of its name.
+        scenes: the same columns and index, one row a label and scene.
+        axes: what to draw.
+
+    Returns:
+        A PNG.
+    """
+    figure = _figure(_PANEL * 1.1 * len(axes) + 2, max(_PANEL, 0.2 * len(means)))
+    figure.suptitle(title, fontsize=11, parse_math=False)
+    panels = figure.subplots(1, len(axes), squeeze=False)[0]
+    for panel, quality in zip(panels, axes, strict=True):
+        _dots(panel, means, scenes, quality.name)
+        panel.set_xlabel("Gaussians, times the baseline's")
+        panel.set_title(quality.label, fontsize=10, parse_math=False)
+        if not quality.higher_is_better:
+            panel.invert_yaxis()
+    names = "\n".join(f"{at} {label}" for at, label in enumerate(means.index, start=1))
+    panels[-1].annotate(
+        names, (1.04, 1), xycoords="axes fraction", va="top", fontsize=8, parse_math=False
+    )
+    return _png(figure)
+
+
+def _dots(axis: Axes, means: pd.DataFrame, scenes: pd.DataFrame, quality: str) -> None:
+    """One panel of a trade-off; blue lines cross where the baseline is."""
+    for label, row in scenes.iterrows():
+        ends = means.loc[[label], ["gaussians", quality]].to_numpy()[0], row[["gaussians", quality]]
+        axis.plot(*zip(*ends, strict=True), color="0.75", linewidth=0.7)
+    axis.scatter(means["gaussians"], means[quality], s=110, color=_ABLATION, zorder=3)
+    for at, spot in enumerate(means[["gaussians", quality]].to_numpy(), start=1):
+        axis.annotate(
+            str(at), tuple(spot), ha="center", va="center", color="white", fontsize=7, zorder=4
+        )
+    axis.axhline(0, color=_BASELINE, linewidth=0.8)
+    axis.axvline(1, color=_BASELINE, linewidth=0.8)
+    axis.set_xscale("log", base=2)
+    axis.xaxis.set_major_formatter(StrMethodFormatter("{x:g}"))
+    axis.grid(alpha=0.3)
+    axis.spines[["top", "right"]].set_visible(False)
 
 
 def _figure(width: float, height: float) -> Figure:

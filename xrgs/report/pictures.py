@@ -15,14 +15,23 @@ from xrgs.files import replacing
 from xrgs.images import ImageError
 from xrgs.progress import progress
 from xrgs.report.collect import BASELINE, ReportError
-from xrgs.report.figures import Panel, curves, differing_crop, side_by_side
+from xrgs.report.figures import (
+    Panel,
+    Quality,
+    curves,
+    differing_crop,
+    side_by_side,
+    trade_off,
+)
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
     from pathlib import Path
 
     import numpy as np
     from numpy.typing import NDArray
 
+    from xrgs.metrics import Metric
     from xrgs.report.compare import Comparison
     from xrgs.store import Store
 
@@ -41,9 +50,10 @@ class Picture:
 
 
 def draw(store: Store, comparison: Comparison, views: pd.DataFrame, folder: Path) -> list[Picture]:
-    """One comparison and one picture of training curves for every scene and ablation.
+    """What each ablation trades; then views and training curves of every scene and ablation.
 
-    Of several conditions and seeds the first is drawn; the title says which.
+    The first is drawn where there are several ablations, once a condition. Of several conditions
+    and seeds the others show the first; the title says which.
 
     Args:
         store: where photographs, renders and histories lie.
@@ -60,7 +70,7 @@ def draw(store: Store, comparison: Comparison, views: pd.DataFrame, folder: Path
     scores = views[views["cell_id"].isin(shown)].groupby("cell_id")
     psnr = {cell_id: rows.set_index("view")["psnr"] for cell_id, rows in scores}
     variants = comparison.cells.drop_duplicates("cell_id").set_index("cell_id")["variant_id"]
-    drawn = []
+    drawn = _trade_offs(comparison, folder)
     for _, pair in progress(wanted.iterrows(), "drawing", "picture", len(wanted)):
         both = psnr[pair["baseline_id"]], psnr[pair["cell_id"]]
         photographs = store.variants / variants[pair["cell_id"]] / "images" / "test"
@@ -69,6 +79,45 @@ def draw(store: Store, comparison: Comparison, views: pd.DataFrame, folder: Path
             _training(store, pair, folder),
         ]
     return drawn
+
+
+def _trade_offs(comparison: Comparison, folder: Path) -> list[Picture]:
+    drawn = []
+    for condition in dict.fromkeys(condition for _, condition in comparison.groups):
+        means, scenes = (
+            _traded(table, condition, comparison.metrics)
+            for table in (comparison.means, comparison.per_scene)
+        )
+        axes = [
+            Quality(m.name, f"{m.label}, {m.unit or '%'}", m.higher_is_better)
+            for m in comparison.metrics
+            if m.name in means
+        ]
+        if len(means) < 2 or not axes:
+            continue
+        title = f"What each ablation trades, mean over scenes{condition and f' ({condition})'}"
+        file = folder / f"trade-off{condition and f'.{slug(condition)}'}.png"
+        with replacing(file) as stream:
+            stream.write(trade_off(title, means, scenes, axes))
+        drawn.append(Picture(title, file))
+    return drawn
+
+
+def _traded(table: pd.DataFrame, condition: str, metrics: Sequence[Metric]) -> pd.DataFrame:
+    """Gaussians over the baseline's, and the change of every score of views that was measured.
+
+    Indexed by label. Decibels differ, other scores change in percent. A label that lacks one of
+    them has no row: the tables say why.
+    """
+    here = table[table.index.get_level_values("condition") == condition].droplevel("condition")
+    of = here.index.get_level_values("metric")
+    columns = {"gaussians": 1 + here.loc[of == "gaussians", "change"].droplevel("metric") / 100}
+    for metric in metrics:
+        if metric.score is not None:
+            how = "difference" if metric.unit == "dB" else "change"
+            columns[metric.name] = here.loc[of == metric.name, how].droplevel("metric")
+    wide = pd.DataFrame(columns).dropna(axis="columns", how="all").dropna()
+    return wide.reset_index().set_index("label")
 
 
 def median_view(baseline: pd.Series, ablation: pd.Series) -> str:
