@@ -10,7 +10,7 @@ import torch
 from xrgs import dataset, images
 from xrgs.dataset import LoadedView
 from xrgs.errors import XrgsError
-from xrgs.views import Variant, View
+from xrgs.variant import Variant, View
 
 HR, LR = (40, 30), (20, 15)
 

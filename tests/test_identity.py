@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 
-from xrgs import identity
+from xrgs import hashing, identity
 from xrgs.config import Conf
 from xrgs.hashing import digest
 from xrgs.identity import cell_identity
@@ -90,7 +90,7 @@ def test_a_changed_file_of_thetraining_code_is_another_cell(
         file = tmp_path / name
         file.parent.mkdir(parents=True, exist_ok=True)
         file.write_bytes((package / name).read_bytes())
-    monkeypatch.setattr(identity, "_PACKAGE", tmp_path)
+    monkeypatch.setattr(hashing, "_PACKAGE", tmp_path)
     identity.training_code.cache_clear()
     assert cell_id(baseline) == before
 

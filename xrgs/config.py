@@ -64,7 +64,7 @@ class SfmConf:
     min_inliers: int = MISSING
     """Points that place a view; the first pair needs 10/3 of it, as in COLMAP (30 and 100)."""
     fallbacks: bool = MISSING
-    """Try other recipes, in the order of `xrgs.placing`, where this one places too few views."""
+    """Try other recipes, as `xrgs.variant.placing` orders them, where this one places too few."""
     reference: bool = MISSING
     """Place the undegraded photographs too, to tell how far off the mixed poses are; not where
     exact cameras are known or nothing is degraded."""

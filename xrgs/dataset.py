@@ -34,7 +34,7 @@ class LoadedView:
     camera: Camera
     image: torch.Tensor  # [H, W, 3] float32, 0..1
     rho: float = 1.0
-    """Relative sampling rate in (0, 1], see `xrgs.views.View`."""
+    """Relative sampling rate in (0, 1], see `xrgs.variant.View`."""
 
 
 @dataclass(frozen=True)

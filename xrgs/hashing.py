@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import hashlib
 import json
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import Any
 
-if TYPE_CHECKING:
-    from pathlib import Path
-
-
+_PACKAGE = Path(__file__).parent
+_SOURCES = frozenset({".py", ".cpp", ".h", ".txt"})
 _CHUNK = 1 << 16  # bytes
 
 
@@ -42,3 +41,18 @@ def file_digest(path: Path) -> str:
         while chunk := stream.read(_CHUNK):
             total.update(chunk)
     return total.hexdigest()
+
+
+def source_digests(*names: str) -> dict[str, str]:
+    """SHA-256 of source files, keyed by their path in this package.
+
+    Args:
+        names: Files and folders of the package; a folder stands for every source file inside.
+    """
+    roots = [_PACKAGE / name for name in names]
+    files = [f for root in roots for f in ([root] if root.is_file() else root.rglob("*"))]
+    return {
+        file.relative_to(_PACKAGE).as_posix(): file_digest(file)
+        for file in sorted(files)
+        if file.suffix in _SOURCES
+    }

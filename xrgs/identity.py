@@ -7,17 +7,15 @@ another name, in another folder or on another machine.
 from __future__ import annotations
 
 from functools import cache
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from xrgs.evaluate import PROTOCOL
-from xrgs.hashing import file_digest, plain
+from xrgs.hashing import plain, source_digests
 from xrgs.splat.backend import resolve_backend
 
 if TYPE_CHECKING:
     from xrgs.config import Conf
 
-_PACKAGE = Path(__file__).parent
 #: Files whose change can change a trained number; of folders, every source file inside.
 _TRAINING_CODE = (
     "splat",
@@ -34,20 +32,13 @@ _TRAINING_CODE = (
 #: What the native backend is compiled from, shipped beside it: two builds of it are not the same
 #: bytes, and not another program.
 _NATIVE_CODE = "native"
-_SOURCES = frozenset({".py", ".cpp", ".h", ".txt"})
 
 
 @cache
 def training_code(backend: str) -> dict[str, str]:
     """SHA-256 of each source file that trains with a backend, keyed by its path in the package."""
     names = (*_TRAINING_CODE, _NATIVE_CODE) if backend == "native" else _TRAINING_CODE
-    roots = [_PACKAGE / name for name in names]
-    files = [f for root in roots for f in ([root] if root.is_file() else root.rglob("*"))]
-    return {
-        file.relative_to(_PACKAGE).as_posix(): file_digest(file)
-        for file in sorted(files)
-        if file.suffix in _SOURCES
-    }
+    return source_digests(*names)
 
 
 def cell_identity(conf: Conf, variant_id: str) -> dict[str, Any]:

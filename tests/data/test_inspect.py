@@ -17,7 +17,7 @@ from xrgs.data import inspect
 from xrgs.data.sheet import COLOURS, contact_sheet
 from xrgs.errors import XrgsError
 from xrgs.report.render import to_text
-from xrgs.views import Variant, View
+from xrgs.variant import Variant, View
 
 Run = Callable[..., tuple[int, str, str]]
 

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Mapping
 
     from xrgs.config import Conf
-    from xrgs.views import Variant
+    from xrgs.variant import Variant
 
 _PLACED, _LOST = "yes", "no"
 

@@ -13,7 +13,7 @@ from xrgs.progress import progress
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
-    from xrgs.views import Variant, View
+    from xrgs.variant import Variant, View
 
 #: px: the box that a whole view is fitted into, the side of the centre beside it, and the rest.
 _BOX = (256, 192)

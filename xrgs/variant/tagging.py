@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 if TYPE_CHECKING:
     from xrgs.images import Lens
-    from xrgs.sfm import Reconstruction
+    from xrgs.variant.sfm import Reconstruction
 
 Array = NDArray[np.float64]
 

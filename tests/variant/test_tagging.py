@@ -3,9 +3,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from xrgs import tagging
 from xrgs.images import Lens
-from xrgs.sfm import Reconstruction
+from xrgs.variant import tagging
+from xrgs.variant.sfm import Reconstruction
 
 LENS = Lens(100, 80, 90.0, 90.0, 50.0, 40.0)
 

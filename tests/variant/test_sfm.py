@@ -6,10 +6,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from xrgs import images, scenes, sfm
+from xrgs import images, scenes
 from xrgs.config import SceneConf, SfmConf
 from xrgs.scenes import motorcycle
 from xrgs.scenes.bundled import photograph
+from xrgs.variant import sfm
 
 CONF = SfmConf("upsampled", 0, 4.0, 0.75, 0, "auto", None, 30, fallbacks=True, reference=False)
 

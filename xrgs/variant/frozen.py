@@ -1,8 +1,8 @@
-"""A mixed-resolution variant of a scene: built once, frozen, hashed, shared by every cell.
+"""A variant on disk: built once, frozen, hashed, shared by every cell.
 
-On disk, in a folder named by its id: `variant.json` (what `Variant` holds, and the hash of every
-other file), `images/<split>/<view>.png`, `points.npz`, `report.json` (how SfM went) and
-`colmap.log`. Nothing here imports torch before a variant is built, so that a plan can read it.
+A folder named by its id has `variant.json` (what `Variant` holds, and the hash of every other
+file), `images/<split>/<view>.png`, `points.npz`, `report.json` (how SfM went) and `colmap.log`.
+Nothing here imports torch before a variant is built, so that a plan can read it.
 """
 
 from __future__ import annotations
@@ -19,46 +19,23 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from xrgs import foreign, npz, scenes, split
+from xrgs import foreign, npz, scenes
 from xrgs.errors import XrgsError
 from xrgs.files import write_json
-from xrgs.hashing import digest, file_digest
+from xrgs.hashing import digest, file_digest, source_digests
 from xrgs.records import FAILED, failed_scenes
-from xrgs.views import SceneFailed, Variant, View
+from xrgs.variant import split
+from xrgs.variant.views import SceneFailed, Variant, View
 
 if TYPE_CHECKING:
     from xrgs.config import SceneConf, VariantConf
-
-__all__ = [
-    "CorruptVariant",
-    "SceneFailed",
-    "Variant",
-    "View",
-    "build",
-    "failure",
-    "find",
-    "key",
-    "load",
-]
 
 _log = logging.getLogger(__name__)
 
 _SPLITS = frozenset({"train", "test", "original"})
 
 #: Their code decides what a variant is: a change of it makes a new one.
-_CODE = (
-    "alignment.py",
-    "degrade.py",
-    "images.py",
-    "mixing.py",
-    "photographs.py",
-    "placing.py",
-    "sfm.py",
-    "split.py",
-    "tagging.py",
-    "variant.py",
-    "views.py",
-)
+_CODE = ("variant", "images.py")
 
 
 class CorruptVariant(XrgsError):  # noqa: N818
@@ -200,7 +177,7 @@ def _written(file: Path) -> int | None:
 
 def _make(scene: scenes.Scene, conf: VariantConf, wanted: str, variants: Path) -> Variant:
     """Mix and freeze; whatever a killed process left of it is cleared first."""
-    from xrgs import mixing
+    from xrgs.variant import mixing
 
     work, failed = variants / f".{wanted}.building", variants / f"{FAILED}{wanted}"
     foreign.remove(work)
@@ -238,9 +215,7 @@ def _freeze(made: Variant, wanted: str, folder: Path, variants: Path) -> Variant
 
 
 def _key(fingerprint: str, conf: VariantConf) -> str:
-    here = Path(__file__).parent
-    code = [file_digest(here / name) for name in _CODE]
-    return digest([fingerprint, asdict(conf), code])
+    return digest([fingerprint, asdict(conf), source_digests(*_CODE)])
 
 
 def _id(content: dict[str, Any]) -> str:

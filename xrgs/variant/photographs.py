@@ -11,11 +11,12 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from xrgs import degrade, images
+from xrgs import images
 from xrgs.errors import XrgsError
 from xrgs.images import Lens
 from xrgs.progress import progress
-from xrgs.split import Frame, frame, scale
+from xrgs.variant import degrade
+from xrgs.variant.split import Frame, frame, scale
 
 if TYPE_CHECKING:
     from xrgs.config import VariantConf

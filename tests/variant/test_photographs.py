@@ -9,8 +9,8 @@ from PIL import Image
 from xrgs import images
 from xrgs.config import SfmConf, VariantConf
 from xrgs.errors import XrgsError
-from xrgs.photographs import prepare, share_cameras
 from xrgs.scenes import Scene
+from xrgs.variant.photographs import prepare, share_cameras
 
 CONF = VariantConf(long_side=0, factor=2, sfm=SfmConf(camera="auto"))
 

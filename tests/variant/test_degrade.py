@@ -7,8 +7,9 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from xrgs import degrade, images
+from xrgs import images
 from xrgs.config import VariantConf
+from xrgs.variant import degrade
 
 CONF = VariantConf(factor=5, tags="flag", degradation="downsample", jpeg_quality=10)
 

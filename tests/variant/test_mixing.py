@@ -1,6 +1,5 @@
 from __future__ import annotations
 
-import ast
 import shutil
 from collections.abc import Callable, Sequence
 from dataclasses import replace
@@ -10,13 +9,13 @@ import numpy as np
 import pytest
 from hydra import compose, initialize_config_dir
 
-from xrgs import config, degrade, images, mixing, placing, scenes, sfm, variant
+from xrgs import config, images, scenes
 from xrgs.config import SceneConf, SfmConf, VariantConf
 from xrgs.errors import XrgsError
 from xrgs.scenes import Scene, procedural
-from xrgs.sfm import Reconstruction, Shot
-from xrgs.split import check
-from xrgs.views import SceneFailed, Variant, View
+from xrgs.variant import SceneFailed, Variant, View, degrade, mixing, placing, sfm
+from xrgs.variant.sfm import Reconstruction, Shot
+from xrgs.variant.split import check
 
 VIEWS = 12
 CONF = VariantConf(
@@ -305,25 +304,6 @@ def test_every_choice_of_variant_is_one_that_can_be_made(
 def test_every_choice_of_variant_is_tested() -> None:
     files = {file.stem for file in (config.CONF_DIR / "variant").iterdir()}
     assert files == {"digital_zoom", "distance", "jpeg", "megapixels", "sampling_rate"}
-
-
-# identity
-
-
-def test_the_code_of_a_variant_is_everything_that_making_one_imports() -> None:
-    """What else is imported can't change a variant: it refuses, counts or writes."""
-    package = Path(mixing.__file__).parent
-    harmless = {"config", "errors", "files", "foreign", "hashing", "machine", "progress"}
-    harmless |= {"scenes"}  # which have marks of their own
-    reached, todo = set(), {"mixing"}
-    while todo:
-        name = todo.pop()
-        reached.add(name)
-        for node in ast.walk(ast.parse((package / f"{name}.py").read_text())):
-            if isinstance(node, ast.ImportFrom) and (node.module or "").startswith("xrgs"):
-                parts = (node.module or "").split(".")[1:2] or [a.name for a in node.names]
-                todo |= set(parts) - harmless - reached
-    assert {f"{name}.py" for name in reached} | {"variant.py"} == set(variant._CODE)
 
 
 # real photographs

@@ -15,17 +15,18 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from xrgs import degrade, images, placing, tagging
-from xrgs.alignment import pose_error
-from xrgs.photographs import Photographs, prepare, write_degraded
+from xrgs import images
 from xrgs.progress import progress
-from xrgs.split import Split, check, split
-from xrgs.views import SceneFailed, Variant, View
+from xrgs.variant import degrade, placing, tagging
+from xrgs.variant.alignment import pose_error
+from xrgs.variant.photographs import Photographs, prepare, write_degraded
+from xrgs.variant.split import Split, check, split
+from xrgs.variant.views import SceneFailed, Variant, View
 
 if TYPE_CHECKING:
     from xrgs.config import VariantConf
     from xrgs.scenes import Scene
-    from xrgs.sfm import Reconstruction
+    from xrgs.variant.sfm import Reconstruction
 
 
 @dataclass(frozen=True)

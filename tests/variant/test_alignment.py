@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from xrgs.alignment import pose_error, similarity
+from xrgs.variant.alignment import pose_error, similarity
 
 
 def rotation(rng: np.random.Generator) -> np.ndarray:

@@ -7,10 +7,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from xrgs import degrade, images, placing, scenes, sfm
+from xrgs import images, scenes
 from xrgs.config import SceneConf, SfmConf, VariantConf
-from xrgs.photographs import Photographs, prepare, write_degraded
-from xrgs.sfm import Reconstruction
+from xrgs.variant import degrade, placing, sfm
+from xrgs.variant.photographs import Photographs, prepare, write_degraded
+from xrgs.variant.sfm import Reconstruction
 
 CONF = VariantConf(
     long_side=185,

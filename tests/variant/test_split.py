@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 
 from xrgs.config import SfmConf, VariantConf
 from xrgs.errors import XrgsError
-from xrgs.split import SSIM_WINDOW, check, frame, scale, split
+from xrgs.variant.split import SSIM_WINDOW, check, frame, scale, split
 
 BASE = VariantConf(
     long_side=504,

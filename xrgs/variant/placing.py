@@ -20,13 +20,13 @@ from collections.abc import Callable, Collection, Iterator
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
-from xrgs import sfm
+from xrgs.variant import sfm
 
 if TYPE_CHECKING:
     from pathlib import Path
 
     from xrgs.config import SfmConf
-    from xrgs.photographs import Photographs
+    from xrgs.variant.photographs import Photographs
 
 _log = logging.getLogger(__name__)
 

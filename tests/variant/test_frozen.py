@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import ast
 import json
 import os
 import shutil
@@ -11,10 +12,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+import xrgs
 from xrgs import images, scenes, variant
 from xrgs.config import SceneConf, SfmConf, VariantConf
 from xrgs.errors import XrgsError
-from xrgs.variant import CorruptVariant, SceneFailed, Variant, View
+from xrgs.hashing import source_digests
+from xrgs.variant import CorruptVariant, SceneFailed, Variant, View, frozen
 
 CONF = VariantConf(
     long_side=252,
@@ -231,10 +234,29 @@ def test_the_key_follows_photographs_config_and_code(
     sfm = replace(PAIR_CONF.sfm, seed=1)
     others = {variant.key(PAIR, replace(PAIR_CONF, **c)) for c in ({"seed": 1}, {"sfm": sfm})}
     others.add(variant.key(PROCEDURAL, PAIR_CONF))
-    monkeypatch.setattr(variant, "_CODE", variant._CODE[:-1])
+    monkeypatch.setattr(frozen, "_CODE", frozen._CODE[:-1])
     others.add(variant.key(PAIR, PAIR_CONF))
     assert len(others | {key}) == 5
     assert variant.find(shared.variants, "0" * 16) is None
+
+
+def test_the_code_of_a_variant_is_everything_that_making_one_imports() -> None:
+    """What else is imported can't change a variant: it refuses, counts or writes."""
+    package = Path(xrgs.__file__).parent
+    harmless = {"config", "errors", "files", "foreign", "hashing", "machine", "progress"}
+    harmless |= {"scenes"}  # which have marks of their own
+    reached, todo = set(), {"variant/mixing"}
+    while todo:
+        file = todo.pop()
+        reached.add(file)
+        for node in ast.walk(ast.parse((package / f"{file}.py").read_text())):
+            if isinstance(node, ast.ImportFrom) and (node.module or "").startswith("xrgs"):
+                for alias in node.names:
+                    room, *inner = f"{node.module}.{alias.name}".split(".")[1:]
+                    todo |= {f"variant/{inner[0]}" if room == "variant" else room} - harmless
+        todo -= reached
+    reached |= {"variant/frozen", "variant/__init__"}
+    assert {f"{file}.py" for file in reached} == set(source_digests(*frozen._CODE))
 
 
 @pytest.mark.parametrize(
