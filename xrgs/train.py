@@ -29,6 +29,7 @@ from xrgs.splat.settings import NOMINAL_STEPS
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
 
+    from xrgs.components import Components
     from xrgs.config import Conf
     from xrgs.dataset import Dataset, LoadedView
     from xrgs.splat.gaussians import Gaussians
@@ -85,26 +86,10 @@ def train(data: Dataset, conf: Conf, checkpoint: Checkpoint | None = None) -> Tr
 
 def _run(data: Dataset, conf: Conf, checkpoint: Checkpoint) -> Trained:
     """One run from its first step to its last."""
-    steps, splat = conf.train.steps, conf.splat
+    steps, splat, ssim = conf.train.steps, conf.splat, conf.splat.ssim_weight
     backend = resolve_backend(splat.backend)
-    gaussians = splats.from_points(
-        data.points,
-        data.colors,
-        init_opacity=splat.init_opacity,
-        sh_degree=splat.raster.sh_degree,
-        generator=stream(conf.seed, "init"),
-    )
-    optimizer = SplatOptimizer(
-        gaussians, splat.optimizer, scene_scale=data.scene_scale, steps=steps, backend=backend
-    )
-    parts = components.build(conf.components, data, splat, backend)
-    densifier = Densifier(
-        optimizer,
-        splat.densify.scaled(steps),
-        scene_scale=data.scene_scale,
-        generator=stream(conf.seed, "densify"),
-        groups=parts.groups(splat.densify),
-    )
+    optimizer, densifier, parts = _built(data, conf, backend)
+    gaussians = optimizer.gaussians
     targets = {view.name: prepare_target(view.image) for view in data.train}
     sh_every = max(1, int(splat.sh_every * steps / NOMINAL_STEPS))
     drawn = Rounds(data.train, conf.seed, steps, parts.trains_on)
@@ -127,13 +112,9 @@ def _run(data: Dataset, conf: Conf, checkpoint: Checkpoint) -> Trained:
             means2d_offset=offset,
             backend=backend,
         )
+        target, weights = targets[view.name], parts.pixel_weight(step)
         loss = photometric_loss(
-            render.image,
-            targets[view.name],
-            l1=1 - splat.ssim_weight,
-            ssim=splat.ssim_weight,
-            pixel_weight=parts.pixel_weight(step),
-            backend=backend,
+            render.image, target, l1=1 - ssim, ssim=ssim, pixel_weight=weights, backend=backend
         )
         loss = parts.loss(loss, render.image, step)
         optimizer.zero_grad()
@@ -142,20 +123,38 @@ def _run(data: Dataset, conf: Conf, checkpoint: Checkpoint) -> Trained:
         optimizer.step(camera, sh_degree=degree)
         ledger.note(step, loss, render, optimizer)
         statistic = None if offset.grad is None else parts.statistic(offset.grad, step)
-        done = densifier.after_step(
-            step.number,
-            statistic,
-            render.visible,
-            width=camera.width,
-            height=camera.height,
-            group=view.tag,
-        )
+        size = {"width": camera.width, "height": camera.height}
+        done = densifier.after_step(step.number, statistic, render.visible, **size, group=view.tag)
         ledger.refined(done)
         if done != Refinement():
             parts.refined(gaussians)
         ledger.leave_out(checkpoint.after_step(step.number))
     parts.finish(gaussians)
     return ledger.close(gaussians)
+
+
+def _built(data: Dataset, conf: Conf, backend: str) -> tuple[SplatOptimizer, Densifier, Components]:
+    """What trains a cell, before its first step; the optimizer has the Gaussians."""
+    splat, steps = conf.splat, conf.train.steps
+    gaussians = splats.from_points(
+        data.points,
+        data.colors,
+        init_opacity=splat.init_opacity,
+        sh_degree=splat.raster.sh_degree,
+        generator=stream(conf.seed, "init"),
+    )
+    optimizer = SplatOptimizer(
+        gaussians, splat.optimizer, scene_scale=data.scene_scale, steps=steps, backend=backend
+    )
+    parts = components.build(conf.components, data, splat, backend)
+    densifier = Densifier(
+        optimizer,
+        splat.densify.scaled(steps),
+        scene_scale=data.scene_scale,
+        generator=stream(conf.seed, "densify"),
+        groups=parts.groups(splat.densify),
+    )
+    return optimizer, densifier, parts
 
 
 def stream(seed: int, axis: str) -> torch.Generator:

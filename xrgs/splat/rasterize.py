@@ -10,9 +10,19 @@ from torch import Tensor
 
 from xrgs.splat.backend import resolve_backend
 from xrgs.splat.cameras import Camera
+from xrgs.splat.gaussians import Activated
 from xrgs.splat.settings import RasterSettings
 
 _MODULES = {"torch": "xrgs.splat.torch_rasterizer", "native": "xrgs.splat.native"}
+#: Of one Gaussian; that of shN goes by its own bands.
+_SHAPES: dict[str, tuple[int, ...]] = {
+    "means": (3,),
+    "quats": (4,),
+    "scales": (3,),
+    "opacities": (),
+    "sh0": (1, 3),
+    "means2d_offset": (2,),
+}
 
 
 @dataclass(frozen=True)
@@ -68,27 +78,25 @@ def rasterize(
         ValueError: a parameter has the wrong shape or type, or values that are not finite or out
             of range; the message names it.
     """
-    parameters = {
-        "means": (means, (3,)),
-        "quats": (quats, (4,)),
-        "scales": (scales, (3,)),
-        "opacities": (opacities, ()),
-        "sh0": (sh0, (1, 3)),
-        "shN": (shN, (*shN.shape[1:2], 3)),
-    }
+    values = Activated(means, quats, scales, opacities, sh0, shN)
+    named = values._asdict()
     if means2d_offset is not None:
-        parameters["means2d_offset"] = (means2d_offset, (2,))
-    count = means.shape[0] if means.ndim else 0
-    for name, (value, shape) in parameters.items():
-        _check(name, value, (count, *shape), means.dtype)
+        named["means2d_offset"] = means2d_offset
+    _check_shapes(named)
     backend = resolve_backend(backend)
     if backend == "torch":  # the native one looks at values as it reads them
-        _check_values({name: value for name, (value, _) in parameters.items()})
+        _check_values(named)
     module = importlib.import_module(_MODULES[backend])
-    render: Render = module.render(
-        means, quats, scales, opacities, sh0, shN, camera, settings, sh_degree, means2d_offset
-    )
+    render: Render = module.render(*values, camera, settings, sh_degree, means2d_offset)
     return render
+
+
+def _check_shapes(values: dict[str, Tensor]) -> None:
+    means = values["means"]
+    count = means.shape[0] if means.ndim else 0
+    shapes = _SHAPES | {"shN": (*values["shN"].shape[1:2], 3)}
+    for name, value in values.items():
+        _check(name, value, (count, *shapes[name]), means.dtype)
 
 
 def _check(name: str, value: Tensor, shape: tuple[int, ...], dtype: torch.dtype) -> None:
@@ -98,11 +106,11 @@ def _check(name: str, value: Tensor, shape: tuple[int, ...], dtype: torch.dtype)
         raise ValueError(f"{name} must be of the floating type of means, got {value.dtype}")
 
 
-def _check_values(parameters: dict[str, Tensor]) -> None:
-    for name, value in parameters.items():
+def _check_values(values: dict[str, Tensor]) -> None:
+    for name, value in values.items():
         if not torch.isfinite(value).all():
             raise ValueError(f"{name} has values that are not finite")
-    if (parameters["scales"] < 0).any():
+    if (values["scales"] < 0).any():
         raise ValueError("scales has values below 0")
-    if ((parameters["opacities"] < 0) | (parameters["opacities"] > 1)).any():
+    if ((values["opacities"] < 0) | (values["opacities"] > 1)).any():
         raise ValueError("opacities has values outside 0..1")
