@@ -14,7 +14,7 @@ from hydra.core.hydra_config import HydraConfig
 from xrgs import cli, config, variant
 from xrgs.config import Conf
 from xrgs.jobs import locks, worker
-from xrgs.jobs.job import STOPPED, Call, run_job
+from xrgs.jobs.job import LOCKED, STOPPED, Call, run_job
 from xrgs.store import Store
 
 
@@ -64,16 +64,25 @@ def test_no_job_begins_for_a_sweep_that_is_gone(conf: Conf, call: Call, store: S
     assert not list(store.cells.iterdir())
 
 
-def test_a_cell_ends_with_its_sweep_and_is_unfinished(
-    conf: Conf, call: Call, store: Store, monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize(
+    ("whose", "what", "outcome"), [(locks.Owner, "lives", STOPPED), (locks.Lock, "beat", LOCKED)]
+)
+def test_a_cell_ends_with_its_sweep_or_its_lock_and_is_unfinished(
+    conf: Conf,
+    call: Call,
+    store: Store,
+    monkeypatch: pytest.MonkeyPatch,
+    whose: type,
+    what: str,
+    outcome: str,
 ) -> None:
-    def run(_: str, __: object, ___: object, objection: Callable[[int], str]) -> None:
-        assert not objection(0)
-        monkeypatch.setattr(locks.Owner, "lives", False)
-        raise worker.WorkerError(objection(0))
+    def run(_: str, __: object, ___: object, objection: Callable[[int], None]) -> None:
+        objection(0)
+        monkeypatch.setattr(whose, what, False if outcome == STOPPED else lambda *_: False)
+        objection(0)
 
     monkeypatch.setattr(worker, "run", run)
-    assert run_job(conf, call) == STOPPED
+    assert run_job(conf, call) == outcome
     (cell,) = store.cells.iterdir()
     assert store.cell(cell.name).state().name == "unfinished"
     assert not list(store.locks.iterdir())

@@ -94,8 +94,16 @@ def test_memory_that_nobody_tells_of_is_not_limited_in_silence(
 
 
 def test_an_objection_ends_it() -> None:
-    ended = supervise.run(python("import time; time.sleep(600)"), Limits(), lambda _: "enough")
-    assert ended == supervise.Ended(-signal.SIGTERM, "enough")
+    asked = []
+
+    def objection(pid: int) -> None:
+        asked.append(pid)
+        if len(asked) == 2:
+            raise XrgsError("enough")
+
+    with pytest.raises(XrgsError, match="enough"):
+        supervise.run(python("import time; time.sleep(600)"), Limits(), objection)
+    assert gone(asked[-1])
 
 
 @pytest.mark.parametrize("how", [signal.SIGKILL, signal.SIGTERM, signal.SIGINT])

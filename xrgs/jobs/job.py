@@ -30,6 +30,15 @@ if TYPE_CHECKING:
 LOCKED, STOPPED, UNWRITABLE = "locked", "stopped", "unwritable"
 
 
+class _LeftError(XrgsError):
+    """The cell is left, for no fault of its own."""
+
+    def __init__(self, outcome: str, reason: str) -> None:
+        super().__init__(reason)
+        self.outcome = outcome
+        """What the job ends with."""
+
+
 @dataclass(frozen=True)
 class Call:
     """One call of `xrgs-sweep`, as its jobs know it: by a folder of its own."""
@@ -112,24 +121,24 @@ def _run_alone(conf: Conf, store: Store, call: Call) -> str:
 
 def _train(conf: Conf, found: Path, folder: CellFolder, lock: locks.Lock, call: Call) -> str:
     request = {"conf": asdict(conf), "variant": str(found), "cell": str(folder.path)}
-    lost = f"{folder.id}: this process was away too long, and another has taken the cell over"
-    left = f"{folder.id}: the sweep that started it is gone"
 
-    def objection(pid: int) -> str:
+    def objection(pid: int) -> None:
         if not lock.beat(pid):
-            return lost
-        return left if call.gone else ""
+            why = "this process was away too long, and another has taken the cell over"
+            raise _LeftError(LOCKED, f"{folder.id}: {why}")
+        if call.gone:
+            raise _LeftError(STOPPED, f"{folder.id}: the sweep that started it is gone")
 
     try:
         worker.run("cell", request, Limits(**asdict(conf.limits)), objection)
+    except _LeftError as error:
+        say(str(error))
+        return error.outcome
     except worker.UnwritableError as error:
         # No fault of the cell's: it stays unfinished, and is run again without being asked for.
         say(f"{folder.id} stopped: {error}")
         return UNWRITABLE
     except XrgsError as error:
-        if str(error) in {lost, left}:
-            say(str(error))
-            return LOCKED if str(error) == lost else STOPPED
         state = folder.state().name
         if state != "done":  # it may have ended, and its process died on the way out
             folder.fail(str(error))

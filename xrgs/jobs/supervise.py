@@ -40,11 +40,11 @@ class Ended:
     code: int
     """Its exit code, or minus the signal that ended it."""
     reason: str = ""
-    """Why it was ended from here; empty where it ended by itself."""
+    """Which limit it was ended at; empty where it ended by itself."""
 
 
 def run(
-    command: Sequence[str], limits: Limits, objection: Callable[[int], str] = lambda _: ""
+    command: Sequence[str], limits: Limits, objection: Callable[[int], None] = lambda _: None
 ) -> Ended:
     """Run a command to its end, or to its limit, with a session of its own.
 
@@ -53,8 +53,8 @@ def run(
     Args:
         command: program and arguments.
         limits: it and its children are ended where they go beyond.
-        objection: asked again and again while it runs, with its process number; a text ends it, and
-            is the reason.
+        objection: called again and again while it runs, with its process number; what it raises
+            ends it, and is raised here.
 
     Raises:
         XrgsError: memory is limited on a system that doesn't tell how much a process has.
@@ -69,7 +69,7 @@ def run(
     return Ended(child.returncode, reason)
 
 
-def _watch(child: subprocess.Popen[bytes], limits: Limits, objection: Callable[[int], str]) -> str:
+def _watch(child: subprocess.Popen[bytes], limits: Limits, objection: Callable[[int], None]) -> str:
     """Wait for its end; why it has to be ended, or empty."""
     start, pause = time.monotonic(), 0.01
     while child.poll() is None:
@@ -81,8 +81,7 @@ def _watch(child: subprocess.Popen[bytes], limits: Limits, objection: Callable[[
                 f"out of memory: it used {used:.2f} GB, more than "
                 f"limits.memory_gb={limits.memory_gb:g}, and was ended"
             )
-        if reason := objection(child.pid):
-            return reason
+        objection(child.pid)
         time.sleep(pause)
         pause = min(_LOOK_S, 1.5 * pause)
     return ""

@@ -45,7 +45,7 @@ def run(
     job: str,
     request: Mapping[str, Any],
     limits: supervise.Limits = _NO_LIMITS,
-    objection: Callable[[int], str] = lambda _: "",
+    objection: Callable[[int], None] = lambda _: None,
 ) -> dict[str, Any]:
     """Run one job in a child process and return its answer.
 
@@ -53,7 +53,8 @@ def run(
         job: a name in `_JOBS`.
         request: what it is to do, as plain JSON values.
         limits: the child is ended where it goes beyond.
-        objection: asked while it runs, with the child's number; a text ends it, and is the reason.
+        objection: called while it runs, with the child's number; what it raises ends the child, and
+            is raised here.
 
     Raises:
         UnwritableError: it could not write its files; nothing else is wrong with it.
