@@ -14,7 +14,7 @@ from hydra.core.hydra_config import HydraConfig
 from xrgs import cli, config, variant
 from xrgs.config import Conf
 from xrgs.jobs import locks, worker
-from xrgs.jobs.job import LOCKED, STOPPED, Call, run_job
+from xrgs.jobs.job import FAIL_FAST, LOCKED, STOPPED, STORE_FULL, Call, run_job
 from xrgs.store import Store
 
 
@@ -51,12 +51,43 @@ def signed_by(call: Call, **changes: object) -> Call:
 
 
 def test_a_call_is_over_when_it_is_stopped_or_its_process_is_no_more(call: Call) -> None:
-    assert not call.over
-    assert signed_by(call, started=1).over
-    assert not signed_by(call, host="elsewhere").over  # there it may run
-    assert not signed_by(call, boot="another").over
-    call.stop()
-    assert call.over
+    assert not call.stopped
+    assert signed_by(call, started=1).stopped == "the sweep is gone"
+    assert not signed_by(call, host="elsewhere").stopped  # there it may run
+    assert not signed_by(call, boot="another").stopped
+    for reason in ("the first", "the second"):
+        call.stop(reason)
+        assert call.stopped == "the first"
+
+
+@pytest.mark.parametrize(
+    ("error", "fail_fast", "why"),
+    [
+        (worker.WorkerError("it raised"), True, FAIL_FAST),
+        (worker.WorkerError("it raised"), False, ""),
+        (worker.UnwritableError("a full disk"), True, STORE_FULL),
+    ],
+)
+def test_a_job_that_stops_the_others_says_why(
+    conf: Conf,
+    call: Call,
+    monkeypatch: pytest.MonkeyPatch,
+    error: worker.WorkerError,
+    fail_fast: bool,
+    why: str,
+) -> None:
+    def run(*_: object) -> None:
+        raise error
+
+    monkeypatch.setattr(worker, "run", run)
+    conf.fail_fast = fail_fast
+    run_job(conf, call)
+    assert call.stopped == why
+
+
+def test_a_disk_too_full_for_the_reason_stops_the_others_all_the_same(call: Call) -> None:
+    (call.folder / "stopped").touch()
+    assert call.stopped == f"there is {call.folder / 'stopped'}"
 
 
 def test_no_job_begins_for_a_sweep_that_is_gone(conf: Conf, call: Call, store: Store) -> None:

@@ -28,6 +28,8 @@ if TYPE_CHECKING:
 #: What a job ends with beside a cell's states: another sweep trains the cell; the sweep is over, or
 #: was told to start nothing more; the store takes no more.
 LOCKED, STOPPED, UNWRITABLE = "locked", "stopped", "unwritable"
+#: Why no job of a call begins any more, see `Call.stop`.
+FAIL_FAST, STORE_FULL = "fail_fast, and a cell failed", "the store can't be written"
 
 
 class _LeftError(XrgsError):
@@ -49,10 +51,11 @@ class Call:
         """Say which process it is."""
         locks.sign(self.folder / "sweep")
 
-    def stop(self) -> None:
-        """Have no job begin any more."""
-        with suppress(OSError):  # a full disk may have room for a name
-            (self.folder / "stopped").touch()
+    def stop(self, reason: str) -> None:
+        """Have no job begin any more, and say why; the first reason stays."""
+        # A full disk may have room for a name, and for no word in it.
+        with suppress(OSError), (self.folder / "stopped").open("x", encoding="utf-8") as stream:
+            stream.write(reason)
 
     @cached_property
     def _owner(self) -> locks.Owner | None:
@@ -64,9 +67,12 @@ class Call:
         return self._owner is not None and self._owner.here and not self._owner.lives
 
     @property
-    def over(self) -> bool:
-        """Whether no job is to begin any more."""
-        return (self.folder / "stopped").exists() or self.gone
+    def stopped(self) -> str:
+        """Why no job is to begin any more; empty while they may."""
+        file = self.folder / "stopped"
+        if file.exists():
+            return file.read_text(encoding="utf-8", errors="replace") or f"there is {file}"
+        return "the sweep is gone" if self.gone else ""
 
 
 def run_job(conf: Conf, call: Call) -> str:
@@ -79,7 +85,7 @@ def run_job(conf: Conf, call: Call) -> str:
     Returns:
         The cell's state, or `LOCKED`, `STOPPED` or `UNWRITABLE`.
     """
-    if call.over:
+    if call.stopped:
         return STOPPED
     store = Store(Path(conf.store))
     try:
@@ -89,8 +95,10 @@ def run_job(conf: Conf, call: Call) -> str:
             raise
         say(f"store={store.path}: {error}")
         outcome = UNWRITABLE
-    if outcome == UNWRITABLE or (conf.fail_fast and outcome == "failed"):
-        call.stop()
+    if outcome == UNWRITABLE:
+        call.stop(STORE_FULL)
+    if conf.fail_fast and outcome == "failed":
+        call.stop(FAIL_FAST)
     return outcome
 
 

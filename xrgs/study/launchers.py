@@ -151,6 +151,11 @@ class Launches:
         with flag_override(self._config.hydra, ["readonly", "struct"], False):
             OmegaConf.update(self._config.hydra, key, value)
 
+    @property
+    def stopped(self) -> str:
+        """Why no job begins any more; empty while they may."""
+        return self._call.stopped if self._call else ""
+
     def run(self, cells: Iterable[Planned], store: Store) -> dict[str, str]:
         """Run cells that have an identity, the longest first.
 
@@ -169,7 +174,7 @@ class Launches:
             self._set(f"launcher.{key}", value)
         outcomes: dict[str, str] = {}
         for batch in self._batches(cells, allowed.batch or len(cells)):
-            if call.over:
+            if call.stopped:
                 outcomes |= {str(cell.cell_id): STOPPED for cell in batch}
                 continue
             outcomes |= self._launch(batch, allowed.threads(len(batch), machine), store)

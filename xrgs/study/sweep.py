@@ -26,7 +26,7 @@ from xrgs.config import to_conf
 from xrgs.errors import XrgsError
 from xrgs.hashing import digest, plain
 from xrgs.jobs import locks, worker
-from xrgs.jobs.job import LOCKED, STOPPED, UNWRITABLE
+from xrgs.jobs.job import FAIL_FAST, LOCKED, UNWRITABLE
 from xrgs.progress import say as _say
 from xrgs.records import StoreError
 from xrgs.store import Store
@@ -188,8 +188,9 @@ class Study:
             plan = self._identified(plan, store)
             if UNWRITABLE in outcomes.values():
                 raise StoreError(f"store={store.path} can't be written. {_NOTHING_LOST}")
-            if STOPPED in outcomes.values() or (conf.fail_fast and "failed" in outcomes.values()):
-                _say("fail_fast: nothing more is started")
+            failed = conf.fail_fast and "failed" in outcomes.values()
+            if why := launches.stopped or (FAIL_FAST if failed else ""):
+                _say(f"nothing more is started: {why}")
                 return list(plan)
             if not wanted and not told:
                 _say(f"waiting for {len(others)} cells: {others[0].name} {others[0].state.reason}")
