@@ -4,12 +4,16 @@ from __future__ import annotations
 
 import importlib.util
 from collections.abc import Callable, Iterator
+from typing import Any
 
 import pytest
 import torch
 from torch import Tensor
 
 from xrgs.splat.cameras import Camera
+from xrgs.splat.gaussians import PARAMETERS
+from xrgs.splat.rasterize import Render, rasterize
+from xrgs.splat.settings import RasterSettings
 
 Scene = dict[str, Tensor]
 
@@ -81,6 +85,56 @@ def make_scene() -> Callable[..., Scene]:
         return {name: value.to(dtype) for name, value in scene.items()}
 
     return make
+
+
+@pytest.fixture(scope="session")
+def draw() -> Callable[..., Render]:
+    """(scene, camera, raster, ...) -> the render of `make_scene`'s parameters."""
+
+    def draw(
+        scene: Scene,
+        camera: Camera,
+        raster: RasterSettings | None = None,
+        *,
+        sh_degree: int = 3,
+        **options: Any,
+    ) -> Render:
+        values = (scene[name] for name in PARAMETERS)
+        settings = raster or RasterSettings()
+        return rasterize(*values, camera, settings, sh_degree=sh_degree, **options)
+
+    return draw
+
+
+@pytest.fixture(scope="session")
+def with_gradients() -> Callable[[Scene], Scene]:
+    """A copy of a scene, of leaves that gradients gather on."""
+    return lambda scene: {name: value.clone().requires_grad_() for name, value in scene.items()}
+
+
+@pytest.fixture(scope="session")
+def single_pixel() -> Callable[..., Scene]:
+    def make(count: int, *, opacity: float, dtype: torch.dtype = torch.float32) -> Scene:
+        """Wide Gaussians behind one another on the optical axis, the first nearest."""
+        means = torch.zeros(count, 3, dtype=dtype)
+        means[:, 2] = 1 + torch.arange(count, dtype=dtype)
+        return {
+            "means": means,
+            "quats": torch.tensor([[1.0, 0, 0, 0]], dtype=dtype).repeat(count, 1),
+            "scales": torch.full((count, 3), 0.1, dtype=dtype),
+            "opacities": torch.full((count,), opacity, dtype=dtype),
+            "sh0": torch.ones(count, 1, 3, dtype=dtype),
+            "shN": torch.zeros(count, 0, 3, dtype=dtype),
+        }
+
+    return make
+
+
+@pytest.fixture
+def pixel() -> Camera:
+    """The camera whose only pixel's centre is the optical axis."""
+    K = torch.tensor([[10.0, 0, 0.5], [0, 10, 0.5], [0, 0, 1]], dtype=torch.float64)
+    return Camera(torch.eye(4, dtype=torch.float64), K, 1, 1)
 
 
 def _isas() -> list[str]:

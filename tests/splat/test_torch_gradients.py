@@ -1,0 +1,132 @@
+"""The renderer's gradients against finite differences."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+
+from xrgs.splat.cameras import Camera
+from xrgs.splat.gaussians import PARAMETERS
+from xrgs.splat.rasterize import rasterize
+from xrgs.splat.settings import RasterSettings
+
+
+@pytest.mark.parametrize("antialiased", [False, True])
+def test_gradients_are_finite_differences_with_the_cuts_off(
+    with_gradients, make_camera, make_scene, antialiased
+):
+    camera = make_camera(6, 5, turned=True)
+    raster = RasterSettings(
+        alpha_min=0.0,
+        alpha_max=1.0,
+        transmittance_min=0.0,
+        antialiased=antialiased,
+        background=(0.3, 0.6, 0.1),
+    )
+    scene = make_scene(4, camera, seed=3, degree=1, size=2.0)
+    scene["sh0"] = 2 + scene["sh0"].abs()  # away from the clamp of colours at 0
+    scene["means"][0] = camera.position + 1.5 * (scene["means"][0] - camera.position)
+    offset = torch.zeros(4, 2, dtype=torch.float64)
+    inputs = [value.requires_grad_() for value in (*with_gradients(scene).values(), offset)]
+
+    def outputs(*values):
+        *parameters, means2d_offset = values
+        render = rasterize(*parameters, camera, raster, sh_degree=1, means2d_offset=means2d_offset)
+        return render.image, render.alpha
+
+    assert torch.autograd.gradcheck(outputs, inputs)
+
+
+def test_gradients_with_the_cuts_on_are_directional_differences(
+    draw, with_gradients, make_camera, make_scene
+):
+    camera = make_camera()
+    raster = RasterSettings(background=(0.9, 0.2, 0.5))
+    scene = make_scene(60, camera, seed=7, size=3.0)
+    scene["opacities"][::2] = 0.99 + 0.005 * scene["opacities"][::2]
+    weights = torch.randn(14, 20, 3, dtype=torch.float64)
+
+    def loss(values):
+        return (draw(values, camera, raster).image * weights).sum()
+
+    leaves = with_gradients(scene)
+    loss(leaves).backward()
+    for name in PARAMETERS:
+        direction = torch.randn_like(scene[name])
+        ahead, behind = (
+            loss(scene | {name: scene[name] + sign * 1e-7 * direction}) for sign in (1, -1)
+        )
+        difference = (ahead - behind) / 2e-7
+        exact = (leaves[name].grad * direction).sum()
+        torch.testing.assert_close(exact, difference, rtol=1e-5, atol=1e-6)
+
+
+def test_background_reaches_the_gradients_of_what_stands_before_it(
+    draw, with_gradients, make_camera, make_scene
+):
+    """Its term of alpha's gradient, alone: black Gaussians before a bright background."""
+    camera = make_camera()
+    raster = RasterSettings(background=(1.0, 2.0, 3.0))
+    scene = make_scene(10, camera, seed=2)
+    scene["sh0"][:] = -10
+    leaves = with_gradients(scene)
+    draw(leaves, camera, raster, sh_degree=0).image.sum().backward()
+    for i in range(10):
+        step = torch.zeros(10, dtype=torch.float64)
+        step[i] = 1e-7
+        ahead, behind = (
+            draw(scene | {"opacities": scene["opacities"] + s}, camera, raster, sh_degree=0)
+            for s in (step, -step)
+        )
+        difference = (ahead.image.sum() - behind.image.sum()) / 2e-7
+        torch.testing.assert_close(leaves["opacities"].grad[i], difference, rtol=1e-5, atol=1e-5)
+    assert leaves["opacities"].grad.min() < -1
+
+
+def test_offset_moves_the_means_and_gathers_the_image_plane_gradient(draw, make_camera, make_scene):
+    camera = make_camera()
+    scene = make_scene(30, camera, seed=4)
+    # Specks, whose shape does not depend on where the Jacobian is clamped: then an offset of the
+    # means is one of the principal point.
+    scene["scales"] = torch.full_like(scene["scales"], 1e-3)
+    shift = torch.tensor([1.0, 2.0], dtype=torch.float64)
+    K = camera.K.clone()
+    K[:2, 2] += shift
+    shifted = draw(scene, Camera(camera.viewmat, K, camera.width, camera.height))
+    offset = shift.expand(30, 2).clone().requires_grad_()
+    by_offset = draw(scene, camera, means2d_offset=offset)
+    torch.testing.assert_close(by_offset.image, shifted.image, atol=1e-5, rtol=0)
+    by_offset.image.square().sum().backward()
+    assert (offset.grad[by_offset.visible] != 0).any()
+    assert (offset.grad[~by_offset.visible] == 0).all()
+
+
+def test_absgrad_sums_the_absolute_gradients_of_single_pixels(
+    draw, with_gradients, make_camera, make_scene
+):
+    camera = make_camera(11, 9)  # two tiles by two
+    scene = make_scene(12, camera, seed=5, size=3.0)
+    generator = torch.Generator().manual_seed(0)
+    v_image = torch.randn(9, 11, 3, generator=generator, dtype=torch.float64)
+    v_alpha = torch.randn(9, 11, generator=generator, dtype=torch.float64)
+
+    def values(*, absgrad):
+        leaves = with_gradients(scene)
+        leaves["means2d_offset"] = torch.full((12, 2), 0.3, dtype=torch.float64).requires_grad_()
+        raster = RasterSettings(absgrad=absgrad)
+        render = draw(leaves, camera, raster, means2d_offset=leaves["means2d_offset"])
+        return leaves, (render.image * v_image).sum(-1) + render.alpha * v_alpha  # [H, W]
+
+    leaves, plain = values(absgrad=False)
+    expected = torch.zeros(12, 2, dtype=torch.float64)
+    for pixel in plain.flatten():
+        (gradient,) = torch.autograd.grad(pixel, leaves["means2d_offset"], retain_graph=True)
+        expected += gradient.abs()
+    plain.sum().backward()
+    absolute, total = values(absgrad=True)
+    torch.testing.assert_close(total, plain)
+    total.sum().backward()
+    torch.testing.assert_close(absolute["means2d_offset"].grad, expected)
+    assert (expected.sum() > 1.5 * leaves["means2d_offset"].grad.abs().sum()).all()
+    for name in PARAMETERS:
+        torch.testing.assert_close(absolute[name].grad, leaves[name].grad)
