@@ -74,7 +74,7 @@ def random_weights() -> weights.Weights:
     return {name: array.astype(np.float32) for name, array in made.items()}
 
 
-@pytest.fixture
+@pytest.fixture(scope="session")
 def compose() -> Callable[..., config.Conf]:
     """(*overrides) -> the config that `conf/` gives with them."""
 

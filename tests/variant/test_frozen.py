@@ -6,69 +6,70 @@ import os
 import shutil
 import subprocess
 import sys
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
 import xrgs
 from xrgs import images, scenes, variant
-from xrgs.config import SceneConf, SfmConf, VariantConf
+from xrgs.config import SceneConf, VariantConf
 from xrgs.errors import XrgsError
 from xrgs.hashing import source_digests
 from xrgs.variant import CorruptVariant, SceneFailed, Variant, View, frozen
 
-CONF = VariantConf(
-    long_side=252,
-    factor=5,
-    hr_fraction=0.3,
-    min_hr=2,
-    selection="random",
-    test_every=8,
-    seed=0,
-    tags="flag",
-    hr_above=0.0,
-    degradation="auto",
-    jpeg_quality=10,
-    sfm=SfmConf("upsampled", 0, 4.0, 0.75, 0, "auto", None, 30, fallbacks=True, reference=False),
-)
 PROCEDURAL = SceneConf("procedural", "procedural", None, 24)
 PAIR = SceneConf("motorcycle", "motorcycle")
-PAIR_CONF = replace(CONF, long_side=185, test_every=0, min_hr=1)
 
 
 @dataclass(frozen=True)
 class Store:
     root: Path
+    configured: Callable[..., VariantConf]
 
     @property
     def variants(self) -> Path:
         return self.root / "variants"
 
-    def build(self, scene: SceneConf, conf: VariantConf) -> Variant:
+    def conf(self, scene: SceneConf, **changes: Any) -> VariantConf:
+        """Small; of a pair neither view is held out."""
+        usual: dict[str, Any] = {"long_side": 252}
+        if scene.kind == "motorcycle":
+            usual = {"long_side": 185, "test_every": 0, "min_hr": 1}
+        return self.configured(**usual | changes)
+
+    def key(self, scene: SceneConf, **changes: Any) -> str:
+        return variant.key(scene, self.conf(scene, **changes))
+
+    def build(self, scene: SceneConf, **changes: Any) -> Variant:
+        conf = self.conf(scene, **changes)
         return variant.build(scene, conf, self.variants, self.root / "scenes")
 
 
 @pytest.fixture(scope="module")
-def shared(tmp_path_factory: pytest.TempPathFactory) -> Store:
-    return Store(tmp_path_factory.mktemp("store"))
+def shared(
+    tmp_path_factory: pytest.TempPathFactory, configured: Callable[..., VariantConf]
+) -> Store:
+    return Store(tmp_path_factory.mktemp("store"), configured)
 
 
 @pytest.fixture(scope="module")
 def made(shared: Store) -> Variant:
     """The embedded scene at the default recipe."""
-    return shared.build(PROCEDURAL, CONF)
+    return shared.build(PROCEDURAL)
 
 
 @pytest.fixture(scope="module")
 def pair(shared: Store) -> Variant:
-    return shared.build(PAIR, PAIR_CONF)
+    return shared.build(PAIR)
 
 
 @pytest.fixture
-def store(tmp_path: Path) -> Store:
-    return Store(tmp_path / "store")
+def store(tmp_path: Path, configured: Callable[..., VariantConf]) -> Store:
+    return Store(tmp_path / "store", configured)
 
 
 def of(built: Variant, split: str, tag: str) -> list[View]:
@@ -85,7 +86,7 @@ def project(points: np.ndarray, view: View) -> tuple[np.ndarray, np.ndarray]:
 def photographs(folder: Path, source: Variant, count: int) -> SceneConf:
     """The first views of the embedded scene as a user's folder, under awkward names."""
     folder.mkdir()
-    rendered = scenes.resolve(PROCEDURAL, source.path.parents[1] / "scenes", CONF.long_side)
+    rendered = scenes.resolve(PROCEDURAL, source.path.parents[1] / "scenes", 252)
     for i, file in enumerate(rendered.files[:count]):
         shutil.copy(file, folder / f"vue d'été {i}, x.png")
     return SceneConf("", "folder", str(folder))
@@ -184,7 +185,7 @@ def test_one_pose_at_two_sizes_is_one_picture(pair: Variant) -> None:
 
 def test_known_intrinsics_follow_the_resize_and_the_crop(store: Store) -> None:
     """741 x 500 shrinks to 204 x 138 and is cropped to 200 x 135 about its centre."""
-    built = store.build(PAIR, replace(PAIR_CONF, long_side=204))
+    built = store.build(PAIR, long_side=204)
     left = next(v for v in built.views if v.name == "motorcycle_left" and v.split == "test")
     assert (left.width, left.height) == (200, 135)
     assert left.K[0] == pytest.approx([994.978 * 204 / 741, 0, 311.193 * 204 / 741 - 2])
@@ -192,8 +193,7 @@ def test_known_intrinsics_follow_the_resize_and_the_crop(store: Store) -> None:
 
 
 def test_native_gives_sfm_the_small_files_as_they_are(store: Store) -> None:
-    conf = replace(PAIR_CONF, long_side=0, sfm=replace(CONF.sfm, lr_images="native"))
-    built = store.build(PAIR, replace(conf, factor=2))
+    built = store.build(PAIR, long_side=0, factor=2, sfm={"lr_images": "native"})
     low = of(built, "train", "LR")[0]
     (high,) = (v for v in of(built, "test", "HR") if v.name == low.name)
     assert built.report["registered"] == 2
@@ -218,7 +218,7 @@ def test_a_loaded_variant_is_the_one_that_was_built(made: Variant) -> None:
 
 def test_a_variant_is_built_once(shared: Store, pair: Variant) -> None:
     written = (pair.path / "variant.json").stat().st_mtime_ns
-    assert shared.build(replace(PAIR, name="other label"), PAIR_CONF).id == pair.id
+    assert shared.build(replace(PAIR, name="other label")).id == pair.id
     assert (pair.path / "variant.json").stat().st_mtime_ns == written
     assert not list(shared.variants.glob(".*.building"))
 
@@ -226,16 +226,15 @@ def test_a_variant_is_built_once(shared: Store, pair: Variant) -> None:
 def test_the_key_follows_photographs_config_and_code(
     shared: Store, pair: Variant, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    key = variant.key(PAIR, PAIR_CONF)
+    key = shared.key(PAIR)
     assert pair.id.startswith(f"{key}-")
     found = variant.find(shared.variants, key)
     assert found is not None
     assert found.id == pair.id
-    sfm = replace(PAIR_CONF.sfm, seed=1)
-    others = {variant.key(PAIR, replace(PAIR_CONF, **c)) for c in ({"seed": 1}, {"sfm": sfm})}
-    others.add(variant.key(PROCEDURAL, PAIR_CONF))
+    others = {shared.key(PAIR, seed=1), shared.key(PAIR, sfm={"seed": 1})}
+    others.add(variant.key(PROCEDURAL, shared.conf(PAIR)))
     monkeypatch.setattr(frozen, "_CODE", frozen._CODE[:-1])
-    others.add(variant.key(PAIR, PAIR_CONF))
+    others.add(shared.key(PAIR))
     assert len(others | {key}) == 5
     assert variant.find(shared.variants, "0" * 16) is None
 
@@ -283,20 +282,20 @@ def test_a_corrupt_variant_is_rebuilt_with_a_warning_not_trusted(
         target.write_bytes(content)
     with pytest.raises(CorruptVariant, match=str(copy)):
         variant.load(copy)
-    key = variant.key(PAIR, PAIR_CONF)
+    key = store.key(PAIR)
     assert variant.find(store.variants, key) is None
     assert "built anew" in caplog.text
-    rebuilt = store.build(PAIR, PAIR_CONF)
+    rebuilt = store.build(PAIR)
     found = variant.find(store.variants, key)
     assert found is not None
     assert found.id == rebuilt.id
 
 
 def test_what_a_killed_process_left_is_cleared(store: Store) -> None:
-    left = store.variants / f".{variant.key(PAIR, PAIR_CONF)}.building" / "frozen"
+    left = store.variants / f".{store.key(PAIR)}.building" / "frozen"
     left.mkdir(parents=True)
     (left / "variant.json").write_text("half")
-    store.build(PAIR, PAIR_CONF)
+    store.build(PAIR)
     assert not left.parent.exists()
 
 
@@ -304,7 +303,7 @@ def test_two_processes_at_once_share_one_variant(store: Store) -> None:
     script = (
         "from pathlib import Path; from xrgs import variant;"
         "from xrgs.config import SceneConf, SfmConf, VariantConf;"
-        f"conf = {PAIR_CONF!r}; root = Path({str(store.root)!r});"
+        f"conf = {store.conf(PAIR)!r}; root = Path({str(store.root)!r});"
         f"print(variant.build({PAIR!r}, conf, root / 'variants', root / 'scenes').id)"
     )
     run = [sys.executable, "-P", "-c", script]
@@ -324,8 +323,7 @@ def test_an_unreadable_photograph_is_left_out_and_told(
     scene = photographs(tmp_path / "photos à moi", made, 9)
     broken = tmp_path / "photos à moi" / "vue d'été 3, x.png"
     broken.write_bytes(broken.read_bytes()[:5000])
-    conf = replace(CONF, test_every=4, hr_fraction=0.5)
-    built = store.build(scene, conf)
+    built = store.build(scene, test_every=4, hr_fraction=0.5)
     assert built.scene == "photos à moi"
     assert str(broken) in built.report["unreadable"][0]
     assert f"{broken}: " in caplog.text
@@ -340,7 +338,7 @@ def test_one_readable_photograph_is_too_few(made: Variant, store: Store, tmp_pat
     scene = photographs(tmp_path / "x", made, 2)
     (tmp_path / "x" / "vue d'été 1, x.png").write_bytes(b"no image")
     with pytest.raises(XrgsError, match=r"x: 1 readable image.*été 1, x\.png"):
-        store.build(scene, CONF)
+        store.build(scene)
     assert not list(store.variants.glob("*-*"))
 
 
@@ -353,7 +351,7 @@ def test_views_of_differing_sizes_keep_their_own_size_and_camera(
     for name in cut:
         file = tmp_path / "x" / f"{name}.png"
         images.save(file, images.read(file)[:, 25:-25])  # 202 x 189
-    built = store.build(scene, replace(CONF, factor=1, test_every=3))
+    built = store.build(scene, factor=1, test_every=3)
     assert built.report["registered"] == 12
     assert built.report["hr_sizes"] == {"202x189": 6, "252x189": 6}
     assert built.report["cameras"] == 12  # no EXIF to say that any two are of one camera
@@ -367,12 +365,12 @@ def test_views_of_differing_sizes_keep_their_own_size_and_camera(
 
 def test_a_factor_that_leaves_too_few_pixels_is_named(store: Store) -> None:
     with pytest.raises(XrgsError, match=r"variant\.factor=30: LR views of 8x6 px"):
-        store.build(replace(PROCEDURAL, views=2), replace(CONF, factor=30))
+        store.build(replace(PROCEDURAL, views=2), factor=30)
 
 
 def test_a_bad_config_is_refused_before_anything_is_made(store: Store) -> None:
     with pytest.raises(XrgsError, match=r"variant\.selection=best"):
-        store.build(PROCEDURAL, replace(CONF, selection="best"))
+        store.build(PROCEDURAL, selection="best")
     assert not store.root.exists()
 
 
@@ -382,11 +380,11 @@ def test_photographs_of_nothing_in_common_fail_as_a_scene(store: Store, tmp_path
         images.save(tmp_path / "x" / f"{i}.png", rng.random((90, 120, 3), dtype=np.float32))
     scene = SceneConf("leaves", "folder", str(tmp_path / "x"))
     with pytest.raises(SceneFailed) as caught:
-        store.build(scene, CONF)
+        store.build(scene)
     message = str(caught.value)
     assert "scene leaves failed: COLMAP placed 0 of 5 views (not 0, 1, 2, 3, 4)" in message
     assert "variant.sfm.min_registered=0.75" in message
-    failed = store.variants / f"failed-{variant.key(scene, CONF)}"
+    failed = store.variants / f"failed-{store.key(scene)}"
     assert str(failed) in message
     report = json.loads((failed / "report.json").read_text())
     reason = report.pop("reason")
@@ -396,7 +394,7 @@ def test_photographs_of_nothing_in_common_fail_as_a_scene(store: Store, tmp_path
     assert variant.failure(store.variants, "another") is None
     assert report["not_registered"] == ["0", "1", "2", "3", "4"]
     assert "Feature extraction" in (failed / "colmap.log").read_text()
-    assert variant.find(store.variants, variant.key(scene, CONF)) is None
+    assert variant.find(store.variants, store.key(scene)) is None
 
 
 def test_too_few_views_placed_to_train_on_fail_whatever_was_asked(
@@ -405,9 +403,8 @@ def test_too_few_views_placed_to_train_on_fail_whatever_was_asked(
     images.save(tmp_path / "x" / "a.png", np.zeros((90, 120, 3), np.float32))
     images.save(tmp_path / "x" / "b.png", np.ones((90, 120, 3), np.float32))
     scene = SceneConf("flat", "folder", str(tmp_path / "x"))
-    conf = replace(CONF, sfm=replace(CONF.sfm, min_registered=0.0))
     with pytest.raises(SceneFailed, match="0 HR, 0 LR and 0 test views; 1 of each, 2 to train"):
-        store.build(scene, conf)
+        store.build(scene, sfm={"min_registered": 0.0})
 
 
 @pytest.mark.data
@@ -415,8 +412,8 @@ def test_fern_is_placed_at_a_reduced_size(store: Store) -> None:
     path = Path(os.environ.get("XRGS_TEST_DATA", "../shared/data")) / "llff" / "fern"
     if not path.is_dir():
         pytest.skip(f"{path} is not there; XRGS_TEST_DATA names the folder that has llff/fern")
-    sfm = replace(CONF.sfm, max_num_features=2000)
-    built = store.build(SceneConf("fern", "folder", str(path)), replace(CONF, sfm=sfm))
+    fern = SceneConf("fern", "folder", str(path))
+    built = store.build(fern, sfm={"max_num_features": 2000})
     assert built.report["registered"] == 20
     assert [len(of(built, *part)) for part in (("test", "HR"), ("train", "HR"))] == [3, 5]
     assert {(v.width, v.height) for v in of(built, "train", "LR")} == {(50, 37)}

@@ -3,55 +3,54 @@ from __future__ import annotations
 import shutil
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
-from hydra import compose, initialize_config_dir
 
 from xrgs import config, images, scenes
-from xrgs.config import SceneConf, SfmConf, VariantConf
+from xrgs.config import SceneConf, VariantConf
 from xrgs.errors import XrgsError
 from xrgs.scenes import Scene, procedural
 from xrgs.variant import SceneFailed, Variant, View, degrade, mixing, placing, sfm
 from xrgs.variant.sfm import Reconstruction, Shot
 from xrgs.variant.split import check
 
+Make = Callable[..., VariantConf]
+Mix = Callable[..., Variant]
 VIEWS = 12
-CONF = VariantConf(
-    long_side=160,
-    factor=5,
-    hr_fraction=0.3,
-    min_hr=0,
-    selection="random",
-    test_every=4,
-    seed=0,
-    tags="flag",
-    hr_above=0.0,
-    degradation="auto",
-    jpeg_quality=10,
-    sfm=SfmConf("upsampled", 0, 4.0, 0.75, 0, "auto", None, 30, fallbacks=True, reference=True),
-)
 
 
 @pytest.fixture(scope="module")
-def rendered(tmp_path_factory: pytest.TempPathFactory) -> Scene:
+def configured(configured: Make) -> Make:
+    """Small, and held against SfM of the undegraded photographs."""
+    return partial(configured, long_side=160, min_hr=0, test_every=4, sfm={"reference": True})
+
+
+@pytest.fixture(scope="module")
+def conf(configured: Make) -> VariantConf:
+    return configured()
+
+
+@pytest.fixture(scope="module")
+def rendered(tmp_path_factory: pytest.TempPathFactory, conf: VariantConf) -> Scene:
     cache = tmp_path_factory.mktemp("scenes")
-    return scenes.resolve(SceneConf("p", "procedural", None, VIEWS), cache, CONF.long_side)
+    return scenes.resolve(SceneConf("p", "procedural", None, VIEWS), cache, conf.long_side)
 
 
 @pytest.fixture(scope="module")
-def placed(rendered: Scene, tmp_path_factory: pytest.TempPathFactory) -> Reconstruction:
+def placed(
+    rendered: Scene, tmp_path_factory: pytest.TempPathFactory, conf: VariantConf
+) -> Reconstruction:
     """The undegraded photographs, placed once for all tests of what is done before and after."""
     work = tmp_path_factory.mktemp("work")
     shots = []
     for file in rendered.files:
         shutil.copy(file, work / file.name)
         shots.append(Shot(file.name, "all"))
-    return sfm.reconstruct(shots, work, work, CONF.sfm)
-
-
-Mix = Callable[..., Variant]
+    return sfm.reconstruct(shots, work, work, conf.sfm)
 
 
 @pytest.fixture
@@ -62,23 +61,25 @@ def given() -> list[list[str]]:
 
 @pytest.fixture
 def mix(
+    configured: Make,
     rendered: Scene,
     placed: Reconstruction,
     given: list[list[str]],
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
 ) -> Mix:
-    """`mixing.mix` of the photographs alone, no camera known, by the poses of `placed`."""
+    """(scene, **changes) -> `mixing.mix`, by default of photographs alone; by `placed`'s poses."""
 
     def recall(shots: Sequence[Shot], *_: object) -> Reconstruction:
         given.append([shot.file for shot in shots])
         return placed
 
-    def run(conf: VariantConf, scene: Scene = replace(rendered, viewmats={})) -> Variant:  # noqa: B008
+    def run(scene: Scene | None = None, **changes: Any) -> Variant:
         work, out = tmp_path / "work", tmp_path / "out"
         work.mkdir()
         out.mkdir()
-        return mixing.mix(scene, conf, work, out)
+        scene = scene or replace(rendered, viewmats={})
+        return mixing.mix(scene, configured(**changes), work, out)
 
     monkeypatch.setattr(sfm, "reconstruct", recall)
     return run
@@ -98,7 +99,7 @@ def number(view: View) -> int:
 def test_by_sampling_rate_the_finest_are_hr_and_nothing_is_degraded(
     mix: Mix, given: list[list[str]]
 ) -> None:
-    made = mix(replace(CONF, tags="sampling_rate"))
+    made = mix(tags="sampling_rate")
     high, low = of(made, "train", "HR"), of(made, "train", "LR")
     assert len(high) == round(0.3 * 9)
     assert len(high) + len(low) == 9
@@ -112,7 +113,7 @@ def test_by_sampling_rate_the_finest_are_hr_and_nothing_is_degraded(
 
 
 def test_a_threshold_of_the_rate_takes_those_above_it(mix: Mix) -> None:
-    made = mix(replace(CONF, tags="sampling_rate", hr_above=0.93))
+    made = mix(tags="sampling_rate", hr_above=0.93)
     assert of(made, "train", "HR")
     assert all(v.rho >= 0.93 for v in of(made, "train", "HR"))
     assert all(v.rho < 0.93 for v in of(made, "train", "LR"))
@@ -120,7 +121,7 @@ def test_a_threshold_of_the_rate_takes_those_above_it(mix: Mix) -> None:
 
 def test_by_distance_the_closest_are_hr(mix: Mix) -> None:
     """Every camera looks at the scene's middle, so the exact cameras tell which are close to it."""
-    made = mix(replace(CONF, tags="distance"))
+    made = mix(tags="distance")
     poses = procedural.viewmats(VIEWS)
     middle = np.array([0.0, 0.1, 5.5, 1.0])
     depth = {v.name: (poses[number(v)] @ middle)[2] for v in made.views}
@@ -138,7 +139,7 @@ def test_by_megapixels_the_larger_photographs_are_hr(
         photo = images.read(file)
         images.save(files[-1], images.resize(photo, 80, 60) if i % 3 else photo)
     scene = replace(rendered, files=tuple(files), viewmats={})
-    made = mix(replace(CONF, tags="megapixels", hr_above=0.75), scene)
+    made = mix(scene, tags="megapixels", hr_above=0.75)
     assert {number(v) for v in of(made, "train", "HR")} == {3, 6, 9}
     assert all((v.width, v.height) == (80, 60) for v in of(made, "train", "LR"))
     assert not of(made, "original", "HR")
@@ -149,18 +150,18 @@ def test_by_megapixels_the_larger_photographs_are_hr(
 
 def test_photographs_all_of_one_class_are_no_mixture(mix: Mix, given: list[list[str]]) -> None:
     with pytest.raises(XrgsError, match=r"variant\.tags=megapixels: every training view is HR at"):
-        mix(replace(CONF, tags="megapixels"))
+        mix(tags="megapixels")
     assert given == []
 
 
 def test_a_threshold_above_all_but_the_held_out_is_named(mix: Mix) -> None:
     with pytest.raises(XrgsError, match=r"variant\.hr_above=1\.0; their values are 0\.\d+ to"):
-        mix(replace(CONF, tags="sampling_rate", hr_above=1.0, test_every=2))
+        mix(tags="sampling_rate", hr_above=1.0, test_every=2)
 
 
 @pytest.mark.parametrize(("fraction", "tag"), [(0.0, "LR"), (1.0, "HR")])
 def test_one_class_alone_where_that_is_what_was_asked(mix: Mix, fraction: float, tag: str) -> None:
-    made = mix(replace(CONF, hr_fraction=fraction))
+    made = mix(hr_fraction=fraction)
     assert len(of(made, "train", tag)) == 9
     assert len(of(made, "original", "HR")) == (9 if tag == "LR" else 0)
     assert len(of(made, "test", "HR")) == 3
@@ -170,7 +171,7 @@ def test_one_class_alone_where_that_is_what_was_asked(mix: Mix, fraction: float,
 
 
 def test_each_degraded_view_has_its_original_from_the_same_pose(mix: Mix) -> None:
-    made = mix(CONF)
+    made = mix()
     low = of(made, "train", "LR")
     originals = {view.name: view for view in of(made, "original", "HR")}
     assert sorted(originals) == [view.name for view in low]
@@ -186,7 +187,7 @@ def test_each_degraded_view_has_its_original_from_the_same_pose(mix: Mix) -> Non
 
 @pytest.mark.parametrize("how", ["digital_zoom", "jpeg"])
 def test_a_degradation_may_keep_the_size(mix: Mix, given: list[list[str]], how: str) -> None:
-    made = mix(replace(CONF, degradation=how, hr_fraction=0.5))
+    made = mix(degradation=how, hr_fraction=0.5)
     assert {(v.width, v.height) for v in made.views} == {(160, 120)}
     originals = {v.name: v for v in of(made, "original", "HR")}
     for view in of(made, "train", "LR"):
@@ -200,7 +201,7 @@ def test_a_degradation_may_keep_the_size(mix: Mix, given: list[list[str]], how: 
 def test_what_is_tagged_after_sfm_is_degraded_after_it_if_asked(
     mix: Mix, given: list[list[str]]
 ) -> None:
-    made = mix(replace(CONF, tags="distance", degradation="downsample"))
+    made = mix(tags="distance", degradation="downsample")
     assert given == [[f"hr/{i:05d}.png" for i in range(VIEWS)]]
     low = of(made, "train", "LR")
     assert {(v.width, v.height) for v in low} == {(32, 24)}
@@ -213,7 +214,7 @@ def test_what_is_tagged_after_sfm_is_degraded_after_it_if_asked(
 def test_mixed_poses_are_held_against_those_of_the_undegraded(
     mix: Mix, given: list[list[str]]
 ) -> None:
-    made = mix(CONF)
+    made = mix()
     assert len(given) == 2
     assert sum(file.startswith("up/") for file in given[0]) == len(of(made, "train", "LR"))
     assert given[1] == [f"hr/{i:05d}.png" for i in range(VIEWS)]
@@ -226,14 +227,14 @@ def test_mixed_poses_are_held_against_those_of_the_undegraded(
 def test_known_cameras_need_no_second_run(
     mix: Mix, rendered: Scene, given: list[list[str]]
 ) -> None:
-    made = mix(CONF, rendered)
+    made = mix(rendered)
     assert len(given) == 1
     assert made.report["pose_error_against"] == "exact cameras"
     assert 0 < made.report["pose_error"]["position_percent"] < 5
 
 
 def test_the_reference_is_left_out_if_so_asked(mix: Mix, given: list[list[str]]) -> None:
-    made = mix(replace(CONF, sfm=replace(CONF.sfm, reference=False)))
+    made = mix(sfm={"reference": False})
     assert len(given) == 1
     assert made.report["pose_error"] == {}
 
@@ -249,12 +250,16 @@ NOTHING = Reconstruction(
 
 
 def test_a_recipe_that_fails_gives_way_to_the_next(
-    rendered: Scene, placed: Reconstruction, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    conf: VariantConf,
+    rendered: Scene,
+    placed: Reconstruction,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     results = iter([NOTHING, placed])
     monkeypatch.setattr(sfm, "reconstruct", lambda *_: next(results))
     (tmp_path / "out").mkdir()
-    made = mixing.mix(rendered, CONF, tmp_path, tmp_path / "out")
+    made = mixing.mix(rendered, conf, tmp_path, tmp_path / "out")
     attempts = made.report["attempts"]
     assert [(a["attempt"], a["registered"]) for a in attempts] == [
         ("configured", 0),
@@ -266,14 +271,14 @@ def test_a_recipe_that_fails_gives_way_to_the_next(
 
 
 def test_where_every_recipe_fails_the_report_has_them_all(
-    rendered: Scene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    conf: VariantConf, rendered: Scene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(sfm, "reconstruct", lambda *_: NOTHING)
     (tmp_path / "out").mkdir()
     with pytest.raises(SceneFailed, match="scene p failed: COLMAP placed 0 of 12") as caught:
-        mixing.mix(rendered, CONF, tmp_path, tmp_path / "out")
+        mixing.mix(rendered, conf, tmp_path, tmp_path / "out")
     tried = [a["attempt"] for a in caught.value.report["attempts"]]
-    assert tried == [name for name, _, _ in placing.recipes(CONF.sfm, VIEWS, smaller=True)]
+    assert tried == [name for name, _, _ in placing.recipes(conf.sfm, VIEWS, smaller=True)]
     assert tried[-1] == "native"
 
 
@@ -292,11 +297,9 @@ def test_where_every_recipe_fails_the_report_has_them_all(
     ],
 )
 def test_every_choice_of_variant_is_one_that_can_be_made(
-    name: str, tags: str, degradation: str
+    compose: Callable[..., config.Conf], name: str, tags: str, degradation: str
 ) -> None:
-    config.register()
-    with initialize_config_dir(str(config.CONF_DIR), version_base="1.3"):
-        conf = config.to_conf(compose("config", [f"variant={name}"] if name else [])).variant
+    conf = compose(*([f"variant={name}"] if name else [])).variant
     check(conf)
     assert (conf.tags, degrade.kind(conf)) == (tags, degradation)
 
@@ -310,15 +313,17 @@ def test_every_choice_of_variant_is_tested() -> None:
 
 
 @pytest.mark.data
-def test_a_collection_of_many_cameras_is_placed(data_root: Path, tmp_path: Path) -> None:
+def test_a_collection_of_many_cameras_is_placed(
+    configured: Make, data_root: Path, tmp_path: Path
+) -> None:
     """Sixteen tourists' photographs, all of differing sizes, at a quarter of them."""
     source = data_root / "captures" / "reichstag" / "images"
     if not source.is_dir():
         pytest.skip(f"{source} is not there")
     files = tuple(sorted(source.iterdir())[:16])
     sizes = [images.size(file) for file in files]
-    conf = replace(CONF, long_side=320, tags="sampling_rate", factor=2)
-    conf = replace(conf, sfm=replace(conf.sfm, max_num_features=1500))
+    few = {"max_num_features": 1500}
+    conf = configured(long_side=320, tags="sampling_rate", factor=2, sfm=few)
     (tmp_path / "out").mkdir()
     made = mixing.mix(Scene("reichstag", "", files), conf, tmp_path, tmp_path / "out")
     assert made.report["registered"] >= 12

@@ -12,8 +12,6 @@ from xrgs.scenes import motorcycle
 from xrgs.scenes.bundled import photograph
 from xrgs.variant import sfm
 
-CONF = SfmConf("upsampled", 0, 4.0, 0.75, 0, "auto", None, 30, fallbacks=True, reference=False)
-
 
 @pytest.mark.parametrize(
     ("count", "asked", "expected"), [(2, 0, 8192), (24, 0, 4166), (100, 0, 1000), (24, 512, 512)]
@@ -29,31 +27,33 @@ def test_small_images_are_searched_at_twice_their_size() -> None:
     assert sfm.octave_for(1008, -1) == -1
 
 
-def test_the_default_inliers_are_colmaps_own() -> None:
+def test_the_default_inliers_are_colmaps_own(sfm_conf: SfmConf) -> None:
     import pycolmap
 
     colmap = pycolmap.IncrementalPipelineOptions().mapper
-    made = sfm.mapping_options(CONF, 24, known=False).mapper
+    made = sfm.mapping_options(sfm_conf, 24, known=False).mapper
     assert made.abs_pose_min_num_inliers == colmap.abs_pose_min_num_inliers
     assert made.init_min_num_inliers == colmap.init_min_num_inliers
-    fewer = sfm.mapping_options(replace(CONF, min_inliers=15), 24, known=False).mapper
+    fewer = sfm.mapping_options(replace(sfm_conf, min_inliers=15), 24, known=False).mapper
     assert (fewer.abs_pose_min_num_inliers, fewer.init_min_num_inliers) == (15, 50)
 
 
-def test_two_views_keep_the_points_that_only_two_see() -> None:
-    two = sfm.mapping_options(CONF, 2, known=False)
+def test_two_views_keep_the_points_that_only_two_see(sfm_conf: SfmConf) -> None:
+    two = sfm.mapping_options(sfm_conf, 2, known=False)
     assert not two.triangulation.ignore_two_view_tracks
     assert two.min_model_size == 2
     assert not two.ba_refine_focal_length
-    many = sfm.mapping_options(CONF, 24, known=False)
+    many = sfm.mapping_options(sfm_conf, 24, known=False)
     assert many.triangulation.ignore_two_view_tracks
     assert many.ba_refine_focal_length
     assert many.mapper.init_min_tri_angle == 4
-    assert not sfm.mapping_options(CONF, 24, known=True).ba_refine_extra_params
+    assert not sfm.mapping_options(sfm_conf, 24, known=True).ba_refine_extra_params
 
 
 @pytest.fixture(scope="module")
-def pair(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, sfm.Reconstruction]:
+def pair(
+    tmp_path_factory: pytest.TempPathFactory, sfm_conf: SfmConf
+) -> tuple[Path, sfm.Reconstruction]:
     """The motorcycle pair at its own size, intrinsics given."""
     work = tmp_path_factory.mktemp("pair")
     scene = scenes.resolve(SceneConf("motorcycle", "motorcycle"), work)
@@ -61,7 +61,7 @@ def pair(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, sfm.Reconstruc
     for file in scene.files:
         images.save(work / file.name, images.read(file))
         shots.append(sfm.Shot(file.name, file.stem, scene.intrinsics[file.stem]))
-    return work, sfm.reconstruct(shots, work, work, CONF)
+    return work, sfm.reconstruct(shots, work, work, sfm_conf)
 
 
 def test_the_stereo_pair_is_placed_with_the_intrinsics_it_was_given(pair) -> None:
@@ -113,13 +113,13 @@ def test_colmaps_log_stays_in_the_work_folder(pair, capfd: pytest.CaptureFixture
 
 
 def test_images_without_anything_in_common_give_no_model(
-    tmp_path: Path, capfd: pytest.CaptureFixture[str]
+    sfm_conf: SfmConf, tmp_path: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:
     rng = np.random.default_rng(0)
     for i in range(3):
         images.save(tmp_path / f"{i}.png", rng.random((90, 120, 3), dtype=np.float32))
     shots = [sfm.Shot(f"{i}.png", "all") for i in range(3)]
-    model = sfm.reconstruct(shots, tmp_path, tmp_path, CONF)
+    model = sfm.reconstruct(shots, tmp_path, tmp_path, sfm_conf)
     assert model.viewmats == {}
     assert model.points.shape == model.colors.shape == (0, 3)
     assert model.report["models"] == []
