@@ -194,6 +194,7 @@ def bench() -> None:
 
 _DATA_HELP = """\
 xrgs-data download DATASET [SCENE...] [data_root=FOLDER] [url=URL] [sha256=HEX]
+                       [max_bytes=N]
     Fetches published scenes and unpacks them into data_root; run again, it continues.
     DATASET: {data}
 xrgs-data lpips [from=FILE_OR_URL]

@@ -29,6 +29,8 @@ class Server:
     content_type: str = "application/zip"
     shift: int = 0
     """Added to where a range is said to start."""
+    length: bool = True
+    """Whether it is said how long the file is."""
     stall: float = 0
     """Seconds before the content."""
     asked: list[str | None] = field(default_factory=list)
@@ -54,12 +56,14 @@ class _Handler(BaseHTTPRequestHandler):
                 self.end_headers()
                 return
             self.send_response(206)
-            self.send_header("Content-Range", f"bytes {start + state.shift}-{size - 1}/{size}")
+            whole = size if state.length else "*"
+            self.send_header("Content-Range", f"bytes {start + state.shift}-{size - 1}/{whole}")
         else:
             self.send_response(200)
         body = state.content[start:]
         self.send_header("Content-Type", state.content_type)
-        self.send_header("Content-Length", str(len(body)))
+        if state.length:
+            self.send_header("Content-Length", str(len(body)))
         self.end_headers()
         time.sleep(state.stall)
         with contextlib.suppress(ConnectionError):  # the client may have heard enough

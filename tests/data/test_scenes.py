@@ -72,6 +72,21 @@ def test_the_hash_of_the_config_is_verified(
     assert "nerf_llff_data.zip: its sha256 is not the config's" in err
 
 
+def test_an_archive_beyond_the_config_s_bytes_is_refused_and_its_key_named(
+    data: Run, server: Any, tmp_path: Path, llff: bytes
+) -> None:
+    server.content = llff
+    arguments = ("download", "llff", "fern", f"url={server.url}")
+    code, _, err = data(*arguments, f"max_bytes={len(llff) - 1}")
+    assert code == 1
+    assert len(err.splitlines()) == 1
+    assert f"{server.url}: {len(llff)} bytes" in err
+    assert "max_bytes=" in err
+    assert not any(file.suffix == ".zip" for file in tmp_path.rglob("*"))
+    code, _, err = data(*arguments, f"max_bytes={len(llff)}")
+    assert code == 0, err
+
+
 def test_offline_says_what_to_do_by_hand(data: Run, tmp_path: Path, llff: bytes) -> None:
     with socket.create_server(("127.0.0.1", 0)) as taken:
         url = f"http://127.0.0.1:{taken.getsockname()[1]}/x.zip"

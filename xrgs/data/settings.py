@@ -14,6 +14,8 @@ class DatasetConf:
     """Where a person finds the archive with a browser."""
     file: str = ""
     """The archive's name on disk."""
+    max_bytes: int = 0
+    """The most that is downloaded for it, whatever the server says or sends."""
     sha256: str = ""
     """Of the archive, in hexadecimal; empty where it is not known."""
     folder: str = ""
