@@ -114,6 +114,33 @@ def data() -> Dataset:
     return Dataset(tuple(views), tuple(views[:1]), points, colors, scene_scale=1.0, factor=5)
 
 
+def _command(name: str) -> list[str]:
+    """`xrgs-<name>`, of the package that is tested."""
+    return [sys.executable, "-P", "-c", f"from xrgs.cli import {name}; {name}()"]
+
+
+@pytest.fixture(scope="session")
+def run_command() -> Callable[..., tuple[int, str, str]]:
+    """(name, folder, *arguments, **environment) -> exit code, stdout and stderr of `xrgs-<name>`.
+
+    It runs in the folder, from its start to its end; `sweeps_in` is for those that are interfered
+    with, or have to end with all that they started.
+    """
+
+    def run(name: str, folder: Path, *arguments: str, **environment: str) -> tuple[int, str, str]:
+        done = subprocess.run(
+            [*_command(name), *arguments],
+            cwd=folder,
+            env=os.environ | environment,
+            capture_output=True,
+            text=True,
+            check=False,
+        )
+        return done.returncode, done.stdout, done.stderr
+
+    return run
+
+
 @dataclass(frozen=True)
 class Sweep:
     """One call of `xrgs-sweep`."""
@@ -146,10 +173,9 @@ class Sweeps:
             (self.folder / "site" / "sitecustomize.py").write_text(self.faults)
             path = [str(self.folder / "site"), os.environ.get("PYTHONPATH", "")]
             changes["PYTHONPATH"] = os.pathsep.join(filter(None, path))
-        command = [sys.executable, "-c", "from xrgs.cli import sweep; sweep()"]
         with (printed / "out").open("wb") as out, (printed / "err").open("wb") as err:
             process = subprocess.Popen(
-                [*command, "store=s", "threads=1", *arguments],
+                [*_command("sweep"), "store=s", "threads=1", *arguments],
                 cwd=self.folder,
                 env=os.environ | changes,
                 stdout=out,

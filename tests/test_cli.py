@@ -8,6 +8,7 @@ import os
 import shutil
 import subprocess
 import sys
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -17,20 +18,8 @@ from PIL import Image
 ROOT = Path(__file__).resolve().parents[1]
 HEAVY = ("kornia", "matplotlib", "pandas", "pycolmap", "scipy", "skimage", "torch")
 SMOKE = ("scene=motorcycle", "preset=smoke", "train.steps=8")
-
-
-def run(command: str, cwd: Path, *arguments: str, **environment: str) -> tuple[int, str, str]:
-    """Exit code, stdout and stderr of `xrgs-<command>`."""
-    script = f"from xrgs.cli import {command}; {command}()"
-    done = subprocess.run(
-        [sys.executable, "-c", script, *arguments],
-        cwd=cwd,
-        env=os.environ | environment,
-        capture_output=True,
-        text=True,
-        check=False,
-    )
-    return done.returncode, done.stdout, done.stderr
+#: As `tests.conftest.run_command` gives it.
+RunCommand = Callable[..., tuple[int, str, str]]
 
 
 def without_heavy(folder: Path) -> str:
@@ -58,10 +47,10 @@ def photographs(folder: Path, count: int, size: tuple[int, int] = (120, 90)) -> 
 
 
 @pytest.fixture(scope="module")
-def swept(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str]:
+def swept(run_command: RunCommand, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str]:
     """A folder with a finished smoke sweep in its store `s`, and what was printed."""
     folder = tmp_path_factory.mktemp("swept")
-    code, out, err = run("sweep", folder, "+ablation=consistency", *SMOKE, "store=s")
+    code, out, err = run_command("sweep", folder, "+ablation=consistency", *SMOKE, "store=s")
     assert code == 0, err
     return folder, out
 
@@ -104,18 +93,18 @@ def test_a_cell_keeps_all_that_a_reader_may_ask_for(swept: tuple[Path, str]) -> 
         assert json.loads((cell / "provenance.json").read_text())["packages"]["torch"]
 
 
-def test_the_report_is_rebuilt_byte_for_byte(store: Path) -> None:
+def test_the_report_is_rebuilt_byte_for_byte(run_command: RunCommand, store: Path) -> None:
     before = contents(store / "reports")
     shutil.rmtree(store / "reports")
-    code, out, err = run("report", store.parent, "store=s")
+    code, out, err = run_command("report", store.parent, "store=s")
     assert code == 0, err
     assert "consistency against baseline" in out
     assert contents(store / "reports") == before
 
 
-def test_a_second_run_trains_nothing(store: Path) -> None:
+def test_a_second_run_trains_nothing(run_command: RunCommand, store: Path) -> None:
     before = contents(store / "cells")
-    code, out, err = run("sweep", store.parent, "+ablation=consistency", *SMOKE, "store=s")
+    code, out, err = run_command("sweep", store.parent, "+ablation=consistency", *SMOKE, "store=s")
     assert code == 0, err
     assert "plan: 2 cells, 2 done" in err
     assert "training" not in err
@@ -127,9 +116,9 @@ def test_a_second_run_trains_nothing(store: Path) -> None:
     "change",
     ["seed=1", "train.steps=9", "components.loss_weighting.lr_weight=0.5", "splat.backend=torch"],
 )
-def test_a_changed_value_is_another_cell(store: Path, change: str) -> None:
+def test_a_changed_value_is_another_cell(run_command: RunCommand, store: Path, change: str) -> None:
     arguments = ("+ablation=consistency", *(a for a in SMOKE if "steps" not in a), "train.steps=8")
-    _, _, err = run("sweep", store.parent, *arguments, change, "store=s", "dry_run=true")
+    _, _, err = run_command("sweep", store.parent, *arguments, change, "store=s", "dry_run=true")
     backend = json.loads(next((store / "cells").rglob("provenance.json")).read_text())["backend"]
     if change == f"splat.backend={backend}":
         assert "2 done" in err  # naming what `auto` chose is no change
@@ -139,13 +128,15 @@ def test_a_changed_value_is_another_cell(store: Path, change: str) -> None:
         assert "0 done" in err
 
 
-def test_a_cell_that_takes_its_count_from_another_is_trained_after_it(store: Path) -> None:
+def test_a_cell_that_takes_its_count_from_another_is_trained_after_it(
+    run_command: RunCommand, store: Path
+) -> None:
     control = ("+ablation=count_matched", "matched_to=gradient_scaling", *SMOKE, f"store={store}")
-    code, _, err = run("sweep", store.parent, *control, "dry_run=true")
+    code, _, err = run_command("sweep", store.parent, *control, "dry_run=true")
     assert code == 0, err
     states = [line.split()[0] for line in err.splitlines() if "motorcycle /" in line]
     assert states == ["done", "absent", "waits"], err
-    code, out, err = run("sweep", store.parent, *control)
+    code, out, err = run_command("sweep", store.parent, *control)
     assert code == 0, err
     assert err.count("training cell") == 2
     assert "3 of 3 cells done" in err
@@ -155,23 +146,23 @@ def test_a_cell_that_takes_its_count_from_another_is_trained_after_it(store: Pat
     wanted = [c["components"]["count_matched"]["gaussians"] for c in configs]
     counts = [json.loads(f.read_text())["gaussians"] for f in store.glob("cells/*/summary.json")]
     assert max(wanted) in counts
-    _, _, err = run("sweep", store.parent, *control)
+    _, _, err = run_command("sweep", store.parent, *control)
     assert "plan: 3 cells, 3 done" in err
 
 
-def test_paths_threads_and_labels_are_no_change(store: Path) -> None:
+def test_paths_threads_and_labels_are_no_change(run_command: RunCommand, store: Path) -> None:
     store.rename(store.with_name("moved"))
     arguments = ("+ablation=consistency", *SMOKE, "threads=1", "data_root=x", "scene.name=y")
-    _, _, err = run("sweep", store.parent, *arguments, "store=moved", "dry_run=true")
+    _, _, err = run_command("sweep", store.parent, *arguments, "store=moved", "dry_run=true")
     assert "2 done" in err
 
 
-def test_a_corrupt_cell_is_run_again_and_not_trusted(store: Path) -> None:
+def test_a_corrupt_cell_is_run_again_and_not_trusted(run_command: RunCommand, store: Path) -> None:
     cell = sorted((store / "cells").iterdir())[0]
     before = contents(cell)
     scores = cell / "scores.csv"
     scores.write_text(scores.read_text().replace("0.", "0.9", 1))
-    code, _, err = run("sweep", store.parent, "+ablation=consistency", *SMOKE, "store=s")
+    code, _, err = run_command("sweep", store.parent, "+ablation=consistency", *SMOKE, "store=s")
     assert code == 0
     assert "corrupt" in err
     assert "1 done" in err
@@ -181,11 +172,13 @@ def test_a_corrupt_cell_is_run_again_and_not_trusted(store: Path) -> None:
     assert cell.with_name(f"{cell.name}.aside-1").is_dir()
 
 
-def test_a_scene_that_fails_does_not_take_the_sweep_with_it(store: Path) -> None:
+def test_a_scene_that_fails_does_not_take_the_sweep_with_it(
+    run_command: RunCommand, store: Path
+) -> None:
     flat = photographs(store.parent / "flat", 6)
     scenes = ("scene=motorcycle,folder", f"scene.path={flat}")
     arguments = ("+ablation=consistency", *SMOKE[1:], *scenes, "store=s")
-    code, out, err = run("sweep", store.parent, *arguments)
+    code, out, err = run_command("sweep", store.parent, *arguments)
     assert code == 1
     assert "flat" in err
     assert "registered" in err
@@ -209,9 +202,11 @@ def test_the_child_imports_what_its_parent_did_and_not_the_folder_it_stands_in(
     assert done.returncode == 0, done.stderr
 
 
-def test_a_dry_run_plans_without_torch_and_writes_nothing(tmp_path: Path) -> None:
+def test_a_dry_run_plans_without_torch_and_writes_nothing(
+    run_command: RunCommand, tmp_path: Path
+) -> None:
     arguments = ("+ablation=consistency,loss_weighting", "seed=0,1", "dry_run=true", "store=s")
-    code, _, err = run("sweep", tmp_path, *arguments, PYTHONPATH=without_heavy(tmp_path))
+    code, _, err = run_command("sweep", tmp_path, *arguments, PYTHONPATH=without_heavy(tmp_path))
     assert code == 0, err
     assert "plan: 6 cells" in err
     assert err.count("variant not built") == 6
@@ -219,8 +214,8 @@ def test_a_dry_run_plans_without_torch_and_writes_nothing(tmp_path: Path) -> Non
 
 
 @pytest.mark.parametrize("sweep", sorted(file.stem for file in (ROOT / "sweeps").glob("*.yaml")))
-def test_every_sweep_file_plans(tmp_path: Path, sweep: str) -> None:
-    code, _, err = run("sweep", tmp_path, f"+sweeps={sweep}", "dry_run=true")
+def test_every_sweep_file_plans(run_command: RunCommand, tmp_path: Path, sweep: str) -> None:
+    code, _, err = run_command("sweep", tmp_path, f"+sweeps={sweep}", "dry_run=true")
     assert code == 0, err
     assert labels(err) > {"baseline"}
 
@@ -230,29 +225,31 @@ def labels(plan: str) -> set[str]:
     return {line.split(" / ")[1] for line in plan.splitlines() if " / seed " in line}
 
 
-def test_every_ablation_is_in_a_sweep(tmp_path: Path) -> None:
+def test_every_ablation_is_in_a_sweep(run_command: RunCommand, tmp_path: Path) -> None:
     planned: set[str] = set()
     for sweep in ("ablations", "controls"):
-        planned |= labels(run("sweep", tmp_path, f"+sweeps={sweep}", "dry_run=true")[2])
+        planned |= labels(run_command("sweep", tmp_path, f"+sweeps={sweep}", "dry_run=true")[2])
     assert planned == {file.stem for file in (ROOT / "conf" / "ablation").glob("*.yaml")}
 
 
-def test_stacked_ablations_and_the_forgotten_plus(tmp_path: Path) -> None:
-    _, _, err = run("sweep", tmp_path, "ablation=[loss_weighting,consistency]", "dry_run=true")
+def test_stacked_ablations_and_the_forgotten_plus(run_command: RunCommand, tmp_path: Path) -> None:
+    _, _, err = run_command(
+        "sweep", tmp_path, "ablation=[loss_weighting,consistency]", "dry_run=true"
+    )
     assert "loss_weighting+consistency" in err
     assert "plan: 2 cells" in err
 
 
 @pytest.mark.parametrize("command", ["sweep", "report", "status", "bench", "data"])
-def test_help_answers_at_once(tmp_path: Path, command: str) -> None:
-    code, out, err = run(command, tmp_path, "--help", PYTHONPATH=without_heavy(tmp_path))
+def test_help_answers_at_once(run_command: RunCommand, tmp_path: Path, command: str) -> None:
+    code, out, err = run_command(command, tmp_path, "--help", PYTHONPATH=without_heavy(tmp_path))
     assert code == 0, err
     assert f"xrgs-{command}" in out
     assert "=" in out
 
 
-def test_help_names_every_choice(tmp_path: Path) -> None:
-    code, out, _ = run("sweep", tmp_path, "--help")
+def test_help_names_every_choice(run_command: RunCommand, tmp_path: Path) -> None:
+    code, out, _ = run_command("sweep", tmp_path, "--help")
     assert code == 0
     for name in ("consistency", "llff/fern", "motorcycle", "laptop", "smoke"):
         assert name in out
@@ -282,7 +279,7 @@ def test_help_names_every_choice(tmp_path: Path) -> None:
     ids=" ".join,
 )
 def test_bad_input_is_named_and_loses_nothing(
-    tmp_path: Path, arguments: list[str], named: list[str]
+    run_command: RunCommand, tmp_path: Path, arguments: list[str], named: list[str]
 ) -> None:
     (tmp_path / "empty").mkdir()
     (tmp_path / "in-the-way").write_text("a file")
@@ -292,7 +289,7 @@ def test_bad_input_is_named_and_loses_nothing(
     for file in photographs(tmp_path / "broken", 5).iterdir():
         file.write_bytes(file.read_bytes()[:60])
     photographs(tmp_path / "small", 5, (40, 30))
-    code, out, err = run("sweep", tmp_path, "preset=smoke", *arguments)
+    code, out, err = run_command("sweep", tmp_path, "preset=smoke", *arguments)
     assert code != 0
     for text in named:
         assert text in out + err
@@ -304,20 +301,22 @@ def test_bad_input_is_named_and_loses_nothing(
     [(["store=gone"], "gone"), (["stroe=x"], "stroe"), (["sweep=nope", "store=s"], "nope")],
 )
 def test_a_report_that_cannot_be_made_says_why(
-    tmp_path: Path, arguments: list[str], named: str
+    run_command: RunCommand, tmp_path: Path, arguments: list[str], named: str
 ) -> None:
     (tmp_path / "s" / "sweeps").mkdir(parents=True)
-    code, _, err = run("report", tmp_path, *arguments)
+    code, _, err = run_command("report", tmp_path, *arguments)
     assert code == 1
     assert named in err
     assert "Traceback" not in err
 
 
-def test_a_trained_cell_becomes_a_load_of_the_benchmark(swept: tuple[Path, str]) -> None:
+def test_a_trained_cell_becomes_a_load_of_the_benchmark(
+    run_command: RunCommand, swept: tuple[Path, str]
+) -> None:
     folder, _ = swept
     cell = sorted((folder / "s" / "cells").iterdir())[0]
     view = json.loads((cell / "status.json").read_text())["views"][0]
-    code, out, err = run("bench", folder, "save=a.npz", f"cell={cell}", f"view={view}")
+    code, out, err = run_command("bench", folder, "save=a.npz", f"cell={cell}", f"view={view}")
     assert code == 0, err
     with np.load(folder / "a.npz") as stored:
         count = json.loads((cell / "summary.json").read_text())["gaussians"]
@@ -327,7 +326,7 @@ def test_a_trained_cell_becomes_a_load_of_the_benchmark(swept: tuple[Path, str])
         with Image.open(cell / "renders" / f"{view}.png") as picture:
             assert picture.size == (stored["width"], stored["height"])
     assert f"{count} Gaussians" in out
-    code, _, err = run("bench", folder, "save=a.npz", f"cell={cell}", "view=none")
+    code, _, err = run_command("bench", folder, "save=a.npz", f"cell={cell}", "view=none")
     assert code != 0
     assert "view=none" in err
     assert view in err

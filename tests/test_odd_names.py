@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import os
 import shutil
-import subprocess
-import sys
 from collections.abc import Callable
 from pathlib import Path
 
@@ -19,6 +17,8 @@ from xrgs.arguments import dotlist, with_quotes
 from xrgs.errors import XrgsError
 from xrgs.scenes import folder, motorcycle
 
+#: As `tests.conftest.run_command` gives it.
+RunCommand = Callable[..., tuple[int, str, str]]
 ACCENT = "e\N{COMBINING ACUTE ACCENT}"
 WHOLE = "\N{LATIN SMALL LETTER E WITH ACUTE}"
 ODD = (
@@ -77,21 +77,7 @@ def test_photographs_that_would_be_one_file_somewhere_are_named(
         folder.photographs(str(tmp_path), 0)
 
 
-def run(command: str, cwd: Path, *arguments: str) -> str:
-    """What a command printed."""
-    script = f"from xrgs.cli import {command}; {command}()"
-    done = subprocess.run(
-        [sys.executable, "-P", "-c", script, *arguments],
-        cwd=cwd,
-        capture_output=True,
-        text=True,
-        check=False,
-    )
-    assert done.returncode == 0, done.stderr
-    return done.stdout
-
-
-def test_a_scene_of_odd_names_goes_the_whole_way(tmp_path: Path) -> None:
+def test_a_scene_of_odd_names_goes_the_whole_way(run_command: RunCommand, tmp_path: Path) -> None:
     scene = tmp_path / f"-部屋 🙂 {{it's}} 50%=#1; {ACCENT}, a"
     scene.mkdir()
     views = ['-a b\'s & "c" (1) 🙂', f"[{ACCENT}]=50%#, $x.y"]
@@ -101,7 +87,9 @@ def test_a_scene_of_odd_names_goes_the_whole_way(tmp_path: Path) -> None:
     conf += ("variant.long_side=185", "variant.sfm.reference=false")
     words = ("+ablation=curriculum", "scene=folder", f"scene.path={scene.name}", *conf)
     store = "store=st öre, 'a' {b} 🙂"
-    assert scene.name in run("sweep", tmp_path, *words, store)
+    code, out, err = run_command("sweep", tmp_path, *words, store)
+    assert code == 0, err
+    assert scene.name in out
     home = tmp_path / store.removeprefix("store=")
     for cell in (home / "cells").iterdir():
         assert {file.stem for file in (cell / "renders").iterdir()} == set(views)
@@ -110,5 +98,7 @@ def test_a_scene_of_odd_names_goes_the_whole_way(tmp_path: Path) -> None:
     assert len(pictures) == 2
     page = (report / "table.md").read_text()
     assert all(f"](figures/{file.name})" in page and file.name.isascii() for file in pictures)
-    assert str(Path(*report.parts[-3:])) in run("report", tmp_path, store)
-    assert scene.name in run("status", tmp_path, store)
+    for command, name in (("report", str(Path(*report.parts[-3:]))), ("status", scene.name)):
+        code, out, err = run_command(command, tmp_path, store)
+        assert code == 0, err
+        assert name in out

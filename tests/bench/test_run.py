@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
-import subprocess
-import sys
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -19,22 +18,19 @@ from xrgs.bench.settings import Settings
 from xrgs.splat.backend import resolve_backend
 from xrgs.splat.settings import RasterSettings
 
-
-def command(cwd: Path, *arguments: str) -> tuple[int, str, str]:
-    """Exit code, stdout and stderr of `xrgs-bench`."""
-    script = "from xrgs.cli import bench; bench()"
-    done = subprocess.run(
-        [sys.executable, "-c", script, *arguments],
-        cwd=cwd, capture_output=True, text=True, check=False,
-    )  # fmt: skip
-    return done.returncode, done.stdout, done.stderr
+#: As `tests.conftest.run_command` gives it.
+RunCommand = Callable[..., tuple[int, str, str]]
 
 
 @pytest.fixture(scope="module")
-def smoke(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str, dict[str, Any]]:
+def smoke(
+    run_command: RunCommand, tmp_path_factory: pytest.TempPathFactory
+) -> tuple[Path, str, dict[str, Any]]:
     """A folder with a smoke benchmark's files, what was printed, and its JSON."""
     folder = tmp_path_factory.mktemp("bench")
-    code, out, err = command(folder, "smoke=true", "repeats=1", "out=o", "json=all.json")
+    code, out, err = run_command(
+        "bench", folder, "smoke=true", "repeats=1", "out=o", "json=all.json"
+    )
     assert code == 0, err
     return folder, out, json.loads((folder / "all.json").read_text())
 
@@ -133,8 +129,10 @@ def test_a_file_is_timed(file: Path, tmp_path: Path) -> None:
         (["lod=a.npz"], "lod"),
     ],
 )
-def test_bad_arguments_end_in_one_line(tmp_path: Path, arguments: list[str], message: str) -> None:
-    code, out, err = command(tmp_path, *arguments)
+def test_bad_arguments_end_in_one_line(
+    run_command: RunCommand, tmp_path: Path, arguments: list[str], message: str
+) -> None:
+    code, out, err = run_command("bench", tmp_path, *arguments)
     assert code != 0
     assert not out
     assert err.startswith("xrgs-bench: ")

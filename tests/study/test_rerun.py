@@ -5,8 +5,6 @@ from __future__ import annotations
 import json
 import os
 import shutil
-import subprocess
-import sys
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
@@ -20,26 +18,16 @@ from xrgs.store import CellFolder
 from xrgs.study.rerun import Again, rerun
 from xrgs.study.status import read
 
-
-def sweep(folder: Path, *arguments: str) -> tuple[int, str, str]:
-    """Exit code, stdout and stderr of `xrgs-sweep`."""
-    script = "from xrgs.cli import sweep; sweep()"
-    done = subprocess.run(
-        [sys.executable, "-P", "-c", script, *arguments],
-        cwd=folder,
-        capture_output=True,
-        text=True,
-        check=False,
-    )
-    return done.returncode, done.stdout, done.stderr
+#: As `tests.conftest.run_command` gives it.
+RunCommand = Callable[..., tuple[int, str, str]]
 
 
 @pytest.fixture(scope="module")
-def trained(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def trained(run_command: RunCommand, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The folder of the smallest cell, in a store `s`."""
     folder = tmp_path_factory.mktemp("trained")
     smallest = ("scene=motorcycle", "preset=smoke", "train.steps=2", "threads=1", "store=s")
-    code, _, err = sweep(folder, *smallest)
+    code, _, err = run_command("sweep", folder, *smallest)
     assert code == 0, err
     return next((folder / "s" / "cells").iterdir())
 
@@ -75,10 +63,10 @@ def train(trained: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., None]
     return fake
 
 
-def test_the_same_program_gives_the_same_bits(trained: Path) -> None:
+def test_the_same_program_gives_the_same_bits(run_command: RunCommand, trained: Path) -> None:
     before = {file: file.stat().st_mtime_ns for file in trained.rglob("*")}
     store = trained.parent.parent
-    code, out, err = sweep(store.parent, f"rerun={trained}")
+    code, out, err = run_command("sweep", store.parent, f"rerun={trained}")
     assert code == 0, out + err
     assert out.startswith("the same, bit for bit: scores.csv, history.csv, splats.ply")
     assert "nothing differs" in err
@@ -269,9 +257,11 @@ def test_a_folder_that_cannot_be_rerun_is_told_why(
     ],
 )
 def test_an_argument_that_would_make_another_cell_is_refused(
-    cell: CellFolder, argument: str, named: str
+    run_command: RunCommand, cell: CellFolder, argument: str, named: str
 ) -> None:
-    code, _, err = sweep(cell.path.parent.parent.parent, f"rerun={cell.path}", argument)
+    code, _, err = run_command(
+        "sweep", cell.path.parent.parent.parent, f"rerun={cell.path}", argument
+    )
     assert code == 1
     assert named in err
     assert "Traceback" not in err

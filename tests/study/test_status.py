@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import os
-import subprocess
-import sys
+from collections.abc import Callable
 from dataclasses import asdict
 from pathlib import Path
 
@@ -96,19 +95,15 @@ def test_a_change_that_keeps_the_size_is_found_where_that_is_asked_for(store: St
     assert [state["good"] for state in states] == ["done", "corrupt"]
 
 
-def test_it_writes_nothing_and_needs_no_torch(store: Store, tmp_path: Path) -> None:
+def test_it_writes_nothing_and_needs_no_torch(
+    run_command: Callable[..., tuple[int, str, str]], store: Store, tmp_path: Path
+) -> None:
     (tmp_path / "torch.py").write_text("raise ImportError('torch was imported')")
     before = sorted(store.path.rglob("*"))
-    done = subprocess.run(
-        [sys.executable, "-c", "from xrgs.cli import status; status()", "store=s"],
-        cwd=tmp_path,
-        env=os.environ | {"PYTHONPATH": f"{tmp_path}:{os.environ.get('PYTHONPATH', '')}"},
-        capture_output=True,
-        text=True,
-        check=False,
-    )
-    assert done.returncode == 0, done.stderr
-    assert "7 cells" in done.stdout
+    path = f"{tmp_path}:{os.environ.get('PYTHONPATH', '')}"
+    code, out, err = run_command("status", tmp_path, "store=s", PYTHONPATH=path)
+    assert code == 0, err
+    assert "7 cells" in out
     assert sorted(store.path.rglob("*")) == before
 
 
