@@ -13,6 +13,7 @@ import pytest
 import xrgs
 from xrgs.report import build
 from xrgs.report.collect import ReportError
+from xrgs.report.figures import trade_off
 from xrgs.store import StoreError
 
 
@@ -64,7 +65,16 @@ def test_an_odd_name_has_its_picture(made: Any) -> None:
     assert all(file.parent == report.folder / "figures" for file in pictures)
 
 
-def test_several_ablations_have_a_picture_of_what_they_trade(made: Any) -> None:
+def test_several_ablations_have_a_picture_of_what_they_trade(
+    made: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    drawn = []
+
+    def drawing(*arguments: Any) -> bytes:
+        drawn.append(arguments)
+        return trade_off(*arguments)
+
+    monkeypatch.setattr("xrgs.report.pictures.trade_off", drawing)
     for condition in ("", "factor=8/x"):
         made.add(condition=condition, values={"lpips": None})
         made.add("densify", condition=condition, factors={"gaussians": 2}, values={"lpips": None})
@@ -74,6 +84,11 @@ def test_several_ablations_have_a_picture_of_what_they_trade(made: Any) -> None:
     names = [file.name for file in report.files if file.name.startswith("trade-off")]
     assert len(names) == 2
     assert "trade-off.png" in names
+    for _, means, scenes, axes in drawn:
+        assert [axis.name for axis in axes] == ["ssim", "psnr"]  # LPIPS was not measured
+        assert means.loc["densify", "gaussians"] == scenes.loc["densify", "gaussians"] == 2
+        assert means.loc["mip", "psnr"] == pytest.approx(2.0)  # dB: a tenth of the baseline's 20
+        assert means.loc["densify", "psnr"] == 0
     page = (report.folder / "table.md").read_text()
     assert all(f"figures/{name}" in page for name in names)
 

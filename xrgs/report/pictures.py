@@ -91,7 +91,7 @@ def _trade_offs(comparison: Comparison, folder: Path) -> list[Picture]:
         axes = [
             Quality(m.name, f"{m.label}, {m.unit or '%'}", m.higher_is_better)
             for m in comparison.metrics
-            if m.name in means
+            if m.score is not None and m.name in means
         ]
         if len(means) < 2 or not axes:
             continue
