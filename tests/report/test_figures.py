@@ -8,14 +8,8 @@ import pandas as pd
 import pytest
 from PIL import Image
 
-from xrgs.report.figures import (
-    Panel,
-    Quality,
-    curves,
-    differing_crop,
-    side_by_side,
-    trade_off,
-)
+from xrgs.metrics import Metric
+from xrgs.report.figures import Panel, curves, differing_crop, side_by_side, trade_off
 from xrgs.report.pictures import median_view, slug
 
 RNG = np.random.default_rng(0)
@@ -89,7 +83,7 @@ ORANGE, BLUE = (0xD5, 0x5E, 0x00), (0x00, 0x72, 0xB2)
 def test_a_trade_off_has_the_better_up_and_the_smaller_left(
     higher_is_better: bool, better: bool
 ) -> None:
-    quality = Quality("q", "quality", higher_is_better)
+    quality = Metric("q", "quality", "dB", higher_is_better=higher_is_better)
     change = 2.0 if better == higher_is_better else -2.0
     means = pd.DataFrame({"gaussians": [0.5], "q": [change]}, index=["_odd $"])
     scenes = pd.DataFrame({"gaussians": [0.4, 0.6], "q": [0.0, 2 * change]}, index=["_odd $"] * 2)

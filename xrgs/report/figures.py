@@ -24,6 +24,8 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from numpy.typing import NDArray
 
+    from xrgs.metrics import Metric
+
     Image = NDArray[np.float32]
 
 #: Okabe and Ito's orange and blue: told apart by colour-blind readers and in grey.
@@ -145,17 +147,9 @@ def curves(
     return _png(figure)
 
 
-class Quality(NamedTuple):
-    """An axis of a trade-off: what is got for the Gaussians."""
-
-    name: str
-    label: str
-    higher_is_better: bool
-
-
 @_default_style()
 def trade_off(
-    title: str, means: pd.DataFrame, scenes: pd.DataFrame, axes: Sequence[Quality]
+    title: str, means: pd.DataFrame, scenes: pd.DataFrame, axes: Sequence[Metric]
 ) -> bytes:
     """Every ablation by its Gaussians and its quality, one panel a quality; better is up and left.
 
@@ -164,9 +158,10 @@ def trade_off(
     Args:
         title: above all.
         means: one row a label, in order: `gaussians`, as a multiple of the baseline's, above 0;
-            and for each of `axes` its change from the baseline, in a column of its name.
+            and for each of `axes` its change from the baseline, in its unit or else in percent, in
+            a column of its name.
         scenes: the same columns and index, one row a label and scene.
-        axes: what to draw.
+        axes: the scores to draw.
 
     Returns:
         A PNG.
@@ -174,11 +169,11 @@ def trade_off(
     figure = _figure(_PANEL * 1.1 * len(axes) + 2, max(_PANEL, 0.2 * len(means)))
     figure.suptitle(title, fontsize=11, parse_math=False)
     panels = figure.subplots(1, len(axes), squeeze=False)[0]
-    for panel, quality in zip(panels, axes, strict=True):
-        _dots(panel, means, scenes, quality.name)
+    for panel, metric in zip(panels, axes, strict=True):
+        _dots(panel, means, scenes, metric.name)
         panel.set_xlabel("Gaussians, times the baseline's")
-        panel.set_title(quality.label, fontsize=10, parse_math=False)
-        if not quality.higher_is_better:
+        panel.set_title(f"{metric.label}, {metric.unit or '%'}", fontsize=10, parse_math=False)
+        if not metric.higher_is_better:
             panel.invert_yaxis()
     names = "\n".join(f"{at} {label}" for at, label in enumerate(means.index, start=1))
     panels[-1].annotate(

@@ -15,14 +15,8 @@ from xrgs.files import replacing
 from xrgs.images import ImageError
 from xrgs.progress import progress
 from xrgs.report.collect import BASELINE, ReportError
-from xrgs.report.figures import (
-    Panel,
-    Quality,
-    curves,
-    differing_crop,
-    side_by_side,
-    trade_off,
-)
+from xrgs.report.figures import Panel, curves, differing_crop, side_by_side, trade_off
+from xrgs.report.tables import titled
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -88,14 +82,10 @@ def _trade_offs(comparison: Comparison, folder: Path) -> list[Picture]:
             _traded(table, condition, comparison.metrics)
             for table in (comparison.means, comparison.per_scene)
         )
-        axes = [
-            Quality(m.name, f"{m.label}, {m.unit or '%'}", m.higher_is_better)
-            for m in comparison.metrics
-            if m.score is not None and m.name in means
-        ]
+        axes = [m for m in comparison.metrics if m.score is not None and m.name in means]
         if len(means) < 2 or not axes:
             continue
-        title = f"What each ablation trades, mean over scenes{condition and f' ({condition})'}"
+        title = titled("What each ablation trades, mean over scenes", condition)
         file = folder / f"trade-off{condition and f'.{slug(condition)}'}.png"
         with replacing(file) as stream:
             stream.write(trade_off(title, means, scenes, axes))

@@ -136,7 +136,7 @@ class Tables:
             for metric in self.comparison.metrics
         )  # fmt: skip
         return Grid(
-            title=_title("Change from baseline, %, mean over scenes", condition),
+            title=titled("Change from baseline, %, mean over scenes", condition),
             columns=("Metric", *labels),
             rows=rows,
             align="l" + "r" * len(labels),
@@ -169,7 +169,7 @@ class Tables:
             if row.why and not math.isnan(row.change):
                 notes.append(f"{metric.label}: pairs left out ({row.why})")
         return Grid(
-            title=_title(f"{label} against baseline: {self._extent(label, condition)}", condition),
+            title=titled(f"{label} against baseline: {self._extent(label, condition)}", condition),
             columns=("Metric", BASELINE, label, "change, %", "dB", "95 % interval, %", "reading"),
             rows=tuple(rows),
             align="lrrrrrl",
@@ -216,7 +216,7 @@ class Tables:
                 ]
                 rows.append((f"{metric.label}, dB", *absolute))
         return Grid(
-            title=_title(f"{label}: change from baseline, scene by scene", condition),
+            title=titled(f"{label}: change from baseline, scene by scene", condition),
             columns=("Metric", *scenes, "mean"),
             rows=tuple(rows),
             align="l" + "r" * (len(scenes) + 1),
@@ -238,7 +238,7 @@ class Tables:
                          for v in found]  # fmt: skip
                 rows.append((scene, metric.label, *texts))
         return Grid(
-            title=_title("Values, means over the seeds that are done", condition),
+            title=titled("Values, means over the seeds that are done", condition),
             columns=("Scene", "Metric", *labels),
             rows=tuple(rows),
             align="ll" + "r" * len(labels),
@@ -282,7 +282,8 @@ def _by_key(table: pd.DataFrame) -> dict[tuple[str, ...], Change]:
     return {key: Change(*row) for key, row in zip(table.index, rows, strict=True)}
 
 
-def _title(text: str, condition: str) -> str:
+def titled(text: str, condition: str) -> str:
+    """A heading that names the condition, where there is one."""
     return f"{text} ({condition})" if condition else text
 
 
