@@ -108,20 +108,22 @@ class Story:
         time.sleep(moment.later)
         if sweep.process.poll() is not None:
             return ""
-        workers = [
-            pid for pid, line in self.sweeps.processes().items() if "xrgs.jobs.worker" in line
-        ]
-        victim = workers[0] if moment.worker and workers else sweep.process.pid
+        workers = {
+            pid: line.split()[-2:]
+            for pid, line in self.sweeps.processes().items()
+            if "xrgs.jobs.worker" in line
+        }
+        victim = next(iter(workers), 0) if moment.worker else 0
         with suppress(ProcessLookupError):
-            os.kill(victim, signal.SIGKILL)
-        if victim != sweep.process.pid and len(self.done()) > done:
+            os.kill(victim or sweep.process.pid, signal.SIGKILL)
+        if victim and (len(self.done()) > done or has_answered(*workers[victim])):
             sweep.process.kill()  # what the worker was to do is done: the sweep goes on to more
         code, out, err = sweep.end()
         self.sweeps.leave_nothing_running()
         if code != -signal.SIGKILL:
             assert code == 1, err
             assert "SIGKILL" in out + err
-        return "sweep" if victim == sweep.process.pid else "worker"
+        return "worker" if victim else "sweep"
 
     def _is_at(self, moment: Moment, before: set[tuple[Path, int, int]]) -> bool:
         """Whether the sweep that was started last has come there, or beyond."""
@@ -139,6 +141,11 @@ class Story:
                     stat = file.stat()
                     found.add((file, stat.st_ino, stat.st_mtime_ns))
         return found
+
+
+def has_answered(request: str, answer: str) -> bool:
+    """Whether a worker had, when it was killed; its folder goes when the sweep has read that."""
+    return Path(answer).exists() or not Path(request).exists()
 
 
 def contents(cell: Path) -> dict[str, tuple[int, ...]]:

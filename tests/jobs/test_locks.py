@@ -198,3 +198,27 @@ def test_of_many_at_once_one_has_it(tmp_path: Path, owner: subprocess.Popen[str]
     assert len(spans) > 20
     for (_, end), (start, _) in pairwise(spans):
         assert end <= start
+
+
+def test_what_is_made_anew_while_it_is_looked_at_is_not_taken_for_the_dead_one(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """One contender gives way and another comes, both between a third one's look and its broom."""
+    contender, looks, living = tmp_path / "cell.1", 0, locks._living
+
+    def generations(folder: Path, name: str) -> dict[int, Path]:
+        nonlocal looks
+        looks += 1
+        return {1: contender} if looks == 2 else {}  # it has come and gone
+
+    def seen(file: Path) -> bool | None:
+        found = living(file)
+        locks.sign(file)
+        return found
+
+    monkeypatch.setattr(locks, "_generations", generations)
+    monkeypatch.setattr(locks, "_living", seen)
+    lock = locks.acquire(tmp_path, "cell")
+    assert lock is not None
+    assert lock.path.name == "cell.0"
+    assert contender.exists()

@@ -89,6 +89,8 @@ class Lock:
             return True
         self.beaten = time.monotonic()
         name, generation = _parts(self.path)
+        if signature(self.path) not in {None, self.owner}:
+            return False
         try:
             os.utime(self.path)
             if not known:
@@ -100,7 +102,7 @@ class Lock:
             return False
         except OSError:  # the store is out of reach for now: whether for too long, it will tell
             return True
-        return last == generation and signature(self.path) in {None, self.owner}
+        return last == generation
 
     def release(self) -> None:
         """Let the next one have it."""
@@ -126,12 +128,14 @@ def acquire(folder: Path, name: str) -> Lock | None:
             continue  # another was quicker: look again
         # What was listed above may be long past: whoever came meanwhile is seen here, and of two
         # at least one sees the other. Both giving way costs nothing but another try.
-        others = {other for other in _generations(folder, name).values() if other != file}
-        if any(_living(other) for other in others):
+        others = [other for other in _generations(folder, name).values() if other != file]
+        living = {other: _living(other) for other in others}
+        if any(living.values()):
             file.unlink(missing_ok=True)
             return None
-        for dead in others:
-            dead.unlink(missing_ok=True)
+        for other in others:
+            if living[other] is False:  # one that is gone may have been made anew, by the living
+                other.unlink(missing_ok=True)
         return Lock(file, time.monotonic(), owner)
 
 
@@ -190,15 +194,16 @@ def _generations(folder: Path, name: str) -> dict[int, Path]:
     return {_parts(file)[1]: file for file in found if file.suffix[1:].isdecimal()}
 
 
-def _living(file: Path) -> bool:
+def _living(file: Path) -> bool | None:
+    """Whether a lock's owner is; None where it has released it since, as the living do."""
     owner = signature(file)
     if owner is not None and owner.here:
-        return owner.lives
+        return owner.lives or (False if signature(file) == owner else None)
     silent = _NAMELESS_S if owner is None else SILENT_S
     try:
         return _now(file.parent) - file.stat().st_mtime < silent
     except OSError:
-        return False
+        return None
 
 
 def _now(folder: Path) -> float:
