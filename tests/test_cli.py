@@ -102,6 +102,22 @@ def test_the_report_is_rebuilt_byte_for_byte(run_command: RunCommand, store: Pat
     assert contents(store / "reports") == before
 
 
+def test_a_report_has_the_pictures_that_are_asked_for(
+    run_command: RunCommand, store: Path, tmp_path: Path
+) -> None:
+    for asked, drawn in (("none", []), ("motorcycle--consistency", ["motorcycle--consistency"])):
+        out = tmp_path / asked
+        code, _, err = run_command(
+            "report", store.parent, "store=s", f"out={out}", f"pictures={asked}"
+        )
+        assert code == 0, err
+        assert [file.stem for file in (out / "figures").iterdir()] == drawn
+    code, _, err = run_command("report", store.parent, "store=s", f"out={out}", "pictures=gone")
+    assert code == 1
+    assert "pictures=gone" in err
+    assert "motorcycle--consistency--training" in err
+
+
 def test_a_second_run_trains_nothing(run_command: RunCommand, store: Path) -> None:
     before = contents(store / "cells")
     code, out, err = run_command("sweep", store.parent, "+ablation=consistency", *SMOKE, "store=s")

@@ -146,16 +146,19 @@ class ReportConf:
     """Id of the sweep; the latest where none is given."""
     out: str | None = None
     """Folder to write to; `<store>/reports/<sweep>` where none is given."""
+    pictures: str = "all"
+    """`all`, `none`, or files' names without their suffix: `trade-off,fern--plus`."""
 
 
 def report() -> None:
-    """`xrgs-report [store=FOLDER] [sweep=ID] [out=FOLDER]`: the tables, from the store alone."""
+    """`xrgs-report [KEY=VALUE ...]`: tables and pictures of a sweep, from the store alone."""
     try:
         conf = _arguments(ReportConf, report)
         from xrgs.report import build
 
         out = Path(conf.out) if conf.out else None
-        print(build(Path(conf.store), conf.sweep, out).text)  # noqa: T201
+        names = {"all": None, "none": []}.get(conf.pictures, conf.pictures.split(","))
+        print(build(Path(conf.store), conf.sweep, out, names).text)  # noqa: T201
     except (XrgsError, OmegaConfBaseException) as error:
         sys.exit(f"xrgs-report: {config.one_line(error)}")
 

@@ -98,6 +98,22 @@ def test_one_ablation_has_no_such_picture(study: Any) -> None:
     assert not [file for file in build(study.store.path).files if "trade-off" in file.name]
 
 
+@pytest.mark.parametrize("names", [(), ("fern--consistency",)])
+def test_the_pictures_that_are_named_are_drawn_and_no_other(study: Any, names: Any) -> None:
+    study.write()
+    report = build(study.store.path, pictures=names)
+    assert [file.stem for file in report.files if file.suffix == ".png"] == list(names)
+    assert {file.stem for file in (report.folder / "figures").iterdir()} == set(names)
+    page = (report.folder / "table.md").read_text()
+    assert page.count("![") == len(names)
+
+
+def test_a_picture_that_is_not_there_is_named_beside_those_that_are(study: Any) -> None:
+    study.write()
+    with pytest.raises(ReportError, match=r"pictures=fern: .*there are: fern--consistency, fern--"):
+        build(study.store.path, pictures=["fern--consistency", "fern"])
+
+
 def test_every_file_is_there_and_named(study: Any) -> None:
     study.write()
     report = build(study.store.path)

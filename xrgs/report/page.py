@@ -20,6 +20,8 @@ from xrgs.report.training import totals
 from xrgs.store import Store
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     import pandas as pd
 
 #: A terminal shows the ablations one by one up to this many; the overview and files have all.
@@ -41,17 +43,24 @@ class Report:
     """Everything written, sorted."""
 
 
-def build(store_path: Path, sweep_id: str | None = None, out: Path | None = None) -> Report:
+def build(
+    store_path: Path,
+    sweep_id: str | None = None,
+    out: Path | None = None,
+    pictures: Sequence[str] | None = None,
+) -> Report:
     """Write tables, scores and figures of a sweep.
 
     Args:
         store_path: the store's folder.
         sweep_id: the sweep; the latest one where none is given.
         out: folder to write to; `<store>/reports/<sweep id>` where none is given.
+        pictures: names of those that are wanted (`draw`); None for all.
 
     Raises:
         StoreError: the store holds no such sweep.
-        ReportError: the sweep's cells can't be compared, or `out` can't be written.
+        ReportError: the sweep's cells can't be compared, there is no picture of such a name, or
+            `out` can't be written.
     """
     store = Store(store_path)
     sweep_id = sweep_id or store.latest_sweep()
@@ -64,11 +73,11 @@ def build(store_path: Path, sweep_id: str | None = None, out: Path | None = None
         raise ReportError(f"{links[0]} is a link: remove it, or name a folder with out=...")
     try:
         (folder / "figures").mkdir(parents=True, exist_ok=True)
-        pictures = draw(store, comparison, sweep.views, folder / "figures")
-        _write_files(folder, sweep, tables, pictures, totals(store, comparison.cells))
+        drawn = draw(store, comparison, sweep.views, folder / "figures", pictures)
+        _write_files(folder, sweep, tables, drawn, totals(store, comparison.cells))
     except OSError as error:
         raise ReportError(f"the report can't be written to {folder}: {error}") from error
-    written = {p.file for p in pictures if p.file} | {folder / name for name in _FILES}
+    written = {p.file for p in drawn if p.file} | {folder / name for name in _FILES}
     text = _text(tables, _warnings(sweep)) + f"\nWritten to {folder}"
     return Report(text=text, folder=folder, files=tuple(sorted(written)))
 

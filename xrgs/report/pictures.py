@@ -6,6 +6,7 @@ import hashlib
 import math
 import re
 from dataclasses import dataclass
+from functools import partial
 from typing import TYPE_CHECKING
 
 import pandas as pd
@@ -19,7 +20,7 @@ from xrgs.report.figures import Panel, curves, differing_crop, side_by_side, tra
 from xrgs.report.tables import titled
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Callable, Sequence
     from pathlib import Path
 
     import numpy as np
@@ -28,6 +29,8 @@ if TYPE_CHECKING:
     from xrgs.metrics import Metric
     from xrgs.report.compare import Comparison
     from xrgs.store import Store
+
+    _Drawing = Callable[[Path], "Picture"]  # into a file of that name
 
 _CURVES = {"gaussians": "Gaussians", "loss": "loss of the step's view, as each run weighs it"}
 #: Of a photograph in a picture that is a thousand pixels wide; three are in memory at a time.
@@ -43,7 +46,13 @@ class Picture:
     why: str = ""
 
 
-def draw(store: Store, comparison: Comparison, views: pd.DataFrame, folder: Path) -> list[Picture]:
+def draw(
+    store: Store,
+    comparison: Comparison,
+    views: pd.DataFrame,
+    folder: Path,
+    names: Sequence[str] | None = None,
+) -> list[Picture]:
     """What each ablation trades; then views and training curves of every scene and ablation.
 
     The first is drawn where there are several ablations, once a condition. Of several conditions
@@ -54,9 +63,13 @@ def draw(store: Store, comparison: Comparison, views: pd.DataFrame, folder: Path
         comparison: the pairs.
         views: `Sweep.views`.
         folder: where the files go; it exists.
+        names: of the pictures that are wanted, a file's without its suffix; None for all.
 
     Returns:
         The pictures in the order of the tables.
+
+    Raises:
+        ReportError: there is none of such a name.
     """
     first = comparison.pairs.sort_values("seed", kind="stable")
     wanted = first.drop_duplicates(["scene", "label"]).sort_values(["scene", "label"])
@@ -64,19 +77,28 @@ def draw(store: Store, comparison: Comparison, views: pd.DataFrame, folder: Path
     scores = views[views["cell_id"].isin(shown)].groupby("cell_id")
     psnr = {cell_id: rows.set_index("view")["psnr"] for cell_id, rows in scores}
     variants = comparison.cells.drop_duplicates("cell_id").set_index("cell_id")["variant_id"]
-    drawn = _trade_offs(comparison, folder)
-    for _, pair in progress(wanted.iterrows(), "drawing", "picture", len(wanted)):
+    known = _trade_offs(comparison)
+    for _, pair in wanted.iterrows():
         both = psnr[pair["baseline_id"]], psnr[pair["cell_id"]]
         photographs = store.variants / variants[pair["cell_id"]] / "images" / "test"
-        drawn += [
-            _views(store, pair, both, photographs, folder),
-            _training(store, pair, folder),
-        ]
-    return drawn
+        stem = f"{slug(pair['scene'])}--{slug(pair['label'])}"
+        known[stem] = partial(_views, store, pair, both, photographs)
+        known[f"{stem}--training"] = partial(_training, store, pair)
+    chosen = known if names is None else _chosen(known, names)
+    bar = progress(chosen.items(), "drawing", "picture", len(chosen))
+    return [drawing(folder / f"{name}.png") for name, drawing in bar]
 
 
-def _trade_offs(comparison: Comparison, folder: Path) -> list[Picture]:
-    drawn = []
+def _chosen(known: dict[str, _Drawing], names: Sequence[str]) -> dict[str, _Drawing]:
+    for name in names:
+        if name not in known:
+            there = ", ".join(known) or "none at all"
+            raise ReportError(f"pictures={name}: there is none of that name; there are: {there}")
+    return {name: drawing for name, drawing in known.items() if name in names}
+
+
+def _trade_offs(comparison: Comparison) -> dict[str, _Drawing]:
+    drawings: dict[str, _Drawing] = {}
     for condition in dict.fromkeys(condition for _, condition in comparison.groups):
         means, scenes = (
             _traded(table, condition, comparison.metrics)
@@ -86,11 +108,17 @@ def _trade_offs(comparison: Comparison, folder: Path) -> list[Picture]:
         if len(means) < 2 or not axes:
             continue
         title = titled("What each ablation trades, mean over scenes", condition)
-        file = folder / f"trade-off{condition and f'.{slug(condition)}'}.png"
-        with replacing(file) as stream:
-            stream.write(trade_off(title, means, scenes, axes))
-        drawn.append(Picture(title, file))
-    return drawn
+        name = f"trade-off{condition and f'.{slug(condition)}'}"
+        drawings[name] = partial(_trade_off, title, means, scenes, axes)
+    return drawings
+
+
+def _trade_off(
+    title: str, means: pd.DataFrame, scenes: pd.DataFrame, axes: Sequence[Metric], file: Path
+) -> Picture:
+    with replacing(file) as stream:
+        stream.write(trade_off(title, means, scenes, axes))
+    return Picture(title, file)
 
 
 def _traded(table: pd.DataFrame, condition: str, metrics: Sequence[Metric]) -> pd.DataFrame:
@@ -126,7 +154,7 @@ def _views(
     pair: pd.Series,
     psnr: tuple[pd.Series, pd.Series],
     photographs: Path,
-    folder: Path,
+    file: Path,
 ) -> Picture:
     view = median_view(*psnr)
     title = f"{_title(pair)}: view {view}, by change of PSNR the median of {len(psnr[0])}"
@@ -144,14 +172,13 @@ def _views(
     )
     if len({panel.image.shape for panel in panels}) > 1:
         return Picture(title, None, f"{view}: photograph and renders differ in size")
-    file = folder / f"{_stem(pair)}.png"
     note = f"where baseline and {pair['label']} differ most"
     with replacing(file) as stream:
         stream.write(side_by_side(title, panels, differing_crop(baseline, ablation), note))
     return Picture(title, file)
 
 
-def _training(store: Store, pair: pd.Series, folder: Path) -> Picture:
+def _training(store: Store, pair: pd.Series, file: Path) -> Picture:
     title = f"{_title(pair)}: training"
     runs = []
     for name, key in ((BASELINE, "baseline_id"), (str(pair["label"]), "cell_id")):
@@ -160,7 +187,6 @@ def _training(store: Store, pair: pd.Series, folder: Path) -> Picture:
             runs.append((name, history.apply(pd.to_numeric)))
         except (OSError, ValueError, TypeError, KeyError):
             return Picture(title, None, f"cells/{pair[key]}/history.csv can't be read")
-    file = folder / f"{_stem(pair)}--training.png"
     with replacing(file) as stream:
         stream.write(curves(title, runs, _CURVES))
     return Picture(title, file)
@@ -183,10 +209,6 @@ def _image(store: Store, path: Path) -> NDArray[np.float32]:
     except (OSError, ImageError) as error:
         # Named inside the store: the report is the same wherever the store lies.
         raise ReportError(f"{inside.as_posix()} can't be read") from error
-
-
-def _stem(pair: pd.Series) -> str:
-    return f"{slug(pair['scene'])}--{slug(pair['label'])}"
 
 
 def slug(text: str) -> str:
