@@ -9,10 +9,10 @@ import math
 import os
 import pickle
 import random
-import time
 import zipfile
 from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -180,25 +180,38 @@ def test_a_run_that_ended_but_for_its_last_words_says_them_again(
 
 
 def test_the_training_time_is_the_sum_and_has_no_writing_in_it(
-    data: Dataset, baseline: Conf, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+    data: Dataset,
+    baseline: Conf,
+    losses: Losses,
+    monkeypatch: pytest.MonkeyPatch,
+    tmp_path: Path,
 ) -> None:
-    real, nap = checkpoint._save, 0.02
+    """By a clock that only a step, a writing and a night between two runs move."""
+    now = 0.0
+    clock = SimpleNamespace(perf_counter=lambda: now, monotonic=lambda: now)
 
-    def slow(*arguments: Any) -> None:
-        time.sleep(nap)
-        real(*arguments)
+    def taking(seconds: float, real: Callable[..., Any]) -> Callable[..., Any]:
+        def call(*arguments: Any, **named: Any) -> Any:
+            nonlocal now
+            now += seconds
+            return real(*arguments, **named)
 
-    monkeypatch.setattr(checkpoint, "_save", slow)
+        return call
+
+    for module in (train, checkpoint):
+        monkeypatch.setattr(module, "time", clock)
+    monkeypatch.setattr(train, "photometric_loss", taking(1.0, losses))
+    monkeypatch.setattr(checkpoint, "_save", taking(100.0, checkpoint._save))
     file = tmp_path / "checkpoint.npz"
-    start = time.perf_counter()
-    first = train.train(data, baseline, Checkpoint(file, "cell", 1e-9))
-    assert first.seconds <= time.perf_counter() - start - STEPS * nap
-    kept = Checkpoint(file, "cell")
-    assert kept.read() == STEPS
-    before = kept._left["ledger"]["seconds"]
-    start = time.perf_counter()
-    assert before < train.train(data, baseline, kept).seconds
-    assert 0.5 * first.seconds < before <= first.seconds
+    losses.restart(STEPS // 2)
+    with pytest.raises(Kill):
+        train.train(data, baseline, Checkpoint(file, "cell", 1e-9))
+    now += 10_000.0
+    losses.restart()
+    kept = Checkpoint(file, "cell", 1e-9)
+    assert kept.read() == STEPS // 2
+    assert train.train(data, baseline, kept).seconds == STEPS
+    assert now == 10_000 + (STEPS + 1) + 100 * STEPS  # one step was begun, and lost
 
 
 class Piece:
