@@ -129,12 +129,12 @@ def acquire(folder: Path, name: str) -> Lock | None:
         # What was listed above may be long past: whoever came meanwhile is seen here, and of two
         # at least one sees the other. Both giving way costs nothing but another try.
         others = [other for other in _generations(folder, name).values() if other != file]
-        living = {other: _living(other) for other in others}
-        if any(living.values()):
+        seen = [(other, _living(other)) for other in others]
+        if any(living for _, living in seen):
             file.unlink(missing_ok=True)
             return None
-        for other in others:
-            if living[other] is False:  # one that is gone may have been made anew, by the living
+        for other, living in seen:
+            if living is False:  # one that is gone may have been made anew, by the living
                 other.unlink(missing_ok=True)
         return Lock(file, time.monotonic(), owner)
 
