@@ -1,6 +1,6 @@
 """Hydra loads plugins from this namespace package only: the sweeper and where `sweeps/` lies.
 
-Hydra imports every plugin at start, so this file stays light: the work is in `xrgs.study.sweep`. It
+Hydra imports every plugin at start, so this file stays light: the work is in `xrgs.sweep.study`. It
 executes the file before it is in `sys.modules`, where a dataclass can't resolve annotations that
 are strings: hence no `from __future__ import annotations`.
 """
@@ -71,7 +71,7 @@ class XrgsSweeper(Sweeper):
 
     def sweep(self, arguments: list[str]) -> Any:
         """Run the study."""
-        from xrgs.study.sweep import Study
+        from xrgs.sweep.study import Study
 
         axes = [f"{key}={values}" for key, values in self._params.items()]
         return Study(self._context, self._task, self._config).run([*axes, *arguments])

@@ -9,8 +9,8 @@ from typing import Any
 import pytest
 
 from xrgs.config import CONF_DIR, Conf
-from xrgs.hashing import digest
-from xrgs.identity import cell_identity
+from xrgs.experiment.identity import cell_identity
+from xrgs.safeio.hashing import digest
 
 ABLATIONS = sorted({path.stem for path in (CONF_DIR / "ablation").glob("*.yaml")} - {"baseline"})
 

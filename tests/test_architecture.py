@@ -1,7 +1,6 @@
-"""The house's own rules: which room may import what.
+"""The rules of the package's structure: which package may import what.
 
-A room is a folder or a file of `xrgs/`. Where a folder's files have an order of their own, each of
-them is one: `variant/sfm`; its face, which other rooms import, is `variant/__init__`.
+A package is a folder of `xrgs/`, or a file at its top. Imports for types alone count as well.
 """
 
 from __future__ import annotations
@@ -19,68 +18,69 @@ PACKAGE = Path(xrgs.__file__).parent
 FILES = {
     path.relative_to(PACKAGE).with_suffix("").as_posix(): path for path in PACKAGE.rglob("*.py")
 }
-#: Libraries that only these rooms may import.
-ONLY_IN = {
-    "hydra": ("arguments", "config", "study", "cli"),
-    "omegaconf": ("arguments", "config", "study", "cli"),
-    "pycolmap": ("variant/sfm",),
-    "matplotlib": ("report",),
-    "pandas": ("store", "report"),
-    "gsplat": (),
-    "tqdm": ("progress", "study"),
-}
-#: Rooms in the order that data walks through them: an import never points to a later one.
+#: The packages in the order that data passes through them: an import never points to a later one.
 FLOW = (
-    ("errors", "files", "foreign", "hashing", "machine", "npz", "splat", "stop", "streams"),
-    ("checkpoint", "progress", "records", "weights"),
-    ("images", "variant/alignment", "variant/split", "variant/views", "variant/degrade"),
-    ("arguments", "config", "scenes", "variant/sfm"),
-    ("variant/photographs", "variant/tagging"),
-    ("variant/placing",),
-    ("variant/mixing",),
-    ("variant/frozen",),
-    ("variant/__init__",),
-    ("dataset", "lpips", "metrics", "components"),
-    ("train", "evaluate"),
-    ("identity", "provenance"),
-    ("store",),
-    ("cell",),
-    ("jobs",),
-    ("report",),
-    ("data",),
-    ("bench",),
-    ("study",),
-    ("cli",),
+    "errors",
+    "safeio",
+    "runtime",
+    "splat",
+    "config",
+    "capture",
+    "training",
+    "evaluation",
+    "experiment",
+    "report",
+    "sweep",
+    "bench",
+    "cli",
 )
-FLOOR = {name: number for number, rooms in enumerate(FLOW) for name in rooms}
-PLANNING = ("study.live", "study.rerun", "study.status", "study.sweep")
+LAYER = {name: number for number, name in enumerate(FLOW)}
+#: Libraries that only these packages or modules may import.
+ONLY_IN = {
+    "hydra": ("config", "sweep", "cli"),
+    "omegaconf": ("config", "sweep", "cli"),
+    "pycolmap": ("capture/sfm",),
+    "matplotlib": ("report",),
+    "pandas": ("experiment/store", "report"),
+    "kornia": ("evaluation/metrics", "bench"),
+    "gsplat": (),
+    "tqdm": ("runtime/progress", "sweep/monitor"),
+}
+#: Modules that must load without torch, pycolmap, kornia and scikit-image: planning and reporting.
+LIGHT = (
+    "capture.variant",
+    "cli.data",
+    "cli.report",
+    "cli.status",
+    "cli.sweep",
+    "report",
+    "sweep.jobs.job",
+    "sweep.monitor",
+    "sweep.rerun",
+    "sweep.status",
+    "sweep.study",
+)
 
 
-def room(file: str) -> str:
-    return file if file in FLOOR else file.partition("/")[0]
+def package_of(name: str) -> str:
+    return name.partition("/")[0]
 
 
-def file_of(imported: str) -> str:
-    """The file of ours that an imported name is in; the name of none of ours is in `__init__`."""
-    parts = imported.split(".")[1:] if imported.startswith("xrgs.") else []
+def module_of(imported: str) -> str:
+    """The file that an imported dotted name is in; `__init__` where it is the package itself."""
+    parts = imported.split(".")[1:]
     while parts:
-        file = "/".join(parts)
-        if file in FILES:
-            return file
-        if f"{file}/__init__" in FILES:
-            return f"{file}/__init__"
+        for file in ("/".join(parts), "/".join([*parts, "__init__"])):
+            if file in FILES:
+                return file
         parts.pop()
     return "__init__"
 
 
 def imports(path: Path) -> set[str]:
-    """What a file imports, at its top or inside a function; not for types alone."""
-    tree = ast.parse(path.read_text(encoding="utf-8"))
-    for node in ast.walk(tree):
-        if isinstance(node, ast.If) and ast.unparse(node.test) == "TYPE_CHECKING":
-            node.body = []
+    """Every dotted name that a file imports, at its top, inside a function or for types alone."""
     found: set[str] = set()
-    for node in ast.walk(tree):
+    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
         if isinstance(node, ast.Import):
             found |= {alias.name for alias in node.names}
         elif isinstance(node, ast.ImportFrom) and node.module is not None:
@@ -88,51 +88,61 @@ def imports(path: Path) -> set[str]:
     return found
 
 
+def own_imports(name: str) -> set[str]:
+    """The files of this package that a file imports, its compiled module aside."""
+    ours = {module for module in imports(FILES[name]) if module.split(".")[0] == "xrgs"}
+    return {module_of(module) for module in ours if module != "xrgs._native"} - {name}
+
+
+def test_every_module_lies_in_a_package() -> None:
+    assert {package_of(name) for name in FILES} - {"__init__"} == set(FLOW)
+
+
+def test_imports_point_down_the_flow() -> None:
+    wrong = [
+        f"{name} -> {other}"
+        for name in FILES
+        if name != "__init__"
+        for other in own_imports(name) - {"__init__"}
+        if LAYER[package_of(other)] > LAYER[package_of(name)]
+    ]
+    assert not wrong
+
+
+def test_there_is_no_circle() -> None:
+    left = {name: own_imports(name) for name in FILES}
+    # A package's `__init__` may gather what its modules define; these never import it back.
+    while free := [name for name, others in left.items() if not others & left.keys()]:
+        for name in free:
+            del left[name]
+    assert not left
+
+
 @pytest.mark.parametrize("library", ONLY_IN)
-def test_a_library_is_imported_in_its_rooms_alone(library: str) -> None:
+def test_a_library_is_imported_in_its_packages_alone(library: str) -> None:
     users = {
         name
         for name, path in FILES.items()
         if any(module.split(".")[0] == library for module in imports(path))
     }
-    assert {room(name) for name in users} <= set(ONLY_IN[library])
-
-
-def test_imports_point_down_the_flow() -> None:
-    wrong = []
-    for name, path in FILES.items():
-        if name in {"__init__", "__main__"}:
-            continue
-        for module in imports(path):
-            target = room(file_of(module))
-            if target in FLOOR and FLOOR[target] > FLOOR[room(name)]:
-                wrong.append(f"{name} -> {module}")
-    assert not wrong
-
-
-def test_who_wants_a_variant_asks_at_its_face() -> None:
-    for name, path in FILES.items():
-        asked = {file_of(module) for module in imports(path)} - {"variant/__init__"}
-        assert name.startswith("variant/") or not {f for f in asked if f.startswith("variant/")}
-
-
-def test_every_room_is_on_the_plan() -> None:
-    rooms = {room(name) for name in FILES} - {"__init__"}
-    assert rooms <= FLOOR.keys()
+    allowed = ONLY_IN[library]
+    assert {n for n in users if n not in allowed and package_of(n) not in allowed} == set()
 
 
 def test_the_model_knows_nothing_of_experiments() -> None:
-    allowed = {"errors", "splat"}
-    for name, path in FILES.items():
-        if room(name) == "splat":
-            used = {m.split(".")[1] for m in imports(path) if m.startswith("xrgs.")}
-            assert used <= allowed | {"_native"}, name
+    used = {
+        package_of(other)
+        for name in FILES
+        if package_of(name) == "splat"
+        for other in own_imports(name)
+    }
+    assert used <= {"errors", "splat"}
 
 
-@pytest.mark.parametrize("name", ["cli", "jobs.job", "report", "variant", *PLANNING])
-def test_planning_and_reporting_run_without_torch(name: str) -> None:
+@pytest.mark.parametrize("module", LIGHT)
+def test_planning_and_reporting_run_without_torch(module: str) -> None:
     heavy = {"torch", "pycolmap", "kornia", "skimage"}
-    script = f"import sys, xrgs.{name}; print(sorted({heavy!r} & set(sys.modules)))"
+    script = f"import sys, xrgs.{module}; print(sorted({heavy!r} & set(sys.modules)))"
     done = subprocess.run(
         [sys.executable, "-P", "-c", script], capture_output=True, text=True, check=True
     )

@@ -15,8 +15,8 @@ from hydra.core.config_store import ConfigStore
 from omegaconf import MISSING, DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from xrgs import foreign
 from xrgs.errors import XrgsError
+from xrgs.safeio import untrusted
 from xrgs.splat.backend import CHOICES
 from xrgs.splat.settings import DensifySettings, OptimizerSettings, RasterSettings
 
@@ -36,7 +36,7 @@ class SceneConf:
     name: str = MISSING
     """Label in tables."""
     kind: str = MISSING
-    """`procedural`, `motorcycle` or `folder` (a module of `xrgs.scenes`)."""
+    """`procedural`, `motorcycle` or `folder` (a module of `xrgs.capture.scenes`)."""
     path: str | None = None
     """Of `folder`: the folder of images, or an LLFF scene (images/, images_4/, images_8/)."""
     views: int = 24
@@ -64,7 +64,7 @@ class SfmConf:
     min_inliers: int = MISSING
     """Points that place a view; the first pair needs 10/3 of it, as in COLMAP (30 and 100)."""
     fallbacks: bool = MISSING
-    """Try other recipes, as `xrgs.variant.placing` orders them, where this one places too few."""
+    """Try other recipes, as `xrgs.capture.placing` orders them, where this one places too few."""
     reference: bool = MISSING
     """Place the undegraded photographs too, to tell how far off the mixed poses are; not where
     exact cameras are known or nothing is degraded."""
@@ -156,7 +156,7 @@ class DensifyConf:
 
     decide: str = MISSING
     """Who sets the thresholds: `nobody` (off: all views alike), `per_class` or `current_view`. Open
-    in the paper; see `xrgs.components.densify`."""
+    in the paper; see `xrgs.training.components.densify`."""
     lr_grow: float = MISSING
     """Times `splat.densify.grow_grad2d`: the threshold of LR views; HR views have that itself. The
     paper has threshold_HR < threshold_LR, and leaves both open."""
@@ -387,7 +387,7 @@ def from_file(file: Path) -> Conf:
         XrgsError: it can't be read, or is of another schema; the message names the file and key.
     """
     try:
-        return from_dict(foreign.parse_json(foreign.read_bytes(file)))
+        return from_dict(untrusted.parse_json(untrusted.read_bytes(file)))
     except OmegaConfBaseException as error:
         raise XrgsError(f"{file}: {one_line(error)} (another version's config?)") from error
     except (OSError, ValueError, TypeError) as error:

@@ -7,10 +7,10 @@ import pytest
 import torch
 
 from xrgs.bench import quality, tables
+from xrgs.capture.dataset import Dataset, LoadedView
 from xrgs.config import Conf
-from xrgs.dataset import Dataset, LoadedView
+from xrgs.experiment.store import write_json
 from xrgs.splat.cameras import Camera
-from xrgs.store import write_json
 
 
 @pytest.fixture

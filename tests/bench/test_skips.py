@@ -11,7 +11,7 @@ import torch
 from xrgs.bench import skips
 from xrgs.bench.loads import Load
 from xrgs.splat.backend import resolve_backend
-from xrgs.splat.settings import Skips
+from xrgs.splat.settings import CullingOptions
 
 BACKEND = resolve_backend("auto")
 
@@ -34,7 +34,7 @@ def wide() -> Load:
 
 
 def test_each_skip_is_there_once(rows: dict[str, Any]) -> None:
-    native = {field.name.replace("_", " ") for field in fields(Skips)}
+    native = {field.name.replace("_", " ") for field in fields(CullingOptions)}
     assert set(rows) == {skips.BANDS} | (native if BACKEND == "native" else set())
     for row in rows.values():
         on, off = row["on"], row["off"]

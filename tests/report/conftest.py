@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from xrgs.store import CellFolder, Store
+from xrgs.experiment.store import CellFolder, Store
 
 SUMMARY = {
     "training_time_s": 100.0,

@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy import stats
 
-from xrgs.metrics import METRICS
+from xrgs.evaluation.metrics import METRICS
 from xrgs.report.collect import ReportError, read_sweep
 from xrgs.report.compare import (
     NOT_FINITE,

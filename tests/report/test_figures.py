@@ -8,7 +8,7 @@ import pandas as pd
 import pytest
 from PIL import Image
 
-from xrgs.metrics import Metric
+from xrgs.evaluation.metrics import Metric
 from xrgs.report.figures import Panel, curves, differing_crop, side_by_side, trade_off
 from xrgs.report.pictures import median_view, slug
 

@@ -14,10 +14,10 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from xrgs.errors import XrgsError
+from xrgs.experiment.store import CellFolder, Store, StoreError
 from xrgs.report import build, page
-from xrgs.store import CellFolder, Store, StoreError
-from xrgs.study.estimate import Past
-from xrgs.study.status import describe, read
+from xrgs.sweep.estimate import RuntimeEstimator
+from xrgs.sweep.status import describe, read
 
 VALUES = st.recursive(
     st.none()
@@ -110,7 +110,7 @@ def test_whatever_a_store_says_ends_in_a_report_or_an_error_of_ours(
         except XrgsError as error:
             text = str(error)
         assert not set("\x1b\0") & set(text)
-    Past(copy)
+    RuntimeEstimator(copy)
 
 
 @pytest.mark.parametrize("cell_id", ["../cells/cell00001", "..", "/tmp", "a\0"])  # noqa: S108

@@ -11,10 +11,10 @@ from typing import Any
 import pytest
 
 import xrgs
+from xrgs.experiment.store import StoreError
 from xrgs.report import build
 from xrgs.report.collect import ReportError
 from xrgs.report.figures import trade_off
-from xrgs.store import StoreError
 
 
 @pytest.fixture

@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-from xrgs.metrics import METRICS, Metric
+from xrgs.evaluation.metrics import METRICS, Metric
 from xrgs.report.collect import read_sweep
 from xrgs.report.compare import compare
 from xrgs.report.tables import Change, Tables, arrow, number, percent, reading, signed

@@ -3,7 +3,7 @@
 import math
 from typing import Any
 
-from xrgs.metrics import METRICS
+from xrgs.evaluation.metrics import METRICS
 from xrgs.report.collect import read_sweep
 from xrgs.report.training import table, totals
 

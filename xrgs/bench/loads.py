@@ -11,14 +11,14 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from xrgs import foreign, npz
 from xrgs.errors import XrgsError
+from xrgs.safeio import npz, untrusted
 from xrgs.splat.cameras import Camera
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from xrgs.dataset import Dataset
+    from xrgs.capture.dataset import Dataset
 
 #: Standard deviation, in units of the spacing of N Gaussians spread over the image: about 40 of
 #: them then contribute to a pixel, whatever N and the size, as in a trained scene.
@@ -123,7 +123,7 @@ def read(path: Path) -> Load:
             finite or out of range; the message names the file and the key.
     """
     try:
-        with foreign.open_regular(path) as file:
+        with untrusted.open_regular(path) as file:
             arrays = npz.read(file)
     except (OSError, ValueError) as error:
         raise XrgsError(f"{path}: cannot be read as .npz: {error}") from error
@@ -196,9 +196,9 @@ def data_of(folder: Path) -> Dataset:
     Raises:
         XrgsError: the cell isn't done, or its variant isn't in the store.
     """
-    from xrgs import dataset, variant
-    from xrgs.records import read_json
-    from xrgs.store import CellFolder
+    from xrgs.capture import dataset, variant
+    from xrgs.experiment.store import CellFolder
+    from xrgs.safeio.records import read_json
 
     state = CellFolder(folder).state()
     if state.name != "done":

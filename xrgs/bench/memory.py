@@ -27,7 +27,7 @@ def measure(
         the system doesn't say (no /proc).
     """
     arguments = [str(value) for value in (gaussians, width, height, backend, threads, seed)]
-    # -P: as xrgs.jobs.worker, the child must import the package that its parent did.
+    # -P: as xrgs.sweep.jobs.worker, the child must import the package that its parent did.
     command = [sys.executable, "-P", "-m", "xrgs.bench.memory", *arguments]
     done = subprocess.run(command, check=True, stdout=subprocess.PIPE)  # noqa: S603
     row: dict[str, Any] = json.loads(done.stdout)

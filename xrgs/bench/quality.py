@@ -1,6 +1,6 @@
 """What a skip that changes numbers does to the pictures: a cell trained again, with and without.
 
-Only such skips are here. The renderer's (`xrgs.splat.settings.Skips`) and those of
+Only such skips are here. The renderer's (`xrgs.splat.settings.CullingOptions`) and those of
 `xrgs.bench.skips` change no bit, or rounding at a cut, as the tables there say of each.
 """
 
@@ -11,19 +11,20 @@ from typing import TYPE_CHECKING, Any
 
 import torch
 
-from xrgs import config, metrics
+from xrgs import config
 from xrgs.bench.loads import data_of
-from xrgs.records import read_json
+from xrgs.evaluation import metrics
+from xrgs.safeio.records import read_json
 from xrgs.splat.backend import resolve_backend
 from xrgs.splat.rasterize import rasterize
-from xrgs.train import Trained, train
+from xrgs.training.loop import Trained, train
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
     from pathlib import Path
 
+    from xrgs.capture.dataset import LoadedView
     from xrgs.config import Conf
-    from xrgs.dataset import LoadedView
 
 AS_IT_IS = "as it is"
 

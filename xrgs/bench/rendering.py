@@ -13,7 +13,7 @@ from torch import Tensor
 from xrgs.bench.loads import Load
 from xrgs.bench.timing import Times, alternate, threads
 from xrgs.splat.rasterize import Render, rasterize
-from xrgs.splat.settings import RasterSettings, Skips
+from xrgs.splat.settings import CullingOptions, RasterSettings
 
 #: Size of the view in which a render is compared to one in double.
 ERROR_CROP = (96, 72)
@@ -29,7 +29,7 @@ class Way:
     backend: str
     settings: RasterSettings = field(default_factory=RasterSettings)
     sh_degree: int = 3
-    skips: Skips | None = None
+    skips: CullingOptions | None = None
     """Of the native backend alone; None leaves out all that it can."""
 
 
@@ -69,7 +69,7 @@ class Rendering:
                 backend = self.way.backend
                 self.render = rasterize(*parameters, *view, sh_degree=degree, backend=backend)
             else:
-                from xrgs.splat import native
+                from xrgs.splat.native import rasterizer as native
 
                 self.render = native.render(*parameters, *view, degree, None, skips=self.way.skips)
 

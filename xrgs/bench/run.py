@@ -9,12 +9,12 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from xrgs import provenance
 from xrgs.bench import loads, memory, rendering, scale, skips, tables, training
 from xrgs.errors import XrgsError
-from xrgs.files import write_json
-from xrgs.machine import usable_cores
-from xrgs.progress import progress
+from xrgs.experiment import provenance
+from xrgs.runtime.machine import usable_cores
+from xrgs.runtime.progress import progress
+from xrgs.safeio.atomic import write_json
 from xrgs.splat.backend import resolve_backend
 
 if TYPE_CHECKING:

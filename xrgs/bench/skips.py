@@ -19,7 +19,7 @@ from xrgs.bench.rendering import Rendering, Way, errors, time_ways
 from xrgs.bench.timing import alternate, threads
 from xrgs.bench.training import L1, SSIM, Step
 from xrgs.splat.loss import photometric_loss, prepare_target
-from xrgs.splat.settings import Skips
+from xrgs.splat.settings import CullingOptions
 from xrgs.splat.sh import bases
 
 BANDS = "bands not on yet"
@@ -29,7 +29,7 @@ _KEPT = ("forward_ms", "backward_ms", "evaluations")
 def time_renders(load: Load, backend: str, repeats: int) -> list[Any]:
     """Rendering forward and back on one thread, with each skip on and off in turn.
 
-    Those of `Skips` are the native backend's; the torch one has that of harmonics alone.
+    Those of `CullingOptions` are the native backend's; the torch one has that of harmonics alone.
 
     Returns:
         A row each: `skip`, `load`, its sizes, `times` (off over on),
@@ -41,9 +41,9 @@ def time_renders(load: Load, backend: str, repeats: int) -> list[Any]:
     if backend == "native":
         without = {
             field.name.replace("_", " "): replace(
-                usual, name=field.name, skips=replace(Skips(), **{field.name: False})
+                usual, name=field.name, skips=replace(CullingOptions(), **{field.name: False})
             )
-            for field in fields(Skips)
+            for field in fields(CullingOptions)
         }
         rows += _rows(load, usual, without, repeats)
     bandless = replace(

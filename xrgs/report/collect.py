@@ -12,14 +12,14 @@ import numpy as np
 import pandas as pd
 
 from xrgs.errors import XrgsError
-from xrgs.progress import progress
-from xrgs.records import StoreError, as_number
+from xrgs.runtime.progress import progress
+from xrgs.safeio.records import StoreError, as_number
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
-    from xrgs.metrics import Metric
-    from xrgs.store import CellFolder, Store
+    from xrgs.evaluation.metrics import Metric
+    from xrgs.experiment.store import CellFolder, Store
 
 BASELINE = "baseline"
 #: What the rows of a sweep's record hold.

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from xrgs.metrics import Metric
+    from xrgs.evaluation.metrics import Metric
 
     Floats = NDArray[np.float64]
 

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from numpy.typing import NDArray
 
-    from xrgs.metrics import Metric
+    from xrgs.evaluation.metrics import Metric
 
     Image = NDArray[np.float32]
 

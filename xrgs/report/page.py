@@ -7,9 +7,8 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from xrgs.files import write_json, write_text
-from xrgs.foreign import one_line
-from xrgs.metrics import METRICS
+from xrgs.evaluation.metrics import METRICS
+from xrgs.experiment.store import Store
 from xrgs.report.collect import RECORD_KEYS, ReportError, Sweep, read_sweep
 from xrgs.report.compare import compare
 from xrgs.report.pictures import Picture, draw
@@ -17,7 +16,8 @@ from xrgs.report.render import Grid, markdown, to_latex, to_markdown, to_text
 from xrgs.report.tables import Tables
 from xrgs.report.training import table as training_table
 from xrgs.report.training import totals
-from xrgs.store import Store
+from xrgs.safeio.atomic import write_json, write_text
+from xrgs.safeio.untrusted import one_line
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

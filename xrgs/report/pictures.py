@@ -11,13 +11,13 @@ from typing import TYPE_CHECKING
 
 import pandas as pd
 
-from xrgs import images
-from xrgs.files import replacing
-from xrgs.images import ImageError
-from xrgs.progress import progress
+from xrgs.capture import images
+from xrgs.capture.images import ImageError
 from xrgs.report.collect import BASELINE, ReportError
 from xrgs.report.figures import Panel, curves, differing_crop, side_by_side, trade_off
 from xrgs.report.tables import titled
+from xrgs.runtime.progress import progress
+from xrgs.safeio.atomic import replacing
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
@@ -26,9 +26,9 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
-    from xrgs.metrics import Metric
+    from xrgs.evaluation.metrics import Metric
+    from xrgs.experiment.store import Store
     from xrgs.report.compare import Comparison
-    from xrgs.store import Store
 
     _Drawing = Callable[[Path], "Picture"]  # into a file of that name
 

@@ -6,7 +6,7 @@ import re
 import unicodedata
 from dataclasses import dataclass
 
-from xrgs.foreign import one_line
+from xrgs.safeio.untrusted import one_line
 
 _MARKDOWN = str.maketrans({char: f"\\{char}" for char in "\\`*_{}[]<>#|~$&"})
 _LATEX = str.maketrans(

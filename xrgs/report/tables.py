@@ -14,7 +14,7 @@ from xrgs.report.render import Grid
 if TYPE_CHECKING:
     from collections.abc import Iterable
 
-    from xrgs.metrics import Metric
+    from xrgs.evaluation.metrics import Metric
     from xrgs.report.compare import Comparison
 
 #: An arrow tells improvement from degradation, as in the paper's tables, not larger from smaller.

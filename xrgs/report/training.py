@@ -10,13 +10,13 @@ from typing import TYPE_CHECKING
 
 import pandas as pd
 
-from xrgs.records import as_number, read_table
 from xrgs.report.render import Grid
+from xrgs.safeio.records import as_number, read_table
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from xrgs.store import CellFolder, Store
+    from xrgs.experiment.store import CellFolder, Store
 
 _LABELS = {
     "steps_HR": "Steps on HR views",

@@ -17,8 +17,8 @@ from torch import Tensor
 
 from xrgs.splat.gaussians import PARAMETERS
 from xrgs.splat.optimizer import SplatOptimizer
-from xrgs.splat.projection import rotations
 from xrgs.splat.settings import DensifySettings
+from xrgs.splat.torch.projection import rotations
 
 SPLIT_SHRINK = 1.6
 """How many times smaller than the Gaussian it replaces each of a split's two is."""
@@ -228,7 +228,7 @@ class Densifier:
         units = width / 2, height / 2
         gradient, seen = self.gradient[row], self.seen[row]
         if self.optimizer.native:
-            from xrgs.splat import native_densify
+            from xrgs.splat.native import densify as native_densify
 
             native_densify.observe(means2d_grad, visible, units, gradient, seen)
             return

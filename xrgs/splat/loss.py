@@ -85,7 +85,7 @@ def photometric_loss(
     if pixel_weight is not None:
         return _weighted_loss(image, _same_shape(image, target), l1, ssim, pixel_weight)
     if resolve_backend(backend) == "native":
-        from xrgs.splat import native_loss
+        from xrgs.splat.native import loss as native_loss
 
         return native_loss.photometric_loss(image, _same_shape(image, target), l1, ssim)
     difference = (image - _same_shape(image, target).image).abs().mean()

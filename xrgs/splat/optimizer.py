@@ -81,7 +81,7 @@ class SplatOptimizer:
             sh_degree: Highest band that was on.
         """
         if self.native:
-            from xrgs.splat import native_adam
+            from xrgs.splat.native import optimizer as native_adam
 
             native_adam.step(self.adam, camera, sh_degree)
         else:

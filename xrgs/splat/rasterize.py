@@ -13,7 +13,7 @@ from xrgs.splat.cameras import Camera
 from xrgs.splat.gaussians import Activated
 from xrgs.splat.settings import RasterSettings
 
-_MODULES = {"torch": "xrgs.splat.torch_rasterizer", "native": "xrgs.splat.native"}
+_MODULES = {"torch": "xrgs.splat.torch.rasterizer", "native": "xrgs.splat.native.rasterizer"}
 #: Of one Gaussian; that of shN goes by its own bands.
 _SHAPES: dict[str, tuple[int, ...]] = {
     "means": (3,),

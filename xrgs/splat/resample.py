@@ -36,7 +36,7 @@ def resize(image: Tensor, height: int, width: int, *, backend: str = "torch") ->
     if height < 1 or width < 1:
         raise ValueError(f"height and width must be at least 1, got {height} and {width}")
     if resolve_backend(backend) == "native":
-        from xrgs.splat import native_resample
+        from xrgs.splat.native import resample as native_resample
 
         return native_resample.resize(image, height, width)
     rows = matrix(image.shape[0], height).to(image.dtype)

@@ -37,7 +37,7 @@ class RasterSettings:
 
 
 @dataclass(frozen=True)
-class Skips:
+class CullingOptions:
     """Work that the compiled renderer leaves out, each kind as long as it is true.
 
     The image is the same with any of them off, to rounding at the cuts; they are here to be

@@ -1,0 +1,181 @@
+"""`xrgs-data download` against a loopback server, as a user meets it."""
+
+from __future__ import annotations
+
+import hashlib
+import io
+import socket
+import subprocess
+import sys
+import zipfile
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+from PIL import Image
+
+from xrgs import config
+
+Run = Callable[..., tuple[int, str, str]]
+
+
+@pytest.fixture(scope="module")
+def llff() -> bytes:
+    """An archive laid out as LLFF's, with two scenes of tiny photographs."""
+    picture, archive = io.BytesIO(), io.BytesIO()
+    Image.new("RGB", (8, 6)).save(picture, "PNG")
+    with zipfile.ZipFile(archive, "w") as made:
+        for name in ("fern/images_4/0.png", "fern/images_4/1.png", "room/images/0.png"):
+            made.writestr(f"nerf_llff_data/{name}", picture.getvalue())
+        made.writestr("nerf_llff_data/room/images/1.png", picture.getvalue())
+        made.writestr("nerf_llff_data/fern/poses_bounds.npy", b"poses")
+        made.writestr("__MACOSX/nerf_llff_data/._fern", b"")
+    return archive.getvalue()
+
+
+def test_only_the_wanted_scenes_appear_and_finished_ones_are_not_touched(
+    xrgs_data: Run, server: Any, tmp_path: Path, llff: bytes
+) -> None:
+    server.content, server.cuts = llff, [100]
+    url = f"url={server.url}"
+    code, out, err = xrgs_data("download", "llff", "fern", url, "data_root=here")
+    assert code == 0, err
+    assert "not verified: none in config" in out
+    assert "here/fern: 2 photographs" in out
+    assert [f.name for f in sorted((tmp_path / "here").iterdir())] == [".downloads", "fern"]
+    mine = tmp_path / "here" / "fern" / "images_4" / "0.png"
+    Image.new("RGB", (4, 3), "red").save(mine)
+    before = mine.read_bytes()
+    server.status = 500  # what is here is not asked for again
+    code, out, err = xrgs_data("download", "llff", "fern", "room", url, "data_root=here")
+    assert code == 0, err
+    assert "here/fern: there already" in out
+    assert "here/room: 2 photographs" in out
+    assert mine.read_bytes() == before
+    assert server.asked == [None, "bytes=100-"]
+
+
+def test_the_hash_of_the_config_is_verified(
+    xrgs_data: Run, server: Any, tmp_path: Path, llff: bytes
+) -> None:
+    server.content = llff
+    url, right = f"url={server.url}", hashlib.sha256(llff).hexdigest()
+    code, _, err = xrgs_data("download", "llff", "fern", url, f"sha256={'0' * 64}")
+    assert code == 1
+    assert "expected 000" in err
+    code, out, err = xrgs_data("download", "llff", "fern", url, f"sha256={right}")
+    assert code == 0, err
+    assert "sha256 verified" in out
+    code, _, err = xrgs_data("download", "llff", "room", url, f"sha256={'0' * 64}")
+    assert code == 1
+    assert "nerf_llff_data.zip: its sha256 is not the config's" in err
+
+
+def test_an_archive_beyond_the_config_s_bytes_is_refused_and_its_key_named(
+    xrgs_data: Run, server: Any, tmp_path: Path, llff: bytes
+) -> None:
+    server.content = llff
+    arguments = ("download", "llff", "fern", f"url={server.url}")
+    code, _, err = xrgs_data(*arguments, f"max_bytes={len(llff) - 1}")
+    assert code == 1
+    assert len(err.splitlines()) == 1
+    assert f"{server.url}: {len(llff)} bytes" in err
+    assert "max_bytes=" in err
+    assert not any(file.suffix == ".zip" for file in tmp_path.rglob("*"))
+    code, _, err = xrgs_data(*arguments, f"max_bytes={len(llff)}")
+    assert code == 0, err
+
+
+def test_offline_says_what_to_do_by_hand(xrgs_data: Run, tmp_path: Path, llff: bytes) -> None:
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        url = f"http://127.0.0.1:{taken.getsockname()[1]}/x.zip"
+    code, _, err = xrgs_data("download", "llff", "fern", f"url={url}")
+    assert code == 1
+    assert len(err.splitlines()) == 1
+    archive = Path("data", "llff", ".downloads", "nerf_llff_data.zip")
+    for text in (url, "refused", "By hand", str(archive), "drive.google.com"):
+        assert text in err
+    (tmp_path / archive).write_bytes(llff)
+    code, _, err = xrgs_data("download", "llff", "fern", f"url={url}")
+    assert code == 0, err
+    assert (tmp_path / "data" / "llff" / "fern" / "images_4" / "1.png").is_file()
+
+
+def test_a_traversing_archive_writes_nothing(
+    xrgs_data: Run, server: Any, tmp_path: Path, llff: bytes
+) -> None:
+    archive = io.BytesIO(llff)
+    with zipfile.ZipFile(archive, "a") as made:
+        made.writestr("nerf_llff_data/fern/../../../../out.txt", b"x")
+    server.content = archive.getvalue()
+    code, _, err = xrgs_data("download", "llff", "fern", f"url={server.url}")
+    assert code == 1
+    assert "leads out of its folder" in err
+    assert {f.name for f in tmp_path.rglob("*") if f.is_file()} == {"nerf_llff_data.zip"}
+
+
+def test_a_folder_in_the_way_is_left_alone(
+    xrgs_data: Run, server: Any, tmp_path: Path, llff: bytes
+) -> None:
+    server.content = llff
+    folder = tmp_path / "data" / "llff" / "fern"
+    folder.mkdir(parents=True)
+    (folder / "notes.txt").write_text("mine")
+    code, _, err = xrgs_data("download", "llff", f"url={server.url}")
+    assert code == 1
+    assert "fern is in the way" in err
+    assert [f.name for f in folder.iterdir()] == ["notes.txt"]
+    assert server.asked == []
+
+
+@pytest.mark.parametrize(
+    ("arguments", "named"),
+    [
+        (["download"], "llff"),
+        (["download", "llf"], "llff"),
+        (["download", "llff", "ferm"], "fern"),
+        (["download", "llff", "ulr=x"], "ulr"),
+        (["download", "llff", "fern", "url=ftp://x"], "ftp://x"),
+        (["fetch"], "fetch"),
+        (["data_root=x"], "--help"),
+        (["lpips", "form=x"], "form"),
+        (["lpips", "from=gone"], "gone"),
+        (["inspect"], "scene=NAME"),
+        (["inspect", "out=x.png"], "scene=NAME"),
+        (["inspect", "gone"], "gone"),
+        (["inspect", "gone", "scene=motorcycle"], "scene=NAME"),
+        (["inspect", "scene=nope"], "scene/nope"),
+        (["inspect", "scene=motorcycle", "variant.fctor=3"], "variant.fctor"),
+        (["inspect", "scene=folder", "scene.path=gone"], "gone"),
+        (["inspect", "scene=motorcycle", "variant.factor=99"], "variant.factor"),
+    ],
+    ids=str,
+)
+def test_a_mistake_is_one_line(xrgs_data: Run, arguments: list[str], named: str) -> None:
+    code, out, err = xrgs_data(*arguments)
+    assert code == 1
+    assert out == ""
+    assert len(err.splitlines()) == 1
+    assert err.startswith("xrgs-data: ")
+    assert named in err
+
+
+@pytest.mark.parametrize("arguments", [[], ["--help"], ["download", "-h"]], ids=str)
+def test_help_needs_no_torch(tmp_path: Path, arguments: list[str]) -> None:
+    (tmp_path / "torch.py").write_text("raise ImportError('torch was imported')")
+    script = (
+        f"import sys; sys.path.insert(0, {str(tmp_path)!r}); from xrgs.cli.data import main; main()"
+    )
+    done = subprocess.run(
+        [sys.executable, "-P", "-c", script, *arguments], capture_output=True, text=True, check=True
+    )
+    for text in ("download", "llff", "lpips", "inspect"):
+        assert text in done.stdout
+
+
+def test_every_scene_of_the_archive_can_be_named_in_a_sweep() -> None:
+    from omegaconf import OmegaConf
+
+    known = {file.stem for file in (config.CONF_DIR / "scene" / "llff").glob("*.yaml")}
+    assert known == set(OmegaConf.load(config.CONF_DIR / "data" / "llff.yaml").scenes)

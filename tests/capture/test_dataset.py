@@ -1,0 +1,110 @@
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from xrgs.capture import dataset, images
+from xrgs.capture.dataset import LoadedView
+from xrgs.capture.views import Variant, View
+from xrgs.errors import XrgsError
+
+HR, LR = (40, 30), (20, 15)
+
+
+def placed(folder: Path, name: str, split: str, tag: str, size: tuple[int, int]) -> View:
+    """A view of one grey; its pose is told by its name, so that a view's copies share it."""
+    number = int(name[1:])
+    grey = {"train": 0.1, "test": 0.2, "original": 0.3}[split] + number / 20
+    file = folder / split / f"{name}.png"
+    images.save(file, np.full((size[1], size[0], 3), grey, np.float32))
+    viewmat = np.eye(4)
+    viewmat[:3, 3] = (-0.3 * number, 0.1 * (number % 2), 0.05 * number)
+    K = np.array([[size[0], 0, size[0] / 2], [0, size[0], size[1] / 2], [0, 0, 1.0]])
+    return View(name, file, split, tag, *size, K, viewmat, size[0] / HR[0])
+
+
+@pytest.fixture
+def variant(tmp_path: Path) -> Variant:
+    """Five views: v0 is the test, v1 HR, v2 to v4 downsampled by 2, with their originals."""
+    views = [placed(tmp_path, f"v{i}", "original", "HR", HR) for i in (2, 3, 4)]
+    views += [placed(tmp_path, "v0", "test", "HR", HR), placed(tmp_path, "v1", "train", "HR", HR)]
+    views += [placed(tmp_path, f"v{i}", "train", "LR", LR) for i in (2, 3, 4)]
+    points = np.random.default_rng(0).normal((0, 0, 4), 1, (50, 3))
+    colors = np.zeros((50, 3), np.uint8)
+    return Variant("id", tmp_path, "grey", 2, True, tuple(views), points, colors, {})
+
+
+def grey(view: LoadedView) -> float:
+    return round(float(view.image.mean()) * 20) / 20
+
+
+def test_mixed_is_what_the_variant_says_and_the_default(variant: Variant) -> None:
+    data = dataset.load(variant)
+    assert [(v.name, v.tag) for v in data.train] == [
+        ("v1", "HR"),
+        ("v2", "LR"),
+        ("v3", "LR"),
+        ("v4", "LR"),
+    ]
+    assert [v.name for v in data.test] == ["v0"]
+    assert [v.rho for v in data.train] == [1, 0.5, 0.5, 0.5]
+    for view in data.train:
+        size = HR if view.tag == "HR" else LR
+        assert view.image.shape == (size[1], size[0], 3)
+        assert (view.camera.width, view.camera.height) == size
+
+
+def test_all_hr_takes_originals_from_the_same_poses(variant: Variant) -> None:
+    mixed, high = dataset.load(variant), dataset.load(variant, "all_hr")
+    assert [(v.name, v.tag, v.rho) for v in high.train] == [
+        (f"v{i}", "HR", 1.0) for i in range(1, 5)
+    ]
+    assert [grey(v) for v in high.train] == [0.15, 0.4, 0.45, 0.5]  # originals from v2 on
+    assert all(v.image.shape == (30, 40, 3) for v in high.train)
+    for a, b in zip(mixed.train, high.train, strict=True):
+        assert torch.equal(a.camera.viewmat, b.camera.viewmat)
+
+
+@pytest.mark.parametrize(("use", "names"), [("hr_only", ["v1"]), ("lr_only", ["v2", "v3", "v4"])])
+def test_one_class_alone(variant: Variant, use: str, names: list[str]) -> None:
+    assert [v.name for v in dataset.load(variant, use).train] == names
+
+
+@pytest.mark.parametrize("use", ["all_hr", "hr_only", "lr_only"])
+def test_the_world_and_the_tests_are_the_same_whatever_is_trained_on(
+    variant: Variant, use: str
+) -> None:
+    mixed, other = dataset.load(variant), dataset.load(variant, use)
+    assert other.scene_scale == mixed.scene_scale
+    assert torch.equal(other.points, mixed.points)
+    assert torch.equal(other.test[0].camera.viewmat, mixed.test[0].camera.viewmat)
+    assert torch.equal(other.test[0].image, mixed.test[0].image)
+    poses = {v.name: v.camera.viewmat for v in mixed.train}
+    assert all(torch.equal(v.camera.viewmat, poses[v.name]) for v in other.train)
+
+
+def test_originals_do_not_move_the_world(variant: Variant) -> None:
+    without = replace(variant, views=tuple(v for v in variant.views if v.split != "original"))
+    assert dataset.load(without).scene_scale == dataset.load(variant).scene_scale
+    assert torch.equal(dataset.load(without).points, dataset.load(variant).points)
+
+
+def test_a_use_that_the_variant_has_no_views_for_is_told(variant: Variant) -> None:
+    without = replace(variant, views=tuple(v for v in variant.views if v.split != "original"))
+    with pytest.raises(XrgsError, match="no original of v2"):
+        dataset.load(without, "all_hr")
+    high = replace(variant, views=tuple(v for v in without.views if v.tag == "HR"))
+    assert [v.name for v in dataset.load(high, "all_hr").train] == ["v1"]
+    with pytest.raises(XrgsError, match="no LR view to train on: not for lr_only"):
+        dataset.load(high, "lr_only")
+    low = replace(without, views=tuple(v for v in without.views if v.name != "v1"))
+    with pytest.raises(XrgsError, match="no HR view to train on: not for hr_only"):
+        dataset.load(low, "hr_only")
+    with pytest.raises(
+        XrgsError, match=r"train\.views=best: must be one of mixed, all_hr, hr_only, lr_only"
+    ):
+        dataset.load(variant, "best")

@@ -1,0 +1,338 @@
+from __future__ import annotations
+
+import shutil
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from xrgs import config
+from xrgs.capture import degrade, images, mixing, placing, scenes, sfm
+from xrgs.capture.scenes import Scene, procedural
+from xrgs.capture.sfm import Reconstruction, Shot
+from xrgs.capture.split import check
+from xrgs.capture.views import SceneFailed, Variant, View
+from xrgs.config import SceneConf, VariantConf
+from xrgs.errors import XrgsError
+
+Make = Callable[..., VariantConf]
+Mix = Callable[..., Variant]
+VIEWS = 12
+
+
+@pytest.fixture(scope="module")
+def configured(configured: Make) -> Make:
+    """Small, and held against SfM of the undegraded photographs."""
+    return partial(configured, long_side=160, min_hr=0, test_every=4, sfm={"reference": True})
+
+
+@pytest.fixture(scope="module")
+def conf(configured: Make) -> VariantConf:
+    return configured()
+
+
+@pytest.fixture(scope="module")
+def rendered(tmp_path_factory: pytest.TempPathFactory, conf: VariantConf) -> Scene:
+    cache = tmp_path_factory.mktemp("scenes")
+    return scenes.resolve(SceneConf("p", "procedural", None, VIEWS), cache, conf.long_side)
+
+
+@pytest.fixture(scope="module")
+def placed(
+    rendered: Scene, tmp_path_factory: pytest.TempPathFactory, conf: VariantConf
+) -> Reconstruction:
+    """The undegraded photographs, placed once for all tests of what is done before and after."""
+    work = tmp_path_factory.mktemp("work")
+    shots = []
+    for file in rendered.files:
+        shutil.copy(file, work / file.name)
+        shots.append(Shot(file.name, "all"))
+    return sfm.reconstruct(shots, work, work, conf.sfm)
+
+
+@pytest.fixture
+def given() -> list[list[str]]:
+    """The files of each call of SfM."""
+    return []
+
+
+@pytest.fixture
+def mix(
+    configured: Make,
+    rendered: Scene,
+    placed: Reconstruction,
+    given: list[list[str]],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> Mix:
+    """(scene, **changes) -> `mixing.mix`, by default of photographs alone; by `placed`'s poses."""
+
+    def recall(shots: Sequence[Shot], *_: object) -> Reconstruction:
+        given.append([shot.file for shot in shots])
+        return placed
+
+    def run(scene: Scene | None = None, **changes: Any) -> Variant:
+        work, out = tmp_path / "work", tmp_path / "out"
+        work.mkdir()
+        out.mkdir()
+        scene = scene or replace(rendered, viewmats={})
+        return mixing.mix(scene, configured(**changes), work, out)
+
+    monkeypatch.setattr(sfm, "reconstruct", recall)
+    return run
+
+
+def of(made: Variant, split: str, tag: str) -> list[View]:
+    return [view for view in made.views if (view.split, view.tag) == (split, tag)]
+
+
+def number(view: View) -> int:
+    return int(view.name[-3:])
+
+
+# tags
+
+
+def test_by_sampling_rate_the_finest_are_hr_and_nothing_is_degraded(
+    mix: Mix, given: list[list[str]]
+) -> None:
+    made = mix(tags="sampling_rate")
+    high, low = of(made, "train", "HR"), of(made, "train", "LR")
+    assert len(high) == round(0.3 * 9)
+    assert len(high) + len(low) == 9
+    assert min(v.rho for v in high) >= max(v.rho for v in low)
+    assert not of(made, "original", "HR")
+    assert {(v.width, v.height) for v in made.views} == {(160, 120)}
+    assert given == [[f"hr/{i:05d}.png" for i in range(VIEWS)]]
+    assert made.report["degradation"] == "none"
+    assert made.report["pose_error"] == {}
+    assert made.report["rho"]["HR"][0] == min(v.rho for v in high)
+
+
+def test_a_threshold_of_the_rate_takes_those_above_it(mix: Mix) -> None:
+    made = mix(tags="sampling_rate", hr_above=0.93)
+    assert of(made, "train", "HR")
+    assert all(v.rho >= 0.93 for v in of(made, "train", "HR"))
+    assert all(v.rho < 0.93 for v in of(made, "train", "LR"))
+
+
+def test_by_distance_the_closest_are_hr(mix: Mix) -> None:
+    """Every camera looks at the scene's middle, so the exact cameras tell which are close to it."""
+    made = mix(tags="distance")
+    poses = procedural.viewmats(VIEWS)
+    middle = np.array([0.0, 0.1, 5.5, 1.0])
+    depth = {v.name: (poses[number(v)] @ middle)[2] for v in made.views}
+    high, low = ([depth[v.name] for v in of(made, "train", tag)] for tag in ("HR", "LR"))
+    assert np.mean(high) < np.mean(low) - 0.2
+    assert min(low) > min(high)
+
+
+def test_by_megapixels_the_larger_photographs_are_hr(
+    mix: Mix, rendered: Scene, tmp_path: Path, given: list[list[str]]
+) -> None:
+    files = []
+    for i, file in enumerate(rendered.files):
+        files.append(tmp_path / file.name)
+        photo = images.read(file)
+        images.save(files[-1], images.resize(photo, 80, 60) if i % 3 else photo)
+    scene = replace(rendered, files=tuple(files), viewmats={})
+    made = mix(scene, tags="megapixels", hr_above=0.75)
+    assert {number(v) for v in of(made, "train", "HR")} == {3, 6, 9}
+    assert all((v.width, v.height) == (80, 60) for v in of(made, "train", "LR"))
+    assert not of(made, "original", "HR")
+    assert made.report["rho"]["LR"][1] == pytest.approx(0.5, abs=0.1)
+    for view in of(made, "test", "HR"):  # at its own full size
+        assert (view.width, view.height) == ((160, 120) if number(view) % 3 == 0 else (80, 60))
+
+
+def test_photographs_all_of_one_class_are_no_mixture(mix: Mix, given: list[list[str]]) -> None:
+    with pytest.raises(XrgsError, match=r"variant\.tags=megapixels: every training view is HR at"):
+        mix(tags="megapixels")
+    assert given == []
+
+
+def test_a_threshold_above_all_but_the_held_out_is_named(mix: Mix) -> None:
+    with pytest.raises(XrgsError, match=r"variant\.hr_above=1\.0; their values are 0\.\d+ to"):
+        mix(tags="sampling_rate", hr_above=1.0, test_every=2)
+
+
+@pytest.mark.parametrize(("fraction", "tag"), [(0.0, "LR"), (1.0, "HR")])
+def test_one_class_alone_where_that_is_what_was_asked(mix: Mix, fraction: float, tag: str) -> None:
+    made = mix(hr_fraction=fraction)
+    assert len(of(made, "train", tag)) == 9
+    assert len(of(made, "original", "HR")) == (9 if tag == "LR" else 0)
+    assert len(of(made, "test", "HR")) == 3
+
+
+# degradations
+
+
+def test_each_degraded_view_has_its_original_from_the_same_pose(mix: Mix) -> None:
+    made = mix()
+    low = of(made, "train", "LR")
+    originals = {view.name: view for view in of(made, "original", "HR")}
+    assert sorted(originals) == [view.name for view in low]
+    for view in low:
+        high = originals[view.name]
+        assert np.array_equal(high.viewmat, view.viewmat)
+        assert (high.width, high.height) == (160, 120) == (view.width * 5, view.height * 5)
+        assert high.K[:2] == pytest.approx(view.K[:2] * 5)
+        shrunk = images.resize(images.read(high.file), view.width, view.height)
+        # The lens is all but straight: straightening and shrinking change places.
+        assert np.abs(shrunk - images.read(view.file)).mean() < 0.01
+
+
+@pytest.mark.parametrize("how", ["digital_zoom", "jpeg"])
+def test_a_degradation_may_keep_the_size(mix: Mix, given: list[list[str]], how: str) -> None:
+    made = mix(degradation=how, hr_fraction=0.5)
+    assert {(v.width, v.height) for v in made.views} == {(160, 120)}
+    originals = {v.name: v for v in of(made, "original", "HR")}
+    for view in of(made, "train", "LR"):
+        before, after = images.read(originals[view.name].file), images.read(view.file)
+        assert 0.005 < np.abs(before - after).mean() < 0.1
+        assert view.rho == originals[view.name].rho  # px per unit; not what is in them
+    low = {number(v) for v in of(made, "train", "LR")}
+    assert given[0] == [f"{'lr' if i in low else 'hr'}/{i:05d}.png" for i in range(VIEWS)]
+
+
+def test_what_is_tagged_after_sfm_is_degraded_after_it_if_asked(
+    mix: Mix, given: list[list[str]]
+) -> None:
+    made = mix(tags="distance", degradation="downsample")
+    assert given == [[f"hr/{i:05d}.png" for i in range(VIEWS)]]
+    low = of(made, "train", "LR")
+    assert {(v.width, v.height) for v in low} == {(32, 24)}
+    assert [v.name for v in of(made, "original", "HR")] == [v.name for v in low]
+
+
+# poses
+
+
+def test_mixed_poses_are_held_against_those_of_the_undegraded(
+    mix: Mix, given: list[list[str]]
+) -> None:
+    made = mix()
+    assert len(given) == 2
+    assert sum(file.startswith("up/") for file in given[0]) == len(of(made, "train", "LR"))
+    assert given[1] == [f"hr/{i:05d}.png" for i in range(VIEWS)]
+    assert made.report["pose_error"]["position_percent"] == pytest.approx(0, abs=1e-6)
+    assert made.report["pose_error_against"] == "SfM of the undegraded photographs"
+    assert made.report["reference"]["registered"] == VIEWS
+    assert made.report["reference"]["seconds"] >= 0
+
+
+def test_known_cameras_need_no_second_run(
+    mix: Mix, rendered: Scene, given: list[list[str]]
+) -> None:
+    made = mix(rendered)
+    assert len(given) == 1
+    assert made.report["pose_error_against"] == "exact cameras"
+    assert 0 < made.report["pose_error"]["position_percent"] < 5
+
+
+def test_the_reference_is_left_out_if_so_asked(mix: Mix, given: list[list[str]]) -> None:
+    made = mix(sfm={"reference": False})
+    assert len(given) == 1
+    assert made.report["pose_error"] == {}
+
+
+NOTHING = Reconstruction(
+    {},
+    {},
+    np.zeros((0, 3)),
+    np.zeros((0, 3), np.uint8),
+    {},
+    {"lr_images": "", "registered": 0, "models": [], "points": 0},
+)
+
+
+def test_a_recipe_that_fails_gives_way_to_the_next(
+    conf: VariantConf,
+    rendered: Scene,
+    placed: Reconstruction,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    results = iter([NOTHING, placed])
+    monkeypatch.setattr(sfm, "reconstruct", lambda *_: next(results))
+    (tmp_path / "out").mkdir()
+    made = mixing.mix(rendered, conf, tmp_path, tmp_path / "out")
+    attempts = made.report["attempts"]
+    assert [(a["attempt"], a["registered"]) for a in attempts] == [
+        ("configured", 0),
+        ("finer", VIEWS),
+    ]
+    assert "COLMAP placed 0 of 12 views" in attempts[0]["refused"]
+    assert attempts[1]["refused"] == ""
+    assert made.report["registered"] == len({v.name for v in made.views}) == VIEWS
+
+
+def test_where_every_recipe_fails_the_report_has_them_all(
+    conf: VariantConf, rendered: Scene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(sfm, "reconstruct", lambda *_: NOTHING)
+    (tmp_path / "out").mkdir()
+    with pytest.raises(SceneFailed, match="scene p failed: COLMAP placed 0 of 12") as caught:
+        mixing.mix(rendered, conf, tmp_path, tmp_path / "out")
+    tried = [a["attempt"] for a in caught.value.report["attempts"]]
+    assert tried == [name for name, _, _ in placing.recipes(conf.sfm, VIEWS, smaller=True)]
+    assert tried[-1] == "native"
+
+
+# the choices in conf/
+
+
+@pytest.mark.parametrize(
+    ("name", "tags", "degradation"),
+    [
+        ("digital_zoom", "flag", "digital_zoom"),
+        ("distance", "distance", "none"),
+        ("jpeg", "flag", "jpeg"),
+        ("megapixels", "megapixels", "none"),
+        ("sampling_rate", "sampling_rate", "none"),
+        ("", "flag", "downsample"),
+    ],
+)
+def test_every_choice_of_variant_is_one_that_can_be_made(
+    compose: Callable[..., config.Conf], name: str, tags: str, degradation: str
+) -> None:
+    conf = compose(*([f"variant={name}"] if name else [])).variant
+    check(conf)
+    assert (conf.tags, degrade.kind(conf)) == (tags, degradation)
+
+
+def test_every_choice_of_variant_is_tested() -> None:
+    files = {file.stem for file in (config.CONF_DIR / "variant").iterdir()}
+    assert files == {"digital_zoom", "distance", "jpeg", "megapixels", "sampling_rate"}
+
+
+# real photographs
+
+
+@pytest.mark.data
+def test_a_collection_of_many_cameras_is_placed(
+    configured: Make, data_root: Path, tmp_path: Path
+) -> None:
+    """Sixteen tourists' photographs, all of differing sizes, at a quarter of them."""
+    source = data_root / "captures" / "reichstag" / "images"
+    if not source.is_dir():
+        pytest.skip(f"{source} is not there")
+    files = tuple(sorted(source.iterdir())[:16])
+    sizes = [images.size(file) for file in files]
+    few = {"max_num_features": 1500}
+    conf = configured(long_side=320, tags="sampling_rate", factor=2, sfm=few)
+    (tmp_path / "out").mkdir()
+    made = mixing.mix(Scene("reichstag", "", files), conf, tmp_path, tmp_path / "out")
+    assert made.report["registered"] >= 12
+    assert made.report["cameras"] == 16
+    scale = 320 / max(max(size) for size in sizes)
+    by_name = dict(zip((file.stem for file in files), sizes, strict=True))
+    for view in made.views:
+        width, height = by_name[view.name]
+        assert 0 <= round(width * scale) - view.width < 2
+        assert 0 <= round(height * scale) - view.height < 2
+    assert min(view.rho for view in made.views) < 0.8  # 0.72 when this was written

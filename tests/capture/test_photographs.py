@@ -1,0 +1,106 @@
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from xrgs.capture import images
+from xrgs.capture.photographs import prepare, share_cameras
+from xrgs.capture.scenes import Scene
+from xrgs.config import SfmConf, VariantConf
+from xrgs.errors import XrgsError
+
+CONF = VariantConf(long_side=0, factor=2, sfm=SfmConf(camera="auto"))
+
+
+def take(
+    file: Path,
+    size: tuple[int, int] = (60, 40),
+    model: str = "",
+    focal: float = 0,
+    orientation: int = 1,
+) -> Path:
+    """A photograph as a camera stores it: `size` before it is turned upright."""
+    exif = Image.Exif()
+    exif[0x0112] = orientation
+    if model:
+        exif[0x010F], exif[0x0110] = "Maker", model
+    if focal:
+        exif.get_ifd(0x8769)[0x920A] = focal
+    ramp = np.linspace(0, 255, size[0]).astype(np.uint8)
+    pixels = np.broadcast_to(ramp[None, :, None], (size[1], size[0], 3))
+    Image.fromarray(np.ascontiguousarray(pixels)).save(file, exif=exif, quality=95)
+    return file
+
+
+def shared(files: list[Path], how: str = "auto") -> list[int]:
+    """Cameras numbered by first use."""
+    names = share_cameras(files, [images.size(file) for file in files], how)
+    return [list(dict.fromkeys(names)).index(name) for name in names]
+
+
+def test_photographs_of_one_size_without_exif_share_a_camera(tmp_path: Path) -> None:
+    files = [take(tmp_path / f"{i}.png") for i in range(3)]
+    assert shared(files) == [0, 0, 0]
+    assert shared(files, "per_image") == [0, 1, 2]
+    assert shared(files, "single") == [0, 0, 0]
+
+
+def test_without_exif_and_of_differing_sizes_each_has_its_own(tmp_path: Path) -> None:
+    sizes = [(60, 40), (60, 40), (50, 40)]
+    files = [take(tmp_path / f"{i}.png", size) for i, size in enumerate(sizes)]
+    assert shared(files) == [0, 1, 2]
+    with pytest.raises(XrgsError, match=r"camera=single.*0\.png is 60x40, .*2\.png is 50x40"):
+        shared(files, "single")
+
+
+def test_exif_tells_cameras_lenses_and_how_they_were_held(tmp_path: Path) -> None:
+    files = [
+        take(tmp_path / "0.jpg", model="A", focal=35.0),
+        take(tmp_path / "1.jpg", model="A", focal=35.0),
+        take(tmp_path / "2.jpg", model="A", focal=50.0),
+        take(tmp_path / "3.jpg", model="B", focal=35.0),
+        take(tmp_path / "4.jpg", model="A", focal=35.0, orientation=6),
+        take(tmp_path / "5.jpg", (30, 20), model="A", focal=35.0),
+        take(tmp_path / "6.jpg", model="A", focal=35.0),
+        take(tmp_path / "7.jpg"),
+        take(tmp_path / "8.jpg"),
+    ]
+    assert shared(files) == [0, 0, 1, 2, 3, 4, 0, 5, 6]
+
+
+def test_a_photograph_taken_sideways_is_prepared_upright(tmp_path: Path) -> None:
+    """Stored 60 x 40 and turned by a quarter: bright left to right becomes top to bottom."""
+    files = [take(tmp_path / "a.png"), take(tmp_path / "b.png", orientation=6)]
+    photos = prepare(Scene("x", "", tuple(files)), CONF, tmp_path)
+    assert [photo.size for photo in photos.all] == [(60, 40), (40, 60)]
+    assert photos[0].camera != photos[1].camera
+    upright = photos.read("hr", 1)
+    assert upright.shape == (60, 40, 3)
+    assert np.array_equal(upright, np.rot90(photos.read("hr", 0), -1))
+
+
+def test_all_are_shrunk_by_one_scale(tmp_path: Path) -> None:
+    sizes = [(200, 100), (100, 200), (120, 60), (50, 50)]
+    files = [take(tmp_path / f"{i}.png", size) for i, size in enumerate(sizes)]
+    conf = VariantConf(long_side=100, factor=2, sfm=SfmConf(camera="auto"))
+    photos = prepare(Scene("x", "", tuple(files)), conf, tmp_path)
+    assert [p.frame.resized for p in photos.all] == [(100, 50), (50, 100), (60, 30), (25, 25)]
+    assert [(p.frame.width, p.frame.height) for p in photos.all][-1] == (24, 24)
+    assert photos.size("hr", 3) == (24, 24)
+
+
+def test_a_photograph_too_small_for_its_copy_is_named(tmp_path: Path) -> None:
+    files = [take(tmp_path / "a.png"), take(tmp_path / "b.png", (60, 21))]
+    with pytest.raises(XrgsError, match=r"b\.png: variant\.factor=2: LR views of 30x10 px"):
+        prepare(Scene("x", "", tuple(files)), CONF, tmp_path)
+
+
+def test_a_file_without_a_header_is_left_out_too(tmp_path: Path) -> None:
+    (tmp_path / "b.png").write_text("no image")
+    files = [take(tmp_path / "a.png"), tmp_path / "b.png", take(tmp_path / "c.png")]
+    photos = prepare(Scene("x", "", tuple(files)), CONF, tmp_path)
+    assert photos.names == ["a", "c"]
+    assert "b.png" in photos.unreadable[0]

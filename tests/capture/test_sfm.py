@@ -1,0 +1,126 @@
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from xrgs.capture import images, scenes, sfm
+from xrgs.capture.scenes import motorcycle
+from xrgs.capture.scenes.bundled import photograph
+from xrgs.config import SceneConf, SfmConf
+
+
+@pytest.mark.parametrize(
+    ("count", "asked", "expected"), [(2, 0, 8192), (24, 0, 4166), (100, 0, 1000), (24, 512, 512)]
+)
+def test_features_fall_with_the_number_of_images(count: int, asked: int, expected: int) -> None:
+    assert sfm.features_for(count, asked) == expected
+
+
+def test_small_images_are_searched_at_twice_their_size() -> None:
+    assert sfm.octave_for(252, None) == -1
+    assert sfm.octave_for(1008, None) == 0
+    assert sfm.octave_for(252, 0) == 0
+    assert sfm.octave_for(1008, -1) == -1
+
+
+def test_the_default_inliers_are_colmaps_own(sfm_conf: SfmConf) -> None:
+    import pycolmap
+
+    colmap = pycolmap.IncrementalPipelineOptions().mapper
+    made = sfm.mapping_options(sfm_conf, 24, known=False).mapper
+    assert made.abs_pose_min_num_inliers == colmap.abs_pose_min_num_inliers
+    assert made.init_min_num_inliers == colmap.init_min_num_inliers
+    fewer = sfm.mapping_options(replace(sfm_conf, min_inliers=15), 24, known=False).mapper
+    assert (fewer.abs_pose_min_num_inliers, fewer.init_min_num_inliers) == (15, 50)
+
+
+def test_two_views_keep_the_points_that_only_two_see(sfm_conf: SfmConf) -> None:
+    two = sfm.mapping_options(sfm_conf, 2, known=False)
+    assert not two.triangulation.ignore_two_view_tracks
+    assert two.min_model_size == 2
+    assert not two.ba_refine_focal_length
+    many = sfm.mapping_options(sfm_conf, 24, known=False)
+    assert many.triangulation.ignore_two_view_tracks
+    assert many.ba_refine_focal_length
+    assert many.mapper.init_min_tri_angle == 4
+    assert not sfm.mapping_options(sfm_conf, 24, known=True).ba_refine_extra_params
+
+
+@pytest.fixture(scope="module")
+def pair(
+    tmp_path_factory: pytest.TempPathFactory, sfm_conf: SfmConf
+) -> tuple[Path, sfm.Reconstruction]:
+    """The motorcycle pair at its own size, intrinsics given."""
+    work = tmp_path_factory.mktemp("pair")
+    scene = scenes.resolve(SceneConf("motorcycle", "motorcycle"), work)
+    shots = []
+    for file in scene.files:
+        images.save(work / file.name, images.read(file))
+        shots.append(sfm.Shot(file.name, file.stem, scene.intrinsics[file.stem]))
+    return work, sfm.reconstruct(shots, work, work, sfm_conf)
+
+
+def test_the_stereo_pair_is_placed_with_the_intrinsics_it_was_given(pair) -> None:
+    model = pair[1]
+    assert model.report["registered"] == len(model.viewmats) == 2
+    assert len(model.points) == len(model.colors) > 500
+    for i, K in enumerate(motorcycle.intrinsics().values()):
+        assert np.array_equal(model.lenses[i].K, K)
+        assert model.lenses[i].k == 0
+
+
+def test_its_cameras_are_parallel_and_side_by_side(pair) -> None:
+    a, b = (pair[1].viewmats[i] for i in range(2))
+    turn = b[:3, :3] @ a[:3, :3].T
+    step = b[:3, 3] - turn @ a[:3, 3]  # of the right camera, in the left one's axes
+    assert np.degrees(np.arccos((np.trace(turn) - 1) / 2)) < 0.5
+    assert -step[0] / np.linalg.norm(step) > 0.995
+
+
+def test_each_view_knows_which_points_were_found_in_it(pair) -> None:
+    """Two views: every point was found in both, and falls inside both images."""
+    model = pair[1]
+    for i, lens in model.lenses.items():
+        assert np.array_equal(model.tracked[i], np.arange(len(model.points)))
+        camera = model.points @ model.viewmats[i][:3, :3].T + model.viewmats[i][:3, 3]
+        pixels = camera @ lens.K.T
+        pixels = pixels[:, :2] / pixels[:, 2:]
+        assert ((pixels > -4) & (pixels < (lens.width + 4, lens.height + 4))).all()
+
+
+def test_its_points_lie_at_the_depths_of_the_published_disparity(pair) -> None:
+    """Depths of SfM are right up to one scale: their ratio to the true ones is one number."""
+    model = pair[1]
+    disparity = np.load(photograph("motorcycle_disp.npz"))["arr_0"]
+    Ks = motorcycle.intrinsics()
+    offset = Ks["motorcycle_right"][0, 2] - Ks["motorcycle_left"][0, 2]
+    camera = model.points @ model.viewmats[0][:3, :3].T + model.viewmats[0][:3, 3]
+    pixel = camera @ Ks["motorcycle_left"].T
+    column, row = np.floor(pixel[:, :2] / pixel[:, 2:]).astype(int).T
+    known = disparity[row.clip(0, 499), column.clip(0, 740)]
+    good = np.isfinite(known)
+    ratio = camera[good, 2] * (known[good] + offset)
+    assert np.median(np.abs(ratio / np.median(ratio) - 1)) < 0.02
+
+
+def test_colmaps_log_stays_in_the_work_folder(pair, capfd: pytest.CaptureFixture[str]) -> None:
+    assert "Feature extraction" in "".join(p.read_text() for p in pair[0].glob("colmap-INFO-*"))
+    assert "colmap" not in capfd.readouterr().err.lower()
+
+
+def test_images_without_anything_in_common_give_no_model(
+    sfm_conf: SfmConf, tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    rng = np.random.default_rng(0)
+    for i in range(3):
+        images.save(tmp_path / f"{i}.png", rng.random((90, 120, 3), dtype=np.float32))
+    shots = [sfm.Shot(f"{i}.png", "all") for i in range(3)]
+    model = sfm.reconstruct(shots, tmp_path, tmp_path, sfm_conf)
+    assert model.viewmats == {}
+    assert model.points.shape == model.colors.shape == (0, 3)
+    assert model.report["models"] == []
+    assert model.report["registered"] == 0
+    assert capfd.readouterr().err == ""

@@ -1,0 +1,105 @@
+"""Names with any character in them: of scenes, photographs, stores, on the command line."""
+
+from __future__ import annotations
+
+import os
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hydra.core.override_parser.overrides_parser import OverridesParser
+from PIL import Image
+
+from xrgs import config
+from xrgs.capture import images
+from xrgs.capture.scenes import folder, motorcycle
+from xrgs.cli.arguments import dotlist, with_quotes
+from xrgs.errors import XrgsError
+
+#: As `tests.conftest.run_command` gives it.
+RunCommand = Callable[..., tuple[int, str, str]]
+ACCENT = "e\N{COMBINING ACUTE ACCENT}"
+WHOLE = "\N{LATIN SMALL LETTER E WITH ACUTE}"
+ODD = (
+    *("a b", " lead", "trail ", "-x", "~nobody", "50%", "a=b", "it's", 'q"q', "a;b", "a&b", "#h"),
+    *("!x", "[x]", "{y}", "(p)", "$x", "a:b", "*", ACCENT, WHOLE, "部屋", "🙂", "1e3", "true"),
+    *("007", "a\\b'"),
+)
+
+
+def parsed(word: str) -> object:
+    """What Hydra makes of a word that went through us."""
+    (override,) = OverridesParser.create().parse_overrides(with_quotes([word]))
+    return override.value()
+
+
+@pytest.mark.parametrize("name", ODD)
+def test_hydra_gets_a_path_as_it_was_written(name: str) -> None:
+    found = parsed(f"scene.path={name}")
+    assert getattr(found, "text", found) == name
+    assert dotlist([f"store={name}"]).store == name
+
+
+@pytest.mark.parametrize("name", ["a,b", "null", "${y}", "a\\b", f"{WHOLE},b"])
+def test_what_hydra_reads_otherwise_is_a_path_where_it_exists(
+    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, compose: Callable[..., config.Conf]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / name).mkdir()
+    assert compose(*with_quotes([f"scene.path={name}"])).scene.path == name
+
+
+def test_lists_quotes_and_other_keys_stay_as_they_are() -> None:
+    words = ["scene.path=a,b", "scene.path='é'", "seed=range(0,9)", "label=é", "+ablation=[a,b]"]
+    assert with_quotes(words) == words
+    assert with_quotes(["scene.path=é,b c"]) == ["scene.path='é',b c"]
+    assert with_quotes(["store=é,b c"]) == ["store='é,b c'"]
+
+
+def test_bytes_that_are_no_unicode_are_named(tmp_path: Path) -> None:
+    with pytest.raises(XrgsError, match=r"store=\\udcff.*no Unicode"):
+        with_quotes(["store=\udcff"])
+    for name in (b"a.png", b"\xff.png"):
+        Image.new("RGB", (9, 9)).save(os.path.join(os.fsencode(tmp_path), name), "PNG")  # noqa: PTH118
+    with pytest.raises(XrgsError, match=r"udcff.*rename it"):
+        folder.photographs(str(tmp_path), 0)
+
+
+@pytest.mark.parametrize("names", [("a.png", "a.jpg"), ("A.png", "a.png"), (ACCENT, WHOLE)])
+def test_photographs_that_would_be_one_file_somewhere_are_named(
+    tmp_path: Path, names: tuple[str, str]
+) -> None:
+    for name in names:
+        file = tmp_path / (name if "." in name else f"{name}.png")
+        images.save(file, np.zeros((9, 9, 3), np.float32))
+    with pytest.raises(XrgsError, match="two images of one name"):
+        folder.photographs(str(tmp_path), 0)
+
+
+def test_a_scene_of_odd_names_goes_the_whole_way(run_command: RunCommand, tmp_path: Path) -> None:
+    scene = tmp_path / f"-部屋 🙂 {{it's}} 50%=#1; {ACCENT}, a"
+    scene.mkdir()
+    views = ['-a b\'s & "c" (1) 🙂', f"[{ACCENT}]=50%#, $x.y"]
+    for name, file in zip(views, motorcycle.files(), strict=True):
+        shutil.copy(file, scene / f"{name}.png")
+    conf = ("preset=smoke", "train.steps=2", "variant.test_every=0", "variant.min_hr=1")
+    conf += ("variant.long_side=185", "variant.sfm.reference=false")
+    words = ("+ablation=curriculum", "scene=folder", f"scene.path={scene.name}", *conf)
+    store = "store=st öre, 'a' {b} 🙂"
+    code, out, err = run_command("sweep", tmp_path, *words, store)
+    assert code == 0, err
+    assert scene.name in out
+    home = tmp_path / store.removeprefix("store=")
+    for cell in (home / "cells").iterdir():
+        assert {file.stem for file in (cell / "renders").iterdir()} == set(views)
+    (report,) = (home / "reports").iterdir()
+    pictures = list((report / "figures").iterdir())
+    assert len(pictures) == 2
+    page = (report / "table.md").read_text()
+    assert all(f"](figures/{file.name})" in page and file.name.isascii() for file in pictures)
+    for command, name in (("report", str(Path(*report.parts[-3:]))), ("status", scene.name)):
+        code, out, err = run_command(command, tmp_path, store)
+        assert code == 0, err
+        assert name in out

@@ -1,0 +1,187 @@
+"""The metrics against scikit-image, kornia and float64 closed forms."""
+
+from __future__ import annotations
+
+import doctest
+import math
+import subprocess
+import sys
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+import torch
+from numpy.lib.stride_tricks import sliding_window_view
+from torch import Tensor
+
+from xrgs.evaluation import metrics
+from xrgs.evaluation.lpips import weights
+
+
+def pair(height: int = 40, width: int = 53) -> tuple[Tensor, Tensor]:
+    generator = torch.Generator().manual_seed(0)
+    y, x = torch.meshgrid(torch.arange(height), torch.arange(width), indexing="ij")
+    waves = 0.5 + 0.3 * torch.sin(x / 5.0 + y / 3.0)[..., None]
+    first, second = (
+        (waves + 0.2 * (torch.rand(height, width, 3, generator=generator) - 0.5)) for _ in range(2)
+    )
+    return first, second
+
+
+def ssim_by_definition(image: Tensor, target: Tensor) -> float:
+    """Wang et al. 2004 in float64, borders mirrored: 11 taps, sigma 1.5, data range 1."""
+    taps = np.exp(-(np.arange(-5, 6) ** 2) / (2 * 1.5**2))
+    window = np.outer(taps, taps) / taps.sum() ** 2
+
+    def patches(x: Tensor) -> np.ndarray:
+        padded = np.pad(x.double().numpy(), ((5, 5), (5, 5), (0, 0)), mode="reflect")
+        return sliding_window_view(padded, (11, 11), axis=(0, 1))  # [H, W, 3, 11, 11]
+
+    a, b = patches(image), patches(target)
+    mean_a, mean_b = (np.einsum("hwcij,ij->hwc", x, window) for x in (a, b))
+    da, db = a - mean_a[..., None, None], b - mean_b[..., None, None]
+    var_a, var_b, cov = (
+        np.einsum("hwcij,ij->hwc", product, window) for product in (da * da, db * db, da * db)
+    )
+    c1, c2 = 0.01**2, 0.03**2
+    return float(
+        np.mean(
+            (2 * mean_a * mean_b + c1)
+            * (2 * cov + c2)
+            / ((mean_a**2 + mean_b**2 + c1) * (var_a + var_b + c2))
+        )
+    )
+
+
+def test_ssim_is_its_definition() -> None:
+    image, target = pair()
+    expected = ssim_by_definition(image, target)
+    assert 0.2 < expected < 0.9
+    assert metrics.ssim(image, target) == pytest.approx(expected, abs=1e-6)
+
+
+def test_ssim_differs_from_scikit_images_by_the_border_alone() -> None:
+    from skimage.metrics import structural_similarity
+
+    image, target = pair(200, 210)
+    expected = structural_similarity(
+        image.numpy(),
+        target.numpy(),
+        gaussian_weights=True,
+        sigma=1.5,
+        use_sample_covariance=False,
+        data_range=1.0,
+        channel_axis=-1,
+    )
+    assert metrics.ssim(image, target) == pytest.approx(expected, abs=5e-3)
+
+
+def test_ssim_of_identical_images_is_one() -> None:
+    image, _ = pair()
+    assert metrics.ssim(image, image) == pytest.approx(1, abs=1e-6)
+
+
+def test_psnr_is_scikit_images_and_kornias() -> None:
+    from kornia.metrics import psnr
+    from skimage.metrics import peak_signal_noise_ratio
+
+    image, target = pair()
+    value = metrics.psnr(image, target)
+    assert value == pytest.approx(
+        peak_signal_noise_ratio(target.numpy().astype(float), image.numpy().astype(float)),
+        rel=1e-12,
+    )
+    assert value == pytest.approx(psnr(image, target, 1.0).item(), rel=1e-6)
+
+
+def test_psnr_of_a_known_error() -> None:
+    flat = torch.full((12, 13, 3), 0.25)
+    assert metrics.psnr(flat, flat + 0.5) == pytest.approx(20 * math.log10(2), rel=1e-12)
+    assert metrics.psnr(torch.zeros(12, 13, 3), torch.ones(12, 13, 3)) == 0
+
+
+def test_psnr_of_identical_images_is_infinite() -> None:
+    image, _ = pair()
+    assert metrics.psnr(image, image) == math.inf
+
+
+def test_lpips_is_none_where_there_are_no_weights() -> None:
+    assert metrics.lpips(*pair()) is None
+
+
+def test_lpips_is_the_networks_distance_where_there_are(
+    random_weights: weights.Weights, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from xrgs.evaluation.lpips.network import distance
+
+    monkeypatch.setattr(weights, "published", lambda: random_weights)
+    image, target = pair()
+    tensors = {name: torch.from_numpy(array) for name, array in random_weights.items()}
+    value = metrics.VIEW_METRICS["lpips"](image, target)
+    assert isinstance(value, float)
+    assert value == distance(image, target, tensors).item() > 0.01
+    # The network shrinks an image to nothing: a cell of tiny views is no failed cell.
+    assert metrics.lpips(*pair(30, 53)) is None
+
+
+def test_the_rows_of_the_tables() -> None:
+    better_high = {metric.name: metric.higher_is_better for metric in metrics.METRICS}
+    assert better_high == {
+        "training_time_s": False,
+        "gaussians": False,
+        "memory_bytes": False,
+        "peak_rss_bytes": False,
+        "lpips": False,
+        "ssim": True,
+        "psnr": True,
+        "evaluations": False,
+    }
+    assert list(metrics.VIEW_METRICS) == ["lpips", "ssim", "psnr"]
+    units = {metric.name: metric.unit for metric in metrics.METRICS if metric.unit}
+    assert units == {
+        "training_time_s": "s",
+        "memory_bytes": "bytes",
+        "peak_rss_bytes": "bytes",
+        "psnr": "dB",
+    }
+
+
+@pytest.mark.parametrize("name", ["psnr", "ssim"])
+def test_directions_are_true(name: str) -> None:
+    """A worse image scores on the worse side."""
+    metric = next(metric for metric in metrics.METRICS if metric.name == name)
+    assert metric.score is not None
+    image, target = pair()
+    near = metric.score(target + 0.1 * (image - target), target)
+    far = metric.score(image, target)
+    assert near is not None
+    assert far is not None
+    assert (near > far) == metric.higher_is_better
+
+
+@pytest.mark.parametrize("score", metrics.VIEW_METRICS.values(), ids=metrics.VIEW_METRICS)
+@pytest.mark.parametrize("shapes", [((9, 9, 3), (9, 8, 3)), ((9, 9), (9, 9)), ((3, 9, 9),) * 2])
+def test_wrong_shapes_are_refused(
+    score: Callable[[Tensor, Tensor], float | None], shapes: tuple[tuple[int, ...], tuple[int, ...]]
+) -> None:
+    with pytest.raises(ValueError, match=r"must be the same \[H, W, 3\]"):
+        score(torch.zeros(shapes[0]), torch.zeros(shapes[1]))
+
+
+def test_an_image_too_small_to_mirror_is_refused() -> None:
+    with pytest.raises(ValueError, match="20 x 5 px is too small for SSIM"):
+        metrics.ssim(torch.zeros(5, 20, 3), torch.zeros(5, 20, 3))
+    assert metrics.ssim(torch.zeros(6, 20, 3), torch.zeros(6, 20, 3)) == pytest.approx(1, abs=1e-4)
+
+
+def test_the_examples_in_the_docstrings() -> None:
+    result = doctest.testmod(metrics)
+    assert result.attempted > 0
+    assert result.failed == 0
+
+
+def test_plans_and_reports_need_no_torch() -> None:
+    heavy = "{'torch', 'kornia'} & set(sys.modules)"
+    code = f"import sys, xrgs.evaluation.metrics; sys.exit(bool({heavy}))"
+    run = subprocess.run([sys.executable, "-P", "-c", code], check=False)
+    assert run.returncode == 0

@@ -1,0 +1,197 @@
+"""A cell's own part of the way: what it hands from room to room."""
+
+from __future__ import annotations
+
+import json
+import logging
+import random
+import shutil
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from dataclasses import asdict
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+
+from xrgs.capture import dataset, variant
+from xrgs.capture.dataset import Dataset
+from xrgs.config import Conf
+from xrgs.evaluation import protocol
+from xrgs.experiment import cell
+from xrgs.experiment.identity import cell_identity
+from xrgs.experiment.store import CellFolder, Store
+from xrgs.safeio.atomic import write_json
+from xrgs.safeio.hashing import digest
+from xrgs.splat.backend import resolve_backend
+from xrgs.sweep.jobs import worker
+from xrgs.training import loop as train
+
+
+class LoadError(Exception):
+    """Which views a cell asked for; it goes no further."""
+
+
+@pytest.mark.parametrize("ablation", ["baseline", *dataset.USES[1:]])
+def test_the_controls_choose_the_views_that_are_trained_on(
+    ablation: str, compose: Callable[..., Conf], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def load(variant: object, use: str) -> None:
+        del variant
+        raise LoadError(use)
+
+    monkeypatch.setattr(dataset, "load", load)
+    views = "mixed" if ablation == "baseline" else ablation
+    with pytest.raises(LoadError, match=views):
+        cell.run(compose(f"+ablation={ablation}"), SimpleNamespace(), CellFolder(tmp_path))
+
+
+class Kill(BaseException):
+    """What no code of ours may catch."""
+
+
+def kill_at(monkeypatch: pytest.MonkeyPatch, module: Any, name: str, call: int) -> None:
+    """Let the nth call of a function from now on be the last; all later ones are as ever."""
+    real, calls = getattr(module, name), [0]
+
+    def mortal(*arguments: Any, **named: Any) -> Any:
+        calls[0] += 1
+        if calls[0] == call:
+            raise Kill
+        return real(*arguments, **named)
+
+    monkeypatch.setattr(module, name, mortal)
+
+
+def begin(conf: Conf, root: Path, variant_id: str = "v") -> CellFolder:
+    """As a sweep does."""
+    identity = cell_identity(conf, variant_id)
+    folder = CellFolder(root / digest(identity))
+    folder.begin(asdict(conf), identity)
+    return folder
+
+
+def results(folder: CellFolder) -> dict[str, Any]:
+    """All that a cell gives but times and this machine's memory."""
+    assert folder.state().name == "done", folder.state().reason
+    assert not folder.checkpoint.exists()
+    names = ["splats.ply", "history.csv", "scores.csv"]
+    names += [f"renders/{file.name}" for file in sorted((folder.path / "renders").iterdir())]
+    summary = folder.summary()
+    del summary["training_time_s"], summary["peak_rss_bytes"]
+    return {name: (folder.path / name).read_bytes() for name in names} | summary
+
+
+@pytest.fixture
+def conf(data: Dataset, baseline: Conf, monkeypatch: pytest.MonkeyPatch) -> Conf:
+    """Of a cell on `data` that writes a checkpoint after each step."""
+    monkeypatch.setattr(dataset, "load", lambda *_: data)
+    baseline.checkpoint_s, baseline.threads = 1e-9, 1
+    return baseline
+
+
+def killed(conf: Conf, root: Path, step: int) -> CellFolder:
+    """The folder of a cell whose process ended in the midst of a step."""
+    folder = begin(conf, root)
+    with pytest.MonkeyPatch.context() as patch:
+        kill_at(patch, train, "photometric_loss", step + 1)
+        with pytest.raises(Kill):
+            cell.run(conf, SimpleNamespace(), folder)
+    assert folder.checkpoint.exists() == (step > 0)
+    return folder
+
+
+def whole(conf: Conf, root: Path) -> dict[str, Any]:
+    """What the cell gives when nothing happens to it."""
+    folder = begin(conf, root)
+    cell.run(conf, SimpleNamespace(), folder)
+    return results(folder)
+
+
+def test_a_cell_killed_in_training_and_again_in_evaluation_goes_on(
+    conf: Conf,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    step = random.randrange(1, conf.train.steps)
+    killed(conf, tmp_path / "a", step)
+    with monkeypatch.context() as patch:
+        kill_at(patch, protocol, "score", 1)
+        with pytest.raises(Kill):
+            cell.run(conf, SimpleNamespace(), begin(conf, tmp_path / "a"))
+    folder = begin(conf, tmp_path / "a")
+    with caplog.at_level(logging.INFO):
+        cell.run(conf, SimpleNamespace(), folder)
+    assert f"going on from the checkpoint, {conf.train.steps} steps done" in caplog.text
+    assert results(folder) == whole(conf, tmp_path / "b"), step
+    assert [path.name for path in folder.path.parent.iterdir()] == [folder.id]  # nothing aside
+
+
+def _truncate(checkpoint: Path, other: Path) -> None:
+    checkpoint.write_bytes(checkpoint.read_bytes()[:-1000])
+
+
+def _exchange(checkpoint: Path, other: Path) -> None:
+    shutil.copy(other, checkpoint)
+
+
+@pytest.mark.parametrize(("spoil", "said"), [(_truncate, "not a zip"), (_exchange, "of cell")])
+def test_a_checkpoint_of_no_use_is_said_and_training_starts_over(
+    conf: Conf,
+    tmp_path: Path,
+    caplog: pytest.LogCaptureFixture,
+    spoil: Callable[[Path, Path], None],
+    said: str,
+) -> None:
+    folder = killed(conf, tmp_path / "a", 9)
+    conf.seed = 1
+    other = killed(conf, tmp_path / "other", 9)
+    conf.seed = 0
+    spoil(folder.checkpoint, other.checkpoint)
+    folder = begin(conf, tmp_path / "a")
+    with caplog.at_level(logging.WARNING):
+        cell.run(conf, SimpleNamespace(), folder)
+    assert "training starts over" in caplog.text
+    assert said in caplog.text
+    assert (folder.path / "refused-checkpoint.npz").exists()
+    assert results(folder) == whole(conf, tmp_path / "b")
+
+
+def test_a_worker_that_is_killed_goes_on_in_another(
+    compose: Callable[..., Conf], tmp_path: Path
+) -> None:
+    changes = ("scene=motorcycle", "preset=smoke", "train.steps=100", "threads=1")
+    conf = compose(*changes, "checkpoint_s=0.05")
+    conf.splat.backend = resolve_backend(conf.splat.backend)
+    store = Store(tmp_path / "s")
+    store.prepare()
+    built = variant.build(conf.scene, conf.variant, store.variants, store.scenes)
+
+    def request(folder: CellFolder) -> dict[str, Any]:
+        return {"conf": asdict(conf), "variant": str(built.path), "cell": str(folder.path)}
+
+    folder = begin(conf, tmp_path / "killed", built.id)
+    write_json(tmp_path / "request.json", request(folder))
+    files = [str(tmp_path / "request.json"), str(tmp_path / "answer.json")]
+    child = subprocess.Popen([sys.executable, "-P", "-m", "xrgs.sweep.jobs.worker", "cell", *files])
+    while not folder.checkpoint.exists() and child.poll() is None:
+        time.sleep(0.005)
+    time.sleep(random.uniform(0, 0.1))
+    child.kill()
+    assert child.wait() == -9
+    folder.fail("its process was ended by SIGKILL")  # what a sweep that outlives it says
+
+    folder = begin(conf, tmp_path / "killed", built.id)
+    worker.run("cell", request(folder))
+    log = (folder.path / "log.txt").read_text()
+    assert "going on from the checkpoint" in log
+    spared = begin(conf, tmp_path / "spared", built.id)
+    worker.run("cell", request(spared))
+    assert results(folder) == results(spared)
+    assert json.loads((folder.path / "status.json").read_text())["files"].keys() == (
+        json.loads((spared.path / "status.json").read_text())["files"].keys()
+    )

@@ -1,0 +1,76 @@
+"""A terminal that is closed, a pipe that nobody reads and a full disk, under what is printed."""
+
+from __future__ import annotations
+
+import os
+import pty
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, contextmanager
+from pathlib import Path
+
+import pytest
+
+_SCRIPT = """
+import sys
+from pathlib import Path
+if sys.argv[1] == "deaf":
+    from xrgs.runtime.streams import ignore_broken_pipe
+    ignore_broken_pipe()
+for stream in (sys.stdout, sys.stderr):
+    print("a word", file=stream, flush=True)
+Path("done").write_text(f"{sys.stdout.isatty()} {sys.stdout.encoding}")
+"""
+
+
+@contextmanager
+def _terminal() -> Iterator[int]:
+    master, slave = pty.openpty()
+    os.close(master)
+    yield slave
+    os.close(slave)
+
+
+@contextmanager
+def _pipe() -> Iterator[int]:
+    reader, writer = os.pipe()
+    os.close(reader)
+    yield writer
+    os.close(writer)
+
+
+@contextmanager
+def _full_disk() -> Iterator[int]:
+    with Path("/dev/full").open("wb") as full:
+        yield full.fileno()
+
+
+@pytest.mark.parametrize("gone", [_terminal, _pipe, _full_disk])
+@pytest.mark.parametrize("how", ["deaf", "as python does"])
+def test_work_outlives_who_was_to_read_of_it(
+    tmp_path: Path, gone: Callable[[], AbstractContextManager[int]], how: str
+) -> None:
+    with gone() as descriptor:
+        done = subprocess.run(
+            [sys.executable, "-c", _SCRIPT, how],
+            cwd=tmp_path,
+            stdout=descriptor,
+            stderr=descriptor,
+            check=False,
+        )
+    assert (done.returncode == 0) == (how == "deaf")
+    assert (tmp_path / "done").exists() == (how == "deaf")
+
+
+def test_what_can_be_printed_is(tmp_path: Path) -> None:
+    done = subprocess.run(
+        [sys.executable, "-c", _SCRIPT, "deaf"],
+        cwd=tmp_path,
+        capture_output=True,
+        text=True,
+        check=True,
+        env=os.environ | {"PYTHONIOENCODING": "utf-8"},
+    )
+    assert (done.stdout, done.stderr) == ("a word\n", "a word\n")
+    assert (tmp_path / "done").read_text() == "False utf-8"

@@ -1,0 +1,392 @@
+"""The compiled renderer against the torch one in double, whose own tests are in test_torch_*.py.
+
+Both read the same float32 numbers. A pixel where some alpha or transmittance is within 1e-4 of a
+threshold may fall on either side of it: these pixels (the band) are found by moving the thresholds
+in the oracle. Outside it images must agree to rounding, and gradients are compared with no weight
+on it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import fields, replace
+from statistics import median
+
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from xrgs.splat.cameras import Camera
+from xrgs.splat.rasterize import rasterize
+from xrgs.splat.settings import CullingOptions, RasterSettings
+
+native = pytest.importorskip("xrgs._native")
+
+NAMES = ("means", "quats", "scales", "opacities", "sh0", "shN")
+BAND = 1e-4
+GRADIENT_FACTOR = 5.0
+"""Gradients may err by this much more than torch's own float32 (norms over all Gaussians)."""
+GRADIENT_FLOOR = 2e-6
+"""Of a gradient's norm: below this an error is rounding, whoever makes it."""
+CANCELLED_FLOOR = {"scales": 1e-3, "quats": 1e-3}
+"""The same where few pixels or Gaussians are left to cancel: first and second moments are summed
+about the tile's centre, in float32, and what is asked for is about the mean. In 1,500 scenes like
+those of `test_random_scenes` 1.2e-4 was needed for scales and 3e-5 for quaternions."""
+CANCELLED_FLOOR_ELSE = 1e-4
+"""Of all others: 2.4e-5 was needed, and below 1e-6 in 99 of 100 scenes."""
+
+
+def rounded(camera):
+    """The camera in numbers that float32 has."""
+    return Camera(camera.viewmat.float(), camera.K.float(), camera.width, camera.height)
+
+
+def single(scene):
+    return {name: value.float() for name, value in scene.items()}
+
+
+def run(scene, camera, raster, backend, dtype, v_image=None, v_alpha=None, *, sh_degree=3):
+    """The render, and the gradients of <image, v_image> + <alpha, v_alpha> by name."""
+    leaves = {name: scene[name].detach().to(dtype, copy=True).requires_grad_() for name in NAMES}
+    offset = torch.zeros(len(leaves["means"]), 2, dtype=dtype, requires_grad=True)
+    render = rasterize(
+        *leaves.values(),
+        camera,
+        raster,
+        sh_degree=sh_degree,
+        means2d_offset=offset,
+        backend=backend,
+    )
+    if v_image is None:
+        return render, {}
+    value = (render.image * v_image.to(dtype)).sum() + (render.alpha * v_alpha.to(dtype)).sum()
+    if value.requires_grad:
+        value.backward()
+    leaves["means2d_offset"] = offset
+    return render, {name: leaf.grad for name, leaf in leaves.items() if leaf.grad is not None}
+
+
+def band_of(scene, camera, raster, exact, sh_degree):
+    """Pixels [H, W] that a small move of a threshold changes."""
+    band = torch.zeros(camera.height, camera.width, dtype=torch.bool)
+    for factor in (1 - BAND, 1 + BAND):
+        for name in ("alpha_min", "transmittance_min"):
+            moved = replace(raster, **{name: getattr(raster, name) * factor})
+            render, _ = run(scene, camera, moved, "torch", torch.float64, sh_degree=sh_degree)
+            band |= (render.image != exact).any(-1)
+        # Uncapped or not, an image hardly changes, but its gradient does.
+        capped = replace(raster, alpha_max=raster.alpha_max * factor)
+        render, _ = run(scene, camera, capped, "torch", torch.float64, sh_degree=sh_degree)
+        band |= (render.image - exact).abs().amax(-1) > 1e-9
+    return band
+
+
+def check(scene, camera, raster=None, *, sh_degree=3, seed=0, floor=None):
+    """Compare image, alpha, visibility and gradients with the oracle's."""
+    raster = raster or RasterSettings()
+    camera, scene = rounded(camera), single(scene)
+    exact, _ = run(scene, camera, raster, "torch", torch.float64, sh_degree=sh_degree)
+    band = band_of(scene, camera, raster, exact.image, sh_degree)
+    generator = torch.Generator().manual_seed(seed)
+    outside = (~band).float()
+    v_image = torch.randn(camera.height, camera.width, 3, generator=generator) * outside[..., None]
+    v_alpha = torch.randn(camera.height, camera.width, generator=generator) * outside
+    results = {
+        dtype: run(scene, camera, raster, backend, dtype, v_image, v_alpha, sh_degree=sh_degree)
+        for backend, dtype in (("torch", torch.float64), ("torch", torch.float32))
+    }
+    theirs, exact_gradients = results[torch.float64]
+    _, single_gradients = results[torch.float32]
+    ours, gradients = run(
+        scene, camera, raster, "native", torch.float32, v_image, v_alpha, sh_degree=sh_degree
+    )
+
+    error = (ours.image.double() - theirs.image).abs().detach()
+    scale = max(1.0, float(theirs.image.detach().max()))
+    assert error.mean() <= 1e-6 * scale
+    assert error.max() <= raster.alpha_min * scale + 1e-5  # one Gaussian more or less
+    assert (error.amax(-1)[~band] <= 1e-5 * scale).all()
+    assert ((ours.alpha.double() - theirs.alpha).abs().detach()[~band] <= 1e-5).all()
+    assert torch.equal(ours.visible, theirs.visible)
+    for name, expected in exact_gradients.items():
+        got = gradients[name]
+        share = floor or CANCELLED_FLOOR.get(name, CANCELLED_FLOOR_ELSE)
+        assert torch.isfinite(got).all(), name
+        allowed = (
+            GRADIENT_FACTOR * (single_gradients[name] - expected).norm() + share * expected.norm()
+        )
+        assert (got - expected).norm() <= allowed, name
+        assert (got[~ours.visible] == 0).all(), name
+    return ours, gradients, band
+
+
+# --- against the oracle -------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("sh_degree", [0, 1, 2, 3])
+def test_a_scene_of_every_degree(isa, make_camera, make_scene, sh_degree):
+    camera = make_camera(50, 37, turned=True)
+    scene = make_scene(300, camera, seed=1)
+    ours, _, band = check(scene, camera, sh_degree=sh_degree, floor=GRADIENT_FLOOR)
+    assert band.float().mean() < 0.1
+    assert ours.image.max() > 0.3
+    assert 0 < ours.evaluations < 300 * 50 * 37
+    assert ours.buffer_bytes > 300 * 64
+
+
+def test_bands_above_the_degree_have_no_gradient(isa, make_camera, make_scene):
+    camera = make_camera()
+    scene = make_scene(40, camera, degree=3)
+    _, gradients, _ = check(scene, camera, sh_degree=1)
+    assert (gradients["shN"][:, 3:] == 0).all()
+    assert (gradients["shN"][:, :3] != 0).any()
+
+
+def test_harmonics_whose_gradient_is_not_wanted_cost_none(isa, make_camera, make_scene):
+    camera = rounded(make_camera(turned=True))
+    scene = single(make_scene(45, camera))
+    gradients = {}
+    for wanted in (True, False):
+        leaves = {name: scene[name].clone().requires_grad_() for name in NAMES}
+        leaves["shN"].requires_grad_(wanted)
+        render = rasterize(
+            *leaves.values(), camera, RasterSettings(), sh_degree=3, backend="native"
+        )
+        render.image.square().sum().backward()
+        gradients[wanted] = {name: leaf.grad for name, leaf in leaves.items()}
+    assert gradients[True].pop("shN") is not None
+    assert gradients[False].pop("shN") is None
+    for name, gradient in gradients[True].items():
+        assert torch.equal(gradients[False][name], gradient), name
+
+
+def test_antialiased_before_a_background(isa, make_camera, make_scene):
+    camera = make_camera(40, 30)
+    raster = RasterSettings(antialiased=True, background=(0.2, 0.5, 0.9))
+    scene = make_scene(300, camera, seed=2, size=0.7)
+    scene["scales"][::5] *= 1e-3  # the compensation leaves little or nothing of these
+    check(scene, camera, raster)
+
+
+@pytest.mark.parametrize("opacity", [0.02, 0.9, 1.0])
+def test_many_layers(isa, make_camera, make_scene, opacity):
+    # More than two batches of Gaussians in a tile; where opaque, pixels end and alphas are capped.
+    camera = make_camera(16, 16, focal=15.0)
+    scene = make_scene(600, camera, seed=3, size=4.0)
+    scene["opacities"][:] = opacity
+    check(scene, camera)
+
+
+def test_without_cuts(isa, make_camera, make_scene):
+    camera = make_camera()
+    raster = RasterSettings(alpha_min=0.0, alpha_max=1.0, transmittance_min=0.0)
+    check(make_scene(30, camera, seed=4), camera, raster)
+
+
+def test_near_and_behind(isa, make_camera, make_scene):
+    camera = make_camera()
+    scene = make_scene(60, camera, seed=5)
+    depths = torch.tensor([-2.0, -1e-3, 0.0, 0.0099, 0.0101, 0.02], dtype=torch.float64)
+    scene["means"][: len(depths), 2] = depths
+    scene["means"][: len(depths), :2] *= 0.01
+    ours, _, _ = check(scene, camera)
+    assert not ours.visible[:4].any()
+
+
+def test_beyond_the_field_of_view(isa, make_camera, make_scene):
+    # Large ones whose centres are far outside, where the Jacobian is held.
+    camera = make_camera(turned=True)
+    scene = make_scene(200, camera, seed=6, size=12.0)
+    inward = scene["means"] - camera.position
+    scene["means"] = camera.position + inward * torch.tensor([1.8, 1.9, 1.0], dtype=torch.float64)
+    ours, _, _ = check(scene, camera)
+    assert ours.visible.sum() > 20
+
+
+@pytest.mark.parametrize("stretch", [30.0, 3000.0])
+def test_needles(isa, make_camera, make_scene, stretch):
+    camera = make_camera(60, 40, turned=True)
+    scene = make_scene(60, camera, seed=7, size=1.0)
+    scene["scales"][:, 0] *= stretch
+    scene["scales"][:, 1:] *= 1e-3
+    check(scene, camera)
+
+
+def test_quaternions_of_any_length(isa, make_camera, make_scene):
+    camera = make_camera()
+    scene = make_scene(50, camera, seed=8)
+    scene["quats"][::5] = 0
+    scene["quats"][1::5] *= 1e-18
+    scene["quats"][2::5] *= 1e18
+    _, gradients, _ = check(scene, camera)
+    assert (gradients["quats"][::5] == 0).all()
+
+
+def test_flat_and_huge(isa, make_camera, make_scene):
+    camera = make_camera()
+    scene = make_scene(50, camera, seed=9)
+    scene["scales"][::4] = 0
+    scene["scales"][3::8] = 1e4
+    scene["opacities"][::10] = 0
+    check(scene, camera)
+
+
+def test_a_covariance_that_overflows_is_dropped(isa, make_camera, make_scene):
+    camera = rounded(make_camera())
+    scene = single(make_scene(50, camera, seed=9))
+    scene["scales"][1::8] = 1e25
+    v_image = torch.ones(camera.height, camera.width, 3)
+    ours, gradients = run(
+        scene, camera, RasterSettings(), "native", torch.float32, v_image, v_image[..., 0]
+    )
+    assert not ours.visible[1::8].any()
+    keep = torch.ones(50, dtype=torch.bool)
+    keep[1::8] = False
+    others = {name: value[keep] for name, value in scene.items()}
+    without, _ = run(others, camera, RasterSettings(), "native", torch.float32)
+    assert torch.equal(ours.image, without.image)
+    assert all((gradients[name][1::8] == 0).all() for name in NAMES)
+
+
+def test_equal_depths_go_by_index(isa, make_camera, make_scene):
+    camera = make_camera()
+    scene = make_scene(80, camera, seed=10)
+    scene["means"][:, 2] = 3.0
+    check(scene, camera)
+
+
+@pytest.mark.parametrize("count", [0, 5])
+def test_none_visible(isa, make_camera, make_scene, count):
+    camera = make_camera()
+    scene = make_scene(count, camera)
+    scene["means"][:, 2] = -5
+    raster = RasterSettings(background=(0.1, 0.2, 0.3))
+    ours, gradients, _ = check(scene, camera, raster)
+    assert torch.equal(ours.image, torch.tensor(raster.background).expand(14, 20, 3))
+    assert not ours.alpha.any()
+    assert ours.evaluations == 0
+    assert all((gradient == 0).all() for gradient in gradients.values())
+
+
+@pytest.mark.parametrize(("width", "height"), [(1, 1), (1, 33), (33, 1), (16, 16), (17, 15)])
+@pytest.mark.parametrize("count", [1, 15, 16, 17])
+def test_sizes(isa, make_camera, make_scene, width, height, count):
+    camera = make_camera(width, height)
+    check(make_scene(count, camera, seed=width + count), camera)
+
+
+@pytest.mark.parametrize("antialiased", [False, True])
+def test_absgrad(isa, make_camera, make_scene, antialiased):
+    camera = make_camera(50, 37, turned=True)
+    scene = make_scene(300, camera, seed=13, size=3.0)
+    raster = RasterSettings(antialiased=antialiased, background=(0.3, 0.6, 0.1))
+    _, plain, _ = check(scene, camera, raster)
+    _, absolute, _ = check(scene, camera, replace(raster, absgrad=True))
+    for name in NAMES:
+        assert torch.equal(absolute[name], plain[name]), name
+    offset = plain["means2d_offset"].abs()
+    assert (absolute["means2d_offset"] >= offset - 1e-4 * offset.max()).all()
+    assert absolute["means2d_offset"].sum() > 1.5 * offset.sum()
+
+
+def test_gradients_are_nearly_as_exact_as_float32_in_torch(make_camera, make_scene):
+    """In the median of many small scenes: 2.5 times torch's for scales, up to 1.6 for others."""
+    errors = {"native": {}, "torch": {}}
+    for seed in range(40):
+        camera = rounded(make_camera(9 + seed % 30, 7 + seed % 20, turned=bool(seed % 2)))
+        scene = single(make_scene(1 + seed % 12, camera, seed=seed, size=0.3 * (1 + seed % 20)))
+        exact, _ = run(scene, camera, RasterSettings(), "torch", torch.float64)
+        outside = (~band_of(scene, camera, RasterSettings(), exact.image, 3)).float()
+        generator = torch.Generator().manual_seed(seed)
+        v_image = torch.randn(*outside.shape, 3, generator=generator) * outside[..., None]
+        v_alpha = torch.randn(*outside.shape, generator=generator) * outside
+        slopes = (v_image, v_alpha)
+        _, expected = run(scene, camera, RasterSettings(), "torch", torch.float64, *slopes)
+        for backend, found in errors.items():
+            _, got = run(scene, camera, RasterSettings(), backend, torch.float32, *slopes)
+            for name, value in expected.items():
+                error = (got[name] - value).norm() / value.norm().clamp_min(1e-30)
+                found.setdefault(name, []).append(float(error))
+    for name in (*NAMES, "means2d_offset"):
+        native_error, torch_error = (median(errors[backend][name]) for backend in errors)
+        assert native_error <= 3 * torch_error, name
+
+
+@given(
+    seed=st.integers(0, 2**31),
+    count=st.integers(0, 80),
+    width=st.integers(1, 40),
+    height=st.integers(1, 40),
+    size=st.floats(0.1, 20.0),
+    stretch=st.floats(0.05, 20.0),
+    antialiased=st.booleans(),
+)
+@settings(max_examples=25, deadline=None)
+def test_random_scenes(
+    make_camera, make_scene, seed, count, width, height, size, stretch, antialiased
+):
+    camera = make_camera(width, height, turned=bool(seed % 2))
+    scene = make_scene(count, camera, seed=seed, size=size)
+    scene["scales"][::2, 0] *= stretch
+    scene["means"][1::7] -= 2 * (scene["means"][1::7] - camera.position)  # behind
+    check(scene, camera, RasterSettings(antialiased=antialiased, background=(0.3, 0.6, 0.1)))
+
+
+# --- what may be skipped ------------------------------------------------------------------------
+
+
+def render_with(skips, scene, camera):
+    """The render, its gradients, and what each skip is there to lessen."""
+    from xrgs.splat.native.rasterizer import render
+
+    leaves = {name: scene[name].clone().requires_grad_() for name in NAMES}
+    done = render(*leaves.values(), camera, RasterSettings(), 3, None, skips)
+    frame = done.image.grad_fn.frame
+    work = {
+        "out_of_view": int(done.visible.sum()),
+        "sub_threshold": int(done.visible.sum()),
+        "tiles": frame.pairs,
+        "blocks": done.evaluations,
+        "saturated": done.evaluations,
+    }
+    done.image.square().sum().backward()
+    return done, {name: leaf.grad for name, leaf in leaves.items()}, work
+
+
+@pytest.mark.parametrize("name", [*(field.name for field in fields(CullingOptions)), "all"])
+def test_what_is_skipped_makes_no_difference(isa, make_camera, make_scene, name):
+    camera = rounded(make_camera(60, 50, focal=60.0, turned=True))
+    scene = single(make_scene(1500, camera, seed=14, size=3.0))
+    scene["opacities"][::3] = 0.99
+    scene["opacities"][1::9] = torch.linspace(0, 1 / 255, 167)
+    scene["scales"][::4, 0] *= 8
+    scene["means"][::50] -= 100 * camera.viewmat[0, :3]  # far to the left
+    names = [field.name for field in fields(CullingOptions)] if name == "all" else [name]
+    usual, usual_gradients, usual_work = render_with(None, scene, camera)
+    done, gradients, work = render_with(
+        CullingOptions(**dict.fromkeys(names, False)), scene, camera
+    )
+    assert torch.equal(done.image, usual.image)
+    assert torch.equal(done.alpha, usual.alpha)
+    for key, gradient in gradients.items():
+        error = (gradient - usual_gradients[key]).norm()
+        assert error <= 1e-5 * usual_gradients[key].norm(), key
+        assert (gradient[~usual.visible] == 0).all(), key
+    for skipped in names:
+        assert work[skipped] > usual_work[skipped], skipped
+    exact, _ = run(scene, camera, RasterSettings(), "torch", torch.float64)
+    error = (done.image.double() - exact.image).abs().detach()
+    assert error.mean() <= 1e-6
+    assert error.max() <= 2e-3
+
+
+def test_a_large_scene_is_within_the_bounds(make_camera, make_scene):
+    camera = rounded(make_camera(150, 110, focal=120.0, turned=True))
+    scene = single(make_scene(20_000, camera, seed=12, size=2.0))
+    images = [
+        run(scene, camera, RasterSettings(), backend, dtype)[0].image.detach().double()
+        for backend, dtype in (("native", torch.float32), ("torch", torch.float64))
+    ]
+    error = (images[0] - images[1]).abs()
+    assert error.mean() <= 1e-6
+    assert error.max() <= 2e-3

@@ -1,0 +1,142 @@
+"""The way the renderer works: it makes no difference, and what it takes is counted."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from xrgs.splat.gaussians import PARAMETERS
+from xrgs.splat.settings import RasterSettings
+from xrgs.splat.torch import rasterizer as torch_rasterizer
+
+# --- how it is done makes no difference ---------------------------------------------------------
+
+
+def test_tiles_and_batches_make_no_difference(with_gradients, make_camera, make_scene, monkeypatch):
+    camera = make_camera(33, 21)
+    scene = make_scene(80, camera, seed=9, size=3.0)
+    renders = []
+    for tile, elements in ((8, 1 << 18), (4, 1 << 18), (16, 1 << 18), (64, 1 << 18), (8, 1)):
+        monkeypatch.setattr(torch_rasterizer, "BATCH_ELEMENTS", elements)
+        leaves = with_gradients(scene)
+        values = (leaves[name] for name in PARAMETERS)
+        render = torch_rasterizer.render(*values, camera, RasterSettings(), 3, None, tile=tile)
+        render.image.square().sum().backward()
+        renders.append((render.image, *(leaves[name].grad for name in PARAMETERS)))
+    for other in renders[1:]:
+        for ours, theirs in zip(renders[0], other, strict=True):
+            torch.testing.assert_close(ours, theirs, rtol=1e-11, atol=1e-11)
+
+
+def test_float32_is_float64_outside_a_band_around_the_thresholds(draw, make_camera, make_scene):
+    camera = make_camera(40, 30, turned=True)
+    scene = make_scene(300, camera, seed=11, size=3.0)
+    scene["scales"][::9, 0] *= 20
+    scene = {name: value.float().double() for name, value in scene.items()}
+    exact = draw(scene, camera).image
+    single = draw({name: value.float() for name, value in scene.items()}, camera).image.double()
+    base = RasterSettings()
+    band = torch.zeros(30, 40, dtype=torch.bool)
+    for factor in (1 - 1e-4, 1 + 1e-4):
+        for name in ("alpha_min", "transmittance_min"):
+            near = RasterSettings(**{name: getattr(base, name) * factor})
+            band |= (draw(scene, camera, near).image != exact).any(-1)
+    error = (single - exact).abs().amax(-1)
+    assert band.float().mean() < 0.1
+    assert error[~band].max() < 2e-5
+    assert error.max() < 2 * base.alpha_min * exact.max()
+
+
+def test_render_is_the_same_twice(draw, with_gradients, make_camera, make_scene):
+    camera = make_camera()
+    scene = make_scene(50, camera, dtype=torch.float32)
+    results = []
+    for _ in range(2):
+        leaves = with_gradients(scene)
+        render = draw(leaves, camera)
+        render.image.sum().backward()
+        results.append([render.image, *(leaves[name].grad for name in PARAMETERS)])
+    assert all(torch.equal(a, b) for a, b in zip(*results, strict=True))
+
+
+@given(
+    seed=st.integers(0, 2**31),
+    count=st.integers(0, 30),
+    width=st.integers(1, 24),
+    height=st.integers(1, 24),
+    stretch=st.floats(-25, 25),
+    dtype=st.sampled_from([torch.float32, torch.float64]),
+    antialiased=st.booleans(),
+)
+@settings(max_examples=40, deadline=None)
+def test_random_scenes(
+    draw,
+    with_gradients,
+    make_camera,
+    make_scene,
+    seed,
+    count,
+    width,
+    height,
+    stretch,
+    dtype,
+    antialiased,
+):
+    camera = make_camera(width, height, turned=bool(seed % 2))
+    scene = make_scene(count, camera, seed=seed, dtype=dtype)
+    scene["scales"][::2, 0] *= float(np.exp(stretch))
+    scene["means"][1::3] -= 2 * (scene["means"][1::3] - camera.position.to(dtype))  # behind
+    raster = RasterSettings(antialiased=antialiased, background=(1.0, 1.0, 1.0))
+    scene["sh0"][:] = 0.5 / 0.28209479177387814
+    scene["shN"][:] = 0
+    leaves = with_gradients(scene)
+    render = draw(leaves, camera, raster)
+    # All white before white is white, whatever hides what.
+    torch.testing.assert_close(
+        render.image, torch.ones(height, width, 3, dtype=dtype), atol=2e-6, rtol=0
+    )
+    assert ((render.alpha >= 0) & (render.alpha < 1)).all()
+    assert not render.visible[1::3].any()
+    render.image.square().mean().backward()
+    for name in PARAMETERS:
+        assert torch.isfinite(leaves[name].grad).all()
+        assert (leaves[name].grad[~render.visible] == 0).all()
+
+
+# --- what it took -------------------------------------------------------------------------------
+
+
+def test_evaluations_are_list_lengths_times_pixels(draw, single_pixel, pixel):
+    render = draw(single_pixel(3, opacity=0.5), pixel, sh_degree=0)
+    assert render.evaluations == 3 * torch_rasterizer.TILE**2
+
+
+@pytest.mark.parametrize("absgrad", [False, True])
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_bytes_of_a_batch_are_what_autograd_keeps(dtype, absgrad):
+    entries = torch.rand(3, 50, 11 if absgrad else 9, dtype=dtype).requires_grad_()
+    corner = torch.zeros(3, 2, dtype=dtype)
+    kept = {}
+
+    def keep(tensor):
+        storage = tensor.untyped_storage()
+        if tensor.numel() >= 3 * 50 * 64:
+            kept[storage.data_ptr()] = tensor.numel() * tensor.element_size()
+        return tensor
+
+    with torch.autograd.graph.saved_tensors_hooks(keep, lambda tensor: tensor):
+        torch_rasterizer.composite(entries, corner, 8, RasterSettings(absgrad=absgrad))
+    per_alpha = torch_rasterizer.alpha_bytes(dtype.itemsize, absgrad=absgrad)
+    assert sum(kept.values()) == 3 * 50 * 64 * per_alpha
+
+
+def test_buffer_bytes_grow_with_the_lists(draw, make_camera, make_scene):
+    camera = make_camera()
+    few, many = (
+        draw(make_scene(count, camera, dtype=torch.float32), camera) for count in (10, 400)
+    )
+    assert few.buffer_bytes > 14 * 20 * 4 * 4
+    assert many.buffer_bytes > 5 * few.buffer_bytes

@@ -1,0 +1,320 @@
+"""Cells that raise, are killed, crash, hang or eat all memory, in sweeps of real processes.
+
+The faults come from a `sitecustomize` of the test's own, which Python loads in every process: in a
+cell's child it stands in for `xrgs.experiment.cell`, and does to cells of some seeds what the test
+names.
+"""
+
+from __future__ import annotations
+
+import errno
+import json
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from xrgs.config import Conf
+from xrgs.experiment.store import Store, StoreError
+from xrgs.sweep import study as sweep
+from xrgs.sweep.jobs import worker
+
+#: Folder and faults -> `tests.conftest.Sweeps`.
+SweepsIn = Callable[..., Any]
+Ended = tuple[int, str, str]
+
+SMOKE = ("scene=motorcycle", "preset=smoke", "train.steps=4")
+FAULTS = """
+import sys
+if "xrgs.sweep.jobs.worker" in sys.orig_argv and "cell" in sys.orig_argv:
+    import ctypes, errno, importlib, os, signal, subprocess, time, types
+    from pathlib import Path
+
+    def real():
+        sys.modules.pop("xrgs.experiment.cell", None)
+        return importlib.import_module("xrgs.experiment.cell")
+
+    def raises(*arguments):
+        cell = real()
+        def load(*_):
+            raise RuntimeError("this cell raises")
+        cell.dataset.load = load
+        cell.run(*arguments)
+
+    def hangs(*_):
+        child = subprocess.Popen([sys.executable, "-S", "-c", "import time; time.sleep(600)"])
+        Path("hangs").touch()
+        time.sleep(600)
+
+    def eats(*_):
+        eaten = []
+        while True:
+            eaten.append(b"x" * 20_000_000)
+            time.sleep(0.01)
+
+    def finds_the_disk_full(*arguments):
+        def fsync(_):
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+        os.fsync = fsync
+        real().run(*arguments)
+
+    def run(conf, variant, folder):
+        fault = {
+            1: raises,
+            2: lambda *_: os.kill(os.getpid(), signal.SIGKILL),
+            3: lambda *_: ctypes.string_at(0),
+            4: hangs,
+            5: eats,
+            6: finds_the_disk_full,
+        }.get(conf.seed)
+        if fault is None:
+            real().run(conf, variant, folder)
+        else:
+            fault(conf, variant, folder)
+
+    sys.modules["xrgs.experiment.cell"] = types.ModuleType("xrgs.experiment.cell")
+    sys.modules["xrgs.experiment.cell"].run = run
+"""
+
+
+def status(cell: Path) -> dict[str, str]:
+    return dict(json.loads((cell / "status.json").read_text()))
+
+
+def files(cell: Path) -> dict[str, tuple[int, bytes]]:
+    """Time and content of every file."""
+    found = [file for file in cell.rglob("*") if file.is_file()]
+    return {file.name: (file.stat().st_mtime_ns, file.read_bytes()) for file in found}
+
+
+@pytest.fixture(scope="module")
+def built(sweeps_in: SweepsIn, tmp_path_factory: pytest.TempPathFactory) -> tuple[Any, Ended]:
+    """A store with a sweep of a cell of most faults and a healthy one; how that ended."""
+    sweeps = sweeps_in(tmp_path_factory.mktemp("faults"), FAULTS)
+    return sweeps, sweeps.run(*SMOKE, "seed=1,2,3,5,0", "limits.memory_gb=1.2")
+
+
+@pytest.fixture
+def sweeps(built: tuple[Any, Ended], sweeps_in: SweepsIn, tmp_path: Path) -> Any:
+    """On a copy of that store."""
+    shutil.copytree(built[0].folder / "s", tmp_path / "s")
+    return sweeps_in(tmp_path, FAULTS)
+
+
+@pytest.fixture(scope="module")
+def stopped(
+    built: tuple[Any, Ended], sweeps_in: SweepsIn, tmp_path_factory: pytest.TempPathFactory
+) -> tuple[Any, dict[str, Ended]]:
+    """On another copy, sweeps that did not come to their end, and what they said of it.
+
+    One found the disk full; others had a signal while a cell hung, which `seen` was looked at.
+    """
+    sweeps = sweeps_in(tmp_path_factory.mktemp("stopped"), FAULTS)
+    shutil.copytree(built[0].folder / "s", sweeps.folder / "s")
+    told = {"full": sweeps.run(*SMOKE, "seed=6,7,0")}
+    for number in (signal.SIGTERM, signal.SIGINT, signal.SIGKILL):
+        sweep = sweeps.start(*SMOKE, "seed=4")
+        wait_for(sweeps.folder / "hangs", sweep.process)
+        if number == signal.SIGKILL:
+            told["seen"] = sweeps.start(*SMOKE, "seed=4", "dry_run=true").end()
+            assert f"by process {sweep.process.pid} on" in told["seen"][2]
+        sweep.process.send_signal(number)
+        told[number.name] = sweep.end()
+        sweeps.leave_nothing_running()
+        (sweeps.folder / "hangs").unlink()
+    return sweeps, told
+
+
+def wait_for(file: Path, process: subprocess.Popen[bytes]) -> None:
+    end = time.monotonic() + 60
+    while not file.exists():
+        assert process.poll() is None
+        assert time.monotonic() < end
+        time.sleep(0.01)
+
+
+def test_each_fault_is_its_cell_s_status_and_the_others_finish(built: tuple[Any, Ended]) -> None:
+    sweeps, (code, out, err) = built
+    assert code == 1, err
+    found = sweeps.cells()
+    assert status(found[0])["state"] == "done"
+    reasons = {
+        1: "RuntimeError: this cell raises",
+        2: "its process was ended by SIGKILL",
+        3: "its process was ended by SIGSEGV",
+        5: "limits.memory_gb=1.2",
+    }
+    for seed, reason in reasons.items():
+        assert status(found[seed])["state"] == "failed"
+        assert reason in status(found[seed])["reason"]
+        assert reason in (found[seed] / "error.txt").read_text()
+        assert (found[seed] / "log.txt").is_file()
+        assert reason in err
+        assert reason.partition(":")[0] in out  # the table says why too
+    assert "Traceback" in (found[1] / "error.txt").read_text()
+    assert "Segmentation fault" in (found[3] / "log.txt").read_text()
+    assert out.count("failed") >= 4
+    assert not list((sweeps.folder / "s" / "locks").iterdir())
+
+
+def test_a_cell_that_hangs_is_ended_at_its_limit_and_fail_fast_starts_nothing_more(
+    sweeps: Any,
+) -> None:
+    before = files(sweeps.cells()[2])
+    code, out, err = sweeps.run(*SMOKE, "seed=2,4,7", "limits.minutes=0.05", "fail_fast=true")
+    assert code == 1
+    assert (sweeps.folder / "hangs").exists()
+    assert "limits.minutes=0.05" in status(sweeps.cells()[4])["reason"]
+    assert "limits.minutes=0.05" in err
+    assert err.count("training cell") == 1
+    assert 7 not in sweeps.cells()
+    # What had failed is left as it was, for nobody has asked for another try.
+    assert files(sweeps.cells()[2]) == before
+    assert "retry=failed" in err
+    assert "SIGKILL" in out
+
+
+def test_a_full_disk_stops_the_sweep_and_costs_no_cell(
+    stopped: tuple[Any, dict[str, Ended]],
+) -> None:
+    sweeps, told = stopped
+    code, _, err = told["full"]
+    assert code == 1
+    assert "is the disk full?" in err  # there was no room for the reason either
+    assert "What is done is kept" in err
+    assert 7 not in sweeps.cells()  # nothing more is tried
+    assert not (sweeps.cells()[6] / "status.json").exists()
+
+
+@pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
+def test_a_signal_ends_the_sweep_with_its_cell_and_says_how_to_go_on(
+    stopped: tuple[Any, dict[str, Ended]], number: signal.Signals, code: int
+) -> None:
+    _, told = stopped
+    ended, _, err = told[number.name]
+    assert ended == code
+    assert err.splitlines()[-1] == (
+        f"stopped by {number.name}. What is done is kept: the same command goes on from there."
+    )
+    assert "Traceback" not in err
+
+
+def test_a_killed_sweep_is_taken_over_and_two_at_once_train_each_cell_once(
+    stopped: tuple[Any, dict[str, Ended]],
+) -> None:
+    """What failed, what was stopped and what a full disk had no room for, in one go."""
+    sweeps, told = stopped
+    assert told["SIGKILL"][0] == -signal.SIGKILL
+    assert "running" in told["seen"][2]
+    assert [file.name for file in (sweeps.folder / "s" / "locks").iterdir()] == [
+        f"{sweeps.cells()[4].name}.0"
+    ]
+    before = files(sweeps.cells()[0])
+    arguments = (*SMOKE, "seed=2,4,6,0", "retry=failed")
+    both = [sweeps.start(*arguments, faults=False) for _ in range(2)]
+    printed = [sweep.end() for sweep in both]
+    sweeps.leave_nothing_running()
+    assert [code for code, *_ in printed] == [0, 0], printed
+    assert sum(err.count("training cell") for *_, err in printed) == 3
+    assert any("unfinished" in err for *_, err in printed)
+    (table, other) = (out for _, out, _ in printed)
+    assert table == other
+    assert "failed" not in table
+    assert all(status(sweeps.cells()[seed])["state"] == "done" for seed in (2, 4, 6))
+    assert files(sweeps.cells()[0]) == before
+    assert not list((sweeps.folder / "s" / "locks").iterdir())
+
+
+#: In a mount namespace of its own: the store moves to a small disk, which is full, has hardly any
+#: room, can't be written, and has room.
+_SMALL_DISK = """
+import os, shutil, subprocess, sys
+from pathlib import Path
+
+def call(title, *arguments):
+    command = [sys.executable, "-c", "from xrgs.cli.sweep import main; main()", *arguments]
+    done = subprocess.run(command, capture_output=True, text=True)
+    print(title, done.returncode, done.stderr.replace("\\n", " "), flush=True)
+
+def leave(kilobytes):
+    Path("s/filler").unlink(missing_ok=True)
+    disk = os.statvfs("s")
+    with open("s/filler", "wb") as filler:
+        filler.write(bytes(disk.f_bavail * disk.f_frsize - 1024 * kilobytes))
+
+def mount(options):
+    subprocess.run(["mount", "-t", "tmpfs", "-o", options, "tmpfs", "s"], check=True)
+
+shutil.move("s", "before")
+os.mkdir("s")
+mount("size=64m")
+shutil.copytree("before", "s", dirs_exist_ok=True)
+for title, room in ("full", 0), ("tight", 40):
+    leave(room)
+    call(title, *sys.argv[1:], "seed=8,9,0")
+mount("remount,ro")
+call("read-only", *sys.argv[1:], "seed=8,9,0")
+mount("remount,rw")
+os.unlink("s/filler")
+call("room", *sys.argv[1:], "seed=8,9,0", "dry_run=true")
+shutil.copytree("s", "after")
+"""
+
+
+def test_a_disk_that_takes_no_more_is_said_and_loses_nothing(sweeps: Any) -> None:
+    own = ["unshare", "--map-root-user", "--mount"]
+    probe = [*own, "mount", "-t", "tmpfs", "tmpfs", str(sweeps.folder)]
+    if shutil.which("unshare") is None or subprocess.run(probe, check=False).returncode:
+        pytest.skip("this system lets nobody mount a small disk")
+    done = subprocess.run(
+        [*own, sys.executable, "-c", _SMALL_DISK, *SMOKE, "threads=1", "store=s"],
+        cwd=sweeps.folder,
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    told = {line.split()[0]: line.split(maxsplit=2)[1:] for line in done.stdout.splitlines()}
+    for title, why in (
+        ("full", "No space left on device"),
+        ("tight", "No space left on device"),
+        ("read-only", "Read-only file system"),
+    ):
+        code, err = told[title]
+        assert code == "1", done.stdout
+        assert why in err
+        assert "store=s" in err
+        assert "Traceback" not in err
+        assert "What is done is kept" in err or "name another with store=" in err
+    code, plan = told["room"]
+    assert code == "0"
+    assert "3 cells, 1 done" in plan
+    assert "failed " not in plan
+    healthy = sweeps.folder / "before" / "cells"
+    for cell in healthy.iterdir():
+        assert files(sweeps.folder / "after" / "cells" / cell.name).keys() == files(cell).keys()
+
+
+def test_a_library_that_dies_of_a_full_disk_is_no_fault_of_the_scene_s(
+    compose: Callable[..., Conf], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    store = Store(tmp_path / "s")
+    store.prepare()
+
+    def full(**_: object) -> None:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    def dies(*_: object) -> dict[str, Any]:
+        monkeypatch.setattr(tempfile, "TemporaryFile", full)
+        raise worker.WorkerError("its process was ended by SIGABRT")
+
+    monkeypatch.setattr(worker, "run", dies)
+    with pytest.raises(StoreError, match="No space left"):
+        sweep._variant_of(compose("scene=motorcycle"), store, build=True)

@@ -1,0 +1,207 @@
+"""`kill -9` at random moments of a sweep: run again, it ends as if it had not been killed.
+
+`XRGS_KILLS=20 pytest tests/jobs/test_kill.py --log-cli-level=info` kills so often and tells of it;
+`XRGS_KILL_SEED=N` draws the moments again that a failure names.
+"""
+
+from __future__ import annotations
+
+import json
+import logging
+import os
+import random
+import shutil
+import signal
+import time
+from collections.abc import Callable
+from contextlib import suppress
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+_log = logging.getLogger(__name__)
+
+#: Two cells. A checkpoint after nearly every step makes training long enough to be hit.
+ARGUMENTS = (
+    "scene=motorcycle",
+    "preset=smoke",
+    "train.steps=40",
+    "+ablation=xrgs",
+    "checkpoint_s=0.001",
+    "retry=failed",
+    "fail_fast=true",
+)
+CELLS = 2
+#: Where a sweep comes by, in order: what is written there first, and about how many seconds it
+#: stays. `start` to `finish` are of each cell.
+STATIONS = {
+    "plan": ("-", 0.5),
+    "build": ("variants/.*.building", 2.0),
+    "start": ("cells/*/config.json", 2.0),
+    "train": ("cells/*/checkpoint.npz", 0.5),
+    "evaluate": ("cells/*/renders", 0.1),
+    "finish": ("cells/*/scores.csv", 0.02),
+    "report": ("sweeps/*.json", 1.0),
+}
+
+
+@dataclass(frozen=True, order=True)
+class Moment:
+    """When to kill, and whom. They are ordered as a sweep comes by, killed and run again."""
+
+    done: int
+    """Cells that are done."""
+    station: int
+    later: float
+    """Seconds since it came there."""
+    worker: bool
+    """Whether to kill the process that builds or trains, if there is one; else the sweep."""
+
+    @property
+    def place(self) -> str:
+        return list(STATIONS)[self.station]
+
+
+def drawn(count: int, chance: random.Random) -> list[Moment]:
+    """Random moments, one of them in training; each station has its turn before one has two."""
+    places = list(STATIONS)
+    turns = ["train", *chance.sample([name for name in places if name != "train"], len(places) - 1)]
+    moments = []
+    for turn in range(count):
+        name = turns[turn % len(turns)]
+        done = {"build": 0, "report": CELLS}.get(name, chance.randrange(CELLS))
+        later = chance.uniform(0, STATIONS[name][1])
+        moments.append(Moment(done, places.index(name), later, chance.random() < 0.5))
+    return sorted(moments)
+
+
+class Story:
+    """A store whose sweeps are killed, and what of it was done by then."""
+
+    def __init__(self, sweeps: Any) -> None:
+        self.sweeps = sweeps
+        self.store = sweeps.folder / "s"
+        self.finished: dict[str, dict[str, tuple[int, ...]]] = {}
+
+    def done(self) -> list[Path]:
+        """Folders of the cells that say that they are done."""
+        found = []
+        for status in self.store.glob("cells/*/status.json"):
+            with suppress(FileNotFoundError):  # set aside just now
+                if json.loads(status.read_text())["state"] == "done":
+                    found.append(status.parent)
+        return found
+
+    def check(self) -> None:
+        """Assert that what was done is as it was: the same files, not written again."""
+        now = {cell.name: contents(cell) for cell in self.done()}
+        for cell, files in self.finished.items():
+            assert now[cell] == files
+        self.finished = now
+
+    def kill(self, moment: Moment) -> str:
+        """Start a sweep and kill it; what was killed, empty where it came to its end before."""
+        before, done = self._signs(moment), len(self.done())
+        sweep = self.sweeps.start(*ARGUMENTS)
+        while sweep.process.poll() is None and not self._is_at(moment, before):
+            time.sleep(0.002)
+        time.sleep(moment.later)
+        if sweep.process.poll() is not None:
+            return ""
+        workers = {
+            pid: line.split()[-2:]
+            for pid, line in self.sweeps.processes().items()
+            if "xrgs.sweep.jobs.worker" in line
+        }
+        victim = next(iter(workers), 0) if moment.worker else 0
+        with suppress(ProcessLookupError):
+            os.kill(victim or sweep.process.pid, signal.SIGKILL)
+        if victim and (len(self.done()) > done or has_answered(*workers[victim])):
+            sweep.process.kill()  # what the worker was to do is done: the sweep goes on to more
+        code, out, err = sweep.end()
+        self.sweeps.leave_nothing_running()
+        if code != -signal.SIGKILL:
+            assert code == 1, err
+            assert "SIGKILL" in out + err
+        return "worker" if victim else "sweep"
+
+    def _is_at(self, moment: Moment, before: set[tuple[Path, int, int]]) -> bool:
+        """Whether the sweep that was started last has come there, or beyond."""
+        done, signs = self.done(), self._signs(moment) - before
+        return moment.place == "plan" or (
+            len(done) >= moment.done and any(file.parent not in done for file, *_ in signs)
+        )
+
+    def _signs(self, moment: Moment) -> set[tuple[Path, int, int]]:
+        """What stations from this one on have left; who writes it again makes another of it."""
+        found = set()
+        for pattern, _ in list(STATIONS.values())[moment.station :]:
+            for file in self.store.glob(pattern):
+                with suppress(FileNotFoundError):
+                    stat = file.stat()
+                    found.add((file, stat.st_ino, stat.st_mtime_ns))
+        return found
+
+
+def has_answered(request: str, answer: str) -> bool:
+    """Whether a worker had, when it was killed; its folder goes when the sweep has read that."""
+    return Path(answer).exists() or not Path(request).exists()
+
+
+def contents(cell: Path) -> dict[str, tuple[int, ...]]:
+    """Inode, time and size of every file, but of a checkpoint that a kill has left."""
+    stats = {file: file.stat() for file in cell.rglob("*") if file.name != "checkpoint.npz"}
+    return {
+        file.relative_to(cell).as_posix(): (stat.st_ino, stat.st_mtime_ns, stat.st_size)
+        for file, stat in stats.items()
+    }
+
+
+def results(cell: Path) -> dict[str, Any]:
+    """All that a cell gives but where its store is, times and this machine's memory."""
+    summary = json.loads((cell / "summary.json").read_text())
+    del summary["training_time_s"], summary["peak_rss_bytes"]
+    names = sorted(json.loads((cell / "status.json").read_text())["files"])
+    told = {"config.json", "provenance.json", "summary.json"}
+    return {"names": names, "summary": summary} | {
+        name: (cell / name).read_bytes() for name in names if name not in told
+    }
+
+
+def test_a_sweep_killed_again_and_again_ends_as_if_it_had_not_been(
+    sweeps_in: Callable[[Path], Any], tmp_path: Path
+) -> None:
+    seed = int(os.environ.get("XRGS_KILL_SEED", random.randrange(10**6)))
+    moments = drawn(int(os.environ.get("XRGS_KILLS", "4")), random.Random(seed))
+    _log.info("XRGS_KILLS=%d XRGS_KILL_SEED=%d", len(moments), seed)
+    (tmp_path / "killed").mkdir()
+    (tmp_path / "spared" / "s").mkdir(parents=True)
+    story = Story(sweeps_in(tmp_path / "killed"))
+    for moment in moments:
+        start = time.monotonic()
+        victim = story.kill(moment) or story.kill(replace(moment, later=0))
+        _log.info(
+            "%d done, %s + %.2f s: %s killed, %.1f s in all",
+            *(moment.done, moment.place, moment.later, victim or "nothing"),
+            time.monotonic() - start,
+        )
+        story.check()
+        assert victim
+
+    code, _, err = story.sweeps.run(*ARGUMENTS)
+    assert code == 0, err
+    assert err.count("training cell") == CELLS - len(story.finished)
+    story.check()
+    assert len(story.finished) == CELLS
+
+    spared = Story(sweeps_in(tmp_path / "spared"))
+    shutil.copytree(story.store / "variants", spared.store / "variants")
+    code, _, err = spared.sweeps.run(*ARGUMENTS)
+    assert code == 0, err
+    assert {cell.name: results(cell) for cell in story.done()} == {
+        cell.name: results(cell) for cell in spared.done()
+    }
+    logs = [(cell / "log.txt").read_text() for cell in story.done()]
+    assert any("going on from the checkpoint" in log for log in logs)
+    for pattern in ("cells/*/.*", "cells/*/checkpoint.npz", "locks/[!.]*"):
+        assert not list(story.store.glob(pattern))

@@ -1,0 +1,121 @@
+"""A process under limits: whatever it does, it ends, with all that it started."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from xrgs.errors import XrgsError
+from xrgs.sweep.jobs import supervise
+from xrgs.sweep.jobs.supervise import Limits
+
+#: Starts a child of its own, writes both their numbers, refuses to end, and hangs.
+_STUBBORN = """
+import json, os, signal, subprocess, sys, time
+from pathlib import Path
+from xrgs.sweep.jobs import supervise
+supervise.follow_parent()
+signal.signal(signal.SIGTERM, signal.SIG_IGN)
+child = subprocess.Popen([sys.executable, "-c", "import time; time.sleep(600)"])
+file = Path(sys.argv[1])
+file.with_suffix(".part").write_text(json.dumps([os.getpid(), child.pid]))
+file.with_suffix(".part").rename(file)
+time.sleep(600)
+"""
+_HUNGRY = """
+import time
+eaten = []
+for _ in range(100):
+    eaten.append(b"x" * 10_000_000)
+    time.sleep(0.02)
+"""
+
+
+def python(script: str, *arguments: str) -> list[str]:
+    return [sys.executable, "-c", script, *arguments]
+
+
+def gone(pid: int) -> bool:
+    try:
+        state = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0]
+    except OSError:
+        return True
+    return state in "ZX"
+
+
+def wait(what: Callable[[], bool], seconds: float = 30.0) -> None:
+    end = time.monotonic() + seconds
+    while not what():
+        assert time.monotonic() < end
+        time.sleep(0.02)
+
+
+def test_what_ends_by_itself_gives_its_code_or_signal() -> None:
+    assert supervise.run(python("raise SystemExit(3)"), Limits()) == supervise.Ended(3)
+    script = "import os; os.kill(os.getpid(), 9)"
+    assert supervise.run(python(script), Limits(1, 1)) == supervise.Ended(-signal.SIGKILL)
+
+
+def test_what_hangs_is_killed_with_its_children_though_it_refuses(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(supervise, "_GRACE_S", 0.5)
+    pids = tmp_path / "pids"
+    ended = supervise.run(python(_STUBBORN, str(pids)), Limits(minutes=0.08))
+    assert "limits.minutes=0.08" in ended.reason
+    for pid in json.loads(pids.read_text()):
+        wait(lambda pid=pid: gone(pid))
+
+
+@pytest.mark.parametrize("by", ["itself", "its child"])
+def test_memory_is_that_of_the_process_and_its_children(by: str) -> None:
+    eats = _HUNGRY
+    if by == "its child":
+        eats = f"import subprocess, sys; subprocess.run([sys.executable, '-c', {_HUNGRY!r}])"
+    ended = supervise.run(python(eats), Limits(memory_gb=0.2))
+    assert "limits.memory_gb=0.2" in ended.reason
+    assert supervise.run(python(_HUNGRY), Limits(memory_gb=4)).reason == ""
+
+
+def test_memory_that_nobody_tells_of_is_not_limited_in_silence(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(Path, "exists", lambda _: False)
+    with pytest.raises(XrgsError, match=r"limits\.memory_gb"):
+        supervise.run(python(""), Limits(memory_gb=1))
+
+
+def test_an_objection_ends_it() -> None:
+    asked = []
+
+    def on_poll(pid: int) -> None:
+        asked.append(pid)
+        if len(asked) == 2:
+            raise XrgsError("enough")
+
+    with pytest.raises(XrgsError, match="enough"):
+        supervise.run(python("import time; time.sleep(600)"), Limits(), on_poll)
+    assert gone(asked[-1])
+
+
+@pytest.mark.parametrize("how", [signal.SIGKILL, signal.SIGTERM, signal.SIGINT])
+def test_no_child_outlives_its_parent(tmp_path: Path, how: signal.Signals) -> None:
+    pids = tmp_path / "pids"
+    script = (
+        "import sys; from xrgs.sweep.jobs import supervise; supervise._GRACE_S = 0.1;"
+        "supervise.run(sys.argv[1:], supervise.Limits())"
+    )
+    command = python(script, *python(_STUBBORN, str(pids)))
+    with subprocess.Popen(command, stderr=subprocess.DEVNULL) as parent:
+        wait(pids.exists)
+        os.kill(parent.pid, how)
+    for pid in json.loads(pids.read_text()):
+        wait(lambda pid=pid: gone(pid))

@@ -1,0 +1,91 @@
+"""A step on an HR view and one on an LR view, and the components of a config."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import pytest
+import torch
+from torch import Tensor
+
+from xrgs.capture.dataset import Dataset, LoadedView
+from xrgs.config import ComponentsConf, Conf
+from xrgs.splat.cameras import Camera
+from xrgs.splat.gaussians import PARAMETERS, Gaussians
+from xrgs.training import components
+from xrgs.training.components import Components, Step, TrainingView
+
+FACTOR = 5
+
+
+def _noise(height: int, width: int, seed: int) -> Tensor:
+    generator = torch.Generator().manual_seed(seed)
+    return torch.rand(height, width, 3, generator=generator, dtype=torch.float64)
+
+
+def _view(tag: str, image: Tensor) -> LoadedView:
+    height, width = image.shape[:2]
+    K = torch.tensor([[1.2 * width, 0, width / 2], [0, 1.2 * width, height / 2], [0, 0, 1]])
+    camera = Camera(torch.eye(4), K, width, height)
+    return LoadedView(tag.lower(), tag, camera, image)
+
+
+@pytest.fixture
+def noise() -> Callable[[int, int, int], Tensor]:
+    """(height, width, seed) -> a float64 image [H, W, 3] in 0..1."""
+    return _noise
+
+
+@pytest.fixture
+def make_view() -> Callable[[str, Tensor], TrainingView]:
+    """(tag, image) -> a view named as its tag in small letters."""
+    return _view
+
+
+@pytest.fixture
+def steps() -> dict[str, Step]:
+    """The first step of 30,000, on a view of each tag; the LR view is 5 times smaller."""
+    views = (_view("HR", _noise(60, 75, 0)), _view("LR", _noise(12, 15, 1)))
+    return {view.tag: Step(0, 30_000, view) for view in views}
+
+
+@pytest.fixture
+def hr(steps: dict[str, Step]) -> Step:
+    return steps["HR"]
+
+
+@pytest.fixture
+def lr(steps: dict[str, Step]) -> Step:
+    return steps["LR"]
+
+
+@pytest.fixture
+def off(baseline: Conf) -> ComponentsConf:
+    """Every component off, as the baseline has it; for a test to switch on what it is about."""
+    return baseline.components
+
+
+@pytest.fixture
+def build(baseline: Conf, hr: Step, lr: Step) -> Callable[..., Components]:
+    """(config, *views) -> its components; the views are `hr`'s and `lr`'s where none is given."""
+
+    def built(conf: ComponentsConf, *views: LoadedView) -> Components:
+        points = torch.rand(50, 3, generator=torch.Generator().manual_seed(2)) + 1
+        data = Dataset(views or (hr.view, lr.view), (), points, points, 1.0, FACTOR)
+        return components.build(conf, data, baseline.splat)
+
+    return built
+
+
+@pytest.fixture
+def gaussians() -> Gaussians:
+    """Six, with a gradient in every value."""
+    shapes = {"means": (3,), "quats": (4,), "scales": (3,), "opacities": (), "sh0": (1, 3)}
+    generator = torch.Generator().manual_seed(0)
+    values = {
+        name: torch.randn(6, *shapes.get(name, (3, 3)), generator=generator).requires_grad_()
+        for name in PARAMETERS
+    }
+    for value in values.values():
+        value.grad = torch.randn(value.shape, generator=generator)
+    return Gaussians(**values)

@@ -1,0 +1,209 @@
+"""Paper 5.6 against its formula in float64, and its cheaper modes against the exact one."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from xrgs.config import ComponentsConf
+from xrgs.errors import XrgsError
+from xrgs.splat.resample import resize
+from xrgs.training.components import Components, Step, TrainingView
+from xrgs.training.components.consistency import Consistency
+
+HR_SIZE, LR_SIZE = (60, 75), (12, 15)
+
+Build = Callable[..., Components]
+Noise = Callable[[int, int, int], Tensor]
+MakeView = Callable[[str, Tensor], TrainingView]
+
+
+@pytest.fixture
+def on(off: ComponentsConf) -> ComponentsConf:
+    off.consistency.weight = 0.1
+    return off
+
+
+def loss_of(parts: Components, image: Tensor, step: Step, base: float = 0.0) -> float:
+    return parts.loss(torch.tensor(base, dtype=torch.float64), image, step).item()
+
+
+def keys_matrix(size: int, target: int) -> NDArray[np.float64]:
+    """[target, size]: Keys' cubic convolution (a = -0.5), stretched when it shrinks."""
+    step = size / target
+    stretch = max(step, 1.0)
+    centre = (np.arange(target)[:, None] + 0.5) * step
+    t = np.abs(np.arange(size)[None] + 0.5 - centre) / stretch
+    near = 1.5 * t**3 - 2.5 * t**2 + 1
+    far = -0.5 * t**3 + 2.5 * t**2 - 4 * t + 2
+    weights = np.where(t < 1, near, np.where(t < 2, far, 0))
+    return weights / weights.sum(axis=1, keepdims=True)
+
+
+def phi(image: Tensor, height: int, width: int) -> NDArray[np.float64]:
+    rows = keys_matrix(image.shape[0], height)
+    columns = keys_matrix(image.shape[1], width)
+    return np.einsum("ah,hwc,bw->abc", rows, image.numpy(), columns)
+
+
+def paper_5_6(image: Tensor, view: TrainingView, *, weight: float, l1: float, ssim: float) -> float:
+    """The formula of the paper, in numpy and scikit-image."""
+    from skimage.metrics import structural_similarity
+
+    size = LR_SIZE if view.tag == "HR" else HR_SIZE
+    projected, pair = phi(image, *size), phi(view.image, *size)
+    similarity = structural_similarity(
+        projected,
+        pair,
+        gaussian_weights=True,
+        sigma=1.5,
+        use_sample_covariance=False,
+        data_range=1.0,
+        channel_axis=-1,
+    )
+    return weight * (l1 * float(np.abs(projected - pair).mean()) + ssim * (1 - similarity))
+
+
+@pytest.mark.parametrize("tag", ["HR", "LR"])
+@pytest.mark.parametrize(("l1", "ssim"), [(0.8, 0.2), (1.0, 0.0), (0.0, 1.0)])
+def test_it_is_the_papers_formula(
+    tag: str,
+    l1: float,
+    ssim: float,
+    build: Build,
+    on: ComponentsConf,
+    steps: dict[str, Step],
+    noise: Noise,
+) -> None:
+    step = steps[tag]
+    photograph = step.view.image
+    image = photograph + 0.4 * (noise(photograph.shape[0], photograph.shape[1], 7) - 0.5)
+    expected = paper_5_6(image, step.view, weight=0.1, l1=l1, ssim=ssim)
+    assert expected > 1e-4
+    on.consistency.l1, on.consistency.ssim = l1, ssim
+    value = loss_of(build(on), image, step, base=0.5)
+    assert value == pytest.approx(0.5 + expected, rel=1e-9)
+    assert step.log == {f"consistency.{tag}": pytest.approx(expected)}
+
+
+@pytest.mark.parametrize("tag", ["HR", "LR"])
+def test_a_render_of_the_photograph_is_consistent(
+    tag: str, build: Build, on: ComponentsConf, steps: dict[str, Step]
+) -> None:
+    step = steps[tag]
+    assert loss_of(build(on), step.view.image, step) == pytest.approx(0, abs=1e-12)
+
+
+@pytest.mark.parametrize("tag", ["HR", "LR"])
+def test_its_gradient_reaches_the_render(
+    tag: str, build: Build, on: ComponentsConf, steps: dict[str, Step]
+) -> None:
+    image = (steps[tag].view.image * 0.9).requires_grad_()
+    build(on).loss(torch.tensor(0.0, dtype=torch.float64), image, steps[tag]).backward()
+    assert image.grad is not None
+    assert (image.grad != 0).float().mean() > 0.9
+
+
+def test_the_weight_of_a_view_multiplies_its_consistency(
+    build: Build, on: ComponentsConf, lr: Step
+) -> None:
+    image = lr.view.image * 0.8
+    alone = loss_of(build(on), image, lr)
+    assert alone > 0
+    on.loss_weighting.lr_weight = 0.25
+    assert loss_of(build(on), image, lr, base=0.5) == pytest.approx(0.25 * (0.5 + alone))
+
+
+def test_pairs_are_made_once(build: Build, on: ComponentsConf, hr: Step) -> None:
+    (consistency,) = build(on)
+    assert isinstance(consistency, Consistency)
+    sizes = {name: tuple(pair.image.shape) for name, pair in consistency.pairs.items()}
+    assert sizes == {"hr": (*LR_SIZE, 3), "lr": (*HR_SIZE, 3)}
+    before = dict(consistency.pairs)
+    consistency.loss(torch.tensor(0.0), hr.view.image, hr)
+    assert all(consistency.pairs[name] is pair for name, pair in before.items())
+
+
+def test_off_leaves_lr_views_alone(build: Build, on: ComponentsConf, hr: Step, lr: Step) -> None:
+    expected = loss_of(build(on), hr.view.image * 0.8, hr)
+    on.consistency.lr_mode = "off"
+    parts = build(on)
+    loss = torch.tensor(0.5, dtype=torch.float64)
+    assert parts.loss(loss, lr.view.image * 0.8, lr) is loss
+    assert loss_of(parts, hr.view.image * 0.8, hr, base=0.5) == pytest.approx(0.5 + expected)
+
+
+def test_fold_is_more_weight_on_l1(
+    build: Build, on: ComponentsConf, hr: Step, lr: Step, noise: Noise
+) -> None:
+    exact = loss_of(build(on), hr.view.image * 0.8, hr)
+    image = lr.view.image + 0.3 * (noise(*LR_SIZE, 3) - 0.5)
+    error = np.abs(image.numpy() - lr.view.image.numpy()).mean()
+    on.consistency.lr_mode = "fold"
+    parts = build(on)
+    assert loss_of(parts, image, lr, base=0.5) == pytest.approx(0.5 + 0.1 * 0.8 * error, rel=1e-12)
+    # HR views are as in the other modes.
+    assert loss_of(parts, hr.view.image * 0.8, hr) == exact
+    (consistency,) = parts
+    assert isinstance(consistency, Consistency)
+    assert set(consistency.pairs) == {"hr"}  # nothing is upsampled
+
+
+@pytest.mark.parametrize(
+    ("kind", "low", "high"),
+    [("one sign", 0.99, 1.01), ("smooth", 0.99, 1.01), ("white", 1.15, 1.3)],
+)
+def test_how_far_fold_is_from_exact(
+    kind: str,
+    low: float,
+    high: float,
+    build: Build,
+    on: ComponentsConf,
+    noise: Noise,
+    make_view: MakeView,
+) -> None:
+    size = (40, 50)
+    error = {
+        "one sign": noise(*size, 5),
+        "smooth": resize(noise(4, 5, 5) - 0.5, *size),
+        "white": torch.randn(
+            *size, 3, generator=torch.Generator().manual_seed(5), dtype=torch.float64
+        ),
+    }[kind]
+    step = Step(0, 1, make_view("LR", noise(*size, 6)))
+    on.consistency.l1, on.consistency.ssim = 1.0, 0.0
+    value = {}
+    for on.consistency.lr_mode in ("fold", "exact"):
+        parts = build(on, step.view)
+        value[on.consistency.lr_mode] = loss_of(parts, step.view.image + error, step)
+    assert low < value["fold"] / value["exact"] < high
+
+
+@pytest.mark.parametrize("size", [(10, 15), (15, 10)])
+def test_an_lr_image_smaller_than_the_window_is_refused(
+    size: tuple[int, int], build: Build, on: ComponentsConf, noise: Noise, make_view: MakeView
+) -> None:
+    view = make_view("HR", noise(size[0] * 5, size[1] * 5, 0))
+    with pytest.raises(XrgsError, match=rf"variant\.factor=5: view hr.*{size[1]} x {size[0]} px"):
+        build(on, view)
+
+
+def test_an_unknown_mode_is_refused(build: Build, on: ComponentsConf) -> None:
+    on.consistency.lr_mode = "folded"
+    with pytest.raises(XrgsError, match=r"^components\.consistency\.lr_mode=folded"):
+        build(on)
+
+
+def test_an_lr_view_of_full_size_is_compared_below_it(
+    build: Build, on: ComponentsConf, hr: Step, make_view: MakeView, noise: Noise
+) -> None:
+    zoomed = make_view("LR", noise(*HR_SIZE, 3))
+    as_hr = make_view("HR", zoomed.image)
+    image = zoomed.image * 0.9
+    value = loss_of(build(on, hr.view, zoomed), image, Step(0, 30_000, zoomed))
+    assert value == pytest.approx(paper_5_6(image, as_hr, weight=0.1, l1=0.8, ssim=0.2), rel=1e-9)

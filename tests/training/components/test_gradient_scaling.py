@@ -1,0 +1,40 @@
+"""Paper 5.3: the gradient of the log-scales, of LR views, and nothing else."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import pytest
+import torch
+
+from xrgs.config import ComponentsConf
+from xrgs.splat.gaussians import PARAMETERS, Gaussians
+from xrgs.training.components import Components, Step
+
+
+@pytest.fixture
+def scaling(build: Callable[..., Components], off: ComponentsConf) -> Components:
+    off.gradient_scaling.lr_scale = 0.3
+    return build(off)
+
+
+@pytest.mark.parametrize(("tag", "factor"), [("LR", 0.3), ("HR", 1.0)])
+def test_only_the_scales_gradient_is_scaled(
+    tag: str, factor: float, scaling: Components, steps: dict[str, Step], gaussians: Gaussians
+) -> None:
+    before = {name: gaussians[name].grad.clone() for name in PARAMETERS}
+    scaling.after_backward(gaussians, steps[tag])
+    for name in PARAMETERS:
+        expected = before[name] * (factor if name == "scales" else 1.0)
+        assert torch.equal(gaussians[name].grad, expected), name
+    assert (before["scales"] != 0).all()
+    norm = before["scales"].norm().item()
+    assert steps[tag].log == {f"gradient_scaling.norm_{tag}": pytest.approx(norm)}
+
+
+def test_without_a_gradient_there_is_nothing_to_scale(
+    scaling: Components, lr: Step, gaussians: Gaussians
+) -> None:
+    gaussians.scales.grad = None
+    scaling.after_backward(gaussians, lr)
+    assert gaussians.scales.grad is None

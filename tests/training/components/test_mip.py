@@ -1,0 +1,206 @@
+"""Mip-Splatting's 3D filter, at the rate of the finest view that sees a Gaussian."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from torch import Tensor
+
+from xrgs.capture.dataset import LoadedView
+from xrgs.config import MipConf
+from xrgs.splat.cameras import Camera
+from xrgs.splat.gaussians import Gaussians, from_points
+from xrgs.splat.rasterize import rasterize
+from xrgs.splat.settings import RasterSettings
+from xrgs.training.components import Step
+from xrgs.training.components.mip import Mip, sampling_rates, smoothed
+
+NEAR = 0.01
+SIZE = 40
+
+
+def camera(focal: float, *, back: float, fy: float | None = None) -> Camera:
+    """Looks along z, `back` world units before the origin."""
+    K = torch.tensor([[focal, 0, SIZE / 2], [0, fy or focal, SIZE / 2], [0, 0, 1]])
+    viewmat = torch.eye(4)
+    viewmat[2, 3] = back
+    return Camera(viewmat, K, SIZE, SIZE)
+
+
+def view(tag: str, camera: Camera) -> LoadedView:
+    return LoadedView(tag.lower(), tag, camera, torch.zeros(SIZE, SIZE, 3))
+
+
+#: 25 px a world unit at the origin, from afar; 20 from near by. Largest focal length over nearest
+#: distance, which belong to no view, would be 100.
+FAR, CLOSE = camera(100.0, back=4.0), camera(20.0, back=1.0)
+STEP = Step(0, 30_000, view("LR", CLOSE))
+
+
+def splats(*means: tuple[float, float, float]) -> Gaussians:
+    count = len(means)
+    generator = torch.Generator().manual_seed(0)
+    points = torch.rand(max(count, 4), 3, generator=generator)
+    made = from_points(
+        points, points, init_opacity=0.6, sh_degree=0, generator=torch.Generator().manual_seed(1)
+    )
+    for name in ("quats", "scales", "opacities", "sh0", "shN"):
+        made[name] = made[name].detach()[:count].requires_grad_()
+    made.scales = torch.log(torch.rand(count, 3, generator=generator) * 0.02).requires_grad_()
+    made.means = torch.tensor(means).requires_grad_()
+    return made
+
+
+def on(*cameras: Camera, every: int = 100) -> Mip:
+    views = [view("LR" if c is CLOSE else "HR", c) for c in cameras]
+    return Mip(MipConf(variance=0.2, every=every), views, NEAR)
+
+
+@pytest.mark.parametrize("order", [(FAR, CLOSE), (CLOSE, FAR)])
+def test_two_cameras_of_differing_focal_length_and_distance(order: tuple[Camera, ...]) -> None:
+    gaussians = splats((0.0, 0.0, 0.0), (0.0, 0.0, 1.0), (0.0, 0.0, 12.0))
+    mip = on(*order)
+    mip.on_gaussians_changed(gaussians)
+    plain = gaussians.activated()
+    filtered = mip.activated(plain, STEP)
+    # f / z of each: 100/4 and 20/1, 100/5 and 20/2, 100/16 and 20/13.
+    nu = torch.tensor([25.0, 20.0, 6.25], dtype=torch.float64)
+    scales, opacities = plain.scales.double(), plain.opacities.double()
+    wider = (scales**2 + (0.2 / nu**2)[:, None]).sqrt()
+    weaker = opacities * (scales.prod(-1) ** 2 / wider.prod(-1) ** 2).sqrt()
+    torch.testing.assert_close(filtered.scales.double(), wider, rtol=1e-6, atol=0)
+    torch.testing.assert_close(filtered.opacities.double(), weaker, rtol=1e-5, atol=0)
+    assert (weaker < 0.9 * opacities).all()
+    for name in ("means", "quats", "sh0", "shN"):
+        assert getattr(filtered, name) is getattr(plain, name)
+
+
+def test_a_view_that_does_not_see_a_gaussian_does_not_count() -> None:
+    # At depth 4 FAR sees 0.8 to each side, and a margin of 15 % of 1.6 more.
+    edge = 0.8 + 0.15 * 1.6
+    means = torch.tensor([[edge - 0.01, 0.0, 0.0], [edge + 0.01, 0.0, 0.0], [0.0, 0.0, -2.0]])
+    rates = sampling_rates(means, [FAR, CLOSE], NEAR)
+    torch.testing.assert_close(rates, torch.tensor([25.0, 20.0, 50.0]))
+    assert torch.equal(sampling_rates(-means - 9, [CLOSE], NEAR), torch.zeros(3))
+    assert torch.equal(sampling_rates(means, [], NEAR), torch.zeros(3))
+
+
+@pytest.mark.parametrize("axis", [0, 1])
+@pytest.mark.parametrize("side", [-1, 1])
+def test_the_margin_is_around_all_four_sides(axis: int, side: int) -> None:
+    means = torch.zeros(2, 3)
+    means[:, axis] = side * torch.tensor([1.03, 1.05])  # of 1.04
+    assert sampling_rates(means, [FAR], NEAR).tolist() == [25.0, 0.0]
+
+
+def test_the_finer_axis_of_a_view_counts() -> None:
+    rates = sampling_rates(torch.zeros(1, 3), [camera(100.0, fy=120.0, back=4.0)], NEAR)
+    assert rates.item() == pytest.approx(30.0)
+
+
+def test_what_no_view_sees_takes_the_coarsest_rate() -> None:
+    gaussians = splats((0.0, 0.0, 0.0), (0.0, 0.0, 1.0), (50.0, 0.0, 0.0))
+    mip = on(FAR, CLOSE)
+    mip.on_gaussians_changed(gaussians)
+    torch.testing.assert_close(mip.variance, 0.2 / torch.tensor([25.0, 20.0, 20.0]) ** 2)
+
+
+def test_where_nothing_is_seen_nothing_is_smoothed() -> None:
+    gaussians = splats((50.0, 0.0, 0.0), (60.0, 0.0, 0.0))
+    mip = on(FAR)
+    mip.on_gaussians_changed(gaussians)
+    plain = gaussians.activated()
+    filtered = mip.activated(plain, STEP)
+    assert torch.equal(filtered.scales, plain.scales)
+    assert torch.equal(filtered.opacities, plain.opacities)
+
+
+@pytest.mark.parametrize("tag", ["HR", "LR"])
+def test_every_view_is_rendered_with_the_same_filter(tag: str) -> None:
+    gaussians = splats((0.0, 0.0, 0.0))
+    mip = on(FAR, CLOSE)
+    mip.on_gaussians_changed(gaussians)
+    step = Step(1, 30_000, view(tag, FAR if tag == "HR" else CLOSE))
+    first = mip.activated(gaussians.activated(), STEP)
+    assert torch.equal(mip.activated(gaussians.activated(), step).scales, first.scales)
+
+
+def test_rates_follow_the_means_every_so_often() -> None:
+    gaussians = splats((0.0, 0.0, 0.0))
+    mip = on(FAR, every=100)
+    mip.on_gaussians_changed(gaussians)
+    before = mip.variance.clone()
+    with torch.no_grad():
+        gaussians.means[0, 2] = 4.0
+    mip.activated(gaussians.activated(), Step(199, 30_000, STEP.view))
+    assert torch.equal(mip.variance, before)
+    mip.activated(gaussians.activated(), Step(200, 30_000, STEP.view))
+    torch.testing.assert_close(mip.variance, 4 * before)
+
+
+def test_mass_is_kept() -> None:
+    generator = torch.Generator().manual_seed(0)
+    scales, opacities, variance = (
+        torch.rand(*shape, generator=generator, dtype=torch.float64)
+        for shape in ((9, 3), (9,), (9,))
+    )
+    wider, weaker = smoothed(scales, opacities, variance)
+    assert (wider > scales).all()
+    torch.testing.assert_close(weaker * wider.prod(-1), opacities * scales.prod(-1))
+
+
+def test_its_gradient_is_that_of_finite_differences() -> None:
+    generator = torch.Generator().manual_seed(0)
+    scales, opacities = (
+        torch.rand(*shape, generator=generator, dtype=torch.float64).requires_grad_()
+        for shape in ((5, 3), (5,))
+    )
+    variance = torch.rand(5, generator=generator, dtype=torch.float64)
+    assert torch.autograd.gradcheck(lambda s, o: smoothed(s, o, variance), (scales, opacities))
+
+
+def test_gradients_reach_the_parameters_and_not_the_rates() -> None:
+    gaussians = splats((0.0, 0.0, 0.0), (0.1, 0.0, 0.5))
+    mip = on(FAR, CLOSE)
+    mip.on_gaussians_changed(gaussians)
+    filtered = mip.activated(gaussians.activated(), STEP)
+    (filtered.scales.sum() + filtered.opacities.sum()).backward()
+    for name in ("scales", "opacities"):
+        assert (gaussians[name].grad != 0).all()
+    assert gaussians.means.grad is None
+
+
+def test_what_is_kept_renders_as_what_was_trained() -> None:
+    gaussians = splats((0.0, 0.0, 0.0), (0.1, 0.05, 0.5), (50.0, 0.0, 0.0))
+    mip = on(FAR, CLOSE)
+    mip.on_gaussians_changed(gaussians)
+    settings = RasterSettings(antialiased=True, sh_degree=0)
+
+    def image(activated: tuple[Tensor, ...]) -> Tensor:
+        return rasterize(*activated, FAR, settings, sh_degree=0).image
+
+    trained = image(mip.activated(gaussians.activated(), STEP))
+    unfiltered = image(gaussians.activated())
+    assert (trained - unfiltered).abs().max() > 0.01
+    mip.finish(gaussians)
+    torch.testing.assert_close(image(gaussians.activated()), trained, rtol=1e-5, atol=1e-6)
+    assert gaussians.scales.is_leaf
+    assert gaussians.scales.requires_grad
+
+
+def test_extreme_gaussians_stay_finite() -> None:
+    gaussians = splats(*[(0.0, 0.0, 0.0)] * 4)
+    gaussians.scales = torch.tensor([-120.0, -60.0, 0.0, 20.0])[:, None].repeat(1, 3)
+    gaussians.opacities = torch.tensor([-120.0, 120.0, 120.0, 120.0])
+    for tensor in (gaussians.scales, gaussians.opacities):
+        tensor.requires_grad_()
+    mip = on(FAR)
+    mip.on_gaussians_changed(gaussians)
+    filtered = mip.activated(gaussians.activated(), STEP)
+    (filtered.scales.sum() + filtered.opacities.sum()).backward()
+    for name in ("scales", "opacities"):
+        assert torch.isfinite(getattr(filtered, name)).all()
+        assert torch.isfinite(gaussians[name].grad).all()
+    mip.finish(gaussians)
+    assert torch.isfinite(gaussians.scales).all()
+    assert torch.isfinite(gaussians.opacities).all()

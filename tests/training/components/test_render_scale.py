@@ -1,0 +1,70 @@
+"""Paper 5.7: LR views see every Gaussian inflated, and only its scales."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import pytest
+import torch
+from torch import Tensor
+
+from xrgs.config import ComponentsConf
+from xrgs.splat.gaussians import PARAMETERS, Gaussians
+from xrgs.training.components import Components, Step, TrainingView
+
+Build = Callable[..., Components]
+
+
+@pytest.fixture
+def on(off: ComponentsConf) -> ComponentsConf:
+    off.render_scale.gamma = 0.25
+    return off
+
+
+def test_the_scales_of_an_lr_view_are_inflated(
+    build: Build, on: ComponentsConf, hr: Step, lr: Step, gaussians: Gaussians
+) -> None:
+    parts, plain = build(on), gaussians.activated()
+    inflated = parts.activated(plain, lr)
+    factor = 5**0.25  # 75 px over 15
+    torch.testing.assert_close(inflated.scales, plain.scales * factor)
+    assert factor == pytest.approx(1.5, abs=0.01)
+    for name in set(PARAMETERS) - {"scales"}:
+        assert getattr(inflated, name) is getattr(plain, name)
+    assert lr.log == {"render_scale.k": pytest.approx(factor)}
+    assert parts.activated(plain, hr) is plain
+
+
+def test_what_is_kept_is_not_inflated_and_gradients_reach_it(
+    build: Build, on: ComponentsConf, lr: Step, gaussians: Gaussians
+) -> None:
+    before = gaussians.scales.detach().clone()
+    gaussians.scales.grad = None
+    build(on).activated(gaussians.activated(), lr).scales.sum().backward()
+    torch.testing.assert_close(gaussians.scales.grad, 5**0.25 * before.exp())
+    assert torch.equal(gaussians.scales.detach(), before)
+
+
+def test_resolution_is_the_longer_side_of_the_largest_view(
+    build: Build,
+    on: ComponentsConf,
+    gaussians: Gaussians,
+    make_view: Callable[[str, Tensor], TrainingView],
+) -> None:
+    on.render_scale.gamma = 1.0
+    turned, wide = make_view("LR", torch.zeros(40, 20, 3)), make_view("HR", torch.zeros(30, 80, 3))
+    parts = build(on, turned, wide)
+    plain = gaussians.activated()
+    torch.testing.assert_close(parts.activated(plain, Step(0, 1, turned)).scales, plain.scales * 2)
+
+
+def test_an_lr_view_of_full_size_stays_as_it_is(
+    build: Build,
+    on: ComponentsConf,
+    gaussians: Gaussians,
+    make_view: Callable[[str, Tensor], TrainingView],
+) -> None:
+    blurred, sharp = (make_view(tag, torch.zeros(40, 60, 3)) for tag in ("LR", "HR"))
+    step, plain = Step(0, 1, blurred), gaussians.activated()
+    assert torch.equal(build(on, blurred, sharp).activated(plain, step).scales, plain.scales)
+    assert step.log == {"render_scale.k": 1.0}  # which says so

@@ -1,0 +1,1 @@
+"""Downloads published scenes: fetches an archive, verifies it and unpacks it."""

@@ -1,0 +1,1 @@
+"""The evaluation protocol and the metrics that cells are compared by."""

@@ -1,0 +1,1 @@
+"""LPIPS: the network, and its published weights."""

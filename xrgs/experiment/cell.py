@@ -1,0 +1,99 @@
+"""One cell: a variant, a config and a seed become Gaussians, scores and their provenance."""
+
+from __future__ import annotations
+
+import csv
+import io
+import logging
+import resource
+import traceback
+from typing import TYPE_CHECKING, Any
+
+from xrgs.capture import dataset
+from xrgs.evaluation import protocol
+from xrgs.experiment import provenance
+from xrgs.runtime import progress
+from xrgs.safeio.atomic import write_json, write_text
+from xrgs.safeio.hashing import digest
+from xrgs.splat.backend import resolve_backend
+from xrgs.splat.ply import save_ply
+from xrgs.training.checkpoint import Checkpoint, CheckpointError
+from xrgs.training.loop import Trained, train
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+
+    from xrgs.capture.dataset import Dataset
+    from xrgs.capture.views import Variant
+    from xrgs.config import Conf
+    from xrgs.experiment.store import CellFolder
+
+_log = logging.getLogger(__name__)
+
+
+def run(conf: Conf, variant: Variant, folder: CellFolder) -> None:
+    """Train, evaluate and write a cell into its begun folder; its status is written last.
+
+    Raises:
+        Exception: whatever went wrong, after `error.txt` says where.
+    """
+    try:
+        with progress.kept_in(folder.progress):
+            views = _run(conf, variant, folder)
+        folder.finish(views, protocol.PROTOCOL)
+    except Exception:
+        write_text(folder.path / "error.txt", traceback.format_exc())
+        raise
+
+
+def _run(conf: Conf, variant: Variant, folder: CellFolder) -> list[str]:
+    """All but the status; the names of the views that were scored."""
+    threads = dataset.use_threads(conf.threads)
+    backend = resolve_backend(conf.splat.backend)
+    write_json(folder.path / "provenance.json", provenance.collect(threads, backend))
+    data = dataset.load(variant, conf.train.views)
+    trained = _train(data, conf, folder)
+    peak_rss_bytes = _peak_rss_bytes()  # before evaluation, which may load LPIPS's network
+    save_ply(folder.path / "splats.ply", trained.gaussians)
+    write_text(folder.path / "history.csv", _csv(trained.history))
+    scores = protocol.score(trained.gaussians, data.test, conf.splat, folder.path / "renders")
+    write_text(folder.path / "scores.csv", _csv(scores))
+    write_json(
+        folder.path / "summary.json",
+        {
+            "training_time_s": trained.seconds,
+            "gaussians": len(trained.gaussians),
+            "memory_bytes": trained.memory_bytes,
+            "peak_rss_bytes": peak_rss_bytes,
+            "evaluations": trained.evaluations,
+            "steps": conf.train.steps,
+            "grow_grad2d": trained.grow_grad2d,
+        },
+    )
+    return [view.name for view in data.test]
+
+
+def _train(data: Dataset, conf: Conf, folder: CellFolder) -> Trained:
+    """Train from the cell's checkpoint, or from the start where there is none of any use."""
+    checkpoint = Checkpoint(folder.checkpoint, digest(folder.identity()), conf.checkpoint_s)
+    try:
+        steps = checkpoint.read()
+        if steps is not None:
+            _log.info("going on from the checkpoint, %d steps done", steps)
+        return train(data, conf, checkpoint)
+    except CheckpointError as error:
+        _log.warning("training starts over: %s", error)
+        checkpoint.refuse()
+    return train(data, conf, checkpoint)
+
+
+def _peak_rss_bytes() -> int:
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
+
+
+def _csv(rows: Sequence[Mapping[str, Any]]) -> str:
+    text = io.StringIO()
+    writer = csv.DictWriter(text, fieldnames=list(rows[0]), lineterminator="\n")
+    writer.writeheader()
+    writer.writerows(rows)
+    return text.getvalue()

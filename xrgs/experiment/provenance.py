@@ -1,0 +1,74 @@
+"""Where, with what and on what a cell was run: enough to explain a number years later."""
+
+from __future__ import annotations
+
+import hashlib
+import platform
+import subprocess
+import sys
+from datetime import UTC, datetime
+from importlib import metadata
+from pathlib import Path
+from typing import Any
+
+import xrgs
+from xrgs.evaluation.lpips import weights
+from xrgs.runtime.machine import usable_cores
+
+_PACKAGES = ("torch", "numpy", "pycolmap", "kornia", "scikit-image", "hydra-core", "pandas")
+
+
+def _git(*arguments: str) -> str | None:
+    command = ["git", "-C", str(Path(__file__).parent), *arguments]
+    try:
+        done = subprocess.run(command, capture_output=True, text=True, timeout=10, check=True)  # noqa: S603
+    except (OSError, subprocess.SubprocessError):
+        return None
+    return done.stdout
+
+
+def _cpu() -> str:
+    try:
+        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
+    except OSError:
+        return platform.processor() or platform.machine()
+    names = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
+    return names[0] if names else platform.machine()
+
+
+def _instruction_set(backend: str) -> str | None:
+    """Of the native kernels; torch's own follow the processor."""
+    if backend != "native":
+        return None
+    from xrgs import _native
+
+    return str(_native.isa())
+
+
+def collect(threads: int, backend: str) -> dict[str, Any]:
+    """The program, its libraries, the machine and the moment, as plain JSON values.
+
+    Args:
+        threads: how many the cell uses.
+        backend: the rasterizer in use, `native` or `torch`.
+
+    Raises:
+        WeightsError: the weights of LPIPS that are there aren't the published ones. A cell that
+            can't be scored is better stopped here than after its training.
+    """
+    diff = _git("diff", "HEAD", "--", ".")
+    return {
+        "xrgs": xrgs.__version__,
+        "git": (_git("rev-parse", "HEAD") or "").strip() or None,
+        "git_diff_sha256": hashlib.sha256(diff.encode()).hexdigest() if diff else None,
+        "python": sys.version.split()[0],
+        "packages": {name: metadata.version(name) for name in _PACKAGES},
+        "platform": platform.platform(),
+        "cpu": _cpu(),
+        "cores": usable_cores(),
+        "threads": threads,
+        "backend": backend,
+        "instruction_set": _instruction_set(backend),
+        "lpips_weights_sha256": None if weights.published() is None else weights.CONTENT_SHA256,
+        "started": datetime.now(UTC).isoformat(timespec="seconds"),
+    }

@@ -1,0 +1,125 @@
+"""A variant at a glance: its views and how SfM went as text, and every view on one sheet."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from xrgs.capture import variant
+from xrgs.capture.contact_sheet import contact_sheet
+from xrgs.errors import XrgsError
+from xrgs.report.render import Grid, to_text
+from xrgs.safeio.records import read_json
+from xrgs.safeio.untrusted import printable
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator, Mapping
+
+    from xrgs.capture.views import Variant
+
+_PLACED, _LOST = "yes", "no"
+
+
+def describe(folder: Path, out: Path | None = None) -> str:
+    """Describe a frozen variant and draw its contact sheet; of a failed one, why it failed.
+
+    Args:
+        folder: Of the variant, in a store; or the `failed-...` folder that a failed one left.
+        out: The sheet's PNG; None: `<folder's name>.png` here.
+
+    Returns:
+        Tables and lines for a terminal.
+
+    Raises:
+        XrgsError: not a variant, or not what was frozen; or the sheet can't be written.
+    """
+    if not folder.is_dir():
+        raise XrgsError(f"{folder}: no such folder; variants are in <store>/variants/")
+    if folder.name.startswith("failed-"):
+        report = read_json(folder / "report.json")
+        return _lines(
+            folder, report, lambda: f"{report.get('scene')}: failed, so there are no views"
+        )
+    found = variant.load(folder)
+    file = out or Path(f"{found.id}.png")
+    try:
+        contact_sheet(found).save(file, "PNG")
+    except OSError as error:
+        raise XrgsError(f"out={file}: can't be written ({error})") from error
+    text = _lines(folder, found.report, lambda: to_text(views_table(found)))
+    return f"{text}\nContact sheet: {file}"
+
+
+def _lines(folder: Path, report: Mapping[str, Any], first: Callable[[], str]) -> str:
+    """What there is to say, with how SfM went.
+
+    Raises:
+        XrgsError: the report is none of ours.
+    """
+    try:
+        return "\n".join([first(), *map(printable, _sfm(report))])
+    except (AttributeError, KeyError, TypeError, ValueError) as error:
+        raise XrgsError(f"{folder / 'report.json'}: not a variant's report ({error!r})") from error
+
+
+def views_table(found: Variant) -> Grid:
+    """One row a photograph that is trained on or held out, by name; those not placed too."""
+    rows = [
+        (v.name, v.split, v.tag, f"{v.width} x {v.height}", f"{v.rho:.3f}", _PLACED)
+        for v in found.views
+        if v.split != "original"
+    ]
+    low = set(found.report.get("lr", ()))
+    trained = low | set(found.report.get("hr", ()))
+    for name in found.report.get("not_registered", ()):
+        split = "train" if name in trained else "test"
+        rows.append((name, split, "LR" if name in low else "HR", "", "", _LOST))
+    columns = ("View", "Split", "Tag", "Size, px", "rho", "Placed")
+    title = f"{found.scene}, variant {found.id}, factor {found.factor}"
+    return Grid(title, columns, tuple(sorted(rows)), "lllrrl", tuple(_counts(found)))
+
+
+def _counts(found: Variant) -> Iterator[str]:
+    train = [view.tag for view in found.views if view.split == "train"]
+    tests = sum(view.split == "test" for view in found.views)
+    kind = "held out" if found.held_out else "tests, at the trained poses"
+    yield f"{train.count('HR')} HR and {train.count('LR')} LR to train on, {tests} {kind}"
+    if originals := sum(view.split == "original" for view in found.views):
+        yield f"originals of degraded views kept beside them: {originals}"
+
+
+def _sfm(report: Mapping[str, Any]) -> Iterator[str]:
+    """How SfM went, as far as the report tells."""
+    yield (
+        f"SfM: {report.get('registered', 0)} of {report.get('images', '?')} views placed, "
+        f"{report.get('points', 0)} points"
+        + _number(report, "reprojection_error_px", ", {:.2f} px")
+    )
+    yield f"  LR images {report.get('lr_images')}, {report.get('max_num_features')} features a view"
+    for attempt in report.get("attempts", ()):
+        verdict = attempt.get("refused") or f"accepted, {attempt.get('registered')} placed"
+        yield f"  recipe {attempt.get('attempt')}: {verdict}"
+    if "tags" in report:
+        yield f"  tags by {report['tags']}, degradation {report.get('degradation')}"
+    if error := report.get("pose_error"):
+        against = report.get("pose_error_against", "exact cameras")
+        yield f"  poses against {against}: " + "; ".join(_pose(error))
+    for tag, rates in report.get("rho", {}).items():
+        yield f"  rho of {tag}: {', '.join(f'{rate:.3f}' for rate in rates)} (least, median, most)"
+    for key, label in (("not_registered", "not placed"), ("unreadable", "unreadable")):
+        if names := report.get(key):
+            yield f"  {label}: {', '.join(names)}"
+
+
+def _pose(error: Mapping[str, float]) -> Iterator[str]:
+    for key, label, unit in (
+        ("position", "position", "% of the extent"),
+        ("rotation", "rotation", "degrees"),
+    ):
+        name = f"{key}_{'percent' if key == 'position' else 'degrees'}"
+        if name in error:
+            yield f"{label} {error[name]:.3f} {unit}, at most {error[f'{name}_max']:.3f}"
+
+
+def _number(report: Mapping[str, Any], key: str, form: str) -> str:
+    return form.format(report[key]) if key in report else ""

@@ -1,0 +1,1 @@
+"""The process that a command runs in: machine, signals, streams, progress."""

@@ -1,0 +1,1 @@
+"""Reads files that anybody may have written, and writes files atomically."""

@@ -1,0 +1,1 @@
+"""Plans a sweep, runs its cells and reports their state."""

@@ -1,0 +1,1 @@
+"""Trains one cell: the loop, its components and its checkpoints."""
