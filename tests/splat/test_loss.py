@@ -9,7 +9,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor
 
-from xrgs.splat.loss import photometric_loss, prepare_target, structural_similarity
+from xrgs.splat.loss import photometric_loss, prepare_target
+from xrgs.splat.torch.loss import structural_similarity
 
 
 def noise(height: int, width: int, seed: int, dtype: torch.dtype = torch.float64) -> Tensor:

@@ -12,7 +12,8 @@ from hypothesis import strategies as st
 from torch import Tensor
 from torch.nn.functional import interpolate
 
-from xrgs.splat.resample import matrix, resize
+from xrgs.splat.bicubic import bicubic_matrix
+from xrgs.splat.resample import resize
 
 NATIVE = importlib.util.find_spec("xrgs._native") is not None
 needs_native = pytest.mark.skipif(not NATIVE, reason="the native backend was not built")
@@ -161,7 +162,10 @@ def test_what_is_not_finite_stays_where_it_is() -> None:
 def test_rows_of_the_matrix_sum_to_one() -> None:
     for old, new in ((20, 100), (100, 20), (7, 7), (1, 5), (101, 33)):
         torch.testing.assert_close(
-            matrix(old, new).sum(dim=1), torch.ones(new, dtype=torch.float64), rtol=0, atol=1e-12
+            bicubic_matrix(old, new).sum(dim=1),
+            torch.ones(new, dtype=torch.float64),
+            rtol=0,
+            atol=1e-12,
         )
 
 

@@ -45,8 +45,8 @@ def test_sums_are_those_in_double(isa: str, count: int) -> None:
         size = {"width": 100 + number, "height": 75}
         ours.after_step(number, gradient, visible, **size)
         exact.after_step(number, gradient.double(), visible, **size)
-    assert torch.equal(ours.seen.double(), exact.seen)
-    torch.testing.assert_close(ours.gradient.double(), exact.gradient, rtol=4e-7, atol=0)
+    assert torch.equal(ours.visible_count.double(), exact.visible_count)
+    torch.testing.assert_close(ours.grad2d_sum.double(), exact.grad2d_sum, rtol=4e-7, atol=0)
 
 
 def test_what_is_not_visible_adds_nothing(isa: str) -> None:
@@ -54,9 +54,9 @@ def test_what_is_not_visible_adds_nothing(isa: str) -> None:
     gradient[~visible] = torch.nan
     ours = densifier(50, "native")
     ours.after_step(1, gradient, visible, width=9, height=9)
-    assert ours.gradient.isfinite().all()
-    assert not ours.gradient[:, ~visible].any()
-    assert torch.equal(ours.seen[0], visible.float())
+    assert ours.grad2d_sum.isfinite().all()
+    assert not ours.grad2d_sum[:, ~visible].any()
+    assert torch.equal(ours.visible_count[0], visible.float())
 
 
 @pytest.mark.usefixtures("threads")
@@ -67,7 +67,7 @@ def test_threads_change_no_bit() -> None:
         torch.set_num_threads(count)
         ours = densifier(40_000, "native")
         ours.after_step(1, gradient, visible, width=100, height=75)
-        results.append(ours.gradient)
+        results.append(ours.grad2d_sum)
     assert all(torch.equal(result, results[0]) for result in results)
 
 

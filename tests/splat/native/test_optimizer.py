@@ -182,7 +182,7 @@ def test_a_parameter_without_gradient_is_left_alone() -> None:
 def test_torch_goes_on_from_our_state_and_we_from_its() -> None:
     mixed, theirs = optimizer(9, "native"), optimizer(9, "torch")
     for step in range(1, 11):
-        mixed.native = step % 3 != 0
+        mixed.backend = "native" if step % 3 else "torch"
         gradients = values(9, step)
         take_step(mixed, gradients)
         take_step(theirs, gradients)

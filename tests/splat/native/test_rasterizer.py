@@ -17,6 +17,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from xrgs.splat.cameras import Camera
+from xrgs.splat.gaussians import ActivatedGaussians
 from xrgs.splat.rasterize import rasterize
 from xrgs.splat.settings import CullingOptions, RasterSettings
 
@@ -335,12 +336,13 @@ def test_random_scenes(
 # --- what may be skipped ------------------------------------------------------------------------
 
 
-def render_with(skips, scene, camera):
-    """The render, its gradients, and what each skip is there to lessen."""
-    from xrgs.splat.native.rasterizer import render
+def render_with(culling, scene, camera):
+    """The render, its gradients, and the work that each kind of culling lessens."""
+    from xrgs.splat.native.rasterizer import render_culled
 
     leaves = {name: scene[name].clone().requires_grad_() for name in NAMES}
-    done = render(*leaves.values(), camera, RasterSettings(), 3, None, skips)
+    gaussians = ActivatedGaussians(**leaves)
+    done = render_culled(gaussians, camera, RasterSettings(), 3, None, culling)
     frame = done.image.grad_fn.frame
     work = {
         "out_of_view": int(done.visible.sum()),
@@ -362,7 +364,7 @@ def test_what_is_skipped_makes_no_difference(isa, make_camera, make_scene, name)
     scene["scales"][::4, 0] *= 8
     scene["means"][::50] -= 100 * camera.viewmat[0, :3]  # far to the left
     names = [field.name for field in fields(CullingOptions)] if name == "all" else [name]
-    usual, usual_gradients, usual_work = render_with(None, scene, camera)
+    usual, usual_gradients, usual_work = render_with(CullingOptions(), scene, camera)
     done, gradients, work = render_with(
         CullingOptions(**dict.fromkeys(names, False)), scene, camera
     )

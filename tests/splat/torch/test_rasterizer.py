@@ -8,7 +8,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from xrgs.splat.gaussians import PARAMETERS
+from xrgs.splat.gaussians import PARAMETERS, ActivatedGaussians
 from xrgs.splat.settings import RasterSettings
 from xrgs.splat.torch import rasterizer as torch_rasterizer
 
@@ -20,10 +20,11 @@ def test_tiles_and_batches_make_no_difference(with_gradients, make_camera, make_
     scene = make_scene(80, camera, seed=9, size=3.0)
     renders = []
     for tile, elements in ((8, 1 << 18), (4, 1 << 18), (16, 1 << 18), (64, 1 << 18), (8, 1)):
+        monkeypatch.setattr(torch_rasterizer, "TILE", tile)
         monkeypatch.setattr(torch_rasterizer, "BATCH_ELEMENTS", elements)
         leaves = with_gradients(scene)
-        values = (leaves[name] for name in PARAMETERS)
-        render = torch_rasterizer.render(*values, camera, RasterSettings(), 3, None, tile=tile)
+        gaussians = ActivatedGaussians(**leaves)
+        render = torch_rasterizer.render(gaussians, camera, RasterSettings(), 3, None)
         render.image.square().sum().backward()
         renders.append((render.image, *(leaves[name].grad for name in PARAMETERS)))
     for other in renders[1:]:

@@ -5,8 +5,8 @@ from hypothesis import strategies as st
 
 from xrgs.splat.settings import RasterSettings
 from xrgs.splat.torch import tiles
-from xrgs.splat.torch.projection import project, visible_in_order
-from xrgs.splat.torch.tiles import Grid, list_pairs, make_batches
+from xrgs.splat.torch.projection import project, visible_by_depth
+from xrgs.splat.torch.tiles import TileGrid, build_tile_batches, intersect_tiles
 
 
 @pytest.fixture
@@ -21,7 +21,7 @@ def flat(make_camera, make_scene):
         scene["opacities"][::5] *= 0.1
         names = ("means", "quats", "scales", "opacities")
         projected = project(*(scene[name] for name in names), camera, RasterSettings())
-        order = visible_in_order(projected, camera, RasterSettings())
+        order = visible_by_depth(projected, camera, RasterSettings())
         return projected._replace(**{k: v[order] for k, v in projected._asdict().items()})
 
     return make
@@ -44,9 +44,9 @@ def contributing(flat, grid):
 @pytest.mark.parametrize("tile", [4, 8, 16])
 @pytest.mark.parametrize(("width", "height"), [(40, 30), (64, 48), (1, 1), (33, 1), (3, 50)])
 def test_lists_hold_all_that_contributes_and_little_else(flat, width, height, tile):
-    grid = Grid(width, height, tile)
+    grid = TileGrid(width, height, tile)
     projected = flat(width, height)
-    tile_of, gaussian = list_pairs(projected, grid, RasterSettings())
+    tile_of, gaussian = intersect_tiles(projected, grid, RasterSettings())
     pairs = list(zip(tile_of.tolist(), gaussian.tolist(), strict=True))
     assert pairs == sorted(set(pairs)), "by tile, then front to back, none twice"
     needed = contributing(projected, grid)
@@ -55,9 +55,9 @@ def test_lists_hold_all_that_contributes_and_little_else(flat, width, height, ti
 
 
 def test_without_a_cut_every_tile_lists_every_gaussian(flat):
-    grid = Grid(40, 30, 8)
+    grid = TileGrid(40, 30, 8)
     projected = flat(40, 30)
-    tile, gaussian = list_pairs(projected, grid, RasterSettings(alpha_min=0.0))
+    tile, gaussian = intersect_tiles(projected, grid, RasterSettings(alpha_min=0.0))
     # exp(-708) is where the reach ends: only specks beyond 37 sigmas may be left out.
     assert len(tile) > 0.3 * grid.columns * grid.rows * len(projected.depths)
     assert set(gaussian.tolist()) == set(range(len(projected.depths)))
@@ -66,7 +66,7 @@ def test_without_a_cut_every_tile_lists_every_gaussian(flat):
 def test_too_many_pairs_is_an_error_before_they_are_made(flat, monkeypatch):
     monkeypatch.setattr(tiles, "MAX_PAIRS", 10)
     with pytest.raises(MemoryError, match=r"pairs in one view, more than 10"):
-        list_pairs(flat(40, 30), Grid(40, 30, 8), RasterSettings())
+        intersect_tiles(flat(40, 30), TileGrid(40, 30, 8), RasterSettings())
 
 
 @given(
@@ -75,11 +75,11 @@ def test_too_many_pairs_is_an_error_before_they_are_made(flat, monkeypatch):
 )
 @settings(max_examples=100, deadline=None)
 def test_batches_hold_each_tile_once_with_its_list(lengths, elements):
-    grid = Grid(24, 16, 8)
+    grid = TileGrid(24, 16, 8)
     tile = torch.repeat_interleave(torch.tensor(lengths))
     gaussian = torch.arange(len(tile)) % 7
     null = 99
-    batches, index = make_batches(tile, gaussian, grid, null, elements)
+    batches, index = build_tile_batches(tile, gaussian, grid, null, elements)
     found, begin = {}, 0
     for batch in batches:
         size = len(batch.tiles) * batch.longest
@@ -94,7 +94,7 @@ def test_batches_hold_each_tile_once_with_its_list(lengths, elements):
 
 
 def test_corners():
-    grid = Grid(20, 9, 8)
+    grid = TileGrid(20, 9, 8)
     assert (grid.columns, grid.rows) == (3, 2)
     corners = grid.corners(torch.arange(6)).tolist()
     assert corners == [[0, 0], [8, 0], [16, 0], [0, 8], [8, 8], [16, 8]]
