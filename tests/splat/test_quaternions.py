@@ -24,7 +24,7 @@ def test_zero_quaternion_is_no_rotation_and_has_no_gradient() -> None:
     quats = torch.zeros(2, 4, requires_grad=True)
     matrices = rotation_matrices(quats)
     assert torch.equal(matrices, torch.eye(3).expand(2, 3, 3))
-    (matrices * torch.randn(2, 3, 3)).sum().backward()
+    torch.autograd.backward((matrices * torch.randn(2, 3, 3)).sum())
     assert quats.grad is not None
     assert torch.equal(quats.grad, torch.zeros(2, 4))
 
@@ -36,7 +36,7 @@ def test_a_quaternions_length_does_not_matter(length: float) -> None:
     matrix = rotation_matrices(scaled)
     torch.testing.assert_close(matrix, rotation_matrices(quat))
     torch.testing.assert_close(matrix[0] @ matrix[0].T, torch.eye(3), atol=1e-6, rtol=0)
-    matrix[0, 0, 1].backward()
+    torch.autograd.backward(matrix[0, 0, 1])
     assert scaled.grad is not None
     assert torch.isfinite(scaled.grad).all()
     along = (scaled.grad / scaled.grad.abs().max() * quat).sum()
