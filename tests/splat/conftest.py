@@ -1,4 +1,4 @@
-"""Small random scenes for the model's tests."""
+"""Small random scenes, cameras and densifiers for the tests of the model."""
 
 from __future__ import annotations
 
@@ -11,9 +11,12 @@ import torch
 from torch import Tensor
 
 from xrgs.splat.cameras import Camera
-from xrgs.splat.gaussians import PARAMETERS
-from xrgs.splat.rasterize import Render, rasterize
-from xrgs.splat.settings import RasterSettings
+from xrgs.splat.densify import Densifier, Groups
+from xrgs.splat.gaussians import PARAMETERS, ActivatedGaussians, Gaussians
+from xrgs.splat.optimizer import SplatOptimizer
+from xrgs.splat.rasterize import rasterize
+from xrgs.splat.render_result import Render
+from xrgs.splat.settings import DensifySettings, OptimizerSettings, RasterSettings
 
 Scene = dict[str, Tensor]
 
@@ -89,7 +92,7 @@ def make_scene() -> Callable[..., Scene]:
 
 @pytest.fixture(scope="session")
 def draw() -> Callable[..., Render]:
-    """(scene, camera, raster, ...) -> the render of `make_scene`'s parameters."""
+    """Renders the parameters of `make_scene`, by default with all bands and settings of gsplat."""
 
     def draw(
         scene: Scene,
@@ -99,17 +102,29 @@ def draw() -> Callable[..., Render]:
         sh_degree: int = 3,
         **options: Any,
     ) -> Render:
-        values = (scene[name] for name in PARAMETERS)
+        gaussians = ActivatedGaussians(*(scene[name] for name in PARAMETERS))
         settings = raster or RasterSettings()
-        return rasterize(*values, camera, settings, sh_degree=sh_degree, **options)
+        return rasterize(*gaussians, camera, settings, sh_degree=sh_degree, **options)
 
     return draw
 
 
 @pytest.fixture(scope="session")
 def with_gradients() -> Callable[[Scene], Scene]:
-    """A copy of a scene, of leaves that gradients gather on."""
+    """Copies a scene to leaves that gradients accumulate on."""
     return lambda scene: {name: value.clone().requires_grad_() for name, value in scene.items()}
+
+
+@pytest.fixture(scope="session")
+def gradients_of() -> Callable[[Scene], Scene]:
+    """Returns the gradients of leaves, each of which must have one."""
+
+    def gradients_of(leaves: Scene) -> Scene:
+        gradients = {name: leaf.grad for name, leaf in leaves.items() if leaf.grad is not None}
+        assert gradients.keys() == leaves.keys()
+        return gradients
+
+    return gradients_of
 
 
 @pytest.fixture(scope="session")
@@ -126,6 +141,53 @@ def single_pixel() -> Callable[..., Scene]:
             "sh0": torch.ones(count, 1, 3, dtype=dtype),
             "shN": torch.zeros(count, 0, 3, dtype=dtype),
         }
+
+    return make
+
+
+@pytest.fixture(scope="session")
+def make_densifier() -> Callable[..., Densifier]:
+    def make(
+        values: Scene,
+        settings: DensifySettings | None = None,
+        *,
+        scene_scale: float = 1.0,
+        seed: int = 0,
+        groups: Groups | None = None,
+        backend: str = "torch",
+    ) -> Densifier:
+        """A densifier of Gaussians with these raw parameters, whose optimizer took no step."""
+        leaves = {name: values[name].clone().requires_grad_() for name in PARAMETERS}
+        optimizer = SplatOptimizer(
+            Gaussians(**leaves),
+            OptimizerSettings(means_final=1.0),
+            scene_scale=scene_scale,
+            steps=1,
+            backend=backend,
+        )
+        return Densifier(
+            optimizer,
+            settings or DensifySettings(),
+            scene_scale=scene_scale,
+            generator=torch.Generator().manual_seed(seed),
+            groups=groups,
+        )
+
+    return make
+
+
+@pytest.fixture(scope="session")
+def similar_pair() -> Callable[..., tuple[Tensor, Tensor]]:
+    def make(height: int, width: int, seed: int = 0) -> tuple[Tensor, Tensor]:
+        """Two images of the same waves, each with noise of its own: their SSIM is about 0.5."""
+        y, x = torch.meshgrid(torch.arange(height), torch.arange(width), indexing="ij")
+        waves = 0.5 + 0.3 * torch.sin(x / 5.0 + y / 3.0)[..., None].expand(-1, -1, 3).double()
+
+        def noise(seed: int) -> Tensor:
+            generator = torch.Generator().manual_seed(seed)
+            return torch.rand(height, width, 3, generator=generator, dtype=torch.float64) - 0.5
+
+        return waves + 0.2 * noise(seed), waves + 0.2 * noise(seed + 1)
 
     return make
 
@@ -159,7 +221,7 @@ def isa(request: pytest.FixtureRequest) -> Iterator[str]:
 
 @pytest.fixture
 def threads() -> Iterator[None]:
-    """Puts torch's thread count back."""
+    """Restores torch's number of threads after the test."""
     before = torch.get_num_threads()
     yield
     torch.set_num_threads(before)

@@ -1,17 +1,35 @@
+"""The choice of a backend, and that both backends have the same functions."""
+
+from __future__ import annotations
+
 import importlib.machinery
 import importlib.util
+import inspect
 import logging
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from types import ModuleType
+from typing import get_args
 
 import pytest
 
 from xrgs.errors import XrgsError
 from xrgs.splat import backend
-from xrgs.splat.backend import NATIVE_MODULE, REQUIRE_NATIVE, resolve_backend
+from xrgs.splat.backend import (
+    NATIVE_MODULE,
+    REQUIRE_NATIVE,
+    Operation,
+    implementation,
+    resolve_backend,
+)
+
+Pretend = Callable[[bool], None]
+OPERATIONS: tuple[Operation, ...] = get_args(Operation)
 
 
 @pytest.fixture
-def built(monkeypatch):
-    """Says whether the extension is there, whatever this machine has."""
+def built(monkeypatch: pytest.MonkeyPatch) -> Iterator[Pretend]:
+    """Pretends that the extension was built or was not, whatever this machine has."""
 
     def pretend(answer: bool) -> None:
         spec = importlib.machinery.ModuleSpec(NATIVE_MODULE, None) if answer else None
@@ -32,13 +50,15 @@ def built(monkeypatch):
         ("torch", False, "torch"),
     ],
 )
-def test_choice(built, caplog, name, there, expected):
+def test_choice(
+    built: Pretend, caplog: pytest.LogCaptureFixture, name: str, there: bool, expected: str
+) -> None:
     built(there)
     assert resolve_backend(name) == expected
     assert not caplog.records
 
 
-def test_fallback_says_so_once(built, caplog):
+def test_fallback_says_so_once(built: Pretend, caplog: pytest.LogCaptureFixture) -> None:
     built(False)
     with caplog.at_level(logging.WARNING):
         assert [resolve_backend("auto") for _ in range(3)] == ["torch"] * 3
@@ -47,13 +67,13 @@ def test_fallback_says_so_once(built, caplog):
     assert "\n" not in record.getMessage()
 
 
-def test_native_asked_for_and_missing(built):
+def test_native_asked_for_and_missing(built: Pretend) -> None:
     built(False)
     with pytest.raises(XrgsError, match=r"splat\.backend=native"):
         resolve_backend("native")
 
 
-def test_native_required_and_missing(built, monkeypatch):
+def test_native_required_and_missing(built: Pretend, monkeypatch: pytest.MonkeyPatch) -> None:
     built(False)
     monkeypatch.setenv(REQUIRE_NATIVE, "1")
     with pytest.raises(XrgsError, match=REQUIRE_NATIVE):
@@ -61,6 +81,47 @@ def test_native_required_and_missing(built, monkeypatch):
     assert resolve_backend("torch") == "torch"
 
 
-def test_unknown_name():
+def test_unknown_name() -> None:
     with pytest.raises(ValueError, match="'cuda'"):
         resolve_backend("cuda")
+
+
+def functions_of(module: ModuleType) -> dict[str, inspect.Signature]:
+    """The signatures of the public functions that a module defines itself."""
+    return {
+        name: inspect.signature(value)
+        for name, value in vars(module).items()
+        if inspect.isfunction(value)
+        and value.__module__ == module.__name__
+        and not name.startswith("_")
+    }
+
+
+@pytest.mark.parametrize("operation", OPERATIONS)
+def test_an_operation_has_the_same_functions_on_both_backends(operation: Operation) -> None:
+    pytest.importorskip(NATIVE_MODULE)
+    reference = functions_of(implementation(operation, "torch"))
+    compiled = functions_of(implementation(operation, "native"))
+    shared = reference.keys() & compiled.keys()
+    assert shared
+    assert {name: reference[name] for name in shared} == {name: compiled[name] for name in shared}
+
+
+@pytest.mark.parametrize("operation", OPERATIONS)
+def test_an_implementation_lies_in_the_backends_folder(operation: Operation) -> None:
+    module = implementation(operation, "torch")
+    assert module.__name__ == f"xrgs.splat.torch.{operation}"
+    assert module is implementation(operation, "torch")
+
+
+def test_every_module_of_the_native_backend_is_an_operation() -> None:
+    folder = Path(backend.__file__).parent / "native"
+    modules = {path.stem for path in folder.glob("*.py")}
+    assert modules == {*OPERATIONS, "__init__", "arguments"}
+
+
+def test_an_implementation_that_was_not_built_is_an_error(built: Pretend) -> None:
+    built(False)
+    with pytest.raises(XrgsError, match=r"splat\.backend=native"):
+        implementation("loss", "native")
+    assert implementation("loss", "auto").__name__ == "xrgs.splat.torch.loss"

@@ -1,10 +1,17 @@
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
 import pytest
 import torch
 
 from xrgs.splat.cameras import Camera
 
+MakeCamera = Callable[..., Camera]
 
-def test_position_is_where_the_camera_sees_the_origin_of_its_axes(make_camera):
+
+def test_the_position_has_camera_coordinates_of_zero(make_camera: MakeCamera) -> None:
     camera = make_camera(turned=True)
     seen = camera.viewmat[:3, :3] @ camera.position + camera.viewmat[:3, 3]
     torch.testing.assert_close(seen, torch.zeros(3, dtype=torch.float64), atol=1e-14, rtol=0)
@@ -25,8 +32,8 @@ def test_position_is_where_the_camera_sees_the_origin_of_its_axes(make_camera):
         ("viewmat", torch.diag(torch.tensor([-1.0, 1.0, 1.0, 1.0])), "rotation"),
     ],
 )
-def test_bad_input_is_named(field, value, message):
-    good = {"viewmat": torch.eye(4), "K": torch.eye(3), "width": 4, "height": 3}
+def test_bad_input_is_named(field: str, value: Any, message: str) -> None:
+    good: dict[str, Any] = {"viewmat": torch.eye(4), "K": torch.eye(3), "width": 4, "height": 3}
     Camera(**good)
     with pytest.raises(ValueError, match=message):
         Camera(**(good | {field: value}))

@@ -1,8 +1,9 @@
-"""Densification that tells groups of views apart: gsplat's `DefaultStrategy`, run once for each."""
+"""Densification with groups of views, against gsplat's `DefaultStrategy` run once for each."""
 
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Callable
 from dataclasses import dataclass
 from types import SimpleNamespace
 from typing import Any
@@ -16,19 +17,19 @@ from torch import Tensor
 
 from xrgs.splat.densify import Densifier, Groups, Refinement, Thresholds
 from xrgs.splat.gaussians import PARAMETERS, Gaussians
-from xrgs.splat.optimizer import SplatOptimizer
-from xrgs.splat.settings import DensifySettings, OptimizerSettings
+
+Refine = Callable[..., tuple[Gaussians, Refinement]]
 
 SCENE_SCALE = 1.7
-#: LR views are five times smaller, which normalised device units take out.
+#: LR views are five times smaller; gradients in normalised device units do not depend on it.
 SIZES = {"HR": (40, 30), "LR": (8, 6)}
 FINE, COARSE = Thresholds(2e-4, 0.005), Thresholds(4e-4, 0.02)
 NOTHING = Thresholds(float("inf"), 0.0)
 
 
 @dataclass
-class Observed:
-    """A step's view."""
+class View:
+    """The image-plane gradients and visibility of a step."""
 
     group: str
     gradient: Tensor  # [N, 2] per px
@@ -48,60 +49,56 @@ def values_of(count: int, rng: np.random.Generator) -> dict[str, Tensor]:
     return {name: torch.from_numpy(value).float() for name, value in values.items()}
 
 
-def view_of(group: str, count: int, rng: np.random.Generator) -> Observed:
-    """Some are not visible, and some that are have no gradient: they are behind others."""
+def view_of(group: str, count: int, rng: np.random.Generator) -> View:
+    """Some Gaussians are not visible; some are, and have no gradient: they are behind others."""
     visible = torch.from_numpy(rng.random(count) < 0.8)
     drawn = visible & torch.from_numpy(rng.random(count) < 0.6)
     half = max(SIZES[group]) / 2
     gradient = rng.normal(size=(count, 2)) * rng.exponential(5e-4, size=(count, 1)) / half
-    return Observed(group, torch.from_numpy(gradient).float() * drawn[:, None], visible)
+    return View(group, torch.from_numpy(gradient).float() * drawn[:, None], visible)
 
 
-def views_of(groups: str, count: int, rng: np.random.Generator) -> list[Observed]:
+def views_of(groups: str, count: int, rng: np.random.Generator) -> list[View]:
     return [view_of({"h": "HR", "l": "LR"}[letter], count, rng) for letter in groups]
 
 
-def ours(
-    values: dict[str, Tensor], views: list[Observed], groups: Groups | None, step: int = 600
-) -> tuple[Gaussians, Refinement]:
-    """What is left after views, at the last of which it is time to refine."""
-    gaussians = Gaussians(**{name: v.clone().requires_grad_() for name, v in values.items()})
-    optimizer = SplatOptimizer(gaussians, OptimizerSettings(), scene_scale=SCENE_SCALE, steps=1)
-    densifier = Densifier(
-        optimizer,
-        DensifySettings(),
-        scene_scale=SCENE_SCALE,
-        generator=torch.Generator().manual_seed(0),
-        groups=groups,
-    )
-    done = Refinement()
-    for view in views:
-        width, height = SIZES[view.group]
-        assert done == Refinement()
-        done = densifier.after_step(
-            step if view is views[-1] else 1,
-            view.gradient,
-            view.visible,
-            width=width,
-            height=height,
-            group=view.group,
-        )
-    return gaussians, done
+@pytest.fixture(scope="session")
+def ours(make_densifier: Callable[..., Densifier]) -> Refine:
+    def refine(
+        values: dict[str, Tensor], views: list[View], groups: Groups | None, step: int = 600
+    ) -> tuple[Gaussians, Refinement]:
+        """The Gaussians after steps on some views, at the last of which they are refined."""
+        densifier = make_densifier(values, scene_scale=SCENE_SCALE, groups=groups)
+        refinement = Refinement()
+        for view in views:
+            width, height = SIZES[view.group]
+            assert refinement == Refinement()
+            refinement = densifier.after_step(
+                step if view is views[-1] else 1,
+                view.gradient,
+                view.visible,
+                width=width,
+                height=height,
+                group=view.group,
+            )
+        return densifier.gaussians, refinement
+
+    return refine
 
 
 def numbers(gaussians: Gaussians) -> Counter[int]:
-    """How many there are of each that there were."""
+    """How many Gaussians there are now of each former one."""
     return Counter(gaussians.sh0[:, 0, 0].int().tolist())
 
 
 def gsplats(
     values: dict[str, Tensor],
-    views: list[Observed],
+    views: list[View],
     thresholds: Thresholds,
     *,
     absgrad: bool = False,
 ) -> Counter[int]:
-    """The same by gsplat, which knows one pair of thresholds."""
+    """The same by gsplat, which has one pair of thresholds."""
     from gsplat.strategy import DefaultStrategy
 
     params = {name: torch.nn.Parameter(value.clone()) for name, value in values.items()}
@@ -134,7 +131,7 @@ def gsplats(
     seed=st.integers(0, 2**32 - 1),
 )
 def test_each_group_grows_by_its_own_statistics(
-    count: int, order: str, absgrad: bool, seed: int
+    ours: Refine, count: int, order: str, absgrad: bool, seed: int
 ) -> None:
     rng = np.random.default_rng(seed)
     values, views = values_of(count, rng), views_of(order, count, rng)
@@ -142,7 +139,7 @@ def test_each_group_grows_by_its_own_statistics(
         for view in views:
             view.gradient = view.gradient.abs()
     fine, coarse = (Thresholds(each.grow_grad2d, 0.0) for each in (FINE, COARSE))
-    gaussians, done = ours(values, views, Groups({"HR": fine, "LR": coarse}))
+    gaussians, refinement = ours(values, views, Groups({"HR": fine, "LR": coarse}))
     expected: dict[str, set[int]] = {}
     for group, thresholds in (("HR", fine), ("LR", coarse)):
         seen = [view for view in views if view.group == group]
@@ -150,9 +147,9 @@ def test_each_group_grows_by_its_own_statistics(
         expected[group] = {number for number, copies in found.items() if copies == 2}
     grown = expected["HR"] | expected["LR"]
     assert numbers(gaussians) == Counter(range(count)) + Counter(grown)
-    assert done.duplicated + done.split == len(grown)
-    assert done.by_group["grown_HR"] == len(expected["HR"])
-    assert done.by_group["grown_LR"] == len(expected["LR"])
+    assert refinement.duplicated + refinement.split == len(grown)
+    assert refinement.by_group["grown_HR"] == len(expected["HR"])
+    assert refinement.by_group["grown_LR"] == len(expected["LR"])
 
 
 @settings(max_examples=30, deadline=None)
@@ -162,12 +159,12 @@ def test_each_group_grows_by_its_own_statistics(
     seed=st.integers(0, 2**32 - 1),
 )
 def test_an_hr_views_gaussian_is_pruned_by_the_hr_threshold(
-    count: int, order: str, seed: int
+    ours: Refine, count: int, order: str, seed: int
 ) -> None:
     rng = np.random.default_rng(seed)
     values, views = values_of(count, rng), views_of(order, count, rng)
     fine, coarse = (Thresholds(float("inf"), each.prune_opacity) for each in (FINE, COARSE))
-    gaussians, done = ours(values, views, Groups({"HR": fine, "LR": coarse}))
+    gaussians, refinement = ours(values, views, Groups({"HR": fine, "LR": coarse}))
     drawn = torch.zeros(count, dtype=torch.bool)
     for view in views:
         if view.group == "HR":
@@ -176,58 +173,60 @@ def test_an_hr_views_gaussian_is_pruned_by_the_hr_threshold(
     expected = [n for n in range(count) if (by_fine if drawn[n] else by_coarse)[n]]
     assert numbers(gaussians) == Counter(expected)
     by_hr = sum(1 for n in range(count) if drawn[n] and not by_fine[n])
-    assert done.by_group["pruned_opacity_HR"] == by_hr
-    assert done.by_group["pruned_opacity_LR"] == done.pruned_opacity - by_hr
-    assert done.pruned_opacity == count - len(expected)
+    assert refinement.by_group["pruned_opacity_HR"] == by_hr
+    assert refinement.by_group["pruned_opacity_LR"] == refinement.pruned_opacity - by_hr
+    assert refinement.pruned_opacity == count - len(expected)
 
 
-def test_both_thresholds_matter_and_neither_is_the_others() -> None:
+def test_each_group_has_thresholds_of_its_own(ours: Refine) -> None:
     """What the two properties above compare does differ, group by group."""
     rng = np.random.default_rng(0)
     values, views = values_of(300, rng), views_of("hlhl", 300, rng)
-    _, done = ours(values, views, Groups({"HR": FINE, "LR": COARSE}))
+    _, refinement = ours(values, views, Groups({"HR": FINE, "LR": COARSE}))
     _, swapped = ours(values, views, Groups({"HR": COARSE, "LR": FINE}))
-    assert all(value > 5 for value in done.by_group.values())
-    assert done.by_group["grown_HR"] > swapped.by_group["grown_HR"] + 20
-    assert done.by_group["grown_LR"] < swapped.by_group["grown_LR"] - 20
-    assert done.pruned_opacity < swapped.pruned_opacity
+    assert all(value > 5 for value in refinement.by_group.values())
+    assert refinement.by_group["grown_HR"] > swapped.by_group["grown_HR"] + 20
+    assert refinement.by_group["grown_LR"] < swapped.by_group["grown_LR"] - 20
+    assert refinement.pruned_opacity < swapped.pruned_opacity
 
 
-def test_copies_and_halves_are_pruned_by_their_parents_threshold() -> None:
+def test_copies_and_halves_are_pruned_by_their_parents_threshold(ours: Refine) -> None:
     values = values_of(4, np.random.default_rng(0))
     values["opacities"] = torch.logit(torch.full((4,), 0.01))  # between the two thresholds
     values["scales"] = torch.tensor([0.005, 0.005, 0.1, 0.1]).log()[:, None].repeat(1, 3)
     gradient = torch.ones(4, 2)
     every = torch.ones(4, dtype=torch.bool)
     by_hr = torch.tensor([True, False, True, False])  # a copy and a split of each
-    views = [Observed("HR", gradient * by_hr[:, None], every), Observed("LR", gradient, every)]
-    gaussians, done = ours(values, views, Groups({"HR": FINE, "LR": COARSE}))
-    assert (done.duplicated, done.split, done.pruned_opacity) == (2, 2, 4)
+    views = [View("HR", gradient * by_hr[:, None], every), View("LR", gradient, every)]
+    gaussians, refinement = ours(values, views, Groups({"HR": FINE, "LR": COARSE}))
+    assert (refinement.duplicated, refinement.split, refinement.pruned_opacity) == (2, 2, 4)
     assert numbers(gaussians) == Counter({0: 2, 2: 2})
 
 
 @pytest.mark.parametrize("order", ["hlh", "hll"])
-def test_pooled_the_last_view_decides_for_all(order: str) -> None:
+def test_pooled_the_last_view_decides_for_all(ours: Refine, order: str) -> None:
     rng = np.random.default_rng(1)
     values, views = values_of(200, rng), views_of(order, 200, rng)
     thresholds = {"HR": FINE, "LR": COARSE}
-    gaussians, done = ours(values, views, Groups(thresholds, pooled=True))
+    gaussians, refinement = ours(values, views, Groups(thresholds, pooled=True))
     last = views[-1].group
     assert numbers(gaussians) == gsplats(values, views, thresholds[last])
-    others = {key: n for key, n in done.by_group.items() if not key.endswith(last)}
+    others = {key: n for key, n in refinement.by_group.items() if not key.endswith(last)}
     assert set(others.values()) == {0}
-    assert done.by_group[f"pruned_opacity_{last}"] == done.pruned_opacity > 0
-    assert done.by_group[f"grown_{last}"] == done.duplicated + done.split > 0
+    assert refinement.by_group[f"pruned_opacity_{last}"] == refinement.pruned_opacity > 0
+    assert refinement.by_group[f"grown_{last}"] == refinement.duplicated + refinement.split > 0
 
 
 @pytest.mark.parametrize("step", [600, 3100])
 @pytest.mark.parametrize("order", ["h", "hlhll"])
-def test_pooled_groups_that_are_alike_are_none(step: int, order: str) -> None:
+def test_pooled_groups_with_the_same_thresholds_are_as_none(
+    ours: Refine, step: int, order: str
+) -> None:
     rng = np.random.default_rng(2)
     values, views = values_of(200, rng), views_of(order, 200, rng)
-    alike = Groups({"HR": FINE, "LR": FINE}, pooled=True)
+    same = Groups({"HR": FINE, "LR": FINE}, pooled=True)
     (plain, without), (pooled, with_groups) = (
-        ours(values, views, groups, step) for groups in (None, alike)
+        ours(values, views, groups, step) for groups in (None, same)
     )
     assert all(torch.equal(plain[name], pooled[name]) for name in PARAMETERS)
     assert len(plain) != 200
@@ -236,18 +235,18 @@ def test_pooled_groups_that_are_alike_are_none(step: int, order: str) -> None:
     assert without.by_group == {}
 
 
-def test_the_reset_is_above_every_threshold() -> None:
+def test_the_reset_is_above_every_threshold(ours: Refine) -> None:
     values = values_of(50, np.random.default_rng(3))
     values["opacities"] += 6
     for thresholds in ({"HR": FINE, "LR": COARSE}, {"HR": COARSE, "LR": FINE}):
         views = views_of("l", 50, np.random.default_rng(0))
-        gaussians, done = ours(values, views, Groups(thresholds), step=3000)
-        assert done.reset > 0
+        gaussians, refinement = ours(values, views, Groups(thresholds), step=3000)
+        assert refinement.reset > 0
         highest = torch.sigmoid(gaussians.opacities.detach()).max().item()
         assert highest == pytest.approx(2 * COARSE.prune_opacity)
 
 
-def test_a_view_of_no_group_is_an_error() -> None:
+def test_a_view_of_no_group_is_an_error(ours: Refine) -> None:
     rng = np.random.default_rng(4)
     with pytest.raises(KeyError, match="LR"):
         ours(values_of(3, rng), views_of("l", 3, rng), Groups({"HR": NOTHING}))

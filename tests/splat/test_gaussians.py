@@ -1,25 +1,37 @@
+"""Gaussians on SfM points, against the start of gsplat's trainer worked out in numpy."""
+
+from __future__ import annotations
+
+from typing import Any
+
 import numpy as np
 import pytest
 import torch
+from numpy.typing import NDArray
 
-from xrgs.splat.gaussians import MIN_SPACING, PARAMETERS, from_points
+from xrgs.splat.gaussians import MIN_SPACING, PARAMETERS, Gaussians, from_points
 from xrgs.splat.sh import sh_to_colors
+
+Array = NDArray[np.float64]
+Cloud = tuple[NDArray[np.float64], NDArray[np.uint8]]
 
 
 @pytest.fixture
-def cloud():
+def cloud() -> Cloud:
     rng = np.random.default_rng(0)
     return rng.normal(size=(30, 3)), rng.integers(0, 256, (30, 3), dtype=np.uint8)
 
 
-def start(points, colors, *, init_opacity=0.1, sh_degree=3, seed=0):
+def start(
+    points: Any, colors: Any, *, init_opacity: float = 0.1, sh_degree: int = 3, seed: int = 0
+) -> Gaussians:
     generator = torch.Generator().manual_seed(seed)
     return from_points(
         points, colors, init_opacity=init_opacity, sh_degree=sh_degree, generator=generator
     )
 
 
-def test_start_is_gsplats(cloud):
+def test_start_is_gsplats(cloud: Cloud) -> None:
     points, colors = cloud
     gaussians = start(points, colors)
     assert len(gaussians) == 30
@@ -36,7 +48,7 @@ def test_start_is_gsplats(cloud):
     np.testing.assert_allclose(sh_to_colors(3, dirs, sh0, shN).detach(), colors / 255.0, atol=1e-6)
 
 
-def test_parameters_are_leaves_reached_by_name(cloud):
+def test_parameters_are_leaves_reached_by_name(cloud: Cloud) -> None:
     gaussians = start(*cloud)
     for name in PARAMETERS:
         assert gaussians[name].is_leaf
@@ -54,29 +66,29 @@ def test_parameters_are_leaves_reached_by_name(cloud):
 
 
 @pytest.mark.parametrize(("degree", "rest"), [(0, 0), (1, 3), (2, 8), (3, 15)])
-def test_bands_stored(cloud, degree, rest):
+def test_bands_stored(cloud: Cloud, degree: int, rest: int) -> None:
     assert start(*cloud, sh_degree=degree).shN.shape == (30, rest, 3)
 
 
-def test_float_colors_are_as_8_bit_ones(cloud):
+def test_float_colors_are_as_8_bit_ones(cloud: Cloud) -> None:
     points, colors = cloud
     floats = start(points, torch.from_numpy(colors).double() / 255)
     torch.testing.assert_close(floats.sh0, start(points, colors).sh0)
 
 
-def test_seed_decides_the_quaternions(cloud):
+def test_seed_decides_the_quaternions(cloud: Cloud) -> None:
     same, other = start(*cloud, seed=0), start(*cloud, seed=1)
     assert torch.equal(start(*cloud, seed=0).quats, same.quats)
     assert not torch.equal(other.quats, same.quats)
 
 
-def test_points_on_one_another_have_a_finite_scale(cloud):
+def test_points_on_one_another_have_a_finite_scale(cloud: Cloud) -> None:
     _, colors = cloud
     gaussians = start(np.zeros((30, 3)), colors)
     torch.testing.assert_close(torch.exp(gaussians.scales), torch.full((30, 3), MIN_SPACING))
 
 
-def test_the_callers_points_are_not_shared():
+def test_the_callers_points_are_not_shared() -> None:
     points = torch.randn(5, 3)
     gaussians = start(points, torch.rand(5, 3))
     before = gaussians.means.detach().clone()
@@ -96,7 +108,7 @@ def test_the_callers_points_are_not_shared():
         ({"init_opacity": 0.0}, "init_opacity"),
     ],
 )
-def test_bad_input_is_named(cloud, change, message):
+def test_bad_input_is_named(cloud: Cloud, change: Any, message: str) -> None:
     points, colors = cloud
     with pytest.raises(ValueError, match=message):
         start(**({"points": points, "colors": colors} | change))

@@ -1,6 +1,14 @@
+"""Normalisation of a scene: what it must leave alone, and where cameras and points end up."""
+
+from __future__ import annotations
+
+from typing import Any
+
 import numpy as np
 import pytest
 import torch
+from numpy.typing import NDArray
+from torch import Tensor
 
 from xrgs.splat.cameras import Camera
 from xrgs.splat.normalize import (
@@ -15,13 +23,17 @@ from xrgs.splat.normalize import (
 from xrgs.splat.rasterize import rasterize
 from xrgs.splat.settings import RasterSettings
 
+Array = NDArray[np.float64]
+World = tuple[Array, Array]
 
-def turn(rng):
+
+def turn(rng: np.random.Generator) -> Array:
     q, _ = np.linalg.qr(rng.normal(size=(3, 3)))
-    return q * np.linalg.det(q)
+    rotation: Array = q * np.linalg.det(q)
+    return rotation
 
 
-def similarity(rng, scale):
+def similarity(rng: np.random.Generator, scale: float) -> Array:
     matrix = np.eye(4)
     matrix[:3, :3] = scale * turn(rng)
     matrix[:3, 3] = rng.normal(size=3)
@@ -29,7 +41,7 @@ def similarity(rng, scale):
 
 
 @pytest.fixture
-def world():
+def world() -> World:
     """Seven cameras that look at a cloud, more or less forward-facing; up is -y, roughly."""
     rng = np.random.default_rng(0)
     points = rng.normal(size=(300, 3)) * (2.0, 1.0, 0.3) + (0.5, 0.2, 6.0)
@@ -43,16 +55,21 @@ def world():
     return viewmats, points
 
 
-def seen(viewmats, points):
+def in_cameras(viewmats: Array, points: Array) -> Array:
     """Coordinates of all points in all cameras: [C, P, 3]."""
-    return np.einsum("cij,pj->cpi", viewmats[:, :3, :3], points) + viewmats[:, None, :3, 3]
+    coordinates: Array = (
+        np.einsum("cij,pj->cpi", viewmats[:, :3, :3], points) + viewmats[:, None, :3, 3]
+    )
+    return coordinates
 
 
-def test_what_cameras_see_only_changes_its_scale(world):
+def test_what_cameras_see_only_changes_its_scale(world: World) -> None:
     normalized = normalize_scene(*world)
     scale = np.cbrt(np.linalg.det(normalized.transform[:3, :3]))
     np.testing.assert_allclose(
-        seen(normalized.viewmats, normalized.points), scale * seen(*world), atol=1e-10
+        in_cameras(normalized.viewmats, normalized.points),
+        scale * in_cameras(*world),
+        atol=1e-10,
     )
     rotations = normalized.viewmats[:, :3, :3]
     np.testing.assert_allclose(
@@ -63,7 +80,7 @@ def test_what_cameras_see_only_changes_its_scale(world):
     )
 
 
-def test_similarity_turns_up_and_puts_the_median_camera_at_one(world):
+def test_similarity_turns_up_and_puts_the_median_camera_at_one(world: World) -> None:
     viewmats, _ = world
     moved = transform_viewmats(similarity_from_cameras(viewmats), viewmats)
     up = -moved[:, 1, :3].mean(0)
@@ -71,7 +88,7 @@ def test_similarity_turns_up_and_puts_the_median_camera_at_one(world):
     assert np.median(np.linalg.norm(camera_positions(moved), axis=1)) == pytest.approx(1)
 
 
-def test_focus_is_where_the_optical_axes_meet():
+def test_focus_is_where_the_optical_axes_meet() -> None:
     """Cameras on a circle that look at the world's origin: it stays, and they are at 1."""
     viewmats = []
     for angle in np.linspace(0, 2, 5):
@@ -84,7 +101,7 @@ def test_focus_is_where_the_optical_axes_meet():
     np.testing.assert_allclose(similarity_from_cameras(np.stack(viewmats)), expected, atol=1e-12)
 
 
-def test_focus_and_scale_are_medians():
+def test_focus_and_scale_are_medians() -> None:
     """Cameras in a row, two units behind the origin, that look along z; one stands far off."""
     viewmats = np.tile(np.eye(4), (3, 1, 1))
     viewmats[:, 0, 3] = (0.0, -1.0, -10.0)
@@ -95,7 +112,7 @@ def test_focus_and_scale_are_medians():
     np.testing.assert_allclose(similarity_from_cameras(viewmats), expected, atol=1e-12)
 
 
-def test_points_end_on_their_principal_axes(world):
+def test_points_end_on_their_principal_axes(world: World) -> None:
     points = normalize_scene(*world).points
     np.testing.assert_allclose(np.median(points, axis=0), 0, atol=0.2)
     covariance = np.cov(points, rowvar=False)
@@ -104,7 +121,7 @@ def test_points_end_on_their_principal_axes(world):
 
 
 @pytest.mark.parametrize("seed", range(6))
-def test_principal_axes_are_a_rigid_motion_of_the_median_to_zero(seed):
+def test_principal_axes_are_a_rigid_motion_of_the_median_to_zero(seed: int) -> None:
     rng = np.random.default_rng(seed)
     points = (rng.normal(size=(50, 3)) * (3, 2, 1)) @ turn(rng).T + rng.normal(size=3)
     transform = principal_axes(points)
@@ -115,15 +132,15 @@ def test_principal_axes_are_a_rigid_motion_of_the_median_to_zero(seed):
     np.testing.assert_allclose(transform_points(transform, median[None]), [[0, 0, 0]], atol=1e-12)
 
 
-def test_scene_scale_is_the_cameras_reach(world):
+def test_scene_scale_is_the_cameras_extent(world: World) -> None:
     normalized = normalize_scene(*world)
     positions = [-v[:3, :3].T @ v[:3, 3] for v in normalized.viewmats]
-    reach = max(np.linalg.norm(p - np.mean(positions, axis=0)) for p in positions)
-    assert normalized.scene_scale == pytest.approx(1.1 * reach)
+    extent = max(np.linalg.norm(p - np.mean(positions, axis=0)) for p in positions)
+    assert normalized.scene_scale == pytest.approx(1.1 * extent)
 
 
 @pytest.mark.parametrize("scale", [1e-3, 0.2, 50.0])
-def test_the_worlds_scale_does_not_matter(world, scale):
+def test_the_worlds_scale_does_not_matter(world: World, scale: float) -> None:
     viewmats, points = world
     scaled = transform_viewmats(np.diag([scale, scale, scale, 1]), viewmats)
     ours, theirs = normalize_scene(scaled, points * scale), normalize_scene(viewmats, points)
@@ -133,7 +150,7 @@ def test_the_worlds_scale_does_not_matter(world, scale):
 
 
 @pytest.mark.parametrize("seed", range(5))
-def test_any_world_is_normalised_to_a_similar_one(world, seed):
+def test_any_world_is_normalised_to_a_similar_one(world: World, seed: int) -> None:
     """Whatever similarity the world came by, only the size of what is seen may differ."""
     viewmats, points = world
     matrix = similarity(np.random.default_rng(seed), scale=3.0)
@@ -141,11 +158,13 @@ def test_any_world_is_normalised_to_a_similar_one(world, seed):
     theirs = normalize_scene(viewmats, points)
     ratio = ours.scene_scale / theirs.scene_scale
     np.testing.assert_allclose(
-        seen(ours.viewmats, ours.points), ratio * seen(theirs.viewmats, theirs.points), atol=1e-8
+        in_cameras(ours.viewmats, ours.points),
+        ratio * in_cameras(theirs.viewmats, theirs.points),
+        atol=1e-8,
     )
 
 
-def test_renders_of_both_worlds_are_equal(world):
+def test_renders_of_both_worlds_are_equal(world: World) -> None:
     viewmats, points = world
     normalized = normalize_scene(viewmats, points)
     scale = np.cbrt(np.linalg.det(normalized.transform[:3, :3]))
@@ -153,7 +172,7 @@ def test_renders_of_both_worlds_are_equal(world):
     count = len(points)
     colors = torch.rand(count, 1, 3, dtype=torch.float64)
 
-    def draw(viewmat, means, size):
+    def draw(viewmat: Array, means: Array, size: float) -> Tensor:
         return rasterize(
             torch.from_numpy(means),
             torch.ones(count, 4, dtype=torch.float64),
@@ -173,7 +192,7 @@ def test_renders_of_both_worlds_are_equal(world):
 
 
 @pytest.mark.parametrize("seed", range(4))
-def test_rotation_between(seed):
+def test_rotation_between(seed: int) -> None:
     rng = np.random.default_rng(seed)
     start, end = (v / np.linalg.norm(v) for v in rng.normal(size=(2, 3)))
     for target in (end, start, -start):
@@ -183,7 +202,7 @@ def test_rotation_between(seed):
         assert np.linalg.det(rotation) == pytest.approx(1)
 
 
-def test_one_camera_on_its_own_focus_keeps_the_scale(world):
+def test_one_camera_on_its_own_focus_keeps_the_scale(world: World) -> None:
     _, points = world
     normalized = normalize_scene(np.eye(4)[None], points)
     assert np.isfinite(normalized.points).all()
@@ -200,6 +219,6 @@ def test_one_camera_on_its_own_focus_keeps_the_scale(world):
         ({"points": np.full((5, 3), np.nan)}, "points must be finite"),
     ],
 )
-def test_bad_input_is_named(world, change, message):
+def test_bad_input_is_named(world: World, change: Any, message: str) -> None:
     with pytest.raises(ValueError, match=message):
         normalize_scene(**({"viewmats": world[0], "points": world[1]} | change))

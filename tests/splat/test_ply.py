@@ -1,4 +1,10 @@
+"""The .ply files of Gaussians against the plyfile library, and damaged ones."""
+
+from __future__ import annotations
+
 import re
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -12,7 +18,7 @@ from xrgs.splat.gaussians import PARAMETERS, Gaussians
 from xrgs.splat.ply import load_ply, save_ply
 
 
-def make(count=5, degree=3):
+def make(count: int = 5, degree: int = 3) -> Gaussians:
     g = torch.Generator().manual_seed(0)
     rest = (degree + 1) ** 2 - 1
     shapes = ((3,), (4,), (3,), (), (1, 3), (rest, 3))
@@ -21,7 +27,7 @@ def make(count=5, degree=3):
 
 
 @pytest.fixture
-def saved(tmp_path):
+def saved(tmp_path: Path) -> Path:
     path = tmp_path / "splats.ply"
     save_ply(path, make())
     return path
@@ -29,7 +35,7 @@ def saved(tmp_path):
 
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])
 @pytest.mark.parametrize("count", [0, 1, 7])
-def test_what_was_saved_is_loaded(tmp_path, count, degree):
+def test_what_was_saved_is_loaded(tmp_path: Path, count: int, degree: int) -> None:
     gaussians = make(count, degree)
     save_ply(tmp_path / "a.ply", gaussians)
     loaded = load_ply(tmp_path / "a.ply")
@@ -40,7 +46,7 @@ def test_what_was_saved_is_loaded(tmp_path, count, degree):
         assert loaded[name].is_contiguous()
 
 
-def test_layout_is_the_one_that_viewers_read(saved):
+def test_layout_is_the_one_that_viewers_read(saved: Path) -> None:
     gaussians = make()
     data = PlyData.read(saved)
     vertex = data["vertex"]
@@ -64,7 +70,7 @@ def test_layout_is_the_one_that_viewers_read(saved):
     np.testing.assert_array_equal(vertex["rot_0"], gaussians.quats[:, 0].detach())
 
 
-def test_another_writers_order_and_properties_are_read(tmp_path, saved):
+def test_another_writers_order_and_properties_are_read(tmp_path: Path, saved: Path) -> None:
     table = PlyData.read(saved)["vertex"].data
     names = [n for n in reversed(table.dtype.names) if not n.startswith("n")]
     other = np.zeros(len(table), dtype=[(n, "<f4") for n in [*names, "extra"]])
@@ -103,7 +109,9 @@ def test_another_writers_order_and_properties_are_read(tmp_path, saved):
         (b"\n", b" ", "is not a .ply file"),
     ],
 )
-def test_a_bad_header_is_an_error_that_names_the_file(saved, old, new, message):
+def test_a_bad_header_is_an_error_that_names_the_file(
+    saved: Path, old: bytes, new: bytes, message: str
+) -> None:
     saved.write_bytes(saved.read_bytes().replace(old, new, 1))
     with pytest.raises(XrgsError, match=re.escape(message)) as error:
         load_ply(saved)
@@ -112,14 +120,14 @@ def test_a_bad_header_is_an_error_that_names_the_file(saved, old, new, message):
 
 
 @pytest.mark.parametrize("change", [-1, -4, 1, 4])
-def test_a_body_of_the_wrong_length(saved, change):
+def test_a_body_of_the_wrong_length(saved: Path, change: Any) -> None:
     data = saved.read_bytes()
     saved.write_bytes(data[:change] if change < 0 else data + b"\0" * change)
     with pytest.raises(XrgsError, match=f"{1240 + change} follow the header"):
         load_ply(saved)
 
 
-def test_a_value_that_is_not_finite(saved):
+def test_a_value_that_is_not_finite(saved: Path) -> None:
     data = saved.read_bytes()
     saved.write_bytes(data[:-4] + np.float32(np.nan).tobytes())
     with pytest.raises(XrgsError, match="not finite"):
@@ -127,14 +135,14 @@ def test_a_value_that_is_not_finite(saved):
 
 
 @pytest.mark.parametrize("content", [b"", b"ply", b"ply\n", b"ply\n" + b"x" * 10_000])
-def test_no_header(tmp_path, content):
+def test_no_header(tmp_path: Path, content: bytes) -> None:
     path = tmp_path / "c.ply"
     path.write_bytes(content)
     with pytest.raises(XrgsError, match=r"c\.ply"):
         load_ply(path)
 
 
-def test_a_missing_file_and_a_folder(tmp_path):
+def test_a_missing_file_and_a_folder(tmp_path: Path) -> None:
     for path in (tmp_path / "none.ply", tmp_path):
         with pytest.raises(XrgsError, match="cannot be read"):
             load_ply(path)
@@ -146,7 +154,9 @@ def test_a_missing_file_and_a_folder(tmp_path):
     deadline=None,
     suppress_health_check=[HealthCheck.function_scoped_fixture],
 )
-def test_a_damaged_file_is_read_or_refused_and_nothing_else(tmp_path, place, junk, cut):
+def test_a_damaged_file_is_read_or_refused_and_nothing_else(
+    tmp_path: Path, place: int, junk: bytes, cut: bool
+) -> None:
     path = tmp_path / "d.ply"
     save_ply(path, make())
     data = path.read_bytes()

@@ -1,4 +1,4 @@
-"""phi against torch's own interpolation, natively too, and its gradient against its transpose."""
+"""Image resampling against torch's own interpolation, on every backend."""
 
 from __future__ import annotations
 
@@ -7,15 +7,12 @@ from collections.abc import Iterator
 
 import pytest
 import torch
-from hypothesis import given, settings
-from hypothesis import strategies as st
 from torch import Tensor
 from torch.nn.functional import interpolate
 
-from xrgs.splat.resample import matrix, resize
+from xrgs.splat.resample import resize
 
 NATIVE = importlib.util.find_spec("xrgs._native") is not None
-needs_native = pytest.mark.skipif(not NATIVE, reason="the native backend was not built")
 
 #: (from, to), [H, W]: up and down, one axis each way, the same, one pixel, whole vectors and not.
 SIZES = [
@@ -101,70 +98,6 @@ def test_one_column_is_resized_as_a_column_of_many(backend: str) -> None:
     torch.testing.assert_close(resize(image, 7, 1, backend=backend), wide[:, :1])
 
 
-side = st.integers(1, 70)
-
-
-@needs_native
-@settings(max_examples=60, deadline=None)
-@given(old=st.tuples(side, side), new=st.tuples(side, side), seed=st.integers(0, 10**6))
-def test_the_gradient_is_by_the_transpose(
-    old: tuple[int, int], new: tuple[int, int], seed: int
-) -> None:
-    image, slope = noise(*old, seed).float(), noise(*new, seed + 1).float() - 0.5
-    resized, gradient = value_and_gradient(image, slope, "native")
-    torch.testing.assert_close(
-        resized.double(), resize(image.double(), *new), rtol=0, atol=1e-6 * 3
-    )
-    # <phi x, y> = <x, phi^T y>, and by how much the terms of the two sums may be off.
-    forth = (resized.double() * slope.double()).sum().item()
-    back = (image.double() * gradient.double()).sum().item()
-    terms = (resized.double() * slope.double()).abs().sum().item()
-    terms += (image.double() * gradient.double()).abs().sum().item()
-    assert abs(forth - back) <= 1e-6 * terms
-
-
-@needs_native
-@pytest.mark.usefixtures("threads")
-@pytest.mark.parametrize(("old", "new"), [((75, 100), (375, 500)), ((131, 60), (33, 17))])
-def test_threads_change_no_bit(isa: str, old: tuple[int, int], new: tuple[int, int]) -> None:
-    image, slope = noise(*old).float(), noise(*new, seed=1).float()
-    results = []
-    for count in (1, 2, 3, 4, 1):
-        torch.set_num_threads(count)
-        results.append(value_and_gradient(image, slope, "native"))
-    for resized, gradient in results[1:]:
-        assert torch.equal(resized, results[0][0])
-        assert torch.equal(gradient, results[0][1])
-
-
-@needs_native
-def test_any_strides_will_do() -> None:
-    planes = noise(3, 20).expand(-1, -1, 3).permute(2, 1, 0).float()  # [3, 20, 3] of odd strides
-    assert not planes.is_contiguous()
-    slope = torch.ones(1, 1, 3).expand(9, 40, 3)
-    one = value_and_gradient(planes, slope, "native")
-    other = value_and_gradient(planes.contiguous(), slope.contiguous(), "native")
-    assert torch.equal(one[0], other[0])
-    assert torch.equal(one[1], other[1])
-
-
-@needs_native
-def test_what_is_not_finite_stays_where_it_is() -> None:
-    image = noise(20, 30).float()
-    image[10, 15] = torch.nan
-    resized = resize(image, 100, 150, backend="native")
-    assert resized[45:60, 70:85].isnan().any()
-    assert resized[:35].isfinite().all()
-    assert resized[:, 100:].isfinite().all()
-
-
-def test_rows_of_the_matrix_sum_to_one() -> None:
-    for old, new in ((20, 100), (100, 20), (7, 7), (1, 5), (101, 33)):
-        torch.testing.assert_close(
-            matrix(old, new).sum(dim=1), torch.ones(new, dtype=torch.float64), rtol=0, atol=1e-12
-        )
-
-
 @pytest.mark.parametrize(
     ("shape", "size", "message"),
     [
@@ -177,23 +110,3 @@ def test_rows_of_the_matrix_sum_to_one() -> None:
 def test_wrong_sizes_are_named(shape: tuple[int, ...], size: tuple[int, int], message: str) -> None:
     with pytest.raises(ValueError, match=message):
         resize(torch.zeros(shape), *size)
-
-
-@needs_native
-def test_the_native_one_is_for_float32() -> None:
-    with pytest.raises(ValueError, match=r"image must be float32 on the CPU.*float64"):
-        resize(noise(4, 5), 8, 10, backend="native")
-
-
-@needs_native
-def test_bands_out_of_the_image_are_refused() -> None:
-    from xrgs import _native
-
-    image, one = torch.zeros(4, 5, 3), torch.ones(2, 2)
-    inside = torch.tensor([0, 2], dtype=torch.int32)
-    for first in ([0, 4], [-1, 0]):
-        outside = torch.tensor(first, dtype=torch.int32)
-        with pytest.raises(ValueError, match="a band reaches out of the image"):
-            _native.resample(image, outside, one, inside, one, 1)
-    with pytest.raises(ValueError, match="weights that do not fit"):
-        _native.resample(image, inside, torch.ones(3, 2), inside, one, 1)

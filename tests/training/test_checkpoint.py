@@ -382,7 +382,7 @@ def test_a_compressed_one_is_refused_before_it_fills_the_memory(tmp_path: Path) 
         ("pieces/optimizer/gaussians/shN", np.zeros((60, 15, 3)), "optimizer"),
         ("pieces/optimizer/adam/sh0/exp_avg", np.zeros((1, 1, 3), np.float32), "optimizer"),
         ("pieces/optimizer/adam/quats/step", np.zeros(4, np.float32), "optimizer"),
-        ("pieces/densifier/seen", np.zeros((2, 60), np.float32), "densifier"),
+        ("pieces/densifier/visible_count", np.zeros((2, 60), np.float32), "densifier"),
         ("pieces/densifier/generator", np.zeros(7, np.uint8), "densifier"),
         ("pieces/drawn/generator", np.zeros(5056, np.float32), "drawn"),
     ],

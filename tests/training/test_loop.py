@@ -12,7 +12,7 @@ import torch
 from xrgs.capture.dataset import USES, Dataset
 from xrgs.config import CONF_DIR, Conf
 from xrgs.errors import XrgsError
-from xrgs.splat.gaussians import PARAMETERS, Activated, Gaussians
+from xrgs.splat.gaussians import PARAMETERS, ActivatedGaussians, Gaussians
 from xrgs.splat.settings import RasterSettings
 from xrgs.training import components
 from xrgs.training import loop as train
@@ -72,7 +72,7 @@ class Recorder(components.Component):
         self.calls: list[tuple[str, int | None]] = []
         self.sizes: list[int] = []
 
-    def activated(self, activated: Activated, step: Step) -> Activated:
+    def activated(self, activated: ActivatedGaussians, step: Step) -> ActivatedGaussians:
         self.calls.append(("activated", step.number))
         assert len(activated.means) == self.sizes[-1]
         return activated

@@ -12,6 +12,7 @@ from torch import Tensor
 
 from xrgs.bench.loads import Load
 from xrgs.bench.timing import Times, alternate, threads
+from xrgs.splat.gaussians import ActivatedGaussians
 from xrgs.splat.rasterize import Render, rasterize
 from xrgs.splat.settings import CullingOptions, RasterSettings
 
@@ -71,7 +72,8 @@ class Rendering:
             else:
                 from xrgs.splat.native import rasterizer as native
 
-                self.render = native.render(*parameters, *view, degree, None, skips=self.way.skips)
+                gaussians = ActivatedGaussians(*parameters)
+                self.render = native.render_culled(gaussians, *view, degree, None, self.way.skips)
 
     def backward(self) -> tuple[Tensor, ...]:
         """Gradients of the six parameters, of the last render, which is then let go."""

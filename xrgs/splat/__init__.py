@@ -1,4 +1,6 @@
-"""The model: Gaussians, cameras, rasterizer, loss, optimizer, densification.
+"""The splatting model: Gaussians, cameras, rasterizer, loss, optimizer and densification.
 
-Knows nothing of XR-GS, scenes or Hydra: it could be its own package.
+The package knows nothing of XR-GS, scenes or Hydra. Each operation that training repeats has a
+public module here, which checks its arguments, and one implementation in `torch/` and one in
+`native/`, which `backend.implementation` chooses between.
 """

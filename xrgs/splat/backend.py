@@ -1,14 +1,17 @@
-"""Which renderer runs: the compiled one where it was built, else the torch one.
+"""The choice between the two implementations of the model: compiled kernels or plain torch.
 
-Needs no torch, so that a plan can name the backend of its cells.
+This module needs no torch, so that a plan can name the backend of its cells.
 """
 
 from __future__ import annotations
 
 import functools
+import importlib
 import importlib.util
 import logging
 import os
+from types import ModuleType
+from typing import Literal
 
 from xrgs.errors import XrgsError
 
@@ -16,20 +19,24 @@ NATIVE_MODULE = "xrgs._native"
 CHOICES = ("auto", "native", "torch")
 REQUIRE_NATIVE = "XRGS_REQUIRE_NATIVE"
 
+Operation = Literal["densify", "loss", "optimizer", "rasterizer", "resample"]
+"""The name of a module that both `xrgs/splat/torch/` and `xrgs/splat/native/` have."""
+
 
 def resolve_backend(name: str) -> str:
-    """The renderer that `name` means on this machine.
+    """Return the backend that a configured name means on this machine.
 
     Args:
-        name: `native`, `torch`, or `auto`: native where the extension was built. Where it was not,
-            `auto` says so once in the log, or fails if XRGS_REQUIRE_NATIVE is 1.
+        name: `native`, `torch`, or `auto`. `auto` means native where the extension was built.
+            Where it was not, `auto` means torch and logs one warning, or fails if the environment
+            variable XRGS_REQUIRE_NATIVE is 1.
 
     Returns:
         `native` or `torch`.
 
     Raises:
-        ValueError: name is none of the three.
-        XrgsError: the native backend was asked for, or required, and is not there.
+        ValueError: The name is none of the three.
+        XrgsError: The native backend is configured or required, and was not built.
     """
     if name not in CHOICES:
         raise ValueError(f"backend must be one of {', '.join(CHOICES)}, got {name!r}")
@@ -43,6 +50,25 @@ def resolve_backend(name: str) -> str:
         raise XrgsError(f"{REQUIRE_NATIVE}=1, and {NATIVE_MODULE} was not built on this machine")
     _warn_once()
     return "torch"
+
+
+def implementation(operation: Operation, backend: str) -> ModuleType:
+    """Return the module that computes an operation, importing it when it is first needed.
+
+    The modules of an operation have functions of the same names and parameters in both backends.
+
+    Args:
+        operation: The module's name.
+        backend: `torch`, `native` or `auto`, as for `resolve_backend`.
+
+    Returns:
+        `xrgs.splat.torch.<operation>` or `xrgs.splat.native.<operation>`.
+
+    Raises:
+        ValueError: `backend` is none of the three.
+        XrgsError: The native backend is configured or required, and was not built.
+    """
+    return importlib.import_module(f"xrgs.splat.{resolve_backend(backend)}.{operation}")
 
 
 @functools.cache

@@ -8,20 +8,30 @@ import torch
 from torch import Tensor
 
 ORTHONORMAL_TOLERANCE = 1e-3
-"""Of a viewmat's rotation: SfM's float32 exports err by 1e-6, a scaled one by its scale."""
+"""Largest entry of R R^T - I that a viewmat's rotation R may have: float32 exports of SfM err by
+1e-6, a matrix with a scale by that scale."""
 
 
 @dataclass(frozen=True)
 class Camera:
-    """One undistorted view. OpenCV axes: x right, y down, z forward; pixel centres at +0.5.
+    """An undistorted pinhole camera with OpenCV axes: x right, y down, z forward.
+
+    The centre of the first pixel is at (0.5, 0.5).
+
+    Attributes:
+        viewmat: [4, 4] rigid transform from world to camera coordinates.
+        K: [3, 3] intrinsics without skew, px.
+        width: Width of the image, px.
+        height: Height of the image, px.
 
     Raises:
-        ValueError: a matrix is of the wrong shape or not finite, `viewmat` is not rigid, `K` has
-            skew or a focal length <= 0, or the image has no pixel. The message names the field.
+        ValueError: A matrix has the wrong shape or values that are not finite, `viewmat` is not
+            rigid, `K` has skew or a focal length that is not above 0, or the image has no pixel.
+            The message names the field.
     """
 
-    viewmat: Tensor  # [4, 4] world to camera, rigid
-    K: Tensor  # [3, 3] px, no skew
+    viewmat: Tensor  # [4, 4]
+    K: Tensor  # [3, 3]
     width: int
     height: int
 
@@ -44,5 +54,5 @@ class Camera:
 
     @property
     def position(self) -> Tensor:
-        """Where the camera stands, in world units."""
+        """The camera's centre [3], world units."""
         return -self.viewmat[:3, :3].T @ self.viewmat[:3, 3]  # [3]

@@ -1,8 +1,12 @@
-"""Where Gaussians come from and go to: gsplat's `DefaultStrategy`, on the same inputs the same.
+"""Adaptive density control: growing, pruning and resetting Gaussians.
 
-One thing is as gsplat means it and not as its release 1.5.3 does it: there the opacity reset never
-happens, since `step % reset_every == 0 & step > 0` compares with `0 & step` (its pull request 776
-mends it).
+Kerbl et al. 2023 (3D Gaussian Splatting), section 5.2, as gsplat's `DefaultStrategy`
+(`strategy/default.py` and `strategy/ops.py` of release 1.5.3) computes it: given the same inputs,
+the results are the same.
+
+One thing is as gsplat intends it and not as its release 1.5.3 does it. There the opacity reset
+never happens, since `step % reset_every == 0 & step > 0` compares with `0 & step` (its pull request
+776 mends it).
 """
 
 from __future__ import annotations
@@ -15,71 +19,75 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from xrgs.splat.backend import implementation
 from xrgs.splat.gaussians import PARAMETERS
 from xrgs.splat.optimizer import SplatOptimizer
+from xrgs.splat.quaternions import rotation_matrices
 from xrgs.splat.settings import DensifySettings
-from xrgs.splat.torch.projection import rotations
 
 SPLIT_SHRINK = 1.6
-"""How many times smaller than the Gaussian it replaces each of a split's two is."""
+"""The scales of a split Gaussian are divided by this in its two halves (section 5.2)."""
 
-_BY_GROUP = ("grown", "pruned_opacity")
+_COUNTED_BY_GROUP = ("grown", "pruned_opacity")
 
 
 @dataclass(frozen=True)
 class Refinement:
-    """What a step's densification did; all 0 at most steps.
+    """What a step's densification did; all counts are 0 at most steps.
 
     Each Gaussian removed is counted once, by the first rule that holds in the order below, so that
     the number of Gaussians grows by exactly `duplicated + split - removed`.
     """
 
     duplicated: int = 0
-    """Small ones with a high gradient: a copy was added."""
+    """Small Gaussians with a high gradient, each of which a copy was added of."""
     split: int = 0
-    """Large ones with a high gradient: replaced by two."""
+    """Large Gaussians with a high gradient, each of which was replaced by two."""
     pruned_non_finite: int = 0
-    """A parameter, or the exponential of a scale, was infinite or no number."""
+    """Gaussians with a parameter, or the exponential of a scale, that was infinite or NaN."""
     pruned_opacity: int = 0
-    """Almost transparent."""
+    """Gaussians with an opacity below the threshold."""
     pruned_scale: int = 0
-    """Too large, and opaque enough to have stayed."""
+    """Gaussians that were too large, with an opacity that was high enough."""
     reset: int = 0
-    """Opacities lowered to the cap."""
+    """Gaussians whose opacity was lowered to the cap."""
     by_group: Mapping[str, int] = field(default_factory=dict)
-    """Where views are told apart: `grown_<group>`, those above the group's threshold (one above two
-    counts in both), and `pruned_opacity_<group>`, those below its."""
+    """Counts for each group of views, where there are groups. `grown_<group>`: Gaussians above the
+    group's growth threshold; one above the thresholds of two groups counts in both.
+    `pruned_opacity_<group>`: Gaussians below its opacity threshold."""
 
     @property
     def removed(self) -> int:
-        """Gaussians gone, those that a split replaced aside."""
+        """Number of Gaussians pruned; those that a split replaced are not among them."""
         return self.pruned_non_finite + self.pruned_opacity + self.pruned_scale
 
     def counts(self) -> dict[str, int]:
-        """All of it by name, groups' behind the rules'."""
+        """Return all counts by name: those of the rules, then those of the groups."""
         rules = {name: value for name, value in vars(self).items() if name != "by_group"}
         return rules | dict(self.by_group)
 
 
 @dataclass(frozen=True)
 class Thresholds:
-    """What a Gaussian must be above to grow, and not below to stay."""
+    """The two thresholds that groups of views may have of their own."""
 
     grow_grad2d: float
+    """A Gaussian grows if its mean image-plane gradient is above this (`DensifySettings`)."""
     prune_opacity: float
+    """A Gaussian is pruned if its opacity is below this."""
 
 
 @dataclass(frozen=True)
 class Groups:
-    """Views that densification tells apart, each group with thresholds of its own.
+    """Groups of views with thresholds of their own.
 
-    Not `pooled`, each group has statistics of its own. A Gaussian grows where any group's are above
-    that group's threshold. It is pruned by the threshold of one group: the first, in the order
-    given, in a view of which it had an image-plane gradient since the last refinement (being in the
-    view's frustum is not enough: of a forward-facing scene every Gaussian is in every frustum); the
-    last where it had none at all.
+    Not `pooled`, each group has statistics of its own. A Gaussian grows where any group's mean
+    gradient is above that group's threshold. It is pruned by the threshold of one group: the first,
+    in the order given, in a view of which it had an image-plane gradient since the last refinement
+    (being in the view's frustum is not enough: in a forward-facing scene every Gaussian is in every
+    frustum), or the last group if it had none in any view.
 
-    `pooled`, there is one statistic of all views, and the view of the step at which Gaussians are
+    `pooled`, all views add to one statistic, and the group of the view at whose step Gaussians are
     refined sets both thresholds.
     """
 
@@ -88,22 +96,24 @@ class Groups:
 
 
 class Densifier:
-    """Grows, prunes and resets Gaussians by the statistics of the steps since it last did.
+    """Grows, prunes and resets Gaussians by the image-plane gradients since the last refinement.
 
-    At steps above `start` and below `stop` that `every` divides: those whose image-plane gradient,
-    averaged over the views that saw them, is above `grow_grad2d` are duplicated (largest scale at
-    most `grow_scale3d * scene_scale`) or split in two; then those with an opacity below
-    `prune_opacity` are removed, and after step `reset_every` those with a scale above
-    `prune_scale3d * scene_scale`. At steps above 0 that `reset_every` divides, opacities are capped
-    at `reset_opacity * prune_opacity`. With none left, all of it is a no-op.
+    Gaussians are refined at steps above `start` and below `stop` that `every` divides. Those whose
+    image-plane gradient, averaged over the views in which they were visible, is above `grow_grad2d`
+    are duplicated (where the largest scale is at most `grow_scale3d * scene_scale`) or split in
+    two. Then those with an opacity below `prune_opacity` are removed and, after step
+    `reset_every`, those with a scale above `prune_scale3d * scene_scale`. At steps above 0 and
+    below `stop` that `reset_every` divides, opacities are capped at `reset_opacity *
+    prune_opacity`. Without Gaussians, all of it does nothing.
 
-    `groups` may put thresholds of their own in place of `grow_grad2d` and `prune_opacity`; the cap
-    is then that of the largest, since opacities below a threshold would all be pruned.
+    `groups` may replace `grow_grad2d` and `prune_opacity` by thresholds for each group of views.
+    The cap is then that of the largest opacity threshold, since the next refinement would prune
+    every opacity that is capped below its threshold.
 
     Attributes:
-        gradient: [G, N] sum of the norms of the image-plane gradients, in normalised device units;
-            G statistics, 1 unless groups have their own.
-        seen: [G, N] views that they are the sum of.
+        grad2d_sum: [G, N] sum of the norms of the image-plane gradients, in normalised device
+            units; G statistics, 1 unless each group has its own.
+        visible_count: [G, N] number of views that were summed.
     """
 
     def __init__(
@@ -118,25 +128,27 @@ class Densifier:
         """Start with empty statistics.
 
         Args:
-            optimizer: Of the Gaussians to densify.
-            settings: Already scaled to the run's length.
-            scene_scale: World units.
-            generator: Draws where the halves of a split go.
-            groups: Of views; None treats all alike, by the thresholds of `settings`.
+            optimizer: The optimizer of the Gaussians, through which they are added and removed.
+            settings: The schedule, already scaled to the run's length, and the thresholds.
+            scene_scale: Extent of the scene, world units.
+            generator: Random generator that draws the means of the two halves of a split.
+            groups: Groups of views; None has one, with the thresholds of `settings`.
         """
         self.optimizer = optimizer
         self.gaussians = optimizer.gaussians
         self.settings = settings
         self.scene_scale = scene_scale
         self.generator = generator
-        self.alike = Thresholds(settings.grow_grad2d, settings.prune_opacity)
-        self.thresholds = {} if groups is None else dict(groups.thresholds)
-        self.apart = groups is not None and not groups.pooled
-        #: Which of the G statistics a view of each group adds to.
-        self.rows = {name: row if self.apart else 0 for row, name in enumerate(self.thresholds)}
-        self.gradient: Tensor
-        self.seen: Tensor
-        self._forget()
+        self.shared_thresholds = Thresholds(settings.grow_grad2d, settings.prune_opacity)
+        self.group_thresholds = {} if groups is None else dict(groups.thresholds)
+        self.per_group = groups is not None and not groups.pooled
+        #: Which of the G statistics the views of each group add to.
+        self.group_rows = {
+            name: row if self.per_group else 0 for row, name in enumerate(self.group_thresholds)
+        }
+        self.grad2d_sum: Tensor
+        self.visible_count: Tensor
+        self._clear_statistics()
 
     def after_step(
         self,
@@ -148,19 +160,19 @@ class Densifier:
         height: int,
         group: str = "",
     ) -> Refinement:
-        """Note a step's statistics and, when it is time, refine and reset.
+        """Accumulate a step's statistics and, where the schedule says so, refine and reset.
 
         Args:
-            step: From 0, after the optimizer's step.
+            step: Number of the step, from 0; the optimizer's step has been taken.
             means2d_grad: [N, 2] gradient of the loss by the projected means, per px; None where
-                the render depends on no Gaussian, and then nothing is noted.
-            visible: [N] bool, seen by this step's view.
-            width: Of the view, px.
-            height: Of the view, px.
-            group: Of the view; no matter where all are alike.
+                the render depends on no Gaussian: then there is nothing to accumulate.
+            visible: [N] bool, whether this step's view shows the Gaussian.
+            width: Width of the view, px.
+            height: Height of the view, px.
+            group: Group of the view; not read where there are no groups.
 
         Returns:
-            What was done.
+            The counts of what was done.
 
         Raises:
             KeyError: There are groups, and the view's is none of them.
@@ -169,114 +181,130 @@ class Densifier:
         if step >= settings.stop:
             return Refinement()
         if means2d_grad is not None:
-            row = self.rows[group] if self.rows else 0
-            self._observe(row, means2d_grad, visible, width, height)
-        done = Refinement()
+            row = self.group_rows[group] if self.group_rows else 0
+            self._accumulate(row, means2d_grad, visible, width, height)
+        refinement = Refinement()
         if step > settings.start and step % settings.every == 0:
-            done = self._refine(self._deciding(group), too_large=step > settings.reset_every)
+            prune_large = step > settings.reset_every
+            refinement = self._refine(self._deciding_thresholds(group), prune_large=prune_large)
         if step > 0 and step % settings.reset_every == 0:
-            done = replace(done, reset=self._reset_opacities())
-        return done
+            refinement = replace(refinement, reset=self._reset_opacities())
+        return refinement
 
     def state_dict(self) -> dict[str, Any]:
-        """The statistics so far, and where chance stands."""
-        generator = self.generator.get_state()
-        return {"gradient": self.gradient, "seen": self.seen, "generator": generator}
+        """Return the statistics so far, and the state of the random generator."""
+        return {
+            "grad2d_sum": self.grad2d_sum,
+            "visible_count": self.visible_count,
+            "generator": self.generator.get_state(),
+        }
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Statistics and chance as `state_dict` told of them; the Gaussians are there already.
+        """Set statistics and random generator to those of `state_dict`.
+
+        Args:
+            state: A result of `state_dict`. The optimizer has loaded its Gaussians already.
 
         Raises:
-            KeyError: One is missing.
+            KeyError: A part of the state is missing.
             ValueError: The statistics are not of these groups and Gaussians.
         """
-        self._forget()
-        for name in ("gradient", "seen"):
-            value, here = state[name], self.gradient
-            if value.shape != here.shape or value.dtype != here.dtype:
+        self._clear_statistics()
+        for name in ("grad2d_sum", "visible_count"):
+            value, current = state[name], self.grad2d_sum
+            if value.shape != current.shape or value.dtype != current.dtype:
                 raise ValueError(f"{name}: {value.dtype} {list(value.shape)} does not fit")
-        self.gradient, self.seen = state["gradient"], state["seen"]
+        self.grad2d_sum, self.visible_count = state["grad2d_sum"], state["visible_count"]
         self.generator.set_state(state["generator"])
 
-    def _deciding(self, group: str) -> dict[str, Thresholds]:
-        """Thresholds for each of the G statistics, at the refinement after a view of a group."""
-        if self.apart:
-            return self.thresholds
-        return {group: self.thresholds[group] if self.thresholds else self.alike}
+    def _deciding_thresholds(self, group: str) -> dict[str, Thresholds]:
+        """Return thresholds for each of the G statistics, for a refinement after a group's view."""
+        if self.per_group:
+            return self.group_thresholds
+        if self.group_thresholds:
+            return {group: self.group_thresholds[group]}
+        return {group: self.shared_thresholds}
 
     @torch.no_grad()
-    def _refine(self, deciding: Mapping[str, Thresholds], *, too_large: bool) -> Refinement:
-        counts = {"pruned_non_finite": self._drop_non_finite()}
-        grow = self.gradient.new_tensor([t.grow_grad2d for t in deciding.values()])  # [G]
-        above = self.gradient / self.seen.clamp_min(1) > grow[:, None]  # [G, N]
-        owner = self._owner()  # before growing: what is new has its parent's
+    def _refine(self, deciding: Mapping[str, Thresholds], *, prune_large: bool) -> Refinement:
+        """Drop what is not finite, grow, prune, and start the statistics again."""
+        dropped = self._drop_non_finite()
+        grow = self.grad2d_sum.new_tensor([t.grow_grad2d for t in deciding.values()])  # [G]
+        mean_grad2d = self.grad2d_sum / self.visible_count.clamp_min(1)  # [G, N]
+        above = mean_grad2d > grow[:, None]  # [G, N]
+        deciding_row = self._deciding_row()  # [N], before growing
         grown, parents = self._grow(above.any(dim=0))
-        prune = self.gradient.new_tensor([t.prune_opacity for t in deciding.values()])
-        pruned, faint = self._prune(prune, owner[parents], too_large=too_large)
-        self._forget()
-        by_group = {f"{what}_{name}": 0 for what in _BY_GROUP for name in self.thresholds}
-        for row, name in enumerate(deciding if self.thresholds else ()):
+        prune = self.grad2d_sum.new_tensor([t.prune_opacity for t in deciding.values()])  # [G]
+        # Copies and halves are pruned by the threshold of their parent.
+        pruned, low_opacity = self._prune(prune, deciding_row[parents], prune_large=prune_large)
+        self._clear_statistics()
+        by_group = {
+            f"{count}_{name}": 0 for count in _COUNTED_BY_GROUP for name in self.group_thresholds
+        }
+        for row, name in enumerate(deciding if self.group_thresholds else ()):
             by_group[f"grown_{name}"] = int(above[row].sum())
-            by_group[f"pruned_opacity_{name}"] = faint[row]
-        return Refinement(**counts, **grown, **pruned, by_group=by_group)
+            by_group[f"pruned_opacity_{name}"] = low_opacity[row]
+        return Refinement(pruned_non_finite=dropped, **grown, **pruned, by_group=by_group)
 
     @torch.no_grad()
-    def _observe(
+    def _accumulate(
         self, row: int, means2d_grad: Tensor, visible: Tensor, width: int, height: int
     ) -> None:
         # gsplat's units: an image is 2 wide and 2 high, whatever its size in pixels.
-        units = width / 2, height / 2
-        gradient, seen = self.gradient[row], self.seen[row]
-        if self.optimizer.native:
-            from xrgs.splat.native import densify as native_densify
+        half_size = width / 2, height / 2
+        accumulate = implementation("densify", self.optimizer.backend).accumulate_statistics
+        sums = self.grad2d_sum[row], self.visible_count[row]
+        accumulate(means2d_grad, visible, half_size, *sums)
 
-            native_densify.observe(means2d_grad, visible, units, gradient, seen)
-            return
-        scaled = means2d_grad * means2d_grad.new_tensor(units)
-        gradient += torch.where(visible, scaled.norm(dim=-1), 0)
-        seen += visible
-
-    def _forget(self) -> None:
-        count = len(self.thresholds) if self.apart else 1
-        self.gradient = self.gaussians.opacities.new_zeros(count, len(self.gaussians))
-        self.seen = torch.zeros_like(self.gradient)
+    def _clear_statistics(self) -> None:
+        count = len(self.group_thresholds) if self.per_group else 1
+        self.grad2d_sum = self.gaussians.opacities.new_zeros(count, len(self.gaussians))
+        self.visible_count = torch.zeros_like(self.grad2d_sum)
 
     @torch.no_grad()
     def _drop_non_finite(self) -> int:
-        """Before growing, so that they leave no copies. Returns how many."""
-        finite = torch.isfinite(self._largest_scale())
+        """Remove what is not finite, before growing would copy it; return how many that were."""
+        finite = torch.isfinite(self._largest_scale())  # [N]
         for name in PARAMETERS:
             finite &= torch.isfinite(self.gaussians[name][..., None]).flatten(1).all(dim=1)
         self._keep(finite)
-        self.gradient, self.seen = self.gradient[:, finite], self.seen[:, finite]
+        self.grad2d_sum = self.grad2d_sum[:, finite]
+        self.visible_count = self.visible_count[:, finite]
         return int((~finite).sum())
 
-    def _owner(self) -> Tensor:
-        """[N] the first statistic that is not 0 of each Gaussian, or else the last."""
-        reached = self.gradient > 0
-        reached[-1] = True
-        return reached.int().argmax(dim=0)
+    def _deciding_row(self) -> Tensor:
+        """Return the first statistic [N] that is not 0 of each Gaussian, or else the last."""
+        has_gradient = self.grad2d_sum > 0  # [G, N]
+        has_gradient[-1] = True
+        return has_gradient.int().argmax(dim=0)
 
-    def _grow(self, high: Tensor) -> tuple[dict[str, int], Tensor]:
-        """Duplicate or split these [N]; counts, and the parent [M] of each there is now."""
-        small = self._largest_scale() <= self.settings.grow_scale3d * self.scene_scale
-        duplicate, split = high & small, high & ~small
+    def _grow(self, high_gradient: Tensor) -> tuple[dict[str, int], Tensor]:
+        """Duplicate or split where `high_gradient` [N].
+
+        Returns:
+            Counts, and the former index [M] of each Gaussian that is there now, or of its parent.
+        """
+        small = self._largest_scale() <= self.settings.grow_scale3d * self.scene_scale  # [N]
+        duplicate, split = high_gradient & small, high_gradient & ~small
         copies = {name: self.gaussians[name][duplicate] for name in PARAMETERS}
-        halves = self._halves(split)
+        halves = self._split_halves(split)
         self._keep(~split)
         self.optimizer.append(
             {name: torch.cat([copies[name], halves[name]]) for name in PARAMETERS}
         )
-        index = torch.arange(len(high))
+        index = torch.arange(len(high_gradient))
         parents = torch.cat([index[~split], index[duplicate], index[split].repeat(2)])
         return {"duplicated": int(duplicate.sum()), "split": int(split.sum())}, parents
 
-    def _halves(self, mask: Tensor) -> dict[str, Tensor]:
-        """Two Gaussians for each in `mask` [N]: smaller, their means drawn from the old one."""
+    def _split_halves(self, mask: Tensor) -> dict[str, Tensor]:
+        """Return two smaller Gaussians for each in `mask` [N], their means drawn from the old one.
+
+        gsplat's `split` (`strategy/ops.py`).
+        """
         old = {name: self.gaussians[name][mask] for name in PARAMETERS}  # [M, ...]
-        scales = old["scales"].exp()
+        scales = old["scales"].exp()  # [M, 3]
         noise = torch.randn(2, len(scales), 3, generator=self.generator, dtype=scales.dtype)
-        rotation = rotations(old["quats"])  # [M, 3, 3]
+        rotation = rotation_matrices(old["quats"])  # [M, 3, 3]
         offsets = torch.einsum("nij,nj,bnj->bni", rotation, scales, noise)  # [2, M, 3]
         halves = {name: torch.cat([value, value]) for name, value in old.items()}
         halves["means"] = (old["means"] + offsets).reshape(-1, 3)
@@ -284,31 +312,44 @@ class Densifier:
         return halves
 
     def _prune(
-        self, thresholds: Tensor, owner: Tensor, *, too_large: bool
+        self, thresholds: Tensor, deciding_row: Tensor, *, prune_large: bool
     ) -> tuple[dict[str, int], list[int]]:
-        """Counts, and how many each of `thresholds` [G] removed, of those that it owns [N]."""
-        faint = torch.sigmoid(self.gaussians.opacities) < thresholds[owner]
-        limit = self.settings.prune_scale3d * self.scene_scale if too_large else math.inf
-        large = ~faint & (self._largest_scale() > limit)
-        self._keep(~(faint | large))
-        counts = {"pruned_opacity": int(faint.sum()), "pruned_scale": int(large.sum())}
-        return counts, torch.bincount(owner[faint], minlength=len(thresholds)).tolist()
+        """Remove Gaussians with a low opacity, or too large.
+
+        Args:
+            thresholds: [G] opacities.
+            deciding_row: [N] which of the thresholds each Gaussian is pruned by.
+            prune_large: Whether Gaussians may be too large.
+
+        Returns:
+            Counts, and how many Gaussians each of the G thresholds removed.
+        """
+        low_opacity = torch.sigmoid(self.gaussians.opacities) < thresholds[deciding_row]  # [N]
+        largest = self.settings.prune_scale3d * self.scene_scale if prune_large else math.inf
+        too_large = ~low_opacity & (self._largest_scale() > largest)
+        self._keep(~(low_opacity | too_large))
+        counts = {
+            "pruned_opacity": int(low_opacity.sum()),
+            "pruned_scale": int(too_large.sum()),
+        }
+        by_row = torch.bincount(deciding_row[low_opacity], minlength=len(thresholds))
+        return counts, by_row.tolist()
 
     @torch.no_grad()
     def _reset_opacities(self) -> int:
-        thresholds = self.thresholds.values() or [self.alike]
+        """Cap opacities above every threshold, with moments of zero; return how many fell."""
+        thresholds = self.group_thresholds.values() or [self.shared_thresholds]
         largest = max(threshold.prune_opacity for threshold in thresholds)
-        value = torch.tensor(self.settings.reset_opacity * largest)
-        cap = torch.logit(value).item()
+        cap = torch.logit(torch.tensor(self.settings.reset_opacity * largest)).item()
         opacities = self.gaussians.opacities
         self.optimizer.reset("opacities", opacities.clamp(max=cap))
         return int((opacities > cap).sum())
 
     def _largest_scale(self) -> Tensor:
-        """[N], world units."""
+        """Return the largest scale [N] of each Gaussian, world units."""
         return self.gaussians.scales.exp().amax(dim=-1)
 
     def _keep(self, mask: Tensor) -> None:
-        """Remove all Gaussians but these [N]; most often none, and then nothing is copied."""
+        """Remove all Gaussians but those of `mask` [N]; nothing is copied where it is all true."""
         if not mask.all():
             self.optimizer.keep(mask)

@@ -1,4 +1,4 @@
-"""The scene: Gaussians as the raw parameters that the optimizer sees."""
+"""The Gaussians of a scene, as the raw parameters that the optimizer moves."""
 
 from __future__ import annotations
 
@@ -15,13 +15,17 @@ from torch import Tensor
 from xrgs.splat.sh import bases, colors_to_sh0
 
 PARAMETERS = ("means", "quats", "scales", "opacities", "sh0", "shN")
+"""Names of the parameters, in the order that functions take them; gsplat's names."""
 
 MIN_SPACING = 1e-7
-"""World units; the smallest initial scale, for points that lie on one another (log 0 else)."""
+"""Smallest initial scale, world units: points that coincide would have a log scale of -inf."""
 
 
-class Activated(NamedTuple):
-    """What `rasterize` takes: the Gaussians in their natural units, in `PARAMETERS`' order."""
+class ActivatedGaussians(NamedTuple):
+    """Gaussians after their activation functions, as `rasterize` takes them.
+
+    The fields are in the order of `PARAMETERS`.
+    """
 
     means: Tensor  # [N, 3] world units
     quats: Tensor  # [N, 4] wxyz, any length
@@ -33,7 +37,10 @@ class Activated(NamedTuple):
 
 @dataclass
 class Gaussians:
-    """N Gaussians. Leaf tensors, on which gradients gather; also reached by name, as a dict's."""
+    """N Gaussians as raw parameters: leaf tensors, on which gradients accumulate.
+
+    A parameter is also read and replaced by its name: `gaussians["means"]`.
+    """
 
     means: Tensor  # [N, 3] world units
     quats: Tensor  # [N, 4] wxyz, any length
@@ -43,6 +50,7 @@ class Gaussians:
     shN: Tensor  # [N, K - 1, 3], K = (degree + 1)^2  # noqa: N815 - the field's name
 
     def __len__(self) -> int:
+        """Return the number of Gaussians."""
         return int(self.means.shape[0])
 
     def __getitem__(self, name: str) -> Tensor:
@@ -56,13 +64,16 @@ class Gaussians:
             raise KeyError(name)
         setattr(self, name, value)
 
-    def activated(self) -> Activated:
-        """Scales in world units, opacities in 0..1, the rest as it is.
+    def activated(self) -> ActivatedGaussians:
+        """Apply the activation functions: exp to scales, the logistic function to opacities.
 
-        shN is cut off from its leaf: its gradient, three quarters of all, is never made. The
-        optimizer has it from sh0's (`SplatOptimizer.step`).
+        shN is detached, so that its gradient, three quarters of all, is never computed. The
+        optimizer derives it from that of sh0 (`SplatOptimizer.step`).
+
+        Returns:
+            The Gaussians, differentiable in all parameters but shN.
         """
-        return Activated(
+        return ActivatedGaussians(
             self.means,
             self.quats,
             torch.exp(self.scales),
@@ -80,24 +91,24 @@ def from_points(
     sh_degree: int,
     generator: torch.Generator,
 ) -> Gaussians:
-    """Gaussians on SfM points, as gsplat's `simple_trainer.py` starts.
+    """Place a Gaussian on each SfM point (`create_splats_with_optimizers`, gsplat's trainer).
 
-    Isotropic, as large as the RMS distance to the three nearest neighbours; random quaternions;
-    band 0 shows the point's colour, the rest is 0.
+    Each is isotropic, with the RMS distance to its three nearest neighbours as its scale. The
+    quaternions are random. Band 0 of the harmonics gives the point's colour, the others are 0.
 
     Args:
         points: [P, 3] world units.
         colors: [P, 3], 8-bit, or floats in 0..1.
-        init_opacity: between 0 and 1.
-        sh_degree: highest band stored, 0 to 3.
-        generator: draws the quaternions.
+        init_opacity: Opacity of every Gaussian, above 0 and below 1.
+        sh_degree: Highest band of the spherical harmonics that is stored, 0 to 3.
+        generator: Random generator that draws the quaternions.
 
     Returns:
-        P Gaussians, float32, with gradients on.
+        P Gaussians, float32 leaf tensors that require gradients.
 
     Raises:
-        ValueError: fewer than 4 points, shapes that do not fit, values that are not finite, or an
-            opacity that has no logit.
+        ValueError: There are fewer than 4 points, shapes do not fit, values are not finite, or the
+            opacity is not above 0 and below 1.
     """
     means = torch.as_tensor(points, dtype=torch.float32)
     rgb = torch.as_tensor(colors)
@@ -108,7 +119,7 @@ def from_points(
             f"points and colors must both be [P, 3], got {list(means.shape)} and {list(rgb.shape)}"
         )
     if count < 4:
-        raise ValueError(f"points: at least 4 are needed to know their spacing, got {count}")
+        raise ValueError(f"points: at least 4 are needed to measure their spacing, got {count}")
     for name, values in (("points", means), ("colors", rgb)):
         if not torch.isfinite(values).all():
             raise ValueError(f"{name} has values that are not finite")
@@ -128,7 +139,7 @@ def from_points(
 
 
 def _spacing(points: Tensor) -> Tensor:
-    """RMS distance of each point [P, 3] to its three nearest neighbours: [P]."""
+    """Return the RMS distance of each point [P, 3] to its three nearest neighbours: [P]."""
     distances, _ = KDTree(points.numpy()).query(points.numpy(), k=4)  # [P, 4], itself first
     squared = torch.from_numpy(distances[:, 1:]).square().mean(dim=-1)
     return squared.sqrt().float().clamp_min(MIN_SPACING)

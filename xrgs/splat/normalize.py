@@ -1,11 +1,12 @@
-"""Bring a scene into gsplat's world: learning rates and thresholds are written for it.
+"""Normalisation of a scene's world, which learning rates and thresholds are written for.
 
-The method of gsplat's `examples/datasets/normalize.py`: a similarity from the cameras (up is -y,
-what they look at in the middle, the median camera at distance 1), then the principal axes of the
-points (z the thinnest). All in numpy float64, as SfM's output is.
+The method is that of gsplat's `examples/datasets/normalize.py`: a similarity from the cameras (up
+is -y, the point they look at is the origin, the median camera is at distance 1), then a rotation to
+the principal axes of the points (z the thinnest). Everything is numpy float64, as the output of SfM
+is.
 
-Medians are taken coordinate by coordinate and the focus from the world's origin, as gsplat does:
-so the result is the same for a world of any scale, but not for any origin.
+Medians are taken coordinate by coordinate, and the focus is found from the world's origin, as in
+gsplat: so the result is the same for a world of any scale, but not for any origin.
 """
 
 from __future__ import annotations
@@ -18,29 +19,33 @@ from numpy.typing import NDArray
 Array = NDArray[np.float64]
 
 SCALE_MARGIN = 1.1
-"""gsplat's trainer multiplies the cameras' extent by this to get the scene's scale."""
+"""The scene's scale is the cameras' extent times this, as in gsplat's trainer."""
 
 
 @dataclass(frozen=True)
-class Normalized:
+class NormalizedScene:
     """A scene in the normalised world."""
 
     viewmats: Array  # [C, 4, 4] world to camera, rigid
     points: Array  # [P, 3]
-    transform: Array  # [4, 4] similarity that brought the old world here
+    transform: Array  # [4, 4] similarity from the old world to the normalised one
     scene_scale: float
-    """1.1 x the largest distance of a camera from the mean camera position."""
+    """1.1 times the largest distance of a camera from the mean of the camera positions."""
 
 
-def normalize_scene(viewmats: Array, points: Array) -> Normalized:
-    """Normalise cameras and points together. An image rendered from either world is the same.
+def normalize_scene(viewmats: Array, points: Array) -> NormalizedScene:
+    """Normalise cameras and points together, so that images of both worlds are the same.
 
     Args:
         viewmats: [C, 4, 4] world to camera, rigid.
         points: [P, 3] SfM points.
 
+    Returns:
+        The scene in the normalised world.
+
     Raises:
-        ValueError: no camera, fewer than 3 points, a wrong shape or a value that is not finite.
+        ValueError: There is no camera, there are fewer than 3 points, or an array has the wrong
+            shape or a value that is not finite.
     """
     for name, value, shape in (("viewmats", viewmats, (4, 4)), ("points", points, (3,))):
         if value.shape[1:] != shape or not np.isfinite(value).all():
@@ -52,25 +57,32 @@ def normalize_scene(viewmats: Array, points: Array) -> Normalized:
     similarity = similarity_from_cameras(viewmats)
     axes = principal_axes(transform_points(similarity, points))
     transform = axes @ similarity
-    moved = transform_viewmats(transform, viewmats)
-    positions = camera_positions(moved)
-    reach = np.linalg.norm(positions - positions.mean(axis=0), axis=1).max()
-    return Normalized(
-        moved, transform_points(transform, points), transform, float(reach) * SCALE_MARGIN
+    normalized = transform_viewmats(transform, viewmats)  # [C, 4, 4]
+    positions = camera_positions(normalized)  # [C, 3]
+    extent = np.linalg.norm(positions - positions.mean(axis=0), axis=1).max()
+    return NormalizedScene(
+        normalized, transform_points(transform, points), transform, float(extent) * SCALE_MARGIN
     )
 
 
 def camera_positions(viewmats: Array) -> Array:
-    """Where the cameras of viewmats [C, 4, 4] stand: [C, 3]."""
+    """Return the centres [C, 3] of cameras with rigid viewmats [C, 4, 4]."""
     positions: Array = -np.einsum("nji,nj->ni", viewmats[:, :3, :3], viewmats[:, :3, 3])
     return positions
 
 
 def similarity_from_cameras(viewmats: Array) -> Array:
-    """Similarity [4, 4] that turns the cameras' mean up axis to -y and their focus to 0.
+    """Return the similarity that turns the cameras' mean up axis to -y and moves their focus to 0.
 
-    The focus is the median of each optical axis's nearest point to the (turned) origin, as in
-    gsplat's `center_method="focus"`; the scale makes the median camera distance from it 1.
+    The focus is the median of the points of the optical axes that are nearest to the (turned)
+    origin, as in gsplat's `center_method="focus"`. The median distance of the cameras from it
+    becomes 1.
+
+    Args:
+        viewmats: [C, 4, 4] world to camera, rigid.
+
+    Returns:
+        [4, 4]
     """
     up = -viewmats[:, 1, :3].mean(axis=0)
     turn = rotation_between(up / np.linalg.norm(up), np.array([0.0, -1.0, 0.0]))
@@ -88,13 +100,21 @@ def similarity_from_cameras(viewmats: Array) -> Array:
 
 
 def rotation_between(start: Array, end: Array) -> Array:
-    """The shortest rotation [3, 3] that takes unit vector `start` to unit vector `end`."""
+    """Return the shortest rotation from one unit vector to another.
+
+    Args:
+        start: [3] unit vector.
+        end: [3] unit vector.
+
+    Returns:
+        [3, 3] matrix R with R start = end.
+    """
     cosine = float(start @ end)
     if cosine <= -1.0 + 1e-12:
-        # Opposite: half a turn about any axis across them.
-        across = np.cross(start, np.eye(3)[np.abs(start).argmin()])
-        across /= np.linalg.norm(across)
-        half_turn: Array = 2.0 * np.outer(across, across) - np.eye(3)
+        # Opposite vectors: half a turn about any axis perpendicular to them.
+        axis = np.cross(start, np.eye(3)[np.abs(start).argmin()])
+        axis /= np.linalg.norm(axis)
+        half_turn: Array = 2.0 * np.outer(axis, axis) - np.eye(3)
         return half_turn
     x, y, z = np.cross(start, end)
     skew = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
@@ -103,7 +123,15 @@ def rotation_between(start: Array, end: Array) -> Array:
 
 
 def principal_axes(points: Array) -> Array:
-    """Rigid transform [4, 4]: the median of points [P, 3] to 0, their widest axis to x, then y."""
+    """Return the rigid transform of points to their principal axes.
+
+    Args:
+        points: [P, 3]
+
+    Returns:
+        [4, 4] transform that moves the points' median to 0, turns the axis of their largest
+        variance to x and that of their smallest to z.
+    """
     centre = np.median(points, axis=0)
     _, vectors = np.linalg.eigh(np.cov(points - centre, rowvar=False))
     rotation = vectors[:, ::-1].T  # eigh's eigenvalues ascend
@@ -116,17 +144,24 @@ def principal_axes(points: Array) -> Array:
 
 
 def transform_points(transform: Array, points: Array) -> Array:
-    """Apply a similarity [4, 4] to points [P, 3]."""
-    moved: Array = points @ transform[:3, :3].T + transform[:3, 3]
-    return moved
+    """Apply a similarity [4, 4] to points [P, 3]: [P, 3]."""
+    transformed: Array = points @ transform[:3, :3].T + transform[:3, 3]
+    return transformed
 
 
 def transform_viewmats(transform: Array, viewmats: Array) -> Array:
-    """The viewmats [C, 4, 4] of the same cameras in the world that a similarity [4, 4] makes.
+    """Return the viewmats of the same cameras in a transformed world.
 
-    They stay rigid: the world's scale goes into the translations.
+    They stay rigid: the scale of the transform goes into the translations.
+
+    Args:
+        transform: [4, 4] similarity from the old world to the new one.
+        viewmats: [C, 4, 4] old world to camera, rigid.
+
+    Returns:
+        [C, 4, 4] new world to camera, rigid.
     """
     scale = np.cbrt(np.linalg.det(transform[:3, :3]))
-    moved: Array = viewmats @ np.linalg.inv(transform)  # old camera from the new world
-    moved[:, :3] *= scale
-    return moved
+    transformed: Array = viewmats @ np.linalg.inv(transform)  # new world to old camera
+    transformed[:, :3] *= scale
+    return transformed

@@ -1,4 +1,4 @@
-"""Adam over the six parameters of the Gaussians, and its state as Gaussians come and go."""
+"""Adam over the six parameters of the Gaussians, whose state follows as Gaussians come and go."""
 
 from __future__ import annotations
 
@@ -8,25 +8,30 @@ from typing import Any
 
 import torch
 from torch import Tensor
-from torch.nn.functional import normalize
 
-from xrgs.splat.backend import resolve_backend
+from xrgs.splat.backend import implementation, resolve_backend
 from xrgs.splat.cameras import Camera
 from xrgs.splat.gaussians import PARAMETERS, Gaussians
 from xrgs.splat.settings import OptimizerSettings
-from xrgs.splat.sh import C0, sh_basis
 
 
 class SplatOptimizer:
-    """One `torch.optim.Adam` with a named group a parameter, at gsplat's rates (`simple_trainer`).
+    """One `torch.optim.Adam` with a named group for each parameter, at gsplat's learning rates.
 
-    The rate of `means` is in units of the scene and decays exponentially, from
-    `settings.means * scene_scale` at the first step to `settings.means_final` of it after the last.
-    The state is torch's own: `adam.state[gaussians.means]["exp_avg"]`.
+    The rates are those of `examples/simple_trainer.py`. That of `means` is multiplied by the
+    scene's scale and decays exponentially, from `settings.means * scene_scale` at the first step to
+    `settings.means_final` times that after the last. The state is torch's own:
+    `adam.state[gaussians.means]["exp_avg"]`.
 
-    Gaussians are added and removed through `append` and `keep` alone, so that parameters and state
-    can't come apart. New ones start with moments of zero, under the step count of the old, as in
-    gsplat.
+    Gaussians are added and removed through `append` and `keep` alone, so that the parameters and
+    the state always fit. New Gaussians start with moments of zero and the step count of the others,
+    as in gsplat (`strategy/ops.py`).
+
+    Attributes:
+        adam: The optimizer that holds groups and state.
+        backend: `torch` or `native`: the backend that computes a step.
+        gaussians: The Gaussians that are optimized.
+        steps_done: Number of steps taken so far.
     """
 
     def __init__(
@@ -41,14 +46,15 @@ class SplatOptimizer:
         """Start with no state.
 
         Args:
-            gaussians: What to optimize; their tensors are replaced as Gaussians come and go.
-            settings: Rates and Adam's constants.
-            scene_scale: World units, above 0.
-            steps: Of the whole run.
-            backend: `torch`, `native` or `auto` (`resolve_backend`): who computes a step.
+            gaussians: The Gaussians to optimize; their tensors are replaced as Gaussians come and
+                go.
+            settings: Learning rates and Adam's constants.
+            scene_scale: Extent of the scene in world units, above 0.
+            steps: Number of steps of the whole run, at least 1.
+            backend: `torch`, `native` or `auto` (`resolve_backend`), which computes the steps.
 
         Raises:
-            ValueError: `scene_scale` or `steps` isn't above 0.
+            ValueError: `scene_scale` or `steps` is not above 0.
         """
         if not (math.isfinite(scene_scale) and scene_scale > 0):
             raise ValueError(f"scene_scale must be above 0, got {scene_scale}")
@@ -59,7 +65,7 @@ class SplatOptimizer:
         self.means_final = settings.means_final
         self.steps = steps
         self.steps_done = 0
-        self.native = resolve_backend(backend) == "native"
+        self.backend = resolve_backend(backend)
         rates = {name: getattr(settings, name) for name in PARAMETERS}
         rates["means"] = self.means_rate
         self.adam = torch.optim.Adam(
@@ -72,92 +78,85 @@ class SplatOptimizer:
     def step(self, camera: Camera | None = None, *, sh_degree: int = 0) -> None:
         """Move every parameter that has a gradient, then decay the rate of `means`.
 
-        With a camera shN moves, too, by the gradient that sh0's implies: seen from one place, all
-        harmonics of a Gaussian change one colour, so their gradient is that of the colour times
-        the basis in the direction of view, and sh0's has the constant C0 in the basis' place.
+        With a camera shN moves, too, by the gradient that sh0's implies. Seen from one place, a
+        Gaussian has one colour c, which is linear in its harmonics: d c / d shN[k] = basis[k](dir)
+        and d c / d sh0 = C0. So the gradient of shN[k] is that of sh0 times basis[k](dir) / C0.
 
         Args:
             camera: The view that the gradients come from, as the Gaussians were rendered in it.
-            sh_degree: Highest band that was on.
+            sh_degree: Highest band of the spherical harmonics that was rendered.
         """
-        if self.native:
-            from xrgs.splat.native import optimizer as native_adam
-
-            native_adam.step(self.adam, camera, sh_degree)
-        else:
-            if camera is not None:
-                self._give_harmonics_gradient(camera, sh_degree)
-            self.adam.step()
+        implementation("optimizer", self.backend).step(self.adam, camera, sh_degree)
         self.steps_done += 1
-        self._decay()
+        self._decay_means_rate()
 
-    def _decay(self) -> None:
+    def _decay_means_rate(self) -> None:
         decay: float = self.means_final ** (self.steps_done / self.steps)
         self._group("means")["lr"] = self.means_rate * decay
 
-    @torch.no_grad()
-    def _give_harmonics_gradient(self, camera: Camera, sh_degree: int) -> None:
-        means, sh0, shN = self.gaussians.means, self.gaussians.sh0, self.gaussians.shN
-        if sh0.grad is not None:
-            dirs = normalize(means - camera.position.to(means), dim=-1)
-            basis = sh_basis(sh_degree, dirs)[:, 1:, None]  # [N, K - 1, 1]
-            shN.grad = torch.zeros_like(shN)
-            shN.grad[:, : basis.shape[1]] = basis * (sh0.grad / C0)
-
     def zero_grad(self) -> None:
-        """Forget the gradients."""
+        """Drop the gradients of all parameters."""
         self.adam.zero_grad()
 
     def state_bytes(self) -> int:
-        """Bytes of Adam's state."""
+        """Return the number of bytes of Adam's state."""
         return sum(value.nbytes for state in self.adam.state.values() for value in state.values())
 
     def state_dict(self) -> dict[str, Any]:
-        """The Gaussians, Adam's state of each parameter that has one, and the steps done."""
+        """Return the state that `load_state_dict` continues from.
+
+        Returns:
+            `gaussians`: the parameters by name; `adam`: the state of each parameter by name, empty
+            where it has none; `steps_done`.
+        """
         values = {name: self.gaussians[name].detach() for name in PARAMETERS}
         adam = {name: dict(self.adam.state.get(self.gaussians[name], {})) for name in PARAMETERS}
         return {"gaussians": values, "adam": adam, "steps_done": self.steps_done}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Gaussians, moments and rates as `state_dict` told of them; gradients are forgotten.
+        """Set Gaussians, moments and learning rates to those of `state_dict`; drop gradients.
+
+        Args:
+            state: A result of `state_dict`, perhaps of another number of Gaussians.
 
         Raises:
             KeyError: A parameter or moment is missing.
-            ValueError: One has another shape or type than its place; nothing is changed then.
+            ValueError: A parameter or moment has another shape or type than the one here; nothing
+                is changed then.
         """
         values, adam = state["gaussians"], state["adam"]
         count = len(values["means"])
         for name in PARAMETERS:
-            here = self.gaussians[name]
+            current = self.gaussians[name]
             moments = [adam[name][key] for key in ("exp_avg", "exp_avg_sq") if adam[name]]
             for value in (values[name], *moments):
-                if value.shape != (count, *here.shape[1:]) or value.dtype != here.dtype:
+                if value.shape != (count, *current.shape[1:]) or value.dtype != current.dtype:
                     raise ValueError(f"{name}: {value.dtype} {list(value.shape)} does not fit")
             if adam[name] and adam[name]["step"].shape != ():
-                raise ValueError(f"{name}: its count of steps is not one number")
+                raise ValueError(f"{name}: the number of its steps is not a scalar")
         for name in PARAMETERS:
             self._replace(name, values[name], torch.zeros_like)
             self.adam.state.pop(self.gaussians[name], None)
             if adam[name]:
                 self.adam.state[self.gaussians[name]] = dict(adam[name])
         self.steps_done = int(state["steps_done"])
-        self._decay()
+        self._decay_means_rate()
 
     def keep(self, index: Tensor) -> None:
-        """Only these Gaussians remain, in this order.
+        """Remove all Gaussians but these, with their moments.
 
         Args:
-            index: [M] int64 indices, or [N] bool.
+            index: [M] int64 indices in the order that the Gaussians shall have, or [N] bool.
         """
         for name in PARAMETERS:
-            kept = self.gaussians[name].detach()[index]
-            self._replace(name, kept, lambda moment: moment[index])
+            values = self.gaussians[name].detach()[index]
+            self._replace(name, values, lambda moment: moment[index])
 
     def append(self, new: Mapping[str, Tensor]) -> None:
-        """Add Gaussians behind the present ones.
+        """Add Gaussians behind the present ones, with moments of zero.
 
         Args:
-            new: [M, ...] for each name of `PARAMETERS`.
+            new: Raw parameters [M, ...] for each name of `PARAMETERS`.
         """
         count = len(new["means"])
 
@@ -169,11 +168,16 @@ class SplatOptimizer:
             self._replace(name, longer, lengthen)
 
     def reset(self, name: str, value: Tensor) -> None:
-        """Give one parameter [N, ...] new values and moments of zero."""
+        """Give one parameter new values and moments of zero.
+
+        Args:
+            name: One of `PARAMETERS`.
+            value: [N, ...] its new values.
+        """
         self._replace(name, value, torch.zeros_like)
 
     def _replace(self, name: str, value: Tensor, moment: Callable[[Tensor], Tensor]) -> None:
-        """Put `value` in a parameter's place, and `moment` of each of its Adam moments."""
+        """Replace a parameter by `value`, and each of its Adam moments m by `moment(m)`."""
         state = self.adam.state.pop(self.gaussians[name], {})
         leaf = value.detach().requires_grad_()
         self.gaussians[name] = leaf

@@ -1,7 +1,8 @@
-"""Gaussians as the .ply that every viewer of 3D Gaussian Splatting opens (INRIA's layout).
+"""Gaussians as .ply files in the layout of INRIA, which viewers of 3D Gaussian Splatting open.
 
-Binary little endian float32, one vertex a Gaussian, raw parameters (logit opacities, log scales);
-the SH rest is channel-major: all coefficients of red, then green, then blue.
+A file is binary little endian float32 with one vertex for each Gaussian and its raw parameters
+(logit opacities, log scales). The harmonics above band 0 are stored by channel: all coefficients of
+red, then green, then blue.
 """
 
 from __future__ import annotations
@@ -34,7 +35,7 @@ def save_ply(path: Path, gaussians: Gaussians) -> None:
     count = len(gaussians)
     columns = [
         gaussians.means,
-        torch.zeros_like(gaussians.means),  # normals, which viewers expect and no one reads
+        torch.zeros_like(gaussians.means),  # normals, which viewers expect and do not use
         gaussians.sh0[:, 0],
         gaussians.shN.transpose(1, 2).flatten(1),
         gaussians.opacities[:, None],
@@ -65,16 +66,16 @@ def load_ply(path: Path) -> Gaussians:
     try:
         with path.open("rb") as file:
             count, names = _read_header(file, path)
-            follow = os.fstat(file.fileno()).st_size - file.tell()
-            if follow != count * len(names) * 4:  # before any of it is read: the file may be huge
+            body_bytes = os.fstat(file.fileno()).st_size - file.tell()
+            if body_bytes != count * len(names) * 4:  # before reading: the file may be huge
                 raise XrgsError(
                     f"{path}: {count} vertices of {len(names)} floats need "
-                    f"{count * len(names) * 4} bytes, {follow} follow the header"
+                    f"{count * len(names) * 4} bytes, {body_bytes} follow the header"
                 )
-            body = file.read(follow)
+            body = file.read(body_bytes)
     except OSError as error:
         raise XrgsError(f"{path}: cannot be read: {error.strerror}") from error
-    if len(body) != follow:
+    if len(body) != body_bytes:
         raise XrgsError(f"{path}: grew shorter while it was read")
     table = np.frombuffer(body, dtype="<f4").reshape(count, len(names))
     if not np.isfinite(table).all():
@@ -83,7 +84,7 @@ def load_ply(path: Path) -> Gaussians:
 
 
 def _properties(rest: int) -> list[str]:
-    """Names of a vertex's columns, with `rest` SH coefficients a channel above band 0."""
+    """Return a vertex's columns, with `rest` SH coefficients above band 0 for each channel."""
     return [
         *("x", "y", "z"),
         *_NORMALS,
@@ -96,7 +97,7 @@ def _properties(rest: int) -> list[str]:
 
 
 def _read_header(file: BinaryIO, path: Path) -> tuple[int, list[str]]:
-    """Number of vertices and names of their columns; leaves `file` at the first vertex."""
+    """Return the number of vertices and their columns; leave `file` at the first vertex."""
     if file.readline(len(_MAGIC)) != _MAGIC:
         raise XrgsError(f"{path}: is not a .ply file")
     count = -1
@@ -124,26 +125,26 @@ def _read_header(file: BinaryIO, path: Path) -> tuple[int, list[str]]:
 
 
 def _is_count(digits: str) -> bool:
-    """Whether it is a number of vertices that memory could hold."""
+    """Return whether a string is a number of vertices that memory could hold."""
     return digits.isascii() and digits.isdigit() and len(digits) <= 12
 
 
 def _gaussians(table: NDArray[np.float32], names: list[str], path: Path) -> Gaussians:
-    """The parameters that a table [N, columns] of named columns holds."""
+    """Return the parameters in a table [N, columns] of named columns."""
     stored = sum(name.startswith("f_rest_") for name in names)
     if stored not in {3 * (bases(degree) - 1) for degree in range(MAX_DEGREE + 1)}:
-        raise XrgsError(f"{path}: {stored} f_rest properties are no whole number of SH bands")
-    needed = [name for name in _properties(stored // 3) if name not in _NORMALS]
-    missing = [name for name in needed if name not in names]
+        raise XrgsError(f"{path}: {stored} f_rest properties are not a whole number of SH bands")
+    required = [name for name in _properties(stored // 3) if name not in _NORMALS]
+    missing = [name for name in required if name not in names]
     if missing:
         raise XrgsError(f"{path}: properties are missing: {', '.join(missing)}")
-    # In a fixed order whatever the file's, so that the parameters can be cut out one by one.
-    ordered = torch.from_numpy(table[:, [names.index(name) for name in needed]])
+    # In a fixed order whatever the file's, so that the parameters can be split off one by one.
+    ordered = torch.from_numpy(table[:, [names.index(name) for name in required]])
     widths = {"means": 3, "sh0": 3, "shN": stored, "opacities": 1, "scales": 3, "quats": 4}
-    parts = dict(zip(widths, ordered.split(list(widths.values()), dim=1), strict=True))
-    parts["opacities"] = parts["opacities"][:, 0]
-    parts["sh0"] = parts["sh0"][:, None]
-    parts["shN"] = parts["shN"].reshape(len(table), 3, stored // 3).transpose(1, 2)
+    values = dict(zip(widths, ordered.split(list(widths.values()), dim=1), strict=True))
+    values["opacities"] = values["opacities"][:, 0]  # [N]
+    values["sh0"] = values["sh0"][:, None]  # [N, 1, 3]
+    values["shN"] = values["shN"].reshape(len(table), 3, stored // 3).transpose(1, 2)
     contiguous = torch.contiguous_format
-    leaves = {name: value.clone(memory_format=contiguous) for name, value in parts.items()}
+    leaves = {name: value.clone(memory_format=contiguous) for name, value in values.items()}
     return Gaussians(**{name: value.requires_grad_() for name, value in leaves.items()})

@@ -1,20 +1,20 @@
-"""The face of rendering: one call, whichever backend does the work."""
+"""Rendering of Gaussians into one view, on whichever backend is chosen."""
 
 from __future__ import annotations
-
-import importlib
-from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
-from xrgs.splat.backend import resolve_backend
+from xrgs.splat.backend import implementation, resolve_backend
 from xrgs.splat.cameras import Camera
-from xrgs.splat.gaussians import Activated
+from xrgs.splat.gaussians import ActivatedGaussians
+from xrgs.splat.render_result import Render
 from xrgs.splat.settings import RasterSettings
+from xrgs.splat.sh import check_sh_degree
 
-_MODULES = {"torch": "xrgs.splat.torch.rasterizer", "native": "xrgs.splat.native.rasterizer"}
-#: Of one Gaussian; that of shN goes by its own bands.
+__all__ = ["Render", "rasterize"]
+
+#: Shape of one Gaussian's value; that of shN depends on how many bands it has.
 _SHAPES: dict[str, tuple[int, ...]] = {
     "means": (3,),
     "quats": (4,),
@@ -23,19 +23,6 @@ _SHAPES: dict[str, tuple[int, ...]] = {
     "sh0": (1, 3),
     "means2d_offset": (2,),
 }
-
-
-@dataclass(frozen=True)
-class Render:
-    """An image and what it took."""
-
-    image: Tensor  # [H, W, 3], 0 and up: not clamped at 1
-    alpha: Tensor  # [H, W], 1 - transmittance
-    visible: Tensor  # [N] bool
-    evaluations: int
-    """Pixels that a Gaussian's alpha was computed at."""
-    buffer_bytes: int
-    """What the renderer allocates beside the parameters and their gradients, at its peak."""
 
 
 def rasterize(
@@ -54,40 +41,45 @@ def rasterize(
 ) -> Render:
     """Render Gaussians into one view (3D Gaussian Splatting, with gsplat's constants).
 
-    A Gaussian is visible if it is in front of `settings.near`, its opacity reaches
-    `settings.alpha_min` and the box around all it can colour overlaps the image.
+    A Gaussian is visible if it is in front of `settings.near`, its opacity is at least
+    `settings.alpha_min`, and the bounding box of the ellipse within which its alpha reaches
+    `settings.alpha_min` overlaps the image.
 
     Args:
         means: [N, 3] world units.
         quats: [N, 4] wxyz, any length; zero is no rotation.
         scales: [N, 3] world units, at least 0.
         opacities: [N] in 0..1.
-        sh0: [N, 1, 3]
-        shN: [N, K - 1, 3]
-        camera: the view.
-        settings: how Gaussians become pixels.
-        sh_degree: highest band that is on, at most the bands of shN.
+        sh0: [N, 1, 3] coefficients of band 0 of the spherical harmonics.
+        shN: [N, K - 1, 3] coefficients of the higher bands.
+        camera: The view.
+        settings: How Gaussians become pixels.
+        sh_degree: Highest band that is on, at most the bands of shN.
         means2d_offset: [N, 2] px, added to the projected means: its gradient is the image-plane
             gradient that densification reads (with `settings.absgrad`, of absolute values).
         backend: `torch`, `native` or `auto` (`resolve_backend`).
 
     Returns:
-        The render, differentiable in every float argument.
+        The render, differentiable in every float argument; once only on the native backend.
 
     Raises:
-        ValueError: a parameter has the wrong shape or type, or values that are not finite or out
-            of range; the message names it.
+        ValueError: A parameter has the wrong shape or type, or values that are not finite or out
+            of range; or `sh_degree` is not 0 to 3 or above the bands of shN. The message names the
+            parameter.
+        MemoryError: The tile lists of the view do not fit in memory.
     """
-    values = Activated(means, quats, scales, opacities, sh0, shN)
-    named = values._asdict()
+    gaussians = ActivatedGaussians(means, quats, scales, opacities, sh0, shN)
+    named = gaussians._asdict()
     if means2d_offset is not None:
         named["means2d_offset"] = means2d_offset
     _check_shapes(named)
+    check_sh_degree(sh_degree, shN)
     backend = resolve_backend(backend)
-    if backend == "torch":  # the native one looks at values as it reads them
+    if backend == "torch":  # the native backend checks values as it reads them
         _check_values(named)
-    module = importlib.import_module(_MODULES[backend])
-    render: Render = module.render(*values, camera, settings, sh_degree, means2d_offset)
+    render: Render = implementation("rasterizer", backend).render(
+        gaussians, camera, settings, sh_degree, means2d_offset
+    )
     return render
 
 
@@ -96,10 +88,12 @@ def _check_shapes(values: dict[str, Tensor]) -> None:
     count = means.shape[0] if means.ndim else 0
     shapes = _SHAPES | {"shN": (*values["shN"].shape[1:2], 3)}
     for name, value in values.items():
-        _check(name, value, (count, *shapes[name]), means.dtype)
+        _check_shape_and_type(name, value, (count, *shapes[name]), means.dtype)
 
 
-def _check(name: str, value: Tensor, shape: tuple[int, ...], dtype: torch.dtype) -> None:
+def _check_shape_and_type(
+    name: str, value: Tensor, shape: tuple[int, ...], dtype: torch.dtype
+) -> None:
     if value.shape != shape:
         raise ValueError(f"{name} must be {list(shape)}, got {list(value.shape)}")
     if not value.is_floating_point() or value.dtype != dtype:

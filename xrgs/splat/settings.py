@@ -1,7 +1,8 @@
-"""The settings of the splatting model: gsplat 1.5.3's defaults (`examples/simple_trainer.py`).
+"""The settings of the splatting model, with gsplat 1.5.3's defaults.
 
-Plain dataclasses without torch, so that a plan can be made without importing it. Step counts are
-those of a 30,000-step run; `scaled` shrinks them with the run, as gsplat's `adjust_steps` does.
+Those are of `examples/simple_trainer.py` and `strategy/default.py`. The settings are plain
+dataclasses without torch, so that a plan can be made without importing it. Step counts are those of
+a 30,000-step run; `scaled` shrinks them with the run, as the trainer's `adjust_steps` does.
 """
 
 from __future__ import annotations
@@ -9,90 +10,114 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 NOMINAL_STEPS = 30_000
+"""Length of the run that step counts in settings are written for."""
 
 
 @dataclass
 class RasterSettings:
-    """How Gaussians become pixels."""
+    """How Gaussians become pixels (arguments of gsplat's `rasterization`)."""
 
     sh_degree: int = 3
     """Highest band of the spherical harmonics, 0 to 3."""
     near: float = 0.01
-    """Gaussians closer than this (world units along z) are dropped."""
+    """Gaussians whose depth (world units along z) is this or less are not rendered."""
     eps2d: float = 0.3
     """Variance added to every projected Gaussian, px^2."""
     alpha_min: float = 1.0 / 255.0
-    """Contributions below this are skipped."""
+    """Contributions to a pixel whose alpha is below this are skipped."""
     alpha_max: float = 0.99
-    """Cap of a contribution; its gradient is zero where clipped (gsplat 1.6; 0.999 in 1.5.3)."""
+    """Cap of a contribution's alpha; the gradient is zero where it is capped (gsplat 1.6; 0.999 in
+    1.5.3)."""
     transmittance_min: float = 1e-4
-    """A pixel is finished once the next Gaussian would leave less light than this."""
+    """A pixel ends before the Gaussian that would leave it this transmittance or less."""
     antialiased: bool = False
-    """Compensate the opacity for `eps2d`, as Mip-Splatting's 2D filter does."""
+    """Compensate the opacity for `eps2d`, as the 2D Mip filter of Mip-Splatting does."""
     background: tuple[float, float, float] = (0.0, 0.0, 0.0)
     """Colour behind the last Gaussian."""
     absgrad: bool = False
-    """The gradient of `means2d_offset` is, per axis, the sum of its absolute values over pixels, so
-    that pixels which pull a Gaussian apart do not cancel (AbsGS; gsplat's `absgrad`)."""
+    """Make the gradient of `means2d_offset`, for each axis, the sum of the absolute values of the
+    pixels' gradients, so that pixels which pull a Gaussian apart do not cancel (AbsGS; gsplat's
+    `absgrad`)."""
 
 
 @dataclass(frozen=True)
 class CullingOptions:
-    """Work that the compiled renderer leaves out, each kind as long as it is true.
+    """Which work without effect the native rasterizer leaves out.
 
-    The image is the same with any of them off, to rounding at the cuts; they are here to be
-    measured.
+    A Gaussian's ellipse is where its alpha is at least `alpha_min`. The image is the same with any
+    of the kinds off, to rounding at the cut-offs; they can be switched off to be measured.
     """
 
     out_of_view: bool = True
-    """Gaussians whose box of reach does not overlap the image."""
+    """Leave out Gaussians whose ellipse's bounding box does not overlap the image."""
     sub_threshold: bool = True
-    """Gaussians whose opacity is below `alpha_min`."""
+    """Leave out Gaussians whose opacity is below `alpha_min`."""
     tiles: bool = True
-    """16x16 px tiles that a Gaussian's box of reach overlaps, but not its ellipse."""
+    """Leave out 16x16 px tiles that the bounding box overlaps, but not the ellipse."""
     blocks: bool = True
-    """4x4 px blocks of a tile that a Gaussian does not reach."""
+    """Leave out 4x4 px blocks of a tile that the ellipse does not overlap."""
     saturated: bool = True
-    """What lies behind the last Gaussian that any pixel of a block composites."""
+    """Leave out what lies behind the last Gaussian that any pixel of a block composites."""
 
 
 @dataclass
 class OptimizerSettings:
-    """Adam's learning rates, one a parameter group."""
+    """Adam's learning rates, one for each parameter, and its constants."""
 
     means: float = 1.6e-4
-    """Times the scene's scale; decays exponentially to `means_final` of itself."""
+    """Multiplied by the scene's scale; decays exponentially from the first step to the last."""
     means_final: float = 0.01
+    """The rate of means after the last step, as a share of the first."""
     scales: float = 5e-3
+    """Rate of log scales."""
     opacities: float = 5e-2
+    """Rate of logit opacities."""
     quats: float = 1e-3
     sh0: float = 2.5e-3
     shN: float = 2.5e-3 / 20  # noqa: N815
     beta1: float = 0.9
+    """Decay of the first moment, per step."""
     beta2: float = 0.999
+    """Decay of the second moment, per step."""
     eps: float = 1e-15
+    """Added to the root of the second moment."""
 
 
 @dataclass
 class DensifySettings:
-    """gsplat's `DefaultStrategy`: when Gaussians are grown, pruned and reset."""
+    """When Gaussians are grown, pruned and reset (gsplat's `DefaultStrategy`).
+
+    A step that is a multiple of `every`, above `start` and below `stop` refines; one that is a
+    multiple of `reset_every`, above 0 and below `stop`, resets opacities.
+    """
 
     start: int = 500
     stop: int = 15_000
     every: int = 100
     reset_every: int = 3_000
     grow_grad2d: float = 2e-4
-    """Mean norm of the image-plane gradient (normalised device units) above which one grows."""
+    """A Gaussian grows if the mean norm of its image-plane gradient (normalised device units) is
+    above this."""
     grow_scale3d: float = 0.01
-    """Times the scene's scale: smaller Gaussians are duplicated, larger ones split."""
+    """Multiplied by the scene's scale: a growing Gaussian whose largest scale is above this is
+    split, otherwise duplicated."""
     prune_opacity: float = 0.005
+    """A Gaussian is pruned if its opacity is below this."""
     prune_scale3d: float = 0.1
-    """Times the scene's scale: larger Gaussians are pruned after the first reset."""
+    """Multiplied by the scene's scale: a Gaussian whose largest scale is above this is pruned, at
+    refinements after step `reset_every`."""
     reset_opacity: float = 2.0
-    """Times `prune_opacity`: the value that a reset caps opacities at."""
+    """Multiplied by `prune_opacity`: a reset caps opacities at this."""
 
     def scaled(self, steps: int) -> DensifySettings:
-        """The same schedule for a run of `steps` steps."""
+        """Return the same schedule for a run of another length.
+
+        Args:
+            steps: Number of steps of the run; the schedule here is for `NOMINAL_STEPS`.
+
+        Returns:
+            Settings with step counts in proportion, rounded down; periods of at least 1.
+        """
         factor = steps / NOMINAL_STEPS
         return replace(
             self,

@@ -1,8 +1,8 @@
-"""Colour that depends on the direction of view: real spherical harmonics, degree 0 to 3.
+"""View-dependent colour: real spherical harmonics of degree 0 to 3.
 
-The basis is the one of 3D Gaussian Splatting and gsplat: orthonormal, Condon-Shortley phase
-included, index l^2 + l + m; a colour is the sum over bands plus 0.5, clamped at 0. Any viewer of
-.ply files expects the same.
+The basis is the one of 3D Gaussian Splatting and of gsplat (`_spherical_harmonics` of
+`cuda/_torch_impl.py`): orthonormal, with the Condon-Shortley phase, indexed l^2 + l + m. A colour
+is the sum over bands plus 0.5, clamped at 0. Every viewer of .ply files expects the same.
 """
 
 from __future__ import annotations
@@ -13,26 +13,45 @@ import torch
 from torch import Tensor
 
 MAX_DEGREE = 3
+"""Highest degree that the basis is written out for."""
 C0 = 0.5 / math.sqrt(math.pi)
+"""The constant basis function of band 0."""
 
 
 def bases(degree: int) -> int:
-    """How many basis functions degree 0 to `degree` have."""
+    """Return the number of basis functions of degree 0 to `degree`."""
     return (degree + 1) ** 2
 
 
-def sh_basis(degree: int, dirs: Tensor) -> Tensor:
-    """The real spherical harmonics of degree 0 to `degree`.
+def check_sh_degree(degree: int, shN: Tensor) -> None:
+    """Raise an error unless harmonics of a degree can be evaluated from the stored coefficients.
 
     Args:
-        degree: 0 to 3.
-        dirs: [..., 3], unit length.
+        degree: Highest band that is on.
+        shN: [N, K - 1, 3] coefficients of the bands above 0.
+
+    Raises:
+        ValueError: The degree is not 0 to 3, or shN has fewer bands than it needs.
+    """
+    if not 0 <= degree <= MAX_DEGREE:
+        raise ValueError(f"sh_degree must be 0 to {MAX_DEGREE}, got {degree}")
+    rest = bases(degree) - 1
+    if shN.shape[1] < rest:
+        raise ValueError(f"sh_degree {degree} needs shN of [N, {rest}, 3], got {list(shN.shape)}")
+
+
+def sh_basis(degree: int, dirs: Tensor) -> Tensor:
+    """Evaluate the real spherical harmonics of degree 0 to `degree`.
+
+    Args:
+        degree: Highest degree, 0 to 3.
+        dirs: [..., 3] directions of unit length.
 
     Returns:
         [..., (degree + 1)^2]
 
     Raises:
-        ValueError: degree is not 0 to 3.
+        ValueError: The degree is not 0 to 3.
     """
     if not 0 <= degree <= MAX_DEGREE:
         raise ValueError(f"sh_degree must be 0 to {MAX_DEGREE}, got {degree}")
@@ -67,24 +86,23 @@ def sh_basis(degree: int, dirs: Tensor) -> Tensor:
 
 
 def sh_to_colors(degree: int, dirs: Tensor, sh0: Tensor, shN: Tensor) -> Tensor:
-    """The colours of Gaussians seen along `dirs`.
+    """Return the colours of Gaussians seen along given directions.
 
     Args:
-        degree: highest band that is on; bands stored above it are left out.
-        dirs: [N, 3], unit length, camera to Gaussian.
-        sh0: [N, 1, 3]
-        shN: [N, K - 1, 3] with K - 1 >= (degree + 1)^2 - 1.
+        degree: Highest band that is on; bands stored above it are left out.
+        dirs: [N, 3] from the camera to each Gaussian, of unit length.
+        sh0: [N, 1, 3] coefficients of band 0.
+        shN: [N, K - 1, 3] coefficients of the higher bands, K >= (degree + 1)^2.
 
     Returns:
-        [N, 3], at least 0.
+        [N, 3], 0 and up: not clamped at 1.
 
     Raises:
-        ValueError: degree is not 0 to 3, or shN has fewer bands than degree asks for.
+        ValueError: The degree is not 0 to 3, or shN has fewer bands than it needs.
     """
+    check_sh_degree(degree, shN)
     rest = bases(degree) - 1
-    if shN.shape[1] < rest:
-        raise ValueError(f"sh_degree {degree} needs shN of [N, {rest}, 3], got {list(shN.shape)}")
-    basis = sh_basis(degree, dirs)  # [N, K]
+    basis = sh_basis(degree, dirs)  # [N, (degree + 1)^2]
     colors = basis[:, :1] * sh0[:, 0]  # [N, 3]
     # Also with no band on, so that shN has a gradient (0) and its Adam steps count, as in gsplat.
     colors = colors + torch.einsum("nk,nkc->nc", basis[:, 1:], shN[:, :rest])
@@ -92,5 +110,12 @@ def sh_to_colors(degree: int, dirs: Tensor, sh0: Tensor, shN: Tensor) -> Tensor:
 
 
 def colors_to_sh0(colors: Tensor) -> Tensor:
-    """The band-0 coefficients that show `colors` [N, 3] (0..1) from everywhere: [N, 1, 3]."""
+    """Return the coefficients of band 0 that give colours, whatever the direction of view.
+
+    Args:
+        colors: [N, 3] in 0..1.
+
+    Returns:
+        [N, 1, 3]
+    """
     return ((colors - 0.5) / C0)[:, None]

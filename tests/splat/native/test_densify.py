@@ -1,15 +1,16 @@
-"""The compiled bookkeeping of densification against the torch one in double."""
+"""The compiled densification statistics against the torch ones in double."""
 
 from __future__ import annotations
+
+from collections.abc import Callable
 
 import pytest
 import torch
 from torch import Tensor
 
 from xrgs.splat.densify import Densifier
-from xrgs.splat.gaussians import Gaussians
-from xrgs.splat.optimizer import SplatOptimizer
-from xrgs.splat.settings import DensifySettings, OptimizerSettings
+
+MakeDensifier = Callable[..., Densifier]
 
 native = pytest.importorskip("xrgs._native")
 
@@ -17,57 +18,58 @@ COUNTS = [0, 1, 7, 8, 9, 16, 17, 31, 300, 40_000]
 
 
 def step(count: int, seed: int = 0) -> tuple[Tensor, Tensor]:
-    """Image-plane gradients [N, 2] and who is visible [N]."""
+    """Image-plane gradients [N, 2] and visibility [N]."""
     generator = torch.Generator().manual_seed(seed)
     gradient = 1e-4 * torch.randn(count, 2, generator=generator)
     return gradient, torch.rand(count, generator=generator) < 0.6
 
 
-def densifier(count: int, backend: str, dtype: torch.dtype = torch.float32) -> Densifier:
-    generator = torch.Generator().manual_seed(1)
-    shapes = {"means": (3,), "quats": (4,), "scales": (3,), "opacities": ()}
-    shapes |= {"sh0": (1, 3), "shN": (15, 3)}
-    values = {
-        name: torch.randn(count, *shape, generator=generator).to(dtype).requires_grad_()
-        for name, shape in shapes.items()
-    }
-    optimizer = SplatOptimizer(
-        Gaussians(**values), OptimizerSettings(), scene_scale=1.0, steps=9, backend=backend
-    )
-    return Densifier(optimizer, DensifySettings(), scene_scale=1.0, generator=torch.Generator())
+@pytest.fixture
+def densifier(make_densifier: MakeDensifier) -> MakeDensifier:
+    def make(count: int, backend: str, dtype: torch.dtype = torch.float32) -> Densifier:
+        generator = torch.Generator().manual_seed(1)
+        shapes = {"means": (3,), "quats": (4,), "scales": (3,), "opacities": ()}
+        shapes |= {"sh0": (1, 3), "shN": (15, 3)}
+        values = {
+            name: torch.randn(count, *shape, generator=generator).to(dtype)
+            for name, shape in shapes.items()
+        }
+        return make_densifier(values, backend=backend)
+
+    return make
 
 
 @pytest.mark.parametrize("count", COUNTS)
-def test_sums_are_those_in_double(isa: str, count: int) -> None:
+def test_sums_are_those_in_double(densifier: MakeDensifier, isa: str, count: int) -> None:
     ours, exact = densifier(count, "native"), densifier(count, "torch", torch.float64)
     for number in range(3):
         gradient, visible = step(count, number)
-        size = {"width": 100 + number, "height": 75}
-        ours.after_step(number, gradient, visible, **size)
-        exact.after_step(number, gradient.double(), visible, **size)
-    assert torch.equal(ours.seen.double(), exact.seen)
-    torch.testing.assert_close(ours.gradient.double(), exact.gradient, rtol=4e-7, atol=0)
+        width = 100 + number
+        ours.after_step(number, gradient, visible, width=width, height=75)
+        exact.after_step(number, gradient.double(), visible, width=width, height=75)
+    assert torch.equal(ours.visible_count.double(), exact.visible_count)
+    torch.testing.assert_close(ours.grad2d_sum.double(), exact.grad2d_sum, rtol=4e-7, atol=0)
 
 
-def test_what_is_not_visible_adds_nothing(isa: str) -> None:
+def test_what_is_not_visible_adds_nothing(densifier: MakeDensifier, isa: str) -> None:
     gradient, visible = step(50)
     gradient[~visible] = torch.nan
     ours = densifier(50, "native")
     ours.after_step(1, gradient, visible, width=9, height=9)
-    assert ours.gradient.isfinite().all()
-    assert not ours.gradient[:, ~visible].any()
-    assert torch.equal(ours.seen[0], visible.float())
+    assert ours.grad2d_sum.isfinite().all()
+    assert not ours.grad2d_sum[:, ~visible].any()
+    assert torch.equal(ours.visible_count[0], visible.float())
 
 
 @pytest.mark.usefixtures("threads")
-def test_threads_change_no_bit() -> None:
+def test_threads_change_no_bit(densifier: MakeDensifier) -> None:
     gradient, visible = step(40_000)
     results = []
     for count in (1, 2, 3, 4):
         torch.set_num_threads(count)
         ours = densifier(40_000, "native")
         ours.after_step(1, gradient, visible, width=100, height=75)
-        results.append(ours.gradient)
+        results.append(ours.grad2d_sum)
     assert all(torch.equal(result, results[0]) for result in results)
 
 

@@ -1,7 +1,7 @@
-"""What the compiled renderer promises beside its numbers, which test_native.py judges.
+"""The compiled rasterizer's promises beside its numbers, which test_rasterizer.py tests.
 
-The same bits each time and on any number of threads, errors that name what is wrong, and renders
-that keep apart.
+These are the same bits each time and on any number of threads, errors that name what is wrong, and
+renders that do not disturb one another.
 """
 
 from __future__ import annotations
@@ -10,25 +10,35 @@ import os
 import signal
 import subprocess
 import sys
+from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 import pytest
 import torch
+from torch import Tensor
 
+from xrgs.splat.cameras import Camera
+from xrgs.splat.gaussians import ActivatedGaussians
 from xrgs.splat.rasterize import rasterize
+from xrgs.splat.render_result import Render
 from xrgs.splat.settings import RasterSettings
+
+Scene = dict[str, Tensor]
+MakeCamera = Callable[..., Camera]
+MakeScene = Callable[..., dict[str, Tensor]]
 
 native = pytest.importorskip("xrgs._native")
 
 NAMES = ("means", "quats", "scales", "opacities", "sh0", "shN")
 
 
-def render(scene, camera):
+def render(scene: Scene, camera: Camera) -> tuple[Render, list[Tensor]]:
     """The render, and the leaves that its gradients go to."""
     leaves = {name: scene[name].clone().requires_grad_() for name in NAMES}
     offset = torch.zeros(len(leaves["means"]), 2, requires_grad=True)
     made = rasterize(
-        *leaves.values(),
+        *ActivatedGaussians(**leaves),
         camera,
         RasterSettings(),
         sh_degree=3,
@@ -38,26 +48,33 @@ def render(scene, camera):
     return made, [*leaves.values(), offset]
 
 
+def gradient(leaf: Tensor) -> Tensor:
+    assert leaf.grad is not None
+    return leaf.grad
+
+
 # --- the same each time -------------------------------------------------------------------------
 
 
 @pytest.fixture(scope="module")
-def large(make_camera, make_scene):
+def large(make_camera: MakeCamera, make_scene: MakeScene) -> tuple[Scene, Camera]:
     """Enough Gaussians and tiles for every stage to be cut into several tasks."""
     camera = make_camera(150, 110, focal=120.0, turned=True)
     return make_scene(20_000, camera, seed=12, size=2.0, dtype=torch.float32), camera
 
 
-def everything(large, count):
+def everything(large: tuple[Scene, Camera], count: int) -> tuple[Render, list[Tensor]]:
     torch.set_num_threads(count)
     scene, camera = large
     v_image = torch.linspace(-1, 1, camera.height * camera.width * 3).reshape(camera.height, -1, 3)
     made, leaves = render(scene, camera)
-    ((made.image * v_image).sum() + (made.alpha * v_image[..., 0]).sum()).backward()
-    return made, [made.image, made.alpha, made.visible, *(leaf.grad for leaf in leaves)]
+    torch.autograd.backward((made.image * v_image).sum() + (made.alpha * v_image[..., 0]).sum())
+    return made, [made.image, made.alpha, made.visible, *(gradient(leaf) for leaf in leaves)]
 
 
-def test_any_number_of_threads_gives_the_same_bits(threads, isa, large):
+def test_any_number_of_threads_gives_the_same_bits(
+    threads: None, isa: str, large: tuple[Scene, Camera]
+) -> None:
     first, expected = everything(large, 1)
     for count in (1, 2, 4, 3):
         again, results = everything(large, count)
@@ -65,7 +82,7 @@ def test_any_number_of_threads_gives_the_same_bits(threads, isa, large):
         assert again.evaluations == first.evaluations
 
 
-def test_instruction_sets_agree(large):
+def test_instruction_sets_agree(large: tuple[Scene, Camera]) -> None:
     before = native.isa()
     images = []
     try:
@@ -80,39 +97,42 @@ def test_instruction_sets_agree(large):
         assert error.max() < 2e-3
 
 
-def test_renders_alive_at_once_keep_apart(make_camera, make_scene):
+def test_renders_alive_at_once_keep_apart(make_camera: MakeCamera, make_scene: MakeScene) -> None:
     camera = make_camera(40, 30)
     scenes = [make_scene(100, camera, seed=seed, dtype=torch.float32) for seed in range(3)]
 
-    def gradient(made, leaves):
-        made.image.sum().backward()
-        return leaves[0].grad
+    def gradient_of_means(made: Render, leaves: list[Tensor]) -> Tensor:
+        torch.autograd.backward(made.image.sum())
+        return gradient(leaves[0])
 
-    alone = [gradient(*render(scene, camera)) for scene in scenes]
+    alone = [gradient_of_means(*render(scene, camera)) for scene in scenes]
     together = [render(scene, camera) for scene in scenes]
-    for expected, parts in zip(reversed(alone), reversed(together), strict=True):
-        assert torch.equal(gradient(*parts), expected)
+    for expected, rendered in zip(reversed(alone), reversed(together), strict=True):
+        assert torch.equal(gradient_of_means(*rendered), expected)
 
 
-def test_gradients_are_handed_over_without_a_copy(make_camera, make_scene):
+def test_gradients_are_handed_over_without_a_copy(
+    make_camera: MakeCamera, make_scene: MakeScene
+) -> None:
     camera = make_camera()
     scene = make_scene(50, camera, dtype=torch.float32)
     places = []
     for _ in range(3):
         made, leaves = render(scene, camera)
-        made.image.sum().backward()
-        places.append(leaves[NAMES.index("shN")].grad.data_ptr())
+        torch.autograd.backward(made.image.sum())
+        places.append(gradient(leaves[NAMES.index("shN")]).data_ptr())
     # A copy would lie where torch's allocator puts it; ours are on cache lines, and come again.
     assert all(place % 64 == 0 for place in places)
 
 
-def test_a_forked_child_renders(large):
+def test_a_forked_child_renders(large: tuple[Scene, Camera]) -> None:
     scene, camera = large
     values, view = [scene[name] for name in NAMES], make_view(camera)
 
-    def image():
+    def image() -> bytes:
         # Only our threads: torch's own do not outlive a fork.
-        return native.Frame().forward(view, *values, None, 2)[0].numpy().tobytes()
+        rendered: bytes = native.Frame().forward(view, *values, None, 2)[0].numpy().tobytes()
+        return rendered
 
     expected = image()
     child = os.fork()
@@ -127,7 +147,9 @@ def test_a_forked_child_renders(large):
 
 @pytest.mark.parametrize("bad", [float("nan"), float("inf"), -float("inf")])
 @pytest.mark.parametrize("name", [*NAMES, "means2d_offset"])
-def test_a_value_that_is_not_finite_is_named(isa, make_camera, make_scene, name, bad):
+def test_a_value_that_is_not_finite_is_named(
+    isa: str, make_camera: MakeCamera, make_scene: MakeScene, name: str, bad: float
+) -> None:
     camera = make_camera()
     scene = make_scene(40, camera, dtype=torch.float32)
     scene["means2d_offset"] = torch.zeros(40, 2)
@@ -147,7 +169,9 @@ def test_a_value_that_is_not_finite_is_named(isa, make_camera, make_scene, name,
         ("opacities", -0.01, "opacities has values outside 0..1"),
     ],
 )
-def test_a_value_out_of_range_is_named(isa, make_camera, make_scene, name, bad, says):
+def test_a_value_out_of_range_is_named(
+    isa: str, make_camera: MakeCamera, make_scene: MakeScene, name: str, bad: float, says: str
+) -> None:
     camera = make_camera()
     scene = make_scene(21, camera, dtype=torch.float32)
     scene[name][20] = bad
@@ -155,8 +179,8 @@ def test_a_value_out_of_range_is_named(isa, make_camera, make_scene, name, bad, 
         render(scene, camera)
 
 
-def make_view(camera, **changes):
-    options = {
+def make_view(camera: Camera, **changes: Any) -> Any:
+    options: dict[str, Any] = {
         "viewmat": camera.viewmat.flatten().tolist(),
         "intrinsics": [camera.K[0, 0], camera.K[1, 1], camera.K[0, 2], camera.K[1, 2]],
         "width": camera.width,
@@ -176,7 +200,7 @@ def make_view(camera, **changes):
     return native.View.make(**(options | changes))
 
 
-def test_shapes_are_checked(make_camera, make_scene):
+def test_shapes_are_checked(make_camera: MakeCamera, make_scene: MakeScene) -> None:
     camera = make_camera()
     scene = make_scene(10, camera, dtype=torch.float32)
     values = [scene[key] for key in NAMES]
@@ -194,7 +218,7 @@ def test_shapes_are_checked(make_camera, make_scene):
         frame.backward(torch.zeros(3, 3, 3), torch.zeros(3, 3), *values, None, True, 1)
 
 
-def test_float64_is_refused(make_camera, make_scene):
+def test_float64_is_refused(make_camera: MakeCamera, make_scene: MakeScene) -> None:
     camera = make_camera()
     with pytest.raises(ValueError, match="float32"):
         render(make_scene(3, camera), camera)
@@ -203,7 +227,10 @@ def test_float64_is_refused(make_camera, make_scene):
 CROWD = """
 import resource, torch
 from xrgs.splat.cameras import Camera
+from xrgs.splat.cameras import Camera
+from xrgs.splat.gaussians import ActivatedGaussians
 from xrgs.splat.rasterize import rasterize
+from xrgs.splat.render_result import Render
 from xrgs.splat.settings import RasterSettings
 
 n = 30_000
@@ -223,7 +250,7 @@ except MemoryError as error:
 
 
 @pytest.mark.skipif(not os.path.exists("/proc/self/statm"), reason="reads Linux's /proc")  # noqa: PTH110
-def test_lists_beyond_memory_are_a_clear_error():
+def test_lists_beyond_memory_are_a_clear_error() -> None:
     # 30,000 Gaussians over 10,000 tiles each: 300 million pairs.
     result = subprocess.run(
         [sys.executable, "-P", "-c", CROWD], capture_output=True, text=True, timeout=60, check=False
@@ -234,7 +261,7 @@ def test_lists_beyond_memory_are_a_clear_error():
 
 
 @pytest.mark.parametrize(("value", "says"), [("portable", "portable"), ("sse9", "XRGS_ISA")])
-def test_the_environment_chooses_the_instruction_set(value, says):
+def test_the_environment_chooses_the_instruction_set(value: Any, says: str) -> None:
     result = subprocess.run(
         [sys.executable, "-P", "-c", "from xrgs import _native; print(_native.isa())"],
         env=os.environ | {"XRGS_ISA": value},
@@ -248,7 +275,7 @@ def test_the_environment_chooses_the_instruction_set(value, says):
 # --- the vector functions -----------------------------------------------------------------------
 
 
-def test_exp2_and_log2(isa):
+def test_exp2_and_log2(isa: str) -> None:
     x = np.linspace(-126, 126, 200_001).astype(np.float32)
     exact = np.exp2(x.astype(np.float64))
     assert np.abs(native.exp2(torch.from_numpy(x)).numpy() / exact - 1).max() < 3e-7

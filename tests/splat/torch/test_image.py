@@ -2,39 +2,54 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 import pytest
 import torch
+from numpy.typing import NDArray
 from scipy.special import sph_harm_y
+from torch import Tensor
 
 from xrgs.splat.cameras import Camera
+from xrgs.splat.render_result import Render
 from xrgs.splat.settings import RasterSettings
+
+Array = NDArray[np.float64]
+#: Depth, index, mean, inverse covariance, opacity and colour.
+Splat = tuple[float, int, Array, Array, float, Array]
+Scene = dict[str, Tensor]
+MakeCamera = Callable[..., Camera]
+MakeScene = Callable[..., dict[str, Tensor]]
+Draw = Callable[..., Render]
 
 NO_CUTS = RasterSettings(alpha_min=0.0, alpha_max=1.0, transmittance_min=0.0)
 
 
-def naive_color(direction, coeffs):
+def naive_color(direction: Array, coeffs: Array) -> Array:
     """Real spherical harmonics from scipy's complex ones."""
     x, y, z = direction / np.linalg.norm(direction)
-    color = np.full(3, 0.5)
+    color: Array = np.full(3, 0.5)
     for index in range(len(coeffs)):
         degree = int(index**0.5)
         order = index - degree * degree - degree
         value = sph_harm_y(degree, abs(order), np.arccos(z), np.arctan2(y, x))
         real = value.real if order >= 0 else value.imag
         color += (real if order == 0 else np.sqrt(2) * real) * coeffs[index]
-    return np.maximum(color, 0)
+    clamped: Array = np.maximum(color, 0)
+    return clamped
 
 
-def naive_rotation(quat):
+def naive_rotation(quat: Array) -> Array:
     if not quat.any():
         return np.eye(3)
     w, x, y, z = quat / np.linalg.norm(quat)
     cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
-    return np.eye(3) + 2 * w * cross + 2 * cross @ cross
+    rotation: Array = np.eye(3) + 2 * w * cross + 2 * cross @ cross
+    return rotation
 
 
-def naive_splats(scene, camera, raster):
+def naive_splats(scene: Scene, camera: Camera, raster: RasterSettings) -> list[Splat]:
     """Depth, index, mean, inverse covariance, opacity and colour of all in front of the camera."""
     viewmat, K = camera.viewmat.numpy(), camera.K.numpy()
     fx, fy, cx, cy = K[0, 0], K[1, 1], K[0, 2], K[1, 2]
@@ -61,24 +76,24 @@ def naive_splats(scene, camera, raster):
     return sorted(splats, key=lambda splat: splat[:2])
 
 
-def naive(scene, camera, raster):
+def naive(scene: Scene, camera: Camera, raster: RasterSettings) -> tuple[Array, Array]:
     image = np.zeros((camera.height, camera.width, 3))
     alphas = np.zeros((camera.height, camera.width))
     splats = naive_splats(scene, camera, raster)
     for row in range(camera.height):
         for column in range(camera.width):
-            left = 1.0
+            transmittance = 1.0
             for _, _, place, conic, opacity, color in splats:
                 d = np.array([column + 0.5, row + 0.5]) - place
-                alpha = min(raster.alpha_max, opacity * np.exp(-0.5 * d @ conic @ d))
+                alpha = min(raster.alpha_max, float(opacity * np.exp(-0.5 * d @ conic @ d)))
                 if alpha < raster.alpha_min:
                     continue
-                if left * (1 - alpha) <= raster.transmittance_min:
+                if transmittance * (1 - alpha) <= raster.transmittance_min:
                     break
-                image[row, column] += left * alpha * color
-                left *= 1 - alpha
-            image[row, column] += left * np.array(raster.background)
-            alphas[row, column] = 1 - left
+                image[row, column] += transmittance * alpha * color
+                transmittance *= 1 - alpha
+            image[row, column] += transmittance * np.array(raster.background)
+            alphas[row, column] = 1 - transmittance
     return image, alphas
 
 
@@ -94,7 +109,9 @@ def naive(scene, camera, raster):
     ],
     ids=["default", "background", "antialiased", "hard cuts", "no cuts"],
 )
-def test_image_is_the_naive_splatters(draw, make_camera, make_scene, raster, seed):
+def test_image_is_the_naive_splatters(
+    draw: Draw, make_camera: MakeCamera, make_scene: MakeScene, raster: RasterSettings, seed: int
+) -> None:
     camera = make_camera(turned=bool(seed))
     scene = make_scene(40, camera, seed=seed, size=2.5)
     scene["opacities"][::3] = 1.0
@@ -108,7 +125,9 @@ def test_image_is_the_naive_splatters(draw, make_camera, make_scene, raster, see
 
 
 @pytest.mark.parametrize(("width", "height"), [(1, 1), (1, 9), (17, 1), (8, 8), (9, 7), (16, 24)])
-def test_sizes_that_are_no_multiple_of_a_tile(draw, make_camera, make_scene, width, height):
+def test_sizes_that_are_no_multiple_of_a_tile(
+    draw: Draw, make_camera: MakeCamera, make_scene: MakeScene, width: int, height: int
+) -> None:
     camera = make_camera(width, height)
     scene = make_scene(12, camera, seed=width, size=3.0)
     render = draw(scene, camera)
@@ -116,7 +135,7 @@ def test_sizes_that_are_no_multiple_of_a_tile(draw, make_camera, make_scene, wid
     np.testing.assert_allclose(render.image, naive(scene, camera, RasterSettings())[0], atol=1e-10)
 
 
-def test_pixel_centres_are_at_a_half(draw, single_pixel):
+def test_pixel_centres_are_at_a_half(draw: Draw, single_pixel: MakeScene) -> None:
     camera = Camera(torch.eye(4), torch.tensor([[10.0, 0, 3.5], [0, 10, 2.5], [0, 0, 1]]), 8, 6)
     scene = single_pixel(1, opacity=0.5)
     alpha = draw(scene, camera, sh_degree=0).alpha

@@ -1,23 +1,39 @@
+"""Projection and culling against gsplat's own torch implementation and closed forms."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
 import pytest
 import torch
 from gsplat.cuda._torch_impl import _fully_fused_projection, _quat_scale_to_covar_preci
+from torch import Tensor
 
 from xrgs.splat.cameras import Camera
 from xrgs.splat.settings import RasterSettings
-from xrgs.splat.torch.projection import depths, project, rotations, visible_in_order, whitened
+from xrgs.splat.torch.projection import conic_cholesky, depths, project, visible_by_depth
+
+Scene = dict[str, Tensor]
+MakeCamera = Callable[..., Camera]
+MakeScene = Callable[..., dict[str, Tensor]]
+Outputs = tuple[Tensor, Tensor, Tensor, Tensor]
 
 SHAPE = ("means", "quats", "scales", "opacities")
 
 
-def ours(scene, camera, settings):
+def shape_of(scene: Scene) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    return scene["means"], scene["quats"], scene["scales"], scene["opacities"]
+
+
+def ours(scene: Scene, camera: Camera, settings: RasterSettings) -> Outputs:
     """means2d, conics, depths and the factor of the opacity, as gsplat returns them."""
-    flat = project(*(scene[name] for name in SHAPE), camera, settings)
-    xx, xy, yy = flat.cov.unbind(-1)
-    conics = torch.stack([yy, -xy, xx], dim=-1) / flat.det[:, None]
-    return flat.means2d, conics, flat.depths, flat.opacities / scene["opacities"]
+    projected = project(*shape_of(scene), camera, settings)
+    xx, xy, yy = projected.cov.unbind(-1)
+    conics = torch.stack([yy, -xy, xx], dim=-1) / projected.det[:, None]
+    return projected.means2d, conics, projected.depths, projected.opacities / scene["opacities"]
 
 
-def gsplats(scene, camera, settings):
+def gsplats(scene: Scene, camera: Camera, settings: RasterSettings) -> Outputs:
     covars, _ = _quat_scale_to_covar_preci(scene["quats"], scene["scales"], compute_preci=False)
     _, means2d, depths, conics, factor = _fully_fused_projection(
         scene["means"],
@@ -35,7 +51,9 @@ def gsplats(scene, camera, settings):
 
 @pytest.mark.parametrize("antialiased", [False, True])
 @pytest.mark.parametrize("turned", [False, True])
-def test_projection_and_its_gradient_are_gsplats(make_camera, make_scene, antialiased, turned):
+def test_projection_and_its_gradient_are_gsplats(
+    make_camera: MakeCamera, make_scene: MakeScene, antialiased: bool, turned: bool
+) -> None:
     camera = make_camera(turned=turned)
     settings = RasterSettings(antialiased=antialiased)
     scene = make_scene(200, camera, size=3.0)
@@ -52,9 +70,8 @@ def test_projection_and_its_gradient_are_gsplats(make_camera, make_scene, antial
     for method in (ours, gsplats):
         outputs = method(scene, camera, settings)
         generator.manual_seed(1)
-        loss = sum(
-            (o * torch.randn(o.shape, generator=generator, dtype=o.dtype)).sum() for o in outputs
-        )
+        weights = [torch.randn(o.shape, generator=generator, dtype=o.dtype) for o in outputs]
+        loss = torch.stack([(o * w).sum() for o, w in zip(outputs, weights, strict=True)]).sum()
         names = ("means", "quats", "scales")
         results.append((outputs, torch.autograd.grad(loss, [scene[name] for name in names])))
     for mine, theirs in zip(results[0][0], results[1][0], strict=True):
@@ -64,10 +81,15 @@ def test_projection_and_its_gradient_are_gsplats(make_camera, make_scene, antial
 
 
 @pytest.fixture
-def one(make_camera):
+def one() -> MakeScene:
     """One Gaussian's parameters, at a place and of a shape."""
 
-    def make(mean, scales=(0.1, 0.2, 0.3), quat=(1.0, 0.2, -0.3, 0.4), dtype=torch.float64):
+    def make(
+        mean: Sequence[float],
+        scales: Sequence[float] = (0.1, 0.2, 0.3),
+        quat: Sequence[float] = (1.0, 0.2, -0.3, 0.4),
+        dtype: torch.dtype = torch.float64,
+    ) -> Scene:
         values = {"means": mean, "quats": quat, "scales": scales}
         scene = {name: torch.tensor([value], dtype=dtype) for name, value in values.items()}
         return scene | {"opacities": torch.tensor([0.5], dtype=dtype)}
@@ -78,8 +100,8 @@ def one(make_camera):
 @pytest.mark.parametrize("side", [-1, 1])
 @pytest.mark.parametrize("axis", [0, 1])
 def test_jacobian_is_clamped_at_1_3_of_the_field_around_the_principal_point(
-    make_camera, one, axis, side
-):
+    make_camera: MakeCamera, one: MakeScene, axis: int, side: int
+) -> None:
     camera = make_camera()
     focal = camera.K[axis, axis]
     size = (camera.width, camera.height)[axis]
@@ -89,7 +111,7 @@ def test_jacobian_is_clamped_at_1_3_of_the_field_around_the_principal_point(
     for slope in (limit, 1.5 * limit, 4 * limit, 0.9 * limit):
         mean = [0.0, 0.0, 2.0]
         mean[axis] = float(2 * slope)
-        covariances.append(project(*one(mean).values(), camera, RasterSettings()).cov)
+        covariances.append(project(*shape_of(one(mean)), camera, RasterSettings()).cov)
     at_limit, beyond, far_beyond, within = covariances
     torch.testing.assert_close(beyond, at_limit, rtol=1e-12, atol=0)
     torch.testing.assert_close(far_beyond, at_limit, rtol=1e-12, atol=0)
@@ -98,62 +120,47 @@ def test_jacobian_is_clamped_at_1_3_of_the_field_around_the_principal_point(
 
 @pytest.mark.parametrize("antialiased", [False, True])
 @pytest.mark.parametrize("slope", [-4.0, -0.1, 0.2, 3.0])
-def test_gradient_within_and_beyond_the_clamp(make_camera, one, slope, antialiased):
+def test_gradient_within_and_beyond_the_clamp(
+    make_camera: MakeCamera, one: MakeScene, slope: float, antialiased: bool
+) -> None:
     camera = make_camera(turned=False)
     settings = RasterSettings(antialiased=antialiased)
     scene = one([2 * slope, -1.5 * slope, 2.0])
-    inputs = [value.requires_grad_() for value in scene.values()]
-    assert torch.autograd.gradcheck(lambda *args: project(*args, camera, settings), inputs)
+    inputs = [value.requires_grad_() for value in shape_of(scene)]
+    assert torch.autograd.gradcheck(
+        lambda m, q, s, o: project(m, q, s, o, camera, settings), inputs
+    )
 
 
-def test_needle_determinant_does_not_cancel(make_camera, one):
+def test_needle_determinant_does_not_cancel(make_camera: MakeCamera, one: MakeScene) -> None:
     camera = make_camera(width=1000, height=800, focal=900.0)
     needle = one([0.1, 0.2, 1.5], scales=(8.0, 1e-4, 1e-4), quat=(0.9, 0.1, 0.2, 0.35))
-    exact = project(*needle.values(), camera, RasterSettings())
-    single = project(*(v.float() for v in needle.values()), camera, RasterSettings())
+    exact = project(*shape_of(needle), camera, RasterSettings())
+    rounded = {name: value.float() for name, value in needle.items()}
+    single = project(*shape_of(rounded), camera, RasterSettings())
     assert exact.cov[0, 0] > 100**2
     torch.testing.assert_close(single.det.double(), exact.det, rtol=1e-4, atol=0)
     xx, xy, yy = single.cov[0]
     assert abs((xx * yy - xy * xy) / exact.det[0] - 1) > 0.01, "the plain formula would do"
-    torch.testing.assert_close(
-        whitened(single)[:, :5].double(), whitened(exact)[:, :5], rtol=1e-4, atol=1e-4
-    )
+    factor = conic_cholesky(single).double()
+    torch.testing.assert_close(factor, conic_cholesky(exact), rtol=1e-4, atol=1e-4)
 
 
 @pytest.mark.parametrize("scales", [(0.0, 0.0, 0.0), (1.0, 0.0, 0.0), (1e-30, 1e-30, 1e-30)])
 @pytest.mark.parametrize("antialiased", [False, True])
-def test_flat_gaussians_have_finite_gradients(make_camera, one, scales, antialiased):
+def test_projected_gaussians_have_finite_gradients(
+    make_camera: MakeCamera, one: MakeScene, scales: tuple[float, float, float], antialiased: bool
+) -> None:
     scene = one([0.1, 0.1, 2.0], scales=scales, dtype=torch.float32)
-    inputs = [value.requires_grad_() for value in scene.values()]
+    inputs = [value.requires_grad_() for value in shape_of(scene)]
     settings = RasterSettings(antialiased=antialiased)
-    flat = project(*inputs, make_camera(), settings)
-    assert flat.det >= 0.09 * (1 - 1e-6)
-    sum(output.sum() for output in flat).backward()
-    assert all(torch.isfinite(value.grad).all() for value in inputs)
+    projected = project(*shape_of(scene), make_camera(), settings)
+    assert projected.det >= 0.09 * (1 - 1e-6)
+    total = torch.stack([output.sum() for output in projected]).sum()
+    assert all(gradient.isfinite().all() for gradient in torch.autograd.grad(total, inputs))
 
 
-def test_zero_quaternion_is_no_rotation_and_has_no_gradient():
-    quats = torch.zeros(2, 4, requires_grad=True)
-    matrices = rotations(quats)
-    assert torch.equal(matrices, torch.eye(3).expand(2, 3, 3))
-    (matrices * torch.randn(2, 3, 3)).sum().backward()
-    assert torch.equal(quats.grad, torch.zeros(2, 4))
-
-
-@pytest.mark.parametrize("length", [1e-15, 1e-3, 7.0, 1e30])
-def test_a_quaternions_length_does_not_matter(length):
-    quat = torch.tensor([[0.3, -0.5, 0.2, 0.7]])
-    scaled = (quat * length).requires_grad_()
-    matrix = rotations(scaled)
-    torch.testing.assert_close(matrix, rotations(quat))
-    torch.testing.assert_close(matrix[0] @ matrix[0].T, torch.eye(3), atol=1e-6, rtol=0)
-    matrix[0, 0, 1].backward()
-    assert torch.isfinite(scaled.grad).all()
-    along = (scaled.grad / scaled.grad.abs().max() * quat).sum()
-    assert abs(along) < 1e-5, "the gradient must be across the quaternion"
-
-
-def test_visible_is_the_box_of_reach_against_the_image(make_camera):
+def test_visible_is_the_bounding_box_against_the_image(make_camera: MakeCamera) -> None:
     camera = make_camera()
     settings = RasterSettings()
     generator = torch.Generator().manual_seed(0)
@@ -166,29 +173,46 @@ def test_visible_is_the_box_of_reach_against_the_image(make_camera):
         "scales": 0.2 * torch.rand(count, 3, generator=generator, dtype=torch.float64),
         "opacities": 0.02 * torch.rand(count, generator=generator, dtype=torch.float64),
     }
-    flat = project(*scene.values(), camera, settings)
-    visible = visible_in_order(flat, camera, settings)
-    assert (flat.depths[visible].diff() >= 0).all()
+    projected = project(*shape_of(scene), camera, settings)
+    visible = visible_by_depth(projected, camera, settings)
+    assert (projected.depths[visible].diff() >= 0).all()
     expected = set()
     for i in range(count):
-        opacity = float(flat.opacities[i])
+        opacity = float(projected.opacities[i])
         if opacity < settings.alpha_min:
             continue
-        reach = (2 * torch.log(flat.opacities[i] / settings.alpha_min)).sqrt()
-        x, y = flat.means2d[i]
-        rx, ry = reach * flat.cov[i, 0].sqrt(), reach * flat.cov[i, 2].sqrt()
+        radius = (2 * torch.log(projected.opacities[i] / settings.alpha_min)).sqrt()
+        x, y = projected.means2d[i]
+        rx, ry = radius * projected.cov[i, 0].sqrt(), radius * projected.cov[i, 2].sqrt()
         if x + rx > 0 and x - rx < camera.width and y + ry > 0 and y - ry < camera.height:
             expected.add(i)
     assert set(visible.tolist()) == expected
     assert 100 < len(expected) < count - 100
 
 
-def test_equal_depths_keep_their_order(make_camera):
+def test_the_cholesky_factor_is_of_half_the_conic(
+    make_camera: MakeCamera, make_scene: MakeScene
+) -> None:
+    camera = make_camera()
+    projected = project(*shape_of(make_scene(50, camera)), camera, RasterSettings())
+    xx, xy, yy = projected.cov.unbind(-1)
+    conics = torch.linalg.inv(torch.stack([xx, xy, xy, yy], dim=-1).reshape(-1, 2, 2))
+    expected = torch.linalg.cholesky(conics / 2, upper=True)  # [50, 2, 2]
+    factor = conic_cholesky(projected)
+    torch.testing.assert_close(
+        factor,
+        torch.stack([expected[:, 0, 0], expected[:, 0, 1], expected[:, 1, 1]], dim=-1),
+        rtol=1e-9,
+        atol=1e-12,
+    )
+
+
+def test_equal_depths_keep_their_order(make_camera: MakeCamera) -> None:
     camera = Camera(torch.eye(4), torch.diag(torch.tensor([9.0, 9.0, 1.0])), 40, 40)
     generator = torch.Generator().manual_seed(0)
     means = torch.rand(100, 3, generator=generator)
     means[:, 2] = torch.arange(100) % 3 + 1.0
     scales, quats = torch.full((100, 3), 0.1), torch.ones(100, 4)
-    flat = project(means, quats, scales, torch.ones(100), camera, RasterSettings())
-    order = visible_in_order(flat, camera, RasterSettings()).tolist()
+    projected = project(means, quats, scales, torch.ones(100), camera, RasterSettings())
+    order = visible_by_depth(projected, camera, RasterSettings()).tolist()
     assert order == sorted(range(100), key=lambda i: (i % 3, i))

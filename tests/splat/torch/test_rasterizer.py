@@ -1,37 +1,56 @@
-"""The way the renderer works: it makes no difference, and what it takes is counted."""
+"""The reference rasterizer: tiles and batches change nothing, and work and memory are counted."""
 
 from __future__ import annotations
+
+from collections.abc import Callable
 
 import numpy as np
 import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from torch import Tensor
 
-from xrgs.splat.gaussians import PARAMETERS
+from xrgs.splat.cameras import Camera
+from xrgs.splat.gaussians import ActivatedGaussians
+from xrgs.splat.render_result import Render
 from xrgs.splat.settings import RasterSettings
 from xrgs.splat.torch import rasterizer as torch_rasterizer
 
-# --- how it is done makes no difference ---------------------------------------------------------
+Scene = dict[str, Tensor]
+MakeCamera = Callable[..., Camera]
+MakeScene = Callable[..., dict[str, Tensor]]
+Draw = Callable[..., Render]
+
+# --- tiles and batches change nothing ------------------------------------------------------------
 
 
-def test_tiles_and_batches_make_no_difference(with_gradients, make_camera, make_scene, monkeypatch):
+def test_tiles_and_batches_make_no_difference(
+    with_gradients: Callable[[Scene], Scene],
+    gradients_of: Callable[[Scene], Scene],
+    make_camera: MakeCamera,
+    make_scene: MakeScene,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     camera = make_camera(33, 21)
     scene = make_scene(80, camera, seed=9, size=3.0)
     renders = []
     for tile, elements in ((8, 1 << 18), (4, 1 << 18), (16, 1 << 18), (64, 1 << 18), (8, 1)):
+        monkeypatch.setattr(torch_rasterizer, "TILE", tile)
         monkeypatch.setattr(torch_rasterizer, "BATCH_ELEMENTS", elements)
         leaves = with_gradients(scene)
-        values = (leaves[name] for name in PARAMETERS)
-        render = torch_rasterizer.render(*values, camera, RasterSettings(), 3, None, tile=tile)
-        render.image.square().sum().backward()
-        renders.append((render.image, *(leaves[name].grad for name in PARAMETERS)))
+        gaussians = ActivatedGaussians(**leaves)
+        render = torch_rasterizer.render(gaussians, camera, RasterSettings(), 3, None)
+        torch.autograd.backward(render.image.square().sum())
+        renders.append((render.image, *gradients_of(leaves).values()))
     for other in renders[1:]:
         for ours, theirs in zip(renders[0], other, strict=True):
             torch.testing.assert_close(ours, theirs, rtol=1e-11, atol=1e-11)
 
 
-def test_float32_is_float64_outside_a_band_around_the_thresholds(draw, make_camera, make_scene):
+def test_float32_is_float64_outside_a_band_around_the_thresholds(
+    draw: Draw, make_camera: MakeCamera, make_scene: MakeScene
+) -> None:
     camera = make_camera(40, 30, turned=True)
     scene = make_scene(300, camera, seed=11, size=3.0)
     scene["scales"][::9, 0] *= 20
@@ -50,15 +69,21 @@ def test_float32_is_float64_outside_a_band_around_the_thresholds(draw, make_came
     assert error.max() < 2 * base.alpha_min * exact.max()
 
 
-def test_render_is_the_same_twice(draw, with_gradients, make_camera, make_scene):
+def test_render_is_the_same_twice(
+    draw: Draw,
+    with_gradients: Callable[[Scene], Scene],
+    gradients_of: Callable[[Scene], Scene],
+    make_camera: MakeCamera,
+    make_scene: MakeScene,
+) -> None:
     camera = make_camera()
     scene = make_scene(50, camera, dtype=torch.float32)
     results = []
     for _ in range(2):
         leaves = with_gradients(scene)
         render = draw(leaves, camera)
-        render.image.sum().backward()
-        results.append([render.image, *(leaves[name].grad for name in PARAMETERS)])
+        torch.autograd.backward(render.image.sum())
+        results.append([render.image, *gradients_of(leaves).values()])
     assert all(torch.equal(a, b) for a, b in zip(*results, strict=True))
 
 
@@ -73,18 +98,19 @@ def test_render_is_the_same_twice(draw, with_gradients, make_camera, make_scene)
 )
 @settings(max_examples=40, deadline=None)
 def test_random_scenes(
-    draw,
-    with_gradients,
-    make_camera,
-    make_scene,
-    seed,
-    count,
-    width,
-    height,
-    stretch,
-    dtype,
-    antialiased,
-):
+    draw: Draw,
+    with_gradients: Callable[[Scene], Scene],
+    gradients_of: Callable[[Scene], Scene],
+    make_camera: MakeCamera,
+    make_scene: MakeScene,
+    seed: int,
+    count: int,
+    width: int,
+    height: int,
+    stretch: float,
+    dtype: torch.dtype,
+    antialiased: bool,
+) -> None:
     camera = make_camera(width, height, turned=bool(seed % 2))
     scene = make_scene(count, camera, seed=seed, dtype=dtype)
     scene["scales"][::2, 0] *= float(np.exp(stretch))
@@ -100,28 +126,30 @@ def test_random_scenes(
     )
     assert ((render.alpha >= 0) & (render.alpha < 1)).all()
     assert not render.visible[1::3].any()
-    render.image.square().mean().backward()
-    for name in PARAMETERS:
-        assert torch.isfinite(leaves[name].grad).all()
-        assert (leaves[name].grad[~render.visible] == 0).all()
+    torch.autograd.backward(render.image.square().mean())
+    for gradient in gradients_of(leaves).values():
+        assert gradient.isfinite().all()
+        assert (gradient[~render.visible] == 0).all()
 
 
-# --- what it took -------------------------------------------------------------------------------
+# --- work and memory -----------------------------------------------------------------------------
 
 
-def test_evaluations_are_list_lengths_times_pixels(draw, single_pixel, pixel):
+def test_evaluations_are_list_lengths_times_pixels(
+    draw: Draw, single_pixel: MakeScene, pixel: Camera
+) -> None:
     render = draw(single_pixel(3, opacity=0.5), pixel, sh_degree=0)
     assert render.evaluations == 3 * torch_rasterizer.TILE**2
 
 
 @pytest.mark.parametrize("absgrad", [False, True])
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_bytes_of_a_batch_are_what_autograd_keeps(dtype, absgrad):
+def test_bytes_of_a_batch_are_what_autograd_keeps(dtype: torch.dtype, absgrad: bool) -> None:
     entries = torch.rand(3, 50, 11 if absgrad else 9, dtype=dtype).requires_grad_()
     corner = torch.zeros(3, 2, dtype=dtype)
-    kept = {}
+    kept: dict[int, int] = {}
 
-    def keep(tensor):
+    def keep(tensor: Tensor) -> Tensor:
         storage = tensor.untyped_storage()
         if tensor.numel() >= 3 * 50 * 64:
             kept[storage.data_ptr()] = tensor.numel() * tensor.element_size()
@@ -133,7 +161,9 @@ def test_bytes_of_a_batch_are_what_autograd_keeps(dtype, absgrad):
     assert sum(kept.values()) == 3 * 50 * 64 * per_alpha
 
 
-def test_buffer_bytes_grow_with_the_lists(draw, make_camera, make_scene):
+def test_buffer_bytes_grow_with_the_lists(
+    draw: Draw, make_camera: MakeCamera, make_scene: MakeScene
+) -> None:
     camera = make_camera()
     few, many = (
         draw(make_scene(count, camera, dtype=torch.float32), camera) for count in (10, 400)

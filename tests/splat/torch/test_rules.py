@@ -1,54 +1,101 @@
-"""What composes a pixel and what is not seen, rule by rule."""
+"""The rules by which a pixel is composited and Gaussians are culled, one by one."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import pytest
 import torch
+from torch import Tensor
 
-from xrgs.splat.gaussians import PARAMETERS
+from xrgs.splat.cameras import Camera
+from xrgs.splat.render_result import Render
 from xrgs.splat.settings import RasterSettings
+
+Scene = dict[str, Tensor]
+MakeCamera = Callable[..., Camera]
+MakeScene = Callable[..., dict[str, Tensor]]
+Draw = Callable[..., Render]
 
 # --- compositing, on one pixel --------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_a_pixel_ends_before_the_gaussian_that_leaves_too_little(
-    draw, with_gradients, single_pixel, pixel, dtype
-):
+    draw: Draw,
+    with_gradients: Callable[[Scene], Scene],
+    gradients_of: Callable[[Scene], Scene],
+    single_pixel: MakeScene,
+    pixel: Camera,
+    dtype: torch.dtype,
+) -> None:
     scene = single_pixel(6, opacity=0.95, dtype=dtype)
     scene["opacities"][4:] = 0.01  # these would leave enough, but the pixel has ended
     leaves = with_gradients(scene)
     render = draw(leaves, pixel, sh_degree=0)
     torch.testing.assert_close(render.alpha, torch.full((1, 1), 1 - 0.05**3, dtype=dtype))
-    render.image.sum().backward()
-    assert (leaves["opacities"].grad[:3] > 0).all()
-    assert (leaves["sh0"].grad[:3] > 0).all()
-    assert (leaves["opacities"].grad[3:] == 0).all()
-    assert (leaves["sh0"].grad[3:] == 0).all()
+    torch.autograd.backward(render.image.sum())
+    for name in ("opacities", "sh0"):
+        gradient = gradients_of(leaves)[name]
+        assert (gradient[:3] > 0).all()
+        assert (gradient[3:] == 0).all()
 
 
-def test_a_capped_alpha_has_no_gradient(draw, with_gradients, single_pixel, pixel):
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_a_transmittance_of_exactly_the_least_ends_the_pixel(
+    draw: Draw, single_pixel: MakeScene, pixel: Camera, dtype: torch.dtype
+) -> None:
+    # Three alphas of exactly 1/2: the third would leave a transmittance of exactly 1/8.
+    scene = single_pixel(3, opacity=0.5, dtype=dtype)
+    for least, alpha in ((0.125, 0.75), (0.1249, 0.875)):
+        raster = RasterSettings(transmittance_min=least)
+        assert draw(scene, pixel, raster, sh_degree=0).alpha.item() == alpha
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_an_alpha_of_exactly_the_least_is_composited(
+    draw: Draw, single_pixel: MakeScene, pixel: Camera, dtype: torch.dtype
+) -> None:
+    scene = single_pixel(1, opacity=0.5, dtype=dtype)
+    for least, alpha in ((0.5, 0.5), (0.5001, 0.0)):
+        render = draw(scene, pixel, RasterSettings(alpha_min=least), sh_degree=0)
+        assert render.alpha.item() == alpha
+        assert render.visible.tolist() == [alpha > 0]
+
+
+def test_a_capped_alpha_has_no_gradient(
+    draw: Draw,
+    with_gradients: Callable[[Scene], Scene],
+    gradients_of: Callable[[Scene], Scene],
+    single_pixel: MakeScene,
+    pixel: Camera,
+) -> None:
     leaves = with_gradients(single_pixel(2, opacity=0.995, dtype=torch.float64))
     with torch.no_grad():
         leaves["opacities"][1] = 0.5
     render = draw(leaves, pixel, sh_degree=0)
     torch.testing.assert_close(render.alpha[0, 0].item(), 1 - 0.01 * 0.5)
-    render.image.sum().backward()
+    torch.autograd.backward(render.image.sum())
+    gradients = gradients_of(leaves)
     for name in ("means", "quats", "scales", "opacities"):
-        assert (leaves[name].grad[0] == 0).all()
-    assert leaves["opacities"].grad[1] != 0
-    assert (leaves["sh0"].grad[0] > 0).all()
+        assert (gradients[name][0] == 0).all()
+    assert gradients["opacities"][1] != 0
+    assert (gradients["sh0"][0] > 0).all()
 
 
 @pytest.mark.parametrize(("opacity", "seen"), [(0.99 / 255, False), (1.01 / 255, True)])
-def test_a_contribution_below_the_cut_is_skipped(draw, single_pixel, pixel, opacity, seen):
+def test_a_contribution_below_the_cut_is_skipped(
+    draw: Draw, single_pixel: MakeScene, pixel: Camera, opacity: float, seen: bool
+) -> None:
     render = draw(single_pixel(1, opacity=opacity), pixel, sh_degree=0)
     assert (render.alpha > 0).item() == seen
     assert render.visible.tolist() == [seen]
 
 
 @pytest.mark.parametrize("order", [(0, 1), (1, 0)])
-def test_of_equal_depths_the_lower_index_is_in_front(draw, single_pixel, pixel, order):
+def test_of_equal_depths_the_lower_index_is_in_front(
+    draw: Draw, single_pixel: MakeScene, pixel: Camera, order: tuple[int, int]
+) -> None:
     scene = single_pixel(2, opacity=0.9)
     scene["means"][:, 2] = 2.0
     scene["sh0"] = torch.tensor([[[1.0, 0, -9]], [[-9.0, 0, 1]]])[list(order)]
@@ -56,21 +103,31 @@ def test_of_equal_depths_the_lower_index_is_in_front(draw, single_pixel, pixel, 
     assert (red > 5 * blue) if order == (0, 1) else (blue > 5 * red)
 
 
-def test_opacity_one_without_a_cap_is_opaque(draw, with_gradients, single_pixel, pixel):
+def test_opacity_one_without_a_cap_is_opaque(
+    draw: Draw,
+    with_gradients: Callable[[Scene], Scene],
+    gradients_of: Callable[[Scene], Scene],
+    single_pixel: MakeScene,
+    pixel: Camera,
+) -> None:
     leaves = with_gradients(single_pixel(3, opacity=1.0, dtype=torch.float64))
     raster = RasterSettings(alpha_max=1.0, transmittance_min=-1.0)
     render = draw(leaves, pixel, raster, sh_degree=0)
     torch.testing.assert_close(render.alpha.item(), 1.0)
-    render.image.sum().backward()
-    assert all(torch.isfinite(leaves[name].grad).all() for name in PARAMETERS)
+    torch.autograd.backward(render.image.sum())
+    assert all(gradient.isfinite().all() for gradient in gradients_of(leaves).values())
 
 
 # --- what is not seen ---------------------------------------------------------------------------
 
 
 def test_behind_or_nearer_than_near_is_not_seen_and_has_no_gradient(
-    draw, with_gradients, make_camera, make_scene
-):
+    draw: Draw,
+    with_gradients: Callable[[Scene], Scene],
+    gradients_of: Callable[[Scene], Scene],
+    make_camera: MakeCamera,
+    make_scene: MakeScene,
+) -> None:
     camera = make_camera()
     scene = make_scene(8, camera, seed=1, dtype=torch.float32)
     depths = torch.tensor([-3.0, -1e-3, 0.0, 1e-30, 0.009, 0.01])
@@ -80,13 +137,19 @@ def test_behind_or_nearer_than_near_is_not_seen_and_has_no_gradient(
     assert not render.visible[:6].any()
     expected = draw({name: value[6:] for name, value in scene.items()}, camera)
     assert torch.equal(render.image, expected.image)
-    render.image.sum().backward()
-    for name in PARAMETERS:
-        assert (leaves[name].grad[:6] == 0).all()
-        assert torch.isfinite(leaves[name].grad).all()
+    torch.autograd.backward(render.image.sum())
+    for gradient in gradients_of(leaves).values():
+        assert (gradient[:6] == 0).all()
+        assert gradient.isfinite().all()
 
 
-def test_a_covariance_that_overflows_is_dropped(draw, with_gradients, make_camera, make_scene):
+def test_a_covariance_that_overflows_is_dropped(
+    draw: Draw,
+    with_gradients: Callable[[Scene], Scene],
+    gradients_of: Callable[[Scene], Scene],
+    make_camera: MakeCamera,
+    make_scene: MakeScene,
+) -> None:
     camera = make_camera()
     scene = make_scene(8, camera, seed=1, dtype=torch.float32)
     scene["scales"][0] = 1e30
@@ -96,16 +159,21 @@ def test_a_covariance_that_overflows_is_dropped(draw, with_gradients, make_camer
     leaves = with_gradients(scene)
     render = draw(leaves, camera)
     assert not render.visible[:4].any()
-    render.image.sum().backward()
-    assert all(torch.isfinite(leaves[name].grad).all() for name in PARAMETERS)
+    torch.autograd.backward(render.image.sum())
+    assert all(gradient.isfinite().all() for gradient in gradients_of(leaves).values())
     expected = draw({name: value[4:] for name, value in scene.items()}, camera)
     assert torch.equal(render.image, expected.image)
 
 
 @pytest.mark.parametrize("count", [0, 5])
 def test_none_or_none_visible_shows_the_background(
-    draw, with_gradients, make_camera, make_scene, count
-):
+    draw: Draw,
+    with_gradients: Callable[[Scene], Scene],
+    gradients_of: Callable[[Scene], Scene],
+    make_camera: MakeCamera,
+    make_scene: MakeScene,
+    count: int,
+) -> None:
     camera = make_camera()
     scene = with_gradients(make_scene(count, camera, dtype=torch.float32))
     with torch.no_grad():
@@ -115,5 +183,5 @@ def test_none_or_none_visible_shows_the_background(
     assert torch.equal(render.alpha, torch.zeros(14, 20))
     assert render.visible.tolist() == [False] * count
     assert render.evaluations == 0
-    render.image.sum().backward()  # a step of training must go through
-    assert all((value.grad == 0).all() for value in scene.values())
+    torch.autograd.backward(render.image.sum())  # as a training step does
+    assert all((gradient == 0).all() for gradient in gradients_of(scene).values())

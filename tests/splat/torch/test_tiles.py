@@ -1,52 +1,67 @@
+"""The lists of tiles against the pixels of each ellipse, one by one."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
 import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from torch import Tensor
 
+from xrgs.splat.cameras import Camera
 from xrgs.splat.settings import RasterSettings
 from xrgs.splat.torch import tiles
-from xrgs.splat.torch.projection import project, visible_in_order
-from xrgs.splat.torch.tiles import Grid, list_pairs, make_batches
+from xrgs.splat.torch.projection import ProjectedGaussians, project, visible_by_depth
+from xrgs.splat.torch.tiles import TileGrid, build_tile_batches, intersect_tiles
+
+MakeCamera = Callable[..., Camera]
+MakeScene = Callable[..., dict[str, Tensor]]
+MakeProjected = Callable[..., ProjectedGaussians]
 
 
 @pytest.fixture
-def flat(make_camera, make_scene):
+def make_projected(make_camera: MakeCamera, make_scene: MakeScene) -> MakeProjected:
     """Projected Gaussians in depth order, of all shapes from specks to needles."""
 
-    def make(width, height, *, count=60, seed=0):
+    def make(width: int, height: int, *, count: int = 60, seed: int = 0) -> ProjectedGaussians:
         camera = make_camera(width, height)
         scene = make_scene(count, camera, seed=seed, size=2.0)
         scene["scales"][::4, 0] *= 20
         scene["scales"][1::4] *= 0.01
         scene["opacities"][::5] *= 0.1
-        names = ("means", "quats", "scales", "opacities")
-        projected = project(*(scene[name] for name in names), camera, RasterSettings())
-        order = visible_in_order(projected, camera, RasterSettings())
+        shape = scene["means"], scene["quats"], scene["scales"], scene["opacities"]
+        projected = project(*shape, camera, RasterSettings())
+        order = visible_by_depth(projected, camera, RasterSettings())
         return projected._replace(**{k: v[order] for k, v in projected._asdict().items()})
 
     return make
 
 
-def contributing(flat, grid):
-    """(tile, Gaussian) of every pixel whose alpha reaches the cut, pixel by pixel."""
+def contributing(projected: ProjectedGaussians, grid: TileGrid) -> set[tuple[int, int]]:
+    """The (tile, Gaussian) pairs of all pixels whose alpha reaches alpha_min."""
     row, column = torch.meshgrid(torch.arange(grid.height), torch.arange(grid.width), indexing="ij")
     tile = (row // grid.tile) * grid.columns + column // grid.tile
-    pairs = set()
-    for i in range(len(flat.depths)):
-        xx, xy, yy = flat.cov[i]
+    pairs: set[tuple[int, int]] = set()
+    for i in range(len(projected.depths)):
+        xx, xy, yy = projected.cov[i]
         conic = torch.linalg.inv(torch.stack([xx, xy, xy, yy]).reshape(2, 2))
-        d = torch.stack([column + 0.5, row + 0.5], dim=-1) - flat.means2d[i]
-        alpha = flat.opacities[i] * torch.exp(-0.5 * torch.einsum("hwi,ij,hwj->hw", d, conic, d))
+        d = torch.stack([column + 0.5, row + 0.5], dim=-1) - projected.means2d[i]
+        exponent = -0.5 * torch.einsum("hwi,ij,hwj->hw", d, conic, d)
+        alpha = projected.opacities[i] * torch.exp(exponent)
         pairs |= {(t, i) for t in set(tile[alpha >= RasterSettings().alpha_min].tolist())}
     return pairs
 
 
 @pytest.mark.parametrize("tile", [4, 8, 16])
 @pytest.mark.parametrize(("width", "height"), [(40, 30), (64, 48), (1, 1), (33, 1), (3, 50)])
-def test_lists_hold_all_that_contributes_and_little_else(flat, width, height, tile):
-    grid = Grid(width, height, tile)
-    projected = flat(width, height)
-    tile_of, gaussian = list_pairs(projected, grid, RasterSettings())
+def test_lists_hold_all_that_contributes_and_little_else(
+    make_projected: MakeProjected, width: int, height: int, tile: int
+) -> None:
+    grid = TileGrid(width, height, tile)
+    projected = make_projected(width, height)
+    tile_of, gaussian = intersect_tiles(projected, grid, RasterSettings())
     pairs = list(zip(tile_of.tolist(), gaussian.tolist(), strict=True))
     assert pairs == sorted(set(pairs)), "by tile, then front to back, none twice"
     needed = contributing(projected, grid)
@@ -54,19 +69,21 @@ def test_lists_hold_all_that_contributes_and_little_else(flat, width, height, ti
     assert len(pairs) <= 1.1 * len(needed) + 10
 
 
-def test_without_a_cut_every_tile_lists_every_gaussian(flat):
-    grid = Grid(40, 30, 8)
-    projected = flat(40, 30)
-    tile, gaussian = list_pairs(projected, grid, RasterSettings(alpha_min=0.0))
+def test_without_a_cut_every_tile_lists_every_gaussian(make_projected: MakeProjected) -> None:
+    grid = TileGrid(40, 30, 8)
+    projected = make_projected(40, 30)
+    tile, gaussian = intersect_tiles(projected, grid, RasterSettings(alpha_min=0.0))
     # exp(-708) is where the reach ends: only specks beyond 37 sigmas may be left out.
     assert len(tile) > 0.3 * grid.columns * grid.rows * len(projected.depths)
     assert set(gaussian.tolist()) == set(range(len(projected.depths)))
 
 
-def test_too_many_pairs_is_an_error_before_they_are_made(flat, monkeypatch):
+def test_too_many_pairs_is_an_error_before_they_are_made(
+    make_projected: MakeProjected, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(tiles, "MAX_PAIRS", 10)
     with pytest.raises(MemoryError, match=r"pairs in one view, more than 10"):
-        list_pairs(flat(40, 30), Grid(40, 30, 8), RasterSettings())
+        intersect_tiles(make_projected(40, 30), TileGrid(40, 30, 8), RasterSettings())
 
 
 @given(
@@ -74,12 +91,12 @@ def test_too_many_pairs_is_an_error_before_they_are_made(flat, monkeypatch):
     elements=st.integers(1, 2000),
 )
 @settings(max_examples=100, deadline=None)
-def test_batches_hold_each_tile_once_with_its_list(lengths, elements):
-    grid = Grid(24, 16, 8)
+def test_batches_hold_each_tile_once_with_its_list(lengths: list[int], elements: int) -> None:
+    grid = TileGrid(24, 16, 8)
     tile = torch.repeat_interleave(torch.tensor(lengths))
     gaussian = torch.arange(len(tile)) % 7
     null = 99
-    batches, index = make_batches(tile, gaussian, grid, null, elements)
+    batches, index = build_tile_batches(tile, gaussian, grid, null, elements)
     found, begin = {}, 0
     for batch in batches:
         size = len(batch.tiles) * batch.longest
@@ -93,8 +110,8 @@ def test_batches_hold_each_tile_once_with_its_list(lengths, elements):
     assert found == {t: gaussian[tile == t].tolist() for t in range(6)}
 
 
-def test_corners():
-    grid = Grid(20, 9, 8)
+def test_corners() -> None:
+    grid = TileGrid(20, 9, 8)
     assert (grid.columns, grid.rows) == (3, 2)
     corners = grid.corners(torch.arange(6)).tolist()
     assert corners == [[0, 0], [8, 0], [16, 0], [0, 8], [8, 8], [16, 8]]

@@ -1,4 +1,4 @@
-"""Densification's bookkeeping of a step by the compiled kernel."""
+"""The densification statistics of a step by the compiled kernel, in one pass over memory."""
 
 from __future__ import annotations
 
@@ -8,22 +8,28 @@ from torch import Tensor
 from xrgs import _native
 
 
-def observe(
+def accumulate_statistics(
     means2d_grad: Tensor,
     visible: Tensor,
-    units: tuple[float, float],
-    gradient: Tensor,
-    seen: Tensor,
+    half_size: tuple[float, float],
+    grad2d_sum: Tensor,
+    visible_count: Tensor,
 ) -> None:
-    """Add a step's gradients to the sums that densification reads, in one pass over memory.
+    """Add the image-plane gradients of a step to the sums that densification decides by.
 
     Args:
-        means2d_grad: [N, 2] float32.
-        visible: [N] bool; the others add nothing, whatever their gradient.
-        units: What the gradient along x and y is multiplied by.
-        gradient: [N] float32, to which the norms are added in place.
-        seen: [N] float32, to which 1 is added in place.
+        means2d_grad: [N, 2] float32 gradient of the loss by the projected means, per px.
+        visible: [N] bool; Gaussians that are not visible add nothing, whatever their gradient.
+        half_size: Half the view's width and height, px, which bring the gradient to normalised
+            device units.
+        grad2d_sum: [N] float32 to which the gradients' norms are added in place.
+        visible_count: [N] float32 to which 1 is added in place where visible.
     """
     _native.observe(
-        means2d_grad.contiguous(), visible, *units, gradient, seen, torch.get_num_threads()
+        means2d_grad.contiguous(),
+        visible,
+        *half_size,
+        grad2d_sum,
+        visible_count,
+        torch.get_num_threads(),
     )

@@ -2,27 +2,26 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import torch
 from torch import Tensor
 
 from xrgs import _native
-
-if TYPE_CHECKING:
-    from xrgs.splat.loss import Target
+from xrgs.splat.native.arguments import require_float32
+from xrgs.splat.ssim import Target
 
 
 def photometric_loss(image: Tensor, target: Target, l1: float, ssim: float) -> Tensor:
-    """`xrgs.splat.loss.photometric_loss` of a float32 image on the CPU, once differentiable.
+    """Return `xrgs.splat.loss.photometric_loss` without pixel weights; once differentiable.
 
     Sums are kept in double and added in a fixed order: value and gradient are bitwise the same for
     any number of threads. Where the image or its target is NaN, so are the loss and the gradient
-    under the windows that see it.
+    of the pixels under the same windows.
 
     Args:
-        image: [H, W, 3] render, of any strides.
-        target: Of the same shape.
+        image: [H, W, 3] render, float32 on the CPU, of any strides.
+        target: The photograph, of the same shape and type.
         l1: Weight of the absolute difference.
         ssim: Weight of the structural dissimilarity.
 
@@ -30,14 +29,10 @@ def photometric_loss(image: Tensor, target: Target, l1: float, ssim: float) -> T
         A scalar.
 
     Raises:
-        ValueError: `image` or `target` isn't float32 on the CPU.
+        ValueError: `image` or `target` is not float32 on the CPU.
     """
-    for name, value in (("image", image), ("target", target.image)):
-        if value.dtype != torch.float32 or value.device.type != "cpu":
-            raise ValueError(
-                f"{name} must be float32 on the CPU for the native loss, got {value.dtype} on"
-                f" {value.device}"
-            )
+    require_float32("image", image)
+    require_float32("target", target.image)
     loss: Tensor = _Photometric.apply(image, target, l1, ssim)
     return loss
 
@@ -61,7 +56,7 @@ class _Photometric(torch.autograd.Function):
 
     @staticmethod
     @torch.autograd.function.once_differentiable
-    def backward(ctx: Any, slope: Tensor) -> tuple[Tensor, None, None, None]:
+    def backward(ctx: Any, v_loss: Tensor) -> tuple[Tensor, None, None, None]:
         (gradient,) = ctx.saved_tensors
         # A loss that nothing multiplies spares a pass over the image.
-        return gradient if slope == 1 else gradient * slope, None, None, None
+        return gradient if v_loss == 1 else gradient * v_loss, None, None, None

@@ -14,39 +14,42 @@ if TYPE_CHECKING:
 
 
 def step(adam: torch.optim.Adam, camera: Camera | None = None, sh_degree: int = 0) -> None:
-    """What `adam.step()` does, for all groups in one pass over memory.
+    """Move every parameter that has a gradient, in one pass over memory.
 
-    With a camera shN's gradient is made of sh0's as its moments are moved (`SplatOptimizer.step`):
-    that of training is never written to memory.
+    The formula is torch's own, in torch's own order, with one rounding fewer where a multiplication
+    and an addition are fused: the two differ by rounding alone (`tests/splat/native/
+    test_optimizer.py` has the bounds). Values whose gradient and moments are all zero, such as
+    those of harmonics that are not on yet, are not written. The result is bitwise the same for any
+    number of threads.
 
-    torch's own formula in torch's own order, one rounding fewer where a multiplication and an
-    addition are fused: the two differ by rounding alone (`tests/splat/test_native_adam.py` says how
-    much). Values whose gradient and moments are all zero, as of harmonics that aren't on yet, are
-    not written. Bitwise the same for any number of threads.
+    With a camera, the gradient of shN is computed from that of sh0 as the moments of shN are moved:
+    it is never written to memory.
 
     Args:
         adam: Named groups of one parameter each, float32 [N, ...] on the CPU, contiguous, with
-            betas and eps in common and without weight decay; those without a gradient stay as
+            betas and eps in common and without weight decay. Parameters without a gradient stay as
             they are.
-        camera: The view that the gradients come from.
-        sh_degree: Highest band that was on.
+        camera: The view that the gradients come from; with it shN moves, too, by the gradient that
+            sh0's implies (`SplatOptimizer.step`).
+        sh_degree: Highest band of the spherical harmonics that was rendered.
 
     Raises:
-        ValueError: A parameter, gradient or moment isn't float32.
+        ValueError: A parameter, gradient or moment is not float32 on the CPU and contiguous.
     """
     beta1, beta2 = adam.defaults["betas"]
     groups = {group["name"]: group for group in adam.param_groups}
     if camera is not None and groups["sh0"]["params"][0].grad is not None:
-        _step_harmonics(adam, groups, camera, sh_degree)  # first: by the means as rendered
+        # Before the means move: directions of view are those of the render.
+        _step_harmonics(adam, groups, camera, sh_degree)
     entries = []
     for name, group in groups.items():
         (parameter,) = group["params"]
         if parameter.grad is None:
             continue
-        state = _state(adam, parameter)
+        state = _adam_state(adam, parameter)
         state["step"] += 1
         tensors = (parameter, parameter.grad, state["exp_avg"], state["exp_avg_sq"])
-        flat = [_plain(name, tensor).view(-1) for tensor in tensors]
+        flat = [_require_plain(name, tensor).view(-1) for tensor in tensors]
         entries.append((*flat, group["lr"], state["step"].item()))
     _native.adam(entries, beta1, beta2, adam.defaults["eps"], torch.get_num_threads())
 
@@ -54,16 +57,17 @@ def step(adam: torch.optim.Adam, camera: Camera | None = None, sh_degree: int = 
 def _step_harmonics(
     adam: torch.optim.Adam, groups: dict[str, dict[str, Any]], camera: Camera, sh_degree: int
 ) -> None:
+    """Move shN by the gradient that sh0's implies."""
     means, sh0, shN = (groups[name]["params"][0] for name in ("means", "sh0", "shN"))
     beta1, beta2 = adam.defaults["betas"]
-    state = _state(adam, shN)
+    state = _adam_state(adam, shN)
     state["step"] += 1
     _native.adam_harmonics(
-        _plain("shN", shN),
-        _plain("shN", state["exp_avg"]),
-        _plain("shN", state["exp_avg_sq"]),
-        _plain("means", means),
-        _plain("sh0", sh0.grad).view(-1, 3),
+        _require_plain("shN", shN),
+        _require_plain("shN", state["exp_avg"]),
+        _require_plain("shN", state["exp_avg_sq"]),
+        _require_plain("means", means),
+        _require_plain("sh0", sh0.grad).view(-1, 3),
         camera.position.tolist(),
         sh_degree,
         groups["shN"]["lr"],
@@ -75,8 +79,8 @@ def _step_harmonics(
     )
 
 
-def _state(adam: torch.optim.Adam, parameter: Tensor) -> dict[str, Tensor]:
-    """Adam's state of a parameter, as torch starts it if there is none."""
+def _adam_state(adam: torch.optim.Adam, parameter: Tensor) -> dict[str, Tensor]:
+    """Return Adam's state of a parameter, created as torch creates it if there is none."""
     state: dict[str, Tensor] = adam.state[parameter]
     if not state:
         state["step"] = torch.zeros(())
@@ -85,7 +89,8 @@ def _state(adam: torch.optim.Adam, parameter: Tensor) -> dict[str, Tensor]:
     return state
 
 
-def _plain(name: str, value: Tensor) -> Tensor:
+def _require_plain(name: str, value: Tensor) -> Tensor:
+    """Return a tensor without its graph; ValueError unless float32, contiguous, on the CPU."""
     if value.dtype != torch.float32 or value.device.type != "cpu" or not value.is_contiguous():
         raise ValueError(
             f"{name} and its gradient must be float32, contiguous, on the CPU for the native"

@@ -1,7 +1,8 @@
-"""The compiled renderer (`xrgs/native`) as a torch operation.
+"""The compiled rasterizer (`xrgs/csrc/raster`) as a torch operation.
 
-The same image as `torch_rasterizer`, many times faster, in float32 on the CPU. What a forward pass
-leaves for its backward pass lives in a `Frame`, whose memory is used again by the next render.
+It renders the same image as `xrgs.splat.torch.rasterizer`, many times faster, in float32 on the
+CPU. What a forward pass keeps for its backward pass lives in a `Frame`, whose memory is used again
+by the next render.
 """
 
 from __future__ import annotations
@@ -15,49 +16,77 @@ from torch.autograd.function import once_differentiable
 
 from xrgs import _native
 from xrgs.splat.cameras import Camera
-from xrgs.splat.rasterize import Render
+from xrgs.splat.gaussians import ActivatedGaussians
+from xrgs.splat.native.arguments import require_float32
+from xrgs.splat.render_result import Render
 from xrgs.splat.settings import CullingOptions, RasterSettings
-from xrgs.splat.sh import MAX_DEGREE, bases
+
+_SHN_INPUT = 7
+"""Place of shN among the arguments of `_Rasterize.forward`."""
 
 
 def render(
-    means: Tensor,
-    quats: Tensor,
-    scales: Tensor,
-    opacities: Tensor,
-    sh0: Tensor,
-    shN: Tensor,
+    gaussians: ActivatedGaussians,
     camera: Camera,
     settings: RasterSettings,
     sh_degree: int,
     means2d_offset: Tensor | None,
-    skips: CullingOptions | None = None,
 ) -> Render:
-    """`rasterize` on the compiled kernels. Shapes, units and result as there.
-
-    With some `skips` off (None: all on) the image is the same and takes longer; without
-    `out_of_view` or `sub_threshold` what these would drop counts as visible.
+    """Render Gaussians into one view as `xrgs.splat.rasterize.rasterize` does.
 
     Uses as many threads as torch (`torch.set_num_threads`); the result is bitwise the same for any
     number of them.
 
+    Args:
+        gaussians: N Gaussians, float32, whose shapes have been checked.
+        camera: The view.
+        settings: How Gaussians become pixels.
+        sh_degree: Highest band of the spherical harmonics that is on.
+        means2d_offset: [N, 2] px, added to the projected means; None for zeros.
+
+    Returns:
+        The render, once differentiable in every parameter and the offset.
+
     Raises:
-        ValueError: a parameter is not float32 or has values that are not finite (harmonics are
-            read, and so checked, for visible Gaussians only), sh_degree is not 0 to 3, or shN has
-            fewer bands than it asks for.
-        MemoryError: the lists of the view do not fit in memory.
+        ValueError: A parameter is not float32 on the CPU, or has values that are not finite or out
+            of range. Harmonics are read, and so checked, for visible Gaussians only.
+        MemoryError: The tile lists of the view do not fit in memory.
     """
-    parameters = (means, quats, scales, opacities, sh0, shN)
-    if means.dtype != torch.float32:
-        raise ValueError(f"means must be float32 for the native backend, got {means.dtype}")
-    if not 0 <= sh_degree <= MAX_DEGREE:
-        raise ValueError(f"sh_degree must be 0 to {MAX_DEGREE}, got {sh_degree}")
-    rest = bases(sh_degree) - 1
-    if shN.shape[1] < rest:
-        raise ValueError(f"sh_degree {sh_degree} needs shN of [N, {rest}, 3], got {[*shN.shape]}")
+    return render_culled(gaussians, camera, settings, sh_degree, means2d_offset, CullingOptions())
+
+
+def render_culled(
+    gaussians: ActivatedGaussians,
+    camera: Camera,
+    settings: RasterSettings,
+    sh_degree: int,
+    means2d_offset: Tensor | None,
+    culling: CullingOptions,
+) -> Render:
+    """Render as `render` does, with some kinds of culling off, so that these can be measured.
+
+    The image is the same and takes longer. Without `out_of_view` or `sub_threshold`, what these
+    would cull counts as visible.
+
+    Args:
+        gaussians: N Gaussians, float32, whose shapes have been checked.
+        camera: The view.
+        settings: How Gaussians become pixels.
+        sh_degree: Highest band of the spherical harmonics that is on.
+        means2d_offset: [N, 2] px, added to the projected means; None for zeros.
+        culling: The kinds of culling that are on.
+
+    Returns:
+        The render, once differentiable in every parameter and the offset.
+
+    Raises:
+        ValueError: As for `render`.
+        MemoryError: As for `render`.
+    """
+    require_float32("means", gaussians.means)
     frame = _native.Frame()
-    view = _view(camera, settings, sh_degree, skips or CullingOptions())
-    image, alpha = _Rasterize.apply(frame, view, *parameters, means2d_offset)
+    view = _native_view(camera, settings, sh_degree, culling)
+    image, alpha = _Rasterize.apply(frame, view, *gaussians, means2d_offset)
     return Render(
         image=image,
         alpha=alpha,
@@ -67,8 +96,8 @@ def render(
     )
 
 
-def _view(
-    camera: Camera, settings: RasterSettings, sh_degree: int, skips: CullingOptions
+def _native_view(
+    camera: Camera, settings: RasterSettings, sh_degree: int, culling: CullingOptions
 ) -> _native.View:
     K = camera.K
     return _native.View.make(
@@ -85,11 +114,11 @@ def _view(
         absgrad=settings.absgrad,
         background=settings.background,
         sh_degree=sh_degree,
-        skips=astuple(skips),
+        skips=astuple(culling),
     )
 
 
-def _plain(tensor: Tensor | None) -> Tensor | None:
+def _contiguous(tensor: Tensor | None) -> Tensor | None:
     return None if tensor is None else tensor.detach().contiguous()
 
 
@@ -100,21 +129,20 @@ class _Rasterize(torch.autograd.Function):
     def forward(
         ctx: Any, frame: _native.Frame, view: _native.View, *inputs: Tensor | None
     ) -> tuple[Tensor, Tensor]:
-        plain = [_plain(tensor) for tensor in inputs]
+        contiguous = [_contiguous(tensor) for tensor in inputs]
         ctx.frame = frame
-        ctx.save_for_backward(*plain)
-        image, alpha = frame.forward(view, *plain, torch.get_num_threads())
+        ctx.save_for_backward(*contiguous)
+        image, alpha = frame.forward(view, *contiguous, torch.get_num_threads())
         return image, alpha
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, v_image: Tensor, v_alpha: Tensor) -> tuple[Tensor | None, ...]:
-        threads = torch.get_num_threads()
         gradients = ctx.frame.backward(
             v_image.contiguous(),
             v_alpha.contiguous(),
             *ctx.saved_tensors,
-            ctx.needs_input_grad[7],  # shN's, as large as all others three times over
-            threads,
+            ctx.needs_input_grad[_SHN_INPUT],  # three quarters of all gradients
+            torch.get_num_threads(),
         )
         return (None, None, *gradients)

@@ -1,7 +1,9 @@
-"""Gaussians in space to ellipses on the image plane, and which of them are seen.
+"""Projection of Gaussians to ellipses on the image plane, and culling of those out of view.
 
-Elliptical weighted averaging as in gsplat 1.5's `_torch_impl.py`. The one difference is that the
-determinant and the quadratic form are written so that nothing cancels in float32.
+Elliptical weighted averaging (Zwicker et al. 2001) as 3D Gaussian Splatting has it (Kerbl et al.
+2023, section 4, equations 5 and 6) and as gsplat 1.5 computes it (`_fully_fused_projection` of
+`cuda/_torch_impl.py`). The one difference is that the determinant and the quadratic form are
+written so that nothing cancels in float32.
 """
 
 from __future__ import annotations
@@ -10,28 +12,37 @@ from typing import NamedTuple
 
 import torch
 from torch import Tensor
-from torch.nn.functional import normalize
 
 from xrgs.splat.cameras import Camera
+from xrgs.splat.quaternions import rotation_matrices
 from xrgs.splat.settings import RasterSettings
 
 CLAMP_MARGIN = 0.3
-"""Share of the half field of view that the Jacobian may look beyond the image (gsplat's 1.3)."""
+"""Share of half the field of view by which the Jacobian's point may lie beyond the image (gsplat
+holds it within 1.3 tan(fov / 2))."""
 
 
-class Projected(NamedTuple):
+class ProjectedGaussians(NamedTuple):
     """Gaussians in the image plane."""
 
     means2d: Tensor  # [M, 2] px
     cov: Tensor  # [M, 3] xx, xy, yy of the dilated covariance, px^2
-    det: Tensor  # [M] of that covariance
-    opacities: Tensor  # [M], compensated if antialiased
+    det: Tensor  # [M] determinants of these covariances, px^4
+    opacities: Tensor  # [M], compensated for the dilation if antialiased
     depths: Tensor  # [M] world units
 
 
 def depths(means: Tensor, camera: Camera) -> Tensor:
-    """Distance of means [N, 3] along the camera's axis: [N], world units."""
-    forward = camera.viewmat[2].to(means)
+    """Return the distance of Gaussians along the camera's optical axis.
+
+    Args:
+        means: [N, 3] world units.
+        camera: The view.
+
+    Returns:
+        [N] world units, negative behind the camera.
+    """
+    forward = camera.viewmat[2].to(means)  # [4]
     return means @ forward[:3] + forward[3]
 
 
@@ -42,101 +53,112 @@ def project(
     opacities: Tensor,
     camera: Camera,
     settings: RasterSettings,
-) -> Projected:
-    """Project Gaussians in front of the camera: EWA, the covariance through the local Jacobian.
+) -> ProjectedGaussians:
+    """Project Gaussians in front of the camera, their covariances through the local Jacobian.
+
+    With M = J W R S (equations 5 and 6 of 3D Gaussian Splatting), a [2, 3] matrix, the covariance
+    on the image plane is M M^T + eps2d I. With `settings.antialiased` the opacity is multiplied by
+    sqrt(det(M M^T) / det(M M^T + eps2d I)), the 2D Mip filter of Mip-Splatting (Yu et al. 2024) as
+    gsplat has it (`calc_compensations`).
 
     Args:
-        means: [M, 3], all in front of the near plane.
-        quats: [M, 4]
-        scales: [M, 3]
-        opacities: [M]
-        camera: the view.
+        means: [M, 3] world units, all in front of the near plane.
+        quats: [M, 4] wxyz, any length.
+        scales: [M, 3] world units.
+        opacities: [M] in 0..1.
+        camera: The view.
         settings: `eps2d` and `antialiased` are read.
+
+    Returns:
+        The M Gaussians on the image plane, differentiable.
     """
     viewmat, K = camera.viewmat.to(means), camera.K.to(means)
     x, y, z = (means @ viewmat[:3, :3].T + viewmat[:3, 3]).unbind(-1)  # [M] each
     fx, fy, cx, cy = K[0, 0], K[1, 1], K[0, 2], K[1, 2]
-    means2d = torch.stack([fx * x / z + cx, fy * y / z + cy], dim=-1)
+    means2d = torch.stack([fx * x / z + cx, fy * y / z + cy], dim=-1)  # [M, 2]
 
     # Far outside the image the affine approximation blows up: hold its point at the border.
-    slope_x = _clamp_slope(x / z, cx / fx, (camera.width - cx) / fx)
-    slope_y = _clamp_slope(y / z, cy / fy, (camera.height - cy) / fy)
-    axes = viewmat[:3, :3] @ (rotations(quats) * scales[:, None, :])  # [M, 3, 3] camera axes
-    m1 = (fx / z)[:, None] * (axes[:, 0] - slope_x[:, None] * axes[:, 2])  # [M, 3]
-    m2 = (fy / z)[:, None] * (axes[:, 1] - slope_y[:, None] * axes[:, 2])
+    tan_x = _clamp_tangent(x / z, cx / fx, (camera.width - cx) / fx)  # [M]
+    tan_y = _clamp_tangent(y / z, cy / fy, (camera.height - cy) / fy)
+    # W R S: the Gaussian's axes in camera coordinates.
+    axes = viewmat[:3, :3] @ (rotation_matrices(quats) * scales[:, None, :])  # [M, 3, 3]
+    row_x = (fx / z)[:, None] * (axes[:, 0] - tan_x[:, None] * axes[:, 2])  # [M, 3], first row of M
+    row_y = (fy / z)[:, None] * (axes[:, 1] - tan_y[:, None] * axes[:, 2])  # [M, 3], second row
 
-    # det([m1; m2] [m1; m2]^T + eps I), expanded so that nothing cancels: ac - b^2 does in float32.
+    # det(M M^T + eps I), expanded so that nothing cancels: xx yy - xy^2 does in float32.
     eps = settings.eps2d
-    xx, xy, yy = (m1 * m1).sum(-1), (m1 * m2).sum(-1), (m2 * m2).sum(-1)
-    area = torch.linalg.vector_norm(torch.linalg.cross(m1, m2), dim=-1)  # sqrt(det), undilated
-    det = area * area + eps * (xx + yy) + eps * eps
+    xx, xy, yy = (row_x * row_x).sum(-1), (row_x * row_y).sum(-1), (row_y * row_y).sum(-1)  # [M]
+    area = torch.linalg.vector_norm(torch.linalg.cross(row_x, row_y), dim=-1)  # sqrt(det(M M^T))
+    det = area * area + eps * (xx + yy) + eps * eps  # [M]
     if settings.antialiased:
         opacities = opacities * area / det.sqrt()
-    cov = torch.stack([xx + eps, xy, yy + eps], dim=-1)
-    return Projected(means2d, cov, det, opacities, z)
+    cov = torch.stack([xx + eps, xy, yy + eps], dim=-1)  # [M, 3]
+    return ProjectedGaussians(means2d, cov, det, opacities, z)
 
 
-def _clamp_slope(slope: Tensor, before: Tensor, after: Tensor) -> Tensor:
+def _clamp_tangent(tangent: Tensor, before: Tensor, after: Tensor) -> Tensor:
     """Hold x/z within the image, whose borders are at -before and after, and a margin."""
     margin = CLAMP_MARGIN * 0.5 * (before + after)
-    return torch.minimum(torch.maximum(slope, -before - margin), after + margin)
+    return torch.minimum(torch.maximum(tangent, -before - margin), after + margin)
 
 
-def rotations(quats: Tensor) -> Tensor:
-    """Rotation matrices [M, 3, 3] of quaternions [M, 4] wxyz of any length; zero is the identity.
+def cutoff_radius_sq(opacities: Tensor, settings: RasterSettings) -> Tensor:
+    """Return the squared radius, in standard deviations, at which alpha falls to alpha_min.
 
-    The gradient of a zero quaternion is zero.
+    The radius r solves opacity exp(-r^2 / 2) = alpha_min.
+
+    Args:
+        opacities: [M] in 0..1.
+        settings: `alpha_min` is read.
+
+    Returns:
+        [M] float64, negative where the opacity itself is below alpha_min.
     """
-    # Scaled by its largest part first, a tiny or huge quaternion has a norm. As the rotation does
-    # not depend on the length, the scale needs no gradient.
-    largest = quats.detach().abs().amax(dim=-1, keepdim=True)  # [M, 1]
-    zero = largest < torch.finfo(quats.dtype).tiny ** 0.5
-    identity = quats.new_tensor([1.0, 0.0, 0.0, 0.0])
-    scaled = torch.where(zero, identity, quats / largest.masked_fill(zero, 1.0))
-    w, x, y, z = normalize(scaled, dim=-1).unbind(-1)
-    matrix = [
-        *(1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)),
-        *(2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)),
-        *(2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)),
-    ]
-    return torch.stack(matrix, dim=-1).reshape(-1, 3, 3)
-
-
-def squared_radius(opacities: Tensor, settings: RasterSettings) -> Tensor:
-    """How far a Gaussian reaches, in sigmas squared: where opacity exp(-r^2 / 2) is alpha_min.
-
-    float64, [M]. Negative where the opacity itself is below the cut.
-    """
-    # Without a cut-off the reach ends where float64 has no normal numbers left.
+    # With an alpha_min of 0 the radius ends where float64 has no normal numbers left.
     smallest = max(settings.alpha_min, torch.finfo(torch.float64).tiny)
     return 2 * torch.log(opacities.double() / smallest)
 
 
-def visible_in_order(flat: Projected, camera: Camera, settings: RasterSettings) -> Tensor:
-    """The Gaussians whose box of reach overlaps the image, front to back: [M] indices.
+def visible_by_depth(
+    projected: ProjectedGaussians, camera: Camera, settings: RasterSettings
+) -> Tensor:
+    """Return the Gaussians whose bounding box at the cutoff radius overlaps the image.
 
-    Equal depths keep the order of their indices.
+    Args:
+        projected: N Gaussians in front of the camera.
+        camera: The view.
+        settings: `alpha_min` is read.
+
+    Returns:
+        [M] indices, front to back; equal depths keep the order of their indices.
     """
-    r2 = squared_radius(flat.opacities, settings)
-    extent = (r2.clamp_min(0)[:, None] * flat.cov[:, [0, 2]]).sqrt()  # [N, 2] px
-    low, high = flat.means2d - extent, flat.means2d + extent
+    radius_sq = cutoff_radius_sq(projected.opacities, settings)  # [N]
+    # Half the bounding box of the ellipse: the radius times the standard deviation of each axis.
+    extent = (radius_sq.clamp_min(0)[:, None] * projected.cov[:, [0, 2]]).sqrt()  # [N, 2] px
+    low, high = projected.means2d - extent, projected.means2d + extent
     size = torch.tensor([camera.width, camera.height])
     # A covariance that overflows, or is singular for want of dilation, has no inverse.
-    usable = torch.isfinite(flat.det) & (flat.det > 0) & torch.isfinite(extent).all(-1)
-    visible = usable & (r2 >= 0) & ((high > 0) & (low < size)).all(-1)
-    order = torch.argsort(flat.depths, stable=True)
+    det = projected.det
+    invertible = torch.isfinite(det) & (det > 0) & torch.isfinite(extent).all(-1)
+    visible = invertible & (radius_sq >= 0) & ((high > 0) & (low < size)).all(-1)  # [N]
+    order = torch.argsort(projected.depths, stable=True)
     return order[visible[order]]
 
 
-def whitened(flat: Projected) -> Tensor:
-    """What a pixel needs to know of a Gaussian's shape: [M, 6] x, y, p, s, q, log(opacity).
+def conic_cholesky(projected: ProjectedGaussians) -> Tensor:
+    """Return the Cholesky factor of half the conic (the inverse covariance) of each Gaussian.
 
-    With d the pixel's centre less the mean, u = p dx - s dy and v = q dy are normal deviates over
-    sqrt(2), so alpha = opacity exp(-u^2 - v^2): the inverse covariance as a sum of squares.
+    The factor [[c_xx, c_xy], [0, c_yy]] makes the exponent a sum of squares: with d a pixel's
+    centre less the mean, u = c_xx dx + c_xy dy and v = c_yy dy, alpha = opacity exp(-u^2 - v^2).
+
+    Args:
+        projected: M Gaussians with invertible covariances.
+
+    Returns:
+        [M, 3] c_xx, c_xy, c_yy in 1/px, differentiable.
     """
-    _, xy, yy = flat.cov.unbind(-1)
-    p = (yy / flat.det / 2).sqrt()
-    s = p * xy / yy
-    q = (0.5 / yy).sqrt()
-    shape = torch.stack([p, s, q, torch.log(flat.opacities)], dim=-1)
-    return torch.cat([flat.means2d, shape], dim=-1)
+    _, xy, yy = projected.cov.unbind(-1)  # [M] each
+    c_xx = (yy / projected.det / 2).sqrt()
+    c_xy = -(c_xx * xy / yy)
+    c_yy = (0.5 / yy).sqrt()
+    return torch.stack([c_xx, c_xy, c_yy], dim=-1)

@@ -1,10 +1,10 @@
-"""The readable renderer: 3D Gaussian Splatting in plain torch, gradients by autograd.
+"""The reference rasterizer: 3D Gaussian Splatting in plain torch, with gradients by autograd.
 
-It is the oracle of every faster one, so it runs in any floating type. Compositing is that of
-gsplat's CUDA kernels.
+Every faster rasterizer is tested against it, so it runs in any floating type. Compositing is that
+of gsplat's CUDA kernels.
 
-A render goes: which Gaussians are visible, front to back -> project them -> list, for every tile,
-the Gaussians that reach it -> composite tiles in padded batches of similar list length.
+A render finds the visible Gaussians, front to back; projects them; lists for every tile the
+Gaussians that reach it; and composites tiles in padded batches of similar list length.
 """
 
 from __future__ import annotations
@@ -17,11 +17,18 @@ from torch.nn.functional import embedding, normalize, pad
 from torch.utils.checkpoint import checkpoint
 
 from xrgs.splat.cameras import Camera
-from xrgs.splat.rasterize import Render
+from xrgs.splat.gaussians import ActivatedGaussians
+from xrgs.splat.render_result import Render
 from xrgs.splat.settings import RasterSettings
 from xrgs.splat.sh import sh_to_colors
-from xrgs.splat.torch.projection import Projected, depths, project, visible_in_order, whitened
-from xrgs.splat.torch.tiles import Batch, Grid, list_pairs, make_batches
+from xrgs.splat.torch.projection import (
+    ProjectedGaussians,
+    conic_cholesky,
+    depths,
+    project,
+    visible_by_depth,
+)
+from xrgs.splat.torch.tiles import TileBatch, TileGrid, build_tile_batches, intersect_tiles
 
 TILE = 8
 """Side of a tile, px. Any gives the same image; 8 was the fastest of 4, 8 and 16 in torch."""
@@ -29,85 +36,116 @@ TILE = 8
 BATCH_ELEMENTS = 1 << 18
 """Alpha values of a batch of tiles: 1 MB in float32, so that a pass stays in the cache."""
 
+_LOG_OPACITY = 5
+"""Column of the log opacity among the attributes of a Gaussian."""
+
 
 def render(
-    means: Tensor,
-    quats: Tensor,
-    scales: Tensor,
-    opacities: Tensor,
-    sh0: Tensor,
-    shN: Tensor,
+    gaussians: ActivatedGaussians,
     camera: Camera,
     settings: RasterSettings,
     sh_degree: int,
     means2d_offset: Tensor | None,
-    tile: int = TILE,
 ) -> Render:
-    """`rasterize` with its arguments checked. Shapes, units and result as there.
+    """Render Gaussians into one view as `xrgs.splat.rasterize.rasterize` does.
+
+    Args:
+        gaussians: N Gaussians of one floating type, whose checks have passed.
+        camera: The view.
+        settings: How Gaussians become pixels.
+        sh_degree: Highest band of the spherical harmonics that is on.
+        means2d_offset: [N, 2] px, added to the projected means; None for zeros.
+
+    Returns:
+        The render, differentiable in every parameter and the offset.
 
     Raises:
-        ValueError: sh_degree is not 0 to 3 or above the bands of shN.
-        MemoryError: more (tile, Gaussian) pairs than fit in memory.
+        MemoryError: There are more (tile, Gaussian) pairs than fit in memory.
     """
+    means = gaussians.means
     if means2d_offset is None:
         means2d_offset = means.new_zeros((len(means), 2))
-    grid = Grid(camera.width, camera.height, tile)
-    # With absgrad the means hold the offset's value, and pixels its gradient: see `_PixelOffset`.
-    mean_offset = means2d_offset.detach() if settings.absgrad else means2d_offset
-
-    def project_some(chosen: Tensor) -> Projected:
-        shape = (means[chosen], quats[chosen], scales[chosen], opacities[chosen])
-        flat = project(*shape, camera, settings)
-        return flat._replace(means2d=flat.means2d + mean_offset[chosen])
-
+    visible_ids, projected, attributes = _project_visible(
+        gaussians, camera, settings, sh_degree, means2d_offset
+    )
+    grid = TileGrid(camera.width, camera.height, TILE)
     with torch.no_grad():
-        in_front = torch.nonzero(depths(means, camera) > settings.near)[:, 0]
-        chosen = in_front[visible_in_order(project_some(in_front), camera, settings)]  # [M]
-    # Projected again rather than masked: what is behind the camera or overflows must stay out of
-    # the graph, where its gradient would be 0 * inf.
-    flat = project_some(chosen)
-    dirs = normalize(means[chosen] - camera.position.to(means), dim=-1)
-    colors = sh_to_colors(sh_degree, dirs, sh0[chosen], shN[chosen])
-    columns = [whitened(flat), colors]
-    if settings.absgrad:
-        columns.append(means2d_offset[chosen] - mean_offset[chosen])
-    records = torch.cat(columns, dim=-1)  # [M, 9], or [M, 11] with absgrad
+        pairs = intersect_tiles(projected, grid, settings)
+        batches, lists = build_tile_batches(*pairs, grid, len(attributes), BATCH_ELEMENTS)
+    canvas, canvas_bytes = _composite_batches(attributes, batches, lists, grid, settings)
 
-    with torch.no_grad():
-        pairs = list_pairs(flat, grid, settings)
-        batches, index = make_batches(*pairs, grid, len(records), BATCH_ELEMENTS)
-    canvas, canvas_bytes = _composite_batches(records, batches, index, grid, settings)
-
-    rgba = canvas.reshape(grid.rows, grid.columns, tile, tile, 4).transpose(1, 2)
-    rgba = rgba.reshape(grid.rows * tile, grid.columns * tile, 4)
-    rgba = rgba[: camera.height, : camera.width]
-    alpha = rgba[..., 3]
-    background = means.new_tensor(settings.background)
+    rgba = canvas.reshape(grid.rows, grid.columns, TILE, TILE, 4).transpose(1, 2)
+    rgba = rgba.reshape(grid.rows * TILE, grid.columns * TILE, 4)
+    rgba = rgba[: camera.height, : camera.width]  # [H, W, 4]
+    alpha = rgba[..., 3]  # [H, W]
+    background = means.new_tensor(settings.background)  # [3]
     return Render(
         image=rgba[..., :3] + (1 - alpha)[..., None] * background,
         alpha=alpha,
-        visible=torch.zeros(len(means), dtype=torch.bool).index_fill(0, chosen, True),
-        evaluations=len(pairs[0]) * tile**2,
-        buffer_bytes=_bytes(*flat, records, *pairs, index) + canvas_bytes,
+        visible=torch.zeros(len(means), dtype=torch.bool).index_fill(0, visible_ids, True),
+        evaluations=len(pairs[0]) * TILE**2,
+        buffer_bytes=_bytes(*projected, attributes, *pairs, lists) + canvas_bytes,
     )
 
 
+def _project_visible(
+    gaussians: ActivatedGaussians,
+    camera: Camera,
+    settings: RasterSettings,
+    sh_degree: int,
+    means2d_offset: Tensor,
+) -> tuple[Tensor, ProjectedGaussians, Tensor]:
+    """Project the visible Gaussians, front to back.
+
+    Returns:
+        Their indices [M], the projected Gaussians, and the attributes that compositing reads:
+        [M, 9] x, y, the Cholesky factor of the conic, log opacity, colour; with absgrad [M, 11],
+        the offset, whose value is zero, behind them.
+    """
+    means, quats, scales, opacities, sh0, shN = gaussians
+    # With absgrad the means hold the offset's value, and pixels its gradient: see `_PixelOffset`.
+    mean_offset = means2d_offset.detach() if settings.absgrad else means2d_offset
+
+    def project_some(ids: Tensor) -> ProjectedGaussians:
+        shape = (means[ids], quats[ids], scales[ids], opacities[ids])
+        projected = project(*shape, camera, settings)
+        return projected._replace(means2d=projected.means2d + mean_offset[ids])
+
+    with torch.no_grad():
+        in_front = torch.nonzero(depths(means, camera) > settings.near)[:, 0]
+        ids = in_front[visible_by_depth(project_some(in_front), camera, settings)]  # [M]
+    # Projected again rather than masked: what is behind the camera or overflows must stay out of
+    # the graph, where its gradient would be 0 * inf.
+    projected = project_some(ids)
+    dirs = normalize(means[ids] - camera.position.to(means), dim=-1)  # [M, 3]
+    colors = sh_to_colors(sh_degree, dirs, sh0[ids], shN[ids])  # [M, 3]
+    log_opacities = torch.log(projected.opacities)[:, None]  # [M, 1]
+    columns = [projected.means2d, conic_cholesky(projected), log_opacities, colors]
+    if settings.absgrad:
+        columns.append(means2d_offset[ids] - mean_offset[ids])
+    return ids, projected, torch.cat(columns, dim=-1)
+
+
 def _composite_batches(
-    records: Tensor, batches: list[Batch], index: Tensor, grid: Grid, settings: RasterSettings
+    attributes: Tensor,
+    batches: list[TileBatch],
+    lists: Tensor,
+    grid: TileGrid,
+    settings: RasterSettings,
 ) -> tuple[Tensor, int]:
-    """Composite every tile: [tiles, tile^2, 4] in row-major order, and the bytes that took."""
-    null = records.new_zeros((1, records.shape[1]))
-    null[:, 5] = float("-inf")  # the log of its opacity
-    listed = embedding(index, torch.cat([records, null]))  # [sum of B K, 9 or 11]
-    parts = listed.split([len(batch.tiles) * batch.longest for batch in batches])
+    """Composite every tile: [tiles, tile^2, 4], numbered row by row, and the bytes that took."""
+    padding = attributes.new_zeros((1, attributes.shape[1]))
+    padding[:, _LOG_OPACITY] = float("-inf")
+    listed = embedding(lists, torch.cat([attributes, padding]))  # [sum of B K, 9 or 11]
+    by_batch = listed.split([len(batch.tiles) * batch.longest for batch in batches])
     outputs = []
-    for batch, part in zip(batches, parts, strict=True):
-        entries = part.reshape(len(batch.tiles), batch.longest, -1)
+    for batch, flat_entries in zip(batches, by_batch, strict=True):
+        entries = flat_entries.reshape(len(batch.tiles), batch.longest, -1)  # [B, K, 9 or 11]
         # Recomputed in the backward pass: a view's alphas at once would not fit in memory.
         rgba = checkpoint(
             composite,
             entries,
-            grid.corners(batch.tiles).to(records),
+            grid.corners(batch.tiles).to(attributes),
             grid.tile,
             settings,
             use_reentrant=False,
@@ -116,24 +154,33 @@ def _composite_batches(
         outputs.append(rgba)
     order = torch.argsort(torch.cat([batch.tiles for batch in batches]))
     canvas = torch.cat(outputs)[order]
-    an_alpha = alpha_bytes(records.itemsize, absgrad=settings.absgrad)
-    peak = max(part.shape[0] for part in parts) * grid.tile**2 * an_alpha
+    bytes_per_alpha = alpha_bytes(attributes.itemsize, absgrad=settings.absgrad)
+    longest_batch = max(flat_entries.shape[0] for flat_entries in by_batch)
+    peak = longest_batch * grid.tile**2 * bytes_per_alpha
     return canvas, _bytes(listed, canvas) + peak
 
 
 def alpha_bytes(itemsize: int, *, absgrad: bool = False) -> int:
-    """What `composite` keeps for its backward pass, bytes an alpha value.
+    """Return the bytes an alpha value that `composite` keeps for its backward pass.
 
-    u, the exponential, alpha, 1 - alpha, after, before and weights, and two masks; with absgrad v
-    and the offset, too.
+    These are u, the exponential, alpha, 1 - alpha, the transmittances before and behind, weights,
+    and two masks; with absgrad also v and the two coordinates of the offset.
+
+    Args:
+        itemsize: Bytes of one number of the floating type.
+        absgrad: Whether pixels have offsets of their own.
+
+    Returns:
+        Bytes for each (pixel, Gaussian) pair of a batch.
     """
     return (10 if absgrad else 7) * itemsize + 2
 
 
 class _PixelOffset(torch.autograd.Function):
-    """An offset [B, K, 2] handed to every pixel: x and y, [B, K, tile, tile] each.
+    """An offset [B, K, 2] expanded to every pixel of a tile: x and y, [B, K, tile, tile] each.
 
-    The offset's gradient is the sum of the absolute values of its pixels' gradients.
+    The gradient of the offset is the sum of the absolute values of its pixels' gradients: the
+    homodirectional gradient of AbsGS (Ye et al. 2024), gsplat's `absgrad`.
     """
 
     @staticmethod
@@ -147,40 +194,41 @@ class _PixelOffset(torch.autograd.Function):
 
 
 def composite(entries: Tensor, corner: Tensor, tile: int, settings: RasterSettings) -> Tensor:
-    """Composite tiles front to back.
+    """Composite tiles front to back (3D Gaussian Splatting, section 4, equation 3).
 
     A contribution below alpha_min is skipped, one above alpha_max is capped (no gradient), and a
-    pixel ends before the Gaussian that would leave it transmittance_min or less.
+    pixel ends before the Gaussian that would leave it a transmittance of transmittance_min or less.
 
     Args:
-        entries: [B, K, 9] a tile's Gaussians: `whitened` and colour; with absgrad [B, K, 11], the
-            offset, whose value is zero, behind them.
-        corner: [B, 2] each tile's top left, px.
-        tile: side of a tile, px.
-        settings: the cut-offs.
+        entries: [B, K, 9] attributes of each tile's Gaussians, front to back: x, y, the Cholesky
+            factor of the conic, log opacity, colour; with absgrad [B, K, 11], the offset, whose
+            value is zero, behind them.
+        corner: [B, 2] top left corner of each tile, px.
+        tile: Side of a tile, px.
+        settings: The cut-offs.
 
     Returns:
         [B, tile^2, 4] colour without background, and alpha.
     """
-    x, y, p, s, q, log_opacity = entries[..., :6, None].unbind(-2)  # [B, K, 1] each
-    centre = torch.arange(tile, dtype=entries.dtype) + 0.5
+    x, y, c_xx, c_xy, c_yy, log_opacity = entries[..., :6, None].unbind(-2)  # [B, K, 1] each
+    centre = torch.arange(tile, dtype=entries.dtype) + 0.5  # [tile]
     dx = corner[:, None, :1] + centre - x  # [B, K, tile]
     dy = corner[:, None, 1:] + centre - y
-    u = (p * dx)[:, :, None, :] - (s * dy)[:, :, :, None]  # [B, K, tile, tile]
-    v = (q * dy)[:, :, :, None]  # [B, K, tile, 1]
+    u = (c_xx * dx)[:, :, None, :] + (c_xy * dy)[:, :, :, None]  # [B, K, tile, tile]
+    v = (c_yy * dy)[:, :, :, None]  # [B, K, tile, 1]
     if settings.absgrad:
-        offset_x, offset_y = _PixelOffset.apply(entries[..., 9:], tile)
-        u = u - p[..., None] * offset_x + s[..., None] * offset_y
-        v = v - q[..., None] * offset_y
+        offset_x, offset_y = _PixelOffset.apply(entries[..., 9:], tile)  # [B, K, tile, tile] each
+        u = u - c_xx[..., None] * offset_x - c_xy[..., None] * offset_y
+        v = v - c_yy[..., None] * offset_y
     row = log_opacity[..., None] - v.square()
     alpha = torch.exp(torch.addcmul(row, u, u, value=-1)).clamp_max(settings.alpha_max)
     alpha = alpha.flatten(2)  # [B, K, tile^2]
     alpha = torch.where(alpha < settings.alpha_min, 0.0, alpha)
 
-    # Never frozen, the product falls on past the end: so what is kept is a prefix, exactly.
-    after = torch.cumprod(1 - alpha, dim=1)  # [B, K, tile^2] transmittance behind each
-    before = torch.cat([torch.ones_like(after[:, :1]), after[:, :-1]], dim=1)
-    weights = torch.where(after > settings.transmittance_min, alpha * before, 0.0)
+    # The product goes on falling behind the pixel's end: what is composited is exactly a prefix.
+    behind = torch.cumprod(1 - alpha, dim=1)  # [B, K, tile^2] transmittance behind each
+    before = torch.cat([torch.ones_like(behind[:, :1]), behind[:, :-1]], dim=1)
+    weights = torch.where(behind > settings.transmittance_min, alpha * before, 0.0)
     colors = pad(entries[..., 6:9], (0, 1), value=1.0)  # [B, K, 4]
     return weights.transpose(1, 2) @ colors
 

@@ -1,4 +1,9 @@
-"""Which Gaussians each tile of the image has to look at, and which tiles go together."""
+"""The Gaussians that each tile of the image composites, and tiles grouped into batches.
+
+The tiles of 3D Gaussian Splatting (Kerbl et al. 2023, section 6; gsplat's `_isect_tiles`). Where
+those list every tile that a bounding box overlaps, these find the ellipse's extent in each row of
+tiles.
+"""
 
 from __future__ import annotations
 
@@ -9,147 +14,169 @@ from torch import Tensor
 from torch.nn.functional import pad
 
 from xrgs.splat.settings import RasterSettings
-from xrgs.splat.torch.projection import Projected, squared_radius
+from xrgs.splat.torch.projection import ProjectedGaussians, cutoff_radius_sq
 
 MAX_PAIRS = 1 << 27
-"""(tile, Gaussian) pairs that fit in memory: some 80 bytes each, so 10 GB."""
+"""Number of (tile, Gaussian) pairs that fit in memory: some 80 bytes each, so 10 GB."""
 
 RADIUS_MARGIN = 0.01
-"""Added to the squared radius in sigmas when listing, so that rounding never drops a pixel."""
+"""Added to the squared cutoff radius (in standard deviations), so that rounding drops no pixel."""
 
 
 @dataclass(frozen=True)
-class Grid:
-    """The square tiles that cover an image; the last of a row or column may stand out."""
+class TileGrid:
+    """The square tiles that cover an image; those of the last row and column may overhang it."""
 
     width: int  # px
-    height: int
+    height: int  # px
     tile: int  # side of a tile, px
 
     @property
     def columns(self) -> int:
-        """Tiles in a row."""
+        """Number of tiles in a row."""
         return -(-self.width // self.tile)
 
     @property
     def rows(self) -> int:
-        """Tiles in a column."""
+        """Number of tiles in a column."""
         return -(-self.height // self.tile)
 
     def span(self, first: Tensor, last: Tensor) -> tuple[Tensor, Tensor]:
-        """Columns (or rows) of tiles, first and last, of pixels first..last; none of none."""
+        """Return the columns (or rows) of tiles that ranges of pixels fall into.
+
+        Args:
+            first: [R] first pixel of each range.
+            last: [R] last pixel of each range; below the first where the range is empty.
+
+        Returns:
+            First and last column (or row), [R] each; the last is below the first where the range
+            is empty.
+        """
         begin = torch.div(first, self.tile, rounding_mode="floor")
         end = torch.div(last, self.tile, rounding_mode="floor")
         return begin, torch.where(last < first, begin - 1, end)
 
     def corners(self, tiles: Tensor) -> Tensor:
-        """Top left [B, 2] x, y in px of tiles [B], numbered row by row."""
+        """Return the top left corners [B, 2] (x, y, px) of tiles [B], numbered row by row."""
         return torch.stack([tiles % self.columns, tiles // self.columns], dim=-1) * self.tile
 
 
 @dataclass(frozen=True)
-class Batch:
-    """Tiles composited together, every list padded to the longest."""
+class TileBatch:
+    """Tiles that are composited together, every list padded to the longest."""
 
     tiles: Tensor  # [B]
     longest: int  # K
 
 
-def list_pairs(flat: Projected, grid: Grid, settings: RasterSettings) -> tuple[Tensor, Tensor]:
-    """Every (tile, Gaussian) pair in which some pixel's alpha reaches the cut.
+def intersect_tiles(
+    projected: ProjectedGaussians, grid: TileGrid, settings: RasterSettings
+) -> tuple[Tensor, Tensor]:
+    """Return every (tile, Gaussian) pair in which some pixel's alpha reaches alpha_min.
 
-    A superset, exact but for a margin: the ellipse's horizontal span is found for each row of
-    tiles.
+    The pairs are a superset, exact but for a margin: the ellipse's horizontal extent is found for
+    each row of tiles.
+
+    Args:
+        projected: Visible Gaussians, front to back.
+        grid: The tiles of the image.
+        settings: `alpha_min` is read.
 
     Returns:
-        tile [P], ascending, row-major; gaussian [P], ascending (front to back) within a tile.
+        tile: [P] ascending, numbered row by row.
+        gaussian: [P] ascending (front to back) within a tile.
 
     Raises:
-        MemoryError: P is beyond memory.
+        MemoryError: P is more than `MAX_PAIRS`.
     """
-    x, y = flat.means2d.double().unbind(-1)
-    xx, xy, yy = flat.cov.double().unbind(-1)
-    r2 = squared_radius(flat.opacities, settings) + RADIUS_MARGIN
-    reach = (r2 * yy).sqrt()
-    top = _first_pixel(y - reach, grid.height)
-    bottom = _last_pixel(y + reach, grid.height)
-    # [R], one entry a (Gaussian, row of tiles)
-    owner, tile_row = _ranges(*grid.span(top, bottom))
+    x, y = projected.means2d.double().unbind(-1)  # [M] each
+    xx, xy, yy = projected.cov.double().unbind(-1)
+    radius_sq = cutoff_radius_sq(projected.opacities, settings) + RADIUS_MARGIN
+    half_height = (radius_sq * yy).sqrt()
+    top = _first_pixel(y - half_height, grid.height)
+    bottom = _last_pixel(y + half_height, grid.height)
+    # [R], one entry for each pair of a Gaussian and a row of tiles.
+    gaussian, tile_row = _expand_ranges(*grid.span(top, bottom))
 
-    # The span's ends are the ellipse's leftmost and rightmost points, or as near to them as the
-    # row allows (the boundary is concave).
-    low = torch.maximum(tile_row * grid.tile, top[owner]) + 0.5 - y[owner]
-    high = torch.minimum(tile_row * grid.tile + grid.tile - 1, bottom[owner]) + 0.5 - y[owner]
-    tip = ((r2 / xx).sqrt() * xy)[owner]
-    right = torch.minimum(torch.maximum(tip, low), high)
-    left = torch.minimum(torch.maximum(-tip, low), high)
-    slope, narrow = (xy / yy)[owner], (flat.det.double() / yy)[owner]
-    half_left = (narrow * (r2[owner] - left * left / yy[owner]).clamp_min(0)).sqrt()
-    half_right = (narrow * (r2[owner] - right * right / yy[owner]).clamp_min(0)).sqrt()
+    # The extent in a row of tiles ends at the ellipse's leftmost and rightmost points or, where
+    # these are outside the row, at the row's border next to them: the boundary is concave.
+    top_dy = torch.maximum(tile_row * grid.tile, top[gaussian]) + 0.5 - y[gaussian]
+    last_row = tile_row * grid.tile + grid.tile - 1
+    bottom_dy = torch.minimum(last_row, bottom[gaussian]) + 0.5 - y[gaussian]
+    dy_at_xmax = ((radius_sq / xx).sqrt() * xy)[gaussian]
+    right_dy = torch.minimum(torch.maximum(dy_at_xmax, top_dy), bottom_dy)
+    left_dy = torch.minimum(torch.maximum(-dy_at_xmax, top_dy), bottom_dy)
+    # At a height dy the ellipse is centred at slope dy, and this wide to either side of it.
+    slope, variance = (xy / yy)[gaussian], (projected.det.double() / yy)[gaussian]
+    radius_sq, yy = radius_sq[gaussian], yy[gaussian]
+    left_width = (variance * (radius_sq - left_dy * left_dy / yy).clamp_min(0)).sqrt()
+    right_width = (variance * (radius_sq - right_dy * right_dy / yy).clamp_min(0)).sqrt()
     begin, end = grid.span(
-        _first_pixel(x[owner] + slope * left - half_left, grid.width),
-        _last_pixel(x[owner] + slope * right + half_right, grid.width),
+        _first_pixel(x[gaussian] + slope * left_dy - left_width, grid.width),
+        _last_pixel(x[gaussian] + slope * right_dy + right_width, grid.width),
     )
     pairs = int((end - begin + 1).clamp_min(0).sum())
     if pairs > MAX_PAIRS:
         raise MemoryError(f"{pairs} (tile, Gaussian) pairs in one view, more than {MAX_PAIRS}")
 
-    entry, tile_column = _ranges(begin, end)
+    entry, tile_column = _expand_ranges(begin, end)  # [P]
     tile, by_tile = torch.sort(tile_row[entry] * grid.columns + tile_column, stable=True)
-    return tile, owner[entry[by_tile]]
+    return tile, gaussian[entry[by_tile]]
 
 
 def _first_pixel(position: Tensor, size: int) -> Tensor:
-    """The first pixel of 0..size-1 whose centre is not before `position`, `size` if none is."""
+    """Return the first pixel of 0..size-1 whose centre is at or after `position`, else `size`."""
     return torch.ceil(position - 0.5).clamp(0, size).long()
 
 
 def _last_pixel(position: Tensor, size: int) -> Tensor:
-    """The last pixel of 0..size-1 whose centre is not after `position`, -1 if none is."""
+    """Return the last pixel of 0..size-1 whose centre is at or before `position`, else -1."""
     return torch.floor(position - 0.5).clamp(-1, size - 1).long()
 
 
-def _ranges(first: Tensor, last: Tensor) -> tuple[Tensor, Tensor]:
-    """All integers of the ranges first..last (inclusive; may be empty), with whose they are.
+def _expand_ranges(first: Tensor, last: Tensor) -> tuple[Tensor, Tensor]:
+    """Return all integers of the ranges first..last (inclusive; may be empty).
 
     Returns:
-        owner and value, both [sum of lengths], by owner and then by value.
+        The index of the range that each integer is of, and the integer: both [sum of lengths], in
+        the order of the ranges and ascending within each.
     """
     lengths = (last - first + 1).clamp_min(0)
-    owner = torch.repeat_interleave(lengths)
+    index = torch.repeat_interleave(lengths)
     starts = torch.cumsum(lengths, 0) - lengths
-    return owner, first[owner] + torch.arange(len(owner)) - starts[owner]
+    return index, first[index] + torch.arange(len(index)) - starts[index]
 
 
-def make_batches(
-    tile: Tensor, gaussian: Tensor, grid: Grid, null: int, elements: int
-) -> tuple[list[Batch], Tensor]:
+def build_tile_batches(
+    tile: Tensor, gaussian: Tensor, grid: TileGrid, padding: int, elements: int
+) -> tuple[list[TileBatch], Tensor]:
     """Group all tiles by the length of their lists, longest first, and pad the lists.
 
     Args:
-        tile: [P] ascending.
-        gaussian: [P]
-        grid: the tiles; those with an empty list are grouped too.
-        null: the index that pads.
-        elements: alpha values that a batch may have, unless one tile alone has more.
+        tile: [P] tiles of the pairs, ascending.
+        gaussian: [P] Gaussians of the pairs.
+        grid: The tiles of the image; those with an empty list are grouped too.
+        padding: The index that lists are padded with.
+        elements: Number of alpha values that a batch may have, unless one tile alone has more.
 
     Returns:
         The batches, and the padded lists of all, one batch after another: [sum of B K].
     """
     tiles = grid.columns * grid.rows
-    counts = torch.bincount(tile, minlength=tiles)
+    counts = torch.bincount(tile, minlength=tiles)  # [tiles]
     starts = torch.cumsum(counts, 0) - counts
-    padded = pad(gaussian, (0, 1), value=null)
+    padded = pad(gaussian, (0, 1), value=padding)  # [P + 1]
     by_length = torch.argsort(counts, descending=True, stable=True)
     lengths = counts[by_length].tolist()
     batches, lists, begin = [], [], 0
     while begin < tiles:
         longest = max(1, lengths[begin])
         size = max(1, elements // (longest * grid.tile**2))
-        chosen = by_length[begin : begin + size]
-        place = torch.arange(longest)
-        inside = place < counts[chosen, None]
-        lists.append(padded[torch.where(inside, starts[chosen, None] + place, len(gaussian))])
-        batches.append(Batch(chosen, longest))
+        batch_tiles = by_length[begin : begin + size]  # [B]
+        place = torch.arange(longest)  # [K]
+        in_list = place < counts[batch_tiles, None]  # [B, K]
+        pair = torch.where(in_list, starts[batch_tiles, None] + place, len(gaussian))
+        lists.append(padded[pair])
+        batches.append(TileBatch(batch_tiles, longest))
         begin += size
-    return batches, torch.cat([entries.flatten() for entries in lists])
+    return batches, torch.cat([indices.flatten() for indices in lists])

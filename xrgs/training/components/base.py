@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
     from xrgs.splat.cameras import Camera
     from xrgs.splat.densify import Groups
-    from xrgs.splat.gaussians import Activated, Gaussians
+    from xrgs.splat.gaussians import ActivatedGaussians, Gaussians
     from xrgs.splat.settings import DensifySettings
 
 
@@ -74,7 +74,7 @@ class Component:
         del step
         return True
 
-    def activated(self, activated: Activated, step: Step) -> Activated:
+    def activated(self, activated: ActivatedGaussians, step: Step) -> ActivatedGaussians:
         """The Gaussians to render in place of those given, differentiable in them."""
         del step
         return activated
@@ -139,7 +139,7 @@ class Components(tuple[Component, ...]):
         """Whether all of them allow the step's view."""
         return all(component.trains_on(step) for component in self)
 
-    def activated(self, activated: Activated, step: Step) -> Activated:
+    def activated(self, activated: ActivatedGaussians, step: Step) -> ActivatedGaussians:
         """`Component.activated` of each in turn."""
         for component in self:
             activated = component.activated(activated, step)

@@ -13,7 +13,7 @@ from xrgs.training.components.base import Component, Step, TrainingView
 if TYPE_CHECKING:  # xrgs.config loads Hydra, which training does without
     from xrgs.config import MipConf
     from xrgs.splat.cameras import Camera
-    from xrgs.splat.gaussians import Activated, Gaussians
+    from xrgs.splat.gaussians import ActivatedGaussians, Gaussians
 
 MARGIN = 0.15
 """Share of the image's size by which a centre may lie outside and still count as seen."""
@@ -46,7 +46,7 @@ class Mip(Component):
         """Rates of the Gaussians as they are now."""
         self._measure(gaussians.means)
 
-    def activated(self, activated: Activated, step: Step) -> Activated:
+    def activated(self, activated: ActivatedGaussians, step: Step) -> ActivatedGaussians:
         """Gaussians with the filter, differentiable in scales and opacities; it is a constant."""
         if step.number % self.every == 0:
             self._measure(activated.means)

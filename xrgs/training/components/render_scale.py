@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
-from xrgs.splat.gaussians import Activated
+from xrgs.splat.gaussians import ActivatedGaussians
 from xrgs.training.components.base import Component, Step, TrainingView
 
 if TYPE_CHECKING:  # xrgs.config loads Hydra, which training does without
@@ -30,7 +30,7 @@ class RenderScale(Component):
             view.name: (largest / _side(view)) ** conf.gamma for view in views if view.tag == "LR"
         }
 
-    def activated(self, activated: Activated, step: Step) -> Activated:
+    def activated(self, activated: ActivatedGaussians, step: Step) -> ActivatedGaussians:
         """Scales times k in an LR view."""
         factor = self.factors.get(step.view.name)
         if factor is None:

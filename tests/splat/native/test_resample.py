@@ -1,0 +1,106 @@
+"""The compiled resampling against the torch one, and its gradient against its transpose."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from torch import Tensor
+
+from xrgs.splat.bicubic import bicubic_matrix
+from xrgs.splat.native.resample import banded_matrix
+from xrgs.splat.resample import resize
+
+native = pytest.importorskip("xrgs._native")
+
+side = st.integers(1, 70)
+
+
+def noise(height: int, width: int, seed: int = 0) -> Tensor:
+    generator = torch.Generator().manual_seed(seed)
+    return torch.rand(height, width, 3, generator=generator, dtype=torch.float64)
+
+
+def value_and_gradient(image: Tensor, slope: Tensor) -> tuple[Tensor, Tensor]:
+    leaf = image.clone().requires_grad_()
+    resized = resize(leaf, slope.shape[0], slope.shape[1], backend="native")
+    (gradient,) = torch.autograd.grad(resized, leaf, slope)
+    return resized.detach(), gradient
+
+
+@pytest.mark.parametrize("transposed", [False, True])
+@pytest.mark.parametrize(("old", "new"), [(20, 100), (100, 20), (7, 7), (1, 5), (5, 1), (97, 4)])
+def test_a_banded_matrix_is_the_dense_one(old: int, new: int, transposed: bool) -> None:
+    dense = bicubic_matrix(old, new).T if transposed else bicubic_matrix(old, new)
+    first, weights = banded_matrix(old, new, transposed=transposed)
+    filled = torch.zeros(dense.shape)
+    columns = first.long()[:, None] + torch.arange(weights.shape[1])
+    filled.scatter_(1, columns, weights)
+    assert torch.equal(filled, dense.float())
+
+
+@settings(max_examples=60, deadline=None)
+@given(old=st.tuples(side, side), new=st.tuples(side, side), seed=st.integers(0, 10**6))
+def test_the_gradient_is_by_the_transpose(
+    old: tuple[int, int], new: tuple[int, int], seed: int
+) -> None:
+    image, slope = noise(*old, seed).float(), noise(*new, seed + 1).float() - 0.5
+    resized, gradient = value_and_gradient(image, slope)
+    torch.testing.assert_close(
+        resized.double(), resize(image.double(), *new), rtol=0, atol=1e-6 * 3
+    )
+    # <phi x, y> = <x, phi^T y>, and by how much the terms of the two sums may be off.
+    forth = (resized.double() * slope.double()).sum().item()
+    back = (image.double() * gradient.double()).sum().item()
+    terms = (resized.double() * slope.double()).abs().sum().item()
+    terms += (image.double() * gradient.double()).abs().sum().item()
+    assert abs(forth - back) <= 1e-6 * terms
+
+
+@pytest.mark.usefixtures("threads")
+@pytest.mark.parametrize(("old", "new"), [((75, 100), (375, 500)), ((131, 60), (33, 17))])
+def test_threads_change_no_bit(isa: str, old: tuple[int, int], new: tuple[int, int]) -> None:
+    image, slope = noise(*old).float(), noise(*new, seed=1).float()
+    results = []
+    for count in (1, 2, 3, 4, 1):
+        torch.set_num_threads(count)
+        results.append(value_and_gradient(image, slope))
+    for resized, gradient in results[1:]:
+        assert torch.equal(resized, results[0][0])
+        assert torch.equal(gradient, results[0][1])
+
+
+def test_any_strides_give_the_same() -> None:
+    planes = noise(3, 20).expand(-1, -1, 3).permute(2, 1, 0).float()  # [3, 20, 3] of odd strides
+    assert not planes.is_contiguous()
+    slope = torch.ones(1, 1, 3).expand(9, 40, 3)
+    one = value_and_gradient(planes, slope)
+    other = value_and_gradient(planes.contiguous(), slope.contiguous())
+    assert torch.equal(one[0], other[0])
+    assert torch.equal(one[1], other[1])
+
+
+def test_what_is_not_finite_stays_where_it_is() -> None:
+    image = noise(20, 30).float()
+    image[10, 15] = torch.nan
+    resized = resize(image, 100, 150, backend="native")
+    assert resized[45:60, 70:85].isnan().any()
+    assert resized[:35].isfinite().all()
+    assert resized[:, 100:].isfinite().all()
+
+
+def test_it_is_for_float32() -> None:
+    with pytest.raises(ValueError, match=r"image must be float32 on the CPU.*float64"):
+        resize(noise(4, 5), 8, 10, backend="native")
+
+
+def test_bands_out_of_the_image_are_refused() -> None:
+    image, one = torch.zeros(4, 5, 3), torch.ones(2, 2)
+    inside = torch.tensor([0, 2], dtype=torch.int32)
+    for first in ([0, 4], [-1, 0]):
+        outside = torch.tensor(first, dtype=torch.int32)
+        with pytest.raises(ValueError, match="a band reaches out of the image"):
+            native.resample(image, outside, one, inside, one, 1)
+    with pytest.raises(ValueError, match="weights that do not fit"):
+        native.resample(image, inside, torch.ones(3, 2), inside, one, 1)

@@ -1,0 +1,296 @@
+"""The rules of densification one by one, each at and around its threshold."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import pytest
+import torch
+from torch import Tensor
+
+from xrgs.splat.densify import Densifier, Groups, Refinement, Thresholds
+from xrgs.splat.gaussians import PARAMETERS
+from xrgs.splat.settings import DensifySettings
+
+MakeDensifier = Callable[..., Densifier]
+
+SCENE_SCALE = 1.7
+WIDTH, HEIGHT = 40, 30
+
+
+@dataclass
+class View:
+    """The image-plane gradients and visibility of a step."""
+
+    gradient: Tensor  # [N, 2] per px
+    visible: Tensor  # [N]
+
+
+@pytest.fixture
+def densifier_of(make_densifier: MakeDensifier) -> MakeDensifier:
+    def make(
+        values: dict[str, Tensor],
+        settings: DensifySettings | None = None,
+        *,
+        seed: int = 0,
+        groups: Groups | None = None,
+    ) -> Densifier:
+        return make_densifier(values, settings, scene_scale=SCENE_SCALE, seed=seed, groups=groups)
+
+    return make
+
+
+def uniform(count: int, *, scale: float = 0.01, opacity: float = 0.5) -> dict[str, Tensor]:
+    """Gaussians at random places, of one scale and opacity."""
+    generator = torch.Generator().manual_seed(0)
+    return {
+        "means": torch.randn(count, 3, generator=generator),
+        "quats": torch.randn(count, 4, generator=generator),
+        "scales": torch.full((count, 3), math.log(scale)),
+        "opacities": torch.logit(torch.full((count,), opacity)),
+        "sh0": torch.randn(count, 1, 3, generator=generator),
+        "shN": torch.randn(count, 3, 3, generator=generator),
+    }
+
+
+def view_of(count: int, norm: float = 0.0) -> View:
+    """Every Gaussian visible, with a gradient of this norm in normalised device units."""
+    gradient = torch.zeros(count, 2)
+    gradient[:, 0] = norm / (WIDTH / 2)
+    return View(gradient, torch.ones(count, dtype=torch.bool))
+
+
+def densify(densifier: Densifier, step: int, view: View) -> Refinement:
+    return densifier.after_step(step, view.gradient, view.visible, width=WIDTH, height=HEIGHT)
+
+
+def take_step(densifier: Densifier, gradients: dict[str, Tensor]) -> None:
+    for name in PARAMETERS:
+        densifier.gaussians[name].grad = gradients[name].clone()
+    densifier.optimizer.step()
+
+
+@pytest.mark.parametrize(
+    ("step", "refines"),
+    [(0, False), (500, False), (550, False), (600, True), (14_900, True), (15_000, False)],
+)
+def test_when_it_refines(densifier_of: MakeDensifier, step: int, refines: bool) -> None:
+    densifier = densifier_of(uniform(3))
+    refinement = densify(densifier, step, view_of(3, norm=1.0))
+    assert refinement.duplicated == (3 if refines else 0)
+
+
+@pytest.mark.parametrize(
+    ("step", "resets"),
+    [(0, False), (2999, False), (3000, True), (12_000, True), (15_000, False), (18_000, False)],
+)
+def test_when_it_resets(densifier_of: MakeDensifier, step: int, resets: bool) -> None:
+    values = uniform(3)
+    values["opacities"][0] = -5.5  # below the cap of 0.01: stays
+    densifier = densifier_of(values, DensifySettings(start=20_000))
+    take_step(densifier, uniform(3))
+    before = densifier.gaussians.opacities.detach().clone()
+    refinement = densify(densifier, step, view_of(3))
+    after = torch.sigmoid(densifier.gaussians.opacities.detach())
+    assert refinement == (Refinement(reset=2) if resets else Refinement())
+    if resets:
+        torch.testing.assert_close(after[1:], torch.full((2,), 0.01))
+        assert densifier.gaussians.opacities[0] == before[0]
+    else:
+        assert torch.equal(densifier.gaussians.opacities, before)
+
+
+def test_the_mean_is_over_the_views_in_which_a_gaussian_is_visible(
+    densifier_of: MakeDensifier,
+) -> None:
+    densifier = densifier_of(uniform(2))
+    view = View(torch.zeros(2, 2), torch.tensor([True, False]))
+    densify(densifier, 1, view)
+    densify(densifier, 2, view)
+    # 3e-4 once: a mean of 1e-4 for the first, visible in three views, and of 3e-4 for the second.
+    assert densify(densifier, 600, view_of(2, norm=3e-4)).duplicated == 1
+    assert torch.equal(densifier.gaussians.means[2], densifier.gaussians.means[1])
+
+
+def test_each_rule_is_counted_once(densifier_of: MakeDensifier) -> None:
+    values = uniform(5)
+    values["opacities"][:2] = -8.0
+    values["scales"][1:3] = 0.0  # 1, above 0.1 scene scales; the second is transparent too
+    values["means"][3, 1] = torch.nan
+    early, late = (densifier_of(values) for _ in range(2))
+    assert densify(early, 600, view_of(5)) == Refinement(pruned_non_finite=1, pruned_opacity=2)
+    refinement = densify(late, 3100, view_of(5))
+    assert refinement == Refinement(pruned_non_finite=1, pruned_opacity=2, pruned_scale=1)
+    assert torch.equal(late.gaussians.means.detach(), values["means"][4:])
+
+
+@pytest.mark.parametrize("name", PARAMETERS)
+@pytest.mark.parametrize("value", [torch.nan, torch.inf, -torch.inf])
+def test_what_is_not_finite_is_dropped_and_leaves_no_copies(
+    densifier_of: MakeDensifier, name: str, value: float
+) -> None:
+    values = uniform(4)
+    values[name][2].fill_(value)
+    densifier = densifier_of(values)
+    refinement = densify(densifier, 600, view_of(4, norm=1.0))
+    assert refinement == Refinement(pruned_non_finite=1, duplicated=3)
+    assert all(densifier.gaussians[parameter].isfinite().all() for parameter in PARAMETERS)
+
+
+def test_a_scale_that_overflows_is_dropped(densifier_of: MakeDensifier) -> None:
+    values = uniform(4)
+    values["scales"][1, 2] = 89.0  # finite, and exp of it isn't
+    densifier = densifier_of(values)
+    assert densify(densifier, 600, view_of(4)).pruned_non_finite == 1
+    assert len(densifier.gaussians) == 3
+
+
+def test_without_gaussians_nothing_happens(densifier_of: MakeDensifier) -> None:
+    densifier = densifier_of(uniform(4, opacity=0.001))
+    take_step(densifier, uniform(4))
+    assert densify(densifier, 600, view_of(4)) == Refinement(pruned_opacity=4)
+    assert len(densifier.gaussians) == 0
+    for step in (601, 700, 3000, 3100):
+        take_step(densifier, uniform(0))
+        assert densify(densifier, step, view_of(0)) == Refinement()
+    assert [densifier.gaussians[name].shape[0] for name in PARAMETERS] == [0] * 6
+
+
+def test_a_nan_gradient_grows_nothing(densifier_of: MakeDensifier) -> None:
+    densifier = densifier_of(uniform(2))
+    view = view_of(2, norm=1.0)
+    view.gradient[0] = torch.nan
+    assert densify(densifier, 600, view).duplicated == 1
+    assert densifier.grad2d_sum.isfinite().all()
+
+
+def test_the_halves_of_a_split_follow_the_old_gaussians_shape(densifier_of: MakeDensifier) -> None:
+    """2 x 4000 halves of a needle: their spread is the needle's own covariance."""
+    count = 4000
+    values = uniform(count)
+    values["means"] = torch.zeros(count, 3)
+    values["quats"] = torch.tensor([3.0, 0.0, 0.0, 3.0]).repeat(count, 1)  # x to y, by 90 degrees
+    sigma = torch.tensor([0.15, 0.01, 0.03])
+    values["scales"] = sigma.log().repeat(count, 1)
+    densifier = densifier_of(values)
+    assert densify(densifier, 600, view_of(count, norm=1.0)).split == count
+    covariance = torch.cov(densifier.gaussians.means.detach().T)
+    expected = torch.diag(sigma[[1, 0, 2]] ** 2)
+    torch.testing.assert_close(covariance.diag(), expected.diag(), rtol=0.08, atol=0)
+    assert (covariance - covariance.diag().diag()).abs().max() < 0.05 * 0.15 * 0.03
+    scales = densifier.gaussians.scales.detach().exp()
+    torch.testing.assert_close(scales, (sigma / 1.6).repeat(2 * count, 1))
+
+
+def test_the_same_seed_splits_the_same(densifier_of: MakeDensifier) -> None:
+    runs = [densifier_of(uniform(30, scale=0.1), seed=seed) for seed in (5, 5, 6)]
+    for run in runs:
+        torch.rand(3)  # the global generator is another
+        densify(run, 600, view_of(30, norm=1.0))
+    assert torch.equal(runs[0].gaussians.means, runs[1].gaussians.means)
+    assert not torch.equal(runs[0].gaussians.means, runs[2].gaussians.means)
+
+
+def test_a_view_that_depends_on_no_gaussian_adds_nothing(densifier_of: MakeDensifier) -> None:
+    densifier = densifier_of(uniform(2))
+    densify(densifier, 599, view_of(2, norm=1.0))
+    nothing = torch.zeros(2, dtype=torch.bool)
+    refinement = densifier.after_step(600, None, nothing, width=WIDTH, height=HEIGHT)
+    assert refinement == Refinement(duplicated=2)
+
+
+def test_statistics_start_again_after_a_refinement(densifier_of: MakeDensifier) -> None:
+    densifier = densifier_of(uniform(2), DensifySettings(grow_grad2d=10.0))
+    densify(densifier, 599, view_of(2, norm=1.0))
+    assert (densifier.visible_count == 1).all()
+    assert (densifier.grad2d_sum == 1).all()
+    densify(densifier, 600, view_of(2, norm=1.0))
+    assert (densifier.visible_count == 0).all()
+    assert (densifier.grad2d_sum == 0).all()
+
+
+# --- exactly at a threshold ---------------------------------------------------------------------
+
+
+def test_a_gradient_of_exactly_the_threshold_does_not_grow(densifier_of: MakeDensifier) -> None:
+    view = view_of(3, norm=0.5)
+    view.gradient[1] *= 1 + 2**-20
+    view.gradient[2] *= 1 - 2**-20
+    densifier = densifier_of(uniform(3), DensifySettings(grow_grad2d=0.5))
+    assert densify(densifier, 600, view) == Refinement(duplicated=1)
+    assert torch.equal(densifier.gaussians.means[3], densifier.gaussians.means[1])
+
+
+def test_a_scale_of_exactly_the_threshold_is_duplicated(make_densifier: MakeDensifier) -> None:
+    values = uniform(3)
+    values["scales"][:] = torch.tensor([0.0, 1e-6, -1e-6])[:, None]  # exp(0) is exactly 1
+    settings = DensifySettings(grow_scale3d=0.5)
+    densifier = make_densifier(values, settings, scene_scale=2.0)
+    assert densify(densifier, 600, view_of(3, norm=1.0)) == Refinement(duplicated=2, split=1)
+
+
+def test_an_opacity_of_exactly_the_threshold_stays(densifier_of: MakeDensifier) -> None:
+    values = uniform(3)
+    values["opacities"] = torch.tensor([0.0, -1e-6, 1e-6])  # the first is exactly 1/2
+    densifier = densifier_of(values, DensifySettings(prune_opacity=0.5))
+    assert densify(densifier, 600, view_of(3)) == Refinement(pruned_opacity=1)
+    assert torch.equal(densifier.gaussians.means.detach(), values["means"][[0, 2]])
+
+
+def test_a_scale_of_exactly_the_largest_stays(make_densifier: MakeDensifier) -> None:
+    values = uniform(3)
+    values["scales"][:] = torch.tensor([0.0, 1e-6, -1e-6])[:, None]
+    densifier = make_densifier(values, DensifySettings(prune_scale3d=0.5), scene_scale=2.0)
+    assert densify(densifier, 3100, view_of(3)) == Refinement(pruned_scale=1)
+    assert torch.equal(densifier.gaussians.means.detach(), values["means"][[0, 2]])
+
+
+@pytest.mark.parametrize(("step", "pruned"), [(2900, 0), (3000, 0), (3100, 1)])
+def test_large_gaussians_are_pruned_after_the_first_reset(
+    densifier_of: MakeDensifier, step: int, pruned: int
+) -> None:
+    densifier = densifier_of(uniform(1, scale=1.0))
+    assert densify(densifier, step, view_of(1)).pruned_scale == pruned
+
+
+def test_opacities_at_the_cap_are_not_counted_as_reset(densifier_of: MakeDensifier) -> None:
+    densifier = densifier_of(uniform(3), DensifySettings(start=20_000))
+    assert densify(densifier, 3000, view_of(3)) == Refinement(reset=3)
+    assert densify(densifier, 6000, view_of(3)) == Refinement()
+
+
+def test_the_group_of_a_gaussian_without_gradients_is_the_last(densifier_of: MakeDensifier) -> None:
+    """A gradient of exactly 0 is none: the second group's higher threshold prunes."""
+    thresholds = {"HR": Thresholds(1.0, 0.1), "LR": Thresholds(1.0, 0.9)}
+    densifier = densifier_of(uniform(2), groups=Groups(thresholds))
+    view = view_of(2)
+    view.gradient[0] = 1e-3
+    refinement = densifier.after_step(
+        600, view.gradient, view.visible, width=WIDTH, height=HEIGHT, group="HR"
+    )
+    assert refinement.by_group["pruned_opacity_HR"] == 0
+    assert refinement.by_group["pruned_opacity_LR"] == 1
+
+
+# --- state --------------------------------------------------------------------------------------
+
+
+def test_state_is_taken_over(densifier_of: MakeDensifier) -> None:
+    first, second = densifier_of(uniform(4, scale=0.1), seed=1), densifier_of(uniform(4, scale=0.1))
+    densify(first, 1, view_of(4, norm=1.0))
+    second.load_state_dict(first.state_dict())
+    for densifier in (first, second):
+        assert densify(densifier, 600, view_of(4)) == Refinement(split=4)
+    assert torch.equal(first.gaussians.means, second.gaussians.means)
+
+
+@pytest.mark.parametrize("name", ["grad2d_sum", "visible_count"])
+def test_state_of_other_gaussians_is_refused(densifier_of: MakeDensifier, name: str) -> None:
+    densifier = densifier_of(uniform(4))
+    state = densifier.state_dict()
+    with pytest.raises(ValueError, match=rf"{name}: torch.float32 \[1, 3\] does not fit"):
+        densifier.load_state_dict(state | {name: torch.zeros(1, 3)})
+    with pytest.raises(ValueError, match=f"{name}: torch.float64"):
+        densifier.load_state_dict(state | {name: torch.zeros(1, 4, dtype=torch.float64)})

@@ -1,0 +1,35 @@
+"""Rotation matrices of quaternions."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+from torch.nn.functional import normalize
+
+
+def rotation_matrices(quats: Tensor) -> Tensor:
+    """Convert quaternions of any length to rotation matrices.
+
+    gsplat's `_quat_to_rotmat` (`cuda/_torch_impl.py`), with two cases settled that it leaves open:
+    a zero quaternion is the identity, with a gradient of zero, and a quaternion whose squares
+    overflow or underflow is normalised all the same.
+
+    Args:
+        quats: [M, 4] w, x, y, z.
+
+    Returns:
+        [M, 3, 3], differentiable.
+    """
+    # Divided by its largest component first, a tiny or huge quaternion has a finite norm. The
+    # rotation does not depend on the length, so this factor needs no gradient.
+    largest = quats.detach().abs().amax(dim=-1, keepdim=True)  # [M, 1]
+    zero = largest < torch.finfo(quats.dtype).tiny ** 0.5
+    identity = quats.new_tensor([1.0, 0.0, 0.0, 0.0])
+    scaled = torch.where(zero, identity, quats / largest.masked_fill(zero, 1.0))  # [M, 4]
+    w, x, y, z = normalize(scaled, dim=-1).unbind(-1)  # [M] each
+    entries = [
+        *(1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)),
+        *(2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)),
+        *(2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)),
+    ]
+    return torch.stack(entries, dim=-1).reshape(-1, 3, 3)
