@@ -89,7 +89,7 @@ def _cost(cell: Path) -> dict[str, Any]:
 
 def _run(folder: Path, command: str, *arguments: str) -> tuple[str, tuple[float, float]]:
     """What `xrgs-<command>` said on stderr, and what it took: seconds, and seconds of CPU."""
-    script = f"from xrgs.cli import {command}; {command}()"
+    script = f"from xrgs.cli.{command} import main; main()"
     start, before = time.perf_counter(), _cpu_seconds()
     done = subprocess.run(  # noqa: S603
         [sys.executable, "-P", "-c", script, *arguments],
