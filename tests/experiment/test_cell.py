@@ -46,7 +46,7 @@ def test_the_controls_choose_the_views_that_are_trained_on(
     monkeypatch.setattr(dataset, "load", load)
     views = "mixed" if ablation == "baseline" else ablation
     with pytest.raises(LoadError, match=views):
-        cell.run(compose(f"+ablation={ablation}"), SimpleNamespace(), CellFolder(tmp_path))
+        cell.run_cell(compose(f"+ablation={ablation}"), SimpleNamespace(), CellFolder(tmp_path))
 
 
 class Kill(BaseException):
@@ -99,7 +99,7 @@ def killed(conf: Conf, root: Path, step: int) -> CellFolder:
     with pytest.MonkeyPatch.context() as patch:
         kill_at(patch, train, "photometric_loss", step + 1)
         with pytest.raises(Kill):
-            cell.run(conf, SimpleNamespace(), folder)
+            cell.run_cell(conf, SimpleNamespace(), folder)
     assert folder.checkpoint.exists() == (step > 0)
     return folder
 
@@ -107,7 +107,7 @@ def killed(conf: Conf, root: Path, step: int) -> CellFolder:
 def whole(conf: Conf, root: Path) -> dict[str, Any]:
     """What the cell gives when nothing happens to it."""
     folder = begin(conf, root)
-    cell.run(conf, SimpleNamespace(), folder)
+    cell.run_cell(conf, SimpleNamespace(), folder)
     return results(folder)
 
 
@@ -122,10 +122,10 @@ def test_a_cell_killed_in_training_and_again_in_evaluation_goes_on(
     with monkeypatch.context() as patch:
         kill_at(patch, protocol, "score", 1)
         with pytest.raises(Kill):
-            cell.run(conf, SimpleNamespace(), begin(conf, tmp_path / "a"))
+            cell.run_cell(conf, SimpleNamespace(), begin(conf, tmp_path / "a"))
     folder = begin(conf, tmp_path / "a")
     with caplog.at_level(logging.INFO):
-        cell.run(conf, SimpleNamespace(), folder)
+        cell.run_cell(conf, SimpleNamespace(), folder)
     assert f"going on from the checkpoint, {conf.train.steps} steps done" in caplog.text
     assert results(folder) == whole(conf, tmp_path / "b"), step
     assert [path.name for path in folder.path.parent.iterdir()] == [folder.id]  # nothing aside
@@ -154,7 +154,7 @@ def test_a_checkpoint_of_no_use_is_said_and_training_starts_over(
     spoil(folder.checkpoint, other.checkpoint)
     folder = begin(conf, tmp_path / "a")
     with caplog.at_level(logging.WARNING):
-        cell.run(conf, SimpleNamespace(), folder)
+        cell.run_cell(conf, SimpleNamespace(), folder)
     assert "training starts over" in caplog.text
     assert said in caplog.text
     assert (folder.path / "refused-checkpoint.npz").exists()
@@ -186,11 +186,11 @@ def test_a_worker_that_is_killed_goes_on_in_another(
     folder.fail("its process was ended by SIGKILL")  # what a sweep that outlives it says
 
     folder = begin(conf, tmp_path / "killed", built.id)
-    worker.run("cell", request(folder))
+    worker.run_in_child("cell", request(folder))
     log = (folder.path / "log.txt").read_text()
     assert "going on from the checkpoint" in log
     spared = begin(conf, tmp_path / "spared", built.id)
-    worker.run("cell", request(spared))
+    worker.run_in_child("cell", request(spared))
     assert results(folder) == results(spared)
     assert json.loads((folder.path / "status.json").read_text())["files"].keys() == (
         json.loads((spared.path / "status.json").read_text())["files"].keys()

@@ -22,8 +22,9 @@ from xrgs.errors import XrgsError
 from xrgs.experiment.store import Store
 from xrgs.safeio.atomic import write_json
 from xrgs.sweep import launch
+from xrgs.sweep.axes import CellSpec
 from xrgs.sweep.launch import LOST, Launches, capacity
-from xrgs.sweep.plan import CellSpec, Planned
+from xrgs.sweep.plan import PlannedCell
 
 SMOKE = ("scene=motorcycle", "preset=smoke", "train.steps=4", "seed=0,1")
 #: Ray's files: the names of its sockets may have no more than 107 bytes.
@@ -257,7 +258,7 @@ def launch_cells(
         fake = Fake(store, fatal)
         monkeypatch.setattr(Plugins, "instantiate_launcher", fake.configured)
         conf = compose(f"store={launch._quoted(tmp_path / 's')}")
-        cells = [Planned(CellSpec(n, "", (f"x={n}",), ()), conf, "v", n) for n in names]
+        cells = [PlannedCell(CellSpec(n, "", (f"x={n}",), ()), conf, "v", n) for n in names]
         launches = Launches(HydraContext(None, None), len, composed(*overrides))
         outcomes = launches.run(cells, store)
         while left := [cell for cell in cells if outcomes[str(cell.cell_id)] == LOST]:
@@ -320,7 +321,7 @@ def test_a_job_finds_its_folders_wherever_it_runs(
     compose: Callable[..., config.Conf], odd: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     conf = compose("scene=folder", "scene.path=p", "store=s")
-    cell = Planned(CellSpec("a", "", ("seed=1",), ()), conf, "v", "a")
+    cell = PlannedCell(CellSpec("a", "", ("seed=1",), ()), conf, "v", "a")
     monkeypatch.chdir(odd)
     overrides = launch._overrides(cell, threads=3)
     monkeypatch.chdir(odd.parent)

@@ -1,4 +1,4 @@
-"""One owner a cell, whatever becomes of owners: processes are killed, hosts fall silent."""
+"""Tests that a cell has one owner, though processes are killed and machines disappear."""
 
 from __future__ import annotations
 

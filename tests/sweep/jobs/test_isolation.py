@@ -47,7 +47,7 @@ if "xrgs.sweep.jobs.worker" in sys.orig_argv and "cell" in sys.orig_argv:
         def load(*_):
             raise RuntimeError("this cell raises")
         cell.dataset.load = load
-        cell.run(*arguments)
+        cell.run_cell(*arguments)
 
     def hangs(*_):
         child = subprocess.Popen([sys.executable, "-S", "-c", "import time; time.sleep(600)"])
@@ -315,6 +315,6 @@ def test_a_library_that_dies_of_a_full_disk_is_no_fault_of_the_scene_s(
         monkeypatch.setattr(tempfile, "TemporaryFile", full)
         raise worker.WorkerError("its process was ended by SIGABRT")
 
-    monkeypatch.setattr(worker, "run", dies)
+    monkeypatch.setattr(worker, "run_in_child", dies)
     with pytest.raises(StoreError, match="No space left"):
         sweep._variant_of(compose("scene=motorcycle"), store, build=True)

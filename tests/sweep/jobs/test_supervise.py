@@ -59,9 +59,13 @@ def wait(what: Callable[[], bool], seconds: float = 30.0) -> None:
 
 
 def test_what_ends_by_itself_gives_its_code_or_signal() -> None:
-    assert supervise.run(python("raise SystemExit(3)"), Limits()) == supervise.Ended(3)
+    assert supervise.run_supervised(
+        python("raise SystemExit(3)"), Limits()
+    ) == supervise.ProcessEnd(3)
     script = "import os; os.kill(os.getpid(), 9)"
-    assert supervise.run(python(script), Limits(1, 1)) == supervise.Ended(-signal.SIGKILL)
+    assert supervise.run_supervised(python(script), Limits(1, 1)) == supervise.ProcessEnd(
+        -signal.SIGKILL
+    )
 
 
 def test_what_hangs_is_killed_with_its_children_though_it_refuses(
@@ -69,7 +73,7 @@ def test_what_hangs_is_killed_with_its_children_though_it_refuses(
 ) -> None:
     monkeypatch.setattr(supervise, "_GRACE_S", 0.5)
     pids = tmp_path / "pids"
-    ended = supervise.run(python(_STUBBORN, str(pids)), Limits(minutes=0.08))
+    ended = supervise.run_supervised(python(_STUBBORN, str(pids)), Limits(minutes=0.08))
     assert "limits.minutes=0.08" in ended.reason
     for pid in json.loads(pids.read_text()):
         wait(lambda pid=pid: gone(pid))
@@ -80,9 +84,9 @@ def test_memory_is_that_of_the_process_and_its_children(by: str) -> None:
     eats = _HUNGRY
     if by == "its child":
         eats = f"import subprocess, sys; subprocess.run([sys.executable, '-c', {_HUNGRY!r}])"
-    ended = supervise.run(python(eats), Limits(memory_gb=0.2))
+    ended = supervise.run_supervised(python(eats), Limits(memory_gb=0.2))
     assert "limits.memory_gb=0.2" in ended.reason
-    assert supervise.run(python(_HUNGRY), Limits(memory_gb=4)).reason == ""
+    assert supervise.run_supervised(python(_HUNGRY), Limits(memory_gb=4)).reason == ""
 
 
 def test_memory_that_nobody_tells_of_is_not_limited_in_silence(
@@ -90,7 +94,7 @@ def test_memory_that_nobody_tells_of_is_not_limited_in_silence(
 ) -> None:
     monkeypatch.setattr(Path, "exists", lambda _: False)
     with pytest.raises(XrgsError, match=r"limits\.memory_gb"):
-        supervise.run(python(""), Limits(memory_gb=1))
+        supervise.run_supervised(python(""), Limits(memory_gb=1))
 
 
 def test_an_objection_ends_it() -> None:
@@ -102,7 +106,7 @@ def test_an_objection_ends_it() -> None:
             raise XrgsError("enough")
 
     with pytest.raises(XrgsError, match="enough"):
-        supervise.run(python("import time; time.sleep(600)"), Limits(), on_poll)
+        supervise.run_supervised(python("import time; time.sleep(600)"), Limits(), on_poll)
     assert gone(asked[-1])
 
 
@@ -111,7 +115,7 @@ def test_no_child_outlives_its_parent(tmp_path: Path, how: signal.Signals) -> No
     pids = tmp_path / "pids"
     script = (
         "import sys; from xrgs.sweep.jobs import supervise; supervise._GRACE_S = 0.1;"
-        "supervise.run(sys.argv[1:], supervise.Limits())"
+        "supervise.run_supervised(sys.argv[1:], supervise.Limits())"
     )
     command = python(script, *python(_STUBBORN, str(pids)))
     with subprocess.Popen(command, stderr=subprocess.DEVNULL) as parent:
