@@ -31,7 +31,7 @@ def test_a_session_is_over_when_it_is_stopped_or_its_process_has_ended(
     assert not signed_by(session, boot="another").stopped
     for reason in ("the first", "the second"):
         session.stop(reason)
-        assert session.stopped == "the first"
+        assert str(session.stopped) == "the first"
 
 
 def test_a_disk_too_full_for_the_reason_stops_the_jobs_all_the_same(session: SweepSession) -> None:

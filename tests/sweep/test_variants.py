@@ -17,8 +17,9 @@ from PIL import Image
 from xrgs.capture import variant
 from xrgs.config import Conf
 from xrgs.errors import XrgsError
-from xrgs.experiment.store import Store, StoreError
+from xrgs.experiment.store import Store
 from xrgs.safeio.atomic import write_json
+from xrgs.safeio.records import StoreError
 from xrgs.sweep import variants
 from xrgs.sweep.jobs import worker
 from xrgs.sweep.status import describe, read

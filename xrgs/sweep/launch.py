@@ -155,7 +155,8 @@ class _JobConfigLoader:
         """
         config = OmegaConf.masked_copy(master_config, ["hydra"])
         with flag_override(config, ["readonly", "struct"], False):
-            config.merge_with_dotlist(overrides)
+            # As text: an id of digits alone, or like 12e4567..., would be parsed as a number.
+            config.cell = overrides[0].removeprefix("cell=")
         with flag_override(config.hydra, ["readonly", "struct"], False):
             config.hydra.overrides.task = list(overrides)
             config.hydra.job.override_dirname = ",".join(overrides)
