@@ -112,16 +112,3 @@ def test_a_launcher_that_is_not_installed_is_named_with_its_extra(
     code, _, err = sweeps_in(tmp_path).run(*ray, "dry_run=true")
     assert code == 1
     assert "pip install 'xrgs[ray]'" in err
-
-
-def test_a_launcher_named_in_an_ablation_is_refused(
-    tmp_path: Path, sweeps_in: Callable[..., Any]
-) -> None:
-    (tmp_path / "mine" / "ablation").mkdir(parents=True)
-    for name in ("here", "there"):
-        file = tmp_path / "mine" / "ablation" / f"{name}.yaml"
-        file.write_text("# @package _global_\ndefaults:\n  - override /hydra/launcher: joblib\n")
-    mine = ("dry_run=true", "--config-dir", "mine")
-    code, _, err = sweeps_in(tmp_path).run("+ablation=here,there", *mine)
-    assert code == 1
-    assert "a launcher is chosen once for a sweep" in err
