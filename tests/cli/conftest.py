@@ -78,15 +78,14 @@ def sweep_here(
     def run(*arguments: str) -> tuple[int, str, str]:
         monkeypatch.setattr(sys, "argv", ["xrgs-sweep", *arguments])
         capsys.readouterr()
-        code: int | str | None = 0
+        code, message = 0, ""
         try:
             sweep.main()
         except SystemExit as end:
-            code = end.code
+            message = end.code if isinstance(end.code, str) else ""
+            code = 1 if message else int(end.code or 0)
         out, err = capsys.readouterr()
-        if isinstance(code, str):
-            code, err = 1, err + code
-        return int(code or 0), out, err
+        return code, out, err + message
 
     return run
 

@@ -94,8 +94,8 @@ def test_a_scene_with_odd_names_is_swept_and_reported(
     views = ['-a b\'s & "c" (1) 🙂', f"[{ACCENT}]=50%#, $x.y"]
     for name, file in zip(views, motorcycle.files(), strict=True):
         shutil.copy(file, scene / f"{name}.png")
-    conf = ("preset=smoke", "train.steps=2", "variant.test_every=0", "variant.min_hr=1")
-    conf += ("variant.long_side=185", "variant.sfm.reference=false")
+    conf = ["preset=smoke", "train.steps=2", "variant.test_every=0", "variant.min_hr=1"]
+    conf += ["variant.long_side=185", "variant.sfm.reference=false"]
     words = ("+ablation=curriculum", "scene=folder", f"scene.path={scene.name}", *conf)
     store = "store=st öre, 'a' {b} 🙂"
     code, out, err = run_command("sweep", tmp_path, *words, store)
