@@ -1,8 +1,9 @@
-"""Hydra loads plugins from this namespace package only: the sweeper and where `sweeps/` lies.
+"""Registers the sweeper with Hydra, the folder `sweeps/`, and launchers that can be installed.
 
-Hydra imports every plugin at start, so this file stays light: the work is in `xrgs.sweep.study`. It
-executes the file before it is in `sys.modules`, where a dataclass can't resolve annotations that
-are strings: hence no `from __future__ import annotations`.
+Hydra loads plugins from this namespace package only. It imports every plugin when it starts, so
+this file stays light: the work is done in `xrgs.sweep.study`. Hydra executes the file before adding
+it to `sys.modules`, where a dataclass looks up annotations that are strings; therefore there is no
+`from __future__ import annotations`.
 """
 
 from dataclasses import dataclass
@@ -21,11 +22,11 @@ from xrgs.config import CONF_DIR
 
 @dataclass
 class XrgsSweeperConf:
-    """`hydra/sweeper: xrgs`."""
+    """The config of `hydra/sweeper: xrgs`."""
 
     _target_: str = "hydra_plugins.xrgs_sweeper.XrgsSweeper"
     params: dict[str, str] | None = None
-    """Axes that a file of `sweeps/` sets: override -> comma-separated values."""
+    """Axes that a file of `sweeps/` sets: comma-separated values by the override's key."""
 
 
 ConfigStore.instance().store(
@@ -41,22 +42,27 @@ for _extra, _launchers in _EXTRAS.items():
     if find_spec(f"hydra_plugins.hydra_{_extra}_launcher") is not None:
         continue
     for _name in _launchers:
-        # In the launcher's place, and open to its settings, so that the sweep can say what to do.
+        # Stands in for the launcher and accepts its settings, so that the sweep can name the
+        # package to install instead of failing on an unknown key.
         _node = OmegaConf.create({"install": f"xrgs[{_extra}]"}, flags={"struct": False})
         ConfigStore.instance().store(_name, _node, group="hydra/launcher", provider="xrgs")
 
 
 class XrgsSearchPath(SearchPathPlugin):
-    """Lets `+sweeps=NAME` find `sweeps/`, which lies beside `conf/` in a checkout."""
+    """Lets `+sweeps=NAME` find `sweeps/`, which is beside `conf/` in a checkout."""
 
     def manipulate_search_path(self, search_path: ConfigSearchPath) -> None:
-        """Add the folder that holds `sweeps/`."""
+        """Add the folder that contains `sweeps/`.
+
+        Args:
+            search_path: Hydra's search path, which is changed.
+        """
         if not (CONF_DIR / "sweeps").is_dir():
             search_path.append(provider="xrgs", path=f"file://{CONF_DIR.parent}")
 
 
 class XrgsSweeper(Sweeper):
-    """Plans the cells of a study and hands those that are not done to the launcher."""
+    """Plans the cells of a study and launches those that are not done."""
 
     def __init__(self, params: dict[str, str] | None) -> None:
         self._params = params or {}
@@ -64,13 +70,23 @@ class XrgsSweeper(Sweeper):
     def setup(
         self, *, hydra_context: HydraContext, task_function: TaskFunction, config: DictConfig
     ) -> None:
-        """Keep what Hydra hands over."""
+        """Keep what Hydra gives a sweeper before it calls `sweep`.
+
+        Args:
+            hydra_context: Hydra's context of this call.
+            task_function: The function that runs one job.
+            config: The config composed from the command line.
+        """
         self._context = hydra_context
         self._task = task_function
         self._config = config
 
     def sweep(self, arguments: list[str]) -> Any:
-        """Run the study."""
+        """Run the study.
+
+        Args:
+            arguments: Overrides of the command line, with the axes among them.
+        """
         from xrgs.sweep.study import Study
 
         axes = [f"{key}={values}" for key, values in self._params.items()]

@@ -1,4 +1,4 @@
-"""A cell's own part of the way: what it hands from room to room."""
+"""Tests of a cell: its views, its files, and how it resumes after a kill."""
 
 from __future__ import annotations
 
@@ -13,12 +13,13 @@ from collections.abc import Callable
 from dataclasses import asdict
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
+from typing import Any, cast
 
 import pytest
 
 from xrgs.capture import dataset, variant
 from xrgs.capture.dataset import Dataset
+from xrgs.capture.views import Variant
 from xrgs.config import Conf
 from xrgs.evaluation import protocol
 from xrgs.experiment import cell
@@ -30,9 +31,12 @@ from xrgs.splat.backend import resolve_backend
 from xrgs.sweep.jobs import worker
 from xrgs.training import loop as train
 
+#: Stands in for a variant that is never read.
+VARIANT = cast(Variant, SimpleNamespace())
+
 
 class LoadError(Exception):
-    """Which views a cell asked for; it goes no further."""
+    """Names the views that a cell loads, and ends it."""
 
 
 @pytest.mark.parametrize("ablation", ["baseline", *dataset.USES[1:]])
@@ -46,15 +50,15 @@ def test_the_controls_choose_the_views_that_are_trained_on(
     monkeypatch.setattr(dataset, "load", load)
     views = "mixed" if ablation == "baseline" else ablation
     with pytest.raises(LoadError, match=views):
-        cell.run(compose(f"+ablation={ablation}"), SimpleNamespace(), CellFolder(tmp_path))
+        cell.run_cell(compose(f"+ablation={ablation}"), VARIANT, CellFolder(tmp_path))
 
 
 class Kill(BaseException):
-    """What no code of ours may catch."""
+    """Stands in for a kill; no code may catch it."""
 
 
 def kill_at(monkeypatch: pytest.MonkeyPatch, module: Any, name: str, call: int) -> None:
-    """Let the nth call of a function from now on be the last; all later ones are as ever."""
+    """Let the n-th call of a function raise `Kill`; all others are unchanged."""
     real, calls = getattr(module, name), [0]
 
     def mortal(*arguments: Any, **named: Any) -> Any:
@@ -67,7 +71,7 @@ def kill_at(monkeypatch: pytest.MonkeyPatch, module: Any, name: str, call: int) 
 
 
 def begin(conf: Conf, root: Path, variant_id: str = "v") -> CellFolder:
-    """As a sweep does."""
+    """Begin a cell's folder as a job does."""
     identity = cell_identity(conf, variant_id)
     folder = CellFolder(root / digest(identity))
     folder.begin(asdict(conf), identity)
@@ -75,7 +79,7 @@ def begin(conf: Conf, root: Path, variant_id: str = "v") -> CellFolder:
 
 
 def results(folder: CellFolder) -> dict[str, Any]:
-    """All that a cell gives but times and this machine's memory."""
+    """Return all results of a cell except times and this machine's memory."""
     assert folder.state().name == "done", folder.state().reason
     assert not folder.checkpoint.exists()
     names = ["splats.ply", "history.csv", "scores.csv"]
@@ -87,27 +91,28 @@ def results(folder: CellFolder) -> dict[str, Any]:
 
 @pytest.fixture
 def conf(data: Dataset, baseline: Conf, monkeypatch: pytest.MonkeyPatch) -> Conf:
-    """Of a cell on `data` that writes a checkpoint after each step."""
+    """The config of a cell on `data` that writes a checkpoint after each step."""
     monkeypatch.setattr(dataset, "load", lambda *_: data)
     baseline.checkpoint_s, baseline.threads = 1e-9, 1
+    baseline.train.steps, baseline.splat.backend = 12, resolve_backend("auto")
     return baseline
 
 
 def killed(conf: Conf, root: Path, step: int) -> CellFolder:
-    """The folder of a cell whose process ended in the midst of a step."""
+    """Return the folder of a cell whose process was killed during a step."""
     folder = begin(conf, root)
     with pytest.MonkeyPatch.context() as patch:
         kill_at(patch, train, "photometric_loss", step + 1)
         with pytest.raises(Kill):
-            cell.run(conf, SimpleNamespace(), folder)
+            cell.run_cell(conf, VARIANT, folder)
     assert folder.checkpoint.exists() == (step > 0)
     return folder
 
 
 def whole(conf: Conf, root: Path) -> dict[str, Any]:
-    """What the cell gives when nothing happens to it."""
+    """Return the results of the cell if it is not killed."""
     folder = begin(conf, root)
-    cell.run(conf, SimpleNamespace(), folder)
+    cell.run_cell(conf, VARIANT, folder)
     return results(folder)
 
 
@@ -122,10 +127,10 @@ def test_a_cell_killed_in_training_and_again_in_evaluation_goes_on(
     with monkeypatch.context() as patch:
         kill_at(patch, protocol, "score", 1)
         with pytest.raises(Kill):
-            cell.run(conf, SimpleNamespace(), begin(conf, tmp_path / "a"))
+            cell.run_cell(conf, VARIANT, begin(conf, tmp_path / "a"))
     folder = begin(conf, tmp_path / "a")
     with caplog.at_level(logging.INFO):
-        cell.run(conf, SimpleNamespace(), folder)
+        cell.run_cell(conf, VARIANT, folder)
     assert f"going on from the checkpoint, {conf.train.steps} steps done" in caplog.text
     assert results(folder) == whole(conf, tmp_path / "b"), step
     assert [path.name for path in folder.path.parent.iterdir()] == [folder.id]  # nothing aside
@@ -139,13 +144,13 @@ def _exchange(checkpoint: Path, other: Path) -> None:
     shutil.copy(other, checkpoint)
 
 
-@pytest.mark.parametrize(("spoil", "said"), [(_truncate, "not a zip"), (_exchange, "of cell")])
-def test_a_checkpoint_of_no_use_is_said_and_training_starts_over(
+@pytest.mark.parametrize(("spoil", "message"), [(_truncate, "not a zip"), (_exchange, "of cell")])
+def test_an_unusable_checkpoint_is_logged_and_training_starts_over(
     conf: Conf,
     tmp_path: Path,
     caplog: pytest.LogCaptureFixture,
     spoil: Callable[[Path, Path], None],
-    said: str,
+    message: str,
 ) -> None:
     folder = killed(conf, tmp_path / "a", 9)
     conf.seed = 1
@@ -154,13 +159,14 @@ def test_a_checkpoint_of_no_use_is_said_and_training_starts_over(
     spoil(folder.checkpoint, other.checkpoint)
     folder = begin(conf, tmp_path / "a")
     with caplog.at_level(logging.WARNING):
-        cell.run(conf, SimpleNamespace(), folder)
+        cell.run_cell(conf, VARIANT, folder)
     assert "training starts over" in caplog.text
-    assert said in caplog.text
+    assert message in caplog.text
     assert (folder.path / "refused-checkpoint.npz").exists()
     assert results(folder) == whole(conf, tmp_path / "b")
 
 
+@pytest.mark.slow
 def test_a_worker_that_is_killed_goes_on_in_another(
     compose: Callable[..., Conf], tmp_path: Path
 ) -> None:
@@ -183,14 +189,14 @@ def test_a_worker_that_is_killed_goes_on_in_another(
     time.sleep(random.uniform(0, 0.1))
     child.kill()
     assert child.wait() == -9
-    folder.fail("its process was ended by SIGKILL")  # what a sweep that outlives it says
+    folder.fail("its process was ended by SIGKILL")  # as the job does that started it
 
     folder = begin(conf, tmp_path / "killed", built.id)
-    worker.run("cell", request(folder))
+    worker.run_in_child("cell", request(folder))
     log = (folder.path / "log.txt").read_text()
     assert "going on from the checkpoint" in log
     spared = begin(conf, tmp_path / "spared", built.id)
-    worker.run("cell", request(spared))
+    worker.run_in_child("cell", request(spared))
     assert results(folder) == results(spared)
     assert json.loads((folder.path / "status.json").read_text())["files"].keys() == (
         json.loads((spared.path / "status.json").read_text())["files"].keys()

@@ -1,9 +1,11 @@
-"""A cell's identity: everything that can change a number, and nothing else."""
+"""Tests that a cell's identity has everything that can change a number, and nothing else."""
 
 from __future__ import annotations
 
+import copy
 import dataclasses
 import json
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +16,7 @@ from xrgs.experiment import identity
 from xrgs.experiment.identity import cell_identity
 from xrgs.safeio import hashing
 from xrgs.safeio.hashing import digest
+from xrgs.splat.backend import resolve_backend
 
 
 def cell_id(conf: Conf, variant: str = "v") -> str:
@@ -52,17 +55,11 @@ def test_every_value_of_training_is_in_it_and_no_other(baseline: Conf) -> None:
     assert len(paths) > 40
     before = json.dumps(dataclasses.asdict(baseline))
     for path in paths:
-        changed = _copy(baseline)
+        changed = copy.deepcopy(baseline)
         change(changed, path)
         counts = path[0] in {"splat", "train", "components", "seed"}
         assert (cell_id(changed) != cell_id(baseline)) == counts, path
     assert json.dumps(dataclasses.asdict(baseline)) == before
-
-
-def _copy(conf: Conf) -> Conf:
-    from xrgs.config import from_dict
-
-    return from_dict(dataclasses.asdict(conf))
 
 
 def test_the_variant_is_in_it(baseline: Conf) -> None:
@@ -70,33 +67,67 @@ def test_the_variant_is_in_it(baseline: Conf) -> None:
 
 
 def test_naming_the_backend_that_auto_chooses_is_no_change(baseline: Conf) -> None:
-    auto, named = _copy(baseline), _copy(baseline)
+    auto, named = copy.deepcopy(baseline), copy.deepcopy(baseline)
     auto.splat.backend = "auto"
-    named.splat.backend = identity.resolve_backend("auto")
+    named.splat.backend = resolve_backend("auto")
     assert cell_id(auto) == cell_id(named)
 
 
-def test_a_changed_file_of_thetraining_code_is_another_cell(
-    baseline: Conf, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
-    before = cell_id(baseline)
-    names = set(cell_identity(baseline, "v")["code"])
-    assert {"train.py", "components/base.py", "metrics.py", "splat/densify.py"} <= names
-    assert "report/tables.py" not in names
-    assert not any(name.startswith("native/") for name in names)
-    assert "native/simd.h" in identity.training_code("native")
+PACKAGE = Path(identity.__file__).parents[1]
 
-    package = Path(identity.__file__).parent
-    for name in names:
+
+def test_the_code_is_every_file_that_can_change_a_number() -> None:
+    names = identity.training_code("torch").keys()
+    for folder in ("splat", "training"):
+        files = {file.relative_to(PACKAGE).as_posix() for file in (PACKAGE / folder).rglob("*.py")}
+        assert files
+        assert files <= names
+    assert {name for name in names if name.partition("/")[0] not in {"splat", "training"}} == {
+        "capture/dataset.py",
+        "evaluation/lpips/network.py",
+        "evaluation/lpips/weights.py",
+        "evaluation/metrics.py",
+        "evaluation/protocol.py",
+        "safeio/npz.py",  # reads the points that training starts from
+    }
+    native = identity.training_code("native").keys()
+    sources = native - names
+    assert names < native
+    assert all(name.startswith("csrc/") for name in sources)
+    assert any(name.endswith(".cpp") for name in sources)
+    assert any(name.endswith(".h") for name in sources)
+
+
+@pytest.fixture
+def copied_package(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
+    """A copy of the training code, which is hashed instead of the installed package's."""
+    for name in identity.training_code("torch"):
         file = tmp_path / name
         file.parent.mkdir(parents=True, exist_ok=True)
-        file.write_bytes((package / name).read_bytes())
+        file.write_bytes((PACKAGE / name).read_bytes())
     monkeypatch.setattr(hashing, "_PACKAGE", tmp_path)
     identity.training_code.cache_clear()
-    assert cell_id(baseline) == before
+    yield tmp_path
+    identity.training_code.cache_clear()
 
-    with (tmp_path / "splat" / "densify.py").open("a") as file:
+
+@pytest.mark.parametrize("name", ["splat/densify.py", "safeio/npz.py"])
+def test_a_changed_file_of_the_training_code_is_another_cell(
+    baseline: Conf, copied_package: Path, name: str
+) -> None:
+    before = cell_id(baseline)
+    with (copied_package / name).open("a") as file:
         file.write("\n# changed\n")
+    assert cell_id(baseline) == before  # read once a process: a plan has one code
     identity.training_code.cache_clear()
     assert cell_id(baseline) != before
-    identity.training_code.cache_clear()
+
+
+def test_files_that_were_changed_added_or_removed_are_named(copied_package: Path) -> None:
+    planned = dict(identity.training_code("torch"))
+    assert identity.changed_code(planned, "torch") == []
+    (copied_package / "splat" / "densify.py").write_text("changed")
+    (copied_package / "splat" / "added.py").write_text("")
+    (copied_package / "safeio" / "npz.py").unlink()
+    names = ["safeio/npz.py", "splat/added.py", "splat/densify.py"]
+    assert identity.changed_code(planned, "torch") == names

@@ -1,4 +1,4 @@
-"""A store: what is on disk, and is it done."""
+"""Tests of a store: the states of cells, what is kept of attempts, and records of sweeps."""
 
 from __future__ import annotations
 
@@ -9,12 +9,14 @@ from pathlib import Path
 import pytest
 
 from xrgs.experiment import store
-from xrgs.experiment.store import CellFolder, Store, StoreError
+from xrgs.experiment.store import CellFolder, Store
 from xrgs.safeio.atomic import write_json
+from xrgs.safeio.records import StoreError
 
 
 @pytest.fixture
 def done(tmp_path: Path) -> CellFolder:
+    """The folder of a finished cell with two test views."""
     folder = CellFolder(tmp_path / "cells" / "abc")
     folder.begin({"seed": 0}, {"seed": 0})
     (folder.path / "scores.csv").write_text("view,psnr,ssim,lpips\na,20.5,0.75,\nb,30.0,0.5,\n")
@@ -50,6 +52,9 @@ def test_a_cell_without_status_is_unfinished_and_an_absent_one_absent(done: Cell
         ("scores.csv", "view,psnr,ssim,lpips\na,99.9,0.75,\nb,30.0,0.5,\n"),
         ("scores.csv", "view,psnr,ssim,lpips\na,20.5,0.75,\n"),
         ("config.json", '{"seed": 1}'),
+        ("identity.json", '{\n "seed": 1\n}\n'),
+        ("history.csv", "step,loss\n0,0.7\n"),  # of the same size, as a report would read it
+        ("summary.json", '{\n "gaussians": 8\n}\n'),
         ("renders/a.png", "12345"),
         ("status.json", "{"),
         ("status.json", '{"state": "done"}'),
@@ -62,6 +67,24 @@ def test_a_cell_that_was_tampered_with_is_corrupt(
     (done.path / name).write_text(content)
     assert done.state().name == "corrupt"
     assert done.state().reason
+
+
+@pytest.mark.parametrize("views", [["a"], ["a", "c"], ["b", "a"], ["a", "b", "b"]])
+def test_scores_of_other_views_than_planned_are_corrupt(done: CellFolder, views: list[str]) -> None:
+    done.finish(views, protocol=1)
+    assert done.state().name == "corrupt"
+    assert "one row for each view" in done.state().reason
+    assert done.state(verify=False).name == "done"  # sizes alone do not show it
+
+
+def test_the_state_of_a_cell_in_training_names_its_owner(done: CellFolder) -> None:
+    assert done.running("process 7 on host").reason == "by process 7 on host"
+    write_json(
+        done.progress,
+        {"what": "training", "unit": "step", "done": 5, "total": 10, "rate": None},
+    )
+    state = done.running("process 7 on host")
+    assert (state.name, state.reason) == ("running", "by process 7 on host: training 5 of 10 steps")
 
 
 def test_a_missing_file_is_named(done: CellFolder) -> None:
@@ -106,7 +129,7 @@ def test_beginning_a_stopped_cell_keeps_its_checkpoint_and_no_result(
         assert not stopped.progress.exists()
     else:
         assert stopped.state().name == "unfinished"
-        assert "goes on from its checkpoint" in stopped.state().reason
+        assert "resumes from its checkpoint" in stopped.state().reason
     stopped.begin({"seed": 0, "store": "elsewhere"}, {"seed": 0})
     assert sorted(entry.name for entry in stopped.path.iterdir()) == [
         "checkpoint.npz",

@@ -122,9 +122,9 @@ def test_a_sweep_of_cells_elsewhere_is_refused(store: Store, cell_id: str) -> No
         file.write_text(json.dumps(forged))
         with pytest.raises(StoreError, match=rf"{file.name}: its cell 2 "):
             build(store.path)
-    with pytest.raises(StoreError, match="no id of a"):
+    with pytest.raises(StoreError, match="is not the id of a"):
         store.cell(cell_id)
-    with pytest.raises(StoreError, match="no id of a"):
+    with pytest.raises(StoreError, match="is not the id of a"):
         build(store.path, cell_id)
 
 

@@ -1,4 +1,4 @@
-"""One owner a cell, whatever becomes of owners: processes are killed, hosts fall silent."""
+"""Tests that a cell has one owner, though processes are killed and machines disappear."""
 
 from __future__ import annotations
 
@@ -61,14 +61,14 @@ def owner(tmp_path: Path) -> Iterator[subprocess.Popen[str]]:
 
 
 def elsewhere(file: Path, age: float) -> None:
-    """Make a lock look like one of another machine, which gave its last sign some time ago."""
+    """Make a lock look like one of another machine, whose last heartbeat is `age` seconds old."""
     owner = locks.Owner(**json.loads(file.read_text()))
     file.write_text(json.dumps(asdict(replace(owner, host="elsewhere", pid=1))))
     then = time.time() - age
     os.utime(file, (then, then))
 
 
-def test_one_has_it_until_it_gives_it_back(tmp_path: Path) -> None:
+def test_a_lock_has_one_owner_until_it_is_released(tmp_path: Path) -> None:
     lock = locks.acquire(tmp_path, "cell")
     assert lock is not None
     assert locks.acquire(tmp_path, "cell") is None
@@ -94,7 +94,7 @@ def test_a_stopped_process_keeps_its_lock_and_a_killed_one_loses_it(
     assert [file.name for file in tmp_path.iterdir()] == ["cell.1"]
 
 
-def test_a_process_number_that_was_given_again_is_another_process(tmp_path: Path) -> None:
+def test_a_process_id_that_is_reused_is_another_process(tmp_path: Path) -> None:
     lock = locks.acquire(tmp_path, "cell")
     assert lock is not None
     owner = json.loads(lock.path.read_text())
@@ -103,7 +103,7 @@ def test_a_process_number_that_was_given_again_is_another_process(tmp_path: Path
     assert locks.acquire(tmp_path, "cell") is not None
 
 
-def test_an_owner_out_of_sight_is_alive_as_long_as_it_gives_signs(tmp_path: Path) -> None:
+def test_an_owner_on_another_machine_is_alive_as_long_as_its_heartbeats(tmp_path: Path) -> None:
     lock = locks.acquire(tmp_path, "cell")
     assert lock is not None
     elsewhere(lock.path, locks.SILENT_S - 60)
@@ -113,9 +113,7 @@ def test_an_owner_out_of_sight_is_alive_as_long_as_it_gives_signs(tmp_path: Path
 
 
 @pytest.mark.parametrize("text", ["", "{"])
-def test_who_was_killed_before_it_said_its_name_is_not_waited_for_long(
-    tmp_path: Path, text: str
-) -> None:
+def test_a_lock_that_stays_unsigned_is_free_after_a_while(tmp_path: Path, text: str) -> None:
     file = tmp_path / "cell.0"
     file.write_text(text)
     assert locks.acquire(tmp_path, "cell") is None  # it may be about to
@@ -124,7 +122,7 @@ def test_who_was_killed_before_it_said_its_name_is_not_waited_for_long(
     assert locks.acquire(tmp_path, "cell") is not None
 
 
-def test_an_interrupted_owner_leaves_no_nameless_lock(
+def test_an_interrupted_owner_leaves_no_unsigned_lock(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def interrupted(*_: object) -> str:
@@ -155,7 +153,7 @@ def test_a_worker_that_outlives_its_owner_holds_the_lock_until_it_ends(tmp_path:
     assert not list(tmp_path.iterdir())
 
 
-def test_a_sign_of_life_is_given_and_a_lost_lock_noticed(
+def test_a_heartbeat_is_given_when_due_and_a_lost_lock_is_noticed(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     lock = locks.acquire(tmp_path, "cell")
@@ -176,6 +174,37 @@ def test_a_sign_of_life_is_given_and_a_lost_lock_noticed(
     assert not other.beat()
 
 
+def test_a_lost_lock_leaves_its_successor_s_file_alone(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """After a take-over and a release the first generation is free again, for a third owner."""
+    lost = locks.acquire(tmp_path, "cell")
+    assert lost is not None
+    lost.path.unlink()
+    third = locks.acquire(tmp_path, "cell")
+    assert third is not None
+    assert third.path == lost.path
+    elsewhere(third.path, 0)
+    signature = third.path.read_text()
+    monkeypatch.setattr(locks, "BEAT_S", 0.0)
+    assert not lost.beat(os.getpid())
+    lost.release()
+    assert third.path.read_text() == signature
+
+
+def test_a_heartbeat_notices_a_newer_generation(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A successor creates its own file first, and deletes the lost one only then."""
+    lost = locks.acquire(tmp_path, "cell")
+    assert lost is not None
+    monkeypatch.setattr(locks, "BEAT_S", 0.0)
+    assert lost.beat()
+    locks.sign(tmp_path / "cell.1")
+    assert lost.path.exists()
+    assert not lost.beat()
+
+
 def test_a_full_disk_leaves_no_lock_behind(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def full(*_: object) -> str:
         raise OSError(28, "No space left on device")
@@ -186,8 +215,8 @@ def test_a_full_disk_leaves_no_lock_behind(tmp_path: Path, monkeypatch: pytest.M
     assert not list(tmp_path.iterdir())
 
 
-def test_of_many_at_once_one_has_it(tmp_path: Path, owner: subprocess.Popen[str]) -> None:
-    """The first of them take over from a dead owner, all at the same time."""
+def test_of_many_contenders_one_has_the_lock(tmp_path: Path, owner: subprocess.Popen[str]) -> None:
+    """The first of them take over from a dead owner at the same time."""
     owner.kill()
     owner.wait()
     log = tmp_path / "log"
@@ -200,10 +229,10 @@ def test_of_many_at_once_one_has_it(tmp_path: Path, owner: subprocess.Popen[str]
         assert end <= start
 
 
-def test_what_is_made_anew_while_it_is_looked_at_is_not_taken_for_the_dead_one(
+def test_a_lock_that_is_created_again_meanwhile_is_not_taken_for_the_dead_one(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """One contender gives way and another comes, both between a third one's look and its broom."""
+    """One contender gives way and another one comes, while a third looks for dead locks."""
     contender, looks, living = tmp_path / "cell.1", 0, locks._living
 
     def generations(folder: Path, name: str) -> dict[int, Path]:

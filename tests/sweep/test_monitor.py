@@ -1,4 +1,4 @@
-"""A sweep while it runs: read from the files that cells of any launcher leave."""
+"""Tests that a running sweep is read from the files that its cells write, with any launcher."""
 
 from __future__ import annotations
 
@@ -11,24 +11,26 @@ from pathlib import Path
 import pytest
 
 from xrgs.config import Conf
-from xrgs.experiment.store import State, Store
+from xrgs.experiment.store import CellState, Store
 from xrgs.runtime.progress import Progress
 from xrgs.safeio.atomic import write_json
-from xrgs.sweep import monitor as live
-from xrgs.sweep.monitor import Running, View
-from xrgs.sweep.plan import CellSpec, Planned
+from xrgs.sweep import monitor as monitor_module
+from xrgs.sweep.axes import CellSpec
+from xrgs.sweep.monitor import RunningCell, SweepMonitor
+from xrgs.sweep.plan import PlannedCell
 
 
 class Cells:
-    """Planned cells, and the files of those that are begun."""
+    """PlannedCell cells, and the files of those that are begun."""
 
     def __init__(self, store: Store, conf: Conf) -> None:
         self.store = store
         self.conf = conf
 
-    def plan(self, name: str, state: str = "absent", seconds: float | None = None) -> Planned:
-        return Planned(
-            CellSpec(name, "", (), ()), self.conf, "v", name, State(state), seconds=seconds
+    def plan(self, name: str, state: str = "absent", seconds: float | None = None) -> PlannedCell:
+        spec = CellSpec(name, "", (), ())
+        return PlannedCell(
+            spec, self.conf, "v", {"name": name}, name, CellState(state), seconds=seconds
         )
 
     def begin(self, name: str) -> None:
@@ -53,87 +55,87 @@ def cells(compose: Callable[..., Conf], tmp_path: Path) -> Cells:
     return Cells(store, compose("train.steps=100"))
 
 
-def test_cells_are_told_from_their_files_alone(cells: Cells) -> None:
+def test_states_are_read_from_the_cells_files_alone(cells: Cells) -> None:
     cells.begin("failed")
     cells.store.cell("failed").fail("it raised")
-    view = View(cells.store.cells)
+    monitor = SweepMonitor(cells.store.cells)
     names = ("a", "b", "c")
     plan = [cells.plan(name) for name in names] + [
         cells.plan("failed", "failed"),
         cells.plan("done", "done"),
         replace(cells.plan("none"), cell_id=None, error="no variant"),
     ]
-    view.watch(plan)
-    assert str(view.look()) == "1 of 6 cells done, 2 failed"
+    monitor.watch(plan)
+    assert str(monitor.snapshot()) == "1 of 6 cells done, 2 failed"
     cells.begin("a")
     cells.step("a", 20, 10.0)
-    look = view.look()
-    assert [run.cell.cell_id for run in look.running] == ["a"]
+    snapshot = monitor.snapshot()
+    assert [cell.cell.cell_id for cell in snapshot.running] == ["a"]
     # 80 steps of a, and 100 of b and of c, which nothing else is known of
-    assert str(look) == (
+    assert str(snapshot) == (
         "1 of 6 cells done, 2 failed, training 20 of 100 steps, 10 steps/s, ~28 s left"
     )
     cells.begin("b")
     cells.step("b", 50, 5.0)
     # 8 s and 10 s, and c at their mean pace 15 s: by two at once
-    assert str(view.look()).endswith("2 failed, 2 in training, 15 steps/s, ~16 s left")
+    assert str(monitor.snapshot()).endswith("2 failed, 2 in training, 15 steps/s, ~16 s left")
     cells.finish("a")
     cells.store.cell("b").fail("it raised")
     cells.begin("c")
-    assert str(view.look()).startswith("2 of 6 cells done, 3 failed, ~15 s left")
+    assert str(monitor.snapshot()).startswith("2 of 6 cells done, 3 failed, ~15 s left")
 
 
 def test_another_sweeps_cell_is_waited_for(cells: Cells) -> None:
-    view = View(cells.store.cells)
-    view.watch([cells.plan("a"), cells.plan("b", "running")])
+    monitor = SweepMonitor(cells.store.cells)
+    monitor.watch([cells.plan("a"), cells.plan("b", "running")])
     cells.begin("b")
     cells.step("b", 90, 0.1)
-    assert str(view.look()) == "0 of 2 cells done, 1 in another sweep"
+    assert str(monitor.snapshot()) == "0 of 2 cells done, 1 in another sweep"
     cells.begin("a")
     cells.step("a", 0, 10.0)
-    assert str(view.look()).endswith("~2 min left")  # b's ten steps, not a's ten seconds
+    assert str(monitor.snapshot()).endswith("~2 min left")  # b's ten steps, not a's ten seconds
     cells.finish("b")
-    assert view.look().done == 1
+    assert monitor.snapshot().done == 1
 
 
-def test_what_is_tried_again_is_not_over_before_it_is(cells: Cells) -> None:
+def test_a_cell_that_is_trained_again_has_not_ended_before_it_does(cells: Cells) -> None:
     for name in ("failed", "corrupt"):
         cells.begin(name)
         cells.store.cell(name).fail("once")
     conf = replace(cells.conf, retry="failed")
     plan = [replace(cells.plan(name, name), conf=conf) for name in ("failed", "corrupt")]
-    view = View(cells.store.cells)
-    view.watch(plan)
-    assert str(view.look()) == "0 of 2 cells done"
+    monitor = SweepMonitor(cells.store.cells)
+    monitor.watch(plan)
+    assert str(monitor.snapshot()) == "0 of 2 cells done"
     cells.begin("failed")
     cells.store.cell("failed").fail("twice")
     cells.begin("corrupt")
     cells.finish("corrupt")
-    assert str(view.look()) == "1 of 2 cells done, 1 failed"
-    view.watch([replace(cell, state=State("failed")) for cell in plan])
-    assert str(view.look()) == "1 of 2 cells done, 1 failed"
+    assert str(monitor.snapshot()) == "1 of 2 cells done, 1 failed"
+    monitor.watch([replace(cell, state=CellState("failed")) for cell in plan])
+    assert str(monitor.snapshot()) == "1 of 2 cells done, 1 failed"
 
 
-def test_what_a_killed_process_left_is_no_sign_of_life(
+def test_files_that_a_killed_process_left_are_no_sign_of_life(
     cells: Cells, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     for name in ("before", "now"):
         cells.begin(name)
     cells.step("before", 5, 1.0)
-    view = View(cells.store.cells)
-    view.watch([cells.plan("before", "unfinished"), cells.plan("now")])
-    assert not view.look().running
+    monitor = SweepMonitor(cells.store.cells)
+    monitor.watch([cells.plan("before", "unfinished"), cells.plan("now")])
+    assert not monitor.snapshot().running
     cells.step("now", 5, 1.0)
-    assert len(view.look().running) == 1
-    monkeypatch.setattr(live, "_SILENT_S", 0.0)
-    assert not view.look().running
+    assert len(monitor.snapshot().running) == 1
+    monkeypatch.setattr(monitor_module, "_SILENT_S", 0.0)
+    assert not monitor.snapshot().running
 
 
-def test_past_cells_tell_at_first_and_its_own_pace_in_the_end(cells: Cells) -> None:
+def test_past_cells_decide_at_first_and_the_own_pace_in_the_end(cells: Cells) -> None:
     cell = cells.plan("a", seconds=100.0)
 
     def left(done: int, rate: float | None, what: str = "training", unit: str = "step") -> float:
-        found = Running(cell, Progress(what, unit, done, 100, rate)).left_s
+        found = RunningCell(cell, Progress(what, unit, done, 100, rate)).left_s
         assert found is not None
         return found
 
@@ -144,12 +146,12 @@ def test_past_cells_tell_at_first_and_its_own_pace_in_the_end(cells: Cells) -> N
     assert left(10, 9.0, "evaluating", "view") == pytest.approx(10)
 
 
-def test_a_log_has_a_line_when_a_cell_is_over_and_the_last_at_the_end(
+def test_a_log_has_a_line_when_a_cell_ends_and_the_last_at_the_end(
     cells: Cells, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr(live, "_LOOK_S", 0.01)
-    with View(cells.store.cells) as view:
-        view.watch([cells.plan("a"), cells.plan("b"), cells.plan("old", "done")])
+    monkeypatch.setattr(monitor_module, "_POLL_S", 0.01)
+    with SweepMonitor(cells.store.cells) as monitor:
+        monitor.watch([cells.plan("a"), cells.plan("b"), cells.plan("old", "done")])
         for name in ("a", "b"):
             cells.begin(name)
             cells.step(name, 1, 1.0)
@@ -157,22 +159,25 @@ def test_a_log_has_a_line_when_a_cell_is_over_and_the_last_at_the_end(
             cells.finish(name)
             if name == "a":
                 time.sleep(0.5)
-    told = capsys.readouterr().err
-    assert "\r" not in told
-    assert [line[:18] for line in told.splitlines()] == ["2 of 3 cells done,", "3 of 3 cells done"]
+    output = capsys.readouterr().err
+    assert "\r" not in output
+    assert [line[:18] for line in output.splitlines()] == [
+        "2 of 3 cells done,",
+        "3 of 3 cells done",
+    ]
 
 
-def test_a_finished_plan_is_told_nothing_of(
+def test_nothing_is_shown_of_a_finished_plan(
     cells: Cells, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    with View(cells.store.cells) as view:
-        view.watch([cells.plan("a", "done"), cells.plan("b", "failed")])
-    with View(cells.store.cells):
+    with SweepMonitor(cells.store.cells) as monitor:
+        monitor.watch([cells.plan("a", "done"), cells.plan("b", "failed")])
+    with SweepMonitor(cells.store.cells):
         pass
     assert capsys.readouterr().err == ""
 
 
-def test_a_terminal_has_one_line_which_is_gone_at_the_end(
+def test_a_terminal_shows_one_line_which_is_removed_at_the_end(
     cells: Cells, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     class Terminal(io.StringIO):
@@ -181,28 +186,28 @@ def test_a_terminal_has_one_line_which_is_gone_at_the_end(
 
     terminal = Terminal()
     monkeypatch.setattr("sys.stderr", terminal)
-    monkeypatch.setattr(live, "_LOOK_S", 0.01)
-    with View(cells.store.cells) as view:
-        view.watch([cells.plan("a"), cells.plan("b")])
+    monkeypatch.setattr(monitor_module, "_POLL_S", 0.01)
+    with SweepMonitor(cells.store.cells) as monitor:
+        monitor.watch([cells.plan("a"), cells.plan("b")])
         cells.begin("a")
         cells.step("a", 50, 1.0)
         time.sleep(0.3)
         cells.finish("a")
-    told = terminal.getvalue()
-    assert " 25%|" in told
-    assert "0 of 2 cells done, training 50 of 100 steps, 1 steps/s" in told
-    *_, last = told.split("\r")
+    output = terminal.getvalue()
+    assert " 25%|" in output
+    assert "0 of 2 cells done, training 50 of 100 steps, 1 steps/s" in output
+    *_, last = output.split("\r")
     assert last.startswith("\x1b[K1 of 2 cells done")
-    assert told.count("\n") == 1
+    assert output.count("\n") == 1
 
 
-def test_a_store_out_of_reach_is_looked_at_again(cells: Cells) -> None:
-    view = View(cells.store.cells)
-    view.watch([cells.plan("a")])
+def test_a_store_out_of_reach_is_read_again(cells: Cells) -> None:
+    monitor = SweepMonitor(cells.store.cells)
+    monitor.watch([cells.plan("a")])
     gone = cells.store.path.with_name("gone")
     cells.store.path.rename(gone)
-    assert str(view.look()) == "0 of 1 cells done"
+    assert str(monitor.snapshot()) == "0 of 1 cells done"
     gone.rename(cells.store.path)
     cells.begin("a")
     cells.finish("a")
-    assert str(view.look()) == "1 of 1 cells done"
+    assert str(monitor.snapshot()) == "1 of 1 cells done"

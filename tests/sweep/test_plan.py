@@ -1,4 +1,4 @@
-"""What is left to do of a study, in which order, and how long it takes."""
+"""Tests of what is left to do of a study, in which order, and how long it takes."""
 
 from __future__ import annotations
 
@@ -9,40 +9,41 @@ from pathlib import Path
 import pytest
 
 from xrgs.config import Conf
-from xrgs.experiment.store import State, Store
+from xrgs.experiment.store import CellState, Store
 from xrgs.safeio.atomic import write_json
-from xrgs.sweep.plan import CellSpec, Planned, describe, identified, length, ready
+from xrgs.sweep.axes import CellSpec
+from xrgs.sweep.plan import PlannedCell, describe, expected_length, identified, ready
 
 
 @pytest.fixture
-def cell(compose: Callable[..., Conf]) -> Callable[..., Planned]:
+def cell(compose: Callable[..., Conf]) -> Callable[..., PlannedCell]:
     """(id, state, seconds, steps) -> a planned cell."""
 
     def planned(
         cell_id: str, state: str = "absent", seconds: float | None = None, steps: int = 10
-    ) -> Planned:
+    ) -> PlannedCell:
         conf = compose(f"train.steps={steps}")
-        wish = CellSpec(cell_id, "", (), ())
-        return Planned(wish, conf, "v", cell_id, State(state), seconds=seconds)
+        spec = CellSpec(cell_id, "", (), ())
+        return PlannedCell(
+            spec, conf, "v", {"id": cell_id}, cell_id, CellState(state), seconds=seconds
+        )
 
     return planned
 
 
-@pytest.mark.parametrize(
-    ("retry", "left"), [(False, {"absent", "corrupt", "unfinished"}), (True, {"failed"})]
-)
-def test_what_is_done_running_or_tried_is_not_run(
-    cell: Callable[..., Planned], retry: bool, left: set[str]
+@pytest.mark.parametrize(("retry", "failed"), [(False, set()), (True, {"failed"})])
+def test_cells_that_are_done_running_or_tried_are_not_trained(
+    cell: Callable[..., PlannedCell], retry: bool, failed: set[str]
 ) -> None:
     names = ("absent", "corrupt", "done", "failed", "running", "unfinished")
     plan = [cell(name, name) for name in names]
-    assert set(ready(plan, (), retry=retry)) == left | {"absent", "corrupt", "unfinished"}
+    assert set(ready(plan, (), retry=retry)) == failed | {"absent", "corrupt", "unfinished"}
     assert "absent" not in ready(plan, {"absent"}, retry=retry)
     assert not ready([replace(each, error="no variant") for each in plan], (), retry=retry)
 
 
-def test_the_longest_come_first_and_what_is_unknown_before_them(
-    cell: Callable[..., Planned],
+def test_the_longest_cells_come_first_and_unknown_ones_before_them(
+    cell: Callable[..., PlannedCell],
 ) -> None:
     plan = [
         cell("short", seconds=5.0),
@@ -50,12 +51,14 @@ def test_the_longest_come_first_and_what_is_unknown_before_them(
         cell("long", seconds=50.0),
         cell("unknown and longer", steps=20),
     ]
-    ordered = sorted(plan, key=length, reverse=True)
+    ordered = sorted(plan, key=expected_length, reverse=True)
     names = [each.cell_id for each in ordered]
     assert names == ["unknown and longer", "unknown", "long", "short"]
 
 
-def test_the_plan_tells_what_is_left(cell: Callable[..., Planned]) -> None:
+def test_the_plan_says_how_long_the_remaining_training_takes(
+    cell: Callable[..., PlannedCell],
+) -> None:
     plan = [
         cell("a", "done", 1000.0),
         cell("b", seconds=40.0),
@@ -65,22 +68,22 @@ def test_the_plan_tells_what_is_left(cell: Callable[..., Planned]) -> None:
     ]
     first, *rows = describe(plan).splitlines()
     assert first.startswith("plan: 5 cells, 1 done; left to train, one after another: ~70 s")
-    assert "1 cells that no past one tells of" in first
+    assert "1 cells without an estimate" in first
     assert "~40 s" in rows[1]
     assert "retry=failed" in rows[-1]
     again = [replace(each, conf=replace(each.conf, retry="failed")) for each in plan]
     assert "~18 min" in describe(again).splitlines()[0]
 
 
-def test_a_cell_that_somebody_trains_is_running_unless_it_is_done(
-    cell: Callable[..., Planned], tmp_path: Path
+def test_a_cell_whose_lock_is_held_is_running_unless_it_is_done(
+    cell: Callable[..., PlannedCell], tmp_path: Path
 ) -> None:
     store = Store(tmp_path)
     store.cell("a").begin({}, {})
-    assert identified(cell("a"), store, {"a": None}).state.name == "running"
+    assert identified(cell("a"), store, {"a": "process 1"}).state.name == "running"
     assert identified(cell("a"), store, {}).state.name == "unfinished"
     folder = store.cell("a")
     (folder.path / "scores.csv").write_text("view\na\n")
     write_json(folder.path / "summary.json", {})
     folder.finish(["a"], 1)
-    assert identified(cell("a"), store, {"a": None}).state.name == "done"
+    assert identified(cell("a"), store, {"a": "process 1"}).state.name == "done"

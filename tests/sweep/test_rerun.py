@@ -58,7 +58,7 @@ def train(trained: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., None]
             folder.finish([], 1)
             return {}
 
-        monkeypatch.setattr(worker, "run", run)
+        monkeypatch.setattr(worker, "run_in_child", run)
 
     return fake
 
@@ -153,7 +153,7 @@ def test_other_code_libraries_and_machines_are_told_before_it_trains(
     def run(*_: object) -> None:
         raise XrgsError("not now")
 
-    monkeypatch.setattr(worker, "run", run)
+    monkeypatch.setattr(worker, "run_in_child", run)
     with pytest.raises(XrgsError, match=r"not now \(.*log\.txt"):
         rerun(cell.path)
     told = capsys.readouterr().err
@@ -206,7 +206,7 @@ def test_a_variant_that_is_gone_is_built_and_has_to_be_the_same(
         asked.append((job, request["conf"]["scene"]["path"], request["store"]))
         return {"variant": other}
 
-    monkeypatch.setattr(worker, "run", run)
+    monkeypatch.setattr(worker, "run_in_child", run)
     with pytest.raises(XrgsError, match="COLMAP" if alike else "its photographs, or the code"):
         rerun(cell.path, photographs="there")
     assert asked == [("variant", "there", str(tmp_path / "s"))]

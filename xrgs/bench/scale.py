@@ -1,7 +1,7 @@
-"""How long planning, reporting and looking take over a store of many finished cells.
+"""Measures planning, reporting and status over a store of many cells, and the cost of a job.
 
-The commands are run as a user runs them. One cell is trained; the others are copies of it, under
-the ids that a plan asks for and with their own seed, their pictures and splats as links to its.
+The commands are run as a user runs them. One cell is trained. The others are copies of it, under
+the ids that a plan gives and with their own seeds; their renders and splats are hard links.
 """
 
 from __future__ import annotations
@@ -16,32 +16,41 @@ import sys
 import tempfile
 import time
 from pathlib import Path
+from statistics import median
 from typing import TYPE_CHECKING, Any
 
+from xrgs import config
+from xrgs.capture import variant
+from xrgs.capture.scenes import motorcycle
 from xrgs.errors import XrgsError
+from xrgs.experiment.store import CellFolder
+from xrgs.sweep.session import HandOver, SweepSession
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Callable, Iterator
 
 _LABELS = ("loss_weighting", "gradient_scaling", "curriculum", "consistency")
 _CELL = ("scene=motorcycle", "preset=smoke", "train.steps=2", "store=store")
 _LINE = re.compile(r"^  \w+ +([0-9a-f]{16}) .*/ seed (\d+)$", re.MULTILINE)
 _LINKED = {".png": "renders", ".ply": "splats"}
+#: Photographs of the scene whose hashing is measured, and times that a job's cost is measured.
+_PHOTOGRAPHS, _REPEATS = 100, 9
 
 
 def measure(cells: int, out: Path) -> dict[str, Any]:
-    """Time each command over so many cells.
+    """Measure each command over a store of many cells, and what a job costs before it trains.
 
     Args:
-        cells: how many, the multiple of 5 below it: of a baseline and four ablations each.
-        out: folder in which the store is made, and cleared away again.
+        cells: Number of cells, rounded down to a multiple of 5: a baseline and four ablations each.
+        out: Folder in which the store is made, and removed at the end.
 
     Returns:
-        `cells`, how many; `commands`, rows of `command`, `seconds`, `cpu_seconds` (of it and of all
-        that it started) and `ms_per_cell`; and of a cell `files`, `inodes` and `bytes`, by kind.
+        `cells`, their number; `commands`, rows of `command`, `seconds`, `cpu_seconds` (of the
+        command and all its children) and `ms_per_cell`; `job`, see `_job_cost`; and for one cell
+        `files`, `inodes` and `bytes` by kind.
 
     Raises:
-        XrgsError: fewer than 5 cells, or a command failed; the message is what it printed.
+        XrgsError: There are fewer than 5 cells, or a command failed; the message has its output.
     """
     seeds = cells // (len(_LABELS) + 1)
     if seeds < 1:
@@ -53,8 +62,8 @@ def measure(cells: int, out: Path) -> dict[str, Any]:
         _run(folder, "sweep", *_CELL)
         template = next((folder / "store" / "cells").iterdir())
         plan, first = _run(folder, "sweep", *axes, "dry_run=true")
-        wanted = _LINE.findall(plan)
-        for cell_id, seed in wanted:
+        planned = _LINE.findall(plan)
+        for cell_id, seed in planned:
             _copy(template, template.with_name(cell_id), int(seed))
         timed = {"plan, nothing done": first}
         for what, command in {
@@ -64,7 +73,7 @@ def measure(cells: int, out: Path) -> dict[str, Any]:
             "status": ("status", "store=store"),
         }.items():
             _, timed[what] = _run(folder, *command)
-        count = len(wanted)
+        count = len(planned)
         rows = [
             {
                 "command": what,
@@ -74,11 +83,51 @@ def measure(cells: int, out: Path) -> dict[str, Any]:
             }
             for what, (wall, cpu) in timed.items()
         ]
-        return {"cells": count, "commands": rows} | _cost(template)
+        job = _job_cost(template, folder)
+        return {"cells": count, "commands": rows, "job": job} | _storage(template)
 
 
-def _cost(cell: Path) -> dict[str, Any]:
-    """What a cell takes of the store, by kind; renders and splats depend on the scene alone."""
+def _job_cost(template: Path, folder: Path) -> dict[str, float]:
+    """Return the ms of what a job does before it trains, and of what only the plan does.
+
+    A job reads and verifies its cell's config and identity, and hashes the training code. The plan
+    hashes every photograph of a scene, once for all of its cells.
+    """
+    cell = CellFolder(template)
+    conf = config.from_file(template / "config.json")
+    photographs = folder / "photographs"
+    photographs.mkdir()
+    content = motorcycle.files()[0].read_bytes()
+    for number in range(_PHOTOGRAPHS):
+        (photographs / f"{number}.png").write_bytes(content)
+    conf.scene.kind, conf.scene.path = "folder", str(photographs)
+    (folder / "session").mkdir()
+    session = SweepSession(folder / "session")
+    session.begin()
+    config_values = json.loads((template / "config.json").read_text(encoding="utf-8"))
+    hand_over = HandOver("cell", config_values, cell.identity())
+    session.hand_over(hand_over)
+    works: dict[str, Callable[[], object]] = {
+        "job: read and verify the hand-over": lambda: session.read(cell.id).check_code(),
+        "plan: write the hand-over": lambda: session.hand_over(hand_over),
+        f"plan: hash {_PHOTOGRAPHS} photographs, once": lambda: variant.key(
+            conf.scene, conf.variant
+        ),
+    }
+    return {what: 1000 * _median_seconds(work) for what, work in works.items()}
+
+
+def _median_seconds(work: Callable[[], object]) -> float:
+    seconds = []
+    for _ in range(_REPEATS):
+        start = time.perf_counter()
+        work()
+        seconds.append(time.perf_counter() - start)
+    return median(seconds)
+
+
+def _storage(cell: Path) -> dict[str, Any]:
+    """Return the files and bytes of a cell; renders and splats depend on the scene alone."""
     files = [file for file in cell.rglob("*") if file.is_file()]
     sizes = dict.fromkeys(("renders", "splats", "the rest"), 0)
     for file in files:
@@ -88,8 +137,8 @@ def _cost(cell: Path) -> dict[str, Any]:
 
 
 def _run(folder: Path, command: str, *arguments: str) -> tuple[str, tuple[float, float]]:
-    """What `xrgs-<command>` said on stderr, and what it took: seconds, and seconds of CPU."""
-    script = f"from xrgs.cli import {command}; {command}()"
+    """Run `xrgs-<command>`; return its stderr, and the seconds and CPU seconds that it took."""
+    script = f"from xrgs.cli.{command} import main; main()"
     start, before = time.perf_counter(), _cpu_seconds()
     done = subprocess.run(  # noqa: S603
         [sys.executable, "-P", "-c", script, *arguments],
@@ -98,20 +147,20 @@ def _run(folder: Path, command: str, *arguments: str) -> tuple[str, tuple[float,
         text=True,
         check=False,
     )
-    took = time.perf_counter() - start, _cpu_seconds() - before
+    seconds = time.perf_counter() - start, _cpu_seconds() - before
     if done.returncode:
         raise XrgsError(f"xrgs-{command} {' '.join(arguments)}: {done.stderr.strip()}")
-    return done.stderr, took
+    return done.stderr, seconds
 
 
 def _cpu_seconds() -> float:
-    """Of every child that has ended."""
+    """Return the CPU seconds of all children that have ended."""
     used = resource.getrusage(resource.RUSAGE_CHILDREN)
     return used.ru_utime + used.ru_stime
 
 
 def _copy(template: Path, cell: Path, seed: int) -> None:
-    """A finished cell like the template, with another seed."""
+    """Copy a finished cell under another id and seed."""
     if cell == template:
         return
     status = json.loads((template / "status.json").read_text(encoding="utf-8"))
@@ -130,18 +179,25 @@ def _copy(template: Path, cell: Path, seed: int) -> None:
     (cell / "status.json").write_text(json.dumps(status), encoding="utf-8")
 
 
-def text(found: dict[str, Any]) -> str:
-    """What was measured, as a table."""
-    return "\n".join(_lines(found))
+def text(result: dict[str, Any]) -> str:
+    """Return what was measured as a table.
+
+    Args:
+        result: What `measure` returned.
+    """
+    return "\n".join(_lines(result))
 
 
-def _lines(found: dict[str, Any]) -> Iterator[str]:
-    sizes = ", ".join(f"{kind} {size}" for kind, size in found["bytes"].items())
-    yield f"{found['cells']} cells; one is {found['files']} files, {found['inodes']} inodes"
-    yield f"bytes of a cell: {sum(found['bytes'].values())} ({sizes})"
+def _lines(result: dict[str, Any]) -> Iterator[str]:
+    sizes = ", ".join(f"{kind} {size}" for kind, size in result["bytes"].items())
+    yield f"{result['cells']} cells; one is {result['files']} files, {result['inodes']} inodes"
+    yield f"bytes of a cell: {sum(result['bytes'].values())} ({sizes})"
     yield f"{'':<42} {'seconds':>8} {'of CPU':>8} {'ms a cell':>10}"
-    for row in found["commands"]:
+    for row in result["commands"]:
         yield (
             f"{row['command']:<42} {row['seconds']:>8.2f} {row['cpu_seconds']:>8.2f} "
             f"{row['ms_per_cell']:>10.2f}"
         )
+    yield f"{'before a job trains':<42} {'ms':>8}"
+    for what, milliseconds in result["job"].items():
+        yield f"{what:<42} {milliseconds:>8.2f}"

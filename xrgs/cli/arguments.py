@@ -1,15 +1,16 @@
-"""What the commands share: their arguments, and paths with any character in them."""
+"""What the commands share: parsing of arguments, paths with any character, and error messages."""
 
 from __future__ import annotations
 
 import sys
-from contextlib import suppress
+from contextlib import contextmanager, suppress
 from typing import TYPE_CHECKING, Any, cast
 
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.override_parser.types import Quote, QuotedString
 from hydra.errors import HydraException
 from omegaconf import DictConfig, OmegaConf
+from omegaconf.errors import OmegaConfBaseException
 
 from xrgs import config
 from xrgs.config import literal
@@ -17,23 +18,47 @@ from xrgs.errors import XrgsError
 from xrgs.safeio.atomic import path_of
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
+    from collections.abc import Iterator, Sequence
 
+#: Keys whose values are paths.
 _PATHS = frozenset({"scene.path", "store", "data_root"})
 
 
-def with_quotes(words: Sequence[str]) -> list[str]:
-    """Hydra's overrides, paths in quotes where its grammar would refuse or change them.
+@contextmanager
+def errors_as_messages(command: str, hint: str = "") -> Iterator[None]:
+    """End the command with a message and code 1 on errors that the user can correct.
 
-    What it reads as it is written and what is in quotes already stay as they are. Commas make a
-    list of scenes, unless there is a folder of that name; no sweep has two stores.
+    Args:
+        command: Name of the command, which begins the message.
+        hint: Added to the message about an invalid argument.
 
     Raises:
-        XrgsError: a word is no valid Unicode, which no file could be written with.
+        SystemExit: With the message, in place of the error.
+    """
+    try:
+        yield
+    except XrgsError as error:
+        sys.exit(f"{command}: {error}")
+    except (OmegaConfBaseException, HydraException) as error:
+        sys.exit(f"{command}: {config.one_line(error)}{hint}")
+
+
+def with_quotes(words: Sequence[str]) -> list[str]:
+    """Return Hydra overrides, with quotes around paths that Hydra's grammar would refuse or change.
+
+    Paths that Hydra reads as they are written, or that are in quotes already, stay unchanged.
+    Commas in `scene.path` separate scenes, unless there is a folder of that name; a sweep has one
+    store, so that commas in `store` are part of the path.
+
+    Args:
+        words: Arguments of the command line.
+
+    Raises:
+        XrgsError: A word is not valid Unicode, and no file could be written with it.
     """
     for word in words:
         if not word.isascii() and word.encode(errors="replace").decode() != word:
-            raise XrgsError(f"{word!r}: bytes that are no Unicode; rename it")
+            raise XrgsError(f"{word!r} has bytes that are not valid Unicode; rename the file")
     return [_with_quotes(word) for word in words]
 
 
@@ -41,50 +66,62 @@ def _with_quotes(word: str) -> str:
     key, _, value = word.partition("=")
     if key not in _PATHS or not value or value[0] in "'\"":
         return word
-    there = path_of(value).exists()
-    if there or key != "scene.path":
-        return f"{key}={_one(key, literal(value) if there else value)}"
-    return f"{key}={','.join(_one(key, part) for part in value.split(','))}"
+    exists = path_of(value).exists()
+    if exists or key != "scene.path":
+        return f"{key}={_quoted(key, literal(value) if exists else value)}"
+    return f"{key}={','.join(_quoted(key, part) for part in value.split(','))}"
 
 
-def _one(key: str, value: str) -> str:
+def _quoted(key: str, value: str) -> str:
+    """Return a path in quotes, or as it is if Hydra reads it as it is written."""
     with suppress(HydraException):
         (override,) = OverridesParser.create().parse_overrides([f"{key}={value}"])
-        found = override.value()
-        if found == value and not override.is_sweep_override():
+        parsed = override.value()
+        if parsed == value and not override.is_sweep_override():
             return value
-        if (found is None or "\\" in value) and not path_of(value).exists():
+        if (parsed is None or "\\" in value) and not path_of(value).exists():
             return value
     return QuotedString(value, Quote.single).with_quotes()
 
 
 def dotlist(words: Sequence[str]) -> DictConfig:
-    """`KEY=VALUE` words as a config: the values as they are written, for a schema to convert."""
+    """Return `KEY=VALUE` words as a config whose values are the texts as they are written.
+
+    Args:
+        words: Arguments of the command line; merging them into a schema converts the texts.
+    """
     conf = OmegaConf.create({})
     for word in words:
         key, _, value = word.partition("=")
-        found: Any = literal(value)
-        OmegaConf.update(conf, key, found)
+        text: Any = literal(value)
+        OmegaConf.update(conf, key, text)
     return conf
 
 
 def choices(group: str) -> str:
-    """The names of a config group's files, for a command's help: `fern, flower`."""
+    """Return the names of a config group's files, for a command's help: `fern, flower`.
+
+    Args:
+        group: Name of the group's folder.
+    """
     folder = config.CONF_DIR / group
     folder = folder if folder.is_dir() else config.CONF_DIR.parent / group
     files = sorted(folder.rglob("*.yaml"))
     return ", ".join(file.relative_to(folder).with_suffix("").as_posix() for file in files)
 
 
-def parse(schema: type[Any], command: Callable[[], None]) -> DictConfig:
-    """What the command line gives; where it asks for help, that is printed and all there is.
+def parse(schema: type[Any], help_text: str) -> DictConfig:
+    """Return the command line as a config of a schema, or print the help and end the command.
+
+    Args:
+        schema: A dataclass of the arguments, with their default values.
+        help_text: What `--help` prints.
 
     Raises:
-        OmegaConfBaseException: a key that the schema has not, or a value of another type.
+        OmegaConfBaseException: An argument is not in the schema, or its value is of another type.
+        SystemExit: With code 0, after the help was printed.
     """
-    known = OmegaConf.structured(schema)
     if {"-h", "--help"} & set(sys.argv[1:]):
-        usage = (command.__doc__ or "").replace("`", "")
-        print(f"{usage}\n\n{OmegaConf.to_yaml(known)}", end="")  # noqa: T201
+        print(help_text, end="")  # noqa: T201
         sys.exit()
-    return cast("DictConfig", OmegaConf.merge(known, dotlist(sys.argv[1:])))
+    return cast("DictConfig", OmegaConf.merge(OmegaConf.structured(schema), dotlist(sys.argv[1:])))

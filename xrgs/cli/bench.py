@@ -1,27 +1,42 @@
-"""`xrgs-bench`: run time against error."""
+"""`xrgs-bench`: measures the run time, error and memory of the rasterizers, and of a store."""
 
 from __future__ import annotations
 
-import sys
 from typing import cast
 
 from omegaconf import OmegaConf
-from omegaconf.errors import OmegaConfBaseException
 
-from xrgs import config
 from xrgs.bench.settings import Settings
-from xrgs.cli.arguments import parse
-from xrgs.errors import XrgsError
+from xrgs.cli.arguments import errors_as_messages, parse
 from xrgs.runtime.machine import let_openmp_sleep
+
+_HELP = """\
+xrgs-bench [KEY=VALUE]...
+
+Measures the run time of rendering and training on random loads, against their numerical error.
+With store_cells=N it measures planning, reporting and the cost of a job over a store of N cells.
+
+  repeats=9        times that each thing is measured, in turn with what it is compared to
+  threads=0        number of threads to measure beside 1; 0 for every core
+  seed=0           seed of the random loads
+  smoke=true       use tiny loads, to see whether everything runs
+  out=FOLDER       folder of bench.csv and bench.png; xrgs-bench by default
+  json=FILE        also write every figure to a JSON file
+
+  load=FILE.npz    measure this load instead of the random ones
+  save=FILE.npz cell=FOLDER view=NAME
+                   make such a load from a view of a trained cell, and measure nothing
+  quality=true cell=FOLDER steps=600
+                   train the cell again with each culling option changed, and compare renders
+  store_cells=N    measure planning, reporting and status over a store of N cells
+"""
 
 
 def main() -> None:
-    """`xrgs-bench [KEY=VALUE]...`: run time against error. See `xrgs/bench/settings.py`."""
-    let_openmp_sleep()  # as training does
-    try:
-        settings = OmegaConf.to_object(parse(Settings, main))
+    """Run `xrgs-bench [KEY=VALUE]...`."""
+    let_openmp_sleep()  # as in training
+    with errors_as_messages("xrgs-bench"):
+        settings = OmegaConf.to_object(parse(Settings, _HELP))
         from xrgs.bench.run import run
 
         print(run(cast("Settings", settings)))  # noqa: T201
-    except (XrgsError, OmegaConfBaseException) as error:
-        sys.exit(f"xrgs-bench: {config.one_line(error)}")

@@ -1,16 +1,22 @@
-"""`xrgs-report`: the tables and pictures of a sweep, from the store alone."""
+"""`xrgs-report`: makes the tables and figures of a sweep, from the store alone."""
 
 from __future__ import annotations
 
-import sys
 from dataclasses import dataclass
 from pathlib import Path
 
-from omegaconf.errors import OmegaConfBaseException
+from xrgs.cli.arguments import errors_as_messages, parse
 
-from xrgs import config
-from xrgs.cli.arguments import parse
-from xrgs.errors import XrgsError
+_HELP = """\
+xrgs-report [KEY=VALUE]...
+
+Makes the tables and figures of a sweep, from the store alone; the same store gives the same bytes.
+
+  store=FOLDER     the store; xrgs-store by default
+  sweep=ID         id of the sweep; the latest by default
+  out=FOLDER       folder to write to; STORE/reports/ID by default
+  pictures=NAMES   all, none, or names of figures without their ending: trade-off,fern--plus
+"""
 
 
 @dataclass
@@ -18,22 +24,21 @@ class ReportConf:
     """Arguments of `xrgs-report`."""
 
     store: str = "xrgs-store"
+    """The store's folder."""
     sweep: str | None = None
-    """Id of the sweep; the latest where none is given."""
+    """Id of the sweep; None for the latest."""
     out: str | None = None
-    """Folder to write to; `<store>/reports/<sweep>` where none is given."""
+    """Folder to write to; None for `<store>/reports/<sweep>`."""
     pictures: str = "all"
-    """`all`, `none`, or files' names without their suffix: `trade-off,fern--plus`."""
+    """`all`, `none`, or names of figures without their ending: `trade-off,fern--plus`."""
 
 
 def main() -> None:
-    """`xrgs-report [KEY=VALUE ...]`: tables and pictures of a sweep, from the store alone."""
-    try:
-        conf = parse(ReportConf, main)
+    """Run `xrgs-report [KEY=VALUE]...`."""
+    with errors_as_messages("xrgs-report"):
+        conf = parse(ReportConf, _HELP)
         from xrgs.report import build
 
         out = Path(conf.out) if conf.out else None
-        names = {"all": None, "none": []}.get(conf.pictures, conf.pictures.split(","))
-        print(build(Path(conf.store), conf.sweep, out, names).text)  # noqa: T201
-    except (XrgsError, OmegaConfBaseException) as error:
-        sys.exit(f"xrgs-report: {config.one_line(error)}")
+        pictures = {"all": None, "none": []}.get(conf.pictures, conf.pictures.split(","))
+        print(build(Path(conf.store), conf.sweep, out, pictures).text)  # noqa: T201

@@ -1,16 +1,20 @@
-"""`xrgs-status`: what a store holds, at a glance."""
+"""`xrgs-status`: prints a summary of a store."""
 
 from __future__ import annotations
 
-import sys
 from dataclasses import dataclass
 from pathlib import Path
 
-from omegaconf.errors import OmegaConfBaseException
+from xrgs.cli.arguments import errors_as_messages, parse
 
-from xrgs import config
-from xrgs.cli.arguments import parse
-from xrgs.errors import XrgsError
+_HELP = """\
+xrgs-status [KEY=VALUE]...
+
+Prints what a store holds: cells by state, why cells failed, which cells are stale, and sizes.
+
+  store=FOLDER     the store; xrgs-store by default
+  verify=true      hash the files that reports are made from; only sizes are compared by default
+"""
 
 
 @dataclass
@@ -18,16 +22,15 @@ class StatusConf:
     """Arguments of `xrgs-status`."""
 
     store: str = "xrgs-store"
+    """The store's folder."""
     verify: bool = False
-    """Hash what reports rest on too; sizes alone are compared without."""
+    """Hash the files that reports are made from; otherwise only sizes are compared."""
 
 
 def main() -> None:
-    """`xrgs-status [store=FOLDER] [verify=true]`: what a store holds, at a glance."""
-    from xrgs.sweep.status import describe, read
+    """Run `xrgs-status [KEY=VALUE]...`."""
+    with errors_as_messages("xrgs-status"):
+        conf = parse(StatusConf, _HELP)
+        from xrgs.sweep.status import describe, read
 
-    try:
-        conf = parse(StatusConf, main)
         print(describe(read(Path(conf.store), verify=conf.verify)))  # noqa: T201
-    except (XrgsError, OmegaConfBaseException) as error:
-        sys.exit(f"xrgs-status: {config.one_line(error)}")

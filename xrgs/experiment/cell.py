@@ -1,4 +1,4 @@
-"""One cell: a variant, a config and a seed become Gaussians, scores and their provenance."""
+"""Runs one cell: trains a variant with a config and a seed, scores it and writes the results."""
 
 from __future__ import annotations
 
@@ -31,29 +31,36 @@ if TYPE_CHECKING:
 _log = logging.getLogger(__name__)
 
 
-def run(conf: Conf, variant: Variant, folder: CellFolder) -> None:
-    """Train, evaluate and write a cell into its begun folder; its status is written last.
+def run_cell(conf: Conf, variant: Variant, folder: CellFolder) -> None:
+    """Train and evaluate a cell, and write its results; its status is written last.
+
+    Args:
+        conf: The cell's config.
+        variant: The frozen variant that it trains on.
+        folder: The cell's folder, in which `CellFolder.begin` has written config and identity.
 
     Raises:
-        Exception: whatever went wrong, after `error.txt` says where.
+        Exception: Whatever went wrong, after its traceback was written to `error.txt`.
     """
     try:
         with progress.kept_in(folder.progress):
-            views = _run(conf, variant, folder)
+            views = _train_and_score(conf, variant, folder)
         folder.finish(views, protocol.PROTOCOL)
     except Exception:
         write_text(folder.path / "error.txt", traceback.format_exc())
         raise
 
 
-def _run(conf: Conf, variant: Variant, folder: CellFolder) -> list[str]:
-    """All but the status; the names of the views that were scored."""
+def _train_and_score(conf: Conf, variant: Variant, folder: CellFolder) -> list[str]:
+    """Write every file but the status; return the names of the views that were scored."""
     threads = dataset.use_threads(conf.threads)
     backend = resolve_backend(conf.splat.backend)
     write_json(folder.path / "provenance.json", provenance.collect(threads, backend))
     data = dataset.load(variant, conf.train.views)
-    trained = _train(data, conf, folder)
-    peak_rss_bytes = _peak_rss_bytes()  # before evaluation, which may load LPIPS's network
+    trained = _train_or_resume(data, conf, folder)
+    peak_rss_bytes = (
+        _peak_rss_bytes()
+    )  # read before evaluation, which may load the network of LPIPS
     save_ply(folder.path / "splats.ply", trained.gaussians)
     write_text(folder.path / "history.csv", _csv(trained.history))
     scores = protocol.score(trained.gaussians, data.test, conf.splat, folder.path / "renders")
@@ -73,8 +80,8 @@ def _run(conf: Conf, variant: Variant, folder: CellFolder) -> list[str]:
     return [view.name for view in data.test]
 
 
-def _train(data: Dataset, conf: Conf, folder: CellFolder) -> Trained:
-    """Train from the cell's checkpoint, or from the start where there is none of any use."""
+def _train_or_resume(data: Dataset, conf: Conf, folder: CellFolder) -> Trained:
+    """Train from the cell's checkpoint, or from the start if there is no usable one."""
     checkpoint = Checkpoint(folder.checkpoint, digest(folder.identity()), conf.checkpoint_s)
     try:
         steps = checkpoint.read()

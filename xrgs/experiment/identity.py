@@ -1,7 +1,7 @@
-"""What makes two cells the same cell: everything that can change a number, and nothing else.
+"""The identity of a cell: every value that can change one of its numbers, and nothing else.
 
-Paths, thread counts, logging and labels are not in it, so a finished cell is found again under
-another name, in another folder or on another machine.
+Paths, thread counts, logging and labels are not part of it, so a finished cell is found again under
+another label, in another folder or on another machine.
 """
 
 from __future__ import annotations
@@ -14,9 +14,11 @@ from xrgs.safeio.hashing import plain, source_digests
 from xrgs.splat.backend import resolve_backend
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping
+
     from xrgs.config import Conf
 
-#: Files whose change can change a trained number; of folders, every source file inside.
+#: Files whose change can change a trained number; a folder stands for every source file inside.
 _TRAINING_CODE = (
     "splat",
     "training",
@@ -27,20 +29,56 @@ _TRAINING_CODE = (
     "evaluation/protocol.py",
     "safeio/npz.py",
 )
-#: What the native backend is compiled from, shipped beside it: two builds of it are not the same
-#: bytes, and not another program.
+#: The C++ sources of the native backend. The compiled module itself is not hashed: two builds of
+#: the same sources differ in their bytes and give the same numbers.
 _NATIVE_CODE = "csrc"
 
 
 @cache
 def training_code(backend: str) -> dict[str, str]:
-    """SHA-256 of each source file that trains with a backend, keyed by its path in the package."""
+    """Return the SHA-256 of each source file that trains with a backend; they are read once.
+
+    Args:
+        backend: `native` or `torch`.
+
+    Returns:
+        The digests, keyed by the file's path in the package.
+    """
+    return _installed_code(backend)
+
+
+def _installed_code(backend: str) -> dict[str, str]:
     names = (*_TRAINING_CODE, _NATIVE_CODE) if backend == "native" else _TRAINING_CODE
     return source_digests(*names)
 
 
+def changed_code(code: Mapping[str, str], backend: str) -> list[str]:
+    """Return the source files that are not the ones that an identity was computed with.
+
+    The installed files are read anew, so that a file edited since this process started counts too.
+
+    Args:
+        code: The `code` of an identity.
+        backend: `native` or `torch`.
+
+    Returns:
+        Paths in the package of files that were changed, added or removed; sorted.
+    """
+    installed = _installed_code(backend)
+    files = code.keys() | installed.keys()
+    return sorted(file for file in files if code.get(file) != installed.get(file))
+
+
 def cell_identity(conf: Conf, variant_id: str) -> dict[str, Any]:
-    """Everything that decides a cell's numbers, as plain JSON values."""
+    """Return everything that decides a cell's numbers, as plain JSON values.
+
+    Args:
+        conf: The cell's config.
+        variant_id: The id of the frozen variant that it trains on.
+
+    Returns:
+        The identity. Its digest is the cell's id.
+    """
     backend = resolve_backend(conf.splat.backend)
     return {
         "splat": plain(conf.splat) | {"backend": backend},

@@ -1,4 +1,4 @@
-"""Where, with what and on what a cell was run: enough to explain a number years later."""
+"""Records where, when and with which software a cell is run, to explain its numbers later."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def _cpu() -> str:
 
 
 def _instruction_set(backend: str) -> str | None:
-    """Of the native kernels; torch's own follow the processor."""
+    """Return the instruction set of the native kernels; None for torch, which chooses its own."""
     if backend != "native":
         return None
     from xrgs import _native
@@ -46,14 +46,14 @@ def _instruction_set(backend: str) -> str | None:
 
 
 def collect(threads: int, backend: str) -> dict[str, Any]:
-    """The program, its libraries, the machine and the moment, as plain JSON values.
+    """Return the program, its libraries, the machine and the time, as plain JSON values.
 
     Args:
-        threads: how many the cell uses.
-        backend: the rasterizer in use, `native` or `torch`.
+        threads: Number of threads that the cell uses.
+        backend: The rasterizer in use, `native` or `torch`.
 
     Raises:
-        WeightsError: the weights of LPIPS that are there aren't the published ones. A cell that
+        WeightsError: The weights of LPIPS on this machine are not the published ones. A cell that
             can't be scored is better stopped here than after its training.
     """
     diff = _git("diff", "HEAD", "--", ".")

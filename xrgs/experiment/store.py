@@ -1,8 +1,9 @@
-"""What is on disk, and is it done.
+"""The store: a folder that keeps variants, trained cells, sweep records and reports.
 
-A store is a folder: `scenes/`, `variants/`, `cells/<cell id>/`, `locks/`, `sweeps/<sweep id>.json`,
-`reports/<sweep id>/`. A cell's `status.json` is written last, by atomic rename, and lists every
-other file of the cell: a cell is done when it says so and the files are those that it lists.
+Its subfolders are `scenes/`, `variants/`, `cells/<cell id>/`, `locks/`, `hydra/` (one folder per
+call of `xrgs-sweep`), `sweeps/<sweep id>.json` and `reports/<sweep id>/`. A cell's `status.json` is
+written last, by atomic rename, and lists every other file of the cell: a cell is done when that
+file says so and the listed files are present and unchanged.
 """
 
 from __future__ import annotations
@@ -26,8 +27,10 @@ if TYPE_CHECKING:
 
     import pandas as pd
 
+#: Label of the cells that all others are compared to.
+BASELINE = "baseline"
 
-#: A report rests on these, so they are verified byte for byte; the others by their size.
+#: Reports are made from these files, so they are verified by their hash; others by their size.
 _VERIFIED_BY_HASH = frozenset(
     {"config.json", "identity.json", "scores.csv", "summary.json", "history.csv"}
 )
@@ -36,114 +39,125 @@ _PROGRESS = "progress.json"
 _NOT_RESULTS = frozenset(
     {"log.txt", "status.json", _PROGRESS, _CHECKPOINT, f"refused-{_CHECKPOINT}"}
 )
-#: What a cell that goes on from its checkpoint keeps of the try that was stopped.
-_GOES_ON_WITH = frozenset({_CHECKPOINT, "identity.json", "log.txt"})
+#: Files of a stopped attempt that are kept when the cell resumes from its checkpoint.
+_KEPT_ON_RESUME = frozenset({_CHECKPOINT, "identity.json", "log.txt"})
 _RECORD_VERSION = 1
-#: Bytes without which a disk is full: less than the files of any cell.
-_ROOM = 1 << 15
-_MOST_SEED = (1 << 63) - 1
+#: Bytes that must be writable before a sweep starts; any cell needs more than that.
+_MIN_FREE_BYTES = 1 << 15
+_MAX_SEED = (1 << 63) - 1
 
 
 @dataclass(frozen=True)
-class State:
-    """Where a cell stands: `absent`, `unfinished`, `failed`, `corrupt` or `done`, and why."""
+class CellState:
+    """The state of a cell, and the reason for it."""
 
     name: str
+    """`absent`, `unfinished`, `running`, `failed`, `corrupt` or `done`."""
     reason: str = ""
 
 
 @dataclass(frozen=True)
 class CellFolder:
-    """One cell's folder in the store."""
+    """The folder of one cell: its config, its results and its state."""
 
     path: Path
+    """The folder, named by the cell's id."""
 
     @property
     def id(self) -> str:
-        """The cell's id."""
+        """The cell's id: the digest of its identity."""
         return self.path.name
 
     @property
     def checkpoint(self) -> Path:
-        """State of the training, while it is not done."""
+        """File of the training checkpoint; it exists while the cell is not done."""
         return self.path / _CHECKPOINT
 
     @property
     def progress(self) -> Path:
-        """How far it is, while its process runs; a killed one leaves it behind."""
+        """File that says how far the cell is; a process that is killed leaves it behind."""
         return self.path / _PROGRESS
 
     @property
     def status(self) -> Path:
-        """Written last: what it says is the end."""
+        """File of the final state, written after all other files."""
         return self.path / "status.json"
 
-    def state(self, *, verify: bool = True) -> State:
-        """Whether this cell's result is there and can be trusted.
+    def state(self, *, verify: bool = True) -> CellState:
+        """Return whether this cell's result is present and can be trusted.
 
         Args:
-            verify: hash what reports rest on too; else sizes alone are compared.
+            verify: Hash the files that reports are made from; otherwise only sizes are compared.
         """
         if not self.path.is_dir():
-            return State("absent")
+            return CellState("absent")
         if self.path.is_symlink():
-            return State("corrupt", "it is a link: a cell is a folder of its own")
+            return CellState("corrupt", "it is a symbolic link; a cell must be a folder")
         if not self.status.exists():
-            goes_on = "; it goes on from its checkpoint" if self.checkpoint.exists() else ""
-            return State("unfinished", f"it was stopped before it ended{goes_on}")
+            resumes = "; it resumes from its checkpoint" if self.checkpoint.exists() else ""
+            return CellState("unfinished", f"it was stopped before it ended{resumes}")
         try:
             status = read_json(self.status)
             if status["state"] == "failed":
-                return State("failed", str(status["reason"]))
+                return CellState("failed", str(status["reason"]))
             self._check(status, verify=verify)
         except (StoreError, AttributeError, KeyError, TypeError, ValueError, OSError) as error:
-            return State("corrupt", str(error))
-        return State("done")
+            return CellState("corrupt", str(error))
+        return CellState("done")
 
-    def running(self, owner: object) -> State:
-        """What a cell's state is while somebody holds its lock."""
+    def running(self, owner: str) -> CellState:
+        """Return the state of a cell whose lock is held.
+
+        Args:
+            owner: Description of the process that holds the lock.
+        """
         now = progress.read(self.progress)
-        return State("running", f"by {owner}" + (f": {now}" if now else ""))
+        return CellState("running", f"by {owner}" + (f": {now}" if now else ""))
 
     def _check(self, status: Mapping[str, Any], *, verify: bool) -> None:
         if status["state"] != "done":
             raise StoreError(f"status.json: unknown state {status['state']!r}")
         for name, entry in status["files"].items():
             if not untrusted.is_inside(name):
-                raise StoreError(f"status.json: {name!r:.80} is no file of this cell")
+                raise StoreError(f"status.json: {name!r:.80} is not a file of this cell")
             if _size(f"{self.path}/{name}") != entry["bytes"]:
                 raise StoreError(f"{name} is missing or has another size")
             hashed = verify and name in _VERIFIED_BY_HASH
             if hashed and file_digest(self.path / name) != entry["sha256"]:
                 raise StoreError(f"{name} has changed since the cell finished")
         if verify and [view for view, _ in self.scores()] != status["views"]:
-            raise StoreError("scores.csv lacks rows of the views that were to be scored")
+            raise StoreError("scores.csv does not have one row for each view that was to be scored")
 
     def scores(self) -> list[tuple[str, dict[str, float]]]:
-        """Every test view's name and scores, NaN where there is none.
+        """Return the name and the scores of every test view, NaN where a score is missing.
 
         Raises:
-            StoreError: they are not there, or are no such table.
+            StoreError: `scores.csv` is missing or malformed.
         """
         file = self.path / "scores.csv"
         header, rows = read_table(file)
         views = [row[0] for row in rows]
         if header[:1] != ["view"] or not all(map(untrusted.is_name, views)):
-            raise StoreError(f"{file}: the names of the views can't be")
+            raise StoreError(f"{file}: the first column must hold names of views")
         try:
             values = [map(as_number, row[1:]) for row in rows]
-            found = [dict(zip(header[1:], row, strict=True)) for row in values]
+            scores = [dict(zip(header[1:], row, strict=True)) for row in values]
         except ValueError as error:
             raise StoreError(f"{file}: {error}") from error
-        return list(zip(views, found, strict=True))
+        return list(zip(views, scores, strict=True))
 
     def begin(self, config: Mapping[str, Any], identity: Mapping[str, Any]) -> None:
-        """A folder with the cell's config, and nothing else that could be taken for a result.
+        """Create the folder with the cell's config and identity, and without any result.
 
-        An earlier try of the very same cell leaves its checkpoint and its log. What can't be that,
-        and what failed or is corrupt and has no checkpoint, is set aside to be looked at.
+        The checkpoint and the log of an earlier attempt at the same cell are kept. A folder that
+        can't be resumed (another identity, or failed or corrupt without a checkpoint) is renamed to
+        `<cell id>.aside-<n>`, so that it can be inspected.
+
+        Args:
+            config: The cell's config as plain JSON values.
+            identity: The values that the cell's id is the digest of.
         """
-        if self._can_go_on(identity):
+        if self._can_resume(identity):
             self._clear()
         elif self.path.exists():
             self.path.rename(_free_name(self.path))
@@ -151,24 +165,29 @@ class CellFolder:
         write_json(self.path / "config.json", config)
         write_json(self.path / "identity.json", identity)
 
-    def _can_go_on(self, identity: Mapping[str, Any]) -> bool:
+    def _can_resume(self, identity: Mapping[str, Any]) -> bool:
         state = self.state().name
         if state != "unfinished" and not (state == "failed" and self.checkpoint.is_file()):
             return False
         try:
             return canonical(self.identity()) == canonical(identity)
         except (StoreError, TypeError, ValueError):
-            # Killed before it had said what it is: nothing in it has begun yet.
-            begun = (self.path / "identity.json", self.checkpoint)
-            return not any(file.exists() for file in begun)
+            # An attempt that was killed before it wrote its identity has not trained anything.
+            written = (self.path / "identity.json", self.checkpoint)
+            return not any(file.exists() for file in written)
 
     def _clear(self) -> None:
         for entry in self.path.iterdir():
-            if entry.name not in _GOES_ON_WITH or entry.is_symlink():
+            if entry.name not in _KEPT_ON_RESUME or entry.is_symlink():
                 untrusted.remove(entry)
 
     def finish(self, views: Sequence[str], protocol: int) -> None:
-        """Declare the cell done: its files are those that lie here now, without the checkpoint."""
+        """Declare the cell done, with the files that are in the folder now.
+
+        Args:
+            views: Names of the test views, in the order of `scores.csv`.
+            protocol: Version of the evaluation protocol.
+        """
         files = {
             file.relative_to(self.path).as_posix(): {
                 "bytes": file.stat().st_size,
@@ -186,14 +205,21 @@ class CellFolder:
                 "files": files,
             }
         )
-        self.drop_checkpoint()  # last: until it is done, the cell may need it
+        self.drop_checkpoint()  # after the status: a cell that is killed before needs it
 
     def drop_checkpoint(self) -> None:
-        """Remove what a finished cell needs no more, whoever was killed before doing so."""
+        """Remove the checkpoint, which a finished cell no longer needs.
+
+        `finish` does this too, but its process may be killed in between.
+        """
         self.checkpoint.unlink(missing_ok=True)
 
     def fail(self, reason: str) -> None:
-        """Declare the cell failed; `error.txt` is there even where it died without a word."""
+        """Declare the cell failed, and write `error.txt` if its process did not.
+
+        Args:
+            reason: Why it failed, for the status and for people.
+        """
         error = self.path / "error.txt"
         if not error.exists():
             write_text(error, f"{reason}\n")
@@ -204,23 +230,35 @@ class CellFolder:
         write_json(self.status, status)
 
     def identity(self) -> dict[str, Any]:
-        """What the cell's id is the digest of."""
+        """Return the values that the cell's id is the digest of.
+
+        Raises:
+            StoreError: `identity.json` is missing or malformed.
+        """
         return read_object(self.path / "identity.json")
 
     def summary(self) -> dict[str, Any]:
-        """The efficiency figures of the whole cell."""
+        """Return the figures of the whole cell: training time, Gaussians, memory and others.
+
+        Raises:
+            StoreError: `summary.json` is missing or malformed.
+        """
         return read_object(self.path / "summary.json")
 
     def provenance(self) -> dict[str, Any]:
-        """Where, when and with what the cell was run."""
+        """Return where, when and with which software the cell was trained.
+
+        Raises:
+            StoreError: `provenance.json` is missing or malformed.
+        """
         return read_object(self.path / "provenance.json")
 
     def history(self) -> pd.DataFrame:
-        """One row a logged step.
+        """Return the training history, one row per logged step.
 
         Raises:
-            OSError: it can't be read.
-            ValueError: it is no table.
+            OSError: `history.csv` can't be read.
+            ValueError: `history.csv` is not a table.
         """
         import pandas as pd
 
@@ -228,16 +266,19 @@ class CellFolder:
 
 
 def _size(file: str) -> int:
-    """Bytes of a regular file, -1 of anything else. A text, for a store asks it of thousands."""
+    """Return the bytes of a regular file, -1 for anything else.
+
+    It takes a string: making a `Path` for each of a store's files would take longer than this.
+    """
     try:
-        found = os.lstat(file)
+        status = os.lstat(file)
     except OSError:
         return -1
-    return found.st_size if stat.S_ISREG(found.st_mode) else -1
+    return status.st_size if stat.S_ISREG(status.st_mode) else -1
 
 
 def _free_name(path: Path) -> Path:
-    """A sibling that does not exist: `<name>.aside-1`, `-2`, ..."""
+    """Return the first sibling that does not exist: `<name>.aside-1`, `<name>.aside-2`, ..."""
     number = 1
     while (free := path.with_name(f"{path.name}.aside-{number}")).exists():
         number += 1
@@ -246,64 +287,76 @@ def _free_name(path: Path) -> Path:
 
 @dataclass(frozen=True)
 class Store:
-    """Everything that is kept, under one folder."""
+    """A store: everything that sweeps keep, in one folder."""
 
     path: Path
+    """The folder."""
 
     @property
     def scenes(self) -> Path:
-        """Embedded scenes, rendered."""
+        """Folder of the rendered photographs of procedural scenes."""
         return self.path / "scenes"
 
     @property
     def variants(self) -> Path:
-        """Frozen variants."""
+        """Folder of the frozen variants."""
         return self.path / "variants"
 
     @property
     def cells(self) -> Path:
-        """Results."""
+        """Folder of the cells."""
         return self.path / "cells"
 
     @property
     def locks(self) -> Path:
-        """Of the cells that are being trained."""
+        """Folder of the locks of cells that are being trained."""
         return self.path / "locks"
 
     @property
     def reports(self) -> Path:
-        """Tables and figures."""
+        """Folder of the reports: tables and figures."""
         return self.path / "reports"
 
     def prepare(self) -> None:
-        """Make the folders, and see that there is room to write.
+        """Create the subfolders, and check that the disk has room.
 
         Raises:
-            StoreError: the folder can't be written; the message names it and the `store` key.
+            StoreError: The folder can't be written; the message names it and the `store` key.
         """
         try:
             folders = (self.scenes, self.variants, self.cells, self.locks, self.path / "sweeps")
             for folder in folders:
                 folder.mkdir(parents=True, exist_ok=True)
             with tempfile.TemporaryFile(dir=self.path) as file:
-                file.write(bytes(_ROOM))
+                file.write(bytes(_MIN_FREE_BYTES))
         except OSError as error:
             raise StoreError(
-                f"store={self.path} can't be written ({error}): name another with store=..."
+                f"store={self.path} can't be written ({error}): choose another with store=..."
             ) from error
 
     def cell(self, cell_id: str) -> CellFolder:
-        """The folder of a cell, which need not exist.
+        """Return the folder of a cell, which need not exist.
+
+        Args:
+            cell_id: The cell's id.
 
         Raises:
-            StoreError: that can't be the id of a cell.
+            StoreError: The id is not a valid name of a folder.
         """
         if not untrusted.is_name(cell_id):
-            raise StoreError(f"{cell_id!r:.80}: no id of a cell")
+            raise StoreError(f"{cell_id!r:.80} is not the id of a cell")
         return CellFolder(self.cells / cell_id)
 
     def write_sweep(self, command: Sequence[str], cells: Iterable[Mapping[str, Any]]) -> str:
-        """Keep what a sweep compared, for its report. The same comparison gives the same id."""
+        """Record which cells a sweep compared, for its report.
+
+        Args:
+            command: Arguments of `xrgs-sweep`.
+            cells: One row for each cell, as `xrgs.sweep.plan.record` makes them.
+
+        Returns:
+            The id of the record; the same rows give the same id.
+        """
         rows = [dict(cell) for cell in cells]
         sweep_id = digest(rows)
         record = {"version": _RECORD_VERSION, "command": list(command), "cells": rows}
@@ -311,10 +364,10 @@ class Store:
         return sweep_id
 
     def latest_sweep(self) -> str:
-        """The id of the sweep recorded last.
+        """Return the id of the sweep that was recorded last.
 
         Raises:
-            StoreError: there is none.
+            StoreError: The store has no record of a sweep.
         """
         records = list((self.path / "sweeps").glob("*.json"))
         if not records:
@@ -322,24 +375,30 @@ class Store:
         return max(records, key=lambda file: (file.stat().st_mtime_ns, file.name)).stem
 
     def sweep_record(self, sweep_id: str | None = None) -> dict[str, Any]:
-        """What a sweep compared; the latest one where no id is given.
+        """Return the record of a sweep.
+
+        Args:
+            sweep_id: The id of the record; None for the latest.
+
+        Returns:
+            `version`, `command` (the arguments of `xrgs-sweep`) and `cells` (one row per cell).
 
         Raises:
-            StoreError: there is no such sweep, or its record is of another version.
+            StoreError: There is no such record, or it is malformed or of another version.
         """
         sweep_id = sweep_id or self.latest_sweep()
         if not untrusted.is_name(sweep_id):
-            raise StoreError(f"{sweep_id!r:.80}: no id of a sweep")
+            raise StoreError(f"{sweep_id!r:.80} is not the id of a sweep")
         file = self.path / "sweeps" / f"{sweep_id}.json"
         record = read_json(file)
         if not isinstance(record, dict) or record.get("version") != _RECORD_VERSION:
-            raise StoreError(f"{file}: not a sweep record of version {_RECORD_VERSION}")
+            raise StoreError(f"{file} is not a sweep record of version {_RECORD_VERSION}")
         command, cells = record.get("command"), record.get("cells")
         if not _is_list(command, str) or not isinstance(cells, list):
-            raise StoreError(f"{file}: no command or no cells")
+            raise StoreError(f"{file}: command or cells is missing or malformed")
         wrong = [number for number, row in enumerate(cells) if not _is_row(row)]
         if wrong:
-            raise StoreError(f"{file}: its cell {wrong[0] + 1} has a value that can't be")
+            raise StoreError(f"{file}: cell {wrong[0] + 1} has a value of a wrong type or form")
         return record
 
 
@@ -348,7 +407,7 @@ def _is_list(value: object, kind: type) -> bool:
 
 
 def _is_row(row: object) -> bool:
-    """Whether what a sweep's record says of a cell is of the right types, as far as it does."""
+    """Return whether the values that a record has for a cell are of the right types."""
     if not isinstance(row, dict):
         return False
     texts = [row.get(key, "") for key in ("scene", "label", "condition")]
@@ -358,5 +417,5 @@ def _is_row(row: object) -> bool:
         _is_list([*texts, error or ""], str)
         and all(one is None or untrusted.is_name(one) for one in ids)
         and type(seed) is int
-        and 0 <= seed <= _MOST_SEED
+        and 0 <= seed <= _MAX_SEED
     )

@@ -21,7 +21,6 @@ if TYPE_CHECKING:
     from xrgs.evaluation.metrics import Metric
     from xrgs.experiment.store import CellFolder, Store
 
-BASELINE = "baseline"
 #: What the rows of a sweep's record hold.
 RECORD_KEYS = (
     "scene",

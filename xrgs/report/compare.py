@@ -18,7 +18,8 @@ import numpy as np
 import pandas as pd
 from scipy.special import stdtrit
 
-from xrgs.report.collect import BASELINE, ReportError
+from xrgs.experiment.store import BASELINE
+from xrgs.report.collect import ReportError
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

@@ -13,7 +13,8 @@ import pandas as pd
 
 from xrgs.capture import images
 from xrgs.capture.images import ImageError
-from xrgs.report.collect import BASELINE, ReportError
+from xrgs.experiment.store import BASELINE
+from xrgs.report.collect import ReportError
 from xrgs.report.figures import Panel, curves, differing_crop, side_by_side, trade_off
 from xrgs.report.tables import titled
 from xrgs.runtime.progress import progress

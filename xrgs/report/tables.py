@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import pandas as pd
 
-from xrgs.report.collect import BASELINE
+from xrgs.experiment.store import BASELINE
 from xrgs.report.render import Grid
 
 if TYPE_CHECKING:

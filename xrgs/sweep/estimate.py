@@ -1,4 +1,4 @@
-"""How long a cell will take, from those that a store holds. Of training alone, on any machine."""
+"""Estimates the training time of a cell from the finished cells of the store."""
 
 from __future__ import annotations
 
@@ -16,44 +16,55 @@ if TYPE_CHECKING:
 
     from xrgs.experiment.store import CellFolder, Store
 
-#: So many finished cells are read, the newest: more would tell little and take long.
-_READ = 500
+#: Number of finished cells that are read, the newest first; more would take long and help little.
+_MAX_CELLS = 500
 
 
 class RuntimeEstimator:
-    """Training times of a store's finished cells, per step, by what they have in common."""
+    """Training times per step of the store's finished cells, grouped by what cells have in common.
+
+    The times are of training alone, on whatever machine a cell was trained.
+    """
 
     def __init__(self, store: Store) -> None:
-        self._times: defaultdict[str, list[float]] = defaultdict(list)
+        """Read the newest cells of a store."""
+        self._seconds_per_step: defaultdict[str, list[float]] = defaultdict(list)
         for cell in _newest(store):
             try:
                 identity, summary = cell.identity(), cell.summary()
-                a_step = summary["training_time_s"] / identity["train"]["steps"]
-                names = _likenesses(identity)
+                seconds = summary["training_time_s"] / identity["train"]["steps"]
+                groups = list(_groups(identity))
             except (StoreError, ArithmeticError, KeyError, TypeError, ValueError):
                 continue
-            for name in names:
-                self._times[name].append(a_step)
+            for group in groups:
+                self._seconds_per_step[group].append(seconds)
 
     @property
     def known(self) -> bool:
-        """Whether there is any finished cell to go by."""
-        return bool(self._times)
+        """Whether the store has a finished cell to go by."""
+        return bool(self._seconds_per_step)
 
     def seconds(self, identity: Mapping[str, Any]) -> float | None:
-        """The mean of the cells that are most like this one; None where there is none at all.
+        """Return the expected training time of a cell.
 
-        Like it are, the first that there are: the same but for seed and code; but for the number
-        of steps too; any of the same variant; any. Times are taken to grow with the steps alone.
+        It is the mean over the most similar cells that exist: those that differ in seed and code
+        only; else those that differ in the number of steps as well; else those of the same variant;
+        else all. Times are taken to be proportional to the number of steps.
+
+        Args:
+            identity: The cell's identity.
+
+        Returns:
+            Seconds; None if there is no finished cell.
         """
-        for name in _likenesses(identity):
-            if name in self._times:
-                return fmean(self._times[name]) * float(identity["train"]["steps"])
+        for group in _groups(identity):
+            if group in self._seconds_per_step:
+                return fmean(self._seconds_per_step[group]) * float(identity["train"]["steps"])
         return None
 
 
-def _likenesses(identity: Mapping[str, Any]) -> Iterator[str]:
-    """What cells may have in common with this one, from the most to the least."""
+def _groups(identity: Mapping[str, Any]) -> Iterator[str]:
+    """Yield the keys of the groups that a cell belongs to, from the most to the least similar."""
     program = {key: identity[key] for key in ("splat", "components", "variant")}
     yield canonical(program | {"train": identity["train"]})
     yield canonical(program | {"views": identity["train"]["views"]})
@@ -64,8 +75,9 @@ def _likenesses(identity: Mapping[str, Any]) -> Iterator[str]:
 def _newest(store: Store) -> list[CellFolder]:
     try:
         with os.scandir(store.cells) as entries:
-            found = [entry for entry in entries if "." not in entry.name]  # none set aside
-            ids = [(entry.stat().st_mtime, entry.name) for entry in found]
+            # Names with a dot are of folders that were set aside, and of reruns.
+            cells = [entry for entry in entries if "." not in entry.name]
+            ids = [(entry.stat().st_mtime, entry.name) for entry in cells]
     except OSError:
         return []
-    return [store.cell(name) for _, name in heapq.nlargest(_READ, ids)]
+    return [store.cell(name) for _, name in heapq.nlargest(_MAX_CELLS, ids)]

@@ -1,9 +1,9 @@
-"""The way of a sweep's cells to Hydra's launcher, whichever is configured, and what may go wrong.
+"""Hands a sweep's cells to Hydra's launcher, whichever is configured, and copes with its failures.
 
-A launcher runs its jobs here or elsewhere, in processes with a working folder of their own. So a
-job is told what it can't find out there: its folders by their full paths, the rasterizer, and its
-share of the cores. What has become of a cell is read in the store: a launcher that breaks takes
-its answers along, and not the sweep.
+A launcher runs jobs here or elsewhere, in processes with a working folder of their own. A job is
+given the session's folder and the id of its cell; the session's folder holds the config, with full
+paths, the rasterizer and the job's share of the cores. What has become of a cell is read from the
+store: a launcher that breaks loses its answers, but not the sweep.
 """
 
 from __future__ import annotations
@@ -13,69 +13,81 @@ import time
 from collections import Counter
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
-from hydra.core.override_parser.types import Quote, QuotedString
 from hydra.core.plugins import Plugins
+from hydra.types import HydraContext
 from omegaconf import OmegaConf, flag_override
 
 from xrgs.errors import XrgsError
 from xrgs.runtime.machine import usable_cores
 from xrgs.runtime.progress import say
+from xrgs.safeio.hashing import plain
 from xrgs.splat.backend import resolve_backend
 from xrgs.sweep import locks
 from xrgs.sweep.jobs import worker
-from xrgs.sweep.jobs.job import STOPPED, SweepSession
-from xrgs.sweep.plan import length
+from xrgs.sweep.jobs.job import STOPPED
+from xrgs.sweep.plan import expected_length
+from xrgs.sweep.session import HandOver, SweepSession
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping, Sequence
 
+    from hydra.core.config_loader import ConfigLoader
     from hydra.core.utils import JobReturn
-    from hydra.types import HydraContext, TaskFunction
+    from hydra.types import TaskFunction
     from omegaconf import DictConfig
 
     from xrgs.experiment.store import Store
-    from xrgs.sweep.plan import Planned
+    from xrgs.sweep.plan import PlannedCell
 
-#: What a job ends with beside what `xrgs.sweep.jobs.job` says: its launcher gave no answer for it.
+#: Outcome of a job whose launcher gave no answer; the cell may be launched again.
 LOST = "lost"
-#: A cell that was begun and lost so many times is left.
-_LOSSES = 3
-#: Seconds between looks at jobs that a broken launcher has left behind.
-_LOOK_S = 2.0
+#: A cell that was begun and lost so many times is not launched again.
+_MAX_LOSSES = 3
+#: Seconds between two polls of jobs that a broken launcher has left behind.
+_POLL_S = 2.0
 
 
 @dataclass(frozen=True)
 class Capacity:
-    """What a launcher does with the jobs of one launch."""
+    """How many jobs a launcher runs, and with how many cores."""
 
     at_once: int | None = None
-    """How many it runs at the same time on this machine; None where that is its own affair."""
+    """Jobs that run at the same time on this machine; None if the launcher decides."""
     cores: int = 0
-    """Of a job; 0 divides this machine's among those that run at once, or leaves it to the job."""
+    """Cores of a job; 0 divides this machine's cores among the jobs that run at the same time, or
+    leaves the number to the job."""
     batch: int | None = None
-    """How many it may be given in one launch; None for any number."""
+    """Jobs that may be given to the launcher at once; None for any number."""
     settings: Mapping[str, Any] = field(default_factory=dict)
-    """Its own settings that say so, by their keys in `hydra.launcher`."""
+    """Settings of the launcher that follow from this, by their keys in `hydra.launcher`."""
 
     def threads(self, jobs: int, machine: int) -> int:
-        """Threads of each of `jobs` jobs on a machine of so many cores; 0 lets the job find out."""
+        """Return the threads of a job.
+
+        Args:
+            jobs: Number of jobs of the batch.
+            machine: Cores of this machine.
+
+        Returns:
+            Number of threads; 0 lets the job use every core that it finds.
+        """
         if self.cores or self.at_once is None:
             return self.cores
         return max(1, machine // min(self.at_once, jobs))
 
 
 def capacity(launcher: DictConfig, threads: int, machine: int) -> Capacity:
-    """What a launcher is to do, from its configuration.
+    """Return how many jobs a launcher is to run at once, from its configuration.
 
     Args:
         launcher: `hydra.launcher`.
-        threads: of a cell, as the user wants them; 0 for no wish.
-        machine: cores that may be used here.
+        threads: Threads of a cell that the user asks for; 0 for no preference.
+        machine: Cores that this process may use.
 
     Raises:
-        XrgsError: the launcher's configuration makes no sense.
+        XrgsError: The launcher's configuration is invalid.
     """
     kind = str(launcher["_target_"]).rpartition(".")[2]
     if kind == "BasicLauncher":
@@ -83,15 +95,16 @@ def capacity(launcher: DictConfig, threads: int, machine: int) -> Capacity:
     if kind == "JoblibLauncher":
         jobs = int(launcher["n_jobs"])
         if jobs == 0:
-            raise XrgsError("hydra.launcher.n_jobs=0: say how many cells to run at once")
-        if jobs < 0:  # joblib's -1 is one for each core, -2 leaves a core free
+            raise XrgsError("hydra.launcher.n_jobs=0: give the number of cells to train at once")
+        if jobs < 0:  # joblib's -1 means one job per core, -2 one fewer
             jobs = max(1, (machine + 1 + jobs) // max(1, threads))
-        # Cells that are found done end at once, from which joblib would learn to hand out several.
+        # Cells that turn out to be done end at once; from such short jobs joblib would learn to
+        # hand several jobs to a worker in one batch, which then run one after another.
         return Capacity(jobs, threads, settings={"n_jobs": jobs, "batch_size": 1})
     if kind == "LocalLauncher":
         cores = launcher["cpus_per_task"] or threads
         jobs = max(1, machine // max(1, cores))
-        return Capacity(jobs, cores, batch=jobs)  # submitit starts all that it is given at once
+        return Capacity(jobs, cores, batch=jobs)  # submitit starts every job of a batch at once
     if kind == "SlurmLauncher":
         cores = launcher["cpus_per_task"] or threads or 1
         return Capacity(cores=cores, settings={"cpus_per_task": cores})
@@ -102,14 +115,14 @@ def capacity(launcher: DictConfig, threads: int, machine: int) -> Capacity:
 
 
 def check(config: DictConfig, cell: DictConfig | None = None) -> None:
-    """That there is a launcher, and that a cell does not ask for another one.
+    """Refuse a launcher that is not installed, and one that is chosen for a single cell.
 
     Args:
-        config: the sweep's, as composed from the command line.
-        cell: of one cell; Hydra would not look at the launcher that it names.
+        config: The sweep's config, composed from the command line.
+        cell: The config of one cell. Hydra would ignore a launcher that only this one names.
 
     Raises:
-        XrgsError: there is none, or it does.
+        XrgsError: The launcher is not installed, or the cell names another launcher.
     """
     launcher = OmegaConf.to_container(config.hydra.launcher, resolve=False)
     if isinstance(launcher, dict) and "install" in launcher:  # see hydra_plugins/xrgs_sweeper.py
@@ -123,30 +136,65 @@ def check(config: DictConfig, cell: DictConfig | None = None) -> None:
     )
 
 
+class _JobConfigLoader:
+    """Gives each job Hydra's own settings and its cell's id, without composing any config.
+
+    Launchers ask the config loader for a job's config, on the machine that runs the job. The plan
+    has composed the cell's config already, so that Hydra's loader would compose it a second time.
+    """
+
+    def load_sweep_config(self, master_config: DictConfig, overrides: list[str]) -> DictConfig:
+        """Return the config of one job.
+
+        Args:
+            master_config: The sweep's config.
+            overrides: `cell=<cell id>` alone.
+
+        Returns:
+            The sweep's `hydra` node, and `cell`.
+        """
+        config = OmegaConf.masked_copy(master_config, ["hydra"])
+        with flag_override(config, ["readonly", "struct"], False):
+            # As text: an id of digits alone, or like 12e4567..., would be parsed as a number.
+            config.cell = overrides[0].removeprefix("cell=")
+        with flag_override(config.hydra, ["readonly", "struct"], False):
+            config.hydra.overrides.task = list(overrides)
+            config.hydra.job.override_dirname = ",".join(overrides)
+        OmegaConf.set_readonly(config.hydra, False)
+        return config
+
+
 class Launches:
     """The launches of one call of `xrgs-sweep`."""
 
     def __init__(self, context: HydraContext, task: TaskFunction, config: DictConfig) -> None:
+        """Prepare to launch; nothing is written before the first launch.
+
+        Args:
+            context: Hydra's context of this call.
+            task: The function that Hydra calls for each job.
+            config: The sweep's config, with its `hydra` node.
+        """
         self._name = str(config.hydra.runtime.choices["hydra/launcher"])
-        self._context, self._task = context, task
+        loader = cast("ConfigLoader", _JobConfigLoader())  # launchers call nothing else of it
+        self._context = HydraContext(loader, context.callbacks)
+        self._task = task
         self._config = copy.deepcopy(config)
-        self._call: SweepSession | None = None
+        self._session: SweepSession | None = None
         self._jobs = 0
         self._losses: Counter[str] = Counter()
         self._suspects: set[str] = set()
 
     def _begin(self) -> SweepSession:
-        """This call, in a folder whose name is the same everywhere.
+        """Create the session's folder, under a name that is the same for every job.
 
-        A job composes its config anew: `now` is another time there, and `.` another folder.
+        In a job on another machine `now` would be another time, and `.` another folder.
         """
-        folder = _folder_of_its_own(Path(self._config.hydra.sweep.dir).absolute())
-        self._set("sweep.dir", _literal(folder))
-        given = self._config.hydra.overrides.hydra
-        self._set("overrides.hydra", [*given, f"hydra.sweep.dir={_quoted(folder)}"])
-        call = SweepSession(folder)
-        call.begin()
-        return call
+        folder = _create_unique(Path(self._config.hydra.sweep.dir).absolute())
+        self._set("sweep.dir", str(folder).replace("${", r"\${"))  # no interpolation begins there
+        session = SweepSession(folder)
+        session.begin()
+        return session
 
     def _set(self, key: str, value: Any) -> None:
         with flag_override(self._config.hydra, ["readonly", "struct"], False):
@@ -154,35 +202,39 @@ class Launches:
 
     @property
     def stopped(self) -> str:
-        """Why no job begins any more; empty while they may."""
-        return self._call.stopped if self._call else ""
+        """Why no further job may begin; empty while they may."""
+        return self._session.stopped if self._session else ""
 
-    def run(self, cells: Iterable[Planned], store: Store) -> dict[str, str]:
-        """Run cells that have an identity, the longest first.
+    def launch(self, cells: Iterable[PlannedCell], store: Store) -> dict[str, str]:
+        """Launch cells that have an identity, the longest first, and wait for them.
+
+        Args:
+            cells: The cells.
+            store: The store.
 
         Returns:
-            What each cell's job ended with, by the cell's id: what `run_job` returned, or `LOST`
-            where it may be tried again, or the state in which its last loss left it.
+            The outcome of each cell's job by the cell's id: what `run_job` returned, or `LOST` if
+            the cell may be launched again, or the state in which its last loss left it.
 
         Raises:
-            XrgsError: the launcher can't be used, or begins nothing.
+            XrgsError: The launcher can't be used, or begins no job.
         """
-        self._call = call = self._call or self._begin()
-        cells = sorted(cells, key=length, reverse=True)
+        self._session = session = self._session or self._begin()
+        cells = sorted(cells, key=expected_length, reverse=True)
         threads, machine = max(cell.conf.threads for cell in cells), usable_cores()
         allowed = capacity(self._config.hydra.launcher, threads, machine)
         for key, value in allowed.settings.items():
             self._set(f"launcher.{key}", value)
         outcomes: dict[str, str] = {}
         for batch in self._batches(cells, allowed.batch or len(cells)):
-            if call.stopped:
+            if session.stopped:
                 outcomes |= {str(cell.cell_id): STOPPED for cell in batch}
                 continue
-            outcomes |= self._launch(batch, allowed.threads(len(batch), machine), store)
+            outcomes |= self._launch_batch(batch, allowed.threads(len(batch), machine), store)
         return outcomes
 
-    def _batches(self, cells: Sequence[Planned], size: int) -> list[Sequence[Planned]]:
-        """Suspects come last and alone: one of them may have been the others' undoing."""
+    def _batches(self, cells: Sequence[PlannedCell], size: int) -> list[Sequence[PlannedCell]]:
+        """Divide cells into batches; suspects of having broken a launcher come last, alone."""
         others = [cell for cell in cells if cell.cell_id not in self._suspects]
         suspects = [cell for cell in cells if cell.cell_id in self._suspects]
         return [
@@ -190,66 +242,76 @@ class Launches:
             *([cell] for cell in suspects),
         ]
 
-    def _launch(self, cells: Sequence[Planned], threads: int, store: Store) -> dict[str, str]:
+    def _launch_batch(
+        self, cells: Sequence[PlannedCell], threads: int, store: Store
+    ) -> dict[str, str]:
         if self._name != "basic":
             say(f"hydra/launcher={self._name}: {len(cells)} cells, threads={threads} each")
+        session = cast("SweepSession", self._session)
+        overrides = [[f"cell={session.hand_over(_job_of(cell, threads))}"] for cell in cells]
         first, self._jobs = self._jobs, self._jobs + len(cells)
         try:
             launcher = Plugins.instance().instantiate_launcher(
                 hydra_context=self._context, task_function=self._task, config=self._config
             )
-            done = launcher.launch([_overrides(cell, threads) for cell in cells], first)
+            returned = launcher.launch(overrides, first)
         except Exception as error:
-            return self._lost(cells, error, store)
+            return self._after_loss(cells, error, store)
         return {
             str(cell.cell_id): self._outcome(cell, job, store)
-            for cell, job in zip(cells, done, strict=True)
+            for cell, job in zip(cells, returned, strict=True)
         }
 
-    def _outcome(self, cell: Planned, job: JobReturn, store: Store) -> str:
-        """What `run_job` returned. Where it raised, that is its cell's alone.
+    def _outcome(self, cell: PlannedCell, job: JobReturn, store: Store) -> str:
+        """Return what `run_job` returned. An exception in a job concerns its own cell alone.
 
-        submitit raises in a job at the end of its time, when it has started it again often enough.
+        submitit raises in a job that ran out of time, when it has been requeued often enough.
         """
         try:
             return str(job.return_value)
         except Exception as error:
-            say(f"{cell.name}: {_line(error)}")
+            say(f"{cell.name}: {_first_line(error)}")
         state = store.cell(str(cell.cell_id)).state().name
-        return self._unanswered(str(cell.cell_id), state) if state == "unfinished" else "failed"
+        return self._after_silence(str(cell.cell_id), state) if state == "unfinished" else "failed"
 
-    def _unanswered(self, cell_id: str, state: str) -> str:
-        """What a cell's job ended with, by the state that it left the cell in."""
+    def _after_silence(self, cell_id: str, state: str) -> str:
+        """Return the outcome of a job that gave no answer, from the state it left its cell in."""
         self._losses[cell_id] += state == "unfinished"
-        ended = state in {"done", "failed"} or self._losses[cell_id] >= _LOSSES
+        ended = state in {"done", "failed"} or self._losses[cell_id] >= _MAX_LOSSES
         return state if ended else LOST
 
-    def _lost(self, cells: Sequence[Planned], error: Exception, store: Store) -> dict[str, str]:
-        """What has become of cells whose launcher broke: it dropped those it had not begun too."""
-        reason = f"hydra/launcher={self._name}: {_line(error)}"
-        were = {str(cell.cell_id): cell.state.name for cell in cells}
-        while were.keys() & locks.holders(store.locks).keys():
-            time.sleep(_LOOK_S)  # jobs that outlive it have their cores still
-        states = {cell_id: store.cell(cell_id).state().name for cell_id in were}
-        if all(states[cell_id] in {were[cell_id], "absent"} - {"unfinished"} for cell_id in were):
-            raise XrgsError(f"{reason}\nIt began no cell.") from error
+    def _after_loss(
+        self, cells: Sequence[PlannedCell], error: Exception, store: Store
+    ) -> dict[str, str]:
+        """Return the outcomes of a batch whose launcher broke, begun or not."""
+        reason = f"hydra/launcher={self._name}: {_first_line(error)}"
+        before = {str(cell.cell_id): cell.state.name for cell in cells}
+        while before.keys() & locks.holders(store.locks).keys():
+            time.sleep(_POLL_S)  # jobs that outlive their launcher still use their cores
+        states = {cell_id: store.cell(cell_id).state().name for cell_id in before}
+        unchanged = {
+            cell_id: state != "unfinished" and state in {before[cell_id], "absent"}
+            for cell_id, state in states.items()
+        }
+        if all(unchanged.values()):
+            raise XrgsError(f"{reason}\nThe launcher began no cell.") from error
         self._suspects |= {cell_id for cell_id in states if states[cell_id] == "unfinished"}
-        outcomes = {cell_id: self._unanswered(cell_id, state) for cell_id, state in states.items()}
-        say(f"{reason}\nof its {len(cells)} cells are left:")
+        outcomes = {cell: self._after_silence(cell, state) for cell, state in states.items()}
+        say(f"{reason}\nof its {len(cells)} cells these are not finished:")
         for cell in cells:
             outcome, state = outcomes[str(cell.cell_id)], states[str(cell.cell_id)]
             if state not in {"done", "failed"}:
-                way = state if outcome == LOST else f"lost {_LOSSES} times, not tried again"
-                say(f"  {cell.cell_id}  {cell.name}  ({way})")
+                note = state if outcome == LOST else f"lost {_MAX_LOSSES} times, not tried again"
+                say(f"  {cell.cell_id}  {cell.name}  ({note})")
         return outcomes
 
 
-def _line(error: Exception) -> str:
+def _first_line(error: Exception) -> str:
     return f"{type(error).__name__}: {str(error).strip().partition(chr(10))[0]}"
 
 
-def _folder_of_its_own(wanted: Path) -> Path:
-    """The folder made, or one beside it: another call may have it, by the clock or by its name."""
+def _create_unique(wanted: Path) -> Path:
+    """Create a folder, or one with a number appended if another call has it already."""
     number, folder = 1, wanted
     while True:
         try:
@@ -265,24 +327,14 @@ def _folder_of_its_own(wanted: Path) -> Path:
             return folder
 
 
-def _literal(path: Path) -> str:
-    """A path as a value of a config, where `${` would begin an interpolation."""
-    return str(path).replace("${", r"\${")
-
-
-def _quoted(path: Path) -> str:
-    """A path as a value of Hydra's command line."""
-    return QuotedString(_literal(path), Quote.single).with_quotes()
-
-
-def _overrides(cell: Planned, threads: int) -> list[str]:
-    """A cell's, and what a job elsewhere would not find by itself."""
-    conf = cell.conf
-    told = {
-        "store": _quoted(Path(conf.store).absolute()),
-        "splat.backend": resolve_backend(conf.splat.backend),
-        "threads": str(conf.threads or threads),
-    }
-    if conf.scene.path:
-        told["scene.path"] = _quoted(Path(conf.scene.path).expanduser().absolute())
-    return [*cell.wish.overrides, *(f"{key}={value}" for key, value in told.items())]
+def _job_of(cell: PlannedCell, threads: int) -> HandOver:
+    """Return what a job on any machine needs: paths in full, the backend chosen, its threads."""
+    if cell.identity is None:
+        raise ValueError(f"{cell.name}: launched without an identity")
+    conf = plain(cell.conf)
+    conf["store"] = str(Path(cell.conf.store).absolute())
+    conf["splat"]["backend"] = resolve_backend(cell.conf.splat.backend)
+    conf["threads"] = cell.conf.threads or threads
+    if cell.conf.scene.path:
+        conf["scene"]["path"] = str(Path(cell.conf.scene.path).expanduser().absolute())
+    return HandOver(cell.name, conf, cell.identity)

@@ -1,14 +1,14 @@
-"""One owner for each cell: locks that are files alone, for sweeps on several machines.
+"""Locks that are plain files: each cell has one owner, for sweeps on several machines.
 
-A lock is the file `<name>.<generation>`, made with O_CREAT | O_EXCL, which local disks, NFS from
-version 3 on, SMB and the cluster file systems do atomically. Nothing rests on flock, which not all
-of them carry from one machine to another. Who finds a dead owner's lock makes the next generation:
-one of any number succeeds, and nobody deletes what another may just have made. The owner touches
-its file as a sign of life.
+A lock is the file `<name>.<generation>`, created with O_CREAT | O_EXCL. That is atomic on local
+disks, NFS from version 3 on, SMB and the cluster file systems; flock is not used, because not all
+of them pass it on from one machine to another. A process that finds the lock of a dead owner
+creates the next generation: of any number of contenders one succeeds, and none deletes a file that
+another has just created. The owner touches its file regularly as a sign of life (its heartbeat).
 
 An owner in the same place (host name, boot and process namespace) is alive as long as its process
-runs, stopped or not. One elsewhere is alive as long as its sign is younger than `SILENT_S`; both
-times are the file server's, so that clocks that differ do no harm.
+exists, suspended or not. An owner elsewhere is alive as long as its last heartbeat is younger than
+`SILENT_S`. Both times are the file server's, so that clocks that differ do no harm.
 """
 
 from __future__ import annotations
@@ -26,40 +26,45 @@ from pathlib import Path
 from xrgs.safeio import untrusted
 from xrgs.safeio.atomic import write_json
 
-#: Seconds from one sign of life to the next, and after how many without one an owner elsewhere is
-#: taken for dead.
+#: Seconds between two heartbeats, and seconds without one after which an owner on another machine
+#: is taken for dead.
 BEAT_S = 30.0
 SILENT_S = 600.0
-#: Seconds that a lock may be without an owner's name. Who makes one writes it at once, and looks
-#: for others after that: one that was killed or suspended in between holds nothing yet.
-_NAMELESS_S = 30.0
+#: Seconds that a lock file may be without its owner's signature. Its creator writes the signature
+#: at once and looks for other owners only then: if it was killed or suspended in between, it does
+#: not hold the lock yet.
+_UNSIGNED_S = 30.0
 
 
 @dataclass(frozen=True)
 class Owner:
-    """Who holds a lock."""
+    """The process that holds a lock, as its signature in the file names it."""
 
     host: str
+    """Name of its machine."""
     boot: str
-    """Of the machine and of the process namespace: process numbers mean something within both."""
+    """Id of the machine's boot and of the process namespace; process ids are valid within both."""
     pid: int
+    """Its process id."""
     started: int
-    """Of the process, clock ticks since boot: numbers are given again. 0 where it is not known."""
+    """When the process started, clock ticks since boot, since process ids are reused; 0 if unknown.
+    """
     worker: int = 0
-    """The process that works under the lock, 0 where there is none: it may outlive for a moment
-    the one that holds it, and write to what the next one has begun."""
+    """Id of the child process that works under the lock, 0 if there is none. It may outlive the
+    owner for a moment, and would then write to the files of the next owner."""
     worker_started: int = 0
+    """When the child process started, as for `started`."""
 
     @property
     def lives(self) -> bool:
-        """Whether one of its processes runs, stopped or not; to be asked where they would run."""
+        """Whether one of its processes exists, suspended or not; only valid if it is `here`."""
         if _start(self.pid) == self.started:
             return True
         return bool(self.worker) and _start(self.worker) == self.worker_started
 
     @property
     def here(self) -> bool:
-        """Whether its processes would run in this place."""
+        """Whether its processes would run on this machine, boot and process namespace."""
         return (self.host, self.boot) == (socket.gethostname(), _boot())
 
     def __str__(self) -> str:
@@ -71,18 +76,22 @@ class Lock:
     """A lock that this process holds until `release`."""
 
     path: Path
+    """The lock's file."""
     beaten: float
+    """When the last heartbeat was given, seconds of the monotonic clock."""
     owner: Owner
+    """The signature of this process in the file."""
 
     def beat(self, worker: int = 0) -> bool:
-        """Give a sign of life if one is due.
+        """Give a heartbeat if one is due.
 
         Args:
-            worker: the process that works under the lock, if any; from now on it holds it as well.
+            worker: Id of the child process that works under the lock, 0 if there is none. From now
+                on the child is an owner as well.
 
         Returns:
-            False where the lock is lost: this process gave none for so long, suspended or cut off
-            from the store, that another has taken over.
+            False if the lock is lost: this process was suspended or cut off from the store for so
+            long that another one has taken over.
         """
         known = worker == self.owner.worker
         if known and time.monotonic() - self.beaten < BEAT_S:
@@ -100,68 +109,92 @@ class Lock:
             last = max(_generations(self.path.parent, name), default=generation)
         except FileNotFoundError:
             return False
-        except OSError:  # the store is out of reach for now: whether for too long, it will tell
+        except OSError:  # the store is out of reach for now; a later heartbeat decides
             return True
         return last == generation
 
     def release(self) -> None:
-        """Let the next one have it."""
-        with suppress(OSError):  # left behind, it dies with this process
-            if signature(self.path) == self.owner:  # not the next one's, where this one was lost
+        """Release the lock, unless it was lost to another owner."""
+        with suppress(OSError):  # a file that is left behind is dead when this process has ended
+            if signature(self.path) == self.owner:
                 self.path.unlink()
 
 
 def acquire(folder: Path, name: str) -> Lock | None:
-    """The lock `name` in a folder, or None where a living owner has it.
+    """Take a lock, unless a living owner holds it.
+
+    Args:
+        folder: The folder of the locks.
+        name: The lock's name.
+
+    Returns:
+        The lock; None if a living owner holds it.
 
     Raises:
-        OSError: the folder can't be written.
+        OSError: The folder can't be written.
     """
     while True:
-        found = _generations(folder, name)
-        if any(_living(file) for file in found.values()):
+        files = _generations(folder, name)
+        if any(_living(file) for file in files.values()):
             return None
-        file = folder / f"{name}.{max(found, default=-1) + 1}"
+        file = folder / f"{name}.{max(files, default=-1) + 1}"
         try:
             owner = sign(file)
         except FileExistsError:
-            continue  # another was quicker: look again
-        # What was listed above may be long past: whoever came meanwhile is seen here, and of two
-        # at least one sees the other. Both giving way costs nothing but another try.
+            continue  # another contender was faster: list the files again
+        # The list above may be outdated. A contender that came since is found by listing once more:
+        # of two, at least one sees the other. If both give way, nothing is lost but a try.
         others = [other for other in _generations(folder, name).values() if other != file]
-        seen = [(other, _living(other)) for other in others]
-        if any(living for _, living in seen):
+        checked = [(other, _living(other)) for other in others]
+        if any(living for _, living in checked):
             file.unlink(missing_ok=True)
             return None
-        for other, living in seen:
-            if living is False:  # one that is gone may have been made anew, by the living
+        for other, living in checked:
+            if living is False:  # None is a released lock, which may exist again, with a new owner
                 other.unlink(missing_ok=True)
         return Lock(file, time.monotonic(), owner)
 
 
 def names(folder: Path) -> set[str]:
-    """Of the locks in a folder, of the living and the dead."""
+    """Return the names of all locks in a folder, whether their owners are alive or not.
+
+    Args:
+        folder: The folder of the locks.
+    """
     return {file.stem for file in folder.iterdir() if file.suffix[1:].isdecimal()}
 
 
-def holders(folder: Path) -> dict[str, Owner | None]:
-    """The living owner of every lock in a folder; None where it has not said yet who it is."""
+def holders(folder: Path) -> dict[str, str]:
+    """Return a description of the living owner of each lock in a folder.
+
+    Args:
+        folder: The folder of the locks, which need not exist.
+
+    Returns:
+        Descriptions for people, by the name of the lock.
+    """
     try:
         files = [Path(entry.path) for entry in os.scandir(folder)]
     except OSError:
         return {}
     return {
-        _parts(file)[0]: signature(file)
+        _parts(file)[0]: str(signature(file) or "a process that has not signed its lock yet")
         for file in files
         if file.suffix[1:].isdecimal() and _living(file)
     }
 
 
 def sign(file: Path) -> Owner:
-    """Make the file and say in it whose it is: this process's.
+    """Create a file that names this process as its owner.
+
+    Args:
+        file: The file.
+
+    Returns:
+        The signature that was written.
 
     Raises:
-        FileExistsError: it is there.
+        FileExistsError: The file exists.
     """
     owner = _self()
     with file.open("x", encoding="utf-8") as stream:
@@ -175,31 +208,36 @@ def sign(file: Path) -> Owner:
 
 
 def signature(file: Path) -> Owner | None:
-    """Whose file it is; None where it does not say."""
+    """Return the owner that a file names; None if it does not name one.
+
+    Args:
+        file: A file that `sign` has created.
+    """
     try:
         owner = Owner(**untrusted.parse_json(untrusted.read_bytes(file)))
     except (OSError, ValueError, TypeError):
         return None
     texts = {"host", "boot"}
-    right = all(type(v) is (str if k in texts else int) for k, v in vars(owner).items())
-    return owner if right else None
+    valid = all(type(v) is (str if k in texts else int) for k, v in vars(owner).items())
+    return owner if valid else None
 
 
 def _parts(file: Path) -> tuple[str, int]:
+    """Return the name and the generation of a lock's file."""
     return file.stem, int(file.suffix[1:])
 
 
 def _generations(folder: Path, name: str) -> dict[int, Path]:
-    found = (file for file in folder.iterdir() if file.stem == name)
-    return {_parts(file)[1]: file for file in found if file.suffix[1:].isdecimal()}
+    files = (file for file in folder.iterdir() if file.stem == name)
+    return {_parts(file)[1]: file for file in files if file.suffix[1:].isdecimal()}
 
 
 def _living(file: Path) -> bool | None:
-    """Whether a lock's owner is; None where it has released it since, as the living do."""
+    """Return whether a lock's owner is alive; None if the lock was released meanwhile."""
     owner = signature(file)
     if owner is not None and owner.here:
         return owner.lives or (False if signature(file) == owner else None)
-    silent = _NAMELESS_S if owner is None else SILENT_S
+    silent = _UNSIGNED_S if owner is None else SILENT_S
     try:
         return _now(file.parent) - file.stat().st_mtime < silent
     except OSError:
@@ -207,7 +245,7 @@ def _living(file: Path) -> bool | None:
 
 
 def _now(folder: Path) -> float:
-    """The file server's time; this machine's where nothing can be written."""
+    """Return the file server's time; this machine's if the folder can't be written."""
     probe = folder / f".now-{os.getpid()}-{secrets.token_hex(4)}"
     try:
         probe.touch()
@@ -219,7 +257,7 @@ def _now(folder: Path) -> float:
 
 
 def _self() -> Owner:
-    """This process, which may be a fork of the one that asked before."""
+    """Return this process as an owner. It is not cached: the process may be forked."""
     return Owner(socket.gethostname(), _boot(), os.getpid(), _start(os.getpid()) or 0)
 
 
@@ -233,15 +271,15 @@ def _boot() -> str:
 
 
 def _start(pid: int) -> int | None:
-    """When a process began, clock ticks since boot; 0 where the system doesn't tell, None if dead.
+    """Return when a process started, clock ticks since boot; 0 if unknown, None if it is dead.
 
-    One that has ended and whose parent has not asked for it yet is dead.
+    A zombie (ended, and not waited for by its parent) is dead.
     """
     try:
         text = Path(f"/proc/{pid}/stat").read_text(encoding="utf-8", errors="replace")
     except OSError:
         return None if Path("/proc/self/stat").exists() else _start_unknown(pid)
-    fields = text.rpartition(")")[2].split()  # the name in brackets may hold anything
+    fields = text.rpartition(")")[2].split()  # the name in brackets may contain anything
     return None if fields[0] in "ZX" else int(fields[19])
 
 

@@ -1,7 +1,7 @@
-"""A sweep while it runs, in one line: what is done, how fast it goes, how long it will take.
+"""Shows a running sweep in one line: what is done, how fast it is, how long it will take.
 
-It rests on the store's files alone, so that it is the same whatever launches the cells, here or on
-other machines: a cell that is over has a status, one that is being trained has its progress.
+It reads the store's files alone, so that it works with any launcher, here or on other machines: a
+cell that has ended has a status file, and a cell in training has a progress file.
 """
 
 from __future__ import annotations
@@ -27,47 +27,51 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from xrgs.runtime.progress import Progress
-    from xrgs.sweep.plan import Planned
+    from xrgs.sweep.plan import PlannedCell
 
-#: Seconds between looks; of the time, looking takes no more than one part in so many, however slow
-#: the store is.
-_LOOK_S, _PART = 1.0, 20
-#: A log has a line when a cell is over, and after so many seconds without.
+#: Seconds between two snapshots, at least; and the pause in multiples of the time that a snapshot
+#: takes, so that a slow store is not kept busy.
+_POLL_S, _PAUSE_FACTOR = 1.0, 20
+#: A log gets a line when a cell has ended, and after so many seconds without one.
 _LINE_S = 600.0
-#: Whose progress stood still for so long is not running: its process died with who started it.
+#: A cell whose progress file has not changed for so many seconds is not running: its process died
+#: together with the one that started it.
 _SILENT_S = 120.0
 
-_Mark = tuple[int, int] | None
+#: Inode and modification time of a file, which change when it is written again; None if absent.
+_FileStamp = tuple[int, int] | None
 
 
 @dataclass(frozen=True)
-class Running:
-    """A cell whose process is at work."""
+class RunningCell:
+    """A cell whose process is training or evaluating it."""
 
-    cell: Planned
-    now: Progress
+    cell: PlannedCell
+    progress: Progress
+    """The content of its progress file."""
 
     @property
     def share(self) -> float:
-        """How much of its training is done, 0..1."""
-        if self.now.unit != "step":
-            return float(self.now.what == "evaluating")
-        return self.now.done / self.now.total if self.now.total else 0.0
+        """The share of its training that is done, 0 to 1."""
+        if self.progress.unit != "step":
+            return float(self.progress.what == "evaluating")
+        return self.progress.done / self.progress.total if self.progress.total else 0.0
 
     @property
     def pace(self) -> float | None:
-        """Seconds a step, lately."""
-        return 1 / self.now.rate if self.now.unit == "step" and self.now.rate else None
+        """Recent seconds per step; None if it is not training, or its rate is not known yet."""
+        rate = self.progress.rate
+        return 1 / rate if self.progress.unit == "step" and rate else None
 
     @property
     def left_s(self) -> float | None:
-        """Seconds left.
+        """Expected seconds to its end; None if unknown.
 
-        Its pace tells little at first, when its Gaussians are few; what past cells took tells less
-        the nearer the end is. Each counts by how far it is.
+        Its own pace says little at first, when it has few Gaussians. The times of past cells say
+        less and less towards the end. The two are averaged, weighted by the share that is done.
         """
         past = None if self.cell.seconds is None else (1 - self.share) * self.cell.seconds
-        own = self.now.left_s
+        own = self.progress.left_s
         if past is None or own is None:
             return own if past is None else past
         return (1 - self.share) * past + self.share * own
@@ -75,30 +79,30 @@ class Running:
 
 @dataclass(frozen=True)
 class SweepSnapshot:
-    """Where the cells of a plan stand at one moment."""
+    """The states of a plan's cells at one moment."""
 
     done: int
     failed: int
-    running: tuple[Running, ...]
-    elsewhere: tuple[Running, ...]
-    """In training by another sweep."""
-    waiting: tuple[Planned, ...]
+    running: tuple[RunningCell, ...]
+    elsewhere: tuple[RunningCell, ...]
+    """Cells that another sweep is training."""
+    waiting: tuple[PlannedCell, ...]
     pace: float | None
-    """Seconds a step of the cells of this sweep, as far as they are known."""
+    """Mean seconds per step of this sweep's running cells; None before any is known."""
 
     @property
-    def over(self) -> int:
-        """Cells that nothing more is done for."""
+    def ended(self) -> int:
+        """Number of cells that are done or failed."""
         return self.done + self.failed
 
     @property
     def total(self) -> int:
-        """All of them."""
-        return self.over + len(self.running) + len(self.elsewhere) + len(self.waiting)
+        """Number of all cells."""
+        return self.ended + len(self.running) + len(self.elsewhere) + len(self.waiting)
 
     @property
     def left_s(self) -> float | None:
-        """Seconds of training left, if as many cells at once go on being trained as are now."""
+        """Expected seconds of training left, if as many cells run at once as do now."""
         waiting = [self._expected(cell) for cell in self.waiting]
         running = [cell.left_s for cell in self.running]
         others = [cell.left_s for cell in self.elsewhere]
@@ -108,7 +112,7 @@ class SweepSnapshot:
         longest = max((s for s in (*known, *others) if s is not None), default=None)
         return longest and max(longest, sum(known) / max(1, len(running)))
 
-    def _expected(self, cell: Planned) -> float | None:
+    def _expected(self, cell: PlannedCell) -> float | None:
         if cell.seconds is not None:
             return cell.seconds
         return None if self.pace is None else cell.conf.train.steps * self.pace
@@ -120,54 +124,61 @@ class SweepSnapshot:
         if self.elsewhere:
             parts.append(f"{len(self.elsewhere)} in another sweep")
         if len(self.running) == 1:
-            parts.append(self.running[0].now.count)
+            parts.append(self.running[0].progress.count)
         elif self.running:
             parts.append(f"{len(self.running)} in training")
-        if rate := sum(1 / run.pace for run in self.running if run.pace):
+        if rate := sum(1 / cell.pace for cell in self.running if cell.pace):
             parts.append(f"{rate:.3g} steps/s")
         if self.left_s is not None:
             parts.append(f"{duration(self.left_s)} left")
         return ", ".join(parts)
 
 
-class View:
-    """Shows a sweep as long as `with` lasts: a bar on a terminal, in a log a line now and then."""
+class SweepMonitor:
+    """Shows a sweep while a `with` block runs: a bar on a terminal, occasional lines in a log."""
 
     def __init__(self, cells: Path) -> None:
-        """Nothing is shown before `watch`.
+        """Prepare to show; nothing is shown before `watch` is called.
 
         Args:
-            cells: the folder that their folders are in.
+            cells: The folder that the cells' folders are in.
         """
         self._cells = cells
-        self._plan: tuple[Planned, ...] = ()
+        self._plan: tuple[PlannedCell, ...] = ()
         self._retry = False
-        self._before: dict[str, _Mark] = {}
-        """Which status a cell had that this sweep was to train."""
-        self._over: dict[str, str] = {}
-        """States of the cells that it has seen ending."""
-        self._moved: dict[str, tuple[_Mark, float]] = {}
+        self._before: dict[str, _FileStamp] = {}
+        """The status file of each cell when it was planned."""
+        self._ended: dict[str, str] = {}
+        """States of the cells that have ended since."""
+        self._moved: dict[str, tuple[_FileStamp, float]] = {}
+        """The progress file of each cell, and when it was first seen like that."""
         self._pace: float | None = None
-        self._told, self._told_at = 0, time.monotonic()
+        self._shown, self._shown_at = 0, time.monotonic()
+        """Number of ended cells in the last line of a log, and when that was written."""
         self._bar: tqdm[Any] | None = None
         self._stop = threading.Event()
-        self._thread = threading.Thread(target=self._watch, name="xrgs-live", daemon=True)
+        self._thread = threading.Thread(target=self._watch, name="xrgs-monitor", daemon=True)
 
-    def watch(self, plan: Sequence[Planned]) -> None:
-        """Take this as what is to be done; called again when it changes."""
+    def watch(self, plan: Sequence[PlannedCell]) -> None:
+        """Set the plan to show; called again when it changes.
+
+        Args:
+            plan: All cells.
+        """
         first = not self._plan
         self._retry = plan[0].conf.retry == "failed"
-        self._plan = tuple({cell.cell_id or cell.wish: cell for cell in plan}.values())
+        self._plan = tuple({cell.cell_id or cell.spec: cell for cell in plan}.values())
         for cell in self._plan:
             name, state = cell.cell_id, cell.state.name
             if name is None or name in self._before:
                 continue
             folder = self._folder(name)
-            self._before[name] = None if state == "absent" else _mark(folder.status)
-            if state not in {"absent", "running"}:  # what a killed try left is no sign of life
-                self._moved[name] = (_mark(folder.progress), -math.inf)
+            self._before[name] = None if state == "absent" else _stamp(folder.status)
+            if state not in {"absent", "running"}:
+                # A progress file that a killed attempt left does not mean that the cell runs.
+                self._moved[name] = (_stamp(folder.progress), -math.inf)
         if first:
-            self._told = self._look(()).over
+            self._shown = self._take_snapshot(()).ended
 
     def __enter__(self) -> Self:
         self._thread.start()
@@ -179,27 +190,27 @@ class View:
         if self._bar is not None:
             self._bar.close()
         if self._plan:
-            look = self.look()
-            if look.over != self._told:
-                say(str(look))
+            snapshot = self.snapshot()
+            if snapshot.ended != self._shown:
+                say(str(snapshot))
 
     def _folder(self, name: str) -> CellFolder:
         return CellFolder(self._cells / name)
 
-    def look(self) -> SweepSnapshot:
-        """Where the cells stand now."""
+    def snapshot(self) -> SweepSnapshot:
+        """Return the states of the cells now."""
         try:
             with os.scandir(self._cells) as entries:
                 begun = {entry.name for entry in entries}
         except OSError:
             begun = set()
-        return self._look(begun)
+        return self._take_snapshot(begun)
 
-    def _look(self, begun: Iterable[str]) -> SweepSnapshot:
-        """Of the cells that are not over, only those are looked at that have a folder."""
+    def _take_snapshot(self, begun: Iterable[str]) -> SweepSnapshot:
+        """Return a snapshot; of the cells that have not ended, only begun ones are read."""
         begun, counts = set(begun), {"done": 0, "failed": 0}
-        running: list[Running] = []
-        elsewhere: list[Running] = []
+        running: list[RunningCell] = []
+        elsewhere: list[RunningCell] = []
         waiting = []
         for cell in self._plan:
             state = self._state(cell, begun)
@@ -208,9 +219,9 @@ class View:
             elif (now := self._progress(cell, begun)) is None:
                 waiting.append(cell)
             else:
-                others = cell.state.name == "running"
-                (elsewhere if others else running).append(Running(cell, now))
-        paces = [run.pace for run in running if run.pace]
+                in_other_sweep = cell.state.name == "running"
+                (elsewhere if in_other_sweep else running).append(RunningCell(cell, now))
+        paces = [cell.pace for cell in running if cell.pace]
         self._pace = fmean(paces) if paces else self._pace
         return SweepSnapshot(
             counts["done"],
@@ -221,8 +232,8 @@ class View:
             self._pace,
         )
 
-    def _state(self, cell: Planned, begun: set[str]) -> str:
-        """`done`, `failed`, or empty while it is neither."""
+    def _state(self, cell: PlannedCell, begun: set[str]) -> str:
+        """Return `done`, `failed`, or nothing while the cell is neither."""
         if cell.error is not None:
             return "failed"
         if cell.state.name == "done" or (cell.state.name == "failed" and not self._retry):
@@ -230,53 +241,53 @@ class View:
         name = cell.cell_id
         if name is None or name not in begun:
             return ""
-        if name not in self._over:
+        if name not in self._ended:
             folder = self._folder(name)
-            if (now := _mark(folder.status)) is None or now == self._before[name]:
+            if (status := _stamp(folder.status)) is None or status == self._before[name]:
                 return ""
-            self._over[name] = "done" if folder.state(verify=False).name == "done" else "failed"
-        return self._over[name]
+            self._ended[name] = "done" if folder.state(verify=False).name == "done" else "failed"
+        return self._ended[name]
 
-    def _progress(self, cell: Planned, begun: set[str]) -> Progress | None:
+    def _progress(self, cell: PlannedCell, begun: set[str]) -> Progress | None:
         if cell.cell_id is None or cell.cell_id not in begun:
             return None
         file = self._folder(cell.cell_id).progress
-        mark, known = _mark(file), self._moved.get(cell.cell_id)
-        if mark is None:
+        stamp, known = _stamp(file), self._moved.get(cell.cell_id)
+        if stamp is None:
             return None
-        if known is None or known[0] != mark:
-            self._moved[cell.cell_id] = known = (mark, time.monotonic())
+        if known is None or known[0] != stamp:
+            self._moved[cell.cell_id] = known = (stamp, time.monotonic())
         return None if time.monotonic() - known[1] > _SILENT_S else progress.read(file)
 
     def _watch(self) -> None:
-        pause = _LOOK_S
+        pause = _POLL_S
         while not self._stop.wait(pause):
             if self._plan:
                 start = time.monotonic()
                 with suppress(OSError):  # the store is out of reach for now
-                    self._show(self.look())
-                pause = max(_LOOK_S, _PART * (time.monotonic() - start))
+                    self._show(self.snapshot())
+                pause = max(_POLL_S, _PAUSE_FACTOR * (time.monotonic() - start))
 
-    def _show(self, look: SweepSnapshot) -> None:
+    def _show(self, snapshot: SweepSnapshot) -> None:
         if sys.stderr.isatty():
-            self._draw(look)
-        elif look.over != self._told or time.monotonic() - self._told_at > _LINE_S:
-            say(str(look))
-            self._told, self._told_at = look.over, time.monotonic()
+            self._draw(snapshot)
+        elif snapshot.ended != self._shown or time.monotonic() - self._shown_at > _LINE_S:
+            say(str(snapshot))
+            self._shown, self._shown_at = snapshot.ended, time.monotonic()
 
-    def _draw(self, look: SweepSnapshot) -> None:
+    def _draw(self, snapshot: SweepSnapshot) -> None:
         if self._bar is None:
             style = "{percentage:3.0f}%|{bar:20}| {desc}"
             self._bar = tqdm(None, bar_format=style, leave=False, dynamic_ncols=True, delay=1e-9)
-        self._bar.total = look.total
-        self._bar.n = look.over + sum(run.share for run in look.running)
-        self._bar.set_description_str(str(look))
+        self._bar.total = snapshot.total
+        self._bar.n = snapshot.ended + sum(cell.share for cell in snapshot.running)
+        self._bar.set_description_str(str(snapshot))
 
 
-def _mark(file: os.PathLike[str]) -> _Mark:
-    """What changes when a file is written anew; None where there is none."""
+def _stamp(file: os.PathLike[str]) -> _FileStamp:
+    """Return what changes when a file is written again; None if there is no file."""
     try:
-        found = os.stat(file)  # noqa: PTH116  of thousands of files a look
+        status = os.stat(file)  # noqa: PTH116  faster than Path.stat, for thousands of files
     except OSError:
         return None
-    return found.st_ino, found.st_mtime_ns
+    return status.st_ino, status.st_mtime_ns

@@ -1,4 +1,4 @@
-"""The cells of a study: what each is, where it stands, and what is left to do."""
+"""The planned cells of a study: what each one is, its state, and what is left to do."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 from xrgs.capture import scenes
 from xrgs.experiment.identity import cell_identity
-from xrgs.experiment.store import State
+from xrgs.experiment.store import BASELINE, CellState
 from xrgs.runtime.progress import duration
 from xrgs.safeio.hashing import digest
 from xrgs.safeio.untrusted import printable
@@ -17,149 +17,167 @@ if TYPE_CHECKING:
 
     from xrgs.config import Conf
     from xrgs.experiment.store import Store
+    from xrgs.sweep.axes import CellSpec
     from xrgs.sweep.estimate import RuntimeEstimator
-    from xrgs.sweep.locks import Owner
-
-BASELINE = "baseline"
 
 
 @dataclass(frozen=True)
-class CellSpec:
-    """One combination of the command line's axes."""
+class PlannedCell:
+    """A cell of the study: what it is and its state."""
 
-    label: str
-    """What is compared: the ablation and the component values set by hand."""
-    condition: str
-    """The other axes' values, beside scene and seed: what label and baseline share."""
-    shared: tuple[str, ...]
-    """Overrides that the matching baseline has too."""
-    changes: tuple[str, ...]
-    """Overrides that make it another program than the baseline."""
-
-    @property
-    def overrides(self) -> list[str]:
-        """All of it, for Hydra to compose."""
-        return [*self.shared, *self.changes]
-
-
-@dataclass(frozen=True)
-class Planned:
-    """A cell of the study: what it is, and where it stands."""
-
-    wish: CellSpec
+    spec: CellSpec
     conf: Conf
     variant_id: str | None = None
+    """The id of its frozen variant; None while that is not built."""
+    identity: Mapping[str, Any] | None = None
+    """What the cell's id is the digest of; None while the variant or a count is missing."""
     cell_id: str | None = None
-    state: State = field(default_factory=lambda: State("absent"))
+    state: CellState = field(default_factory=lambda: CellState("absent"))
     error: str | None = None
-    """Why the cell can't be run: its scene failed, or the cell that it takes a number from."""
+    """Why the cell can't be trained: its scene failed, or the cell that it takes a count from."""
     seconds: float | None = None
-    """Of training, as cells before it took; None where the store knows none like it."""
+    """Expected seconds of training; None if the store has no finished cell to go by."""
 
     @property
     def name(self) -> str:
-        """For people."""
-        parts = (scenes.label(self.conf.scene), self.wish.label, self.wish.condition)
+        """The cell's name for people: scene, label, condition and seed."""
+        parts = (scenes.label(self.conf.scene), self.spec.label, self.spec.condition)
         return " / ".join(part for part in parts if part) + f" / seed {self.conf.seed}"
 
     @property
     def reference(self) -> CellSpec | None:
-        """The cell whose number of Gaussians this one is to have."""
+        """The cell whose number of Gaussians this one is to match; None if there is none."""
         name = self.conf.matched_to
-        return replace(self.wish, label=name, changes=(f"+ablation={name}",)) if name else None
+        return replace(self.spec, label=name, changes=(f"+ablation={name}",)) if name else None
 
     @property
     def waits(self) -> bool:
-        """Whether that number is still to come."""
+        """Whether the cell waits for the number of Gaussians of its reference."""
         return self.reference is not None and not self.conf.components.count_matched.gaussians
 
 
-def identified(cell: Planned, store: Store, held: Mapping[str, Owner | None]) -> Planned:
-    """The cell with its identity, if it has one yet, and its state; what is done stays done."""
+def identified(cell: PlannedCell, store: Store, holders: Mapping[str, str]) -> PlannedCell:
+    """Return a cell with its identity, as soon as that is known, and its current state.
+
+    The identity is computed once; a cell that was done before stays so.
+
+    Args:
+        cell: The cell.
+        store: The store.
+        holders: Descriptions of the processes that train cells now, by the cells' ids.
+    """
     if cell.variant_id is None or cell.waits or cell.state.name == "done":
         return cell
-    cell_id = cell.cell_id or digest(cell_identity(cell.conf, cell.variant_id))
+    identity = cell.identity or cell_identity(cell.conf, cell.variant_id)
+    cell_id = cell.cell_id or digest(identity)
     state = store.cell(cell_id).state()
-    if state.name != "done" and cell_id in held:
-        state = store.cell(cell_id).running(held[cell_id])
-    return replace(cell, cell_id=cell_id, state=state)
+    if state.name != "done" and cell_id in holders:
+        state = store.cell(cell_id).running(holders[cell_id])
+    return replace(cell, identity=identity, cell_id=cell_id, state=state)
 
 
-def estimated(plan: Sequence[Planned], past: RuntimeEstimator) -> list[Planned]:
-    """The cells with the time that each will take, where past ones tell."""
+def estimated(plan: Sequence[PlannedCell], past: RuntimeEstimator) -> list[PlannedCell]:
+    """Return the cells with the expected seconds of training, where past cells allow it.
+
+    A cell that waits for a count has no identity yet; it is estimated with the count that it has.
+
+    Args:
+        plan: The cells.
+        past: Estimates from the store's finished cells.
+    """
     if not past.known:
         return list(plan)
     return [
-        replace(cell, seconds=past.seconds(cell_identity(cell.conf, cell.variant_id)))
-        if cell.variant_id is not None and cell.state.name != "done"
+        replace(cell, seconds=past.seconds(cell.identity or cell_identity(cell.conf, variant_id)))
+        if (variant_id := cell.variant_id) is not None and cell.state.name != "done"
         else cell
         for cell in plan
     ]
 
 
-def length(cell: Planned) -> tuple[float, int]:
-    """What is longest by what is known comes last; of what isn't, the number of steps tells."""
+def expected_length(cell: PlannedCell) -> tuple[float, int]:
+    """Return the key by which cells are sorted, the longest last.
+
+    Cells without an estimate count as longer than all others, and are sorted by their steps.
+
+    Args:
+        cell: The cell.
+    """
     return (float("inf") if cell.seconds is None else cell.seconds, cell.conf.train.steps)
 
 
 def ready(
-    plan: Sequence[Planned], tried: Container[str], *, retry: bool = False
-) -> dict[str, Planned]:
-    """The cells that can be run now and are not done, by their identity."""
-    left = {"done", "running"} if retry else {"done", "running", "failed"}
+    plan: Sequence[PlannedCell], tried: Container[str], *, retry: bool = False
+) -> dict[str, PlannedCell]:
+    """Return the cells that can be trained now and are not done, by their ids.
+
+    Args:
+        plan: All cells.
+        tried: Ids of cells that this sweep has trained already, with whatever outcome.
+        retry: Train cells again that failed in an earlier sweep.
+    """
+    left_alone = {"done", "running"} if retry else {"done", "running", "failed"}
     return {
         cell.cell_id: cell
         for cell in plan
         if cell.cell_id is not None
         and cell.cell_id not in tried
         and cell.error is None
-        and cell.state.name not in left
+        and cell.state.name not in left_alone
     }
 
 
-def describe(plan: Sequence[Planned]) -> str:
-    """The plan as lines: state, identity, time, name, and why where it is not plain."""
+def describe(plan: Sequence[PlannedCell]) -> str:
+    """Return the plan as text: one line per cell with its state, id, expected time and name.
+
+    Args:
+        plan: All cells.
+    """
     done = sum(cell.state.name == "done" for cell in plan)
-    lines = [f"plan: {len(plan)} cells, {done} done{_left(plan)}"]
+    lines = [f"plan: {len(plan)} cells, {done} done{_remaining(plan)}"]
     for cell in plan:
         state = "failed" if cell.error else "waits" if cell.waits else cell.state.name
         reason = (cell.error or cell.state.reason or "").partition("\n")[0]
-        identity = cell.cell_id or ("no count yet" if cell.waits else "variant not built")
-        wanted = not cell.error and state != "done"
-        time_left = duration(cell.seconds) if wanted else ""
-        line = f"  {state:<10} {identity:<18} {time_left:>8}  {cell.name}"
+        cell_id = cell.cell_id or ("no count yet" if cell.waits else "variant not built")
+        to_train = not cell.error and state != "done"
+        time_left = duration(cell.seconds) if to_train else ""
+        line = f"  {state:<10} {cell_id:<18} {time_left:>8}  {cell.name}"
         lines.append(printable(f"{line}  ({reason})" if reason else line))
     failed = any(cell.error or cell.state.name == "failed" for cell in plan)
     if plan[0].conf.retry != "failed" and failed:
-        lines.append("failed cells are left as they are: retry=failed runs them again")
+        lines.append("failed cells are not trained again; retry=failed trains them again")
     return "\n".join(lines)
 
 
-def _left(plan: Sequence[Planned]) -> str:
-    """How long the training that is left takes, as far as the store's cells tell."""
+def _remaining(plan: Sequence[PlannedCell]) -> str:
+    """Return how long the remaining training takes, as far as the store's cells allow to say."""
     retry = plan[0].conf.retry == "failed"
-    left = [cell for cell in plan if cell.waits and not cell.error]
-    left += ready(plan, (), retry=retry).values()
-    known = [cell.seconds for cell in left if cell.seconds is not None]
+    remaining = [cell for cell in plan if cell.waits and not cell.error]
+    remaining += ready(plan, (), retry=retry).values()
+    known = [cell.seconds for cell in remaining if cell.seconds is not None]
     if not known:
         return ""
-    unknown = len(left) - len(known)
-    more = f" and {unknown} cells that no past one tells of" if unknown else ""
+    unknown = len(remaining) - len(known)
+    more = f" and {unknown} cells without an estimate" if unknown else ""
     return f"; left to train, one after another: {duration(sum(known))}{more}"
 
 
-def record(plan: Sequence[Planned]) -> list[dict[str, Any]]:
-    """The rows that a report is made from: each cell with its matching baseline's id."""
-    baselines = {c.wish.shared: c.cell_id for c in plan if c.wish.label == BASELINE}
+def record(plan: Sequence[PlannedCell]) -> list[dict[str, Any]]:
+    """Return the rows that a report is made from: each cell with its matching baseline's id.
+
+    Args:
+        plan: All cells, with every baseline among them.
+    """
+    baselines = {cell.spec.shared: cell.cell_id for cell in plan if cell.spec.label == BASELINE}
     return [
         {
             "cell_id": cell.cell_id,
-            "label": cell.wish.label,
-            "condition": cell.wish.condition,
+            "label": cell.spec.label,
+            "condition": cell.spec.condition,
             "scene": scenes.label(cell.conf.scene),
             "seed": cell.conf.seed,
             "variant_id": cell.variant_id,
-            "baseline_id": baselines[cell.wish.shared],
+            "baseline_id": baselines[cell.spec.shared],
             "error": cell.error,
         }
         for cell in plan

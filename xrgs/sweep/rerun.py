@@ -1,7 +1,8 @@
-"""A cell trained again from its folder alone: the same numbers, or what differs.
+"""Trains a finished cell again from its folder alone, and compares the results.
 
-Its config says what to train, its variant what on. What differs before it is trained (the program,
-its libraries, the machine) is said first; it is why numbers differ, if they do.
+The cell's config says how to train, and its identity names the variant to train on. Differences of
+the program, its libraries and the machine are reported before the training; they are the cause if
+the numbers differ.
 """
 
 from __future__ import annotations
@@ -24,18 +25,20 @@ from xrgs.safeio.hashing import digest, file_digest
 from xrgs.safeio.records import StoreError
 from xrgs.safeio.untrusted import printable
 from xrgs.splat.backend import resolve_backend
+from xrgs.sweep import variants
+from xrgs.sweep.axes import CellSpec
 from xrgs.sweep.jobs import worker
-from xrgs.sweep.monitor import View
-from xrgs.sweep.plan import CellSpec, Planned
+from xrgs.sweep.monitor import SweepMonitor
+from xrgs.sweep.plan import PlannedCell
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping
 
     from xrgs.config import Conf
 
-#: Compared byte for byte.
+#: Files of results that are compared byte for byte.
 _RESULTS = ("scores.csv", "history.csv", "splats.ply")
-#: Of the summary: what no clock and no other process has a part in.
+#: Figures of the summary that are compared; times and memory differ from run to run.
 _COUNTS = ("steps", "gaussians", "evaluations", "grow_grad2d")
 _ID = re.compile(r"[0-9a-f]{16}")
 _VARIANT = re.compile(rf"{_ID.pattern}-{_ID.pattern}")
@@ -43,18 +46,20 @@ _VARIANT = re.compile(rf"{_ID.pattern}-{_ID.pattern}")
 
 @dataclass(frozen=True)
 class RerunResult:
-    """A cell that was trained again."""
+    """The comparison of a cell with the same cell trained again."""
 
     folder: CellFolder
+    """The folder of the cell that was trained again."""
     before: list[str]
-    """What differed before it was trained."""
+    """Differences that were known before the training: of code, libraries and machine."""
     differences: list[str]
-    """In what it gave. Empty: the same, bit for bit."""
+    """Differences of the results; none if they are equal bit for bit."""
 
     def __str__(self) -> str:
         if self.differences:
-            lines = ["not the same numbers", *_listed(self.before, "what differs in how")]
-            lines += _listed(self.differences, "what differs in what it gave")
+            lines = ["The numbers are not the same."]
+            lines += _listed(self.before, "differences in code, libraries or machine")
+            lines += _listed(self.differences, "differences in the results")
         else:
             lines = [f"the same, bit for bit: {', '.join(_RESULTS)}, {', '.join(_COUNTS)}"]
             lines += _listed(self.before, "although these differ")
@@ -68,19 +73,24 @@ def rerun(
     threads: int | None = None,
     photographs: str | None = None,
 ) -> RerunResult:
-    """Train a finished cell again and compare.
+    """Train a finished cell again and compare the results.
 
     Args:
-        folder: the cell's, in a store or not.
-        out: where to; `<folder>.rerun-1` (or the next number) where none is given.
-        store: where its variant lies, or is built; the store that the folder is in, where none is
-            given. Its config names one too, but may be a stranger's.
-        threads: in place of as many as it was trained with. No number is meant to depend on them.
-        photographs: in place of the config's `scene.path`, where the variant has to be built.
+        folder: The cell's folder, in a store or elsewhere.
+        out: Folder to write to; by default `<folder>.rerun-1`, or the next free number.
+        store: The store that has the cell's variant, or in which it is built; by default the store
+            that the folder is in. The config's own store is not used: the folder may come from
+            another person.
+        threads: Number of threads; by default as many as the cell was trained with. No result
+            should depend on it.
+        photographs: Replaces the config's `scene.path`, if the variant has to be built.
+
+    Returns:
+        The comparison.
 
     Raises:
-        XrgsError: the folder holds no finished cell, or the config of another version; there is no
-            such variant and it can't be made again; or the training failed.
+        XrgsError: The folder holds no finished cell, or the config of another version; the variant
+            is missing and can't be built again; or the training failed.
     """
     original = CellFolder(folder)
     conf, identity = _read(original)
@@ -90,29 +100,30 @@ def rerun(
     if conf.threads < 0:
         raise XrgsError(f"threads={conf.threads}: must be at least 0")
     if out is not None and out.exists():
-        raise XrgsError(f"out={out}: is there already")
+        raise XrgsError(f"out={out} exists already")
     conf.splat.backend = resolve_backend(conf.splat.backend)
     now = cell_identity(conf, str(identity["variant"]))
     before = [*_own_contradictions(original, identity, now), *_other_program(original, conf, now)]
-    for line in _listed(before, "what differs from when it was trained") or ["nothing differs yet"]:
+    title = "differences from when the cell was trained"
+    for line in _listed(before, title) or ["code, libraries and machine are the same"]:
         say(line)
     _provide(str(identity["variant"]), conf, home)
-    again = CellFolder(out or _next_to(folder))
-    _train(conf, home.variants / str(identity["variant"]), again, now, original)
-    return RerunResult(again, before, [*_differences(original, again)])
+    repeated = CellFolder(out or _free_sibling(folder))
+    _train_again(conf, home.variants / str(identity["variant"]), repeated, now, original)
+    return RerunResult(repeated, before, [*_differences(original, repeated)])
 
 
 def _read(original: CellFolder) -> tuple[Conf, dict[str, Any]]:
-    """Its config, with as many threads as it was trained with, and its identity."""
+    """Return the cell's config, with the threads that it was trained with, and its identity."""
     if not original.path.is_dir():
-        raise XrgsError(f"rerun={original.path}: no such folder")
+        raise XrgsError(f"rerun={original.path}: there is no such folder")
     for name in ("config.json", "identity.json", "provenance.json", "status.json"):
         if not (original.path / name).is_file():
-            raise XrgsError(f"rerun={original.path}: not the folder of a finished cell: no {name}")
+            raise XrgsError(f"rerun={original.path} is not a finished cell: it has no {name}")
     state = original.state()
     if state.name == "failed":
         reason = state.reason.partition("\n")[0]
-        raise XrgsError(f"rerun={original.path}: failed, so that it has no numbers ({reason})")
+        raise XrgsError(f"rerun={original.path}: the cell failed and has no results ({reason})")
     conf = config.from_file(original.path / "config.json")
     try:
         identity, conf.threads = original.identity(), int(original.provenance()["threads"])
@@ -126,31 +137,31 @@ def _read(original: CellFolder) -> tuple[Conf, dict[str, Any]]:
 def _own_contradictions(
     original: CellFolder, then: Mapping[str, Any], now: Mapping[str, Any]
 ) -> Iterator[str]:
-    """What the folder's own files have against each other: somebody has changed them."""
+    """Yield contradictions between the folder's own files, which somebody must have changed."""
     state = original.state()
     if state.name != "done":
         yield f"the folder: {state.name}: {state.reason}"
     named = original.id.partition(".")[0]
     if _ID.fullmatch(named) and digest(then) != named:
-        yield f"the folder: identity.json is of cell {digest(then)}, not of {named}"
-    known = {"code", "protocol", "variant"}  # the rest is from config.json
-    for line in _changes(_without(then, known), _without(now, known)):
+        yield f"the folder: identity.json is that of cell {digest(then)}, not of {named}"
+    not_in_config = {"code", "protocol", "variant"}
+    for line in _changes(_without(then, not_in_config), _without(now, not_in_config)):
         yield f"identity.json against config.json: {line}"
 
 
 def _other_program(original: CellFolder, conf: Conf, now: Mapping[str, Any]) -> Iterator[str]:
-    """What is another program, library or machine than then."""
+    """Yield differences of the program, its libraries and the machine."""
     then = original.identity()
     if then.get("protocol") != now["protocol"]:
-        yield f"protocol of evaluation: {then.get('protocol')} -> {now['protocol']}"
+        yield f"evaluation protocol: {then.get('protocol')} -> {now['protocol']}"
     code = then.get("code") or {}
     for file in sorted(code.keys() | now["code"].keys()):
         if code.get(file) != now["code"].get(file):
-            what = "new" if file not in code else "changed" if file in now["code"] else "gone"
-            yield f"code: {file} ({what})"
+            change = "new" if file not in code else "changed" if file in now["code"] else "removed"
+            yield f"code: {file} ({change})"
     here = provenance.collect(conf.threads or usable_cores(), conf.splat.backend)
     made_with = original.provenance()
-    new = here.keys() - made_with.keys()  # that an older version did not record
+    new = here.keys() - made_with.keys()  # values that an older version did not record
     yield from _changes(_without(made_with, {"started"}), _without(here, {"started", *new}))
 
 
@@ -175,64 +186,67 @@ def _short(value: object) -> str:
 def _store_of(folder: Path) -> Path:
     cells = folder.resolve().parent
     if cells.name != "cells":
-        raise XrgsError(f"rerun={folder}: not in a store: name one that has its variant, store=...")
+        raise XrgsError(
+            f"rerun={folder} is not in a store; name the store that has its variant with store=..."
+        )
     return cells.parent
 
 
-def _provide(wanted: str, conf: Conf, store: Store) -> None:
-    """See to it that the variant is in the store.
+def _provide(variant_id: str, conf: Conf, store: Store) -> None:
+    """Make sure that the variant is in the store.
 
     Raises:
-        XrgsError: it is not, and building it again gives another one.
+        XrgsError: It is not, and building it again gives another variant.
     """
-    if (store.variants / wanted).is_dir():
+    if (store.variants / variant_id).is_dir():
         return
-    say(f"variant {wanted} is not in {store.path}: building it from {conf.scene.path or 'scratch'}")
+    say(f"variant {variant_id} is not in {store.path} and is built again")
     store.prepare()
     try:
-        made = worker.run("variant", {"conf": asdict(conf), "store": str(store.path)})["variant"]
+        built = variants.build(conf, store)
     except XrgsError as error:
-        raise XrgsError(f"variant {wanted} is not in {store.path}, and: {error}") from error
-    if made == wanted:
+        raise XrgsError(f"variant {variant_id} is not in {store.path}, and: {error}") from error
+    if built == variant_id:
         return
-    alike = made.partition("-")[0] == wanted.partition("-")[0]
+    same_key = built.partition("-")[0] == variant_id.partition("-")[0]
     why = (
-        "the photographs are the same, but COLMAP places them otherwise each time"
-        if alike
-        else "its photographs, or the code that makes it, are others"
+        "the photographs are the same, but COLMAP gives other camera poses each time"
+        if same_key
+        else "its photographs, or the code that builds it, are not the same"
     )
     raise XrgsError(
-        f"variant {wanted} is not in {store.path}, and was built as {made}: {why}. "
-        "Give the store that has it, store=..."
+        f"variant {variant_id} is not in {store.path}, and building it gave {built}: {why}. "
+        "Name the store that has the variant with store=..."
     )
 
 
-def _next_to(folder: Path) -> Path:
+def _free_sibling(folder: Path) -> Path:
     folder = folder.resolve()
     names = (folder.with_name(f"{folder.name}.rerun-{number}") for number in count(1))
     return next(name for name in names if not name.exists())
 
 
-def _train(
-    conf: Conf, variant: Path, again: CellFolder, identity: dict[str, Any], original: CellFolder
+def _train_again(
+    conf: Conf, variant: Path, repeated: CellFolder, identity: dict[str, Any], original: CellFolder
 ) -> None:
-    """Train as a sweep's cell is; nobody else knows of the folder, so there is no lock."""
-    again.begin(asdict(conf), identity)
-    plan = Planned(
-        CellSpec("again", "", (), ()),
+    """Train like a sweep's cell, but without a lock: no other process writes to the folder."""
+    repeated.begin(asdict(conf), identity)
+    cell = PlannedCell(
+        CellSpec("rerun", "", (), ()),
         conf,
         variant.name,
-        again.id,
+        identity,
+        repeated.id,
         seconds=_seconds(original),
     )
     try:
-        with View(again.path.parent) as view:
-            view.watch([plan])
-            request = {"conf": asdict(conf), "variant": str(variant), "cell": str(again.path)}
-            worker.run("cell", request)
+        with SweepMonitor(repeated.path.parent) as monitor:
+            monitor.watch([cell])
+            request = {"conf": asdict(conf), "variant": str(variant), "cell": str(repeated.path)}
+            worker.run_in_child("cell", request)
     except XrgsError as error:
-        again.fail(str(error))
-        raise XrgsError(f"{error} ({again.path / 'log.txt'})") from error
+        repeated.fail(str(error))
+        raise XrgsError(f"{error} ({repeated.path / 'log.txt'})") from error
 
 
 def _seconds(original: CellFolder) -> float | None:
@@ -249,41 +263,41 @@ def _summary(cell: CellFolder) -> dict[str, Any]:
         return {}
 
 
-def _differences(original: CellFolder, again: CellFolder) -> Iterator[str]:
-    """What is not the same in what two cells gave, numbers first."""
-    yield from _scores(original, again)
-    summaries = _summary(original), _summary(again)
+def _differences(original: CellFolder, repeated: CellFolder) -> Iterator[str]:
+    """Yield the differences of two cells' results, scores first."""
+    yield from _score_differences(original, repeated)
+    summaries = _summary(original), _summary(repeated)
     for name in _COUNTS:
         then, now = (summary.get(name) for summary in summaries)
         if then != now:
             yield f"{name}: {_number(then)} -> {_number(now)}"
     for name in _RESULTS:
-        then, now = original.path / name, again.path / name
+        then, now = original.path / name, repeated.path / name
         if not then.is_file():
-            yield f"{name}: not in {original.path}"
+            yield f"{name}: missing in {original.path}"
         elif file_digest(then) != file_digest(now):
-            yield f"{name}: other bytes"
+            yield f"{name}: the bytes differ"
 
 
-def _scores(original: CellFolder, again: CellFolder) -> Iterator[str]:
-    """Of each score: how far the two are apart."""
-    then, now = _table(original), _table(again)
+def _score_differences(original: CellFolder, repeated: CellFolder) -> Iterator[str]:
+    """Yield for each metric by how much the scores of two cells differ."""
+    then, now = _scores(original), _scores(repeated)
     if then.keys() != now.keys():
         views = sorted({view for view, _ in then.keys() ^ now.keys()})
-        yield f"scores.csv: only one has {', '.join(views)}"
-    apart: dict[str, list[float]] = {}
+        yield f"scores.csv: only one of the two has {', '.join(views)}"
+    differences_of: dict[str, list[float]] = {}
     for view, metric in then.keys() & now.keys():
         a, b = then[view, metric], now[view, metric]
         if a != b and not (math.isnan(a) and math.isnan(b)):
-            apart.setdefault(metric, []).append(abs(a - b))
-    for metric, differences in sorted(apart.items()):
+            differences_of.setdefault(metric, []).append(abs(a - b))
+    for metric, differences in sorted(differences_of.items()):
         known = [difference for difference in differences if not math.isnan(difference)]
-        how = f"by at most {max(known):.3g}" if known else "and one of the two has none"
-        yield f"{metric}: differs in {len(differences)} views, {how}"
+        amount = f"by at most {max(known):.3g}" if known else "and one of the two has no score"
+        yield f"{metric}: differs in {len(differences)} views, {amount}"
 
 
-def _table(cell: CellFolder) -> dict[tuple[str, str], float]:
-    """(view, metric) -> value, NaN where there is none; empty where it can't be read."""
+def _scores(cell: CellFolder) -> dict[tuple[str, str], float]:
+    """Return the scores by view and metric, NaN where one is missing; empty if unreadable."""
     try:
         scores = cell.scores()
     except StoreError:

@@ -1,4 +1,4 @@
-"""A store at a glance: what is done, who trains what, what failed, and what other code made."""
+"""Summarises a store: what is done, running, failed, and trained by another version of the code."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 from xrgs.errors import XrgsError
 from xrgs.experiment.identity import training_code
-from xrgs.experiment.store import State, Store
+from xrgs.experiment.store import CellState, Store
 from xrgs.safeio.records import FAILED, StoreError, failed_scenes, read_json
 from xrgs.safeio.untrusted import printable
 from xrgs.sweep import locks
@@ -21,60 +21,66 @@ if TYPE_CHECKING:
     from xrgs.experiment.store import CellFolder
 
 _STATES = ("done", "running", "unfinished", "failed", "corrupt")
-#: So many cells are named of each kind that wants looking at.
-_NAMED = 20
+#: Cells of each state are listed by name up to this number.
+_MAX_NAMED = 20
 
 
 @dataclass(frozen=True)
 class CellSummary:
-    """One cell's folder."""
+    """The state of one cell's folder."""
 
     id: str
     scene: str
+    """The scene's label in the latest sweep that has the cell, else from the cell's config."""
     label: str
-    """As the latest sweep that holds the cell has them; of none, `?` for the label."""
-    state: State
+    """The cell's label and condition in that sweep, `?` if no sweep has the cell."""
+    state: CellState
     stale: tuple[str, ...]
-    """Of a done cell: files of the code that trained it which are not what is installed now. A
-    sweep would train it again."""
+    """For a done cell, source files that have changed since it was trained. A sweep would train
+    the cell again."""
 
 
 @dataclass(frozen=True)
-class Status:
+class StoreStatus:
     """What a store holds."""
 
     path: Path
+    """The store's folder."""
     cells: tuple[CellSummary, ...]
     aside: int
-    """Folders that a later try of the same cell has set aside, and those of reruns."""
+    """Number of folders of earlier attempts that were set aside, and of reruns."""
     variants: tuple[str, ...]
+    """Ids of the frozen variants."""
     failed_scenes: tuple[tuple[str, str, str], ...]
-    """Key of the variant that can't be made, scene, and why."""
+    """Scenes that no variant could be made of: the variant's key, the scene, and the reason."""
     sweeps: int
+    """Number of recorded sweeps."""
     sizes: Mapping[str, int]
-    """Bytes of each folder of the store."""
+    """Bytes of each subfolder of the store."""
 
 
-def read(path: Path, *, verify: bool = False) -> Status:
-    """Look through a store; nothing is written.
+def read(path: Path, *, verify: bool = False) -> StoreStatus:
+    """Read the state of a store; nothing is written.
 
     Args:
-        path: the store's folder.
-        verify: hash what reports rest on too; else a cell is corrupt where a size is wrong.
+        path: The store's folder.
+        verify: Hash the files that reports are made from; otherwise only sizes are compared.
 
     Raises:
-        StoreError: there is no such store.
+        StoreError: There is no such store.
     """
     store = Store(path)
     if not store.cells.is_dir():
-        raise StoreError(f"store={path}: no store; xrgs-sweep makes one")
+        raise StoreError(f"store={path} is not a store; xrgs-sweep makes one")
     names, sweeps = _names(store)
-    held = locks.holders(store.locks)
+    holders = locks.holders(store.locks)
     ids = sorted(entry.name for entry in os.scandir(store.cells) if entry.is_dir())
     cells = [name for name in ids if "." not in name]
-    return Status(
+    return StoreStatus(
         path,
-        tuple(_see(store.cell(cell), names.get(cell), held, verify=verify) for cell in cells),
+        tuple(
+            _summarise(store.cell(cell), names.get(cell), holders, verify=verify) for cell in cells
+        ),
         len(ids) - len(cells),
         tuple(sorted(_variants(store))),
         tuple((key, *why) for key, why in failed_scenes(store.variants).items()),
@@ -84,14 +90,14 @@ def read(path: Path, *, verify: bool = False) -> Status:
 
 
 def _variants(store: Store) -> Iterator[str]:
-    """Those that are frozen; not what is being built, and not the reports of those that failed."""
+    """Yield the frozen variants: not those being built, and not the reports of failed ones."""
     for folder in store.variants.glob("[!.]*-*"):
         if not folder.name.startswith(FAILED):
             yield folder.name
 
 
 def _names(store: Store) -> tuple[dict[str, tuple[str, str]], int]:
-    """Scene and label of every cell that a sweep recorded, the latest sweep's; and the sweeps."""
+    """Return scene and label of every recorded cell, and the number of recorded sweeps."""
     names: dict[str, tuple[str, str]] = {}
     files = sorted((store.path / "sweeps").glob("*.json"), key=lambda file: file.stat().st_mtime_ns)
     for file in files:
@@ -104,22 +110,22 @@ def _names(store: Store) -> tuple[dict[str, tuple[str, str]], int]:
     return names, len(files)
 
 
-def _see(
+def _summarise(
     cell: CellFolder,
     name: tuple[str, str] | None,
-    held: Mapping[str, locks.Owner | None],
+    holders: Mapping[str, str],
     *,
     verify: bool,
 ) -> CellSummary:
     state = cell.state(verify=verify)
-    if state.name != "done" and cell.id in held:
-        state = cell.running(held[cell.id])
+    if state.name != "done" and cell.id in holders:
+        state = cell.running(holders[cell.id])
     scene, label = name or (_scene(cell), "?")
     return CellSummary(cell.id, scene, label, state, _stale(cell) if state.name == "done" else ())
 
 
 def _scene(cell: CellFolder) -> str:
-    """Of a cell that no sweep has recorded yet."""
+    """Return the scene of a cell that no sweep has recorded yet."""
     try:
         scene = read_json(cell.path / "config.json")["scene"]
         return str(scene["name"] or scene["path"] or scene["kind"])
@@ -128,6 +134,7 @@ def _scene(cell: CellFolder) -> str:
 
 
 def _stale(cell: CellFolder) -> tuple[str, ...]:
+    """Return the source files that are not the ones that the cell was trained with."""
     try:
         identity = cell.identity()
         then: dict[str, Any] = identity["code"]
@@ -146,7 +153,7 @@ def _bytes(folder: str) -> int:
     for entry in _walk(folder):
         try:
             total += entry.stat(follow_symlinks=False).st_size
-        except OSError:  # gone while it was looked at
+        except OSError:  # removed since it was listed
             continue
     return total
 
@@ -163,35 +170,42 @@ def _walk(folder: str) -> Iterator[os.DirEntry[str]]:
             yield entry
 
 
-def describe(status: Status) -> str:
-    """The store as text."""
+def describe(status: StoreStatus) -> str:
+    """Return the state of a store as text.
+
+    Args:
+        status: The state, from `read`.
+    """
     counts = Counter(cell.state.name for cell in status.cells)
     stale = [cell for cell in status.cells if cell.stale]
     parts = [f"{counts[state]} {state}" for state in _STATES if counts[state]]
     lines = [f"store {status.path}: {len(status.cells)} cells", "  " + (", ".join(parts) or "none")]
     if status.aside:
-        lines.append(f"  {status.aside} folders of earlier tries and reruns (*.*)")
+        lines.append(f"  {status.aside} folders of earlier attempts and reruns (*.*)")
     lines.append(f"  {len(status.variants)} variants, {status.sweeps} sweeps recorded")
     sizes = ", ".join(f"{name} {_size(size)}" for name, size in sorted(status.sizes.items()))
     lines += [f"  {_size(sum(status.sizes.values()))} on disk: {sizes}", ""]
     lines += _table(status.cells)
     for state in ("running", "failed", "corrupt", "unfinished"):
-        lines += _named(state, [cell for cell in status.cells if cell.state.name == state])
+        lines += _listed(state, [cell for cell in status.cells if cell.state.name == state])
     if status.failed_scenes:
-        lines += ["", "failed scenes, left as they are: retry=failed tries them again"]
+        lines += ["", "failed scenes, not tried again; retry=failed tries them again"]
         lines += [
             printable(f"  {key}  {scene}  {reason.partition(chr(10))[0]}")
-            for key, scene, reason in status.failed_scenes[:_NAMED]
+            for key, scene, reason in status.failed_scenes[:_MAX_NAMED]
         ]
     if stale:
         files = Counter(file for cell in stale for file in cell.stale)
-        lines += ["", f"stale: {len(stale)} done cells are of other code than what is installed"]
-        lines += [f"  {file}: {count} cells" for file, count in files.most_common(_NAMED)]
+        lines += [
+            "",
+            f"stale: {len(stale)} done cells were trained with other code than is installed",
+        ]
+        lines += [f"  {file}: {count} cells" for file, count in files.most_common(_MAX_NAMED)]
     return "\n".join(lines)
 
 
 def _table(cells: Sequence[CellSummary]) -> list[str]:
-    """Cells of each scene and label by state; columns without a cell are left out."""
+    """Return a table of the cells of each scene and label by state, without empty columns."""
     counts: dict[tuple[str, str], Counter[str]] = {}
     for cell in cells:
         row = counts.setdefault((cell.scene, cell.label), Counter())
@@ -218,15 +232,15 @@ def _aligned(rows: Iterable[tuple[str, ...]]) -> list[str]:
     ]
 
 
-def _named(state: str, cells: Sequence[CellSummary]) -> list[str]:
+def _listed(state: str, cells: Sequence[CellSummary]) -> list[str]:
     if not cells:
         return []
     lines = ["", f"{state}:"]
-    for cell in cells[:_NAMED]:
+    for cell in cells[:_MAX_NAMED]:
         reason = cell.state.reason.partition("\n")[0]
         lines.append(printable(f"  {cell.id}  {cell.scene} / {cell.label}  {reason}"))
-    if len(cells) > _NAMED:
-        lines.append(f"  and {len(cells) - _NAMED} more")
+    if len(cells) > _MAX_NAMED:
+        lines.append(f"  and {len(cells) - _MAX_NAMED} more")
     return lines
 
 

@@ -1,20 +1,16 @@
-"""Cells that raise, are killed, crash, hang or eat all memory, in sweeps of real processes.
+"""Tests of cells that raise, are killed, crash, hang or use all memory, in real sweeps.
 
-The faults come from a `sitecustomize` of the test's own, which Python loads in every process: in a
-cell's child it stands in for `xrgs.experiment.cell`, and does to cells of some seeds what the test
-names.
+The faults come from a `sitecustomize` of these tests, which Python loads in every process: in a
+cell's child it replaces `xrgs.experiment.cell`, and injects a fault into the cells of some seeds.
 """
 
 from __future__ import annotations
 
-import errno
 import json
-import os
 import shutil
 import signal
 import subprocess
 import sys
-import tempfile
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -22,12 +18,9 @@ from typing import Any
 
 import pytest
 
-from xrgs.config import Conf
-from xrgs.experiment.store import Store, StoreError
-from xrgs.sweep import study as sweep
-from xrgs.sweep.jobs import worker
+pytestmark = pytest.mark.slow
 
-#: Folder and faults -> `tests.conftest.Sweeps`.
+#: (folder, faults) -> `tests.conftest.Sweeps`.
 SweepsIn = Callable[..., Any]
 Ended = tuple[int, str, str]
 
@@ -47,7 +40,7 @@ if "xrgs.sweep.jobs.worker" in sys.orig_argv and "cell" in sys.orig_argv:
         def load(*_):
             raise RuntimeError("this cell raises")
         cell.dataset.load = load
-        cell.run(*arguments)
+        cell.run_cell(*arguments)
 
     def hangs(*_):
         child = subprocess.Popen([sys.executable, "-S", "-c", "import time; time.sleep(600)"])
@@ -64,9 +57,9 @@ if "xrgs.sweep.jobs.worker" in sys.orig_argv and "cell" in sys.orig_argv:
         def fsync(_):
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
         os.fsync = fsync
-        real().run(*arguments)
+        real().run_cell(*arguments)
 
-    def run(conf, variant, folder):
+    def run_cell(conf, variant, folder):
         fault = {
             1: raises,
             2: lambda *_: os.kill(os.getpid(), signal.SIGKILL),
@@ -76,12 +69,12 @@ if "xrgs.sweep.jobs.worker" in sys.orig_argv and "cell" in sys.orig_argv:
             6: finds_the_disk_full,
         }.get(conf.seed)
         if fault is None:
-            real().run(conf, variant, folder)
+            real().run_cell(conf, variant, folder)
         else:
             fault(conf, variant, folder)
 
     sys.modules["xrgs.experiment.cell"] = types.ModuleType("xrgs.experiment.cell")
-    sys.modules["xrgs.experiment.cell"].run = run
+    sys.modules["xrgs.experiment.cell"].run_cell = run_cell
 """
 
 
@@ -189,7 +182,7 @@ def test_a_full_disk_stops_the_sweep_and_costs_no_cell(
     code, _, err = told["full"]
     assert code == 1
     assert "is the disk full?" in err  # there was no room for the reason either
-    assert "What is done is kept" in err
+    assert "Finished cells are kept" in err
     assert 7 not in sweeps.cells()  # nothing more is tried
     assert not (sweeps.cells()[6] / "status.json").exists()
 
@@ -201,9 +194,8 @@ def test_a_signal_ends_the_sweep_with_its_cell_and_says_how_to_go_on(
     _, told = stopped
     ended, _, err = told[number.name]
     assert ended == code
-    assert err.splitlines()[-1] == (
-        f"stopped by {number.name}. What is done is kept: the same command goes on from there."
-    )
+    hint = "Finished cells are kept: run the same command again to continue."
+    assert err.splitlines()[-1] == f"stopped by {number.name}. {hint}"
     assert "Traceback" not in err
 
 
@@ -292,7 +284,7 @@ def test_a_disk_that_takes_no_more_is_said_and_loses_nothing(sweeps: Any) -> Non
         assert why in err
         assert "store=s" in err
         assert "Traceback" not in err
-        assert "What is done is kept" in err or "name another with store=" in err
+        assert "Finished cells are kept" in err or "choose another with store=" in err
     code, plan = told["room"]
     assert code == "0"
     assert "3 cells, 1 done" in plan
@@ -300,21 +292,3 @@ def test_a_disk_that_takes_no_more_is_said_and_loses_nothing(sweeps: Any) -> Non
     healthy = sweeps.folder / "before" / "cells"
     for cell in healthy.iterdir():
         assert files(sweeps.folder / "after" / "cells" / cell.name).keys() == files(cell).keys()
-
-
-def test_a_library_that_dies_of_a_full_disk_is_no_fault_of_the_scene_s(
-    compose: Callable[..., Conf], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    store = Store(tmp_path / "s")
-    store.prepare()
-
-    def full(**_: object) -> None:
-        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-
-    def dies(*_: object) -> dict[str, Any]:
-        monkeypatch.setattr(tempfile, "TemporaryFile", full)
-        raise worker.WorkerError("its process was ended by SIGABRT")
-
-    monkeypatch.setattr(worker, "run", dies)
-    with pytest.raises(StoreError, match="No space left"):
-        sweep._variant_of(compose("scene=motorcycle"), store, build=True)

@@ -1,145 +1,254 @@
-"""What a job does when its sweep is over."""
+"""Tests of a job: when it trains, when it leaves its cell, and what it reports."""
 
 from __future__ import annotations
 
 import json
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
+from typing import Any
 
-import hydra
 import pytest
 from hydra.core.hydra_config import HydraConfig
+from omegaconf import DictConfig, OmegaConf
 
-from xrgs import config
-from xrgs.capture import variant
+from xrgs.capture import scenes, variant
 from xrgs.cli import sweep as command
-from xrgs.config import Conf
+from xrgs.errors import XrgsError
 from xrgs.experiment.store import Store
 from xrgs.sweep import locks
 from xrgs.sweep.jobs import worker
-from xrgs.sweep.jobs.job import FAIL_FAST, LOCKED, STOPPED, STORE_FULL, SweepSession, run_job
+from xrgs.sweep.jobs.job import (
+    FAIL_FAST,
+    LOCKED,
+    STOPPED,
+    STORE_FULL,
+    UNWRITABLE,
+    run_job,
+)
+from xrgs.sweep.session import HandOver, SweepSession
+
+HandOverOf = Callable[..., HandOver]
+
+
+def ended(session: SweepSession) -> SweepSession:
+    """Return the session as that of a process that has ended."""
+    file = session.folder / "sweep"
+    file.write_text(json.dumps(json.loads(file.read_text()) | {"started": 1}))
+    return SweepSession(session.folder)
 
 
 @pytest.fixture
-def store(tmp_path: Path) -> Store:
-    """An empty one."""
-    store = Store(tmp_path / "s")
-    store.prepare()
-    return store
+def requests(monkeypatch: pytest.MonkeyPatch, store: Store) -> list[tuple[str, Mapping[str, Any]]]:
+    """What child processes were asked to do; none is started, and each cell is done at once."""
+    requested: list[tuple[str, Mapping[str, Any]]] = []
+
+    def finish(job: str, request: Mapping[str, Any], *_: object) -> dict[str, Any]:
+        requested.append((job, request))
+        folder = store.cell(Path(request["cell"]).name)
+        (folder.path / "scores.csv").write_text("view\na\n")
+        folder.finish(["a"], 1)
+        return {}
+
+    monkeypatch.setattr(worker, "run_in_child", finish)
+    return requested
 
 
-@pytest.fixture
-def conf(compose: Callable[..., Conf], store: Store) -> Conf:
-    """A cell's, whose variant is there as far as a job looks."""
-    conf = compose("scene=motorcycle", "splat.backend=torch", f"store={store.path}")
-    (store.variants / f"{variant.key(conf.scene, conf.variant)}-0").mkdir()
-    return conf
+def test_a_job_trains_what_was_planned_and_reads_no_photograph(
+    session: SweepSession,
+    store: Store,
+    hand_over_of: HandOverOf,
+    requests: list[tuple[str, Mapping[str, Any]]],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    made = hand_over_of(seed=5)
+    cell_id = session.hand_over(made)
+
+    def unexpected(*_: object) -> None:
+        raise AssertionError("a job composes, hashes and identifies nothing")
+
+    for module, name in (
+        (scenes, "fingerprint"),
+        (variant, "key"),
+        (variant, "find"),
+        (variant, "load"),
+    ):
+        monkeypatch.setattr(module, name, unexpected)
+    assert run_job(session, cell_id) == "done"
+    folder = store.cell(cell_id)
+    assert requests == [
+        (
+            "cell",
+            {
+                "conf": made.config,
+                "variant": str(store.variants / made.variant_id),
+                "cell": str(folder.path),
+            },
+        )
+    ]
+    assert folder.identity() == made.identity
+    assert json.loads((folder.path / "config.json").read_text()) == made.config
+    assert not list(store.locks.iterdir())
 
 
-@pytest.fixture
-def call(tmp_path: Path) -> SweepSession:
-    """A call of this process."""
-    (tmp_path / "call").mkdir()
-    call = SweepSession(tmp_path / "call")
-    call.begin()
-    return call
+def test_a_cell_that_is_done_meanwhile_is_not_trained_again(
+    session: SweepSession,
+    hand_over_of: HandOverOf,
+    requests: list[tuple[str, Mapping[str, Any]]],
+) -> None:
+    cell_id = session.hand_over(hand_over_of())
+    assert run_job(session, cell_id) == run_job(session, cell_id) == "done"
+    assert len(requests) == 1
 
 
-def signed_by(call: SweepSession, **changes: object) -> SweepSession:
-    """The call as another process's."""
-    file = call.folder / "sweep"
-    file.write_text(json.dumps(json.loads(file.read_text()) | changes))
-    return SweepSession(call.folder)
+def test_a_cell_that_another_process_trains_is_left_to_it(
+    session: SweepSession,
+    store: Store,
+    hand_over_of: HandOverOf,
+    requests: list[tuple[str, Mapping[str, Any]]],
+) -> None:
+    cell_id = session.hand_over(hand_over_of())
+    assert locks.acquire(store.locks, cell_id) is not None
+    assert run_job(session, cell_id) == LOCKED
+    assert not requests
 
 
-def test_a_call_is_over_when_it_is_stopped_or_its_process_is_no_more(call: SweepSession) -> None:
-    assert not call.stopped
-    assert signed_by(call, started=1).stopped == "the sweep is gone"
-    assert not signed_by(call, host="elsewhere").stopped  # there it may run
-    assert not signed_by(call, boot="another").stopped
-    for reason in ("the first", "the second"):
-        call.stop(reason)
-        assert call.stopped == "the first"
+def test_a_job_of_other_code_trains_nothing_and_blames_no_cell(
+    session: SweepSession,
+    store: Store,
+    hand_over_of: HandOverOf,
+    requests: list[tuple[str, Mapping[str, Any]]],
+) -> None:
+    made = hand_over_of()
+    planned = dict(made.identity) | {"code": {"splat/densify.py": "0"}}
+    cell_id = session.hand_over(HandOver(made.name, made.config, planned))
+    with pytest.raises(XrgsError, match="planned with other code"):
+        run_job(session, cell_id)
+    assert not requests
+    assert store.cell(cell_id).state().name == "absent"
+    assert not list(store.locks.iterdir())
+
+
+def test_a_variant_that_was_removed_is_named(
+    session: SweepSession, store: Store, hand_over_of: HandOverOf
+) -> None:
+    made = hand_over_of()
+    (store.variants / made.variant_id).rmdir()
+    with pytest.raises(XrgsError, match=f"its variant .*{made.variant_id} is missing"):
+        run_job(session, session.hand_over(made))
 
 
 @pytest.mark.parametrize(
-    ("error", "fail_fast", "why"),
+    ("error", "fail_fast", "outcome", "reason"),
     [
-        (worker.WorkerError("it raised"), True, FAIL_FAST),
-        (worker.WorkerError("it raised"), False, ""),
-        (worker.UnwritableError("a full disk"), True, STORE_FULL),
+        (worker.WorkerError("it raised"), True, "failed", FAIL_FAST),
+        (worker.WorkerError("it raised"), False, "failed", ""),
+        (worker.UnwritableError("a full disk"), True, UNWRITABLE, STORE_FULL),
     ],
 )
 def test_a_job_that_stops_the_others_says_why(
-    conf: Conf,
-    call: SweepSession,
+    session: SweepSession,
+    store: Store,
+    hand_over_of: HandOverOf,
     monkeypatch: pytest.MonkeyPatch,
     error: worker.WorkerError,
     fail_fast: bool,
-    why: str,
+    outcome: str,
+    reason: str,
 ) -> None:
-    def run(*_: object) -> None:
+    def fail(*_: object) -> None:
         raise error
 
-    monkeypatch.setattr(worker, "run", run)
-    conf.fail_fast = fail_fast
-    run_job(conf, call)
-    assert call.stopped == why
+    monkeypatch.setattr(worker, "run_in_child", fail)
+    cell_id = session.hand_over(hand_over_of(fail_fast=fail_fast))
+    assert run_job(session, cell_id) == outcome
+    assert session.stopped == reason
+    state = store.cell(cell_id).state()
+    assert state.name == ("failed" if outcome == "failed" else "unfinished")
+    if reason:
+        assert run_job(session, session.hand_over(hand_over_of(seed=1))) == STOPPED
 
 
-def test_a_disk_too_full_for_the_reason_stops_the_others_all_the_same(call: SweepSession) -> None:
-    (call.folder / "stopped").touch()
-    assert call.stopped == f"there is {call.folder / 'stopped'}"
-
-
-def test_no_job_begins_for_a_sweep_that_is_gone(
-    conf: Conf, call: SweepSession, store: Store
+def test_a_cell_whose_process_died_after_it_was_finished_is_done(
+    session: SweepSession,
+    store: Store,
+    hand_over_of: HandOverOf,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    assert run_job(conf, signed_by(call, started=1)) == STOPPED
+    def die_at_exit(_: str, request: Mapping[str, Any], *__: object) -> None:
+        folder = store.cell(Path(request["cell"]).name)
+        (folder.path / "scores.csv").write_text("view\na\n")
+        folder.finish(["a"], 1)
+        raise worker.WorkerError("its process was ended by SIGSEGV")
+
+    monkeypatch.setattr(worker, "run_in_child", die_at_exit)
+    assert run_job(session, session.hand_over(hand_over_of())) == "done"
+
+
+def test_no_job_begins_for_a_sweep_whose_process_has_ended(
+    session: SweepSession, store: Store, hand_over_of: HandOverOf
+) -> None:
+    cell_id = session.hand_over(hand_over_of())
+    assert run_job(ended(session), cell_id) == STOPPED
     assert not list(store.cells.iterdir())
 
 
 @pytest.mark.parametrize(
-    ("whose", "what", "outcome"), [(locks.Owner, "lives", STOPPED), (locks.Lock, "beat", LOCKED)]
+    ("owner", "attribute", "outcome"),
+    [(locks.Owner, "lives", STOPPED), (locks.Lock, "beat", LOCKED)],
 )
 def test_a_cell_ends_with_its_sweep_or_its_lock_and_is_unfinished(
-    conf: Conf,
-    call: SweepSession,
+    session: SweepSession,
     store: Store,
+    hand_over_of: HandOverOf,
     monkeypatch: pytest.MonkeyPatch,
-    whose: type,
-    what: str,
+    owner: type,
+    attribute: str,
     outcome: str,
 ) -> None:
-    def run(_: str, __: object, ___: object, on_poll: Callable[[int], None]) -> None:
+    def train(_: str, __: object, ___: object, on_poll: Callable[[int], None]) -> None:
         on_poll(0)
-        monkeypatch.setattr(whose, what, False if outcome == STOPPED else lambda *_: False)
+        lost = False if outcome == STOPPED else lambda *_: False
+        monkeypatch.setattr(owner, attribute, lost)
         on_poll(0)
 
-    monkeypatch.setattr(worker, "run", run)
-    assert run_job(conf, call) == outcome
+    monkeypatch.setattr(worker, "run_in_child", train)
+    assert run_job(session, session.hand_over(hand_over_of())) == outcome
     (cell,) = store.cells.iterdir()
     assert store.cell(cell.name).state().name == "unfinished"
     assert not list(store.locks.iterdir())
 
 
-class Ended(Exception):  # noqa: N818
-    """In place of a process's end."""
+class ProcessEnded(Exception):  # noqa: N818
+    """Stands in for the end of the process."""
 
 
-def test_a_worker_whose_sweep_is_gone_ends_without_an_answer(
-    call: SweepSession, monkeypatch: pytest.MonkeyPatch
+@pytest.fixture
+def job_config(session: SweepSession, monkeypatch: pytest.MonkeyPatch) -> DictConfig:
+    """The config that a launcher gives to a job."""
+    hydra = OmegaConf.create({"hydra": {"sweep": {"dir": str(session.folder)}}})
+    monkeypatch.setattr(HydraConfig.instance(), "cfg", hydra)
+    return OmegaConf.create({"cell": "x"})
+
+
+def test_a_launcher_s_worker_whose_sweep_has_ended_ends_without_an_answer(
+    session: SweepSession, job_config: DictConfig, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def end(_: int) -> None:
-        raise Ended
+        raise ProcessEnded
 
-    signed_by(call, started=1)
-    config.register()
-    with hydra.initialize_config_dir(str(config.CONF_DIR), version_base="1.3"):
-        folder = f"hydra.sweep.dir={call.folder}"
-        composed = hydra.compose("config", [folder], return_hydra_config=True)
-    monkeypatch.setattr(HydraConfig.instance(), "cfg", composed)
+    ended(session)
     monkeypatch.setattr(os, "_exit", end)
-    with pytest.raises(Ended):
-        command._sweep(composed)
+    with pytest.raises(ProcessEnded):
+        command._run_job(job_config)
+
+
+def test_the_command_hands_a_cell_s_id_to_its_job(
+    session: SweepSession,
+    job_config: DictConfig,
+    hand_over_of: HandOverOf,
+    requests: list[tuple[str, Mapping[str, Any]]],
+) -> None:
+    job_config.cell = session.hand_over(hand_over_of())
+    assert command._run_job(job_config) == "done"
+    assert len(requests) == 1

@@ -1,7 +1,7 @@
-"""`kill -9` at random moments of a sweep: run again, it ends as if it had not been killed.
+"""Tests that a sweep killed by `kill -9` at random moments ends as if it had not been killed.
 
-`XRGS_KILLS=20 pytest tests/jobs/test_kill.py --log-cli-level=info` kills so often and tells of it;
-`XRGS_KILL_SEED=N` draws the moments again that a failure names.
+`XRGS_KILLS=20 pytest tests/sweep/jobs/test_kill.py --log-cli-level=info` kills 20 times and logs
+each; `XRGS_KILL_SEED=N` draws the moments again that a failure's log names.
 """
 
 from __future__ import annotations
@@ -19,6 +19,10 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+import pytest
+
+pytestmark = pytest.mark.slow
+
 _log = logging.getLogger(__name__)
 
 #: Two cells. A checkpoint after nearly every step makes training long enough to be hit.
@@ -32,9 +36,9 @@ ARGUMENTS = (
     "fail_fast=true",
 )
 CELLS = 2
-#: Where a sweep comes by, in order: what is written there first, and about how many seconds it
-#: stays. `start` to `finish` are of each cell.
-STATIONS = {
+#: The phases of a sweep in order: the file that each writes first, and about how many seconds it
+#: takes. The phases from `start` to `finish` are those of each cell.
+PHASES = {
     "plan": ("-", 0.5),
     "build": ("variants/.*.building", 2.0),
     "start": ("cells/*/config.json", 2.0),
@@ -47,36 +51,36 @@ STATIONS = {
 
 @dataclass(frozen=True, order=True)
 class Moment:
-    """When to kill, and whom. They are ordered as a sweep comes by, killed and run again."""
+    """When to kill, and which process; ordered as a sweep reaches them over all its restarts."""
 
     done: int
-    """Cells that are done."""
-    station: int
+    """Number of cells that are done."""
+    phase: int
     later: float
-    """Seconds since it came there."""
+    """Seconds since the phase began."""
     worker: bool
-    """Whether to kill the process that builds or trains, if there is one; else the sweep."""
+    """Whether to kill the child that builds or trains, if there is one; else the sweep."""
 
     @property
-    def place(self) -> str:
-        return list(STATIONS)[self.station]
+    def phase_name(self) -> str:
+        return list(PHASES)[self.phase]
 
 
 def drawn(count: int, chance: random.Random) -> list[Moment]:
-    """Random moments, one of them in training; each station has its turn before one has two."""
-    places = list(STATIONS)
+    """Return random moments, one of them in training; no phase is hit twice before all are hit."""
+    places = list(PHASES)
     turns = ["train", *chance.sample([name for name in places if name != "train"], len(places) - 1)]
     moments = []
     for turn in range(count):
         name = turns[turn % len(turns)]
         done = {"build": 0, "report": CELLS}.get(name, chance.randrange(CELLS))
-        later = chance.uniform(0, STATIONS[name][1])
+        later = chance.uniform(0, PHASES[name][1])
         moments.append(Moment(done, places.index(name), later, chance.random() < 0.5))
     return sorted(moments)
 
 
-class Story:
-    """A store whose sweeps are killed, and what of it was done by then."""
+class KilledSweeps:
+    """A store whose sweeps are killed, and the cells that were done before each kill."""
 
     def __init__(self, sweeps: Any) -> None:
         self.sweeps = sweeps
@@ -100,7 +104,7 @@ class Story:
         self.finished = now
 
     def kill(self, moment: Moment) -> str:
-        """Start a sweep and kill it; what was killed, empty where it came to its end before."""
+        """Start a sweep and kill it; return what was killed, or nothing if it ended before."""
         before, done = self._signs(moment), len(self.done())
         sweep = self.sweeps.start(*ARGUMENTS)
         while sweep.process.poll() is None and not self._is_at(moment, before):
@@ -128,14 +132,14 @@ class Story:
     def _is_at(self, moment: Moment, before: set[tuple[Path, int, int]]) -> bool:
         """Whether the sweep that was started last has come there, or beyond."""
         done, signs = self.done(), self._signs(moment) - before
-        return moment.place == "plan" or (
+        return moment.phase_name == "plan" or (
             len(done) >= moment.done and any(file.parent not in done for file, *_ in signs)
         )
 
     def _signs(self, moment: Moment) -> set[tuple[Path, int, int]]:
-        """What stations from this one on have left; who writes it again makes another of it."""
+        """What phases from this one on have left; who writes it again makes another of it."""
         found = set()
-        for pattern, _ in list(STATIONS.values())[moment.station :]:
+        for pattern, _ in list(PHASES.values())[moment.phase :]:
             for file in self.store.glob(pattern):
                 with suppress(FileNotFoundError):
                     stat = file.stat()
@@ -144,7 +148,7 @@ class Story:
 
 
 def has_answered(request: str, answer: str) -> bool:
-    """Whether a worker had, when it was killed; its folder goes when the sweep has read that."""
+    """Return whether a child had answered when it was killed; a read answer's folder is gone."""
     return Path(answer).exists() or not Path(request).exists()
 
 
@@ -176,32 +180,32 @@ def test_a_sweep_killed_again_and_again_ends_as_if_it_had_not_been(
     _log.info("XRGS_KILLS=%d XRGS_KILL_SEED=%d", len(moments), seed)
     (tmp_path / "killed").mkdir()
     (tmp_path / "spared" / "s").mkdir(parents=True)
-    story = Story(sweeps_in(tmp_path / "killed"))
+    killed = KilledSweeps(sweeps_in(tmp_path / "killed"))
     for moment in moments:
         start = time.monotonic()
-        victim = story.kill(moment) or story.kill(replace(moment, later=0))
+        victim = killed.kill(moment) or killed.kill(replace(moment, later=0))
         _log.info(
             "%d done, %s + %.2f s: %s killed, %.1f s in all",
-            *(moment.done, moment.place, moment.later, victim or "nothing"),
+            *(moment.done, moment.phase_name, moment.later, victim or "nothing"),
             time.monotonic() - start,
         )
-        story.check()
+        killed.check()
         assert victim
 
-    code, _, err = story.sweeps.run(*ARGUMENTS)
+    code, _, err = killed.sweeps.run(*ARGUMENTS)
     assert code == 0, err
-    assert err.count("training cell") == CELLS - len(story.finished)
-    story.check()
-    assert len(story.finished) == CELLS
+    assert err.count("training cell") == CELLS - len(killed.finished)
+    killed.check()
+    assert len(killed.finished) == CELLS
 
-    spared = Story(sweeps_in(tmp_path / "spared"))
-    shutil.copytree(story.store / "variants", spared.store / "variants")
+    spared = KilledSweeps(sweeps_in(tmp_path / "spared"))
+    shutil.copytree(killed.store / "variants", spared.store / "variants")
     code, _, err = spared.sweeps.run(*ARGUMENTS)
     assert code == 0, err
-    assert {cell.name: results(cell) for cell in story.done()} == {
+    assert {cell.name: results(cell) for cell in killed.done()} == {
         cell.name: results(cell) for cell in spared.done()
     }
-    logs = [(cell / "log.txt").read_text() for cell in story.done()]
+    logs = [(cell / "log.txt").read_text() for cell in killed.done()]
     assert any("going on from the checkpoint" in log for log in logs)
     for pattern in ("cells/*/.*", "cells/*/checkpoint.npz", "locks/[!.]*"):
-        assert not list(story.store.glob(pattern))
+        assert not list(killed.store.glob(pattern))

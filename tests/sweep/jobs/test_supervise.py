@@ -1,4 +1,4 @@
-"""A process under limits: whatever it does, it ends, with all that it started."""
+"""Tests that a process under limits ends with all that it started, whatever it does."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 import pytest
@@ -20,6 +21,7 @@ from xrgs.sweep.jobs.supervise import Limits
 #: Starts a child of its own, writes both their numbers, refuses to end, and hangs.
 _STUBBORN = """
 import json, os, signal, subprocess, sys, time
+from functools import partial
 from pathlib import Path
 from xrgs.sweep.jobs import supervise
 supervise.follow_parent()
@@ -58,21 +60,25 @@ def wait(what: Callable[[], bool], seconds: float = 30.0) -> None:
         time.sleep(0.02)
 
 
-def test_what_ends_by_itself_gives_its_code_or_signal() -> None:
-    assert supervise.run(python("raise SystemExit(3)"), Limits()) == supervise.Ended(3)
+def test_a_process_that_ends_by_itself_gives_its_code_or_signal() -> None:
+    assert supervise.run_supervised(
+        python("raise SystemExit(3)"), Limits()
+    ) == supervise.ProcessEnd(3)
     script = "import os; os.kill(os.getpid(), 9)"
-    assert supervise.run(python(script), Limits(1, 1)) == supervise.Ended(-signal.SIGKILL)
+    assert supervise.run_supervised(python(script), Limits(1, 1)) == supervise.ProcessEnd(
+        -signal.SIGKILL
+    )
 
 
-def test_what_hangs_is_killed_with_its_children_though_it_refuses(
+def test_a_process_that_hangs_is_killed_with_its_children_though_it_ignores_sigterm(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(supervise, "_GRACE_S", 0.5)
     pids = tmp_path / "pids"
-    ended = supervise.run(python(_STUBBORN, str(pids)), Limits(minutes=0.08))
-    assert "limits.minutes=0.08" in ended.reason
+    ended = supervise.run_supervised(python(_STUBBORN, str(pids)), Limits(minutes=0.05))
+    assert "limits.minutes=0.05" in ended.reason
     for pid in json.loads(pids.read_text()):
-        wait(lambda pid=pid: gone(pid))
+        wait(partial(gone, pid))
 
 
 @pytest.mark.parametrize("by", ["itself", "its child"])
@@ -80,30 +86,30 @@ def test_memory_is_that_of_the_process_and_its_children(by: str) -> None:
     eats = _HUNGRY
     if by == "its child":
         eats = f"import subprocess, sys; subprocess.run([sys.executable, '-c', {_HUNGRY!r}])"
-    ended = supervise.run(python(eats), Limits(memory_gb=0.2))
+    ended = supervise.run_supervised(python(eats), Limits(memory_gb=0.2))
     assert "limits.memory_gb=0.2" in ended.reason
-    assert supervise.run(python(_HUNGRY), Limits(memory_gb=4)).reason == ""
+    assert supervise.run_supervised(python(_HUNGRY), Limits(memory_gb=4)).reason == ""
 
 
-def test_memory_that_nobody_tells_of_is_not_limited_in_silence(
+def test_a_system_that_does_not_say_how_much_memory_is_used_is_refused(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr(Path, "exists", lambda _: False)
     with pytest.raises(XrgsError, match=r"limits\.memory_gb"):
-        supervise.run(python(""), Limits(memory_gb=1))
+        supervise.run_supervised(python(""), Limits(memory_gb=1))
 
 
-def test_an_objection_ends_it() -> None:
-    asked = []
+def test_an_exception_of_on_poll_ends_the_process() -> None:
+    polled = []
 
     def on_poll(pid: int) -> None:
-        asked.append(pid)
-        if len(asked) == 2:
+        polled.append(pid)
+        if len(polled) == 2:
             raise XrgsError("enough")
 
     with pytest.raises(XrgsError, match="enough"):
-        supervise.run(python("import time; time.sleep(600)"), Limits(), on_poll)
-    assert gone(asked[-1])
+        supervise.run_supervised(python("import time; time.sleep(600)"), Limits(), on_poll)
+    assert gone(polled[-1])
 
 
 @pytest.mark.parametrize("how", [signal.SIGKILL, signal.SIGTERM, signal.SIGINT])
@@ -111,11 +117,11 @@ def test_no_child_outlives_its_parent(tmp_path: Path, how: signal.Signals) -> No
     pids = tmp_path / "pids"
     script = (
         "import sys; from xrgs.sweep.jobs import supervise; supervise._GRACE_S = 0.1;"
-        "supervise.run(sys.argv[1:], supervise.Limits())"
+        "supervise.run_supervised(sys.argv[1:], supervise.Limits())"
     )
     command = python(script, *python(_STUBBORN, str(pids)))
     with subprocess.Popen(command, stderr=subprocess.DEVNULL) as parent:
         wait(pids.exists)
         os.kill(parent.pid, how)
     for pid in json.loads(pids.read_text()):
-        wait(lambda pid=pid: gone(pid))
+        wait(partial(gone, pid))

@@ -1,1 +1,1 @@
-"""One cell's job: a process of its own, under limits, whose owner has the cell's lock."""
+"""Runs one cell's job: a child process under limits, whose parent holds the cell's lock."""

@@ -1,4 +1,4 @@
-"""A process under limits of time and memory, which never outlives the one that started it."""
+"""Runs a process under limits of time and memory, which never outlives the one that started it."""
 
 from __future__ import annotations
 
@@ -16,61 +16,65 @@ from xrgs.errors import XrgsError
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
-#: Seconds between looks at the child, and how long it has after SIGTERM to end by itself.
-_LOOK_S = 0.2
+#: Seconds between two polls of the child, and seconds it has after SIGTERM to end by itself.
+_POLL_S = 0.2
 _GRACE_S = 5.0
-#: Nothing is ever written to the pipe: `read` returns at its end. The group asked to end keeps it.
+#: Waits for the end of the pipe on its standard input, to which nothing is ever written, and then
+#: kills its process group. It ignores the signals that the group gets when it is asked to end.
 _WATCHER = "trap '' TERM INT HUP; read -r _; kill -s KILL -- -$1"
 
 
 @dataclass(frozen=True)
 class Limits:
-    """What a process and its children may take; 0 is no limit."""
+    """Limits of a process and all its children; 0 means no limit."""
 
     minutes: float = 0.0
+    """Wall time, minutes."""
     memory_gb: float = 0.0
-    """10^9 bytes of resident memory of all of them together, read every 0.2 s: what is allocated
-    and never touched costs nothing. Not RLIMIT_AS: torch alone maps several times what it uses."""
+    """Resident memory of all of them together, 10^9 bytes, read every 0.2 s. RLIMIT_AS would not
+    do: torch alone maps several times the memory that it uses."""
 
 
 @dataclass(frozen=True)
-class Ended:
+class ProcessEnd:
     """How a process ended."""
 
     code: int
-    """Its exit code, or minus the signal that ended it."""
+    """Its exit code, or minus the number of the signal that ended it."""
     reason: str = ""
-    """Which limit it was ended at; empty where it ended by itself."""
+    """Which limit it exceeded and was ended for; empty if it ended by itself."""
 
 
-def run(
+def run_supervised(
     command: Sequence[str], limits: Limits, on_poll: Callable[[int], None] = lambda _: None
-) -> Ended:
-    """Run a command to its end, or to its limit, with a session of its own.
+) -> ProcessEnd:
+    """Run a command, in a session of its own, until it ends or exceeds a limit.
 
-    Its standard input is a pipe that ends when this process does (`follow_parent`).
+    Its standard input is a pipe that ends when this process does (see `follow_parent`).
 
     Args:
-        command: program and arguments.
-        limits: it and its children are ended where they go beyond.
-        on_poll: called again and again while it runs, with its process number; what it raises
-            ends it, and is raised here.
+        command: The program and its arguments.
+        limits: The process and its children are ended when they exceed them.
+        on_poll: Called repeatedly while the process runs, with its process id. An exception that
+            it raises ends the process and is raised here.
 
     Raises:
-        XrgsError: memory is limited on a system that doesn't tell how much a process has.
+        XrgsError: Memory is limited, on a system that does not say how much a process uses.
     """
     if limits.memory_gb and not Path("/proc/self/statm").exists():
-        raise XrgsError(f"limits.memory_gb={limits.memory_gb:g}: this system has no /proc")
+        raise XrgsError(
+            f"limits.memory_gb={limits.memory_gb:g} can't be kept: this system has no /proc"
+        )
     child = subprocess.Popen(command, stdin=subprocess.PIPE, start_new_session=True)  # noqa: S603
     try:
         reason = _watch(child, limits, on_poll)
     finally:
         _end(child)
-    return Ended(child.returncode, reason)
+    return ProcessEnd(child.returncode, reason)
 
 
 def _watch(child: subprocess.Popen[bytes], limits: Limits, on_poll: Callable[[int], None]) -> str:
-    """Wait for its end; why it has to be ended, or empty."""
+    """Wait until the child ends or exceeds a limit; return which limit, or nothing."""
     start, pause = time.monotonic(), 0.01
     while child.poll() is None:
         minutes = (time.monotonic() - start) / 60
@@ -83,12 +87,12 @@ def _watch(child: subprocess.Popen[bytes], limits: Limits, on_poll: Callable[[in
             )
         on_poll(child.pid)
         time.sleep(pause)
-        pause = min(_LOOK_S, 1.5 * pause)
+        pause = min(_POLL_S, 1.5 * pause)
     return ""
 
 
 def _end(child: subprocess.Popen[bytes]) -> None:
-    """End it and whatever it started: asked first, so that its log can say where it was."""
+    """End the child and all that it started, by SIGTERM first, so that it can log its stack."""
     if child.poll() is None:
         _signal(child, signal.SIGTERM)
         with suppress(subprocess.TimeoutExpired):
@@ -100,16 +104,17 @@ def _end(child: subprocess.Popen[bytes]) -> None:
 
 
 def _signal(child: subprocess.Popen[bytes], number: int) -> None:
-    with suppress(ProcessLookupError, PermissionError):  # all gone; or but the dead are left
+    # The group has no process any more, or none but zombies.
+    with suppress(ProcessLookupError, PermissionError):
         os.killpg(child.pid, number)
 
 
 def _resident_bytes(session: int) -> int:
-    """Resident memory of every process of a session; pages that they share count for each."""
+    """Return the resident bytes of all processes of a session; shared pages count for each."""
     page, total = os.sysconf("SC_PAGE_SIZE"), 0
     for folder in Path("/proc").iterdir():
         if folder.name.isdecimal():
-            with suppress(OSError, IndexError):  # it may end while it is looked at
+            with suppress(OSError, IndexError):  # it may end while it is read
                 stat = (folder / "stat").read_text(encoding="utf-8", errors="replace")
                 if int(stat.rpartition(")")[2].split()[3]) == session:
                     total += page * int((folder / "statm").read_text(encoding="ascii").split()[1])
@@ -117,18 +122,18 @@ def _resident_bytes(session: int) -> int:
 
 
 def follow_parent() -> None:
-    """In the child: end, with all its children, when the process that started it is no more.
+    """End this child and all its children when the process that started it has ended.
 
-    An orphan that went on would write to a cell which by its lock is nobody's. A process of its own
-    waits for the pipe's end, so that a child that hangs in native code ends too. It is the shell: a
-    thread would want the interpreter, and PR_SET_PDEATHSIG leaves the child's children.
+    An orphan would go on writing to a cell whose lock is free. A separate shell process waits for
+    the end of the pipe on standard input, so that a child that hangs in native code is ended too: a
+    thread would need the interpreter's lock, and PR_SET_PDEATHSIG would spare the child's children.
     """
     if os.getpgrp() != os.getpid():
-        return  # started by hand: its group is the shell's
+        return  # started by hand: the process group is the shell's
     subprocess.Popen(["/bin/sh", "-c", _WATCHER, "sh", str(os.getpid())])  # noqa: S603
 
 
 def offer_to_oom_killer() -> None:
-    """In the child: where the machine runs out of memory, this process goes, not the sweep."""
+    """Let the kernel kill this child, and not the sweep, when the machine runs out of memory."""
     with suppress(OSError):
         Path("/proc/self/oom_score_adj").write_text("500", encoding="ascii")

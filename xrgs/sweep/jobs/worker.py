@@ -1,7 +1,8 @@
-"""Work in a process of its own: a kill, an out-of-memory or a segfault ends that work alone.
+"""Does one piece of work in a child process: a kill or a segfault ends that work alone.
 
-The parent (`run`) stays without torch; the child is
-`python -m xrgs.sweep.jobs.worker JOB REQUEST ANSWER`.
+The parent calls `run_in_child` and never imports torch. The child runs
+`python -m xrgs.sweep.jobs.worker JOB REQUEST ANSWER`: the name of the work, the file that says what
+to do, and the file for its answer.
 """
 
 from __future__ import annotations
@@ -28,49 +29,56 @@ from xrgs.sweep.jobs import supervise
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
 
-#: What says that a file system takes no more, whatever the job does.
+#: Said to the user when the store can't be written any more.
+NOTHING_LOST = (
+    "Finished cells are kept: when there is room to write, run the same command again to continue."
+)
+#: Errors by which a file system says that nothing more can be written to it.
 _UNWRITABLE = frozenset({errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EIO})
 _NO_LIMITS = supervise.Limits()
 
 
 class WorkerError(XrgsError):
-    """The child said why it failed, or died without a word."""
+    """The work failed in the child, or the child died before it answered."""
 
 
 class UnwritableError(WorkerError):
-    """The child could not write: the disk is full, or read-only, or broken."""
+    """The child could not write its files: the disk is full, read-only or broken."""
 
 
-def run(
+def run_in_child(
     job: str,
     request: Mapping[str, Any],
     limits: supervise.Limits = _NO_LIMITS,
     on_poll: Callable[[int], None] = lambda _: None,
 ) -> dict[str, Any]:
-    """Run one job in a child process and return its answer.
+    """Do one piece of work in a child process and return its answer.
 
     Args:
-        job: a name in `_JOBS`.
-        request: what it is to do, as plain JSON values.
-        limits: the child is ended where it goes beyond.
-        on_poll: called while it runs, with the child's number; what it raises ends the child, and
-            is raised here.
+        job: `variant` to build a variant, or `cell` to train a cell.
+        request: The arguments of the work, as plain JSON values.
+        limits: The child is ended when it exceeds them.
+        on_poll: Called repeatedly while the child runs, with its process id. An exception that it
+            raises ends the child and is raised here.
+
+    Returns:
+        The answer of the work, as plain JSON values.
 
     Raises:
-        UnwritableError: it could not write its files; nothing else is wrong with it.
-        WorkerError: the job failed; the message is its reason.
+        UnwritableError: The child could not write its files; nothing else is wrong with its work.
+        WorkerError: The work failed; the message is the reason.
     """
     with tempfile.TemporaryDirectory(prefix="xrgs-") as folder:
         request_file, answer_file = Path(folder) / "request.json", Path(folder) / "answer.json"
         write_json(request_file, dict(request))
-        # -P: run from a checkout, the child must import the installed package as its parent does.
+        # -P keeps the working folder off sys.path: the child imports the package its parent did.
         child = [sys.executable, "-P", "-m", "xrgs.sweep.jobs.worker"]
         command = [*child, job, str(request_file), str(answer_file)]
-        ended = supervise.run(command, limits, on_poll)
+        ended = supervise.run_supervised(command, limits, on_poll)
         if ended.reason:
             raise WorkerError(ended.reason)
         if not answer_file.exists() and ended.code == os.EX_IOERR:
-            raise UnwritableError(f"it had no room for its answer in {folder}: is the disk full?")
+            raise UnwritableError(f"it could not write its answer to {folder}: is the disk full?")
         if not answer_file.exists():
             raise WorkerError(_death(ended.code))
         answer = dict(read_json(answer_file))
@@ -81,7 +89,11 @@ def run(
 
 
 def unwritable(error: OSError) -> bool:
-    """Whether an error is the file system's, that nothing more can be written."""
+    """Return whether an error says that nothing more can be written to a file system.
+
+    Args:
+        error: The error of a system call.
+    """
     return error.errno in _UNWRITABLE
 
 
@@ -111,17 +123,18 @@ def _run_cell(request: Mapping[str, Any]) -> dict[str, Any]:
 
     folder = CellFolder(Path(request["cell"]))
     with (folder.path / "log.txt").open("a", encoding="utf-8") as log:
-        # All that the cell, libraries and children print, to the last words. How far it is, it
-        # leaves in a file: on a terminal the bars of several cells would run into each other.
+        # Everything that the cell, its libraries and its children print goes to the log. Progress
+        # goes to a file instead: on a terminal the bars of several cells would mix.
         for descriptor in (1, 2):
             os.dup2(log.fileno(), descriptor)
-        # A cell that is ended from outside says where it was. To the descriptor, which stays open.
+        # A cell that is ended by SIGTERM writes its stack. It is given the descriptor, which stays
+        # open when `log` is closed.
         faulthandler.register(signal.SIGTERM, 2, chain=True)
         logging.basicConfig(format="%(asctime)s %(message)s", level=logging.INFO)
         frozen = variant.load(Path(request["variant"]))
         if frozen.id != frozen.path.name:
-            raise variant.CorruptVariant(f"{frozen.path}: this is variant {frozen.id}, renamed")
-        cell.run(from_dict(request["conf"]), frozen, folder)
+            raise variant.CorruptVariant(f"{frozen.path} holds another variant: {frozen.id}")
+        cell.run_cell(from_dict(request["conf"]), frozen, folder)
     return {}
 
 
@@ -132,7 +145,13 @@ _JOBS: dict[str, Callable[[Mapping[str, Any]], dict[str, Any]]] = {
 
 
 def main(job: str, request: str, answer: str) -> None:
-    """The child: do the job and write the answer, or what went wrong."""
+    """Do one piece of work in the child, and write its answer or the reason why it failed.
+
+    Args:
+        job: `variant` or `cell`.
+        request: JSON file with the arguments.
+        answer: File for the answer.
+    """
     faulthandler.enable()
     ignore_broken_pipe()
     supervise.follow_parent()

@@ -1,24 +1,31 @@
-"""Names with any character in them: of scenes, photographs, stores, on the command line."""
+"""Tests of the commands' arguments: help, errors, and paths with any character in them."""
 
 from __future__ import annotations
 
 import os
 import shutil
+import sys
 from collections.abc import Callable
+from dataclasses import fields
 from pathlib import Path
 
 import numpy as np
 import pytest
 from hydra.core.override_parser.overrides_parser import OverridesParser
+from hydra.errors import HydraException
+from omegaconf.errors import ConfigKeyError
 from PIL import Image
 
 from xrgs import config
+from xrgs.bench.settings import Settings
 from xrgs.capture import images
 from xrgs.capture.scenes import folder, motorcycle
-from xrgs.cli.arguments import dotlist, with_quotes
+from xrgs.cli import bench, report, status
+from xrgs.cli.arguments import dotlist, errors_as_messages, with_quotes
+from xrgs.cli.report import ReportConf
+from xrgs.cli.status import StatusConf
 from xrgs.errors import XrgsError
 
-#: As `tests.conftest.run_command` gives it.
 RunCommand = Callable[..., tuple[int, str, str]]
 ACCENT = "e\N{COMBINING ACUTE ACCENT}"
 WHOLE = "\N{LATIN SMALL LETTER E WITH ACUTE}"
@@ -30,20 +37,20 @@ ODD = (
 
 
 def parsed(word: str) -> object:
-    """What Hydra makes of a word that went through us."""
+    """Return what Hydra reads from a word that was given quotes."""
     (override,) = OverridesParser.create().parse_overrides(with_quotes([word]))
     return override.value()
 
 
 @pytest.mark.parametrize("name", ODD)
-def test_hydra_gets_a_path_as_it_was_written(name: str) -> None:
+def test_hydra_reads_a_path_as_it_was_written(name: str) -> None:
     found = parsed(f"scene.path={name}")
     assert getattr(found, "text", found) == name
     assert dotlist([f"store={name}"]).store == name
 
 
 @pytest.mark.parametrize("name", ["a,b", "null", "${y}", "a\\b", f"{WHOLE},b"])
-def test_what_hydra_reads_otherwise_is_a_path_where_it_exists(
+def test_a_word_that_hydra_reads_otherwise_is_a_path_if_it_exists(
     name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, compose: Callable[..., config.Conf]
 ) -> None:
     monkeypatch.chdir(tmp_path)
@@ -58,8 +65,8 @@ def test_lists_quotes_and_other_keys_stay_as_they_are() -> None:
     assert with_quotes(["store=é,b c"]) == ["store='é,b c'"]
 
 
-def test_bytes_that_are_no_unicode_are_named(tmp_path: Path) -> None:
-    with pytest.raises(XrgsError, match=r"store=\\udcff.*no Unicode"):
+def test_bytes_that_are_not_unicode_are_named(tmp_path: Path) -> None:
+    with pytest.raises(XrgsError, match=r"store=\\udcff.*not valid Unicode"):
         with_quotes(["store=\udcff"])
     for name in (b"a.png", b"\xff.png"):
         Image.new("RGB", (9, 9)).save(os.path.join(os.fsencode(tmp_path), name), "PNG")  # noqa: PTH118
@@ -78,14 +85,17 @@ def test_photographs_that_would_be_one_file_somewhere_are_named(
         folder.photographs(str(tmp_path), 0)
 
 
-def test_a_scene_of_odd_names_goes_the_whole_way(run_command: RunCommand, tmp_path: Path) -> None:
+@pytest.mark.slow
+def test_a_scene_with_odd_names_is_swept_and_reported(
+    run_command: RunCommand, tmp_path: Path
+) -> None:
     scene = tmp_path / f"-部屋 🙂 {{it's}} 50%=#1; {ACCENT}, a"
     scene.mkdir()
     views = ['-a b\'s & "c" (1) 🙂', f"[{ACCENT}]=50%#, $x.y"]
     for name, file in zip(views, motorcycle.files(), strict=True):
         shutil.copy(file, scene / f"{name}.png")
-    conf = ("preset=smoke", "train.steps=2", "variant.test_every=0", "variant.min_hr=1")
-    conf += ("variant.long_side=185", "variant.sfm.reference=false")
+    conf = ["preset=smoke", "train.steps=2", "variant.test_every=0", "variant.min_hr=1"]
+    conf += ["variant.long_side=185", "variant.sfm.reference=false"]
     words = ("+ablation=curriculum", "scene=folder", f"scene.path={scene.name}", *conf)
     store = "store=st öre, 'a' {b} 🙂"
     code, out, err = run_command("sweep", tmp_path, *words, store)
@@ -103,3 +113,54 @@ def test_a_scene_of_odd_names_goes_the_whole_way(run_command: RunCommand, tmp_pa
         code, out, err = run_command(command, tmp_path, store)
         assert code == 0, err
         assert name in out
+
+
+@pytest.mark.parametrize("command", ["sweep", "report", "status", "bench", "data"])
+def test_help_answers_at_once(
+    run_command: RunCommand, tmp_path: Path, without_heavy: str, command: str
+) -> None:
+    code, out, err = run_command(command, tmp_path, "--help", PYTHONPATH=without_heavy)
+    assert code == 0, err
+    assert out.startswith(f"xrgs-{command} ")
+    assert max(map(len, out.splitlines())) < 600
+    assert "=" in out
+    assert "`" not in out
+
+
+def test_help_names_every_choice(run_command: RunCommand, tmp_path: Path) -> None:
+    code, out, _ = run_command("sweep", tmp_path, "--help")
+    assert code == 0
+    for name in ("consistency", "llff/fern", "motorcycle", "laptop", "smoke"):
+        assert name in out
+
+
+@pytest.mark.parametrize("schema", [ReportConf, StatusConf, Settings])
+def test_help_has_every_argument(
+    schema: type, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    command = {ReportConf: report, StatusConf: status, Settings: bench}[schema]
+    monkeypatch.setattr(sys, "argv", ["command", "--help"])
+    with pytest.raises(SystemExit) as end:
+        command.main()
+    assert end.value.code is None
+    out = capsys.readouterr().out
+    assert [field.name for field in fields(schema) if f"{field.name}=" not in out] == []
+
+
+@pytest.mark.parametrize(
+    ("error", "message"),
+    [
+        (XrgsError("two\nlines"), "xrgs-x: two\nlines"),
+        (HydraException("two\nlines"), "xrgs-x: two (hint)"),
+        (ConfigKeyError("two\nlines"), "xrgs-x: two (hint)"),
+    ],
+)
+def test_an_error_that_the_user_can_correct_is_a_message(error: Exception, message: str) -> None:
+    with pytest.raises(SystemExit) as end, errors_as_messages("xrgs-x", " (hint)"):
+        raise error
+    assert end.value.code == message
+
+
+def test_other_errors_are_not_hidden() -> None:
+    with pytest.raises(ZeroDivisionError), errors_as_messages("xrgs-x"):
+        raise ZeroDivisionError

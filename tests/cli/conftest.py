@@ -1,0 +1,146 @@
+"""Fixtures of the commands' tests: commands in this process, and a store of a real sweep."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import shutil
+import sys
+from collections.abc import Callable, Mapping
+from contextlib import nullcontext
+from dataclasses import dataclass, field
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+from PIL import Image
+
+import xrgs.report
+from xrgs.capture import variant
+from xrgs.cli import sweep
+from xrgs.experiment.store import Store
+from xrgs.safeio.atomic import write_json
+from xrgs.sweep.jobs import worker
+
+RunCommand = Callable[..., tuple[int, str, str]]
+SMOKE = ("scene=motorcycle", "preset=smoke", "train.steps=8")
+#: Modules that take long to import, and that a plan and `--help` must do without.
+HEAVY = ("kornia", "matplotlib", "pandas", "pycolmap", "scipy", "skimage", "torch")
+
+
+@pytest.fixture(scope="session")
+def contents() -> Callable[[Path], dict[str, str]]:
+    """(folder) -> the digest of every file in it."""
+
+    def read(folder: Path) -> dict[str, str]:
+        return {
+            file.relative_to(folder).as_posix(): hashlib.sha256(file.read_bytes()).hexdigest()
+            for file in sorted(folder.rglob("*"))
+            if file.is_file()
+        }
+
+    return read
+
+
+@pytest.fixture(scope="session")
+def photographs() -> Callable[..., Path]:
+    """(folder, count, size) -> the folder with flat photographs, in which SIFT finds nothing."""
+
+    def written(folder: Path, count: int, size: tuple[int, int] = (120, 90)) -> Path:
+        folder.mkdir(parents=True, exist_ok=True)
+        for number in range(count):
+            pixels = np.full((size[1], size[0], 3), 40 + number, np.uint8)
+            Image.fromarray(pixels).save(folder / f"{number}.png")
+        return folder
+
+    return written
+
+
+@pytest.fixture
+def without_heavy(tmp_path_factory: pytest.TempPathFactory) -> str:
+    """A PYTHONPATH where modules that take long to import raise an error."""
+    folder = tmp_path_factory.mktemp("heavy")
+    for name in HEAVY:
+        (folder / f"{name}.py").write_text(f"raise ImportError('{name} was imported')")
+    return os.pathsep.join([str(folder), os.environ.get("PYTHONPATH", "")])
+
+
+@pytest.fixture
+def sweep_here(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> Callable[..., tuple[int, str, str]]:
+    """(*arguments) -> exit code, stdout and stderr of `xrgs-sweep`, run in this process."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sweep, "stoppable", nullcontext)  # keep pytest's own signal handlers
+
+    def run(*arguments: str) -> tuple[int, str, str]:
+        monkeypatch.setattr(sys, "argv", ["xrgs-sweep", *arguments])
+        capsys.readouterr()
+        code, message = 0, ""
+        try:
+            sweep.main()
+        except SystemExit as end:
+            message = end.code if isinstance(end.code, str) else ""
+            code = 1 if message else int(end.code or 0)
+        out, err = capsys.readouterr()
+        return code, out, err + message
+
+    return run
+
+
+@dataclass
+class Children:
+    """Stands in for the child processes of a sweep: variants and cells are made at once."""
+
+    trained: list[str] = field(default_factory=list)
+    """Ids of the cells that were trained, in order."""
+    failures: dict[int, str] = field(default_factory=dict)
+    """The error of cells that fail, by their seed."""
+    gaussians: int = 100
+
+    def run(self, job: str, request: Mapping[str, Any], *_: object) -> dict[str, Any]:
+        if job == "variant":
+            made = Store(Path(request["store"])).variants / "0123456789abcdef-0123456789abcdef"
+            made.mkdir()
+            return {"variant": made.name}
+        folder = Store(Path(request["conf"]["store"])).cell(Path(request["cell"]).name)
+        self.trained.append(folder.id)
+        if (seed := request["conf"]["seed"]) in self.failures:
+            raise worker.WorkerError(self.failures[seed])
+        (folder.path / "scores.csv").write_text("view\na\n")
+        summary = {"gaussians": self.gaussians + len(self.trained), "training_time_s": 1.0}
+        write_json(folder.path / "summary.json", summary)
+        folder.finish(["a"], 1)
+        return {}
+
+    def find(self, variants: Path, _: str) -> SimpleNamespace | None:
+        names = [folder.name for folder in variants.glob("0123456789abcdef-*")]
+        return SimpleNamespace(id=names[0]) if names else None
+
+
+@pytest.fixture
+def children(monkeypatch: pytest.MonkeyPatch) -> Children:
+    """Child processes that are not started, and a report that is not made."""
+    made = Children()
+    monkeypatch.setattr(worker, "run_in_child", made.run)
+    monkeypatch.setattr(variant, "find", made.find)
+    monkeypatch.setattr(xrgs.report, "build", lambda *_: SimpleNamespace(text="the table"))
+    return made
+
+
+@pytest.fixture(scope="session")
+def swept(run_command: RunCommand, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str]:
+    """A folder with a finished smoke sweep in its store `s`, and what was printed."""
+    folder = tmp_path_factory.mktemp("swept")
+    code, out, err = run_command("sweep", folder, "+ablation=consistency", *SMOKE, "store=s")
+    assert code == 0, err
+    return folder, out
+
+
+@pytest.fixture
+def store(swept: tuple[Path, str], tmp_path: Path) -> Path:
+    """A copy of that store, which a test may change."""
+    shutil.copytree(swept[0] / "s", tmp_path / "s")
+    return tmp_path / "s"

@@ -1,0 +1,264 @@
+"""Tests of `xrgs-sweep`: plans, and whole sweeps whose child processes are stood in for."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+from PIL import Image
+
+from xrgs.capture import variant
+from xrgs.config import CONF_DIR
+from xrgs.experiment.store import Store
+
+SweepHere = Callable[..., tuple[int, str, str]]
+RunCommand = Callable[..., tuple[int, str, str]]
+SCENE = ("scene=motorcycle", "preset=smoke", "store=s")
+SWEEPS = CONF_DIR / "sweeps" if (CONF_DIR / "sweeps").is_dir() else CONF_DIR.parent / "sweeps"
+
+
+def labels(plan: str) -> set[str]:
+    """Return what is compared in a printed plan: the second names of its cells."""
+    return {line.split(" / ")[1] for line in plan.splitlines() if " / seed " in line}
+
+
+def test_a_sweep_trains_each_cell_once_and_ends_with_the_table(
+    sweep_here: SweepHere, children: Any, tmp_path: Path
+) -> None:
+    arguments = ("+ablation=consistency", "seed=0,1", *SCENE)
+    code, out, err = sweep_here(*arguments)
+    assert code == 0, err
+    assert "building the mixed-resolution variant" in err
+    assert "plan: 4 cells, 0 done" in err
+    assert out == "the table\n"
+    assert len(children.trained) == len(set(children.trained)) == 4
+    code, out, err = sweep_here(*arguments)
+    assert code == 0, err
+    assert "plan: 4 cells, 4 done" in err
+    assert len(children.trained) == 4
+    record = Store(tmp_path / "s").sweep_record()
+    assert [row["label"] for row in record["cells"]] == ["baseline", "consistency"] * 2
+    assert record["cells"][1]["baseline_id"] == record["cells"][0]["cell_id"]
+
+
+def test_a_cell_keeps_the_config_and_identity_of_its_plan(
+    sweep_here: SweepHere, children: Any, tmp_path: Path
+) -> None:
+    sweep_here(*SCENE, "threads=3")
+    (cell_id,) = children.trained
+    folder = Store(tmp_path / "s").cell(cell_id)
+    (handed_over,) = (tmp_path / "s" / "hydra").glob(f"*/cells/{cell_id}.json")
+    content = json.loads(handed_over.read_text())
+    conf = json.loads((folder.path / "config.json").read_text())
+    assert (content["config"], content["identity"]) == (conf, folder.identity())
+    assert (conf["store"], conf["threads"]) == (str(tmp_path / "s"), 3)
+
+
+def test_photographs_are_hashed_once_for_all_cells_of_a_scene(
+    sweep_here: SweepHere, children: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    calls = []
+
+    def key(*_: object) -> str:
+        calls.append("key")
+        return "0123456789abcdef"
+
+    monkeypatch.setattr(variant, "key", key)
+    code, _, err = sweep_here("+ablation=consistency", "seed=0,1,2", *SCENE)
+    assert code == 0, err
+    assert len(children.trained) == 6
+    assert len(calls) == 1
+
+
+def test_a_cell_that_fails_leaves_the_others_and_is_not_tried_again(
+    sweep_here: SweepHere, children: Any, tmp_path: Path
+) -> None:
+    children.failures = {1: "it raised"}
+    code, out, err = sweep_here("seed=0,1,2", *SCENE)
+    assert (code, out) == (1, "the table\n")
+    assert "failed: it raised" in err
+    assert len(children.trained) == 3
+    code, _, err = sweep_here("seed=0,1,2", *SCENE)
+    assert code == 1
+    assert len(children.trained) == 3
+    assert "retry=failed trains them again" in err
+    children.failures = {}
+    code, _, err = sweep_here("seed=0,1,2", *SCENE, "retry=failed")
+    assert code == 0, err
+    assert len(children.trained) == 4
+
+
+def test_fail_fast_starts_no_further_cell(sweep_here: SweepHere, children: Any) -> None:
+    children.failures = {0: "it raised"}
+    code, _, err = sweep_here("seed=0,1,2", *SCENE, "fail_fast=true")
+    assert code == 1
+    assert "no further cell is started: fail_fast, and a cell failed" in err
+    assert len(children.trained) == 1
+
+
+def test_a_cell_that_takes_a_count_from_another_is_trained_after_it(
+    sweep_here: SweepHere, children: Any, tmp_path: Path
+) -> None:
+    control = ("+ablation=count_matched", "matched_to=gradient_scaling", *SCENE)
+    _, _, err = sweep_here(*control, "dry_run=true")
+    states = [line.split()[0] for line in err.splitlines() if "motorcycle /" in line]
+    assert states == ["absent", "absent", "waits"], err
+    code, _, err = sweep_here(*control)
+    assert code == 0, err
+    store = Store(tmp_path / "s")
+    rows = {row["label"].split()[0]: row["cell_id"] for row in store.sweep_record()["cells"]}
+    assert children.trained[-1] == rows["count_matched"]
+    count = store.cell(rows["gradient_scaling"]).summary()["gaussians"]
+    identity = store.cell(rows["count_matched"]).identity()
+    assert identity["components"]["count_matched"]["gaussians"] == count
+    assert "plan: 3 cells, 3 done" in sweep_here(*control)[2]
+    assert len(children.trained) == 3
+
+
+@pytest.mark.parametrize(
+    ("changes", "done"),
+    [
+        (["seed=1"], 0),
+        (["train.steps=9"], 0),
+        (["components.loss_weighting.lr_weight=0.5"], 1),  # the baseline has no component
+        (["threads=1", "data_root=x", "scene.name=y", "store=./s", "checkpoint_s=7"], 2),
+    ],
+)
+def test_a_value_that_changes_a_number_is_another_cell(
+    sweep_here: SweepHere, children: Any, changes: list[str], done: int
+) -> None:
+    arguments = ("+ablation=consistency", "train.steps=8", *SCENE)
+    code, _, err = sweep_here(*arguments)
+    assert code == 0, err
+    keys = {change.partition("=")[0] for change in changes}
+    kept = [word for word in arguments if word.partition("=")[0] not in keys]
+    _, _, err = sweep_here(*kept, *changes, "dry_run=true")
+    assert f"plan: 2 cells, {done} done" in err
+
+
+@pytest.mark.parametrize(
+    "name", sorted({file.stem for file in SWEEPS.glob("*.yaml")} - {"ablations", "controls"})
+)
+def test_every_sweep_file_plans(sweep_here: SweepHere, name: str) -> None:
+    code, _, err = sweep_here(f"+sweeps={name}", "dry_run=true")
+    assert code == 0, err
+    assert labels(err) > {"baseline"}
+
+
+@pytest.mark.slow
+def test_every_ablation_is_in_a_sweep(sweep_here: SweepHere) -> None:
+    planned: set[str] = set()
+    for name in ("ablations", "controls"):
+        code, _, err = sweep_here(f"+sweeps={name}", "dry_run=true")
+        assert code == 0, err
+        planned |= labels(err)
+    assert planned == {file.stem for file in (CONF_DIR / "ablation").glob("*.yaml")}
+
+
+def test_ablations_stack_and_the_plus_may_be_forgotten(sweep_here: SweepHere) -> None:
+    _, _, err = sweep_here("ablation=[loss_weighting,consistency]", "dry_run=true")
+    assert "loss_weighting+consistency" in err
+    assert "plan: 2 cells" in err
+
+
+def test_a_single_run_is_refused(sweep_here: SweepHere, children: Any) -> None:
+    code, _, err = sweep_here(*SCENE, "hydra.mode=RUN")
+    assert code == 1
+    assert "hydra.mode must be MULTIRUN" in err
+    assert not children.trained
+
+
+def test_a_launcher_named_in_an_ablation_is_refused(sweep_here: SweepHere, tmp_path: Path) -> None:
+    (tmp_path / "mine" / "ablation").mkdir(parents=True)
+    for name in ("here", "there"):
+        file = tmp_path / "mine" / "ablation" / f"{name}.yaml"
+        file.write_text("# @package _global_\ndefaults:\n  - override /hydra/launcher: joblib\n")
+    code, _, err = sweep_here("+ablation=here,there", "dry_run=true", "--config-dir", "mine")
+    assert code == 1
+    assert "a launcher is chosen once for a sweep" in err
+
+
+@pytest.mark.parametrize(
+    ("arguments", "named"),
+    [
+        (["+ablation=nope"], ["ablation/nope", "consistency"]),
+        (["scene=nope"], ["scene/nope", "procedural"]),
+        (["train.stpes=3"], ["train.stpes"]),
+        (["train.steps=many"], ["train.steps", "many"]),
+        (["seed=interval(0,1)"], ["interval"]),
+        (["scene=folder"], ["scene.path"]),
+        (["scene=folder", "scene.path=gone"], ["gone"]),
+        (["scene=folder", "scene.path=empty"], ["empty"]),
+        (["scene=folder", "scene.path=one"], ["one"]),
+        (["store=in-the-way"], ["in-the-way", "store="]),
+        (["train.steps=0"], ["train.steps"]),
+        (["checkpoint_s=nan"], ["checkpoint_s"]),
+        (["splat.backend=cuda"], ["splat.backend=cuda", "native"]),
+        (["store=\udcff"], ["not valid Unicode"]),
+        (["rerun=gone"], ["rerun=gone", "no such folder"]),
+        (["rerun=gone", "seed=1"], ["seed", "rerun= takes out="]),
+        (["rerun=gone", "threads=x"], ["threads"]),
+    ],
+    ids=lambda value: " ".join(value).encode(errors="replace").decode(),
+)
+def test_bad_input_is_named(
+    sweep_here: SweepHere,
+    tmp_path: Path,
+    photographs: Callable[..., Path],
+    arguments: list[str],
+    named: list[str],
+) -> None:
+    (tmp_path / "empty").mkdir()
+    (tmp_path / "in-the-way").write_text("a file")
+    photographs(tmp_path / "one", 1)
+    code, out, err = sweep_here("preset=smoke", *arguments)
+    if arguments[0].startswith("rerun="):
+        code, out, err = sweep_here(*arguments)
+    assert code == 1
+    for text in named:
+        assert text in out + err
+    assert "Traceback" not in err
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("arguments", "named"),
+    [
+        (["scene=folder", "scene.path=sizes", "variant.sfm.camera=single"], ["sizes", "90"]),
+        (["scene=folder", "scene.path=broken"], ["broken"]),
+        (["scene=folder", "scene.path=small"], ["variant.factor"]),
+        (["components.loss_weighting.lr_weight=-1"], ["components.loss_weighting.lr_weight"]),
+    ],
+    ids=" ".join,
+)
+def test_bad_input_that_a_child_finds_is_named(
+    sweep_here: SweepHere,
+    tmp_path: Path,
+    photographs: Callable[..., Path],
+    arguments: list[str],
+    named: list[str],
+) -> None:
+    photographs(tmp_path / "sizes", 5)
+    Image.new("RGB", (90, 120)).save(tmp_path / "sizes" / "2.png")
+    for file in photographs(tmp_path / "broken", 5).iterdir():
+        file.write_bytes(file.read_bytes()[:60])
+    photographs(tmp_path / "small", 5, (40, 30))
+    code, out, err = sweep_here("scene=motorcycle", "preset=smoke", *arguments)
+    assert code == 1
+    for text in named:
+        assert text in out + err
+    assert "Traceback" not in err
+
+
+def test_a_dry_run_plans_without_torch_and_writes_nothing(
+    run_command: RunCommand, tmp_path: Path, without_heavy: str
+) -> None:
+    arguments = ("+ablation=consistency,loss_weighting", "seed=0,1", "dry_run=true", "store=s")
+    code, _, err = run_command("sweep", tmp_path, *arguments, PYTHONPATH=without_heavy)
+    assert code == 0, err
+    assert "plan: 6 cells" in err
+    assert err.count("variant not built") == 6
+    assert not list(tmp_path.iterdir())

@@ -1,0 +1,146 @@
+"""Tests of `xrgs-sweep` as a user runs it: a process of its own, which trains in others."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+pytestmark = pytest.mark.slow
+
+RunCommand = Callable[..., tuple[int, str, str]]
+Contents = Callable[[Path], dict[str, str]]
+SMOKE = ("scene=motorcycle", "preset=smoke", "train.steps=8")
+
+
+def test_a_sweep_ends_with_the_table_and_where_it_is(swept: tuple[Path, str]) -> None:
+    folder, out = swept
+    for label in ("Training time", "Gaussians", "Memory", "LPIPS", "SSIM", "PSNR"):
+        assert label in out
+    assert "n/a" in out
+    assert "one seed: no interval" in out
+    assert "↑" in out or "↓" in out
+    written = folder / out.strip().rpartition("Written to ")[2]
+    assert {"table.md", "table.tex", "table.csv"} <= {file.name for file in written.iterdir()}
+
+
+def test_a_cell_keeps_all_that_a_reader_may_need(
+    swept: tuple[Path, str], contents: Contents
+) -> None:
+    cells = sorted((swept[0] / "s" / "cells").iterdir())
+    assert len(cells) == 2
+    for cell in cells:
+        assert set(contents(cell)) == {
+            "config.json",
+            "history.csv",
+            "identity.json",
+            "log.txt",
+            "provenance.json",
+            "renders/motorcycle_left.png",
+            "renders/motorcycle_right.png",
+            "scores.csv",
+            "splats.ply",
+            "status.json",
+            "summary.json",
+        }
+        assert json.loads((cell / "provenance.json").read_text())["packages"]["torch"]
+
+
+def test_a_second_run_trains_nothing(
+    run_command: RunCommand, store: Path, contents: Contents
+) -> None:
+    before = contents(store / "cells")
+    code, out, err = run_command("sweep", store.parent, "+ablation=consistency", *SMOKE, "store=s")
+    assert code == 0, err
+    assert "plan: 2 cells, 2 done" in err
+    assert "training" not in err
+    assert "consistency against baseline" in out
+    assert contents(store / "cells") == before
+
+
+def test_naming_the_backend_that_auto_chooses_is_no_change(
+    run_command: RunCommand, store: Path
+) -> None:
+    used = json.loads(next((store / "cells").rglob("provenance.json")).read_text())["backend"]
+    arguments = ("+ablation=consistency", *SMOKE, "store=s", "dry_run=true")
+    for backend, done in (("native", 2), ("torch", 0)) if used == "native" else (("torch", 2),):
+        _, _, err = run_command("sweep", store.parent, *arguments, f"splat.backend={backend}")
+        assert f"plan: 2 cells, {done} done" in err
+
+
+def test_a_count_matched_cell_has_the_gaussians_of_its_reference(
+    run_command: RunCommand, store: Path
+) -> None:
+    control = ("+ablation=count_matched", "matched_to=gradient_scaling", *SMOKE, f"store={store}")
+    code, out, err = run_command("sweep", store.parent, *control)
+    assert code == 0, err
+    assert err.count("training cell") == 2
+    assert "3 of 3 cells done" in err
+    assert "\r" not in err
+    assert "count_matched" in out
+    configs = [json.loads(f.read_text()) for f in store.glob("cells/*/config.json")]
+    matched = [conf["components"]["count_matched"]["gaussians"] for conf in configs]
+    counts = [json.loads(f.read_text())["gaussians"] for f in store.glob("cells/*/summary.json")]
+    assert max(matched) in counts
+    _, _, err = run_command("sweep", store.parent, *control)
+    assert "plan: 3 cells, 3 done" in err
+
+
+def test_a_moved_store_is_no_change(run_command: RunCommand, store: Path) -> None:
+    store.rename(store.with_name("moved"))
+    arguments = ("+ablation=consistency", *SMOKE, "threads=1", "data_root=x", "scene.name=y")
+    _, _, err = run_command("sweep", store.parent, *arguments, "store=moved", "dry_run=true")
+    assert "2 done" in err
+
+
+def test_a_corrupt_cell_is_trained_again(
+    run_command: RunCommand, store: Path, contents: Contents
+) -> None:
+    cell = sorted((store / "cells").iterdir())[0]
+    before = contents(cell)
+    scores = cell / "scores.csv"
+    scores.write_text(scores.read_text().replace("0.", "0.9", 1))
+    code, _, err = run_command("sweep", store.parent, "+ablation=consistency", *SMOKE, "store=s")
+    assert code == 0
+    assert "corrupt" in err
+    assert "1 done" in err
+    # It is trained again to the same bits; the corrupt folder is kept beside it.
+    assert contents(cell)["splats.ply"] == before["splats.ply"]
+    assert contents(cell)["scores.csv"] == before["scores.csv"]
+    assert cell.with_name(f"{cell.name}.aside-1").is_dir()
+
+
+def test_a_scene_that_fails_leaves_the_other_scenes(
+    run_command: RunCommand, store: Path, photographs: Callable[..., Path]
+) -> None:
+    flat = photographs(store.parent / "flat", 6)
+    scenes = ("scene=motorcycle,folder", f"scene.path={flat}")
+    arguments = ("+ablation=consistency", *SMOKE[1:], *scenes, "store=s")
+    code, out, err = run_command("sweep", store.parent, *arguments)
+    assert code == 1
+    assert "flat" in err
+    assert "registered" in err
+    assert "failed" in out
+    assert "Training time" in out  # the table of the other scene
+
+
+def test_the_child_imports_the_package_of_its_parent_and_not_that_of_its_folder(
+    store: Path,
+) -> None:
+    shutil.rmtree(store / "cells")
+    (store.parent / "xrgs").mkdir()
+    (store.parent / "xrgs" / "__init__.py").write_text("raise ImportError('the wrong package')")
+    script = "import sys; sys.path.remove(''); from xrgs.cli.sweep import main; main()"
+    done = subprocess.run(
+        [sys.executable, "-c", script, *SMOKE, "train.steps=2", "store=s"],
+        cwd=store.parent,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr

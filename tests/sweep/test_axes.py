@@ -1,0 +1,90 @@
+"""Tests that the axes of a command line become combinations, each with its matching baseline."""
+
+from __future__ import annotations
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from xrgs.errors import XrgsError
+from xrgs.experiment.store import BASELINE
+from xrgs.sweep.axes import expand
+
+
+def labels_and_conditions(*arguments: str) -> list[tuple[str, str]]:
+    return [(spec.label, spec.condition) for spec in expand(arguments)]
+
+
+def test_no_argument_gives_the_baseline() -> None:
+    assert labels_and_conditions() == [(BASELINE, "")]
+
+
+@pytest.mark.parametrize("prefix", ["+", "", "++"])
+def test_an_ablation_brings_its_baseline(prefix: str) -> None:
+    specs = labels_and_conditions(f"{prefix}ablation=consistency")
+    assert specs == [(BASELINE, ""), ("consistency", "")]
+
+
+def test_a_baseline_that_is_named_is_not_planned_twice() -> None:
+    specs = labels_and_conditions("+ablation=baseline,consistency")
+    assert specs == [(BASELINE, ""), ("consistency", "")]
+
+
+def test_ablations_stack() -> None:
+    specs = labels_and_conditions("+ablation=[loss_weighting,consistency]")
+    assert specs[1][0] == "loss_weighting+consistency"
+
+
+def test_each_seed_and_scene_has_a_baseline_of_its_own() -> None:
+    specs = expand(["+ablation=consistency", "seed=0,1", "scene=motorcycle,procedural"])
+    assert len(specs) == 8
+    for spec in specs:
+        assert spec.condition == ""
+        matching = [s for s in specs if s.label == BASELINE and s.shared == spec.shared]
+        assert len(matching) == 1
+
+
+def test_a_swept_value_is_a_condition_and_a_fixed_one_is_not() -> None:
+    specs = expand(["+ablation=consistency", "train.steps=10,20", "splat.eps=1"])
+    assert {spec.condition for spec in specs} == {"train.steps=10", "train.steps=20"}
+
+
+@pytest.mark.parametrize("axis", ["scene.path=a,b", "scene.views=8,9", "seed=0,1"])
+def test_values_of_the_scene_and_the_seed_are_no_condition(axis: str) -> None:
+    """Tables have columns of their own for the scene and the seed."""
+    specs = expand(["+ablation=consistency", axis])
+    assert len(specs) == 4
+    assert {spec.condition for spec in specs} == {""}
+    assert len({spec.shared for spec in specs}) == 2
+
+
+def test_a_key_that_begins_like_the_scene_is_a_condition() -> None:
+    specs = expand(["+ablation=consistency", "+scenery.path=a,b"])
+    assert {spec.condition for spec in specs} == {"scenery.path=a", "scenery.path=b"}
+
+
+def test_a_component_value_belongs_to_the_change_and_not_to_the_baseline() -> None:
+    specs = expand(["+ablation=consistency", "components.consistency.weight=0.1,0.2"])
+    assert [spec.label for spec in specs] == [
+        BASELINE,
+        "consistency consistency.weight=0.1",
+        "consistency consistency.weight=0.2",
+    ]
+    assert specs[0].overrides == []
+
+
+def test_an_interval_is_refused_by_name() -> None:
+    with pytest.raises(XrgsError, match=r"interval\(0,1\): an axis must be a list"):
+        expand(["seed=interval(0,1)"])
+
+
+@given(
+    st.lists(st.sampled_from("abc"), min_size=1, max_size=3, unique=True),
+    st.lists(st.integers(0, 9), min_size=1, max_size=3, unique=True),
+)
+def test_every_combination_is_planned_once(ablations: list[str], seeds: list[int]) -> None:
+    specs = expand([f"+ablation={','.join(ablations)}", f"seed={','.join(map(str, seeds))}"])
+    assert len(specs) == len(set(specs)) == (len(ablations) + 1) * len(seeds)
+    for seed in seeds:
+        group = [spec for spec in specs if f"seed={seed}" in spec.shared]
+        assert [spec.label for spec in group] == [BASELINE, *ablations]

@@ -1,0 +1,163 @@
+"""Tests that a variant is found or built, and that a scene that fails is remembered."""
+
+from __future__ import annotations
+
+import errno
+import os
+import tempfile
+from collections.abc import Callable
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from xrgs.capture import variant
+from xrgs.config import Conf
+from xrgs.errors import XrgsError
+from xrgs.experiment.store import Store
+from xrgs.safeio.atomic import write_json
+from xrgs.safeio.records import StoreError
+from xrgs.sweep import variants
+from xrgs.sweep.jobs import worker
+from xrgs.sweep.status import describe, read
+
+BUILDING = "building the mixed-resolution variant"
+CONF = ("variant.factor=1", "variant.sfm.fallbacks=false")
+HINT = "failed cells are not trained again; retry=failed trains them again"
+
+
+@pytest.fixture
+def store(tmp_path: Path) -> Store:
+    """An empty store."""
+    store = Store(tmp_path / "s")
+    store.prepare()
+    return store
+
+
+@pytest.fixture
+def conf(compose: Callable[..., Conf]) -> Conf:
+    """A config of the embedded two-image scene."""
+    return compose("scene=motorcycle")
+
+
+def fail(*_: object) -> dict[str, Any]:
+    raise worker.WorkerError("SfM placed too few views")
+
+
+def unexpected(*_: object) -> dict[str, Any]:
+    raise AssertionError("no child process is needed")
+
+
+def remember_failure(conf: Conf, store: Store) -> None:
+    """Write the report of a build that failed, as `variant.build` does."""
+    folder = store.variants / f"failed-{variant.key(conf.scene, conf.variant)}"
+    folder.mkdir()
+    write_json(folder / "report.json", {"scene": "motorcycle", "reason": "no first pair"})
+
+
+def test_a_frozen_variant_is_found_and_not_built(
+    conf: Conf, store: Store, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(variant, "find", lambda *_: SimpleNamespace(id="k-1"))
+    monkeypatch.setattr(worker, "run_in_child", unexpected)
+    assert variants.find(conf, store) == variants.find_or_build(conf, store) == "k-1"
+    assert variants.plan(conf, store, allow_build=True) == ("k-1", None)
+
+
+def test_a_variant_that_the_store_lacks_is_built_in_a_child(
+    conf: Conf, store: Store, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    requests = []
+
+    def build(job: str, request: dict[str, Any]) -> dict[str, Any]:
+        requests.append((job, request["conf"]["scene"]["kind"], request["store"]))
+        return {"variant": "k-1"}
+
+    monkeypatch.setattr(worker, "run_in_child", build)
+    assert variants.find(conf, store) is None
+    assert variants.plan(conf, store, allow_build=False) == (None, None)
+    assert not requests
+    assert variants.plan(conf, store, allow_build=True) == ("k-1", None)
+    assert variants.find_or_build(conf, store) == "k-1"
+    assert requests == [("variant", "motorcycle", str(store.path))] * 2
+
+
+def test_a_scene_that_failed_is_not_tried_again_unless_asked(
+    conf: Conf, store: Store, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    remember_failure(conf, store)
+    monkeypatch.setattr(worker, "run_in_child", unexpected)
+    assert variants.plan(conf, store, allow_build=True) == (None, "no first pair")
+    conf.retry = "failed"
+    assert variants.plan(conf, store, allow_build=False) == (None, None)
+    monkeypatch.setattr(worker, "run_in_child", fail)
+    # The reason is the remembered one, so that the record of a repeated sweep is the same.
+    assert variants.plan(conf, store, allow_build=True) == (None, "no first pair")
+
+
+def test_a_failure_is_the_reason_in_the_plan_and_an_error_elsewhere(
+    conf: Conf, store: Store, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(worker, "run_in_child", fail)
+    assert variants.plan(conf, store, allow_build=True) == (None, "SfM placed too few views")
+    with pytest.raises(XrgsError, match="SfM placed too few views"):
+        variants.find_or_build(conf, store)
+
+
+def test_a_library_that_dies_of_a_full_disk_is_not_a_failure_of_the_scene(
+    conf: Conf, store: Store, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def full(**_: object) -> None:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    def dies(*_: object) -> dict[str, Any]:
+        monkeypatch.setattr(tempfile, "TemporaryFile", full)
+        raise worker.WorkerError("its process was ended by SIGABRT")
+
+    monkeypatch.setattr(worker, "run_in_child", dies)
+    with pytest.raises(StoreError, match="No space left"):
+        variants.plan(conf, store, allow_build=True)
+
+
+def test_a_child_that_can_not_write_stops_the_sweep(
+    conf: Conf, store: Store, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def unwritable(*_: object) -> dict[str, Any]:
+        raise worker.UnwritableError("No space left on device")
+
+    monkeypatch.setattr(worker, "run_in_child", unwritable)
+    with pytest.raises(StoreError, match=r"No space left.*Finished cells are kept"):
+        variants.plan(conf, store, allow_build=True)
+
+
+@pytest.mark.slow
+def test_sweeps_of_a_scene_that_sfm_can_not_place(
+    sweeps_in: Callable[..., Any], tmp_path: Path
+) -> None:
+    for number in range(2):  # SIFT finds no feature in a flat image
+        pixels = np.full((30, 40, 3), 40 + number, np.uint8)
+        (tmp_path / "leaves").mkdir(exist_ok=True)
+        Image.fromarray(pixels).save(tmp_path / "leaves" / f"{number}.png")
+    sweeps = sweeps_in(tmp_path)
+    scene = ("scene=folder", "scene.path=leaves", "preset=smoke", *CONF)
+    code, table, err = sweeps.run(*scene)
+    assert code == 1
+    assert BUILDING in err
+    assert "COLMAP placed 0 of 2 views" in table
+    code, second_table, err = sweeps.run(*scene)
+    assert code == 1
+    assert second_table == table
+    assert BUILDING not in err
+    assert "  failed     variant not built" in err
+    assert "COLMAP placed 0 of 2 views" in err
+    assert HINT in err
+    text = describe(read(tmp_path / "s"))
+    assert "failed scenes, not tried again; retry=failed tries them again" in text
+    assert "  leaves  scene leaves failed: COLMAP placed 0 of 2 views" in text
+    code, table, err = sweeps.run(*scene, "retry=failed", "fail_fast=true")
+    assert code == 1
+    assert BUILDING in err
+    assert HINT not in err

@@ -1,0 +1,101 @@
+"""Expands the axes of a command line into cells, each group with its matching baseline."""
+
+from __future__ import annotations
+
+import itertools
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+from hydra.core.override_parser.overrides_parser import OverridesParser
+
+from xrgs.errors import XrgsError
+from xrgs.experiment.store import BASELINE
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Sequence
+
+    from hydra.core.override_parser.types import Override
+
+
+@dataclass(frozen=True)
+class CellSpec:
+    """One combination of the command line's axes."""
+
+    label: str
+    """What is compared: the ablation, and component values that were set by hand."""
+    condition: str
+    """Values of the other swept axes, except scene and seed; equal for a label and its baseline."""
+    shared: tuple[str, ...]
+    """Overrides that the matching baseline has too."""
+    changes: tuple[str, ...]
+    """Overrides that make this another program than the baseline."""
+
+    @property
+    def overrides(self) -> list[str]:
+        """All overrides, for Hydra to compose."""
+        return [*self.shared, *self.changes]
+
+
+def expand(arguments: Sequence[str]) -> list[CellSpec]:
+    """Return every combination of the axes, each group with its matching baseline first.
+
+    Args:
+        arguments: Hydra overrides, for example `+ablation=consistency,loss_weighting` and
+            `seed=0,1`.
+
+    Raises:
+        XrgsError: An axis is an interval instead of a list of values.
+    """
+    overrides = OverridesParser.create().parse_overrides(list(arguments))
+    axes = {override.get_key_element(): _values(override) for override in overrides}
+    swept = {key for key, values in axes.items() if len(values) > 1}
+    specs: dict[CellSpec, None] = {}
+    for combination in itertools.product(*axes.values()):
+        override_of = dict(zip(axes, combination, strict=True))
+        name_of = {key: key.lstrip("+~") for key in override_of}
+        shared = tuple(text for key, text in override_of.items() if not _is_change(name_of[key]))
+        changes = tuple(text for key, text in override_of.items() if _is_change(name_of[key]))
+        condition = " ".join(
+            override_of[key].lstrip("+")
+            for key in override_of
+            if key in swept and _is_condition(name_of[key])
+        )
+        label = _label(
+            (name_of[key], text.partition("=")[2])
+            for key, text in override_of.items()
+            if _is_change(name_of[key])
+        )
+        specs[CellSpec(BASELINE, condition, shared, ())] = None
+        if label != BASELINE:
+            specs[CellSpec(label, condition, shared, changes)] = None
+    return list(specs)
+
+
+def _values(override: Override) -> list[str]:
+    """Return the override once for each of its values."""
+    key = override.get_key_element()
+    if not override.is_sweep_override():
+        return [f"{key}={override.get_value_element_as_str()}"]
+    if not override.is_discrete_sweep():
+        raise XrgsError(f"{override.input_line}: an axis must be a list of values")
+    return [f"{key}={value}" for value in override.sweep_string_iterator()]
+
+
+def _is_change(name: str) -> bool:
+    """Return whether a key makes a cell another program than its baseline."""
+    return name in {"ablation", "matched_to"} or name.startswith("components.")
+
+
+def _is_condition(name: str) -> bool:
+    """Return whether a swept key is part of the condition; scenes and seeds have own columns."""
+    return not _is_change(name) and name.partition(".")[0] not in {"scene", "seed"}
+
+
+def _label(changes: Iterable[tuple[str, str]]) -> str:
+    parts = [
+        value.strip("[]").replace(",", "+").replace(" ", "").replace("'", "")
+        if key == "ablation"
+        else f"{key.removeprefix('components.')}={value}"
+        for key, value in changes
+    ]
+    return " ".join(part for part in parts if part) or BASELINE

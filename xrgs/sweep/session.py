@@ -1,0 +1,178 @@
+"""The folder of one call of `xrgs-sweep`, through which the plan hands its cells over to jobs.
+
+The folder is in the store, so that jobs on other machines see it. It holds `sweep` (which process
+the call is), `stopped` (why no further job may begin) and `cells/<cell id>.json` (what the plan
+knows of a cell that it launches). A job is given the folder and a cell's id, and reads the rest.
+"""
+
+from __future__ import annotations
+
+from contextlib import suppress
+from dataclasses import asdict, dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from xrgs.errors import XrgsError
+from xrgs.experiment.identity import changed_code
+from xrgs.safeio import untrusted
+from xrgs.safeio.atomic import write_json
+from xrgs.safeio.hashing import canonical, digest
+from xrgs.safeio.records import read_object
+from xrgs.splat.backend import resolve_backend
+from xrgs.sweep import locks
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+#: Files are named in a message up to this many.
+_MAX_NAMED = 3
+
+
+@dataclass(frozen=True)
+class HandOver:
+    """What the plan hands over to the job of one cell."""
+
+    name: str
+    """The cell's name for people: scene, label, condition and seed."""
+    config: Mapping[str, Any]
+    """The cell's config as plain JSON values, its paths absolute and its backend chosen."""
+    identity: Mapping[str, Any]
+    """The values that the cell's id is the digest of."""
+
+    @property
+    def cell_id(self) -> str:
+        """The cell's id."""
+        return digest(self.identity)
+
+    @property
+    def variant_id(self) -> str:
+        """The id of the frozen variant that the cell trains on."""
+        return str(self.identity["variant"])
+
+    def check_code(self) -> None:
+        """Refuse to train with other code than the cell was planned with.
+
+        Raises:
+            XrgsError: The planned backend is not available here, or source files of the installed
+                package differ from the planned ones.
+        """
+        backend = resolve_backend(self.identity["splat"]["backend"])
+        files = changed_code(self.identity["code"], backend)
+        if files:
+            named = ", ".join(files[:_MAX_NAMED]) + (", ..." if files[_MAX_NAMED:] else "")
+            raise XrgsError(
+                f"{self.name}: cell {self.cell_id} was planned with other code than is installed "
+                f"here and now; {len(files)} files differ ({named}). Install the same version of "
+                "xrgs wherever cells are trained, and start the sweep again"
+            )
+
+
+@dataclass(frozen=True)
+class SweepSession:
+    """One call of `xrgs-sweep`, known to its jobs by a folder of its own."""
+
+    folder: Path
+
+    def begin(self) -> None:
+        """Write which process this call is.
+
+        Raises:
+            OSError: The folder can't be written, or belongs to another call.
+        """
+        locks.sign(self.folder / "sweep")
+        (self.folder / "cells").mkdir()
+
+    def hand_over(self, cell: HandOver) -> str:
+        """Write what a job needs to know of a cell.
+
+        Args:
+            cell: The config, the identity and the name of the cell.
+
+        Returns:
+            The cell's id, with which `read` finds it.
+
+        Raises:
+            OSError: The folder can't be written.
+        """
+        cell_id = cell.cell_id
+        # Not durable: when the power goes, this call and its jobs are over.
+        write_json(self._file(cell_id), asdict(cell), durable=False)
+        return cell_id
+
+    def read(self, cell_id: str) -> HandOver:
+        """Read what the plan has written for a cell.
+
+        Args:
+            cell_id: The cell's id.
+
+        Raises:
+            XrgsError: The file is missing or malformed, its identity is not the cell's, or its
+                config contradicts its identity.
+        """
+        if not untrusted.is_name(cell_id):
+            raise XrgsError(f"{cell_id!r:.80} is not the id of a cell")
+        file = self._file(cell_id)
+        content = read_object(file)
+        try:
+            cell = HandOver(content["name"], content["config"], content["identity"])
+            wrong = _contradiction(cell, cell_id)
+        except (AttributeError, KeyError, TypeError, ValueError) as error:
+            raise XrgsError(f"{file} is not what a plan writes for a job ({error!r})") from error
+        if wrong:
+            raise XrgsError(f"{file} is not what the plan of this sweep has written: {wrong}")
+        return cell
+
+    def _file(self, cell_id: str) -> Path:
+        return self.folder / "cells" / f"{cell_id}.json"
+
+    def stop(self, reason: str) -> None:
+        """Let no further job begin; of several reasons the first is kept.
+
+        Args:
+            reason: Why, for people.
+        """
+        # A full disk may have room for the file's name and none for the reason in it.
+        with suppress(OSError), (self.folder / "stopped").open("x", encoding="utf-8") as stream:
+            stream.write(reason)
+
+    @cached_property
+    def _owner(self) -> locks.Owner | None:
+        return locks.signature(self.folder / "sweep")
+
+    @property
+    def owner_dead(self) -> bool:
+        """Whether the process of this call has ended; False on machines that can't know."""
+        return self._owner is not None and self._owner.here and not self._owner.lives
+
+    @property
+    def stopped(self) -> str:
+        """Why no further job may begin; empty while they may."""
+        file = self.folder / "stopped"
+        if file.exists():
+            reason = file.read_text(encoding="utf-8", errors="replace")
+            return reason or f"{file} exists"
+        return "the process of the sweep has ended" if self.owner_dead else ""
+
+
+def _contradiction(cell: HandOver, cell_id: str) -> str:
+    """Return what is inconsistent in a hand-over that was read; empty if nothing is."""
+    config, identity = cell.config, cell.identity
+    rules = {
+        f"its identity has the digest {cell.cell_id}": cell.cell_id == cell_id,
+        "the id of its variant is not a name": untrusted.is_name(identity["variant"]),
+        "its code is not a list of digests": all(
+            isinstance(text, str) for text in identity["code"].values()
+        ),
+        "its name or the path of its store is not text": isinstance(cell.name, str)
+        and isinstance(config["store"], str),
+        "fail_fast is neither true nor false": isinstance(config["fail_fast"], bool),
+        "a limit is not a number": all(
+            type(config["limits"][name]) in {int, float} for name in ("minutes", "memory_gb")
+        ),
+    } | {
+        f"{key} differs between its config and its identity": canonical(config[key])
+        == canonical(identity[key])
+        for key in ("splat", "train", "components", "seed")
+    }
+    return next((problem for problem, holds in rules.items() if not holds), "")

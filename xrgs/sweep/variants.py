@@ -1,0 +1,104 @@
+"""Finds the frozen variant of a config in the store, or builds it in a process of its own."""
+
+from __future__ import annotations
+
+from dataclasses import asdict
+from typing import TYPE_CHECKING
+
+from xrgs.capture import scenes, variant
+from xrgs.errors import XrgsError
+from xrgs.runtime.progress import say
+from xrgs.safeio.records import StoreError
+from xrgs.sweep.jobs import worker
+
+if TYPE_CHECKING:
+    from xrgs.config import Conf
+    from xrgs.experiment.store import Store
+
+
+def find(conf: Conf, store: Store) -> str | None:
+    """Return the id of the frozen variant of a config, after checking every hash.
+
+    Args:
+        conf: A cell's config; only its scene and its variant are read.
+        store: The store.
+
+    Returns:
+        The variant's id; None if the store does not have it.
+
+    Raises:
+        XrgsError: The photographs are missing.
+    """
+    frozen = variant.find(store.variants, variant.key(conf.scene, conf.variant))
+    return None if frozen is None else frozen.id
+
+
+def build(conf: Conf, store: Store) -> str:
+    """Build the variant of a config in a process of its own, and return its id.
+
+    Args:
+        conf: A cell's config; only its scene and its variant are read.
+        store: The store to build it in.
+
+    Raises:
+        UnwritableError: The disk is full or can't be written.
+        XrgsError: The photographs are missing, or can't be made into a variant.
+    """
+    say(f"{scenes.label(conf.scene)}: building the mixed-resolution variant")
+    answer = worker.run_in_child("variant", {"conf": asdict(conf), "store": str(store.path)})
+    return str(answer["variant"])
+
+
+def find_or_build(conf: Conf, store: Store) -> str:
+    """Return the id of the frozen variant of a config, which is built if the store lacks it.
+
+    Args:
+        conf: A cell's config; only its scene and its variant are read.
+        store: The store.
+
+    Raises:
+        XrgsError: The photographs are missing, or can't be made into a variant.
+    """
+    found = find(conf, store)
+    if found is None:
+        store.prepare()
+        found = build(conf, store)
+    return found
+
+
+def plan(conf: Conf, store: Store, *, allow_build: bool) -> tuple[str | None, str | None]:
+    """Return the id of a config's variant for a sweep, or the reason why there is none.
+
+    A scene that failed before is not tried again, like a failed cell, unless `retry=failed`.
+
+    Args:
+        conf: A cell's config.
+        store: The store.
+        allow_build: Build the variant if the store lacks it; False for a dry run.
+
+    Returns:
+        The variant's id and None; or None and the reason; or None twice if it is not built yet.
+
+    Raises:
+        StoreError: The store can't be written.
+    """
+    key = None
+    try:
+        key = variant.key(conf.scene, conf.variant)
+        frozen = variant.find(store.variants, key)
+        if frozen is not None:
+            return frozen.id, None
+        failure = None if conf.retry == "failed" else variant.failure(store.variants, key)
+        if failure or not allow_build:
+            return None, failure
+        return build(conf, store), None
+    except worker.UnwritableError as error:
+        raise StoreError(f"store={store.path}: {error}. {worker.NOTHING_LOST}") from error
+    except XrgsError as error:
+        say(f"{scenes.label(conf.scene)}: {error}")
+        if allow_build:
+            # COLMAP dies of a full disk without saying so, which is no fault of the scene.
+            store.prepare()
+        # The reason as the store remembers it: a sweep planned again gives the same record.
+        remembered = variant.failure(store.variants, key) if key else None
+        return None, remembered or str(error)
