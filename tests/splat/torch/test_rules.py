@@ -165,6 +165,33 @@ def test_a_covariance_that_overflows_is_dropped(
     assert torch.equal(render.image, expected.image)
 
 
+def test_a_singular_covariance_is_dropped(
+    draw: Draw, single_pixel: MakeScene, pixel: Camera
+) -> None:
+    scene = single_pixel(2, opacity=0.5)
+    scene["scales"][0] = 0  # a point, which without dilation has no inverse covariance
+    render = draw(scene, pixel, RasterSettings(eps2d=0.0), sh_degree=0)
+    assert render.visible.tolist() == [False, True]
+    assert render.alpha.item() == 0.5
+
+
+def test_a_box_that_only_touches_the_image_is_not_visible(
+    draw: Draw, single_pixel: MakeScene, pixel: Camera
+) -> None:
+    # At an opacity of exactly alpha_min the box is the mean itself, px; the image is 1 x 1 px.
+    scene = single_pixel(1, opacity=0.5)
+    for x, y, visible in (
+        (0.0, 0.5, False),
+        (1.0, 0.5, False),
+        (0.5, 0.0, False),
+        (0.9, 0.1, True),
+    ):
+        offset = torch.tensor([[x - 0.5, y - 0.5]])
+        raster = RasterSettings(alpha_min=0.5)
+        render = draw(scene, pixel, raster, sh_degree=0, means2d_offset=offset)
+        assert render.visible.tolist() == [visible]
+
+
 @pytest.mark.parametrize("count", [0, 5])
 def test_none_or_none_visible_shows_the_background(
     draw: Draw,
