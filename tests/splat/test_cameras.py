@@ -37,3 +37,7 @@ def test_bad_input_is_named(field: str, value: Any, message: str) -> None:
     Camera(**good)
     with pytest.raises(ValueError, match=message):
         Camera(**(good | {field: value}))
+
+
+def test_an_image_of_one_pixel_is_accepted() -> None:
+    assert Camera(torch.eye(4), torch.eye(3), width=1, height=1).width == 1

@@ -112,3 +112,8 @@ def test_bad_input_is_named(cloud: Cloud, change: Any, message: str) -> None:
     points, colors = cloud
     with pytest.raises(ValueError, match=message):
         start(**({"points": points, "colors": colors} | change))
+
+
+def test_four_points_are_enough(cloud: Cloud) -> None:
+    points, colors = cloud
+    assert len(start(points[:4], colors[:4])) == 4

@@ -93,6 +93,10 @@ def test_a_target_keeps_no_graph() -> None:
     assert not any(x.requires_grad for x in (target.image, target.mean, target.variance))
 
 
+def test_an_image_of_the_windows_size_has_one_window() -> None:
+    assert prepare_target(torch.zeros(11, 11, 3)).mean.shape == (1, 1, 3)
+
+
 @pytest.mark.parametrize("size", [(10, 30), (30, 10), (1, 1)])
 def test_an_image_smaller_than_the_window_is_refused(size: tuple[int, int]) -> None:
     with pytest.raises(ValueError, match=f"{size[1]} x {size[0]} px.*11 px"):

@@ -222,3 +222,8 @@ def test_one_camera_on_its_own_focus_keeps_the_scale(world: World) -> None:
 def test_bad_input_is_named(world: World, change: Any, message: str) -> None:
     with pytest.raises(ValueError, match=message):
         normalize_scene(**({"viewmats": world[0], "points": world[1]} | change))
+
+
+def test_one_camera_and_three_points_are_enough(world: World) -> None:
+    viewmats, points = world
+    assert len(normalize_scene(viewmats[:1], points[:3]).points) == 3

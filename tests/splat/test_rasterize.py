@@ -150,3 +150,12 @@ def test_bands_above_the_degree_do_not_show(draw: Draw, scene: Scene) -> None:
 def test_unknown_backend(draw: Draw) -> None:
     with pytest.raises(ValueError, match="'cuda'"):
         draw(backend="cuda")
+
+
+@pytest.mark.parametrize(
+    ("name", "bound"), [("opacities", 0.0), ("opacities", 1.0), ("scales", 0.0)]
+)
+def test_a_value_at_its_bound_is_accepted(
+    draw: Draw, scene: Scene, name: str, bound: float
+) -> None:
+    assert draw(**{name: torch.full_like(scene[name], bound)}).image.isfinite().all()
