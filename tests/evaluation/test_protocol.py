@@ -34,7 +34,7 @@ def test_scores_are_the_same_for_any_number_of_threads(
     scores = []
     for threads in (1, 2, 3):
         torch.set_num_threads(threads)
-        scores += protocol.score(gaussians, [view], baseline.splat, tmp_path / str(threads))
+        scores += protocol.score_views(gaussians, [view], baseline.splat, tmp_path / str(threads))
         assert torch.get_num_threads() == threads
     torch.set_num_threads(1)
     assert scores[0]["psnr"] > 1

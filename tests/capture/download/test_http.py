@@ -1,4 +1,4 @@
-"""Downloads against a server that cuts, refuses, forgets ranges or sends something else."""
+"""Downloads from a server that cuts, refuses, ignores ranges or sends something else."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from xrgs.capture.download import http as fetch
 from xrgs.capture.download.http import DownloadError, TooLargeError, download
 
 CONTENT = random.Random(0).randbytes(700_000)
-#: Of bytes that a download may have: these very ones.
+#: The largest size that is accepted: exactly the content's.
 MOST = len(CONTENT)
 SHA256 = hashlib.sha256(CONTENT).hexdigest()
 
@@ -94,7 +94,9 @@ def test_more_than_there_is_was_of_another_file(server: Any, target: Path) -> No
 def test_a_range_that_was_not_asked_for_is_refused(server: Any, target: Path) -> None:
     server.content, server.shift = CONTENT, 5
     part(target, CONTENT[:1000])
-    with pytest.raises(DownloadError, match="asked for what follows 1000, given 1005"):
+    with pytest.raises(
+        DownloadError, match="requested the bytes from 1000 on, received those from 1005"
+    ):
         download(server.url, target, MOST)
 
 
@@ -122,7 +124,7 @@ def test_more_bytes_than_are_allowed_are_not_written(
     for before in (b"", CONTENT[:1000]):
         part(target, before)
         with pytest.raises(
-            TooLargeError, match=rf"{server.url}: \d+ bytes .* {MOST - 1} is the most"
+            TooLargeError, match=rf"{server.url}: \d+ bytes .* at most {MOST - 1} are allowed"
         ):
             download(server.url, target, MOST - 1, SHA256)
         assert not target.exists()
@@ -159,7 +161,7 @@ def test_a_web_page_is_no_archive(server: Any, target: Path) -> None:
 def test_offline_is_said_with_address_and_file(target: Path) -> None:
     with socket.create_server(("127.0.0.1", 0)) as taken:
         url = f"http://127.0.0.1:{taken.getsockname()[1]}/x.zip"
-    with pytest.raises(DownloadError, match=rf"{url}: can't be had \(.*refused.*{target}"):
+    with pytest.raises(DownloadError, match=rf"{url}: can't be downloaded \(.*refused.*{target}"):
         download(url, target, MOST)
 
 
