@@ -154,18 +154,13 @@ def prepare_hr_views(scene: Scene, conf: VariantConf, work: Path) -> PhotoCollec
             geometries[file] = hr = hr_geometry(size, shrink, conf)
         except XrgsError as error:
             raise XrgsError(f"{file}: {error}") from None
-        left, top = hr.crop_offset
-        resized = images.resize(image, *hr.resized)
-        cropped = resized[top : top + hr.height, left : left + hr.width]
-        images.save(work / "hr" / f"{len(geometries) - 1:05d}.png", cropped)
+        images.save(work / "hr" / f"{len(geometries) - 1:05d}.png", _resize_and_crop(image, hr))
     messages = tuple(unreadable[file] for file in scene.files if file in unreadable)
     for message in messages:
         _log.warning("%s; left out", message)
     if len(geometries) < 2:
-        raise XrgsError(
-            f"scene {scene.name}: {len(geometries)} readable image(s), two are needed: "
-            f"{list(messages)}"
-        )
+        count = f"{len(geometries)} readable image(s), two are needed"
+        raise XrgsError(f"scene {scene.name}: {count}: {list(messages)}")
     cameras = assign_cameras(
         list(geometries), [sizes[file] for file in geometries], conf.sfm.camera
     )
@@ -174,6 +169,11 @@ def prepare_hr_views(scene: Scene, conf: VariantConf, work: Path) -> PhotoCollec
         for i, ((file, hr), camera) in enumerate(zip(geometries.items(), cameras, strict=True))
     )
     return PhotoCollection(tuple(photos), work, messages)
+
+
+def _resize_and_crop(image: images.ImageArray, hr: HrGeometry) -> images.ImageArray:
+    left, top = hr.crop_offset
+    return images.resize(image, *hr.resized)[top : top + hr.height, left : left + hr.width]
 
 
 def _read_sizes(

@@ -111,9 +111,8 @@ def reconstruct(
     Args:
         sfm_images: The images; those without `K` get one SIMPLE_RADIAL camera per `camera` name.
         folder: The folder that `SfmImage.file` is relative to.
-        work: An existing folder for COLMAP's database, models and logs. Features and matches that
-            an earlier call left there are reused: it must have had the same images,
-            `max_num_features` and `first_octave`.
+        work: An existing folder for COLMAP's database, models and logs. Features and matches of
+            an earlier call with the same images, `max_num_features` and `first_octave` are reused.
         conf: The settings.
 
     Returns:

@@ -86,8 +86,8 @@ def _is_llff_folder(folder: Path) -> bool:
 
 
 def _images_in(folder: Path) -> tuple[Path, ...]:
-    found = (f for f in folder.iterdir() if f.suffix.lower() in SUFFIXES and f.is_file())
-    return tuple(sorted((f for f in found if not f.name.startswith(".")), key=lambda f: f.name))
+    files = (f for f in folder.iterdir() if f.suffix.lower() in SUFFIXES and f.is_file())
+    return tuple(sorted((f for f in files if not f.name.startswith(".")), key=lambda f: f.name))
 
 
 def _select_copies(copies: list[tuple[Path, ...]], long_side: int) -> tuple[Path, ...]:
