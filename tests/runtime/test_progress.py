@@ -60,7 +60,7 @@ def test_a_line_replaces_a_bar(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.mark.usefixtures("quick")
-def test_what_is_kept_in_a_file_is_drawn_nowhere_and_gone_at_the_end(
+def test_progress_in_a_file_is_shown_nowhere_and_removed_at_the_end(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     file = tmp_path / "progress.json"

@@ -42,7 +42,7 @@ def test_one_folder_is_written_and_nothing_else(tmp_path: Path) -> None:
     assert [f.name for f in target.parent.iterdir()] == ["fern"]
 
 
-def test_the_folders_rights_are_those_that_the_umask_leaves(tmp_path: Path) -> None:
+def test_the_folder_has_the_permissions_of_the_umask(tmp_path: Path) -> None:
     (tmp_path / "plain").mkdir()
     unpack(archive(tmp_path), "set/fern", tmp_path / "fern")
     assert (tmp_path / "fern").stat().st_mode == (tmp_path / "plain").stat().st_mode
@@ -74,9 +74,7 @@ def test_an_empty_folder_may_be_filled_and_no_other(tmp_path: Path) -> None:
         ("set/fern/a\nb", "not a valid file name"),
     ],
 )
-def test_a_name_that_leads_elsewhere_spoils_the_archive(
-    tmp_path: Path, name: str, why: str
-) -> None:
+def test_one_unsafe_name_refuses_the_whole_archive(tmp_path: Path, name: str, why: str) -> None:
     file = archive(tmp_path, {name: b"x"})
     with pytest.raises(UnpackError, match=f"set.zip: .* in it .*{why}.*nothing was unpacked"):
         unpack(file, "set/fern", tmp_path / "deep" / "down" / "fern")
@@ -103,7 +101,7 @@ def test_a_bomb_is_refused(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("limit", "why"), [("_MAX_BYTES", "unpacks to 51 bytes"), ("_MAX_FILES", "holds 2 files")]
 )
-def test_more_than_a_scene_can_be_is_refused(
+def test_too_many_files_or_bytes_are_refused(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, limit: str, why: str
 ) -> None:
     monkeypatch.setattr(unpack_module, limit, 1)
@@ -111,7 +109,7 @@ def test_more_than_a_scene_can_be_is_refused(
         unpack(archive(tmp_path), "set/fern", tmp_path / "fern")
 
 
-def test_two_files_that_some_systems_take_for_one_are_refused(tmp_path: Path) -> None:
+def test_two_names_that_differ_in_case_alone_are_refused(tmp_path: Path) -> None:
     file = archive(tmp_path, {"set/fern/POSES.npy": b"x"})
     with pytest.raises(UnpackError, match="two files of one name"):
         unpack(file, "set/fern", tmp_path / "fern")
