@@ -9,7 +9,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from xrgs.capture.split import (
-    SSIM_WINDOW,
     check_variant_conf,
     hr_geometry,
     shrink_factor,
@@ -17,6 +16,7 @@ from xrgs.capture.split import (
 )
 from xrgs.config import VariantConf
 from xrgs.errors import XrgsError
+from xrgs.splat.ssim import WINDOW
 
 Make = Callable[..., VariantConf]
 
@@ -133,7 +133,7 @@ def test_an_hr_view_is_a_whole_number_of_lr_pixels_and_never_enlarged(
 ) -> None:
     conf = configured(long_side=side, factor=factor)
     shrink = min(1, (side or max(width, height)) / max(width, height))
-    if min(round(width * shrink), round(height * shrink)) // factor < SSIM_WINDOW:
+    if min(round(width * shrink), round(height * shrink)) // factor < WINDOW:
         with pytest.raises(XrgsError, match=r"variant\.factor"):
             hr_geometry((width, height), shrink_factor([(width, height)], conf), conf)
         return

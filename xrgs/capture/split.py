@@ -13,9 +13,6 @@ from xrgs.errors import XrgsError
 if TYPE_CHECKING:
     from xrgs.config import VariantConf
 
-#: The width of the SSIM window of the training loss, px: no LR view may be smaller.
-SSIM_WINDOW = 11
-
 
 @dataclass(frozen=True)
 class Split:
@@ -175,15 +172,18 @@ def hr_geometry(size: tuple[int, int], shrink: float, conf: VariantConf) -> HrGe
         The sizes before and after the crop.
 
     Raises:
-        XrgsError: The LR view, `factor` times smaller, would be smaller than the SSIM window.
+        XrgsError: The LR view, `factor` times smaller, would be smaller than the SSIM window of the
+            training loss.
     """
+    from xrgs.splat.ssim import WINDOW  # imports torch, which a plan must not wait for
+
     resized = round(size[0] * shrink), round(size[1] * shrink)
     # The crop makes x and y shrink by the same whole factor; else they differ by up to 0.6%.
     lr = resized[0] // conf.factor, resized[1] // conf.factor
-    if min(lr) < SSIM_WINDOW:
+    if min(lr) < WINDOW:
         raise XrgsError(
             f"variant.factor={conf.factor}: LR views of {lr[0]}x{lr[1]} px are smaller than the "
-            f"SSIM window of {SSIM_WINDOW} px; lower variant.factor, or raise "
+            f"SSIM window of {WINDOW} px; lower variant.factor, or raise "
             f"variant.long_side={conf.long_side}"
         )
     return HrGeometry(resized, lr[0] * conf.factor, lr[1] * conf.factor)
