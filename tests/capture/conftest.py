@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -60,6 +61,17 @@ def small_conf(configured: Callable[..., VariantConf]) -> Callable[..., VariantC
 
 
 @pytest.fixture(scope="session")
+def build_in(small_conf: Callable[..., VariantConf]) -> Callable[..., Variant]:
+    """(store, scene, **changes) -> the variant of `small_conf` with these changes, in the store."""
+
+    def build(store: Path, scene: SceneConf, **changes: Any) -> Variant:
+        conf = small_conf(scene, **changes)
+        return variant.build(scene, conf, store / "variants", store / "scenes")
+
+    return build
+
+
+@pytest.fixture(scope="session")
 def shared_store(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A store for variants that no test changes."""
     return tmp_path_factory.mktemp("store")
@@ -67,20 +79,18 @@ def shared_store(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="session")
 def procedural_variant(
-    shared_store: Path, procedural_scene: SceneConf, small_conf: Callable[..., VariantConf]
+    build_in: Callable[..., Variant], shared_store: Path, procedural_scene: SceneConf
 ) -> Variant:
     """The embedded scene with the default settings, at 252 px. Building it takes seconds."""
-    conf = small_conf(procedural_scene)
-    return variant.build(procedural_scene, conf, shared_store / "variants", shared_store / "scenes")
+    return build_in(shared_store, procedural_scene)
 
 
 @pytest.fixture(scope="session")
 def stereo_variant(
-    shared_store: Path, stereo_scene: SceneConf, small_conf: Callable[..., VariantConf]
+    build_in: Callable[..., Variant], shared_store: Path, stereo_scene: SceneConf
 ) -> Variant:
     """The stereo pair at 185 px, one view of it LR."""
-    conf = small_conf(stereo_scene)
-    return variant.build(stereo_scene, conf, shared_store / "variants", shared_store / "scenes")
+    return build_in(shared_store, stereo_scene)
 
 
 @pytest.fixture
@@ -90,11 +100,6 @@ def store(tmp_path: Path) -> Path:
 
 
 @pytest.fixture
-def build(store: Path, small_conf: Callable[..., VariantConf]) -> Callable[..., Variant]:
-    """(scene, **changes) -> the variant of `small_conf` with these changes, built in `store`."""
-
-    def built(scene: SceneConf, **changes: Any) -> Variant:
-        conf = small_conf(scene, **changes)
-        return variant.build(scene, conf, store / "variants", store / "scenes")
-
-    return built
+def build(build_in: Callable[..., Variant], store: Path) -> Callable[..., Variant]:
+    """(scene, **changes) -> as `build_in`, in `store`."""
+    return partial(build_in, store)
