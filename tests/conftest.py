@@ -49,9 +49,9 @@ def _signals_are_heard() -> Iterator[None]:
 @pytest.fixture(scope="session", autouse=True)
 def lpips_weights(tmp_path_factory: pytest.TempPathFactory) -> Iterator[weights.Weights | None]:
     """This machine's weights of LPIPS; hidden from all that don't ask, so that CI sees the same."""
-    found = weights.published()
+    found = weights.load_published()
     with pytest.MonkeyPatch.context() as patch:
-        patch.delenv(weights.EXPLICIT, raising=False)
+        patch.delenv(weights.PATH_VARIABLE, raising=False)
         patch.setenv("XRGS_CACHE", str(tmp_path_factory.mktemp("cache")))
         yield found
 

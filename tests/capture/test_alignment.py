@@ -5,12 +5,13 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from xrgs.capture.alignment import pose_error, similarity
+from xrgs.capture.alignment import fit_similarity, pose_error
 
 
 def rotation(rng: np.random.Generator) -> np.ndarray:
     q, _ = np.linalg.qr(rng.normal(size=(3, 3)))
-    return q * np.linalg.det(q)
+    proper: np.ndarray = q * np.linalg.det(q)
+    return proper
 
 
 def cameras(rng: np.random.Generator, count: int) -> dict[str, np.ndarray]:
@@ -22,7 +23,9 @@ def cameras(rng: np.random.Generator, count: int) -> dict[str, np.ndarray]:
     return found
 
 
-def moved(views: dict[str, np.ndarray], s: float, R: np.ndarray, t: np.ndarray) -> dict:
+def moved(
+    views: dict[str, np.ndarray], s: float, R: np.ndarray, t: np.ndarray
+) -> dict[str, np.ndarray]:
     """The same cameras in a world of other units: x' = s R x + t."""
     changed = {}
     for name, matrix in views.items():
@@ -35,7 +38,7 @@ def moved(views: dict[str, np.ndarray], s: float, R: np.ndarray, t: np.ndarray) 
 
 @settings(deadline=None)
 @given(st.integers(0, 10_000), st.floats(0.01, 100), st.integers(3, 12))
-def test_a_similarity_of_the_world_is_no_error(seed: int, scale: float, count: int) -> None:
+def test_a_similarity_of_the_world_is_not_an_error(seed: int, scale: float, count: int) -> None:
     rng = np.random.default_rng(seed)
     exact = cameras(rng, count)
     error = pose_error(moved(exact, scale, rotation(rng), rng.normal(size=3)), exact)
@@ -44,13 +47,31 @@ def test_a_similarity_of_the_world_is_no_error(seed: int, scale: float, count: i
 
 @settings(deadline=None)
 @given(st.integers(0, 10_000), st.floats(0.01, 100))
-def test_the_similarity_of_moved_points_is_found_without_a_mirror(seed: int, scale: float) -> None:
+def test_the_similarity_of_moved_points_is_fitted(seed: int, scale: float) -> None:
     rng = np.random.default_rng(seed)
     R, shift, points = rotation(rng), rng.normal(size=3), rng.normal(size=(7, 3))
-    s, Q, t = similarity(points, scale * points @ R.T + shift)
+    s, Q, t = fit_similarity(points, scale * points @ R.T + shift)
     assert s == pytest.approx(scale)
     assert pytest.approx(R, abs=1e-9) == Q
     assert t == pytest.approx(shift, abs=1e-7)
+
+
+@settings(deadline=None)
+@given(st.integers(0, 10_000))
+def test_mirrored_points_are_fitted_by_a_rotation_and_not_by_a_reflection(seed: int) -> None:
+    """No rotation fits better than scipy's, and the scale is that of linear least squares."""
+    from scipy.spatial.transform import Rotation
+
+    points = np.random.default_rng(seed).normal(size=(7, 3))
+    mirrored = points * (1, 1, -1)
+    scale, R, shift = fit_similarity(points, mirrored)
+    assert np.linalg.det(R) == pytest.approx(1)
+    assert pytest.approx(np.eye(3), abs=1e-9) == R @ R.T
+    centred, target = points - points.mean(0), mirrored - mirrored.mean(0)
+    expected, _ = Rotation.align_vectors(target, centred)
+    assert pytest.approx(expected.as_matrix(), abs=1e-6) == R
+    assert scale == pytest.approx((centred @ R.T * target).sum() / (centred**2).sum())
+    assert shift == pytest.approx(mirrored.mean(0) - scale * R @ points.mean(0))
 
 
 def test_one_turned_camera_is_measured_in_degrees() -> None:

@@ -15,8 +15,8 @@ from xrgs.errors import XrgsError
 HR, LR = (40, 30), (20, 15)
 
 
-def placed(folder: Path, name: str, split: str, tag: str, size: tuple[int, int]) -> View:
-    """A view of one grey; its pose is told by its name, so that a view's copies share it."""
+def make_view(folder: Path, name: str, split: str, tag: str, size: tuple[int, int]) -> View:
+    """A view of one grey, whose pose depends on its name alone."""
     number = int(name[1:])
     grey = {"train": 0.1, "test": 0.2, "original": 0.3}[split] + number / 20
     file = folder / split / f"{name}.png"
@@ -30,9 +30,12 @@ def placed(folder: Path, name: str, split: str, tag: str, size: tuple[int, int])
 @pytest.fixture
 def variant(tmp_path: Path) -> Variant:
     """Five views: v0 is the test, v1 HR, v2 to v4 downsampled by 2, with their originals."""
-    views = [placed(tmp_path, f"v{i}", "original", "HR", HR) for i in (2, 3, 4)]
-    views += [placed(tmp_path, "v0", "test", "HR", HR), placed(tmp_path, "v1", "train", "HR", HR)]
-    views += [placed(tmp_path, f"v{i}", "train", "LR", LR) for i in (2, 3, 4)]
+    views = [make_view(tmp_path, f"v{i}", "original", "HR", HR) for i in (2, 3, 4)]
+    views += [
+        make_view(tmp_path, "v0", "test", "HR", HR),
+        make_view(tmp_path, "v1", "train", "HR", HR),
+    ]
+    views += [make_view(tmp_path, f"v{i}", "train", "LR", LR) for i in (2, 3, 4)]
     points = np.random.default_rng(0).normal((0, 0, 4), 1, (50, 3))
     colors = np.zeros((50, 3), np.uint8)
     return Variant("id", tmp_path, "grey", 2, True, tuple(views), points, colors, {})
@@ -42,7 +45,7 @@ def grey(view: LoadedView) -> float:
     return round(float(view.image.mean()) * 20) / 20
 
 
-def test_mixed_is_what_the_variant_says_and_the_default(variant: Variant) -> None:
+def test_mixed_is_the_default_and_takes_the_views_as_they_are(variant: Variant) -> None:
     data = dataset.load(variant)
     assert [(v.name, v.tag) for v in data.train] == [
         ("v1", "HR"),
@@ -93,16 +96,20 @@ def test_originals_do_not_move_the_world(variant: Variant) -> None:
     assert torch.equal(dataset.load(without).points, dataset.load(variant).points)
 
 
-def test_a_use_that_the_variant_has_no_views_for_is_told(variant: Variant) -> None:
+def test_a_use_without_views_is_refused(variant: Variant) -> None:
     without = replace(variant, views=tuple(v for v in variant.views if v.split != "original"))
     with pytest.raises(XrgsError, match="no original of v2"):
         dataset.load(without, "all_hr")
     high = replace(variant, views=tuple(v for v in without.views if v.tag == "HR"))
     assert [v.name for v in dataset.load(high, "all_hr").train] == ["v1"]
-    with pytest.raises(XrgsError, match="no LR view to train on: not for lr_only"):
+    with pytest.raises(
+        XrgsError, match=r"train\.views=lr_only: variant id has no LR training view"
+    ):
         dataset.load(high, "lr_only")
     low = replace(without, views=tuple(v for v in without.views if v.name != "v1"))
-    with pytest.raises(XrgsError, match="no HR view to train on: not for hr_only"):
+    with pytest.raises(
+        XrgsError, match=r"train\.views=hr_only: variant id has no HR training view"
+    ):
         dataset.load(low, "hr_only")
     with pytest.raises(
         XrgsError, match=r"train\.views=best: must be one of mixed, all_hr, hr_only, lr_only"

@@ -22,14 +22,14 @@ def photo() -> np.ndarray:
     return (smooth + rng.normal(0, 0.1, smooth.shape)).clip(0, 1).astype(np.float32)
 
 
-def test_auto_degrades_what_was_drawn_and_leaves_what_was_measured() -> None:
+def test_auto_degrades_views_drawn_at_random_and_no_others() -> None:
     kinds = {
-        tags: degrade.kind(replace(CONF, tags=tags, degradation="auto"))
+        tags: degrade.resolve_degradation(replace(CONF, tags=tags, degradation="auto"))
         for tags in ("flag", "megapixels", "distance", "sampling_rate")
     }
     assert kinds.pop("flag") == "downsample"
     assert set(kinds.values()) == {"none"}
-    assert degrade.kind(replace(CONF, tags="distance", degradation="jpeg")) == "jpeg"
+    assert degrade.resolve_degradation(replace(CONF, tags="distance", degradation="jpeg")) == "jpeg"
 
 
 def test_none_is_the_photograph_itself(photo: np.ndarray) -> None:

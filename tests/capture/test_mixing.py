@@ -1,3 +1,5 @@
+"""What a variant holds: tags, degraded views, poses and their report; SfM is run once for all."""
+
 from __future__ import annotations
 
 import shutil
@@ -11,10 +13,10 @@ import numpy as np
 import pytest
 
 from xrgs import config
-from xrgs.capture import degrade, images, mixing, placing, scenes, sfm
+from xrgs.capture import degrade, images, mixing, registration, scenes, sfm
 from xrgs.capture.scenes import Scene, procedural
-from xrgs.capture.sfm import Reconstruction, Shot
-from xrgs.capture.split import check
+from xrgs.capture.sfm import Reconstruction, SfmImage
+from xrgs.capture.split import check_variant_conf
 from xrgs.capture.views import SceneFailed, Variant, View
 from xrgs.config import SceneConf, VariantConf
 from xrgs.errors import XrgsError
@@ -26,7 +28,7 @@ VIEWS = 12
 
 @pytest.fixture(scope="module")
 def configured(configured: Make) -> Make:
-    """Small, and held against SfM of the undegraded photographs."""
+    """Small views, whose poses are compared with SfM of the undegraded photographs."""
     return partial(configured, long_side=160, min_hr=0, test_every=4, sfm={"reference": True})
 
 
@@ -42,21 +44,21 @@ def rendered(tmp_path_factory: pytest.TempPathFactory, conf: VariantConf) -> Sce
 
 
 @pytest.fixture(scope="module")
-def placed(
+def reconstruction(
     rendered: Scene, tmp_path_factory: pytest.TempPathFactory, conf: VariantConf
 ) -> Reconstruction:
-    """The undegraded photographs, placed once for all tests of what is done before and after."""
+    """SfM of the undegraded photographs, run once for all tests of what comes before and after."""
     work = tmp_path_factory.mktemp("work")
-    shots = []
+    inputs = []
     for file in rendered.files:
         shutil.copy(file, work / file.name)
-        shots.append(Shot(file.name, "all"))
-    return sfm.reconstruct(shots, work, work, conf.sfm)
+        inputs.append(SfmImage(file.name, "all"))
+    return sfm.reconstruct(inputs, work, work, conf.sfm)
 
 
 @pytest.fixture
 def given() -> list[list[str]]:
-    """The files of each call of SfM."""
+    """The files that each call of SfM gets."""
     return []
 
 
@@ -64,23 +66,26 @@ def given() -> list[list[str]]:
 def mix(
     configured: Make,
     rendered: Scene,
-    placed: Reconstruction,
+    reconstruction: Reconstruction,
     given: list[list[str]],
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
 ) -> Mix:
-    """(scene, **changes) -> `mixing.mix`, by default of photographs alone; by `placed`'s poses."""
+    """(scene, **changes) -> `mix_resolutions` with `reconstruction` in the place of SfM.
 
-    def recall(shots: Sequence[Shot], *_: object) -> Reconstruction:
-        given.append([shot.file for shot in shots])
-        return placed
+    The default scene has no exact cameras.
+    """
+
+    def recall(inputs: Sequence[SfmImage], *_: object) -> Reconstruction:
+        given.append([image.file for image in inputs])
+        return reconstruction
 
     def run(scene: Scene | None = None, **changes: Any) -> Variant:
         work, out = tmp_path / "work", tmp_path / "out"
         work.mkdir()
         out.mkdir()
         scene = scene or replace(rendered, viewmats={})
-        return mixing.mix(scene, configured(**changes), work, out)
+        return mixing.mix_resolutions(scene, configured(**changes), work, out)
 
     monkeypatch.setattr(sfm, "reconstruct", recall)
     return run
@@ -97,7 +102,7 @@ def number(view: View) -> int:
 # tags
 
 
-def test_by_sampling_rate_the_finest_are_hr_and_nothing_is_degraded(
+def test_by_sampling_rate_the_highest_are_hr_and_nothing_is_degraded(
     mix: Mix, given: list[list[str]]
 ) -> None:
     made = mix(tags="sampling_rate")
@@ -121,7 +126,7 @@ def test_a_threshold_of_the_rate_takes_those_above_it(mix: Mix) -> None:
 
 
 def test_by_distance_the_closest_are_hr(mix: Mix) -> None:
-    """Every camera looks at the scene's middle, so the exact cameras tell which are close to it."""
+    """Every camera looks at one point, so that the exact cameras say which are close to it."""
     made = mix(tags="distance")
     poses = procedural.viewmats(VIEWS)
     middle = np.array([0.0, 0.1, 5.5, 1.0])
@@ -149,7 +154,7 @@ def test_by_megapixels_the_larger_photographs_are_hr(
         assert (view.width, view.height) == ((160, 120) if number(view) % 3 == 0 else (80, 60))
 
 
-def test_photographs_all_of_one_class_are_no_mixture(mix: Mix, given: list[list[str]]) -> None:
+def test_photographs_of_one_class_alone_are_refused(mix: Mix, given: list[list[str]]) -> None:
     with pytest.raises(XrgsError, match=r"variant\.tags=megapixels: every training view is HR at"):
         mix(tags="megapixels")
     assert given == []
@@ -161,7 +166,7 @@ def test_a_threshold_above_all_but_the_held_out_is_named(mix: Mix) -> None:
 
 
 @pytest.mark.parametrize(("fraction", "tag"), [(0.0, "LR"), (1.0, "HR")])
-def test_one_class_alone_where_that_is_what_was_asked(mix: Mix, fraction: float, tag: str) -> None:
+def test_one_class_alone_where_the_config_says_so(mix: Mix, fraction: float, tag: str) -> None:
     made = mix(hr_fraction=fraction)
     assert len(of(made, "train", tag)) == 9
     assert len(of(made, "original", "HR")) == (9 if tag == "LR" else 0)
@@ -182,7 +187,7 @@ def test_each_degraded_view_has_its_original_from_the_same_pose(mix: Mix) -> Non
         assert (high.width, high.height) == (160, 120) == (view.width * 5, view.height * 5)
         assert high.K[:2] == pytest.approx(view.K[:2] * 5)
         shrunk = images.resize(images.read(high.file), view.width, view.height)
-        # The lens is all but straight: straightening and shrinking change places.
+        # The lens is nearly a pinhole, so that undistortion and downsampling commute.
         assert np.abs(shrunk - images.read(view.file)).mean() < 0.01
 
 
@@ -199,9 +204,7 @@ def test_a_degradation_may_keep_the_size(mix: Mix, given: list[list[str]], how: 
     assert given[0] == [f"{'lr' if i in low else 'hr'}/{i:05d}.png" for i in range(VIEWS)]
 
 
-def test_what_is_tagged_after_sfm_is_degraded_after_it_if_asked(
-    mix: Mix, given: list[list[str]]
-) -> None:
+def test_views_tagged_after_sfm_can_be_degraded_after_it(mix: Mix, given: list[list[str]]) -> None:
     made = mix(tags="distance", degradation="downsample")
     assert given == [[f"hr/{i:05d}.png" for i in range(VIEWS)]]
     low = of(made, "train", "LR")
@@ -212,7 +215,7 @@ def test_what_is_tagged_after_sfm_is_degraded_after_it_if_asked(
 # poses
 
 
-def test_mixed_poses_are_held_against_those_of_the_undegraded(
+def test_the_poses_are_compared_with_those_of_the_undegraded(
     mix: Mix, given: list[list[str]]
 ) -> None:
     made = mix()
@@ -225,7 +228,7 @@ def test_mixed_poses_are_held_against_those_of_the_undegraded(
     assert made.report["reference"]["seconds"] >= 0
 
 
-def test_known_cameras_need_no_second_run(
+def test_exact_cameras_need_no_second_run_of_sfm(
     mix: Mix, rendered: Scene, given: list[list[str]]
 ) -> None:
     made = mix(rendered)
@@ -234,13 +237,13 @@ def test_known_cameras_need_no_second_run(
     assert 0 < made.report["pose_error"]["position_percent"] < 5
 
 
-def test_the_reference_is_left_out_if_so_asked(mix: Mix, given: list[list[str]]) -> None:
+def test_the_reference_can_be_switched_off(mix: Mix, given: list[list[str]]) -> None:
     made = mix(sfm={"reference": False})
     assert len(given) == 1
     assert made.report["pose_error"] == {}
 
 
-NOTHING = Reconstruction(
+EMPTY = Reconstruction(
     {},
     {},
     np.zeros((0, 3)),
@@ -250,36 +253,37 @@ NOTHING = Reconstruction(
 )
 
 
-def test_a_recipe_that_fails_gives_way_to_the_next(
+def test_a_refused_attempt_is_followed_by_the_next(
     conf: VariantConf,
     rendered: Scene,
-    placed: Reconstruction,
+    reconstruction: Reconstruction,
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    results = iter([NOTHING, placed])
+    results = iter([EMPTY, reconstruction])
     monkeypatch.setattr(sfm, "reconstruct", lambda *_: next(results))
     (tmp_path / "out").mkdir()
-    made = mixing.mix(rendered, conf, tmp_path, tmp_path / "out")
+    made = mixing.mix_resolutions(rendered, conf, tmp_path, tmp_path / "out")
     attempts = made.report["attempts"]
     assert [(a["attempt"], a["registered"]) for a in attempts] == [
         ("configured", 0),
         ("finer", VIEWS),
     ]
-    assert "COLMAP placed 0 of 12 views" in attempts[0]["refused"]
+    assert "COLMAP registered 0 of 12 views" in attempts[0]["refused"]
     assert attempts[1]["refused"] == ""
     assert made.report["registered"] == len({v.name for v in made.views}) == VIEWS
 
 
-def test_where_every_recipe_fails_the_report_has_them_all(
+def test_where_every_attempt_is_refused_the_report_has_them_all(
     conf: VariantConf, rendered: Scene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(sfm, "reconstruct", lambda *_: NOTHING)
+    monkeypatch.setattr(sfm, "reconstruct", lambda *_: EMPTY)
     (tmp_path / "out").mkdir()
-    with pytest.raises(SceneFailed, match="scene p failed: COLMAP placed 0 of 12") as caught:
-        mixing.mix(rendered, conf, tmp_path, tmp_path / "out")
+    with pytest.raises(SceneFailed, match="scene p failed: COLMAP registered 0 of 12") as caught:
+        mixing.mix_resolutions(rendered, conf, tmp_path, tmp_path / "out")
     tried = [a["attempt"] for a in caught.value.report["attempts"]]
-    assert tried == [name for name, _, _ in placing.recipes(conf.sfm, VIEWS, smaller=True)]
+    attempts = registration.sfm_attempts(conf.sfm, VIEWS, any_smaller=True)
+    assert tried == [attempt.name for attempt in attempts]
     assert tried[-1] == "native"
 
 
@@ -297,15 +301,15 @@ def test_where_every_recipe_fails_the_report_has_them_all(
         ("", "flag", "downsample"),
     ],
 )
-def test_every_choice_of_variant_is_one_that_can_be_made(
+def test_every_variant_in_conf_is_valid(
     compose: Callable[..., config.Conf], name: str, tags: str, degradation: str
 ) -> None:
     conf = compose(*([f"variant={name}"] if name else [])).variant
-    check(conf)
-    assert (conf.tags, degrade.kind(conf)) == (tags, degradation)
+    check_variant_conf(conf)
+    assert (conf.tags, degrade.resolve_degradation(conf)) == (tags, degradation)
 
 
-def test_every_choice_of_variant_is_tested() -> None:
+def test_every_variant_in_conf_is_tested() -> None:
     files = {file.stem for file in (config.CONF_DIR / "variant").iterdir()}
     assert files == {"digital_zoom", "distance", "jpeg", "megapixels", "sampling_rate"}
 
@@ -314,10 +318,11 @@ def test_every_choice_of_variant_is_tested() -> None:
 
 
 @pytest.mark.data
-def test_a_collection_of_many_cameras_is_placed(
+@pytest.mark.slow
+def test_a_collection_of_many_cameras_is_registered(
     configured: Make, data_root: Path, tmp_path: Path
 ) -> None:
-    """Sixteen tourists' photographs, all of differing sizes, at a quarter of them."""
+    """Sixteen photographs of as many tourists, all of differing sizes, at a quarter of these."""
     source = data_root / "captures" / "reichstag" / "images"
     if not source.is_dir():
         pytest.skip(f"{source} is not there")
@@ -326,7 +331,7 @@ def test_a_collection_of_many_cameras_is_placed(
     few = {"max_num_features": 1500}
     conf = configured(long_side=320, tags="sampling_rate", factor=2, sfm=few)
     (tmp_path / "out").mkdir()
-    made = mixing.mix(Scene("reichstag", "", files), conf, tmp_path, tmp_path / "out")
+    made = mixing.mix_resolutions(Scene("reichstag", "", files), conf, tmp_path, tmp_path / "out")
     assert made.report["registered"] >= 12
     assert made.report["cameras"] == 16
     scale = 320 / max(max(size) for size in sizes)

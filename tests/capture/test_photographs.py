@@ -7,7 +7,7 @@ import pytest
 from PIL import Image
 
 from xrgs.capture import images
-from xrgs.capture.photographs import prepare, share_cameras
+from xrgs.capture.photographs import assign_cameras, prepare_hr_views
 from xrgs.capture.scenes import Scene
 from xrgs.config import SfmConf, VariantConf
 from xrgs.errors import XrgsError
@@ -15,14 +15,14 @@ from xrgs.errors import XrgsError
 CONF = VariantConf(long_side=0, factor=2, sfm=SfmConf(camera="auto"))
 
 
-def take(
+def write_photograph(
     file: Path,
     size: tuple[int, int] = (60, 40),
     model: str = "",
     focal: float = 0,
     orientation: int = 1,
 ) -> Path:
-    """A photograph as a camera stores it: `size` before it is turned upright."""
+    """Write a photograph as a camera does: `size` is that before the EXIF orientation."""
     exif = Image.Exif()
     exif[0x0112] = orientation
     if model:
@@ -35,46 +35,49 @@ def take(
     return file
 
 
-def shared(files: list[Path], how: str = "auto") -> list[int]:
-    """Cameras numbered by first use."""
-    names = share_cameras(files, [images.size(file) for file in files], how)
+def camera_numbers(files: list[Path], how: str = "auto") -> list[int]:
+    """The camera of each photograph, numbered by first use."""
+    names = assign_cameras(files, [images.size(file) for file in files], how)
     return [list(dict.fromkeys(names)).index(name) for name in names]
 
 
 def test_photographs_of_one_size_without_exif_share_a_camera(tmp_path: Path) -> None:
-    files = [take(tmp_path / f"{i}.png") for i in range(3)]
-    assert shared(files) == [0, 0, 0]
-    assert shared(files, "per_image") == [0, 1, 2]
-    assert shared(files, "single") == [0, 0, 0]
+    files = [write_photograph(tmp_path / f"{i}.png") for i in range(3)]
+    assert camera_numbers(files) == [0, 0, 0]
+    assert camera_numbers(files, "per_image") == [0, 1, 2]
+    assert camera_numbers(files, "single") == [0, 0, 0]
 
 
 def test_without_exif_and_of_differing_sizes_each_has_its_own(tmp_path: Path) -> None:
     sizes = [(60, 40), (60, 40), (50, 40)]
-    files = [take(tmp_path / f"{i}.png", size) for i, size in enumerate(sizes)]
-    assert shared(files) == [0, 1, 2]
+    files = [write_photograph(tmp_path / f"{i}.png", size) for i, size in enumerate(sizes)]
+    assert camera_numbers(files) == [0, 1, 2]
     with pytest.raises(XrgsError, match=r"camera=single.*0\.png is 60x40, .*2\.png is 50x40"):
-        shared(files, "single")
+        camera_numbers(files, "single")
 
 
 def test_exif_tells_cameras_lenses_and_how_they_were_held(tmp_path: Path) -> None:
     files = [
-        take(tmp_path / "0.jpg", model="A", focal=35.0),
-        take(tmp_path / "1.jpg", model="A", focal=35.0),
-        take(tmp_path / "2.jpg", model="A", focal=50.0),
-        take(tmp_path / "3.jpg", model="B", focal=35.0),
-        take(tmp_path / "4.jpg", model="A", focal=35.0, orientation=6),
-        take(tmp_path / "5.jpg", (30, 20), model="A", focal=35.0),
-        take(tmp_path / "6.jpg", model="A", focal=35.0),
-        take(tmp_path / "7.jpg"),
-        take(tmp_path / "8.jpg"),
+        write_photograph(tmp_path / "0.jpg", model="A", focal=35.0),
+        write_photograph(tmp_path / "1.jpg", model="A", focal=35.0),
+        write_photograph(tmp_path / "2.jpg", model="A", focal=50.0),
+        write_photograph(tmp_path / "3.jpg", model="B", focal=35.0),
+        write_photograph(tmp_path / "4.jpg", model="A", focal=35.0, orientation=6),
+        write_photograph(tmp_path / "5.jpg", (30, 20), model="A", focal=35.0),
+        write_photograph(tmp_path / "6.jpg", model="A", focal=35.0),
+        write_photograph(tmp_path / "7.jpg"),
+        write_photograph(tmp_path / "8.jpg"),
     ]
-    assert shared(files) == [0, 0, 1, 2, 3, 4, 0, 5, 6]
+    assert camera_numbers(files) == [0, 0, 1, 2, 3, 4, 0, 5, 6]
 
 
 def test_a_photograph_taken_sideways_is_prepared_upright(tmp_path: Path) -> None:
     """Stored 60 x 40 and turned by a quarter: bright left to right becomes top to bottom."""
-    files = [take(tmp_path / "a.png"), take(tmp_path / "b.png", orientation=6)]
-    photos = prepare(Scene("x", "", tuple(files)), CONF, tmp_path)
+    files = [
+        write_photograph(tmp_path / "a.png"),
+        write_photograph(tmp_path / "b.png", orientation=6),
+    ]
+    photos = prepare_hr_views(Scene("x", "", tuple(files)), CONF, tmp_path)
     assert [photo.size for photo in photos.all] == [(60, 40), (40, 60)]
     assert photos[0].camera != photos[1].camera
     upright = photos.read("hr", 1)
@@ -84,23 +87,27 @@ def test_a_photograph_taken_sideways_is_prepared_upright(tmp_path: Path) -> None
 
 def test_all_are_shrunk_by_one_scale(tmp_path: Path) -> None:
     sizes = [(200, 100), (100, 200), (120, 60), (50, 50)]
-    files = [take(tmp_path / f"{i}.png", size) for i, size in enumerate(sizes)]
+    files = [write_photograph(tmp_path / f"{i}.png", size) for i, size in enumerate(sizes)]
     conf = VariantConf(long_side=100, factor=2, sfm=SfmConf(camera="auto"))
-    photos = prepare(Scene("x", "", tuple(files)), conf, tmp_path)
-    assert [p.frame.resized for p in photos.all] == [(100, 50), (50, 100), (60, 30), (25, 25)]
-    assert [(p.frame.width, p.frame.height) for p in photos.all][-1] == (24, 24)
+    photos = prepare_hr_views(Scene("x", "", tuple(files)), conf, tmp_path)
+    assert [p.hr.resized for p in photos.all] == [(100, 50), (50, 100), (60, 30), (25, 25)]
+    assert [(p.hr.width, p.hr.height) for p in photos.all][-1] == (24, 24)
     assert photos.size("hr", 3) == (24, 24)
 
 
 def test_a_photograph_too_small_for_its_copy_is_named(tmp_path: Path) -> None:
-    files = [take(tmp_path / "a.png"), take(tmp_path / "b.png", (60, 21))]
+    files = [write_photograph(tmp_path / "a.png"), write_photograph(tmp_path / "b.png", (60, 21))]
     with pytest.raises(XrgsError, match=r"b\.png: variant\.factor=2: LR views of 30x10 px"):
-        prepare(Scene("x", "", tuple(files)), CONF, tmp_path)
+        prepare_hr_views(Scene("x", "", tuple(files)), CONF, tmp_path)
 
 
 def test_a_file_without_a_header_is_left_out_too(tmp_path: Path) -> None:
     (tmp_path / "b.png").write_text("no image")
-    files = [take(tmp_path / "a.png"), tmp_path / "b.png", take(tmp_path / "c.png")]
-    photos = prepare(Scene("x", "", tuple(files)), CONF, tmp_path)
+    files = [
+        write_photograph(tmp_path / "a.png"),
+        tmp_path / "b.png",
+        write_photograph(tmp_path / "c.png"),
+    ]
+    photos = prepare_hr_views(Scene("x", "", tuple(files)), CONF, tmp_path)
     assert photos.names == ["a", "c"]
     assert "b.png" in photos.unreadable[0]

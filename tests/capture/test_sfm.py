@@ -1,3 +1,5 @@
+"""SfM of the stereo pair against its calibration and disparity, and the options of COLMAP."""
+
 from __future__ import annotations
 
 from dataclasses import replace
@@ -8,22 +10,24 @@ import pytest
 
 from xrgs.capture import images, scenes, sfm
 from xrgs.capture.scenes import motorcycle
-from xrgs.capture.scenes.bundled import photograph
+from xrgs.capture.scenes.bundled import bundled_photograph
 from xrgs.config import SceneConf, SfmConf
+
+StereoPair = tuple[Path, sfm.Reconstruction]
 
 
 @pytest.mark.parametrize(
     ("count", "asked", "expected"), [(2, 0, 8192), (24, 0, 4166), (100, 0, 1000), (24, 512, 512)]
 )
 def test_features_fall_with_the_number_of_images(count: int, asked: int, expected: int) -> None:
-    assert sfm.features_for(count, asked) == expected
+    assert sfm.features_per_image(count, asked) == expected
 
 
-def test_small_images_are_searched_at_twice_their_size() -> None:
-    assert sfm.octave_for(252, None) == -1
-    assert sfm.octave_for(1008, None) == 0
-    assert sfm.octave_for(252, 0) == 0
-    assert sfm.octave_for(1008, -1) == -1
+def test_features_of_small_images_are_detected_at_twice_the_resolution() -> None:
+    assert sfm.first_octave(252, None) == -1
+    assert sfm.first_octave(1008, None) == 0
+    assert sfm.first_octave(252, 0) == 0
+    assert sfm.first_octave(1008, -1) == -1
 
 
 def test_the_default_inliers_are_colmaps_own(sfm_conf: SfmConf) -> None:
@@ -50,21 +54,19 @@ def test_two_views_keep_the_points_that_only_two_see(sfm_conf: SfmConf) -> None:
 
 
 @pytest.fixture(scope="module")
-def pair(
-    tmp_path_factory: pytest.TempPathFactory, sfm_conf: SfmConf
-) -> tuple[Path, sfm.Reconstruction]:
+def stereo_pair(tmp_path_factory: pytest.TempPathFactory, sfm_conf: SfmConf) -> StereoPair:
     """The motorcycle pair at its own size, intrinsics given."""
     work = tmp_path_factory.mktemp("pair")
     scene = scenes.resolve(SceneConf("motorcycle", "motorcycle"), work)
-    shots = []
+    inputs = []
     for file in scene.files:
         images.save(work / file.name, images.read(file))
-        shots.append(sfm.Shot(file.name, file.stem, scene.intrinsics[file.stem]))
-    return work, sfm.reconstruct(shots, work, work, sfm_conf)
+        inputs.append(sfm.SfmImage(file.name, file.stem, scene.intrinsics[file.stem]))
+    return work, sfm.reconstruct(inputs, work, work, sfm_conf)
 
 
-def test_the_stereo_pair_is_placed_with_the_intrinsics_it_was_given(pair) -> None:
-    model = pair[1]
+def test_the_stereo_pair_is_registered_with_its_known_intrinsics(stereo_pair: StereoPair) -> None:
+    model = stereo_pair[1]
     assert model.report["registered"] == len(model.viewmats) == 2
     assert len(model.points) == len(model.colors) > 500
     for i, K in enumerate(motorcycle.intrinsics().values()):
@@ -72,29 +74,29 @@ def test_the_stereo_pair_is_placed_with_the_intrinsics_it_was_given(pair) -> Non
         assert model.lenses[i].k == 0
 
 
-def test_its_cameras_are_parallel_and_side_by_side(pair) -> None:
-    a, b = (pair[1].viewmats[i] for i in range(2))
+def test_its_cameras_are_parallel_and_side_by_side(stereo_pair: StereoPair) -> None:
+    a, b = (stereo_pair[1].viewmats[i] for i in range(2))
     turn = b[:3, :3] @ a[:3, :3].T
     step = b[:3, 3] - turn @ a[:3, 3]  # of the right camera, in the left one's axes
     assert np.degrees(np.arccos((np.trace(turn) - 1) / 2)) < 0.5
     assert -step[0] / np.linalg.norm(step) > 0.995
 
 
-def test_each_view_knows_which_points_were_found_in_it(pair) -> None:
+def test_the_observed_points_of_each_view_are_listed(stereo_pair: StereoPair) -> None:
     """Two views: every point was found in both, and falls inside both images."""
-    model = pair[1]
+    model = stereo_pair[1]
     for i, lens in model.lenses.items():
-        assert np.array_equal(model.tracked[i], np.arange(len(model.points)))
+        assert np.array_equal(model.observed[i], np.arange(len(model.points)))
         camera = model.points @ model.viewmats[i][:3, :3].T + model.viewmats[i][:3, 3]
         pixels = camera @ lens.K.T
         pixels = pixels[:, :2] / pixels[:, 2:]
         assert ((pixels > -4) & (pixels < (lens.width + 4, lens.height + 4))).all()
 
 
-def test_its_points_lie_at_the_depths_of_the_published_disparity(pair) -> None:
+def test_its_points_lie_at_the_depths_of_the_published_disparity(stereo_pair: StereoPair) -> None:
     """Depths of SfM are right up to one scale: their ratio to the true ones is one number."""
-    model = pair[1]
-    disparity = np.load(photograph("motorcycle_disp.npz"))["arr_0"]
+    model = stereo_pair[1]
+    disparity = np.load(bundled_photograph("motorcycle_disp.npz"))["arr_0"]
     Ks = motorcycle.intrinsics()
     offset = Ks["motorcycle_right"][0, 2] - Ks["motorcycle_left"][0, 2]
     camera = model.points @ model.viewmats[0][:3, :3].T + model.viewmats[0][:3, 3]
@@ -106,19 +108,23 @@ def test_its_points_lie_at_the_depths_of_the_published_disparity(pair) -> None:
     assert np.median(np.abs(ratio / np.median(ratio) - 1)) < 0.02
 
 
-def test_colmaps_log_stays_in_the_work_folder(pair, capfd: pytest.CaptureFixture[str]) -> None:
-    assert "Feature extraction" in "".join(p.read_text() for p in pair[0].glob("colmap-INFO-*"))
+def test_colmaps_log_stays_in_the_work_folder(
+    stereo_pair: StereoPair, capfd: pytest.CaptureFixture[str]
+) -> None:
+    assert "Feature extraction" in "".join(
+        p.read_text() for p in stereo_pair[0].glob("colmap-INFO-*")
+    )
     assert "colmap" not in capfd.readouterr().err.lower()
 
 
-def test_images_without_anything_in_common_give_no_model(
+def test_unrelated_images_give_an_empty_model(
     sfm_conf: SfmConf, tmp_path: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:
     rng = np.random.default_rng(0)
     for i in range(3):
         images.save(tmp_path / f"{i}.png", rng.random((90, 120, 3), dtype=np.float32))
-    shots = [sfm.Shot(f"{i}.png", "all") for i in range(3)]
-    model = sfm.reconstruct(shots, tmp_path, tmp_path, sfm_conf)
+    inputs = [sfm.SfmImage(f"{i}.png", "all") for i in range(3)]
+    model = sfm.reconstruct(inputs, tmp_path, tmp_path, sfm_conf)
     assert model.viewmats == {}
     assert model.points.shape == model.colors.shape == (0, 3)
     assert model.report["models"] == []

@@ -2,14 +2,21 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import partial
+from typing import Any
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from xrgs.capture.split import SSIM_WINDOW, check, frame, scale, split
+from xrgs.capture.split import (
+    check_variant_conf,
+    hr_geometry,
+    shrink_factor,
+    split_views,
+)
 from xrgs.config import VariantConf
 from xrgs.errors import XrgsError
+from xrgs.splat.ssim import WINDOW
 
 Make = Callable[..., VariantConf]
 
@@ -26,46 +33,50 @@ CHANGES = st.fixed_dictionaries(
 
 @given(st.integers(2, 200), CHANGES)
 def test_the_parts_are_disjoint_ordered_and_cover_all(
-    configured: Make, views: int, changes: dict
+    configured: Make, views: int, changes: dict[str, Any]
 ) -> None:
-    parts = split(views, configured(**changes))
+    parts = split_views(views, configured(**changes))
     assert sorted(parts.test + parts.hr + parts.lr) == list(range(views))
     for part in (parts.test, parts.hr, parts.lr):
         assert list(part) == sorted(part)
 
 
 @given(st.integers(2, 200), CHANGES)
-def test_the_share_that_stays_hr_is_exact(configured: Make, views: int, changes: dict) -> None:
+def test_the_share_that_stays_hr_is_exact(
+    configured: Make, views: int, changes: dict[str, Any]
+) -> None:
     conf = configured(**changes)
-    parts = split(views, conf)
+    parts = split_views(views, conf)
     train = len(parts.hr) + len(parts.lr)
-    wanted = max(conf.min_hr, round(conf.hr_fraction * train))
-    assert len(parts.hr) == min(train, wanted)
+    expected = max(conf.min_hr, round(conf.hr_fraction * train))
+    assert len(parts.hr) == min(train, expected)
 
 
 @given(st.integers(2, 200), CHANGES)
 def test_every_nth_view_is_held_out_and_none_where_it_is_zero(
-    configured: Make, views: int, changes: dict
+    configured: Make, views: int, changes: dict[str, Any]
 ) -> None:
     conf = configured(**changes)
     expected = [i for i in range(views) if conf.test_every and i % conf.test_every == 0]
-    assert list(split(views, conf).test) == expected
+    assert list(split_views(views, conf).test) == expected
 
 
 @given(st.integers(2, 200), CHANGES)
-def test_the_split_is_a_function_of_its_config(configured: Make, views: int, changes: dict) -> None:
-    assert split(views, configured(**changes)) == split(views, configured(**changes))
+def test_the_split_is_a_function_of_its_config(
+    configured: Make, views: int, changes: dict[str, Any]
+) -> None:
+    assert split_views(views, configured(**changes)) == split_views(views, configured(**changes))
 
 
 def test_another_seed_chooses_other_views_and_holds_out_the_same(configured: Make) -> None:
-    a, b = split(40, configured()), split(40, configured(seed=1))
+    a, b = split_views(40, configured()), split_views(40, configured(seed=1))
     assert a.test == b.test == (0, 8, 16, 24, 32)
     assert a.hr != b.hr
 
 
 def test_a_uniform_selection_is_evenly_spaced(configured: Make) -> None:
     conf = configured(selection="uniform", test_every=0, hr_fraction=0.25, min_hr=0)
-    assert split(16, conf).hr == (2, 6, 10, 14)
+    assert split_views(16, conf).hr == (2, 6, 10, 14)
 
 
 scored = st.lists(st.floats(0.01, 1), min_size=2, max_size=60, unique=True)
@@ -86,9 +97,9 @@ def test_of_scored_views_the_best_share_is_hr(
     count = round(fraction * len(train))
     if 0 < fraction < 1 and count in (0, len(train)):
         with pytest.raises(XrgsError, match=r"variant\.hr_fraction"):
-            split(len(scores), conf, scores)
+            split_views(len(scores), conf, scores)
         return
-    parts = split(len(scores), conf, scores)
+    parts = split_views(len(scores), conf, scores)
     best = sorted(train, key=lambda i: scores[i], reverse=True)[:count]
     assert parts.hr == tuple(sorted(best))
     assert parts.lr == tuple(i for i in train if i not in best)
@@ -96,24 +107,24 @@ def test_of_scored_views_the_best_share_is_hr(
 
 def test_views_of_equal_score_are_of_one_class(by_rate: Make) -> None:
     conf = by_rate(hr_fraction=0.5, test_every=0)
-    assert split(6, conf, [1, 0.5, 0.5, 0.5, 0.5, 0.2]).hr == (0, 1, 2, 3, 4)
+    assert split_views(6, conf, [1, 0.5, 0.5, 0.5, 0.5, 0.2]).hr == (0, 1, 2, 3, 4)
 
 
 def test_a_view_without_a_score_is_lr_and_not_counted(by_rate: Make) -> None:
     conf = by_rate(hr_fraction=0.5, test_every=0)
-    assert split(5, conf, [0.5, float("nan"), 1, float("nan"), float("nan")]).hr == (2,)
+    assert split_views(5, conf, [0.5, float("nan"), 1, float("nan"), float("nan")]).hr == (2,)
 
 
 def test_a_threshold_of_the_score_is_inclusive(by_rate: Make) -> None:
     conf = by_rate(hr_above=0.75, test_every=0)
-    assert split(4, conf, [1, 0.75, 0.7499, 0.1]).hr == (0, 1)
+    assert split_views(4, conf, [1, 0.75, 0.7499, 0.1]).hr == (0, 1)
 
 
-def test_one_scale_brings_the_largest_photograph_to_the_long_side(configured: Make) -> None:
+def test_one_factor_brings_the_longest_side_to_long_side(configured: Make) -> None:
     sizes = [(2000, 1500), (1000, 4000), (640, 480)]
-    assert scale(sizes, configured(long_side=1000)) == 0.25
-    assert scale(sizes, configured(long_side=0)) == 1
-    assert scale(sizes, configured(long_side=9000)) == 1
+    assert shrink_factor(sizes, configured(long_side=1000)) == 0.25
+    assert shrink_factor(sizes, configured(long_side=0)) == 1
+    assert shrink_factor(sizes, configured(long_side=9000)) == 1
 
 
 @given(st.integers(60, 5000), st.integers(60, 5000), st.integers(0, 3000), st.integers(1, 8))
@@ -122,24 +133,24 @@ def test_an_hr_view_is_a_whole_number_of_lr_pixels_and_never_enlarged(
 ) -> None:
     conf = configured(long_side=side, factor=factor)
     shrink = min(1, (side or max(width, height)) / max(width, height))
-    if min(round(width * shrink), round(height * shrink)) // factor < SSIM_WINDOW:
+    if min(round(width * shrink), round(height * shrink)) // factor < WINDOW:
         with pytest.raises(XrgsError, match=r"variant\.factor"):
-            frame((width, height), scale([(width, height)], conf), conf)
+            hr_geometry((width, height), shrink_factor([(width, height)], conf), conf)
         return
-    made = frame((width, height), scale([(width, height)], conf), conf)
+    made = hr_geometry((width, height), shrink_factor([(width, height)], conf), conf)
     assert made.width % factor == made.height % factor == 0
     assert made.width <= made.resized[0] <= width
     assert made.height <= made.resized[1] <= height
     assert made.resized[0] - made.width < factor
     assert max(made.resized) == min(side or 10**9, max(width, height))
-    left, top = made.corner
+    left, top = made.crop_offset
     assert abs(made.resized[0] - made.width - 2 * left) <= 1
     assert abs(made.resized[1] - made.height - 2 * top) <= 1
 
 
 def test_a_factor_too_large_for_the_ssim_window_is_named(configured: Make) -> None:
     with pytest.raises(XrgsError, match=r"variant\.factor=40: LR views of 12x9 px .*SSIM window"):
-        frame((504, 378), 1.0, configured(factor=40))
+        hr_geometry((504, 378), 1.0, configured(factor=40))
 
 
 @pytest.mark.parametrize(
@@ -164,9 +175,9 @@ def test_a_factor_too_large_for_the_ssim_window_is_named(configured: Make) -> No
         ({"sfm": {"max_num_features": -1}}, "variant.sfm.max_num_features=-1"),
     ],
 )
-def test_a_variant_that_cannot_be_made_is_refused_by_key(
-    configured: Make, change: dict, key: str
+def test_an_invalid_config_is_refused_by_its_key(
+    configured: Make, change: dict[str, Any], key: str
 ) -> None:
     with pytest.raises(XrgsError, match=key):
-        check(configured(**change))
-    check(configured())
+        check_variant_conf(configured(**change))
+    check_variant_conf(configured())

@@ -71,7 +71,7 @@ def test_bytes_that_are_not_unicode_are_named(tmp_path: Path) -> None:
     for name in (b"a.png", b"\xff.png"):
         Image.new("RGB", (9, 9)).save(os.path.join(os.fsencode(tmp_path), name), "PNG")  # noqa: PTH118
     with pytest.raises(XrgsError, match=r"udcff.*rename it"):
-        folder.photographs(str(tmp_path), 0)
+        folder.list_photographs(str(tmp_path), 0)
 
 
 @pytest.mark.parametrize("names", [("a.png", "a.jpg"), ("A.png", "a.png"), (ACCENT, WHOLE)])
@@ -82,7 +82,7 @@ def test_photographs_that_would_be_one_file_somewhere_are_named(
         file = tmp_path / (name if "." in name else f"{name}.png")
         images.save(file, np.zeros((9, 9, 3), np.float32))
     with pytest.raises(XrgsError, match="two images of one name"):
-        folder.photographs(str(tmp_path), 0)
+        folder.list_photographs(str(tmp_path), 0)
 
 
 @pytest.mark.slow

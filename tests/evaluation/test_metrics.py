@@ -114,7 +114,7 @@ def test_lpips_is_the_networks_distance_where_there_are(
 ) -> None:
     from xrgs.evaluation.lpips.network import distance
 
-    monkeypatch.setattr(weights, "published", lambda: random_weights)
+    monkeypatch.setattr(weights, "load_published", lambda: random_weights)
     image, target = pair()
     tensors = {name: torch.from_numpy(array) for name, array in random_weights.items()}
     value = metrics.VIEW_METRICS["lpips"](image, target)

@@ -1,18 +1,32 @@
-"""Scores are what they are, on any machine."""
+"""Scores and renders against the renderer and float64 formulas, for any number of threads."""
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
+from PIL import Image
 
 from xrgs.capture.dataset import Dataset, LoadedView
 from xrgs.config import Conf
 from xrgs.evaluation import protocol
 from xrgs.splat.cameras import Camera
-from xrgs.splat.gaussians import from_points
+from xrgs.splat.gaussians import Gaussians, from_points
+from xrgs.splat.rasterize import rasterize
+
+
+@pytest.fixture
+def gaussians(data: Dataset) -> Gaussians:
+    """Gaussians whose colours depend on the view direction, by random SH of every degree."""
+    generator = torch.Generator().manual_seed(0)
+    made = from_points(data.points, data.colors, init_opacity=0.6, sh_degree=3, generator=generator)
+    with torch.no_grad():
+        made.shN += 0.3 * torch.randn(made.shN.shape, generator=generator)
+    return made
 
 
 @pytest.fixture
@@ -24,17 +38,35 @@ def view(data: Dataset) -> LoadedView:
     return replace(data.test[0], camera=Camera(torch.eye(4), K, width, height), image=noise)
 
 
-def test_scores_are_the_same_for_any_number_of_threads(
-    data: Dataset, view: LoadedView, baseline: Conf, tmp_path: Path
+def test_scores_and_pngs_are_of_the_render_with_all_sh_degrees(
+    gaussians: Gaussians, data: Dataset, baseline: Conf, tmp_path: Path
 ) -> None:
-    generator = torch.Generator().manual_seed(0)
-    gaussians = from_points(
-        data.points, data.colors, init_opacity=0.1, sh_degree=3, generator=generator
-    )
+    conf = baseline.splat
+    (row,) = protocol.score_views(gaussians, data.test, conf, tmp_path / "renders")
+    view = data.test[0]
+    images = {}
+    with torch.no_grad():
+        for degree in (0, 3):
+            render = rasterize(
+                *gaussians.activated(), view.camera, conf.raster, sh_degree=degree, backend="torch"
+            )
+            images[degree] = render.image.double().numpy().clip(0, 1)
+    assert np.abs(images[3] - images[0]).mean() > 0.01
+    error = ((images[3] - view.image.double().numpy()) ** 2).mean()
+    assert row["view"] == view.name
+    assert row["psnr"] == pytest.approx(10 * math.log10(1 / error), rel=1e-6)
+    assert row["lpips"] is None
+    png = np.asarray(Image.open(tmp_path / "renders" / f"{view.name}.png"), dtype=float) / 255
+    assert np.abs(png - images[3]).max() <= 0.5 / 255 + 1e-6
+
+
+def test_scores_are_the_same_for_any_number_of_threads(
+    gaussians: Gaussians, view: LoadedView, baseline: Conf, tmp_path: Path
+) -> None:
     scores = []
     for threads in (1, 2, 3):
         torch.set_num_threads(threads)
-        scores += protocol.score(gaussians, [view], baseline.splat, tmp_path / str(threads))
+        scores += protocol.score_views(gaussians, [view], baseline.splat, tmp_path / str(threads))
         assert torch.get_num_threads() == threads
     torch.set_num_threads(1)
     assert scores[0]["psnr"] > 1

@@ -8,10 +8,10 @@ from pathlib import Path
 
 import pytest
 
+from xrgs.errors import StoreError
 from xrgs.experiment import store
 from xrgs.experiment.store import CellFolder, Store
 from xrgs.safeio.atomic import write_json
-from xrgs.safeio.records import StoreError
 
 
 @pytest.fixture

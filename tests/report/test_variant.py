@@ -80,12 +80,12 @@ def test_a_variant_is_built_described_and_drawn(xrgs_data: Run, tmp_path: Path) 
     image.write_bytes(image.read_bytes()[:-1])
     code, out, err = xrgs_data("inspect", str(folder))
     assert code == 1
-    assert "motorcycle_left.png: not what was written" in err
+    assert "motorcycle_left.png: it has changed since it was frozen" in err
     (folder / "variant.json").unlink()
     code, out, err = xrgs_data("inspect", str(folder))
     assert code == 1
     assert out == ""
-    assert "not a whole variant" in err
+    assert "not a complete variant" in err
 
 
 def test_the_table_has_a_row_a_view_and_leaves_originals_out(mixed: Variant) -> None:

@@ -1,4 +1,4 @@
-"""How far something is: drawn, told in lines, or left in a file."""
+"""Progress as a bar, as lines of a log, and in a file."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from xrgs.runtime import progress
-from xrgs.runtime.progress import Bar, Progress, duration, kept_in, read
+from xrgs.runtime.progress import Progress, ProgressBar, format_duration, read, written_to
 
 
 class Terminal(io.StringIO):
@@ -19,52 +19,52 @@ class Terminal(io.StringIO):
 
 @pytest.fixture
 def quick(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Everything is shown at once."""
-    for name in ("_BAR_S", "_FILE_S", "_LINE_S", "_SHORT_S"):
+    """Every update is shown at once."""
+    for name in ("_BAR_S", "_FILE_S", "_LINE_S", "_BAR_DELAY_S"):
         monkeypatch.setattr(progress, name, 0.0)
 
 
 @pytest.mark.usefixtures("quick")
 def test_a_log_gets_lines_and_no_carriage_return(capsys: pytest.CaptureFixture[str]) -> None:
     assert list(progress.progress("abc", "reading", "letter")) == ["a", "b", "c"]
-    told = capsys.readouterr().err
-    assert "\r" not in told
-    lines = told.splitlines()
+    output = capsys.readouterr().err
+    assert "\r" not in output
+    lines = output.splitlines()
     assert lines[0] == "reading 0 of 3 letters"
     assert lines[-1].startswith("reading 3 of 3 letters, ")
 
 
-def test_a_log_gets_nothing_of_what_is_short(capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_log_gets_no_line_of_short_work(capsys: pytest.CaptureFixture[str]) -> None:
     assert len(list(progress.progress(range(100_000), "counting", "number"))) == 100_000
     assert capsys.readouterr().err == ""
 
 
 @pytest.mark.usefixtures("quick")
-def test_a_terminal_gets_a_bar_which_is_gone_at_the_end(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_terminal_gets_a_bar_that_is_cleared_at_the_end(monkeypatch: pytest.MonkeyPatch) -> None:
     terminal = Terminal()
     monkeypatch.setattr("sys.stderr", terminal)
-    with Bar("SfM: matches", "pair", 10, done=3) as bar:
+    with ProgressBar("SfM: matches", "pair", 10, done=3) as bar:
         bar.update(2)
-    told = terminal.getvalue()
-    assert "SfM: matches" in told
-    assert "5/10" in told
-    assert "\n" not in told
-    assert told.rpartition("5/10")[2].rpartition("\r")[0].rpartition("\r")[2].strip() == ""
+    output = terminal.getvalue()
+    assert "SfM: matches" in output
+    assert "5/10" in output
+    assert "\n" not in output
+    assert output.rpartition("5/10")[2].rpartition("\r")[0].rpartition("\r")[2].strip() == ""
 
 
-def test_a_line_takes_the_place_of_a_bar(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_line_replaces_a_bar(monkeypatch: pytest.MonkeyPatch) -> None:
     terminal = Terminal()
     monkeypatch.setattr("sys.stderr", terminal)
-    progress.say("a cell failed")
+    progress.log_line("a cell failed")
     assert terminal.getvalue() == "\r\x1b[Ka cell failed\n"
 
 
 @pytest.mark.usefixtures("quick")
-def test_what_is_kept_in_a_file_is_drawn_nowhere_and_gone_at_the_end(
+def test_progress_in_a_file_is_shown_nowhere_and_removed_at_the_end(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     file = tmp_path / "progress.json"
-    with kept_in(file):
+    with written_to(file):
         for item in progress.progress(range(5, 8), "training", "step", 8, done=5):
             found = read(file)
             assert found is not None
@@ -75,15 +75,17 @@ def test_what_is_kept_in_a_file_is_drawn_nowhere_and_gone_at_the_end(
         assert [entry.name for entry in tmp_path.iterdir()] == ["progress.json"]
     assert not list(tmp_path.iterdir())
     assert capsys.readouterr().err == ""
-    with pytest.raises(ZeroDivisionError), kept_in(file):
+    with pytest.raises(ZeroDivisionError), written_to(file):
         [1 / number for number in progress.progress([1, 0], "training", "step")]
     assert not file.exists()
 
 
-def test_the_file_is_written_seldom(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_file_is_not_written_for_every_item(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     written: list[int] = []
     monkeypatch.setattr(progress, "_write", lambda _, now: written.append(now.done))
-    with kept_in(tmp_path / "progress.json"):
+    with written_to(tmp_path / "progress.json"):
         assert sum(progress.progress(range(10_000), "training", "step")) == 49_995_000
     assert written[0] == 0
     assert len(written) < 3
@@ -91,7 +93,7 @@ def test_the_file_is_written_seldom(tmp_path: Path, monkeypatch: pytest.MonkeyPa
 
 @pytest.mark.usefixtures("quick")
 def test_a_file_that_cannot_be_written_stops_nothing(tmp_path: Path) -> None:
-    with kept_in(tmp_path / "gone" / "progress.json"):
+    with written_to(tmp_path / "gone" / "progress.json"):
         assert list(progress.progress([1, 2], "training", "step")) == [1, 2]
 
 
@@ -107,18 +109,18 @@ def test_a_file_that_cannot_be_written_stops_nothing(tmp_path: Path) -> None:
         '{"what": "a", "unit": "b", "done": 1, "total": 1, "rate": "fast"}',
     ],
 )
-def test_nonsense_is_nothing(tmp_path: Path, text: str) -> None:
+def test_an_invalid_file_is_no_progress(tmp_path: Path, text: str) -> None:
     (tmp_path / "progress.json").write_text(text)
     assert read(tmp_path / "progress.json") is None
 
 
-def test_a_rate_without_end_is_none(tmp_path: Path) -> None:
+def test_a_rate_that_is_not_finite_is_none(tmp_path: Path) -> None:
     found = {"what": "a", "unit": "b", "done": 1, "total": 2, "rate": float("nan")}
     (tmp_path / "progress.json").write_text(json.dumps(found))
     assert read(tmp_path / "progress.json") == Progress("a", "b", 1, 2, None)
 
 
-def test_what_is_known_is_told() -> None:
+def test_the_text_has_all_that_is_known() -> None:
     assert str(Progress("training", "step", 1200, 3000, 31.04)) == (
         "training 1,200 of 3,000 steps, 31 steps/s, ~58 s left"
     )
@@ -138,4 +140,4 @@ def test_what_is_known_is_told() -> None:
     ],
 )
 def test_duration(seconds: float | None, text: str) -> None:
-    assert duration(seconds) == text
+    assert format_duration(seconds) == text

@@ -1,4 +1,4 @@
-"""Ctrl-C and SIGTERM, seen from outside."""
+"""Ctrl-C and SIGTERM, sent to a child process."""
 
 from __future__ import annotations
 
@@ -10,10 +10,10 @@ import pytest
 
 _SCRIPT = """
 import signal, sys, time
-from xrgs.runtime.signals import stoppable
+from xrgs.runtime.signals import exit_on_signal
 if sys.argv[1] == "nohup":
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-with stoppable("Go on."):
+with exit_on_signal("Run it again."):
     try:
         print("ready", flush=True)
         time.sleep(60 if sys.argv[1] != "nohup" else 0.5)
@@ -31,23 +31,25 @@ def stopped(how: str, *signals: signal.Signals) -> tuple[int, str, str]:
         command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
     ) as process:
         assert process.stdout is not None
-        heard = [process.stdout.readline()]
+        lines = [process.stdout.readline()]
         for number in signals:
             process.send_signal(number)
-            heard.append(process.stdout.readline())
+            lines.append(process.stdout.readline())
         out, err = process.communicate()
-    return process.returncode, "".join(heard) + out, err
+    return process.returncode, "".join(lines) + out, err
 
 
 @pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
-def test_a_signal_ends_it_in_order_and_says_how_to_go_on(number: signal.Signals, code: int) -> None:
-    told = stopped("at once", number)
-    assert told == (code, "ready\ntidied up\n", f"stopped by {number.name}. Go on.\n")
+def test_a_signal_ends_the_block_in_order_and_prints_the_hint(
+    number: signal.Signals, code: int
+) -> None:
+    result = stopped("at once", number)
+    assert result == (code, "ready\ntidied up\n", f"stopped by {number.name}. Run it again.\n")
 
 
-def test_the_second_one_ends_it_at_once() -> None:
+def test_a_second_signal_ends_the_process_at_once() -> None:
     assert stopped("slow", signal.SIGINT, signal.SIGTERM)[0] == -signal.SIGTERM
 
 
-def test_what_was_ignored_stays_ignored() -> None:
+def test_an_ignored_signal_stays_ignored() -> None:
     assert stopped("nohup", signal.SIGINT) == (0, "ready\ntidied up\n", "")

@@ -1,4 +1,4 @@
-"""Hashes of values and of files."""
+"""Hashes of values, files and source code."""
 
 from __future__ import annotations
 
@@ -9,14 +9,22 @@ from pathlib import Path
 
 import pytest
 
+import xrgs
 from xrgs.config import Conf
-from xrgs.safeio.hashing import file_digest, plain
+from xrgs.safeio.hashing import canonical_json, digest, file_digest, source_digests, to_plain
 
 
-def test_a_config_is_what_asdict_makes_of_it(compose: Callable[..., Conf]) -> None:
+def test_equal_values_have_one_text_and_one_hash() -> None:
+    assert canonical_json({"b": [1, 2.5], "a": "é"}) == '{"a":"é","b":[1,2.5]}'
+    expected = hashlib.sha256('{"a":"é","b":[1,2.5]}'.encode()).hexdigest()[:16]
+    assert digest({"a": "é", "b": [1, 2.5]}) == digest({"b": [1, 2.5], "a": "é"}) == expected
+    assert digest({"a": 1}) != digest({"a": "1"})
+
+
+def test_a_config_becomes_the_dicts_of_asdict(compose: Callable[..., Conf]) -> None:
     conf = compose("+ablation=xrgs", "scene=llff/fern")
-    assert plain(conf) == asdict(conf)
-    assert list(plain(conf)) == list(asdict(conf))
+    assert to_plain(conf) == asdict(conf)
+    assert list(to_plain(conf)) == list(asdict(conf))
 
 
 @pytest.mark.parametrize("size", [0, 1, (1 << 16) - 1, 1 << 16, (1 << 17) + 1])
@@ -24,3 +32,12 @@ def test_a_file_is_hashed_to_its_end(tmp_path: Path, size: int) -> None:
     content = b"ab" * (size // 2) + b"c" * (size % 2)
     (tmp_path / "file").write_bytes(content)
     assert file_digest(tmp_path / "file") == hashlib.sha256(content).hexdigest()
+
+
+def test_source_files_are_hashed_one_by_one_and_folders_with_all_inside() -> None:
+    package = Path(xrgs.__file__).parent
+    found = source_digests("evaluation/lpips", "errors.py")
+    names = ["__init__", "download", "network", "weights"]
+    assert list(found) == ["errors.py", *(f"evaluation/lpips/{name}.py" for name in names)]
+    for name, value in found.items():
+        assert value == hashlib.sha256((package / name).read_bytes()).hexdigest()

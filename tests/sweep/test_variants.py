@@ -16,10 +16,9 @@ from PIL import Image
 
 from xrgs.capture import variant
 from xrgs.config import Conf
-from xrgs.errors import XrgsError
+from xrgs.errors import StoreError, XrgsError
 from xrgs.experiment.store import Store
 from xrgs.safeio.atomic import write_json
-from xrgs.safeio.records import StoreError
 from xrgs.sweep import variants
 from xrgs.sweep.jobs import worker
 from xrgs.sweep.status import describe, read
@@ -146,17 +145,17 @@ def test_sweeps_of_a_scene_that_sfm_can_not_place(
     code, table, err = sweeps.run(*scene)
     assert code == 1
     assert BUILDING in err
-    assert "COLMAP placed 0 of 2 views" in table
+    assert "COLMAP registered 0 of 2 views" in table
     code, second_table, err = sweeps.run(*scene)
     assert code == 1
     assert second_table == table
     assert BUILDING not in err
     assert "  failed     variant not built" in err
-    assert "COLMAP placed 0 of 2 views" in err
+    assert "COLMAP registered 0 of 2 views" in err
     assert HINT in err
     text = describe(read(tmp_path / "s"))
     assert "failed scenes, not tried again; retry=failed tries them again" in text
-    assert "  leaves  scene leaves failed: COLMAP placed 0 of 2 views" in text
+    assert "  leaves  scene leaves failed: COLMAP registered 0 of 2 views" in text
     code, table, err = sweeps.run(*scene, "retry=failed", "fail_fast=true")
     assert code == 1
     assert BUILDING in err

@@ -1,1 +1,1 @@
-"""From photographs to a frozen mixed-resolution dataset."""
+"""Makes a frozen mixed-resolution dataset from photographs: a variant."""

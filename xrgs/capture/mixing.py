@@ -1,7 +1,7 @@
-"""The recipe of a variant, step by step: photographs, tags, LR copies, SfM, straightening.
+"""Makes the content of a variant: HR and LR views, their poses by SfM, and undistorted images.
 
-COLMAP is re-run on the mixed-resolution content (paper section 4). Where the tags follow from
-depth they are only known after it: then SfM sees the photographs as they are.
+COLMAP is re-run on the mixed-resolution images (paper section 4). Where the tags depend on depth,
+they are known only after SfM, which then gets the photographs as they are.
 """
 
 from __future__ import annotations
@@ -15,10 +15,11 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from xrgs.capture import degrade, images, placing, tagging
+from xrgs.capture import degrade, images, registration, tagging
 from xrgs.capture.alignment import pose_error
-from xrgs.capture.photographs import Photographs, prepare, write_degraded
-from xrgs.capture.split import Split, check, split
+from xrgs.capture.lens import undistort
+from xrgs.capture.photographs import PhotoCollection, prepare_hr_views, write_degraded
+from xrgs.capture.split import Split, check_variant_conf, split_views
 from xrgs.capture.views import SceneFailed, Variant, View
 from xrgs.runtime.progress import progress
 
@@ -29,53 +30,56 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True)
-class _Mixture:
-    """What is being mixed, and how."""
+class _Inputs:
+    """The photographs of a variant, and the class of each."""
 
     scene: Scene
     conf: VariantConf
-    photos: Photographs
-    parts: Split
+    photos: PhotoCollection
+    split: Split
 
     @property
     def degraded(self) -> tuple[int, ...]:
-        """Indices of the views that are trained on with less in them than was taken."""
-        return () if degrade.kind(self.conf) == "none" else self.parts.lr
+        """Indices of the training views that the variant degrades."""
+        return () if degrade.resolve_degradation(self.conf) == "none" else self.split.lr
 
 
-def mix(scene: Scene, conf: VariantConf, work: Path, out: Path) -> Variant:
-    """Everything of a variant but its id: images in `out`, SfM's log beside them.
+def mix_resolutions(scene: Scene, conf: VariantConf, work: Path, out: Path) -> Variant:
+    """Make the views, poses and points of a variant.
 
     Args:
         scene: The photographs.
-        conf: What to make of them.
-        work: An existing folder for what is not kept.
+        conf: The variant's config.
+        work: An existing folder for temporary files.
         out: An existing folder for `images/<split>/<view>.png` and `colmap.log`.
 
+    Returns:
+        The variant, with an empty id.
+
     Raises:
-        SceneFailed: too few views are placed.
-        XrgsError: the photographs or the config are not usable.
+        SceneFailed: Too few views are registered.
+        XrgsError: The photographs or the config are not usable; the message names what is wrong.
     """
-    check(conf)
+    check_variant_conf(conf)
     start = time.perf_counter()
-    photos = prepare(scene, conf, work)
-    mixture = _Mixture(scene, conf, photos, _tags_before(photos, conf))
-    write_degraded(photos, mixture.degraded, conf)
-    placed = placing.place(
-        photos, mixture.degraded, conf.sfm, work, lambda model: _refusal(mixture, model)
+    photos = prepare_hr_views(scene, conf, work)
+    inputs = _Inputs(scene, conf, photos, _split_before_sfm(photos, conf))
+    write_degraded(photos, inputs.degraded, conf)
+    registered = registration.register(
+        photos, inputs.degraded, conf.sfm, work, lambda model: _refusal(inputs, model)
     )
-    model = placed.model
-    _keep_log(work, out)
-    report = _report(mixture, model) | {"attempts": placed.attempts}
-    if placed.refused:
-        raise SceneFailed(f"scene {scene.name} failed: {placed.refused}", report)
-    report |= _pose_error(mixture, model, work)
-    depth = tagging.depths(model)
-    if conf.tags in tagging.NEED_DEPTH:
-        mixture = replace(mixture, parts=_tags_after(mixture, model, depth))
-        write_degraded(photos, mixture.degraded, conf)
-    views = _straighten(mixture, model, depth, out)
-    report |= _tags_report(mixture, views)
+    model = registered.model
+    _write_log(work, out)
+    report = _sfm_report(inputs, model) | {"attempts": registered.attempts}
+    if registered.refused:
+        raise SceneFailed(f"scene {scene.name} failed: {registered.refused}", report)
+    report |= _pose_report(inputs, model, work)
+    depths = tagging.median_depths(model)
+    if conf.tags in tagging.DEPTH_POLICIES:
+        inputs = replace(inputs, split=_split_by_depth(inputs, model, depths))
+        write_degraded(photos, inputs.degraded, conf)
+    views = _write_undistorted(inputs, model, depths, out)
+    report |= _tags_report(inputs, views)
     report["seconds"] = round(time.perf_counter() - start, 1)
     held_out = conf.test_every > 0
     return Variant(
@@ -83,53 +87,54 @@ def mix(scene: Scene, conf: VariantConf, work: Path, out: Path) -> Variant:
     )
 
 
-def _tags_before(photos: Photographs, conf: VariantConf) -> Split:
-    """HR and LR as far as the photographs alone tell; where depth decides, all HR for now."""
+def _split_before_sfm(photos: PhotoCollection, conf: VariantConf) -> Split:
+    """Split the views; where the tags depend on depth, all training views are HR for now."""
     if conf.tags == "megapixels":
-        return split(len(photos), conf, tagging.megapixels([p.size for p in photos.all]))
-    if conf.tags in tagging.NEED_DEPTH:
-        return split(len(photos), replace(conf, hr_fraction=1.0))
-    return split(len(photos), conf)
+        scores = tagging.megapixel_scores([photo.size for photo in photos.all])
+        return split_views(len(photos), conf, scores)
+    if conf.tags in tagging.DEPTH_POLICIES:
+        return split_views(len(photos), replace(conf, hr_fraction=1.0))
+    return split_views(len(photos), conf)
 
 
-def _tags_after(mixture: _Mixture, model: Reconstruction, depth: Mapping[int, float]) -> Split:
-    lenses = {i: lens.straightened() for i, lens in model.lenses.items()}
-    conf, views = mixture.conf, len(mixture.photos)
-    return split(views, conf, tagging.by_depth(conf.tags, views, lenses, depth))
+def _split_by_depth(inputs: _Inputs, model: Reconstruction, depths: Mapping[int, float]) -> Split:
+    lenses = {i: lens.undistorted() for i, lens in model.lenses.items()}
+    conf, views = inputs.conf, len(inputs.photos)
+    return split_views(views, conf, tagging.depth_scores(conf.tags, views, lenses, depths))
 
 
-def _refusal(mixture: _Mixture, model: Reconstruction) -> str:
-    """Why too few views are placed to train on and to test; empty where they are enough."""
-    parts, names, conf = mixture.parts, mixture.photos.names, mixture.conf
-    placed = model.viewmats.keys()
-    hr, lr = placed & set(parts.hr), placed & set(parts.lr)
-    tests = placed & set(parts.test) if conf.test_every else placed
-    missing = [name for i, name in enumerate(names) if i not in placed]
-    summary = f"COLMAP placed {len(placed)} of {len(names)} views"
+def _refusal(inputs: _Inputs, model: Reconstruction) -> str:
+    """Say why too few views are registered to train and to test on; empty where they are enough."""
+    split, names, conf = inputs.split, inputs.photos.names, inputs.conf
+    registered = model.viewmats.keys()
+    hr, lr = registered & set(split.hr), registered & set(split.lr)
+    tests = registered & set(split.test) if conf.test_every else registered
+    missing = [name for i, name in enumerate(names) if i not in registered]
+    summary = f"COLMAP registered {len(registered)} of {len(names)} views"
     if missing:
         summary += f" (not {', '.join(missing[:6])}{', ...' if len(missing) > 6 else ''})"
-    summary += f" and {len(model.points)} points"
-    if len(placed) < conf.sfm.min_registered * len(names):
-        share = conf.sfm.min_registered
-        return f"{summary}; variant.sfm.min_registered={share} asks for more."
-    lost = (parts.hr and not hr) or (parts.lr and not lr)
-    if lost or len(hr) + len(lr) < 2 or not tests:
-        left = f"{len(hr)} HR, {len(lr)} LR and {len(tests)} test views"
-        return f"{summary}: {left}; 1 of each, 2 to train on are needed."
+    summary += f" and found {len(model.points)} points"
+    fraction = conf.sfm.min_registered
+    if len(registered) < fraction * len(names):
+        return f"{summary}; variant.sfm.min_registered={fraction} requires more."
+    class_lost = (split.hr and not hr) or (split.lr and not lr)
+    if class_lost or len(hr) + len(lr) < 2 or not tests:
+        counts = f"{len(hr)} HR, {len(lr)} LR and {len(tests)} test views"
+        return f"{summary}: {counts}; at least one of each class and two training views are needed."
     return ""
 
 
-def _keep_log(work: Path, out: Path) -> None:
-    """COLMAP's log files as one; each begins with a name of its own making."""
-    parts = sorted(work.rglob("colmap-*"))
-    text = "".join(part.read_text(encoding="utf-8", errors="replace") for part in parts)
+def _write_log(work: Path, out: Path) -> None:
+    """Join COLMAP's log files; each of them begins with its own name."""
+    files = sorted(work.rglob("colmap-*"))
+    text = "".join(file.read_text(encoding="utf-8", errors="replace") for file in files)
     (out / "colmap.log").write_text(text, encoding="utf-8")
 
 
-def _report(mixture: _Mixture, model: Reconstruction) -> dict[str, Any]:
-    """What is known before the tags are: the photographs, and how SfM went."""
-    scene, photos = mixture.scene, mixture.photos
-    sizes = Counter(f"{p.frame.width}x{p.frame.height}" for p in photos.all)
+def _sfm_report(inputs: _Inputs, model: Reconstruction) -> dict[str, Any]:
+    """Report the photographs, and how SfM went."""
+    scene, photos = inputs.scene, inputs.photos
+    sizes = Counter(f"{photo.hr.width}x{photo.hr.height}" for photo in photos.all)
     return model.report | {
         "scene": scene.name,
         "fingerprint": scene.fingerprint,
@@ -141,66 +146,68 @@ def _report(mixture: _Mixture, model: Reconstruction) -> dict[str, Any]:
     }
 
 
-def _pose_error(mixture: _Mixture, model: Reconstruction, work: Path) -> dict[str, Any]:
-    """How far the poses are from exact ones, or else from those of the undegraded photographs."""
-    photos, exact = mixture.photos, mixture.scene.viewmats
-    found = {photos.names[i]: matrix for i, matrix in model.viewmats.items()}
+def _pose_report(inputs: _Inputs, model: Reconstruction, work: Path) -> dict[str, Any]:
+    """Compare the poses with exact ones, or else with those of the undegraded photographs."""
+    photos, exact = inputs.photos, inputs.scene.viewmats
+    estimated = {photos.names[i]: matrix for i, matrix in model.viewmats.items()}
     if exact:
-        return {"pose_error": pose_error(found, exact), "pose_error_against": "exact cameras"}
-    if not mixture.conf.sfm.reference or not mixture.degraded:
+        return {"pose_error": pose_error(estimated, exact), "pose_error_against": "exact cameras"}
+    if not inputs.conf.sfm.reference or not inputs.degraded:
         return {"pose_error": {}, "pose_error_against": ""}
     start = time.perf_counter()
-    best = placing.reference(photos, mixture.conf.sfm, work)
-    exact = {photos.names[i]: matrix for i, matrix in best.viewmats.items()}
-    told = ("registered", "points", "reprojection_error_px")
+    reference = registration.reconstruct_undegraded(photos, inputs.conf.sfm, work)
+    exact = {photos.names[i]: matrix for i, matrix in reference.viewmats.items()}
+    keys = ("registered", "points", "reprojection_error_px")
+    results = {key: reference.report[key] for key in keys if key in reference.report}
     seconds = round(time.perf_counter() - start, 1)
     return {
-        "pose_error": pose_error(found, exact),
+        "pose_error": pose_error(estimated, exact),
         "pose_error_against": "SfM of the undegraded photographs",
-        "reference": {k: best.report[k] for k in told if k in best.report} | {"seconds": seconds},
+        "reference": results | {"seconds": seconds},
     }
 
 
-def _tags_report(mixture: _Mixture, views: tuple[View, ...]) -> dict[str, Any]:
-    """Who is what, and how finely each class samples the scene."""
-    names, parts = mixture.photos.names, mixture.parts
+def _tags_report(inputs: _Inputs, views: tuple[View, ...]) -> dict[str, Any]:
+    """Report the class of each view, and minimum, median and maximum of rho per class."""
+    names, split = inputs.photos.names, inputs.split
     rates = {
         tag: [view.rho for view in views if (view.split, view.tag) == ("train", tag)]
         for tag in ("HR", "LR")
     }
     return {
-        "tags": mixture.conf.tags,
-        "degradation": degrade.kind(mixture.conf),
-        "tests": len(parts.test),
-        "hr": [names[i] for i in parts.hr],
-        "lr": [names[i] for i in parts.lr],
+        "tags": inputs.conf.tags,
+        "degradation": degrade.resolve_degradation(inputs.conf),
+        "tests": len(split.test),
+        "hr": [names[i] for i in split.hr],
+        "lr": [names[i] for i in split.lr],
         "rho": {
-            tag: [min(found), float(np.median(found)), max(found)]
-            for tag, found in rates.items()
-            if found
+            tag: [min(values), float(np.median(values)), max(values)]
+            for tag, values in rates.items()
+            if values
         },
     }
 
 
-def _straighten(
-    mixture: _Mixture, model: Reconstruction, depth: Mapping[int, float], out: Path
+def _write_undistorted(
+    inputs: _Inputs, model: Reconstruction, depths: Mapping[int, float], out: Path
 ) -> tuple[View, ...]:
-    """Undistort what is trained on and what is tested on, each at its own size."""
-    photos, parts = mixture.photos, mixture.parts
-    degraded, low = set(mixture.degraded), set(parts.lr)
-    train = [("train", i, "LR" if i in low else "HR") for i in sorted((*parts.hr, *parts.lr))]
-    test = [("test", i, "HR") for i in (parts.test or range(len(photos)))]
+    """Undistort every registered view at its own size, and write it."""
+    photos, split = inputs.photos, inputs.split
+    degraded, low = set(inputs.degraded), set(split.lr)
+    train = [("train", i, "LR" if i in low else "HR") for i in sorted((*split.hr, *split.lr))]
+    test = [("test", i, "HR") for i in (split.test or range(len(photos)))]
     original = [("original", i, "HR") for i in sorted(degraded)]
-    todo = [entry for entry in (*train, *test, *original) if entry[1] in model.viewmats]
+    registered = [entry for entry in (*train, *test, *original) if entry[1] in model.viewmats]
     views, rates = [], []
-    for part, i, tag in progress(todo, "undistorting", "view"):
+    for part, i, tag in progress(registered, "undistorting", "view"):
         image = photos.read("lr" if part == "train" and i in degraded else "hr", i)
         height, width = image.shape[:2]
-        lens = model.lenses[i].at(width, height)
+        lens = model.lenses[i].resized(width, height)
         file = out / "images" / part / f"{photos.names[i]}.png"
-        images.save(file, images.straighten(image, lens))
-        K, name = lens.straightened().K, photos.names[i]
+        images.save(file, undistort(image, lens))
+        K, name = lens.undistorted().K, photos.names[i]
         views.append(View(name, file, part, tag, width, height, K, model.viewmats[i], 1.0))
-        rates.append(tagging.rate(K, depth[i]))
-    views = [replace(v, rho=rho) for v, rho in zip(views, tagging.of_best(rates), strict=True)]
+        rates.append(tagging.sampling_rate(K, depths[i]))
+    rhos = tagging.relative_to_largest(rates)
+    views = [replace(view, rho=rho) for view, rho in zip(views, rhos, strict=True)]
     return tuple(sorted(views, key=lambda view: (view.split, view.name)))

@@ -1,4 +1,4 @@
-"""A scene's photographs as HR views on disk: each of its own size, and which share a camera."""
+"""Turns a scene's photographs into HR views on disk, and decides which of them share a camera."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from xrgs.capture import degrade, images
-from xrgs.capture.images import Lens
-from xrgs.capture.split import Frame, frame, scale
+from xrgs.capture.lens import Lens
+from xrgs.capture.split import HrGeometry, hr_geometry, shrink_factor
 from xrgs.errors import XrgsError
 from xrgs.runtime.progress import progress
 
@@ -29,35 +29,41 @@ class Photograph:
     """One readable photograph of a scene."""
 
     name: str
-    """Its file name without the ending."""
+    """Its file name without the suffix."""
     number: str
-    """Names its copies, for COLMAP need not cope with people's file names."""
+    """The name of its copies on disk, because COLMAP need not accept people's file names."""
     size: tuple[int, int]
-    """Width and height of the file, upright, px."""
-    frame: Frame
+    """Width and height of the file, with the EXIF orientation applied, px."""
+    hr: HrGeometry
+    """The size of its HR view."""
     camera: str
-    """Photographs of one value share one camera."""
+    """The name of its camera; photographs with one name share the camera in SfM."""
     K: NDArray[np.float64] | None
-    """[3, 3] px of the file, where known: then it has no distortion."""
+    """Intrinsics [3, 3] of the file, px, where they are known; then there is no distortion."""
 
     @property
     def lens(self) -> Lens | None:
-        """The camera of the HR view, where known: the file's, resized, then cropped."""
+        """The camera of the HR view, after resize and crop; None where it is not known."""
         if self.K is None:
             return None
-        K, (left, top) = self.K, self.frame.corner
-        lens = Lens(*self.size, K[0, 0], K[1, 1], K[0, 2], K[1, 2]).at(*self.frame.resized)
+        K, (left, top) = self.K, self.hr.crop_offset
+        lens = Lens(*self.size, K[0, 0], K[1, 1], K[0, 2], K[1, 2]).resized(*self.hr.resized)
         cx, cy = lens.cx - left, lens.cy - top
-        return Lens(self.frame.width, self.frame.height, lens.fx, lens.fy, cx, cy)
+        return Lens(self.hr.width, self.hr.height, lens.fx, lens.fy, cx, cy)
 
 
 @dataclass(frozen=True)
-class Photographs:
-    """All of a scene, sorted by name; their copies lie in `folder`."""
+class PhotoCollection:
+    """The readable photographs of a scene, sorted by name, and their copies in a work folder.
+
+    A copy is of one of three kinds: `hr` is the HR view, `lr` the degraded view, and `up` the
+    degraded view resized back to the size of the HR view, for SfM.
+    """
 
     all: tuple[Photograph, ...]
     folder: Path
     unreadable: tuple[str, ...] = ()
+    """One message for each photograph that was left out."""
 
     def __len__(self) -> int:
         return len(self.all)
@@ -67,71 +73,113 @@ class Photographs:
 
     @property
     def names(self) -> list[str]:
-        """Of the photographs, in order."""
+        """The names of the photographs, in order."""
         return [photo.name for photo in self.all]
 
     def file(self, kind: str, index: int) -> str:
-        """Path in `folder` of a copy: `hr` the HR view, `lr` the degraded one, `up` it enlarged."""
+        """Return the path of a copy, relative to `folder`.
+
+        Args:
+            kind: `hr`, `lr` or `up`.
+            index: The photograph's index.
+
+        Returns:
+            The path; the copy need not exist.
+        """
         return f"{kind}/{self.all[index].number}.png"
 
     def size(self, kind: str, index: int) -> tuple[int, int]:
-        """Width and height of a copy that is there, px."""
+        """Read the size of an existing copy.
+
+        Args:
+            kind: `hr`, `lr` or `up`.
+            index: The photograph's index.
+
+        Returns:
+            Width and height, px.
+        """
         return images.size(self.folder / self.file(kind, index))
 
-    def read(self, kind: str, index: int) -> images.Photo:
-        """A copy that is there."""
+    def read(self, kind: str, index: int) -> images.ImageArray:
+        """Read an existing copy.
+
+        Args:
+            kind: `hr`, `lr` or `up`.
+            index: The photograph's index.
+
+        Returns:
+            [H, W, 3] in 0..1.
+        """
         return images.read(self.folder / self.file(kind, index))
 
-    def enlarge(self, index: int) -> None:
-        """Make the `up` copy, if it is not there."""
+    def upsample(self, index: int) -> None:
+        """Make the `up` copy of a photograph from its `lr` copy, where it does not exist.
+
+        Args:
+            index: The photograph's index.
+        """
         file = self.folder / self.file("up", index)
         if not file.exists():
-            target = self.all[index].frame
+            target = self.all[index].hr
             images.save(file, images.resize(self.read("lr", index), target.width, target.height))
 
 
-def prepare(scene: Scene, conf: VariantConf, work: Path) -> Photographs:
-    """Read every photograph, drop what can't be read, shrink and crop the rest to HR views.
+def prepare_hr_views(scene: Scene, conf: VariantConf, work: Path) -> PhotoCollection:
+    """Read every photograph, leave out the unreadable ones, and write the others as HR views.
 
-    All are shrunk by one scale: what one camera resolved better than another it still does.
+    All are resized by one factor, so that a camera that resolved more than another still does.
+
+    Args:
+        scene: The scene.
+        conf: The variant's config.
+        work: An existing folder for the copies.
+
+    Returns:
+        The readable photographs, with their `hr` copies.
 
     Raises:
-        XrgsError: fewer than two can be read, or one is too small for its LR copy; named.
+        XrgsError: Fewer than two photographs can be read, or one is too small for its LR view; the
+            message names them.
     """
-    sizes, unreadable = _sizes(scene.files)
-    shrink = scale(list(sizes.values()), conf) if sizes else 1.0
-    kept: dict[Path, Frame] = {}
+    sizes, unreadable = _read_sizes(scene.files)
+    shrink = shrink_factor(list(sizes.values()), conf) if sizes else 1.0
+    geometries: dict[Path, HrGeometry] = {}
     for file, size in progress(sizes.items(), "HR views", "view"):
         try:
-            photo = images.read(file)
+            image = images.read(file)
         except images.ImageError as error:
             unreadable[file] = str(error)
             continue
         try:
-            kept[file] = target = frame(size, shrink, conf)
+            geometries[file] = hr = hr_geometry(size, shrink, conf)
         except XrgsError as error:
             raise XrgsError(f"{file}: {error}") from None
-        left, top = target.corner
-        shrunk = images.resize(photo, *target.resized)
-        cut = shrunk[top : top + target.height, left : left + target.width]
-        images.save(work / "hr" / f"{len(kept) - 1:05d}.png", cut)
+        images.save(work / "hr" / f"{len(geometries) - 1:05d}.png", _resize_and_crop(image, hr))
     messages = tuple(unreadable[file] for file in scene.files if file in unreadable)
     for message in messages:
         _log.warning("%s; left out", message)
-    if len(kept) < 2:
-        raise XrgsError(f"scene {scene.name}: {len(kept)} readable image(s): {list(messages)}")
-    cameras = share_cameras(list(kept), [sizes[file] for file in kept], conf.sfm.camera)
-    photos = (
-        Photograph(
-            file.stem, f"{i:05d}", sizes[file], kept[file], camera, scene.intrinsics.get(file.stem)
-        )
-        for i, (file, camera) in enumerate(zip(kept, cameras, strict=True))
+    if len(geometries) < 2:
+        count = f"{len(geometries)} readable image(s), two are needed"
+        raise XrgsError(f"scene {scene.name}: {count}: {list(messages)}")
+    cameras = assign_cameras(
+        list(geometries), [sizes[file] for file in geometries], conf.sfm.camera
     )
-    return Photographs(tuple(photos), work, messages)
+    photos = (
+        Photograph(file.stem, f"{i:05d}", sizes[file], hr, camera, scene.intrinsics.get(file.stem))
+        for i, ((file, hr), camera) in enumerate(zip(geometries.items(), cameras, strict=True))
+    )
+    return PhotoCollection(tuple(photos), work, messages)
 
 
-def _sizes(files: Sequence[Path]) -> tuple[dict[Path, tuple[int, int]], dict[Path, str]]:
-    """Width and height of each file, and what is wrong with those that have none."""
+def _resize_and_crop(image: images.ImageArray, hr: HrGeometry) -> images.ImageArray:
+    left, top = hr.crop_offset
+    return images.resize(image, *hr.resized)[top : top + hr.height, left : left + hr.width]
+
+
+def _read_sizes(
+    files: Sequence[Path],
+) -> tuple[dict[Path, tuple[int, int]], dict[Path, str]]:
+    """Read the size of each file, or the message that says why it has none."""
     sizes: dict[Path, tuple[int, int]] = {}
     unreadable: dict[Path, str] = {}
     for file in files:
@@ -142,37 +190,52 @@ def _sizes(files: Sequence[Path]) -> tuple[dict[Path, tuple[int, int]], dict[Pat
     return sizes, unreadable
 
 
-def share_cameras(files: Sequence[Path], sizes: Sequence[tuple[int, int]], how: str) -> list[str]:
-    """A camera's name for each file; those of one name share it, so they are of one size.
+def assign_cameras(
+    files: Sequence[Path], sizes: Sequence[tuple[int, int]], policy: str
+) -> list[str]:
+    """Name the camera of each photograph; photographs with one name share it in SfM.
 
     Args:
         files: The photographs.
-        sizes: Their width and height, upright: a camera held upright is another one to SfM.
-        how: `sfm.camera`.
+        sizes: Their width and height with the EXIF orientation applied, px: a camera held upright
+            is another camera to SfM.
+        policy: `variant.sfm.camera`: `single` for one camera, `per_image` for one each, `auto` for
+            one per size and EXIF camera.
+
+    Returns:
+        One name per photograph; all photographs with one name have one size.
 
     Raises:
-        XrgsError: `single`, but the sizes differ.
+        XrgsError: The policy is `single`, but the sizes differ.
     """
-    alike = len(set(sizes)) == 1
-    if how == "single":
-        if not alike:
+    one_size = len(set(sizes)) == 1
+    if policy == "single":
+        if not one_size:
             other = next(i for i, size in enumerate(sizes) if size != sizes[0])
             a, b = (f"{files[i]} is {sizes[i][0]}x{sizes[i][1]}" for i in (0, other))
-            raise XrgsError(f"variant.sfm.camera=single, but sizes differ: {a}, {b}")
+            raise XrgsError(
+                f"variant.sfm.camera=single, but sizes differ: {a}, {b}; use auto or per_image"
+            )
         return ["all"] * len(files)
-    if how == "per_image":
+    if policy == "per_image":
         return [f"{i:05d}" for i in range(len(files))]
     names = []
     for i, (file, size) in enumerate(zip(files, sizes, strict=True)):
-        mark = images.camera_mark(file)
-        # Of photographs that tell no camera and differ in size, two alike are so by chance.
-        alone = not mark and not alike
-        names.append(f"{i:05d}" if alone else f"{size[0]}x{size[1]} {mark}")
+        exif = images.exif_camera(file)
+        # Where EXIF names no camera and the sizes differ, two equal sizes are a coincidence.
+        own = not exif and not one_size
+        names.append(f"{i:05d}" if own else f"{size[0]}x{size[1]} {exif}")
     return names
 
 
-def write_degraded(photos: Photographs, which: Sequence[int], conf: VariantConf) -> None:
-    """The degraded copies of some photographs, in `lr`."""
+def write_degraded(photos: PhotoCollection, which: Sequence[int], conf: VariantConf) -> None:
+    """Degrade some HR views and write them as `lr` copies.
+
+    Args:
+        photos: The photographs, with their `hr` copies.
+        which: Indices of the views to degrade.
+        conf: The variant's config.
+    """
     for i in progress(which, "LR views", "view"):
         low = degrade.degrade(photos.read("hr", i), conf)
         images.save(photos.folder / photos.file("lr", i), low)

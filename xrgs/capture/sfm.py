@@ -1,12 +1,12 @@
-"""Structure from motion with pycolmap, and nothing else: cameras and points of a set of images.
+"""Runs structure from motion with pycolmap: finds the cameras and points of a set of images.
 
-COLMAP's own log goes to a file in the work folder; what the user sees is one bar a stage.
+COLMAP's own log goes to files in the work folder; the user sees one progress bar per stage.
 """
 
 from __future__ import annotations
 
 import tempfile
-import zlib  # noqa: F401  as a first import pycolmap 4.2.1 corrupts the heap
+import zlib  # noqa: F401  pycolmap 4.2.1 corrupts the heap where it is imported before zlib
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,94 +17,121 @@ import pycolmap
 from numpy.typing import NDArray
 
 from xrgs.capture import images
-from xrgs.capture.images import Lens
+from xrgs.capture.lens import Lens
 from xrgs.runtime.machine import usable_cores
-from xrgs.runtime.progress import Bar
+from xrgs.runtime.progress import ProgressBar
 
 if TYPE_CHECKING:
     from xrgs.config import SfmConf
 
-#: Features over all images that keep exhaustive matching at minutes on two cores.
-_FEATURES_IN_ALL = 100_000
-_MOST_FEATURES = 8192
-#: Longer side, px, up to which features are sought at twice the resolution.
-_SMALL = 640
-#: Two views of a narrow baseline: the angle (degrees) below which a point tells nothing of depth.
+#: The number of features in all images with which exhaustive matching takes minutes on two cores.
+_TOTAL_FEATURES = 100_000
+#: COLMAP's own default of `max_num_features`, per image.
+_MAX_FEATURES = 8192
+#: The longer side, px, up to which features are detected at twice the resolution.
+_SMALL_SIDE = 640
+#: The smallest triangulation angle for two views of a narrow baseline, degrees.
 _TWO_VIEW_ANGLE = 0.2
-#: COLMAP asks the first pair for 100 inliers, a later view for 30.
-_FIRST_PAIR = 100 / 30
-#: Where a PINHOLE camera's parameters stand in K.
-_PINHOLE = ((0, 0), (1, 1), (0, 2), (1, 2))
+#: Inliers that the first pair needs over those that a later view needs: COLMAP's defaults of
+#: `init_min_num_inliers` and `abs_pose_min_num_inliers`.
+_FIRST_PAIR_RATIO = 100 / 30
+#: The entries of K that are the parameters of COLMAP's PINHOLE camera.
+_PINHOLE_ENTRIES = ((0, 0), (1, 1), (0, 2), (1, 2))
 
 
 @dataclass(frozen=True)
-class Shot:
-    """One image that SfM is to place."""
+class SfmImage:
+    """One image that SfM is to register."""
 
     file: str
-    """Relative to the folder of all images."""
+    """Its path, relative to the folder of all images."""
     camera: str
-    """Shots of one name share one camera."""
+    """The name of its camera; images with one name share the camera."""
     K: NDArray[np.float64] | None = None
-    """[3, 3] px where known: then there is no distortion, and nothing is refined."""
+    """Intrinsics [3, 3], px, where they are known: then there is no distortion, and they are not
+    refined."""
 
 
 @dataclass(frozen=True)
 class Reconstruction:
-    """The largest model found; empty where there is none. Keys are indices of the shots."""
+    """COLMAP's largest model, empty where there is none; keys are indices of the images."""
 
     lenses: dict[int, Lens]
-    viewmats: dict[int, NDArray[np.float64]]  # [4, 4] world to camera
-    points: NDArray[np.float64]  # [P, 3]
-    colors: NDArray[np.uint8]  # [P, 3]
-    tracked: dict[int, NDArray[np.intp]]
-    """Indices of the points found in each shot, ascending."""
+    """The camera of each registered image, in that image's px."""
+    viewmats: dict[int, NDArray[np.float64]]
+    """World to camera [4, 4], OpenCV axes."""
+    points: NDArray[np.float64]
+    """SfM points [P, 3]."""
+    colors: NDArray[np.uint8]
+    """Their colours [P, 3]."""
+    observed: dict[int, NDArray[np.intp]]
+    """Indices of the points that were found in each image, ascending."""
     report: dict[str, Any]
+    """Settings and results, by the keys that the variant's report has."""
 
 
-def features_for(count: int, asked: int) -> int:
-    """Features an image: what was asked for, or (0) what keeps exhaustive matching quick."""
-    return asked or min(_MOST_FEATURES, _FEATURES_IN_ALL // max(count, 1))
-
-
-def octave_for(long_side: int, asked: int | None) -> int:
-    """SIFT's first octave: what was asked for; else 0, the recipe's, or -1 for small images.
-
-    On the embedded scene, mixed, -1 gave 1.7 to 2 times the points and 3 to 21% less position
-    error at 250 and at 500 px.
-    """
-    if asked is not None:
-        return asked
-    return -1 if long_side <= _SMALL else 0
-
-
-def reconstruct(shots: Sequence[Shot], folder: Path, work: Path, conf: SfmConf) -> Reconstruction:
-    """Cameras and points of `shots`, by exhaustive matching and incremental mapping.
+def features_per_image(images: int, configured: int) -> int:
+    """Choose `max_num_features`, the most features of one image.
 
     Args:
-        shots: The images; those without `K` get one SIMPLE_RADIAL camera per `camera` name.
-        folder: What `Shot.file` is relative to.
-        work: An existing folder for COLMAP's database, models and logs. Features and matches that
-            an earlier call left there are taken as they are: it must have been of the same shots,
-            features and octave.
-        conf: The recipe.
+        images: The number of images.
+        configured: `variant.sfm.max_num_features`; 0 for automatic.
 
-    Not reproducible across machines, nor quite between runs: keep what it returned.
+    Returns:
+        What was configured; else as many as keep exhaustive matching short, at most COLMAP's 8192.
+    """
+    return configured or min(_MAX_FEATURES, _TOTAL_FEATURES // max(images, 1))
+
+
+def first_octave(long_side: int, configured: int | None) -> int:
+    """Choose SIFT's `first_octave`: -1 detects features at twice the resolution.
+
+    For small images -1 is better: on the embedded scene with mixed resolution it gave 1.7 to 2
+    times the points and 3 to 21% less position error, at 250 px and at 500 px.
+
+    Args:
+        long_side: The longest side of all images, px.
+        configured: `variant.sfm.first_octave`; None for automatic.
+
+    Returns:
+        What was configured; else -1 up to 640 px, and 0 above.
+    """
+    if configured is not None:
+        return configured
+    return -1 if long_side <= _SMALL_SIDE else 0
+
+
+def reconstruct(
+    sfm_images: Sequence[SfmImage], folder: Path, work: Path, conf: SfmConf
+) -> Reconstruction:
+    """Find cameras and points by exhaustive matching and incremental mapping.
+
+    The result is not reproducible across machines, and not quite between runs: keep it.
+
+    Args:
+        sfm_images: The images; those without `K` get one SIMPLE_RADIAL camera per `camera` name.
+        folder: The folder that `SfmImage.file` is relative to.
+        work: An existing folder for COLMAP's database, models and logs. Features and matches of
+            an earlier call with the same images, `max_num_features` and `first_octave` are reused.
+        conf: The settings.
+
+    Returns:
+        The largest model; empty where COLMAP found none.
     """
     _log_to(work)
     pycolmap.set_random_seed(conf.seed)
     database = work / "database.db"
     threads = usable_cores()
-    max_features = features_for(len(shots), conf.max_num_features)
-    longest = max(max(images.size(folder / shot.file)) for shot in shots)
-    octave = octave_for(longest, conf.first_octave)
+    max_features = features_per_image(len(sfm_images), conf.max_num_features)
+    longest = max(max(images.size(folder / image.file)) for image in sfm_images)
+    octave = first_octave(longest, conf.first_octave)
     if not database.exists():
-        _extract(shots, folder, database, max_features, octave, threads)
-        _match(shots, database, work, threads)
-    models = _map(shots, folder, database, work, conf, threads)
+        _extract(sfm_images, folder, database, max_features, octave, threads)
+        _match(sfm_images, database, work, threads)
+    models = _map(sfm_images, folder, database, work, conf, threads)
     report = {
         "first_octave": octave,
-        "images": len(shots),
+        "images": len(sfm_images),
         "init_min_tri_angle": conf.init_min_tri_angle,
         "lr_images": conf.lr_images,
         "max_num_features": max_features,
@@ -115,15 +142,14 @@ def reconstruct(shots: Sequence[Shot], folder: Path, work: Path, conf: SfmConf) 
         "models": sorted((model.num_reg_images() for model in models), reverse=True),
     }
     if not models:
-        nothing = np.zeros((0, 3))
-        return Reconstruction({}, {}, nothing, nothing.astype(np.uint8), {}, report)
-    return _as_plain(
-        max(models, key=lambda m: (m.num_reg_images(), m.num_points3D())), shots, report
-    )
+        no_points = np.zeros((0, 3))
+        return Reconstruction({}, {}, no_points, no_points.astype(np.uint8), {}, report)
+    largest = max(models, key=lambda m: (m.num_reg_images(), m.num_points3D()))
+    return _to_numpy(largest, sfm_images, report)
 
 
 def _log_to(work: Path) -> None:
-    """COLMAP's log into `work`, and out of the terminal."""
+    """Send COLMAP's log to files in `work`, and not to the terminal."""
     log = pycolmap.logging
     log.logtostderr = log.alsologtostderr = False
     log.stderrthreshold = int(log.FATAL.value)
@@ -132,7 +158,7 @@ def _log_to(work: Path) -> None:
 
 
 def _extract(
-    shots: Sequence[Shot],
+    sfm_images: Sequence[SfmImage],
     folder: Path,
     database: Path,
     max_features: int,
@@ -144,19 +170,19 @@ def _extract(
     options.sift.max_num_features = max_features
     options.sift.first_octave = octave
     cameras: dict[str, int] = {}
-    with Bar("SfM: features", "view", len(shots)) as bar:
-        for camera, batch in _batches(shots, 2 * threads):
+    with ProgressBar("SfM: features", "view", len(sfm_images)) as bar:
+        for camera, batch in _batches(sfm_images, 2 * threads):
             reader = pycolmap.ImageReaderOptions()
             if camera in cameras:
                 reader.existing_camera_id = cameras[camera]
             elif batch[0].K is not None:
                 K = batch[0].K
                 reader.camera_model = "PINHOLE"
-                reader.camera_params = ",".join(repr(float(K[i, j])) for i, j in _PINHOLE)
+                reader.camera_params = ",".join(repr(float(K[i, j])) for i, j in _PINHOLE_ENTRIES)
             pycolmap.extract_features(
                 database,
                 folder,
-                image_names=[shot.file for shot in batch],
+                image_names=[image.file for image in batch],
                 camera_mode=pycolmap.CameraMode.SINGLE,
                 reader_options=reader,
                 extraction_options=options,
@@ -168,26 +194,26 @@ def _extract(
             bar.update(len(batch))
 
 
-def _batches(shots: Sequence[Shot], size: int) -> Iterator[tuple[str, list[Shot]]]:
-    """Shots of one camera, a few at a time, so that progress can be shown between them."""
-    cameras: dict[str, list[Shot]] = {}
-    for shot in shots:
-        cameras.setdefault(shot.camera, []).append(shot)
+def _batches(sfm_images: Sequence[SfmImage], size: int) -> Iterator[tuple[str, list[SfmImage]]]:
+    """Yield images of one camera, a few at a time, so that progress can be shown in between."""
+    cameras: dict[str, list[SfmImage]] = {}
+    for image in sfm_images:
+        cameras.setdefault(image.camera, []).append(image)
     for camera, group in cameras.items():
         for start in range(0, len(group), size):
             yield camera, group[start : start + size]
 
 
-def _match(shots: Sequence[Shot], database: Path, work: Path, threads: int) -> None:
-    """Every pair, one image against those before it at a time."""
+def _match(sfm_images: Sequence[SfmImage], database: Path, work: Path, threads: int) -> None:
+    """Match every pair of images: one image at a time with all that come before it."""
     matching = pycolmap.FeatureMatchingOptions()
     matching.num_threads = threads
     pairing = pycolmap.ImportedPairingOptions()
     pairing.match_list_path = work / "pairs.txt"
-    pairs = len(shots) * (len(shots) - 1) // 2
-    with Bar("SfM: matches", "pair", pairs) as bar:
-        for i in range(1, len(shots)):
-            lines = [f"{shot.file} {shots[i].file}\n" for shot in shots[:i]]
+    pairs = len(sfm_images) * (len(sfm_images) - 1) // 2
+    with ProgressBar("SfM: matches", "pair", pairs) as bar:
+        for i in range(1, len(sfm_images)):
+            lines = [f"{image.file} {sfm_images[i].file}\n" for image in sfm_images[:i]]
             (work / "pairs.txt").write_text("".join(lines), encoding="utf-8")
             pycolmap.match_image_pairs(
                 database,
@@ -199,38 +225,52 @@ def _match(shots: Sequence[Shot], database: Path, work: Path, threads: int) -> N
 
 
 def _map(
-    shots: Sequence[Shot], folder: Path, database: Path, work: Path, conf: SfmConf, threads: int
+    sfm_images: Sequence[SfmImage],
+    folder: Path,
+    database: Path,
+    work: Path,
+    conf: SfmConf,
+    threads: int,
 ) -> list[Any]:
-    options = mapping_options(conf, len(shots), known=all(s.K is not None for s in shots))
+    options = mapping_options(conf, len(sfm_images), known=all(s.K is not None for s in sfm_images))
     options.num_threads = threads
     out = Path(tempfile.mkdtemp(prefix="models-", dir=work))
-    with Bar("SfM: cameras", "view", len(shots)) as bar:
+    with ProgressBar("SfM: cameras", "view", len(sfm_images)) as bar:
         models = pycolmap.incremental_mapping(
             database,
             folder,
             out,
             options=options,
-            next_image_callback=lambda: bar.update(int(bar.n < len(shots))),
+            next_image_callback=lambda: bar.update(int(bar.n < len(sfm_images))),
         )
     return list(models.values())
 
 
 def mapping_options(conf: SfmConf, count: int, *, known: bool) -> Any:
-    """COLMAP's `IncrementalPipelineOptions` for so many images, intrinsics known or not."""
+    """Build the options of COLMAP's incremental mapping.
+
+    Args:
+        conf: The settings.
+        count: The number of images. Of two, COLMAP's defaults would drop every point.
+        known: Whether the intrinsics of all images are known; they are then not refined.
+
+    Returns:
+        pycolmap's `IncrementalPipelineOptions`.
+    """
     options = pycolmap.IncrementalPipelineOptions()
     options.random_seed = conf.seed
     options.mapper.init_min_tri_angle = conf.init_min_tri_angle
     options.mapper.abs_pose_min_num_inliers = conf.min_inliers
-    options.mapper.init_min_num_inliers = round(conf.min_inliers * _FIRST_PAIR)
+    options.mapper.init_min_num_inliers = round(conf.min_inliers * _FIRST_PAIR_RATIO)
     options.min_model_size = min(count, options.min_model_size)
     if count == 2:
-        # By default every point that only two images see is dropped: here that is all of them.
+        # By default a point that only two images observe is dropped, which is every one here.
         options.triangulation.ignore_two_view_tracks = False
         options.triangulation.min_angle = _TWO_VIEW_ANGLE
         options.mapper.filter_min_tri_angle = _TWO_VIEW_ANGLE
         options.mapper.init_min_tri_angle = _TWO_VIEW_ANGLE
         options.mapper.init_max_forward_motion = 1.0
-    if known or count == 2:  # two views can't tell a focal length from a depth
+    if known or count == 2:  # from two views, focal length and depth can't be told apart
         options.ba_refine_focal_length = False
         options.ba_refine_extra_params = False
         options.mapper.abs_pose_refine_focal_length = False
@@ -238,12 +278,12 @@ def mapping_options(conf: SfmConf, count: int, *, known: bool) -> Any:
     return options
 
 
-def _as_plain(model: Any, shots: Sequence[Shot], report: dict[str, Any]) -> Reconstruction:
-    """Pycolmap's model as numpy arrays, points in the order of their ids."""
-    index = {shot.file: i for i, shot in enumerate(shots)}
+def _to_numpy(model: Any, sfm_images: Sequence[SfmImage], report: dict[str, Any]) -> Reconstruction:
+    """Convert pycolmap's model into numpy arrays, with the points in the order of their ids."""
+    index = {image.file: i for i, image in enumerate(sfm_images)}
     order = sorted(model.points3D)
     number = {point: p for p, point in enumerate(order)}
-    lenses, viewmats, tracked = {}, {}, {}
+    lenses, viewmats, observed = {}, {}, {}
     for image in model.images.values():
         if not image.has_pose:
             continue
@@ -251,7 +291,7 @@ def _as_plain(model: Any, shots: Sequence[Shot], report: dict[str, Any]) -> Reco
         viewmats[i] = np.vstack([image.cam_from_world().matrix(), [0.0, 0.0, 0.0, 1.0]])
         lenses[i] = _lens(model.cameras[image.camera_id])
         own = {number[p.point3D_id] for p in image.points2D if p.has_point3D()}
-        tracked[i] = np.array(sorted(own), dtype=np.intp)
+        observed[i] = np.array(sorted(own), dtype=np.intp)
     points = np.array([model.points3D[p].xyz for p in order], dtype=np.float64).reshape(-1, 3)
     colors = np.array([model.points3D[p].color for p in order], dtype=np.uint8).reshape(-1, 3)
     report |= {
@@ -259,7 +299,7 @@ def _as_plain(model: Any, shots: Sequence[Shot], report: dict[str, Any]) -> Reco
         "points": len(order),
         "reprojection_error_px": float(model.compute_mean_reprojection_error()),
     }
-    return Reconstruction(lenses, viewmats, points, colors, tracked, report)
+    return Reconstruction(lenses, viewmats, points, colors, observed, report)
 
 
 def _lens(camera: Any) -> Lens:

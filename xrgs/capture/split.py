@@ -1,4 +1,4 @@
-"""Which views are held out, which stay HR, and what size they have: arithmetic on numbers alone."""
+"""Decides which views are held out, which stay HR, and which size they have, from numbers alone."""
 
 from __future__ import annotations
 
@@ -13,52 +13,57 @@ from xrgs.errors import XrgsError
 if TYPE_CHECKING:
     from xrgs.config import VariantConf
 
-#: An LR view must hold at least one window of the training loss's SSIM.
-SSIM_WINDOW = 11
-
 
 @dataclass(frozen=True)
 class Split:
-    """Indices of the name-sorted views, ascending; the three are disjoint and cover all."""
+    """Ascending indices into the views sorted by name; the three are disjoint and cover all."""
 
     test: tuple[int, ...]
-    """Held out: never trained on, never degraded."""
+    """The held-out views: never trained on, never degraded."""
     hr: tuple[int, ...]
-    """Trained on as they are."""
+    """The training views that stay as they are."""
     lr: tuple[int, ...]
-    """Trained on, and degraded where the variant degrades."""
+    """The training views tagged LR; they are degraded where the variant degrades."""
 
 
 @dataclass(frozen=True)
-class Frame:
-    """How a photograph becomes an HR view: shrunk, then cropped about its centre."""
+class HrGeometry:
+    """How a photograph becomes an HR view: resized, then cropped about its centre."""
 
     resized: tuple[int, int]
     """Width and height before the crop, px."""
     width: int
+    """Width of the HR view, px."""
     height: int
+    """Height of the HR view, px."""
 
     @property
-    def corner(self) -> tuple[int, int]:
-        """Left and top of the crop, px."""
+    def crop_offset(self) -> tuple[int, int]:
+        """Left and top of the crop in the resized photograph, px."""
         return (self.resized[0] - self.width) // 2, (self.resized[1] - self.height) // 2
 
 
-def check(conf: VariantConf) -> None:
-    """Refuse a variant that can't be made.
+def check_variant_conf(conf: VariantConf) -> None:
+    """Refuse a config from which no variant can be made.
+
+    Args:
+        conf: The variant's config.
 
     Raises:
-        XrgsError: names the key, its value and what it may be.
+        XrgsError: A value is out of its range; the message names the key, the value and the range.
     """
     rules = {
         "factor": (conf.factor >= 1, "1 or more"),
         "hr_fraction": (0 <= conf.hr_fraction <= 1, "0 to 1"),
         "min_hr": (conf.min_hr >= 0, "0 or more"),
         "long_side": (conf.long_side >= 0, "0 (the photographs' size) or more"),
-        "test_every": (conf.test_every == 0 or conf.test_every >= 2, "0 (none held out), or 2+"),
+        "test_every": (
+            conf.test_every == 0 or conf.test_every >= 2,
+            "0 (none held out), or 2 or more",
+        ),
         "selection": _one_of(conf.selection, "random", "uniform"),
         "tags": _one_of(conf.tags, "flag", "megapixels", "distance", "sampling_rate"),
-        "hr_above": (0 <= conf.hr_above <= 1, "0 (by variant.hr_fraction) to 1"),
+        "hr_above": (0 <= conf.hr_above <= 1, "0 (use variant.hr_fraction) to 1"),
         "degradation": _one_of(
             conf.degradation, "auto", "none", "downsample", "digital_zoom", "jpeg"
         ),
@@ -70,58 +75,68 @@ def check(conf: VariantConf) -> None:
         "sfm.first_octave": (conf.sfm.first_octave in (None, -1, 0), "null (by size), -1 or 0"),
         "sfm.min_inliers": (conf.sfm.min_inliers >= 6, "6 or more"),
     }
-    for key, (good, wanted) in rules.items():
-        if not good:
-            value = conf.sfm if key.startswith("sfm.") else conf
-            given = getattr(value, key.removeprefix("sfm."))
-            raise XrgsError(f"variant.{key}={given}: must be {wanted}")
+    for key, (valid, accepted) in rules.items():
+        if not valid:
+            owner = conf.sfm if key.startswith("sfm.") else conf
+            value = getattr(owner, key.removeprefix("sfm."))
+            raise XrgsError(f"variant.{key}={value}: must be {accepted}")
     if conf.tags == "flag" and conf.hr_above:
-        raise XrgsError(f"variant.hr_above={conf.hr_above}: not read with variant.tags=flag")
+        raise XrgsError(
+            f"variant.hr_above={conf.hr_above}: not read with variant.tags=flag, whose share of HR "
+            "views is variant.hr_fraction"
+        )
 
 
 def _one_of(value: str, *choices: str) -> tuple[bool, str]:
     return value in choices, " or ".join(choices)
 
 
-def split(views: int, conf: VariantConf, scores: Sequence[float] | None = None) -> Split:
-    """Every `test_every`-th view held out; of the others some are HR.
+def split_views(views: int, conf: VariantConf, scores: Sequence[float] | None = None) -> Split:
+    """Hold out every `test_every`-th view, and divide the others into HR and LR.
 
     Args:
-        views: How many there are.
-        conf: Which are HR: a share, at least `min_hr`; or what scores `hr_above` and more.
-        scores: A view's value, 0..1, high for HR; NaN where it is not known, which makes it LR.
-            Equals are of one class, so that a share may be exceeded. None draws by `selection`.
+        views: The number of views.
+        conf: The variant's config: HR is a fraction of the training views, at least `min_hr` of
+            them, or every view that scores `hr_above` or more.
+        scores: One score per view in 0..1, higher for HR; NaN where it is not known, which makes
+            the view LR. Views of one score get one class, so that the fraction may be exceeded.
+            None draws the HR views by `variant.selection`.
+
+    Returns:
+        The indices of each class.
 
     Raises:
-        XrgsError: the scores put all into one class though both were asked for.
+        XrgsError: The scores put all training views into one class though the config asks for two.
     """
     every = conf.test_every
     test = tuple(range(0, views, every)) if every else ()
     train = [i for i in range(views) if i not in test]
-    chosen = _drawn(train, conf) if scores is None else _best(train, scores, conf)
+    chosen = _select(train, conf) if scores is None else _select_by_score(train, scores, conf)
     hr = tuple(i for i in train if i in chosen)
     return Split(test, hr, tuple(i for i in train if i not in chosen))
 
 
-def _share(views: int, conf: VariantConf) -> int:
+def _hr_count(views: int, conf: VariantConf) -> int:
     return min(views, max(conf.min_hr, round(conf.hr_fraction * views)))
 
 
-def _drawn(train: Sequence[int], conf: VariantConf) -> set[int]:
-    count = _share(len(train), conf)
+def _select(train: Sequence[int], conf: VariantConf) -> set[int]:
+    """Select the HR views at random or evenly spaced, as `variant.selection` says."""
+    count = _hr_count(len(train), conf)
     if conf.selection == "uniform":
         return {train[(2 * k + 1) * len(train) // (2 * count)] for k in range(count)}
     rng = np.random.default_rng(conf.seed)
     return set(rng.choice(train, count, replace=False).tolist()) if count else set()
 
 
-def _best(train: Sequence[int], scores: Sequence[float], conf: VariantConf) -> set[int]:
+def _select_by_score(train: Sequence[int], scores: Sequence[float], conf: VariantConf) -> set[int]:
+    """Select the HR views that score highest, or that score `hr_above` or more."""
     known = sorted((scores[i] for i in train if not np.isnan(scores[i])), reverse=True)
-    count = _share(len(known), conf)
-    least = conf.hr_above or (known[count - 1] if count else np.inf)
-    chosen = {i for i in train if scores[i] >= least}
-    mixed = conf.hr_above > 0 or 0 < conf.hr_fraction < 1
-    if known and mixed and len(chosen) in (0, len(known)):
+    count = _hr_count(len(known), conf)
+    threshold = conf.hr_above or (known[count - 1] if count else np.inf)
+    chosen = {i for i in train if scores[i] >= threshold}
+    two_classes = conf.hr_above > 0 or 0 < conf.hr_fraction < 1
+    if known and two_classes and len(chosen) in (0, len(known)):
         limit = f"hr_above={conf.hr_above}" if conf.hr_above else f"hr_fraction={conf.hr_fraction}"
         raise XrgsError(
             f"variant.tags={conf.tags}: every training view is {'HR' if chosen else 'LR'} at "
@@ -130,24 +145,45 @@ def _best(train: Sequence[int], scores: Sequence[float], conf: VariantConf) -> s
     return chosen
 
 
-def scale(sizes: Sequence[tuple[int, int]], conf: VariantConf) -> float:
-    """By how much every photograph of a scene is shrunk, 0..1; its largest goes to `long_side`."""
+def shrink_factor(sizes: Sequence[tuple[int, int]], conf: VariantConf) -> float:
+    """Compute the one factor by which all photographs of a scene are resized.
+
+    Args:
+        sizes: Width and height of each photograph, px.
+        conf: The variant's config.
+
+    Returns:
+        A factor in (0, 1] that brings the longest side of all to `variant.long_side`; 1 where that
+        is 0 or larger.
+    """
     largest = max(max(size) for size in sizes)
     return min(conf.long_side or largest, largest) / largest
 
 
-def frame(size: tuple[int, int], shrink: float, conf: VariantConf) -> Frame:
-    """The HR size of a photograph of `size`: a multiple of the factor.
+def hr_geometry(size: tuple[int, int], shrink: float, conf: VariantConf) -> HrGeometry:
+    """Compute the size of the HR view of a photograph, a multiple of `variant.factor`.
+
+    Args:
+        size: Width and height of the photograph, px.
+        shrink: What `shrink_factor` gives for its scene.
+        conf: The variant's config.
+
+    Returns:
+        The sizes before and after the crop.
 
     Raises:
-        XrgsError: its copy `factor` times smaller would be smaller than the SSIM window.
+        XrgsError: The LR view, `factor` times smaller, would be smaller than the SSIM window of the
+            training loss.
     """
+    from xrgs.splat.ssim import WINDOW  # imports torch, which a plan must not wait for
+
     resized = round(size[0] * shrink), round(size[1] * shrink)
-    # Cropped so that x and y shrink by the same, whole, factor (else they differ by up to 0.6%).
+    # The crop makes x and y shrink by the same whole factor; else they differ by up to 0.6%.
     lr = resized[0] // conf.factor, resized[1] // conf.factor
-    if min(lr) < SSIM_WINDOW:
+    if min(lr) < WINDOW:
         raise XrgsError(
             f"variant.factor={conf.factor}: LR views of {lr[0]}x{lr[1]} px are smaller than the "
-            f"SSIM window of {SSIM_WINDOW}; lower it, or raise variant.long_side={conf.long_side}"
+            f"SSIM window of {WINDOW} px; lower variant.factor, or raise "
+            f"variant.long_side={conf.long_side}"
         )
-    return Frame(resized, lr[0] * conf.factor, lr[1] * conf.factor)
+    return HrGeometry(resized, lr[0] * conf.factor, lr[1] * conf.factor)

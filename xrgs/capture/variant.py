@@ -1,8 +1,9 @@
-"""A variant on disk: built once, frozen, hashed, shared by every cell.
+"""Builds, freezes, finds and loads variants on disk; cells share them.
 
-A folder named by its id has `variant.json` (what `Variant` holds, and the hash of every other
-file), `images/<split>/<view>.png`, `points.npz`, `report.json` (how SfM went) and `colmap.log`.
-Nothing here imports torch before a variant is built, so that a plan can read it.
+A variant is a folder named by its id: `variant.json` holds the fields of `Variant` and the hash of
+every other file that decides a number, `images/<split>/<view>.png` the images, `points.npz` the SfM
+points, `report.json` how SfM went, and `colmap.log` COLMAP's log. Nothing here imports torch before
+a variant is built, so that a plan can read variants.
 """
 
 from __future__ import annotations
@@ -20,12 +21,12 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from xrgs.capture import scenes, split
+from xrgs.capture.failures import FAILED_PREFIX, failed_scenes
 from xrgs.capture.views import SceneFailed, Variant, View
 from xrgs.errors import XrgsError
 from xrgs.safeio import npz, untrusted
 from xrgs.safeio.atomic import write_json
 from xrgs.safeio.hashing import digest, file_digest, source_digests
-from xrgs.safeio.records import FAILED, failed_scenes
 
 if TYPE_CHECKING:
     from xrgs.config import SceneConf, VariantConf
@@ -34,43 +35,55 @@ _log = logging.getLogger(__name__)
 
 _SPLITS = frozenset({"train", "test", "original"})
 
-#: Their code decides what a variant is: a change of it makes a new one.
-_CODE = (
-    *(
-        f"capture/{name}.py"
-        for name in (
-            "alignment",
-            "degrade",
-            "images",
-            "mixing",
-            "photographs",
-            "placing",
-            "sfm",
-            "split",
-            "tagging",
-            "variant",
-            "views",
-        )
-    ),
+#: The source files that decide what a variant is: a change in one of them changes every key.
+_SOURCES = (
+    "capture/alignment.py",
+    "capture/degrade.py",
+    "capture/images.py",
+    "capture/lens.py",
+    "capture/mixing.py",
+    "capture/photographs.py",
+    "capture/registration.py",
+    "capture/sfm.py",
+    "capture/split.py",
+    "capture/tagging.py",
+    "capture/variant.py",
+    "capture/views.py",
 )
 
 
 class CorruptVariant(XrgsError):  # noqa: N818
-    """A frozen variant that is not what was written; the message names the file."""
+    """A frozen variant is damaged or was changed; the message names the file."""
 
 
 def key(scene: SceneConf, conf: VariantConf) -> str:
-    """What a variant is made from, 16 hex digits: photographs, variant config, code. No SfM is run.
+    """Hash what a variant is made from: photographs, variant config and code, without running SfM.
+
+    Args:
+        scene: The scene's config.
+        conf: The variant's config.
+
+    Returns:
+        16 hexadecimal digits.
 
     Raises:
-        XrgsError: the photographs are not there.
+        XrgsError: The photographs are not there.
     """
-    return _key(scenes.fingerprint(scene, conf.long_side), conf)
+    fingerprint = scenes.fingerprint(scene, conf.long_side)
+    return digest([fingerprint, asdict(conf), source_digests(*_SOURCES)])
 
 
-def find(variants: Path, wanted: str) -> Variant | None:
-    """The frozen variant of a key, verified; a corrupt one is reported and passed over."""
-    for folder in sorted(variants.glob(f"{wanted}-*")):
+def find(variants: Path, wanted_key: str) -> Variant | None:
+    """Find the frozen variant of a key, and verify it; a corrupt one is logged and passed over.
+
+    Args:
+        variants: The store's folder of variants.
+        wanted_key: What `key` gives.
+
+    Returns:
+        The variant; None where there is no intact one.
+    """
+    for folder in sorted(variants.glob(f"{wanted_key}-*")):
         try:
             return load(folder)
         except CorruptVariant as error:
@@ -78,62 +91,74 @@ def find(variants: Path, wanted: str) -> Variant | None:
     return None
 
 
-def failure(variants: Path, wanted: str) -> str | None:
-    """Why the scene of a key failed when it was last tried; None where it did not.
+def failure(variants: Path, wanted_key: str) -> str | None:
+    """Read why the scene of a key could not be made into a variant when it was last tried.
 
-    The key has the photographs, the config and the code: of others, this says nothing.
+    Args:
+        variants: The store's folder of variants.
+        wanted_key: What `key` gives. It covers photographs, config and code, so that a failure says
+            nothing about any others.
+
+    Returns:
+        The reason; None where the key did not fail.
     """
-    found = failed_scenes(variants, wanted)
-    return found[wanted][1] if found else None
+    failed = failed_scenes(variants, wanted_key)
+    return failed[wanted_key][1] if failed else None
 
 
 def load(folder: Path) -> Variant:
-    """A frozen variant, after checking every hash.
+    """Load a frozen variant, after every hash is verified.
+
+    Args:
+        folder: The variant's folder, which may come from anybody.
+
+    Returns:
+        The variant.
 
     Raises:
-        CorruptVariant: a file is missing, or is not the one that was frozen.
+        CorruptVariant: A file is missing, or is not the one that was frozen.
     """
     try:
         content = untrusted.parse_json(untrusted.read_bytes(folder / "variant.json"))
         if content["id"] != _id(content):
-            raise CorruptVariant(f"{folder / 'variant.json'}: not what was written")
+            raise CorruptVariant(f"{folder / 'variant.json'}: it has changed since it was frozen")
         for name, expected in content["files"].items():
-            if not untrusted.is_inside(name) or _digest(folder, name) != expected:
-                raise CorruptVariant(f"{folder / name}: not what was written")
+            if not untrusted.is_inside(name) or _linkless_digest(folder, name) != expected:
+                raise CorruptVariant(f"{folder / name}: it has changed since it was frozen")
         with untrusted.open_regular(folder / "points.npz") as stream:
-            stored = npz.read(stream)
+            arrays = npz.read(stream)
         report = untrusted.parse_json(untrusted.read_bytes(folder / "report.json"))
-        found = Variant(
+        variant = Variant(
             content["id"],
             folder,
             content["scene"],
             content["factor"],
             content["held_out"],
-            tuple(_view(folder, entry) for entry in content["views"]),
-            stored["points"],
-            stored["colors"],
+            tuple(_view_from_json(folder, entry) for entry in content["views"]),
+            arrays["points"],
+            arrays["colors"],
             report,
         )
-        _check(found, content["files"])
+        _check(variant, content["files"])
     except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
-        raise CorruptVariant(f"{folder}: not a whole variant ({error!r})") from error
-    return found
+        raise CorruptVariant(f"{folder}: not a complete variant ({error!r})") from error
+    return variant
 
 
-def _check(found: Variant, files: dict[str, str]) -> None:
-    """That values are of their kinds, and names name what is in the folder alone.
+def _check(variant: Variant, files: dict[str, str]) -> None:
+    """Check that values have their types, and that all files are in the variant's folder.
 
     Raises:
-        ValueError: says what is not.
+        ValueError: A value is wrong; the message names it.
     """
-    views, points, colors = found.views, found.points, found.colors
+    views, points, colors = variant.views, variant.points, variant.colors
     names = {(view.split, view.name) for view in views}
     rules = {
-        "id": untrusted.is_name(found.id),
-        "scene, factor or report": isinstance(found.scene, str)
-        and type(found.factor) is int
-        and found.factor >= 1
-        and isinstance(found.report, dict),
+        "id": untrusted.is_name(variant.id),
+        "scene, factor or report": isinstance(variant.scene, str)
+        and type(variant.factor) is int
+        and variant.factor >= 1
+        and isinstance(variant.report, dict),
         "points": points.shape == (len(points), 3)
         and points.dtype == np.float64
         and bool(np.isfinite(points).all()),
@@ -141,7 +166,7 @@ def _check(found: Variant, files: dict[str, str]) -> None:
         "two views of one name": len(names) == len(views),
     } | {
         f"view {view.name!r:.80}": untrusted.is_name(view.name)
-        and view.file.relative_to(found.path).as_posix() in files
+        and view.file.relative_to(variant.path).as_posix() in files
         and view.split in _SPLITS
         and view.tag in {"HR", "LR"}
         and all(type(side) is int and side > 0 for side in (view.width, view.height))
@@ -150,59 +175,64 @@ def _check(found: Variant, files: dict[str, str]) -> None:
         and bool(np.isfinite([*view.K.flat, *view.viewmat.flat, view.rho]).all())
         for view in views
     }
-    if wrong := [what for what, right in rules.items() if not right]:
+    if wrong := [what for what, valid in rules.items() if not valid]:
         raise ValueError(wrong[0])
 
 
 def build(scene: SceneConf, conf: VariantConf, variants: Path, cache: Path) -> Variant:
-    """The variant of a scene: the frozen one, or made now. Any number of processes may ask.
+    """Find the variant of a scene, or make it; any number of processes may call this at once.
 
     Args:
-        scene: Where the photographs are from.
-        conf: What is made of them.
-        variants: Folder of frozen variants.
-        cache: Folder of rendered scenes.
+        scene: The scene's config.
+        conf: The variant's config.
+        variants: The store's folder of variants; it is made where it is missing.
+        cache: The folder of rendered scenes.
+
+    Returns:
+        The frozen variant.
 
     Raises:
-        SceneFailed: SfM can't place enough views; its report stays in `variants/failed-<key>`.
-        XrgsError: something of the config or the photographs is wrong; the message names it.
+        SceneFailed: SfM can't register enough views; its report is in `variants/failed-<key>`.
+        XrgsError: The config or the photographs are not usable; the message names what is wrong.
     """
-    split.check(conf)
-    wanted = key(scene, conf)
+    split.check_variant_conf(conf)
+    wanted_key = key(scene, conf)
     variants.mkdir(parents=True, exist_ok=True)
-    report = variants / f"{FAILED}{wanted}" / "report.json"
-    before = _written(report)
-    with _locked(variants / f".{wanted}.lock"):
-        found = find(variants, wanted)
+    report = variants / f"{FAILED_PREFIX}{wanted_key}" / "report.json"
+    report_before = _modified_ns(report)
+    with _lock(variants / f".{wanted_key}.lock"):
+        found = find(variants, wanted_key)
         if found is not None:
             return found
-        reason = failure(variants, wanted)
-        if reason and _written(report) != before:  # tried by another process while we waited
+        reason = failure(variants, wanted_key)
+        if reason and _modified_ns(report) != report_before:  # another process tried meanwhile
             raise SceneFailed(f"{reason} Report: {report}", {})
-        for corrupt in variants.glob(f"{wanted}-*"):
+        for corrupt in variants.glob(f"{wanted_key}-*"):
             untrusted.remove(corrupt)
         resolved = scenes.resolve(scene, cache, conf.long_side)
-        return _make(resolved, conf, wanted, variants)
+        return _make(resolved, conf, wanted_key, variants)
 
 
-def _written(file: Path) -> int | None:
+def _modified_ns(file: Path) -> int | None:
     try:
         return file.stat().st_mtime_ns
     except OSError:
         return None
 
 
-def _make(scene: scenes.Scene, conf: VariantConf, wanted: str, variants: Path) -> Variant:
-    """Mix and freeze; whatever a killed process left of it is cleared first."""
+def _make(scene: scenes.Scene, conf: VariantConf, wanted_key: str, variants: Path) -> Variant:
+    """Make and freeze a variant, after what a killed process left of it is removed."""
     from xrgs.capture import mixing
 
-    work, failed = variants / f".{wanted}.building", variants / f"{FAILED}{wanted}"
+    work = variants / f".{wanted_key}.building"
+    failed = variants / f"{FAILED_PREFIX}{wanted_key}"
     untrusted.remove(work)
     untrusted.remove(failed)
     frozen = work / "frozen"
     frozen.mkdir(parents=True)
     try:
-        return _freeze(mixing.mix(scene, conf, work, frozen), wanted, frozen, variants)
+        made = mixing.mix_resolutions(scene, conf, work, frozen)
+        return _freeze(made, wanted_key, frozen, variants)
     except SceneFailed as error:
         write_json(frozen / "report.json", error.report | {"reason": str(error)})
         frozen.rename(failed)
@@ -211,17 +241,17 @@ def _make(scene: scenes.Scene, conf: VariantConf, wanted: str, variants: Path) -
         shutil.rmtree(work, ignore_errors=True)
 
 
-def _freeze(made: Variant, wanted: str, folder: Path, variants: Path) -> Variant:
-    """Write what `made` holds beside its images, and rename the folder to its id."""
+def _freeze(made: Variant, wanted_key: str, folder: Path, variants: Path) -> Variant:
+    """Write a variant's fields into the folder of its images, and rename the folder to its id."""
     np.savez(folder / "points.npz", points=made.points, colors=made.colors)
     write_json(folder / "report.json", made.report)
     files = [folder / "points.npz", *sorted({view.file for view in made.views})]
     content: dict[str, Any] = {
-        "key": wanted,
+        "key": wanted_key,
         "scene": made.scene,
         "factor": made.factor,
         "held_out": made.held_out,
-        "views": [_entry(folder, view) for view in made.views],
+        "views": [_view_to_json(folder, view) for view in made.views],
         "files": {f.relative_to(folder).as_posix(): file_digest(f) for f in files},
     }
     content["id"] = _id(content)
@@ -231,41 +261,37 @@ def _freeze(made: Variant, wanted: str, folder: Path, variants: Path) -> Variant
     return load(home)
 
 
-def _key(fingerprint: str, conf: VariantConf) -> str:
-    return digest([fingerprint, asdict(conf), source_digests(*_CODE)])
-
-
 def _id(content: dict[str, Any]) -> str:
-    """Hash of everything in `variant.json` but the id and the label, after the key."""
+    """Compute the id: the key, then a hash of all of `variant.json` but the id and the label."""
     hashed = {k: v for k, v in content.items() if k not in ("id", "scene")}
     return f"{content['key']}-{digest(hashed)}"
 
 
-def _entry(folder: Path, view: View) -> dict[str, Any]:
+def _view_to_json(folder: Path, view: View) -> dict[str, Any]:
     file = view.file.relative_to(folder).as_posix()
     arrays = {"K": view.K.tolist(), "viewmat": view.viewmat.tolist()}
     return asdict(view) | {"file": file} | arrays
 
 
-def _digest(folder: Path, name: str) -> str:
-    """Hash of a file in the folder itself: a link, to a file or on the way to it, has none.
+def _view_from_json(folder: Path, entry: dict[str, Any]) -> View:
+    arrays = {name: np.array(entry[name], dtype=np.float64) for name in ("K", "viewmat")}
+    return View(**(entry | {"file": folder / entry["file"]} | arrays))
+
+
+def _linkless_digest(folder: Path, name: str) -> str:
+    """Hash a file of the folder; return an empty text where a link leads to or through its path.
 
     Raises:
-        OSError: it is not there.
+        OSError: The file is not there.
     """
     file = folder / name
     return file_digest(file) if file.resolve() == folder.resolve() / name else ""
 
 
-def _view(folder: Path, entry: dict[str, Any]) -> View:
-    arrays = {name: np.array(entry[name], dtype=np.float64) for name in ("K", "viewmat")}
-    return View(**(entry | {"file": folder / entry["file"]} | arrays))
-
-
 @contextmanager
-def _locked(file: Path) -> Iterator[None]:
-    """Hold an exclusive lock; the system lets go of it if this process dies."""
-    # Never through a link, which would have another file emptied.
+def _lock(file: Path) -> Iterator[None]:
+    """Hold an exclusive lock; the system releases it where this process dies."""
+    # O_NOFOLLOW: opening through a link for writing would empty the file that it leads to.
     with os.fdopen(os.open(file, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW, 0o666), "w") as handle:
         try:
             fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)

@@ -1,4 +1,4 @@
-"""What a mixed-resolution variant is once it is made: views, cameras, points."""
+"""The dataclasses of a variant: its views, cameras and points."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from xrgs.errors import XrgsError
 
 
 class SceneFailed(XrgsError):  # noqa: N818
-    """A scene that can't be made into a variant, as the paper's Leaves; `report` says why."""
+    """A scene can't be made into a variant, as the paper's Leaves; `report` says how SfM went."""
 
     def __init__(self, message: str, report: dict[str, Any]) -> None:
         super().__init__(message)
@@ -22,42 +22,50 @@ class SceneFailed(XrgsError):  # noqa: N818
 
 @dataclass(frozen=True)
 class View:
-    """One undistorted photograph and its pinhole camera."""
+    """One undistorted photograph on disk, and its pinhole camera."""
 
     name: str
-    """The photograph's file name without its ending."""
+    """The photograph's file name without its suffix."""
     file: Path
-    """PNG, 8-bit RGB, exactly `width` x `height`."""
+    """A PNG, 8-bit RGB, of exactly `width` x `height` px."""
     split: str
-    """`train`, `test`, or `original`: what a degraded training view was before, at its own size
-    and from the same pose. Originals are for the control that degrades nothing."""
+    """`train`, `test` or `original`. An original is a degraded training view before it was
+    degraded: from the same pose, at its own size, for the control that degrades nothing."""
     tag: str
-    """`HR` or `LR`; tests and originals, which nothing degraded, are `HR`."""
+    """`HR` or `LR`, the classes of the paper's method. Test views and originals are `HR`."""
     width: int
     height: int
-    K: NDArray[np.float64]  # [3, 3] px; pixel centres at +0.5
-    viewmat: NDArray[np.float64]  # [4, 4] world to camera, OpenCV axes
+    K: NDArray[np.float64]
+    """Intrinsics [3, 3], px; pixel centres are at +0.5."""
+    viewmat: NDArray[np.float64]
+    """World to camera [4, 4], in the world of SfM, OpenCV axes."""
     rho: float
-    """Relative sampling rate in (0, 1]: focal length (px) over the median depth of the SfM points
-    that the view sees, over the largest such of the variant. About 1/factor if downsampled."""
+    """The relative sampling rate, in (0, 1]: focal length (px) / median depth of the SfM points
+    that the view observes, over the largest such ratio of the variant. Downsampling a view by
+    `factor` divides it by `factor`."""
 
 
 @dataclass(frozen=True)
 class Variant:
-    """What a cell trains and is tested on."""
+    """A frozen mixed-resolution dataset, which cells train and are evaluated on."""
 
     id: str
-    """`<key>-<hash>`: the hash is of the images, the cameras and SfM's points."""
+    """`<key>-<hash>`, where the hash covers the images, the cameras and the SfM points."""
     path: Path
+    """The folder that it was loaded from."""
     scene: str
-    """The scene's name when the variant was built; a label, not in the hash."""
+    """The scene's name when the variant was built; a label that is not part of the hash."""
     factor: int
-    """How many times fewer pixels a side the method takes LR views to have; real captures are
-    cropped to multiples of it too."""
+    """How many times fewer pixels per side the method takes LR views to have. The HR views of
+    real captures are cropped to multiples of it too."""
     held_out: bool
-    """False where there are too few views to hold any out: the tests are the trained poses, HR."""
-    views: tuple[View, ...]  # sorted by (split, name)
-    points: NDArray[np.float64]  # [P, 3] SfM points, world units of SfM
-    colors: NDArray[np.uint8]  # [P, 3]
+    """False where there are too few views to hold any out: the test views are then the HR versions
+    of the training poses."""
+    views: tuple[View, ...]
+    """All views, sorted by (split, name)."""
+    points: NDArray[np.float64]
+    """SfM points [P, 3], in the world of SfM."""
+    colors: NDArray[np.uint8]
+    """Their colours [P, 3]."""
     report: dict[str, Any]
-    """How SfM went: views registered, points, reprojection error, the recipe that worked."""
+    """How SfM went: registered views, points, reprojection error, every attempt."""

@@ -15,7 +15,7 @@ from omegaconf.errors import OmegaConfBaseException
 from xrgs import config
 from xrgs.config import literal
 from xrgs.errors import XrgsError
-from xrgs.safeio.atomic import path_of
+from xrgs.safeio.paths import user_path
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
@@ -66,7 +66,7 @@ def _with_quotes(word: str) -> str:
     key, _, value = word.partition("=")
     if key not in _PATHS or not value or value[0] in "'\"":
         return word
-    exists = path_of(value).exists()
+    exists = user_path(value).exists()
     if exists or key != "scene.path":
         return f"{key}={_quoted(key, literal(value) if exists else value)}"
     return f"{key}={','.join(_quoted(key, part) for part in value.split(','))}"
@@ -79,7 +79,7 @@ def _quoted(key: str, value: str) -> str:
         parsed = override.value()
         if parsed == value and not override.is_sweep_override():
             return value
-        if (parsed is None or "\\" in value) and not path_of(value).exists():
+        if (parsed is None or "\\" in value) and not user_path(value).exists():
             return value
     return QuotedString(value, Quote.single).with_quotes()
 

@@ -8,7 +8,7 @@ from omegaconf import OmegaConf
 
 from xrgs.bench.settings import Settings
 from xrgs.cli.arguments import errors_as_messages, parse
-from xrgs.runtime.machine import let_openmp_sleep
+from xrgs.runtime.machine import set_passive_openmp_wait
 
 _HELP = """\
 xrgs-bench [KEY=VALUE]...
@@ -34,7 +34,7 @@ With store_cells=N it measures planning, reporting and the cost of a job over a 
 
 def main() -> None:
     """Run `xrgs-bench [KEY=VALUE]...`."""
-    let_openmp_sleep()  # as in training
+    set_passive_openmp_wait()  # as in training
     with errors_as_messages("xrgs-bench"):
         settings = OmegaConf.to_object(parse(Settings, _HELP))
         from xrgs.bench.run import run

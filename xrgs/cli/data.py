@@ -48,16 +48,16 @@ def main() -> None:
 
 
 def _lpips(values: dict[str, str]) -> str:
-    from xrgs.evaluation.lpips import download
+    from xrgs.evaluation.lpips.download import fetch_weights
 
     source = values.pop("from", None)
     if values:
         raise XrgsError(f"{next(iter(values))}=: lpips takes only from=; see xrgs-data --help")
-    return download.get(source)
+    return fetch_weights(source)
 
 
 def _download(words: list[str], values: dict[str, str]) -> str:
-    from xrgs.capture.download import scenes
+    from xrgs.capture.download.scenes import fetch_scenes
     from xrgs.capture.download.settings import DatasetConf
 
     file = config.CONF_DIR / "data" / f"{words[0] if words else ''}.yaml"
@@ -66,7 +66,7 @@ def _download(words: list[str], values: dict[str, str]) -> str:
     data_root = values.pop("data_root", None)
     root = data_root or OmegaConf.load(config.CONF_DIR / "config.yaml").data_root
     conf = OmegaConf.merge(OmegaConf.structured(DatasetConf), OmegaConf.load(file), values)
-    return scenes.get(cast("DatasetConf", OmegaConf.to_object(conf)), words[1:], Path(root))
+    return fetch_scenes(cast("DatasetConf", OmegaConf.to_object(conf)), words[1:], Path(root))
 
 
 def _inspect(words: list[str], values: dict[str, str]) -> str:

@@ -14,7 +14,7 @@ from omegaconf import MISSING, DictConfig, OmegaConf
 
 from xrgs import config
 from xrgs.cli.arguments import choices, dotlist, errors_as_messages, with_quotes
-from xrgs.runtime.signals import stoppable
+from xrgs.runtime.signals import exit_on_signal
 from xrgs.runtime.streams import ignore_broken_pipe
 
 _HELP = """\
@@ -85,7 +85,9 @@ def main() -> None:
         return
     ignore_broken_pipe()
     if any(argument.startswith("rerun=") for argument in arguments):
-        with stoppable("The cell is unchanged; the folder that was begun beside it has no result."):
+        with exit_on_signal(
+            "The cell is unchanged; the folder that was begun beside it has no result."
+        ):
             _rerun(arguments)
         return
     config.register()
@@ -93,7 +95,7 @@ def main() -> None:
     words = ["+" + word if word.startswith("ablation=") else word for word in arguments]
     with errors_as_messages("xrgs-sweep"):
         sys.argv[1:] = with_quotes(words)
-    with stoppable("Finished cells are kept: run the same command again to continue."):
+    with exit_on_signal("Finished cells are kept: run the same command again to continue."):
         _run_job()
 
 

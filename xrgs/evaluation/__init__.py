@@ -1,1 +1,1 @@
-"""The evaluation protocol and the metrics that cells are compared by."""
+"""Evaluates trained Gaussians: the frozen protocol and the metrics that cells are compared by."""

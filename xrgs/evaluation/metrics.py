@@ -1,8 +1,8 @@
-"""What a cell is judged by: each metric's name, label, unit and direction, in the tables' order.
+"""Defines every metric: its name, label, unit and direction, in the order of the tables.
 
-To add one: an entry of `METRICS`. A score of a view has its function there, and is then computed by
-every evaluation from that on; any other is a number of the cell's summary. torch and kornia are
-imported where they are used, since plans and reports are made without them.
+To add a metric, add an entry to `METRICS`. A metric that scores a view names its function there,
+and every later evaluation computes it; any other is a value of the cell's summary. torch and kornia
+are imported where they are used, because plans and reports are made without them.
 """
 
 from __future__ import annotations
@@ -17,23 +17,26 @@ from xrgs.evaluation.lpips import weights
 if TYPE_CHECKING:
     from torch import Tensor
 
-WINDOW = 11
-"""Taps of the SSIM window along each axis."""
+SSIM_WINDOW = 11
+"""Width of the SSIM window, px. It is part of the evaluation protocol, and not taken from the
+training loss: another window there must not change what the scores mean."""
 
 
 def psnr(image: Tensor, target: Tensor) -> float:
-    """Peak signal-to-noise ratio `10 log10(1 / mean (image - target)^2)`, the mean in float64.
+    """Compute the peak signal-to-noise ratio 10 log10(1 / mean((image - target)²)).
+
+    The mean is taken in float64 over all pixels and channels.
 
     Args:
-        image: [H, W, 3] in 0..1.
-        target: [H, W, 3] in 0..1.
+        image: The render, [H, W, 3] in 0..1.
+        target: The photograph, [H, W, 3] in 0..1.
 
     Returns:
-        dB; infinity where the images are identical, as scikit-image has it (a table shows no
-        percentage of it).
+        The ratio in dB; infinity where the images are identical, as in scikit-image (tables show
+        no percentage change from or to infinity).
 
     Raises:
-        ValueError: the shapes differ or aren't [H, W, 3].
+        ValueError: The shapes differ or are not [H, W, 3].
 
     Example:
         >>> import torch
@@ -46,75 +49,82 @@ def psnr(image: Tensor, target: Tensor) -> float:
 
 
 def ssim(image: Tensor, target: Tensor) -> float:
-    """Structural similarity (Wang et al. 2004), the mean over channels and every pixel.
+    """Compute the structural similarity, averaged over channels and pixels.
 
-    kornia's: a Gaussian window of 11 taps and sigma 1.5, data range 1, borders reflected, which is
-    what gsplat's evaluation gives to the fourth digit.
+    It is `kornia.metrics.ssim`: a Gaussian window of 11 x 11 px and sigma 1.5, data range 1,
+    borders reflected. gsplat's evaluation gives the same to the fourth digit.
+
+    Source: Wang et al. 2004, "Image quality assessment: from error visibility to structural
+    similarity".
 
     Args:
-        image: [H, W, 3] in 0..1.
-        target: [H, W, 3] in 0..1.
+        image: The render, [H, W, 3] in 0..1.
+        target: The photograph, [H, W, 3] in 0..1.
 
     Returns:
-        -1 to 1; 1 where the images are identical.
+        A value in -1..1; 1 where the images are identical.
 
     Raises:
-        ValueError: the shapes differ, aren't [H, W, 3], or a side is too short to be reflected.
+        ValueError: The shapes differ, are not [H, W, 3], or a side is too short to be reflected.
     """
     from kornia import metrics
 
     _check(image, target)
     height, width = image.shape[:2]
-    if min(height, width) <= WINDOW // 2:
+    if min(height, width) <= SSIM_WINDOW // 2:
         raise ValueError(
             f"an image of {width} x {height} px is too small for SSIM: each side must have more "
-            f"than {WINDOW // 2} px"
+            f"than {SSIM_WINDOW // 2} px"
         )
     planes, reference = (x.permute(2, 0, 1)[None] for x in (image, target))  # [1, 3, H, W]
-    return float(metrics.ssim(planes, reference, window_size=WINDOW).mean())
+    return float(metrics.ssim(planes, reference, window_size=SSIM_WINDOW).mean())
 
 
 def lpips(image: Tensor, target: Tensor) -> float | None:
-    """Perceptual distance (Zhang et al. 2018), AlexNet, version 0.1: gsplat's `alex`.
+    """Compute the perceptual distance LPIPS, version 0.1, with AlexNet (`alex` in gsplat).
+
+    Source: Zhang et al. 2018, "The unreasonable effectiveness of deep features as a perceptual
+    metric"; see `xrgs.evaluation.lpips.network`.
 
     Args:
-        image: [H, W, 3] in 0..1.
-        target: [H, W, 3] in 0..1.
+        image: The render, [H, W, 3] in 0..1.
+        target: The photograph, [H, W, 3] in 0..1.
 
     Returns:
-        0 where the images are identical; None (n/a in the tables) where this machine has no
-        weights, or a side of the image is too short for the network.
+        The distance, 0 where the images are identical; None (n/a in the tables) where this machine
+        has no weights, or a side of the images is too short for the network.
 
     Raises:
-        ValueError: the shapes differ or aren't [H, W, 3].
-        WeightsError: the weights that are there aren't the published ones.
+        ValueError: The shapes differ or are not [H, W, 3].
+        WeightsError: This machine's weights are not the published ones.
     """
     _check(image, target)
-    published = weights.published()
+    published = weights.load_published()
     if published is None:
         return None
     import torch
 
-    from xrgs.evaluation.lpips.network import SMALLEST, distance
+    from xrgs.evaluation.lpips.network import MIN_SIDE, distance
 
-    if min(image.shape[:2]) < SMALLEST:
+    if min(image.shape[:2]) < MIN_SIDE:
         return None
     return float(distance(image, target, {k: torch.from_numpy(v) for k, v in published.items()}))
 
 
 @dataclass(frozen=True)
 class Metric:
-    """One row of a table."""
+    """A metric: one row of a table."""
 
     name: str
-    """Column in the store."""
+    """The name of its column in the store."""
     label: str
-    """In tables."""
+    """The name shown in tables."""
     unit: str
-    """`s`, `bytes`, `dB`, or none."""
+    """`s`, `bytes`, `dB`, or empty for a number without a unit."""
     higher_is_better: bool
     score: Callable[[Tensor, Tensor], float | None] | None = None
-    """Of a render and its photograph, both [H, W, 3] in 0..1; None: no score of a view."""
+    """The function that scores a render and its photograph, both [H, W, 3] in 0..1; None for a
+    metric of the whole cell."""
 
 
 METRICS = (
@@ -127,10 +137,10 @@ METRICS = (
     Metric("psnr", "PSNR", "dB", higher_is_better=True, score=psnr),
     Metric("evaluations", "Alpha evaluations", "", higher_is_better=False),
 )
-"""The rows of the tables, in order."""
+"""All metrics, in the order of the tables' rows."""
 
 VIEW_METRICS = {metric.name: metric.score for metric in METRICS if metric.score is not None}
-"""What evaluation computes for each test view."""
+"""The functions that evaluation calls for each test view, by metric name."""
 
 
 def _check(image: Tensor, target: Tensor) -> None:

@@ -13,6 +13,7 @@ from xrgs.capture import dataset
 from xrgs.evaluation import protocol
 from xrgs.experiment import provenance
 from xrgs.runtime import progress
+from xrgs.runtime.machine import set_torch_threads
 from xrgs.safeio.atomic import write_json, write_text
 from xrgs.safeio.hashing import digest
 from xrgs.splat.backend import resolve_backend
@@ -43,9 +44,9 @@ def run_cell(conf: Conf, variant: Variant, folder: CellFolder) -> None:
         Exception: Whatever went wrong, after its traceback was written to `error.txt`.
     """
     try:
-        with progress.kept_in(folder.progress):
+        with progress.written_to(folder.progress):
             views = _train_and_score(conf, variant, folder)
-        folder.finish(views, protocol.PROTOCOL)
+        folder.finish(views, protocol.PROTOCOL_VERSION)
     except Exception:
         write_text(folder.path / "error.txt", traceback.format_exc())
         raise
@@ -53,7 +54,7 @@ def run_cell(conf: Conf, variant: Variant, folder: CellFolder) -> None:
 
 def _train_and_score(conf: Conf, variant: Variant, folder: CellFolder) -> list[str]:
     """Write every file but the status; return the names of the views that were scored."""
-    threads = dataset.use_threads(conf.threads)
+    threads = set_torch_threads(conf.threads)
     backend = resolve_backend(conf.splat.backend)
     write_json(folder.path / "provenance.json", provenance.collect(threads, backend))
     data = dataset.load(variant, conf.train.views)
@@ -63,7 +64,7 @@ def _train_and_score(conf: Conf, variant: Variant, folder: CellFolder) -> list[s
     )  # read before evaluation, which may load the network of LPIPS
     save_ply(folder.path / "splats.ply", trained.gaussians)
     write_text(folder.path / "history.csv", _csv(trained.history))
-    scores = protocol.score(trained.gaussians, data.test, conf.splat, folder.path / "renders")
+    scores = protocol.score_views(trained.gaussians, data.test, conf.splat, folder.path / "renders")
     write_text(folder.path / "scores.csv", _csv(scores))
     write_json(
         folder.path / "summary.json",

@@ -9,8 +9,8 @@ from __future__ import annotations
 from functools import cache
 from typing import TYPE_CHECKING, Any
 
-from xrgs.evaluation.protocol import PROTOCOL
-from xrgs.safeio.hashing import plain, source_digests
+from xrgs.evaluation.protocol import PROTOCOL_VERSION
+from xrgs.safeio.hashing import source_digests, to_plain
 from xrgs.splat.backend import resolve_backend
 
 if TYPE_CHECKING:
@@ -81,11 +81,11 @@ def cell_identity(conf: Conf, variant_id: str) -> dict[str, Any]:
     """
     backend = resolve_backend(conf.splat.backend)
     return {
-        "splat": plain(conf.splat) | {"backend": backend},
-        "train": plain(conf.train),
-        "components": plain(conf.components),
+        "splat": to_plain(conf.splat) | {"backend": backend},
+        "train": to_plain(conf.train),
+        "components": to_plain(conf.components),
         "seed": conf.seed,
         "variant": variant_id,
-        "protocol": PROTOCOL,
+        "protocol": PROTOCOL_VERSION,
         "code": training_code(backend),
     }

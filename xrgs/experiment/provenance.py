@@ -69,6 +69,8 @@ def collect(threads: int, backend: str) -> dict[str, Any]:
         "threads": threads,
         "backend": backend,
         "instruction_set": _instruction_set(backend),
-        "lpips_weights_sha256": None if weights.published() is None else weights.CONTENT_SHA256,
+        "lpips_weights_sha256": None
+        if weights.load_published() is None
+        else weights.CONTENT_SHA256,
         "started": datetime.now(UTC).isoformat(timespec="seconds"),
     }

@@ -16,11 +16,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from xrgs.errors import StoreError
 from xrgs.runtime import progress
 from xrgs.safeio import untrusted
 from xrgs.safeio.atomic import write_json, write_text
-from xrgs.safeio.hashing import canonical, digest, file_digest
-from xrgs.safeio.records import StoreError, as_number, read_json, read_object, read_table
+from xrgs.safeio.hashing import canonical_json, digest, file_digest
+from xrgs.safeio.records import as_number, read_json, read_object, read_table
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping, Sequence
@@ -170,7 +171,7 @@ class CellFolder:
         if state != "unfinished" and not (state == "failed" and self.checkpoint.is_file()):
             return False
         try:
-            return canonical(self.identity()) == canonical(identity)
+            return canonical_json(self.identity()) == canonical_json(identity)
         except (StoreError, TypeError, ValueError):
             # An attempt that was killed before it wrote its identity has not trained anything.
             written = (self.path / "identity.json", self.checkpoint)

@@ -11,9 +11,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import pandas as pd
 
-from xrgs.errors import XrgsError
+from xrgs.errors import StoreError, XrgsError
 from xrgs.runtime.progress import progress
-from xrgs.safeio.records import StoreError, as_number
+from xrgs.safeio.records import as_number
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence

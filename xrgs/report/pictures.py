@@ -18,7 +18,7 @@ from xrgs.report.collect import ReportError
 from xrgs.report.figures import Panel, curves, differing_crop, side_by_side, trade_off
 from xrgs.report.tables import titled
 from xrgs.runtime.progress import progress
-from xrgs.safeio.atomic import replacing
+from xrgs.safeio.atomic import atomic_writer
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
@@ -117,7 +117,7 @@ def _trade_offs(comparison: Comparison) -> dict[str, _Drawing]:
 def _trade_off(
     title: str, means: pd.DataFrame, scenes: pd.DataFrame, axes: Sequence[Metric], file: Path
 ) -> Picture:
-    with replacing(file) as stream:
+    with atomic_writer(file) as stream:
         stream.write(trade_off(title, means, scenes, axes))
     return Picture(title, file)
 
@@ -174,7 +174,7 @@ def _views(
     if len({panel.image.shape for panel in panels}) > 1:
         return Picture(title, None, f"{view}: photograph and renders differ in size")
     note = f"where baseline and {pair['label']} differ most"
-    with replacing(file) as stream:
+    with atomic_writer(file) as stream:
         stream.write(side_by_side(title, panels, differing_crop(baseline, ablation), note))
     return Picture(title, file)
 
@@ -188,7 +188,7 @@ def _training(store: Store, pair: pd.Series, file: Path) -> Picture:
             runs.append((name, history.apply(pd.to_numeric)))
         except (OSError, ValueError, TypeError, KeyError):
             return Picture(title, None, f"cells/{pair[key]}/history.csv can't be read")
-    with replacing(file) as stream:
+    with atomic_writer(file) as stream:
         stream.write(curves(title, runs, _CURVES))
     return Picture(title, file)
 

@@ -1,1 +1,1 @@
-"""The process that a command runs in: machine, signals, streams, progress."""
+"""Handles what concerns the process itself: cores, threads, signals, streams and progress."""

@@ -1,4 +1,4 @@
-"""What of this machine a process may use."""
+"""Cores and threads that this process uses."""
 
 from __future__ import annotations
 
@@ -8,28 +8,49 @@ from contextlib import contextmanager
 
 
 def usable_cores() -> int:
-    """Cores that this process may run on, which can be fewer than the machine has."""
+    """Count the cores that this process may run on.
+
+    Returns:
+        The size of the process's CPU affinity, which can be smaller than the machine; the number
+        of cores of the machine on systems without affinity.
+    """
     if hasattr(os, "sched_getaffinity"):
         return len(os.sched_getaffinity(0))
     return os.cpu_count() or 1
 
 
-def let_openmp_sleep() -> None:
-    """Have OpenMP's threads sleep between their loops. To be called before torch is imported.
+def set_passive_openmp_wait() -> None:
+    """Make OpenMP's threads sleep between parallel loops; call this before torch is imported.
 
-    torch's own threads are OpenMP's, and spin for milliseconds after each loop in case there is
-    another, on the cores that the native kernels' threads want meanwhile: on two busy cores a
-    training step took three times as long. Who has set OMP_WAIT_POLICY is left alone.
+    torch's threads are OpenMP's. By default they spin for milliseconds after each loop, in case
+    another one follows, on cores that the threads of the native kernels need in that time: on two
+    busy cores a training step took three times as long. A value of OMP_WAIT_POLICY that is already
+    in the environment is kept.
     """
     os.environ.setdefault("OMP_WAIT_POLICY", "passive")
 
 
+def set_torch_threads(threads: int) -> int:
+    """Set the number of torch's threads.
+
+    Args:
+        threads: The number of threads; 0 for every core that this process may use.
+
+    Returns:
+        The number that torch has now.
+    """
+    import torch
+
+    torch.set_num_threads(threads or usable_cores())
+    return torch.get_num_threads()
+
+
 @contextmanager
-def one_thread() -> Iterator[int]:
-    """Have torch work with one thread for a while.
+def single_torch_thread() -> Iterator[int]:
+    """Limit torch to one thread for the length of a block.
 
     Yields:
-        How many it had, and has again afterwards.
+        The number of threads that torch had before, and has again afterwards.
     """
     import torch
 

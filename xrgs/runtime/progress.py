@@ -1,8 +1,8 @@
-"""How far a long piece of work is: one way to say it, whoever looks.
+"""Shows the progress of long work: as a bar, as lines of a log, or in a file for another process.
 
-On a terminal it is a bar. In a log, where a bar would be a page of carriage returns, it is a line
-now and then. What another process watches (`kept_in`) leaves it in a small file instead: a sweep's
-cells may be on other machines, and many of them are shown in one line.
+On a terminal progress is a tqdm bar. In a log, where a bar would be a page of carriage returns, it
+is one line a minute. Inside `written_to` it is kept in a small file instead, and nothing is shown:
+the cells of a sweep may run on other machines, and one line shows many of them.
 """
 
 from __future__ import annotations
@@ -30,37 +30,38 @@ else:
 
 _T = TypeVar("_T")
 
-#: Seconds between two states of a bar, of the file, and two lines of a log.
+#: Seconds between two updates of a bar, of the file, and between two lines of a log.
 _BAR_S, _FILE_S, _LINE_S = 0.5, 2.0, 60.0
-#: What is over sooner, s, gets no bar.
-_SHORT_S = 2.0
-#: Of what is read of such a file.
-_MOST_BYTES = 1 << 12
+#: Seconds before a bar appears, so that short work shows none.
+_BAR_DELAY_S = 2.0
+#: The largest progress file that is read, in bytes.
+_MAX_BYTES = 1 << 12
 
 _file: ContextVar[Path | None] = ContextVar("file", default=None)
 
 
 @dataclass(frozen=True)
 class Progress:
-    """How far something is."""
+    """How much of a piece of work is done."""
 
     what: str
-    """What is done: `training`."""
+    """The work, for example `training`."""
     unit: str
-    """Of what, in the singular: `step`."""
+    """What is counted, in the singular, for example `step`."""
     done: int
     total: int | None
+    """How many there are in all; None where that is not known."""
     rate: float | None
-    """Units a second, lately; None where it is not known yet."""
+    """Recent units per second; None where that is not known yet."""
 
     @property
-    def left_s(self) -> float | None:
-        """Seconds that are left at this rate."""
+    def remaining_s(self) -> float | None:
+        """The estimated seconds to the end; None where total or rate are not known."""
         return (self.total - self.done) / self.rate if self.total and self.rate else None
 
     @property
     def count(self) -> str:
-        """`training 1,200 of 3,000 steps`."""
+        """A phrase such as `training 1,200 of 3,000 steps`."""
         of = "" if self.total is None else f" of {self.total:,}"
         return f"{self.what} {self.done:,}{of} {self.unit}s"
 
@@ -68,15 +69,18 @@ class Progress:
         parts = [self.count]
         if self.rate:
             parts.append(f"{self.rate:.3g} {self.unit}s/s")
-        if self.left_s is not None:
-            parts.append(f"{duration(self.left_s)} left")
+        if self.remaining_s is not None:
+            parts.append(f"{format_duration(self.remaining_s)} left")
         return ", ".join(parts)
 
 
-class Bar(_Tqdm):
-    """Counts items as they are taken, or what `update` is told, and shows how many there were."""
+class ProgressBar(_Tqdm):
+    """Counts items as they are iterated over, or by `update`, and shows the count.
 
-    monitor_interval = 0  # tqdm's own thread is for bars that skip looking at the clock
+    It is a tqdm bar whose output goes to a terminal, a log or a file, see the module.
+    """
+
+    monitor_interval = 0  # tqdm's monitoring thread serves bars that skip updates: these do not
 
     def __init__(
         self,
@@ -87,18 +91,18 @@ class Bar(_Tqdm):
         items: Iterable[Any] | None = None,
         done: int = 0,
     ) -> None:
-        """Nothing is done yet.
+        """Start counting.
 
         Args:
-            what: What is done with them.
-            unit: What one of them is, in the singular.
-            total: How many there are in all; that of `items` where they have a length.
-            items: What is counted as it is taken; None where `update` is called.
-            done: So many were behind us before; `items` are the others.
+            what: The work, for example `training`.
+            unit: What is counted, in the singular; `byte` is shown in kB and MB.
+            total: How many there are in all; by default the length of `items`, where they have one.
+            items: What to iterate over and count; None where `update` is called instead.
+            done: How many were done before; `items` are the others.
         """
         self._file = _file.get()
         self._drawn = self._file is None and sys.stderr.isatty()
-        every, delay = (_BAR_S, _SHORT_S) if self._drawn else (_LINE_S, _LINE_S)
+        every, delay = (_BAR_S, _BAR_DELAY_S) if self._drawn else (_LINE_S, _LINE_S)
         super().__init__(
             items,
             what,
@@ -114,41 +118,69 @@ class Bar(_Tqdm):
         )
 
     def display(self, msg: str | None = None, pos: int | None = None) -> Any:
-        """Show it where it is to be seen: tqdm calls this when it is time, and at its end."""
+        """Show the count; tqdm calls this when an update is due, and at the end.
+
+        Args:
+            msg: tqdm's own text: None for the count, empty at the end.
+            pos: The line of the terminal, counted from the bar's own.
+
+        Returns:
+            On a terminal what tqdm returns, else None.
+        """
         if self._drawn:
             draw: Callable[..., Any] = super().display
-            return draw(msg, pos)  # tqdm wants it back: whether there is something to be cleared
-        if msg is None:  # else it is the end, and empty
+            return draw(msg, pos)
+        if msg is None:
             total = None if self.total is None else int(self.total)
             now = Progress(self.desc, self.unit, int(self.n), total, self._rate())
             if self._file is None:
-                say(str(now))
+                log_line(str(now))
             else:
                 _write(self._file, now)
         return None
 
     def _rate(self) -> float | None:
-        known = self.format_dict
-        done = self.n - self.initial
-        return known["rate"] or (done / known["elapsed"] if done and known["elapsed"] else None)
+        state = self.format_dict
+        counted = self.n - self.initial
+        return state["rate"] or (
+            counted / state["elapsed"] if counted and state["elapsed"] else None
+        )
 
 
 def progress(
     items: Iterable[_T], what: str, unit: str, total: int | None = None, *, done: int = 0
 ) -> Iterator[_T]:
-    """The items, with a `Bar` that counts them."""
-    return iter(Bar(what, unit, total, items=items, done=done))
+    """Iterate over items while a `ProgressBar` counts them.
+
+    Args:
+        items: What to iterate over.
+        what: The work, for example `training`.
+        unit: What an item is, in the singular.
+        total: How many there are in all; by default the length of `items`, where they have one.
+        done: How many were done before; `items` are the others.
+
+    Returns:
+        An iterator over the same items.
+    """
+    return iter(ProgressBar(what, unit, total, items=items, done=done))
 
 
 def _write(file: Path, now: Progress) -> None:
-    # No result: a file that can't be written, or is lost when the power goes, does no harm.
+    # Progress is no result: it does no harm that it can't be written, or is lost with the power.
     with suppress(OSError):
         write_json(file, asdict(now), durable=False)
 
 
 @contextmanager
-def kept_in(file: Path) -> Iterator[None]:
-    """Bars made within are drawn nowhere: the latest is in `file`, which is gone at the end."""
+def written_to(file: Path) -> Iterator[None]:
+    """Keep the progress of all bars made within a block in a file, and show none of them.
+
+    Args:
+        file: The file; it holds the latest state of the latest bar, and is removed at the end.
+
+    Yields:
+        Nothing.
+    """
     token = _file.set(file)
     try:
         yield
@@ -159,14 +191,21 @@ def kept_in(file: Path) -> Iterator[None]:
 
 
 def read(file: Path) -> Progress | None:
-    """What a process left in a file; None where there is nothing, or nothing that makes sense."""
+    """Read the progress that another process keeps in a file.
+
+    Args:
+        file: The file given to `written_to` there.
+
+    Returns:
+        The progress; None where there is no such file or its content is not valid.
+    """
     try:
-        found = untrusted.parse_json(untrusted.read_bytes(file, _MOST_BYTES))
-        total, rate = found["total"], found["rate"]
+        content = untrusted.parse_json(untrusted.read_bytes(file, _MAX_BYTES))
+        total, rate = content["total"], content["rate"]
         return Progress(
-            str(found["what"]),
-            str(found["unit"]),
-            int(found["done"]),
+            str(content["what"]),
+            str(content["unit"]),
+            int(content["done"]),
             None if total is None else int(total),
             None if rate is None or not math.isfinite(rate) else float(rate),
         )
@@ -174,14 +213,25 @@ def read(file: Path) -> Progress | None:
         return None
 
 
-def say(text: str) -> None:
-    """A line on stderr for who watches; on a terminal, in place of a bar that may stand there."""
+def log_line(text: str) -> None:
+    """Print one line on stderr; on a terminal it replaces a bar on the current line.
+
+    Args:
+        text: The line, without its end.
+    """
     clear = "\r\x1b[K" if sys.stderr.isatty() else ""
     print(f"{clear}{text}", file=sys.stderr, flush=True)  # noqa: T201
 
 
-def duration(seconds: float | None) -> str:
-    """For people: `~40 s`, `~12 min`, `~3.5 h`, `?`."""
+def format_duration(seconds: float | None) -> str:
+    """Format a duration for people: `~40 s`, `~12 min`, `~3.5 h`, or `?`.
+
+    Args:
+        seconds: The duration; None where it is not known.
+
+    Returns:
+        The text.
+    """
     if seconds is None:
         return "?"
     if seconds < 99.5:

@@ -1,4 +1,4 @@
-"""Ctrl-C and SIGTERM: what runs is ended in order, with a line that says how to go on."""
+"""Ends a command in order on Ctrl-C and SIGTERM, with a line that says how to continue."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ if TYPE_CHECKING:
     from types import FrameType
 
 
-class Stopped(KeyboardInterrupt):
-    """A signal asked this process to end; libraries treat it as they do Ctrl-C."""
+class StopSignal(KeyboardInterrupt):
+    """Raised by the first SIGINT or SIGTERM; libraries handle it as they handle Ctrl-C."""
 
     def __init__(self, number: int) -> None:
         super().__init__(number)
@@ -21,29 +21,34 @@ class Stopped(KeyboardInterrupt):
 
 
 @contextmanager
-def stoppable(going_on: str) -> Iterator[None]:
-    """End in order on SIGINT or SIGTERM; the second one ends this process at once.
+def exit_on_signal(hint: str) -> Iterator[None]:
+    """End this process in order when SIGINT or SIGTERM arrives during a block.
 
-    A signal that was ignored from the start (`nohup`, a shell's `&`) stays so.
+    The first signal raises an exception in the block, so that its `finally` clauses run; the second
+    one ends the process at once. A signal that the process ignored from its start (`nohup`, a
+    shell's `&`) stays ignored.
 
     Args:
-        going_on: what is left to say then.
+        hint: What to print after the name of the signal: what is kept, and how to continue.
+
+    Yields:
+        Nothing.
 
     Raises:
-        SystemExit: with 128 and the signal's number, as shells tell of it.
+        SystemExit: A signal arrived; the exit code is 128 plus its number, as shells report it.
     """
     for number in (signal.SIGINT, signal.SIGTERM):
         if signal.getsignal(number) is not signal.SIG_IGN:
-            signal.signal(number, _stop)
+            signal.signal(number, _raise_stop)
     try:
         yield
-    except Stopped as stopped:
-        print(f"stopped by {signal.Signals(stopped.number).name}. {going_on}", file=sys.stderr)  # noqa: T201
-        sys.exit(128 + stopped.number)
+    except StopSignal as stop:
+        print(f"stopped by {signal.Signals(stop.number).name}. {hint}", file=sys.stderr)  # noqa: T201
+        sys.exit(128 + stop.number)
 
 
-def _stop(number: int, _: FrameType | None) -> None:
-    for each in (signal.SIGINT, signal.SIGTERM):
-        if signal.getsignal(each) is _stop:
-            signal.signal(each, signal.SIG_DFL)
-    raise Stopped(number)
+def _raise_stop(number: int, _: FrameType | None) -> None:
+    for handled in (signal.SIGINT, signal.SIGTERM):
+        if signal.getsignal(handled) is _raise_stop:
+            signal.signal(handled, signal.SIG_DFL)
+    raise StopSignal(number)

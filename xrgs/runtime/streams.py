@@ -1,4 +1,4 @@
-"""What is printed may be lost, the work is not: terminals are closed, readers of pipes go home."""
+"""Keeps the program running when its terminal is closed or the reader of its pipe has ended."""
 
 from __future__ import annotations
 
@@ -14,20 +14,24 @@ if TYPE_CHECKING:
 
 
 class _WriteErrorsIgnored(io.FileIO):
-    """A file descriptor whose errors are nobody's concern."""
+    """A file descriptor that reports every write as complete, whether it succeeded or not."""
 
     def write(self, data: ReadableBuffer) -> int:
-        """Write what can be written, and say that all of it was."""
+        """Write what can be written, and return the size of all of it."""
         with suppress(OSError):
             return super().write(data)
         return memoryview(data).nbytes
 
 
 def ignore_broken_pipe() -> None:
-    """From now on, printing to a terminal or a pipe that is gone does nothing."""
+    """Make stdout and stderr ignore write errors from now on.
+
+    What is printed to a closed terminal, a pipe without a reader or a full disk is lost, and the
+    work goes on. A stream that something else has put in the place of Python's own is left alone.
+    """
     for name in ("stdout", "stderr"):
         stream = getattr(sys, name)
-        if stream is not None and stream is getattr(sys, f"__{name}__"):  # else it is another's
+        if stream is not None and stream is getattr(sys, f"__{name}__"):
             setattr(sys, name, _without_write_errors(stream))
 
 

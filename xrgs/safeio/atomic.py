@@ -1,4 +1,4 @@
-"""Files that a reader sees whole: the old content or the new, never half of one."""
+"""Writes files atomically: a reader sees the old content or the new, never a part of either."""
 
 from __future__ import annotations
 
@@ -6,20 +6,31 @@ import json
 import os
 import secrets
 from contextlib import contextmanager
-from pathlib import Path
 from typing import IO, TYPE_CHECKING
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
+    from pathlib import Path
 
 
 @contextmanager
-def replacing(path: Path, *, durable: bool = True) -> Iterator[IO[bytes]]:
-    """A stream whose content takes the place of a file at the end, if no exception comes before.
+def atomic_writer(path: Path, *, durable: bool = True) -> Iterator[IO[bytes]]:
+    """Open a binary stream whose content replaces a file when the block ends without an exception.
 
-    What is not `durable` may be lost when the power goes, and doesn't wait for the disk.
+    The content is written to a temporary file in the same folder, which is renamed at the end.
+
+    Args:
+        path: The file to replace or create; its folder must exist.
+        durable: Whether to wait until the content is on the disk. Without it, the new content can
+            be lost in a power failure.
+
+    Yields:
+        The stream to write to.
+
+    Raises:
+        OSError: The file can't be written. The old file is then as it was.
     """
-    # Not mkstemp: its files are for their owner alone, and a store is for a team.
+    # Not mkstemp: only the owner could read its files, and a store is shared by a team.
     temporary = path.with_name(f".{path.name}.{os.getpid()}-{secrets.token_hex(4)}")
     try:
         with temporary.open("xb") as stream:
@@ -34,20 +45,30 @@ def replacing(path: Path, *, durable: bool = True) -> Iterator[IO[bytes]]:
 
 
 def write_text(path: Path, text: str, *, durable: bool = True) -> None:
-    """Write a file so that a reader sees the old or the new content, never half of one."""
-    with replacing(path, durable=durable) as stream:
+    """Write a UTF-8 text file atomically.
+
+    Args:
+        path: The file to replace or create; its folder must exist.
+        text: The whole content.
+        durable: As for `atomic_writer`.
+
+    Raises:
+        OSError: The file can't be written.
+    """
+    with atomic_writer(path, durable=durable) as stream:
         stream.write(text.encode("utf-8"))
 
 
 def write_json(path: Path, value: object, *, durable: bool = True) -> None:
-    """Write `value` as indented JSON with sorted keys, atomically."""
+    """Write a value atomically as indented JSON with sorted keys.
+
+    Args:
+        path: The file to replace or create; its folder must exist.
+        value: Anything that `json.dumps` accepts.
+        durable: As for `atomic_writer`.
+
+    Raises:
+        OSError: The file can't be written.
+    """
     text = json.dumps(value, indent=1, sort_keys=True, ensure_ascii=False) + "\n"
     write_text(path, text, durable=durable)
-
-
-def path_of(text: str) -> Path:
-    """The path that a person wrote: `~` is a home, and where nobody has that name, itself."""
-    try:
-        return Path(text).expanduser()
-    except RuntimeError:
-        return Path(text)

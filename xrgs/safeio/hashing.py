@@ -1,4 +1,4 @@
-"""Hashes of values and of files: the names that results are found by."""
+"""Hashes of values, files and source code, from which results get their ids."""
 
 from __future__ import annotations
 
@@ -8,51 +8,85 @@ from pathlib import Path
 from typing import Any
 
 _PACKAGE = Path(__file__).parents[1]
-_SOURCES = frozenset({".py", ".cpp", ".h", ".txt"})
+_SOURCE_SUFFIXES = frozenset({".py", ".cpp", ".h", ".txt"})
 _CHUNK = 1 << 16  # bytes
 
 
-def canonical(value: object) -> str:
-    """`value` as JSON with sorted keys and no spaces: equal values give equal text."""
+def canonical_json(value: object) -> str:
+    """Serialise a value so that equal values give equal text: sorted keys, no spaces.
+
+    Args:
+        value: Anything that `json.dumps` accepts.
+
+    Returns:
+        One line of JSON.
+    """
     return json.dumps(value, sort_keys=True, separators=(",", ":"), ensure_ascii=False)
 
 
 def digest(value: object) -> str:
-    """The first 16 hexadecimal digits of the SHA-256 of `canonical(value)`."""
-    return hashlib.sha256(canonical(value).encode()).hexdigest()[:16]
+    """Hash a value.
+
+    Args:
+        value: Anything that `json.dumps` accepts.
+
+    Returns:
+        The first 16 hexadecimal digits of the SHA-256 of `canonical_json(value)`.
+    """
+    return hashlib.sha256(canonical_json(value).encode()).hexdigest()[:16]
 
 
-def plain(value: Any) -> Any:
-    """A config's dataclasses as dicts of the same values.
+def to_plain(value: Any) -> Any:
+    """Convert nested config dataclasses into nested dicts, as `dataclasses.asdict` does.
 
-    What `dataclasses.asdict` gives, eight times as fast: it copies every value deeply, and a plan
-    of ten thousand cells asks for each of them several times.
+    It is eight times as fast as `asdict`, which copies every value deeply; a plan of ten thousand
+    cells converts each config several times. The values are shared, not copied.
+
+    Args:
+        value: A dataclass instance; any other value is returned as it is.
+
+    Returns:
+        A dict with the fields in their order, or the value itself.
     """
     if hasattr(value, "__dataclass_fields__"):
-        return {name: plain(getattr(value, name)) for name in value.__dataclass_fields__}
+        return {name: to_plain(getattr(value, name)) for name in value.__dataclass_fields__}
     return value
 
 
 def file_digest(path: Path) -> str:
-    """SHA-256 of a file's bytes, in hexadecimal."""
-    total = hashlib.sha256()
+    """Hash a file's bytes.
+
+    Args:
+        path: The file.
+
+    Returns:
+        All 64 hexadecimal digits of the SHA-256.
+
+    Raises:
+        OSError: The file can't be read.
+    """
+    sha256 = hashlib.sha256()
     # hashlib.file_digest zeroes a buffer of 256 kB first, which takes longer than a small file.
     with path.open("rb", buffering=0) as stream:
         while chunk := stream.read(_CHUNK):
-            total.update(chunk)
-    return total.hexdigest()
+            sha256.update(chunk)
+    return sha256.hexdigest()
 
 
 def source_digests(*names: str) -> dict[str, str]:
-    """SHA-256 of source files, keyed by their path in this package.
+    """Hash source files of this package.
 
     Args:
-        names: Files and folders of the package; a folder stands for every source file inside.
+        names: Files and folders, relative to the package; a folder stands for every source file
+            below it.
+
+    Returns:
+        The SHA-256 of each file, keyed by its path in the package, with `/`, in sorted order.
     """
     roots = [_PACKAGE / name for name in names]
     files = [f for root in roots for f in ([root] if root.is_file() else root.rglob("*"))]
     return {
         file.relative_to(_PACKAGE).as_posix(): file_digest(file)
         for file in sorted(files)
-        if file.suffix in _SOURCES
+        if file.suffix in _SOURCE_SUFFIXES
     }

@@ -1,8 +1,8 @@
-"""A .npz from anybody: arrays of numbers, or an error. Nothing in it is run or unpacked.
+"""Reads an untrusted .npz archive into numeric arrays, without running or decompressing anything.
 
-`np.load` allocates what a header says before it looks whether so much follows, and unpacks a
-thousand bytes out of one. Here members are stored, not compressed, as `np.savez` and our own
-checkpoints are, so that the file's size bounds the memory.
+`np.load` allocates the size that an array's header declares before it checks how many bytes follow,
+and decompresses a thousand bytes out of one. This reader accepts only stored members, as `np.savez`
+and our own checkpoints write them, so that the size of the file bounds the memory that is needed.
 """
 
 from __future__ import annotations
@@ -18,24 +18,30 @@ from numpy.lib import format as npy
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-_HEADERS = {(1, 0): npy.read_array_header_1_0, (2, 0): npy.read_array_header_2_0}
-#: Bool, signed, unsigned, float: no objects, text or records.
-_KINDS = "biuf"
+_HEADER_READERS = {(1, 0): npy.read_array_header_1_0, (2, 0): npy.read_array_header_2_0}
+#: The admitted dtype kinds: bool, signed, unsigned and floating; no objects, text or records.
+_DTYPE_KINDS = "biuf"
 _CHUNK = 1 << 20  # bytes
 
 
 def read(stream: IO[bytes]) -> dict[str, NDArray[Any]]:
-    """Every array, by its name without `.npy`.
+    """Read every array of an archive.
+
+    Args:
+        stream: The archive, seekable.
+
+    Returns:
+        The arrays by member name without `.npy`, writable.
 
     Raises:
-        OSError: it can't be read.
-        ValueError: it is no such archive; the message says why.
+        OSError: The stream can't be read.
+        ValueError: It is not such an archive; the message says why.
     """
     try:
         return _read(stream)
     except OSError:
         raise
-    except Exception as error:  # a stranger's bytes lead zipfile and numpy to nearly any
+    except Exception as error:  # zipfile and numpy raise nearly anything on untrusted bytes
         raise ValueError(str(error) or type(error).__name__) from error
 
 
@@ -44,35 +50,39 @@ def _read(stream: IO[bytes]) -> dict[str, NDArray[Any]]:
     with zipfile.ZipFile(stream) as archive:
         members = archive.infolist()
         if any(member.compress_type != zipfile.ZIP_STORED for member in members):
-            raise ValueError("a member is compressed")
+            raise ValueError("a member of the archive is compressed")
         if sum(member.file_size for member in members) > size:
-            raise ValueError("its members are said to be larger than it")
-        arrays = {m.filename.removesuffix(".npy"): _array(archive, m) for m in members}
+            raise ValueError("the archive's members claim to be larger than the archive")
+        arrays = {m.filename.removesuffix(".npy"): _read_array(archive, m) for m in members}
     if len(arrays) < len(members):
-        raise ValueError("two members of one name")
+        raise ValueError("the archive has two members of one name")
     return arrays
 
 
-def _array(archive: zipfile.ZipFile, member: zipfile.ZipInfo) -> NDArray[Any]:
+def _read_array(archive: zipfile.ZipFile, member: zipfile.ZipInfo) -> NDArray[Any]:
     try:
         with archive.open(member) as stream:
-            return _content(stream, member)
+            return _parse_npy(stream, member)
     except zipfile.BadZipFile as error:
         raise ValueError(f"{member.filename} is damaged ({error})") from error
 
 
-def _content(stream: IO[bytes], member: zipfile.ZipInfo) -> NDArray[Any]:
+def _parse_npy(stream: IO[bytes], member: zipfile.ZipInfo) -> NDArray[Any]:
+    """Parse one .npy member, whose header must declare exactly the bytes that follow it."""
     version = npy.read_magic(stream)
-    if version not in _HEADERS:
-        raise ValueError(f"{member.filename}: .npy of version {version}")
-    shape, by_columns, dtype = _HEADERS[version](stream)
-    follow = member.file_size - stream.tell()
-    if dtype.kind not in _KINDS or math.prod(shape) * dtype.itemsize != follow:
-        raise ValueError(f"{member.filename}: {dtype} {shape} is not what follows")
-    array = np.empty(shape, dtype, order="F" if by_columns else "C")
-    flat = array.reshape(-1, order="A").view(np.uint8)
-    done = 0
-    while chunk := stream.read(_CHUNK):  # to its end, where the checksum is compared
-        flat[done : done + len(chunk)] = np.frombuffer(chunk, np.uint8)
-        done += len(chunk)
+    if version not in _HEADER_READERS:
+        raise ValueError(f"{member.filename}: .npy format version {version} is not supported")
+    shape, fortran_order, dtype = _HEADER_READERS[version](stream)
+    data_bytes = member.file_size - stream.tell()
+    if dtype.kind not in _DTYPE_KINDS or math.prod(shape) * dtype.itemsize != data_bytes:
+        raise ValueError(
+            f"{member.filename}: its header declares {dtype} {shape}, which is not the data that "
+            "follows it"
+        )
+    array = np.empty(shape, dtype, order="F" if fortran_order else "C")
+    buffer = array.reshape(-1, order="A").view(np.uint8)
+    filled = 0
+    while chunk := stream.read(_CHUNK):  # to the end, where zipfile compares the checksum
+        buffer[filled : filled + len(chunk)] = np.frombuffer(chunk, np.uint8)
+        filled += len(chunk)
     return array

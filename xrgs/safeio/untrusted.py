@@ -1,7 +1,7 @@
-"""Bytes that somebody else may have made: a store, a scene, weights from a stranger.
+"""Reads bytes and names that somebody else may have made: stores, photographs, weights.
 
-Nothing in them is run, no name in them leads anywhere else, and none of them takes more memory than
-its own size lets one expect.
+Nothing in them is executed, no name in them leads outside its folder, and none of them makes this
+process use more memory than the size of the file suggests.
 """
 
 from __future__ import annotations
@@ -15,23 +15,30 @@ import stat
 from pathlib import Path
 from typing import Any, BinaryIO
 
-#: Of a file that is read whole. The record of a sweep of a million cells is half of it.
-MOST_BYTES = 1 << 29
-#: Levels of JSON: what we write has six, and Python's own limit is an error of another kind.
-_DEEPEST = 50
-#: Of a name in bytes: file systems end at 255, and `.png` is still to come.
-_LONGEST_NAME = 251
+#: The largest file that is read whole. The record of a sweep of a million cells takes half of it.
+MAX_BYTES = 1 << 29
+#: The deepest nesting of JSON. Our own files have six levels; Python's own limit, far above this,
+#: is a RecursionError and not a ValueError.
+_MAX_DEPTH = 50
+#: The longest name in bytes: file systems end at 255, and `.png` may be appended.
+_MAX_NAME_BYTES = 251
 _NOT_IN_NAMES = re.compile(r"[/\\\x00-\x1f\x7f-\x9f\ud800-\udfff]")
 
 
 def open_regular(file: Path) -> BinaryIO:
-    """A regular file, opened to be read; its folders may be links, itself it may not.
+    """Open a regular file for reading, without following a link in the last part of its path.
 
-    A link would have us read what is not in the folder that we were given, and a named pipe wait
-    for ever.
+    A link could lead out of the folder that is to be read, and opening a named pipe would block
+    forever. The folders on the way to the file may be links.
+
+    Args:
+        file: The file.
+
+    Returns:
+        A binary stream.
 
     Raises:
-        OSError: missing, a link, a pipe, a device or a folder.
+        OSError: The file is missing, a link, a pipe, a device or a folder.
     """
     descriptor = os.open(file, os.O_RDONLY | os.O_CLOEXEC | os.O_NOFOLLOW | os.O_NONBLOCK)
     try:
@@ -43,24 +50,38 @@ def open_regular(file: Path) -> BinaryIO:
         raise
 
 
-def read_bytes(file: Path, most: int = MOST_BYTES) -> bytes:
-    """All of a regular file.
+def read_bytes(file: Path, max_bytes: int = MAX_BYTES) -> bytes:
+    """Read all of a regular file.
+
+    Args:
+        file: The file.
+        max_bytes: The largest size that is read; a file of exactly this size is.
+
+    Returns:
+        The content.
 
     Raises:
-        OSError: as of `open_regular`, or it is larger than `most` bytes.
+        OSError: As `open_regular`, or the file is larger than `max_bytes`.
     """
     with open_regular(file) as stream:
         size = os.fstat(stream.fileno()).st_size
-        if size > most:
-            raise OSError(errno.EFBIG, f"{size} bytes, at most {most} are read", str(file))
+        if size > max_bytes:
+            raise OSError(errno.EFBIG, f"{size} bytes, at most {max_bytes} are read", str(file))
         return stream.read()
 
 
 def parse_json(content: bytes) -> Any:
-    """JSON of a depth and with strings that can be handled further.
+    """Parse UTF-8 JSON of bounded depth whose strings can be encoded again.
+
+    Args:
+        content: The bytes of the JSON text.
+
+    Returns:
+        Dicts, lists, strings, numbers, booleans and None.
 
     Raises:
-        ValueError: anything else; a string of no valid Unicode too, which couldn't be printed.
+        ValueError: It is not JSON, is nested more than 50 levels deep, or has a string with half
+            of a surrogate pair, which could be neither printed nor written.
     """
     text = content.decode("utf-8")
     try:
@@ -68,15 +89,15 @@ def parse_json(content: bytes) -> Any:
     except RecursionError:
         raise ValueError("nested too deeply") from None
     if "\\u" in text:
-        json.dumps(value, ensure_ascii=False).encode()  # a half of a pair of surrogates
-    if text.count("[") + text.count("{") > _DEEPEST:
+        json.dumps(value, ensure_ascii=False).encode()  # fails on half of a surrogate pair
+    if text.count("[") + text.count("{") > _MAX_DEPTH:
         _check_depth(value)
     return value
 
 
 def _check_depth(value: Any) -> None:
     level = [value]
-    for _ in range(_DEEPEST):
+    for _ in range(_MAX_DEPTH):
         level = [
             inner
             for outer in level
@@ -89,36 +110,65 @@ def _check_depth(value: Any) -> None:
 
 
 def is_name(value: object) -> bool:
-    """Whether it can name one file or folder: nothing in it leads elsewhere or commands terminals.
+    """Tell whether a value can safely name one file or folder.
 
-    Any script, spaces, quotes and marks may be in it; slashes, control characters and what is no
-    valid Unicode may not.
+    Args:
+        value: Anything; only strings can be names.
+
+    Returns:
+        True for a string of at most 251 bytes that has no slash, backslash, control character or
+        lone surrogate, and is neither empty, `.` nor `..`. Any script, spaces and quotes may be in
+        it.
     """
     if not isinstance(value, str) or value in {"", ".", ".."} or _NOT_IN_NAMES.search(value):
         return False
-    return len(value.encode("utf-8")) <= _LONGEST_NAME
+    return len(value.encode("utf-8")) <= _MAX_NAME_BYTES
 
 
 def is_inside(value: object) -> bool:
-    """Whether it is a path of such names, with `/`, below the folder that it is meant in."""
+    """Tell whether a value is a relative path that stays below the folder it is relative to.
+
+    Args:
+        value: Anything; only strings can be paths.
+
+    Returns:
+        True where every part between slashes satisfies `is_name`.
+    """
     return isinstance(value, str) and all(is_name(part) for part in value.split("/"))
 
 
 def printable(text: str) -> str:
-    """`text` with a space for what can't be printed: terminals obey some of that."""
+    """Replace every character that can't be printed by a space, so that terminals obey none.
+
+    Args:
+        text: Any text.
+
+    Returns:
+        A text of the same length.
+    """
     return "".join(char if char.isprintable() else " " for char in text)
 
 
 def one_line(text: str) -> str:
-    """`text` without line breaks, runs of spaces and what can't be printed."""
+    """Make a text one printable line: `printable`, with every run of spaces reduced to one.
+
+    Args:
+        text: Any text.
+
+    Returns:
+        The line, without spaces at its ends.
+    """
     return " ".join(printable(text).split())
 
 
 def remove(path: Path) -> None:
-    """Take a file or folder away; of a link itself, never what it leads to.
+    """Remove a file, a folder with all that is in it, or a link, but never what a link leads to.
+
+    Args:
+        path: What to remove; nothing happens where nothing is there.
 
     Raises:
-        OSError: it is there and can't be.
+        OSError: It is there and can't be removed.
     """
     if path.is_dir() and not path.is_symlink():
         shutil.rmtree(path)

@@ -8,8 +8,8 @@ from collections import defaultdict
 from statistics import fmean
 from typing import TYPE_CHECKING, Any
 
-from xrgs.safeio.hashing import canonical
-from xrgs.safeio.records import StoreError
+from xrgs.errors import StoreError
+from xrgs.safeio.hashing import canonical_json
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping
@@ -66,8 +66,8 @@ class RuntimeEstimator:
 def _groups(identity: Mapping[str, Any]) -> Iterator[str]:
     """Yield the keys of the groups that a cell belongs to, from the most to the least similar."""
     program = {key: identity[key] for key in ("splat", "components", "variant")}
-    yield canonical(program | {"train": identity["train"]})
-    yield canonical(program | {"views": identity["train"]["views"]})
+    yield canonical_json(program | {"train": identity["train"]})
+    yield canonical_json(program | {"views": identity["train"]["views"]})
     yield str(identity["variant"])
     yield ""
 

@@ -21,8 +21,8 @@ from omegaconf import OmegaConf, flag_override
 
 from xrgs.errors import XrgsError
 from xrgs.runtime.machine import usable_cores
-from xrgs.runtime.progress import say
-from xrgs.safeio.hashing import plain
+from xrgs.runtime.progress import log_line
+from xrgs.safeio.hashing import to_plain
 from xrgs.splat.backend import resolve_backend
 from xrgs.sweep import locks
 from xrgs.sweep.jobs import worker
@@ -246,7 +246,7 @@ class Launches:
         self, cells: Sequence[PlannedCell], threads: int, store: Store
     ) -> dict[str, str]:
         if self._name != "basic":
-            say(f"hydra/launcher={self._name}: {len(cells)} cells, threads={threads} each")
+            log_line(f"hydra/launcher={self._name}: {len(cells)} cells, threads={threads} each")
         session = cast("SweepSession", self._session)
         overrides = [[f"cell={session.hand_over(_job_of(cell, threads))}"] for cell in cells]
         first, self._jobs = self._jobs, self._jobs + len(cells)
@@ -270,7 +270,7 @@ class Launches:
         try:
             return str(job.return_value)
         except Exception as error:
-            say(f"{cell.name}: {_first_line(error)}")
+            log_line(f"{cell.name}: {_first_line(error)}")
         state = store.cell(str(cell.cell_id)).state().name
         return self._after_silence(str(cell.cell_id), state) if state == "unfinished" else "failed"
 
@@ -297,12 +297,12 @@ class Launches:
             raise XrgsError(f"{reason}\nThe launcher began no cell.") from error
         self._suspects |= {cell_id for cell_id in states if states[cell_id] == "unfinished"}
         outcomes = {cell: self._after_silence(cell, state) for cell, state in states.items()}
-        say(f"{reason}\nof its {len(cells)} cells these are not finished:")
+        log_line(f"{reason}\nof its {len(cells)} cells these are not finished:")
         for cell in cells:
             outcome, state = outcomes[str(cell.cell_id)], states[str(cell.cell_id)]
             if state not in {"done", "failed"}:
                 note = state if outcome == LOST else f"lost {_MAX_LOSSES} times, not tried again"
-                say(f"  {cell.cell_id}  {cell.name}  ({note})")
+                log_line(f"  {cell.cell_id}  {cell.name}  ({note})")
         return outcomes
 
 
@@ -331,7 +331,7 @@ def _job_of(cell: PlannedCell, threads: int) -> HandOver:
     """Return what a job on any machine needs: paths in full, the backend chosen, its threads."""
     if cell.identity is None:
         raise ValueError(f"{cell.name}: launched without an identity")
-    conf = plain(cell.conf)
+    conf = to_plain(cell.conf)
     conf["store"] = str(Path(cell.conf.store).absolute())
     conf["splat"]["backend"] = resolve_backend(cell.conf.splat.backend)
     conf["threads"] = cell.conf.threads or threads

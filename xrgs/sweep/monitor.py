@@ -20,7 +20,7 @@ from tqdm import tqdm
 
 from xrgs.experiment.store import CellFolder
 from xrgs.runtime import progress
-from xrgs.runtime.progress import duration, say
+from xrgs.runtime.progress import format_duration, log_line
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
@@ -71,7 +71,7 @@ class RunningCell:
         less and less towards the end. The two are averaged, weighted by the share that is done.
         """
         past = None if self.cell.seconds is None else (1 - self.share) * self.cell.seconds
-        own = self.progress.left_s
+        own = self.progress.remaining_s
         if past is None or own is None:
             return own if past is None else past
         return (1 - self.share) * past + self.share * own
@@ -130,7 +130,7 @@ class SweepSnapshot:
         if rate := sum(1 / cell.pace for cell in self.running if cell.pace):
             parts.append(f"{rate:.3g} steps/s")
         if self.left_s is not None:
-            parts.append(f"{duration(self.left_s)} left")
+            parts.append(f"{format_duration(self.left_s)} left")
         return ", ".join(parts)
 
 
@@ -192,7 +192,7 @@ class SweepMonitor:
         if self._plan:
             snapshot = self.snapshot()
             if snapshot.ended != self._shown:
-                say(str(snapshot))
+                log_line(str(snapshot))
 
     def _folder(self, name: str) -> CellFolder:
         return CellFolder(self._cells / name)
@@ -272,7 +272,7 @@ class SweepMonitor:
         if sys.stderr.isatty():
             self._draw(snapshot)
         elif snapshot.ended != self._shown or time.monotonic() - self._shown_at > _LINE_S:
-            say(str(snapshot))
+            log_line(str(snapshot))
             self._shown, self._shown_at = snapshot.ended, time.monotonic()
 
     def _draw(self, snapshot: SweepSnapshot) -> None:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 from xrgs.capture import scenes
 from xrgs.experiment.identity import cell_identity
 from xrgs.experiment.store import BASELINE, CellState
-from xrgs.runtime.progress import duration
+from xrgs.runtime.progress import format_duration
 from xrgs.safeio.hashing import digest
 from xrgs.safeio.untrusted import printable
 
@@ -140,7 +140,7 @@ def describe(plan: Sequence[PlannedCell]) -> str:
         reason = (cell.error or cell.state.reason or "").partition("\n")[0]
         cell_id = cell.cell_id or ("no count yet" if cell.waits else "variant not built")
         to_train = not cell.error and state != "done"
-        time_left = duration(cell.seconds) if to_train else ""
+        time_left = format_duration(cell.seconds) if to_train else ""
         line = f"  {state:<10} {cell_id:<18} {time_left:>8}  {cell.name}"
         lines.append(printable(f"{line}  ({reason})" if reason else line))
     failed = any(cell.error or cell.state.name == "failed" for cell in plan)
@@ -159,7 +159,7 @@ def _remaining(plan: Sequence[PlannedCell]) -> str:
         return ""
     unknown = len(remaining) - len(known)
     more = f" and {unknown} cells without an estimate" if unknown else ""
-    return f"; left to train, one after another: {duration(sum(known))}{more}"
+    return f"; left to train, one after another: {format_duration(sum(known))}{more}"
 
 
 def record(plan: Sequence[PlannedCell]) -> list[dict[str, Any]]:

@@ -15,14 +15,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from xrgs import config
-from xrgs.errors import XrgsError
+from xrgs.errors import StoreError, XrgsError
 from xrgs.experiment import provenance
 from xrgs.experiment.identity import cell_identity
 from xrgs.experiment.store import CellFolder, Store
 from xrgs.runtime.machine import usable_cores
-from xrgs.runtime.progress import say
+from xrgs.runtime.progress import log_line
 from xrgs.safeio.hashing import digest, file_digest
-from xrgs.safeio.records import StoreError
 from xrgs.safeio.untrusted import printable
 from xrgs.splat.backend import resolve_backend
 from xrgs.sweep import variants
@@ -106,7 +105,7 @@ def rerun(
     before = [*_own_contradictions(original, identity, now), *_other_program(original, conf, now)]
     title = "differences from when the cell was trained"
     for line in _listed(before, title) or ["code, libraries and machine are the same"]:
-        say(line)
+        log_line(line)
     _provide(str(identity["variant"]), conf, home)
     repeated = CellFolder(out or _free_sibling(folder))
     _train_again(conf, home.variants / str(identity["variant"]), repeated, now, original)
@@ -200,7 +199,7 @@ def _provide(variant_id: str, conf: Conf, store: Store) -> None:
     """
     if (store.variants / variant_id).is_dir():
         return
-    say(f"variant {variant_id} is not in {store.path} and is built again")
+    log_line(f"variant {variant_id} is not in {store.path} and is built again")
     store.prepare()
     try:
         built = variants.build(conf, store)

@@ -17,7 +17,7 @@ from xrgs.errors import XrgsError
 from xrgs.experiment.identity import changed_code
 from xrgs.safeio import untrusted
 from xrgs.safeio.atomic import write_json
-from xrgs.safeio.hashing import canonical, digest
+from xrgs.safeio.hashing import canonical_json, digest
 from xrgs.safeio.records import read_object
 from xrgs.splat.backend import resolve_backend
 from xrgs.sweep import locks
@@ -171,8 +171,8 @@ def _contradiction(cell: HandOver, cell_id: str) -> str:
             type(config["limits"][name]) in {int, float} for name in ("minutes", "memory_gb")
         ),
     } | {
-        f"{key} differs between its config and its identity": canonical(config[key])
-        == canonical(identity[key])
+        f"{key} differs between its config and its identity": canonical_json(config[key])
+        == canonical_json(identity[key])
         for key in ("splat", "train", "components", "seed")
     }
     return next((problem for problem, holds in rules.items() if not holds), "")

@@ -7,10 +7,11 @@ from collections import Counter
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
-from xrgs.errors import XrgsError
+from xrgs.capture.failures import FAILED_PREFIX, failed_scenes
+from xrgs.errors import StoreError, XrgsError
 from xrgs.experiment.identity import training_code
 from xrgs.experiment.store import CellState, Store
-from xrgs.safeio.records import FAILED, StoreError, failed_scenes, read_json
+from xrgs.safeio.records import read_json
 from xrgs.safeio.untrusted import printable
 from xrgs.sweep import locks
 
@@ -92,7 +93,7 @@ def read(path: Path, *, verify: bool = False) -> StoreStatus:
 def _variants(store: Store) -> Iterator[str]:
     """Yield the frozen variants: not those being built, and not the reports of failed ones."""
     for folder in store.variants.glob("[!.]*-*"):
-        if not folder.name.startswith(FAILED):
+        if not folder.name.startswith(FAILED_PREFIX):
             yield folder.name
 
 

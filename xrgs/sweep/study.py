@@ -21,12 +21,11 @@ from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from xrgs.config import to_conf
-from xrgs.errors import XrgsError
+from xrgs.errors import StoreError, XrgsError
 from xrgs.evaluation.lpips import weights
 from xrgs.experiment.store import Store
-from xrgs.runtime.progress import say
-from xrgs.safeio.hashing import digest, plain
-from xrgs.safeio.records import StoreError
+from xrgs.runtime.progress import log_line
+from xrgs.safeio.hashing import digest, to_plain
 from xrgs.sweep import launch, locks, variants
 from xrgs.sweep.axes import CellSpec, expand
 from xrgs.sweep.estimate import RuntimeEstimator
@@ -98,9 +97,12 @@ class Study:
         plan = self._with_variants(plan, store, allow_build=not dry_run)
         plan = self._identified(plan, store)
         plan = estimated(plan, RuntimeEstimator(store))
-        say(describe(plan))
-        if weights.find() is None and any(cell.state.name != "done" for cell in plan):
-            say(f"LPIPS is not computed for the cells trained now (n/a in tables): {weights.HINT}")
+        log_line(describe(plan))
+        if weights.find_weights() is None and any(cell.state.name != "done" for cell in plan):
+            log_line(
+                "LPIPS is not computed for the cells trained now (n/a in tables): "
+                f"{weights.FETCH_HINT}"
+            )
         if dry_run:
             return True
         _tidy({cell.cell_id for cell in plan if cell.cell_id and cell.state.name == "done"}, store)
@@ -139,11 +141,11 @@ class Study:
                 raise StoreError(f"store={store.path} can't be written. {worker.NOTHING_LOST}")
             failed = conf.fail_fast and "failed" in outcomes.values()
             if reason := launches.stopped or (FAIL_FAST if failed else ""):
-                say(f"no further cell is started: {reason}")
+                log_line(f"no further cell is started: {reason}")
                 return list(plan)
             if not to_train and not waiting_said:
                 first = elsewhere[0]
-                say(f"waiting for {len(elsewhere)} cells: {first.name} {first.state.reason}")
+                log_line(f"waiting for {len(elsewhere)} cells: {first.name} {first.state.reason}")
                 waiting_said = True
             if not begun:
                 time.sleep(_POLL_S)
@@ -201,7 +203,7 @@ class Study:
         results: dict[str, tuple[str | None, str | None]] = {}
         cells = []
         for cell in plan:
-            key = digest([plain(cell.conf.scene), plain(cell.conf.variant)])
+            key = digest([to_plain(cell.conf.scene), to_plain(cell.conf.variant)])
             if key not in results:
                 results[key] = variants.plan(cell.conf, store, allow_build=allow_build)
             variant_id, error = results[key]

@@ -6,9 +6,8 @@ from dataclasses import asdict
 from typing import TYPE_CHECKING
 
 from xrgs.capture import scenes, variant
-from xrgs.errors import XrgsError
-from xrgs.runtime.progress import say
-from xrgs.safeio.records import StoreError
+from xrgs.errors import StoreError, XrgsError
+from xrgs.runtime.progress import log_line
 from xrgs.sweep.jobs import worker
 
 if TYPE_CHECKING:
@@ -44,7 +43,7 @@ def build(conf: Conf, store: Store) -> str:
         UnwritableError: The disk is full or can't be written.
         XrgsError: The photographs are missing, or can't be made into a variant.
     """
-    say(f"{scenes.label(conf.scene)}: building the mixed-resolution variant")
+    log_line(f"{scenes.label(conf.scene)}: building the mixed-resolution variant")
     answer = worker.run_in_child("variant", {"conf": asdict(conf), "store": str(store.path)})
     return str(answer["variant"])
 
@@ -95,7 +94,7 @@ def plan(conf: Conf, store: Store, *, allow_build: bool) -> tuple[str | None, st
     except worker.UnwritableError as error:
         raise StoreError(f"store={store.path}: {error}. {worker.NOTHING_LOST}") from error
     except XrgsError as error:
-        say(f"{scenes.label(conf.scene)}: {error}")
+        log_line(f"{scenes.label(conf.scene)}: {error}")
         if allow_build:
             # COLMAP dies of a full disk without saying so, which is no fault of the scene.
             store.prepare()

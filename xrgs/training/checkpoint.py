@@ -18,7 +18,7 @@ import torch
 
 from xrgs.errors import XrgsError
 from xrgs.safeio import npz, untrusted
-from xrgs.safeio.atomic import replacing
+from xrgs.safeio.atomic import atomic_writer
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -145,7 +145,7 @@ def _save(file: Path, state: State) -> None:
     arrays: dict[str, NDArray[Any]] = {}
     text = json.dumps(_without_tensors(state, "", arrays))
     arrays[_PLAIN] = np.frombuffer(text.encode(), np.uint8)
-    with replacing(file) as stream, zipfile.ZipFile(stream, "w") as archive:
+    with atomic_writer(file) as stream, zipfile.ZipFile(stream, "w") as archive:
         for name, array in arrays.items():
             with archive.open(name, "w", force_zip64=True) as member:
                 np.lib.format.write_array(member, array, allow_pickle=False)

@@ -1,4 +1,4 @@
-"""Downloads against a server that cuts, refuses, forgets ranges or sends something else."""
+"""Downloads from a server that cuts, refuses, ignores ranges or sends something else."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from xrgs.capture.download import http as fetch
 from xrgs.capture.download.http import DownloadError, TooLargeError, download
 
 CONTENT = random.Random(0).randbytes(700_000)
-#: Of bytes that a download may have: these very ones.
+#: The largest size that is accepted: exactly the content's.
 MOST = len(CONTENT)
 SHA256 = hashlib.sha256(CONTENT).hexdigest()
 
@@ -34,7 +34,7 @@ def part(target: Path, content: bytes | None = None) -> Path:
 
 
 @pytest.mark.parametrize("sha256", ["", SHA256, SHA256.upper()])
-def test_a_file_arrives_whole(server: Any, target: Path, sha256: str) -> None:
+def test_a_file_is_downloaded_completely(server: Any, target: Path, sha256: str) -> None:
     server.content = CONTENT
     download(server.url, target, MOST, sha256)
     assert target.read_bytes() == CONTENT
@@ -42,14 +42,14 @@ def test_a_file_arrives_whole(server: Any, target: Path, sha256: str) -> None:
     assert server.asked == [None]
 
 
-def test_a_cut_connection_is_taken_up_where_it_broke(server: Any, target: Path) -> None:
+def test_a_lost_connection_is_resumed(server: Any, target: Path) -> None:
     server.content, server.cuts = CONTENT, [300_000, 1000]
     download(server.url, target, MOST, SHA256)
     assert target.read_bytes() == CONTENT
     assert server.asked == [None, "bytes=300000-", "bytes=301000-"]
 
 
-def test_a_server_that_gives_nothing_more_is_left_and_what_came_is_kept(
+def test_a_server_that_sends_no_more_is_given_up_and_the_part_is_kept(
     server: Any, target: Path
 ) -> None:
     server.content, server.cuts = CONTENT, [300_000, 0]
@@ -77,24 +77,26 @@ def test_a_server_without_ranges_that_cuts_does_not_loop(server: Any, target: Pa
     assert len(server.asked) == 2
 
 
-def test_all_that_was_missing_was_the_name(server: Any, target: Path) -> None:
+def test_a_complete_part_is_only_renamed(server: Any, target: Path) -> None:
     server.content = CONTENT
     part(target, CONTENT)
     download(server.url, target, MOST, SHA256)
     assert target.read_bytes() == CONTENT
 
 
-def test_more_than_there_is_was_of_another_file(server: Any, target: Path) -> None:
+def test_a_part_longer_than_the_file_is_discarded(server: Any, target: Path) -> None:
     server.content = CONTENT
     part(target, CONTENT + b"more")
     download(server.url, target, MOST, SHA256)
     assert target.read_bytes() == CONTENT
 
 
-def test_a_range_that_was_not_asked_for_is_refused(server: Any, target: Path) -> None:
+def test_another_range_than_the_requested_one_is_refused(server: Any, target: Path) -> None:
     server.content, server.shift = CONTENT, 5
     part(target, CONTENT[:1000])
-    with pytest.raises(DownloadError, match="asked for what follows 1000, given 1005"):
+    with pytest.raises(
+        DownloadError, match="requested the bytes from 1000 on, received those from 1005"
+    ):
         download(server.url, target, MOST)
 
 
@@ -105,7 +107,7 @@ def test_another_content_is_not_kept(server: Any, target: Path) -> None:
     assert list(target.parent.iterdir()) == []
 
 
-def test_a_server_that_falls_silent_is_left(
+def test_a_silent_server_is_given_up(
     server: Any, target: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     server.content, server.stall = CONTENT, 0.6
@@ -115,26 +117,24 @@ def test_a_server_that_falls_silent_is_left(
 
 
 @pytest.mark.parametrize("length", [True, False], ids=["said", "not said"])
-def test_more_bytes_than_are_allowed_are_not_written(
-    server: Any, target: Path, length: bool
-) -> None:
+def test_bytes_beyond_the_limit_are_not_written(server: Any, target: Path, length: bool) -> None:
     server.content, server.length = CONTENT, length
     for before in (b"", CONTENT[:1000]):
         part(target, before)
         with pytest.raises(
-            TooLargeError, match=rf"{server.url}: \d+ bytes .* {MOST - 1} is the most"
+            TooLargeError, match=rf"{server.url}: \d+ bytes .* at most {MOST - 1} are allowed"
         ):
             download(server.url, target, MOST - 1, SHA256)
         assert not target.exists()
         there = len(part(target).read_bytes())
         assert there == len(before) if length else len(before) < there < MOST
-    download(server.url, target, MOST, SHA256)  # what came is no loss
+    download(server.url, target, MOST, SHA256)  # what was received is not lost
     assert target.read_bytes() == CONTENT
     assert server.asked[-1] is not None
 
 
 @pytest.mark.parametrize("there", [MOST, MOST + 4])
-def test_what_came_before_counts_too(server: Any, target: Path, there: int) -> None:
+def test_the_part_counts_towards_the_limit(server: Any, target: Path, there: int) -> None:
     server.content = CONTENT
     part(target, (CONTENT + b"more")[:there])
     with pytest.raises(TooLargeError, match=f"{MOST} bytes"):
@@ -149,17 +149,17 @@ def test_a_refusal_is_named(server: Any, target: Path, status: int) -> None:
         download(server.url, target, MOST)
 
 
-def test_a_web_page_is_no_archive(server: Any, target: Path) -> None:
+def test_a_web_page_is_refused(server: Any, target: Path) -> None:
     server.content, server.content_type = b"<html>", "text/html; charset=utf-8"
     with pytest.raises(DownloadError, match="sent a web page"):
         download(server.url, target, MOST)
     assert not target.exists()
 
 
-def test_offline_is_said_with_address_and_file(target: Path) -> None:
+def test_an_unreachable_server_is_named_with_the_file(target: Path) -> None:
     with socket.create_server(("127.0.0.1", 0)) as taken:
         url = f"http://127.0.0.1:{taken.getsockname()[1]}/x.zip"
-    with pytest.raises(DownloadError, match=rf"{url}: can't be had \(.*refused.*{target}"):
+    with pytest.raises(DownloadError, match=rf"{url}: can't be downloaded \(.*refused.*{target}"):
         download(url, target, MOST)
 
 

@@ -1,4 +1,4 @@
-"""`xrgs-data download` against a loopback server, as a user meets it."""
+"""`xrgs-data download` from a server on the loopback interface."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def llff() -> bytes:
     return archive.getvalue()
 
 
-def test_only_the_wanted_scenes_appear_and_finished_ones_are_not_touched(
+def test_only_the_named_scenes_are_unpacked_and_existing_ones_kept(
     xrgs_data: Run, server: Any, tmp_path: Path, llff: bytes
 ) -> None:
     server.content, server.cuts = llff, [100]
@@ -47,7 +47,7 @@ def test_only_the_wanted_scenes_appear_and_finished_ones_are_not_touched(
     mine = tmp_path / "here" / "fern" / "images_4" / "0.png"
     Image.new("RGB", (4, 3), "red").save(mine)
     before = mine.read_bytes()
-    server.status = 500  # what is here is not asked for again
+    server.status = 500  # the archive is not requested again
     code, out, err = xrgs_data("download", "llff", "fern", "room", url, "data_root=here")
     assert code == 0, err
     assert "here/fern: there already" in out

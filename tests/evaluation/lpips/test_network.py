@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from xrgs.capture import images
-from xrgs.capture.scenes.bundled import photograph
-from xrgs.evaluation.lpips.network import SMALLEST, distance
+from xrgs.capture.scenes.bundled import bundled_photograph
+from xrgs.evaluation.lpips.network import MIN_SIDE, distance
 from xrgs.evaluation.lpips.weights import Weights
 
 Array = NDArray[np.float64]
@@ -30,11 +30,12 @@ def tensors(weights: Weights, dtype: torch.dtype = torch.float32) -> dict[str, T
 
 
 def convolve(x: Array, weight: Array, bias: Array, stride: int, padding: int) -> Array:
-    """Of [C, H, W]: every output pixel is a sum over one window."""
+    """Convolve [C, H, W]: every output pixel is a sum over one window."""
     size = weight.shape[-1]
     padded = np.pad(x, ((0, 0), (padding, padding), (padding, padding)))
     windows = sliding_window_view(padded, (size, size), axis=(1, 2))[:, ::stride, ::stride]
-    return np.einsum("chwij,ocij->ohw", windows, weight, optimize=True) + bias[:, None, None]
+    sums: Array = np.einsum("chwij,ocij->ohw", windows, weight, optimize=True)
+    return sums + bias[:, None, None]
 
 
 def by_definition(image: Tensor, target: Tensor, weights: Weights) -> float:
@@ -76,7 +77,7 @@ def test_it_is_a_distance(random_weights: Weights) -> None:
     assert 0 < distance(image, near, known) < distance(image, target, known)
 
 
-@pytest.mark.parametrize("size", [(SMALLEST - 1, 60), (60, SMALLEST - 1)])
+@pytest.mark.parametrize("size", [(MIN_SIDE - 1, 60), (60, MIN_SIDE - 1)])
 def test_an_image_that_does_not_reach_the_last_layer_is_refused(
     random_weights: Weights, size: tuple[int, int]
 ) -> None:
@@ -85,7 +86,7 @@ def test_an_image_that_does_not_reach_the_last_layer_is_refused(
 
 
 def astronaut() -> Tensor:
-    return torch.from_numpy(images.read(photograph("astronaut.png")))[:375, :500]
+    return torch.from_numpy(images.read(bundled_photograph("astronaut.png")))[:375, :500]
 
 
 def blocks(image: Tensor) -> Tensor:

@@ -1,4 +1,4 @@
-"""Where LPIPS's weights are looked for, and what is refused in place of them."""
+"""Where the weights of LPIPS are searched, and what is refused in their place."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from xrgs.experiment import provenance
 
 @pytest.fixture
 def known(random_weights: Weights, monkeypatch: pytest.MonkeyPatch) -> Weights:
-    """Random weights that pass for the published ones."""
+    """Random weights that are accepted as the published ones."""
     monkeypatch.setattr(weights, "CONTENT_SHA256", weights.content_digest(random_weights))
     return random_weights
 
@@ -27,7 +27,7 @@ def known(random_weights: Weights, monkeypatch: pytest.MonkeyPatch) -> Weights:
 def nowhere(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
     """A machine without weights; its cache."""
     monkeypatch.setenv("XRGS_CACHE", str(tmp_path / "cache"))
-    monkeypatch.delenv(weights.EXPLICIT, raising=False)
+    monkeypatch.delenv(weights.PATH_VARIABLE, raising=False)
     monkeypatch.setattr(weights, "_PACKAGE", "xrgs_test_weights")
     return tmp_path / "cache"
 
@@ -52,7 +52,7 @@ def same(a: Weights, b: Weights) -> bool:
     return a.keys() == b.keys() and all(np.array_equal(a[name], b[name]) for name in a)
 
 
-def test_what_is_saved_is_loaded_without_a_pickle(known: Weights, tmp_path: Path) -> None:
+def test_saved_weights_are_loaded_without_a_pickle(known: Weights, tmp_path: Path) -> None:
     file = tmp_path / "made" / "w.npz"
     weights.save(known, file)
     assert same(weights.load(file), known)
@@ -98,7 +98,7 @@ class Evil:
 
 def test_a_pickle_that_calls_something_is_refused_before_the_call(tmp_path: Path) -> None:
     content = pickle.dumps({"a": Evil(tmp_path / "made")})
-    with pytest.raises(WeightsError, match=r"w\.ckpt: its pickle asks for posix\.mkdir"):
+    with pytest.raises(WeightsError, match=r"w\.ckpt: its pickle refers to posix\.mkdir"):
         weights.read_pickle(content, "w.ckpt")
     assert not (tmp_path / "made").exists()
     pickle.loads(content)  # noqa: S301  it would have done it
@@ -126,7 +126,7 @@ def test_a_file_of_something_else_is_named(tmp_path: Path, content: bytes) -> No
 
 def test_an_npz_that_needs_a_pickle_is_refused(tmp_path: Path) -> None:
     np.savez(tmp_path / "w.npz", a=np.array([Evil(tmp_path / "made")], dtype=object))
-    with pytest.raises(WeightsError, match="not a file of arrays"):
+    with pytest.raises(WeightsError, match="not an archive of arrays"):
         weights.load(tmp_path / "w.npz")
     assert not (tmp_path / "made").exists()
 
@@ -134,24 +134,24 @@ def test_an_npz_that_needs_a_pickle_is_refused(tmp_path: Path) -> None:
 def test_the_places_in_order(
     nowhere: Path, known: Weights, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    assert weights.find() is None
-    assert weights.published() is None
+    assert weights.find_weights() is None
+    assert weights.load_published() is None
     package = tmp_path / "xrgs_test_weights"
     (package / "weights").mkdir(parents=True)
     (package / "__init__.py").write_text("raise ImportError('it was imported')")
     installed = package / "weights" / "alexnet.ckpt"
     monkeypatch.syspath_prepend(tmp_path)
-    assert weights.find() is None
+    assert weights.find_weights() is None
     installed.write_bytes(b"x")
-    assert weights.find() == installed
+    assert weights.find_weights() == installed
     weights.save(known, weights.cache_file())
-    assert weights.find() == weights.cache_file()
+    assert weights.find_weights() == weights.cache_file()
     assert weights.cache_file().parent == nowhere
-    monkeypatch.setenv(weights.EXPLICIT, str(installed))
-    assert weights.find() == installed
-    monkeypatch.setenv(weights.EXPLICIT, str(tmp_path / "gone"))
+    monkeypatch.setenv(weights.PATH_VARIABLE, str(installed))
+    assert weights.find_weights() == installed
+    monkeypatch.setenv(weights.PATH_VARIABLE, str(tmp_path / "gone"))
     with pytest.raises(WeightsError, match=r"XRGS_LPIPS=.*gone: no such file"):
-        weights.find()
+        weights.find_weights()
 
 
 def test_the_cache_is_where_the_system_says(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -164,16 +164,14 @@ def test_the_cache_is_where_the_system_says(monkeypatch: pytest.MonkeyPatch) -> 
     assert weights.cache_folder() == Path.home() / "mine"
 
 
-def test_a_cells_provenance_tells_whether_lpips_was_to_be_had(
-    nowhere: Path, known: Weights
-) -> None:
+def test_a_cells_provenance_has_the_hash_of_the_weights(nowhere: Path, known: Weights) -> None:
     key = "lpips_weights_sha256"
     assert provenance.collect(1, "torch")[key] is None
     weights.save(known, weights.cache_file())
     assert provenance.collect(1, "torch")[key] == weights.content_digest(known)
 
 
-def test_weights_that_are_spoilt_stop_a_cell_before_it_trains(
+def test_spoilt_weights_stop_a_cell_before_it_trains(
     nowhere: Path, random_weights: Weights
 ) -> None:
     weights.save(random_weights, weights.cache_file())

@@ -81,7 +81,7 @@ def test_evaluation_renders_as_training_does(
     scores = {}
     for setting in (False, True):
         baseline.splat.raster.antialiased = setting
-        (row,) = protocol.score(gaussians, [view], baseline.splat, tmp_path)
+        (row,) = protocol.score_views(gaussians, [view], baseline.splat, tmp_path)
         scores[setting] = row["psnr"]
     assert scores[antialiased] > 100
     assert scores[not antialiased] < 60

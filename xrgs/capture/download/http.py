@@ -1,4 +1,4 @@
-"""A file from a web server, resumed where it broke off, whole or not there at all."""
+"""Downloads a file from a web server, and resumes an interrupted download."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from urllib.parse import urlsplit
 from urllib.request import Request, urlopen
 
 from xrgs.errors import XrgsError
-from xrgs.runtime.progress import Bar
+from xrgs.runtime.progress import ProgressBar
 from xrgs.safeio.hashing import file_digest
 
 if TYPE_CHECKING:
@@ -25,55 +25,64 @@ _CHUNK = 1 << 18
 
 
 class DownloadError(XrgsError):
-    """A file that could not be had; the message names the address and the file."""
+    """A file can't be downloaded; the message names the address and the file."""
 
 
 class TooLargeError(DownloadError):
-    """A file of more bytes than were allowed."""
+    """A file is larger than allowed."""
 
 
-class _Cut(Exception):  # noqa: N818  caught here: a state, not an error that anyone is shown
-    """The connection ended early."""
+class _ConnectionLost(Exception):  # noqa: N818  caught in this module, and never shown
+    """The server can't be reached, or the connection ended early."""
 
 
 def is_url(text: str) -> bool:
-    """Whether `text` is an address that `download` can read."""
+    """Tell whether a text is an address that `download` can read.
+
+    Args:
+        text: Any text.
+
+    Returns:
+        True for http and https addresses.
+    """
     return urlsplit(text).scheme in ("http", "https")
 
 
 def download(url: str, target: Path, max_bytes: int, sha256: str = "") -> None:
-    """Fetch `url` into `target`; what came before a break waits in `<target>.part`.
+    """Download a file; what an interrupted download received is kept in `<target>.part`.
 
-    A broken connection is taken up again for as long as each try brings something.
+    A lost connection is resumed for as long as each attempt receives something.
 
     Args:
-        url: http or https.
-        target: The file; its folder is made. Only a whole file ever has this name.
-        max_bytes: The most that is taken, whatever the server says or sends.
-        sha256: What the content must have, in hexadecimal; empty: not verified.
+        url: An http or https address.
+        target: The file to write; its folder is made. Only a complete file ever has this name.
+        max_bytes: The largest size that is accepted, whatever the server announces or sends.
+        sha256: The expected SHA-256, in hexadecimal; empty to verify nothing.
 
     Raises:
-        TooLargeError: it has more; what came of it waits, for a larger `max_bytes`.
-        DownloadError: unreachable, refused, another content, or the disk can't take it.
+        TooLargeError: The file is larger than `max_bytes`; what was received is kept, for a call
+            with a larger one.
+        DownloadError: The server is unreachable or refuses, the content has another hash, or the
+            disk can't take it.
     """
     if not is_url(url):
         raise DownloadError(f"{url or 'an empty address'}: only http and https are read")
     part = target.with_name(f"{target.name}.part")
     try:
         part.parent.mkdir(parents=True, exist_ok=True)
-        with part.open("ab") as stream, _alone(stream, target):
-            _all_of(url, stream, target, max_bytes)
-        if sha256 and (found := file_digest(part)) != sha256.lower():
+        with part.open("ab") as stream, _exclusive(stream, target):
+            _receive_all(url, stream, target, max_bytes)
+        if sha256 and (actual := file_digest(part)) != sha256.lower():
             part.unlink()
-            raise DownloadError(f"{url}: sha256 is {found}, expected {sha256}; it was not kept")
+            raise DownloadError(f"{url}: sha256 is {actual}, expected {sha256}; it was not kept")
         part.replace(target)
     except OSError as error:
         raise DownloadError(f"{part}: {error.strerror or error}") from error
 
 
 @contextmanager
-def _alone(stream: IO[bytes], target: Path) -> Iterator[None]:
-    """Two processes that append to one file would spoil it."""
+def _exclusive(stream: IO[bytes], target: Path) -> Iterator[None]:
+    """Lock the file: two processes that append to it would spoil it."""
     try:
         fcntl.flock(stream, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except BlockingIOError as error:
@@ -81,44 +90,45 @@ def _alone(stream: IO[bytes], target: Path) -> Iterator[None]:
     yield
 
 
-def _all_of(url: str, stream: IO[bytes], target: Path, max_bytes: int) -> None:
+def _receive_all(url: str, stream: IO[bytes], target: Path, max_bytes: int) -> None:
+    """Receive until the file is complete, or an attempt brings nothing."""
     while True:
         before = stream.tell()
         try:
             _receive(url, stream, target.name, max_bytes)
             return
-        except _Cut as cut:
+        except _ConnectionLost as lost:
             if stream.tell() > before:
                 continue
-            kept = f"; {before} bytes are kept for the next try" if before else ""
-            raise DownloadError(f"{url}: can't be had ({cut}) for {target}{kept}") from cut
+            kept = f"; {before} bytes are kept for the next attempt" if before else ""
+            raise DownloadError(f"{url}: can't be downloaded ({lost}) to {target}{kept}") from lost
 
 
 def _receive(url: str, stream: IO[bytes], label: str, max_bytes: int) -> None:
-    """Append what is missing.
+    """Request and append the missing part of the file.
 
     Raises:
-        _Cut: the server can't be reached, or the connection ended early.
-        DownloadError: the server has no such file, or one that is too large.
-        OSError: the disk.
+        _ConnectionLost: The server can't be reached, or the connection ended early.
+        DownloadError: The server has no such file, or one that is too large.
+        OSError: The disk can't take it.
     """
-    have = stream.tell()
+    received = stream.tell()
     headers = {"User-Agent": "xrgs", "Accept-Encoding": "identity"}
-    if have:
-        headers["Range"] = f"bytes={have}-"
+    if received:
+        headers["Range"] = f"bytes={received}-"
     try:
         response = urlopen(Request(url, headers=headers), timeout=_TIMEOUT)  # noqa: S310  is_url
     except HTTPError as error:
         error.close()
-        if error.code != 416 or not have:
+        if error.code != 416 or not received:
             raise DownloadError(f"{url}: the server says {error.code} {error.reason}") from error
-        if _span(error.headers.get("Content-Range"))[1] != have:
-            _empty(stream)  # longer than the file: of another one
+        if _parse_range(error.headers.get("Content-Range"))[1] != received:
+            _truncate(stream)  # more than the file has: it is of another one
             _receive(url, stream, label, max_bytes)
-        _not_beyond(url, stream.tell(), max_bytes)
-        return  # all of it came before, and only its end was not seen
+        _check_size(url, stream.tell(), max_bytes)
+        return  # the whole file was received before
     except (URLError, OSError, HTTPException) as error:
-        raise _Cut(str(getattr(error, "reason", error))) from error
+        raise _ConnectionLost(str(getattr(error, "reason", error))) from error
     with response:
         _append(url, response, stream, label, max_bytes)
 
@@ -130,29 +140,31 @@ def _append(
         raise DownloadError(f"{url}: the server sent a web page, not the file")
     length = response.headers.get("Content-Length")
     total = int(length) if length else None
-    start, whole = _span(response.headers.get("Content-Range"))
+    start, length_of_file = _parse_range(response.headers.get("Content-Range"))
     if response.status == 206 and start == stream.tell():
-        total = whole
+        total = length_of_file
     elif response.status == 206:
-        raise DownloadError(f"{url}: asked for what follows {stream.tell()}, given {start}")
-    _not_beyond(url, total or 0, max_bytes)
+        raise DownloadError(
+            f"{url}: requested the bytes from {stream.tell()} on, received those from {start} on"
+        )
+    _check_size(url, total or 0, max_bytes)
     if response.status != 206:
-        _empty(stream)  # the server knows no ranges: from the beginning
-    with Bar(label, "byte", total, done=stream.tell()) as bar:
+        _truncate(stream)  # the server does not support ranges: start again
+    with ProgressBar(label, "byte", total, done=stream.tell()) as bar:
         while chunk := _read(response):
-            _not_beyond(url, stream.tell() + len(chunk), max_bytes)
+            _check_size(url, stream.tell() + len(chunk), max_bytes)
             stream.write(chunk)
             bar.update(len(chunk))
     if total is not None and stream.tell() != total:
-        raise _Cut(f"the connection ended after {stream.tell()} of {total} bytes")
+        raise _ConnectionLost(f"the connection ended after {stream.tell()} of {total} bytes")
 
 
-def _not_beyond(url: str, size: int, max_bytes: int) -> None:
+def _check_size(url: str, size: int, max_bytes: int) -> None:
     if size > max_bytes:
-        raise TooLargeError(f"{url}: {size} bytes or more, and {max_bytes} is the most allowed")
+        raise TooLargeError(f"{url}: {size} bytes or more, and at most {max_bytes} are allowed")
 
 
-def _empty(stream: IO[bytes]) -> None:
+def _truncate(stream: IO[bytes]) -> None:
     stream.seek(0)
     stream.truncate()
 
@@ -161,13 +173,13 @@ def _read(response: HTTPResponse) -> bytes:
     try:
         return response.read(_CHUNK)
     except (OSError, HTTPException) as error:
-        raise _Cut(str(error) or repr(error)) from error
+        raise _ConnectionLost(str(error) or repr(error)) from error
 
 
-def _span(header: str | None) -> tuple[int | None, int | None]:
-    """First byte and whole length of a `Content-Range`, each None where it says none."""
+def _parse_range(header: str | None) -> tuple[int | None, int | None]:
+    """Parse the first byte and the total length of a `Content-Range`, each None if missing."""
     match = re.fullmatch(r"bytes (?:(\d+)-\d+|\*)/(\d+|\*)", header or "")
     if match is None:
         return None, None
-    start, whole = match.groups()
-    return (int(start) if start else None), (int(whole) if whole.isdigit() else None)
+    start, total = match.groups()
+    return (int(start) if start else None), (int(total) if total.isdigit() else None)

@@ -1,4 +1,4 @@
-"""What a published set of scenes is, as `conf/data/` describes it."""
+"""The config schema of a published set of scenes, whose values are in `conf/data/`."""
 
 from __future__ import annotations
 
@@ -7,18 +7,19 @@ from dataclasses import dataclass, field
 
 @dataclass
 class DatasetConf:
-    """One archive of scenes, a folder each."""
+    """One archive of scenes, each in a folder of its own."""
 
     url: str = ""
+    """The address to download the archive from."""
     page: str = ""
-    """Where a person finds the archive with a browser."""
+    """The web page where a person finds the archive with a browser."""
     file: str = ""
-    """The archive's name on disk."""
+    """The archive's file name on disk."""
     max_bytes: int = 0
-    """The most that is downloaded for it, whatever the server says or sends."""
+    """The largest size that is downloaded, in bytes, whatever the server announces or sends."""
     sha256: str = ""
-    """Of the archive, in hexadecimal; empty where it is not known."""
+    """The archive's SHA-256, in hexadecimal; empty where it is not known."""
     folder: str = ""
     """The folder in the archive that holds the scenes' folders."""
     scenes: list[str] = field(default_factory=list)
-    """All that the archive holds."""
+    """The names of all scenes in the archive."""

@@ -1,4 +1,7 @@
-"""Where photographs come from: embedded scenes and folders. Light until a scene is resolved."""
+"""Provides the photographs of a scene: of a folder, or of a scene embedded in this package.
+
+Nothing here imports torch before an embedded scene is rendered.
+"""
 
 from __future__ import annotations
 
@@ -11,7 +14,7 @@ from typing import TYPE_CHECKING
 from xrgs.capture.scenes import folder, motorcycle, procedural
 from xrgs.capture.scenes.scene import Scene
 from xrgs.errors import XrgsError
-from xrgs.safeio.atomic import path_of
+from xrgs.safeio.paths import user_path
 
 if TYPE_CHECKING:
     from xrgs.config import SceneConf
@@ -22,78 +25,92 @@ _KINDS = ("procedural", "motorcycle", "folder")
 
 
 def label(conf: SceneConf) -> str:
-    """The scene's name in tables: `scene.name`, or where that is empty the folder's own name."""
+    """Return the scene's name in tables.
+
+    Args:
+        conf: The scene's config.
+
+    Returns:
+        `scene.name`; where that is empty, the name of the folder, or the kind of the scene.
+    """
     if conf.name:
         return conf.name
-    return path_of(conf.path).resolve().name if conf.path else conf.kind
+    return user_path(conf.path).resolve().name if conf.path else conf.kind
 
 
 def fingerprint(conf: SceneConf, long_side: int = 0) -> str:
-    """Hash of what the photographs are, 16 hex digits, without rendering or decoding them.
+    """Hash the photographs of a scene, without rendering or decoding them.
 
     Args:
-        conf: The scene.
-        long_side: Longer side that is wanted, px; 0 is the full size. A folder may hold several
-            sizes, and the procedural scene is rendered at the size asked for.
+        conf: The scene's config.
+        long_side: `variant.long_side`: the longer side of the HR views, px; 0 for the full size. A
+            folder may hold copies of several sizes, and the procedural scene is rendered in it.
+
+    Returns:
+        16 hexadecimal digits.
 
     Raises:
-        XrgsError: an unknown kind, or photographs that are not there.
+        XrgsError: The kind is unknown, or the photographs are not there.
     """
     _check(conf)
     if conf.kind == "folder":
-        content = folder.digest(folder.photographs(conf.path, long_side))
+        content = folder.files_digest(folder.list_photographs(conf.path, long_side))
     elif conf.kind == "motorcycle":
         calibration = repr([(n, k.tolist()) for n, k in motorcycle.intrinsics().items()])
-        content = folder.digest(motorcycle.files()) + calibration
+        content = folder.files_digest(motorcycle.files()) + calibration
     else:
         content = procedural.digest(long_side, conf.views)
     return hashlib.sha256(f"{conf.kind}\0{content}".encode()).hexdigest()[:16]
 
 
 def resolve(conf: SceneConf, cache: Path, long_side: int = 0) -> Scene:
-    """The scene's photographs on disk; an embedded scene is rendered into `cache` the first time.
+    """Find a scene's photographs on disk; the procedural scene is rendered where it is not.
 
     Args:
-        conf: The scene.
-        cache: Folder of rendered scenes; each has one of its own, named by its fingerprint.
-        long_side: As in `fingerprint`.
+        conf: The scene's config.
+        cache: The folder of rendered scenes; each has a folder of its own, named by its
+            fingerprint.
+        long_side: As for `fingerprint`.
+
+    Returns:
+        The scene.
 
     Raises:
-        XrgsError: an unknown kind, or photographs that are not there.
+        XrgsError: The kind is unknown, or the photographs are not there.
     """
-    name, mark = label(conf), fingerprint(conf, long_side)
+    name, scene_hash = label(conf), fingerprint(conf, long_side)
     if conf.kind == "folder":
-        return Scene(name, mark, folder.photographs(conf.path, long_side))
+        return Scene(name, scene_hash, folder.list_photographs(conf.path, long_side))
     if conf.kind == "motorcycle":
         known, exact = motorcycle.intrinsics(), motorcycle.viewmats()
-        return Scene(name, mark, motorcycle.files(), known, exact)
+        return Scene(name, scene_hash, motorcycle.files(), known, exact)
     names = procedural.names(conf.views)
-    home = cache / mark
+    home = cache / scene_hash
     if not home.is_dir():
         _render(conf, home, long_side)
     exact = dict(zip(names, procedural.viewmats(conf.views), strict=True))
-    # The intrinsics are known too, but SfM is to find them, as in a real capture.
-    return Scene(name, mark, tuple(home / f"{n}.png" for n in names), viewmats=exact)
+    # The intrinsics are known too, but SfM estimates them, as for a real capture.
+    return Scene(name, scene_hash, tuple(home / f"{n}.png" for n in names), viewmats=exact)
 
 
 def _check(conf: SceneConf) -> None:
     if conf.kind not in _KINDS:
-        raise XrgsError(f"scene.kind={conf.kind}: unknown; one of {', '.join(_KINDS)}")
+        raise XrgsError(f"scene.kind={conf.kind}: unknown; must be one of {', '.join(_KINDS)}")
     if conf.kind == "procedural" and conf.views < 2:
-        raise XrgsError(f"scene.views={conf.views}: two or more are needed")
+        raise XrgsError(f"scene.views={conf.views}: must be 2 or more")
 
 
 def _render(conf: SceneConf, home: Path, long_side: int) -> None:
-    """Render beside `home` and rename, so that what is there is whole; the first to finish wins."""
+    """Render into a temporary folder and rename it to `home`, unless another process has one."""
     home.parent.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(dir=home.parent, prefix=".rendering-") as temporary:
-        made = Path(temporary) / "images"
         from xrgs.capture.scenes import still_life
 
-        still_life.render(made, long_side, conf.views)
+        rendered = Path(temporary) / "images"
+        still_life.render(rendered, long_side, conf.views)
         try:
-            made.rename(home)
+            rendered.rename(home)
         except OSError:
             if not home.is_dir():
                 raise
-            shutil.rmtree(made)
+            shutil.rmtree(rendered)

@@ -1,4 +1,4 @@
-"""The photographs that scikit-image's wheel itself carries; found without importing it."""
+"""Finds the photographs in scikit-image's wheel, without importing scikit-image."""
 
 from __future__ import annotations
 
@@ -8,11 +8,17 @@ from pathlib import Path
 from xrgs.errors import XrgsError
 
 
-def photograph(name: str) -> Path:
-    """Path of a photograph of scikit-image's `data` folder.
+def bundled_photograph(name: str) -> Path:
+    """Find a file in scikit-image's `data` folder.
+
+    Args:
+        name: The file's name.
+
+    Returns:
+        Its path.
 
     Raises:
-        XrgsError: scikit-image, or the file in it, is not there.
+        XrgsError: scikit-image, or the file in it, is not installed.
     """
     spec = find_spec("skimage")
     if spec is None or spec.origin is None:

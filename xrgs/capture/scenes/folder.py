@@ -1,4 +1,9 @@
-"""Photographs in a folder: any folder of images, or a scene laid out as LLFF publishes them."""
+"""Lists the photographs in a folder: any folder of images, or a scene in LLFF's layout.
+
+LLFF's layout (Mildenhall et al. 2019, "Local light field fusion") has the photographs in `images/`,
+copies that are smaller by a factor N in `images_N/`, and poses in `poses_bounds.npy`, which are not
+read.
+"""
 
 from __future__ import annotations
 
@@ -11,41 +16,47 @@ from xrgs.capture import images
 from xrgs.errors import XrgsError
 from xrgs.runtime.progress import progress
 from xrgs.safeio import untrusted
-from xrgs.safeio.atomic import path_of
+from xrgs.safeio.paths import user_path
 
+#: The suffixes of files that are read as photographs, in lower case.
 SUFFIXES = frozenset({".bmp", ".jpeg", ".jpg", ".png", ".tif", ".tiff", ".webp"})
 _LLFF_FOLDER = re.compile(r"images(_\d+)?")
 
 
-def photographs(path: str | None, long_side: int) -> tuple[Path, ...]:
-    """The image files of `scene.path`, sorted by name.
+def list_photographs(path: str | None, long_side: int) -> tuple[Path, ...]:
+    """List the image files of a scene's folder.
 
-    In an LLFF scene (images/, images_4/, ...) the smallest copies whose longer side is at least
-    `long_side` px are taken, the largest where none is or where 0 asks for full size.
-    `poses_bounds.npy` is never read.
+    Args:
+        path: `scene.path`, the folder.
+        long_side: `variant.long_side`, px. Of an LLFF scene the smallest copies whose longer side
+            has at least so many px are taken; the largest where none has, or where this is 0.
+
+    Returns:
+        At least two files, sorted by name.
 
     Raises:
-        XrgsError: no such folder, fewer than two images, or two of one name.
+        XrgsError: There is no such folder, it holds fewer than two images or two of one name, or a
+            name can't be used.
     """
     if not path:
         raise XrgsError("scene.path is empty: give the folder of photographs, scene.path=...")
-    folder = path_of(path)
+    folder = user_path(path)
     if not folder.is_dir():
         raise XrgsError(f"scene.path={folder}: no such folder (scene=llff/... looks in data_root)")
-    copies = [_images_in(f) for f in sorted(folder.iterdir()) if _is_llff(f)]
-    files = _smallest([c for c in copies if c], long_side) or _images_in(folder)
+    copies = [_images_in(f) for f in sorted(folder.iterdir()) if _is_llff_folder(f)]
+    files = _select_copies([c for c in copies if c], long_side) or _images_in(folder)
     if len(files) < 2:
         count = f"only {files[0].name}" if files else "no image"
-        wanted = " ".join(sorted(SUFFIXES))
-        raise XrgsError(f"scene.path={folder}: {count} in it; two or more are needed ({wanted})")
+        suffixes = " ".join(sorted(SUFFIXES))
+        raise XrgsError(f"scene.path={folder}: {count} in it; two or more are needed ({suffixes})")
     seen: dict[str, Path] = {}
     for file in files:
         if not untrusted.is_name(file.stem):
             raise XrgsError(
-                f"{str(file)!r}: a name with a backslash, a control character or bytes that are "
-                "no Unicode; rename it"
+                f"{str(file)!r}: its name has a backslash, a control character or bytes that are "
+                "not valid Unicode; rename it"
             )
-        # A store may lie where A and a, or an accent as one character or two, are one name.
+        # On some file systems A and a, or an accent as one or two characters, are one name.
         name = unicodedata.normalize("NFC", file.stem).casefold()
         if name in seen:
             raise XrgsError(f"{seen[name]} and {file.name}: two images of one name; rename one")
@@ -53,36 +64,43 @@ def photographs(path: str | None, long_side: int) -> tuple[Path, ...]:
     return files
 
 
-def digest(files: tuple[Path, ...]) -> str:
-    """Hash of the files' names and bytes, hex."""
-    total = hashlib.sha256()
+def files_digest(files: tuple[Path, ...]) -> str:
+    """Hash the names and bytes of files.
+
+    Args:
+        files: The files; the hash depends on their order, and not on their folder.
+
+    Returns:
+        All 64 hexadecimal digits of a SHA-256.
+    """
+    sha256 = hashlib.sha256()
     for file in progress(files, "hashing photographs", "file"):
         with file.open("rb") as stream:
             content = hashlib.file_digest(stream, "sha256").hexdigest()
-        total.update(f"{file.name}\0{content}\n".encode())
-    return total.hexdigest()
+        sha256.update(f"{file.name}\0{content}\n".encode())
+    return sha256.hexdigest()
 
 
-def _is_llff(folder: Path) -> bool:
+def _is_llff_folder(folder: Path) -> bool:
     return folder.is_dir() and _LLFF_FOLDER.fullmatch(folder.name) is not None
 
 
 def _images_in(folder: Path) -> tuple[Path, ...]:
-    found = (f for f in folder.iterdir() if f.suffix.lower() in SUFFIXES and f.is_file())
-    return tuple(sorted((f for f in found if not f.name.startswith(".")), key=lambda f: f.name))
+    files = (f for f in folder.iterdir() if f.suffix.lower() in SUFFIXES and f.is_file())
+    return tuple(sorted((f for f in files if not f.name.startswith(".")), key=lambda f: f.name))
 
 
-def _smallest(copies: list[tuple[Path, ...]], long_side: int) -> tuple[Path, ...]:
-    """The copies of an LLFF scene to read; empty where there are none."""
-    sides = sorted(((_side(files), files) for files in copies), key=lambda c: c[0])
+def _select_copies(copies: list[tuple[Path, ...]], long_side: int) -> tuple[Path, ...]:
+    """Select the copies of an LLFF scene to read; empty where there are none."""
+    sides = sorted(((_long_side(files), files) for files in copies), key=lambda c: c[0])
     if not sides:
         return ()
-    enough = [files for side, files in sides if long_side and side >= long_side]
-    return enough[0] if enough else sides[-1][1]
+    sufficient = [files for side, files in sides if long_side and side >= long_side]
+    return sufficient[0] if sufficient else sides[-1][1]
 
 
-def _side(files: tuple[Path, ...]) -> int:
-    """Longest side of the photographs of a folder; what can't be read is left to the reader."""
+def _long_side(files: tuple[Path, ...]) -> int:
+    """Find the longest side of photographs, px; unreadable ones are reported when they are read."""
     sides = [0]
     for file in files:
         try:

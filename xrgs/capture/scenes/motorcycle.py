@@ -1,6 +1,7 @@
-"""The Middlebury 2014 `motorcycle` stereo pair that scikit-image's wheel carries (741 x 500).
+"""The `motorcycle` stereo pair of Middlebury 2014, which is in scikit-image's wheel (741 x 500 px).
 
-Rectified: both cameras look the same way, and stand 193.001 mm apart along x.
+Source: Scharstein et al. 2014, "High-resolution stereo datasets with subpixel-accurate ground
+truth". The pair is rectified: both cameras have one orientation, and are 193.001 mm apart along x.
 """
 
 from __future__ import annotations
@@ -10,7 +11,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from xrgs.capture.scenes.bundled import photograph
+from xrgs.capture.scenes.bundled import bundled_photograph
 
 #: The calibration published with the pair, px at 741 x 500 and mm.
 _FOCAL = 994.978
@@ -20,20 +21,35 @@ _BASELINE = {"motorcycle_left": 0.0, "motorcycle_right": 193.001}
 
 
 def files() -> tuple[Path, ...]:
-    """Left and right, in scikit-image's own folder."""
-    return tuple(photograph(f"{name}.png") for name in _CX)
+    """Find both photographs in scikit-image's wheel.
+
+    Returns:
+        The left and the right one.
+
+    Raises:
+        XrgsError: scikit-image, or a file in it, is not installed.
+    """
+    return tuple(bundled_photograph(f"{name}.png") for name in _CX)
 
 
 def intrinsics() -> dict[str, NDArray[np.float64]]:
-    """[3, 3] px at the files' size, by name."""
+    """Return the published intrinsics.
+
+    Returns:
+        [3, 3] in px of the files, by name.
+    """
     return {n: np.array([[_FOCAL, 0, cx], [0, _FOCAL, _CY], [0, 0, 1]]) for n, cx in _CX.items()}
 
 
 def viewmats() -> dict[str, NDArray[np.float64]]:
-    """[4, 4] world to camera by name; the left camera is the world, mm."""
-    found = {}
+    """Return the published poses.
+
+    Returns:
+        World to camera [4, 4] by name, in mm; the left camera is the origin of the world.
+    """
+    matrices = {}
     for name, baseline in _BASELINE.items():
         matrix = np.eye(4)
         matrix[0, 3] = -baseline
-        found[name] = matrix
-    return found
+        matrices[name] = matrix
+    return matrices

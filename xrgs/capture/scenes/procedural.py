@@ -1,8 +1,8 @@
-"""The embedded multi-view scene, but for its solids: exact cameras, and which photographs it shows.
+"""The cameras and textures of the procedural multi-view scene, which is embedded in this package.
 
-The textures are photographs that scikit-image carries in its own wheel, so nothing is downloaded.
-Lengths are in metres or so; y points down, the cameras stand near the origin and look along +z.
-What stands in the scene is in `still_life`, which needs torch; nothing here does.
+Its textures are photographs in scikit-image's wheel, so that nothing is downloaded. A world unit is
+about a metre; y points down, and the cameras are near the origin and look along +z. The solids are
+in `still_life`, which needs torch; nothing here does.
 """
 
 from __future__ import annotations
@@ -13,16 +13,16 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from xrgs.capture.scenes.bundled import photograph
+from xrgs.capture.scenes.bundled import bundled_photograph
 
-#: Rendered at this size where the variant asks for no other.
+#: The width of the views, px, where `variant.long_side` is 0.
 FULL_SIDE = 1008
 _FOCAL = 0.9  # image widths
-_FOCUS = np.array([0.0, 0.1, 5.5])  # every camera looks here
-_START = np.array([0.7, 0.55, 0.5])  # of the sequence of positions, as a share of the box
-_REACH = np.array([1.1, 0.7, 0.4])  # half size of the box the cameras stand in
+_FOCUS = np.array([0.0, 0.1, 5.5])  # the point that every camera looks at
+_START = np.array([0.7, 0.55, 0.5])  # first position, as a fraction of the cameras' box
+_HALF_SIZE = np.array([1.1, 0.7, 0.4])  # half the size of the cameras' box
 
-#: Name in the scene: file in scikit-image's wheel, and the tint of the grey ones.
+#: By the name of a texture, its file in scikit-image's wheel and the RGB tint it is multiplied by.
 TEXTURES: dict[str, tuple[str, tuple[float, float, float]]] = {
     "astronaut": ("astronaut.png", (1, 1, 1)),
     "bark": ("gravel.png", (0.75, 0.5, 0.35)),
@@ -42,26 +42,48 @@ TEXTURES: dict[str, tuple[str, tuple[float, float, float]]] = {
 
 
 def camera_size(long_side: int) -> tuple[int, int]:
-    """Width and height of the views, 4:3; 0 means the full size."""
+    """Compute the size of the views.
+
+    Args:
+        long_side: Their width, px; 0 for the full size.
+
+    Returns:
+        Width and height, px, at 4:3.
+    """
     width = long_side or FULL_SIDE
     return width, max(1, round(width * 0.75))
 
 
 def intrinsics(width: int, height: int) -> NDArray[np.float64]:
-    """[3, 3] px."""
+    """Compute the intrinsics of the views.
+
+    Args:
+        width: px.
+        height: px.
+
+    Returns:
+        [3, 3], px.
+    """
     f = _FOCAL * width
     return np.array([[f, 0, width / 2], [0, f, height / 2], [0, 0, 1]])
 
 
 def viewmats(views: int) -> NDArray[np.float64]:
-    """World-to-camera matrices [views, 4, 4] of cameras spread over a box, forward-facing.
+    """Compute the poses of forward-facing cameras that are spread evenly over a box.
 
-    Positions follow the R3 sequence (Roberts 2018), which fills the box evenly for any number;
-    its start puts every 8th view of the first 24 among the others, none at the rim.
+    Positions follow the R3 sequence (Roberts 2018, "The unreasonable effectiveness of quasirandom
+    sequences"), which fills the box evenly for any number of views. Its start is chosen so that
+    every 8th of the first 24 views lies between others, and none at the box's border.
+
+    Args:
+        views: The number of views.
+
+    Returns:
+        World-to-camera matrices [views, 4, 4].
     """
-    g = 1.2207440846057596  # the real root of x⁴ = x + 1
+    g = 1.2207440846057596  # the positive real root of x⁴ = x + 1
     steps = np.arange(views)[:, None] * np.array([1 / g, 1 / g**2, 1 / g**3])
-    positions = (2 * ((_START + steps) % 1) - 1) * _REACH
+    positions = (2 * ((_START + steps) % 1) - 1) * _HALF_SIZE
     return np.stack([_look_at(position) for position in positions])
 
 
@@ -76,13 +98,28 @@ def _look_at(position: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def names(views: int) -> list[str]:
-    """The views' names, in order."""
+    """Name the views.
+
+    Args:
+        views: The number of views.
+
+    Returns:
+        `view_000`, `view_001`, ...
+    """
     return [f"view_{index:03d}" for index in range(views)]
 
 
 def digest(long_side: int, views: int) -> str:
-    """Hash of everything the rendered views depend on: sources, photographs, parameters; hex."""
-    total = hashlib.sha256(repr((camera_size(long_side), views)).encode())
+    """Hash everything that the rendered views depend on: source code, photographs, parameters.
+
+    Args:
+        long_side: As for `camera_size`.
+        views: The number of views.
+
+    Returns:
+        All 64 hexadecimal digits of a SHA-256.
+    """
+    sha256 = hashlib.sha256(repr((camera_size(long_side), views)).encode())
     here = Path(__file__).parent
     for file in (
         here / "procedural.py",
@@ -90,7 +127,7 @@ def digest(long_side: int, views: int) -> str:
         here / "raycast.py",
         here.parent / "images.py",
     ):
-        total.update(file.read_bytes())
+        sha256.update(file.read_bytes())
     for name, _ in TEXTURES.values():
-        total.update(photograph(name).read_bytes())
-    return total.hexdigest()
+        sha256.update(bundled_photograph(name).read_bytes())
+    return sha256.hexdigest()

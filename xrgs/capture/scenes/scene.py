@@ -1,4 +1,4 @@
-"""What a scene is to the rest of the program: photographs in order, and what is known of them."""
+"""The dataclass of a scene: its photographs in order, and the cameras that are known."""
 
 from __future__ import annotations
 
@@ -12,16 +12,20 @@ from numpy.typing import NDArray
 
 @dataclass(frozen=True)
 class Scene:
-    """Photographs, sorted by name, and the cameras where they are known.
+    """The photographs of a scene, and the cameras where they are known.
 
-    A photograph's name is its file name without the ending; it is the key of both mappings.
+    The key of both mappings is the name of a photograph: its file name without the suffix.
     """
 
     name: str
+    """The name of the scene in tables."""
     fingerprint: str
-    """Hash of the photographs' names and bytes, or of what they are rendered from."""
+    """A hash of the photographs' names and bytes, or of what they are rendered from."""
     files: tuple[Path, ...]
+    """The photographs, sorted by name."""
     intrinsics: Mapping[str, NDArray[np.float64]] = field(default_factory=dict)
-    """[3, 3] px at the file's own size, no distortion; given to SfM and not refined."""
+    """Exact intrinsics [3, 3] in px of the file, without distortion; SfM gets them, and does not
+    refine them."""
     viewmats: Mapping[str, NDArray[np.float64]] = field(default_factory=dict)
-    """[4, 4] exact world-to-camera; a yardstick, never given to SfM."""
+    """Exact world-to-camera matrices [4, 4]. SfM never gets them: its poses are compared with
+    them."""

@@ -1,4 +1,4 @@
-"""What the embedded scene is made of: textured planes, boxes and balls at several depths."""
+"""Builds the solids of the procedural scene, at several depths, and renders its views."""
 
 from __future__ import annotations
 
@@ -14,22 +14,27 @@ from numpy.typing import NDArray
 
 from xrgs.capture import images
 from xrgs.capture.scenes import procedural, raycast
-from xrgs.capture.scenes.bundled import photograph
+from xrgs.capture.scenes.bundled import bundled_photograph
 from xrgs.capture.scenes.raycast import Ball, Pyramid, Quad, pyramid
-from xrgs.runtime.machine import one_thread
+from xrgs.runtime.machine import single_torch_thread
 from xrgs.runtime.progress import progress
 
+#: Samples per pixel along each axis.
 SUPERSAMPLE = 3
 
 
-def _wall(texture: str, left: float, top: float, width: float, height: float, z: float) -> Quad:
-    """An upright rectangle that faces the cameras; a negative size mirrors its texture."""
+def _upright_quad(
+    texture: str, left: float, top: float, width: float, height: float, z: float
+) -> Quad:
+    """Make an upright rectangle that faces the cameras; a negative size mirrors its texture."""
     corner = torch.tensor([left, top, z])
     return Quad(texture, corner, torch.tensor([width, 0.0, 0.0]), torch.tensor([0.0, height, 0.0]))
 
 
-def _floor(texture: str, left: float, y: float, width: float, far: float, length: float) -> Quad:
-    """A level rectangle from `far` towards the cameras; a negative width mirrors its texture."""
+def _level_quad(
+    texture: str, left: float, y: float, width: float, far: float, length: float
+) -> Quad:
+    """Make a level rectangle from z = `far` towards the cameras; a negative width mirrors it."""
     depth = torch.tensor([0.0, 0.0, -length])
     return Quad(texture, torch.tensor([left, y, far]), torch.tensor([width, 0.0, 0.0]), depth)
 
@@ -37,7 +42,7 @@ def _floor(texture: str, left: float, y: float, width: float, far: float, length
 def _box(
     texture: str, foot: tuple[float, float, float], size: tuple[float, float, float], turn: float
 ) -> Iterator[Quad]:
-    """Front, sides and top of a box on `foot`, turned by `turn` degrees about the vertical."""
+    """Yield front, sides and top of a box on the point `foot`, turned by `turn` degrees."""
     c, s = math.cos(math.radians(turn)), math.sin(math.radians(turn))
     w = size[0] * torch.tensor([c, 0.0, s])
     h = torch.tensor([0.0, size[1], 0.0])
@@ -50,65 +55,79 @@ def _box(
 
 
 def solids() -> list[Quad | Ball]:
-    """Everything in the scene, world units."""
+    """List the solids of the scene.
+
+    Returns:
+        The solids, in world units.
+    """
     floor = 1.5
-    placed: list[Quad | Ball] = []
-    # Mirrored tiles: fine texture, and no two alike a fixed step apart for SfM to confuse.
+    result: list[Quad | Ball] = []
+    # Mirrored tiles give fine texture without a period, which SfM could mistake for one place.
     for x, y in itertools.product((-7.0, 7.0), (-4.0, 4.0)):
-        placed.append(_wall("brick", 0.0, -1.5, x, y, 8.0))
+        result.append(_upright_quad("brick", 0.0, -1.5, x, y, 8.0))
     for left, width, far in itertools.product((-3.0, 3.0), (-3.0, 3.0), (8.0, 4.5)):
-        placed.append(_floor("gravel", left, floor, width, far, 3.5))
-    placed += [
-        _wall("astronaut", -4.3, -3.1, 2.0, 2.0, 7.9),
-        _wall("coins", -2.0, -3.3, 1.5, 1.18, 7.9),
-        _wall("page", -0.2, -3.2, 1.6, 0.8, 7.9),
-        _wall("stars", 1.7, -3.2, 2.4, 2.09, 7.9),
-        _wall("leaves", -4.5, -0.5, 2.0, 2.0, 7.4),
-        _wall("leaves", -0.5, -0.5, -2.0, 2.0, 7.4),
-        _wall("leaves", -0.5, -0.5, 2.0, 2.0, 7.4),
-        _wall("leaves", 3.5, -0.5, -2.0, 2.0, 7.4),
-        _wall("tissue", -1.75, -1.6, 1.3, 1.3, 6.9),
+        result.append(_level_quad("gravel", left, floor, width, far, 3.5))
+    result += [
+        _upright_quad("astronaut", -4.3, -3.1, 2.0, 2.0, 7.9),
+        _upright_quad("coins", -2.0, -3.3, 1.5, 1.18, 7.9),
+        _upright_quad("page", -0.2, -3.2, 1.6, 0.8, 7.9),
+        _upright_quad("stars", 1.7, -3.2, 2.4, 2.09, 7.9),
+        _upright_quad("leaves", -4.5, -0.5, 2.0, 2.0, 7.4),
+        _upright_quad("leaves", -0.5, -0.5, -2.0, 2.0, 7.4),
+        _upright_quad("leaves", -0.5, -0.5, 2.0, 2.0, 7.4),
+        _upright_quad("leaves", 3.5, -0.5, -2.0, 2.0, 7.4),
+        _upright_quad("tissue", -1.75, -1.6, 1.3, 1.3, 6.9),
         Ball("retina", torch.tensor([0.9, -0.9, 6.1]), 0.55),
         Ball("moon", torch.tensor([0.15, 0.95, 4.6]), 0.55),
         Ball("leaves", torch.tensor([3.2, 0.75, 6.6]), 0.9),
         Ball("coins", torch.tensor([1.15, 1.2, 3.9]), 0.3),
     ]
-    placed += _box("coffee", (-1.75, floor, 5.3), (1.3, 1.1, 1.0), 28.0)
-    placed += _box("rocket", (1.95, floor, 5.4), (1.0, 1.9, 0.8), -32.0)
-    placed += _box("cat", (-3.1, floor, 6.6), (1.5, 2.0, 0.6), 20.0)
-    placed += _box("page", (-0.6, floor, 3.7), (0.5, 0.25, 0.7), -20.0)
-    for k in range(6):  # thin rails in front of everything: edges that hide and uncover
+    result += _box("coffee", (-1.75, floor, 5.3), (1.3, 1.1, 1.0), 28.0)
+    result += _box("rocket", (1.95, floor, 5.4), (1.0, 1.9, 0.8), -32.0)
+    result += _box("cat", (-3.1, floor, 6.6), (1.5, 2.0, 0.6), 20.0)
+    result += _box("page", (-0.6, floor, 3.7), (0.5, 0.25, 0.7), -20.0)
+    for k in range(6):  # thin rails in front of everything, for edges with disocclusions
         foot = (-2.1 + 0.16 * k, floor, 3.4 + 0.12 * k)
-        placed += _box("bark", foot, (0.05, 1.6, 0.05), 15.0 * k)
-    return placed
+        result += _box("bark", foot, (0.05, 1.6, 0.05), 15.0 * k)
+    return result
 
 
 def textures() -> dict[str, Pyramid]:
-    """The photographs as pyramids, in colour."""
+    """Read the photographs that are the scene's textures.
+
+    Returns:
+        Pyramids of [3, h, w] in 0..1, tinted, by the name of the texture.
+    """
     return {
         name: pyramid(
-            torch.from_numpy(images.read(photograph(file)) * np.array(tint, np.float32)).movedim(
-                -1, 0
-            )
+            torch.from_numpy(
+                images.read(bundled_photograph(file)) * np.array(tint, np.float32)
+            ).movedim(-1, 0)
         )
         for name, (file, tint) in procedural.TEXTURES.items()
     }
 
 
 def render(folder: Path, long_side: int, views: int) -> None:
-    """Write every view to `folder` as a PNG of its name, with a progress bar."""
+    """Render every view and write it as `<name>.png`.
+
+    Args:
+        folder: The folder for the images; it is made where it is missing.
+        long_side: The width of the views, px; 0 for the full size.
+        views: The number of views.
+    """
     width, height = procedural.camera_size(long_side)
     K = torch.from_numpy(procedural.intrinsics(width, height))
-    scene, skins = solids(), textures()
+    scene, pyramids = solids(), textures()
 
-    def take(name: str, viewmat: NDArray[np.float64]) -> None:
+    def render_view(name: str, viewmat: NDArray[np.float64]) -> None:
         pose = torch.from_numpy(viewmat)
-        image = raycast.render(scene, skins, K, pose, width, height, SUPERSAMPLE)
+        image = raycast.render(scene, pyramids, K, pose, width, height, SUPERSAMPLE)
         images.save(folder / f"{name}.png", image.numpy())
 
     names, poses = procedural.names(views), procedural.viewmats(views)
-    # A thread a view, and none inside it: on a busy machine torch's own wait for each other.
-    with one_thread() as threads, ThreadPoolExecutor(threads) as pool:
-        done = pool.map(take, names, poses)
+    # One thread per view, and none within: on a busy machine torch's threads wait for each other.
+    with single_torch_thread() as threads, ThreadPoolExecutor(threads) as pool:
+        done = pool.map(render_view, names, poses)
         for _ in progress(done, "rendering the scene", "view", views):
             pass

@@ -1,1 +1,1 @@
-"""LPIPS: the network, and its published weights."""
+"""LPIPS, version 0.1, with AlexNet: the network, its published weights, and their download."""

@@ -1,4 +1,8 @@
-"""LPIPS with AlexNet, version 0.1 (Zhang et al. 2018), in plain torch: no torchvision."""
+"""LPIPS with AlexNet, version 0.1, in plain torch: torchvision is not needed.
+
+Source: Zhang et al. 2018, "The unreasonable effectiveness of deep features as a perceptual metric",
+and the authors' package `lpips`.
+"""
 
 from __future__ import annotations
 
@@ -12,47 +16,50 @@ if TYPE_CHECKING:
 
     from torch import Tensor
 
-#: What the authors subtract from and divide an image in -1..1 by, a value a channel.
+#: The authors' normalisation of an image in -1..1: one mean and one deviation per channel.
 _SHIFT = (-0.030, -0.088, -0.188)
 _SCALE = (0.458, 0.448, 0.450)
-#: Stride and padding of AlexNet's five convolutions; before the second and third it pools.
+#: Stride and padding of AlexNet's five convolutions. The second and third are preceded by max
+#: pooling.
 _CONVOLUTIONS = ((4, 2), (1, 2), (1, 1), (1, 1), (1, 1))
 _POOLED = frozenset({1, 2})
 _EPS = 1e-10
-#: Shorter side, px, of the smallest image that reaches the last layer.
-SMALLEST = 31
+#: The shortest side of an image, px, that leaves the last layer at least one pixel.
+MIN_SIDE = 31
 
 
 def distance(image: Tensor, target: Tensor, weights: Mapping[str, Tensor]) -> Tensor:
-    """How different two images look: 0 where they are identical, larger is worse.
+    """Compute how different two images look (Zhang et al. 2018, equation 1).
 
-    Of each layer's rectified features, scaled to unit length over channels, the squared
-    difference, weighed by a learned head, averaged over the pixels, summed over the layers.
+    The rectified features of each layer are normalised to unit length over the channels. Their
+    squared differences are weighted per channel by the learned linear heads, averaged over the
+    pixels, and summed over the layers.
 
     Args:
         image: [H, W, 3] in 0..1.
         target: [H, W, 3] in 0..1.
-        weights: As `xrgs.evaluation.lpips.weights.load` gives them, in the images' dtype.
+        weights: Tensors named as `xrgs.evaluation.lpips.weights.load` names them, in the images'
+            dtype.
 
     Returns:
-        Scalar.
+        A scalar: 0 where the images are identical, larger where they differ more.
 
     Raises:
-        ValueError: a side is shorter than `SMALLEST`.
+        ValueError: A side is shorter than `MIN_SIDE`.
     """
-    if min(image.shape[:2]) < SMALLEST:
+    if min(image.shape[:2]) < MIN_SIDE:
         height, width = image.shape[:2]
         raise ValueError(f"an image of {width} x {height} px is too small for LPIPS")
     both = torch.stack([image, target]).permute(0, 3, 1, 2)  # [2, 3, H, W]
     shift, scale = (both.new_tensor(values)[:, None, None] for values in (_SHIFT, _SCALE))
     layers = _features((2 * both - 1 - shift) / scale, weights)
     return torch.stack(
-        [_differ(x, weights[f"head{i}"]) for i, x in enumerate(layers)]
+        [_layer_distance(x, weights[f"head{i}"]) for i, x in enumerate(layers)]
     ).sum()  # [5] summed
 
 
 def _features(x: Tensor, weights: Mapping[str, Tensor]) -> Iterator[Tensor]:
-    """AlexNet's five rectified layers of images [N, 3, H, W], each [N, C, h, w]."""
+    """Yield AlexNet's five rectified layers of images [N, 3, H, W], each [N, C, h, w]."""
     for i, (stride, padding) in enumerate(_CONVOLUTIONS):
         if i in _POOLED:
             x = max_pool2d(x, kernel_size=3, stride=2)
@@ -60,8 +67,8 @@ def _features(x: Tensor, weights: Mapping[str, Tensor]) -> Iterator[Tensor]:
         yield x
 
 
-def _differ(x: Tensor, head: Tensor) -> Tensor:
-    """A layer's share of the distance: features [2, C, h, w], head [C]; a scalar."""
+def _layer_distance(x: Tensor, head: Tensor) -> Tensor:
+    """Compute one layer's term of the distance from features [2, C, h, w] and a head [C]."""
     unit = x / (x.square().sum(1, keepdim=True).sqrt() + _EPS)
     squared = (unit[0] - unit[1]).square()  # [C, h, w]
     return torch.einsum("chw,c->hw", squared, head).mean()

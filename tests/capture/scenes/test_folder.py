@@ -1,0 +1,60 @@
+"""Folders of photographs, and scenes in LLFF's layout."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from xrgs.capture import images, scenes
+from xrgs.config import SceneConf
+from xrgs.errors import XrgsError
+
+Fill = Callable[..., SceneConf]
+
+
+@pytest.mark.parametrize(
+    ("long_side", "width"), [(0, 400), (20, 50), (50, 50), (51, 100), (999, 400)]
+)
+def test_an_llff_scene_gives_the_smallest_copies_that_suffice(
+    fill: Fill, tmp_path: Path, long_side: int, width: int
+) -> None:
+    for folder, size in {"images": 400, "images_4": 100, "images_8": 50}.items():
+        fill(tmp_path / folder, "a.png", "b.png", size=(size, size * 3 // 4))
+    (tmp_path / "poses_bounds.npy").write_bytes(b"never read")
+    scene = scenes.resolve(SceneConf("fern", "folder", str(tmp_path)), tmp_path, long_side)
+    assert images.size(scene.files[0])[0] == width
+
+
+def test_copies_are_measured_by_their_largest_photograph(fill: Fill, tmp_path: Path) -> None:
+    """Where sizes differ the first alone tells little; what can't be read tells nothing."""
+    fill(tmp_path / "images", "a.png", "b.png", size=(400, 300))
+    fill(tmp_path / "images_4", "a.png", size=(60, 45))
+    fill(tmp_path / "images_4", "b.png", size=(100, 75))
+    (tmp_path / "images_4" / "c.png").write_text("no image")
+    scene = scenes.resolve(SceneConf("x", "folder", str(tmp_path)), tmp_path, 100)
+    assert scene.files[0].parent.name == "images_4"
+
+
+@pytest.mark.parametrize(
+    ("names", "message"),
+    [
+        ([], "no image in it"),
+        (["only.png"], r"only only\.png in it; two or more"),
+        (["a.png", "a.jpg"], r"a\.jpg and a\.png: two images of one name"),
+    ],
+)
+def test_a_folder_without_a_scene_is_refused(
+    fill: Fill, tmp_path: Path, names: list[str], message: str
+) -> None:
+    with pytest.raises(XrgsError, match=message) as caught:
+        scenes.fingerprint(fill(tmp_path / "x", *names))
+    assert str(tmp_path / "x") in str(caught.value)
+
+
+def test_a_missing_folder_or_path_names_the_key(tmp_path: Path) -> None:
+    with pytest.raises(XrgsError, match=r"scene\.path=.*nowhere: no such folder"):
+        scenes.resolve(SceneConf("x", "folder", str(tmp_path / "nowhere")), tmp_path)
+    with pytest.raises(XrgsError, match=r"scene\.path is empty"):
+        scenes.resolve(SceneConf("x", "folder", None), tmp_path)

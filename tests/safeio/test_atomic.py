@@ -1,0 +1,56 @@
+"""Files that are written atomically: whole, or as they were before."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import pytest
+
+from xrgs.safeio.atomic import atomic_writer, write_json, write_text
+
+
+def test_the_new_content_appears_at_the_end_of_the_block(tmp_path: Path) -> None:
+    file = tmp_path / "file"
+    file.write_bytes(b"old")
+    with atomic_writer(file) as stream:
+        stream.write(b"new")
+        stream.flush()
+        assert file.read_bytes() == b"old"
+    assert file.read_bytes() == b"new"
+    assert list(tmp_path.iterdir()) == [file]
+
+
+def test_an_exception_leaves_the_old_content_and_no_temporary_file(tmp_path: Path) -> None:
+    file = tmp_path / "file"
+    file.write_bytes(b"old")
+    with pytest.raises(TypeError), atomic_writer(file) as stream:
+        stream.writelines([b"half", "not bytes"])  # type: ignore[list-item]
+    assert file.read_bytes() == b"old"
+    assert list(tmp_path.iterdir()) == [file]
+
+
+def test_others_can_read_the_file_as_the_umask_allows(tmp_path: Path) -> None:
+    before = os.umask(0o022)
+    try:
+        write_text(tmp_path / "file", "text")
+    finally:
+        os.umask(before)
+    assert (tmp_path / "file").stat().st_mode & 0o777 == 0o644
+
+
+@pytest.mark.parametrize("durable", [True, False])
+def test_only_a_durable_file_waits_for_the_disk(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, durable: bool
+) -> None:
+    synced: list[int] = []
+    monkeypatch.setattr(os, "fsync", synced.append)
+    write_text(tmp_path / "file", "text", durable=durable)
+    assert len(synced) == durable
+    assert (tmp_path / "file").read_text() == "text"
+
+
+def test_json_has_sorted_keys_and_keeps_unicode(tmp_path: Path) -> None:
+    write_json(tmp_path / "file", {"b": [1.5, None], "a": "部屋"})
+    expected = '{\n "a": "部屋",\n "b": [\n  1.5,\n  null\n ]\n}\n'
+    assert (tmp_path / "file").read_text(encoding="utf-8") == expected

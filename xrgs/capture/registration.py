@@ -1,0 +1,197 @@
+"""Registers the views of a mixed-resolution scene, with further attempts where too few register.
+
+With `sfm.lr_images: upsampled`, downsampled views are resized back to HR size for SfM alone, and
+one camera serves both sizes, which makes the poses of the small images several times more accurate.
+With `native`, SfM gets the files as they are, and a camera of their own for the small ones.
+
+The attempts, in order; the first whose reconstruction is accepted is used. All but the first need
+`sfm.fallbacks`:
+
+1. `configured`: `variant.sfm` as it is.
+2. `finer`: twice the features, detected at twice the resolution.
+3. `relaxed`: the features of 2, a quarter of the triangulation angle for the first pair
+   (`init_min_tri_angle`), and half of the inliers per view (`abs_pose_min_num_inliers`).
+4. `native` (or `upsampled`, where native was configured): as 3, with the LR images given the other
+   way.
+"""
+
+from __future__ import annotations
+
+import logging
+import time
+from collections.abc import Callable, Collection, Iterator
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any
+
+from xrgs.capture import sfm
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from xrgs.capture.photographs import PhotoCollection
+    from xrgs.config import SfmConf
+
+_log = logging.getLogger(__name__)
+
+#: The fewest inliers that COLMAP itself accepts for an absolute pose.
+_MIN_INLIERS = 6
+#: The report's values that are kept for each attempt.
+_ATTEMPT_KEYS = (
+    "lr_images",
+    "first_octave",
+    "max_num_features",
+    "init_min_tri_angle",
+    "min_inliers",
+    "registered",
+    "models",
+    "points",
+    "reprojection_error_px",
+)
+
+
+@dataclass(frozen=True)
+class Attempt:
+    """One way to run SfM."""
+
+    name: str
+    folder: str
+    """The name of its work folder; attempts with one folder share features and matches."""
+    conf: SfmConf
+
+
+@dataclass(frozen=True)
+class Registration:
+    """The reconstruction that was chosen, and a report of every attempt."""
+
+    model: sfm.Reconstruction
+    refused: str
+    """Why even the best reconstruction is not accepted; empty where it is."""
+    attempts: list[dict[str, Any]]
+    """For each attempt its name, why it was refused, its seconds, settings and results."""
+
+
+def register(
+    photos: PhotoCollection,
+    degraded: Collection[int],
+    conf: SfmConf,
+    work: Path,
+    refusal: Callable[[sfm.Reconstruction], str],
+) -> Registration:
+    """Run SfM on the mixed-resolution images, until a reconstruction is accepted.
+
+    Args:
+        photos: The photographs, with their `hr` copies and the `lr` copies of the degraded ones.
+        degraded: Indices of the views that SfM gets degraded.
+        conf: The settings of the first attempt.
+        work: An existing folder for SfM's own files.
+        refusal: The acceptance check: returns why a reconstruction is refused, and an empty text to
+            accept it.
+
+    Returns:
+        The first reconstruction that was accepted; where none was, the one with the most registered
+        views, and the earlier one of two with equally many.
+    """
+    best: tuple[sfm.Reconstruction, str] | None = None
+    reports: list[dict[str, Any]] = []
+    any_smaller = any(_is_smaller(photos, i) for i in degraded)
+    for attempt in sfm_attempts(conf, len(photos), any_smaller=any_smaller):
+        start = time.perf_counter()
+        folder = work / attempt.folder
+        folder.mkdir(exist_ok=True)
+        model = sfm.reconstruct(
+            sfm_images(photos, degraded, attempt.conf), photos.folder, folder, attempt.conf
+        )
+        reason = refusal(model)
+        seconds = round(time.perf_counter() - start, 1)
+        results = {key: model.report[key] for key in _ATTEMPT_KEYS if key in model.report}
+        reports.append({"attempt": attempt.name, "refused": reason, "seconds": seconds} | results)
+        if best is None or len(model.viewmats) > len(best[0].viewmats) or not reason:
+            best = model, reason
+        if not reason:
+            break
+        _log.warning("SfM attempt %s: %s", attempt.name, reason)
+    if best is None:
+        raise RuntimeError("there is always a first attempt")
+    return Registration(*best, reports)
+
+
+def sfm_attempts(conf: SfmConf, images: int, *, any_smaller: bool) -> Iterator[Attempt]:
+    """Yield the attempts to run SfM, in order.
+
+    Args:
+        conf: The settings of the first attempt; `fallbacks` says whether there are others.
+        images: The number of images.
+        any_smaller: Whether any image is smaller than its HR view, so that it can be given
+            upsampled or native.
+
+    Yields:
+        The attempts, see the module.
+    """
+    yield Attempt("configured", "sfm", conf)
+    if not conf.fallbacks:
+        return
+    features = 2 * sfm.features_per_image(images, conf.max_num_features)
+    finer = replace(conf, max_num_features=features, first_octave=-1)
+    yield Attempt("finer", "sfm-finer", finer)
+    relaxed = replace(
+        finer,
+        init_min_tri_angle=conf.init_min_tri_angle / 4,
+        min_inliers=max(_MIN_INLIERS, conf.min_inliers // 2),
+    )
+    yield Attempt("relaxed", "sfm-finer", relaxed)
+    if any_smaller:
+        other = "native" if conf.lr_images == "upsampled" else "upsampled"
+        yield Attempt(other, f"sfm-{other}", replace(relaxed, lr_images=other))
+
+
+def sfm_images(
+    photos: PhotoCollection, degraded: Collection[int], conf: SfmConf
+) -> list[sfm.SfmImage]:
+    """List the images that SfM gets, with the intrinsics that are known.
+
+    Args:
+        photos: The photographs, with their copies; `up` copies are made where they are needed.
+        degraded: Indices of the views that SfM gets degraded.
+        conf: The settings; `lr_images` says how smaller views are given.
+
+    Returns:
+        One image per photograph, in order.
+    """
+    result = []
+    for i, photo in enumerate(photos.all):
+        kind, camera, lens = "hr", photo.camera, photo.lens
+        if i in degraded:
+            kind = "lr"
+            if _is_smaller(photos, i) and conf.lr_images == "upsampled":
+                kind = "up"
+                photos.upsample(i)
+            elif _is_smaller(photos, i):
+                camera = f"{camera} lr"
+                lens = lens and lens.resized(*photos.size("lr", i))
+        # Where the intrinsics are known, each image has a camera of its own, with its own K.
+        name = photo.name if lens else camera
+        result.append(sfm.SfmImage(photos.file(kind, i), name, lens.K if lens else None))
+    return result
+
+
+def _is_smaller(photos: PhotoCollection, index: int) -> bool:
+    hr = photos[index].hr
+    return photos.size("lr", index) != (hr.width, hr.height)
+
+
+def reconstruct_undegraded(
+    photos: PhotoCollection, conf: SfmConf, work: Path
+) -> sfm.Reconstruction:
+    """Run SfM on the HR views alone, as a reference for the poses of the mixed-resolution scene.
+
+    Args:
+        photos: The photographs, with their `hr` copies.
+        conf: The settings; there is one attempt.
+        work: An existing folder for SfM's own files.
+
+    Returns:
+        The reconstruction, accepted or not.
+    """
+    folder = work / "sfm-reference"
+    folder.mkdir()
+    return sfm.reconstruct(sfm_images(photos, (), conf), photos.folder, folder, conf)

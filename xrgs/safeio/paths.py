@@ -1,0 +1,20 @@
+"""Paths as users write them."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+
+def user_path(text: str) -> Path:
+    """Return the path that a user wrote, with `~` and `~name` expanded to home folders.
+
+    Args:
+        text: The path as it was typed.
+
+    Returns:
+        The expanded path; the path as it stands where there is no user of that name.
+    """
+    try:
+        return Path(text).expanduser()
+    except RuntimeError:
+        return Path(text)
