@@ -24,18 +24,26 @@ const char* isa_name(Isa isa);
 std::vector<std::string> available_isas();
 
 #ifdef XRGS_X86
-#define XRGS_PICK(table)                                        \
-  (::xrgs::active_isa() == ::xrgs::Isa::avx512 ? ::xrgs::avx512::table  \
-   : ::xrgs::active_isa() == ::xrgs::Isa::avx2 ? ::xrgs::avx2::table    \
+#define XRGS_PICK(table)                                               \
+  (::xrgs::active_isa() == ::xrgs::Isa::avx512 ? ::xrgs::avx512::table \
+   : ::xrgs::active_isa() == ::xrgs::Isa::avx2 ? ::xrgs::avx2::table   \
                                                : ::xrgs::portable::table)
-#define XRGS_DECLARE_TABLE(type, table)                       \
-  namespace portable { extern const type table; }             \
-  namespace avx2 { extern const type table; }                 \
-  namespace avx512 { extern const type table; }
+#define XRGS_DECLARE_TABLE(type, table) \
+  namespace portable {                  \
+  extern const type table;              \
+  }                                     \
+  namespace avx2 {                      \
+  extern const type table;              \
+  }                                     \
+  namespace avx512 {                    \
+  extern const type table;              \
+  }
 #else
 #define XRGS_PICK(table) (::xrgs::portable::table)
 #define XRGS_DECLARE_TABLE(type, table) \
-  namespace portable { extern const type table; }
+  namespace portable {                  \
+  extern const type table;              \
+  }
 #endif
 
 }  // namespace xrgs

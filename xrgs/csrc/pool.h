@@ -20,8 +20,8 @@ void run_tasks(int threads, std::int64_t count, Task task, void* context);
 template <class Body>
 void parallel_for(int threads, std::int64_t count, Body&& body) {
   run_tasks(
-      threads, count, [](void* context, std::int64_t index) { (*static_cast<Body*>(context))(index); },
-      &body);
+      threads, count,
+      [](void* context, std::int64_t index) { (*static_cast<Body*>(context))(index); }, &body);
 }
 
 }  // namespace xrgs

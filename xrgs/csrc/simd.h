@@ -23,9 +23,15 @@ constexpr int kLanes = 16;
 
 #if defined(__AVX512F__)
 
-struct Floats { __m512 v; };
-struct Ints { __m512i v; };
-struct Mask { __mmask16 v; };
+struct Floats {
+  __m512 v;
+};
+struct Ints {
+  __m512i v;
+};
+struct Mask {
+  __mmask16 v;
+};
 
 XRGS_INLINE Floats splat(float a) { return {_mm512_set1_ps(a)}; }
 XRGS_INLINE Ints splat_int(std::int32_t a) { return {_mm512_set1_epi32(a)}; }
@@ -52,8 +58,8 @@ XRGS_INLINE Floats min(Floats a, Floats b) { return {_mm512_min_ps(a.v, b.v)}; }
 XRGS_INLINE Floats max(Floats a, Floats b) { return {_mm512_max_ps(a.v, b.v)}; }
 // Of positive numbers (of others, anything): compared as integers, which more units can do.
 XRGS_INLINE Floats min_positive(Floats a, Floats b) {
-  return {_mm512_castsi512_ps(
-      _mm512_min_epi32(_mm512_castps_si512(a.v), _mm512_castps_si512(b.v)))};
+  return {
+      _mm512_castsi512_ps(_mm512_min_epi32(_mm512_castps_si512(a.v), _mm512_castps_si512(b.v)))};
 }
 XRGS_INLINE Floats abs(Floats a) { return {_mm512_abs_ps(a.v)}; }
 XRGS_INLINE Floats sqrt(Floats a) { return {_mm512_sqrt_ps(a.v)}; }
@@ -64,15 +70,23 @@ XRGS_INLINE Floats ceil(Floats a) {
   return {_mm512_roundscale_ps(a.v, _MM_FROUND_TO_POS_INF | _MM_FROUND_NO_EXC)};
 }
 
-XRGS_INLINE Mask operator<(Floats a, Floats b) { return {_mm512_cmp_ps_mask(a.v, b.v, _CMP_LT_OQ)}; }
-XRGS_INLINE Mask operator<=(Floats a, Floats b) { return {_mm512_cmp_ps_mask(a.v, b.v, _CMP_LE_OQ)}; }
-XRGS_INLINE Mask operator==(Floats a, Floats b) { return {_mm512_cmp_ps_mask(a.v, b.v, _CMP_EQ_OQ)}; }
+XRGS_INLINE Mask operator<(Floats a, Floats b) {
+  return {_mm512_cmp_ps_mask(a.v, b.v, _CMP_LT_OQ)};
+}
+XRGS_INLINE Mask operator<=(Floats a, Floats b) {
+  return {_mm512_cmp_ps_mask(a.v, b.v, _CMP_LE_OQ)};
+}
+XRGS_INLINE Mask operator==(Floats a, Floats b) {
+  return {_mm512_cmp_ps_mask(a.v, b.v, _CMP_EQ_OQ)};
+}
 XRGS_INLINE Mask operator&(Mask a, Mask b) { return {static_cast<__mmask16>(a.v & b.v)}; }
 XRGS_INLINE Mask operator|(Mask a, Mask b) { return {static_cast<__mmask16>(a.v | b.v)}; }
 XRGS_INLINE std::uint32_t bits(Mask m) { return m.v; }
 XRGS_INLINE Mask mask_of(std::uint32_t bits) { return {static_cast<__mmask16>(bits)}; }
 // m ? a : b, and m ? a : 0
-XRGS_INLINE Floats select(Mask m, Floats a, Floats b) { return {_mm512_mask_mov_ps(b.v, m.v, a.v)}; }
+XRGS_INLINE Floats select(Mask m, Floats a, Floats b) {
+  return {_mm512_mask_mov_ps(b.v, m.v, a.v)};
+}
 XRGS_INLINE Floats keep(Mask m, Floats a) { return {_mm512_maskz_mov_ps(m.v, a.v)}; }
 
 XRGS_INLINE Ints operator+(Ints a, Ints b) { return {_mm512_add_epi32(a.v, b.v)}; }
@@ -80,9 +94,13 @@ XRGS_INLINE Ints operator-(Ints a, Ints b) { return {_mm512_sub_epi32(a.v, b.v)}
 XRGS_INLINE Ints operator&(Ints a, Ints b) { return {_mm512_and_si512(a.v, b.v)}; }
 XRGS_INLINE Ints operator|(Ints a, Ints b) { return {_mm512_or_si512(a.v, b.v)}; }
 template <int Count>
-XRGS_INLINE Ints shift_left(Ints a) { return {_mm512_slli_epi32(a.v, Count)}; }
+XRGS_INLINE Ints shift_left(Ints a) {
+  return {_mm512_slli_epi32(a.v, Count)};
+}
 template <int Count>
-XRGS_INLINE Ints shift_right(Ints a) { return {_mm512_srai_epi32(a.v, Count)}; }
+XRGS_INLINE Ints shift_right(Ints a) {
+  return {_mm512_srai_epi32(a.v, Count)};
+}
 XRGS_INLINE Ints as_ints(Floats a) { return {_mm512_castps_si512(a.v)}; }
 XRGS_INLINE Floats as_floats(Ints a) { return {_mm512_castsi512_ps(a.v)}; }
 XRGS_INLINE Floats to_floats(Ints a) { return {_mm512_cvtepi32_ps(a.v)}; }
@@ -108,9 +126,13 @@ XRGS_INLINE void deinterleave(Floats low, Floats high, Floats& a, Floats& b) {
 // The lanes as a 4x4 matrix, row by row: every row its own column C; row R in every row; and the
 // sum of the rows in every row.
 template <int C>
-XRGS_INLINE Floats splat_column(Floats a) { return {_mm512_permute_ps(a.v, C * 0x55)}; }
+XRGS_INLINE Floats splat_column(Floats a) {
+  return {_mm512_permute_ps(a.v, C * 0x55)};
+}
 template <int R>
-XRGS_INLINE Floats splat_row(Floats a) { return {_mm512_shuffle_f32x4(a.v, a.v, R * 0x55)}; }
+XRGS_INLINE Floats splat_row(Floats a) {
+  return {_mm512_shuffle_f32x4(a.v, a.v, R * 0x55)};
+}
 XRGS_INLINE Floats sum_rows(Floats a) {
   a = {_mm512_add_ps(a.v, _mm512_shuffle_f32x4(a.v, a.v, 0x4e))};
   return {_mm512_add_ps(a.v, _mm512_shuffle_f32x4(a.v, a.v, 0xb1))};
@@ -158,9 +180,15 @@ XRGS_INLINE void transpose(Floats (&r)[16]) {
 
 #elif defined(__AVX2__)
 
-struct Floats { __m256 lo, hi; };
-struct Ints { __m256i lo, hi; };
-struct Mask { __m256 lo, hi; };
+struct Floats {
+  __m256 lo, hi;
+};
+struct Ints {
+  __m256i lo, hi;
+};
+struct Mask {
+  __m256 lo, hi;
+};
 
 XRGS_INLINE Floats splat(float a) { return {_mm256_set1_ps(a), _mm256_set1_ps(a)}; }
 XRGS_INLINE Ints splat_int(std::int32_t a) { return {_mm256_set1_epi32(a), _mm256_set1_epi32(a)}; }
@@ -171,8 +199,8 @@ XRGS_INLINE void store(float* p, Floats a) {
 }
 // Lanes from..from+7 that are below `count`.
 XRGS_INLINE __m256i lanes_below(int count, int from) {
-  const __m256i lane = _mm256_add_epi32(_mm256_setr_epi32(0, 1, 2, 3, 4, 5, 6, 7),
-                                        _mm256_set1_epi32(from));
+  const __m256i lane =
+      _mm256_add_epi32(_mm256_setr_epi32(0, 1, 2, 3, 4, 5, 6, 7), _mm256_set1_epi32(from));
   return _mm256_cmpgt_epi32(_mm256_set1_epi32(count), lane);
 }
 // The first `count` (0 to 16) lanes; the others are zero, or left alone.
@@ -280,12 +308,18 @@ template <int Count>
 XRGS_INLINE Ints shift_right(Ints a) {
   return {_mm256_srai_epi32(a.lo, Count), _mm256_srai_epi32(a.hi, Count)};
 }
-XRGS_INLINE Ints as_ints(Floats a) { return {_mm256_castps_si256(a.lo), _mm256_castps_si256(a.hi)}; }
+XRGS_INLINE Ints as_ints(Floats a) {
+  return {_mm256_castps_si256(a.lo), _mm256_castps_si256(a.hi)};
+}
 XRGS_INLINE Floats as_floats(Ints a) {
   return {_mm256_castsi256_ps(a.lo), _mm256_castsi256_ps(a.hi)};
 }
-XRGS_INLINE Floats to_floats(Ints a) { return {_mm256_cvtepi32_ps(a.lo), _mm256_cvtepi32_ps(a.hi)}; }
-XRGS_INLINE Ints to_ints(Floats a) { return {_mm256_cvttps_epi32(a.lo), _mm256_cvttps_epi32(a.hi)}; }
+XRGS_INLINE Floats to_floats(Ints a) {
+  return {_mm256_cvtepi32_ps(a.lo), _mm256_cvtepi32_ps(a.hi)};
+}
+XRGS_INLINE Ints to_ints(Floats a) {
+  return {_mm256_cvttps_epi32(a.lo), _mm256_cvttps_epi32(a.hi)};
+}
 XRGS_INLINE void store(std::int32_t* p, Ints a) {
   _mm256_storeu_si256(reinterpret_cast<__m256i*>(p), a.lo);
   _mm256_storeu_si256(reinterpret_cast<__m256i*>(p + 8), a.hi);
@@ -377,13 +411,19 @@ XRGS_INLINE void transpose(Floats (&r)[16]) {
 
 #else
 
-struct Floats { float v[16]; };
-struct Ints { std::int32_t v[16]; };
-struct Mask { std::int32_t v[16]; };  // all bits of a lane set, or none
+struct Floats {
+  float v[16];
+};
+struct Ints {
+  std::int32_t v[16];
+};
+struct Mask {
+  std::int32_t v[16];
+};  // all bits of a lane set, or none
 
-#define XRGS_EACH(type, expression)                     \
-  type r;                                               \
-  for (int i = 0; i < 16; ++i) r.v[i] = (expression);   \
+#define XRGS_EACH(type, expression)                   \
+  type r;                                             \
+  for (int i = 0; i < 16; ++i) r.v[i] = (expression); \
   return r
 
 XRGS_INLINE Floats splat(float a) { XRGS_EACH(Floats, a); }
@@ -393,7 +433,9 @@ XRGS_INLINE void store(float* p, Floats a) {
   for (int i = 0; i < 16; ++i) p[i] = a.v[i];
 }
 // The first `count` (0 to 16) lanes; the others are zero, or left alone.
-XRGS_INLINE Floats load_first(const float* p, int count) { XRGS_EACH(Floats, i < count ? p[i] : 0.0f); }
+XRGS_INLINE Floats load_first(const float* p, int count) {
+  XRGS_EACH(Floats, i < count ? p[i] : 0.0f);
+}
 XRGS_INLINE void store_first(float* p, Floats a, int count) {
   for (int i = 0; i < count; ++i) p[i] = a.v[i];
 }
@@ -404,8 +446,12 @@ XRGS_INLINE Floats operator-(Floats a, Floats b) { XRGS_EACH(Floats, a.v[i] - b.
 XRGS_INLINE Floats operator*(Floats a, Floats b) { XRGS_EACH(Floats, a.v[i] * b.v[i]); }
 XRGS_INLINE Floats operator/(Floats a, Floats b) { XRGS_EACH(Floats, a.v[i] / b.v[i]); }
 // a b + c and c - a b
-XRGS_INLINE Floats fma(Floats a, Floats b, Floats c) { XRGS_EACH(Floats, a.v[i] * b.v[i] + c.v[i]); }
-XRGS_INLINE Floats fnma(Floats a, Floats b, Floats c) { XRGS_EACH(Floats, c.v[i] - a.v[i] * b.v[i]); }
+XRGS_INLINE Floats fma(Floats a, Floats b, Floats c) {
+  XRGS_EACH(Floats, a.v[i] * b.v[i] + c.v[i]);
+}
+XRGS_INLINE Floats fnma(Floats a, Floats b, Floats c) {
+  XRGS_EACH(Floats, c.v[i] - a.v[i] * b.v[i]);
+}
 XRGS_INLINE Floats min(Floats a, Floats b) { XRGS_EACH(Floats, a.v[i] < b.v[i] ? a.v[i] : b.v[i]); }
 XRGS_INLINE Floats max(Floats a, Floats b) { XRGS_EACH(Floats, a.v[i] > b.v[i] ? a.v[i] : b.v[i]); }
 // Of positive numbers (of others, anything).
@@ -429,7 +475,9 @@ XRGS_INLINE Mask mask_of(std::uint32_t bits) {
   XRGS_EACH(Mask, -static_cast<std::int32_t>((bits >> i) & 1u));
 }
 // m ? a : b, and m ? a : 0
-XRGS_INLINE Floats select(Mask m, Floats a, Floats b) { XRGS_EACH(Floats, m.v[i] ? a.v[i] : b.v[i]); }
+XRGS_INLINE Floats select(Mask m, Floats a, Floats b) {
+  XRGS_EACH(Floats, m.v[i] ? a.v[i] : b.v[i]);
+}
 XRGS_INLINE Floats keep(Mask m, Floats a) { XRGS_EACH(Floats, m.v[i] ? a.v[i] : 0.0f); }
 
 // Sums wrap around, as those of the vectors do.
@@ -447,7 +495,9 @@ XRGS_INLINE Ints shift_left(Ints a) {
   XRGS_EACH(Ints, static_cast<std::int32_t>(static_cast<std::uint32_t>(a.v[i]) << Count));
 }
 template <int Count>
-XRGS_INLINE Ints shift_right(Ints a) { XRGS_EACH(Ints, a.v[i] >> Count); }
+XRGS_INLINE Ints shift_right(Ints a) {
+  XRGS_EACH(Ints, a.v[i] >> Count);
+}
 XRGS_INLINE Ints as_ints(Floats a) {
   Ints r;
   std::memcpy(r.v, a.v, sizeof r.v);
@@ -485,9 +535,13 @@ XRGS_INLINE void deinterleave(Floats low, Floats high, Floats& a, Floats& b) {
 // The lanes as a 4x4 matrix, row by row: every row its own column C; row R in every row; and the
 // sum of the rows in every row.
 template <int C>
-XRGS_INLINE Floats splat_column(Floats a) { XRGS_EACH(Floats, a.v[i / 4 * 4 + C]); }
+XRGS_INLINE Floats splat_column(Floats a) {
+  XRGS_EACH(Floats, a.v[i / 4 * 4 + C]);
+}
 template <int R>
-XRGS_INLINE Floats splat_row(Floats a) { XRGS_EACH(Floats, a.v[4 * R + i % 4]); }
+XRGS_INLINE Floats splat_row(Floats a) {
+  XRGS_EACH(Floats, a.v[4 * R + i % 4]);
+}
 XRGS_INLINE Floats sum_rows(Floats a) {
   XRGS_EACH(Floats, (a.v[i % 4] + a.v[8 + i % 4]) + (a.v[4 + i % 4] + a.v[12 + i % 4]));
 }

@@ -30,9 +30,10 @@ XRGS_INLINE Floats exp2(Floats x) {
   const Floats magic = splat(393216.0f);
   const Floats t = x + magic;
   const Floats f = x - (t - magic);  // -1/64 to 1/64
-  const Floats p = fma(f, fma(f, splat(0.24022474884986877f), splat(0.6931573152542114f)), splat(1.0f));
-  const __m512i part = _mm512_permutex2var_epi32(_mm512_load_si512(kExp2Table), _mm512_castps_si512(t.v),
-                                                 _mm512_load_si512(kExp2Table + 16));
+  const Floats p =
+      fma(f, fma(f, splat(0.24022474884986877f), splat(0.6931573152542114f)), splat(1.0f));
+  const __m512i part = _mm512_permutex2var_epi32(
+      _mm512_load_si512(kExp2Table), _mm512_castps_si512(t.v), _mm512_load_si512(kExp2Table + 16));
   return p * as_floats(Ints{part} + shift_left<18>(as_ints(t)));
 #else
   const Floats magic = splat(12582912.0f);  // 1.5 * 2^23: adding it rounds to an integer

@@ -41,7 +41,8 @@ void bind_bench(nb::module_& m) {
         if (threads < 1) throw nb::value_error("threads must be at least 1");
         return multiply_adds_per_second(threads);
       },
-      nb::arg("threads"), "Scalar float32 multiply-adds a second that this machine can do, measured.");
+      nb::arg("threads"),
+      "Scalar float32 multiply-adds a second that this machine can do, measured.");
 }
 
 }  // namespace xrgs

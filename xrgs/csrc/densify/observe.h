@@ -8,11 +8,11 @@
 namespace xrgs {
 
 struct Observation {
-  const float* slope;            // [N, 2] of the loss by the projected means, per px
-  const std::uint8_t* visible;   // [N] 0 or 1
-  float scale_x, scale_y;        // px to the units of the sum
-  float* gradient;               // [N] sum of the slopes' norms
-  float* seen;                   // [N] how many they are
+  const float* slope;           // [N, 2] of the loss by the projected means, per px
+  const std::uint8_t* visible;  // [N] 0 or 1
+  float scale_x, scale_y;       // px to the units of the sum
+  float* gradient;              // [N] sum of the slopes' norms
+  float* seen;                  // [N] how many they are
 };
 
 struct ObserveKernels {

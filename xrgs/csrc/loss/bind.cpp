@@ -40,9 +40,7 @@ void run_bands(const Photometric& job, int threads) {
   const std::size_t size = (kernels.scratch(job.width) + 15) / 16 * 16;
   std::unique_ptr<void, GiveBlock> scratch(take_block(bands * size * sizeof(float)));
   parallel_for(threads, bands, [&](std::int64_t i) {
-    const auto row = [&](std::int64_t band) {
-      return static_cast<int>(job.height * band / bands);
-    };
+    const auto row = [&](std::int64_t band) { return static_cast<int>(job.height * band / bands); };
     kernels.band(job, row(i), row(i + 1), static_cast<float*>(scratch.get()) + i * size);
   });
 }

@@ -7,20 +7,20 @@
 
 namespace xrgs {
 
-constexpr int kTaps = 11;            // of the SSIM window along each axis
-constexpr int kReach = kTaps - 1;    // rows and columns that a map is smaller than its image
+constexpr int kTaps = 11;          // of the SSIM window along each axis
+constexpr int kReach = kTaps - 1;  // rows and columns that a map is smaller than its image
 
 // What one call computes. The gradient is of l1_slope * sum |image - target| + ssim_slope * sum S,
 // with S the SSIM of each channel where the whole window lies inside the image.
 struct Photometric {
-  const float *image, *target;    // [H, W, 3]
-  const float *mean, *variance;   // [H - 10, W - 10, 3] of the target under the window
+  const float *image, *target;   // [H, W, 3]
+  const float *mean, *variance;  // [H - 10, W - 10, 3] of the target under the window
   int height, width;
-  float taps[kTaps / 2 + 1];      // of the window: taps[|distance from the middle|]
+  float taps[kTaps / 2 + 1];  // of the window: taps[|distance from the middle|]
   float l1_slope, ssim_slope;
-  double* l1_rows;                // [H] sum of |image - target| over each row
-  double* ssim_rows;              // [H - 10] sum of S over each row
-  float* gradient;                // [H, W, 3], or null if only the sums are wanted
+  double* l1_rows;    // [H] sum of |image - target| over each row
+  double* ssim_rows;  // [H - 10] sum of S over each row
+  float* gradient;    // [H, W, 3], or null if only the sums are wanted
 };
 
 struct PhotometricKernels {

@@ -23,11 +23,11 @@ constexpr int kGroup = 2;
 constexpr int kInputs = kGroup + kReach;  // rows that a group of rows is made of
 constexpr int kRing = 16;                 // rows of A, B and C kept
 static_assert(kRing >= kInputs, "a group needs all its rows in the ring");
-constexpr int kStep = 3;                  // floats from one pixel to the next
-constexpr int kSpan = kStep * kReach;     // floats that a map's row is shorter than an image's
-constexpr int kChunk = 192;               // columns (floats) summed down before they go across
-constexpr int kMargin = 48;               // of a chunk's left neighbour, that its window reaches
-constexpr int kAhead = 256;               // floats: how far ahead new rows are fetched
+constexpr int kStep = 3;               // floats from one pixel to the next
+constexpr int kSpan = kStep * kReach;  // floats that a map's row is shorter than an image's
+constexpr int kChunk = 192;            // columns (floats) summed down before they go across
+constexpr int kMargin = 48;            // of a chunk's left neighbour, that its window reaches
+constexpr int kAhead = 256;            // floats: how far ahead new rows are fetched
 constexpr int kFields = 3;
 constexpr float kMiddle = 0.5f;
 constexpr float kC1 = 0.0001f, kC2 = 0.0009f;  // (0.01)^2 and (0.03)^2, for a data range of 1
@@ -97,9 +97,15 @@ XRGS_INLINE Floats sum_across(const Weights& w, const float* p) {
 class Band {
  public:
   Band(const Photometric& job, int first, int last, float* scratch)
-      : job_(job), weights_(job.taps), first_(first), last_(last),
-        columns_(kStep * job.width), map_columns_(columns_ - kSpan),
-        map_rows_(job.height - kReach), row_(ring_row(job.width)), ring_(scratch),
+      : job_(job),
+        weights_(job.taps),
+        first_(first),
+        last_(last),
+        columns_(kStep * job.width),
+        map_columns_(columns_ - kSpan),
+        map_rows_(job.height - kReach),
+        row_(ring_row(job.width)),
+        ring_(scratch),
         zeros_(scratch + kFields * kRing * row_) {
     std::memset(zeros_, 0, row_ * sizeof(float));
   }
@@ -179,7 +185,8 @@ class Band {
             });
         },
         [&](int c, int lanes, int place) {
-          for (int row = 0; row < rows; ++row) sum[row] += map_vector(y + row, row, c, lanes, place);
+          for (int row = 0; row < rows; ++row)
+            sum[row] += map_vector(y + row, row, c, lanes, place);
           if (++in_sum == kChunk / kLanes || c + kLanes >= map_columns_) {
             for (int row = 0; row < rows; ++row) {
               total[row] += static_cast<double>(xrgs::XRGS_NS::sum(sum[row]));
@@ -254,7 +261,8 @@ class Band {
         },
         [&](int c, int lanes, int place) {
           for (int row = 0; row < kGroup; ++row)
-            if (y + row >= first_ && y + row < last_) gradient_vector(y + row, row, c, lanes, place);
+            if (y + row >= first_ && y + row < last_)
+              gradient_vector(y + row, row, c, lanes, place);
         });
   }
 
@@ -266,7 +274,8 @@ class Band {
     const Floats x = load_lanes(job_.image + at, lanes), t = load_lanes(job_.target + at, lanes);
     const Floats slope = splat(job_.l1_slope), two = splat(2.0f), middle = splat(kMiddle);
     const Floats sign = keep(t < x, slope) - keep(x < t, slope);
-    store_first(job_.gradient + at, fma(t - middle, p, fma(two * (x - middle), b, a + sign)), lanes);
+    store_first(job_.gradient + at, fma(t - middle, p, fma(two * (x - middle), b, a + sign)),
+                lanes);
   }
 
   float* ring(int y, int field) { return ring_ + (field * kRing + (y & (kRing - 1))) * row_; }

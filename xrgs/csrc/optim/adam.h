@@ -17,8 +17,8 @@ struct AdamGroup {
   float keep1, beta2, keep2, rate, inv_root, eps;
 };
 
-// The harmonics above band 0, whose gradient is made here of that of band 0, times their basis in the
-// direction of view.
+// The harmonics above band 0, whose gradient is made here of that of band 0, times their basis in
+// the direction of view.
 struct HarmonicsGroup {
   AdamGroup adam;             // without a gradient; size is count * rest * 3
   const float* means;         // [count, 3] as they were rendered

@@ -9,8 +9,12 @@ namespace {
 struct Constants {
   Floats keep1, beta2, keep2, rate, inv_root, eps;
   explicit Constants(const AdamGroup& g)
-      : keep1(splat(g.keep1)), beta2(splat(g.beta2)), keep2(splat(g.keep2)), rate(splat(g.rate)),
-        inv_root(splat(g.inv_root)), eps(splat(g.eps)) {}
+      : keep1(splat(g.keep1)),
+        beta2(splat(g.beta2)),
+        keep2(splat(g.keep2)),
+        rate(splat(g.rate)),
+        inv_root(splat(g.inv_root)),
+        eps(splat(g.eps)) {}
 };
 
 XRGS_INLINE void move(const Constants& k, float* p, const float* g, float* m, float* v, int lanes) {
@@ -65,17 +69,22 @@ void step_harmonics_degree(const HarmonicsGroup& group, std::int64_t first, std:
     for (std::int64_t at = 0; at < size; at += kLanes) {
       const int some = size - at < kLanes ? static_cast<int>(size - at) : kLanes;
       const std::int64_t place = begin + at;
-      move(k, adam.parameter + place, gradient.rows + at, adam.mean + place, adam.square + place, some);
+      move(k, adam.parameter + place, gradient.rows + at, adam.mean + place, adam.square + place,
+           some);
     }
   }
 }
 
 void step_harmonics(const HarmonicsGroup& group, std::int64_t first, std::int64_t last) {
   switch (group.degree) {
-    case 0: return step_harmonics_degree<0>(group, first, last);
-    case 1: return step_harmonics_degree<1>(group, first, last);
-    case 2: return step_harmonics_degree<2>(group, first, last);
-    default: return step_harmonics_degree<3>(group, first, last);
+    case 0:
+      return step_harmonics_degree<0>(group, first, last);
+    case 1:
+      return step_harmonics_degree<1>(group, first, last);
+    case 2:
+      return step_harmonics_degree<2>(group, first, last);
+    default:
+      return step_harmonics_degree<3>(group, first, last);
   }
 }
 

@@ -82,10 +82,11 @@ void adam_harmonics(Harmonics parameter, Harmonics mean, Harmonics square, Vecto
                     Vectors sh0_gradient, std::array<float, 3> position, int degree, double lr,
                     double step, double beta1, double beta2, double eps, int threads) {
   const std::size_t count = parameter.shape(0), rest = parameter.shape(1);
-  if (means.shape(0) != count || sh0_gradient.shape(0) != count || mean.size() != parameter.size() ||
-      square.size() != parameter.size())
+  if (means.shape(0) != count || sh0_gradient.shape(0) != count ||
+      mean.size() != parameter.size() || square.size() != parameter.size())
     throw nb::value_error("adam_harmonics: shapes that do not fit");
-  if (degree < 0 || degree > 3 || (degree + 1) * (degree + 1) - 1 > static_cast<int>(rest) || rest > 15)
+  if (degree < 0 || degree > 3 || (degree + 1) * (degree + 1) - 1 > static_cast<int>(rest) ||
+      rest > 15)
     throw nb::value_error("adam_harmonics: shN does not have the bands of sh_degree");
   HarmonicsGroup group{};
   group.adam = Betas{beta1, beta2, eps}.constants(lr, step);
@@ -109,12 +110,13 @@ void bind_optim(nb::module_& m) {
         nb::arg("threads"),
         "One step of Adam in place. Each group is (parameter, gradient, exp_avg, exp_avg_sq, lr,\n"
         "step): four float32 [N], the rate, and the number of this step, from 1.");
-  m.def("adam_harmonics", &adam_harmonics, nb::arg("parameter"), nb::arg("mean"), nb::arg("square"),
-        nb::arg("means"), nb::arg("sh0_gradient"), nb::arg("position"), nb::arg("degree"),
-        nb::arg("lr"), nb::arg("step"), nb::arg("beta1"), nb::arg("beta2"), nb::arg("eps"),
-        nb::arg("threads"),
-        "The same for shN [N, K - 1, 3], its gradient made of sh0's [N, 3]: times the basis in the\n"
-        "direction from the camera's position to the means, over that of band 0.");
+  m.def(
+      "adam_harmonics", &adam_harmonics, nb::arg("parameter"), nb::arg("mean"), nb::arg("square"),
+      nb::arg("means"), nb::arg("sh0_gradient"), nb::arg("position"), nb::arg("degree"),
+      nb::arg("lr"), nb::arg("step"), nb::arg("beta1"), nb::arg("beta2"), nb::arg("eps"),
+      nb::arg("threads"),
+      "The same for shN [N, K - 1, 3], its gradient made of sh0's [N, 3]: times the basis in the\n"
+      "direction from the camera's position to the means, over that of band 0.");
 }
 
 }  // namespace xrgs

@@ -54,7 +54,8 @@ struct Emitter {
   std::int64_t count = 0;
 
   XRGS_INLINE void row(std::uint32_t gaussian, int row, std::int32_t begin, std::int32_t end) {
-    const std::uint32_t base = static_cast<std::uint32_t>(row) * static_cast<std::uint32_t>(columns);
+    const std::uint32_t base =
+        static_cast<std::uint32_t>(row) * static_cast<std::uint32_t>(columns);
     for (std::int32_t column = begin; column <= end; ++column) {
       const std::uint32_t tile = base + static_cast<std::uint32_t>(column);
       ++tile_counts[tile];
@@ -103,7 +104,8 @@ void emit_sixteen(Frame& frame, const std::uint64_t* order, int lanes, Emitter& 
     const int count = rows.last[i] - rows.first[i] + 1;
     const std::int64_t before = out.count;
     if (count > kFewRows)
-      emit_tall(frame.records[gaussian[i]], gaussian[i], rows.first[i], rows.last[i], frame.view, out);
+      emit_tall(frame.records[gaussian[i]], gaussian[i], rows.first[i], rows.last[i], frame.view,
+                out);
     else
       for (int k = 0; k < count; ++k)
         out.row(gaussian[i], rows.first[i] + k, columns[k].begin[i], columns[k].end[i]);

@@ -57,7 +57,8 @@ class LentFrame {
 void check_size(const char* name, std::size_t size, std::size_t count) {
   if (size != count)
     throw nb::value_error((std::string(name) + " must have " + std::to_string(count) +
-                           " rows, got " + std::to_string(size)).c_str());
+                           " rows, got " + std::to_string(size))
+                              .c_str());
 }
 
 // The tensors of a call, held for as long as their pointers are used.
@@ -79,9 +80,15 @@ struct Tensors {
     if (sh0.shape(1) != 1) throw nb::value_error("sh0 must be [N, 1, 3]");
     if (offsets) check_size("means2d_offset", offsets->shape(0), count);
     if (count > 0xffffffffu) throw nb::value_error("means: more than 2^32 Gaussians");
-    return {static_cast<std::int64_t>(count), means.data(),     quats.data(), scales.data(),
-            opacities.data(),                 sh0.data(),       shN.data(),
-            static_cast<int>(shN.shape(1)),   offsets ? offsets->data() : nullptr};
+    return {static_cast<std::int64_t>(count),
+            means.data(),
+            quats.data(),
+            scales.data(),
+            opacities.data(),
+            sh0.data(),
+            shN.data(),
+            static_cast<int>(shN.shape(1)),
+            offsets ? offsets->data() : nullptr};
   }
 };
 
@@ -129,14 +136,15 @@ std::tuple<Output, Output> forward(LentFrame& frame, const View& view, const Vec
   const Parameters parameters = tensors.checked();
   if ((view.degree + 1) * (view.degree + 1) - 1 > parameters.rest)
     throw nb::value_error("shN has fewer bands than sh_degree asks for");
-  const auto height = static_cast<std::size_t>(view.height), width = static_cast<std::size_t>(view.width);
+  const auto height = static_cast<std::size_t>(view.height),
+             width = static_cast<std::size_t>(view.width);
   Output image = new_array<float>({height, width, 3}), alpha = new_array<float>({height, width});
   bool good = true, enough = true;
   {
     nb::gil_scoped_release release;
     try {
       good = render(threads, parameters, view, *frame, static_cast<float*>(image.data()),
-                      static_cast<float*>(alpha.data()));
+                    static_cast<float*>(alpha.data()));
     } catch (const std::bad_alloc&) {
       enough = false;
     }
@@ -162,14 +170,20 @@ Outputs backward(LentFrame& frame, const Image& image_gradient, const Plane& alp
       alpha_gradient.shape(0) != height || alpha_gradient.shape(1) != width)
     throw nb::value_error("the gradients must have the image's size");
   const std::size_t n = means.shape(0), rest = shN.shape(1);
-  Outputs out{new_array<float>({n, 3}),    new_array<float>({n, 4}),       new_array<float>({n, 3}),
-              new_array<float>({n}),       new_array<float>({n, 1, 3}),    std::nullopt,
+  Outputs out{new_array<float>({n, 3}),
+              new_array<float>({n, 4}),
+              new_array<float>({n, 3}),
+              new_array<float>({n}),
+              new_array<float>({n, 1, 3}),
+              std::nullopt,
               std::nullopt};
   if (with_rest) std::get<5>(out) = new_array<float>({n, rest, 3});
   if (offsets) std::get<6>(out) = new_array<float>({n, 2});
   const auto pointer = [](Output& array) { return static_cast<float*>(array.data()); };
-  const Gradients gradients{pointer(std::get<0>(out)), pointer(std::get<1>(out)),
-                            pointer(std::get<2>(out)), pointer(std::get<3>(out)),
+  const Gradients gradients{pointer(std::get<0>(out)),
+                            pointer(std::get<1>(out)),
+                            pointer(std::get<2>(out)),
+                            pointer(std::get<3>(out)),
                             pointer(std::get<4>(out)),
                             with_rest ? pointer(*std::get<5>(out)) : nullptr,
                             offsets ? pointer(*std::get<6>(out)) : nullptr};
@@ -187,22 +201,25 @@ Outputs backward(LentFrame& frame, const Image& image_gradient, const Plane& alp
   return out;
 }
 
-View make_view(const Matrix4& viewmat, const std::array<float, 4>& intrinsics, int width, int height,
-               float near, float eps2d, float alpha_min, float alpha_max, float transmittance_min,
-               bool antialiased, bool absgrad, const std::array<float, 3>& background, int degree,
+View make_view(const Matrix4& viewmat, const std::array<float, 4>& intrinsics, int width,
+               int height, float near, float eps2d, float alpha_min, float alpha_max,
+               float transmittance_min, bool antialiased, bool absgrad,
+               const std::array<float, 3>& background, int degree,
                const std::array<bool, 5>& skips) {
   if (width < 1 || height < 1) throw nb::value_error("width and height must be at least 1");
   if (degree < 0 || degree > 3) throw nb::value_error("sh_degree must be 0 to 3");
   View v;
   for (int i = 0; i < 3; ++i) {
-    for (int k = 0; k < 3; ++k) v.rotation[3 * i + k] = viewmat[static_cast<std::size_t>(4 * i + k)];
+    for (int k = 0; k < 3; ++k)
+      v.rotation[3 * i + k] = viewmat[static_cast<std::size_t>(4 * i + k)];
     v.translation[i] = viewmat[static_cast<std::size_t>(4 * i + 3)];
     v.background[i] = background[static_cast<std::size_t>(i)];
   }
   for (int k = 0; k < 3; ++k) {
     double position = 0.0;
     for (int i = 0; i < 3; ++i)
-      position -= static_cast<double>(v.rotation[3 * i + k]) * static_cast<double>(v.translation[i]);
+      position -=
+          static_cast<double>(v.rotation[3 * i + k]) * static_cast<double>(v.translation[i]);
     v.position[k] = static_cast<float>(position);
   }
   v.fx = intrinsics[0];
@@ -228,7 +245,8 @@ Output visible_of(LentFrame& frame) {
   const auto count = static_cast<std::size_t>(frame->gaussians);
   Output out = new_array<bool>({count});
   bool* visible = static_cast<bool*>(out.data());
-  for (std::size_t i = 0; i < count; ++i) visible[i] = (frame->visible[i / 16] >> (i % 16) & 1) != 0;
+  for (std::size_t i = 0; i < count; ++i)
+    visible[i] = (frame->visible[i / 16] >> (i % 16) & 1) != 0;
   return out;
 }
 
@@ -260,14 +278,18 @@ void bind_raster(nb::module_& m) {
       .def("backward", &backward, "image_gradient"_a, "alpha_gradient"_a, "means"_a, "quats"_a,
            "scales"_a, "opacities"_a, "sh0"_a, "shN"_a, "offsets"_a.none(), "with_rest"_a,
            "threads"_a,
-           "Gradients of the parameters, in their order (shN's if with_rest), and of the offsets if\n"
+           "Gradients of the parameters, in their order (shN's if with_rest), and of the offsets "
+           "if\n"
            "there are any.")
       .def("visible", &visible_of, "Which Gaussians are visible: [N] bool.")
-      .def_prop_ro("pairs", [](LentFrame& f) { return f->pairs(); }, "(tile, Gaussian) pairs.")
-      .def_prop_ro("evaluations", [](LentFrame& f) { return f->evaluations(); },
-                   "Pixels that a Gaussian's alpha was computed at.")
-      .def_prop_ro("bytes", [](LentFrame& f) { return f->bytes(); },
-                   "Memory in use, that of the backward pass included.")
+      .def_prop_ro(
+          "pairs", [](LentFrame& f) { return f->pairs(); }, "(tile, Gaussian) pairs.")
+      .def_prop_ro(
+          "evaluations", [](LentFrame& f) { return f->evaluations(); },
+          "Pixels that a Gaussian's alpha was computed at.")
+      .def_prop_ro(
+          "bytes", [](LentFrame& f) { return f->bytes(); },
+          "Memory in use, that of the backward pass included.")
       .def_prop_ro("timings", &timings_of, "Milliseconds of each stage.");
 }
 

@@ -131,7 +131,8 @@ std::uint32_t start_blocks(const Tile& tile, const View& view, Block* blocks) {
   return alive;
 }
 
-void write_blocks(const Tile& tile, const View& view, const Block* blocks, float* image, float* alpha) {
+void write_blocks(const Tile& tile, const View& view, const Block* blocks, float* image,
+                  float* alpha) {
   const float* back = view.background;
   for (int b = 0; b < kBlocks; ++b) {
     const BlockPlace place(tile, view, b);
@@ -172,8 +173,9 @@ void composite(Frame& frame, int index, float* image, float* alpha) {
       if ((alive >> b & 1u) == 0) continue;
       store(batch->before[b], load(blocks[b].t));
       const int listed = compact(hits[b], count, batch->lists[b]);
-      const int went = stop ? composite_block<true>(rows, batch->lists[b], listed, b, cuts, blocks[b])
-                            : composite_block<false>(rows, batch->lists[b], listed, b, cuts, blocks[b]);
+      const int went =
+          stop ? composite_block<true>(rows, batch->lists[b], listed, b, cuts, blocks[b])
+               : composite_block<false>(rows, batch->lists[b], listed, b, cuts, blocks[b]);
       batch->counts[b] = static_cast<std::uint8_t>(went);
       entries_done += went;
       if (stop && !any(cuts.transmittance_min < load(blocks[b].t))) alive &= ~(1u << b);

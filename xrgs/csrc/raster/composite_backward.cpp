@@ -147,7 +147,8 @@ XRGS_INLINE void walk_back(const Rows& rows, const std::uint8_t* list, int count
 }
 
 // From sums about the tile's centre to sums about the Gaussians' means, into their slots.
-void write_slots(const Rows& rows, const Rows& sums, const Entry* entries, int count, float* slots) {
+void write_slots(const Rows& rows, const Rows& sums, const Entry* entries, int count,
+                 float* slots) {
   for (int at = 0; at < count; at += 16) {
     Floats means[16], m[16], out[16];
     for (int i = 0; i < 16; ++i) {
@@ -222,7 +223,8 @@ void backward_tile(const Frame& frame, int index, const float* image_gradient,
       const int listed = batch.counts[b];
       if (listed == 0) continue;
       walk_forward(rows, batch.lists[b], listed, b, cuts, batch.before[b], notes);
-      walk_back<Absolute>(rows, batch.lists[b], listed, b, cuts, incoming[b], notes, behind[b], sums);
+      walk_back<Absolute>(rows, batch.lists[b], listed, b, cuts, incoming[b], notes, behind[b],
+                          sums);
     }
     write_slots(rows, sums, entries + at, count, slots);
   }

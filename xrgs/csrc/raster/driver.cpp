@@ -45,7 +45,8 @@ class Borrowed {
 void close_up(int threads, std::int64_t chunks, const std::int32_t* seen, Frame& frame) {
   constexpr std::int64_t kTogether = 32;  // chunks a task
   std::vector<std::int64_t> place(static_cast<std::size_t>(chunks) + 1, 0);
-  for (std::size_t c = 0; c < static_cast<std::size_t>(chunks); ++c) place[c + 1] = place[c] + seen[c];
+  for (std::size_t c = 0; c < static_cast<std::size_t>(chunks); ++c)
+    place[c + 1] = place[c] + seen[c];
   frame.seen = place.back();
   parallel_for(threads, (chunks + kTogether - 1) / kTogether, [&](std::int64_t task) {
     for (std::int64_t c = task * kTogether; c < std::min(chunks, (task + 1) * kTogether); ++c)

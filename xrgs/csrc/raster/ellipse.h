@@ -46,7 +46,8 @@ XRGS_INLINE Mask span(const Ellipse& e, Floats top, Floats bottom, Floats& left,
 
 // Lanes of sixteen records that were transposed.
 XRGS_INLINE Ellipse ellipse_of(const Floats (&fields)[16]) {
-  return {fields[0], fields[1], fields[3], fields[4], fields[9], fields[10], fields[11], fields[12]};
+  return {fields[0], fields[1],  fields[3],  fields[4],
+          fields[9], fields[10], fields[11], fields[12]};
 }
 
 XRGS_INLINE Ellipse ellipse_of(const Record& r) {

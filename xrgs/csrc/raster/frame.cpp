@@ -57,10 +57,11 @@ std::int64_t Frame::evaluations() const {
 }
 
 std::int64_t Frame::bytes() const {
-  return static_cast<std::int64_t>(
-      records.bytes() + visible.bytes() + shades.bytes() + slots.bytes() + order.bytes() + spare.bytes() +
-      entries.bytes() + tile_begin.bytes() + batch_begin.bytes() + batches_done.bytes() +
-      batches.bytes() + tile_evaluations.bytes() + entries.size() * kSlotSize * sizeof(float));
+  return static_cast<std::int64_t>(records.bytes() + visible.bytes() + shades.bytes() +
+                                   slots.bytes() + order.bytes() + spare.bytes() + entries.bytes() +
+                                   tile_begin.bytes() + batch_begin.bytes() + batches_done.bytes() +
+                                   batches.bytes() + tile_evaluations.bytes() +
+                                   entries.size() * kSlotSize * sizeof(float));
 }
 
 std::unique_ptr<Frame> take_frame() { return store<Frame>().take(); }

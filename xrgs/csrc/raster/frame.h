@@ -21,7 +21,8 @@ template <class T>
 class Buffer {
  public:
   Buffer() = default;
-  Buffer(Buffer&& other) noexcept : data_(other.data_), capacity_(other.capacity_), size_(other.size_) {
+  Buffer(Buffer&& other) noexcept
+      : data_(other.data_), capacity_(other.capacity_), size_(other.size_) {
     other.data_ = nullptr;
     other.capacity_ = other.size_ = 0;
   }
@@ -70,18 +71,18 @@ struct Timings {
 struct Frame {
   View view;
   std::int64_t gaussians = 0;
-  Buffer<Record> records;                // [N], of visible Gaussians only
-  Buffer<std::uint16_t> visible;         // [N / 16] a bit a Gaussian
-  Buffer<Shade> shades;                  // [N / 16], where one of them is visible
-  Buffer<Slots> slots;                   // [N]
-  Buffer<std::uint64_t> order, spare;    // depth key << 32 | Gaussian; visible ones, front to back
-  std::int64_t seen = 0;                 // how many are visible
-  Buffer<Entry> entries;                 // [pairs] by tile, front to back
-  Buffer<std::uint32_t> tile_begin;      // [tiles + 1] into entries
-  Buffer<std::uint32_t> batch_begin;     // [tiles + 1] into batches
-  Buffer<std::uint32_t> batches_done;    // [tiles] how many of a tile's batches were composited
+  Buffer<Record> records;              // [N], of visible Gaussians only
+  Buffer<std::uint16_t> visible;       // [N / 16] a bit a Gaussian
+  Buffer<Shade> shades;                // [N / 16], where one of them is visible
+  Buffer<Slots> slots;                 // [N]
+  Buffer<std::uint64_t> order, spare;  // depth key << 32 | Gaussian; visible ones, front to back
+  std::int64_t seen = 0;               // how many are visible
+  Buffer<Entry> entries;               // [pairs] by tile, front to back
+  Buffer<std::uint32_t> tile_begin;    // [tiles + 1] into entries
+  Buffer<std::uint32_t> batch_begin;   // [tiles + 1] into batches
+  Buffer<std::uint32_t> batches_done;  // [tiles] how many of a tile's batches were composited
   Buffer<Batch> batches;
-  Buffer<std::int64_t> tile_evaluations; // [tiles]
+  Buffer<std::int64_t> tile_evaluations;  // [tiles]
   Timings timings;
 
   std::int64_t pairs() const { return static_cast<std::int64_t>(entries.size()); }
@@ -93,10 +94,10 @@ struct Frame {
 struct Workspace {
   // For each chunk of Gaussians in depth order its pairs, front to back, in pieces.
   std::vector<std::vector<Buffer<Pair>>> emitted;
-  Buffer<std::uint32_t> places;        // [chunks, tiles]
-  Buffer<std::uint32_t> histogram;     // of the sort
-  Buffer<std::int32_t> chunk_seen;     // [chunks]
-  Buffer<float> sums;                  // [pairs, kSlotSize]
+  Buffer<std::uint32_t> places;     // [chunks, tiles]
+  Buffer<std::uint32_t> histogram;  // of the sort
+  Buffer<std::int32_t> chunk_seen;  // [chunks]
+  Buffer<float> sums;               // [pairs, kSlotSize]
 };
 
 std::unique_ptr<Frame> take_frame();

@@ -45,7 +45,8 @@ struct Padded {
   float values[64];
   const float* of(const float* all, std::int64_t group, int lanes, int width) {
     if (lanes == 16) return all + group * width;
-    for (int i = 0; i < 16 * width; ++i) values[i] = i < lanes * width ? all[group * width + i] : 0.0f;
+    for (int i = 0; i < 16 * width; ++i)
+      values[i] = i < lanes * width ? all[group * width + i] : 0.0f;
     return values;
   }
 };
@@ -97,17 +98,17 @@ XRGS_INLINE Rotation rotation_of(const Inputs& in) {
 }
 
 struct Projected {
-  Floats x, y, z, inv_z;       // camera coordinates
-  Floats slope_x, slope_y;     // held within the field of view
-  Mask free_x, free_y;         // where they were not held
+  Floats x, y, z, inv_z;    // camera coordinates
+  Floats slope_x, slope_y;  // held within the field of view
+  Mask free_x, free_y;      // where they were not held
   Rotation rotation;
-  Vector3 axis[3];             // rows of A
-  Vector3 m1, m2, normal;      // px; normal = m1 x m2
-  Floats xx, xy, yy;           // dilated covariance, px^2
-  Floats area, det;            // |normal|, and the determinant of the dilated covariance
-  Floats opacity;              // compensated where antialiased
-  Floats mean_x, mean_y;       // px
-  Mask front;                  // in front of the near plane
+  Vector3 axis[3];         // rows of A
+  Vector3 m1, m2, normal;  // px; normal = m1 x m2
+  Floats xx, xy, yy;       // dilated covariance, px^2
+  Floats area, det;        // |normal|, and the determinant of the dilated covariance
+  Floats opacity;          // compensated where antialiased
+  Floats mean_x, mean_y;   // px
+  Mask front;              // in front of the near plane
 };
 
 XRGS_INLINE Floats clamp_slope(Floats slope, float focal, float centre, float size, Mask& inside) {

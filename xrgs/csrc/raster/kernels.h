@@ -13,8 +13,8 @@ struct Frame;
 
 struct RasterKernels {
   // Project Gaussians first..last-1 (first a multiple of 16): records and bits of the visible ones,
-  // their sort keys from `order` on; returns how many. Sets *good to false where a parameter that was
-  // read is not finite or out of range (harmonics are read for visible Gaussians only).
+  // their sort keys from `order` on; returns how many. Sets *good to false where a parameter that
+  // was read is not finite or out of range (harmonics are read for visible Gaussians only).
   std::int64_t (*project)(const Parameters& parameters, const View& view, std::int64_t first,
                           std::int64_t last, Frame& frame, std::uint64_t* order, bool* good);
 

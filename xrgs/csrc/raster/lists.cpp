@@ -17,8 +17,8 @@ constexpr std::int64_t kChunkLeast = 4096;
 constexpr std::int64_t kPiece = 1 << 16;  // pairs
 
 // Emit a chunk's pairs, piece by piece. False where memory ran out.
-bool emit_chunk(const RasterKernels& kernels, Frame& frame, std::int64_t first,
-                std::int64_t last, std::vector<Buffer<Pair>>& pieces, std::uint32_t* counts) {
+bool emit_chunk(const RasterKernels& kernels, Frame& frame, std::int64_t first, std::int64_t last,
+                std::vector<Buffer<Pair>>& pieces, std::uint32_t* counts) {
   const std::int64_t tiles = std::int64_t{frame.view.columns()} * frame.view.rows();
   std::size_t used = 0;
   try {

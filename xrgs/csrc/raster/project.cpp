@@ -43,7 +43,8 @@ XRGS_INLINE Vector3 colors_of(const Parameters& p, std::int64_t group, int lanes
   if constexpr (kRest > 0) {
     Floats basis[kRest], c[3 * kRest];
     sh_basis<Degree>(direction, basis);
-    load_columns<3 * kRest>(p.shN + group * p.rest * 3, p.rest * 3, rows_to_load(visible, lanes), c);
+    load_columns<3 * kRest>(p.shN + group * p.rest * 3, p.rest * 3, rows_to_load(visible, lanes),
+                            c);
     for (int k = 0; k < kRest; ++k)
       color = add(color, basis[k], {c[3 * k], c[3 * k + 1], c[3 * k + 2]});
     for (int channel = 0; channel < 3; ++channel) {
@@ -64,7 +65,8 @@ XRGS_INLINE Mask is_visible(const Projected& o, const View& v, Floats reach2) {
   // reach2 is in units of log2: 2 ln(opacity / alpha_min) = 2 ln 2 reach2.
   const Floats r2 = splat(2.0f / kLog2e) * reach2, zero = splat(0.0f), huge = splat(1e18f);
   const Floats extent_x = sqrt(r2 * o.xx), extent_y = sqrt(r2 * o.yy);
-  const Mask usable = (zero < o.det) & (o.det < splat(3e38f)) & (extent_x < huge) & (extent_y < huge);
+  const Mask usable =
+      (zero < o.det) & (o.det < splat(3e38f)) & (extent_x < huge) & (extent_y < huge);
   const bool anywhere = !v.skips.out_of_view;  // then only what overflows is dropped
   const Floats left = anywhere ? -huge : zero;
   const Floats right = anywhere ? huge : splat(static_cast<float>(v.width));
@@ -75,8 +77,8 @@ XRGS_INLINE Mask is_visible(const Projected& o, const View& v, Floats reach2) {
   return o.front & (opacity_min <= o.opacity) & usable & overlaps;
 }
 
-XRGS_INLINE void store_records(const Projected& o, Floats level, Floats reach2, const Vector3& color,
-                               std::uint32_t visible, Record* records) {
+XRGS_INLINE void store_records(const Projected& o, Floats level, Floats reach2,
+                               const Vector3& color, std::uint32_t visible, Record* records) {
   const Whitening white = whiten(o);
   const Floats scale = splat(kSqrtLog2e), zero = splat(0.0f);
   const Floats p = white.p * scale, s = white.s * scale, q = white.q * scale;
@@ -125,7 +127,8 @@ std::uint32_t project_sixteen(const Parameters& p, const View& v, std::int64_t g
   const Vector3 direction = direction_of(in.mean, v.position, inv);
   const Vector3 color = colors_of<Degree>(p, group, lanes, visible, direction,
                                           frame.shades[static_cast<std::size_t>(group / 16)]);
-  const Mask finite = (color.x * zero == zero) & (color.y * zero == zero) & (color.z * zero == zero);
+  const Mask finite =
+      (color.x * zero == zero) & (color.y * zero == zero) & (color.z * zero == zero);
   if ((visible & ~bits(finite)) != 0) *good = false;
   store_records(o, level, reach2, color, visible, frame.records.data() + group);
   store(depths, o.z);
@@ -164,10 +167,14 @@ std::int64_t project_degree(const Parameters& p, const View& v, std::int64_t fir
 std::int64_t project(const Parameters& p, const View& v, std::int64_t first, std::int64_t last,
                      Frame& frame, std::uint64_t* order, bool* good) {
   switch (v.degree) {
-    case 0: return project_degree<0>(p, v, first, last, frame, order, good);
-    case 1: return project_degree<1>(p, v, first, last, frame, order, good);
-    case 2: return project_degree<2>(p, v, first, last, frame, order, good);
-    default: return project_degree<3>(p, v, first, last, frame, order, good);
+    case 0:
+      return project_degree<0>(p, v, first, last, frame, order, good);
+    case 1:
+      return project_degree<1>(p, v, first, last, frame, order, good);
+    case 2:
+      return project_degree<2>(p, v, first, last, frame, order, good);
+    default:
+      return project_degree<3>(p, v, first, last, frame, order, good);
   }
 }
 

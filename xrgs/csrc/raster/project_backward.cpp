@@ -25,7 +25,8 @@ XRGS_INLINE void sum_slots(const Frame& frame, const float* sums, std::int64_t g
     Floats sum = load(slots.count > 0 ? slot : kNoSlot);
     for (std::uint32_t k = 1; k < kFewSlots; ++k)
       sum += load(k < slots.count ? slot + k * kSlotSize : kNoSlot);
-    for (std::uint32_t k = kFewSlots; k < slots.count; ++k) sum += load(slot + std::size_t{k} * kSlotSize);
+    for (std::uint32_t k = kFewSlots; k < slots.count; ++k)
+      sum += load(slot + std::size_t{k} * kSlotSize);
     out[i] = sum;
   }
   transpose(out);
@@ -42,9 +43,9 @@ struct CovarianceGradient {
 XRGS_INLINE CovarianceGradient whitening_backward(const Projected& o, const Floats (&sum)[16]) {
   const Whitening w = whiten(o);
   const Floats two = splat(2.0f), half = splat(0.5f);
-  const Floats gu = fnma(w.s, sum[kGy], w.p * sum[kGx]);      // sum of g u
-  const Floats gux = fnma(w.s, sum[kGxy], w.p * sum[kGxx]);   // of g u dx
-  const Floats guy = fnma(w.s, sum[kGyy], w.p * sum[kGxy]);   // of g u dy
+  const Floats gu = fnma(w.s, sum[kGy], w.p * sum[kGx]);     // sum of g u
+  const Floats gux = fnma(w.s, sum[kGxy], w.p * sum[kGxx]);  // of g u dx
+  const Floats guy = fnma(w.s, sum[kGyy], w.p * sum[kGxy]);  // of g u dy
   const Floats inv_yy = splat(1.0f) / o.yy, ratio = o.xy * inv_yy;
   const Floats vs = two * guy;
   const Floats vq_q = -(two * w.q * w.q * sum[kGyy]);  // dL/dq times q
@@ -100,9 +101,9 @@ struct ShapeGradient {
 };
 
 // From image-plane axes and means to means, scales and quaternions.
-XRGS_INLINE ShapeGradient projection_backward(const Projected& o, const View& view, const Inputs& in,
-                                              const Vector3& v_m1, const Vector3& v_m2,
-                                              Floats v_x2d, Floats v_y2d) {
+XRGS_INLINE ShapeGradient projection_backward(const Projected& o, const View& view,
+                                              const Inputs& in, const Vector3& v_m1,
+                                              const Vector3& v_m2, Floats v_x2d, Floats v_y2d) {
   const Floats zero = splat(0.0f);
   const Floats focal_x = splat(view.fx) * o.inv_z, focal_y = splat(view.fy) * o.inv_z;
   const Vector3 a0 = times(focal_x, v_m1), a1 = times(focal_y, v_m2);
@@ -110,7 +111,8 @@ XRGS_INLINE ShapeGradient projection_backward(const Projected& o, const View& vi
   const Floats v_slope_x = select(o.free_x, -dot(a0, o.axis[2]), zero);
   const Floats v_slope_y = select(o.free_y, -dot(a1, o.axis[2]), zero);
   // Slopes and means both move with x/z and y/z.
-  const Floats v_xz = fma(splat(view.fx), v_x2d, v_slope_x), v_yz = fma(splat(view.fy), v_y2d, v_slope_y);
+  const Floats v_xz = fma(splat(view.fx), v_x2d, v_slope_x),
+               v_yz = fma(splat(view.fy), v_y2d, v_slope_y);
   Vector3 v_cam;
   v_cam.x = v_xz * o.inv_z;
   v_cam.y = v_yz * o.inv_z;
@@ -128,7 +130,8 @@ XRGS_INLINE ShapeGradient projection_backward(const Projected& o, const View& vi
     *mean[k] = fma(splat(r[k]), v_cam.x, fma(splat(r[3 + k]), v_cam.y, splat(r[6 + k]) * v_cam.z));
     const Vector3 row = to_world(a0, a1, a2, k);  // of rotation diag(scale)
     const Vector3& q = o.rotation.row[k];
-    out.scale = {fma(row.x, q.x, out.scale.x), fma(row.y, q.y, out.scale.y), fma(row.z, q.z, out.scale.z)};
+    out.scale = {fma(row.x, q.x, out.scale.x), fma(row.y, q.y, out.scale.y),
+                 fma(row.z, q.z, out.scale.z)};
     v_rotation[k] = {row.x * in.scale.x, row.y * in.scale.y, row.z * in.scale.z};
   }
   quaternion_backward(o.rotation, v_rotation, out.quat);
@@ -150,10 +153,12 @@ struct Sixteen {
   }
 };
 
-void zero_floats(float* p, std::int64_t count) { std::memset(p, 0, static_cast<std::size_t>(count) * 4); }
+void zero_floats(float* p, std::int64_t count) {
+  std::memset(p, 0, static_cast<std::size_t>(count) * 4);
+}
 
-// The colour's part: writes the gradients of the harmonics (of those above band 0 if they are wanted),
-// returns that of the mean.
+// The colour's part: writes the gradients of the harmonics (of those above band 0 if they are
+// wanted), returns that of the mean.
 template <int Degree>
 XRGS_INLINE Vector3 color_backward(const Parameters& p, const View& view, const Inputs& in,
                                    const Shade& shade, const Floats (&sum)[16], std::int64_t group,
@@ -169,7 +174,8 @@ XRGS_INLINE Vector3 color_backward(const Parameters& p, const View& view, const 
   Vector3 v_mean{splat(0.0f), splat(0.0f), splat(0.0f)};
   if constexpr (kRest > 0) {
     const auto slope = [&](int axis) {
-      return Vector3{load(shade.slope[axis]), load(shade.slope[3 + axis]), load(shade.slope[6 + axis])};
+      return Vector3{load(shade.slope[axis]), load(shade.slope[3 + axis]),
+                     load(shade.slope[6 + axis])};
     };
     const Vector3 v_d{dot(slope(0), v), dot(slope(1), v), dot(slope(2), v)};
     v_mean = times(inv, add(v_d, -dot(v_d, d), d));
@@ -191,7 +197,8 @@ void write_zeros(const Parameters& p, std::int64_t group, int lanes, const Gradi
   zero_floats(out.scales + group * 3, lanes * 3);
   zero_floats(out.opacities + group, lanes);
   zero_floats(out.sh0 + group * 3, lanes * 3);
-  if (out.shN != nullptr) zero_floats(out.shN + group * p.rest * 3, std::int64_t{lanes} * p.rest * 3);
+  if (out.shN != nullptr)
+    zero_floats(out.shN + group * p.rest * 3, std::int64_t{lanes} * p.rest * 3);
   if (out.offsets != nullptr) zero_floats(out.offsets + group * 2, lanes * 2);
 }
 
@@ -219,8 +226,9 @@ void write_shape(const ShapeGradient& v, Floats v_opacity, Floats v_x2d, Floats 
 }
 
 template <int Degree>
-void backward_sixteen(const Parameters& p, const Frame& frame, const float* sums, std::int64_t group,
-                      int lanes, std::uint32_t visible, const Gradients& out, Harmonics& harmonics) {
+void backward_sixteen(const Parameters& p, const Frame& frame, const float* sums,
+                      std::int64_t group, int lanes, std::uint32_t visible, const Gradients& out,
+                      Harmonics& harmonics) {
   const View& view = frame.view;
   Floats sum[16];
   sum_slots(frame, sums, group, visible, sum);
@@ -232,7 +240,8 @@ void backward_sixteen(const Parameters& p, const Frame& frame, const float* sums
   covariance_backward(o, view, in, v, v_opacity, v_m1, v_m2);
   ShapeGradient shape = projection_backward(o, view, in, v_m1, v_m2, v.mean_x, v.mean_y);
   const Shade& shade = frame.shades[static_cast<std::size_t>(group / 16)];
-  const Vector3 by_color = color_backward<Degree>(p, view, in, shade, sum, group, lanes, out, harmonics);
+  const Vector3 by_color =
+      color_backward<Degree>(p, view, in, shade, sum, group, lanes, out, harmonics);
   shape.mean = add(shape.mean, splat(1.0f), by_color);
   const Floats v_x2d = view.absgrad ? sum[kAbsX] : v.mean_x;
   const Floats v_y2d = view.absgrad ? sum[kAbsY] : v.mean_y;
@@ -256,13 +265,17 @@ void backward_degree(const Parameters& p, const Frame& frame, const float* sums,
 
 }  // namespace
 
-void project_backward(const Parameters& p, const Frame& frame, const float* sums, std::int64_t first,
-                      std::int64_t last, const Gradients& out) {
+void project_backward(const Parameters& p, const Frame& frame, const float* sums,
+                      std::int64_t first, std::int64_t last, const Gradients& out) {
   switch (frame.view.degree) {
-    case 0: return backward_degree<0>(p, frame, sums, first, last, out);
-    case 1: return backward_degree<1>(p, frame, sums, first, last, out);
-    case 2: return backward_degree<2>(p, frame, sums, first, last, out);
-    default: return backward_degree<3>(p, frame, sums, first, last, out);
+    case 0:
+      return backward_degree<0>(p, frame, sums, first, last, out);
+    case 1:
+      return backward_degree<1>(p, frame, sums, first, last, out);
+    case 2:
+      return backward_degree<2>(p, frame, sums, first, last, out);
+    default:
+      return backward_degree<3>(p, frame, sums, first, last, out);
   }
 }
 

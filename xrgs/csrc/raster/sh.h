@@ -10,11 +10,11 @@
 namespace xrgs {
 namespace XRGS_NS {
 
-constexpr float kC0 = 0.28209479f;                            // sqrt(1 / 4 pi)
-constexpr float kC1 = 0.48860251f;                            // sqrt(3 / 4 pi)
-constexpr float kC2 = 1.09254843f, kC20 = 0.31539157f;        // sqrt(15 / 4 pi), sqrt(5 / 16 pi)
-constexpr float kC31 = 0.45704580f, kC32 = 2.89061144f;       // sqrt(21 / 32 pi), sqrt(105 / 4 pi)
-constexpr float kC33 = 0.59004359f, kC30 = 0.37317633f;       // sqrt(35 / 32 pi), sqrt(7 / 16 pi)
+constexpr float kC0 = 0.28209479f;                       // sqrt(1 / 4 pi)
+constexpr float kC1 = 0.48860251f;                       // sqrt(3 / 4 pi)
+constexpr float kC2 = 1.09254843f, kC20 = 0.31539157f;   // sqrt(15 / 4 pi), sqrt(5 / 16 pi)
+constexpr float kC31 = 0.45704580f, kC32 = 2.89061144f;  // sqrt(21 / 32 pi), sqrt(105 / 4 pi)
+constexpr float kC33 = 0.59004359f, kC30 = 0.37317633f;  // sqrt(35 / 32 pi), sqrt(7 / 16 pi)
 
 constexpr int rest_of(int degree) { return (degree + 1) * (degree + 1) - 1; }
 
@@ -83,7 +83,8 @@ XRGS_INLINE Vector3 sh_gradient(const Vector3& d, const Floats* coefficients, in
 
 // Sixteen rows of `Width` floats, `stride` apart, as columns; rows not in `rows` read as zero.
 template <int Width>
-XRGS_INLINE void load_columns(const float* p, std::int64_t stride, std::uint32_t rows, Floats* out) {
+XRGS_INLINE void load_columns(const float* p, std::int64_t stride, std::uint32_t rows,
+                              Floats* out) {
   for (int c = 0; c < Width; c += 16) {
     const int width = Width - c < 16 ? Width - c : 16;
     Floats r[16];
@@ -94,8 +95,8 @@ XRGS_INLINE void load_columns(const float* p, std::int64_t stride, std::uint32_t
   }
 }
 
-// Whose harmonics to load: where most of the sixteen are visible those of all, as a test of each one
-// would cost more than what it spares.
+// Whose harmonics to load: where most of the sixteen are visible those of all, as a test of each
+// one would cost more than what it spares.
 XRGS_INLINE std::uint32_t rows_to_load(std::uint32_t visible, int lanes) {
   return __builtin_popcount(visible) >= 8 ? (1u << lanes) - 1u : visible;
 }

@@ -1,4 +1,5 @@
-// LSD radix sort of (depth key, Gaussian): up to 11 bits at a time, of as many as the keys differ in.
+// LSD radix sort of (depth key, Gaussian): up to 11 bits at a time, of as many as the keys differ
+// in.
 //
 // In parallel each chunk counts its digits, and the counts are summed digit by digit, chunk by
 // chunk: each chunk then knows its places, and the result is the stable one for any chunking.
@@ -63,7 +64,8 @@ void sort_by_depth(int threads, Frame& frame, Workspace& workspace) {
   const auto digit_of = [=](std::uint64_t item, int shift) {
     return ((key_of(item) - least) >> shift) & (digits - 1);
   };
-  std::uint32_t* histogram = workspace.histogram.resize(static_cast<std::size_t>(chunks) * kMostDigits);
+  std::uint32_t* histogram =
+      workspace.histogram.resize(static_cast<std::size_t>(chunks) * kMostDigits);
   bool swapped = false;
   for (int shift = 0; shift < 32 && range >> shift != 0; shift += bits) {
     parallel_for(threads, chunks, [&](std::int64_t c) {

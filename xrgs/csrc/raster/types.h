@@ -10,10 +10,10 @@
 
 namespace xrgs {
 
-constexpr int kTile = 16;         // side of a tile, px: sixteen 4x4 blocks, one vector each
-constexpr int kBlocks = 16;       // of a tile, row by row
-constexpr int kBatch = 128;       // Gaussians of a tile that are composited at once
-constexpr int kChunk = 1024;      // Gaussians that a task projects; a multiple of 16
+constexpr int kTile = 16;     // side of a tile, px: sixteen 4x4 blocks, one vector each
+constexpr int kBlocks = 16;   // of a tile, row by row
+constexpr int kBatch = 128;   // Gaussians of a tile that are composited at once
+constexpr int kChunk = 1024;  // Gaussians that a task projects; a multiple of 16
 
 // Work that is left out, each kind as long as it is true; the image is the same without.
 struct Skips {
@@ -38,7 +38,7 @@ struct View {
   float background[3];
   bool antialiased;
   bool absgrad;  // the offsets' gradient is of each pixel's gradient the absolute value, summed
-  int degree;  // highest band of the spherical harmonics that is on
+  int degree;    // highest band of the spherical harmonics that is on
   Skips skips;
 
   int columns() const { return (width + kTile - 1) / kTile; }
@@ -69,14 +69,14 @@ struct Gradients {
 // u = p dx - s dy and v = q dy: alpha = 2^(level - u^2 - v^2). The inverse covariance as a sum of
 // squares has no cancellation, where a dx^2 + 2 b dx dy + c dy^2 of a long needle loses all digits.
 struct alignas(64) Record {
-  float x, y;           // mean, px
-  float p, s, q;        // px^-1
-  float level;          // log2 of the opacity
+  float x, y;     // mean, px
+  float p, s, q;  // px^-1
+  float level;    // log2 of the opacity
   float red, green, blue;
-  float inv_p;          // 1 / p
-  float tip;            // dy of the rightmost point of the ellipse of reach, px
-  float reach2;         // the ellipse of reach is u^2 + v^2 = reach2
-  float reach_y;        // half its height, px
+  float inv_p;    // 1 / p
+  float tip;      // dy of the rightmost point of the ellipse of reach, px
+  float reach2;   // the ellipse of reach is u^2 + v^2 = reach2
+  float reach_y;  // half its height, px
   float unused[3];
 };
 static_assert(sizeof(Record) == 64, "a record is one cache line");
@@ -87,8 +87,8 @@ struct Entry {
   std::uint32_t slot;  // where the backward pass leaves this pair's sums
 };
 
-// How the colours of sixteen Gaussians move with the direction that they are seen from, kept from the
-// forward pass so that the backward pass need not read the harmonics again.
+// How the colours of sixteen Gaussians move with the direction that they are seen from, kept from
+// the forward pass so that the backward pass need not read the harmonics again.
 struct alignas(64) Shade {
   float slope[9][16];     // d(red)/dx, d(red)/dy, d(red)/dz, d(green)/dx, ... before the clamp at 0
   std::uint16_t open[3];  // for red, green, blue: a bit where the clamp does not hold it
@@ -115,9 +115,9 @@ constexpr int kSlotSize = 16;  // floats: one cache line
 
 // Work of one batch of one tile, kept from the forward pass for the backward pass.
 struct Batch {
-  std::uint8_t counts[kBlocks];                // how far each block went in its list
-  std::uint8_t lists[kBlocks][kBatch];         // places in the batch, front to back
-  alignas(64) float before[kBlocks][16];       // transmittance of each pixel before the batch
+  std::uint8_t counts[kBlocks];           // how far each block went in its list
+  std::uint8_t lists[kBlocks][kBatch];    // places in the batch, front to back
+  alignas(64) float before[kBlocks][16];  // transmittance of each pixel before the batch
 };
 
 }  // namespace xrgs

@@ -10,8 +10,8 @@ namespace xrgs {
 // One matrix [count, old]: output i is the sum over t of weights[i * taps + t] times input
 // first[i] + t.
 struct Bands {
-  const int* first;       // [count]
-  const float* weights;   // [count, taps]
+  const int* first;      // [count]
+  const float* weights;  // [count, taps]
   int count, taps;
 };
 

@@ -52,8 +52,7 @@ std::size_t scratch(int width) {
   return (floats + kLanes - 1) / kLanes * kLanes * kLanes;
 }
 
-void across(const Bands& columns, const float* in, int width, int rows, float* out,
-            float* turned) {
+void across(const Bands& columns, const float* in, int width, int rows, float* out, float* turned) {
   const int in_floats = kStep * width, out_floats = kStep * columns.count;
   for (int c = 0; c < in_floats; c += kLanes) {
     const int lanes = in_floats - c < kLanes ? in_floats - c : kLanes;
