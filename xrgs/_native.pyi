@@ -30,7 +30,7 @@ def adam_step(
     eps: float,
     threads: int,
 ) -> None: ...
-def adam_step_shN(
+def adam_step_sh_rest(
     parameter: Tensor,
     exp_avg: Tensor,
     exp_avg_sq: Tensor,

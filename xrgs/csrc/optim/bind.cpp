@@ -1,4 +1,5 @@
-// xrgs._native.adam_step and adam_step_shN: one step of Adam, each as one job of the thread pool.
+// xrgs._native.adam_step and adam_step_sh_rest: one step of Adam, each as one job of the thread
+// pool.
 #include "optim/bind.h"
 
 #include <nanobind/ndarray.h>
@@ -81,19 +82,20 @@ void adam_step(nb::list tuples, double beta1, double beta2, double eps, int thre
   });
 }
 
-void adam_step_shN(ShCoefficients parameter, ShCoefficients exp_avg, ShCoefficients exp_avg_sq,
-                   Vectors means, Vectors sh0_gradient, std::array<float, 3> camera_position,
-                   int sh_degree, double lr, double step, double beta1, double beta2, double eps,
-                   int threads) {
+void adam_step_sh_rest(ShCoefficients parameter, ShCoefficients exp_avg, ShCoefficients exp_avg_sq,
+                       Vectors means, Vectors sh0_gradient, std::array<float, 3> camera_position,
+                       int sh_degree, double lr, double step, double beta1, double beta2,
+                       double eps, int threads) {
   const std::size_t count = parameter.shape(0), rest_count = parameter.shape(1);
   if (means.shape(0) != count || sh0_gradient.shape(0) != count ||
       exp_avg.size() != parameter.size() || exp_avg_sq.size() != parameter.size())
     throw nb::value_error(
-        "adam_step_shN: shapes that do not fit: exp_avg and exp_avg_sq must have the shape of the"
+        "adam_step_sh_rest: shapes that do not fit: exp_avg and exp_avg_sq must have the shape of "
+        "the"
         " parameter, means and sh0_gradient as many rows");
   if (sh_degree < 0 || sh_degree > 3 ||
       (sh_degree + 1) * (sh_degree + 1) - 1 > static_cast<int>(rest_count) || rest_count > 15)
-    throw nb::value_error("adam_step_shN: shN does not have the bands of sh_degree (0 to 3)");
+    throw nb::value_error("adam_step_sh_rest: shN does not have the bands of sh_degree (0 to 3)");
   ShNAdamGroup group{};
   group.adam = AdamOptions{beta1, beta2, eps}.group(lr, step);
   group.adam.parameter = parameter.data(), group.adam.exp_avg = exp_avg.data();
@@ -118,7 +120,7 @@ void bind_optim(nb::module_& m) {
         "Each group is a tuple (parameter, gradient, exp_avg, exp_avg_sq, lr, step): four float32 "
         "[N],\n"
         "the learning rate, and the number of this step, from 1.");
-  m.def("adam_step_shN", &adam_step_shN, nb::arg("parameter"), nb::arg("exp_avg"),
+  m.def("adam_step_sh_rest", &adam_step_sh_rest, nb::arg("parameter"), nb::arg("exp_avg"),
         nb::arg("exp_avg_sq"), nb::arg("means"), nb::arg("sh0_gradient"),
         nb::arg("camera_position"), nb::arg("sh_degree"), nb::arg("lr"), nb::arg("step"),
         nb::arg("beta1"), nb::arg("beta2"), nb::arg("eps"), nb::arg("threads"),

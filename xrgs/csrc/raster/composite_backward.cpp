@@ -1,9 +1,9 @@
 // Compositing, backward: from the gradient of the image to pair_grads, one row for each (tile,
 // Gaussian) pair.
 //
-// With v the gradient of a pixel's colour and v_alpha that of its alpha, each Gaussian i of the
-// pixel's list has (Eq. 16 and 17)
-//   G_i = color_i . v - background . v + v_alpha,    w_i = alpha_i T_i,
+// With v_image the gradient of a pixel's colour and v_alpha that of its alpha, each Gaussian i of
+// the pixel's list has (Eq. 16 and 17)
+//   G_i = (color_i - background) . v_image + v_alpha,    w_i = alpha_i T_i,
 //   dL/d(ln alpha_i) = w_i (G_i - R_i),    R_{i-1} = R_i + alpha_i (G_i - R_i),
 // where R_i is what lies behind Gaussian i, divided by the transmittance in front of it. Computed
 // back to front, R needs no division by 1 - alpha and loses no digits to cancellation.
@@ -13,9 +13,9 @@
 // pass back to front then computes R and sums over the block's pixels. The sums are products of 4x4
 // matrices: with g as a matrix, X = (1, x, x^2) in each column and Y = (1, y, y^2) in each row,
 // both from the tile's centre, Y^T g X holds the nine moments; with w in the place of g, the sums
-// of w v. At the end of the batch the moments are moved from the tile's centre to each Gaussian's
-// mean (Eq. 18). Absolute values have no such moments, so with absgrad the derivatives by the mean
-// are summed pixel by pixel (Eq. 21).
+// of w v_image. At the end of the batch the moments are moved from the tile's centre to each
+// Gaussian's mean (Eq. 18). Absolute values have no such moments, so with absgrad the derivatives
+// by the mean are summed pixel by pixel (Eq. 21).
 #include "raster/stages.h"
 #include "raster/tile_batch.h"
 
@@ -27,8 +27,7 @@ namespace {
 // each of its four pixels.
 struct PixelGradients {
   alignas(64) float red[16], green[16], blue[16];
-  alignas(
-      64) float constant[16];  // v_alpha - background . v: the part of G that no Gaussian changes
+  alignas(64) float constant[16];  // v_alpha - background . v_image, the same for every Gaussian
   alignas(64) float colors[4][16];
 };
 
@@ -116,8 +115,8 @@ constexpr int kAbsU = 3, kAbsV = 7;
 
 // Processes a block's list back to front and adds each Gaussian's sums over the block's pixels to
 // its row of moments. Row i < 3, column j < 3 of that row, read as a 4x4 matrix, has the sum of g
-// y^i x^j, and row 3 that of w v. With Absgrad the last column of rows 0 and 1 has those of |g u|
-// and |g (chol_yy v - chol_xy u)|. `behind` is R of Eq. 17, for each pixel.
+// y^i x^j, and row 3 that of w v_image. With Absgrad the last column of rows 0 and 1 has those of
+// |g u| and |g (chol_yy v - chol_xy u)|. `behind` is R of Eq. 17, for each pixel.
 template <bool Absgrad>
 XRGS_INLINE void accumulate_moments(const BatchRows& rows, const std::uint8_t* list, int count,
                                     int block, const AlphaThresholds& thresholds,

@@ -115,9 +115,9 @@ struct TileIntersection {
 };
 
 // The columns of pair_grads [pairs, kPairGradStride]: sums over the pixels of a pair. With
-// g = dL/d(ln alpha), w = alpha T and v = dL/d(image), they are g, g dx, g dy, g dx^2, g dx dy, g
-// dy^2 and w v for each colour (Eq. 18); with absgrad also |dL/d(mean2d)| for x and y (Eq. 21),
-// else zeros.
+// g = dL/d(ln alpha) and w = alpha T, they are
+//   g, g dx, g dy, g dx^2, g dx dy, g dy^2, and w v_image for each colour (Eq. 18);
+// with absgrad also |dL/d(mean2d)| for x and y (Eq. 21), else zeros.
 enum PairGradField {
   kGrad,
   kGradDx,

@@ -62,7 +62,7 @@ def _step_harmonics(
     beta1, beta2 = adam.defaults["betas"]
     state = _adam_state(adam, shN)
     state["step"] += 1
-    _native.adam_step_shN(
+    _native.adam_step_sh_rest(
         _require_plain("shN", shN),
         _require_plain("shN", state["exp_avg"]),
         _require_plain("shN", state["exp_avg_sq"]),
