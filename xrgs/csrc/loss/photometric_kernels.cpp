@@ -70,7 +70,8 @@ XRGS_INLINE Floats load_lanes(const float* p, int lanes) {
 // Sums one vector of columns down the image, for each row of a group. read(input_row, value) loads
 // the three fields of one input row.
 template <class Read>
-XRGS_INLINE void sum_down(const WindowWeights& w, ColumnChunk& chunk, int at_chunk, Read&& read) {
+XRGS_INLINE void sum_down(const WindowWeights& w, ColumnChunk& chunk, int chunk_index,
+                          Read&& read) {
   Floats sum[kGroup][kFields];
   for (auto& row : sum)
     for (Floats& field : row) field = broadcast(0.0f);
@@ -87,7 +88,7 @@ XRGS_INLINE void sum_down(const WindowWeights& w, ColumnChunk& chunk, int at_chu
     }
   }
   for (int row = 0; row < kGroup; ++row)
-    for (int f = 0; f < kFields; ++f) store(&chunk.rows[row][f][at_chunk], sum[row][f]);
+    for (int f = 0; f < kFields; ++f) store(&chunk.rows[row][f][chunk_index], sum[row][f]);
 }
 
 XRGS_INLINE Floats sum_across(const WindowWeights& w, const float* p) {
@@ -126,10 +127,10 @@ class Band {
   }
 
  private:
-  // Calls down(column, lanes, at_chunk) for each vector of a group's `inputs` columns, and
-  // across(column, lanes, at_chunk) for each of its `outputs` as soon as the sums that it reads are
-  // in the chunk. Its taps start at `at_chunk`, which is `lead` columns to the left of its own
-  // column.
+  // Calls down(column, lanes, chunk_index) for each vector of a group's `inputs` columns, and
+  // across(column, lanes, chunk_index) for each of its `outputs` as soon as the sums that it reads
+  // are in the chunk. Its taps start at `chunk_index`, which is `lead` columns to the left of its
+  // own column.
   template <class Down, class Across>
   XRGS_INLINE void for_each_column(int inputs, int outputs, int lead, Down&& down,
                                    Across&& across) {
@@ -182,18 +183,18 @@ class Band {
     int in_sum = 0;
     for_each_column(
         columns_, map_columns_, 0,
-        [&](int c, int lanes, int at_chunk) {
+        [&](int c, int lanes, int chunk_index) {
           if (lanes == kLanes)
-            sum_down(weights_, chunk_, at_chunk,
+            sum_down(weights_, chunk_, chunk_index,
                      [&](int i, Floats* v) { moments(load(x[i] + c), load(t[i] + c), v); });
           else
-            sum_down(weights_, chunk_, at_chunk, [&](int i, Floats* v) {
+            sum_down(weights_, chunk_, chunk_index, [&](int i, Floats* v) {
               moments(load_first(x[i] + c, lanes), load_first(t[i] + c, lanes), v);
             });
         },
-        [&](int c, int lanes, int at_chunk) {
+        [&](int c, int lanes, int chunk_index) {
           for (int row = 0; row < rows; ++row)
-            sum[row] += map_vector(y + row, row, c, lanes, at_chunk);
+            sum[row] += map_vector(y + row, row, c, lanes, chunk_index);
           if (++in_sum == kChunk / kLanes || c + kLanes >= map_columns_) {
             for (int row = 0; row < rows; ++row) {
               total[row] += static_cast<double>(sum_lanes(sum[row]));
@@ -213,11 +214,12 @@ class Band {
   }
 
   // Returns S of one vector, and stores its derivatives by the moments in the ring.
-  XRGS_INLINE Floats map_vector(int y, int row, int c, int lanes, int at_chunk) {
+  XRGS_INLINE Floats map_vector(int y, int row, int c, int lanes, int chunk_index) {
     const std::size_t at = static_cast<std::size_t>(y) * map_columns_ + c;
-    const Floats offset = sum_across(weights_, &chunk_.rows[row][0][at_chunk]);  // mean - kMidpoint
-    const Floats square = sum_across(weights_, &chunk_.rows[row][1][at_chunk]);
-    const Floats product = sum_across(weights_, &chunk_.rows[row][2][at_chunk]);
+    const Floats offset =
+        sum_across(weights_, &chunk_.rows[row][0][chunk_index]);  // mean - kMidpoint
+    const Floats square = sum_across(weights_, &chunk_.rows[row][1][chunk_index]);
+    const Floats product = sum_across(weights_, &chunk_.rows[row][2][chunk_index]);
     const Floats m = offset + broadcast(kMidpoint);
     const Floats mt = load_lanes(job_.target_mean + at, lanes);
     const Floats offset_t = mt - broadcast(kMidpoint);
@@ -256,28 +258,28 @@ class Band {
       }
     for_each_column(
         map_columns_, columns_, kRowShrink,
-        [&](int c, int lanes, int at_chunk) {
+        [&](int c, int lanes, int chunk_index) {
           if (lanes == kLanes)
-            sum_down(weights_, chunk_, at_chunk, [&](int i, Floats* v) {
+            sum_down(weights_, chunk_, chunk_index, [&](int i, Floats* v) {
               for (int f = 0; f < kFields; ++f) v[f] = load(map[i][f] + c);
             });
           else
-            sum_down(weights_, chunk_, at_chunk, [&](int i, Floats* v) {
+            sum_down(weights_, chunk_, chunk_index, [&](int i, Floats* v) {
               for (int f = 0; f < kFields; ++f) v[f] = load_first(map[i][f] + c, lanes);
             });
         },
-        [&](int c, int lanes, int at_chunk) {
+        [&](int c, int lanes, int chunk_index) {
           for (int row = 0; row < kGroup; ++row)
             if (y + row >= first_ && y + row < last_)
-              gradient_vector(y + row, row, c, lanes, at_chunk);
+              gradient_vector(y + row, row, c, lanes, chunk_index);
         });
   }
 
-  XRGS_INLINE void gradient_vector(int y, int row, int c, int lanes, int at_chunk) {
+  XRGS_INLINE void gradient_vector(int y, int row, int c, int lanes, int chunk_index) {
     const std::size_t at = static_cast<std::size_t>(y) * columns_ + c;
-    const Floats a = sum_across(weights_, &chunk_.rows[row][0][at_chunk]);
-    const Floats b = sum_across(weights_, &chunk_.rows[row][1][at_chunk]);
-    const Floats p = sum_across(weights_, &chunk_.rows[row][2][at_chunk]);
+    const Floats a = sum_across(weights_, &chunk_.rows[row][0][chunk_index]);
+    const Floats b = sum_across(weights_, &chunk_.rows[row][1][chunk_index]);
+    const Floats p = sum_across(weights_, &chunk_.rows[row][2][chunk_index]);
     const Floats x = load_lanes(job_.image + at, lanes), t = load_lanes(job_.target + at, lanes);
     const Floats slope = broadcast(job_.l1_slope), two = broadcast(2.0f),
                  middle = broadcast(kMidpoint);

@@ -15,11 +15,11 @@ constexpr int kProjectChunk = 1024;  // Gaussians that one task projects; a mult
 // Work that the rasterizer leaves out. Each option skips one kind of work while it is true; the
 // image is the same either way, to rounding at the thresholds.
 struct CullingOptions {
-  bool out_of_view;    // Gaussians whose cutoff ellipse has a bounding box outside the image
+  bool out_of_view;    // Gaussians whose bounding box (Eq. 12) does not overlap the image
   bool sub_threshold;  // Gaussians whose opacity is below alpha_min
-  bool tiles;   // tiles that the bounding box of the cutoff ellipse overlaps, but not the ellipse
-  bool blocks;  // 4x4 blocks of a tile that the cutoff ellipse does not overlap
-  bool saturated;  // Gaussians behind the last one that any pixel of a block composites
+  bool tiles;          // tiles that the bounding box overlaps, but not the cutoff ellipse (Eq. 13)
+  bool blocks;         // 4x4 blocks of a tile that the cutoff ellipse does not overlap
+  bool saturated;      // Gaussians behind the last one that any pixel of a block composites
 };
 
 // The camera and the settings of one render.
@@ -66,8 +66,8 @@ struct ParameterGradients {
 };
 
 // A visible Gaussian in the image plane: one cache line. With d = pixel centre - mean2d,
-//   u = chol_xx dx - chol_xy dy,  v = chol_yy dy,  alpha = 2^(log2_opacity - u^2 - v^2)   (Eq. 7,
-//   8).
+//   u = chol_xx dx - chol_xy dy,  v = chol_yy dy,  alpha = 2^(log2_opacity - u^2 - v^2)
+// (Eq. 7 and 8).
 // chol_* is the Cholesky factor of the conic (the inverse of the 2D covariance), scaled so that the
 // exponent is one of base 2. Conics as gsplat stores them, a dx^2 + 2 b dx dy + c dy^2, lose all
 // digits to cancellation for a long thin Gaussian; a sum of squares does not.
@@ -94,10 +94,10 @@ struct TileEntry {
 // this so that the backward pass need not read the spherical harmonics again, three quarters of the
 // parameters.
 struct alignas(64) ColorDerivatives {
-  float dcolor_ddir[9][16];  // d(red)/dx, d(red)/dy, d(red)/dz, d(green)/dx, ... of the unclamped
-                             // colour
-  std::uint16_t
-      unclamped[3];  // for red, green and blue: bit i is set where Gaussian i is not clamped at 0
+  // d(red)/dx, d(red)/dy, d(red)/dz, d(green)/dx, ... of the colour before the clamp at 0.
+  float dcolor_ddir[9][16];
+  // For red, green and blue: bit i is set where the colour of Gaussian i is not clamped.
+  std::uint16_t unclamped[3];
 };
 
 // The (tile, Gaussian) pairs of one Gaussian: rows first..first + count - 1 of pair_grads. They are

@@ -15,25 +15,21 @@
 //   Floats load(const float*)           sixteen floats, of any alignment
 //   void store(float*, Floats)
 //   void store(int32*, Ints)
-//   Floats load_first(p, count)         the first `count` (0 to 16) lanes; the others are zero, and
-//   their
-//                                       memory is not read
-//   void store_first(p, a, count)       the first `count` lanes; the rest of the memory is left
-//   alone void stream(float*, Floats)         store past the cache, for memory that is not read
-//   soon; the
-//                                       address is a multiple of 64 bytes
+//   Floats load_first(p, count)         the first `count` (0 to 16) lanes; the others are zero and
+//                                       their memory is not read
+//   void store_first(p, a, count)       the first `count` lanes; other memory is left alone
+//   void stream(float*, Floats)         stores past the cache, for memory that is not read soon,
+//                                       to an address that is a multiple of 64 bytes
 //   void stream_fence()                 makes the stores of stream() visible to other threads
 //
 //   + - * /, sqrt, abs, floor, ceil     lane by lane, as IEEE 754 rounds
-//   Floats fma(a, b, c)                 a b + c, rounded once where the processor has an
-//   instruction for Floats fnma(a, b, c)                it (AVX2, AVX-512); likewise c - a b Floats
-//   min(a, b), max(a, b)         b where a comparison with NaN decides Floats min_positive(a, b)
-//   min for positive numbers; for others the result is unspecified Floats sqrt_upper_bound(a) for a
-//   >= 0: at least sqrt(a), and at most 0.1% more, or at most
-//                                       1.001e-10 where a < 1e-20
-//   Floats exp2(a)                      2^a for -126 <= a <= 127, relative error below 2.4e-7; for
-//   other
-//                                       arguments the result is unspecified
+//   Floats fma(a, b, c)                 a b + c, rounded once where there is an instruction for it
+//   Floats fnma(a, b, c)                c - a b, likewise
+//   Floats min(a, b), max(a, b)         b where a or b is NaN
+//   Floats min_positive(a, b)           min of positive numbers; of others unspecified
+//   Floats sqrt_upper_bound(a)          for a >= 0: at least sqrt(max(a, 1e-20)), at most 0.1% more
+//   Floats exp2(a)                      2^a with a relative error below 2.4e-7 for
+//                                       -126 <= a <= 127; for others unspecified
 //   <, <=, ==                           comparisons that are false for NaN
 //   Mask & Mask
 //   uint32 to_bits(Mask)                lane i as bit i
@@ -62,8 +58,8 @@
 //   Floats sum_rows(a)                  (row 0 + row 2) + (row 1 + row 3), in all four rows
 //   Floats add_last_row(a, b)           a + b in row 3, a in the others
 //
-// Every instruction set adds in the same order; what differs between them is the rounding of fma
-// where there is no such instruction, and exp2.
+// Every instruction set adds in the same order. Results differ between them where one has no fused
+// multiply-add, where the compiler fuses a product and a sum, and in exp2.
 //
 // Kernel files must not call inline functions of the standard library unless they are certain to be
 // inlined: the linker keeps one copy of such a function for the whole module, which may be the one
