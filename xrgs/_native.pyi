@@ -1,4 +1,8 @@
-"""The compiled kernels (`xrgs/native`): what each family's bind.cpp defines."""
+"""The compiled kernels of `xrgs/csrc`: the types of what each family's bind.cpp defines.
+
+Their docstrings are in the module (`help(xrgs._native)`). Tensors are float32, on the CPU and
+contiguous.
+"""
 
 from collections.abc import Sequence
 
@@ -9,30 +13,45 @@ def set_isa(name: str) -> None: ...
 def available_isas() -> list[str]: ...
 def exp2(x: Tensor) -> Tensor: ...
 def log2(x: Tensor) -> Tensor: ...
-def photometric(
+def photometric_loss(
     image: Tensor,
     target: Tensor,
-    mean: Tensor,
-    variance: Tensor,
+    target_mean: Tensor,
+    target_variance: Tensor,
     l1: float,
     ssim: float,
     with_gradient: bool,
     threads: int,
 ) -> tuple[float, Tensor | None]: ...
-def adam(
+def adam_step(
     groups: list[tuple[Tensor, Tensor, Tensor, Tensor, float, float]],
     beta1: float,
     beta2: float,
     eps: float,
     threads: int,
 ) -> None: ...
-def observe(
-    slope: Tensor,
+def adam_step_sh_rest(
+    parameter: Tensor,
+    exp_avg: Tensor,
+    exp_avg_sq: Tensor,
+    means: Tensor,
+    sh0_gradient: Tensor,
+    camera_position: Sequence[float],
+    sh_degree: int,
+    lr: float,
+    step: float,
+    beta1: float,
+    beta2: float,
+    eps: float,
+    threads: int,
+) -> None: ...
+def accumulate_grad2d(
+    means2d_grad: Tensor,
     visible: Tensor,
     scale_x: float,
     scale_y: float,
-    gradient: Tensor,
-    seen: Tensor,
+    grad2d_sum: Tensor,
+    visible_count: Tensor,
     threads: int,
 ) -> None: ...
 def resample(
@@ -43,26 +62,11 @@ def resample(
     column_weights: Tensor,
     threads: int,
 ) -> Tensor: ...
-def adam_harmonics(
-    parameter: Tensor,
-    mean: Tensor,
-    square: Tensor,
-    means: Tensor,
-    sh0_gradient: Tensor,
-    position: Sequence[float],
-    degree: int,
-    lr: float,
-    step: float,
-    beta1: float,
-    beta2: float,
-    eps: float,
-    threads: int,
-) -> None: ...
 def multiply_adds_per_second(threads: int) -> float: ...
 
-class View:
-    @staticmethod
-    def make(
+class RenderConfig:
+    def __init__(
+        self,
         *,
         viewmat: Sequence[float],
         intrinsics: Sequence[float],
@@ -77,19 +81,21 @@ class View:
         absgrad: bool,
         background: Sequence[float],
         sh_degree: int,
-        skips: Sequence[bool],
-    ) -> View: ...
+        culling: Sequence[bool],
+    ) -> None: ...
 
 class Frame:
     def __init__(self) -> None: ...
-    # The six parameters, the offsets or None, and the number of threads.
-    def forward(self, view: View, *inputs: Tensor | int | None) -> tuple[Tensor, Tensor]: ...
-    # The gradients of image and alpha, and then the same, with shN's gradient or without before the
-    # number of threads.
+    # The inputs are the six parameters, means2d_offset or None, and the number of threads.
+    def forward(
+        self, config: RenderConfig, *inputs: Tensor | int | None
+    ) -> tuple[Tensor, Tensor]: ...
+    # The inputs are the gradients of image and alpha, the six parameters, means2d_offset or None,
+    # whether the gradient of shN is needed, and the number of threads.
     def backward(self, *inputs: Tensor | int | None) -> tuple[Tensor | None, ...]: ...
     def visible(self) -> Tensor: ...
     @property
-    def pairs(self) -> int: ...
+    def pair_count(self) -> int: ...
     @property
     def evaluations(self) -> int: ...
     @property

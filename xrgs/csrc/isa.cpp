@@ -1,4 +1,3 @@
-// Run-time choice of the instruction set by what the processor (and the system) support.
 #include "isa.h"
 
 #include <atomic>
@@ -12,7 +11,7 @@ constexpr const char* kNames[] = {"portable", "avx2", "avx512"};
 
 bool supported(Isa isa) {
 #ifdef XRGS_X86
-  // The builtins also ask the system whether it saves the wide registers.
+  // The builtins also check that the operating system saves the wide registers.
   if (isa == Isa::avx512)
     return __builtin_cpu_supports("avx512f") && __builtin_cpu_supports("avx512dq") &&
            __builtin_cpu_supports("avx512bw") && __builtin_cpu_supports("avx512vl") &&
@@ -28,7 +27,7 @@ Isa parse(const std::string& name) {
   for (Isa isa : {Isa::portable, Isa::avx2, Isa::avx512}) {
     if (name != isa_name(isa)) continue;
     if (!supported(isa))
-      throw std::invalid_argument("XRGS_ISA=" + name + ": this machine does not have it");
+      throw std::invalid_argument("XRGS_ISA is " + name + ", which this machine does not have");
     return isa;
   }
   throw std::invalid_argument("XRGS_ISA must be portable, avx2 or avx512, got " + name);

@@ -19,7 +19,7 @@ void* allocate(std::size_t bytes) noexcept {
   if (bytes >= 2 * kHugePage) {
     const std::size_t size = (bytes + kHugePage - 1) / kHugePage * kHugePage;
     void* block = std::aligned_alloc(kHugePage, size);
-    // A wish: without huge pages the block is as good as any.
+    // A failure is no error: the block works without huge pages, only more slowly.
     if (block != nullptr) (void)madvise(block, size, MADV_HUGEPAGE);
     return block;
   }

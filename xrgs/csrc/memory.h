@@ -1,13 +1,14 @@
-// Large blocks of memory.
+// Allocation of large blocks of memory.
 #pragma once
 
 #include <cstddef>
 
 namespace xrgs {
 
-// At least `bytes` on a 64-byte boundary, contents anything; null where there is no memory. Large
-// blocks ask for huge pages: records and sums are read in no order, and with pages of 4 KB most
-// such reads miss the TLB, too. Freed by std::free.
+// Returns at least `bytes` of uninitialised memory on a 64-byte boundary, or null where there is
+// not enough. The caller frees it with std::free. Large blocks ask for huge pages, because
+// projected Gaussians and pair_grads are read in random order, where with pages of 4 KB most reads
+// miss the TLB as well.
 void* allocate(std::size_t bytes) noexcept;
 
 }  // namespace xrgs

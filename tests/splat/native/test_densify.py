@@ -84,4 +84,4 @@ def test_shapes_that_do_not_fit_are_refused() -> None:
     ):
         slope, seen_now, total, seen = wrong
         with pytest.raises(ValueError, match="shapes that do not fit"):
-            native.observe(slope, seen_now, 1.0, 1.0, total, seen, 1)
+            native.accumulate_grad2d(slope, seen_now, 1.0, 1.0, total, seen, 1)

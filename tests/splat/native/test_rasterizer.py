@@ -410,7 +410,7 @@ def render_with(
     work = {
         "out_of_view": int(done.visible.sum()),
         "sub_threshold": int(done.visible.sum()),
-        "tiles": frame.pairs,
+        "tiles": frame.pair_count,
         "blocks": done.evaluations,
         "saturated": done.evaluations,
     }

@@ -194,10 +194,10 @@ def make_view(camera: Camera, **changes: Any) -> Any:
         "absgrad": False,
         "background": (0.0, 0.0, 0.0),
         "sh_degree": 3,
-        "skips": (True,) * 5,
+        "culling": (True,) * 5,
     }
     options["intrinsics"] = [float(value) for value in options["intrinsics"]]
-    return native.View.make(**(options | changes))
+    return native.RenderConfig(**(options | changes))
 
 
 def test_shapes_are_checked(make_camera: MakeCamera, make_scene: MakeScene) -> None:

@@ -1,4 +1,4 @@
-// xrgs._native.multiply_adds_per_second: the measured peak of the instruction set in use.
+// xrgs._native.multiply_adds_per_second: measures the peak of the instruction set in use.
 #include "bench/bind.h"
 
 #include <algorithm>
@@ -7,7 +7,7 @@
 #include <vector>
 
 #include "bench/peak.h"
-#include "pool.h"
+#include "thread_pool.h"
 
 namespace nb = nanobind;
 
@@ -16,9 +16,9 @@ namespace {
 
 double multiply_adds_per_second(int threads) {
   constexpr std::int64_t kRounds = 100000;  // well under a millisecond
-  constexpr int kTries = 50;                // the fastest counts: others use the machine too
+  constexpr int kTries = 50;  // the fastest counts, as other programs may use the machine too
   nb::gil_scoped_release release;
-  const PeakKernels& kernels = XRGS_PICK(peak_kernels);
+  const PeakKernels& kernels = XRGS_SELECT(peak_kernels);
   std::vector<float> results(static_cast<std::size_t>(threads));
   double best = 0;
   for (int i = 0; i < kTries; ++i) {
@@ -41,7 +41,8 @@ void bind_bench(nb::module_& m) {
         if (threads < 1) throw nb::value_error("threads must be at least 1");
         return multiply_adds_per_second(threads);
       },
-      nb::arg("threads"), "Scalar float32 multiply-adds a second that this machine can do, measured.");
+      nb::arg("threads"),
+      "Measure how many scalar float32 multiply-adds this machine can do in a second.");
 }
 
 }  // namespace xrgs

@@ -1,4 +1,4 @@
-// The benchmark's yardstick in Python.
+// The Python binding of the measurement of the processor's peak.
 #pragma once
 
 #include <nanobind/nanobind.h>

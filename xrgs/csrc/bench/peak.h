@@ -1,4 +1,5 @@
-// How many fused multiply-adds this machine can do: the yardstick of xrgs-bench.
+// Measures how many fused multiply-adds a machine can do, which xrgs-bench compares the kernels
+// with.
 #pragma once
 
 #include <cstdint>
@@ -8,8 +9,8 @@
 namespace xrgs {
 
 struct PeakKernels {
-  // `rounds` times 16 fused multiply-adds of 16 lanes each, none waiting for another of its round.
-  // The result only keeps the compiler from leaving the work out.
+  // Does `rounds` times 16 fused multiply-adds of 16 lanes each, which do not depend on one another
+  // within a round. The result has no meaning; it keeps the compiler from removing the work.
   float (*multiply_add)(std::int64_t rounds);
 };
 

@@ -1,4 +1,4 @@
-// The face of densification's bookkeeping in Python.
+// The Python binding of the densification statistics.
 #pragma once
 
 #include <nanobind/nanobind.h>

@@ -1,4 +1,5 @@
-// xrgs._native.photometric: the sums of L1 and SSIM over an image, and the gradient of the loss.
+// xrgs._native.photometric_loss: L1 and SSIM of an image against a target, and the gradient of the
+// loss.
 #include "loss/bind.h"
 
 #include <nanobind/nanobind.h>
@@ -9,9 +10,9 @@
 #include <memory>
 #include <vector>
 
-#include "arrays.h"
 #include "loss/photometric.h"
-#include "pool.h"
+#include "output_arrays.h"
+#include "thread_pool.h"
 
 namespace nb = nanobind;
 
@@ -20,29 +21,30 @@ namespace {
 
 using Image = nb::ndarray<const float, nb::shape<-1, -1, 3>, nb::c_contig, nb::device::cpu>;
 
-constexpr double kSigma = 1.5;
-constexpr int kLeastBand = 32;  // rows; a band computes ten rows more than its own
+constexpr double kSigma = 1.5;    // of the window, px
+constexpr int kMinBandRows = 32;  // a band computes ten rows more than its own
 
-void set_taps(float* taps) {
-  double weights[kTaps / 2 + 1], total = 0;
-  for (int i = 0; i <= kTaps / 2; ++i) {
+// Sets the weights of a normalised Gaussian window.
+void set_window(float* window) {
+  double weights[kWindow / 2 + 1], total = 0;
+  for (int i = 0; i <= kWindow / 2; ++i) {
     weights[i] = std::exp(-i * i / (2 * kSigma * kSigma));
     total += i == 0 ? weights[i] : 2 * weights[i];
   }
-  for (int i = 0; i <= kTaps / 2; ++i) taps[i] = static_cast<float>(weights[i] / total);
+  for (int i = 0; i <= kWindow / 2; ++i) window[i] = static_cast<float>(weights[i] / total);
 }
 
-void run_bands(const Photometric& job, int threads) {
-  const PhotometricKernels& kernels = XRGS_PICK(photometric_kernels);
-  // One band does least work twice; with more threads, two each, for one that others hold up.
-  const int most = job.height / kLeastBand > 0 ? job.height / kLeastBand : 1;
+void run_bands(const PhotometricJob& job, int threads) {
+  const PhotometricKernels& kernels = XRGS_SELECT(photometric_kernels);
+  // A single band repeats the least work. With more threads each has two bands, so that one which
+  // another
+  // program delays holds up less.
+  const int most = job.height / kMinBandRows > 0 ? job.height / kMinBandRows : 1;
   const int bands = threads <= 1 ? 1 : (2 * threads < most ? 2 * threads : most);
-  const std::size_t size = (kernels.scratch(job.width) + 15) / 16 * 16;
-  std::unique_ptr<void, GiveBlock> scratch(take_block(bands * size * sizeof(float)));
+  const std::size_t size = (kernels.scratch_size(job.width) + 15) / 16 * 16;
+  std::unique_ptr<void, ReleaseBlock> scratch(acquire_block(bands * size * sizeof(float)));
   parallel_for(threads, bands, [&](std::int64_t i) {
-    const auto row = [&](std::int64_t band) {
-      return static_cast<int>(job.height * band / bands);
-    };
+    const auto row = [&](std::int64_t band) { return static_cast<int>(job.height * band / bands); };
     kernels.band(job, row(i), row(i + 1), static_cast<float*>(scratch.get()) + i * size);
   });
 }
@@ -53,24 +55,27 @@ double total(const std::vector<double>& rows) {
   return sum;
 }
 
-nb::tuple photometric(Image image, Image target, Image mean, Image variance, double l1, double ssim,
-                      bool with_gradient, int threads) {
+nb::tuple photometric_loss(Image image, Image target, Image target_mean, Image target_variance,
+                           double l1, double ssim, bool with_gradient, int threads) {
   const std::size_t height = image.shape(0), width = image.shape(1);
-  const auto is = [](const Image& a, std::size_t rows, std::size_t columns) {
+  const auto has_size = [](const Image& a, std::size_t rows, std::size_t columns) {
     return a.shape(0) == rows && a.shape(1) == columns;
   };
-  if (height < kTaps || width < kTaps || !is(target, height, width) ||
-      !is(mean, height - kReach, width - kReach) || !is(variance, height - kReach, width - kReach))
-    throw nb::value_error("photometric: shapes that do not fit");
+  if (height < kWindow || width < kWindow || !has_size(target, height, width) ||
+      !has_size(target_mean, height - kMapShrink, width - kMapShrink) ||
+      !has_size(target_variance, height - kMapShrink, width - kMapShrink))
+    throw nb::value_error(
+        "photometric_loss: shapes that do not fit: image and target must be [H, W, 3] of at least "
+        "11 x 11 px, target_mean and target_variance [H - 10, W - 10, 3]");
   const double pixels = 3.0 * height * width;
-  const double windows = 3.0 * (height - kReach) * (width - kReach);
-  std::vector<double> l1_rows(height), ssim_rows(height - kReach);
+  const double windows = 3.0 * (height - kMapShrink) * (width - kMapShrink);
+  std::vector<double> l1_rows(height), ssim_rows(height - kMapShrink);
   nb::object gradient = nb::none();
-  Photometric job{};
+  PhotometricJob job{};
   job.image = image.data(), job.target = target.data();
-  job.mean = mean.data(), job.variance = variance.data();
+  job.target_mean = target_mean.data(), job.target_variance = target_variance.data();
   job.height = static_cast<int>(height), job.width = static_cast<int>(width);
-  set_taps(job.taps);
+  set_window(job.window);
   job.l1_slope = static_cast<float>(l1 / pixels);
   job.ssim_slope = static_cast<float>(-ssim / windows);
   job.l1_rows = l1_rows.data(), job.ssim_rows = ssim_rows.data();
@@ -90,11 +95,14 @@ nb::tuple photometric(Image image, Image target, Image mean, Image variance, dou
 }  // namespace
 
 void bind_loss(nb::module_& m) {
-  m.def("photometric", &photometric, nb::arg("image"), nb::arg("target"), nb::arg("mean"),
-        nb::arg("variance"), nb::arg("l1"), nb::arg("ssim"), nb::arg("with_gradient"),
-        nb::arg("threads"),
-        "l1 mean|image - target| + ssim (1 - SSIM), and its gradient by the image [H, W, 3] or\n"
-        "None. mean and variance [H - 10, W - 10, 3] are the target's under the window.");
+  m.def(
+      "photometric_loss", &photometric_loss, nb::arg("image"), nb::arg("target"),
+      nb::arg("target_mean"), nb::arg("target_variance"), nb::arg("l1"), nb::arg("ssim"),
+      nb::arg("with_gradient"), nb::arg("threads"),
+      "Return l1 mean|image - target| + ssim (1 - SSIM), and its gradient by the image or None.\n\n"
+      "image and target are [H, W, 3]; target_mean and target_variance [H - 10, W - 10, 3] are "
+      "the\n"
+      "target's under the window.");
 }
 
 }  // namespace xrgs

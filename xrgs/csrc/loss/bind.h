@@ -1,4 +1,4 @@
-// The face of the photometric loss in Python.
+// The Python binding of the photometric loss.
 #pragma once
 
 #include <nanobind/nanobind.h>

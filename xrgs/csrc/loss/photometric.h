@@ -7,28 +7,31 @@
 
 namespace xrgs {
 
-constexpr int kTaps = 11;            // of the SSIM window along each axis
-constexpr int kReach = kTaps - 1;    // rows and columns that a map is smaller than its image
+constexpr int kWindow = 11;  // side of the SSIM window, px
+constexpr int kMapShrink =
+    kWindow - 1;  // rows and columns by which the SSIM map is smaller than the image
 
-// What one call computes. The gradient is of l1_slope * sum |image - target| + ssim_slope * sum S,
-// with S the SSIM of each channel where the whole window lies inside the image.
-struct Photometric {
-  const float *image, *target;    // [H, W, 3]
-  const float *mean, *variance;   // [H - 10, W - 10, 3] of the target under the window
+// The arguments of one evaluation. The gradient is that of l1_slope * sum |image - target| +
+// ssim_slope * sum S, where S is the SSIM of each channel at every place where the whole window
+// lies inside the image.
+struct PhotometricJob {
+  const float *image, *target;                 // [H, W, 3]
+  const float *target_mean, *target_variance;  // [H - 10, W - 10, 3], under the window
   int height, width;
-  float taps[kTaps / 2 + 1];      // of the window: taps[|distance from the middle|]
+  float window[kWindow / 2 +
+               1];  // weight of the window at each distance from its middle, along one axis
   float l1_slope, ssim_slope;
-  double* l1_rows;                // [H] sum of |image - target| over each row
-  double* ssim_rows;              // [H - 10] sum of S over each row
-  float* gradient;                // [H, W, 3], or null if only the sums are wanted
+  double* l1_rows;    // [H] receives the sum of |image - target| of each row
+  double* ssim_rows;  // [H - 10] receives the sum of S of each row
+  float* gradient;    // [H, W, 3] receives the gradient; null if only the sums are needed
 };
 
 struct PhotometricKernels {
-  // Floats of scratch that one call of `band` needs, on a 64-byte boundary.
-  std::size_t (*scratch)(int width);
-  // Rows first..last-1 of the image: their sums, and their gradient. Each row comes out the same
-  // whatever band it is in.
-  void (*band)(const Photometric& job, int first, int last, float* scratch);
+  // Returns the floats of scratch that one call of `band` needs, on a 64-byte boundary.
+  std::size_t (*scratch_size)(int width);
+  // Computes the sums and the gradient of rows first..last-1 of the image. A row has the same
+  // result whatever band it belongs to.
+  void (*band)(const PhotometricJob& job, int first, int last, float* scratch);
 };
 
 XRGS_DECLARE_TABLE(PhotometricKernels, photometric_kernels)

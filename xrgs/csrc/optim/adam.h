@@ -1,4 +1,4 @@
-// Adam (Kingma and Ba 2015) over a piece of a parameter, its gradient and its two moments.
+// Adam (Kingma and Ba 2015, Algorithm 1), in the form of torch's fused step.
 #pragma once
 
 #include <cstdint>
@@ -7,31 +7,35 @@
 
 namespace xrgs {
 
+// One parameter tensor, its gradient and its moments, all of `size` floats.
 struct AdamGroup {
   float* parameter;
   const float* gradient;
-  float *mean, *square;  // exp_avg and exp_avg_sq
+  float *exp_avg, *exp_avg_sq;
   std::int64_t size;
-  // As torch's fused step has them: keep = 1 - beta, rate = lr / (1 - beta1^t),
-  // inv_root = 1 / sqrt(1 - beta2^t).
-  float keep1, beta2, keep2, rate, inv_root, eps;
+  float one_minus_beta1, beta2, one_minus_beta2;
+  float step_size;       // lr / (1 - beta1^step)
+  float inv_sqrt_bias2;  // 1 / sqrt(1 - beta2^step)
+  float eps;
 };
 
-// The harmonics above band 0, whose gradient is made here of that of band 0, times their basis in the
-// direction of view.
-struct HarmonicsGroup {
-  AdamGroup adam;             // without a gradient; size is count * rest * 3
-  const float* means;         // [count, 3] as they were rendered
+// The parameter shN. Its gradient is the gradient of sh0 times the basis functions in the viewing
+// direction, divided by that of degree 0 (Eq. 31 of docs/rasterizer.md); it is computed during the
+// step, so that it is never written to memory.
+struct ShNAdamGroup {
+  AdamGroup adam;             // gradient is unused; size is count * rest_count * 3
+  const float* means;         // [count, 3], the values that were rendered
   const float* sh0_gradient;  // [count, 3]
-  float position[3];          // of the camera
-  int rest, degree;           // how many there are, and the highest band that is on
+  float camera_position[3];
+  int rest_count;  // basis functions above degree 0 that are stored
+  int sh_degree;   // the highest degree that was rendered
 };
 
 struct AdamKernels {
-  // Values first..last-1 of a group.
+  // Updates the values first..last-1 of a group.
   void (*step)(const AdamGroup& group, std::int64_t first, std::int64_t last);
-  // Gaussians first..last-1.
-  void (*step_harmonics)(const HarmonicsGroup& group, std::int64_t first, std::int64_t last);
+  // Updates shN of Gaussians first..last-1.
+  void (*step_shN)(const ShNAdamGroup& group, std::int64_t first, std::int64_t last);
 };
 
 XRGS_DECLARE_TABLE(AdamKernels, adam_kernels)

@@ -1,4 +1,4 @@
-// The face of the optimizer in Python.
+// The Python bindings of the optimizer.
 #pragma once
 
 #include <nanobind/nanobind.h>

@@ -1,4 +1,4 @@
-// The rasterizer in Python.
+// The Python bindings of the rasterizer.
 #pragma once
 
 #include <nanobind/nanobind.h>

@@ -1,187 +1,205 @@
-// Compositing, forward: a tile's list, front to back, into sixteen blocks of 4x4 pixels.
+// Compositing, forward: blends a tile's list of Gaussians front to back into sixteen blocks of 4x4
+// pixels.
 //
-// Alpha = 2^(level - u^2 - v^2), capped at alpha_max and skipped below alpha_min; a pixel's colour
-// gains alpha T color, and its transmittance T becomes T (1 - alpha), unless that is
-// transmittance_min or less: then this Gaussian is not composited and the pixel is finished.
-// T is never frozen: it only falls, so the test stays failed, and what was kept is a prefix.
+// Alpha is capped at alpha_max and skipped below alpha_min (Eq. 8). A pixel's colour gains alpha T
+// color, and its transmittance T becomes T (1 - alpha) (Eq. 14). Where that is transmittance_min or
+// less, this Gaussian is not composited and the pixel is saturated. T is still multiplied after
+// that: it can only fall, so the test keeps failing, and the composited Gaussians are a prefix of
+// the list.
 //
-// With the view's skips off, every block goes through the tile's list, and to its end.
-#include "raster/batch.h"
-#include "raster/ellipse.h"
+// With the culling options off, every block goes through the whole list of its tile.
+#include "raster/cutoff_ellipse.h"
 #include "raster/stages.h"
+#include "raster/tile_batch.h"
 
 namespace xrgs {
 namespace XRGS_NS {
 namespace {
 
-constexpr int kCheckEvery = 8;  // Gaussians between the tests whether a block is finished
+constexpr int kCheckEvery = 8;  // Gaussians between two tests for a saturated block
 
-struct Block {
-  alignas(64) float t[16];     // what T falls to, kept or not
-  alignas(64) float left[16];  // T behind the last Gaussian that was kept
+// The pixels of a block while it is composited.
+struct BlockState {
+  alignas(64) float running_T[16];  // the product of 1 - alpha of all Gaussians so far
+  alignas(64) float final_T[16];    // the same of the composited ones: the transmittance
   alignas(64) float red[16], green[16], blue[16];
 };
 
-// For each byte the places of its bits, one a byte, lowest first.
-struct Places {
+// For each byte, the positions of its set bits, lowest first, one in each byte of the result.
+struct BitPositions {
   std::uint64_t of[256];
-  constexpr Places() : of() {
+  constexpr BitPositions() : of() {
     for (unsigned byte = 0; byte < 256; ++byte) {
-      std::uint64_t places = 0;
+      std::uint64_t positions = 0;
       unsigned count = 0;
       for (unsigned bit = 0; bit < 8; ++bit)
-        if ((byte >> bit & 1u) != 0) places |= static_cast<std::uint64_t>(bit) << (8 * count++);
-      of[byte] = places;
+        if ((byte >> bit & 1u) != 0) positions |= static_cast<std::uint64_t>(bit) << (8 * count++);
+      of[byte] = positions;
     }
   }
 };
-constexpr Places kPlaces;
+constexpr BitPositions kBitPositions;
 
-// The list of a block: the places in the batch whose bits are set.
-XRGS_INLINE int compact(const std::uint16_t* hits, int count, std::uint8_t* list) {
+// Writes the positions of the set bits among the first `count`, and returns how many they are.
+XRGS_INLINE int list_set_bits(const std::uint16_t* bits, int count, std::uint8_t* list) {
   int n = 0;
   for (int i = 0; i < count; i += 8) {
-    const unsigned byte = hits[i / 16] >> (i % 16) & 255u;
-    const std::uint64_t places =
-        kPlaces.of[byte] + static_cast<std::uint64_t>(i) * 0x0101010101010101u;
-    std::memcpy(list + n, &places, 8);  // past the list's end: overwritten by the next, or unread
+    const unsigned byte = bits[i / 16] >> (i % 16) & 255u;
+    const std::uint64_t positions =
+        kBitPositions.of[byte] + static_cast<std::uint64_t>(i) * 0x0101010101010101u;
+    // Bytes past the end of the list are overwritten by the next eight, or never read.
+    std::memcpy(list + n, &positions, 8);
     n += __builtin_popcount(byte);
   }
   return n;
 }
 
-// Bring in a batch, and note which blocks each of its Gaussians reaches: hits[block][place / 16].
-void load_batch(const Frame& frame, const Tile& tile, const Entry* entries, int count, Rows& rows,
-                std::uint16_t (&hits)[kBlocks][kBatch / 16]) {
+// Bit i % 16 of hits[block][i / 16]: the cutoff ellipse of Gaussian i of the batch overlaps the
+// block.
+using BlockHits = std::uint16_t[kBlocksPerTile][kBatchSize / 16];
+
+// Loads a batch and finds the blocks that each of its Gaussians overlaps.
+void load_and_cull_batch(const Frame& frame, const Tile& tile, const TileEntry* entries, int count,
+                         BatchRows& rows, BlockHits& hits) {
   const Floats centre = centre_of(tile);
   for (int at = 0; at < count; at += 16) {
     const int lanes = count - at < 16 ? count - at : 16;
     Floats fields[16];
-    load_sixteen(frame, entries + at, lanes, centre, fields);
+    load_projected(frame, entries + at, lanes, centre, fields);
     for (int i = 0; i < 16; ++i) store(rows[at + i], fields[i]);
     transpose(fields);
-    const Ellipse e = ellipse_of(fields);
-    const std::uint32_t inside = (1u << lanes) - 1u;
+    const CutoffEllipse e = cutoff_ellipse(fields);
+    const std::uint32_t existing = (1u << lanes) - 1u;
     for (int row = 0; row < 4; ++row) {
       const float top = static_cast<float>(4 * row) - 7.5f;
       Floats left, right;
-      const Mask reached = span(e, splat(top), splat(top + 3.0f), left, right) & mask_of(inside);
+      const Mask overlaps_rows =
+          strip_extent(e, broadcast(top), broadcast(top + 3.0f), left, right) &
+          mask_from_bits(existing);
       for (int column = 0; column < 4; ++column) {
         const float first = static_cast<float>(4 * column) - 7.5f;
-        const Mask hit = reached & (left <= splat(first + 3.0f)) & (splat(first) <= right);
-        hits[4 * row + column][at / 16] = static_cast<std::uint16_t>(bits(hit));
+        const Mask hit =
+            overlaps_rows & (left <= broadcast(first + 3.0f)) & (broadcast(first) <= right);
+        hits[4 * row + column][at / 16] = static_cast<std::uint16_t>(to_bits(hit));
       }
     }
   }
 }
 
-// As if each Gaussian reached every block.
-void hit_all(int count, std::uint16_t (&hits)[kBlocks][kBatch / 16]) {
+// Marks every Gaussian of the batch as one that overlaps every block.
+void hit_all_blocks(int count, BlockHits& hits) {
   for (int at = 0; at < count; at += 16) {
     const int lanes = count - at < 16 ? count - at : 16;
     for (auto& block : hits) block[at / 16] = static_cast<std::uint16_t>((1u << lanes) - 1u);
   }
 }
 
-// Composite a block's list. Returns how far it went: to the end, or (with Stop) to where no pixel
-// is left.
-template <bool Stop>
-int composite_block(const Rows& rows, const std::uint8_t* list, int count, int index,
-                    const Cuts& cuts, Block& block) {
-  const Floats x = pixels_x(index), y = pixels_y(index);
-  Floats t = load(block.t), left = load(block.left);
+// Composites a block's list. Returns the number of Gaussians that were evaluated: all of them or,
+// with StopWhenSaturated, those up to the test that found every pixel saturated.
+template <bool StopWhenSaturated>
+int composite_block(const BatchRows& rows, const std::uint8_t* list, int count, int block_index,
+                    const AlphaThresholds& thresholds, BlockState& block) {
+  const Floats x = pixels_x(block_index), y = pixels_y(block_index);
+  Floats running_T = load(block.running_T), final_T = load(block.final_T);
   Floats red = load(block.red), green = load(block.green), blue = load(block.blue);
   int at = 0;
   while (at < count) {
     const float* g = rows[list[at]];
-    const Floats alpha = alpha_at(g, x, y, cuts);
-    const Floats gain = alpha * t;
-    t = t - gain;
-    const Mask kept = cuts.transmittance_min < t;
-    const Floats weight = keep(kept, gain);
-    red = fma(weight, splat(g[kRed]), red);
-    green = fma(weight, splat(g[kGreen]), green);
-    blue = fma(weight, splat(g[kBlue]), blue);
-    left = select(kept, t, left);
-    if (++at % kCheckEvery == 0 && Stop && !any(kept)) break;
+    const Floats alpha = alpha_at(g, x, y, thresholds);
+    const Floats alpha_T = alpha * running_T;
+    running_T = running_T - alpha_T;
+    const Mask composited = thresholds.transmittance_min < running_T;
+    const Floats weight = select_or_zero(composited, alpha_T);
+    red = fma(weight, broadcast(g[kRed]), red);
+    green = fma(weight, broadcast(g[kGreen]), green);
+    blue = fma(weight, broadcast(g[kBlue]), blue);
+    final_T = select(composited, running_T, final_T);
+    if (++at % kCheckEvery == 0 && StopWhenSaturated && !any(composited)) break;
   }
-  store(block.t, t);
-  store(block.left, left);
+  store(block.running_T, running_T);
+  store(block.final_T, final_T);
   store(block.red, red);
   store(block.green, green);
   store(block.blue, blue);
   return at;
 }
 
-// Blocks with all pixels outside the image start finished.
-std::uint32_t start_blocks(const Tile& tile, const View& view, Block* blocks) {
-  std::uint32_t alive = 0;
-  for (int b = 0; b < kBlocks; ++b) {
-    Block& block = blocks[b];
+// Initialises the blocks and returns a bit for each one that overlaps the image. Pixels outside the
+// image start saturated.
+std::uint32_t init_blocks(const Tile& tile, const RenderConfig& config, BlockState* blocks) {
+  std::uint32_t active_blocks = 0;
+  for (int b = 0; b < kBlocksPerTile; ++b) {
+    BlockState& block = blocks[b];
     for (int i = 0; i < 16; ++i) {
-      const int x = tile.column * kTile + 4 * (b % 4) + i % 4;
-      const int y = tile.row * kTile + 4 * (b / 4) + i / 4;
-      const bool inside = x < view.width && y < view.height;
-      block.t[i] = inside ? 1.0f : 0.0f;
-      block.left[i] = 1.0f;
+      const int x = tile.column * kTileSize + 4 * (b % 4) + i % 4;
+      const int y = tile.row * kTileSize + 4 * (b / 4) + i / 4;
+      const bool inside = x < config.width && y < config.height;
+      block.running_T[i] = inside ? 1.0f : 0.0f;
+      block.final_T[i] = 1.0f;
       block.red[i] = block.green[i] = block.blue[i] = 0.0f;
-      if (inside) alive |= 1u << b;
+      if (inside) active_blocks |= 1u << b;
     }
   }
-  return alive;
+  return active_blocks;
 }
 
-void write_blocks(const Tile& tile, const View& view, const Block* blocks, float* image, float* alpha) {
-  const float* back = view.background;
-  for (int b = 0; b < kBlocks; ++b) {
-    const BlockPlace place(tile, view, b);
-    if (!place.inside()) continue;
-    const Floats left = load(blocks[b].left);
-    alignas(64) float colors[48], opaque[16];
-    store_triples(colors, fma(left, splat(back[0]), load(blocks[b].red)),
-                  fma(left, splat(back[1]), load(blocks[b].green)),
-                  fma(left, splat(back[2]), load(blocks[b].blue)));
-    store(opaque, splat(1.0f) - left);
-    copy_rows<3>(colors, 12, image + 3 * place.pixel, 3 * std::int64_t{view.width}, place);
-    copy_rows<1>(opaque, 4, alpha + place.pixel, view.width, place);
+// Writes colour over the background, and alpha = 1 - T (Eq. 15).
+void write_blocks(const Tile& tile, const RenderConfig& config, const BlockState* blocks,
+                  float* image, float* alpha) {
+  const float* background = config.background;
+  for (int b = 0; b < kBlocksPerTile; ++b) {
+    const BlockRegion region(tile, config, b);
+    if (!region.overlaps_image()) continue;
+    const Floats final_T = load(blocks[b].final_T);
+    alignas(64) float colors[48], alphas[16];
+    store_triples(colors, fma(final_T, broadcast(background[0]), load(blocks[b].red)),
+                  fma(final_T, broadcast(background[1]), load(blocks[b].green)),
+                  fma(final_T, broadcast(background[2]), load(blocks[b].blue)));
+    store(alphas, broadcast(1.0f) - final_T);
+    copy_block<3>(colors, 12, image + 3 * region.first_pixel, 3 * std::int64_t{config.width},
+                  region);
+    copy_block<1>(alphas, 4, alpha + region.first_pixel, config.width, region);
   }
 }
 
 }  // namespace
 
-void composite(Frame& frame, int index, float* image, float* alpha) {
-  const View& view = frame.view;
-  const Tile tile(frame, index);
-  const Cuts cuts(view);
-  const bool stop = view.skips.saturated;
-  Block blocks[kBlocks];
-  alignas(64) Rows rows;
-  std::uint32_t alive = start_blocks(tile, view, blocks);
-  std::int64_t entries_done = 0;
-  Batch* batch = frame.batches.data() + frame.batch_begin[tile.index];
-  std::uint32_t done = 0;
-  for (std::uint32_t at = tile.begin; at < tile.end && alive != 0; at += kBatch, ++batch, ++done) {
-    const int count = tile.end - at < kBatch ? static_cast<int>(tile.end - at) : kBatch;
-    const Entry* entries = frame.entries.data() + at;
-    std::uint16_t hits[kBlocks][kBatch / 16];
-    load_batch(frame, tile, entries, count, rows, hits);
-    if (!view.skips.blocks) hit_all(count, hits);
-    prefetch_records(frame, at + kBatch);  // the next batch's, or the next tile's
-    for (int b = 0; b < kBlocks; ++b) {
+void composite(Frame& frame, int tile_index, float* image, float* alpha) {
+  const RenderConfig& config = frame.config;
+  const Tile tile(frame, tile_index);
+  const AlphaThresholds thresholds(config);
+  const bool stop = config.culling.saturated;
+  BlockState blocks[kBlocksPerTile];
+  alignas(64) BatchRows rows;
+  std::uint32_t active_blocks = init_blocks(tile, config, blocks);
+  std::int64_t evaluated_blocks = 0;
+  SavedBatch* batch = frame.batches.data() + frame.batch_offsets[tile.index];
+  std::uint32_t batches = 0;
+  for (std::uint32_t at = tile.begin; at < tile.end && active_blocks != 0;
+       at += kBatchSize, ++batch, ++batches) {
+    const int count = tile.end - at < kBatchSize ? static_cast<int>(tile.end - at) : kBatchSize;
+    const TileEntry* entries = frame.entries.data() + at;
+    BlockHits hits;
+    load_and_cull_batch(frame, tile, entries, count, rows, hits);
+    if (!config.culling.blocks) hit_all_blocks(count, hits);
+    prefetch_batch(frame, at + kBatchSize);  // of this tile, or the first of the next
+    for (int b = 0; b < kBlocksPerTile; ++b) {
       batch->counts[b] = 0;
-      if ((alive >> b & 1u) == 0) continue;
-      store(batch->before[b], load(blocks[b].t));
-      const int listed = compact(hits[b], count, batch->lists[b]);
-      const int went = stop ? composite_block<true>(rows, batch->lists[b], listed, b, cuts, blocks[b])
-                            : composite_block<false>(rows, batch->lists[b], listed, b, cuts, blocks[b]);
-      batch->counts[b] = static_cast<std::uint8_t>(went);
-      entries_done += went;
-      if (stop && !any(cuts.transmittance_min < load(blocks[b].t))) alive &= ~(1u << b);
+      if ((active_blocks >> b & 1u) == 0) continue;
+      store(batch->transmittance[b], load(blocks[b].running_T));
+      const int listed = list_set_bits(hits[b], count, batch->lists[b]);
+      const int evaluated =
+          stop ? composite_block<true>(rows, batch->lists[b], listed, b, thresholds, blocks[b])
+               : composite_block<false>(rows, batch->lists[b], listed, b, thresholds, blocks[b]);
+      batch->counts[b] = static_cast<std::uint8_t>(evaluated);
+      evaluated_blocks += evaluated;
+      if (stop && !any(thresholds.transmittance_min < load(blocks[b].running_T)))
+        active_blocks &= ~(1u << b);
     }
   }
-  frame.batches_done[tile.index] = done;
-  frame.tile_evaluations[tile.index] = 16 * entries_done;
-  write_blocks(tile, view, blocks, image, alpha);
+  frame.composited_batches[tile.index] = batches;
+  frame.tile_evaluations[tile.index] = 16 * evaluated_blocks;
+  write_blocks(tile, config, blocks, image, alpha);
 }
 
 }  // namespace XRGS_NS

@@ -1,4 +1,3 @@
-// The stores of frames and workspaces: a few of each are kept.
 #include "raster/frame.h"
 
 #include <cstdlib>
@@ -10,42 +9,43 @@
 namespace xrgs {
 namespace {
 
-constexpr std::size_t kKept = 2;  // training renders one view at a time, or a pair
+constexpr std::size_t kMaxUnused = 2;  // training renders one view at a time, or a pair
 
+// Objects that are not in use and wait to be used again.
 template <class T>
-class Store {
+class FreeList {
  public:
-  std::unique_ptr<T> take() {
+  std::unique_ptr<T> acquire() {
     std::lock_guard<std::mutex> lock(mutex_);
-    if (free_.empty()) return std::make_unique<T>();
-    std::unique_ptr<T> last = std::move(free_.back());
-    free_.pop_back();
+    if (unused_.empty()) return std::make_unique<T>();
+    std::unique_ptr<T> last = std::move(unused_.back());
+    unused_.pop_back();
     return last;
   }
-  void give(std::unique_ptr<T> used) {
+  void release(std::unique_ptr<T> object) {
     std::lock_guard<std::mutex> lock(mutex_);
-    if (free_.size() < kKept) free_.push_back(std::move(used));
+    if (unused_.size() < kMaxUnused) unused_.push_back(std::move(object));
   }
 
  private:
   std::mutex mutex_;
-  std::vector<std::unique_ptr<T>> free_;
+  std::vector<std::unique_ptr<T>> unused_;
 };
 
-// Never destroyed: a frame may outlive every static at the interpreter's exit.
+// The list is never destroyed, because a frame may outlive every static when the interpreter exits.
 template <class T>
-Store<T>& store() {
-  static Store<T>* instance = new Store<T>;
+FreeList<T>& free_list() {
+  static FreeList<T>* instance = new FreeList<T>;
   return *instance;
 }
 
 }  // namespace
 
-void* grow_block(void* block, std::size_t bytes) {
+void* replace_block(void* block, std::size_t bytes) {
   std::free(block);
-  void* grown = allocate(bytes);
-  if (grown == nullptr) throw std::bad_alloc();
-  return grown;
+  void* replacement = allocate(bytes);
+  if (replacement == nullptr) throw std::bad_alloc();
+  return replacement;
 }
 
 void free_block(void* block) noexcept { std::free(block); }
@@ -58,16 +58,19 @@ std::int64_t Frame::evaluations() const {
 
 std::int64_t Frame::bytes() const {
   return static_cast<std::int64_t>(
-      records.bytes() + visible.bytes() + shades.bytes() + slots.bytes() + order.bytes() + spare.bytes() +
-      entries.bytes() + tile_begin.bytes() + batch_begin.bytes() + batches_done.bytes() +
-      batches.bytes() + tile_evaluations.bytes() + entries.size() * kSlotSize * sizeof(float));
+      projected.bytes() + visible.bytes() + color_derivatives.bytes() + pair_ranges.bytes() +
+      order.bytes() + order_buffer.bytes() + entries.bytes() + tile_offsets.bytes() +
+      batch_offsets.bytes() + composited_batches.bytes() + batches.bytes() +
+      tile_evaluations.bytes() + entries.size() * kPairGradStride * sizeof(float));
 }
 
-std::unique_ptr<Frame> take_frame() { return store<Frame>().take(); }
-void give_frame(std::unique_ptr<Frame> frame) noexcept { store<Frame>().give(std::move(frame)); }
-std::unique_ptr<Workspace> take_workspace() { return store<Workspace>().take(); }
-void give_workspace(std::unique_ptr<Workspace> workspace) noexcept {
-  store<Workspace>().give(std::move(workspace));
+std::unique_ptr<Frame> acquire_frame() { return free_list<Frame>().acquire(); }
+void release_frame(std::unique_ptr<Frame> frame) noexcept {
+  free_list<Frame>().release(std::move(frame));
+}
+std::unique_ptr<Workspace> acquire_workspace() { return free_list<Workspace>().acquire(); }
+void release_workspace(std::unique_ptr<Workspace> workspace) noexcept {
+  free_list<Workspace>().release(std::move(workspace));
 }
 
 }  // namespace xrgs

@@ -1,6 +1,7 @@
 // The memory of one rendered view, from its forward pass to its backward pass.
 //
-// Frames are kept and used again: fresh pages would cost as much as the kernels that write them.
+// Frames are used again for later views, because touching new pages takes as long as the kernels
+// that write them.
 #pragma once
 
 #include <cstddef>
@@ -13,28 +14,30 @@
 
 namespace xrgs {
 
-void* grow_block(void* block, std::size_t bytes);  // contents are lost; throws std::bad_alloc
+// Frees `block` and returns a block of at least `bytes` in its place. Throws std::bad_alloc.
+void* replace_block(void* block, std::size_t bytes);
 void free_block(void* block) noexcept;
 
-// An array that only ever grows, on a 64-byte boundary, its contents left as they are.
+// An array on a 64-byte boundary whose memory only grows and is never initialised.
 template <class T>
 class Buffer {
  public:
   Buffer() = default;
-  Buffer(Buffer&& other) noexcept : data_(other.data_), capacity_(other.capacity_), size_(other.size_) {
+  Buffer(Buffer&& other) noexcept
+      : data_(other.data_), capacity_(other.capacity_), size_(other.size_) {
     other.data_ = nullptr;
     other.capacity_ = other.size_ = 0;
   }
   Buffer& operator=(Buffer&&) = delete;
   ~Buffer() { free_block(data_); }
 
-  // Room for `size` elements; what was in it is lost where it has to grow.
+  // Makes room for `size` elements. The contents are lost where the memory has to grow.
   T* resize(std::size_t size) {
     if (size > capacity_) {
-      const std::size_t wanted = kExactBuffers ? size : size + size / 8;
+      const std::size_t new_capacity = kExactBuffers ? size : size + size / 8;
       capacity_ = 0;
-      data_ = static_cast<T*>(grow_block(data_, wanted * sizeof(T)));
-      capacity_ = wanted;
+      data_ = static_cast<T*>(replace_block(data_, new_capacity * sizeof(T)));
+      capacity_ = new_capacity;
     }
     size_ = size;
     return data_;
@@ -53,7 +56,7 @@ class Buffer {
 
  private:
 #ifdef __SANITIZE_ADDRESS__
-  static constexpr bool kExactBuffers = true;
+  static constexpr bool kExactBuffers = true;  // so that the sanitizer sees a step past the end
 #else
   static constexpr bool kExactBuffers = false;
 #endif
@@ -61,47 +64,50 @@ class Buffer {
   std::size_t capacity_ = 0, size_ = 0;
 };
 
-// Milliseconds of each stage.
+// The duration of each stage, in milliseconds.
 struct Timings {
-  double project = 0, sort = 0, bin = 0, composite = 0;
+  double project = 0, sort = 0, intersect_tiles = 0, composite = 0;
   double composite_backward = 0, project_backward = 0;
 };
 
 struct Frame {
-  View view;
-  std::int64_t gaussians = 0;
-  Buffer<Record> records;                // [N], of visible Gaussians only
-  Buffer<std::uint16_t> visible;         // [N / 16] a bit a Gaussian
-  Buffer<Shade> shades;                  // [N / 16], where one of them is visible
-  Buffer<Slots> slots;                   // [N]
-  Buffer<std::uint64_t> order, spare;    // depth key << 32 | Gaussian; visible ones, front to back
-  std::int64_t seen = 0;                 // how many are visible
-  Buffer<Entry> entries;                 // [pairs] by tile, front to back
-  Buffer<std::uint32_t> tile_begin;      // [tiles + 1] into entries
-  Buffer<std::uint32_t> batch_begin;     // [tiles + 1] into batches
-  Buffer<std::uint32_t> batches_done;    // [tiles] how many of a tile's batches were composited
-  Buffer<Batch> batches;
-  Buffer<std::int64_t> tile_evaluations; // [tiles]
+  RenderConfig config;
+  std::int64_t gaussian_count = 0;             // N
+  std::int64_t visible_count = 0;              // M
+  Buffer<ProjectedGaussian> projected;         // [N], written for visible Gaussians only
+  Buffer<std::uint16_t> visible;               // [N / 16], one bit for each Gaussian
+  Buffer<ColorDerivatives> color_derivatives;  // [N / 16], written where one of them is visible
+  Buffer<PairRange> pair_ranges;               // [N]
+  Buffer<std::uint64_t> order;                 // [M] depth key << 32 | Gaussian, front to back
+  Buffer<std::uint64_t> order_buffer;          // [N] the second array of the sort
+  Buffer<TileEntry> entries;                   // [pairs] by tile, each tile front to back
+  Buffer<std::uint32_t> tile_offsets;          // [tiles + 1] into entries
+  Buffer<std::uint32_t> batch_offsets;         // [tiles + 1] into batches
+  Buffer<std::uint32_t> composited_batches;    // [tiles] batches before the tile was saturated
+  Buffer<SavedBatch> batches;                  // [batches]
+  Buffer<std::int64_t> tile_evaluations;       // [tiles] alphas that were computed
   Timings timings;
 
-  std::int64_t pairs() const { return static_cast<std::int64_t>(entries.size()); }
+  std::int64_t pair_count() const { return static_cast<std::int64_t>(entries.size()); }
   std::int64_t evaluations() const;
+  // The memory in use, including the pair_grads of the backward pass.
   std::int64_t bytes() const;
 };
 
-// Memory that no view keeps: used within one forward or one backward pass.
+// Memory that is used within one forward or one backward pass and belongs to no view.
 struct Workspace {
-  // For each chunk of Gaussians in depth order its pairs, front to back, in pieces.
-  std::vector<std::vector<Buffer<Pair>>> emitted;
-  Buffer<std::uint32_t> places;        // [chunks, tiles]
-  Buffer<std::uint32_t> histogram;     // of the sort
-  Buffer<std::int32_t> chunk_seen;     // [chunks]
-  Buffer<float> sums;                  // [pairs, kSlotSize]
+  // The pairs of each chunk of Gaussians in depth order, front to back, in several segments.
+  std::vector<std::vector<Buffer<TileIntersection>>> intersections;
+  Buffer<std::uint32_t> list_positions;       // [chunks, tiles]
+  Buffer<std::uint32_t> histogram;            // of the depth sort
+  Buffer<std::int32_t> chunk_visible_counts;  // [chunks]
+  Buffer<float> pair_grads;                   // [pairs, kPairGradStride]
 };
 
-std::unique_ptr<Frame> take_frame();
-void give_frame(std::unique_ptr<Frame> frame) noexcept;
-std::unique_ptr<Workspace> take_workspace();
-void give_workspace(std::unique_ptr<Workspace> workspace) noexcept;
+// A frame or a workspace that was released before, or a new one. Throws std::bad_alloc.
+std::unique_ptr<Frame> acquire_frame();
+void release_frame(std::unique_ptr<Frame> frame) noexcept;
+std::unique_ptr<Workspace> acquire_workspace();
+void release_workspace(std::unique_ptr<Workspace> workspace) noexcept;
 
 }  // namespace xrgs

@@ -1,11 +1,12 @@
-// Projection, forward: parameters -> records, sixteen Gaussians in lanes.
+// The projection stage: from parameters to projected Gaussians, sixteen at a time.
 //
-// A Gaussian is visible if it is in front of the near plane, its opacity reaches alpha_min, and the
-// box of its ellipse of reach (where opacity exp(-r^2 / 2) = alpha_min) overlaps the image. With
-// the view's skips off, Gaussians that fail one of the last two are projected all the same.
+// A Gaussian is visible if it is in front of the near plane, its opacity is at least alpha_min, and
+// the bounding box of its cutoff ellipse overlaps the image. With the culling options off,
+// Gaussians that fail one of the last two conditions are projected as well.
+#include <cstring>
+
 #include "raster/sh.h"
 #include "raster/stages.h"
-#include "vector_math.h"
 
 namespace xrgs {
 namespace XRGS_NS {
@@ -14,15 +15,16 @@ namespace {
 constexpr float kLog2e = 1.44269504f;
 constexpr float kSqrtLog2e = 1.20112241f;
 
-// Added to the squared radius of reach (which is log2(opacity / alpha_min), at most 8 or so), so
-// that rounding in the tests of tiles and blocks never drops a pixel.
-constexpr float kReachMargin = 0.01f;
+// Added to cutoff_radius_sq = log2(opacity / alpha_min), which is at most 8 with the default
+// alpha_min, so that rounding in the tests of tiles and blocks never drops a pixel.
+constexpr float kCutoffMargin = 0.01f;
 
-constexpr float kSmallest = 1.17549435e-38f;
+constexpr float kSmallestNormal = 1.17549435e-38f;
 
-XRGS_INLINE Floats finite_times_zero(const Inputs& in) {
-  // Zero times a number is zero, and times what is no number is not: their sum tells.
-  const Floats zero = splat(0.0f);
+// Zero where all inputs are finite, otherwise NaN: zero times a number is zero, zero times infinity
+// or NaN is NaN.
+XRGS_INLINE Floats sum_times_zero(const GaussianInputs& in) {
+  const Floats zero = broadcast(0.0f);
   Floats sum = in.mean.x * zero;
   for (Floats part : {in.mean.y, in.mean.z, in.qw, in.qx, in.qy, in.qz, in.scale.x, in.scale.y,
                       in.scale.z, in.opacity, in.offset_x, in.offset_y})
@@ -30,144 +32,169 @@ XRGS_INLINE Floats finite_times_zero(const Inputs& in) {
   return sum;
 }
 
-// Colours before the clamp at zero.
+XRGS_INLINE Mask valid_inputs(const GaussianInputs& in) {
+  const Floats zero = broadcast(0.0f);
+  return (sum_times_zero(in) == zero) & (zero <= in.opacity) & (in.opacity <= broadcast(1.0f)) &
+         (zero <= min(in.scale.x, min(in.scale.y, in.scale.z)));
+}
+
+// The colours before the clamp at zero (Eq. 9), and what the backward pass needs of them.
 template <int Degree>
-XRGS_INLINE Vector3 colors_of(const Parameters& p, std::int64_t group, int lanes,
-                              std::uint32_t visible, const Vector3& direction, Shade& shade) {
-  Padded padded;
+XRGS_INLINE Vector3 unclamped_colors(const GaussianParameters& p, std::int64_t group, int lanes,
+                                     std::uint32_t visible, const Vector3& direction,
+                                     ColorDerivatives& derivatives) {
+  PaddedRows padded;
   Vector3 c0;
   load_triples(padded.of(p.sh0, group, lanes, 3), c0.x, c0.y, c0.z);
-  const Floats half = splat(0.5f);
-  Vector3 color = add({half, half, half}, splat(kC0), c0);
-  constexpr int kRest = rest_of(Degree);
+  const Floats half = broadcast(0.5f);
+  Vector3 color = add_scaled({half, half, half}, broadcast(kC0), c0);
+  constexpr int kRest = rest_basis_count(Degree);
   if constexpr (kRest > 0) {
     Floats basis[kRest], c[3 * kRest];
     sh_basis<Degree>(direction, basis);
-    load_columns<3 * kRest>(p.shN + group * p.rest * 3, p.rest * 3, rows_to_load(visible, lanes), c);
+    load_columns<3 * kRest>(p.shN + group * p.rest_count * 3, p.rest_count * 3,
+                            rows_to_load(visible, lanes), c);
     for (int k = 0; k < kRest; ++k)
-      color = add(color, basis[k], {c[3 * k], c[3 * k + 1], c[3 * k + 2]});
+      color = add_scaled(color, basis[k], {c[3 * k], c[3 * k + 1], c[3 * k + 2]});
     for (int channel = 0; channel < 3; ++channel) {
-      const Vector3 slope = sh_gradient<Degree>(direction, c + channel, 3);
-      stream(shade.slope[3 * channel], slope.x);
-      stream(shade.slope[3 * channel + 1], slope.y);
-      stream(shade.slope[3 * channel + 2], slope.z);
+      const Vector3 gradient = sh_direction_gradient<Degree>(direction, c + channel, 3);
+      stream(derivatives.dcolor_ddir[3 * channel], gradient.x);
+      stream(derivatives.dcolor_ddir[3 * channel + 1], gradient.y);
+      stream(derivatives.dcolor_ddir[3 * channel + 2], gradient.z);
     }
   }
-  const Floats zero = splat(0.0f);
-  shade.open[0] = static_cast<std::uint16_t>(bits(zero <= color.x));
-  shade.open[1] = static_cast<std::uint16_t>(bits(zero <= color.y));
-  shade.open[2] = static_cast<std::uint16_t>(bits(zero <= color.z));
+  const Floats zero = broadcast(0.0f);
+  derivatives.unclamped[0] = static_cast<std::uint16_t>(to_bits(zero <= color.x));
+  derivatives.unclamped[1] = static_cast<std::uint16_t>(to_bits(zero <= color.y));
+  derivatives.unclamped[2] = static_cast<std::uint16_t>(to_bits(zero <= color.z));
   return color;
 }
 
-XRGS_INLINE Mask is_visible(const Projected& o, const View& v, Floats reach2) {
-  // reach2 is in units of log2: 2 ln(opacity / alpha_min) = 2 ln 2 reach2.
-  const Floats r2 = splat(2.0f / kLog2e) * reach2, zero = splat(0.0f), huge = splat(1e18f);
-  const Floats extent_x = sqrt(r2 * o.xx), extent_y = sqrt(r2 * o.yy);
-  const Mask usable = (zero < o.det) & (o.det < splat(3e38f)) & (extent_x < huge) & (extent_y < huge);
-  const bool anywhere = !v.skips.out_of_view;  // then only what overflows is dropped
+XRGS_INLINE Mask is_visible(const Projection& o, const RenderConfig& config,
+                            Floats cutoff_radius_sq) {
+  // The squared radius in standard deviations is 2 ln(opacity / alpha_min) = 2 ln 2
+  // cutoff_radius_sq.
+  const Floats sigma_sq = broadcast(2.0f / kLog2e) * cutoff_radius_sq;
+  const Floats zero = broadcast(0.0f), huge = broadcast(1e18f);
+  const Floats extent_x = sqrt(sigma_sq * o.xx), extent_y = sqrt(sigma_sq * o.yy);  // Eq. 12
+  const Mask usable =
+      (zero < o.det) & (o.det < broadcast(3e38f)) & (extent_x < huge) & (extent_y < huge);
+  const bool anywhere = !config.culling.out_of_view;  // then only what overflows is dropped
   const Floats left = anywhere ? -huge : zero;
-  const Floats right = anywhere ? huge : splat(static_cast<float>(v.width));
-  const Floats bottom = anywhere ? huge : splat(static_cast<float>(v.height));
+  const Floats right = anywhere ? huge : broadcast(static_cast<float>(config.width));
+  const Floats bottom = anywhere ? huge : broadcast(static_cast<float>(config.height));
   const Mask overlaps = (left < o.mean_x + extent_x) & (left < o.mean_y + extent_y) &
                         (o.mean_x - extent_x < right) & (o.mean_y - extent_y < bottom);
-  const Floats opacity_min = splat(v.skips.sub_threshold ? v.alpha_min : kSmallest);
-  return o.front & (opacity_min <= o.opacity) & usable & overlaps;
+  const Floats opacity_min =
+      broadcast(config.culling.sub_threshold ? config.alpha_min : kSmallestNormal);
+  return o.in_front & (opacity_min <= o.opacity) & usable & overlaps;
 }
 
-XRGS_INLINE void store_records(const Projected& o, Floats level, Floats reach2, const Vector3& color,
-                               std::uint32_t visible, Record* records) {
-  const Whitening white = whiten(o);
-  const Floats scale = splat(kSqrtLog2e), zero = splat(0.0f);
-  const Floats p = white.p * scale, s = white.s * scale, q = white.q * scale;
-  const Floats inv_p = splat(1.0f) / p, inv_q = splat(1.0f) / q;
-  const Floats margined = reach2 + splat(kReachMargin);
-  const Floats reach = sqrt(margined);
-  const Floats shear = s * inv_q;  // the rightmost point has v = u s / q
-  const Floats tip = reach * shear * inv_q / sqrt(fma(shear, shear, splat(1.0f)));
+XRGS_INLINE void store_projected(const Projection& o, Floats log2_opacity, Floats cutoff_radius_sq,
+                                 const Vector3& color, std::uint32_t visible,
+                                 ProjectedGaussian* projected) {
+  const ConicFactor factor = conic_factor(o);
+  const Floats to_base_2 = broadcast(kSqrtLog2e), zero = broadcast(0.0f);
+  const Floats chol_xx = factor.xx * to_base_2, chol_xy = factor.xy * to_base_2;
+  const Floats chol_yy = factor.yy * to_base_2;
+  const Floats inv_xx = broadcast(1.0f) / chol_xx, inv_yy = broadcast(1.0f) / chol_yy;
+  const Floats radius_sq = cutoff_radius_sq + broadcast(kCutoffMargin);
+  const Floats radius = sqrt(radius_sq);
+  const Floats shear = chol_xy * inv_yy;  // the rightmost point has v = u chol_xy / chol_yy
+  const Floats dy_at_xmax = radius * shear * inv_yy / sqrt(fma(shear, shear, broadcast(1.0f)));
   Floats rows[16] = {o.mean_x,
                      o.mean_y,
-                     p,
-                     s,
-                     q,
-                     level,
+                     chol_xx,
+                     chol_xy,
+                     chol_yy,
+                     log2_opacity,
                      max(color.x, zero),
                      max(color.y, zero),
                      max(color.z, zero),
-                     inv_p,
-                     tip,
-                     margined,
-                     reach * inv_q,
+                     inv_xx,
+                     dy_at_xmax,
+                     radius_sq,
+                     radius * inv_yy,
                      zero,
                      zero,
                      zero};
   transpose(rows);
   for (int i = 0; i < 16; ++i)
-    if ((visible >> i & 1u) != 0) stream(&records[i].x, rows[i]);
+    if ((visible >> i & 1u) != 0) stream(&projected[i].mean2d_x, rows[i]);
 }
 
+// Projects Gaussians group..group+lanes-1. Returns a bit for each visible one and stores their
+// depths.
 template <int Degree>
-std::uint32_t project_sixteen(const Parameters& p, const View& v, std::int64_t group, int lanes,
-                              Frame& frame, float* depths, bool* good) {
-  const Inputs in = load_inputs(p, group, lanes);
-  const Floats zero = splat(0.0f);
-  const Mask good_input = (finite_times_zero(in) == zero) & (zero <= in.opacity) &
-                          (in.opacity <= splat(1.0f)) &
-                          (zero <= min(in.scale.x, min(in.scale.y, in.scale.z)));
-  if (bits(good_input) != 0xffffu) *good = false;
-  const Projected o = project_inputs(in, v);
-  const Floats level = log2(max(o.opacity, splat(kSmallest)));
-  const Floats reach2 = max(level - splat(v.level_min), zero);
-  const std::uint32_t inside = lanes == 16 ? 0xffffu : (1u << lanes) - 1u;
-  const std::uint32_t visible = bits(is_visible(o, v, reach2)) & inside;
+std::uint32_t project_group(const GaussianParameters& p, const RenderConfig& config,
+                            std::int64_t group, int lanes, Frame& frame, float* depths,
+                            bool* params_valid) {
+  const GaussianInputs in = load_inputs(p, group, lanes);
+  const Floats zero = broadcast(0.0f);
+  if (to_bits(valid_inputs(in)) != 0xffffu) *params_valid = false;
+  const Projection o = project_inputs(in, config);
+  const Floats log2_opacity = log2(max(o.opacity, broadcast(kSmallestNormal)));
+  const Floats cutoff_radius_sq = max(log2_opacity - broadcast(config.log2_alpha_min), zero);
+  const std::uint32_t existing = lanes == 16 ? 0xffffu : (1u << lanes) - 1u;
+  const std::uint32_t visible = to_bits(is_visible(o, config, cutoff_radius_sq)) & existing;
   if (visible == 0) return 0;
-  Floats inv;
-  const Vector3 direction = direction_of(in.mean, v.position, inv);
-  const Vector3 color = colors_of<Degree>(p, group, lanes, visible, direction,
-                                          frame.shades[static_cast<std::size_t>(group / 16)]);
-  const Mask finite = (color.x * zero == zero) & (color.y * zero == zero) & (color.z * zero == zero);
-  if ((visible & ~bits(finite)) != 0) *good = false;
-  store_records(o, level, reach2, color, visible, frame.records.data() + group);
+  Floats inv_distance;
+  const Vector3 direction = view_direction(in.mean, config.camera_position, inv_distance);
+  const Vector3 color =
+      unclamped_colors<Degree>(p, group, lanes, visible, direction,
+                               frame.color_derivatives[static_cast<std::size_t>(group / 16)]);
+  const Mask finite =
+      (color.x * zero == zero) & (color.y * zero == zero) & (color.z * zero == zero);
+  if ((visible & ~to_bits(finite)) != 0) *params_valid = false;
+  store_projected(o, log2_opacity, cutoff_radius_sq, color, visible,
+                  frame.projected.data() + group);
   store(depths, o.z);
   return visible;
 }
 
-// An order of unsigned integers that is the order of the floats.
-std::uint32_t key_of(float depth) {
+// An unsigned integer whose order is that of the floats.
+std::uint32_t depth_key(float depth) {
   std::uint32_t key;
   std::memcpy(&key, &depth, sizeof key);
   return (key & 0x80000000u) != 0 ? ~key : key | 0x80000000u;
 }
 
 template <int Degree>
-std::int64_t project_degree(const Parameters& p, const View& v, std::int64_t first,
-                            std::int64_t last, Frame& frame, std::uint64_t* order, bool* good) {
-  std::int64_t seen = 0;
+std::int64_t project_degree(const GaussianParameters& p, const RenderConfig& config,
+                            std::int64_t first, std::int64_t last, Frame& frame,
+                            std::uint64_t* sort_keys, bool* params_valid) {
+  std::int64_t visible_count = 0;
   for (std::int64_t group = first; group < last; group += 16) {
     const int lanes = last - group < 16 ? static_cast<int>(last - group) : 16;
     alignas(64) float depths[16];
-    const std::uint32_t visible = project_sixteen<Degree>(p, v, group, lanes, frame, depths, good);
+    const std::uint32_t visible =
+        project_group<Degree>(p, config, group, lanes, frame, depths, params_valid);
     frame.visible[static_cast<std::size_t>(group / 16)] = static_cast<std::uint16_t>(visible);
-    for (std::uint32_t left = visible; left != 0; left &= left - 1) {
-      const int i = __builtin_ctz(left);
-      order[seen++] = static_cast<std::uint64_t>(key_of(depths[i])) << 32 |
-                      static_cast<std::uint64_t>(group + i);
+    for (std::uint32_t remaining = visible; remaining != 0; remaining &= remaining - 1) {
+      const int i = __builtin_ctz(remaining);
+      sort_keys[visible_count++] = static_cast<std::uint64_t>(depth_key(depths[i])) << 32 |
+                                   static_cast<std::uint64_t>(group + i);
     }
-    for (int i = 0; i < lanes; ++i) frame.slots[static_cast<std::size_t>(group + i)] = {0, 0};
+    for (int i = 0; i < lanes; ++i) frame.pair_ranges[static_cast<std::size_t>(group + i)] = {0, 0};
   }
   stream_fence();
-  return seen;
+  return visible_count;
 }
 
 }  // namespace
 
-std::int64_t project(const Parameters& p, const View& v, std::int64_t first, std::int64_t last,
-                     Frame& frame, std::uint64_t* order, bool* good) {
-  switch (v.degree) {
-    case 0: return project_degree<0>(p, v, first, last, frame, order, good);
-    case 1: return project_degree<1>(p, v, first, last, frame, order, good);
-    case 2: return project_degree<2>(p, v, first, last, frame, order, good);
-    default: return project_degree<3>(p, v, first, last, frame, order, good);
+std::int64_t project(const GaussianParameters& p, const RenderConfig& config, std::int64_t first,
+                     std::int64_t last, Frame& frame, std::uint64_t* sort_keys,
+                     bool* params_valid) {
+  switch (config.sh_degree) {
+    case 0:
+      return project_degree<0>(p, config, first, last, frame, sort_keys, params_valid);
+    case 1:
+      return project_degree<1>(p, config, first, last, frame, sort_keys, params_valid);
+    case 2:
+      return project_degree<2>(p, config, first, last, frame, sort_keys, params_valid);
+    default:
+      return project_degree<3>(p, config, first, last, frame, sort_keys, params_valid);
   }
 }
 

@@ -1,9 +1,12 @@
-// Projection, backward: from the sums of a Gaussian's pairs to the gradients of its parameters.
+// The backward projection: from the rows of pair_grads to the gradients of the parameters.
 //
-// A Gaussian's slots are added in the order in which its tiles were emitted, so the result does not
-// depend on the threads. Then the chain rule back through whitening, covariance, projection,
-// rotation and harmonics (geometry.h, sh.h), sixteen Gaussians in lanes; what is not visible gets
-// zeros. The harmonics themselves, three quarters of a Gaussian, are not read: see Shade.
+// The rows of a Gaussian are added in the order in which its tiles were found, so the result does
+// not depend on the threads. The chain rule then leads back through the Cholesky factor of the
+// conic, the covariance, the projection, the rotation and the spherical harmonics (Eq. 19 to 32),
+// for sixteen Gaussians at a time; Gaussians that are not visible get zeros. The coefficients of
+// the harmonics are not read: see ColorDerivatives.
+#include <cstring>
+
 #include "raster/sh.h"
 #include "raster/stages.h"
 
@@ -11,76 +14,82 @@ namespace xrgs {
 namespace XRGS_NS {
 namespace {
 
-// How many slots of a Gaussian are added without a branch, those it lacks being zeros: most have no
-// more, and how many is nothing that a processor could predict.
-constexpr std::uint32_t kFewSlots = 4;
-alignas(64) constexpr float kNoSlot[kSlotSize] = {};
+// Rows of a Gaussian that are added without a branch, missing ones as zeros: most Gaussians have no
+// more, and their number is not predictable.
+constexpr std::uint32_t kFewPairs = 4;
+alignas(64) constexpr float kNoPair[kPairGradStride] = {};
 
-XRGS_INLINE void sum_slots(const Frame& frame, const float* sums, std::int64_t group,
-                           std::uint32_t visible, Floats (&out)[16]) {
+XRGS_INLINE void sum_pair_grads(const Frame& frame, const float* pair_grads, std::int64_t group,
+                                std::uint32_t visible, Floats (&out)[16]) {
   for (int i = 0; i < 16; ++i) {
-    Slots slots{0, 0};
-    if ((visible >> i & 1u) != 0) slots = frame.slots[static_cast<std::size_t>(group + i)];
-    const float* slot = sums + std::size_t{slots.first} * kSlotSize;
-    Floats sum = load(slots.count > 0 ? slot : kNoSlot);
-    for (std::uint32_t k = 1; k < kFewSlots; ++k)
-      sum += load(k < slots.count ? slot + k * kSlotSize : kNoSlot);
-    for (std::uint32_t k = kFewSlots; k < slots.count; ++k) sum += load(slot + std::size_t{k} * kSlotSize);
+    PairRange range{0, 0};
+    if ((visible >> i & 1u) != 0) range = frame.pair_ranges[static_cast<std::size_t>(group + i)];
+    const float* row = pair_grads + std::size_t{range.first} * kPairGradStride;
+    Floats sum = load(range.count > 0 ? row : kNoPair);
+    for (std::uint32_t k = 1; k < kFewPairs; ++k)
+      sum += load(k < range.count ? row + k * kPairGradStride : kNoPair);
+    for (std::uint32_t k = kFewPairs; k < range.count; ++k)
+      sum += load(row + std::size_t{k} * kPairGradStride);
     out[i] = sum;
   }
   transpose(out);
 }
 
-// Gradients of what whitening reads.
-struct CovarianceGradient {
+// The gradients of the projected mean, of the dilated 2D covariance and of its determinant, which
+// is treated as a fourth independent variable.
+struct ConicGradient {
   Floats xx, xy, yy, det;
   Floats mean_x, mean_y;
 };
 
-// Through u = p dx - s dy, v = q dy, ln alpha = ln(opacity) - u^2 - v^2, and p, s, q of the
-// covariance.
-XRGS_INLINE CovarianceGradient whitening_backward(const Projected& o, const Floats (&sum)[16]) {
-  const Whitening w = whiten(o);
-  const Floats two = splat(2.0f), half = splat(0.5f);
-  const Floats gu = fnma(w.s, sum[kGy], w.p * sum[kGx]);      // sum of g u
-  const Floats gux = fnma(w.s, sum[kGxy], w.p * sum[kGxx]);   // of g u dx
-  const Floats guy = fnma(w.s, sum[kGyy], w.p * sum[kGxy]);   // of g u dy
-  const Floats inv_yy = splat(1.0f) / o.yy, ratio = o.xy * inv_yy;
-  const Floats vs = two * guy;
-  const Floats vq_q = -(two * w.q * w.q * sum[kGyy]);  // dL/dq times q
-  const Floats vp_p = w.p * fma(vs, ratio, -(two * gux));
-  CovarianceGradient v;
-  v.xy = vs * w.p * inv_yy;
-  v.yy = inv_yy * (half * (vp_p - vq_q) - vs * w.s);
-  v.det = -(half * vp_p / o.det);
-  v.xx = splat(0.0f);
-  v.mean_x = two * w.p * gu;
-  v.mean_y = two * fnma(w.s, gu, w.q * w.q * sum[kGy]);
+// Through u = xx dx - xy dy, v = yy dy and ln alpha = ln(opacity) - u^2 - v^2 to the factor of the
+// conic, and from there to the covariance (Eq. 20, 22 and 23).
+XRGS_INLINE ConicGradient conic_factor_backward(const Projection& o, const Floats (&sum)[16]) {
+  const ConicFactor factor = conic_factor(o);
+  const Floats two = broadcast(2.0f), half = broadcast(0.5f);
+  // The sums of g u, g u dx and g u dy.
+  const Floats g_u = fnma(factor.xy, sum[kGradDy], factor.xx * sum[kGradDx]);
+  const Floats g_u_dx = fnma(factor.xy, sum[kGradDxDy], factor.xx * sum[kGradDxDx]);
+  const Floats g_u_dy = fnma(factor.xy, sum[kGradDyDy], factor.xx * sum[kGradDxDy]);
+  const Floats inv_yy = broadcast(1.0f) / o.yy, ratio = o.xy * inv_yy;
+  const Floats v_factor_xy = two * g_u_dy;
+  // The gradients of ln(factor.yy), and of ln(factor.xx) with factor.xy / factor.xx held fixed.
+  const Floats v_log_yy = -(two * factor.yy * factor.yy * sum[kGradDyDy]);
+  const Floats v_log_xx = factor.xx * fma(v_factor_xy, ratio, -(two * g_u_dx));
+  ConicGradient v;
+  v.xy = v_factor_xy * factor.xx * inv_yy;
+  v.yy = inv_yy * (half * (v_log_xx - v_log_yy) - v_factor_xy * factor.xy);
+  v.det = -(half * v_log_xx / o.det);
+  v.xx = broadcast(0.0f);
+  v.mean_x = two * factor.xx * g_u;
+  v.mean_y = two * fnma(factor.xy, g_u, factor.yy * factor.yy * sum[kGradDy]);
   return v;
 }
 
-// The gradients of the image-plane axes; v_opacity becomes that of the uncompensated opacity.
-XRGS_INLINE void covariance_backward(const Projected& o, const View& view, const Inputs& in,
-                                     CovarianceGradient v, Floats& v_opacity, Vector3& v_m1,
-                                     Vector3& v_m2) {
-  const Floats zero = splat(0.0f), half = splat(0.5f), eps = splat(view.eps2d);
-  Floats per_area = zero;  // dL/d(area) / area
-  if (view.antialiased) {
-    const Floats inv_root = splat(1.0f) / sqrt(max(o.det, splat(1e-37f)));
+// The gradients of the rows of M (Eq. 24 and 25). v_opacity is that of the compensated opacity and
+// becomes that of the parameter.
+XRGS_INLINE void covariance_backward(const Projection& o, const RenderConfig& config,
+                                     const GaussianInputs& in, ConicGradient v, Floats& v_opacity,
+                                     Vector3& v_m_x, Vector3& v_m_y) {
+  const Floats zero = broadcast(0.0f), half = broadcast(0.5f), eps = broadcast(config.eps2d);
+  Floats v_sqrt_det2d_ratio = zero;  // dL/d(sqrt_det2d) / sqrt_det2d
+  if (config.antialiased) {
+    const Floats inv_root = broadcast(1.0f) / sqrt(max(o.det, broadcast(1e-37f)));
     v.det = v.det - half * v_opacity * o.opacity / o.det;
-    per_area = select(zero < o.area, v_opacity * in.opacity * inv_root / o.area, zero);
-    v_opacity = v_opacity * o.area * inv_root;
+    v_sqrt_det2d_ratio =
+        select(zero < o.sqrt_det2d, v_opacity * in.opacity * inv_root / o.sqrt_det2d, zero);
+    v_opacity = v_opacity * o.sqrt_det2d * inv_root;
   }
   v.xx = fma(eps, v.det, v.xx);
   v.yy = fma(eps, v.det, v.yy);
-  const Vector3 v_normal = times(fma(splat(2.0f), v.det, per_area), o.normal);
-  v_m1 = add(add(cross(o.m2, v_normal), v.xx + v.xx, o.m1), v.xy, o.m2);
-  v_m2 = add(add(cross(v_normal, o.m1), v.yy + v.yy, o.m2), v.xy, o.m1);
+  const Vector3 v_normal = times(fma(broadcast(2.0f), v.det, v_sqrt_det2d_ratio), o.normal);
+  v_m_x = add_scaled(add_scaled(cross(o.m_y, v_normal), v.xx + v.xx, o.m_x), v.xy, o.m_y);
+  v_m_y = add_scaled(add_scaled(cross(v_normal, o.m_x), v.yy + v.yy, o.m_y), v.xy, o.m_x);
 }
 
-// The gradient of the unit quaternion from that of its rotation's rows, and through its length.
+// The gradient of the quaternion, given that of the rows of its rotation matrix (Eq. 30).
 XRGS_INLINE void quaternion_backward(const Rotation& r, const Vector3 (&v)[3], Floats (&out)[4]) {
-  const Floats two = splat(2.0f);
+  const Floats two = broadcast(2.0f);
   const Floats d21 = v[2].y - v[1].z, d02 = v[0].z - v[2].x, d10 = v[1].x - v[0].y;
   const Floats s10 = v[1].x + v[0].y, s02 = v[0].z + v[2].x, s21 = v[2].y + v[1].z;
   Floats w = two * fma(r.x, d21, fma(r.y, d02, r.z * d10));
@@ -94,175 +103,202 @@ XRGS_INLINE void quaternion_backward(const Rotation& r, const Vector3 (&v)[3], F
   out[3] = r.inv_length * fnma(along, r.z, z);
 }
 
-struct ShapeGradient {
+struct GeometryGradient {
   Vector3 mean, scale;
   Floats quat[4];
 };
 
-// From image-plane axes and means to means, scales and quaternions.
-XRGS_INLINE ShapeGradient projection_backward(const Projected& o, const View& view, const Inputs& in,
-                                              const Vector3& v_m1, const Vector3& v_m2,
-                                              Floats v_x2d, Floats v_y2d) {
-  const Floats zero = splat(0.0f);
-  const Floats focal_x = splat(view.fx) * o.inv_z, focal_y = splat(view.fy) * o.inv_z;
-  const Vector3 a0 = times(focal_x, v_m1), a1 = times(focal_y, v_m2);
-  const Vector3 a2 = add(times(-o.slope_x, a0), -o.slope_y, a1);
-  const Floats v_slope_x = select(o.free_x, -dot(a0, o.axis[2]), zero);
-  const Floats v_slope_y = select(o.free_y, -dot(a1, o.axis[2]), zero);
-  // Slopes and means both move with x/z and y/z.
-  const Floats v_xz = fma(splat(view.fx), v_x2d, v_slope_x), v_yz = fma(splat(view.fy), v_y2d, v_slope_y);
-  Vector3 v_cam;
-  v_cam.x = v_xz * o.inv_z;
-  v_cam.y = v_yz * o.inv_z;
-  v_cam.z = -o.inv_z * (fma(v_cam.x, o.x, v_cam.y * o.y) + dot(v_m1, o.m1) + dot(v_m2, o.m2));
+// From the rows of M and the projected mean to means, scales and quaternions (Eq. 26 to 30).
+XRGS_INLINE GeometryGradient projection_backward(const Projection& o, const RenderConfig& config,
+                                                 const GaussianInputs& in, const Vector3& v_m_x,
+                                                 const Vector3& v_m_y, Floats v_mean2d_x,
+                                                 Floats v_mean2d_y) {
+  const Floats zero = broadcast(0.0f);
+  const Floats focal_x = broadcast(config.fx) * o.inv_z, focal_y = broadcast(config.fy) * o.inv_z;
+  // The gradients of the rows of A.
+  const Vector3 a0 = times(focal_x, v_m_x), a1 = times(focal_y, v_m_y);
+  const Vector3 a2 = add_scaled(times(-o.slope_x, a0), -o.slope_y, a1);
+  const Floats v_slope_x = select(o.slope_x_unclamped, -dot(a0, o.axis[2]), zero);
+  const Floats v_slope_y = select(o.slope_y_unclamped, -dot(a1, o.axis[2]), zero);
+  // Both the slopes and the projected means depend on x/z and y/z.
+  const Floats v_x_over_z = fma(broadcast(config.fx), v_mean2d_x, v_slope_x);
+  const Floats v_y_over_z = fma(broadcast(config.fy), v_mean2d_y, v_slope_y);
+  Vector3 v_camera;
+  v_camera.x = v_x_over_z * o.inv_z;
+  v_camera.y = v_y_over_z * o.inv_z;
+  v_camera.z =
+      -o.inv_z * (fma(v_camera.x, o.x, v_camera.y * o.y) + dot(v_m_x, o.m_x) + dot(v_m_y, o.m_y));
 
-  const float* r = view.rotation;
-  const auto to_world = [r](const Vector3& c0, const Vector3& c1, const Vector3& c2, int k) {
-    return add(add(times(splat(r[k]), c0), splat(r[3 + k]), c1), splat(r[6 + k]), c2);
+  const float* r = config.rotation;
+  const auto world_row = [r](const Vector3& c0, const Vector3& c1, const Vector3& c2, int k) {
+    return add_scaled(add_scaled(times(broadcast(r[k]), c0), broadcast(r[3 + k]), c1),
+                      broadcast(r[6 + k]), c2);
   };
-  ShapeGradient out;
+  GeometryGradient out;
   Floats* mean[3] = {&out.mean.x, &out.mean.y, &out.mean.z};
   Vector3 v_rotation[3];
   out.scale = {zero, zero, zero};
   for (int k = 0; k < 3; ++k) {
-    *mean[k] = fma(splat(r[k]), v_cam.x, fma(splat(r[3 + k]), v_cam.y, splat(r[6 + k]) * v_cam.z));
-    const Vector3 row = to_world(a0, a1, a2, k);  // of rotation diag(scale)
+    *mean[k] = fma(broadcast(r[k]), v_camera.x,
+                   fma(broadcast(r[3 + k]), v_camera.y, broadcast(r[6 + k]) * v_camera.z));
+    const Vector3 row = world_row(a0, a1, a2, k);  // of rotation diag(scale)
     const Vector3& q = o.rotation.row[k];
-    out.scale = {fma(row.x, q.x, out.scale.x), fma(row.y, q.y, out.scale.y), fma(row.z, q.z, out.scale.z)};
+    out.scale = {fma(row.x, q.x, out.scale.x), fma(row.y, q.y, out.scale.y),
+                 fma(row.z, q.z, out.scale.z)};
     v_rotation[k] = {row.x * in.scale.x, row.y * in.scale.y, row.z * in.scale.z};
   }
   quaternion_backward(o.rotation, v_rotation, out.quat);
   return out;
 }
 
-// Where sixteen Gaussians' gradients of `width` floats go: to their place, or for a group that is
-// not whole to a buffer, and from there with `copy_out`.
-struct Sixteen {
+// Writes the gradients of sixteen Gaussians to an array [N, width]: straight to its rows or, for a
+// group that is not whole, to a buffer that copy_out() copies to them.
+struct GroupWriter {
   std::int64_t group;
   int lanes;
   float buffer[64];
 
-  Sixteen(std::int64_t first, int count) : group(first), lanes(count) {}
-  float* of(float* all, int width) { return lanes == 16 ? all + group * width : buffer; }
+  GroupWriter(std::int64_t first, int count) : group(first), lanes(count) {}
+  float* target(float* all, int width) { return lanes == 16 ? all + group * width : buffer; }
   void copy_out(float* all, int width) {
     if (lanes == 16) return;
     for (int i = 0; i < lanes * width; ++i) all[group * width + i] = buffer[i];
   }
 };
 
-void zero_floats(float* p, std::int64_t count) { std::memset(p, 0, static_cast<std::size_t>(count) * 4); }
+void zero_floats(float* p, std::int64_t count) {
+  std::memset(p, 0, static_cast<std::size_t>(count) * 4);
+}
 
-// The colour's part: writes the gradients of the harmonics (of those above band 0 if they are wanted),
-// returns that of the mean.
+// Writes the gradients of sh0 and, where it is wanted, of shN (Eq. 31). Returns the gradient of the
+// mean that comes from the viewing direction (Eq. 32).
 template <int Degree>
-XRGS_INLINE Vector3 color_backward(const Parameters& p, const View& view, const Inputs& in,
-                                   const Shade& shade, const Floats (&sum)[16], std::int64_t group,
-                                   int lanes, const Gradients& out, Harmonics& harmonics) {
-  constexpr int kRest = rest_of(Degree);
-  Floats inv;
-  const Vector3 d = direction_of(in.mean, view.position, inv);
-  const Vector3 v{keep(mask_of(shade.open[0]), sum[kWr]), keep(mask_of(shade.open[1]), sum[kWg]),
-                  keep(mask_of(shade.open[2]), sum[kWb])};
-  Sixteen to(group, lanes);
-  store_triples(to.of(out.sh0, 3), splat(kC0) * v.x, splat(kC0) * v.y, splat(kC0) * v.z);
-  to.copy_out(out.sh0, 3);
-  Vector3 v_mean{splat(0.0f), splat(0.0f), splat(0.0f)};
+XRGS_INLINE Vector3 color_backward(const GaussianParameters& p, const RenderConfig& config,
+                                   const GaussianInputs& in, const ColorDerivatives& derivatives,
+                                   const Floats (&sum)[16], std::int64_t group, int lanes,
+                                   const ParameterGradients& out, ShGradientRows& sh_rows) {
+  constexpr int kRest = rest_basis_count(Degree);
+  Floats inv_distance;
+  const Vector3 d = view_direction(in.mean, config.camera_position, inv_distance);
+  const Vector3 v{select_or_zero(mask_from_bits(derivatives.unclamped[0]), sum[kGradRed]),
+                  select_or_zero(mask_from_bits(derivatives.unclamped[1]), sum[kGradGreen]),
+                  select_or_zero(mask_from_bits(derivatives.unclamped[2]), sum[kGradBlue])};
+  GroupWriter writer(group, lanes);
+  store_triples(writer.target(out.sh0, 3), broadcast(kC0) * v.x, broadcast(kC0) * v.y,
+                broadcast(kC0) * v.z);
+  writer.copy_out(out.sh0, 3);
+  Vector3 v_mean{broadcast(0.0f), broadcast(0.0f), broadcast(0.0f)};
   if constexpr (kRest > 0) {
-    const auto slope = [&](int axis) {
-      return Vector3{load(shade.slope[axis]), load(shade.slope[3 + axis]), load(shade.slope[6 + axis])};
+    const auto by_axis = [&](int axis) {
+      return Vector3{load(derivatives.dcolor_ddir[axis]), load(derivatives.dcolor_ddir[3 + axis]),
+                     load(derivatives.dcolor_ddir[6 + axis])};
     };
-    const Vector3 v_d{dot(slope(0), v), dot(slope(1), v), dot(slope(2), v)};
-    v_mean = times(inv, add(v_d, -dot(v_d, d), d));
+    const Vector3 v_d{dot(by_axis(0), v), dot(by_axis(1), v), dot(by_axis(2), v)};
+    v_mean = times(inv_distance, add_scaled(v_d, -dot(v_d, d), d));
   }
   if (out.shN == nullptr) return v_mean;
-  harmonics_gradient<Degree>(d, v, p.rest, harmonics);
-  float* place = out.shN + group * p.rest * 3;
-  const int count = lanes * p.rest * 3;
+  sh_coefficient_gradient<Degree>(d, v, p.rest_count, sh_rows);
+  float* target = out.shN + group * p.rest_count * 3;
+  const int count = lanes * p.rest_count * 3;
   if (lanes == 16)  // on a 64-byte boundary, as the array and sixteen rows of any width are
-    for (int i = 0; i < count; i += 16) stream(place + i, load(harmonics.rows + i));
+    for (int i = 0; i < count; i += 16) stream(target + i, load(sh_rows.rows + i));
   else
-    for (int i = 0; i < count; ++i) place[i] = harmonics.rows[i];
+    for (int i = 0; i < count; ++i) target[i] = sh_rows.rows[i];
   return v_mean;
 }
 
-void write_zeros(const Parameters& p, std::int64_t group, int lanes, const Gradients& out) {
+void write_zeros(const GaussianParameters& p, std::int64_t group, int lanes,
+                 const ParameterGradients& out) {
   zero_floats(out.means + group * 3, lanes * 3);
   zero_floats(out.quats + group * 4, lanes * 4);
   zero_floats(out.scales + group * 3, lanes * 3);
   zero_floats(out.opacities + group, lanes);
   zero_floats(out.sh0 + group * 3, lanes * 3);
-  if (out.shN != nullptr) zero_floats(out.shN + group * p.rest * 3, std::int64_t{lanes} * p.rest * 3);
-  if (out.offsets != nullptr) zero_floats(out.offsets + group * 2, lanes * 2);
+  if (out.shN != nullptr)
+    zero_floats(out.shN + group * p.rest_count * 3, std::int64_t{lanes} * p.rest_count * 3);
+  if (out.means2d_offset != nullptr) zero_floats(out.means2d_offset + group * 2, lanes * 2);
 }
 
-void write_shape(const ShapeGradient& v, Floats v_opacity, Floats v_x2d, Floats v_y2d, Mask visible,
-                 std::int64_t group, int lanes, const Gradients& out) {
-  Sixteen to(group, lanes);
-  store_triples(to.of(out.means, 3), keep(visible, v.mean.x), keep(visible, v.mean.y),
-                keep(visible, v.mean.z));
-  to.copy_out(out.means, 3);
-  store_triples(to.of(out.scales, 3), keep(visible, v.scale.x), keep(visible, v.scale.y),
-                keep(visible, v.scale.z));
-  to.copy_out(out.scales, 3);
-  store_quadruples(to.of(out.quats, 4), keep(visible, v.quat[0]), keep(visible, v.quat[1]),
-                   keep(visible, v.quat[2]), keep(visible, v.quat[3]));
-  to.copy_out(out.quats, 4);
-  store(to.of(out.opacities, 1), keep(visible, v_opacity));
-  to.copy_out(out.opacities, 1);
-  if (out.offsets == nullptr) return;
+// Writes the gradients of all parameters but the colours.
+void write_geometry(const GeometryGradient& v, Floats v_opacity, Floats v_mean2d_x,
+                    Floats v_mean2d_y, Mask visible, std::int64_t group, int lanes,
+                    const ParameterGradients& out) {
+  GroupWriter writer(group, lanes);
+  store_triples(writer.target(out.means, 3), select_or_zero(visible, v.mean.x),
+                select_or_zero(visible, v.mean.y), select_or_zero(visible, v.mean.z));
+  writer.copy_out(out.means, 3);
+  store_triples(writer.target(out.scales, 3), select_or_zero(visible, v.scale.x),
+                select_or_zero(visible, v.scale.y), select_or_zero(visible, v.scale.z));
+  writer.copy_out(out.scales, 3);
+  store_quadruples(writer.target(out.quats, 4), select_or_zero(visible, v.quat[0]),
+                   select_or_zero(visible, v.quat[1]), select_or_zero(visible, v.quat[2]),
+                   select_or_zero(visible, v.quat[3]));
+  writer.copy_out(out.quats, 4);
+  store(writer.target(out.opacities, 1), select_or_zero(visible, v_opacity));
+  writer.copy_out(out.opacities, 1);
+  if (out.means2d_offset == nullptr) return;
   Floats low, high;
-  interleave(keep(visible, v_x2d), keep(visible, v_y2d), low, high);
-  float* offsets = to.of(out.offsets, 2);
+  interleave(select_or_zero(visible, v_mean2d_x), select_or_zero(visible, v_mean2d_y), low, high);
+  float* offsets = writer.target(out.means2d_offset, 2);
   store(offsets, low);
   store(offsets + 16, high);
-  to.copy_out(out.offsets, 2);
+  writer.copy_out(out.means2d_offset, 2);
 }
 
+// Writes the gradients of Gaussians group..group+lanes-1.
 template <int Degree>
-void backward_sixteen(const Parameters& p, const Frame& frame, const float* sums, std::int64_t group,
-                      int lanes, std::uint32_t visible, const Gradients& out, Harmonics& harmonics) {
-  const View& view = frame.view;
+void backward_group(const GaussianParameters& p, const Frame& frame, const float* pair_grads,
+                    std::int64_t group, int lanes, std::uint32_t visible,
+                    const ParameterGradients& out, ShGradientRows& sh_rows) {
+  const RenderConfig& config = frame.config;
   Floats sum[16];
-  sum_slots(frame, sums, group, visible, sum);
-  const Inputs in = load_inputs(p, group, lanes);
-  const Projected o = project_inputs(in, view);
-  const CovarianceGradient v = whitening_backward(o, sum);
-  Floats v_opacity = sum[kG] / o.opacity;
-  Vector3 v_m1, v_m2;
-  covariance_backward(o, view, in, v, v_opacity, v_m1, v_m2);
-  ShapeGradient shape = projection_backward(o, view, in, v_m1, v_m2, v.mean_x, v.mean_y);
-  const Shade& shade = frame.shades[static_cast<std::size_t>(group / 16)];
-  const Vector3 by_color = color_backward<Degree>(p, view, in, shade, sum, group, lanes, out, harmonics);
-  shape.mean = add(shape.mean, splat(1.0f), by_color);
-  const Floats v_x2d = view.absgrad ? sum[kAbsX] : v.mean_x;
-  const Floats v_y2d = view.absgrad ? sum[kAbsY] : v.mean_y;
-  write_shape(shape, v_opacity, v_x2d, v_y2d, mask_of(visible), group, lanes, out);
+  sum_pair_grads(frame, pair_grads, group, visible, sum);
+  const GaussianInputs in = load_inputs(p, group, lanes);
+  const Projection o = project_inputs(in, config);
+  const ConicGradient v = conic_factor_backward(o, sum);
+  Floats v_opacity = sum[kGrad] / o.opacity;  // Eq. 19
+  Vector3 v_m_x, v_m_y;
+  covariance_backward(o, config, in, v, v_opacity, v_m_x, v_m_y);
+  GeometryGradient geometry = projection_backward(o, config, in, v_m_x, v_m_y, v.mean_x, v.mean_y);
+  const ColorDerivatives& derivatives =
+      frame.color_derivatives[static_cast<std::size_t>(group / 16)];
+  const Vector3 by_direction =
+      color_backward<Degree>(p, config, in, derivatives, sum, group, lanes, out, sh_rows);
+  geometry.mean = add_scaled(geometry.mean, broadcast(1.0f), by_direction);
+  const Floats v_offset_x = config.absgrad ? sum[kAbsGradX] : v.mean_x;
+  const Floats v_offset_y = config.absgrad ? sum[kAbsGradY] : v.mean_y;
+  write_geometry(geometry, v_opacity, v_offset_x, v_offset_y, mask_from_bits(visible), group, lanes,
+                 out);
 }
 
 template <int Degree>
-void backward_degree(const Parameters& p, const Frame& frame, const float* sums, std::int64_t first,
-                     std::int64_t last, const Gradients& out) {
-  Harmonics harmonics;
+void backward_degree(const GaussianParameters& p, const Frame& frame, const float* pair_grads,
+                     std::int64_t first, std::int64_t last, const ParameterGradients& out) {
+  ShGradientRows sh_rows;
   for (std::int64_t group = first; group < last; group += 16) {
     const int lanes = last - group < 16 ? static_cast<int>(last - group) : 16;
     const std::uint32_t visible = frame.visible[static_cast<std::size_t>(group / 16)];
     if (visible == 0)
       write_zeros(p, group, lanes, out);
     else
-      backward_sixteen<Degree>(p, frame, sums, group, lanes, visible, out, harmonics);
+      backward_group<Degree>(p, frame, pair_grads, group, lanes, visible, out, sh_rows);
   }
   stream_fence();
 }
 
 }  // namespace
 
-void project_backward(const Parameters& p, const Frame& frame, const float* sums, std::int64_t first,
-                      std::int64_t last, const Gradients& out) {
-  switch (frame.view.degree) {
-    case 0: return backward_degree<0>(p, frame, sums, first, last, out);
-    case 1: return backward_degree<1>(p, frame, sums, first, last, out);
-    case 2: return backward_degree<2>(p, frame, sums, first, last, out);
-    default: return backward_degree<3>(p, frame, sums, first, last, out);
+void project_backward(const GaussianParameters& p, const Frame& frame, const float* pair_grads,
+                      std::int64_t first, std::int64_t last, const ParameterGradients& out) {
+  switch (frame.config.sh_degree) {
+    case 0:
+      return backward_degree<0>(p, frame, pair_grads, first, last, out);
+    case 1:
+      return backward_degree<1>(p, frame, pair_grads, first, last, out);
+    case 2:
+      return backward_degree<2>(p, frame, pair_grads, first, last, out);
+    default:
+      return backward_degree<3>(p, frame, pair_grads, first, last, out);
   }
 }
 

@@ -1,4 +1,5 @@
-// The kernels of one instruction set, each in the file of its name; see kernels.h.
+// The kernels of one instruction set, each defined in the file of its name. raster_kernels.h
+// documents them.
 #pragma once
 
 #include "raster/frame.h"
@@ -7,15 +8,18 @@
 namespace xrgs {
 namespace XRGS_NS {
 
-std::int64_t project(const Parameters& parameters, const View& view, std::int64_t first,
-                     std::int64_t last, Frame& frame, std::uint64_t* order, bool* good);
-std::int64_t emit(Frame& frame, std::int64_t* next, std::int64_t last, Pair* pairs,
-                  std::int64_t room, std::uint32_t* tile_counts);
+std::int64_t project(const GaussianParameters& parameters, const RenderConfig& config,
+                     std::int64_t first, std::int64_t last, Frame& frame, std::uint64_t* sort_keys,
+                     bool* params_valid);
+std::int64_t intersect_tiles(Frame& frame, std::int64_t* next, std::int64_t last,
+                             TileIntersection* intersections, std::int64_t capacity,
+                             std::uint32_t* tile_counts);
 void composite(Frame& frame, int tile, float* image, float* alpha);
-void composite_backward(const Frame& frame, int tile, const float* image_gradient,
-                        const float* alpha_gradient, float* sums);
-void project_backward(const Parameters& parameters, const Frame& frame, const float* sums,
-                      std::int64_t first, std::int64_t last, const Gradients& gradients);
+void composite_backward(const Frame& frame, int tile, const float* v_image, const float* v_alpha,
+                        float* pair_grads);
+void project_backward(const GaussianParameters& parameters, const Frame& frame,
+                      const float* pair_grads, std::int64_t first, std::int64_t last,
+                      const ParameterGradients& gradients);
 
 }  // namespace XRGS_NS
 }  // namespace xrgs

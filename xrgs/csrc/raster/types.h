@@ -1,123 +1,144 @@
-// What the stages of the rasterizer hand to one another. Plain data, the same for every copy of
-// the kernels.
-//
-// A view goes: project (parameters -> records), sort (by depth), bin (a list of records for each
-// tile), composite (lists -> image); and back: composite backward (image gradient -> a slot of sums
-// for each (tile, Gaussian) pair), project backward (slots -> parameter gradients).
+// The data that the stages of the rasterizer pass to one another: plain structs, the same for every
+// instruction set. docs/rasterizer.md describes the stages and derives the equations that the
+// comments refer to.
 #pragma once
 
 #include <cstdint>
 
 namespace xrgs {
 
-constexpr int kTile = 16;         // side of a tile, px: sixteen 4x4 blocks, one vector each
-constexpr int kBlocks = 16;       // of a tile, row by row
-constexpr int kBatch = 128;       // Gaussians of a tile that are composited at once
-constexpr int kChunk = 1024;      // Gaussians that a task projects; a multiple of 16
+constexpr int kTileSize = 16;        // side of a tile, px: sixteen 4x4 blocks, one vector each
+constexpr int kBlocksPerTile = 16;   // row by row
+constexpr int kBatchSize = 128;      // Gaussians of a tile that are composited together
+constexpr int kProjectChunk = 1024;  // Gaussians that one task projects; a multiple of 16
 
-// Work that is left out, each kind as long as it is true; the image is the same without.
-struct Skips {
-  bool out_of_view;    // Gaussians whose box of reach does not overlap the image
+// Work that the rasterizer leaves out. Each option skips one kind of work while it is true; the
+// image is the same either way, to rounding at the thresholds.
+struct CullingOptions {
+  bool out_of_view;    // Gaussians whose bounding box (Eq. 12) does not overlap the image
   bool sub_threshold;  // Gaussians whose opacity is below alpha_min
-  bool tiles;          // tiles that the box of reach overlaps, but not the ellipse
-  bool blocks;         // blocks of a tile that the ellipse does not reach
-  bool saturated;      // what lies behind the last Gaussian that a block's pixels composite
+  bool tiles;          // tiles that the bounding box overlaps, but not the cutoff ellipse (Eq. 13)
+  bool blocks;         // 4x4 blocks of a tile that the cutoff ellipse does not overlap
+  bool saturated;      // Gaussians behind the last one that any pixel of a block composites
 };
 
-// The camera and the settings, as the kernels need them.
-struct View {
-  float rotation[9];  // world to camera, row by row
-  float translation[3];
-  float position[3];  // of the camera, world units
-  float fx, fy, cx, cy;
-  int width, height;
-  float near, eps2d;
-  float alpha_min;  // at least the smallest normal number
-  float level_min;  // log2 of alpha_min
+// The camera and the settings of one render.
+struct RenderConfig {
+  float rotation[9];         // world to camera, row by row
+  float translation[3];      // world to camera
+  float camera_position[3];  // world units
+  float fx, fy, cx, cy;      // px
+  int width, height;         // px
+  float near;                // world units
+  float eps2d;               // px^2, added to the diagonal of the 2D covariance
+  float alpha_min;           // at least the smallest normal number
+  float log2_alpha_min;
   float alpha_max, transmittance_min;
   float background[3];
-  bool antialiased;
-  bool absgrad;  // the offsets' gradient is of each pixel's gradient the absolute value, summed
-  int degree;  // highest band of the spherical harmonics that is on
-  Skips skips;
+  bool antialiased;  // compensate opacities for eps2d (Eq. 10)
+  bool absgrad;      // the gradient of means2d_offset sums absolute values over pixels (Eq. 21)
+  int sh_degree;     // the highest degree of the spherical harmonics that is used, 0 to 3
+  CullingOptions culling;
 
-  int columns() const { return (width + kTile - 1) / kTile; }
-  int rows() const { return (height + kTile - 1) / kTile; }
+  int tile_columns() const { return (width + kTileSize - 1) / kTileSize; }
+  int tile_rows() const { return (height + kTileSize - 1) / kTileSize; }
+  std::int64_t tile_count() const { return std::int64_t{tile_columns()} * tile_rows(); }
 };
 
 // The Gaussians: activated parameters, float32, contiguous.
-struct Parameters {
-  std::int64_t count;
-  const float* means;      // [N, 3]
-  const float* quats;      // [N, 4] wxyz
-  const float* scales;     // [N, 3]
-  const float* opacities;  // [N]
-  const float* sh0;        // [N, 3]
-  const float* shN;        // [N, rest, 3]
-  int rest;
-  const float* offsets;  // [N, 2] px added to the projected means, or null
+struct GaussianParameters {
+  std::int64_t count;           // N
+  const float* means;           // [N, 3]
+  const float* quats;           // [N, 4] wxyz
+  const float* scales;          // [N, 3]
+  const float* opacities;       // [N]
+  const float* sh0;             // [N, 3]
+  const float* shN;             // [N, rest_count, 3]
+  int rest_count;               // basis functions above degree 0 that are stored
+  const float* means2d_offset;  // [N, 2] px added to the projected means, or null
 };
 
-// Where their gradients go.
-struct Gradients {
+// The arrays that receive the gradients of the parameters; shapes as above.
+struct ParameterGradients {
   float *means, *quats, *scales, *opacities, *sh0;
-  float* shN;      // or null
-  float* offsets;  // or null
+  float* shN;             // null where it is not needed
+  float* means2d_offset;  // null where there is no offset
 };
 
-// A visible Gaussian in the image plane: one cache line. With d = pixel centre - (x, y),
-// u = p dx - s dy and v = q dy: alpha = 2^(level - u^2 - v^2). The inverse covariance as a sum of
-// squares has no cancellation, where a dx^2 + 2 b dx dy + c dy^2 of a long needle loses all digits.
-struct alignas(64) Record {
-  float x, y;           // mean, px
-  float p, s, q;        // px^-1
-  float level;          // log2 of the opacity
-  float red, green, blue;
-  float inv_p;          // 1 / p
-  float tip;            // dy of the rightmost point of the ellipse of reach, px
-  float reach2;         // the ellipse of reach is u^2 + v^2 = reach2
-  float reach_y;        // half its height, px
+// A visible Gaussian in the image plane: one cache line. With d = pixel centre - mean2d,
+//   u = chol_xx dx - chol_xy dy,  v = chol_yy dy,  alpha = 2^(log2_opacity - u^2 - v^2)
+// (Eq. 7 and 8).
+// chol_* is the Cholesky factor of the conic (the inverse of the 2D covariance), scaled so that the
+// exponent is one of base 2. Conics as gsplat stores them, a dx^2 + 2 b dx dy + c dy^2, lose all
+// digits to cancellation for a long thin Gaussian; a sum of squares does not.
+struct alignas(64) ProjectedGaussian {
+  float mean2d_x, mean2d_y;         // px
+  float chol_xx, chol_xy, chol_yy;  // px^-1; chol_xy has the sign of the covariance
+  float log2_opacity;               // compensated if antialiased
+  float red, green, blue;           // at least 0
+  float inv_chol_xx;                // px
+  float dy_at_xmax;                 // dy of the rightmost point of the cutoff ellipse, px
+  float cutoff_radius_sq;           // the cutoff ellipse is u^2 + v^2 = cutoff_radius_sq (Eq. 11)
+  float radius_y;                   // half the height of the cutoff ellipse, px
   float unused[3];
 };
-static_assert(sizeof(Record) == 64, "a record is one cache line");
+static_assert(sizeof(ProjectedGaussian) == 64, "a projected Gaussian is one cache line");
 
-// A Gaussian in a tile's list.
-struct Entry {
+// A Gaussian in the list of a tile.
+struct TileEntry {
   std::uint32_t gaussian;
-  std::uint32_t slot;  // where the backward pass leaves this pair's sums
+  std::uint32_t pair;  // row of pair_grads that belongs to this (tile, Gaussian) pair
 };
 
-// How the colours of sixteen Gaussians move with the direction that they are seen from, kept from the
-// forward pass so that the backward pass need not read the harmonics again.
-struct alignas(64) Shade {
-  float slope[9][16];     // d(red)/dx, d(red)/dy, d(red)/dz, d(green)/dx, ... before the clamp at 0
-  std::uint16_t open[3];  // for red, green, blue: a bit where the clamp does not hold it
+// How the colours of sixteen Gaussians change with the viewing direction. The forward pass stores
+// this so that the backward pass need not read the spherical harmonics again, three quarters of the
+// parameters.
+struct alignas(64) ColorDerivatives {
+  // d(red)/dx, d(red)/dy, d(red)/dz, d(green)/dx, ... of the colour before the clamp at 0.
+  float dcolor_ddir[9][16];
+  // For red, green and blue: bit i is set where the colour of Gaussian i is not clamped.
+  std::uint16_t unclamped[3];
 };
 
-// The slots of a Gaussian: first, first + 1, ..., first + count - 1. They lie in the order of the
-// Gaussians, so that the projection's backward pass reads them one after the other.
-struct Slots {
+// The (tile, Gaussian) pairs of one Gaussian: rows first..first + count - 1 of pair_grads. They are
+// numbered in the order of the Gaussians, so the backward projection reads them one after the
+// other.
+struct PairRange {
   std::uint32_t first;
   std::uint32_t count;
 };
 
-// A (tile, Gaussian) pair as binning emits it, front to back.
-struct Pair {
+// A (tile, Gaussian) pair as tile intersection writes it, front to back.
+struct TileIntersection {
   std::uint32_t tile;
   std::uint32_t gaussian;
 };
 
-// A pair's sums over its pixels, with g = dL/d(ln alpha), w = the weight of its colour and
-// v = dL/d(image): g, g dx, g dy, g dx^2, g dx dy, g dy^2, and w v for each colour; with absgrad
-// also |g d(ln alpha)/dx| and |g d(ln alpha)/dy|, x and y the mean's, else zeros.
-enum SlotField { kG, kGx, kGy, kGxx, kGxy, kGyy, kWr, kWg, kWb, kAbsX, kAbsY, kSlotFields };
-constexpr int kSlotSize = 16;  // floats: one cache line
+// The columns of pair_grads [pairs, kPairGradStride]: sums over the pixels of a pair. With
+// g = dL/d(ln alpha) and w = alpha T, they are
+//   g, g dx, g dy, g dx^2, g dx dy, g dy^2, and w v_image for each colour (Eq. 18);
+// with absgrad also |dL/d(mean2d)| for x and y (Eq. 21), else zeros.
+enum PairGradField {
+  kGrad,
+  kGradDx,
+  kGradDy,
+  kGradDxDx,
+  kGradDxDy,
+  kGradDyDy,
+  kGradRed,
+  kGradGreen,
+  kGradBlue,
+  kAbsGradX,
+  kAbsGradY,
+  kPairGradFields
+};
+constexpr int kPairGradStride = 16;  // floats: one cache line
 
-// Work of one batch of one tile, kept from the forward pass for the backward pass.
-struct Batch {
-  std::uint8_t counts[kBlocks];                // how far each block went in its list
-  std::uint8_t lists[kBlocks][kBatch];         // places in the batch, front to back
-  alignas(64) float before[kBlocks][16];       // transmittance of each pixel before the batch
+// What the forward pass keeps of one batch of one tile for the backward pass.
+struct SavedBatch {
+  std::uint8_t counts[kBlocksPerTile];             // Gaussians that each block composited
+  std::uint8_t lists[kBlocksPerTile][kBatchSize];  // their positions in the batch, front to back
+  alignas(64) float transmittance[kBlocksPerTile][16];  // of each pixel, in front of the batch
 };
 
 }  // namespace xrgs

@@ -1,4 +1,4 @@
-// The face of resampling in Python.
+// The Python binding of the resampling of images.
 #pragma once
 
 #include <nanobind/nanobind.h>

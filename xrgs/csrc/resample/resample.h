@@ -1,4 +1,5 @@
-// An image by a banded matrix down its rows and another across its columns: resizing, either way.
+// Multiplies an image by a banded matrix along its rows and another along its columns, which is how
+// images are resized.
 #pragma once
 
 #include <cstddef>
@@ -7,23 +8,25 @@
 
 namespace xrgs {
 
-// One matrix [count, old]: output i is the sum over t of weights[i * taps + t] times input
-// first[i] + t.
-struct Bands {
-  const int* first;       // [count]
-  const float* weights;   // [count, taps]
+// A matrix [count, size] with `taps` adjacent non-zero weights in each row: output i is the sum
+// over t of weights[i * taps + t] times input first[i] + t.
+struct BandedMatrix {
+  const int* first;      // [count]
+  const float* weights;  // [count, taps]
   int count, taps;
 };
 
 struct ResampleKernels {
-  // Rows first..last-1 of out [rows.count, columns], from in [., columns].
-  void (*down)(const Bands& rows, const float* in, std::size_t columns, int first, int last,
+  // Resamples along the columns: writes rows first..last-1 of out [rows.count, columns], given
+  // in [., columns].
+  void (*down)(const BandedMatrix& rows, const float* in, std::size_t columns, int first, int last,
                float* out);
-  // At most 16 rows of out [., columns.count, 3] from as many of in [., width, 3].
-  void (*across)(const Bands& columns, const float* in, int width, int rows, float* out,
+  // Resamples along the rows: writes `rows` (at most 16) rows of out [., columns.count, 3], given
+  // as many of in [., width, 3].
+  void (*across)(const BandedMatrix& columns, const float* in, int width, int rows, float* out,
                  float* scratch);
-  // Floats of scratch that one call of `across` needs, on a 64-byte boundary.
-  std::size_t (*scratch)(int width);
+  // Returns the floats of scratch that one call of `across` needs, on a 64-byte boundary.
+  std::size_t (*scratch_size)(int width);
 };
 
 XRGS_DECLARE_TABLE(ResampleKernels, resample_kernels)

@@ -25,7 +25,7 @@ def accumulate_statistics(
         grad2d_sum: [N] float32 to which the gradients' norms are added in place.
         visible_count: [N] float32 to which 1 is added in place where visible.
     """
-    _native.observe(
+    _native.accumulate_grad2d(
         means2d_grad.contiguous(),
         visible,
         *half_size,

@@ -40,7 +40,7 @@ def photometric_loss(image: Tensor, target: Target, l1: float, ssim: float) -> T
 class _Photometric(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, image: Tensor, target: Target, l1: float, ssim: float) -> Tensor:
-        value, gradient = _native.photometric(
+        value, gradient = _native.photometric_loss(
             image.detach().contiguous(),
             target.image,
             target.mean,

@@ -51,7 +51,7 @@ def step(adam: torch.optim.Adam, camera: Camera | None = None, sh_degree: int = 
         tensors = (parameter, parameter.grad, state["exp_avg"], state["exp_avg_sq"])
         flat = [_require_plain(name, tensor).view(-1) for tensor in tensors]
         entries.append((*flat, group["lr"], state["step"].item()))
-    _native.adam(entries, beta1, beta2, adam.defaults["eps"], torch.get_num_threads())
+    _native.adam_step(entries, beta1, beta2, adam.defaults["eps"], torch.get_num_threads())
 
 
 def _step_harmonics(
@@ -62,7 +62,7 @@ def _step_harmonics(
     beta1, beta2 = adam.defaults["betas"]
     state = _adam_state(adam, shN)
     state["step"] += 1
-    _native.adam_harmonics(
+    _native.adam_step_sh_rest(
         _require_plain("shN", shN),
         _require_plain("shN", state["exp_avg"]),
         _require_plain("shN", state["exp_avg_sq"]),

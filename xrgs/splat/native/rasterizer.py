@@ -98,9 +98,9 @@ def render_culled(
 
 def _native_view(
     camera: Camera, settings: RasterSettings, sh_degree: int, culling: CullingOptions
-) -> _native.View:
+) -> _native.RenderConfig:
     K = camera.K
-    return _native.View.make(
+    return _native.RenderConfig(
         viewmat=camera.viewmat.flatten().tolist(),
         intrinsics=[K[0, 0].item(), K[1, 1].item(), K[0, 2].item(), K[1, 2].item()],
         width=camera.width,
@@ -114,7 +114,7 @@ def _native_view(
         absgrad=settings.absgrad,
         background=settings.background,
         sh_degree=sh_degree,
-        skips=astuple(culling),
+        culling=astuple(culling),
     )
 
 
@@ -127,7 +127,7 @@ class _Rasterize(torch.autograd.Function):
 
     @staticmethod
     def forward(
-        ctx: Any, frame: _native.Frame, view: _native.View, *inputs: Tensor | None
+        ctx: Any, frame: _native.Frame, view: _native.RenderConfig, *inputs: Tensor | None
     ) -> tuple[Tensor, Tensor]:
         contiguous = [_contiguous(tensor) for tensor in inputs]
         ctx.frame = frame

@@ -1,4 +1,4 @@
-// exp2 and log2 over whole arrays: what the tests of vector_math.h call.
+// exp2 and log2 of simd.h over whole arrays, so that tests can call them.
 #pragma once
 
 #include <cstdint>
@@ -7,11 +7,11 @@
 
 namespace xrgs {
 
-struct VectorMathKernels {
+struct ArrayMathKernels {
   void (*exp2)(const float* x, float* y, std::int64_t count);
   void (*log2)(const float* x, float* y, std::int64_t count);
 };
 
-XRGS_DECLARE_TABLE(VectorMathKernels, vector_math_kernels)
+XRGS_DECLARE_TABLE(ArrayMathKernels, array_math_kernels)
 
 }  // namespace xrgs

@@ -1,19 +1,18 @@
-#include "vector_math_kernels.h"
-
-#include "vector_math.h"
+#include "simd/array_math.h"
+#include "simd/simd.h"
 
 namespace xrgs {
 namespace XRGS_NS {
 namespace {
 
-void exp2_all(const float* x, float* y, std::int64_t count) {
+void exp2_array(const float* x, float* y, std::int64_t count) {
   for (std::int64_t i = 0; i < count; i += kLanes) {
     const int lanes = count - i < kLanes ? static_cast<int>(count - i) : kLanes;
     store_first(y + i, exp2(load_first(x + i, lanes)), lanes);
   }
 }
 
-void log2_all(const float* x, float* y, std::int64_t count) {
+void log2_array(const float* x, float* y, std::int64_t count) {
   for (std::int64_t i = 0; i < count; i += kLanes) {
     const int lanes = count - i < kLanes ? static_cast<int>(count - i) : kLanes;
     store_first(y + i, log2(load_first(x + i, lanes)), lanes);
@@ -22,7 +21,7 @@ void log2_all(const float* x, float* y, std::int64_t count) {
 
 }  // namespace
 
-extern const VectorMathKernels vector_math_kernels{exp2_all, log2_all};
+extern const ArrayMathKernels array_math_kernels{exp2_array, log2_array};
 
 }  // namespace XRGS_NS
 }  // namespace xrgs

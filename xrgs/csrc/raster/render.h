@@ -1,0 +1,20 @@
+// The forward and the backward pass of one view: all stages of the rasterizer in order.
+#pragma once
+
+#include "raster/frame.h"
+#include "raster/types.h"
+
+namespace xrgs {
+
+// Renders into image [H, W, 3] and alpha [H, W]. Returns false, with nothing rendered, where a
+// parameter is not finite or out of range. Throws std::bad_alloc.
+bool render(int threads, const GaussianParameters& parameters, const RenderConfig& config,
+            Frame& frame, float* image, float* alpha);
+
+// Writes the gradients of the parameters, given those of image and alpha. The parameters must be
+// the ones that were rendered into the frame. Throws std::bad_alloc.
+void render_backward(int threads, const GaussianParameters& parameters, Frame& frame,
+                     const float* v_image, const float* v_alpha,
+                     const ParameterGradients& gradients);
+
+}  // namespace xrgs

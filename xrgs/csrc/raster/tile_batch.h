@@ -1,0 +1,125 @@
+// One batch of a tile's Gaussians: at most kBatchSize of them, copied side by side, with the tile's
+// centre as the origin of x and y.
+#pragma once
+
+#include <cstddef>
+#include <cstdint>
+#include <cstring>
+
+#include "raster/frame.h"
+#include "simd/simd.h"
+
+namespace xrgs {
+namespace XRGS_NS {
+
+// The Gaussians of a batch, one row each, in the layout of ProjectedGaussian.
+using BatchRows = float[kBatchSize][16];
+enum BatchField { kX, kY, kCholXX, kCholXY, kCholYY, kLog2Opacity, kRed, kGreen, kBlue };
+
+struct Tile {
+  int column, row;
+  std::size_t index;
+  std::uint32_t begin, end;  // of its list in frame.entries
+
+  Tile(const Frame& frame, int tile)
+      : column(tile % frame.config.tile_columns()),
+        row(tile / frame.config.tile_columns()),
+        index(static_cast<std::size_t>(tile)),
+        begin(frame.tile_offsets[index]),
+        end(frame.tile_offsets[index + 1]) {}
+
+  float centre_x() const { return static_cast<float>(column * kTileSize) + 0.5f * kTileSize; }
+  float centre_y() const { return static_cast<float>(row * kTileSize) + 0.5f * kTileSize; }
+};
+
+// The positions of the sixteen pixel centres of a block, from the tile's centre.
+XRGS_INLINE Floats pixels_x(int block) {
+  alignas(64) float x[16];
+  for (int i = 0; i < 16; ++i) x[i] = static_cast<float>(4 * (block % 4) + i % 4) - 7.5f;
+  return load(x);
+}
+XRGS_INLINE Floats pixels_y(int block) {
+  alignas(64) float y[16];
+  for (int i = 0; i < 16; ++i) y[i] = static_cast<float>(4 * (block / 4) + i / 4) - 7.5f;
+  return load(y);
+}
+
+// Loads the projected Gaussians of `count` (1 to 16) entries and subtracts `centre`; rows past the
+// end repeat the last one.
+XRGS_INLINE void load_projected(const Frame& frame, const TileEntry* entries, int count,
+                                Floats centre, Floats (&out)[16]) {
+  for (int i = 0; i < 16; ++i) {
+    const std::uint32_t gaussian = entries[i < count ? i : count - 1].gaussian;
+    out[i] = load(&frame.projected[gaussian].mean2d_x) - centre;
+  }
+}
+
+// Prefetches the projected Gaussians of the batch that begins at entry `first`.
+XRGS_INLINE void prefetch_batch(const Frame& frame, std::size_t first) {
+  const std::size_t pairs = frame.entries.size();
+  for (std::size_t i = first; i < pairs && i < first + kBatchSize; ++i)
+    prefetch(&frame.projected[frame.entries[i].gaussian]);
+}
+
+// The tile's centre in the fields of the mean, zero in all others.
+XRGS_INLINE Floats centre_of(const Tile& tile) {
+  const float centre[16] = {tile.centre_x(), tile.centre_y()};
+  return load(centre);
+}
+
+// The thresholds of compositing, in all lanes.
+struct AlphaThresholds {
+  Floats log2_alpha_min;
+  Floats alpha_max, transmittance_min;
+
+  explicit AlphaThresholds(const RenderConfig& config)
+      : log2_alpha_min(broadcast(config.log2_alpha_min)),
+        alpha_max(broadcast(config.alpha_max)),
+        transmittance_min(broadcast(config.transmittance_min)) {}
+};
+
+// The alpha of a Gaussian g of the batch at sixteen pixels (Eq. 8): capped at alpha_max, and zero
+// below alpha_min.
+XRGS_INLINE Floats alpha_at(const float* g, Floats x, Floats y, const AlphaThresholds& thresholds) {
+  const Floats dx = x - broadcast(g[kX]), dy = y - broadcast(g[kY]);
+  const Floats u = fnma(broadcast(g[kCholXY]), dy, broadcast(g[kCholXX]) * dx);
+  const Floats v = broadcast(g[kCholYY]) * dy;
+  const Floats log2_alpha = fnma(u, u, fnma(v, v, broadcast(g[kLog2Opacity])));
+  return select_or_zero(thresholds.log2_alpha_min <= log2_alpha,
+                        min_positive(exp2(log2_alpha), thresholds.alpha_max));
+}
+
+// The part of an image that a 4x4 block covers: the index of its first pixel in row-major order,
+// and the width and height (at most 4) that lie inside the image.
+struct BlockRegion {
+  std::int64_t first_pixel;
+  int width, height;
+
+  BlockRegion(const Tile& tile, const RenderConfig& config, int block) {
+    const int x = tile.column * kTileSize + 4 * (block % 4);
+    const int y = tile.row * kTileSize + 4 * (block / 4);
+    first_pixel = std::int64_t{y} * config.width + x;
+    width = config.width - x < 4 ? config.width - x : 4;
+    height = config.height - y < 4 ? config.height - y : 4;
+  }
+  bool overlaps_image() const { return width > 0 && height > 0; }
+  bool whole() const { return width == 4 && height == 4; }
+};
+
+// Copies a block with `Channels` floats a pixel between two arrays whose rows are from_stride and
+// to_stride floats apart. Only the part inside the image is copied.
+template <int Channels>
+XRGS_INLINE void copy_block(const float* from, std::int64_t from_stride, float* to,
+                            std::int64_t to_stride, const BlockRegion& region) {
+  if (region.whole()) {
+    for (int row = 0; row < 4; ++row)
+      std::memcpy(to + row * to_stride, from + row * from_stride, 4 * Channels * sizeof(float));
+    return;
+  }
+  for (int row = 0; row < region.height; ++row)
+    for (int i = 0; i < Channels * region.width; ++i)
+      to[row * to_stride + i] = from[row * from_stride + i];
+}
+
+}  // namespace XRGS_NS
+}  // namespace xrgs

@@ -1,0 +1,134 @@
+// Vectors of sixteen float lanes: the only vector type of the kernels.
+//
+// A kernel is written once, in terms of the operations below, and compiled once for each
+// instruction set. Each instruction set is one file, which defines the operations that are listed
+// here; a new one is such a file, a line in the #if at the end of this list, and its compiler flags
+// in CMakeLists.txt.
+//
+// The file of an instruction set must define
+//
+//   struct Floats, Ints, Mask           sixteen float32, sixteen int32, sixteen booleans
+//   int kVectorRegisters                number of Floats that the registers hold
+//
+//   Floats broadcast(float)             the same number in every lane
+//   Ints broadcast_int(int32)
+//   Floats load(const float*)           sixteen floats, of any alignment
+//   void store(float*, Floats)
+//   void store(int32*, Ints)
+//   Floats load_first(p, count)         the first `count` (0 to 16) lanes; the others are zero and
+//                                       their memory is not read
+//   void store_first(p, a, count)       the first `count` lanes; other memory is left alone
+//   void stream(float*, Floats)         stores past the cache, for memory that is not read soon,
+//                                       to an address that is a multiple of 64 bytes
+//   void stream_fence()                 makes the stores of stream() visible to other threads
+//
+//   + - * /, sqrt, abs, floor, ceil     lane by lane, as IEEE 754 rounds
+//   Floats fma(a, b, c)                 a b + c, rounded once where there is an instruction for it
+//   Floats fnma(a, b, c)                c - a b, likewise
+//   Floats min(a, b), max(a, b)         b where a or b is NaN
+//   Floats min_positive(a, b)           min of positive numbers; of others unspecified
+//   Floats sqrt_upper_bound(a)          for a >= 0: at least sqrt(max(a, 1e-20)), at most 0.1% more
+//   Floats exp2(a)                      2^a with a relative error below 2.4e-7 for
+//                                       -126 <= a <= 127; for others unspecified
+//   <, <=, ==                           comparisons that are false for NaN
+//   Mask & Mask
+//   uint32 to_bits(Mask)                lane i as bit i
+//   Mask mask_from_bits(uint32)
+//   Floats select(m, a, b)              a where the mask is set, else b
+//   Floats select_or_zero(m, a)         a where the mask is set, else 0, even where a is not finite
+//
+//   Ints + Ints, Ints - Ints            modulo 2^32
+//   Ints shift_left<Count>(Ints)
+//   Ints shift_right<Count>(Ints)       arithmetic: copies of the sign bit move in
+//   as_ints(Floats), as_floats(Ints)    the same bits as the other type
+//   to_floats(Ints)                     the nearest float
+//   to_ints(Floats)                     rounded towards zero
+//
+//   float sum_lanes(a)                  upper half plus lower half, and so on down to one lane
+//   void interleave(a, b, low, high)    low = a0 b0 a1 b1 ... a7 b7, high = a8 b8 ... a15 b15
+//   void deinterleave(low, high, a, b)  the inverse
+//   void transpose(Floats (&rows)[16])  row i, lane j becomes row j, lane i
+//   void load_triples(p, x, y, z)       sixteen (x, y, z) that are adjacent in memory
+//   void store_triples(p, x, y, z)
+//
+// and, with the lanes read as a 4x4 matrix, row by row,
+//
+//   Floats broadcast_column<C>(a)       in each row its own value of column C, four times
+//   Floats broadcast_row<R>(a)          row R, in all four rows
+//   Floats sum_rows(a)                  (row 0 + row 2) + (row 1 + row 3), in all four rows
+//   Floats add_last_row(a, b)           a + b in row 3, a in the others
+//
+// Every instruction set adds in the same order. Results differ between them where one has no fused
+// multiply-add, where the compiler fuses a product and a sum, and in exp2.
+//
+// Kernel files must not call inline functions of the standard library unless they are certain to be
+// inlined: the linker keeps one copy of such a function for the whole module, which may be the one
+// that was compiled for a processor other than the one at hand.
+#pragma once
+
+namespace xrgs {
+namespace XRGS_NS {
+
+constexpr int kLanes = 16;
+
+#define XRGS_INLINE inline __attribute__((always_inline))
+
+}  // namespace XRGS_NS
+}  // namespace xrgs
+
+#if defined(__AVX512F__)
+#include "simd/avx512.h"
+#elif defined(__AVX2__)
+#include "simd/avx2.h"
+#else
+#include "simd/portable.h"
+#endif
+
+// What follows is made of the operations above, the same for every instruction set.
+namespace xrgs {
+namespace XRGS_NS {
+
+XRGS_INLINE Floats operator-(Floats a) { return broadcast(0.0f) - a; }
+XRGS_INLINE Floats& operator+=(Floats& a, Floats b) { return a = a + b; }
+XRGS_INLINE Floats clamp(Floats a, Floats low, Floats high) { return min(max(a, low), high); }
+XRGS_INLINE bool any(Mask m) { return to_bits(m) != 0; }
+
+// Sixteen (w, x, y, z) that are adjacent in memory.
+XRGS_INLINE void load_quadruples(const float* p, Floats& w, Floats& x, Floats& y, Floats& z) {
+  Floats wy[2], xz[2];
+  deinterleave(load(p), load(p + 16), wy[0], xz[0]);
+  deinterleave(load(p + 32), load(p + 48), wy[1], xz[1]);
+  deinterleave(wy[0], wy[1], w, y);
+  deinterleave(xz[0], xz[1], x, z);
+}
+XRGS_INLINE void store_quadruples(float* p, Floats w, Floats x, Floats y, Floats z) {
+  Floats wy[2], xz[2], out[4];
+  interleave(w, y, wy[0], wy[1]);
+  interleave(x, z, xz[0], xz[1]);
+  interleave(wy[0], xz[0], out[0], out[1]);
+  interleave(wy[1], xz[1], out[2], out[3]);
+  for (int i = 0; i < 4; ++i) store(p + 16 * i, out[i]);
+}
+
+// The base-2 logarithm of finite x >= 2^-126, with a relative error below 2.1e-7.
+//
+// log2(x) = n + log2(m), with m in [sqrt(1/2), sqrt(2)). With s = (m - 1) / (m + 1), |s| < 0.172,
+// the series log2(m) = 2/ln 2 (s + s^3/3 + s^5/5 + ...) is cut after s^9, at a relative error of
+// 4e-9; the rest of the error is rounding.
+XRGS_INLINE Floats log2(Floats x) {
+  // n is the exponent of x / sqrt(1/2), so that m lies on both sides of 1.
+  const Ints n = shift_right<23>(as_ints(x) - broadcast_int(0x3f3504f3));
+  const Floats m = as_floats(as_ints(x) - shift_left<23>(n));
+  const Floats s = (m - broadcast(1.0f)) / (m + broadcast(1.0f));
+  const Floats s2 = s * s;
+  Floats p = fma(s2, broadcast(0.3205989f), broadcast(0.4121986f));
+  p = fma(s2, p, broadcast(0.5770780f));
+  p = fma(s2, p, broadcast(0.9617967f));
+  p = fma(s2, p, broadcast(2.8853900818f));
+  return fma(s, p, to_floats(n));
+}
+
+XRGS_INLINE void prefetch(const void* p) { __builtin_prefetch(p, 0, 3); }
+
+}  // namespace XRGS_NS
+}  // namespace xrgs

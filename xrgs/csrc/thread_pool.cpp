@@ -1,0 +1,135 @@
+// The pool runs one job at a time, whose tasks an atomic counter hands out.
+//
+// A render is a dozen jobs of a fraction of a millisecond each, and waking a sleeping thread takes
+// a tenth of a millisecond: a thread that waits spins for a moment before it sleeps.
+//
+// The pool is never destroyed: threads that sleep at exit end with the process. A forked child has
+// none of its parent's threads and starts a new pool.
+#include "thread_pool.h"
+
+#include <pthread.h>
+
+#include <atomic>
+#include <chrono>
+#include <condition_variable>
+#include <mutex>
+#include <system_error>
+#include <thread>
+
+namespace xrgs {
+namespace {
+
+class ThreadPool {
+ public:
+  void run_job(int threads, std::int64_t count, Task task, void* context) {
+    if (busy_.test_and_set(std::memory_order_acquire)) {
+      for (std::int64_t i = 0; i < count; ++i) task(context, i);
+      return;
+    }
+    start_workers(threads - 1);
+    {
+      std::lock_guard<std::mutex> lock(mutex_);
+      task_ = task;
+      context_ = context;
+      count_ = count;
+      next_.store(0, std::memory_order_relaxed);
+      workers_to_join_ = threads - 1;
+      ++generation_;
+    }
+    wake_.notify_all();
+    run_remaining_tasks();
+    {
+      std::lock_guard<std::mutex> lock(mutex_);
+      workers_to_join_ = 0;  // a worker that wakes now has nothing to do
+    }
+    spin_wait([this] { return active_workers_ == 0; });
+    std::unique_lock<std::mutex> lock(mutex_);
+    done_.wait(lock, [this] { return active_workers_ == 0; });
+    busy_.clear(std::memory_order_release);
+  }
+
+ private:
+  // Starts threads until there are `count`. Only the caller that set busy_ may call this.
+  void start_workers(int count) {
+    try {
+      for (; started_ < count; ++started_) std::thread([this] { worker_loop(); }).detach();
+    } catch (const std::system_error&) {
+      // With fewer threads than requested the job takes longer, but it is done.
+    }
+  }
+
+  // Spins until `ready`, but no longer than some 50 us, which other work on a busy machine does not
+  // notice.
+  template <class Ready>
+  static void spin_wait(Ready ready) {
+    const auto end = std::chrono::steady_clock::now() + std::chrono::microseconds(50);
+    while (!ready() && std::chrono::steady_clock::now() < end)
+      for (int i = 0; i < 16; ++i) pause();
+  }
+
+  static void pause() {
+#ifdef XRGS_X86
+    __builtin_ia32_pause();
+#endif
+  }
+
+  void run_remaining_tasks() {
+    for (;;) {
+      const std::int64_t index = next_.fetch_add(1, std::memory_order_relaxed);
+      if (index >= count_) return;
+      task_(context_, index);
+    }
+  }
+
+  void worker_loop() {
+    std::uint64_t last_generation = 0;
+    std::unique_lock<std::mutex> lock(mutex_);
+    for (;;) {
+      wake_.wait(lock, [&] { return generation_ != last_generation && workers_to_join_ > 0; });
+      last_generation = generation_;
+      --workers_to_join_;
+      ++active_workers_;
+      lock.unlock();
+      run_remaining_tasks();
+      lock.lock();
+      if (--active_workers_ == 0) done_.notify_one();
+      lock.unlock();
+      spin_wait([&] { return generation_ != last_generation; });
+      lock.lock();
+    }
+  }
+
+  std::atomic_flag busy_ = ATOMIC_FLAG_INIT;  // set while a job runs
+  std::mutex mutex_;  // guards the members below; the atomic ones may be read without it
+  std::condition_variable wake_, done_;
+  Task task_ = nullptr;
+  void* context_ = nullptr;
+  std::int64_t count_ = 0;
+  std::atomic<std::int64_t> next_{0};
+  std::atomic<std::uint64_t> generation_{0};  // the number of the job
+  int workers_to_join_ = 0;                   // workers that may still join the job
+  std::atomic<int> active_workers_{0};        // workers that have joined it and not finished
+  int started_ = 0;
+};
+
+ThreadPool* pool = nullptr;
+std::once_flag at_fork;
+
+// A forked child has one thread only, so nothing races with this.
+void replace_pool_in_child() { pool = new ThreadPool; }
+
+}  // namespace
+
+void run_tasks(int threads, std::int64_t count, Task task, void* context) {
+  if (threads <= 1 || count <= 1) {
+    for (std::int64_t i = 0; i < count; ++i) task(context, i);
+    return;
+  }
+  std::call_once(at_fork, [] {
+    pool = new ThreadPool;
+    pthread_atfork(nullptr, nullptr, replace_pool_in_child);
+  });
+  pool->run_job(threads, count, task, context);
+}
+
+}  // namespace xrgs
