@@ -147,7 +147,7 @@ def test_links_and_pipes_are_not_read(store: Store) -> None:
     (cell.path / "status.json").unlink()
     os.mkfifo(cell.path / "status.json")
     assert "not a regular file" in cell.state().reason
-    (store.cells / "link").symlink_to(other.path)
+    (store.cells_folder / "link").symlink_to(other.path)
     assert store.cell("link").state().name == "corrupt"
     assert "2 corrupt" in describe(read(store.path))
 

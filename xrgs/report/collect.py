@@ -118,7 +118,7 @@ def _scores(cell: CellFolder, metrics: Sequence[Metric]) -> list[dict[str, Any]]
     names = {metric.name for metric in metrics}
     return [
         {"cell_id": cell.id, "view": view} | {k: v for k, v in row.items() if k in names}
-        for view, row in cell.scores()
+        for view, row in cell.view_scores()
     ]
 
 
