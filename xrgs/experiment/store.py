@@ -361,6 +361,9 @@ class Store:
     path: Path
     """The folder."""
 
+    def __init__(self, path: str | Path) -> None:
+        object.__setattr__(self, "path", Path(path))
+
     @property
     def scenes(self) -> Path:
         """Folder of the rendered photographs of procedural scenes."""
@@ -433,7 +436,7 @@ class Store:
         Returns:
             One row a cell, sorted by scene, label, condition, seed and id, with the columns
             `cell_id`; `scene`, `label` and `condition` as the latest sweep with the cell named it
-            (None where no sweep has it); `seed`; `variant` (its id); `state` and `reason` as of
+            (missing where no sweep has it); `seed`; `variant` (its id); `state` and `reason` as of
             `CellFolder.state`; each metric of `xrgs.evaluation.metrics.METRICS`, of the whole cell
             or its mean over test views (NaN where there is none); and each value of its config by
             its key, as `train.steps`.
