@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING
 
 import torch
 
-from xrgs.splat.rasterize import Render
 from xrgs.splat.rasterize import rasterize as rasterize_parameters
+from xrgs.splat.render_result import Render
 from xrgs.splat.settings import RasterSettings
 
 if TYPE_CHECKING:
