@@ -18,7 +18,6 @@ from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from typing import Any
 
-import hydra
 import numpy as np
 import pytest
 import torch
@@ -82,13 +81,7 @@ def random_weights() -> weights.Weights:
 @pytest.fixture(scope="session")
 def compose() -> Callable[..., config.Conf]:
     """(*overrides) -> the config that `conf/` gives with them."""
-
-    def composed(*overrides: str) -> config.Conf:
-        config.register()
-        with hydra.initialize_config_dir(str(config.CONF_DIR), version_base="1.3"):
-            return config.to_conf(hydra.compose("config", list(overrides)))
-
-    return composed
+    return config.compose
 
 
 @pytest.fixture

@@ -11,6 +11,7 @@ from dataclasses import dataclass, field, is_dataclass
 from pathlib import Path
 from typing import Any
 
+import hydra
 from hydra.core.config_store import ConfigStore
 from omegaconf import MISSING, DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
@@ -337,6 +338,27 @@ def to_conf(cfg: DictConfig) -> Conf:
     if conf.retry not in _RETRY:
         raise XrgsError(f"retry={conf.retry}: must be one of {', '.join(_RETRY)}")
     return conf
+
+
+def compose(*overrides: str) -> Conf:
+    """Return the config that a command line of `xrgs-sweep` would give to a cell.
+
+    Args:
+        overrides: Hydra overrides without axes, as `preset=smoke`, `+ablation=consistency` or
+            `train.steps=100`; none gives the baseline of `conf/config.yaml`.
+
+    Raises:
+        HydraException: An override is malformed, or there is no such key or file.
+        OmegaConfBaseException: A value is missing or of another type; the message names its key.
+        XrgsError: A value is out of its range; the message names its key.
+
+    Example:
+        >>> compose("preset=smoke", "train.steps=100").train.steps
+        100
+    """
+    register()
+    with hydra.initialize_config_dir(str(CONF_DIR), version_base="1.3"):
+        return to_conf(hydra.compose("config", list(overrides)))
 
 
 def _as_object(cfg: DictConfig, name: str) -> Any:

@@ -1,4 +1,4 @@
-"""Stores made by writing files: no cell is trained."""
+"""Stores made by writing files; no cell is trained."""
 
 import json
 from pathlib import Path

@@ -43,7 +43,7 @@ def compared(made: Any) -> Comparison:
 
 
 def mean_of(comparison: Comparison, metric: str, label: str = "consistency") -> Any:
-    return comparison.means.loc[(label, "", metric)]
+    return comparison.means.xs((label, "", metric))
 
 
 def test_the_papers_table_1(made: Any) -> None:
@@ -146,6 +146,20 @@ def test_a_metric_that_one_view_lacks_is_not_averaged(made: Any) -> None:
     row = mean_of(compared(made), "lpips")
     assert math.isnan(row["change"])
     assert row["why"] == NOT_MEASURED
+
+
+def test_a_pair_that_is_left_out_does_not_narrow_the_interval(made: Any) -> None:
+    """Three scenes, one of which has no percentage: the interval is of two values."""
+    for scene, baseline, factor in (("fern", 100, 1.1), ("room", 200, 1.5), ("trex", 0, 1.0)):
+        made.add(scene=scene, values={"gaussians": baseline})
+        made.add("consistency", scene=scene, values={"gaussians": baseline * factor + 1})
+    row = mean_of(compared(made), "gaussians")
+    changes = (100 * 0.1 + 100 / 100, 100 * 0.5 + 100 / 200)
+    interval = stats.t.interval(0.95, 1, loc=np.mean(changes), scale=stats.sem(changes))
+    assert row["n"] == 2
+    assert row["change"] == pytest.approx(np.mean(changes))
+    assert (row["low"], row["high"]) == pytest.approx(interval, rel=1e-9)
+    assert row["why"] == ZERO_BASELINE
 
 
 def test_variants_are_not_mixed(made: Any) -> None:

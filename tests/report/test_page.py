@@ -11,10 +11,10 @@ from typing import Any
 import pytest
 
 import xrgs
-from xrgs.experiment.store import StoreError
 from xrgs.report import build
 from xrgs.report.collect import ReportError
 from xrgs.report.figures import trade_off
+from xrgs.safeio.records import StoreError
 
 
 @pytest.fixture
@@ -110,7 +110,9 @@ def test_the_pictures_that_are_named_are_drawn_and_no_other(study: Any, names: A
 
 def test_a_picture_that_is_not_there_is_named_beside_those_that_are(study: Any) -> None:
     study.write()
-    with pytest.raises(ReportError, match=r"pictures=fern: .*there are: fern--consistency, fern--"):
+    with pytest.raises(
+        ReportError, match=r"pictures=fern: .*choose from: fern--consistency, fern--"
+    ):
         build(study.store.path, pictures=["fern--consistency", "fern"])
 
 

@@ -7,17 +7,17 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from xrgs.report.render import (
-    Grid,
+    TextTable,
     latex,
     markdown,
-    one_line,
     to_latex,
     to_markdown,
     to_text,
     width,
 )
+from xrgs.safeio.untrusted import one_line
 
-GRID = Grid(
+TABLE = TextTable(
     title="a_b & c",
     columns=("Metric", "50% | x"),
     rows=(("PSNR", "-0.80 ↓"), ("[odd]", "n/a")),
@@ -27,13 +27,13 @@ GRID = Grid(
 
 
 def test_text_is_aligned() -> None:
-    assert to_text(GRID) == (
+    assert to_text(TABLE) == (
         "a_b & c\n\nMetric  50% | x\n──────  ───────\nPSNR    -0.80 ↓\n[odd]       n/a\n100 $\n"
     )
 
 
 def test_markdown_is_escaped_and_aligned() -> None:
-    assert to_markdown(GRID) == (
+    assert to_markdown(TABLE) == (
         "### a\\_b \\& c\n"
         "\n"
         "| Metric  | 50% \\| x |\n"
@@ -46,7 +46,7 @@ def test_markdown_is_escaped_and_aligned() -> None:
 
 
 def test_latex_is_escaped() -> None:
-    text = to_latex(GRID)
+    text = to_latex(TABLE)
     assert r"\caption{a\_b \& c}" in text
     assert r"Metric & 50\% \textbar{} x \\" in text
     assert r"PSNR & $-$0.80 $\downarrow$ \\" in text
@@ -70,19 +70,19 @@ def test_latex_characters(text: str, escaped: str) -> None:
 
 
 def test_wide_characters_keep_the_columns() -> None:
-    grid = Grid("t", ("a", "b"), (("部屋", "1"), ("cafe\u0301", "2"), ("plain", "3")), "lr")
-    lines = to_text(grid).splitlines()[2:]
+    table = TextTable("t", ("a", "b"), (("部屋", "1"), ("cafe\u0301", "2"), ("plain", "3")), "lr")
+    lines = to_text(table).splitlines()[2:]
     assert len({width(line) for line in lines}) == 1
 
 
 @given(st.text(max_size=30))
 def test_a_name_stays_in_its_cell(name: str) -> None:
-    grid = Grid("t", ("a", "b"), ((name, "1"),), "ll")
-    lines = to_markdown(grid).split("\n")
+    table = TextTable("t", ("a", "b"), ((name, "1"),), "ll")
+    lines = to_markdown(table).split("\n")
     assert len(lines) == 6
     assert len(re.findall(r"(?<!\\)(?:\\\\)*\|", lines[4])) == 3
-    assert len(to_text(grid).split("\n")) == 6
-    row = next(line for line in to_latex(grid).split("\n") if line.endswith(r"1 \\"))
+    assert len(to_text(table).split("\n")) == 6
+    row = next(line for line in to_latex(table).split("\n") if line.endswith(r"1 \\"))
     assert len(re.findall(r"(?<!\\)&", row)) == 1
 
 

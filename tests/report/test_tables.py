@@ -96,13 +96,13 @@ def test_less_gaussians_outside_noise_are_better() -> None:
 def test_psnr_has_decibels_beside_its_percentage(made: Any) -> None:
     made.add()
     made.add("consistency", factors={"psnr": 0.99})
-    grid = tables(made).mean("consistency", "")
-    rows = {row[0]: row for row in grid.rows}
+    table = tables(made).mean("consistency", "")
+    rows = {row[0]: row for row in table.rows}
     assert rows["PSNR"] == (
         "PSNR", "20.00 dB", "19.80 dB", "-1.00 ↓", "-0.20", "", "one seed: no interval",
     )  # fmt: skip
     assert rows["SSIM"][4] == ""
-    assert grid.title == "consistency against baseline: scene fern, seed 0"
+    assert table.title == "consistency against baseline: scene fern, seed 0"
 
 
 def test_failed_scenes_are_shown_as_failed(made: Any) -> None:
@@ -113,9 +113,9 @@ def test_failed_scenes_are_shown_as_failed(made: Any) -> None:
     made.add(scene="room")
     made.add("consistency", scene="room", state="failed")
     built = tables(made)
-    grid = built.per_scene("consistency", "")
-    assert grid.columns == ("Metric", "fern", "leaves", "room", "mean")
-    rows = {row[0]: [text.strip() for text in row[1:]] for row in grid.rows}
+    table = built.per_scene("consistency", "")
+    assert table.columns == ("Metric", "fern", "leaves", "room", "mean")
+    rows = {row[0]: [text.strip() for text in row[1:]] for row in table.rows}
     assert rows["Gaussians, %"] == ["-50.00 ↑", "failed", "failed", "-50.00 ↑"]
     assert rows["PSNR, dB"] == ["0.00", "failed", "failed", "0.00"]
     assert "1 of 3 scenes" in built.mean("consistency", "").title
@@ -132,13 +132,38 @@ def test_nothing_missing_is_no_table(made: Any) -> None:
     assert tables(made).missing() is None
 
 
+@pytest.mark.parametrize(("seeds", "mixed"), [((1, 1), True), ((1, 2), False), ((2, 2), False)])
+def test_the_note_on_one_seed_is_for_scenes_that_all_have_one(
+    made: Any, seeds: tuple[int, int], mixed: bool
+) -> None:
+    for scene, count in zip(("fern", "room"), seeds, strict=True):
+        for seed in range(count):
+            made.add(scene=scene, seed=seed)
+            factor = 1.1 + 0.1 * seed + 0.05 * (scene == "room")
+            made.add("consistency", scene=scene, seed=seed, factors={"gaussians": factor})
+    (note,) = (n for n in tables(made).mean("consistency", "").notes if n.startswith("interval"))
+    assert note.startswith("interval: Student's t over the scenes' means")
+    assert note.endswith("; with one seed, differences of runs and of scenes are mixed") == mixed
+
+
+@pytest.mark.parametrize(
+    ("count", "text"), [(1, "seed 0"), (8, "seeds 0, 1, 2, 3, 4, 5, 6, 7"), (9, "9 seeds")]
+)
+def test_a_title_lists_up_to_eight_seeds(made: Any, count: int, text: str) -> None:
+    for seed in range(count):
+        made.add(seed=seed)
+        made.add("consistency", seed=seed)
+    title = tables(made).mean("consistency", "").title
+    assert title == f"consistency against baseline: scene fern, {text}"
+
+
 def test_several_ablations_stand_beside_each_other(made: Any) -> None:
     made.add()
     made.add("consistency", factors={"gaussians": 0.5})
     made.add("loss_weighting", state="failed")
-    (grid,) = tables(made).overviews()
-    assert grid.columns == ("Metric", "consistency", "loss_weighting")
-    assert ("Gaussians", "-50.00 ↑", "failed  ") in grid.rows
+    (table,) = tables(made).overviews()
+    assert table.columns == ("Metric", "consistency", "loss_weighting")
+    assert ("Gaussians", "-50.00 ↑", "failed  ") in table.rows
 
 
 def test_one_ablation_needs_no_overview(made: Any) -> None:
@@ -151,9 +176,9 @@ def test_values_side_by_side(made: Any) -> None:
     for seed, size in enumerate((1.0, 3.0)):
         made.add(seed=seed, factors={"gaussians": size})
         made.add("consistency", seed=seed, factors={"gaussians": size / 2})
-    grid = tables(made).values("")
-    assert grid.columns == ("Scene", "Metric", "baseline", "consistency")
-    assert ("fern", "Gaussians", "10,000", "5,000") in grid.rows
+    table = tables(made).values("")
+    assert table.columns == ("Scene", "Metric", "baseline", "consistency")
+    assert ("fern", "Gaussians", "10,000", "5,000") in table.rows
 
 
 def test_pairs_left_out_of_a_mean_are_named(made: Any) -> None:
@@ -161,9 +186,9 @@ def test_pairs_left_out_of_a_mean_are_named(made: Any) -> None:
     made.add("consistency")
     made.add(scene="room")
     made.add("consistency", scene="room", factors={"gaussians": 2.0})
-    grid = tables(made).mean("consistency", "")
-    assert "Gaussians: pairs left out (the baseline is zero)" in grid.notes
-    assert next(row for row in grid.rows if row[0] == "Gaussians")[3] == "+100.00 ↓"
+    table = tables(made).mean("consistency", "")
+    assert "Gaussians: pairs left out (the baseline is zero)" in table.notes
+    assert next(row for row in table.rows if row[0] == "Gaussians")[3] == "+100.00 ↓"
 
 
 def test_the_long_table_has_every_number_at_full_precision(made: Any) -> None:

@@ -90,15 +90,15 @@ def test_a_variant_is_built_described_and_drawn(xrgs_data: Run, tmp_path: Path) 
 
 def test_the_table_has_a_row_a_view_and_leaves_originals_out(mixed: Variant) -> None:
     report = mixed.report | {"not_registered": ["lost", "gone"]}
-    grid = inspect.views_table(replace(mixed, report=report))
-    assert grid.rows == (
+    table = inspect.views_table(replace(mixed, report=report))
+    assert table.rows == (
         ("a", "train", "HR", "400 x 300", "1.000", "yes"),
         ("b-low", "train", "LR", "80 x 60", "0.200", "yes"),
         ("c-held-out", "test", "HR", "400 x 300", "0.900", "yes"),
         ("gone", "test", "HR", "", "", "no"),
         ("lost", "train", "LR", "", "", "no"),
     )
-    text = to_text(grid)
+    text = to_text(table)
     assert "1 HR and 1 LR to train on, 1 held out" in text
     assert "originals of degraded views kept beside them: 1" in text
 

@@ -58,7 +58,7 @@ def cells(compose: Callable[..., Conf], tmp_path: Path) -> Cells:
 def test_states_are_read_from_the_cells_files_alone(cells: Cells) -> None:
     cells.begin("failed")
     cells.store.cell("failed").fail("it raised")
-    monitor = SweepMonitor(cells.store.cells)
+    monitor = SweepMonitor(cells.store.cells_folder)
     names = ("a", "b", "c")
     plan = [cells.plan(name) for name in names] + [
         cells.plan("failed", "failed"),
@@ -86,7 +86,7 @@ def test_states_are_read_from_the_cells_files_alone(cells: Cells) -> None:
 
 
 def test_another_sweeps_cell_is_waited_for(cells: Cells) -> None:
-    monitor = SweepMonitor(cells.store.cells)
+    monitor = SweepMonitor(cells.store.cells_folder)
     monitor.watch([cells.plan("a"), cells.plan("b", "running")])
     cells.begin("b")
     cells.step("b", 90, 0.1)
@@ -104,7 +104,7 @@ def test_a_cell_that_is_trained_again_has_not_ended_before_it_does(cells: Cells)
         cells.store.cell(name).fail("once")
     conf = replace(cells.conf, retry="failed")
     plan = [replace(cells.plan(name, name), conf=conf) for name in ("failed", "corrupt")]
-    monitor = SweepMonitor(cells.store.cells)
+    monitor = SweepMonitor(cells.store.cells_folder)
     monitor.watch(plan)
     assert str(monitor.snapshot()) == "0 of 2 cells done"
     cells.begin("failed")
@@ -122,7 +122,7 @@ def test_files_that_a_killed_process_left_are_no_sign_of_life(
     for name in ("before", "now"):
         cells.begin(name)
     cells.step("before", 5, 1.0)
-    monitor = SweepMonitor(cells.store.cells)
+    monitor = SweepMonitor(cells.store.cells_folder)
     monitor.watch([cells.plan("before", "unfinished"), cells.plan("now")])
     assert not monitor.snapshot().running
     cells.step("now", 5, 1.0)
@@ -150,7 +150,7 @@ def test_a_log_has_a_line_when_a_cell_ends_and_the_last_at_the_end(
     cells: Cells, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setattr(monitor_module, "_POLL_S", 0.01)
-    with SweepMonitor(cells.store.cells) as monitor:
+    with SweepMonitor(cells.store.cells_folder) as monitor:
         monitor.watch([cells.plan("a"), cells.plan("b"), cells.plan("old", "done")])
         for name in ("a", "b"):
             cells.begin(name)
@@ -170,9 +170,9 @@ def test_a_log_has_a_line_when_a_cell_ends_and_the_last_at_the_end(
 def test_nothing_is_shown_of_a_finished_plan(
     cells: Cells, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    with SweepMonitor(cells.store.cells) as monitor:
+    with SweepMonitor(cells.store.cells_folder) as monitor:
         monitor.watch([cells.plan("a", "done"), cells.plan("b", "failed")])
-    with SweepMonitor(cells.store.cells):
+    with SweepMonitor(cells.store.cells_folder):
         pass
     assert capsys.readouterr().err == ""
 
@@ -187,7 +187,7 @@ def test_a_terminal_shows_one_line_which_is_removed_at_the_end(
     terminal = Terminal()
     monkeypatch.setattr("sys.stderr", terminal)
     monkeypatch.setattr(monitor_module, "_POLL_S", 0.01)
-    with SweepMonitor(cells.store.cells) as monitor:
+    with SweepMonitor(cells.store.cells_folder) as monitor:
         monitor.watch([cells.plan("a"), cells.plan("b")])
         cells.begin("a")
         cells.step("a", 50, 1.0)
@@ -202,7 +202,7 @@ def test_a_terminal_shows_one_line_which_is_removed_at_the_end(
 
 
 def test_a_store_out_of_reach_is_read_again(cells: Cells) -> None:
-    monitor = SweepMonitor(cells.store.cells)
+    monitor = SweepMonitor(cells.store.cells_folder)
     monitor.watch([cells.plan("a")])
     gone = cells.store.path.with_name("gone")
     cells.store.path.rename(gone)

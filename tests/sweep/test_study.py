@@ -90,7 +90,7 @@ def test_a_sweep_that_starts_nothing_more_says_why(
         for name in "abc"
     ]
     plan = [replace(cell, cell_id=digest(cell.identity)) for cell in plan]
-    with SweepMonitor(store.cells) as monitor:
+    with SweepMonitor(store.cells_folder) as monitor:
         final = study(*given)._run_until_complete(plan, store, monitor)
     assert [cell.state.name for cell in final] == ["absent"] * 3
     assert launcher.launched == 3

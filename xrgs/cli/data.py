@@ -6,7 +6,6 @@ import sys
 from pathlib import Path
 from typing import cast
 
-import hydra
 from omegaconf import OmegaConf
 
 from xrgs import config
@@ -78,10 +77,8 @@ def _inspect(words: list[str], values: dict[str, str]) -> str:
     if words:
         folder = Path(words[0]).expanduser()
     else:
-        config.register()
-        with hydra.initialize_config_dir(str(config.CONF_DIR), version_base="1.3"):
-            overrides = with_quotes([f"{key}={value}" for key, value in values.items()])
-            conf = config.to_conf(hydra.compose("config", overrides))
+        overrides = with_quotes([f"{key}={value}" for key, value in values.items()])
+        conf = config.compose(*overrides)
         store = Store(Path(conf.store))
         folder = store.variants / variants.find_or_build(conf, store)
     return variant.describe(folder, Path(out) if out else None)

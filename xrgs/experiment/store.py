@@ -28,6 +28,11 @@ if TYPE_CHECKING:
 
     import pandas as pd
 
+    from xrgs.capture.dataset import Dataset
+    from xrgs.config import Conf
+    from xrgs.splat.cameras import Camera
+    from xrgs.splat.gaussians import Gaussians
+
 #: Label of the cells that all others are compared to.
 BASELINE = "baseline"
 
@@ -126,10 +131,10 @@ class CellFolder:
             hashed = verify and name in _VERIFIED_BY_HASH
             if hashed and file_digest(self.path / name) != entry["sha256"]:
                 raise StoreError(f"{name} has changed since the cell finished")
-        if verify and [view for view, _ in self.scores()] != status["views"]:
+        if verify and [view for view, _ in self.view_scores()] != status["views"]:
             raise StoreError("scores.csv does not have one row for each view that was to be scored")
 
-    def scores(self) -> list[tuple[str, dict[str, float]]]:
+    def view_scores(self) -> list[tuple[str, dict[str, float]]]:
         """Return the name and the scores of every test view, NaN where a score is missing.
 
         Raises:
@@ -265,6 +270,70 @@ class CellFolder:
 
         return pd.read_csv(io.BytesIO(untrusted.read_bytes(self.path / "history.csv")))
 
+    def scores(self) -> pd.DataFrame:
+        """Return the scores of the test views.
+
+        Returns:
+            One row a view, indexed by its name (`view`), one column a score (`psnr` in dB, `ssim`,
+            `lpips`); NaN where a score was not computed.
+
+        Raises:
+            StoreError: `scores.csv` is missing or is not such a table.
+        """
+        import pandas as pd
+
+        scores = self.view_scores()
+        index = pd.Index([name for name, _ in scores], name="view", dtype=object)
+        return pd.DataFrame([values for _, values in scores], index=index)
+
+    def config(self) -> Conf:
+        """Return the config that the cell was trained with.
+
+        Raises:
+            XrgsError: `config.json` can't be read, or is of another version's schema.
+        """
+        from xrgs.config import from_file
+
+        return from_file(self.path / "config.json")
+
+    def gaussians(self) -> Gaussians:
+        """Load the trained Gaussians, in the world of `cameras`.
+
+        Raises:
+            XrgsError: `splats.ply` is missing or damaged.
+        """
+        from xrgs.splat.ply import load_ply
+
+        return load_ply(self.path / "splats.ply")
+
+    def dataset(self) -> Dataset:
+        """Load the views that the cell was trained and tested on: photographs, cameras, points.
+
+        The cameras and points are in the normalised world of the Gaussians.
+
+        Raises:
+            StoreError: `identity.json` can't be read.
+            XrgsError: The variant is not in the store, or is damaged.
+        """
+        from xrgs.experiment.results import load_dataset
+
+        return load_dataset(self.path)
+
+    def cameras(self) -> dict[str, dict[str, Camera]]:
+        """Load the cameras of the cell's views, in the normalised world of its Gaussians.
+
+        Returns:
+            `{"train": {name: camera}, "test": {name: camera}}`, in the variant's order.
+
+        Raises:
+            XrgsError: As `dataset`, whose photographs are read with them.
+        """
+        data = self.dataset()
+        splits = {"train": data.train, "test": data.test}
+        return {
+            split: {view.name: view.camera for view in views} for split, views in splits.items()
+        }
+
 
 def _size(file: str) -> int:
     """Return the bytes of a regular file, -1 for anything else.
@@ -293,6 +362,9 @@ class Store:
     path: Path
     """The folder."""
 
+    def __init__(self, path: str | Path) -> None:
+        object.__setattr__(self, "path", Path(path))
+
     @property
     def scenes(self) -> Path:
         """Folder of the rendered photographs of procedural scenes."""
@@ -304,7 +376,7 @@ class Store:
         return self.path / "variants"
 
     @property
-    def cells(self) -> Path:
+    def cells_folder(self) -> Path:
         """Folder of the cells."""
         return self.path / "cells"
 
@@ -325,7 +397,13 @@ class Store:
             StoreError: The folder can't be written; the message names it and the `store` key.
         """
         try:
-            folders = (self.scenes, self.variants, self.cells, self.locks, self.path / "sweeps")
+            folders = (
+                self.scenes,
+                self.variants,
+                self.cells_folder,
+                self.locks,
+                self.path / "sweeps",
+            )
             for folder in folders:
                 folder.mkdir(parents=True, exist_ok=True)
             with tempfile.TemporaryFile(dir=self.path) as file:
@@ -346,7 +424,62 @@ class Store:
         """
         if not untrusted.is_name(cell_id):
             raise StoreError(f"{cell_id!r:.80} is not the id of a cell")
-        return CellFolder(self.cells / cell_id)
+        return CellFolder(self.cells_folder / cell_id)
+
+    def cells(self, *, verify: bool = True) -> pd.DataFrame:
+        """List the cells: what they are, whether they are done, and how they scored.
+
+        `table.loc[:, table.astype(str).nunique() > 1]` keeps the columns in which cells differ.
+
+        Args:
+            verify: Compare the hashes of each cell's results, and not only the sizes of its files.
+
+        Returns:
+            One row a cell, sorted by scene, label, condition, seed and id, with the columns
+            `cell_id`; `scene`, `label` and `condition` as the latest sweep with the cell named it
+            (missing where no sweep has it); `seed`; `variant` (its id); `state` and `reason` as of
+            `CellFolder.state`; each metric of `xrgs.evaluation.metrics.METRICS`, of the whole cell
+            or its mean over test views (NaN where there is none); and each value of its config by
+            its key, as `train.steps`.
+
+        Raises:
+            StoreError: There is no such store, or a sweep's record in it can't be read.
+        """
+        from xrgs.experiment.results import cell_columns, cell_metrics, cells_table
+
+        if not self.cells_folder.is_dir():
+            raise StoreError(f"{self.path}: no store; xrgs-sweep makes one with store={self.path}")
+        names, rows = self.recorded_names(), []
+        for entry in os.scandir(self.cells_folder):
+            # The name of a folder that was set aside has a dot.
+            if not entry.is_dir() or "." in entry.name or not untrusted.is_name(entry.name):
+                continue
+            cell = self.cell(entry.name)
+            state = cell.state(verify=verify)
+            row = cell_columns(cell.path, names.get(cell.id, {}))
+            row |= {"state": state.name, "reason": untrusted.printable(state.reason)}
+            done = state.name == "done"
+            rows.append(row | (cell_metrics(cell.path, cell.scores()) if done else {}))
+        return cells_table(rows)
+
+    def recorded_names(self) -> dict[str, dict[str, str]]:
+        """Return scene, label and condition of each cell that a sweep recorded, by the cell's id.
+
+        A cell of several sweeps has the names that the latest one gave it.
+
+        Raises:
+            StoreError: A sweep's record can't be read; the message names it.
+        """
+        from xrgs.experiment.results import CELL_NAMES
+
+        files = (self.path / "sweeps").glob("*.json")
+        names: dict[str, dict[str, str]] = {}
+        for file in sorted(files, key=lambda file: (file.stat().st_mtime_ns, file.name)):
+            for row in self.sweep_record(file.stem)["cells"]:
+                if row.get("cell_id") is not None:
+                    texts = {key: untrusted.printable(row.get(key, "")) for key in CELL_NAMES}
+                    names[row["cell_id"]] = texts
+        return names
 
     def write_sweep(self, command: Sequence[str], cells: Iterable[Mapping[str, Any]]) -> str:
         """Record which cells a sweep compared, for its report.

@@ -1,4 +1,4 @@
-"""From a store to tables and figures, without training and without torch."""
+"""Tables and figures of a sweep, made from its store alone, without training and without torch."""
 
 from xrgs.report.page import Report, build
 

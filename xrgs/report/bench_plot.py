@@ -1,4 +1,4 @@
-"""The plot of a benchmark: time against error."""
+"""The plot of a benchmark: rendering time against error."""
 
 from __future__ import annotations
 
@@ -12,36 +12,37 @@ if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
 _DPI = 150
-_LEAST_ERROR = 1e-9  # an error of 0 has no logarithm
+_MIN_ERROR = 1e-9  # an error of 0 has no logarithm
 #: Okabe and Ito's colours, told apart by colour-blind readers.
 _COLORS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00")
 _MARKERS = "osD^v"
 
 
 def time_against_error(rows: Sequence[Mapping[str, Any]]) -> bytes:
-    """Each load rendered each way as a point: down is faster, left is more exact.
+    """Draw a point for each scene and renderer: lower is faster, further left is more exact.
 
     Args:
-        rows: With `way`, `threads`, `gaussians`, `forward_ms`, `backward_ms` and
-            `image_mean_error`; only those of one thread are drawn, larger marks for more Gaussians.
+        rows: One mapping a measurement, with `way` (the renderer's name), `threads`, `gaussians`,
+            `forward_ms`, `backward_ms` and `image_mean_error`. Only rows of one thread are drawn;
+            a larger mark has more Gaussians.
 
     Returns:
-        A .png.
+        The bytes of a PNG.
     """
     names = list(dict.fromkeys(row["way"] for row in rows))
     most = max(row["gaussians"] for row in rows)
     with style.context("default"):
         figure = Figure(figsize=(8.0, 5.5), layout="constrained")
         axes = figure.add_subplot()
-        for place, name in enumerate(names):
-            used = [row for row in rows if row["way"] == name and row["threads"] == 1]
+        for index, name in enumerate(names):
+            points = [row for row in rows if row["way"] == name and row["threads"] == 1]
             axes.scatter(
-                [max(row["image_mean_error"], _LEAST_ERROR) for row in used],
-                [row["forward_ms"] + row["backward_ms"] for row in used],
-                s=[20 + 100 * (row["gaussians"] / most) ** 0.5 for row in used],
-                c=_COLORS[place % len(_COLORS)],
-                # Ways of the same colour differ by their mark.
-                marker=_MARKERS[(place + place // len(_COLORS)) % len(_MARKERS)],
+                [max(row["image_mean_error"], _MIN_ERROR) for row in points],
+                [row["forward_ms"] + row["backward_ms"] for row in points],
+                s=[20 + 100 * (row["gaussians"] / most) ** 0.5 for row in points],
+                c=_COLORS[index % len(_COLORS)],
+                # Renderers of the same colour differ by their mark.
+                marker=_MARKERS[(index + index // len(_COLORS)) % len(_MARKERS)],
                 alpha=0.7,
                 label=name,
             )

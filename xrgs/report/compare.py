@@ -1,12 +1,12 @@
-"""Percentage change of each metric from the paired baseline: the arithmetic of the paper's Table 1.
+"""Percentage change of each metric from the paired baseline, as in the paper's Table 1.
 
-A pair is an ablation's cell and the baseline trained on the same variant with the same seed. The
-change of a pair is 100 (value - baseline) / |baseline|; a scene's change is the mean over its
-seeds, and the sweep's is the mean over scenes, each scene counting once.
+A pair is an ablation's cell and the baseline that was trained on the same variant with the same
+seed. The change of a pair is 100 (value - baseline) / |baseline|. A scene's change is the mean over
+its seeds, and the sweep's change is the mean over scenes, in which each scene counts once.
 
-The 95 % interval is Student's t around that mean. Its unit is a scene's mean where there is more
-than one scene (it then says how far the mean would move with other scenes like these; the noise
-between seeds is inside it), else a seed. One scene with one seed has no interval.
+The 95 % interval is Student's t around that mean. With more than one scene it is taken over the
+scenes' means: it then says how far the mean would move with other scenes like these, and includes
+the noise between seeds. With one scene it is taken over seeds. One scene with one seed has none.
 """
 
 from __future__ import annotations
@@ -39,17 +39,18 @@ _GROUP = ["label", "condition"]
 
 
 def percent_change(baseline: Floats, value: Floats) -> tuple[Floats, NDArray[np.str_]]:
-    """Change from `baseline` to `value` in percent of the baseline's magnitude.
+    """Return the change from `baseline` to `value` in percent of the baseline's magnitude.
 
-    The magnitude, so that a larger value is a positive change below zero too (SSIM and PSNR can
-    be negative).
+    The magnitude is taken so that a larger value is a positive change below zero as well: SSIM and
+    PSNR can be negative.
 
     Args:
-        baseline: [N]
-        value: [N]
+        baseline: [N] values of the baseline.
+        value: [N] values of the ablation, in the same unit.
 
     Returns:
-        change [N], NaN where there is none, and why there is none [N], else empty.
+        The changes [N], NaN where there is none, and the reasons why there is none [N], empty where
+        there is one.
 
     Example:
         >>> percent_change(np.array([20.0, 0.0]), np.array([25.0, 1.0]))[0]
@@ -71,11 +72,14 @@ def percent_change(baseline: Floats, value: Floats) -> tuple[Floats, NDArray[np.
 
 
 def half_width(spread: Floats, n: Floats) -> Floats:
-    """Half the width of Student's 95 % interval of a mean; NaN for fewer than two values.
+    """Return half the width of Student's 95 % interval of each mean.
 
     Args:
-        spread: [N] sample standard deviations (n - 1).
-        n: [N] how many values each is of.
+        spread: [N] sample standard deviations, with n - 1 in the denominator.
+        n: [N] number of values behind each mean.
+
+    Returns:
+        [N] in the unit of `spread`; NaN for fewer than two values.
     """
     with np.errstate(all="ignore"):
         return np.asarray(stdtrit(n - 1, 0.5 + CONFIDENCE / 2) * spread / np.sqrt(n))
@@ -83,23 +87,25 @@ def half_width(spread: Floats, n: Floats) -> Floats:
 
 @dataclass(frozen=True)
 class Comparison:
-    """Every number of a report's tables."""
+    """Holds every number of a report's tables."""
 
     metrics: tuple[Metric, ...]
     scenes: tuple[str, ...]
-    """Sorted."""
+    """Names of the scenes, sorted."""
     groups: tuple[tuple[str, str], ...]
-    """(label, condition) of each ablation, as the sweep ordered them."""
+    """(label, condition) of each ablation, in the sweep's order."""
     cells: pd.DataFrame
+    """`Sweep.cells`, in which an ablation without a finished baseline has that as its reason."""
     pairs: pd.DataFrame
-    """One row an ablation's cell and metric: baseline, value, change (%), difference, why."""
+    """One row for each metric of each ablation's cell: `baseline`, `value`, `change` (%),
+    `difference` (in the metric's unit) and `why` there is no change."""
     per_scene: pd.DataFrame
     """Means over seeds, indexed by label, condition, scene, metric."""
     means: pd.DataFrame
     """Means over scenes, indexed by label, condition, metric."""
 
     def missing(self) -> pd.DataFrame:
-        """The cells that gave no number, with `reason`, in the sweep's order."""
+        """Return the cells without results, with `reason`, in the sweep's order."""
         return self.cells[self.cells["reason"] != ""]
 
 
@@ -107,11 +113,14 @@ def compare(cells: pd.DataFrame, metrics: Sequence[Metric]) -> Comparison:
     """Pair every ablation with its baseline and average over seeds, then over scenes.
 
     Args:
-        cells: `Sweep.cells`.
-        metrics: the rows of the tables, in order.
+        cells: The table `Sweep.cells`.
+        metrics: The metrics to compare, in the order of the tables' rows.
+
+    Returns:
+        The pairs, and their means over seeds and over scenes.
 
     Raises:
-        ReportError: a cell's baseline is of another scene, variant or seed, or not in the sweep;
+        ReportError: A cell's baseline is of another scene, variant or seed, or is not in the sweep;
             cells of one scene and condition are of different variants; or the cells were scored
             by different evaluation protocols. The message names both cells.
     """
@@ -132,7 +141,14 @@ def compare(cells: pd.DataFrame, metrics: Sequence[Metric]) -> Comparison:
 
 
 def check_comparable(cells: pd.DataFrame) -> None:
-    """Refuse cells that no percentage may be made of; see `compare`."""
+    """Refuse cells that can't be compared.
+
+    Args:
+        cells: The table `Sweep.cells`.
+
+    Raises:
+        ReportError: As of `compare`.
+    """
     _one_value(cells[cells["state"] == "done"], [], "protocol", "evaluation protocol")
     _one_value(cells.dropna(subset="variant_id"), ["scene", "condition"], "variant_id", "variant")
     ablations = cells[(cells["label"] != BASELINE) & cells["cell_id"].notna()]
@@ -157,7 +173,7 @@ def check_comparable(cells: pd.DataFrame) -> None:
 
 
 def _one_value(cells: pd.DataFrame, within: list[str], key: str, label: str) -> None:
-    """Refuse two values of `key` among the cells that share the keys `within`."""
+    """Refuse cells that share the keys `within` and differ in `key`."""
     distinct = cells.drop_duplicates([*within, key])
     repeated = distinct[distinct.duplicated(within)] if within else distinct.iloc[1:]
     if repeated.empty:
@@ -178,27 +194,27 @@ def _name(cell: pd.Series) -> str:
 
 
 def _baselines(cells: pd.DataFrame) -> pd.DataFrame:
-    """The baselines that were planned, one row a cell, indexed by its id."""
+    """Return the baselines that were planned, one row for each cell, indexed by its id."""
     planned = cells[(cells["label"] == BASELINE) & cells["cell_id"].notna()]
     return planned.drop_duplicates("cell_id").set_index("cell_id")
 
 
 def _pairs(cells: pd.DataFrame, metrics: Sequence[Metric]) -> pd.DataFrame:
-    """The pairs of which both are done; an ablation whose baseline is not gets that as reason."""
+    """Return the pairs of finished cells; set in `cells` why an ablation is without one."""
     baselines = _baselines(cells)
     ablations = cells["label"] != BASELINE
-    lost = baselines[baselines["state"] != "done"]
-    orphans = ablations & (cells["state"] == "done") & cells["baseline_id"].isin(lost.index)
-    reasons = "no baseline: " + lost["reason"].astype(str)
-    cells.loc[orphans, "reason"] = cells.loc[orphans, "baseline_id"].map(reasons).astype(str)
-    paired = cells[ablations & (cells["state"] == "done") & ~orphans]
+    failed = baselines[baselines["state"] != "done"]
+    unpaired = ablations & (cells["state"] == "done") & cells["baseline_id"].isin(failed.index)
+    reasons = "no baseline: " + failed["reason"].astype(str)
+    cells.loc[unpaired, "reason"] = cells.loc[unpaired, "baseline_id"].map(reasons).astype(str)
+    paired = cells[ablations & (cells["state"] == "done") & ~unpaired]
     matched = baselines.loc[paired["baseline_id"]]
     parts = []
     for metric in metrics:
         baseline = matched[metric.name].to_numpy(np.float64)
         value = paired[metric.name].to_numpy(np.float64)
         change, why = percent_change(baseline, value)
-        with np.errstate(invalid="ignore"):  # inf - inf is the NaN that is meant
+        with np.errstate(invalid="ignore"):  # inf - inf gives NaN, as it should
             difference = value - baseline
         part = paired[["label", "condition", "scene", "seed", "cell_id", "baseline_id"]]
         parts.append(
@@ -215,7 +231,7 @@ def _pairs(cells: pd.DataFrame, metrics: Sequence[Metric]) -> pd.DataFrame:
 
 
 def _summary(rows: pd.DataFrame, by: list[str], unit: str) -> pd.DataFrame:
-    """Mean and interval of the rows that share the keys `by`; `why` names what was left out."""
+    """Return mean and interval of the rows that share the keys `by`; `why` says what is missing."""
     grouped = rows.groupby(by, sort=False)
     table = grouped.agg(
         baseline=("baseline", "mean"),
@@ -226,8 +242,8 @@ def _summary(rows: pd.DataFrame, by: list[str], unit: str) -> pd.DataFrame:
         n=("change", "count"),
     )
     half = half_width(table["spread"].to_numpy(), table["n"].to_numpy(np.float64))
-    odd = rows[rows["why"] != ""].drop_duplicates([*by, "why"])
-    why = odd.groupby(by, sort=False)["why"].agg("; ".join)
+    incomplete = rows[rows["why"] != ""].drop_duplicates([*by, "why"])
+    why = incomplete.groupby(by, sort=False)["why"].agg("; ".join)
     return table.assign(
         low=table["change"] - half,
         high=table["change"] + half,
@@ -237,7 +253,7 @@ def _summary(rows: pd.DataFrame, by: list[str], unit: str) -> pd.DataFrame:
 
 
 def _over_scenes(per_scene: pd.DataFrame) -> pd.DataFrame:
-    """Means over scenes; a group with one scene keeps that scene's interval, over its seeds."""
+    """Return means over scenes; a single scene keeps its own interval, which is over its seeds."""
     by = [*_GROUP, "metric"]
     rows = per_scene.reset_index()
     means = _summary(rows, by, unit="scenes")

@@ -1,7 +1,7 @@
-"""Pictures of a comparison: renders side by side, curves of training, Gaussians against quality.
+"""Draws a comparison: renders side by side, training curves, number of Gaussians against quality.
 
-The same inputs give the same bytes: matplotlib's own defaults whatever the user's style, no dates
-and no version in the file. Nothing goes through pyplot, which keeps figures alive.
+The same inputs give the same bytes: matplotlib's own style is used whatever the user's is, and no
+date or version is written. pyplot is not used, since it keeps figures in memory.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 
     Image = NDArray[np.float32]
 
-#: Okabe and Ito's orange and blue: told apart by colour-blind readers and in grey.
+#: Okabe and Ito's orange and blue, which colour-blind readers can distinguish, also in grey.
 _ABLATION, _BASELINE, _FRAME = "#D55E00", "#0072B2", "#FFD400"
 _DPI = 130
 _PANEL = 3.4  # inches
@@ -36,7 +36,7 @@ _ZOOM = 5
 
 
 class Panel(NamedTuple):
-    """One image and the line under it."""
+    """One image of a row, with its title and the line under it."""
 
     image: Image  # [H, W, 3] 0..1
     title: str
@@ -45,9 +45,9 @@ class Panel(NamedTuple):
 
 @contextmanager
 def _default_style() -> Iterator[None]:
-    """Matplotlib's own style, and no warning for a script that its font lacks.
+    """Use matplotlib's own style, without warnings for characters that its font lacks.
 
-    Such characters are drawn as boxes; the tables beside the picture have the name.
+    Such characters are drawn as boxes; the tables of the report have the name.
     """
     with style.context("default"), warnings.catch_warnings():
         warnings.filterwarnings("ignore", message="Glyph .* missing from")
@@ -55,15 +55,15 @@ def _default_style() -> Iterator[None]:
 
 
 def differing_crop(first: Image, second: Image, zoom: int = _ZOOM) -> tuple[slice, slice]:
-    """The window, `zoom` times smaller than the images, in which they differ most.
+    """Find the window, `zoom` times smaller than the images, in which they differ most.
 
     Args:
-        first: [H, W, 3]
-        second: [H, W, 3]
-        zoom: how many times smaller its sides are; the topmost, leftmost of equals wins.
+        first: [H, W, 3] in 0..1.
+        second: [H, W, 3] in 0..1.
+        zoom: How many times smaller the window's sides are than the images'.
 
     Returns:
-        Rows and columns.
+        The window's rows and columns; of equal windows, the topmost and then the leftmost.
     """
     difference = np.abs(first.astype(np.float64) - second).mean(axis=2)  # [H, W]
     height, width = (max(1, side // zoom) for side in difference.shape)
@@ -80,16 +80,16 @@ def differing_crop(first: Image, second: Image, zoom: int = _ZOOM) -> tuple[slic
 def side_by_side(
     title: str, panels: Sequence[Panel], crop: tuple[slice, slice], note: str
 ) -> bytes:
-    """The panels in a row with `crop` framed, and below each its crop enlarged.
+    """Draw the panels in a row with `crop` framed, and each panel's crop enlarged below it.
 
     Args:
-        title: above all.
-        panels: images of one size, e.g. photograph, baseline and ablation.
-        crop: rows and columns, as `differing_crop` gives them.
-        note: what the window is, e.g. "where the two differ most".
+        title: The title of the figure.
+        panels: The images, of one size: photograph, baseline and ablation.
+        crop: The rows and columns of the crop, as `differing_crop` returns them.
+        note: What the crop shows, for example "where the two differ most".
 
     Returns:
-        A PNG.
+        The bytes of a PNG.
     """
     rows, columns = crop
     height, width = panels[0].image.shape[:2]
@@ -118,15 +118,15 @@ def side_by_side(
 def curves(
     title: str, runs: Sequence[tuple[str, pd.DataFrame]], columns: Mapping[str, str]
 ) -> bytes:
-    """Training curves over steps, one panel a column, one line a run.
+    """Draw training curves over steps: one panel for each column, one line for each run.
 
     Args:
-        title: above all.
-        runs: label and history (`step` and `columns`) of the baseline, then of the ablation.
-        columns: what to draw, and what to write above it.
+        title: The title of the figure.
+        runs: Label and history (with `step` and `columns`) of the baseline, then of the ablation.
+        columns: The columns to draw, with the title of each panel.
 
     Returns:
-        A PNG.
+        The bytes of a PNG.
     """
     figure = _figure(_PANEL * 1.5 * len(columns), _PANEL)
     figure.suptitle(title, fontsize=11, parse_math=False)
@@ -151,20 +151,20 @@ def curves(
 def trade_off(
     title: str, means: pd.DataFrame, scenes: pd.DataFrame, axes: Sequence[Metric]
 ) -> bytes:
-    """Every ablation by its Gaussians and its quality, one panel a quality; better is up and left.
+    """Draw each ablation by its number of Gaussians and its quality, one panel for each score.
 
-    A numbered dot is an ablation's mean, the thin lines from it lead to its scenes.
+    Better is up and left. A numbered dot is an ablation's mean; thin lines lead to its scenes.
 
     Args:
-        title: above all.
-        means: one row a label, in order: `gaussians`, as a multiple of the baseline's, above 0;
-            and for each of `axes` its change from the baseline, in its unit or else in percent, in
-            a column of its name.
-        scenes: the same columns and index, one row a label and scene.
-        axes: the scores to draw.
+        title: The title of the figure.
+        means: One row for each label, in order: `gaussians`, as a multiple of the baseline's, above
+            0; and for each of `axes`, in a column of its name, its change from the baseline, in its
+            unit or, where it has none, in percent.
+        scenes: The same columns and index, one row for each label and scene.
+        axes: The scores to draw.
 
     Returns:
-        A PNG.
+        The bytes of a PNG.
     """
     figure = _figure(_PANEL * 1.1 * len(axes) + 2, max(_PANEL, 0.2 * len(means)))
     figure.suptitle(title, fontsize=11, parse_math=False)
@@ -183,7 +183,7 @@ def trade_off(
 
 
 def _dots(axis: Axes, means: pd.DataFrame, scenes: pd.DataFrame, quality: str) -> None:
-    """One panel of a trade-off; blue lines cross where the baseline is."""
+    """Draw one panel of a trade-off, with blue lines that cross where the baseline is."""
     for label, row in scenes.iterrows():
         ends = means.loc[[label], ["gaussians", quality]].to_numpy()[0], row[["gaussians", quality]]
         axis.plot(*zip(*ends, strict=True), color="0.75", linewidth=0.7)
@@ -201,7 +201,7 @@ def _dots(axis: Axes, means: pd.DataFrame, scenes: pd.DataFrame, quality: str) -
 
 
 def _figure(width: float, height: float) -> Figure:
-    """An empty figure of so many inches."""
+    """Make an empty figure of this size in inches."""
     return Figure(figsize=(width, height), dpi=_DPI, layout="constrained")
 
 

@@ -1,4 +1,4 @@
-"""The report of a sweep, made from the store alone: the same store gives the same bytes."""
+"""Writes the report of a sweep from its store alone: the same store gives the same bytes."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from xrgs.experiment.store import Store
 from xrgs.report.collect import RECORD_KEYS, ReportError, Sweep, read_sweep
 from xrgs.report.compare import compare
 from xrgs.report.pictures import Picture, draw
-from xrgs.report.render import Grid, markdown, to_latex, to_markdown, to_text
+from xrgs.report.render import TextTable, markdown, to_latex, to_markdown, to_text
 from xrgs.report.tables import Tables
 from xrgs.report.training import table as training_table
 from xrgs.report.training import totals
@@ -24,23 +24,32 @@ if TYPE_CHECKING:
 
     import pandas as pd
 
-#: A terminal shows the ablations one by one up to this many; the overview and files have all.
-_MOST_ON_TERMINAL = 6
-_MOST_MISSING_ON_TERMINAL = 20
-#: What training time depends on beside the program.
-_MACHINE = ("cpu", "threads", "backend")
-_MADE_WITH = ("xrgs", "git", "git_diff_sha256", "python", "packages.torch", "platform", *_MACHINE)
+#: Most ablations whose own tables are printed; the overview and the files have all.
+_MAX_PRINTED_ABLATIONS = 6
+_MAX_PRINTED_MISSING = 20
+#: Entries of a cell's provenance that training time depends on, beside the program.
+_MACHINE_KEYS = ("cpu", "threads", "backend")
+_PROVENANCE_KEYS = (
+    "xrgs",
+    "git",
+    "git_diff_sha256",
+    "python",
+    "packages.torch",
+    "platform",
+    *_MACHINE_KEYS,
+)
 
 
 @dataclass(frozen=True)
 class Report:
-    """What `build` made."""
+    """A report that `build` has written."""
 
     text: str
-    """For the terminal, with the folder's name at the end."""
+    """The tables for a terminal, with the folder's name at the end."""
     folder: Path
+    """The folder that it was written to."""
     files: tuple[Path, ...]
-    """Everything written, sorted."""
+    """Every file that was written, sorted."""
 
 
 def build(
@@ -49,17 +58,20 @@ def build(
     out: Path | None = None,
     pictures: Sequence[str] | None = None,
 ) -> Report:
-    """Write tables, scores and figures of a sweep.
+    """Write the tables, scores and figures of a sweep.
 
     Args:
-        store_path: the store's folder.
-        sweep_id: the sweep; the latest one where none is given.
-        out: folder to write to; `<store>/reports/<sweep id>` where none is given.
-        pictures: names of those that are wanted (`draw`); None for all.
+        store_path: The store's folder.
+        sweep_id: The id of the sweep; None takes the latest one.
+        out: The folder to write to; None takes `<store>/reports/<sweep id>`.
+        pictures: Names of the pictures to draw, as of `draw`; None draws all.
+
+    Returns:
+        The report: its text and its files.
 
     Raises:
-        StoreError: the store holds no such sweep.
-        ReportError: the sweep's cells can't be compared, there is no picture of such a name, or
+        StoreError: The store holds no such sweep.
+        ReportError: The sweep's cells can't be compared, there is no picture of such a name, or
             `out` can't be written.
     """
     store = Store(store_path)
@@ -68,7 +80,7 @@ def build(
     comparison = compare(sweep.cells, METRICS)
     tables = Tables(comparison)
     folder = out or store.reports / sweep_id
-    links = [place for place in (folder, folder / "figures") if place.is_symlink()]
+    links = [path for path in (folder, folder / "figures") if path.is_symlink()]
     if links and out is None:
         raise ReportError(f"{links[0]} is a link: remove it, or name a folder with out=...")
     try:
@@ -82,6 +94,7 @@ def build(
     return Report(text=text, folder=folder, files=tuple(sorted(written)))
 
 
+#: The files of every report, beside its pictures.
 _FILES = (
     "table.md",
     "table.tex",
@@ -105,9 +118,9 @@ def _write_files(
     views = names.merge(sweep.views, on="cell_id")
     metrics = [metric.name for metric in tables.comparison.metrics]
     order = [*RECORD_KEYS, "state", "reason", "protocol", *metrics]
-    write_text(folder / "table.md", _page(sweep, tables, pictures, folder, training))
-    grids = [grid for grid in _grids(tables) if grid.rows]
-    write_text(folder / "table.tex", "\n".join(map(to_latex, grids)))
+    write_text(folder / "table.md", _markdown_page(sweep, tables, pictures, folder, training))
+    non_empty = [table for table in _all_tables(tables) if table.rows]
+    write_text(folder / "table.tex", "\n".join(map(to_latex, non_empty)))
     write_text(folder / "table.csv", _csv(tables.long()))
     write_text(folder / "cells.csv", _csv(cells[order]))
     write_text(folder / "views.csv", _csv(views))
@@ -119,27 +132,34 @@ def _csv(table: pd.DataFrame) -> str:
     return str(table.to_csv(index=False, lineterminator="\n"))
 
 
-def _grids(tables: Tables) -> list[Grid]:
-    """Every table, the widest view first."""
+def _all_tables(tables: Tables) -> list[TextTable]:
+    """Return every table of changes and values, overviews first."""
     comparison = tables.comparison
-    grids = tables.overviews()
-    for group in comparison.groups:
-        grids.append(tables.mean(*group))
-        if len(comparison.scenes) > 1:
-            grids.append(tables.per_scene(*group))
-    grids += [tables.values(name) for name in dict.fromkeys(comparison.cells["condition"])]
+    result = [*tables.overviews(), *_ablation_tables(tables)]
+    result += [tables.values(name) for name in dict.fromkeys(comparison.cells["condition"])]
     missing = tables.missing()
-    return grids + ([missing] if missing else [])
+    return result + ([missing] if missing else [])
 
 
-def _training(tables: Tables, training: pd.DataFrame) -> list[Grid]:
-    """What training did, for each condition."""
+def _ablation_tables(tables: Tables) -> list[TextTable]:
+    """Return each ablation's table of means and, with several scenes, its table of scenes."""
+    comparison = tables.comparison
+    result = []
+    for group in comparison.groups:
+        result.append(tables.mean(*group))
+        if len(comparison.scenes) > 1:
+            result.append(tables.per_scene(*group))
+    return result
+
+
+def _training_tables(tables: Tables, training: pd.DataFrame) -> list[TextTable]:
+    """Return one table of what training did for each condition."""
     cells = tables.comparison.cells
     labels = cells.groupby("condition", sort=False)["label"].unique()
     return [training_table(training, list(of), str(name)) for name, of in labels.items()]
 
 
-def _page(
+def _markdown_page(
     sweep: Sweep,
     tables: Tables,
     pictures: list[Picture],
@@ -150,47 +170,44 @@ def _page(
     parts = [
         f"# Change from baseline\n\nSweep {markdown(sweep.id)}: {markdown(command)}\n",
         *(f"**{markdown(line)}**\n" for line in _warnings(sweep)),
-        *(to_markdown(grid) for grid in _grids(tables) if grid.rows),
-        *(to_markdown(grid) for grid in _training(tables, training) if grid.rows),
-        *(_picture(picture, folder) for picture in pictures),
-        to_markdown(_made_with(sweep)),
+        *(to_markdown(table) for table in _all_tables(tables) if table.rows),
+        *(to_markdown(table) for table in _training_tables(tables, training) if table.rows),
+        *(_picture_link(picture, folder) for picture in pictures),
+        to_markdown(_provenance_table(sweep)),
     ]
     return "\n".join(parts)
 
 
-def _picture(picture: Picture, folder: Path) -> str:
+def _picture_link(picture: Picture, folder: Path) -> str:
     title = markdown(picture.title)
     if picture.file is None:
         return f"No picture of {title}: {markdown(picture.why)}\n"
     return f"![{title}]({picture.file.relative_to(folder).as_posix()})\n\n{title}\n"
 
 
-def _made_with(sweep: Sweep) -> Grid:
-    rows = tuple((key, "; ".join(sweep.provenance.get(key, ["n/a"]))) for key in _MADE_WITH)
-    return Grid("Made with", ("", "values"), rows, "ll")
+def _provenance_table(sweep: Sweep) -> TextTable:
+    rows = tuple((key, "; ".join(sweep.provenance.get(key, ["n/a"]))) for key in _PROVENANCE_KEYS)
+    return TextTable("Made with", ("", "values"), rows, "ll")
 
 
 def _warnings(sweep: Sweep) -> list[str]:
-    mixed = [key for key in _MACHINE if len(sweep.provenance.get(key, ())) > 1]
+    mixed = [key for key in _MACHINE_KEYS if len(sweep.provenance.get(key, ())) > 1]
     if not mixed:
         return []
     return [f"The cells differ in {', '.join(mixed)}: their training times do not compare."]
 
 
 def _text(tables: Tables, warnings: list[str]) -> str:
-    """What a command prints."""
+    """Return what a command prints: at most so many tables that they can be read."""
     comparison = tables.comparison
-    grids = tables.overviews()
-    if len(comparison.groups) <= _MOST_ON_TERMINAL:
-        for group in comparison.groups:
-            grids.append(tables.mean(*group))
-            if len(comparison.scenes) > 1:
-                grids.append(tables.per_scene(*group))
+    printed = tables.overviews()
+    if len(comparison.groups) <= _MAX_PRINTED_ABLATIONS:
+        printed += _ablation_tables(tables)
     if not comparison.groups:
-        grids += [tables.values(name) for name in dict.fromkeys(comparison.cells["condition"])]
+        printed += [tables.values(name) for name in dict.fromkeys(comparison.cells["condition"])]
     missing = tables.missing()
     if missing:
-        more = len(missing.rows) - _MOST_MISSING_ON_TERMINAL
+        more = len(missing.rows) - _MAX_PRINTED_MISSING
         notes = (f"and {more} more, in table.md",) if more > 0 else ()
-        grids.append(replace(missing, rows=missing.rows[:_MOST_MISSING_ON_TERMINAL], notes=notes))
-    return "\n".join([*(to_text(grid) for grid in grids if grid.rows), *warnings])
+        printed.append(replace(missing, rows=missing.rows[:_MAX_PRINTED_MISSING], notes=notes))
+    return "\n".join([*(to_text(table) for table in printed if table.rows), *warnings])

@@ -1,4 +1,4 @@
-"""Which pictures a report has, and where their images lie in the store."""
+"""Decides which pictures a report has, and reads their images from the store."""
 
 from __future__ import annotations
 
@@ -31,16 +31,16 @@ if TYPE_CHECKING:
     from xrgs.experiment.store import Store
     from xrgs.report.compare import Comparison
 
-    _Drawing = Callable[[Path], "Picture"]  # into a file of that name
+    _Drawing = Callable[[Path], "Picture"]  # draws into the file
 
 _CURVES = {"gaussians": "Gaussians", "loss": "loss of the step's view, as each run weighs it"}
-#: Of a photograph in a picture that is a thousand pixels wide; three are in memory at a time.
-_MOST_PIXELS = 50_000_000
+#: Largest image that is drawn; three are in memory at a time.
+_MAX_PIXELS = 50_000_000
 
 
 @dataclass(frozen=True)
 class Picture:
-    """A figure's file, or why there is none."""
+    """The file of a figure, or the reason why there is none."""
 
     title: str
     file: Path | None
@@ -54,51 +54,55 @@ def draw(
     folder: Path,
     names: Sequence[str] | None = None,
 ) -> list[Picture]:
-    """What each ablation trades; then views and training curves of every scene and ablation.
+    """Draw what each ablation trades, and views and training curves of each scene and ablation.
 
-    The first is drawn where there are several ablations, once a condition. Of several conditions
-    and seeds the others show the first; the title says which.
+    The trade-offs are drawn where there are several ablations, one figure for each condition. The
+    other pictures show the first condition and seed, which their titles name.
 
     Args:
-        store: where photographs, renders and histories lie.
-        comparison: the pairs.
-        views: `Sweep.views`.
-        folder: where the files go; it exists.
-        names: of the pictures that are wanted, a file's without its suffix; None for all.
+        store: The store with the photographs, renders and histories.
+        comparison: The pairs of cells.
+        views: The table `Sweep.views`.
+        folder: The existing folder to write the files to.
+        names: Names of the pictures to draw, which are file names without suffix; None draws all.
 
     Returns:
-        The pictures in the order of the tables.
+        The pictures, in the order of the tables.
 
     Raises:
-        ReportError: there is none of such a name.
+        ReportError: There is no picture of such a name.
     """
     first = comparison.pairs.sort_values("seed", kind="stable")
-    wanted = first.drop_duplicates(["scene", "label"]).sort_values(["scene", "label"])
-    shown = {*wanted["cell_id"], *wanted["baseline_id"]}
+    pairs = first.drop_duplicates(["scene", "label"]).sort_values(["scene", "label"])
+    shown = {*pairs["cell_id"], *pairs["baseline_id"]}
     scores = views[views["cell_id"].isin(shown)].groupby("cell_id")
     psnr = {cell_id: rows.set_index("view")["psnr"] for cell_id, rows in scores}
     variants = comparison.cells.drop_duplicates("cell_id").set_index("cell_id")["variant_id"]
-    known = _trade_offs(comparison)
-    for _, pair in wanted.iterrows():
+    drawings = _trade_offs(comparison)
+    for _, pair in pairs.iterrows():
         both = psnr[pair["baseline_id"]], psnr[pair["cell_id"]]
         photographs = store.variants / variants[pair["cell_id"]] / "images" / "test"
         stem = f"{slug(pair['scene'])}--{slug(pair['label'])}"
-        known[stem] = partial(_views, store, pair, both, photographs)
-        known[f"{stem}--training"] = partial(_training, store, pair)
-    chosen = known if names is None else _chosen(known, names)
+        drawings[stem] = partial(_views, store, pair, both, photographs)
+        drawings[f"{stem}--training"] = partial(_training, store, pair)
+    chosen = drawings if names is None else _chosen(drawings, names)
     bar = progress(chosen.items(), "drawing", "picture", len(chosen))
     return [drawing(folder / f"{name}.png") for name, drawing in bar]
 
 
-def _chosen(known: dict[str, _Drawing], names: Sequence[str]) -> dict[str, _Drawing]:
+def _chosen(drawings: dict[str, _Drawing], names: Sequence[str]) -> dict[str, _Drawing]:
+    """Return the drawings of these names."""
     for name in names:
-        if name not in known:
-            there = ", ".join(known) or "none at all"
-            raise ReportError(f"pictures={name}: there is none of that name; there are: {there}")
-    return {name: drawing for name, drawing in known.items() if name in names}
+        if name not in drawings:
+            choices = ", ".join(drawings) or "none"
+            raise ReportError(
+                f"pictures={name}: there is no picture of that name; choose from: {choices}"
+            )
+    return {name: drawing for name, drawing in drawings.items() if name in names}
 
 
 def _trade_offs(comparison: Comparison) -> dict[str, _Drawing]:
+    """Return the trade-off figures, one for each condition with several ablations."""
     drawings: dict[str, _Drawing] = {}
     for condition in dict.fromkeys(condition for _, condition in comparison.groups):
         means, scenes = (
@@ -123,10 +127,10 @@ def _trade_off(
 
 
 def _traded(table: pd.DataFrame, condition: str, metrics: Sequence[Metric]) -> pd.DataFrame:
-    """Gaussians over the baseline's, and the change of every score of views that was measured.
+    """Return Gaussians as a multiple of the baseline's, and the change of each measured score.
 
-    Indexed by label. Decibels differ, other scores change in percent. A label that lacks one of
-    them has no row: the tables say why.
+    The index is the label. Scores in decibels change by their difference, others in percent. A
+    label that lacks a score has no row; the tables say why.
     """
     here = table[table.index.get_level_values("condition") == condition].droplevel("condition")
     of = here.index.get_level_values("metric")
@@ -140,11 +144,14 @@ def _traded(table: pd.DataFrame, condition: str, metrics: Sequence[Metric]) -> p
 
 
 def median_view(baseline: pd.Series, ablation: pd.Series) -> str:
-    """The view whose change of PSNR is the (lower) median: neither the best nor the worst case.
+    """Return the view whose change of PSNR is the median: neither the best nor the worst case.
 
     Args:
-        baseline: PSNR in dB, indexed by view.
-        ablation: likewise.
+        baseline: PSNR of the baseline in dB, indexed by view.
+        ablation: PSNR of the ablation in dB, indexed by view.
+
+    Returns:
+        The name of the view; of an even number of views, the lower of the two in the middle.
     """
     change = (ablation - baseline.reindex(ablation.index)).fillna(0.0).sort_index()
     return str(change.sort_values(kind="stable").index[(len(change) - 1) // 2])
@@ -200,20 +207,27 @@ def _title(pair: pd.Series) -> str:
 
 def _image(store: Store, path: Path) -> NDArray[np.float32]:
     inside = path.relative_to(store.path)
-    home = (store.path / inside.parts[0]).resolve()
+    allowed = (store.path / inside.parts[0]).resolve()
     try:
-        if not path.resolve().is_relative_to(home):
+        if not path.resolve().is_relative_to(allowed):
             raise ImageError("a link leads out of the store")
-        if math.prod(images.size(path)) > _MOST_PIXELS:
+        if math.prod(images.size(path)) > _MAX_PIXELS:
             raise ImageError("too large to be drawn")
         return images.read(path)
     except (OSError, ImageError) as error:
-        # Named inside the store: the report is the same wherever the store lies.
+        # The path inside the store: the report is the same wherever the store is.
         raise ReportError(f"{inside.as_posix()} can't be read") from error
 
 
 def slug(text: str) -> str:
-    """`text` as part of a file name on any system; different texts give different names."""
+    """Return `text` as part of a file name that any system accepts.
+
+    Args:
+        text: The name of a scene, label or condition.
+
+    Returns:
+        At most 67 ASCII characters; different texts give different names.
+    """
     plain = re.sub(r"[^A-Za-z0-9_.]+", "-", text).strip("-.")[:60]
     if text and plain == text:
         return text

@@ -1,4 +1,4 @@
-"""The tables of a comparison: what stands in which row and column, and how a number is written."""
+"""Builds the tables of a comparison: their rows and columns, and how a number is written."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import pandas as pd
 
 from xrgs.experiment.store import BASELINE
-from xrgs.report.render import Grid
+from xrgs.report.render import TextTable
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
@@ -17,13 +17,15 @@ if TYPE_CHECKING:
     from xrgs.evaluation.metrics import Metric
     from xrgs.report.compare import Comparison
 
-#: An arrow tells improvement from degradation, as in the paper's tables, not larger from smaller.
+#: An arrow means improvement or degradation, as in the paper's tables, not larger or smaller.
 BETTER, WORSE, SAME = "↑", "↓", "="
+#: Longest list of seeds in a title; of more seeds it has the number.
+_MAX_LISTED = 8
 ARROWS_NOTE = f"{BETTER} improvement, {WORSE} degradation, {SAME} no change at this precision"
 
 
 class Change(NamedTuple):
-    """One row of `Comparison.means` or `.per_scene`."""
+    """One row of `Comparison.means` or `Comparison.per_scene`: the fields are its columns."""
 
     baseline: float
     value: float
@@ -38,7 +40,12 @@ class Change(NamedTuple):
 
 
 def number(value: float, unit: str) -> str:
-    """A value with its unit, at a precision that fits its size."""
+    """Write a value with its unit, at a precision that fits its size.
+
+    Args:
+        value: The value; NaN is written as n/a.
+        unit: Its unit, empty for none; bytes are written in MiB.
+    """
     if math.isnan(value):
         return "n/a"
     if unit == "bytes":
@@ -53,7 +60,11 @@ def number(value: float, unit: str) -> str:
 
 
 def signed(value: float) -> str:
-    """Two decimals with a sign, zero without; n/a for NaN."""
+    """Write a number with two decimals and a sign, zero without sign.
+
+    Args:
+        value: The number; NaN is written as n/a.
+    """
     if math.isnan(value):
         return "n/a"
     text = f"{value:+,.2f}"
@@ -61,7 +72,15 @@ def signed(value: float) -> str:
 
 
 def arrow(change: float, metric: Metric) -> str:
-    """Whether the printed change is an improvement, in the metric's own direction."""
+    """Return whether the printed change is an improvement, in the metric's own direction.
+
+    Args:
+        change: The change in percent.
+        metric: The metric that changed.
+
+    Returns:
+        `BETTER`, `WORSE`, `SAME` where the change is printed as 0.00, or a space for NaN.
+    """
     if math.isnan(change):
         return " "
     if signed(change) == "0.00":
@@ -70,12 +89,26 @@ def arrow(change: float, metric: Metric) -> str:
 
 
 def percent(change: float, metric: Metric) -> str:
-    """A change as the paper's tables print it: `-44.57 ↑`."""
+    """Write a change as the paper's tables do: `-44.57 ↑`.
+
+    Args:
+        change: The change in percent.
+        metric: The metric that changed.
+    """
     return f"{signed(change)} {arrow(change, metric)}"
 
 
 def reading(row: Change, metric: Metric) -> str:
-    """What the interval allows to be said."""
+    """Say in words what the interval shows.
+
+    Args:
+        row: The change with its interval.
+        metric: The metric that changed.
+
+    Returns:
+        `better` or `worse` where the interval does not contain 0, `inside noise` where it does,
+        `unchanged`, `one seed: no interval`, or `n/a` with the reason.
+    """
     if math.isnan(row.change):
         return f"n/a: {row.why}"
     if math.isnan(row.low):
@@ -88,12 +121,20 @@ def reading(row: Change, metric: Metric) -> str:
 
 
 def interval(row: Change) -> str:
-    """The 95 % interval of the change."""
+    """Write the 95 % interval of a change in percent, empty where there is none.
+
+    Args:
+        row: The change with its interval.
+    """
     return "" if math.isnan(row.low) else f"{signed(row.low)} to {signed(row.high)}"
 
 
 class Tables:
-    """Builds every table of one comparison."""
+    """Builds every table of one comparison.
+
+    Args:
+        comparison: The pairs of cells and their means.
+    """
 
     def __init__(self, comparison: Comparison) -> None:
         self.comparison = comparison
@@ -108,34 +149,34 @@ class Tables:
 
     @cached_property
     def _seeds(self) -> dict[tuple[str, str, str], list[int]]:
-        """Seeds of the pairs, by (label, condition, scene)."""
+        """The seeds of the pairs, by (label, condition, scene)."""
         pairs = self.comparison.pairs
         keys = zip(pairs["label"], pairs["condition"], pairs["scene"], strict=True)
-        found: dict[tuple[str, str, str], set[int]] = {}
+        seeds: dict[tuple[str, str, str], set[int]] = {}
         for key, seed in zip(keys, pairs["seed"], strict=True):
-            found.setdefault(key, set()).add(seed)
-        return {key: sorted(seeds) for key, seeds in found.items()}
+            seeds.setdefault(key, set()).add(seed)
+        return {key: sorted(values) for key, values in seeds.items()}
 
     def scenes_of(self, label: str, condition: str) -> list[str]:
-        """The scenes that gave at least one pair."""
+        """Return the scenes with at least one pair of this label and condition."""
         return [s for s in self.comparison.scenes if (label, condition, s) in self._seeds]
 
-    def overviews(self) -> list[Grid]:
-        """Every ablation beside the others, one table a condition, where there are several."""
-        grids = []
+    def overviews(self) -> list[TextTable]:
+        """Return a table of all ablations for each condition that has several."""
+        overviews = []
         for condition in dict.fromkeys(condition for _, condition in self.comparison.groups):
             labels = [name for name, other in self.comparison.groups if other == condition]
             if len(labels) > 1:
-                grids.append(self._overview(labels, condition))
-        return grids
+                overviews.append(self._overview(labels, condition))
+        return overviews
 
-    def _overview(self, labels: list[str], condition: str) -> Grid:
+    def _overview(self, labels: list[str], condition: str) -> TextTable:
         rows = tuple(
             (metric.label, *(self._cell(self._means.get((name, condition, metric.name)), metric)
                              for name in labels))
             for metric in self.comparison.metrics
         )  # fmt: skip
-        return Grid(
+        return TextTable(
             title=titled("Change from baseline, %, mean over scenes", condition),
             columns=("Metric", *labels),
             rows=rows,
@@ -147,8 +188,13 @@ class Tables:
     def _cell(row: Change | None, metric: Metric) -> str:
         return "failed  " if row is None else percent(row.change, metric)
 
-    def mean(self, label: str, condition: str) -> Grid:
-        """The paper's Table 1 for one ablation, and beside it what it leaves out."""
+    def mean(self, label: str, condition: str) -> TextTable:
+        """Return the paper's Table 1 for one ablation, with values, intervals and what they show.
+
+        Args:
+            label: The ablation.
+            condition: The condition that it was run under.
+        """
         rows = []
         notes = [ARROWS_NOTE]
         for metric in self.comparison.metrics:
@@ -168,7 +214,7 @@ class Tables:
             )
             if row.why and not math.isnan(row.change):
                 notes.append(f"{metric.label}: pairs left out ({row.why})")
-        return Grid(
+        return TextTable(
             title=titled(f"{label} against baseline: {self._extent(label, condition)}", condition),
             columns=("Metric", BASELINE, label, "change, %", "dB", "95 % interval, %", "reading"),
             rows=tuple(rows),
@@ -177,7 +223,7 @@ class Tables:
         )
 
     def _extent(self, label: str, condition: str) -> str:
-        """How many scenes and which seeds a mean is over."""
+        """Say how many scenes and which seeds a mean is over."""
         scenes = self.scenes_of(label, condition)
         seeds = sorted({n for s in scenes for n in self._seeds[label, condition, s]})
         of = "" if len(scenes) == len(self.comparison.scenes) else (
@@ -187,6 +233,7 @@ class Tables:
         return f"{names}, {_list('seed', seeds)}"
 
     def _interval_note(self, label: str, condition: str) -> tuple[str, ...]:
+        """Say what the intervals of a table are over; nothing where there are none."""
         units = [
             row.unit
             for metric in self.comparison.metrics
@@ -197,11 +244,16 @@ class Tables:
         if "scenes" not in units:
             return ("interval: Student's t over the seeds",)
         seeds = {len(self._seeds[label, condition, s]) for s in self.scenes_of(label, condition)}
-        alone = "; one seed: how runs differ is not told from how scenes do" * (seeds == {1})
+        alone = "; with one seed, differences of runs and of scenes are mixed" * (seeds == {1})
         return (f"interval: Student's t over the scenes' means{alone}",)
 
-    def per_scene(self, label: str, condition: str) -> Grid:
-        """One column a scene, failed ones too, and their mean."""
+    def per_scene(self, label: str, condition: str) -> TextTable:
+        """Return a table with one column for each scene, failed ones too, and their mean.
+
+        Args:
+            label: The ablation.
+            condition: The condition that it was run under.
+        """
         scenes = self.comparison.scenes
         rows: list[tuple[str, ...]] = []
         for metric in self.comparison.metrics:
@@ -215,7 +267,7 @@ class Tables:
                     for row in (*found, mean)
                 ]
                 rows.append((f"{metric.label}, dB", *absolute))
-        return Grid(
+        return TextTable(
             title=titled(f"{label}: change from baseline, scene by scene", condition),
             columns=("Metric", *scenes, "mean"),
             rows=tuple(rows),
@@ -223,8 +275,12 @@ class Tables:
             notes=(ARROWS_NOTE,),
         )
 
-    def values(self, condition: str) -> Grid:
-        """Every label's own values, means over the seeds that are done."""
+    def values(self, condition: str) -> TextTable:
+        """Return a table of each label's own values, means over the seeds that are done.
+
+        Args:
+            condition: The condition that the cells were run under.
+        """
         cells = self.comparison.cells
         done = cells[(cells["state"] == "done") & (cells["condition"] == condition)]
         labels = list(dict.fromkeys(cells.loc[cells["condition"] == condition, "label"]))
@@ -237,20 +293,20 @@ class Tables:
                 texts = ["failed" if v is None else number(v[metric.name], metric.unit)
                          for v in found]  # fmt: skip
                 rows.append((scene, metric.label, *texts))
-        return Grid(
+        return TextTable(
             title=titled("Values, means over the seeds that are done", condition),
             columns=("Scene", "Metric", *labels),
             rows=tuple(rows),
             align="ll" + "r" * len(labels),
         )
 
-    def missing(self) -> Grid | None:
-        """The cells that gave no number, and why; None where there are none."""
+    def missing(self) -> TextTable | None:
+        """Return a table of the cells without results and why; None where there are none."""
         rows = self.comparison.missing()
         if rows.empty:
             return None
         keys = ["scene", "label", "condition", "seed", "state", "reason"]
-        return Grid(
+        return TextTable(
             title=f"{len(rows)} of {len(self.comparison.cells)} cells gave no number",
             columns=("Scene", "Label", "Condition", "Seed", "State", "Reason"),
             rows=tuple(tuple(map(str, row)) for row in rows[keys].itertuples(index=False)),
@@ -258,7 +314,7 @@ class Tables:
         )
 
     def long(self) -> pd.DataFrame:
-        """Every change at full precision, one row a number: `table.csv`."""
+        """Return every change at full precision, one in each row, as in `table.csv`."""
         metrics = {metric.name: metric for metric in self.comparison.metrics}
         scenes = self.comparison.per_scene.reset_index()
         means = self.comparison.means.reset_index()
@@ -283,12 +339,18 @@ def _by_key(table: pd.DataFrame) -> dict[tuple[str, ...], Change]:
 
 
 def titled(text: str, condition: str) -> str:
-    """A heading that names the condition, where there is one."""
+    """Return a heading that names the condition, where there is one.
+
+    Args:
+        text: The heading.
+        condition: The condition; empty for none.
+    """
     return f"{text} ({condition})" if condition else text
 
 
 def _list(word: str, values: Iterable[int]) -> str:
+    """List values after their name, `seeds 0, 1`; of many, say only how many there are."""
     texts = [str(value) for value in values]
-    if len(texts) > 8:
+    if len(texts) > _MAX_LISTED:
         return f"{len(texts)} {word}s"
     return f"{word}{'s' * (len(texts) > 1)} {', '.join(texts)}"

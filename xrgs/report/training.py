@@ -1,6 +1,7 @@
-"""What training did: where to look when a component changes nothing, or harms.
+"""Tables of what training did, to see why a component changes nothing or makes results worse.
 
-Steps on views of each tag, what each rule of densification did, and what components noted.
+They count steps on views of each tag and what each rule of densification did, and have the means of
+what components logged.
 """
 
 from __future__ import annotations
@@ -10,7 +11,7 @@ from typing import TYPE_CHECKING
 
 import pandas as pd
 
-from xrgs.report.render import Grid
+from xrgs.report.render import TextTable
 from xrgs.safeio.records import as_number, read_table
 
 if TYPE_CHECKING:
@@ -28,21 +29,24 @@ _LABELS = {
     "pruned_non_finite": "Pruned: not finite",
     "reset": "Opacities reset",
 }
-#: Of a logged step, and not of the training up to it.
-_OF_ONE_STEP = frozenset({"step", "view", "loss", "gaussians"})
+#: Columns of a history that describe the logged step alone, not the training up to it.
+_SINGLE_STEP_COLUMNS = frozenset({"step", "view", "loss", "gaussians"})
 
 
 def totals(store: Store, cells: pd.DataFrame) -> pd.DataFrame:
-    """What training did in every cell that is done.
+    """Return what training did in each cell that is done.
 
     Args:
-        store: that holds them.
-        cells: `Comparison.cells`.
+        store: The store that holds the cells.
+        cells: The table `Comparison.cells`.
 
     Returns:
-        One row a cell: `cell_id`, `scene`, `label`, `condition`, `seed`, and a column for each
-        count of its history (over the whole of training) and each note of a component (its mean
-        over training); NaN where a cell has none.
+        One row for each cell: `cell_id`, `scene`, `label`, `condition`, `seed`, and a column for
+        each count of its history (over the whole training) and each value that a component logged
+        (its mean over training); NaN where a cell has none.
+
+    Raises:
+        StoreError: A cell's history can't be read; the message names it.
     """
     done = cells[cells["state"] == "done"].drop_duplicates("cell_id")
     keys = done[["cell_id", "scene", "label", "condition", "seed"]].reset_index(drop=True)
@@ -53,59 +57,62 @@ def _totals(cell: CellFolder) -> dict[str, float]:
     header, rows = read_table(cell.path / "history.csv")
     if not rows:
         return {}
-    found = {}
-    for at, name in enumerate(header):
-        if name in _OF_ONE_STEP:
+    result = {}
+    for column, name in enumerate(header):
+        if name in _SINGLE_STEP_COLUMNS:
             continue
-        if _is_note(name):
-            values = [as_number(row[at]) for row in rows if row[at]]
+        if _is_component_log(name):
+            values = [as_number(row[column]) for row in rows if row[column]]
             if values:
-                found[name] = fmean(values)
+                result[name] = fmean(values)
         else:
-            found[name] = as_number(rows[-1][at])  # counted from the first step on
-    return found
+            result[name] = as_number(rows[-1][column])  # counts start at the first step
+    return result
 
 
-def _is_note(name: str) -> bool:
-    """Components put their own name and a dot before what they note."""
+def _is_component_log(name: str) -> bool:
+    """Return whether a component logged this column: a dot ends the component's name in it."""
     return "." in name
 
 
-def table(totals: pd.DataFrame, labels: Sequence[str], condition: str) -> Grid:
-    """The totals of one condition, scene by scene, means over seeds.
+def table(totals: pd.DataFrame, labels: Sequence[str], condition: str) -> TextTable:
+    """Return the totals of one condition, scene by scene, as means over seeds.
 
     Args:
-        totals: of `totals`.
-        labels: the columns, in order.
-        condition: which.
+        totals: The table that `totals` returns.
+        labels: The labels of the columns, in order.
+        condition: The condition that the cells were run under.
     """
-    found = totals[totals["condition"] == condition]
-    names = [name for name in _ordered(totals) if found[name].notna().any()]
-    means = found.groupby(["scene", "label"])[names].mean().to_dict("index")
+    chosen = totals[totals["condition"] == condition]
+    names = [name for name in _ordered(totals) if chosen[name].notna().any()]
+    means = chosen.groupby(["scene", "label"])[names].mean().to_dict("index")
     rows = []
-    for scene in sorted(found["scene"].unique()):
+    for scene in sorted(chosen["scene"].unique()):
         of_scene = [means.get((scene, label), {}) for label in labels]
         for name in names:
-            texts = [_text(values.get(name), note=_is_note(name)) for values in of_scene]
+            texts = [
+                _text(values.get(name), is_component_log=_is_component_log(name))
+                for values in of_scene
+            ]
             if any(texts):
                 rows.append((scene, _LABELS.get(name, name.replace("_", " ")), *texts))
     title = "What training did, means over the seeds that are done"
-    return Grid(
+    return TextTable(
         title=f"{title} ({condition})" if condition else title,
         columns=("Scene", "", *labels),
         rows=tuple(rows),
         align="ll" + "r" * len(labels),
-        notes=("names with a dot: a component's own notes, their mean over training",),
+        notes=("names with a dot: values that a component logged, means over training",),
     )
 
 
 def _ordered(totals: pd.DataFrame) -> list[str]:
-    """The columns that are numbers: known ones, then the components', each in their order."""
+    """Return the columns of numbers: known ones, then the components', each in their own order."""
     numbers = [*totals.columns[5:]]
-    return sorted(numbers, key=lambda name: (name not in _LABELS, _is_note(name)))
+    return sorted(numbers, key=lambda name: (name not in _LABELS, _is_component_log(name)))
 
 
-def _text(value: float | None, *, note: bool) -> str:
+def _text(value: float | None, *, is_component_log: bool) -> str:
     if value is None or pd.isna(value):
         return ""
-    return f"{value:.4g}" if note else f"{value:,.0f}"
+    return f"{value:.4g}" if is_component_log else f"{value:,.0f}"

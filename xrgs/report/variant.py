@@ -1,4 +1,4 @@
-"""A variant at a glance: its views and how SfM went as text, and every view on one sheet."""
+"""Describes a variant for `xrgs-data inspect`: its views, how SfM went, and a contact sheet."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 from xrgs.capture import variant
 from xrgs.capture.contact_sheet import contact_sheet
 from xrgs.errors import XrgsError
-from xrgs.report.render import Grid, to_text
+from xrgs.report.render import TextTable, to_text
 from xrgs.safeio.records import read_json
 from xrgs.safeio.untrusted import printable
 
@@ -17,21 +17,21 @@ if TYPE_CHECKING:
 
     from xrgs.capture.views import Variant
 
-_PLACED, _LOST = "yes", "no"
+_REGISTERED, _NOT_REGISTERED = "yes", "no"
 
 
 def describe(folder: Path, out: Path | None = None) -> str:
-    """Describe a frozen variant and draw its contact sheet; of a failed one, why it failed.
+    """Describe a frozen variant and draw its contact sheet; for a failed one, say why it failed.
 
     Args:
-        folder: Of the variant, in a store; or the `failed-...` folder that a failed one left.
-        out: The sheet's PNG; None: `<folder's name>.png` here.
+        folder: The variant's folder in a store, or the `failed-...` folder of one that failed.
+        out: The PNG of the contact sheet; None writes `<variant id>.png` to the current folder.
 
     Returns:
         Tables and lines for a terminal.
 
     Raises:
-        XrgsError: not a variant, or not what was frozen; or the sheet can't be written.
+        XrgsError: The folder is not a variant or has changed, or the sheet can't be written.
     """
     if not folder.is_dir():
         raise XrgsError(f"{folder}: no such folder; variants are in <store>/variants/")
@@ -40,21 +40,21 @@ def describe(folder: Path, out: Path | None = None) -> str:
         return _lines(
             folder, report, lambda: f"{report.get('scene')}: failed, so there are no views"
         )
-    found = variant.load(folder)
-    file = out or Path(f"{found.id}.png")
+    frozen = variant.load(folder)
+    file = out or Path(f"{frozen.id}.png")
     try:
-        contact_sheet(found).save(file, "PNG")
+        contact_sheet(frozen).save(file, "PNG")
     except OSError as error:
         raise XrgsError(f"out={file}: can't be written ({error})") from error
-    text = _lines(folder, found.report, lambda: to_text(views_table(found)))
+    text = _lines(folder, frozen.report, lambda: to_text(views_table(frozen)))
     return f"{text}\nContact sheet: {file}"
 
 
 def _lines(folder: Path, report: Mapping[str, Any], first: Callable[[], str]) -> str:
-    """What there is to say, with how SfM went.
+    """Return the first part and how SfM went.
 
     Raises:
-        XrgsError: the report is none of ours.
+        XrgsError: The report is malformed.
     """
     try:
         return "\n".join([first(), *map(printable, _sfm(report))])
@@ -62,34 +62,38 @@ def _lines(folder: Path, report: Mapping[str, Any], first: Callable[[], str]) ->
         raise XrgsError(f"{folder / 'report.json'}: not a variant's report ({error!r})") from error
 
 
-def views_table(found: Variant) -> Grid:
-    """One row a photograph that is trained on or held out, by name; those not placed too."""
+def views_table(frozen: Variant) -> TextTable:
+    """Return a table of the photographs that are trained on or held out, by name.
+
+    Args:
+        frozen: The variant; photographs that SfM did not register are in the table too.
+    """
     rows = [
-        (v.name, v.split, v.tag, f"{v.width} x {v.height}", f"{v.rho:.3f}", _PLACED)
-        for v in found.views
+        (v.name, v.split, v.tag, f"{v.width} x {v.height}", f"{v.rho:.3f}", _REGISTERED)
+        for v in frozen.views
         if v.split != "original"
     ]
-    low = set(found.report.get("lr", ()))
-    trained = low | set(found.report.get("hr", ()))
-    for name in found.report.get("not_registered", ()):
+    low = set(frozen.report.get("lr", ()))
+    trained = low | set(frozen.report.get("hr", ()))
+    for name in frozen.report.get("not_registered", ()):
         split = "train" if name in trained else "test"
-        rows.append((name, split, "LR" if name in low else "HR", "", "", _LOST))
+        rows.append((name, split, "LR" if name in low else "HR", "", "", _NOT_REGISTERED))
     columns = ("View", "Split", "Tag", "Size, px", "rho", "Placed")
-    title = f"{found.scene}, variant {found.id}, factor {found.factor}"
-    return Grid(title, columns, tuple(sorted(rows)), "lllrrl", tuple(_counts(found)))
+    title = f"{frozen.scene}, variant {frozen.id}, factor {frozen.factor}"
+    return TextTable(title, columns, tuple(sorted(rows)), "lllrrl", tuple(_counts(frozen)))
 
 
-def _counts(found: Variant) -> Iterator[str]:
-    train = [view.tag for view in found.views if view.split == "train"]
-    tests = sum(view.split == "test" for view in found.views)
-    kind = "held out" if found.held_out else "tests, at the trained poses"
+def _counts(frozen: Variant) -> Iterator[str]:
+    train = [view.tag for view in frozen.views if view.split == "train"]
+    tests = sum(view.split == "test" for view in frozen.views)
+    kind = "held out" if frozen.held_out else "tests, at the trained poses"
     yield f"{train.count('HR')} HR and {train.count('LR')} LR to train on, {tests} {kind}"
-    if originals := sum(view.split == "original" for view in found.views):
+    if originals := sum(view.split == "original" for view in frozen.views):
         yield f"originals of degraded views kept beside them: {originals}"
 
 
 def _sfm(report: Mapping[str, Any]) -> Iterator[str]:
-    """How SfM went, as far as the report tells."""
+    """Yield lines on how SfM went, as far as the report has them."""
     yield (
         f"SfM: {report.get('registered', 0)} of {report.get('images', '?')} views placed, "
         f"{report.get('points', 0)} points"

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
@@ -56,3 +58,46 @@ class Camera:
     def position(self) -> Tensor:
         """The camera's centre [3], world units."""
         return -self.viewmat[:3, :3].T @ self.viewmat[:3, 3]  # [3]
+
+    @classmethod
+    def look_at(
+        cls,
+        position: Sequence[float],
+        target: Sequence[float],
+        *,
+        width: int,
+        height: int,
+        fov: float = 50.0,
+        up: Sequence[float] = (0.0, 0.0, 1.0),
+    ) -> Camera:
+        """Return a camera that stands at a position and looks at a target.
+
+        Args:
+            position: Where the camera stands: x, y, z in world units.
+            target: What it looks at, which becomes the centre of the image: x, y, z in world units.
+            width: Width of the image, px.
+            height: Height of the image, px.
+            fov: Horizontal field of view, degrees, above 0 and below 180.
+            up: The direction in the world that points up in the image, of any length.
+
+        Returns:
+            The camera, float32, with square pixels.
+
+        Raises:
+            ValueError: `fov` is out of range, the position is the target, or `up` is along the
+                line between them.
+        """
+        if not 0 < fov < 180:
+            raise ValueError(f"fov must be above 0 and below 180 degrees, got {fov}")
+        start, end, upward = (torch.tensor(v, dtype=torch.float64) for v in (position, target, up))
+        forward = end - start
+        right = torch.linalg.cross(forward, upward)
+        if right.norm() <= 1e-9 * forward.norm() * upward.norm():
+            raise ValueError("look_at: up must not be along the line from position to target")
+        down = torch.linalg.cross(forward, right)
+        rotation = torch.stack([axis / axis.norm() for axis in (right, down, forward)])  # [3, 3]
+        viewmat = torch.eye(4)
+        viewmat[:3, :3], viewmat[:3, 3] = rotation, -rotation @ start
+        focal = 0.5 * width / math.tan(math.radians(fov) / 2)
+        K = torch.tensor([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]])
+        return cls(viewmat, K, width, height)

@@ -64,6 +64,36 @@ class Gaussians:
             raise KeyError(name)
         setattr(self, name, value)
 
+    @classmethod
+    def from_points(
+        cls,
+        points: Tensor | NDArray[np.float64],
+        colors: Tensor | NDArray[np.uint8],
+        *,
+        init_opacity: float = 0.1,
+        sh_degree: int = 3,
+        generator: torch.Generator | None = None,
+    ) -> Gaussians:
+        """Start Gaussians on the points of a point cloud, one a point.
+
+        Args:
+            points: [P, 3] world units, at least 4 points.
+            colors: [P, 3], 8-bit, or floats in 0..1.
+            init_opacity: Opacity of each, between 0 and 1 (gsplat's default).
+            sh_degree: Highest band of the spherical harmonics that is stored, 0 to 3.
+            generator: Draws the quaternions; None takes one with seed 0.
+
+        Returns:
+            P Gaussians, float32, with gradients on.
+
+        Raises:
+            ValueError: As the function `from_points`, which does the work.
+        """
+        generator = generator or torch.Generator().manual_seed(0)
+        return from_points(
+            points, colors, init_opacity=init_opacity, sh_degree=sh_degree, generator=generator
+        )
+
     def activated(self) -> ActivatedGaussians:
         """Apply the activation functions: exp to scales, the logistic function to opacities.
 

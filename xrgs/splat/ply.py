@@ -26,12 +26,18 @@ _MAGIC = b"ply\n"
 _FORMAT = "format binary_little_endian 1.0"
 
 
-def save_ply(path: Path, gaussians: Gaussians) -> None:
-    """Write Gaussians to `path`, replacing it.
+def save_ply(path: str | Path, gaussians: Gaussians) -> None:
+    """Write Gaussians to a .ply file, replacing it.
+
+    Args:
+        path: The file to write.
+        gaussians: The N Gaussians; they are written as float32, in raw parameters (logarithms of
+            scales, logits of opacities).
 
     Raises:
-        OSError: the file cannot be written.
+        OSError: The file can't be written.
     """
+    path = Path(path)
     count = len(gaussians)
     columns = [
         gaussians.means,
@@ -50,10 +56,11 @@ def save_ply(path: Path, gaussians: Gaussians) -> None:
         file.write(table.numpy().astype("<f4").tobytes())
 
 
-def load_ply(path: Path) -> Gaussians:
+def load_ply(path: str | Path) -> Gaussians:
     """Read Gaussians that `save_ply`, or any 3D Gaussian Splatting trainer, wrote.
 
-    Properties may come in any order; others than float32 ones are not read.
+    Args:
+        path: The .ply file; its properties may come in any order, all of them float32.
 
     Returns:
         float32 leaf tensors with gradients on.
@@ -61,6 +68,7 @@ def load_ply(path: Path) -> Gaussians:
     Raises:
         XrgsError: the file is missing, truncated or not such a .ply; the message names it.
     """
+    path = Path(path)
     if not path.is_file():  # a named pipe would be waited for
         raise XrgsError(f"{path}: cannot be read: there is no such file")
     try:

@@ -74,7 +74,7 @@ def _groups(identity: Mapping[str, Any]) -> Iterator[str]:
 
 def _newest(store: Store) -> list[CellFolder]:
     try:
-        with os.scandir(store.cells) as entries:
+        with os.scandir(store.cells_folder) as entries:
             # Names with a dot are of folders that were set aside, and of reruns.
             cells = [entry for entry in entries if "." not in entry.name]
             ids = [(entry.stat().st_mtime, entry.name) for entry in cells]

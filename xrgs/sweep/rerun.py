@@ -298,7 +298,7 @@ def _score_differences(original: CellFolder, repeated: CellFolder) -> Iterator[s
 def _scores(cell: CellFolder) -> dict[tuple[str, str], float]:
     """Return the scores by view and metric, NaN where one is missing; empty if unreadable."""
     try:
-        scores = cell.scores()
+        scores = cell.view_scores()
     except StoreError:
         return {}
     return {(view, name): value for view, row in scores for name, value in row.items()}

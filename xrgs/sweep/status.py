@@ -71,11 +71,11 @@ def read(path: Path, *, verify: bool = False) -> StoreStatus:
         StoreError: There is no such store.
     """
     store = Store(path)
-    if not store.cells.is_dir():
+    if not store.cells_folder.is_dir():
         raise StoreError(f"store={path} is not a store; xrgs-sweep makes one")
     names, sweeps = _names(store)
     holders = locks.holders(store.locks)
-    ids = sorted(entry.name for entry in os.scandir(store.cells) if entry.is_dir())
+    ids = sorted(entry.name for entry in os.scandir(store.cells_folder) if entry.is_dir())
     cells = [name for name in ids if "." not in name]
     return StoreStatus(
         path,

@@ -106,7 +106,7 @@ class Study:
         if dry_run:
             return True
         _tidy({cell.cell_id for cell in plan if cell.cell_id and cell.state.name == "done"}, store)
-        with SweepMonitor(store.cells) as monitor:
+        with SweepMonitor(store.cells_folder) as monitor:
             plan = self._run_until_complete(plan, store, monitor)
         plan = [_without_reference(cell) for cell in plan]
         sweep_id = store.write_sweep(arguments, record(plan))

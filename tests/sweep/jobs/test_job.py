@@ -190,7 +190,7 @@ def test_no_job_begins_for_a_sweep_whose_process_has_ended(
 ) -> None:
     cell_id = session.hand_over(hand_over_of())
     assert run_job(ended(session), cell_id) == STOPPED
-    assert not list(store.cells.iterdir())
+    assert not list(store.cells_folder.iterdir())
 
 
 @pytest.mark.parametrize(
@@ -214,7 +214,7 @@ def test_a_cell_ends_with_its_sweep_or_its_lock_and_is_unfinished(
 
     monkeypatch.setattr(worker, "run_in_child", train)
     assert run_job(session, session.hand_over(hand_over_of())) == outcome
-    (cell,) = store.cells.iterdir()
+    (cell,) = store.cells_folder.iterdir()
     assert store.cell(cell.name).state().name == "unfinished"
     assert not list(store.locks.iterdir())
 

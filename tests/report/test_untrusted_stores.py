@@ -1,4 +1,4 @@
-"""A store that somebody else has made up: reported, or refused by an error that names the file."""
+"""A store of unknown origin is reported, or refused by an error that names the file."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import hashlib
 import json
 import os
 import shutil
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -14,8 +15,9 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from xrgs.errors import XrgsError
-from xrgs.experiment.store import CellFolder, Store, StoreError
+from xrgs.experiment.store import CellFolder, Store
 from xrgs.report import build, page
+from xrgs.safeio.records import StoreError
 from xrgs.sweep.estimate import RuntimeEstimator
 from xrgs.sweep.status import describe, read
 
@@ -36,7 +38,7 @@ FILES = ("sweep", "status", "identity", "summary", "config", "provenance", "scor
 
 
 def places(document: Any) -> list[tuple[Any, Any]]:
-    """Every value in a document, as what holds it and its key there."""
+    """Every value in a document, as its container and its key there."""
     found = []
     for key in list(document) if isinstance(document, dict) else range(len(document)):
         found.append((document, key))
@@ -46,7 +48,7 @@ def places(document: Any) -> list[tuple[Any, Any]]:
 
 
 def forge(file: Path, place: int, value: Any) -> None:
-    """Put a value into a .json or a .csv, in place of one that is there."""
+    """Replace one value of a .json or .csv file."""
     if file.suffix == ".json":
         document = [json.loads(file.read_text())]
         holder, key = (found := places(document))[place % len(found)]
@@ -61,7 +63,7 @@ def forge(file: Path, place: int, value: Any) -> None:
 
 
 def declared(cell: CellFolder) -> None:
-    """Have the cell's status tell of its files as they are now."""
+    """Update the sizes and hashes in the cell's status to its files as they are now."""
     status = json.loads((cell.path / "status.json").read_text())
     for name in status["files"]:
         content = (cell.path / name).read_bytes()
@@ -85,7 +87,7 @@ def store(made: Any) -> Store:
 @settings(
     max_examples=20, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
 )
-def test_whatever_a_store_says_ends_in_a_report_or_an_error_of_ours(
+def test_any_content_of_a_store_gives_a_report_or_an_xrgs_error(
     store: Store, monkeypatch: pytest.MonkeyPatch, name: str, place: int, value: Any, raw: bool
 ) -> None:
     monkeypatch.setattr(page, "draw", lambda *_: [])
@@ -104,7 +106,12 @@ def test_whatever_a_store_says_ends_in_a_report_or_an_error_of_ours(
         forge(file, place, value)
     if name not in {"sweep", "status"}:
         declared(cell)
-    for look in (lambda: build(copy.path).text, lambda: describe(read(copy.path, verify=True))):
+    looks: tuple[Callable[[], str], ...] = (
+        lambda: build(copy.path).text,
+        lambda: describe(read(copy.path, verify=True)),
+        lambda: copy.cells().to_csv(),
+    )
+    for look in looks:
         try:
             text = look()
         except XrgsError as error:
@@ -147,7 +154,7 @@ def test_links_and_pipes_are_not_read(store: Store) -> None:
     (cell.path / "status.json").unlink()
     os.mkfifo(cell.path / "status.json")
     assert "not a regular file" in cell.state().reason
-    (store.cells / "link").symlink_to(other.path)
+    (store.cells_folder / "link").symlink_to(other.path)
     assert store.cell("link").state().name == "corrupt"
     assert "2 corrupt" in describe(read(store.path))
 

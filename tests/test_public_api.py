@@ -1,0 +1,63 @@
+"""`import xrgs`: every public name is there, documented, and imported when it is first used."""
+
+from __future__ import annotations
+
+import ast
+import inspect
+import subprocess
+import sys
+from pathlib import Path
+from types import ModuleType
+
+import pytest
+
+import xrgs
+
+HEAVY = ("torch", "pandas", "numpy", "hydra", "kornia", "pycolmap", "matplotlib", "skimage")
+#: Names for planning and for looking at results; using them must not import torch.
+WITHOUT_TORCH = ("RasterSettings", "Store", "XrgsError", "compose")
+
+
+def test_import_is_light() -> None:
+    script = f"import sys, xrgs; dir(xrgs); print(*sorted(set({HEAVY}) & set(sys.modules)))"
+    light = "; ".join(f"xrgs.{name}" for name in WITHOUT_TORCH)
+    script += f"; {light}; print('torch' in sys.modules)"
+    done = subprocess.run(
+        [sys.executable, "-P", "-c", script], capture_output=True, text=True, check=True
+    )
+    assert done.stdout.splitlines() == ["", "False"]
+
+
+def static_imports() -> dict[str, str]:
+    """The public names that type checkers see, with their modules."""
+    tree = ast.parse(Path(xrgs.__file__).read_text(encoding="utf-8"))
+    block = next(node for node in tree.body if isinstance(node, ast.If))
+    modules: dict[str, str] = {}
+    for node in block.body:
+        assert isinstance(node, ast.ImportFrom)
+        modules |= {alias.name: str(node.module) for alias in node.names}
+    return modules
+
+
+def test_type_checkers_and_python_see_the_same_names() -> None:
+    assert static_imports() == xrgs._MODULES
+    assert sorted(xrgs.__all__) == sorted(xrgs._MODULES)
+    assert set(xrgs.__all__) <= set(dir(xrgs))
+
+
+@pytest.mark.parametrize("name", xrgs.__all__)
+def test_every_name_is_there_and_documented(name: str) -> None:
+    value = getattr(xrgs, name)
+    assert not isinstance(value, ModuleType)
+    assert value.__name__ == name
+    assert value.__module__ == xrgs._MODULES[name] or inspect.isfunction(value)
+    text = inspect.getdoc(value) or ""
+    assert text.splitlines()[0].endswith(".")
+    if inspect.isfunction(value):
+        names = [p for p in inspect.signature(value).parameters if p not in {"args", "kwargs"}]
+        assert all(f"{parameter}:" in text for parameter in names), f"{name} lacks Args"
+
+
+def test_an_unknown_name_is_an_attribute_error() -> None:
+    with pytest.raises(AttributeError, match="module 'xrgs' has no attribute 'rasterise'"):
+        xrgs.rasterise  # noqa: B018

@@ -1,0 +1,51 @@
+"""Datasets for `train` from Python: of a config, which builds what is missing, or of a folder."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from xrgs.capture import dataset, variant
+
+if TYPE_CHECKING:
+    from xrgs.capture.dataset import Dataset
+    from xrgs.config import Conf
+
+
+def build_dataset(conf: Conf) -> Dataset:
+    """Load the views of a config, building their variant in its store where it is missing.
+
+    Building takes minutes: COLMAP places the views. A variant is built once; the next call, and any
+    sweep with the same scene and variant, finds it.
+
+    Args:
+        conf: The config, as `compose` gives it; `scene`, `variant`, `store` and `train.views` are
+            read.
+
+    Returns:
+        Photographs, cameras and points, in the normalised world that training takes place in.
+
+    Raises:
+        SceneFailed: COLMAP can't place enough views.
+        XrgsError: A value of the config or a photograph is wrong; the message names it.
+    """
+    store = Path(conf.store)
+    built = variant.build(conf.scene, conf.variant, store / "variants", store / "scenes")
+    return dataset.load(built, conf.train.views)
+
+
+def load_dataset(folder: str | Path, views: str = "mixed") -> Dataset:
+    """Load the views of a variant that a sweep has built.
+
+    Args:
+        folder: The variant's folder, `<store>/variants/<variant id>`.
+        views: Which training views: `mixed`, `all_hr`, `hr_only` or `lr_only` (`train.views`).
+
+    Returns:
+        Photographs, cameras and points, in the normalised world that training takes place in.
+
+    Raises:
+        CorruptVariant: The folder is not a variant, or a file in it has changed.
+        XrgsError: `views` is none of these, or the variant has no such views.
+    """
+    return dataset.load(variant.load(Path(folder)), views)

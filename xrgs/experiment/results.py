@@ -1,0 +1,127 @@
+"""The files of cells as pandas tables and Python objects: what `Store` and `CellFolder` hand out.
+
+The files are read as untrusted: nothing in them is run, and no name in them leads out of the store.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import pandas as pd
+
+from xrgs.evaluation.metrics import METRICS
+from xrgs.safeio.records import StoreError, as_number, read_object
+from xrgs.safeio.untrusted import is_name, printable
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Iterator, Mapping
+    from pathlib import Path
+
+    from xrgs.capture.dataset import Dataset
+
+#: What a sweep's record names a cell by.
+CELL_NAMES = ("scene", "label", "condition")
+#: Groups of a cell's config that become columns; the others do not change a number.
+_CONFIG_GROUPS = ("scene", "variant", "splat", "train", "components")
+
+
+def cells_table(rows: Iterable[Mapping[str, Any]]) -> pd.DataFrame:
+    """Make the table of `Store.cells`.
+
+    Args:
+        rows: One mapping a cell: the values of `cell_columns`, with `state` and `reason`.
+
+    Returns:
+        The cells sorted by scene, label, condition, seed and id, with the config's columns last.
+    """
+    rows = list(rows)
+    metrics = [metric.name for metric in METRICS]
+    leading = ["cell_id", *CELL_NAMES, "seed", "variant", "state", "reason", *metrics]
+    config = dict.fromkeys(key for row in rows for key in row if key not in leading)
+    table = pd.DataFrame(rows, columns=[*leading, *config])
+    table[metrics] = table[metrics].astype("float64")
+    table["seed"] = table["seed"].astype("Int64")
+    return table.sort_values([*CELL_NAMES, "seed", "cell_id"], ignore_index=True)
+
+
+def cell_columns(folder: Path, names: Mapping[str, str]) -> dict[str, Any]:
+    """Return what a cell's `identity.json` and `config.json` say of it, as columns of a table.
+
+    Args:
+        folder: The cell's folder; a file that is missing in it gives no columns.
+        names: Scene, label and condition in the record of a sweep; empty where there is none.
+    """
+    identity, config = (_object(folder / name) for name in ("identity.json", "config.json"))
+    seed, variant = identity.get("seed"), identity.get("variant")
+    settings = dict(_flat({name: config.get(name) for name in _CONFIG_GROUPS}))
+    return {
+        **{key: value for key, value in settings.items() if "." in key},
+        "cell_id": folder.name,
+        "scene": names.get("scene") or settings.get("scene.name"),
+        "label": names.get("label"),
+        "condition": names.get("condition"),
+        "seed": seed if type(seed) is int and abs(seed) < 1 << 63 else None,
+        "variant": variant if is_name(variant) else None,
+    }
+
+
+def _object(file: Path) -> dict[str, Any]:
+    """Read a JSON file of values under names; empty where it can't be read."""
+    try:
+        return read_object(file)
+    except StoreError:
+        return {}
+
+
+def _flat(values: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
+    """Yield nested values under dotted names, as `train.steps`."""
+    for name, value in values.items():
+        key = printable(f"{prefix}{name}")
+        if isinstance(value, dict):
+            yield from _flat(value, f"{key}.")
+        else:
+            yield key, printable(value) if isinstance(value, str) else value
+
+
+def cell_metrics(folder: Path, scores: pd.DataFrame) -> dict[str, float]:
+    """Return the metrics of a finished cell, by name.
+
+    Args:
+        folder: The cell's folder.
+        scores: The scores of its test views, as `CellFolder.scores` returns them.
+
+    Returns:
+        Numbers of the whole cell from `summary.json`, and the means of scores over the test views;
+        a score that one view lacks has no mean (NaN).
+    """
+    summary, means = _object(folder / "summary.json"), scores.mean(skipna=False)
+    metrics = {}
+    for metric in METRICS:
+        if metric.name in means:
+            metrics[metric.name] = float(means[metric.name])
+        elif metric.name in summary:
+            try:
+                metrics[metric.name] = as_number(summary[metric.name])
+            except ValueError:
+                continue
+    return metrics
+
+
+def load_dataset(folder: Path) -> Dataset:
+    """Load the views that a cell was trained and tested on; see `CellFolder.dataset`.
+
+    Args:
+        folder: The cell's folder, `<store>/cells/<id>`.
+
+    Raises:
+        StoreError: `identity.json` can't be read, or names no variant or views.
+        XrgsError: The variant is not in the store, or is damaged.
+    """
+    from xrgs.capture import dataset, variant
+
+    identity = read_object(folder / "identity.json")
+    variant_id, train = identity.get("variant"), identity.get("train")
+    views = train.get("views") if isinstance(train, dict) else None
+    if not isinstance(variant_id, str) or not is_name(variant_id) or not isinstance(views, str):
+        raise StoreError(f"{folder / 'identity.json'}: it names no variant or no train.views")
+    return dataset.load(variant.load(folder.parents[1] / "variants" / variant_id), views)

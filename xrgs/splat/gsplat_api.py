@@ -1,0 +1,441 @@
+"""gsplat's `rasterization` on the CPU: the signature and the results of gsplat 1.5.3.
+
+Code that calls `gsplat.rasterization` on a GPU runs here by importing it from `xrgs` instead. What
+is not served is refused by an error that names the argument.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple, get_args
+
+import torch
+from torch.nn.functional import pad
+
+from xrgs.splat.cameras import Camera
+from xrgs.splat.rasterize import rasterize as rasterize_parameters
+from xrgs.splat.rendering import backend_for
+from xrgs.splat.settings import RasterSettings
+from xrgs.splat.sh import C0, MAX_DEGREE, bases
+from xrgs.splat.torch.projection import depths as camera_depths
+from xrgs.splat.torch.projection import project
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+RenderMode = Literal["RGB", "D", "ED", "RGB+D", "RGB+ED"]
+RasterizeMode = Literal["classic", "antialiased"]
+
+#: Constants of gsplat 1.5.3's kernels (`RasterizeToPixels3DGSFwd.cu`, `ProjectionEWA3DGSFused.cu`).
+ALPHA_MIN, ALPHA_MAX, TRANSMITTANCE_MIN = 1.0 / 255.0, 0.999, 1e-4
+MAX_RADIUS_SIGMAS = 3.33
+MIN_DEPTH_ALPHA = 1e-10
+"""Alpha that the expected depth is divided by at least."""
+
+
+class _Shapes(NamedTuple):
+    """What decides where the Gaussians are drawn, and how opaque they are."""
+
+    means: Tensor  # [N, 3]
+    quats: Tensor  # [N, 4]
+    scales: Tensor  # [N, 3]
+    opacities: Tensor  # [N]
+
+
+class _Projections(NamedTuple):
+    """All Gaussians on the image planes of C cameras; zeros where a Gaussian is not drawn."""
+
+    radii: Tensor  # [C, N, 2] int32, px
+    means2d: Tensor  # [C, N, 2] px
+    depths: Tensor  # [C, N] world units
+    conics: Tensor  # [C, N, 3] xx, xy, yy of the inverse covariance, 1 / px^2
+    opacities: Tensor  # [C, N], compensated if antialiased
+
+
+def rasterization(
+    means: Tensor,
+    quats: Tensor,
+    scales: Tensor,
+    opacities: Tensor,
+    colors: Tensor,
+    viewmats: Tensor,
+    Ks: Tensor,
+    width: int,
+    height: int,
+    near_plane: float = 0.01,
+    far_plane: float = 1e10,
+    radius_clip: float = 0.0,
+    eps2d: float = 0.3,
+    sh_degree: int | None = None,
+    packed: bool = True,
+    tile_size: int = 16,
+    backgrounds: Tensor | None = None,
+    render_mode: RenderMode = "RGB",
+    sparse_grad: bool = False,
+    absgrad: bool = False,
+    rasterize_mode: RasterizeMode = "classic",
+    channel_chunk: int = 32,  # noqa: ARG001 - changes gsplat's speed alone
+    distributed: bool = False,
+    camera_model: str = "pinhole",
+    segmented: bool = False,  # noqa: ARG001 - changes gsplat's speed alone
+    covars: Tensor | None = None,
+    with_ut: bool = False,
+    with_eval3d: bool = False,
+    radial_coeffs: Tensor | None = None,
+    tangential_coeffs: Tensor | None = None,
+    thin_prism_coeffs: Tensor | None = None,
+    ftheta_coeffs: object = None,
+    rolling_shutter: object = None,
+    viewmats_rs: Tensor | None = None,
+    *,
+    backend: str = "auto",
+) -> tuple[Tensor, Tensor, dict[str, Any]]:
+    """Render Gaussians into C cameras as `gsplat.rasterization` of gsplat 1.5.3 does.
+
+    The results are differentiable in means, quats, scales, opacities, colors and backgrounds.
+    Each camera is rendered on its own, three channels at a time: RGB+D and RGB+ED take two passes
+    a camera, D channels take D / 3, rounded up.
+
+    Args:
+        means: [N, 3] world units.
+        quats: [N, 4] wxyz, any length.
+        scales: [N, 3] world units (not logarithms).
+        opacities: [N] in 0..1 (not logits).
+        colors: With `sh_degree`, coefficients of spherical harmonics [N, K, 3] or [C, N, K, 3];
+            without it, colours or other features after activation, [N, D] or [C, N, D].
+        viewmats: [C, 4, 4] world to camera, rigid; without gradients.
+        Ks: [C, 3, 3] intrinsics in px, without skew; without gradients.
+        width: Width of the images, px.
+        height: Height of the images, px.
+        near_plane: Gaussians nearer than this are not drawn, world units along z.
+        far_plane: Gaussians farther than this are not drawn, world units along z.
+        radius_clip: Gaussians whose radii are not above this are not drawn, px.
+        eps2d: Variance added to each projected covariance, px^2.
+        sh_degree: Highest band of the spherical harmonics that is evaluated, 0 to 3; None takes
+            `colors` as they are.
+        packed: Whether `meta` holds one entry for each drawn Gaussian, or all [C, N].
+        tile_size: Only returned in `meta`: it does not change the image.
+        backgrounds: [C, D] colour behind the last Gaussian; None is black. Depth has none.
+        render_mode: `RGB` colours, `D` the accumulated z-depth, `ED` the expected z-depth (`D` over
+            alpha), or colours with either as the last channel.
+        sparse_grad: Not served.
+        absgrad: Store the sum of absolute image-plane gradients in `meta["means2d"].absgrad` by the
+            backward pass; `meta["means2d"].grad` then stays None. Served for one pass a camera.
+        rasterize_mode: `antialiased` compensates opacities for `eps2d`, as Mip-Splatting does.
+        channel_chunk: Without effect.
+        distributed: Not served.
+        camera_model: Only `pinhole` is served.
+        segmented: Without effect.
+        covars: Not served; give quats and scales.
+        with_ut: Not served.
+        with_eval3d: Not served.
+        radial_coeffs: Not served.
+        tangential_coeffs: Not served.
+        thin_prism_coeffs: Not served.
+        ftheta_coeffs: Not served.
+        rolling_shutter: None, or gsplat's `RollingShutterType.GLOBAL`.
+        viewmats_rs: Not served.
+        backend: `native`, `torch`, or `auto`: native for float32 where the extension was built,
+            else torch. gsplat has no such argument.
+
+    Returns:
+        The colours [C, H, W, X], X the channels of the render mode; alpha [C, H, W, 1]; and `meta`:
+        `radii` (int32, px; 0 where not drawn), `means2d` (px), `depths`, `conics` and `opacities`,
+        with `camera_ids`, `gaussian_ids` and `batch_ids` if packed (else None), and `width`,
+        `height`, `tile_size`, `n_cameras`, `n_batches`. The intersections with tiles (`isect_ids`,
+        `isect_offsets`, `flatten_ids`, `tiles_per_gauss`) are not in it.
+
+        `meta["means2d"]` is a leaf: after the backward pass its `.grad` is the image-plane gradient
+        that gsplat's `DefaultStrategy` reads, so the strategy runs on this function. No gradient
+        flows from `meta` to the Gaussians: a loss on `meta` itself is not served.
+
+    Raises:
+        NotImplementedError: An argument has a value that is not served; the message names it.
+        ValueError: A tensor has a wrong shape or type, or values that are not finite; a camera is
+            not rigid or has skew. The message names the argument.
+    """
+    _refuse(
+        sparse_grad=sparse_grad,
+        distributed=distributed,
+        camera_model=camera_model != "pinhole",
+        covars=covars is not None,
+        with_ut=with_ut,
+        with_eval3d=with_eval3d,
+        radial_coeffs=radial_coeffs is not None,
+        tangential_coeffs=tangential_coeffs is not None,
+        thin_prism_coeffs=thin_prism_coeffs is not None,
+        ftheta_coeffs=ftheta_coeffs is not None,
+        rolling_shutter=getattr(rolling_shutter, "name", rolling_shutter) not in {None, "GLOBAL"},
+        viewmats_rs=viewmats_rs is not None,
+    )
+    _check_choice("render_mode", render_mode, get_args(RenderMode))
+    _check_choice("rasterize_mode", rasterize_mode, get_args(RasterizeMode))
+    backend = backend_for(means, backend)
+    shapes = _Shapes(means, quats, scales, opacities)
+    cameras = _cameras(viewmats, Ks, width, height)
+    _check_shapes(shapes, colors, len(cameras), sh_degree, backgrounds)
+    settings = RasterSettings(
+        near=near_plane,
+        eps2d=eps2d,
+        alpha_min=ALPHA_MIN,
+        alpha_max=ALPHA_MAX,
+        transmittance_min=TRANSMITTANCE_MIN,
+        antialiased=rasterize_mode == "antialiased",
+        absgrad=absgrad,
+    )
+    projections = _project(shapes, cameras, settings, far_plane, radius_clip)
+    requires_grad = any(value.requires_grad for value in (*shapes, colors))
+    meta, offsets = _meta(projections, packed, requires_grad, absgrad)
+    meta |= {"width": width, "height": height, "tile_size": tile_size}
+    renderer = _Renderer(shapes, settings, render_mode, sh_degree, backend)
+    per_camera = colors.ndim == (3 if sh_degree is None else 4)
+    images, alphas = [], []
+    for index, camera in enumerate(cameras):
+        image, alpha = renderer.render(
+            camera,
+            colors[index] if per_camera else colors,
+            offsets[index],
+            (projections.radii[index] > 0).all(dim=-1),
+            None if backgrounds is None else backgrounds[index],
+        )
+        images.append(image)
+        alphas.append(alpha)
+    return torch.stack(images), torch.stack(alphas), meta
+
+
+def _refuse(**given: bool) -> None:
+    for name, is_given in given.items():
+        if is_given:
+            raise NotImplementedError(
+                f"{name}: xrgs.rasterization serves only its default; leave it out"
+            )
+
+
+def _check_choice(name: str, value: str, choices: tuple[str, ...]) -> None:
+    if value not in choices:
+        raise ValueError(f"{name} must be one of {', '.join(choices)}, got {value!r}")
+
+
+def _check_shapes(
+    shapes: _Shapes, colors: Tensor, cameras: int, sh_degree: int | None, backgrounds: Tensor | None
+) -> None:
+    """Check everything whose shape decides how the arguments are taken apart."""
+    count = len(shapes.means) if shapes.means.ndim else 0
+    for (name, value), tail in zip(shapes._asdict().items(), ((3,), (4,), (3,), ()), strict=True):
+        if value.shape != (count, *tail):
+            raise ValueError(f"{name} must be {[count, *tail]}, got {list(value.shape)}")
+    if sh_degree is None:
+        tail_ndim, expected = 1, "[N, D] or [C, N, D]"
+        is_wide_enough = True
+    else:
+        if not 0 <= sh_degree <= MAX_DEGREE:
+            raise ValueError(f"sh_degree must be 0 to {MAX_DEGREE}, or None, got {sh_degree}")
+        tail_ndim, expected = 2, f"[N, K, 3] or [C, N, K, 3] with K of at least {bases(sh_degree)}"
+        is_wide_enough = colors.shape[-1] == 3 and colors.shape[-2] >= bases(sh_degree)
+    prefix = colors.shape[: max(0, colors.ndim - tail_ndim)]
+    if prefix not in {(count,), (cameras, count)} or not is_wide_enough:
+        raise ValueError(
+            f"colors must be {expected}, N = {count}, C = {cameras}, got {list(colors.shape)}"
+        )
+    channels = 3 if sh_degree is not None else int(colors.shape[-1])
+    if backgrounds is not None and backgrounds.shape != (cameras, channels):
+        raise ValueError(
+            f"backgrounds must be [{cameras}, {channels}], got {list(backgrounds.shape)}"
+        )
+
+
+def _cameras(viewmats: Tensor, Ks: Tensor, width: int, height: int) -> list[Camera]:
+    if viewmats.ndim != 3 or Ks.ndim != 3 or len(viewmats) != len(Ks) or len(Ks) == 0:
+        raise ValueError(
+            "viewmats must be [C, 4, 4] and Ks [C, 3, 3] with one C of at least 1, "
+            f"got {list(viewmats.shape)} and {list(Ks.shape)}"
+        )
+    for name, matrices in (("viewmats", viewmats), ("Ks", Ks)):
+        if matrices.requires_grad and torch.is_grad_enabled():
+            raise NotImplementedError(
+                f"{name}: xrgs.rasterization gives no gradients of cameras; use {name}.detach()"
+            )
+    cameras = []
+    for index, (viewmat, K) in enumerate(zip(viewmats.detach(), Ks.detach(), strict=True)):
+        try:
+            cameras.append(Camera(viewmat, K, width, height))
+        except ValueError as error:
+            raise ValueError(f"viewmats, Ks, camera {index}: {error}") from error
+    return cameras
+
+
+@torch.no_grad()
+def _project(
+    shapes: _Shapes,
+    cameras: list[Camera],
+    settings: RasterSettings,
+    far_plane: float,
+    radius_clip: float,
+) -> _Projections:
+    """Project every Gaussian into every camera and find its radii as gsplat's kernels do."""
+    views = []
+    for camera in cameras:
+        z = camera_depths(shapes.means, camera)
+        chosen = torch.nonzero((z > settings.near) & (z < far_plane))[:, 0]  # [M]
+        means, quats, scales, opacities = (value[chosen] for value in shapes)
+        flat = project(means, quats, scales, opacities, camera, settings)
+        xx, xy, yy = flat.cov.unbind(-1)
+        # A box around all that alpha_min lets be seen (StopThePop, section B.2).
+        reach = (2 * torch.log(flat.opacities / settings.alpha_min)).clamp_min(0).sqrt()
+        reach = reach.clamp_max(MAX_RADIUS_SIGMAS)[:, None]  # [M, 1] standard deviations
+        radii = (reach * torch.stack([xx, yy], dim=-1).sqrt()).ceil()  # [M, 2]
+        size = radii.new_tensor([camera.width, camera.height])
+        inside = ((flat.means2d + radii > 0) & (flat.means2d - radii < size)).all(-1)
+        usable = (flat.det > 0) & torch.isfinite(flat.det) & (flat.opacities >= settings.alpha_min)
+        drawn = inside & usable & (radii > radius_clip).any(-1) & (radii > 0).all(-1)
+        conics = torch.stack([yy, -xy, xx], dim=-1) / flat.det[:, None]
+        values = (radii.int(), flat.means2d, flat.depths, conics, flat.opacities)
+        views.append([_scatter(value, chosen, drawn, len(z)) for value in values])
+    return _Projections(*(torch.stack(column) for column in zip(*views, strict=True)))
+
+
+def _scatter(values: Tensor, chosen: Tensor, drawn: Tensor, count: int) -> Tensor:
+    """Place the values [M, ...] of drawn Gaussians among zeros [N, ...]."""
+    placed = values.new_zeros((count, *values.shape[1:]))
+    placed[chosen[drawn]] = values[drawn]
+    return placed
+
+
+def _meta(
+    projections: _Projections, packed: bool, requires_grad: bool, absgrad: bool
+) -> tuple[dict[str, Any], Tensor]:
+    """Make gsplat's `meta`, and the offsets [C, N, 2] that send gradients to its `means2d`.
+
+    The offsets are zeros: the rasterizer adds them to its own projected means, so that the gradient
+    of an offset is the gradient of a projected mean.
+    """
+    drawn = (projections.radii > 0).all(dim=-1)  # [C, N]
+    camera_ids, gaussian_ids = torch.nonzero(drawn, as_tuple=True)
+    values = projections._asdict()
+    ids: dict[str, Tensor | None] = dict.fromkeys(("batch_ids", "camera_ids", "gaussian_ids"))
+    if packed:
+        values = {name: value[camera_ids, gaussian_ids] for name, value in values.items()}
+        ids = {
+            "batch_ids": torch.zeros_like(camera_ids),
+            "camera_ids": camera_ids,
+            "gaussian_ids": gaussian_ids,
+        }
+    means2d = values["means2d"].clone().requires_grad_(requires_grad and torch.is_grad_enabled())
+    zeros: Tensor = (
+        _AbsoluteGradient.apply(means2d) if absgrad else means2d - means2d.detach()
+    )  # as means2d
+    if packed:
+        placed = torch.zeros_like(projections.means2d)
+        zeros = placed.index_put((camera_ids, gaussian_ids), zeros)
+    counts = {"n_cameras": len(drawn), "n_batches": 1}
+    return {**ids, **values, "means2d": means2d, **counts}, zeros
+
+
+class _AbsoluteGradient(torch.autograd.Function):
+    """Zeros of the shape of means2d, whose gradient becomes `means2d.absgrad`."""
+
+    @staticmethod
+    def forward(ctx: Any, means2d: Tensor) -> Tensor:
+        ctx.means2d = means2d
+        return torch.zeros_like(means2d)
+
+    @staticmethod
+    def backward(ctx: Any, v_offsets: Tensor) -> None:
+        ctx.means2d.absgrad = v_offsets
+
+
+class _Renderer(NamedTuple):
+    """What all cameras of a call share."""
+
+    shapes: _Shapes
+    settings: RasterSettings
+    render_mode: RenderMode
+    sh_degree: int | None
+    backend: str
+
+    def render(
+        self,
+        camera: Camera,
+        colors: Tensor,
+        offset: Tensor,
+        drawn: Tensor,
+        background: Tensor | None,
+    ) -> tuple[Tensor, Tensor]:
+        """Render one camera: its channels [H, W, X] and alpha [H, W, 1].
+
+        Args:
+            camera: The view.
+            colors: [N, K, 3] coefficients, or [N, D] colours.
+            offset: [N, 2] zeros, for the gradients of the projected means.
+            drawn: [N] which Gaussians are drawn.
+            background: [D] colour behind the last Gaussian; None is black.
+        """
+        hidden = torch.where(drawn, self.shapes.opacities, 0.0)
+        shapes = self.shapes._replace(opacities=hidden)
+        features, layers = [], []
+        if "RGB" in self.render_mode and self.sh_degree is not None:
+            coefficients = colors[:, : bases(self.sh_degree)]
+            layers.append(self._pass(shapes, coefficients, self.sh_degree, camera, offset))
+        elif "RGB" in self.render_mode:
+            features.append(colors)
+        if "D" in self.render_mode:
+            features.append(camera_depths(shapes.means, camera)[:, None])
+        if features:
+            values = torch.where(drawn[:, None], torch.cat(features, dim=1), 0.0)
+            layers += self._features(shapes, values, camera, offset)
+        if self.settings.absgrad and len(layers) > 1:
+            raise NotImplementedError(
+                f"absgrad: xrgs.rasterization serves it for up to three channels, "
+                f"not for this render_mode={self.render_mode!r} and colors"
+            )
+        image = torch.cat([layer for layer, _ in layers], dim=-1)
+        alpha = layers[0][1]
+        return self._finished(image, alpha, background), alpha
+
+    def _pass(
+        self, shapes: _Shapes, coefficients: Tensor, degree: int, camera: Camera, offset: Tensor
+    ) -> tuple[Tensor, Tensor]:
+        """Render three channels, given as spherical harmonics, and alpha [H, W, 1]."""
+        render = rasterize_parameters(
+            *shapes,
+            coefficients[:, :1],
+            coefficients[:, 1:],
+            camera,
+            self.settings,
+            sh_degree=degree,
+            means2d_offset=offset,
+            backend=self.backend,
+        )
+        return render.image, render.alpha[..., None]
+
+    def _features(
+        self, shapes: _Shapes, features: Tensor, camera: Camera, offset: Tensor
+    ) -> list[tuple[Tensor, Tensor]]:
+        """Render features [N, D] of any sign and size, three channels a pass.
+
+        The rasterizer draws max(C0 sh0 + 1/2, 0). So that nothing is cut off at 0, features are
+        scaled to -1..1, by a power of two, which is exact, and raised to at least 1/2: compositing
+        is linear, so what was added comes off again as so many times alpha.
+        """
+        layers = []
+        for group in features.split(3, dim=1):
+            values = pad(group, (0, 3 - group.shape[1]))  # [N, 3]
+            largest = values.detach().abs().amax(dim=0) if len(values) else values.new_ones(3)
+            scale = torch.ldexp(torch.ones_like(largest), torch.frexp(largest).exponent)
+            values = values / scale
+            negative = (values < 0).any(dim=0)
+            raised = torch.where(negative, 1.5, 0.5).to(values)  # [3]
+            coefficients = (values + (raised - 0.5)) / C0
+            image, alpha = self._pass(shapes, coefficients[:, None], 0, camera, offset)
+            image = (image - raised * alpha) * scale
+            layers.append((image[..., : group.shape[1]], alpha))
+        return layers
+
+    def _finished(self, image: Tensor, alpha: Tensor, background: Tensor | None) -> Tensor:
+        """Put the background behind the colours, and divide the depth where it is expected."""
+        channels = image.shape[-1] - ("D" in self.render_mode)
+        colors, depth = image[..., :channels], image[..., channels:]
+        if background is not None:
+            colors = colors + (1.0 - alpha) * background[:channels]
+        if "ED" in self.render_mode:
+            depth = depth / alpha.clamp_min(MIN_DEPTH_ALPHA)
+        return torch.cat([colors, depth], dim=-1)
