@@ -187,7 +187,7 @@ def test_bytes_in_place_of_weights_or_a_checkpoint_are_named(
     with pytest.raises(WeightsError, match=r"w\.npz"):
         weights.load(file)
     with pytest.raises(CheckpointError, match=r"w\.npz"):
-        Checkpoint(file).read()
+        Checkpoint(file).load()
 
 
 def test_weights_larger_than_weights_are_not_read(tmp_path: Path) -> None:
