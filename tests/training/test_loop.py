@@ -12,11 +12,17 @@ import torch
 from xrgs.capture.dataset import USES, Dataset
 from xrgs.config import CONF_DIR, Conf
 from xrgs.splat import rasterize
-from xrgs.splat.gaussians import PARAMETERS, ActivatedGaussians, Gaussians
+from xrgs.splat.densify import Densifier
+from xrgs.splat.gaussians import PARAMETERS, ActivatedGaussians, Gaussians, from_points
+from xrgs.splat.loss import photometric_loss, prepare_target
+from xrgs.splat.optimizer import SplatOptimizer
+from xrgs.splat.settings import DensifySettings, OptimizerSettings, RasterSettings
 from xrgs.training import components, loop
 from xrgs.training.components import Step
 from xrgs.training.count_matching import train_cell
 from xrgs.training.loop import train
+from xrgs.training.sampler import EpochSampler
+from xrgs.training.seeding import seeded_generator
 
 #: Every file of `conf/ablation` that changes how training goes, not what is trained on.
 ABLATIONS = sorted(
@@ -40,6 +46,55 @@ def test_the_same_seed_gives_the_same_bits_and_another_does_not(
     assert first.history == second.history
     other = train(data, dataclasses.replace(conf, seed=1))
     assert not same(first.gaussians, other.gaussians)
+
+
+def plain_loop(data: Dataset, conf: Conf) -> Gaussians:
+    """gsplat's training written out for a config without components, densified every fifth step."""
+    steps, seed = conf.train.steps, conf.seed
+    gaussians = from_points(
+        data.points,
+        data.colors,
+        init_opacity=0.1,
+        sh_degree=3,
+        generator=seeded_generator(seed, "init"),
+    )
+    optimizer = SplatOptimizer(
+        gaussians, OptimizerSettings(), scene_scale=data.scene_scale, steps=steps, backend="auto"
+    )
+    densifier = Densifier(
+        optimizer,
+        DensifySettings(start=0, stop=steps // 2, every=5, reset_every=steps // 3),
+        scene_scale=data.scene_scale,
+        generator=seeded_generator(seed, "densify"),
+    )
+    for step in EpochSampler(data.train, seed, steps, lambda _: True):
+        camera, degree = step.view.camera, min(step.number, 3)
+        offset = torch.zeros(len(gaussians), 2, requires_grad=True)
+        render = rasterize.rasterize(
+            *gaussians.activated(),
+            camera,
+            RasterSettings(),
+            sh_degree=degree,
+            means2d_offset=offset,
+            backend="auto",
+        )
+        target = prepare_target(step.view.image)
+        loss = photometric_loss(render.image, target, l1=0.8, ssim=0.2, backend="auto")
+        optimizer.zero_grad()
+        torch.autograd.backward(loss)
+        optimizer.step(camera, sh_degree=degree)
+        densifier.after_step(
+            step.number, offset.grad, render.visible, width=camera.width, height=camera.height
+        )
+    return gaussians
+
+
+def test_the_baseline_is_a_plain_loop(data: Dataset, compose: Compose, same: Same) -> None:
+    schedule = ["splat.densify.every=5000", "splat.densify.reset_every=10000"]
+    conf = compose("preset=paper", "train.steps=30", "seed=3", "splat.backend=auto", *schedule)
+    expected = plain_loop(data, conf)
+    assert len(expected) > 100  # densification took part
+    assert same(train(data, conf).gaussians, expected)
 
 
 def test_training_lowers_the_loss(data: Dataset, short: Conf) -> None:

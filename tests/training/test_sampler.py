@@ -11,6 +11,7 @@ from xrgs.capture.dataset import Dataset
 from xrgs.errors import XrgsError
 from xrgs.training.components import Step
 from xrgs.training.sampler import EpochSampler
+from xrgs.training.seeding import seeded_generator
 
 ALL = ["v0", "v1", "v2", "v3"]
 
@@ -44,6 +45,13 @@ def test_the_order_depends_on_the_seed_alone(data: Dataset) -> None:
     assert sampled_names(data, 40, always, seed=1) != names
     torch.rand(7)  # the global generator is not used
     assert sampled_names(data, 20, always) == names[:20]
+
+
+def test_an_epoch_is_a_permutation_drawn_from_the_seeds_generator(data: Dataset) -> None:
+    generator = seeded_generator(5, "views")
+    orders = [torch.randperm(4, generator=generator).flip(0).tolist() for _ in range(3)]
+    expected = [f"v{i}" for order in orders for i in order]
+    assert sampled_names(data, 12, always, seed=5) == expected
 
 
 def test_a_view_that_is_not_allowed_is_not_sampled(data: Dataset) -> None:
