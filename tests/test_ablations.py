@@ -1,7 +1,8 @@
-"""Every file of `conf/ablation`: a delta of the baseline, another cell, and a layer for others."""
+"""Every file of `conf/ablation` is a delta of the baseline that gives another cell."""
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable
 from dataclasses import asdict
 from typing import Any
@@ -17,42 +18,49 @@ ABLATIONS = sorted({path.stem for path in (CONF_DIR / "ablation").glob("*.yaml")
 Compose = Callable[..., Conf]
 
 
+@pytest.fixture(scope="module")
+def composed(compose: Compose) -> Compose:
+    """(*overrides) -> their config, composed once for all tests, which must not change it."""
+    return functools.cache(compose)
+
+
 def cell_id(conf: Conf) -> str:
     return digest(cell_identity(conf, "variant"))
 
 
 def flat(values: dict[str, Any], prefix: str = "") -> dict[str, Any]:
-    found: dict[str, Any] = {}
+    """Nested dicts as one dict by dotted keys."""
+    result: dict[str, Any] = {}
     for name, value in values.items():
-        found |= (
+        result |= (
             flat(value, f"{prefix}{name}.") if isinstance(value, dict) else {prefix + name: value}
         )
-    return found
+    return result
 
 
 def delta(conf: Conf, baseline: Conf) -> dict[str, Any]:
-    """What differs, by key."""
-    plain = flat(asdict(baseline))
-    return {key: value for key, value in flat(asdict(conf)).items() if value != plain[key]}
+    """The values that differ from the baseline's, by key."""
+    expected = flat(asdict(baseline))
+    return {key: value for key, value in flat(asdict(conf)).items() if value != expected[key]}
 
 
 @pytest.mark.parametrize("name", ABLATIONS)
-def test_each_is_another_cell(name: str, compose: Compose) -> None:
-    baseline, ablation = compose(), compose(f"+ablation={name}")
-    if ablation.matched_to is not None:  # the sweep gives it the number of that cell's Gaussians
-        ablation = compose(f"+ablation={name}", "components.count_matched.gaussians=1000")
+def test_each_ablation_is_another_cell(name: str, composed: Compose) -> None:
+    baseline, ablation = composed(), composed(f"+ablation={name}")
+    if ablation.matched_to is not None:  # a sweep fills in that cell's number of Gaussians
+        ablation = composed(f"+ablation={name}", "components.count_matched.gaussians=1000")
     assert cell_id(ablation) != cell_id(baseline)
     changed = delta(ablation, baseline)
     assert {key.split(".")[0] for key in changed} <= {"components", "splat", "train", "matched_to"}
 
 
-def test_the_one_called_baseline_is_the_baseline(compose: Compose) -> None:
-    assert cell_id(compose("+ablation=baseline")) == cell_id(compose())
+def test_the_ablation_named_baseline_is_the_baseline(composed: Compose) -> None:
+    assert cell_id(composed("+ablation=baseline")) == cell_id(composed())
 
 
-def test_no_two_are_the_same_cell(compose: Compose) -> None:
-    confs = [compose(f"+ablation={name}") for name in ABLATIONS]
-    # Two controls differ only in the cell whose number of Gaussians they are to have.
+def test_no_two_ablations_are_the_same_cell(composed: Compose) -> None:
+    confs = [composed(f"+ablation={name}") for name in ABLATIONS]
+    # Two controls differ only in the cell whose number of Gaussians they have to reach.
     assert len({(cell_id(conf), conf.matched_to) for conf in confs}) == len(ABLATIONS)
 
 
@@ -68,10 +76,12 @@ def test_no_two_are_the_same_cell(compose: Compose) -> None:
         (("densify", "absgrad"), None),
     ],
 )
-def test_they_stack(names: tuple[str, ...], whole: str | None, compose: Compose) -> None:
-    baseline = compose()
-    layers = [delta(compose(f"+ablation={name}"), baseline) for name in names]
-    stacked = compose(f"+ablation=[{','.join(names)}]")
-    assert delta(stacked, baseline) == {key: v for layer in layers for key, v in layer.items()}
+def test_ablations_can_be_combined(
+    names: tuple[str, ...], whole: str | None, composed: Compose
+) -> None:
+    baseline = composed()
+    layers = [delta(composed(f"+ablation={name}"), baseline) for name in names]
+    combined = composed(f"+ablation=[{','.join(names)}]")
+    assert delta(combined, baseline) == {key: v for layer in layers for key, v in layer.items()}
     if whole is not None:
-        assert stacked == compose(f"+ablation={whole}")
+        assert combined == composed(f"+ablation={whole}")

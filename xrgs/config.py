@@ -1,7 +1,8 @@
-"""The schema of an experiment: every field, its type and its meaning.
+"""The schema of an experiment: every key of the config, its type and its meaning.
 
-The values live in `conf/`: `conf/config.yaml` is the baseline with every component present and off.
-The model's own fields are in `xrgs.splat.settings`, which knows nothing of experiments.
+The values are in `conf/`: `conf/config.yaml` has every key with its value in the baseline, in which
+every component is present and off. The keys of the model itself are declared in
+`xrgs.splat.settings`, which can be used without this module.
 """
 
 from __future__ import annotations
@@ -21,11 +22,11 @@ from xrgs.safeio import untrusted
 from xrgs.splat.backend import CHOICES
 from xrgs.splat.settings import DensifySettings, OptimizerSettings, RasterSettings
 
-_HERE = Path(__file__).parent
+_PACKAGE = Path(__file__).parent
 #: `conf/` is inside the package in a wheel and beside it in a checkout.
-CONF_DIR = _HERE / "conf" if (_HERE / "conf").is_dir() else _HERE.parent / "conf"
+CONF_DIR = _PACKAGE / "conf" if (_PACKAGE / "conf").is_dir() else _PACKAGE.parent / "conf"
 
-#: Backslashes before it are an escape.
+#: The start of an interpolation, with the backslashes before it: an odd number of them escapes it.
 _INTERPOLATION = re.compile(r"(\\*)\$\{")
 _RETRY = ("none", "failed")
 
@@ -35,117 +36,132 @@ class SceneConf:
     """Where the photographs come from."""
 
     name: str = MISSING
-    """Label in tables."""
+    """Label in tables; where it is empty, the name of the folder."""
     kind: str = MISSING
-    """`procedural`, `motorcycle` or `folder` (a module of `xrgs.capture.scenes`)."""
-    path: str | None = None
-    """Of `folder`: the folder of images, or an LLFF scene (images/, images_4/, images_8/)."""
-    views: int = 24
-    """Of `procedural`: how many."""
+    """`procedural`, `motorcycle` or `folder`, each a module of `xrgs.capture.scenes`."""
+    path: str | None = MISSING
+    """With `kind=folder`: the folder of photographs, or an LLFF scene (images/, images_4/, ...)."""
+    views: int = MISSING
+    """With `kind=procedural`: number of views that are rendered."""
 
 
 @dataclass
 class SfmConf:
-    """How COLMAP is run on the mixed images."""
+    """How COLMAP finds the cameras of the mixed images."""
 
     lr_images: str = MISSING
-    """`upsampled`: LR images are brought to HR size for SIFT only. `native`: files as they are."""
+    """`upsampled` brings LR images to HR size for COLMAP alone; `native` gives it the files as they
+    are."""
     max_num_features: int = MISSING
-    """Per image; 0 chooses by the number of images so that exhaustive matching stays quick."""
+    """SIFT features of an image; 0 chooses by the number of images, so that exhaustive matching
+    stays quick."""
     init_min_tri_angle: float = MISSING
-    """Degrees between the first two views; COLMAP's 16 fails on forward-facing scenes."""
+    """Smallest triangulation angle of the first pair, degrees; COLMAP's 16 fails on forward-facing
+    scenes."""
     min_registered: float = MISSING
-    """Share of the views that must register, else the next fallback is tried."""
+    """Share of the views that must register, or the next recipe of `fallbacks` is tried, 0 to 1."""
     seed: int = MISSING
+    """Seed of COLMAP's random sampling."""
     camera: str = MISSING
-    """`single`, `per_image`, or `auto`: one for photographs of the same size, make, model and focal
-    length; those without EXIF share one where all have one size, and else have one each."""
+    """`single`, `per_image`, or `auto`: one camera for photographs of the same size, make, model
+    and focal length; without EXIF one camera where all have one size, else one for each."""
     first_octave: int | None = MISSING
-    """Of SIFT: 0, -1 for twice the resolution; null takes -1 up to 640 px."""
+    """First octave of SIFT: 0, or -1 for twice the resolution; None takes -1 up to 640 px."""
     min_inliers: int = MISSING
-    """Points that place a view; the first pair needs 10/3 of it, as in COLMAP (30 and 100)."""
+    """Inliers that register a view; the first pair needs 10/3 of it, as in COLMAP (30 and 100)."""
     fallbacks: bool = MISSING
-    """Try other recipes, as `xrgs.capture.placing` orders them, where this one places too few."""
+    """Whether other recipes are tried, in the order of `xrgs.capture.placing`, where this one
+    registers too few views."""
     reference: bool = MISSING
-    """Place the undegraded photographs too, to tell how far off the mixed poses are; not where
-    exact cameras are known or nothing is degraded."""
+    """Whether the undegraded photographs are placed too, to report how far off the mixed poses are.
+    It is skipped where the cameras are known or nothing is degraded."""
 
 
 @dataclass
 class VariantConf:
-    """The mixed-resolution dataset made of a scene."""
+    """The mixed-resolution dataset that is made of a scene (paper, section 4.1)."""
 
     long_side: int = MISSING
-    """Longer side of the largest HR view, px; 0 keeps the photographs' size. All are shrunk by one
-    scale, so that differing photographs keep their relative sampling rates."""
+    """Longer side of the largest HR view, px; 0 keeps the photographs' size. All photographs are
+    resized by one scale, which keeps their relative sampling rates."""
     factor: int = MISSING
-    """How many times smaller an LR view is, and across what the consistency loss compares; HR
-    views are cropped to a multiple of it."""
+    """How many times smaller an LR view is, and the ratio that the consistency loss compares
+    across; HR views are cropped to a multiple of it."""
     hr_fraction: float = MISSING
-    """Share of the training views that are HR."""
+    """Share of the training views that are HR, 0 to 1."""
     min_hr: int = MISSING
-    """At least this many of them."""
+    """Smallest number of training views that are HR."""
     selection: str = MISSING
-    """Of `tags=flag`: `random` (seeded) or `uniform` (evenly spaced)."""
+    """Which views are HR with `tags=flag`: `random` (by `seed`) or `uniform` (evenly spaced)."""
     test_every: int = MISSING
-    """Every n-th view is held out, from the first; 0 trains on all and tests on the same poses."""
+    """Every n-th view is held out for testing, beginning with the first; 0 trains on all views and
+    tests on the same poses."""
     seed: int = MISSING
-    """Of the selection. Not the training's: all seeds of a study share one variant."""
+    """Seed of `selection=random`. It is not the seed of training: all seeds of a study share one
+    variant."""
     tags: str = MISSING
-    """Which views are HR: `flag` (the selection's), or those of most `megapixels`, of least
-    `distance` from what they show, or of the highest `sampling_rate` (focal px over depth)."""
+    """How views are tagged: `flag` (by `selection`), or HR are those of most `megapixels`, of least
+    `distance` to what they show, or of the highest `sampling_rate` (focal length in px over
+    depth)."""
     hr_above: float = MISSING
-    """Of the latter three: HR from this share of the best view's value on; 0 goes by hr_fraction.
-    Values: pixels, 1 / distance, sampling rate."""
+    """With the latter three: HR are views from this share of the best view's value on, 0 to 1; 0
+    goes by `hr_fraction`. The values are pixels, 1 / distance and sampling rate."""
     degradation: str = MISSING
-    """Of LR views: `downsample`, `digital_zoom` (down, then up again: same size, no detail),
-    `jpeg` or `none`; `auto` is downsample with `tags=flag` and none with the others."""
+    """What is done to LR views: `downsample`, `digital_zoom` (down, then up again: the same size,
+    no detail), `jpeg` or `none`; `auto` is `downsample` with `tags=flag` and `none` otherwise."""
     jpeg_quality: int = MISSING
-    """Of `jpeg`: 1 to 95."""
+    """With `degradation=jpeg`: quality, 1 to 95."""
     sfm: SfmConf = field(default_factory=SfmConf)
+    """How COLMAP finds the cameras."""
 
 
 @dataclass
 class SplatConf:
-    """The model and its optimisation."""
+    """The model, the renderer and the optimisation."""
 
     raster: RasterSettings = field(default_factory=RasterSettings)
+    """How Gaussians become pixels."""
     optimizer: OptimizerSettings = field(default_factory=OptimizerSettings)
+    """Learning rates of Adam."""
     densify: DensifySettings = field(default_factory=DensifySettings)
+    """When Gaussians are grown, pruned and reset."""
     sh_every: int = MISSING
-    """Steps of a 30,000-step run after which one more SH band is switched on."""
+    """Steps of a 30,000-step run after which one more band of spherical harmonics is switched
+    on."""
     init_opacity: float = MISSING
+    """Opacity of the first Gaussians, 0 to 1."""
     ssim_weight: float = MISSING
-    """Weight of 1 - SSIM in the loss; L1 has the rest."""
+    """Weight of 1 - SSIM in the loss, 0 to 1; L1 has the rest."""
     backend: str = MISSING
     """`native`, `torch`, or `auto`: native where the extension was built."""
 
 
 @dataclass
 class TrainConf:
-    """How long to train."""
+    """How long to train, and on which views."""
 
     steps: int = MISSING
-    """One view a step. Every schedule is written for 30,000 steps and scales with this."""
+    """Number of steps, one view a step. Every schedule is written for 30,000 steps and scales with
+    this."""
     views: str = MISSING
-    """`mixed`: all, as the variant has them. The controls: `all_hr`, the originals in place of the
-    degraded ones; `hr_only` and `lr_only`, those of one tag."""
+    """`mixed`: all views as the variant has them. The controls: `all_hr`, the originals in place of
+    the degraded views; `hr_only` and `lr_only`, the views of one tag."""
 
 
 @dataclass
 class LossWeightingConf:
-    """Resolution-aware loss weighting (paper 5.2)."""
+    """Resolution-aware loss weighting (paper, section 5.2)."""
 
     lr_weight: float = MISSING
     """Factor of the whole loss of an LR view; 1 is off."""
     stat_from: str = MISSING
-    """What densification reads of a view's image-plane gradient: `weighted`, as the weighted loss
-    gives it, or `unweighted`. Open in the paper, whose formula gives the former."""
+    """Which image-plane gradient of a view densification reads: that of the `weighted` loss, as the
+    paper's formula gives it, or of the `unweighted` one."""
 
 
 @dataclass
 class GradientScalingConf:
-    """Gradient scaling for Gaussian radii (paper 5.3)."""
+    """Gradient scaling for Gaussian radii (paper, section 5.3)."""
 
     lr_scale: float = MISSING
     """Factor of the gradient of the log-scales in LR views; 1 is off."""
@@ -153,105 +169,112 @@ class GradientScalingConf:
 
 @dataclass
 class DensifyConf:
-    """Resolution-aware densification and pruning (paper 5.4)."""
+    """Resolution-aware densification and pruning (paper, section 5.4)."""
 
     decide: str = MISSING
-    """Who sets the thresholds: `nobody` (off: all views alike), `per_class` or `current_view`. Open
-    in the paper; see `xrgs.training.components.densify`."""
+    """Whose thresholds hold at a refinement: `nobody` (off: one set for all views), `per_class` or
+    `current_view`; `xrgs.training.components.densify` explains them. Our choice where the paper is
+    silent."""
     lr_grow: float = MISSING
-    """Times `splat.densify.grow_grad2d`: the threshold of LR views; HR views have that itself. The
-    paper has threshold_HR < threshold_LR, and leaves both open."""
+    """Threshold to grow in LR views, times `splat.densify.grow_grad2d`, which is that of HR views.
+    The paper gives no values, only threshold_HR < threshold_LR."""
     lr_prune: float = MISSING
-    """Times `splat.densify.prune_opacity`, likewise."""
+    """Threshold to prune in LR views, times `splat.densify.prune_opacity`, likewise."""
 
 
 @dataclass
 class CurriculumConf:
-    """LR-only warm-up (paper 5.5)."""
+    """LR-only warm-up (paper, section 5.5)."""
 
     lr_only: float = MISSING
-    """Steps of a 30,000-step run in which LR views alone are trained on; 0 is off. Open in the
-    paper whether densification rests meanwhile: here it goes on."""
+    """First steps of a 30,000-step run that train on LR views alone; 0 is off. Densification goes
+    on meanwhile: our choice where the paper is silent."""
 
 
 @dataclass
 class RenderScaleConf:
-    """Resolution-aware rendering (paper 5.7 and 6.3)."""
+    """Resolution-aware rendering (paper, sections 5.7 and 6.3)."""
 
     gamma: float = MISSING
-    """Scales of LR views x (R_max / R)^gamma, R the view's longer side in px; 0 is off. Open in the
-    paper are k(R), its values, and what R is."""
+    """LR views are rendered with scales times (R_max / R)^gamma, where R is the longer side of the
+    view in px; 0 is off. k(R), its values and the meaning of R are our choice where the paper is
+    silent."""
 
 
 @dataclass
 class ConsistencyConf:
-    """Cross-resolution consistency loss (paper 5.6)."""
+    """Cross-resolution consistency loss (paper, section 5.6)."""
 
     weight: float = MISSING
     """w of the paper; 0 is off."""
     l1: float = MISSING
+    """lambda_1 of the paper: weight of the L1 part."""
     ssim: float = MISSING
+    """lambda_2 of the paper: weight of 1 - SSIM."""
     lr_mode: str = MISSING
-    """LR views: `exact` (both upsampled), `fold` (its L1 part by weight alone) or `off`."""
+    """What is computed of LR views: `exact` (both are upsampled), `fold` (the L1 part, by weight
+    alone) or `off`."""
 
 
 @dataclass
 class AdaptiveWeightingConf:
-    """LR views weigh the more, the less texture the scene has (paper 7.2, 1)."""
+    """A higher weight of LR views in scenes of little texture (paper, section 7.2, 1)."""
 
     texture: float = MISSING
-    """Mean gradient of the LR views, intensity a px, from which they weigh no more than loss
-    weighting has it; 0 is off."""
+    """Mean gradient of the LR views, intensity per px, from which on LR views have no more weight
+    than loss weighting gives them; 0 is off."""
 
 
 @dataclass
 class RegionWeightingConf:
-    """Smooth or HR-less regions of LR views keep their full weight (paper 7.2, 2)."""
+    """Full weight of smooth or HR-less regions of LR views (paper, section 7.2, 2)."""
 
     texture: float = MISSING
-    """Gradient, intensity a px, from which a region that an HR view covers weighs no more than loss
-    weighting has it; 0 is off."""
+    """Gradient, intensity per px, from which on a region that an HR view covers has no more weight
+    than loss weighting gives it; 0 is off."""
 
 
 @dataclass
 class HybridScheduleConf:
-    """LR views come back to their full weight after densification (paper 7.2, 3)."""
+    """Return of LR views to full weight after densification (paper, section 7.2, 3)."""
 
     ramp: int = MISSING
-    """Steps of a 30,000-step run that it takes them, from `splat.densify.stop` on; 0 is off."""
+    """Steps of a 30,000-step run that the return takes, from `splat.densify.stop` on; 0 is off."""
 
 
 @dataclass
 class ContinuousWeightingConf:
-    """A view's weight from its sampling rate, in place of loss weighting's (paper, conclusion)."""
+    """A weight by a view's sampling rate in place of loss weighting's (paper, conclusion)."""
 
     gamma: float = MISSING
-    """Power of the view's rate over the finest view's; 0 is off. Open in the paper."""
+    """A view's weight is its sampling rate over the finest view's, to this power; 0 is off. Our
+    choice where the paper is silent."""
 
 
 @dataclass
 class MipConf:
-    """Mip-Splatting's 3D smoothing filter; not in the paper."""
+    """Mip-Splatting's 3D smoothing filter, which is not in the paper."""
 
     variance: float = MISSING
-    """Of the filter, px^2 of the finest view that sees a Gaussian; 0 is off."""
+    """Variance of the filter, px^2 of the finest view that sees a Gaussian; 0 is off."""
     every: int = MISSING
-    """Steps after which the rates are found anew."""
+    """Steps of this run between two updates of the sampling rates."""
 
 
 @dataclass
 class CountMatchedConf:
-    """The baseline with as many Gaussians as another cell (`conf/ablation/count_matched.yaml`)."""
+    """The baseline with as many Gaussians as another cell (`xrgs.training.count_matching`)."""
 
     gaussians: int = MISSING
-    """How many; 0 is off. A sweep fills it in from the cell that `matched_to` names."""
+    """The number of Gaussians to reach; 0 is off. A sweep fills it in from the cell of
+    `matched_to`."""
     tolerance: float = MISSING
-    """Relative, of that number."""
+    """Largest deviation from that number, relative to it."""
 
 
 @dataclass
 class ComponentsConf:
-    """The components of XR-GS, each the identity in the baseline."""
+    """The components of XR-GS, each of them off in the baseline."""
 
     loss_weighting: LossWeightingConf = field(default_factory=LossWeightingConf)
     gradient_scaling: GradientScalingConf = field(default_factory=GradientScalingConf)
@@ -269,42 +292,50 @@ class ComponentsConf:
 
 @dataclass
 class LimitsConf:
-    """What a cell may take before it is ended and counts as failed; 0 is no limit."""
+    """What a cell may use before it is ended and counts as failed; 0 sets no limit."""
 
     minutes: float = MISSING
-    """From its start to its end, training and evaluation."""
+    """Wall time from its start to its end, training and evaluation, min."""
     memory_gb: float = MISSING
-    """Resident, of its process and the children of that; 1 GB is 10^9 bytes."""
+    """Resident memory of its process and that process's children, in units of 10^9 bytes."""
 
 
 @dataclass
 class Conf:
-    """One cell of a study, and how to run it."""
+    """The config of one cell, and how to run it."""
 
     scene: SceneConf = field(default_factory=SceneConf)
+    """Where the photographs come from."""
     variant: VariantConf = field(default_factory=VariantConf)
+    """The mixed-resolution dataset that is made of them."""
     splat: SplatConf = field(default_factory=SplatConf)
+    """The model, the renderer and the optimisation."""
     train: TrainConf = field(default_factory=TrainConf)
+    """How long to train, and on which views."""
     components: ComponentsConf = field(default_factory=ComponentsConf)
-    matched_to: str | None = None
-    """Ablation whose number of Gaussians a sweep puts in `components.count_matched.gaussians`."""
+    """The components of XR-GS."""
+    matched_to: str | None = MISSING
+    """Name of the ablation whose number of Gaussians `components.count_matched` has to reach; None
+    for none."""
     seed: int = MISSING
+    """Seed of training: initial rotations, order of the views, positions of split Gaussians."""
     store: str = MISSING
-    """Folder of everything that is kept: variants, cells, reports."""
+    """Folder that variants, cells and reports are kept in."""
     data_root: str = MISSING
-    """Folder that `scene=llff/...` looks in."""
+    """Folder that `scene=llff/...` reads."""
     threads: int = MISSING
-    """Of a cell; 0 takes every core this process may use."""
+    """Threads of a cell; 0 uses every core that the process may use."""
     checkpoint_s: float = MISSING
-    """Seconds between two checkpoints of a cell in training, from which it goes on where it was
-    killed; 0 writes none."""
+    """Seconds between two checkpoints of a cell in training, from which a killed cell continues; 0
+    writes none."""
     limits: LimitsConf = field(default_factory=LimitsConf)
+    """What a cell may use."""
     retry: str = MISSING
     """`failed` runs failed cells again; `none` reports them and leaves them."""
     fail_fast: bool = MISSING
-    """Start no further cell after the first that fails."""
+    """Whether no further cell starts after the first that fails."""
     dry_run: bool = MISSING
-    """Print the plan and stop."""
+    """Whether the plan is printed and nothing is run."""
 
 
 def register() -> None:
@@ -313,14 +344,20 @@ def register() -> None:
 
 
 def to_conf(cfg: DictConfig) -> Conf:
-    """A composed Hydra config as plain dataclasses, every value present and of its type.
+    """Convert a composed Hydra config to dataclasses, every value present and of its type.
+
+    Args:
+        cfg: A config composed from `conf/config.yaml`, whose defaults contain the schema.
+
+    Returns:
+        The config, its interpolations resolved.
 
     Raises:
-        OmegaConfBaseException: a value is missing or of another type; the message names its key.
-        XrgsError: a value is out of its range; the message names its key.
+        OmegaConfBaseException: A value is missing or of another type; the message names its key.
+        XrgsError: A value is out of its range, or a key is unknown; the message names the key.
     """
-    # The schema is in the config's own defaults, so that its nodes are checked and typed already:
-    # merging them into it once more takes twenty times as long, and a plan composes many.
+    # The schema is in the config's own defaults, so its nodes are typed and checked already. To
+    # merge it in once more takes twenty times as long, and a plan composes many configs.
     conf = Conf(**{name: _as_object(cfg, name) for name in Conf.__dataclass_fields__})
     _check_known(conf, "")
     least_values = (
@@ -367,11 +404,7 @@ def _as_object(cfg: DictConfig, name: str) -> Any:
 
 
 def _check_known(value: Any, path: str) -> None:
-    """Refuse what a `+` has added to the schema, which would be read by nobody.
-
-    Raises:
-        XrgsError: names the key.
-    """
+    """Raise `XrgsError` where a `+` has added a key to the schema, which nothing would read."""
     for name, inner in vars(value).items():
         if name not in value.__dataclass_fields__:
             raise XrgsError(f"{path}{name}: there is no such key")
@@ -380,43 +413,77 @@ def _check_known(value: Any, path: str) -> None:
 
 
 def from_dict(values: Any) -> Conf:
-    """The config that `dataclasses.asdict` wrote, its texts as they are.
+    """Convert what `dataclasses.asdict` made of a config back to the config.
 
-    A path may hold a `${`; and what a stranger writes there is not to be looked up in this
-    process's environment.
+    Texts are taken literally: a path may contain `${`, and a file of unknown origin must not read
+    this process's environment.
+
+    Args:
+        values: Nested dicts of plain values.
+
+    Returns:
+        The config.
+
+    Raises:
+        OmegaConfBaseException: A key is unknown, or a value is missing or of another type.
+        TypeError: `values` is no dict of a config.
     """
-    conf = OmegaConf.to_object(OmegaConf.merge(OmegaConf.structured(Conf), literal(values)))
+    escaped = escape_interpolations(values)
+    conf = OmegaConf.to_object(OmegaConf.merge(OmegaConf.structured(Conf), escaped))
     if not isinstance(conf, Conf):
         raise TypeError(f"expected a config of schema Conf, got {type(conf).__name__}")
     return conf
 
 
-def literal(value: Any) -> Any:
-    """Values in which OmegaConf finds nothing to be resolved."""
+def escape_interpolations(value: Any) -> Any:
+    r"""Escape `${` in texts, so that OmegaConf takes them literally.
+
+    Args:
+        value: A text, or any nesting of dicts and lists of values.
+
+    Returns:
+        The same with `\${` in place of `${`, and with twice the backslashes that come before it.
+    """
     if isinstance(value, dict):
-        return {name: literal(inner) for name, inner in value.items()}
+        return {name: escape_interpolations(inner) for name, inner in value.items()}
     if isinstance(value, list):
-        return [literal(inner) for inner in value]
+        return [escape_interpolations(inner) for inner in value]
     if not isinstance(value, str):
         return value
-    return _INTERPOLATION.sub(lambda found: 2 * found[1] + r"\${", value)
+    return _INTERPOLATION.sub(lambda match: 2 * match[1] + r"\${", value)
 
 
 def from_file(file: Path) -> Conf:
-    """The config that a cell's folder holds, as JSON.
+    """Read the config that a cell's folder holds as JSON.
+
+    Args:
+        file: The JSON file.
+
+    Returns:
+        The config.
 
     Raises:
-        XrgsError: it can't be read, or is of another schema; the message names the file and key.
+        XrgsError: The file can't be read, or has another schema; the message names the file and
+            the key.
     """
     try:
         return from_dict(untrusted.parse_json(untrusted.read_bytes(file)))
     except OmegaConfBaseException as error:
-        raise XrgsError(f"{file}: {one_line(error)} (another version's config?)") from error
+        raise XrgsError(
+            f"{file}: {error_line(error)} (another version of xrgs may have written it)"
+        ) from error
     except (OSError, ValueError, TypeError) as error:
-        raise XrgsError(f"{file}: no config ({error})") from error
+        raise XrgsError(f"{file}: it holds no config ({error})") from error
 
 
-def one_line(error: Exception) -> str:
-    """What is wrong, in one line that names the key."""
+def error_line(error: Exception) -> str:
+    """Return the first line of an error's message, with the key that it is about.
+
+    Args:
+        error: Any exception. Those of OmegaConf know their key, and do not always print it.
+
+    Returns:
+        One line, that begins with the key where the message does not contain it.
+    """
     line, key = str(error).splitlines()[0], getattr(error, "full_key", None)
     return line if not key or key in line else f"{key}: {line}"

@@ -144,7 +144,7 @@ def _exchange(checkpoint: Path, other: Path) -> None:
     shutil.copy(other, checkpoint)
 
 
-@pytest.mark.parametrize(("spoil", "message"), [(_truncate, "not a zip"), (_exchange, "of cell")])
+@pytest.mark.parametrize(("spoil", "message"), [(_truncate, "not a zip"), (_exchange, "to cell")])
 def test_an_unusable_checkpoint_is_logged_and_training_starts_over(
     conf: Conf,
     tmp_path: Path,

@@ -154,7 +154,7 @@ def test_other_bytes_than_weights_or_a_checkpoint_are_refused_by_name(
     with pytest.raises(WeightsError, match=r"w\.npz"):
         weights.load(file)
     with pytest.raises(CheckpointError, match=r"w\.npz"):
-        Checkpoint(file).read()
+        Checkpoint(file).load()
 
 
 def test_a_file_too_large_for_weights_is_not_read(tmp_path: Path) -> None:

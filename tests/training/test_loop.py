@@ -3,70 +3,117 @@
 from __future__ import annotations
 
 import dataclasses
-import itertools
 from collections.abc import Callable
+from typing import Any
 
 import pytest
 import torch
 
 from xrgs.capture.dataset import USES, Dataset
 from xrgs.config import CONF_DIR, Conf
-from xrgs.errors import XrgsError
-from xrgs.splat.gaussians import PARAMETERS, ActivatedGaussians, Gaussians
-from xrgs.splat.settings import RasterSettings
-from xrgs.training import components
-from xrgs.training import loop as train
+from xrgs.splat import rasterize
+from xrgs.splat.densify import Densifier
+from xrgs.splat.gaussians import PARAMETERS, ActivatedGaussians, Gaussians, from_points
+from xrgs.splat.loss import photometric_loss, prepare_target
+from xrgs.splat.optimizer import SplatOptimizer
+from xrgs.splat.settings import DensifySettings, OptimizerSettings, RasterSettings
+from xrgs.training import components, loop
 from xrgs.training.components import Step
-from xrgs.training.loop import EpochSampler
+from xrgs.training.count_matching import train_cell
+from xrgs.training.loop import train
+from xrgs.training.sampler import EpochSampler
+from xrgs.training.seeding import seeded_generator
 
-#: All of `conf/ablation` that changes how training goes, and not what is trained on.
+#: Every file of `conf/ablation` that changes how training goes, not what is trained on.
 ABLATIONS = sorted(
     {path.stem for path in (CONF_DIR / "ablation").glob("*.yaml")} - {"baseline"} - set(USES)
 )
 
+Compose = Callable[..., Conf]
+Same = Callable[[Gaussians, Gaussians], bool]
 
+
+@pytest.mark.parametrize("backend", ["torch", "native"])
 def test_the_same_seed_gives_the_same_bits_and_another_does_not(
-    data: Dataset, baseline: Conf
+    data: Dataset, compose: Compose, same: Same, backend: str
 ) -> None:
-    first, second = train.train(data, baseline), train.train(data, baseline)
+    if backend == "native":
+        pytest.importorskip("xrgs._native")
+    conf = compose("train.steps=12", "splat.densify.every=5000", f"splat.backend={backend}")
+    first, second = train(data, conf), train(data, conf)
+    assert len(first.gaussians) != 60  # densification took part
     assert same(first.gaussians, second.gaussians)
     assert first.history == second.history
-    other = train.train(data, dataclasses.replace(baseline, seed=1))
+    other = train(data, dataclasses.replace(conf, seed=1))
     assert not same(first.gaussians, other.gaussians)
 
 
-def test_training_lowers_the_loss(data: Dataset, baseline: Conf) -> None:
-    baseline.train.steps = 80
-    baseline.splat.densify.stop = 0  # the optimizer alone
-    losses = [row["loss"] for row in train.train(data, baseline).history]
+def plain_loop(data: Dataset, conf: Conf) -> Gaussians:
+    """gsplat's training written out for a config without components, densified every fifth step."""
+    steps, seed = conf.train.steps, conf.seed
+    gaussians = from_points(
+        data.points,
+        data.colors,
+        init_opacity=0.1,
+        sh_degree=3,
+        generator=seeded_generator(seed, "init"),
+    )
+    optimizer = SplatOptimizer(
+        gaussians, OptimizerSettings(), scene_scale=data.scene_scale, steps=steps, backend="auto"
+    )
+    densifier = Densifier(
+        optimizer,
+        DensifySettings(start=0, stop=steps // 2, every=5, reset_every=steps // 3),
+        scene_scale=data.scene_scale,
+        generator=seeded_generator(seed, "densify"),
+    )
+    for step in EpochSampler(data.train, seed, steps, lambda _: True):
+        camera, degree = step.view.camera, min(step.number, 3)
+        offset = torch.zeros(len(gaussians), 2, requires_grad=True)
+        render = rasterize.rasterize(
+            *gaussians.activated(),
+            camera,
+            RasterSettings(),
+            sh_degree=degree,
+            means2d_offset=offset,
+            backend="auto",
+        )
+        target = prepare_target(step.view.image)
+        loss = photometric_loss(render.image, target, l1=0.8, ssim=0.2, backend="auto")
+        optimizer.zero_grad()
+        torch.autograd.backward(loss)
+        optimizer.step(camera, sh_degree=degree)
+        densifier.after_step(
+            step.number, offset.grad, render.visible, width=camera.width, height=camera.height
+        )
+    return gaussians
+
+
+def test_the_baseline_is_a_plain_loop(data: Dataset, compose: Compose, same: Same) -> None:
+    schedule = ["splat.densify.every=5000", "splat.densify.reset_every=10000"]
+    conf = compose("preset=paper", "train.steps=30", "seed=3", "splat.backend=auto", *schedule)
+    expected = plain_loop(data, conf)
+    assert len(expected) > 100  # densification took part
+    assert same(train(data, conf).gaussians, expected)
+
+
+def test_training_lowers_the_loss(data: Dataset, short: Conf) -> None:
+    short.train.steps = 80
+    short.splat.densify.stop = 0  # the optimizer alone
+    losses = [row["loss"] for row in train(data, short).history]
     assert sum(losses[-8:]) < 0.5 * sum(losses[:8])
 
 
-def test_the_history_balances_what_densification_did(data: Dataset, baseline: Conf) -> None:
-    trained = train.train(data, baseline)
-    last = trained.history[-1]
-    assert last["step"] == baseline.train.steps - 1
-    grown = last["duplicated"] + last["split"]
-    removed = last["pruned_opacity"] + last["pruned_scale"] + last["pruned_non_finite"]
-    assert grown > 0
-    # The last refinement comes before the last logged step, so the ledger must balance.
-    assert last["gaussians"] == 60 + grown - removed == len(trained.gaussians)
-    assert trained.evaluations > 0
-    model = sum(trained.gaussians[name].nbytes for name in PARAMETERS)
-    assert trained.memory_bytes > 4 * model  # parameters, gradients, two moments, and buffers
-
-
 def test_components_that_change_nothing_change_no_bit(
-    data: Dataset, baseline: Conf, monkeypatch: pytest.MonkeyPatch
+    data: Dataset, short: Conf, same: Same
 ) -> None:
-    plain = train.train(data, baseline)
-    idle = components.Components([components.Component()])
-    monkeypatch.setattr(components, "build", lambda *_: idle)
-    assert same(plain.gaussians, train.train(data, baseline).gaussians)
+    plain = train(data, short)
+    idle = train(data, short, extra_components=[components.Component()])
+    assert same(plain.gaussians, idle.gaussians)
 
 
-class Recorder(components.Component):
-    """Writes down which hook was called, at which step, over how many Gaussians."""
+class HookRecorder(components.Component):
+    """Records which hook was called at which step, and for how many Gaussians."""
 
     def __init__(self) -> None:
         self.calls: list[tuple[str, int | None]] = []
@@ -91,12 +138,12 @@ class Recorder(components.Component):
         assert gaussians.scales.grad is not None
 
     def densification_grad2d(self, gradient: torch.Tensor, step: Step) -> torch.Tensor:
-        self.calls.append(("statistic", step.number))
+        self.calls.append(("densification_grad2d", step.number))
         assert len(gradient) == self.sizes[-1]
         return gradient
 
     def on_gaussians_changed(self, gaussians: Gaussians) -> None:
-        self.calls.append(("refined", None))
+        self.calls.append(("on_gaussians_changed", None))
         self.sizes.append(len(gaussians))
 
     def finish(self, gaussians: Gaussians) -> None:
@@ -104,119 +151,77 @@ class Recorder(components.Component):
         gaussians.sh0.data.zero_()
 
 
-def test_hooks_are_called_in_the_order_of_a_step(
-    data: Dataset, baseline: Conf, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    recorder = Recorder()
-    monkeypatch.setattr(components, "build", lambda *_: components.Components([recorder]))
-    trained = train.train(data, baseline)
-    each = ("activated", "pixel_weight", "loss", "after_backward", "statistic")
-    steps = baseline.train.steps
+def test_hooks_are_called_in_the_order_of_a_step(data: Dataset, short: Conf) -> None:
+    recorder = HookRecorder()
+    result = train(data, short, extra_components=[recorder])
+    each = ("activated", "pixel_weight", "loss", "after_backward", "densification_grad2d")
     in_steps = [call for call in recorder.calls if call[1] is not None]
-    assert in_steps == [(name, number) for number in range(steps) for name in each]
-    assert recorder.calls[0] == ("refined", None)
+    assert in_steps == [(name, number) for number in range(short.train.steps) for name in each]
+    assert recorder.calls[0] == ("on_gaussians_changed", None)
     assert recorder.calls[-1] == ("finish", None)
-    assert len(set(recorder.sizes)) > 3  # told of every refinement, or the sizes above are wrong
-    assert (trained.gaussians.sh0 == 0).all()  # what `finish` makes is what is kept
+    # The hook was called after every refinement, or the sizes above would not agree.
+    assert len(set(recorder.sizes)) > 3
+    assert (result.gaussians.sh0 == 0).all()  # the result is what `finish` made of the Gaussians
 
 
-def test_the_history_has_the_mean_of_what_components_note(
-    data: Dataset, baseline: Conf, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    class Noting(components.Component):
+def test_extra_components_run_behind_those_of_the_config(data: Dataset, short: Conf) -> None:
+    class Doubling(components.Component):
         def loss(self, loss: torch.Tensor, image: torch.Tensor, step: Step) -> torch.Tensor:
             del image
-            if step.number >= 300 and step.view.tag == "LR":
-                step.log["noting.number"] = step.number
-            return loss
+            step.log["loss.before"] = loss.item()
+            return 2 * loss
 
-    monkeypatch.setattr(components, "build", lambda *_: components.Components([Noting()]))
-    baseline.train.steps, baseline.splat.densify.stop = 400, 0
-    baseline.splat.backend = "auto"
-    history = train.train(data, baseline).history
-    assert len({tuple(row) for row in history}) == 1
-    lr = {view.name for view in data.train if view.tag == "LR"}
-    drawn = EpochSampler(data.train, baseline.seed, 400, lambda _: True)
-    noted = [step.number for step in drawn if step.view.name in lr and step.number >= 300]
-    for last, row in itertools.pairwise(history):
-        numbers = [number for number in noted if last["step"] < number <= row["step"]]
-        mean = sum(numbers) / len(numbers) if numbers else None
-        assert row["noting.number"] == mean
-    assert history[-1]["steps_HR"] == history[-1]["steps_LR"] == 200
+    short.train.steps = 4
+    short.components.loss_weighting.lr_weight = 0.25
+    first = train(data, short, extra_components=[Doubling()]).history
+    assert [row["loss"] for row in first] == [2 * row["loss.before"] for row in first]
+    plain = train(data, short).history
+    assert first[0]["loss.before"] == plain[0]["loss"]
 
 
-def test_the_threshold_that_gives_a_count_is_found_and_kept(data: Dataset, baseline: Conf) -> None:
-    plain = train.train(data, baseline)
-    wanted = round(0.8 * len(plain.gaussians))
-    baseline.components.count_matched.gaussians = wanted
-    matched = train.train(data, baseline)
-    assert abs(len(matched.gaussians) / wanted - 1) <= 0.05
-    assert matched.grow_grad2d > plain.grow_grad2d == baseline.splat.densify.grow_grad2d
-    baseline.components.count_matched.gaussians = 0
-    baseline.splat.densify.grow_grad2d = matched.grow_grad2d
-    assert same(train.train(data, baseline).gaussians, matched.gaussians)
-
-
-def test_the_history_counts_by_group(data: Dataset, compose: Callable[..., Conf]) -> None:
-    history = train.train(data, compose("train.steps=40", "+ablation=densify")).history
-    assert len({tuple(row) for row in history}) == 1
-    last = history[-1]
-    assert last["grown_HR"] > 0
-    assert last["grown_LR"] > 0
-    grown = last["duplicated"] + last["split"]
-    assert max(last["grown_HR"], last["grown_LR"]) <= grown <= last["grown_HR"] + last["grown_LR"]
-    assert last["pruned_opacity_HR"] + last["pruned_opacity_LR"] == last["pruned_opacity"]
-
-
-def test_a_statistic_of_nothing_grows_nothing(
-    data: Dataset, baseline: Conf, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    class Blind(components.Component):
+def test_a_gradient_of_zero_grows_nothing(data: Dataset, short: Conf) -> None:
+    class Zero(components.Component):
         def densification_grad2d(self, gradient: torch.Tensor, step: Step) -> torch.Tensor:
             del step
             return torch.zeros_like(gradient)
 
-    monkeypatch.setattr(components, "build", lambda *_: components.Components([Blind()]))
-    last = train.train(data, baseline).history[-1]
+    last = train(data, short, extra_components=[Zero()]).history[-1]
     assert last["duplicated"] == last["split"] == 0
 
 
 @pytest.mark.parametrize("ablation", ABLATIONS)
 def test_each_ablation_changes_the_result(
-    data: Dataset, compose: Callable[..., Conf], ablation: str
+    data: Dataset, compose: Compose, same: Same, ablation: str
 ) -> None:
-    short = ["train.steps=20", "splat.backend=auto"]
-    plain = train.train(data, compose(*short))
-    conf = compose(*short, f"+ablation={ablation}")
-    if conf.matched_to is not None:  # as a sweep would
+    overrides = ["train.steps=20", "splat.backend=auto"]
+    plain = train_cell(data, compose(*overrides))
+    conf = compose(*overrides, f"+ablation={ablation}")
+    if conf.matched_to is not None:  # as a sweep does
         conf.components.count_matched.gaussians = round(0.8 * len(plain.gaussians))
-    changed = train.train(data, conf)
-    assert not same(plain.gaussians, changed.gaussians)
+    assert not same(plain.gaussians, train_cell(data, conf).gaussians)
 
 
 @pytest.mark.parametrize(
-    "relief",
+    "change",
     ["adaptive_weighting.texture=0.3", "region_weighting.texture=0.3", "hybrid_schedule.ramp=5000"],
 )
-def test_each_relief_changes_what_weighting_does(
-    data: Dataset, compose: Callable[..., Conf], relief: str
+def test_each_attenuation_changes_what_loss_weighting_does(
+    data: Dataset, compose: Compose, same: Same, change: str
 ) -> None:
-    short = ["train.steps=20", "splat.backend=auto", "components.loss_weighting.lr_weight=0.25"]
-    weighted = train.train(data, compose(*short))
-    relieved = train.train(data, compose(*short, f"components.{relief}"))
-    assert not same(weighted.gaussians, relieved.gaussians)
+    overrides = ["train.steps=20", "splat.backend=auto", "components.loss_weighting.lr_weight=0.25"]
+    weighted = train(data, compose(*overrides))
+    attenuated = train(data, compose(*overrides, f"components.{change}"))
+    assert not same(weighted.gaussians, attenuated.gaussians)
 
 
-def test_what_is_kept_is_no_smaller_than_its_filter(
-    data: Dataset, compose: Callable[..., Conf]
-) -> None:
+def test_the_result_is_no_smaller_than_the_mip_filter(data: Dataset, compose: Compose) -> None:
     smallest = {}
     for variance in (0.0, 2.0):
         conf = compose(
             "train.steps=20", "splat.backend=auto", f"components.mip.variance={variance}"
         )
-        smallest[variance] = train.train(data, conf).gaussians.activated().scales.min().item()
-    # The finest view has a focal length of 72 px, and sees none nearer than 1.
+        smallest[variance] = train(data, conf).gaussians.activated().scales.min().item()
+    # The finest view has a focal length of 72 px, and no Gaussian is nearer to it than 1.
     assert smallest[0.0] < 2**0.5 / 72 < smallest[2.0]
 
 
@@ -234,76 +239,42 @@ def test_what_is_kept_is_no_smaller_than_its_filter(
     ],
     ids=["loss_gradient", "per_class", "current_view", "render_scale"],
 )
-def test_what_is_for_lr_views_leaves_hr_views_alone(
-    data: Dataset, compose: Callable[..., Conf], changes: list[str]
+def test_what_changes_lr_views_alone_does_not_change_training_on_hr_views(
+    data: Dataset, compose: Compose, same: Same, changes: list[str]
 ) -> None:
-    # With lr_prune 1: else what no HR view draws is pruned sooner, and the reset is higher.
+    # With lr_prune at 1: another value raises the reset opacity and prunes Gaussians that no HR
+    # view shows.
     views = tuple(view for view in data.train if view.tag == "HR")
     data = dataclasses.replace(data, train=views)
-    short = ["train.steps=20", "splat.backend=auto"]
-    plain = train.train(data, compose(*short))
-    assert same(plain.gaussians, train.train(data, compose(*short, *changes)).gaussians)
+    overrides = ["train.steps=20", "splat.backend=auto"]
+    plain = train(data, compose(*overrides))
+    assert same(plain.gaussians, train(data, compose(*overrides, *changes)).gaussians)
 
 
-def test_training_goes_on_when_every_gaussian_is_pruned(data: Dataset, baseline: Conf) -> None:
-    baseline.splat.densify.prune_opacity = 2.0
-    trained = train.train(data, baseline)
-    assert len(trained.gaussians) == 0
-    assert trained.history[-1]["step"] == baseline.train.steps - 1
+def test_training_continues_when_every_gaussian_is_pruned(data: Dataset, short: Conf) -> None:
+    short.splat.densify.prune_opacity = 2.0
+    result = train(data, short)
+    assert len(result.gaussians) == 0
+    assert result.history[-1]["step"] == short.train.steps - 1
 
 
-def test_the_sh_bands_come_on_in_turn(
-    data: Dataset, baseline: Conf, monkeypatch: pytest.MonkeyPatch
+def test_the_sh_bands_are_switched_on_in_turn(
+    data: Dataset, short: Conf, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     degrees = []
-    real = train.rasterize
 
-    def spy(*arguments: object, sh_degree: int, **rest: object) -> object:
+    def spy(*arguments: Any, sh_degree: int, **others: Any) -> rasterize.Render:
         degrees.append(sh_degree)
-        return real(*arguments, sh_degree=sh_degree, **rest)
+        return rasterize.rasterize(*arguments, sh_degree=sh_degree, **others)
 
-    monkeypatch.setattr(train, "rasterize", spy)
-    baseline.train.steps = 60
-    train.train(data, baseline)
+    monkeypatch.setattr(loop, "rasterize", spy)
+    short.train.steps = 60
+    train(data, short)
     assert degrees == [min(step // 2, 3) for step in range(60)]
 
 
-def names_of(data: Dataset, steps: int, trains_on: Callable[[Step], bool]) -> list[str]:
-    drawn = list(EpochSampler(data.train, 0, steps, trains_on))
-    assert [(step.number, step.of) for step in drawn] == [(n, steps) for n in range(steps)]
-    return [step.view.name for step in drawn]
-
-
-def test_every_view_is_seen_once_before_any_is_seen_twice(data: Dataset) -> None:
-    names = names_of(data, 40, lambda _: True)
-    rounds = [tuple(names[start : start + 4]) for start in range(0, 40, 4)]
-    assert all(sorted(r) == ["v0", "v1", "v2", "v3"] for r in rounds)
-    assert len(set(rounds)) > 1
-
-
-def test_a_view_that_is_refused_is_not_drawn(data: Dataset) -> None:
-    names = names_of(data, 40, lambda step: step.number >= 20 or step.view.name in {"v1", "v3"})
-    assert all(sorted(names[start : start + 2]) == ["v1", "v3"] for start in range(0, 20, 2))
-    assert all(sorted(names[s : s + 4]) == ["v0", "v1", "v2", "v3"] for s in range(20, 40, 4))
-
-
-def test_a_view_refused_in_the_middle_of_a_round_is_passed_over(data: Dataset) -> None:
-    names = names_of(data, 40, lambda step: step.number < 2 or step.view.name != "v2")
-    assert "v2" not in names[2:]
-    assert len(set(names[:5])) >= 3
-
-
-def test_where_every_view_is_refused_it_is_an_error(data: Dataset) -> None:
-    with pytest.raises(XrgsError, match=r"step 7: the components leave no view to train on"):
-        names_of(data, 40, lambda step: step.number < 7)
-
-
-def test_a_splat_keeps_its_activated_ranges(data: Dataset, baseline: Conf) -> None:
-    _, _, scales, opacities, _, _ = train.train(data, baseline).gaussians.activated()
-    assert (scales > 0).all()
-    assert ((opacities >= 0) & (opacities <= 1)).all()
-    assert RasterSettings().sh_degree == 3
-
-
-def same(first: Gaussians, second: Gaussians) -> bool:
-    return all(torch.equal(first[name], second[name]) for name in PARAMETERS)
+def test_activated_parameters_stay_in_their_ranges(data: Dataset, short: Conf) -> None:
+    activated = train(data, short).gaussians.activated()
+    assert (activated.scales > 0).all()
+    assert ((activated.opacities >= 0) & (activated.opacities <= 1)).all()
+    assert all(torch.isfinite(getattr(activated, name)).all() for name in PARAMETERS)

@@ -17,7 +17,7 @@ from xrgs.evaluation import metrics
 from xrgs.safeio.records import read_json
 from xrgs.splat.backend import resolve_backend
 from xrgs.splat.rasterize import rasterize
-from xrgs.training.loop import Trained, train
+from xrgs.training.count_matching import train_cell
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -25,6 +25,7 @@ if TYPE_CHECKING:
 
     from xrgs.capture.dataset import LoadedView
     from xrgs.config import Conf
+    from xrgs.training.recorder import TrainingResult
 
 AS_IT_IS = "as it is"
 
@@ -49,7 +50,7 @@ def compare(folder: Path, steps: int) -> list[dict[str, Any]]:
     conf.train.steps = steps
     rows: list[dict[str, Any]] = []
     for name, changed in _changes(conf).items():
-        trained = train(data, changed)
+        trained = train_cell(data, changed)
         psnr = _psnr(trained, data.test, changed)
         rows.append(
             {
@@ -83,7 +84,7 @@ def _changes(conf: Conf) -> dict[str, Conf]:
     return made
 
 
-def _psnr(trained: Trained, views: Sequence[LoadedView], conf: Conf) -> float:
+def _psnr(trained: TrainingResult, views: Sequence[LoadedView], conf: Conf) -> float:
     backend, raster = resolve_backend(conf.splat.backend), conf.splat.raster
     values = []
     with torch.no_grad():

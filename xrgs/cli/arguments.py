@@ -13,7 +13,7 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from xrgs import config
-from xrgs.config import literal
+from xrgs.config import escape_interpolations
 from xrgs.errors import XrgsError
 from xrgs.safeio.paths import user_path
 
@@ -40,7 +40,7 @@ def errors_as_messages(command: str, hint: str = "") -> Iterator[None]:
     except XrgsError as error:
         sys.exit(f"{command}: {error}")
     except (OmegaConfBaseException, HydraException) as error:
-        sys.exit(f"{command}: {config.one_line(error)}{hint}")
+        sys.exit(f"{command}: {config.error_line(error)}{hint}")
 
 
 def with_quotes(words: Sequence[str]) -> list[str]:
@@ -68,7 +68,7 @@ def _with_quotes(word: str) -> str:
         return word
     exists = user_path(value).exists()
     if exists or key != "scene.path":
-        return f"{key}={_quoted(key, literal(value) if exists else value)}"
+        return f"{key}={_quoted(key, escape_interpolations(value) if exists else value)}"
     return f"{key}={','.join(_quoted(key, part) for part in value.split(','))}"
 
 
@@ -93,7 +93,7 @@ def dotlist(words: Sequence[str]) -> DictConfig:
     conf = OmegaConf.create({})
     for word in words:
         key, _, value = word.partition("=")
-        text: Any = literal(value)
+        text: Any = escape_interpolations(value)
         OmegaConf.update(conf, key, text)
     return conf
 

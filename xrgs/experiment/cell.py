@@ -19,7 +19,7 @@ from xrgs.safeio.hashing import digest
 from xrgs.splat.backend import resolve_backend
 from xrgs.splat.ply import save_ply
 from xrgs.training.checkpoint import Checkpoint, CheckpointError
-from xrgs.training.loop import Trained, train
+from xrgs.training.count_matching import train_cell
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -28,6 +28,7 @@ if TYPE_CHECKING:
     from xrgs.capture.views import Variant
     from xrgs.config import Conf
     from xrgs.experiment.store import CellFolder
+    from xrgs.training.recorder import TrainingResult
 
 _log = logging.getLogger(__name__)
 
@@ -81,18 +82,18 @@ def _train_and_score(conf: Conf, variant: Variant, folder: CellFolder) -> list[s
     return [view.name for view in data.test]
 
 
-def _train_or_resume(data: Dataset, conf: Conf, folder: CellFolder) -> Trained:
+def _train_or_resume(data: Dataset, conf: Conf, folder: CellFolder) -> TrainingResult:
     """Train from the cell's checkpoint, or from the start if there is no usable one."""
     checkpoint = Checkpoint(folder.checkpoint, digest(folder.identity()), conf.checkpoint_s)
     try:
-        steps = checkpoint.read()
+        steps = checkpoint.load()
         if steps is not None:
             _log.info("going on from the checkpoint, %d steps done", steps)
-        return train(data, conf, checkpoint)
+        return train_cell(data, conf, checkpoint)
     except CheckpointError as error:
         _log.warning("training starts over: %s", error)
-        checkpoint.refuse()
-    return train(data, conf, checkpoint)
+        checkpoint.set_aside()
+    return train_cell(data, conf, checkpoint)
 
 
 def _peak_rss_bytes() -> int:

@@ -19,6 +19,7 @@ from hydra.core.plugins import Plugins
 from hydra.types import HydraContext
 from omegaconf import OmegaConf, flag_override
 
+from xrgs.config import escape_interpolations
 from xrgs.errors import XrgsError
 from xrgs.runtime.machine import usable_cores
 from xrgs.runtime.progress import log_line
@@ -191,7 +192,7 @@ class Launches:
         In a job on another machine `now` would be another time, and `.` another folder.
         """
         folder = _create_unique(Path(self._config.hydra.sweep.dir).absolute())
-        self._set("sweep.dir", str(folder).replace("${", r"\${"))  # no interpolation begins there
+        self._set("sweep.dir", escape_interpolations(str(folder)))
         session = SweepSession(folder)
         session.begin()
         return session

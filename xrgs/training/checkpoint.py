@@ -1,8 +1,9 @@
-"""A run's state on disk, so that one that is killed goes on as if it had not been.
+"""The state of a training run on disk, from which a killed run continues to the same result.
 
-What has state says so itself, by `state_dict` and `load_state_dict` as torch's own modules do;
-training names those pieces once (`Checkpoint.keep`). The file is a .npz of plain arrays beside one
-JSON text: reading one from a stranger runs no code, and numbers come back to the last bit.
+Each object that the steps change returns its state by `state_dict` and takes it back by
+`load_state_dict`, as torch's modules do; a run registers them once (`Checkpoint.register`). The
+file is a .npz of plain arrays and one JSON text, so that reading a file of unknown origin runs no
+code, and so that numbers come back to the last bit.
 """
 
 from __future__ import annotations
@@ -28,137 +29,153 @@ if TYPE_CHECKING:
 
 _log = logging.getLogger(__name__)
 
-_PLAIN = "state.json"
-"""Member of the archive that holds all that is no tensor, as bytes of UTF-8."""
+_JSON_MEMBER = "state.json"
+"""Member of the archive that holds everything but the tensors, as bytes of UTF-8."""
 
 State = dict[str, Any]
-"""Tensors, and values that JSON has, under names; dicts of them may nest. No name has a `/`."""
+"""Tensors and values that JSON can hold, by name; dicts of them may nest. No name contains `/`."""
 
 
 class CheckpointError(XrgsError):
-    """The file is damaged, or of another cell."""
+    """The file is damaged, or belongs to another cell."""
 
 
 class Stateful(Protocol):
-    """A piece of a run that the steps before have changed."""
+    """An object of a run that the steps change."""
 
     def state_dict(self) -> State:
-        """What the steps so far have made of it. Tensors are not copied."""
+        """Return the state. Tensors are not copied."""
 
     def load_state_dict(self, state: State) -> None:
-        """Become what `state_dict` told of, in one built from the same config and data.
+        """Take over the state of an object that was built from the same config and data.
+
+        Args:
+            state: What `state_dict` returned.
 
         Raises:
-            KeyError: something is missing.
-            TypeError: something is of another kind.
-            ValueError: something does not fit.
+            KeyError: An entry is missing.
+            TypeError: An entry is of another type.
+            ValueError: An entry does not fit.
         """
 
 
 class Checkpoint:
-    """The file in which a run keeps the state of its pieces, written every so often."""
+    """Writes the state of the registered objects to a file every so often, and restores it."""
 
-    def __init__(self, file: Path | None = None, cell: str = "", every_s: float = 0.0) -> None:
-        """Nothing is read yet.
+    def __init__(self, file: Path | None = None, cell_id: str = "", every_s: float = 0.0) -> None:
+        """Set where and how often the state is written.
 
         Args:
-            file: Where; None keeps nothing.
-            cell: Which program it is the state of. Another's is refused.
+            file: The checkpoint file; None writes nothing.
+            cell_id: The cell whose state it is. The file of another cell is refused.
             every_s: Seconds between two writes; 0 never writes.
         """
         self.file = file
-        self.cell = cell
+        self.cell_id = cell_id
         self.every_s = every_s
-        self._pieces: dict[str, Stateful] = {}
-        self._left: State = {}
-        self._written = time.monotonic()
+        self._objects: dict[str, Stateful] = {}
+        self._loaded: State = {}
+        """States that `load` has read and no object has taken over yet."""
+        self._written_at = time.monotonic()
 
-    def read(self) -> int | None:
-        """Hold ready what a run before left, for the pieces that `keep` names.
+    def load(self) -> int | None:
+        """Read the file; the objects take over their states when they are registered.
 
         Returns:
-            The number of steps done; None where nothing was left.
+            The number of steps done; None where there is no file.
 
         Raises:
-            CheckpointError: the file is damaged, or of another cell; the message names it.
+            CheckpointError: The file is damaged, or belongs to another cell; the message names the
+                file.
         """
-        self._left = {}
+        self._loaded = {}
         if self.file is None or not self.file.exists():
             return None
         try:
             state = _load(self.file)
-            cell, steps, pieces = state["cell"], int(state["steps"]), dict(state["pieces"])
-        except Exception as error:  # whatever a stranger's bytes may lead to
+            cell_id, steps, states = state["cell"], int(state["steps"]), dict(state["states"])
+        except Exception as error:  # the bytes may be anything, and so may the error
             raise CheckpointError(f"{self.file}: {type(error).__name__}: {error}") from error
-        if cell != self.cell:
-            raise CheckpointError(f"{self.file}: of cell {cell}, not of {self.cell}")
-        self._left = pieces
+        if cell_id != self.cell_id:
+            raise CheckpointError(f"{self.file}: belongs to cell {cell_id}, not to {self.cell_id}")
+        self._loaded = states
         return steps
 
-    def keep(self, **pieces: Stateful) -> None:
-        """Name the pieces that have state, in place of those of the same name.
+    def register(self, **objects: Stateful) -> None:
+        """Add objects whose state is to be written; they replace those of the same name.
 
-        Each takes what a run before left under its name, the first time that the name is given.
+        The first object registered under a name takes over the state that `load` has read for it.
+
+        Args:
+            objects: Each by the name of its state in the file. They are restored in their order.
 
         Raises:
-            CheckpointError: what was left does not fit; the pieces are of no more use.
+            CheckpointError: A state does not fit its object. The objects may be half restored, and
+                must not be used.
         """
-        self._pieces |= pieces
-        for name, piece in pieces.items():
-            if name not in self._left:
+        self._objects |= objects
+        for name, value in objects.items():
+            if name not in self._loaded:
                 continue
             try:
-                piece.load_state_dict(self._left.pop(name))
+                value.load_state_dict(self._loaded.pop(name))
             except (KeyError, TypeError, ValueError, AttributeError, RuntimeError) as error:
                 raise CheckpointError(
                     f"{self.file}: {name}: {type(error).__name__}: {error}"
                 ) from error
 
-    def after_step(self, number: int) -> float:
-        """Write if it is time. A disk that is full or gone costs the checkpoint, not the run.
+    def save_if_due(self, step: int) -> float:
+        """Write the file if the interval has passed.
+
+        Where the disk is full or gone, a warning is logged and training continues.
 
         Args:
-            number: Of the step that is done, from 0.
+            step: The number of the step that is done, from 0.
 
         Returns:
-            Seconds that it took.
+            The seconds that it took.
         """
         start = time.monotonic()
-        if self.file is None or self.every_s <= 0 or start - self._written < self.every_s:
+        if self.file is None or self.every_s <= 0 or start - self._written_at < self.every_s:
             return 0.0
-        pieces = {name: piece.state_dict() for name, piece in self._pieces.items()}
+        states = {name: value.state_dict() for name, value in self._objects.items()}
         try:
-            _save(self.file, {"cell": self.cell, "steps": number + 1, "pieces": pieces})
+            _save(self.file, {"cell": self.cell_id, "steps": step + 1, "states": states})
         except OSError as error:
-            _log.warning("no checkpoint at step %d: %s", number + 1, error)
-        self._written = time.monotonic()
-        return self._written - start
+            _log.warning(
+                "%s: no checkpoint was written after step %d (%s); training continues",
+                self.file,
+                step,
+                error,
+            )
+        self._written_at = time.monotonic()
+        return self._written_at - start
 
-    def refuse(self) -> None:
-        """Move the file aside, so that training starts over, and forget what it held."""
-        self._left, self._pieces = {}, {}
+    def set_aside(self) -> None:
+        """Rename the file to `refused-<name>` and forget its states: training starts over."""
+        self._loaded, self._objects = {}, {}
         if self.file is not None and self.file.exists():
             self.file.replace(self.file.with_name(f"refused-{self.file.name}"))
 
 
 def _save(file: Path, state: State) -> None:
     arrays: dict[str, NDArray[Any]] = {}
-    text = json.dumps(_without_tensors(state, "", arrays))
-    arrays[_PLAIN] = np.frombuffer(text.encode(), np.uint8)
+    text = json.dumps(_split_off_tensors(state, "", arrays))
+    arrays[_JSON_MEMBER] = np.frombuffer(text.encode(), np.uint8)
     with atomic_writer(file) as stream, zipfile.ZipFile(stream, "w") as archive:
         for name, array in arrays.items():
             with archive.open(name, "w", force_zip64=True) as member:
                 np.lib.format.write_array(member, array, allow_pickle=False)
 
 
-def _without_tensors(state: State, path: str, arrays: dict[str, NDArray[Any]]) -> State:
-    """The plain values, as JSON has them; tensors go into `arrays` by their path."""
+def _split_off_tensors(state: State, path: str, arrays: dict[str, NDArray[Any]]) -> State:
+    """Return the values that JSON can hold; the tensors are put into `arrays` by their path."""
     plain: State = {}
     for name, value in state.items():
         if isinstance(value, torch.Tensor):
             arrays[path + name] = value.detach().numpy()
         elif isinstance(value, dict):
-            plain[name] = _without_tensors(value, f"{path}{name}/", arrays)
+            plain[name] = _split_off_tensors(value, f"{path}{name}/", arrays)
         else:
             plain[name] = value
     return plain
@@ -167,16 +184,17 @@ def _without_tensors(state: State, path: str, arrays: dict[str, NDArray[Any]]) -
 def _load(file: Path) -> State:
     with untrusted.open_regular(file) as stream:
         arrays = npz.read(stream)
-    state: State = untrusted.parse_json(arrays.pop(_PLAIN).tobytes())
-    _with_tensors(state, arrays)
+    state: State = untrusted.parse_json(arrays.pop(_JSON_MEMBER).tobytes())
+    _put_back_tensors(state, arrays)
     return state
 
 
-def _with_tensors(state: State, arrays: Mapping[str, NDArray[Any]]) -> None:
+def _put_back_tensors(state: State, arrays: Mapping[str, NDArray[Any]]) -> None:
     for path, array in arrays.items():
         *folders, name = path.split("/")
-        place = state
+        inner = state
         for folder in folders:
-            place = place[folder]
-        # In memory of torch's own alignment, on which the order of a vectorised sum may depend.
-        place[name] = torch.from_numpy(array).clone()
+            inner = inner[folder]
+        # Cloned into memory of torch's own alignment: the order of a vectorised sum may depend on
+        # the alignment.
+        inner[name] = torch.from_numpy(array).clone()

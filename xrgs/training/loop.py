@@ -1,299 +1,175 @@
-"""The training loop: gsplat's default training, with the hooks of the XR-GS components."""
+"""The training loop: gsplat's default training, with the hooks of the XR-GS components.
+
+`train` trains one configuration. What trains more than once to answer a question, as the control of
+`xrgs.training.count_matching` does, calls it and is not known here.
+"""
 
 from __future__ import annotations
 
-import dataclasses
-import time
-from collections import Counter, defaultdict
 from dataclasses import dataclass
-from statistics import fmean
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import torch
 
-from xrgs.errors import XrgsError
 from xrgs.runtime.progress import progress
-from xrgs.safeio.hashing import digest
-from xrgs.splat import gaussians as splats
 from xrgs.splat.backend import resolve_backend
 from xrgs.splat.densify import Densifier, Refinement
+from xrgs.splat.gaussians import from_points
 from xrgs.splat.loss import photometric_loss, prepare_target
 from xrgs.splat.optimizer import SplatOptimizer
 from xrgs.splat.rasterize import rasterize
 from xrgs.splat.settings import NOMINAL_STEPS
-from xrgs.training import components
-from xrgs.training.checkpoint import Checkpoint, State
-from xrgs.training.components import Step
-from xrgs.training.components.count_matched import Search
+from xrgs.training.checkpoint import Checkpoint
+from xrgs.training.components import Components
+from xrgs.training.components import build as build_components
+from xrgs.training.recorder import TrainingRecorder, TrainingResult
+from xrgs.training.sampler import EpochSampler
+from xrgs.training.seeding import seeded_generator
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator
+    from collections.abc import Iterable
 
-    from xrgs.capture.dataset import Dataset, LoadedView
-    from xrgs.config import Conf
-    from xrgs.splat.gaussians import Gaussians
-    from xrgs.splat.rasterize import Render
-    from xrgs.training.components import Components
+    from xrgs.capture.dataset import Dataset
+    from xrgs.config import Conf, SplatConf
+    from xrgs.splat.loss import Target
+    from xrgs.training.components import Component
 
-_LOGGED_ROWS = 200
+
+def train(
+    data: Dataset,
+    conf: Conf,
+    checkpoint: Checkpoint | None = None,
+    extra_components: Iterable[Component] = (),
+) -> TrainingResult:
+    """Train one configuration. The same data, config and seed give the same bits.
+
+    Args:
+        data: The views to train on and the points to start from.
+        conf: The config. `components.count_matched`, which asks for several trainings, is not
+            read: `xrgs.training.count_matching.train_cell` does that.
+        checkpoint: Where the state of the run is written. A state that its `load` has read is
+            continued from. None writes nothing.
+        extra_components: Components that run behind those that the config switches on.
+
+    Returns:
+        The trained Gaussians and the record of the training.
+
+    Raises:
+        CheckpointError: The state that was read does not fit this config and data.
+        XrgsError: A component's value is out of range, a view is too small for a component, or
+            the components leave no view to train on.
+    """
+    checkpoint = checkpoint or Checkpoint()
+    run = _set_up(data, conf, extra_components)
+    run.components.on_gaussians_changed(run.optimizer.gaussians)
+    # Everything that a step changes. The Gaussians belong to the optimizer's state, which must be
+    # restored first: the others' states have to fit the number of Gaussians.
+    checkpoint.register(
+        optimizer=run.optimizer,
+        densifier=run.densifier,
+        components=run.components,
+        sampler=run.sampler,
+        recorder=run.recorder,
+    )
+    _run_steps(run, checkpoint)
+    gaussians = run.optimizer.gaussians
+    run.components.finish(gaussians)
+    return run.recorder.finish(gaussians)
 
 
 @dataclass(frozen=True)
-class Trained:
-    """What training gave, and what it took."""
+class _Run:
+    """Everything that the steps of one run use."""
 
-    gaussians: Gaussians
-    history: list[dict[str, Any]]
-    """One row a logged step: the step done, its view and loss, Gaussians; since the start, the
-    steps on views of each tag and what each rule of densification did; since the row before, the
-    mean of what components noted, None where none did. Every row has every column."""
-    seconds: float
-    """Of training alone: no loading, no evaluation."""
-    memory_bytes: int
-    """Model, gradients, optimizer and renderer buffers at the step where they were largest."""
-    evaluations: int
-    """Alpha evaluations of all forward passes: the work done, whatever the machine."""
-    grow_grad2d: float
-    """The threshold of growth that it was trained with."""
+    splat: SplatConf
+    steps: int
+    sh_every: int
+    """Steps of this run after which one more SH band is switched on."""
+    backend: str
+    targets: dict[str, Target]
+    optimizer: SplatOptimizer
+    components: Components
+    densifier: Densifier
+    sampler: EpochSampler
+    recorder: TrainingRecorder
 
 
-def train(data: Dataset, conf: Conf, checkpoint: Checkpoint | None = None) -> Trained:
-    """Train one cell. The same dataset, config and seed give the same Gaussians, bit for bit.
-
-    Args:
-        data: What to train on.
-        conf: The cell's config.
-        checkpoint: Where the run keeps its state; it goes on from what was read there.
-
-    Raises:
-        CheckpointError: what was read there does not fit this cell.
-        XrgsError: a component's value is out of range, or a view is too small for it.
-    """
-    checkpoint = checkpoint or Checkpoint()
-    wanted = conf.components.count_matched.gaussians
-    if not wanted:
-        return _run(data, conf, checkpoint)
-
-    def run(threshold: float) -> Trained:
-        densify = dataclasses.replace(conf.splat.densify, grow_grad2d=threshold)
-        splat = dataclasses.replace(conf.splat, densify=densify)
-        return _run(data, dataclasses.replace(conf, splat=splat), checkpoint)
-
-    search = Search(conf.splat.densify.grow_grad2d, wanted)
-    checkpoint.keep(search=search)
-    return search(run)
-
-
-def _run(data: Dataset, conf: Conf, checkpoint: Checkpoint) -> Trained:
-    """One run from its first step to its last."""
-    steps, splat, ssim = conf.train.steps, conf.splat, conf.splat.ssim_weight
-    backend = resolve_backend(splat.backend)
-    optimizer, densifier, parts = _built(data, conf, backend)
-    gaussians = optimizer.gaussians
-    targets = {view.name: prepare_target(view.image) for view in data.train}
-    sh_every = max(1, int(splat.sh_every * steps / NOMINAL_STEPS))
-    drawn = EpochSampler(data.train, conf.seed, steps, parts.trains_on)
-
-    ledger = TrainingRecorder(steps, splat.densify.grow_grad2d)
-    parts.on_gaussians_changed(gaussians)
-    # All that a step changes. The optimizer has the Gaussians, so it is the first to take its own.
-    checkpoint.keep(
-        optimizer=optimizer, densifier=densifier, components=parts, drawn=drawn, ledger=ledger
-    )
-    for step in progress(drawn, "training", "step", steps, done=drawn.number):
+def _run_steps(run: _Run, checkpoint: Checkpoint) -> None:
+    raster, ssim, backend = run.splat.raster, run.splat.ssim_weight, run.backend
+    components, optimizer, densifier = run.components, run.optimizer, run.densifier
+    sampler, recorder, gaussians = run.sampler, run.recorder, run.optimizer.gaussians
+    for step in progress(sampler, "training", "step", run.steps, done=sampler.next_step):
         view, camera = step.view, step.view.camera
-        degree = min(step.number // sh_every, splat.raster.sh_degree)
-        offset = torch.zeros(len(gaussians), 2, requires_grad=True)
+        sh_degree = min(step.number // run.sh_every, raster.sh_degree)
+        # Render the view of this step. The gradient of the offset is for densification.
+        means2d_offset = torch.zeros(len(gaussians), 2, requires_grad=True)
         render = rasterize(
-            *parts.activated(gaussians.activated(), step),
+            *components.activated(gaussians.activated(), step),
             camera,
-            splat.raster,
-            sh_degree=degree,
-            means2d_offset=offset,
+            raster,
+            sh_degree=sh_degree,
+            means2d_offset=means2d_offset,
             backend=backend,
         )
-        target, weights = targets[view.name], parts.pixel_weight(step)
+        # Loss: L1 and SSIM against the photograph, then the terms and weights of the components.
+        image, target, weights = render.image, run.targets[view.name], components.pixel_weight(step)
         loss = photometric_loss(
-            render.image, target, l1=1 - ssim, ssim=ssim, pixel_weight=weights, backend=backend
+            image, target, l1=1 - ssim, ssim=ssim, pixel_weight=weights, backend=backend
         )
-        loss = parts.loss(loss, render.image, step)
+        loss = components.loss(loss, image, step)
+        # Backward, then the components' changes of the gradients.
         optimizer.zero_grad()
         torch.autograd.backward(loss)
-        parts.after_backward(gaussians, step)
-        optimizer.step(camera, sh_degree=degree)
-        ledger.note(step, loss, render, optimizer)
-        statistic = None if offset.grad is None else parts.densification_grad2d(offset.grad, step)
-        size = {"width": camera.width, "height": camera.height}
-        done = densifier.after_step(step.number, statistic, render.visible, **size, group=view.tag)
-        ledger.refined(done)
-        if done != Refinement():
-            parts.on_gaussians_changed(gaussians)
-        ledger.leave_out(checkpoint.after_step(step.number))
-    parts.finish(gaussians)
-    return ledger.close(gaussians)
+        components.after_backward(gaussians, step)
+        # Optimise, and record the step while its gradients and buffers still exist.
+        optimizer.step(camera, sh_degree=sh_degree)
+        recorder.record_step(step, loss, render, optimizer)
+        # Densify, prune and reset. There is no gradient where the render shows no Gaussian.
+        grad2d, size = means2d_offset.grad, {"width": camera.width, "height": camera.height}
+        if grad2d is not None:
+            grad2d = components.densification_grad2d(grad2d, step)
+        refinement = densifier.after_step(
+            step.number, grad2d, render.visible, **size, group=view.tag
+        )
+        if refinement != Refinement():
+            components.on_gaussians_changed(gaussians)
+        recorder.record_refinement(refinement)
+        # Write a checkpoint where one is due, which is no training time.
+        recorder.exclude_time(checkpoint.save_if_due(step.number))
 
 
-def _built(data: Dataset, conf: Conf, backend: str) -> tuple[SplatOptimizer, Densifier, Components]:
-    """What trains a cell, before its first step; the optimizer has the Gaussians."""
+def _set_up(data: Dataset, conf: Conf, extra_components: Iterable[Component]) -> _Run:
+    """Everything that the steps use, before the first step; the recorder's clock starts last."""
     splat, steps = conf.splat, conf.train.steps
-    gaussians = splats.from_points(
+    backend = resolve_backend(splat.backend)
+    gaussians = from_points(
         data.points,
         data.colors,
         init_opacity=splat.init_opacity,
         sh_degree=splat.raster.sh_degree,
-        generator=stream(conf.seed, "init"),
+        generator=seeded_generator(conf.seed, "init"),
     )
     optimizer = SplatOptimizer(
         gaussians, splat.optimizer, scene_scale=data.scene_scale, steps=steps, backend=backend
     )
-    parts = components.build(conf.components, data, splat, backend)
+    built = build_components(conf.components, data, splat, backend)
+    components = Components([*built, *extra_components])
     densifier = Densifier(
         optimizer,
         splat.densify.scaled(steps),
         scene_scale=data.scene_scale,
-        generator=stream(conf.seed, "densify"),
-        groups=parts.groups(splat.densify),
+        generator=seeded_generator(conf.seed, "densify"),
+        groups=components.groups(splat.densify),
     )
-    return optimizer, densifier, parts
-
-
-def stream(seed: int, axis: str) -> torch.Generator:
-    """A generator of its own for each use of chance, so that what one draws moves no other."""
-    return torch.Generator().manual_seed(int(digest([seed, axis])[:15], 16))
-
-
-class EpochSampler:
-    """`steps` steps, each time round all views in a new order.
-
-    A view that `trains_on` refuses is passed over; one that it newly allows joins the next round.
-    """
-
-    def __init__(
-        self,
-        views: tuple[LoadedView, ...],
-        seed: int,
-        steps: int,
-        trains_on: Callable[[Step], bool],
-    ) -> None:
-        self.views = views
-        self.steps = steps
-        self.trains_on = trains_on
-        self.number = 0
-        """Of the next step."""
-        self.generator = stream(seed, "views")
-        self.order: list[LoadedView] = []
-        """What is left of the round, last first."""
-
-    def __iter__(self) -> Iterator[Step]:
-        return self
-
-    def __next__(self) -> Step:
-        """The next step.
-
-        Raises:
-            XrgsError: `trains_on` refuses every view.
-        """
-        if self.number >= self.steps:
-            raise StopIteration
-        while self.order and not self._allows(self.order[-1]):
-            self.order.pop()
-        if not self.order:
-            allowed = [view for view in self.views if self._allows(view)]
-            if not allowed:
-                raise XrgsError(f"step {self.number}: the components leave no view to train on")
-            order = torch.randperm(len(allowed), generator=self.generator).tolist()
-            self.order = [allowed[i] for i in order]
-        self.number += 1
-        return Step(self.number - 1, self.steps, self.order.pop())
-
-    def _allows(self, view: LoadedView) -> bool:
-        return self.trains_on(Step(self.number, self.steps, view))
-
-    def state_dict(self) -> State:
-        """The next step's number, the rest of the round, and where chance stands."""
-        order = [view.name for view in self.order]
-        return {"number": self.number, "order": order, "generator": self.generator.get_state()}
-
-    def load_state_dict(self, state: State) -> None:
-        """Go on where `state_dict` was asked."""
-        by_name = {view.name: view for view in self.views}
-        self.number, self.order = int(state["number"]), [by_name[name] for name in state["order"]]
-        self.generator.set_state(state["generator"])
-
-
-class TrainingRecorder:
-    """Keeps what a report wants to know of a run; its clock runs from the moment it is made."""
-
-    def __init__(self, steps: int, grow_grad2d: float) -> None:
-        self.started = time.perf_counter()
-        self.grow_grad2d = grow_grad2d
-        self.every = max(1, steps // _LOGGED_ROWS)
-        self.last = steps - 1
-        self.counts = Counter({"steps_HR": 0, "steps_LR": 0} | Refinement().counts())
-        self.notes: defaultdict[str, list[float]] = defaultdict(list)
-        self.history: list[dict[str, Any]] = []
-        self.memory_bytes = 0
-        self.evaluations = 0
-
-    def note(
-        self,
-        step: Step,
-        loss: torch.Tensor,
-        render: Render,
-        optimizer: SplatOptimizer,
-    ) -> None:
-        gaussians = optimizer.gaussians
-        model = [gaussians[name] for name in splats.PARAMETERS]
-        gradients = [value.grad for value in model if value.grad is not None]
-        used = sum(value.nbytes for value in model + gradients)
-        used += optimizer.state_bytes() + render.buffer_bytes
-        self.memory_bytes = max(self.memory_bytes, used)
-        self.evaluations += render.evaluations
-        self.counts[f"steps_{step.view.tag}"] += 1
-        for name, value in step.log.items():
-            self.notes[name].append(value)
-        if step.number % self.every == 0 or step.number == self.last:
-            row = {"step": step.number, "view": step.view.name, "loss": loss.item()}
-            means = {name: fmean(values) for name, values in self.notes.items()}
-            self.history.append(row | {"gaussians": len(gaussians)} | self.counts | means)
-            self.notes.clear()
-
-    def refined(self, done: Refinement) -> None:
-        self.counts.update(done.counts())
-
-    def leave_out(self, seconds: float) -> None:
-        """Just now, something else than training took so long."""
-        self.started += seconds
-
-    def state_dict(self) -> State:
-        """All of it, with the seconds of training so far."""
-        return {
-            "seconds": time.perf_counter() - self.started,
-            "counts": dict(self.counts),
-            "notes": dict(self.notes),
-            "history": self.history,
-            "memory_bytes": self.memory_bytes,
-            "evaluations": self.evaluations,
-        }
-
-    def load_state_dict(self, state: State) -> None:
-        """Go on where `state_dict` was asked: the time between doesn't count."""
-        self.started = time.perf_counter() - float(state["seconds"])
-        self.counts = Counter(state["counts"])
-        self.notes = defaultdict(list, state["notes"])
-        self.history = list(state["history"])
-        self.memory_bytes = int(state["memory_bytes"])
-        self.evaluations = int(state["evaluations"])
-
-    def close(self, gaussians: Gaussians) -> Trained:
-        seconds = time.perf_counter() - self.started
-        blank = {name: None for row in self.history for name in row} | dict.fromkeys(self.counts, 0)
-        history = [blank | row for row in self.history]
-        return Trained(
-            gaussians,
-            history,
-            seconds,
-            self.memory_bytes,
-            self.evaluations,
-            self.grow_grad2d,
-        )
+    return _Run(
+        splat=splat,
+        steps=steps,
+        sh_every=max(1, int(splat.sh_every * steps / NOMINAL_STEPS)),
+        backend=backend,
+        targets={view.name: prepare_target(view.image) for view in data.train},
+        optimizer=optimizer,
+        components=components,
+        densifier=densifier,
+        sampler=EpochSampler(data.train, conf.seed, steps, components.trains_on),
+        recorder=TrainingRecorder(steps, splat.densify.grow_grad2d),
+    )

@@ -16,7 +16,6 @@ from xrgs.training.components.adaptive_weighting import AdaptiveWeighting
 from xrgs.training.components.base import Component, Components, Step, TrainingView, not_negative
 from xrgs.training.components.consistency import Consistency
 from xrgs.training.components.continuous_weighting import ContinuousWeighting
-from xrgs.training.components.count_matched import CountMatched
 from xrgs.training.components.curriculum import Curriculum
 from xrgs.training.components.densify import Densify
 from xrgs.training.components.gradient_scaling import GradientScaling
@@ -49,8 +48,6 @@ _NOT_NEGATIVE = (
     "hybrid_schedule.ramp",
     "continuous_weighting.gamma",
     "mip.variance",
-    "count_matched.gaussians",
-    "count_matched.tolerance",
 )
 
 
@@ -90,8 +87,6 @@ def build(
         components.append(Mip(conf.mip, data.train, splat.raster.near))
     if conf.render_scale.gamma != 0:
         components.append(RenderScale(conf.render_scale, data.train))
-    if conf.count_matched.gaussians != 0:
-        components.append(CountMatched(conf.count_matched, splat.densify.stop))
     return Components(components)
 
 

@@ -1,0 +1,219 @@
+"""A killed run continues from its checkpoint, and ends with the result of one never killed."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import math
+import random
+from collections.abc import Callable
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+import torch
+from hypothesis import Phase, example, given, settings
+from hypothesis import strategies as st
+
+from xrgs.capture.dataset import Dataset
+from xrgs.config import Conf
+from xrgs.splat.loss import photometric_loss
+from xrgs.training import checkpoint, loop, recorder
+from xrgs.training.checkpoint import Checkpoint
+from xrgs.training.count_matching import train_cell
+from xrgs.training.loop import train
+from xrgs.training.recorder import TrainingResult
+
+STEPS = 24
+#: Densification every fourth step: every single step, as the schedule of so few steps has it, would
+#: leave no statistics to be restored.
+SHORT = (f"train.steps={STEPS}", "splat.densify.every=5000", "splat.densify.stop=25000")
+CASES = {
+    "baseline": [],
+    "groups": ["+ablation=densify"],
+    "current_view": ["+ablation=densify", "components.densify.decide=current_view"],
+    "xrgs": ["+ablation=xrgs"],
+    "curriculum": ["+ablation=curriculum"],
+    # Its rates are found anew between refinements too, or they would be new at every restart.
+    "mip": ["+ablation=mip", "components.mip.every=7"],
+    "count_matched": [],
+}
+
+Compose = Callable[..., Conf]
+Comparable = Callable[[TrainingResult], dict[str, Any]]
+
+
+class Kill(BaseException):
+    """Ends a run as a kill does: no code of the package may catch it."""
+
+
+class Losses:
+    """Counts the losses of a run, which are its steps, and kills the run at one of them."""
+
+    def __init__(self) -> None:
+        self.restart()
+        self.states: dict[tuple[int, int], str] = {}
+        """Digest of the state after each step of each attempt of count matching."""
+
+    def restart(self, last: float = math.inf) -> None:
+        """Count from 0 again, and kill the run after so many losses."""
+        self.last = last
+        self.count = 0
+        self.at_checkpoint = 0
+        """The count when the last checkpoint was written."""
+
+    def __call__(self, *arguments: Any, **named: Any) -> torch.Tensor:
+        self.count += 1
+        if self.count > self.last:
+            raise Kill
+        return photometric_loss(*arguments, **named)
+
+
+class CheckpointEveryFewSteps(Checkpoint):
+    """Is written at every n-th step, and asserts that a step gives the same state each time."""
+
+    def __init__(self, file: Path, every: int, losses: Losses) -> None:
+        super().__init__(file, "cell", every_s=1e-9)
+        self.every, self.losses = every, losses
+
+    def save_if_due(self, step: int) -> float:
+        states = {name: value.state_dict() for name, value in self._objects.items()}
+        del states["recorder"]["seconds"]
+        attempt = len(states.get("search", {}).get("tried", ()))
+        state = digest_of(states)
+        assert self.losses.states.setdefault((attempt, step), state) == state
+        if step % self.every != 0:
+            return 0.0
+        self.losses.at_checkpoint = self.losses.count
+        return super().save_if_due(step)
+
+
+def digest_of(states: dict[str, Any]) -> str:
+    arrays: dict[str, Any] = {}
+    plain = checkpoint._split_off_tensors(states, "", arrays)
+    digest = hashlib.sha256(json.dumps(plain).encode())
+    for name, array in arrays.items():
+        digest.update(f"{name} {array.shape}".encode() + array.tobytes())
+    return digest.hexdigest()
+
+
+@pytest.fixture
+def losses(monkeypatch: pytest.MonkeyPatch) -> Losses:
+    counter = Losses()
+    monkeypatch.setattr(loop, "photometric_loss", counter)
+    # A row every fourth step: logs that wait for their row are part of the state.
+    monkeypatch.setattr(recorder, "_HISTORY_ROWS", STEPS // 4)
+    return counter
+
+
+@pytest.fixture
+def conf(compose: Compose) -> Conf:
+    """The baseline's config, `STEPS` steps with the renderer that is installed everywhere."""
+    return compose(*SHORT, "splat.backend=torch")
+
+
+def train_with_checkpoints(
+    file: Path, every: int, losses: Losses, data: Dataset, conf: Conf
+) -> TrainingResult:
+    """Train on from the checkpoint where there is one, and write one at every n-th step."""
+    written = CheckpointEveryFewSteps(file, every, losses)
+    written.load()
+    return train_cell(data, conf, written)
+
+
+@pytest.mark.parametrize("backend", ["native", pytest.param("torch", marks=pytest.mark.slow)])
+@pytest.mark.parametrize("case", CASES)
+def test_a_killed_run_ends_as_one_never_killed(
+    case: str,
+    backend: str,
+    data: Dataset,
+    compose: Compose,
+    comparable: Comparable,
+    losses: Losses,
+    tmp_path: Path,
+) -> None:
+    if backend == "native":
+        pytest.importorskip("xrgs._native")
+    conf = compose(*SHORT, f"splat.backend={backend}", *CASES[case])
+    file = tmp_path / "checkpoint.npz"
+    if case == "count_matched":
+        count = len(train(data, conf).gaussians)
+        conf.components.count_matched.gaussians = round(0.8 * count)
+        losses.restart()
+    never_killed = train_with_checkpoints(file, STEPS, losses, data, conf)
+    total = losses.count
+    assert (total > STEPS) == (case == "count_matched")  # which takes more than one attempt
+
+    # hypothesis begins with the smallest kill there is, so two at random come first; on the torch
+    # backend, whose steps take ten times as long, they are the only ones.
+    at_random = [random.randrange(total // 4, total), random.randrange(1, total)]
+    phases = [Phase.explicit] if backend == "torch" else [Phase.explicit, Phase.generate]
+
+    @settings(max_examples=2, phases=phases, deadline=None)
+    @example(kills=at_random, every=random.randint(1, 9))
+    @given(kills=st.lists(st.integers(1, total), min_size=1, max_size=2), every=st.integers(1, 9))
+    def check(kills: list[int], every: int) -> None:
+        file.unlink(missing_ok=True)
+        done = 0
+        for kill in kills:
+            losses.restart(kill)
+            try:
+                train_with_checkpoints(file, every, losses, data, conf)
+            except Kill:
+                done += losses.at_checkpoint
+            else:  # fewer steps were left than the kill would have needed
+                assert done + losses.count == total
+                done += losses.at_checkpoint
+        losses.restart()
+        resumed = train_with_checkpoints(file, every, losses, data, conf)
+        assert comparable(resumed) == comparable(never_killed)
+        assert done + losses.count == total  # only steps behind the last checkpoint were repeated
+
+    check()
+
+
+def test_a_run_killed_after_its_last_step_trains_no_step_again(
+    data: Dataset, conf: Conf, comparable: Comparable, losses: Losses, tmp_path: Path
+) -> None:
+    file = tmp_path / "checkpoint.npz"
+    first = train_with_checkpoints(file, 1, losses, data, conf)
+    losses.restart()
+    again = train_with_checkpoints(file, 1, losses, data, conf)
+    assert losses.count == 0
+    assert comparable(again) == comparable(first)
+
+
+def test_the_training_time_is_the_sum_of_the_runs_without_writing(
+    data: Dataset,
+    conf: Conf,
+    losses: Losses,
+    monkeypatch: pytest.MonkeyPatch,
+    tmp_path: Path,
+) -> None:
+    """The clock is moved by a step, by a write, and by the time between two runs alone."""
+    now = 0.0
+    clock = SimpleNamespace(perf_counter=lambda: now, monotonic=lambda: now)
+
+    def taking(seconds: float, function: Callable[..., Any]) -> Callable[..., Any]:
+        def call(*arguments: Any, **named: Any) -> Any:
+            nonlocal now
+            now += seconds
+            return function(*arguments, **named)
+
+        return call
+
+    for module in (recorder, checkpoint):
+        monkeypatch.setattr(module, "time", clock)
+    monkeypatch.setattr(loop, "photometric_loss", taking(1.0, losses))
+    monkeypatch.setattr(checkpoint, "_save", taking(100.0, checkpoint._save))
+    file = tmp_path / "checkpoint.npz"
+    losses.restart(STEPS // 2)
+    with pytest.raises(Kill):
+        train(data, conf, Checkpoint(file, "cell", 1e-9))
+    now += 10_000.0
+    losses.restart()
+    loaded = Checkpoint(file, "cell", 1e-9)
+    assert loaded.load() == STEPS // 2
+    assert train(data, conf, loaded).seconds == STEPS
+    assert now == 10_000 + (STEPS + 1) + 100 * STEPS  # one step was begun, and lost

@@ -1,0 +1,222 @@
+"""Count matching: the search for the threshold, the check that ends a run, and both together."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+
+from xrgs.capture.dataset import Dataset
+from xrgs.config import Conf
+from xrgs.errors import XrgsError
+from xrgs.splat.gaussians import Gaussians, from_points
+from xrgs.training import count_matching, loop
+from xrgs.training.components import Step
+from xrgs.training.count_matching import (
+    CountCheck,
+    CountMismatchError,
+    ThresholdSearch,
+    next_threshold,
+    train_cell,
+)
+
+TOLERANCE = 0.05
+
+
+def simulated_training(
+    power: float, at_start: int, target: int, ripple: float = 0.0
+) -> tuple[Callable[[float], float], list[float]]:
+    """A training that gives `at_start` Gaussians at 2e-4 and fewer with a higher threshold.
+
+    It returns its threshold; the list has those that it was called with.
+    """
+    thresholds: list[float] = []
+
+    def train_at(threshold: float) -> float:
+        thresholds.append(threshold)
+        wave = 1 + ripple * math.sin(1e6 * threshold)
+        count = round(at_start * wave * (threshold / 2e-4) ** -power)
+        if abs(count / target - 1) > TOLERANCE:
+            raise CountMismatchError(count)
+        return threshold
+
+    return train_at, thresholds
+
+
+@given(
+    power=st.floats(0.4, 4.0),
+    at_start=st.integers(2_000, 1_000_000),
+    share=st.floats(0.05, 2.0),
+    ripple=st.floats(0.0, 0.02),
+)
+def test_a_threshold_is_found_in_few_attempts(
+    power: float, at_start: int, share: float, ripple: float
+) -> None:
+    target = round(at_start * share)
+    train_at, thresholds = simulated_training(power, at_start, target, ripple)
+    threshold = ThresholdSearch(2e-4, target).run(train_at)
+    assert threshold == thresholds[-1]
+    assert len(thresholds) <= 8
+    assert (threshold > 2e-4) == (len(thresholds) > 1 and share < 1)
+
+
+def test_the_first_threshold_is_kept_where_it_matches() -> None:
+    train_at, thresholds = simulated_training(1.5, 1000, 1010)
+    assert ThresholdSearch(2e-4, 1010).run(train_at) == 2e-4
+    assert thresholds == [2e-4]
+
+
+def test_a_number_that_no_threshold_gives_is_an_error_after_ten_attempts() -> None:
+    calls = []
+
+    def train_at(threshold: float) -> None:
+        calls.append(threshold)
+        raise CountMismatchError(500 if threshold > 3e-4 else 50_000)
+
+    with pytest.raises(XrgsError, match=r"count_matched\.gaussians=5000: .*0\.0002: 50000"):
+        ThresholdSearch(2e-4, 5000).run(train_at)
+    assert len(calls) == 10
+
+
+def test_a_restored_search_continues_with_the_same_thresholds() -> None:
+    train_at, thresholds = simulated_training(0.4, 50_000, 5_000, 0.02)
+    ThresholdSearch(2e-4, 5_000).run(train_at)
+    expected = thresholds.copy()
+    assert len(expected) > 3
+    first = ThresholdSearch(2e-4, 5_000)
+
+    def killed_at_the_third(threshold: float) -> None:
+        if threshold == expected[2]:
+            raise KeyboardInterrupt
+        train_at(threshold)
+
+    with pytest.raises(KeyboardInterrupt):
+        first.run(killed_at_the_third)
+    second = ThresholdSearch(2e-4, 5_000)
+    second.load_state_dict(first.state_dict())
+    train_again, continued = simulated_training(0.4, 50_000, 5_000, 0.02)
+    second.run(train_again)
+    assert continued == expected[2:]
+
+
+def test_the_second_threshold_assumes_a_power_of_one_and_a_half() -> None:
+    assert next_threshold([(2e-4, 8000)], 1000) == pytest.approx(2e-4 * 8 ** (2 / 3))
+
+
+def test_the_secant_through_two_attempts_finds_a_power_law_at_once() -> None:
+    power = 2.3
+    tried = [(2e-4, 100_000), (5e-4, round(100_000 * 2.5**-power))]
+    expected = 2e-4 * 10 ** (1 / power)
+    assert next_threshold(tried, 10_000) == pytest.approx(expected, rel=1e-4)
+
+
+@pytest.mark.parametrize(
+    ("tried", "target", "expected"),
+    [
+        # A higher threshold gave more Gaussians: the slope has the wrong sign.
+        ([(2e-4, 1000), (3e-4, 1010)], 500, 3e-4 * (1010 / 500) ** 2),
+        # Nearly no change: the slope would step far away.
+        ([(2e-4, 1000), (3e-4, 999)], 500, 3e-4 * (999 / 500) ** 2),
+        # A fall so steep that the slope would hardly step.
+        ([(2e-4, 10_000), (2.1e-4, 1000)], 500, 2.1e-4 * 2**0.2),
+    ],
+)
+def test_the_measured_power_stays_between_a_half_and_five(
+    tried: list[tuple[float, int]], target: int, expected: float
+) -> None:
+    assert next_threshold(tried, target) == pytest.approx(expected)
+    assert next_threshold(tried, target) > tried[-1][0]
+
+
+def test_a_guess_outside_the_bracket_is_replaced_by_its_middle() -> None:
+    # The secant of the last two leads to 9.6e-4 and more, beyond what gave too few.
+    tried = [(9e-4, 400), (2e-4, 1000), (4e-4, 990)]
+    assert next_threshold(tried, 500) == pytest.approx(math.sqrt(4e-4 * 9e-4))
+
+
+@pytest.mark.parametrize(
+    ("tried", "expected"),
+    [
+        # Too many at the higher threshold, too few at the lower one: one of them is noise.
+        ([(3e-4, 600), (2e-4, 450)], 2e-4 * (450 / 500) ** 2 / 1.1),
+        ([(2e-4, 450), (3e-4, 600)], 3e-4 * (600 / 500) ** 2 * 1.1),
+    ],
+)
+def test_an_inverted_bracket_is_left_by_a_step_of_a_tenth(
+    tried: list[tuple[float, int]], expected: float
+) -> None:
+    assert next_threshold(tried, 500) == pytest.approx(expected)
+
+
+def test_a_count_of_zero_is_no_obstacle() -> None:
+    assert 0 < next_threshold([(2e-4, 0)], 500) < 2e-4
+    assert 0 < next_threshold([(2e-4, 1000), (9e-4, 0)], 500) < 9e-4
+
+
+def model_of(count: int) -> Gaussians:
+    """A model of so many Gaussians."""
+    generator = torch.Generator().manual_seed(0)
+    points = torch.rand(count, 3, generator=generator)
+    return from_points(points, points, init_opacity=0.1, sh_degree=0, generator=generator)
+
+
+@pytest.mark.parametrize(
+    ("count", "mismatch"), [(104, False), (106, True), (96, False), (94, True)]
+)
+def test_the_count_is_checked_once_densification_has_stopped(
+    count: int, mismatch: bool, data: Dataset
+) -> None:
+    check, gaussians = CountCheck(100, TOLERANCE, stop=15_000), model_of(count)
+    check.after_backward(gaussians, Step(1499, 3000, data.train[0]))
+    stopped = Step(1500, 3000, data.train[0])
+    checks: tuple[Callable[[], None], ...] = (
+        lambda: check.after_backward(gaussians, stopped),
+        lambda: check.finish(gaussians),
+    )
+    for checked in checks:
+        if mismatch:
+            with pytest.raises(CountMismatchError) as raised:
+                checked()
+            assert raised.value.count == count
+        else:
+            checked()
+
+
+def test_the_matched_run_is_the_plain_run_with_its_threshold(
+    data: Dataset, short: Conf, same: Callable[[Gaussians, Gaussians], bool]
+) -> None:
+    plain = train_cell(data, short)
+    target = round(0.8 * len(plain.gaussians))
+    short.components.count_matched.gaussians = target
+    matched = train_cell(data, short)
+    assert abs(len(matched.gaussians) / target - 1) <= short.components.count_matched.tolerance
+    assert matched.grow_grad2d > plain.grow_grad2d == short.splat.densify.grow_grad2d
+    short.components.count_matched.gaussians = 0
+    short.splat.densify.grow_grad2d = matched.grow_grad2d
+    assert same(train_cell(data, short).gaussians, matched.gaussians)
+
+
+def test_one_training_does_not_read_the_count(
+    data: Dataset, short: Conf, same: Callable[[Gaussians, Gaussians], bool]
+) -> None:
+    short.train.steps = 10
+    plain = loop.train(data, short)
+    short.components.count_matched.gaussians = 1
+    assert same(loop.train(data, short).gaussians, plain.gaussians)
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [("gaussians", -1), ("tolerance", -0.05), ("tolerance", math.nan), ("tolerance", math.inf)],
+)
+def test_a_value_out_of_range_names_its_key(
+    name: str, value: float, data: Dataset, short: Conf, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(count_matching, "train", lambda *_: pytest.fail("training has begun"))
+    setattr(short.components.count_matched, name, value)
+    with pytest.raises(XrgsError, match=rf"^components\.count_matched\.{name}={value}"):
+        train_cell(data, short)

@@ -1,0 +1,243 @@
+"""Trains the baseline to as many Gaussians as another cell has: a control for claims of efficiency.
+
+A method that ends with fewer Gaussians has to be better than the baseline with as few. Only one
+thing is changed in the baseline: `splat.densify.grow_grad2d`, the gradient above which
+densification grows a Gaussian. It is searched for: training runs with one threshold, ends as soon
+as densification has stopped at too many or too few Gaussians, and starts again with another
+threshold. The paper has no such control.
+"""
+
+from __future__ import annotations
+
+import logging
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any, TypeVar
+
+from xrgs.errors import XrgsError
+from xrgs.training.checkpoint import Checkpoint
+from xrgs.training.components.base import Component, Step, not_negative
+from xrgs.training.loop import train
+
+if TYPE_CHECKING:  # xrgs.config imports Hydra, which training does not need
+    from xrgs.capture.dataset import Dataset
+    from xrgs.config import Conf
+    from xrgs.splat.gaussians import Gaussians
+    from xrgs.training.recorder import TrainingResult
+
+_T = TypeVar("_T")
+
+_log = logging.getLogger(__name__)
+
+_ATTEMPTS = 10
+_FIRST_POWER = 1.5
+"""Assumed p of count ~ threshold^-p until two attempts have measured it."""
+_POWER_RANGE = 0.5, 5.0
+"""Bounds of the measured p; counts are noisy, and not quite monotone in the threshold."""
+
+
+def train_cell(data: Dataset, conf: Conf, checkpoint: Checkpoint | None = None) -> TrainingResult:
+    """Train what a cell's config asks for: count-matched where that is switched on, else once.
+
+    Args:
+        data: The views to train on and the points to start from.
+        conf: The config of the cell.
+        checkpoint: Where the state of the run is written; None writes nothing.
+
+    Returns:
+        The trained Gaussians and the record of the training that gave them.
+
+    Raises:
+        CheckpointError: The state that was read does not fit this config and data.
+        XrgsError: A component's value is out of range, the components leave no view to train on,
+            or no threshold gives the number of Gaussians.
+    """
+    count_matched = conf.components.count_matched
+    not_negative("components.count_matched.gaussians", count_matched.gaussians)
+    not_negative("components.count_matched.tolerance", count_matched.tolerance)
+    if count_matched.gaussians == 0:
+        return train(data, conf, checkpoint)
+    return train_count_matched(data, conf, checkpoint)
+
+
+def train_count_matched(
+    data: Dataset, conf: Conf, checkpoint: Checkpoint | None = None
+) -> TrainingResult:
+    """Train again and again until the number of Gaussians is the one that is asked for.
+
+    Args:
+        data: The views to train on and the points to start from.
+        conf: The config; `components.count_matched` has the number of Gaussians, above 0, and the
+            tolerance, and `splat.densify.grow_grad2d` is the first threshold.
+        checkpoint: Where the state of the search and of the run in progress is written; None
+            writes nothing.
+
+    Returns:
+        The result of the run that matched; its `grow_grad2d` is the threshold that was found.
+
+    Raises:
+        CheckpointError: The state that was read does not fit this config and data.
+        XrgsError: Ten thresholds gave other numbers of Gaussians, or as `train` raises it.
+    """
+    checkpoint = checkpoint or Checkpoint()
+    count_matched, densify = conf.components.count_matched, conf.splat.densify
+    count_check = CountCheck(count_matched.gaussians, count_matched.tolerance, densify.stop)
+
+    def train_at(threshold: float) -> TrainingResult:
+        splat = replace(conf.splat, densify=replace(densify, grow_grad2d=threshold))
+        return train(data, replace(conf, splat=splat), checkpoint, [count_check])
+
+    search = ThresholdSearch(densify.grow_grad2d, count_matched.gaussians)
+    checkpoint.register(search=search)
+    return search.run(train_at)
+
+
+class CountMismatchError(Exception):
+    """Densification has stopped at a number of Gaussians outside the tolerance.
+
+    Attributes:
+        count: The number of Gaussians.
+    """
+
+    def __init__(self, count: int) -> None:
+        super().__init__(count)
+        self.count = count
+
+
+class CountCheck(Component):
+    """Ends a run once its number of Gaussians is final and outside the tolerance."""
+
+    def __init__(self, target: int, tolerance: float, stop: int) -> None:
+        """Set the number of Gaussians and the step from which on it is checked.
+
+        Args:
+            target: Number of Gaussians, above 0.
+            tolerance: Largest deviation, relative to `target`.
+            stop: Step of a 30,000-step run at which densification stops.
+        """
+        self.target, self.tolerance, self.stop = target, tolerance, stop
+
+    def after_backward(self, gaussians: Gaussians, step: Step) -> None:
+        """Check the number of Gaussians from the step on at which densification has stopped.
+
+        Args:
+            gaussians: The model, whose number of Gaussians is checked.
+            step: The step of the run.
+
+        Raises:
+            CountMismatchError: The number is outside the tolerance.
+        """
+        if step.nominal >= self.stop:
+            self.finish(gaussians)
+
+    def finish(self, gaussians: Gaussians) -> None:
+        """Check the number of Gaussians.
+
+        Args:
+            gaussians: The model, whose number of Gaussians is checked.
+
+        Raises:
+            CountMismatchError: The number is outside the tolerance.
+        """
+        if abs(len(gaussians) / self.target - 1) > self.tolerance:
+            raise CountMismatchError(len(gaussians))
+
+
+class ThresholdSearch:
+    """Searches the threshold of densification that gives a number of Gaussians.
+
+    The method is a secant of log(count) over log(threshold), kept within the bracket of thresholds
+    that gave too many and too few.
+
+    Attributes:
+        tried: The (threshold, count) of each attempt that did not match, in their order.
+    """
+
+    def __init__(self, start: float, target: int) -> None:
+        """Start with no attempts.
+
+        Args:
+            start: The first threshold to try, in normalised device units.
+            target: The number of Gaussians to reach.
+        """
+        self.start, self.target = start, target
+        self.tried: list[tuple[float, int]] = []
+
+    def run(self, train_at: Callable[[float], _T]) -> _T:
+        """Try thresholds until one matches.
+
+        Args:
+            train_at: Trains with a threshold, and raises `CountMismatchError` where the number of
+                Gaussians is outside the tolerance.
+
+        Returns:
+            What `train_at` returned.
+
+        Raises:
+            XrgsError: Ten thresholds gave other numbers; the message lists them.
+        """
+        while len(self.tried) < _ATTEMPTS:
+            threshold = next_threshold(self.tried, self.target) if self.tried else self.start
+            try:
+                return train_at(threshold)
+            except CountMismatchError as mismatch:
+                self.tried.append((threshold, mismatch.count))
+                _log.info(
+                    "count matching: threshold %.3g gave %d Gaussians, the target is %d",
+                    threshold,
+                    mismatch.count,
+                    self.target,
+                )
+        counts = ", ".join(f"{threshold:.3g}: {count}" for threshold, count in self.tried)
+        raise XrgsError(
+            f"components.count_matched.gaussians={self.target}: no value of"
+            " splat.densify.grow_grad2d gave this number within"
+            f" components.count_matched.tolerance; tried (value: Gaussians): {counts}"
+        )
+
+    def state_dict(self) -> dict[str, Any]:
+        """Return the attempts so far; the threshold in use follows from them."""
+        return {"tried": self.tried}
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Continue from a state that `state_dict` returned.
+
+        Args:
+            state: From a search with the same start and target.
+
+        Raises:
+            KeyError: The attempts are missing.
+            TypeError: An attempt is of another type.
+            ValueError: An attempt is not a threshold and a count.
+        """
+        self.tried = [(float(threshold), int(count)) for threshold, count in state["tried"]]
+
+
+def next_threshold(tried: Sequence[tuple[float, int]], target: int) -> float:
+    """Choose the threshold to try next.
+
+    Args:
+        tried: (threshold, count) of each attempt so far, in their order; at least one.
+        target: The number of Gaussians to reach.
+
+    Returns:
+        The threshold where count ~ threshold^-p through the last attempt reaches the target, with p
+        measured by the last two; the bracket's geometric mean where that lies outside the bracket;
+        and a step of 10% beyond the former where there is no bracket to stay within.
+    """
+    low = max((threshold for threshold, count in tried if count > target), default=0.0)
+    high = min((threshold for threshold, count in tried if count <= target), default=math.inf)
+    threshold, count = tried[-1]
+    power = _FIRST_POWER
+    if len(tried) > 1 and tried[-2][1] != count and min(count, tried[-2][1]) > 0:
+        earlier_threshold, earlier_count = tried[-2]
+        slope = -math.log(count / earlier_count) / math.log(threshold / earlier_threshold)
+        power = min(max(slope, _POWER_RANGE[0]), _POWER_RANGE[1])
+    guess: float = threshold * (max(count, 1) / target) ** (1 / power)
+    if low < guess < high:
+        return guess
+    if 0 < low < high < math.inf:
+        return math.sqrt(low * high)
+    # Counts are not quite monotone in the threshold: one end of the bracket may have been wrong.
+    return guess * 1.1 if count > target else guess / 1.1
