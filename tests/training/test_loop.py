@@ -72,16 +72,19 @@ class Recorder(components.Component):
         self.calls: list[tuple[str, int | None]] = []
         self.sizes: list[int] = []
 
-    def activated(self, activated: ActivatedGaussians, step: Step) -> ActivatedGaussians:
+    def before_render(self, activated: ActivatedGaussians, step: Step) -> ActivatedGaussians:
         self.calls.append(("activated", step.number))
         assert len(activated.means) == self.sizes[-1]
         return activated
 
-    def pixel_weight(self, step: Step) -> torch.Tensor:
+    def pixel_weights(self, step: Step) -> torch.Tensor:
         self.calls.append(("pixel_weight", step.number))
         return torch.ones(step.view.image.shape[:2])
 
-    def loss(self, loss: torch.Tensor, image: torch.Tensor, step: Step) -> torch.Tensor:
+    def modify_loss(
+        self, loss: torch.Tensor, image: torch.Tensor, gaussians: Gaussians, step: Step
+    ) -> torch.Tensor:
+        del gaussians
         self.calls.append(("loss", step.number))
         assert image.shape == step.view.image.shape
         return loss
@@ -99,7 +102,7 @@ class Recorder(components.Component):
         self.calls.append(("refined", None))
         self.sizes.append(len(gaussians))
 
-    def finish(self, gaussians: Gaussians) -> None:
+    def after_training(self, gaussians: Gaussians) -> None:
         self.calls.append(("finish", None))
         gaussians.sh0.data.zero_()
 
@@ -124,8 +127,10 @@ def test_the_history_has_the_mean_of_what_components_note(
     data: Dataset, baseline: Conf, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     class Noting(components.Component):
-        def loss(self, loss: torch.Tensor, image: torch.Tensor, step: Step) -> torch.Tensor:
-            del image
+        def modify_loss(
+            self, loss: torch.Tensor, image: torch.Tensor, gaussians: Gaussians, step: Step
+        ) -> torch.Tensor:
+            del image, gaussians
             if step.number >= 300 and step.view.tag == "LR":
                 step.log["noting.number"] = step.number
             return loss

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 from xrgs.evaluation.protocol import PROTOCOL
 from xrgs.safeio.hashing import plain, source_digests
 from xrgs.splat.backend import resolve_backend
+from xrgs.training import plugins
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -87,5 +88,30 @@ def cell_identity(conf: Conf, variant_id: str) -> dict[str, Any]:
         "seed": conf.seed,
         "variant": variant_id,
         "protocol": PROTOCOL,
-        "code": training_code(backend),
+        "code": training_code(backend) | _plugin_code(conf.components.plugins),
     }
+
+
+def installed_code(identity: Mapping[str, Any]) -> dict[str, str]:
+    """Hash the code that would train a cell of an identity now, without importing any of it.
+
+    Args:
+        identity: An identity, of a store of any origin.
+
+    Returns:
+        As the identity's `code`, of the files that are installed now. A plugin that is not
+        installed has none.
+
+    Raises:
+        KeyError: The identity lacks its backend.
+    """
+    names = identity.get("components", {}).get("plugins", {})
+    return training_code(identity["splat"]["backend"]) | plugins.installed_digests(names)
+
+
+def _plugin_code(names: Mapping[str, Any]) -> dict[str, str]:
+    """SHA-256 of the source files of plugins, which must be installed."""
+    digests: dict[str, str] = {}
+    for name in sorted(names):
+        digests |= plugins.source_digests(name)
+    return digests

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 from xrgs.errors import XrgsError
-from xrgs.experiment.identity import training_code
+from xrgs.experiment.identity import installed_code
 from xrgs.experiment.store import CellState, Store
 from xrgs.safeio.records import FAILED, StoreError, failed_scenes, read_json
 from xrgs.safeio.untrusted import printable
@@ -138,7 +138,7 @@ def _stale(cell: CellFolder) -> tuple[str, ...]:
     try:
         identity = cell.identity()
         then: dict[str, Any] = identity["code"]
-        now = training_code(identity["splat"]["backend"])
+        now = installed_code(identity)
         if then == now:
             return ()
         return tuple(

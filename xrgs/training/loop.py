@@ -92,7 +92,7 @@ def _run(data: Dataset, conf: Conf, checkpoint: Checkpoint) -> Trained:
     gaussians = optimizer.gaussians
     targets = {view.name: prepare_target(view.image) for view in data.train}
     sh_every = max(1, int(splat.sh_every * steps / NOMINAL_STEPS))
-    drawn = EpochSampler(data.train, conf.seed, steps, parts.trains_on)
+    drawn = EpochSampler(data.train, conf.seed, steps, parts.allows_view)
 
     ledger = TrainingRecorder(steps, splat.densify.grow_grad2d)
     parts.on_gaussians_changed(gaussians)
@@ -105,18 +105,18 @@ def _run(data: Dataset, conf: Conf, checkpoint: Checkpoint) -> Trained:
         degree = min(step.number // sh_every, splat.raster.sh_degree)
         offset = torch.zeros(len(gaussians), 2, requires_grad=True)
         render = rasterize(
-            *parts.activated(gaussians.activated(), step),
+            *parts.before_render(gaussians.activated(), step),
             camera,
             splat.raster,
             sh_degree=degree,
             means2d_offset=offset,
             backend=backend,
         )
-        target, weights = targets[view.name], parts.pixel_weight(step)
+        target, weights = targets[view.name], parts.pixel_weights(step)
         loss = photometric_loss(
             render.image, target, l1=1 - ssim, ssim=ssim, pixel_weight=weights, backend=backend
         )
-        loss = parts.loss(loss, render.image, step)
+        loss = parts.modify_loss(loss, render.image, gaussians, step)
         optimizer.zero_grad()
         torch.autograd.backward(loss)
         parts.after_backward(gaussians, step)
@@ -129,7 +129,7 @@ def _run(data: Dataset, conf: Conf, checkpoint: Checkpoint) -> Trained:
         if done != Refinement():
             parts.on_gaussians_changed(gaussians)
         ledger.leave_out(checkpoint.after_step(step.number))
-    parts.finish(gaussians)
+    parts.after_training(gaussians)
     return ledger.close(gaussians)
 
 
@@ -152,7 +152,7 @@ def _built(data: Dataset, conf: Conf, backend: str) -> tuple[SplatOptimizer, Den
         splat.densify.scaled(steps),
         scene_scale=data.scene_scale,
         generator=stream(conf.seed, "densify"),
-        groups=parts.groups(splat.densify),
+        groups=parts.densification_groups(splat.densify),
     )
     return optimizer, densifier, parts
 

@@ -45,9 +45,9 @@ class CountMatched(Component):
     def after_backward(self, gaussians: Gaussians, step: Step) -> None:
         """Look at the number from the step on at which densification has stopped."""
         if step.nominal >= self.stop:
-            self.finish(gaussians)
+            self.after_training(gaussians)
 
-    def finish(self, gaussians: Gaussians) -> None:
+    def after_training(self, gaussians: Gaussians) -> None:
         """Look at the number.
 
         Raises:
