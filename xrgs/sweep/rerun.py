@@ -144,13 +144,13 @@ def _check_plugins_allowed(original: CellFolder, conf: Conf, allowed: Sequence[s
     Raises:
         XrgsError: It names one; the message says what to add to the command.
     """
-    names = sorted(conf.components.plugins)
-    if not set(names) <= set(allowed):
-        text = printable(", ".join(names))
+    names = set(conf.components.plugins)
+    if not names <= set(allowed):
+        text = printable(",".join(sorted(names)))
         raise XrgsError(
-            f"rerun={original.path}: this cell was trained with components of other packages"
-            f" ({text}), whose code would be imported. If you trust what is installed here under"
-            f" these names, and the settings in the cell's config.json, add plugins=[{text}]"
+            f"rerun={original.path}: this cell was trained with components of other packages, whose"
+            " code would be imported. If you trust the packages that are installed here under these"
+            f" names, and the settings in the cell's config.json, add plugins={text}"
         )
 
 

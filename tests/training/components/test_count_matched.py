@@ -78,7 +78,7 @@ def test_the_number_is_looked_at_once_densification_has_stopped(count: int, off:
     component.after_backward(Many(count), Step(1499, 3000, None))
     for look in (
         lambda: component.after_backward(Many(count), Step(1500, 3000, None)),
-        lambda: component.finish(Many(count)),
+        lambda: component.after_training(Many(count)),
     ):
         if off:
             with pytest.raises(CountOff) as caught:
