@@ -13,6 +13,7 @@ import torch
 from xrgs.capture.dataset import Dataset
 from xrgs.config import Conf, from_dict
 from xrgs.errors import XrgsError
+from xrgs.experiment import identity
 from xrgs.experiment.identity import cell_identity, installed_code
 from xrgs.safeio.hashing import digest, file_digest
 from xrgs.training import components, plugins
@@ -53,7 +54,7 @@ def install(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Install
     """Install a package, as pip lays it out, in a folder on `sys.path`."""
     before = set(sys.modules)
     monkeypatch.syspath_prepend(tmp_path)
-    plugins.source_digests.cache_clear()
+    identity.plugin_code.cache_clear()
 
     def installed(dist: str, points: dict[str, str], sources: dict[str, str]) -> Path:
         info = tmp_path / f"{dist}-1.0.dist-info"
@@ -68,7 +69,7 @@ def install(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Install
         return tmp_path
 
     yield installed
-    plugins.source_digests.cache_clear()
+    identity.plugin_code.cache_clear()
     for name in set(sys.modules) - before:
         del sys.modules[name]
 
@@ -210,7 +211,7 @@ def test_a_change_of_a_plugin_is_another_cell(
     else:
         points = folder / "dist-1.0.dist-info" / "entry_points.txt"
         points.write_text(points.read_text().replace("Plugin", "OtherPlugin"))
-    plugins.source_digests.cache_clear()
+    identity.plugin_code.cache_clear()
     assert digest(cell_identity(baseline, "v")) != digest(before)
     assert (installed_code(before) == before["code"]) == (changed == "settings")
 
@@ -218,9 +219,10 @@ def test_a_change_of_a_plugin_is_another_cell(
 def test_code_that_is_no_longer_installed_is_left_out(install: Install, baseline: Conf) -> None:
     install("dist", {"one": "one:Plugin"}, {"one.py": SOURCE})
     baseline.components.plugins = {"one": {}}
-    identity = cell_identity(baseline, "v")
-    identity["components"]["plugins"]["never_installed"] = {}
-    assert installed_code(identity) == identity["code"]
+    then = cell_identity(baseline, "v")
+    code = dict(then["code"])
+    then["code"]["plugins/removed"] = then["code"]["plugins/removed/removed.py"] = "0" * 64
+    assert installed_code(then) == code
 
 
 @pytest.mark.parametrize("settings", [None, 0.1, "weight", [1]])

@@ -88,7 +88,7 @@ def cell_identity(conf: Conf, variant_id: str) -> dict[str, Any]:
         "seed": conf.seed,
         "variant": variant_id,
         "protocol": PROTOCOL,
-        "code": training_code(backend) | _plugin_code(conf.components.plugins),
+        "code": training_code(backend) | plugin_code(tuple(sorted(conf.components.plugins))),
     }
 
 
@@ -103,15 +103,25 @@ def installed_code(identity: Mapping[str, Any]) -> dict[str, str]:
         installed has none.
 
     Raises:
-        KeyError: The identity lacks its backend.
+        KeyError: The identity lacks its backend or its code.
     """
-    names = identity.get("components", {}).get("plugins", {})
-    return training_code(identity["splat"]["backend"]) | plugins.installed_digests(names)
+    return training_code(identity["splat"]["backend"]) | plugins.digests_now(identity["code"])
 
 
-def _plugin_code(names: Mapping[str, Any]) -> dict[str, str]:
-    """SHA-256 of the source files of plugins, which must be installed."""
+@cache
+def plugin_code(names: tuple[str, ...]) -> dict[str, str]:
+    """Hash the source files of components of other packages; they are read once.
+
+    Args:
+        names: The names of the plugins.
+
+    Returns:
+        SHA-256 by `plugins/<name>/<path in the package>`.
+
+    Raises:
+        XrgsError: A plugin is not installed, or has no source file.
+    """
     digests: dict[str, str] = {}
-    for name in sorted(names):
+    for name in names:
         digests |= plugins.source_digests(name)
     return digests

@@ -13,7 +13,6 @@ This module does not import torch, so that planning and reporting can use it.
 from __future__ import annotations
 
 import dataclasses
-from functools import cache
 from importlib.machinery import PathFinder
 from importlib.metadata import EntryPoint, entry_points
 from importlib.util import find_spec
@@ -24,7 +23,7 @@ from xrgs.errors import XrgsError
 from xrgs.safeio.hashing import digest, file_digest
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Iterator, Mapping
+    from collections.abc import Iterator, Mapping
     from importlib.machinery import ModuleSpec
 
 GROUP = "xrgs.components"
@@ -66,13 +65,12 @@ def find(name: str) -> EntryPoint:
     return points[0]
 
 
-@cache
 def source_digests(name: str) -> dict[str, str]:
     """Hash the source of a plugin, without importing its package.
 
-    The hashes cover its entry point's value and every file of the package that the entry point
-    names (or of the module, where it is a single file) but bytecode and hidden files. What that
-    package imports from other packages is not covered.
+    The files are read anew at each call. The hashes cover the entry point's value and every file of
+    the package that it names (or of the module, where that is a single file) but bytecode and
+    hidden files. What the package imports from other packages is not covered.
 
     Args:
         name: The name of the plugin.
@@ -99,17 +97,18 @@ def source_digests(name: str) -> dict[str, str]:
     return digests
 
 
-def installed_digests(names: Iterable[str]) -> dict[str, str]:
-    """Hash the sources of those of the named plugins that are installed.
+def digests_now(code: Mapping[str, str]) -> dict[str, str]:
+    """Hash the installed source of the plugins that the `code` of an identity contains.
 
     Args:
-        names: Names of plugins, which may come from a store of unknown origin.
+        code: The `code` of an identity, from a store of any origin.
 
     Returns:
-        As `source_digests`; a plugin that is not installed adds nothing.
+        As `source_digests`; a plugin that is not installed any more adds nothing.
     """
+    names = {key.removeprefix("plugins/") for key in code if key.startswith("plugins/")}
     digests: dict[str, str] = {}
-    for name in set(names) & set(installed()):
+    for name in names & set(installed()):
         digests |= source_digests(name)
     return digests
 
@@ -204,6 +203,6 @@ def _package_files(folder: Path) -> Iterator[Path]:
     """Every file of a package in a fixed order, but bytecode and hidden files."""
     for file in sorted(folder.rglob("*")):
         parts = file.relative_to(folder).parts
-        hidden = any(part.startswith(".") or part == "__pycache__" for part in parts)
+        hidden = any(part.startswith(".") for part in parts)
         if file.is_file() and not hidden and file.suffix not in _BYTECODE:
             yield file

@@ -16,8 +16,8 @@ if TYPE_CHECKING:  # xrgs.config loads Hydra, which training does without
 class Densify(Component):
     """Gives LR views their own thresholds of densification and pruning.
 
-    Section 5.4 of the paper maintains two sets of thresholds for what gsplat's `DefaultStrategy`
-    [ye2025] grows and prunes:
+    Section 5.4 of the paper maintains two sets of thresholds for the adaptive density control of
+    3D Gaussian Splatting [kerbl2023, section 5.2], as gsplat's `DefaultStrategy` [ye2025] has it:
 
         threshold_HR < threshold_LR
 
