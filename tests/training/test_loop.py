@@ -275,7 +275,7 @@ def test_the_sh_bands_come_on_in_turn(
 
 def names_of(data: Dataset, steps: int, trains_on: Callable[[Step], bool]) -> list[str]:
     drawn = list(EpochSampler(data.train, 0, steps, trains_on))
-    assert [(step.number, step.of) for step in drawn] == [(n, steps) for n in range(steps)]
+    assert [(step.number, step.total) for step in drawn] == [(n, steps) for n in range(steps)]
     return [step.view.name for step in drawn]
 
 

@@ -14,7 +14,7 @@ from xrgs.capture.dataset import Dataset
 from xrgs.config import Conf, from_dict
 from xrgs.errors import XrgsError
 from xrgs.experiment import identity
-from xrgs.experiment.identity import cell_identity, installed_code
+from xrgs.experiment.identity import cell_identity, changed_code
 from xrgs.safeio.hashing import digest, file_digest
 from xrgs.training import components, plugins
 from xrgs.training.components import Components
@@ -203,7 +203,7 @@ def test_a_change_of_a_plugin_is_another_cell(
     folder = install("dist", {"one": "one:Plugin"}, {"one.py": SOURCE})
     baseline.components.plugins = {"one": {"weight": 1.0}}
     before = cell_identity(baseline, "v")
-    assert installed_code(before) == before["code"]
+    assert changed_code(before["code"], "torch") == []
     if changed == "source":
         (folder / "one.py").write_text(f"{SOURCE}\n# changed\n")
     elif changed == "settings":
@@ -213,16 +213,18 @@ def test_a_change_of_a_plugin_is_another_cell(
         points.write_text(points.read_text().replace("Plugin", "OtherPlugin"))
     identity.plugin_code.cache_clear()
     assert digest(cell_identity(baseline, "v")) != digest(before)
-    assert (installed_code(before) == before["code"]) == (changed == "settings")
+    files = {"source": ["plugins/one/one.py"], "settings": [], "entry point": ["plugins/one"]}
+    assert changed_code(before["code"], "torch") == files[changed]
 
 
-def test_code_that_is_no_longer_installed_is_left_out(install: Install, baseline: Conf) -> None:
+def test_a_plugin_that_is_not_installed_any_more_is_changed_code(
+    install: Install, baseline: Conf
+) -> None:
     install("dist", {"one": "one:Plugin"}, {"one.py": SOURCE})
     baseline.components.plugins = {"one": {}}
-    then = cell_identity(baseline, "v")
-    code = dict(then["code"])
-    then["code"]["plugins/removed"] = then["code"]["plugins/removed/removed.py"] = "0" * 64
-    assert installed_code(then) == code
+    code = cell_identity(baseline, "v")["code"]
+    removed = ["plugins/removed", "plugins/removed/removed.py"]
+    assert changed_code(code | dict.fromkeys(removed, "0" * 64), "torch") == removed
 
 
 @pytest.mark.parametrize("settings", [None, 0.1, "weight", [1]])

@@ -65,7 +65,7 @@ def changed_code(code: Mapping[str, str], backend: str) -> list[str]:
     Returns:
         Paths in the package of files that were changed, added or removed; sorted.
     """
-    installed = _installed_code(backend)
+    installed = _installed_code(backend) | plugins.digests_now(code)
     files = code.keys() | installed.keys()
     return sorted(file for file in files if code.get(file) != installed.get(file))
 
@@ -90,22 +90,6 @@ def cell_identity(conf: Conf, variant_id: str) -> dict[str, Any]:
         "protocol": PROTOCOL,
         "code": training_code(backend) | plugin_code(tuple(sorted(conf.components.plugins))),
     }
-
-
-def installed_code(identity: Mapping[str, Any]) -> dict[str, str]:
-    """Hash the code that would train a cell of an identity now, without importing any of it.
-
-    Args:
-        identity: An identity, of a store of any origin.
-
-    Returns:
-        As the identity's `code`, of the files that are installed now. A plugin that is not
-        installed has none.
-
-    Raises:
-        KeyError: The identity lacks its backend or its code.
-    """
-    return training_code(identity["splat"]["backend"]) | plugins.digests_now(identity["code"])
 
 
 @cache

@@ -8,11 +8,12 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 from xrgs.errors import XrgsError
-from xrgs.experiment.identity import installed_code
+from xrgs.experiment.identity import training_code
 from xrgs.experiment.store import CellState, Store
 from xrgs.safeio.records import FAILED, StoreError, failed_scenes, read_json
 from xrgs.safeio.untrusted import printable
 from xrgs.sweep import locks
+from xrgs.training import plugins
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -138,7 +139,7 @@ def _stale(cell: CellFolder) -> tuple[str, ...]:
     try:
         identity = cell.identity()
         then: dict[str, Any] = identity["code"]
-        now = installed_code(identity)
+        now = training_code(identity["splat"]["backend"]) | plugins.digests_now(then)
         if then == now:
             return ()
         return tuple(

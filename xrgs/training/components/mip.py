@@ -29,7 +29,7 @@ MARGIN = 0.15
 class Mip(Component):
     """Limits Gaussians to the detail that the finest training view which sees them can resolve.
 
-    Mip-Splatting [yu2024, section 4.1, equation 9] renders each Gaussian k convolved with an
+    Mip-Splatting [yu2024, section 4.1] renders each Gaussian k convolved with an
     isotropic Gaussian, the 3D smoothing filter:
 
         Sigma_k <- Sigma_k + (s / nu_k^2) I,
@@ -129,7 +129,7 @@ class Mip(Component):
 
 
 def smooth(scales: Tensor, opacities: Tensor, variance: Tensor) -> tuple[Tensor, Tensor]:
-    """Convolve Gaussians with isotropic ones, and keep their integrals [yu2024, equation 9].
+    """Convolve Gaussians with isotropic ones, and keep their integrals [yu2024, section 4.1].
 
     Args:
         scales: [N, 3] standard deviations in world units, above 0.

@@ -26,7 +26,7 @@ class Settings:
 class OpacityRegularizer(Component):
     """Adds the mean opacity to the loss, so that Gaussians of little use fade and are pruned.
 
-    3DGS-MCMC [kheradmand2024, section 3.3] adds to the photometric loss
+    3DGS-MCMC [kheradmand2024] adds to the photometric loss
 
         weight * mean_i |o_i|,   o_i = sigmoid(opacity logit of Gaussian i),
 
