@@ -288,6 +288,10 @@ class ComponentsConf:
     continuous_weighting: ContinuousWeightingConf = field(default_factory=ContinuousWeightingConf)
     mip: MipConf = field(default_factory=MipConf)
     count_matched: CountMatchedConf = field(default_factory=CountMatchedConf)
+    plugins: dict[str, Any] = field(default_factory=dict)
+    """The settings of components that other installed packages provide, by the names of their entry
+    points in the group `xrgs.components`. A name that is not here is never imported. See
+    `examples/new_component`."""
 
 
 @dataclass
@@ -360,6 +364,7 @@ def to_conf(cfg: DictConfig) -> Conf:
     # merge it in once more takes twenty times as long, and a plan composes many configs.
     conf = Conf(**{name: _as_object(cfg, name) for name in Conf.__dataclass_fields__})
     _check_known(conf, "")
+    _check_plugins(conf.components)
     least_values = (
         ("train.steps", conf.train.steps, 1),
         ("threads", conf.threads, 0),
@@ -412,6 +417,20 @@ def _check_known(value: Any, path: str) -> None:
             _check_known(inner, f"{path}{name}.")
 
 
+def _check_plugins(components: ComponentsConf) -> None:
+    """Check that every plugin's settings are a mapping; the plugin itself checks what is in it.
+
+    Raises:
+        XrgsError: One is something else; the message names its key.
+    """
+    for name, settings in components.plugins.items():
+        if not isinstance(settings, dict):
+            key = f"components.plugins.{name}"
+            raise XrgsError(
+                f"{key}={settings}: must be a mapping of settings, e.g. +{key}.weight=0.1"
+            )
+
+
 def from_dict(values: Any) -> Conf:
     """Convert what `dataclasses.asdict` made of a config back to the config.
 
@@ -432,6 +451,7 @@ def from_dict(values: Any) -> Conf:
     conf = OmegaConf.to_object(OmegaConf.merge(OmegaConf.structured(Conf), escaped))
     if not isinstance(conf, Conf):
         raise TypeError(f"expected a config of schema Conf, got {type(conf).__name__}")
+    _check_plugins(conf.components)
     return conf
 
 
@@ -472,6 +492,8 @@ def from_file(file: Path) -> Conf:
         raise XrgsError(
             f"{file}: {error_line(error)} (another version of xrgs may have written it)"
         ) from error
+    except XrgsError as error:
+        raise XrgsError(f"{file}: {error}") from error
     except (OSError, ValueError, TypeError) as error:
         raise XrgsError(f"{file}: it holds no config ({error})") from error
 

@@ -119,16 +119,19 @@ class HookRecorder(components.Component):
         self.calls: list[tuple[str, int | None]] = []
         self.sizes: list[int] = []
 
-    def activated(self, activated: ActivatedGaussians, step: Step) -> ActivatedGaussians:
+    def before_render(self, activated: ActivatedGaussians, step: Step) -> ActivatedGaussians:
         self.calls.append(("activated", step.number))
         assert len(activated.means) == self.sizes[-1]
         return activated
 
-    def pixel_weight(self, step: Step) -> torch.Tensor:
+    def pixel_weights(self, step: Step) -> torch.Tensor:
         self.calls.append(("pixel_weight", step.number))
         return torch.ones(step.view.image.shape[:2])
 
-    def loss(self, loss: torch.Tensor, image: torch.Tensor, step: Step) -> torch.Tensor:
+    def modify_loss(
+        self, loss: torch.Tensor, image: torch.Tensor, gaussians: Gaussians, step: Step
+    ) -> torch.Tensor:
+        del gaussians
         self.calls.append(("loss", step.number))
         assert image.shape == step.view.image.shape
         return loss
@@ -146,7 +149,7 @@ class HookRecorder(components.Component):
         self.calls.append(("on_gaussians_changed", None))
         self.sizes.append(len(gaussians))
 
-    def finish(self, gaussians: Gaussians) -> None:
+    def after_training(self, gaussians: Gaussians) -> None:
         self.calls.append(("finish", None))
         gaussians.sh0.data.zero_()
 
@@ -166,8 +169,10 @@ def test_hooks_are_called_in_the_order_of_a_step(data: Dataset, short: Conf) -> 
 
 def test_extra_components_run_behind_those_of_the_config(data: Dataset, short: Conf) -> None:
     class Doubling(components.Component):
-        def loss(self, loss: torch.Tensor, image: torch.Tensor, step: Step) -> torch.Tensor:
-            del image
+        def modify_loss(
+            self, loss: torch.Tensor, image: torch.Tensor, gaussians: Gaussians, step: Step
+        ) -> torch.Tensor:
+            del image, gaussians
             step.log["loss.before"] = loss.item()
             return 2 * loss
 

@@ -171,8 +171,10 @@ def test_the_history_counts_by_group(data: Dataset, compose: Callable[..., Conf]
 
 def test_the_history_has_what_components_log(data: Dataset, short: Conf) -> None:
     class Logging(components.Component):
-        def loss(self, loss: torch.Tensor, image: torch.Tensor, step: Step) -> torch.Tensor:
-            del image
+        def modify_loss(
+            self, loss: torch.Tensor, image: torch.Tensor, gaussians: Gaussians, step: Step
+        ) -> torch.Tensor:
+            del image, gaussians
             if step.number >= 300 and step.view.tag == "LR":
                 step.log["logging.number"] = step.number
             return loss

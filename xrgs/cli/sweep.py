@@ -32,6 +32,7 @@ Commas make axes, +ablation=[a,b] stacks. Finished cells are found in the store 
   retry=failed      fail_fast=true        train failed cells again; stop after the first failure
 
 xrgs-sweep rerun=CELL_FOLDER [out=FOLDER] [store=FOLDER] [threads=N] [scene.path=FOLDER]
+           [plugins=NAME[,NAME]...]
   trains a finished cell again in another folder, and prints "the same, bit for bit" or what differs
 
 --cfg job prints every key with its value; --hydra-help explains Hydra's own options.
@@ -59,6 +60,8 @@ class RerunConf:
     threads: int | None = None
     """Number of threads; None for as many as the cell was trained with."""
     scene: PhotographsConf = field(default_factory=PhotographsConf)
+    plugins: str = ""
+    """Names of components of other packages that the cell may import, separated by commas."""
 
 
 @hydra.main(version_base="1.3", config_path=str(config.CONF_DIR), config_name="config")
@@ -102,11 +105,12 @@ def main() -> None:
 def _rerun(arguments: list[str]) -> None:
     from xrgs.sweep.rerun import rerun
 
-    hint = " (rerun= takes out=, store=, threads= and scene.path=)"
+    hint = " (rerun= takes out=, store=, threads=, scene.path= and plugins=)"
     with errors_as_messages("xrgs-sweep", hint):
         conf = OmegaConf.merge(OmegaConf.structured(RerunConf), dotlist(arguments))
         out, store = (Path(path) if path else None for path in (conf.out, conf.store))
-        result = rerun(Path(conf.rerun), out, store, conf.threads, conf.scene.path)
+        photographs, plugins = conf.scene.path, conf.plugins.split(",")
+        result = rerun(Path(conf.rerun), out, store, conf.threads, photographs, plugins)
     print(result)  # noqa: T201
     if result.differences:
         sys.exit(1)

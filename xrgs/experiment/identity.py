@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 from xrgs.evaluation.protocol import PROTOCOL_VERSION
 from xrgs.safeio.hashing import source_digests, to_plain
 from xrgs.splat.backend import resolve_backend
+from xrgs.training import plugins
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -64,7 +65,7 @@ def changed_code(code: Mapping[str, str], backend: str) -> list[str]:
     Returns:
         Paths in the package of files that were changed, added or removed; sorted.
     """
-    installed = _installed_code(backend)
+    installed = _installed_code(backend) | plugins.digests_now(code)
     files = code.keys() | installed.keys()
     return sorted(file for file in files if code.get(file) != installed.get(file))
 
@@ -87,5 +88,24 @@ def cell_identity(conf: Conf, variant_id: str) -> dict[str, Any]:
         "seed": conf.seed,
         "variant": variant_id,
         "protocol": PROTOCOL_VERSION,
-        "code": training_code(backend),
+        "code": training_code(backend) | plugin_code(tuple(sorted(conf.components.plugins))),
     }
+
+
+@cache
+def plugin_code(names: tuple[str, ...]) -> dict[str, str]:
+    """Hash the source files of components of other packages; they are read once.
+
+    Args:
+        names: The names of the plugins.
+
+    Returns:
+        SHA-256 by `plugins/<name>/<path in the package>`.
+
+    Raises:
+        XrgsError: A plugin is not installed, or has no source file.
+    """
+    digests: dict[str, str] = {}
+    for name in names:
+        digests |= plugins.source_digests(name)
+    return digests

@@ -31,7 +31,7 @@ from xrgs.sweep.monitor import SweepMonitor
 from xrgs.sweep.plan import PlannedCell
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Mapping
+    from collections.abc import Iterator, Mapping, Sequence
 
     from xrgs.config import Conf
 
@@ -71,6 +71,7 @@ def rerun(
     store: Path | None = None,
     threads: int | None = None,
     photographs: str | None = None,
+    plugins: Sequence[str] = (),
 ) -> RerunResult:
     """Train a finished cell again and compare the results.
 
@@ -83,6 +84,8 @@ def rerun(
         threads: Number of threads; by default as many as the cell was trained with. No result
             should depend on it.
         photographs: Replaces the config's `scene.path`, if the variant has to be built.
+        plugins: Names of the components of other packages that may be imported. A cell that was
+            trained with one that is not named is refused: a store must not decide what is imported.
 
     Returns:
         The comparison.
@@ -93,6 +96,7 @@ def rerun(
     """
     original = CellFolder(folder)
     conf, identity = _read(original)
+    _check_plugins_allowed(original, conf, plugins)
     home = Store(store or _store_of(folder))
     conf.threads = conf.threads if threads is None else threads
     conf.scene.path = photographs or conf.scene.path
@@ -131,6 +135,22 @@ def _read(original: CellFolder) -> tuple[Conf, dict[str, Any]]:
     if not _VARIANT.fullmatch(str(identity.get("variant"))):
         raise XrgsError(f"{original.path / 'identity.json'}: variant={identity.get('variant')}")
     return conf, identity
+
+
+def _check_plugins_allowed(original: CellFolder, conf: Conf, allowed: Sequence[str]) -> None:
+    """Refuse a cell whose config names a plugin that the user has not named.
+
+    Raises:
+        XrgsError: It names one; the message says what to add to the command.
+    """
+    names = set(conf.components.plugins)
+    if not names <= set(allowed):
+        text = printable(",".join(sorted(names)))
+        raise XrgsError(
+            f"rerun={original.path}: this cell was trained with components of other packages, whose"
+            " code would be imported. If you trust the packages that are installed here under these"
+            f" names, and the settings in the cell's config.json, add plugins={text}"
+        )
 
 
 def _own_contradictions(

@@ -14,6 +14,7 @@ from xrgs.experiment.store import CellState, Store
 from xrgs.safeio.records import read_json
 from xrgs.safeio.untrusted import printable
 from xrgs.sweep import locks
+from xrgs.training import plugins
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -139,7 +140,7 @@ def _stale(cell: CellFolder) -> tuple[str, ...]:
     try:
         identity = cell.identity()
         then: dict[str, Any] = identity["code"]
-        now = training_code(identity["splat"]["backend"])
+        now = training_code(identity["splat"]["backend"]) | plugins.digests_now(then)
         if then == now:
             return ()
         return tuple(

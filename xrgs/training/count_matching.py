@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 from xrgs.errors import XrgsError
 from xrgs.training.checkpoint import Checkpoint
-from xrgs.training.components.base import Component, Step, not_negative
+from xrgs.training.components.base import Component, Step, check_not_negative
 from xrgs.training.loop import train
 
 if TYPE_CHECKING:  # xrgs.config imports Hydra, which training does not need
@@ -54,8 +54,8 @@ def train_cell(data: Dataset, conf: Conf, checkpoint: Checkpoint | None = None) 
             or no threshold gives the number of Gaussians.
     """
     count_matched = conf.components.count_matched
-    not_negative("components.count_matched.gaussians", count_matched.gaussians)
-    not_negative("components.count_matched.tolerance", count_matched.tolerance)
+    check_not_negative("components.count_matched.gaussians", count_matched.gaussians)
+    check_not_negative("components.count_matched.tolerance", count_matched.tolerance)
     if count_matched.gaussians == 0:
         return train(data, conf, checkpoint)
     return train_count_matched(data, conf, checkpoint)
@@ -129,9 +129,9 @@ class CountCheck(Component):
             CountMismatchError: The number is outside the tolerance.
         """
         if step.nominal >= self.stop:
-            self.finish(gaussians)
+            self.after_training(gaussians)
 
-    def finish(self, gaussians: Gaussians) -> None:
+    def after_training(self, gaussians: Gaussians) -> None:
         """Check the number of Gaussians.
 
         Args:

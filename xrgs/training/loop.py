@@ -73,7 +73,7 @@ def train(
     )
     _run_steps(run, checkpoint)
     gaussians = run.optimizer.gaussians
-    run.components.finish(gaussians)
+    run.components.after_training(gaussians)
     return run.recorder.finish(gaussians)
 
 
@@ -104,7 +104,7 @@ def _run_steps(run: _Run, checkpoint: Checkpoint) -> None:
         # Render the view of this step. The gradient of the offset is for densification.
         means2d_offset = torch.zeros(len(gaussians), 2, requires_grad=True)
         render = rasterize(
-            *components.activated(gaussians.activated(), step),
+            *components.before_render(gaussians.activated(), step),
             camera,
             raster,
             sh_degree=sh_degree,
@@ -112,11 +112,15 @@ def _run_steps(run: _Run, checkpoint: Checkpoint) -> None:
             backend=backend,
         )
         # Loss: L1 and SSIM against the photograph, then the terms and weights of the components.
-        image, target, weights = render.image, run.targets[view.name], components.pixel_weight(step)
         loss = photometric_loss(
-            image, target, l1=1 - ssim, ssim=ssim, pixel_weight=weights, backend=backend
+            render.image,
+            run.targets[view.name],
+            l1=1 - ssim,
+            ssim=ssim,
+            pixel_weight=components.pixel_weights(step),
+            backend=backend,
         )
-        loss = components.loss(loss, image, step)
+        loss = components.modify_loss(loss, render.image, gaussians, step)
         # Backward, then the components' changes of the gradients.
         optimizer.zero_grad()
         torch.autograd.backward(loss)
@@ -159,7 +163,7 @@ def _set_up(data: Dataset, conf: Conf, extra_components: Iterable[Component]) ->
         splat.densify.scaled(steps),
         scene_scale=data.scene_scale,
         generator=seeded_generator(conf.seed, "densify"),
-        groups=components.groups(splat.densify),
+        groups=components.densification_groups(splat.densify),
     )
     return _Run(
         splat=splat,
@@ -170,6 +174,6 @@ def _set_up(data: Dataset, conf: Conf, extra_components: Iterable[Component]) ->
         optimizer=optimizer,
         components=components,
         densifier=densifier,
-        sampler=EpochSampler(data.train, conf.seed, steps, components.trains_on),
+        sampler=EpochSampler(data.train, conf.seed, steps, components.allows_view),
         recorder=TrainingRecorder(steps, splat.densify.grow_grad2d),
     )

@@ -43,10 +43,16 @@ def make_view() -> Callable[[str, Tensor], TrainingView]:
 
 
 @pytest.fixture
-def steps() -> dict[str, Step]:
-    """The first step of 30,000, on a view of each tag; the LR view is 5 times smaller."""
-    views = (_view("HR", _noise(60, 75, 0)), _view("LR", _noise(12, 15, 1)))
-    return {view.tag: Step(0, 30_000, view) for view in views}
+def views() -> dict[str, LoadedView]:
+    """A view of each tag by its tag; the LR view is 5 times smaller."""
+    both = (_view("HR", _noise(60, 75, 0)), _view("LR", _noise(12, 15, 1)))
+    return {view.tag: view for view in both}
+
+
+@pytest.fixture
+def steps(views: dict[str, LoadedView]) -> dict[str, Step]:
+    """The first step of 30,000, on a view of each tag."""
+    return {tag: Step(0, 30_000, view) for tag, view in views.items()}
 
 
 @pytest.fixture
@@ -61,17 +67,17 @@ def lr(steps: dict[str, Step]) -> Step:
 
 @pytest.fixture
 def off(baseline: Conf) -> ComponentsConf:
-    """Every component off, as the baseline has it; for a test to switch on what it is about."""
+    """Every component off, as in the baseline; a test switches on the one that it examines."""
     return baseline.components
 
 
 @pytest.fixture
-def build(baseline: Conf, hr: Step, lr: Step) -> Callable[..., Components]:
-    """(config, *views) -> its components; the views are `hr`'s and `lr`'s where none is given."""
+def build(baseline: Conf, views: dict[str, LoadedView]) -> Callable[..., Components]:
+    """(config, *views) -> its components; the views are those of `hr` and `lr` if none is given."""
 
-    def built(conf: ComponentsConf, *views: LoadedView) -> Components:
+    def built(conf: ComponentsConf, *given: LoadedView) -> Components:
         points = torch.rand(50, 3, generator=torch.Generator().manual_seed(2)) + 1
-        data = Dataset(views or (hr.view, lr.view), (), points, points, 1.0, FACTOR)
+        data = Dataset(given or tuple(views.values()), (), points, points, 1.0, FACTOR)
         return components.build(conf, data, baseline.splat)
 
     return built
@@ -79,7 +85,7 @@ def build(baseline: Conf, hr: Step, lr: Step) -> Callable[..., Components]:
 
 @pytest.fixture
 def gaussians() -> Gaussians:
-    """Six, with a gradient in every value."""
+    """Six Gaussians with a gradient in every value."""
     shapes = {"means": (3,), "quats": (4,), "scales": (3,), "opacities": (), "sh0": (1, 3)}
     generator = torch.Generator().manual_seed(0)
     values = {
@@ -89,3 +95,10 @@ def gaussians() -> Gaussians:
     for value in values.values():
         value.grad = torch.randn(value.shape, generator=generator)
     return Gaussians(**values)
+
+
+@pytest.fixture
+def gradients(gaussians: Gaussians) -> dict[str, Tensor]:
+    """A copy of the gradients of `gaussians`, by parameter."""
+    parameters = {name: gaussians[name] for name in PARAMETERS}
+    return {name: p.grad.clone() for name, p in parameters.items() if p.grad is not None}

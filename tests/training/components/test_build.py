@@ -1,24 +1,30 @@
-"""The baseline has no component; each is on alone; a value out of range names its key."""
+"""The components that a config builds: none in the baseline, and each by its own setting."""
 
 from __future__ import annotations
 
+import dataclasses
 import subprocess
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import pytest
 import torch
+from torch import Tensor
 
-from xrgs.config import ComponentsConf
+from xrgs.capture.dataset import LoadedView
+from xrgs.config import ComponentsConf, DensifyConf
 from xrgs.errors import XrgsError
+from xrgs.splat.densify import Groups, Thresholds
 from xrgs.splat.gaussians import PARAMETERS, Gaussians
 from xrgs.splat.settings import DensifySettings
-from xrgs.training.components import Component, Components, Step
+from xrgs.training import components
+from xrgs.training.components import Component, Components, Step, TrainingSetup
 from xrgs.training.components.consistency import Consistency
 from xrgs.training.components.curriculum import Curriculum
 from xrgs.training.components.densify import Densify
 from xrgs.training.components.gradient_scaling import GradientScaling
+from xrgs.training.components.loss_weighting import LossWeighting
 from xrgs.training.components.mip import Mip
 from xrgs.training.components.render_scale import RenderScale
 from xrgs.training.components.weighting import Weighting
@@ -46,28 +52,117 @@ def test_the_baseline_has_no_component(build: Build, off: ComponentsConf) -> Non
     assert build(off) == ()
 
 
+def test_every_setting_has_a_component() -> None:
+    """A built-in component of its own, the weight of a view, count matching or the plugins."""
+    weights = {
+        "continuous_weighting",
+        "adaptive_weighting",
+        "region_weighting",
+        "hybrid_schedule",
+    }
+    keys = {field.name for field in dataclasses.fields(ComponentsConf)}
+    assert keys == set(components.BUILT_IN) | weights | {"count_matched", "plugins"}
+
+
+def test_the_weight_of_a_view_multiplies_its_consistency_loss() -> None:
+    order = list(components.BUILT_IN)
+    assert order.index("consistency") < order.index("loss_weighting")
+
+
+@pytest.mark.parametrize("tag", ["HR", "LR"])
+def test_at_the_value_that_is_off_each_changes_nothing(
+    tag: str,
+    steps: dict[str, Step],
+    views: dict[str, LoadedView],
+    off: ComponentsConf,
+    gaussians: Gaussians,
+    gradients: dict[str, Tensor],
+) -> None:
+    """Built at its off value, which `build` does not do, a component is the identity too."""
+    step, loss = steps[tag], torch.tensor(0.3)
+    assert (
+        Weighting(LossWeighting(off.loss_weighting)).modify_loss(
+            loss, step.view.image, gaussians, step
+        )
+        is loss
+    )
+    scaling = GradientScaling(off.gradient_scaling)
+    scaling.after_backward(gaussians, step)
+    assert gaussians.scales.grad is not None
+    assert torch.equal(gaussians.scales.grad, gradients["scales"])
+    activated = gaussians.activated()
+    scale = RenderScale(off.render_scale, list(views.values()))
+    assert torch.equal(scale.before_render(activated, step).scales, activated.scales)
+    assert Curriculum(off.curriculum, list(views.values())).allows_view(step)
+
+
+def test_two_components_with_thresholds_are_refused() -> None:
+    densify = Densify(DensifyConf("per_class", 2.0, 2.0))
+    assert Components([Component(), densify]).densification_groups(DensifySettings()) is not None
+    with pytest.raises(XrgsError, match=r"^components: Densify and Other both set thresholds"):
+        Components([densify, Other()]).densification_groups(DensifySettings())
+
+
+class Other(Component):
+    """A component with thresholds of densification, and with a state."""
+
+    def __init__(self) -> None:
+        self.count = 0
+
+    def densification_groups(self, settings: DensifySettings) -> Groups:
+        del settings
+        return Groups({"HR": Thresholds(1.0, 1.0), "LR": Thresholds(1.0, 1.0)})
+
+    def state_dict(self) -> dict[str, Any]:
+        return {"count": self.count} if self.count else {}
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        self.count = state["count"]
+
+
+def test_the_states_of_two_components_of_one_class_are_kept_apart() -> None:
+    kinds = Other(), Component(), Other(), Other()
+    kinds[0].count, kinds[2].count = 1, 2
+    states = Components(kinds).state_dict()
+    assert states == {"0.Other": {"count": 1}, "2.Other": {"count": 2}}
+    again = Other(), Component(), Other(), Other()
+    Components(again).load_state_dict(states)
+    assert [again[0].count, again[2].count, again[3].count] == [1, 2, 0]
+
+
+def test_a_component_without_from_settings_says_so() -> None:
+    with pytest.raises(NotImplementedError, match="Other does not define from_settings"):
+        Other.from_settings(None, TrainingSetup(None, None, None, "torch"))  # type: ignore[arg-type]
+
+
 @pytest.mark.parametrize("parts", [Components(), Components([Component()])])
 @pytest.mark.parametrize("tag", ["HR", "LR"])
 def test_a_component_that_overrides_nothing_is_the_identity(
-    parts: Components, tag: str, steps: dict[str, Step], gaussians: Gaussians
+    parts: Components,
+    tag: str,
+    steps: dict[str, Step],
+    gaussians: Gaussians,
+    gradients: dict[str, Tensor],
 ) -> None:
     step = steps[tag]
-    before = {name: (gaussians[name].clone(), gaussians[name].grad.clone()) for name in PARAMETERS}
+    values = {name: gaussians[name].clone() for name in PARAMETERS}
     loss = torch.tensor(0.3, requires_grad=True)
     gradient = torch.rand(6, 2)
     activated = gaussians.activated()
-    assert parts.trains_on(step)
-    assert parts.activated(activated, step) is activated
-    assert parts.pixel_weight(step) is None
-    assert parts.loss(loss, step.view.image, step) is loss
+    assert parts.allows_view(step)
+    assert parts.before_render(activated, step) is activated
+    assert parts.pixel_weights(step) is None
+    assert parts.modify_loss(loss, step.view.image, gaussians, step) is loss
     assert parts.densification_grad2d(gradient, step) is gradient
-    assert parts.groups(DensifySettings()) is None
+    assert parts.densification_groups(DensifySettings()) is None
     parts.after_backward(gaussians, step)
     parts.on_gaussians_changed(gaussians)
-    parts.finish(gaussians)
-    for name, (value, grad) in before.items():
+    parts.after_training(gaussians)
+    for name, value in values.items():
+        gradient_now = gaussians[name].grad
+        assert gradient_now is not None
         assert torch.equal(gaussians[name], value), name
-        assert torch.equal(gaussians[name].grad, grad), name
+        assert torch.equal(gradient_now, gradients[name]), name
 
 
 @pytest.mark.parametrize("key", ON)

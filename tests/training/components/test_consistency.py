@@ -1,4 +1,4 @@
-"""Paper 5.6 against its formula in float64, and its cheaper modes against the exact one."""
+"""Section 5.6 against its formula in float64, and its cheaper modes against the exact one."""
 
 from __future__ import annotations
 
@@ -10,11 +10,15 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from xrgs.config import ComponentsConf
+from xrgs.config import ComponentsConf, ConsistencyConf
 from xrgs.errors import XrgsError
+from xrgs.splat.gaussians import Gaussians
 from xrgs.splat.resample import resize
 from xrgs.training.components import Components, Step, TrainingView
 from xrgs.training.components.consistency import Consistency
+
+#: The losses of these tests do not depend on the Gaussians.
+NO_GAUSSIANS = Gaussians(*[torch.empty(0)] * 6)
 
 HR_SIZE, LR_SIZE = (60, 75), (12, 15)
 
@@ -30,7 +34,9 @@ def on(off: ComponentsConf) -> ComponentsConf:
 
 
 def loss_of(parts: Components, image: Tensor, step: Step, base: float = 0.0) -> float:
-    return parts.loss(torch.tensor(base, dtype=torch.float64), image, step).item()
+    return parts.modify_loss(
+        torch.tensor(base, dtype=torch.float64), image, NO_GAUSSIANS, step
+    ).item()
 
 
 def keys_matrix(size: int, target: int) -> NDArray[np.float64]:
@@ -42,13 +48,15 @@ def keys_matrix(size: int, target: int) -> NDArray[np.float64]:
     near = 1.5 * t**3 - 2.5 * t**2 + 1
     far = -0.5 * t**3 + 2.5 * t**2 - 4 * t + 2
     weights = np.where(t < 1, near, np.where(t < 2, far, 0))
-    return weights / weights.sum(axis=1, keepdims=True)
+    normalised: NDArray[np.float64] = weights / weights.sum(axis=1, keepdims=True)
+    return normalised
 
 
 def phi(image: Tensor, height: int, width: int) -> NDArray[np.float64]:
     rows = keys_matrix(image.shape[0], height)
     columns = keys_matrix(image.shape[1], width)
-    return np.einsum("ah,hwc,bw->abc", rows, image.numpy(), columns)
+    projected: NDArray[np.float64] = np.einsum("ah,hwc,bw->abc", rows, image.numpy(), columns)
+    return projected
 
 
 def paper_5_6(image: Tensor, view: TrainingView, *, weight: float, l1: float, ssim: float) -> float:
@@ -66,7 +74,7 @@ def paper_5_6(image: Tensor, view: TrainingView, *, weight: float, l1: float, ss
         data_range=1.0,
         channel_axis=-1,
     )
-    return weight * (l1 * float(np.abs(projected - pair).mean()) + ssim * (1 - similarity))
+    return weight * (l1 * float(np.abs(projected - pair).mean()) + ssim * (1 - float(similarity)))
 
 
 @pytest.mark.parametrize("tag", ["HR", "LR"])
@@ -104,7 +112,11 @@ def test_its_gradient_reaches_the_render(
     tag: str, build: Build, on: ComponentsConf, steps: dict[str, Step]
 ) -> None:
     image = (steps[tag].view.image * 0.9).requires_grad_()
-    build(on).loss(torch.tensor(0.0, dtype=torch.float64), image, steps[tag]).backward()
+    torch.autograd.backward(
+        build(on).modify_loss(
+            torch.tensor(0.0, dtype=torch.float64), image, NO_GAUSSIANS, steps[tag]
+        )
+    )
     assert image.grad is not None
     assert (image.grad != 0).float().mean() > 0.9
 
@@ -122,11 +134,11 @@ def test_the_weight_of_a_view_multiplies_its_consistency(
 def test_pairs_are_made_once(build: Build, on: ComponentsConf, hr: Step) -> None:
     (consistency,) = build(on)
     assert isinstance(consistency, Consistency)
-    sizes = {name: tuple(pair.image.shape) for name, pair in consistency.pairs.items()}
+    sizes = {name: tuple(pair.image.shape) for name, pair in consistency.paired_targets.items()}
     assert sizes == {"hr": (*LR_SIZE, 3), "lr": (*HR_SIZE, 3)}
-    before = dict(consistency.pairs)
-    consistency.loss(torch.tensor(0.0), hr.view.image, hr)
-    assert all(consistency.pairs[name] is pair for name, pair in before.items())
+    before = dict(consistency.paired_targets)
+    consistency.modify_loss(torch.tensor(0.0), hr.view.image, NO_GAUSSIANS, hr)
+    assert all(consistency.paired_targets[name] is pair for name, pair in before.items())
 
 
 def test_off_leaves_lr_views_alone(build: Build, on: ComponentsConf, hr: Step, lr: Step) -> None:
@@ -134,7 +146,7 @@ def test_off_leaves_lr_views_alone(build: Build, on: ComponentsConf, hr: Step, l
     on.consistency.lr_mode = "off"
     parts = build(on)
     loss = torch.tensor(0.5, dtype=torch.float64)
-    assert parts.loss(loss, lr.view.image * 0.8, lr) is loss
+    assert parts.modify_loss(loss, lr.view.image * 0.8, NO_GAUSSIANS, lr) is loss
     assert loss_of(parts, hr.view.image * 0.8, hr, base=0.5) == pytest.approx(0.5 + expected)
 
 
@@ -151,7 +163,7 @@ def test_fold_is_more_weight_on_l1(
     assert loss_of(parts, hr.view.image * 0.8, hr) == exact
     (consistency,) = parts
     assert isinstance(consistency, Consistency)
-    assert set(consistency.pairs) == {"hr"}  # nothing is upsampled
+    assert set(consistency.paired_targets) == {"hr"}  # nothing is upsampled
 
 
 @pytest.mark.parametrize(
@@ -197,6 +209,20 @@ def test_an_unknown_mode_is_refused(build: Build, on: ComponentsConf) -> None:
     on.consistency.lr_mode = "folded"
     with pytest.raises(XrgsError, match=r"^components\.consistency\.lr_mode=folded"):
         build(on)
+
+
+@pytest.mark.parametrize(
+    ("size", "paired"), [((24, 30), (48, 60)), ((24, 36), (12, 18)), ((28, 35), (56, 70))]
+)
+def test_the_opposite_resolution_of_an_lr_view_goes_by_its_size(
+    size: tuple[int, int], paired: tuple[int, int], make_view: MakeView, noise: Noise
+) -> None:
+    """HR views are 50 px long and the factor is 2, so that 50 / sqrt(2) = 35.4 px separates."""
+    views = [make_view("HR", noise(40, 50, 0)), make_view("LR", noise(*size, 1))]
+    settings = ConsistencyConf(weight=0.1, l1=0.8, ssim=0.2, lr_mode="exact")
+    targets = Consistency(settings, views, factor=2).paired_targets
+    assert targets["lr"].image.shape[:2] == paired
+    assert targets["hr"].image.shape[:2] == (20, 25)
 
 
 def test_an_lr_view_of_full_size_is_compared_below_it(

@@ -1,4 +1,4 @@
-"""Paper, conclusion: a view weighs by its sampling rate, not by a binary tag."""
+"""Conclusion of the paper: the weight of a view by its sampling rate, not by its tag."""
 
 from __future__ import annotations
 
@@ -10,7 +10,11 @@ import torch
 
 from xrgs.capture.dataset import LoadedView
 from xrgs.config import ComponentsConf
+from xrgs.splat.gaussians import Gaussians
 from xrgs.training.components import Components, Step
+
+#: The losses of these tests do not depend on the Gaussians.
+NO_GAUSSIANS = Gaussians(*[torch.empty(0)] * 6)
 
 
 @pytest.fixture
@@ -21,7 +25,7 @@ def view(lr: Step) -> LoadedView:
 
 def weight(parts: Components, view: LoadedView, number: int = 0) -> float:
     loss = torch.tensor(1.0, dtype=torch.float64)
-    return parts.loss(loss, view.image, Step(number, 30_000, view)).item()
+    return parts.modify_loss(loss, view.image, NO_GAUSSIANS, Step(number, 30_000, view)).item()
 
 
 @pytest.mark.parametrize(
@@ -41,7 +45,7 @@ def test_the_weight_is_a_power_of_the_rate_whatever_the_tag(
     assert weight(build(off, view), view) == pytest.approx(expected, rel=1e-3)
 
 
-def test_it_takes_the_place_of_the_tag(
+def test_it_replaces_the_weight_by_tag(
     view: LoadedView, build: Callable[..., Components], off: ComponentsConf
 ) -> None:
     off.continuous_weighting.gamma = 1.0
@@ -50,7 +54,7 @@ def test_it_takes_the_place_of_the_tag(
     assert weight(build(off, view), view) == 0.5
 
 
-def test_others_give_back_what_it_takes(
+def test_the_hybrid_schedule_attenuates_it(
     view: LoadedView, build: Callable[..., Components], off: ComponentsConf
 ) -> None:
     off.continuous_weighting.gamma = 1.0

@@ -1,4 +1,4 @@
-"""Paper 5.4: thresholds of its own for each class; how they decide is tested in tests/splat."""
+"""Section 5.4: the thresholds of each class; tests/splat tests what densification does."""
 
 from __future__ import annotations
 
@@ -26,26 +26,28 @@ def test_lr_views_have_other_thresholds_and_hr_views_gsplats(
     decide: str, pooled: bool, build: Build, on: ComponentsConf
 ) -> None:
     on.densify.decide = decide
-    groups = build(on).groups(DensifySettings())
+    groups = build(on).densification_groups(DensifySettings())
     hr, lr = Thresholds(2e-4, 0.005), Thresholds(4e-4, 0.015)
     assert groups == Groups({"HR": hr, "LR": lr}, pooled)
-    assert list(groups.thresholds) == ["HR", "LR"]  # HR has the first say on pruning
+    assert list(groups.thresholds) == ["HR", "LR"]  # the first has precedence in pruning
 
 
-def test_they_follow_the_settings_of_the_model(build: Build, on: ComponentsConf) -> None:
-    groups = build(on).groups(DensifySettings(grow_grad2d=8e-4, prune_opacity=0.1))
+def test_the_thresholds_follow_the_settings_of_densification(
+    build: Build, on: ComponentsConf
+) -> None:
+    groups = build(on).densification_groups(DensifySettings(grow_grad2d=8e-4, prune_opacity=0.1))
     assert groups is not None
     assert groups.thresholds["HR"] == Thresholds(8e-4, 0.1)
     assert groups.thresholds["LR"].grow_grad2d == pytest.approx(16e-4)
 
 
-def test_in_the_baseline_all_views_are_alike(build: Build, off: ComponentsConf) -> None:
-    assert build(off).groups(DensifySettings()) is None
+def test_the_baseline_has_no_groups_of_views(build: Build, off: ComponentsConf) -> None:
+    assert build(off).densification_groups(DensifySettings()) is None
     off.loss_weighting.lr_weight = 0.25
-    assert build(off).groups(DensifySettings()) is None
+    assert build(off).densification_groups(DensifySettings()) is None
 
 
-def test_an_unknown_way_to_decide_is_refused(build: Build, on: ComponentsConf) -> None:
+def test_an_unknown_value_of_decide_is_refused(build: Build, on: ComponentsConf) -> None:
     on.densify.decide = "everybody"
     with pytest.raises(XrgsError, match=r"^components\.densify\.decide=everybody"):
         build(on)

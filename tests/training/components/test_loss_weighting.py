@@ -1,4 +1,4 @@
-"""Paper 5.2: the whole loss of an LR view is weighted, and with it its gradients."""
+"""Section 5.2: the whole loss of an LR view is weighted, and with it its gradients."""
 
 from __future__ import annotations
 
@@ -9,7 +9,11 @@ import torch
 
 from xrgs.config import ComponentsConf
 from xrgs.errors import XrgsError
+from xrgs.splat.gaussians import Gaussians
 from xrgs.training.components import Components, Step
+
+#: The losses of these tests do not depend on the Gaussians.
+NO_GAUSSIANS = Gaussians(*[torch.empty(0)] * 6)
 
 
 @pytest.fixture
@@ -20,14 +24,14 @@ def weighting(build: Callable[..., Components], off: ComponentsConf) -> Componen
 
 def test_the_loss_of_an_lr_view_is_weighted(weighting: Components, hr: Step, lr: Step) -> None:
     loss = torch.tensor(0.8)
-    assert weighting.loss(loss, lr.view.image, lr) == 0.2
-    assert weighting.loss(loss, hr.view.image, hr) is loss
+    assert weighting.modify_loss(loss, lr.view.image, NO_GAUSSIANS, lr) == 0.2
+    assert weighting.modify_loss(loss, hr.view.image, NO_GAUSSIANS, hr) is loss
     assert (lr.log, hr.log) == ({"weighting.LR": 0.25}, {})
 
 
 def test_its_gradients_are_weighted_with_it(weighting: Components, lr: Step) -> None:
     x = torch.tensor(3.0, requires_grad=True)
-    weighting.loss(x * 2, lr.view.image, lr).backward()
+    torch.autograd.backward(weighting.modify_loss(x * 2, lr.view.image, NO_GAUSSIANS, lr))
     assert x.grad == 0.5
 
 
@@ -39,7 +43,7 @@ def test_densification_reads_the_weighted_gradient(
     assert weighting.densification_grad2d(gradient, hr) is gradient
 
 
-def test_or_the_gradient_as_it_would_be_without_the_weight(
+def test_unweighted_densification_reads_the_gradient_without_the_weight(
     build: Callable[..., Components], off: ComponentsConf, hr: Step, lr: Step
 ) -> None:
     off.loss_weighting.lr_weight, off.loss_weighting.stat_from = 0.25, "unweighted"
@@ -49,13 +53,15 @@ def test_or_the_gradient_as_it_would_be_without_the_weight(
     (expected,) = torch.autograd.grad(plain, means2d, retain_graph=True)
     for step in (lr, hr):
         (found,) = torch.autograd.grad(
-            weighting.loss(plain, step.view.image, step), means2d, retain_graph=True
+            weighting.modify_loss(plain, step.view.image, NO_GAUSSIANS, step),
+            means2d,
+            retain_graph=True,
         )
         assert torch.equal(found, expected) == (step is hr)
         assert torch.equal(weighting.densification_grad2d(found, step), expected)
 
 
-def test_a_weight_of_nothing_divides_nothing(
+def test_a_weight_of_0_is_not_divided_by(
     build: Callable[..., Components], off: ComponentsConf, lr: Step
 ) -> None:
     off.loss_weighting.lr_weight, off.loss_weighting.stat_from = 0.0, "unweighted"

@@ -1,22 +1,26 @@
-"""Mip-Splatting's 3D filter, at the rate of the finest view that sees a Gaussian."""
+"""Mip-Splatting's 3D filter, at the highest sampling rate of the views that see a Gaussian."""
 
 from __future__ import annotations
+
+from collections.abc import Callable
 
 import pytest
 import torch
 from torch import Tensor
 
 from xrgs.capture.dataset import LoadedView
-from xrgs.config import MipConf
+from xrgs.config import ComponentsConf, MipConf
 from xrgs.splat.cameras import Camera
-from xrgs.splat.gaussians import Gaussians, from_points
+from xrgs.splat.gaussians import ActivatedGaussians, Gaussians, from_points
 from xrgs.splat.rasterize import rasterize
 from xrgs.splat.settings import RasterSettings
-from xrgs.training.components import Step
-from xrgs.training.components.mip import Mip, sampling_rates, smoothed
+from xrgs.training.components import Components, Step
+from xrgs.training.components.mip import Mip, sampling_rates, smooth
 
 NEAR = 0.01
 SIZE = 40
+
+Build = Callable[..., Components]
 
 
 def camera(focal: float, *, back: float, fy: float | None = None) -> Camera:
@@ -62,7 +66,7 @@ def test_two_cameras_of_differing_focal_length_and_distance(order: tuple[Camera,
     mip = on(*order)
     mip.on_gaussians_changed(gaussians)
     plain = gaussians.activated()
-    filtered = mip.activated(plain, STEP)
+    filtered = mip.before_render(plain, STEP)
     # f / z of each: 100/4 and 20/1, 100/5 and 20/2, 100/16 and 20/13.
     nu = torch.tensor([25.0, 20.0, 6.25], dtype=torch.float64)
     scales, opacities = plain.scales.double(), plain.opacities.double()
@@ -85,6 +89,16 @@ def test_a_view_that_does_not_see_a_gaussian_does_not_count() -> None:
     assert torch.equal(sampling_rates(means, [], NEAR), torch.zeros(3))
 
 
+def test_a_view_does_not_see_what_is_nearer_than_near(build: Build, off: ComponentsConf) -> None:
+    means = torch.tensor([[0.0, 0.0, -0.992], [0.0, 0.0, -0.98]])  # depths of 0.008 and 0.02
+    torch.testing.assert_close(sampling_rates(means, [CLOSE], NEAR), torch.tensor([0.0, 1000.0]))
+    off.mip.variance = 0.2
+    (mip,) = build(off, view("LR", CLOSE))
+    assert isinstance(mip, Mip)
+    mip.on_gaussians_changed(splats((0.0, 0.0, -0.992), (0.0, 0.0, 0.0)))
+    assert mip.unseen_count == 1  # the model's near plane is 0.01
+
+
 @pytest.mark.parametrize("axis", [0, 1])
 @pytest.mark.parametrize("side", [-1, 1])
 def test_the_margin_is_around_all_four_sides(axis: int, side: int) -> None:
@@ -98,19 +112,19 @@ def test_the_finer_axis_of_a_view_counts() -> None:
     assert rates.item() == pytest.approx(30.0)
 
 
-def test_what_no_view_sees_takes_the_coarsest_rate() -> None:
+def test_a_gaussian_that_no_view_sees_takes_the_lowest_rate() -> None:
     gaussians = splats((0.0, 0.0, 0.0), (0.0, 0.0, 1.0), (50.0, 0.0, 0.0))
     mip = on(FAR, CLOSE)
     mip.on_gaussians_changed(gaussians)
     torch.testing.assert_close(mip.variance, 0.2 / torch.tensor([25.0, 20.0, 20.0]) ** 2)
 
 
-def test_where_nothing_is_seen_nothing_is_smoothed() -> None:
+def test_gaussians_that_no_view_sees_are_not_filtered() -> None:
     gaussians = splats((50.0, 0.0, 0.0), (60.0, 0.0, 0.0))
     mip = on(FAR)
     mip.on_gaussians_changed(gaussians)
     plain = gaussians.activated()
-    filtered = mip.activated(plain, STEP)
+    filtered = mip.before_render(plain, STEP)
     assert torch.equal(filtered.scales, plain.scales)
     assert torch.equal(filtered.opacities, plain.opacities)
 
@@ -121,8 +135,8 @@ def test_every_view_is_rendered_with_the_same_filter(tag: str) -> None:
     mip = on(FAR, CLOSE)
     mip.on_gaussians_changed(gaussians)
     step = Step(1, 30_000, view(tag, FAR if tag == "HR" else CLOSE))
-    first = mip.activated(gaussians.activated(), STEP)
-    assert torch.equal(mip.activated(gaussians.activated(), step).scales, first.scales)
+    first = mip.before_render(gaussians.activated(), STEP)
+    assert torch.equal(mip.before_render(gaussians.activated(), step).scales, first.scales)
 
 
 def test_rates_follow_the_means_every_so_often() -> None:
@@ -132,9 +146,9 @@ def test_rates_follow_the_means_every_so_often() -> None:
     before = mip.variance.clone()
     with torch.no_grad():
         gaussians.means[0, 2] = 4.0
-    mip.activated(gaussians.activated(), Step(199, 30_000, STEP.view))
+    mip.before_render(gaussians.activated(), Step(199, 30_000, STEP.view))
     assert torch.equal(mip.variance, before)
-    mip.activated(gaussians.activated(), Step(200, 30_000, STEP.view))
+    mip.before_render(gaussians.activated(), Step(200, 30_000, STEP.view))
     torch.testing.assert_close(mip.variance, 4 * before)
 
 
@@ -144,7 +158,7 @@ def test_mass_is_kept() -> None:
         torch.rand(*shape, generator=generator, dtype=torch.float64)
         for shape in ((9, 3), (9,), (9,))
     )
-    wider, weaker = smoothed(scales, opacities, variance)
+    wider, weaker = smooth(scales, opacities, variance)
     assert (wider > scales).all()
     torch.testing.assert_close(weaker * wider.prod(-1), opacities * scales.prod(-1))
 
@@ -156,33 +170,35 @@ def test_its_gradient_is_that_of_finite_differences() -> None:
         for shape in ((5, 3), (5,))
     )
     variance = torch.rand(5, generator=generator, dtype=torch.float64)
-    assert torch.autograd.gradcheck(lambda s, o: smoothed(s, o, variance), (scales, opacities))
+    assert torch.autograd.gradcheck(lambda s, o: smooth(s, o, variance), (scales, opacities))
 
 
 def test_gradients_reach_the_parameters_and_not_the_rates() -> None:
     gaussians = splats((0.0, 0.0, 0.0), (0.1, 0.0, 0.5))
     mip = on(FAR, CLOSE)
     mip.on_gaussians_changed(gaussians)
-    filtered = mip.activated(gaussians.activated(), STEP)
-    (filtered.scales.sum() + filtered.opacities.sum()).backward()
+    filtered = mip.before_render(gaussians.activated(), STEP)
+    torch.autograd.backward(filtered.scales.sum() + filtered.opacities.sum())
     for name in ("scales", "opacities"):
-        assert (gaussians[name].grad != 0).all()
+        gradient = gaussians[name].grad
+        assert gradient is not None
+        assert bool((gradient != 0).all())
     assert gaussians.means.grad is None
 
 
-def test_what_is_kept_renders_as_what_was_trained() -> None:
+def test_what_is_saved_renders_as_what_was_trained() -> None:
     gaussians = splats((0.0, 0.0, 0.0), (0.1, 0.05, 0.5), (50.0, 0.0, 0.0))
     mip = on(FAR, CLOSE)
     mip.on_gaussians_changed(gaussians)
     settings = RasterSettings(antialiased=True, sh_degree=0)
 
-    def image(activated: tuple[Tensor, ...]) -> Tensor:
+    def image(activated: ActivatedGaussians) -> Tensor:
         return rasterize(*activated, FAR, settings, sh_degree=0).image
 
-    trained = image(mip.activated(gaussians.activated(), STEP))
+    trained = image(mip.before_render(gaussians.activated(), STEP))
     unfiltered = image(gaussians.activated())
     assert (trained - unfiltered).abs().max() > 0.01
-    mip.finish(gaussians)
+    mip.after_training(gaussians)
     torch.testing.assert_close(image(gaussians.activated()), trained, rtol=1e-5, atol=1e-6)
     assert gaussians.scales.is_leaf
     assert gaussians.scales.requires_grad
@@ -196,11 +212,13 @@ def test_extreme_gaussians_stay_finite() -> None:
         tensor.requires_grad_()
     mip = on(FAR)
     mip.on_gaussians_changed(gaussians)
-    filtered = mip.activated(gaussians.activated(), STEP)
-    (filtered.scales.sum() + filtered.opacities.sum()).backward()
+    filtered = mip.before_render(gaussians.activated(), STEP)
+    torch.autograd.backward(filtered.scales.sum() + filtered.opacities.sum())
     for name in ("scales", "opacities"):
         assert torch.isfinite(getattr(filtered, name)).all()
-        assert torch.isfinite(gaussians[name].grad).all()
-    mip.finish(gaussians)
+        gradient = gaussians[name].grad
+        assert gradient is not None
+        assert torch.isfinite(gradient).all()
+    mip.after_training(gaussians)
     assert torch.isfinite(gaussians.scales).all()
     assert torch.isfinite(gaussians.opacities).all()

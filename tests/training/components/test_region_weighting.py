@@ -1,4 +1,4 @@
-"""Paper 7.2: LR views weigh less where they are textured and an HR view covers them, only there."""
+"""Section 7.2: LR views are attenuated where they are textured and an HR view covers them."""
 
 from __future__ import annotations
 
@@ -9,29 +9,33 @@ from torch import Tensor
 from xrgs.capture.dataset import Dataset, LoadedView
 from xrgs.config import Conf, RegionWeightingConf
 from xrgs.splat.cameras import Camera
+from xrgs.splat.gaussians import Gaussians
 from xrgs.training import components
 from xrgs.training.components import Step
-from xrgs.training.components.region_weighting import coverage, region_shares
+from xrgs.training.components.region_weighting import coverage, region_attenuations
+
+#: The losses of these tests do not depend on the Gaussians.
+NO_GAUSSIANS = Gaussians(*[torch.empty(0)] * 6)
 
 NEAR = 0.01
 
 
-def camera(size: int, *, x: float = 0.0, focal: float | None = None) -> Camera:
-    """Sees -1 to 1 around `x` at depth 2, unless its focal length is another."""
+def camera(size: int, *, x: float = 0.0, back: float = 0.0, focal: float | None = None) -> Camera:
+    """A camera that sees -1 to 1 around `x` at depth 2, unless its focal length is another."""
     K = torch.tensor([[focal or size, 0, size / 2], [0, focal or size, size / 2], [0, 0, 1]])
     viewmat = torch.eye(4)
-    viewmat[0, 3] = -x
+    viewmat[0, 3], viewmat[2, 3] = -x, back
     return Camera(viewmat, K.float(), size, size)
 
 
 def wall(depth: float) -> Tensor:
-    """Points [P, 3] all over what cameras near the origin see."""
+    """Points [P, 3] of a wall that fills the views of cameras near the origin."""
     y, x = torch.meshgrid(torch.linspace(-4, 4, 41), torch.linspace(-4, 4, 41), indexing="ij")
     return torch.stack([x, y, torch.full_like(x, depth)], dim=-1).reshape(-1, 3)
 
 
 def checks(size: int, rows: int) -> Tensor:
-    """[size, size, 3]: a chequered pattern above, grey below the first `rows`."""
+    """An image [size, size, 3]: a chequered pattern in the first `rows`, grey below."""
     image = torch.full((size, size, 3), 0.5)
     y, x = torch.meshgrid(torch.arange(rows), torch.arange(size), indexing="ij")
     image[:rows] = ((x + y) % 2)[..., None].float()
@@ -55,10 +59,10 @@ def test_several_views_cover_together() -> None:
 @pytest.mark.parametrize(
     ("others", "points"),
     [
-        ([camera(20)], wall(2.0)),  # sees it no finer
-        ([camera(100, focal=20)], wall(2.0)),  # larger, and still no finer
-        ([camera(100, x=5.0)], wall(2.0)),  # looks elsewhere
-        ([camera(100)], wall(-2.0)),  # no point in view
+        ([camera(20)], wall(2.0)),  # the same sampling rate
+        ([camera(100, focal=20)], wall(2.0)),  # a larger image of the same sampling rate
+        ([camera(100, x=5.0)], wall(2.0)),  # another part of the wall
+        ([camera(100)], wall(-2.0)),  # points behind the camera
         ([], wall(2.0)),
     ],
 )
@@ -67,10 +71,24 @@ def test_what_is_not_covered(others: list[Camera], points: Tensor) -> None:
 
 
 def test_a_few_stray_points_do_not_move_the_depth() -> None:
-    points = torch.cat([wall(2.0), torch.tensor([[0.05, 0.05, 0.1], [-0.5, 0.0, 0.5]])])
+    """Two points between the camera and the wall, in view, that would move a mean of depths."""
+    stray = torch.tensor([[0.0, 0.0, 0.1], [-0.2, 0.0, 0.5]])
     others = [camera(100, x=1.0)]
+    alone = coverage(camera(20), others, stray, NEAR)
     expected = coverage(camera(20), others, wall(2.0), NEAR)
-    assert torch.equal(coverage(camera(20), others, points, NEAR), expected)
+    assert not torch.equal(alone, expected)
+    both = coverage(camera(20), others, torch.cat([wall(2.0), stray]), NEAR)
+    assert torch.equal(both, expected)
+
+
+def test_a_point_nearer_than_near_is_seen_by_no_view() -> None:
+    """The wall is 2 before one camera and 3 before the other; only one of them sees it."""
+    close, away = camera(20), camera(20, back=1.0)
+    finer_close, finer_away = camera(100), camera(100, back=1.0)
+    assert coverage(close, [finer_away], wall(2.0), NEAR).all()
+    assert not coverage(close, [finer_away], wall(2.0), near=2.5).any()
+    assert coverage(away, [finer_close], wall(2.0), NEAR).any()
+    assert not coverage(away, [finer_close], wall(2.0), near=2.5).any()
 
 
 def views(rows: int = 10) -> list[LoadedView]:
@@ -80,24 +98,24 @@ def views(rows: int = 10) -> list[LoadedView]:
     ]
 
 
-def test_the_share_is_high_where_textured_and_covered_alone() -> None:
-    shares = region_shares(RegionWeightingConf(0.07), views(), wall(2.0), NEAR)
-    assert set(shares) == {"low"}
-    share = shares["low"]
-    assert (share[:9, 10:] == 1).all()
-    assert (share[:, :10] == 0).all()  # no HR view
-    assert (share[13:] == 0).all()  # nothing to attenuate
+def test_textured_and_covered_pixels_alone_are_attenuated() -> None:
+    attenuations = region_attenuations(RegionWeightingConf(0.07), views(), wall(2.0), NEAR)
+    assert set(attenuations) == {"low"}
+    attenuation = attenuations["low"]
+    assert (attenuation[:9, 10:] == 1).all()
+    assert (attenuation[:, :10] == 0).all()  # no HR view covers these
+    assert (attenuation[13:] == 0).all()  # these are flat
 
 
-def test_half_the_texture_is_half_the_share() -> None:
-    strong = region_shares(RegionWeightingConf(8.0), views(), wall(2.0), NEAR)["low"]
-    weak = region_shares(RegionWeightingConf(16.0), views(), wall(2.0), NEAR)["low"]
-    # A chequered pattern's slope: 1 both ways.
-    torch.testing.assert_close(strong[:7, 10:], torch.full((7, 10), 2**0.5 / 8))
-    torch.testing.assert_close(weak, strong / 2)
+def test_the_attenuation_is_proportional_to_the_texture() -> None:
+    coarse = region_attenuations(RegionWeightingConf(8.0), views(), wall(2.0), NEAR)["low"]
+    coarser = region_attenuations(RegionWeightingConf(16.0), views(), wall(2.0), NEAR)["low"]
+    # The gradient of a chequered pattern is 1 along both axes.
+    torch.testing.assert_close(coarse[:7, 10:], torch.full((7, 10), 2**0.5 / 8))
+    torch.testing.assert_close(coarser, coarse / 2)
 
 
-def test_training_weighs_those_pixels_less(baseline: Conf) -> None:
+def test_training_gives_attenuated_pixels_less_weight(baseline: Conf) -> None:
     conf = baseline.components
     conf.loss_weighting.lr_weight = 0.25
     conf.region_weighting.texture = 0.07
@@ -106,14 +124,14 @@ def test_training_weighs_those_pixels_less(baseline: Conf) -> None:
     data = Dataset((low, high), (), points, points, 1.0, 5)
     parts = components.build(conf, data, baseline.splat)
     step = Step(0, 30_000, low)
-    relative = parts.pixel_weight(step)
+    relative = parts.pixel_weights(step)
     assert relative is not None
-    weights = relative * parts.loss(torch.tensor(1.0), low.image, step)
-    share = region_shares(conf.region_weighting, (low, high), points, NEAR)["low"]
-    torch.testing.assert_close(weights, 1 - 0.75 * share)
+    weights = relative * parts.modify_loss(torch.tensor(1.0), low.image, NO_GAUSSIANS, step)
+    attenuation = region_attenuations(conf.region_weighting, (low, high), points, NEAR)["low"]
+    torch.testing.assert_close(weights, 1 - 0.75 * attenuation)
     assert weights.min() < 0.26
     assert weights.max() > 0.99
     step = Step(0, 30_000, high)
     loss = torch.tensor(0.3)
-    assert parts.pixel_weight(step) is None
-    assert parts.loss(loss, high.image, step) is loss
+    assert parts.pixel_weights(step) is None
+    assert parts.modify_loss(loss, high.image, NO_GAUSSIANS, step) is loss

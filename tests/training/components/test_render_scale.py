@@ -1,4 +1,4 @@
-"""Paper 5.7: LR views see every Gaussian inflated, and only its scales."""
+"""Section 5.7: LR views are rendered with larger scales, and nothing else changes."""
 
 from __future__ import annotations
 
@@ -25,22 +25,22 @@ def test_the_scales_of_an_lr_view_are_inflated(
     build: Build, on: ComponentsConf, hr: Step, lr: Step, gaussians: Gaussians
 ) -> None:
     parts, plain = build(on), gaussians.activated()
-    inflated = parts.activated(plain, lr)
+    inflated = parts.before_render(plain, lr)
     factor = 5**0.25  # 75 px over 15
     torch.testing.assert_close(inflated.scales, plain.scales * factor)
     assert factor == pytest.approx(1.5, abs=0.01)
     for name in set(PARAMETERS) - {"scales"}:
         assert getattr(inflated, name) is getattr(plain, name)
     assert lr.log == {"render_scale.k": pytest.approx(factor)}
-    assert parts.activated(plain, hr) is plain
+    assert parts.before_render(plain, hr) is plain
 
 
-def test_what_is_kept_is_not_inflated_and_gradients_reach_it(
+def test_the_trained_scales_stay_and_gradients_reach_them(
     build: Build, on: ComponentsConf, lr: Step, gaussians: Gaussians
 ) -> None:
     before = gaussians.scales.detach().clone()
     gaussians.scales.grad = None
-    build(on).activated(gaussians.activated(), lr).scales.sum().backward()
+    torch.autograd.backward(build(on).before_render(gaussians.activated(), lr).scales.sum())
     torch.testing.assert_close(gaussians.scales.grad, 5**0.25 * before.exp())
     assert torch.equal(gaussians.scales.detach(), before)
 
@@ -55,7 +55,9 @@ def test_resolution_is_the_longer_side_of_the_largest_view(
     turned, wide = make_view("LR", torch.zeros(40, 20, 3)), make_view("HR", torch.zeros(30, 80, 3))
     parts = build(on, turned, wide)
     plain = gaussians.activated()
-    torch.testing.assert_close(parts.activated(plain, Step(0, 1, turned)).scales, plain.scales * 2)
+    torch.testing.assert_close(
+        parts.before_render(plain, Step(0, 1, turned)).scales, plain.scales * 2
+    )
 
 
 def test_an_lr_view_of_full_size_stays_as_it_is(
@@ -66,5 +68,5 @@ def test_an_lr_view_of_full_size_stays_as_it_is(
 ) -> None:
     blurred, sharp = (make_view(tag, torch.zeros(40, 60, 3)) for tag in ("LR", "HR"))
     step, plain = Step(0, 1, blurred), gaussians.activated()
-    assert torch.equal(build(on, blurred, sharp).activated(plain, step).scales, plain.scales)
-    assert step.log == {"render_scale.k": 1.0}  # which says so
+    assert torch.equal(build(on, blurred, sharp).before_render(plain, step).scales, plain.scales)
+    assert step.log == {"render_scale.k": 1.0}  # the history shows that nothing was scaled

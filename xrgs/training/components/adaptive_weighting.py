@@ -1,4 +1,4 @@
-"""Adaptive weighting (paper 7.2, 1)."""
+"""Adaptive weighting [xrgs, section 7.2, proposal 1]."""
 
 from __future__ import annotations
 
@@ -13,23 +13,33 @@ if TYPE_CHECKING:  # xrgs.config loads Hydra, which training does without
 
 
 class AdaptiveWeighting:
-    """LR views weigh the more, the less texture the scene has (paper 7.2, 1).
+    """Attenuates LR views in proportion to the texture of the scene.
 
-    The share of the attenuation that stays is `min(1, g / texture)`, where g is the mean over all
-    LR views and their pixels of the gradient's magnitude: none in a flat scene, whose LR views lack
-    nothing, all of it from `texture` on, linear in between. It is computed once.
+    The attenuation is `min(1, g / texture)`, where g is the mean of `gradient_magnitude` over all
+    pixels of all LR views, in intensity per px. It is computed once. A flat scene, whose LR views
+    lack no detail, is not attenuated at all; from `texture` on the attenuation is complete, and it
+    is linear in between.
 
-    The paper says neither how texture is measured nor what weight it gives. `texture` 0.07 lies
-    between the LLFF scenes that the paper calls cluttered (fern, flower, horns: 0.074 to 0.12 at
-    factor 5 of 504 and 1008 px) and the simple ones (fortress 0.055; a single object 0.03 to 0.04).
+    Our choice where the paper is silent: section 7.2 proposes to "estimate image texture (e.g., via
+    Fourier or gradient magnitude) and increase LR weighting when the scene is globally
+    low-frequency", without measure or weights. Measure, ramp and threshold are ours. `texture` 0.07
+    lies between the LLFF scenes that the paper calls cluttered (fern, flower, horns: 0.074 to 0.12
+    at factor 5 of 504 and 1008 px) and the simple ones (fortress 0.055; a single object 0.03 to
+    0.04).
     """
 
-    def __init__(self, conf: AdaptiveWeightingConf, views: Sequence[TrainingView]) -> None:
+    def __init__(self, settings: AdaptiveWeightingConf, views: Sequence[TrainingView]) -> None:
+        """Measure the texture of the scene.
+
+        Args:
+            settings: The component's settings; `texture` is above 0.
+            views: All training views; those tagged LR are measured.
+        """
         magnitudes = [gradient_magnitude(v.image).mean().item() for v in views if v.tag == "LR"]
-        self.gradient = sum(magnitudes) / len(magnitudes) if magnitudes else 0.0
-        self.share = min(1.0, self.gradient / conf.texture)
+        self.mean_gradient = sum(magnitudes) / len(magnitudes) if magnitudes else 0.0
+        self.attenuation = min(1.0, self.mean_gradient / settings.texture)
 
     def __call__(self, step: Step) -> float:
-        """Of the attenuation, what stays: the same at every step."""
+        """Return the attenuation, the same at every step."""
         del step
-        return self.share
+        return self.attenuation

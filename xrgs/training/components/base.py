@@ -1,22 +1,36 @@
-"""What a component of XR-GS is: the hooks by which training calls it, in the order of a step."""
+"""The interface of a component: the hooks that training calls, in the order of a step.
+
+One step of training runs these hooks, each for every component that is on:
+
+1. `allows_view` while the sampler chooses the step's view,
+2. `before_render` on the activated Gaussians, then the view is rendered,
+3. `pixel_weights` for the photometric loss, then `modify_loss` on that loss, then backward,
+4. `after_backward` on the gradients of the parameters, then the optimizer steps,
+5. `densification_grad2d` on the image-plane gradient, then densification reads it,
+6. `on_gaussians_changed` where densification has added, removed or reset Gaussians.
+
+`densification_groups` is called once before the first step, `after_training` once after the last.
+"""
 
 from __future__ import annotations
 
 import functools
 import math
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any, ClassVar, Protocol, Self
 
 import torch
 
 from xrgs.errors import XrgsError
 from xrgs.splat.settings import NOMINAL_STEPS
 
-if TYPE_CHECKING:
+if TYPE_CHECKING:  # xrgs.config loads Hydra, which training does without
     from collections.abc import Mapping
 
     from torch import Tensor
 
+    from xrgs.capture.dataset import Dataset
+    from xrgs.config import ComponentsConf, SplatConf
     from xrgs.splat.cameras import Camera
     from xrgs.splat.densify import Groups
     from xrgs.splat.gaussians import ActivatedGaussians, Gaussians
@@ -24,178 +38,306 @@ if TYPE_CHECKING:
 
 
 class TrainingView(Protocol):
-    """What a component may know of a view."""
+    """A training view as components see it."""
 
     @property
     def name(self) -> str:
-        """Its photograph's, unique among the views."""
+        """The name of the view's photograph, unique among the views."""
 
     @property
     def tag(self) -> str:
-        """`HR` or `LR`."""
+        """The resolution class of the view, `HR` or `LR`."""
 
     @property
     def rho(self) -> float:
-        """Its sampling rate over the finest of all views', in (0, 1]."""
+        """The sampling rate of the view over the highest rate of all views, in (0, 1]."""
 
     @property
     def camera(self) -> Camera:
-        """In the normalised world."""
+        """The camera in the normalised world."""
 
     @property
     def image(self) -> Tensor:
-        """The photograph [H, W, 3] at the size it is rendered at."""
+        """The photograph [H, W, 3] in 0..1, at the size at which the view is rendered."""
 
 
 @dataclass(frozen=True)
 class Step:
-    """One step of training: where it is in the run, and the view it is of."""
+    """One step of training: its position in the run, and the view that it renders."""
 
     number: int
-    """From 0."""
-    of: int
-    """Steps of the whole run."""
+    """The number of the step, from 0."""
+    total: int
+    """The number of steps of the whole run."""
     view: TrainingView
+    """The view that the step renders."""
     log: dict[str, float] = field(default_factory=dict, compare=False)
-    """What components note of the step, by a column of the history, `<component>.<what>`. A row of
-    the history has the mean over the steps, since the row before, that noted it."""
+    """Values that components record of the step, by column names `<component>.<quantity>`. A row of
+    history.csv has the mean of each over the steps since the row before that recorded it."""
 
     @property
     def nominal(self) -> float:
-        """Where it would be in a run of 30,000 steps, for which schedules are written."""
-        return self.number * NOMINAL_STEPS / self.of
+        """The position of the step in a run of 30,000 steps, in which schedules are written."""
+        return self.number * NOMINAL_STEPS / self.total
+
+
+@dataclass(frozen=True)
+class TrainingSetup:
+    """Everything that a component may read when it is built."""
+
+    components: ComponentsConf
+    """The settings of all components, `components` of the config."""
+    data: Dataset
+    """The training views, the SfM points, the scene scale and the downsampling factor."""
+    splat: SplatConf
+    """The settings of the model, its optimizer and its densification, `splat` of the config."""
+    backend: str
+    """`torch` or `native`: the implementation that renders and computes losses."""
 
 
 class Component:
-    """One change to training. Each hook is the identity until a component overrides it."""
+    """One change to training. Every hook is the identity until a subclass overrides it.
 
-    def trains_on(self, step: Step) -> bool:
-        """Whether the view may be drawn at that step."""
+    Attributes:
+        settings_type: For components of other packages: the dataclass of their settings. xrgs
+            builds it from `components.plugins.<name>` of the config, checking names and types.
+    """
+
+    settings_type: ClassVar[type[Any] | None] = None
+
+    @classmethod
+    def from_settings(cls, settings: Any, setup: TrainingSetup) -> Self | None:
+        """Build the component that the settings describe.
+
+        Args:
+            settings: The component's own settings: a dataclass of `xrgs.config`, or a
+                `settings_type` for components of other packages.
+            setup: The data, the model's settings and the other components' settings.
+
+        Returns:
+            The component, or None where the settings leave it off, which must change nothing.
+
+        Raises:
+            XrgsError: A setting is out of its range; the message names its key.
+        """
+        raise NotImplementedError(f"{cls.__name__} does not define from_settings")
+
+    def allows_view(self, step: Step) -> bool:
+        """Decide whether training may sample the step's view at that step.
+
+        Args:
+            step: The step with the view in question.
+
+        Returns:
+            False excludes the view. The sampler skips it, and leaves it out of epochs that begin
+            while it is excluded.
+        """
         del step
         return True
 
-    def activated(self, activated: ActivatedGaussians, step: Step) -> ActivatedGaussians:
-        """The Gaussians to render in place of those given, differentiable in them."""
+    def before_render(self, activated: ActivatedGaussians, step: Step) -> ActivatedGaussians:
+        """Change the Gaussians for this step's render alone.
+
+        Args:
+            activated: N Gaussians with their scales in world units and their opacities in 0..1.
+            step: The step with its view.
+
+        Returns:
+            The N Gaussians to render, differentiable in those given.
+        """
         del step
         return activated
 
-    def pixel_weight(self, step: Step) -> Tensor | None:
-        """What each pixel [H, W] weighs in the photometric loss; None where all weigh 1."""
+    def pixel_weights(self, step: Step) -> Tensor | None:
+        """Weight the pixels of the view in the photometric loss.
+
+        Args:
+            step: The step with its view.
+
+        Returns:
+            Weights [H, W] of the view's pixels, or None where every pixel has weight 1.
+        """
         del step
         return None
 
-    def loss(self, loss: Tensor, image: Tensor, step: Step) -> Tensor:
-        """The loss to go on with, before backward.
+    def modify_loss(self, loss: Tensor, image: Tensor, gaussians: Gaussians, step: Step) -> Tensor:
+        """Change the loss before backward, by a further term or a factor.
 
         Args:
-            loss: Scalar, what the components before this one made of the photometric loss.
-            image: [H, W, 3] render of the view, unclamped.
-            step: With its view.
+            loss: Scalar; the photometric loss as the components before this one have changed it.
+            image: [H, W, 3] render of the view, not clamped to 0..1.
+            gaussians: The N Gaussians that are trained; a term may depend on their parameters.
+            step: The step with its view.
+
+        Returns:
+            The scalar to call backward on.
         """
-        del image, step
+        del image, gaussians, step
         return loss
 
     def after_backward(self, gaussians: Gaussians, step: Step) -> None:
-        """Change the parameters' gradients in place, before the optimizer reads them."""
+        """Change the gradients of the parameters in place, before the optimizer reads them.
 
-    def densification_grad2d(self, gradient: Tensor, step: Step) -> Tensor:
-        """The image-plane gradient [N, 2] that densification is to read, in place of that given."""
+        Args:
+            gaussians: The N Gaussians with their gradients. A change of the gradient of `shN` has
+                no effect: the optimizer computes it from the gradient of `sh0`.
+            step: The step with its view.
+        """
+
+    def densification_grad2d(self, grad2d: Tensor, step: Step) -> Tensor:
+        """Change the image-plane gradient that densification averages, and nothing else.
+
+        Args:
+            grad2d: [N, 2] gradient of the loss with respect to the projected means, per pixel.
+            step: The step with its view.
+
+        Returns:
+            The gradient [N, 2] that densification reads in its place.
+        """
         del step
-        return gradient
+        return grad2d
 
-    def groups(self, settings: DensifySettings) -> Groups | None:
-        """The views that densification tells apart, by their tags; None where it is to tell none.
+    def densification_groups(self, settings: DensifySettings) -> Groups | None:
+        """Give groups of views their own thresholds of densification and pruning.
 
-        Asked once, before training; at most one of the components may have an answer.
+        Training calls it once, before the first step. At most one component may return groups.
+
+        Args:
+            settings: The settings of densification.
+
+        Returns:
+            The thresholds by the views' tags, or None to leave densification as it is.
         """
         del settings
         return None
 
     def on_gaussians_changed(self, gaussians: Gaussians) -> None:
-        """Gaussians came or went, or training begins."""
+        """Update what depends on the number and the order of the Gaussians.
 
-    def finish(self, gaussians: Gaussians) -> None:
-        """Training is over: make the Gaussians, in place, those that are to be shown and kept."""
+        Training calls it before the first step, and after each densification that has added,
+        removed or reset Gaussians.
+
+        Args:
+            gaussians: The N Gaussians as they are now.
+        """
+
+    def after_training(self, gaussians: Gaussians) -> None:
+        """Change the trained Gaussians in place, before they are evaluated and saved.
+
+        Args:
+            gaussians: The N trained Gaussians.
+        """
 
     def state_dict(self) -> dict[str, Any]:
-        """What the steps so far have made of it, for a checkpoint; nothing where none did."""
+        """Return what the steps so far have changed in the component, for a checkpoint.
+
+        Returns:
+            Tensors and JSON values by name; empty for a component without state.
+        """
         return {}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Become what `state_dict` told of; not called where that was nothing.
+        """Restore what `state_dict` returned.
+
+        Args:
+            state: The state of a component that was built from the same settings; never empty.
 
         Raises:
-            KeyError: Something is missing.
-            ValueError: Something does not fit.
+            KeyError: An entry is missing.
+            ValueError: An entry does not fit.
         """
 
 
 class Components(tuple[Component, ...]):
-    """The components that are on, in the order that their hooks run; none is the baseline."""
+    """The components that are on, in the order in which their hooks run; empty is the baseline."""
 
     __slots__ = ()
 
-    def trains_on(self, step: Step) -> bool:
-        """Whether all of them allow the step's view."""
-        return all(component.trains_on(step) for component in self)
+    def allows_view(self, step: Step) -> bool:
+        """Whether every component allows the step's view."""
+        return all(component.allows_view(step) for component in self)
 
-    def activated(self, activated: ActivatedGaussians, step: Step) -> ActivatedGaussians:
-        """`Component.activated` of each in turn."""
+    def before_render(self, activated: ActivatedGaussians, step: Step) -> ActivatedGaussians:
+        """Apply `Component.before_render` of each component in turn."""
         for component in self:
-            activated = component.activated(activated, step)
+            activated = component.before_render(activated, step)
         return activated
 
-    def pixel_weight(self, step: Step) -> Tensor | None:
-        """The product of `Component.pixel_weight` of each that has one; None where none has."""
-        weights = [weight for c in self if (weight := c.pixel_weight(step)) is not None]
+    def pixel_weights(self, step: Step) -> Tensor | None:
+        """The product [H, W] of the components' pixel weights; None where none has any."""
+        weights = [weight for c in self if (weight := c.pixel_weights(step)) is not None]
         return functools.reduce(torch.mul, weights) if weights else None
 
-    def loss(self, loss: Tensor, image: Tensor, step: Step) -> Tensor:
-        """`Component.loss` of each in turn; the very `loss` given where none is on."""
+    def modify_loss(self, loss: Tensor, image: Tensor, gaussians: Gaussians, step: Step) -> Tensor:
+        """Apply `Component.modify_loss` of each component in turn."""
         for component in self:
-            loss = component.loss(loss, image, step)
+            loss = component.modify_loss(loss, image, gaussians, step)
         return loss
 
     def after_backward(self, gaussians: Gaussians, step: Step) -> None:
-        """`Component.after_backward` of each in turn."""
+        """Call `Component.after_backward` of each component in turn."""
         for component in self:
             component.after_backward(gaussians, step)
 
-    def densification_grad2d(self, gradient: Tensor, step: Step) -> Tensor:
-        """`Component.densification_grad2d` of each in turn."""
+    def densification_grad2d(self, grad2d: Tensor, step: Step) -> Tensor:
+        """Apply `Component.densification_grad2d` of each component in turn."""
         for component in self:
-            gradient = component.densification_grad2d(gradient, step)
-        return gradient
+            grad2d = component.densification_grad2d(grad2d, step)
+        return grad2d
 
-    def groups(self, settings: DensifySettings) -> Groups | None:
-        """`Component.groups` of the one that has an answer."""
-        answers = (component.groups(settings) for component in self)
-        return next((answer for answer in answers if answer is not None), None)
+    def densification_groups(self, settings: DensifySettings) -> Groups | None:
+        """The groups of the one component that has any.
+
+        Raises:
+            XrgsError: Two components have groups.
+        """
+        groups = {
+            type(component).__name__: answer
+            for component in self
+            if (answer := component.densification_groups(settings)) is not None
+        }
+        if len(groups) > 1:
+            raise XrgsError(
+                f"components: {' and '.join(groups)} both set thresholds of densification; switch"
+                " one of them off"
+            )
+        return next(iter(groups.values()), None)
 
     def on_gaussians_changed(self, gaussians: Gaussians) -> None:
-        """`Component.on_gaussians_changed` of each in turn."""
+        """Call `Component.on_gaussians_changed` of each component in turn."""
         for component in self:
             component.on_gaussians_changed(gaussians)
 
-    def finish(self, gaussians: Gaussians) -> None:
-        """`Component.finish` of each in turn."""
+    def after_training(self, gaussians: Gaussians) -> None:
+        """Call `Component.after_training` of each component in turn."""
         for component in self:
-            component.finish(gaussians)
+            component.after_training(gaussians)
 
     def state_dict(self) -> dict[str, Any]:
-        """`Component.state_dict` of those that have one, by their classes' names."""
-        states = {type(component).__name__: component.state_dict() for component in self}
+        """The states of the components that have one, by position and class name."""
+        states = {name: component.state_dict() for name, component in self._named()}
         return {name: state for name, state in states.items() if state}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """`Component.load_state_dict` of those that are in `state`."""
-        for component in self:
-            name = type(component).__name__
+        """Restore the components that have an entry in `state`."""
+        for name, component in self._named():
             if name in state:
                 component.load_state_dict(state[name])
 
+    def _named(self) -> list[tuple[str, Component]]:
+        """Each component with a name that is unique even where class names are not."""
+        return [(f"{i}.{type(component).__name__}", component) for i, component in enumerate(self)]
 
-def not_negative(key: str, value: float) -> None:
-    """Raise `XrgsError`, naming the key, unless its value is finite and 0 or more."""
+
+def check_not_negative(key: str, value: float) -> None:
+    """Check that a setting is a finite number of at least 0.
+
+    Args:
+        key: The key of the setting in the config, for the message.
+        value: The value of the setting.
+
+    Raises:
+        XrgsError: It is not; the message names the key.
+    """
     if not (math.isfinite(value) and value >= 0):
         raise XrgsError(f"{key}={value}: must be a finite number, 0 or more")

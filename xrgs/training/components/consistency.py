@@ -1,95 +1,142 @@
-"""Cross-resolution consistency (paper 5.6)."""
+"""Cross-resolution consistency loss [xrgs, section 5.6]."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Self
 
 from torch import Tensor
 
 from xrgs.errors import XrgsError
 from xrgs.splat.loss import WINDOW, Target, photometric_loss, prepare_target
 from xrgs.splat.resample import resize
-from xrgs.training.components.base import Component, Step, TrainingView
+from xrgs.training.components.base import (
+    Component,
+    Step,
+    TrainingSetup,
+    TrainingView,
+    check_not_negative,
+)
 
 if TYPE_CHECKING:  # xrgs.config loads Hydra, which training does without
     from xrgs.config import ConsistencyConf
+    from xrgs.splat.gaussians import Gaussians
+
+_LR_MODES = ("exact", "fold", "off")
 
 
 class Consistency(Component):
-    """Cross-resolution consistency (paper 5.6): the render must agree at the other resolution too.
+    """Compares the render with the photograph at the opposite resolution too.
 
-    `loss + weight * (l1 * |phi(render) - pair|_1 + ssim * (1 - SSIM(phi(render), pair)))`, where
-    `pair` is phi of the photograph, made once here and kept: of an HR view `factor` times smaller,
-    of an LR view `factor` times larger. phi is antialiased bicubic to an exact size, unclamped.
-    An LR view that is not small (zoomed, compressed, or tagged by what it shows) has its other
-    resolution below it, too: its longer side is nearer to the HR views' than to 1 / `factor` of it.
+    Section 5.6 of the paper adds to the loss of every view
 
-    phi is linear: phi(render) - phi(photograph) = phi(render - photograph). An LR view's branch
-    therefore knows nothing that the photometric loss doesn't, and costs factor^2 times the pixels.
-    `lr_mode` chooses: `exact` does it as the paper has it; `off` leaves LR views alone; `fold`
-    takes phi for an isometry of L1 and adds `weight * l1 * mean |render - photograph|` at the
-    view's own size, which is what a larger weight of the photometric L1 would be, and leaves the
-    SSIM part out. phi's rows sum to 1 and its columns to factor^2 (to 3 % at a corner), so the two
-    are equal where the error keeps its sign. Elsewhere `fold` is more than the exact L1 where signs
-    alternate from pixel to pixel and phi averages them out (1.23 times for white noise, factor 5),
-    and never less than 0.7 of it, since absolute columns sum to at most 1.19 factor an axis.
+        L_cons = w (lambda_1 |phi(I_rend) - I_pair|_1 + lambda_2 (1 - SSIM(phi(I_rend), I_pair)))
+
+    where phi is bicubic resampling to the opposite resolution and I_pair = phi(I) is the paired
+    image, computed once for each photograph I. Here w is `weight`, lambda_1 is `l1` and lambda_2 is
+    `ssim`; the L1 term is a mean over pixels and channels, SSIM is that of the photometric loss
+    [wang2004].
+
+    Our choice where the paper is silent:
+
+    - w is 0.1 in `conf/ablation/consistency.yaml`, lambda_1 0.8 and lambda_2 0.2, as in the
+      photometric loss.
+    - phi is antialiased, resamples to an exact size in pixels, and its result is not clamped. It
+      makes an HR view `factor` times smaller and an LR view `factor` times larger.
+    - The view's weight multiplies L_cons as well (`xrgs.training.components.weighting`). Otherwise
+      this term would give back to LR views the influence that loss weighting takes from them.
+    - An LR view is downsampled as an HR view is where its longer side is nearer to that of the HR
+      views than to 1 / `factor` of it. Such views are not small: they are zoomed digitally,
+      compressed, or tagged by distance.
+
+    phi is linear, so that phi(I_rend) - phi(I) = phi(I_rend - I): for an LR view the term contains
+    no information that the photometric loss lacks, and costs factor^2 times as many pixels.
+    `lr_mode` chooses what happens there. `exact` is the paper's term. `off` leaves LR views out.
+    `fold` adds `weight * l1 * mean |I_rend - I|` at the view's own size, which is what the L1 term
+    would be if phi kept L1 norms, and leaves out the SSIM term. The rows of phi sum to 1 and its
+    columns to factor^2 (to 3% at a corner), so that `fold` equals the exact L1 term where the error
+    keeps its sign. Elsewhere it is larger where signs alternate from pixel to pixel and phi
+    averages them out (1.23 times for white noise at factor 5), and never less than 0.7 times the
+    exact term, since the absolute columns sum to at most 1.19 factor along an axis.
     """
 
     def __init__(
         self,
-        conf: ConsistencyConf,
+        settings: ConsistencyConf,
         views: Sequence[TrainingView],
         factor: int,
         backend: str = "torch",
     ) -> None:
-        if conf.lr_mode not in {"exact", "fold", "off"}:
+        """Compute the paired images.
+
+        Args:
+            settings: The component's settings.
+            views: All training views.
+            factor: How many times smaller an LR view is than an HR view.
+            backend: `torch` or `native`: the implementation of the loss and of the resampling.
+
+        Raises:
+            XrgsError: `lr_mode` is unknown, or a paired image is smaller than the SSIM window.
+        """
+        if settings.lr_mode not in _LR_MODES:
             raise XrgsError(
-                f"components.consistency.lr_mode={conf.lr_mode}: must be exact, fold or off"
+                f"components.consistency.lr_mode={settings.lr_mode}: must be exact, fold or off"
             )
-        self.weight, self.l1, self.ssim = conf.weight, conf.l1, conf.ssim
-        self.lr_mode = conf.lr_mode
+        self.weight, self.l1, self.ssim = settings.weight, settings.l1, settings.ssim
+        self.lr_mode = settings.lr_mode
         self.backend = backend
-        largest = max((max(v.image.shape) for v in views if v.tag == "HR"), default=math.inf)
-        self.pairs = {
-            view.name: _pair(view, factor, largest)
+        hr_sides = (max(view.image.shape) for view in views if view.tag == "HR")
+        hr_long_side = max(hr_sides, default=math.inf)
+        self.paired_targets = {
+            view.name: _paired_target(view, factor, hr_long_side)
             for view in views
-            if view.tag == "HR" or conf.lr_mode == "exact"
+            if view.tag == "HR" or settings.lr_mode == "exact"
         }
 
-    def loss(self, loss: Tensor, image: Tensor, step: Step) -> Tensor:
-        """`loss` and the view's consistency."""
-        added = self._of(image, step.view)
-        if added is None:
-            return loss
-        step.log[f"consistency.{step.view.tag}"] = added.item()
-        return loss + added
+    @classmethod
+    def from_settings(cls, settings: ConsistencyConf, setup: TrainingSetup) -> Self | None:
+        """Build the component; a `weight` of 0 leaves it off."""
+        for name in ("weight", "l1", "ssim"):
+            check_not_negative(f"components.consistency.{name}", getattr(settings, name))
+        if settings.weight == 0:
+            return None
+        return cls(settings, setup.data.train, setup.data.factor, setup.backend)
 
-    def _of(self, image: Tensor, view: TrainingView) -> Tensor | None:
-        """Scalar; None where the view has none."""
+    def modify_loss(self, loss: Tensor, image: Tensor, gaussians: Gaussians, step: Step) -> Tensor:
+        """Return `loss + L_cons`, and record L_cons as `consistency.<tag>`."""
+        del gaussians
+        consistency = self._consistency_loss(image, step.view)
+        if consistency is None:
+            return loss
+        step.log[f"consistency.{step.view.tag}"] = consistency.item()
+        return loss + consistency
+
+    def _consistency_loss(self, image: Tensor, view: TrainingView) -> Tensor | None:
+        """L_cons of a render [H, W, 3], a scalar; None where the view has no such term."""
         if view.tag == "HR" or self.lr_mode == "exact":
-            pair = self.pairs[view.name]
-            height, width = pair.image.shape[:2]
+            target = self.paired_targets[view.name]
+            height, width = target.image.shape[:2]
             projected = resize(image, height, width, backend=self.backend)
-            # Its weight goes into the loss's own: a factor outside is one more pass over the image.
+            # The weight is part of both factors: outside, it is one more pass over the image.
             l1, ssim = self.weight * self.l1, self.weight * self.ssim
-            return photometric_loss(projected, pair, l1=l1, ssim=ssim, backend=self.backend)
+            return photometric_loss(projected, target, l1=l1, ssim=ssim, backend=self.backend)
         if self.lr_mode == "fold":
             return self.weight * self.l1 * (image - view.image).abs().mean()
         return None
 
 
-def _pair(view: TrainingView, factor: int, largest: float) -> Target:
-    """The view's photograph at the opposite resolution; `largest` is the HR views' longest side."""
+def _paired_target(view: TrainingView, factor: int, hr_long_side: float) -> Target:
+    """The photograph at the opposite resolution; `hr_long_side` is the longest of HR views, px."""
     height, width = view.image.shape[:2]
-    if view.tag == "HR" or max(height, width) > largest / math.sqrt(factor):
+    if view.tag == "HR" or max(height, width) > hr_long_side / math.sqrt(factor):
         height, width = round(height / factor), round(width / factor)
     else:
         height, width = height * factor, width * factor
     if min(height, width) < WINDOW:
         raise XrgsError(
             f"variant.factor={factor}: view {view.name} at its low resolution is {width} x {height}"
-            f" px, smaller than the SSIM window of {WINDOW} px of the consistency loss"
+            f" px, smaller than the SSIM window of {WINDOW} px of the consistency loss; use larger"
+            " photographs or a smaller factor"
         )
     return prepare_target(resize(view.image, height, width))

@@ -1,31 +1,60 @@
-"""LR-only warm-up (paper 5.5)."""
+"""LR-only warm-up [xrgs, section 5.5]."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Self
 
 from xrgs.errors import XrgsError
-from xrgs.training.components.base import Component, Step, TrainingView
+from xrgs.training.components.base import (
+    Component,
+    Step,
+    TrainingSetup,
+    TrainingView,
+    check_not_negative,
+)
 
 if TYPE_CHECKING:  # xrgs.config loads Hydra, which training does without
     from xrgs.config import CurriculumConf
 
 
 class Curriculum(Component):
-    """LR-only warm-up (paper 5.5): HR views wait until step `lr_only` of 30,000.
+    """Trains on LR views alone before step `lr_only`: the LR-only warm-up.
 
-    All else goes on meanwhile: the Gaussians that LR views ask for are grown, pruned and reset. A
-    round through the LR views that is under way at the end of the warm-up is finished first.
+    Section 5.5 of the paper, with N typically 5000:
+
+        D_train(t < N) = {LR views only}
+
+    N is `lr_only`, in steps of a 30,000-step run.
+
+    Our choice where the paper is silent: densification, pruning and opacity resets go on during the
+    warm-up, on the statistics of LR views. An epoch through the LR views that is under way when the
+    warm-up ends is completed first.
     """
 
-    def __init__(self, conf: CurriculumConf, views: Sequence[TrainingView]) -> None:
+    def __init__(self, settings: CurriculumConf, views: Sequence[TrainingView]) -> None:
+        """Set the length of the warm-up.
+
+        Args:
+            settings: The component's settings.
+            views: All training views.
+
+        Raises:
+            XrgsError: No view is tagged LR.
+        """
         if not any(view.tag == "LR" for view in views):
             raise XrgsError(
-                f"components.curriculum.lr_only={conf.lr_only}: there is no LR view to warm up on"
+                f"components.curriculum.lr_only={settings.lr_only}: there is no LR view to warm up"
+                " on; set it to 0, or train on the mixed views (train.views=mixed)"
             )
-        self.lr_only = conf.lr_only
+        self.lr_only = settings.lr_only
 
-    def trains_on(self, step: Step) -> bool:
-        """LR views always, HR views after the warm-up."""
+    @classmethod
+    def from_settings(cls, settings: CurriculumConf, setup: TrainingSetup) -> Self | None:
+        """Build the component; an `lr_only` of 0 leaves it off."""
+        check_not_negative("components.curriculum.lr_only", settings.lr_only)
+        return None if settings.lr_only == 0 else cls(settings, setup.data.train)
+
+    def allows_view(self, step: Step) -> bool:
+        """Allow LR views always, and HR views after the warm-up."""
         return step.view.tag == "LR" or step.nominal >= self.lr_only

@@ -1,12 +1,12 @@
-"""Resolution-aware densification and pruning (paper 5.4)."""
+"""Resolution-aware densification and pruning [xrgs, section 5.4]."""
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Self
 
 from xrgs.errors import XrgsError
 from xrgs.splat.densify import Groups, Thresholds
-from xrgs.training.components.base import Component
+from xrgs.training.components.base import Component, TrainingSetup, check_not_negative
 
 if TYPE_CHECKING:  # xrgs.config loads Hydra, which training does without
     from xrgs.config import DensifyConf
@@ -14,32 +14,58 @@ if TYPE_CHECKING:  # xrgs.config loads Hydra, which training does without
 
 
 class Densify(Component):
-    """Resolution-aware densification and pruning (paper 5.4): two sets of thresholds.
+    """Gives LR views their own thresholds of densification and pruning.
 
-    HR views have those of `splat.densify`, LR views `lr_grow` and `lr_prune` times them. The paper
-    doesn't say which set holds at a refinement, whose statistics are of views of both kinds:
+    Section 5.4 of the paper maintains two sets of thresholds for the adaptive density control of
+    3D Gaussian Splatting [kerbl2023, section 5.2], as gsplat's `DefaultStrategy` [ye2025] has it:
 
-    `per_class`: HR and LR views have statistics of their own, and a Gaussian grows where either is
-    above its own threshold. The LR prune threshold is for Gaussians that no HR view draws: those
-    that had an image-plane gradient in none since the last refinement.
+        threshold_HR < threshold_LR
 
-    `current_view`: one statistic of all views; the view of the step at which Gaussians are refined
-    sets both thresholds, for all of them.
+    HR views have the thresholds of `splat.densify`: `grow_grad2d` 2e-4 in normalised device units,
+    `prune_opacity` 0.005. LR views have `lr_grow` and `lr_prune` times those.
 
-    The opacity reset follows the larger prune threshold, or the refinement after it would remove
-    every Gaussian that the other threshold is for.
+    Our choice where the paper is silent: it gives no values, and both factors are 2 in
+    `conf/ablation/densify.yaml`. Nor does it say which thresholds apply at a refinement, whose
+    statistics are averages over 100 steps on views of both kinds. `decide` chooses:
+
+    - `per_class`: HR and LR views have separate statistics, and a Gaussian grows where either is
+      above its own threshold. The LR prune threshold applies to Gaussians to which no HR view has
+      contributed an image-plane gradient since the last refinement.
+    - `current_view`: all views share one statistic, and the view of the step at which Gaussians are
+      refined sets both thresholds, for all Gaussians. It is the literal reading of the section.
+
+    The opacity reset follows the larger prune threshold. Otherwise the refinement after a reset
+    would prune every Gaussian to which the larger threshold applies.
     """
 
-    def __init__(self, conf: DensifyConf) -> None:
-        if conf.decide not in {"per_class", "current_view"}:
+    def __init__(self, settings: DensifyConf) -> None:
+        """Take the factors and the rule from the settings.
+
+        Args:
+            settings: The component's settings.
+
+        Raises:
+            XrgsError: `decide` is unknown.
+        """
+        if settings.decide not in {"per_class", "current_view"}:
             raise XrgsError(
-                f"components.densify.decide={conf.decide}: must be nobody, per_class or"
+                f"components.densify.decide={settings.decide}: must be nobody, per_class or"
                 " current_view"
             )
-        self.conf = conf
+        self.settings = settings
 
-    def groups(self, settings: DensifySettings) -> Groups:
-        """HR first: what an HR view draws is pruned by the HR threshold."""
+    @classmethod
+    def from_settings(cls, settings: DensifyConf, setup: TrainingSetup) -> Self | None:
+        """Build the component; `decide: nobody` leaves it off."""
+        del setup
+        check_not_negative("components.densify.lr_grow", settings.lr_grow)
+        check_not_negative("components.densify.lr_prune", settings.lr_prune)
+        return None if settings.decide == "nobody" else cls(settings)
+
+    def densification_groups(self, settings: DensifySettings) -> Groups:
+        """Return the thresholds of HR and LR views; HR comes first, and so takes precedence."""
         hr = Thresholds(settings.grow_grad2d, settings.prune_opacity)
-        lr = Thresholds(hr.grow_grad2d * self.conf.lr_grow, hr.prune_opacity * self.conf.lr_prune)
-        return Groups({"HR": hr, "LR": lr}, pooled=self.conf.decide == "current_view")
+        lr = Thresholds(
+            hr.grow_grad2d * self.settings.lr_grow, hr.prune_opacity * self.settings.lr_prune
+        )
+        return Groups({"HR": hr, "LR": lr}, pooled=self.settings.decide == "current_view")

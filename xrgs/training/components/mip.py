@@ -1,14 +1,21 @@
-"""The 3D smoothing filter of Mip-Splatting, at the rate that mixed resolution asks for."""
+"""The 3D smoothing filter of Mip-Splatting [yu2024], for views of mixed resolution."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Self
 
 import torch
 from torch import Tensor
 
-from xrgs.training.components.base import Component, Step, TrainingView
+from xrgs.errors import XrgsError
+from xrgs.training.components.base import (
+    Component,
+    Step,
+    TrainingSetup,
+    TrainingView,
+    check_not_negative,
+)
 
 if TYPE_CHECKING:  # xrgs.config loads Hydra, which training does without
     from xrgs.config import MipConf
@@ -16,117 +23,153 @@ if TYPE_CHECKING:  # xrgs.config loads Hydra, which training does without
     from xrgs.splat.gaussians import ActivatedGaussians, Gaussians
 
 MARGIN = 0.15
-"""Share of the image's size by which a centre may lie outside and still count as seen."""
+"""Fraction of the image's size by which a centre may lie outside the image and count as seen."""
 
 
 class Mip(Component):
-    """No Gaussian is smaller than the finest of the training views that see it can tell.
+    """Limits Gaussians to the detail that the finest training view which sees them can resolve.
 
-    Mip-Splatting (Yu et al. 2024, 4.1): each Gaussian is rendered convolved with an isotropic one
-    of variance `variance / nu^2`, which is added to its squared scales, and its opacity takes the
-    root of the ratio of the determinants, so that its mass stays. nu, in pixels a world unit, is
-    the highest rate f_i / z_i of a view i that sees it. Its authors' code divides the largest focal
-    length of all views by the nearest distance, which is the same where all focal lengths are; with
-    LR and HR views it pairs one view's distance with another's focal length.
+    Mip-Splatting [yu2024, section 4.1] renders each Gaussian k convolved with an
+    isotropic Gaussian, the 3D smoothing filter:
 
-    The rates are found anew whenever Gaussians came or went, and every `every` steps, as means move
-    (their code does both, the second once densification is over). A Gaussian that no view sees
-    takes the coarsest rate of those that are seen, as there; where none is seen there is no filter.
-    Densification reads the parameters without the filter, as there; `finish` bakes it in.
+        Sigma_k <- Sigma_k + (s / nu_k^2) I,
+        o_k <- o_k sqrt(|Sigma_k| / |Sigma_k + (s / nu_k^2) I|)
+
+    so that its integral stays the same. nu_k, in px per world unit, is the highest sampling rate
+    f_i / z_ik of a view i that sees it, with focal length f_i in px and depth z_ik in world units.
+    s is `variance`, in px^2; Mip-Splatting's is 0.2. The paper's code tests visibility with the
+    margin of 15% that is used here as well.
+
+    Our choice for mixed resolution: nu_k is the maximum of f_i / z_ik over the views. The authors'
+    code divides the largest focal length of all views by the nearest distance. Both are the same
+    where all focal lengths are equal; with LR and HR views the latter combines the distance of one
+    view with the focal length of another. The XR-GS paper has no such filter.
+
+    The rates are computed anew whenever Gaussians were added or removed, and every `every` steps,
+    since means move (as the authors' code does, the latter only after densification there). A
+    Gaussian that no view sees has the lowest rate of those that are seen, as there; where none is
+    seen, nothing is filtered. Densification reads the parameters without the filter, as there.
+    After training the filter becomes part of the scales and opacities that are saved.
+
+    Attributes:
+        variance: [N] variance of each Gaussian's filter, s / nu_k^2, in world units squared.
+        unseen_count: The number of Gaussians that no view sees.
     """
 
-    def __init__(self, conf: MipConf, views: Sequence[TrainingView], near: float) -> None:
-        self.strength, self.every = conf.variance, conf.every
+    def __init__(self, settings: MipConf, views: Sequence[TrainingView], near: float) -> None:
+        """Take the cameras; the filter is computed when the Gaussians are there.
+
+        Args:
+            settings: The component's settings.
+            views: All training views.
+            near: Depth below which a Gaussian is not rendered, world units.
+        """
+        self.strength, self.every = settings.variance, settings.every
         self.cameras = [view.camera for view in views]
         self.near = near
-        self.variance = torch.empty(0)  # [N] world units^2, of the Gaussians as they are
-        self.unseen = 0
+        self.variance = torch.empty(0)
+        self.unseen_count = 0
+
+    @classmethod
+    def from_settings(cls, settings: MipConf, setup: TrainingSetup) -> Self | None:
+        """Build the component; a `variance` of 0 leaves it off."""
+        check_not_negative("components.mip.variance", settings.variance)
+        if settings.every < 1:
+            raise XrgsError(f"components.mip.every={settings.every}: must be at least 1")
+        if settings.variance == 0:
+            return None
+        return cls(settings, setup.data.train, setup.splat.raster.near)
 
     def on_gaussians_changed(self, gaussians: Gaussians) -> None:
-        """Rates of the Gaussians as they are now."""
-        self._measure(gaussians.means)
+        """Compute the filter of the Gaussians as they are now."""
+        self._update_variance(gaussians.means)
 
-    def activated(self, activated: ActivatedGaussians, step: Step) -> ActivatedGaussians:
-        """Gaussians with the filter, differentiable in scales and opacities; it is a constant."""
+    def before_render(self, activated: ActivatedGaussians, step: Step) -> ActivatedGaussians:
+        """Apply the filter to scales and opacities; gradients do not reach the filter itself.
+
+        The mean standard deviation and the number of Gaussians that no view sees are recorded as
+        `mip.sigma`, in world units, and `mip.unseen`.
+        """
         if step.number % self.every == 0:
-            self._measure(activated.means)
+            self._update_variance(activated.means)
             step.log["mip.sigma"] = self.variance.sqrt().mean().item()
-            step.log["mip.unseen"] = self.unseen
-        scales, opacities = smoothed(activated.scales, activated.opacities, self.variance)
+            step.log["mip.unseen"] = self.unseen_count
+        scales, opacities = smooth(activated.scales, activated.opacities, self.variance)
         return activated._replace(scales=scales, opacities=opacities)
 
     @torch.no_grad()
-    def finish(self, gaussians: Gaussians) -> None:
-        """The filter becomes part of scales and opacities: what is kept is what was trained."""
+    def after_training(self, gaussians: Gaussians) -> None:
+        """Make the filter part of scales and opacities, so that what was rendered is saved."""
         activated = gaussians.activated()
-        scales, opacities = smoothed(
+        scales, opacities = smooth(
             activated.scales.double(), activated.opacities.double(), self.variance.double()
         )
-        # An opacity that left the range of float32 must not become an infinite logit.
+        # An opacity outside the range of float32 must not become an infinite logit.
         bounds = torch.finfo(torch.float32)
         logits = torch.logit(opacities.clamp(bounds.tiny, 1 - bounds.eps))
         gaussians.scales = scales.log().to(gaussians.scales).requires_grad_()
         gaussians.opacities = logits.to(gaussians.opacities).requires_grad_()
 
     def state_dict(self) -> dict[str, Any]:
-        """The filter: it is of the means as they were when they were last measured."""
+        """Return the filter, which depends on the means at the step when it was computed."""
         return {"variance": self.variance}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """The filter that `state_dict` told of."""
+        """Restore the filter that `state_dict` returned."""
         self.variance = state["variance"]
 
-    def _measure(self, means: Tensor) -> None:
-        rate = sampling_rates(means.detach(), self.cameras, self.near)
-        seen = rate > 0
-        self.unseen = int((~seen).sum())
-        coarsest = rate[seen].min() if seen.any() else rate.new_tensor(torch.inf)
-        variance = self.strength / torch.where(seen, rate, coarsest).square()
-        self.variance = variance.clamp_min(torch.finfo(variance.dtype).tiny)  # else 0 / 0
+    def _update_variance(self, means: Tensor) -> None:
+        rates = sampling_rates(means.detach(), self.cameras, self.near)
+        seen = rates > 0
+        self.unseen_count = int((~seen).sum())
+        lowest = rates[seen].min() if seen.any() else rates.new_tensor(torch.inf)
+        variance = self.strength / torch.where(seen, rates, lowest).square()
+        # Above 0, since the opacity of a Gaussian with a scale of 0 would be 0 / 0.
+        self.variance = variance.clamp_min(torch.finfo(variance.dtype).tiny)
 
 
-def smoothed(scales: Tensor, opacities: Tensor, variance: Tensor) -> tuple[Tensor, Tensor]:
-    """Gaussians convolved with an isotropic one of equal mass.
+def smooth(scales: Tensor, opacities: Tensor, variance: Tensor) -> tuple[Tensor, Tensor]:
+    """Convolve Gaussians with isotropic ones, and keep their integrals [yu2024, section 4.1].
 
     Args:
-        scales: [N, 3] world units, above 0.
-        opacities: [N]
-        variance: [N] world units^2.
+        scales: [N, 3] standard deviations in world units, above 0.
+        opacities: [N] in 0..1.
+        variance: [N] variances of the isotropic Gaussians, in world units squared.
 
     Returns:
-        `sqrt(scales^2 + variance)`, and `opacities` times the root of the covariances'
-        determinants' ratio.
+        The scales [N, 3], `sqrt(scales^2 + variance)`, and the opacities [N] times the square root
+        of the ratio of the determinants of the covariances, before over after.
     """
     wider = torch.sqrt(scales * scales + variance[:, None])
-    # A ratio an axis, since a product of three small scales underflows.
+    # One ratio per axis, since the product of three small scales underflows.
     ratio = scales / wider
     return wider, opacities * ratio[:, 0] * ratio[:, 1] * ratio[:, 2]
 
 
 def sampling_rates(means: Tensor, cameras: Sequence[Camera], near: float) -> Tensor:
-    """Pixels a world unit at which the finest view that sees each point samples it.
+    """Compute the highest sampling rate of each point among the views that see it.
 
-    A view sees a point whose depth is above `near` and that falls on the image or within 15 % of
-    its size beside it. Of fx and fy the larger counts.
+    A view sees a point whose depth is above `near` and whose projection lies on the image or within
+    15% of the image's size outside it. The rate is the larger of fx and fy over the depth.
 
     Args:
-        means: [N, 3] world units.
-        cameras: Of the views.
-        near: World units.
+        means: [N, 3] points, world units.
+        cameras: The cameras of the views.
+        near: Depth below which a point is not seen, world units.
 
     Returns:
-        [N], 0 where no view sees the point.
+        [N] rates in px per world unit, 0 where no view sees the point.
     """
-    finest = means.new_zeros(len(means))
+    highest = means.new_zeros(len(means))
     for camera in cameras:
         viewmat, K = camera.viewmat.to(means), camera.K.to(means)
         size = means.new_tensor([camera.width, camera.height])
         # Homogeneous pixels: compared before the division by depth, which may be 0.
         projected = torch.addmm(K @ viewmat[:3, 3], means, (K @ viewmat[:3, :3]).T)  # [N, 3]
         depth = projected[:, 2:]
-        flat = projected[:, :2]
-        seen = (depth > near) & (flat >= -MARGIN * size * depth)
-        seen &= flat <= (1 + MARGIN) * size * depth
+        pixels = projected[:, :2]
+        seen = (depth > near) & (pixels >= -MARGIN * size * depth)
+        seen &= pixels <= (1 + MARGIN) * size * depth
         rate = torch.maximum(K[0, 0], K[1, 1]) / depth[:, 0]
-        finest = torch.where(seen.all(dim=-1), torch.maximum(finest, rate), finest)
-    return finest
+        highest = torch.where(seen.all(dim=-1), torch.maximum(highest, rate), highest)
+    return highest

@@ -1,4 +1,4 @@
-"""Region-aware weighting (paper 7.2, 2)."""
+"""Region-aware weighting [xrgs, section 7.2, proposal 2]."""
 
 from __future__ import annotations
 
@@ -18,102 +18,118 @@ if TYPE_CHECKING:  # xrgs.config loads Hydra, which training does without
     from xrgs.splat.cameras import Camera
 
 WINDOW = 5
-"""Side, px, of the square that a pixel's texture is the mean of."""
-NEIGHBOURS = 5
-"""SfM points whose median depth a pixel takes."""
+"""Side, in px, of the square over which the texture of a pixel is averaged."""
+NEAREST_POINTS = 5
+"""Number of SfM points whose median depth is the depth of a pixel."""
 
 
-def region_shares(
-    conf: RegionWeightingConf, views: Sequence[TrainingView], points: Tensor, near: float
+def region_attenuations(
+    settings: RegionWeightingConf, views: Sequence[TrainingView], points: Tensor, near: float
 ) -> dict[str, Tensor]:
-    """Where in each LR view the attenuation stays: textured, and covered by an HR view.
+    """Compute where each LR view is attenuated: where it is textured and an HR view covers it.
 
-    A pixel's share is `min(1, g / texture)` where an HR view covers it and 0 elsewhere: smooth
-    regions, and what no HR view can teach, keep the full weight of LR supervision (paper 7.2, 2).
-    g is the gradient's magnitude, averaged over 5 x 5 px. The paper says neither how texture is
-    measured nor that coverage matters; `texture` is `adaptive_weighting`'s.
+    The attenuation of a pixel is `min(1, g / texture)` where an HR view covers it, and 0 elsewhere,
+    where g is `gradient_magnitude` averaged over 5 x 5 px. So smooth regions, and regions that no
+    HR view sees, keep the full weight of LR supervision.
+
+    Our choice where the paper is silent: section 7.2 proposes "spatially varying loss/gradient
+    scaling so smooth regions retain LR supervision while textured regions benefit from XR-GS
+    attenuation". The measure, its window and the condition of coverage are ours; `texture` is 0.07,
+    as in adaptive weighting.
 
     Args:
-        conf: Of region weighting.
-        views: Every training view.
+        settings: The settings of region weighting; `texture`, in intensity per px, is above 0.
+        views: All training views.
         points: [P, 3] SfM points, world units.
-        near: Nearest depth that is seen, world units.
+        near: Depth below which a point is not seen, world units.
 
     Returns:
-        [H, W] in 0..1, for each LR view by its name.
+        Attenuations [H, W] in 0..1, by the name of each LR view.
     """
-    high = [view.camera for view in views if view.tag == "HR"]
-    shares = {}
+    hr_cameras = [view.camera for view in views if view.tag == "HR"]
+    attenuations = {}
     for view in views:
         if view.tag == "LR":
-            texture = _smoothed(gradient_magnitude(view.image)) / conf.texture
-            covered = coverage(view.camera, high, points, near)
-            shares[view.name] = texture.clamp_max(1.0) * covered
-    return shares
+            texture = _box_mean(gradient_magnitude(view.image)) / settings.texture
+            covered = coverage(view.camera, hr_cameras, points, near)
+            attenuations[view.name] = texture.clamp_max(1.0) * covered
+    return attenuations
 
 
 def coverage(camera: Camera, others: Sequence[Camera], points: Tensor, near: float) -> Tensor:
-    """Which pixels of a view show something that one of `others` samples more finely.
+    """Find the pixels of a view whose content another view samples more finely.
 
-    A pixel's depth is the median of the five SfM points nearest to it in the image. Where that puts
-    it is projected into the other views: inside one of them, and at more pixels a world unit than
-    here, it is covered. Occlusion is not looked at: a few points a view can't tell the far side of
-    an edge from the near one. So what an object hides from every HR view counts as covered.
+    The depth of a pixel is the median depth of the five SfM points that project nearest to it. The
+    pixel is covered where its point at that depth projects into one of the other views, at more px
+    per world unit than in its own. Occlusion is not tested, since a few points per view cannot
+    separate the two sides of a depth edge. What an object hides from every other view therefore
+    counts as covered.
+
+    Args:
+        camera: The camera of the view.
+        others: The cameras of the other views.
+        points: [P, 3] SfM points, world units.
+        near: Depth below which a point is not seen, world units.
 
     Returns:
-        [H, W] bool; False everywhere if the view has no point in it.
+        [H, W] bool; False everywhere if no point projects into the view.
     """
-    depth = _depths(camera, points, near)
+    depth = _pixel_depths(camera, points, near)
     if depth is None:
         return torch.zeros(camera.height, camera.width, dtype=torch.bool)
-    x, y = _pixels(camera).unbind(-1)
+    x, y = _pixel_centres(camera).unbind(-1)
     K = camera.K.to(points)
     rays = torch.stack([(x - K[0, 2]) / K[0, 0], (y - K[1, 2]) / K[1, 1], torch.ones_like(x)], -1)
     viewmat = camera.viewmat.to(points)
     world = (rays * depth[:, None] - viewmat[:3, 3]) @ viewmat[:3, :3]  # [H W, 3]
     covered = torch.zeros(len(world), dtype=torch.bool)
     for other in others:
-        flat, z = _project(other, world)
+        pixels, z = _project(other, world)
         finer = other.K[0, 0] / z > K[0, 0] / depth
-        covered |= (z > near) & _inside(flat, other) & finer
+        covered |= (z > near) & _inside(pixels, other) & finer
     return covered.reshape(camera.height, camera.width)
 
 
-def _depths(camera: Camera, points: Tensor, near: float) -> Tensor | None:
-    """Of each pixel, in row-major order [H W]; None where no point is in view."""
-    flat, z = _project(camera, points)
-    seen = (z > near) & _inside(flat, camera)
+def _pixel_depths(camera: Camera, points: Tensor, near: float) -> Tensor | None:
+    """The depth of each pixel [H W] in row-major order; None where no point is in view."""
+    pixels, z = _project(camera, points)
+    seen = (z > near) & _inside(pixels, camera)
     count = int(seen.sum())
     if count == 0:
         return None
-    nearest = range(1, min(NEIGHBOURS, count) + 1)
-    _, index = KDTree(flat[seen].numpy()).query(_pixels(camera).numpy(), k=nearest)  # [H W, k]
-    return z[seen][torch.from_numpy(index)].median(dim=1).values
+    ranks = range(1, min(NEAREST_POINTS, count) + 1)
+    tree = KDTree(pixels[seen].numpy())
+    _, nearest = tree.query(_pixel_centres(camera).numpy(), k=ranks)  # [H W, k]
+    return z[seen][torch.from_numpy(nearest)].median(dim=1).values
 
 
-def _pixels(camera: Camera) -> Tensor:
-    """Centres [H W, 2], x and y."""
+def _pixel_centres(camera: Camera) -> Tensor:
+    """The centres [H W, 2] of the pixels, x and y, in row-major order."""
     y, x = torch.meshgrid(torch.arange(camera.height), torch.arange(camera.width), indexing="ij")
     return torch.stack([x, y], dim=-1).reshape(-1, 2) + 0.5
 
 
 def _project(camera: Camera, points: Tensor) -> tuple[Tensor, Tensor]:
-    """Where points [P, 3] fall, [P, 2] px, and their depth [P]; of those behind, anywhere."""
+    """The projections [P, 2] of points [P, 3], px, and their depths [P].
+
+    The projection of a point with a depth of 0 or less has no meaning.
+    """
     viewmat, K = camera.viewmat.to(points), camera.K.to(points)
-    inside = points @ viewmat[:3, :3].T + viewmat[:3, 3]
-    z = inside[:, 2]
-    flat = inside[:, :2] / z[:, None] * K[[0, 1], [0, 1]] + K[:2, 2]
-    return flat, z
+    in_camera = points @ viewmat[:3, :3].T + viewmat[:3, 3]
+    z = in_camera[:, 2]
+    pixels = in_camera[:, :2] / z[:, None] * K[[0, 1], [0, 1]] + K[:2, 2]
+    return pixels, z
 
 
-def _inside(flat: Tensor, camera: Camera) -> Tensor:
-    return ((flat > 0) & (flat < flat.new_tensor([camera.width, camera.height]))).all(dim=-1)
+def _inside(pixels: Tensor, camera: Camera) -> Tensor:
+    """Whether each of the pixels [P, 2] lies on the image."""
+    return ((pixels > 0) & (pixels < pixels.new_tensor([camera.width, camera.height]))).all(dim=-1)
 
 
-def _smoothed(values: Tensor) -> Tensor:
-    """[H, W]: the mean of the window around each pixel, of what of it lies inside."""
+def _box_mean(values: Tensor) -> Tensor:
+    """The mean [H, W] over the window around each pixel, over the part inside the image."""
     pooled = avg_pool2d(
         values[None, None], WINDOW, stride=1, padding=WINDOW // 2, count_include_pad=False
     )
-    smoothed: Tensor = pooled[0, 0]
-    return smoothed
+    mean: Tensor = pooled[0, 0]
+    return mean

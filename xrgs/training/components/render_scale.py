@@ -1,37 +1,62 @@
-"""Resolution-aware rendering (paper 5.7 and 6.3)."""
+"""Resolution-aware rendering [xrgs, sections 5.7 and 6.3]."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Self
 
 from xrgs.splat.gaussians import ActivatedGaussians
-from xrgs.training.components.base import Component, Step, TrainingView
+from xrgs.training.components.base import (
+    Component,
+    Step,
+    TrainingSetup,
+    TrainingView,
+    check_not_negative,
+)
 
 if TYPE_CHECKING:  # xrgs.config loads Hydra, which training does without
     from xrgs.config import RenderScaleConf
 
 
 class RenderScale(Component):
-    """Resolution-aware rendering (paper 5.7): an LR view sees every Gaussian `k` times as large.
+    """Renders LR views with larger Gaussians.
 
-    `k = (R_max / R)^gamma`. The paper has k(R) and "the camera resolution" and says no more. R here
-    is the longer side of the view in px, which a camera that is turned by 90 degrees keeps, and
-    R_max the largest of all training views. So LR views that were degraded at their full size have
-    k = 1, and nothing happens to them.
+    Section 5.7 of the paper scales the Gaussians by the camera resolution R at render time:
 
-    Scales are inflated before the render, for this render alone: what is kept, optimised and shown
-    are the Gaussians themselves, and the gradient of the log-scales is that of the inflated ones.
+        sigma' = k(R) sigma
+
+    Our choice where the paper is silent: `k = (R_max / R)^gamma`, where R is the longer side of the
+    view in px, which does not change when a camera is turned by 90 degrees, and R_max that of the
+    largest training view. So LR views that were degraded at full size have k = 1. Only LR views are
+    scaled, as in section 6.3. The paper gives no values; gamma 0.25 makes k 1.5 at factor 5.
+
+    The scales in world units are multiplied for the render alone. The Gaussians that are optimised,
+    evaluated and saved stay as they are, and the gradient of their log-scales is that of the scaled
+    ones. The paper found that it blurs; it is off in the full system.
     """
 
-    def __init__(self, conf: RenderScaleConf, views: Sequence[TrainingView]) -> None:
-        largest = max(_side(view) for view in views)
+    def __init__(self, settings: RenderScaleConf, views: Sequence[TrainingView]) -> None:
+        """Compute k of each LR view.
+
+        Args:
+            settings: The component's settings.
+            views: All training views.
+        """
+        largest = max(_long_side(view) for view in views)
         self.factors = {
-            view.name: (largest / _side(view)) ** conf.gamma for view in views if view.tag == "LR"
+            view.name: (largest / _long_side(view)) ** settings.gamma
+            for view in views
+            if view.tag == "LR"
         }
 
-    def activated(self, activated: ActivatedGaussians, step: Step) -> ActivatedGaussians:
-        """Scales times k in an LR view."""
+    @classmethod
+    def from_settings(cls, settings: RenderScaleConf, setup: TrainingSetup) -> Self | None:
+        """Build the component; a `gamma` of 0 leaves it off."""
+        check_not_negative("components.render_scale.gamma", settings.gamma)
+        return None if settings.gamma == 0 else cls(settings, setup.data.train)
+
+    def before_render(self, activated: ActivatedGaussians, step: Step) -> ActivatedGaussians:
+        """Multiply the scales by k in an LR view, and record k as `render_scale.k`."""
         factor = self.factors.get(step.view.name)
         if factor is None:
             return activated
@@ -39,5 +64,6 @@ class RenderScale(Component):
         return activated._replace(scales=activated.scales * factor)
 
 
-def _side(view: TrainingView) -> int:
+def _long_side(view: TrainingView) -> int:
+    """The longer side of a view, px."""
     return max(view.camera.width, view.camera.height)

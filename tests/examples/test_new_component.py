@@ -1,0 +1,138 @@
+"""`examples/new_component`: installed beside xrgs, swept, edited, and trained again."""
+
+from __future__ import annotations
+
+import csv
+import json
+import os
+import re
+import shutil
+import subprocess
+import sys
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import pytest
+
+from xrgs.safeio.hashing import file_digest
+
+EXAMPLE = Path(__file__).resolve().parents[2] / "examples" / "new_component"
+SOURCE = "xrgs_opacity_regularizer/__init__.py"
+NAME = "opacity_regularizer"
+CELL = ("scene=motorcycle", "preset=smoke", "train.steps=4", "threads=1", "store=s")
+
+pytestmark = pytest.mark.slow
+
+
+@dataclass(frozen=True)
+class Installed:
+    """The example, installed in a folder of its own."""
+
+    folder: Path
+    """Where the commands run; their store is `s`."""
+    site: Path
+    """The folder of the installed package, for PYTHONPATH."""
+    run_command: Callable[..., tuple[int, str, str]]
+
+    def sweep(self, *arguments: str, installed: bool = True) -> tuple[int, str, str]:
+        """Exit code, stdout and stderr of `xrgs-sweep`."""
+        path = os.pathsep.join(filter(None, [str(self.site), os.environ.get("PYTHONPATH", "")]))
+        environment = {"PYTHONPATH": path} if installed else {}
+        return self.run_command("sweep", self.folder, *arguments, **environment)
+
+    def cell(self) -> Path:
+        """The folder of the one cell with the regulariser."""
+        (folder,) = (
+            file.parent
+            for file in (self.folder / "s" / "cells").glob("*/identity.json")
+            if json.loads(file.read_text())["components"]["plugins"]
+        )
+        return folder
+
+
+@pytest.fixture(scope="module")
+def example(
+    tmp_path_factory: pytest.TempPathFactory, run_command: Callable[..., tuple[int, str, str]]
+) -> Installed:
+    folder = tmp_path_factory.mktemp("example")
+    # From a copy: pip may leave files in the folder that it builds.
+    source = shutil.copytree(EXAMPLE, folder / "new_component")
+    pip = [sys.executable, "-m", "pip", "--disable-pip-version-check", "install", "--no-deps"]
+    # Without build isolation, which would download the build backend: it is a test dependency.
+    target = ["--no-build-isolation", "--no-index", "--target", str(folder / "site")]
+    subprocess.run([*pip, *target, str(source)], check=True, capture_output=True)
+    return Installed(folder, folder / "site", run_command)
+
+
+@pytest.fixture(scope="module")
+def swept(example: Installed) -> tuple[int, str, str]:
+    """A sweep with the example's own ablation file."""
+    conf = ("--config-dir", str(example.folder / "new_component" / "conf"))
+    return example.sweep(*conf, f"+ablation={NAME}", *CELL)
+
+
+def test_the_sweep_ends_with_a_table_of_the_component(swept: tuple[int, str, str]) -> None:
+    code, out, err = swept
+    assert code == 0, err
+    assert out.startswith(f"{NAME} against baseline")
+
+
+def test_the_component_is_in_the_history(example: Installed, swept: tuple[int, str, str]) -> None:
+    with (example.cell() / "history.csv").open() as file:
+        first = next(csv.DictReader(file))
+    # Every Gaussian starts with an opacity of 0.1.
+    assert float(first["opacity_regularizer.term"]) == pytest.approx(0.01 * 0.1, rel=1e-4)
+
+
+def test_the_identity_has_the_hash_of_the_source(
+    example: Installed, swept: tuple[int, str, str]
+) -> None:
+    code = json.loads((example.cell() / "identity.json").read_text())["code"]
+    assert code[f"plugins/{NAME}/{SOURCE}"] == file_digest(example.site / SOURCE)
+
+
+def test_a_plan_names_what_is_not_installed(
+    example: Installed, swept: tuple[int, str, str]
+) -> None:
+    weight = f"+components.plugins.{NAME}.weight=0.01"
+    code, _, err = example.sweep(weight, *CELL, "dry_run=true", installed=False)
+    assert code == 1
+    assert f"components.plugins.{NAME}: no installed package offers" in err
+
+
+def test_an_edit_of_the_source_is_another_cell(
+    example: Installed, swept: tuple[int, str, str]
+) -> None:
+    def planned() -> str:
+        """The id of the cell in the plan, by its settings on the command line."""
+        weight = f"+components.plugins.{NAME}.weight=0.01"
+        code, out, err = example.sweep(weight, *CELL, "dry_run=true")
+        assert code == 0, err
+        (line,) = (line for line in (out + err).splitlines() if f"plugins.{NAME}" in line)
+        (found,) = re.findall(r"\b[0-9a-f]{16}\b", line)
+        return str(found)
+
+    before = planned()
+    assert before == example.cell().name  # whichever way it is switched on
+    source = example.site / SOURCE
+    text = source.read_text()
+    source.write_text(f"{text}\n# edited\n")
+    try:
+        assert planned() != before
+    finally:
+        source.write_text(text)
+
+
+def test_it_is_trained_again_only_where_it_is_named(
+    example: Installed, swept: tuple[int, str, str]
+) -> None:
+    """A store must not decide which installed package is imported."""
+    rerun = (f"rerun={example.cell()}", "out=again")
+    code, _, err = example.sweep(*rerun)
+    assert code == 1
+    assert f"add plugins={NAME}" in err
+    assert not (example.folder / "again").exists()
+    code, out, err = example.sweep(*rerun, f"plugins={NAME}")
+    assert code == 0, err
+    assert out.startswith("the same, bit for bit")

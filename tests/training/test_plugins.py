@@ -1,0 +1,262 @@
+"""Components of other packages: found and hashed without an import, then built from the config."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable, Iterator
+from dataclasses import asdict
+from pathlib import Path
+
+import pytest
+import torch
+
+from xrgs.capture.dataset import Dataset
+from xrgs.config import Conf, from_dict
+from xrgs.errors import XrgsError
+from xrgs.experiment import identity
+from xrgs.experiment.identity import cell_identity, changed_code
+from xrgs.safeio.hashing import digest, file_digest
+from xrgs.training import components, plugins
+from xrgs.training.components import Components
+
+#: (folder, dist, entry points as name -> value, **sources by dotted module)
+Install = Callable[..., Path]
+
+#: A component with two settings and without hooks, which are not what is tested here.
+SOURCE = """
+from dataclasses import dataclass
+
+from xrgs.training.components import Component
+
+
+@dataclass
+class Settings:
+    weight: float
+    rounds: int = 3
+
+
+class Plugin(Component):
+    settings_type = Settings
+
+    def __init__(self, settings):
+        self.settings = settings
+
+    @classmethod
+    def from_settings(cls, settings, setup):
+        if settings.weight == 13:
+            raise ValueError("an unlucky number")
+        return None if settings.weight == 0 else cls(settings)
+"""
+
+
+@pytest.fixture
+def install(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Install]:
+    """Install a package, as pip lays it out, in a folder on `sys.path`."""
+    before = set(sys.modules)
+    monkeypatch.syspath_prepend(tmp_path)
+    identity.plugin_code.cache_clear()
+
+    def installed(dist: str, points: dict[str, str], sources: dict[str, str]) -> Path:
+        info = tmp_path / f"{dist}-1.0.dist-info"
+        info.mkdir()
+        (info / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {dist}\nVersion: 1.0\n")
+        lines = [f"{name} = {value}" for name, value in points.items()]
+        (info / "entry_points.txt").write_text("\n".join([f"[{plugins.GROUP}]", *lines]))
+        for name, source in sources.items():
+            file = tmp_path / name
+            file.parent.mkdir(parents=True, exist_ok=True)
+            file.write_text(source)
+        return tmp_path
+
+    yield installed
+    identity.plugin_code.cache_clear()
+    for name in set(sys.modules) - before:
+        del sys.modules[name]
+
+
+def build(baseline: Conf, data: Dataset, **values: object) -> Components:
+    baseline.components.plugins = dict(values)
+    return components.build(baseline.components, data, baseline.splat)
+
+
+def test_a_plugin_is_built_from_its_settings(
+    install: Install, baseline: Conf, data: Dataset
+) -> None:
+    install("dist", {"second": "one:Plugin", "first": "one:Plugin"}, {"one.py": SOURCE})
+    assert {"first", "second"} <= set(plugins.installed())
+    assert build(baseline, data, first={"weight": 0}) == ()
+    baseline.components.render_scale.gamma = 0.25
+    built = build(baseline, data, second={"weight": 1}, first={"weight": 0.5, "rounds": 7})
+    assert [type(component).__name__ for component in built] == ["RenderScale", "Plugin", "Plugin"]
+    settings = [vars(component)["settings"] for component in built[1:]]
+    assert [asdict(values) for values in settings] == [
+        {"weight": 0.5, "rounds": 7},
+        {"weight": 1.0, "rounds": 3},
+    ]
+    assert type(settings[1].weight) is float
+
+
+def test_an_unknown_name_lists_those_that_are_installed(
+    install: Install, baseline: Conf, data: Dataset
+) -> None:
+    install("dist", {"one": "one:Plugin", "two": "one:Plugin"}, {"one.py": SOURCE})
+    with pytest.raises(
+        XrgsError, match=r"^components\.plugins\.wun: .*installed are: .*one, .*two"
+    ):
+        build(baseline, data, wun={})
+    with pytest.raises(XrgsError, match=r"^components\.plugins\.wun: "):
+        cell_identity(baseline, "v")
+
+
+def test_one_name_in_two_packages_is_refused(install: Install) -> None:
+    install("left", {"one": "left:Plugin"}, {"left.py": SOURCE})
+    install("right", {"one": "right:Plugin"}, {"right.py": SOURCE})
+    with pytest.raises(XrgsError, match=r"plugins\.one: left and right offer"):
+        plugins.find("one")
+
+
+@pytest.mark.parametrize(
+    ("values", "message"),
+    [
+        ({"wieght": 1.0}, r"\.wieght: there is no such setting; there are: weight, rounds"),
+        ({}, r"\.weight: is missing"),
+        ({"weight": "1.0"}, r"\.weight=1\.0: must be of type float"),
+        ({"weight": True}, r"\.weight=True: must be of type float"),
+        ({"weight": 1, "rounds": 2.5}, r"\.rounds=2\.5: must be of type int"),
+        ({"weight": 13}, r": ValueError: an unlucky number"),
+    ],
+)
+def test_a_wrong_setting_names_its_key(
+    values: dict[str, object], message: str, install: Install, baseline: Conf, data: Dataset
+) -> None:
+    install("dist", {"one": "one:Plugin"}, {"one.py": SOURCE})
+    with pytest.raises(XrgsError, match=rf"^components\.plugins\.one{message}"):
+        build(baseline, data, one=values)
+
+
+@pytest.mark.parametrize(
+    ("source", "message"),
+    [
+        ("import no_such_module", "importing one:Plugin failed: ModuleNotFoundError"),
+        ("1 / 0", "importing one:Plugin failed: ZeroDivisionError"),
+        ("", "importing one:Plugin failed: AttributeError"),
+        ("Plugin = 3", "entry point one:Plugin must name a subclass"),
+        ("class Plugin: pass", "entry point one:Plugin must name a subclass"),
+        (
+            "from xrgs.training.components import Component as Plugin",
+            "Component must define settings_type",
+        ),
+    ],
+)
+def test_a_package_that_is_no_component_names_the_key(
+    source: str, message: str, install: Install, baseline: Conf, data: Dataset
+) -> None:
+    install("dist", {"one": "one:Plugin"}, {"one.py": source})
+    with pytest.raises(XrgsError, match=rf"^components\.plugins\.one: .*{message}"):
+        build(baseline, data, one={"weight": 1})
+
+
+def test_a_plugin_without_source_is_refused(install: Install) -> None:
+    install("dist", {"one": "not_there:Plugin", "two": "space.not_there:Plugin"}, {"space/x": ""})
+    for name in ("one", "two"):
+        with pytest.raises(XrgsError, match=rf"plugins\.{name}: .*names no module"):
+            plugins.source_digests(name)
+
+
+def test_the_identity_has_the_source_and_imports_none_of_it(
+    install: Install, baseline: Conf
+) -> None:
+    """Each file raises an error when it is imported."""
+    sources = {
+        "package/__init__.py": "1 / 0",
+        "package/deep/kernel.cpp": "int x;",
+        "package/deep/table.json": "{}",
+        "package/__pycache__/x.cpython-311.pyc": "bytecode",
+        "package/.cache/x": "hidden",
+        "space/inner/__init__.py": "1 / 0",
+        "space/inner/part.py": "1 / 0",
+        "space/other/__init__.py": "1 / 0",
+        "single.py": "1 / 0",
+    }
+    points = {"a": "package.part:Plugin", "b": "space.inner.part:Plugin", "c": "single:Plugin"}
+    folder = install("dist", points, sources)
+    baseline.components.plugins = {name: {} for name in points}
+    code = cell_identity(baseline, "v")["code"]
+    files = {
+        "plugins/a/package/__init__.py": "package/__init__.py",
+        "plugins/a/package/deep/kernel.cpp": "package/deep/kernel.cpp",
+        "plugins/a/package/deep/table.json": "package/deep/table.json",
+        "plugins/b/inner/__init__.py": "space/inner/__init__.py",
+        "plugins/b/inner/part.py": "space/inner/part.py",
+        "plugins/c/single.py": "single.py",
+    }
+    expected = {name: file_digest(folder / file) for name, file in files.items()}
+    expected |= {f"plugins/{name}": digest(value) for name, value in points.items()}
+    assert {name: value for name, value in code.items() if name.startswith("plugins/")} == expected
+    assert not {"package", "space", "space.inner", "single"} & set(sys.modules)
+
+
+@pytest.mark.parametrize("changed", ["source", "settings", "entry point"])
+def test_a_change_of_a_plugin_is_another_cell(
+    changed: str, install: Install, baseline: Conf
+) -> None:
+    folder = install("dist", {"one": "one:Plugin"}, {"one.py": SOURCE})
+    baseline.components.plugins = {"one": {"weight": 1.0}}
+    before = cell_identity(baseline, "v")
+    assert changed_code(before["code"], "torch") == []
+    if changed == "source":
+        (folder / "one.py").write_text(f"{SOURCE}\n# changed\n")
+    elif changed == "settings":
+        baseline.components.plugins = {"one": {"weight": 2.0}}
+    else:
+        points = folder / "dist-1.0.dist-info" / "entry_points.txt"
+        points.write_text(points.read_text().replace("Plugin", "OtherPlugin"))
+    identity.plugin_code.cache_clear()
+    assert digest(cell_identity(baseline, "v")) != digest(before)
+    files = {"source": ["plugins/one/one.py"], "settings": [], "entry point": ["plugins/one"]}
+    assert changed_code(before["code"], "torch") == files[changed]
+
+
+def test_a_plugin_that_is_not_installed_any_more_is_changed_code(
+    install: Install, baseline: Conf
+) -> None:
+    install("dist", {"one": "one:Plugin"}, {"one.py": SOURCE})
+    baseline.components.plugins = {"one": {}}
+    code = cell_identity(baseline, "v")["code"]
+    removed = ["plugins/removed", "plugins/removed/removed.py"]
+    assert changed_code(code | dict.fromkeys(removed, "0" * 64), "torch") == removed
+
+
+@pytest.mark.parametrize("settings", [None, 0.1, "weight", [1]])
+def test_settings_that_are_no_mapping_are_refused(settings: object, baseline: Conf) -> None:
+    values = asdict(baseline)
+    values["components"]["plugins"] = {"one": settings}
+    with pytest.raises(XrgsError, match=r"^components\.plugins\.one=.*: must be a mapping"):
+        from_dict(values)
+
+
+def test_settings_come_from_the_command_line(compose: Callable[..., Conf]) -> None:
+    conf = compose("+components.plugins.one.weight=0.5", "+components.plugins.one.deep={a: [1, 2]}")
+    assert conf.components.plugins == {"one": {"weight": 0.5, "deep": {"a": [1, 2]}}}
+    assert from_dict(asdict(conf)) == conf
+    with pytest.raises(XrgsError, match=r"^components\.plugins\.one=0\.5: must be a mapping"):
+        compose("+components.plugins.one=0.5")
+
+
+def test_a_plugin_may_add_a_term_of_the_gaussians(
+    install: Install, baseline: Conf, data: Dataset
+) -> None:
+    """The loop hands the Gaussians to `modify_loss`, and their gradients reach the optimizer."""
+    from xrgs.training import loop
+
+    source = SOURCE + (
+        "\n    def modify_loss(self, loss, image, gaussians, step):"
+        "\n        return loss + self.settings.weight * gaussians.opacities.sigmoid().mean()\n"
+    )
+    install("dist", {"one": "one:Plugin"}, {"one.py": source})
+    baseline.splat.backend, baseline.train.steps = "auto", 10
+    plain = loop.train(data, baseline).gaussians
+    baseline.components.plugins = {"one": {"weight": 10.0}}
+    regularised = loop.train(data, baseline).gaussians
+    means = [torch.sigmoid(gaussians.opacities).mean() for gaussians in (plain, regularised)]
+    assert means[1] < 0.9 * means[0]

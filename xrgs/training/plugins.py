@@ -1,0 +1,208 @@
+"""Components of other installed packages, found by their entry points.
+
+A package offers a component by an entry point in the group `xrgs.components`; its name is the key
+under `components.plugins` of the config. Finding a plugin and hashing its source, which its cells'
+identities contain, execute none of its code. Only `load` does, and training calls it only for the
+names in the config of the cell that it trains. The config comes from the user's command line and
+files; a config that is read from a store is used for training again only where the user has named
+its plugins (`xrgs.sweep.rerun`). So a store from elsewhere never makes xrgs import a package.
+
+This module does not import torch, so that planning and reporting can use it.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from importlib.machinery import PathFinder
+from importlib.metadata import EntryPoint, entry_points
+from importlib.util import find_spec
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, TypeVar, get_type_hints
+
+from xrgs.errors import XrgsError
+from xrgs.safeio.hashing import digest, file_digest
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator, Mapping
+    from importlib.machinery import ModuleSpec
+
+GROUP = "xrgs.components"
+"""The entry point group in which packages offer components."""
+
+_BYTECODE = frozenset({".pyc", ".pyo"})
+_Settings = TypeVar("_Settings")
+
+
+def installed() -> list[str]:
+    """Return the names of the plugins that installed packages offer, sorted."""
+    return sorted({point.name for point in entry_points(group=GROUP)})
+
+
+def find(name: str) -> EntryPoint:
+    """Find the entry point of a plugin, without importing its package.
+
+    Args:
+        name: The name of the plugin, its key under `components.plugins`.
+
+    Returns:
+        The entry point; its value is `package.module:Class`.
+
+    Raises:
+        XrgsError: No installed package offers the plugin, or several do.
+    """
+    points = list(entry_points(group=GROUP, name=name))
+    if not points:
+        names = ", ".join(installed()) or "none"
+        raise XrgsError(
+            f"components.plugins.{name}: no installed package offers a component of this name in"
+            f" the entry point group {GROUP}; installed are: {names}"
+        )
+    if len({point.value for point in points}) > 1:
+        packages = " and ".join(sorted(point.dist.name for point in points if point.dist))
+        raise XrgsError(
+            f"components.plugins.{name}: {packages} offer a component of this name; uninstall one"
+        )
+    return points[0]
+
+
+def source_digests(name: str) -> dict[str, str]:
+    """Hash the source of a plugin, without importing its package.
+
+    The files are read anew at each call. The hashes cover the entry point's value and every file of
+    the package that it names (or of the module, where that is a single file) but bytecode and
+    hidden files. What the package imports from other packages is not covered.
+
+    Args:
+        name: The name of the plugin.
+
+    Returns:
+        SHA-256 of each file by `plugins/<name>/<path from the folder of the package>`, and a digest
+        of the entry point's value by `plugins/<name>`.
+
+    Raises:
+        XrgsError: The plugin is not installed, or has no source file.
+    """
+    point = find(name)
+    origin = _origin(point.module)
+    if origin is None or not origin.is_file():
+        raise XrgsError(
+            f"components.plugins.{name}: the entry point {point.value} names no module whose files"
+            " can be hashed for the identity of cells; install the package again"
+        )
+    files = _package_files(origin.parent) if origin.stem == "__init__" else [origin]
+    base = origin.parent.parent if origin.stem == "__init__" else origin.parent
+    digests = {f"plugins/{name}": digest(point.value)}
+    for file in files:
+        digests[f"plugins/{name}/{file.relative_to(base).as_posix()}"] = file_digest(file)
+    return digests
+
+
+def digests_now(code: Mapping[str, str]) -> dict[str, str]:
+    """Hash the installed source of the plugins that the `code` of an identity contains.
+
+    Args:
+        code: The `code` of an identity, from a store of any origin.
+
+    Returns:
+        As `source_digests`; a plugin that is not installed any more adds nothing.
+    """
+    names = {key.removeprefix("plugins/") for key in code if key.startswith("plugins/")}
+    digests: dict[str, str] = {}
+    for name in names & set(installed()):
+        digests |= source_digests(name)
+    return digests
+
+
+def load(name: str) -> object:
+    """Import a plugin's package and return what its entry point names.
+
+    Args:
+        name: The name of the plugin.
+
+    Returns:
+        The object, for the caller to check.
+
+    Raises:
+        XrgsError: The plugin is not installed, or cannot be imported.
+    """
+    point = find(name)
+    try:
+        return point.load()
+    except Exception as error:  # whatever a module may raise while it is imported
+        raise XrgsError(
+            f"components.plugins.{name}: importing {point.value} failed:"
+            f" {type(error).__name__}: {error}"
+        ) from error
+
+
+def parse_settings(kind: type[_Settings], values: Mapping[str, Any], key: str) -> _Settings:
+    """Build the settings of a plugin from its values in the config.
+
+    Args:
+        kind: The dataclass of the settings. Fields of type bool, int, float or str are checked; a
+            float takes whole numbers as well. Fields of other types are passed as they are.
+        values: The values by their names.
+        key: The key of the plugin in the config, for messages.
+
+    Returns:
+        The settings, with defaults for what is not in `values`.
+
+    Raises:
+        XrgsError: A name is unknown, a value is missing or of another type; the message names the
+            key.
+    """
+    hints = get_type_hints(kind)
+    fields = {field.name: field for field in dataclasses.fields(kind)}  # type: ignore[arg-type]
+    for name in values:
+        if name not in fields:
+            raise XrgsError(
+                f"{key}.{name}: there is no such setting; there are: {', '.join(fields) or 'none'}"
+            )
+    for name, field in fields.items():
+        required = (
+            field.default is dataclasses.MISSING and field.default_factory is dataclasses.MISSING
+        )
+        if required and name not in values:
+            raise XrgsError(f"{key}.{name}: is missing; set it, e.g. +{key}.{name}=...")
+    return kind(**{name: _typed(f"{key}.{name}", v, hints[name]) for name, v in values.items()})
+
+
+def _typed(key: str, value: Any, kind: Any) -> Any:
+    """The value as a bool, int, float or str; of another kind, as it is."""
+    if kind not in {bool, int, float, str}:
+        return value
+    if kind is float and type(value) is int:
+        return float(value)
+    if type(value) is not kind:
+        raise XrgsError(f"{key}={value}: must be of type {kind.__name__}")
+    return value
+
+
+def _origin(module: str) -> Path | None:
+    """The file of the first package or module in a dotted name that is no namespace package.
+
+    `importlib.util.find_spec` imports the parents of a dotted name. Namespace packages have no
+    code, so that only the first name that has code is needed, and it is found without an import.
+    """
+    first, *rest = module.split(".")
+    spec: ModuleSpec | None
+    try:
+        spec = find_spec(first)
+    except (ImportError, ValueError):
+        return None
+    name = first
+    for part in rest:
+        if spec is None or spec.origin is not None or spec.submodule_search_locations is None:
+            break
+        name = f"{name}.{part}"
+        spec = PathFinder.find_spec(name, list(spec.submodule_search_locations))
+    return Path(spec.origin) if spec is not None and spec.origin is not None else None
+
+
+def _package_files(folder: Path) -> Iterator[Path]:
+    """Every file of a package in a fixed order, but bytecode and hidden files."""
+    for file in sorted(folder.rglob("*")):
+        parts = file.relative_to(folder).parts
+        hidden = any(part.startswith(".") for part in parts)
+        if file.is_file() and not hidden and file.suffix not in _BYTECODE:
+            yield file
