@@ -19,22 +19,22 @@ _MARKERS = "osD^v"
 
 
 def time_against_error(rows: Sequence[Mapping[str, Any]]) -> bytes:
-    """Each load rendered each way as a point: down is faster, left is more exact.
+    """Draw each load rendered with each method as a point: lower is faster, left is more exact.
 
     Args:
-        rows: With `way`, `threads`, `gaussians`, `forward_ms`, `backward_ms` and
+        rows: With `method`, `threads`, `gaussians`, `forward_ms`, `backward_ms` and
             `image_mean_error`; only those of one thread are drawn, larger marks for more Gaussians.
 
     Returns:
         A .png.
     """
-    names = list(dict.fromkeys(row["way"] for row in rows))
+    names = list(dict.fromkeys(row["method"] for row in rows))
     most = max(row["gaussians"] for row in rows)
     with style.context("default"):
         figure = Figure(figsize=(8.0, 5.5), layout="constrained")
         axes = figure.add_subplot()
         for place, name in enumerate(names):
-            used = [row for row in rows if row["way"] == name and row["threads"] == 1]
+            used = [row for row in rows if row["method"] == name and row["threads"] == 1]
             axes.scatter(
                 [max(row["image_mean_error"], _LEAST_ERROR) for row in used],
                 [row["forward_ms"] + row["backward_ms"] for row in used],
