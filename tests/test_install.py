@@ -1,4 +1,4 @@
-"""What is installed is what is in the checkout: no file is missing from the wheel."""
+"""The installed package has every file of the checkout, and the native backend."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def test_every_config_file_is_installed(name: str, inside: str) -> None:
 
 
 @pytest.mark.skipif(
-    os.environ.get(REQUIRE_NATIVE) != "1", reason=f"{REQUIRE_NATIVE} isn't 1: native is a choice"
+    os.environ.get(REQUIRE_NATIVE) != "1", reason=f"{REQUIRE_NATIVE} is not 1"
 )
 def test_the_native_backend_is_the_one_in_use() -> None:
     assert resolve_backend("auto") == "native"
