@@ -31,6 +31,7 @@ def smoke(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str, dict[str
     return folder, text, json.loads((folder / "all.json").read_text())
 
 
+@pytest.mark.slow
 def test_every_backend_is_timed_in_every_part(smoke: tuple[Path, str, dict[str, Any]]) -> None:
     _, out, found = smoke
     backends = {"torch"} if resolve_backend("auto") == "torch" else {"native", "torch"}
@@ -59,6 +60,7 @@ def test_every_backend_is_timed_in_every_part(smoke: tuple[Path, str, dict[str, 
         assert title in out
 
 
+@pytest.mark.slow
 def test_higher_cutoffs_cost_accuracy(smoke: tuple[Path, str, dict[str, Any]]) -> None:
     rows = smoke[2]["rows"]
     first = rows[0]["backend"]
@@ -71,6 +73,7 @@ def test_higher_cutoffs_cost_accuracy(smoke: tuple[Path, str, dict[str, Any]]) -
     assert fewer["evaluations"] < usual["evaluations"]
 
 
+@pytest.mark.slow
 def test_stages_add_up_to_no_more_than_the_pass(smoke: tuple[Path, str, dict[str, Any]]) -> None:
     native = [row for row in smoke[2]["rows"] if row["backend"] == "native"]
     if not native:
@@ -83,6 +86,7 @@ def test_stages_add_up_to_no_more_than_the_pass(smoke: tuple[Path, str, dict[str
     assert smoke[2]["machine"]["multiply_adds_per_s"]["1"] > 1e8
 
 
+@pytest.mark.slow
 def test_the_files_hold_the_results(smoke: tuple[Path, str, dict[str, Any]]) -> None:
     folder, _, found = smoke
     with (folder / "o" / "bench.csv").open(newline="") as file:

@@ -108,31 +108,31 @@ def time_resizes(
     width, height = size
     generator = torch.Generator().manual_seed(0)
     image = torch.rand(height // factor, width // factor, 3, generator=generator)
-    image_grad = torch.rand(height, width, 3, generator=generator)
+    resized_grad = torch.rand(height, width, 3, generator=generator)
     image.requires_grad_()
-
-    def resize_ours(backend: str, count: int) -> object:
-        with use_threads(count):
-            resized = resize(image, height, width, backend=backend)
-            return torch.autograd.grad(resized, image, image_grad)
-
-    def resize_torch(count: int) -> object:
-        with use_threads(count):
-            planes = image.permute(2, 0, 1)[None]
-            resized = interpolate(planes, (height, width), mode="bicubic", antialias=True)
-            return torch.autograd.grad(resized, image, image_grad.permute(2, 0, 1)[None])
 
     tasks: dict[str, Callable[[], object]] = {}
     for count in counts:
-        tasks |= {
-            f"{backend}/{count}": partial(resize_ours, backend, count) for backend in backends
-        }
-        tasks[f"interpolate/{count}"] = partial(resize_torch, count)
+        for backend in backends:
+            tasks[f"{backend}/{count}"] = partial(_our_resize, image, resized_grad, backend, count)
+        tasks[f"interpolate/{count}"] = partial(_torch_resize, image, resized_grad, count)
     times = time_interleaved(tasks, repeats)
-    return [
-        _timing_row(name, time) | {"width": width, "height": height, "factor": factor}
-        for name, time in times.items()
-    ]
+    sizes = {"width": width, "height": height, "factor": factor}
+    return [_timing_row(name, timings) | sizes for name, timings in times.items()]
+
+
+def _our_resize(image: Tensor, resized_grad: Tensor, backend: str, count: int) -> object:
+    height, width, _ = resized_grad.shape
+    with use_threads(count):
+        resized = resize(image, height, width, backend=backend)
+        return torch.autograd.grad(resized, image, resized_grad)
+
+
+def _torch_resize(image: Tensor, resized_grad: Tensor, count: int) -> object:
+    with use_threads(count):
+        planes = image.permute(2, 0, 1)[None]
+        resized = interpolate(planes, resized_grad.shape[:2], mode="bicubic", antialias=True)
+        return torch.autograd.grad(resized, image, resized_grad.permute(2, 0, 1)[None])
 
 
 def time_optimizers(
