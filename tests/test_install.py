@@ -22,8 +22,6 @@ def test_every_config_file_is_installed(name: str, inside: str) -> None:
         assert (installed / file).read_bytes() == (ROOT / name / file).read_bytes()
 
 
-@pytest.mark.skipif(
-    os.environ.get(REQUIRE_NATIVE) != "1", reason=f"{REQUIRE_NATIVE} is not 1"
-)
+@pytest.mark.skipif(os.environ.get(REQUIRE_NATIVE) != "1", reason=f"{REQUIRE_NATIVE} is not 1")
 def test_the_native_backend_is_the_one_in_use() -> None:
     assert resolve_backend("auto") == "native"
