@@ -1,8 +1,9 @@
-"""What several rooms' tests share."""
+"""Fixtures that the tests of several packages share."""
 
 from __future__ import annotations
 
 import contextlib
+import importlib
 import json
 import os
 import signal
@@ -14,6 +15,7 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import suppress
 from dataclasses import dataclass, field
+from functools import partial
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from typing import Any
@@ -29,14 +31,14 @@ from xrgs.splat.cameras import Camera
 
 
 @pytest.fixture(scope="session", autouse=True)
-def _one_thread() -> None:
-    """Tensors of a test are small: two threads wait for each other longer than they work."""
+def _one_torch_thread() -> None:
+    """Let torch use one thread: a second one costs more than it gives on small tensors."""
     torch.set_num_threads(1)
 
 
 @pytest.fixture(scope="session", autouse=True)
-def _signals_are_heard() -> Iterator[None]:
-    """A child ignores what its parent does, as after a shell's `&`; tests send signals."""
+def _default_signal_handlers() -> Iterator[None]:
+    """Restore SIGINT and SIGHUP where they are ignored, as after a shell's `&`: tests send them."""
     ignored = [n for n in (signal.SIGINT, signal.SIGHUP) if signal.getsignal(n) is signal.SIG_IGN]
     for number in ignored:
         signal.signal(number, signal.SIG_DFL)
@@ -47,7 +49,10 @@ def _signals_are_heard() -> Iterator[None]:
 
 @pytest.fixture(scope="session", autouse=True)
 def lpips_weights(tmp_path_factory: pytest.TempPathFactory) -> Iterator[weights.Weights | None]:
-    """This machine's weights of LPIPS; hidden from all that don't ask, so that CI sees the same."""
+    """Hide this machine's LPIPS weights from all tests, which then see the same everywhere.
+
+    The value is the weights, or None if the machine has none; tests get them as `published`.
+    """
     found = weights.load_published()
     with pytest.MonkeyPatch.context() as patch:
         patch.delenv(weights.PATH_VARIABLE, raising=False)
@@ -57,36 +62,36 @@ def lpips_weights(tmp_path_factory: pytest.TempPathFactory) -> Iterator[weights.
 
 @pytest.fixture
 def published(lpips_weights: weights.Weights | None) -> weights.Weights:
-    """The published weights of LPIPS."""
+    """Return the published LPIPS weights; the test is skipped if this machine has none."""
     if lpips_weights is None:
-        pytest.skip("no weights of LPIPS on this machine: xrgs-data lpips")
+        pytest.skip("this machine has no LPIPS weights: `xrgs-data lpips` downloads them")
     return lpips_weights
 
 
 @pytest.fixture
 def random_weights() -> weights.Weights:
-    """Weights of the network's shapes, and of no use."""
+    """Return random weights of the shapes of LPIPS's network."""
     rng = np.random.default_rng(0)
-    made: dict[str, np.ndarray] = {}
+    arrays: dict[str, np.ndarray[Any, Any]] = {}
     channels, kernels = (3, 64, 192, 384, 256, 256), (11, 5, 3, 3, 3)
     for i, k in enumerate(kernels):
         inputs, outputs = channels[i : i + 2]
         scale = (2 / (inputs * k * k)) ** 0.5
-        made[f"conv{i}.weight"] = scale * rng.normal(size=(outputs, inputs, k, k))
-        made[f"conv{i}.bias"] = 0.1 * rng.normal(size=outputs)
-        made[f"head{i}"] = rng.random(outputs)
-    return {name: array.astype(np.float32) for name, array in made.items()}
+        arrays[f"conv{i}.weight"] = scale * rng.normal(size=(outputs, inputs, k, k))
+        arrays[f"conv{i}.bias"] = 0.1 * rng.normal(size=outputs)
+        arrays[f"head{i}"] = rng.random(outputs)
+    return {name: array.astype(np.float32) for name, array in arrays.items()}
 
 
 @pytest.fixture(scope="session")
 def compose() -> Callable[..., config.Conf]:
-    """(*overrides) -> the config that `conf/` gives with them."""
+    """Return the function (*overrides) -> the config that `conf/` gives with these overrides."""
     return config.compose
 
 
 @pytest.fixture
 def baseline(compose: Callable[..., config.Conf]) -> config.Conf:
-    """The baseline's config as `conf/` gives it, 40 steps on the torch backend."""
+    """Return the baseline's config with 40 steps on the torch backend."""
     return compose("train.steps=40", "splat.backend=torch")
 
 
@@ -98,7 +103,7 @@ def _camera(width: int, height: int) -> Camera:
 
 @pytest.fixture
 def data() -> Dataset:
-    """Four views, two of them LR, of one smooth picture; 60 points in front."""
+    """Return four views of a smooth ramp, two HR and two LR, and 60 points in front of them."""
     generator = torch.Generator().manual_seed(3)
     points = torch.rand(60, 3, generator=generator) - 0.5 + torch.tensor([0.0, 0.0, 2.0])
     views = []
@@ -113,16 +118,17 @@ def data() -> Dataset:
 
 
 def _command(name: str) -> list[str]:
-    """`xrgs-<name>`, of the package that is tested."""
+    """Return the command line of `xrgs-<name>` of the package under test."""
     return [sys.executable, "-P", "-c", f"from xrgs.cli.{name} import main; main()"]
 
 
 @pytest.fixture(scope="session")
 def run_command() -> Callable[..., tuple[int, str, str]]:
-    """(name, folder, *arguments, **environment) -> exit code, stdout and stderr of `xrgs-<name>`.
+    """Return a function that runs a command in a process of its own.
 
-    It runs in the folder, from its start to its end; `sweeps_in` is for those that are interfered
-    with, or have to end with all that they started.
+    Its arguments are (name, folder, *arguments, **environment), the name without "xrgs-"; it
+    returns the exit code, stdout and stderr. `call_command` is faster and will mostly do.
+    `sweeps_in` is for sweeps that are killed, or whose child processes are checked.
     """
 
     def run(name: str, folder: Path, *arguments: str, **environment: str) -> tuple[int, str, str]:
@@ -141,28 +147,28 @@ def run_command() -> Callable[..., tuple[int, str, str]]:
 
 @dataclass(frozen=True)
 class Sweep:
-    """One call of `xrgs-sweep`."""
+    """A running process of `xrgs-sweep`."""
 
     process: subprocess.Popen[bytes]
     printed: Path
-    """Folder of the files `out` and `err`."""
+    """Folder with the files `out` and `err`, which hold stdout and stderr."""
 
     def end(self) -> tuple[int, str, str]:
-        """Wait for it; exit code, stdout and stderr."""
+        """Wait for the end; return the exit code, stdout and stderr."""
         code = self.process.wait(300)
-        return code, *((self.printed / name).read_text() for name in ("out", "err"))
+        return code, (self.printed / "out").read_text(), (self.printed / "err").read_text()
 
 
 @dataclass(frozen=True)
 class Sweeps:
-    """Sweeps of real processes in a folder of their own, which holds their store `s`."""
+    """Starts sweeps as real processes in a folder of its own, with the store `s` in it."""
 
     folder: Path
     faults: str = ""
-    """Python that every process runs at its start, the cells' too."""
+    """Python code that every process of the sweep runs at its start, the cells' included."""
 
     def start(self, *arguments: str, faults: bool = True) -> Sweep:
-        """Start one."""
+        """Start a sweep with these arguments and return at once."""
         printed = Path(tempfile.mkdtemp(prefix="printed-", dir=self.folder))
         (self.folder / "tmp").mkdir(exist_ok=True)
         changes = {"TMPDIR": str(self.folder / "tmp"), "SWEEPS_OF": str(self.folder)}
@@ -182,70 +188,72 @@ class Sweeps:
         return Sweep(process, printed)
 
     def run(self, *arguments: str, faults: bool = True) -> tuple[int, str, str]:
-        """One from its start to its end: exit code, stdout and stderr."""
+        """Run a sweep to its end; return the exit code, stdout and stderr."""
         ended = self.start(*arguments, faults=faults).end()
         self.leave_nothing_running()
         return ended
 
     def leave_nothing_running(self) -> None:
-        """Assert that these sweeps, and all that they started, come to an end now."""
+        """Assert that all processes of these sweeps end within 20 s."""
         end = time.monotonic() + 20
-        while left := self.processes():
-            assert time.monotonic() < end, left
+        while running := self.processes():
+            assert time.monotonic() < end, running
             time.sleep(0.01)
 
     def processes(self) -> dict[int, str]:
-        """Number and command line of each process that these sweeps have started and that runs."""
+        """Return the command line of each running process of these sweeps, by its process id."""
         mark = f"SWEEPS_OF={self.folder}".encode()
-        found = {}
+        command_lines = {}
         for process in Path("/proc").glob("[0-9]*"):
-            with suppress(OSError):  # it may end while it is looked at
+            with suppress(OSError):  # the process may have ended meanwhile
                 if mark in (process / "environ").read_bytes().split(b"\0"):
                     line = (process / "cmdline").read_bytes().replace(b"\0", b" ")
-                    found[int(process.name)] = line.decode()
-        return found
+                    command_lines[int(process.name)] = line.decode()
+        return command_lines
 
     def cells(self) -> dict[int, Path]:
-        """The folder of every cell by its seed."""
-        found = (self.folder / "s" / "cells").glob("*/identity.json")
+        """Return the folder of each cell by its seed."""
+        files = (self.folder / "s" / "cells").glob("*/identity.json")
         return {
-            json.loads(f.read_text())["seed"]: f.parent for f in found if "." not in f.parent.name
+            json.loads(f.read_text())["seed"]: f.parent for f in files if "." not in f.parent.name
         }
 
 
 @pytest.fixture(scope="session")
 def sweeps_in() -> Callable[..., Sweeps]:
-    """(folder, faults) -> sweeps in that folder."""
+    """Return the function (folder, faults) -> `Sweeps` in that folder."""
     return Sweeps
 
 
 @pytest.fixture(scope="session")
 def data_root() -> Path:
-    """The folder of real photographs; tests that need it skip where it is absent."""
+    """Return the folder of real photographs; the test is skipped if it is absent."""
     folder = Path(os.environ.get("XRGS_TEST_DATA", "../shared/data")).resolve()
     if not folder.is_dir():
-        pytest.skip(f"no photographs in {folder}: set XRGS_TEST_DATA")
+        pytest.skip(f"there is no folder {folder}: set XRGS_TEST_DATA to one with photographs")
     return folder
 
 
 @dataclass
 class Server:
-    """What is served, how badly, and what was asked for."""
+    """The state of the test web server: what it serves, its faults, and the requests so far."""
 
     content: bytes = b""
     ranges: bool = True
+    """Whether the server answers requests for a range of bytes with that range."""
     cuts: list[int] = field(default_factory=list)
-    """Bytes after which each of the first answers breaks off."""
+    """Number of bytes after which each of the first answers breaks off."""
     status: int | None = None
+    """HTTP status of an error to answer every request with."""
     content_type: str = "application/zip"
     shift: int = 0
-    """Added to where a range is said to start."""
+    """Number added to the start of a range in the Content-Range header."""
     length: bool = True
-    """Whether it is said how long the file is."""
+    """Whether the headers give the length of the file."""
     stall: float = 0
-    """Seconds before the content."""
+    """Seconds between the headers and the content."""
     asked: list[str | None] = field(default_factory=list)
-    """The Range header of every request."""
+    """The Range header of each request so far, None where there was none."""
     url: str = ""
 
 
@@ -253,14 +261,14 @@ class _Handler(BaseHTTPRequestHandler):
     state: Server
 
     def do_GET(self) -> None:
-        state, wanted = self.state, self.headers.get("Range")
-        state.asked.append(wanted)
+        state, byte_range = self.state, self.headers.get("Range")
+        state.asked.append(byte_range)
         if state.status is not None:
             self.send_error(state.status)
             return
         start, size = 0, len(state.content)
-        if wanted and state.ranges:
-            start = int(wanted.removeprefix("bytes=").removesuffix("-"))
+        if byte_range and state.ranges:
+            start = int(byte_range.removeprefix("bytes=").removesuffix("-"))
             if start >= size:
                 self.send_response(416)
                 self.send_header("Content-Range", f"bytes */{size}")
@@ -277,7 +285,7 @@ class _Handler(BaseHTTPRequestHandler):
             self.send_header("Content-Length", str(len(body)))
         self.end_headers()
         time.sleep(state.stall)
-        with contextlib.suppress(ConnectionError):  # the client may have heard enough
+        with contextlib.suppress(ConnectionError):  # the client may have closed the connection
             self.wfile.write(body[: state.cuts.pop(0)] if state.cuts else body)
 
     def log_message(self, format: str, *args: Any) -> None:  # noqa: A002
@@ -286,7 +294,7 @@ class _Handler(BaseHTTPRequestHandler):
 
 @pytest.fixture
 def server() -> Iterator[Server]:
-    """A web server on the loopback interface that misbehaves as it is told."""
+    """Start a web server on the loopback interface; return its state, whose faults can be set."""
     state = Server()
     handler = type("Handler", (_Handler,), {"state": state})
     with ThreadingHTTPServer(("127.0.0.1", 0), handler) as listening:
@@ -299,20 +307,32 @@ def server() -> Iterator[Server]:
 
 
 @pytest.fixture
-def xrgs_data(
+def call_command(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> Callable[..., tuple[int, str, str]]:
-    """`xrgs-data ARGUMENT...` in an empty folder: exit code, standard output, what is wrong."""
+    """Return a function that runs a command in this process, in the folder `tmp_path`.
 
-    from xrgs.cli import data
+    Its arguments are (name, *arguments), the name without "xrgs-"; it returns the exit code, stdout
+    and the message of the error.
+    """
 
-    def run(*arguments: str) -> tuple[int, str, str]:
+    def call(name: str, *arguments: str) -> tuple[int, str, str]:
+        main = importlib.import_module(f"xrgs.cli.{name}").main
         monkeypatch.chdir(tmp_path)
-        monkeypatch.setattr(sys, "argv", ["xrgs-data", *arguments])
+        monkeypatch.setenv("OMP_WAIT_POLICY", os.environ.get("OMP_WAIT_POLICY", "passive"))
+        monkeypatch.setattr(sys, "argv", [f"xrgs-{name}", *arguments])
         try:
-            data.main()
+            main()
         except SystemExit as end:
             return 1, capsys.readouterr().out, str(end.code)
         return 0, capsys.readouterr().out, ""
 
-    return run
+    return call
+
+
+@pytest.fixture
+def xrgs_data(
+    call_command: Callable[..., tuple[int, str, str]],
+) -> Callable[..., tuple[int, str, str]]:
+    """Return `call_command` for `xrgs-data`."""
+    return partial(call_command, "data")

@@ -60,4 +60,4 @@ def test_every_name_is_there_and_documented(name: str) -> None:
 
 def test_an_unknown_name_is_an_attribute_error() -> None:
     with pytest.raises(AttributeError, match="module 'xrgs' has no attribute 'rasterise'"):
-        xrgs.rasterise  # noqa: B018
+        xrgs.rasterise  # type: ignore[attr-defined]  # noqa: B018

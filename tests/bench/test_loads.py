@@ -103,17 +103,17 @@ def test_random_loads_put_as_many_gaussians_on_a_pixel_as_trained_ones(count: in
 
 
 def test_a_crop_is_the_middle_of_the_view(load: Load) -> None:
-    crop = load.cropped(20, 10)
+    crop = load.center_crop(20, 10)
     whole, middle = render(load), render(crop)
     # The Jacobian's clamp follows the field of view, so that the two are not quite the same.
     assert (middle - whole[10:20, 10:30]).abs().mean() < 0.005
     assert (middle - whole[11:21, 11:31]).abs().mean() > 0.02
-    same = load.cropped(400, 400)
+    same = load.center_crop(400, 400)
     assert (same.camera.width, same.camera.height) == (40, 30)
 
 
 def test_a_smaller_view_shows_the_same(load: Load) -> None:
-    small = load.smaller(5)
+    small = load.downscaled(5)
     assert (small.camera.width, small.camera.height) == (8, 6)
     corner = load.camera.K.inverse() @ torch.tensor([40.0, 30.0, 1.0])
     torch.testing.assert_close(small.camera.K @ corner, torch.tensor([8.0, 6.0, 1.0]))

@@ -2,9 +2,12 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import pytest
+
 from xrgs.bench import memory
 
 
+@pytest.mark.slow
 def test_a_process_grows_by_what_is_counted_and_not_by_the_imports() -> None:
     row = memory.measure(20_000, 64, 48, "torch", threads=1, seed=0)
     assert (row["gaussians"], row["width"], row["height"]) == (20_000, 64, 48)

@@ -9,7 +9,7 @@ import torch
 from xrgs.bench import quality, tables
 from xrgs.capture.dataset import Dataset, LoadedView
 from xrgs.config import Conf
-from xrgs.experiment.store import write_json
+from xrgs.safeio.atomic import write_json
 from xrgs.splat.cameras import Camera
 
 
@@ -28,20 +28,20 @@ def cell(tmp_path: Path, baseline: Conf, monkeypatch: pytest.MonkeyPatch) -> Pat
     points = torch.rand(40, 3, generator=generator) - 0.5 + torch.tensor([0.0, 0.0, 2.0])
     colors = torch.rand(40, 3, generator=generator)
     data = Dataset(tuple(views), tuple(views[:1]), points, colors, scene_scale=1.0, factor=5)
-    monkeypatch.setattr(quality, "data_of", lambda _: data)
+    monkeypatch.setattr(quality, "load_cell_dataset", lambda _: data)
     return tmp_path
 
 
 def test_each_cut_is_trained_and_compared(cell: Path) -> None:
     rows = {row["change"]: row for row in quality.compare(cell, steps=6)}
-    assert next(iter(rows)) == quality.AS_IT_IS
+    assert next(iter(rows)) == quality.UNCHANGED
     assert {"LR consistency fold", "LR consistency off"} < set(rows)
     assert "LR consistency exact" not in rows  # as it is
-    assert rows[quality.AS_IT_IS]["difference"] == 0
+    assert rows[quality.UNCHANGED]["difference"] == 0
     for name in ("another seed", "alpha cut 4/255", "LR consistency off"):
-        assert rows[name]["psnr"] != rows[quality.AS_IT_IS]["psnr"]
-        change = rows[name]["psnr"] - rows[quality.AS_IT_IS]["psnr"]
+        assert rows[name]["psnr"] != rows[quality.UNCHANGED]["psnr"]
+        change = rows[name]["psnr"] - rows[quality.UNCHANGED]["psnr"]
         assert rows[name]["difference"] == pytest.approx(change)
-    fewer, usual = rows["alpha cut 4/255"], rows[quality.AS_IT_IS]
+    fewer, usual = rows["alpha cut 4/255"], rows[quality.UNCHANGED]
     assert fewer["evaluations"] < usual["evaluations"]
     assert "stop at 1e-2" in tables.quality(list(rows.values()))

@@ -2,24 +2,26 @@ from __future__ import annotations
 
 import torch
 
-from xrgs.bench.timing import Times, alternate, threads
+from xrgs.bench.timing import Timings, time_interleaved, use_threads
 
 
-def test_things_run_in_turn() -> None:
+def test_tasks_run_in_turn() -> None:
     ran: list[str] = []
-    times = alternate({"a": lambda: ran.append("a"), "b": lambda: ran.append("b")}, repeats=3)
+    times = time_interleaved(
+        {"a": lambda: ran.append("a"), "b": lambda: ran.append("b")}, repeats=3
+    )
     assert "".join(ran) == "ab" + "ababab"  # once to warm up
-    assert all(len(times[name].all) == 3 for name in "ab")
+    assert all(len(times[name].milliseconds) == 3 for name in "ab")
 
 
-def test_least_and_median() -> None:
-    times = Times((5.0, 1.0, 2.0, 9.0, 3.0))
-    assert times.least == 1.0
+def test_minimum_and_median() -> None:
+    times = Timings((5.0, 1.0, 2.0, 9.0, 3.0))
+    assert times.minimum == 1.0
     assert times.median == 3.0
 
 
-def test_threads_are_put_back() -> None:
+def test_the_number_of_threads_is_restored() -> None:
     before = torch.get_num_threads()
-    with threads(before + 1):
+    with use_threads(before + 1):
         assert torch.get_num_threads() == before + 1
     assert torch.get_num_threads() == before

@@ -175,7 +175,7 @@ def test_the_count_is_checked_once_densification_has_stopped(
     stopped = Step(1500, 3000, data.train[0])
     checks: tuple[Callable[[], None], ...] = (
         lambda: check.after_backward(gaussians, stopped),
-        lambda: check.finish(gaussians),
+        lambda: check.after_training(gaussians),
     )
     for checked in checks:
         if mismatch:

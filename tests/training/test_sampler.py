@@ -21,11 +21,11 @@ def always(step: Step) -> bool:
 
 
 def sampled_names(
-    data: Dataset, steps: int, trains_on: Callable[[Step], bool], seed: int = 0
+    data: Dataset, steps: int, allows_view: Callable[[Step], bool], seed: int = 0
 ) -> list[str]:
     """The view of each step, after a check that the steps are numbered in turn."""
-    sampled = list(EpochSampler(data.train, seed, steps, trains_on))
-    assert [(step.number, step.of) for step in sampled] == [(n, steps) for n in range(steps)]
+    sampled = list(EpochSampler(data.train, seed, steps, allows_view))
+    assert [(step.number, step.total) for step in sampled] == [(n, steps) for n in range(steps)]
     return [step.view.name for step in sampled]
 
 

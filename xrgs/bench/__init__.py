@@ -1,1 +1,1 @@
-"""Run time against error, from small loads to large: `xrgs-bench`."""
+"""The benchmark `xrgs-bench`: run time against error, from small loads to large."""

@@ -1,4 +1,4 @@
-"""What is rendered in a benchmark: Gaussians and a view, random, from a file or from a cell."""
+"""Makes the loads of a benchmark: Gaussians and a view, random, from a file or from a cell."""
 
 from __future__ import annotations
 
@@ -20,12 +20,16 @@ if TYPE_CHECKING:
 
     from xrgs.capture.dataset import Dataset
 
-#: Standard deviation, in units of the spacing of N Gaussians spread over the image: about 40 of
-#: them then contribute to a pixel, whatever N and the size, as in a trained scene.
-_SPREAD = 1.5
-_DEPTHS = (2.0, 6.0)  # world units
-_BEYOND = 1.15  # how far, in half images, means reach: a tenth of them or so are out of view
+#: Standard deviation of a Gaussian in units of the mean distance of N Gaussians spread over the
+#: image. About 40 of them then contribute to a pixel for any N and image size, as in a trained
+#: scene.
+_SIZE_PER_SPACING = 1.5
+_DEPTH_RANGE = (2.0, 6.0)  # world units
+#: Half the side of the area that projected means cover, in half images: about a tenth of the
+#: Gaussians are out of view.
+_COVERED_AREA = 1.15
 
+#: The keys of a load's .npz and their shapes, N Gaussians.
 _SHAPES = {
     "means": ("N", 3),
     "quats": ("N", 4),
@@ -41,7 +45,7 @@ _SHAPES = {
 
 @dataclass(frozen=True)
 class Load:
-    """Gaussians with activated parameters, float32, and the view they are rendered into."""
+    """Gaussians with activated float32 parameters, and the view that they are rendered into."""
 
     name: str
     means: Tensor  # [N, 3] world units
@@ -55,49 +59,75 @@ class Load:
         return len(self.means)
 
     @property
-    def parameters(self) -> tuple[Tensor, ...]:
-        """As `rasterize` takes them."""
+    def parameters(self) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]:
+        """The six parameters in the order in which `rasterize` takes them."""
         sh0, rest = self.sh[:, :1].contiguous(), self.sh[:, 1:].contiguous()
         return self.means, self.quats, self.scales, self.opacities, sh0, rest
 
     @property
     def pixels(self) -> int:
-        """Of the view."""
+        """The number of pixels of the view."""
         return self.camera.width * self.camera.height
 
-    def seen_by(self, camera: Camera) -> Load:
-        """The same Gaussians in another view."""
+    def with_camera(self, camera: Camera) -> Load:
+        """Return the same Gaussians with another camera.
+
+        Args:
+            camera: The new camera.
+        """
         return replace(self, camera=camera)
 
-    def smaller(self, factor: int) -> Load:
-        """The same view, its sides `factor` times smaller."""
+    def downscaled(self, factor: int) -> Load:
+        """Return the same view at a lower resolution.
+
+        Args:
+            factor: Divisor of width and height; the result is rounded down, to at least 1 px.
+        """
         camera = self.camera
         width, height = max(1, camera.width // factor), max(1, camera.height // factor)
         scale = torch.tensor([width / camera.width, height / camera.height, 1.0])
-        return self.seen_by(
+        return self.with_camera(
             replace(camera, K=camera.K * scale[:, None], width=width, height=height)
         )
 
-    def cropped(self, width: int, height: int) -> Load:
-        """The middle of the view, as a view of its own."""
+    def center_crop(self, width: int, height: int) -> Load:
+        """Return the middle of the view as a view of its own.
+
+        Args:
+            width: Width of the crop, px; at most the view's.
+            height: Height of the crop, px; at most the view's.
+        """
         camera = self.camera
         width, height = min(width, camera.width), min(height, camera.height)
         K = camera.K.clone()
         K[0, 2] -= (camera.width - width) // 2
         K[1, 2] -= (camera.height - height) // 2
-        return self.seen_by(replace(camera, K=K, width=width, height=height))
+        return self.with_camera(replace(camera, K=K, width=width, height=height))
 
 
 def random_load(count: int, width: int, height: int, seed: int) -> Load:
-    """Gaussians all over the view and a little beyond, anisotropic, a few of them opaque."""
+    """Make anisotropic Gaussians all over the view and a little beyond, few of them opaque.
+
+    Args:
+        count: Number of Gaussians.
+        width: Width of the view, px.
+        height: Height of the view, px.
+        seed: Seed of the random numbers.
+    """
     generator = torch.Generator().manual_seed(seed)
 
     def uniform(*shape: int, low: float, high: float) -> Tensor:
         return low + (high - low) * torch.rand(*shape, generator=generator)
 
     focal = 0.9 * width
-    depth = uniform(count, low=_DEPTHS[0], high=_DEPTHS[1])
-    plane = _BEYOND * torch.tensor([width, height]) / 2 / focal * uniform(count, 2, low=-1, high=1)
+    depth = uniform(count, low=_DEPTH_RANGE[0], high=_DEPTH_RANGE[1])
+    plane = (
+        _COVERED_AREA
+        * torch.tensor([width, height])
+        / 2
+        / focal
+        * uniform(count, 2, low=-1, high=1)
+    )
     means = torch.cat([plane * depth[:, None], depth[:, None]], dim=1)
     spacing = math.sqrt(width * height / count) / focal * depth  # [N] world units
     spread = torch.exp(0.5 * torch.randn(count, 3, generator=generator) - 0.25)
@@ -108,7 +138,7 @@ def random_load(count: int, width: int, height: int, seed: int) -> Load:
         name="random",
         means=means,
         quats=torch.randn(count, 4, generator=generator),
-        scales=_SPREAD * spacing[:, None] * spread,
+        scales=_SIZE_PER_SPACING * spacing[:, None] * spread,
         opacities=torch.sigmoid(1.5 * torch.randn(count, generator=generator) - 1.5),
         sh=sh,
         camera=Camera(viewmat=torch.eye(4), K=K, width=width, height=height),
@@ -116,10 +146,15 @@ def random_load(count: int, width: int, height: int, seed: int) -> Load:
 
 
 def read(path: Path) -> Load:
-    """A load from a .npz (its keys: see `_SHAPES`; opacities 0..1, scales in world units).
+    """Read a load from a .npz file.
+
+    Args:
+        path: File with `means` [N, 3], `quats` [N, 4] wxyz, `scales` [N, 3] in world units,
+            `opacities` [N] in 0..1, `sh` [N, 16, 3], `viewmat` [4, 4] world to camera, `K` [3, 3],
+            `width` and `height`.
 
     Raises:
-        XrgsError: the file is missing or not a .npz, or a key is missing, of the wrong shape, not
+        XrgsError: The file is missing or not a .npz, or a key is missing, of the wrong shape, not
             finite or out of range; the message names the file and the key.
     """
     try:
@@ -150,10 +185,14 @@ def read(path: Path) -> Load:
 
 
 def write(path: Path, load: Load) -> None:
-    """Write a load so that `read` gives it back.
+    """Write a load as a .npz file that `read` reads.
+
+    Args:
+        path: File to write.
+        load: What is written.
 
     Raises:
-        XrgsError: the file cannot be written.
+        XrgsError: The file cannot be written.
     """
     camera = load.camera
     arrays = {key: getattr(load, key).numpy() for key in list(_SHAPES)[:5]}
@@ -165,19 +204,19 @@ def write(path: Path, load: Load) -> None:
         raise XrgsError(f"{path}: cannot be written: {error.strerror}") from error
 
 
-def from_cell(folder: Path, view_name: str) -> Load:
-    """A trained cell's Gaussians, seen from one of its views at that view's size.
+def load_from_cell(folder: Path, view_name: str) -> Load:
+    """Make a load of a trained cell's Gaussians and one of its views.
 
     Args:
-        folder: The cell's, within its store.
-        view_name: A training or a test view.
+        folder: Folder of the cell in its store.
+        view_name: Name of a training or test view.
 
     Raises:
-        XrgsError: the cell isn't done, its variant isn't in the store, or it has no such view.
+        XrgsError: The cell isn't done, its variant isn't in the store, or it has no such view.
     """
     from xrgs.splat.ply import load_ply
 
-    data = data_of(folder)
+    data = load_cell_dataset(folder)
     views = {view.name: view for view in (*data.train, *data.test)}
     if view_name not in views:
         raise XrgsError(f"view={view_name}: {folder} has {', '.join(sorted(views))}")
@@ -190,11 +229,14 @@ def from_cell(folder: Path, view_name: str) -> Load:
     return Load(f"{folder.name}:{view_name}", means, quats, scales, opacities, sh, camera)
 
 
-def data_of(folder: Path) -> Dataset:
-    """What a cell was trained and tested on.
+def load_cell_dataset(folder: Path) -> Dataset:
+    """Load the dataset that a cell was trained and tested on.
+
+    Args:
+        folder: Folder of the cell in its store.
 
     Raises:
-        XrgsError: the cell isn't done, or its variant isn't in the store.
+        XrgsError: The cell isn't done, or its variant isn't in the store.
     """
     from xrgs.capture import dataset, variant
     from xrgs.experiment.store import CellFolder
@@ -209,8 +251,7 @@ def data_of(folder: Path) -> Dataset:
 
 def _check(path: Path, key: str, value: NDArray[np.generic], shape: tuple[object, ...]) -> None:
     if value.shape != shape:
-        wanted = [side if side != "N" else "N" for side in _SHAPES[key]]
-        raise XrgsError(f"{path}: {key} must be {wanted}, got {list(value.shape)}")
+        raise XrgsError(f"{path}: {key} must be {list(_SHAPES[key])}, got {list(value.shape)}")
     if value.dtype.kind not in "fiu":
         raise XrgsError(f"{path}: {key} must be numbers, got {value.dtype}")
     if not np.isfinite(value).all():

@@ -1,6 +1,7 @@
-"""What a training step takes of memory: the bytes counted, and by how much a process grows.
+"""Measures the memory of a training step: the bytes counted, and by how much a process grows.
 
-A process of its own, since the benchmark's has held other loads: `python -m xrgs.bench.memory`.
+A process of its own is measured (`python -m xrgs.bench.memory`), since the benchmark's process has
+held other loads before.
 """
 
 from __future__ import annotations
@@ -11,23 +12,32 @@ import sys
 from pathlib import Path
 from typing import Any
 
-_STEPS = 3  # the first has no optimizer state yet
-_STATUS = Path("/proc/self/status")
+_STEPS = 3  # in the first one, the optimizer has no state yet
+_PROCESS_STATUS = Path("/proc/self/status")
 
 
 def measure(
     gaussians: int, width: int, height: int, backend: str, threads: int, seed: int
 ) -> dict[str, Any]:
-    """A row of one load, trained for a few steps.
+    """Train a random load for a few steps in a new process and measure its memory.
+
+    Args:
+        gaussians: Number of Gaussians.
+        width: Width of the view, px.
+        height: Height of the view, px.
+        backend: "native" or "torch".
+        threads: Number of threads.
+        seed: Seed of the load.
 
     Returns:
-        `counted_bytes`: parameters, gradients, Adam's state and the renderer's buffers.
-        `base_rss_bytes`: resident once all is imported. `peak_rss_bytes`: at its highest later.
-        `growth_bytes`: the difference, which is what training took; these three are None where
-        the system doesn't say (no /proc).
+        A row: the arguments but for the seed; `counted_bytes`, of parameters, gradients, Adam's
+        state and the renderer's buffers; `base_rss_bytes`, the resident memory once everything is
+        imported; `peak_rss_bytes`, its maximum later; and `growth_bytes`, their difference, which
+        is what training took. The last three are None on a system without /proc.
     """
     arguments = [str(value) for value in (gaussians, width, height, backend, threads, seed)]
-    # -P: as xrgs.sweep.jobs.worker, the child must import the package that its parent did.
+    # -P, as for xrgs.sweep.jobs.worker: the child must import the same package as its parent, and
+    # not a checkout that happens to be the current folder.
     command = [sys.executable, "-P", "-m", "xrgs.bench.memory", *arguments]
     done = subprocess.run(command, check=True, stdout=subprocess.PIPE)  # noqa: S603
     row: dict[str, Any] = json.loads(done.stdout)
@@ -35,23 +45,25 @@ def measure(
 
 
 def _resident() -> tuple[int, int] | None:
-    """Bytes resident now, and at their highest so far."""
-    if not _STATUS.exists():
+    """Return the resident memory in bytes, now and at its maximum so far; None without /proc."""
+    if not _PROCESS_STATUS.exists():
         return None
-    lines = dict(line.split(":", 1) for line in _STATUS.read_text("ascii").splitlines())
-    now, most = (1024 * int(lines[key].split()[0]) for key in ("VmRSS", "VmHWM"))
-    return now, most
+    lines = dict(line.split(":", 1) for line in _PROCESS_STATUS.read_text("ascii").splitlines())
+    current, peak = (1024 * int(lines[key].split()[0]) for key in ("VmRSS", "VmHWM"))
+    return current, peak
 
 
-def _measured(arguments: list[str]) -> dict[str, Any]:
+def _measure_this_process(arguments: list[str]) -> dict[str, Any]:
     from xrgs.bench import loads, training
 
     backend = arguments.pop(3)
     gaussians, width, height, threads, seed = map(int, arguments)
-    # A step of next to nothing loads what is loaded late.
-    _train(training.Step(loads.random_load(50, 16, 16, seed), backend, threads))
+    # A tiny step first, so that libraries which are loaded on first use count as the base.
+    _train(training.TrainingStep(loads.random_load(50, 16, 16, seed), backend, threads))
     before = _resident()
-    step = training.Step(loads.random_load(gaussians, width, height, seed), backend, threads)
+    step = training.TrainingStep(
+        loads.random_load(gaussians, width, height, seed), backend, threads
+    )
     counted = _train(step)
     after = _resident()
     base, peak = (None, None) if before is None or after is None else (before[0], after[1])
@@ -69,11 +81,11 @@ def _measured(arguments: list[str]) -> dict[str, Any]:
 
 
 def _train(step: Any) -> int:
-    """Bytes counted at the last of a few steps."""
+    """Train a few steps; return the bytes counted at the last one."""
     for _ in range(_STEPS):
-        step.all()
+        step.run_step()
     return int(step.counted_bytes())
 
 
 if __name__ == "__main__":
-    sys.stdout.write(json.dumps(_measured(sys.argv[1:])))
+    sys.stdout.write(json.dumps(_measure_this_process(sys.argv[1:])))

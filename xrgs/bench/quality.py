@@ -1,7 +1,7 @@
-"""What a skip that changes numbers does to the pictures: a cell trained again, with and without.
+"""Measures what each approximation costs in PSNR: a cell is trained again with it changed.
 
-Only such skips are here. The renderer's (`xrgs.splat.settings.CullingOptions`) and those of
-`xrgs.bench.skips` change no bit, or rounding at a cut, as the tables there say of each.
+The shortcuts of `xrgs.bench.shortcuts` are not measured here: they change no bit, or only the
+rounding at a cutoff, as their table says for each.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 import torch
 
 from xrgs import config
-from xrgs.bench.loads import data_of
+from xrgs.bench.loads import load_cell_dataset
 from xrgs.evaluation import metrics
 from xrgs.safeio.records import read_json
 from xrgs.splat.backend import resolve_backend
@@ -27,25 +27,25 @@ if TYPE_CHECKING:
     from xrgs.config import Conf
     from xrgs.training.recorder import TrainingResult
 
-AS_IT_IS = "as it is"
+UNCHANGED = "unchanged"
 
 
 def compare(folder: Path, steps: int) -> list[dict[str, Any]]:
-    """Train a cell's variant with its config, and again with each cut changed.
+    """Train a cell's variant with its config, and again with each approximation changed.
 
     Args:
-        folder: Of a finished cell, in its store; nothing is written there.
-        steps: To train for; every schedule scales with them.
+        folder: Folder of a finished cell in its store; nothing is written there.
+        steps: Number of training steps; every schedule scales with it.
 
     Returns:
-        A row each: `change`, mean `psnr` of the test views in dB, its `difference` from the cell as
-        it is (what another seed changes says how much of that is chance), Gaussians, alpha
-        evaluations and seconds.
+        A row for each run: `change`; `psnr`, the mean of the test views in dB; `difference`, from
+        the unchanged run's (that of another seed shows how much is chance); `gaussians`,
+        `evaluations` (of alpha) and `seconds`.
 
     Raises:
-        XrgsError: the cell isn't done, or its variant isn't in the store.
+        XrgsError: The cell isn't done, or its variant isn't in the store.
     """
-    data = data_of(folder)
+    data = load_cell_dataset(folder)
     conf = config.from_dict(read_json(folder / "config.json"))
     conf.train.steps = steps
     rows: list[dict[str, Any]] = []
@@ -67,21 +67,21 @@ def compare(folder: Path, steps: int) -> list[dict[str, Any]]:
 
 
 def _changes(conf: Conf) -> dict[str, Conf]:
-    """Copies of a cell's config, each but the first with one thing changed."""
-    names = [AS_IT_IS, "another seed", "alpha cut 4/255", "alpha cut 1/1020", "stop at 1e-2"]
+    """Return copies of a cell's config by name, each but the first with one value changed."""
+    names = [UNCHANGED, "another seed", "alpha cut 4/255", "alpha cut 1/1020", "stop at 1e-2"]
     consistency = conf.components.consistency
     modes = [mode for mode in ("exact", "fold", "off") if mode != consistency.lr_mode]
     if consistency.weight != 0:
         names += [f"LR consistency {mode}" for mode in modes]
-    made = {name: config.from_dict(asdict(conf)) for name in names}
-    made["another seed"].seed += 1
-    made["alpha cut 4/255"].splat.raster.alpha_min = 4 / 255
-    made["alpha cut 1/1020"].splat.raster.alpha_min = 1 / 1020
-    made["stop at 1e-2"].splat.raster.transmittance_min = 1e-2
+    configs = {name: config.from_dict(asdict(conf)) for name in names}
+    configs["another seed"].seed += 1
+    configs["alpha cut 4/255"].splat.raster.alpha_min = 4 / 255
+    configs["alpha cut 1/1020"].splat.raster.alpha_min = 1 / 1020
+    configs["stop at 1e-2"].splat.raster.transmittance_min = 1e-2
     for mode in modes:
-        if (name := f"LR consistency {mode}") in made:
-            made[name].components.consistency.lr_mode = mode
-    return made
+        if (name := f"LR consistency {mode}") in configs:
+            configs[name].components.consistency.lr_mode = mode
+    return configs
 
 
 def _psnr(trained: TrainingResult, views: Sequence[LoadedView], conf: Conf) -> float:

@@ -1,4 +1,4 @@
-"""Rendering a load forward and back: its time by stage, its work and memory, and its error."""
+"""Measures rendering forward and backward: time by stage, work, memory and error."""
 
 from __future__ import annotations
 
@@ -11,126 +11,161 @@ import torch
 from torch import Tensor
 
 from xrgs.bench.loads import Load
-from xrgs.bench.timing import Times, alternate, threads
+from xrgs.bench.timing import Timings, time_interleaved, use_threads
 from xrgs.splat.gaussians import ActivatedGaussians
 from xrgs.splat.rasterize import Render, rasterize
 from xrgs.splat.settings import CullingOptions, RasterSettings
 
-#: Size of the view in which a render is compared to one in double.
+#: Width and height, px, of the view in which a render is compared to one in float64.
 ERROR_CROP = (96, 72)
-#: Loads that the torch backend renders in seconds, not minutes.
+#: Above these sizes the torch backend would take minutes, and isn't timed.
 _TORCH_GAUSSIANS, _TORCH_PIXELS, _TORCH_REPEATS = 100_000, 504 * 378, 2
 
 
 @dataclass(frozen=True)
-class Way:
-    """A backend, with settings that trade error for time."""
+class RenderMethod:
+    """A backend with raster settings, which may trade error for time."""
 
     name: str
     backend: str
     settings: RasterSettings = field(default_factory=RasterSettings)
     sh_degree: int = 3
-    skips: CullingOptions | None = None
-    """Of the native backend alone; None leaves out all that it can."""
+    culling: CullingOptions | None = None
+    """The kinds of culling that the native backend uses; None means all of them."""
 
 
-def ways(backends: Sequence[str]) -> list[Way]:
-    """Each backend as it is, and the fastest of them cutting off more than gsplat does."""
+def default_methods(backends: Sequence[str]) -> list[RenderMethod]:
+    """Return each backend at gsplat's settings, and the first one with other cutoffs as well.
+
+    Args:
+        backends: Names of the backends, the fastest first.
+    """
     first, usual = backends[0], RasterSettings()
-    return [Way(name, name) for name in backends] + [
-        Way(f"{first}, alpha cut 4/255", first, replace(usual, alpha_min=4 / 255)),
-        Way(f"{first}, alpha cut 1/1020", first, replace(usual, alpha_min=1 / 1020)),
-        Way(f"{first}, stop at 1e-2", first, replace(usual, transmittance_min=1e-2)),
+    return [RenderMethod(name, name) for name in backends] + [
+        RenderMethod(f"{first}, alpha cut 4/255", first, replace(usual, alpha_min=4 / 255)),
+        RenderMethod(f"{first}, alpha cut 1/1020", first, replace(usual, alpha_min=1 / 1020)),
+        RenderMethod(f"{first}, stop at 1e-2", first, replace(usual, transmittance_min=1e-2)),
     ]
 
 
-class Rendering:
-    """One load rendered one way by some threads, again and again."""
+class RenderTask:
+    """Renders one load with one method and number of threads, any number of times.
+
+    Attributes:
+        image: The last image, [H, W, 3], once `backward` was called.
+        work: Visible Gaussians, alpha evaluations and bytes of buffers of the last render.
+        stages: The shortest time of each stage in ms, native backend only.
+    """
 
     def __init__(
-        self, load: Load, way: Way, count: int, dtype: torch.dtype = torch.float32
+        self, load: Load, method: RenderMethod, count: int, dtype: torch.dtype = torch.float32
     ) -> None:
-        self.camera, self.way, self.threads = load.camera, way, count
+        self.camera, self.method, self.threads = load.camera, method, count
         self.leaves = [p.to(dtype).clone().requires_grad_() for p in load.parameters]
         generator = torch.Generator().manual_seed(0)
         shape = (load.camera.height, load.camera.width, 3)
-        self.slope = torch.randn(shape, generator=generator).to(dtype)  # of a loss, by the image
+        self.image_grad = torch.randn(shape, generator=generator).to(dtype)  # dL/d(image)
         self.render: Render | None = None
         self.image: Tensor | None = None
         self.work: dict[str, int] = {}
         self.stages: dict[str, float] = {}
 
     def forward(self) -> None:
-        """Render, for one `backward`."""
+        """Render the load and keep the graph for one call of `backward`."""
         means, quats, scales, opacities, sh0, rest = self.leaves
         parameters = means, quats, scales, opacities, sh0, rest
-        view, degree = (self.camera, self.way.settings), self.way.sh_degree
-        with threads(self.threads):
-            if self.way.skips is None:
-                backend = self.way.backend
+        view, degree = (self.camera, self.method.settings), self.method.sh_degree
+        with use_threads(self.threads):
+            if self.method.culling is None:
+                backend = self.method.backend
                 self.render = rasterize(*parameters, *view, sh_degree=degree, backend=backend)
             else:
                 from xrgs.splat.native import rasterizer as native
 
                 gaussians = ActivatedGaussians(*parameters)
-                self.render = native.render_culled(gaussians, *view, degree, None, self.way.skips)
+                culling = self.method.culling
+                self.render = native.render_culled(gaussians, *view, degree, None, culling)
 
     def backward(self) -> tuple[Tensor, ...]:
-        """Gradients of the six parameters, of the last render, which is then let go."""
+        """Return the gradients of the six parameters for the last render, and free its graph."""
         render, self.render = self.render, None
-        assert render is not None, "render first"  # noqa: S101 - a mistake of ours
+        assert render is not None, "forward() must be called first"  # noqa: S101
         graph: Any = render.image.grad_fn
-        with threads(self.threads):
-            gradients = torch.autograd.grad(render.image, self.leaves, self.slope)
+        with use_threads(self.threads):
+            gradients = torch.autograd.grad(render.image, self.leaves, self.image_grad)
         self.image = render.image.detach()
         self.work = {
             "visible": int(render.visible.sum()),
             "evaluations": render.evaluations,
             "buffer_bytes": render.buffer_bytes,
         }
-        if self.way.backend == "native":
+        if self.method.backend == "native":
             for stage, ms in graph.frame.timings.items():
                 self.stages[stage] = min(ms, self.stages.get(stage, ms))
         return gradients
 
 
-def time_load(load: Load, chosen: Sequence[Way], counts: Sequence[int], repeats: int) -> list[Any]:
-    """A row for each way and number of threads, timed in turn.
+def time_load(
+    load: Load, chosen: Sequence[RenderMethod], counts: Sequence[int], repeats: int
+) -> list[Any]:
+    """Time all methods on a load, in turn.
 
-    The torch backend is left out of loads too large for it. Else it takes its turns with the first
-    of the others, fewer of them, and its rows say `times_slower` than that one it was.
+    The torch backend is left out if the load is too large for it. Otherwise it is timed in turn
+    with the first native method, with fewer repeats, and its rows have `times_slower`: its time
+    over that method's.
+
+    Args:
+        load: What is rendered.
+        chosen: The methods.
+        counts: Numbers of threads.
+        repeats: Number of timed runs.
+
+    Returns:
+        A row for each method and number of threads, as `time_methods` gives it.
     """
-    fast = [way for way in chosen if way.backend != "torch"]
-    rows = list(time_ways(load, fast, counts, repeats).values())
+    fast = [method for method in chosen if method.backend != "torch"]
+    rows = list(time_methods(load, fast, counts, repeats).values())
     if len(load) > _TORCH_GAUSSIANS or load.pixels > _TORCH_PIXELS:
         return rows
-    slow = [way for way in chosen if way.backend == "torch"]
-    timed = time_ways(load, [*fast[:1], *slow], counts, min(repeats, _TORCH_REPEATS))
-    for way in slow:
+    slow = [method for method in chosen if method.backend == "torch"]
+    timed = time_methods(load, [*fast[:1], *slow], counts, min(repeats, _TORCH_REPEATS))
+    for method in slow:
         for count in counts:
-            row = timed[way.name, count]
+            row = timed[method.name, count]
             if fast:
-                row["times_slower"] = _whole(row) / _whole(timed[fast[0].name, count])
+                row["times_slower"] = _total_ms(row) / _total_ms(timed[fast[0].name, count])
             rows.append(row)
     return rows
 
 
-def _whole(row: dict[str, Any]) -> float:
+def _total_ms(row: dict[str, Any]) -> float:
     return float(row["forward_median_ms"] + row["backward_median_ms"])
 
 
-def time_ways(
-    load: Load, chosen: Sequence[Way], counts: Sequence[int], repeats: int
+def time_methods(
+    load: Load, chosen: Sequence[RenderMethod], counts: Sequence[int], repeats: int
 ) -> dict[tuple[str, int], dict[str, Any]]:
-    """A row for each way (by its name) and number of threads, all timed in turn."""
+    """Time each method with each number of threads, all in turn.
+
+    Args:
+        load: What is rendered.
+        chosen: The methods.
+        counts: Numbers of threads.
+        repeats: Number of timed runs.
+
+    Returns:
+        A row for each name of a method and number of threads: sizes, times in ms, work and memory.
+    """
     renderings = {
-        (way.name, count): Rendering(load, way, count) for way in chosen for count in counts
+        (method.name, count): RenderTask(load, method, count)
+        for method in chosen
+        for count in counts
     }
-    things: dict[str, Callable[[], object]] = {}
+    tasks: dict[str, Callable[[], object]] = {}
     for (name, count), rendering in renderings.items():
-        things[f"{name} {count} forward"] = rendering.forward
-        things[f"{name} {count} backward"] = rendering.backward
-    times = alternate(things, repeats)
+        tasks[f"{name} {count} forward"] = rendering.forward
+        tasks[f"{name} {count} backward"] = rendering.backward
+    times = time_interleaved(tasks, repeats)
     return {
         (name, count): _row(
             load,
@@ -142,21 +177,21 @@ def time_ways(
     }
 
 
-def _row(load: Load, rendering: Rendering, forward: Times, backward: Times) -> dict[str, Any]:
+def _row(load: Load, rendering: RenderTask, forward: Timings, backward: Timings) -> dict[str, Any]:
     work, stages = rendering.work, rendering.stages
     model = sum(leaf.nbytes for leaf in rendering.leaves)
-    compositing = stages.get("composite", forward.least)
+    compositing = stages.get("composite", forward.minimum)
     return {
         "load": load.name,
-        "way": rendering.way.name,
-        "backend": rendering.way.backend,
+        "method": rendering.method.name,
+        "backend": rendering.method.backend,
         "threads": rendering.threads,
         "gaussians": len(load),
         "visible": work["visible"],
         "width": load.camera.width,
         "height": load.camera.height,
-        "forward_ms": forward.least,
-        "backward_ms": backward.least,
+        "forward_ms": forward.minimum,
+        "backward_ms": backward.minimum,
         "forward_median_ms": forward.median,
         "backward_median_ms": backward.median,
         "stages_ms": dict(stages),
@@ -166,37 +201,42 @@ def _row(load: Load, rendering: Rendering, forward: Times, backward: Times) -> d
     }
 
 
-def errors(load: Load, chosen: Sequence[Way]) -> dict[str, dict[str, float]]:
-    """How far each way, in float32, is from the torch backend at gsplat's settings in double.
+def errors(load: Load, chosen: Sequence[RenderMethod]) -> dict[str, dict[str, float]]:
+    """Compare each method in float32 to the torch backend at gsplat's settings in float64.
 
-    Over the middle of the view alone (`ERROR_CROP`), rendered as a view of its own: in double the
-    whole of a large one would take minutes.
+    Only the middle of the view (`ERROR_CROP`) is rendered, as a view of its own: a large view would
+    take minutes in float64.
+
+    Args:
+        load: What is rendered.
+        chosen: The methods.
 
     Returns:
-        For each way `image_mean` and `image_max`, absolute; `gradient`, the norm of the error
-        over the norm of the gradient, of the worst of the six parameters.
+        For each method's name, `image_mean` and `image_max`, the absolute error of the image, and
+        `gradient`, the norm of the gradient's error over the gradient's norm, for the parameter
+        of the six where it is largest.
     """
-    crop = load.cropped(*ERROR_CROP)
-    reference = Way("exact", "torch", sh_degree=chosen[0].sh_degree)
-    exact = Rendering(crop, reference, torch.get_num_threads(), torch.float64)
+    crop = load.center_crop(*ERROR_CROP)
+    reference = RenderMethod("exact", "torch", sh_degree=chosen[0].sh_degree)
+    exact = RenderTask(crop, reference, torch.get_num_threads(), torch.float64)
     exact.forward()
     expected = exact.backward()
-    found = {}
-    for way in chosen:
-        rendering = Rendering(crop, way, torch.get_num_threads())
+    errors_by_name = {}
+    for method in chosen:
+        rendering = RenderTask(crop, method, torch.get_num_threads())
         rendering.forward()
         gradients = rendering.backward()
         difference = (_image(rendering).double() - _image(exact)).abs()
-        found[way.name] = {
+        errors_by_name[method.name] = {
             "image_mean": difference.mean().item(),
             "image_max": difference.max().item(),
             "gradient": max(map(_relative, gradients, expected)),
         }
-    return found
+    return errors_by_name
 
 
-def _image(rendering: Rendering) -> Tensor:
-    assert rendering.image is not None, "render first"  # noqa: S101 - a mistake of ours
+def _image(rendering: RenderTask) -> Tensor:
+    assert rendering.image is not None, "backward() must be called first"  # noqa: S101
     return rendering.image
 
 
@@ -206,24 +246,40 @@ def _relative(value: Tensor, exact: Tensor) -> float:
 
 
 def time_views(load: Load, backend: str, counts: Sequence[int], repeats: int) -> list[Any]:
-    """How time grows with views: one forward and backward pass of each, one after the other."""
-    step = 0.02 * load.means[:, 2].median().item()  # world units, from one camera to the next
+    """Time the forward and backward passes of several views, one after the other.
+
+    Args:
+        load: The Gaussians and the first view; the others are beside it.
+        backend: "native" or "torch".
+        counts: Numbers of views.
+        repeats: Number of timed runs.
+
+    Returns:
+        A row for each number of views: `views` and `ms`.
+    """
+    baseline = 0.02 * load.means[:, 2].median().item()  # between cameras, world units
     renderings = []
     for number in range(max(counts)):
         viewmat = load.camera.viewmat.clone()
-        viewmat[0, 3] += step * number
-        view = load.seen_by(replace(load.camera, viewmat=viewmat))
-        renderings.append(Rendering(view, Way(backend, backend), torch.get_num_threads()))
+        viewmat[0, 3] += baseline * number
+        view = load.with_camera(replace(load.camera, viewmat=viewmat))
+        renderings.append(RenderTask(view, RenderMethod(backend, backend), torch.get_num_threads()))
 
-    def walk(count: int) -> None:
+    def render_views(count: int) -> None:
         for rendering in renderings[:count]:
             rendering.forward()
             rendering.backward()
 
-    times = alternate({str(count): partial(walk, count) for count in counts}, repeats)
-    return [{"views": count, "ms": times[str(count)].least} for count in counts]
+    times = time_interleaved(
+        {str(count): partial(render_views, count) for count in counts}, repeats
+    )
+    return [{"views": count, "ms": times[str(count)].minimum} for count in counts]
 
 
-def describe(way: Way) -> Mapping[str, Any]:
-    """A way and all of its settings, for a program to read."""
-    return {"name": way.name, "backend": way.backend, "settings": asdict(way.settings)}
+def describe(method: RenderMethod) -> Mapping[str, Any]:
+    """Return a method with all of its settings as JSON values.
+
+    Args:
+        method: What is described.
+    """
+    return {"name": method.name, "backend": method.backend, "settings": asdict(method.settings)}

@@ -1,4 +1,4 @@
-"""What `xrgs-bench` does: time, compare, and leave a table, a .csv, a plot and a .json."""
+"""Runs the benchmark and writes its results: a table, two .csv files, a plot and a .json."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from xrgs.bench import loads, memory, rendering, scale, skips, tables, training
+from xrgs.bench import loads, memory, rendering, scale, shortcuts, tables, training
 from xrgs.errors import XrgsError
 from xrgs.experiment import provenance
 from xrgs.runtime.machine import usable_cores
@@ -25,24 +25,24 @@ if TYPE_CHECKING:
     from xrgs.bench.tables import Row
 
 
-class Grid(NamedTuple):
-    """Which random loads, and at which sizes the rest is timed."""
+class BenchmarkSizes(NamedTuple):
+    """The sizes of what is measured; a load is every number of Gaussians at every image size."""
 
-    gaussians: tuple[int, ...]
-    sizes: tuple[tuple[int, int], ...]
-    step: tuple[int, int, int]  # Gaussians, width and height of the training step
-    views: tuple[int, ...]
-    memory: tuple[int, int, int]  # of the step whose memory is measured
+    gaussians: tuple[int, ...]  # numbers of Gaussians
+    sizes: tuple[tuple[int, int], ...]  # width and height, px
+    step: tuple[int, int, int]  # Gaussians, width and height of the timed training step
+    views: tuple[int, ...]  # numbers of views rendered one after the other
+    memory: tuple[int, int, int]  # Gaussians, width and height of the step whose memory is measured
 
 
-FULL = Grid(
+FULL = BenchmarkSizes(
     gaussians=(10_000, 100_000, 300_000, 1_000_000),
     sizes=((252, 189), (504, 378), (1008, 756)),
     step=(100_000, 504, 378),
     views=(1, 2, 4, 8),
     memory=(300_000, 1008, 756),
 )
-SMOKE = Grid(
+SMOKE = BenchmarkSizes(
     gaussians=(200, 400),
     sizes=((32, 24), (48, 36)),
     step=(300, 80, 60),
@@ -53,10 +53,16 @@ _LR_FACTOR = 5
 
 
 def run(settings: Settings) -> str:
-    """Run the benchmark, or save a load; returns what to print.
+    """Run what the settings choose: the benchmark, `save`, `quality` or `store_cells`.
+
+    Args:
+        settings: The arguments of `xrgs-bench`.
+
+    Returns:
+        The text to print.
 
     Raises:
-        XrgsError: an argument is wrong, or a file cannot be read or written.
+        XrgsError: An argument is wrong, or a file cannot be read or written.
     """
     if settings.save is not None:
         return _save(settings)
@@ -68,49 +74,49 @@ def run(settings: Settings) -> str:
         raise XrgsError("repeats must be at least 1 and threads at least 0")
     counts = sorted({1, settings.threads or usable_cores()})
     backends = ["native", "torch"] if resolve_backend("auto") == "native" else ["torch"]
-    found: dict[str, Any] = {"machine": _machine(backends, counts)}
+    results: dict[str, Any] = {"machine": _machine(backends, counts)}
     if settings.load is not None:
         load = loads.read(Path(settings.load))
-        found |= _time_loads([load], settings, counts, backends)
-        found["skips"] = _time_skips(load, settings, backends)
+        results |= _time_loads([load], settings, counts, backends)
+        results["shortcuts"] = _time_shortcuts(load, settings, backends)
     else:
-        grid = SMOKE if settings.smoke else FULL
+        sizes = SMOKE if settings.smoke else FULL
         chosen = [
             loads.random_load(count, *size, settings.seed)
-            for size in grid.sizes
-            for count in grid.gaussians
+            for size in sizes.sizes
+            for count in sizes.gaussians
         ]
-        found |= _time_loads(chosen, settings, counts, backends)
-        found |= _time_training(grid, settings, counts, backends)
-        found["memory"] = [memory.measure(*grid.memory, backends[0], counts[-1], settings.seed)]
-    found["peak_rss_bytes"] = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
-    _write(found, settings)
-    return tables.text(found)
+        results |= _time_loads(chosen, settings, counts, backends)
+        results |= _time_training(sizes, settings, counts, backends)
+        results["memory"] = [memory.measure(*sizes.memory, backends[0], counts[-1], settings.seed)]
+    results["peak_rss_bytes"] = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
+    _write(results, settings)
+    return tables.text(results)
 
 
 def _save(settings: Settings) -> str:
     if settings.save is None or settings.cell is None or settings.view is None:
         raise XrgsError("save=FILE.npz needs cell=FOLDER and view=NAME")
-    load = loads.from_cell(Path(settings.cell), settings.view)
+    load = loads.load_from_cell(Path(settings.cell), settings.view)
     loads.write(Path(settings.save), load)
     size = f"{load.camera.width} x {load.camera.height} px"
     return f"{settings.save}: {len(load)} Gaussians, {size}"
 
 
 def _scale(settings: Settings) -> str:
-    found = scale.measure(settings.store_cells, Path(settings.out))
+    result = scale.measure(settings.store_cells, Path(settings.out))
     if settings.json is not None:
-        _write_json(settings.json, {"scale": found})
-    return scale.text(found)
+        _write_json(settings.json, {"scale": result})
+    return scale.text(result)
 
 
 def _quality(settings: Settings) -> str:
     from xrgs.bench import quality
-    from xrgs.bench.timing import threads
+    from xrgs.bench.timing import use_threads
 
     if settings.cell is None or settings.steps < 1:
         raise XrgsError("quality=true needs cell=FOLDER and steps of at least 1")
-    with threads(settings.threads or usable_cores()):
+    with use_threads(settings.threads or usable_cores()):
         rows = quality.compare(Path(settings.cell), settings.steps)
     if settings.json is not None:
         _write_json(settings.json, {"quality": rows})
@@ -132,57 +138,60 @@ def _machine(backends: Sequence[str], counts: Sequence[int]) -> dict[str, Any]:
 def _time_loads(
     chosen: Sequence[Load], settings: Settings, counts: Sequence[int], backends: Sequence[str]
 ) -> dict[str, Any]:
-    ways = rendering.ways(backends)
+    methods = rendering.default_methods(backends)
     rows: list[Row] = []
     for load in progress(chosen, "rendering", "load", len(chosen)):
-        error = rendering.errors(load, ways)
-        timed = rendering.time_load(load, ways, counts, settings.repeats)
-        rows += [row | {"error": error[row["way"]]} for row in timed]
-    return {"rows": rows, "ways": [rendering.describe(way) for way in ways]}
+        error = rendering.errors(load, methods)
+        timed = rendering.time_load(load, methods, counts, settings.repeats)
+        rows += [row | {"error": error[row["method"]]} for row in timed]
+    return {"rows": rows, "methods": [rendering.describe(method) for method in methods]}
 
 
 def _time_training(
-    grid: Grid, settings: Settings, counts: Sequence[int], backends: Sequence[str]
+    sizes: BenchmarkSizes, settings: Settings, counts: Sequence[int], backends: Sequence[str]
 ) -> dict[str, Any]:
-    count, width, height = grid.step
+    count, width, height = sizes.step
     load = loads.random_load(count, width, height, settings.seed)
-    views = {"HR": load, "LR": load.smaller(_LR_FACTOR)}
+    views = {"HR": load, "LR": load.downscaled(_LR_FACTOR)}
     repeats = settings.repeats
     return {
-        "views": rendering.time_views(load, backends[0], grid.views, repeats),
-        "losses": training.time_losses(grid.sizes[1:], backends, counts, repeats),
+        "views": rendering.time_views(load, backends[0], sizes.views, repeats),
+        "losses": training.time_losses(sizes.sizes[1:], backends, counts, repeats),
         "resizes": training.time_resizes((width, height), _LR_FACTOR, backends, counts, repeats),
-        "optimizers": training.time_optimizers(grid.gaussians[1:3], backends, counts, repeats),
+        "optimizers": training.time_optimizers(sizes.gaussians[1:3], backends, counts, repeats),
         "steps": training.time_steps(views, backends[0], counts, repeats),
-        "skips": _time_skips(load, settings, backends),
+        "shortcuts": _time_shortcuts(load, settings, backends),
     }
 
 
-def _time_skips(load: Load, settings: Settings, backends: Sequence[str]) -> dict[str, Any]:
-    """Of a view and of the same view at low resolution."""
-    views = (load, load.smaller(_LR_FACTOR))
+def _time_shortcuts(load: Load, settings: Settings, backends: Sequence[str]) -> dict[str, Any]:
+    """Time the shortcuts for a view, and for the same view at low resolution."""
+    views = (load, load.downscaled(_LR_FACTOR))
     backend, repeats = backends[0], settings.repeats
     return {
-        "renders": [row for view in views for row in skips.time_renders(view, backend, repeats)],
-        "steps": skips.time_steps(load, backend, repeats),
+        "renders": [
+            row for view in views for row in shortcuts.time_renders(view, backend, repeats)
+        ],
+        "steps": shortcuts.time_steps(load, backend, repeats),
     }
 
 
-def growth(rows: Sequence[Row], way: str, count: int) -> dict[str, float]:
-    """Exponents of forward and backward time: 1 where twice as many take twice as long.
+def fit_growth(rows: Sequence[Row], method: str, count: int) -> dict[str, float]:
+    """Fit how the forward and backward time grows with Gaussians and pixels.
 
     Args:
-        rows: Of random loads.
-        way: Which of them.
-        count: Threads.
+        rows: Rows of random loads, as `rendering.time_load` gives them.
+        method: Name of the method whose rows are used.
+        count: Number of threads of the rows that are used.
 
     Returns:
-        `gaussians` and `pixels`: a fit of log time to the logarithms of both; empty where the loads
-        differ in neither.
+        The exponents `gaussians` and `pixels` of a power law, fitted by least squares to the
+        logarithms; 1 means that twice as many take twice as long. Empty unless the loads differ in
+        both.
     """
-    used = [row for row in rows if row["way"] == way and row["threads"] == count]
+    used = [row for row in rows if row["method"] == method and row["threads"] == count]
     numbers = np.array([(row["gaussians"], row["width"] * row["height"]) for row in used], float)
-    numbers = numbers.reshape(-1, 2)  # of none too
+    numbers = numbers.reshape(-1, 2)  # also if there are no rows
     if len(np.unique(numbers[:, 0])) < 2 or len(np.unique(numbers[:, 1])) < 2:
         return {}
     times = np.array([row["forward_ms"] + row["backward_ms"] for row in used])
@@ -191,23 +200,24 @@ def growth(rows: Sequence[Row], way: str, count: int) -> dict[str, float]:
     return {"gaussians": float(exponents[0]), "pixels": float(exponents[1])}
 
 
-def _write(found: dict[str, Any], settings: Settings) -> None:
+def _write(results: dict[str, Any], settings: Settings) -> None:
     from xrgs.report.bench_plot import time_against_error
 
-    rows = found["rows"]
-    found["growth"] = growth(rows, rows[0]["way"], rows[0]["threads"])
+    rows = results["rows"]
+    results["growth"] = fit_growth(rows, rows[0]["method"], rows[0]["threads"])
     flat = [tables.flat(row) for row in rows]
-    without = [tables.flat_skip(row) for row in found["skips"]["renders"]]
+    shortcut_rows = [tables.flat_shortcut(row) for row in results["shortcuts"]["renders"]]
     folder = Path(settings.out)
     try:
         folder.mkdir(parents=True, exist_ok=True)
         _write_csv(folder / "bench.csv", flat)
-        _write_csv(folder / "skips.csv", without + found["skips"]["steps"])
-        (folder / "bench.png").write_bytes(time_against_error(flat + tables.skip_points(found)))
+        _write_csv(folder / "shortcuts.csv", shortcut_rows + results["shortcuts"]["steps"])
+        points = flat + tables.shortcut_points(results)
+        (folder / "bench.png").write_bytes(time_against_error(points))
     except OSError as error:
         raise XrgsError(f"{error.filename}: cannot be written: {error.strerror}") from error
     if settings.json is not None:
-        _write_json(settings.json, found)
+        _write_json(settings.json, results)
 
 
 def _write_csv(path: Path, rows: Sequence[Row]) -> None:
@@ -218,8 +228,8 @@ def _write_csv(path: Path, rows: Sequence[Row]) -> None:
         writer.writerows(rows)
 
 
-def _write_json(name: str, found: dict[str, Any]) -> None:
+def _write_json(name: str, results: dict[str, Any]) -> None:
     try:
-        write_json(Path(name).absolute(), found)
+        write_json(Path(name).absolute(), results)
     except OSError as error:
         raise XrgsError(f"{error.filename}: cannot be written: {error.strerror}") from error

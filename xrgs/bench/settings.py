@@ -1,4 +1,4 @@
-"""The arguments of `xrgs-bench`. Without torch, so that `--help` and mistakes answer at once."""
+"""The arguments of `xrgs-bench`, without torch, so that `--help` and mistakes answer at once."""
 
 from __future__ import annotations
 
@@ -7,31 +7,31 @@ from dataclasses import dataclass
 
 @dataclass
 class Settings:
-    """What to time, and where to leave what was measured."""
+    """What to measure, and where to write the results."""
 
     load: str | None = None
-    """A .npz to time in place of the random loads."""
+    """A .npz file to time instead of the random loads: Gaussians and a view, see `save`."""
     save: str | None = None
-    """Make such a file instead of timing anything, from `cell` and `view`."""
+    """Write such a .npz file from `cell` and `view` instead of timing anything."""
     cell: str | None = None
-    """Folder of a trained cell, in its store: of `save` and `quality`."""
+    """Folder of a trained cell in its store, for `save` and `quality`."""
     view: str | None = None
-    """Name of one of its views, trained on or held out."""
+    """Name of a training or test view of `cell`, for `save`."""
     out: str = "xrgs-bench"
-    """Folder of bench.csv and bench.png."""
+    """Folder for bench.csv, shortcuts.csv and bench.png."""
     json: str | None = None
-    """File for every figure, for a program to read."""
+    """File for all results as JSON."""
     repeats: int = 9
-    """Times that each thing is timed, in turn with what it is compared to."""
+    """Number of times that each task is timed, in turn with those it is compared to."""
     threads: int = 0
-    """Beside 1; 0 takes every core."""
+    """Number of threads to time besides 1; 0 means one for each core."""
     smoke: bool = False
-    """Tiny loads: does everything run?"""
+    """Use tiny loads, to check that everything runs."""
     quality: bool = False
-    """Train `cell` again with each cut changed and compare pictures, instead of timing."""
+    """Train `cell` again with each approximation changed and compare PSNR, instead of timing."""
     steps: int = 600
-    """Of `quality`."""
+    """Number of training steps of each run of `quality`."""
     store_cells: int = 0
-    """Time planning, reporting and status over a store of so many cells, instead."""
+    """Instead, time planning, reporting and status over a store of this many cells."""
     seed: int = 0
-    """Of the random loads."""
+    """Seed of the random loads."""

@@ -1,4 +1,4 @@
-"""The figures of a benchmark as text and as flat rows."""
+"""Formats the results of a benchmark as text tables and as flat rows."""
 
 from __future__ import annotations
 
@@ -9,7 +9,11 @@ Row = dict[str, Any]
 
 
 def flat(row: Row) -> Row:
-    """A row without dictionaries in it: `stages_ms.sort` becomes `sort_ms`, as a .csv wants it."""
+    """Flatten a row of `rendering.time_load` for a .csv: `stages_ms.sort` becomes `sort_ms`.
+
+    Args:
+        row: The row, with dictionaries under `stages_ms` and `error`.
+    """
     plain: Row = {}
     for key, value in row.items():
         if key == "stages_ms":
@@ -21,8 +25,12 @@ def flat(row: Row) -> Row:
     return plain
 
 
-def flat_skip(row: Row) -> Row:
-    """A row of `skips.time_renders` without dictionaries: `on.forward_ms` to `on_forward_ms`."""
+def flat_shortcut(row: Row) -> Row:
+    """Flatten a row of `shortcuts.time_renders`: `on.forward_ms` becomes `on_forward_ms`.
+
+    Args:
+        row: The row, with dictionaries under `on` and `off`.
+    """
     plain: Row = {}
     for key, value in row.items():
         if isinstance(value, dict):
@@ -32,37 +40,48 @@ def flat_skip(row: Row) -> Row:
     return plain
 
 
-def skip_points(found: Row) -> list[Row]:
-    """What the plot needs of each skip switched off."""
+def shortcut_points(results: Row) -> list[Row]:
+    """Return the rows of the plot for each shortcut switched off.
+
+    Args:
+        results: All results of the benchmark.
+    """
     return [
         {
-            "way": f"{row['backend']} without skipping {row['skip']}",
+            "method": f"{row['backend']} without shortcut: {row['shortcut']}",
             "threads": row["threads"],
             "gaussians": row["gaussians"],
             "forward_ms": row["off"]["forward_ms"],
             "backward_ms": row["off"]["backward_ms"],
             "image_mean_error": row["off"]["image_mean"],
         }
-        for row in found["skips"]["renders"]
+        for row in results["shortcuts"]["renders"]
     ]
 
 
-def text(found: Row) -> str:
-    """All tables, the widest first."""
-    parts = [_machine(found["machine"]), _renders(found), _stages(found["rows"])]
-    if found.get("growth"):
-        way, growth = found["rows"][0]["way"], found["growth"]
+def text(results: Row) -> str:
+    """Format all tables.
+
+    Args:
+        results: All results of the benchmark.
+    """
+    parts = [_machine(results["machine"]), _renders(results), _stages(results["rows"])]
+    if results.get("growth"):
+        method, growth = results["rows"][0]["method"], results["growth"]
         parts.append(
             f"time grows with Gaussians^{growth['gaussians']:.2f} and pixels^{growth['pixels']:.2f}"
-            f" ({way}, one thread)"
+            f" ({method}, one thread)"
         )
-    if "views" in found:
-        parts += [_views(found["views"]), _kinds("loss, value and gradient", found["losses"])]
-        parts += [_kinds("phi, up and the gradient back", found["resizes"])]
-        parts += [_kinds("Adam, one step", found["optimizers"]), _steps(found["steps"])]
-    parts += [_skips(found["skips"]["renders"]), _step_skips(found["skips"]["steps"])]
-    if "memory" in found:
-        parts.append(_memory(found["memory"]))
+    if "views" in results:
+        parts += [_views(results["views"]), _kinds("loss, value and gradient", results["losses"])]
+        parts += [_kinds("LR view upsampled, value and gradient", results["resizes"])]
+        parts += [_kinds("Adam, one step", results["optimizers"]), _steps(results["steps"])]
+    parts += [
+        _shortcuts(results["shortcuts"]["renders"]),
+        _step_shortcuts(results["shortcuts"]["steps"]),
+    ]
+    if "memory" in results:
+        parts.append(_memory(results["memory"]))
     return "\n\n".join(parts)
 
 
@@ -76,15 +95,15 @@ def _machine(machine: Row) -> str:
     return "\n".join(lines)
 
 
-def _renders(found: Row) -> str:
-    peaks = found["machine"].get("multiply_adds_per_s", {})
+def _renders(results: Row) -> str:
+    peaks = results["machine"].get("multiply_adds_per_s", {})
     lines = []
-    for row in found["rows"]:
+    for row in results["rows"]:
         peak = peaks.get(str(row["threads"]))
         share = peak / row["evaluations_per_s"] if peak and row["backend"] == "native" else None
         lines.append(
             [
-                row["way"],
+                row["method"],
                 str(row["threads"]),
                 str(row["gaussians"]),
                 f"{row['width']}x{row['height']}",
@@ -100,20 +119,21 @@ def _renders(found: Row) -> str:
                 f"{row['times_slower']:.0f}x" if "times_slower" in row else "",
             ]
         )
-    head = "way|threads|Gaussians|size|forward ms|backward ms|M alphas|G alphas/s|FMA/alpha|MB"
+    head = "method|threads|Gaussians|size|forward ms|backward ms|M alphas|G alphas/s|FMA/alpha|MB"
     head += "|mean error|max error|gradient error|slower"
     note = (
-        "least of the repeats; alphas/s of compositing alone, FMA/alpha: multiply-adds that the\n"
-        "measured peak has time for in one; MB: parameters, gradients and buffers; errors against\n"
-        "the torch backend in double, over the middle of the view; slower: than native, in turn"
+        "Times are minima over the repeats. alphas/s: alpha evaluations while compositing;\n"
+        "FMA/alpha: fused multiply-adds at the measured peak in the time of one evaluation;\n"
+        "MB: parameters, gradients and buffers; errors: against torch in float64, over the\n"
+        "middle of the view; slower: time over that of native, timed in turn"
     )
     return f"{_table(head.split('|'), lines)}\n{note}"
 
 
 def _stages(rows: Sequence[Row]) -> str:
-    timed = [row for row in rows if row["stages_ms"] and row["way"] == row["backend"]]
+    timed = [row for row in rows if row["stages_ms"] and row["method"] == row["backend"]]
     if not timed:
-        return "no stages: the native backend was not built"
+        return "There are no times by stage, since the native backend was not built."
     names = list(timed[0]["stages_ms"])
     lines = [
         [str(row["threads"]), str(row["gaussians"]), f"{row['width']}x{row['height']}"]
@@ -127,11 +147,11 @@ def _views(rows: Sequence[Row]) -> str:
     lines = [
         [str(row["views"]), f"{row['ms']:.1f}", f"{row['ms'] / row['views']:.1f}"] for row in rows
     ]
-    return _table(["views", "forward + backward ms", "a view"], lines)
+    return _table(["views", "forward + backward ms", "per view"], lines)
 
 
 def _kinds(title: str, rows: Sequence[Row]) -> str:
-    """Rows of a `kind` each, beside how much longer it took than the first at the same size."""
+    """Format rows of alternatives, with their time over that of the first at the same size."""
     first: dict[object, float] = {}
     lines = []
     for row in rows:
@@ -139,7 +159,7 @@ def _kinds(title: str, rows: Sequence[Row]) -> str:
         base = first.setdefault((size, row["threads"]), row["ms"])
         times = [f"{row['ms']:.2f}", f"{row['median_ms']:.2f}", f"{row['ms'] / base:.2f}x"]
         lines.append([row["kind"], str(row["threads"]), size, *times])
-    return _table([title, "threads", "size", "ms", "median", "to the first"], lines)
+    return _table([title, "threads", "size", "ms", "median", "/ first"], lines)
 
 
 def _steps(rows: Sequence[Row]) -> str:
@@ -157,38 +177,38 @@ def _steps(rows: Sequence[Row]) -> str:
 def _lr_shares(rows: Sequence[Row]) -> list[str]:
     ms = {(row["view"], row["threads"]): row["step_ms"] for row in rows}
     return [
-        f"{count} thread(s): an LR view's step takes {ms['LR', count] / ms['HR', count]:.2f} of an"
-        " HR view's (bar: below 0.33)"
+        f"{count} thread(s): an LR view's step takes {ms['LR', count] / ms['HR', count]:.2f} of the"
+        " time of an HR view's (goal: below 0.33)"
         for count in sorted({row["threads"] for row in rows})
     ]
 
 
-def _skips(rows: Sequence[Row]) -> str:
+def _shortcuts(rows: Sequence[Row]) -> str:
     lines = []
     for row in rows:
         on, off = row["on"], row["off"]
         both = [(on[key], off[key]) for key in ("forward_ms", "backward_ms")]
         lines.append(
-            [row["skip"], str(row["gaussians"]), f"{row['width']}x{row['height']}"]
+            [row["shortcut"], str(row["gaussians"]), f"{row['width']}x{row['height']}"]
             + [f"{value:.1f}" for pair in both for value in pair]
             + [f"{row['times']:.2f}x"]
             + [f"{side['evaluations'] / 1e6:.2f}" for side in (on, off)]
             + [f"{side['image_mean']:.1e}" for side in (on, off)]
             + [f"{side['gradient']:.1e}" for side in (on, off)]
-            + ["no bit" if row["same_bits"] else "rounding or cuts"]
+            + ["nothing" if row["same_bits"] else "rounding"]
         )
-    head = "skipped|Gaussians|size|forward ms on|off|backward ms on|off|off / on|M alphas on|off"
+    head = "shortcut|Gaussians|size|forward ms on|off|backward ms on|off|off / on|M alphas on|off"
     head += "|mean error on|off|gradient error on|off|changes"
-    return f"{_table(head.split('|'), lines)}\none thread; on: skipped, as the program is"
+    return f"{_table(head.split('|'), lines)}\nOne thread. The program runs with every shortcut on."
 
 
-def _step_skips(rows: Sequence[Row]) -> str:
+def _step_shortcuts(rows: Sequence[Row]) -> str:
     lines = []
     for row in rows:
         load = [str(row["gaussians"]), f"{row['width']}x{row['height']}"]
         times = [f"{row['on_ms']:.2f}", f"{row['off_ms']:.2f}", f"{row['times']:.2f}x"]
-        lines.append([row["skip"], row["part"], *load, *times, "no bit"])
-    head = "skipped in a step|part|Gaussians|size|ms on|off|off / on|changes"
+        lines.append([row["shortcut"], row["part"], *load, *times, "nothing"])
+    head = "shortcut of a step|part|Gaussians|size|ms on|off|off / on|changes"
     return _table(head.split("|"), lines)
 
 
@@ -201,37 +221,41 @@ def _memory(rows: Sequence[Row]) -> str:
     for row in rows:
         load = [str(row["threads"]), str(row["gaussians"]), f"{row['width']}x{row['height']}"]
         lines.append(["training step", *load, *(megabytes(row[key]) for key in keys)])
-    head = "memory|threads|Gaussians|size|counted MB|process grew MB|from|to"
+    head = "memory|threads|Gaussians|size|counted MB|growth MB|base RSS MB|peak RSS MB"
     note = (
-        "counted: parameters, gradients, Adam's state, the renderer's buffers; grew: resident at\n"
-        "its highest, less what torch and the program take once loaded\n"
-        "(bar: 300,000 Gaussians at 1008x756 below 1000 MB)"
+        "counted: parameters, gradients, Adam's state and the renderer's buffers; growth: of the\n"
+        "process, from once everything is imported to its peak\n"
+        "(goal: 300,000 Gaussians at 1008x756 below 1000 MB)"
     )
     return f"{_table(head.split('|'), lines)}\n{note}"
 
 
 def quality(rows: Sequence[Row]) -> str:
-    """The table of `xrgs.bench.quality`."""
+    """Format the table of `xrgs.bench.quality`.
+
+    Args:
+        rows: What `quality.compare` returned.
+    """
     lines = []
     for row in rows:
-        picture = [f"{row['psnr']:.3f}", f"{row['difference']:+.3f}"]
+        scores = [f"{row['psnr']:.3f}", f"{row['difference']:+.3f}"]
         work = [str(row["gaussians"]), f"{row['evaluations'] / 1e6:.0f}", f"{row['seconds']:.1f}"]
-        lines.append([row["change"], str(row["steps"]), *picture, *work])
+        lines.append([row["change"], str(row["steps"]), *scores, *work])
     head = "trained|steps|PSNR dB|difference|Gaussians|M alphas|seconds"
     note = (
-        "another seed: what chance does; skips that are not here change no bit, or rounding at a\n"
-        "cut, as the last column of their table says"
+        "Another seed shows what chance does. The shortcuts that xrgs-bench times change nothing\n"
+        "but rounding, as the last column of their table says."
     )
     return f"{_table(head.split('|'), lines)}\n{note}"
 
 
 def _table(head: Sequence[str], lines: Sequence[Sequence[str]]) -> str:
-    """Columns, the first to the left, the others to the right."""
+    """Align columns: the first to the left, the others to the right."""
     widths = [max(map(len, column)) for column in zip(head, *lines, strict=True)]
     return "\n".join(
         "  ".join(
-            cell.ljust(width) if place == 0 else cell.rjust(width)
-            for place, (cell, width) in enumerate(zip(line, widths, strict=True))
+            cell.ljust(width) if column == 0 else cell.rjust(width)
+            for column, (cell, width) in enumerate(zip(line, widths, strict=True))
         ).rstrip()
         for line in [head, *lines]
     )

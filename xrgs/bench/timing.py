@@ -1,4 +1,4 @@
-"""Timing things against one another on a machine that does other work too."""
+"""Times alternatives against one another on a machine that does other work too."""
 
 from __future__ import annotations
 
@@ -12,41 +12,54 @@ import torch
 
 
 @dataclass(frozen=True)
-class Times:
-    """Milliseconds that something took, each time it ran."""
+class Timings:
+    """The durations of one task."""
 
-    all: tuple[float, ...]
+    milliseconds: tuple[float, ...]
+    """Duration of each run, in the order of the runs."""
 
     @property
-    def least(self) -> float:
-        """What it takes when nothing disturbs it."""
-        return min(self.all)
+    def minimum(self) -> float:
+        """The shortest run in ms: the duration when nothing else disturbs the task."""
+        return min(self.milliseconds)
 
     @property
     def median(self) -> float:
-        """What it took mostly."""
-        return statistics.median(self.all)
+        """The median run in ms."""
+        return statistics.median(self.milliseconds)
 
 
-def alternate(things: Mapping[str, Callable[[], object]], repeats: int) -> dict[str, Times]:
-    """Run each thing once to warm up, then all in turn, A B A B, `repeats` times.
+def time_interleaved(tasks: Mapping[str, Callable[[], object]], repeats: int) -> dict[str, Timings]:
+    """Run each task once to warm up, then all of them in turn, A B A B, `repeats` times.
 
-    What slows the machine for a while so slows all of them, and their ratios stay true.
+    Whatever slows the machine down for a while then slows all tasks down, so that the ratios of
+    their durations stay true.
+
+    Args:
+        tasks: The tasks by name.
+        repeats: Number of timed runs of each task.
+
+    Returns:
+        The durations of each task, by its name.
     """
-    for thing in things.values():
-        thing()
-    times: dict[str, list[float]] = {name: [] for name in things}
+    for task in tasks.values():
+        task()
+    durations: dict[str, list[float]] = {name: [] for name in tasks}
     for _ in range(repeats):
-        for name, thing in things.items():
+        for name, task in tasks.items():
             start = time.perf_counter()
-            thing()
-            times[name].append(1e3 * (time.perf_counter() - start))
-    return {name: Times(tuple(values)) for name, values in times.items()}
+            task()
+            durations[name].append(1e3 * (time.perf_counter() - start))
+    return {name: Timings(tuple(values)) for name, values in durations.items()}
 
 
 @contextmanager
-def threads(count: int) -> Iterator[None]:
-    """Let torch, and with it the native kernels, use this many threads for a while."""
+def use_threads(count: int) -> Iterator[None]:
+    """Set the number of threads of torch, and with it of the native kernels, for a `with` block.
+
+    Args:
+        count: Number of threads.
+    """
     before = torch.get_num_threads()
     torch.set_num_threads(count)
     try:

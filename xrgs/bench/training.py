@@ -1,4 +1,4 @@
-"""Loss, optimizer and the whole training step: where its time goes, against the alternatives."""
+"""Times the parts of a training step, and the loss and the optimizer against alternatives."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from torch import Tensor
 from torch.nn.functional import interpolate
 
 from xrgs.bench.loads import Load
-from xrgs.bench.timing import Times, alternate, threads
+from xrgs.bench.timing import Timings, time_interleaved, use_threads
 from xrgs.splat.densify import Densifier
 from xrgs.splat.gaussians import PARAMETERS, Gaussians
 from xrgs.splat.loss import photometric_loss, prepare_target
@@ -21,49 +21,62 @@ from xrgs.splat.rasterize import rasterize
 from xrgs.splat.resample import resize
 from xrgs.splat.settings import DensifySettings, OptimizerSettings, RasterSettings
 
-L1, SSIM = 0.8, 0.2
-PARTS = ("render", "loss", "backward", "optimizer", "densify")
+L1, SSIM = 0.8, 0.2  # weights of the photometric loss
+#: Computes the loss; returns its gradient with respect to the image.
+LossTask = Callable[[], tuple[Tensor, ...]]
+STEP_PARTS = ("render", "loss", "backward", "optimizer", "densify")
 
 
 def time_losses(
     sizes: Sequence[tuple[int, int]], backends: Sequence[str], counts: Sequence[int], repeats: int
 ) -> list[Any]:
-    """Value and gradient of the photometric loss at each (width, height), against kornia's SSIM."""
+    """Time the value and gradient of the photometric loss, against one made of kornia's SSIM.
+
+    Args:
+        sizes: Width and height of each image, px.
+        backends: Names of the backends.
+        counts: Numbers of threads.
+        repeats: Number of timed runs.
+
+    Returns:
+        A row for each `kind` (a backend or "kornia"), number of threads and size.
+    """
     rows = []
     for width, height in sizes:
         generator = torch.Generator().manual_seed(0)
         image, photograph = torch.rand(2, height, width, 3, generator=generator)
         image.requires_grad_()
-        things: dict[str, Callable[[], object]] = {}
+        tasks: dict[str, Callable[[], object]] = {}
         for count in counts:
             for backend in backends:
-                things[f"{backend}/{count}"] = _our_loss(image, photograph, backend, count)
-            things[f"kornia/{count}"] = _kornias_loss(image, photograph, count)
-        times = alternate(things, repeats)
+                tasks[f"{backend}/{count}"] = _our_loss(image, photograph, backend, count)
+            tasks[f"kornia/{count}"] = _kornia_loss(image, photograph, count)
+        times = time_interleaved(tasks, repeats)
         rows += [
-            _named(name, time) | {"width": width, "height": height} for name, time in times.items()
+            _timing_row(name, time) | {"width": width, "height": height}
+            for name, time in times.items()
         ]
     return rows
 
 
-def _our_loss(image: Tensor, photograph: Tensor, backend: str, count: int) -> Callable[[], object]:
-    target = prepare_target(photograph)  # once a view
+def _our_loss(image: Tensor, photograph: Tensor, backend: str, count: int) -> LossTask:
+    target = prepare_target(photograph)  # once per view
 
-    def run() -> object:
-        with threads(count):
+    def run() -> tuple[Tensor, ...]:
+        with use_threads(count):
             loss = photometric_loss(image, target, l1=L1, ssim=SSIM, backend=backend)
             return torch.autograd.grad(loss, image)
 
     return run
 
 
-def _kornias_loss(image: Tensor, photograph: Tensor, count: int) -> Callable[[], object]:
+def _kornia_loss(image: Tensor, photograph: Tensor, count: int) -> LossTask:
     from kornia.losses import ssim_loss
 
     reference = photograph.permute(2, 0, 1)[None]
 
-    def run() -> object:
-        with threads(count):
+    def run() -> tuple[Tensor, ...]:
+        with use_threads(count):
             # kornia's loss is (1 - SSIM) / 2.
             half = ssim_loss(image.permute(2, 0, 1)[None], reference, 11, padding="valid")
             loss = L1 * (image - photograph).abs().mean() + 2 * SSIM * half
@@ -79,54 +92,72 @@ def time_resizes(
     counts: Sequence[int],
     repeats: int,
 ) -> list[Any]:
-    """An LR view brought up to (width, height), as the consistency loss does, and its gradient.
+    """Time the upsampling of an LR view, as in the consistency loss, and its gradient.
 
-    `interpolate` is torch's own function, of the same values.
+    Args:
+        size: Width and height of the result, px.
+        factor: Ratio of the result's sides to the LR view's.
+        backends: Names of the backends.
+        counts: Numbers of threads.
+        repeats: Number of timed runs.
+
+    Returns:
+        A row for each `kind` (a backend, or "interpolate", torch's function with the same values)
+        and number of threads.
     """
     width, height = size
     generator = torch.Generator().manual_seed(0)
     image = torch.rand(height // factor, width // factor, 3, generator=generator)
-    slope = torch.rand(height, width, 3, generator=generator)
+    resized_grad = torch.rand(height, width, 3, generator=generator)
     image.requires_grad_()
 
-    def ours(backend: str, count: int) -> object:
-        with threads(count):
-            resized = resize(image, height, width, backend=backend)
-            return torch.autograd.grad(resized, image, slope)
-
-    def torchs(count: int) -> object:
-        with threads(count):
-            planes = image.permute(2, 0, 1)[None]
-            resized = interpolate(planes, (height, width), mode="bicubic", antialias=True)
-            return torch.autograd.grad(resized, image, slope.permute(2, 0, 1)[None])
-
-    things: dict[str, Callable[[], object]] = {}
+    tasks: dict[str, Callable[[], object]] = {}
     for count in counts:
-        things |= {f"{backend}/{count}": partial(ours, backend, count) for backend in backends}
-        things[f"interpolate/{count}"] = partial(torchs, count)
-    times = alternate(things, repeats)
-    return [
-        _named(name, time) | {"width": width, "height": height, "factor": factor}
-        for name, time in times.items()
-    ]
+        for backend in backends:
+            tasks[f"{backend}/{count}"] = partial(_our_resize, image, resized_grad, backend, count)
+        tasks[f"interpolate/{count}"] = partial(_torch_resize, image, resized_grad, count)
+    times = time_interleaved(tasks, repeats)
+    sizes = {"width": width, "height": height, "factor": factor}
+    return [_timing_row(name, timings) | sizes for name, timings in times.items()]
+
+
+def _our_resize(image: Tensor, resized_grad: Tensor, backend: str, count: int) -> object:
+    height, width, _ = resized_grad.shape
+    with use_threads(count):
+        resized = resize(image, height, width, backend=backend)
+        return torch.autograd.grad(resized, image, resized_grad)
+
+
+def _torch_resize(image: Tensor, resized_grad: Tensor, count: int) -> object:
+    with use_threads(count):
+        planes = image.permute(2, 0, 1)[None]
+        resized = interpolate(planes, resized_grad.shape[:2], mode="bicubic", antialias=True)
+        return torch.autograd.grad(resized, image, resized_grad.permute(2, 0, 1)[None])
 
 
 def time_optimizers(
     sizes: Sequence[int], backends: Sequence[str], counts: Sequence[int], repeats: int
 ) -> list[Any]:
-    """A step of Adam over all parameters of so many Gaussians.
+    """Time a step of Adam over all parameters.
 
-    `torch` is torch's fused step, one optimizer with six groups; `default` is torch.optim.Adam as
-    it comes.
+    Args:
+        sizes: Numbers of Gaussians.
+        backends: Names of the backends; "torch" is torch's fused Adam with six groups.
+        counts: Numbers of threads.
+        repeats: Number of timed runs.
+
+    Returns:
+        A row for each `kind` (a backend, or "default": torch.optim.Adam with its defaults), number
+        of threads and size.
     """
     rows = []
     for size in sizes:
-        things: dict[str, Callable[[], object]] = {}
+        tasks: dict[str, Callable[[], object]] = {}
         for count in counts:
             for kind in (*backends, "default"):
-                things[f"{kind}/{count}"] = _optimizer_step(size, kind, count)
-        times = alternate(things, repeats)
-        rows += [_named(name, time) | {"gaussians": size} for name, time in times.items()]
+                tasks[f"{kind}/{count}"] = _optimizer_step(size, kind, count)
+        times = time_interleaved(tasks, repeats)
+        rows += [_timing_row(name, time) | {"gaussians": size} for name, time in times.items()]
     return rows
 
 
@@ -148,7 +179,7 @@ def _optimizer_step(size: int, kind: str, count: int) -> Callable[[], object]:
         gaussians[name].grad = 1e-4 * torch.randn(gaussians[name].shape, generator=generator)
 
     def run() -> None:
-        with threads(count):
+        with use_threads(count):
             optimizer.step()
 
     return run
@@ -160,16 +191,16 @@ def _optimizer(gaussians: Gaussians, backend: str) -> SplatOptimizer:
     )
 
 
-def _named(name: str, times: Times) -> dict[str, Any]:
+def _timing_row(name: str, times: Timings) -> dict[str, Any]:
     kind, _, count = name.partition("/")
-    return {"kind": kind, "threads": int(count), "ms": times.least, "median_ms": times.median}
+    return {"kind": kind, "threads": int(count), "ms": times.minimum, "median_ms": times.median}
 
 
-class Step:
-    """The parts of a training step on a load, in the order of `PARTS`.
+class TrainingStep:
+    """A training step on a load, whose parts can be run one by one, in the order of `STEP_PARTS`.
 
-    The photograph is the load's own render, and the Gaussians stay as many as they are: nothing
-    reaches the thresholds of densification, whose bookkeeping is timed all the same.
+    The target is the load's own render, slightly brighter. The number of Gaussians stays the same:
+    the densification thresholds are out of reach, but the statistics are gathered.
     """
 
     def __init__(self, load: Load, backend: str, count: int, *, sh_degree: int = 3) -> None:
@@ -196,8 +227,8 @@ class Step:
         self.target = prepare_target(self.rendered.image.detach() + 0.01)
 
     def render(self) -> None:
-        """Activation and the forward pass."""
-        with threads(self.threads):
+        """Activate the parameters and render."""
+        with use_threads(self.threads):
             self.optimizer.zero_grad()
             self.offset = torch.zeros(len(self.gaussians), 2, requires_grad=True)
             self.rendered = rasterize(
@@ -210,36 +241,36 @@ class Step:
             )
 
     def loss(self) -> None:
-        """Its value, and natively its gradient too."""
-        with threads(self.threads):
+        """Compute the loss; the native backend computes its gradient as well."""
+        with use_threads(self.threads):
             self.value = photometric_loss(
                 self.rendered.image, self.target, l1=L1, ssim=SSIM, backend=self.backend
             )
 
     def backward(self) -> None:
-        """To the raw parameters."""
-        with threads(self.threads):
+        """Backpropagate to the raw parameters."""
+        with use_threads(self.threads):
             torch.autograd.backward(self.value)
 
     def optimize(self) -> None:
-        """One step of Adam."""
-        with threads(self.threads):
+        """Take one step of Adam."""
+        with use_threads(self.threads):
             self.optimizer.step(self.camera, sh_degree=self.sh_degree)
 
     def densify(self) -> None:
-        """All steps from one refinement to the next."""
+        """Run densification's part of all steps from one refinement to the next."""
         for step in range(1, self.settings.every + 1):
             self._after_step(step)
 
-    def all(self) -> None:
-        """One whole step, its share of densification's bookkeeping included."""
+    def run_step(self) -> None:
+        """Run one whole step, including its part of densification."""
         for part in (self.render, self.loss, self.backward, self.optimize):
             part()
         self._after_step(1)
 
     def _after_step(self, step: int) -> None:
         camera = self.camera
-        with threads(self.threads):
+        with use_threads(self.threads):
             self.densifier.after_step(
                 step,
                 self.offset.grad,
@@ -249,36 +280,49 @@ class Step:
             )
 
     def counted_bytes(self) -> int:
-        """Parameters, gradients, Adam's state and the renderer's buffers, as training counts."""
+        """Return the bytes of parameters, gradients, Adam's state and the renderer's buffers.
+
+        Training counts the same.
+        """
         model = [self.gaussians[name] for name in PARAMETERS]
         gradients = [value.grad for value in model if value.grad is not None]
-        held = sum(value.nbytes for value in model + gradients)
-        return held + self.optimizer.state_bytes() + self.rendered.buffer_bytes
+        model_bytes = sum(value.nbytes for value in model + gradients)
+        return model_bytes + self.optimizer.state_bytes() + self.rendered.buffer_bytes
 
     def parts(self) -> list[Callable[[], None]]:
-        """One for each of `PARTS`."""
+        """Return the functions of the parts, in the order of `STEP_PARTS`."""
         return [self.render, self.loss, self.backward, self.optimize, self.densify]
 
 
 def time_steps(
     loads: dict[str, Load], backend: str, counts: Sequence[int], repeats: int
 ) -> list[Any]:
-    """Milliseconds of each part of a step for each load and number of threads."""
+    """Time each part of a training step.
+
+    Args:
+        loads: The loads by the name of the view, "HR" or "LR".
+        backend: "native" or "torch".
+        counts: Numbers of threads.
+        repeats: Number of timed runs.
+
+    Returns:
+        A row for each load and number of threads, with `parts_ms` and their sum `step_ms`.
+    """
     steps = {
-        f"{name}/{count}": Step(load, backend, count)
+        f"{name}/{count}": TrainingStep(load, backend, count)
         for name, load in loads.items()
         for count in counts
     }
-    things = {
+    tasks = {
         f"{name}/{part}": run
         for name, step in steps.items()
-        for part, run in zip(PARTS, step.parts(), strict=True)
+        for part, run in zip(STEP_PARTS, step.parts(), strict=True)
     }
-    times = alternate(things, repeats)
+    times = time_interleaved(tasks, repeats)
     rows = []
     for name, step in steps.items():
         view, _, count = name.partition("/")
-        parts = {part: times[f"{name}/{part}"].least for part in PARTS}
+        parts = {part: times[f"{name}/{part}"].minimum for part in STEP_PARTS}
         parts["densify"] /= step.settings.every
         rows.append(
             {

@@ -19,23 +19,23 @@ _MARKERS = "osD^v"
 
 
 def time_against_error(rows: Sequence[Mapping[str, Any]]) -> bytes:
-    """Draw a point for each scene and renderer: lower is faster, further left is more exact.
+    """Draw a point for each scene and method: lower is faster, further left is more exact.
 
     Args:
-        rows: One mapping a measurement, with `way` (the renderer's name), `threads`, `gaussians`,
-            `forward_ms`, `backward_ms` and `image_mean_error`. Only rows of one thread are drawn;
-            a larger mark has more Gaussians.
+        rows: One mapping a measurement, with `method`, `threads`, `gaussians`, `forward_ms`,
+            `backward_ms` and `image_mean_error`. Only rows of one thread are drawn; a larger mark
+            has more Gaussians.
 
     Returns:
         The bytes of a PNG.
     """
-    names = list(dict.fromkeys(row["way"] for row in rows))
+    names = list(dict.fromkeys(row["method"] for row in rows))
     most = max(row["gaussians"] for row in rows)
     with style.context("default"):
         figure = Figure(figsize=(8.0, 5.5), layout="constrained")
         axes = figure.add_subplot()
         for index, name in enumerate(names):
-            points = [row for row in rows if row["way"] == name and row["threads"] == 1]
+            points = [row for row in rows if row["method"] == name and row["threads"] == 1]
             axes.scatter(
                 [max(row["image_mean_error"], _MIN_ERROR) for row in points],
                 [row["forward_ms"] + row["backward_ms"] for row in points],

@@ -1,4 +1,4 @@
-"""What is left out, on and off: the work it spares, and that it changes nothing it shouldn't."""
+"""Each shortcut saves work, and changes no bit unless it says so."""
 
 from __future__ import annotations
 
@@ -8,8 +8,8 @@ from typing import Any
 import pytest
 import torch
 
-from xrgs.bench import skips
-from xrgs.bench.loads import Load
+from xrgs.bench import shortcuts
+from xrgs.bench.loads import Load, random_load
 from xrgs.splat.backend import resolve_backend
 from xrgs.splat.settings import CullingOptions
 
@@ -18,14 +18,12 @@ BACKEND = resolve_backend("auto")
 
 @pytest.fixture(scope="module")
 def rows(wide: Load) -> dict[str, Any]:
-    return {row["skip"]: row for row in skips.time_renders(wide, BACKEND, repeats=1)}
+    return {row["shortcut"]: row for row in shortcuts.time_renders(wide, BACKEND, repeats=1)}
 
 
 @pytest.fixture(scope="module")
 def wide() -> Load:
-    """A third of it out of view, a third under the cut."""
-    from xrgs.bench.loads import random_load
-
+    """Return a load of which a third is out of view and a third below `alpha_min`."""
     load = random_load(300, 120, 90, seed=0)
     means, opacities = load.means.clone(), load.opacities.clone()
     means[:100, 0] += 50
@@ -33,9 +31,9 @@ def wide() -> Load:
     return replace(load, means=means, opacities=opacities)
 
 
-def test_each_skip_is_there_once(rows: dict[str, Any]) -> None:
+def test_each_shortcut_is_timed_once(rows: dict[str, Any]) -> None:
     native = {field.name.replace("_", " ") for field in fields(CullingOptions)}
-    assert set(rows) == {skips.BANDS} | (native if BACKEND == "native" else set())
+    assert set(rows) == {shortcuts.INACTIVE_BANDS} | (native if BACKEND == "native" else set())
     for row in rows.values():
         on, off = row["on"], row["off"]
         for side in (on, off):
@@ -46,27 +44,27 @@ def test_each_skip_is_there_once(rows: dict[str, Any]) -> None:
 
 
 @pytest.mark.skipif(BACKEND == "torch", reason="the native backend was not built")
-def test_blocks_spare_evaluations(rows: dict[str, Any]) -> None:
+def test_culling_blocks_saves_alpha_evaluations(rows: dict[str, Any]) -> None:
     on, off = rows["blocks"]["on"], rows["blocks"]["off"]
     assert on["evaluations"] < 0.8 * off["evaluations"]
 
 
-def test_harmonics_of_zero_change_no_bit(rows: dict[str, Any]) -> None:
-    assert rows[skips.BANDS]["same_bits"] is True
+def test_inactive_bands_change_no_bit(rows: dict[str, Any]) -> None:
+    assert rows[shortcuts.INACTIVE_BANDS]["same_bits"] is True
 
 
-def test_statistics_at_hand_change_no_bit(load: Load) -> None:
-    known, computed = (run() for run in skips._statistics(load, BACKEND))
-    assert torch.equal(known, computed)
-    assert [row["part"] for row in skips.time_steps(load, BACKEND, repeats=1)] == [
+def test_a_prepared_target_changes_no_bit(load: Load) -> None:
+    prepared, computed = (run() for run in shortcuts._statistics(load, BACKEND))
+    assert torch.equal(prepared, computed)
+    assert [row["part"] for row in shortcuts.time_steps(load, BACKEND, repeats=1)] == [
         "loss",
         "optimizer",
     ]
 
 
-def test_zero_moments_are_left_alone(load: Load) -> None:
-    bandless, full = skips.before_and_after_bands(load, BACKEND)
-    for step, moves in ((bandless, False), (full, True)):
+def test_the_optimizer_leaves_zero_moments_alone(load: Load) -> None:
+    degree_0, degree_3 = shortcuts.before_and_after_bands(load, BACKEND)
+    for step, moves in ((degree_0, False), (degree_3, True)):
         before = step.gaussians.shN.detach().clone()
         step.optimize()
         assert torch.equal(step.gaussians.shN, before) != moves

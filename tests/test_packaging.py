@@ -1,0 +1,73 @@
+"""What the package says of itself is what the workflows test and what is installed."""
+
+from __future__ import annotations
+
+import re
+import tomllib
+from importlib import metadata
+from pathlib import Path
+from typing import Any
+
+import pytest
+import yaml
+
+import xrgs
+
+ROOT = Path(__file__).resolve().parents[1]
+PYPROJECT: dict[str, Any] = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))
+PROJECT: dict[str, Any] = PYPROJECT["project"]
+
+
+def workflow(name: str) -> dict[str, Any]:
+    loaded: dict[str, Any] = yaml.safe_load((ROOT / ".github" / "workflows" / name).read_text())
+    return loaded
+
+
+def pythons_of_the_workflow() -> list[str]:
+    versions: list[str] = workflow("ci.yml")["jobs"]["test"]["strategy"]["matrix"]["python"]
+    return versions
+
+
+def test_the_classifiers_name_the_pythons_that_the_workflow_tests() -> None:
+    prefix = "Programming Language :: Python :: 3."
+    named = [c.removeprefix(prefix) for c in PROJECT["classifiers"] if c.startswith(prefix)]
+    assert [f"3.{minor}" for minor in named] == pythons_of_the_workflow()
+    assert PROJECT["requires-python"] == f">={pythons_of_the_workflow()[0]}"
+
+
+def test_wheels_are_built_for_the_pythons_that_the_workflow_tests() -> None:
+    built = PYPROJECT["tool"]["cibuildwheel"]["build"]
+    assert built == [f"cp{version.replace('.', '')}-*" for version in pythons_of_the_workflow()]
+
+
+def test_the_operating_systems_are_those_of_the_test_jobs() -> None:
+    runners = {job["runs-on"].partition("-")[0] for job in workflow("ci.yml")["jobs"].values()}
+    systems = [c for c in PROJECT["classifiers"] if c.startswith("Operating System")]
+    assert runners == {"ubuntu"}
+    assert systems == ["Operating System :: POSIX :: Linux"]
+
+
+def test_every_action_is_pinned_to_a_commit() -> None:
+    for file in sorted((ROOT / ".github" / "workflows").glob("*.yml")):
+        uses = re.findall(r"uses: (\S+)", file.read_text("utf-8"))
+        assert uses
+        assert all(re.fullmatch(r"[\w/-]+@[0-9a-f]{40}", action) for action in uses)
+
+
+def test_the_version_is_the_same_everywhere() -> None:
+    version = PROJECT["version"]
+    assert metadata.version("xrgs") == version
+    changes = (ROOT / "CHANGELOG.md").read_text("utf-8")
+    releases = re.findall(r"^## \[?(\d[\d.]*)\]? - \d{4}-\d{2}-\d{2}$", changes, re.MULTILINE)
+    assert releases[0] == version
+
+
+@pytest.mark.parametrize("name", PROJECT["scripts"])
+def test_every_command_is_installed(name: str) -> None:
+    (command,) = metadata.entry_points(group="console_scripts", name=name)
+    assert command.value == PROJECT["scripts"][name]
+    assert callable(command.load())
+
+
+def test_the_types_are_installed() -> None:
+    assert (Path(xrgs.__file__).parent / "py.typed").is_file()
