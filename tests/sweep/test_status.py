@@ -1,4 +1,4 @@
-"""`xrgs-status`: a store at a glance."""
+"""Tests of the summary of a store."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ def cell(store: Store, name: str, code: dict[str, str] | None = None) -> CellFol
     """A cell that was begun."""
     folder = store.cell(name)
     what = {"splat": {"backend": "torch"}, "code": code or identity.training_code("torch")}
-    folder.begin({"scene": {"name": "room"}}, what)
+    folder.begin({"scene": {"name": "statue"}}, what)
     return folder
 
 
@@ -40,7 +40,7 @@ def store(tmp_path: Path) -> Store:
     store.prepare()
     done(store, "good")
     now = identity.training_code("torch")
-    done(store, "stale", now | {"train.py": "0", "gone.py": "1"})
+    done(store, "stale", now | {"splat/densify.py": "0", "gone.py": "1"})
     (done(store, "corrupt").path / "scores.csv").write_text("view\n")
     done(store, "twice")
     done(store, "twice")
@@ -51,7 +51,7 @@ def store(tmp_path: Path) -> Store:
     assert locks.acquire(store.locks, "busy") is not None
     (store.variants / "fa-bb").mkdir()
     (store.variants / "failed-aa").mkdir()
-    rows = [("good", "room", "baseline"), ("stale", "room", "consistency"), (None, "fern", "x")]
+    rows = [("good", "statue", "baseline"), ("stale", "statue", "consistency"), (None, "fern", "x")]
     store.write_sweep(
         ["a"],
         [
@@ -66,23 +66,23 @@ def test_every_cell_is_counted_and_told_why(store: Store) -> None:
     text = describe(read(store.path))
     assert "7 cells" in text
     assert "3 done, 1 running, 1 unfinished, 1 failed, 1 corrupt" in text
-    assert "1 folders of earlier tries" in text
+    assert "1 folders of earlier attempts" in text
     assert "1 variants, 1 sweeps" in text
-    assert "failed  room / ?  ended by SIGKILL\n" in text
+    assert "failed  statue / ?  ended by SIGKILL\n" in text
     assert f"process {os.getpid()} on" in text
     assert ": training 20 of 80 steps, 3 steps/s, ~20 s left" in text
     assert "scores.csv is missing or has another size" in text
     lines = [line.split() for line in text.splitlines()]
-    assert ["room", "baseline", "1"] in lines
-    assert ["room", "consistency", "1", "1"] in lines
+    assert ["statue", "baseline", "1"] in lines
+    assert ["statue", "consistency", "1", "1"] in lines
 
 
 def test_a_stale_cell_names_the_files_that_are_others_now(store: Store) -> None:
     stale = {cell.id: cell.stale for cell in read(store.path).cells if cell.stale}
-    assert stale == {"stale": ("gone.py", "train.py")}
+    assert stale == {"stale": ("gone.py", "splat/densify.py")}
     text = describe(read(store.path))
     assert "stale: 1 done cells" in text
-    assert "  train.py: 1 cells" in text
+    assert "  splat/densify.py: 1 cells" in text
 
 
 def test_a_change_that_keeps_the_size_is_found_where_that_is_asked_for(store: Store) -> None:

@@ -65,14 +65,7 @@ def measure(cells: int, out: Path) -> dict[str, Any]:
         planned = _LINE.findall(plan)
         for cell_id, seed in planned:
             _copy(template, template.with_name(cell_id), int(seed))
-        timed = {"plan, nothing done": first}
-        for what, command in {
-            "plan, all done": ("sweep", *axes, "dry_run=true"),
-            "sweep, all done: plan, record and report": ("sweep", *axes),
-            "report": ("report", "store=store"),
-            "status": ("status", "store=store"),
-        }.items():
-            _, timed[what] = _run(folder, *command)
+        times = {"plan, nothing done": first} | _time_commands(folder, axes)
         count = len(planned)
         rows = [
             {
@@ -81,10 +74,21 @@ def measure(cells: int, out: Path) -> dict[str, Any]:
                 "cpu_seconds": cpu,
                 "ms_per_cell": 1000 * cpu / count,
             }
-            for what, (wall, cpu) in timed.items()
+            for what, (wall, cpu) in times.items()
         ]
         job = _job_cost(template, folder)
         return {"cells": count, "commands": rows, "job": job} | _storage(template)
+
+
+def _time_commands(folder: Path, axes: tuple[str, ...]) -> dict[str, tuple[float, float]]:
+    """Return the seconds and CPU seconds of each command over a store whose cells are all done."""
+    commands = {
+        "plan, all done": ("sweep", *axes, "dry_run=true"),
+        "sweep, all done: plan, record and report": ("sweep", *axes),
+        "report": ("report", "store=store"),
+        "status": ("status", "store=store"),
+    }
+    return {what: _run(folder, *command)[1] for what, command in commands.items()}
 
 
 def _job_cost(template: Path, folder: Path) -> dict[str, float]:

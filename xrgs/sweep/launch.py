@@ -311,19 +311,19 @@ def _first_line(error: Exception) -> str:
     return f"{type(error).__name__}: {str(error).strip().partition(chr(10))[0]}"
 
 
-def _create_unique(wanted: Path) -> Path:
+def _create_unique(preferred: Path) -> Path:
     """Create a folder, or one with a number appended if another call has it already."""
-    number, folder = 1, wanted
+    number, folder = 1, preferred
     while True:
         try:
             folder.mkdir(parents=True)
         except FileExistsError:
             number += 1
-            folder = wanted.with_name(f"{wanted.name}-{number}")
+            folder = preferred.with_name(f"{preferred.name}-{number}")
         except OSError as error:
             if worker.unwritable(error):
                 raise
-            raise XrgsError(f"hydra.sweep.dir={wanted}: {error}") from error
+            raise XrgsError(f"hydra.sweep.dir={preferred}: {error}") from error
         else:
             return folder
 

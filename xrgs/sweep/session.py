@@ -13,7 +13,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from xrgs.errors import XrgsError
+from xrgs.errors import StoreError, XrgsError
 from xrgs.experiment.identity import changed_code
 from xrgs.safeio import untrusted
 from xrgs.safeio.atomic import write_json
@@ -113,7 +113,11 @@ class SweepSession:
         if not untrusted.is_name(cell_id):
             raise XrgsError(f"{cell_id!r:.80} is not the id of a cell")
         file = self._file(cell_id)
-        content = read_object(file)
+        try:
+            content = read_object(file)
+        except StoreError as error:
+            where = "hydra.sweep.dir must be a folder that every machine of the sweep can read"
+            raise XrgsError(f"{error} ({where})") from error
         try:
             cell = HandOver(content["name"], content["config"], content["identity"])
             wrong = _contradiction(cell, cell_id)

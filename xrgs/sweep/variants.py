@@ -58,11 +58,11 @@ def find_or_build(conf: Conf, store: Store) -> str:
     Raises:
         XrgsError: The photographs are missing, or can't be made into a variant.
     """
-    found = find(conf, store)
-    if found is None:
+    variant_id = find(conf, store)
+    if variant_id is None:
         store.prepare()
-        found = build(conf, store)
-    return found
+        variant_id = build(conf, store)
+    return variant_id
 
 
 def plan(conf: Conf, store: Store, *, allow_build: bool) -> tuple[str | None, str | None]:

@@ -76,7 +76,7 @@ def _run_under_lock(cell: HandOver, store: Store, session: SweepSession) -> str:
     folder = store.cell(cell.cell_id)
     lock = locks.acquire(store.locks, folder.id)
     if lock is None:
-        log_line(f"{folder.id}: another sweep is training this cell, which is left to it")
+        log_line(f"{folder.id}: another sweep is training this cell; this sweep leaves it")
         return LOCKED
     try:
         if folder.state().name == "done":  # finished by another sweep since this one was planned

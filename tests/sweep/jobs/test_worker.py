@@ -1,0 +1,125 @@
+"""Tests of work in a child process: its answer, its errors, and its death."""
+
+from __future__ import annotations
+
+import errno
+import faulthandler
+import json
+import os
+import signal
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from xrgs.errors import XrgsError
+from xrgs.sweep.jobs import supervise, worker
+from xrgs.sweep.jobs.supervise import ProcessEnd
+from xrgs.sweep.jobs.worker import UnwritableError, WorkerError, run_in_child
+
+
+@pytest.fixture
+def child(monkeypatch: pytest.MonkeyPatch) -> Callable[[ProcessEnd, object], None]:
+    """(end, answer) -> stand in for the child process: it writes the answer and ends like this."""
+
+    def stands_in(end: ProcessEnd, answer: object = None) -> None:
+        def run(command: Sequence[str], *_: object) -> ProcessEnd:
+            assert json.loads(Path(command[-2]).read_text()) == {"number": 1}
+            if answer is not None:
+                Path(command[-1]).write_text(json.dumps(answer))
+            return end
+
+        monkeypatch.setattr(supervise, "run_supervised", run)
+
+    return stands_in
+
+
+def test_the_answer_of_the_child_is_returned(child: Callable[..., None]) -> None:
+    child(ProcessEnd(0), {"variant": "v"})
+    assert run_in_child("variant", {"number": 1}) == {"variant": "v"}
+
+
+@pytest.mark.parametrize(
+    ("end", "answer", "error", "message"),
+    [
+        (ProcessEnd(0), {"error": "no photographs"}, WorkerError, "no photographs"),
+        (ProcessEnd(0), {"error": "x", "errno": errno.ENOSPC}, UnwritableError, "x"),
+        (ProcessEnd(0), {"error": "x", "errno": errno.EROFS}, UnwritableError, "x"),
+        (ProcessEnd(0), {"error": "x", "errno": errno.ENOENT}, WorkerError, "x"),
+        (ProcessEnd(-signal.SIGTERM, "it took too long"), None, WorkerError, "it took too long"),
+        (ProcessEnd(os.EX_IOERR), None, UnwritableError, "is the disk full?"),
+        (ProcessEnd(3), None, WorkerError, "ended with exit code 3 before it answered"),
+        (ProcessEnd(-signal.SIGSEGV), None, WorkerError, "ended by SIGSEGV$"),
+        (ProcessEnd(-signal.SIGKILL), None, WorkerError, r"ended by SIGKILL \(out of memory\?\)"),
+    ],
+)
+def test_what_went_wrong_in_the_child_is_raised(
+    child: Callable[..., None],
+    end: ProcessEnd,
+    answer: object,
+    error: type[WorkerError],
+    message: str,
+) -> None:
+    child(end, answer)
+    with pytest.raises(WorkerError, match=message) as caught:
+        run_in_child("cell", {"number": 1})
+    assert type(caught.value) is error
+
+
+@pytest.fixture
+def in_this_process(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> Callable[[Callable[..., dict[str, Any]]], dict[str, Any]]:
+    """(work) -> the answer that the child's `main` writes when it does this work."""
+    for name in ("follow_parent", "offer_to_oom_killer"):
+        monkeypatch.setattr(supervise, name, lambda: None)
+    for name in ("ignore_broken_pipe", "let_openmp_sleep"):
+        monkeypatch.setattr(worker, name, lambda: None)
+    monkeypatch.setattr(faulthandler, "enable", lambda: None)
+
+    def answered(work: Callable[..., dict[str, Any]]) -> dict[str, Any]:
+        monkeypatch.setitem(worker._JOBS, "cell", work)
+        (tmp_path / "request").write_text('{"number": 1}')
+        worker.main("cell", str(tmp_path / "request"), str(tmp_path / "answer"))
+        return dict(json.loads((tmp_path / "answer").read_text()))
+
+    return answered
+
+
+def raising(error: Exception) -> Callable[..., dict[str, Any]]:
+    def work(_: object) -> dict[str, Any]:
+        raise error
+
+    return work
+
+
+def test_the_child_answers_with_the_result_or_the_error(
+    in_this_process: Callable[..., dict[str, Any]], capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert in_this_process(lambda request: {"twice": 2 * request["number"]}) == {"twice": 2}
+    assert in_this_process(raising(XrgsError("no photographs"))) == {"error": "no photographs"}
+    assert capsys.readouterr().err == ""
+    full = in_this_process(raising(OSError(errno.ENOSPC, "no room")))
+    assert full == {"error": "OSError: [Errno 28] no room", "errno": errno.ENOSPC}
+    other = in_this_process(raising(KeyError("k")))
+    assert other == {"error": "KeyError: 'k'", "errno": None}
+    assert "Traceback" in capsys.readouterr().err
+
+
+def test_a_child_that_can_not_write_its_answer_says_so_by_its_exit_code(
+    in_this_process: Callable[..., dict[str, Any]], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def full(*_: object) -> None:
+        raise OSError(errno.ENOSPC, "no room")
+
+    monkeypatch.setattr(worker, "write_json", full)
+    with pytest.raises(SystemExit) as end:
+        in_this_process(lambda _: {})
+    assert end.value.code == os.EX_IOERR
+
+
+def test_a_child_process_answers() -> None:
+    """A process of its own, which fails before it needs torch."""
+    with pytest.raises(WorkerError, match="KeyError: 'conf'"):
+        run_in_child("variant", {})
