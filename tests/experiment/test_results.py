@@ -12,9 +12,8 @@ import pytest
 import torch
 
 from xrgs.capture.variant import CorruptVariant
-from xrgs.errors import XrgsError
+from xrgs.errors import StoreError, XrgsError
 from xrgs.experiment.store import CellFolder, Store
-from xrgs.safeio.records import StoreError
 from xrgs.splat.gaussians import PARAMETERS, Gaussians
 from xrgs.splat.ply import save_ply
 

@@ -11,10 +11,10 @@ from typing import Any
 import pytest
 
 import xrgs
+from xrgs.errors import StoreError
 from xrgs.report import build
 from xrgs.report.collect import ReportError
 from xrgs.report.figures import trade_off
-from xrgs.safeio.records import StoreError
 
 
 @pytest.fixture

@@ -14,10 +14,9 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from xrgs.errors import XrgsError
+from xrgs.errors import StoreError, XrgsError
 from xrgs.experiment.store import CellFolder, Store
 from xrgs.report import build, page
-from xrgs.safeio.records import StoreError
 from xrgs.sweep.estimate import RuntimeEstimator
 from xrgs.sweep.status import describe, read
 

@@ -9,8 +9,9 @@ from typing import TYPE_CHECKING, Any
 
 import pandas as pd
 
+from xrgs.errors import StoreError
 from xrgs.evaluation.metrics import METRICS
-from xrgs.safeio.records import StoreError, as_number, read_object
+from xrgs.safeio.records import as_number, read_object
 from xrgs.safeio.untrusted import is_name, printable
 
 if TYPE_CHECKING:
