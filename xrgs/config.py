@@ -70,7 +70,7 @@ class SfmConf:
     min_inliers: int = MISSING
     """Inliers that register a view; the first pair needs 10/3 of it, as in COLMAP (30 and 100)."""
     fallbacks: bool = MISSING
-    """Whether other recipes are tried, in the order of `xrgs.capture.placing`, where this one
+    """Whether other recipes are tried, in the order of `xrgs.capture.registration`, where this one
     registers too few views."""
     reference: bool = MISSING
     """Whether the undegraded photographs are placed too, to report how far off the mixed poses are.

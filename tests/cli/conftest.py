@@ -73,7 +73,7 @@ def sweep_here(
 ) -> Callable[..., tuple[int, str, str]]:
     """(*arguments) -> exit code, stdout and stderr of `xrgs-sweep`, run in this process."""
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(sweep, "stoppable", nullcontext)  # keep pytest's own signal handlers
+    monkeypatch.setattr(sweep, "exit_on_signal", nullcontext)  # keep pytest's own signal handlers
 
     def run(*arguments: str) -> tuple[int, str, str]:
         monkeypatch.setattr(sys, "argv", ["xrgs-sweep", *arguments])

@@ -32,7 +32,7 @@ def gaussians(data: Dataset) -> Gaussians:
 @pytest.fixture
 def view(data: Dataset) -> LoadedView:
     """A view of noise, large enough for torch to divide its sums among threads."""
-    width, height = 400, 300
+    width, height = 240, 180
     noise = torch.rand(height, width, 3, generator=torch.Generator().manual_seed(1))
     K = torch.tensor([[width, 0.0, width / 2], [0.0, width, height / 2], [0.0, 0.0, 1.0]])
     return replace(data.test[0], camera=Camera(torch.eye(4), K, width, height), image=noise)

@@ -125,7 +125,7 @@ def test_a_cell_killed_in_training_and_again_in_evaluation_goes_on(
     step = random.randrange(1, conf.train.steps)
     killed(conf, tmp_path / "a", step)
     with monkeypatch.context() as patch:
-        kill_at(patch, protocol, "score", 1)
+        kill_at(patch, protocol, "score_views", 1)
         with pytest.raises(Kill):
             cell.run_cell(conf, VARIANT, begin(conf, tmp_path / "a"))
     folder = begin(conf, tmp_path / "a")
