@@ -340,6 +340,7 @@ def test_absgrad(
     assert absolute["means2d_offset"].sum() > 1.5 * offset.sum()
 
 
+@pytest.mark.slow
 def test_gradients_are_nearly_as_exact_as_float32_in_torch(
     make_camera: MakeCamera, make_scene: MakeScene
 ) -> None:

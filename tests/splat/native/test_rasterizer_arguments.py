@@ -250,6 +250,7 @@ except MemoryError as error:
 
 
 @pytest.mark.skipif(not os.path.exists("/proc/self/statm"), reason="reads Linux's /proc")  # noqa: PTH110
+@pytest.mark.slow
 def test_lists_beyond_memory_are_a_clear_error() -> None:
     # 30,000 Gaussians over 10,000 tiles each: 300 million pairs.
     result = subprocess.run(

@@ -73,7 +73,8 @@ def test_without_a_cut_every_tile_lists_every_gaussian(make_projected: MakeProje
     grid = TileGrid(40, 30, 8)
     projected = make_projected(40, 30)
     tile, gaussian = intersect_tiles(projected, grid, RasterSettings(alpha_min=0.0))
-    # exp(-708) is where the reach ends: only specks beyond 37 sigmas may be left out.
+    # Without alpha_min the ellipse ends where alpha is exp(-708): only specks beyond 37 standard
+    # deviations may be left out.
     assert len(tile) > 0.3 * grid.columns * grid.rows * len(projected.depths)
     assert set(gaussian.tolist()) == set(range(len(projected.depths)))
 
