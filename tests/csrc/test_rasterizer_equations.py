@@ -1,0 +1,283 @@
+"""The equations of docs/rasterizer.md agree with autograd through the torch rasterizer in float64.
+
+The kernels are tested against the torch rasterizer elsewhere; these tests keep the page right. The
+names are those of the page, and comments give the numbers of its equations.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import pytest
+import torch
+from torch import Tensor
+from torch.linalg import cross
+
+from xrgs.splat.cameras import Camera
+from xrgs.splat.rasterize import rasterize
+from xrgs.splat.settings import RasterSettings
+from xrgs.splat.sh import sh_basis
+
+N, WIDTH, HEIGHT = 14, 14, 10
+FX, FY, CX, CY = 13.0, 14.0, 6.3, 6.0
+SETTINGS = RasterSettings()
+NAMES = ("means", "quats", "scales", "opacities", "sh0", "shN")
+
+
+def dot(a: Tensor, b: Tensor) -> Tensor:
+    return (a * b).sum(-1)
+
+
+def random(*shape: int, generator: torch.Generator) -> Tensor:
+    return torch.randn(*shape, generator=generator, dtype=torch.float64)
+
+
+@pytest.fixture(scope="module")
+def camera() -> Camera:
+    K = torch.tensor([[FX, 0, CX], [0, FY, CY], [0, 0, 1]], dtype=torch.float64)
+    rotation, _ = torch.linalg.qr(random(3, 3, generator=torch.Generator().manual_seed(5)))
+    viewmat = torch.eye(4, dtype=torch.float64)
+    viewmat[:3, :3] = rotation * torch.linalg.det(rotation)
+    viewmat[:3, 3] = torch.tensor([0.3, -0.2, 0.5])
+    return Camera(viewmat, K, WIDTH, HEIGHT)
+
+
+@pytest.fixture(scope="module")
+def scene(camera: Camera) -> dict[str, Tensor]:
+    """Gaussians in and around the image; some are so far outside that slopes are clamped."""
+    g = torch.Generator().manual_seed(1)
+    z = 2 + 3 * torch.rand(N, generator=g, dtype=torch.float64)
+    pixel = (torch.rand(N, 2, generator=g, dtype=torch.float64) * 1.9 - 0.45) * torch.tensor(
+        [WIDTH, HEIGHT]
+    )
+    local = torch.stack([(pixel[:, 0] - CX) / FX * z, (pixel[:, 1] - CY) / FY * z, z], dim=-1)
+    return {
+        "means": (local - camera.viewmat[:3, 3]) @ camera.viewmat[:3, :3],
+        "quats": random(N, 4, generator=g),
+        "scales": torch.exp(0.5 * random(N, 3, generator=g)) * 3 * z[:, None] / FX,
+        "opacities": 0.1 + 0.89 * torch.rand(N, generator=g, dtype=torch.float64),
+        "sh0": random(N, 1, 3, generator=g),
+        "shN": 0.3 * random(N, 15, 3, generator=g),
+    }
+
+
+@dataclass
+class Forward:
+    """Equations 1 to 10 for every Gaussian."""
+
+    scene: dict[str, Tensor]
+    camera: Camera
+    antialiased: bool
+
+    def __post_init__(self) -> None:
+        s, self.W = self.scene, self.camera.viewmat[:3, :3]
+        local = s["means"] @ self.W.T + self.camera.viewmat[:3, 3]
+        self.x, self.y, self.z = local.unbind(-1)  # 1
+        self.mean2d = torch.stack(
+            [FX * self.x / self.z + CX, FY * self.y / self.z + CY], dim=-1
+        )  # 2
+        self.sx, self.sx_free = self._clamped(self.x / self.z, CX, FX, WIDTH)
+        self.sy, self.sy_free = self._clamped(self.y / self.z, CY, FY, HEIGHT)
+        self.q = s["quats"] / s["quats"].norm(dim=-1, keepdim=True)
+        self.Q = self._rotation()
+        self.a = self.W @ (self.Q * s["scales"][:, None, :])
+        self.m0 = (FX / self.z)[:, None] * (self.a[:, 0] - self.sx[:, None] * self.a[:, 2])  # 4
+        self.m1 = (FY / self.z)[:, None] * (self.a[:, 1] - self.sy[:, None] * self.a[:, 2])
+        self.n = cross(self.m0, self.m1)
+        eps = SETTINGS.eps2d
+        xx, yy = dot(self.m0, self.m0), dot(self.m1, self.m1)
+        self.xx, self.xy, self.yy = xx + eps, dot(self.m0, self.m1), yy + eps  # 5
+        self.D = dot(self.n, self.n) + eps * (xx + yy) + eps * eps  # 6
+        self.lxx = (self.yy / (2 * self.D)).sqrt()  # 7
+        self.lxy = self.lxx * self.xy / self.yy
+        self.lyy = 1 / (2 * self.yy).sqrt()
+        offset = s["means"] - self.camera.position
+        self.distance = offset.norm(dim=-1, keepdim=True)
+        self.r = offset / self.distance
+        self.Y = sh_basis(3, self.r)
+        self.coefficients = torch.cat([s["sh0"], s["shN"]], dim=1)
+        self.unclamped = 0.5 + torch.einsum("nk,nkc->nc", self.Y, self.coefficients)  # 9
+        self.c = self.unclamped.clamp_min(0)
+        self.n_length = self.n.norm(dim=-1)
+        self.compensation = self.n_length / self.D.sqrt()
+        self.o = s["opacities"] * (self.compensation if self.antialiased else 1)  # 10
+
+    @staticmethod
+    def _clamped(slope: Tensor, centre: float, focal: float, size: int) -> tuple[Tensor, Tensor]:
+        margin = 0.3 * 0.5 * size / focal  # 3
+        low, high = -centre / focal - margin, (size - centre) / focal + margin
+        return slope.clamp(low, high), (low <= slope) & (slope <= high)
+
+    def _rotation(self) -> Tensor:
+        w, x, y, z = self.q.unbind(-1)
+        rows = [
+            *(1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)),
+            *(2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)),
+            *(2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)),
+        ]
+        return torch.stack(rows, dim=-1).reshape(-1, 3, 3)
+
+
+@dataclass
+class PairGrads:
+    """Equations 8 and 14 to 18 and 21: one pixel after another, summed over all pixels."""
+
+    f: Forward
+    background: Tensor
+
+    def __post_init__(self) -> None:
+        self.image = torch.zeros(HEIGHT, WIDTH, 3, dtype=torch.float64)
+        self.alpha = torch.zeros(HEIGHT, WIDTH, dtype=torch.float64)
+        self.sums = torch.zeros(N, 6, dtype=torch.float64)
+        self.v_color = torch.zeros(N, 3, dtype=torch.float64)
+        self.absgrad = torch.zeros(N, 2, dtype=torch.float64)
+
+    def add_pixel(self, row: int, column: int, v_image: Tensor, v_alpha: Tensor) -> None:
+        f = self.f
+        dx, dy = column + 0.5 - f.mean2d[:, 0], row + 0.5 - f.mean2d[:, 1]
+        u, v = f.lxx * dx - f.lxy * dy, f.lyy * dy
+        raw = f.o * torch.exp(-u * u - v * v)
+        alpha = torch.where(raw < SETTINGS.alpha_min, 0.0, raw.clamp_max(SETTINGS.alpha_max))  # 8
+        T, composited = torch.ones((), dtype=torch.float64), []
+        for i in torch.argsort(f.z).tolist():
+            if T * (1 - alpha[i]) <= SETTINGS.transmittance_min:
+                break
+            composited.append((i, alpha[i] * T))
+            self.image[row, column] += alpha[i] * T * f.c[i]
+            T = T * (1 - alpha[i])  # 14
+        self.image[row, column] += T * self.background  # 15
+        self.alpha[row, column] = 1 - T
+        R = torch.zeros((), dtype=torch.float64)
+        for i, weight in reversed(composited):
+            G = f.c[i] @ v_image - self.background @ v_image + v_alpha  # 16
+            g = weight * (G - R) * (raw[i] <= SETTINGS.alpha_max)  # 17
+            R = R + alpha[i] * (G - R)
+            x, y = dx[i], dy[i]
+            self.sums[i] += g * torch.stack([torch.ones_like(x), x, y, x * x, x * y, y * y])  # 18
+            self.v_color[i] += weight * v_image
+            by_y = f.lyy[i] * v[i] - f.lxy[i] * u[i]
+            self.absgrad[i] += torch.stack([2 * g * f.lxx[i] * u[i], 2 * g * by_y]).abs()  # 21
+
+
+def gradients(f: Forward, pairs: PairGrads) -> dict[str, Tensor]:
+    """Equations 19 to 32."""
+    S1, Sx, Sy, Sxx, Sxy, Syy = pairs.sums.unbind(-1)
+    v_o = S1 / f.o  # 19
+    Su = f.lxx * Sx - f.lxy * Sy
+    v_mean2d = torch.stack([2 * f.lxx * Su, 2 * (f.lyy**2 * Sy - f.lxy * Su)], dim=-1)  # 20
+    v_lxx = -2 * (f.lxx * Sxx - f.lxy * Sxy)  # 22
+    v_lxy = 2 * (f.lxx * Sxy - f.lxy * Syy)
+    v_lyy = -2 * f.lyy * Syy
+    shared = f.lxx * v_lxx + f.lxy * v_lxy
+    v_xy = f.lxx / f.yy * v_lxy  # 23
+    v_yy = (shared / 2 - f.lyy * v_lyy / 2 - f.lxy * v_lxy) / f.yy
+    v_D = -shared / (2 * f.D)
+    v_n_length, v_opacity = torch.zeros_like(v_D), v_o
+    if f.antialiased:  # 24
+        v_D = v_D - v_o * f.o / (2 * f.D)
+        v_n_length = v_o * f.scene["opacities"] / f.D.sqrt()
+        v_opacity = v_o * f.compensation
+    v_n = (2 * v_D + v_n_length / f.n_length)[:, None] * f.n
+    eps = SETTINGS.eps2d
+    v_m0 = cross(f.m1, v_n) + 2 * (eps * v_D)[:, None] * f.m0 + v_xy[:, None] * f.m1  # 25
+    v_m1 = cross(v_n, f.m0) + 2 * (v_yy + eps * v_D)[:, None] * f.m1 + v_xy[:, None] * f.m0
+    v_mean, v_scale, v_quat = geometry_gradients(f, v_mean2d, v_m0, v_m1)
+    v_unclamped = torch.where(f.unclamped >= 0, pairs.v_color, 0.0)
+    v_coefficients = f.Y[:, :, None] * v_unclamped[:, None, :]  # 31
+    direction = f.r.clone().requires_grad_()
+    colors = torch.einsum("nk,nkc->nc", sh_basis(3, direction), f.coefficients)
+    (v_r,) = torch.autograd.grad((v_unclamped * colors).sum(), direction)
+    v_mean = v_mean + (v_r - dot(v_r, f.r)[:, None] * f.r) / f.distance  # 32
+    return {
+        "means": v_mean,
+        "quats": v_quat,
+        "scales": v_scale,
+        "opacities": v_opacity,
+        "sh0": v_coefficients[:, :1],
+        "shN": v_coefficients[:, 1:],
+        "means2d_offset": v_mean2d,
+    }
+
+
+def geometry_gradients(
+    f: Forward, v_mean2d: Tensor, v_m0: Tensor, v_m1: Tensor
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Equations 26 to 30: means (without their colour's part), scales, quaternions."""
+    v_a0, v_a1 = (FX / f.z)[:, None] * v_m0, (FY / f.z)[:, None] * v_m1  # 26
+    v_a = torch.stack([v_a0, v_a1, -f.sx[:, None] * v_a0 - f.sy[:, None] * v_a1], dim=1)
+    v_sx = torch.where(f.sx_free, -dot(v_a0, f.a[:, 2]), 0.0)
+    v_sy = torch.where(f.sy_free, -dot(v_a1, f.a[:, 2]), 0.0)
+    v_x = (FX * v_mean2d[:, 0] + v_sx) / f.z  # 27
+    v_y = (FY * v_mean2d[:, 1] + v_sy) / f.z
+    v_z = -(f.x * v_x + f.y * v_y + dot(v_m0, f.m0) + dot(v_m1, f.m1)) / f.z
+    v_mean = torch.stack([v_x, v_y, v_z], dim=-1) @ f.W  # 28
+    v_B = f.W.T @ v_a
+    v_scale = (v_B * f.Q).sum(1)  # 29
+    V = v_B * f.scene["scales"][:, None, :]
+    w, x, y, z = f.q.unbind(-1)
+    V00, V01, V02, V10, V11, V12, V20, V21, V22 = V.flatten(1).unbind(-1)
+    rows = [  # 30
+        x * (V21 - V12) + y * (V02 - V20) + z * (V10 - V01),
+        y * (V10 + V01) + z * (V02 + V20) - 2 * x * (V11 + V22) + w * (V21 - V12),
+        x * (V10 + V01) + z * (V21 + V12) - 2 * y * (V00 + V22) + w * (V02 - V20),
+        x * (V02 + V20) + y * (V21 + V12) - 2 * z * (V00 + V11) + w * (V10 - V01),
+    ]
+    v_unit = 2 * torch.stack(rows, dim=-1)
+    length = f.scene["quats"].norm(dim=-1, keepdim=True)
+    return v_mean, v_scale, (v_unit - dot(v_unit, f.q)[:, None] * f.q) / length
+
+
+@pytest.mark.parametrize("antialiased", [False, True])
+def test_the_equations_are_those_of_the_torch_rasterizer(
+    scene: dict[str, Tensor], camera: Camera, antialiased: bool
+) -> None:
+    g = torch.Generator().manual_seed(2)
+    v_image, v_alpha = random(HEIGHT, WIDTH, 3, generator=g), random(HEIGHT, WIDTH, generator=g)
+    background = (0.2, 0.5, 0.9)
+    expected: dict[str, Tensor] = {}
+    for absgrad in (True, False):
+        leaves = {name: scene[name].clone().requires_grad_() for name in NAMES}
+        offset = torch.zeros(N, 2, dtype=torch.float64, requires_grad=True)
+        raster = RasterSettings(antialiased=antialiased, background=background, absgrad=absgrad)
+        render = rasterize(
+            **leaves,
+            camera=camera,
+            settings=raster,
+            sh_degree=3,
+            means2d_offset=offset,
+            backend="torch",
+        )
+        ((render.image * v_image).sum() + (render.alpha * v_alpha).sum()).backward()  # type: ignore[no-untyped-call]
+        leaves["absgrad" if absgrad else "means2d_offset"] = offset
+        expected |= {name: leaf.grad for name, leaf in leaves.items() if leaf.grad is not None}
+
+    f = Forward(scene, camera, antialiased)
+    pairs = PairGrads(f, torch.tensor(background, dtype=torch.float64))
+    for row in range(HEIGHT):
+        for column in range(WIDTH):
+            pairs.add_pixel(row, column, v_image[row, column], v_alpha[row, column])
+    ours = gradients(f, pairs) | {"absgrad": pairs.absgrad}
+
+    assert not bool(f.sx_free.all() & f.sy_free.all())  # Eq. 3 clamps some
+    assert bool((f.unclamped < 0).any())  # and Eq. 9
+    torch.testing.assert_close(pairs.image, render.image.detach(), rtol=0, atol=1e-12)
+    torch.testing.assert_close(pairs.alpha, render.alpha.detach(), rtol=0, atol=1e-12)
+    assert ours.keys() == expected.keys()
+    for name, value in ours.items():
+        assert (value - expected[name]).norm() <= 1e-12 * expected[name].norm(), name
+
+
+def test_the_cutoff_ellipse(scene: dict[str, Tensor], camera: Camera) -> None:
+    """Equations 11 to 13, against a walk around each ellipse."""
+    f = Forward(scene, camera, antialiased=False)
+    rho = torch.log(f.o / SETTINGS.alpha_min).sqrt()[:, None]  # 11
+    angle = torch.linspace(0, 2 * torch.pi, 20_001, dtype=torch.float64)
+    dy = rho * angle.sin() / f.lyy[:, None]
+    dx = (rho * angle.cos() + f.lxy[:, None] * dy) / f.lxx[:, None]
+    box = (2 * rho[:, 0] ** 2)[:, None] * torch.stack([f.xx, f.yy], dim=-1)  # 12
+    walked = torch.stack([dx.amax(1), dy.amax(1)], dim=-1)
+    torch.testing.assert_close(walked, box.sqrt(), rtol=1e-7, atol=0)
+    shear = f.lxy / f.lyy
+    dy_at_xmax = rho[:, 0] / f.lyy * shear / (1 + shear**2).sqrt()  # 13
+    rightmost = dy.gather(1, dx.argmax(1, keepdim=True))[:, 0]
+    torch.testing.assert_close(rightmost, dy_at_xmax, rtol=0, atol=1e-3 * float(dy.max()))
