@@ -74,7 +74,7 @@ def in_this_process(
     """(work) -> the answer that the child's `main` writes when it does this work."""
     for name in ("follow_parent", "offer_to_oom_killer"):
         monkeypatch.setattr(supervise, name, lambda: None)
-    for name in ("ignore_broken_pipe", "let_openmp_sleep"):
+    for name in ("ignore_broken_pipe", "set_passive_openmp_wait"):
         monkeypatch.setattr(worker, name, lambda: None)
     monkeypatch.setattr(faulthandler, "enable", lambda: None)
 
