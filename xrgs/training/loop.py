@@ -112,15 +112,12 @@ def _run_steps(run: _Run, checkpoint: Checkpoint) -> None:
             backend=backend,
         )
         # Loss: L1 and SSIM against the photograph, then the terms and weights of the components.
+        image, target = render.image, run.targets[view.name]
+        weights = components.pixel_weights(step)
         loss = photometric_loss(
-            render.image,
-            run.targets[view.name],
-            l1=1 - ssim,
-            ssim=ssim,
-            pixel_weight=components.pixel_weights(step),
-            backend=backend,
+            image, target, l1=1 - ssim, ssim=ssim, pixel_weight=weights, backend=backend
         )
-        loss = components.modify_loss(loss, render.image, gaussians, step)
+        loss = components.modify_loss(loss, image, gaussians, step)
         # Backward, then the components' changes of the gradients.
         optimizer.zero_grad()
         torch.autograd.backward(loss)
