@@ -12,6 +12,9 @@ from types import ModuleType
 import pytest
 
 import xrgs
+from xrgs.capture.dataset import Dataset
+from xrgs.config import Conf
+from xrgs.training import count_matching
 
 HEAVY = ("torch", "pandas", "numpy", "hydra", "kornia", "pycolmap", "matplotlib", "skimage")
 #: Names for planning and for looking at results; using them must not import torch.
@@ -35,7 +38,7 @@ def static_imports() -> dict[str, str]:
     modules: dict[str, str] = {}
     for node in block.body:
         assert isinstance(node, ast.ImportFrom)
-        modules |= {alias.name: str(node.module) for alias in node.names}
+        modules |= {alias.asname or alias.name: str(node.module) for alias in node.names}
     return modules
 
 
@@ -49,7 +52,7 @@ def test_type_checkers_and_python_see_the_same_names() -> None:
 def test_every_name_is_there_and_documented(name: str) -> None:
     value = getattr(xrgs, name)
     assert not isinstance(value, ModuleType)
-    assert value.__name__ == name
+    assert value.__name__ == xrgs._NAMES_IN_MODULES.get(name, name)
     assert value.__module__ == xrgs._MODULES[name] or inspect.isfunction(value)
     text = inspect.getdoc(value) or ""
     assert text.splitlines()[0].endswith(".")
@@ -61,3 +64,17 @@ def test_every_name_is_there_and_documented(name: str) -> None:
 def test_an_unknown_name_is_an_attribute_error() -> None:
     with pytest.raises(AttributeError, match="module 'xrgs' has no attribute 'rasterise'"):
         xrgs.rasterise  # type: ignore[attr-defined]  # noqa: B018
+
+
+def test_train_matches_counts_where_its_config_says_so(
+    data: Dataset, baseline: Conf, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    matched: list[int] = []
+    monkeypatch.setattr(
+        count_matching,
+        "train_count_matched",
+        lambda _, conf, __: matched.append(conf.components.count_matched.gaussians),
+    )
+    baseline.components.count_matched.gaussians = 70
+    xrgs.train(data, baseline)
+    assert matched == [70]

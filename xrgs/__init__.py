@@ -32,7 +32,7 @@ if TYPE_CHECKING:
     from xrgs.splat.render_result import Render
     from xrgs.splat.rendering import rasterize
     from xrgs.splat.settings import RasterSettings
-    from xrgs.training.loop import train
+    from xrgs.training.count_matching import train_cell as train
 
 __version__ = "0.1.0"
 
@@ -53,6 +53,8 @@ __all__ = [
     "train",
 ]
 
+#: Public names that differ from those in their modules.
+_NAMES_IN_MODULES = {"train": "train_cell"}
 #: The module of each public name; the imports above say the same to type checkers and editors.
 _MODULES = {
     "Camera": "xrgs.splat.cameras",
@@ -68,7 +70,7 @@ _MODULES = {
     "rasterization": "xrgs.splat.gsplat_api",
     "rasterize": "xrgs.splat.rendering",
     "save_ply": "xrgs.splat.ply",
-    "train": "xrgs.training.loop",
+    "train": "xrgs.training.count_matching",
 }
 
 
@@ -78,7 +80,8 @@ if not TYPE_CHECKING:  # else type checkers would take any name to be there
         """Import a public name when it is first used (PEP 562)."""
         if name not in _MODULES:
             raise AttributeError(f"module 'xrgs' has no attribute {name!r}")
-        value = globals()[name] = getattr(import_module(_MODULES[name]), name)
+        inner_name = _NAMES_IN_MODULES.get(name, name)
+        value = globals()[name] = getattr(import_module(_MODULES[name]), inner_name)
         return value
 
 
