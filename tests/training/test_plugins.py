@@ -52,7 +52,6 @@ class Plugin(Component):
 @pytest.fixture
 def install(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Install]:
     """Install a package, as pip lays it out, in a folder on `sys.path`."""
-    before = set(sys.modules)
     monkeypatch.syspath_prepend(tmp_path)
     identity.plugin_code.cache_clear()
 
@@ -70,8 +69,9 @@ def install(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Install
 
     yield installed
     identity.plugin_code.cache_clear()
-    for name in set(sys.modules) - before:
-        del sys.modules[name]
+    for name, module in list(sys.modules.items()):
+        if str(getattr(module, "__file__", "")).startswith(str(tmp_path)):
+            del sys.modules[name]
 
 
 def build(baseline: Conf, data: Dataset, **values: object) -> Components:

@@ -54,7 +54,7 @@ def ssim(image: Tensor, target: Tensor) -> float:
     It is `kornia.metrics.ssim`: a Gaussian window of 11 x 11 px and sigma 1.5, data range 1,
     borders reflected. gsplat's evaluation gives the same to the fourth digit.
 
-    Source: Wang et al. 2004, "Image quality assessment: from error visibility to structural
+    Source: [wang2004] "Image quality assessment: from error visibility to structural
     similarity".
 
     Args:
@@ -83,7 +83,7 @@ def ssim(image: Tensor, target: Tensor) -> float:
 def lpips(image: Tensor, target: Tensor) -> float | None:
     """Compute the perceptual distance LPIPS, version 0.1, with AlexNet (`alex` in gsplat).
 
-    Source: Zhang et al. 2018, "The unreasonable effectiveness of deep features as a perceptual
+    Source: [zhang2018] "The unreasonable effectiveness of deep features as a perceptual
     metric"; see `xrgs.evaluation.lpips.network`.
 
     Args:

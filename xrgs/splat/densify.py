@@ -1,6 +1,6 @@
 """Adaptive density control: growing, pruning and resetting Gaussians.
 
-Kerbl et al. 2023 (3D Gaussian Splatting), section 5.2, as gsplat's `DefaultStrategy`
+3D Gaussian Splatting [kerbl2023, section 5.2], as `DefaultStrategy` of gsplat [ye2025]
 (`strategy/default.py` and `strategy/ops.py` of release 1.5.3) computes it: given the same inputs,
 the results are the same.
 

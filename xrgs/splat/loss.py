@@ -1,6 +1,6 @@
 """The photometric loss of 3D Gaussian Splatting: L1 and structural dissimilarity.
 
-Kerbl et al. 2023 (3D Gaussian Splatting), section 5.1, equation 7: (1 - lambda) L1 + lambda D-SSIM
+3D Gaussian Splatting [kerbl2023, section 5.1, equation 7]: (1 - lambda) L1 + lambda D-SSIM
 with lambda = 0.2. The dissimilarity is 1 - SSIM, as in the code of that paper and in gsplat.
 """
 

@@ -31,13 +31,13 @@ class RasterSettings:
     transmittance_min: float = 1e-4
     """A pixel ends before the Gaussian that would leave it this transmittance or less."""
     antialiased: bool = False
-    """Compensate the opacity for `eps2d`, as the 2D Mip filter of Mip-Splatting does."""
+    """Compensate the opacity for `eps2d`, as the 2D Mip filter of Mip-Splatting [yu2024] does."""
     background: tuple[float, float, float] = (0.0, 0.0, 0.0)
     """Colour behind the last Gaussian."""
     absgrad: bool = False
     """Make the gradient of `means2d_offset`, for each axis, the sum of the absolute values of the
-    pixels' gradients, so that pixels which pull a Gaussian apart do not cancel (AbsGS; gsplat's
-    `absgrad`)."""
+    pixels' gradients, so that pixels which pull a Gaussian apart do not cancel (AbsGS
+    [ye2024absgs]; gsplat's `absgrad`)."""
 
 
 @dataclass(frozen=True)

@@ -20,8 +20,8 @@ if TYPE_CHECKING:
 class EpochSampler:
     """Samples training views epoch by epoch, one view a step.
 
-    An epoch is a random permutation of the views that `trains_on` allows when the epoch begins. A
-    view that `trains_on` no longer allows when its turn comes is skipped; one that becomes allowed
+    An epoch is a random permutation of the views that `allows_view` allows when the epoch begins. A
+    view that it no longer allows when the view's turn comes is skipped; one that becomes allowed
     during an epoch takes part from the next epoch on.
 
     Attributes:
@@ -34,7 +34,7 @@ class EpochSampler:
         views: Sequence[LoadedView],
         seed: int,
         steps: int,
-        trains_on: Callable[[Step], bool],
+        allows_view: Callable[[Step], bool],
     ) -> None:
         """Start before the first step.
 
@@ -42,11 +42,11 @@ class EpochSampler:
             views: The training views; their names are unique.
             seed: `seed` of the config; the order of the views depends on it alone.
             steps: Number of steps of the whole run.
-            trains_on: Whether a step may train on its view.
+            allows_view: Whether a step may train on its view.
         """
         self.views = views
         self.steps = steps
-        self.trains_on = trains_on
+        self.allows_view = allows_view
         self.next_step = 0
         self.generator = seeded_generator(seed, "views")
         self.remaining: list[LoadedView] = []
@@ -58,7 +58,7 @@ class EpochSampler:
         """Return the next step with its view.
 
         Raises:
-            XrgsError: `trains_on` allows no view at this step.
+            XrgsError: `allows_view` allows no view at this step.
         """
         if self.next_step >= self.steps:
             raise StopIteration
@@ -80,7 +80,7 @@ class EpochSampler:
         self.remaining = [allowed[i] for i in order]
 
     def _allows(self, view: LoadedView) -> bool:
-        return self.trains_on(Step(self.next_step, self.steps, view))
+        return self.allows_view(Step(self.next_step, self.steps, view))
 
     def state_dict(self) -> State:
         """Return the next step's number, the rest of the epoch and the generator's state."""

@@ -1,6 +1,6 @@
 """Lists the photographs in a folder: any folder of images, or a scene in LLFF's layout.
 
-LLFF's layout (Mildenhall et al. 2019, "Local light field fusion") has the photographs in `images/`,
+LLFF's layout ([mildenhall2019], "Local light field fusion") has the photographs in `images/`,
 copies that are smaller by a factor N in `images_N/`, and poses in `poses_bounds.npy`, which are not
 read.
 """

@@ -1,6 +1,6 @@
 """The `motorcycle` stereo pair of Middlebury 2014, which is in scikit-image's wheel (741 x 500 px).
 
-Source: Scharstein et al. 2014, "High-resolution stereo datasets with subpixel-accurate ground
+Source: [scharstein2014] "High-resolution stereo datasets with subpixel-accurate ground
 truth". The pair is rectified: both cameras have one orientation, and are 193.001 mm apart along x.
 """
 

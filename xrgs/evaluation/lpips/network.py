@@ -1,6 +1,6 @@
 """LPIPS with AlexNet, version 0.1, in plain torch: torchvision is not needed.
 
-Source: Zhang et al. 2018, "The unreasonable effectiveness of deep features as a perceptual metric",
+Source: [zhang2018] "The unreasonable effectiveness of deep features as a perceptual metric",
 and the authors' package `lpips`.
 """
 
@@ -29,7 +29,7 @@ MIN_SIDE = 31
 
 
 def distance(image: Tensor, target: Tensor, weights: Mapping[str, Tensor]) -> Tensor:
-    """Compute how different two images look (Zhang et al. 2018, equation 1).
+    """Compute how different two images look [zhang2018, equation 1].
 
     The rectified features of each layer are normalised to unit length over the channels. Their
     squared differences are weighted per channel by the learned linear heads, averaged over the

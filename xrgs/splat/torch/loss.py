@@ -49,7 +49,7 @@ def weighted_photometric_loss(
 def structural_similarity(image: Tensor, target: Target) -> Tensor:
     """Return the mean SSIM over pixels and channels (padding "valid").
 
-    Wang et al. 2004, equation 13, with a data range of 1: what gsplat's trainer calls as
+    [wang2004, equation 13] with a data range of 1: what gsplat's trainer calls as
     `fused_ssim(padding="valid")`.
 
     Args:
@@ -63,7 +63,7 @@ def structural_similarity(image: Tensor, target: Target) -> Tensor:
 
 
 def ssim_map(image: Tensor, target: Target) -> Tensor:
-    """Return the SSIM of every window that lies inside the image (Wang et al. 2004, equation 13).
+    """Return the SSIM of every window that lies inside the image [wang2004, equation 13].
 
     Args:
         image: [H, W, 3] render, of any floating type.

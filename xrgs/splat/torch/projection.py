@@ -1,6 +1,6 @@
 """Projection of Gaussians to ellipses on the image plane, and culling of those out of view.
 
-Elliptical weighted averaging (Zwicker et al. 2001) as 3D Gaussian Splatting has it (Kerbl et al.
+Elliptical weighted averaging [zwicker2001] as 3D Gaussian Splatting has it (Kerbl et al.
 2023, section 4, equations 5 and 6) and as gsplat 1.5 computes it (`_fully_fused_projection` of
 `cuda/_torch_impl.py`). The one difference is that the determinant and the quadratic form are
 written so that nothing cancels in float32.
@@ -58,7 +58,7 @@ def project(
 
     With M = J W R S (equations 5 and 6 of 3D Gaussian Splatting), a [2, 3] matrix, the covariance
     on the image plane is M M^T + eps2d I. With `settings.antialiased` the opacity is multiplied by
-    sqrt(det(M M^T) / det(M M^T + eps2d I)), the 2D Mip filter of Mip-Splatting (Yu et al. 2024) as
+    sqrt(det(M M^T) / det(M M^T + eps2d I)), the 2D Mip filter of Mip-Splatting [yu2024] as
     gsplat has it (`calc_compensations`).
 
     Args:

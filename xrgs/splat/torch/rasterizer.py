@@ -180,7 +180,7 @@ class _PixelOffset(torch.autograd.Function):
     """An offset [B, K, 2] expanded to every pixel of a tile: x and y, [B, K, tile, tile] each.
 
     The gradient of the offset is the sum of the absolute values of its pixels' gradients: the
-    homodirectional gradient of AbsGS (Ye et al. 2024), gsplat's `absgrad`.
+    homodirectional gradient of AbsGS [ye2024absgs], gsplat's `absgrad`.
     """
 
     @staticmethod

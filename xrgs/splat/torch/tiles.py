@@ -1,6 +1,6 @@
 """The Gaussians that each tile of the image composites, and tiles grouped into batches.
 
-The tiles of 3D Gaussian Splatting (Kerbl et al. 2023, section 6; gsplat's `_isect_tiles`). Where
+The tiles of 3D Gaussian Splatting [kerbl2023, section 6] (gsplat's `_isect_tiles`). Where
 those list every tile that a bounding box overlaps, these find the ellipse's extent in each row of
 tiles.
 """
