@@ -10,9 +10,8 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from copy import copy
-from dataclasses import fields, replace
+from dataclasses import replace
 from statistics import median
-from typing import Any
 
 import pytest
 import torch
@@ -24,7 +23,7 @@ from xrgs.splat.cameras import Camera
 from xrgs.splat.gaussians import ActivatedGaussians
 from xrgs.splat.rasterize import rasterize
 from xrgs.splat.render_result import Render
-from xrgs.splat.settings import CullingOptions, RasterSettings
+from xrgs.splat.settings import RasterSettings
 
 Scene = dict[str, Tensor]
 MakeCamera = Callable[..., Camera]
@@ -174,29 +173,6 @@ def test_bands_above_the_degree_have_no_gradient(
     _, gradients, _ = check(scene, camera, sh_degree=1)
     assert (gradients["shN"][:, 3:] == 0).all()
     assert (gradients["shN"][:, :3] != 0).any()
-
-
-def test_harmonics_whose_gradient_is_not_wanted_cost_none(
-    isa: str, make_camera: MakeCamera, make_scene: MakeScene
-) -> None:
-    camera = rounded(make_camera(turned=True))
-    scene = single(make_scene(45, camera))
-    gradients: dict[bool, dict[str, Tensor | None]] = {}
-    for wanted in (True, False):
-        leaves = {name: scene[name].clone().requires_grad_() for name in NAMES}
-        leaves["shN"].requires_grad_(wanted)
-        gaussians = ActivatedGaussians(**leaves)
-        render = rasterize(*gaussians, camera, RasterSettings(), sh_degree=3, backend="native")
-        torch.autograd.backward(render.image.square().sum())
-        gradients[wanted] = {name: leaf.grad for name, leaf in leaves.items()}
-    assert gradients[True].pop("shN") is not None
-    assert gradients[False].pop("shN") is None
-    assert gradients[False].keys() == gradients[True].keys()
-    for name, gradient in gradients[True].items():
-        other = gradients[False][name]
-        assert gradient is not None
-        assert other is not None
-        assert torch.equal(other, gradient), name
 
 
 def test_antialiased_before_a_background(
@@ -392,61 +368,6 @@ def test_random_scenes(
     scene["scales"][::2, 0] *= stretch
     scene["means"][1::7] -= 2 * (scene["means"][1::7] - camera.position)  # behind
     check(scene, camera, RasterSettings(antialiased=antialiased, background=(0.3, 0.6, 0.1)))
-
-
-# --- culling ------------------------------------------------------------------------------------
-
-
-def render_with(
-    culling: CullingOptions, scene: Scene, camera: Camera
-) -> tuple[Render, Scene, dict[str, int]]:
-    """The render, its gradients, and the work that each kind of culling lessens."""
-    from xrgs.splat.native.rasterizer import render_culled
-
-    leaves = {name: scene[name].clone().requires_grad_() for name in NAMES}
-    gaussians = ActivatedGaussians(**leaves)
-    done = render_culled(gaussians, camera, RasterSettings(), 3, None, culling)
-    graph: Any = done.image.grad_fn
-    frame = graph.frame
-    work = {
-        "out_of_view": int(done.visible.sum()),
-        "sub_threshold": int(done.visible.sum()),
-        "tiles": frame.pair_count,
-        "blocks": done.evaluations,
-        "saturated": done.evaluations,
-    }
-    torch.autograd.backward(done.image.square().sum())
-    gradients = {name: leaf.grad for name, leaf in leaves.items() if leaf.grad is not None}
-    return done, gradients, work
-
-
-@pytest.mark.parametrize("name", [*(field.name for field in fields(CullingOptions)), "all"])
-def test_culling_makes_no_difference(
-    isa: str, make_camera: MakeCamera, make_scene: MakeScene, name: str
-) -> None:
-    camera = rounded(make_camera(60, 50, focal=60.0, turned=True))
-    scene = single(make_scene(1500, camera, seed=14, size=3.0))
-    scene["opacities"][::3] = 0.99
-    scene["opacities"][1::9] = torch.linspace(0, 1 / 255, 167)
-    scene["scales"][::4, 0] *= 8
-    scene["means"][::50] -= 100 * camera.viewmat[0, :3]  # far to the left
-    names = [field.name for field in fields(CullingOptions)] if name == "all" else [name]
-    usual, usual_gradients, usual_work = render_with(CullingOptions(), scene, camera)
-    done, gradients, work = render_with(
-        CullingOptions(**dict.fromkeys(names, False)), scene, camera
-    )
-    assert torch.equal(done.image, usual.image)
-    assert torch.equal(done.alpha, usual.alpha)
-    for key, gradient in gradients.items():
-        error = (gradient - usual_gradients[key]).norm()
-        assert error <= 1e-5 * usual_gradients[key].norm(), key
-        assert (gradient[~usual.visible] == 0).all(), key
-    for culled in names:
-        assert work[culled] > usual_work[culled], culled
-    exact, _ = run(scene, camera, RasterSettings(), "torch", torch.float64)
-    error = (done.image.double() - exact.image).abs().detach()
-    assert error.mean() <= 1e-6
-    assert error.max() <= 2e-3
 
 
 def test_a_large_scene_is_within_the_bounds(make_camera: MakeCamera, make_scene: MakeScene) -> None:

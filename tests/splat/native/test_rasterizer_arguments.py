@@ -125,6 +125,29 @@ def test_gradients_are_handed_over_without_a_copy(
     assert all(place % 64 == 0 for place in places)
 
 
+def test_harmonics_whose_gradient_is_not_wanted_is_not_computed(
+    isa: str, make_camera: MakeCamera, make_scene: MakeScene
+) -> None:
+    camera = make_camera(turned=True)
+    scene = make_scene(45, camera, dtype=torch.float32)
+    gradients: dict[bool, dict[str, Tensor | None]] = {}
+    for wanted in (True, False):
+        leaves = {name: scene[name].clone().requires_grad_() for name in NAMES}
+        leaves["shN"].requires_grad_(wanted)
+        gaussians = ActivatedGaussians(**leaves)
+        render = rasterize(*gaussians, camera, RasterSettings(), sh_degree=3, backend="native")
+        torch.autograd.backward(render.image.square().sum())
+        gradients[wanted] = {name: leaf.grad for name, leaf in leaves.items()}
+    assert gradients[True].pop("shN") is not None
+    assert gradients[False].pop("shN") is None
+    assert gradients[False].keys() == gradients[True].keys()
+    for name, gradient in gradients[True].items():
+        other = gradients[False][name]
+        assert gradient is not None
+        assert other is not None
+        assert torch.equal(other, gradient), name
+
+
 def test_a_forked_child_renders(large: tuple[Scene, Camera]) -> None:
     scene, camera = large
     values, view = [scene[name] for name in NAMES], make_view(camera)

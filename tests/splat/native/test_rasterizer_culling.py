@@ -1,0 +1,77 @@
+"""The culling of the compiled rasterizer: each kind changes the work and not the image."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import fields
+from typing import Any
+
+import pytest
+import torch
+from torch import Tensor
+
+from xrgs.splat.cameras import Camera
+from xrgs.splat.gaussians import PARAMETERS, ActivatedGaussians
+from xrgs.splat.rasterize import rasterize
+from xrgs.splat.render_result import Render
+from xrgs.splat.settings import CullingOptions, RasterSettings
+
+Scene = dict[str, Tensor]
+MakeCamera = Callable[..., Camera]
+MakeScene = Callable[..., dict[str, Tensor]]
+
+pytest.importorskip("xrgs._native")
+
+
+def render_with(
+    culling: CullingOptions, scene: Scene, camera: Camera
+) -> tuple[Render, Scene, dict[str, int]]:
+    """The render, its gradients, and the work that each kind of culling lessens."""
+    from xrgs.splat.native.rasterizer import render_culled
+
+    leaves = {name: scene[name].clone().requires_grad_() for name in PARAMETERS}
+    gaussians = ActivatedGaussians(**leaves)
+    done = render_culled(gaussians, camera, RasterSettings(), 3, None, culling)
+    graph: Any = done.image.grad_fn
+    frame = graph.frame
+    work = {
+        "out_of_view": int(done.visible.sum()),
+        "sub_threshold": int(done.visible.sum()),
+        "tiles": frame.pair_count,
+        "blocks": done.evaluations,
+        "saturated": done.evaluations,
+    }
+    torch.autograd.backward(done.image.square().sum())
+    gradients = {name: leaf.grad for name, leaf in leaves.items() if leaf.grad is not None}
+    return done, gradients, work
+
+
+@pytest.mark.parametrize("name", [*(field.name for field in fields(CullingOptions)), "all"])
+def test_culling_makes_no_difference(
+    isa: str, make_camera: MakeCamera, make_scene: MakeScene, name: str
+) -> None:
+    camera = make_camera(60, 50, focal=60.0, turned=True)
+    camera = Camera(camera.viewmat.float(), camera.K.float(), camera.width, camera.height)
+    scene = make_scene(1500, camera, seed=14, size=3.0, dtype=torch.float32)
+    scene["opacities"][::3] = 0.99
+    scene["opacities"][1::9] = torch.linspace(0, 1 / 255, 167)
+    scene["scales"][::4, 0] *= 8
+    scene["means"][::50] -= 100 * camera.viewmat[0, :3]  # far to the left
+    names = [field.name for field in fields(CullingOptions)] if name == "all" else [name]
+    usual, usual_gradients, usual_work = render_with(CullingOptions(), scene, camera)
+    done, gradients, work = render_with(
+        CullingOptions(**dict.fromkeys(names, False)), scene, camera
+    )
+    assert torch.equal(done.image, usual.image)
+    assert torch.equal(done.alpha, usual.alpha)
+    for key, gradient in gradients.items():
+        error = (gradient - usual_gradients[key]).norm()
+        assert error <= 1e-5 * usual_gradients[key].norm(), key
+        assert (gradient[~usual.visible] == 0).all(), key
+    for culled in names:
+        assert work[culled] > usual_work[culled], culled
+    exact_scene = ActivatedGaussians(**{key: value.double() for key, value in scene.items()})
+    exact = rasterize(*exact_scene, camera, RasterSettings(), sh_degree=3, backend="torch")
+    error = (done.image.double() - exact.image).abs().detach()
+    assert error.mean() <= 1e-6
+    assert error.max() <= 2e-3
