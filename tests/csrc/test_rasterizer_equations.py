@@ -14,7 +14,7 @@ from torch import Tensor
 from torch.linalg import cross
 
 from xrgs.splat.cameras import Camera
-from xrgs.splat.rasterize import rasterize
+from xrgs.splat.rasterize import rasterize_parameters
 from xrgs.splat.settings import RasterSettings
 from xrgs.splat.sh import sh_basis
 
@@ -239,7 +239,7 @@ def test_the_equations_are_those_of_the_torch_rasterizer(
         leaves = {name: scene[name].clone().requires_grad_() for name in NAMES}
         offset = torch.zeros(N, 2, dtype=torch.float64, requires_grad=True)
         raster = RasterSettings(antialiased=antialiased, background=background, absgrad=absgrad)
-        render = rasterize(
+        render = rasterize_parameters(
             **leaves,
             camera=camera,
             settings=raster,

@@ -16,7 +16,7 @@ from xrgs.config import Conf
 from xrgs.evaluation import protocol
 from xrgs.splat.cameras import Camera
 from xrgs.splat.gaussians import Gaussians, from_points
-from xrgs.splat.rasterize import rasterize
+from xrgs.splat.rasterize import rasterize_parameters
 
 
 @pytest.fixture
@@ -47,7 +47,7 @@ def test_scores_and_pngs_are_of_the_render_with_all_sh_degrees(
     images = {}
     with torch.no_grad():
         for degree in (0, 3):
-            render = rasterize(
+            render = rasterize_parameters(
                 *gaussians.activated(), view.camera, conf.raster, sh_degree=degree, backend="torch"
             )
             images[degree] = render.image.double().numpy().clip(0, 1)

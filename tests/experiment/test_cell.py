@@ -23,8 +23,9 @@ from xrgs.capture.views import Variant
 from xrgs.config import Conf
 from xrgs.evaluation import protocol
 from xrgs.experiment import cell
+from xrgs.experiment.cell_folder import CellFolder
 from xrgs.experiment.identity import cell_identity
-from xrgs.experiment.store import CellFolder, Store
+from xrgs.experiment.store import Store
 from xrgs.safeio.atomic import write_json
 from xrgs.safeio.hashing import digest
 from xrgs.splat.backend import resolve_backend

@@ -13,7 +13,8 @@ import torch
 
 from xrgs.capture.variant import CorruptVariant
 from xrgs.errors import StoreError, XrgsError
-from xrgs.experiment.store import CellFolder, Store
+from xrgs.experiment.cell_folder import CellFolder
+from xrgs.experiment.store import Store
 from xrgs.splat.gaussians import PARAMETERS, Gaussians
 from xrgs.splat.ply import save_ply
 

@@ -10,7 +10,8 @@ import pytest
 
 from xrgs.errors import StoreError
 from xrgs.experiment import store
-from xrgs.experiment.store import CellFolder, Store
+from xrgs.experiment.cell_folder import CellFolder
+from xrgs.experiment.store import Store
 from xrgs.safeio.atomic import write_json
 
 

@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from xrgs.experiment.store import CellFolder, Store
+from xrgs.experiment.cell_folder import CellFolder
+from xrgs.experiment.store import Store
 
 SUMMARY = {
     "training_time_s": 100.0,

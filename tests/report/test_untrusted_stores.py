@@ -15,7 +15,8 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from xrgs.errors import StoreError, XrgsError
-from xrgs.experiment.store import CellFolder, Store
+from xrgs.experiment.cell_folder import CellFolder
+from xrgs.experiment.store import Store
 from xrgs.report import build, page
 from xrgs.sweep.estimate import RuntimeEstimator
 from xrgs.sweep.status import describe, read

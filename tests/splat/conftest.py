@@ -14,7 +14,7 @@ from xrgs.splat.cameras import Camera
 from xrgs.splat.densify import Densifier, Groups
 from xrgs.splat.gaussians import PARAMETERS, ActivatedGaussians, Gaussians
 from xrgs.splat.optimizer import SplatOptimizer
-from xrgs.splat.rasterize import rasterize
+from xrgs.splat.rasterize import rasterize_parameters
 from xrgs.splat.render_result import Render
 from xrgs.splat.settings import DensifySettings, OptimizerSettings, RasterSettings
 
@@ -104,7 +104,7 @@ def draw() -> Callable[..., Render]:
     ) -> Render:
         gaussians = ActivatedGaussians(*(scene[name] for name in PARAMETERS))
         settings = raster or RasterSettings()
-        return rasterize(*gaussians, camera, settings, sh_degree=sh_degree, **options)
+        return rasterize_parameters(*gaussians, camera, settings, sh_degree=sh_degree, **options)
 
     return draw
 

@@ -20,7 +20,7 @@ from xrgs.splat.normalize import (
     transform_points,
     transform_viewmats,
 )
-from xrgs.splat.rasterize import rasterize
+from xrgs.splat.rasterize import rasterize_parameters
 from xrgs.splat.settings import RasterSettings
 
 Array = NDArray[np.float64]
@@ -173,7 +173,7 @@ def test_renders_of_both_worlds_are_equal(world: World) -> None:
     colors = torch.rand(count, 1, 3, dtype=torch.float64)
 
     def draw(viewmat: Array, means: Array, size: float) -> Tensor:
-        return rasterize(
+        return rasterize_parameters(
             torch.from_numpy(means),
             torch.ones(count, 4, dtype=torch.float64),
             torch.full((count, 3), 0.1 * size, dtype=torch.float64),

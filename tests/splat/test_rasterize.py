@@ -1,4 +1,4 @@
-"""The arguments of `rasterize`: what it accepts, and the errors that name what it does not."""
+"""The arguments of `rasterize_parameters`: what it accepts, and the errors that name what it does not."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from torch import Tensor
 
 from xrgs.splat.cameras import Camera
 from xrgs.splat.gaussians import ActivatedGaussians
-from xrgs.splat.rasterize import rasterize
+from xrgs.splat.rasterize import rasterize_parameters
 from xrgs.splat.render_result import Render
 from xrgs.splat.settings import RasterSettings
 
@@ -39,7 +39,7 @@ def draw(make_camera: MakeCamera, scene: Scene) -> Draw:
         backend: str = "torch",
         **change: Tensor,
     ) -> Render:
-        return rasterize(
+        return rasterize_parameters(
             *ActivatedGaussians(**(scene | change)),
             make_camera(),
             RasterSettings(),

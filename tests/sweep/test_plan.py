@@ -9,7 +9,8 @@ from pathlib import Path
 import pytest
 
 from xrgs.config import Conf
-from xrgs.experiment.store import CellState, Store
+from xrgs.experiment.cell_folder import CellState
+from xrgs.experiment.store import Store
 from xrgs.safeio.atomic import write_json
 from xrgs.sweep.axes import CellSpec
 from xrgs.sweep.plan import PlannedCell, describe, expected_length, identified, ready

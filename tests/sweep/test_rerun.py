@@ -15,8 +15,9 @@ import pytest
 from xrgs.config import Conf
 from xrgs.errors import XrgsError
 from xrgs.experiment import provenance
+from xrgs.experiment.cell_folder import CellFolder
 from xrgs.experiment.identity import cell_identity
-from xrgs.experiment.store import CellFolder, Store
+from xrgs.experiment.store import Store
 from xrgs.safeio.atomic import write_json
 from xrgs.safeio.hashing import digest
 from xrgs.sweep.jobs import worker

@@ -11,7 +11,8 @@ import pytest
 
 from xrgs.errors import XrgsError
 from xrgs.experiment import identity
-from xrgs.experiment.store import CellFolder, Store
+from xrgs.experiment.cell_folder import CellFolder
+from xrgs.experiment.store import Store
 from xrgs.runtime.progress import Progress
 from xrgs.safeio.atomic import write_json
 from xrgs.sweep import locks

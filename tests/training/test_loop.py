@@ -70,7 +70,7 @@ def plain_loop(data: Dataset, conf: Conf) -> Gaussians:
     for step in EpochSampler(data.train, seed, steps, lambda _: True):
         camera, degree = step.view.camera, min(step.number, 3)
         offset = torch.zeros(len(gaussians), 2, requires_grad=True)
-        render = rasterize.rasterize(
+        render = rasterize.rasterize_parameters(
             *gaussians.activated(),
             camera,
             RasterSettings(),
@@ -270,9 +270,9 @@ def test_the_sh_bands_are_switched_on_in_turn(
 
     def spy(*arguments: Any, sh_degree: int, **others: Any) -> rasterize.Render:
         degrees.append(sh_degree)
-        return rasterize.rasterize(*arguments, sh_degree=sh_degree, **others)
+        return rasterize.rasterize_parameters(*arguments, sh_degree=sh_degree, **others)
 
-    monkeypatch.setattr(loop, "rasterize", spy)
+    monkeypatch.setattr(loop, "rasterize_parameters", spy)
     short.train.steps = 60
     train(data, short)
     assert degrees == [min(step // 2, 3) for step in range(60)]

@@ -60,7 +60,7 @@ class Load:
 
     @property
     def parameters(self) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]:
-        """The six parameters in the order in which `rasterize` takes them."""
+        """The six parameters in the order in which `rasterize_parameters` takes them."""
         sh0, rest = self.sh[:, :1].contiguous(), self.sh[:, 1:].contiguous()
         return self.means, self.quats, self.scales, self.opacities, sh0, rest
 
@@ -239,7 +239,7 @@ def load_cell_dataset(folder: Path) -> Dataset:
         XrgsError: The cell isn't done, or its variant isn't in the store.
     """
     from xrgs.capture import dataset, variant
-    from xrgs.experiment.store import CellFolder
+    from xrgs.experiment.cell_folder import CellFolder
     from xrgs.safeio.records import read_json
 
     state = CellFolder(folder).state()

@@ -16,7 +16,7 @@ from xrgs.bench.loads import load_cell_dataset
 from xrgs.evaluation import metrics
 from xrgs.safeio.records import read_json
 from xrgs.splat.backend import resolve_backend
-from xrgs.splat.rasterize import rasterize
+from xrgs.splat.rasterize import rasterize_parameters
 from xrgs.training.count_matching import train_cell
 
 if TYPE_CHECKING:
@@ -89,7 +89,7 @@ def _psnr(trained: TrainingResult, views: Sequence[LoadedView], conf: Conf) -> f
     values = []
     with torch.no_grad():
         for view in views:
-            render = rasterize(
+            render = rasterize_parameters(
                 *trained.gaussians.activated(),
                 view.camera,
                 raster,

@@ -23,7 +23,7 @@ from xrgs import config
 from xrgs.capture import variant
 from xrgs.capture.scenes import motorcycle
 from xrgs.errors import XrgsError
-from xrgs.experiment.store import CellFolder
+from xrgs.experiment.cell_folder import CellFolder
 from xrgs.sweep.session import HandOver, SweepSession
 
 if TYPE_CHECKING:

@@ -17,7 +17,7 @@ from xrgs.splat.densify import Densifier
 from xrgs.splat.gaussians import PARAMETERS, Gaussians
 from xrgs.splat.loss import photometric_loss, prepare_target
 from xrgs.splat.optimizer import SplatOptimizer
-from xrgs.splat.rasterize import rasterize
+from xrgs.splat.rasterize import rasterize_parameters
 from xrgs.splat.resample import resize
 from xrgs.splat.settings import DensifySettings, OptimizerSettings, RasterSettings
 
@@ -231,7 +231,7 @@ class TrainingStep:
         with use_threads(self.threads):
             self.optimizer.zero_grad()
             self.offset = torch.zeros(len(self.gaussians), 2, requires_grad=True)
-            self.rendered = rasterize(
+            self.rendered = rasterize_parameters(
                 *self.gaussians.activated(),
                 self.camera,
                 RasterSettings(),

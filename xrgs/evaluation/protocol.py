@@ -47,14 +47,14 @@ def score_views(
     from xrgs.runtime.machine import single_torch_thread
     from xrgs.runtime.progress import progress
     from xrgs.splat.backend import resolve_backend
-    from xrgs.splat.rasterize import rasterize
+    from xrgs.splat.rasterize import rasterize_parameters
 
     renders.mkdir(exist_ok=True)
     backend = resolve_backend(conf.backend)
     rows = []
     with torch.no_grad():
         for view in progress(views, "evaluating", "view"):
-            render = rasterize(
+            render = rasterize_parameters(
                 *gaussians.activated(),
                 view.camera,
                 conf.raster,

@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from xrgs.capture.dataset import Dataset
     from xrgs.capture.views import Variant
     from xrgs.config import Conf
-    from xrgs.experiment.store import CellFolder
+    from xrgs.experiment.cell_folder import CellFolder
     from xrgs.training.recorder import TrainingResult
 
 _log = logging.getLogger(__name__)

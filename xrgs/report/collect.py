@@ -19,7 +19,8 @@ if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
     from xrgs.evaluation.metrics import Metric
-    from xrgs.experiment.store import CellFolder, Store
+    from xrgs.experiment.cell_folder import CellFolder
+    from xrgs.experiment.store import Store
 
 #: Keys of each row of a sweep's record.
 RECORD_KEYS = (

@@ -17,7 +17,8 @@ from xrgs.safeio.records import as_number, read_table
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from xrgs.experiment.store import CellFolder, Store
+    from xrgs.experiment.cell_folder import CellFolder
+    from xrgs.experiment.store import Store
 
 _LABELS = {
     "steps_HR": "Steps on HR views",

@@ -22,7 +22,7 @@ MIN_SPACING = 1e-7
 
 
 class ActivatedGaussians(NamedTuple):
-    """Gaussians after their activation functions, as `rasterize` takes them.
+    """Gaussians after their activation functions, as `rasterize_parameters` takes them.
 
     The fields are in the order of `PARAMETERS`.
     """

@@ -12,7 +12,7 @@ import torch
 from torch.nn.functional import pad
 
 from xrgs.splat.cameras import Camera
-from xrgs.splat.rasterize import rasterize as rasterize_parameters
+from xrgs.splat.rasterize import rasterize_parameters
 from xrgs.splat.rendering import backend_for
 from xrgs.splat.settings import RasterSettings
 from xrgs.splat.sh import C0, MAX_DEGREE, bases

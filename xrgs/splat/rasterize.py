@@ -12,7 +12,7 @@ from xrgs.splat.render_result import Render
 from xrgs.splat.settings import RasterSettings
 from xrgs.splat.sh import check_sh_degree
 
-__all__ = ["Render", "rasterize"]
+__all__ = ["Render", "rasterize_parameters"]
 
 #: Shape of one Gaussian's value; that of shN depends on how many bands it has.
 _SHAPES: dict[str, tuple[int, ...]] = {
@@ -25,7 +25,7 @@ _SHAPES: dict[str, tuple[int, ...]] = {
 }
 
 
-def rasterize(
+def rasterize_parameters(
     means: Tensor,
     quats: Tensor,
     scales: Tensor,

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import torch
 
-from xrgs.splat.rasterize import rasterize as rasterize_parameters
+from xrgs.splat.rasterize import rasterize_parameters
 from xrgs.splat.render_result import Render
 from xrgs.splat.settings import RasterSettings
 

@@ -14,7 +14,8 @@ from xrgs.safeio.hashing import canonical_json
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping
 
-    from xrgs.experiment.store import CellFolder, Store
+    from xrgs.experiment.cell_folder import CellFolder
+    from xrgs.experiment.store import Store
 
 #: Number of finished cells that are read, the newest first; more would take long and help little.
 _MAX_CELLS = 500

@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any, Self
 
 from tqdm import tqdm
 
-from xrgs.experiment.store import CellFolder
+from xrgs.experiment.cell_folder import CellFolder
 from xrgs.runtime import progress
 from xrgs.runtime.progress import format_duration, log_line
 

@@ -6,8 +6,9 @@ from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 
 from xrgs.capture import scenes
+from xrgs.experiment.cell_folder import CellState
 from xrgs.experiment.identity import cell_identity
-from xrgs.experiment.store import BASELINE, CellState
+from xrgs.experiment.store import BASELINE
 from xrgs.runtime.progress import format_duration
 from xrgs.safeio.hashing import digest
 from xrgs.safeio.untrusted import printable

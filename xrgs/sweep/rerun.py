@@ -17,8 +17,9 @@ from typing import TYPE_CHECKING, Any
 from xrgs import config
 from xrgs.errors import StoreError, XrgsError
 from xrgs.experiment import provenance
+from xrgs.experiment.cell_folder import CellFolder
 from xrgs.experiment.identity import cell_identity
-from xrgs.experiment.store import CellFolder, Store
+from xrgs.experiment.store import Store
 from xrgs.runtime.machine import usable_cores
 from xrgs.runtime.progress import log_line
 from xrgs.safeio.hashing import digest, file_digest

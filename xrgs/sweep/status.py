@@ -9,8 +9,9 @@ from typing import TYPE_CHECKING, Any
 
 from xrgs.capture.failures import FAILED_PREFIX, failed_scenes
 from xrgs.errors import StoreError, XrgsError
+from xrgs.experiment.cell_folder import CellState
 from xrgs.experiment.identity import training_code
-from xrgs.experiment.store import CellState, Store
+from xrgs.experiment.store import Store
 from xrgs.safeio.records import read_json
 from xrgs.safeio.untrusted import printable
 from xrgs.sweep import locks
@@ -20,7 +21,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Mapping, Sequence
     from pathlib import Path
 
-    from xrgs.experiment.store import CellFolder
+    from xrgs.experiment.cell_folder import CellFolder
 
 _STATES = ("done", "running", "unfinished", "failed", "corrupt")
 #: Cells of each state are listed by name up to this number.

@@ -17,7 +17,7 @@ from xrgs.splat.densify import Densifier, Refinement
 from xrgs.splat.gaussians import from_points
 from xrgs.splat.loss import photometric_loss, prepare_target
 from xrgs.splat.optimizer import SplatOptimizer
-from xrgs.splat.rasterize import rasterize
+from xrgs.splat.rasterize import rasterize_parameters
 from xrgs.splat.settings import NOMINAL_STEPS
 from xrgs.training.checkpoint import Checkpoint
 from xrgs.training.components import Components
@@ -103,7 +103,7 @@ def _run_steps(run: _Run, checkpoint: Checkpoint) -> None:
         sh_degree = min(step.number // run.sh_every, raster.sh_degree)
         # Render the view of this step. The gradient of the offset is for densification.
         means2d_offset = torch.zeros(len(gaussians), 2, requires_grad=True)
-        render = rasterize(
+        render = rasterize_parameters(
             *components.before_render(gaussians.activated(), step),
             camera,
             raster,

@@ -100,7 +100,7 @@ def test_one_view_is_too_few(tmp_path: Path) -> None:
 def test_fingerprints_need_neither_torch_nor_scikit_image() -> None:
     script = (
         "import sys; from xrgs.capture import scenes; from xrgs.config import SceneConf;"
-        "scenes.fingerprint(SceneConf('p', 'procedural'), 100);"
+        "scenes.fingerprint(SceneConf('p', 'procedural', views=24), 100);"
         "scenes.fingerprint(SceneConf('m', 'motorcycle'));"
         "print(sorted({'torch', 'skimage', 'pycolmap'} & set(sys.modules)))"
     )

@@ -21,7 +21,7 @@ from torch import Tensor
 
 from xrgs.splat.cameras import Camera
 from xrgs.splat.gaussians import ActivatedGaussians
-from xrgs.splat.rasterize import rasterize
+from xrgs.splat.rasterize import rasterize_parameters
 from xrgs.splat.render_result import Render
 from xrgs.splat.settings import RasterSettings
 
@@ -67,7 +67,7 @@ def run(
     """The render, and with v the gradients of <image, v[0]> + <alpha, v[1]> by name."""
     leaves = {name: scene[name].detach().to(dtype, copy=True).requires_grad_() for name in NAMES}
     offset = torch.zeros(len(leaves["means"]), 2, dtype=dtype, requires_grad=True)
-    render = rasterize(
+    render = rasterize_parameters(
         *ActivatedGaussians(**leaves),
         camera,
         raster,

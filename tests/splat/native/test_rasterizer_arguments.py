@@ -20,7 +20,7 @@ from torch import Tensor
 
 from xrgs.splat.cameras import Camera
 from xrgs.splat.gaussians import ActivatedGaussians
-from xrgs.splat.rasterize import rasterize
+from xrgs.splat.rasterize import rasterize_parameters
 from xrgs.splat.render_result import Render
 from xrgs.splat.settings import RasterSettings
 
@@ -37,7 +37,7 @@ def render(scene: Scene, camera: Camera) -> tuple[Render, list[Tensor]]:
     """The render, and the leaves that its gradients go to."""
     leaves = {name: scene[name].clone().requires_grad_() for name in NAMES}
     offset = torch.zeros(len(leaves["means"]), 2, requires_grad=True)
-    made = rasterize(
+    made = rasterize_parameters(
         *ActivatedGaussians(**leaves),
         camera,
         RasterSettings(),
@@ -135,7 +135,9 @@ def test_harmonics_whose_gradient_is_not_wanted_is_not_computed(
         leaves = {name: scene[name].clone().requires_grad_() for name in NAMES}
         leaves["shN"].requires_grad_(wanted)
         gaussians = ActivatedGaussians(**leaves)
-        render = rasterize(*gaussians, camera, RasterSettings(), sh_degree=3, backend="native")
+        render = rasterize_parameters(
+            *gaussians, camera, RasterSettings(), sh_degree=3, backend="native"
+        )
         torch.autograd.backward(render.image.square().sum())
         gradients[wanted] = {name: leaf.grad for name, leaf in leaves.items()}
     assert gradients[True].pop("shN") is not None
@@ -252,7 +254,7 @@ import resource, torch
 from xrgs.splat.cameras import Camera
 from xrgs.splat.cameras import Camera
 from xrgs.splat.gaussians import ActivatedGaussians
-from xrgs.splat.rasterize import rasterize
+from xrgs.splat.rasterize import rasterize_parameters
 from xrgs.splat.render_result import Render
 from xrgs.splat.settings import RasterSettings
 
@@ -266,7 +268,7 @@ camera = Camera(torch.eye(4), K, side, side)
 used = int(open("/proc/self/statm").read().split()[0]) * resource.getpagesize()
 resource.setrlimit(resource.RLIMIT_AS, (used + (400 << 20), resource.RLIM_INFINITY))
 try:
-    rasterize(*scene, camera, RasterSettings(), sh_degree=0, backend="native")
+    rasterize_parameters(*scene, camera, RasterSettings(), sh_degree=0, backend="native")
 except MemoryError as error:
     print(error)
 """

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from xrgs.splat.cameras import Camera
 from xrgs.splat.gaussians import PARAMETERS, ActivatedGaussians
-from xrgs.splat.rasterize import rasterize
+from xrgs.splat.rasterize import rasterize_parameters
 from xrgs.splat.render_result import Render
 from xrgs.splat.settings import CullingOptions, RasterSettings
 
@@ -71,7 +71,9 @@ def test_culling_makes_no_difference(
     for culled in names:
         assert work[culled] > usual_work[culled], culled
     exact_scene = ActivatedGaussians(**{key: value.double() for key, value in scene.items()})
-    exact = rasterize(*exact_scene, camera, RasterSettings(), sh_degree=3, backend="torch")
+    exact = rasterize_parameters(
+        *exact_scene, camera, RasterSettings(), sh_degree=3, backend="torch"
+    )
     error = (done.image.double() - exact.image).abs().detach()
     assert error.mean() <= 1e-6
     assert error.max() <= 2e-3

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from xrgs.splat.cameras import Camera
 from xrgs.splat.gaussians import PARAMETERS, ActivatedGaussians
-from xrgs.splat.rasterize import rasterize
+from xrgs.splat.rasterize import rasterize_parameters
 from xrgs.splat.render_result import Render
 from xrgs.splat.settings import RasterSettings
 
@@ -44,7 +44,9 @@ def test_gradients_are_finite_differences_with_the_cuts_off(
     def outputs(*values: Tensor) -> tuple[Tensor, Tensor]:
         *parameters, offset = values
         gaussians = ActivatedGaussians(*parameters)
-        render = rasterize(*gaussians, camera, raster, sh_degree=1, means2d_offset=offset)
+        render = rasterize_parameters(
+            *gaussians, camera, raster, sh_degree=1, means2d_offset=offset
+        )
         return render.image, render.alpha
 
     assert torch.autograd.gradcheck(outputs, inputs)

@@ -11,7 +11,7 @@ from torch import Tensor
 from xrgs.splat.cameras import Camera
 from xrgs.splat.gaussians import PARAMETERS, ActivatedGaussians, Gaussians
 from xrgs.splat.optimizer import SplatOptimizer
-from xrgs.splat.rasterize import rasterize
+from xrgs.splat.rasterize import rasterize_parameters
 from xrgs.splat.settings import OptimizerSettings, RasterSettings
 
 MakeCamera = Callable[..., Camera]
@@ -26,7 +26,7 @@ def test_the_gradient_of_harmonics_follows_from_that_of_sh0(
     scene = make_scene(30, camera)
     gaussians = Gaussians(**{name: value.requires_grad_() for name, value in scene.items()})
     activated = ActivatedGaussians(*(gaussians[name] for name in PARAMETERS))
-    render = rasterize(*activated, camera, RasterSettings(), sh_degree=sh_degree)
+    render = rasterize_parameters(*activated, camera, RasterSettings(), sh_degree=sh_degree)
     torch.autograd.backward(render.image.square().sum())
     expected = gaussians.shN.grad
     assert expected is not None

@@ -13,7 +13,7 @@ from xrgs.config import Conf
 from xrgs.evaluation import protocol
 from xrgs.splat.cameras import Camera
 from xrgs.splat.gaussians import Gaussians
-from xrgs.splat.rasterize import rasterize
+from xrgs.splat.rasterize import rasterize_parameters
 from xrgs.splat.settings import RasterSettings
 
 SIZE = 31
@@ -58,7 +58,9 @@ def test_a_small_gaussian_fades_instead_of_growing_brighter(
             eps2d=eps2d, antialiased=antialiased, alpha_min=1e-6, alpha_max=0.999
         )
         activated = one(sigma).activated()
-        alpha = rasterize(*activated, CAMERA, settings, sh_degree=0, backend=backend).alpha
+        alpha = rasterize_parameters(
+            *activated, CAMERA, settings, sh_degree=0, backend=backend
+        ).alpha
         peaks[antialiased] = alpha[SIZE // 2, SIZE // 2].item()
         sums[antialiased] = alpha.sum().item()
     assert peaks[False] == pytest.approx(OPACITY, rel=1e-5)
@@ -76,7 +78,9 @@ def test_evaluation_renders_as_training_does(
 ) -> None:
     gaussians = one(0.4)
     settings = RasterSettings(antialiased=antialiased)
-    photograph = rasterize(*gaussians.activated(), CAMERA, settings, sh_degree=3).image.detach()
+    photograph = rasterize_parameters(
+        *gaussians.activated(), CAMERA, settings, sh_degree=3
+    ).image.detach()
     view = LoadedView("v", "HR", CAMERA, photograph)
     scores = {}
     for setting in (False, True):

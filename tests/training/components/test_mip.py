@@ -12,7 +12,7 @@ from xrgs.capture.dataset import LoadedView
 from xrgs.config import ComponentsConf, MipConf
 from xrgs.splat.cameras import Camera
 from xrgs.splat.gaussians import ActivatedGaussians, Gaussians, from_points
-from xrgs.splat.rasterize import rasterize
+from xrgs.splat.rasterize import rasterize_parameters
 from xrgs.splat.settings import RasterSettings
 from xrgs.training.components import Components, Step
 from xrgs.training.components.mip import Mip, sampling_rates, smooth
@@ -193,7 +193,7 @@ def test_what_is_saved_renders_as_what_was_trained() -> None:
     settings = RasterSettings(antialiased=True, sh_degree=0)
 
     def image(activated: ActivatedGaussians) -> Tensor:
-        return rasterize(*activated, FAR, settings, sh_degree=0).image
+        return rasterize_parameters(*activated, FAR, settings, sh_degree=0).image
 
     trained = image(mip.before_render(gaussians.activated(), STEP))
     unfiltered = image(gaussians.activated())

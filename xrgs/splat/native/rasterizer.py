@@ -32,7 +32,7 @@ def render(
     sh_degree: int,
     means2d_offset: Tensor | None,
 ) -> Render:
-    """Render Gaussians into one view as `xrgs.splat.rasterize.rasterize` does.
+    """Render Gaussians into one view as `xrgs.splat.rasterize.rasterize_parameters` does.
 
     Uses as many threads as torch (`torch.set_num_threads`); the result is bitwise the same for any
     number of them.

@@ -47,7 +47,7 @@ def render(
     sh_degree: int,
     means2d_offset: Tensor | None,
 ) -> Render:
-    """Render Gaussians into one view as `xrgs.splat.rasterize.rasterize` does.
+    """Render Gaussians into one view as `xrgs.splat.rasterize.rasterize_parameters` does.
 
     Args:
         gaussians: N Gaussians of one floating type, whose checks have passed.

@@ -16,7 +16,7 @@ from xrgs.sweep.jobs import worker
 from xrgs.sweep.jobs.supervise import Limits
 
 if TYPE_CHECKING:
-    from xrgs.experiment.store import CellFolder
+    from xrgs.experiment.cell_folder import CellFolder
     from xrgs.sweep.session import HandOver, SweepSession
 
 #: Outcomes of a job beside the states of a cell. LOCKED: another sweep is training the cell.

@@ -119,7 +119,7 @@ def _run_cell(request: Mapping[str, Any]) -> dict[str, Any]:
     from xrgs.capture import variant
     from xrgs.config import from_dict
     from xrgs.experiment import cell
-    from xrgs.experiment.store import CellFolder
+    from xrgs.experiment.cell_folder import CellFolder
 
     folder = CellFolder(Path(request["cell"]))
     with (folder.path / "log.txt").open("a", encoding="utf-8") as log:

@@ -1,0 +1,345 @@
+"""One cell's folder in a store: its files, its state, and its results.
+
+A cell's `status.json` is written last, by atomic rename, and lists every other file of the cell: a
+cell is done when that file says so and the listed files are present and unchanged.
+"""
+
+from __future__ import annotations
+
+import io
+import os
+import stat
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from xrgs.errors import StoreError
+from xrgs.runtime import progress
+from xrgs.safeio import untrusted
+from xrgs.safeio.atomic import write_json, write_text
+from xrgs.safeio.hashing import canonical_json, file_digest
+from xrgs.safeio.records import as_number, read_json, read_object, read_table
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+
+    import pandas as pd
+
+    from xrgs.capture.dataset import Dataset
+    from xrgs.config import Conf
+    from xrgs.splat.cameras import Camera
+    from xrgs.splat.gaussians import Gaussians
+
+#: Reports are made from these files, so they are verified by their hash; others by their size.
+_VERIFIED_BY_HASH = frozenset(
+    {"config.json", "identity.json", "scores.csv", "summary.json", "history.csv"}
+)
+_CHECKPOINT = "checkpoint.npz"
+_PROGRESS = "progress.json"
+_NOT_RESULTS = frozenset(
+    {"log.txt", "status.json", _PROGRESS, _CHECKPOINT, f"refused-{_CHECKPOINT}"}
+)
+#: Files of a stopped attempt that are kept when the cell resumes from its checkpoint.
+_KEPT_ON_RESUME = frozenset({_CHECKPOINT, "identity.json", "log.txt"})
+
+
+@dataclass(frozen=True)
+class CellState:
+    """The state of a cell, and the reason for it."""
+
+    name: str
+    """`absent`, `unfinished`, `running`, `failed`, `corrupt` or `done`."""
+    reason: str = ""
+
+
+@dataclass(frozen=True)
+class CellFolder:
+    """The folder of one cell: its config, its results and its state."""
+
+    path: Path
+    """The folder, named by the cell's id."""
+
+    @property
+    def id(self) -> str:
+        """The cell's id: the digest of its identity."""
+        return self.path.name
+
+    @property
+    def checkpoint(self) -> Path:
+        """File of the training checkpoint; it exists while the cell is not done."""
+        return self.path / _CHECKPOINT
+
+    @property
+    def progress(self) -> Path:
+        """File that says how far the cell is; a process that is killed leaves it behind."""
+        return self.path / _PROGRESS
+
+    @property
+    def status(self) -> Path:
+        """File of the final state, written after all other files."""
+        return self.path / "status.json"
+
+    def state(self, *, verify: bool = True) -> CellState:
+        """Return whether this cell's result is present and can be trusted.
+
+        Args:
+            verify: Hash the files that reports are made from; otherwise only sizes are compared.
+        """
+        if not self.path.is_dir():
+            return CellState("absent")
+        if self.path.is_symlink():
+            return CellState("corrupt", "it is a symbolic link; a cell must be a folder")
+        if not self.status.exists():
+            resumes = "; it resumes from its checkpoint" if self.checkpoint.exists() else ""
+            return CellState("unfinished", f"it was stopped before it ended{resumes}")
+        try:
+            status = read_json(self.status)
+            if status["state"] == "failed":
+                return CellState("failed", str(status["reason"]))
+            self._check(status, verify=verify)
+        except (StoreError, AttributeError, KeyError, TypeError, ValueError, OSError) as error:
+            return CellState("corrupt", str(error))
+        return CellState("done")
+
+    def running(self, owner: str) -> CellState:
+        """Return the state of a cell whose lock is held.
+
+        Args:
+            owner: Description of the process that holds the lock.
+        """
+        now = progress.read(self.progress)
+        return CellState("running", f"by {owner}" + (f": {now}" if now else ""))
+
+    def _check(self, status: Mapping[str, Any], *, verify: bool) -> None:
+        if status["state"] != "done":
+            raise StoreError(f"status.json: unknown state {status['state']!r}")
+        for name, entry in status["files"].items():
+            if not untrusted.is_inside(name):
+                raise StoreError(f"status.json: {name!r:.80} is not a file of this cell")
+            if _size(f"{self.path}/{name}") != entry["bytes"]:
+                raise StoreError(f"{name} is missing or has another size")
+            hashed = verify and name in _VERIFIED_BY_HASH
+            if hashed and file_digest(self.path / name) != entry["sha256"]:
+                raise StoreError(f"{name} has changed since the cell finished")
+        if verify and [view for view, _ in self.view_scores()] != status["views"]:
+            raise StoreError("scores.csv does not have one row for each view that was to be scored")
+
+    def view_scores(self) -> list[tuple[str, dict[str, float]]]:
+        """Return the name and the scores of every test view, NaN where a score is missing.
+
+        Raises:
+            StoreError: `scores.csv` is missing or malformed.
+        """
+        file = self.path / "scores.csv"
+        header, rows = read_table(file)
+        views = [row[0] for row in rows]
+        if header[:1] != ["view"] or not all(map(untrusted.is_name, views)):
+            raise StoreError(f"{file}: the first column must hold names of views")
+        try:
+            values = [map(as_number, row[1:]) for row in rows]
+            scores = [dict(zip(header[1:], row, strict=True)) for row in values]
+        except ValueError as error:
+            raise StoreError(f"{file}: {error}") from error
+        return list(zip(views, scores, strict=True))
+
+    def begin(self, config: Mapping[str, Any], identity: Mapping[str, Any]) -> None:
+        """Create the folder with the cell's config and identity, and without any result.
+
+        The checkpoint and the log of an earlier attempt at the same cell are kept. A folder that
+        can't be resumed (another identity, or failed or corrupt without a checkpoint) is renamed to
+        `<cell id>.aside-<n>`, so that it can be inspected.
+
+        Args:
+            config: The cell's config as plain JSON values.
+            identity: The values that the cell's id is the digest of.
+        """
+        if self._can_resume(identity):
+            self._clear()
+        elif self.path.exists():
+            self.path.rename(_free_name(self.path))
+        self.path.mkdir(parents=True, exist_ok=True)
+        write_json(self.path / "config.json", config)
+        write_json(self.path / "identity.json", identity)
+
+    def _can_resume(self, identity: Mapping[str, Any]) -> bool:
+        state = self.state().name
+        if state != "unfinished" and not (state == "failed" and self.checkpoint.is_file()):
+            return False
+        try:
+            return canonical_json(self.identity()) == canonical_json(identity)
+        except (StoreError, TypeError, ValueError):
+            # An attempt that was killed before it wrote its identity has not trained anything.
+            written = (self.path / "identity.json", self.checkpoint)
+            return not any(file.exists() for file in written)
+
+    def _clear(self) -> None:
+        for entry in self.path.iterdir():
+            if entry.name not in _KEPT_ON_RESUME or entry.is_symlink():
+                untrusted.remove(entry)
+
+    def finish(self, views: Sequence[str], protocol: int) -> None:
+        """Declare the cell done, with the files that are in the folder now.
+
+        Args:
+            views: Names of the test views, in the order of `scores.csv`.
+            protocol: Version of the evaluation protocol.
+        """
+        files = {
+            file.relative_to(self.path).as_posix(): {
+                "bytes": file.stat().st_size,
+                "sha256": file_digest(file),
+            }
+            for file in sorted(self.path.rglob("*"))
+            if file.is_file() and file.name not in _NOT_RESULTS
+        }
+        self._set_status(
+            {
+                "state": "done",
+                "reason": "",
+                "views": list(views),
+                "protocol": protocol,
+                "files": files,
+            }
+        )
+        self.drop_checkpoint()  # after the status: a cell that is killed before needs it
+
+    def drop_checkpoint(self) -> None:
+        """Remove the checkpoint, which a finished cell no longer needs.
+
+        `finish` does this too, but its process may be killed in between.
+        """
+        self.checkpoint.unlink(missing_ok=True)
+
+    def fail(self, reason: str) -> None:
+        """Declare the cell failed, and write `error.txt` if its process did not.
+
+        Args:
+            reason: Why it failed, for the status and for people.
+        """
+        error = self.path / "error.txt"
+        if not error.exists():
+            write_text(error, f"{reason}\n")
+        self.progress.unlink(missing_ok=True)
+        self._set_status({"state": "failed", "reason": reason, "views": [], "files": {}})
+
+    def _set_status(self, status: Mapping[str, Any]) -> None:
+        write_json(self.status, status)
+
+    def identity(self) -> dict[str, Any]:
+        """Return the values that the cell's id is the digest of.
+
+        Raises:
+            StoreError: `identity.json` is missing or malformed.
+        """
+        return read_object(self.path / "identity.json")
+
+    def summary(self) -> dict[str, Any]:
+        """Return the figures of the whole cell: training time, Gaussians, memory and others.
+
+        Raises:
+            StoreError: `summary.json` is missing or malformed.
+        """
+        return read_object(self.path / "summary.json")
+
+    def provenance(self) -> dict[str, Any]:
+        """Return where, when and with which software the cell was trained.
+
+        Raises:
+            StoreError: `provenance.json` is missing or malformed.
+        """
+        return read_object(self.path / "provenance.json")
+
+    def history(self) -> pd.DataFrame:
+        """Return the training history, one row per logged step.
+
+        Raises:
+            OSError: `history.csv` can't be read.
+            ValueError: `history.csv` is not a table.
+        """
+        import pandas as pd
+
+        return pd.read_csv(io.BytesIO(untrusted.read_bytes(self.path / "history.csv")))
+
+    def scores(self) -> pd.DataFrame:
+        """Return the scores of the test views.
+
+        Returns:
+            One row a view, indexed by its name (`view`), one column a score (`psnr` in dB, `ssim`,
+            `lpips`); NaN where a score was not computed.
+
+        Raises:
+            StoreError: `scores.csv` is missing or is not such a table.
+        """
+        import pandas as pd
+
+        scores = self.view_scores()
+        index = pd.Index([name for name, _ in scores], name="view", dtype=object)
+        return pd.DataFrame([values for _, values in scores], index=index)
+
+    def config(self) -> Conf:
+        """Return the config that the cell was trained with.
+
+        Raises:
+            XrgsError: `config.json` can't be read, or is of another version's schema.
+        """
+        from xrgs.config import from_file
+
+        return from_file(self.path / "config.json")
+
+    def gaussians(self) -> Gaussians:
+        """Load the trained Gaussians, in the world of `cameras`.
+
+        Raises:
+            XrgsError: `splats.ply` is missing or damaged.
+        """
+        from xrgs.splat.ply import load_ply
+
+        return load_ply(self.path / "splats.ply")
+
+    def dataset(self) -> Dataset:
+        """Load the views that the cell was trained and tested on: photographs, cameras, points.
+
+        The cameras and points are in the normalised world of the Gaussians.
+
+        Raises:
+            StoreError: `identity.json` can't be read.
+            XrgsError: The variant is not in the store, or is damaged.
+        """
+        from xrgs.experiment.results import load_dataset
+
+        return load_dataset(self.path)
+
+    def cameras(self) -> dict[str, dict[str, Camera]]:
+        """Load the cameras of the cell's views, in the normalised world of its Gaussians.
+
+        Returns:
+            `{"train": {name: camera}, "test": {name: camera}}`, in the variant's order.
+
+        Raises:
+            XrgsError: As `dataset`, whose photographs are read with them.
+        """
+        data = self.dataset()
+        splits = {"train": data.train, "test": data.test}
+        return {
+            split: {view.name: view.camera for view in views} for split, views in splits.items()
+        }
+
+
+def _size(file: str) -> int:
+    """Return the bytes of a regular file, -1 for anything else.
+
+    It takes a string: making a `Path` for each of a store's files would take longer than this.
+    """
+    try:
+        status = os.lstat(file)
+    except OSError:
+        return -1
+    return status.st_size if stat.S_ISREG(status.st_mode) else -1
+
+
+def _free_name(path: Path) -> Path:
+    """Return the first sibling that does not exist: `<name>.aside-1`, `<name>.aside-2`, ..."""
+    number = 1
+    while (free := path.with_name(f"{path.name}.aside-{number}")).exists():
+        number += 1
+    return free
