@@ -1,4 +1,4 @@
-"""The arguments of `rasterize_parameters`: what it accepts, and the errors that name what it does not."""
+"""The arguments of `rasterize_parameters`: what it accepts, and the errors that name a wrong one."""
 
 from __future__ import annotations
 
