@@ -41,7 +41,7 @@ ONLY_IN = {
     "omegaconf": ("config", "sweep", "cli"),
     "pycolmap": ("capture/sfm",),
     "matplotlib": ("report",),
-    "pandas": ("experiment/results", "experiment/store", "report"),
+    "pandas": ("experiment", "report"),
     "kornia": ("evaluation/metrics", "bench"),
     "gsplat": (),
     "tqdm": ("runtime/progress", "sweep/monitor"),

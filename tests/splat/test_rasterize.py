@@ -1,4 +1,4 @@
-"""The arguments of `rasterize_parameters`: what it accepts, and the errors that name a wrong one."""
+"""The arguments of `rasterize_parameters`: what it accepts, and what its errors name."""
 
 from __future__ import annotations
 
