@@ -68,7 +68,7 @@ def test_a_missing_key_is_named(file: Path, key: str) -> None:
         (
             "means",
             np.full((150, 3), "x"),
-            "means.npy: its header declares <U1",
+            "cannot be read as .npz: means.npy: its header",
         ),
         ("viewmat", 2 * np.eye(4), "viewmat must be a rotation"),
     ],
