@@ -21,6 +21,8 @@ from xrgs.capture.views import SceneFailed, Variant, View
 from xrgs.config import SceneConf, VariantConf
 from xrgs.errors import XrgsError
 
+pytestmark = pytest.mark.slow
+
 Make = Callable[..., VariantConf]
 Mix = Callable[..., Variant]
 VIEWS = 12
@@ -318,7 +320,6 @@ def test_every_variant_in_conf_is_tested() -> None:
 
 
 @pytest.mark.data
-@pytest.mark.slow
 def test_a_collection_of_many_cameras_is_registered(
     configured: Make, data_root: Path, tmp_path: Path
 ) -> None:

@@ -23,6 +23,8 @@ from xrgs.config import SceneConf, VariantConf
 from xrgs.errors import XrgsError
 from xrgs.safeio.hashing import source_digests
 
+pytestmark = pytest.mark.slow
+
 Build = Callable[..., Variant]
 Conf = Callable[..., VariantConf]
 PACKAGE = Path(xrgs.__file__).parent
@@ -160,7 +162,6 @@ def test_what_a_killed_process_left_is_removed(
     assert not leftover.parent.exists()
 
 
-@pytest.mark.slow
 def test_two_processes_at_once_share_one_variant(
     store: Path, stereo_scene: SceneConf, small_conf: Conf
 ) -> None:

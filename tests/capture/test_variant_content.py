@@ -15,6 +15,8 @@ from xrgs.capture.views import Variant, View
 from xrgs.config import SceneConf
 from xrgs.errors import XrgsError
 
+pytestmark = pytest.mark.slow
+
 Build = Callable[..., Variant]
 
 
@@ -32,7 +34,6 @@ def project(points: np.ndarray, view: View) -> tuple[np.ndarray, np.ndarray]:
 # the embedded multi-view scene
 
 
-@pytest.mark.slow
 def test_every_8th_view_is_held_out_and_a_fraction_of_the_rest_stays_hr(
     procedural_variant: Variant,
 ) -> None:
@@ -46,7 +47,6 @@ def test_every_8th_view_is_held_out_and_a_fraction_of_the_rest_stays_hr(
     assert [(v.split, v.name) for v in made.views] == sorted((v.split, v.name) for v in made.views)
 
 
-@pytest.mark.slow
 def test_images_have_the_size_of_their_tag(procedural_variant: Variant) -> None:
     for view in procedural_variant.views:
         expected = (250, 185) if view.tag == "HR" else (50, 37)
@@ -54,7 +54,6 @@ def test_images_have_the_size_of_their_tag(procedural_variant: Variant) -> None:
         assert images.size(view.file) == expected
 
 
-@pytest.mark.slow
 def test_the_cameras_are_the_exact_ones_up_to_a_similarity(procedural_variant: Variant) -> None:
     """At 250 px, 0.8% and 0.17 degrees were measured; all HR, intrinsics known, gives 0.46%."""
     error = procedural_variant.report["pose_error"]
@@ -63,7 +62,6 @@ def test_the_cameras_are_the_exact_ones_up_to_a_similarity(procedural_variant: V
     assert error["rotation_degrees"] < 0.4
 
 
-@pytest.mark.slow
 def test_an_lr_camera_is_the_hr_camera_at_a_fifth_of_the_size(procedural_variant: Variant) -> None:
     high = select(procedural_variant, "train", "HR")[0]
     low = select(procedural_variant, "train", "LR")[0]
@@ -72,7 +70,6 @@ def test_an_lr_camera_is_the_hr_camera_at_a_fifth_of_the_size(procedural_variant
     assert small * 5 == pytest.approx(large, abs=1e-6)
 
 
-@pytest.mark.slow
 def test_points_have_the_colour_of_the_pixels_they_project_to(procedural_variant: Variant) -> None:
     """Images, cameras and points agree after undistortion, at both sizes."""
     made = procedural_variant
@@ -87,7 +84,6 @@ def test_points_have_the_colour_of_the_pixels_they_project_to(procedural_variant
         assert np.median(np.abs(shown - expected)) < 0.5 * np.median(np.abs(shown - other))
 
 
-@pytest.mark.slow
 def test_rho_is_the_sampling_rate_over_the_largest(procedural_variant: Variant) -> None:
     rho = {(view.split, view.name): view.rho for view in procedural_variant.views}
     assert max(rho.values()) == 1
@@ -97,7 +93,6 @@ def test_rho_is_the_sampling_rate_over_the_largest(procedural_variant: Variant) 
     assert 0 < report["LR"][0] < report["LR"][2] <= 0.2 + 1e-9 < report["HR"][0] <= 1
 
 
-@pytest.mark.slow
 def test_the_report_says_how_sfm_went(procedural_variant: Variant) -> None:
     report = procedural_variant.report
     assert report["points"] == len(procedural_variant.points) > 300
@@ -174,7 +169,6 @@ def photographs(tmp_path: Path, procedural_scene: SceneConf) -> Callable[[str, i
     return copied
 
 
-@pytest.mark.slow
 def test_an_unreadable_photograph_is_left_out_and_reported(
     photographs: Callable[[str, int], SceneConf],
     build: Build,
@@ -206,7 +200,6 @@ def test_one_readable_photograph_is_too_few(
     assert not list((store / "variants").glob("*-*"))
 
 
-@pytest.mark.slow
 def test_views_of_differing_sizes_keep_their_own_size_and_camera(
     photographs: Callable[[str, int], SceneConf], build: Build, tmp_path: Path
 ) -> None:
@@ -229,7 +222,6 @@ def test_views_of_differing_sizes_keep_their_own_size_and_camera(
 
 
 @pytest.mark.data
-@pytest.mark.slow
 def test_fern_is_registered_at_a_reduced_size(build: Build, data_root: Path) -> None:
     path = data_root / "llff" / "fern"
     if not path.is_dir():

@@ -99,6 +99,7 @@ def test_fail_fast_starts_no_further_cell(sweep_here: SweepHere, children: Any) 
     assert len(children.trained) == 1
 
 
+@pytest.mark.slow
 def test_a_cell_that_takes_a_count_from_another_is_trained_after_it(
     sweep_here: SweepHere, children: Any, tmp_path: Path
 ) -> None:
@@ -118,6 +119,7 @@ def test_a_cell_that_takes_a_count_from_another_is_trained_after_it(
     assert len(children.trained) == 3
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("changes", "done"),
     [
@@ -139,6 +141,7 @@ def test_a_value_that_changes_a_number_is_another_cell(
     assert f"plan: 2 cells, {done} done" in err
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "name", sorted({file.stem for file in SWEEPS.glob("*.yaml")} - {"ablations", "controls"})
 )

@@ -72,6 +72,7 @@ def test_any_axis_can_be_up(render_ply: ModuleType, ply: Path, tmp_path: Path, u
     assert max(half.max() for half in halves(png)) > 1
 
 
+@pytest.mark.slow
 def test_it_runs_as_a_script(ply: Path, tmp_path: Path) -> None:
     done = subprocess.run(
         [sys.executable, str(SCRIPT), str(ply), str(tmp_path / "image.png"), "--width", "32"],

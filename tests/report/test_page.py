@@ -36,6 +36,7 @@ def content(folder: Path) -> dict[str, bytes]:
     }
 
 
+@pytest.mark.slow
 def test_a_report_is_the_same_byte_for_byte(study: Any) -> None:
     sweep_id = study.write()
     first = build(study.store.path)
@@ -46,6 +47,7 @@ def test_a_report_is_the_same_byte_for_byte(study: Any) -> None:
     assert content(first.folder) == before
 
 
+@pytest.mark.slow
 def test_a_copied_store_gives_the_same_report(study: Any, tmp_path: Path) -> None:
     study.write()
     (study.store.cell("cell00003").path / "status.json").write_text("no JSON")
@@ -65,6 +67,7 @@ def test_an_odd_name_has_its_picture(made: Any) -> None:
     assert all(file.parent == report.folder / "figures" for file in pictures)
 
 
+@pytest.mark.slow
 def test_several_ablations_have_a_picture_of_what_they_trade(
     made: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -93,6 +96,7 @@ def test_several_ablations_have_a_picture_of_what_they_trade(
     assert all(f"figures/{name}" in page for name in names)
 
 
+@pytest.mark.slow
 def test_one_ablation_has_no_such_picture(study: Any) -> None:
     study.write()
     assert not [file for file in build(study.store.path).files if "trade-off" in file.name]
@@ -234,6 +238,7 @@ def test_a_record_that_lacks_a_key_is_named(made: Any) -> None:
         build(made.store.path)
 
 
+@pytest.mark.slow
 def test_a_report_needs_no_torch(study: Any) -> None:
     study.write()
     code = (

@@ -83,6 +83,7 @@ def store(made: Any) -> Store:
     return kept
 
 
+@pytest.mark.slow
 @given(name=st.sampled_from(FILES), place=st.integers(0, 99), value=VALUES, raw=st.booleans())
 @settings(
     max_examples=20, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]

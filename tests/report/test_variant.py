@@ -60,6 +60,7 @@ def rgb(colour: str) -> list[int]:
     return [int(colour[i : i + 2], 16) for i in (1, 3, 5)]
 
 
+@pytest.mark.slow
 def test_a_variant_is_built_described_and_drawn(xrgs_data: Run, tmp_path: Path) -> None:
     arguments = ("scene=motorcycle", "preset=smoke", "store=s", "out=sheet.png")
     code, out, err = xrgs_data("inspect", *arguments)

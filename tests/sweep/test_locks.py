@@ -215,6 +215,7 @@ def test_a_full_disk_leaves_no_lock_behind(tmp_path: Path, monkeypatch: pytest.M
     assert not list(tmp_path.iterdir())
 
 
+@pytest.mark.slow
 def test_of_many_contenders_one_has_the_lock(tmp_path: Path, owner: subprocess.Popen[str]) -> None:
     """The first of them take over from a dead owner at the same time."""
     owner.kill()

@@ -53,7 +53,7 @@ class Plugin(Component):
 def install(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Install]:
     """Install a package, as pip lays it out, in a folder on `sys.path`."""
     monkeypatch.syspath_prepend(tmp_path)
-    identity.plugin_code.cache_clear()
+    identity.training_code.cache_clear()
 
     def installed(dist: str, points: dict[str, str], sources: dict[str, str]) -> Path:
         info = tmp_path / f"{dist}-1.0.dist-info"
@@ -68,7 +68,7 @@ def install(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Install
         return tmp_path
 
     yield installed
-    identity.plugin_code.cache_clear()
+    identity.training_code.cache_clear()
     for name, module in list(sys.modules.items()):
         if str(getattr(module, "__file__", "")).startswith(str(tmp_path)):
             del sys.modules[name]
@@ -211,7 +211,7 @@ def test_a_change_of_a_plugin_is_another_cell(
     else:
         points = folder / "dist-1.0.dist-info" / "entry_points.txt"
         points.write_text(points.read_text().replace("Plugin", "OtherPlugin"))
-    identity.plugin_code.cache_clear()
+    identity.training_code.cache_clear()
     assert digest(cell_identity(baseline, "v")) != digest(before)
     files = {"source": ["plugins/one/one.py"], "settings": [], "entry point": ["plugins/one"]}
     assert changed_code(before["code"], "torch") == files[changed]

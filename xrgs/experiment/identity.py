@@ -36,16 +36,27 @@ _NATIVE_CODE = "csrc"
 
 
 @cache
-def training_code(backend: str) -> dict[str, str]:
+def training_code(backend: str, plugin_names: tuple[str, ...] = ()) -> dict[str, str]:
     """Return the SHA-256 of each source file that trains with a backend; they are read once.
+
+    All cells of the same backend and plugins share the returned object: a plan of ten thousand
+    cells would else hold as many copies.
 
     Args:
         backend: `native` or `torch`.
+        plugin_names: The names of components of other packages, sorted.
 
     Returns:
-        The digests, keyed by the file's path in the package.
+        The digests, keyed by the file's path in the package; those of other packages by
+        `plugins/<name>/<path in the package>`.
+
+    Raises:
+        XrgsError: A plugin is not installed, or has no source file.
     """
-    return _installed_code(backend)
+    digests = _installed_code(backend)
+    for name in plugin_names:
+        digests |= plugins.source_digests(name)
+    return digests
 
 
 def _installed_code(backend: str) -> dict[str, str]:
@@ -88,24 +99,5 @@ def cell_identity(conf: Conf, variant_id: str) -> dict[str, Any]:
         "seed": conf.seed,
         "variant": variant_id,
         "protocol": PROTOCOL_VERSION,
-        "code": training_code(backend) | plugin_code(tuple(sorted(conf.components.plugins))),
+        "code": training_code(backend, tuple(sorted(conf.components.plugins))),
     }
-
-
-@cache
-def plugin_code(names: tuple[str, ...]) -> dict[str, str]:
-    """Hash the source files of components of other packages; they are read once.
-
-    Args:
-        names: The names of the plugins.
-
-    Returns:
-        SHA-256 by `plugins/<name>/<path in the package>`.
-
-    Raises:
-        XrgsError: A plugin is not installed, or has no source file.
-    """
-    digests: dict[str, str] = {}
-    for name in names:
-        digests |= plugins.source_digests(name)
-    return digests

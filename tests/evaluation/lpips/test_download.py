@@ -17,6 +17,8 @@ from xrgs.errors import XrgsError
 from xrgs.evaluation.lpips import download, weights
 from xrgs.evaluation.lpips.weights import Weights
 
+pytestmark = pytest.mark.slow
+
 
 @pytest.fixture
 def checkpoint(random_weights: Weights, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> bytes:

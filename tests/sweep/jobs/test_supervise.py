@@ -18,6 +18,8 @@ from xrgs.errors import XrgsError
 from xrgs.sweep.jobs import supervise
 from xrgs.sweep.jobs.supervise import Limits
 
+pytestmark = pytest.mark.slow
+
 #: Starts a child of its own, writes both their numbers, refuses to end, and hangs.
 _STUBBORN = """
 import json, os, signal, subprocess, sys, time

@@ -178,6 +178,7 @@ def test_all_are_on_together(build: Build, off: ComponentsConf) -> None:
     assert {type(component) for component in build(off)} == {kind for _, kind in ON.values()}
 
 
+@pytest.mark.slow
 def test_training_needs_no_hydra() -> None:
     code = "import sys, xrgs.training.components; sys.exit('hydra' in sys.modules)"
     run = subprocess.run([sys.executable, "-P", "-c", code], check=False)
