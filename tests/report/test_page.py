@@ -145,7 +145,7 @@ def test_the_terminal_has_table_failures_and_folder(study: Any) -> None:
 
 def test_scores_are_kept_view_by_view(study: Any) -> None:
     study.write()
-    with (build(study.store.path).folder / "views.csv").open(newline="") as stream:
+    with (build(study.store.path, pictures=[]).folder / "views.csv").open(newline="") as stream:
         rows = list(csv.DictReader(stream))
     assert len(rows) == 4 * 2
     assert rows[0]["view"] == "IMG_001"
@@ -154,7 +154,8 @@ def test_scores_are_kept_view_by_view(study: Any) -> None:
 
 def test_provenance_is_gathered_without_its_moment(study: Any) -> None:
     study.write()
-    found = json.loads((build(study.store.path).folder / "provenance.json").read_text())
+    folder = build(study.store.path, pictures=[]).folder
+    found = json.loads((folder / "provenance.json").read_text())
     assert found == {"backend": ["torch"], "cpu": ["a processor"], "threads": ["2"]}
 
 
@@ -172,7 +173,7 @@ def test_a_corrupt_cell_is_not_trusted(study: Any) -> None:
     study.write()
     scores = study.store.cell("cell00001").path / "scores.csv"
     scores.write_text(scores.read_text().replace("20.", "90."))
-    text = build(study.store.path).text
+    text = build(study.store.path, pictures=[]).text
     assert "corrupt" in text
     assert "consistency against baseline: 1 of 3 scenes" in text
 
@@ -190,7 +191,7 @@ def test_a_missing_render_costs_its_picture_alone(study: Any) -> None:
 def test_baselines_alone_have_their_values(made: Any) -> None:
     made.add()
     made.write(("scene=fern",))
-    assert "100.00 s" in build(made.store.path).text
+    assert "100.00 s" in build(made.store.path, pictures=[]).text
 
 
 def test_a_sweep_of_which_everything_failed(made: Any) -> None:
@@ -203,7 +204,7 @@ def test_a_sweep_of_which_everything_failed(made: Any) -> None:
 
 def test_another_folder_can_be_asked_for(study: Any, tmp_path: Path) -> None:
     study.write()
-    report = build(study.store.path, out=tmp_path / "out")
+    report = build(study.store.path, out=tmp_path / "out", pictures=[])
     assert (tmp_path / "out" / "table.md").exists()
     assert report.folder == tmp_path / "out"
     assert not study.store.reports.exists()
