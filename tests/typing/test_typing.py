@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+import os
 import re
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
-from mypy import api
+
+import xrgs
 
 FOLDER = Path(__file__).parent
 CORRECT, WRONG = FOLDER / "correct_use.py", FOLDER / "wrong_use.py"
@@ -21,9 +25,21 @@ def expected_errors() -> set[tuple[int, str]]:
 
 @pytest.mark.slow
 def test_correct_use_passes_and_each_wrong_use_is_found(tmp_path: Path) -> None:
-    options = ["--strict", "--config-file=", f"--cache-dir={tmp_path}", "--no-error-summary"]
-    out, err, _ = api.run([*options, str(CORRECT), str(WRONG)])
-    assert err == ""
+    # From an empty folder, so that the installed package is found and not the checkout. mypy does
+    # not see an editable installation, whose source it is given instead.
+    installed = Path(xrgs.__file__).parents[1]
+    source = {} if installed.name == "site-packages" else {"MYPYPATH": str(installed)}
+    options = ["--strict", "--config-file=", "--follow-imports=silent", "--no-error-summary"]
+    done = subprocess.run(
+        [sys.executable, "-m", "mypy", *options, str(CORRECT), str(WRONG)],
+        cwd=tmp_path,
+        env=os.environ | source,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    out = done.stdout
+    assert done.stderr == ""
     found = re.findall(r"^(\S+?):(\d+): error: .*\[([a-z-]+)\]$", out, flags=re.MULTILINE)
     assert len(found) == out.count(": error: "), out
     assert {Path(file).name for file, _, _ in found} == {WRONG.name}, out

@@ -67,15 +67,21 @@ class Moment:
 
 
 def drawn(count: int, chance: random.Random) -> list[Moment]:
-    """Return random moments, one of them in training; no phase is hit twice before all are hit."""
+    """Return random moments; no phase is hit twice before all are hit.
+
+    The first one drawn kills a worker soon after its first checkpoint, on a fast machine too: from
+    there, training has to resume.
+    """
     places = list(PHASES)
     turns = ["train", *chance.sample([name for name in places if name != "train"], len(places) - 1)]
     moments = []
     for turn in range(count):
         name = turns[turn % len(turns)]
         done = {"build": 0, "report": CELLS}.get(name, chance.randrange(CELLS))
-        later = chance.uniform(0, PHASES[name][1])
-        moments.append(Moment(done, places.index(name), later, chance.random() < 0.5))
+        longest, worker = PHASES[name][1], chance.random() < 0.5
+        if turn == 0:
+            longest, worker = 0.05, True
+        moments.append(Moment(done, places.index(name), chance.uniform(0, longest), worker))
     return sorted(moments)
 
 
