@@ -167,6 +167,7 @@ def test_a_factor_too_large_for_the_ssim_window_is_named(configured: Make) -> No
         ({"hr_above": 0.5}, "variant.hr_above=0.5: not read with variant.tags=flag"),
         ({"degradation": "blur"}, "variant.degradation=blur"),
         ({"jpeg_quality": 0}, "variant.jpeg_quality=0"),
+        ({"jpeg_quality": 96}, "variant.jpeg_quality=96"),
         ({"sfm": {"camera": "both"}}, "variant.sfm.camera=both"),
         ({"sfm": {"first_octave": -2}}, "variant.sfm.first_octave=-2"),
         ({"sfm": {"min_inliers": 5}}, "variant.sfm.min_inliers=5"),
@@ -181,3 +182,38 @@ def test_an_invalid_config_is_refused_by_its_key(
     with pytest.raises(XrgsError, match=key):
         check_variant_conf(configured(**change))
     check_variant_conf(configured())
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"factor": 1},
+        {"hr_fraction": 0.0},
+        {"hr_fraction": 1.0},
+        {"min_hr": 0},
+        {"long_side": 0},
+        {"test_every": 0},
+        {"test_every": 2},
+        {"selection": "random"},
+        {"selection": "uniform"},
+        {"tags": "flag", "hr_above": 0.0},
+        {"tags": "megapixels", "hr_above": 0.5},
+        {"tags": "distance", "hr_above": 1.0},
+        {"tags": "sampling_rate"},
+        *({"degradation": d} for d in ("auto", "none", "downsample", "digital_zoom", "jpeg")),
+        {"jpeg_quality": 1},
+        {"jpeg_quality": 95},
+        {"sfm": {"lr_images": "upsampled"}},
+        {"sfm": {"lr_images": "native"}},
+        {"sfm": {"min_registered": 0.0}},
+        {"sfm": {"min_registered": 1.0}},
+        {"sfm": {"max_num_features": 0}},
+        *({"sfm": {"camera": c}} for c in ("auto", "single", "per_image")),
+        *({"sfm": {"first_octave": o}} for o in (None, -1, 0)),
+        {"sfm": {"min_inliers": 6}},
+    ],
+)
+def test_every_documented_value_and_limit_is_accepted(
+    configured: Make, change: dict[str, Any]
+) -> None:
+    check_variant_conf(configured(**change))

@@ -80,3 +80,24 @@ def test_distance_and_sampling_rate_can_disagree() -> None:
     assert by_rate == pytest.approx([1, np.nan, 2 / 3], nan_ok=True)
     assert by_distance == pytest.approx([0.5, np.nan, 1], nan_ok=True)
     assert tagging.megapixel_scores([(40, 30), (30, 40), (20, 15)]) == [1, 1, 0.25]
+
+
+def test_points_on_the_border_of_the_image_and_close_to_the_camera_count() -> None:
+    """Pixels 0 and 100 of 100 are the image's own border; depth is bounded by 0 alone."""
+    border = [[-50 / 90, 0, 1], [50 / 90, 0, 1], [0, -40 / 90, 1], [0, 40 / 90, 1]]
+    for point in border:
+        assert tagging.median_depth(np.array([point]), np.eye(4), LENS) == 1
+        assert np.isnan(
+            tagging.median_depth(1.02 * np.array([point]) - [0, 0, 0.02], np.eye(4), LENS)
+        )
+    assert tagging.median_depth(column(0.25, 0.5, 0.75), np.eye(4), LENS) == 0.5
+
+
+def test_each_view_has_the_depth_of_the_points_that_it_observes() -> None:
+    points = column(*[4.0] * 8, *[6.0] * 8, *[9.0] * 40)
+    poses = {0: np.eye(4), 3: np.eye(4)}
+    observed = {0: np.arange(8), 3: np.arange(8, 16)}
+    model = Reconstruction(
+        dict.fromkeys(poses, LENS), poses, points, np.zeros((56, 3), np.uint8), observed, {}
+    )
+    assert tagging.median_depths(model) == {0: 4, 3: 6}

@@ -35,6 +35,24 @@ def test_ablations_stack() -> None:
     assert specs[1][0] == "loss_weighting+consistency"
 
 
+def test_spaces_and_quotes_are_not_part_of_a_label() -> None:
+    specs = labels_and_conditions("+ablation=[loss_weighting, 'consistency']")
+    assert specs[1][0] == "loss_weighting+consistency"
+
+
+def test_a_cell_has_the_overrides_of_its_combination() -> None:
+    baseline, cell = expand(["+ablation=consistency", "seed=3", "train.steps=10"])
+    assert (baseline.shared, baseline.changes) == (("seed=3", "train.steps=10"), ())
+    assert (cell.shared, cell.changes) == (baseline.shared, ("+ablation=consistency",))
+    assert cell.overrides == ["seed=3", "train.steps=10", "+ablation=consistency"]
+
+
+def test_a_count_to_match_is_a_change_of_the_program() -> None:
+    baseline, cell = expand(["matched_to=xrgs"])
+    assert (baseline.label, baseline.shared) == (BASELINE, ())
+    assert (cell.label, cell.changes) == ("matched_to=xrgs", ("matched_to=xrgs",))
+
+
 def test_each_seed_and_scene_has_a_baseline_of_its_own() -> None:
     specs = expand(["+ablation=consistency", "seed=0,1", "scene=motorcycle,procedural"])
     assert len(specs) == 8
