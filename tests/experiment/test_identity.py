@@ -12,6 +12,7 @@ from typing import Any
 import pytest
 
 from xrgs.config import Conf
+from xrgs.evaluation.protocol import PROTOCOL_VERSION
 from xrgs.experiment import identity
 from xrgs.experiment.identity import cell_identity
 from xrgs.safeio import hashing
@@ -131,3 +132,27 @@ def test_files_that_were_changed_added_or_removed_are_named(copied_package: Path
     (copied_package / "safeio" / "npz.py").unlink()
     names = ["safeio/npz.py", "splat/added.py", "splat/densify.py"]
     assert identity.changed_code(planned, "torch") == names
+
+
+@pytest.mark.parametrize("backend", ["torch", "auto"])
+def test_an_identity_has_these_keys_and_values(baseline: Conf, backend: str) -> None:
+    """The hand-over to jobs, status and reports read identities by these keys."""
+    baseline.splat.backend = backend
+    resolved = resolve_backend(backend)
+    values = dataclasses.asdict(baseline)
+    assert cell_identity(baseline, "v") == {
+        "splat": values["splat"] | {"backend": resolved},
+        "train": values["train"],
+        "components": values["components"],
+        "seed": baseline.seed,
+        "variant": "v",
+        "protocol": PROTOCOL_VERSION,
+        "code": identity.training_code(resolved),
+    }
+
+
+def test_code_is_compared_for_the_backend_that_is_named() -> None:
+    for backend in ("torch", "native"):
+        assert identity.changed_code(identity.training_code(backend), backend) == []
+    native, torch = (identity.training_code(backend) for backend in ("native", "torch"))
+    assert identity.changed_code(native, "torch") == sorted(native.keys() - torch.keys())

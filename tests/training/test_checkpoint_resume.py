@@ -25,8 +25,6 @@ from xrgs.training.count_matching import train_cell
 from xrgs.training.loop import train
 from xrgs.training.recorder import TrainingResult
 
-pytestmark = pytest.mark.slow
-
 STEPS = 24
 #: Densification every fourth step: every single step, as the schedule of so few steps has it, would
 #: leave no statistics to be restored.

@@ -222,3 +222,50 @@ def test_extreme_gaussians_stay_finite() -> None:
     mip.after_training(gaussians)
     assert torch.isfinite(gaussians.scales).all()
     assert torch.isfinite(gaussians.opacities).all()
+
+
+def test_the_history_has_the_mean_filter_and_the_number_of_unseen_gaussians() -> None:
+    gaussians = splats((0.0, 0.0, 0.0), (0.0, 0.0, 1.0), (50.0, 0.0, 0.0))
+    mip = on(FAR, CLOSE)
+    assert mip.unseen_count == 0
+    assert mip.variance.shape == (0,)
+    step = Step(0, 30_000, view("LR", CLOSE))
+    mip.before_render(gaussians.activated(), step)
+    sigma = (0.2**0.5 / torch.tensor([25.0, 20.0, 20.0], dtype=torch.float64)).mean().item()
+    assert step.log == {"mip.sigma": pytest.approx(sigma, rel=1e-6), "mip.unseen": 1}
+    between = Step(1, 30_000, view("LR", CLOSE))
+    mip.before_render(gaussians.activated(), between)
+    assert between.log == {}
+
+
+def test_a_rate_below_one_pixel_a_unit_is_seen() -> None:
+    gaussians = splats((0.0, 0.0, 0.0), (0.0, 0.0, 396.0))
+    mip = on(FAR)
+    mip.on_gaussians_changed(gaussians)
+    torch.testing.assert_close(mip.variance, 0.2 / torch.tensor([25.0, 0.25]) ** 2)
+    assert mip.unseen_count == 0
+
+
+def test_the_larger_focal_length_counts_whichever_axis_has_it() -> None:
+    rates = sampling_rates(torch.zeros(1, 3), [camera(120.0, fy=100.0, back=4.0)], NEAR)
+    assert rates.item() == pytest.approx(30.0)
+
+
+def test_the_state_is_the_filter() -> None:
+    gaussians = splats((0.0, 0.0, 0.0), (0.0, 0.0, 1.0))
+    mip, resumed = on(FAR, CLOSE), on(FAR, CLOSE)
+    mip.on_gaussians_changed(gaussians)
+    resumed.load_state_dict({"variance": mip.state_dict()["variance"].clone()})
+    assert torch.equal(resumed.variance, mip.variance)
+    between = Step(1, 30_000, view("LR", CLOSE))
+    filtered = (m.before_render(gaussians.activated(), between).scales for m in (resumed, mip))
+    assert torch.equal(*filtered)
+
+
+def test_a_gaussian_on_the_near_plane_is_not_seen() -> None:
+    means = torch.tensor([[0.0, 0.0, NEAR - 4.0], [0.0, 0.0, 0.5 - 4.0]])
+    at_near = camera(100.0, back=4.0)
+    depth = means[:, 2] + 4.0
+    rates = sampling_rates(means, [at_near], float(depth[0]))
+    assert rates[0] == 0
+    assert rates[1] == pytest.approx(200.0)
