@@ -10,7 +10,7 @@ import pytest
 from xrgs.evaluation.metrics import METRICS, Metric
 from xrgs.report.collect import read_sweep
 from xrgs.report.compare import compare
-from xrgs.report.tables import Change, Tables, arrow, number, percent, reading, signed
+from xrgs.report.tables import ARROWS_NOTE, Change, Tables, arrow, number, percent, reading, signed
 
 BY_NAME = {metric.name: metric for metric in METRICS}
 #: Whether more of it is better, from the metrics' own papers and common sense, not from the code.
@@ -164,6 +164,21 @@ def test_several_ablations_stand_beside_each_other(made: Any) -> None:
     (table,) = tables(made).overviews()
     assert table.columns == ("Metric", "consistency", "loss_weighting")
     assert ("Gaussians", "-50.00 ↑", "failed  ") in table.rows
+    assert table.title == "Change from baseline, %, mean over scenes"
+    assert table.align == "lrr"
+    assert table.notes == (ARROWS_NOTE,)
+
+
+def test_an_overview_of_each_condition_names_it(made: Any) -> None:
+    for condition in ("train.steps=10", "train.steps=20"):
+        made.add(condition=condition)
+        for label in ("consistency", "loss_weighting"):
+            made.add(label, condition=condition)
+    titles = [table.title for table in tables(made).overviews()]
+    assert len(titles) == 2
+    for title, condition in zip(titles, ("train.steps=10", "train.steps=20"), strict=True):
+        assert title.startswith("Change from baseline, %, mean over scenes")
+        assert condition in title
 
 
 def test_one_ablation_needs_no_overview(made: Any) -> None:

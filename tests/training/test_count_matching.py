@@ -220,3 +220,18 @@ def test_a_value_out_of_range_names_its_key(
     setattr(short.components.count_matched, name, value)
     with pytest.raises(XrgsError, match=rf"^components\.count_matched\.{name}={value}"):
         train_cell(data, short)
+
+
+def test_a_deviation_of_exactly_the_tolerance_is_accepted() -> None:
+    check = CountCheck(100, 0.5, stop=15_000)
+    check.after_training(model_of(150))
+    with pytest.raises(CountMismatchError, match="151"):
+        check.after_training(model_of(151))
+
+
+def test_every_attempt_that_missed_is_logged(caplog: pytest.LogCaptureFixture) -> None:
+    train_at, _ = simulated_training(power=1.5, at_start=150, target=100)
+    with caplog.at_level("INFO"):
+        ThresholdSearch(2e-4, 100).run(train_at)
+    message = "count matching: threshold 0.0002 gave 150 Gaussians, the target is 100"
+    assert caplog.messages[0] == message
