@@ -220,3 +220,45 @@ def test_the_long_table_has_every_number_at_full_precision(made: Any) -> None:
     assert rows[1]["printed"] == percent(fern, BY_NAME["training_time_s"]) == "-66.67 ↑"
     assert rows[1]["reading"] == "one seed: no interval"
     assert rows[0]["n_of"] == "scenes"
+
+
+def test_cells_without_results_are_listed_with_why(made: Any) -> None:
+    made.add()
+    made.add("consistency", state="failed")
+    table = tables(made).missing()
+    assert table is not None
+    assert table.title == "1 of 2 cells gave no number"
+    assert table.columns == ("Scene", "Label", "Condition", "Seed", "State", "Reason")
+    assert table.align == "lllrll"
+    assert [row[:5] for row in table.rows] == [("fern", "consistency", "", "0", "failed")]
+
+
+def test_tables_of_a_condition_name_it_and_align_numbers_to_the_right(made: Any) -> None:
+    for condition, factor in (("train.steps=10", 2.0), ("train.steps=20", 3.0)):
+        for scene in ("fern", "horns"):
+            made.add(scene=scene, condition=condition, values={"gaussians": 10 * factor})
+            made.add("consistency", scene=scene, condition=condition, state="failed")
+    built = tables(made)
+    values = built.values("train.steps=20")
+    assert values.title == "Values, means over the seeds that are done (train.steps=20)"
+    assert values.align == "llrr"
+    rows = {row[:2]: row[2:] for row in values.rows}
+    assert rows["fern", "Gaussians"] == ("30", "failed")
+    by_scene = built.per_scene("consistency", "train.steps=20")
+    assert by_scene.title == "consistency: change from baseline, scene by scene (train.steps=20)"
+    assert by_scene.align == "lrrr"
+    assert by_scene.notes == (ARROWS_NOTE,)
+
+
+def test_the_long_table_has_each_metrics_unit_and_direction(made: Any) -> None:
+    made.add()
+    made.add("consistency", factors={"psnr": 0.5})
+    long = tables(made).long()
+    for row in long.to_dict("records"):
+        metric = BY_NAME[row["metric"]]
+        assert row["metric_unit"] == metric.unit
+        assert row["higher_is_better"] == MORE_IS_BETTER[row["metric"]]
+        assert row["printed"] == row["printed"].rstrip()
+    assert set(long["scene"]) == {"", "fern"}
+    (mean,) = long[(long["level"] == "mean") & (long["metric"] == "psnr")].to_dict("records")
+    assert (mean["printed"], mean["scene"]) == ("-50.00 ↓", "")
