@@ -10,6 +10,7 @@ namespace XRGS_NS {
 
 // The number of vectors that the registers hold.
 constexpr int kVectorRegisters = 8;
+constexpr bool kFusedMultiplyAdd = true;
 
 struct Floats {
   __m256 lo, hi;
@@ -220,12 +221,6 @@ XRGS_INLINE void transpose(Floats (&r)[16]) {
     r[i] = {block[0][i], block[2][i]};
     r[i + 8] = {block[1][i], block[3][i]};
   }
-}
-
-// rsqrt has a relative error of at most 1.5 * 2^-12 = 3.7e-4, which the last factor outweighs.
-XRGS_INLINE Floats sqrt_upper_bound(Floats a) {
-  a = max(a, broadcast(1e-20f));
-  return a * Floats{_mm256_rsqrt_ps(a.lo), _mm256_rsqrt_ps(a.hi)} * broadcast(1.0005f);
 }
 
 XRGS_INLINE void stream_fence() { _mm_sfence(); }

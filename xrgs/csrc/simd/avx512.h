@@ -10,6 +10,7 @@ namespace XRGS_NS {
 
 // The number of vectors that the registers hold.
 constexpr int kVectorRegisters = 32;
+constexpr bool kFusedMultiplyAdd = true;
 
 struct Floats {
   __m512 v;
@@ -154,12 +155,6 @@ XRGS_INLINE void transpose(Floats (&r)[16]) {
   }
 }
 
-// rsqrt14 has a relative error of at most 2^-14 = 6.1e-5, which the last factor outweighs.
-XRGS_INLINE Floats sqrt_upper_bound(Floats a) {
-  a = max(a, broadcast(1e-20f));
-  return a * Floats{_mm512_rsqrt14_ps(a.v)} * broadcast(1.0001f);
-}
-
 XRGS_INLINE void stream_fence() { _mm_sfence(); }
 
 XRGS_INLINE void load_triples(const float* p, Floats& x, Floats& y, Floats& z) {
@@ -187,32 +182,6 @@ XRGS_INLINE void store_triples(float* p, Floats x, Floats y, Floats z) {
   _mm512_storeu_ps(p, _mm512_permutex2var_ps(a, a2, z.v));
   _mm512_storeu_ps(p + 16, _mm512_permutex2var_ps(b, b2, z.v));
   _mm512_storeu_ps(p + 32, _mm512_permutex2var_ps(c, c2, z.v));
-}
-
-// The bits of 2^(i/32), minus i << 18: the shifted sum of exp2 adds i << 18 again.
-alignas(64) constexpr std::uint32_t kExp2Table[32] = {
-    0x3f800000, 0x3f7ecd87, 0x3f7daac3, 0x3f7c980f, 0x3f7b95c2, 0x3f7aa43a, 0x3f79c3d3, 0x3f78f4f0,
-    0x3f7837f0, 0x3f778d3a, 0x3f76f532, 0x3f767043, 0x3f75fed7, 0x3f75a15b, 0x3f75583f, 0x3f7523f6,
-    0x3f7504f3, 0x3f74fbaf, 0x3f7508a4, 0x3f752c4d, 0x3f75672a, 0x3f75b9be, 0x3f76248c, 0x3f76a81e,
-    0x3f7744fd, 0x3f77fbb8, 0x3f78ccdf, 0x3f79b907, 0x3f7ac0c7, 0x3f7be4ba, 0x3f7d257d, 0x3f7e83b3,
-};
-
-// exp2(x) = 2^n 2^(i/32) 2^f, with n + i/32 the multiple of 1/32 that is nearest to x: a table
-// holds 2^(i/32), and 2^f is a polynomial of degree 2. Multiplications limit the speed of AVX-512
-// code, and this form needs fewer than the polynomial of degree 5. The polynomial's relative
-// error is 5.3e-8; with the rounding of each step the total is 2.2e-7 (measured). exp2(0) is
-// exactly 1.
-XRGS_INLINE Floats exp2(Floats x) {
-  // Adding 1.5 * 2^18 rounds x to a multiple of 1/32. The low five bits of the sum are i, and the
-  // bits above them are n.
-  const Floats magic = broadcast(393216.0f);
-  const Floats t = x + magic;
-  const Floats f = x - (t - magic);  // -1/64 to 1/64
-  const Floats p = fma(f, fma(f, broadcast(0.24022474884986877f), broadcast(0.6931573152542114f)),
-                       broadcast(1.0f));
-  const __m512i part = _mm512_permutex2var_epi32(
-      _mm512_load_si512(kExp2Table), _mm512_castps_si512(t.v), _mm512_load_si512(kExp2Table + 16));
-  return p * as_floats(Ints{part} + shift_left<18>(as_ints(t)));
 }
 
 }  // namespace XRGS_NS

@@ -10,6 +10,7 @@ namespace XRGS_NS {
 
 // The number of vectors that the registers hold, if there are sixteen registers of four floats.
 constexpr int kVectorRegisters = 4;
+constexpr bool kFusedMultiplyAdd = false;
 
 struct Floats {
   float v[16];
@@ -152,8 +153,6 @@ XRGS_INLINE void transpose(Floats (&r)[16]) {
       r[j].v[i] = t;
     }
 }
-
-XRGS_INLINE Floats sqrt_upper_bound(Floats a) { return sqrt(max(a, broadcast(1e-20f))); }
 
 XRGS_INLINE void stream_fence() {}
 

@@ -9,6 +9,7 @@
 //
 //   struct Floats, Ints, Mask           sixteen float32, sixteen int32, sixteen booleans
 //   int kVectorRegisters                number of Floats that the registers hold
+//   bool kFusedMultiplyAdd              fma() rounds once
 //
 //   Floats broadcast(float)             the same number in every lane
 //   Ints broadcast_int(int32)
@@ -23,13 +24,10 @@
 //   void stream_fence()                 makes the stores of stream() visible to other threads
 //
 //   + - * /, sqrt, abs, floor, ceil     lane by lane, as IEEE 754 rounds
-//   Floats fma(a, b, c)                 a b + c, rounded once where there is an instruction for it
+//   Floats fma(a, b, c)                 a b + c, rounded once if kFusedMultiplyAdd, else twice
 //   Floats fnma(a, b, c)                c - a b, likewise
 //   Floats min(a, b), max(a, b)         b where a or b is NaN
 //   Floats min_positive(a, b)           min of positive numbers; of others unspecified
-//   Floats sqrt_upper_bound(a)          for a >= 0: at least sqrt(max(a, 1e-20)), at most 0.1% more
-//   Floats exp2(a)                      2^a with a relative error below 2.4e-7 for
-//                                       -126 <= a <= 127; for others unspecified
 //   <, <=, ==                           comparisons that are false for NaN
 //   Mask & Mask
 //   uint32 to_bits(Mask)                lane i as bit i
@@ -58,8 +56,9 @@
 //   Floats sum_rows(a)                  (row 0 + row 2) + (row 1 + row 3), in all four rows
 //   Floats add_last_row(a, b)           a + b in row 3, a in the others
 //
-// Every instruction set adds in the same order. Results differ between them where one has no fused
-// multiply-add, where the compiler fuses a product and a sum, and in exp2.
+// Every instruction set rounds in the same way and adds in the same order, and the compiler fuses
+// nothing of its own accord (-ffp-contract=off): all of them that have a fused multiply-add give the
+// same bits. kFusedMultiplyAdd says whether one has.
 //
 // Kernel files must not call inline functions of the standard library unless they are certain to be
 // inlined: the linker keeps one copy of such a function for the whole module, which may be the one
@@ -108,6 +107,35 @@ XRGS_INLINE void store_quadruples(float* p, Floats w, Floats x, Floats y, Floats
   interleave(wy[0], xz[0], out[0], out[1]);
   interleave(wy[1], xz[1], out[2], out[3]);
   for (int i = 0; i < 4; ++i) store(p + 16 * i, out[i]);
+}
+
+// 2^x with a relative error below 2.0e-7 for -126 <= x <= 127, and exactly 1 at 0; for other x
+// unspecified.
+//
+// 2^x = 2^n 2^f, with n the integer nearest to x: 2^f is a polynomial of degree 5 whose constant is
+// 1, and n is added to its exponent. The polynomial's relative error is 9.2e-8; the rest is rounding.
+XRGS_INLINE Floats exp2(Floats x) {
+  const Floats magic = broadcast(12582912.0f);  // 1.5 * 2^23: adding it rounds to an integer
+  const Floats t = x + magic;
+  const Floats f = x - (t - magic);  // -1/2 to 1/2
+  Floats p = fma(f, broadcast(0.0013264727f), broadcast(0.0096715127f));
+  p = fma(f, p, broadcast(0.0555073374f));
+  p = fma(f, p, broadcast(0.2402224208f));
+  p = fma(f, p, broadcast(0.6931469776f));
+  p = fma(f, p, broadcast(1.0f));
+  return as_floats(as_ints(p) + shift_left<23>(as_ints(t)));
+}
+
+// For a >= 0: at least sqrt(max(a, 1e-20)), and at most 0.2% more.
+//
+// The approximate inverse square roots of the instruction sets differ. This one starts from the bits
+// of a, at most 3.5% off, and one step of Newton's method brings it to at most 0.18% below the inverse
+// root, never above, which the last factor outweighs.
+XRGS_INLINE Floats sqrt_upper_bound(Floats a) {
+  a = max(a, broadcast(1e-20f));
+  const Floats start = as_floats(broadcast_int(0x5f3759df) - shift_right<1>(as_ints(a)));
+  const Floats a_start = a * start;
+  return a_start * fnma(broadcast(0.5f * 1.0019f) * a_start, start, broadcast(1.5f * 1.0019f));
 }
 
 // The base-2 logarithm of finite x >= 2^-126, with a relative error below 2.1e-7.
