@@ -152,8 +152,9 @@ class PairGrads:
             G = f.c[i] @ v_image - self.background @ v_image + v_alpha  # 16
             g = weight * (G - R) * (raw[i] <= SETTINGS.alpha_max)  # 17
             R = R + alpha[i] * (G - R)
-            x, y = dx[i], dy[i]
-            self.sums[i] += g * torch.stack([torch.ones_like(x), x, y, x * x, x * y, y * y])  # 18
+            of_u, y = u[i], dy[i]
+            powers = [torch.ones_like(y), of_u, y, of_u * of_u, of_u * y, y * y]
+            self.sums[i] += g * torch.stack(powers)  # 18
             self.v_color[i] += weight * v_image
             by_y = f.lyy[i] * v[i] - f.lxy[i] * u[i]
             self.absgrad[i] += torch.stack([2 * g * f.lxx[i] * u[i], 2 * g * by_y]).abs()  # 21
@@ -161,14 +162,10 @@ class PairGrads:
 
 def gradients(f: Forward, pairs: PairGrads) -> dict[str, Tensor]:
     """Equations 19 to 32."""
-    S1, Sx, Sy, Sxx, Sxy, Syy = pairs.sums.unbind(-1)
+    S1, Su, Sy, Suu, Suy, Syy = pairs.sums.unbind(-1)
     v_o = S1 / f.o  # 19
-    Su = f.lxx * Sx - f.lxy * Sy
     v_mean2d = torch.stack([2 * f.lxx * Su, 2 * (f.lyy**2 * Sy - f.lxy * Su)], dim=-1)  # 20
-    v_lxx = -2 * (f.lxx * Sxx - f.lxy * Sxy)  # 22
-    v_lxy = 2 * (f.lxx * Sxy - f.lxy * Syy)
-    v_lyy = -2 * f.lyy * Syy
-    shared = f.lxx * v_lxx + f.lxy * v_lxy
+    shared, v_lxy, v_lyy = -2 * Suu, 2 * Suy, -2 * f.lyy * Syy  # 22
     v_xy = f.lxx / f.yy * v_lxy  # 23
     v_yy = (shared / 2 - f.lyy * v_lyy / 2 - f.lxy * v_lxy) / f.yy
     v_D = -shared / (2 * f.D)

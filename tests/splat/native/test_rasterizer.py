@@ -8,6 +8,7 @@ on it.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from copy import copy
 from dataclasses import replace
@@ -314,6 +315,50 @@ def test_absgrad(
     offset = plain["means2d_offset"].abs()
     assert (absolute["means2d_offset"] >= offset - 1e-4 * offset.max()).all()
     assert absolute["means2d_offset"].sum() > 1.5 * offset.sum()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("antialiased", [False, True])
+def test_gradients_of_needles_are_as_exact_as_float32_in_torch(antialiased: bool) -> None:
+    """Gaussians of up to 1,000 px, three times as long as the image is wide, in many directions.
+
+    In the median at most twice torch's error, which is about 1e-5 for all parameters.
+    """
+    size = 320
+    focal, depth = float(size), 2.0
+    K = torch.tensor([[focal, 0, size / 2], [0, focal, size / 2], [0, 0, 1]])
+    camera = Camera(torch.eye(4), K, size, size)
+    raster = RasterSettings(
+        antialiased=antialiased, alpha_min=1e-6, alpha_max=1.0, transmittance_min=0.0
+    )
+    for length, width in ((100, 0.3), (1000, 0.05)):
+        errors: dict[str, dict[str, list[float]]] = {"native": {}, "torch": {}}
+        for seed in range(40):
+            generator = torch.Generator().manual_seed(seed)
+            half_angle = 0.15 + 0.5 * torch.rand(1, generator=generator).item()
+            scene = single(
+                {
+                    "means": torch.tensor([[0.03, 0.02, depth]]),
+                    "quats": torch.tensor(
+                        [[math.cos(half_angle), 0.02, 0.01, math.sin(half_angle)]]
+                    ),
+                    "scales": torch.tensor([[length, width, width]]) * depth / focal,
+                    "opacities": torch.tensor([0.9]),
+                    "sh0": torch.randn(1, 1, 3, generator=generator),
+                    "shN": torch.zeros(1, 15, 3),
+                    "means2d_offset": torch.zeros(1, 2),
+                }
+            )
+            v_image = torch.randn(size, size, 3, generator=generator)
+            v = v_image, torch.randn(size, size, generator=generator)
+            _, expected = run(scene, camera, raster, "torch", torch.float64, v)
+            for backend, of_backend in errors.items():
+                _, got = run(scene, camera, raster, backend, torch.float32, v)
+                for name in ("means", "quats", "scales", "opacities", "sh0"):
+                    error = (got[name] - expected[name]).norm() / expected[name].norm()
+                    of_backend.setdefault(name, []).append(float(error))
+        for name, native in errors["native"].items():
+            assert median(native) <= 2 * median(errors["torch"][name]), (length, width, name)
 
 
 @pytest.mark.slow

@@ -54,6 +54,11 @@ XRGS_INLINE int list_set_bits(const std::uint16_t* bits, int count, std::uint8_t
   return n;
 }
 
+// Fills a list of `count` up to a multiple of kUnroll.
+XRGS_INLINE void fill_up(std::uint8_t* list, int count) {
+  for (int i = count; i % kUnroll != 0; ++i) list[i] = kBatchSize;
+}
+
 // Bit i % 16 of hits[block][i / 16]: the cutoff ellipse of Gaussian i of the batch overlaps the
 // block.
 using BlockHits = std::uint16_t[kBlocksPerTile][kBatchSize / 16];
@@ -65,9 +70,7 @@ void load_and_cull_batch(const Frame& frame, const Tile& tile, const TileEntry* 
   for (int at = 0; at < count; at += 16) {
     const int lanes = count - at < 16 ? count - at : 16;
     Floats fields[16];
-    load_projected(frame, entries + at, lanes, centre, fields);
-    for (int i = 0; i < 16; ++i) store(rows[at + i], fields[i]);
-    transpose(fields);
+    load_projected(frame, entries + at, lanes, centre, rows, at, fields);
     const CutoffEllipse e = cutoff_ellipse(fields);
     const std::uint32_t existing = (1u << lanes) - 1u;
     for (int row = 0; row < 4; ++row) {
@@ -104,18 +107,24 @@ int composite_block(const BatchRows& rows, const std::uint8_t* list, int count, 
   Floats red = load(block.red), green = load(block.green), blue = load(block.blue);
   int at = 0;
   while (at < count) {
-    const float* g = rows[list[at]];
-    const Floats alpha = alpha_at(g, x, y, thresholds);
-    const Floats alpha_T = alpha * running_T;
-    running_T = running_T - alpha_T;
-    const Mask composited = thresholds.transmittance_min < running_T;
-    const Floats weight = select_or_zero(composited, alpha_T);
-    red = fma(weight, broadcast(g[kRed]), red);
-    green = fma(weight, broadcast(g[kGreen]), green);
-    blue = fma(weight, broadcast(g[kBlue]), blue);
-    final_T = select(composited, running_T, final_T);
-    if (++at % kCheckEvery == 0 && StopWhenSaturated && !any(composited)) break;
+    Floats alpha[kUnroll];
+    alphas_at(rows, list + at, x, y, thresholds, alpha);
+    Mask composited;
+    for (int i = 0; i < kUnroll; ++i) {
+      const float* g = rows[list[at + i]];
+      const Floats alpha_T = alpha[i] * running_T;
+      running_T = running_T - alpha_T;
+      composited = thresholds.transmittance_min < running_T;
+      const Floats weight = select_or_zero(composited, alpha_T);
+      red = fma(weight, broadcast(g[kRed]), red);
+      green = fma(weight, broadcast(g[kGreen]), green);
+      blue = fma(weight, broadcast(g[kBlue]), blue);
+      final_T = select(composited, running_T, final_T);
+    }
+    at += kUnroll;
+    if (at % kCheckEvery == 0 && StopWhenSaturated && !any(composited)) break;
   }
+  if (at > count) at = count;
   store(block.running_T, running_T);
   store(block.final_T, final_T);
   store(block.red, red);
@@ -143,22 +152,35 @@ std::uint32_t init_blocks(const Tile& tile, const RenderConfig& config, BlockSta
   return active_blocks;
 }
 
+// Prefetches a row of pixels that write_blocks will write, where the image has it.
+XRGS_INLINE void prefetch_image_row(const Tile& tile, const RenderConfig& config, int row,
+                                    const float* image, const float* alpha) {
+  const std::int64_t first = row_start(tile, config, row);
+  if (first < 0) return;
+  for (int i = 0; i < 3; ++i) prefetch_to_write(image + 3 * first + 16 * i);
+  prefetch_to_write(alpha + first);
+}
+
 // Writes colour over the background, and alpha = 1 - T (Eq. 15).
 void write_blocks(const Tile& tile, const RenderConfig& config, const BlockState* blocks,
                   float* image, float* alpha) {
   const float* background = config.background;
+  // All blocks are stored before any is copied: a load from bytes that two stores have just written
+  // waits until both are in the cache.
+  alignas(64) float colors[kBlocksPerTile][48], alphas[kBlocksPerTile][16];
+  for (int b = 0; b < kBlocksPerTile; ++b) {
+    const Floats final_T = load(blocks[b].final_T);
+    store_triples(colors[b], fma(final_T, broadcast(background[0]), load(blocks[b].red)),
+                  fma(final_T, broadcast(background[1]), load(blocks[b].green)),
+                  fma(final_T, broadcast(background[2]), load(blocks[b].blue)));
+    store(alphas[b], broadcast(1.0f) - final_T);
+  }
   for (int b = 0; b < kBlocksPerTile; ++b) {
     const BlockRegion region(tile, config, b);
     if (!region.overlaps_image()) continue;
-    const Floats final_T = load(blocks[b].final_T);
-    alignas(64) float colors[48], alphas[16];
-    store_triples(colors, fma(final_T, broadcast(background[0]), load(blocks[b].red)),
-                  fma(final_T, broadcast(background[1]), load(blocks[b].green)),
-                  fma(final_T, broadcast(background[2]), load(blocks[b].blue)));
-    store(alphas, broadcast(1.0f) - final_T);
-    copy_block<3>(colors, 12, image + 3 * region.first_pixel, 3 * std::int64_t{config.width},
+    copy_block<3>(colors[b], 12, image + 3 * region.first_pixel, 3 * std::int64_t{config.width},
                   region);
-    copy_block<1>(alphas, 4, alpha + region.first_pixel, config.width, region);
+    copy_block<1>(alphas[b], 4, alpha + region.first_pixel, config.width, region);
   }
 }
 
@@ -171,6 +193,7 @@ void composite(Frame& frame, int tile_index, float* image, float* alpha) {
   const bool stop = config.culling.saturated;
   BlockState blocks[kBlocksPerTile];
   alignas(64) BatchRows rows;
+  set_transparent_row(rows);
   std::uint32_t active_blocks = init_blocks(tile, config, blocks);
   std::int64_t evaluated_blocks = 0;
   SavedBatch* batch = frame.batches.data() + frame.batch_offsets[tile.index];
@@ -182,12 +205,16 @@ void composite(Frame& frame, int tile_index, float* image, float* alpha) {
     BlockHits hits;
     load_and_cull_batch(frame, tile, entries, count, rows, hits);
     if (!config.culling.blocks) hit_all_blocks(count, hits);
-    prefetch_batch(frame, at + kBatchSize);  // of this tile, or the first of the next
     for (int b = 0; b < kBlocksPerTile; ++b) {
+      prefetch_part(frame, at + static_cast<std::uint32_t>(count), b);  // of this or the next tile
+      if (batches == 0) prefetch_image_row(tile, config, b, image, alpha);
+      prefetch_to_write(batch->transmittance[(b + 2) % kBlocksPerTile]);
+      prefetch_to_write(batch->lists[(b + 2) % kBlocksPerTile]);
       batch->counts[b] = 0;
       if ((active_blocks >> b & 1u) == 0) continue;
       store(batch->transmittance[b], load(blocks[b].running_T));
       const int listed = list_set_bits(hits[b], count, batch->lists[b]);
+      fill_up(batch->lists[b], listed);
       const int evaluated =
           stop ? composite_block<true>(rows, batch->lists[b], listed, b, thresholds, blocks[b])
                : composite_block<false>(rows, batch->lists[b], listed, b, thresholds, blocks[b]);

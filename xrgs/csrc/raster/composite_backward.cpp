@@ -31,35 +31,63 @@ struct PixelGradients {
   alignas(64) float colors[4][16];
 };
 
+// The fields of a batch's Gaussians that move_moments needs, side by side.
+struct BatchColumns {
+  alignas(64) float mean_y[kBatchSize], centre_u[kBatchSize];
+  alignas(64) float chol_xx[kBatchSize], chol_xy[kBatchSize];
+};
+
 // Alpha and w at the sixteen pixels of a block, for each Gaussian of its list.
 using AlphasAndWeights = float[kBatchSize][32];
+
+// Stores, for each column C of a block, (red, green, blue, 0) of its four pixels.
+template <int C>
+XRGS_INLINE void store_column(Floats red, Floats green, Floats blue, float* out) {
+  const Floats low = select(mask_from_bits(0x2222), broadcast_column<C>(green),
+                            select_or_zero(mask_from_bits(0x4444), broadcast_column<C>(blue)));
+  store(out, select(mask_from_bits(0x1111), broadcast_column<C>(red), low));
+}
+XRGS_INLINE void store_by_column(Floats red, Floats green, Floats blue, float (&out)[4][16]) {
+  store_column<0>(red, green, blue, out[0]);
+  store_column<1>(red, green, blue, out[1]);
+  store_column<2>(red, green, blue, out[2]);
+  store_column<3>(red, green, blue, out[3]);
+}
 
 void load_pixel_gradients(const Tile& tile, const RenderConfig& config, const float* v_image,
                           const float* v_alpha, PixelGradients* pixel_gradients) {
   const float* background = config.background;
+  // All blocks are copied before any is loaded, for the reason given at write_blocks.
+  alignas(64) float colors[kBlocksPerTile][48] = {}, alphas[kBlocksPerTile][16] = {};
   for (int b = 0; b < kBlocksPerTile; ++b) {
     const BlockRegion region(tile, config, b);
     if (!region.overlaps_image()) continue;
-    PixelGradients& out = pixel_gradients[b];
-    alignas(64) float colors[48] = {}, alphas[16] = {};
-    copy_block<3>(v_image + 3 * region.first_pixel, 3 * std::int64_t{config.width}, colors, 12,
+    copy_block<3>(v_image + 3 * region.first_pixel, 3 * std::int64_t{config.width}, colors[b], 12,
                   region);
-    copy_block<1>(v_alpha + region.first_pixel, config.width, alphas, 4, region);
+    copy_block<1>(v_alpha + region.first_pixel, config.width, alphas[b], 4, region);
+  }
+  for (int b = 0; b < kBlocksPerTile; ++b) {
+    PixelGradients& out = pixel_gradients[b];
     Floats red, green, blue;
-    load_triples(colors, red, green, blue);
+    load_triples(colors[b], red, green, blue);
     store(out.red, red);
     store(out.green, green);
     store(out.blue, blue);
-    Floats constant = fnma(broadcast(background[0]), red, load(alphas));
+    Floats constant = fnma(broadcast(background[0]), red, load(alphas[b]));
     constant = fnma(broadcast(background[1]), green, constant);
     store(out.constant, fnma(broadcast(background[2]), blue, constant));
-    for (int row = 0; row < 4; ++row)
-      for (int column = 0; column < 4; ++column) {
-        const float* from = colors + 12 * row + 3 * column;
-        const float pixel[4] = {from[0], from[1], from[2], 0.0f};
-        std::memcpy(out.colors[column] + 4 * row, pixel, sizeof pixel);
-      }
+    store_by_column(red, green, blue, out.colors);
   }
+}
+
+// Prefetches one row of pixels of what load_pixel_gradients reads, where the tile and row exist.
+XRGS_INLINE void prefetch_gradient_row(const Frame& frame, int tile_index, int row,
+                                       const float* v_image, const float* v_alpha) {
+  if (tile_index >= frame.config.tile_count()) return;
+  const std::int64_t first = row_start(Tile(frame, tile_index), frame.config, row);
+  if (first < 0) return;
+  for (int i = 0; i < 3; ++i) prefetch(v_image + 3 * first + 16 * i);
+  prefetch(v_alpha + first);
 }
 
 // Repeats the forward pass over a block's list: stores alpha (zero where it was not composited) and
@@ -69,39 +97,39 @@ XRGS_INLINE void recompute_alphas(const BatchRows& rows, const std::uint8_t* lis
                                   const float* transmittance, AlphasAndWeights& out) {
   const Floats x = pixels_x(block), y = pixels_y(block);
   Floats running_T = load(transmittance);
-  for (int at = 0; at < count; ++at) {
-    const Floats alpha = alpha_at(rows[list[at]], x, y, thresholds);
-    const Floats alpha_T = alpha * running_T;
-    running_T = running_T - alpha_T;
-    const Mask composited = thresholds.transmittance_min < running_T;
-    store(out[at], select_or_zero(composited, alpha));
-    store(out[at] + 16, select_or_zero(composited, alpha_T));
+  for (int at = 0; at < count; at += kUnroll) {
+    Floats alpha[kUnroll];
+    alphas_at(rows, list + at, x, y, thresholds, alpha);
+    for (int i = 0; i < kUnroll; ++i) {
+      const Floats alpha_T = alpha[i] * running_T;
+      running_T = running_T - alpha_T;
+      const Mask composited = thresholds.transmittance_min < running_T;
+      store(out[at + i], select_or_zero(composited, alpha[i]));
+      store(out[at + i] + 16, select_or_zero(composited, alpha_T));
+    }
   }
 }
 
-// The factors of the moments: x[i] has 1, x, x^2, 0 of column i in every row; y[i] has 1, y, y^2, 0
-// of row i, each in the whole of a row of its own.
+// The factors of the moments, for each row and column i of a tile. of_column[i] has 1, x, x^2, 0 in
+// every row; of_row[i] has 1, y, y^2, 0, each in the whole of a row of its own.
 struct PixelPowers {
-  Floats x[4], y[4];
-
-  explicit PixelPowers(int block) {
-    for (int i = 0; i < 4; ++i) {
-      const float at_x = static_cast<float>(4 * (block % 4) + i) - 7.5f;
-      const float at_y = static_cast<float>(4 * (block / 4) + i) - 7.5f;
-      alignas(64) float by_column[16], by_row[16];
-      for (int k = 0; k < 4; ++k) {
-        const float power_x[4] = {1.0f, at_x, at_x * at_x, 0.0f};
-        const float power_y[4] = {1.0f, at_y, at_y * at_y, 0.0f};
-        for (int j = 0; j < 4; ++j) {
-          by_column[4 * k + j] = power_x[j];
-          by_row[4 * k + j] = power_y[k];
-        }
+  alignas(64) float of_column[kTileSize][16], of_row[kTileSize][16];
+  constexpr PixelPowers() : of_column(), of_row() {
+    for (int i = 0; i < kTileSize; ++i) {
+      const float at = static_cast<float>(i) - 7.5f;
+      const float power[4] = {1.0f, at, at * at, 0.0f};
+      for (int k = 0; k < 16; ++k) {
+        of_column[i][k] = power[k % 4];
+        of_row[i][k] = power[k / 4];
       }
-      x[i] = load(by_column);
-      y[i] = load(by_row);
     }
   }
 };
+constexpr PixelPowers kPixelPowers;
+
+XRGS_INLINE void load_four(const float (*rows)[16], Floats (&out)[4]) {
+  for (int i = 0; i < 4; ++i) out[i] = load(rows[i]);
+}
 
 // The sum over the columns c of column c of `a` times factors[c], row by row: a product of 4x4
 // matrices.
@@ -115,77 +143,105 @@ constexpr int kAbsU = 3, kAbsV = 7;
 
 // Processes a block's list back to front and adds each Gaussian's sums over the block's pixels to
 // its row of moments. Row i < 3, column j < 3 of that row, read as a 4x4 matrix, has the sum of g
-// y^i x^j, and row 3 that of w v_image. With Absgrad the last column of rows 0 and 1 has those of
-// |g u| and |g (chol_yy v - chol_xy u)|. `behind` is R of Eq. 17, for each pixel.
+// y^i x^j. Those of w v_image go to its row of color_sums, pixel row by pixel row. With Absgrad the
+// last column of rows 0 and 1 has those of |g u| and |g (chol_yy v - chol_xy u)|. `behind` is R of
+// Eq. 17, for each pixel.
 template <bool Absgrad>
 XRGS_INLINE void accumulate_moments(const BatchRows& rows, const std::uint8_t* list, int count,
                                     int block, const AlphaThresholds& thresholds,
                                     const PixelGradients& v, const AlphasAndWeights& alphas,
-                                    float* behind, BatchRows& moments) {
+                                    float* behind, BatchRows& moments, BatchRows& color_sums) {
   const Floats red = load(v.red), green = load(v.green), blue = load(v.blue);
   const Floats constant = load(v.constant);
   const Floats colors[4] = {load(v.colors[0]), load(v.colors[1]), load(v.colors[2]),
                             load(v.colors[3])};
-  const PixelPowers powers(block);
+  Floats powers_x[4], powers_y[4];
+  load_four(kPixelPowers.of_column + 4 * (block % 4), powers_x);
+  load_four(kPixelPowers.of_row + 4 * (block / 4), powers_y);
   const Floats x = pixels_x(block), y = pixels_y(block);  // used with Absgrad only
   Floats r = load(behind);
-  for (int at = count - 1; at >= 0; --at) {
-    const float* g = rows[list[at]];
-    const Floats alpha = load(alphas[at]), weight = load(alphas[at] + 16);
-    const Floats color_gradient =
-        fma(broadcast(g[kRed]), red,
-            fma(broadcast(g[kGreen]), green, fma(broadcast(g[kBlue]), blue, constant)));
-    const Floats difference = color_gradient - r;
-    r = fma(alpha, difference, r);
-    // An alpha that is capped at alpha_max does not change with its Gaussian.
-    const Floats gradient = select_or_zero(alpha < thresholds.alpha_max, weight * difference);
-    const Floats by_row = times_columns(gradient, powers.x);
-    float* sums = moments[list[at]];
-    Floats even = fma(broadcast_row<0>(by_row), powers.y[0], load(sums));
-    Floats odd = broadcast_row<1>(by_row) * powers.y[1];
-    even = fma(broadcast_row<2>(by_row), powers.y[2], even);
-    odd = fma(broadcast_row<3>(by_row), powers.y[3], odd);
-    store(sums, add_last_row(even + odd, sum_rows(times_columns(weight, colors))));
+  for (int at = (count - 1) / kUnroll * kUnroll; at >= 0; at -= kUnroll) {
+    const float* g[kUnroll];
+    Floats weight[kUnroll], gradient[kUnroll];
+    for (int i = kUnroll - 1; i >= 0; --i) {
+      g[i] = rows[list[at + i]];
+      const Floats alpha = load(alphas[at + i]);
+      weight[i] = load(alphas[at + i] + 16);
+      const Floats color_gradient =
+          fma(broadcast(g[i][kRed]), red,
+              fma(broadcast(g[i][kGreen]), green, fma(broadcast(g[i][kBlue]), blue, constant)));
+      const Floats difference = color_gradient - r;
+      r = fma(alpha, difference, r);
+      // An alpha that is capped at alpha_max does not change with its Gaussian.
+      gradient[i] = multiply_where(alpha < thresholds.alpha_max, weight[i], difference);
+    }
+    Floats by_row[kUnroll], even[kUnroll], odd[kUnroll], color[kUnroll];
+    for (int i = 0; i < kUnroll; ++i) by_row[i] = times_columns(gradient[i], powers_x);
+    for (int i = 0; i < kUnroll; ++i) {
+      even[i] = fma(broadcast_row<0>(by_row[i]), powers_y[0], load(moments[list[at + i]]));
+      odd[i] = broadcast_row<1>(by_row[i]) * powers_y[1];
+      even[i] = fma(broadcast_row<2>(by_row[i]), powers_y[2], even[i]);
+      odd[i] = fma(broadcast_row<3>(by_row[i]), powers_y[3], odd[i]);
+      color[i] = times_columns(weight[i], colors) + load(color_sums[list[at + i]]);
+    }
+    for (int i = 0; i < kUnroll; ++i) {
+      store(moments[list[at + i]], even[i] + odd[i]);
+      store(color_sums[list[at + i]], color[i]);
+    }
     if constexpr (Absgrad) {
-      const Floats dx = x - broadcast(g[kX]), dy = y - broadcast(g[kY]);
-      const Floats u = fnma(broadcast(g[kCholXY]), dy, broadcast(g[kCholXX]) * dx);
-      const Floats v_row = broadcast(g[kCholYY]) * dy;
-      sums[kAbsU] += sum_lanes(abs(gradient * u));
-      sums[kAbsV] +=
-          sum_lanes(abs(gradient * fnma(broadcast(g[kCholXY]), u, broadcast(g[kCholYY]) * v_row)));
+      for (int i = 0; i < kUnroll; ++i) {
+        float* sums = moments[list[at + i]];
+        const Floats u = u_at(g[i], x, y), v_row = v_at(g[i], y);
+        sums[kAbsU] += sum_lanes(abs(gradient[i] * u));
+        sums[kAbsV] += sum_lanes(
+            abs(gradient[i] * fnma(broadcast(g[i][kCholXY]), u, broadcast(g[i][kCholYY]) * v_row)));
+      }
     }
   }
   store(behind, r);
 }
 
-// Moves the moments of a batch from the tile's centre to the Gaussians' means, and writes them to
-// pair_grads.
-void write_pair_grads(const BatchRows& rows, const BatchRows& moments, const TileEntry* entries,
-                      int count, float* pair_grads) {
+// The first six columns of pair_grads, from the moments m about the tile's centre, for sixteen
+// Gaussians. u is a linear function of the position, so its moments are combinations of those of x
+// and y; it is small where g is not, at the centre of the tile as well, so that little cancels.
+XRGS_INLINE void move_moments(const BatchColumns& columns, int at, const Floats (&m)[16],
+                              Floats (&out)[16]) {
+  const Floats mean_y = load(columns.mean_y + at), u_centre = load(columns.centre_u + at);
+  const Floats chol_xx = load(columns.chol_xx + at), chol_xy = load(columns.chol_xy + at);
+  const Floats g = m[0], gx = m[1], gxx = m[2], gy = m[4], gxy = m[5], gyy = m[8];
+  const auto times_u = [&](Floats of_1, Floats of_x, Floats of_y) {
+    return fma(u_centre, of_1, fnma(chol_xy, of_y, chol_xx * of_x));
+  };
+  const Floats g_u = times_u(g, gx, gy);
+  const Floats g_ux = times_u(gx, gxx, gxy), g_uy = times_u(gy, gxy, gyy);
+  const Floats g_dy = fnma(mean_y, g, gy);
+  // chol_* is scaled for base 2: its u is that of Eq. 8 times sqrt(log2(e)).
+  const Floats to_base_e = broadcast(0.832554611f);
+  out[kGrad] = g;
+  out[kGradU] = to_base_e * g_u;
+  out[kGradDy] = g_dy;
+  out[kGradUU] = broadcast(0.693147181f) * times_u(g_u, g_ux, g_uy);
+  out[kGradUDy] = to_base_e * fnma(mean_y, g_u, g_uy);
+  out[kGradDyDy] = fnma(mean_y, gy + g_dy, gyy);
+}
+
+// Writes the pair_grads of a batch, from its moments about the tile's centre.
+void write_pair_grads(const BatchColumns& columns, const BatchRows& moments,
+                      const BatchRows& color_sums, const TileEntry* entries, int count,
+                      float* pair_grads) {
   for (int at = 0; at < count; at += 16) {
-    Floats fields[16], m[16], out[16];
-    for (int i = 0; i < 16; ++i) {
-      fields[i] = load(rows[at + i]);
-      m[i] = load(moments[at + i]);
-    }
-    transpose(fields);
+    Floats m[16], out[16];
+    for (int i = 0; i < 16; ++i)
+      m[i] = add_last_row(load(moments[at + i]), sum_rows(load(color_sums[at + i])));
     transpose(m);
-    const Floats mean_x = fields[kX], mean_y = fields[kY];
-    const Floats g = m[0], gx = m[1], gxx = m[2], gy = m[4], gxy = m[5], gyy = m[8];
-    const Floats g_dx = fnma(mean_x, g, gx), g_dy = fnma(mean_y, g, gy);
-    out[kGrad] = g;
-    out[kGradDx] = g_dx;
-    out[kGradDy] = g_dy;
-    out[kGradDxDx] = fnma(mean_x, gx + g_dx, gxx);
-    out[kGradDxDy] = fnma(mean_x, gy, fnma(mean_y, g_dx, gxy));
-    out[kGradDyDy] = fnma(mean_y, gy + g_dy, gyy);
+    move_moments(columns, at, m, out);
     out[kGradRed] = m[12];
     out[kGradGreen] = m[13];
     out[kGradBlue] = m[14];
     // ln alpha = ln 2 (log2_opacity - u^2 - v^2), and the derivatives by the mean are du/dx =
     // -chol_xx, du/dy = chol_xy and dv/dy = -chol_yy.
     const Floats two_ln2 = broadcast(2.0f * 0.693147181f);
-    out[kAbsGradX] = two_ln2 * fields[kCholXX] * m[kAbsU];
+    out[kAbsGradX] = two_ln2 * load(columns.chol_xx + at) * m[kAbsU];
     out[kAbsGradY] = two_ln2 * m[kAbsV];
     for (int i = kPairGradFields; i < 16; ++i) out[i] = broadcast(0.0f);
     transpose(out);
@@ -194,19 +250,32 @@ void write_pair_grads(const BatchRows& rows, const BatchRows& moments, const Til
   }
 }
 
-// Loads a batch and sets its moments to zero.
+// Loads a batch and sets its sums to zero.
 void load_batch(const Frame& frame, const Tile& tile, const TileEntry* entries, int count,
-                BatchRows& rows, BatchRows& moments) {
+                BatchRows& rows, BatchColumns& columns, BatchRows& moments, BatchRows& color_sums) {
   const Floats centre = centre_of(tile);
   for (int at = 0; at < count; at += 16) {
     const int lanes = count - at < 16 ? count - at : 16;
     Floats fields[16];
-    load_projected(frame, entries + at, lanes, centre, fields);
+    load_projected(frame, entries + at, lanes, centre, rows, at, fields);
+    store(columns.mean_y + at, fields[kY]);
+    store(columns.centre_u + at, fields[kCentreU]);
+    store(columns.chol_xx + at, fields[kCholXX]);
+    store(columns.chol_xy + at, fields[kCholXY]);
     for (int i = 0; i < 16; ++i) {
-      store(rows[at + i], fields[i]);
       store(moments[at + i], broadcast(0.0f));
+      store(color_sums[at + i], broadcast(0.0f));
     }
   }
+}
+
+// The first entry of the last batch of a tile that was composited; past all entries where there is
+// no such tile.
+std::size_t last_batch(const Frame& frame, int tile) {
+  if (tile >= frame.config.tile_count()) return frame.entries.size();
+  const auto index = static_cast<std::size_t>(tile);
+  const std::uint32_t batches = frame.composited_batches[index];
+  return frame.tile_offsets[index] + (batches > 0 ? batches - 1 : 0) * std::size_t{kBatchSize};
 }
 
 template <bool Absgrad>
@@ -216,8 +285,10 @@ void backward_tile(const Frame& frame, int tile_index, const float* v_image, con
   const Tile tile(frame, tile_index);
   if (tile.begin == tile.end) return;
   const AlphaThresholds thresholds(config);
-  alignas(64) BatchRows rows, moments;
+  alignas(64) BatchRows rows, moments, color_sums;
+  BatchColumns columns;
   alignas(64) AlphasAndWeights alphas;
+  set_transparent_row(rows);
   alignas(64) float behind[kBlocksPerTile][16] = {};
   PixelGradients pixel_gradients[kBlocksPerTile];
   load_pixel_gradients(tile, config, v_image, v_alpha, pixel_gradients);
@@ -229,21 +300,25 @@ void backward_tile(const Frame& frame, int tile_index, const float* v_image, con
   for (std::uint32_t n = composited * kBatchSize; composited < batches && n < tile.end - tile.begin;
        ++n)
     stream(pair_grads + std::size_t{entries[n].pair} * kPairGradStride, broadcast(0.0f));
+  const std::size_t next_tile = last_batch(frame, tile_index + 1);
   for (std::uint32_t n = composited; n-- > 0;) {
     const std::uint32_t at = n * kBatchSize, remaining = tile.end - tile.begin - at;
     const int count = remaining < kBatchSize ? static_cast<int>(remaining) : kBatchSize;
     const SavedBatch& batch = frame.batches[frame.batch_offsets[tile.index] + n];
-    load_batch(frame, tile, entries + at, count, rows, moments);
-    // The next batch to be processed is the one in front of this, or one of the next tile.
-    prefetch_batch(frame, n > 0 ? tile.begin + at - kBatchSize : tile.end);
+    load_batch(frame, tile, entries + at, count, rows, columns, moments, color_sums);
     for (int b = 0; b < kBlocksPerTile; ++b) {
+      // The next batch to be processed is the one in front of this, or the last of the next tile.
+      prefetch_part(frame, n > 0 ? tile.begin + at - kBatchSize : next_tile, b);
+      if (n == 0) prefetch_gradient_row(frame, tile_index + 1, b, v_image, v_alpha);
+      prefetch(batch.transmittance[(b + 2) % kBlocksPerTile]);
+      prefetch(batch.lists[(b + 2) % kBlocksPerTile]);
       const int listed = batch.counts[b];
       if (listed == 0) continue;
       recompute_alphas(rows, batch.lists[b], listed, b, thresholds, batch.transmittance[b], alphas);
       accumulate_moments<Absgrad>(rows, batch.lists[b], listed, b, thresholds, pixel_gradients[b],
-                                  alphas, behind[b], moments);
+                                  alphas, behind[b], moments, color_sums);
     }
-    write_pair_grads(rows, moments, entries + at, count, pair_grads);
+    write_pair_grads(columns, moments, color_sums, entries + at, count, pair_grads);
   }
   stream_fence();
 }

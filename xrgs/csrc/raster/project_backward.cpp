@@ -46,23 +46,20 @@ struct ConicGradient {
 // conic, and from there to the covariance (Eq. 20, 22 and 23).
 XRGS_INLINE ConicGradient conic_factor_backward(const Projection& o, const Floats (&sum)[16]) {
   const ConicFactor factor = conic_factor(o);
-  const Floats two = broadcast(2.0f), half = broadcast(0.5f);
-  // The sums of g u, g u dx and g u dy.
-  const Floats g_u = fnma(factor.xy, sum[kGradDy], factor.xx * sum[kGradDx]);
-  const Floats g_u_dx = fnma(factor.xy, sum[kGradDxDy], factor.xx * sum[kGradDxDx]);
-  const Floats g_u_dy = fnma(factor.xy, sum[kGradDyDy], factor.xx * sum[kGradDxDy]);
-  const Floats inv_yy = broadcast(1.0f) / o.yy, ratio = o.xy * inv_yy;
-  const Floats v_factor_xy = two * g_u_dy;
-  // The gradients of ln(factor.yy), and of ln(factor.xx) with factor.xy / factor.xx held fixed.
-  const Floats v_log_yy = -(two * factor.yy * factor.yy * sum[kGradDyDy]);
-  const Floats v_log_xx = factor.xx * fma(v_factor_xy, ratio, -(two * g_u_dx));
+  const Floats two = broadcast(2.0f);
+  const Floats inv_yy = broadcast(1.0f) / o.yy;
+  // Half the gradients of ln(factor.xx), with factor.xy / factor.xx held fixed, and of
+  // ln(factor.yy).
+  const Floats half_v_log_xx = -sum[kGradUU];
+  const Floats half_v_log_yy = -(factor.yy * factor.yy * sum[kGradDyDy]);
+  const Floats v_factor_xy = two * sum[kGradUDy];
   ConicGradient v;
-  v.xy = v_factor_xy * factor.xx * inv_yy;
-  v.yy = inv_yy * (half * (v_log_xx - v_log_yy) - v_factor_xy * factor.xy);
-  v.det = -(half * v_log_xx / o.det);
   v.xx = broadcast(0.0f);
-  v.mean_x = two * factor.xx * g_u;
-  v.mean_y = two * fnma(factor.xy, g_u, factor.yy * factor.yy * sum[kGradDy]);
+  v.xy = v_factor_xy * factor.xx * inv_yy;
+  v.yy = inv_yy * fnma(v_factor_xy, factor.xy, half_v_log_xx - half_v_log_yy);
+  v.det = sum[kGradUU] / o.det;
+  v.mean_x = two * factor.xx * sum[kGradU];
+  v.mean_y = two * fnma(factor.xy, sum[kGradU], factor.yy * factor.yy * sum[kGradDy]);
   return v;
 }
 

@@ -12,9 +12,23 @@
 namespace xrgs {
 namespace XRGS_NS {
 
-// The Gaussians of a batch, one row each, in the layout of ProjectedGaussian.
-using BatchRows = float[kBatchSize][16];
-enum BatchField { kX, kY, kCholXX, kCholXY, kCholYY, kLog2Opacity, kRed, kGreen, kBlue };
+// The Gaussians of a batch, one row each, in the layout of ProjectedGaussian, whose unused fields
+// hold u and v (Eq. 8) at the tile's centre. The last row is one that is transparent everywhere:
+// lists are filled up with it to a multiple of kUnroll.
+using BatchRows = float[kBatchSize + 1][16];
+enum BatchField {
+  kX,
+  kY,
+  kCholXX,
+  kCholXY,
+  kCholYY,
+  kLog2Opacity,
+  kRed,
+  kGreen,
+  kBlue,
+  kCentreU = 13,
+  kCentreV = 14
+};
 
 struct Tile {
   int column, row;
@@ -44,27 +58,55 @@ XRGS_INLINE Floats pixels_y(int block) {
   return load(y);
 }
 
-// Loads the projected Gaussians of `count` (1 to 16) entries and subtracts `centre`; rows past the
-// end repeat the last one.
+// Loads the projected Gaussians of `count` (1 to 16) entries into rows first..first+15 of a batch,
+// with `centre` subtracted; rows past the end repeat the last one. fields[i] receives the i-th
+// field of each, and u and v at the centre.
 XRGS_INLINE void load_projected(const Frame& frame, const TileEntry* entries, int count,
-                                Floats centre, Floats (&out)[16]) {
+                                Floats centre, BatchRows& rows, int first, Floats (&fields)[16]) {
   for (int i = 0; i < 16; ++i) {
     const std::uint32_t gaussian = entries[i < count ? i : count - 1].gaussian;
-    out[i] = load(&frame.projected[gaussian].mean2d_x) - centre;
+    fields[i] = load(&frame.projected[gaussian].mean2d_x) - centre;
+    store(rows[first + i], fields[i]);
+  }
+  transpose(fields);
+  fields[kCentreU] = fnma(fields[kCholXX], fields[kX], fields[kCholXY] * fields[kY]);
+  fields[kCentreV] = -(fields[kCholYY] * fields[kY]);
+  alignas(64) float u[16], v[16];
+  store(u, fields[kCentreU]);
+  store(v, fields[kCentreV]);
+  for (int i = 0; i < 16; ++i) {
+    rows[first + i][kCentreU] = u[i];
+    rows[first + i][kCentreV] = v[i];
   }
 }
 
-// Prefetches the projected Gaussians of the batch that begins at entry `first`.
-XRGS_INLINE void prefetch_batch(const Frame& frame, std::size_t first) {
-  const std::size_t pairs = frame.entries.size();
-  for (std::size_t i = first; i < pairs && i < first + kBatchSize; ++i)
+// Prefetches one of kBlocksPerTile parts of the projected Gaussians of the batch that begins at
+// entry `first`: a processor has too few buffers for all of them at once, so each block fetches a
+// part.
+XRGS_INLINE void prefetch_part(const Frame& frame, std::size_t first, int part) {
+  constexpr std::size_t kPart = kBatchSize / kBlocksPerTile;
+  const std::size_t pairs = frame.entries.size(),
+                    begin = first + static_cast<std::size_t>(part) * kPart;
+  for (std::size_t i = begin; i < pairs && i < begin + kPart; ++i)
     prefetch(&frame.projected[frame.entries[i].gaussian]);
+}
+
+// The index of the first pixel of a row of a tile, or -1 where the row is below the image.
+XRGS_INLINE std::int64_t row_start(const Tile& tile, const RenderConfig& config, int row) {
+  const int y = tile.row * kTileSize + row;
+  return y < config.height ? std::int64_t{y} * config.width + tile.column * kTileSize : -1;
 }
 
 // The tile's centre in the fields of the mean, zero in all others.
 XRGS_INLINE Floats centre_of(const Tile& tile) {
   const float centre[16] = {tile.centre_x(), tile.centre_y()};
   return load(centre);
+}
+
+// Makes the last row of a batch transparent.
+XRGS_INLINE void set_transparent_row(BatchRows& rows) {
+  const float row[16] = {0, 0, 0, 0, 0, -1e30f};
+  store(rows[kBatchSize], load(row));
 }
 
 // The thresholds of compositing, in all lanes.
@@ -78,15 +120,33 @@ struct AlphaThresholds {
         transmittance_min(broadcast(config.transmittance_min)) {}
 };
 
-// The alpha of a Gaussian g of the batch at sixteen pixels (Eq. 8): capped at alpha_max, and zero
-// below alpha_min.
-XRGS_INLINE Floats alpha_at(const float* g, Floats x, Floats y, const AlphaThresholds& thresholds) {
-  const Floats dx = x - broadcast(g[kX]), dy = y - broadcast(g[kY]);
-  const Floats u = fnma(broadcast(g[kCholXY]), dy, broadcast(g[kCholXX]) * dx);
-  const Floats v = broadcast(g[kCholYY]) * dy;
-  const Floats log2_alpha = fnma(u, u, fnma(v, v, broadcast(g[kLog2Opacity])));
-  return select_or_zero(thresholds.log2_alpha_min <= log2_alpha,
-                        min_positive(exp2(log2_alpha), thresholds.alpha_max));
+// Gaussians that are composited side by side: each operation of one waits several cycles for the
+// one before, and those of the other fill the gaps. Longer lists would gain from four, but lists
+// are filled up to a multiple of it, and those of small images have some fifteen Gaussians.
+constexpr int kUnroll = 2;
+
+// u and v of a Gaussian g of the batch at sixteen pixels (Eq. 8): linear functions of the position.
+XRGS_INLINE Floats u_at(const float* g, Floats x, Floats y) {
+  return fma(broadcast(g[kCholXX]), x, fnma(broadcast(g[kCholXY]), y, broadcast(g[kCentreU])));
+}
+XRGS_INLINE Floats v_at(const float* g, Floats y) {
+  return fma(broadcast(g[kCholYY]), y, broadcast(g[kCentreV]));
+}
+
+// The alphas of kUnroll Gaussians of the batch at sixteen pixels (Eq. 8): capped at alpha_max, and
+// zero below alpha_min.
+XRGS_INLINE void alphas_at(const BatchRows& rows, const std::uint8_t* list, Floats x, Floats y,
+                           const AlphaThresholds& thresholds, Floats (&alpha)[kUnroll]) {
+  Floats log2_alpha[kUnroll];
+  for (int i = 0; i < kUnroll; ++i) {
+    const float* g = rows[list[i]];
+    const Floats u = u_at(g, x, y), v = v_at(g, y);
+    log2_alpha[i] = fnma(u, u, fnma(v, v, broadcast(g[kLog2Opacity])));
+  }
+  exp2(log2_alpha, alpha);
+  for (int i = 0; i < kUnroll; ++i)
+    alpha[i] = min_positive_where(thresholds.log2_alpha_min <= log2_alpha[i], alpha[i],
+                                  thresholds.alpha_max);
 }
 
 // The part of an image that a 4x4 block covers: the index of its first pixel in row-major order,

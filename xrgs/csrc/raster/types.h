@@ -115,15 +115,17 @@ struct TileIntersection {
 };
 
 // The columns of pair_grads [pairs, kPairGradStride]: sums over the pixels of a pair. With
-// g = dL/d(ln alpha) and w = alpha T, they are
-//   g, g dx, g dy, g dx^2, g dx dy, g dy^2, and w v_image for each colour (Eq. 18);
-// with absgrad also |dL/d(mean2d)| for x and y (Eq. 21), else zeros.
+// g = dL/d(ln alpha), w = alpha T, and u and dy as in Eq. 8, they are
+//   g, g u, g dy, g u^2, g u dy, g dy^2, and w v_image for each colour (Eq. 18);
+// with absgrad also |dL/d(mean2d)| for x and y (Eq. 21), else zeros. Powers of u, and not of dx,
+// because the sum of g u^2 over a long thin Gaussian is a small difference of those of g dx^2,
+// g dx dy and g dy^2.
 enum PairGradField {
   kGrad,
-  kGradDx,
+  kGradU,
   kGradDy,
-  kGradDxDx,
-  kGradDxDy,
+  kGradUU,
+  kGradUDy,
   kGradDyDy,
   kGradRed,
   kGradGreen,

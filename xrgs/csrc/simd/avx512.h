@@ -73,6 +73,13 @@ XRGS_INLINE Floats select(Mask m, Floats a, Floats b) {
   return {_mm512_mask_mov_ps(b.v, m.v, a.v)};
 }
 XRGS_INLINE Floats select_or_zero(Mask m, Floats a) { return {_mm512_maskz_mov_ps(m.v, a.v)}; }
+XRGS_INLINE Floats multiply_where(Mask m, Floats a, Floats b) {
+  return {_mm512_maskz_mul_ps(m.v, a.v, b.v)};
+}
+XRGS_INLINE Floats min_positive_where(Mask m, Floats a, Floats b) {
+  return {_mm512_castsi512_ps(
+      _mm512_maskz_min_epi32(m.v, _mm512_castps_si512(a.v), _mm512_castps_si512(b.v)))};
+}
 
 XRGS_INLINE Ints operator+(Ints a, Ints b) { return {_mm512_add_epi32(a.v, b.v)}; }
 XRGS_INLINE Ints operator-(Ints a, Ints b) { return {_mm512_sub_epi32(a.v, b.v)}; }

@@ -7,6 +7,11 @@
 namespace xrgs {
 namespace XRGS_NS {
 
+XRGS_INLINE Floats multiply_where(Mask m, Floats a, Floats b) { return select_or_zero(m, a * b); }
+XRGS_INLINE Floats min_positive_where(Mask m, Floats a, Floats b) {
+  return select_or_zero(m, min_positive(a, b));
+}
+
 XRGS_INLINE void load_triples(const float* p, Floats& x, Floats& y, Floats& z) {
   float part[3][16];
   for (int i = 0; i < 16; ++i)

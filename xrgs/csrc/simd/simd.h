@@ -34,6 +34,8 @@
 //   Mask mask_from_bits(uint32)
 //   Floats select(m, a, b)              a where the mask is set, else b
 //   Floats select_or_zero(m, a)         a where the mask is set, else 0, even where a is not finite
+//   Floats multiply_where(m, a, b)      select_or_zero(m, a * b)
+//   Floats min_positive_where(m, a, b)  select_or_zero(m, min_positive(a, b))
 //
 //   Ints + Ints, Ints - Ints            modulo 2^32
 //   Ints shift_left<Count>(Ints)
@@ -57,8 +59,8 @@
 //   Floats add_last_row(a, b)           a + b in row 3, a in the others
 //
 // Every instruction set rounds in the same way and adds in the same order, and the compiler fuses
-// nothing of its own accord (-ffp-contract=off): all of them that have a fused multiply-add give the
-// same bits. kFusedMultiplyAdd says whether one has.
+// nothing of its own accord (-ffp-contract=off): all of them that have a fused multiply-add give
+// the same bits. kFusedMultiplyAdd says whether one has.
 //
 // Kernel files must not call inline functions of the standard library unless they are certain to be
 // inlined: the linker keeps one copy of such a function for the whole module, which may be the one
@@ -109,28 +111,41 @@ XRGS_INLINE void store_quadruples(float* p, Floats w, Floats x, Floats y, Floats
   for (int i = 0; i < 4; ++i) store(p + 16 * i, out[i]);
 }
 
-// 2^x with a relative error below 2.0e-7 for -126 <= x <= 127, and exactly 1 at 0; for other x
+// 2^x with a relative error below 1.1e-7 for -126 <= x <= 127, and exactly 1 at 0; for other x
 // unspecified.
 //
-// 2^x = 2^n 2^f, with n the integer nearest to x: 2^f is a polynomial of degree 5 whose constant is
-// 1, and n is added to its exponent. The polynomial's relative error is 9.2e-8; the rest is rounding.
-XRGS_INLINE Floats exp2(Floats x) {
+// 2^x = 2^n 2^f, with n the integer nearest to x: 2^f is a polynomial of degree 6 whose constant is
+// 1, and n is added to its exponent. The polynomial's relative error is 2.0e-9; the rest is
+// rounding. Each step is taken for all `Count` vectors before the next, because each waits for the
+// one before.
+template <int Count>
+XRGS_INLINE void exp2(const Floats (&x)[Count], Floats (&result)[Count]) {
+  constexpr float kCoefficients[] = {0.00015353362f, 0.0013398874f, 0.0096184374f, 0.0555033247f,
+                                     0.2402264791f,  0.6931472029f, 1.0f};
   const Floats magic = broadcast(12582912.0f);  // 1.5 * 2^23: adding it rounds to an integer
-  const Floats t = x + magic;
-  const Floats f = x - (t - magic);  // -1/2 to 1/2
-  Floats p = fma(f, broadcast(0.0013264727f), broadcast(0.0096715127f));
-  p = fma(f, p, broadcast(0.0555073374f));
-  p = fma(f, p, broadcast(0.2402224208f));
-  p = fma(f, p, broadcast(0.6931469776f));
-  p = fma(f, p, broadcast(1.0f));
-  return as_floats(as_ints(p) + shift_left<23>(as_ints(t)));
+  Floats t[Count], f[Count], p[Count];
+  for (int i = 0; i < Count; ++i) {
+    t[i] = x[i] + magic;
+    f[i] = x[i] - (t[i] - magic);  // -1/2 to 1/2
+    p[i] = broadcast(kCoefficients[0]);
+  }
+  for (int k = 1; k < 7; ++k)
+    for (int i = 0; i < Count; ++i) p[i] = fma(f[i], p[i], broadcast(kCoefficients[k]));
+  for (int i = 0; i < Count; ++i)
+    result[i] = as_floats(as_ints(p[i]) + shift_left<23>(as_ints(t[i])));
+}
+XRGS_INLINE Floats exp2(Floats x) {
+  const Floats in[1] = {x};
+  Floats out[1];
+  exp2(in, out);
+  return out[0];
 }
 
 // For a >= 0: at least sqrt(max(a, 1e-20)), and at most 0.2% more.
 //
-// The approximate inverse square roots of the instruction sets differ. This one starts from the bits
-// of a, at most 3.5% off, and one step of Newton's method brings it to at most 0.18% below the inverse
-// root, never above, which the last factor outweighs.
+// The approximate inverse square roots of the instruction sets differ. This one starts from the
+// bits of a, at most 3.5% off, and one step of Newton's method brings it to at most 0.18% below the
+// inverse root, never above, which the last factor outweighs.
 XRGS_INLINE Floats sqrt_upper_bound(Floats a) {
   a = max(a, broadcast(1e-20f));
   const Floats start = as_floats(broadcast_int(0x5f3759df) - shift_right<1>(as_ints(a)));
@@ -157,6 +172,7 @@ XRGS_INLINE Floats log2(Floats x) {
 }
 
 XRGS_INLINE void prefetch(const void* p) { __builtin_prefetch(p, 0, 3); }
+XRGS_INLINE void prefetch_to_write(const void* p) { __builtin_prefetch(p, 1, 3); }
 
 }  // namespace XRGS_NS
 }  // namespace xrgs
