@@ -14,8 +14,9 @@ namespace {
 
 constexpr std::size_t kAlignment = 64;
 
-#ifdef __SANITIZE_ADDRESS__
-// Every block is new and has the exact size, so that the sanitizer sees a step past its end.
+#ifdef XRGS_FAULT_INJECTION
+// Every block is new, so that its allocation can fail, and has the exact size, so that a sanitizer
+// sees a step past its end.
 constexpr std::size_t kMaxUnusedBytes = 0;
 constexpr bool kExactSizes = true;
 #else
