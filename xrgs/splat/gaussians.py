@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from scipy.spatial import KDTree
 from torch import Tensor
 
-from xrgs.splat.sh import bases, colors_to_sh0
+from xrgs.splat.sh import bases, check_degree, colors_to_sh0
 
 PARAMETERS = ("means", "quats", "scales", "opacities", "sh0", "shN")
 """Names of the parameters, in the order that functions take them; gsplat's names."""
@@ -137,9 +137,10 @@ def from_points(
         P Gaussians, float32 leaf tensors that require gradients.
 
     Raises:
-        ValueError: There are fewer than 4 points, shapes do not fit, values are not finite, or the
-            opacity is not above 0 and below 1.
+        ValueError: There are fewer than 4 points, shapes do not fit, values are not finite, the
+            opacity is not above 0 and below 1, or the degree is not 0 to 3.
     """
+    check_degree(sh_degree)
     means = torch.as_tensor(points, dtype=torch.float32)
     rgb = torch.as_tensor(colors)
     rgb = rgb.float() / 255.0 if rgb.dtype == torch.uint8 else rgb.float()

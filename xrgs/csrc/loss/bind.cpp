@@ -7,7 +7,6 @@
 
 #include <cmath>
 #include <cstdint>
-#include <memory>
 #include <vector>
 
 #include "loss/photometric.h"
@@ -42,10 +41,10 @@ void run_bands(const PhotometricJob& job, int threads) {
   const int most = job.height / kMinBandRows > 0 ? job.height / kMinBandRows : 1;
   const int bands = threads <= 1 ? 1 : (2 * threads < most ? 2 * threads : most);
   const std::size_t size = (kernels.scratch_size(job.width) + 15) / 16 * 16;
-  std::unique_ptr<void, ReleaseBlock> scratch(acquire_block(bands * size * sizeof(float)));
+  const OwnedBlock scratch = acquire_block(bands * size * sizeof(float));
   parallel_for(threads, bands, [&](std::int64_t i) {
     const auto row = [&](std::int64_t band) { return static_cast<int>(job.height * band / bands); };
-    kernels.band(job, row(i), row(i + 1), static_cast<float*>(scratch.get()) + i * size);
+    kernels.band(job, row(i), row(i + 1), static_cast<float*>(scratch->data) + i * size);
   });
 }
 
@@ -96,8 +95,9 @@ nb::tuple photometric_loss(Image image, Image target, Image target_mean, Image t
 
 void bind_loss(nb::module_& m) {
   m.def(
-      "photometric_loss", &photometric_loss, nb::arg("image"), nb::arg("target"),
-      nb::arg("target_mean"), nb::arg("target_variance"), nb::arg("l1"), nb::arg("ssim"),
+      "photometric_loss", &photometric_loss, nb::arg("image").noconvert(),
+      nb::arg("target").noconvert(), nb::arg("target_mean").noconvert(),
+      nb::arg("target_variance").noconvert(), nb::arg("l1"), nb::arg("ssim"),
       nb::arg("with_gradient"), nb::arg("threads"),
       "Return l1 mean|image - target| + ssim (1 - SSIM), and its gradient by the image or None.\n\n"
       "image and target are [H, W, 3]; target_mean and target_variance [H - 10, W - 10, 3] are "
