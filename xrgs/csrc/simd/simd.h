@@ -80,7 +80,7 @@ constexpr int kLanes = 16;
 #elif defined(__AVX2__)
 #include "simd/avx2.h"
 #else
-#include "simd/portable.h"
+#include "simd/vector16.h"
 #endif
 
 // What follows is made of the operations above, the same for every instruction set.
