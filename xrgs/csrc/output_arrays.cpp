@@ -2,7 +2,6 @@
 // all.
 #include "output_arrays.h"
 
-#include <cstdlib>
 #include <map>
 #include <mutex>
 #include <new>
@@ -75,7 +74,7 @@ void release_block(void* block) noexcept {
   const std::size_t size = entry->second;
   cache.in_use.erase(entry);
   if (cache.unused_bytes + size > kMaxCachedBytes) {
-    std::free(block);
+    deallocate(block);
     return;
   }
   cache.unused[size].push_back(block);

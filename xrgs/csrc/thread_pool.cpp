@@ -7,14 +7,16 @@
 // none of its parent's threads and starts a new pool.
 #include "thread_pool.h"
 
-#include <pthread.h>
-
 #include <atomic>
 #include <chrono>
 #include <condition_variable>
 #include <mutex>
 #include <system_error>
 #include <thread>
+
+#if !defined(_WIN32)  // whose processes do not fork
+#include <pthread.h>
+#endif
 
 namespace xrgs {
 namespace {
@@ -70,6 +72,8 @@ class ThreadPool {
   static void pause() {
 #ifdef XRGS_X86
     __builtin_ia32_pause();
+#elif defined(__aarch64__)
+    asm volatile("isb");  // "yield" does nothing on most processors
 #endif
   }
 
@@ -115,8 +119,10 @@ class ThreadPool {
 ThreadPool* pool = nullptr;
 std::once_flag at_fork;
 
+#if !defined(_WIN32)
 // A forked child has one thread only, so nothing races with this.
 void replace_pool_in_child() { pool = new ThreadPool; }
+#endif
 
 }  // namespace
 
@@ -127,7 +133,9 @@ void run_tasks(int threads, std::int64_t count, Task task, void* context) {
   }
   std::call_once(at_fork, [] {
     pool = new ThreadPool;
+#if !defined(_WIN32)
     pthread_atfork(nullptr, nullptr, replace_pool_in_child);
+#endif
   });
   pool->run_job(threads, count, task, context);
 }

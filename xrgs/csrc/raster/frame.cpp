@@ -1,6 +1,5 @@
 #include "raster/frame.h"
 
-#include <cstdlib>
 #include <mutex>
 #include <new>
 
@@ -42,13 +41,13 @@ FreeList<T>& free_list() {
 }  // namespace
 
 void* replace_block(void* block, std::size_t bytes) {
-  std::free(block);
+  deallocate(block);
   void* replacement = allocate(bytes);
   if (replacement == nullptr) throw std::bad_alloc();
   return replacement;
 }
 
-void free_block(void* block) noexcept { std::free(block); }
+void free_block(void* block) noexcept { deallocate(block); }
 
 std::int64_t Frame::evaluations() const {
   std::int64_t sum = 0;
