@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import csv
-import resource
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -12,7 +11,7 @@ import numpy as np
 from xrgs.bench import loads, memory, rendering, scale, shortcuts, tables, training
 from xrgs.errors import XrgsError
 from xrgs.experiment import provenance
-from xrgs.runtime.machine import usable_cores
+from xrgs.runtime.machine import peak_rss, usable_cores
 from xrgs.runtime.progress import progress
 from xrgs.safeio.atomic import write_json
 from xrgs.splat.backend import resolve_backend
@@ -89,7 +88,7 @@ def run(settings: Settings) -> str:
         results |= _time_loads(chosen, settings, counts, backends)
         results |= _time_training(sizes, settings, counts, backends)
         results["memory"] = [memory.measure(*sizes.memory, backends[0], counts[-1], settings.seed)]
-    results["peak_rss_bytes"] = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
+    results["peak_rss_bytes"] = peak_rss()
     _write(results, settings)
     return tables.text(results)
 

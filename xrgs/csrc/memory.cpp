@@ -9,6 +9,8 @@
 
 #if defined(__linux__)
 #include <sys/mman.h>
+#elif defined(_WIN32)
+#include <malloc.h>
 #endif
 
 namespace xrgs {
@@ -52,7 +54,20 @@ void* allocate(std::size_t bytes) noexcept {
     return block;
   }
 #endif
-  return std::aligned_alloc(kLine, (bytes + kLine - 1) / kLine * kLine);
+  const std::size_t size = (bytes + kLine - 1) / kLine * kLine;
+#if defined(_WIN32)
+  return _aligned_malloc(size, kLine);
+#else
+  return std::aligned_alloc(kLine, size);
+#endif
+}
+
+void deallocate(void* block) noexcept {
+#if defined(_WIN32)
+  _aligned_free(block);
+#else
+  std::free(block);
+#endif
 }
 
 }  // namespace xrgs

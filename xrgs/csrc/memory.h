@@ -9,10 +9,11 @@
 namespace xrgs {
 
 // Returns at least `bytes` of uninitialised memory on a 64-byte boundary, or null where there is
-// not enough. The caller frees it with std::free. Large blocks ask for huge pages, because
+// not enough. The caller frees it with deallocate(). Large blocks ask for huge pages, because
 // projected Gaussians and pair_grads are read in random order, where with pages of 4 KB most reads
 // miss the TLB as well.
 void* allocate(std::size_t bytes) noexcept;
+void deallocate(void* block) noexcept;
 
 #ifdef XRGS_FAULT_INJECTION
 // For tests only: makes the number-th allocation of the module from now on fail, the next one being

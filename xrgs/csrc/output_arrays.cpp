@@ -3,7 +3,6 @@
 // release needs no memory and cannot fail.
 #include "output_arrays.h"
 
-#include <cstdlib>
 #include <mutex>
 #include <new>
 
@@ -65,7 +64,7 @@ std::size_t size_class(std::size_t bytes) {
 }
 
 void delete_block(Block* block) noexcept {
-  std::free(block->data);
+  deallocate(block->data);
   delete block;
 }
 

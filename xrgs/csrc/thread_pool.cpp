@@ -8,8 +8,6 @@
 // memory that could be missing.
 #include "thread_pool.h"
 
-#include <pthread.h>
-
 #include <atomic>
 #include <chrono>
 #include <condition_variable>
@@ -17,6 +15,10 @@
 #include <new>
 #include <system_error>
 #include <thread>
+
+#if !defined(_WIN32)  // whose processes do not fork
+#include <pthread.h>
+#endif
 
 namespace xrgs {
 namespace {
@@ -123,12 +125,16 @@ alignas(ThreadPool) unsigned char pool_memory[sizeof(ThreadPool)];
 
 ThreadPool* new_pool() { return new (pool_memory) ThreadPool; }
 
+#if !defined(_WIN32)
 // A forked child has one thread only, so nothing races with this.
 void replace_pool_in_child() { new_pool(); }
+#endif
 
 // This runs when the module is loaded, before there is a second thread that could use the pool.
 ThreadPool* const pool = [] {
+#if !defined(_WIN32)
   pthread_atfork(nullptr, nullptr, replace_pool_in_child);
+#endif
   return new_pool();
 }();
 

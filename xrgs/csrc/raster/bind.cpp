@@ -262,7 +262,8 @@ RenderConfig make_config(const Matrix4& viewmat, const std::array<float, 4>& int
   config.near = near;
   config.eps2d = eps2d;
   config.alpha_min = std::max(alpha_min, std::numeric_limits<float>::min());
-  config.log2_alpha_min = std::log2(config.alpha_min);
+  // In double, whose rounding to float hides how mathematical libraries differ.
+  config.log2_alpha_min = static_cast<float>(std::log2(static_cast<double>(config.alpha_min)));
   config.alpha_max = alpha_max;
   config.transmittance_min = transmittance_min;
   config.antialiased = antialiased;

@@ -1,7 +1,6 @@
 #include "raster/frame.h"
 
 #include <array>
-#include <cstdlib>
 #include <mutex>
 #include <new>
 
@@ -53,7 +52,7 @@ void* new_block(std::size_t bytes) {
   return block;
 }
 
-void free_block(void* block) noexcept { std::free(block); }
+void free_block(void* block) noexcept { deallocate(block); }
 
 std::int64_t Frame::evaluations() const {
   std::int64_t sum = 0;

@@ -40,7 +40,8 @@
 //   Ints shift_right<Count>(Ints)       arithmetic: copies of the sign bit move in
 //   as_ints(Floats), as_floats(Ints)    the same bits as the other type
 //   to_floats(Ints)                     the nearest float
-//   to_ints(Floats)                     rounded towards zero
+//   to_ints(Floats)                     rounded towards zero; of numbers that fit no int32
+//                                       unspecified
 //
 //   float sum_lanes(a)                  upper half plus lower half, and so on down to one lane
 //   void interleave(a, b, low, high)    low = a0 b0 a1 b1 ... a7 b7, high = a8 b8 ... a15 b15
@@ -80,7 +81,7 @@ constexpr int kLanes = 16;
 #elif defined(__AVX2__)
 #include "simd/avx2.h"
 #else
-#include "simd/portable.h"
+#include "simd/vector16.h"
 #endif
 
 // What follows is made of the operations above, the same for every instruction set.
