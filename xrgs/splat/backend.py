@@ -19,7 +19,7 @@ NATIVE_MODULE = "xrgs._native"
 CHOICES = ("auto", "native", "torch")
 REQUIRE_NATIVE = "XRGS_REQUIRE_NATIVE"
 
-Operation = Literal["densify", "loss", "optimizer", "rasterizer", "resample"]
+Operation = Literal["activations", "densify", "loss", "optimizer", "rasterizer", "resample"]
 """The name of a module that both `xrgs/splat/torch/` and `xrgs/splat/native/` have."""
 
 

@@ -16,6 +16,7 @@ from xrgs.training.components.base import (
     TrainingView,
     check_not_negative,
 )
+from xrgs.training.components.reductions import rounded_mean
 
 if TYPE_CHECKING:  # xrgs.config loads Hydra, which training does without
     from xrgs.config import MipConf
@@ -92,7 +93,7 @@ class Mip(Component):
         """
         if step.number % self.every == 0:
             self._update_variance(activated.means)
-            step.log["mip.sigma"] = self.variance.sqrt().mean().item()
+            step.log["mip.sigma"] = rounded_mean(self.variance.sqrt())
             step.log["mip.unseen"] = self.unseen_count
         scales, opacities = smooth(activated.scales, activated.opacities, self.variance)
         return activated._replace(scales=scales, opacities=opacities)
@@ -100,9 +101,11 @@ class Mip(Component):
     @torch.no_grad()
     def after_training(self, gaussians: Gaussians) -> None:
         """Make the filter part of scales and opacities, so that what was rendered is saved."""
-        activated = gaussians.activated()
+        # In double, which rounds to one float32 whatever computes its last digits.
         scales, opacities = smooth(
-            activated.scales.double(), activated.opacities.double(), self.variance.double()
+            gaussians.scales.double().exp(),
+            gaussians.opacities.double().sigmoid(),
+            self.variance.double(),
         )
         # An opacity outside the range of float32 must not become an infinite logit.
         bounds = torch.finfo(torch.float32)
@@ -162,14 +165,13 @@ def sampling_rates(means: Tensor, cameras: Sequence[Camera], near: float) -> Ten
     """
     highest = means.new_zeros(len(means))
     for camera in cameras:
-        viewmat, K = camera.viewmat.to(means), camera.K.to(means)
-        size = means.new_tensor([camera.width, camera.height])
-        # Homogeneous pixels: compared before the division by depth, which may be 0.
-        projected = torch.addmm(K @ viewmat[:3, 3], means, (K @ viewmat[:3, :3]).T)  # [N, 3]
-        depth = projected[:, 2:]
-        pixels = projected[:, :2]
-        seen = (depth > near) & (pixels >= -MARGIN * size * depth)
-        seen &= pixels <= (1 + MARGIN) * size * depth
-        rate = torch.maximum(K[0, 0], K[1, 1]) / depth[:, 0]
-        highest = torch.where(seen.all(dim=-1), torch.maximum(highest, rate), highest)
+        K = camera.K.to(means)
+        x, y, depth = camera.to_camera(means)  # [N] each
+        seen = depth > near
+        for axis, (place, size) in enumerate(((x, camera.width), (y, camera.height))):
+            # Homogeneous pixels: compared before the division by depth, which may be 0.
+            pixels = K[axis, axis] * place + K[axis, 2] * depth
+            seen &= (pixels >= -MARGIN * size * depth) & (pixels <= (1 + MARGIN) * size * depth)
+        rate = torch.maximum(K[0, 0], K[1, 1]) / depth
+        highest = torch.where(seen, torch.maximum(highest, rate), highest)
     return highest

@@ -20,6 +20,7 @@ from xrgs.training.components.base import (
 from xrgs.training.components.continuous_weighting import ContinuousWeighting
 from xrgs.training.components.hybrid_schedule import HybridSchedule
 from xrgs.training.components.loss_weighting import LossWeighting
+from xrgs.training.components.reductions import rounded_mean
 from xrgs.training.components.region_weighting import region_attenuations
 
 if TYPE_CHECKING:  # xrgs.config loads Hydra, which training does without
@@ -81,7 +82,7 @@ class Weighting(Component):
         self.view_weight = view_weight
         self.attenuations = attenuations
         self.regions = regions or {}
-        self.region_means = {name: region.mean().item() for name, region in self.regions.items()}
+        self.region_means = {name: rounded_mean(region) for name, region in self.regions.items()}
         self.stat_from = stat_from
 
     @classmethod
