@@ -1,7 +1,7 @@
 """A short training on the native backend, and the SHA-256 of all that it computes.
 
-A program, because `XRGS_ISA` and `ATEN_CPU_CAPABILITY` are read when a process starts. Its arguments
-are numbers of threads; it prints a line with the hash for each.
+A program, because `XRGS_ISA` and `ATEN_CPU_CAPABILITY` are read when a process starts. Its
+arguments are numbers of threads; it prints a line with the hash for each.
 """
 
 from __future__ import annotations
@@ -97,4 +97,4 @@ def _smooth(image: Tensor) -> Tensor:
 if __name__ == "__main__":
     for threads in sys.argv[1:]:
         torch.set_num_threads(int(threads))
-        print(training_hash(), flush=True)
+        sys.stdout.write(f"{training_hash()}\n")

@@ -331,7 +331,9 @@ class Densifier:
         Returns:
             Counts, and how many Gaussians each of the G thresholds removed.
         """
-        low_opacity = self._activations.logistic(self.gaussians.opacities) < thresholds[deciding_row]  # [N]
+        low_opacity = (
+            self._activations.logistic(self.gaussians.opacities) < thresholds[deciding_row]
+        )  # [N]
         largest = self.settings.prune_scale3d * self.scene_scale if prune_large else math.inf
         too_large = ~low_opacity & (self._largest_scale() > largest)
         self._keep(~(low_opacity | too_large))

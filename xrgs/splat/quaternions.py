@@ -5,6 +5,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from xrgs.splat.rounding import rounded_sqrt
+
 
 def rotation_matrices(quats: Tensor) -> Tensor:
     """Convert quaternions of any length to rotation matrices.
@@ -27,7 +29,7 @@ def rotation_matrices(quats: Tensor) -> Tensor:
     scaled = torch.where(zero, identity, quats / largest.masked_fill(zero, 1.0))  # [M, 4]
     w, x, y, z = scaled.unbind(-1)  # [M] each
     # Written out, since the order in which torch's norm adds depends on the processor.
-    length = torch.sqrt(w * w + x * x + y * y + z * z)  # at least 1
+    length = rounded_sqrt(w * w + x * x + y * y + z * z)  # at least 1
     w, x, y, z = w / length, x / length, y / length, z / length
     entries = [
         *(1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)),

@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
+from xrgs.splat.rounding import rounded_mean
 from xrgs.training.components.base import Step, TrainingView
-from xrgs.training.components.reductions import rounded_mean
 from xrgs.training.components.texture import gradient_magnitude
 
 if TYPE_CHECKING:  # xrgs.config loads Hydra, which training does without

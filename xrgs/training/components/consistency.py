@@ -129,9 +129,7 @@ class Consistency(Component):
         return None
 
 
-def _paired_target(
-    view: TrainingView, factor: int, hr_long_side: float, backend: str
-) -> Target:
+def _paired_target(view: TrainingView, factor: int, hr_long_side: float, backend: str) -> Target:
     """The photograph at the opposite resolution; `hr_long_side` is the longest of HR views, px."""
     height, width = view.image.shape[:2]
     if view.tag == "HR" or max(height, width) > hr_long_side / math.sqrt(factor):

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Self
 
+from xrgs.splat.rounding import rounded_norm
 from xrgs.training.components.base import Component, Step, TrainingSetup, check_not_negative
-from xrgs.training.components.reductions import rounded_norm
 
 if TYPE_CHECKING:  # xrgs.config loads Hydra, which training does without
     from xrgs.config import GradientScalingConf

@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from xrgs.errors import XrgsError
+from xrgs.splat.rounding import rounded_mean, rounded_sqrt
 from xrgs.training.components.base import (
     Component,
     Step,
@@ -16,7 +17,6 @@ from xrgs.training.components.base import (
     TrainingView,
     check_not_negative,
 )
-from xrgs.training.components.reductions import rounded_mean
 
 if TYPE_CHECKING:  # xrgs.config loads Hydra, which training does without
     from xrgs.config import MipConf
@@ -93,7 +93,7 @@ class Mip(Component):
         """
         if step.number % self.every == 0:
             self._update_variance(activated.means)
-            step.log["mip.sigma"] = rounded_mean(self.variance.sqrt())
+            step.log["mip.sigma"] = rounded_mean(rounded_sqrt(self.variance))
             step.log["mip.unseen"] = self.unseen_count
         scales, opacities = smooth(activated.scales, activated.opacities, self.variance)
         return activated._replace(scales=scales, opacities=opacities)
@@ -143,7 +143,7 @@ def smooth(scales: Tensor, opacities: Tensor, variance: Tensor) -> tuple[Tensor,
         The scales [N, 3], `sqrt(scales^2 + variance)`, and the opacities [N] times the square root
         of the ratio of the determinants of the covariances, before over after.
     """
-    wider = torch.sqrt(scales * scales + variance[:, None])
+    wider = rounded_sqrt(scales * scales + variance[:, None])
     # One ratio per axis, since the product of three small scales underflows.
     ratio = scales / wider
     return wider, opacities * ratio[:, 0] * ratio[:, 1] * ratio[:, 2]

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Self
 from torch import Tensor
 
 from xrgs.errors import XrgsError
+from xrgs.splat.rounding import rounded_mean
 from xrgs.training.components.adaptive_weighting import AdaptiveWeighting
 from xrgs.training.components.base import (
     Component,
@@ -20,7 +21,6 @@ from xrgs.training.components.base import (
 from xrgs.training.components.continuous_weighting import ContinuousWeighting
 from xrgs.training.components.hybrid_schedule import HybridSchedule
 from xrgs.training.components.loss_weighting import LossWeighting
-from xrgs.training.components.reductions import rounded_mean
 from xrgs.training.components.region_weighting import region_attenuations
 
 if TYPE_CHECKING:  # xrgs.config loads Hydra, which training does without
