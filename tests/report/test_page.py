@@ -253,3 +253,21 @@ def test_a_report_needs_no_torch(study: Any) -> None:
         env={"PYTHONPATH": str(Path(xrgs.__file__).parents[1])},
     )
     assert (study.store.reports).is_dir()
+
+
+def test_cells_of_different_arithmetic_are_warned_of(made: Any) -> None:
+    cells = [made.add(), made.add("consistency")]
+    made.write()
+    old: dict[str, str] = {}  # what a cell of an older version says
+    fused, unfused = {"arithmetic": "fma"}, {"arithmetic": "no-fma"}
+    for first, second in ((fused, fused), (fused, unfused), (old, fused)):
+        for cell, said in zip(cells, (first, second), strict=True):
+            file = cell.path / "provenance.json"
+            content = json.loads(file.read_text())
+            content.pop("arithmetic", None)
+            file.write_text(json.dumps(content | said))
+        report = build(made.store.path, pictures=[])
+        page = (report.folder / "table.md").read_text()
+        assert ("different arithmetic (fma, no-fma)" in report.text) == (second is unfused)
+        assert ("trained with different arithmetic" in page) == (second is unfused)
+        assert "| arithmetic " in page

@@ -30,9 +30,9 @@ HELD = "3ef4df2a552218a912027e434cbcc8d3fad5c95b1b3a32a932d1294bf7ba44ec"
 """The hash of the training on every machine with a fused multiply-add."""
 UPDATE = (
     "the training of tests/training/hashed_training.py does not give the bits that HELD stands for."
-    " If you have changed what training computes, on purpose, put the new hash into HELD, and let the"
-    " tests marked slow show that it does not depend on the machine. If you have not, this machine,"
-    " or a library on it, computes something else than others do: find out what."
+    " If you have changed what training computes, on purpose, put the new hash into HELD, and let"
+    " the tests marked slow show that it does not depend on the machine. If you have not, this"
+    " machine, or a library on it, computes something else than others do: find out what."
 )
 WIDE = [isa for isa in native.available_isas() if isa != "portable"]
 
