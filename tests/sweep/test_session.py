@@ -161,5 +161,5 @@ def test_a_job_on_a_machine_of_other_arithmetic_is_refused(
     made = hand_over_of()
     made.check_code()
     monkeypatch.setattr("xrgs.sweep.session.arithmetic", lambda _: "no-fma")
-    with pytest.raises(XrgsError, match="planned with the arithmetic .* this machine has no-fma"):
+    with pytest.raises(XrgsError, match=r"planned with the arithmetic .* this machine has no-fma"):
         made.check_code()

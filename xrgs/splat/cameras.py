@@ -59,7 +59,8 @@ class Camera:
         """The camera's centre [3], world units."""
         # Written out, since the order in which torch's products add depends on the processor.
         first, second, third = (row[:3] * row[3] for row in self.viewmat[:3])
-        return -(first + second + third)  # [3]
+        position: Tensor = -(first + second + third)  # [3]
+        return position
 
     def to_camera(self, points: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Transform points from the world to the camera.

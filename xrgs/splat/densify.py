@@ -362,7 +362,8 @@ class Densifier:
 
     def _largest_scale(self) -> Tensor:
         """Return the largest scale [N] of each Gaussian, world units."""
-        return self._activations.exp(self.gaussians.scales.amax(dim=-1))
+        largest: Tensor = self._activations.exp(self.gaussians.scales.amax(dim=-1))
+        return largest
 
     def _keep(self, mask: Tensor) -> None:
         """Remove all Gaussians but those of `mask` [N]; nothing is copied where it is all true."""

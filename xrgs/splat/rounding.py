@@ -40,4 +40,5 @@ def rounded_norm(values: Tensor) -> float:
         values: A floating tensor of any shape.
     """
     norm = torch.linalg.vector_norm(values.detach(), dtype=torch.float64)
-    return norm.to(values.dtype).item()
+    rounded: float = norm.to(values.dtype).item()
+    return rounded
