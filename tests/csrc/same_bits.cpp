@@ -83,7 +83,7 @@ class Hash {
       hash_ = (hash_ ^ bytes[i]) * 1099511628211u;
   }
   void print(const char* name) const {
-    const char* rounding = XRGS_SELECT(simd_checks).fused_multiply_add ? "fma" : "no-fma";
+    const char* rounding = XRGS_SELECT(array_math_kernels).fused_multiply_add ? "fma" : "no-fma";
     std::printf("%s %s %016llx\n", rounding, name, static_cast<unsigned long long>(hash_));
   }
 

@@ -6,7 +6,6 @@
 namespace xrgs {
 
 struct SimdChecks {
-  bool fused_multiply_add;  // kFusedMultiplyAdd of the instruction set
   // Compares every operation with what simd.h promises, lane by lane, for ordinary and special
   // values. Prints what differs, and returns the number of differences.
   int (*run)();

@@ -258,7 +258,7 @@ int run() {
 
 }  // namespace
 
-extern const SimdChecks simd_checks{kFusedMultiplyAdd, run};
+extern const SimdChecks simd_checks{run};
 
 }  // namespace XRGS_NS
 }  // namespace xrgs

@@ -4,6 +4,7 @@
 #include <nanobind/stl/string.h>
 #include <nanobind/stl/vector.h>
 
+#include "activations/bind.h"
 #include "bench/bind.h"
 #include "densify/bind.h"
 #include "isa.h"
@@ -47,6 +48,10 @@ NB_MODULE(_native, m) {
         "Use another instruction set from now on, in the whole process.");
   m.def("available_isas", &available_isas,
         "Return the instruction sets that this machine has, narrowest first.");
+  m.def(
+      "fused_multiply_add", [] { return XRGS_SELECT(array_math_kernels).fused_multiply_add; },
+      "Return whether the instruction set in use has a fused multiply-add: all that have one give "
+      "the same bits.");
   m.def("exp2", &exp2_array, nb::arg("x").noconvert(),
         "Return 2^x as the kernels compute it, float32 [N], for -126 <= x <= 127.");
   m.def("log2", &log2_array, nb::arg("x").noconvert(),
@@ -61,6 +66,7 @@ NB_MODULE(_native, m) {
   m.def("delete_unused_frames", &delete_unused_frames,
         "Free the frames and workspaces that wait to be used again.");
 #endif
+  bind_activations(m);
   bind_densify(m);
   bind_raster(m);
   bind_loss(m);

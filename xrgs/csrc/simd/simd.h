@@ -58,8 +58,8 @@
 //   Floats add_last_row(a, b)           a + b in row 3, a in the others
 //
 // Every instruction set rounds in the same way and adds in the same order, and the compiler fuses
-// nothing of its own accord (-ffp-contract=off): all of them that have a fused multiply-add give the
-// same bits. kFusedMultiplyAdd says whether one has.
+// nothing of its own accord (-ffp-contract=off): all of them that have a fused multiply-add give
+// the same bits. kFusedMultiplyAdd says whether one has.
 //
 // Kernel files must not call inline functions of the standard library unless they are certain to be
 // inlined: the linker keeps one copy of such a function for the whole module, which may be the one
@@ -114,7 +114,8 @@ XRGS_INLINE void store_quadruples(float* p, Floats w, Floats x, Floats y, Floats
 // unspecified.
 //
 // 2^x = 2^n 2^f, with n the integer nearest to x: 2^f is a polynomial of degree 5 whose constant is
-// 1, and n is added to its exponent. The polynomial's relative error is 9.2e-8; the rest is rounding.
+// 1, and n is added to its exponent. The polynomial's relative error is 9.2e-8; the rest is
+// rounding.
 XRGS_INLINE Floats exp2(Floats x) {
   const Floats magic = broadcast(12582912.0f);  // 1.5 * 2^23: adding it rounds to an integer
   const Floats t = x + magic;
@@ -127,11 +128,38 @@ XRGS_INLINE Floats exp2(Floats x) {
   return as_floats(as_ints(p) + shift_left<23>(as_ints(t)));
 }
 
+// e^x with a relative error below 1.0e-7, and exactly 1 at 0: 0 where e^x is below 2^-126, infinite
+// where it is above the largest float, NaN for NaN. No value lies below the normal numbers, so that
+// the result is the same where the processor flushes those to 0.
+//
+// e^x = 2^n e^r, with n the integer nearest to x / ln 2 and r = x - n ln 2. ln 2 is subtracted in
+// two parts, the first of which has so few bits that its product with n is exact. e^r is a
+// polynomial of degree 6 whose first two coefficients are 1. Its relative error is 3.1e-9; the rest
+// is rounding.
+XRGS_INLINE Floats exp(Floats x) {
+  const Floats magic = broadcast(12582912.0f);  // as in exp2
+  const Floats t = fma(x, broadcast(1.44269504f), magic);
+  const Floats n = t - magic;
+  const Floats r = fnma(n, broadcast(-2.12194440e-4f), fnma(n, broadcast(0.693359375f), x));
+  Floats p = fma(r, broadcast(0.0013814539f), broadcast(0.008368745f));
+  p = fma(r, p, broadcast(0.04166839f));
+  p = fma(r, p, broadcast(0.16666521f));
+  p = fma(r, p, broadcast(0.49999994f));
+  p = fma(r, p, broadcast(1.0f));
+  p = fma(r, p, broadcast(1.0f));
+  const Floats y = as_floats(as_ints(p) + shift_left<23>(as_ints(t)));
+  // Outside of these bounds, the first and last floats whose result is a normal number, n does not
+  // fit the exponent.
+  const Floats small = select(x < broadcast(-87.336540f), broadcast(0.0f), y);
+  const Floats all = select(broadcast(88.722831f) < x, broadcast(__builtin_inff()), small);
+  return select(x == x, all, x);
+}
+
 // For a >= 0: at least sqrt(max(a, 1e-20)), and at most 0.2% more.
 //
-// The approximate inverse square roots of the instruction sets differ. This one starts from the bits
-// of a, at most 3.5% off, and one step of Newton's method brings it to at most 0.18% below the inverse
-// root, never above, which the last factor outweighs.
+// The approximate inverse square roots of the instruction sets differ. This one starts from the
+// bits of a, at most 3.5% off, and one step of Newton's method brings it to at most 0.18% below the
+// inverse root, never above, which the last factor outweighs.
 XRGS_INLINE Floats sqrt_upper_bound(Floats a) {
   a = max(a, broadcast(1e-20f));
   const Floats start = as_floats(broadcast_int(0x5f3759df) - shift_right<1>(as_ints(a)));
