@@ -316,6 +316,21 @@ def test_a_weighted_image_without_gradient_has_the_same_loss(isa: str) -> None:
     assert native_loss(image, prepare_target(photograph), pixel_weight=weight).item() == loss
 
 
+@pytest.mark.usefixtures("threads")
+def test_threads_change_no_bit_of_a_larger_weighted_loss() -> None:
+    # At this size torch's own sums depend on the number of threads.
+    generator = torch.Generator().manual_seed(0)
+    photograph, image = (torch.rand(200, 300, 3, generator=generator) for _ in range(2))
+    weight = torch.rand(200, 300, generator=generator)
+    results = []
+    for count in (1, 2, 3):
+        torch.set_num_threads(count)
+        results.append(value_and_gradient(image, photograph, "native", weight=weight))
+    for loss, gradient in results[1:]:
+        assert loss == results[0][0]
+        assert torch.equal(gradient, results[0][1])
+
+
 def test_strided_weights_count_the_same() -> None:
     image, photograph = pair(20, 24)
     weight, target = random_weights(20, 24), prepare_target(photograph)
