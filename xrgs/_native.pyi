@@ -24,6 +24,7 @@ def photometric_loss(
     target: Tensor,
     target_mean: Tensor,
     target_variance: Tensor,
+    pixel_weight: Tensor | None,
     l1: float,
     ssim: float,
     with_gradient: bool,
