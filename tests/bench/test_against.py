@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import csv
+import math
 import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from xrgs.bench import against, loads, run
+from xrgs.bench import against, against_worker, loads, run, training
 from xrgs.bench.against import HR_STEP, LR_STEP, MEAN_STEP, RENDER, SIDES
 from xrgs.bench.loads import Load
 from xrgs.bench.settings import Settings
@@ -66,8 +67,24 @@ def test_an_installation_that_cannot_run_is_named_with_its_reason(
     python.chmod(0o755)
     with pytest.raises(XrgsError, match=r"python cannot run the benchmark: no torch here"):
         against.measure(str(python), load, (load, load), [1], 1)
+    python.write_text("#!/bin/sh\necho hello\nexec cat >/dev/null\n")
+    with pytest.raises(XrgsError, match=r"answers 'hello', not JSON"):
+        against.measure(str(python), load, (load, load), [1], 1)
+    python.write_bytes(b"\0")
+    with pytest.raises(XrgsError, match=r"cannot be run: Exec format error"):
+        against.measure(str(python), load, (load, load), [1], 1)
     with pytest.raises(XrgsError, match="must be the Python executable"):
         against.measure(str(tmp_path), load, (load, load), [1], 1)
+
+
+def test_the_worker_takes_the_step_of_the_benchmark() -> None:
+    assert (against_worker.L1, against_worker.SSIM) == (training.L1, training.SSIM)
+
+
+def test_the_worker_finds_a_function_under_the_name_of_its_release() -> None:
+    assert against_worker._find("math", "rasterize_parameters", "hypot") is math.hypot
+    with pytest.raises(AttributeError, match="math has none of a, b"):
+        against_worker._find("math", "a", "b")
 
 
 def test_larger_gaussians_overlap_more() -> None:

@@ -61,7 +61,10 @@ def measure(
         XrgsError: `other` is no executable file, or a worker fails; the message has the end of what
             it wrote.
     """
-    if not (Path(other).is_file() and os.access(other, os.X_OK)):
+    # Not resolved: the executable of a virtual environment is a link, and its place tells Python
+    # which environment it belongs to.
+    python = str(Path(other).absolute())
+    if not (Path(python).is_file() and os.access(python, os.X_OK)):
         raise XrgsError(f"against={other}: must be the Python executable of an environment")
     with ExitStack() as stack:
         folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="xrgs-bench-")))
@@ -70,8 +73,8 @@ def measure(
             files[name] = str(folder / f"{name}.npz")
             loads.write(Path(files[name]), load)
         workers = {
-            side: stack.enter_context(_Worker(python, folder / side))
-            for side, python in zip(SIDES, (sys.executable, other), strict=True)
+            side: stack.enter_context(_Worker(executable, folder / side))
+            for side, executable in zip(SIDES, (sys.executable, python), strict=True)
         }
         setup = {"scene": files[RENDER], "views": {key: files[key] for key in (HR_STEP, LR_STEP)}}
         for worker in workers.values():
@@ -82,7 +85,11 @@ def measure(
 
 
 class _Worker:
-    """A process that runs one installation; a context manager that ends it."""
+    """A process that runs one installation; a context manager that ends it.
+
+    Raises:
+        XrgsError: The executable is no program, or the process ends or answers something else.
+    """
 
     def __init__(self, python: str, log: Path) -> None:
         self.python = python
@@ -91,16 +98,19 @@ class _Worker:
         # script out of sys.path, and PYTHONPATH could name this package.
         environment = {key: value for key, value in os.environ.items() if key != "PYTHONPATH"}
         environment.setdefault("OMP_WAIT_POLICY", "passive")  # as in training
-        with log.open("wb") as stderr:
-            self.process = subprocess.Popen(  # noqa: S603
-                [python, "-P", str(_WORKER)],
-                cwd=log.parent,
-                env=environment,
-                stdin=subprocess.PIPE,
-                stdout=subprocess.PIPE,
-                stderr=stderr,
-                text=True,
-            )
+        try:
+            with log.open("wb") as stderr:
+                self.process = subprocess.Popen(  # noqa: S603
+                    [python, "-P", str(_WORKER)],
+                    cwd=log.parent,
+                    env=environment,
+                    stdin=subprocess.PIPE,
+                    stdout=subprocess.PIPE,
+                    stderr=stderr,
+                    text=True,
+                )
+        except OSError as error:
+            raise XrgsError(f"against: {python} cannot be run: {error.strerror}") from error
 
     def __enter__(self) -> _Worker:
         return self
@@ -126,7 +136,10 @@ class _Worker:
         line = _opened(self.process.stdout).readline()
         if not line:
             raise self._failure()
-        answer: dict[str, Any] = json.loads(line)
+        try:
+            answer: dict[str, Any] = json.loads(line)
+        except ValueError:
+            raise XrgsError(f"against: {self.python} answers {line.strip()!r}, not JSON") from None
         return answer
 
     def _failure(self) -> XrgsError:

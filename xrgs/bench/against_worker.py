@@ -25,7 +25,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-L1, SSIM = 0.8, 0.2  # weights of the photometric loss
+L1, SSIM = 0.8, 0.2  # weights of the photometric loss, as in xrgs.bench.training
 SH_DEGREE = 3
 _PARAMETERS = ("means", "quats", "scales", "opacities")
 
