@@ -68,6 +68,14 @@ def test_one_panel_answers_each_question(results: dict[str, Any]) -> None:
 
 
 def test_a_single_load_shows_no_growth(results: dict[str, Any]) -> None:
-    results["rows"] = results["rows"][:4]
+    results["rows"] = results["rows"][:8]
     results["growth"] = {}
     assert len(panels.panels(results)) == 3
+
+
+def test_a_single_backend_is_not_compared(results: dict[str, Any]) -> None:
+    results["rows"] = results["rows"][:4]
+    results["growth"] = {}
+    cutoffs, _ = panels.panels(results)
+    assert isinstance(cutoffs, Panel)
+    assert [mark.label for mark in cutoffs.marks] == ["gsplat's settings", "stop at 1e-2"]

@@ -24,14 +24,15 @@ def panels(results: Row) -> list[Panel | RatioPanel]:
         results: All results of the benchmark, with `rows` and `shortcuts`.
 
     Returns:
-        Time against error of each backend, and of each cutoff, on the largest load that every
-        method was timed on; what each shortcut saves; and, where loads differ in size, how the time
-        grows with Gaussians and with pixels.
+        Time against error of each backend, if there are several, and of each cutoff, on the largest
+        load that most methods were timed on; what each shortcut saves; and, where loads differ in
+        size, how the time grows with Gaussians and with pixels.
     """
     rows = [row for row in results["rows"] if row["threads"] == 1]
     usual = rows[0]["method"]
     load = _largest_common_load(rows)
-    made: list[Panel | RatioPanel] = [_backends(load), _cutoffs(load, usual)]
+    made: list[Panel | RatioPanel] = [_backends(load)] if _has_other_backend(load) else []
+    made.append(_cutoffs(load, usual))
     made.append(_shortcuts(results["shortcuts"]["renders"]))
     for found, what in (
         (growth_by_gaussians(rows, usual, 1), "Gaussians"),
@@ -49,6 +50,10 @@ def _largest_common_load(rows: Sequence[Row]) -> list[Row]:
         key = (row["load"], row["gaussians"], row["width"], row["height"])
         groups.setdefault(key, []).append(row)
     return max(groups.values(), key=lambda group: (len(group), _size(group[0])))
+
+
+def _has_other_backend(load: Sequence[Row]) -> bool:
+    return len({row["backend"] for row in load}) > 1
 
 
 def _size(row: Row) -> int:
