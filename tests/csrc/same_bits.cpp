@@ -17,6 +17,7 @@
 #include <string>
 #include <vector>
 
+#include "activations/activations.h"
 #include "densify/grad2d.h"
 #include "isa.h"
 #include "loss/photometric.h"
@@ -216,18 +217,21 @@ struct Loss {
   Image gradient;
 };
 
-void photometric_loss(int threads, const Floats& image, const Target& target, Loss& loss) {
+// `pixel_weight` has a weight for each pixel; null weighs all of them 1.
+void photometric_loss(int threads, const Floats& image, const Target& target,
+                      const float* pixel_weight, Loss& loss) {
   xrgs::PhotometricJob job{};
   job.image = image.data(), job.target = target.image.data();
   job.target_mean = target.mean.data(), job.target_variance = target.variance.data();
+  job.pixel_weight = pixel_weight;
   job.height = kHeight, job.width = kWidth;
   std::copy(kWindowWeights, kWindowWeights + xrgs::kWindow / 2 + 1, job.window);
-  job.l1_slope = 0.8f / (3 * kPixels), job.ssim_slope = -0.2f / (3 * kMapWidth * kMapHeight);
+  job.l1_slope = 0.8f / (3 * kPixels), job.ssim_slope = 0.2f / (3 * kMapWidth * kMapHeight);
   job.l1_rows = loss.l1_rows.data(), job.ssim_rows = loss.ssim_rows.data();
   job.gradient = loss.gradient.color.data();
   const auto& kernels = XRGS_SELECT(photometric_kernels);
   parallel_for(threads, threads, [&](std::int64_t band) {
-    Floats scratch(kernels.scratch_size(kWidth));
+    Floats scratch(kernels.scratch_size(job));
     const auto row = [&](std::int64_t at) { return static_cast<int>(kHeight * at / threads); };
     kernels.band(job, row(band), row(band + 1), scratch.data());
   });
@@ -301,6 +305,28 @@ void array_math_part() {
   log2_hash.print("log2");
 }
 
+void activations_part(int threads) {
+  constexpr std::int64_t kCount = 10001, kPerTask = 1000;
+  const auto& kernels = XRGS_SELECT(activation_kernels);
+  Random random(8);
+  // Some values of exp are infinite, some of either function 0.
+  const Floats x = random.array(kCount, -95.0f, 95.0f), v_y = random.array(kCount, -1.0f, 1.0f);
+  const auto print = [&](const char* name, auto value, auto gradient) {
+    Floats y(x.size()), v_x(x.size());
+    parallel_for(threads, (kCount + kPerTask - 1) / kPerTask, [&](std::int64_t task) {
+      const std::int64_t first = task * kPerTask, last = std::min(kCount, first + kPerTask);
+      value(x.data(), y.data(), first, last);
+      gradient(v_y.data(), y.data(), v_x.data(), first, last);
+    });
+    Hash hash;
+    hash.add(y);
+    hash.add(v_x);
+    hash.print(name);
+  };
+  print("exp", kernels.exp, kernels.exp_backward);
+  print("logistic", kernels.logistic, kernels.logistic_backward);
+}
+
 void raster_part(int threads, bool antialiased, bool absgrad, const char* forward_name,
                  const char* backward_name) {
   const xrgs::RenderConfig config = make_config(antialiased, absgrad);
@@ -326,13 +352,17 @@ void loss_part(int threads) {
   const Floats image = random.array(3 * kPixels, 0.0f, 1.0f);
   Floats other = image;
   for (float& value : other) value += random.between(-0.1f, 0.1f);
-  Loss loss;
-  photometric_loss(threads, image, make_target(other), loss);
-  Hash hash;
-  hash.add(loss.l1_rows);
-  hash.add(loss.ssim_rows);
-  hash.add(loss.gradient.color);
-  hash.print("loss");
+  const Target target = make_target(other);
+  const Floats weights = random.array(kPixels, 0.0f, 1.0f);
+  for (const float* pixel_weight : {static_cast<const float*>(nullptr), weights.data()}) {
+    Loss loss;
+    photometric_loss(threads, image, target, pixel_weight, loss);
+    Hash hash;
+    hash.add(loss.l1_rows);
+    hash.add(loss.ssim_rows);
+    hash.add(loss.gradient.color);
+    hash.print(pixel_weight == nullptr ? "loss" : "loss-weighted");
+  }
 }
 
 void adam_part(int threads) {
@@ -415,7 +445,7 @@ void training_part(int threads) {
   double first = 0, last = 0;
   for (int step = 1; step <= kSteps; ++step) {
     render(threads, p, config, frame, image);
-    photometric_loss(threads, image.color, target, loss);
+    photometric_loss(threads, image.color, target, nullptr, loss);
     last = 0;
     for (double row : loss.l1_rows) last += row;
     if (step == 1) first = last;
@@ -447,6 +477,7 @@ int main(int argc, char** argv) {
   }
   if (XRGS_SELECT(simd_checks).run() != 0) return 1;
   array_math_part();
+  activations_part(threads);
   raster_part(threads, false, false, "forward", "backward");
   raster_part(threads, true, true, "forward-antialiased", "backward-absgrad");
   loss_part(threads);

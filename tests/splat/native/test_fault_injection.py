@@ -143,16 +143,29 @@ def test_a_frame_is_used_again_after_a_failure(view: tuple[Any, Results]) -> Non
     assert number > 5
 
 
-def test_loss() -> None:
+@pytest.mark.parametrize("weighted", [False, True])
+def test_loss(weighted: bool) -> None:
     g = torch.Generator().manual_seed(0)
     image, target = torch.rand(2, 80, 48, 3, generator=g)
     mean, variance = torch.rand(2, 70, 38, 3, generator=g)
+    weight = torch.rand(80, 48, generator=g) if weighted else None
 
     def run() -> Results:
         value, gradient = native.photometric_loss(
-            image, target, mean, variance, 0.8, 0.2, True, THREADS
+            image, target, mean, variance, weight, 0.8, 0.2, True, THREADS
         )
         return [torch.tensor(value, dtype=torch.float64), gradient]
+
+    assert_every_failure_is_an_error(run, at_least=4)
+
+
+@pytest.mark.parametrize("name", ["exp", "logistic"])
+def test_activations(name: str) -> None:
+    x = torch.linspace(-5, 5, 40_000)
+
+    def run() -> Results:
+        y = getattr(native, name)(x, THREADS)
+        return [y, getattr(native, f"{name}_backward")(x, y, THREADS)]
 
     assert_every_failure_is_an_error(run, at_least=4)
 

@@ -70,8 +70,12 @@ def backward(v_image: Tensor, v_alpha: Tensor, *parameters: Tensor) -> None:
     )
 
 
-def loss(*images: Tensor) -> None:
-    native.photometric_loss(*images, 0.8, 0.2, True, 1)
+def loss(*tensors: Tensor) -> None:
+    native.photometric_loss(*tensors, 0.8, 0.2, True, 1)
+
+
+def activation(kernel: Callable[..., Tensor]) -> Callable[..., Tensor]:
+    return lambda *tensors: kernel(*tensors, 1)
 
 
 def resample(*tensors: Tensor) -> None:
@@ -89,8 +93,12 @@ CALLS: dict[str, tuple[Callable[..., object], list[Tensor]]] = {
     "accumulate_grad2d": (accumulate, [*ones((N, 2)), torch.ones(N).bool(), *ones((N,), (N,))]),
     "forward": (forward, ones(*PARAMETER_SHAPES)),
     "backward": (backward, ones((20, 20, 3), (20, 20), *PARAMETER_SHAPES)),
-    "photometric_loss": (loss, ones(*[(20, 20, 3)] * 2, *[(10, 10, 3)] * 2)),
+    "photometric_loss": (loss, ones(*[(20, 20, 3)] * 2, *[(10, 10, 3)] * 2, (20, 20))),
     "resample": (resample, [*ones((20, 20, 3)), *banded_matrix(20, 9), *banded_matrix(20, 9)]),
+    "exp": (activation(native.exp), ones((N,))),
+    "exp_backward": (activation(native.exp_backward), ones((N,), (N,))),
+    "logistic": (activation(native.logistic), ones((N,))),
+    "logistic_backward": (activation(native.logistic_backward), ones((N,), (N,))),
     "exp2": (native.exp2, ones((N,))),
     "log2": (native.log2, ones((N,))),
 }
