@@ -17,7 +17,6 @@ from xrgs import config
 from xrgs.capture.dataset import Dataset, LoadedView
 from xrgs.splat.cameras import Camera
 from xrgs.splat.gaussians import PARAMETERS
-from xrgs.training.components.region_weighting import region_attenuations
 from xrgs.training.loop import train
 
 GAUSSIANS = 60_001
@@ -41,6 +40,7 @@ _OVERRIDES = (
     # Every component whose own code computes more than single products.
     "components.loss_weighting.lr_weight=0.5",
     "components.adaptive_weighting.texture=0.9",
+    "components.region_weighting.texture=0.5",
     "components.gradient_scaling.lr_scale=0.3",
     "components.render_scale.gamma=0.25",
     "components.consistency.weight=0.1",
@@ -59,13 +59,9 @@ def training_hash() -> str:
     rules = ("split", "duplicated", "pruned_opacity", "pruned_scale", "reset")
     if not all(counts[rule] for rule in rules):
         raise AssertionError(f"the training does not go through every rule: {counts}")
-    conf.components.region_weighting.texture = 0.07
-    regions = region_attenuations(
-        conf.components.region_weighting, data.train, data.points, conf.splat.raster.near
-    )
     digest = hashlib.sha256()
-    for tensor in (*(result.gaussians[name] for name in PARAMETERS), *regions.values()):
-        digest.update(tensor.detach().contiguous().numpy().tobytes())
+    for name in PARAMETERS:
+        digest.update(result.gaussians[name].detach().contiguous().numpy().tobytes())
     digest.update(json.dumps(result.history).encode())
     return digest.hexdigest()
 
