@@ -35,6 +35,7 @@ def smoke(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str, dict[str
 def test_every_backend_is_timed_in_every_part(smoke: tuple[Path, str, dict[str, Any]]) -> None:
     _, out, found = smoke
     backends = {"torch"} if resolve_backend("auto") == "torch" else {"native", "torch"}
+    assert {row["method"] for row in found["rows"]} >= backends | {"torch float64"}
     loads = len(run.SMOKE.gaussians) * len(run.SMOKE.sizes)
     for backend in backends:
         rows = [row for row in found["rows"] if row["method"] == backend]
@@ -54,8 +55,19 @@ def test_every_backend_is_timed_in_every_part(smoke: tuple[Path, str, dict[str, 
     assert {row["views"] for row in found["views"]} == set(run.SMOKE.views)
     assert {row["kind"] for row in found["resizes"]} == backends | {"interpolate"}
     assert set(found["growth"]) == {"gaussians", "pixels"}
+    assert {key: len(lines) for key, lines in found["growth_lines"].items()} == {
+        "gaussians": len(run.SMOKE.sizes),
+        "pixels": len(run.SMOKE.gaussians),
+    }
     titles = ["gradient error", "loss, value and gradient", "Adam, one step", "densify"]
-    titles += ["an LR view's step takes", "LR view upsampled", "shortcut of a step", "growth MB"]
+    titles += [
+        "speed-up",
+        "exponent",
+        "an LR view's step takes",
+        "LR view upsampled",
+        "shortcut of a step",
+        "growth MB",
+    ]
     for title in titles:
         assert title in out
 
@@ -83,6 +95,8 @@ def test_stages_add_up_to_no_more_than_the_pass(smoke: tuple[Path, str, dict[str
         back = {name: ms for name, ms in stages.items() if name.endswith("backward")}
         assert 0 < sum(back.values()) <= row["backward_ms"]
         assert 0 < sum(stages.values()) - sum(back.values()) <= row["forward_ms"]
+        assert set(row["ideal_share"]) == set(row["multiply_share"]) <= set(stages)
+        assert row["pairs"] > 0
     assert smoke[2]["machine"]["multiply_adds_per_s"]["1"] > 1e8
 
 
@@ -125,6 +139,7 @@ def test_a_file_is_timed(file: Path, tmp_path: Path) -> None:
         (["quality=true"], "quality=true needs cell=FOLDER"),
         (["quality=true", "cell=nowhere"], "cell=nowhere: is absent"),
         (["repeats=0"], "repeats must be at least 1"),
+        (["against=none"], "against=none: must be the Python executable of an environment"),
         (["repeats=many"], "repeats"),
         (["lod=a.npz"], "lod"),
     ],
@@ -140,25 +155,11 @@ def test_bad_arguments_end_in_one_line(
     assert "\n" not in err
 
 
-def test_growth_finds_the_exponents() -> None:
-    rows = [
-        {
-            "method": "native",
-            "threads": 1,
-            "gaussians": count,
-            "width": side,
-            "height": side,
-            "forward_ms": 1e-3 * count**0.8 * side,
-            "backward_ms": 2e-3 * count**0.8 * side,
-        }
-        for count in (10, 100, 1000)
-        for side in (10, 20)
-    ]  # fmt: shortcut
-    found = run.fit_growth(rows, "native", 1)
-    assert found["gaussians"] == pytest.approx(0.8)
-    assert found["pixels"] == pytest.approx(0.5)
-    assert run.fit_growth(rows[:1], "native", 1) == {}
-    assert run.fit_growth(rows, "torch", 1) == {}
+def test_float64_is_the_reference_of_errors(load: Load) -> None:
+    method = RenderMethod("exact", "torch", dtype=torch.float64)
+    found = rendering.errors(load, [method])["exact"]
+    assert max(found.values()) < 1e-12
+    assert rendering.describe(method)["dtype"] == "float64"
 
 
 def test_errors_tell_wrong_settings_from_right_ones(load: Load) -> None:

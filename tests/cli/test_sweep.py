@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -13,6 +14,7 @@ from PIL import Image
 from xrgs.capture import variant
 from xrgs.config import CONF_DIR
 from xrgs.experiment.store import Store
+from xrgs.splat.backend import REQUIRE_NATIVE
 
 SweepHere = Callable[..., tuple[int, str, str]]
 RunCommand = Callable[..., tuple[int, str, str]]
@@ -265,3 +267,25 @@ def test_a_dry_run_plans_without_torch_and_writes_nothing(
     assert "plan: 6 cells" in err
     assert err.count("variant not built") == 6
     assert not list(tmp_path.iterdir())
+
+
+def test_a_dry_run_without_kernels_says_how_long_torch_takes(
+    run_command: RunCommand,
+    tmp_path: Path,
+    without_heavy: str,
+    photographs: Callable[..., Path],
+) -> None:
+    (tmp_path / "sitecustomize.py").write_text(
+        "import importlib.util as u\n"
+        "find = u.find_spec\n"
+        "u.find_spec = lambda name, *a: None if name == 'xrgs._native' else find(name, *a)\n"
+    )
+    variables = {"PYTHONPATH": f"{tmp_path}{os.pathsep}{without_heavy}", REQUIRE_NATIVE: "0"}
+    scene = ("scene=folder", f"scene.path={photographs(tmp_path / 'photographs', 5)}")
+    arguments = ("+ablation=consistency", "seed=0,1", "dry_run=true", "store=s")
+    code, _, err = run_command("sweep", tmp_path, *scene, *arguments, **variables)
+    assert code == 0, err
+    assert "left to train, one after another: ~" in err
+    (line,) = (line for line in err.splitlines() if "not built on this machine" in line)
+    assert "torch trains 4 cells, ~" in line
+    assert " instead of ~" in line

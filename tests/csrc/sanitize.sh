@@ -27,7 +27,7 @@ import sys
 sys.meta_path[:] = [finder for finder in sys.meta_path if "ScikitBuild" not in type(finder).__name__]
 PYTHON
 
-# Python leaks at exit by design. The test of the memory limit leaves no room for shadow memory.
+# Python leaks at exit by design. A limit of memory leaves no room for shadow memory.
 export ASAN_OPTIONS=detect_leaks=0:allocator_may_return_null=1 UBSAN_OPTIONS=print_stacktrace=1
 export PYTHONSAFEPATH=1 PYTHONPATH=$folder/package
 compiler=${CXX:-c++}
@@ -37,5 +37,4 @@ export LD_PRELOAD
 "$python" -c "
 from xrgs import _native
 assert _native.__file__.startswith('$folder'), f'{_native.__file__} is not the sanitized module'"
-"$python" -m pytest tests/splat/native -p no:cacheprovider \
-  --deselect tests/splat/native/test_rasterizer_arguments.py::test_lists_beyond_memory_are_a_clear_error "$@"
+"$python" -m pytest tests/splat/native -p no:cacheprovider -k "not beyond_memory" "$@"

@@ -4,7 +4,10 @@ from __future__ import annotations
 
 import copy
 import dataclasses
+import importlib
 import json
+import subprocess
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -12,12 +15,13 @@ from typing import Any
 import pytest
 
 from xrgs.config import Conf
+from xrgs.errors import XrgsError
 from xrgs.evaluation.protocol import PROTOCOL_VERSION
 from xrgs.experiment import identity
 from xrgs.experiment.identity import cell_identity
 from xrgs.safeio import hashing
 from xrgs.safeio.hashing import digest
-from xrgs.splat.backend import resolve_backend
+from xrgs.splat.backend import arithmetic, resolve_backend
 
 
 def cell_id(conf: Conf, variant: str = "v") -> str:
@@ -147,6 +151,7 @@ def test_an_identity_has_these_keys_and_values(baseline: Conf, backend: str) -> 
         "seed": baseline.seed,
         "variant": "v",
         "protocol": PROTOCOL_VERSION,
+        "arithmetic": arithmetic(resolved),
         "code": identity.training_code(resolved),
     }
 
@@ -156,3 +161,49 @@ def test_code_is_compared_for_the_backend_that_is_named() -> None:
         assert identity.changed_code(identity.training_code(backend), backend) == []
     native, torch = (identity.training_code(backend) for backend in ("native", "torch"))
     assert identity.changed_code(native, "torch") == sorted(native.keys() - torch.keys())
+
+
+def test_the_native_backend_on_a_machine_without_fused_multiply_add_is_another_cell(
+    baseline: Conf,
+) -> None:
+    native = pytest.importorskip("xrgs._native")
+    before, found = native.isa(), {}
+    try:
+        for isa in native.available_isas():
+            native.set_isa(isa)
+            ids = []
+            for backend in ("native", "torch"):
+                baseline.splat.backend = backend
+                ids.append(cell_id(baseline))
+            found[isa] = (native.fused_multiply_add(), *ids)
+    finally:
+        native.set_isa(before)
+    assert all(fused for isa, (fused, *_) in found.items() if isa != "portable")
+    for fused, on_native, on_torch in found.values():
+        for other_fused, on_other_native, on_other_torch in found.values():
+            assert (on_native == on_other_native) == (fused == other_fused)
+            assert on_torch == on_other_torch
+
+
+def test_a_native_module_that_cannot_be_loaded_is_an_error_of_one_line(
+    baseline: Conf, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Built for another Python or C library: the module is found, and its import fails."""
+    pytest.importorskip("xrgs._native")
+    baseline.splat.backend = "native"
+
+    def fail(name: str) -> None:
+        raise ImportError(f"{name}: version `GLIBC_9.9' not found")
+
+    monkeypatch.setattr(importlib, "import_module", fail)
+    with pytest.raises(XrgsError, match=r"splat\.backend=native: .*GLIBC_9\.9.*install xrgs"):
+        cell_id(baseline)
+
+
+def test_planning_a_native_cell_needs_no_torch() -> None:
+    pytest.importorskip("xrgs._native")
+    script = (
+        "import sys\nfrom xrgs.splat.backend import arithmetic\n"
+        "assert arithmetic('native') in {'fma', 'no-fma'}\nassert 'torch' not in sys.modules\n"
+    )
+    subprocess.run([sys.executable, "-P", "-c", script], check=True)

@@ -47,6 +47,7 @@ class MadeStore:
         state: str = "done",
         pictures: bool = False,
         cpu: str = "a processor",
+        arithmetic: str | None = None,
         history: str = HISTORY,
     ) -> CellFolder:
         """One cell: the made-up baseline's values times `factors`, or `values` outright."""
@@ -77,7 +78,7 @@ class MadeStore:
         if state == "failed":
             folder.fail("RuntimeError: out of luck")
             return folder
-        self._fill(folder, found, cpu)
+        self._fill(folder, found, cpu, arithmetic)
         (folder.path / "history.csv").write_text(history)
         if pictures:
             self._draw(folder, variant, noise=0.02 * len(self.rows))
@@ -98,10 +99,11 @@ class MadeStore:
         return self.store.write_sweep(command, self.rows)
 
     @staticmethod
-    def _fill(folder: CellFolder, found: dict[str, Any], cpu: str) -> None:
+    def _fill(folder: CellFolder, found: dict[str, Any], cpu: str, arithmetic: str | None) -> None:
         summary = {key: found[key] for key in SUMMARY}
         (folder.path / "summary.json").write_text(json.dumps(summary))
         provenance = {"cpu": cpu, "threads": 2, "backend": "torch", "started": str(folder.path)}
+        provenance |= {} if arithmetic is None else {"arithmetic": arithmetic}
         (folder.path / "provenance.json").write_text(json.dumps(provenance))
         # The views differ, their mean is the value asked for.
         lines = ["view,psnr,ssim,lpips"]

@@ -253,3 +253,19 @@ def test_a_report_needs_no_torch(study: Any) -> None:
         env={"PYTHONPATH": str(Path(xrgs.__file__).parents[1])},
     )
     assert (study.store.reports).is_dir()
+
+
+@pytest.mark.parametrize("arithmetics", [("fma", "fma"), ("fma", "no-fma"), (None, "fma")])
+def test_cells_of_different_arithmetic_are_warned_of(
+    made: Any, arithmetics: tuple[str | None, str]
+) -> None:
+    """A cell of an older version says none."""
+    baseline, ablation = arithmetics
+    made.add(arithmetic=baseline)
+    made.add("consistency", arithmetic=ablation)
+    made.write()
+    report = build(made.store.path, pictures=[])
+    page = (report.folder / "table.md").read_text()
+    assert ("different arithmetic (fma, no-fma)" in report.text) == (ablation == "no-fma")
+    assert ("trained with different arithmetic" in page) == (ablation == "no-fma")
+    assert "| arithmetic " in page

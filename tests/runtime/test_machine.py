@@ -1,8 +1,9 @@
-"""Cores, torch's threads, and OpenMP's wait policy."""
+"""Cores, memory, torch's threads, and OpenMP's wait policy."""
 
 from __future__ import annotations
 
 import os
+import resource
 import subprocess
 import sys
 from pathlib import Path
@@ -11,6 +12,7 @@ import pytest
 import torch
 
 from xrgs.runtime.machine import (
+    peak_rss,
     set_passive_openmp_wait,
     set_torch_threads,
     single_torch_thread,
@@ -92,3 +94,15 @@ sys.argv[1:] = ["repeats=none"]
         check=False,
     )
     assert done.stdout.startswith("called\n"), done.stderr
+
+
+@pytest.mark.parametrize(("platform", "unit"), [("linux", 1024), ("darwin", 1)])
+def test_the_peak_memory_is_in_bytes(
+    platform: str, unit: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    class Usage:
+        ru_maxrss = 300_000
+
+    monkeypatch.setattr(sys, "platform", platform)
+    monkeypatch.setattr(resource, "getrusage", lambda *_: Usage)
+    assert peak_rss() == 300_000 * unit

@@ -192,6 +192,22 @@ def similar_pair() -> Callable[..., tuple[Tensor, Tensor]]:
     return make
 
 
+@pytest.fixture(scope="session")
+def almost_equal() -> Callable[[float, float, float], tuple[Tensor, Tensor]]:
+    def make(level: float, texture: float, difference: float) -> tuple[Tensor, Tensor]:
+        """A float32 render and its photograph near convergence.
+
+        The photograph is noise of height `texture` above `level`, the render is above it by noise
+        of height `difference`.
+        """
+        generator = torch.Generator().manual_seed(0)
+        noise = torch.rand(2, 60, 70, 3, generator=generator)
+        photograph = level + texture * noise[0]
+        return photograph + difference * noise[1], photograph
+
+    return make
+
+
 @pytest.fixture
 def pixel() -> Camera:
     """The camera whose only pixel's centre is the optical axis."""

@@ -106,6 +106,8 @@ def test_the_callers_points_are_not_shared() -> None:
         ({"colors": np.full((30, 3), np.inf)}, "colors has values"),
         ({"init_opacity": 1.0}, "init_opacity"),
         ({"init_opacity": 0.0}, "init_opacity"),
+        ({"sh_degree": 4}, "sh_degree must be 0 to 3, got 4"),
+        ({"sh_degree": -1}, "sh_degree must be 0 to 3, got -1"),
     ],
 )
 def test_bad_input_is_named(cloud: Cloud, change: Any, message: str) -> None:

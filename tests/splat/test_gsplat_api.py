@@ -195,6 +195,18 @@ def test_spherical_harmonics_are_gsplats(sh_degree: int, per_camera: bool) -> No
         torch.testing.assert_close(found, expected, rtol=1e-7, atol=1e-8)
 
 
+@pytest.mark.parametrize("backend", ["torch", "native"])
+def test_bands_above_degree_3_are_left_out(backend: str) -> None:
+    if backend == "native":
+        pytest.importorskip("xrgs._native")
+    made = scene(sh_degree=3).to(torch.float32)
+    wide = made._replace(colors=torch.cat([made.colors, torch.ones(80, 9, 3)], dim=1))
+    expected, found = (
+        rasterization(**each.arguments(), sh_degree=3, backend=backend)[0] for each in (made, wide)
+    )
+    assert torch.equal(found, expected)
+
+
 @pytest.mark.parametrize("mode", MODES)
 @pytest.mark.parametrize("sh_degree", [None, 3])
 def test_the_native_backend_gives_gsplats_images_and_gradients(

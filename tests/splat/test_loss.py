@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from torch import Tensor
 
 from xrgs.splat.loss import photometric_loss, prepare_target
-from xrgs.splat.torch.loss import structural_similarity
+from xrgs.splat.torch.loss import dissimilarity_map
 
 SimilarPair = Callable[..., tuple[Tensor, Tensor]]
 
@@ -26,9 +26,9 @@ def test_the_loss_is_its_formula(similar_pair: SimilarPair, l1: float, ssim: flo
     image, photograph = similar_pair(20, 24)
     target = prepare_target(photograph)
     absolute = np.abs(image.numpy() - photograph.numpy()).mean()
-    similarity = structural_similarity(image, target).item()
+    dissimilarity = dissimilarity_map(image, target).mean().item()
     loss = photometric_loss(image, target, l1=l1, ssim=ssim).item()
-    assert loss == pytest.approx(l1 * absolute + ssim * (1 - similarity), rel=1e-12)
+    assert loss == pytest.approx(l1 * absolute + ssim * dissimilarity, rel=1e-12)
 
 
 def test_gradients_are_those_of_finite_differences(similar_pair: SimilarPair) -> None:
@@ -57,6 +57,29 @@ def test_float32_is_float64_rounded(similar_pair: SimilarPair) -> None:
     torch.testing.assert_close(
         grad32[certain], grad64[certain], rtol=1e-4, atol=1e-4 * grad64.abs().max().item()
     )
+
+
+@pytest.mark.parametrize(
+    ("level", "texture", "difference"),
+    [(0.5, 0.3, 1e-3), (0.97, 1e-3, 1e-4), (0.0, 1e-3, 1e-4)],
+)
+def test_ssim_keeps_its_digits_near_convergence(
+    almost_equal: Callable[[float, float, float], tuple[Tensor, Tensor]],
+    level: float,
+    texture: float,
+    difference: float,
+) -> None:
+    results = []
+    for dtype in (torch.float32, torch.float64):
+        image, photograph = (x.to(dtype) for x in almost_equal(level, texture, difference))
+        image.requires_grad_()
+        loss = photometric_loss(image, prepare_target(photograph), l1=0.0, ssim=1.0)
+        torch.autograd.backward(loss)
+        assert image.grad is not None
+        results.append((loss.item(), image.grad.double()))
+    (loss32, grad32), (loss64, grad64) = results
+    assert loss32 == pytest.approx(loss64, rel=1e-6)
+    assert (grad32 - grad64).norm() <= 1e-6 * grad64.norm()
 
 
 @settings(max_examples=50, deadline=None)

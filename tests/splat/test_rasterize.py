@@ -140,6 +140,11 @@ def test_sh_degree_above_the_bands_stored(draw: Draw) -> None:
         draw(sh_degree=2, shN=torch.zeros(6, 3, 3))
 
 
+def test_more_bands_than_degree_3_has(draw: Draw) -> None:
+    with pytest.raises(ValueError, match=r"^shN must be .* at most 15, got \[6, 24, 3\]"):
+        draw(shN=torch.zeros(6, 24, 3))
+
+
 def test_bands_above_the_degree_do_not_show(draw: Draw, scene: Scene) -> None:
     shN = scene["shN"].clone()
     shN[:, 3:] = 9.0

@@ -34,7 +34,7 @@ def test_the_image_is_that_of_the_activated_parameters(
     settings = RasterSettings(background=(0.1, 0.2, 0.3))
     render = rasterize(gaussians, camera, settings=settings, backend=backend)
     expected = parameters.rasterize_parameters(
-        *gaussians.activated(), camera, settings, sh_degree=2, backend=backend
+        *gaussians.activated(backend=backend), camera, settings, sh_degree=2, backend=backend
     )
     assert torch.equal(render.image, expected.image)
     assert torch.equal(render.alpha, expected.alpha)

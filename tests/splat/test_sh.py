@@ -82,3 +82,8 @@ def test_degree_out_of_range(dirs: Tensor, degree: int) -> None:
 def test_too_few_bands(dirs: Tensor) -> None:
     with pytest.raises(ValueError, match=r"sh_degree 2 needs shN of \[N, 8, 3\]"):
         sh_to_colors(2, dirs, torch.zeros(len(dirs), 1, 3), torch.zeros(len(dirs), 3, 3))
+
+
+def test_too_many_bands(dirs: Tensor) -> None:
+    with pytest.raises(ValueError, match=r"shN must be \[N, K - 1, 3\] with K - 1 of at most 15"):
+        sh_to_colors(3, dirs, torch.zeros(len(dirs), 1, 3), torch.zeros(len(dirs), 16, 3))

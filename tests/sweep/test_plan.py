@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib.util
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -11,9 +12,20 @@ import pytest
 from xrgs.config import Conf
 from xrgs.experiment.cell_folder import CellState
 from xrgs.experiment.store import Store
+from xrgs.runtime.progress import format_duration
 from xrgs.safeio.atomic import write_json
+from xrgs.splat import backend
 from xrgs.sweep.axes import CellSpec
-from xrgs.sweep.plan import PlannedCell, describe, expected_length, identified, ready
+from xrgs.sweep.estimate import TORCH_SLOWDOWN, RuntimeEstimator, torch_seconds
+from xrgs.sweep.plan import (
+    PlannedCell,
+    describe,
+    estimated,
+    expected_length,
+    identified,
+    ready,
+    without_kernels,
+)
 
 
 @pytest.fixture
@@ -30,6 +42,18 @@ def cell(compose: Callable[..., Conf]) -> Callable[..., PlannedCell]:
         )
 
     return planned
+
+
+@pytest.fixture
+def no_kernels(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A machine on which the kernels were not built."""
+    monkeypatch.setattr(importlib.util, "find_spec", lambda _: None)
+    monkeypatch.delenv(backend.REQUIRE_NATIVE, raising=False)
+
+
+def configured(cell: PlannedCell, name: str) -> PlannedCell:
+    conf = cell.conf
+    return replace(cell, conf=replace(conf, splat=replace(conf.splat, backend=name)))
 
 
 @pytest.mark.parametrize(("retry", "failed"), [(False, set()), (True, {"failed"})])
@@ -74,6 +98,52 @@ def test_the_plan_says_how_long_the_remaining_training_takes(
     assert "retry=failed" in rows[-1]
     again = [replace(each, conf=replace(each.conf, retry="failed")) for each in plan]
     assert "~18 min" in describe(again).splitlines()[0]
+
+
+def test_without_kernels_the_plan_says_how_long_torch_takes(
+    cell: Callable[..., PlannedCell], no_kernels: None
+) -> None:
+    unbuilt = replace(cell("a"), variant_id=None, cell_id=None, identity=None, seconds=4000.0)
+    plan = [
+        unbuilt,
+        cell("b", seconds=8000.0),
+        cell("c", "done", 1e9),
+        replace(cell("d", seconds=1e9), error="no variant"),
+        configured(cell("e", seconds=1e9), "torch"),
+    ]
+    line = without_kernels(plan)
+    assert "were not built on this machine: torch trains 2 cells" in line
+    assert f"~3.3 h instead of {format_duration(12000 / TORCH_SLOWDOWN)}" in line
+    assert "pip install" in line
+    assert "~3.3 h" in describe(plan[:2]).splitlines()[0]
+    unknown = without_kernels([*plan, cell("f")])
+    assert "torch trains 3 cells, 30 to 60 times longer" in unknown
+    assert without_kernels(plan[2:]) == ""
+
+
+def test_with_kernels_the_plan_says_nothing_of_torch(
+    cell: Callable[..., PlannedCell], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name: name)
+    assert without_kernels([cell("a", seconds=1e9)]) == ""
+
+
+def test_torch_is_estimated_by_size_where_the_store_says_nothing(
+    cell: Callable[..., PlannedCell], no_kernels: None, tmp_path: Path
+) -> None:
+    nothing = RuntimeEstimator(Store(tmp_path))
+    plan = [replace(cell("a"), variant_id=None), cell("b"), cell("c", "done")]
+    seconds = torch_seconds(plan[0].conf)
+    assert seconds is not None
+    assert [each.seconds for each in estimated(plan, nothing)] == [seconds, seconds, None]
+
+
+def test_native_cells_have_no_estimate_before_the_first_is_done(
+    cell: Callable[..., PlannedCell], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name: name)
+    (only,) = estimated([cell("a")], RuntimeEstimator(Store(tmp_path)))
+    assert only.seconds is None
 
 
 def test_a_cell_whose_lock_is_held_is_running_unless_it_is_done(

@@ -171,7 +171,7 @@ def test_other_code_libraries_and_machines_are_reported_before_the_training(
     identity, made_with = cell.identity(), cell.provenance()
     identity["code"] |= {"training/loop.py": "0", "old.py": "1"}
     del identity["code"]["evaluation/metrics.py"]
-    write_json(cell.path / "identity.json", identity | {"protocol": 0})
+    write_json(cell.path / "identity.json", identity | {"protocol": 0, "arithmetic": "no-fma"})
     made_with["packages"]["torch"] = "1.0"
     made_with |= {"cpu": "abacus", "git": "f" * 40}
     write_json(cell.path / "provenance.json", made_with)
@@ -188,6 +188,7 @@ def test_other_code_libraries_and_machines_are_reported_before_the_training(
         "code: old.py (removed)",
         "code: evaluation/metrics.py (new)",
         "evaluation protocol: 0 -> 1",
+        "arithmetic, which decides the last digits: no-fma -> ",
         "packages.torch: 1.0 -> ",
         "cpu: abacus -> ",
         "git: ffff",

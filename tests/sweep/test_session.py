@@ -153,3 +153,13 @@ def test_code_that_is_edited_while_a_sweep_runs_is_noticed(
     assert identity.training_code("torch") != edited
     with pytest.raises(XrgsError, match=r"splat/densify\.py"):
         made.check_code()
+
+
+def test_a_job_on_a_machine_of_other_arithmetic_is_refused(
+    hand_over_of: HandOverOf, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    made = hand_over_of()
+    made.check_code()
+    monkeypatch.setattr("xrgs.sweep.session.arithmetic", lambda _: "no-fma")
+    with pytest.raises(XrgsError, match=r"planned with the arithmetic .* this machine has no-fma"):
+        made.check_code()

@@ -15,20 +15,26 @@ from xrgs.experiment.cell_folder import CellFolder
 from xrgs.experiment.store import Store
 from xrgs.runtime.progress import Progress
 from xrgs.safeio.atomic import write_json
-from xrgs.sweep import locks
+from xrgs.sweep import locks, status
 from xrgs.sweep.status import describe, read
 
 
-def cell(store: Store, name: str, code: dict[str, str] | None = None) -> CellFolder:
-    """A cell that was begun."""
+def cell(
+    store: Store, name: str, code: dict[str, str] | None = None, **changes: object
+) -> CellFolder:
+    """A cell that was begun, with these changes of its identity; None removes a key."""
     folder = store.cell(name)
-    what = {"splat": {"backend": "torch"}, "code": code or identity.training_code("torch")}
-    folder.begin({"scene": {"name": "statue"}}, what)
+    what: dict[str, object] = {"splat": {"backend": "torch"}, "arithmetic": "torch"}
+    what["code"] = code or identity.training_code("torch")
+    what |= changes
+    folder.begin({"scene": {"name": "statue"}}, {k: v for k, v in what.items() if v is not None})
     return folder
 
 
-def done(store: Store, name: str, code: dict[str, str] | None = None) -> CellFolder:
-    folder = cell(store, name, code)
+def done(
+    store: Store, name: str, code: dict[str, str] | None = None, **changes: object
+) -> CellFolder:
+    folder = cell(store, name, code, **changes)
     (folder.path / "scores.csv").write_text("view,psnr\na,20\n")
     folder.finish(["a"], 1)
     return folder
@@ -84,6 +90,27 @@ def test_a_stale_cell_names_the_files_that_are_others_now(store: Store) -> None:
     text = describe(read(store.path))
     assert "stale: 1 done cells" in text
     assert "  splat/densify.py: 1 cells" in text
+
+
+def test_a_cell_of_another_arithmetic_is_stale(
+    store: Store, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    code, native = identity.training_code("native"), {"backend": "native"}
+    done(store, "fused", code, arithmetic="fma", splat=native)
+    done(store, "unfused", code, arithmetic="no-fma", splat=native)
+    # As a cell has it that was trained before the arithmetic was part of the identity.
+    done(store, "old", code, arithmetic=None, splat=native)
+    monkeypatch.setattr(status, "arithmetic", lambda _: "fma")
+    stale = {cell.id: cell.stale for cell in read(store.path).cells}
+    assert stale["fused"] == ()
+    assert stale["unfused"] == ("arithmetic (no-fma, here fma)",)
+    assert stale["old"] == ("arithmetic (not recorded, here fma)",)
+
+    def missing(_: str) -> str:
+        raise XrgsError("not built on this machine")
+
+    monkeypatch.setattr(status, "arithmetic", missing)  # where stores are only read
+    assert [cell.id for cell in read(store.path).cells if cell.stale] == ["stale"]
 
 
 def test_a_change_that_keeps_the_size_is_found_where_that_is_asked_for(store: Store) -> None:

@@ -105,7 +105,9 @@ class Load:
         return self.with_camera(replace(camera, K=K, width=width, height=height))
 
 
-def random_load(count: int, width: int, height: int, seed: int) -> Load:
+def random_load(
+    count: int, width: int, height: int, seed: int, size_per_spacing: float = _SIZE_PER_SPACING
+) -> Load:
     """Make anisotropic Gaussians all over the view and a little beyond, few of them opaque.
 
     Args:
@@ -113,6 +115,9 @@ def random_load(count: int, width: int, height: int, seed: int) -> Load:
         width: Width of the view, px.
         height: Height of the view, px.
         seed: Seed of the random numbers.
+        size_per_spacing: Standard deviation of a Gaussian in units of the mean distance of `count`
+            Gaussians spread over the image; twice as much makes four times as many contribute to a
+            pixel.
     """
     generator = torch.Generator().manual_seed(seed)
 
@@ -138,7 +143,7 @@ def random_load(count: int, width: int, height: int, seed: int) -> Load:
         name="random",
         means=means,
         quats=torch.randn(count, 4, generator=generator),
-        scales=_SIZE_PER_SPACING * spacing[:, None] * spread,
+        scales=size_per_spacing * spacing[:, None] * spread,
         opacities=torch.sigmoid(1.5 * torch.randn(count, generator=generator) - 1.5),
         sh=sh,
         camera=Camera(viewmat=torch.eye(4), K=K, width=width, height=height),

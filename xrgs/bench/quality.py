@@ -90,7 +90,7 @@ def _psnr(trained: TrainingResult, views: Sequence[LoadedView], conf: Conf) -> f
     with torch.no_grad():
         for view in views:
             render = rasterize_parameters(
-                *trained.gaussians.activated(),
+                *trained.gaussians.activated(backend=backend),
                 view.camera,
                 raster,
                 sh_degree=raster.sh_degree,

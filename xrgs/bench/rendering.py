@@ -20,6 +20,8 @@ from xrgs.splat.settings import CullingOptions, RasterSettings
 ERROR_CROP = (96, 72)
 #: Above these sizes the torch backend would take minutes, and isn't timed.
 _TORCH_GAUSSIANS, _TORCH_PIXELS, _TORCH_REPEATS = 100_000, 504 * 378, 2
+#: The name of the method whose results are the reference of all errors.
+TORCH_FLOAT64 = "torch float64"
 
 
 @dataclass(frozen=True)
@@ -32,16 +34,19 @@ class RenderMethod:
     sh_degree: int = 3
     culling: CullingOptions | None = None
     """The kinds of culling that the native backend uses; None means all of them."""
+    dtype: torch.dtype = torch.float32
 
 
 def default_methods(backends: Sequence[str]) -> list[RenderMethod]:
-    """Return each backend at gsplat's settings, and the first one with other cutoffs as well.
+    """Return each backend at gsplat's settings, torch in float64, and the first with other cutoffs.
 
     Args:
         backends: Names of the backends, the fastest first.
     """
     first, usual = backends[0], RasterSettings()
-    return [RenderMethod(name, name) for name in backends] + [
+    return [
+        *(RenderMethod(name, name) for name in backends),
+        RenderMethod(TORCH_FLOAT64, "torch", dtype=torch.float64),
         RenderMethod(f"{first}, alpha cut 4/255", first, replace(usual, alpha_min=4 / 255)),
         RenderMethod(f"{first}, alpha cut 1/1020", first, replace(usual, alpha_min=1 / 1020)),
         RenderMethod(f"{first}, stop at 1e-2", first, replace(usual, transmittance_min=1e-2)),
@@ -53,18 +58,17 @@ class RenderTask:
 
     Attributes:
         image: The last image, [H, W, 3], once `backward` was called.
-        work: Visible Gaussians, alpha evaluations and bytes of buffers of the last render.
+        work: Visible Gaussians, alpha evaluations and bytes of buffers of the last render; with the
+            native backend also the (tile, Gaussian) pairs.
         stages: The shortest time of each stage in ms, native backend only.
     """
 
-    def __init__(
-        self, load: Load, method: RenderMethod, count: int, dtype: torch.dtype = torch.float32
-    ) -> None:
+    def __init__(self, load: Load, method: RenderMethod, count: int) -> None:
         self.camera, self.method, self.threads = load.camera, method, count
-        self.leaves = [p.to(dtype).clone().requires_grad_() for p in load.parameters]
+        self.leaves = [p.to(method.dtype).clone().requires_grad_() for p in load.parameters]
         generator = torch.Generator().manual_seed(0)
         shape = (load.camera.height, load.camera.width, 3)
-        self.image_grad = torch.randn(shape, generator=generator).to(dtype)  # dL/d(image)
+        self.image_grad = torch.randn(shape, generator=generator).to(method.dtype)  # dL/d(image)
         self.render: Render | None = None
         self.image: Tensor | None = None
         self.work: dict[str, int] = {}
@@ -102,6 +106,7 @@ class RenderTask:
             "buffer_bytes": render.buffer_bytes,
         }
         if self.method.backend == "native":
+            self.work["pairs"] = graph.frame.pair_count
             for stage, ms in graph.frame.timings.items():
                 self.stages[stage] = min(ms, self.stages.get(stage, ms))
         return gradients
@@ -197,6 +202,7 @@ def _row(load: Load, rendering: RenderTask, forward: Timings, backward: Timings)
         "forward_median_ms": forward.median,
         "backward_median_ms": backward.median,
         "stages_ms": dict(stages),
+        "pairs": work.get("pairs"),
         "evaluations": work["evaluations"],
         "evaluations_per_s": 1e3 * work["evaluations"] / compositing,
         "memory_bytes": 2 * model + work["buffer_bytes"],  # 2: parameters and gradients
@@ -204,7 +210,7 @@ def _row(load: Load, rendering: RenderTask, forward: Timings, backward: Timings)
 
 
 def errors(load: Load, chosen: Sequence[RenderMethod]) -> dict[str, dict[str, float]]:
-    """Compare each method in float32 to the torch backend at gsplat's settings in float64.
+    """Compare each method to the torch backend at gsplat's settings in float64.
 
     Only the middle of the view (`ERROR_CROP`) is rendered, as a view of its own: a large view would
     take minutes in float64.
@@ -219,8 +225,8 @@ def errors(load: Load, chosen: Sequence[RenderMethod]) -> dict[str, dict[str, fl
         of the six where it is largest.
     """
     crop = load.center_crop(*ERROR_CROP)
-    reference = RenderMethod("exact", "torch", sh_degree=chosen[0].sh_degree)
-    exact = RenderTask(crop, reference, torch.get_num_threads(), torch.float64)
+    reference = RenderMethod("exact", "torch", sh_degree=chosen[0].sh_degree, dtype=torch.float64)
+    exact = RenderTask(crop, reference, torch.get_num_threads())
     exact.forward()
     expected = exact.backward()
     errors_by_name = {}
@@ -284,4 +290,6 @@ def describe(method: RenderMethod) -> Mapping[str, Any]:
     Args:
         method: What is described.
     """
-    return {"name": method.name, "backend": method.backend, "settings": asdict(method.settings)}
+    dtype = str(method.dtype).removeprefix("torch.")
+    settings = asdict(method.settings)
+    return {"name": method.name, "backend": method.backend, "dtype": dtype, "settings": settings}

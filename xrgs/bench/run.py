@@ -3,16 +3,25 @@
 from __future__ import annotations
 
 import csv
-import resource
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-import numpy as np
-
-from xrgs.bench import loads, memory, rendering, scale, shortcuts, tables, training
+from xrgs.bench import (
+    against,
+    growth,
+    instructions,
+    loads,
+    memory,
+    panels,
+    rendering,
+    scale,
+    shortcuts,
+    tables,
+    training,
+)
 from xrgs.errors import XrgsError
 from xrgs.experiment import provenance
-from xrgs.runtime.machine import usable_cores
+from xrgs.runtime.machine import peak_rss, usable_cores
 from xrgs.runtime.progress import progress
 from xrgs.safeio.atomic import write_json
 from xrgs.splat.backend import resolve_backend
@@ -33,6 +42,7 @@ class BenchmarkSizes(NamedTuple):
     step: tuple[int, int, int]  # Gaussians, width and height of the timed training step
     views: tuple[int, ...]  # numbers of views rendered one after the other
     memory: tuple[int, int, int]  # Gaussians, width and height of the step whose memory is measured
+    scene: tuple[int, int, int]  # Gaussians, width and height of the scene of `against`
 
 
 FULL = BenchmarkSizes(
@@ -41,6 +51,7 @@ FULL = BenchmarkSizes(
     step=(100_000, 504, 378),
     views=(1, 2, 4, 8),
     memory=(300_000, 1008, 756),
+    scene=(57_000, 696, 521),
 )
 SMOKE = BenchmarkSizes(
     gaussians=(200, 400),
@@ -48,12 +59,16 @@ SMOKE = BenchmarkSizes(
     step=(300, 80, 60),
     views=(1, 2),
     memory=(300, 80, 60),
+    scene=(300, 80, 60),
 )
 _LR_FACTOR = 5
+#: Makes 56 Gaussians contribute to a pixel of the scene of `against`, as in a trained scene of
+#: llff/fern with as many Gaussians and pixels.
+_SCENE_SIZE_PER_SPACING = 1.88
 
 
 def run(settings: Settings) -> str:
-    """Run what the settings choose: the benchmark, `save`, `quality` or `store_cells`.
+    """Run what the settings choose: the benchmark, `save`, `quality`, `store_cells` or `against`.
 
     Args:
         settings: The arguments of `xrgs-bench`.
@@ -73,6 +88,8 @@ def run(settings: Settings) -> str:
     if settings.repeats < 1 or settings.threads < 0:
         raise XrgsError("repeats must be at least 1 and threads at least 0")
     counts = sorted({1, settings.threads or usable_cores()})
+    if settings.against is not None:
+        return _against(settings.against, settings, counts)
     backends = ["native", "torch"] if resolve_backend("auto") == "native" else ["torch"]
     results: dict[str, Any] = {"machine": _machine(backends, counts)}
     if settings.load is not None:
@@ -89,7 +106,8 @@ def run(settings: Settings) -> str:
         results |= _time_loads(chosen, settings, counts, backends)
         results |= _time_training(sizes, settings, counts, backends)
         results["memory"] = [memory.measure(*sizes.memory, backends[0], counts[-1], settings.seed)]
-    results["peak_rss_bytes"] = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
+    _add_shares_of_peak(results)
+    results["peak_rss_bytes"] = peak_rss()
     _write(results, settings)
     return tables.text(results)
 
@@ -123,6 +141,25 @@ def _quality(settings: Settings) -> str:
     return tables.quality(rows)
 
 
+def _against(other: str, settings: Settings, counts: Sequence[int]) -> str:
+    sizes, seed = SMOKE if settings.smoke else FULL, settings.seed
+    if settings.load is None:
+        scene = loads.random_load(*sizes.scene, seed, _SCENE_SIZE_PER_SPACING)
+    else:
+        scene = loads.read(Path(settings.load))
+    step = loads.random_load(*sizes.step, seed)
+    views = (step, step.downscaled(_LR_FACTOR))
+    result = against.measure(other, scene, views, counts, settings.repeats)
+    try:
+        Path(settings.out).mkdir(parents=True, exist_ok=True)
+        _write_csv(Path(settings.out) / "against.csv", result["rows"])
+    except OSError as error:
+        raise XrgsError(f"{error.filename}: cannot be written: {error.strerror}") from error
+    if settings.json is not None:
+        _write_json(settings.json, {"against": result})
+    return tables.against(result, scene, step)
+
+
 def _machine(backends: Sequence[str], counts: Sequence[int]) -> dict[str, Any]:
     machine = provenance.collect(counts[-1], backends[0])
     if "native" in backends:
@@ -145,6 +182,16 @@ def _time_loads(
         timed = rendering.time_load(load, methods, counts, settings.repeats)
         rows += [row | {"error": error[row["method"]]} for row in timed]
     return {"rows": rows, "methods": [rendering.describe(method) for method in methods]}
+
+
+def _add_shares_of_peak(results: dict[str, Any]) -> None:
+    """Add `ideal_share`, and `multiply_share`, by stage to the rows of the native backend."""
+    peaks = results["machine"].get("multiply_adds_per_s", {})
+    for row in results["rows"]:
+        if row["stages_ms"]:
+            shares = instructions.shares_of_peak(row, peaks[str(row["threads"])])
+            row["ideal_share"] = {stage: share for stage, (share, _) in shares.items()}
+            row["multiply_share"] = {stage: share for stage, (_, share) in shares.items()}
 
 
 def _time_training(
@@ -176,35 +223,16 @@ def _time_shortcuts(load: Load, settings: Settings, backends: Sequence[str]) -> 
     }
 
 
-def fit_growth(rows: Sequence[Row], method: str, count: int) -> dict[str, float]:
-    """Fit how the forward and backward time grows with Gaussians and pixels.
-
-    Args:
-        rows: Rows of random loads, as `rendering.time_load` gives them.
-        method: Name of the method whose rows are used.
-        count: Number of threads of the rows that are used.
-
-    Returns:
-        The exponents `gaussians` and `pixels` of a power law, fitted by least squares to the
-        logarithms; 1 means that twice as many take twice as long. Empty unless the loads differ in
-        both.
-    """
-    used = [row for row in rows if row["method"] == method and row["threads"] == count]
-    numbers = np.array([(row["gaussians"], row["width"] * row["height"]) for row in used], float)
-    numbers = numbers.reshape(-1, 2)  # also if there are no rows
-    if len(np.unique(numbers[:, 0])) < 2 or len(np.unique(numbers[:, 1])) < 2:
-        return {}
-    times = np.array([row["forward_ms"] + row["backward_ms"] for row in used])
-    design = np.column_stack([np.log(numbers), np.ones(len(used))])
-    exponents = np.linalg.lstsq(design, np.log(times), rcond=None)[0]
-    return {"gaussians": float(exponents[0]), "pixels": float(exponents[1])}
-
-
 def _write(results: dict[str, Any], settings: Settings) -> None:
-    from xrgs.report.bench_plot import time_against_error
+    from xrgs.report.bench_plot import draw_panels
 
     rows = results["rows"]
-    results["growth"] = fit_growth(rows, rows[0]["method"], rows[0]["threads"])
+    usual = rows[0]["method"], rows[0]["threads"]
+    results["growth"] = growth.fit_growth(rows, *usual)
+    results["growth_lines"] = {
+        "gaussians": [line._asdict() for line in growth.growth_by_gaussians(rows, *usual)],
+        "pixels": [line._asdict() for line in growth.growth_by_pixels(rows, *usual)],
+    }
     flat = [tables.flat(row) for row in rows]
     shortcut_rows = [tables.flat_shortcut(row) for row in results["shortcuts"]["renders"]]
     folder = Path(settings.out)
@@ -212,8 +240,7 @@ def _write(results: dict[str, Any], settings: Settings) -> None:
         folder.mkdir(parents=True, exist_ok=True)
         _write_csv(folder / "bench.csv", flat)
         _write_csv(folder / "shortcuts.csv", shortcut_rows + results["shortcuts"]["steps"])
-        points = flat + tables.shortcut_points(results)
-        (folder / "bench.png").write_bytes(time_against_error(points))
+        (folder / "bench.png").write_bytes(draw_panels(panels.panels(results)))
     except OSError as error:
         raise XrgsError(f"{error.filename}: cannot be written: {error.strerror}") from error
     if settings.json is not None:

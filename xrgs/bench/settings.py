@@ -18,7 +18,7 @@ class Settings:
     view: str | None = None
     """Name of a training or test view of `cell`, for `save`."""
     out: str = "xrgs-bench"
-    """Folder for bench.csv, shortcuts.csv and bench.png."""
+    """Folder for bench.csv, shortcuts.csv and bench.png, or for against.csv."""
     json: str | None = None
     """File for all results as JSON."""
     repeats: int = 9
@@ -27,6 +27,8 @@ class Settings:
     """Number of threads to time besides 1; 0 means one for each core."""
     smoke: bool = False
     """Use tiny loads, to check that everything runs."""
+    against: str | None = None
+    """Instead, time this installation and another in turn: the Python executable of the other."""
     quality: bool = False
     """Train `cell` again with each approximation changed and compare PSNR, instead of timing."""
     steps: int = 600

@@ -3,7 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
+
+from xrgs.bench.against import HR_SHARE, SIDES
+from xrgs.bench.instructions import STAGES
+
+if TYPE_CHECKING:
+    from xrgs.bench.loads import Load
 
 Row = dict[str, Any]
 
@@ -12,7 +18,8 @@ def flat(row: Row) -> Row:
     """Flatten a row of `rendering.time_load` for a .csv: `stages_ms.sort` becomes `sort_ms`.
 
     Args:
-        row: The row, with dictionaries under `stages_ms` and `error`.
+        row: The row, with dictionaries under `stages_ms`, `error`, `ideal_share` and
+            `multiply_share`.
     """
     plain: Row = {}
     for key, value in row.items():
@@ -20,6 +27,8 @@ def flat(row: Row) -> Row:
             plain |= {f"{stage}_ms": ms for stage, ms in value.items()}
         elif key == "error":
             plain |= {f"{name}_error": error for name, error in value.items()}
+        elif key in {"ideal_share", "multiply_share"}:
+            plain |= {f"{stage}_{key}": share for stage, share in value.items()}
         else:
             plain[key] = value
     return plain
@@ -40,25 +49,6 @@ def flat_shortcut(row: Row) -> Row:
     return plain
 
 
-def shortcut_points(results: Row) -> list[Row]:
-    """Return the rows of the plot for each shortcut switched off.
-
-    Args:
-        results: All results of the benchmark.
-    """
-    return [
-        {
-            "method": f"{row['backend']} without shortcut: {row['shortcut']}",
-            "threads": row["threads"],
-            "gaussians": row["gaussians"],
-            "forward_ms": row["off"]["forward_ms"],
-            "backward_ms": row["off"]["backward_ms"],
-            "image_mean_error": row["off"]["image_mean"],
-        }
-        for row in results["shortcuts"]["renders"]
-    ]
-
-
 def text(results: Row) -> str:
     """Format all tables.
 
@@ -66,12 +56,10 @@ def text(results: Row) -> str:
         results: All results of the benchmark.
     """
     parts = [_machine(results["machine"]), _renders(results), _stages(results["rows"])]
+    if any("ideal_share" in row for row in results["rows"]):
+        parts += [_shares(results["rows"]), _ideal_instructions()]
     if results.get("growth"):
-        method, growth = results["rows"][0]["method"], results["growth"]
-        parts.append(
-            f"time grows with Gaussians^{growth['gaussians']:.2f} and pixels^{growth['pixels']:.2f}"
-            f" ({method}, one thread)"
-        )
+        parts.append(_growth(results))
     if "views" in results:
         parts += [_views(results["views"]), _kinds("loss, value and gradient", results["losses"])]
         parts += [_kinds("LR view upsampled, value and gradient", results["resizes"])]
@@ -96,38 +84,43 @@ def _machine(machine: Row) -> str:
 
 
 def _renders(results: Row) -> str:
-    peaks = results["machine"].get("multiply_adds_per_s", {})
-    lines = []
-    for row in results["rows"]:
-        peak = peaks.get(str(row["threads"]))
-        share = peak / row["evaluations_per_s"] if peak and row["backend"] == "native" else None
-        lines.append(
-            [
-                row["method"],
-                str(row["threads"]),
-                str(row["gaussians"]),
-                f"{row['width']}x{row['height']}",
-                f"{row['forward_ms']:.1f}",
-                f"{row['backward_ms']:.1f}",
-                f"{row['evaluations'] / 1e6:.1f}",
-                f"{row['evaluations_per_s'] / 1e9:.3f}",
-                "" if share is None else f"{share:.0f}",
-                f"{row['memory_bytes'] / 2**20:.0f}",
-                f"{row['error']['image_mean']:.1e}",
-                f"{row['error']['image_max']:.1e}",
-                f"{row['error']['gradient']:.1e}",
-                f"{row['times_slower']:.0f}x" if "times_slower" in row else "",
-            ]
-        )
-    head = "method|threads|Gaussians|size|forward ms|backward ms|M alphas|G alphas/s|FMA/alpha|MB"
+    one = {_load_of(row): _total_ms(row) for row in results["rows"] if row["threads"] == 1}
+    lines = [
+        [
+            row["method"],
+            str(row["threads"]),
+            str(row["gaussians"]),
+            f"{row['width']}x{row['height']}",
+            f"{row['forward_ms']:.1f}",
+            f"{row['backward_ms']:.1f}",
+            f"{row['evaluations'] / 1e6:.1f}",
+            f"{row['evaluations_per_s'] / 1e9:.3f}",
+            f"{one[_load_of(row)] / _total_ms(row):.2f}x",
+            f"{row['memory_bytes'] / 2**20:.0f}",
+            f"{row['error']['image_mean']:.1e}",
+            f"{row['error']['image_max']:.1e}",
+            f"{row['error']['gradient']:.1e}",
+            f"{row['times_slower']:.0f}x" if "times_slower" in row else "",
+        ]
+        for row in results["rows"]
+    ]
+    head = "method|threads|Gaussians|size|forward ms|backward ms|M alphas|G alphas/s|speed-up|MB"
     head += "|mean error|max error|gradient error|slower"
     note = (
         "Times are minima over the repeats. alphas/s: alpha evaluations while compositing;\n"
-        "FMA/alpha: fused multiply-adds at the measured peak in the time of one evaluation;\n"
+        "speed-up: over one thread (goal on two: 1.9x);\n"
         "MB: parameters, gradients and buffers; errors: against torch in float64, over the\n"
         "middle of the view; slower: time over that of native, timed in turn"
     )
     return f"{_table(head.split('|'), lines)}\n{note}"
+
+
+def _load_of(row: Row) -> tuple[object, ...]:
+    return tuple(row[key] for key in ("method", "load", "gaussians", "width", "height"))
+
+
+def _total_ms(row: Row) -> float:
+    return float(row["forward_ms"] + row["backward_ms"])
 
 
 def _stages(rows: Sequence[Row]) -> str:
@@ -141,6 +134,47 @@ def _stages(rows: Sequence[Row]) -> str:
         for row in timed
     ]
     return _table(["threads", "Gaussians", "size", *(f"{name} ms" for name in names)], lines)
+
+
+def _shares(rows: Sequence[Row]) -> str:
+    timed = [row for row in rows if "ideal_share" in row and row["method"] == row["backend"]]
+    names = list(timed[0]["ideal_share"])
+    lines = []
+    for row in timed:
+        cells = [str(row["threads"]), str(row["gaussians"]), f"{row['width']}x{row['height']}"]
+        for name in names:
+            shares = (row["ideal_share"][name], row["multiply_share"][name])
+            cells.append(" / ".join(f"{100 * share:.0f}" for share in shares))
+        lines.append(cells)
+    note = (
+        "Percentages of a stage's time that its ideal vector instructions take at the measured\n"
+        "peak of multiply-adds, one in the place of each: all of them / those that multiply.\n"
+        "All of them is what a processor with no other vector units needs at least; one with\n"
+        "others can pass 100. Goal of both composite stages: 60"
+    )
+    head = ["threads", "Gaussians", "size", *(f"{name} %" for name in names)]
+    return f"{_table(head, lines)}\n{note}"
+
+
+def _ideal_instructions() -> str:
+    lines = []
+    for stage, works in STAGES.items():
+        for work in works:
+            counts = (work.instructions.total, work.instructions.multiply)
+            lines.append([stage, f"{work.per} {work.unit}", *map(str, counts), work.source])
+    return _table(["ideal vector instructions", "of", "all", "multiply", "source"], lines)
+
+
+def _growth(results: Row) -> str:
+    method, growth = results["rows"][0]["method"], results["growth"]
+    lines = []
+    for what, other in (("gaussians", "pixels"), ("pixels", "Gaussians")):
+        for line in results["growth_lines"][what]:
+            span = f"{line['sizes'][0]} to {line['sizes'][-1]}"
+            lines.append([what, span, f"{line['fixed']} {other}", f"{line['exponent']:.2f}"])
+        lines.append([what, "all loads", "", f"{growth[what]:.2f}"])
+    table = _table(["time grows with", "from", "at", "exponent"], lines)
+    return f"{table}\n{method}, one thread; 1 means that twice as many take twice as long"
 
 
 def _views(rows: Sequence[Row]) -> str:
@@ -164,14 +198,15 @@ def _kinds(title: str, rows: Sequence[Row]) -> str:
 
 def _steps(rows: Sequence[Row]) -> str:
     names = list(rows[0]["parts_ms"])
+    one = {row["view"]: row["step_ms"] for row in rows if row["threads"] == 1}
     lines = [
         [row["view"], str(row["threads"]), str(row["gaussians"]), f"{row['width']}x{row['height']}"]
         + [f"{row['parts_ms'][name]:.2f}" for name in names]
-        + [f"{row['step_ms']:.2f}"]
+        + [f"{row['step_ms']:.2f}", f"{one[row['view']] / row['step_ms']:.2f}x"]
         for row in rows
     ]
-    table = _table(["step", "threads", "Gaussians", "size", *names, "all ms"], lines)
-    return "\n".join([table, *_lr_shares(rows)])
+    head = ["step", "threads", "Gaussians", "size", *names, "all ms", "speed-up"]
+    return "\n".join([_table(head, lines), *_lr_shares(rows)])
 
 
 def _lr_shares(rows: Sequence[Row]) -> list[str]:
@@ -228,6 +263,36 @@ def _memory(rows: Sequence[Row]) -> str:
         "(goal: 300,000 Gaussians at 1008x756 below 1000 MB)"
     )
     return f"{_table(head.split('|'), lines)}\n{note}"
+
+
+def against(result: Row, scene: Load, step: Load) -> str:
+    """Format the table of `xrgs.bench.against`.
+
+    Args:
+        result: What `against.measure` returned.
+        scene: The load that was rendered.
+        step: The HR load that was trained.
+    """
+    lines = []
+    for row in result["rows"]:
+        times = [f"{row['this_ms']:.2f}", f"{row['other_ms']:.2f}", f"{row['times_faster']:.2f}x"]
+        spread = f"{row['times_faster_low']:.2f} to {row['times_faster_high']:.2f}"
+        speedups = [f"{row['this_speedup']:.2f}x", f"{row['other_speedup']:.2f}x"]
+        lines.append([row["task"], str(row["threads"]), *times, spread, *speedups])
+    head = "task|threads|this ms|other ms|times faster|quartiles|this speed-up|other's"
+    sides = [f"{side}: {result[side]['package']}, {result[side]['isa']}" for side in SIDES]
+    note = (
+        "Medians; the other's time over this one's, repetition by repetition, and its quartiles;\n"
+        "speed-up: over one thread (goal on two: 1.9x).\n"
+        f"render: forward and backward, {_describe_load(scene)};\n"
+        f"steps: every part of a training step, {_describe_load(step)};\n"
+        f"mean: {HR_SHARE:.0%} HR steps, the others LR"
+    )
+    return "\n".join([*sides, _table(head.split("|"), lines), note])
+
+
+def _describe_load(load: Load) -> str:
+    return f"{len(load)} Gaussians at {load.camera.width}x{load.camera.height}"
 
 
 def quality(rows: Sequence[Row]) -> str:

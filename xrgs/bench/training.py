@@ -232,7 +232,7 @@ class TrainingStep:
             self.optimizer.zero_grad()
             self.offset = torch.zeros(len(self.gaussians), 2, requires_grad=True)
             self.rendered = rasterize_parameters(
-                *self.gaussians.activated(),
+                *self.gaussians.activated(backend=self.backend),
                 self.camera,
                 RasterSettings(),
                 sh_degree=self.sh_degree,

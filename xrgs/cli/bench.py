@@ -20,10 +20,12 @@ With store_cells=N it measures planning, reporting and the cost of a job over a 
   threads=0        number of threads to measure beside 1; 0 for every core
   seed=0           seed of the random loads
   smoke=true       use tiny loads, to see whether everything runs
-  out=FOLDER       folder of bench.csv and bench.png; xrgs-bench by default
+  out=FOLDER       folder of the .csv files and bench.png; xrgs-bench by default
   json=FILE        also write every figure to a JSON file
 
   load=FILE.npz    measure this load instead of the random ones
+  against=PYTHON   render and train with this installation and another in turn, the one of the
+                   environment of that Python executable; into against.csv
   save=FILE.npz cell=FOLDER view=NAME
                    make such a load from a view of a trained cell, and measure nothing
   quality=true cell=FOLDER steps=600

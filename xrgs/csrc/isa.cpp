@@ -1,5 +1,9 @@
 #include "isa.h"
 
+#ifdef XRGS_X86
+#include <cpuid.h>
+#endif
+
 #include <atomic>
 #include <cstdlib>
 #include <stdexcept>
@@ -9,16 +13,38 @@ namespace {
 
 constexpr const char* kNames[] = {"portable", "avx2", "avx512"};
 
+#ifdef XRGS_X86
+// The instructions that the processor has and that the operating system saves the registers of.
+// They are read from the processor, because __builtin_cpu_supports asks the compiler's runtime
+// library, and that of Zig says no to everything.
+struct Processor {
+  bool avx2 = false;
+  bool avx512 = false;
+};
+
+bool all(unsigned features, unsigned wanted) { return (features & wanted) == wanted; }
+
+Processor read_processor() {
+  unsigned eax = 0, ebx = 0, ecx = 0, edx = 0;
+  constexpr unsigned kLeaf1 = bit_OSXSAVE | bit_AVX | bit_FMA | bit_POPCNT;
+  if (__get_cpuid(1, &eax, &ebx, &ecx, &edx) == 0 || !all(ecx, kLeaf1)) return {};
+  if (__get_cpuid_count(7, 0, &eax, &ebx, &ecx, &edx) == 0) return {};
+  unsigned saved = 0, high = 0;
+  asm("xgetbv" : "=a"(saved), "=d"(high) : "c"(0));
+  constexpr unsigned kYmm = 0x6, kZmm = 0xe6;  // bits of XCR0: SSE and AVX; opmask and ZMM as well
+  Processor processor;
+  processor.avx2 = all(saved, kYmm) && all(ebx, bit_AVX2 | bit_BMI | bit_BMI2);
+  processor.avx512 = processor.avx2 && all(saved, kZmm) &&
+                     all(ebx, bit_AVX512F | bit_AVX512DQ | bit_AVX512BW | bit_AVX512VL);
+  return processor;
+}
+#endif
+
 bool supported(Isa isa) {
 #ifdef XRGS_X86
-  // The builtins also check that the operating system saves the wide registers.
-  if (isa == Isa::avx512)
-    return __builtin_cpu_supports("avx512f") && __builtin_cpu_supports("avx512dq") &&
-           __builtin_cpu_supports("avx512bw") && __builtin_cpu_supports("avx512vl") &&
-           __builtin_cpu_supports("bmi2");
-  if (isa == Isa::avx2)
-    return __builtin_cpu_supports("avx2") && __builtin_cpu_supports("fma") &&
-           __builtin_cpu_supports("bmi2");
+  static const Processor processor = read_processor();
+  if (isa == Isa::avx512) return processor.avx512;
+  if (isa == Isa::avx2) return processor.avx2;
 #endif
   return isa == Isa::portable;
 }

@@ -2,8 +2,15 @@
 
 #include <cstdlib>
 
+#ifdef XRGS_FAULT_INJECTION
+#include <atomic>
+#include <new>
+#endif
+
 #if defined(__linux__)
 #include <sys/mman.h>
+#elif defined(_WIN32)
+#include <malloc.h>
 #endif
 
 namespace xrgs {
@@ -12,9 +19,32 @@ namespace {
 constexpr std::size_t kLine = 64;
 [[maybe_unused]] constexpr std::size_t kHugePage = std::size_t{2} << 20;
 
+#ifdef XRGS_FAULT_INJECTION
+std::atomic<std::int64_t> allocations_left{0};  // until the one that fails, with it
+std::atomic<bool> has_failed{false};
+
+bool must_fail() noexcept {
+  if (allocations_left.load() <= 0 || allocations_left.fetch_sub(1) != 1) return false;
+  has_failed = true;
+  return true;
+}
+#endif
+
 }  // namespace
 
+#ifdef XRGS_FAULT_INJECTION
+void fail_allocation(std::int64_t number) noexcept {
+  has_failed = false;
+  allocations_left = number;
+}
+
+bool allocation_failed() noexcept { return has_failed; }
+#endif
+
 void* allocate(std::size_t bytes) noexcept {
+#ifdef XRGS_FAULT_INJECTION
+  if (must_fail()) return nullptr;
+#endif
 #if defined(__linux__) && defined(MADV_HUGEPAGE) && !defined(__SANITIZE_ADDRESS__)
   if (bytes >= 2 * kHugePage) {
     const std::size_t size = (bytes + kHugePage - 1) / kHugePage * kHugePage;
@@ -24,7 +54,35 @@ void* allocate(std::size_t bytes) noexcept {
     return block;
   }
 #endif
-  return std::aligned_alloc(kLine, (bytes + kLine - 1) / kLine * kLine);
+  const std::size_t size = (bytes + kLine - 1) / kLine * kLine;
+#if defined(_WIN32)
+  return _aligned_malloc(size, kLine);
+#else
+  return std::aligned_alloc(kLine, size);
+#endif
+}
+
+void deallocate(void* block) noexcept {
+#if defined(_WIN32)
+  _aligned_free(block);
+#else
+  std::free(block);
+#endif
 }
 
 }  // namespace xrgs
+
+#ifdef XRGS_FAULT_INJECTION
+// The linker is told (--wrap) to call the first of these where the module's code says operator new,
+// which is the second: a module cannot replace operator new for itself alone. _Znwm is the name of
+// operator new(unsigned long).
+extern "C" {
+void* __real__Znwm(std::size_t bytes);
+void* __wrap__Znwm(std::size_t bytes);
+}
+
+void* __wrap__Znwm(std::size_t bytes) {
+  if (xrgs::must_fail()) throw std::bad_alloc();
+  return __real__Znwm(bytes);
+}
+#endif

@@ -4,13 +4,16 @@
 #include <nanobind/stl/string.h>
 #include <nanobind/stl/vector.h>
 
+#include "activations/bind.h"
 #include "bench/bind.h"
 #include "densify/bind.h"
 #include "isa.h"
 #include "loss/bind.h"
+#include "memory.h"
 #include "optim/bind.h"
 #include "output_arrays.h"
 #include "raster/bind.h"
+#include "raster/frame.h"
 #include "resample/bind.h"
 #include "simd/array_math.h"
 
@@ -45,10 +48,25 @@ NB_MODULE(_native, m) {
         "Use another instruction set from now on, in the whole process.");
   m.def("available_isas", &available_isas,
         "Return the instruction sets that this machine has, narrowest first.");
-  m.def("exp2", &exp2_array, nb::arg("x"),
+  m.def(
+      "fused_multiply_add", [] { return XRGS_SELECT(array_math_kernels).fused_multiply_add; },
+      "Return whether the instruction set in use has a fused multiply-add: all that have one give "
+      "the same bits.");
+  m.def("exp2", &exp2_array, nb::arg("x").noconvert(),
         "Return 2^x as the kernels compute it, float32 [N], for -126 <= x <= 127.");
-  m.def("log2", &log2_array, nb::arg("x"),
+  m.def("log2", &log2_array, nb::arg("x").noconvert(),
         "Return the base-2 logarithm as the kernels compute it, float32 [N], for x >= 2^-126.");
+  m.def("unused_bytes", &unused_bytes,
+        "Return the bytes of released tensors that are kept for the next ones.");
+#ifdef XRGS_FAULT_INJECTION
+  m.def("fail_allocation", &fail_allocation, nb::arg("number"),
+        "Make the number-th allocation of this module from now on fail; 0 stands for none.");
+  m.def("allocation_failed", &allocation_failed,
+        "Return whether the allocation that was to fail was reached.");
+  m.def("delete_unused_frames", &delete_unused_frames,
+        "Free the frames and workspaces that wait to be used again.");
+#endif
+  bind_activations(m);
   bind_densify(m);
   bind_raster(m);
   bind_loss(m);

@@ -1,13 +1,10 @@
-// Blocks that are not in use are kept in one list for each size class, at most kMaxCachedBytes in
-// all.
+// Blocks that are not in use are kept in one list, the last released first: some tens of blocks,
+// which are searched in well under a microsecond. The blocks are the list's elements, so that a
+// release needs no memory and cannot fail.
 #include "output_arrays.h"
 
-#include <cstdlib>
-#include <map>
 #include <mutex>
 #include <new>
-#include <unordered_map>
-#include <vector>
 
 #include "memory.h"
 
@@ -16,20 +13,39 @@ namespace {
 
 constexpr std::size_t kAlignment = 64;
 
-#ifdef __SANITIZE_ADDRESS__
-// Every block is new and has the exact size, so that the sanitizer sees a step past its end.
-constexpr std::size_t kMaxCachedBytes = 0;
+#ifdef XRGS_FAULT_INJECTION
+// Every block is new, so that its allocation can fail, and has the exact size, so that a sanitizer
+// sees a step past its end.
+constexpr std::size_t kMaxUnusedBytes = 0;
 constexpr bool kExactSizes = true;
 #else
-constexpr std::size_t kMaxCachedBytes = std::size_t{1} << 30;
+constexpr std::size_t kMaxUnusedBytes = std::size_t{1} << 30;
 constexpr bool kExactSizes = false;
 #endif
 
+// A block that was in none of this many acquisitions is of a size that is no longer wanted: about
+// twenty steps of training, in which views of every size come again.
+constexpr std::uint64_t kMaxIdleAcquisitions = 256;
+
 struct BlockCache {
   std::mutex mutex;
-  std::unordered_map<void*, std::size_t> in_use;  // the size class of each block
-  std::map<std::size_t, std::vector<void*>> unused;
+  Block* unused = nullptr;
   std::size_t unused_bytes = 0;
+  std::uint64_t acquisitions = 0;
+
+  // Takes the block that `link` points to out of the list.
+  Block* take(Block** link) noexcept {
+    Block* block = *link;
+    *link = block->next;
+    unused_bytes -= block->size;
+    return block;
+  }
+  // Takes a block of exactly `size` bytes, or returns null.
+  Block* take_size(std::size_t size) noexcept {
+    Block** link = &unused;
+    while (*link != nullptr && (*link)->size != size) link = &(*link)->next;
+    return *link == nullptr ? nullptr : take(link);
+  }
 };
 
 // The cache is never destroyed, because tensors may outlive every static when the interpreter
@@ -47,39 +63,61 @@ std::size_t size_class(std::size_t bytes) {
   return size;
 }
 
+void delete_block(Block* block) noexcept {
+  deallocate(block->data);
+  delete block;
+}
+
+Block* new_block(std::size_t size) {
+  auto block = std::make_unique<Block>();
+  block->data = allocate(size);
+  if (block->data == nullptr) throw std::bad_alloc();
+  block->size = size;
+  return block.release();
+}
+
+// Deletes the blocks of sizes that are no longer wanted. Only where a new block is needed does the
+// memory grow, so only then is this called: as long as sizes stay the same, all blocks are kept.
+void delete_idle_blocks(BlockCache& cache) {
+  for (Block** link = &cache.unused; *link != nullptr;)
+    if (cache.acquisitions - (*link)->last_used > kMaxIdleAcquisitions)
+      delete_block(cache.take(link));
+    else
+      link = &(*link)->next;
+}
+
 }  // namespace
 
-void* acquire_block(std::size_t bytes) {
+OwnedBlock acquire_block(std::size_t bytes) {
   const std::size_t size = size_class(bytes);
   BlockCache& cache = block_cache();
   std::lock_guard<std::mutex> lock(cache.mutex);
-  void* block = nullptr;
-  auto blocks = cache.unused.find(size);
-  if (blocks != cache.unused.end() && !blocks->second.empty()) {
-    block = blocks->second.back();
-    blocks->second.pop_back();
-    cache.unused_bytes -= size;
-  } else {
-    block = allocate(size);
-    if (block == nullptr) throw std::bad_alloc();
+  ++cache.acquisitions;
+  Block* block = cache.take_size(size);
+  if (block == nullptr) {
+    delete_idle_blocks(cache);
+    block = new_block(size);
   }
-  cache.in_use.emplace(block, size);
-  return block;
+  block->last_used = cache.acquisitions;
+  return OwnedBlock(block);
 }
 
-void release_block(void* block) noexcept {
+void release_block(Block* block) noexcept {
   BlockCache& cache = block_cache();
   std::lock_guard<std::mutex> lock(cache.mutex);
-  auto entry = cache.in_use.find(block);
-  if (entry == cache.in_use.end()) return;
-  const std::size_t size = entry->second;
-  cache.in_use.erase(entry);
-  if (cache.unused_bytes + size > kMaxCachedBytes) {
-    std::free(block);
+  if (cache.unused_bytes + block->size > kMaxUnusedBytes) {
+    delete_block(block);
     return;
   }
-  cache.unused[size].push_back(block);
-  cache.unused_bytes += size;
+  block->next = cache.unused;
+  cache.unused = block;
+  cache.unused_bytes += block->size;
+}
+
+std::size_t unused_bytes() {
+  BlockCache& cache = block_cache();
+  std::lock_guard<std::mutex> lock(cache.mutex);
+  return cache.unused_bytes;
 }
 
 }  // namespace xrgs

@@ -4,17 +4,21 @@
 // a tenth of a millisecond: a thread that waits spins for a moment before it sleeps.
 //
 // The pool is never destroyed: threads that sleep at exit end with the process. A forked child has
-// none of its parent's threads and starts a new pool.
+// none of its parent's threads and starts a new pool, in the same place, so that nothing here needs
+// memory that could be missing.
 #include "thread_pool.h"
-
-#include <pthread.h>
 
 #include <atomic>
 #include <chrono>
 #include <condition_variable>
 #include <mutex>
+#include <new>
 #include <system_error>
 #include <thread>
+
+#if !defined(_WIN32)  // whose processes do not fork
+#include <pthread.h>
+#endif
 
 namespace xrgs {
 namespace {
@@ -55,6 +59,8 @@ class ThreadPool {
       for (; started_ < count; ++started_) std::thread([this] { worker_loop(); }).detach();
     } catch (const std::system_error&) {
       // With fewer threads than requested the job takes longer, but it is done.
+    } catch (const std::bad_alloc&) {
+      // The same: there is no memory for another thread.
     }
   }
 
@@ -68,8 +74,11 @@ class ThreadPool {
   }
 
   static void pause() {
-#ifdef XRGS_X86
+#if defined(__x86_64__)
     __builtin_ia32_pause();
+#elif defined(__aarch64__)
+    // "yield" does nothing on most processors; "isb" waits about as long as x86's "pause".
+    asm volatile("isb" ::: "memory");
 #endif
   }
 
@@ -112,11 +121,22 @@ class ThreadPool {
   int started_ = 0;
 };
 
-ThreadPool* pool = nullptr;
-std::once_flag at_fork;
+alignas(ThreadPool) unsigned char pool_memory[sizeof(ThreadPool)];
 
+ThreadPool* new_pool() { return new (pool_memory) ThreadPool; }
+
+#if !defined(_WIN32)
 // A forked child has one thread only, so nothing races with this.
-void replace_pool_in_child() { pool = new ThreadPool; }
+void replace_pool_in_child() { new_pool(); }
+#endif
+
+// This runs when the module is loaded, before there is a second thread that could use the pool.
+ThreadPool* const pool = [] {
+#if !defined(_WIN32)
+  pthread_atfork(nullptr, nullptr, replace_pool_in_child);
+#endif
+  return new_pool();
+}();
 
 }  // namespace
 
@@ -125,10 +145,6 @@ void run_tasks(int threads, std::int64_t count, Task task, void* context) {
     for (std::int64_t i = 0; i < count; ++i) task(context, i);
     return;
   }
-  std::call_once(at_fork, [] {
-    pool = new ThreadPool;
-    pthread_atfork(nullptr, nullptr, replace_pool_in_child);
-  });
   pool->run_job(threads, count, task, context);
 }
 

@@ -55,7 +55,7 @@ def score_views(
     with torch.no_grad():
         for view in progress(views, "evaluating", "view"):
             render = rasterize_parameters(
-                *gaussians.activated(),
+                *gaussians.activated(backend=backend),
                 view.camera,
                 conf.raster,
                 sh_degree=conf.raster.sh_degree,

@@ -5,7 +5,6 @@ from __future__ import annotations
 import csv
 import io
 import logging
-import resource
 import traceback
 from typing import TYPE_CHECKING, Any
 
@@ -13,7 +12,7 @@ from xrgs.capture import dataset
 from xrgs.evaluation import protocol
 from xrgs.experiment import provenance
 from xrgs.runtime import progress
-from xrgs.runtime.machine import set_torch_threads
+from xrgs.runtime.machine import peak_rss, set_torch_threads
 from xrgs.safeio.atomic import write_json, write_text
 from xrgs.safeio.hashing import digest
 from xrgs.splat.backend import resolve_backend
@@ -60,9 +59,7 @@ def _train_and_score(conf: Conf, variant: Variant, folder: CellFolder) -> list[s
     write_json(folder.path / "provenance.json", provenance.collect(threads, backend))
     data = dataset.load(variant, conf.train.views)
     trained = _train_or_resume(data, conf, folder)
-    peak_rss_bytes = (
-        _peak_rss_bytes()
-    )  # read before evaluation, which may load the network of LPIPS
+    peak_rss_bytes = peak_rss()  # read before evaluation, which may load the network of LPIPS
     save_ply(folder.path / "splats.ply", trained.gaussians)
     write_text(folder.path / "history.csv", _csv(trained.history))
     scores = protocol.score_views(trained.gaussians, data.test, conf.splat, folder.path / "renders")
@@ -94,10 +91,6 @@ def _train_or_resume(data: Dataset, conf: Conf, folder: CellFolder) -> TrainingR
         _log.warning("training starts over: %s", error)
         checkpoint.set_aside()
     return train_cell(data, conf, checkpoint)
-
-
-def _peak_rss_bytes() -> int:
-    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
 
 
 def _csv(rows: Sequence[Mapping[str, Any]]) -> str:

@@ -1,7 +1,10 @@
 """The identity of a cell: every value that can change one of its numbers, and nothing else.
 
 Paths, thread counts, logging and labels are not part of it, so a finished cell is found again under
-another label, in another folder or on another machine.
+another label, in another folder or on another machine. Of a machine it has the arithmetic
+(`xrgs.splat.backend.arithmetic`): the native backend gives the same bits on all machines of the
+same arithmetic. The last digits of the torch backend differ among machines, and this is not part of
+it.
 """
 
 from __future__ import annotations
@@ -11,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 from xrgs.evaluation.protocol import PROTOCOL_VERSION
 from xrgs.safeio.hashing import source_digests, to_plain
-from xrgs.splat.backend import resolve_backend
+from xrgs.splat.backend import arithmetic, resolve_backend
 from xrgs.training import plugins
 
 if TYPE_CHECKING:
@@ -90,6 +93,9 @@ def cell_identity(conf: Conf, variant_id: str) -> dict[str, Any]:
 
     Returns:
         The identity. Its digest is the cell's id.
+
+    Raises:
+        XrgsError: The backend that is configured is not available on this machine.
     """
     backend = resolve_backend(conf.splat.backend)
     return {
@@ -99,5 +105,6 @@ def cell_identity(conf: Conf, variant_id: str) -> dict[str, Any]:
         "seed": conf.seed,
         "variant": variant_id,
         "protocol": PROTOCOL_VERSION,
+        "arithmetic": arithmetic(backend),
         "code": training_code(backend, tuple(sorted(conf.components.plugins))),
     }

@@ -14,6 +14,7 @@ from typing import Any
 import xrgs
 from xrgs.evaluation.lpips import weights
 from xrgs.runtime.machine import usable_cores
+from xrgs.splat.backend import arithmetic
 
 _PACKAGES = ("torch", "numpy", "pycolmap", "kornia", "scikit-image", "hydra-core", "pandas")
 
@@ -55,6 +56,7 @@ def collect(threads: int, backend: str) -> dict[str, Any]:
     Raises:
         WeightsError: The weights of LPIPS on this machine are not the published ones. A cell that
             can't be scored is better stopped here than after its training.
+        XrgsError: The backend is not available on this machine.
     """
     diff = _git("diff", "HEAD", "--", ".")
     return {
@@ -68,6 +70,7 @@ def collect(threads: int, backend: str) -> dict[str, Any]:
         "cores": usable_cores(),
         "threads": threads,
         "backend": backend,
+        "arithmetic": arithmetic(backend),
         "instruction_set": _instruction_set(backend),
         "lpips_weights_sha256": None
         if weights.load_published() is None

@@ -36,6 +36,7 @@ _PROVENANCE_KEYS = (
     "python",
     "packages.torch",
     "platform",
+    "arithmetic",
     *_MACHINE_KEYS,
 )
 
@@ -191,10 +192,18 @@ def _provenance_table(sweep: Sweep) -> TextTable:
 
 
 def _warnings(sweep: Sweep) -> list[str]:
+    warnings = []
     mixed = [key for key in _MACHINE_KEYS if len(sweep.provenance.get(key, ())) > 1]
-    if not mixed:
-        return []
-    return [f"The cells differ in {', '.join(mixed)}: their training times do not compare."]
+    if mixed:
+        differing = ", ".join(mixed)
+        warnings.append(f"The cells differ in {differing}: their training times do not compare.")
+    arithmetics = sweep.provenance.get("arithmetic", ())
+    if len(arithmetics) > 1:
+        warnings.append(
+            f"The cells were trained with different arithmetic ({', '.join(arithmetics)}): beside"
+            " what is compared, they differ as cells of different seeds do."
+        )
+    return warnings
 
 
 def _text(tables: Tables, warnings: list[str]) -> str:

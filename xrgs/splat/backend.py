@@ -19,7 +19,7 @@ NATIVE_MODULE = "xrgs._native"
 CHOICES = ("auto", "native", "torch")
 REQUIRE_NATIVE = "XRGS_REQUIRE_NATIVE"
 
-Operation = Literal["densify", "loss", "optimizer", "rasterizer", "resample"]
+Operation = Literal["activations", "densify", "loss", "optimizer", "rasterizer", "resample"]
 """The name of a module that both `xrgs/splat/torch/` and `xrgs/splat/native/` have."""
 
 
@@ -69,6 +69,35 @@ def implementation(operation: Operation, backend: str) -> ModuleType:
         XrgsError: The native backend is configured or required, and was not built.
     """
     return importlib.import_module(f"xrgs.splat.{resolve_backend(backend)}.{operation}")
+
+
+def arithmetic(backend: str) -> str:
+    """Return what decides the last bits of a backend's results, beside its source code.
+
+    All instruction sets with a fused multiply-add, which rounds a product and a sum once, give the
+    same bits in the native kernels. Those without one round twice and give others.
+
+    Args:
+        backend: `native` or `torch`.
+
+    Returns:
+        `fma` or `no-fma` for the instruction set that the native kernels use in this process;
+        `torch` for torch, which chooses its own for each operation, and whose last bits differ from
+        processor to processor and with the number of threads.
+
+    Raises:
+        XrgsError: The backend is native and its module can't be loaded on this machine.
+    """
+    if backend == "torch":
+        return "torch"
+    try:
+        native = importlib.import_module(NATIVE_MODULE)
+    except ImportError as error:
+        raise XrgsError(
+            f"splat.backend={backend}: {NATIVE_MODULE} can't be loaded ({error}); install xrgs"
+            " again on this machine, or use splat.backend=torch"
+        ) from error
+    return "fma" if native.fused_multiply_add() else "no-fma"
 
 
 @functools.cache

@@ -57,7 +57,27 @@ class Camera:
     @property
     def position(self) -> Tensor:
         """The camera's centre [3], world units."""
-        return -self.viewmat[:3, :3].T @ self.viewmat[:3, 3]  # [3]
+        # Written out, since the order in which torch's products add depends on the processor.
+        first, second, third = (row[:3] * row[3] for row in self.viewmat[:3])
+        position: Tensor = -(first + second + third)  # [3]
+        return position
+
+    def to_camera(self, points: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Transform points from the world to the camera.
+
+        Args:
+            points: [P, 3] world units, float32 or float64.
+
+        Returns:
+            x, y and z [P] each in camera coordinates, world units, of the points' type. z is the
+            depth.
+        """
+        x, y, z = points.unbind(-1)
+        # Written out, as in `position`.
+        first, second, third = (
+            row[0] * x + row[1] * y + row[2] * z + row[3] for row in self.viewmat[:3].to(points)
+        )
+        return first, second, third
 
     @classmethod
     def look_at(

@@ -6,7 +6,10 @@ the results are the same.
 
 One thing is as gsplat intends it and not as its release 1.5.3 does it. There the opacity reset
 never happens, since `step % reset_every == 0 & step > 0` compares with `0 & step` (its pull request
-776 mends it).
+776 mends it). And the random numbers of a split are drawn in double: those that torch draws in
+float32 depend on the processor.
+
+On the native backend, nothing here depends on the number of threads or on the processor.
 """
 
 from __future__ import annotations
@@ -14,6 +17,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
+from types import ModuleType
 from typing import Any
 
 import torch
@@ -302,13 +306,16 @@ class Densifier:
         gsplat's `split` (`strategy/ops.py`).
         """
         old = {name: self.gaussians[name][mask] for name in PARAMETERS}  # [M, ...]
-        scales = old["scales"].exp()  # [M, 3]
-        noise = torch.randn(2, len(scales), 3, generator=self.generator, dtype=scales.dtype)
-        rotation = rotation_matrices(old["quats"])  # [M, 3, 3]
-        offsets = torch.einsum("nij,nj,bnj->bni", rotation, scales, noise)  # [2, M, 3]
+        scales = self._activations.exp(old["scales"])  # [M, 3]
+        # In double, since the numbers that torch draws in float32 depend on the processor.
+        noise = torch.randn(2, len(scales), 3, generator=self.generator, dtype=torch.float64)
+        along_axes = (noise.to(scales) * scales)[..., None, :]  # [2, M, 1, 3]
+        # [2, M, 3] each; added one by one, in an order that does not depend on the processor.
+        first, second, third = (rotation_matrices(old["quats"]) * along_axes).unbind(-1)
+        offsets = first + second + third
         halves = {name: torch.cat([value, value]) for name, value in old.items()}
         halves["means"] = (old["means"] + offsets).reshape(-1, 3)
-        halves["scales"] = (scales / SPLIT_SHRINK).log().repeat(2, 1)
+        halves["scales"] = (old["scales"] - math.log(SPLIT_SHRINK)).repeat(2, 1)
         return halves
 
     def _prune(
@@ -324,7 +331,9 @@ class Densifier:
         Returns:
             Counts, and how many Gaussians each of the G thresholds removed.
         """
-        low_opacity = torch.sigmoid(self.gaussians.opacities) < thresholds[deciding_row]  # [N]
+        low_opacity = (
+            self._activations.logistic(self.gaussians.opacities) < thresholds[deciding_row]
+        )  # [N]
         largest = self.settings.prune_scale3d * self.scene_scale if prune_large else math.inf
         too_large = ~low_opacity & (self._largest_scale() > largest)
         self._keep(~(low_opacity | too_large))
@@ -340,14 +349,21 @@ class Densifier:
         """Cap opacities above every threshold, with moments of zero; return how many fell."""
         thresholds = self.group_thresholds.values() or [self.shared_thresholds]
         largest = max(threshold.prune_opacity for threshold in thresholds)
-        cap = torch.logit(torch.tensor(self.settings.reset_opacity * largest)).item()
+        cap_opacity = torch.tensor(self.settings.reset_opacity * largest, dtype=torch.float64)
+        cap = torch.logit(cap_opacity).item()
         opacities = self.gaussians.opacities
         self.optimizer.reset("opacities", opacities.clamp(max=cap))
         return int((opacities > cap).sum())
 
+    @property
+    def _activations(self) -> ModuleType:
+        """The activation functions of the optimizer's backend."""
+        return implementation("activations", self.optimizer.backend)
+
     def _largest_scale(self) -> Tensor:
         """Return the largest scale [N] of each Gaussian, world units."""
-        return self.gaussians.scales.exp().amax(dim=-1)
+        largest: Tensor = self._activations.exp(self.gaussians.scales.amax(dim=-1))
+        return largest
 
     def _keep(self, mask: Tensor) -> None:
         """Remove all Gaussians but those of `mask` [N]; nothing is copied where it is all true."""

@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 from scipy.spatial import KDTree
 from torch import Tensor
 
-from xrgs.splat.sh import bases, colors_to_sh0
+from xrgs.splat.backend import implementation
+from xrgs.splat.sh import bases, check_degree, colors_to_sh0
 
 PARAMETERS = ("means", "quats", "scales", "opacities", "sh0", "shN")
 """Names of the parameters, in the order that functions take them; gsplat's names."""
@@ -94,20 +95,29 @@ class Gaussians:
             points, colors, init_opacity=init_opacity, sh_degree=sh_degree, generator=generator
         )
 
-    def activated(self) -> ActivatedGaussians:
+    def activated(self, *, backend: str = "torch") -> ActivatedGaussians:
         """Apply the activation functions: exp to scales, the logistic function to opacities.
 
         shN is detached, so that its gradient, three quarters of all, is never computed. The
         optimizer derives it from that of sh0 (`SplatOptimizer.step`).
 
+        Args:
+            backend: `torch`, `native` or `auto` (`resolve_backend`), which computes the functions.
+                The native backend takes float32 on the CPU only, and gives the same bits for any
+                number of threads, which torch does not.
+
         Returns:
-            The Gaussians, differentiable in all parameters but shN.
+            The Gaussians, differentiable in all parameters but shN; once on the native backend.
+
+        Raises:
+            ValueError: The parameters are not float32 on the CPU for the native backend.
         """
+        activations = implementation("activations", backend)
         return ActivatedGaussians(
             self.means,
             self.quats,
-            torch.exp(self.scales),
-            torch.sigmoid(self.opacities),
+            activations.exp(self.scales),
+            activations.logistic(self.opacities),
             self.sh0,
             self.shN.detach(),
         )
@@ -137,9 +147,10 @@ def from_points(
         P Gaussians, float32 leaf tensors that require gradients.
 
     Raises:
-        ValueError: There are fewer than 4 points, shapes do not fit, values are not finite, or the
-            opacity is not above 0 and below 1.
+        ValueError: There are fewer than 4 points, shapes do not fit, values are not finite, the
+            opacity is not above 0 and below 1, or the degree is not 0 to 3.
     """
+    check_degree(sh_degree)
     means = torch.as_tensor(points, dtype=torch.float32)
     rgb = torch.as_tensor(colors)
     rgb = rgb.float() / 255.0 if rgb.dtype == torch.uint8 else rgb.float()
@@ -156,7 +167,7 @@ def from_points(
     if not 0.0 < init_opacity < 1.0:
         raise ValueError(f"init_opacity must be between 0 and 1, got {init_opacity}")
 
-    log_spacing = torch.log(_spacing(means))  # [P]
+    log_spacing = torch.from_numpy(np.log(_spacing(means))).float()  # [P]
     tensors = {
         "means": means.clone(),
         "quats": torch.rand((count, 4), generator=generator),
@@ -168,8 +179,8 @@ def from_points(
     return Gaussians(**{name: value.requires_grad_() for name, value in tensors.items()})
 
 
-def _spacing(points: Tensor) -> Tensor:
+def _spacing(points: Tensor) -> NDArray[np.float64]:
     """Return the RMS distance of each point [P, 3] to its three nearest neighbours: [P]."""
     distances, _ = KDTree(points.numpy()).query(points.numpy(), k=4)  # [P, 4], itself first
-    squared = torch.from_numpy(distances[:, 1:]).square().mean(dim=-1)
-    return squared.sqrt().float().clamp_min(MIN_SPACING)
+    spacing: NDArray[np.float64] = np.sqrt(np.square(distances[:, 1:]).mean(axis=1))
+    return np.maximum(spacing, MIN_SPACING)

@@ -64,28 +64,26 @@ def photometric_loss(
         ssim: Weight of the structural dissimilarity.
         pixel_weight: [H, W]; None weighs all pixels 1.
         backend: `torch`, `native` or `auto` (`resolve_backend`). The native backend takes float32
-            on the CPU only, and computes the gradient along with the value. It has no pixel
-            weights: with these, torch computes the loss whatever the backend.
+            on the CPU only, `pixel_weight` included, and computes the gradient along with the
+            value, by `image` only.
 
     Returns:
         A scalar.
 
     Raises:
         ValueError: `image` does not have the target's shape, `pixel_weight` is not of its size, or
-            `image` is not float32 on the CPU for the native backend.
+            for the native backend one of them is not float32 on the CPU, or `pixel_weight` requires
+            a gradient.
     """
     if image.shape != target.image.shape:
         raise ValueError(
             f"image is {list(image.shape)}, its target {list(target.image.shape)} [H, W, 3]"
         )
-    loss: Tensor
-    if pixel_weight is None:
-        loss = implementation("loss", backend).photometric_loss(image, target, l1, ssim)
-        return loss
-    if pixel_weight.shape != image.shape[:2]:
+    if pixel_weight is not None and pixel_weight.shape != image.shape[:2]:
         raise ValueError(
             f"pixel_weight must be {list(image.shape[:2])} [H, W], got {list(pixel_weight.shape)}"
         )
-    weighted = implementation("loss", "torch").weighted_photometric_loss
-    loss = weighted(image, target, l1, ssim, pixel_weight)
+    loss: Tensor = implementation("loss", backend).photometric_loss(
+        image, target, l1, ssim, pixel_weight
+    )
     return loss

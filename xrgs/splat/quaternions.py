@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import torch
 from torch import Tensor
-from torch.nn.functional import normalize
+
+from xrgs.splat.rounding import rounded_sqrt
 
 
 def rotation_matrices(quats: Tensor) -> Tensor:
@@ -26,7 +27,10 @@ def rotation_matrices(quats: Tensor) -> Tensor:
     zero = largest < torch.finfo(quats.dtype).tiny ** 0.5
     identity = quats.new_tensor([1.0, 0.0, 0.0, 0.0])
     scaled = torch.where(zero, identity, quats / largest.masked_fill(zero, 1.0))  # [M, 4]
-    w, x, y, z = normalize(scaled, dim=-1).unbind(-1)  # [M] each
+    w, x, y, z = scaled.unbind(-1)  # [M] each
+    # Written out, since the order in which torch's norm adds depends on the processor.
+    length = rounded_sqrt(w * w + x * x + y * y + z * z)  # at least 1
+    w, x, y, z = w / length, x / length, y / length, z / length
     entries = [
         *(1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)),
         *(2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)),

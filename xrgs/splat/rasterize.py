@@ -64,8 +64,8 @@ def rasterize_parameters(
 
     Raises:
         ValueError: A parameter has the wrong shape or type, or values that are not finite or out
-            of range; or `sh_degree` is not 0 to 3 or above the bands of shN. The message names the
-            parameter.
+            of range; or `sh_degree` is not 0 to 3 or above the bands of shN, of which there are at
+            most 15. The message names the parameter.
         MemoryError: The tile lists of the view do not fit in memory.
     """
     gaussians = ActivatedGaussians(means, quats, scales, opacities, sh0, shN)

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 import torch
 
+from xrgs.splat.backend import implementation
 from xrgs.splat.rasterize import rasterize_parameters
 from xrgs.splat.render_result import Render
 from xrgs.splat.settings import RasterSettings
@@ -56,18 +57,20 @@ def rasterize(
     if sh_degree is None:
         stored = math.isqrt(gaussians.shN.shape[1] + 1) - 1  # K = (degree + 1)^2
         sh_degree = min(settings.sh_degree, stored)
+    backend = backend_for(gaussians.means, backend)
     # Not `Gaussians.activated`, which cuts shN off from its gradient.
+    activations = implementation("activations", backend)
     return rasterize_parameters(
         gaussians.means,
         gaussians.quats,
-        torch.exp(gaussians.scales),
-        torch.sigmoid(gaussians.opacities),
+        activations.exp(gaussians.scales),
+        activations.logistic(gaussians.opacities),
         gaussians.sh0,
         gaussians.shN,
         camera,
         settings,
         sh_degree=sh_degree,
-        backend=backend_for(gaussians.means, backend),
+        backend=backend,
     )
 
 

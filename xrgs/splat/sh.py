@@ -23,6 +23,12 @@ def bases(degree: int) -> int:
     return (degree + 1) ** 2
 
 
+def check_degree(degree: int) -> None:
+    """Raise ValueError unless harmonics of degree 0 to `degree` are served: `degree` is 0 to 3."""
+    if not 0 <= degree <= MAX_DEGREE:
+        raise ValueError(f"sh_degree must be 0 to {MAX_DEGREE}, got {degree}")
+
+
 def check_sh_degree(degree: int, shN: Tensor) -> None:
     """Raise an error unless harmonics of a degree can be evaluated from the stored coefficients.
 
@@ -31,13 +37,17 @@ def check_sh_degree(degree: int, shN: Tensor) -> None:
         shN: [N, K - 1, 3] coefficients of the bands above 0.
 
     Raises:
-        ValueError: The degree is not 0 to 3, or shN has fewer bands than it needs.
+        ValueError: The degree is not 0 to 3, or shN has fewer bands than it needs or more than
+            degree 3 has.
     """
-    if not 0 <= degree <= MAX_DEGREE:
-        raise ValueError(f"sh_degree must be 0 to {MAX_DEGREE}, got {degree}")
-    rest = bases(degree) - 1
+    check_degree(degree)
+    rest, most = bases(degree) - 1, bases(MAX_DEGREE) - 1
     if shN.shape[1] < rest:
         raise ValueError(f"sh_degree {degree} needs shN of [N, {rest}, 3], got {list(shN.shape)}")
+    if shN.shape[1] > most:
+        raise ValueError(
+            f"shN must be [N, K - 1, 3] with K - 1 of at most {most}, got {list(shN.shape)}"
+        )
 
 
 def sh_basis(degree: int, dirs: Tensor) -> Tensor:
@@ -53,8 +63,7 @@ def sh_basis(degree: int, dirs: Tensor) -> Tensor:
     Raises:
         ValueError: The degree is not 0 to 3.
     """
-    if not 0 <= degree <= MAX_DEGREE:
-        raise ValueError(f"sh_degree must be 0 to {MAX_DEGREE}, got {degree}")
+    check_degree(degree)
     x, y, z = dirs.unbind(-1)
     basis = [torch.full_like(x, C0)]
     if degree >= 1:
@@ -98,7 +107,7 @@ def sh_to_colors(degree: int, dirs: Tensor, sh0: Tensor, shN: Tensor) -> Tensor:
         [N, 3], 0 and up: not clamped at 1.
 
     Raises:
-        ValueError: The degree is not 0 to 3, or shN has fewer bands than it needs.
+        ValueError: As for `check_sh_degree`.
     """
     check_sh_degree(degree, shN)
     rest = bases(degree) - 1

@@ -12,6 +12,8 @@ from xrgs.experiment.store import BASELINE
 from xrgs.runtime.progress import format_duration
 from xrgs.safeio.hashing import digest
 from xrgs.safeio.untrusted import printable
+from xrgs.splat.backend import resolve_backend
+from xrgs.sweep.estimate import TORCH_SLOWDOWN, torch_seconds
 
 if TYPE_CHECKING:
     from collections.abc import Container, Mapping, Sequence
@@ -37,7 +39,7 @@ class PlannedCell:
     error: str | None = None
     """Why the cell can't be trained: its scene failed, or the cell that it takes a count from."""
     seconds: float | None = None
-    """Expected seconds of training; None if the store has no finished cell to go by."""
+    """Expected seconds of training; None where nothing is known to go by."""
 
     @property
     def name(self) -> str:
@@ -78,22 +80,27 @@ def identified(cell: PlannedCell, store: Store, holders: Mapping[str, str]) -> P
 
 
 def estimated(plan: Sequence[PlannedCell], past: RuntimeEstimator) -> list[PlannedCell]:
-    """Return the cells with the expected seconds of training, where past cells allow it.
+    """Return the cells with the expected seconds of training, as far as they are known.
 
-    A cell that waits for a count has no identity yet; it is estimated with the count that it has.
+    Where the store's finished cells say nothing, the torch backend, which takes hours, is estimated
+    by the size of the images.
 
     Args:
         plan: The cells.
         past: Estimates from the store's finished cells.
     """
-    if not past.known:
-        return list(plan)
     return [
-        replace(cell, seconds=past.seconds(cell.identity or cell_identity(cell.conf, variant_id)))
-        if (variant_id := cell.variant_id) is not None and cell.state.name != "done"
-        else cell
+        cell if cell.state.name == "done" else replace(cell, seconds=_expected_seconds(cell, past))
         for cell in plan
     ]
+
+
+def _expected_seconds(cell: PlannedCell, past: RuntimeEstimator) -> float | None:
+    """Return a cell's seconds of training; while it waits for a count, with the count it has."""
+    if cell.variant_id is not None and past.known:
+        return past.seconds(cell.identity or cell_identity(cell.conf, cell.variant_id))
+    torch = resolve_backend(cell.conf.splat.backend) == "torch"
+    return torch_seconds(cell.conf) if torch else None
 
 
 def expected_length(cell: PlannedCell) -> tuple[float, int]:
@@ -150,11 +157,43 @@ def describe(plan: Sequence[PlannedCell]) -> str:
     return "\n".join(lines)
 
 
-def _remaining(plan: Sequence[PlannedCell]) -> str:
-    """Return how long the remaining training takes, as far as the store's cells allow to say."""
+def without_kernels(plan: Sequence[PlannedCell]) -> str:
+    """Return a line that says how long torch takes where the kernels were not built.
+
+    Args:
+        plan: All cells, with their expected seconds.
+
+    Returns:
+        The line; empty where no cell that is left to train falls back to torch.
+    """
+    cells = [
+        cell
+        for cell in _left(plan)
+        if cell.conf.splat.backend == "auto" and resolve_backend("auto") == "torch"
+    ]
+    if not cells:
+        return ""
+    known = [cell.seconds for cell in cells if cell.seconds is not None]
+    torch, native = (format_duration(sum(known) / ratio) for ratio in (1.0, TORCH_SLOWDOWN))
+    complete = len(known) == len(cells)
+    instead = f"{torch} instead of {native}" if complete else "30 to 60 times longer"
+    return (
+        f"the kernels were not built on this machine: torch trains {len(cells)} cells, {instead}; "
+        "`pip install --force-reinstall --no-deps .` builds them with a C++17 compiler or with "
+        "PyPI's ziglang"
+    )
+
+
+def _left(plan: Sequence[PlannedCell]) -> list[PlannedCell]:
+    """Return the cells that are to be trained, those whose variant or count is missing as well."""
     retry = plan[0].conf.retry == "failed"
-    remaining = [cell for cell in plan if cell.waits and not cell.error]
-    remaining += ready(plan, (), retry=retry).values()
+    unidentified = [cell for cell in plan if cell.cell_id is None and not cell.error]
+    return [*unidentified, *ready(plan, (), retry=retry).values()]
+
+
+def _remaining(plan: Sequence[PlannedCell]) -> str:
+    """Return how long the remaining training takes, as far as that is known."""
+    remaining = _left(plan)
     known = [cell.seconds for cell in remaining if cell.seconds is not None]
     if not known:
         return ""

@@ -164,7 +164,7 @@ def _own_contradictions(
     named = original.id.partition(".")[0]
     if _ID.fullmatch(named) and digest(then) != named:
         yield f"the folder: identity.json is that of cell {digest(then)}, not of {named}"
-    not_in_config = {"code", "protocol", "variant"}
+    not_in_config = {"arithmetic", "code", "protocol", "variant"}
     for line in _changes(_without(then, not_in_config), _without(now, not_in_config)):
         yield f"identity.json against config.json: {line}"
 
@@ -174,6 +174,9 @@ def _other_program(original: CellFolder, conf: Conf, now: Mapping[str, Any]) -> 
     then = original.identity()
     if then.get("protocol") != now["protocol"]:
         yield f"evaluation protocol: {then.get('protocol')} -> {now['protocol']}"
+    arithmetic = then.get("arithmetic", "not recorded")
+    if arithmetic != now["arithmetic"]:
+        yield f"arithmetic, which decides the last digits: {arithmetic} -> {now['arithmetic']}"
     code = then.get("code") or {}
     for file in sorted(code.keys() | now["code"].keys()):
         if code.get(file) != now["code"].get(file):
@@ -182,7 +185,8 @@ def _other_program(original: CellFolder, conf: Conf, now: Mapping[str, Any]) -> 
     here = provenance.collect(conf.threads or usable_cores(), conf.splat.backend)
     made_with = original.provenance()
     new = here.keys() - made_with.keys()  # values that an older version did not record
-    yield from _changes(_without(made_with, {"started"}), _without(here, {"started", *new}))
+    told = {"started", "arithmetic"}
+    yield from _changes(_without(made_with, told), _without(here, told | new))
 
 
 def _without(values: Mapping[str, Any], names: set[str]) -> dict[str, Any]:

@@ -19,7 +19,7 @@ from xrgs.safeio import untrusted
 from xrgs.safeio.atomic import write_json
 from xrgs.safeio.hashing import canonical_json, digest
 from xrgs.safeio.records import read_object
-from xrgs.splat.backend import resolve_backend
+from xrgs.splat.backend import arithmetic, resolve_backend
 from xrgs.sweep import locks
 
 if TYPE_CHECKING:
@@ -51,11 +51,11 @@ class HandOver:
         return str(self.identity["variant"])
 
     def check_code(self) -> None:
-        """Refuse to train with other code than the cell was planned with.
+        """Refuse to train with other code or other arithmetic than the cell was planned with.
 
         Raises:
-            XrgsError: The planned backend is not available here, or source files of the installed
-                package differ from the planned ones.
+            XrgsError: The planned backend is not available here, source files of the installed
+                package differ from the planned ones, or this machine's arithmetic does.
         """
         backend = resolve_backend(self.identity["splat"]["backend"])
         files = changed_code(self.identity["code"], backend)
@@ -65,6 +65,13 @@ class HandOver:
                 f"{self.name}: cell {self.cell_id} was planned with other code than is installed "
                 f"here and now; {len(files)} files differ ({named}). Install the same version of "
                 "xrgs wherever cells are trained, and start the sweep again"
+            )
+        planned, here = self.identity.get("arithmetic"), arithmetic(backend)
+        if planned != here:
+            raise XrgsError(
+                f"{self.name}: cell {self.cell_id} was planned with the arithmetic {planned}, and"
+                f" this machine has {here}, which gives other last digits. Start the sweep on a"
+                " machine like those that train, or set splat.backend=torch"
             )
 
 

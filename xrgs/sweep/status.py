@@ -14,6 +14,7 @@ from xrgs.experiment.identity import training_code
 from xrgs.experiment.store import Store
 from xrgs.safeio.records import read_json
 from xrgs.safeio.untrusted import printable
+from xrgs.splat.backend import arithmetic
 from xrgs.sweep import locks
 from xrgs.training import plugins
 
@@ -39,8 +40,8 @@ class CellSummary:
     """The cell's label and condition in that sweep, `?` if no sweep has the cell."""
     state: CellState
     stale: tuple[str, ...]
-    """For a done cell, source files that have changed since it was trained. A sweep would train
-    the cell again."""
+    """For a done cell, source files that have changed since it was trained, and its arithmetic if
+    this machine has another. A sweep would train the cell again."""
 
 
 @dataclass(frozen=True)
@@ -137,18 +138,32 @@ def _scene(cell: CellFolder) -> str:
 
 
 def _stale(cell: CellFolder) -> tuple[str, ...]:
-    """Return the source files that are not the ones that the cell was trained with."""
+    """Return the source files that are not the ones that the cell was trained with.
+
+    The cell's arithmetic is among them where it is not this machine's.
+    """
     try:
         identity = cell.identity()
         then: dict[str, Any] = identity["code"]
-        now = training_code(identity["splat"]["backend"]) | plugins.digests_now(then)
-        if then == now:
-            return ()
-        return tuple(
-            sorted(file for file in then.keys() | now.keys() if then.get(file) != now.get(file))
-        )
+        backend = identity["splat"]["backend"]
+        now = training_code(backend) | plugins.digests_now(then)
+        files = then.keys() | now.keys() if then != now else ()
+        changed = sorted(file for file in files if then.get(file) != now.get(file))
+        return (*changed, *_other_arithmetic(backend, identity.get("arithmetic", "not recorded")))
     except (XrgsError, AttributeError, KeyError, TypeError, ValueError):
         return ("identity.json",)
+
+
+def _other_arithmetic(backend: str, trained: object) -> list[str]:
+    """Return how a cell's arithmetic differs from this machine's; empty if it does not.
+
+    A machine on which the backend is not available, where stores are only read, has none.
+    """
+    try:
+        here = arithmetic(backend)
+    except XrgsError:
+        return []
+    return [] if trained == here else [printable(f"arithmetic ({trained}, here {here})")]
 
 
 def _bytes(folder: str) -> int:
@@ -201,7 +216,7 @@ def describe(status: StoreStatus) -> str:
         files = Counter(file for cell in stale for file in cell.stale)
         lines += [
             "",
-            f"stale: {len(stale)} done cells were trained with other code than is installed",
+            f"stale: {len(stale)} done cells were trained with other code or arithmetic than here",
         ]
         lines += [f"  {file}: {count} cells" for file, count in files.most_common(_MAX_NAMED)]
     return "\n".join(lines)

@@ -32,7 +32,15 @@ from xrgs.sweep.estimate import RuntimeEstimator
 from xrgs.sweep.jobs import worker
 from xrgs.sweep.jobs.job import FAIL_FAST, LOCKED, UNWRITABLE
 from xrgs.sweep.monitor import SweepMonitor
-from xrgs.sweep.plan import PlannedCell, describe, estimated, identified, ready, record
+from xrgs.sweep.plan import (
+    PlannedCell,
+    describe,
+    estimated,
+    identified,
+    ready,
+    record,
+    without_kernels,
+)
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -98,6 +106,8 @@ class Study:
         plan = self._identified(plan, store)
         plan = estimated(plan, RuntimeEstimator(store))
         log_line(describe(plan))
+        if slow := without_kernels(plan):
+            log_line(slow)
         if weights.find_weights() is None and any(cell.state.name != "done" for cell in plan):
             log_line(
                 "LPIPS is not computed for the cells trained now (n/a in tables): "

@@ -104,7 +104,7 @@ def _run_steps(run: _Run, checkpoint: Checkpoint) -> None:
         # Render the view of this step. The gradient of the offset is for densification.
         means2d_offset = torch.zeros(len(gaussians), 2, requires_grad=True)
         render = rasterize_parameters(
-            *components.before_render(gaussians.activated(), step),
+            *components.before_render(gaussians.activated(backend=backend), step),
             camera,
             raster,
             sh_degree=sh_degree,

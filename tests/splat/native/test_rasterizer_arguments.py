@@ -234,6 +234,8 @@ def test_shapes_are_checked(make_camera: MakeCamera, make_scene: MakeScene) -> N
         frame.forward(make_view(camera), *values[:3], values[3][:9], *values[4:], None, 1)
     with pytest.raises(ValueError, match="shN has fewer bands"):
         frame.forward(make_view(camera), *values[:5], values[5][:, :8].contiguous(), None, 1)
+    with pytest.raises(ValueError, match="shN must have at most 15 bands, got 24"):
+        frame.forward(make_view(camera), *values[:5], torch.zeros(10, 24, 3), None, 1)
     with pytest.raises(ValueError, match="sh_degree"):
         make_view(camera, sh_degree=4)
     with pytest.raises(ValueError, match="at least 1"):
@@ -241,6 +243,44 @@ def test_shapes_are_checked(make_camera: MakeCamera, make_scene: MakeScene) -> N
     frame.forward(make_view(camera), *values, None, 1)
     with pytest.raises(ValueError, match="image's size"):
         frame.backward(torch.zeros(3, 3, 3), torch.zeros(3, 3), *values, None, True, 1)
+    v_image, v_alpha = torch.zeros(camera.height, camera.width, 3), torch.zeros(camera.height, 20)
+    for bands, says in ((24, "at most 15 bands"), (8, "fewer bands")):
+        values[5] = torch.zeros(10, bands, 3)
+        with pytest.raises(ValueError, match=says):
+            frame.backward(v_image, v_alpha, *values, None, True, 1)
+
+
+def test_a_frame_without_a_render_is_refused(
+    make_camera: MakeCamera, make_scene: MakeScene
+) -> None:
+    camera = make_camera()
+    scene = make_scene(10, camera, dtype=torch.float32)
+    values = [scene[key] for key in NAMES]
+    v_image, v_alpha = torch.zeros(camera.height, camera.width, 3), torch.zeros(camera.height, 20)
+    frame = native.Frame()
+    uses: list[Callable[[], object]] = [
+        frame.visible,
+        lambda: frame.evaluations,
+        lambda: frame.pair_count,
+        lambda: frame.bytes,
+        lambda: frame.timings,
+        lambda: frame.backward(v_image, v_alpha, *values, None, True, 1),
+    ]
+
+    def assert_all_refused() -> None:
+        for use in uses:
+            with pytest.raises(ValueError, match="the frame has no render"):
+                use()
+
+    assert_all_refused()
+    frame.forward(make_view(camera), *values, None, 1)
+    for use in uses:
+        use()
+    values[0] = torch.full((10, 3), torch.nan)
+    with pytest.raises(ValueError, match="means has values that are not finite"):
+        frame.forward(make_view(camera), *values, None, 1)
+    values[0] = scene["means"]
+    assert_all_refused()
 
 
 def test_float64_is_refused(make_camera: MakeCamera, make_scene: MakeScene) -> None:
@@ -284,6 +324,50 @@ def test_lists_beyond_memory_are_a_clear_error() -> None:
     assert "the lists of 30000 visible Gaussians in 1600x1600 px do not fit" in result.stdout, (
         result.stderr
     )
+
+
+AFTER_FAILURE = """
+import resource, torch
+from xrgs.splat.cameras import Camera
+from xrgs.splat.rasterize import rasterize_parameters
+from xrgs.splat.settings import RasterSettings
+
+def render(n):
+    means = torch.tensor([0.0, 0.0, 1.0]).repeat(n, 1)
+    scene = [means, torch.ones(n, 4), torch.full((n, 3), 100.0), torch.full((n,), 0.5)]
+    scene += [torch.zeros(n, 1, 3), torch.zeros(n, 0, 3)]
+    K = torch.tensor([[400.0, 0, 400], [0, 400, 400], [0, 0, 1]])
+    camera = Camera(torch.eye(4), K, 800, 800)
+    made = rasterize_parameters(*scene, camera, RasterSettings(), sh_degree=0, backend="native")
+    return made.image.clone()
+
+torch.set_num_threads(1)
+before = render(100)
+used = int(open("/proc/self/statm").read().split()[0]) * resource.getpagesize()
+resource.setrlimit(resource.RLIMIT_AS, (used + (200 << 20), resource.RLIM_INFINITY))
+for _ in range(3):
+    try:
+        render(6000)  # 15 million pairs
+    except MemoryError as error:
+        print(error)
+print(torch.equal(render(100), before))
+"""
+
+
+@pytest.mark.skipif(not os.path.exists("/proc/self/statm"), reason="reads Linux's /proc")  # noqa: PTH110
+@pytest.mark.slow
+def test_a_render_after_one_beyond_memory_is_right() -> None:
+    result = subprocess.run(
+        [sys.executable, "-P", "-c", AFTER_FAILURE],
+        capture_output=True,
+        text=True,
+        timeout=60,
+        check=False,
+    )
+    *errors, equal = result.stdout.splitlines() or [""]
+    assert equal == "True", (result.returncode, result.stdout, result.stderr)
+    assert len(errors) == 3
+    assert all("the lists of 6000 visible Gaussians" in error for error in errors)
 
 
 @pytest.mark.parametrize(("value", "says"), [("portable", "portable"), ("sse9", "XRGS_ISA")])

@@ -46,9 +46,9 @@ void accumulate_grad2d(Means2dGrad means2d_grad, Visible visible, double scale_x
 }  // namespace
 
 void bind_densify(nb::module_& m) {
-  m.def("accumulate_grad2d", &accumulate_grad2d, nb::arg("means2d_grad"), nb::arg("visible"),
-        nb::arg("scale_x"), nb::arg("scale_y"), nb::arg("grad2d_sum"), nb::arg("visible_count"),
-        nb::arg("threads"),
+  m.def("accumulate_grad2d", &accumulate_grad2d, nb::arg("means2d_grad").noconvert(),
+        nb::arg("visible").noconvert(), nb::arg("scale_x"), nb::arg("scale_y"),
+        nb::arg("grad2d_sum").noconvert(), nb::arg("visible_count").noconvert(), nb::arg("threads"),
         "Add to the densification statistics of the visible Gaussians, in place.\n\n"
         "grad2d_sum [N] += |(scale_x gx, scale_y gy)| of means2d_grad [N, 2]; visible_count [N] += "
         "1.");

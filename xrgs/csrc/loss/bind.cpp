@@ -4,10 +4,11 @@
 
 #include <nanobind/nanobind.h>
 #include <nanobind/ndarray.h>
+#include <nanobind/stl/optional.h>
 
 #include <cmath>
 #include <cstdint>
-#include <memory>
+#include <optional>
 #include <vector>
 
 #include "loss/photometric.h"
@@ -20,6 +21,7 @@ namespace xrgs {
 namespace {
 
 using Image = nb::ndarray<const float, nb::shape<-1, -1, 3>, nb::c_contig, nb::device::cpu>;
+using PixelWeights = nb::ndarray<const float, nb::shape<-1, -1>, nb::c_contig, nb::device::cpu>;
 
 constexpr double kSigma = 1.5;    // of the window, px
 constexpr int kMinBandRows = 32;  // a band computes ten rows more than its own
@@ -41,11 +43,11 @@ void run_bands(const PhotometricJob& job, int threads) {
   // program delays holds up less.
   const int most = job.height / kMinBandRows > 0 ? job.height / kMinBandRows : 1;
   const int bands = threads <= 1 ? 1 : (2 * threads < most ? 2 * threads : most);
-  const std::size_t size = (kernels.scratch_size(job.width) + 15) / 16 * 16;
-  std::unique_ptr<void, ReleaseBlock> scratch(acquire_block(bands * size * sizeof(float)));
+  const std::size_t size = (kernels.scratch_size(job) + 15) / 16 * 16;
+  const OwnedBlock scratch = acquire_block(bands * size * sizeof(float));
   parallel_for(threads, bands, [&](std::int64_t i) {
     const auto row = [&](std::int64_t band) { return static_cast<int>(job.height * band / bands); };
-    kernels.band(job, row(i), row(i + 1), static_cast<float*>(scratch.get()) + i * size);
+    kernels.band(job, row(i), row(i + 1), static_cast<float*>(scratch->data) + i * size);
   });
 }
 
@@ -56,17 +58,19 @@ double total(const std::vector<double>& rows) {
 }
 
 nb::tuple photometric_loss(Image image, Image target, Image target_mean, Image target_variance,
-                           double l1, double ssim, bool with_gradient, int threads) {
+                           std::optional<PixelWeights> pixel_weight, double l1, double ssim,
+                           bool with_gradient, int threads) {
   const std::size_t height = image.shape(0), width = image.shape(1);
   const auto has_size = [](const Image& a, std::size_t rows, std::size_t columns) {
     return a.shape(0) == rows && a.shape(1) == columns;
   };
   if (height < kWindow || width < kWindow || !has_size(target, height, width) ||
       !has_size(target_mean, height - kMapShrink, width - kMapShrink) ||
-      !has_size(target_variance, height - kMapShrink, width - kMapShrink))
+      !has_size(target_variance, height - kMapShrink, width - kMapShrink) ||
+      (pixel_weight && (pixel_weight->shape(0) != height || pixel_weight->shape(1) != width)))
     throw nb::value_error(
         "photometric_loss: shapes that do not fit: image and target must be [H, W, 3] of at least "
-        "11 x 11 px, target_mean and target_variance [H - 10, W - 10, 3]");
+        "11 x 11 px, target_mean and target_variance [H - 10, W - 10, 3], pixel_weight [H, W]");
   const double pixels = 3.0 * height * width;
   const double windows = 3.0 * (height - kMapShrink) * (width - kMapShrink);
   std::vector<double> l1_rows(height), ssim_rows(height - kMapShrink);
@@ -74,10 +78,11 @@ nb::tuple photometric_loss(Image image, Image target, Image target_mean, Image t
   PhotometricJob job{};
   job.image = image.data(), job.target = target.data();
   job.target_mean = target_mean.data(), job.target_variance = target_variance.data();
+  job.pixel_weight = pixel_weight ? pixel_weight->data() : nullptr;
   job.height = static_cast<int>(height), job.width = static_cast<int>(width);
   set_window(job.window);
   job.l1_slope = static_cast<float>(l1 / pixels);
-  job.ssim_slope = static_cast<float>(-ssim / windows);
+  job.ssim_slope = static_cast<float>(ssim / windows);
   job.l1_rows = l1_rows.data(), job.ssim_rows = ssim_rows.data();
   if (with_gradient) {
     Output array = new_array<float>({height, width, 3});
@@ -88,7 +93,7 @@ nb::tuple photometric_loss(Image image, Image target, Image target_mean, Image t
     nb::gil_scoped_release release;
     run_bands(job, threads);
   }
-  const double loss = l1 * (total(l1_rows) / pixels) + ssim * (1 - total(ssim_rows) / windows);
+  const double loss = l1 * (total(l1_rows) / pixels) + ssim * (total(ssim_rows) / windows);
   return nb::make_tuple(loss, gradient);
 }
 
@@ -96,13 +101,16 @@ nb::tuple photometric_loss(Image image, Image target, Image target_mean, Image t
 
 void bind_loss(nb::module_& m) {
   m.def(
-      "photometric_loss", &photometric_loss, nb::arg("image"), nb::arg("target"),
-      nb::arg("target_mean"), nb::arg("target_variance"), nb::arg("l1"), nb::arg("ssim"),
-      nb::arg("with_gradient"), nb::arg("threads"),
-      "Return l1 mean|image - target| + ssim (1 - SSIM), and its gradient by the image or None.\n\n"
-      "image and target are [H, W, 3]; target_mean and target_variance [H - 10, W - 10, 3] are "
-      "the\n"
-      "target's under the window.");
+      "photometric_loss", &photometric_loss, nb::arg("image").noconvert(),
+      nb::arg("target").noconvert(), nb::arg("target_mean").noconvert(),
+      nb::arg("target_variance").noconvert(), nb::arg("pixel_weight").noconvert().none(),
+      nb::arg("l1"), nb::arg("ssim"), nb::arg("with_gradient"), nb::arg("threads"),
+      "Return l1 mean(w |image - target|) + ssim mean(w (1 - SSIM)), and its gradient by the "
+      "image\n"
+      "or None.\n\n"
+      "image and target are [H, W, 3]; target_mean and target_variance [H - 10, W - 10, 3] are\n"
+      "the target's under the window; pixel_weight [H, W] has the weight w of each pixel, and of\n"
+      "the window around it, and None weighs all of them 1.");
 }
 
 }  // namespace xrgs

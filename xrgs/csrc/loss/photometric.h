@@ -11,24 +11,26 @@ constexpr int kWindow = 11;  // side of the SSIM window, px
 constexpr int kMapShrink =
     kWindow - 1;  // rows and columns by which the SSIM map is smaller than the image
 
-// The arguments of one evaluation. The gradient is that of l1_slope * sum |image - target| +
-// ssim_slope * sum S, where S is the SSIM of each channel at every place where the whole window
-// lies inside the image.
+// The arguments of one evaluation. The gradient is that of l1_slope * sum w |image - target| +
+// ssim_slope * sum w (1 - S), where w is the weight of each pixel, and S is the SSIM of each
+// channel at every place where the whole window lies inside the image; its weight is that of the
+// pixel at the middle of the window.
 struct PhotometricJob {
   const float *image, *target;                 // [H, W, 3]
   const float *target_mean, *target_variance;  // [H - 10, W - 10, 3], under the window
+  const float* pixel_weight;                   // [H, W]; null weighs all pixels 1
   int height, width;
   float window[kWindow / 2 +
                1];  // weight of the window at each distance from its middle, along one axis
   float l1_slope, ssim_slope;
-  double* l1_rows;    // [H] receives the sum of |image - target| of each row
-  double* ssim_rows;  // [H - 10] receives the sum of S of each row
+  double* l1_rows;    // [H] receives the sum of w |image - target| of each row
+  double* ssim_rows;  // [H - 10] receives the sum of w (1 - S) of each row
   float* gradient;    // [H, W, 3] receives the gradient; null if only the sums are needed
 };
 
 struct PhotometricKernels {
   // Returns the floats of scratch that one call of `band` needs, on a 64-byte boundary.
-  std::size_t (*scratch_size)(int width);
+  std::size_t (*scratch_size)(const PhotometricJob& job);
   // Computes the sums and the gradient of rows first..last-1 of the image. A row has the same
   // result whatever band it belongs to.
   void (*band)(const PhotometricJob& job, int first, int last, float* scratch);

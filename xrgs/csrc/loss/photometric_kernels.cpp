@@ -1,14 +1,33 @@
 // The kernel reads the rows of an image as they are stored, with interleaved channels: a tap of the
 // window is one row further down, or three floats further right.
 //
-// For each group of kGroup rows, the moments of the window (x, x^2 and x t, of the image x and the
-// target t) are summed down the image first, for a chunk of columns at a time, and then across
-// while the chunk is in the first-level cache. SSIM gives the derivatives A, B and C of the loss by
-// the three moments, which go to a ring of rows. The gradient is the same window over A, B and C,
-// transposed, taken from that ring:
-//   dL/dx = window(A) + 2 x window(B) + t window(C) + l1_slope sign(x - t).
-// Variances are differences of moments, so all values are measured from kMidpoint, the middle of
-// the range: the squares are smaller, and fewer digits cancel.
+// SSIM compares an image x with its target t under a window, whose weighted mean is E. Near
+// convergence x and t are almost equal, and the usual form, 1 - SSIM with moments of x, loses all
+// of its digits. Hence the moments are those of the difference d = x - t, and 1 - SSIM is a sum of
+// small terms, none of which is a difference of large ones:
+//   p = E[d], q = E[d^2], r = E[t d];
+//   var_d = max(0, q - p^2),             cov = r - mean_t p, the covariance of t and d,
+//   mean_x = mean_t + p,                 var_x = max(0, var_t + 2 cov + var_d),
+//   D = var_x + var_t + C2,              a = 1 - structure = var_d / D,
+//   N = 2 mean_x mean_t + C1,            l = luminance = N / M,
+//   M = mean_x^2 + mean_t^2 + C1 = p^2 + N,
+//   1 - SSIM = 1 - (1 - a) l = a l + p^2 / M.
+// D is the usual denominator, since var_t + cov is the covariance of t and x. Rounding makes the
+// variances of flat images negative, which the two maxima mend. Of the derivatives by q, r and p,
+// the kernel keeps these factors:
+//   u = 2 (1 - a) l / D  = 2 by_q,
+//   v = 2 a l / D        = -by_r,
+//   by_p = 2 (1 - a) p (mean_t^2 + mean_t mean_x + C1) / M^2 - p u + mean_t v.
+// The fraction is the derivative of p^2 / M, 2 p / M - 2 p^2 mean_x / M^2, without its
+// cancellation: M - p mean_x = mean_t^2 + mean_t mean_x + C1. A variance that a maximum replaces
+// has no derivative: u is zero for var_d, and for var_x v is zero and u is 2 l / D.
+//
+// For each group of kGroup rows, the moments are summed down the image first, for a chunk of
+// columns at a time, and then across while the chunk is in the first-level cache. by_p, u and v go
+// to a ring of rows. The gradient is the same window over them, transposed, taken from that ring:
+//   dL/dx = ssim_slope (window(by_p) + d window(u) - t window(v)) + l1_slope sign(d).
+// With pixel weights, by_p, u and v are multiplied by the weight of the window's middle, and
+// l1_slope by that of the pixel.
 #include <cstring>
 
 #include "loss/photometric.h"
@@ -21,18 +40,18 @@ namespace {
 // Rows that are summed together and share their loads: 12 sums with AVX-512, else 6.
 constexpr int kGroup = kVectorRegisters >= 32 ? 4 : 2;
 constexpr int kInputRows = kGroup + kMapShrink;  // rows that the windows of a group cover
-constexpr int kRing = 16;                        // rows of A, B and C that are kept
+constexpr int kRing = 16;                        // rows of the derivatives that are kept
 static_assert(kRing >= kInputRows, "a group needs all its rows in the ring");
 constexpr int kChannels = 3;
 constexpr int kRowShrink = kChannels * kMapShrink;  // floats by which a row of the map is shorter
 constexpr int kChunk = 192;  // columns (floats) that are summed down before they are summed across
 constexpr int kMargin = 48;  // columns of the chunk to the left that its windows cover
-constexpr int kPrefetchDistance = 256;  // floats
-constexpr int kFields = 3;              // moments, or derivatives by them
-constexpr float kMidpoint = 0.5f;
+constexpr int kPrefetchDistance = 256;         // floats
+constexpr int kFields = 3;                     // moments, or derivatives by them
 constexpr float kC1 = 0.0001f, kC2 = 0.0009f;  // (0.01)^2 and (0.03)^2, for a data range of 1
 
-// The window along one axis, in all lanes.
+// The window along one axis, in all lanes. Loops use a local one: a store through a pointer could
+// change any other as far as the compiler knows, which would load the weights again after each.
 struct WindowWeights {
   Floats of[kWindow / 2 + 1];
   explicit WindowWeights(const float* window) {
@@ -63,8 +82,17 @@ std::size_t ring_row_size(int width) {
   return static_cast<std::size_t>((round_up(kChannels * width) / kLanes | 1) * kLanes);
 }
 
+// The floats of a row of pixel weights, one for each channel.
+int weight_row_size(int width) { return kChannels * round_up(width); }
+
 XRGS_INLINE Floats load_lanes(const float* p, int lanes) {
   return lanes == kLanes ? load(p) : load_first(p, lanes);
+}
+XRGS_INLINE void store_lanes(float* p, Floats a, int lanes) {
+  if (lanes == kLanes)
+    store(p, a);
+  else
+    store_first(p, a, lanes);
 }
 
 // Sums one vector of columns down the image, for each row of a group. read(input_row, value) loads
@@ -98,11 +126,31 @@ XRGS_INLINE Floats sum_across(const WindowWeights& w, const float* p) {
   return sum;
 }
 
+// The sums of the rows of a group, vector by vector: of a chunk's width in float, and of these in
+// double.
+struct RowSums {
+  Floats part[kGroup];
+  double total[kGroup] = {};
+  int vectors = 0;
+
+  RowSums() { clear(); }
+  void clear() {
+    for (Floats& sum : part) sum = broadcast(0.0f);
+    vectors = 0;
+  }
+  // Ends the vector that was added to the rows' parts.
+  XRGS_INLINE void next(bool last) {
+    if (++vectors < kChunk / kLanes && !last) return;
+    for (int row = 0; row < kGroup; ++row) total[row] += static_cast<double>(sum_lanes(part[row]));
+    clear();
+  }
+};
+
+template <bool kWeighted>
 class Band {
  public:
   Band(const PhotometricJob& job, int first, int last, float* scratch)
       : job_(job),
-        weights_(job.window),
         first_(first),
         last_(last),
         columns_(kChannels * job.width),
@@ -110,7 +158,8 @@ class Band {
         map_rows_(job.height - kMapShrink),
         row_size_(ring_row_size(job.width)),
         ring_(scratch),
-        zeros_(scratch + kFields * kRing * row_size_) {
+        zeros_(ring_ + kFields * kRing * row_size_),
+        weight_rows_(zeros_ + row_size_) {
     std::memset(zeros_, 0, row_size_ * sizeof(float));
   }
 
@@ -120,9 +169,10 @@ class Band {
         job_.gradient == nullptr || first_ < kMapShrink ? first_ : first_ - kMapShrink;
     for (int y = start; y < last_; y += kGroup) {
       if (y < map_rows_) map_group(y);
-      for (int row = y; row < y + kGroup; ++row)
-        if (row >= first_ && row < last_) absolute_row(row);
-      if (job_.gradient != nullptr && y + kGroup > first_) gradient_group(y);
+      if (job_.gradient == nullptr)
+        absolute_group(y);
+      else if (y + kGroup > first_)
+        gradient_group(y);
     }
   }
 
@@ -130,7 +180,7 @@ class Band {
   // Calls down(column, lanes, chunk_index) for each vector of a group's `inputs` columns, and
   // across(column, lanes, chunk_index) for each of its `outputs` as soon as the sums that it reads
   // are in the chunk. Its taps start at `chunk_index`, which is `lead` columns to the left of its
-  // own column.
+  // own column. Both are inlined twice, so that nearly all calls, those of kLanes, need no masks.
   template <class Down, class Across>
   XRGS_INLINE void for_each_column(int inputs, int outputs, int lead, Down&& down,
                                    Across&& across) {
@@ -140,35 +190,60 @@ class Band {
       chunk_.shift();
       const int end = start + kChunk < inputs ? start + kChunk : inputs;
       for (int c = start; c < end; c += kLanes)
-        down(c, end - c < kLanes ? end - c : kLanes, kMargin + c - start);
+        if (end - c >= kLanes)
+          down(c, kLanes, kMargin + c - start);
+        else
+          down(c, end - c, kMargin + c - start);
       // Columns past the last input are zero.
       for (int c = end > start ? round_up(end) : start; c < start + kChunk; c += kLanes)
         for (auto& row : chunk_.rows)
           for (float* field : row) store(field + kMargin + c - start, broadcast(0.0f));
       // An output is ready when the last tap of its last lane is within the chunk.
       for (; done < outputs && done - lead + kRowShrink + kLanes <= start + kChunk; done += kLanes)
-        across(done, outputs - done < kLanes ? outputs - done : kLanes,
-               kMargin + done - lead - start);
+        if (outputs - done >= kLanes)
+          across(done, kLanes, kMargin + done - lead - start);
+        else
+          across(done, outputs - done, kMargin + done - lead - start);
     }
   }
 
-  void absolute_row(int y) {
-    const float* x = job_.image + static_cast<std::size_t>(y) * columns_;
-    const float* t = job_.target + static_cast<std::size_t>(y) * columns_;
-    double total = 0;
-    for (int start = 0; start < columns_; start += kChunk) {
-      const int end = start + kChunk < columns_ ? start + kChunk : columns_;
-      Floats sum = broadcast(0.0f);
-      for (int c = start; c < end; c += kLanes) {
-        const int lanes = end - c < kLanes ? end - c : kLanes;
-        sum += abs(load_lanes(x + c, lanes) - load_lanes(t + c, lanes));
+  // Writes the weights of a group of pixel rows, from row y on, to `rows`, once for each channel.
+  void expand_weights(int y, float* rows) {
+    const int size = weight_row_size(job_.width);
+    for (int row = 0; row < kGroup && y + row < job_.height; ++row)
+      for (int x = 0; x < job_.width; x += kLanes) {
+        const float* from = job_.pixel_weight + static_cast<std::size_t>(y + row) * job_.width + x;
+        const Floats w = load_lanes(from, job_.width - x < kLanes ? job_.width - x : kLanes);
+        store_triples(rows + row * size + kChannels * x, w, w, w);
       }
-      total += static_cast<double>(sum_lanes(sum));
+  }
+
+  bool is_own_row(int y) const { return y >= first_ && y < last_; }
+
+  void store_totals(const RowSums& sums, int y, int rows, double* totals) const {
+    for (int row = 0; row < rows; ++row)
+      if (is_own_row(y + row)) totals[y + row] = sums.total[row];
+  }
+
+  // Sums the absolute differences of a group's rows, in the order in which gradient_group does.
+  void absolute_group(int y) {
+    if (kWeighted) expand_weights(y, weight_rows_);
+    RowSums sums;
+    for (int c = 0; c < columns_; c += kLanes) {
+      const int lanes = columns_ - c < kLanes ? columns_ - c : kLanes;
+      for (int row = 0; row < kGroup; ++row) {
+        if (!is_own_row(y + row)) continue;
+        const std::size_t at = static_cast<std::size_t>(y + row) * columns_ + c;
+        const Floats d = load_lanes(job_.image + at, lanes) - load_lanes(job_.target + at, lanes);
+        sums.part[row] += kWeighted ? load_lanes(pixel_weights(row) + c, lanes) * abs(d) : abs(d);
+      }
+      sums.next(c + kLanes >= columns_);
     }
-    job_.l1_rows[y] = total;
+    store_totals(sums, y, kGroup, job_.l1_rows);
   }
 
   void map_group(int y) {
+    if (kWeighted) expand_weights(y + kMapShrink / 2, pixel_weights(kGroup));
     const float *x[kInputRows], *t[kInputRows];
     for (int i = 0; i < kInputRows; ++i) {
       const int row =
@@ -177,76 +252,71 @@ class Band {
       t[i] = job_.target + static_cast<std::size_t>(row) * columns_;
     }
     const int rows = map_rows_ - y < kGroup ? map_rows_ - y : kGroup;
-    Floats sum[kGroup];
-    for (Floats& s : sum) s = broadcast(0.0f);
-    double total[kGroup] = {};
-    int in_sum = 0;
+    const WindowWeights w(job_.window);
+    RowSums sums;
     for_each_column(
         columns_, map_columns_, 0,
-        [&](int c, int lanes, int chunk_index) {
-          if (lanes == kLanes)
-            sum_down(weights_, chunk_, chunk_index,
-                     [&](int i, Floats* v) { moments(load(x[i] + c), load(t[i] + c), v); });
-          else
-            sum_down(weights_, chunk_, chunk_index, [&](int i, Floats* v) {
-              moments(load_first(x[i] + c, lanes), load_first(t[i] + c, lanes), v);
-            });
+        [&](int c, int lanes, int chunk_index) __attribute__((always_inline)) {
+          sum_down(w, chunk_, chunk_index, [&](int i, Floats* v) {
+            moments(load_lanes(x[i] + c, lanes), load_lanes(t[i] + c, lanes), v);
+          });
         },
-        [&](int c, int lanes, int chunk_index) {
+        [&](int c, int lanes, int chunk_index) __attribute__((always_inline)) {
           for (int row = 0; row < rows; ++row)
-            sum[row] += map_vector(y + row, row, c, lanes, chunk_index);
-          if (++in_sum == kChunk / kLanes || c + kLanes >= map_columns_) {
-            for (int row = 0; row < rows; ++row) {
-              total[row] += static_cast<double>(sum_lanes(sum[row]));
-              sum[row] = broadcast(0.0f);
-            }
-            in_sum = 0;
-          }
+            sums.part[row] += map_vector(w, y + row, row, c, lanes, chunk_index);
+          sums.next(c + kLanes >= map_columns_);
         });
-    for (int row = 0; row < rows; ++row)
-      if (y + row >= first_ && y + row < last_) job_.ssim_rows[y + row] = total[row];
+    store_totals(sums, y, rows, job_.ssim_rows);
   }
 
   static XRGS_INLINE void moments(Floats x, Floats t, Floats* v) {
-    v[0] = x - broadcast(kMidpoint);
-    v[1] = v[0] * v[0];
-    v[2] = v[0] * (t - broadcast(kMidpoint));
+    const Floats d = x - t;
+    v[0] = d;
+    v[1] = d * d;
+    v[2] = t * d;
   }
 
-  // Returns S of one vector, and stores its derivatives by the moments in the ring.
-  XRGS_INLINE Floats map_vector(int y, int row, int c, int lanes, int chunk_index) {
+  // Returns 1 - SSIM of one vector, times its weight, and stores by_p, u and v in the ring.
+  XRGS_INLINE Floats map_vector(const WindowWeights& w, int y, int row, int c, int lanes,
+                                int chunk_index) {
     const std::size_t at = static_cast<std::size_t>(y) * map_columns_ + c;
-    const Floats offset =
-        sum_across(weights_, &chunk_.rows[row][0][chunk_index]);  // mean - kMidpoint
-    const Floats square = sum_across(weights_, &chunk_.rows[row][1][chunk_index]);
-    const Floats product = sum_across(weights_, &chunk_.rows[row][2][chunk_index]);
-    const Floats m = offset + broadcast(kMidpoint);
-    const Floats mt = load_lanes(job_.target_mean + at, lanes);
-    const Floats offset_t = mt - broadcast(kMidpoint);
-    const Floats vt = load_lanes(job_.target_variance + at, lanes);
+    const Floats p = sum_across(w, &chunk_.rows[row][0][chunk_index]);
+    const Floats q = sum_across(w, &chunk_.rows[row][1][chunk_index]);
+    const Floats r = sum_across(w, &chunk_.rows[row][2][chunk_index]);
+    const Floats mean_t = load_lanes(job_.target_mean + at, lanes);
+    const Floats var_t = load_lanes(job_.target_variance + at, lanes);
     prefetch(job_.target_mean + at + kPrefetchDistance);
     prefetch(job_.target_variance + at + kPrefetchDistance);
     const Floats zero = broadcast(0.0f), one = broadcast(1.0f), two = broadcast(2.0f);
-    const Floats raw = fnma(offset, offset, square);
-    const Floats v = max(zero, raw);  // max(0, NaN) is NaN
-    const Floats covariance = fnma(offset, offset_t, product);
-    const Floats inv_l = one / (fma(m, m, mt * mt) + broadcast(kC1));
-    const Floats inv_s = one / (v + vt + broadcast(kC2));
-    const Floats luminance = fma(two * m, mt, broadcast(kC1)) * inv_l;
-    const Floats structure = fma(two, covariance, broadcast(kC2)) * inv_s;
-    const Floats s = luminance * structure;
-    if (job_.gradient != nullptr) {
-      const Floats slope = broadcast(job_.ssim_slope);
-      const Floats by_product = slope * two * luminance * inv_s;
-      // A variance that was clamped at 0 has no gradient; a NaN stays NaN.
-      const Floats by_square = select(raw < zero, zero, -(slope * s * inv_s));
-      const Floats explicit_part = slope * two * structure * inv_l * fnma(m, luminance, mt);
-      const Floats by_mean = explicit_part - fma(two * offset, by_square, offset_t * by_product);
-      store_first(ring(y, 0) + c, by_mean, lanes);
-      store_first(ring(y, 1) + c, by_square, lanes);
-      store_first(ring(y, 2) + c, by_product, lanes);
+    const Floats c1 = broadcast(kC1), c2 = broadcast(kC2);
+    const Floats mean_x = mean_t + p;
+    const Floats raw_d = fnma(p, p, q);
+    const Floats var_d = max(zero, raw_d);  // max(0, NaN) is NaN
+    const Floats raw_x = fma(two, fnma(mean_t, p, r), var_t + var_d);
+    const Floats inv_d = one / (max(zero, raw_x) + (var_t + c2));
+    const Floats means = mean_t * mean_x;
+    const Floats n = fma(two, means, c1);
+    const Floats inv_m = one / fma(p, p, n);
+    const Floats a = var_d * inv_d, luminance = n * inv_m, p_by_m = p * inv_m;
+    Floats lacking = fma(a, luminance, p * p_by_m);
+    Floats weight = one;
+    if (kWeighted) {
+      weight = load_lanes(centre_weights(row) + c, lanes);
+      lacking = lacking * weight;
     }
-    return lanes == kLanes ? s : select_or_zero(mask_from_bits((1u << lanes) - 1), s);
+    if (job_.gradient != nullptr) {
+      Floats common = two * luminance * inv_d;
+      Floats by_luminance = two * p_by_m * inv_m * fma(mean_t, mean_t, means + c1) * (one - a);
+      if (kWeighted) common = common * weight, by_luminance = by_luminance * weight;
+      // A variance that was clamped at 0 has no gradient; a NaN stays NaN.
+      const Floats v = select(raw_x < zero, zero, common * a);
+      const Floats u = select(raw_d < zero, zero, common - v);
+      const Floats by_p = fma(mean_t, v, fnma(p, u, by_luminance));
+      store_lanes(ring(y, 0) + c, by_p, lanes);
+      store_lanes(ring(y, 1) + c, u, lanes);
+      store_lanes(ring(y, 2) + c, v, lanes);
+    }
+    return lanes == kLanes ? lacking : select_or_zero(mask_from_bits((1u << lanes) - 1), lacking);
   }
 
   void gradient_group(int y) {
@@ -256,53 +326,72 @@ class Band {
         const int row = y - kMapShrink + i;
         map[i][f] = row >= 0 && row < map_rows_ ? ring(row, f) : zeros_;
       }
+    if (kWeighted) expand_weights(y, weight_rows_);
+    const WindowWeights w(job_.window);
+    RowSums sums;
     for_each_column(
         map_columns_, columns_, kRowShrink,
-        [&](int c, int lanes, int chunk_index) {
-          if (lanes == kLanes)
-            sum_down(weights_, chunk_, chunk_index, [&](int i, Floats* v) {
-              for (int f = 0; f < kFields; ++f) v[f] = load(map[i][f] + c);
-            });
-          else
-            sum_down(weights_, chunk_, chunk_index, [&](int i, Floats* v) {
-              for (int f = 0; f < kFields; ++f) v[f] = load_first(map[i][f] + c, lanes);
-            });
+        [&](int c, int lanes, int chunk_index) __attribute__((always_inline)) {
+          sum_down(w, chunk_, chunk_index, [&](int i, Floats* v) {
+            for (int f = 0; f < kFields; ++f) v[f] = load_lanes(map[i][f] + c, lanes);
+          });
         },
-        [&](int c, int lanes, int chunk_index) {
+        [&](int c, int lanes, int chunk_index) __attribute__((always_inline)) {
           for (int row = 0; row < kGroup; ++row)
-            if (y + row >= first_ && y + row < last_)
-              gradient_vector(y + row, row, c, lanes, chunk_index);
+            if (is_own_row(y + row))
+              sums.part[row] += gradient_vector(w, y + row, row, c, lanes, chunk_index);
+          sums.next(c + kLanes >= columns_);
         });
+    store_totals(sums, y, kGroup, job_.l1_rows);
   }
 
-  XRGS_INLINE void gradient_vector(int y, int row, int c, int lanes, int chunk_index) {
+  // Stores the gradient of one vector, and returns its |d|, times the weights.
+  XRGS_INLINE Floats gradient_vector(const WindowWeights& w, int y, int row, int c, int lanes,
+                                     int chunk_index) {
     const std::size_t at = static_cast<std::size_t>(y) * columns_ + c;
-    const Floats a = sum_across(weights_, &chunk_.rows[row][0][chunk_index]);
-    const Floats b = sum_across(weights_, &chunk_.rows[row][1][chunk_index]);
-    const Floats p = sum_across(weights_, &chunk_.rows[row][2][chunk_index]);
+    const Floats by_p = sum_across(w, &chunk_.rows[row][0][chunk_index]);
+    const Floats u = sum_across(w, &chunk_.rows[row][1][chunk_index]);
+    const Floats v = sum_across(w, &chunk_.rows[row][2][chunk_index]);
     const Floats x = load_lanes(job_.image + at, lanes), t = load_lanes(job_.target + at, lanes);
-    const Floats slope = broadcast(job_.l1_slope), two = broadcast(2.0f),
-                 middle = broadcast(kMidpoint);
+    const Floats d = x - t;
+    Floats difference = abs(d), slope = broadcast(job_.l1_slope);
+    if (kWeighted) {
+      const Floats weight = load_lanes(pixel_weights(row) + c, lanes);
+      difference = weight * difference;
+      slope = weight * slope;
+    }
     const Floats sign = select_or_zero(t < x, slope) - select_or_zero(x < t, slope);
-    store_first(job_.gradient + at, fma(t - middle, p, fma(two * (x - middle), b, a + sign)),
-                lanes);
+    const Floats by_ssim = fnma(t, v, fma(d, u, by_p));
+    store_lanes(job_.gradient + at, fma(broadcast(job_.ssim_slope), by_ssim, sign), lanes);
+    return difference;
   }
 
+  // The pixel weights of a group's row, once for each channel.
+  float* pixel_weights(int row) const { return weight_rows_ + row * weight_row_size(job_.width); }
+  // The pixel weights at the middles of the windows of a group's row, likewise.
+  float* centre_weights(int row) const { return pixel_weights(kGroup + row) + kRowShrink / 2; }
   float* ring(int y, int field) { return ring_ + (field * kRing + (y & (kRing - 1))) * row_size_; }
 
   const PhotometricJob& job_;
-  const WindowWeights weights_;
   const int first_, last_, columns_, map_columns_, map_rows_;
   const std::size_t row_size_;
   float* const ring_;
   float* const zeros_;
+  float* const weight_rows_;  // of pixel_weights and centre_weights; only if kWeighted
   ColumnChunk chunk_;
 };
 
-std::size_t scratch_size(int width) { return (kFields * kRing + 1) * ring_row_size(width); }
+std::size_t scratch_size(const PhotometricJob& job) {
+  const int weight_rows = job.pixel_weight == nullptr ? 0 : 2 * kGroup;
+  return (kFields * kRing + 1) * ring_row_size(job.width) +
+         static_cast<std::size_t>(weight_rows) * weight_row_size(job.width);
+}
 
 void band(const PhotometricJob& job, int first, int last, float* memory) {
-  Band(job, first, last, memory).compute();
+  if (job.pixel_weight == nullptr)
+    Band<false>(job, first, last, memory).compute();
+  else
+    Band<true>(job, first, last, memory).compute();
 }
 
 }  // namespace

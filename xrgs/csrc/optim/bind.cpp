@@ -10,9 +10,11 @@
 #include <array>
 #include <cmath>
 #include <cstdint>
+#include <string>
 #include <vector>
 
 #include "optim/adam.h"
+#include "raster/types.h"
 #include "thread_pool.h"
 
 namespace nb = nanobind;
@@ -42,10 +44,26 @@ struct AdamOptions {
   }
 };
 
+// A tensor of a tuple. Nothing is converted, because the step would change the copy. Throws
+// TypeError.
+Values values_of(const nb::tuple& fields, std::size_t index, const char* name) {
+  Values values;
+  if (!nb::try_cast(fields[index], values, false))
+    throw nb::type_error(("adam_step: " + std::string(name) +
+                          " must be float32 [N], contiguous, on the CPU, without a graph")
+                             .c_str());
+  return values;
+}
+
 AdamGroup group_from_tuple(nb::handle tuple, const AdamOptions& options) {
-  const auto fields = nb::cast<nb::tuple>(tuple);
-  const auto parameter = nb::cast<Values>(fields[0]), gradient = nb::cast<Values>(fields[1]);
-  const auto exp_avg = nb::cast<Values>(fields[2]), exp_avg_sq = nb::cast<Values>(fields[3]);
+  nb::tuple fields;
+  if (!nb::try_cast(tuple, fields) || fields.size() != 6)
+    throw nb::type_error(
+        "adam_step: groups must be tuples (parameter, gradient, exp_avg, exp_avg_sq, lr, step)");
+  const Values parameter = values_of(fields, 0, "parameter");
+  const Values gradient = values_of(fields, 1, "gradient");
+  const Values exp_avg = values_of(fields, 2, "exp_avg");
+  const Values exp_avg_sq = values_of(fields, 3, "exp_avg_sq");
   for (const Values* other : {&gradient, &exp_avg, &exp_avg_sq})
     if (other->shape(0) != parameter.shape(0))
       throw nb::value_error(
@@ -93,8 +111,9 @@ void adam_step_sh_rest(ShCoefficients parameter, ShCoefficients exp_avg, ShCoeff
         "adam_step_sh_rest: shapes that do not fit: exp_avg and exp_avg_sq must have the shape of "
         "the"
         " parameter, means and sh0_gradient as many rows");
-  if (sh_degree < 0 || sh_degree > 3 ||
-      (sh_degree + 1) * (sh_degree + 1) - 1 > static_cast<int>(rest_count) || rest_count > 15)
+  if (sh_degree < 0 || sh_degree > kMaxShDegree ||
+      static_cast<std::size_t>(rest_basis_count(sh_degree)) > rest_count ||
+      rest_count > static_cast<std::size_t>(rest_basis_count(kMaxShDegree)))
     throw nb::value_error("adam_step_sh_rest: shN does not have the bands of sh_degree (0 to 3)");
   ShNAdamGroup group{};
   group.adam = AdamOptions{beta1, beta2, eps}.group(lr, step);
@@ -120,8 +139,9 @@ void bind_optim(nb::module_& m) {
         "Each group is a tuple (parameter, gradient, exp_avg, exp_avg_sq, lr, step): four float32 "
         "[N],\n"
         "the learning rate, and the number of this step, from 1.");
-  m.def("adam_step_sh_rest", &adam_step_sh_rest, nb::arg("parameter"), nb::arg("exp_avg"),
-        nb::arg("exp_avg_sq"), nb::arg("means"), nb::arg("sh0_gradient"),
+  m.def("adam_step_sh_rest", &adam_step_sh_rest, nb::arg("parameter").noconvert(),
+        nb::arg("exp_avg").noconvert(), nb::arg("exp_avg_sq").noconvert(),
+        nb::arg("means").noconvert(), nb::arg("sh0_gradient").noconvert(),
         nb::arg("camera_position"), nb::arg("sh_degree"), nb::arg("lr"), nb::arg("step"),
         nb::arg("beta1"), nb::arg("beta2"), nb::arg("eps"), nb::arg("threads"),
         "Make one step of Adam on shN [N, K - 1, 3] in place.\n\n"

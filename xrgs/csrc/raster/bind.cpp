@@ -62,6 +62,16 @@ void check_rows(const char* name, std::size_t rows, std::size_t expected) {
                               .c_str());
 }
 
+void check_bands(std::size_t stored, int sh_degree) {
+  constexpr auto most = static_cast<std::size_t>(rest_basis_count(kMaxShDegree));
+  if (stored > most)
+    throw nb::value_error(
+        ("shN must have at most " + std::to_string(most) + " bands, got " + std::to_string(stored))
+            .c_str());
+  if (stored < static_cast<std::size_t>(rest_basis_count(sh_degree)))
+    throw nb::value_error("shN has fewer bands than sh_degree needs");
+}
+
 // The parameter tensors of a call, which own the memory that GaussianParameters points to.
 struct ParameterTensors {
   Vectors means;
@@ -71,7 +81,8 @@ struct ParameterTensors {
   ShCoefficients sh0, shN;
   std::optional<Offsets> means2d_offset;
 
-  GaussianParameters checked() const {
+  // Throws ValueError where shapes do not fit one another or the degree of the harmonics.
+  GaussianParameters checked(int sh_degree) const {
     const std::size_t count = means.shape(0);
     check_rows("quats", quats.shape(0), count);
     check_rows("scales", scales.shape(0), count);
@@ -79,6 +90,7 @@ struct ParameterTensors {
     check_rows("sh0", sh0.shape(0), count);
     check_rows("shN", shN.shape(0), count);
     if (sh0.shape(1) != 1) throw nb::value_error("sh0 must be [N, 1, 3]");
+    check_bands(shN.shape(1), sh_degree);
     if (means2d_offset) check_rows("means2d_offset", means2d_offset->shape(0), count);
     if (count > 0xffffffffu) throw nb::value_error("means has more than 2^32 - 1 rows");
     return {static_cast<std::int64_t>(count),
@@ -120,12 +132,25 @@ bool all_finite(const float* p, std::size_t count) {
   throw nb::value_error("sh0 and shN overflow: a colour is not finite");
 }
 
+// Throws MemoryError. The message is made without further allocations.
 [[noreturn]] void throw_out_of_memory(const Frame& frame) {
-  const std::string message = "the lists of " + std::to_string(frame.visible_count) +
-                              " visible Gaussians in " + std::to_string(frame.config.width) + "x" +
-                              std::to_string(frame.config.height) + " px do not fit in memory";
-  PyErr_SetString(PyExc_MemoryError, message.c_str());
+  if (frame.visible_count > 0)
+    PyErr_Format(
+        PyExc_MemoryError, "the lists of %lld visible Gaussians in %dx%d px do not fit in memory",
+        static_cast<long long>(frame.visible_count), frame.config.width, frame.config.height);
+  else
+    PyErr_Format(PyExc_MemoryError,
+                 "%lld Gaussians do not fit in memory a second time, projected to %dx%d px",
+                 static_cast<long long>(frame.gaussian_count), frame.config.width,
+                 frame.config.height);
   throw nb::python_error();
+}
+
+// The frame of a render that was completed. Throws ValueError where there is none.
+Frame& rendered(FrameHandle& frame) {
+  if (!frame->rendered)
+    throw nb::value_error("the frame has no render: call forward first, and without an error");
+  return *frame;
 }
 
 std::tuple<Output, Output> forward(FrameHandle& frame, const RenderConfig& config,
@@ -134,9 +159,7 @@ std::tuple<Output, Output> forward(FrameHandle& frame, const RenderConfig& confi
                                    const ShCoefficients& sh0, const ShCoefficients& shN,
                                    const std::optional<Offsets>& means2d_offset, int threads) {
   const ParameterTensors tensors{means, quats, scales, opacities, sh0, shN, means2d_offset};
-  const GaussianParameters parameters = tensors.checked();
-  if ((config.sh_degree + 1) * (config.sh_degree + 1) - 1 > parameters.rest_count)
-    throw nb::value_error("shN has fewer bands than sh_degree needs");
+  const GaussianParameters parameters = tensors.checked(config.sh_degree);
   const auto height = static_cast<std::size_t>(config.height);
   const auto width = static_cast<std::size_t>(config.width);
   Output image = new_array<float>({height, width, 3}), alpha = new_array<float>({height, width});
@@ -159,16 +182,17 @@ std::tuple<Output, Output> forward(FrameHandle& frame, const RenderConfig& confi
 using GradientTensors = std::tuple<Output, Output, Output, Output, Output, std::optional<Output>,
                                    std::optional<Output>>;
 
-GradientTensors backward(FrameHandle& frame, const Image& v_image, const Plane& v_alpha,
+GradientTensors backward(FrameHandle& handle, const Image& v_image, const Plane& v_alpha,
                          const Vectors& means, const Quaternions& quats, const Vectors& scales,
                          const Scalars& opacities, const ShCoefficients& sh0,
                          const ShCoefficients& shN, const std::optional<Offsets>& means2d_offset,
                          bool with_shN, int threads) {
   const ParameterTensors tensors{means, quats, scales, opacities, sh0, shN, means2d_offset};
-  const GaussianParameters parameters = tensors.checked();
-  check_rows("means", means.shape(0), static_cast<std::size_t>(frame->gaussian_count));
-  const auto height = static_cast<std::size_t>(frame->config.height);
-  const auto width = static_cast<std::size_t>(frame->config.width);
+  Frame& frame = rendered(handle);
+  const GaussianParameters parameters = tensors.checked(frame.config.sh_degree);
+  check_rows("means", means.shape(0), static_cast<std::size_t>(frame.gaussian_count));
+  const auto height = static_cast<std::size_t>(frame.config.height);
+  const auto width = static_cast<std::size_t>(frame.config.width);
   if (v_image.shape(0) != height || v_image.shape(1) != width || v_alpha.shape(0) != height ||
       v_alpha.shape(1) != width)
     throw nb::value_error("the gradients must have the image's size");
@@ -194,12 +218,12 @@ GradientTensors backward(FrameHandle& frame, const Image& v_image, const Plane& 
   {
     nb::gil_scoped_release release;
     try {
-      render_backward(threads, parameters, *frame, v_image.data(), v_alpha.data(), gradients);
+      render_backward(threads, parameters, frame, v_image.data(), v_alpha.data(), gradients);
     } catch (const std::bad_alloc&) {
       allocation_ok = false;
     }
   }
-  if (!allocation_ok) throw_out_of_memory(*frame);
+  if (!allocation_ok) throw_out_of_memory(frame);
   return out;
 }
 
@@ -238,7 +262,8 @@ RenderConfig make_config(const Matrix4& viewmat, const std::array<float, 4>& int
   config.near = near;
   config.eps2d = eps2d;
   config.alpha_min = std::max(alpha_min, std::numeric_limits<float>::min());
-  config.log2_alpha_min = std::log2(config.alpha_min);
+  // In double, whose rounding to float hides how mathematical libraries differ.
+  config.log2_alpha_min = static_cast<float>(std::log2(static_cast<double>(config.alpha_min)));
   config.alpha_max = alpha_max;
   config.transmittance_min = transmittance_min;
   config.antialiased = antialiased;
@@ -248,17 +273,17 @@ RenderConfig make_config(const Matrix4& viewmat, const std::array<float, 4>& int
   return config;
 }
 
-Output visible_mask(FrameHandle& frame) {
-  const auto count = static_cast<std::size_t>(frame->gaussian_count);
+Output visible_mask(FrameHandle& handle) {
+  const Frame& frame = rendered(handle);
+  const auto count = static_cast<std::size_t>(frame.gaussian_count);
   Output out = new_array<bool>({count});
   bool* visible = static_cast<bool*>(out.data());
-  for (std::size_t i = 0; i < count; ++i)
-    visible[i] = (frame->visible[i / 16] >> (i % 16) & 1) != 0;
+  for (std::size_t i = 0; i < count; ++i) visible[i] = (frame.visible[i / 16] >> (i % 16) & 1) != 0;
   return out;
 }
 
 nb::dict timings_dict(FrameHandle& frame) {
-  const Timings& t = frame->timings;
+  const Timings& t = rendered(frame).timings;
   nb::dict out;
   out["project"] = t.project;
   out["sort"] = t.sort;
@@ -280,26 +305,30 @@ void bind_raster(nb::module_& m) {
            "viewmat: 16 floats, world to camera, row by row. intrinsics: fx, fy, cx, cy in px.\n"
            "culling: out_of_view, sub_threshold, tiles, blocks, saturated, as in\n"
            "xrgs.splat.settings.CullingOptions. The others are those of RasterSettings.");
+  // Tensors are never converted: a copy of another type would cost more than the render.
   nb::class_<FrameHandle>(m, "Frame",
                           "The memory of one rendered view, from its forward to its backward pass.")
       .def(nb::init<>())
-      .def("forward", &forward, "config"_a, "means"_a, "quats"_a, "scales"_a, "opacities"_a,
-           "sh0"_a, "shN"_a, "means2d_offset"_a.none(), "threads"_a,
+      .def("forward", &forward, "config"_a, "means"_a.noconvert(), "quats"_a.noconvert(),
+           "scales"_a.noconvert(), "opacities"_a.noconvert(), "sh0"_a.noconvert(),
+           "shN"_a.noconvert(), "means2d_offset"_a.none().noconvert(), "threads"_a,
            "Render the Gaussians: image [H, W, 3] and alpha [H, W].")
-      .def("backward", &backward, "v_image"_a, "v_alpha"_a, "means"_a, "quats"_a, "scales"_a,
-           "opacities"_a, "sh0"_a, "shN"_a, "means2d_offset"_a.none(), "with_shN"_a, "threads"_a,
+      .def("backward", &backward, "v_image"_a.noconvert(), "v_alpha"_a.noconvert(),
+           "means"_a.noconvert(), "quats"_a.noconvert(), "scales"_a.noconvert(),
+           "opacities"_a.noconvert(), "sh0"_a.noconvert(), "shN"_a.noconvert(),
+           "means2d_offset"_a.none().noconvert(), "with_shN"_a, "threads"_a,
            "Compute the gradients of the parameters, in their order, from those of image and "
            "alpha.\n"
            "shN's is None unless with_shN, that of means2d_offset is None where there is none.")
       .def("visible", &visible_mask, "Return which Gaussians are visible: [N] bool.")
       .def_prop_ro(
-          "pair_count", [](FrameHandle& f) { return f->pair_count(); },
+          "pair_count", [](FrameHandle& f) { return rendered(f).pair_count(); },
           "Number of (tile, Gaussian) pairs, gsplat's number of tile intersections.")
       .def_prop_ro(
-          "evaluations", [](FrameHandle& f) { return f->evaluations(); },
+          "evaluations", [](FrameHandle& f) { return rendered(f).evaluations(); },
           "Number of alphas that were computed: one for each pixel and Gaussian.")
       .def_prop_ro(
-          "bytes", [](FrameHandle& f) { return f->bytes(); },
+          "bytes", [](FrameHandle& f) { return rendered(f).bytes(); },
           "Memory in use, in bytes, including that of the backward pass.")
       .def_prop_ro("timings", &timings_dict, "Duration of each stage, in milliseconds.");
 }

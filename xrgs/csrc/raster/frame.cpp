@@ -1,6 +1,6 @@
 #include "raster/frame.h"
 
-#include <cstdlib>
+#include <array>
 #include <mutex>
 #include <new>
 
@@ -17,19 +17,24 @@ class FreeList {
  public:
   std::unique_ptr<T> acquire() {
     std::lock_guard<std::mutex> lock(mutex_);
-    if (unused_.empty()) return std::make_unique<T>();
-    std::unique_ptr<T> last = std::move(unused_.back());
-    unused_.pop_back();
-    return last;
+    if (count_ == 0) return std::make_unique<T>();
+    return std::move(unused_[--count_]);
   }
-  void release(std::unique_ptr<T> object) {
+  void release(std::unique_ptr<T> object) noexcept {
     std::lock_guard<std::mutex> lock(mutex_);
-    if (unused_.size() < kMaxUnused) unused_.push_back(std::move(object));
+    if (count_ < kMaxUnused) unused_[count_++] = std::move(object);
   }
+#ifdef XRGS_FAULT_INJECTION
+  void clear() noexcept {
+    std::lock_guard<std::mutex> lock(mutex_);
+    while (count_ > 0) unused_[--count_].reset();
+  }
+#endif
 
  private:
   std::mutex mutex_;
-  std::vector<std::unique_ptr<T>> unused_;
+  std::array<std::unique_ptr<T>, kMaxUnused> unused_;
+  std::size_t count_ = 0;
 };
 
 // The list is never destroyed, because a frame may outlive every static when the interpreter exits.
@@ -41,14 +46,13 @@ FreeList<T>& free_list() {
 
 }  // namespace
 
-void* replace_block(void* block, std::size_t bytes) {
-  std::free(block);
-  void* replacement = allocate(bytes);
-  if (replacement == nullptr) throw std::bad_alloc();
-  return replacement;
+void* new_block(std::size_t bytes) {
+  void* block = allocate(bytes);
+  if (block == nullptr) throw std::bad_alloc();
+  return block;
 }
 
-void free_block(void* block) noexcept { std::free(block); }
+void free_block(void* block) noexcept { deallocate(block); }
 
 std::int64_t Frame::evaluations() const {
   std::int64_t sum = 0;
@@ -66,11 +70,19 @@ std::int64_t Frame::bytes() const {
 
 std::unique_ptr<Frame> acquire_frame() { return free_list<Frame>().acquire(); }
 void release_frame(std::unique_ptr<Frame> frame) noexcept {
+  frame->rendered = false;
   free_list<Frame>().release(std::move(frame));
 }
 std::unique_ptr<Workspace> acquire_workspace() { return free_list<Workspace>().acquire(); }
 void release_workspace(std::unique_ptr<Workspace> workspace) noexcept {
   free_list<Workspace>().release(std::move(workspace));
 }
+
+#ifdef XRGS_FAULT_INJECTION
+void delete_unused_frames() noexcept {
+  free_list<Frame>().clear();
+  free_list<Workspace>().clear();
+}
+#endif
 
 }  // namespace xrgs

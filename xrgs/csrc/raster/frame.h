@@ -14,8 +14,8 @@
 
 namespace xrgs {
 
-// Frees `block` and returns a block of at least `bytes` in its place. Throws std::bad_alloc.
-void* replace_block(void* block, std::size_t bytes);
+// Returns an uninitialised block of at least `bytes`. Throws std::bad_alloc.
+void* new_block(std::size_t bytes);
 void free_block(void* block) noexcept;
 
 // An array on a 64-byte boundary whose memory only grows and is never initialised.
@@ -31,12 +31,15 @@ class Buffer {
   Buffer& operator=(Buffer&&) = delete;
   ~Buffer() { free_block(data_); }
 
-  // Makes room for `size` elements. The contents are lost where the memory has to grow.
+  // Makes room for `size` elements. The contents are lost where the memory has to grow. Throws
+  // std::bad_alloc and is empty then.
   T* resize(std::size_t size) {
     if (size > capacity_) {
       const std::size_t new_capacity = kExactBuffers ? size : size + size / 8;
-      capacity_ = 0;
-      data_ = static_cast<T*>(replace_block(data_, new_capacity * sizeof(T)));
+      // The old block is freed first, so that the two are never in memory at once.
+      free_block(std::exchange(data_, nullptr));
+      capacity_ = size_ = 0;
+      data_ = static_cast<T*>(new_block(new_capacity * sizeof(T)));
       capacity_ = new_capacity;
     }
     size_ = size;
@@ -71,6 +74,7 @@ struct Timings {
 };
 
 struct Frame {
+  bool rendered = false;  // whether the members below are those of a render that was completed
   RenderConfig config;
   std::int64_t gaussian_count = 0;             // N
   std::int64_t visible_count = 0;              // M
@@ -109,5 +113,10 @@ std::unique_ptr<Frame> acquire_frame();
 void release_frame(std::unique_ptr<Frame> frame) noexcept;
 std::unique_ptr<Workspace> acquire_workspace();
 void release_workspace(std::unique_ptr<Workspace> workspace) noexcept;
+
+#ifdef XRGS_FAULT_INJECTION
+// For tests only: the next render has to allocate everything.
+void delete_unused_frames() noexcept;
+#endif
 
 }  // namespace xrgs

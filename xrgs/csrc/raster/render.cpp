@@ -111,8 +111,10 @@ void for_each_tile(int threads, const Frame& frame, Body&& body) {
 bool render(int threads, const GaussianParameters& parameters, const RenderConfig& config,
             Frame& frame, float* image, float* alpha) {
   const RasterKernels& kernels = XRGS_SELECT(raster_kernels);
+  frame.rendered = false;
   ScopedWorkspace workspace;
   frame.config = config;
+  frame.visible_count = 0;
   StageTimer timer;
   if (!project_chunks(threads, kernels, parameters, frame, *workspace)) return false;
   frame.timings.project = timer.elapsed_ms();
@@ -122,6 +124,7 @@ bool render(int threads, const GaussianParameters& parameters, const RenderConfi
   frame.timings.intersect_tiles = timer.elapsed_ms();
   for_each_tile(threads, frame, [&](int tile) { kernels.composite(frame, tile, image, alpha); });
   frame.timings.composite = timer.elapsed_ms();
+  frame.rendered = true;
   return true;
 }
 

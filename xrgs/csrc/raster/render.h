@@ -6,13 +6,15 @@
 
 namespace xrgs {
 
-// Renders into image [H, W, 3] and alpha [H, W]. Returns false, with nothing rendered, where a
-// parameter is not finite or out of range. Throws std::bad_alloc.
+// Renders into image [H, W, 3] and alpha [H, W], and sets frame.rendered. Returns false, with
+// nothing rendered, where a parameter is not finite or out of range. Throws std::bad_alloc. In both
+// cases frame.rendered is false, and the frame can be rendered into again.
 bool render(int threads, const GaussianParameters& parameters, const RenderConfig& config,
             Frame& frame, float* image, float* alpha);
 
 // Writes the gradients of the parameters, given those of image and alpha. The parameters must be
-// the ones that were rendered into the frame. Throws std::bad_alloc.
+// the ones that were rendered into the frame. Throws std::bad_alloc, after which it can be called
+// again.
 void render_backward(int threads, const GaussianParameters& parameters, Frame& frame,
                      const float* v_image, const float* v_alpha,
                      const ParameterGradients& gradients);

@@ -20,9 +20,6 @@ constexpr float kC2 = 1.09254843f, kC20 = 0.31539157f;   // sqrt(15 / 4 pi), sqr
 constexpr float kC31 = 0.45704580f, kC32 = 2.89061144f;  // sqrt(21 / 32 pi), sqrt(105 / 4 pi)
 constexpr float kC33 = 0.59004359f, kC30 = 0.37317633f;  // sqrt(35 / 32 pi), sqrt(7 / 16 pi)
 
-// The number of basis functions of degree 1 to `degree`: K - 1 of shN [N, K - 1, 3].
-constexpr int rest_basis_count(int degree) { return (degree + 1) * (degree + 1) - 1; }
-
 // Evaluates the basis functions of degree 1 to Degree; basis[0] is the first of degree 1.
 template <int Degree>
 XRGS_INLINE void sh_basis(const Vector3& d, Floats* basis) {

@@ -11,6 +11,10 @@ constexpr int kTileSize = 16;        // side of a tile, px: sixteen 4x4 blocks, 
 constexpr int kBlocksPerTile = 16;   // row by row
 constexpr int kBatchSize = 128;      // Gaussians of a tile that are composited together
 constexpr int kProjectChunk = 1024;  // Gaussians that one task projects; a multiple of 16
+constexpr int kMaxShDegree = 3;      // of the spherical harmonics
+
+// The number of basis functions of degree 1 to `degree`: K - 1 of shN [N, K - 1, 3].
+constexpr int rest_basis_count(int degree) { return (degree + 1) * (degree + 1) - 1; }
 
 // Work that the rasterizer leaves out. Each option skips one kind of work while it is true; the
 // image is the same either way, to rounding at the thresholds.
@@ -54,7 +58,7 @@ struct GaussianParameters {
   const float* opacities;       // [N]
   const float* sh0;             // [N, 3]
   const float* shN;             // [N, rest_count, 3]
-  int rest_count;               // basis functions above degree 0 that are stored
+  int rest_count;               // basis functions above degree 0 that are stored, at most 15
   const float* means2d_offset;  // [N, 2] px added to the projected means, or null
 };
 

@@ -6,7 +6,6 @@
 
 #include <cstdint>
 #include <limits>
-#include <memory>
 
 #include "output_arrays.h"
 #include "resample/resample.h"
@@ -20,7 +19,6 @@ namespace {
 using Image = nb::ndarray<const float, nb::shape<-1, -1, 3>, nb::c_contig, nb::device::cpu>;
 using First = nb::ndarray<const std::int32_t, nb::ndim<1>, nb::c_contig, nb::device::cpu>;
 using Weights = nb::ndarray<const float, nb::ndim<2>, nb::c_contig, nb::device::cpu>;
-using Scratch = std::unique_ptr<void, ReleaseBlock>;
 
 constexpr int kRowsPerTask = 16;
 
@@ -52,13 +50,13 @@ void resample_across(const BandedMatrix& columns, const float* in, int height, i
   const ResampleKernels& kernels = XRGS_SELECT(resample_kernels);
   const int tasks = (height + kRowsPerTask - 1) / kRowsPerTask;
   const std::size_t size = kernels.scratch_size(width);
-  Scratch scratch(acquire_block(tasks * size * sizeof(float)));
+  const OwnedBlock scratch = acquire_block(tasks * size * sizeof(float));
   parallel_for(threads, tasks, [&](std::int64_t task) {
     const int first = static_cast<int>(task) * kRowsPerTask;
     const int rows = height - first < kRowsPerTask ? height - first : kRowsPerTask;
     kernels.across(columns, in + static_cast<std::size_t>(3) * first * width, width, rows,
                    out + static_cast<std::size_t>(3) * first * columns.count,
-                   static_cast<float*>(scratch.get()) + task * size);
+                   static_cast<float*>(scratch->data) + task * size);
   });
 }
 
@@ -76,13 +74,13 @@ Output resample(Image image, First row_first, Weights row_weights, First column_
   nb::gil_scoped_release release;
   // The pass across comes where the image has fewer rows.
   if (new_height <= height) {
-    Scratch intermediate(acquire_block(3 * new_height * width * sizeof(float)));
-    float* between = static_cast<float*>(intermediate.get());
+    const OwnedBlock intermediate = acquire_block(3 * new_height * width * sizeof(float));
+    float* between = static_cast<float*>(intermediate->data);
     resample_down(rows, image.data(), 3 * width, between, threads);
     resample_across(columns, between, rows.count, static_cast<int>(width), to, threads);
   } else {
-    Scratch intermediate(acquire_block(3 * height * new_width * sizeof(float)));
-    float* between = static_cast<float*>(intermediate.get());
+    const OwnedBlock intermediate = acquire_block(3 * height * new_width * sizeof(float));
+    float* between = static_cast<float*>(intermediate->data);
     resample_across(columns, image.data(), static_cast<int>(height), static_cast<int>(width),
                     between, threads);
     resample_down(rows, between, 3 * new_width, to, threads);
@@ -93,8 +91,9 @@ Output resample(Image image, First row_first, Weights row_weights, First column_
 }  // namespace
 
 void bind_resample(nb::module_& m) {
-  m.def("resample", &resample, nb::arg("image"), nb::arg("row_first"), nb::arg("row_weights"),
-        nb::arg("column_first"), nb::arg("column_weights"), nb::arg("threads"),
+  m.def("resample", &resample, nb::arg("image").noconvert(), nb::arg("row_first").noconvert(),
+        nb::arg("row_weights").noconvert(), nb::arg("column_first").noconvert(),
+        nb::arg("column_weights").noconvert(), nb::arg("threads"),
         "Multiply an image [H, W, 3] by a banded matrix down and another across: [h, w, 3].\n\n"
         "Output i is the sum over t of weights[i, t] times input first[i] + t.");
 }

@@ -1,4 +1,5 @@
-// exp2 and log2 of simd.h over whole arrays, so that tests can call them.
+// exp2 and log2 of simd.h over whole arrays, so that tests can call them, and what an instruction
+// set says of its arithmetic.
 #pragma once
 
 #include <cstdint>
@@ -10,6 +11,7 @@ namespace xrgs {
 struct ArrayMathKernels {
   void (*exp2)(const float* x, float* y, std::int64_t count);
   void (*log2)(const float* x, float* y, std::int64_t count);
+  bool fused_multiply_add;  // kFusedMultiplyAdd of simd.h
 };
 
 XRGS_DECLARE_TABLE(ArrayMathKernels, array_math_kernels)

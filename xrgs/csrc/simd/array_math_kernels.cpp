@@ -21,7 +21,7 @@ void log2_array(const float* x, float* y, std::int64_t count) {
 
 }  // namespace
 
-extern const ArrayMathKernels array_math_kernels{exp2_array, log2_array};
+extern const ArrayMathKernels array_math_kernels{exp2_array, log2_array, kFusedMultiplyAdd};
 
 }  // namespace XRGS_NS
 }  // namespace xrgs

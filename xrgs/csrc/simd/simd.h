@@ -42,7 +42,8 @@
 //   Ints shift_right<Count>(Ints)       arithmetic: copies of the sign bit move in
 //   as_ints(Floats), as_floats(Ints)    the same bits as the other type
 //   to_floats(Ints)                     the nearest float
-//   to_ints(Floats)                     rounded towards zero
+//   to_ints(Floats)                     rounded towards zero; of numbers that fit no int32
+//                                       unspecified
 //
 //   float sum_lanes(a)                  upper half plus lower half, and so on down to one lane
 //   void interleave(a, b, low, high)    low = a0 b0 a1 b1 ... a7 b7, high = a8 b8 ... a15 b15
@@ -82,7 +83,7 @@ constexpr int kLanes = 16;
 #elif defined(__AVX2__)
 #include "simd/avx2.h"
 #else
-#include "simd/portable.h"
+#include "simd/vector16.h"
 #endif
 
 // What follows is made of the operations above, the same for every instruction set.
@@ -139,6 +140,33 @@ XRGS_INLINE Floats exp2(Floats x) {
   Floats out[1];
   exp2(in, out);
   return out[0];
+}
+
+// e^x with a relative error below 1.0e-7, and exactly 1 at 0: 0 where e^x is below 2^-126, infinite
+// where it is above the largest float, NaN for NaN. No value lies below the normal numbers, so that
+// the result is the same where the processor flushes those to 0.
+//
+// e^x = 2^n e^r, with n the integer nearest to x / ln 2 and r = x - n ln 2. ln 2 is subtracted in
+// two parts, the first of which has so few bits that its product with n is exact. e^r is a
+// polynomial of degree 6 whose first two coefficients are 1. Its relative error is 3.1e-9; the rest
+// is rounding.
+XRGS_INLINE Floats exp(Floats x) {
+  const Floats magic = broadcast(12582912.0f);  // as in exp2
+  const Floats t = fma(x, broadcast(1.44269504f), magic);
+  const Floats n = t - magic;
+  const Floats r = fnma(n, broadcast(-2.12194440e-4f), fnma(n, broadcast(0.693359375f), x));
+  Floats p = fma(r, broadcast(0.0013814539f), broadcast(0.008368745f));
+  p = fma(r, p, broadcast(0.04166839f));
+  p = fma(r, p, broadcast(0.16666521f));
+  p = fma(r, p, broadcast(0.49999994f));
+  p = fma(r, p, broadcast(1.0f));
+  p = fma(r, p, broadcast(1.0f));
+  const Floats y = as_floats(as_ints(p) + shift_left<23>(as_ints(t)));
+  // Outside of these bounds, the first and last floats whose result is a normal number, n does not
+  // fit the exponent.
+  const Floats small = select(x < broadcast(-87.336540f), broadcast(0.0f), y);
+  const Floats all = select(broadcast(88.722831f) < x, broadcast(__builtin_inff()), small);
+  return select(x == x, all, x);
 }
 
 // For a >= 0: at least sqrt(max(a, 1e-20)), and at most 0.2% more.

@@ -13,3 +13,15 @@ def require_float32(name: str, value: Tensor) -> None:
             f"{name} must be float32 on the CPU for the native backend, got {value.dtype} on"
             f" {value.device}"
         )
+
+
+def require_contiguous(name: str, value: Tensor) -> None:
+    """Raise ValueError unless a tensor, named in the message, is float32, contiguous, on the CPU.
+
+    A kernel that changes a tensor in place cannot take a copy of it.
+    """
+    require_float32(name, value)
+    if not value.is_contiguous():
+        raise ValueError(
+            f"{name} must be contiguous for the native backend, got strides {value.stride()}"
+        )

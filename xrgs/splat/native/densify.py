@@ -6,6 +6,7 @@ import torch
 from torch import Tensor
 
 from xrgs import _native
+from xrgs.splat.native.arguments import require_contiguous, require_float32
 
 
 def accumulate_statistics(
@@ -24,12 +25,23 @@ def accumulate_statistics(
             device units.
         grad2d_sum: [N] float32 to which the gradients' norms are added in place.
         visible_count: [N] float32 to which 1 is added in place where visible.
+
+    Raises:
+        ValueError: A tensor does not have its type or shape, or a sum is not contiguous.
     """
+    require_float32("means2d_grad", means2d_grad)
+    if visible.dtype != torch.bool:
+        raise ValueError(f"visible must be bool, got {visible.dtype}")
+    require_contiguous("grad2d_sum", grad2d_sum)
+    require_contiguous("visible_count", visible_count)
     _native.accumulate_grad2d(
         means2d_grad.contiguous(),
-        visible,
+        visible.contiguous(),
         *half_size,
         grad2d_sum,
         visible_count,
         torch.get_num_threads(),
     )
+    # So that autograd refuses to use the values from before.
+    torch.autograd.graph.increment_version(grad2d_sum)
+    torch.autograd.graph.increment_version(visible_count)

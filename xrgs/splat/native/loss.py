@@ -12,39 +12,58 @@ from xrgs.splat.native.arguments import require_float32
 from xrgs.splat.ssim import Target
 
 
-def photometric_loss(image: Tensor, target: Target, l1: float, ssim: float) -> Tensor:
-    """Return `xrgs.splat.loss.photometric_loss` without pixel weights; once differentiable.
+def photometric_loss(
+    image: Tensor, target: Target, l1: float, ssim: float, pixel_weight: Tensor | None
+) -> Tensor:
+    """Return `xrgs.splat.loss.photometric_loss`; once differentiable, by the image only.
 
     Sums are kept in double and added in a fixed order: value and gradient are bitwise the same for
-    any number of threads. Where the image or its target is NaN, so are the loss and the gradient
-    of the pixels under the same windows.
+    any number of threads. Where the image, its target or the weight of a window is NaN, so are the
+    loss and the gradient of the pixels under the same windows.
 
     Args:
         image: [H, W, 3] render, float32 on the CPU, of any strides.
         target: The photograph, of the same shape and type.
         l1: Weight of the absolute difference.
         ssim: Weight of the structural dissimilarity.
+        pixel_weight: [H, W], float32 on the CPU, of any strides; None weighs all pixels 1.
 
     Returns:
         A scalar.
 
     Raises:
-        ValueError: `image` or `target` is not float32 on the CPU.
+        ValueError: `image`, `target` or `pixel_weight` is not float32 on the CPU, or `pixel_weight`
+            requires a gradient.
     """
     require_float32("image", image)
     require_float32("target", target.image)
-    loss: Tensor = _Photometric.apply(image, target, l1, ssim)
+    if pixel_weight is not None:
+        require_float32("pixel_weight", pixel_weight)
+        if pixel_weight.requires_grad:
+            raise ValueError(
+                "pixel_weight must not require a gradient: the native backend has none by it"
+            )
+        pixel_weight = pixel_weight.contiguous()
+    loss: Tensor = _Photometric.apply(image, target, l1, ssim, pixel_weight)
     return loss
 
 
 class _Photometric(torch.autograd.Function):
     @staticmethod
-    def forward(ctx: Any, image: Tensor, target: Target, l1: float, ssim: float) -> Tensor:
+    def forward(
+        ctx: Any,
+        image: Tensor,
+        target: Target,
+        l1: float,
+        ssim: float,
+        pixel_weight: Tensor | None,
+    ) -> Tensor:
         value, gradient = _native.photometric_loss(
             image.detach().contiguous(),
             target.image,
             target.mean,
             target.variance,
+            pixel_weight,
             l1,
             ssim,
             ctx.needs_input_grad[0],
@@ -56,7 +75,7 @@ class _Photometric(torch.autograd.Function):
 
     @staticmethod
     @torch.autograd.function.once_differentiable
-    def backward(ctx: Any, v_loss: Tensor) -> tuple[Tensor, None, None, None]:
+    def backward(ctx: Any, v_loss: Tensor) -> tuple[Tensor, None, None, None, None]:
         (gradient,) = ctx.saved_tensors
         # A loss that nothing multiplies spares a pass over the image.
-        return gradient if v_loss == 1 else gradient * v_loss, None, None, None
+        return gradient if v_loss == 1 else gradient * v_loss, None, None, None, None

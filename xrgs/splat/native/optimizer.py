@@ -41,7 +41,7 @@ def step(adam: torch.optim.Adam, camera: Camera | None = None, sh_degree: int = 
     if camera is not None and groups["sh0"]["params"][0].grad is not None:
         # Before the means move: directions of view are those of the render.
         _step_harmonics(adam, groups, camera, sh_degree)
-    entries = []
+    entries, changed = [], []
     for name, group in groups.items():
         (parameter,) = group["params"]
         if parameter.grad is None:
@@ -51,7 +51,9 @@ def step(adam: torch.optim.Adam, camera: Camera | None = None, sh_degree: int = 
         tensors = (parameter, parameter.grad, state["exp_avg"], state["exp_avg_sq"])
         flat = [_require_plain(name, tensor).view(-1) for tensor in tensors]
         entries.append((*flat, group["lr"], state["step"].item()))
+        changed += [parameter, state["exp_avg"], state["exp_avg_sq"]]
     _native.adam_step(entries, beta1, beta2, adam.defaults["eps"], torch.get_num_threads())
+    _mark_changed(*changed)
 
 
 def _step_harmonics(
@@ -77,6 +79,13 @@ def _step_harmonics(
         adam.defaults["eps"],
         torch.get_num_threads(),
     )
+    _mark_changed(shN, state["exp_avg"], state["exp_avg_sq"])
+
+
+def _mark_changed(*tensors: Tensor) -> None:
+    """Count a change in place, so that a backward pass refuses to use the values from before."""
+    for tensor in tensors:
+        torch.autograd.graph.increment_version(tensor)
 
 
 def _adam_state(adam: torch.optim.Adam, parameter: Tensor) -> dict[str, Tensor]:

@@ -8,75 +8,63 @@ from torch import Tensor
 from xrgs.splat.ssim import C1, C2, WINDOW, Target, window_mean
 
 
-def photometric_loss(image: Tensor, target: Target, l1: float, ssim: float) -> Tensor:
-    """Return `xrgs.splat.loss.photometric_loss` without pixel weights; its checks have passed.
-
-    Args:
-        image: [H, W, 3] render, of any floating type and strides.
-        target: The photograph, of the same shape and type.
-        l1: Weight of the absolute difference.
-        ssim: Weight of the structural dissimilarity.
-
-    Returns:
-        A scalar.
-    """
-    difference = (image - target.image).abs().mean()
-    return l1 * difference + ssim * (1 - structural_similarity(image, target))
-
-
-def weighted_photometric_loss(
-    image: Tensor, target: Target, l1: float, ssim: float, pixel_weight: Tensor
+def photometric_loss(
+    image: Tensor, target: Target, l1: float, ssim: float, pixel_weight: Tensor | None
 ) -> Tensor:
-    """Return `xrgs.splat.loss.photometric_loss` with pixel weights; its checks have passed.
+    """Return `xrgs.splat.loss.photometric_loss`; its checks have passed.
 
     Args:
         image: [H, W, 3] render, of any floating type and strides.
         target: The photograph, of the same shape and type.
         l1: Weight of the absolute difference.
         ssim: Weight of the structural dissimilarity.
-        pixel_weight: [H, W]
+        pixel_weight: [H, W]; None weighs all pixels 1.
 
     Returns:
         A scalar.
     """
-    difference = (image - target.image).abs().mean(dim=-1)  # [H, W]
-    dissimilarity = 1 - ssim_map(image, target).mean(dim=-1)  # [H - 10, W - 10]
-    border = WINDOW // 2
-    centre_weight = pixel_weight[border:-border, border:-border]  # [H - 10, W - 10]
-    return l1 * (pixel_weight * difference).mean() + ssim * (centre_weight * dissimilarity).mean()
+    difference = (image - target.image).abs()  # [H, W, 3]
+    dissimilarity = dissimilarity_map(image, target)  # [H - 10, W - 10, 3]
+    if pixel_weight is not None:
+        border = WINDOW // 2
+        difference = pixel_weight[..., None] * difference
+        dissimilarity = pixel_weight[border:-border, border:-border, None] * dissimilarity
+    return l1 * difference.mean() + ssim * dissimilarity.mean()
 
 
-def structural_similarity(image: Tensor, target: Target) -> Tensor:
-    """Return the mean SSIM over pixels and channels (padding "valid").
+def dissimilarity_map(image: Tensor, target: Target) -> Tensor:
+    """Return 1 - SSIM of every window that lies inside the image [wang2004, equation 13].
 
-    [wang2004, equation 13] with a data range of 1: what gsplat's trainer calls as
+    The data range is 1, and no window is padded: what gsplat's trainer calls as
     `fused_ssim(padding="valid")`.
 
-    Args:
-        image: [H, W, 3] render, of any floating type.
-        target: The photograph, of the same shape and type.
+    SSIM is luminance times structure. Where the image is almost its target both are almost 1, and
+    in float32 their difference from 1 would be rounding. They are computed from the moments of the
+    difference d = x - t of image and target instead, in which nothing cancels:
 
-    Returns:
-        A scalar in [-1, 1].
-    """
-    return ssim_map(image, target).mean()
-
-
-def ssim_map(image: Tensor, target: Target) -> Tensor:
-    """Return the SSIM of every window that lies inside the image [wang2004, equation 13].
+        1 - luminance = E[d]^2 / (mean_x^2 + mean_t^2 + C1)
+        1 - structure = var_d / (var_x + var_t + C2), where var_x = var_t + 2 cov(t, d) + var_d
+        1 - SSIM = (1 - structure) luminance + (1 - luminance)
 
     Args:
         image: [H, W, 3] render, of any floating type.
         target: The photograph, of the same shape and type.
 
     Returns:
-        [H - 10, W - 10, 3], each value that of the window around the pixel.
+        [H - 10, W - 10, 3], in 0..2 but for rounding, each value that of the window around the
+        pixel.
     """
-    products = torch.cat([image, image * image, image * target.image], dim=-1)  # [H, W, 9]
+    difference = image - target.image
+    products = torch.cat(
+        [difference, difference * difference, target.image * difference], dim=-1
+    )  # [H, W, 9]
     mean, square, product = window_mean(products).chunk(3, dim=-1)  # [H - 10, W - 10, 3] each
+    covariance = product - target.mean * mean
     # Rounding makes the variance of a flat image negative; far outside 0..1 that could outgrow C2.
     variance = (square - mean * mean).clamp_min(0)
-    covariance = product - mean * target.mean
-    luminance = (2 * mean * target.mean + C1) / (mean * mean + target.mean * target.mean + C1)
-    structure = (2 * covariance + C2) / (variance + target.variance + C2)
-    return luminance * structure
+    image_variance = (target.variance + 2 * covariance + variance).clamp_min(0)
+    image_mean = target.mean + mean
+    squares = image_mean * image_mean + target.mean * target.mean + C1
+    luminance = (2 * image_mean * target.mean + C1) / squares
+    lacking_structure = variance / (image_variance + target.variance + C2)
+    return lacking_structure * luminance + mean * mean / squares

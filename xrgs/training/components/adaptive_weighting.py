@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
+from xrgs.splat.rounding import rounded_mean
 from xrgs.training.components.base import Step, TrainingView
 from xrgs.training.components.texture import gradient_magnitude
 
@@ -35,7 +36,7 @@ class AdaptiveWeighting:
             settings: The component's settings; `texture` is above 0.
             views: All training views; those tagged LR are measured.
         """
-        magnitudes = [gradient_magnitude(v.image).mean().item() for v in views if v.tag == "LR"]
+        magnitudes = [rounded_mean(gradient_magnitude(v.image)) for v in views if v.tag == "LR"]
         self.mean_gradient = sum(magnitudes) / len(magnitudes) if magnitudes else 0.0
         self.attenuation = min(1.0, self.mean_gradient / settings.texture)
 

@@ -6,6 +6,7 @@ import math
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Self
 
+import torch
 from torch import Tensor
 
 from xrgs.errors import XrgsError
@@ -89,7 +90,7 @@ class Consistency(Component):
         hr_sides = (max(view.image.shape) for view in views if view.tag == "HR")
         hr_long_side = max(hr_sides, default=math.inf)
         self.paired_targets = {
-            view.name: _paired_target(view, factor, hr_long_side)
+            view.name: _paired_target(view, factor, hr_long_side, backend)
             for view in views
             if view.tag == "HR" or settings.lr_mode == "exact"
         }
@@ -122,11 +123,13 @@ class Consistency(Component):
             l1, ssim = self.weight * self.l1, self.weight * self.ssim
             return photometric_loss(projected, target, l1=l1, ssim=ssim, backend=self.backend)
         if self.lr_mode == "fold":
-            return self.weight * self.l1 * (image - view.image).abs().mean()
+            # Summed in double, whose last digits alone depend on the number of threads.
+            difference = (image - view.image).abs().mean(dtype=torch.float64)
+            return self.weight * self.l1 * difference.to(image)
         return None
 
 
-def _paired_target(view: TrainingView, factor: int, hr_long_side: float) -> Target:
+def _paired_target(view: TrainingView, factor: int, hr_long_side: float, backend: str) -> Target:
     """The photograph at the opposite resolution; `hr_long_side` is the longest of HR views, px."""
     height, width = view.image.shape[:2]
     if view.tag == "HR" or max(height, width) > hr_long_side / math.sqrt(factor):
@@ -139,4 +142,4 @@ def _paired_target(view: TrainingView, factor: int, hr_long_side: float) -> Targ
             f" px, smaller than the SSIM window of {WINDOW} px of the consistency loss; use larger"
             " photographs or a smaller factor"
         )
-    return prepare_target(resize(view.image, height, width))
+    return prepare_target(resize(view.image, height, width, backend=backend))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Self
 
+from xrgs.splat.rounding import rounded_norm
 from xrgs.training.components.base import Component, Step, TrainingSetup, check_not_negative
 
 if TYPE_CHECKING:  # xrgs.config loads Hydra, which training does without
@@ -44,6 +45,6 @@ class GradientScaling(Component):
         gradient = gaussians.scales.grad
         if gradient is None:
             return
-        step.log[f"gradient_scaling.norm_{step.view.tag}"] = gradient.norm().item()
+        step.log[f"gradient_scaling.norm_{step.view.tag}"] = rounded_norm(gradient)
         if step.view.tag == "LR":
             gradient.mul_(self.lr_scale)

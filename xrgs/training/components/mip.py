@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from xrgs.errors import XrgsError
+from xrgs.splat.rounding import rounded_mean, rounded_sqrt
 from xrgs.training.components.base import (
     Component,
     Step,
@@ -92,7 +93,7 @@ class Mip(Component):
         """
         if step.number % self.every == 0:
             self._update_variance(activated.means)
-            step.log["mip.sigma"] = self.variance.sqrt().mean().item()
+            step.log["mip.sigma"] = rounded_mean(rounded_sqrt(self.variance))
             step.log["mip.unseen"] = self.unseen_count
         scales, opacities = smooth(activated.scales, activated.opacities, self.variance)
         return activated._replace(scales=scales, opacities=opacities)
@@ -100,9 +101,11 @@ class Mip(Component):
     @torch.no_grad()
     def after_training(self, gaussians: Gaussians) -> None:
         """Make the filter part of scales and opacities, so that what was rendered is saved."""
-        activated = gaussians.activated()
+        # In double, which rounds to one float32 whatever computes its last digits.
         scales, opacities = smooth(
-            activated.scales.double(), activated.opacities.double(), self.variance.double()
+            gaussians.scales.double().exp(),
+            gaussians.opacities.double().sigmoid(),
+            self.variance.double(),
         )
         # An opacity outside the range of float32 must not become an infinite logit.
         bounds = torch.finfo(torch.float32)
@@ -140,7 +143,7 @@ def smooth(scales: Tensor, opacities: Tensor, variance: Tensor) -> tuple[Tensor,
         The scales [N, 3], `sqrt(scales^2 + variance)`, and the opacities [N] times the square root
         of the ratio of the determinants of the covariances, before over after.
     """
-    wider = torch.sqrt(scales * scales + variance[:, None])
+    wider = rounded_sqrt(scales * scales + variance[:, None])
     # One ratio per axis, since the product of three small scales underflows.
     ratio = scales / wider
     return wider, opacities * ratio[:, 0] * ratio[:, 1] * ratio[:, 2]
@@ -162,14 +165,13 @@ def sampling_rates(means: Tensor, cameras: Sequence[Camera], near: float) -> Ten
     """
     highest = means.new_zeros(len(means))
     for camera in cameras:
-        viewmat, K = camera.viewmat.to(means), camera.K.to(means)
-        size = means.new_tensor([camera.width, camera.height])
-        # Homogeneous pixels: compared before the division by depth, which may be 0.
-        projected = torch.addmm(K @ viewmat[:3, 3], means, (K @ viewmat[:3, :3]).T)  # [N, 3]
-        depth = projected[:, 2:]
-        pixels = projected[:, :2]
-        seen = (depth > near) & (pixels >= -MARGIN * size * depth)
-        seen &= pixels <= (1 + MARGIN) * size * depth
-        rate = torch.maximum(K[0, 0], K[1, 1]) / depth[:, 0]
-        highest = torch.where(seen.all(dim=-1), torch.maximum(highest, rate), highest)
+        K = camera.K.to(means)
+        x, y, depth = camera.to_camera(means)  # [N] each
+        seen = depth > near
+        for axis, (place, size) in enumerate(((x, camera.width), (y, camera.height))):
+            # Homogeneous pixels: compared before the division by depth, which may be 0.
+            pixels = K[axis, axis] * place + K[axis, 2] * depth
+            seen &= (pixels >= -MARGIN * size * depth) & (pixels <= (1 + MARGIN) * size * depth)
+        rate = torch.maximum(K[0, 0], K[1, 1]) / depth
+        highest = torch.where(seen, torch.maximum(highest, rate), highest)
     return highest

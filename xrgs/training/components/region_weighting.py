@@ -81,7 +81,9 @@ def coverage(camera: Camera, others: Sequence[Camera], points: Tensor, near: flo
     K = camera.K.to(points)
     rays = torch.stack([(x - K[0, 2]) / K[0, 0], (y - K[1, 2]) / K[1, 1], torch.ones_like(x)], -1)
     viewmat = camera.viewmat.to(points)
-    world = (rays * depth[:, None] - viewmat[:3, 3]) @ viewmat[:3, :3]  # [H W, 3]
+    # The product with the transposed rotation, in an order that does not depend on the processor.
+    at_depth = (rays * depth[:, None] - viewmat[:3, 3])[..., None] * viewmat[:3, :3]
+    world = at_depth[:, 0] + at_depth[:, 1] + at_depth[:, 2]  # [H W, 3]
     covered = torch.zeros(len(world), dtype=torch.bool)
     for other in others:
         pixels, z = _project(other, world)
@@ -114,10 +116,9 @@ def _project(camera: Camera, points: Tensor) -> tuple[Tensor, Tensor]:
 
     The projection of a point with a depth of 0 or less has no meaning.
     """
-    viewmat, K = camera.viewmat.to(points), camera.K.to(points)
-    in_camera = points @ viewmat[:3, :3].T + viewmat[:3, 3]
-    z = in_camera[:, 2]
-    pixels = in_camera[:, :2] / z[:, None] * K[[0, 1], [0, 1]] + K[:2, 2]
+    K = camera.K.to(points)
+    x, y, z = camera.to_camera(points)
+    pixels = torch.stack([x, y], dim=-1) / z[:, None] * K[[0, 1], [0, 1]] + K[:2, 2]
     return pixels, z
 
 

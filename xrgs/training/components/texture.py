@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-import torch
 from torch import Tensor
 from torch.nn.functional import pad
+
+from xrgs.splat.rounding import rounded_sqrt
 
 
 def gradient_magnitude(image: Tensor) -> Tensor:
@@ -27,5 +28,6 @@ def gradient_magnitude(image: Tensor) -> Tensor:
     """
     inner = image[:-1, :-1]
     squared = (image[:-1, 1:] - inner).square() + (image[1:, :-1] - inner).square()
-    magnitude: Tensor = torch.sqrt(squared.mean(dim=-1))  # [H - 1, W - 1]
+    red, green, blue = squared.unbind(-1)
+    magnitude = rounded_sqrt((red + green + blue) / 3)  # [H - 1, W - 1]
     return pad(magnitude[None], (0, 1, 0, 1), mode="replicate")[0]

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Self
 from torch import Tensor
 
 from xrgs.errors import XrgsError
+from xrgs.splat.rounding import rounded_mean
 from xrgs.training.components.adaptive_weighting import AdaptiveWeighting
 from xrgs.training.components.base import (
     Component,
@@ -81,7 +82,7 @@ class Weighting(Component):
         self.view_weight = view_weight
         self.attenuations = attenuations
         self.regions = regions or {}
-        self.region_means = {name: region.mean().item() for name, region in self.regions.items()}
+        self.region_means = {name: rounded_mean(region) for name, region in self.regions.items()}
         self.stat_from = stat_from
 
     @classmethod

@@ -1,0 +1,188 @@
+"""The build backend: scikit-build-core, with a compiler from PyPI where the machine has none.
+
+The kernels need a C++17 compiler. Where none is found, the wheels of `ziglang`, which contain clang
+and the C++ library, are added to what the build requires, and CMake is given that compiler. Where
+the variable CXX names a compiler, that one is used or none: CXX=/nonexistent installs the package
+without kernels. A build that fails, for whatever reason, leaves a package that renders with torch
+(`if.failed` in pyproject.toml).
+"""
+
+from __future__ import annotations
+
+import contextlib
+import importlib.util
+import os
+import platform
+import shlex
+import shutil
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from scikit_build_core import build as _scikit_build
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator, Mapping
+
+__all__ = [
+    "build_editable",
+    "build_sdist",
+    "build_wheel",
+    "get_requires_for_build_editable",
+    "get_requires_for_build_sdist",
+    "get_requires_for_build_wheel",
+]
+
+#: Zig's command line changes between minor versions.
+ZIGLANG = "ziglang>=0.17.1,<0.18"
+#: Machines on which the kernels were built with it.
+_ZIGLANG_SYSTEM, _ZIGLANG_MACHINES = "Linux", ("x86_64", "aarch64")
+#: In the order in which CMake tries them.
+_COMPILERS = ("c++", "g++", "clang++")
+_TRIAL = """\
+#include <optional>
+#include <stdexcept>
+int trial(std::optional<int> value) {
+  if (!value) throw std::runtime_error("");
+  return *value;
+}
+"""
+#: With a target, Zig takes the C library's headers from its own wheel, where a machine without a
+#: compiler seldom has any, and compiles for any processor of that architecture. All wheels of torch
+#: need this glibc or a newer one.
+_TARGET = "{machine}-linux-gnu.2.28"
+#: Debian's Python.h includes a header relative to /usr/include. Without an optimization level, as
+#: where CMake tries the compiler, Zig adds checks that need a library of their own.
+_CLANG_OPTIONS = ("-mcpu=baseline", "-idirafter", "/usr/include", "-fno-sanitize=undefined")
+
+build_sdist = _scikit_build.build_sdist
+get_requires_for_build_sdist = _scikit_build.get_requires_for_build_sdist
+
+
+def get_requires_for_build_wheel(config_settings: dict[str, Any] | None = None) -> list[str]:
+    """Return what the build of a wheel requires: see PEP 517."""
+    return [*_scikit_build.get_requires_for_build_wheel(config_settings), *_required_compiler()]
+
+
+def get_requires_for_build_editable(config_settings: dict[str, Any] | None = None) -> list[str]:
+    """Return what an editable installation requires: see PEP 660."""
+    return [*_scikit_build.get_requires_for_build_editable(config_settings), *_required_compiler()]
+
+
+def build_wheel(
+    wheel_directory: str,
+    config_settings: dict[str, Any] | None = None,
+    metadata_directory: str | None = None,
+) -> str:
+    """Build a wheel and return its name: see PEP 517."""
+    with _compiler():
+        return str(_scikit_build.build_wheel(wheel_directory, config_settings, metadata_directory))
+
+
+def build_editable(
+    wheel_directory: str,
+    config_settings: dict[str, Any] | None = None,
+    metadata_directory: str | None = None,
+) -> str:
+    """Build the wheel of an editable installation and return its name: see PEP 660."""
+    with _compiler():
+        return str(
+            _scikit_build.build_editable(wheel_directory, config_settings, metadata_directory)
+        )
+
+
+def find_compiler() -> str | None:
+    """Return the command of a C++17 compiler: CXX if that is set, else the first that works.
+
+    Returns:
+        The command, in which CXX may have options; None if no compiler works.
+    """
+    named = os.environ.get("CXX", "").strip()
+    candidates = [named] if named else [path for name in _COMPILERS if (path := shutil.which(name))]
+    return next((command for command in candidates if _compiles(command)), None)
+
+
+def _compiles(command: str) -> bool:
+    """Return whether a compiler makes a shared library of a C++17 source."""
+    with tempfile.TemporaryDirectory(prefix="xrgs-build-") as folder:
+        source = Path(folder, "trial.cpp")
+        source.write_text(_TRIAL, "utf-8")
+        options = ["-std=c++17", "-shared", "-fPIC", str(source), "-o", str(source) + ".so"]
+        try:
+            arguments = [*shlex.split(command), *options]
+            done = subprocess.run(arguments, capture_output=True, check=False)  # noqa: S603
+        except (OSError, ValueError):
+            return False
+        return done.returncode == 0
+
+
+def _required_compiler() -> list[str]:
+    """Return the requirement of a compiler from PyPI where the machine has none."""
+    served = platform.system() == _ZIGLANG_SYSTEM and platform.machine() in _ZIGLANG_MACHINES
+    named = os.environ.get("CXX", "").strip()
+    return [ZIGLANG] if served and not named and find_compiler() is None else []
+
+
+@contextlib.contextmanager
+def _compiler() -> Iterator[None]:
+    """Set CXX to the compiler that works, or to clang of `ziglang` where that is installed."""
+    with tempfile.TemporaryDirectory(prefix="xrgs-build-") as folder:
+        named = os.environ.get("CXX", "").strip()
+        if (compiler := find_compiler()) is not None:
+            variables = {"CXX": compiler}
+        elif not named and importlib.util.find_spec("ziglang") is not None:
+            _say(f"no C++17 compiler ({', '.join(_COMPILERS)}) works: ziglang compiles the kernels")
+            variables = ziglang_compiler(Path(folder))
+        else:
+            missing = (
+                f"CXX={named} is no C++17 compiler that works"
+                if named
+                else f"no C++17 compiler ({', '.join(_COMPILERS)}) works, and ziglang is missing"
+            )
+            _say(f"{missing}: the package is installed without kernels, and renders with torch")
+            variables = {}
+        with _environment(variables):
+            yield
+
+
+def ziglang_compiler(folder: Path) -> dict[str, str]:
+    """Write the commands of a compiler that call `ziglang`.
+
+    CMake looks for `ar` and `ranlib`, which may be missing as well, beside the compiler.
+
+    Args:
+        folder: An empty folder for the commands and for the libraries that Zig compiles.
+
+    Returns:
+        Environment variables with which CMake uses them.
+    """
+    clang = ["-target", _TARGET.format(machine=platform.machine()), *_CLANG_OPTIONS]
+    for name, options in {"cc": clang, "c++": clang, "ar": [], "ranlib": []}.items():
+        command = shlex.join([sys.executable, "-m", "ziglang", name, *options])
+        script = folder / name
+        script.write_text(f'#!/bin/sh\nexec {command} "$@"\n', "utf-8")
+        script.chmod(0o755)
+    caches = ("ZIG_GLOBAL_CACHE_DIR", "ZIG_LOCAL_CACHE_DIR")
+    variables = {name: os.environ.get(name, str(folder / "cache")) for name in caches}
+    return {"CC": str(folder / "cc"), "CXX": str(folder / "c++"), **variables}
+
+
+@contextlib.contextmanager
+def _environment(variables: Mapping[str, str]) -> Iterator[None]:
+    """Set environment variables for a while."""
+    before = {name: os.environ.get(name) for name in variables}
+    os.environ.update(variables)
+    try:
+        yield
+    finally:
+        for name, value in before.items():
+            if value is None:
+                del os.environ[name]
+            else:
+                os.environ[name] = value
+
+
+def _say(message: str) -> None:
+    sys.stderr.write(f"xrgs: {message}\n")

@@ -1,0 +1,117 @@
+"""Two installations are compared in turn."""
+
+from __future__ import annotations
+
+import csv
+import math
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from xrgs.bench import against, against_worker, loads, run, training
+from xrgs.bench.against import HR_STEP, LR_STEP, MEAN_STEP, RENDER, SIDES
+from xrgs.bench.loads import Load
+from xrgs.bench.settings import Settings
+from xrgs.errors import XrgsError
+from xrgs.splat.backend import resolve_backend
+from xrgs.splat.settings import RasterSettings
+from xrgs.splat.torch.projection import project
+
+
+def test_ratios_are_taken_repetition_by_repetition() -> None:
+    """The machine is half as fast in the second repetition, which changes no ratio."""
+    slowness = np.array([1.0, 2.0, 1.0, 1.0, 1.0])
+    ms = {
+        (side, task, count): base * factor * slowness / count
+        for side, factor in zip(SIDES, (1.0, 1.5), strict=True)
+        for task, base in ((RENDER, 8.0), (HR_STEP, 10.0), (LR_STEP, 2.0))
+        for count in (1, 2)
+    }
+    ms["other", RENDER, 1] = 8.0 * slowness * np.array([1.0, 2.0, 3.0, 4.0, 5.0])
+    rows = {(row["task"], row["threads"]): row for row in against.summarize(ms, [1, 2])}
+    assert len(rows) == 8
+    mean = rows[MEAN_STEP, 2]
+    assert mean["this_ms"] == pytest.approx((0.3 * 10 + 0.7 * 2) / 2)
+    assert mean["other_ms"] == pytest.approx(1.5 * mean["this_ms"])
+    for key in ("times_faster", "times_faster_low", "times_faster_high"):
+        assert mean[key] == pytest.approx(1.5)
+    assert mean["this_speedup"] == mean["other_speedup"] == pytest.approx(2)
+    assert rows[MEAN_STEP, 1]["this_speedup"] == pytest.approx(1)
+    render = rows[RENDER, 1]
+    assert render["times_faster"] == pytest.approx(3)
+    assert render["times_faster_low"] == pytest.approx(2)
+    assert render["times_faster_high"] == pytest.approx(4)
+
+
+@pytest.mark.slow
+def test_an_installation_is_compared_with_itself(tmp_path: Path) -> None:
+    if resolve_backend("auto") != "native":
+        pytest.skip("the native backend was not built")
+    settings = Settings(smoke=True, repeats=2, threads=2, out=str(tmp_path), against=sys.executable)
+    text = run.run(settings)
+    with (tmp_path / "against.csv").open(newline="") as file:
+        rows = list(csv.DictReader(file))
+    tasks = (RENDER, HR_STEP, LR_STEP, MEAN_STEP)
+    cases = [(task, count) for task in tasks for count in "12"]
+    assert [(row["task"], row["threads"]) for row in rows] == cases
+    assert all(float(row[f"{side}_ms"]) > 0 for row in rows for side in SIDES)
+    for word in (*tasks, "times faster", "speed-up", "300 Gaussians at 80x60"):
+        assert word in text
+
+
+def test_an_installation_that_cannot_run_is_named_with_its_reason(
+    load: Load, tmp_path: Path
+) -> None:
+    python = tmp_path / "python"
+    python.write_text("#!/bin/sh\necho 'no torch here' >&2\nexit 3\n")
+    python.chmod(0o755)
+    with pytest.raises(XrgsError, match=r"python cannot run the benchmark: no torch here"):
+        against.measure(str(python), load, (load, load), [1], 1)
+    python.write_text("#!/bin/sh\necho hello\nexec cat >/dev/null\n")
+    with pytest.raises(XrgsError, match=r"answers 'hello', not JSON"):
+        against.measure(str(python), load, (load, load), [1], 1)
+    python.write_bytes(b"\0")
+    with pytest.raises(XrgsError, match=r"cannot be run: Exec format error"):
+        against.measure(str(python), load, (load, load), [1], 1)
+    with pytest.raises(XrgsError, match="must be the Python executable"):
+        against.measure(str(tmp_path), load, (load, load), [1], 1)
+
+
+def test_the_worker_takes_the_step_of_the_benchmark() -> None:
+    assert (against_worker.L1, against_worker.SSIM) == (training.L1, training.SSIM)
+
+
+def test_the_worker_finds_a_function_under_the_name_of_its_release() -> None:
+    assert against_worker._find("math", "rasterize_parameters", "hypot") is math.hypot
+    with pytest.raises(AttributeError, match="math has none of a, b"):
+        against_worker._find("math", "a", "b")
+
+
+def test_larger_gaussians_overlap_more() -> None:
+    usual = loads.random_load(50, 40, 30, seed=0)
+    larger = loads.random_load(50, 40, 30, 0, size_per_spacing=3.0)
+    np.testing.assert_allclose(larger.scales, 2 * usual.scales, rtol=1e-6)
+    np.testing.assert_array_equal(larger.means, usual.means)
+
+
+@pytest.mark.slow
+def test_the_scene_is_as_heavy_as_a_trained_one() -> None:
+    """56 Gaussians contribute to a pixel, counted by Eq. 8 and 14 at pixels of its middle rows."""
+    scene = loads.random_load(*run.FULL.scene, 0, run._SCENE_SIZE_PER_SPACING)
+    means, quats, scales, opacities, *_ = (value.double() for value in scene.parameters)
+    settings = RasterSettings()
+    projected = project(means, quats, scales, opacities, scene.camera, settings)
+    xx, xy, yy = projected.cov.unbind(-1)
+    order = projected.depths.argsort()
+    counts = []
+    for x in range(8, scene.camera.width, 16):
+        y = scene.camera.height // 2 + x % 7 - 3
+        dx, dy = (torch.tensor([x + 0.5, y + 0.5]) - projected.means2d).unbind(-1)
+        power = (yy * dx**2 - 2 * xy * dx * dy + xx * dy**2) / (2 * projected.det)
+        alpha = (projected.opacities * torch.exp(-power)).clamp_max(settings.alpha_max)[order]
+        alpha = alpha[alpha >= settings.alpha_min]
+        counts.append(int(((1 - alpha).cumprod(0) > settings.transmittance_min).sum()))
+    assert 52 < sum(counts) / len(counts) < 60

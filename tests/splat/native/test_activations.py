@@ -1,0 +1,140 @@
+"""The compiled activation functions against numpy and torch in double."""
+
+from __future__ import annotations
+
+import importlib
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from xrgs.splat.gaussians import Gaussians
+
+native = pytest.importorskip("xrgs._native")
+activations = importlib.import_module("xrgs.splat.native.activations")
+
+SMALLEST = 2.0**-126
+"""The smallest normal float32 number."""
+LARGEST = float(np.finfo(np.float32).max)
+FUNCTIONS = {"exp": activations.exp, "logistic": activations.logistic}
+EXACT: dict[str, Callable[[NDArray[np.float64]], NDArray[np.float64]]] = {
+    "exp": np.exp,
+    "logistic": lambda x: np.exp(np.minimum(x, 0)) / (1 + np.exp(-np.abs(x))),
+}
+ERROR = {"exp": 1.0e-7, "logistic": 2.0e-7}
+COUNTS = [0, 1, 15, 16, 17, 40_000]
+
+
+def floats_around(value: float, count: int = 300) -> NDArray[np.float32]:
+    """The floats that are next to a value, on both sides."""
+    bits = int(np.float32(value).view(np.int32))
+    return np.arange(bits - count, bits + count, dtype=np.int32).view(np.float32)
+
+
+def every_magnitude() -> NDArray[np.float32]:
+    """Arguments of all sizes, and the floats next to each bound of the functions' ranges."""
+    rng = np.random.default_rng(0)
+    sizes = 10.0 ** rng.uniform(-30, 2, size=20_000) * rng.choice([-1, 1], size=20_000)
+    bounds = [floats_around(sign * np.log(v)) for v in (LARGEST, SMALLEST) for sign in (-1, 1)]
+    return np.concatenate([np.linspace(-104, 104, 100_003), sizes, *bounds]).astype(np.float32)
+
+
+@pytest.mark.parametrize("name", FUNCTIONS)
+def test_values_are_those_in_double(isa: str, name: str) -> None:
+    x = every_magnitude()
+    y = FUNCTIONS[name](torch.from_numpy(x)).numpy().astype(np.float64)
+    with np.errstate(over="ignore"):
+        exact = EXACT[name](x.astype(np.float64))
+    normal = (exact >= SMALLEST) & (exact <= LARGEST)
+    assert np.abs(y[normal] / exact[normal] - 1).max() < ERROR[name]
+    assert (y[exact < SMALLEST] == 0).all()
+    assert (y[exact > LARGEST] == np.inf).all()
+    assert (exact < SMALLEST).any()
+    assert (exact > LARGEST).any() == (name == "exp")
+
+
+@pytest.mark.parametrize(
+    ("name", "expected"), [("exp", [0, 1, 1, np.inf]), ("logistic", [0, 0.5, 0.5, 1])]
+)
+def test_values_at_the_ends_and_at_zero(isa: str, name: str, expected: list[float]) -> None:
+    y = FUNCTIONS[name](torch.tensor([-torch.inf, -0.0, 0.0, torch.inf, torch.nan]))
+    assert y[:4].tolist() == expected
+    assert y[4].isnan()
+
+
+@pytest.mark.parametrize("name", FUNCTIONS)
+@pytest.mark.parametrize("count", COUNTS)
+def test_gradients_are_those_in_double(isa: str, name: str, count: int) -> None:
+    generator = torch.Generator().manual_seed(count)
+    x = 4 * torch.randn(count, 3, generator=generator)
+    slope = torch.randn(count, 3, generator=generator)
+    ours, exact = x.requires_grad_(), x.detach().double().requires_grad_()
+    torch.autograd.backward(FUNCTIONS[name](ours), slope)
+    reference = {"exp": torch.exp, "logistic": torch.sigmoid}[name](exact)
+    torch.autograd.backward(reference, slope.double())
+    assert ours.grad is not None
+    assert exact.grad is not None
+    # 1 - y of the logistic function loses the digits that y itself has lost.
+    relative, absolute = (3e-7, 0.0) if name == "exp" else (5e-7, 3e-7)
+    torch.testing.assert_close(ours.grad.double(), exact.grad, rtol=relative, atol=absolute)
+
+
+@pytest.mark.parametrize("name", FUNCTIONS)
+def test_a_tensor_of_other_strides_is_taken(name: str) -> None:
+    x = torch.linspace(-3, 3, 30).view(5, 6)
+    assert torch.equal(FUNCTIONS[name](x.T), FUNCTIONS[name](x).T)
+
+
+@pytest.mark.parametrize("name", FUNCTIONS)
+def test_all_instruction_sets_with_fused_multiply_add_give_the_same_bits(name: str) -> None:
+    before, x = native.isa(), torch.from_numpy(every_magnitude())
+    results: dict[bool, list[Tensor]] = {True: [], False: []}
+    try:
+        for other in native.available_isas():
+            native.set_isa(other)
+            results[native.fused_multiply_add()].append(FUNCTIONS[name](x))
+    finally:
+        native.set_isa(before)
+    for same in results.values():
+        assert all(torch.equal(result, same[0]) for result in same)
+
+
+@pytest.mark.usefixtures("threads")
+def test_threads_change_no_bit() -> None:
+    """100,003 Gaussians: torch divides its own work among threads from 32,768 elements on."""
+    generator = torch.Generator().manual_seed(0)
+    shapes = {"means": (3,), "quats": (4,), "scales": (3,), "opacities": ()}
+    shapes |= {"sh0": (1, 3), "shN": (0, 3)}
+    raw = {name: torch.randn(100_003, *s, generator=generator) for name, s in shapes.items()}
+    results = []
+    for count in (1, 2, 3):
+        torch.set_num_threads(count)
+        gaussians = Gaussians(**{name: value.clone() for name, value in raw.items()})
+        gaussians.scales.requires_grad_()
+        gaussians.opacities.requires_grad_()
+        activated = gaussians.activated(backend="native")
+        torch.autograd.backward(
+            activated.scales.square().sum() + activated.opacities.square().sum()
+        )
+        assert gaussians.scales.grad is not None
+        assert gaussians.opacities.grad is not None
+        results.append(
+            (activated.scales, activated.opacities, gaussians.scales.grad, gaussians.opacities.grad)
+        )
+    for result in results:
+        assert all(torch.equal(a, b) for a, b in zip(result, results[0], strict=True))
+
+
+@pytest.mark.parametrize("name", FUNCTIONS)
+def test_another_type_is_refused(name: str) -> None:
+    with pytest.raises(ValueError, match="x must be float32 on the CPU"):
+        FUNCTIONS[name](torch.zeros(3, dtype=torch.float64))
+
+
+def test_lengths_that_do_not_fit_are_refused() -> None:
+    for backward in (native.exp_backward, native.logistic_backward):
+        with pytest.raises(ValueError, match="shapes that do not fit"):
+            backward(torch.zeros(3), torch.zeros(4), 1)

@@ -1,0 +1,217 @@
+"""How the compiled module takes and returns tensors, whatever it computes."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import pytest
+import torch
+from torch import Tensor
+
+from xrgs.splat.cameras import Camera
+from xrgs.splat.gaussians import PARAMETERS, Gaussians
+from xrgs.splat.native.densify import accumulate_statistics
+from xrgs.splat.native.resample import banded_matrix
+from xrgs.splat.optimizer import SplatOptimizer
+from xrgs.splat.settings import OptimizerSettings
+
+native = pytest.importorskip("xrgs._native")
+
+SHAPES = ((3,), (4,), (3,), (), (1, 3), (15, 3))  # of PARAMETERS
+N = 20
+
+
+def strided(tensor: Tensor) -> Tensor:
+    """The same values, not side by side."""
+    return tensor.repeat_interleave(2, dim=-1)[..., ::2]
+
+
+def adam_step(*tensors: Tensor) -> None:
+    native.adam_step([(*tensors, 0.1, 1.0)], 0.9, 0.999, 1e-15, 1)
+
+
+def adam_step_sh_rest(*tensors: Tensor) -> None:
+    native.adam_step_sh_rest(*tensors, [0.0, 0.0, 9.0], 3, 0.1, 1.0, 0.9, 0.999, 1e-15, 1)
+
+
+def accumulate(means2d_grad: Tensor, visible: Tensor, *sums: Tensor) -> None:
+    native.accumulate_grad2d(means2d_grad, visible, 1.0, 1.0, *sums, 1)
+
+
+def config() -> Any:
+    return native.RenderConfig(
+        viewmat=torch.eye(4).flatten().tolist(),
+        intrinsics=[20.0, 20.0, 10.0, 10.0],
+        width=20,
+        height=20,
+        near=0.01,
+        eps2d=0.3,
+        alpha_min=1 / 255,
+        alpha_max=0.99,
+        transmittance_min=1e-4,
+        antialiased=False,
+        absgrad=False,
+        background=(0.0, 0.0, 0.0),
+        sh_degree=3,
+        culling=(True,) * 5,
+    )
+
+
+def forward(*parameters: Tensor) -> Any:
+    frame = native.Frame()
+    frame.forward(config(), *parameters, 1)
+    return frame
+
+
+def backward(v_image: Tensor, v_alpha: Tensor, *parameters: Tensor) -> None:
+    forward(*(torch.ones(N, *shape) for shape in (*SHAPES, (2,)))).backward(
+        v_image, v_alpha, *parameters, True, 1
+    )
+
+
+def loss(*tensors: Tensor) -> None:
+    native.photometric_loss(*tensors, 0.8, 0.2, True, 1)
+
+
+def activation(kernel: Callable[..., Tensor]) -> Callable[..., Tensor]:
+    return lambda *tensors: kernel(*tensors, 1)
+
+
+def resample(*tensors: Tensor) -> None:
+    native.resample(*tensors, 1)
+
+
+def ones(*shapes: tuple[int, ...]) -> list[Tensor]:
+    return [torch.ones(shape) for shape in shapes]
+
+
+PARAMETER_SHAPES = [(N, *shape) for shape in (*SHAPES, (2,))]
+CALLS: dict[str, tuple[Callable[..., object], list[Tensor]]] = {
+    "adam_step": (adam_step, ones((N,), (N,), (N,), (N,))),
+    "adam_step_sh_rest": (adam_step_sh_rest, ones(*[(N, 15, 3)] * 3, (N, 3), (N, 3))),
+    "accumulate_grad2d": (accumulate, [*ones((N, 2)), torch.ones(N).bool(), *ones((N,), (N,))]),
+    "forward": (forward, ones(*PARAMETER_SHAPES)),
+    "backward": (backward, ones((20, 20, 3), (20, 20), *PARAMETER_SHAPES)),
+    "photometric_loss": (loss, ones(*[(20, 20, 3)] * 2, *[(10, 10, 3)] * 2, (20, 20))),
+    "resample": (resample, [*ones((20, 20, 3)), *banded_matrix(20, 9), *banded_matrix(20, 9)]),
+    "exp": (activation(native.exp), ones((N,))),
+    "exp_backward": (activation(native.exp_backward), ones((N,), (N,))),
+    "logistic": (activation(native.logistic), ones((N,))),
+    "logistic_backward": (activation(native.logistic_backward), ones((N,), (N,))),
+    "exp2": (native.exp2, ones((N,))),
+    "log2": (native.log2, ones((N,))),
+}
+
+
+@pytest.mark.parametrize("name", CALLS)
+def test_nothing_is_converted(name: str) -> None:
+    call, tensors = CALLS[name]
+    call(*(tensor.clone() for tensor in tensors))
+    for place, tensor in enumerate(tensors):
+        for wrong in (tensor.double(), strided(tensor)):
+            changed = [*tensors[:place], wrong, *tensors[place + 1 :]]
+            with pytest.raises(TypeError, match=r"incompatible function arguments|must be float32"):
+                call(*changed)
+
+
+def test_a_group_of_adam_that_is_no_tuple_is_refused() -> None:
+    with pytest.raises(TypeError, match="groups must be tuples"):
+        native.adam_step([torch.ones(3)], 0.9, 0.999, 1e-15, 1)
+
+
+def test_statistics_of_another_type_are_named() -> None:
+    good: dict[str, Any] = {
+        "means2d_grad": torch.ones(N, 2),
+        "visible": torch.ones(N, dtype=torch.bool),
+        "half_size": (1.0, 1.0),
+        "grad2d_sum": torch.zeros(N),
+        "visible_count": torch.zeros(N),
+    }
+    accumulate_statistics(**good)
+    for name, wrong, says in (
+        ("means2d_grad", torch.ones(N, 2).double(), "float32"),
+        ("visible", torch.ones(N), "bool"),
+        ("grad2d_sum", torch.zeros(N).double(), "float32"),
+        ("visible_count", torch.zeros(N).double(), "float32"),
+        ("grad2d_sum", torch.zeros(2 * N)[::2], "contiguous"),
+        ("visible_count", torch.zeros(2 * N)[::2], "contiguous"),
+    ):
+        with pytest.raises(ValueError, match=f"^{name} must be {says}"):
+            accumulate_statistics(**(good | {name: wrong}))
+
+
+# --- autograd notices changes in place -----------------------------------------------------------
+
+
+def optimizer() -> SplatOptimizer:
+    values = [torch.ones(N, *shape).requires_grad_() for shape in SHAPES]
+    gaussians = Gaussians(**dict(zip(PARAMETERS, values, strict=True)))
+    settings = OptimizerSettings()
+    return SplatOptimizer(gaussians, settings, scene_scale=1.0, steps=10, backend="native")
+
+
+@pytest.mark.parametrize("with_camera", [False, True])
+@pytest.mark.parametrize("name", PARAMETERS)
+def test_a_backward_pass_through_values_from_before_a_step_is_refused(
+    with_camera: bool, name: str
+) -> None:
+    # As it is with torch.optim.Adam and its defaults.
+    of = optimizer()
+    for each in PARAMETERS:
+        if each != "shN" or not with_camera:
+            of.gaussians[each].grad = torch.ones_like(of.gaussians[each])
+    saved = of.gaussians[name].square().sum()  # keeps the values for its gradient
+    if with_camera:
+        camera = Camera(torch.eye(4), torch.eye(3) * torch.tensor([9.0, 9.0, 1.0]), 9, 9)
+        of.step(camera, sh_degree=3)
+    else:
+        of.step()
+    with pytest.raises(RuntimeError, match="modified by an inplace operation"):
+        torch.autograd.backward(saved)
+
+
+def test_a_backward_pass_through_statistics_from_before_is_refused() -> None:
+    for place in (0, 1):
+        factor = torch.ones(N, requires_grad=True)
+        sums = torch.zeros(N), torch.zeros(N)
+        product = (factor * sums[place]).sum()
+        accumulate_statistics(torch.ones(N, 2), torch.ones(N).bool(), (1.0, 1.0), *sums)
+        with pytest.raises(RuntimeError, match="modified by an inplace operation"):
+            torch.autograd.backward(product)
+
+
+# --- memory that is used again -------------------------------------------------------------------
+
+
+@pytest.fixture
+def reuse() -> None:
+    """Skip the test where released memory is not kept, as under AddressSanitizer."""
+    native.exp2(torch.ones(100_000))
+    if native.unused_bytes() == 0:
+        pytest.skip("this build keeps no released memory")
+
+
+@pytest.mark.usefixtures("reuse")
+def test_memory_of_sizes_that_are_no_longer_wanted_is_freed() -> None:
+    count = 100_000
+    for _ in range(12):  # each size for a while, as a model grows
+        count = count * 9 // 8
+        x = torch.ones(count)
+        assert len({native.exp2(x).data_ptr() for _ in range(3)}) == 1
+        for _ in range(300):
+            native.exp2(x[:1])
+    # What was in use last, up to an eighth more of it, and the size before.
+    assert native.unused_bytes() < 2.2 * 4 * count
+
+
+@pytest.mark.usefixtures("reuse")
+def test_memory_of_sizes_that_take_turns_is_kept() -> None:
+    sizes = [50_000, 80_000, 120_000, 200_000]
+    inputs = [torch.ones(size) for size in sizes]
+    first = [native.exp2(x).data_ptr() for x in inputs]
+    for _ in range(100):
+        assert [native.exp2(x).data_ptr() for x in inputs] == first
+    assert native.unused_bytes() >= 4 * sum(sizes)
+    native.exp2(torch.ones(300_000))  # of another size: those that take turns stay
+    assert [native.exp2(x).data_ptr() for x in inputs] == first

@@ -1,0 +1,241 @@
+"""The build backend: which compiler builds the kernels, and what a build without one requires."""
+
+from __future__ import annotations
+
+import importlib.machinery
+import importlib.util
+import os
+import platform
+import shutil
+import subprocess
+import sys
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+from types import ModuleType, SimpleNamespace
+from typing import Any
+
+import pytest
+
+FILE = Path(__file__).resolve().parents[1] / "build_backend" / "xrgs_build.py"
+Programs = Callable[..., None]
+
+
+@dataclass
+class ScikitBuild:
+    """Stands in for `scikit_build_core.build`: notes the compiler that a build is given."""
+
+    compiler: str | None = None
+    beside: list[str] = field(default_factory=list)
+    inside: Callable[[], None] = lambda: None
+
+    def build_wheel(self, *_: object) -> str:
+        self.compiler = os.environ.get("CXX")
+        if self.compiler and Path(self.compiler).is_file():
+            self.beside = sorted(path.name for path in Path(self.compiler).parent.iterdir())
+        self.inside()
+        return "xrgs.whl"
+
+    build_editable = build_wheel
+
+    def build_sdist(self, *_: object) -> str:
+        return "xrgs.tar.gz"
+
+    def get_requires_for_build_wheel(self, _: object) -> list[str]:
+        return ["ninja"]
+
+    get_requires_for_build_editable = get_requires_for_build_wheel
+
+    def get_requires_for_build_sdist(self, _: object) -> list[str]:
+        return []
+
+
+@pytest.fixture
+def scikit_build(monkeypatch: pytest.MonkeyPatch) -> ScikitBuild:
+    made = ScikitBuild()
+    monkeypatch.setitem(sys.modules, "scikit_build_core", SimpleNamespace(build=made))
+    return made
+
+
+@pytest.fixture
+def backend(scikit_build: ScikitBuild, monkeypatch: pytest.MonkeyPatch) -> Any:
+    """The backend on Linux on x86-64, with no program in PATH, no CXX, and no `ziglang`."""
+    spec = importlib.util.spec_from_file_location("xrgs_build", FILE)
+    assert spec is not None
+    assert spec.loader is not None
+    module: ModuleType = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    monkeypatch.setattr(platform, "system", lambda: "Linux")
+    monkeypatch.setattr(platform, "machine", lambda: "x86_64")
+    monkeypatch.setattr(importlib.util, "find_spec", lambda _: None)
+    monkeypatch.delenv("CXX", raising=False)
+    monkeypatch.setenv("PATH", "")
+    return module
+
+
+@pytest.fixture
+def programs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Programs:
+    """(**exit codes by name) -> puts programs that end with them into PATH, which is else empty.
+
+    `cxx` stands for c++, `gxx` for g++ and `clangxx` for clang++.
+    """
+
+    def put(**codes: int) -> None:
+        for name, code in codes.items():
+            file = tmp_path / name.replace("xx", "++")
+            file.write_text(f"#!/bin/sh\nexit {code}\n")
+            file.chmod(0o755)
+        monkeypatch.setenv("PATH", str(tmp_path))
+
+    return put
+
+
+def requires(backend: Any) -> list[str]:
+    wheel: list[str] = backend.get_requires_for_build_wheel({})
+    assert backend.get_requires_for_build_editable({}) == wheel
+    assert wheel[0] == "ninja"
+    assert backend.get_requires_for_build_sdist({}) == []
+    return wheel[1:]
+
+
+def test_a_machine_without_a_compiler_requires_ziglang(backend: Any) -> None:
+    assert requires(backend) == [backend.ZIGLANG]
+
+
+@pytest.mark.parametrize("name", ["cxx", "gxx", "clangxx"])
+def test_a_machine_with_a_compiler_requires_nothing(
+    backend: Any, scikit_build: ScikitBuild, programs: Programs, name: str, tmp_path: Path
+) -> None:
+    programs(**{name: 0})
+    assert requires(backend) == []
+    assert backend.build_wheel("dist") == "xrgs.whl"
+    assert scikit_build.compiler == str(tmp_path / name.replace("xx", "++"))
+    assert "CXX" not in os.environ
+
+
+def test_a_compiler_that_does_not_work_is_none(backend: Any, programs: Programs) -> None:
+    programs(cxx=1, gxx=1)
+    assert requires(backend) == [backend.ZIGLANG]
+
+
+def test_the_first_compiler_that_works_is_the_one_that_builds(
+    backend: Any, scikit_build: ScikitBuild, programs: Programs, tmp_path: Path
+) -> None:
+    programs(cxx=1, gxx=1, clangxx=0)
+    assert requires(backend) == []
+    backend.build_editable("dist")
+    assert scikit_build.compiler == str(tmp_path / "clang++")
+
+
+@pytest.mark.parametrize(("system", "machine"), [("Darwin", "arm64"), ("Linux", "riscv64")])
+def test_other_machines_get_no_ziglang(
+    backend: Any, monkeypatch: pytest.MonkeyPatch, system: str, machine: str
+) -> None:
+    monkeypatch.setattr(platform, "system", lambda: system)
+    monkeypatch.setattr(platform, "machine", lambda: machine)
+    assert requires(backend) == []
+
+
+def test_cxx_names_the_compiler_with_its_options(
+    backend: Any,
+    scikit_build: ScikitBuild,
+    programs: Programs,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    programs(cxx=1, mine=0)
+    command = f"{tmp_path / 'mine'} -pipe"
+    monkeypatch.setenv("CXX", command)
+    assert requires(backend) == []
+    backend.build_wheel("dist")
+    assert scikit_build.compiler == command
+    assert os.environ["CXX"] == command
+
+
+@pytest.mark.parametrize("command", ["/nonexistent", "'"])
+def test_nothing_replaces_a_compiler_that_cxx_names(
+    backend: Any,
+    scikit_build: ScikitBuild,
+    programs: Programs,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    command: str,
+) -> None:
+    programs(cxx=0)
+    found = importlib.machinery.ModuleSpec("ziglang", None)
+    monkeypatch.setattr(importlib.util, "find_spec", lambda _: found)
+    monkeypatch.setenv("CXX", command)
+    assert requires(backend) == []
+    assert backend.build_wheel("dist") == "xrgs.whl"
+    assert scikit_build.compiler == command
+    message = capsys.readouterr().err
+    assert f"CXX={command} is no C++17 compiler that works" in message
+    assert "without kernels" in message
+
+
+def test_without_any_compiler_the_build_says_so_and_goes_on(
+    backend: Any, scikit_build: ScikitBuild, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert backend.build_wheel("dist") == "xrgs.whl"
+    assert scikit_build.compiler is None
+    message = capsys.readouterr().err
+    assert "c++, g++, clang++" in message
+    assert "ziglang is missing" in message
+
+
+def test_ziglang_builds_where_nothing_else_does(
+    backend: Any,
+    scikit_build: ScikitBuild,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    """The commands that CMake gets call `ziglang` for any processor, and are gone afterwards."""
+    (tmp_path / "ziglang.py").write_text("import sys; print(*sys.argv[1:])")
+    monkeypatch.setenv("PYTHONPATH", str(tmp_path))
+    found = importlib.machinery.ModuleSpec("ziglang", None)
+    monkeypatch.setattr(importlib.util, "find_spec", lambda _: found)
+    called: dict[str, str] = {}
+
+    def call() -> None:
+        for variable in ("CC", "CXX"):
+            command = [os.environ[variable], "-c", "a file.cpp"]
+            done = subprocess.run(command, capture_output=True, text=True, check=True)
+            called[variable] = done.stdout.strip()
+
+    scikit_build.inside = call
+    backend.build_wheel("dist")
+    assert "ziglang compiles the kernels" in capsys.readouterr().err
+    assert scikit_build.beside == ["ar", "c++", "cc", "ranlib"]
+    for variable, name in (("CC", "cc"), ("CXX", "c++")):
+        assert called[variable].startswith(f"{name} -target x86_64-linux-gnu.")
+        assert "-mcpu=baseline" in called[variable]
+        assert called[variable].endswith("-c a file.cpp")
+    assert scikit_build.compiler is not None
+    assert not Path(scikit_build.compiler).exists()
+    assert not {"CC", "CXX", "ZIG_GLOBAL_CACHE_DIR"} & os.environ.keys()
+
+
+def test_a_build_that_raises_leaves_the_environment_as_it_was(
+    backend: Any, scikit_build: ScikitBuild, programs: Programs
+) -> None:
+    programs(cxx=0)
+
+    def fail() -> None:
+        raise RuntimeError("CMake failed")
+
+    scikit_build.inside = fail
+    with pytest.raises(RuntimeError, match="CMake failed"):
+        backend.build_wheel("dist")
+    assert "CXX" not in os.environ
+
+
+@pytest.mark.skipif(shutil.which("c++") is None, reason="this machine has no compiler")
+def test_a_real_compiler_is_found_and_a_c_compiler_is_not_enough(
+    backend: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.undo()
+    monkeypatch.setenv("CXX", "c++")
+    assert backend.find_compiler() == "c++"
+    monkeypatch.setenv("CXX", "c++ -x c")
+    assert backend.find_compiler() is None

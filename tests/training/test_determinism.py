@@ -1,0 +1,96 @@
+"""Tests that training on the native backend gives the same bits wherever it is computed.
+
+The training is that of `hashed_training.py`, in a process of its own. What is not the same:
+
+- Instruction sets without a fused multiply-add give other bits. A cell's identity says which of the
+  two arithmetics it was trained with.
+- The similarity to the normalised world (`xrgs.splat.normalize`) is computed in double by numpy's
+  BLAS and LAPACK. Its last digits depend on the processor, which the rounding of cameras and points
+  to float32 removes from all but a few values in a million.
+- Logarithms, cosines and exponentials in double (of spacings, random numbers and `mip`'s result)
+  have last digits of their own in each library; the rounding to float32 removes those likewise.
+- Scores: the metrics are torch's, whose sums and logarithms depend on the processor in the last
+  digits.
+- The torch backend.
+"""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+native = pytest.importorskip("xrgs._native")
+
+PROGRAM = Path(__file__).with_name("hashed_training.py")
+HELD = "31757ed09b4de99a4dab79214151ca8429454362f245f1130e5921e7cfa0d187"
+"""The hash of the training on every machine with a fused multiply-add."""
+UPDATE = (
+    "the training of tests/training/hashed_training.py does not give the bits that HELD stands for."
+    " If you have changed what training computes, on purpose, put the new hash into HELD, and let"
+    " the tests marked slow show that it does not depend on the machine. If you have not, this"
+    " machine, or a library on it, computes something else than others do: find out what."
+)
+WIDE = [isa for isa in native.available_isas() if isa != "portable"]
+
+
+def hashes(*threads: int, **environment: str) -> list[str]:
+    """The hash of the training for each number of threads, with these environment variables."""
+    done = subprocess.run(
+        [sys.executable, "-P", str(PROGRAM), *map(str, threads)],
+        env=os.environ | {"OMP_WAIT_POLICY": "passive"} | environment,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
+    return done.stdout.split()
+
+
+fused = pytest.mark.skipif(
+    not native.fused_multiply_add(), reason="this machine has no fused multiply-add"
+)
+
+
+@fused
+def test_two_threads_give_the_held_bits() -> None:
+    assert hashes(2) == [HELD], UPDATE
+
+
+@pytest.mark.slow
+def test_the_number_of_threads_changes_no_bit() -> None:
+    one, two, three = hashes(1, 2, 3)
+    assert one == two == three
+
+
+@fused
+@pytest.mark.slow
+@pytest.mark.parametrize("capability", ["default", "avx2", "avx512"])
+@pytest.mark.parametrize("isa", WIDE)
+def test_neither_torchs_nor_our_instruction_set_changes_a_bit(isa: str, capability: str) -> None:
+    assert hashes(1, XRGS_ISA=isa, ATEN_CPU_CAPABILITY=capability) == [HELD], UPDATE
+
+
+@fused
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("variable", "value"),
+    [
+        ("MKL_CBWR", "COMPATIBLE"),
+        ("MKL_CBWR", "AVX2"),
+        ("OPENBLAS_CORETYPE", "Nehalem"),
+        ("ONEDNN_MAX_CPU_ISA", "SSE41"),
+        ("GLIBC_TUNABLES", "glibc.cpu.hwcaps=-AVX2,-FMA,-AVX512F"),
+    ],
+)
+def test_the_code_paths_of_other_processors_change_no_bit(variable: str, value: str) -> None:
+    assert hashes(1, **{variable: value}) == [HELD], UPDATE
+
+
+@pytest.mark.slow
+def test_without_fused_multiply_add_the_bits_are_others() -> None:
+    """Else the identity of a cell would tell apart what is the same."""
+    assert hashes(1, XRGS_ISA="portable") != [HELD] or native.available_isas() == ["portable"]

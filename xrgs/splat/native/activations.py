@@ -1,0 +1,82 @@
+"""The activation functions of the raw parameters by the compiled kernels.
+
+torch's own functions depend in their last bits on the number of threads, where a tensor is divided
+among these, and on the processor. These do not.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import torch
+from torch import Tensor
+from torch.autograd.function import once_differentiable
+
+from xrgs import _native
+from xrgs.splat.native.arguments import require_float32
+
+
+def exp(x: Tensor) -> Tensor:
+    """Return e^x: scales of their natural logarithms.
+
+    The relative error is below 1.0e-7. A result below 2^-126 is 0, one above the largest float is
+    infinite, and NaN stays NaN. Values and gradients are bitwise the same for any number of
+    threads.
+
+    Args:
+        x: A float32 tensor of any shape, on the CPU.
+
+    Returns:
+        A tensor of the same shape, contiguous, once differentiable.
+
+    Raises:
+        ValueError: `x` is not float32 on the CPU.
+    """
+    return _activate(x, _native.exp, _native.exp_backward)
+
+
+def logistic(x: Tensor) -> Tensor:
+    """Return 1 / (1 + e^-x): opacities of their logits.
+
+    The relative error is below 2.0e-7. A result below 2^-126 is 0, and NaN stays NaN. Values and
+    gradients are bitwise the same for any number of threads.
+
+    Args:
+        x: A float32 tensor of any shape, on the CPU.
+
+    Returns:
+        A tensor of the same shape, contiguous, once differentiable.
+
+    Raises:
+        ValueError: `x` is not float32 on the CPU.
+    """
+    return _activate(x, _native.logistic, _native.logistic_backward)
+
+
+_Forward = Callable[[Tensor, int], Tensor]
+_Backward = Callable[[Tensor, Tensor, int], Tensor]
+
+
+def _activate(x: Tensor, forward: _Forward, backward: _Backward) -> Tensor:
+    require_float32("x", x)
+    y: Tensor = _Activation.apply(x, forward, backward)
+    return y
+
+
+class _Activation(torch.autograd.Function):
+    """A function of single elements, whose derivative is a function of its value."""
+
+    @staticmethod
+    def forward(ctx: Any, x: Tensor, forward: _Forward, backward: _Backward) -> Tensor:
+        y = forward(x.detach().contiguous().view(-1), torch.get_num_threads()).view(x.shape)
+        ctx.backward_kernel = backward
+        ctx.save_for_backward(y)
+        return y
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, v_y: Tensor) -> tuple[Tensor, None, None]:
+        (y,) = ctx.saved_tensors
+        flat = v_y.contiguous().view(-1), y.view(-1)
+        return ctx.backward_kernel(*flat, torch.get_num_threads()).view(y.shape), None, None
