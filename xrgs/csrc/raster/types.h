@@ -12,6 +12,10 @@ constexpr int kBlocksPerTile = 16;   // row by row
 constexpr int kBatchSize = 128;      // Gaussians of a tile that are composited together
 constexpr int kProjectChunk = 1024;  // Gaussians that one task projects; a multiple of 16
 
+// The largest magnitude of a colour and of the background. A pixel is a mean of both, so it cannot
+// overflow.
+constexpr float kLargestColor = 1e38f;
+
 // Work that the rasterizer leaves out. Each option skips one kind of work while it is true; the
 // image is the same either way, to rounding at the thresholds.
 struct CullingOptions {
