@@ -222,6 +222,43 @@ def test_beyond_the_field_of_view(isa: str, make_camera: MakeCamera, make_scene:
     assert ours.visible.sum() > 20
 
 
+@pytest.mark.parametrize("antialiased", [False, True])
+def test_beyond_the_field_of_view_at_the_near_plane(
+    isa: str, make_camera: MakeCamera, make_scene: MakeScene, antialiased: bool
+) -> None:
+    # Small ones whose slopes are held, where a step towards the camera changes them most.
+    camera = make_camera(turned=True)
+    scene = make_scene(200, camera, seed=16, size=1.0)
+    in_camera = (scene["means"] @ camera.viewmat[:3, :3].T) + camera.viewmat[:3, 3]
+    depth = torch.linspace(0.0095, 0.03, 200, dtype=torch.float64)
+    share = depth / in_camera[:, 2]
+    slopes = in_camera[:, :2] / in_camera[:, 2:] * 1.5
+    in_camera = torch.cat([slopes * depth[:, None], depth[:, None]], dim=1)
+    scene["means"] = (in_camera - camera.viewmat[:3, 3]) @ camera.viewmat[:3, :3]
+    scene["scales"] *= 4 * share[:, None]
+    raster = RasterSettings(antialiased=antialiased, background=(0.3, 0.6, 0.1))
+    ours, _, _ = check(scene, camera, raster)
+    half = torch.tensor([camera.width, camera.height]) / camera.K.diagonal()[:2] / 2
+    held = (slopes.abs() > 1.7 * half).any(dim=1)
+    assert (ours.visible & held).sum() > 10
+    assert not ours.visible[depth < 0.00999].any()
+
+
+@pytest.mark.parametrize("near", [0.0, -1.0])
+def test_a_near_plane_at_the_camera_or_behind(
+    isa: str, make_camera: MakeCamera, make_scene: MakeScene, near: float
+) -> None:
+    camera = make_camera()
+    scene = make_scene(60, camera, seed=5)
+    depths = torch.tensor([-2.0, -0.5, -0.1, 0.0, 1e-4, 1e-3, 0.02], dtype=torch.float64)
+    scene["means"][: len(depths), :2] *= depths[:, None] / 3
+    scene["means"][: len(depths), 2] = depths
+    scene["scales"][: len(depths)] = 0.05 * depths.abs()[:, None]
+    ours, _, _ = check(scene, camera, RasterSettings(near=near))
+    expected = (depths > near) & (depths != 0)
+    assert torch.equal(ours.visible[: len(depths)], expected)
+
+
 @pytest.mark.parametrize("stretch", [30.0, 3000.0])
 def test_needles(isa: str, make_camera: MakeCamera, make_scene: MakeScene, stretch: float) -> None:
     camera = make_camera(60, 40, turned=True)

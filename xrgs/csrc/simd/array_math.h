@@ -1,4 +1,4 @@
-// exp2 and log2 of simd.h over whole arrays, so that tests can call them.
+// exp2, log2 and sqrt_upper_bound of simd.h over whole arrays, so that tests can call them.
 #pragma once
 
 #include <cstdint>
@@ -10,6 +10,7 @@ namespace xrgs {
 struct ArrayMathKernels {
   void (*exp2)(const float* x, float* y, std::int64_t count);
   void (*log2)(const float* x, float* y, std::int64_t count);
+  void (*sqrt_upper_bound)(const float* x, float* y, std::int64_t count);
 };
 
 XRGS_DECLARE_TABLE(ArrayMathKernels, array_math_kernels)
