@@ -276,6 +276,7 @@ def test_quaternions_of_any_length(
     scene["quats"][::5] = 0
     scene["quats"][1::5] *= 1e-18
     scene["quats"][2::5] *= 1e18
+    scene["quats"][3::5] *= 3.4e38 / scene["quats"][3::5].abs().amax(1, keepdim=True)
     _, gradients, _ = check(scene, camera)
     assert (gradients["quats"][::5] == 0).all()
 
@@ -306,6 +307,23 @@ def test_a_covariance_that_overflows_is_dropped(
     without, _ = run(others, camera, RasterSettings(), "native", torch.float32)
     assert torch.equal(ours.image, without.image)
     assert all((gradients[name][1::8] == 0).all() for name in NAMES)
+
+
+def test_beyond_the_largest_depth(isa: str, make_camera: MakeCamera, make_scene: MakeScene) -> None:
+    camera = rounded(make_camera())
+    scene = single(make_scene(50, camera, seed=9))
+    scene["means"][1::8] = torch.tensor([1e37, -1e37, 1.5e38])
+    scene["scales"][1::8] = 1e37
+    scene["opacities"][1::8] = 0.9
+    v_image = torch.ones(camera.height, camera.width, 3)
+    ours, gradients = run(
+        scene, camera, RasterSettings(), "native", torch.float32, (v_image, v_image[..., 0])
+    )
+    assert not ours.visible[1::8].any()
+    assert all((gradients[name][1::8] == 0).all() for name in NAMES)
+    scene["means"][1::8] = torch.tensor([0.0, 0.0, -1.0])
+    without, _ = run(scene, camera, RasterSettings(), "native", torch.float32)
+    assert torch.equal(ours.image, without.image)
 
 
 def test_equal_depths_go_by_index(isa: str, make_camera: MakeCamera, make_scene: MakeScene) -> None:
