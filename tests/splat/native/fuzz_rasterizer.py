@@ -327,6 +327,7 @@ LOSSY = {
     "scales of needles",
     "quats tiny",  # zero is what is below the root of the smallest number, that of the type
     "quats of all sizes",
+    "opacities at the threshold",
     "camera far away",
     "focal length huge",
     "focal lengths of two sizes",
@@ -513,12 +514,19 @@ def compare_with_torch(scene: Scene) -> None:
         (each.image - exact.image).abs().detach().amax(-1) for each in (ours, single)
     )  # [H, W]
     scale = max(1.0, float(exact.image.detach().max()))
-    bound = FACTOR * allowed.max() + 1e-5 * scale
+    bound = FACTOR * allowed.max() + (_threshold_step(scene.settings) + 1e-5) * scale
     if not scene.cases:
         band = _band(scene, exact.image)
         bound = torch.where(band, scene.settings.alpha_min * scale + 1e-5, 1e-5 * scale)
         _compare_gradients(scene, ~band)
     require((error <= bound).all(), f"the image errs by {error.max():.2g}")
+
+
+def _threshold_step(settings: RasterSettings) -> float:
+    """The largest weight of a Gaussian that is composited or not, as alpha or T is rounded."""
+    # The transmittance in front of one that leaves transmittance_min.
+    last = settings.transmittance_min / max(1 - settings.alpha_max, 1e-6)
+    return max(settings.alpha_min, min(1.0, last))
 
 
 def _compare_gradients(scene: Scene, outside: Tensor) -> None:
