@@ -35,6 +35,13 @@ xrgs::Output log2_array(Vector x) {
   return y;
 }
 
+xrgs::Output sqrt_upper_bound_array(Vector x) {
+  xrgs::Output y = xrgs::new_array<float>({x.shape(0)});
+  XRGS_SELECT(array_math_kernels)
+      .sqrt_upper_bound(x.data(), static_cast<float*>(y.data()), x.size());
+  return y;
+}
+
 }  // namespace
 
 NB_MODULE(_native, m) {
@@ -56,6 +63,8 @@ NB_MODULE(_native, m) {
         "Return 2^x as the kernels compute it, float32 [N], for -126 <= x <= 127.");
   m.def("log2", &log2_array, nb::arg("x").noconvert(),
         "Return the base-2 logarithm as the kernels compute it, float32 [N], for x >= 2^-126.");
+  m.def("sqrt_upper_bound", &sqrt_upper_bound_array, nb::arg("x").noconvert(),
+        "Return a bound of the square root as the kernels compute it, float32 [N], for x >= 0.");
   m.def("unused_bytes", &unused_bytes,
         "Return the bytes of released tensors that are kept for the next ones.");
 #ifdef XRGS_FAULT_INJECTION

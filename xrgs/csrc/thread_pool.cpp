@@ -16,6 +16,8 @@
 #include <system_error>
 #include <thread>
 
+#include "flush_denormals.h"
+
 #if !defined(_WIN32)  // whose processes do not fork
 #include <pthread.h>
 #endif
@@ -91,6 +93,7 @@ class ThreadPool {
   }
 
   void worker_loop() {
+    const FlushDenormals flush;  // as run_tasks does for the caller
     std::uint64_t last_generation = 0;
     std::unique_lock<std::mutex> lock(mutex_);
     for (;;) {
@@ -141,6 +144,7 @@ ThreadPool* const pool = [] {
 }  // namespace
 
 void run_tasks(int threads, std::int64_t count, Task task, void* context) {
+  const FlushDenormals flush;
   if (threads <= 1 || count <= 1) {
     for (std::int64_t i = 0; i < count; ++i) task(context, i);
     return;

@@ -14,8 +14,9 @@ using Task = void (*)(void* context, std::int64_t index);
 
 // Runs the tasks 0..count-1 on up to `threads` threads, one of which is the caller's, and returns
 // when all are done. Tasks must not throw. A call from inside a task, and a call while that of
-// another thread is running, run all of their tasks in the caller. It is safe to call this in a
-// forked child and while the interpreter exits.
+// another thread is running, run all of their tasks in the caller. Tasks take denormal numbers for
+// zeros on every thread, whatever its state (flush_denormals.h); that of the caller is restored. It
+// is safe to call this in a forked child and while the interpreter exits.
 void run_tasks(int threads, std::int64_t count, Task task, void* context);
 
 // Runs body(index) for the indices 0..count-1, as run_tasks does.

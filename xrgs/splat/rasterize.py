@@ -60,7 +60,8 @@ def rasterize_parameters(
         backend: `torch`, `native` or `auto` (`resolve_backend`).
 
     Returns:
-        The render, differentiable in every float argument; once only on the native backend.
+        The render, differentiable in every float argument; once only on the native backend, whose
+        backward pass raises ValueError where a gradient is not finite (`native.rasterizer.render`).
 
     Raises:
         ValueError: A parameter has the wrong shape or type, or values that are not finite or out

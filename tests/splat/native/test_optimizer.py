@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from typing import Any
+
+import numpy as np
 import pytest
 import torch
 from hypothesis import given, settings
@@ -87,6 +90,45 @@ def test_it_is_torchs_adam_but_for_rounding(isa: str, count: int) -> None:
         take_step(ours, gradients)
         take_step(theirs, gradients)
         assert_same(ours, theirs, step)
+
+
+def assert_follows_float64(gradients: np.ndarray[Any, Any], steps: int, last_gradient: int) -> None:
+    """Adam on float32 [n, N] gradients, again and again until a step and zeros after it.
+
+    The reference is Algorithm 1 of Kingma and Ba in float64. Each step may round the parameter, and
+    move it by a share more or less: beta2, a float32, is off by 1.3e-8, which is a share of 1.3e-5
+    of what its powers converge to, and the root of that of a step.
+    """
+    lr, beta1, beta2, eps = 1e-3, 0.9, 0.999, 1e-15
+    count = gradients.shape[1]
+    parameter, exp_avg, exp_avg_sq = (torch.zeros(count) for _ in range(3))
+    tensors = [torch.from_numpy(row) for row in (*gradients, np.zeros(count, np.float32))]
+    exact, m, v, bound = (np.zeros(count) for _ in range(4))
+    for step in range(1, steps + 1):
+        gradient = tensors[step % len(gradients) if step <= last_gradient else -1]
+        group = (parameter, gradient, exp_avg, exp_avg_sq, lr, float(step))
+        native.adam_step([group], beta1, beta2, eps, 1)
+        g = gradient.double().numpy()
+        m = beta1 * m + (1 - beta1) * g
+        v = beta2 * v + (1 - beta2) * g**2
+        move = lr * m / (1 - beta1**step) / (np.sqrt(v / (1 - beta2**step)) + eps)
+        exact -= move
+        bound += ULP / 2 * np.abs(exact) + 2e-5 * np.abs(move)
+    assert (bound < 1e-3 * np.abs(exact)).all()
+    assert (np.abs(parameter.double().numpy() - exact) <= bound).all()
+
+
+@pytest.mark.slow
+def test_a_long_training_follows_float64(isa: str) -> None:
+    generator = np.random.default_rng(0)
+    gradients = 1e-3 * (generator.normal(size=(64, 19)) + generator.choice([-1, 1], 19))
+    assert_follows_float64(gradients.astype(np.float32), 30_000, 30_000)
+
+
+@pytest.mark.parametrize("size", [1e-12, 1e-3, 1.0])
+def test_a_thousand_steps_without_gradient_follow_float64(isa: str, size: float) -> None:
+    gradients = size * np.random.default_rng(0).normal(size=(64, 19)) + size
+    assert_follows_float64(gradients.astype(np.float32), 1100, 100)
 
 
 def test_a_first_step_is_within_two_ulp(isa: str) -> None:

@@ -223,6 +223,43 @@ def test_beyond_the_field_of_view(isa: str, make_camera: MakeCamera, make_scene:
     assert ours.visible.sum() > 20
 
 
+@pytest.mark.parametrize("antialiased", [False, True])
+def test_beyond_the_field_of_view_at_the_near_plane(
+    isa: str, make_camera: MakeCamera, make_scene: MakeScene, antialiased: bool
+) -> None:
+    # Small ones whose slopes are held, where a step towards the camera changes them most.
+    camera = make_camera(turned=True)
+    scene = make_scene(200, camera, seed=16, size=1.0)
+    in_camera = (scene["means"] @ camera.viewmat[:3, :3].T) + camera.viewmat[:3, 3]
+    depth = torch.linspace(0.0095, 0.03, 200, dtype=torch.float64)
+    share = depth / in_camera[:, 2]
+    slopes = in_camera[:, :2] / in_camera[:, 2:] * 1.5
+    in_camera = torch.cat([slopes * depth[:, None], depth[:, None]], dim=1)
+    scene["means"] = (in_camera - camera.viewmat[:3, 3]) @ camera.viewmat[:3, :3]
+    scene["scales"] *= 4 * share[:, None]
+    raster = RasterSettings(antialiased=antialiased, background=(0.3, 0.6, 0.1))
+    ours, _, _ = check(scene, camera, raster)
+    half = torch.tensor([camera.width, camera.height]) / camera.K.diagonal()[:2] / 2
+    held = (slopes.abs() > 1.7 * half).any(dim=1)
+    assert (ours.visible & held).sum() > 10
+    assert not ours.visible[depth < 0.00999].any()
+
+
+@pytest.mark.parametrize("near", [0.0, -1.0])
+def test_a_near_plane_at_the_camera_or_behind(
+    isa: str, make_camera: MakeCamera, make_scene: MakeScene, near: float
+) -> None:
+    camera = make_camera()
+    scene = make_scene(60, camera, seed=5)
+    depths = torch.tensor([-2.0, -0.5, -0.1, 0.0, 1e-4, 1e-3, 0.02], dtype=torch.float64)
+    scene["means"][: len(depths), :2] *= depths[:, None] / 3
+    scene["means"][: len(depths), 2] = depths
+    scene["scales"][: len(depths)] = 0.05 * depths.abs()[:, None]
+    ours, _, _ = check(scene, camera, RasterSettings(near=near))
+    expected = (depths > near) & (depths != 0)
+    assert torch.equal(ours.visible[: len(depths)], expected)
+
+
 @pytest.mark.parametrize("stretch", [30.0, 3000.0])
 def test_needles(isa: str, make_camera: MakeCamera, make_scene: MakeScene, stretch: float) -> None:
     camera = make_camera(60, 40, turned=True)
@@ -240,6 +277,7 @@ def test_quaternions_of_any_length(
     scene["quats"][::5] = 0
     scene["quats"][1::5] *= 1e-18
     scene["quats"][2::5] *= 1e18
+    scene["quats"][3::5] *= 3.4e38 / scene["quats"][3::5].abs().amax(1, keepdim=True)
     _, gradients, _ = check(scene, camera)
     assert (gradients["quats"][::5] == 0).all()
 
@@ -270,6 +308,23 @@ def test_a_covariance_that_overflows_is_dropped(
     without, _ = run(others, camera, RasterSettings(), "native", torch.float32)
     assert torch.equal(ours.image, without.image)
     assert all((gradients[name][1::8] == 0).all() for name in NAMES)
+
+
+def test_beyond_the_largest_depth(isa: str, make_camera: MakeCamera, make_scene: MakeScene) -> None:
+    camera = rounded(make_camera())
+    scene = single(make_scene(50, camera, seed=9))
+    scene["means"][1::8] = torch.tensor([1e37, -1e37, 1.5e38])
+    scene["scales"][1::8] = 1e37
+    scene["opacities"][1::8] = 0.9
+    v_image = torch.ones(camera.height, camera.width, 3)
+    ours, gradients = run(
+        scene, camera, RasterSettings(), "native", torch.float32, (v_image, v_image[..., 0])
+    )
+    assert not ours.visible[1::8].any()
+    assert all((gradients[name][1::8] == 0).all() for name in NAMES)
+    scene["means"][1::8] = torch.tensor([0.0, 0.0, -1.0])
+    without, _ = run(scene, camera, RasterSettings(), "native", torch.float32)
+    assert torch.equal(ours.image, without.image)
 
 
 def test_equal_depths_go_by_index(isa: str, make_camera: MakeCamera, make_scene: MakeScene) -> None:

@@ -13,7 +13,6 @@ import sys
 from collections.abc import Callable
 from typing import Any
 
-import numpy as np
 import pytest
 import torch
 from torch import Tensor
@@ -380,16 +379,3 @@ def test_the_environment_chooses_the_instruction_set(value: Any, says: str) -> N
         check=False,
     )
     assert says in (result.stdout if value == "portable" else result.stderr)
-
-
-# --- the vector functions -----------------------------------------------------------------------
-
-
-def test_exp2_and_log2(isa: str) -> None:
-    x = np.linspace(-126, 126, 200_001).astype(np.float32)
-    exact = np.exp2(x.astype(np.float64))
-    assert np.abs(native.exp2(torch.from_numpy(x)).numpy() / exact - 1).max() < 1.1e-7
-    y = np.exp2(np.linspace(-126, 126, 200_001)).astype(np.float32)
-    logs = np.log2(y.astype(np.float64))
-    error = np.abs(native.log2(torch.from_numpy(y)).numpy() - logs)
-    assert (error <= 1e-7 + 1.2e-7 * np.abs(logs)).all()

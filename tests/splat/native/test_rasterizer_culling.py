@@ -46,17 +46,43 @@ def render_with(
     return done, gradients, work
 
 
-@pytest.mark.parametrize("name", [*(field.name for field in fields(CullingOptions)), "all"])
+NAMES = [*(field.name for field in fields(CullingOptions)), "all"]
+
+
+def crowd(make_scene: MakeScene, camera: Camera, count: int, size: float) -> tuple[Scene, Camera]:
+    """Gaussians of which each kind of culling leaves out some, and their camera in float32."""
+    camera = Camera(camera.viewmat.float(), camera.K.float(), camera.width, camera.height)
+    scene = make_scene(count, camera, seed=14, size=size, dtype=torch.float32)
+    scene["opacities"][::3] = 0.99
+    faint = scene["opacities"][1::9]
+    faint[:] = torch.linspace(0, 1 / 255, len(faint))
+    scene["scales"][::4, 0] *= 8
+    scene["means"][::50] -= 100 * camera.viewmat[0, :3]  # far to the left
+    return scene, camera
+
+
+@pytest.mark.parametrize("name", NAMES)
 def test_culling_makes_no_difference(
     isa: str, make_camera: MakeCamera, make_scene: MakeScene, name: str
 ) -> None:
-    camera = make_camera(60, 50, focal=60.0, turned=True)
-    camera = Camera(camera.viewmat.float(), camera.K.float(), camera.width, camera.height)
-    scene = make_scene(1500, camera, seed=14, size=3.0, dtype=torch.float32)
-    scene["opacities"][::3] = 0.99
-    scene["opacities"][1::9] = torch.linspace(0, 1 / 255, 167)
-    scene["scales"][::4, 0] *= 8
-    scene["means"][::50] -= 100 * camera.viewmat[0, :3]  # far to the left
+    scene, camera = crowd(make_scene, make_camera(60, 50, focal=60.0, turned=True), 1500, 3.0)
+    check_culling(scene, camera, name)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", NAMES)
+def test_culling_makes_no_difference_thousands_of_pixels_away(
+    isa: str, make_camera: MakeCamera, make_scene: MakeScene, name: str
+) -> None:
+    # The image of 500 px at the right end of one of 4,500, where float32 coordinates are coarse.
+    scene, camera = crowd(make_scene, make_camera(500, 20, focal=60.0), 1500, 3.0)
+    K = camera.K.clone()
+    K[0, 2] += 4000
+    check_culling(scene, Camera(camera.viewmat, K, 4500, 20), name)
+
+
+def check_culling(scene: Scene, camera: Camera, name: str) -> None:
+    """Compare renders with and without a kind of culling, or all, with each other and the truth."""
     names = [field.name for field in fields(CullingOptions)] if name == "all" else [name]
     usual, usual_gradients, usual_work = render_with(CullingOptions(), scene, camera)
     done, gradients, work = render_with(

@@ -10,6 +10,7 @@
 #include <algorithm>
 #include <array>
 #include <cmath>
+#include <cstdio>
 #include <limits>
 #include <memory>
 #include <optional>
@@ -129,7 +130,7 @@ bool all_finite(const float* p, std::size_t count) {
   for (std::size_t i = 0; i < t.opacities.size(); ++i)
     if (t.opacities.data()[i] < 0.0f || t.opacities.data()[i] > 1.0f)
       throw nb::value_error("opacities has values outside 0..1");
-  throw nb::value_error("sh0 and shN overflow: a colour is not finite");
+  throw nb::value_error("sh0 and shN overflow: a colour is above 1e38");
 }
 
 // Throws MemoryError. The message is made without further allocations.
@@ -178,9 +179,10 @@ std::tuple<Output, Output> forward(FrameHandle& frame, const RenderConfig& confi
   return {std::move(image), std::move(alpha)};
 }
 
-// The gradients of means, quats, scales, opacities, sh0, shN and means2d_offset.
+// The gradients of means, quats, scales, opacities, sh0, shN and means2d_offset, and whether all of
+// them are finite.
 using GradientTensors = std::tuple<Output, Output, Output, Output, Output, std::optional<Output>,
-                                   std::optional<Output>>;
+                                   std::optional<Output>, bool>;
 
 GradientTensors backward(FrameHandle& handle, const Image& v_image, const Plane& v_alpha,
                          const Vectors& means, const Quaternions& quats, const Vectors& scales,
@@ -203,7 +205,8 @@ GradientTensors backward(FrameHandle& handle, const Image& v_image, const Plane&
                       new_array<float>({n}),
                       new_array<float>({n, 1, 3}),
                       std::nullopt,
-                      std::nullopt};
+                      std::nullopt,
+                      true};
   if (with_shN) std::get<5>(out) = new_array<float>({n, rest_count, 3});
   if (means2d_offset) std::get<6>(out) = new_array<float>({n, 2});
   const auto pointer = [](Output& array) { return static_cast<float*>(array.data()); };
@@ -218,13 +221,22 @@ GradientTensors backward(FrameHandle& handle, const Image& v_image, const Plane&
   {
     nb::gil_scoped_release release;
     try {
-      render_backward(threads, parameters, frame, v_image.data(), v_alpha.data(), gradients);
+      std::get<7>(out) =
+          render_backward(threads, parameters, frame, v_image.data(), v_alpha.data(), gradients);
     } catch (const std::bad_alloc&) {
       allocation_ok = false;
     }
   }
   if (!allocation_ok) throw_out_of_memory(frame);
   return out;
+}
+
+void check_within(const char* name, float value, float largest) {
+  if (!(std::abs(value) <= largest)) {
+    char bound[16];
+    std::snprintf(bound, sizeof bound, "%.2g", static_cast<double>(largest));
+    throw nb::value_error((std::string(name) + " must be finite, at most " + bound).c_str());
+  }
 }
 
 // The camera's position in world units, -R^T t.
@@ -236,6 +248,23 @@ void set_camera_position(RenderConfig& config) {
                   static_cast<double>(config.translation[i]);
     config.camera_position[k] = static_cast<float>(position);
   }
+}
+
+// Throws an error that names the first number of the camera or the settings that float32 does not
+// hold, or the background that is too bright.
+void check_finite(const RenderConfig& config) {
+  constexpr float kLargest = std::numeric_limits<float>::max();
+  for (float value : config.rotation) check_within("viewmat", value, kLargest);
+  for (float value : config.translation) check_within("viewmat", value, kLargest);
+  for (float value : config.camera_position) check_within("viewmat's position", value, kLargest);
+  for (float value : {config.fx, config.fy, config.cx, config.cy})
+    check_within("intrinsics", value, kLargest);
+  check_within("near", config.near, kLargest);
+  check_within("eps2d", config.eps2d, kLargest);
+  check_within("alpha_min", config.alpha_min, kLargest);
+  check_within("alpha_max", config.alpha_max, kLargest);
+  check_within("transmittance_min", config.transmittance_min, kLargest);
+  for (float value : config.background) check_within("background", value, kLargestColor);
 }
 
 RenderConfig make_config(const Matrix4& viewmat, const std::array<float, 4>& intrinsics, int width,
@@ -270,6 +299,7 @@ RenderConfig make_config(const Matrix4& viewmat, const std::array<float, 4>& int
   config.absgrad = absgrad;
   config.sh_degree = sh_degree;
   config.culling = {culling[0], culling[1], culling[2], culling[3], culling[4]};
+  check_finite(config);
   return config;
 }
 
@@ -319,7 +349,8 @@ void bind_raster(nb::module_& m) {
            "means2d_offset"_a.none().noconvert(), "with_shN"_a, "threads"_a,
            "Compute the gradients of the parameters, in their order, from those of image and "
            "alpha.\n"
-           "shN's is None unless with_shN, that of means2d_offset is None where there is none.")
+           "shN's is None unless with_shN, that of means2d_offset is None where there is none.\n"
+           "The last value says whether all of them are finite.")
       .def("visible", &visible_mask, "Return which Gaussians are visible: [N] bool.")
       .def_prop_ro(
           "pair_count", [](FrameHandle& f) { return rendered(f).pair_count(); },

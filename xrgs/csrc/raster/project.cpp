@@ -130,11 +130,11 @@ std::uint32_t project_group(const GaussianParameters& p, const RenderConfig& con
                             std::int64_t group, int lanes, Frame& frame, float* depths,
                             bool* params_valid) {
   const GaussianInputs in = load_inputs(p, group, lanes);
-  const Floats zero = broadcast(0.0f);
   if (to_bits(valid_inputs(in)) != 0xffffu) *params_valid = false;
   const Projection o = project_inputs(in, config);
   const Floats log2_opacity = log2(max(o.opacity, broadcast(kSmallestNormal)));
-  const Floats cutoff_radius_sq = max(log2_opacity - broadcast(config.log2_alpha_min), zero);
+  const Floats cutoff_radius_sq =
+      max(log2_opacity - broadcast(config.log2_alpha_min), broadcast(0.0f));
   const std::uint32_t existing = lanes == 16 ? 0xffffu : (1u << lanes) - 1u;
   const std::uint32_t visible = to_bits(is_visible(o, config, cutoff_radius_sq)) & existing;
   if (visible == 0) return 0;
@@ -143,9 +143,10 @@ std::uint32_t project_group(const GaussianParameters& p, const RenderConfig& con
   const Vector3 color =
       unclamped_colors<Degree>(p, group, lanes, visible, direction,
                                frame.color_derivatives[static_cast<std::size_t>(group / 16)]);
-  const Mask finite =
-      (color.x * zero == zero) & (color.y * zero == zero) & (color.z * zero == zero);
-  if ((visible & ~to_bits(finite)) != 0) *params_valid = false;
+  const Floats largest = broadcast(kLargestColor);
+  const Mask in_range =
+      (abs(color.x) <= largest) & (abs(color.y) <= largest) & (abs(color.z) <= largest);
+  if ((visible & ~to_bits(in_range)) != 0) *params_valid = false;
   store_projected(o, log2_opacity, cutoff_radius_sq, color, visible,
                   frame.projected.data() + group);
   store(depths, o.z);

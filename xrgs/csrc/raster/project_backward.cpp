@@ -105,6 +105,19 @@ struct GeometryGradient {
   Floats quat[4];
 };
 
+// Whether all gradients of the visible Gaussians are finite. Those of shN are products of the
+// gradient of the colour and a basis function, none of which is above 1.
+XRGS_INLINE bool all_finite(const GeometryGradient& v, const Vector3& v_color, Floats v_opacity,
+                            Floats v_offset_x, Floats v_offset_y, std::uint32_t visible) {
+  const Floats zero = broadcast(0.0f);
+  Floats sum = v_opacity * zero;  // stays zero: infinity or NaN times zero is NaN
+  for (Floats part :
+       {v.mean.x, v.mean.y, v.mean.z, v.scale.x, v.scale.y, v.scale.z, v.quat[0], v.quat[1],
+        v.quat[2], v.quat[3], v_color.x, v_color.y, v_color.z, v_offset_x, v_offset_y})
+    sum = fma(part, zero, sum);
+  return (visible & ~to_bits(sum == zero)) == 0;
+}
+
 // From the rows of M and the projected mean to means, scales and quaternions (Eq. 26 to 30).
 XRGS_INLINE GeometryGradient projection_backward(const Projection& o, const RenderConfig& config,
                                                  const GaussianInputs& in, const Vector3& v_m_x,
@@ -167,19 +180,20 @@ void zero_floats(float* p, std::int64_t count) {
   std::memset(p, 0, static_cast<std::size_t>(count) * 4);
 }
 
-// Writes the gradients of sh0 and, where it is wanted, of shN (Eq. 31). Returns the gradient of the
-// mean that comes from the viewing direction (Eq. 32).
+// Writes the gradients of sh0 and, where it is wanted, of shN (Eq. 31). Sets v to the gradient of
+// the colour, and returns that of the mean that comes from the viewing direction (Eq. 32).
 template <int Degree>
 XRGS_INLINE Vector3 color_backward(const GaussianParameters& p, const RenderConfig& config,
                                    const GaussianInputs& in, const ColorDerivatives& derivatives,
                                    const Floats (&sum)[16], std::int64_t group, int lanes,
-                                   const ParameterGradients& out, ShGradientRows& sh_rows) {
+                                   const ParameterGradients& out, ShGradientRows& sh_rows,
+                                   Vector3& v) {
   constexpr int kRest = rest_basis_count(Degree);
   Floats inv_distance;
   const Vector3 d = view_direction(in.mean, config.camera_position, inv_distance);
-  const Vector3 v{select_or_zero(mask_from_bits(derivatives.unclamped[0]), sum[kGradRed]),
-                  select_or_zero(mask_from_bits(derivatives.unclamped[1]), sum[kGradGreen]),
-                  select_or_zero(mask_from_bits(derivatives.unclamped[2]), sum[kGradBlue])};
+  v = {select_or_zero(mask_from_bits(derivatives.unclamped[0]), sum[kGradRed]),
+       select_or_zero(mask_from_bits(derivatives.unclamped[1]), sum[kGradGreen]),
+       select_or_zero(mask_from_bits(derivatives.unclamped[2]), sum[kGradBlue])};
   GroupWriter writer(group, lanes);
   store_triples(writer.target(out.sh0, 3), broadcast(kC0) * v.x, broadcast(kC0) * v.y,
                 broadcast(kC0) * v.z);
@@ -242,9 +256,9 @@ void write_geometry(const GeometryGradient& v, Floats v_opacity, Floats v_mean2d
   writer.copy_out(out.means2d_offset, 2);
 }
 
-// Writes the gradients of Gaussians group..group+lanes-1.
+// Writes the gradients of Gaussians group..group+lanes-1. Returns whether all of them are finite.
 template <int Degree>
-void backward_group(const GaussianParameters& p, const Frame& frame, const float* pair_grads,
+bool backward_group(const GaussianParameters& p, const Frame& frame, const float* pair_grads,
                     std::int64_t group, int lanes, std::uint32_t visible,
                     const ParameterGradients& out, ShGradientRows& sh_rows) {
   const RenderConfig& config = frame.config;
@@ -259,33 +273,37 @@ void backward_group(const GaussianParameters& p, const Frame& frame, const float
   GeometryGradient geometry = projection_backward(o, config, in, v_m_x, v_m_y, v.mean_x, v.mean_y);
   const ColorDerivatives& derivatives =
       frame.color_derivatives[static_cast<std::size_t>(group / 16)];
+  Vector3 v_color;
   const Vector3 by_direction =
-      color_backward<Degree>(p, config, in, derivatives, sum, group, lanes, out, sh_rows);
+      color_backward<Degree>(p, config, in, derivatives, sum, group, lanes, out, sh_rows, v_color);
   geometry.mean = add_scaled(geometry.mean, broadcast(1.0f), by_direction);
   const Floats v_offset_x = config.absgrad ? sum[kAbsGradX] : v.mean_x;
   const Floats v_offset_y = config.absgrad ? sum[kAbsGradY] : v.mean_y;
   write_geometry(geometry, v_opacity, v_offset_x, v_offset_y, mask_from_bits(visible), group, lanes,
                  out);
+  return all_finite(geometry, v_color, v_opacity, v_offset_x, v_offset_y, visible);
 }
 
 template <int Degree>
-void backward_degree(const GaussianParameters& p, const Frame& frame, const float* pair_grads,
+bool backward_degree(const GaussianParameters& p, const Frame& frame, const float* pair_grads,
                      std::int64_t first, std::int64_t last, const ParameterGradients& out) {
   ShGradientRows sh_rows;
+  bool finite = true;
   for (std::int64_t group = first; group < last; group += 16) {
     const int lanes = last - group < 16 ? static_cast<int>(last - group) : 16;
     const std::uint32_t visible = frame.visible[static_cast<std::size_t>(group / 16)];
     if (visible == 0)
       write_zeros(p, group, lanes, out);
-    else
-      backward_group<Degree>(p, frame, pair_grads, group, lanes, visible, out, sh_rows);
+    else if (!backward_group<Degree>(p, frame, pair_grads, group, lanes, visible, out, sh_rows))
+      finite = false;
   }
   stream_fence();
+  return finite;
 }
 
 }  // namespace
 
-void project_backward(const GaussianParameters& p, const Frame& frame, const float* pair_grads,
+bool project_backward(const GaussianParameters& p, const Frame& frame, const float* pair_grads,
                       std::int64_t first, std::int64_t last, const ParameterGradients& out) {
   switch (frame.config.sh_degree) {
     case 0:

@@ -12,6 +12,9 @@ namespace XRGS_NS {
 // of gsplat and of the original 3DGS code, around the true principal point (Eq. 3).
 constexpr float kClampMargin = 0.3f;
 
+// From this depth on, in world units, a Gaussian is not visible: the reciprocal would be denormal.
+constexpr float kDepthEnd = 8e37f;
+
 struct Vector3 {
   Floats x, y, z;
 };
@@ -73,18 +76,19 @@ struct Rotation {
 XRGS_INLINE Rotation quat_to_rotation(const GaussianInputs& in) {
   // Dividing by the largest component first keeps the squares of tiny and of huge quaternions in
   // range.
-  const Floats one = broadcast(1.0f);
+  // Both are divided by four before, as the reciprocal of the largest numbers is denormal.
+  const Floats one = broadcast(1.0f), quarter = broadcast(0.25f);
   const Floats largest = max(max(abs(in.qw), abs(in.qx)), max(abs(in.qy), abs(in.qz)));
   const Mask zero =
       largest < broadcast(1.0842022e-19f);  // the square root of the smallest normal number
-  const Floats inv_largest = one / select(zero, one, largest);
+  const Floats inv_largest = one / (quarter * select(zero, one, largest));
   Rotation r;
-  r.w = select(zero, one, in.qw * inv_largest);
-  r.x = select(zero, broadcast(0.0f), in.qx * inv_largest);
-  r.y = select(zero, broadcast(0.0f), in.qy * inv_largest);
-  r.z = select(zero, broadcast(0.0f), in.qz * inv_largest);
+  r.w = select(zero, one, quarter * in.qw * inv_largest);
+  r.x = select(zero, broadcast(0.0f), quarter * in.qx * inv_largest);
+  r.y = select(zero, broadcast(0.0f), quarter * in.qy * inv_largest);
+  r.z = select(zero, broadcast(0.0f), quarter * in.qz * inv_largest);
   const Floats inv = one / sqrt(fma(r.w, r.w, fma(r.x, r.x, fma(r.y, r.y, r.z * r.z))));
-  r.inv_length = select(zero, broadcast(0.0f), inv * inv_largest);
+  r.inv_length = select(zero, broadcast(0.0f), quarter * inv * inv_largest);
   r.w = r.w * inv;
   r.x = r.x * inv;
   r.y = r.y * inv;
@@ -110,7 +114,7 @@ struct Projection {
   Floats det;             // of the dilated covariance (Eq. 6)
   Floats opacity;         // compensated if antialiased (Eq. 10)
   Floats mean_x, mean_y;  // px (Eq. 2)
-  Mask in_front;          // of the near plane
+  Mask in_front;          // of the near plane, and nearer than kDepthEnd
 };
 
 // Clamps a slope to the field of view and a margin (Eq. 3); `size` is the width or height in px.
@@ -132,7 +136,7 @@ XRGS_INLINE Projection project_inputs(const GaussianInputs& in, const RenderConf
   o.x = dot(row[0], in.mean) + broadcast(config.translation[0]);
   o.y = dot(row[1], in.mean) + broadcast(config.translation[1]);
   o.z = dot(row[2], in.mean) + broadcast(config.translation[2]);
-  o.in_front = broadcast(config.near) < o.z;
+  o.in_front = (broadcast(config.near) < o.z) & (abs(o.z) < broadcast(kDepthEnd));
   o.z = select(o.in_front, o.z, broadcast(1.0f));
   o.inv_z = broadcast(1.0f) / o.z;
   const Floats focal_x = broadcast(config.fx) * o.inv_z, focal_y = broadcast(config.fy) * o.inv_z;

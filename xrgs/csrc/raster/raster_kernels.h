@@ -39,8 +39,8 @@ struct RasterKernels {
                              const float* v_alpha, float* pair_grads);
 
   // Writes the parameter gradients of Gaussians first..last-1 (first a multiple of 16); those of
-  // Gaussians that are not visible are zeros.
-  void (*project_backward)(const GaussianParameters& parameters, const Frame& frame,
+  // Gaussians that are not visible are zeros. Returns whether all of them are finite.
+  bool (*project_backward)(const GaussianParameters& parameters, const Frame& frame,
                            const float* pair_grads, std::int64_t first, std::int64_t last,
                            const ParameterGradients& gradients);
 };

@@ -128,7 +128,7 @@ bool render(int threads, const GaussianParameters& parameters, const RenderConfi
   return true;
 }
 
-void render_backward(int threads, const GaussianParameters& parameters, Frame& frame,
+bool render_backward(int threads, const GaussianParameters& parameters, Frame& frame,
                      const float* v_image, const float* v_alpha,
                      const ParameterGradients& gradients) {
   const RasterKernels& kernels = XRGS_SELECT(raster_kernels);
@@ -140,12 +140,15 @@ void render_backward(int threads, const GaussianParameters& parameters, Frame& f
   });
   frame.timings.composite_backward = timer.elapsed_ms();
   const std::int64_t chunks = (parameters.count + kProjectChunk - 1) / kProjectChunk;
+  std::atomic<bool> all_finite{true};
   parallel_for(threads, chunks, [&](std::int64_t c) {
     const std::int64_t first = c * kProjectChunk;
     const std::int64_t last = std::min(parameters.count, first + kProjectChunk);
-    kernels.project_backward(parameters, frame, pair_grads, first, last, gradients);
+    if (!kernels.project_backward(parameters, frame, pair_grads, first, last, gradients))
+      all_finite = false;
   });
   frame.timings.project_backward = timer.elapsed_ms();
+  return all_finite;
 }
 
 }  // namespace xrgs

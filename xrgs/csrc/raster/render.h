@@ -12,10 +12,10 @@ namespace xrgs {
 bool render(int threads, const GaussianParameters& parameters, const RenderConfig& config,
             Frame& frame, float* image, float* alpha);
 
-// Writes the gradients of the parameters, given those of image and alpha. The parameters must be
-// the ones that were rendered into the frame. Throws std::bad_alloc, after which it can be called
-// again.
-void render_backward(int threads, const GaussianParameters& parameters, Frame& frame,
+// Writes the gradients of the parameters, given those of image and alpha, and returns whether all
+// of them are finite. The parameters must be the ones that were rendered into the frame. Throws
+// std::bad_alloc, after which it can be called again.
+bool render_backward(int threads, const GaussianParameters& parameters, Frame& frame,
                      const float* v_image, const float* v_alpha,
                      const ParameterGradients& gradients);
 

@@ -17,7 +17,7 @@ std::int64_t intersect_tiles(Frame& frame, std::int64_t* next, std::int64_t last
 void composite(Frame& frame, int tile, float* image, float* alpha);
 void composite_backward(const Frame& frame, int tile, const float* v_image, const float* v_alpha,
                         float* pair_grads);
-void project_backward(const GaussianParameters& parameters, const Frame& frame,
+bool project_backward(const GaussianParameters& parameters, const Frame& frame,
                       const float* pair_grads, std::int64_t first, std::int64_t last,
                       const ParameterGradients& gradients);
 

@@ -16,6 +16,10 @@ constexpr int kMaxShDegree = 3;      // of the spherical harmonics
 // The number of basis functions of degree 1 to `degree`: K - 1 of shN [N, K - 1, 3].
 constexpr int rest_basis_count(int degree) { return (degree + 1) * (degree + 1) - 1; }
 
+// The largest magnitude of a colour and of the background. A pixel is a mean of both, so it cannot
+// overflow.
+constexpr float kLargestColor = 1e38f;
+
 // Work that the rasterizer leaves out. Each option skips one kind of work while it is true; the
 // image is the same either way, to rounding at the thresholds.
 struct CullingOptions {

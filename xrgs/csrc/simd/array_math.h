@@ -1,5 +1,5 @@
-// exp2 and log2 of simd.h over whole arrays, so that tests can call them, and what an instruction
-// set says of its arithmetic.
+// exp2, log2 and sqrt_upper_bound of simd.h over whole arrays, so that tests can call them, and
+// what an instruction set says of its arithmetic.
 #pragma once
 
 #include <cstdint>
@@ -11,6 +11,7 @@ namespace xrgs {
 struct ArrayMathKernels {
   void (*exp2)(const float* x, float* y, std::int64_t count);
   void (*log2)(const float* x, float* y, std::int64_t count);
+  void (*sqrt_upper_bound)(const float* x, float* y, std::int64_t count);
   bool fused_multiply_add;  // kFusedMultiplyAdd of simd.h
 };
 

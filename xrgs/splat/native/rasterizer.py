@@ -7,6 +7,7 @@ by the next render.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import astuple
 from typing import Any
 
@@ -16,13 +17,15 @@ from torch.autograd.function import once_differentiable
 
 from xrgs import _native
 from xrgs.splat.cameras import Camera
-from xrgs.splat.gaussians import ActivatedGaussians
+from xrgs.splat.gaussians import PARAMETERS, ActivatedGaussians
 from xrgs.splat.native.arguments import require_float32
 from xrgs.splat.render_result import Render
 from xrgs.splat.settings import CullingOptions, RasterSettings
 
-_SHN_INPUT = 7
-"""Place of shN among the arguments of `_Rasterize.forward`."""
+_FIRST_PARAMETER = 2
+"""Place of the first parameter among the arguments of `_Rasterize.forward`."""
+_SHN_INPUT = _FIRST_PARAMETER + PARAMETERS.index("shN")
+"""Place of shN among them."""
 
 
 def render(
@@ -45,11 +48,14 @@ def render(
         means2d_offset: [N, 2] px, added to the projected means; None for zeros.
 
     Returns:
-        The render, once differentiable in every parameter and the offset.
+        The render, once differentiable in every parameter and the offset. Its backward pass raises
+        ValueError where a gradient that is asked for is not finite, and names the parameter or, if
+        that is where it comes from, `v_image` or `v_alpha`.
 
     Raises:
         ValueError: A parameter is not float32 on the CPU, or has values that are not finite or out
-            of range. Harmonics are read, and so checked, for visible Gaussians only.
+            of range; or float32 can't hold a number of the camera or the settings. Harmonics are
+            read, and so checked, for visible Gaussians only.
         MemoryError: The tile lists of the view do not fit in memory.
     """
     return render_culled(gaussians, camera, settings, sh_degree, means2d_offset, CullingOptions())
@@ -138,11 +144,34 @@ class _Rasterize(torch.autograd.Function):
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, v_image: Tensor, v_alpha: Tensor) -> tuple[Tensor | None, ...]:
-        gradients = ctx.frame.backward(
+        *gradients, all_finite = ctx.frame.backward(
             v_image.contiguous(),
             v_alpha.contiguous(),
             *ctx.saved_tensors,
             ctx.needs_input_grad[_SHN_INPUT],  # three quarters of all gradients
             torch.get_num_threads(),
         )
+        if not all_finite:
+            needed = ctx.needs_input_grad[_FIRST_PARAMETER:]
+            _raise_if_not_finite(v_image, v_alpha, gradients, needed)
         return (None, None, *gradients)
+
+
+def _raise_if_not_finite(
+    v_image: Tensor, v_alpha: Tensor, gradients: Sequence[Tensor | None], needed: Sequence[bool]
+) -> None:
+    """Raise ValueError for the first needed gradient that is not finite, if there is one."""
+    names = (*PARAMETERS, "means2d_offset")
+    for name, gradient, is_needed in zip(names, gradients, needed, strict=True):
+        if not is_needed or gradient is None or torch.isfinite(gradient).all():
+            continue
+        for incoming, source in (("v_image", v_image), ("v_alpha", v_alpha)):
+            if not torch.isfinite(source).all():
+                raise ValueError(
+                    f"{incoming}, the gradient of the loss by the {incoming[2:]}, has values that"
+                    " are not finite"
+                )
+        raise ValueError(
+            f"the gradient of {name} is not finite: the parameters, the settings or the gradient"
+            " of the image are too large or too small for float32"
+        )

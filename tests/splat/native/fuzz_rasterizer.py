@@ -1,0 +1,622 @@
+"""Random and mostly hostile scenes for the compiled rasterizer, forward and backward.
+
+    python tests/splat/native/fuzz_rasterizer.py --seed 0 --count 10000
+
+draws the scenes of the seeds 0 to 9999. Each must give an image and gradients that are finite and
+in range, or an error that names what can't be rendered. One scene in `--compare-every` is compared
+with torch in float64, unless float32 can't be near it; one without a hostile case must render, and
+its gradients are compared as well. The command ends with the first scene that fails, whose seed it
+prints, or with the number of refused scenes.
+"""
+
+from __future__ import annotations
+
+import argparse
+import re
+import sys
+from collections import defaultdict
+from collections.abc import Callable, Iterable, Mapping
+from copy import copy
+from dataclasses import dataclass, field, replace
+from random import Random
+
+import torch
+from torch import Tensor
+
+from xrgs.splat.backend import implementation
+from xrgs.splat.cameras import Camera
+from xrgs.splat.gaussians import PARAMETERS, ActivatedGaussians
+from xrgs.splat.native.rasterizer import render_culled
+from xrgs.splat.render_result import Render
+from xrgs.splat.settings import CullingOptions, RasterSettings
+
+SIZES = (1, 2, 3, 15, 16, 17)
+"""Of images: below, at and above the sides of a block and of a tile; of scenes likewise."""
+FLOAT32_MAX = 3e38
+BAND = 1e-4
+"""A pixel is in the band if moving a threshold by this share changes it: float32 may fall on either
+side there, so that no gradient is compared, and the image only to one Gaussian more or less."""
+FACTOR = 5.0
+"""Gradients (their norms over all Gaussians) and images of hostile scenes (the pixel furthest off)
+may err by this much more than torch's own float32."""
+GRADIENT_FLOOR = {"scales": 1e-3, "quats": 1e-3}
+"""Or by this share of their norm, where few pixels are left to cancel."""
+GRADIENT_FLOOR_ELSE = 1e-4
+REFUSAL = re.compile(
+    r"(the gradient of (means|quats|scales|opacities|sh0|shN|means2d_offset) is not finite"
+    r"|sh0 and shN overflow)"
+)
+"""The errors that a scene of finite numbers may give."""
+
+
+@dataclass
+class Scene:
+    """What is rendered, and the gradients of the loss by its image and alpha."""
+
+    means: Tensor  # [N, 3] in camera coordinates until `place_in_world`
+    quats: Tensor  # [N, 4]
+    scales: Tensor  # [N, 3]
+    opacities: Tensor  # [N]
+    sh0: Tensor  # [N, 1, 3]
+    shN: Tensor  # noqa: N815  # [N, K - 1, 3]
+    viewmat: Tensor  # [4, 4]
+    K: Tensor  # [3, 3]
+    width: int
+    height: int
+    sh_degree: int
+    v_image: Tensor  # [H, W, 3]
+    v_alpha: Tensor  # [H, W]
+    means2d_offset: Tensor | None = None  # [N, 2]
+    settings: RasterSettings = field(default_factory=RasterSettings)
+    culling: CullingOptions = field(default_factory=CullingOptions)
+    needed: tuple[bool, ...] = (True,) * 7
+    """Whether the gradient of each parameter, and of the offset, is asked for."""
+    cases: list[str] = field(default_factory=list)
+    """The hostile cases in it."""
+
+    @property
+    def camera(self) -> Camera:
+        return Camera(self.viewmat, self.K, self.width, self.height)
+
+
+class Draw:
+    """The random numbers of one scene."""
+
+    def __init__(self, seed: int) -> None:
+        self.random = Random(seed)
+        self.generator = torch.Generator().manual_seed(seed)
+
+    def normal(self, *shape: int) -> Tensor:
+        return torch.randn(*shape, generator=self.generator)
+
+    def uniform(self, *shape: int) -> Tensor:
+        return torch.rand(*shape, generator=self.generator)
+
+    def one_of(self, *values: float) -> float:
+        return self.random.choice(values)
+
+    def chance(self, probability: float) -> bool:
+        return self.random.random() < probability
+
+
+# --- hostile cases: each changes a plain scene --------------------------------------------------
+
+Case = Callable[[Draw, Scene], None]
+
+
+def _spread(draw: Draw, value: Tensor, decades: float) -> Tensor:
+    """Each row times a random power of ten."""
+    return value * 10 ** (draw.normal(len(value), 1) * decades).clamp(-37, 37)
+
+
+def means_near(draw: Draw, scene: Scene) -> None:
+    distance = (draw.uniform(len(scene.means)) - 0.5) * 10 ** (-3 - 3 * draw.random.random())
+    scene.means[:, 2] = 0.01 + distance
+
+
+def means_on_the_camera_plane(draw: Draw, scene: Scene) -> None:
+    scene.means[:, 2] = draw.one_of(0.0, 1e-38, 1e-45, -1e-30, 0.01)
+
+
+def means_behind(draw: Draw, scene: Scene) -> None:
+    scene.means[:, 2] *= torch.sign(draw.normal(len(scene.means)))
+
+
+def means_huge(draw: Draw, scene: Scene) -> None:
+    scene.means *= draw.one_of(1e10, 1e18, 1e19, 1e20, 1e30, 3e37)
+
+
+def means_of_all_sizes(draw: Draw, scene: Scene) -> None:
+    scene.means = _spread(draw, scene.means, 12)
+
+
+def means_on_the_axis(draw: Draw, scene: Scene) -> None:
+    scene.means[:, :2] = 0
+
+
+def means_all_the_same(draw: Draw, scene: Scene) -> None:
+    scene.means[:] = scene.means[:1].clone()
+
+
+def scales_zero(draw: Draw, scene: Scene) -> None:
+    scene.scales[:] = 0
+
+
+def scales_tiny(draw: Draw, scene: Scene) -> None:
+    scene.scales[:] = draw.one_of(1e-45, 1e-30, 1e-20, 1e-10)
+
+
+def scales_huge(draw: Draw, scene: Scene) -> None:
+    scene.scales *= draw.one_of(1e2, 1e4, 1e6, 1e10, 1e18, 1e30)
+
+
+def scales_of_all_sizes(draw: Draw, scene: Scene) -> None:
+    scene.scales = 10 ** (draw.normal(*scene.scales.shape) * 10).clamp(-38, 38)
+
+
+def scales_flat(draw: Draw, scene: Scene) -> None:
+    scene.scales[:, draw.random.randrange(3)] = 0
+
+
+def scales_needle(draw: Draw, scene: Scene) -> None:
+    scene.scales *= torch.tensor([1e5, 1e-5, 1e-5])
+
+
+def quats_zero(draw: Draw, scene: Scene) -> None:
+    scene.quats[:] = 0
+
+
+def quats_huge(draw: Draw, scene: Scene) -> None:
+    scene.quats *= draw.one_of(1e10, 1e19, 1e30, 5e37)
+
+
+def quats_tiny(draw: Draw, scene: Scene) -> None:
+    scene.quats *= draw.one_of(1e-10, 1e-18, 1e-20, 1e-30, 1e-40)
+
+
+def quats_of_all_sizes(draw: Draw, scene: Scene) -> None:
+    scene.quats = _spread(draw, scene.quats, 15)
+
+
+def opacities_zero(draw: Draw, scene: Scene) -> None:
+    scene.opacities[:] = 0
+
+
+def opacities_one(draw: Draw, scene: Scene) -> None:
+    scene.opacities[:] = 1
+
+
+def opacities_denormal(draw: Draw, scene: Scene) -> None:
+    scene.opacities[:] = 1e-42
+
+
+def opacities_at_the_threshold(draw: Draw, scene: Scene) -> None:
+    scene.opacities = (1 + (draw.uniform(len(scene.means)) - 0.5) * 1e-6) / 255
+
+
+def opacities_zero_or_one(draw: Draw, scene: Scene) -> None:
+    scene.opacities = scene.opacities.round()
+
+
+def colors_huge(draw: Draw, scene: Scene) -> None:
+    factor = draw.one_of(1e6, 1e15, 1e30, 1e38)
+    scene.sh0 = scene.sh0 * factor
+    scene.shN = scene.shN * factor
+
+
+def colors_zero(draw: Draw, scene: Scene) -> None:
+    scene.sh0 = torch.zeros_like(scene.sh0)
+    scene.shN = torch.zeros_like(scene.shN)
+
+
+def camera_far_away(draw: Draw, scene: Scene) -> None:
+    scene.viewmat[:3, 3] *= draw.one_of(1e4, 1e15, 1e30)
+
+
+def focal_tiny(draw: Draw, scene: Scene) -> None:
+    scene.K[0, 0] = scene.K[1, 1] = draw.one_of(1e-3, 1e-10, 1e-30)
+
+
+def focal_huge(draw: Draw, scene: Scene) -> None:
+    scene.K[0, 0] = scene.K[1, 1] = draw.one_of(1e5, 1e10, 1e18, 1e30)
+
+
+def focal_of_two_sizes(draw: Draw, scene: Scene) -> None:
+    scene.K[0, 0] *= 1e4
+    scene.K[1, 1] *= 1e-4
+
+
+def centre_far_away(draw: Draw, scene: Scene) -> None:
+    for axis in (0, 1):
+        scene.K[axis, 2] = draw.one_of(-1, 1) * 10 ** draw.random.uniform(1, 12)
+
+
+def offsets_huge(draw: Draw, scene: Scene) -> None:
+    scene.means2d_offset = draw.normal(len(scene.means), 2) * draw.one_of(1, 1e3, 1e20)
+
+
+def not_contiguous(draw: Draw, scene: Scene) -> None:
+    scene.means = scene.means.t().contiguous().t()
+    scene.quats = torch.cat([scene.quats, scene.quats], 1)[:, :4]
+    scene.opacities = torch.stack([scene.opacities, scene.opacities], 1)[:, 0]
+    scene.shN = scene.shN.permute(2, 1, 0).contiguous().permute(2, 1, 0)
+
+
+def setting(name: str, *values: float) -> Case:
+    def case(draw: Draw, scene: Scene) -> None:
+        setattr(scene.settings, name, draw.one_of(*values))  # the scene has settings of its own
+
+    return case
+
+
+def image_gradients_huge(draw: Draw, scene: Scene) -> None:
+    factor = draw.one_of(1e10, 1e20, 1e30, 1e37)
+    scene.v_image = scene.v_image * factor
+    scene.v_alpha = scene.v_alpha * factor
+
+
+def image_gradients_zero(draw: Draw, scene: Scene) -> None:
+    scene.v_image = torch.zeros_like(scene.v_image)
+    scene.v_alpha = torch.zeros_like(scene.v_alpha)
+
+
+def image_gradients_expanded(draw: Draw, scene: Scene) -> None:
+    scene.v_image = torch.ones(1).expand(scene.v_image.shape)
+    scene.v_alpha = torch.ones(1).expand(scene.v_alpha.shape)
+
+
+GROUPS: tuple[Mapping[str, Case], ...] = (
+    {
+        "means near the near plane": means_near,
+        "means on the camera's plane": means_on_the_camera_plane,
+        "means behind": means_behind,
+        "means huge": means_huge,
+        "means of all sizes": means_of_all_sizes,
+        "means on the axis": means_on_the_axis,
+        "means all the same": means_all_the_same,
+    },
+    {
+        "scales zero": scales_zero,
+        "scales tiny": scales_tiny,
+        "scales huge": scales_huge,
+        "scales of all sizes": scales_of_all_sizes,
+        "scales flat": scales_flat,
+        "scales of needles": scales_needle,
+    },
+    {
+        "quats zero": quats_zero,
+        "quats huge": quats_huge,
+        "quats tiny": quats_tiny,
+        "quats of all sizes": quats_of_all_sizes,
+    },
+    {
+        "opacities zero": opacities_zero,
+        "opacities one": opacities_one,
+        "opacities denormal": opacities_denormal,
+        "opacities at the threshold": opacities_at_the_threshold,
+        "opacities zero or one": opacities_zero_or_one,
+    },
+    {"colours huge": colors_huge, "colours zero": colors_zero},
+    {"camera far away": camera_far_away},
+    {
+        "focal length tiny": focal_tiny,
+        "focal length huge": focal_huge,
+        "focal lengths of two sizes": focal_of_two_sizes,
+        "principal point far away": centre_far_away,
+    },
+    {"offsets huge": offsets_huge},
+    {"tensors that are not contiguous": not_contiguous},
+    {"eps2d": setting("eps2d", 0.0, 1e-10, 10.0, 1e6)},
+    {"alpha_min": setting("alpha_min", 0.0, 1e-6, 0.5)},
+    {"near": setting("near", 0.0, 1e-20, -1.0, 100.0)},
+    {"alpha_max": setting("alpha_max", 0.5, 0.9999, 1.0)},
+    {"transmittance_min": setting("transmittance_min", 0.0, 1e-10, 0.5)},
+    {
+        "image gradients huge": image_gradients_huge,
+        "image gradients zero": image_gradients_zero,
+        "image gradients expanded": image_gradients_expanded,
+    },
+)
+"""At most one case of each group is in a scene."""
+LOSSY = {
+    "means on the camera's plane",
+    "means huge",
+    "means of all sizes",
+    "scales huge",
+    "scales of all sizes",
+    "scales of needles",
+    "quats tiny",  # zero is what is below the root of the smallest number, that of the type
+    "quats of all sizes",
+    "opacities at the threshold",
+    "camera far away",
+    "focal length huge",
+    "focal lengths of two sizes",
+    "principal point far away",
+    "offsets huge",
+}
+"""Cases whose rounding to float32 moves more than a rounding of the image."""
+
+
+# --- scenes -------------------------------------------------------------------------------------
+
+
+def random_scene(seed: int) -> Scene:
+    """Return the scene of a seed: one in five is plain, the others have hostile cases."""
+    draw = Draw(seed)
+    scene = _plain_scene(draw)
+    hostility = draw.one_of(0.0, 0.1, 0.1, 0.3, 0.7)
+    for group in GROUPS:
+        if draw.chance(hostility):
+            name = draw.random.choice(list(group))
+            group[name](draw, scene)
+            scene.cases.append(name)
+    _place_in_world(scene)
+    return scene
+
+
+def _plain_scene(draw: Draw) -> Scene:
+    random = draw.random
+    count = random.choice([0, *SIZES, 31, 33, random.randrange(300)])
+    height, width = (random.choice([*SIZES, random.randrange(1, 65)]) for _ in "HW")
+    sh_degree = random.randrange(4)
+    bands = max(random.choice([0, 3, 8, 15]), (sh_degree + 1) ** 2 - 1)
+    means = draw.normal(count, 3)
+    means[:, 2] = means[:, 2].abs() * 3 + 0.5
+    focal = max(width, height) * random.uniform(0.5, 2.0)
+    return Scene(
+        means=means,
+        quats=draw.normal(count, 4),
+        scales=torch.exp(draw.normal(count, 3) * 0.7 - 2),
+        opacities=draw.uniform(count),
+        sh0=draw.normal(count, 1, 3) * 0.5,
+        shN=draw.normal(count, bands, 3) * 0.15,
+        viewmat=_random_pose(draw),
+        K=torch.tensor([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]]),
+        width=width,
+        height=height,
+        sh_degree=sh_degree,
+        v_image=draw.normal(height, width, 3),
+        v_alpha=draw.normal(height, width),
+        means2d_offset=torch.zeros(count, 2) if draw.chance(0.5) else None,
+        settings=RasterSettings(
+            antialiased=draw.chance(0.4),
+            absgrad=draw.chance(0.3),
+            background=(0.2, 0.5, 0.9) if draw.chance(0.5) else (0.0, 0.0, 0.0),
+        ),
+        culling=CullingOptions(*(draw.chance(0.9) for _ in range(5))),
+        needed=tuple(draw.chance(0.8) for _ in range(7)),
+    )
+
+
+def _random_pose(draw: Draw) -> Tensor:
+    w, x, y, z = torch.nn.functional.normalize(draw.normal(4).double(), dim=0).tolist()
+    turn = torch.tensor(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+        ]
+    )
+    pose = torch.eye(4)
+    pose[:3, :3], pose[:3, 3] = turn, draw.normal(3)
+    return pose
+
+
+def _place_in_world(scene: Scene) -> None:
+    """Move the means from camera to world coordinates; keep what was made huge within float32."""
+    rotation, shift = scene.viewmat[:3, :3].double(), scene.viewmat[:3, 3].double()
+    means = (scene.means.double() - shift) @ rotation
+    means = means.clamp(-FLOAT32_MAX, FLOAT32_MAX).float()
+    # In the layout of the tensor that it replaces.
+    scene.means = torch.empty_like(scene.means).copy_(means)
+    for name in ("quats", "scales", "sh0", "shN"):
+        value: Tensor = getattr(scene, name)
+        setattr(scene, name, value.clamp(-FLOAT32_MAX, FLOAT32_MAX))
+
+
+# --- checks -------------------------------------------------------------------------------------
+
+
+class FuzzError(Exception):
+    """A scene gives what it must not; the message says what."""
+
+
+def require(condition: bool | Tensor, message: str) -> None:
+    if not condition:
+        raise FuzzError(message)
+
+
+def render(
+    scene: Scene, backend: str, dtype: torch.dtype, settings: RasterSettings | None = None
+) -> tuple[Render, dict[str, Tensor]]:
+    """The render, and its leaves: the parameters and the offset whose gradients are needed."""
+    # Leaves keep the strides of the scene's tensors.
+    leaves = {name: getattr(scene, name) for name in (*PARAMETERS, "means2d_offset")}
+    leaves = {
+        name: value.detach().to(dtype).requires_grad_(needed)
+        for (name, value), needed in zip(leaves.items(), scene.needed, strict=True)
+        if value is not None
+    }
+    gaussians = ActivatedGaussians(*(leaves[name] for name in PARAMETERS))
+    settings, offset = settings or scene.settings, leaves.get("means2d_offset")
+    if backend == "native":
+        rendered = render_culled(
+            gaussians, scene.camera, settings, scene.sh_degree, offset, scene.culling
+        )
+    else:
+        oracle = implementation("rasterizer", backend).render
+        rendered = oracle(gaussians, scene.camera, settings, scene.sh_degree, offset)
+    return rendered, {name: leaf for name, leaf in leaves.items() if leaf.requires_grad}
+
+
+def gradients_of(scene: Scene, rendered: Render, leaves: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    if not rendered.image.requires_grad:  # nothing is needed or, in torch, nothing is visible
+        return {name: torch.zeros_like(leaf) for name, leaf in leaves.items()}
+    outputs = (rendered.image, rendered.alpha)
+    incoming = [scene.v_image.to(rendered.image.dtype), scene.v_alpha.to(rendered.image.dtype)]
+    values = torch.autograd.grad(
+        outputs, list(leaves.values()), incoming, allow_unused=True, materialize_grads=True
+    )
+    return dict(zip(leaves, values, strict=True))
+
+
+def check_scene(scene: Scene, *, compare: bool = False) -> str | None:
+    """Render a scene and check what comes back.
+
+    Args:
+        scene: The scene.
+        compare: Compare with torch in float64 as well, unless a case is lossy.
+
+    Returns:
+        None, or the message of the error where the scene is refused.
+
+    Raises:
+        FuzzError: A value is not finite or out of range, an error names nothing, a plain scene is
+            refused, or differs from torch's.
+    """
+    try:
+        rendered, leaves = render(scene, "native", torch.float32)
+        check_image(rendered)
+        gradients = gradients_of(scene, rendered, leaves)
+    except (ValueError, MemoryError) as error:
+        require(bool(scene.cases), f"a plain scene is refused: {error}")
+        require(REFUSAL.match(str(error)) is not None, f"an error that names nothing: {error}")
+        return str(error)
+    check_gradients(gradients, rendered.visible)
+    if compare and LOSSY.isdisjoint(scene.cases):
+        compare_with_torch(scene)
+    return None
+
+
+def check_image(rendered: Render) -> None:
+    image, alpha = rendered.image.detach(), rendered.alpha.detach()
+    require(torch.isfinite(image).all(), "the image is not finite")
+    require((image >= 0).all(), "the image is below 0")
+    require(((alpha >= 0) & (alpha <= 1)).all(), "alpha is not in 0..1")
+
+
+def check_gradients(gradients: Mapping[str, Tensor], visible: Tensor) -> None:
+    for name, gradient in gradients.items():
+        require(torch.isfinite(gradient).all(), f"the gradient of {name} is silently not finite")
+        require((gradient[~visible] == 0).all(), f"what is not visible has a gradient of {name}")
+
+
+def compare_with_torch(scene: Scene) -> None:
+    """Compare the image with torch in float64, to rounding as it is in torch's float32.
+
+    Raises:
+        FuzzError: The image or, of a plain scene, a gradient differs by more.
+    """
+    exact, _ = render(scene, "torch", torch.float64)
+    single, _ = render(scene, "torch", torch.float32)
+    ours, _ = render(scene, "native", torch.float32)
+    error, allowed = (
+        (each.image - exact.image).abs().detach().amax(-1) for each in (ours, single)
+    )  # [H, W]
+    scale = max(1.0, float(exact.image.detach().max()))
+    bound = FACTOR * allowed.max() + (_threshold_step(scene.settings) + 1e-5) * scale
+    if not scene.cases:
+        band = _band(scene, exact.image)
+        bound = torch.where(band, scene.settings.alpha_min * scale + 1e-5, 1e-5 * scale)
+        _compare_gradients(scene, ~band)
+    require((error <= bound).all(), f"the image errs by {error.max():.2g}")
+
+
+def _threshold_step(settings: RasterSettings) -> float:
+    """The largest weight of a Gaussian that is composited or not, as alpha or T is rounded."""
+    # The transmittance in front of one that leaves transmittance_min.
+    last = settings.transmittance_min / max(1 - settings.alpha_max, 1e-6)
+    return max(settings.alpha_min, min(1.0, last))
+
+
+def _compare_gradients(scene: Scene, outside: Tensor) -> None:
+    """Compare the gradients of a loss by the pixels [H, W] outside the band."""
+    scene = replace(
+        scene, v_image=scene.v_image * outside[..., None], v_alpha=scene.v_alpha * outside
+    )
+    exact, rounded, ours = (
+        gradients_of(scene, *render(scene, backend, dtype))
+        for backend, dtype in (
+            ("torch", torch.float64),
+            ("torch", torch.float32),
+            ("native", torch.float32),
+        )
+    )
+    for name, expected in exact.items():
+        allowed = FACTOR * (rounded[name] - expected).norm()
+        allowed += GRADIENT_FLOOR.get(name, GRADIENT_FLOOR_ELSE) * expected.norm()
+        error = (ours[name] - expected).norm()
+        require(error <= allowed, f"the gradient of {name} errs by {error:.2g}, not {allowed:.2g}")
+
+
+def _band(scene: Scene, exact: Tensor) -> Tensor:
+    """Pixels [H, W] that a small move of a threshold changes."""
+    band = torch.zeros(scene.height, scene.width, dtype=torch.bool)
+    for factor in (1 - BAND, 1 + BAND):
+        for name in ("alpha_min", "transmittance_min", "alpha_max"):
+            moved = copy(scene.settings)
+            setattr(moved, name, getattr(moved, name) * factor)
+            image = render(scene, "torch", torch.float64, moved)[0].image
+            band |= (image - exact).abs().detach().amax(-1) > 1e-9
+    return band
+
+
+# --- the command --------------------------------------------------------------------------------
+
+
+def fuzz(
+    seeds: Iterable[int], compare_every: int, report: Callable[[int], None]
+) -> dict[str, list[int]]:
+    """Check the scenes of some seeds.
+
+    Args:
+        seeds: The seeds.
+        compare_every: A scene whose seed is a multiple of this is compared with torch.
+        report: Called with each seed that passed.
+
+    Returns:
+        The errors that were given, with the seeds of the scenes that were refused.
+
+    Raises:
+        FuzzError: As `check_scene` raises it, with the seed and the cases of the scene.
+    """
+    refused: defaultdict[str, list[int]] = defaultdict(list)
+    for seed in seeds:
+        scene = random_scene(seed)
+        try:
+            error = check_scene(scene, compare=seed % compare_every == 0)
+        except FuzzError as failure:
+            raise FuzzError(f"seed {seed} ({', '.join(scene.cases)}): {failure}") from failure
+        if error is not None:
+            refused[error].append(seed)
+        report(seed)
+    return refused
+
+
+def _report_progress(seed: int) -> None:
+    if (seed + 1) % 10_000 == 0:
+        print(f"{seed + 1} done", flush=True)  # noqa: T201
+
+
+def main(arguments: list[str]) -> int:
+    parser = argparse.ArgumentParser(description="Fuzz the compiled rasterizer.")
+    parser.add_argument("--seed", type=int, default=0, help="the first seed")
+    parser.add_argument("--count", type=int, default=10_000, help="the number of scenes")
+    parser.add_argument("--compare-every", type=int, default=20, help="see above")
+    options = parser.parse_args(arguments)
+    torch.set_num_threads(1)  # the scenes are tiny
+    seeds = range(options.seed, options.seed + options.count)
+    try:
+        refused = fuzz(seeds, options.compare_every, _report_progress)
+    except FuzzError as error:
+        print(error)  # noqa: T201
+        return 1
+    total = sum(len(of_one) for of_one in refused.values())
+    print(f"{options.count} scenes, {total} of them refused")  # noqa: T201
+    for message, of_one in refused.items():
+        print(f"{len(of_one):8} from seed {of_one[0]}: {message}")  # noqa: T201
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))

@@ -1,0 +1,194 @@
+"""What float32 cannot hold: an error names it, and no NaN is returned in silence."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from torch import Tensor
+
+from xrgs.splat.cameras import Camera
+from xrgs.splat.gaussians import ActivatedGaussians
+from xrgs.splat.rasterize import rasterize_parameters
+from xrgs.splat.settings import RasterSettings
+
+pytest.importorskip("xrgs._native")
+
+HEIGHT, WIDTH = 14, 20
+OVERFLOWS = r"^the gradient of {} is not finite"
+
+
+def camera() -> Camera:
+    """Its optical axis goes through the centre of a pixel."""
+    K = torch.tensor([[18.0, 0, 10.5], [0, 18, 7.5], [0, 0, 1]])
+    return Camera(torch.eye(4), K, WIDTH, HEIGHT)
+
+
+def gaussians(**changes: Any) -> dict[str, Tensor]:
+    """One Gaussian on the optical axis and one beside it, with some values replaced."""
+    values = {
+        "means": torch.tensor([[0.0, 0, 2], [-0.3, 0.2, 3]]),
+        "quats": torch.tensor([[1.0, 0.2, 0.3, 0.4], [0.5, 0.1, 0, 0.3]]),
+        "scales": torch.tensor([[0.1, 0.2, 0.15], [0.3, 0.2, 0.1]]),
+        "opacities": torch.tensor([0.7, 0.8]),
+        "sh0": torch.ones(2, 1, 3),
+        "shN": torch.full((2, 15, 3), 0.1),
+    }
+    for name, value in changes.items():
+        values[name][0] = torch.tensor(value)
+    return values
+
+
+def gradients(
+    values: Mapping[str, Tensor],
+    settings: RasterSettings | None = None,
+    *,
+    v_image: Tensor | None = None,
+    v_alpha: Tensor | None = None,
+    needed: tuple[str, ...] | None = None,
+) -> list[Tensor]:
+    """The gradients of the needed parameters, by default of all."""
+    leaves = {name: value.clone() for name, value in values.items()}
+    wanted = [leaves[name].requires_grad_() for name in needed or leaves]
+    render = rasterize_parameters(
+        *ActivatedGaussians(**leaves),
+        camera(),
+        settings or RasterSettings(),
+        sh_degree=3,
+        backend="native",
+    )
+    assert torch.isfinite(render.image).all()
+    assert torch.isfinite(render.alpha).all()
+    v_image = torch.ones(HEIGHT, WIDTH, 3) if v_image is None else v_image
+    v_alpha = torch.zeros(HEIGHT, WIDTH) if v_alpha is None else v_alpha
+    return list(torch.autograd.grad((render.image, render.alpha), wanted, (v_image, v_alpha)))
+
+
+def all_finite(values: list[Tensor]) -> bool:
+    return all(bool(torch.isfinite(value).all()) for value in values)
+
+
+# --- finite numbers whose gradients are not -----------------------------------------------------
+
+
+@pytest.mark.parametrize("antialiased", [False, True])
+def test_without_dilation(isa: str, antialiased: bool) -> None:
+    settings = RasterSettings(eps2d=0.0, antialiased=antialiased)
+    assert all_finite(gradients(gaussians(scales=1e-8), settings))
+    with pytest.raises(ValueError, match=OVERFLOWS.format("means")):
+        gradients(gaussians(scales=1e-9), settings)
+
+
+@pytest.mark.parametrize("near", [0.0, -1.0])
+def test_next_to_the_camera(isa: str, near: float) -> None:
+    settings = RasterSettings(near=near)
+
+    def at(z: float) -> dict[str, Tensor]:
+        return gaussians(means=[0.0, 0, z], scales=z / 10)
+
+    assert all_finite(gradients(at(1e-35), settings))
+    with pytest.raises(ValueError, match=OVERFLOWS.format("scales")):
+        gradients(at(6e-37), settings)
+
+
+def test_huge_colours(isa: str) -> None:
+    assert all_finite(gradients(gaussians(sh0=1e36)))
+    with pytest.raises(ValueError, match=OVERFLOWS.format("means")):
+        gradients(gaussians(sh0=2e38))
+
+
+def test_a_colour_that_could_overflow_the_image_is_refused(isa: str) -> None:
+    values = gaussians(sh0=3.39e38, shN=0.0)  # a colour of 0.96e38
+    v_image = torch.full((HEIGHT, WIDTH, 3), 1e-3)  # so that nothing else overflows
+    gradients(values, v_image=v_image)
+    values["shN"][0, 1] = 3e38
+    with pytest.raises(ValueError, match=r"^sh0 and shN overflow: a colour is above 1e38"):
+        gradients(values, v_image=v_image)
+
+
+def test_huge_gradients_of_the_image(isa: str) -> None:
+    v = torch.ones(HEIGHT, WIDTH, 3)
+    assert all_finite(gradients(gaussians(), v_image=1e35 * v))
+    with pytest.raises(ValueError, match=OVERFLOWS.format("means")):
+        gradients(gaussians(), v_image=1e37 * v)
+
+
+def test_harmonics_alone_are_named(isa: str) -> None:
+    v = torch.full((HEIGHT, WIDTH, 3), 3e38)
+    with pytest.raises(ValueError, match=OVERFLOWS.format("sh0")):
+        gradients(gaussians(), v_image=v, needed=("sh0", "shN"))
+    with pytest.raises(ValueError, match=OVERFLOWS.format("shN")):
+        gradients(gaussians(), v_image=v, needed=("shN",))
+
+
+def test_what_is_not_needed_may_overflow(isa: str) -> None:
+    values, settings = gaussians(scales=1e-9), RasterSettings(eps2d=0.0)
+    (found,) = gradients(values, settings, needed=("sh0",))
+    (expected,) = gradients(gaussians(scales=1e-8), settings, needed=("sh0",))
+    torch.testing.assert_close(found, expected)
+
+
+# --- what the caller hands in -------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("bad", [float("nan"), float("inf")])
+@pytest.mark.parametrize("name", ["v_image", "v_alpha"])
+def test_incoming_gradients_are_named(isa: str, name: str, bad: float) -> None:
+    v_image, v_alpha = torch.ones(HEIGHT, WIDTH, 3), torch.ones(HEIGHT, WIDTH)
+    (v_image if name == "v_image" else v_alpha)[7, 10] = bad
+    with pytest.raises(ValueError, match=f"^{name}, .* has values that are not finite"):
+        gradients(gaussians(), v_image=v_image, v_alpha=v_alpha)
+
+
+def test_a_gradient_where_nothing_is_does_not_matter(isa: str) -> None:
+    v_image = torch.ones(HEIGHT, WIDTH, 3)
+    expected = gradients(gaussians(), v_image=v_image)
+    v_image[0, 19] = float("nan")
+    found = gradients(gaussians(), v_image=v_image)
+    assert all(torch.equal(a, b) for a, b in zip(found, expected, strict=True))
+
+
+@pytest.mark.parametrize("bad", [float("nan"), float("inf"), 1e300])
+@pytest.mark.parametrize("name", ["near", "eps2d", "alpha_min", "alpha_max", "transmittance_min"])
+def test_settings_that_float32_does_not_hold_are_named(name: str, bad: float) -> None:
+    settings = RasterSettings()
+    setattr(settings, name, bad)
+    with pytest.raises(ValueError, match=f"^{name} must be finite"):
+        gradients(gaussians(), settings)
+
+
+def test_a_background_that_could_overflow_the_image_is_named() -> None:
+    v_image = torch.full((HEIGHT, WIDTH, 3), 1e-3)  # so that nothing else overflows
+    gradients(gaussians(), RasterSettings(background=(0.0, 1e38, 0.0)), v_image=v_image)
+    with pytest.raises(ValueError, match=r"^background must be finite, at most 1e\+38"):
+        gradients(gaussians(), RasterSettings(background=(0.0, 1.1e38, 0.0)))
+
+
+def test_a_camera_that_float32_does_not_hold_is_named() -> None:
+    viewmat = torch.eye(4, dtype=torch.float64)
+    viewmat[0, 3] = 1e39
+    far = Camera(viewmat, camera().K.double(), WIDTH, HEIGHT)
+    with pytest.raises(ValueError, match=r"^viewmat must be finite"):
+        rasterize_parameters(
+            *ActivatedGaussians(**gaussians()), far, RasterSettings(), sh_degree=3, backend="native"
+        )
+
+
+# --- many scenes --------------------------------------------------------------------------------
+
+
+@pytest.mark.slow
+def test_fuzzing() -> None:
+    # In a process of its own, so that a crash is a failure of this test alone.
+    tool = Path(__file__).with_name("fuzz_rasterizer.py")
+    result = subprocess.run(
+        [sys.executable, tool, "--count", "10000"], capture_output=True, text=True, check=False
+    )
+    assert result.returncode == 0, result.stdout + result.stderr
+    refused = int(result.stdout.split("10000 scenes, ")[1].split(" ")[0])
+    assert 0 < refused < 300  # that is, an error is no way out
