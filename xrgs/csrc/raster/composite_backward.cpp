@@ -229,10 +229,11 @@ XRGS_INLINE void move_moments(const BatchColumns& columns, int at, const Floats 
 void write_pair_grads(const BatchColumns& columns, const BatchRows& moments,
                       const BatchRows& color_sums, const TileEntry* entries, int count,
                       float* pair_grads) {
+  const Mask last_row = mask_from_bits(0xf000);
   for (int at = 0; at < count; at += 16) {
     Floats m[16], out[16];
     for (int i = 0; i < 16; ++i)
-      m[i] = add_last_row(load(moments[at + i]), sum_rows(load(color_sums[at + i])));
+      m[i] = select(last_row, sum_rows(load(color_sums[at + i])), load(moments[at + i]));
     transpose(m);
     move_moments(columns, at, m, out);
     out[kGradRed] = m[12];

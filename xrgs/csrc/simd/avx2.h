@@ -179,9 +179,6 @@ XRGS_INLINE Floats sum_rows(Floats a) {
   const __m256 all = _mm256_add_ps(pairs, _mm256_permute2f128_ps(pairs, pairs, 0x01));
   return {all, all};
 }
-XRGS_INLINE Floats add_last_row(Floats a, Floats b) {
-  return {a.lo, _mm256_blend_ps(a.hi, _mm256_add_ps(a.hi, b.hi), 0xf0)};
-}
 
 XRGS_INLINE float sum_lanes(Floats a) {
   const __m256 half = _mm256_add_ps(a.lo, a.hi);

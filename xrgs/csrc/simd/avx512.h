@@ -123,9 +123,6 @@ XRGS_INLINE Floats sum_rows(Floats a) {
   a = {_mm512_add_ps(a.v, _mm512_shuffle_f32x4(a.v, a.v, 0x4e))};
   return {_mm512_add_ps(a.v, _mm512_shuffle_f32x4(a.v, a.v, 0xb1))};
 }
-XRGS_INLINE Floats add_last_row(Floats a, Floats b) {
-  return {_mm512_mask_add_ps(a.v, 0xf000, a.v, b.v)};
-}
 
 XRGS_INLINE float sum_lanes(Floats a) {
   const __m256 half = _mm256_add_ps(_mm512_castps512_ps256(a.v), _mm512_extractf32x8_ps(a.v, 1));

@@ -57,7 +57,6 @@
 //   Floats broadcast_column<C>(a)       in each row its own value of column C, four times
 //   Floats broadcast_row<R>(a)          row R, in all four rows
 //   Floats sum_rows(a)                  (row 0 + row 2) + (row 1 + row 3), in all four rows
-//   Floats add_last_row(a, b)           a + b in row 3, a in the others
 //
 // Every instruction set rounds in the same way and adds in the same order, and the compiler fuses
 // nothing of its own accord (-ffp-contract=off): all of them that have a fused multiply-add give

@@ -250,9 +250,6 @@ XRGS_INLINE Floats sum_rows(Floats a) {
   const Float4 sum = (a.v[0] + a.v[2]) + (a.v[1] + a.v[3]);
   return {sum, sum, sum, sum};
 }
-XRGS_INLINE Floats add_last_row(Floats a, Floats b) {
-  return {a.v[0], a.v[1], a.v[2], a.v[3] + b.v[3]};
-}
 
 XRGS_INLINE float sum_lanes(Floats a) {
   const Float4 quarter = (a.v[0] + a.v[2]) + (a.v[1] + a.v[3]);
