@@ -71,7 +71,7 @@ def plain_loop(data: Dataset, conf: Conf) -> Gaussians:
         camera, degree = step.view.camera, min(step.number, 3)
         offset = torch.zeros(len(gaussians), 2, requires_grad=True)
         render = rasterize.rasterize_parameters(
-            *gaussians.activated(),
+            *gaussians.activated(backend="auto"),
             camera,
             RasterSettings(),
             sh_degree=degree,
