@@ -37,7 +37,7 @@ CASES = {
     "curriculum": ["+ablation=curriculum"],
     # Its rates are found anew between refinements too, or they would be new at every restart.
     "mip": ["+ablation=mip", "components.mip.every=7"],
-    # Without the reset, after which so few Gaussians are left that hardly any number can match.
+    # Without the reset, after which too few Gaussians are left for numbers to be matched.
     "count_matched": ["splat.densify.reset_every=50000"],
 }
 

@@ -17,6 +17,7 @@ namespace XRGS_NS {
 namespace {
 
 constexpr int kCheckEvery = 8;  // Gaussians between two tests for a saturated block
+static_assert(kCheckEvery % kUnroll == 0, "a block is tested after whole groups of Gaussians");
 
 // The pixels of a block while it is composited.
 struct BlockState {
@@ -70,7 +71,8 @@ void load_and_cull_batch(const Frame& frame, const Tile& tile, const TileEntry* 
   for (int at = 0; at < count; at += 16) {
     const int lanes = count - at < 16 ? count - at : 16;
     Floats fields[16];
-    load_projected(frame, entries + at, lanes, centre, rows, at, fields);
+    load_projected(frame, entries + at, lanes, centre, rows, at);
+    load_fields(rows, at, fields);
     const CutoffEllipse e = cutoff_ellipse(fields);
     const std::uint32_t existing = (1u << lanes) - 1u;
     for (int row = 0; row < 4; ++row) {
@@ -208,8 +210,10 @@ void composite(Frame& frame, int tile_index, float* image, float* alpha) {
     for (int b = 0; b < kBlocksPerTile; ++b) {
       prefetch_part(frame, at + static_cast<std::uint32_t>(count), b);  // of this or the next tile
       if (batches == 0) prefetch_image_row(tile, config, b, image, alpha);
-      prefetch_to_write(batch->transmittance[(b + 2) % kBlocksPerTile]);
-      prefetch_to_write(batch->lists[(b + 2) % kBlocksPerTile]);
+      if (b + kBlocksAhead < kBlocksPerTile) {
+        prefetch_to_write(batch->transmittance[b + kBlocksAhead]);
+        prefetch_to_write(batch->lists[b + kBlocksAhead]);
+      }
       batch->counts[b] = 0;
       if ((active_blocks >> b & 1u) == 0) continue;
       store(batch->transmittance[b], load(blocks[b].running_T));

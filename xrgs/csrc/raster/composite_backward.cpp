@@ -31,12 +31,6 @@ struct PixelGradients {
   alignas(64) float colors[4][16];
 };
 
-// The fields of a batch's Gaussians that move_moments needs, side by side.
-struct BatchColumns {
-  alignas(64) float mean_y[kBatchSize], centre_u[kBatchSize];
-  alignas(64) float chol_xx[kBatchSize], chol_xy[kBatchSize];
-};
-
 // Alpha and w at the sixteen pixels of a block, for each Gaussian of its list.
 using AlphasAndWeights = float[kBatchSize][32];
 
@@ -191,10 +185,10 @@ XRGS_INLINE void accumulate_moments(const BatchRows& rows, const std::uint8_t* l
     if constexpr (Absgrad) {
       for (int i = 0; i < kUnroll; ++i) {
         float* sums = moments[list[at + i]];
-        const Floats u = u_at(g[i], x, y), v_row = v_at(g[i], y);
-        sums[kAbsU] += sum_lanes(abs(gradient[i] * u));
-        sums[kAbsV] += sum_lanes(
-            abs(gradient[i] * fnma(broadcast(g[i][kCholXY]), u, broadcast(g[i][kCholYY]) * v_row)));
+        const ScaledOffset d(g[i], x, y);
+        const Floats by_y = fnma(broadcast(g[i][kCholXY]), d.u, broadcast(g[i][kCholYY]) * d.v);
+        sums[kAbsU] += sum_lanes(abs(gradient[i] * d.u));
+        sums[kAbsV] += sum_lanes(abs(gradient[i] * by_y));
       }
     }
   }
@@ -204,10 +198,10 @@ XRGS_INLINE void accumulate_moments(const BatchRows& rows, const std::uint8_t* l
 // The first six columns of pair_grads, from the moments m about the tile's centre, for sixteen
 // Gaussians. u is a linear function of the position, so its moments are combinations of those of x
 // and y; it is small where g is not, at the centre of the tile as well, so that little cancels.
-XRGS_INLINE void move_moments(const BatchColumns& columns, int at, const Floats (&m)[16],
+XRGS_INLINE void move_moments(const Floats (&fields)[16], const Floats (&m)[16],
                               Floats (&out)[16]) {
-  const Floats mean_y = load(columns.mean_y + at), u_centre = load(columns.centre_u + at);
-  const Floats chol_xx = load(columns.chol_xx + at), chol_xy = load(columns.chol_xy + at);
+  const Floats mean_y = fields[kY], chol_xx = fields[kCholXX], chol_xy = fields[kCholXY];
+  const Floats u_centre = fnma(chol_xx, fields[kX], chol_xy * mean_y);
   const Floats g = m[0], gx = m[1], gxx = m[2], gy = m[4], gxy = m[5], gyy = m[8];
   const auto times_u = [&](Floats of_1, Floats of_x, Floats of_y) {
     return fma(u_centre, of_1, fnma(chol_xy, of_y, chol_xx * of_x));
@@ -226,23 +220,23 @@ XRGS_INLINE void move_moments(const BatchColumns& columns, int at, const Floats 
 }
 
 // Writes the pair_grads of a batch, from its moments about the tile's centre.
-void write_pair_grads(const BatchColumns& columns, const BatchRows& moments,
-                      const BatchRows& color_sums, const TileEntry* entries, int count,
-                      float* pair_grads) {
+void write_pair_grads(const BatchRows& rows, const BatchRows& moments, const BatchRows& color_sums,
+                      const TileEntry* entries, int count, float* pair_grads) {
   const Mask last_row = mask_from_bits(0xf000);
   for (int at = 0; at < count; at += 16) {
-    Floats m[16], out[16];
+    Floats fields[16], m[16], out[16];
+    load_fields(rows, at, fields);
     for (int i = 0; i < 16; ++i)
       m[i] = select(last_row, sum_rows(load(color_sums[at + i])), load(moments[at + i]));
     transpose(m);
-    move_moments(columns, at, m, out);
+    move_moments(fields, m, out);
     out[kGradRed] = m[12];
     out[kGradGreen] = m[13];
     out[kGradBlue] = m[14];
     // ln alpha = ln 2 (log2_opacity - u^2 - v^2), and the derivatives by the mean are du/dx =
     // -chol_xx, du/dy = chol_xy and dv/dy = -chol_yy.
     const Floats two_ln2 = broadcast(2.0f * 0.693147181f);
-    out[kAbsGradX] = two_ln2 * load(columns.chol_xx + at) * m[kAbsU];
+    out[kAbsGradX] = two_ln2 * fields[kCholXX] * m[kAbsU];
     out[kAbsGradY] = two_ln2 * m[kAbsV];
     for (int i = kPairGradFields; i < 16; ++i) out[i] = broadcast(0.0f);
     transpose(out);
@@ -253,16 +247,11 @@ void write_pair_grads(const BatchColumns& columns, const BatchRows& moments,
 
 // Loads a batch and sets its sums to zero.
 void load_batch(const Frame& frame, const Tile& tile, const TileEntry* entries, int count,
-                BatchRows& rows, BatchColumns& columns, BatchRows& moments, BatchRows& color_sums) {
+                BatchRows& rows, BatchRows& moments, BatchRows& color_sums) {
   const Floats centre = centre_of(tile);
   for (int at = 0; at < count; at += 16) {
     const int lanes = count - at < 16 ? count - at : 16;
-    Floats fields[16];
-    load_projected(frame, entries + at, lanes, centre, rows, at, fields);
-    store(columns.mean_y + at, fields[kY]);
-    store(columns.centre_u + at, fields[kCentreU]);
-    store(columns.chol_xx + at, fields[kCholXX]);
-    store(columns.chol_xy + at, fields[kCholXY]);
+    load_projected(frame, entries + at, lanes, centre, rows, at);
     for (int i = 0; i < 16; ++i) {
       store(moments[at + i], broadcast(0.0f));
       store(color_sums[at + i], broadcast(0.0f));
@@ -287,9 +276,10 @@ void backward_tile(const Frame& frame, int tile_index, const float* v_image, con
   if (tile.begin == tile.end) return;
   const AlphaThresholds thresholds(config);
   alignas(64) BatchRows rows, moments, color_sums;
-  BatchColumns columns;
   alignas(64) AlphasAndWeights alphas;
   set_transparent_row(rows);
+  store(moments[kBatchSize], broadcast(0.0f));
+  store(color_sums[kBatchSize], broadcast(0.0f));
   alignas(64) float behind[kBlocksPerTile][16] = {};
   PixelGradients pixel_gradients[kBlocksPerTile];
   load_pixel_gradients(tile, config, v_image, v_alpha, pixel_gradients);
@@ -306,20 +296,22 @@ void backward_tile(const Frame& frame, int tile_index, const float* v_image, con
     const std::uint32_t at = n * kBatchSize, remaining = tile.end - tile.begin - at;
     const int count = remaining < kBatchSize ? static_cast<int>(remaining) : kBatchSize;
     const SavedBatch& batch = frame.batches[frame.batch_offsets[tile.index] + n];
-    load_batch(frame, tile, entries + at, count, rows, columns, moments, color_sums);
+    load_batch(frame, tile, entries + at, count, rows, moments, color_sums);
     for (int b = 0; b < kBlocksPerTile; ++b) {
       // The next batch to be processed is the one in front of this, or the last of the next tile.
       prefetch_part(frame, n > 0 ? tile.begin + at - kBatchSize : next_tile, b);
       if (n == 0) prefetch_gradient_row(frame, tile_index + 1, b, v_image, v_alpha);
-      prefetch(batch.transmittance[(b + 2) % kBlocksPerTile]);
-      prefetch(batch.lists[(b + 2) % kBlocksPerTile]);
+      if (b + kBlocksAhead < kBlocksPerTile) {
+        prefetch(batch.transmittance[b + kBlocksAhead]);
+        prefetch(batch.lists[b + kBlocksAhead]);
+      }
       const int listed = batch.counts[b];
       if (listed == 0) continue;
       recompute_alphas(rows, batch.lists[b], listed, b, thresholds, batch.transmittance[b], alphas);
       accumulate_moments<Absgrad>(rows, batch.lists[b], listed, b, thresholds, pixel_gradients[b],
                                   alphas, behind[b], moments, color_sums);
     }
-    write_pair_grads(columns, moments, color_sums, entries + at, count, pair_grads);
+    write_pair_grads(rows, moments, color_sums, entries + at, count, pair_grads);
   }
   stream_fence();
 }

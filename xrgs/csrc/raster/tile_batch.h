@@ -12,23 +12,10 @@
 namespace xrgs {
 namespace XRGS_NS {
 
-// The Gaussians of a batch, one row each, in the layout of ProjectedGaussian, whose unused fields
-// hold u and v (Eq. 8) at the tile's centre. The last row is one that is transparent everywhere:
-// lists are filled up with it to a multiple of kUnroll.
+// The Gaussians of a batch, one row each, in the layout of ProjectedGaussian. The last row is one
+// that is transparent everywhere: lists are filled up with it to a multiple of kUnroll.
 using BatchRows = float[kBatchSize + 1][16];
-enum BatchField {
-  kX,
-  kY,
-  kCholXX,
-  kCholXY,
-  kCholYY,
-  kLog2Opacity,
-  kRed,
-  kGreen,
-  kBlue,
-  kCentreU = 13,
-  kCentreV = 14
-};
+enum BatchField { kX, kY, kCholXX, kCholXY, kCholYY, kLog2Opacity, kRed, kGreen, kBlue };
 
 struct Tile {
   int column, row;
@@ -59,25 +46,19 @@ XRGS_INLINE Floats pixels_y(int block) {
 }
 
 // Loads the projected Gaussians of `count` (1 to 16) entries into rows first..first+15 of a batch,
-// with `centre` subtracted; rows past the end repeat the last one. fields[i] receives the i-th
-// field of each, and u and v at the centre.
+// with `centre` subtracted; rows past the end repeat the last one.
 XRGS_INLINE void load_projected(const Frame& frame, const TileEntry* entries, int count,
-                                Floats centre, BatchRows& rows, int first, Floats (&fields)[16]) {
+                                Floats centre, BatchRows& rows, int first) {
   for (int i = 0; i < 16; ++i) {
     const std::uint32_t gaussian = entries[i < count ? i : count - 1].gaussian;
-    fields[i] = load(&frame.projected[gaussian].mean2d_x) - centre;
-    store(rows[first + i], fields[i]);
+    store(rows[first + i], load(&frame.projected[gaussian].mean2d_x) - centre);
   }
-  transpose(fields);
-  fields[kCentreU] = fnma(fields[kCholXX], fields[kX], fields[kCholXY] * fields[kY]);
-  fields[kCentreV] = -(fields[kCholYY] * fields[kY]);
-  alignas(64) float u[16], v[16];
-  store(u, fields[kCentreU]);
-  store(v, fields[kCentreV]);
-  for (int i = 0; i < 16; ++i) {
-    rows[first + i][kCentreU] = u[i];
-    rows[first + i][kCentreV] = v[i];
-  }
+}
+
+// The fields of the Gaussians in rows first..first+15 of a batch: out[i] is the i-th of each.
+XRGS_INLINE void load_fields(const BatchRows& rows, int first, Floats (&out)[16]) {
+  for (int i = 0; i < 16; ++i) out[i] = load(rows[first + i]);
+  transpose(out);
 }
 
 // Prefetches one of kBlocksPerTile parts of the projected Gaussians of the batch that begins at
@@ -90,6 +71,9 @@ XRGS_INLINE void prefetch_part(const Frame& frame, std::size_t first, int part) 
   for (std::size_t i = begin; i < pairs && i < begin + kPart; ++i)
     prefetch(&frame.projected[frame.entries[i].gaussian]);
 }
+
+// Blocks between the prefetch of what the frame saves of a batch and its use.
+constexpr int kBlocksAhead = 2;
 
 // The index of the first pixel of a row of a tile, or -1 where the row is below the image.
 XRGS_INLINE std::int64_t row_start(const Tile& tile, const RenderConfig& config, int row) {
@@ -125,13 +109,15 @@ struct AlphaThresholds {
 // are filled up to a multiple of it, and those of small images have some fifteen Gaussians.
 constexpr int kUnroll = 2;
 
-// u and v of a Gaussian g of the batch at sixteen pixels (Eq. 8): linear functions of the position.
-XRGS_INLINE Floats u_at(const float* g, Floats x, Floats y) {
-  return fma(broadcast(g[kCholXX]), x, fnma(broadcast(g[kCholXY]), y, broadcast(g[kCentreU])));
-}
-XRGS_INLINE Floats v_at(const float* g, Floats y) {
-  return fma(broadcast(g[kCholYY]), y, broadcast(g[kCentreV]));
-}
+// u and v of a Gaussian g of the batch at sixteen pixels (Eq. 8).
+struct ScaledOffset {
+  Floats u, v;
+  ScaledOffset(const float* g, Floats x, Floats y) {
+    const Floats dx = x - broadcast(g[kX]), dy = y - broadcast(g[kY]);
+    u = fnma(broadcast(g[kCholXY]), dy, broadcast(g[kCholXX]) * dx);
+    v = broadcast(g[kCholYY]) * dy;
+  }
+};
 
 // The alphas of kUnroll Gaussians of the batch at sixteen pixels (Eq. 8): capped at alpha_max, and
 // zero below alpha_min.
@@ -140,8 +126,8 @@ XRGS_INLINE void alphas_at(const BatchRows& rows, const std::uint8_t* list, Floa
   Floats log2_alpha[kUnroll];
   for (int i = 0; i < kUnroll; ++i) {
     const float* g = rows[list[i]];
-    const Floats u = u_at(g, x, y), v = v_at(g, y);
-    log2_alpha[i] = fnma(u, u, fnma(v, v, broadcast(g[kLog2Opacity])));
+    const ScaledOffset d(g, x, y);
+    log2_alpha[i] = fnma(d.u, d.u, fnma(d.v, d.v, broadcast(g[kLog2Opacity])));
   }
   exp2(log2_alpha, alpha);
   for (int i = 0; i < kUnroll; ++i)
