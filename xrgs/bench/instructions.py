@@ -55,11 +55,11 @@ class Work(NamedTuple):
     """The function in `xrgs/csrc/raster` that does it."""
 
 
-#: Of alpha_at, for sixteen pixels. Additions: dx, dy, and three that round and reduce the argument
-#: of exp2. Multiplications: three of u and v, two to add -u^2 - v^2 to log2(opacity), and the five
+#: Of alphas_at, for sixteen pixels. Additions: dx, dy, and three that round and reduce the argument
+#: of exp2. Multiplications: three of u and v, two to add -u^2 - v^2 to log2(opacity), and the six
 #: steps of exp2's polynomial. Comparisons: with alpha_min, and the minimum with alpha_max.
 #: Integers: a shift and an addition make the power of two.
-_ALPHA = Instructions(multiply=10, add=5, compare=2, integer=2)
+_ALPHA = Instructions(multiply=11, add=5, compare=2, integer=2)
 
 #: What each stage does, with SH degree 3.
 STAGES: dict[str, tuple[Work, ...]] = {
@@ -71,7 +71,7 @@ STAGES: dict[str, tuple[Work, ...]] = {
         Work(
             "gaussians",
             LANES,
-            Instructions(multiply=412, add=62, compare=51, integer=5, permute=282),
+            Instructions(multiply=415, add=62, compare=56, integer=5, permute=282),
             "project.cpp: project_group",
         ),
     ),
@@ -104,25 +104,26 @@ STAGES: dict[str, tuple[Work, ...]] = {
         # colour's gradient (3 multiplications), R (an addition and a multiplication), g (a
         # multiplication, and the comparison with alpha_max), two products of 4x4 matrices (4
         # multiplications and 4 permutations each), the rows' sums (4, 4 and an addition), and the
-        # addition of the colours' sums (2 permutations, 3 additions).
+        # addition to the colours' sums.
         Work(
             "evaluations",
             LANES,
             Instructions(
                 multiply=_ALPHA.multiply + 18,
-                add=_ALPHA.add + 6,
+                add=_ALPHA.add + 4,
                 compare=_ALPHA.compare + 4,
                 integer=_ALPHA.integer,
-                permute=14,
+                permute=12,
             ),
             "composite_backward.cpp: recompute_alphas, accumulate_moments",
         ),
-        # Sixteen subtractions of the tile's centre, three transposes, and the moments moved to the
-        # mean.
+        # Sixteen subtractions of the tile's centre, three transposes, the rows of the colours' sums
+        # added (2 permutations, 2 additions and a selection for each pair), and the moments moved
+        # to the mean.
         Work(
             "pairs",
             LANES,
-            Instructions(multiply=9, add=18, permute=192),
+            Instructions(multiply=23, add=49, compare=16, permute=224),
             "composite_backward.cpp: load_batch, write_pair_grads",
         ),
     ),
@@ -130,11 +131,11 @@ STAGES: dict[str, tuple[Work, ...]] = {
         Work("pairs", 1, Instructions(add=1), "project_backward.cpp: sum_pair_grads"),
         # The transpose of the sums; the inputs and the projection again; the chain rule through
         # conic, covariance, Jacobian and rotation; 45 products of the SH basis (192 permutations);
-        # and the permutations of what is written.
+        # the test that all are finite; and the permutations of what is written.
         Work(
             "gaussians",
             LANES,
-            Instructions(multiply=416, add=48, compare=41, permute=302),
+            Instructions(multiply=425, add=46, compare=44, permute=302),
             "project_backward.cpp: backward_group",
         ),
     ),
