@@ -18,7 +18,9 @@ from torch import Tensor
 
 from xrgs.splat.cameras import Camera
 from xrgs.splat.gaussians import PARAMETERS
+from xrgs.splat.native.rasterizer import render_config
 from xrgs.splat.native.resample import banded_matrix
+from xrgs.splat.settings import CullingOptions, RasterSettings
 
 Scene = dict[str, Tensor]
 MakeCamera = Callable[..., Camera]
@@ -71,22 +73,7 @@ def view(make_camera: MakeCamera, make_scene: MakeScene) -> tuple[Any, Results]:
     wall["means"][:] = torch.tensor([0.0, 0.0, 500.0])
     wall["scales"][:] = 2000.0
     wall["opacities"][:] = 0.99
-    config = native.RenderConfig(
-        viewmat=torch.eye(4).flatten().tolist(),
-        intrinsics=[150.0, 150.0, 80.0, 80.0],
-        width=160,
-        height=160,
-        near=0.01,
-        eps2d=0.3,
-        alpha_min=1 / 255,
-        alpha_max=0.99,
-        transmittance_min=1e-4,
-        antialiased=False,
-        absgrad=False,
-        background=(0.0, 0.0, 0.0),
-        sh_degree=3,
-        culling=(True,) * 5,
-    )
+    config = render_config(camera, RasterSettings(), 3, CullingOptions())
     return config, [torch.cat([scene[name], wall[name]]) for name in PARAMETERS]
 
 

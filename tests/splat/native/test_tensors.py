@@ -12,9 +12,10 @@ from torch import Tensor
 from xrgs.splat.cameras import Camera
 from xrgs.splat.gaussians import PARAMETERS, Gaussians
 from xrgs.splat.native.densify import accumulate_statistics
+from xrgs.splat.native.rasterizer import render_config
 from xrgs.splat.native.resample import banded_matrix
 from xrgs.splat.optimizer import SplatOptimizer
-from xrgs.splat.settings import OptimizerSettings
+from xrgs.splat.settings import CullingOptions, OptimizerSettings, RasterSettings
 
 native = pytest.importorskip("xrgs._native")
 
@@ -40,22 +41,9 @@ def accumulate(means2d_grad: Tensor, visible: Tensor, *sums: Tensor) -> None:
 
 
 def config() -> Any:
-    return native.RenderConfig(
-        viewmat=torch.eye(4).flatten().tolist(),
-        intrinsics=[20.0, 20.0, 10.0, 10.0],
-        width=20,
-        height=20,
-        near=0.01,
-        eps2d=0.3,
-        alpha_min=1 / 255,
-        alpha_max=0.99,
-        transmittance_min=1e-4,
-        antialiased=False,
-        absgrad=False,
-        background=(0.0, 0.0, 0.0),
-        sh_degree=3,
-        culling=(True,) * 5,
-    )
+    K = torch.tensor([[20.0, 0, 10], [0, 20, 10], [0, 0, 1]])
+    camera = Camera(torch.eye(4), K, 20, 20)
+    return render_config(camera, RasterSettings(), 3, CullingOptions())
 
 
 def forward(*parameters: Tensor) -> Any:

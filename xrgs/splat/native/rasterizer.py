@@ -91,7 +91,7 @@ def render_culled(
     """
     require_float32("means", gaussians.means)
     frame = _native.Frame()
-    view = _native_view(camera, settings, sh_degree, culling)
+    view = render_config(camera, settings, sh_degree, culling)
     image, alpha = _Rasterize.apply(frame, view, *gaussians, means2d_offset)
     return Render(
         image=image,
@@ -102,9 +102,23 @@ def render_culled(
     )
 
 
-def _native_view(
+def render_config(
     camera: Camera, settings: RasterSettings, sh_degree: int, culling: CullingOptions
 ) -> _native.RenderConfig:
+    """Return a view and settings as the compiled rasterizer takes them.
+
+    Args:
+        camera: The view.
+        settings: How Gaussians become pixels.
+        sh_degree: Highest band of the spherical harmonics that is on.
+        culling: The kinds of culling that are on.
+
+    Returns:
+        The config of `_native.Frame.forward`.
+
+    Raises:
+        ValueError: A number of the view or the settings is one that float32 does not hold.
+    """
     K = camera.K
     return _native.RenderConfig(
         viewmat=camera.viewmat.flatten().tolist(),
