@@ -102,7 +102,7 @@ struct Frame {
 struct Workspace {
   // The pairs of each chunk of Gaussians in depth order, front to back, in several segments.
   std::vector<std::vector<Buffer<TileIntersection>>> intersections;
-  Buffer<std::uint32_t> list_positions;       // [chunks, tiles]
+  Buffer<std::uint32_t> list_positions;       // [chunks, tiles], rows padded
   Buffer<std::uint32_t> histogram;            // of the depth sort
   Buffer<std::int32_t> chunk_visible_counts;  // [chunks]
   Buffer<float> pair_grads;                   // [pairs, kPairGradStride]

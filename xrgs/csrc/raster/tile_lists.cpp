@@ -17,6 +17,9 @@ namespace {
 
 constexpr std::int64_t kMinChunk = 4096;  // Gaussians
 constexpr std::int64_t kSegmentPairs = 1 << 16;
+// Counts are kept apart by so many that those of two chunks are never in the same pair of cache
+// lines: two threads that write to one line wait for each other at each write.
+constexpr std::int64_t kCountsAlignment = 32;
 
 // Writes the pairs of Gaussians first..last-1 of the depth order, segment by segment. Returns false
 // where memory ran out.
@@ -40,17 +43,17 @@ bool intersect_chunk(const RasterKernels& kernels, Frame& frame, std::int64_t fi
   return true;
 }
 
-// Turns counts [chunks, tiles] into the position of each chunk's first entry in each tile's list,
-// and fills tile_offsets and batch_offsets.
-void counts_to_positions(std::int64_t chunks, std::int64_t tiles, std::uint32_t* counts,
-                         Frame& frame) {
+// Turns counts [chunks, stride], of which the first `tiles` of each row are used, into the position
+// of each chunk's first entry in each tile's list, and fills tile_offsets and batch_offsets.
+void counts_to_positions(std::int64_t chunks, std::int64_t tiles, std::int64_t stride,
+                         std::uint32_t* counts, Frame& frame) {
   std::int64_t position = 0, batch = 0;
   for (std::int64_t tile = 0; tile < tiles; ++tile) {
     frame.tile_offsets[static_cast<std::size_t>(tile)] = static_cast<std::uint32_t>(position);
     frame.batch_offsets[static_cast<std::size_t>(tile)] = static_cast<std::uint32_t>(batch);
     const std::int64_t begin = position;
     for (std::int64_t c = 0; c < chunks; ++c) {
-      std::uint32_t& entry = counts[c * tiles + tile];
+      std::uint32_t& entry = counts[c * stride + tile];
       const std::uint32_t count = entry;
       entry = static_cast<std::uint32_t>(position);
       position += count;
@@ -117,13 +120,15 @@ void build_tile_lists(int threads, const RasterKernels& kernels, Frame& frame,
   const std::int64_t chunk_size = (frame.visible_count + chunks - 1) / chunks;
   if (static_cast<std::int64_t>(workspace.intersections.size()) < chunks)
     workspace.intersections.resize(static_cast<std::size_t>(chunks));
-  std::uint32_t* counts = workspace.list_positions.resize(static_cast<std::size_t>(chunks * tiles));
+  const std::int64_t stride = (tiles + kCountsAlignment - 1) / kCountsAlignment * kCountsAlignment;
+  std::uint32_t* counts =
+      workspace.list_positions.resize(static_cast<std::size_t>(chunks * stride));
   std::atomic<bool> allocation_ok{true};
   parallel_for(threads, chunks, [&](std::int64_t c) {
-    std::fill(counts + c * tiles, counts + (c + 1) * tiles, 0u);
+    std::fill(counts + c * stride, counts + (c + 1) * stride, 0u);
     if (!intersect_chunk(kernels, frame, std::min(frame.visible_count, c * chunk_size),
                          std::min(frame.visible_count, (c + 1) * chunk_size),
-                         workspace.intersections[static_cast<std::size_t>(c)], counts + c * tiles))
+                         workspace.intersections[static_cast<std::size_t>(c)], counts + c * stride))
       allocation_ok = false;
   });
   if (!allocation_ok) throw std::bad_alloc();
@@ -137,11 +142,11 @@ void build_tile_lists(int threads, const RasterKernels& kernels, Frame& frame,
   frame.batch_offsets.resize(static_cast<std::size_t>(tiles) + 1);
   frame.composited_batches.resize(static_cast<std::size_t>(tiles));
   frame.tile_evaluations.resize(static_cast<std::size_t>(tiles));
-  counts_to_positions(chunks, tiles, counts, frame);
+  counts_to_positions(chunks, tiles, stride, counts, frame);
   frame.entries.resize(static_cast<std::size_t>(pairs));
   frame.batches.resize(frame.batch_offsets[static_cast<std::size_t>(tiles)]);
   parallel_for(threads, chunks, [&](std::int64_t c) {
-    scatter_chunk(workspace.intersections[static_cast<std::size_t>(c)], counts + c * tiles, frame);
+    scatter_chunk(workspace.intersections[static_cast<std::size_t>(c)], counts + c * stride, frame);
   });
 }
 
