@@ -86,14 +86,21 @@ bool project_chunks(int threads, const RasterKernels& kernels, const GaussianPar
   return all_valid;
 }
 
-// Calls body(tile) for every tile. Where each thread has few tiles, those with the longest lists
-// are started first, so that no thread works on a long one alone at the end.
+// Calls body(tile) for every tile: several that are side by side in one task, because neighbours
+// share cache lines of the image, and each tile prefetches the next. Where each thread has few
+// tiles, those with the longest lists are started first, one by one, so that no thread works on a
+// long one alone at the end.
 template <class Body>
 void for_each_tile(int threads, const Frame& frame, Body&& body) {
   constexpr std::int64_t kFewTilesPerThread = 128;
   const std::int64_t tiles = frame.config.tile_count();
   if (threads == 1 || tiles > kFewTilesPerThread * threads) {
-    parallel_for(threads, tiles, [&](std::int64_t tile) { body(static_cast<int>(tile)); });
+    constexpr std::int64_t kTilesPerTask = 8;
+    parallel_for(threads, (tiles + kTilesPerTask - 1) / kTilesPerTask, [&](std::int64_t task) {
+      const std::int64_t last = std::min(tiles, (task + 1) * kTilesPerTask);
+      for (std::int64_t tile = task * kTilesPerTask; tile < last; ++tile)
+        body(static_cast<int>(tile));
+    });
     return;
   }
   const auto length = [&](int tile) {
