@@ -97,9 +97,10 @@ def test_backward(view: tuple[Any, Results]) -> None:
     _, alpha = frame.forward(config, *parameters, offset, THREADS)
 
     def run() -> Results:
-        gradients = frame.backward(
+        *gradients, finite = frame.backward(
             v_image, torch.ones_like(alpha), *parameters, offset, True, THREADS
         )
+        assert finite
         return list(gradients)
 
     assert_every_failure_is_an_error(run, at_least=8)
