@@ -13,6 +13,7 @@ line, runs that task once, and answers with {"ms": DURATION}. It ends with its i
 from __future__ import annotations
 
 import importlib
+import inspect
 import json
 import math
 import sys
@@ -93,6 +94,9 @@ def step_task(load: Load) -> Callable[[], None]:
     raw = (means, quats, scales.clamp_min(1e-8).log(), opacities.clamp(1e-4, 1 - 1e-4).logit())
     leaves = [value.clone().requires_grad_() for value in (*raw, sh0, rest)]
     gaussians = _find("xrgs.splat.gaussians", "Gaussians")(*leaves)
+    # As training activates them: an older installation has torch's functions alone.
+    has_backend = "backend" in inspect.signature(gaussians.activated).parameters
+    choice = {"backend": "native"} if has_backend else {}
     optimizer = _find("xrgs.splat.optimizer", "SplatOptimizer")(
         gaussians,
         _find("xrgs.splat.settings", "OptimizerSettings")(),
@@ -110,7 +114,7 @@ def step_task(load: Load) -> Callable[[], None]:
     def render() -> tuple[Any, Tensor]:
         offset = torch.zeros(len(gaussians), 2, requires_grad=True)
         rendered = rasterize(
-            *gaussians.activated(),
+            *gaussians.activated(**choice),
             camera,
             settings,
             sh_degree=SH_DEGREE,
