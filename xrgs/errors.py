@@ -7,3 +7,10 @@ class XrgsError(Exception):
 
 class StoreError(XrgsError):
     """A store can't be used, or one of its files is missing, damaged or not what it should be."""
+
+
+class UnreadableError(StoreError):
+    """A file can't be read now, because of its permissions or because a disk or a server fails.
+
+    Nothing is known of its content: it is neither missing nor damaged, and is to be read again.
+    """

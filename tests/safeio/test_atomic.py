@@ -46,7 +46,7 @@ def test_only_a_durable_file_waits_for_the_disk(
     synced: list[int] = []
     monkeypatch.setattr(os, "fsync", synced.append)
     write_text(tmp_path / "file", "text", durable=durable)
-    assert len(synced) == durable
+    assert len(synced) == (2 if durable else 0)  # the content, and the name
     assert (tmp_path / "file").read_text() == "text"
 
 

@@ -8,21 +8,25 @@ import secrets
 from contextlib import contextmanager
 from typing import IO, TYPE_CHECKING
 
+from xrgs.safeio.confined import confined
+
 if TYPE_CHECKING:
     from collections.abc import Iterator
     from pathlib import Path
 
+    from xrgs.safeio.confined import ConfinedPath
+
 
 @contextmanager
-def atomic_writer(path: Path, *, durable: bool = True) -> Iterator[IO[bytes]]:
+def atomic_writer(path: Path | ConfinedPath, *, durable: bool = True) -> Iterator[IO[bytes]]:
     """Open a binary stream whose content replaces a file when the block ends without an exception.
 
     The content is written to a temporary file in the same folder, which is renamed at the end.
 
     Args:
         path: The file to replace or create; its folder must exist.
-        durable: Whether to wait until the content is on the disk. Without it, the new content can
-            be lost in a power failure.
+        durable: Whether to wait until the content and the name are on the disk. Without it, the
+            new content can be lost in a power failure.
 
     Yields:
         The stream to write to.
@@ -30,21 +34,24 @@ def atomic_writer(path: Path, *, durable: bool = True) -> Iterator[IO[bytes]]:
     Raises:
         OSError: The file can't be written. The old file is then as it was.
     """
+    file = confined(path)
     # Not mkstemp: only the owner could read its files, and a store is shared by a team.
-    temporary = path.with_name(f".{path.name}.{os.getpid()}-{secrets.token_hex(4)}")
+    temporary = file.with_name(f".{file.name}.{os.getpid()}-{secrets.token_hex(4)}")
     try:
-        with temporary.open("xb") as stream:
+        with temporary.create() as stream:
             yield stream
             stream.flush()
             if durable:
                 os.fsync(stream.fileno())
-        temporary.replace(path)
+        temporary.rename(file)
     except BaseException:
         temporary.unlink(missing_ok=True)
         raise
+    if durable:
+        file.sync_name()
 
 
-def write_text(path: Path, text: str, *, durable: bool = True) -> None:
+def write_text(path: Path | ConfinedPath, text: str, *, durable: bool = True) -> None:
     """Write a UTF-8 text file atomically.
 
     Args:
@@ -59,7 +66,7 @@ def write_text(path: Path, text: str, *, durable: bool = True) -> None:
         stream.write(text.encode("utf-8"))
 
 
-def write_json(path: Path, value: object, *, durable: bool = True) -> None:
+def write_json(path: Path | ConfinedPath, value: object, *, durable: bool = True) -> None:
     """Write a value atomically as indented JSON with sorted keys.
 
     Args:

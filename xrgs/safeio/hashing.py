@@ -5,7 +5,12 @@ from __future__ import annotations
 import hashlib
 import json
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
+
+from xrgs.safeio.confined import confined
+
+if TYPE_CHECKING:
+    from xrgs.safeio.confined import ConfinedPath
 
 _PACKAGE = Path(__file__).parents[1]
 _SOURCE_SUFFIXES = frozenset({".py", ".cpp", ".h", ".txt"})
@@ -53,8 +58,8 @@ def to_plain(value: Any) -> Any:
     return value
 
 
-def file_digest(path: Path) -> str:
-    """Hash a file's bytes.
+def file_digest(path: Path | ConfinedPath) -> str:
+    """Hash a regular file's bytes.
 
     Args:
         path: The file.
@@ -63,11 +68,11 @@ def file_digest(path: Path) -> str:
         All 64 hexadecimal digits of the SHA-256.
 
     Raises:
-        OSError: The file can't be read.
+        OSError: The file can't be read, or is not a regular file.
     """
     sha256 = hashlib.sha256()
     # hashlib.file_digest zeroes a buffer of 256 kB first, which takes longer than a small file.
-    with path.open("rb", buffering=0) as stream:
+    with confined(path).open() as stream:
         while chunk := stream.read(_CHUNK):
             sha256.update(chunk)
     return sha256.hexdigest()

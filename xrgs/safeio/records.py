@@ -7,32 +7,58 @@ import io
 import math
 from typing import TYPE_CHECKING, Any
 
-from xrgs.errors import StoreError
+from xrgs.errors import StoreError, UnreadableError
 from xrgs.safeio import untrusted
+from xrgs.safeio.confined import MAX_BYTES, confined, is_passing
 
 if TYPE_CHECKING:
     from pathlib import Path
 
+    from xrgs.safeio.confined import ConfinedPath
 
-def read_json(path: Path) -> Any:
+
+def read_file(path: Path | ConfinedPath, max_bytes: int = MAX_BYTES) -> bytes:
+    """Read a regular file of a store.
+
+    Args:
+        path: The file.
+        max_bytes: The largest size that is read.
+
+    Returns:
+        The content.
+
+    Raises:
+        UnreadableError: It can't be read now; nothing is known of its content.
+        StoreError: It is missing, too large or not a regular file; the message names it.
+    """
+    try:
+        return confined(path).read_bytes(max_bytes)
+    except OSError as error:
+        kind = UnreadableError if is_passing(error) else StoreError
+        raise kind(f"{path}: {error.strerror}") from error
+
+
+def read_json(path: Path | ConfinedPath) -> Any:
     """Read the JSON value in a file.
 
     Args:
-        path: The file, of at most `untrusted.MAX_BYTES` bytes.
+        path: The file, of at most `confined.MAX_BYTES` bytes.
 
     Returns:
         Dicts, lists, strings, numbers, booleans and None.
 
     Raises:
-        StoreError: The file is missing, unreadable or not JSON; the message names it.
+        UnreadableError: As `read_file`.
+        StoreError: The file is missing or not JSON; the message names it.
     """
+    content = read_file(path)
     try:
-        return untrusted.parse_json(untrusted.read_bytes(path))
-    except (OSError, ValueError) as error:
+        return untrusted.parse_json(content)
+    except ValueError as error:
         raise StoreError(f"{path}: {error}") from error
 
 
-def read_object(path: Path) -> dict[str, Any]:
+def read_object(path: Path | ConfinedPath) -> dict[str, Any]:
     """Read the JSON object in a file.
 
     Args:
@@ -50,7 +76,7 @@ def read_object(path: Path) -> dict[str, Any]:
     return value
 
 
-def read_table(path: Path) -> tuple[list[str], list[list[str]]]:
+def read_table(path: Path | ConfinedPath) -> tuple[list[str], list[list[str]]]:
     """Read a CSV table.
 
     Args:
@@ -60,12 +86,14 @@ def read_table(path: Path) -> tuple[list[str], list[list[str]]]:
         The header, whose names are distinct, and the rows, each as long as the header.
 
     Raises:
-        StoreError: The file is missing, unreadable or not such a table; the message names it.
+        UnreadableError: As `read_file`.
+        StoreError: The file is missing or not such a table; the message names it.
     """
+    content = read_file(path)
     try:
-        text = untrusted.read_bytes(path).decode("utf-8")
+        text = content.decode("utf-8")
         header, *rows = csv.reader(io.StringIO(text, newline=""), strict=True)
-    except (OSError, ValueError, csv.Error) as error:
+    except (ValueError, csv.Error) as error:
         raise StoreError(f"{path}: {error}") from error
     if len(set(header)) < len(header) or any(len(row) != len(header) for row in rows):
         raise StoreError(

@@ -1,0 +1,453 @@
+"""Files and folders below a root that nothing in the root can lead out of.
+
+A store, a variant or the folder of a report may come from anybody, and may hold links, named pipes
+and files of any size. `ConfinedPath` is the one way into them. Its root is what a user has named:
+it may be a link, or lie behind links. Below the root no link is followed, only regular files are
+opened, and nothing is made in a root that is no longer there.
+
+The kernel resolves such a path in one call where it has openat2 (Linux from 5.6 on); elsewhere each
+folder on the way is opened from the one before, without following links.
+"""
+
+from __future__ import annotations
+
+import errno
+import os
+import shutil
+import stat
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, BinaryIO
+
+from xrgs.safeio.beneath import open_folder_beneath, regular_size
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+#: The largest file that is read whole, in bytes. Ten thousand cells' sweep record takes 3 MB.
+MAX_BYTES = 1 << 26
+#: The deepest nesting of folders that is walked. A store's own folders have five levels.
+_MAX_DEPTH = 40
+_FOLDER = os.O_DIRECTORY | os.O_CLOEXEC | os.O_RDONLY
+#: Opening a named pipe without O_NONBLOCK would wait for its writer, for ever.
+_REGULAR = os.O_CLOEXEC | os.O_NONBLOCK | os.O_NOFOLLOW
+_READABLE_BY_ALL = 0o666  # less the umask: a store is shared by a team
+
+
+#: Errors that tell what is there, or that nothing is; every other one may be gone when the same
+#: file is read again: permissions, a disk or a server that fails, too many open files.
+_CONCLUSIVE = frozenset(
+    {
+        errno.ENOENT,
+        errno.ENOTDIR,
+        errno.EISDIR,
+        errno.ELOOP,
+        errno.EINVAL,
+        errno.EFBIG,
+        errno.ENAMETOOLONG,
+        errno.ENXIO,
+    }
+)
+
+
+class RootMissingError(FileNotFoundError):
+    """The root of a path is no longer there: it was moved or deleted."""
+
+
+def is_passing(error: OSError) -> bool:
+    """Tell whether an error says nothing about what a file holds, so that it is to be tried again.
+
+    Args:
+        error: The error of a system call that looked at a file or read it.
+    """
+    return isinstance(error, RootMissingError) or error.errno not in _CONCLUSIVE
+
+
+@dataclass(frozen=True, order=True)
+class ConfinedPath:
+    """A path below a root, which need not exist.
+
+    It has no `__fspath__`, so that nothing opens it by any other way. Errors are those of the
+    system calls, `OSError`, and name the whole path; a link on the way below the root is ELOOP, or
+    ENOTDIR where a folder is expected.
+    """
+
+    root: Path
+    """The folder (or the file) that a user has named."""
+    parts: tuple[str, ...] = ()
+    """The names from the root on."""
+
+    def __truediv__(self, inside: str) -> ConfinedPath:
+        """Return a path further inside.
+
+        Args:
+            inside: A relative path with `/`.
+
+        Raises:
+            ValueError: A part of it is empty, `.` or `..`, or has a NUL character.
+        """
+        parts = inside.split("/")
+        if any(part in {"", ".", ".."} or "\0" in part for part in parts):
+            raise ValueError(f"{inside!r:.200} is not a path inside {self}")
+        return ConfinedPath(self.root, (*self.parts, *parts))
+
+    def __str__(self) -> str:
+        return str(self.path)
+
+    @property
+    def path(self) -> Path:
+        """The whole path, for messages; opening it would follow links."""
+        return self.root.joinpath(*self.parts)
+
+    @property
+    def name(self) -> str:
+        """The last name."""
+        return self.parts[-1] if self.parts else self.root.name
+
+    @property
+    def stem(self) -> str:
+        """The last name without its suffix."""
+        return Path(self.name).stem
+
+    @property
+    def suffix(self) -> str:
+        """The suffix of the last name, with its dot; empty where there is none."""
+        return Path(self.name).suffix
+
+    @property
+    def parent(self) -> ConfinedPath:
+        """The folder that this is in.
+
+        Raises:
+            ValueError: This is the root.
+        """
+        if not self.parts:
+            raise ValueError(f"{self} is the root")
+        return ConfinedPath(self.root, self.parts[:-1])
+
+    def with_name(self, name: str) -> ConfinedPath:
+        """Return a sibling.
+
+        Args:
+            name: The sibling's name.
+
+        Raises:
+            ValueError: It is not a name.
+        """
+        if not self.parts:
+            return ConfinedPath(self.root.with_name(name))
+        return self.parent / name
+
+    def relative_to(self, folder: ConfinedPath) -> str:
+        """Return the path from a folder to this, with `/`.
+
+        Args:
+            folder: A folder above this, of the same root.
+
+        Raises:
+            ValueError: This is not below the folder.
+        """
+        depth = len(folder.parts)
+        if folder.root != self.root or self.parts[:depth] != folder.parts:
+            raise ValueError(f"{self} is not in {folder}")
+        return "/".join(self.parts[depth:])
+
+    # Looking
+
+    def lstat(self) -> os.stat_result:
+        """Return what the system knows of the file, the folder, or the link itself."""
+        with self._located() as (folder, name):
+            return os.stat(name, dir_fd=folder, follow_symlinks=not self.parts)
+
+    def exists(self) -> bool:
+        """Tell whether something is there: a file, a folder, a link or anything else.
+
+        Raises:
+            OSError: It can't be told now, for want of permission or because the disk fails.
+        """
+        return self._mode() != 0
+
+    def is_file(self) -> bool:
+        """Tell whether a regular file is there, and raise as `exists` does."""
+        return stat.S_ISREG(self._mode())
+
+    def is_dir(self) -> bool:
+        """Tell whether a folder is there, and raise as `exists` does."""
+        return stat.S_ISDIR(self._mode())
+
+    def is_link(self) -> bool:
+        """Tell whether a symbolic link is there, and raise as `exists` does."""
+        return stat.S_ISLNK(self._mode())
+
+    def _mode(self) -> int:
+        try:
+            return self.lstat().st_mode
+        except RootMissingError:
+            raise
+        except (FileNotFoundError, NotADirectoryError):
+            return 0
+
+    def sizes(self, names: list[str]) -> dict[str, int]:
+        """Return the bytes of regular files below this folder; -1 for whatever is not one.
+
+        Each folder is opened once for all files in it.
+
+        Args:
+            names: Paths in this folder, with `/`.
+
+        Raises:
+            OSError: It can't be told now what a name is.
+            ValueError: A name is not a path in this folder.
+        """
+        sizes = dict.fromkeys(names, -1)
+        by_folder: dict[ConfinedPath, list[str]] = {}
+        for name in names:
+            by_folder.setdefault((self / name).parent, []).append(name)
+        for folder, inside in by_folder.items():
+            try:
+                with folder._opened() as descriptor:
+                    for name in inside:
+                        sizes[name] = regular_size(descriptor, name.rpartition("/")[2])
+            except OSError as error:
+                if is_passing(error):
+                    raise
+        return sizes
+
+    def names(self) -> list[str]:
+        """Return the names in this folder, sorted; names that aren't UTF-8 have lone surrogates."""
+        with self._opened() as folder:
+            return sorted(os.listdir(folder))  # noqa: PTH208  Path lists no descriptor
+
+    def iterdir(self) -> list[ConfinedPath]:
+        """Return the paths in this folder, sorted by name."""
+        return [ConfinedPath(self.root, (*self.parts, name)) for name in self.names()]
+
+    def folders(self) -> list[str]:
+        """Return the names of the folders in this folder, sorted; links are none."""
+        with self._opened() as folder, os.scandir(folder) as entries:
+            return sorted(entry.name for entry in entries if entry.is_dir(follow_symlinks=False))
+
+    def walk(self) -> Iterator[tuple[str, os.stat_result]]:
+        """Yield the path from here and the status of whatever is below this folder but folders.
+
+        Raises:
+            OSError: A folder can't be read, or they are nested more than 40 deep.
+        """
+        waiting = [self]
+        while waiting:
+            folder = waiting.pop()
+            if len(folder.parts) - len(self.parts) > _MAX_DEPTH:
+                raise OSError(errno.ENAMETOOLONG, "folders are nested too deeply", str(folder))
+            with folder._opened() as descriptor, os.scandir(descriptor) as entries:
+                for entry in entries:
+                    inside = ConfinedPath(self.root, (*folder.parts, entry.name))
+                    if entry.is_dir(follow_symlinks=False):
+                        waiting.append(inside)
+                    else:
+                        yield inside.relative_to(self), entry.stat(follow_symlinks=False)
+
+    # Reading
+
+    def open(self) -> BinaryIO:
+        """Open a regular file for reading.
+
+        Raises:
+            OSError: It is missing, or a link, a pipe, a device or a folder.
+        """
+        return os.fdopen(self._open_regular(os.O_RDONLY), "rb")
+
+    def read_bytes(self, max_bytes: int = MAX_BYTES) -> bytes:
+        """Read all of a regular file.
+
+        Args:
+            max_bytes: The largest size that is read; a file of exactly this size is.
+
+        Raises:
+            OSError: As `open`, or the file is larger than `max_bytes`.
+        """
+        with self.open() as stream:
+            size = os.fstat(stream.fileno()).st_size
+            content = stream.read(max_bytes + 1) if size <= max_bytes else b""
+        if max(size, len(content)) > max_bytes:
+            why = f"{max(size, len(content))} bytes, at most {max_bytes} are read"
+            raise OSError(errno.EFBIG, why, str(self))
+        return content
+
+    def read_text(self, max_bytes: int = MAX_BYTES) -> str:
+        """Read all of a UTF-8 file.
+
+        Args:
+            max_bytes: As for `read_bytes`.
+
+        Raises:
+            OSError: As `read_bytes`.
+            UnicodeDecodeError: The content is not UTF-8.
+        """
+        return self.read_bytes(max_bytes).decode("utf-8")
+
+    # Writing
+
+    def create(self) -> BinaryIO:
+        """Create a file for writing.
+
+        Raises:
+            FileExistsError: Something of that name exists.
+            OSError: The file can't be created.
+        """
+        return os.fdopen(self._open_regular(os.O_WRONLY | os.O_CREAT | os.O_EXCL), "wb")
+
+    def append(self) -> BinaryIO:
+        """Open a regular file for writing at its end; it is created where it is missing."""
+        return os.fdopen(self._open_regular(os.O_WRONLY | os.O_CREAT | os.O_APPEND), "ab")
+
+    def make_folder(self, *, exclusive: bool = False) -> None:
+        """Make this folder and those above it, but for the root.
+
+        Args:
+            exclusive: Whether it is an error that the folder exists.
+
+        Raises:
+            RootMissingError: The root is not there.
+            OSError: A folder can't be made, or something else has its name.
+        """
+        for depth in range(1, len(self.parts) + 1):
+            last = depth == len(self.parts)
+            ConfinedPath(self.root, self.parts[:depth])._make_one(exclusive=exclusive and last)
+
+    def _make_one(self, *, exclusive: bool) -> None:
+        with self._located() as (folder, name):
+            try:
+                os.mkdir(name, dir_fd=folder)
+            except FileExistsError:
+                if exclusive or not self.is_dir():
+                    raise
+
+    def rename(self, target: ConfinedPath) -> None:
+        """Give this file or folder another name, in the place of a file that has it.
+
+        Args:
+            target: The new path.
+
+        Raises:
+            OSError: It can't be renamed; for a folder, also where a folder with content is there.
+        """
+        with self._located() as (here, name), target._located() as (there, new):
+            os.rename(name, new, src_dir_fd=here, dst_dir_fd=there)
+
+    def unlink(self, *, missing_ok: bool = False) -> None:
+        """Remove a file or a link.
+
+        Args:
+            missing_ok: Whether a missing file is no error.
+        """
+        try:
+            with self._located() as (folder, name):
+                os.unlink(name, dir_fd=folder)
+        except FileNotFoundError:
+            if not missing_ok:
+                raise
+
+    def remove(self) -> None:
+        """Remove a file, a link, or a folder with all that is in it.
+
+        Nothing happens where nothing is there. What a link leads to is never touched.
+
+        Raises:
+            OSError: It is there and can't be removed.
+        """
+        if not self.is_dir():
+            self.unlink(missing_ok=True)
+            return
+        with self._located() as (folder, name):
+            try:
+                shutil.rmtree(name, dir_fd=folder)
+            except RecursionError:
+                why = "folders are nested too deeply to be removed"
+                raise OSError(errno.ENAMETOOLONG, why, str(self)) from None
+
+    def touch(self) -> None:
+        """Set the time of the last change of an existing file to now."""
+        with self._located() as (folder, name):
+            os.utime(name, dir_fd=folder, follow_symlinks=False)
+
+    def sync_name(self) -> None:
+        """Wait until this name is on the disk, as after creating or renaming the file or folder.
+
+        A file whose content was synced can still be lost with its name in a power failure.
+        """
+        with self._located() as (folder, _):
+            try:
+                os.fsync(folder)
+            except OSError as error:
+                if error.errno not in {errno.EINVAL, errno.ENOTSUP}:  # it has no such thing
+                    raise
+
+    def make_root(self) -> None:
+        """Make the root, a folder, with those above it. A root that vanishes is not made again.
+
+        Raises:
+            OSError: It can't be made, or something else has its name.
+        """
+        self.root.mkdir(parents=True, exist_ok=True)
+
+    # Resolving
+
+    def _open_regular(self, flags: int) -> int:
+        flags |= _REGULAR
+        if not self.parts:  # a user may name a link
+            flags &= ~os.O_NOFOLLOW
+        with self._located() as (folder, name):
+            descriptor = os.open(name, flags, _READABLE_BY_ALL, dir_fd=folder)
+        if not stat.S_ISREG(os.fstat(descriptor).st_mode):
+            os.close(descriptor)
+            raise OSError(errno.EINVAL, "not a regular file", str(self))
+        return descriptor
+
+    @contextmanager
+    def _located(self) -> Iterator[tuple[int, str]]:
+        """Open the folder that this is in; yield its descriptor and the last name.
+
+        An error in the block names the whole path, and not the last name alone.
+        """
+        if not self.parts:
+            with ConfinedPath(self.root.parent)._opened() as folder, self._naming_errors():
+                yield folder, self.root.name or "."
+            return
+        with self.parent._opened() as folder, self._naming_errors():
+            yield folder, self.parts[-1]
+
+    @contextmanager
+    def _opened(self) -> Iterator[int]:
+        """Open this folder; yield its descriptor."""
+        try:
+            descriptor = os.open(self.root, _FOLDER)
+        except FileNotFoundError as error:
+            raise RootMissingError(error.errno, error.strerror, str(self.root)) from None
+        try:
+            if self.parts:
+                root = descriptor
+                with self._naming_errors():
+                    descriptor = open_folder_beneath(root, self.parts)
+                os.close(root)
+            yield descriptor
+        finally:
+            os.close(descriptor)
+
+    @contextmanager
+    def _naming_errors(self) -> Iterator[None]:
+        try:
+            yield
+        except RootMissingError:
+            raise
+        except OSError as error:
+            raise OSError(error.errno, error.strerror, str(self)) from None
+
+
+def confined(path: Path | ConfinedPath) -> ConfinedPath:
+    """Return a path that a user has named as the root that it is; a confined one as it stands.
+
+    Args:
+        path: The path.
+    """
+    return path if isinstance(path, ConfinedPath) else ConfinedPath(path)
