@@ -17,8 +17,9 @@ from hydra.core.config_store import ConfigStore
 from omegaconf import MISSING, DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from xrgs.errors import XrgsError
-from xrgs.safeio import untrusted
+from xrgs.errors import StoreError, XrgsError
+from xrgs.safeio.confined import ConfinedPath
+from xrgs.safeio.records import read_json
 from xrgs.splat.backend import CHOICES
 from xrgs.splat.settings import DensifySettings, OptimizerSettings, RasterSettings
 
@@ -473,7 +474,7 @@ def escape_interpolations(value: Any) -> Any:
     return _INTERPOLATION.sub(lambda match: 2 * match[1] + r"\${", value)
 
 
-def from_file(file: Path) -> Conf:
+def from_file(file: Path | ConfinedPath) -> Conf:
     """Read the config that a cell's folder holds as JSON.
 
     Args:
@@ -487,14 +488,16 @@ def from_file(file: Path) -> Conf:
             the key.
     """
     try:
-        return from_dict(untrusted.parse_json(untrusted.read_bytes(file)))
+        return from_dict(read_json(file))
+    except StoreError:
+        raise
     except OmegaConfBaseException as error:
         raise XrgsError(
             f"{file}: {error_line(error)} (another version of xrgs may have written it)"
         ) from error
     except XrgsError as error:
         raise XrgsError(f"{file}: {error}") from error
-    except (OSError, ValueError, TypeError) as error:
+    except (ValueError, TypeError) as error:
         raise XrgsError(f"{file}: it holds no config ({error})") from error
 
 

@@ -6,6 +6,8 @@ Nothing here imports torch before it is called.
 from __future__ import annotations
 
 import io
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
@@ -13,6 +15,8 @@ from numpy.typing import NDArray
 from PIL import Image, ImageOps
 
 from xrgs.errors import XrgsError
+from xrgs.safeio.atomic import atomic_writer
+from xrgs.safeio.confined import ConfinedPath, confined
 
 ImageArray = NDArray[np.float32]  # [H, W, 3]
 
@@ -29,11 +33,13 @@ class ImageError(XrgsError):
     """A file can't be read as a photograph; the message begins with its path."""
 
 
-def _open(path: Path) -> Image.Image:
-    return Image.open(path, formats=_FORMATS)
+@contextmanager
+def _open(path: Path | ConfinedPath) -> Iterator[Image.Image]:
+    with confined(path).open() as stream, Image.open(stream, formats=_FORMATS) as image:
+        yield image
 
 
-def size(path: Path) -> tuple[int, int]:
+def size(path: Path | ConfinedPath) -> tuple[int, int]:
     """Read the size that `read` would give an image, from the header alone.
 
     Args:
@@ -53,7 +59,7 @@ def size(path: Path) -> tuple[int, int]:
         raise ImageError(f"{path}: not a readable image ({error})") from error
 
 
-def exif_camera(path: Path) -> str:
+def exif_camera(path: Path | ConfinedPath) -> str:
     """Read from EXIF which camera and focal length took a photograph.
 
     Args:
@@ -75,7 +81,7 @@ def exif_camera(path: Path) -> str:
     return "/".join("" if value is None else str(value).strip("\0 ") for value in values).strip("/")
 
 
-def read(path: Path) -> ImageArray:
+def read(path: Path | ConfinedPath) -> ImageArray:
     """Read a photograph as RGB, with the EXIF orientation applied.
 
     Args:
@@ -91,7 +97,7 @@ def read(path: Path) -> ImageArray:
     return image
 
 
-def read_pil(path: Path) -> Image.Image:
+def read_pil(path: Path | ConfinedPath) -> Image.Image:
     """Read a photograph as `read` does, into PIL's own image.
 
     Args:
@@ -113,18 +119,19 @@ def read_pil(path: Path) -> Image.Image:
         raise ImageError(f"{path}: unreadable or truncated image ({error})") from error
 
 
-def save(path: Path, image: ImageArray) -> None:
+def save(path: Path | ConfinedPath, image: ImageArray) -> None:
     """Write an 8-bit RGB PNG, clamped to 0..1 and rounded to nearest.
 
     Args:
-        path: The file; its folder is made where it is missing.
+        path: The file, which is replaced atomically; its folder is made where it is missing.
         image: [H, W, 3].
 
     Raises:
         OSError: The file can't be written.
     """
-    path.parent.mkdir(parents=True, exist_ok=True)
-    Image.fromarray(_to_8_bit(image)).save(path, compress_level=4)
+    confined(path).make_parent()
+    with atomic_writer(path) as stream:
+        Image.fromarray(_to_8_bit(image)).save(stream, "PNG", compress_level=4)
 
 
 def _to_8_bit(image: ImageArray) -> NDArray[np.uint8]:

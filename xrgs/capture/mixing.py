@@ -22,6 +22,8 @@ from xrgs.capture.photographs import PhotoCollection, prepare_hr_views, write_de
 from xrgs.capture.split import Split, check_variant_conf, split_views
 from xrgs.capture.views import SceneFailed, Variant, View
 from xrgs.runtime.progress import progress
+from xrgs.safeio.atomic import write_text
+from xrgs.safeio.confined import ConfinedPath
 
 if TYPE_CHECKING:
     from xrgs.capture.scenes import Scene
@@ -44,7 +46,7 @@ class _Inputs:
         return () if degrade.resolve_degradation(self.conf) == "none" else self.split.lr
 
 
-def mix_resolutions(scene: Scene, conf: VariantConf, work: Path, out: Path) -> Variant:
+def mix_resolutions(scene: Scene, conf: VariantConf, work: Path, out: ConfinedPath) -> Variant:
     """Make the views, poses and points of a variant.
 
     Args:
@@ -124,11 +126,11 @@ def _refusal(inputs: _Inputs, model: Reconstruction) -> str:
     return ""
 
 
-def _write_log(work: Path, out: Path) -> None:
+def _write_log(work: Path, out: ConfinedPath) -> None:
     """Join COLMAP's log files; each of them begins with its own name."""
     files = sorted(work.rglob("colmap-*"))
     text = "".join(file.read_text(encoding="utf-8", errors="replace") for file in files)
-    (out / "colmap.log").write_text(text, encoding="utf-8")
+    write_text(out / "colmap.log", text)
 
 
 def _sfm_report(inputs: _Inputs, model: Reconstruction) -> dict[str, Any]:
@@ -189,7 +191,7 @@ def _tags_report(inputs: _Inputs, views: tuple[View, ...]) -> dict[str, Any]:
 
 
 def _write_undistorted(
-    inputs: _Inputs, model: Reconstruction, depths: Mapping[int, float], out: Path
+    inputs: _Inputs, model: Reconstruction, depths: Mapping[int, float], out: ConfinedPath
 ) -> tuple[View, ...]:
     """Undistort every registered view at its own size, and write it."""
     photos, split = inputs.photos, inputs.split

@@ -16,6 +16,7 @@ from xrgs.capture.lens import Lens
 from xrgs.capture.split import HrGeometry, hr_geometry, shrink_factor
 from xrgs.errors import XrgsError
 from xrgs.runtime.progress import progress
+from xrgs.safeio.confined import ConfinedPath
 
 if TYPE_CHECKING:
     from xrgs.capture.scenes import Scene
@@ -143,7 +144,7 @@ def prepare_hr_views(scene: Scene, conf: VariantConf, work: Path) -> PhotoCollec
     """
     sizes, unreadable = _read_sizes(scene.files)
     shrink = shrink_factor(list(sizes.values()), conf) if sizes else 1.0
-    geometries: dict[Path, HrGeometry] = {}
+    geometries: dict[Path | ConfinedPath, HrGeometry] = {}
     for file, size in progress(sizes.items(), "HR views", "view"):
         try:
             image = images.read(file)
@@ -177,11 +178,11 @@ def _resize_and_crop(image: images.ImageArray, hr: HrGeometry) -> images.ImageAr
 
 
 def _read_sizes(
-    files: Sequence[Path],
-) -> tuple[dict[Path, tuple[int, int]], dict[Path, str]]:
+    files: Sequence[Path | ConfinedPath],
+) -> tuple[dict[Path | ConfinedPath, tuple[int, int]], dict[Path | ConfinedPath, str]]:
     """Read the size of each file, or the message that says why it has none."""
-    sizes: dict[Path, tuple[int, int]] = {}
-    unreadable: dict[Path, str] = {}
+    sizes: dict[Path | ConfinedPath, tuple[int, int]] = {}
+    unreadable: dict[Path | ConfinedPath, str] = {}
     for file in files:
         try:
             sizes[file] = images.size(file)
@@ -191,7 +192,7 @@ def _read_sizes(
 
 
 def assign_cameras(
-    files: Sequence[Path], sizes: Sequence[tuple[int, int]], policy: str
+    files: Sequence[Path | ConfinedPath], sizes: Sequence[tuple[int, int]], policy: str
 ) -> list[str]:
     """Name the camera of each photograph; photographs with one name share it in SfM.
 

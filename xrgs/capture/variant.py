@@ -10,10 +10,8 @@ from __future__ import annotations
 
 import fcntl
 import logging
-import os
-import shutil
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -23,10 +21,12 @@ import numpy as np
 from xrgs.capture import scenes, split
 from xrgs.capture.failures import FAILED_PREFIX, failed_scenes
 from xrgs.capture.views import SceneFailed, Variant, View
-from xrgs.errors import XrgsError
+from xrgs.errors import StoreError, UnreadableError, XrgsError
 from xrgs.safeio import npz, untrusted
-from xrgs.safeio.atomic import write_json
+from xrgs.safeio.atomic import atomic_writer, write_json
+from xrgs.safeio.confined import ConfinedPath, confined, is_passing
 from xrgs.safeio.hashing import digest, file_digest, source_digests
+from xrgs.safeio.records import read_object
 
 if TYPE_CHECKING:
     from xrgs.config import SceneConf, VariantConf
@@ -73,7 +73,7 @@ def key(scene: SceneConf, conf: VariantConf) -> str:
     return digest([fingerprint, asdict(conf), source_digests(*_SOURCES)])
 
 
-def find(variants: Path, wanted_key: str) -> Variant | None:
+def find(variants: Path | ConfinedPath, wanted_key: str) -> Variant | None:
     """Find the frozen variant of a key, and verify it; a corrupt one is logged and passed over.
 
     Args:
@@ -83,7 +83,7 @@ def find(variants: Path, wanted_key: str) -> Variant | None:
     Returns:
         The variant; None where there is no intact one.
     """
-    for folder in sorted(variants.glob(f"{wanted_key}-*")):
+    for folder in _of_key(confined(variants), wanted_key):
         try:
             return load(folder)
         except CorruptVariant as error:
@@ -91,7 +91,15 @@ def find(variants: Path, wanted_key: str) -> Variant | None:
     return None
 
 
-def failure(variants: Path, wanted_key: str) -> str | None:
+def _of_key(variants: ConfinedPath, wanted_key: str) -> list[ConfinedPath]:
+    """Return the folders of the variants of a key."""
+    try:
+        return [variants / name for name in variants.names() if name.startswith(f"{wanted_key}-")]
+    except FileNotFoundError:
+        return []
+
+
+def failure(variants: Path | ConfinedPath, wanted_key: str) -> str | None:
     """Read why the scene of a key could not be made into a variant when it was last tried.
 
     Args:
@@ -102,15 +110,18 @@ def failure(variants: Path, wanted_key: str) -> str | None:
     Returns:
         The reason; None where the key did not fail.
     """
-    failed = failed_scenes(variants, wanted_key)
+    try:
+        failed = failed_scenes(variants, wanted_key)
+    except FileNotFoundError:
+        return None
     return failed[wanted_key][1] if failed else None
 
 
-def load(folder: Path) -> Variant:
+def load(path: Path | ConfinedPath) -> Variant:
     """Load a frozen variant, after every hash is verified.
 
     Args:
-        folder: The variant's folder, which may come from anybody.
+        path: The variant's folder, which may come from anybody.
 
     Returns:
         The variant.
@@ -118,16 +129,17 @@ def load(folder: Path) -> Variant:
     Raises:
         CorruptVariant: A file is missing, or is not the one that was frozen.
     """
+    folder = confined(path)
     try:
-        content = untrusted.parse_json(untrusted.read_bytes(folder / "variant.json"))
+        content = read_object(folder / "variant.json")
         if content["id"] != _id(content):
             raise CorruptVariant(f"{folder / 'variant.json'}: it has changed since it was frozen")
         for name, expected in content["files"].items():
-            if not untrusted.is_inside(name) or _linkless_digest(folder, name) != expected:
-                raise CorruptVariant(f"{folder / name}: it has changed since it was frozen")
-        with untrusted.open_regular(folder / "points.npz") as stream:
+            if not untrusted.is_inside(name) or file_digest(folder / name) != expected:
+                raise CorruptVariant(f"{folder}/{name}: it has changed since it was frozen")
+        with (folder / "points.npz").open() as stream:
             arrays = npz.read(stream)
-        report = untrusted.parse_json(untrusted.read_bytes(folder / "report.json"))
+        report = read_object(folder / "report.json")
         variant = Variant(
             content["id"],
             folder,
@@ -140,7 +152,12 @@ def load(folder: Path) -> Variant:
             report,
         )
         _check(variant, content["files"])
-    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
+    except UnreadableError:
+        raise
+    except OSError as error:
+        kind = UnreadableError if is_passing(error) else CorruptVariant
+        raise kind(f"{error.filename}: {error.strerror}") from error
+    except (StoreError, ValueError, KeyError, TypeError, AttributeError) as error:
         raise CorruptVariant(f"{folder}: not a complete variant ({error!r})") from error
     return variant
 
@@ -166,7 +183,7 @@ def _check(variant: Variant, files: dict[str, str]) -> None:
         "two views of one name": len(names) == len(views),
     } | {
         f"view {view.name!r:.80}": untrusted.is_name(view.name)
-        and view.file.relative_to(variant.path).as_posix() in files
+        and view.file.relative_to(variant.folder) in files
         and view.split in _SPLITS
         and view.tag in {"HR", "LR"}
         and all(type(side) is int and side > 0 for side in (view.width, view.height))
@@ -179,7 +196,12 @@ def _check(variant: Variant, files: dict[str, str]) -> None:
         raise ValueError(wrong[0])
 
 
-def build(scene: SceneConf, conf: VariantConf, variants: Path, cache: Path) -> Variant:
+def build(
+    scene: SceneConf,
+    conf: VariantConf,
+    variants: Path | ConfinedPath,
+    cache: Path | ConfinedPath,
+) -> Variant:
     """Find the variant of a scene, or make it; any number of processes may call this at once.
 
     Args:
@@ -197,53 +219,60 @@ def build(scene: SceneConf, conf: VariantConf, variants: Path, cache: Path) -> V
     """
     split.check_variant_conf(conf)
     wanted_key = key(scene, conf)
-    variants.mkdir(parents=True, exist_ok=True)
-    report = variants / f"{FAILED_PREFIX}{wanted_key}" / "report.json"
+    home = confined(variants)
+    home.make_folder()
+    report = home / f"{FAILED_PREFIX}{wanted_key}" / "report.json"
     report_before = _modified_ns(report)
-    with _lock(variants / f".{wanted_key}.lock"):
-        found = find(variants, wanted_key)
+    with _lock(home / f".{wanted_key}.lock"):
+        found = find(home, wanted_key)
         if found is not None:
             return found
-        reason = failure(variants, wanted_key)
+        reason = failure(home, wanted_key)
         if reason and _modified_ns(report) != report_before:  # another process tried meanwhile
             raise SceneFailed(f"{reason} Report: {report}", {})
-        for corrupt in variants.glob(f"{wanted_key}-*"):
-            untrusted.remove(corrupt)
-        resolved = scenes.resolve(scene, cache, conf.long_side)
-        return _make(resolved, conf, wanted_key, variants)
+        for corrupt in _of_key(home, wanted_key):
+            corrupt.remove()
+        resolved = scenes.resolve(scene, confined(cache), conf.long_side)
+        return _make(resolved, conf, wanted_key, home)
 
 
-def _modified_ns(file: Path) -> int | None:
+def _modified_ns(file: ConfinedPath) -> int | None:
     try:
-        return file.stat().st_mtime_ns
-    except OSError:
+        return file.lstat().st_mtime_ns
+    except FileNotFoundError:
         return None
 
 
-def _make(scene: scenes.Scene, conf: VariantConf, wanted_key: str, variants: Path) -> Variant:
+def _make(
+    scene: scenes.Scene, conf: VariantConf, wanted_key: str, variants: ConfinedPath
+) -> Variant:
     """Make and freeze a variant, after what a killed process left of it is removed."""
     from xrgs.capture import mixing
 
     work = variants / f".{wanted_key}.building"
     failed = variants / f"{FAILED_PREFIX}{wanted_key}"
-    untrusted.remove(work)
-    untrusted.remove(failed)
+    work.remove()
+    failed.remove()
     frozen = work / "frozen"
-    frozen.mkdir(parents=True)
+    frozen.make_folder()
     try:
-        made = mixing.mix_resolutions(scene, conf, work, frozen)
+        made = mixing.mix_resolutions(scene, conf, work.path, frozen)
         return _freeze(made, wanted_key, frozen, variants)
     except SceneFailed as error:
         write_json(frozen / "report.json", error.report | {"reason": str(error)})
         frozen.rename(failed)
         raise SceneFailed(f"{error} Report: {failed}", error.report) from None
     finally:
-        shutil.rmtree(work, ignore_errors=True)
+        with suppress(OSError):
+            work.remove()
 
 
-def _freeze(made: Variant, wanted_key: str, folder: Path, variants: Path) -> Variant:
+def _freeze(
+    made: Variant, wanted_key: str, folder: ConfinedPath, variants: ConfinedPath
+) -> Variant:
     """Write a variant's fields into the folder of its images, and rename the folder to its id."""
-    np.savez(folder / "points.npz", points=made.points, colors=made.colors)
+    with atomic_writer(folder / "points.npz") as stream:
+        np.savez(stream, points=made.points, colors=made.colors)
     write_json(folder / "report.json", made.report)
     files = [folder / "points.npz", *sorted({view.file for view in made.views})]
     content: dict[str, Any] = {
@@ -252,12 +281,13 @@ def _freeze(made: Variant, wanted_key: str, folder: Path, variants: Path) -> Var
         "factor": made.factor,
         "held_out": made.held_out,
         "views": [_view_to_json(folder, view) for view in made.views],
-        "files": {f.relative_to(folder).as_posix(): file_digest(f) for f in files},
+        "files": {f.relative_to(folder): file_digest(f) for f in files},
     }
     content["id"] = _id(content)
     write_json(folder / "variant.json", content)
     home = variants / content["id"]
     folder.rename(home)
+    home.sync_name()
     return load(home)
 
 
@@ -267,32 +297,21 @@ def _id(content: dict[str, Any]) -> str:
     return f"{content['key']}-{digest(hashed)}"
 
 
-def _view_to_json(folder: Path, view: View) -> dict[str, Any]:
-    file = view.file.relative_to(folder).as_posix()
+def _view_to_json(folder: ConfinedPath, view: View) -> dict[str, Any]:
+    file = view.file.relative_to(folder)
     arrays = {"K": view.K.tolist(), "viewmat": view.viewmat.tolist()}
-    return asdict(view) | {"file": file} | arrays
+    return vars(view) | {"file": file} | arrays
 
 
-def _view_from_json(folder: Path, entry: dict[str, Any]) -> View:
+def _view_from_json(folder: ConfinedPath, entry: dict[str, Any]) -> View:
     arrays = {name: np.array(entry[name], dtype=np.float64) for name in ("K", "viewmat")}
     return View(**(entry | {"file": folder / entry["file"]} | arrays))
 
 
-def _linkless_digest(folder: Path, name: str) -> str:
-    """Hash a file of the folder; return an empty text where a link leads to or through its path.
-
-    Raises:
-        OSError: The file is not there.
-    """
-    file = folder / name
-    return file_digest(file) if file.resolve() == folder.resolve() / name else ""
-
-
 @contextmanager
-def _lock(file: Path) -> Iterator[None]:
+def _lock(file: ConfinedPath) -> Iterator[None]:
     """Hold an exclusive lock; the system releases it where this process dies."""
-    # O_NOFOLLOW: opening through a link for writing would empty the file that it leads to.
-    with os.fdopen(os.open(file, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW, 0o666), "w") as handle:
+    with file.append() as handle:
         try:
             fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from xrgs.errors import XrgsError
+from xrgs.safeio.confined import ConfinedPath
 
 
 class SceneFailed(XrgsError):  # noqa: N818
@@ -26,7 +27,7 @@ class View:
 
     name: str
     """The photograph's file name without its suffix."""
-    file: Path
+    file: ConfinedPath
     """A PNG, 8-bit RGB, of exactly `width` x `height` px."""
     split: str
     """`train`, `test` or `original`. An original is a degraded training view before it was
@@ -51,7 +52,7 @@ class Variant:
 
     id: str
     """`<key>-<hash>`, where the hash covers the images, the cameras and the SfM points."""
-    path: Path
+    folder: ConfinedPath
     """The folder that it was loaded from."""
     scene: str
     """The scene's name when the variant was built; a label that is not part of the hash."""
@@ -69,3 +70,8 @@ class Variant:
     """Their colours [P, 3]."""
     report: dict[str, Any]
     """How SfM went: registered views, points, reprojection error, every attempt."""
+
+    @property
+    def path(self) -> Path:
+        """The folder's path. What is in the folder may come from anybody: `folder` opens it."""
+        return self.folder.path

@@ -12,6 +12,7 @@ from xrgs import config
 from xrgs.cli.arguments import choices, errors_as_messages, with_quotes
 from xrgs.errors import XrgsError
 from xrgs.experiment.store import Store
+from xrgs.safeio.confined import ConfinedPath
 from xrgs.sweep import variants
 
 _HELP = """\
@@ -74,6 +75,7 @@ def _inspect(words: list[str], values: dict[str, str]) -> str:
     out = values.pop("out", None)
     if bool(words) == bool(values) or len(words) > 1:
         raise XrgsError("inspect: give a variant's folder, or scene=NAME and other keys")
+    folder: Path | ConfinedPath
     if words:
         folder = Path(words[0]).expanduser()
     else:

@@ -14,10 +14,10 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
-    from pathlib import Path
 
     from xrgs.capture.dataset import LoadedView
     from xrgs.config import SplatConf
+    from xrgs.safeio.confined import ConfinedPath
     from xrgs.splat.gaussians import Gaussians
 
 #: The version of this protocol, part of a cell's identity: increment it when a change here or in
@@ -26,7 +26,7 @@ PROTOCOL_VERSION = 1
 
 
 def score_views(
-    gaussians: Gaussians, views: Sequence[LoadedView], conf: SplatConf, renders: Path
+    gaussians: Gaussians, views: Sequence[LoadedView], conf: SplatConf, renders: ConfinedPath
 ) -> list[dict[str, Any]]:
     """Render and score each view, and write its clamped render as `<view>.png`.
 
@@ -49,7 +49,7 @@ def score_views(
     from xrgs.splat.backend import resolve_backend
     from xrgs.splat.rasterize import rasterize_parameters
 
-    renders.mkdir(exist_ok=True)
+    renders.make_folder()
     backend = resolve_backend(conf.backend)
     rows = []
     with torch.no_grad():

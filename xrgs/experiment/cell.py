@@ -48,7 +48,7 @@ def run_cell(conf: Conf, variant: Variant, folder: CellFolder) -> None:
             views = _train_and_score(conf, variant, folder)
         folder.finish(views, protocol.PROTOCOL_VERSION)
     except Exception:
-        write_text(folder.path / "error.txt", traceback.format_exc())
+        write_text(folder.folder / "error.txt", traceback.format_exc())
         raise
 
 
@@ -56,16 +56,18 @@ def _train_and_score(conf: Conf, variant: Variant, folder: CellFolder) -> list[s
     """Write every file but the status; return the names of the views that were scored."""
     threads = set_torch_threads(conf.threads)
     backend = resolve_backend(conf.splat.backend)
-    write_json(folder.path / "provenance.json", provenance.collect(threads, backend))
+    write_json(folder.folder / "provenance.json", provenance.collect(threads, backend))
     data = dataset.load(variant, conf.train.views)
     trained = _train_or_resume(data, conf, folder)
     peak_rss_bytes = peak_rss()  # read before evaluation, which may load the network of LPIPS
-    save_ply(folder.path / "splats.ply", trained.gaussians)
-    write_text(folder.path / "history.csv", _csv(trained.history))
-    scores = protocol.score_views(trained.gaussians, data.test, conf.splat, folder.path / "renders")
-    write_text(folder.path / "scores.csv", _csv(scores))
+    save_ply(folder.folder / "splats.ply", trained.gaussians)
+    write_text(folder.folder / "history.csv", _csv(trained.history))
+    scores = protocol.score_views(
+        trained.gaussians, data.test, conf.splat, folder.folder / "renders"
+    )
+    write_text(folder.folder / "scores.csv", _csv(scores))
     write_json(
-        folder.path / "summary.json",
+        folder.folder / "summary.json",
         {
             "training_time_s": trained.seconds,
             "gaussians": len(trained.gaussians),

@@ -7,26 +7,26 @@ cell is done when that file says so and the listed files are present and unchang
 from __future__ import annotations
 
 import io
-import os
-import stat
 from dataclasses import dataclass
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from xrgs.errors import StoreError
+from xrgs.errors import StoreError, UnreadableError
 from xrgs.runtime import progress
 from xrgs.safeio import untrusted
 from xrgs.safeio.atomic import write_json, write_text
+from xrgs.safeio.confined import confined
 from xrgs.safeio.hashing import canonical_json, file_digest
-from xrgs.safeio.records import as_number, read_json, read_object, read_table
+from xrgs.safeio.records import as_number, read_file, read_json, read_object, read_table
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
+    from pathlib import Path
 
     import pandas as pd
 
     from xrgs.capture.dataset import Dataset
     from xrgs.config import Conf
+    from xrgs.safeio.confined import ConfinedPath
     from xrgs.splat.cameras import Camera
     from xrgs.splat.gaussians import Gaussians
 
@@ -48,7 +48,8 @@ class CellState:
     """The state of a cell, and the reason for it."""
 
     name: str
-    """`absent`, `unfinished`, `running`, `failed`, `corrupt` or `done`."""
+    """`absent`, `unfinished`, `running`, `failed`, `corrupt` or `done`; `unknown` where a file can't
+    be read now, so that nothing may be done with the cell but to look again."""
     reason: str = ""
 
 
@@ -56,28 +57,36 @@ class CellState:
 class CellFolder:
     """The folder of one cell: its config, its results and its state."""
 
-    path: Path
+    folder: ConfinedPath
     """The folder, named by the cell's id."""
+
+    def __init__(self, folder: Path | ConfinedPath) -> None:
+        object.__setattr__(self, "folder", confined(folder))
+
+    @property
+    def path(self) -> Path:
+        """The folder's path. What is in the folder may come from anybody: `folder` opens it."""
+        return self.folder.path
 
     @property
     def id(self) -> str:
         """The cell's id: the digest of its identity."""
-        return self.path.name
+        return self.folder.name
 
     @property
-    def checkpoint(self) -> Path:
+    def checkpoint(self) -> ConfinedPath:
         """File of the training checkpoint; it exists while the cell is not done."""
-        return self.path / _CHECKPOINT
+        return self.folder / _CHECKPOINT
 
     @property
-    def progress(self) -> Path:
+    def progress(self) -> ConfinedPath:
         """File that says how far the cell is; a process that is killed leaves it behind."""
-        return self.path / _PROGRESS
+        return self.folder / _PROGRESS
 
     @property
-    def status(self) -> Path:
+    def status(self) -> ConfinedPath:
         """File of the final state, written after all other files."""
-        return self.path / "status.json"
+        return self.folder / "status.json"
 
     def state(self, *, verify: bool = True) -> CellState:
         """Return whether this cell's result is present and can be trusted.
@@ -85,20 +94,25 @@ class CellFolder:
         Args:
             verify: Hash the files that reports are made from; otherwise only sizes are compared.
         """
-        if not self.path.is_dir():
-            return CellState("absent")
-        if self.path.is_symlink():
+        try:
+            return self._look(verify=verify)
+        except (UnreadableError, OSError) as error:
+            return CellState("unknown", f"it can't be read now: {error}")
+        except (StoreError, AttributeError, KeyError, TypeError, ValueError) as error:
+            return CellState("corrupt", str(error))
+
+    def _look(self, *, verify: bool) -> CellState:
+        if self.folder.is_link():
             return CellState("corrupt", "it is a symbolic link; a cell must be a folder")
+        if not self.folder.is_dir():
+            return CellState("absent")
         if not self.status.exists():
             resumes = "; it resumes from its checkpoint" if self.checkpoint.exists() else ""
             return CellState("unfinished", f"it was stopped before it ended{resumes}")
-        try:
-            status = read_json(self.status)
-            if status["state"] == "failed":
-                return CellState("failed", str(status["reason"]))
-            self._check(status, verify=verify)
-        except (StoreError, AttributeError, KeyError, TypeError, ValueError, OSError) as error:
-            return CellState("corrupt", str(error))
+        status = read_json(self.status)
+        if status["state"] == "failed":
+            return CellState("failed", str(status["reason"]))
+        self._check(status, verify=verify)
         return CellState("done")
 
     def running(self, owner: str) -> CellState:
@@ -113,13 +127,16 @@ class CellFolder:
     def _check(self, status: Mapping[str, Any], *, verify: bool) -> None:
         if status["state"] != "done":
             raise StoreError(f"status.json: unknown state {status['state']!r}")
-        for name, entry in status["files"].items():
+        files = status["files"]
+        for name in files:
             if not untrusted.is_inside(name):
                 raise StoreError(f"status.json: {name!r:.80} is not a file of this cell")
-            if _size(f"{self.path}/{name}") != entry["bytes"]:
+        sizes = self.folder.sizes(list(files))
+        for name, entry in files.items():
+            if sizes[name] != entry["bytes"]:
                 raise StoreError(f"{name} is missing or has another size")
             hashed = verify and name in _VERIFIED_BY_HASH
-            if hashed and file_digest(self.path / name) != entry["sha256"]:
+            if hashed and file_digest(self.folder / name) != entry["sha256"]:
                 raise StoreError(f"{name} has changed since the cell finished")
         if verify and [view for view, _ in self.view_scores()] != status["views"]:
             raise StoreError("scores.csv does not have one row for each view that was to be scored")
@@ -130,7 +147,7 @@ class CellFolder:
         Raises:
             StoreError: `scores.csv` is missing or malformed.
         """
-        file = self.path / "scores.csv"
+        file = self.folder / "scores.csv"
         header, rows = read_table(file)
         views = [row[0] for row in rows]
         if header[:1] != ["view"] or not all(map(untrusted.is_name, views)):
@@ -155,11 +172,11 @@ class CellFolder:
         """
         if self._can_resume(identity):
             self._clear()
-        elif self.path.exists():
-            self.path.rename(_free_name(self.path))
-        self.path.mkdir(parents=True, exist_ok=True)
-        write_json(self.path / "config.json", config)
-        write_json(self.path / "identity.json", identity)
+        elif self.folder.exists():
+            self.folder.rename(_free_name(self.folder))
+        self.folder.make_folder()
+        write_json(self.folder / "config.json", config)
+        write_json(self.folder / "identity.json", identity)
 
     def _can_resume(self, identity: Mapping[str, Any]) -> bool:
         state = self.state().name
@@ -169,13 +186,13 @@ class CellFolder:
             return canonical_json(self.identity()) == canonical_json(identity)
         except (StoreError, TypeError, ValueError):
             # An attempt that was killed before it wrote its identity has not trained anything.
-            written = (self.path / "identity.json", self.checkpoint)
+            written = (self.folder / "identity.json", self.checkpoint)
             return not any(file.exists() for file in written)
 
     def _clear(self) -> None:
-        for entry in self.path.iterdir():
-            if entry.name not in _KEPT_ON_RESUME or entry.is_symlink():
-                untrusted.remove(entry)
+        for entry in self.folder.iterdir():
+            if entry.name not in _KEPT_ON_RESUME or not entry.is_file():
+                entry.remove()
 
     def finish(self, views: Sequence[str], protocol: int) -> None:
         """Declare the cell done, with the files that are in the folder now.
@@ -185,12 +202,9 @@ class CellFolder:
             protocol: Version of the evaluation protocol.
         """
         files = {
-            file.relative_to(self.path).as_posix(): {
-                "bytes": file.stat().st_size,
-                "sha256": file_digest(file),
-            }
-            for file in sorted(self.path.rglob("*"))
-            if file.is_file() and file.name not in _NOT_RESULTS
+            name: {"bytes": status.st_size, "sha256": file_digest(self.folder / name)}
+            for name, status in sorted(self.folder.walk())
+            if name not in _NOT_RESULTS
         }
         self._set_status(
             {
@@ -216,7 +230,7 @@ class CellFolder:
         Args:
             reason: Why it failed, for the status and for people.
         """
-        error = self.path / "error.txt"
+        error = self.folder / "error.txt"
         if not error.exists():
             write_text(error, f"{reason}\n")
         self.progress.unlink(missing_ok=True)
@@ -231,7 +245,7 @@ class CellFolder:
         Raises:
             StoreError: `identity.json` is missing or malformed.
         """
-        return read_object(self.path / "identity.json")
+        return read_object(self.folder / "identity.json")
 
     def summary(self) -> dict[str, Any]:
         """Return the figures of the whole cell: training time, Gaussians, memory and others.
@@ -239,7 +253,7 @@ class CellFolder:
         Raises:
             StoreError: `summary.json` is missing or malformed.
         """
-        return read_object(self.path / "summary.json")
+        return read_object(self.folder / "summary.json")
 
     def provenance(self) -> dict[str, Any]:
         """Return where, when and with which software the cell was trained.
@@ -247,18 +261,18 @@ class CellFolder:
         Raises:
             StoreError: `provenance.json` is missing or malformed.
         """
-        return read_object(self.path / "provenance.json")
+        return read_object(self.folder / "provenance.json")
 
     def history(self) -> pd.DataFrame:
         """Return the training history, one row per logged step.
 
         Raises:
-            OSError: `history.csv` can't be read.
+            StoreError: `history.csv` can't be read.
             ValueError: `history.csv` is not a table.
         """
         import pandas as pd
 
-        return pd.read_csv(io.BytesIO(untrusted.read_bytes(self.path / "history.csv")))
+        return pd.read_csv(io.BytesIO(read_file(self.folder / "history.csv")))
 
     def scores(self) -> pd.DataFrame:
         """Return the scores of the test views.
@@ -284,7 +298,7 @@ class CellFolder:
         """
         from xrgs.config import from_file
 
-        return from_file(self.path / "config.json")
+        return from_file(self.folder / "config.json")
 
     def gaussians(self) -> Gaussians:
         """Load the trained Gaussians, in the world of `cameras`.
@@ -294,7 +308,7 @@ class CellFolder:
         """
         from xrgs.splat.ply import load_ply
 
-        return load_ply(self.path / "splats.ply")
+        return load_ply(self.folder / "splats.ply")
 
     def dataset(self) -> Dataset:
         """Load the views that the cell was trained and tested on: photographs, cameras, points.
@@ -307,7 +321,7 @@ class CellFolder:
         """
         from xrgs.experiment.results import load_dataset
 
-        return load_dataset(self.path)
+        return load_dataset(self.folder)
 
     def cameras(self) -> dict[str, dict[str, Camera]]:
         """Load the cameras of the cell's views, in the normalised world of its Gaussians.
@@ -325,19 +339,7 @@ class CellFolder:
         }
 
 
-def _size(file: str) -> int:
-    """Return the bytes of a regular file, -1 for anything else.
-
-    It takes a string: making a `Path` for each of a store's files would take longer than this.
-    """
-    try:
-        status = os.lstat(file)
-    except OSError:
-        return -1
-    return status.st_size if stat.S_ISREG(status.st_mode) else -1
-
-
-def _free_name(path: Path) -> Path:
+def _free_name(path: ConfinedPath) -> ConfinedPath:
     """Return the first sibling that does not exist: `<name>.aside-1`, `<name>.aside-2`, ..."""
     number = 1
     while (free := path.with_name(f"{path.name}.aside-{number}")).exists():

@@ -11,12 +11,12 @@ import pandas as pd
 
 from xrgs.errors import StoreError
 from xrgs.evaluation.metrics import METRICS
+from xrgs.safeio.confined import ConfinedPath
 from xrgs.safeio.records import as_number, read_object
 from xrgs.safeio.untrusted import is_name, printable
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Mapping
-    from pathlib import Path
 
     from xrgs.capture.dataset import Dataset
 
@@ -45,7 +45,7 @@ def cells_table(rows: Iterable[Mapping[str, Any]]) -> pd.DataFrame:
     return table.sort_values([*CELL_NAMES, "seed", "cell_id"], ignore_index=True)
 
 
-def cell_columns(folder: Path, names: Mapping[str, str]) -> dict[str, Any]:
+def cell_columns(folder: ConfinedPath, names: Mapping[str, str]) -> dict[str, Any]:
     """Return what a cell's `identity.json` and `config.json` say of it, as columns of a table.
 
     Args:
@@ -66,7 +66,7 @@ def cell_columns(folder: Path, names: Mapping[str, str]) -> dict[str, Any]:
     }
 
 
-def _object(file: Path) -> dict[str, Any]:
+def _object(file: ConfinedPath) -> dict[str, Any]:
     """Read a JSON file of values under names; empty where it can't be read."""
     try:
         return read_object(file)
@@ -84,7 +84,7 @@ def _flat(values: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, An
             yield key, printable(value) if isinstance(value, str) else value
 
 
-def cell_metrics(folder: Path, scores: pd.DataFrame) -> dict[str, float]:
+def cell_metrics(folder: ConfinedPath, scores: pd.DataFrame) -> dict[str, float]:
     """Return the metrics of a finished cell, by name.
 
     Args:
@@ -108,7 +108,7 @@ def cell_metrics(folder: Path, scores: pd.DataFrame) -> dict[str, float]:
     return metrics
 
 
-def load_dataset(folder: Path) -> Dataset:
+def load_dataset(folder: ConfinedPath) -> Dataset:
     """Load the views that a cell was trained and tested on; see `CellFolder.dataset`.
 
     Args:
@@ -125,4 +125,5 @@ def load_dataset(folder: Path) -> Dataset:
     views = train.get("views") if isinstance(train, dict) else None
     if not isinstance(variant_id, str) or not is_name(variant_id) or not isinstance(views, str):
         raise StoreError(f"{folder / 'identity.json'}: it names no variant or no train.views")
-    return dataset.load(variant.load(folder.parents[1] / "variants" / variant_id), views)
+    store = folder.path.parents[1]
+    return dataset.load(variant.load(ConfinedPath(store) / f"variants/{variant_id}"), views)

@@ -7,16 +7,17 @@ described in `xrgs.experiment.cell_folder`.
 
 from __future__ import annotations
 
-import os
 import tempfile
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from xrgs.errors import StoreError
+from xrgs.errors import StoreError, UnreadableError
 from xrgs.experiment.cell_folder import CellFolder
+from xrgs.runtime.progress import log_line
 from xrgs.safeio import untrusted
 from xrgs.safeio.atomic import write_json
+from xrgs.safeio.confined import ConfinedPath, RootMissingError
 from xrgs.safeio.hashing import digest
 from xrgs.safeio.records import read_json
 
@@ -46,51 +47,70 @@ class Store:
         object.__setattr__(self, "path", Path(path))
 
     @property
-    def scenes(self) -> Path:
+    def folder(self) -> ConfinedPath:
+        """The folder as the root of everything in it, which may come from anybody."""
+        return ConfinedPath(self.path)
+
+    @property
+    def scenes(self) -> ConfinedPath:
         """Folder of the rendered photographs of procedural scenes."""
-        return self.path / "scenes"
+        return self.folder / "scenes"
 
     @property
-    def variants(self) -> Path:
+    def variants(self) -> ConfinedPath:
         """Folder of the frozen variants."""
-        return self.path / "variants"
+        return self.folder / "variants"
 
     @property
-    def cells_folder(self) -> Path:
+    def cells_folder(self) -> ConfinedPath:
         """Folder of the cells."""
-        return self.path / "cells"
+        return self.folder / "cells"
 
     @property
-    def locks(self) -> Path:
+    def locks(self) -> ConfinedPath:
         """Folder of the locks of cells that are being trained."""
-        return self.path / "locks"
+        return self.folder / "locks"
 
     @property
-    def reports(self) -> Path:
+    def sweeps(self) -> ConfinedPath:
+        """Folder of the records of sweeps."""
+        return self.folder / "sweeps"
+
+    @property
+    def reports(self) -> ConfinedPath:
         """Folder of the reports: tables and figures."""
-        return self.path / "reports"
+        return self.folder / "reports"
+
+    @property
+    def exists(self) -> bool:
+        """Whether the folder is a store: whether it is there and has a folder of cells.
+
+        Raises:
+            StoreError: It can't be told now; the message names the folder.
+        """
+        try:
+            return self.cells_folder.is_dir()
+        except (RootMissingError, NotADirectoryError):
+            return False
+        except OSError as error:
+            raise UnreadableError(f"store={self.path}: {error.strerror}; try again") from error
 
     def prepare(self) -> None:
-        """Create the subfolders, and check that the disk has room.
+        """Create the folder and its subfolders, and check that the disk has room.
 
         Raises:
             StoreError: The folder can't be written; the message names it and the `store` key.
         """
         try:
-            folders = (
-                self.scenes,
-                self.variants,
-                self.cells_folder,
-                self.locks,
-                self.path / "sweeps",
-            )
-            for folder in folders:
-                folder.mkdir(parents=True, exist_ok=True)
+            self.folder.make_root()
+            for folder in (self.scenes, self.variants, self.cells_folder, self.locks, self.sweeps):
+                folder.make_folder()
             with tempfile.TemporaryFile(dir=self.path) as file:
                 file.write(bytes(_MIN_FREE_BYTES))
         except OSError as error:
             raise StoreError(
-                f"store={self.path} can't be written ({error}): choose another with store=..."
+                f"store={self.path} can't be written ({error.strerror}: {error.filename}): choose"
+                " another with store=..."
             ) from error
 
     def cell(self, cell_id: str) -> CellFolder:
@@ -123,43 +143,75 @@ class Store:
             its key, as `train.steps`.
 
         Raises:
-            StoreError: There is no such store, or a sweep's record in it can't be read.
+            StoreError: There is no such store. A sweep's record that can't be read is named on
+                stderr.
         """
         from xrgs.experiment.results import cell_columns, cell_metrics, cells_table
 
-        if not self.cells_folder.is_dir():
+        if not self.exists:
             raise StoreError(f"{self.path}: no store; xrgs-sweep makes one with store={self.path}")
-        names, rows = self.recorded_names(), []
-        for entry in os.scandir(self.cells_folder):
-            # The name of a folder that was set aside has a dot.
-            if not entry.is_dir() or "." in entry.name or not untrusted.is_name(entry.name):
-                continue
-            cell = self.cell(entry.name)
+        names, rows = self._names(), []
+        for cell in self.cell_folders():
             state = cell.state(verify=verify)
-            row = cell_columns(cell.path, names.get(cell.id, {}))
+            row = cell_columns(cell.folder, names.get(cell.id, {}))
             row |= {"state": state.name, "reason": untrusted.printable(state.reason)}
             done = state.name == "done"
-            rows.append(row | (cell_metrics(cell.path, cell.scores()) if done else {}))
+            rows.append(row | (cell_metrics(cell.folder, cell.scores()) if done else {}))
         return cells_table(rows)
 
-    def recorded_names(self) -> dict[str, dict[str, str]]:
-        """Return scene, label and condition of each cell that a sweep recorded, by the cell's id.
-
-        A cell of several sweeps has the names that the latest one gave it.
+    def cell_folders(self) -> list[CellFolder]:
+        """Return the cells, sorted by id; folders of earlier attempts, whose names have a dot, not.
 
         Raises:
-            StoreError: A sweep's record can't be read; the message names it.
+            OSError: The folder of cells can't be read.
         """
+        names = self.cells_folder.folders()
+        return [self.cell(name) for name in names if "." not in name and untrusted.is_name(name)]
+
+    def _names(self) -> dict[str, dict[str, str]]:
+        """Return scene, label and condition of recorded cells by id, as the latest sweep has it."""
         from xrgs.experiment.results import CELL_NAMES
 
-        files = (self.path / "sweeps").glob("*.json")
-        names: dict[str, dict[str, str]] = {}
-        for file in sorted(files, key=lambda file: (file.stat().st_mtime_ns, file.name)):
-            for row in self.sweep_record(file.stem)["cells"]:
-                if row.get("cell_id") is not None:
-                    texts = {key: untrusted.printable(row.get(key, "")) for key in CELL_NAMES}
-                    names[row["cell_id"]] = texts
-        return names
+        records, damaged = self.records()
+        for message in damaged:
+            log_line(f"{message}; its names of cells are left out")
+        return {
+            row["cell_id"]: {key: untrusted.printable(row.get(key, "")) for key in CELL_NAMES}
+            for record in records.values()
+            for row in record["cells"]
+            if row.get("cell_id") is not None
+        }
+
+    def sweep_ids(self) -> list[str]:
+        """Return the ids of the recorded sweeps, oldest first.
+
+        Raises:
+            OSError: The folder of the records can't be read.
+        """
+        times = {
+            name.removesuffix(".json"): status.st_mtime_ns
+            for name, status in self.sweeps.walk()
+            if name.endswith(".json") and untrusted.is_name(name)
+        }
+        return sorted(times, key=lambda sweep_id: (times[sweep_id], sweep_id))
+
+    def records(self) -> tuple[dict[str, dict[str, Any]], tuple[str, ...]]:
+        """Read the records of all sweeps.
+
+        Returns:
+            The records that can be read, by the sweep's id, oldest first, and for each other one a
+            message that names its file.
+
+        Raises:
+            OSError: The folder of the records can't be read.
+        """
+        records, damaged = {}, []
+        for sweep_id in self.sweep_ids():
+            try:
+                records[sweep_id] = self.sweep_record(sweep_id)
+            except StoreError as error:
+                damaged.append(str(error))
+        return records, tuple(damaged)
 
     def write_sweep(self, command: Sequence[str], cells: Iterable[Mapping[str, Any]]) -> str:
         """Record which cells a sweep compared, for its report.
@@ -174,19 +226,24 @@ class Store:
         rows = [dict(cell) for cell in cells]
         sweep_id = digest(rows)
         record = {"version": _RECORD_VERSION, "command": list(command), "cells": rows}
-        write_json(self.path / "sweeps" / f"{sweep_id}.json", record)
+        write_json(self.sweeps / f"{sweep_id}.json", record)
         return sweep_id
 
     def latest_sweep(self) -> str:
         """Return the id of the sweep that was recorded last.
 
         Raises:
-            StoreError: The store has no record of a sweep.
+            StoreError: The store has no record of a sweep, or can't be read.
         """
-        records = list((self.path / "sweeps").glob("*.json"))
-        if not records:
+        try:
+            ids = self.sweep_ids()
+        except (FileNotFoundError, NotADirectoryError):
+            ids = []
+        except OSError as error:
+            raise UnreadableError(f"{error.filename}: {error.strerror}; try again") from error
+        if not ids:
             raise StoreError(f"store={self.path} holds no sweep: run xrgs-sweep first")
-        return max(records, key=lambda file: (file.stat().st_mtime_ns, file.name)).stem
+        return ids[-1]
 
     def sweep_record(self, sweep_id: str | None = None) -> dict[str, Any]:
         """Return the record of a sweep.
@@ -203,7 +260,7 @@ class Store:
         sweep_id = sweep_id or self.latest_sweep()
         if not untrusted.is_name(sweep_id):
             raise StoreError(f"{sweep_id!r:.80} is not the id of a sweep")
-        file = self.path / "sweeps" / f"{sweep_id}.json"
+        file = self.sweeps / f"{sweep_id}.json"
         record = read_json(file)
         if not isinstance(record, dict) or record.get("version") != _RECORD_VERSION:
             raise StoreError(f"{file} is not a sweep record of version {_RECORD_VERSION}")

@@ -17,6 +17,7 @@ from xrgs.report.tables import Tables
 from xrgs.report.training import table as training_table
 from xrgs.report.training import totals
 from xrgs.safeio.atomic import write_json, write_text
+from xrgs.safeio.confined import ConfinedPath
 from xrgs.safeio.untrusted import one_line
 
 if TYPE_CHECKING:
@@ -80,19 +81,20 @@ def build(
     sweep = read_sweep(store, sweep_id, METRICS)
     comparison = compare(sweep.cells, METRICS)
     tables = Tables(comparison)
-    folder = out or store.reports / sweep_id
-    links = [path for path in (folder, folder / "figures") if path.is_symlink()]
-    if links and out is None:
-        raise ReportError(f"{links[0]} is a link: remove it, or name a folder with out=...")
+    folder = ConfinedPath(out) if out else store.reports / sweep_id
     try:
-        (folder / "figures").mkdir(parents=True, exist_ok=True)
+        folder.make_root()
+        (folder / "figures").make_folder()
         drawn = draw(store, comparison, sweep.views, folder / "figures", pictures)
         _write_files(folder, sweep, tables, drawn, totals(store, comparison.cells))
     except OSError as error:
-        raise ReportError(f"the report can't be written to {folder}: {error}") from error
+        raise ReportError(
+            f"the report can't be written to {folder}: {error.filename}: {error.strerror};"
+            " name another folder with out=..."
+        ) from error
     written = {p.file for p in drawn if p.file} | {folder / name for name in _FILES}
     text = _text(tables, _warnings(sweep)) + f"\nWritten to {folder}"
-    return Report(text=text, folder=folder, files=tuple(sorted(written)))
+    return Report(text=text, folder=folder.path, files=tuple(sorted(file.path for file in written)))
 
 
 #: The files of every report, beside its pictures.
@@ -108,7 +110,7 @@ _FILES = (
 
 
 def _write_files(
-    folder: Path,
+    folder: ConfinedPath,
     sweep: Sweep,
     tables: Tables,
     pictures: list[Picture],
@@ -164,7 +166,7 @@ def _markdown_page(
     sweep: Sweep,
     tables: Tables,
     pictures: list[Picture],
-    folder: Path,
+    folder: ConfinedPath,
     training: pd.DataFrame,
 ) -> str:
     command = one_line(shlex.join(["xrgs-sweep", *sweep.command]))
@@ -179,11 +181,11 @@ def _markdown_page(
     return "\n".join(parts)
 
 
-def _picture_link(picture: Picture, folder: Path) -> str:
+def _picture_link(picture: Picture, folder: ConfinedPath) -> str:
     title = markdown(picture.title)
     if picture.file is None:
         return f"No picture of {title}: {markdown(picture.why)}\n"
-    return f"![{title}]({picture.file.relative_to(folder).as_posix()})\n\n{title}\n"
+    return f"![{title}]({picture.file.relative_to(folder)})\n\n{title}\n"
 
 
 def _provenance_table(sweep: Sweep) -> TextTable:

@@ -13,6 +13,7 @@ import pandas as pd
 
 from xrgs.capture import images
 from xrgs.capture.images import ImageError
+from xrgs.errors import StoreError
 from xrgs.experiment.store import BASELINE
 from xrgs.report.collect import ReportError
 from xrgs.report.figures import Panel, curves, differing_crop, side_by_side, trade_off
@@ -22,7 +23,6 @@ from xrgs.safeio.atomic import atomic_writer
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
-    from pathlib import Path
 
     import numpy as np
     from numpy.typing import NDArray
@@ -30,8 +30,9 @@ if TYPE_CHECKING:
     from xrgs.evaluation.metrics import Metric
     from xrgs.experiment.store import Store
     from xrgs.report.compare import Comparison
+    from xrgs.safeio.confined import ConfinedPath
 
-    _Drawing = Callable[[Path], "Picture"]  # draws into the file
+    _Drawing = Callable[[ConfinedPath], "Picture"]  # draws into the file
 
 _CURVES = {"gaussians": "Gaussians", "loss": "loss of the step's view, as each run weighs it"}
 #: Largest image that is drawn; three are in memory at a time.
@@ -43,7 +44,7 @@ class Picture:
     """The file of a figure, or the reason why there is none."""
 
     title: str
-    file: Path | None
+    file: ConfinedPath | None
     why: str = ""
 
 
@@ -51,7 +52,7 @@ def draw(
     store: Store,
     comparison: Comparison,
     views: pd.DataFrame,
-    folder: Path,
+    folder: ConfinedPath,
     names: Sequence[str] | None = None,
 ) -> list[Picture]:
     """Draw what each ablation trades, and views and training curves of each scene and ablation.
@@ -119,7 +120,11 @@ def _trade_offs(comparison: Comparison) -> dict[str, _Drawing]:
 
 
 def _trade_off(
-    title: str, means: pd.DataFrame, scenes: pd.DataFrame, axes: Sequence[Metric], file: Path
+    title: str,
+    means: pd.DataFrame,
+    scenes: pd.DataFrame,
+    axes: Sequence[Metric],
+    file: ConfinedPath,
 ) -> Picture:
     with atomic_writer(file) as stream:
         stream.write(trade_off(title, means, scenes, axes))
@@ -161,16 +166,16 @@ def _views(
     store: Store,
     pair: pd.Series,
     psnr: tuple[pd.Series, pd.Series],
-    photographs: Path,
-    file: Path,
+    photographs: ConfinedPath,
+    file: ConfinedPath,
 ) -> Picture:
     view = median_view(*psnr)
     title = f"{_title(pair)}: view {view}, by change of PSNR the median of {len(psnr[0])}"
     name = f"{view}.png"
     try:
-        truth = _image(store, photographs / name)
-        baseline = _image(store, store.cell(pair["baseline_id"]).path / "renders" / name)
-        ablation = _image(store, store.cell(pair["cell_id"]).path / "renders" / name)
+        truth = _image(photographs / name)
+        baseline = _image(store.cell(pair["baseline_id"]).folder / "renders" / name)
+        ablation = _image(store.cell(pair["cell_id"]).folder / "renders" / name)
     except ReportError as error:
         return Picture(title, None, str(error))
     panels = (
@@ -186,14 +191,14 @@ def _views(
     return Picture(title, file)
 
 
-def _training(store: Store, pair: pd.Series, file: Path) -> Picture:
+def _training(store: Store, pair: pd.Series, file: ConfinedPath) -> Picture:
     title = f"{_title(pair)}: training"
     runs = []
     for name, key in ((BASELINE, "baseline_id"), (str(pair["label"]), "cell_id")):
         try:
             history = store.cell(pair[key]).history()[["step", *_CURVES]]
             runs.append((name, history.apply(pd.to_numeric)))
-        except (OSError, ValueError, TypeError, KeyError):
+        except (StoreError, ValueError, TypeError, KeyError):
             return Picture(title, None, f"cells/{pair[key]}/history.csv can't be read")
     with atomic_writer(file) as stream:
         stream.write(curves(title, runs, _CURVES))
@@ -205,18 +210,14 @@ def _title(pair: pd.Series) -> str:
     return ", ".join(str(part) for part in parts if part)
 
 
-def _image(store: Store, path: Path) -> NDArray[np.float32]:
-    inside = path.relative_to(store.path)
-    allowed = (store.path / inside.parts[0]).resolve()
+def _image(file: ConfinedPath) -> NDArray[np.float32]:
     try:
-        if not path.resolve().is_relative_to(allowed):
-            raise ImageError("a link leads out of the store")
-        if math.prod(images.size(path)) > _MAX_PIXELS:
+        if math.prod(images.size(file)) > _MAX_PIXELS:
             raise ImageError("too large to be drawn")
-        return images.read(path)
+        return images.read(file)
     except (OSError, ImageError) as error:
         # The path inside the store: the report is the same wherever the store is.
-        raise ReportError(f"{inside.as_posix()} can't be read") from error
+        raise ReportError(f"{'/'.join(file.parts)} can't be read") from error
 
 
 def slug(text: str) -> str:

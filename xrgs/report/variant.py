@@ -9,6 +9,8 @@ from xrgs.capture import variant
 from xrgs.capture.contact_sheet import contact_sheet
 from xrgs.errors import XrgsError
 from xrgs.report.render import TextTable, to_text
+from xrgs.safeio.atomic import atomic_writer
+from xrgs.safeio.confined import confined
 from xrgs.safeio.records import read_json
 from xrgs.safeio.untrusted import printable
 
@@ -16,15 +18,16 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Mapping
 
     from xrgs.capture.views import Variant
+    from xrgs.safeio.confined import ConfinedPath
 
 _REGISTERED, _NOT_REGISTERED = "yes", "no"
 
 
-def describe(folder: Path, out: Path | None = None) -> str:
+def describe(path: Path | ConfinedPath, out: Path | None = None) -> str:
     """Describe a frozen variant and draw its contact sheet; for a failed one, say why it failed.
 
     Args:
-        folder: The variant's folder in a store, or the `failed-...` folder of one that failed.
+        path: The variant's folder in a store, or the `failed-...` folder of one that failed.
         out: The PNG of the contact sheet; None writes `<variant id>.png` to the current folder.
 
     Returns:
@@ -33,6 +36,7 @@ def describe(folder: Path, out: Path | None = None) -> str:
     Raises:
         XrgsError: The folder is not a variant or has changed, or the sheet can't be written.
     """
+    folder = confined(path)
     if not folder.is_dir():
         raise XrgsError(f"{folder}: no such folder; variants are in <store>/variants/")
     if folder.name.startswith("failed-"):
@@ -43,14 +47,15 @@ def describe(folder: Path, out: Path | None = None) -> str:
     frozen = variant.load(folder)
     file = out or Path(f"{frozen.id}.png")
     try:
-        contact_sheet(frozen).save(file, "PNG")
+        with atomic_writer(file) as stream:
+            contact_sheet(frozen).save(stream, "PNG")
     except OSError as error:
         raise XrgsError(f"out={file}: can't be written ({error})") from error
     text = _lines(folder, frozen.report, lambda: to_text(views_table(frozen)))
     return f"{text}\nContact sheet: {file}"
 
 
-def _lines(folder: Path, report: Mapping[str, Any], first: Callable[[], str]) -> str:
+def _lines(folder: ConfinedPath, report: Mapping[str, Any], first: Callable[[], str]) -> str:
     """Return the first part and how SfM went.
 
     Raises:

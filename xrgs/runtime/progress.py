@@ -19,10 +19,10 @@ from tqdm import tqdm
 
 from xrgs.safeio import untrusted
 from xrgs.safeio.atomic import write_json
+from xrgs.safeio.confined import ConfinedPath
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator
-    from pathlib import Path
 
     _Tqdm = tqdm[Any]
 else:
@@ -37,7 +37,7 @@ _BAR_DELAY_S = 2.0
 #: The largest progress file that is read, in bytes.
 _MAX_BYTES = 1 << 12
 
-_file: ContextVar[Path | None] = ContextVar("file", default=None)
+_file: ContextVar[ConfinedPath | None] = ContextVar("file", default=None)
 
 
 @dataclass(frozen=True)
@@ -165,14 +165,14 @@ def progress(
     return iter(ProgressBar(what, unit, total, items=items, done=done))
 
 
-def _write(file: Path, now: Progress) -> None:
+def _write(file: ConfinedPath, now: Progress) -> None:
     # Progress is no result: it does no harm that it can't be written, or is lost with the power.
     with suppress(OSError):
         write_json(file, asdict(now), durable=False)
 
 
 @contextmanager
-def written_to(file: Path) -> Iterator[None]:
+def written_to(file: ConfinedPath) -> Iterator[None]:
     """Keep the progress of all bars made within a block in a file, and show none of them.
 
     Args:
@@ -190,7 +190,7 @@ def written_to(file: Path) -> Iterator[None]:
             file.unlink(missing_ok=True)
 
 
-def read(file: Path) -> Progress | None:
+def read(file: ConfinedPath) -> Progress | None:
     """Read the progress that another process keeps in a file.
 
     Args:
@@ -200,7 +200,7 @@ def read(file: Path) -> Progress | None:
         The progress; None where there is no such file or its content is not valid.
     """
     try:
-        content = untrusted.parse_json(untrusted.read_bytes(file, _MAX_BYTES))
+        content = untrusted.parse_json(file.read_bytes(_MAX_BYTES))
         total, rate = content["total"], content["rate"]
         return Progress(
             str(content["what"]),

@@ -315,6 +315,13 @@ class ConfinedPath:
             last = depth == len(self.parts)
             ConfinedPath(self.root, self.parts[:depth])._make_one(exclusive=exclusive and last)
 
+    def make_parent(self) -> None:
+        """Make the folder that this is in; for a root, with those above it, as a user asked."""
+        if self.parts:
+            self.parent.make_folder()
+        else:
+            self.root.parent.mkdir(parents=True, exist_ok=True)
+
     def _make_one(self, *, exclusive: bool) -> None:
         with self._located() as (folder, name):
             try:

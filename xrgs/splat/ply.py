@@ -16,6 +16,8 @@ import torch
 from numpy.typing import NDArray
 
 from xrgs.errors import XrgsError
+from xrgs.safeio.atomic import atomic_writer
+from xrgs.safeio.confined import ConfinedPath, confined
 from xrgs.splat.gaussians import Gaussians
 from xrgs.splat.sh import MAX_DEGREE, bases
 
@@ -26,8 +28,8 @@ _MAGIC = b"ply\n"
 _FORMAT = "format binary_little_endian 1.0"
 
 
-def save_ply(path: str | Path, gaussians: Gaussians) -> None:
-    """Write Gaussians to a .ply file, replacing it.
+def save_ply(path: str | Path | ConfinedPath, gaussians: Gaussians) -> None:
+    """Write Gaussians to a .ply file, which is replaced atomically.
 
     Args:
         path: The file to write.
@@ -37,7 +39,7 @@ def save_ply(path: str | Path, gaussians: Gaussians) -> None:
     Raises:
         OSError: The file can't be written.
     """
-    path = Path(path)
+    path = Path(path) if isinstance(path, str) else path
     count = len(gaussians)
     columns = [
         gaussians.means,
@@ -51,12 +53,12 @@ def save_ply(path: str | Path, gaussians: Gaussians) -> None:
     table = torch.cat([column.detach().float() for column in columns], dim=1)
     names = _properties(gaussians.shN.shape[1])
     header = [_FORMAT, f"element vertex {count}", *(f"property float {n}" for n in names)]
-    with path.open("wb") as file:
+    with atomic_writer(path) as file:
         file.write(_MAGIC + "".join(f"{line}\n" for line in [*header, "end_header"]).encode())
         file.write(table.numpy().astype("<f4").tobytes())
 
 
-def load_ply(path: str | Path) -> Gaussians:
+def load_ply(path: str | Path | ConfinedPath) -> Gaussians:
     """Read Gaussians that `save_ply`, or any 3D Gaussian Splatting trainer, wrote.
 
     Args:
@@ -68,11 +70,9 @@ def load_ply(path: str | Path) -> Gaussians:
     Raises:
         XrgsError: the file is missing, truncated or not such a .ply; the message names it.
     """
-    path = Path(path)
-    if not path.is_file():  # a named pipe would be waited for
-        raise XrgsError(f"{path}: cannot be read: there is no such file")
+    path = Path(path) if isinstance(path, str) else path
     try:
-        with path.open("rb") as file:
+        with confined(path).open() as file:
             count, names = _read_header(file, path)
             body_bytes = os.fstat(file.fileno()).st_size - file.tell()
             if body_bytes != count * len(names) * 4:  # before reading: the file may be huge
@@ -104,7 +104,7 @@ def _properties(rest: int) -> list[str]:
     ]
 
 
-def _read_header(file: BinaryIO, path: Path) -> tuple[int, list[str]]:
+def _read_header(file: BinaryIO, path: Path | ConfinedPath) -> tuple[int, list[str]]:
     """Return the number of vertices and their columns; leave `file` at the first vertex."""
     if file.readline(len(_MAGIC)) != _MAGIC:
         raise XrgsError(f"{path}: is not a .ply file")
@@ -137,7 +137,9 @@ def _is_count(digits: str) -> bool:
     return digits.isascii() and digits.isdigit() and len(digits) <= 12
 
 
-def _gaussians(table: NDArray[np.float32], names: list[str], path: Path) -> Gaussians:
+def _gaussians(
+    table: NDArray[np.float32], names: list[str], path: Path | ConfinedPath
+) -> Gaussians:
     """Return the parameters in a table [N, columns] of named columns."""
     stored = sum(name.startswith("f_rest_") for name in names)
     if stored not in {3 * (bases(degree) - 1) for degree in range(MAX_DEGREE + 1)}:

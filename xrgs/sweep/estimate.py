@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import heapq
-import os
 from collections import defaultdict
 from statistics import fmean
 from typing import TYPE_CHECKING, Any
@@ -109,10 +108,7 @@ def _groups(identity: Mapping[str, Any]) -> Iterator[str]:
 
 def _newest(store: Store) -> list[CellFolder]:
     try:
-        with os.scandir(store.cells_folder) as entries:
-            # Names with a dot are of folders that were set aside, and of reruns.
-            cells = [entry for entry in entries if "." not in entry.name]
-            ids = [(entry.stat().st_mtime, entry.name) for entry in cells]
+        cells = [(cell.folder.lstat().st_mtime, cell.id) for cell in store.cell_folders()]
     except OSError:
         return []
-    return [store.cell(name) for _, name in heapq.nlargest(_MAX_CELLS, ids)]
+    return [store.cell(cell_id) for _, cell_id in heapq.nlargest(_MAX_CELLS, cells)]

@@ -25,6 +25,7 @@ from pathlib import Path
 
 from xrgs.safeio import untrusted
 from xrgs.safeio.atomic import write_json
+from xrgs.safeio.confined import ConfinedPath, confined
 
 #: Seconds between two heartbeats, and seconds without one after which an owner on another machine
 #: is taken for dead.
@@ -34,6 +35,7 @@ SILENT_S = 600.0
 #: at once and looks for other owners only then: if it was killed or suspended in between, it does
 #: not hold the lock yet.
 _UNSIGNED_S = 30.0
+_MAX_BYTES = 4096  # of a lock's file
 
 
 @dataclass(frozen=True)
@@ -75,7 +77,7 @@ class Owner:
 class Lock:
     """A lock that this process holds until `release`."""
 
-    path: Path
+    path: ConfinedPath
     """The lock's file."""
     beaten: float
     """When the last heartbeat was given, seconds of the monotonic clock."""
@@ -101,7 +103,7 @@ class Lock:
         if signature(self.path) not in {None, self.owner}:
             return False
         try:
-            os.utime(self.path)
+            self.path.touch()
             if not known:
                 owner = replace(self.owner, worker=worker, worker_started=_start(worker) or 0)
                 write_json(self.path, asdict(owner))
@@ -120,7 +122,7 @@ class Lock:
                 self.path.unlink()
 
 
-def acquire(folder: Path, name: str) -> Lock | None:
+def acquire(folder: ConfinedPath, name: str) -> Lock | None:
     """Take a lock, unless a living owner holds it.
 
     Args:
@@ -155,7 +157,7 @@ def acquire(folder: Path, name: str) -> Lock | None:
         return Lock(file, time.monotonic(), owner)
 
 
-def names(folder: Path) -> set[str]:
+def names(folder: ConfinedPath) -> set[str]:
     """Return the names of all locks in a folder, whether their owners are alive or not.
 
     Args:
@@ -164,7 +166,7 @@ def names(folder: Path) -> set[str]:
     return {file.stem for file in folder.iterdir() if file.suffix[1:].isdecimal()}
 
 
-def holders(folder: Path) -> dict[str, str]:
+def holders(folder: ConfinedPath) -> dict[str, str]:
     """Return a description of the living owner of each lock in a folder.
 
     Args:
@@ -174,7 +176,7 @@ def holders(folder: Path) -> dict[str, str]:
         Descriptions for people, by the name of the lock.
     """
     try:
-        files = [Path(entry.path) for entry in os.scandir(folder)]
+        files = folder.iterdir()
     except OSError:
         return {}
     return {
@@ -184,11 +186,11 @@ def holders(folder: Path) -> dict[str, str]:
     }
 
 
-def sign(file: Path) -> Owner:
+def sign(path: Path | ConfinedPath) -> Owner:
     """Create a file that names this process as its owner.
 
     Args:
-        file: The file.
+        path: The file.
 
     Returns:
         The signature that was written.
@@ -196,10 +198,10 @@ def sign(file: Path) -> Owner:
     Raises:
         FileExistsError: The file exists.
     """
-    owner = _self()
-    with file.open("x", encoding="utf-8") as stream:
+    owner, file = _self(), confined(path)
+    with file.create() as stream:
         try:
-            stream.write(json.dumps(asdict(owner)))
+            stream.write(json.dumps(asdict(owner)).encode())
             stream.flush()
         except BaseException:
             file.unlink(missing_ok=True)
@@ -207,14 +209,14 @@ def sign(file: Path) -> Owner:
     return owner
 
 
-def signature(file: Path) -> Owner | None:
+def signature(path: Path | ConfinedPath) -> Owner | None:
     """Return the owner that a file names; None if it does not name one.
 
     Args:
-        file: A file that `sign` has created.
+        path: A file that `sign` has created.
     """
     try:
-        owner = Owner(**untrusted.parse_json(untrusted.read_bytes(file)))
+        owner = Owner(**untrusted.parse_json(confined(path).read_bytes(_MAX_BYTES)))
     except (OSError, ValueError, TypeError):
         return None
     texts = {"host", "boot"}
@@ -222,34 +224,34 @@ def signature(file: Path) -> Owner | None:
     return owner if valid else None
 
 
-def _parts(file: Path) -> tuple[str, int]:
+def _parts(file: ConfinedPath) -> tuple[str, int]:
     """Return the name and the generation of a lock's file."""
     return file.stem, int(file.suffix[1:])
 
 
-def _generations(folder: Path, name: str) -> dict[int, Path]:
+def _generations(folder: ConfinedPath, name: str) -> dict[int, ConfinedPath]:
     files = (file for file in folder.iterdir() if file.stem == name)
     return {_parts(file)[1]: file for file in files if file.suffix[1:].isdecimal()}
 
 
-def _living(file: Path) -> bool | None:
+def _living(file: ConfinedPath) -> bool | None:
     """Return whether a lock's owner is alive; None if the lock was released meanwhile."""
     owner = signature(file)
     if owner is not None and owner.here:
         return owner.lives or (False if signature(file) == owner else None)
     silent = _UNSIGNED_S if owner is None else SILENT_S
     try:
-        return _now(file.parent) - file.stat().st_mtime < silent
+        return _now(file.parent) - file.lstat().st_mtime < silent
     except OSError:
         return None
 
 
-def _now(folder: Path) -> float:
+def _now(folder: ConfinedPath) -> float:
     """Return the file server's time; this machine's if the folder can't be written."""
     probe = folder / f".now-{os.getpid()}-{secrets.token_hex(4)}"
     try:
-        probe.touch()
-        now = probe.stat().st_mtime
+        probe.create().close()
+        now = probe.lstat().st_mtime
         probe.unlink()
     except OSError:
         return time.time()

@@ -7,7 +7,6 @@ cell that has ended has a status file, and a cell in training has a progress fil
 from __future__ import annotations
 
 import math
-import os
 import sys
 import threading
 import time
@@ -24,9 +23,9 @@ from xrgs.runtime.progress import format_duration, log_line
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
-    from pathlib import Path
 
     from xrgs.runtime.progress import Progress
+    from xrgs.safeio.confined import ConfinedPath
     from xrgs.sweep.plan import PlannedCell
 
 #: Seconds between two snapshots, at least; and the pause in multiples of the time that a snapshot
@@ -137,7 +136,7 @@ class SweepSnapshot:
 class SweepMonitor:
     """Shows a sweep while a `with` block runs: a bar on a terminal, occasional lines in a log."""
 
-    def __init__(self, cells: Path) -> None:
+    def __init__(self, cells: ConfinedPath) -> None:
         """Prepare to show; nothing is shown before `watch` is called.
 
         Args:
@@ -200,8 +199,7 @@ class SweepMonitor:
     def snapshot(self) -> SweepSnapshot:
         """Return the states of the cells now."""
         try:
-            with os.scandir(self._cells) as entries:
-                begun = {entry.name for entry in entries}
+            begun = set(self._cells.names())
         except OSError:
             begun = set()
         return self._take_snapshot(begun)
@@ -284,10 +282,10 @@ class SweepMonitor:
         self._bar.set_description_str(str(snapshot))
 
 
-def _stamp(file: os.PathLike[str]) -> _FileStamp:
+def _stamp(file: ConfinedPath) -> _FileStamp:
     """Return what changes when a file is written again; None if there is no file."""
     try:
-        status = os.stat(file)  # noqa: PTH116  faster than Path.stat, for thousands of files
+        status = file.lstat()
     except OSError:
         return None
     return status.st_ino, status.st_mtime_ns

@@ -22,6 +22,7 @@ from xrgs.experiment.identity import cell_identity
 from xrgs.experiment.store import Store
 from xrgs.runtime.machine import usable_cores
 from xrgs.runtime.progress import log_line
+from xrgs.safeio.confined import ConfinedPath
 from xrgs.safeio.hashing import digest, file_digest
 from xrgs.safeio.untrusted import printable
 from xrgs.splat.backend import resolve_backend
@@ -119,22 +120,22 @@ def rerun(
 
 def _read(original: CellFolder) -> tuple[Conf, dict[str, Any]]:
     """Return the cell's config, with the threads that it was trained with, and its identity."""
-    if not original.path.is_dir():
+    if not original.folder.is_dir():
         raise XrgsError(f"rerun={original.path}: there is no such folder")
     for name in ("config.json", "identity.json", "provenance.json", "status.json"):
-        if not (original.path / name).is_file():
+        if not (original.folder / name).is_file():
             raise XrgsError(f"rerun={original.path} is not a finished cell: it has no {name}")
     state = original.state()
     if state.name == "failed":
         reason = state.reason.partition("\n")[0]
         raise XrgsError(f"rerun={original.path}: the cell failed and has no results ({reason})")
-    conf = config.from_file(original.path / "config.json")
+    conf = config.from_file(original.folder / "config.json")
     try:
         identity, conf.threads = original.identity(), int(original.provenance()["threads"])
     except (KeyError, TypeError, ValueError) as error:
         raise XrgsError(f"{original.path}: identity.json or provenance.json: {error!r}") from error
     if not _VARIANT.fullmatch(str(identity.get("variant"))):
-        raise XrgsError(f"{original.path / 'identity.json'}: variant={identity.get('variant')}")
+        raise XrgsError(f"{original.folder / 'identity.json'}: variant={identity.get('variant')}")
     return conf, identity
 
 
@@ -251,7 +252,11 @@ def _free_sibling(folder: Path) -> Path:
 
 
 def _train_again(
-    conf: Conf, variant: Path, repeated: CellFolder, identity: dict[str, Any], original: CellFolder
+    conf: Conf,
+    variant: ConfinedPath,
+    repeated: CellFolder,
+    identity: dict[str, Any],
+    original: CellFolder,
 ) -> None:
     """Train like a sweep's cell, but without a lock: no other process writes to the folder."""
     repeated.begin(asdict(conf), identity)
@@ -264,13 +269,13 @@ def _train_again(
         seconds=_seconds(original),
     )
     try:
-        with SweepMonitor(repeated.path.parent) as monitor:
+        with SweepMonitor(ConfinedPath(repeated.path.parent)) as monitor:
             monitor.watch([cell])
             request = {"conf": asdict(conf), "variant": str(variant), "cell": str(repeated.path)}
             worker.run_in_child("cell", request)
     except XrgsError as error:
         repeated.fail(str(error))
-        raise XrgsError(f"{error} ({repeated.path / 'log.txt'})") from error
+        raise XrgsError(f"{error} ({repeated.folder / 'log.txt'})") from error
 
 
 def _seconds(original: CellFolder) -> float | None:
@@ -296,7 +301,7 @@ def _differences(original: CellFolder, repeated: CellFolder) -> Iterator[str]:
         if then != now:
             yield f"{name}: {_number(then)} -> {_number(now)}"
     for name in _RESULTS:
-        then, now = original.path / name, repeated.path / name
+        then, now = original.folder / name, repeated.folder / name
         if not then.is_file():
             yield f"{name}: missing in {original.path}"
         elif file_digest(then) != file_digest(now):

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections import Counter
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
@@ -23,6 +22,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from xrgs.experiment.cell_folder import CellFolder
+    from xrgs.safeio.confined import ConfinedPath
 
 _STATES = ("done", "running", "unfinished", "failed", "corrupt")
 #: Cells of each state are listed by name up to this number.
@@ -74,44 +74,38 @@ def read(path: Path, *, verify: bool = False) -> StoreStatus:
         StoreError: There is no such store.
     """
     store = Store(path)
-    if not store.cells_folder.is_dir():
+    if not store.exists:
         raise StoreError(f"store={path} is not a store; xrgs-sweep makes one")
     names, sweeps = _names(store)
     holders = locks.holders(store.locks)
-    ids = sorted(entry.name for entry in os.scandir(store.cells_folder) if entry.is_dir())
-    cells = [name for name in ids if "." not in name]
+    cells = store.cell_folders()
     return StoreStatus(
         path,
-        tuple(
-            _summarise(store.cell(cell), names.get(cell), holders, verify=verify) for cell in cells
-        ),
-        len(ids) - len(cells),
+        tuple(_summarise(cell, names.get(cell.id), holders, verify=verify) for cell in cells),
+        len(store.cells_folder.folders()) - len(cells),
         tuple(sorted(_variants(store))),
         tuple((key, *why) for key, why in failed_scenes(store.variants).items()),
         sweeps,
-        {folder.name: _bytes(folder.path) for folder in os.scandir(path) if folder.is_dir()},
+        {name: _bytes(store.folder / name) for name in store.folder.folders()},
     )
 
 
 def _variants(store: Store) -> Iterator[str]:
     """Yield the frozen variants: not those being built, and not the reports of failed ones."""
-    for folder in store.variants.glob("[!.]*-*"):
-        if not folder.name.startswith(FAILED_PREFIX):
-            yield folder.name
+    for name in store.variants.folders():
+        if "-" in name and not name.startswith((".", FAILED_PREFIX)):
+            yield name
 
 
 def _names(store: Store) -> tuple[dict[str, tuple[str, str]], int]:
     """Return scene and label of every recorded cell, and the number of recorded sweeps."""
     names: dict[str, tuple[str, str]] = {}
-    files = sorted((store.path / "sweeps").glob("*.json"), key=lambda file: file.stat().st_mtime_ns)
-    for file in files:
-        try:
-            for row in store.sweep_record(file.stem)["cells"]:
-                label = " ".join(part for part in (row["label"], row["condition"]) if part)
-                names[row["cell_id"]] = (row["scene"], label)
-        except (StoreError, KeyError):
-            continue
-    return names, len(files)
+    records, damaged = store.records()
+    for record in records.values():
+        for row in record["cells"]:
+            label = " ".join(row[key] for key in ("label", "condition") if row.get(key))
+            names[row.get("cell_id")] = (row.get("scene", "?"), label)
+    return names, len(records) + len(damaged)
 
 
 def _summarise(
@@ -131,7 +125,7 @@ def _summarise(
 def _scene(cell: CellFolder) -> str:
     """Return the scene of a cell that no sweep has recorded yet."""
     try:
-        scene = read_json(cell.path / "config.json")["scene"]
+        scene = read_json(cell.folder / "config.json")["scene"]
         return str(scene["name"] or scene["path"] or scene["kind"])
     except (StoreError, KeyError, TypeError):
         return "?"
@@ -166,26 +160,8 @@ def _other_arithmetic(backend: str, trained: object) -> list[str]:
     return [] if trained == here else [printable(f"arithmetic ({trained}, here {here})")]
 
 
-def _bytes(folder: str) -> int:
-    total = 0
-    for entry in _walk(folder):
-        try:
-            total += entry.stat(follow_symlinks=False).st_size
-        except OSError:  # removed since it was listed
-            continue
-    return total
-
-
-def _walk(folder: str) -> Iterator[os.DirEntry[str]]:
-    try:
-        entries = list(os.scandir(folder))
-    except OSError:
-        return
-    for entry in entries:
-        if entry.is_dir(follow_symlinks=False):
-            yield from _walk(entry.path)
-        else:
-            yield entry
+def _bytes(folder: ConfinedPath) -> int:
+    return sum(status.st_size for _, status in folder.walk())
 
 
 def describe(status: StoreStatus) -> str:

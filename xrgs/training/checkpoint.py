@@ -20,6 +20,7 @@ import torch
 from xrgs.errors import XrgsError
 from xrgs.safeio import npz, untrusted
 from xrgs.safeio.atomic import atomic_writer
+from xrgs.safeio.confined import ConfinedPath, confined
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -62,7 +63,9 @@ class Stateful(Protocol):
 class Checkpoint:
     """Writes the state of the registered objects to a file every so often, and restores it."""
 
-    def __init__(self, file: Path | None = None, cell_id: str = "", every_s: float = 0.0) -> None:
+    def __init__(
+        self, file: Path | ConfinedPath | None = None, cell_id: str = "", every_s: float = 0.0
+    ) -> None:
         """Set where and how often the state is written.
 
         Args:
@@ -70,7 +73,7 @@ class Checkpoint:
             cell_id: The cell whose state it is. The file of another cell is refused.
             every_s: Seconds between two writes; 0 never writes.
         """
-        self.file = file
+        self.file = None if file is None else confined(file)
         self.cell_id = cell_id
         self.every_s = every_s
         self._objects: dict[str, Stateful] = {}
@@ -155,10 +158,10 @@ class Checkpoint:
         """Rename the file to `refused-<name>` and forget its states: training starts over."""
         self._loaded, self._objects = {}, {}
         if self.file is not None and self.file.exists():
-            self.file.replace(self.file.with_name(f"refused-{self.file.name}"))
+            self.file.rename(self.file.with_name(f"refused-{self.file.name}"))
 
 
-def _save(file: Path, state: State) -> None:
+def _save(file: ConfinedPath, state: State) -> None:
     arrays: dict[str, NDArray[Any]] = {}
     text = json.dumps(_split_off_tensors(state, "", arrays))
     arrays[_JSON_MEMBER] = np.frombuffer(text.encode(), np.uint8)
@@ -181,8 +184,8 @@ def _split_off_tensors(state: State, path: str, arrays: dict[str, NDArray[Any]])
     return plain
 
 
-def _load(file: Path) -> State:
-    with untrusted.open_regular(file) as stream:
+def _load(file: ConfinedPath) -> State:
+    with file.open() as stream:
         arrays = npz.read(stream)
     state: State = untrusted.parse_json(arrays.pop(_JSON_MEMBER).tobytes())
     _put_back_tensors(state, arrays)

@@ -6,14 +6,14 @@ Nothing here imports torch before an embedded scene is rendered.
 from __future__ import annotations
 
 import hashlib
-import shutil
-import tempfile
-from pathlib import Path
+import secrets
+from contextlib import suppress
 from typing import TYPE_CHECKING
 
 from xrgs.capture.scenes import folder, motorcycle, procedural
 from xrgs.capture.scenes.scene import Scene
 from xrgs.errors import XrgsError
+from xrgs.safeio.confined import ConfinedPath
 from xrgs.safeio.paths import user_path
 
 if TYPE_CHECKING:
@@ -63,7 +63,7 @@ def fingerprint(conf: SceneConf, long_side: int = 0) -> str:
     return hashlib.sha256(f"{conf.kind}\0{content}".encode()).hexdigest()[:16]
 
 
-def resolve(conf: SceneConf, cache: Path, long_side: int = 0) -> Scene:
+def resolve(conf: SceneConf, cache: ConfinedPath, long_side: int = 0) -> Scene:
     """Find a scene's photographs on disk; the procedural scene is rendered where it is not.
 
     Args:
@@ -100,17 +100,15 @@ def _check(conf: SceneConf) -> None:
         raise XrgsError(f"scene.views={conf.views}: must be 2 or more")
 
 
-def _render(conf: SceneConf, home: Path, long_side: int) -> None:
+def _render(conf: SceneConf, home: ConfinedPath, long_side: int) -> None:
     """Render into a temporary folder and rename it to `home`, unless another process has one."""
-    home.parent.mkdir(parents=True, exist_ok=True)
-    with tempfile.TemporaryDirectory(dir=home.parent, prefix=".rendering-") as temporary:
-        from xrgs.capture.scenes import still_life
+    from xrgs.capture.scenes import still_life
 
-        rendered = Path(temporary) / "images"
+    rendered = home.with_name(f".rendering-{secrets.token_hex(4)}")
+    rendered.make_folder()
+    try:
         still_life.render(rendered, long_side, conf.views)
-        try:
+        with suppress(FileExistsError):  # another process was faster
             rendered.rename(home)
-        except OSError:
-            if not home.is_dir():
-                raise
-            shutil.rmtree(rendered)
+    finally:
+        rendered.remove()

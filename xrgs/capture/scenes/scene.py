@@ -9,6 +9,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from xrgs.safeio.confined import ConfinedPath
+
 
 @dataclass(frozen=True)
 class Scene:
@@ -21,7 +23,7 @@ class Scene:
     """The name of the scene in tables."""
     fingerprint: str
     """A hash of the photographs' names and bytes, or of what they are rendered from."""
-    files: tuple[Path, ...]
+    files: tuple[Path | ConfinedPath, ...]
     """The photographs, sorted by name."""
     intrinsics: Mapping[str, NDArray[np.float64]] = field(default_factory=dict)
     """Exact intrinsics [3, 3] in px of the file, without distortion; SfM gets them, and does not

@@ -17,6 +17,7 @@ from xrgs.sweep.jobs.supervise import Limits
 
 if TYPE_CHECKING:
     from xrgs.experiment.cell_folder import CellFolder
+    from xrgs.safeio.confined import ConfinedPath
     from xrgs.sweep.session import HandOver, SweepSession
 
 #: Outcomes of a job beside the states of a cell. LOCKED: another sweep is training the cell.
@@ -90,7 +91,11 @@ def _run_under_lock(cell: HandOver, store: Store, session: SweepSession) -> str:
 
 
 def _train_in_child(
-    cell: HandOver, variant: Path, folder: CellFolder, lock: locks.Lock, session: SweepSession
+    cell: HandOver,
+    variant: ConfinedPath,
+    folder: CellFolder,
+    lock: locks.Lock,
+    session: SweepSession,
 ) -> str:
     """Train the cell in a child process; return the job's outcome."""
 

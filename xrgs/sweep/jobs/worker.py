@@ -122,7 +122,7 @@ def _run_cell(request: Mapping[str, Any]) -> dict[str, Any]:
     from xrgs.experiment.cell_folder import CellFolder
 
     folder = CellFolder(Path(request["cell"]))
-    with (folder.path / "log.txt").open("a", encoding="utf-8") as log:
+    with (folder.folder / "log.txt").append() as log:
         # Everything that the cell, its libraries and its children print goes to the log. Progress
         # goes to a file instead: on a terminal the bars of several cells would mix.
         for descriptor in (1, 2):
