@@ -15,6 +15,7 @@ from xrgs.safeio.atomic import write_json
 @pytest.fixture
 def done(tmp_path: Path) -> CellFolder:
     """The folder of a finished cell with two test views."""
+    (tmp_path / "cells").mkdir()
     folder = CellFolder(tmp_path / "cells" / "abc")
     folder.begin({"seed": 0}, {"seed": 0})
     (folder.path / "scores.csv").write_text("view,psnr,ssim,lpips\na,20.5,0.75,\nb,30.0,0.5,\n")
@@ -111,10 +112,10 @@ def test_beginning_another_cell_sets_the_old_folder_aside(done: CellFolder) -> N
 def stopped(done: CellFolder) -> CellFolder:
     """A folder of a try that was stopped after a checkpoint, with all that may lie about."""
     (done.path / "status.json").unlink()
-    done.checkpoint.write_bytes(b"state")
+    done.checkpoint.path.write_bytes(b"state")
     (done.path / "log.txt").write_text("begun\n")
     (done.path / ".checkpoint.npz.1-abcd").write_bytes(b"half")
-    done.progress.write_text("{}")
+    done.progress.path.write_text("{}")
     return done
 
 
@@ -144,6 +145,7 @@ def test_beginning_a_stopped_cell_keeps_its_checkpoint_and_no_result(
 def test_a_cell_killed_before_its_first_checkpoint_leaves_no_folder_aside(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, at: str
 ) -> None:
+    (tmp_path / "cells").mkdir()
     folder = CellFolder(tmp_path / "cells" / "abc")
 
     def killed(file: Path, value: object) -> None:
@@ -168,6 +170,7 @@ def test_a_cell_killed_before_its_first_checkpoint_leaves_no_folder_aside(
 
 
 def test_a_failed_cell_without_checkpoint_is_set_aside_with_its_error(tmp_path: Path) -> None:
+    (tmp_path / "cells").mkdir()
     folder = CellFolder(tmp_path / "cells" / "abc")
     folder.begin({"seed": 0}, {"seed": 0})
     folder.fail("out of luck")
@@ -208,5 +211,5 @@ def test_a_finished_cell_has_no_checkpoint(stopped: CellFolder) -> None:
     stopped.progress.unlink()  # of a process that is no more: no part of the result
     assert stopped.state().name == "done"
     assert not stopped.checkpoint.exists()
-    stopped.checkpoint.write_bytes(b"killed before it was removed")
+    stopped.checkpoint.path.write_bytes(b"killed before it was removed")
     assert stopped.state().name == "done"

@@ -113,7 +113,7 @@ class MadeStore:
         (folder.path / "scores.csv").write_text("\n".join(lines) + "\n")
 
     def _draw(self, folder: CellFolder, variant: str, noise: float) -> None:
-        photographs = self.store.variants / variant / "images" / "test"
+        photographs = self.store.path / "variants" / variant / "images" / "test"
         photographs.mkdir(parents=True, exist_ok=True)
         (folder.path / "renders").mkdir()
         for number, view in enumerate(VIEWS):

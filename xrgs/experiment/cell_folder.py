@@ -8,25 +8,23 @@ from __future__ import annotations
 
 import io
 from dataclasses import dataclass
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from xrgs.errors import StoreError, UnreadableError
 from xrgs.runtime import progress
 from xrgs.safeio import untrusted
 from xrgs.safeio.atomic import write_json, write_text
-from xrgs.safeio.confined import confined
+from xrgs.safeio.confined import ConfinedPath
 from xrgs.safeio.hashing import canonical_json, file_digest
 from xrgs.safeio.records import as_number, read_file, read_json, read_object, read_table
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
-    from pathlib import Path
-
     import pandas as pd
 
     from xrgs.capture.dataset import Dataset
     from xrgs.config import Conf
-    from xrgs.safeio.confined import ConfinedPath
     from xrgs.splat.cameras import Camera
     from xrgs.splat.gaussians import Gaussians
 
@@ -61,7 +59,12 @@ class CellFolder:
     """The folder, named by the cell's id."""
 
     def __init__(self, folder: Path | ConfinedPath) -> None:
-        object.__setattr__(self, "folder", confined(folder))
+        if not isinstance(folder, ConfinedPath):
+            # The cell's folder is below a root, so that `begin` can rename it and make a new one.
+            named = folder.name not in {"", ".."}
+            path = folder if named else folder.resolve()  # resolving would follow a link
+            folder = ConfinedPath(path.parent) / path.name
+        object.__setattr__(self, "folder", folder)
 
     @property
     def path(self) -> Path:
