@@ -19,6 +19,7 @@ from xrgs.safeio import untrusted
 from xrgs.safeio.atomic import write_json
 from xrgs.safeio.hashing import digest
 from xrgs.safeio.records import read_json
+from xrgs.safeio.words import for_line
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping, Sequence
@@ -137,7 +138,7 @@ class Store:
             cell = self.cell(entry.name)
             state = cell.state(verify=verify)
             row = cell_columns(cell.path, names.get(cell.id, {}))
-            row |= {"state": state.name, "reason": untrusted.printable(state.reason)}
+            row |= {"state": state.name, "reason": for_line(state.reason)}
             done = state.name == "done"
             rows.append(row | (cell_metrics(cell.path, cell.scores()) if done else {}))
         return cells_table(rows)
@@ -157,7 +158,7 @@ class Store:
         for file in sorted(files, key=lambda file: (file.stat().st_mtime_ns, file.name)):
             for row in self.sweep_record(file.stem)["cells"]:
                 if row.get("cell_id") is not None:
-                    texts = {key: untrusted.printable(row.get(key, "")) for key in CELL_NAMES}
+                    texts = {key: for_line(row.get(key, "")) for key in CELL_NAMES}
                     names[row["cell_id"]] = texts
         return names
 

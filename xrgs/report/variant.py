@@ -10,7 +10,7 @@ from xrgs.capture.contact_sheet import contact_sheet
 from xrgs.errors import XrgsError
 from xrgs.report.render import TextTable, to_text
 from xrgs.safeio.records import read_json
-from xrgs.safeio.untrusted import printable
+from xrgs.safeio.words import for_line
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Mapping
@@ -38,7 +38,9 @@ def describe(folder: Path, out: Path | None = None) -> str:
     if folder.name.startswith("failed-"):
         report = read_json(folder / "report.json")
         return _lines(
-            folder, report, lambda: f"{report.get('scene')}: failed, so there are no views"
+            folder,
+            report,
+            lambda: for_line(f"{report.get('scene')}: failed, so there are no views"),
         )
     frozen = variant.load(folder)
     file = out or Path(f"{frozen.id}.png")
@@ -47,7 +49,7 @@ def describe(folder: Path, out: Path | None = None) -> str:
     except OSError as error:
         raise XrgsError(f"out={file}: can't be written ({error})") from error
     text = _lines(folder, frozen.report, lambda: to_text(views_table(frozen)))
-    return f"{text}\nContact sheet: {file}"
+    return f"{text}\n{for_line(f'Contact sheet: {file}')}"
 
 
 def _lines(folder: Path, report: Mapping[str, Any], first: Callable[[], str]) -> str:
@@ -57,7 +59,7 @@ def _lines(folder: Path, report: Mapping[str, Any], first: Callable[[], str]) ->
         XrgsError: The report is malformed.
     """
     try:
-        return "\n".join([first(), *map(printable, _sfm(report))])
+        return "\n".join([first(), *map(for_line, _sfm(report))])
     except (AttributeError, KeyError, TypeError, ValueError) as error:
         raise XrgsError(f"{folder / 'report.json'}: not a variant's report ({error!r})") from error
 
