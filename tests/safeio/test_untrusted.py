@@ -89,10 +89,3 @@ def test_json_may_have_50_levels_and_no_more(opening: str, closing: str) -> None
     untrusted.parse_json(fifty.encode())
     with pytest.raises(ValueError, match="nested too deeply"):
         untrusted.parse_json((opening + fifty + closing).encode())
-
-
-def test_text_for_a_terminal_has_no_control_characters() -> None:
-    text = "a\tb\x1b[2J\n  \u202ec "
-    assert untrusted.printable(text) == "a b [2J    c "
-    assert len(untrusted.printable(text)) == len(text)
-    assert untrusted.one_line(text) == "a b [2J c"

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from xrgs.cli.arguments import errors_as_messages, parse
+from xrgs.runtime.streams import say
 
 _HELP = """\
 xrgs-status [KEY=VALUE]...
@@ -33,4 +34,4 @@ def main() -> None:
         conf = parse(StatusConf, _HELP)
         from xrgs.sweep.status import describe, read
 
-        print(describe(read(Path(conf.store), verify=conf.verify)))  # noqa: T201
+        say(describe(read(Path(conf.store), verify=conf.verify)))

@@ -18,6 +18,7 @@ from xrgs.safeio.atomic import write_json, write_text
 from xrgs.safeio.confined import ConfinedPath
 from xrgs.safeio.hashing import canonical_json, file_digest
 from xrgs.safeio.records import as_number, read_file, read_json, read_object, read_table
+from xrgs.safeio.words import for_terminal
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -235,7 +236,7 @@ class CellFolder:
         """
         error = self.folder / "error.txt"
         if not error.exists():
-            write_text(error, f"{reason}\n")
+            write_text(error, for_terminal(f"{reason}\n"))
         self.progress.unlink(missing_ok=True)
         self._set_status({"state": "failed", "reason": reason, "views": [], "files": {}})
 

@@ -13,7 +13,8 @@ from xrgs.errors import StoreError
 from xrgs.evaluation.metrics import METRICS
 from xrgs.safeio.confined import ConfinedPath
 from xrgs.safeio.records import as_number, read_object
-from xrgs.safeio.untrusted import is_name, printable
+from xrgs.safeio.untrusted import is_name
+from xrgs.safeio.words import for_line
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Mapping
@@ -77,11 +78,11 @@ def _object(file: ConfinedPath) -> dict[str, Any]:
 def _flat(values: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
     """Yield nested values under dotted names, as `train.steps`."""
     for name, value in values.items():
-        key = printable(f"{prefix}{name}")
+        key = for_line(f"{prefix}{name}")
         if isinstance(value, dict):
             yield from _flat(value, f"{key}.")
         else:
-            yield key, printable(value) if isinstance(value, str) else value
+            yield key, for_line(value) if isinstance(value, str) else value
 
 
 def cell_metrics(folder: ConfinedPath, scores: pd.DataFrame) -> dict[str, float]:

@@ -20,6 +20,7 @@ from xrgs.safeio.atomic import write_json
 from xrgs.safeio.confined import ConfinedPath, RootMissingError
 from xrgs.safeio.hashing import digest
 from xrgs.safeio.records import read_json
+from xrgs.safeio.words import for_line
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping, Sequence
@@ -154,7 +155,7 @@ class Store:
         for cell in self.cell_folders():
             state = cell.state(verify=verify)
             row = cell_columns(cell.folder, names.get(cell.id, {}))
-            row |= {"state": state.name, "reason": untrusted.printable(state.reason)}
+            row |= {"state": state.name, "reason": for_line(state.reason)}
             done = state.name == "done"
             rows.append(row | (cell_metrics(cell.folder, cell.scores()) if done else {}))
         return cells_table(rows)
@@ -176,7 +177,7 @@ class Store:
         for message in damaged:
             log_line(f"{message}; its names of cells are left out")
         return {
-            row["cell_id"]: {key: untrusted.printable(row.get(key, "")) for key in CELL_NAMES}
+            row["cell_id"]: {key: for_line(row.get(key, "")) for key in CELL_NAMES}
             for record in records.values()
             for row in record["cells"]
             if row.get("cell_id") is not None

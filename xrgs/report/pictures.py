@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import hashlib
 import math
-import re
 from dataclasses import dataclass
 from functools import partial
 from typing import TYPE_CHECKING
@@ -20,6 +18,7 @@ from xrgs.report.figures import Panel, curves, differing_crop, side_by_side, tra
 from xrgs.report.tables import titled
 from xrgs.runtime.progress import progress
 from xrgs.safeio.atomic import atomic_writer
+from xrgs.safeio.words import for_file_name
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
@@ -83,7 +82,7 @@ def draw(
     for _, pair in pairs.iterrows():
         both = psnr[pair["baseline_id"]], psnr[pair["cell_id"]]
         photographs = store.variants / variants[pair["cell_id"]] / "images" / "test"
-        stem = f"{slug(pair['scene'])}--{slug(pair['label'])}"
+        stem = f"{for_file_name(pair['scene'])}--{for_file_name(pair['label'])}"
         drawings[stem] = partial(_views, store, pair, both, photographs)
         drawings[f"{stem}--training"] = partial(_training, store, pair)
     chosen = drawings if names is None else _chosen(drawings, names)
@@ -114,7 +113,7 @@ def _trade_offs(comparison: Comparison) -> dict[str, _Drawing]:
         if len(means) < 2 or not axes:
             continue
         title = titled("What each ablation trades, mean over scenes", condition)
-        name = f"trade-off{condition and f'.{slug(condition)}'}"
+        name = f"trade-off{condition and f'.{for_file_name(condition)}'}"
         drawings[name] = partial(_trade_off, title, means, scenes, axes)
     return drawings
 
@@ -218,18 +217,3 @@ def _image(file: ConfinedPath) -> NDArray[np.float32]:
     except (OSError, ImageError) as error:
         # The path inside the store: the report is the same wherever the store is.
         raise ReportError(f"{'/'.join(file.parts)} can't be read") from error
-
-
-def slug(text: str) -> str:
-    """Return `text` as part of a file name that any system accepts.
-
-    Args:
-        text: The name of a scene, label or condition.
-
-    Returns:
-        At most 67 ASCII characters; different texts give different names.
-    """
-    plain = re.sub(r"[^A-Za-z0-9_.]+", "-", text).strip("-.")[:60]
-    if text and plain == text:
-        return text
-    return f"{plain}-{hashlib.sha256(text.encode()).hexdigest()[:6]}".lstrip("-")

@@ -12,7 +12,7 @@ from xrgs.report.render import TextTable, to_text
 from xrgs.safeio.atomic import atomic_writer
 from xrgs.safeio.confined import confined
 from xrgs.safeio.records import read_json
-from xrgs.safeio.untrusted import printable
+from xrgs.safeio.words import for_line
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Mapping
@@ -42,7 +42,9 @@ def describe(path: Path | ConfinedPath, out: Path | None = None) -> str:
     if folder.name.startswith("failed-"):
         report = read_json(folder / "report.json")
         return _lines(
-            folder, report, lambda: f"{report.get('scene')}: failed, so there are no views"
+            folder,
+            report,
+            lambda: for_line(f"{report.get('scene')}: failed, so there are no views"),
         )
     frozen = variant.load(folder)
     file = out or Path(f"{frozen.id}.png")
@@ -52,7 +54,7 @@ def describe(path: Path | ConfinedPath, out: Path | None = None) -> str:
     except OSError as error:
         raise XrgsError(f"out={file}: can't be written ({error})") from error
     text = _lines(folder, frozen.report, lambda: to_text(views_table(frozen)))
-    return f"{text}\nContact sheet: {file}"
+    return f"{text}\n{for_line(f'Contact sheet: {file}')}"
 
 
 def _lines(folder: ConfinedPath, report: Mapping[str, Any], first: Callable[[], str]) -> str:
@@ -62,7 +64,7 @@ def _lines(folder: ConfinedPath, report: Mapping[str, Any], first: Callable[[], 
         XrgsError: The report is malformed.
     """
     try:
-        return "\n".join([first(), *map(printable, _sfm(report))])
+        return "\n".join([first(), *map(for_line, _sfm(report))])
     except (AttributeError, KeyError, TypeError, ValueError) as error:
         raise XrgsError(f"{folder / 'report.json'}: not a variant's report ({error!r})") from error
 

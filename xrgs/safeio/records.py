@@ -1,4 +1,4 @@
-"""Reads a store's JSON files and CSV tables, whoever wrote them."""
+"""Reads a store's JSON files and CSV tables, whoever wrote them, and writes such tables."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ from xrgs.safeio import untrusted
 from xrgs.safeio.confined import MAX_BYTES, confined, is_passing
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
     from pathlib import Path
 
     from xrgs.safeio.confined import ConfinedPath
@@ -100,6 +101,22 @@ def read_table(path: Path | ConfinedPath) -> tuple[list[str], list[list[str]]]:
             f"{path}: two columns have one name, or a row is not as long as the header"
         )
     return header, rows
+
+
+def table_text(rows: Sequence[Mapping[str, object]]) -> str:
+    """Return a CSV table whose texts are exactly as they are given, so that they can be read back.
+
+    In a table that is made for people, each text must have gone through `words.for_csv`.
+
+    Args:
+        rows: One mapping a row, of values by column. A value that a row lacks is empty.
+    """
+    text = io.StringIO()
+    columns = list(dict.fromkeys(column for row in rows for column in row))
+    writer = csv.DictWriter(text, columns, lineterminator="\n")
+    writer.writeheader()
+    writer.writerows(rows)
+    return text.getvalue()
 
 
 def as_number(value: object) -> float:

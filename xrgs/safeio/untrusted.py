@@ -137,30 +137,6 @@ def is_inside(value: object) -> bool:
     return isinstance(value, str) and all(is_name(part) for part in value.split("/"))
 
 
-def printable(text: str) -> str:
-    """Replace every character that can't be printed by a space, so that terminals obey none.
-
-    Args:
-        text: Any text.
-
-    Returns:
-        A text of the same length.
-    """
-    return "".join(char if char.isprintable() else " " for char in text)
-
-
-def one_line(text: str) -> str:
-    """Make a text one printable line: `printable`, with every run of spaces reduced to one.
-
-    Args:
-        text: Any text.
-
-    Returns:
-        The line, without spaces at its ends.
-    """
-    return " ".join(printable(text).split())
-
-
 def remove(path: Path) -> None:
     """Remove a file, a folder with all that is in it, or a link, but never what a link leads to.
 

@@ -12,7 +12,7 @@ from xrgs.experiment.cell_folder import CellState
 from xrgs.experiment.identity import training_code
 from xrgs.experiment.store import Store
 from xrgs.safeio.records import read_json
-from xrgs.safeio.untrusted import printable
+from xrgs.safeio.words import MAX_CELL, for_line
 from xrgs.splat.backend import arithmetic
 from xrgs.sweep import locks
 from xrgs.training import plugins
@@ -157,7 +157,7 @@ def _other_arithmetic(backend: str, trained: object) -> list[str]:
         here = arithmetic(backend)
     except XrgsError:
         return []
-    return [] if trained == here else [printable(f"arithmetic ({trained}, here {here})")]
+    return [] if trained == here else [f"arithmetic ({trained}, here {here})"]
 
 
 def _bytes(folder: ConfinedPath) -> int:
@@ -185,7 +185,7 @@ def describe(status: StoreStatus) -> str:
     if status.failed_scenes:
         lines += ["", "failed scenes, not tried again; retry=failed tries them again"]
         lines += [
-            printable(f"  {key}  {scene}  {reason.partition(chr(10))[0]}")
+            f"  {key}  {scene}  {reason.partition(chr(10))[0]}"
             for key, scene, reason in status.failed_scenes[:_MAX_NAMED]
         ]
     if stale:
@@ -195,7 +195,7 @@ def describe(status: StoreStatus) -> str:
             f"stale: {len(stale)} done cells were trained with other code or arithmetic than here",
         ]
         lines += [f"  {file}: {count} cells" for file, count in files.most_common(_MAX_NAMED)]
-    return "\n".join(lines)
+    return "\n".join(map(for_line, lines))
 
 
 def _table(cells: Sequence[CellSummary]) -> list[str]:
@@ -208,7 +208,10 @@ def _table(cells: Sequence[CellSummary]) -> list[str]:
     columns = [c for c in (*_STATES, "stale") if any(row[c] for row in counts.values())]
     rows = [("scene", "label", *columns)]
     rows += [
-        (*map(printable, key), *(str(row[column] or "") for column in columns))
+        (
+            *(for_line(name, MAX_CELL) for name in key),
+            *(str(row[column] or "") for column in columns),
+        )
         for key, row in sorted(counts.items())
     ]
     return _aligned(rows) if cells else []
@@ -232,7 +235,7 @@ def _listed(state: str, cells: Sequence[CellSummary]) -> list[str]:
     lines = ["", f"{state}:"]
     for cell in cells[:_MAX_NAMED]:
         reason = cell.state.reason.partition("\n")[0]
-        lines.append(printable(f"  {cell.id}  {cell.scene} / {cell.label}  {reason}"))
+        lines.append(f"  {cell.id}  {cell.scene} / {cell.label}  {reason}")
     if len(cells) > _MAX_NAMED:
         lines.append(f"  and {len(cells) - _MAX_NAMED} more")
     return lines

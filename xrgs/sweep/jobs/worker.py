@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING, Any
 
 from xrgs.errors import XrgsError
 from xrgs.runtime.machine import set_passive_openmp_wait
-from xrgs.runtime.streams import ignore_broken_pipe
+from xrgs.runtime.streams import ignore_broken_pipe, log_to_stderr, say
 from xrgs.safeio.atomic import write_json
 from xrgs.safeio.records import read_json
 from xrgs.sweep.jobs import supervise
@@ -110,6 +110,7 @@ def _build_variant(request: Mapping[str, Any]) -> dict[str, Any]:
     from xrgs.config import from_dict
     from xrgs.experiment.store import Store
 
+    log_to_stderr()
     conf, store = from_dict(request["conf"]), Store(Path(request["store"]))
     built = variant.build(conf.scene, conf.variant, store.variants, store.scenes)
     return {"variant": built.id}
@@ -130,7 +131,7 @@ def _run_cell(request: Mapping[str, Any]) -> dict[str, Any]:
         # A cell that is ended by SIGTERM writes its stack. It is given the descriptor, which stays
         # open when `log` is closed.
         faulthandler.register(signal.SIGTERM, 2, chain=True)
-        logging.basicConfig(format="%(asctime)s %(message)s", level=logging.INFO)
+        log_to_stderr(logging.INFO)
         frozen = variant.load(Path(request["variant"]))
         if frozen.id != frozen.path.name:
             raise variant.CorruptVariant(f"{frozen.path} holds another variant: {frozen.id}")
@@ -162,13 +163,13 @@ def main(job: str, request: str, answer: str) -> None:
     except XrgsError as error:
         result = {"error": str(error)}
     except Exception as error:
-        traceback.print_exc()
+        say(traceback.format_exc(), sys.stderr)
         number = error.errno if isinstance(error, OSError) else None
         result = {"error": f"{type(error).__name__}: {error}", "errno": number}
     try:
         write_json(Path(answer), result)
     except OSError:
-        traceback.print_exc()
+        say(traceback.format_exc(), sys.stderr)
         sys.exit(os.EX_IOERR)
 
 
