@@ -6,7 +6,6 @@ cell is done when that file says so and the listed files are present and unchang
 
 from __future__ import annotations
 
-import io
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -15,13 +14,14 @@ from xrgs.errors import StoreError, UnreadableError
 from xrgs.runtime import progress
 from xrgs.safeio import untrusted
 from xrgs.safeio.atomic import write_json, write_text
-from xrgs.safeio.confined import ConfinedPath
+from xrgs.safeio.confined import ConfinedPath, is_passing
 from xrgs.safeio.hashing import canonical_json, file_digest
-from xrgs.safeio.records import as_number, read_file, read_json, read_object, read_table
+from xrgs.safeio.records import as_number, read_json, read_object, read_table
 from xrgs.safeio.words import for_terminal
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
+
     import pandas as pd
 
     from xrgs.capture.dataset import Dataset
@@ -47,9 +47,26 @@ class CellState:
     """The state of a cell, and the reason for it."""
 
     name: str
-    """`absent`, `unfinished`, `running`, `failed`, `corrupt` or `done`; `unknown` where a file can't
-    be read now, so that nothing may be done with the cell but to look again."""
+    """`absent`, `unfinished`, `running`, `failed`, `corrupt` or `done`; `unknown` where a file can
+    not be read now, so that nothing may be done with the cell but to look again."""
     reason: str = ""
+
+    @classmethod
+    def of_error(cls, error: Exception) -> CellState:
+        """Return the state of a cell whose files can't be read, or are not what they should be.
+
+        Args:
+            error: What was raised when they were read.
+        """
+        if isinstance(error, (UnreadableError, OSError)):
+            return cls("unknown", f"it can't be read now: {error}")
+        if isinstance(error, StoreError):
+            return cls("corrupt", str(error))
+        return cls("corrupt", f"a file is malformed: {error!r}")
+
+
+#: What reading the files of a cell may raise, whatever is in them.
+READING_ERRORS = (StoreError, OSError, AttributeError, KeyError, TypeError, ValueError)
 
 
 @dataclass(frozen=True)
@@ -100,16 +117,15 @@ class CellFolder:
         """
         try:
             return self._look(verify=verify)
-        except (UnreadableError, OSError) as error:
-            return CellState("unknown", f"it can't be read now: {error}")
-        except (StoreError, AttributeError, KeyError, TypeError, ValueError) as error:
-            return CellState("corrupt", str(error))
+        except READING_ERRORS as error:
+            return CellState.of_error(error)
 
     def _look(self, *, verify: bool) -> CellState:
         if self.folder.is_link():
             return CellState("corrupt", "it is a symbolic link; a cell must be a folder")
         if not self.folder.is_dir():
-            return CellState("absent")
+            there = self.folder.exists()
+            return CellState("corrupt", "it is not a folder") if there else CellState("absent")
         if not self.status.exists():
             resumes = "; it resumes from its checkpoint" if self.checkpoint.exists() else ""
             return CellState("unfinished", f"it was stopped before it ended{resumes}")
@@ -145,6 +161,35 @@ class CellFolder:
         if verify and [view for view, _ in self.view_scores()] != status["views"]:
             raise StoreError("scores.csv does not have one row for each view that was to be scored")
 
+    def verify(self) -> list[str]:
+        """Hash every file of a finished cell.
+
+        Returns:
+            A line for each file that is missing, has changed, can't be read now or does not belong
+            there; empty for an intact cell.
+        """
+        try:
+            files = read_object(self.status)["files"]
+            wrong = [why for name, entry in files.items() if (why := self._wrong(name, entry))]
+            listed = files.keys() | _NOT_RESULTS
+            wrong += [
+                f"{self.folder}/{name}: it does not belong there"
+                for name, _ in self.folder.walk()
+                if name not in listed
+            ]
+        except READING_ERRORS as error:
+            return [f"{self.status}: {CellState.of_error(error).reason}"]
+        return wrong
+
+    def _wrong(self, name: str, entry: Mapping[str, Any]) -> str:
+        """Return what is wrong with one of the cell's files; empty where nothing is."""
+        try:
+            intact = file_digest(self.folder / name) == entry["sha256"]
+        except OSError as error:
+            again = "; try again" if is_passing(error) else ""
+            return f"{self.folder}/{name}: {error.strerror}{again}"
+        return "" if intact else f"{self.folder}/{name}: it has changed since the cell finished"
+
     def view_scores(self) -> list[tuple[str, dict[str, float]]]:
         """Return the name and the scores of every test view, NaN where a score is missing.
 
@@ -156,6 +201,8 @@ class CellFolder:
         views = [row[0] for row in rows]
         if header[:1] != ["view"] or not all(map(untrusted.is_name, views)):
             raise StoreError(f"{file}: the first column must hold names of views")
+        if len(set(views)) < len(views):
+            raise StoreError(f"{file}: a view has two rows")
         try:
             values = [map(as_number, row[1:]) for row in rows]
             scores = [dict(zip(header[1:], row, strict=True)) for row in values]
@@ -268,15 +315,23 @@ class CellFolder:
         return read_object(self.folder / "provenance.json")
 
     def history(self) -> pd.DataFrame:
-        """Return the training history, one row per logged step.
+        """Return the training history, one row per logged step; `view` is text, all else numbers.
 
         Raises:
-            StoreError: `history.csv` can't be read.
-            ValueError: `history.csv` is not a table.
+            StoreError: `history.csv` can't be read, or is not such a table.
         """
         import pandas as pd
 
-        return pd.read_csv(io.BytesIO(read_file(self.folder / "history.csv")))
+        file = self.folder / "history.csv"
+        header, rows = read_table(file)
+        table = pd.DataFrame(rows, columns=header, dtype=object)
+        try:
+            for name in header:
+                if name != "view":
+                    table[name] = pd.to_numeric(table[name].map(as_number), downcast="integer")
+        except ValueError as error:
+            raise StoreError(f"{file}: {name}: {error}") from error
+        return table
 
     def scores(self) -> pd.DataFrame:
         """Return the scores of the test views.

@@ -83,10 +83,12 @@ def build(
     tables = Tables(comparison)
     folder = ConfinedPath(out) if out else store.reports / sweep_id
     try:
-        folder.make_root()
+        if out:
+            folder.make_root()
+        _refuse_links(folder / "figures")
         (folder / "figures").make_folder()
         drawn = draw(store, comparison, sweep.views, folder / "figures", pictures)
-        _write_files(folder, sweep, tables, drawn, totals(store, comparison.cells))
+        _write_files(folder, sweep, tables, drawn, totals(comparison.cells, sweep.training))
     except OSError as error:
         raise ReportError(
             f"the report can't be written to {folder}: {error.filename}: {error.strerror};"
@@ -95,6 +97,17 @@ def build(
     written = {p.file for p in drawn if p.file} | {folder / name for name in _FILES}
     text = f"{_text(tables, _warnings(sweep))}\n{for_line(f'Written to {folder}')}"
     return Report(text=text, folder=folder.path, files=tuple(sorted(file.path for file in written)))
+
+
+def _refuse_links(folder: ConfinedPath) -> None:
+    """Refuse to write where a link would lead out of the store, or of the folder of the report."""
+    for depth in range(1, len(folder.parts) + 1):
+        above = ConfinedPath(folder.root, folder.parts[:depth])
+        if above.is_link():
+            raise ReportError(
+                f"{above} is a link, and what it leads to is not written to: remove it, or name"
+                " another folder with out=..."
+            )
 
 
 #: The files of every report, beside its pictures.
@@ -196,6 +209,9 @@ def _provenance_table(sweep: Sweep) -> TextTable:
 
 def _warnings(sweep: Sweep) -> list[str]:
     warnings = []
+    unknown = sweep.cells.loc[sweep.cells["state"] == "unknown", "cell_id"].nunique()
+    if unknown:
+        warnings.append(f"{unknown} cells can't be read now: run the report again.")
     mixed = [key for key in _MACHINE_KEYS if len(sweep.provenance.get(key, ())) > 1]
     if mixed:
         differing = ", ".join(mixed)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from functools import partial
+from itertools import islice
 from typing import TYPE_CHECKING
 
 import pandas as pd
@@ -36,6 +37,10 @@ if TYPE_CHECKING:
 _CURVES = {"gaussians": "Gaussians", "loss": "loss of the step's view, as each run weighs it"}
 #: Largest image that is drawn; three are in memory at a time.
 _MAX_PIXELS = 50_000_000
+#: The most pictures that are drawn without being asked for by name; each takes up to a second.
+_MAX_PICTURES = 100
+#: The most ablations that one figure of trade-offs can name.
+_MAX_ABLATIONS = 200
 
 
 @dataclass(frozen=True)
@@ -64,7 +69,8 @@ def draw(
         comparison: The pairs of cells.
         views: The table `Sweep.views`.
         folder: The existing folder to write the files to.
-        names: Names of the pictures to draw, which are file names without suffix; None draws all.
+        names: Names of the pictures to draw, which are file names without suffix; None draws all,
+            but no more than the first 100.
 
     Returns:
         The pictures, in the order of the tables.
@@ -80,14 +86,29 @@ def draw(
     variants = comparison.cells.drop_duplicates("cell_id").set_index("cell_id")["variant_id"]
     drawings = _trade_offs(comparison)
     for _, pair in pairs.iterrows():
-        both = psnr[pair["baseline_id"]], psnr[pair["cell_id"]]
+        both = _same_views(psnr.get(pair["baseline_id"]), psnr.get(pair["cell_id"]))
         photographs = store.variants / variants[pair["cell_id"]] / "images" / "test"
         stem = f"{for_file_name(pair['scene'])}--{for_file_name(pair['label'])}"
         drawings[stem] = partial(_views, store, pair, both, photographs)
         drawings[f"{stem}--training"] = partial(_training, store, pair)
-    chosen = drawings if names is None else _chosen(drawings, names)
+    first_ones = dict(islice(drawings.items(), _MAX_PICTURES))
+    chosen = first_ones if names is None else _chosen(drawings, names)
     bar = progress(chosen.items(), "drawing", "picture", len(chosen))
-    return [drawing(folder / f"{name}.png") for name, drawing in bar]
+    drawn = [drawing(folder / f"{name}.png") for name, drawing in bar]
+    if names is None and len(chosen) < len(drawings):
+        why = f"only the first {len(chosen)} are drawn; pictures=NAMES draws others"
+        drawn.append(Picture(f"{len(drawings) - len(chosen)} more", None, why))
+    return drawn
+
+
+def _same_views(
+    baseline: pd.Series | None, ablation: pd.Series | None
+) -> tuple[pd.Series, pd.Series]:
+    """Return the PSNR of the views that both cells have, in their order; perhaps of none."""
+    if baseline is None or ablation is None:
+        return pd.Series(dtype=float), pd.Series(dtype=float)
+    both = ablation.index[ablation.index.isin(baseline.index)]
+    return baseline[both], ablation[both]
 
 
 def _chosen(drawings: dict[str, _Drawing], names: Sequence[str]) -> dict[str, _Drawing]:
@@ -110,7 +131,7 @@ def _trade_offs(comparison: Comparison) -> dict[str, _Drawing]:
             for table in (comparison.means, comparison.per_scene)
         )
         axes = [m for m in comparison.metrics if m.score is not None and m.name in means]
-        if len(means) < 2 or not axes:
+        if not 2 <= len(means) <= _MAX_ABLATIONS or not axes:
             continue
         title = titled("What each ablation trades, mean over scenes", condition)
         name = f"trade-off{condition and f'.{for_file_name(condition)}'}"
@@ -168,6 +189,8 @@ def _views(
     photographs: ConfinedPath,
     file: ConfinedPath,
 ) -> Picture:
+    if psnr[0].empty:
+        return Picture(_title(pair), None, "the two cells have no test view in common")
     view = median_view(*psnr)
     title = f"{_title(pair)}: view {view}, by change of PSNR the median of {len(psnr[0])}"
     name = f"{view}.png"
@@ -195,9 +218,8 @@ def _training(store: Store, pair: pd.Series, file: ConfinedPath) -> Picture:
     runs = []
     for name, key in ((BASELINE, "baseline_id"), (str(pair["label"]), "cell_id")):
         try:
-            history = store.cell(pair[key]).history()[["step", *_CURVES]]
-            runs.append((name, history.apply(pd.to_numeric)))
-        except (StoreError, ValueError, TypeError, KeyError):
+            runs.append((name, store.cell(pair[key]).history()[["step", *_CURVES]]))
+        except (StoreError, KeyError):
             return Picture(title, None, f"cells/{pair[key]}/history.csv can't be read")
     with atomic_writer(file) as stream:
         stream.write(curves(title, runs, _CURVES))
