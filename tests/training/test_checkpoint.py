@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 
 from xrgs.capture.dataset import Dataset
 from xrgs.config import Conf
+from xrgs.safeio.confined import ConfinedPath
 from xrgs.training import checkpoint
 from xrgs.training.checkpoint import Checkpoint, CheckpointError
 from xrgs.training.loop import train
@@ -226,14 +227,14 @@ def test_a_state_that_does_not_fit_is_refused_by_its_object(
 ) -> None:
     file = tmp_path / "c.npz"
     train(data, few_steps, Checkpoint(file, "cell", EVERY_STEP))
-    state = checkpoint._load(file)
+    state = checkpoint._load(ConfinedPath(file))
     *folders, name = member.split("/")
     inner = state
     for folder in folders:
         inner = inner[folder]
     assert name in inner
     inner[name] = torch.from_numpy(value)
-    checkpoint._save(file, state)
+    checkpoint._save(ConfinedPath(file), state)
     loaded = Checkpoint(file, "cell")
     loaded.load()
     with pytest.raises(CheckpointError, match=rf"c\.npz: {named}: "):
