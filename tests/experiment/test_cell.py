@@ -76,8 +76,7 @@ def begin(conf: Conf, root: Path, variant_id: str = "v") -> CellFolder:
     identity = cell_identity(conf, variant_id)
     root.mkdir(exist_ok=True)
     folder = CellFolder(root / digest(identity))
-    folder.begin(asdict(conf), identity)
-    return folder
+    return folder.begin(asdict(conf), identity)
 
 
 def results(folder: CellFolder) -> dict[str, Any]:
@@ -180,7 +179,7 @@ def test_a_worker_that_is_killed_goes_on_in_another(
     built = variant.build(conf.scene, conf.variant, store.variants, store.scenes)
 
     def request(folder: CellFolder) -> dict[str, Any]:
-        return {"conf": asdict(conf), "variant": str(built.path), "cell": str(folder.path)}
+        return worker.cell_request(asdict(conf), built.folder, folder)
 
     folder = begin(conf, tmp_path / "killed", built.id)
     write_json(tmp_path / "request.json", request(folder))

@@ -260,7 +260,7 @@ def _train_again(
     original: CellFolder,
 ) -> None:
     """Train like a sweep's cell, but without a lock: no other process writes to the folder."""
-    repeated.begin(asdict(conf), identity)
+    attempt = repeated.begin(asdict(conf), identity)
     cell = PlannedCell(
         CellSpec("rerun", "", (), ()),
         conf,
@@ -272,10 +272,9 @@ def _train_again(
     try:
         with SweepMonitor(ConfinedPath(repeated.path.parent)) as monitor:
             monitor.watch([cell])
-            request = {"conf": asdict(conf), "variant": str(variant), "cell": str(repeated.path)}
-            worker.run_in_child("cell", request)
+            worker.run_in_child("cell", worker.cell_request(asdict(conf), variant, attempt))
     except XrgsError as error:
-        repeated.fail(str(error))
+        attempt.fail(str(error))
         raise XrgsError(f"{error} ({repeated.folder / 'log.txt'})") from error
 
 
