@@ -13,6 +13,7 @@ import pytest
 from xrgs.capture import variant
 from xrgs.capture.views import Variant
 from xrgs.config import Conf, SceneConf, SfmConf, VariantConf
+from xrgs.safeio.confined import ConfinedPath
 
 
 @pytest.fixture(scope="session")
@@ -66,7 +67,9 @@ def build_in(small_conf: Callable[..., VariantConf]) -> Callable[..., Variant]:
 
     def build(store: Path, scene: SceneConf, **changes: Any) -> Variant:
         conf = small_conf(scene, **changes)
-        return variant.build(scene, conf, store / "variants", store / "scenes")
+        store.mkdir(exist_ok=True)
+        root = ConfinedPath(store)
+        return variant.build(scene, conf, root / "variants", root / "scenes")
 
     return build
 

@@ -11,15 +11,16 @@ from xrgs.capture import dataset, images
 from xrgs.capture.dataset import LoadedView
 from xrgs.capture.views import Variant, View
 from xrgs.errors import XrgsError
+from xrgs.safeio.confined import ConfinedPath
 
 HR, LR = (40, 30), (20, 15)
 
 
-def make_view(folder: Path, name: str, split: str, tag: str, size: tuple[int, int]) -> View:
+def make_view(folder: ConfinedPath, name: str, split: str, tag: str, size: tuple[int, int]) -> View:
     """A view of one grey, whose pose depends on its name alone."""
     number = int(name[1:])
     grey = {"train": 0.1, "test": 0.2, "original": 0.3}[split] + number / 20
-    file = folder / split / f"{name}.png"
+    file = folder / f"{split}/{name}.png"
     images.save(file, np.full((size[1], size[0], 3), grey, np.float32))
     viewmat = np.eye(4)
     viewmat[:3, 3] = (-0.3 * number, 0.1 * (number % 2), 0.05 * number)
@@ -30,15 +31,16 @@ def make_view(folder: Path, name: str, split: str, tag: str, size: tuple[int, in
 @pytest.fixture
 def variant(tmp_path: Path) -> Variant:
     """Five views: v0 is the test, v1 HR, v2 to v4 downsampled by 2, with their originals."""
-    views = [make_view(tmp_path, f"v{i}", "original", "HR", HR) for i in (2, 3, 4)]
+    folder = ConfinedPath(tmp_path)
+    views = [make_view(folder, f"v{i}", "original", "HR", HR) for i in (2, 3, 4)]
     views += [
-        make_view(tmp_path, "v0", "test", "HR", HR),
-        make_view(tmp_path, "v1", "train", "HR", HR),
+        make_view(folder, "v0", "test", "HR", HR),
+        make_view(folder, "v1", "train", "HR", HR),
     ]
-    views += [make_view(tmp_path, f"v{i}", "train", "LR", LR) for i in (2, 3, 4)]
+    views += [make_view(folder, f"v{i}", "train", "LR", LR) for i in (2, 3, 4)]
     points = np.random.default_rng(0).normal((0, 0, 4), 1, (50, 3))
     colors = np.zeros((50, 3), np.uint8)
-    return Variant("id", tmp_path, "grey", 2, True, tuple(views), points, colors, {})
+    return Variant("id", folder, "grey", 2, True, tuple(views), points, colors, {})
 
 
 def grey(view: LoadedView) -> float:

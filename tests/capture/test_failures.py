@@ -8,19 +8,22 @@ from pathlib import Path
 from xrgs.capture.failures import failed_scenes
 
 
-def test_readable_reports_are_listed_by_key_and_others_left_out(tmp_path: Path) -> None:
+def test_reports_are_listed_by_key_and_damaged_ones_say_what_is_wrong(tmp_path: Path) -> None:
     for key, report in {
         "b": {"scene": "leaves", "reason": "too few views"},
         "a": {"scene": "flat", "reason": "no points"},
         "c": {"scene": "no reason"},
+        "f": {"scene": ["a"], "reason": "b"},
         "d": [],
     }.items():
         (tmp_path / f"failed-{key}").mkdir()
         (tmp_path / f"failed-{key}" / "report.json").write_text(json.dumps(report))
     (tmp_path / "failed-e").mkdir()
     (tmp_path / "frozen").mkdir()
-    expected = {"a": ("flat", "no points"), "b": ("leaves", "too few views")}
-    assert failed_scenes(tmp_path) == expected
-    assert list(failed_scenes(tmp_path)) == ["a", "b"]
-    assert failed_scenes(tmp_path, "b") == {"b": ("leaves", "too few views")}
-    assert failed_scenes(tmp_path, "f") == {}
+    listed = failed_scenes(tmp_path)
+    assert list(listed) == ["a", "b", "c", "d", "e", "f"]
+    assert (listed["a"], listed["b"]) == (("flat", "no points"), ("leaves", "too few views"))
+    for key in "cdef":
+        scene, reason = listed[key]
+        assert scene == "?"
+        assert reason.startswith(f"{tmp_path}/failed-{key}/report.json: ")

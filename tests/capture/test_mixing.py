@@ -20,6 +20,7 @@ from xrgs.capture.split import check_variant_conf
 from xrgs.capture.views import SceneFailed, Variant, View
 from xrgs.config import SceneConf, VariantConf
 from xrgs.errors import XrgsError
+from xrgs.safeio.confined import ConfinedPath
 
 pytestmark = pytest.mark.slow
 
@@ -42,7 +43,9 @@ def conf(configured: Make) -> VariantConf:
 @pytest.fixture(scope="module")
 def rendered(tmp_path_factory: pytest.TempPathFactory, conf: VariantConf) -> Scene:
     cache = tmp_path_factory.mktemp("scenes")
-    return scenes.resolve(SceneConf("p", "procedural", None, VIEWS), cache, conf.long_side)
+    return scenes.resolve(
+        SceneConf("p", "procedural", None, VIEWS), ConfinedPath(cache), conf.long_side
+    )
 
 
 @pytest.fixture(scope="module")
@@ -53,7 +56,7 @@ def reconstruction(
     work = tmp_path_factory.mktemp("work")
     inputs = []
     for file in rendered.files:
-        shutil.copy(file, work / file.name)
+        shutil.copy(str(file), work / file.name)
         inputs.append(SfmImage(file.name, "all"))
     return sfm.reconstruct(inputs, work, work, conf.sfm)
 
@@ -87,7 +90,7 @@ def mix(
         work.mkdir()
         out.mkdir()
         scene = scene or replace(rendered, viewmats={})
-        return mixing.mix_resolutions(scene, configured(**changes), work, out)
+        return mixing.mix_resolutions(scene, configured(**changes), work, ConfinedPath(out))
 
     monkeypatch.setattr(sfm, "reconstruct", recall)
     return run
@@ -143,7 +146,7 @@ def test_by_megapixels_the_larger_photographs_are_hr(
 ) -> None:
     files = []
     for i, file in enumerate(rendered.files):
-        files.append(tmp_path / file.name)
+        files.append(ConfinedPath(tmp_path / file.name))
         photo = images.read(file)
         images.save(files[-1], images.resize(photo, 80, 60) if i % 3 else photo)
     scene = replace(rendered, files=tuple(files), viewmats={})
@@ -265,7 +268,7 @@ def test_a_refused_attempt_is_followed_by_the_next(
     results = iter([EMPTY, reconstruction])
     monkeypatch.setattr(sfm, "reconstruct", lambda *_: next(results))
     (tmp_path / "out").mkdir()
-    made = mixing.mix_resolutions(rendered, conf, tmp_path, tmp_path / "out")
+    made = mixing.mix_resolutions(rendered, conf, tmp_path, ConfinedPath(tmp_path / "out"))
     attempts = made.report["attempts"]
     assert [(a["attempt"], a["registered"]) for a in attempts] == [
         ("configured", 0),
@@ -282,7 +285,7 @@ def test_where_every_attempt_is_refused_the_report_has_them_all(
     monkeypatch.setattr(sfm, "reconstruct", lambda *_: EMPTY)
     (tmp_path / "out").mkdir()
     with pytest.raises(SceneFailed, match="scene p failed: COLMAP registered 0 of 12") as caught:
-        mixing.mix_resolutions(rendered, conf, tmp_path, tmp_path / "out")
+        mixing.mix_resolutions(rendered, conf, tmp_path, ConfinedPath(tmp_path / "out"))
     tried = [a["attempt"] for a in caught.value.report["attempts"]]
     attempts = registration.sfm_attempts(conf.sfm, VIEWS, any_smaller=True)
     assert tried == [attempt.name for attempt in attempts]
@@ -332,7 +335,12 @@ def test_a_collection_of_many_cameras_is_registered(
     few = {"max_num_features": 1500}
     conf = configured(long_side=320, tags="sampling_rate", factor=2, sfm=few)
     (tmp_path / "out").mkdir()
-    made = mixing.mix_resolutions(Scene("reichstag", "", files), conf, tmp_path, tmp_path / "out")
+    made = mixing.mix_resolutions(
+        Scene("reichstag", "", tuple(map(ConfinedPath, files))),
+        conf,
+        tmp_path,
+        ConfinedPath(tmp_path / "out"),
+    )
     assert made.report["registered"] >= 12
     assert made.report["cameras"] == 16
     scale = 320 / max(max(size) for size in sizes)

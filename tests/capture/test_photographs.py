@@ -11,6 +11,7 @@ from xrgs.capture.photographs import assign_cameras, prepare_hr_views
 from xrgs.capture.scenes import Scene
 from xrgs.config import SfmConf, VariantConf
 from xrgs.errors import XrgsError
+from xrgs.safeio.confined import ConfinedPath
 
 CONF = VariantConf(long_side=0, factor=2, sfm=SfmConf(camera="auto"))
 
@@ -21,7 +22,7 @@ def write_photograph(
     model: str = "",
     focal: float = 0,
     orientation: int = 1,
-) -> Path:
+) -> ConfinedPath:
     """Write a photograph as a camera does: `size` is that before the EXIF orientation."""
     exif = Image.Exif()
     exif[0x0112] = orientation
@@ -32,10 +33,10 @@ def write_photograph(
     ramp = np.linspace(0, 255, size[0]).astype(np.uint8)
     pixels = np.broadcast_to(ramp[None, :, None], (size[1], size[0], 3))
     Image.fromarray(np.ascontiguousarray(pixels)).save(file, exif=exif, quality=95)
-    return file
+    return ConfinedPath(file)
 
 
-def camera_numbers(files: list[Path], how: str = "auto") -> list[int]:
+def camera_numbers(files: list[ConfinedPath], how: str = "auto") -> list[int]:
     """The camera of each photograph, numbered by first use."""
     names = assign_cameras(files, [images.size(file) for file in files], how)
     return [list(dict.fromkeys(names)).index(name) for name in names]
@@ -105,7 +106,7 @@ def test_a_file_without_a_header_is_left_out_too(tmp_path: Path) -> None:
     (tmp_path / "b.png").write_text("no image")
     files = [
         write_photograph(tmp_path / "a.png"),
-        tmp_path / "b.png",
+        ConfinedPath(tmp_path / "b.png"),
         write_photograph(tmp_path / "c.png"),
     ]
     photos = prepare_hr_views(Scene("x", "", tuple(files)), CONF, tmp_path)

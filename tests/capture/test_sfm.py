@@ -12,6 +12,7 @@ from xrgs.capture import images, scenes, sfm
 from xrgs.capture.scenes import motorcycle
 from xrgs.capture.scenes.bundled import bundled_photograph
 from xrgs.config import SceneConf, SfmConf
+from xrgs.safeio.confined import ConfinedPath
 
 StereoPair = tuple[Path, sfm.Reconstruction]
 
@@ -57,7 +58,7 @@ def test_two_views_keep_the_points_that_only_two_see(sfm_conf: SfmConf) -> None:
 def stereo_pair(tmp_path_factory: pytest.TempPathFactory, sfm_conf: SfmConf) -> StereoPair:
     """The motorcycle pair at its own size, intrinsics given."""
     work = tmp_path_factory.mktemp("pair")
-    scene = scenes.resolve(SceneConf("motorcycle", "motorcycle"), work)
+    scene = scenes.resolve(SceneConf("motorcycle", "motorcycle"), ConfinedPath(work))
     inputs = []
     for file in scene.files:
         images.save(work / file.name, images.read(file))

@@ -21,6 +21,7 @@ from xrgs.capture.variant import CorruptVariant
 from xrgs.capture.views import SceneFailed, Variant
 from xrgs.config import SceneConf, VariantConf
 from xrgs.errors import XrgsError
+from xrgs.safeio.confined import ConfinedPath
 from xrgs.safeio.hashing import source_digests
 
 pytestmark = pytest.mark.slow
@@ -48,7 +49,8 @@ def test_a_variant_is_built_once_whatever_the_scenes_label(
 ) -> None:
     written = (stereo_variant.path / "variant.json").stat().st_mtime_ns
     scene, conf = replace(stereo_scene, name="other label"), small_conf(stereo_scene)
-    again = variant.build(scene, conf, shared_store / "variants", shared_store / "scenes")
+    root = ConfinedPath(shared_store)
+    again = variant.build(scene, conf, root / "variants", root / "scenes")
     assert again.id == stereo_variant.id
     assert (stereo_variant.path / "variant.json").stat().st_mtime_ns == written
     assert not list((shared_store / "variants").glob(".*.building"))
@@ -168,10 +170,12 @@ def test_two_processes_at_once_share_one_variant(
     script = (
         "from pathlib import Path; from xrgs.capture import variant;"
         "from xrgs.config import SceneConf, SfmConf, VariantConf;"
-        f"conf = {small_conf(stereo_scene)!r}; root = Path({str(store)!r});"
+        "from xrgs.safeio.confined import ConfinedPath;"
+        f"conf = {small_conf(stereo_scene)!r}; root = ConfinedPath(Path({str(store)!r}));"
         f"print(variant.build({stereo_scene!r}, conf, root / 'variants', root / 'scenes').id)"
     )
     command = [sys.executable, "-P", "-c", script]
+    store.mkdir()
     both = [subprocess.Popen(command, stdout=subprocess.PIPE, text=True) for _ in range(2)]
     ids = {process.communicate()[0].strip() for process in both}
     assert [process.returncode for process in both] == [0, 0]
@@ -191,7 +195,7 @@ def test_a_bad_config_is_refused_before_anything_is_made(
 ) -> None:
     with pytest.raises(XrgsError, match=r"variant\.selection=best"):
         build(procedural_scene, selection="best")
-    assert not store.exists()
+    assert not list(store.iterdir())
 
 
 def test_unrelated_photographs_fail_as_a_scene(

@@ -14,6 +14,7 @@ from xrgs.capture import images, scenes
 from xrgs.capture.views import Variant, View
 from xrgs.config import SceneConf
 from xrgs.errors import XrgsError
+from xrgs.safeio.confined import ConfinedPath
 
 pytestmark = pytest.mark.slow
 
@@ -161,9 +162,10 @@ def photographs(tmp_path: Path, procedural_scene: SceneConf) -> Callable[[str, i
 
     def copied(name: str, count: int) -> SceneConf:
         (tmp_path / name).mkdir()
-        rendered = scenes.resolve(replace(procedural_scene, views=count), tmp_path / "scenes", 252)
+        cache = ConfinedPath(tmp_path) / "scenes"
+        rendered = scenes.resolve(replace(procedural_scene, views=count), cache, 252)
         for i, file in enumerate(rendered.files):
-            shutil.copy(file, tmp_path / name / f"vue d'été {i}, x.png")
+            shutil.copy(str(file), tmp_path / name / f"vue d'été {i}, x.png")
         return SceneConf("", "folder", str(tmp_path / name))
 
     return copied

@@ -227,14 +227,14 @@ def test_a_state_that_does_not_fit_is_refused_by_its_object(
 ) -> None:
     file = ConfinedPath(tmp_path) / "c.npz"
     train(data, few_steps, Checkpoint(file, "cell", EVERY_STEP))
-    state = checkpoint._load(ConfinedPath(file))
+    state = checkpoint._load(file)
     *folders, name = member.split("/")
     inner = state
     for folder in folders:
         inner = inner[folder]
     assert name in inner
     inner[name] = torch.from_numpy(value)
-    checkpoint._save(ConfinedPath(file), state)
+    checkpoint._save(file, state)
     loaded = Checkpoint(file, "cell")
     loaded.load()
     with pytest.raises(CheckpointError, match=rf"c\.npz: {named}: "):

@@ -8,6 +8,8 @@ from typing import TYPE_CHECKING
 from PIL import Image, ImageDraw, ImageFont
 
 from xrgs.capture import images
+from xrgs.capture.images import ImageError
+from xrgs.errors import UnreadableError
 from xrgs.runtime.progress import progress
 from xrgs.safeio.words import MAX_CELL, for_line
 
@@ -26,9 +28,11 @@ COLOURS: Mapping[str, str] = {"HR": "#0072b2", "LR": "#e69f00", "test": "#7f7f7f
 _BACKGROUND, _TEXT_COLOUR = "white", "black"
 #: Width over height of the sheet, about that of a screen.
 _ASPECT = 1.6
+#: The most views that are drawn, by name; a tile takes 0.4 MB.
+_MAX_TILES = 500
 
 
-def contact_sheet(variant: Variant) -> Image.Image:
+def contact_sheet(variant: Variant) -> tuple[Image.Image, list[str]]:
     """Draw the training and test views, sorted by name, each in a border of its class's colour.
 
     Beside each image is its centre. The centre of a view that is smaller than the largest one is
@@ -39,26 +43,32 @@ def contact_sheet(variant: Variant) -> Image.Image:
         variant: The frozen variant.
 
     Returns:
-        An RGB image.
-
-    Raises:
-        ImageError: An image can't be read.
+        An RGB image, and notes: why an image can't be read, whose tile then says so, or that there
+        are too many views to draw all.
     """
     views = sorted(
         (view for view in variant.views if view.split != "original"),
         key=lambda view: (view.name, view.split),
     )
-    largest = max(max(view.width, view.height) for view in views)
-    columns = max(1, round(math.sqrt(_ASPECT * len(views) * _TILE[1] / _TILE[0])))
-    rows = math.ceil(len(views) / columns)
+    shown = views[:_MAX_TILES]
+    notes = [f"the first {len(shown)} of {len(views)} views"] if len(shown) < len(views) else []
+    largest = max(max(view.width, view.height) for view in shown)
+    columns = max(1, round(math.sqrt(_ASPECT * len(shown) * _TILE[1] / _TILE[0])))
+    rows = math.ceil(len(shown) / columns)
     step = _TILE[0] + _GAP, _TILE[1] + _GAP
     top = _TEXT + 2 * _GAP
     sheet = Image.new("RGB", (_GAP + columns * step[0], top + rows * step[1]), _BACKGROUND)
     _legend(sheet, variant, views)
-    for index, view in enumerate(progress(views, "contact sheet", "view")):
+    for index, view in enumerate(progress(shown, "contact sheet", "view")):
         row, column = divmod(index, columns)
-        sheet.paste(_tile(view, largest), (_GAP + column * step[0], top + row * step[1]))
-    return sheet
+        image = None
+        try:
+            image = images.read_png_pil(view.file, (view.width, view.height))
+        except (ImageError, UnreadableError) as error:
+            notes.append(str(error))
+        tile = _tile(view, image, largest)
+        sheet.paste(tile, (_GAP + column * step[0], top + row * step[1]))
+    return sheet, notes
 
 
 def _view_class(view: View) -> str:
@@ -66,23 +76,30 @@ def _view_class(view: View) -> str:
     return "test" if view.split == "test" else view.tag
 
 
-def _tile(view: View, largest: int) -> Image.Image:
+def _tile(view: View, image: Image.Image | None, largest: int) -> Image.Image:
     """Draw the border, the whole image, its centre, and the name below."""
     tile = Image.new("RGB", _TILE, _BACKGROUND)
     draw = ImageDraw.Draw(tile)
     frame = (0, 0, _TILE[0] - 1, _BOX[1] + 2 * _BORDER - 1)
     draw.rectangle(frame, fill=COLOURS[_view_class(view)])
-    image = images.read_pil(view.file)
-    whole = _fit(image)
-    left = _BORDER + (_BOX[0] - whole.width) // 2
-    tile.paste(whole, (left, _BORDER + (_BOX[1] - whole.height) // 2))
-    magnified = max(1, round(largest / max(image.size)))
-    tile.paste(_crop_centre(image, magnified), (_BOX[0] + 2 * _BORDER, _BORDER))
+    if image is None:
+        draw.text((2 * _GAP, 2 * _GAP), "unreadable", _BACKGROUND, _font())
+    else:
+        _draw_image(tile, image, largest)
     label = f"{view.width}x{view.height}  {view.split} {view.tag}"
     width = _TILE[0] - draw.textlength(label, _font()) - _GAP
     draw.text((0, frame[3] + 3), _shorten(draw, view.name, width), _TEXT_COLOUR, _font())
     draw.text((_TILE[0], frame[3] + 3), label, _TEXT_COLOUR, _font(), anchor="ra")
     return tile
+
+
+def _draw_image(tile: Image.Image, image: Image.Image, largest: int) -> None:
+    """Draw the whole image, and its centre beside it."""
+    whole = _fit(image)
+    left = _BORDER + (_BOX[0] - whole.width) // 2
+    tile.paste(whole, (left, _BORDER + (_BOX[1] - whole.height) // 2))
+    magnified = min(_CENTRE, max(1, round(largest / max(image.size))))
+    tile.paste(_crop_centre(image, magnified), (_BOX[0] + 2 * _BORDER, _BORDER))
 
 
 def _fit(image: Image.Image) -> Image.Image:

@@ -69,7 +69,8 @@ def load(variant: Variant, use: str = "mixed") -> Dataset:
         The dataset, with views in the order of the variant.
 
     Raises:
-        ImageError: An image is missing or unreadable; the message names it.
+        UnreadableError: An image can't be read now.
+        ImageError: An image is missing, unreadable or not of its view's size; the message names it.
         XrgsError: `use` is none of these, or the variant has no such views.
     """
     training = _training_views(variant, use)
@@ -127,5 +128,5 @@ def _load_view(view: View, viewmat: NDArray[np.float64]) -> LoadedView:
         width=view.width,
         height=view.height,
     )
-    image = torch.from_numpy(images.read(view.file))
+    image = torch.from_numpy(images.read_png(view.file, (view.width, view.height)))
     return LoadedView(view.name, view.tag, camera, image, view.rho)

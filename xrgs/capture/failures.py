@@ -21,12 +21,32 @@ if TYPE_CHECKING:
 FAILED_PREFIX = "failed-"
 
 
-def failed_scenes(variants: Path | ConfinedPath, key: str = "") -> dict[str, tuple[str, str]]:
+def read_failure(folder: ConfinedPath) -> tuple[str, str]:
+    """Read which scene could not be made into a variant, and why.
+
+    Args:
+        folder: The folder `failed-<key>`.
+
+    Returns:
+        The scene's name and the reason.
+
+    Raises:
+        UnreadableError: The report can't be read now.
+        StoreError: The report is missing or damaged.
+    """
+    file = folder / "report.json"
+    report = read_object(file)
+    scene, reason = report.get("scene"), report.get("reason")
+    if not isinstance(scene, str) or not isinstance(reason, str):
+        raise StoreError(f"{file}: it has no scene or no reason")
+    return scene, reason
+
+
+def failed_scenes(variants: Path | ConfinedPath) -> dict[str, tuple[str, str]]:
     """List the scenes that could not be made into a variant.
 
     Args:
         variants: The store's folder of variants.
-        key: The key of the only variant to look for; empty lists all.
 
     Returns:
         The scene's name and the reason, by the key of the variant. Where the report can't be read,
@@ -36,15 +56,13 @@ def failed_scenes(variants: Path | ConfinedPath, key: str = "") -> dict[str, tup
         OSError: The folder can't be read; it may be missing.
     """
     folder = confined(variants)
-    names = [f"{FAILED_PREFIX}{key}"] if key else folder.folders()
     failed = {}
-    for name in names:
-        if not name.startswith(FAILED_PREFIX) or (key and not (folder / name).is_dir()):
+    for name in folder.folders():
+        if not name.startswith(FAILED_PREFIX):
             continue
         try:
-            report = read_object(folder / name / "report.json")
-            why = str(report["scene"]), str(report["reason"])
-        except (StoreError, KeyError) as error:
-            why = "?", f"{folder / name / 'report.json'}: {error}"
+            why = read_failure(folder / name)
+        except StoreError as error:
+            why = "?", str(error)
         failed[name.removeprefix(FAILED_PREFIX)] = why
     return failed

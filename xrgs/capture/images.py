@@ -1,5 +1,7 @@
 """Reads, resizes and saves photographs: float32 arrays [H, W, 3] in 0..1 in memory.
 
+Photographs of users are read in five formats, with their EXIF orientation. The images of a store,
+which may come from anybody, are PNGs as `save` writes them, and are read by `read_png` alone.
 Nothing here imports torch before it is called.
 """
 
@@ -7,22 +9,28 @@ from __future__ import annotations
 
 import io
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, ImageOps
 
-from xrgs.errors import XrgsError
+from xrgs.errors import UnreadableError, XrgsError
 from xrgs.safeio.atomic import atomic_writer
-from xrgs.safeio.confined import ConfinedPath, confined
+from xrgs.safeio.confined import ConfinedPath, confined, is_passing
 
 ImageArray = NDArray[np.float32]  # [H, W, 3]
 
 #: The formats that are read. PIL goes by the content of a file and not by its suffix, and it hands
 #: some of the other formats that it knows to external programs.
 _FORMATS = ("BMP", "JPEG", "PNG", "TIFF", "WEBP")
+#: The largest photograph that is read: cameras give 200 megapixels, and PIL takes 1 GB for this.
+MAX_PIXELS = 1 << 28
+#: The largest image of a store that is read. In training it takes 800 MB.
+MAX_PNG_PIXELS = 1 << 26
+#: Deflate, the compression of PNGs, makes at most 1032 bytes of one.
+_MAX_EXPANSION = 1032
 _EXIF_ORIENTATION = 0x0112
 _EXIF_CAMERA = (0x010F, 0x0110)  # make, model
 _EXIF_DETAILS = 0x8769
@@ -33,14 +41,37 @@ class ImageError(XrgsError):
     """A file can't be read as a photograph; the message begins with its path."""
 
 
+# PIL's limit holds for the whole process, and refuses photographs that `MAX_PIXELS` admits.
+if Image.MAX_IMAGE_PIXELS is not None:
+    Image.MAX_IMAGE_PIXELS = max(Image.MAX_IMAGE_PIXELS, MAX_PIXELS)
+
+
 @contextmanager
-def _open(path: Path | ConfinedPath) -> Iterator[Image.Image]:
-    with confined(path).open() as stream, Image.open(stream, formats=_FORMATS) as image:
-        yield image
+def _opened(
+    path: Path | ConfinedPath, formats: tuple[str, ...] = _FORMATS, max_pixels: int = MAX_PIXELS
+) -> Iterator[Image.Image]:
+    """Open an image whose header declares at most so many pixels.
+
+    Every error of the block names the file.
+    """
+    try:
+        with confined(path).open() as stream, Image.open(stream, formats=formats) as image:
+            if image.width * image.height > max_pixels:
+                size = f"{image.width} x {image.height}"
+                raise ValueError(f"it has {size} pixels; at most {max_pixels} in all are read")
+            yield image
+    except MemoryError:
+        raise
+    except Exception as error:  # PIL raises nearly anything on a damaged file
+        # PIL's own OSErrors, of truncated files, have no number.
+        if isinstance(error, OSError) and error.errno is not None and is_passing(error):
+            raise UnreadableError(f"{path}: {error.strerror}; try again") from error
+        why = error.strerror if isinstance(error, OSError) and error.strerror else error
+        raise ImageError(f"{path}: unreadable or truncated image ({why})") from error
 
 
 def size(path: Path | ConfinedPath) -> tuple[int, int]:
-    """Read the size that `read` would give an image, from the header alone.
+    """Read the size that `read` would give a photograph; most formats have it in the header.
 
     Args:
         path: The image file.
@@ -49,14 +80,12 @@ def size(path: Path | ConfinedPath) -> tuple[int, int]:
         Width and height, px, after the EXIF orientation is applied.
 
     Raises:
-        ImageError: The header can't be read.
+        UnreadableError: The file can't be read now.
+        ImageError: It is not an image, or is larger than `MAX_PIXELS`.
     """
-    try:
-        with _open(path) as image:
-            transposed = image.getexif().get(_EXIF_ORIENTATION, 1) >= 5
-            return (image.height, image.width) if transposed else (image.width, image.height)
-    except Exception as error:  # PIL raises nearly anything on a damaged file
-        raise ImageError(f"{path}: not a readable image ({error})") from error
+    with _opened(path) as image:
+        transposed = image.getexif().get(_EXIF_ORIENTATION, 1) >= 5
+        return (image.height, image.width) if transposed else (image.width, image.height)
 
 
 def exif_camera(path: Path | ConfinedPath) -> str:
@@ -69,15 +98,14 @@ def exif_camera(path: Path | ConfinedPath) -> str:
         `make/model/focal length/35 mm equivalent`; empty where EXIF has none of them.
 
     Raises:
-        ImageError: The header can't be read.
+        UnreadableError: The file can't be read now.
+        ImageError: It is not an image.
     """
-    try:
-        with _open(path) as image:
-            exif = image.getexif()
+    with _opened(path) as image:
+        exif, details = image.getexif(), {}
+        with suppress(Exception):  # PIL raises nearly anything on damaged EXIF
             details = exif.get_ifd(_EXIF_DETAILS)
-            values = [exif.get(tag) for tag in _EXIF_CAMERA] + [details.get(t) for t in _EXIF_FOCAL]
-    except Exception as error:  # PIL raises nearly anything on a damaged file
-        raise ImageError(f"{path}: not a readable image ({error})") from error
+        values = [exif.get(tag) for tag in _EXIF_CAMERA] + [details.get(t) for t in _EXIF_FOCAL]
     return "/".join("" if value is None else str(value).strip("\0 ") for value in values).strip("/")
 
 
@@ -91,32 +119,77 @@ def read(path: Path | ConfinedPath) -> ImageArray:
         [H, W, 3], its 8-bit values / 255.
 
     Raises:
-        ImageError: The file is unreadable, truncated, or has more than 8 bits per channel.
+        UnreadableError: The file can't be read now.
+        ImageError: It is unreadable, truncated, larger than `MAX_PIXELS`, or has more than 8 bits
+            per channel.
     """
-    image: ImageArray = np.asarray(read_pil(path), dtype=np.float32) / np.float32(255)
-    return image
+    with _opened(path) as image:
+        image.load()
+        if image.mode[0] in "IF":
+            raise ValueError(f"{image.mode} pixels; only 8 bits per channel are read")
+        return _to_array(ImageOps.exif_transpose(image).convert("RGB"))
 
 
-def read_pil(path: Path | ConfinedPath) -> Image.Image:
-    """Read a photograph as `read` does, into PIL's own image.
+def read_png(
+    path: Path | ConfinedPath,
+    size: tuple[int, int] | None = None,
+    max_pixels: int = MAX_PNG_PIXELS,
+) -> ImageArray:
+    """Read an image of a store: a PNG as `save` writes it, whoever wrote this one.
 
     Args:
         path: The image file.
+        size: The width and height that it must have, px; None admits any.
+        max_pixels: The most pixels that it may have.
+
+    Returns:
+        [H, W, 3], its 8-bit values / 255.
+
+    Raises:
+        UnreadableError: The file can't be read now.
+        ImageError: It is not such a PNG; this is told before its pixels are decoded, unless they
+            are damaged.
+    """
+    return _to_array(read_png_pil(path, size, max_pixels))
+
+
+def read_png_pil(
+    path: Path | ConfinedPath,
+    size: tuple[int, int] | None = None,
+    max_pixels: int = MAX_PNG_PIXELS,
+) -> Image.Image:
+    """Read a PNG as `read_png` does, into PIL's own image.
+
+    Args:
+        path: The image file.
+        size: As for `read_png`.
+        max_pixels: As for `read_png`.
 
     Returns:
         An image of mode RGB.
 
     Raises:
-        ImageError: As `read`.
+        XrgsError: As `read_png`.
     """
-    try:
-        with _open(path) as image:
-            image.load()
-            if image.mode[0] in "IF":
-                raise ValueError(f"{image.mode} pixels; only 8 bits per channel are read")
-            return ImageOps.exif_transpose(image).convert("RGB")
-    except Exception as error:  # PIL raises nearly anything on a damaged file
-        raise ImageError(f"{path}: unreadable or truncated image ({error})") from error
+    with _opened(path, ("PNG",), max_pixels) as image:
+        if size is not None and image.size != size:
+            raise ValueError(
+                f"it has {image.width} x {image.height} pixels, not {size[0]} x {size[1]}"
+            )
+        if image.mode != "RGB":
+            raise ValueError(f"its pixels are {image.mode}, not 8-bit RGB")
+        file_bytes = confined(path).lstat().st_size
+        if 3 * image.width * image.height > _MAX_EXPANSION * file_bytes:
+            raise ValueError(
+                f"{file_bytes} bytes are too few for {image.width} x {image.height} px"
+            )
+        image.load()
+        return image
+
+
+def _to_array(image: Image.Image) -> ImageArray:
+    array: ImageArray = np.asarray(image, dtype=np.float32) / np.float32(255)
+    return array
 
 
 def save(path: Path | ConfinedPath, image: ImageArray) -> None:

@@ -139,12 +139,14 @@ def prepare_hr_views(scene: Scene, conf: VariantConf, work: Path) -> PhotoCollec
         The readable photographs, with their `hr` copies.
 
     Raises:
-        XrgsError: Fewer than two photographs can be read, or one is too small for its LR view; the
-            message names them.
+        UnreadableError: A photograph can't be read now. It is not left out: the variant would be
+            another one whenever a disk or a server fails.
+        XrgsError: Fewer than two photographs can be read, or one is too small for its LR view, or
+            too large for a variant; the message names them.
     """
     sizes, unreadable = _read_sizes(scene.files)
     shrink = shrink_factor(list(sizes.values()), conf) if sizes else 1.0
-    geometries: dict[Path | ConfinedPath, HrGeometry] = {}
+    geometries: dict[ConfinedPath, HrGeometry] = {}
     for file, size in progress(sizes.items(), "HR views", "view"):
         try:
             image = images.read(file)
@@ -152,7 +154,7 @@ def prepare_hr_views(scene: Scene, conf: VariantConf, work: Path) -> PhotoCollec
             unreadable[file] = str(error)
             continue
         try:
-            geometries[file] = hr = hr_geometry(size, shrink, conf)
+            geometries[file] = hr = _checked_geometry(size, shrink, conf)
         except XrgsError as error:
             raise XrgsError(f"{file}: {error}") from None
         images.save(work / "hr" / f"{len(geometries) - 1:05d}.png", _resize_and_crop(image, hr))
@@ -172,17 +174,27 @@ def prepare_hr_views(scene: Scene, conf: VariantConf, work: Path) -> PhotoCollec
     return PhotoCollection(tuple(photos), work, messages)
 
 
+def _checked_geometry(size: tuple[int, int], shrink: float, conf: VariantConf) -> HrGeometry:
+    hr = hr_geometry(size, shrink, conf)
+    if hr.width * hr.height > images.MAX_PNG_PIXELS:
+        raise XrgsError(
+            f"an HR view of {hr.width}x{hr.height} px has more than {images.MAX_PNG_PIXELS} "
+            f"pixels; lower variant.long_side={conf.long_side}"
+        )
+    return hr
+
+
 def _resize_and_crop(image: images.ImageArray, hr: HrGeometry) -> images.ImageArray:
     left, top = hr.crop_offset
     return images.resize(image, *hr.resized)[top : top + hr.height, left : left + hr.width]
 
 
 def _read_sizes(
-    files: Sequence[Path | ConfinedPath],
-) -> tuple[dict[Path | ConfinedPath, tuple[int, int]], dict[Path | ConfinedPath, str]]:
+    files: Sequence[ConfinedPath],
+) -> tuple[dict[ConfinedPath, tuple[int, int]], dict[ConfinedPath, str]]:
     """Read the size of each file, or the message that says why it has none."""
-    sizes: dict[Path | ConfinedPath, tuple[int, int]] = {}
-    unreadable: dict[Path | ConfinedPath, str] = {}
+    sizes: dict[ConfinedPath, tuple[int, int]] = {}
+    unreadable: dict[ConfinedPath, str] = {}
     for file in files:
         try:
             sizes[file] = images.size(file)
@@ -192,7 +204,7 @@ def _read_sizes(
 
 
 def assign_cameras(
-    files: Sequence[Path | ConfinedPath], sizes: Sequence[tuple[int, int]], policy: str
+    files: Sequence[ConfinedPath], sizes: Sequence[tuple[int, int]], policy: str
 ) -> list[str]:
     """Name the camera of each photograph; photographs with one name share it in SfM.
 

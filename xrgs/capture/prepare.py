@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from xrgs.capture import dataset, variant
+from xrgs.safeio.confined import ConfinedPath
 
 if TYPE_CHECKING:
     from xrgs.capture.dataset import Dataset
@@ -29,7 +30,8 @@ def build_dataset(conf: Conf) -> Dataset:
         SceneFailed: COLMAP can't place enough views.
         XrgsError: A value of the config or a photograph is wrong; the message names it.
     """
-    store = Path(conf.store)
+    store = ConfinedPath(Path(conf.store))
+    store.make_root()
     built = variant.build(conf.scene, conf.variant, store / "variants", store / "scenes")
     return dataset.load(built, conf.train.views)
 

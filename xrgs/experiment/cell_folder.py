@@ -30,6 +30,7 @@ if TYPE_CHECKING:
 
     from xrgs.capture.dataset import Dataset
     from xrgs.config import Conf
+    from xrgs.safeio.confined import ConfinedPath
     from xrgs.splat.cameras import Camera
     from xrgs.splat.gaussians import Gaussians
 

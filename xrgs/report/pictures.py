@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 from functools import partial
 from itertools import islice
@@ -12,7 +11,7 @@ import pandas as pd
 
 from xrgs.capture import images
 from xrgs.capture.images import ImageError
-from xrgs.errors import StoreError
+from xrgs.errors import StoreError, UnreadableError
 from xrgs.experiment.store import BASELINE
 from xrgs.report.collect import ReportError
 from xrgs.report.figures import Panel, curves, differing_crop, side_by_side, trade_off
@@ -233,9 +232,7 @@ def _title(pair: pd.Series) -> str:
 
 def _image(file: ConfinedPath) -> NDArray[np.float32]:
     try:
-        if math.prod(images.size(file)) > _MAX_PIXELS:
-            raise ImageError("too large to be drawn")
-        return images.read(file)
-    except (OSError, ImageError) as error:
+        return images.read_png(file, max_pixels=_MAX_PIXELS)
+    except (UnreadableError, ImageError) as error:
         # The path inside the store: the report is the same wherever the store is.
         raise ReportError(f"{'/'.join(file.parts)} can't be read") from error

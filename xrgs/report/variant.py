@@ -47,14 +47,16 @@ def describe(path: Path | ConfinedPath, out: Path | None = None) -> str:
             lambda: for_line(f"{report.get('scene')}: failed, so there are no views"),
         )
     frozen = variant.load(folder)
+    sheet, notes = contact_sheet(frozen)
     file = out or Path(f"{frozen.id}.png")
     try:
         with atomic_writer(file) as stream:
-            contact_sheet(frozen).save(stream, "PNG")
+            sheet.save(stream, "PNG")
     except OSError as error:
         raise XrgsError(f"out={file}: can't be written ({error})") from error
     text = _lines(folder, frozen.report, lambda: to_text(views_table(frozen)))
-    return f"{text}\n{for_line(f'Contact sheet: {file}')}"
+    more = [f"Contact sheet: {file}", *(f"  {note}" for note in notes)]
+    return "\n".join([text, *map(for_line, more)])
 
 
 def _lines(folder: ConfinedPath, report: Mapping[str, Any], first: Callable[[], str]) -> str:

@@ -10,6 +10,7 @@ import pytest
 from xrgs.capture import images, scenes
 from xrgs.config import SceneConf
 from xrgs.errors import XrgsError
+from xrgs.safeio.confined import ConfinedPath
 
 Fill = Callable[..., SceneConf]
 
@@ -23,7 +24,9 @@ def test_an_llff_scene_gives_the_smallest_copies_that_suffice(
     for folder, size in {"images": 400, "images_4": 100, "images_8": 50}.items():
         fill(tmp_path / folder, "a.png", "b.png", size=(size, size * 3 // 4))
     (tmp_path / "poses_bounds.npy").write_bytes(b"never read")
-    scene = scenes.resolve(SceneConf("fern", "folder", str(tmp_path)), tmp_path, long_side)
+    scene = scenes.resolve(
+        SceneConf("fern", "folder", str(tmp_path)), ConfinedPath(tmp_path), long_side
+    )
     assert images.size(scene.files[0])[0] == width
 
 
@@ -33,8 +36,8 @@ def test_copies_are_measured_by_their_largest_photograph(fill: Fill, tmp_path: P
     fill(tmp_path / "images_4", "a.png", size=(60, 45))
     fill(tmp_path / "images_4", "b.png", size=(100, 75))
     (tmp_path / "images_4" / "c.png").write_text("no image")
-    scene = scenes.resolve(SceneConf("x", "folder", str(tmp_path)), tmp_path, 100)
-    assert scene.files[0].parent.name == "images_4"
+    scene = scenes.resolve(SceneConf("x", "folder", str(tmp_path)), ConfinedPath(tmp_path), 100)
+    assert scene.files[0].path.parent.name == "images_4"
 
 
 @pytest.mark.parametrize(
@@ -55,6 +58,6 @@ def test_a_folder_without_a_scene_is_refused(
 
 def test_a_missing_folder_or_path_names_the_key(tmp_path: Path) -> None:
     with pytest.raises(XrgsError, match=r"scene\.path=.*nowhere: no such folder"):
-        scenes.resolve(SceneConf("x", "folder", str(tmp_path / "nowhere")), tmp_path)
+        scenes.resolve(SceneConf("x", "folder", str(tmp_path / "nowhere")), ConfinedPath(tmp_path))
     with pytest.raises(XrgsError, match=r"scene\.path is empty"):
-        scenes.resolve(SceneConf("x", "folder", None), tmp_path)
+        scenes.resolve(SceneConf("x", "folder", None), ConfinedPath(tmp_path))

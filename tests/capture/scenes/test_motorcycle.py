@@ -11,11 +11,12 @@ from xrgs.capture import images, scenes
 from xrgs.capture.scenes import motorcycle
 from xrgs.capture.scenes.bundled import bundled_photograph
 from xrgs.config import SceneConf
+from xrgs.safeio.confined import ConfinedPath
 
 
 def test_the_motorcycle_calibration_fits_its_disparity(tmp_path: Path) -> None:
     """With depth = baseline f / (disparity + cx_right - cx_left), left pixels reproject right."""
-    scene = scenes.resolve(SceneConf("motorcycle", "motorcycle"), tmp_path)
+    scene = scenes.resolve(SceneConf("motorcycle", "motorcycle"), ConfinedPath(tmp_path))
     assert [file.stem for file in scene.files] == ["motorcycle_left", "motorcycle_right"]
     assert images.size(scene.files[0]) == (741, 500)
     disparity = np.load(bundled_photograph("motorcycle_disp.npz"))["arr_0"]

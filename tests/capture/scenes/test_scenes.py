@@ -15,6 +15,7 @@ from xrgs.capture import images, scenes
 from xrgs.capture.scenes import procedural
 from xrgs.config import SceneConf
 from xrgs.errors import XrgsError
+from xrgs.safeio.confined import ConfinedPath
 
 Fill = Callable[..., SceneConf]
 PROCEDURAL = SceneConf("procedural", "procedural", None, 3)
@@ -28,7 +29,7 @@ def test_a_folder_is_its_images_sorted_by_name(fill: Fill, tmp_path: Path) -> No
     conf = fill(tmp_path / "my scene é", "b 1.png", "ä.JPG", "a,2.jpeg")
     (tmp_path / "my scene é" / "notes.txt").write_text("no image")
     (tmp_path / "my scene é" / ".hidden.png").write_bytes(b"")
-    scene = scenes.resolve(conf, tmp_path / "cache")
+    scene = scenes.resolve(conf, ConfinedPath(tmp_path) / "cache")
     assert stems(scene) == ["a,2", "b 1", "ä"]
     assert scene.name == scenes.label(conf) == "my scene é"
     assert not scene.intrinsics
@@ -38,7 +39,7 @@ def test_a_folder_is_its_images_sorted_by_name(fill: Fill, tmp_path: Path) -> No
 
 def test_a_given_name_wins_over_the_folders(fill: Fill, tmp_path: Path) -> None:
     conf = replace(fill(tmp_path / "x", "a.png", "b.png"), name="garden")
-    assert scenes.resolve(conf, tmp_path).name == "garden"
+    assert scenes.resolve(conf, ConfinedPath(tmp_path)).name == "garden"
 
 
 def test_the_fingerprint_follows_names_and_bytes_alone(fill: Fill, tmp_path: Path) -> None:
@@ -57,27 +58,29 @@ def test_the_fingerprint_follows_names_and_bytes_alone(fill: Fill, tmp_path: Pat
 
 def test_an_unknown_kind_names_the_key(tmp_path: Path) -> None:
     with pytest.raises(XrgsError, match=r"scene\.kind=llff: unknown; must be one of procedural"):
-        scenes.resolve(SceneConf("x", "llff", str(tmp_path)), tmp_path)
+        scenes.resolve(SceneConf("x", "llff", str(tmp_path)), ConfinedPath(tmp_path))
 
 
 def test_the_procedural_scene_is_rendered_once(tmp_path: Path) -> None:
-    first = scenes.resolve(PROCEDURAL, tmp_path, 60)
+    first = scenes.resolve(PROCEDURAL, ConfinedPath(tmp_path), 60)
     assert stems(first) == ["view_000", "view_001", "view_002"]
     assert images.size(first.files[0]) == (60, 45)
     assert first.viewmats.keys() == set(stems(first))
     assert not first.intrinsics  # SfM is to find them, as in a real capture
-    times = [file.stat().st_mtime_ns for file in first.files]
-    again = scenes.resolve(PROCEDURAL, tmp_path, 60)
-    assert [file.stat().st_mtime_ns for file in again.files] == times
-    assert [p.name for p in tmp_path.iterdir()] == [first.fingerprint]
+    times = [file.lstat().st_mtime_ns for file in first.files]
+    again = scenes.resolve(PROCEDURAL, ConfinedPath(tmp_path), 60)
+    assert [file.lstat().st_mtime_ns for file in again.files] == times
+    assert [p.name for p in tmp_path.iterdir() if p.name[0] != "."] == [first.fingerprint]
 
 
 def test_two_processes_that_render_at_once_get_one_complete_scene(tmp_path: Path) -> None:
     with ThreadPoolExecutor(2) as pool:
-        found = list(pool.map(lambda _: scenes.resolve(PROCEDURAL, tmp_path, 60), range(2)))
+        found = list(
+            pool.map(lambda _: scenes.resolve(PROCEDURAL, ConfinedPath(tmp_path), 60), range(2))
+        )
     assert found[0].files == found[1].files
     assert all(images.read(file).shape == (45, 60, 3) for file in found[0].files)
-    assert [p.name for p in tmp_path.iterdir()] == [found[0].fingerprint]
+    assert [p.name for p in tmp_path.iterdir() if p.name[0] != "."] == [found[0].fingerprint]
 
 
 def test_size_and_number_of_views_are_in_the_fingerprint() -> None:
@@ -94,7 +97,7 @@ def test_size_and_number_of_views_are_in_the_fingerprint() -> None:
 
 def test_one_view_is_too_few(tmp_path: Path) -> None:
     with pytest.raises(XrgsError, match=r"scene\.views=1"):
-        scenes.resolve(replace(PROCEDURAL, views=1), tmp_path)
+        scenes.resolve(replace(PROCEDURAL, views=1), ConfinedPath(tmp_path))
 
 
 def test_fingerprints_need_neither_torch_nor_scikit_image() -> None:

@@ -6,20 +6,20 @@ Nothing here imports torch before an embedded scene is rendered.
 from __future__ import annotations
 
 import hashlib
-import secrets
-from contextlib import suppress
 from typing import TYPE_CHECKING
 
 from xrgs.capture.scenes import folder, motorcycle, procedural
+from xrgs.capture.scenes.rendered import provide, verify
 from xrgs.capture.scenes.scene import Scene
 from xrgs.errors import XrgsError
 from xrgs.safeio.confined import ConfinedPath
 from xrgs.safeio.paths import user_path
+from xrgs.safeio.words import for_line
 
 if TYPE_CHECKING:
     from xrgs.config import SceneConf
 
-__all__ = ["Scene", "fingerprint", "label", "resolve"]
+__all__ = ["Scene", "fingerprint", "label", "resolve", "verify"]
 
 _KINDS = ("procedural", "motorcycle", "folder")
 
@@ -31,11 +31,11 @@ def label(conf: SceneConf) -> str:
         conf: The scene's config.
 
     Returns:
-        `scene.name`; where that is empty, the name of the folder, or the kind of the scene.
+        `scene.name`; where that is empty, the name of the folder, or the kind of the scene. It is
+        one line of at most 200 characters that can be printed.
     """
-    if conf.name:
-        return conf.name
-    return user_path(conf.path).resolve().name if conf.path else conf.kind
+    name = conf.name or (user_path(conf.path).resolve().name if conf.path else "")
+    return for_line(name, 200).strip() or conf.kind
 
 
 def fingerprint(conf: SceneConf, long_side: int = 0) -> str:
@@ -76,18 +76,18 @@ def resolve(conf: SceneConf, cache: ConfinedPath, long_side: int = 0) -> Scene:
         The scene.
 
     Raises:
+        UnreadableError: The rendered scene is there, but can't be read now.
         XrgsError: The kind is unknown, or the photographs are not there.
     """
     name, scene_hash = label(conf), fingerprint(conf, long_side)
     if conf.kind == "folder":
-        return Scene(name, scene_hash, folder.list_photographs(conf.path, long_side))
+        files = folder.list_photographs(conf.path, long_side)
+        return Scene(name, scene_hash, tuple(map(ConfinedPath, files)))
     if conf.kind == "motorcycle":
         known, exact = motorcycle.intrinsics(), motorcycle.viewmats()
-        return Scene(name, scene_hash, motorcycle.files(), known, exact)
-    names = procedural.names(conf.views)
-    home = cache / scene_hash
-    if not home.is_dir():
-        _render(conf, home, long_side)
+        return Scene(name, scene_hash, tuple(map(ConfinedPath, motorcycle.files())), known, exact)
+    names, home = procedural.names(conf.views), cache / scene_hash
+    provide(home, [f"{n}.png" for n in names], lambda work: _render(work, long_side, conf.views))
     exact = dict(zip(names, procedural.viewmats(conf.views), strict=True))
     # The intrinsics are known too, but SfM estimates them, as for a real capture.
     return Scene(name, scene_hash, tuple(home / f"{n}.png" for n in names), viewmats=exact)
@@ -100,15 +100,7 @@ def _check(conf: SceneConf) -> None:
         raise XrgsError(f"scene.views={conf.views}: must be 2 or more")
 
 
-def _render(conf: SceneConf, home: ConfinedPath, long_side: int) -> None:
-    """Render into a temporary folder and rename it to `home`, unless another process has one."""
-    from xrgs.capture.scenes import still_life
+def _render(folder: ConfinedPath, long_side: int, views: int) -> None:
+    from xrgs.capture.scenes import still_life  # imports torch
 
-    rendered = home.with_name(f".rendering-{secrets.token_hex(4)}")
-    rendered.make_folder()
-    try:
-        still_life.render(rendered, long_side, conf.views)
-        with suppress(FileExistsError):  # another process was faster
-            rendered.rename(home)
-    finally:
-        rendered.remove()
+    still_life.render(folder, long_side, views)

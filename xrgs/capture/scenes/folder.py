@@ -8,15 +8,20 @@ read.
 from __future__ import annotations
 
 import hashlib
+import logging
 import re
 import unicodedata
 from pathlib import Path
 
 from xrgs.capture import images
-from xrgs.errors import XrgsError
+from xrgs.errors import UnreadableError, XrgsError
 from xrgs.runtime.progress import progress
 from xrgs.safeio import untrusted
+from xrgs.safeio.hashing import file_digest
 from xrgs.safeio.paths import user_path
+from xrgs.safeio.words import for_line
+
+_log = logging.getLogger(__name__)
 
 #: The suffixes of files that are read as photographs, in lower case.
 SUFFIXES = frozenset({".bmp", ".jpeg", ".jpg", ".png", ".tif", ".tiff", ".webp"})
@@ -35,16 +40,21 @@ def list_photographs(path: str | None, long_side: int) -> tuple[Path, ...]:
         At least two files, sorted by name.
 
     Raises:
+        UnreadableError: The folder can't be read now.
         XrgsError: There is no such folder, it holds fewer than two images or two of one name, or a
             name can't be used.
     """
     if not path:
         raise XrgsError("scene.path is empty: give the folder of photographs, scene.path=...")
     folder = user_path(path)
-    if not folder.is_dir():
-        raise XrgsError(f"scene.path={folder}: no such folder (scene=llff/... looks in data_root)")
-    copies = [_images_in(f) for f in sorted(folder.iterdir()) if _is_llff_folder(f)]
-    files = _select_copies([c for c in copies if c], long_side) or _images_in(folder)
+    try:
+        if not folder.is_dir():
+            why = "no such folder (scene=llff/... looks in data_root)"
+            raise XrgsError(f"scene.path={folder}: {why}")
+        copies = [_images_in(f) for f in sorted(folder.iterdir()) if _is_llff_folder(f)]
+        files = _select_copies([c for c in copies if c], long_side) or _images_in(folder)
+    except OSError as error:
+        raise UnreadableError(f"{error.filename}: {error.strerror}; try again") from error
     if len(files) < 2:
         count = f"only {files[0].name}" if files else "no image"
         suffixes = " ".join(sorted(SUFFIXES))
@@ -72,11 +82,18 @@ def files_digest(files: tuple[Path, ...]) -> str:
 
     Returns:
         All 64 hexadecimal digits of a SHA-256.
+
+    Raises:
+        UnreadableError: A file can't be read now. It is not left out: the hash would be another one
+            whenever a disk or a server fails.
     """
     sha256 = hashlib.sha256()
     for file in progress(files, "hashing photographs", "file"):
-        with file.open("rb") as stream:
-            content = hashlib.file_digest(stream, "sha256").hexdigest()
+        try:
+            content = file_digest(file)
+        except OSError as error:
+            why = f"{error.strerror}; try again, or move it out of the folder"
+            raise UnreadableError(f"{file}: {why}") from error
         sha256.update(f"{file.name}\0{content}\n".encode())
     return sha256.hexdigest()
 
@@ -86,8 +103,14 @@ def _is_llff_folder(folder: Path) -> bool:
 
 
 def _images_in(folder: Path) -> tuple[Path, ...]:
-    files = (f for f in folder.iterdir() if f.suffix.lower() in SUFFIXES and f.is_file())
-    return tuple(sorted((f for f in files if not f.name.startswith(".")), key=lambda f: f.name))
+    """List the regular files that are photographs by their suffix, and the links to such files."""
+    files = sorted(folder.iterdir(), key=lambda file: file.name)
+    named = [f for f in files if f.suffix.lower() in SUFFIXES and not f.name.startswith(".")]
+    for file in named:
+        if not file.is_file() and not file.is_dir():
+            why = "not a regular file, nor a link to one (a pipe, a device?)"
+            _log.warning("%s: %s; left out", for_line(str(file)), why)
+    return tuple(file for file in named if file.is_file())
 
 
 def _select_copies(copies: list[tuple[Path, ...]], long_side: int) -> tuple[Path, ...]:

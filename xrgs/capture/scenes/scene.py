@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,8 +22,8 @@ class Scene:
     """The name of the scene in tables."""
     fingerprint: str
     """A hash of the photographs' names and bytes, or of what they are rendered from."""
-    files: tuple[Path | ConfinedPath, ...]
-    """The photographs, sorted by name."""
+    files: tuple[ConfinedPath, ...]
+    """The photographs, sorted by name; one that a user named is a path by itself."""
     intrinsics: Mapping[str, NDArray[np.float64]] = field(default_factory=dict)
     """Exact intrinsics [3, 3] in px of the file, without distortion; SfM gets them, and does not
     refine them."""
