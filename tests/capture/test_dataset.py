@@ -9,6 +9,7 @@ import torch
 
 from xrgs.capture import dataset, images
 from xrgs.capture.dataset import LoadedView
+from xrgs.capture.images import ImageError
 from xrgs.capture.views import Variant, View
 from xrgs.errors import XrgsError
 from xrgs.safeio.confined import ConfinedPath
@@ -117,3 +118,27 @@ def test_a_use_without_views_is_refused(variant: Variant) -> None:
         XrgsError, match=r"train\.views=best: must be one of mixed, all_hr, hr_only, lr_only"
     ):
         dataset.load(variant, "best")
+
+
+def test_an_image_of_another_size_than_the_list_says_is_named(variant: Variant) -> None:
+    views = tuple(replace(v, width=v.width + 1) if v.name == "v3" else v for v in variant.views)
+    with pytest.raises(ImageError, match=r"train/v3\.png: .*it has 20 x 15 pixels, not 21 x 15"):
+        dataset.load(replace(variant, views=views))
+
+
+@pytest.mark.parametrize("of", ["points", "cameras", "nothing"])
+def test_a_world_that_cant_be_normalised_is_one_line(variant: Variant, of: str) -> None:
+    """Points beyond float64's range, cameras whose up axes cancel out, and no camera at all."""
+    points, views = variant.points, variant.views
+    if of == "points":
+        points = np.full((5, 3), 1e300) * np.arange(5)[:, None]
+    elif of == "cameras":
+        half_turn = np.diag([-1.0, -1.0, 1.0, 1.0])
+        upright = (replace(v, viewmat=np.eye(4)) for v in views if v.split != "original")
+        views = tuple(
+            replace(v, viewmat=half_turn) if i % 2 else v for i, v in enumerate([*upright][:4])
+        )
+    else:
+        views = ()
+    with pytest.raises(XrgsError, match="its cameras and points can't be of one scene"):
+        dataset.load(replace(variant, points=points, views=views))

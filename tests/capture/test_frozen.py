@@ -24,7 +24,7 @@ from xrgs.safeio.confined import ConfinedPath
 
 Forge = Callable[..., Path]
 Edit = Callable[[dict[str, Any]], object]
-_COLORS = np.zeros((2, 3), np.uint8)
+_COLORS = np.zeros((5, 3), np.uint8)
 
 
 def make(folder: Path) -> Variant:
@@ -36,7 +36,7 @@ def make(folder: Path) -> Variant:
         file.path.parent.mkdir(parents=True)
         Image.new("RGB", (4, 3)).save(file.path)
         views.append(View(name, file, split, "HR", 4, 3, np.eye(3), np.eye(4), 1.0))
-    return Variant("", work, "scene", 5, True, tuple(views), np.ones((2, 3)), _COLORS, {})
+    return Variant("", work, "scene", 5, True, tuple(views), np.ones((5, 3)), _COLORS, {})
 
 
 @pytest.fixture(scope="module")
@@ -158,15 +158,16 @@ def test_a_wrong_value_in_the_list_is_refused_and_named(
 @pytest.mark.parametrize(
     "arrays",
     [
-        {"points": np.full((2, 3), np.nan), "colors": _COLORS},
-        {"points": np.full((2, 3), 1e308), "colors": _COLORS},
-        {"points": np.ones((2, 3), np.float32), "colors": _COLORS},
-        {"points": np.ones(6), "colors": _COLORS},
+        {"points": np.full((5, 3), np.nan), "colors": _COLORS},
+        {"points": np.full((5, 3), 1e308), "colors": _COLORS},
+        {"points": np.ones((5, 3), np.float32), "colors": _COLORS},
+        {"points": np.ones(15), "colors": _COLORS},
         {"points": np.float64(1), "colors": _COLORS},
         {"points": np.ones((0, 3)), "colors": _COLORS[:0]},
-        {"points": np.ones((2, 3)), "colors": np.zeros((3, 3), np.uint8)},
-        {"points": np.ones((2, 3)), "colors": np.zeros((2, 3))},
-        {"points": np.ones((2, 3))},
+        {"points": np.ones((3, 3)), "colors": _COLORS[:3]},
+        {"points": np.ones((5, 3)), "colors": np.zeros((3, 3), np.uint8)},
+        {"points": np.ones((5, 3)), "colors": np.zeros((5, 3))},
+        {"points": np.ones((5, 3))},
     ],
 )
 def test_wrong_points_are_refused(forge: Forge, arrays: dict[str, Any]) -> None:

@@ -2,10 +2,15 @@
 
 from __future__ import annotations
 
+import errno
 import io
+import os
+import re
+import stat
 import zlib
 from pathlib import Path
 from typing import Any
+from unittest.mock import Mock
 
 import pytest
 from hypothesis import HealthCheck, given, settings
@@ -14,6 +19,8 @@ from PIL import Image
 
 from xrgs.capture import images
 from xrgs.capture.images import ImageError
+from xrgs.errors import UnreadableError
+from xrgs.safeio.confined import ConfinedPath
 
 FAST = settings(
     max_examples=100, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
@@ -45,7 +52,7 @@ PHOTOGRAPHS = {kind: photograph(kind) for kind in ("PNG", "JPEG", "TIFF", "WEBP"
 def test_a_damaged_photograph_is_read_or_refused(tmp_path: Path, kind: str, change: Any) -> None:
     file = tmp_path / "a.png"
     file.write_bytes(changed(PHOTOGRAPHS[kind], change))
-    for reader in (images.size, images.exif_camera, images.read):
+    for reader in (images.size, images.exif_camera, images.read, images.read_png):
         try:
             reader(file)
         except ImageError as error:
@@ -74,3 +81,85 @@ def test_an_image_that_declares_too_many_pixels_is_refused(tmp_path: Path) -> No
     for reader in (images.size, images.read):
         with pytest.raises(ImageError, match=r"a\.png.*decompression bomb"):
             reader(tmp_path / "a.png")
+
+
+def bitmap(width: int, height: int) -> bytes:
+    """A BMP of one pixel whose header declares this size."""
+    stream = io.BytesIO()
+    Image.new("RGB", (1, 1)).save(stream, "BMP")
+    content = stream.getvalue()
+    return content[:18] + width.to_bytes(4, "little") + height.to_bytes(4, "little") + content[26:]
+
+
+def test_a_photograph_of_200_megapixels_is_admitted_and_a_larger_one_refused(
+    tmp_path: Path,
+) -> None:
+    (tmp_path / "a.bmp").write_bytes(bitmap(16_320, 12_240))
+    assert images.size(tmp_path / "a.bmp") == (16_320, 12_240)
+    (tmp_path / "a.bmp").write_bytes(bitmap(1 << 14, 1 << 14))
+    assert images.size(tmp_path / "a.bmp") == (1 << 14, 1 << 14)
+    (tmp_path / "a.bmp").write_bytes(bitmap(1 << 14, (1 << 14) + 1))
+    for reader in (images.size, images.read):
+        with pytest.raises(ImageError, match=r"a\.bmp: "):
+            reader(tmp_path / "a.bmp")
+
+
+@pytest.mark.parametrize("kind", ["BMP", "JPEG", "TIFF", "WEBP"])
+def test_images_of_stores_are_pngs_alone(tmp_path: Path, kind: str) -> None:
+    file = tmp_path / "a.png"
+    Image.new("RGB", (9, 9)).save(file, kind)
+    assert images.read(file).shape == (9, 9, 3)
+    with pytest.raises(ImageError, match=r"a\.png: .*cannot identify"):
+        images.read_png(file)
+
+
+@pytest.mark.parametrize("mode", ["L", "P", "RGBA", "I;16", "1"])
+def test_images_of_stores_have_8_bit_rgb_pixels_alone(tmp_path: Path, mode: str) -> None:
+    Image.new(mode, (9, 9)).save(tmp_path / "a.png")
+    with pytest.raises(ImageError, match=r"a\.png: .*not 8-bit RGB"):
+        images.read_png(tmp_path / "a.png")
+
+
+@pytest.mark.parametrize("kind", ["pipe", "folder", "socket"])
+def test_what_is_no_regular_file_is_refused_at_once(tmp_path: Path, kind: str) -> None:
+    file = tmp_path / "a.png"
+    if kind == "pipe":
+        os.mkfifo(file)
+    elif kind == "folder":
+        file.mkdir()
+    else:
+        os.mknod(file, 0o600 | stat.S_IFSOCK)
+    for reader in (images.size, images.exif_camera, images.read, images.read_png):
+        with pytest.raises(ImageError, match=r"a\.png: "):
+            reader(file)
+
+
+def test_a_file_that_cant_be_read_now_is_not_called_damaged(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """At once, or in the middle of its content."""
+    file = tmp_path / "a.png"
+    file.write_bytes(PHOTOGRAPHS["PNG"])
+    failure = OSError(errno.EIO, os.strerror(errno.EIO))
+
+    class Sick(io.BytesIO):
+        def read(self, size: int | None = -1, /) -> bytes:
+            if self.tell() > 60:
+                raise failure
+            return super().read(size)
+
+    for opened in (lambda _: Sick(PHOTOGRAPHS["PNG"]), Mock(side_effect=failure)):
+        monkeypatch.setattr(ConfinedPath, "open", opened)
+        for reader in (images.read, images.read_png):
+            with pytest.raises(UnreadableError, match=r"a\.png: Input/output error; try again"):
+                reader(file)
+
+
+def test_only_this_module_decodes_images() -> None:
+    package = Path(images.__file__).parents[1]
+    users = {
+        file.relative_to(package).as_posix()
+        for file in package.rglob("*.py")
+        if re.search(r"\bImage\.open\(|\bimread\(", file.read_text(encoding="utf-8"))
+    }
+    assert users == {"capture/images.py"}

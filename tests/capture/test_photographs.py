@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -10,7 +11,7 @@ from xrgs.capture import images
 from xrgs.capture.photographs import assign_cameras, prepare_hr_views
 from xrgs.capture.scenes import Scene
 from xrgs.config import SfmConf, VariantConf
-from xrgs.errors import XrgsError
+from xrgs.errors import UnreadableError, XrgsError
 from xrgs.safeio.confined import ConfinedPath
 
 CONF = VariantConf(long_side=0, factor=2, sfm=SfmConf(camera="auto"))
@@ -112,3 +113,38 @@ def test_a_file_without_a_header_is_left_out_too(tmp_path: Path) -> None:
     photos = prepare_hr_views(Scene("x", "", tuple(files)), CONF, tmp_path)
     assert photos.names == ["a", "c"]
     assert "b.png" in photos.unreadable[0]
+
+
+@pytest.mark.parametrize("failing", ["size", "read"])
+def test_a_photograph_that_cant_be_read_now_is_not_left_out(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, failing: str
+) -> None:
+    """A variant without it would be frozen as that of all photographs."""
+    files = [write_photograph(tmp_path / f"{name}.png") for name in "abc"]
+    reader = getattr(images, failing)
+
+    def fails(file: ConfinedPath) -> object:
+        if file.name == "b.png":
+            raise UnreadableError("b.png: Input/output error")
+        return reader(file)
+
+    monkeypatch.setattr(images, failing, fails)
+    with pytest.raises(UnreadableError, match=r"b\.png"):
+        prepare_hr_views(Scene("x", "", tuple(files)), CONF, tmp_path)
+
+
+def test_an_hr_view_that_no_variant_may_have_names_the_key(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(images, "MAX_PNG_PIXELS", 60 * 40 - 1)
+    files = [write_photograph(tmp_path / f"{name}.png") for name in "ab"]
+    with pytest.raises(XrgsError, match=r"a\.png: an HR view of 60x40 px .*variant\.long_side=0"):
+        prepare_hr_views(Scene("x", "", tuple(files)), CONF, tmp_path)
+
+
+def test_a_camera_with_damaged_exif_is_one_without(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    file = write_photograph(tmp_path / "a.jpg", model="X")
+    monkeypatch.setattr(Image.Exif, "get_ifd", Mock(side_effect=SyntaxError("damaged")))
+    assert images.exif_camera(file) == "Maker/X"

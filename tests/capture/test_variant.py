@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import ast
+import errno
 import json
+import os
 import shutil
 import subprocess
 import sys
@@ -20,7 +22,7 @@ from xrgs.capture.failures import failed_scenes
 from xrgs.capture.variant import CorruptVariant
 from xrgs.capture.views import SceneFailed, Variant
 from xrgs.config import SceneConf, VariantConf
-from xrgs.errors import XrgsError
+from xrgs.errors import UnreadableError, XrgsError
 from xrgs.safeio.confined import ConfinedPath
 from xrgs.safeio.hashing import source_digests
 
@@ -32,7 +34,7 @@ PACKAGE = Path(xrgs.__file__).parent
 
 
 def test_a_loaded_variant_is_the_one_that_was_built(stereo_variant: Variant) -> None:
-    loaded = variant.load(stereo_variant.path)
+    loaded = variant.load(stereo_variant.folder)
     assert (loaded.id, loaded.path) == (stereo_variant.id, stereo_variant.path)
     assert loaded.report == stereo_variant.report
     assert np.array_equal(loaded.points, stereo_variant.points)
@@ -142,15 +144,57 @@ def test_a_corrupt_variant_is_built_anew_with_a_warning(
         damaged = bytearray(target.read_bytes())
         damaged[len(damaged) // 2] ^= 1
         target.write_bytes(damaged)
+    damaged_bytes = target.read_bytes() if target.exists() else b""
     with pytest.raises(CorruptVariant, match=str(copy)):
         variant.load(copy)
     key = variant.key(stereo_scene, small_conf(stereo_scene))
     assert variant.find(store / "variants", key) is None
     assert "built anew" in caplog.text
     rebuilt = build(stereo_scene)
+    aside = store / "variants" / f".{copy.name}.aside-1"
+    assert f"renamed to {aside.name}" in caplog.text
+    if damage != "image gone":  # nothing is lost
+        assert (aside / target.relative_to(copy)).read_bytes() == damaged_bytes
     found = variant.find(store / "variants", key)
     assert found is not None
     assert found.id == rebuilt.id
+
+
+@pytest.mark.parametrize("name", ["variant.json", "points.npz"])
+def test_a_variant_that_cant_be_read_now_is_neither_removed_nor_built_anew(
+    stereo_variant: Variant,
+    stereo_scene: SceneConf,
+    store: Path,
+    build: Build,
+    name: str,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    copy = store / "variants" / stereo_variant.path.name
+    shutil.copytree(stereo_variant.path, copy)
+    before = sorted(path.name for path in copy.parent.iterdir())
+    opened = ConfinedPath._open_regular
+
+    def fails(self: ConfinedPath, flags: int) -> int:
+        if self.name == name:
+            raise OSError(errno.EIO, os.strerror(errno.EIO), str(self))
+        return opened(self, flags)
+
+    monkeypatch.setattr(ConfinedPath, "_open_regular", fails)
+    with pytest.raises(UnreadableError, match=f"{name}: Input/output error; try again"):
+        build(stereo_scene)
+    monkeypatch.undo()
+    assert sorted(p.name for p in copy.parent.iterdir() if not p.name.endswith(".lock")) == before
+    assert build(stereo_scene).id == copy.name
+
+
+def test_a_failure_is_forgotten_where_its_report_is_damaged(tmp_path: Path) -> None:
+    assert variant.failure(tmp_path / "nowhere", "key") is None
+    report = tmp_path / "failed-key" / "report.json"
+    report.parent.mkdir()
+    report.write_text('{"scene": "leaves", "reason": "too few"}')
+    assert variant.failure(tmp_path, "key") == "too few"
+    report.write_text("{")
+    assert variant.failure(tmp_path, "key") is None
 
 
 def test_what_a_killed_process_left_is_removed(

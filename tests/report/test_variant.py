@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import json
+import os
+import resource
 import shutil
+import zlib
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -18,16 +21,17 @@ from xrgs.capture.views import Variant, View
 from xrgs.errors import XrgsError
 from xrgs.report import variant as inspect
 from xrgs.report.render import to_text
+from xrgs.safeio.confined import ConfinedPath
 
 Run = Callable[..., tuple[int, str, str]]
 
 
 def view(folder: Path, name: str, split: str, tag: str, size: tuple[int, int], rho: float) -> View:
     """Of noise: no two of its pixels are alike."""
-    file = folder / split / f"{name}.png"
-    file.parent.mkdir(parents=True, exist_ok=True)
+    file = ConfinedPath(folder) / f"{split}/{name}.png"
+    file.make_parent()
     pixels = np.random.default_rng(len(name)).integers(0, 256, (size[1], size[0], 3))
-    Image.fromarray(pixels.astype(np.uint8)).save(file)
+    Image.fromarray(pixels.astype(np.uint8)).save(file.path)
     return View(name, file, split, tag, *size, np.eye(3), np.eye(4), rho)
 
 
@@ -42,8 +46,9 @@ def mixed(tmp_path: Path) -> Variant:
     )
     report: dict[str, Any] = {"hr": ["a"], "lr": ["b-low", "lost"]}
     nothing = np.zeros((0, 3))
+    folder = ConfinedPath(tmp_path)
     return Variant(
-        "key-hash", tmp_path, "room", 5, True, views, nothing, nothing.astype(np.uint8), report
+        "key-hash", folder, "room", 5, True, views, nothing, nothing.astype(np.uint8), report
     )
 
 
@@ -81,12 +86,12 @@ def test_a_variant_is_built_described_and_drawn(xrgs_data: Run, tmp_path: Path) 
     image.write_bytes(image.read_bytes()[:-1])
     code, out, err = xrgs_data("inspect", str(folder))
     assert code == 1
-    assert "motorcycle_left.png: it has changed since it was frozen" in err
+    assert "motorcycle_left.png: it has changed since it was written" in err
     (folder / "variant.json").unlink()
     code, out, err = xrgs_data("inspect", str(folder))
     assert code == 1
     assert out == ""
-    assert "not a complete variant" in err
+    assert "variant.json: No such file or directory" in err
 
 
 def test_the_table_has_a_row_a_view_and_leaves_originals_out(mixed: Variant) -> None:
@@ -148,17 +153,17 @@ def test_a_failed_variant_says_what_was_tried(tmp_path: Path) -> None:
 
 
 def test_borders_tell_the_tag(mixed: Variant) -> None:
-    found = tiles(contact_sheet(mixed))
+    found = tiles(contact_sheet(mixed)[0])
     assert [tile[1, 1].tolist() for tile in found] == [
         rgb(COLOURS[k]) for k in ("HR", "LR", "test")
     ]
 
 
 def test_the_centre_shows_the_pixels_as_they_are(mixed: Variant) -> None:
-    high, low, _ = tiles(contact_sheet(mixed))
-    whole = np.asarray(Image.open(mixed.views[2].file))
+    high, low, _ = tiles(contact_sheet(mixed)[0])
+    whole = np.asarray(Image.open(mixed.views[2].file.path))
     assert np.array_equal(high[4:196, 264:456], whole[54:246, 104:296])
-    small = np.asarray(Image.open(mixed.views[3].file))
+    small = np.asarray(Image.open(mixed.views[3].file.path))
     centre = low[4:196, 264:456]
     for k in range(5):  # each pixel a square of 5
         block = centre[k::5, k::5]
@@ -166,11 +171,15 @@ def test_the_centre_shows_the_pixels_as_they_are(mixed: Variant) -> None:
 
 
 def test_a_small_view_is_magnified_and_a_large_one_shrunk(mixed: Variant) -> None:
-    high, low, _ = tiles(contact_sheet(mixed))
-    whole = np.asarray(Image.open(mixed.views[2].file).resize((256, 192), Image.Resampling.BOX))
+    high, low, _ = tiles(contact_sheet(mixed)[0])
+    whole = np.asarray(
+        Image.open(mixed.views[2].file.path).resize((256, 192), Image.Resampling.BOX)
+    )
     assert np.array_equal(high[4:196, 4:260], whole)
     shown = {tuple(pixel) for pixel in low[4:196, 4:260].reshape(-1, 3).tolist()}
-    stored = {tuple(p) for p in np.asarray(Image.open(mixed.views[3].file)).reshape(-1, 3).tolist()}
+    stored = {
+        tuple(p) for p in np.asarray(Image.open(mixed.views[3].file.path)).reshape(-1, 3).tolist()
+    }
     assert shown == stored  # no pixel is blended with another
 
 
@@ -179,11 +188,122 @@ def test_names_that_are_too_long_or_of_another_script_are_drawn(
 ) -> None:
     names = ("x" * 200, "фото 写真", "")
     views = tuple(replace(v, name=n) for v, n in zip(mixed.views[1:], names, strict=True))
-    sheet = contact_sheet(replace(mixed, views=views, scene="s" * 500))
-    assert sheet.size == contact_sheet(mixed).size
+    sheet = contact_sheet(replace(mixed, views=views, scene="s" * 500))[0]
+    assert sheet.size == contact_sheet(mixed)[0].size
 
 
-def test_a_view_that_is_gone_is_named(mixed: Variant) -> None:
-    mixed.views[2].file.unlink()
-    with pytest.raises(XrgsError, match=r"a\.png: unreadable or truncated"):
-        contact_sheet(mixed)
+@pytest.mark.parametrize(
+    ("damage", "why"),
+    [
+        ("gone", "No such file or directory"),
+        ("a pipe", "not a regular file"),
+        ("a JPEG", "cannot identify"),
+        ("truncated", "truncated"),
+        ("another size", "it has 13000 x 13000 pixels"),
+        ("too few bytes", "bytes are too few for 400 x 300 px"),
+        ("too large", "at most"),
+    ],
+)
+def test_one_image_that_cant_be_read_does_not_take_the_sheet(
+    mixed: Variant, damage: str, why: str
+) -> None:
+    view, file = mixed.views[2], mixed.views[2].file.path
+    content = file.read_bytes()
+    file.unlink()
+    if damage == "a pipe":
+        os.mkfifo(file)
+    elif damage == "a JPEG":
+        Image.new("RGB", (400, 300)).save(file, "JPEG")
+    elif damage == "truncated":
+        file.write_bytes(content[: len(content) // 2])
+    elif damage in {"another size", "too large"}:
+        file.write_bytes(flat_png(13_000, 13_000))
+    elif damage == "too few bytes":
+        file.write_bytes(flat_png(400, 300)[:200])
+    if damage == "too large":
+        view = replace(view, width=13_000, height=13_000)
+    views = (*mixed.views[:2], view, mixed.views[3])
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    sheet, notes = contact_sheet(replace(mixed, views=views))
+    assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 200_000  # kB
+    assert len(notes) == 1
+    assert str(file) in notes[0]
+    assert why in notes[0]
+    high, low, held_out = tiles(sheet)
+    assert len(np.unique(high[4:196, 4:456])) > 1  # it says so
+    assert held_out[4:196, 4:260].std() > 20  # the others are drawn as ever
+    assert low[4:196, 4:260].std() > 20
+
+
+def flat_png(width: int, height: int) -> bytes:
+    """A black PNG, made without its pixels in memory: 13,000 px a side take 0.5 MB."""
+    row = b"\0" * (3 * width + 1)
+    compressor = zlib.compressobj()
+    data = b"".join([*(compressor.compress(row) for _ in range(height)), compressor.flush()])
+    head = width.to_bytes(4, "big") + height.to_bytes(4, "big") + b"\x08\x02\0\0\0"
+    chunks = ((b"IHDR", head), (b"IDAT", data), (b"IEND", b""))
+    return b"\x89PNG\r\n\x1a\n" + b"".join(
+        len(body).to_bytes(4, "big") + kind + body + zlib.crc32(kind + body).to_bytes(4, "big")
+        for kind, body in chunks
+    )
+
+
+def test_only_so_many_views_are_drawn(mixed: Variant, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("xrgs.capture.contact_sheet._MAX_TILES", 2)
+    sheet, notes = contact_sheet(mixed)
+    assert notes == ["the first 2 of 3 views"]
+    two = contact_sheet(replace(mixed, views=(mixed.views[2], mixed.views[3])))[0]
+    assert np.array_equal(np.asarray(sheet)[32:], np.asarray(two)[32:])  # below the legend
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        {"lr": 5},
+        {"hr": [["a"]]},
+        {"not_registered": "abc"},
+        {"not_registered": ["x" * 10_000]},
+        {"not_registered": ["a"] * 20_000},
+        {"not_registered": [1]},
+        {"unreadable": [1]},
+        {"unreadable": 1},
+        {"attempts": [1]},
+        {"attempts": {"a": 1}},
+        {"rho": [1]},
+        {"rho": {"HR": ["a"]}},
+        {"rho": {"HR": [10**400]}},
+        {"pose_error": {"position_percent": 1.0}},
+        {"pose_error": 1},
+        {"reprojection_error_px": "a"},
+        {"reprojection_error_px": 10**400},
+        {"reprojection_error_px": None},
+    ],
+)
+def test_a_report_of_wrong_types_is_one_line(tmp_path: Path, wrong: dict[str, Any]) -> None:
+    folder = tmp_path / "failed-key"
+    folder.mkdir()
+    (folder / "report.json").write_text(json.dumps({"scene": "x"} | wrong))
+    with pytest.raises(XrgsError, match=r"report\.json: not a variant's report") as caught:
+        inspect.describe(folder)
+    assert len(str(caught.value).splitlines()) == 1
+    (folder / "report.json").write_text("[]")
+    with pytest.raises(XrgsError, match=r"report\.json: not a JSON object"):
+        inspect.describe(folder)
+
+
+def test_nothing_of_a_report_reaches_the_terminal_as_an_escape(tmp_path: Path) -> None:
+    folder = tmp_path / "failed-key"
+    folder.mkdir()
+    evil = "\x1b[2J\x07\n" + "x" * 5_000
+    report = {
+        "scene": evil,
+        "lr_images": evil,
+        "tags": evil,
+        "unreadable": [evil],
+        "attempts": [{"attempt": evil, "refused": evil}],
+    }
+    (folder / "report.json").write_text(json.dumps(report))
+    lines = inspect.describe(folder).split("\n")
+    assert all(line.isprintable() for line in lines)
+    assert len(lines) == 6
+    assert max(map(len, lines)) < 1_100

@@ -12,7 +12,7 @@ from xrgs.capture import images
 from xrgs.errors import XrgsError
 from xrgs.runtime.progress import progress
 from xrgs.splat.cameras import Camera
-from xrgs.splat.normalize import normalize_scene
+from xrgs.splat.normalize import NormalizedScene, normalize_scene
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -71,11 +71,12 @@ def load(variant: Variant, use: str = "mixed") -> Dataset:
     Raises:
         UnreadableError: An image can't be read now.
         ImageError: An image is missing, unreadable or not of its view's size; the message names it.
-        XrgsError: `use` is none of these, or the variant has no such views.
+        XrgsError: `use` is none of these, or the variant has no such views, or its cameras and
+            points can't be normalised.
     """
     training = _training_views(variant, use)
     posed = [view for view in variant.views if view.split != "original"]
-    world = normalize_scene(np.stack([view.viewmat for view in posed]), variant.points)
+    world = _normalized(variant, posed)
     viewmats = {
         (view.split, view.name): viewmat
         for view, viewmat in zip(posed, world.viewmats, strict=True)
@@ -95,6 +96,16 @@ def load(variant: Variant, use: str = "mixed") -> Dataset:
         scene_scale=world.scene_scale,
         factor=variant.factor,
     )
+
+
+def _normalized(variant: Variant, posed: list[View]) -> NormalizedScene:
+    """Normalise the world of a variant, which anybody may have made up."""
+    try:
+        with np.errstate(divide="raise", over="raise", invalid="raise"):
+            return normalize_scene(np.stack([view.viewmat for view in posed]), variant.points)
+    except (FloatingPointError, ValueError, np.linalg.LinAlgError) as error:
+        why = f"its cameras and points can't be of one scene ({error})"
+        raise XrgsError(f"{variant.path}: {why}") from error
 
 
 def _training_views(variant: Variant, use: str) -> list[View]:

@@ -39,6 +39,8 @@ _FREE_PIXELS, _PIXELS_PER_BYTE = 1 << 28, 100
 #: The largest number of a camera or a point. Training computes with their squares in float32.
 _MAX_NUMBER = 1e12
 _MAX_SCENE_NAME = 250
+#: The fewest points: a Gaussian's first size is the distance of a point to its three nearest.
+_MIN_POINTS = 4
 
 
 class CorruptVariant(XrgsError):  # noqa: N818
@@ -276,8 +278,10 @@ def _assembled(folder: ConfinedPath, content: dict[str, Any]) -> Variant:
         points, colors = arrays["points"], arrays["colors"]
     except (ValueError, KeyError) as error:
         raise StoreError(f"{file}: not the points of a variant ({error!r:.200})") from error
-    if points.dtype != np.float64 or points.shape != (points.size // 3, 3) or not points.size:
+    if points.dtype != np.float64 or points.shape != (points.size // 3, 3):
         raise StoreError(f"{file}: points are {points.dtype} {points.shape}, not float64 [P, 3]")
+    if len(points) < _MIN_POINTS:
+        raise StoreError(f"{file}: it has {len(points)} points, at least {_MIN_POINTS} are needed")
     if colors.dtype != np.uint8 or colors.shape != points.shape:
         raise StoreError(f"{file}: colors are {colors.dtype} {colors.shape}, not those of points")
     if not (np.abs(points) <= _MAX_NUMBER).all():

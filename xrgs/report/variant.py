@@ -7,19 +7,23 @@ from typing import TYPE_CHECKING, Any
 
 from xrgs.capture import variant
 from xrgs.capture.contact_sheet import contact_sheet
+from xrgs.capture.failures import FAILED_PREFIX
 from xrgs.errors import XrgsError
 from xrgs.report.render import TextTable, to_text
 from xrgs.safeio.atomic import atomic_writer
 from xrgs.safeio.confined import confined
-from xrgs.safeio.records import read_json
+from xrgs.safeio.records import read_object
+from xrgs.safeio.untrusted import is_name
 from xrgs.safeio.words import for_line
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator, Mapping
+    from collections.abc import Iterator, Mapping
 
     from xrgs.capture.views import Variant
     from xrgs.safeio.confined import ConfinedPath
 
+#: The longest line of a report, in characters, and how many names of views and attempts are read.
+_MAX_NAMES, _MAX_ATTEMPTS = 1 << 14, 10
 _REGISTERED, _NOT_REGISTERED = "yes", "no"
 
 
@@ -31,7 +35,7 @@ def describe(path: Path | ConfinedPath, out: Path | None = None) -> str:
         out: The PNG of the contact sheet; None writes `<variant id>.png` to the current folder.
 
     Returns:
-        Tables and lines for a terminal.
+        Tables and lines for a terminal. They name each image that can't be read.
 
     Raises:
         XrgsError: The folder is not a variant or has changed, or the sheet can't be written.
@@ -39,14 +43,13 @@ def describe(path: Path | ConfinedPath, out: Path | None = None) -> str:
     folder = confined(path)
     if not folder.is_dir():
         raise XrgsError(f"{folder}: no such folder; variants are in <store>/variants/")
-    if folder.name.startswith("failed-"):
-        report = read_json(folder / "report.json")
-        return _lines(
-            folder,
-            report,
-            lambda: for_line(f"{report.get('scene')}: failed, so there are no views"),
-        )
+    if folder.name.startswith(FAILED_PREFIX):
+        report = read_object(folder / "report.json")
+        failed = f"{report.get('scene')}: failed, so there are no views"
+        return "\n".join([for_line(failed), *_sfm_lines(folder, report)])
     frozen = variant.load(folder)
+    sfm = _sfm_lines(folder, frozen.report)
+    table = to_text(views_table(frozen))
     sheet, notes = contact_sheet(frozen)
     file = out or Path(f"{frozen.id}.png")
     try:
@@ -54,28 +57,42 @@ def describe(path: Path | ConfinedPath, out: Path | None = None) -> str:
             sheet.save(stream, "PNG")
     except OSError as error:
         raise XrgsError(f"out={file}: can't be written ({error})") from error
-    text = _lines(folder, frozen.report, lambda: to_text(views_table(frozen)))
-    more = [f"Contact sheet: {file}", *(f"  {note}" for note in notes)]
-    return "\n".join([text, *map(for_line, more)])
+    lines = [table, *sfm, f"Contact sheet: {file}", *(f"  {note}" for note in map(for_line, notes))]
+    return "\n".join(lines)
 
 
-def _lines(folder: ConfinedPath, report: Mapping[str, Any], first: Callable[[], str]) -> str:
-    """Return the first part and how SfM went.
+def _sfm_lines(folder: ConfinedPath, report: Mapping[str, Any]) -> list[str]:
+    """Check a report, which anybody may have written, and return lines on how SfM went.
 
     Raises:
         XrgsError: The report is malformed.
     """
     try:
-        return "\n".join([first(), *map(for_line, _sfm(report))])
-    except (AttributeError, KeyError, TypeError, ValueError) as error:
-        raise XrgsError(f"{folder / 'report.json'}: not a variant's report ({error!r})") from error
+        _check_names(report)
+        return [for_line(line) for line in _sfm(report)]
+    except (AttributeError, LookupError, TypeError, ValueError, ArithmeticError) as error:
+        file = folder / "report.json"
+        raise XrgsError(f"{file}: not a variant's report ({error!r:.200})") from error
+
+
+def _check_names(report: Mapping[str, Any]) -> None:
+    """Check the names of views that a table will have.
+
+    Raises:
+        ValueError: A list is not one, has what is no name, or is longer than any variant's.
+    """
+    for key in ("hr", "lr", "not_registered"):
+        names = report.get(key, [])
+        if not isinstance(names, list) or len(names) > _MAX_NAMES or not all(map(is_name, names)):
+            raise ValueError(f"{key} is not a list of views")
 
 
 def views_table(frozen: Variant) -> TextTable:
     """Return a table of the photographs that are trained on or held out, by name.
 
     Args:
-        frozen: The variant; photographs that SfM did not register are in the table too.
+        frozen: The variant; photographs that SfM did not register are in the table too, by the
+            names in its report.
     """
     rows = [
         (v.name, v.split, v.tag, f"{v.width} x {v.height}", f"{v.rho:.3f}", _REGISTERED)
@@ -109,7 +126,7 @@ def _sfm(report: Mapping[str, Any]) -> Iterator[str]:
         + _number(report, "reprojection_error_px", ", {:.2f} px")
     )
     yield f"  LR images {report.get('lr_images')}, {report.get('max_num_features')} features a view"
-    for attempt in report.get("attempts", ()):
+    for attempt in report.get("attempts", ())[:_MAX_ATTEMPTS]:
         verdict = attempt.get("refused") or f"accepted, {attempt.get('registered')} placed"
         yield f"  recipe {attempt.get('attempt')}: {verdict}"
     if "tags" in report:
@@ -117,8 +134,10 @@ def _sfm(report: Mapping[str, Any]) -> Iterator[str]:
     if error := report.get("pose_error"):
         against = report.get("pose_error_against", "exact cameras")
         yield f"  poses against {against}: " + "; ".join(_pose(error))
-    for tag, rates in report.get("rho", {}).items():
-        yield f"  rho of {tag}: {', '.join(f'{rate:.3f}' for rate in rates)} (least, median, most)"
+    for tag in ("HR", "LR"):
+        if rates := report.get("rho", {}).get(tag):
+            numbers = ", ".join(f"{rate:.3f}" for rate in rates)
+            yield f"  rho of {tag}: {numbers} (least, median, most)"
     for key, label in (("not_registered", "not placed"), ("unreadable", "unreadable")):
         if names := report.get(key):
             yield f"  {label}: {', '.join(names)}"

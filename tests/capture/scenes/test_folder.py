@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import errno
+import os
+import stat
 from collections.abc import Callable
 from pathlib import Path
 
@@ -9,7 +12,7 @@ import pytest
 
 from xrgs.capture import images, scenes
 from xrgs.config import SceneConf
-from xrgs.errors import XrgsError
+from xrgs.errors import UnreadableError, XrgsError
 from xrgs.safeio.confined import ConfinedPath
 
 Fill = Callable[..., SceneConf]
@@ -61,3 +64,48 @@ def test_a_missing_folder_or_path_names_the_key(tmp_path: Path) -> None:
         scenes.resolve(SceneConf("x", "folder", str(tmp_path / "nowhere")), ConfinedPath(tmp_path))
     with pytest.raises(XrgsError, match=r"scene\.path is empty"):
         scenes.resolve(SceneConf("x", "folder", None), ConfinedPath(tmp_path))
+
+
+def test_what_is_no_regular_file_is_left_out_with_a_warning(
+    fill: Fill, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    folder = tmp_path / "x"
+    conf = fill(folder, "a.png", "b.png")
+    only = scenes.fingerprint(conf)
+    os.mkfifo(folder / "c.png")
+    os.mknod(folder / "d.png", 0o600 | stat.S_IFSOCK)
+    (folder / "e.png").symlink_to(folder / "nowhere")
+    (folder / "f.png").symlink_to(folder / "c.png")
+    (folder / "g.png").mkdir()
+    scene = scenes.resolve(conf, ConfinedPath(tmp_path))
+    assert [file.name for file in scene.files] == ["a.png", "b.png"]
+    assert scene.fingerprint == only
+    for name in "cdef":
+        assert f"{folder}/{name}.png: not a regular file" in caplog.text
+    assert "g.png" not in caplog.text
+
+
+def test_a_link_to_a_photograph_is_one(fill: Fill, tmp_path: Path) -> None:
+    fill(tmp_path / "originals", "a.png", "b.png")
+    (tmp_path / "x").mkdir()
+    for name in ("a.png", "b.png"):
+        (tmp_path / "x" / name).symlink_to(tmp_path / "originals" / name)
+    scene = scenes.resolve(SceneConf("", "folder", str(tmp_path / "x")), ConfinedPath(tmp_path))
+    assert [images.read(file).shape for file in scene.files] == [(30, 40, 3)] * 2
+
+
+def test_a_photograph_that_cant_be_read_now_stops_the_plan(
+    fill: Fill, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Without it the scene would be another one, for which every cell is trained anew."""
+    conf = fill(tmp_path / "x", "a.png", "b.png")
+    opened = ConfinedPath._open_regular
+
+    def fails(self: ConfinedPath, flags: int) -> int:
+        if self.name == "b.png":
+            raise OSError(errno.EACCES, os.strerror(errno.EACCES), str(self))
+        return opened(self, flags)
+
+    monkeypatch.setattr(ConfinedPath, "_open_regular", fails)
+    with pytest.raises(UnreadableError, match=r"x/b\.png: Permission denied; try again, or move"):
+        scenes.fingerprint(conf)

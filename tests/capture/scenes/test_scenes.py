@@ -9,6 +9,7 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from xrgs.capture import images, scenes
@@ -71,6 +72,24 @@ def test_the_procedural_scene_is_rendered_once(tmp_path: Path) -> None:
     again = scenes.resolve(PROCEDURAL, ConfinedPath(tmp_path), 60)
     assert [file.lstat().st_mtime_ns for file in again.files] == times
     assert [p.name for p in tmp_path.iterdir() if p.name[0] != "."] == [first.fingerprint]
+
+
+def test_other_images_do_not_become_the_procedural_scene(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    first = scenes.resolve(PROCEDURAL, ConfinedPath(tmp_path), 60)
+    genuine = first.files[1].read_bytes()
+    images.save(first.files[1], np.full((45, 60, 3), (1, 0, 0), np.float32))
+    again = scenes.resolve(PROCEDURAL, ConfinedPath(tmp_path), 60)
+    assert again.files[1].read_bytes() == genuine
+    assert "view_001.png: it has changed" in caplog.text
+
+
+def test_a_label_is_one_printable_line(tmp_path: Path) -> None:
+    assert scenes.label(SceneConf("a\n\x1b[31mb", "procedural")) == "a [31mb"
+    assert scenes.label(SceneConf("\n", "procedural")) == "procedural"
+    assert scenes.label(SceneConf("", "folder", str(tmp_path / "a\tb"))) == "a b"
+    assert len(scenes.label(SceneConf("x" * 9_999, "procedural"))) == 200
 
 
 def test_two_processes_that_render_at_once_get_one_complete_scene(tmp_path: Path) -> None:
