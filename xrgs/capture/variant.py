@@ -285,6 +285,7 @@ def _freeze(
     }
     content["id"] = _id(content)
     write_json(folder / "variant.json", content)
+    folder.sync_tree()
     home = variants / content["id"]
     folder.rename(home)
     home.sync_name()
