@@ -75,8 +75,7 @@ def freeze(made: Variant, key: str, folder: ConfinedPath, variants: ConfinedPath
     }
     content["id"] = variant_id(content)
     write_json(folder / MANIFEST, content)
-    for inside in {name.rpartition("/")[0] for name in images} | {"images"}:
-        (folder / inside).sync_name()
+    folder.sync_tree()
     home = variants / content["id"]
     folder.rename(home)
     home.sync_name()

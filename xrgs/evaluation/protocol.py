@@ -30,6 +30,8 @@ def score_views(
 ) -> list[dict[str, Any]]:
     """Render and score each view, and write its clamped render as `<view>.png`.
 
+    The renders are not waited for until they are on the disk: `CellFolder.finish` does that.
+
     Args:
         gaussians: The trained model.
         views: The test views, at full size.
@@ -65,5 +67,5 @@ def score_views(
             with single_torch_thread():  # sums over several threads differ in the last digit
                 scores = {name: fn(image, view.image) for name, fn in metrics.VIEW_METRICS.items()}
             rows.append({"view": view.name} | scores)
-            images.save(renders / f"{view.name}.png", image.numpy())
+            images.save(renders / f"{view.name}.png", image.numpy(), durable=False)
     return rows

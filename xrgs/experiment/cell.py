@@ -51,19 +51,23 @@ def run_cell(conf: Conf, variant: Variant, folder: CellFolder) -> None:
 
 
 def _train_and_score(conf: Conf, variant: Variant, folder: CellFolder) -> list[str]:
-    """Write every file but the status; return the names of the views that were scored."""
+    """Write every file but the status; return the names of the views that were scored.
+
+    None of the files is waited for until it is on the disk: `CellFolder.finish` does that.
+    """
     threads = set_torch_threads(conf.threads)
     backend = resolve_backend(conf.splat.backend)
-    write_json(folder.folder / "provenance.json", provenance.collect(threads, backend))
+    what = provenance.collect(threads, backend)
+    write_json(folder.folder / "provenance.json", what, durable=False)
     data = dataset.load(variant, conf.train.views)
     trained = _train_or_resume(data, conf, folder)
     peak_rss_bytes = peak_rss()  # read before evaluation, which may load the network of LPIPS
-    save_ply(folder.folder / "splats.ply", trained.gaussians)
-    write_text(folder.folder / "history.csv", table_text(trained.history))
+    save_ply(folder.folder / "splats.ply", trained.gaussians, durable=False)
+    write_text(folder.folder / "history.csv", table_text(trained.history), durable=False)
     scores = protocol.score_views(
         trained.gaussians, data.test, conf.splat, folder.folder / "renders"
     )
-    write_text(folder.folder / "scores.csv", table_text(scores))
+    write_text(folder.folder / "scores.csv", table_text(scores), durable=False)
     write_json(
         folder.folder / "summary.json",
         {
@@ -75,6 +79,7 @@ def _train_and_score(conf: Conf, variant: Variant, folder: CellFolder) -> list[s
             "steps": conf.train.steps,
             "grow_grad2d": trained.grow_grad2d,
         },
+        durable=False,
     )
     return [view.name for view in data.test]
 

@@ -121,19 +121,28 @@ class CellFolder:
             return CellState.of_error(error)
 
     def _look(self, *, verify: bool) -> CellState:
+        try:
+            status = read_json(self.status)
+        except StoreError:
+            if (state := self._without_status()) is None:
+                raise
+            return state
+        if status["state"] == "failed":
+            return CellState("failed", str(status["reason"]))
+        self._check(status, verify=verify)
+        return CellState("done")
+
+    def _without_status(self) -> CellState | None:
+        """Return the state of a cell that has no status; None where it has one."""
         if self.folder.is_link():
             return CellState("corrupt", "it is a symbolic link; a cell must be a folder")
         if not self.folder.is_dir():
             there = self.folder.exists()
             return CellState("corrupt", "it is not a folder") if there else CellState("absent")
-        if not self.status.exists():
-            resumes = "; it resumes from its checkpoint" if self.checkpoint.exists() else ""
-            return CellState("unfinished", f"it was stopped before it ended{resumes}")
-        status = read_json(self.status)
-        if status["state"] == "failed":
-            return CellState("failed", str(status["reason"]))
-        self._check(status, verify=verify)
-        return CellState("done")
+        if self.status.exists():
+            return None
+        resumes = "; it resumes from its checkpoint" if self.checkpoint.exists() else ""
+        return CellState("unfinished", f"it was stopped before it ended{resumes}")
 
     def running(self, owner: str) -> CellState:
         """Return the state of a cell whose lock is held.
@@ -274,7 +283,7 @@ class CellFolder:
         return self.folder.with_name(f".{self.id}.{kind}-{secrets.token_hex(4)}")
 
     def _leftovers(self, kind: str) -> list[CellFolder]:
-        """Return the hidden folders of one kind, which only a killed process leaves."""
+        """Return the hidden folders of one kind: the last attempt, or what nobody needs (`new`)."""
         prefix = f".{self.id}.{kind}-"
         names = [name for name in self.folder.siblings() if name.startswith(prefix)]
         return [CellFolder(self.folder.with_name(name)) for name in names]
@@ -294,13 +303,14 @@ class CellFolder:
 
     def _settle_leftovers(self, identity: Mapping[str, Any]) -> None:
         """Remove stopped attempts, which the new one goes on from; keep every other one aside."""
+        for old in self._leftovers("old"):
+            stopped = old._can_resume(identity)
+            name = self._hidden("new") if stopped else _free_name(self.folder)
+            old.folder.rename(name)
+            # What a power failure leaves of a removal must not pass for an attempt.
+            name.sync_name()
         for new in self._leftovers("new"):
             _remove(new.folder)
-        for old in self._leftovers("old"):
-            if old._can_resume(identity):
-                _remove(old.folder)
-            else:
-                old.folder.rename(_free_name(self.folder))
 
     def _can_resume(self, identity: Mapping[str, Any]) -> bool:
         state = self.state()

@@ -110,6 +110,7 @@ class Store:
             self.folder.make_root()
             for folder in (self.scenes, self.variants, self.cells_folder, self.locks, self.sweeps):
                 folder.make_folder()
+            self.cells_folder.sync_name()  # and the names of the others, which are beside it
             with tempfile.TemporaryFile(dir=self.path) as file:
                 file.write(bytes(_MIN_FREE_BYTES))
         except OSError as error:

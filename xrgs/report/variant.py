@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from xrgs.capture.views import Variant
     from xrgs.safeio.confined import ConfinedPath
 
-#: The longest line of a report, in characters, and how many names of views and attempts are read.
+#: How many names of views and attempts are read.
 _MAX_NAMES, _MAX_ATTEMPTS = 1 << 14, 10
 _REGISTERED, _NOT_REGISTERED = "yes", "no"
 

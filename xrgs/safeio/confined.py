@@ -34,6 +34,8 @@ _FOLDER = os.O_DIRECTORY | os.O_CLOEXEC | os.O_RDONLY
 #: Opening a named pipe without O_NONBLOCK would wait for its writer, for ever.
 _REGULAR = os.O_CLOEXEC | os.O_NONBLOCK | os.O_NOFOLLOW
 _READABLE_BY_ALL = 0o666  # less the umask: a store is shared by a team
+#: Parts of a path that name nothing inside a folder.
+_NO_NAMES = frozenset({"", ".", ".."})
 
 
 #: Errors that tell what is there, or that nothing is; every other one may be gone when the same
@@ -126,10 +128,7 @@ class ConfinedPath:
         Raises:
             ValueError: A part of it is empty, `.` or `..`, or has a NUL character.
         """
-        parts = inside.split("/")
-        if any(part in {"", ".", ".."} or "\0" in part for part in parts):
-            raise ValueError(f"{inside!r:.200} is not a path inside {self}")
-        return ConfinedPath(self.root, (*self.parts, *parts), self.pin)
+        return ConfinedPath(self.root, (*self.parts, *_split(inside)), self.pin)
 
     def __str__(self) -> str:
         return str(self.path)
@@ -246,12 +245,13 @@ class ConfinedPath:
             ValueError: A name is not a path in this folder.
         """
         sizes = dict.fromkeys(names, -1)
-        by_folder: dict[ConfinedPath, list[str]] = {}
+        by_folder: dict[str, list[str]] = {}
         for name in names:
-            by_folder.setdefault((self / name).parent, []).append(name)
+            _split(name)
+            by_folder.setdefault(name.rpartition("/")[0], []).append(name)
         for folder, inside in by_folder.items():
             try:
-                with folder._opened() as descriptor:
+                with (self / folder if folder else self)._opened() as descriptor:
                     for name in inside:
                         sizes[name] = regular_size(descriptor, name.rpartition("/")[2])
             except OSError as error:
@@ -318,7 +318,9 @@ class ConfinedPath:
         """
         with self.open() as stream:
             size = os.fstat(stream.fileno()).st_size
-            content = stream.read(max_bytes + 1) if size <= max_bytes else b""
+            content = stream.read(size + 1) if size <= max_bytes else b""
+            if len(content) > size:  # it grows; otherwise no more memory than this is asked for
+                content += stream.read(max_bytes + 1 - len(content))
         if max(size, len(content)) > max_bytes:
             why = f"{max(size, len(content))} bytes, at most {max_bytes} are read"
             raise OSError(errno.EFBIG, why, str(self))
@@ -552,6 +554,13 @@ def confined(path: Path | ConfinedPath) -> ConfinedPath:
         path: The path.
     """
     return path if isinstance(path, ConfinedPath) else ConfinedPath(path)
+
+
+def _split(inside: str) -> list[str]:
+    parts = inside.split("/")
+    if "\0" in inside or not _NO_NAMES.isdisjoint(parts):
+        raise ValueError(f"{inside!r:.200} is not a path inside a folder")
+    return parts
 
 
 def _identity(status: os.stat_result) -> tuple[int, int]:

@@ -28,13 +28,16 @@ _MAGIC = b"ply\n"
 _FORMAT = "format binary_little_endian 1.0"
 
 
-def save_ply(path: str | Path | ConfinedPath, gaussians: Gaussians) -> None:
+def save_ply(
+    path: str | Path | ConfinedPath, gaussians: Gaussians, *, durable: bool = True
+) -> None:
     """Write Gaussians to a .ply file, which is replaced atomically.
 
     Args:
         path: The file to write.
         gaussians: The N Gaussians; they are written as float32, in raw parameters (logarithms of
             scales, logits of opacities).
+        durable: Whether to wait until the content and the name are on the disk.
 
     Raises:
         OSError: The file can't be written.
@@ -53,7 +56,7 @@ def save_ply(path: str | Path | ConfinedPath, gaussians: Gaussians) -> None:
     table = torch.cat([column.detach().float() for column in columns], dim=1)
     names = _properties(gaussians.shN.shape[1])
     header = [_FORMAT, f"element vertex {count}", *(f"property float {n}" for n in names)]
-    with atomic_writer(path) as file:
+    with atomic_writer(path, durable=durable) as file:
         file.write(_MAGIC + "".join(f"{line}\n" for line in [*header, "end_header"]).encode())
         file.write(table.numpy().astype("<f4").tobytes())
 
