@@ -26,6 +26,7 @@ import torch
 
 from xrgs import config
 from xrgs.capture.dataset import Dataset, LoadedView
+from xrgs.capture.download import http
 from xrgs.evaluation.lpips import weights
 from xrgs.splat.cameras import Camera
 
@@ -245,13 +246,15 @@ class Server:
     """Number of bytes after which each of the first answers breaks off."""
     status: int | None = None
     """HTTP status of an error to answer every request with."""
+    busy: list[tuple[int, dict[str, str]]] = field(default_factory=list)
+    """HTTP status and further headers of each of the first answers, which are errors."""
+    date: str = ""
+    """The time in the Date header; empty for the real one."""
     content_type: str = "application/zip"
-    shift: int = 0
-    """Number added to the start of a range in the Content-Range header."""
     length: bool = True
     """Whether the headers give the length of the file."""
-    stall: float = 0
-    """Seconds between the headers and the content."""
+    etag: str = '"first"'
+    """The version of the content; other requests than those for this version get all of it."""
     asked: list[str | None] = field(default_factory=list)
     """The Range header of each request so far, None where there was none."""
     url: str = ""
@@ -266,8 +269,16 @@ class _Handler(BaseHTTPRequestHandler):
         if state.status is not None:
             self.send_error(state.status)
             return
+        if state.busy:
+            status, headers = state.busy.pop(0)
+            self.send_response(status)
+            for name, value in headers.items():
+                self.send_header(name, value)
+            self.end_headers()
+            return
         start, size = 0, len(state.content)
-        if byte_range and state.ranges:
+        is_same = self.headers.get("If-Range") in (None, state.etag)
+        if byte_range and state.ranges and is_same:
             start = int(byte_range.removeprefix("bytes=").removesuffix("-"))
             if start >= size:
                 self.send_response(416)
@@ -276,24 +287,35 @@ class _Handler(BaseHTTPRequestHandler):
                 return
             self.send_response(206)
             whole = size if state.length else "*"
-            self.send_header("Content-Range", f"bytes {start + state.shift}-{size - 1}/{whole}")
+            self.send_header("Content-Range", f"bytes {start}-{size - 1}/{whole}")
         else:
             self.send_response(200)
         body = state.content[start:]
         self.send_header("Content-Type", state.content_type)
+        self.send_header("ETag", state.etag)
         if state.length:
             self.send_header("Content-Length", str(len(body)))
         self.end_headers()
-        time.sleep(state.stall)
         with contextlib.suppress(ConnectionError):  # the client may have closed the connection
             self.wfile.write(body[: state.cuts.pop(0)] if state.cuts else body)
+
+    def date_time_string(self, timestamp: float | None = None) -> str:
+        return self.state.date or super().date_time_string(timestamp)
 
     def log_message(self, format: str, *args: Any) -> None:  # noqa: A002
         pass
 
 
 @pytest.fixture
-def server() -> Iterator[Server]:
+def pauses(monkeypatch: pytest.MonkeyPatch) -> list[float]:
+    """Let downloads try again at once; return the seconds that they would have waited."""
+    waited: list[float] = []
+    monkeypatch.setattr(http, "_wait", waited.append)
+    return waited
+
+
+@pytest.fixture
+def server(pauses: list[float]) -> Iterator[Server]:
     """Start a web server on the loopback interface; return its state, whose faults can be set."""
     state = Server()
     handler = type("Handler", (_Handler,), {"state": state})

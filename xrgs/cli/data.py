@@ -20,6 +20,7 @@ _HELP = """\
 xrgs-data download DATASET [SCENE]... [data_root=FOLDER] [url=URL] [sha256=HEX] [max_bytes=N]
     Downloads published scenes and unpacks them into data_root. Run again, it continues.
     DATASET: {data}
+    redirect_hosts=HOST,... admits redirects from url= to these hosts; no others are followed.
 xrgs-data lpips [from=FILE_OR_URL]
     Downloads the weights of LPIPS; without them its rows in tables are n/a.
 xrgs-data inspect VARIANT_FOLDER [out=FILE.png]
@@ -66,7 +67,10 @@ def _download(words: list[str], values: dict[str, str]) -> str:
         raise XrgsError(f"download {' '.join(words)}: the dataset must be one of {choices('data')}")
     data_root = values.pop("data_root", None)
     root = data_root or OmegaConf.load(config.CONF_DIR / "config.yaml").data_root
+    hosts = values.pop("redirect_hosts", None)
     conf = OmegaConf.merge(OmegaConf.structured(DatasetConf), OmegaConf.load(file), values)
+    if hosts is not None:
+        conf.redirect_hosts = hosts.split(",")
     return fetch_scenes(cast("DatasetConf", OmegaConf.to_object(conf)), words[1:], Path(root))
 
 

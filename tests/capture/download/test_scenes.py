@@ -69,7 +69,86 @@ def test_the_hash_of_the_config_is_verified(
     assert "sha256 verified" in out
     code, _, err = xrgs_data("download", "llff", "room", url, f"sha256={'0' * 64}")
     assert code == 1
-    assert "nerf_llff_data.zip: its sha256 is not the config's" in err
+    assert f"nerf_llff_data.zip: its sha256 is {right}, not 0000" in err
+
+
+def test_the_hash_of_the_first_use_is_verified_later(
+    xrgs_data: Run, server: Any, tmp_path: Path, llff: bytes
+) -> None:
+    server.content, digest = llff, hashlib.sha256(llff).hexdigest()
+    url, archive = f"url={server.url}", tmp_path / "data/llff/.downloads/nerf_llff_data.zip"
+    record = archive.with_name("nerf_llff_data.zip.sha256")
+    code, out, err = xrgs_data("download", "llff", "fern", url)
+    assert code == 0, err
+    assert f"not verified: none in config. It is {digest}" in out
+    assert f"sha256={digest}" in out
+    assert record.read_text() == f"{digest}  nerf_llff_data.zip\n"  # as `sha256sum -c` reads it
+
+    server.content = llff + b"changed"  # still a zip archive
+    archive.write_bytes(server.content)
+    code, _, err = xrgs_data("download", "llff", "room", url)
+    assert code == 1
+    assert f"not {digest}, that of its first use in {Path('data', 'llff')}" in err
+    archive.unlink()
+    code, _, err = xrgs_data("download", "llff", "room", url)
+    assert code == 1
+    assert f"expected {digest}" in err
+    assert record.name in err
+    assert not archive.exists()
+
+    changed = hashlib.sha256(server.content).hexdigest()
+    code, out, err = xrgs_data("download", "llff", "room", url, f"sha256={changed}")
+    assert code == 0, err
+    assert f"sha256 verified: {changed}" in out
+    assert record.read_text().startswith(changed)
+
+
+def test_an_archive_that_can_not_be_unpacked_is_not_trusted(
+    xrgs_data: Run, server: Any, tmp_path: Path, llff: bytes
+) -> None:
+    server.content = llff[:-30]
+    code, _, err = xrgs_data("download", "llff", "fern", f"url={server.url}")
+    assert code == 1
+    assert "not a complete zip archive" in err
+    (tmp_path / "data/llff/.downloads/nerf_llff_data.zip").unlink()
+    server.content, server.etag = llff, '"mended"'
+    code, _, err = xrgs_data("download", "llff", "fern", f"url={server.url}")
+    assert code == 0, err
+
+
+@pytest.mark.parametrize("content", [b"", b"0" * 64, b"\x1b]0;x", b"0" * 5000, None])
+def test_a_damaged_record_of_the_first_use_is_named(
+    xrgs_data: Run, server: Any, tmp_path: Path, llff: bytes, content: bytes | None
+) -> None:
+    server.content = llff
+    record = tmp_path / "data/llff/.downloads/nerf_llff_data.zip.sha256"
+    record.parent.mkdir(parents=True)
+    if content is None:
+        record.mkdir()
+    else:
+        record.write_bytes(content)
+    code, _, err = xrgs_data("download", "llff", "fern", f"url={server.url}")
+    assert code == 1
+    assert "nerf_llff_data.zip.sha256: " in err
+    assert len(err.splitlines()) == 1
+    assert server.asked == []
+
+
+def test_redirects_are_followed_to_the_named_hosts_alone(
+    xrgs_data: Run, server: Any, llff: bytes
+) -> None:
+    server.content = llff
+    elsewhere = server.url.replace("127.0.0.1", "localhost")
+    arguments = ("download", "llff", "fern", f"url={server.url}")
+    server.busy = [(302, {"Location": elsewhere})]
+    code, _, err = xrgs_data(*arguments)
+    assert code == 1
+    assert "another host, which is not followed" in err
+    assert len(err.splitlines()) == 1
+    server.busy = [(302, {"Location": elsewhere})]
+    host = elsewhere.split("/")[2]
+    code, _, err = xrgs_data(*arguments, f"redirect_hosts=example.org,{host}")
+    assert code == 0, err
 
 
 def test_an_archive_beyond_the_config_s_bytes_is_refused_and_its_key_named(
@@ -87,7 +166,9 @@ def test_an_archive_beyond_the_config_s_bytes_is_refused_and_its_key_named(
     assert code == 0, err
 
 
-def test_offline_says_what_to_do_by_hand(xrgs_data: Run, tmp_path: Path, llff: bytes) -> None:
+def test_offline_says_what_to_do_by_hand(
+    xrgs_data: Run, tmp_path: Path, llff: bytes, pauses: list[float]
+) -> None:
     with socket.create_server(("127.0.0.1", 0)) as taken:
         url = f"http://127.0.0.1:{taken.getsockname()[1]}/x.zip"
     code, _, err = xrgs_data("download", "llff", "fern", f"url={url}")

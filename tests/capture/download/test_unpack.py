@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import stat
 import zipfile
 from pathlib import Path
@@ -96,6 +97,30 @@ def test_a_bomb_is_refused(tmp_path: Path) -> None:
         UnpackError, match=r"unpacks \d+ bytes to 1048576.*too much for a folder of photo"
     ):
         unpack(file, "set/fern", tmp_path / "fern")
+
+
+def test_a_folder_is_on_the_disk_before_it_has_its_name(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Each file and folder is synced before the rename, and the folder around them after it."""
+    events: list[str] = []
+    sync, rename = os.fsync, Path.rename
+
+    def synced(descriptor: int) -> None:
+        events.append("sync " + Path(f"/proc/self/fd/{descriptor}").readlink().name)
+        sync(descriptor)
+
+    def renamed(self: Path, to: Path) -> Path:
+        events.append("rename")
+        return rename(self, to)
+
+    monkeypatch.setattr(os, "fsync", synced)
+    monkeypatch.setattr(Path, "rename", renamed)
+    file = archive(tmp_path)
+    unpack(file, "set/fern", tmp_path / "data" / "fern")
+    before, after = events[: events.index("rename")], events[events.index("rename") + 1 :]
+    assert sorted(before) == ["sync a.png", "sync fern", "sync images", "sync poses.npy"]
+    assert after == ["sync data"]
 
 
 @pytest.mark.parametrize(

@@ -19,6 +19,9 @@ class DatasetConf:
     """The largest size that is downloaded, in bytes, whatever the server announces or sends."""
     sha256: str = ""
     """The archive's SHA-256, in hexadecimal; empty where it is not known."""
+    redirect_hosts: list[str] = field(default_factory=list)
+    """Hosts besides that of `url` to which it may redirect, with a port where it is not the usual
+    one; redirects to others are refused."""
     folder: str = ""
     """The folder in the archive that holds the scenes' folders."""
     scenes: list[str] = field(default_factory=list)

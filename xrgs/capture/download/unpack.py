@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import re
 import shutil
 import stat
@@ -9,8 +10,10 @@ import tempfile
 import zipfile
 from pathlib import Path, PurePosixPath
 
+from xrgs.capture.download.part import sync_folder
 from xrgs.errors import XrgsError
 from xrgs.runtime.progress import progress
+from xrgs.safeio.untrusted import one_line
 
 #: Limits for one folder: unpacked bytes, far more than the largest LLFF scene has, and files.
 _MAX_BYTES = 8 << 30
@@ -51,13 +54,17 @@ def unpack(archive: Path, folder: str, target: Path) -> None:
                 for member in progress(members, f"unpacking {folder}", "file"):
                     inside = PurePosixPath(member.filename).relative_to(folder)
                     _write(opened, member, made.joinpath(*inside.parts))
+                for written in (made, *(path for path in made.rglob("*") if path.is_dir())):
+                    sync_folder(written)
                 made.rename(target)
+            sync_folder(target.parent)
     except UnpackError:
         raise
     except OSError as error:
         raise UnpackError(f"{archive}: can't be unpacked into {target} ({error})") from error
     except Exception as error:  # zipfile raises nearly anything on a damaged archive
-        raise UnpackError(f"{archive}: not a complete zip archive ({error}); delete it") from error
+        why = one_line(str(error))
+        raise UnpackError(f"{archive}: not a complete zip archive ({why}); delete it") from error
 
 
 def _members(opened: zipfile.ZipFile, archive: Path, folder: str) -> list[zipfile.ZipInfo]:
@@ -102,3 +109,5 @@ def _write(opened: zipfile.ZipFile, member: zipfile.ZipInfo, file: Path) -> None
     file.parent.mkdir(parents=True, exist_ok=True)
     with opened.open(member) as source, file.open("xb") as stream:
         shutil.copyfileobj(source, stream, _CHUNK)
+        stream.flush()
+        os.fsync(stream.fileno())

@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 
 from xrgs.errors import XrgsError
 from xrgs.safeio import npz
+from xrgs.safeio.atomic import atomic_writer
 from xrgs.safeio.confined import confined
 
 Weights = dict[str, NDArray[np.float32]]
@@ -169,12 +170,8 @@ def save(weights: Weights, file: Path) -> None:
         OSError: The file can't be written.
     """
     file.parent.mkdir(parents=True, exist_ok=True)
-    temporary = file.with_name(f".{file.stem}.{os.getpid()}.npz")
-    try:
-        np.savez(temporary, allow_pickle=False, **weights)
-        temporary.replace(file)
-    finally:
-        temporary.unlink(missing_ok=True)
+    with atomic_writer(file) as stream:
+        np.savez(stream, allow_pickle=False, **weights)
 
 
 def content_digest(weights: Weights) -> str:
