@@ -96,7 +96,7 @@ def _cell_file(name: str, kind: Kind, store: Path) -> list[Look]:
     named = Path(name).name
     drawn = name in {"history.csv", "renders/view_1.png"}
     looks = all_looks(store, named, done=3, drawn=drawn)
-    return [*looks, rerun(cell, named, can_train=True)] if kind in _DISTINCT.values() else looks
+    return [*looks, rerun(cell, named, can_train=True)] if kind is _pipe else looks
 
 
 def _unfinished(name: str, kind: Kind, store: Path) -> list[Look]:

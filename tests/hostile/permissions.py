@@ -18,7 +18,7 @@ def _cell(store: Path) -> list[Look]:
 def _cell_file(name: str, store: Path) -> list[Look]:
     cell = cell_of(store)
     (cell / name).chmod(0)
-    return [*all_looks(store, name, done=3), rerun(cell, can_train=True)]
+    return [*all_looks(store, name, done=3), rerun(cell, name)]
 
 
 def _part(part: str, mode: int, store: Path) -> list[Look]:

@@ -35,6 +35,9 @@ _PRELOADED = (
     *("xrgs.sweep.rerun", "xrgs.sweep.study", "xrgs.experiment.results", "hydra_plugins"),
 )
 
+#: How many times longer a command may take that trains a cell.
+_TRAINING = 4
+
 
 @dataclass(frozen=True)
 class Row:
@@ -73,7 +76,8 @@ def run_case(name: str, make: Maker, base: Path, folder: Path, wall_s: float) ->
     before = judge.snapshot(folder, *kept_out)
     theme, _, case = name.partition("/")
     for number, look in enumerate(looks):
-        ended = sandbox.run(partial(_program, look), folder / f"look-{number}", wall_s)
+        limit = _TRAINING * wall_s if look.can_train else wall_s
+        ended = sandbox.run(partial(_program, look), folder / f"look-{number}", limit)
         found = list(judge.verdicts(look, ended))
         if look.command == "report":
             found += judge.report_verdicts(store)

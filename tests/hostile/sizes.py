@@ -23,7 +23,7 @@ def grow(file: Path, size: int = _SIZE) -> None:
 def _cell_file(name: str, store: Path) -> list[Look]:
     cell = cell_of(store)
     grow(cell / name)
-    return [*all_looks(store, name, done=3), rerun(cell, name, can_train=True)]
+    return all_looks(store, name, done=3)
 
 
 def _declared(name: str, store: Path) -> list[Look]:
@@ -32,9 +32,9 @@ def _declared(name: str, store: Path) -> list[Look]:
     grow(cell / name)
     edit(cell / "status.json", lambda d: d["files"][name].update(bytes=_SIZE))
     hashed = name in {"scores.csv", "history.csv", "summary.json", "identity.json", "config.json"}
-    looks = [report(store, name if hashed else ""), rerun(cell, can_train=True)]
-    verified = status(store, name if hashed else "", done=3 if hashed else None, verify=True)
-    return [*looks, verified, plan(store, done=3 if hashed else None)]
+    named, done = (name, 3) if hashed else ("", None)
+    verified = status(store, named, done=done, verify=True)
+    return [report(store, named), verified, plan(store, done=done)]
 
 
 def _not_listed(name: str, store: Path) -> list[Look]:
