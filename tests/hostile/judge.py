@@ -27,7 +27,9 @@ _OBEYED = frozenset({"Cc", "Cf", "Cs", "Zl", "Zp"})
 _NUMBER = re.compile(r"[+-]?(\d[\d,]*(\.\d*)?|\.\d+)([eE][+-]?\d+)?( [↑↓=])?|[+-]?(inf|nan)")
 #: What would be run or loaded where the page or the table is shown.
 _ACTIVE = {
-    "table.md": re.compile(r"<(script|img|iframe)|\]\((?!figures/)|(?<!\\)!\[[^\]]*\]\(http", re.I),
+    "table.md": re.compile(
+        r"(?<!\\)<(script|img|iframe)|\]\((?!figures/)|(?<!\\)!\[[^\]]*\]\(http", re.I
+    ),
     "table.tex": re.compile(r"\\(input|write|include|openout|catcode)\b"),
 }
 
@@ -79,7 +81,7 @@ def report_verdicts(store: Path) -> Iterator[str]:
 
 def _formula(text: str) -> str:
     """Return a field of a CSV table that a spreadsheet would compute; empty if there is none."""
-    csv.field_size_limit(max(len(text), 1))
+    csv.field_size_limit(max(len(text), csv.field_size_limit()))
     for row in csv.reader(io.StringIO(text, newline="")):
         for field in row:
             if field[:1] in {"=", "+", "-", "@", "\t", "\r"} and not _NUMBER.fullmatch(field):

@@ -43,8 +43,8 @@ def _folder(path: Path) -> None:
 
 def _elsewhere(path: Path) -> None:
     """Link to a file outside the store."""
-    root = next(parent for parent in path.parents if parent.name == "store")
-    path.symlink_to(root.with_name("OUTSIDE") / "victim.txt")
+    store = next(folder for folder in (path, *path.parents) if folder.name == "store")
+    path.symlink_to(store.with_name("OUTSIDE") / "victim.txt")
 
 
 KINDS: Mapping[str, Kind] = {
@@ -129,7 +129,7 @@ def _folder_is(part: str, kind: Kind, store: Path) -> list[Look]:
     return [
         status(store, done=done),
         cells(store, done=done),
-        report(store, part if part != "locks" else "", pair=part in {"locks", "scenes"}),
+        report(store, part if part == "sweeps" else "", pair=part in {"locks", "scenes"}),
         plan(store, done=None),
     ]
 

@@ -18,7 +18,9 @@ def _cell(store: Path) -> list[Look]:
 def _cell_file(name: str, store: Path) -> list[Look]:
     cell = cell_of(store)
     (cell / name).chmod(0)
-    return [*all_looks(store, name, done=3), rerun(cell, name)]
+    hashed = [report(store, name), cells(store, name, done=3), plan(store, name, done=3)]
+    sized = status(store, name, done=3) if name == "status.json" else status(store)
+    return [sized, *hashed, rerun(cell, name)]
 
 
 def _part(part: str, mode: int, store: Path) -> list[Look]:

@@ -67,7 +67,8 @@ def _conf(label: str, seed: int) -> Conf:
     return config.compose(*ablation, "scene=motorcycle", "preset=smoke", f"seed={seed}")
 
 
-def _picture(seed: int, width: int, height: int) -> Image.Image:
+def picture(seed: int, width: int, height: int) -> Image.Image:
+    """A ramp with noise."""
     ramp = np.linspace(40, 200, width)[None, :, None] * np.ones((height, 1, 3))
     noise = np.random.default_rng(seed).integers(0, 50, (height, width, 3))
     return Image.fromarray((ramp + noise).astype(np.uint8))
@@ -83,7 +84,7 @@ def _write_variant(variants: Path, conf: Conf) -> str:
         width, height = WIDTH // factor, HEIGHT // factor
         file = folder / "images" / split / f"{name}.png"
         file.parent.mkdir(parents=True, exist_ok=True)
-        _picture(number, width, height).save(file)
+        picture(number, width, height).save(file)
         viewmat = np.eye(4)
         viewmat[0, 3] = -0.1 * number
         views.append(
@@ -136,8 +137,8 @@ def _write_cell(store: Store, conf: Conf, variant_id: str, made_with: dict[str, 
     (cell.path / "log.txt").write_text("a line of the log\n")
     (cell.path / "renders").mkdir()
     for number, view in enumerate(TESTS):
-        picture = _picture(10 * conf.seed + number, WIDTH, HEIGHT)
-        picture.save(cell.path / "renders" / f"{view}.png")
+        render = picture(10 * conf.seed + number, WIDTH, HEIGHT)
+        render.save(cell.path / "renders" / f"{view}.png")
     cell.finish(TESTS, PROTOCOL_VERSION)
     return cell.id
 

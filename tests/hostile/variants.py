@@ -102,7 +102,7 @@ _ARCHIVES: Mapping[str, Callable[[Path], bytes]] = {
 }
 
 
-def _archive(make: Callable[[Path], bytes], *, listed: bool, store: Path) -> list[Look]:
+def _archive(make: Callable[[Path], bytes], store: Path, *, listed: bool) -> list[Look]:
     folder = variant_of(store)
     (folder / "points.npz").write_bytes(make(store.with_name("canary")))
     if listed:
@@ -164,7 +164,7 @@ _CHANGES: Mapping[str, Callable[[Variant], None]] = {
 }
 
 
-def _changed(change: Callable[[Variant], None], *, listed: bool, store: Path) -> list[Look]:
+def _changed(change: Callable[[Variant], None], store: Path, *, listed: bool) -> list[Look]:
     folder = variant_of(store)
     edit(folder / "variant.json", change)
     if listed:

@@ -138,7 +138,8 @@ def _rerun_variant(store: Path) -> list[Look]:
     cell = cell_of(store)
     edit(cell / "identity.json", lambda d: d.update(variant=ESCAPES))
     seal(cell)
-    return [*all_looks(store, "identity.json", done=None, pair=False), rerun(cell, "identity.json")]
+    looks = [status(store, done=None), cells(store, done=None), plan(store)]
+    return [*looks, report(store, "identity.json", pair=False), rerun(cell, "identity.json")]
 
 
 def _rerun_config(store: Path) -> list[Look]:
