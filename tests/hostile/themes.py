@@ -10,6 +10,7 @@ from tests.hostile import (
     nesting,
     permissions,
     pictures,
+    resumed,
     sizes,
     sweeps,
     variants,
@@ -27,4 +28,5 @@ THEMES: Mapping[str, Mapping[str, Maker]] = {
     "sweeps": sweeps.CASES,
     "pictures": pictures.CASES,
     "variants": variants.CASES,
+    "resumed": resumed.CASES,
 }
