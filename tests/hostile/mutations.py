@@ -42,6 +42,8 @@ _VALUES: tuple[object, ...] = (
     *(None, True, False, [], {}, [[]], {"": None}, [None] * 100, {"a": {"b": [1]}}),
     *TEXTS,
 )
+#: Chunks are repeated up to this size, so that what a parser takes is its own fault.
+_MAX_BYTES = 1 << 20
 _DIGITS = re.compile(rb"-?\d+(\.\d+)?")
 _FORMATS = ("<H", ">H", "<i", ">i", "<I", ">I", "<q", ">q", "<f", "<d")
 
@@ -52,7 +54,7 @@ _FORMATS = ("<H", ">H", "<i", ">i", "<I", ">I", "<q", ">q", "<f", "<d")
 def mutate_bytes(random: Random, content: bytes) -> bytes:
     """Change a few bytes, chunks, numbers or the length."""
     for _ in range(random.choice((1, 1, 1, 2, 4))):
-        content = random.choice(_OF_BYTES)(random, content)
+        content = random.choice(_OF_BYTES)(random, content)[:_MAX_BYTES]
     return content
 
 
