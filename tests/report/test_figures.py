@@ -102,3 +102,27 @@ def test_the_view_shown_is_neither_the_best_nor_the_worst() -> None:
     assert median_view(baseline, pd.Series({"a": 25.0, "b": 10.0, "c": 21.0})) == "c"
     assert median_view(baseline, baseline) == "b"
     assert median_view(baseline * np.inf, baseline * np.inf) == "b"
+
+
+ODD_NAMES = {
+    "mathematics": r"$\frac{1}{$ \undefined",
+    "missing": "कमरा བོད",
+    "codes": "a\nb\x1b[2J",
+    "wide": "部" * 60,
+    "long": "x" * 10**6,
+    "half": "\ud800",
+}
+
+
+@pytest.mark.parametrize("name", ODD_NAMES.values(), ids=ODD_NAMES)
+def test_any_name_is_drawn_without_a_warning(name: str) -> None:
+    history = pd.DataFrame({"step": [0, 1], "loss": [1.0, 0.5], "gaussians": [1, 2]})
+    means = pd.DataFrame({"gaussians": [0.5, 2.0], "psnr": [0.1, -0.1]}, index=[name, "other"])
+    metric = Metric("psnr", "PSNR", "dB", higher_is_better=True)
+    crop = differing_crop(PICTURE, 1 - PICTURE)
+    for png in (
+        side_by_side(name, [Panel(PICTURE, name, name)] * 3, crop, name),
+        curves(name, [(name, history), (name, history)], {"loss": "loss", "gaussians": "x"}),
+        trade_off(name, means, means, [metric]),
+    ):
+        assert picture(png).std() > 0

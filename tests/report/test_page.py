@@ -2,12 +2,14 @@
 
 import csv
 import json
+import re
 import shutil
 import subprocess
 import sys
 from pathlib import Path
 from typing import Any
 
+import cmarkgfm
 import pytest
 
 import xrgs
@@ -131,7 +133,7 @@ def test_every_file_is_there_and_named(study: Any) -> None:
     assert {"fern--consistency.png", "fern--consistency--training.png"} <= names
     page = (report.folder / "table.md").read_text()
     assert "figures/fern--consistency.png" in page
-    assert "room\\|\\_\\&%\\$ 部屋" in page
+    assert "room\\|\\_&amp;%\\$ 部屋" in page
 
 
 def test_the_terminal_has_table_failures_and_folder(study: Any) -> None:
@@ -269,3 +271,43 @@ def test_cells_of_different_arithmetic_are_warned_of(
     assert ("different arithmetic (fma, no-fma)" in report.text) == (ablation == "no-fma")
     assert ("trained with different arithmetic" in page) == (ablation == "no-fma")
     assert "| arithmetic " in page
+
+
+#: Codes of a terminal, formulas, markup, mathematics, a line break and a script that no font has.
+EVIL = (
+    "=cmd|'/C calc'!A1 <script>\x1b[2J\x1b]0;t\x07\n\n# H | a | [x](javascript:a) $\\frac{$ "
+    "\\input{/etc/passwd} \u202e\x9b2J कमरा https://evil.example"
+)
+
+
+def test_words_of_a_foreign_store_are_not_obeyed(made: Any) -> None:
+    for label in ("baseline", EVIL, f"-{EVIL}"):
+        made.add(label, scene=EVIL, condition=EVIL, variant="v", pictures=True)
+    made.add_error(f"@{EVIL}", EVIL)
+    made.write((EVIL, "seed=0"))
+    report = build(made.store.path)
+    texts = {file.name: file.read_text() for file in report.files if file.suffix != ".png"}
+    for name, text in (texts | {"": report.text}).items():
+        assert text.replace("\n", "").isprintable(), name
+        assert text.count("\n") < 200, name
+    for name in ("table.csv", "cells.csv", "views.csv", "training.csv"):
+        for row in csv.reader(texts[name].splitlines(), strict=True):
+            assert not [cell for cell in row if cell.startswith(("=", "@", "-=", "-cmd"))]
+    page = cmarkgfm.github_flavored_markdown_to_html(texts["table.md"])
+    assert not re.search(r"<(a|script)\b|src=\"(?!figures/)", page)
+    assert r"\input" not in texts["table.tex"]
+    assert len([file for file in report.files if file.suffix == ".png"]) == 5
+
+
+def test_long_labels_are_shortened_and_stay_apart(made: Any) -> None:
+    made.add()
+    for end in "ab":
+        made.add("x" * 10**6 + end)
+    made.write()
+    report = build(made.store.path, pictures=[])
+    assert sum(file.stat().st_size for file in report.files) < 10**6
+    shown = {
+        row["label"]
+        for row in csv.DictReader((report.folder / "cells.csv").read_text().splitlines())
+    }
+    assert len(shown) == 3

@@ -30,7 +30,7 @@ def test_text_is_aligned() -> None:
 
 def test_markdown_is_escaped_and_aligned() -> None:
     assert to_markdown(TABLE) == (
-        "### a\\_b \\& c\n"
+        "### a\\_b &amp; c\n"
         "\n"
         "| Metric  | 50% \\| x |\n"
         "| ------- | -------: |\n"

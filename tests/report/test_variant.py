@@ -306,4 +306,21 @@ def test_nothing_of_a_report_reaches_the_terminal_as_an_escape(tmp_path: Path) -
     lines = inspect.describe(folder).split("\n")
     assert all(line.isprintable() for line in lines)
     assert len(lines) == 6
-    assert max(map(len, lines)) < 1_100
+    assert max(map(len, lines)) < 4_100
+
+
+def test_a_scene_of_another_s_words_is_drawn_on_one_line(mixed: Variant) -> None:
+    sheet = contact_sheet(replace(mixed, scene="a\nb\x1b"))[0]
+    plain = contact_sheet(replace(mixed, scene="a b "))[0]
+    assert np.array_equal(np.asarray(sheet), np.asarray(plain))
+
+
+def test_what_a_failed_variant_says_is_not_obeyed(tmp_path: Path) -> None:
+    folder = tmp_path / "failed-key"
+    folder.mkdir()
+    attempt = {"attempt": "a\nb\x1b[2J", "refused": "\x1b]0;t\x07"}
+    report = {"scene": "x\n\x1b[2J", "attempts": [attempt], "unreadable": ["\u202ey"]}
+    (folder / "report.json").write_text(json.dumps(report))
+    lines = inspect.describe(folder).split("\n")
+    assert lines[0] == "x  [2J: failed, so there are no views"
+    assert lines[3:] == ["  recipe a b [2J:  ]0;t ", "  unreadable:  y"]

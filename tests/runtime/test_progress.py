@@ -142,3 +142,19 @@ def test_the_text_has_all_that_is_known() -> None:
 )
 def test_duration(seconds: float | None, text: str) -> None:
     assert format_duration(seconds) == text
+
+
+def test_a_line_is_one_line_whatever_it_names(capsys: pytest.CaptureFixture[str]) -> None:
+    progress.log_line("waiting for a\nplan: 0 cells\x1b[2J on \x9bhost")
+    assert capsys.readouterr().err == "waiting for a plan: 0 cells [2J on  host\n"
+
+
+def test_the_words_of_another_process_are_plain_and_short(tmp_path: Path) -> None:
+    file = tmp_path / "progress.json"
+    content = {"what": "\x1b[2J" + "x" * 999, "unit": "a\nb", "done": 1, "total": 2, "rate": None}
+    file.write_text(json.dumps(content))
+    found = read(file)
+    assert found is not None
+    assert found.what.startswith(" [2Jxxx")
+    assert found.unit == "a b"
+    assert len(str(found)) < 200

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import os
 import pty
 import subprocess
@@ -11,6 +12,8 @@ from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
 
 import pytest
+
+from xrgs.runtime.streams import say
 
 _SCRIPT = """
 import sys
@@ -74,3 +77,38 @@ def test_output_with_a_reader_is_complete(tmp_path: Path) -> None:
     )
     assert (done.stdout, done.stderr) == ("text\n", "text\n")
     assert (tmp_path / "done").read_text() == "False utf-8"
+
+
+def test_what_is_said_is_not_obeyed_and_keeps_its_lines() -> None:
+    stream = io.StringIO()
+    say("a\x1b[2J\n  b\r\u202ec", stream)
+    assert stream.getvalue() == "a [2J\n  b  c\n"
+
+
+def test_a_character_that_the_stream_lacks_is_a_number() -> None:
+    stream = io.TextIOWrapper(io.BytesIO(), encoding="latin-1")
+    say("é 部 ↑", stream)
+    assert stream.buffer.getvalue() == b"\xe9 \\u90e8 \\u2191\n"
+
+
+def test_a_message_of_a_log_is_one_line_and_a_traceback_keeps_its_lines() -> None:
+    script = (
+        "import logging\n"
+        "from xrgs.runtime.streams import log_to_stderr\n"
+        "log_to_stderr()\n"
+        "log = logging.getLogger('xrgs.x')\n"
+        "log.info('not shown')\n"
+        "log.warning('%s; left out', 'a\\n2026-01-01 forged\\x1b[2J')\n"
+        "try:\n"
+        "    raise ValueError('\\x1b]0;t\\x07')\n"
+        "except ValueError:\n"
+        "    log.exception('failed')\n"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", script], capture_output=True, text=True, check=True
+    )
+    first, second, *traceback = done.stderr.splitlines()
+    assert first.endswith(" a 2026-01-01 forged [2J; left out")
+    assert second.endswith(" failed")
+    assert traceback[0] == "Traceback (most recent call last):"
+    assert traceback[-1] == "ValueError:  ]0;t "

@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import math
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from xrgs.errors import StoreError, XrgsError
-from xrgs.safeio.records import as_number, read_json, read_object, read_table
+from xrgs.safeio.records import as_number, read_json, read_object, read_table, table_text
 
 
 @pytest.fixture
@@ -67,3 +70,19 @@ def test_a_missing_number_is_nan(value: object) -> None:
 def test_anything_else_is_not_a_number(value: object) -> None:
     with pytest.raises(ValueError):  # noqa: PT011 - float's own messages
         as_number(value)
+
+
+@given(
+    st.lists(
+        st.lists(st.text(st.characters(exclude_categories=["Cc", "Cs"])), min_size=2, max_size=2)
+    )
+)
+def test_a_table_is_read_back_exactly(rows: list[list[str]]) -> None:
+    with TemporaryDirectory() as folder:
+        file = Path(folder) / "file"
+        text = table_text([{"view": "=1", "x": 0.1}, *({"view": a, "y": b} for a, b in rows)])
+        file.write_text(text, encoding="utf-8", newline="")
+        header, found = read_table(file)
+    assert header == (["view", "x", "y"] if rows else ["view", "x"])
+    assert found[0][:2] == ["=1", "0.1"]
+    assert [[row[0], row[2]] for row in found[1:]] == rows

@@ -283,3 +283,18 @@ def test_equal_results_are_reported_with_the_differences_of_the_machine(tmp_path
     text = str(RerunResult(CellFolder(tmp_path), ["cpu: a -> b"], []))
     assert text.splitlines()[1:3] == ["although these differ:", "  cpu: a -> b"]
     assert os.fspath(tmp_path) in text
+
+
+def test_names_of_a_foreign_cell_are_not_obeyed(
+    cell: CellFolder, train: Callable[..., None], capsys: pytest.CaptureFixture[str]
+) -> None:
+    identity, made_with = cell.identity(), cell.provenance()
+    identity["code"]["x\x1b]0;t\x07\nthe same.py"] = "0"
+    write_json(cell.path / "identity.json", identity | {"\x1b[2J": "\n\x9b"})
+    write_json(cell.path / "provenance.json", made_with | {"cpu\n\x1b": "\x1b[2J" + "x" * 1000})
+    train(("summary.json", '"steps": ', '"steps": 1'))
+    text = str(rerun(cell.path))
+    for shown in (text, capsys.readouterr().err):
+        assert shown.replace("\n", "").isprintable()
+        assert "  code: x ]0;t  the same.py (removed)\n" in shown
+        assert max(map(len, shown.split("\n"))) < 300

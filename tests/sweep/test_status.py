@@ -144,3 +144,22 @@ def test_a_sweep_record_that_cannot_be_read_hides_no_cell(store: Store) -> None:
     (store.path / "sweeps" / "bad.json").write_text("{")
     write_json(store.path / "sweeps" / "other.json", {"cells": [{"cell_id": "good"}]})
     assert len(read(store.path).cells) == 7
+
+
+def test_names_of_a_store_are_not_obeyed_and_stay_on_their_lines(store: Store) -> None:
+    code = identity.training_code("torch") | {"x\x1b]0;t\x07\nstale: no cells": "0"}
+    done(store, "evil", code)
+    path = store.path.rename(store.path.with_name("s\x1b[2J\nstore s: 99 cells"))
+    (path / "folder\x1b[31m\n").mkdir()
+    text = describe(read(path))
+    assert text.replace("\n", "").isprintable()
+    assert [line for line in text.split("\n") if line.startswith(("store", "stale:"))] == [
+        f"store {path.parent}/s [2J store s: 99 cells: 8 cells",
+        "stale: 2 done cells were trained with other code or arithmetic than here",
+    ]
+
+
+def test_a_long_name_leaves_the_table_its_columns(store: Store) -> None:
+    write_json(cell(store, "long").path / "config.json", {"scene": {"name": "x" * 10**6}})
+    row = next(line for line in describe(read(store.path)).split("\n") if line.startswith("xxx"))
+    assert row.split()[1:] == ["?", "1"]

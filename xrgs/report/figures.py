@@ -36,7 +36,7 @@ _DPI = 130
 _PANEL = 3.4  # inches
 _ZOOM = 5
 #: The longest name beside a figure's axes, in characters: a longer one would leave them no room.
-_MAX_NAME = 50
+_MAX_NAME = 40
 
 
 class Panel(NamedTuple):
@@ -148,7 +148,8 @@ def curves(
         axis.grid(alpha=0.3)
         axis.spines[["top", "right"]].set_visible(False)
     names = [for_line(label, _MAX_NAME) for label, _ in runs]
-    axes[0].legend(lines, names, frameon=False, fontsize=9)
+    legend = axes[0].legend(lines, names, frameon=False, fontsize=9)
+    legend.set_in_layout(False)  # a long name lies over the curves, and takes none of their room
     return _png(figure)
 
 

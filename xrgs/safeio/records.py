@@ -167,7 +167,8 @@ def table_text(rows: Sequence[Mapping[str, object]]) -> str:
     In a table that is made for people, each text must have gone through `words.for_csv`.
 
     Args:
-        rows: One mapping a row, of values by column. A value that a row lacks is empty.
+        rows: One mapping a row, of values by column, whose texts have no control characters. A
+            value that a row lacks is empty.
     """
     text = io.StringIO()
     columns = list(dict.fromkeys(column for row in rows for column in row))

@@ -27,7 +27,8 @@ _FORMULA = re.compile(r"(^|;\s*)(?=[=+\-@＝＋－＠])")
 #: A number with its sign, as tables print it; the arrow says whether a change is an improvement.
 _NUMBER = re.compile(r"[+-]?\d[\d,.]*(e[+-]?\d+)?( [↑↓=])?", re.ASCII)
 _MARKDOWN = str.maketrans(
-    {char: f"\\{char}" for char in "\\`*_{}[]<>#|~$&"}
+    {char: f"\\{char}" for char in "\\`*_{}[]#|~$"}
+    | {"&": "&amp;", "<": "&lt;", ">": "&gt;"}
     | {"@": "@<!-- -->"}  # GitHub makes links of e-mail addresses whose characters are escaped
 )
 #: What begins a list or a rule where it begins a paragraph, and what is a link without brackets.
