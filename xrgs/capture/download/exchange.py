@@ -18,7 +18,7 @@ from yarl import URL  # aiohttp's own class for addresses
 
 from xrgs.capture.download.part import DownloadError, Version
 from xrgs.runtime.progress import ProgressBar
-from xrgs.safeio.untrusted import one_line
+from xrgs.safeio.words import for_line
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -325,5 +325,5 @@ def _seconds(date: str) -> float | None:
 
 def _words(text: str) -> str:
     """Return words that a server may have chosen, short enough for a message, on one line."""
-    line = one_line(text)
+    line = for_line(text)
     return line if len(line) <= _MAX_WORDS else f"{line[:_MAX_WORDS]}..."

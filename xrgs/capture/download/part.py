@@ -11,6 +11,7 @@ from typing import IO, TYPE_CHECKING
 from xrgs.errors import XrgsError
 from xrgs.safeio import untrusted
 from xrgs.safeio.atomic import write_json
+from xrgs.safeio.confined import confined
 from xrgs.safeio.hashing import file_digest
 
 if TYPE_CHECKING:
@@ -160,7 +161,7 @@ def _file(target: Path) -> Path:
 def _read_version(record: Path) -> Version:
     """Read the version that a part is of; an unknown one where the record is missing or damaged."""
     try:
-        content = untrusted.parse_json(untrusted.read_bytes(record, _MAX_BYTES))
+        content = untrusted.parse_json(confined(record).read_bytes(_MAX_BYTES))
         version = Version(content["url"], content["validator"], content["total"])
         texts = isinstance(version.url, str) and isinstance(version.validator, str)
         # The validator becomes a header of a request.

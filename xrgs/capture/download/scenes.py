@@ -14,7 +14,7 @@ from xrgs.capture.scenes.folder import list_photographs
 from xrgs.errors import XrgsError
 from xrgs.safeio.atomic import write_text
 from xrgs.safeio.hashing import file_digest
-from xrgs.safeio.untrusted import read_bytes
+from xrgs.safeio.confined import confined
 
 if TYPE_CHECKING:
     from xrgs.capture.download.settings import DatasetConf
@@ -109,7 +109,7 @@ def _digest_file(archive: Path) -> Path:
 def _read_digest(record: Path) -> str:
     """Read the archive's SHA-256 at its first use; empty where it was not used before."""
     try:
-        content = read_bytes(record, _MAX_RECORD_BYTES).decode("ascii", "replace")
+        content = confined(record).read_bytes(_MAX_RECORD_BYTES).decode("ascii", "replace")
     except FileNotFoundError:
         return ""
     except OSError as error:

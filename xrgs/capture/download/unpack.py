@@ -13,7 +13,7 @@ from pathlib import Path, PurePosixPath
 from xrgs.capture.download.part import sync_folder
 from xrgs.errors import XrgsError
 from xrgs.runtime.progress import progress
-from xrgs.safeio.untrusted import one_line
+from xrgs.safeio.words import for_line
 
 #: Limits for one folder: unpacked bytes, far more than the largest LLFF scene has, and files.
 _MAX_BYTES = 8 << 30
@@ -63,7 +63,7 @@ def unpack(archive: Path, folder: str, target: Path) -> None:
     except OSError as error:
         raise UnpackError(f"{archive}: can't be unpacked into {target} ({error})") from error
     except Exception as error:  # zipfile raises nearly anything on a damaged archive
-        why = one_line(str(error))
+        why = for_line(str(error))
         raise UnpackError(f"{archive}: not a complete zip archive ({why}); delete it") from error
 
 
