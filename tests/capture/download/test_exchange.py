@@ -234,6 +234,7 @@ def test_only_a_validator_that_tells_every_byte_lets_a_part_be_continued(
         {"Content_Range": "bytes 1005-199999/200000"},
         {"Content_Range": "bytes 1000-500/200000"},
         {"Content_Range": "bytes 1000-199999/5"},
+        {"Content_Range": "bytes 1000-199999/150000"},
         {"Content_Range": "bytes 1000-199999/*"},
         {"Content_Range": f"bytes 1000-199999/{'9' * 30}"},
         {"Content_Range": "items 1000-199999/200000"},
