@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
+import errno
 import json
+import shutil
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 
-from xrgs.experiment.cell_folder import CellFolder
+from xrgs.errors import UnreadableError
+from xrgs.experiment.cell_folder import CellFolder, CellState
 from xrgs.safeio.atomic import write_json
+from xrgs.safeio.confined import ConfinedPath, ReplacedError
 
 
 @pytest.fixture
@@ -198,3 +203,99 @@ def test_a_finished_cell_has_no_checkpoint(stopped: CellFolder) -> None:
     assert not stopped.checkpoint.exists()
     stopped.checkpoint.path.write_bytes(b"killed before it was removed")
     assert stopped.state().name == "done"
+
+
+# attempts
+
+
+def test_an_attempt_writes_nothing_once_another_has_begun(tmp_path: Path) -> None:
+    folder = CellFolder(tmp_path / "cells" / "abc")
+    first = folder.begin({"seed": 0}, {"seed": 0})
+    write_json(first.folder / "summary.json", {})
+    second = folder.begin({"seed": 0}, {"seed": 0})
+    writes: list[Callable[[], None]] = [
+        lambda: write_json(first.folder / "summary.json", {}),
+        lambda: first.fail("out of luck"),
+        lambda: first.finish([], 1),
+        first.drop_checkpoint,
+    ]
+    for write in writes:
+        with pytest.raises(ReplacedError, match="it was replaced by another folder"):
+            write()
+    assert first.state().name == "unknown"
+    assert second.state().name == folder.state().name == "unfinished"
+    assert second.folder.names() == ["config.json", "identity.json"]
+
+
+def test_a_log_that_is_still_written_to_is_not_that_of_the_next_attempt(tmp_path: Path) -> None:
+    folder = CellFolder(tmp_path / "cells" / "abc")
+    first = folder.begin({"seed": 0}, {"seed": 0})
+    with (first.folder / "log.txt").append() as log:
+        log.write(b"before")
+        log.flush()
+        second = folder.begin({"seed": 0}, {"seed": 0})
+        log.write(b"after")
+    assert (second.path / "log.txt").read_text() == "before"
+
+
+def test_a_cell_that_another_process_begins_meanwhile_is_left_to_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The first process was suspended while it began: the second has even finished the cell."""
+    folder, sync = CellFolder(tmp_path / "cells" / "abc"), ConfinedPath.sync_tree
+    folder.begin({"seed": 0}, {"seed": 0})
+
+    def overtaken(new: ConfinedPath) -> None:
+        sync(new)
+        monkeypatch.setattr(ConfinedPath, "sync_tree", sync)
+        second = folder.begin({"seed": 0}, {"seed": 0})
+        (second.path / "scores.csv").write_text("view\na\n")
+        second.finish(["a"], 1)
+
+    monkeypatch.setattr(ConfinedPath, "sync_tree", overtaken)
+    with pytest.raises(OSError, match="abc"):
+        folder.begin({"seed": 0}, {"seed": 0})
+    assert folder.state().name == "done"
+    assert [entry.name for entry in folder.path.parent.iterdir()] == ["abc"]
+
+
+@pytest.mark.parametrize("in_place", [False, True])
+def test_what_a_killed_process_left_of_other_attempts_is_used_or_removed(
+    stopped: CellFolder, in_place: bool
+) -> None:
+    home = stopped.path.parent
+    shutil.copytree(stopped.path, home / ".abc.new-1")
+    if in_place:
+        shutil.copytree(stopped.path, home / ".abc.old-1")
+        stopped.checkpoint.path.write_bytes(b"newer")
+    else:
+        stopped.path.rename(home / ".abc.old-1")
+    (home / ".abcd.old-1").mkdir()  # of another cell
+    attempt = stopped.begin({"seed": 0}, {"seed": 0})
+    assert attempt.checkpoint.read_bytes() == (b"newer" if in_place else b"state")
+    assert sorted(entry.name for entry in home.iterdir()) == [".abcd.old-1", "abc"]
+
+
+def test_a_cell_that_can_not_be_read_now_is_not_begun(
+    done: CellFolder, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    unknown = CellState("unknown", "it can't be read now: Input/output error")
+    monkeypatch.setattr(CellFolder, "state", lambda _: unknown)
+    with pytest.raises(UnreadableError, match="abc: it can't be read now: Input/output error"):
+        done.begin({"seed": 0}, {"seed": 0})
+    assert [entry.name for entry in done.path.parent.iterdir()] == ["abc"]
+    assert (done.path / "status.json").exists()
+
+
+def test_a_beginning_that_fails_leaves_the_cell_as_it_was(
+    stopped: CellFolder, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def full(_: object) -> None:
+        raise OSError(errno.ENOSPC, "no room")
+
+    before = sorted(stopped.path.iterdir())
+    monkeypatch.setattr(ConfinedPath, "sync_tree", full)
+    with pytest.raises(OSError, match="no room"):
+        stopped.begin({"seed": 0}, {"seed": 0})
+    assert sorted(stopped.path.iterdir()) == before
+    assert [entry.name for entry in stopped.path.parent.iterdir()] == ["abc"]

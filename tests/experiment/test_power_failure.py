@@ -217,7 +217,8 @@ class Recorder:
                 folder = named.get(key)
                 path = (Path.cwd() if folder is None else opened(folder)) / os.fspath(argument)
             if path.is_relative_to(self.root):
-                yield path.relative_to(self.root).as_posix().removeprefix(".")
+                below = path.relative_to(self.root).as_posix()
+                yield "" if below == "." else below
 
     def _look(self) -> None:
         """Record what was written since, and find out who wrote past this recorder."""
@@ -395,8 +396,7 @@ def attempts(
 
 
 def recorded_run(attempts: Attempts) -> Recorder:
-    """Record an attempt at the cell to its end, and when the cell was declared done."""
-    attempts.store.prepare()
+    """Record the preparation of the store, an attempt, and when the cell was declared done."""
     recorder = Recorder(attempts.store.path)
     drop = CellFolder.drop_checkpoint
 
@@ -406,6 +406,7 @@ def recorded_run(attempts: Attempts) -> Recorder:
 
     with recorder.recording(), pytest.MonkeyPatch.context() as patch:
         patch.setattr(CellFolder, "drop_checkpoint", declared)
+        attempts.store.prepare()
         attempts.run()
     return recorder
 

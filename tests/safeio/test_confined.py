@@ -11,7 +11,13 @@ from typing import TYPE_CHECKING
 import pytest
 
 from xrgs.safeio import beneath
-from xrgs.safeio.confined import ConfinedPath, RootMissingError, confined, is_passing
+from xrgs.safeio.confined import (
+    ConfinedPath,
+    ReplacedError,
+    RootMissingError,
+    confined,
+    is_passing,
+)
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -246,3 +252,99 @@ def test_an_error_of_the_disk_is_no_answer(
 def test_a_path_of_a_user_is_a_root_and_a_confined_one_stays(root: ConfinedPath) -> None:
     assert confined(root / "a") == root / "a"
     assert confined(root.root) == root
+
+
+# Pinned roots
+
+
+@pytest.fixture
+def pinned(root: ConfinedPath) -> ConfinedPath:
+    return (root / "a").pinned()
+
+
+def test_a_pinned_root_is_used_as_any_other_while_its_name_leads_to_it(
+    pinned: ConfinedPath,
+) -> None:
+    assert (pinned / "b/file").read_bytes() == b"abc"
+    (pinned / "c/d").make_folder()
+    (pinned / "c").rename(pinned / "e")
+    assert [path.name for path in pinned.iterdir()] == ["b", "e"]
+    assert pinned.identity() == (pinned.path.stat().st_dev, pinned.path.stat().st_ino)
+
+
+def test_nothing_is_done_in_a_folder_that_has_taken_the_name_of_a_pinned_root(
+    pinned: ConfinedPath, root: ConfinedPath
+) -> None:
+    pinned.path.rename(root.root / "old")
+    (root.root / "a").mkdir()
+    for use in (
+        (pinned / "file").create,
+        (pinned / "file").append,
+        (pinned / "b/file").read_bytes,
+        (pinned / "b").make_folder,
+        lambda: (pinned / "b/file").unlink(missing_ok=True),
+        (pinned / "b").parent.names,
+        lambda: (pinned / "b").with_name("c").make_folder(),
+        lambda: list(pinned.walk()),
+        (pinned / "b").remove,
+        (pinned / "b/file").exists,
+    ):
+        with pytest.raises(ReplacedError, match="it was replaced by another folder") as raised:
+            use()
+        assert raised.value.filename == str(pinned.path)
+        assert is_passing(raised.value)
+    assert not list((root.root / "a").iterdir())
+    assert (root.root / "old/b/file").read_bytes() == b"abc"
+
+
+def test_what_was_opened_before_a_takeover_stays_in_the_old_folder(
+    pinned: ConfinedPath, root: ConfinedPath
+) -> None:
+    with pinned._opened() as descriptor:
+        pinned.path.rename(root.root / "old")
+        (root.root / "a").mkdir()
+        os.mkdir("made", dir_fd=descriptor)
+    assert (root.root / "old/made").is_dir()
+    assert not list((root.root / "a").iterdir())
+
+
+def test_a_pinned_root_that_is_removed_is_missing_and_its_inode_is_not_used_again(
+    pinned: ConfinedPath, root: ConfinedPath
+) -> None:
+    (root / "a").remove()
+    with pytest.raises(RootMissingError):
+        (pinned / "file").create()
+    for number in range(20):  # a file system may give out a free inode at once
+        (root.root / f"other-{number}").mkdir()
+        assert (root / f"other-{number}").identity() != pinned.identity()
+
+
+def test_a_root_is_pinned_only_where_it_is_the_expected_one(root: ConfinedPath) -> None:
+    known = (root / "a").identity()
+    assert ((root / "a").pinned(known) / "b/file").read_bytes() == b"abc"
+    (root.root / "a").rename(root.root / "old")
+    (root.root / "a").mkdir()
+    with pytest.raises(ReplacedError, match="before this process began"):
+        (root / "a").pinned(known)
+
+
+def test_a_tree_is_synced_with_all_its_folders(
+    root: ConfinedPath, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (root.root / "a/pipe").symlink_to("nowhere")
+    synced = []
+    monkeypatch.setattr(os, "fsync", lambda fd: synced.append(os.fstat(fd).st_ino))
+    root.sync_tree()
+    paths = [root.root, *(root.root / name for name in ("a", "a/b", "a/b/file"))]
+    assert sorted(synced) == sorted(path.stat().st_ino for path in paths)
+
+
+def test_a_root_is_made_on_its_own_only_where_nothing_has_its_name(tmp_path: Path) -> None:
+    made = ConfinedPath(tmp_path / "new")
+    made.make_folder()
+    assert not made.exists()
+    made.make_folder(exclusive=True)
+    assert made.is_dir()
+    with pytest.raises(FileExistsError):
+        made.make_folder(exclusive=True)
+    assert made.siblings() == ["new"]

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from xrgs.capture.dataset import Dataset
 from xrgs.config import Conf
-from xrgs.safeio.confined import ConfinedPath
+from xrgs.safeio.confined import ConfinedPath, ReplacedError
 from xrgs.training import checkpoint
 from xrgs.training.checkpoint import Checkpoint, CheckpointError
 from xrgs.training.loop import train
@@ -273,3 +273,15 @@ def test_any_program_can_read_its_json_and_arrays(
         state = json.loads(arrays["state.json"].tobytes())
         assert state["steps"] == few_steps.train.steps
         assert arrays["states/optimizer/gaussians/means"].shape[1] == 3
+
+
+def test_training_ends_where_another_process_has_begun_the_run_again(
+    data: Dataset, few_steps: Conf, tmp_path: Path
+) -> None:
+    (tmp_path / "c").mkdir()
+    file = ConfinedPath(tmp_path / "c").pinned() / "checkpoint.npz"
+    (tmp_path / "c").rename(tmp_path / "old")
+    (tmp_path / "c").mkdir()
+    with pytest.raises(ReplacedError):
+        train(data, few_steps, Checkpoint(file, "cell", EVERY_STEP))
+    assert not list((tmp_path / "c").iterdir())

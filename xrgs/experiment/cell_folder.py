@@ -2,6 +2,10 @@
 
 A cell's `status.json` is written last, by atomic rename, and lists every other file of the cell: a
 cell is done when that file says so and the listed files are present and unchanged.
+
+Each attempt at a cell has a folder of its own, which takes the place of the one before it. Its
+process works in that very folder, whatever gets the name afterwards. What a kill leaves between two
+attempts are folders `.<cell id>.old-*` and `.new-*`; the next attempt settles them.
 """
 
 from __future__ import annotations
@@ -9,6 +13,7 @@ from __future__ import annotations
 import errno
 import secrets
 import shutil
+import stat
 from contextlib import suppress
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
@@ -17,7 +22,7 @@ from xrgs.errors import StoreError, UnreadableError
 from xrgs.runtime import progress
 from xrgs.safeio import untrusted
 from xrgs.safeio.atomic import write_json, write_text
-from xrgs.safeio.confined import ReplacedError, RootMissingError, confined, is_passing
+from xrgs.safeio.confined import ReplacedError, confined, is_passing
 from xrgs.safeio.hashing import canonical_json, file_digest
 from xrgs.safeio.records import as_number, read_json, read_object, read_table
 from xrgs.safeio.words import for_terminal
@@ -134,11 +139,13 @@ class CellFolder:
 
     def _without_status(self) -> CellState | None:
         """Return the state of a cell that has no status; None where it has one."""
-        if self.folder.is_link():
+        found = self.folder.look()
+        if found is not None and stat.S_ISLNK(found.st_mode):
             return CellState("corrupt", "it is a symbolic link; a cell must be a folder")
-        if not self.folder.is_dir():
-            there = self.folder.exists()
-            return CellState("corrupt", "it is not a folder") if there else CellState("absent")
+        if found is None:
+            return CellState("absent")
+        if not stat.S_ISDIR(found.st_mode):
+            return CellState("corrupt", "it is not a folder")
         if self.status.exists():
             return None
         resumes = "; it resumes from its checkpoint" if self.checkpoint.exists() else ""
@@ -242,7 +249,8 @@ class CellFolder:
             ReplacedError: Another process has begun the cell at the same time.
         """
         self.folder.make_parent()
-        before, stopped = self._identity(), self._stopped(identity)
+        before = self.folder.identity() if self.folder.exists() else None
+        stopped = self._stopped(identity)
         new = self._hidden("new")
         try:
             new.make_folder(exclusive=True)
@@ -260,15 +268,6 @@ class CellFolder:
         self.folder.sync_name()
         self._settle_leftovers(identity)
         return attempt
-
-    def _identity(self) -> tuple[int, int] | None:
-        """Return device and inode of whatever has this name now; None if nothing has."""
-        try:
-            return self.folder.identity()
-        except RootMissingError:
-            raise
-        except FileNotFoundError:
-            return None
 
     def _stopped(self, identity: Mapping[str, Any]) -> CellFolder | None:
         """Return the attempt that a new one goes on from: the last, where it can be resumed.

@@ -224,13 +224,18 @@ class ConfinedPath:
         """Tell whether a symbolic link is there, and raise as `exists` does."""
         return stat.S_ISLNK(self._mode())
 
-    def _mode(self) -> int:
+    def look(self) -> os.stat_result | None:
+        """Return what `lstat` returns; None where nothing is there. It raises as `exists` does."""
         try:
-            return self.lstat().st_mode
+            return self.lstat()
         except RootMissingError:
             raise
         except (FileNotFoundError, NotADirectoryError):
-            return 0
+            return None
+
+    def _mode(self) -> int:
+        found = self.look()
+        return 0 if found is None else found.st_mode
 
     def sizes(self, names: list[str]) -> dict[str, int]:
         """Return the bytes of regular files below this folder; -1 for whatever is not one.

@@ -83,6 +83,7 @@ def test_a_job_trains_what_was_planned_and_reads_no_photograph(
                 "conf": made.config,
                 "variant": str(store.variants / made.variant_id),
                 "cell": str(folder.path),
+                "folder": folder.folder.identity(),
             },
         )
     ]
@@ -217,6 +218,26 @@ def test_a_cell_ends_with_its_sweep_or_its_lock_and_is_unfinished(
     (cell,) = store.cells_folder.iterdir()
     assert store.cell(cell.name).state().name == "unfinished"
     assert not list(store.locks.iterdir())
+
+
+def test_a_cell_that_was_taken_over_is_left_as_it_is(
+    session: SweepSession,
+    store: Store,
+    hand_over_of: HandOverOf,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    made = hand_over_of()
+
+    def lose(_: str, request: Mapping[str, Any], *__: object) -> None:
+        folder = store.cell(Path(request["cell"]).name).begin(made.config, made.identity)
+        (folder.path / "scores.csv").write_text("view\na\n")
+        folder.finish(["a"], 1)
+        raise worker.AttemptLostError("another attempt at the cell has begun")
+
+    monkeypatch.setattr(worker, "run_in_child", lose)
+    cell_id = session.hand_over(made)
+    assert run_job(session, cell_id) == LOCKED
+    assert store.cell(cell_id).state().name == "done"
 
 
 class ProcessEnded(Exception):  # noqa: N818

@@ -16,7 +16,12 @@ import pytest
 from xrgs.errors import XrgsError
 from xrgs.sweep.jobs import supervise, worker
 from xrgs.sweep.jobs.supervise import ProcessEnd
-from xrgs.sweep.jobs.worker import UnwritableError, WorkerError, run_in_child
+from xrgs.sweep.jobs.worker import (
+    AttemptLostError,
+    UnwritableError,
+    WorkerError,
+    run_in_child,
+)
 
 
 @pytest.fixture
@@ -44,6 +49,7 @@ def test_the_answer_of_the_child_is_returned(child: Callable[..., None]) -> None
     ("end", "answer", "error", "message"),
     [
         (ProcessEnd(0), {"error": "no photographs"}, WorkerError, "no photographs"),
+        (ProcessEnd(os.EX_TEMPFAIL), {"error": "x", "lost": True}, AttemptLostError, "x"),
         (ProcessEnd(0), {"error": "x", "errno": errno.ENOSPC}, UnwritableError, "x"),
         (ProcessEnd(0), {"error": "x", "errno": errno.EROFS}, UnwritableError, "x"),
         (ProcessEnd(0), {"error": "x", "errno": errno.ENOENT}, WorkerError, "x"),
