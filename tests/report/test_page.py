@@ -282,7 +282,7 @@ EVIL = (
 
 def test_words_of_a_foreign_store_are_not_obeyed(made: Any) -> None:
     for label in ("baseline", EVIL, f"-{EVIL}"):
-        made.add(label, scene=EVIL, condition=EVIL, variant="v", pictures=True)
+        made.add(label, scene=EVIL, condition=EVIL, variant="v", pictures=True, cpu=EVIL)
     made.add_error(f"@{EVIL}", EVIL)
     made.write((EVIL, "seed=0"))
     report = build(made.store.path)

@@ -141,7 +141,8 @@ def _write_files(
     write_text(folder / "cells.csv", _csv(cells[order]))
     write_text(folder / "views.csv", _csv(views))
     write_text(folder / "training.csv", _csv(training))
-    write_json(folder / "provenance.json", sweep.provenance)
+    provenance = {for_line(key): [*map(for_line, of)] for key, of in sweep.provenance.items()}
+    write_json(folder / "provenance.json", provenance)
 
 
 def _csv(table: pd.DataFrame) -> str:
