@@ -237,6 +237,27 @@ def test_errors_of_disks_and_permissions_may_pass(number: int, passing: bool) ->
     assert is_passing(OSError(number, os.strerror(number))) is passing
 
 
+def test_an_error_of_a_library_is_about_the_content() -> None:
+    assert not is_passing(OSError("cannot identify image file"))
+
+
+def test_a_file_is_updated_where_it_is_and_never_created(tmp_path: Path) -> None:
+    file = ConfinedPath(tmp_path) / "a"
+    with pytest.raises(FileNotFoundError):
+        file.update()
+    file.path.write_bytes(b"before")
+    inode = file.lstat().st_ino
+    with file.update() as stream:
+        assert stream.read() == b"before"
+        stream.seek(0)
+        stream.write(b"be")
+        file.unlink()
+        file.path.write_bytes(b"another's")
+        stream.write(b"hind")
+    assert file.read_bytes() == b"another's"
+    assert file.lstat().st_ino != inode
+
+
 def test_an_error_of_the_disk_is_no_answer(
     root: ConfinedPath, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable
 from dataclasses import asdict, replace
 from pathlib import Path
@@ -11,6 +12,7 @@ import pytest
 from xrgs.config import Conf
 from xrgs.experiment.identity import cell_identity
 from xrgs.experiment.store import Store
+from xrgs.safeio.confined import ConfinedPath
 from xrgs.sweep.session import HandOver, SweepSession
 
 #: The id of a variant that is not built.
@@ -24,6 +26,25 @@ def store(tmp_path: Path) -> Store:
     store.prepare()
     (store.variants / VARIANT).make_folder()
     return store
+
+
+@pytest.fixture
+def sick(monkeypatch: pytest.MonkeyPatch) -> Callable[[str, int], None]:
+    """(end of a path, number of an error) -> files with that end can't be read from now on.
+
+    The number 0 makes all files readable again.
+    """
+    read = ConfinedPath._open_regular
+
+    def sicken(end: str, number: int) -> None:
+        def fail(path: ConfinedPath, flags: int) -> int:
+            if number and str(path).endswith(end):
+                raise OSError(number, os.strerror(number), str(path))
+            return read(path, flags)
+
+        monkeypatch.setattr(ConfinedPath, "_open_regular", fail)
+
+    return sicken
 
 
 @pytest.fixture

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import pickle
 import shutil
 from collections.abc import Callable, Sequence
@@ -22,8 +23,9 @@ from xrgs.experiment.identity import cell_identity
 from xrgs.experiment.store import Store
 from xrgs.safeio.atomic import write_json
 from xrgs.safeio.hashing import digest
-from xrgs.sweep import launch
+from xrgs.sweep import launch, locks
 from xrgs.sweep.axes import CellSpec
+from xrgs.sweep.jobs.job import UNKNOWN
 from xrgs.sweep.launch import LOST, Launches, capacity
 from xrgs.sweep.plan import PlannedCell
 from xrgs.sweep.session import SweepSession
@@ -257,6 +259,50 @@ def test_two_calls_never_share_a_folder(
         assert (odd / name / "sweep").is_file()
 
 
+def test_a_job_is_told_which_locks_the_plan_has_watched(
+    composed: Callable[..., DictConfig],
+    compose: Callable[..., config.Conf],
+    store: Store,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """A job in a process of its own has watched nothing."""
+    cells = [planned(compose(f"seed={seed}"), "a") for seed in (0, 1)]
+    fake = FakeLauncher(store, set())
+    monkeypatch.setattr(Plugins, "instantiate_launcher", fake.configured)
+    dead = {str(cells[1].cell_id): ("x.0 stamp",)}
+    monkeypatch.setattr(locks, "confirmed", lambda _: dead)
+    context = HydraContext(None, None)  # type: ignore[arg-type]  # launches load no config
+    Launches(context, len, composed()).launch(cells, store)
+    session = SweepSession(Path(fake.config.hydra.sweep.dir))
+    told = [session.read(str(cell.cell_id)).dead_locks for cell in cells]
+    assert told == [(), ("x.0 stamp",)]
+
+
+def test_an_answer_that_is_lost_of_a_cell_that_can_not_be_read_blames_no_cell(
+    launch_cells: Callable[..., tuple[dict[str, str], FakeLauncher]],
+    sick: Callable[[str, int], None],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    def answer(self: FakeLauncher, name: str) -> JobReturn:
+        sick("status.json", errno.EIO)
+        return JobReturn(status=JobStatus.FAILED, _return_value=RuntimeError("timed out"))
+
+    monkeypatch.setattr(FakeLauncher, "answer", answer)
+    outcomes, _ = launch_cells("a", set())
+    assert outcomes == {"a": UNKNOWN}
+
+
+def test_a_folder_of_a_sweep_in_a_store_leads_nowhere_else(
+    launch_cells: Callable[..., tuple[dict[str, str], FakeLauncher]], tmp_path: Path
+) -> None:
+    (tmp_path / "s").mkdir()
+    (tmp_path / "elsewhere").mkdir()
+    (tmp_path / "s" / "hydra").symlink_to(tmp_path / "elsewhere")
+    with pytest.raises(XrgsError, match=r"hydra\.sweep\.dir=.*s/hydra"):
+        launch_cells("a", set())
+    assert not list((tmp_path / "elsewhere").iterdir())
+
+
 def test_a_launcher_composes_nothing_for_a_job(
     launch_cells: Callable[..., tuple[dict[str, str], FakeLauncher]], tmp_path: Path
 ) -> None:
@@ -279,7 +325,18 @@ def test_a_launcher_composes_nothing_for_a_job(
 
 @pytest.mark.parametrize("cell_id", ["0123456789012345", "12e4567890123456", "1234567890abcdef"])
 def test_an_id_that_looks_like_a_number_stays_text(
-    composed: Callable[..., DictConfig], cell_id: str
+    composed: Callable[..., DictConfig], session: SweepSession, cell_id: str
 ) -> None:
-    job = launch._JobConfigLoader().load_sweep_config(composed(), [f"cell={cell_id}"])
+    given = composed(*with_quotes([f"hydra.sweep.dir={session.folder}"]))
+    job = launch._JobConfigLoader().load_sweep_config(given, [f"cell={cell_id}"])
     assert job.cell == cell_id
+
+
+def test_a_job_of_a_sweep_whose_folder_is_gone_does_not_begin(
+    composed: Callable[..., DictConfig], session: SweepSession
+) -> None:
+    """Hydra would make the folder again, and the store with it."""
+    given = composed(*with_quotes([f"hydra.sweep.dir={session.folder}"]))
+    session.folder.path.rename(session.folder.path.with_name("elsewhere"))
+    with pytest.raises(XrgsError, match="is no longer there"):
+        launch._JobConfigLoader().load_sweep_config(given, ["cell=a"])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import io
 import time
 from collections.abc import Callable
@@ -202,6 +203,29 @@ def test_a_terminal_shows_one_line_which_is_removed_at_the_end(
     *_, last = output.split("\r")
     assert last.startswith("\x1b[K1 of 2 cells done")
     assert output.count("\n") == 1
+
+
+def test_a_status_that_can_not_be_read_is_read_again(
+    cells: Cells, sick: Callable[[str, int], None]
+) -> None:
+    monitor = SweepMonitor(cells.store.cells_folder)
+    monitor.watch([cells.plan("a")])
+    cells.begin("a")
+    cells.finish("a")
+    sick("status.json", errno.EIO)
+    assert str(monitor.snapshot()) == "0 of 1 cells done"
+    sick("", 0)
+    assert str(monitor.snapshot()) == "1 of 1 cells done"
+
+
+def test_cells_that_were_seen_to_end_still_count_when_the_store_is_gone(cells: Cells) -> None:
+    monitor = SweepMonitor(cells.store.cells_folder)
+    monitor.watch([cells.plan("a"), cells.plan("b")])
+    cells.begin("a")
+    cells.finish("a")
+    assert str(monitor.snapshot()) == "1 of 2 cells done"
+    cells.store.path.rename(cells.store.path.with_name("gone"))
+    assert str(monitor.snapshot()) == "1 of 2 cells done"
 
 
 def test_a_store_out_of_reach_is_read_again(cells: Cells) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import os
 import shutil
@@ -31,6 +32,7 @@ RunCommand = Callable[..., tuple[int, str, str]]
 def trained(compose: Callable[..., Conf], tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The folder of a finished cell in a store `s`, which was not really trained."""
     store = Store(tmp_path_factory.mktemp("trained") / "s")
+    store.prepare()
     conf = compose("scene=motorcycle", "train.steps=2", "threads=1", "splat.backend=torch")
     variant_id = "0123456789abcdef-0123456789abcdef"
     identity = cell_identity(conf, variant_id)
@@ -229,7 +231,7 @@ def test_a_missing_variant_is_built_and_has_to_be_the_same(
     other = f"{variant_id[:16] if same_key else '0' * 16}-{'1' * 16}"
     requests: list[Any] = []
 
-    def run(job: str, request: dict[str, Any]) -> dict[str, Any]:
+    def run(job: str, request: dict[str, Any], **_: object) -> dict[str, Any]:
         requests.append((job, request["conf"]["scene"]["path"], request["store"]))
         return {"variant": other}
 
@@ -272,6 +274,17 @@ def test_a_folder_that_can_not_be_rerun_is_refused_with_a_reason(
     spoil(cell)
     with pytest.raises(XrgsError, match=named):
         rerun(cell.path)
+
+
+@pytest.mark.parametrize("name", ["status.json", "config.json", "provenance.json", "splats.ply"])
+def test_a_file_that_can_not_be_read_now_is_named(
+    cell: CellFolder, train: Callable[..., None], sick: Callable[[str, int], None], name: str
+) -> None:
+    train()
+    sick(f"{cell.id}/{name}", errno.EIO)
+    with pytest.raises(XrgsError, match=os.strerror(errno.EIO)) as caught:
+        rerun(cell.path)
+    assert f"{cell.id}/{name}" in str(caught.value)
 
 
 def test_fewer_threads_than_none_are_refused(cell: CellFolder) -> None:

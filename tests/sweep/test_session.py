@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+import errno
 import json
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import pytest
 
 from xrgs.errors import XrgsError
 from xrgs.experiment import identity
+from xrgs.safeio.confined import RootMissingError
 from xrgs.sweep.session import HandOver, SweepSession
 
 HandOverOf = Callable[..., HandOver]
@@ -17,9 +20,9 @@ HandOverOf = Callable[..., HandOver]
 
 def signed_by(session: SweepSession, **changes: object) -> SweepSession:
     """Return the session as that of another process."""
-    file = session.folder / "sweep"
+    file = session.folder.path / "sweep"
     file.write_text(json.dumps(json.loads(file.read_text()) | changes))
-    return SweepSession(session.folder)
+    return SweepSession(session.folder.path)
 
 
 def test_a_session_is_over_when_it_is_stopped_or_its_process_has_ended(
@@ -35,14 +38,43 @@ def test_a_session_is_over_when_it_is_stopped_or_its_process_has_ended(
 
 
 def test_a_disk_too_full_for_the_reason_stops_the_jobs_all_the_same(session: SweepSession) -> None:
-    (session.folder / "stopped").touch()
+    (session.folder.path / "stopped").touch()
+    assert session.stopped == f"{session.folder / 'stopped'} exists"
+
+
+def test_a_session_whose_folder_is_gone_is_over_and_does_not_reappear(
+    session: SweepSession, hand_over_of: HandOverOf
+) -> None:
+    assert session.exists
+    path = session.folder.path
+    path.rename(path.with_name("moved"))
+    assert not session.exists
+    assert session.stopped == f"{path} is no longer there"
+    session.stop("a reason")
+    with pytest.raises(RootMissingError):
+        session.hand_over(hand_over_of())
+    assert not path.exists()
+
+
+def test_a_reason_that_can_not_be_read_now_stops_nothing(
+    session: SweepSession, sick: Callable[[str, int], None]
+) -> None:
+    session.stop("enough\x1b[31m\nof it")
+    sick("stopped", errno.EIO)
+    assert str(session.stopped) == ""
+    sick("", 0)
+    assert str(session.stopped) == "enough [31m of it"
+
+
+def test_something_else_with_the_name_of_the_reason_stops_the_jobs(session: SweepSession) -> None:
+    (session.folder.path / "stopped").symlink_to("/etc/hostname")
     assert session.stopped == f"{session.folder / 'stopped'} exists"
 
 
 def test_a_job_reads_what_the_plan_has_written(
     session: SweepSession, hand_over_of: HandOverOf
 ) -> None:
-    written = hand_over_of(seed=3)
+    written = replace(hand_over_of(seed=3), dead_locks=("a.0 x", "a.1 y"))
     cell_id = session.hand_over(written)
     read = session.read(cell_id)
     assert read == written
@@ -78,6 +110,8 @@ def remove(content: dict[str, Any], key: str) -> None:
         (lambda c: c.update(config=[]), "not what a plan writes"),
         (lambda c: c.update(identity="x"), "not what a plan writes"),
         (lambda c: c["identity"].update(code=[1]), "not what a plan writes"),
+        (lambda c: c.update(dead_locks=[1]), "dead locks are not text"),
+        (lambda c: c.update(dead_locks=1), "not what a plan writes"),
         (lambda c: remove(c["config"], "limits"), "KeyError"),
     ],
 )
@@ -88,7 +122,7 @@ def test_a_hand_over_that_somebody_changed_is_refused(
     message: str,
 ) -> None:
     cell_id = session.hand_over(hand_over_of())
-    file = session.folder / "cells" / f"{cell_id}.json"
+    file = session.folder.path / "cells" / f"{cell_id}.json"
     content = json.loads(file.read_text())
     change(content)
     file.write_text(json.dumps(content))
@@ -109,7 +143,7 @@ def test_a_variant_outside_of_the_store_is_refused(
 
 @pytest.mark.parametrize("content", ["", "{", "[]", "1" * 10_000, '{"a": NaN}'])
 def test_a_file_that_is_no_hand_over_is_named(session: SweepSession, content: str) -> None:
-    (session.folder / "cells" / "a.json").write_text(content)
+    (session.folder.path / "cells" / "a.json").write_text(content)
     with pytest.raises(XrgsError, match=r"a\.json"):
         session.read("a")
 

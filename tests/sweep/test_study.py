@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+import errno
+import os
+import shutil
+import time
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -10,18 +14,21 @@ import hydra
 import pytest
 from hydra.core.plugins import Plugins
 from hydra.core.utils import JobReturn, JobStatus
+from hydra.errors import CompactHydraException
 from hydra.types import HydraContext
 from omegaconf import DictConfig
 
 from xrgs import config
-from xrgs.experiment.store import Store
+from xrgs.experiment.identity import cell_identity
+from xrgs.experiment.store import BASELINE, Store
 from xrgs.safeio.hashing import digest
 from xrgs.sweep import plan as plan_module
 from xrgs.sweep import study as study_module
+from xrgs.sweep import variants
 from xrgs.sweep.axes import CellSpec
 from xrgs.sweep.jobs.job import FAIL_FAST, STOPPED, STORE_FULL
 from xrgs.sweep.monitor import SweepMonitor
-from xrgs.sweep.plan import PlannedCell
+from xrgs.sweep.plan import PlannedCell, describe, record
 from xrgs.sweep.session import SweepSession
 from xrgs.sweep.study import Study
 
@@ -147,3 +154,205 @@ def test_a_cell_that_waits_for_a_count_in_vain_says_so(compose: Callable[..., co
     assert cell.waits
     error = study_module._without_reference(cell).error
     assert error == "matched_to=gradient_scaling: that cell is not done"
+
+
+class Trainer:
+    """A launcher whose jobs finish their cells."""
+
+    def __init__(self, store: Store) -> None:
+        self.store = store
+        self.launched: list[str] = []
+
+    def configured(self, **_: object) -> Trainer:
+        return self
+
+    def launch(self, jobs: Sequence[Sequence[str]], _: int) -> list[JobReturn]:
+        for (job,) in jobs:
+            cell_id = job.removeprefix("cell=")
+            self.launched.append(cell_id)
+            finish(self.store, cell_id)
+        return [JobReturn(status=JobStatus.COMPLETED, _return_value="done") for _ in jobs]
+
+
+def finish(store: Store, cell_id: str) -> None:
+    cell = store.cell(cell_id)
+    cell.begin({}, {})
+    (cell.path / "scores.csv").write_text("view\na\n")
+    cell.finish(["a"], 1)
+
+
+def files(folder: Path) -> dict[Path, tuple[int, int]]:
+    """Inode and time of everything in a folder."""
+    stats = {file: file.stat() for file in folder.rglob("*")}
+    return {file: (stat.st_ino, stat.st_mtime_ns) for file, stat in stats.items()}
+
+
+@pytest.fixture
+def planned(
+    compose: Callable[..., config.Conf], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> tuple[Store, Trainer, list[PlannedCell]]:
+    """A store in which the first of two cells is done, a launcher, and the plan of both."""
+    store = Store(tmp_path / "s")
+    store.prepare()
+    trainer = Trainer(store)
+    monkeypatch.setattr(Plugins, "instantiate_launcher", trainer.configured)
+    monkeypatch.setattr(study_module, "_POLL_S", 0.0)
+    conf = compose("store=s", "splat.backend=torch")
+    plan = []
+    for seed in (0, 1):
+        cell_conf = replace(conf, seed=seed)
+        identity = cell_identity(cell_conf, "v")
+        spec = CellSpec(BASELINE, "", (f"seed={seed}",), ())
+        plan.append(PlannedCell(spec, cell_conf, "v", identity, digest(identity)))
+    finish(store, str(plan[0].cell_id))
+    return store, trainer, plan
+
+
+def test_a_cell_that_can_not_be_read_is_left_alone_and_the_others_are_trained(
+    planned: tuple[Store, Trainer, list[PlannedCell]],
+    study: Callable[..., Study],
+    sick: Callable[[str, int], None],
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    store, trainer, plan = planned
+    before = files(store.cell(str(plan[0].cell_id)).path)
+    sick(f"{plan[0].cell_id}/status.json", errno.EIO)
+    with SweepMonitor(store.cells_folder) as monitor:
+        made = study("store=s")
+        plan = made._identified(plan, store)
+        final = made._run_until_complete(plan, store, monitor)
+    assert trainer.launched == [plan[1].cell_id]
+    assert [cell.state.name for cell in final] == ["unknown", "done"]
+    text = describe(final)
+    assert f"{plan[0].cell_id}/status.json: {os.strerror(errno.EIO)}" in text
+    assert "can't be read now" in text
+    assert "; run the same command again)" in text
+    assert "failed" not in text
+    assert [row["error"] for row in record(final)] == [None, None]
+    sick("", 0)
+    assert files(store.cell(str(plan[0].cell_id)).path) == before
+    assert "1 of 2 cells done" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("looks", [1, study_module._UNKNOWN_LOOKS, 100])
+def test_an_error_that_passes_is_waited_for_a_while(
+    planned: tuple[Store, Trainer, list[PlannedCell]],
+    study: Callable[..., Study],
+    sick: Callable[[str, int], None],
+    monkeypatch: pytest.MonkeyPatch,
+    looks: int,
+) -> None:
+    store, trainer, plan = planned
+    sick(f"{plan[0].cell_id}/status.json", errno.ESTALE)
+    slept = []
+
+    def sleep(seconds: float) -> None:
+        slept.append(seconds)
+        if len(slept) == looks:
+            sick("", 0)
+
+    made = study("store=s")
+    plan = made._identified(plan, store)
+    finish(store, str(plan[1].cell_id))
+    monkeypatch.setattr(study_module, "_POLL_S", 2.0)
+    monkeypatch.setattr(time, "sleep", sleep)
+    final = made._run_until_complete(plan[:1], store, SweepMonitor(store.cells_folder))
+    passes = looks < study_module._UNKNOWN_LOOKS
+    assert final[0].state.name == ("done" if passes else "unknown")
+    assert slept == [2.0] * min(looks + 1, study_module._UNKNOWN_LOOKS)
+    assert not trainer.launched
+
+
+def test_a_variant_that_can_not_be_read_makes_its_cells_unknown_until_it_can(
+    planned: tuple[Store, Trainer, list[PlannedCell]],
+    study: Callable[..., Study],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    store, trainer, plan = planned
+    found = [variants.PlannedVariant(unknown="its variant can't be read now: points.npz")]
+    monkeypatch.setattr(variants, "plan", lambda *_, **__: found[-1])
+    made = study("store=s")
+    plan = [replace(cell, variant_id=None, identity=None, cell_id=None) for cell in plan]
+    plan = made._identified(made._with_variants(plan, store, allow_build=True), store)
+    monitor = SweepMonitor(store.cells_folder)
+    final = made._run_until_complete(plan, store, monitor)
+    assert not trainer.launched
+    assert [cell.state.name for cell in final] == ["unknown"] * 2
+    assert "variant unknown" in describe(final)
+    assert {(row["state"], row["error"]) for row in record(final)} == {
+        ("unknown", "its variant can't be read now: points.npz")
+    }
+    found.append(variants.PlannedVariant("v"))
+    final = made._run_until_complete(plan, store, monitor)
+    assert [cell.state.name for cell in final] == ["done"] * 2
+    assert len(trainer.launched) == 1
+
+
+def test_a_count_that_can_not_be_read_is_unknown(
+    planned: tuple[Store, Trainer, list[PlannedCell]],
+    study: Callable[..., Study],
+    sick: Callable[[str, int], None],
+    compose: Callable[..., config.Conf],
+) -> None:
+    store, _, (reference, _) = planned
+    control = ("+ablation=count_matched", f"matched_to={BASELINE}")
+    cell = PlannedCell(reference.spec, compose(*control), "v")
+    assert cell.reference is not None
+    done = replace(reference, state=store.cell(str(reference.cell_id)).state())
+    sick("summary.json", errno.EIO)
+    waiting = study("store=s")._with_count(cell, {cell.reference: done}, store)
+    assert waiting.unknown
+    assert "summary.json" in waiting.state.reason
+    assert waiting.conf == cell.conf
+
+
+@pytest.mark.parametrize("how", ["renamed", "deleted", "unmounted"])
+def test_a_store_that_vanishes_ends_the_study_with_one_line(
+    planned: tuple[Store, Trainer, list[PlannedCell]],
+    study: Callable[..., Study],
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    tmp_path: Path,
+    how: str,
+) -> None:
+    store, trainer, plan = planned
+
+    def launch(jobs: Sequence[Sequence[str]], _: int) -> list[JobReturn]:
+        store.path.rename(tmp_path / "moved")
+        if how == "deleted":
+            shutil.rmtree(tmp_path / "moved")
+        elif how == "unmounted":
+            store.path.mkdir()
+        raise RuntimeError("a worker found no folder")
+
+    monkeypatch.setattr(trainer, "launch", launch)
+    made = study("store=s")
+
+    def train(_: object) -> bool:
+        made._store = store
+        with SweepMonitor(store.cells_folder) as monitor:
+            made._run_until_complete(made._identified(plan, store), store, monitor)
+        return True
+
+    monkeypatch.setattr(made, "_plan_and_train", train)
+    with pytest.raises(CompactHydraException, match=r"^store=.*: it is no longer there") as end:
+        made.run([])
+    assert "\n" not in str(end.value)
+    assert capsys.readouterr().err == ""
+    if how == "unmounted":
+        store.path.rmdir()  # empty
+    assert not store.path.exists()
+
+
+@pytest.mark.parametrize("number", [errno.EACCES, errno.ESTALE, errno.EIO])
+def test_an_error_of_the_store_has_no_traceback(
+    study: Callable[..., Study], monkeypatch: pytest.MonkeyPatch, number: int
+) -> None:
+    made = study("store=s")
+
+    def fail(_: object) -> bool:
+        raise OSError(number, os.strerror(number), "s/sweeps/a.json")
+
+    monkeypatch.setattr(made, "_plan_and_train", fail)
+    with pytest.raises(CompactHydraException, match=r"store=s: .*a\.json.*same command again"):
+        made.run([])

@@ -19,9 +19,12 @@ from xrgs.config import Conf
 from xrgs.errors import StoreError, XrgsError
 from xrgs.experiment.store import Store
 from xrgs.safeio.atomic import write_json
+from xrgs.safeio.confined import ConfinedPath
 from xrgs.sweep import variants
 from xrgs.sweep.jobs import worker
+from xrgs.sweep.presence import StoreGoneError
 from xrgs.sweep.status import describe, read
+from xrgs.sweep.variants import PlannedVariant
 
 BUILDING = "building the mixed-resolution variant"
 CONF = ("variant.factor=1", "variant.sfm.fallbacks=false")
@@ -42,18 +45,18 @@ def conf(compose: Callable[..., Conf]) -> Conf:
     return compose("scene=motorcycle")
 
 
-def fail(*_: object) -> dict[str, Any]:
+def fail(*_: object, **__: object) -> dict[str, Any]:
     raise worker.WorkerError("SfM placed too few views")
 
 
-def unexpected(*_: object) -> dict[str, Any]:
+def unexpected(*_: object, **__: object) -> dict[str, Any]:
     raise AssertionError("no child process is needed")
 
 
 def remember_failure(conf: Conf, store: Store) -> None:
     """Write the report of a build that failed, as `variant.build` does."""
     folder = store.variants / f"failed-{variant.key(conf.scene, conf.variant)}"
-    folder.mkdir()
+    folder.make_folder()
     write_json(folder / "report.json", {"scene": "motorcycle", "reason": "no first pair"})
 
 
@@ -63,7 +66,7 @@ def test_a_frozen_variant_is_found_and_not_built(
     monkeypatch.setattr(variant, "find", lambda *_: SimpleNamespace(id="k-1"))
     monkeypatch.setattr(worker, "run_in_child", unexpected)
     assert variants.find(conf, store) == variants.find_or_build(conf, store) == "k-1"
-    assert variants.plan(conf, store, allow_build=True) == ("k-1", None)
+    assert variants.plan(conf, store, allow_build=True) == PlannedVariant("k-1")
 
 
 def test_a_variant_that_the_store_lacks_is_built_in_a_child(
@@ -71,15 +74,15 @@ def test_a_variant_that_the_store_lacks_is_built_in_a_child(
 ) -> None:
     requests = []
 
-    def build(job: str, request: dict[str, Any]) -> dict[str, Any]:
+    def build(job: str, request: dict[str, Any], **_: object) -> dict[str, Any]:
         requests.append((job, request["conf"]["scene"]["kind"], request["store"]))
         return {"variant": "k-1"}
 
     monkeypatch.setattr(worker, "run_in_child", build)
     assert variants.find(conf, store) is None
-    assert variants.plan(conf, store, allow_build=False) == (None, None)
+    assert variants.plan(conf, store, allow_build=False) == PlannedVariant()
     assert not requests
-    assert variants.plan(conf, store, allow_build=True) == ("k-1", None)
+    assert variants.plan(conf, store, allow_build=True) == PlannedVariant("k-1")
     assert variants.find_or_build(conf, store) == "k-1"
     assert requests == [("variant", "motorcycle", str(store.path))] * 2
 
@@ -89,19 +92,21 @@ def test_a_scene_that_failed_is_not_tried_again_unless_asked(
 ) -> None:
     remember_failure(conf, store)
     monkeypatch.setattr(worker, "run_in_child", unexpected)
-    assert variants.plan(conf, store, allow_build=True) == (None, "no first pair")
+    assert variants.plan(conf, store, allow_build=True) == PlannedVariant(error="no first pair")
     conf.retry = "failed"
-    assert variants.plan(conf, store, allow_build=False) == (None, None)
+    assert variants.plan(conf, store, allow_build=False) == PlannedVariant()
     monkeypatch.setattr(worker, "run_in_child", fail)
     # The reason is the remembered one, so that the record of a repeated sweep is the same.
-    assert variants.plan(conf, store, allow_build=True) == (None, "no first pair")
+    assert variants.plan(conf, store, allow_build=True) == PlannedVariant(error="no first pair")
 
 
 def test_a_failure_is_the_reason_in_the_plan_and_an_error_elsewhere(
     conf: Conf, store: Store, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(worker, "run_in_child", fail)
-    assert variants.plan(conf, store, allow_build=True) == (None, "SfM placed too few views")
+    assert variants.plan(conf, store, allow_build=True) == PlannedVariant(
+        error="SfM placed too few views"
+    )
     with pytest.raises(XrgsError, match="SfM placed too few views"):
         variants.find_or_build(conf, store)
 
@@ -112,7 +117,7 @@ def test_a_library_that_dies_of_a_full_disk_is_not_a_failure_of_the_scene(
     def full(**_: object) -> None:
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
-    def dies(*_: object) -> dict[str, Any]:
+    def dies(*_: object, **__: object) -> dict[str, Any]:
         monkeypatch.setattr(tempfile, "TemporaryFile", full)
         raise worker.WorkerError("its process was ended by SIGABRT")
 
@@ -124,12 +129,71 @@ def test_a_library_that_dies_of_a_full_disk_is_not_a_failure_of_the_scene(
 def test_a_child_that_can_not_write_stops_the_sweep(
     conf: Conf, store: Store, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def unwritable(*_: object) -> dict[str, Any]:
+    def unwritable(*_: object, **__: object) -> dict[str, Any]:
         raise worker.UnwritableError("No space left on device")
 
     monkeypatch.setattr(worker, "run_in_child", unwritable)
     with pytest.raises(StoreError, match=r"No space left.*Finished cells are kept"):
         variants.plan(conf, store, allow_build=True)
+
+
+@pytest.mark.parametrize("number", [errno.EACCES, errno.EIO, errno.ESTALE])
+def test_a_variant_that_can_not_be_read_now_is_not_built_anew(
+    conf: Conf,
+    store: Store,
+    monkeypatch: pytest.MonkeyPatch,
+    sick: Callable[[str, int], None],
+    number: int,
+) -> None:
+    frozen = store.variants / f"{variant.key(conf.scene, conf.variant)}-0123456789abcdef"
+    frozen.make_folder()
+    write_json(frozen / "variant.json", {})
+    monkeypatch.setattr(worker, "run_in_child", unexpected)
+    sick("variant.json", number)
+    found = variants.plan(conf, store, allow_build=True)
+    assert found == PlannedVariant(unknown=found.unknown)
+    assert f"{frozen}/variant.json: {os.strerror(number)}" in str(found.unknown)
+    assert frozen.names() == ["variant.json"]
+
+
+def test_a_folder_of_variants_that_can_not_be_listed_is_unknown(
+    conf: Conf, store: Store, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fail(path: ConfinedPath) -> list[str]:
+        raise OSError(errno.EACCES, os.strerror(errno.EACCES), str(path))
+
+    monkeypatch.setattr(ConfinedPath, "names", fail)
+    monkeypatch.setattr(worker, "run_in_child", unexpected)
+    assert "Permission denied" in str(variants.plan(conf, store, allow_build=True).unknown)
+
+
+def test_a_child_that_can_not_read_a_file_now_fails_no_scene(
+    conf: Conf, store: Store, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def stale(*_: object, **__: object) -> dict[str, Any]:
+        raise worker.PassingError("Stale file handle")
+
+    monkeypatch.setattr(worker, "run_in_child", stale)
+    found = variants.plan(conf, store, allow_build=True)
+    assert "Stale file handle" in str(found.unknown)
+    assert found.error is None
+
+
+@pytest.mark.parametrize("seen", ["by its parent", "by the child"])
+def test_a_store_that_vanishes_while_a_variant_is_built_does_not_reappear(
+    conf: Conf, store: Store, monkeypatch: pytest.MonkeyPatch, seen: str
+) -> None:
+    def build(*_: object, on_poll: Callable[[int], None]) -> dict[str, Any]:
+        on_poll(0)
+        store.path.rename(store.path.with_name("moved"))
+        if seen == "by its parent":
+            on_poll(0)
+        raise worker.WorkerError("FileNotFoundError: no such file")
+
+    monkeypatch.setattr(worker, "run_in_child", build)
+    with pytest.raises(StoreGoneError, match="no longer there"):
+        variants.plan(conf, store, allow_build=True)
+    assert not store.path.exists()
 
 
 @pytest.mark.slow

@@ -111,13 +111,27 @@ class Store:
             for folder in (self.scenes, self.variants, self.cells_folder, self.locks, self.sweeps):
                 folder.make_folder()
             self.cells_folder.sync_name()  # and the names of the others, which are beside it
+        except OSError as error:
+            raise self._unwritable(error) from error
+        self.check_room()
+
+    def check_room(self) -> None:
+        """Check that the disk has room, without creating the folder.
+
+        Raises:
+            StoreError: As `prepare`.
+        """
+        try:
             with tempfile.TemporaryFile(dir=self.path) as file:
                 file.write(bytes(_MIN_FREE_BYTES))
         except OSError as error:
-            raise StoreError(
-                f"store={self.path} can't be written ({error.strerror}: {error.filename}): choose"
-                " another with store=..."
-            ) from error
+            raise self._unwritable(error) from error
+
+    def _unwritable(self, error: OSError) -> StoreError:
+        return StoreError(
+            f"store={self.path} can't be written ({error.strerror}: {error.filename}): choose"
+            " another with store=..."
+        )
 
     def cell(self, cell_id: str) -> CellFolder:
         """Return the folder of a cell, which need not exist.

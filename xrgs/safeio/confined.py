@@ -66,9 +66,12 @@ def is_passing(error: OSError) -> bool:
     """Tell whether an error says nothing about what a file holds, so that it is to be tried again.
 
     Args:
-        error: The error of a system call that looked at a file or read it.
+        error: The error of a system call that looked at a file or read it. Libraries raise others,
+            without a number: those are about the content.
     """
-    return isinstance(error, RootMissingError) or error.errno not in _CONCLUSIVE
+    if isinstance(error, RootMissingError):
+        return True
+    return error.errno is not None and error.errno not in _CONCLUSIVE
 
 
 class _Pin:
@@ -357,6 +360,17 @@ class ConfinedPath:
     def append(self) -> BinaryIO:
         """Open a regular file for writing at its end; it is created where it is missing."""
         return os.fdopen(self._open_regular(os.O_WRONLY | os.O_CREAT | os.O_APPEND), "ab")
+
+    def update(self) -> BinaryIO:
+        """Open an existing regular file for reading and writing, with the content that it has.
+
+        What is written goes to the file that was opened, even if its name is another file's or
+        nobody's by then.
+
+        Raises:
+            OSError: As `open`, or the file can't be written.
+        """
+        return os.fdopen(self._open_regular(os.O_RDWR), "r+b")
 
     def make_folder(self, *, exclusive: bool = False) -> None:
         """Make this folder and those above it, as far as they are below the root.

@@ -23,11 +23,13 @@ from xrgs.config import escape_interpolations
 from xrgs.errors import XrgsError
 from xrgs.runtime.machine import usable_cores
 from xrgs.runtime.progress import log_line
+from xrgs.safeio.confined import ConfinedPath, RootMissingError
 from xrgs.safeio.hashing import to_plain
+from xrgs.safeio.words import for_line
 from xrgs.splat.backend import resolve_backend
-from xrgs.sweep import locks
+from xrgs.sweep import locks, presence
 from xrgs.sweep.jobs import worker
-from xrgs.sweep.jobs.job import STOPPED
+from xrgs.sweep.jobs.job import STOPPED, UNKNOWN
 from xrgs.sweep.plan import expected_length
 from xrgs.sweep.session import HandOver, SweepSession
 
@@ -153,7 +155,13 @@ class _JobConfigLoader:
 
         Returns:
             The sweep's `hydra` node, and `cell`.
+
+        Raises:
+            XrgsError: The session's folder is no longer there. Hydra would make it again.
         """
+        folder = master_config.hydra.sweep.dir
+        if not SweepSession(Path(folder)).exists:
+            raise XrgsError(f"hydra.sweep.dir={folder} is no longer there")
         config = OmegaConf.masked_copy(master_config, ["hydra"])
         with flag_override(config, ["readonly", "struct"], False):
             # As text: an id of digits alone, or like 12e4567..., would be parsed as a number.
@@ -186,14 +194,14 @@ class Launches:
         self._losses: Counter[str] = Counter()
         self._suspects: set[str] = set()
 
-    def _begin(self) -> SweepSession:
+    def _begin(self, store: Store) -> SweepSession:
         """Create the session's folder, under a name that is the same for every job.
 
         In a job on another machine `now` would be another time, and `.` another folder.
         """
-        folder = _create_unique(Path(self._config.hydra.sweep.dir).absolute())
+        folder = _create_unique(Path(self._config.hydra.sweep.dir).absolute(), store)
         self._set("sweep.dir", escape_interpolations(str(folder)))
-        session = SweepSession(folder)
+        session = SweepSession(folder.path)
         session.begin()
         return session
 
@@ -218,9 +226,9 @@ class Launches:
             the cell may be launched again, or the state in which its last loss left it.
 
         Raises:
-            XrgsError: The launcher can't be used, or begins no job.
+            XrgsError: The launcher can't be used, or begins no job; or the store is gone.
         """
-        self._session = session = self._session or self._begin()
+        self._session = session = self._session or self._begin(store)
         cells = sorted(cells, key=expected_length, reverse=True)
         threads, machine = max(cell.conf.threads for cell in cells), usable_cores()
         allowed = capacity(self._config.hydra.launcher, threads, machine)
@@ -249,7 +257,9 @@ class Launches:
         if self._name != "basic":
             log_line(f"hydra/launcher={self._name}: {len(cells)} cells, threads={threads} each")
         session = cast("SweepSession", self._session)
-        overrides = [[f"cell={session.hand_over(_job_of(cell, threads))}"] for cell in cells]
+        dead = locks.confirmed(store.locks)
+        jobs = [_job_of(cell, threads, dead.get(str(cell.cell_id), ())) for cell in cells]
+        overrides = [[f"cell={session.hand_over(job)}"] for job in jobs]
         first, self._jobs = self._jobs, self._jobs + len(cells)
         try:
             launcher = Plugins.instance().instantiate_launcher(
@@ -257,6 +267,7 @@ class Launches:
             )
             returned = launcher.launch(overrides, first)
         except Exception as error:
+            presence.check(store)
             return self._after_loss(cells, error, store)
         return {
             str(cell.cell_id): self._outcome(cell, job, store)
@@ -273,6 +284,8 @@ class Launches:
         except Exception as error:
             log_line(f"{cell.name}: {_first_line(error)}")
         state = store.cell(str(cell.cell_id)).state().name
+        if state == "unknown":
+            return UNKNOWN
         return self._after_silence(str(cell.cell_id), state) if state == "unfinished" else "failed"
 
     def _after_silence(self, cell_id: str, state: str) -> str:
@@ -309,27 +322,54 @@ class Launches:
 
 
 def _first_line(error: Exception) -> str:
-    return f"{type(error).__name__}: {str(error).strip().partition(chr(10))[0]}"
+    return for_line(f"{type(error).__name__}: {str(error).strip().partition(chr(10))[0]}")
 
 
-def _create_unique(preferred: Path) -> Path:
+def _create_unique(preferred: Path, store: Store) -> ConfinedPath:
     """Create a folder, or one with a number appended if another call has it already."""
-    number, folder = 1, preferred
-    while True:
-        try:
-            folder.mkdir(parents=True)
-        except FileExistsError:
+    folder = wanted = _located(preferred, store)
+    number = 1
+    try:
+        wanted.make_parent()
+        while not _make(folder):
             number += 1
-            folder = preferred.with_name(f"{preferred.name}-{number}")
-        except OSError as error:
-            if worker.unwritable(error):
-                raise
-            raise XrgsError(f"hydra.sweep.dir={preferred}: {error}") from error
-        else:
-            return folder
+            folder = wanted.with_name(f"{wanted.name}-{number}")
+    except RootMissingError:
+        raise
+    except OSError as error:
+        if worker.unwritable(error):
+            raise
+        raise XrgsError(f"hydra.sweep.dir={preferred}: {error}") from error
+    return folder
 
 
-def _job_of(cell: PlannedCell, threads: int) -> HandOver:
+def _make(folder: ConfinedPath) -> bool:
+    """Make a folder; return False if another call has made it."""
+    try:
+        folder.make_folder(exclusive=True)
+    except FileExistsError:
+        return False
+    return True
+
+
+def _located(folder: Path, store: Store) -> ConfinedPath:
+    """Return a folder as one in the store, which is not made again, or in the one it is to be in.
+
+    Raises:
+        XrgsError: The folder that it is to be in can't be made.
+    """
+    home = store.path.absolute()
+    if folder != home and folder.is_relative_to(home) and ".." not in folder.parts:
+        return ConfinedPath(home) / folder.relative_to(home).as_posix()
+    above = ConfinedPath(folder.parent)
+    try:
+        above.make_root()
+        return above / folder.name
+    except (OSError, ValueError) as error:
+        raise XrgsError(f"hydra.sweep.dir={folder}: {error}") from error
+
+
+def _job_of(cell: PlannedCell, threads: int, dead_locks: tuple[str, ...] = ()) -> HandOver:
     """Return what a job on any machine needs: paths in full, the backend chosen, its threads."""
     if cell.identity is None:
         raise ValueError(f"{cell.name}: launched without an identity")
@@ -339,4 +379,4 @@ def _job_of(cell: PlannedCell, threads: int) -> HandOver:
     conf["threads"] = cell.conf.threads or threads
     if cell.conf.scene.path:
         conf["scene"]["path"] = str(Path(cell.conf.scene.path).expanduser().absolute())
-    return HandOver(cell.name, conf, cell.identity)
+    return HandOver(cell.name, conf, cell.identity, dead_locks)

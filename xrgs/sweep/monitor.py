@@ -237,13 +237,16 @@ class SweepMonitor:
         if cell.state.name == "done" or (cell.state.name == "failed" and not self._retry):
             return cell.state.name
         name = cell.cell_id
-        if name is None or name not in begun:
+        if name is None or (name not in begun and name not in self._ended):
             return ""
         if name not in self._ended:
             folder = self._folder(name)
             if (status := _stamp(folder.status)) is None or status == self._before[name]:
                 return ""
-            self._ended[name] = "done" if folder.state(verify=False).name == "done" else "failed"
+            state = folder.state(verify=False).name
+            if state == "unknown":  # it is read again
+                return ""
+            self._ended[name] = "done" if state == "done" else "failed"
         return self._ended[name]
 
     def _progress(self, cell: PlannedCell, begun: set[str]) -> Progress | None:

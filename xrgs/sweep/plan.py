@@ -54,6 +54,11 @@ class PlannedCell:
         return replace(self.spec, label=name, changes=(f"+ablation={name}",)) if name else None
 
     @property
+    def unknown(self) -> bool:
+        """Whether a file of the store can't be read now, so that the cell is left alone."""
+        return self.error is None and self.state.name == "unknown"
+
+    @property
     def waits(self) -> bool:
         """Whether the cell waits for the number of Gaussians of its reference."""
         return self.reference is not None and not self.conf.components.count_matched.gaussians
@@ -124,7 +129,7 @@ def ready(
         tried: Ids of cells that this sweep has trained already, with whatever outcome.
         retry: Train cells again that failed in an earlier sweep.
     """
-    left_alone = {"done", "running"} if retry else {"done", "running", "failed"}
+    left_alone = {"done", "running", "unknown"} | (set() if retry else {"failed"})
     return {
         cell.cell_id: cell
         for cell in plan
@@ -144,10 +149,10 @@ def describe(plan: Sequence[PlannedCell]) -> str:
     done = sum(cell.state.name == "done" for cell in plan)
     lines = [f"plan: {len(plan)} cells, {done} done{_remaining(plan)}"]
     for cell in plan:
-        state = "failed" if cell.error else "waits" if cell.waits else cell.state.name
-        reason = (cell.error or cell.state.reason or "").partition("\n")[0]
-        cell_id = cell.cell_id or ("no count yet" if cell.waits else "variant not built")
-        to_train = not cell.error and state != "done"
+        state, reason = _shown_state(cell)
+        missing = {"unknown": "variant unknown", "waits": "no count yet"}
+        cell_id = cell.cell_id or missing.get(state, "variant not built")
+        to_train = not cell.error and state not in {"done", "unknown"}
         time_left = format_duration(cell.seconds) if to_train else ""
         line = f"  {state:<10} {cell_id:<18} {time_left:>8}  {cell.name}"
         lines.append(f"{line}  ({reason})" if reason else line)
@@ -155,6 +160,16 @@ def describe(plan: Sequence[PlannedCell]) -> str:
     if plan[0].conf.retry != "failed" and failed:
         lines.append("failed cells are not trained again; retry=failed trains them again")
     return "\n".join(map(for_line, lines))
+
+
+def _shown_state(cell: PlannedCell) -> tuple[str, str]:
+    """Return the state of a cell and the reason for it, as the plan shows them."""
+    reason = cell.state.reason.partition("\n")[0]
+    if cell.error:
+        return "failed", cell.error.partition("\n")[0]
+    if cell.unknown:
+        return "unknown", f"{reason}; run the same command again"
+    return "waits" if cell.waits else cell.state.name, reason
 
 
 def without_kernels(plan: Sequence[PlannedCell]) -> str:
@@ -187,7 +202,9 @@ def without_kernels(plan: Sequence[PlannedCell]) -> str:
 def _left(plan: Sequence[PlannedCell]) -> list[PlannedCell]:
     """Return the cells that are to be trained, those whose variant or count is missing as well."""
     retry = plan[0].conf.retry == "failed"
-    unidentified = [cell for cell in plan if cell.cell_id is None and not cell.error]
+    unidentified = [
+        cell for cell in plan if cell.cell_id is None and not cell.error and not cell.unknown
+    ]
     return [*unidentified, *ready(plan, (), retry=retry).values()]
 
 
@@ -220,5 +237,16 @@ def record(plan: Sequence[PlannedCell]) -> list[dict[str, Any]]:
             "baseline_id": baselines[cell.spec.shared],
             "error": cell.error,
         }
+        | _unknown(cell)
         for cell in plan
     ]
+
+
+def _unknown(cell: PlannedCell) -> dict[str, str]:
+    """Return what a record says of a cell whose id is not known because its variant is not.
+
+    The state of a cell that has an id is read when a report is made, and may be another one then.
+    """
+    if cell.cell_id is not None or not cell.unknown:
+        return {}
+    return {"state": "unknown", "error": cell.state.reason}

@@ -98,6 +98,20 @@ def rerun(
         XrgsError: The folder holds no finished cell, or the config of another version; the variant
             is missing and can't be built again; or the training failed.
     """
+    try:
+        return _rerun(folder, out, store, threads, photographs, plugins)
+    except OSError as error:
+        raise XrgsError(f"rerun={folder}: {error}") from error
+
+
+def _rerun(
+    folder: Path,
+    out: Path | None,
+    store: Path | None,
+    threads: int | None,
+    photographs: str | None,
+    plugins: Sequence[str],
+) -> RerunResult:
     original = CellFolder(folder)
     conf, identity = _read(original)
     _check_plugins_allowed(original, conf, plugins)
@@ -106,8 +120,7 @@ def rerun(
     conf.scene.path = photographs or conf.scene.path
     if conf.threads < 0:
         raise XrgsError(f"threads={conf.threads}: must be at least 0")
-    if out is not None and out.exists():
-        raise XrgsError(f"out={out} exists already")
+    repeated = CellFolder(_free_folder(out, folder))
     conf.splat.backend = resolve_backend(conf.splat.backend)
     now = cell_identity(conf, str(identity["variant"]))
     before = [*_own_contradictions(original, identity, now), *_other_program(original, conf, now)]
@@ -115,7 +128,6 @@ def rerun(
     for line in _listed(before, title) or ["code, libraries and machine are the same"]:
         log_line(line)
     _provide(str(identity["variant"]), conf, home)
-    repeated = CellFolder(out or _free_sibling(folder))
     _train_again(conf, home.variants / str(identity["variant"]), repeated, now, original)
     return RerunResult(repeated, before, [*_differences(original, repeated)])
 
@@ -128,6 +140,8 @@ def _read(original: CellFolder) -> tuple[Conf, dict[str, Any]]:
         if not (original.folder / name).is_file():
             raise XrgsError(f"rerun={original.path} is not a finished cell: it has no {name}")
     state = original.state()
+    if state.name == "unknown":
+        raise XrgsError(f"rerun={original.path}: {state.reason}")
     if state.name == "failed":
         reason = state.reason.partition("\n")[0]
         raise XrgsError(f"rerun={original.path}: the cell failed and has no results ({reason})")
@@ -246,10 +260,22 @@ def _provide(variant_id: str, conf: Conf, store: Store) -> None:
     )
 
 
-def _free_sibling(folder: Path) -> Path:
-    folder = folder.resolve()
-    names = (folder.with_name(f"{folder.name}.rerun-{number}") for number in count(1))
-    return next(name for name in names if not name.exists())
+def _free_folder(out: Path | None, folder: Path) -> ConfinedPath:
+    """Return the folder to write to, which does not exist, in one that does.
+
+    Raises:
+        XrgsError: `out` exists.
+    """
+    if out is None:
+        beside = folder.resolve()
+        above = ConfinedPath(beside.parent)
+        names = (above / f"{beside.name}.rerun-{number}" for number in count(1))
+        return next(name for name in names if not name.exists())
+    above = ConfinedPath(out.absolute().parent)
+    above.make_root()
+    if (above / out.name).exists():
+        raise XrgsError(f"out={out} exists already")
+    return above / out.name
 
 
 def _train_again(
@@ -270,7 +296,7 @@ def _train_again(
         seconds=_seconds(original),
     )
     try:
-        with SweepMonitor(ConfinedPath(repeated.path.parent)) as monitor:
+        with SweepMonitor(repeated.folder.parent) as monitor:
             monitor.watch([cell])
             worker.run_in_child("cell", worker.cell_request(asdict(conf), variant, attempt))
     except XrgsError as error:

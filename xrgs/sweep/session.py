@@ -10,23 +10,26 @@ from __future__ import annotations
 from contextlib import suppress
 from dataclasses import asdict, dataclass
 from functools import cached_property
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from xrgs.errors import StoreError, XrgsError
 from xrgs.experiment.identity import changed_code
 from xrgs.safeio import untrusted
 from xrgs.safeio.atomic import write_json
+from xrgs.safeio.confined import ConfinedPath, RootMissingError, is_passing
 from xrgs.safeio.hashing import canonical_json, digest
 from xrgs.safeio.records import read_object
+from xrgs.safeio.words import for_line
 from xrgs.splat.backend import arithmetic, resolve_backend
 from xrgs.sweep import locks
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
+    from pathlib import Path
 
 #: Files are named in a message up to this many.
 _MAX_NAMED = 3
+_MAX_REASON = 1 << 12  # bytes of the file `stopped`
 
 
 @dataclass(frozen=True)
@@ -39,6 +42,8 @@ class HandOver:
     """The cell's config as plain JSON values, its paths absolute and its backend chosen."""
     identity: Mapping[str, Any]
     """The values that the cell's id is the digest of."""
+    dead_locks: tuple[str, ...] = ()
+    """Locks of the cell whose owners the plan has watched long enough, see `locks.confirmed`."""
 
     @property
     def cell_id(self) -> str:
@@ -79,7 +84,23 @@ class HandOver:
 class SweepSession:
     """One call of `xrgs-sweep`, known to its jobs by a folder of its own."""
 
-    folder: Path
+    folder: ConfinedPath
+    """The folder. It is a root of its own: a job does not create it again when it vanishes."""
+
+    def __init__(self, folder: Path) -> None:
+        object.__setattr__(self, "folder", ConfinedPath(folder))
+
+    @property
+    def exists(self) -> bool:
+        """Whether the folder is there, and is that of a call.
+
+        Raises:
+            OSError: It can't be told now.
+        """
+        try:
+            return (self.folder / "sweep").is_file()
+        except RootMissingError:
+            return False
 
     def begin(self) -> None:
         """Write which process this call is.
@@ -88,7 +109,7 @@ class SweepSession:
             OSError: The folder can't be written, or belongs to another call.
         """
         locks.sign(self.folder / "sweep")
-        (self.folder / "cells").mkdir()
+        (self.folder / "cells").make_folder(exclusive=True)
 
     def hand_over(self, cell: HandOver) -> str:
         """Write what a job needs to know of a cell.
@@ -126,7 +147,8 @@ class SweepSession:
             where = "hydra.sweep.dir must be a folder that every machine of the sweep can read"
             raise XrgsError(f"{error} ({where})") from error
         try:
-            cell = HandOver(content["name"], content["config"], content["identity"])
+            dead = tuple(content["dead_locks"])
+            cell = HandOver(content["name"], content["config"], content["identity"], dead)
             wrong = _contradiction(cell, cell_id)
         except (AttributeError, KeyError, TypeError, ValueError) as error:
             raise XrgsError(f"{file} is not what a plan writes for a job ({error!r})") from error
@@ -134,7 +156,7 @@ class SweepSession:
             raise XrgsError(f"{file} is not what the plan of this sweep has written: {wrong}")
         return cell
 
-    def _file(self, cell_id: str) -> Path:
+    def _file(self, cell_id: str) -> ConfinedPath:
         return self.folder / "cells" / f"{cell_id}.json"
 
     def stop(self, reason: str) -> None:
@@ -144,8 +166,8 @@ class SweepSession:
             reason: Why, for people.
         """
         # A full disk may have room for the file's name and none for the reason in it.
-        with suppress(OSError), (self.folder / "stopped").open("x", encoding="utf-8") as stream:
-            stream.write(reason)
+        with suppress(OSError), (self.folder / "stopped").create() as stream:
+            stream.write(reason.encode())
 
     @cached_property
     def _owner(self) -> locks.Owner | None:
@@ -160,9 +182,16 @@ class SweepSession:
     def stopped(self) -> str:
         """Why no further job may begin; empty while they may."""
         file = self.folder / "stopped"
-        if file.exists():
-            reason = file.read_text(encoding="utf-8", errors="replace")
-            return reason or f"{file} exists"
+        try:
+            reason = file.read_bytes(_MAX_REASON).decode(errors="replace")
+            return for_line(reason) or f"{file} exists"
+        except RootMissingError:
+            return f"{self.folder} is no longer there"
+        except FileNotFoundError:
+            pass
+        except OSError as error:
+            if not is_passing(error):  # something else has that name
+                return f"{file} exists"
         return "the process of the sweep has ended" if self.owner_dead else ""
 
 
@@ -177,6 +206,7 @@ def _contradiction(cell: HandOver, cell_id: str) -> str:
         ),
         "its name or the path of its store is not text": isinstance(cell.name, str)
         and isinstance(config["store"], str),
+        "its dead locks are not text": all(isinstance(text, str) for text in cell.dead_locks),
         "fail_fast is neither true nor false": isinstance(config["fail_fast"], bool),
         "a limit is not a number": all(
             type(config["limits"][name]) in {int, float} for name in ("minutes", "memory_gb")

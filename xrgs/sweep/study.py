@@ -13,6 +13,7 @@ from __future__ import annotations
 import re
 import sys
 import time
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -22,14 +23,16 @@ from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from xrgs.config import to_conf
-from xrgs.errors import StoreError, XrgsError
+from xrgs.errors import StoreError, UnreadableError, XrgsError
 from xrgs.evaluation.lpips import weights
+from xrgs.experiment.cell_folder import CellState
 from xrgs.experiment.store import Store
 from xrgs.runtime.progress import log_line
 from xrgs.runtime.streams import say
+from xrgs.safeio.confined import is_passing
 from xrgs.safeio.hashing import digest, to_plain
 from xrgs.safeio.words import for_line
-from xrgs.sweep import launch, locks, variants
+from xrgs.sweep import launch, locks, presence, variants
 from xrgs.sweep.axes import CellSpec, expand
 from xrgs.sweep.estimate import RuntimeEstimator
 from xrgs.sweep.jobs import worker
@@ -56,6 +59,8 @@ if TYPE_CHECKING:
 _SEED = re.compile(r"seed=(\d+)")
 #: Seconds between two looks at what other sweeps have finished.
 _POLL_S = 2.0
+#: Number of such looks at cells of which a file can't be read, before they are left alone.
+_UNKNOWN_LOOKS = 5
 
 
 class Study:
@@ -73,6 +78,8 @@ class Study:
         self._task = task
         self._config = config
         self._composed: dict[tuple[str, ...], Conf] = {}
+        self._store: Store | None = None
+        """The store, once it is prepared."""
 
     def run(self, arguments: Sequence[str]) -> None:
         """Plan the cells, build their variants, train what is not done, record and report.
@@ -86,16 +93,25 @@ class Study:
         """
         try:
             complete = self._plan_and_train(arguments)
-        except (XrgsError, OmegaConfBaseException) as error:
-            raise CompactHydraException(for_line(str(error))) from error
-        except OSError as error:
-            if not worker.unwritable(error):
-                raise
-            store = self._config.store
-            message = f"store={store}: {error}. {worker.NOTHING_LOST}"
-            raise CompactHydraException(for_line(message)) from error
+        except (XrgsError, OmegaConfBaseException, OSError) as error:
+            raise CompactHydraException(for_line(self._message(error))) from error
         if not complete:
             raise SystemExit(1)
+
+    def _message(self, error: Exception) -> str:
+        """Return what is said of an error that is no fault of the program; raise any other one."""
+        try:
+            if self._store is not None:
+                presence.check(self._store)
+        except presence.StoreGoneError as gone:
+            return str(gone)
+        if not isinstance(error, OSError):
+            return str(error)
+        if worker.unwritable(error):
+            return f"store={self._config.store}: {error}. {worker.NOTHING_LOST}"
+        if is_passing(error):
+            return f"store={self._config.store}: {error}; run the same command again"
+        raise error
 
     def _plan_and_train(self, arguments: Sequence[str]) -> bool:
         """Return whether every cell is done, or the run was a dry one."""
@@ -105,13 +121,15 @@ class Study:
         dry_run = plan[0].conf.dry_run
         if not dry_run:
             store.prepare()
+            self._store = store
         plan = self._with_variants(plan, store, allow_build=not dry_run)
         plan = self._identified(plan, store)
         plan = estimated(plan, RuntimeEstimator(store))
         say(describe(plan), sys.stderr)
         if slow := without_kernels(plan):
             log_line(slow)
-        if weights.find_weights() is None and any(cell.state.name != "done" for cell in plan):
+        to_train = any(cell.state.name != "done" and not cell.unknown for cell in plan)
+        if to_train and weights.find_weights() is None:
             log_line(
                 "LPIPS is not computed for the cells trained now (n/a in tables): "
                 f"{weights.FETCH_HINT}"
@@ -134,29 +152,33 @@ class Study:
         """Launch cells until none is left to do, here or in another sweep; return the final plan.
 
         Raises:
-            StoreError: The store can't be written any more.
+            StoreError: The store can't be written any more, or is no longer there.
         """
         conf = plan[0].conf
-        waiting_said, tried = False, set[str]()
+        waiting_said, tried, looks = False, set[str](), 0
         launches = launch.Launches(self._context, self._task, self._config)
         while True:
+            presence.check(store)
             monitor.watch(plan)
             to_train = ready(plan, tried, retry=conf.retry == "failed")
             elsewhere = [cell for cell in plan if cell.state.name == "running"]
-            if not to_train and not elsewhere:
+            unknown = any(cell.unknown for cell in plan) and looks < _UNKNOWN_LOOKS
+            if not to_train and not elsewhere and not unknown:
                 return list(plan)
             outcomes = launches.launch(to_train.values(), store) if to_train else {}
             not_begun = {LOCKED, launch.LOST}
             begun = {cell_id for cell_id in to_train if outcomes[cell_id] not in not_begun}
             tried |= begun
-            plan = self._identified(plan, store)
+            presence.check(store)
+            plan = self._identified(self._looked_again(plan, store), store)
+            looks += unknown and not begun
             if UNWRITABLE in outcomes.values():
                 raise StoreError(f"store={store.path} can't be written. {worker.NOTHING_LOST}")
             failed = conf.fail_fast and "failed" in outcomes.values()
             if reason := launches.stopped or (FAIL_FAST if failed else ""):
                 log_line(f"no further cell is started: {reason}")
                 return list(plan)
-            if not to_train and not waiting_said:
+            if elsewhere and not to_train and not waiting_said:
                 first = elsewhere[0]
                 log_line(f"waiting for {len(elsewhere)} cells: {first.name} {first.state.reason}")
                 waiting_said = True
@@ -190,7 +212,10 @@ class Study:
         reference = cells.get(cell.reference) if cell.waits and cell.reference else None
         if reference is None or reference.cell_id is None or reference.state.name != "done":
             return cell
-        count = store.cell(reference.cell_id).summary()["gaussians"]
+        try:
+            count = store.cell(reference.cell_id).summary()["gaussians"]
+        except UnreadableError as error:
+            return replace(cell, state=CellState("unknown", f"it can't be read now: {error}"))
         changes = (*cell.spec.changes, f"components.count_matched.gaussians={count}")
         spec = replace(cell.spec, changes=changes)
         return replace(cell, spec=spec, conf=self._compose(spec))
@@ -213,25 +238,33 @@ class Study:
         self, plan: Sequence[PlannedCell], store: Store, *, allow_build: bool
     ) -> list[PlannedCell]:
         """Return the cells with their variants; each is built once, and a failure is its own."""
-        results: dict[str, tuple[str | None, str | None]] = {}
+        results: dict[str, variants.PlannedVariant] = {}
         cells = []
         for cell in plan:
             key = digest([to_plain(cell.conf.scene), to_plain(cell.conf.variant)])
             if key not in results:
                 results[key] = variants.plan(cell.conf, store, allow_build=allow_build)
-            variant_id, error = results[key]
-            cells.append(replace(cell, variant_id=variant_id, error=error))
+            found = results[key]
+            state = CellState("unknown", found.unknown) if found.unknown else CellState("absent")
+            cells.append(replace(cell, variant_id=found.id, error=found.error, state=state))
         return cells
+
+    def _looked_again(self, plan: Sequence[PlannedCell], store: Store) -> list[PlannedCell]:
+        """Return the cells, with the variants that could not be read before and can be now."""
+        unknown = [cell for cell in plan if cell.unknown and cell.variant_id is None]
+        found = {cell.spec: cell for cell in self._with_variants(unknown, store, allow_build=True)}
+        return [found.get(cell.spec, cell) for cell in plan]
 
 
 def _tidy(done: set[str], store: Store) -> None:
     """Remove the checkpoints and locks that a killed sweep left of cells that are done."""
-    for cell_id in done:
-        store.cell(cell_id).drop_checkpoint()
-    for cell_id in done & locks.names(store.locks):
-        lock = locks.acquire(store.locks, cell_id)
-        if lock is not None:
-            lock.release()
+    with suppress(OSError):  # they disturb nobody, and the next sweep removes them
+        for cell_id in done:
+            store.cell(cell_id).drop_checkpoint()
+        for cell_id in done & locks.names(store.locks):
+            lock = locks.acquire(store.locks, cell_id)
+            if lock is not None:
+                lock.release()
 
 
 def _without_reference(cell: PlannedCell) -> PlannedCell:

@@ -2,17 +2,30 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict
+from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING
 
 from xrgs.capture import scenes, variant
-from xrgs.errors import StoreError, XrgsError
+from xrgs.errors import StoreError, UnreadableError, XrgsError
 from xrgs.runtime.progress import log_line
+from xrgs.safeio.confined import is_passing
+from xrgs.sweep import presence
 from xrgs.sweep.jobs import worker
 
 if TYPE_CHECKING:
     from xrgs.config import Conf
     from xrgs.experiment.store import Store
+
+
+@dataclass(frozen=True)
+class PlannedVariant:
+    """The variant of a config for a sweep; nothing at all while it is not built."""
+
+    id: str | None = None
+    error: str | None = None
+    """Why its scene can't be made into a variant."""
+    unknown: str | None = None
+    """Which file can't be read now, so that nothing is known of it."""
 
 
 def find(conf: Conf, store: Store) -> str | None:
@@ -41,10 +54,13 @@ def build(conf: Conf, store: Store) -> str:
 
     Raises:
         UnwritableError: The disk is full or can't be written.
+        UnreadableError: A file can't be read now.
+        StoreGoneError: The store is no longer there.
         XrgsError: The photographs are missing, or can't be made into a variant.
     """
     log_line(f"{scenes.label(conf.scene)}: building the mixed-resolution variant")
-    answer = worker.run_in_child("variant", {"conf": asdict(conf), "store": str(store.path)})
+    request = {"conf": asdict(conf), "store": str(store.path)}
+    answer = worker.run_in_child("variant", request, on_poll=lambda _: presence.check(store))
     return str(answer["variant"])
 
 
@@ -65,8 +81,8 @@ def find_or_build(conf: Conf, store: Store) -> str:
     return variant_id
 
 
-def plan(conf: Conf, store: Store, *, allow_build: bool) -> tuple[str | None, str | None]:
-    """Return the id of a config's variant for a sweep, or the reason why there is none.
+def plan(conf: Conf, store: Store, *, allow_build: bool) -> PlannedVariant:
+    """Return a config's variant for a sweep, or the reason why there is none.
 
     A scene that failed before is not tried again, like a failed cell, unless `retry=failed`.
 
@@ -75,29 +91,43 @@ def plan(conf: Conf, store: Store, *, allow_build: bool) -> tuple[str | None, st
         store: The store.
         allow_build: Build the variant if the store lacks it; False for a dry run.
 
-    Returns:
-        The variant's id and None; or None and the reason; or None twice if it is not built yet.
-
     Raises:
-        StoreError: The store can't be written.
+        StoreError: The store can't be written, or is no longer there.
     """
+    try:
+        return _find_or_build(conf, store, allow_build=allow_build)
+    except worker.UnwritableError as error:
+        raise StoreError(f"store={store.path}: {error}. {worker.NOTHING_LOST}") from error
+    except presence.StoreGoneError:
+        raise
+    except UnreadableError as error:
+        reason = str(error)
+    except OSError as error:
+        if not is_passing(error):
+            raise
+        reason = str(error)
+    return PlannedVariant(unknown=f"its variant can't be read now: {reason}")
+
+
+def _find_or_build(conf: Conf, store: Store, *, allow_build: bool) -> PlannedVariant:
     key = None
     try:
         key = variant.key(conf.scene, conf.variant)
         frozen = variant.find(store.variants, key)
         if frozen is not None:
-            return frozen.id, None
+            return PlannedVariant(frozen.id)
         failure = None if conf.retry == "failed" else variant.failure(store.variants, key)
         if failure or not allow_build:
-            return None, failure
-        return build(conf, store), None
-    except worker.UnwritableError as error:
-        raise StoreError(f"store={store.path}: {error}. {worker.NOTHING_LOST}") from error
+            return PlannedVariant(error=failure)
+        return PlannedVariant(build(conf, store))
+    except (UnreadableError, worker.UnwritableError, presence.StoreGoneError):
+        raise
     except XrgsError as error:
-        log_line(f"{scenes.label(conf.scene)}: {error}")
         if allow_build:
+            presence.check(store)
             # COLMAP dies of a full disk without saying so, which is no fault of the scene.
-            store.prepare()
+            store.check_room()
+        log_line(f"{scenes.label(conf.scene)}: {error}")
         # The reason as the store remembers it: a sweep planned again gives the same record.
         remembered = variant.failure(store.variants, key) if key else None
-        return None, remembered or str(error)
+        return PlannedVariant(error=remembered or str(error))

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import os
+import shutil
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
@@ -20,9 +22,11 @@ from xrgs.sweep import locks
 from xrgs.sweep.jobs import worker
 from xrgs.sweep.jobs.job import (
     FAIL_FAST,
+    GONE,
     LOCKED,
     STOPPED,
     STORE_FULL,
+    UNKNOWN,
     UNWRITABLE,
     run_job,
 )
@@ -33,9 +37,9 @@ HandOverOf = Callable[..., HandOver]
 
 def ended(session: SweepSession) -> SweepSession:
     """Return the session as that of a process that has ended."""
-    file = session.folder / "sweep"
+    file = session.folder.path / "sweep"
     file.write_text(json.dumps(json.loads(file.read_text()) | {"started": 1}))
-    return SweepSession(session.folder)
+    return SweepSession(session.folder.path)
 
 
 @pytest.fixture
@@ -134,7 +138,7 @@ def test_a_variant_that_was_removed_is_named(
     session: SweepSession, store: Store, hand_over_of: HandOverOf
 ) -> None:
     made = hand_over_of()
-    (store.variants / made.variant_id).rmdir()
+    (store.variants / made.variant_id).remove()
     with pytest.raises(XrgsError, match=f"its variant .*{made.variant_id} is missing"):
         run_job(session, session.hand_over(made))
 
@@ -238,6 +242,168 @@ def test_a_cell_that_was_taken_over_is_left_as_it_is(
     cell_id = session.hand_over(made)
     assert run_job(session, cell_id) == LOCKED
     assert store.cell(cell_id).state().name == "done"
+
+
+def content(folder: Path) -> dict[str, tuple[int, int, bytes]]:
+    """Inode, time and bytes of every file of a folder."""
+    files = [file for file in folder.rglob("*") if file.is_file()]
+    stats = {file: file.stat() for file in files}
+    return {f.name: (s.st_ino, s.st_mtime_ns, f.read_bytes()) for f, s in stats.items()}
+
+
+def take_over(store: Store, cell_id: str) -> None:
+    """Do what a sweep on another machine does that took this process for dead."""
+    successor = store.locks / f"{cell_id}.1"
+    locks.sign(successor)
+    values = json.loads(successor.read_text())
+    successor.path.write_text(json.dumps(values | {"host": "elsewhere"}))
+    (store.locks / f"{cell_id}.0").unlink()
+    (store.cell(cell_id).path / "log.txt").write_text("of the successor")
+
+
+@pytest.mark.parametrize(
+    "end",
+    [
+        None,
+        worker.WorkerError("its process was ended by SIGKILL"),
+        worker.UnwritableError("no space"),
+        worker.PassingError("stale"),
+    ],
+)
+def test_a_job_whose_lock_was_taken_over_writes_nothing_from_then_on(
+    session: SweepSession,
+    store: Store,
+    hand_over_of: HandOverOf,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    end: Exception | None,
+) -> None:
+    """Its process was stopped for long: it notices by a heartbeat, or its child has ended first."""
+    cell_id = session.hand_over(hand_over_of(fail_fast=True))
+    before = {}
+
+    def train(_: str, __: object, ___: object, on_poll: Callable[[int], None]) -> None:
+        on_poll(0)
+        take_over(store, cell_id)
+        before["cell"], before["locks"] = (
+            content(store.cell(cell_id).path),
+            content(store.path / "locks"),
+        )
+        if end is not None:
+            raise end
+        monkeypatch.setattr(locks, "BEAT_S", 0.0)
+        on_poll(0)
+
+    monkeypatch.setattr(worker, "run_in_child", train)
+    assert run_job(session, cell_id) == LOCKED
+    assert content(store.cell(cell_id).path) == before["cell"]
+    assert content(store.path / "locks") == before["locks"]
+    assert not session.stopped
+    assert "another has taken over" in capsys.readouterr().err
+
+
+def test_a_lock_that_is_lost_before_the_training_begins_is_noticed(
+    session: SweepSession,
+    store: Store,
+    hand_over_of: HandOverOf,
+    requests: list[tuple[str, Mapping[str, Any]]],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    cell_id = session.hand_over(hand_over_of())
+
+    def check(_: HandOver) -> None:
+        store.cell(cell_id).folder.make_folder()
+        take_over(store, cell_id)
+
+    monkeypatch.setattr(HandOver, "check_code", check)
+    assert run_job(session, cell_id) == LOCKED
+    assert content(store.cell(cell_id).path).keys() == {"log.txt"}
+    assert not requests
+
+
+@pytest.mark.parametrize("number", [errno.EACCES, errno.EIO, errno.ESTALE])
+def test_a_cell_whose_status_can_not_be_read_is_left_as_it_is(
+    session: SweepSession,
+    store: Store,
+    hand_over_of: HandOverOf,
+    requests: list[tuple[str, Mapping[str, Any]]],
+    sick: Callable[[str, int], None],
+    capsys: pytest.CaptureFixture[str],
+    number: int,
+) -> None:
+    cell_id = session.hand_over(hand_over_of())
+    assert run_job(session, cell_id) == "done"
+    before = content(store.path / "cells")
+    for file in ("status.json", "scores.csv"):
+        sick(file, number)
+        assert run_job(session, cell_id) == UNKNOWN
+        err = capsys.readouterr().err
+        assert file in err
+        assert os.strerror(number) in err
+    sick("", 0)
+    assert content(store.path / "cells") == before
+    assert len(requests) == 1
+    assert not session.stopped
+    assert run_job(session, cell_id) == "done"
+
+
+@pytest.mark.parametrize("number", [errno.EACCES, errno.EIO, errno.ESTALE])
+@pytest.mark.parametrize("end", ["stale", "raised"])
+def test_a_file_that_can_not_be_read_fails_no_cell(
+    session: SweepSession,
+    store: Store,
+    hand_over_of: HandOverOf,
+    sick: Callable[[str, int], None],
+    monkeypatch: pytest.MonkeyPatch,
+    number: int,
+    end: str,
+) -> None:
+    """In the child, or in its parent when the child has failed."""
+    cell_id = session.hand_over(hand_over_of(fail_fast=True))
+
+    def train(*_: object) -> None:
+        if end == "stale":
+            raise worker.PassingError("stale")
+        (store.cell(cell_id).path / "status.json").write_text('{"state": "done"}')
+        sick("status.json", number)
+        raise worker.WorkerError("it raised")
+
+    monkeypatch.setattr(worker, "run_in_child", train)
+    assert run_job(session, cell_id) == UNKNOWN
+    assert not (store.cell(cell_id).path / "error.txt").exists()
+    assert not session.stopped
+
+
+@pytest.mark.parametrize("how", ["renamed", "deleted", "unmounted"])
+@pytest.mark.parametrize("seen", ["by its parent", "by the child"])
+def test_a_store_that_vanishes_while_a_cell_trains_does_not_reappear(
+    session: SweepSession,
+    store: Store,
+    hand_over_of: HandOverOf,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    tmp_path: Path,
+    how: str,
+    seen: str,
+) -> None:
+    def train(_: str, __: object, ___: object, on_poll: Callable[[int], None]) -> None:
+        on_poll(0)
+        store.path.rename(tmp_path / "moved")
+        if how == "deleted":
+            shutil.rmtree(tmp_path / "moved")
+        elif how == "unmounted":
+            store.path.mkdir()
+        if seen == "by the child":
+            raise worker.WorkerError("FileNotFoundError: no such file")
+        on_poll(0)
+
+    monkeypatch.setattr(worker, "run_in_child", train)
+    assert run_job(session, session.hand_over(hand_over_of(fail_fast=True))) == GONE
+    assert "moved" not in capsys.readouterr().err  # the sweep says it once
+    if how == "unmounted":
+        store.path.rmdir()  # empty
+    assert not store.path.exists()
+    assert not session.stopped
 
 
 class ProcessEnded(Exception):  # noqa: N818

@@ -1,7 +1,7 @@
 """Tests that a sweep killed by `kill -9` at random moments ends as if it had not been killed.
 
 `XRGS_KILLS=20 pytest tests/sweep/jobs/test_kill.py --log-cli-level=info` kills 20 times and logs
-each; `XRGS_KILL_SEED=N` draws the moments again that a failure's log names.
+each; with `XRGS_KILL_SEED=N` besides, it draws the same moments as the run that printed this seed.
 """
 
 from __future__ import annotations
@@ -179,11 +179,12 @@ def results(cell: Path) -> dict[str, Any]:
 
 
 def test_a_sweep_killed_again_and_again_ends_as_if_it_had_not_been(
-    sweeps_in: Callable[[Path], Any], tmp_path: Path
+    sweeps_in: Callable[[Path], Any], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     seed = int(os.environ.get("XRGS_KILL_SEED", random.randrange(10**6)))
     moments = drawn(int(os.environ.get("XRGS_KILLS", "4")), random.Random(seed))
-    _log.info("XRGS_KILLS=%d XRGS_KILL_SEED=%d", len(moments), seed)
+    with capsys.disabled():  # whether the test passes or not
+        print(f"\nXRGS_KILLS={len(moments)} XRGS_KILL_SEED={seed}", flush=True)  # noqa: T201
     (tmp_path / "killed").mkdir()
     (tmp_path / "spared" / "s").mkdir(parents=True)
     killed = KilledSweeps(sweeps_in(tmp_path / "killed"))

@@ -13,11 +13,13 @@ from typing import Any
 
 import pytest
 
-from xrgs.errors import XrgsError
+from xrgs.errors import UnreadableError, XrgsError
+from xrgs.runtime import processes
 from xrgs.sweep.jobs import supervise, worker
 from xrgs.sweep.jobs.supervise import ProcessEnd
 from xrgs.sweep.jobs.worker import (
     AttemptLostError,
+    PassingError,
     UnwritableError,
     WorkerError,
     run_in_child,
@@ -53,6 +55,9 @@ def test_the_answer_of_the_child_is_returned(child: Callable[..., None]) -> None
         (ProcessEnd(0), {"error": "x", "errno": errno.ENOSPC}, UnwritableError, "x"),
         (ProcessEnd(0), {"error": "x", "errno": errno.EROFS}, UnwritableError, "x"),
         (ProcessEnd(0), {"error": "x", "errno": errno.ENOENT}, WorkerError, "x"),
+        (ProcessEnd(0), {"error": "x", "errno": errno.ESTALE}, PassingError, "x"),
+        (ProcessEnd(0), {"error": "x", "errno": errno.EACCES}, PassingError, "x"),
+        (ProcessEnd(0), {"error": "x", "unreadable": True}, PassingError, "x"),
         (ProcessEnd(-signal.SIGTERM, "it took too long"), None, WorkerError, "it took too long"),
         (ProcessEnd(os.EX_IOERR), None, UnwritableError, "is the disk full?"),
         (ProcessEnd(3), None, WorkerError, "ended with exit code 3 before it answered"),
@@ -78,8 +83,8 @@ def in_this_process(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> Callable[[Callable[..., dict[str, Any]]], dict[str, Any]]:
     """(work) -> the answer that the child's `main` writes when it does this work."""
-    for name in ("follow_parent", "offer_to_oom_killer"):
-        monkeypatch.setattr(supervise, name, lambda: None)
+    monkeypatch.setattr(supervise, "follow_parent", lambda: None)
+    monkeypatch.setattr(processes, "offer_to_oom_killer", lambda: None)
     for name in ("ignore_broken_pipe", "set_passive_openmp_wait"):
         monkeypatch.setattr(worker, name, lambda: None)
     monkeypatch.setattr(faulthandler, "enable", lambda: None)
@@ -105,6 +110,8 @@ def test_the_child_answers_with_the_result_or_the_error(
 ) -> None:
     assert in_this_process(lambda request: {"twice": 2 * request["number"]}) == {"twice": 2}
     assert in_this_process(raising(XrgsError("no photographs"))) == {"error": "no photographs"}
+    sick = in_this_process(raising(UnreadableError("status.json: Input/output error")))
+    assert sick == {"error": "status.json: Input/output error", "unreadable": True}
     assert capsys.readouterr().err == ""
     full = in_this_process(raising(OSError(errno.ENOSPC, "no room")))
     assert full == {"error": "OSError: [Errno 28] no room", "errno": errno.ENOSPC}
@@ -129,3 +136,15 @@ def test_a_child_process_answers() -> None:
     """A process of its own, which fails before it needs torch."""
     with pytest.raises(WorkerError, match="KeyError: 'conf'"):
         run_in_child("variant", {})
+
+
+def test_a_child_whose_store_is_gone_leaves_it_to_its_parent_to_say_so(
+    in_this_process: Callable[..., dict[str, Any]],
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+    tmp_path: Path,
+) -> None:
+    monkeypatch.setattr(worker, "read_object", lambda _: {"store": str(tmp_path / "gone")})
+    answer = in_this_process(raising(FileNotFoundError(errno.ENOENT, "gone")))
+    assert answer["errno"] == errno.ENOENT
+    assert capsys.readouterr().err == ""

@@ -13,8 +13,8 @@ from xrgs.capture.download.unpack import UnpackError, unpack
 from xrgs.capture.scenes.folder import list_photographs
 from xrgs.errors import XrgsError
 from xrgs.safeio.atomic import write_text
-from xrgs.safeio.hashing import file_digest
 from xrgs.safeio.confined import confined
+from xrgs.safeio.hashing import file_digest
 
 if TYPE_CHECKING:
     from xrgs.capture.download.settings import DatasetConf

@@ -8,10 +8,11 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from xrgs.errors import XrgsError
+from xrgs.errors import UnreadableError, XrgsError
 from xrgs.experiment.store import Store
 from xrgs.runtime.progress import log_line
-from xrgs.sweep import locks
+from xrgs.safeio.confined import is_passing
+from xrgs.sweep import locks, presence
 from xrgs.sweep.jobs import worker
 from xrgs.sweep.jobs.supervise import Limits
 
@@ -22,7 +23,8 @@ if TYPE_CHECKING:
 
 #: Outcomes of a job beside the states of a cell. LOCKED: another sweep is training the cell.
 #: STOPPED: the sweep is over, or no further job may begin. UNWRITABLE: the store can't be written.
-LOCKED, STOPPED, UNWRITABLE = "locked", "stopped", "unwritable"
+#: GONE: the store is no longer there. UNKNOWN: a file can't be read now, and the cell was left.
+LOCKED, STOPPED, UNWRITABLE, GONE, UNKNOWN = "locked", "stopped", "unwritable", "gone", "unknown"
 #: Reasons for which no further job of a sweep begins, see `SweepSession.stop`.
 FAIL_FAST, STORE_FULL = "fail_fast, and a cell failed", "the store can't be written"
 
@@ -30,8 +32,8 @@ FAIL_FAST, STORE_FULL = "fail_fast, and a cell failed", "the store can't be writ
 class _CellLeftError(XrgsError):
     """This job has to leave its cell unfinished, which is no fault of the cell."""
 
-    def __init__(self, outcome: str, reason: str) -> None:
-        super().__init__(reason)
+    def __init__(self, outcome: str) -> None:
+        super().__init__(outcome)
         self.outcome = outcome
         """The outcome of the job."""
 
@@ -44,7 +46,7 @@ def run_job(session: SweepSession, cell_id: str) -> str:
         cell_id: The cell's id; the session's folder holds its config and identity.
 
     Returns:
-        The cell's state, or `LOCKED`, `STOPPED` or `UNWRITABLE`.
+        The cell's state, or `LOCKED`, `STOPPED`, `UNWRITABLE`, `GONE` or `UNKNOWN`.
 
     Raises:
         XrgsError: The cell was not handed over by this sweep's plan, its code is not the planned
@@ -57,15 +59,25 @@ def run_job(session: SweepSession, cell_id: str) -> str:
     try:
         outcome = _run_under_lock(cell, store, session)
     except OSError as error:
-        if not worker.unwritable(error):
-            raise
-        log_line(f"store={store.path}: {error}")
-        outcome = UNWRITABLE
+        outcome = _outcome_of(error, store)
+        if outcome != GONE:
+            log_line(f"store={store.path}: {error}")
     if outcome == UNWRITABLE:
         session.stop(STORE_FULL)
     if cell.config["fail_fast"] and outcome == "failed":
         session.stop(FAIL_FAST)
     return outcome
+
+
+def _outcome_of(error: OSError, store: Store) -> str:
+    """Return the outcome of a job that an error of the store ended; raise any other error again."""
+    if presence.is_gone(store):
+        return GONE
+    if worker.unwritable(error):
+        return UNWRITABLE
+    if not is_passing(error):
+        raise error
+    return UNKNOWN
 
 
 def _run_under_lock(cell: HandOver, store: Store, session: SweepSession) -> str:
@@ -75,23 +87,38 @@ def _run_under_lock(cell: HandOver, store: Store, session: SweepSession) -> str:
     if not variant.is_dir():
         raise XrgsError(f"{cell.name}: its variant {variant} is missing")
     folder = store.cell(cell.cell_id)
-    lock = locks.acquire(store.locks, folder.id)
+    lock = locks.acquire(store.locks, folder.id, cell.dead_locks)
     if lock is None:
         log_line(f"{folder.id}: another sweep is training this cell; this sweep leaves it")
         return LOCKED
     try:
-        if folder.state().name == "done":  # finished by another sweep since this one was planned
-            return "done"
+        state = folder.state()
+        if state.name == "unknown":
+            log_line(f"{folder.id} is left: {state.reason}")
+        if state.name in {"done", "unknown"}:  # done by another sweep since this one was planned
+            return state.name
         cell.check_code()
+        if not lock.is_held():
+            return _lost(folder)
         attempt = folder.begin(cell.config, cell.identity)
         log_line(f"{cell.name}: training cell {folder.id}")
-        return _train_in_child(cell, variant, attempt, lock, session)
+        return _train_in_child(cell, store, variant, attempt, lock, session)
     finally:
         lock.release()
 
 
+def _lost(folder: CellFolder) -> str:
+    """Say that the lock is lost; from then on this job does not touch the cell's folder."""
+    log_line(
+        f"{folder.id} is left: this process gave no sign of life for too long, and another has"
+        " taken over"
+    )
+    return LOCKED
+
+
 def _train_in_child(
     cell: HandOver,
+    store: Store,
     variant: ConfinedPath,
     folder: CellFolder,
     lock: locks.Lock,
@@ -100,11 +127,12 @@ def _train_in_child(
     """Train the cell in a child process; return the job's outcome."""
 
     def on_poll(pid: int) -> None:
+        presence.check(store)
         if not lock.beat(pid):
-            why = "this process gave no sign of life for too long, and another has taken over"
-            raise _CellLeftError(LOCKED, f"{folder.id} is left: {why}")
+            raise _CellLeftError(_lost(folder))
         if session.owner_dead:
-            raise _CellLeftError(STOPPED, f"{folder.id} is left: its sweep's process has ended")
+            log_line(f"{folder.id} is left: its sweep's process has ended")
+            raise _CellLeftError(STOPPED)
 
     request = worker.cell_request(cell.config, variant, folder)
     limits = cell.config["limits"]
@@ -113,18 +141,29 @@ def _train_in_child(
             "cell", request, Limits(limits["minutes"], limits["memory_gb"]), on_poll
         )
     except _CellLeftError as error:
-        log_line(str(error))
         return error.outcome
-    except worker.AttemptLostError as error:
-        log_line(f"{folder.id} is left: {error}")
-        return LOCKED
-    except worker.UnwritableError as error:
-        # No fault of the cell: it stays unfinished, and the next sweep trains it without `retry`.
+    except XrgsError as error:
+        return _after_error(error, store, folder, lock)
+    return folder.state().name
+
+
+def _after_error(error: XrgsError, store: Store, folder: CellFolder, lock: locks.Lock) -> str:
+    """Return the outcome of a cell whose process failed, and write it where that is its fault."""
+    if presence.is_gone(store):
+        return GONE
+    # The cell is another process's now, though its own may have failed before.
+    if isinstance(error, worker.AttemptLostError) or not lock.is_held():
+        return _lost(folder)
+    # The first two are no fault of the cell, which the next sweep trains without `retry`.
+    if isinstance(error, worker.UnwritableError):
         log_line(f"{folder.id} stopped: {error}")
         return UNWRITABLE
-    except XrgsError as error:
-        state = folder.state().name
-        if state != "done":  # the cell may be finished although its process died at its exit
-            folder.fail(str(error))
-            log_line(f"{folder.id} failed: {error}")
-    return folder.state().name
+    if isinstance(error, UnreadableError):
+        log_line(f"{folder.id} is left: {error}")
+        return UNKNOWN
+    state = folder.state().name
+    if state in {"done", "unknown"}:  # it may be finished although its process died at its exit
+        return state
+    folder.fail(str(error))
+    log_line(f"{folder.id} failed: {error}")
+    return "failed"

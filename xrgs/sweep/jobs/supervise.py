@@ -8,10 +8,10 @@ import subprocess
 import time
 from contextlib import suppress
 from dataclasses import dataclass
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 from xrgs.errors import XrgsError
+from xrgs.runtime import processes
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
@@ -61,7 +61,7 @@ def run_supervised(
     Raises:
         XrgsError: Memory is limited, on a system that does not say how much a process uses.
     """
-    if limits.memory_gb and not Path("/proc/self/statm").exists():
+    if limits.memory_gb and not processes.proc_exists():
         raise XrgsError(
             f"limits.memory_gb={limits.memory_gb:g} can't be kept: this system has no /proc"
         )
@@ -80,7 +80,10 @@ def _watch(child: subprocess.Popen[bytes], limits: Limits, on_poll: Callable[[in
         minutes = (time.monotonic() - start) / 60
         if limits.minutes and minutes > limits.minutes:
             return f"it took longer than limits.minutes={limits.minutes:g} and was ended"
-        if limits.memory_gb and (used := _resident_bytes(child.pid) / 1e9) > limits.memory_gb:
+        if (
+            limits.memory_gb
+            and (used := processes.resident_bytes(child.pid) / 1e9) > limits.memory_gb
+        ):
             return (
                 f"out of memory: it used {used:.2f} GB, more than "
                 f"limits.memory_gb={limits.memory_gb:g}, and was ended"
@@ -109,18 +112,6 @@ def _signal(child: subprocess.Popen[bytes], number: int) -> None:
         os.killpg(child.pid, number)
 
 
-def _resident_bytes(session: int) -> int:
-    """Return the resident bytes of all processes of a session; shared pages count for each."""
-    page, total = os.sysconf("SC_PAGE_SIZE"), 0
-    for folder in Path("/proc").iterdir():
-        if folder.name.isdecimal():
-            with suppress(OSError, IndexError):  # it may end while it is read
-                stat = (folder / "stat").read_text(encoding="utf-8", errors="replace")
-                if int(stat.rpartition(")")[2].split()[3]) == session:
-                    total += page * int((folder / "statm").read_text(encoding="ascii").split()[1])
-    return total
-
-
 def follow_parent() -> None:
     """End this child and all its children when the process that started it has ended.
 
@@ -131,9 +122,3 @@ def follow_parent() -> None:
     if os.getpgrp() != os.getpid():
         return  # started by hand: the process group is the shell's
     subprocess.Popen(["/bin/sh", "-c", _WATCHER, "sh", str(os.getpid())])  # noqa: S603
-
-
-def offer_to_oom_killer() -> None:
-    """Let the kernel kill this child, and not the sweep, when the machine runs out of memory."""
-    with suppress(OSError):
-        Path("/proc/self/oom_score_adj").write_text("500", encoding="ascii")

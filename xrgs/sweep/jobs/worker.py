@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import errno
 import faulthandler
-import json
 import logging
 import os
 import signal
@@ -19,12 +18,14 @@ import traceback
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from xrgs.errors import XrgsError
+from xrgs.errors import UnreadableError, XrgsError
+from xrgs.runtime import processes
 from xrgs.runtime.machine import set_passive_openmp_wait
 from xrgs.runtime.streams import ignore_broken_pipe, log_to_stderr, say
 from xrgs.safeio.atomic import write_json
 from xrgs.safeio.confined import ConfinedPath, ReplacedError
-from xrgs.safeio.records import read_json
+from xrgs.safeio.records import read_object
+from xrgs.sweep import presence
 from xrgs.sweep.jobs import supervise
 
 if TYPE_CHECKING:
@@ -38,6 +39,8 @@ NOTHING_LOST = (
 )
 #: Errors by which a file system says that nothing more can be written to it.
 _UNWRITABLE = frozenset({errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EIO})
+#: Errors that say nothing of the work, and may be gone when it is tried again.
+_PASSING = frozenset({errno.EACCES, errno.EPERM, errno.ESTALE, errno.ETIMEDOUT})
 _NO_LIMITS = supervise.Limits()
 
 
@@ -51,6 +54,10 @@ class AttemptLostError(WorkerError):
 
 class UnwritableError(WorkerError):
     """The child could not write its files: the disk is full, read-only or broken."""
+
+
+class PassingError(WorkerError, UnreadableError):
+    """The child could not read a file now; nothing is known to be wrong with its work."""
 
 
 def run_in_child(
@@ -74,10 +81,12 @@ def run_in_child(
     Raises:
         AttemptLostError: Another attempt at the cell has begun.
         UnwritableError: The child could not write its files; nothing else is wrong with its work.
+        PassingError: The child could not read a file now.
         WorkerError: The work failed; the message is the reason.
     """
     with tempfile.TemporaryDirectory(prefix="xrgs-") as folder:
-        request_file, answer_file = Path(folder) / "request.json", Path(folder) / "answer.json"
+        files = ConfinedPath(Path(folder))
+        request_file, answer_file = files / "request.json", files / "answer.json"
         write_json(request_file, dict(request))
         # -P keeps the working folder off sys.path: the child imports the package its parent did.
         child = [sys.executable, "-P", "-m", "xrgs.sweep.jobs.worker"]
@@ -89,13 +98,20 @@ def run_in_child(
             raise UnwritableError(f"it could not write its answer to {folder}: is the disk full?")
         if not answer_file.exists():
             raise WorkerError(_death(ended.code))
-        answer = dict(read_json(answer_file))
+        answer = read_object(answer_file)
     if answer.get("lost"):
         raise AttemptLostError(str(answer["error"]))
     if "error" in answer:
-        unwritable = answer.get("errno") in _UNWRITABLE
-        raise (UnwritableError if unwritable else WorkerError)(str(answer["error"]))
+        raise _kind(answer)(str(answer["error"]))
     return answer
+
+
+def _kind(answer: Mapping[str, Any]) -> type[WorkerError]:
+    if answer.get("errno") in _UNWRITABLE:
+        return UnwritableError
+    return (
+        PassingError if answer.get("errno") in _PASSING or "unreadable" in answer else WorkerError
+    )
 
 
 def cell_request(
@@ -136,9 +152,22 @@ def _build_variant(request: Mapping[str, Any]) -> dict[str, Any]:
     from xrgs.experiment.store import Store
 
     log_to_stderr()
+    _import_colmap()
     conf, store = from_dict(request["conf"]), Store(Path(request["store"]))
     built = variant.build(conf.scene, conf.variant, store.variants, store.scenes)
     return {"variant": built.id}
+
+
+def _import_colmap() -> None:
+    """Import COLMAP, without the stack that it prints when its process is ended by SIGTERM.
+
+    It has no log of its own here: what it prints would be on the terminal of the sweep.
+    """
+    signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGTERM})
+    from xrgs.capture import sfm  # noqa: F401
+
+    signal.signal(signal.SIGTERM, signal.SIG_DFL)
+    signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGTERM})
 
 
 def _run_cell(request: Mapping[str, Any]) -> dict[str, Any]:
@@ -165,6 +194,12 @@ def _run_cell(request: Mapping[str, Any]) -> dict[str, Any]:
     return {}
 
 
+def _store_is_gone(request: Mapping[str, Any]) -> bool:
+    from xrgs.experiment.store import Store
+
+    return "store" in request and presence.is_gone(Store(Path(request["store"])))
+
+
 _JOBS: dict[str, Callable[[Mapping[str, Any]], dict[str, Any]]] = {
     "variant": _build_variant,
     "cell": _run_cell,
@@ -182,17 +217,22 @@ def main(job: str, request: str, answer: str) -> None:
     faulthandler.enable()
     ignore_broken_pipe()
     supervise.follow_parent()
-    supervise.offer_to_oom_killer()
+    processes.offer_to_oom_killer()
     set_passive_openmp_wait()
+    given: dict[str, Any] = {}
     try:
-        result = _JOBS[job](json.loads(Path(request).read_text(encoding="utf-8")))
+        given = read_object(Path(request))
+        result = _JOBS[job](given)
     except ReplacedError as error:
         why = f"{error.filename}: {error.strerror}: another attempt at the cell has begun"
         result = {"error": why, "lost": True}
+    except UnreadableError as error:
+        result = {"error": str(error), "unreadable": True}
     except XrgsError as error:
         result = {"error": str(error)}
     except Exception as error:
-        say(traceback.format_exc(), sys.stderr)
+        if not _store_is_gone(given):  # the sweep notices that by itself
+            say(traceback.format_exc(), sys.stderr)
         number = error.errno if isinstance(error, OSError) else None
         result = {"error": f"{type(error).__name__}: {error}", "errno": number}
     try:
