@@ -42,6 +42,7 @@ from xrgs.experiment.cell_folder import CellFolder
 from xrgs.experiment.store import Store
 from xrgs.runtime import progress
 from xrgs.safeio import npz, records, untrusted
+from xrgs.safeio.confined import ConfinedPath
 from xrgs.splat.ply import load_ply
 from xrgs.sweep import locks
 from xrgs.training.checkpoint import Checkpoint
@@ -123,7 +124,7 @@ def _of_cells(cell: Path) -> dict[str, Parser]:
         "table": Parser(cell / "scores.csv", mutate_csv, records.read_table, store_error),
         "config": Parser(cell / "config.json", mutate_json, config.from_file, (XrgsError,)),
         "progress": Parser(
-            cell / "progress.json", mutate_json, lambda file: str(progress.read(file))
+            cell / "progress.json", mutate_json, lambda file: str(progress.read(ConfinedPath(file)))
         ),
         "status": Parser(cell / "status.json", mutate_json, lambda _: str(folder.state())),
         "scores": Parser(cell / "scores.csv", mutate_csv, lambda _: folder.scores(), store_error),
@@ -153,10 +154,10 @@ def _of_stores(store: Path, cell: Path) -> dict[str, Parser]:
             sweep, mutate_json, lambda f: Store(store).sweep_record(f.stem), (StoreError,)
         ),
         "sweep-names": Parser(
-            sweep, mutate_json, lambda _: Store(store).recorded_names(), (StoreError,)
+            sweep, mutate_json, lambda _: str(Store(store).records()), (StoreError,)
         ),
         "lock": Parser(lock, mutate_json, lambda file: str(locks.signature(file))),
-        "locks": Parser(lock, mutate_json, lambda file: str(locks.holders(file.parent))),
+        "locks": Parser(lock, mutate_json, lambda file: str(locks.holders(ConfinedPath(file.parent)))),
         "cells-identity": Parser(cell / "identity.json", mutate_json, table, seal=seal),
         "cells-config": Parser(cell / "config.json", mutate_json, table, seal=seal),
         "cells-summary": Parser(cell / "summary.json", mutate_json, table, seal=seal),

@@ -153,7 +153,7 @@ def test_the_words_of_another_process_are_plain_and_short(tmp_path: Path) -> Non
     file = tmp_path / "progress.json"
     content = {"what": "\x1b[2J" + "x" * 999, "unit": "a\nb", "done": 1, "total": 2, "rate": None}
     file.write_text(json.dumps(content))
-    found = read(file)
+    found = read(ConfinedPath(file))
     assert found is not None
     assert found.what.startswith(" [2Jxxx")
     assert found.unit == "a b"
