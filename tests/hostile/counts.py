@@ -31,28 +31,28 @@ def _identity(key: str, value: str, store: Path) -> list[Look]:
     _with_json(cell / "identity.json", (key,), value)
     seal(cell)
     # The report of the sweep may be refused: its record contradicts the identity.
-    return all_looks(store, done=None, pair=False)
+    return all_looks(store, done=None, planned=False, pair=False)
 
 
 def _summary(value: str, store: Path) -> list[Look]:
     cell = cell_of(store)
     _with_json(cell / "summary.json", (*_SUMMARY, "steps", "grow_grad2d"), value)
     seal(cell)
-    return all_looks(store, done=None)
+    return all_looks(store, done=None, planned=False)
 
 
 def _scores(value: str, store: Path) -> list[Look]:
     cell = cell_of(store)
     replace_column(cell / "scores.csv", value, range(1, 9))
     seal(cell)
-    return all_looks(store, done=None)
+    return all_looks(store, done=None, planned=False)
 
 
 def _history(value: str, columns: tuple[int, ...], store: Path) -> list[Look]:
     cell = cell_of(store)
     replace_column(cell / "history.csv", value, columns)
     seal(cell)
-    return all_looks(store, done=None, drawn=True)
+    return all_looks(store, done=None, planned=False, drawn=True)
 
 
 def _text(name: str, content: bytes, store: Path) -> list[Look]:
@@ -60,7 +60,7 @@ def _text(name: str, content: bytes, store: Path) -> list[Look]:
     (cell / name).write_bytes(content)
     seal(cell)
     if name == "history.csv":  # only reports and reruns read it
-        return [*all_looks(store, drawn=True)]
+        return [*all_looks(store, drawn=True, planned=False)]
     named = () if content == _TEXTS["no rows"] else (name,)
     return [report(store, *named), cells(store, *named, done=None), status(store, done=None)]
 
@@ -75,7 +75,7 @@ def _config(keys: tuple[str, ...], value: Any, store: Path) -> list[Look]:
 
     edit(cell / "config.json", change)
     seal(cell)
-    return [*all_looks(store), rerun(cell)]
+    return [*all_looks(store, planned=False), rerun(cell)]
 
 
 def _status_bytes(value: str, store: Path) -> list[Look]:
@@ -91,7 +91,7 @@ def _threads(value: str, store: Path) -> list[Look]:
     cell = cell_of(store)
     _with_json(cell / "provenance.json", ("threads",), value)
     seal(cell)
-    return [*all_looks(store), rerun(cell)]
+    return [*all_looks(store, planned=False), rerun(cell)]
 
 
 def _lock(fields: Mapping[str, object], store: Path) -> list[Look]:

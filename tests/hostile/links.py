@@ -91,11 +91,12 @@ def _cell_file(name: str, kind: Kind, store: Path) -> list[Look]:
     cell = cell_of(store)
     _replace(cell / name, kind)
     harmless = _CELL_FILES[name]
+    planned = name == "status.json"
     if harmless:
-        return all_looks(store)
+        return all_looks(store, planned=planned)
     named = Path(name).name
     drawn = name in {"history.csv", "renders/view_1.png"}
-    looks = all_looks(store, named, done=3, drawn=drawn)
+    looks = all_looks(store, named, done=3, drawn=drawn, planned=planned)
     return [*looks, rerun(cell, named, can_train=True)] if kind is _pipe else looks
 
 

@@ -71,12 +71,21 @@ def cells(store: Path, *names: str, done: int | None = 4) -> Look:
 
 
 def all_looks(
-    store: Path, *names: str, done: int | None = 4, pair: bool = True, drawn: bool = False
+    store: Path,
+    *names: str,
+    done: int | None = 4,
+    pair: bool = True,
+    drawn: bool = False,
+    planned: bool = True,
 ) -> list[Look]:
-    """Every command that reads a whole store."""
-    return [
+    """Every command that reads a whole store.
+
+    A plan takes most of the time of the four. It reads statuses, locks and variants, and hashes the
+    files of cells; the cases that change what is in such a file alone leave it out.
+    """
+    looks = [
         status(store, *names, done=done),
         report(store, *names, pair=pair, drawn=drawn),
         cells(store, *names, done=done),
-        plan(store, *names, done=done),
     ]
+    return [*looks, plan(store, *names, done=done)] if planned else looks

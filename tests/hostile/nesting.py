@@ -55,14 +55,14 @@ def _json(name: str, content: str, store: Path) -> list[Look]:
     if name == "status.json":
         return all_looks(store, name, done=3)
     seal(cell)
-    looks = all_looks(store, done=None)
+    looks = all_looks(store, done=None, planned=False)
     return looks if name == "summary.json" else [*looks, rerun(cell, name)]
 
 
 def _sweep(content: str, store: Path) -> list[Look]:
     file = sweep_file(store)
     file.write_text(content)
-    return all_looks(store, pair=False)
+    return all_looks(store, pair=False, planned=False)
 
 
 def _variant(content: str, store: Path) -> list[Look]:
@@ -74,7 +74,7 @@ def _variant(content: str, store: Path) -> list[Look]:
 def _variant_report(content: str, store: Path) -> list[Look]:
     folder = variant_of(store)
     (folder / "report.json").write_text(content)
-    return [inspect(folder, "report.json"), *all_looks(store, done=None)]
+    return [inspect(folder, "report.json"), *all_looks(store, done=None, planned=False)]
 
 
 def _file_names(name: str, store: Path) -> list[Look]:

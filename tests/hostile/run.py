@@ -164,20 +164,20 @@ def _remove(folder: Path) -> None:
 
 
 def write_table(rows: Iterable[Row], out: Path | None) -> list[Row]:
-    """Print a line for each row as it comes, write all to a CSV table, and return them."""
+    """Print a line for each row as it comes, write it to a CSV table as well, and return all."""
     done = []
-    for row in rows:
-        done.append(row)
-        print(  # noqa: T201
-            f"{row.theme}/{row.case:40} {row.command:8} {row.exit_code:>6} {row.wall_s:>6} s "
-            f"{row.rss_mb:5} MB  {row.verdict}",
-            flush=True,
-        )
-    if out is not None:
-        with out.open("w", encoding="utf-8", newline="") as stream:
-            writer = csv.writer(stream, lineterminator="\n")
-            writer.writerow(field.name for field in fields(Row))
-            writer.writerows(map(astuple, done))
+    with (out or Path(os.devnull)).open("w", encoding="utf-8", newline="") as stream:
+        writer = csv.writer(stream, lineterminator="\n")
+        writer.writerow(field.name for field in fields(Row))
+        for row in rows:
+            done.append(row)
+            writer.writerow(astuple(row))
+            stream.flush()
+            print(  # noqa: T201
+                f"{row.theme}/{row.case:40} {row.command:8} {row.exit_code:>6} {row.wall_s:>6} s "
+                f"{row.rss_mb:5} MB  {row.verdict}",
+                flush=True,
+            )
     return done
 
 

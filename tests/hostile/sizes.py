@@ -23,7 +23,7 @@ def grow(file: Path, size: int = _SIZE) -> None:
 def _cell_file(name: str, store: Path) -> list[Look]:
     cell = cell_of(store)
     grow(cell / name)
-    return all_looks(store, name, done=3)
+    return all_looks(store, name, done=3, planned=name == "status.json")
 
 
 def _declared(name: str, store: Path) -> list[Look]:
@@ -52,7 +52,7 @@ def _unfinished(name: str, store: Path) -> list[Look]:
 
 def _sweep(store: Path) -> list[Look]:
     grow(sweep_file(store))
-    return all_looks(store, pair=False)
+    return all_looks(store, pair=False, planned=False)
 
 
 def _lock(store: Path) -> list[Look]:

@@ -8,7 +8,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from tests.hostile.looks import Look, Maker, cells, plan, report, status
+from tests.hostile.looks import Look, Maker, cells, report, status
 from tests.hostile.reference import edit, sweep_file
 
 Rows = list[dict[str, Any]]
@@ -50,13 +50,13 @@ def _many_scenes(rows: Rows) -> Rows:
 def _whole(content: str, store: Path) -> list[Look]:
     sweep_file(store).write_text(content)
     name = "" if '"cells": []' in content else sweep_file(store).name
-    return [status(store), cells(store), plan(store), report(store, name, pair=False)]
+    return [status(store), cells(store), report(store, name, pair=False)]
 
 
 def _another(content: bytes, store: Path) -> list[Look]:
     """A second record, later than the healthy one, which the report takes by default."""
     (store / "sweeps" / "zz.json").write_bytes(content)
-    return [status(store), cells(store), plan(store), report(store, "zz.json", pair=False)]
+    return [status(store), cells(store), report(store, "zz.json", pair=False)]
 
 
 def _same_time(store: Path) -> list[Look]:
@@ -64,7 +64,7 @@ def _same_time(store: Path) -> list[Look]:
     text = sweep_file(store).read_text()
     for number in range(1000):
         (store / "sweeps" / f"{number:016x}.json").write_text(text)
-    return [status(store), cells(store), plan(store), report(store)]
+    return [status(store), cells(store), report(store)]
 
 
 _TYPES: Mapping[str, object] = {

@@ -57,6 +57,13 @@ def test_a_parser_reads_or_refuses_what_is_mutated(known: dict[str, Parser], nam
     assert faults(name, known[name], 50) == []
 
 
+@pytest.mark.parametrize(
+    ("name", "seed"), [("variant", 77), ("progress", 105), ("config", 512), ("scores-sealed", 691)]
+)
+def test_what_the_fuzzer_found_stays_mended(known: dict[str, Parser], name: str, seed: int) -> None:
+    assert list(fuzz(name, known[name], [seed])) == [None]
+
+
 @pytest.mark.parametrize("name", NAMES)
 def test_a_parser_reads_or_refuses_any_bytes(known: dict[str, Parser], name: str) -> None:
     parser = known[name]

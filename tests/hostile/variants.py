@@ -107,7 +107,7 @@ def _archive(make: Callable[[Path], bytes], store: Path, *, listed: bool) -> lis
     (folder / "points.npz").write_bytes(make(store.with_name("canary")))
     if listed:
         folder = seal_variant(folder)
-    return [inspect(folder), *all_looks(store, done=None)]
+    return [inspect(folder), *all_looks(store, done=None, planned=listed)]
 
 
 def _views(values: Mapping[str, Any]) -> Callable[[Variant], None]:
@@ -169,7 +169,7 @@ def _changed(change: Callable[[Variant], None], store: Path, *, listed: bool) ->
     edit(folder / "variant.json", change)
     if listed:
         folder = seal_variant(folder)
-    return [inspect(folder), *all_looks(store, done=None)]
+    return [inspect(folder), *all_looks(store, done=None, planned=listed)]
 
 
 def _report(values: Mapping[str, object], store: Path) -> list[Look]:
@@ -191,7 +191,7 @@ def _splats(content: bytes, store: Path) -> list[Look]:
     cell = cell_of(store)
     (cell / "splats.ply").write_bytes(content)
     seal(cell)
-    return all_looks(store)
+    return all_looks(store, planned=False)
 
 
 _VERTICES = np.zeros((2, 17), "<f4")
