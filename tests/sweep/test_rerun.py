@@ -231,7 +231,7 @@ def test_a_missing_variant_is_built_and_has_to_be_the_same(
     other = f"{variant_id[:16] if same_key else '0' * 16}-{'1' * 16}"
     requests: list[Any] = []
 
-    def run(job: str, request: dict[str, Any], **_: object) -> dict[str, Any]:
+    def run(job: str, request: dict[str, Any], *_: object) -> dict[str, Any]:
         requests.append((job, request["conf"]["scene"]["path"], request["store"]))
         return {"variant": other}
 

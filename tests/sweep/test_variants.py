@@ -45,11 +45,11 @@ def conf(compose: Callable[..., Conf]) -> Conf:
     return compose("scene=motorcycle")
 
 
-def fail(*_: object, **__: object) -> dict[str, Any]:
+def fail(*_: object) -> dict[str, Any]:
     raise worker.WorkerError("SfM placed too few views")
 
 
-def unexpected(*_: object, **__: object) -> dict[str, Any]:
+def unexpected(*_: object) -> dict[str, Any]:
     raise AssertionError("no child process is needed")
 
 
@@ -74,7 +74,7 @@ def test_a_variant_that_the_store_lacks_is_built_in_a_child(
 ) -> None:
     requests = []
 
-    def build(job: str, request: dict[str, Any], **_: object) -> dict[str, Any]:
+    def build(job: str, request: dict[str, Any], *_: object) -> dict[str, Any]:
         requests.append((job, request["conf"]["scene"]["kind"], request["store"]))
         return {"variant": "k-1"}
 
@@ -117,7 +117,7 @@ def test_a_library_that_dies_of_a_full_disk_is_not_a_failure_of_the_scene(
     def full(**_: object) -> None:
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
-    def dies(*_: object, **__: object) -> dict[str, Any]:
+    def dies(*_: object) -> dict[str, Any]:
         monkeypatch.setattr(tempfile, "TemporaryFile", full)
         raise worker.WorkerError("its process was ended by SIGABRT")
 
@@ -129,7 +129,7 @@ def test_a_library_that_dies_of_a_full_disk_is_not_a_failure_of_the_scene(
 def test_a_child_that_can_not_write_stops_the_sweep(
     conf: Conf, store: Store, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def unwritable(*_: object, **__: object) -> dict[str, Any]:
+    def unwritable(*_: object) -> dict[str, Any]:
         raise worker.UnwritableError("No space left on device")
 
     monkeypatch.setattr(worker, "run_in_child", unwritable)
@@ -170,7 +170,7 @@ def test_a_folder_of_variants_that_can_not_be_listed_is_unknown(
 def test_a_child_that_can_not_read_a_file_now_fails_no_scene(
     conf: Conf, store: Store, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def stale(*_: object, **__: object) -> dict[str, Any]:
+    def stale(*_: object) -> dict[str, Any]:
         raise worker.PassingError("Stale file handle")
 
     monkeypatch.setattr(worker, "run_in_child", stale)
@@ -183,7 +183,7 @@ def test_a_child_that_can_not_read_a_file_now_fails_no_scene(
 def test_a_store_that_vanishes_while_a_variant_is_built_does_not_reappear(
     conf: Conf, store: Store, monkeypatch: pytest.MonkeyPatch, seen: str
 ) -> None:
-    def build(*_: object, on_poll: Callable[[int], None]) -> dict[str, Any]:
+    def build(_: str, __: object, ___: object, on_poll: Callable[[int], None]) -> dict[str, Any]:
         on_poll(0)
         store.path.rename(store.path.with_name("moved"))
         if seen == "by its parent":

@@ -11,6 +11,7 @@ from xrgs.runtime.progress import log_line
 from xrgs.safeio.confined import is_passing
 from xrgs.sweep import presence
 from xrgs.sweep.jobs import worker
+from xrgs.sweep.jobs.supervise import Limits
 
 if TYPE_CHECKING:
     from xrgs.config import Conf
@@ -60,7 +61,7 @@ def build(conf: Conf, store: Store) -> str:
     """
     log_line(f"{scenes.label(conf.scene)}: building the mixed-resolution variant")
     request = {"conf": asdict(conf), "store": str(store.path)}
-    answer = worker.run_in_child("variant", request, on_poll=lambda _: presence.check(store))
+    answer = worker.run_in_child("variant", request, Limits(), lambda _: presence.check(store))
     return str(answer["variant"])
 
 
