@@ -19,7 +19,7 @@ from xrgs.safeio import untrusted
 from xrgs.safeio.atomic import write_json, write_text
 from xrgs.safeio.confined import ReplacedError, RootMissingError, confined, is_passing
 from xrgs.safeio.hashing import canonical_json, file_digest
-from xrgs.safeio.records import as_number, read_json, read_object, read_table
+from xrgs.safeio.records import MAX_BYTES, as_number, read_object, read_table
 from xrgs.safeio.words import for_terminal
 
 if TYPE_CHECKING:
@@ -129,10 +129,13 @@ class CellFolder:
         if not self.status.exists():
             resumes = "; it resumes from its checkpoint" if self.checkpoint.exists() else ""
             return CellState("unfinished", f"it was stopped before it ended{resumes}")
-        status = read_json(self.status)
-        if status["state"] == "failed":
-            return CellState("failed", str(status["reason"]))
-        self._check(status, verify=verify)
+        status = read_object(self.status)
+        try:
+            if status["state"] == "failed":
+                return CellState("failed", str(status["reason"]))
+            self._check(status, verify=verify)
+        except (AttributeError, KeyError, TypeError, ValueError) as error:
+            raise StoreError(f"{self.status}: it is malformed ({error!r})") from error
         return CellState("done")
 
     def running(self, owner: str) -> CellState:
@@ -155,8 +158,10 @@ class CellFolder:
         for name, entry in files.items():
             if sizes[name] != entry["bytes"]:
                 raise StoreError(f"{name} is missing or has another size")
-            hashed = verify and name in _VERIFIED_BY_HASH
-            if hashed and file_digest(self.folder / name) != entry["sha256"]:
+            is_read = name in _VERIFIED_BY_HASH
+            if is_read and sizes[name] > MAX_BYTES:
+                raise StoreError(f"{name} has {sizes[name]} bytes, at most {MAX_BYTES} are read")
+            if is_read and verify and file_digest(self.folder / name) != entry["sha256"]:
                 raise StoreError(f"{name} has changed since the cell finished")
         if verify and [view for view, _ in self.view_scores()] != status["views"]:
             raise StoreError("scores.csv does not have one row for each view that was to be scored")
