@@ -63,8 +63,11 @@ class CellState:
         Args:
             error: What was raised when they were read.
         """
-        if isinstance(error, (UnreadableError, OSError)):
+        if isinstance(error, UnreadableError):
             return cls("unknown", f"it can't be read now: {error}")
+        if isinstance(error, OSError):
+            kind = "unknown" if is_passing(error) else "corrupt"
+            return cls(kind, f"{error.filename}: {error.strerror}")
         if isinstance(error, StoreError):
             return cls("corrupt", str(error))
         return cls("corrupt", f"a file is malformed: {error!r}")
