@@ -73,3 +73,24 @@ def test_an_interrupted_write_leaves_the_old_file(
         write_json(file, 2)
     assert json.loads(file.read_text()) == 1
     assert list(tmp_path.iterdir()) == [file]
+
+
+def test_the_bounds_of_a_record(tmp_path: Path) -> None:
+    store = Store(tmp_path)
+    store.prepare()
+    row = {
+        "cell_id": "0123456789abcdef",
+        "variant_id": "0123456789abcdef-0123456789abcdef",
+        "baseline_id": "0123456789abcdef",
+        "scene": "garden",
+        "label": "consistency",
+        "condition": "variant.factor=4",
+        "seed": 0,
+        "error": None,
+    }
+    many = store.write_sweep([], [row | {"seed": seed} for seed in range(100_000)])
+    assert len(store.sweep_record(many)["cells"]) == 100_000
+    store.verify_sweep(many)
+    long = store.write_sweep([], [row | {"label": "x" * 2001}])
+    with pytest.raises(StoreError, match=rf"{long}\.json: cell 1 "):
+        store.sweep_record(long)

@@ -2,19 +2,23 @@
 
 from __future__ import annotations
 
+import errno
 import os
+import subprocess
 from collections.abc import Callable
 from dataclasses import asdict
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 from xrgs.errors import XrgsError
-from xrgs.experiment import identity
+from xrgs.experiment import identity, verification
 from xrgs.experiment.cell_folder import CellFolder
 from xrgs.experiment.store import Store
 from xrgs.runtime.progress import Progress
 from xrgs.safeio.atomic import write_json
+from xrgs.safeio.confined import ConfinedPath
 from xrgs.sweep import locks, status
 from xrgs.sweep.status import describe, read
 
@@ -113,14 +117,198 @@ def test_a_cell_of_another_arithmetic_is_stale(
     assert [cell.id for cell in read(store.path).cells if cell.stale] == ["stale"]
 
 
-def test_a_change_that_keeps_the_size_is_found_where_that_is_asked_for(store: Store) -> None:
-    scores = store.cell("good").path / "scores.csv"
-    scores.write_text(scores.read_text().replace("20", "99"))
-    states = [
-        {cell.id: cell.state.name for cell in read(store.path, verify=verify).cells}
-        for verify in (False, True)
+@pytest.fixture
+def intact(store: Store) -> Store:
+    """The store, with nothing in it that is damaged or can't be verified."""
+    for name in ("corrupt", "stopped", "failed", "busy"):
+        store.cell(name).folder.remove()
+    (store.variants / "fa-bb").remove()
+    return store
+
+
+@pytest.mark.parametrize(
+    ("name", "verified"), [("scores.csv", True), ("splats.ply", True), ("log.txt", False)]
+)
+def test_a_change_that_keeps_the_size_is_found_where_that_is_asked_for(
+    intact: Store, name: str, verified: bool
+) -> None:
+    cell = intact.cell("good")
+    for file in ("splats.ply", "log.txt"):
+        (cell.path / file).write_text("20 Gaussians")
+    cell.finish(["a"], 1)
+    assert read(intact.path, verify=True).intact
+    changed = cell.path / name
+    changed.write_text(changed.read_text().replace("20", "99"))
+    found = [read(intact.path, verify=verify) for verify in (False, True)]
+    assert [status.intact for status in found] == [True, not verified]
+    named = f"{changed}: it has changed since the cell finished"
+    assert (named in describe(found[1])) == verified
+    if name == "scores.csv":  # a report is made from it: the cell is not done any more
+        assert "scores.csv has changed" in describe(found[1])
+
+
+def test_every_file_is_verified_and_what_was_hashed_is_said(intact: Store) -> None:
+    found = read(intact.path, verify=True)
+    assert found.verification is not None
+    paths = [
+        path for name in ("good", "stale", "twice") for path in intact.cell(name).path.iterdir()
     ]
-    assert [state["good"] for state in states] == ["done", "corrupt"]
+    paths += (intact.path / "sweeps").iterdir()
+    assert found.verification.files == len(paths)
+    assert found.verification.bytes == sum(path.stat().st_size for path in paths)
+    assert f"hashed: {len(paths)} files, " in describe(found)
+    assert describe(found).endswith("all of them as they were written")
+
+
+def test_files_that_do_not_belong_there_and_missing_ones_are_damage(intact: Store) -> None:
+    good, stale = intact.cell("good").path, intact.cell("stale").path
+    (good / "extra").mkdir()
+    (good / "extra" / "file").write_text("1")
+    os.mkfifo(stale / "pipe")
+    verification = read(intact.path, verify=True).verification
+    assert verification is not None
+    assert verification.damage == (
+        f"{good}/extra/file: it does not belong there",
+        f"{stale}/pipe: it does not belong there",
+    )
+
+
+def test_a_record_whose_cells_were_changed_is_damage(intact: Store) -> None:
+    (file,) = (intact.path / "sweeps").iterdir()
+    file.write_text(file.read_text().replace("consistency", "inconsistent"))
+    found = read(intact.path, verify=True)
+    assert not found.intact
+    assert f"{file}: its cells have changed since it was written" in describe(found)
+
+
+def test_variants_and_scenes_are_verified_each_by_its_own_rule(
+    intact: Store, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    names = ("variants/a-b", "variants/failed-b", "variants/.a.building", "scenes/c", "scenes/.c")
+    for name in names:
+        (intact.folder / name).make_folder()
+    for module in (verification.variant, verification.scenes):
+        monkeypatch.setattr(module, "verify", lambda folder: [f"{folder}/x: wrong"])
+    done = read(intact.path, verify=True).verification
+    assert done is not None
+    wrong = ("variants/a-b", "scenes/c")
+    assert done.damage == tuple(f"{intact.path}/{name}/x: wrong" for name in wrong)
+
+
+@pytest.mark.parametrize(("damaged", "code"), [(False, 0), (True, 1)])
+def test_the_command_ends_with_1_where_something_is_damaged(
+    run_command: Callable[..., tuple[int, str, str]], intact: Store, damaged: bool, code: int
+) -> None:
+    if damaged:
+        (intact.path / "sweeps" / "bad.json").write_text("{")
+    name = f"store={intact.path.name}"
+    assert run_command("status", intact.path.parent, name, "verify=true")[0] == code
+    assert run_command("status", intact.path.parent, name)[0] == 0
+
+
+def unreadable(monkeypatch: pytest.MonkeyPatch, name: str, number: int) -> None:
+    """Let opening files and folders of a name fail, as for want of permission."""
+    real = ConfinedPath._opened, ConfinedPath._open_regular
+
+    def failing(path: ConfinedPath) -> None:
+        if path.name == name:
+            raise OSError(number, os.strerror(number), str(path))
+
+    def opened(path: ConfinedPath) -> Any:
+        failing(path)
+        return real[0](path)
+
+    def open_regular(path: ConfinedPath, flags: int) -> int:
+        failing(path)
+        return real[1](path, flags)
+
+    monkeypatch.setattr(ConfinedPath, "_opened", opened)
+    monkeypatch.setattr(ConfinedPath, "_open_regular", open_regular)
+
+
+@pytest.mark.parametrize("number", [errno.EACCES, errno.EIO, errno.ESTALE])
+def test_a_cell_that_cannot_be_read_now_is_listed_with_the_reason(
+    intact: Store, monkeypatch: pytest.MonkeyPatch, number: int
+) -> None:
+    unreadable(monkeypatch, "status.json", number)
+    found = read(intact.path)
+    assert {cell.state.name for cell in found.cells} == {"unknown"}
+    assert not found.intact
+    text = describe(found)
+    assert "\nunknown:\n" in text
+    assert f"good/status.json: {os.strerror(number)}" in text
+    cells = intact.cells()
+    assert set(cells["state"]) == {"unknown"}
+    assert cells["reason"].str.contains(os.strerror(number)).all()
+
+
+@pytest.mark.parametrize("folder", ["cells", "sweeps", "variants", "locks"])
+@pytest.mark.parametrize("kind", ["link", "pipe", "unreadable"])
+def test_a_folder_that_cannot_be_listed_is_named_and_hides_no_other(
+    intact: Store, monkeypatch: pytest.MonkeyPatch, tmp_path: Path, folder: str, kind: str
+) -> None:
+    path = intact.path / folder
+    if kind == "unreadable":
+        unreadable(monkeypatch, folder, errno.EACCES)
+    else:
+        path.rename(tmp_path / "elsewhere")
+        if kind == "link":
+            path.symlink_to(tmp_path / "elsewhere")
+        else:
+            os.mkfifo(path)
+    if folder == "cells" and kind != "unreadable":
+        with pytest.raises(XrgsError, match="is not a store"):
+            read(intact.path)
+        return
+    text = describe(read(intact.path))
+    assert (f"  {path}: " in text) == (folder != "locks" or kind == "unreadable")
+    assert ("3 done" in text) == (folder != "cells")
+    assert ("1 sweeps recorded" in text) == (folder != "sweeps")
+
+
+def test_what_is_no_cell_is_named(intact: Store, tmp_path: Path) -> None:
+    cells = intact.path / "cells"
+    (cells / "dangling").symlink_to(tmp_path / "gone")
+    os.mkfifo(cells / "pipe")
+    (cells / os.fsdecode(b"\xff\xfe")).mkdir()
+    (cells / "\x1b[2J").mkdir()
+    (intact.path / "variants" / "a-b").symlink_to(tmp_path)
+    (intact.path / "sweeps" / "pipe.json").symlink_to(tmp_path / "gone")
+    text = describe(read(intact.path))
+    assert "5 cells\n  3 done, 2 corrupt" in text
+    assert "dangling  ? / ?  it is a symbolic link" in text
+    assert "pipe  ? / ?  it is not a folder" in text
+    assert text.count("a cell can't have this name") == 2
+    assert f"{intact.path}/variants/a-b: not a folder" in text
+    assert f"{intact.path}/sweeps/pipe.json: is a link, which is not followed" in text
+    assert text.isprintable() or not set(text) & set("\x1b\udcff")
+    assert len(intact.cells()) == 5
+
+
+def test_the_size_of_folders_that_are_nested_too_deeply_is_unknown(intact: Store) -> None:
+    place = os.open(intact.path / "scenes", os.O_RDONLY)
+    for _ in range(1500):
+        os.mkdir("d", dir_fd=place)
+        deeper = os.open("d", os.O_RDONLY, dir_fd=place)
+        os.close(place)
+        place = deeper
+    os.close(place)
+    found = read(intact.path)
+    assert found.sizes["scenes"] is None
+    text = describe(found)
+    assert "on disk at least: " in text
+    assert "scenes unknown" in text
+    assert "folders are nested too deeply" in text
+    assert "3 done" in text
+    subprocess.run(["/bin/rm", "-rf", str(intact.path / "scenes")], check=True)  # rmtree recurses
+
+
+def test_links_and_what_they_lead_to_have_no_size(intact: Store, tmp_path: Path) -> None:
+    before = read(intact.path).sizes
+    (tmp_path / "large").write_bytes(bytes(1_000_000))
+    (intact.path / "cells" / "good" / "link").symlink_to(tmp_path / "large")
+    (intact.path / "folder").symlink_to(tmp_path)
+    assert read(intact.path).sizes == before
 
 
 def test_it_writes_nothing_and_needs_no_torch(

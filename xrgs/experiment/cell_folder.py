@@ -24,7 +24,7 @@ from xrgs.safeio import untrusted
 from xrgs.safeio.atomic import write_json, write_text
 from xrgs.safeio.confined import ReplacedError, confined, is_passing
 from xrgs.safeio.hashing import canonical_json, file_digest
-from xrgs.safeio.records import as_number, read_json, read_object, read_table
+from xrgs.safeio.records import MAX_BYTES, as_number, read_object, read_table
 from xrgs.safeio.words import for_terminal
 
 if TYPE_CHECKING:
@@ -68,8 +68,11 @@ class CellState:
         Args:
             error: What was raised when they were read.
         """
-        if isinstance(error, (UnreadableError, OSError)):
+        if isinstance(error, UnreadableError):
             return cls("unknown", f"it can't be read now: {error}")
+        if isinstance(error, OSError):
+            kind = "unknown" if is_passing(error) else "corrupt"
+            return cls(kind, f"{error.filename}: {error.strerror}")
         if isinstance(error, StoreError):
             return cls("corrupt", str(error))
         return cls("corrupt", f"a file is malformed: {error!r}")
@@ -127,14 +130,17 @@ class CellFolder:
 
     def _look(self, *, verify: bool) -> CellState:
         try:
-            status = read_json(self.status)
+            status = read_object(self.status)
         except StoreError:
             if (state := self._without_status()) is None:
                 raise
             return state
-        if status["state"] == "failed":
-            return CellState("failed", str(status["reason"]))
-        self._check(status, verify=verify)
+        try:
+            if status["state"] == "failed":
+                return CellState("failed", str(status["reason"]))
+            self._check(status, verify=verify)
+        except (AttributeError, KeyError, TypeError, ValueError) as error:
+            raise StoreError(f"{self.status}: it is malformed ({error!r})") from error
         return CellState("done")
 
     def _without_status(self) -> CellState | None:
@@ -171,8 +177,10 @@ class CellFolder:
         for name, entry in files.items():
             if sizes[name] != entry["bytes"]:
                 raise StoreError(f"{name} is missing or has another size")
-            hashed = verify and name in _VERIFIED_BY_HASH
-            if hashed and file_digest(self.folder / name) != entry["sha256"]:
+            is_read = name in _VERIFIED_BY_HASH
+            if is_read and sizes[name] > MAX_BYTES:
+                raise StoreError(f"{name} has {sizes[name]} bytes, at most {MAX_BYTES} are read")
+            if is_read and verify and file_digest(self.folder / name) != entry["sha256"]:
                 raise StoreError(f"{name} has changed since the cell finished")
         if verify and [view for view, _ in self.view_scores()] != status["views"]:
             raise StoreError("scores.csv does not have one row for each view that was to be scored")

@@ -197,7 +197,10 @@ class Store:
         """Return scene, label and condition of recorded cells by id, as the latest sweep has it."""
         from xrgs.experiment.results import CELL_NAMES
 
-        records, damaged = self.records()
+        try:
+            records, damaged = self.records()
+        except StoreError as error:
+            records, damaged = {}, (str(error),)
         for message in damaged:
             log_line(f"{message}; its names of cells are left out")
         return {
@@ -223,14 +226,13 @@ class Store:
 
         Returns:
             The records that can be read, by the sweep's id, oldest first, and for each other one a
-            message that names its file; for a folder that can't be listed, the message names that.
+            message that names its file.
+
+        Raises:
+            StoreError: As `sweep_ids`.
         """
-        try:
-            sweep_ids = self.sweep_ids()
-        except StoreError as error:
-            return {}, (str(error),)
         records, damaged = {}, []
-        for sweep_id in sweep_ids:
+        for sweep_id in self.sweep_ids():
             try:
                 records[sweep_id] = self.sweep_record(sweep_id)
             except StoreError as error:

@@ -8,7 +8,6 @@ the cells of a sweep may run on other machines, and one line shows many of them.
 from __future__ import annotations
 
 import io
-import math
 import sys
 from contextlib import contextmanager, suppress
 from contextvars import ContextVar
@@ -40,6 +39,8 @@ _BAR_DELAY_S = 2.0
 _MAX_BYTES = 1 << 12
 #: The most characters of a bar's words that are shown.
 _MAX_WORD = 80
+#: Counts, and units a second, beyond this are not valid.
+_MAX_COUNT = 1 << 53
 
 _file: ContextVar[ConfinedPath | None] = ContextVar("file", default=None)
 
@@ -205,15 +206,13 @@ def read(file: ConfinedPath) -> Progress | None:
     """
     try:
         content = untrusted.parse_json(file.read_bytes(_MAX_BYTES))
-        total, rate = content["total"], content["rate"]
-        return Progress(
-            for_line(str(content["what"]), _MAX_WORD),
-            for_line(str(content["unit"]), _MAX_WORD),
-            int(content["done"]),
-            None if total is None else int(total),
-            None if rate is None or not math.isfinite(rate) else float(rate),
-        )
-    except (OSError, ValueError, KeyError, TypeError, OverflowError):
+        what, unit = (for_line(str(content[key]), _MAX_WORD) for key in ("what", "unit"))
+        done, total, rate = content["done"], content["total"], content["rate"]
+        if not all(type(n) is int and 0 <= n < _MAX_COUNT for n in (done, total or 0)):
+            return None
+        known = rate is not None and 1 / _MAX_COUNT < rate < _MAX_COUNT
+        return Progress(what, unit, done, total, float(rate) if known else None)
+    except (OSError, ValueError, KeyError, TypeError):
         return None
 
 

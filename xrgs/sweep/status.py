@@ -167,7 +167,7 @@ def _bytes(folder: ConfinedPath) -> int:
 def _names(store: Store, problems: _Problems) -> tuple[dict[str, tuple[str, str]], int]:
     """Return scene and label of every recorded cell, and the number of recorded sweeps."""
     names: dict[str, tuple[str, str]] = {}
-    records, damaged = store.records()
+    records, damaged = problems.unless(store.records) or ({}, ())
     problems += damaged
     for record in records.values():
         for row in record["cells"]:
