@@ -51,7 +51,7 @@ def provide(
             raise UnreadableError(f"{home}: {error.strerror}; try again") from error
         damage = None if missing else _damage(home, images)
         if isinstance(damage, UnreadableError):
-            raise damage
+            raise UnreadableError(f"{damage}; try again")
         if damage is not None:
             aside = sealed.set_aside(home)
             _log.warning("%s; renamed to %s, and rendered anew", damage, aside.name)
