@@ -10,6 +10,7 @@ import shutil
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -19,7 +20,7 @@ from xrgs.capture import frozen, sealed
 from xrgs.capture.frozen import CorruptVariant
 from xrgs.capture.views import Variant, View
 from xrgs.errors import UnreadableError
-from xrgs.safeio import confined
+from xrgs.safeio import confined, npz
 from xrgs.safeio.confined import ConfinedPath
 
 Forge = Callable[..., Path]
@@ -266,6 +267,16 @@ def test_a_file_that_cant_be_read_now_says_nothing_of_the_variant(
         frozen.load(folder)
     (line,) = frozen.verify(folder)
     assert f"{name}: Input/output error" in line
+
+
+def test_a_disk_that_fails_within_the_points_says_nothing_of_the_variant(
+    forge: Forge, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder = forge()
+    failure = OSError(errno.EIO, os.strerror(errno.EIO))
+    monkeypatch.setattr(npz, "read", Mock(side_effect=failure))
+    with pytest.raises(UnreadableError, match=f"{folder.name}: Input/output error; try again"):
+        frozen.load(folder)
 
 
 def test_everything_is_on_the_disk_before_the_variant_has_its_name(

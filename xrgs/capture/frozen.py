@@ -107,7 +107,7 @@ def load(path: Path | ConfinedPath) -> Variant:
             variant has, or the folder's name is not the variant's id.
     """
     folder = confined(path)
-    with _errors_as_corrupt():
+    with _errors_as_corrupt(folder):
         content = _manifest(folder)
         for error in sealed.changed(folder, content["files"]):
             raise error
@@ -127,7 +127,7 @@ def verify(path: Path | ConfinedPath) -> list[str]:
     folder = confined(path)
     errors: list[XrgsError] = []
     try:
-        with _errors_as_corrupt():
+        with _errors_as_corrupt(folder):
             content = _manifest(folder)
             errors += sealed.changed(folder, content["files"])
             errors += sealed.unlisted(folder, {MANIFEST, REPORT, LOG, *content["files"]})
@@ -139,16 +139,17 @@ def verify(path: Path | ConfinedPath) -> list[str]:
 
 
 @contextmanager
-def _errors_as_corrupt() -> Iterator[None]:
+def _errors_as_corrupt(folder: ConfinedPath) -> Iterator[None]:
     """Raise `UnreadableError` for what may pass, and `CorruptVariant` for any other error."""
     try:
         yield
     except UnreadableError as error:
         raise UnreadableError(f"{error}; try again") from error
     except OSError as error:
+        why = f"{error.filename or folder}: {error.strerror or error}"  # a stream's has no name
         if is_passing(error):
-            raise UnreadableError(f"{error.filename}: {error.strerror}; try again") from error
-        raise CorruptVariant(f"{error.filename}: {error.strerror}") from error
+            raise UnreadableError(f"{why}; try again") from error
+        raise CorruptVariant(why) from error
     except StoreError as error:
         raise CorruptVariant(str(error)) from error
 

@@ -40,7 +40,13 @@ def describe(path: Path | ConfinedPath, out: Path | None = None) -> str:
         XrgsError: The folder is not a variant or has changed, or the sheet can't be written.
     """
     folder = confined(path)
-    if not folder.is_dir():
+    try:
+        found = folder.is_dir()
+    except FileNotFoundError:
+        found = False
+    except OSError as error:
+        raise XrgsError(f"{folder}: {error.strerror}; try again") from error
+    if not found:
         raise XrgsError(f"{folder}: no such folder; variants are in <store>/variants/")
     if folder.name.startswith(FAILED_PREFIX):
         report = read_object(folder / "report.json")
