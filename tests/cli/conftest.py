@@ -22,6 +22,7 @@ from xrgs.capture import variant
 from xrgs.cli import sweep
 from xrgs.experiment.store import Store
 from xrgs.safeio.atomic import write_json
+from xrgs.safeio.confined import ConfinedPath
 from xrgs.sweep.jobs import worker
 
 RunCommand = Callable[..., tuple[int, str, str]]
@@ -103,7 +104,7 @@ class Children:
     def run(self, job: str, request: Mapping[str, Any], *_: object) -> dict[str, Any]:
         if job == "variant":
             made = Store(Path(request["store"])).variants / "0123456789abcdef-0123456789abcdef"
-            made.mkdir()
+            made.make_folder()
             return {"variant": made.name}
         folder = Store(Path(request["conf"]["store"])).cell(Path(request["cell"]).name)
         self.trained.append(folder.id)
@@ -115,8 +116,8 @@ class Children:
         folder.finish(["a"], 1)
         return {}
 
-    def find(self, variants: Path, _: str) -> SimpleNamespace | None:
-        names = [folder.name for folder in variants.glob("0123456789abcdef-*")]
+    def find(self, variants: ConfinedPath, _: str) -> SimpleNamespace | None:
+        names = [name for name in variants.names() if name.startswith("0123456789abcdef-")]
         return SimpleNamespace(id=names[0]) if names else None
 
 

@@ -150,7 +150,7 @@ def test_help_has_every_argument(
 @pytest.mark.parametrize(
     ("error", "message"),
     [
-        (XrgsError("two\nlines"), "xrgs-x: two\nlines"),
+        (XrgsError("two\nlines"), "xrgs-x: two lines"),
         (HydraException("two\nlines"), "xrgs-x: two (hint)"),
         (ConfigKeyError("two\nlines"), "xrgs-x: two (hint)"),
     ],

@@ -57,8 +57,8 @@ def test_inspect_builds_a_variant_that_the_store_lacks(
 
     monkeypatch.setattr(worker, "run_in_child", build)
     monkeypatch.setattr(variant, "find", lambda *_: SimpleNamespace(id="k-1") if built else None)
-    monkeypatch.setattr(xrgs.report.variant, "describe", lambda *given: f"{given}")
+    monkeypatch.setattr(xrgs.report.variant, "describe", lambda folder, out: f"{folder} {out}")
     code, out, err = xrgs_data("inspect", "scene=motorcycle", "store=s", "out=x.png")
     assert code == 0, err
-    assert out.strip() == str((Path("s/variants/k-1"), Path("x.png")))
+    assert out.strip() == "s/variants/k-1 x.png"
     assert jobs == ([] if built else [("variant", "motorcycle")])

@@ -14,6 +14,7 @@ from PIL import Image
 from xrgs.capture.dataset import Dataset, LoadedView
 from xrgs.config import Conf
 from xrgs.evaluation import protocol
+from xrgs.safeio.confined import ConfinedPath
 from xrgs.splat.cameras import Camera
 from xrgs.splat.gaussians import Gaussians, from_points
 from xrgs.splat.rasterize import rasterize_parameters
@@ -42,7 +43,8 @@ def test_scores_and_pngs_are_of_the_render_with_all_sh_degrees(
     gaussians: Gaussians, data: Dataset, baseline: Conf, tmp_path: Path
 ) -> None:
     conf = baseline.splat
-    (row,) = protocol.score_views(gaussians, data.test, conf, tmp_path / "renders")
+    renders = ConfinedPath(tmp_path) / "renders"
+    (row,) = protocol.score_views(gaussians, data.test, conf, renders)
     view = data.test[0]
     images = {}
     with torch.no_grad():
@@ -66,7 +68,8 @@ def test_scores_are_the_same_for_any_number_of_threads(
     scores = []
     for threads in (1, 2, 3):
         torch.set_num_threads(threads)
-        scores += protocol.score_views(gaussians, [view], baseline.splat, tmp_path / str(threads))
+        renders = ConfinedPath(tmp_path) / str(threads)
+        scores += protocol.score_views(gaussians, [view], baseline.splat, renders)
         assert torch.get_num_threads() == threads
     torch.set_num_threads(1)
     assert scores[0]["psnr"] > 1

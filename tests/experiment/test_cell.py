@@ -74,9 +74,9 @@ def kill_at(monkeypatch: pytest.MonkeyPatch, module: Any, name: str, call: int) 
 def begin(conf: Conf, root: Path, variant_id: str = "v") -> CellFolder:
     """Begin a cell's folder as a job does."""
     identity = cell_identity(conf, variant_id)
+    root.mkdir(exist_ok=True)
     folder = CellFolder(root / digest(identity))
-    folder.begin(asdict(conf), identity)
-    return folder
+    return folder.begin(asdict(conf), identity)
 
 
 def results(folder: CellFolder) -> dict[str, Any]:
@@ -157,7 +157,7 @@ def test_an_unusable_checkpoint_is_logged_and_training_starts_over(
     conf.seed = 1
     other = killed(conf, tmp_path / "other", 9)
     conf.seed = 0
-    spoil(folder.checkpoint, other.checkpoint)
+    spoil(folder.checkpoint.path, other.checkpoint.path)
     folder = begin(conf, tmp_path / "a")
     with caplog.at_level(logging.WARNING):
         cell.run_cell(conf, VARIANT, folder)
@@ -179,7 +179,7 @@ def test_a_worker_that_is_killed_goes_on_in_another(
     built = variant.build(conf.scene, conf.variant, store.variants, store.scenes)
 
     def request(folder: CellFolder) -> dict[str, Any]:
-        return {"conf": asdict(conf), "variant": str(built.path), "cell": str(folder.path)}
+        return worker.cell_request(asdict(conf), built.folder, folder)
 
     folder = begin(conf, tmp_path / "killed", built.id)
     write_json(tmp_path / "request.json", request(folder))

@@ -113,8 +113,8 @@ class MadeStore:
         (folder.path / "scores.csv").write_text("\n".join(lines) + "\n")
 
     def _draw(self, folder: CellFolder, variant: str, noise: float) -> None:
-        photographs = self.store.variants / variant / "images" / "test"
-        photographs.make_folder()
+        photographs = self.store.path / "variants" / variant / "images" / "test"
+        photographs.mkdir(parents=True, exist_ok=True)
         (folder.path / "renders").mkdir()
         for number, view in enumerate(VIEWS):
             rng = np.random.default_rng(number)
@@ -122,7 +122,7 @@ class MadeStore:
             worse = image.copy()
             worse[20:40, 40:60] += rng.uniform(-1, 1, (20, 20, 3)) * noise
             for path, pixels in (
-                ((photographs / f"{view}.png").path, image),
+                (photographs / f"{view}.png", image),
                 (folder.path / "renders" / f"{view}.png", worse),
             ):
                 Image.fromarray((pixels.clip(0, 1) * 255).astype(np.uint8)).save(path)

@@ -10,7 +10,7 @@ from PIL import Image
 
 from xrgs.evaluation.metrics import Metric
 from xrgs.report.figures import Panel, curves, differing_crop, side_by_side, trade_off
-from xrgs.report.pictures import median_view, slug
+from xrgs.report.pictures import median_view
 
 RNG = np.random.default_rng(0)
 PICTURE = RNG.uniform(0, 1, (40, 60, 3)).astype(np.float32)
@@ -102,16 +102,3 @@ def test_the_view_shown_is_neither_the_best_nor_the_worst() -> None:
     assert median_view(baseline, pd.Series({"a": 25.0, "b": 10.0, "c": 21.0})) == "c"
     assert median_view(baseline, baseline) == "b"
     assert median_view(baseline * np.inf, baseline * np.inf) == "b"
-
-
-@pytest.mark.parametrize("name", ["../../etc/passwd", "a/b", "部屋", "a b", "..", "", "x" * 300])
-def test_file_names_are_plain(name: str) -> None:
-    found = slug(name)
-    assert set(found) <= set("abcdefghijklmnopqrstuvwxyz0123456789-_.")
-    assert 0 < len(found) < 80
-    assert not found.startswith(".")
-
-
-def test_different_names_have_different_files() -> None:
-    assert len({slug(name) for name in ("a b", "a/b", "a-b", "a|b")}) == 4
-    assert slug("loss_weighting") == "loss_weighting"

@@ -180,7 +180,7 @@ def test_a_corrupt_cell_is_not_trusted(study: Any) -> None:
 
 def test_a_missing_render_costs_its_picture_alone(study: Any) -> None:
     study.write()
-    shutil.rmtree(study.store.variants)
+    shutil.rmtree(study.store.path / "variants")
     report = build(study.store.path)
     page = (report.folder / "table.md").read_text()
     assert "No picture of fern, consistency, seed 0" in page

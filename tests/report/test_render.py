@@ -2,20 +2,16 @@
 
 import re
 
-import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
 from xrgs.report.render import (
     TextTable,
-    latex,
-    markdown,
     to_latex,
     to_markdown,
     to_text,
     width,
 )
-from xrgs.safeio.untrusted import one_line
 
 TABLE = TextTable(
     title="a_b & c",
@@ -55,20 +51,6 @@ def test_latex_is_escaped() -> None:
     assert r"100 \$" in text
 
 
-@pytest.mark.parametrize(
-    ("text", "escaped"),
-    [
-        ("\\", r"\textbackslash{}"),
-        ("x-1", "x-1"),
-        ("-1 to -2", "$-$1 to $-$2"),
-        ("~^", r"\textasciitilde{}\textasciicircum{}"),
-        ("{#}", r"\{\#\}"),
-    ],
-)
-def test_latex_characters(text: str, escaped: str) -> None:
-    assert latex(text) == escaped
-
-
 def test_wide_characters_keep_the_columns() -> None:
     table = TextTable("t", ("a", "b"), (("部屋", "1"), ("cafe\u0301", "2"), ("plain", "3")), "lr")
     lines = to_text(table).splitlines()[2:]
@@ -84,8 +66,3 @@ def test_a_name_stays_in_its_cell(name: str) -> None:
     assert len(to_text(table).split("\n")) == 6
     row = next(line for line in to_latex(table).split("\n") if line.endswith(r"1 \\"))
     assert len(re.findall(r"(?<!\\)&", row)) == 1
-
-
-@given(st.text(max_size=30))
-def test_escaping_loses_no_character(name: str) -> None:
-    assert re.sub(r"\\(.)", r"\1", markdown(name)) == one_line(name)

@@ -22,7 +22,8 @@ step,view,loss,gaussians,steps_HR,steps_LR,split,reset,grown_HR,weighting.LR
 
 
 def _totals(made: Any) -> Any:
-    return totals(made.store, read_sweep(made.store, made.write(), METRICS).cells)
+    sweep = read_sweep(made.store, made.write(), METRICS)
+    return totals(sweep.cells, sweep.training)
 
 
 def test_counts_are_the_last_rows_and_notes_are_means(made: Any) -> None:

@@ -155,7 +155,7 @@ def test_links_and_pipes_are_not_read(store: Store) -> None:
     (cell.path / "status.json").unlink()
     os.mkfifo(cell.path / "status.json")
     assert "not a regular file" in cell.state().reason
-    (store.cells_folder / "link").symlink_to(other.path)
+    (store.cells_folder.path / "link").symlink_to(other.path)
     assert store.cell("link").state().name == "corrupt"
     assert "2 corrupt" in describe(read(store.path))
 
@@ -197,7 +197,7 @@ def test_a_cell_that_goes_on_does_not_write_through_links(store: Store, tmp_path
     precious.write_text("mine")
     cell = store.cell("going")
     cell.begin({}, {"seed": 0})
-    cell.checkpoint.write_bytes(b"state")
+    cell.checkpoint.path.write_bytes(b"state")
     (cell.path / "log.txt").symlink_to(precious)
     cell.begin({}, {"seed": 0})
     assert cell.checkpoint.read_bytes() == b"state"

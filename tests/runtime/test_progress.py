@@ -10,6 +10,7 @@ import pytest
 
 from xrgs.runtime import progress
 from xrgs.runtime.progress import Progress, ProgressBar, format_duration, read, written_to
+from xrgs.safeio.confined import ConfinedPath
 
 
 class Terminal(io.StringIO):
@@ -63,7 +64,7 @@ def test_a_line_replaces_a_bar(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_progress_in_a_file_is_shown_nowhere_and_removed_at_the_end(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    file = tmp_path / "progress.json"
+    file = ConfinedPath(tmp_path) / "progress.json"
     with written_to(file):
         for item in progress.progress(range(5, 8), "training", "step", 8, done=5):
             found = read(file)
@@ -77,7 +78,7 @@ def test_progress_in_a_file_is_shown_nowhere_and_removed_at_the_end(
     assert capsys.readouterr().err == ""
     with pytest.raises(ZeroDivisionError), written_to(file):
         [1 / number for number in progress.progress([1, 0], "training", "step")]
-    assert not file.exists()
+    assert not list(tmp_path.iterdir())
 
 
 def test_the_file_is_not_written_for_every_item(
@@ -85,7 +86,7 @@ def test_the_file_is_not_written_for_every_item(
 ) -> None:
     written: list[int] = []
     monkeypatch.setattr(progress, "_write", lambda _, now: written.append(now.done))
-    with written_to(tmp_path / "progress.json"):
+    with written_to(ConfinedPath(tmp_path) / "progress.json"):
         assert sum(progress.progress(range(10_000), "training", "step")) == 49_995_000
     assert written[0] == 0
     assert len(written) < 3
@@ -93,7 +94,7 @@ def test_the_file_is_not_written_for_every_item(
 
 @pytest.mark.usefixtures("quick")
 def test_a_file_that_cannot_be_written_stops_nothing(tmp_path: Path) -> None:
-    with written_to(tmp_path / "gone" / "progress.json"):
+    with written_to(ConfinedPath(tmp_path) / "gone/progress.json"):
         assert list(progress.progress([1, 2], "training", "step")) == [1, 2]
 
 
@@ -111,13 +112,13 @@ def test_a_file_that_cannot_be_written_stops_nothing(tmp_path: Path) -> None:
 )
 def test_an_invalid_file_is_no_progress(tmp_path: Path, text: str) -> None:
     (tmp_path / "progress.json").write_text(text)
-    assert read(tmp_path / "progress.json") is None
+    assert read(ConfinedPath(tmp_path) / "progress.json") is None
 
 
 def test_a_rate_that_is_not_finite_is_none(tmp_path: Path) -> None:
     found = {"what": "a", "unit": "b", "done": 1, "total": 2, "rate": float("nan")}
     (tmp_path / "progress.json").write_text(json.dumps(found))
-    assert read(tmp_path / "progress.json") == Progress("a", "b", 1, 2, None)
+    assert read(ConfinedPath(tmp_path) / "progress.json") == Progress("a", "b", 1, 2, None)
 
 
 def test_the_text_has_all_that_is_known() -> None:

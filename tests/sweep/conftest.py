@@ -22,7 +22,7 @@ def store(tmp_path: Path) -> Store:
     """An empty store, with the folder of one variant."""
     store = Store(tmp_path / "s")
     store.prepare()
-    (store.variants / VARIANT).mkdir()
+    (store.variants / VARIANT).make_folder()
     return store
 
 

@@ -56,8 +56,8 @@ def store(tmp_path: Path) -> Store:
     busy = cell(store, "busy")
     write_json(busy.progress, asdict(Progress("training", "step", 20, 80, 3.0)))
     assert locks.acquire(store.locks, "busy") is not None
-    (store.variants / "fa-bb").mkdir()
-    (store.variants / "failed-aa").mkdir()
+    (store.variants / "fa-bb").make_folder()
+    (store.variants / "failed-aa").make_folder()
     rows = [("good", "statue", "baseline"), ("stale", "statue", "consistency"), (None, "fern", "x")]
     store.write_sweep(
         ["a"],

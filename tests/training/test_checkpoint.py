@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 
 from xrgs.capture.dataset import Dataset
 from xrgs.config import Conf
+from xrgs.safeio.confined import ConfinedPath
 from xrgs.training import checkpoint
 from xrgs.training.checkpoint import Checkpoint, CheckpointError
 from xrgs.training.loop import train
@@ -224,7 +225,7 @@ def test_a_state_that_does_not_fit_is_refused_by_its_object(
     value: NDArray[Any],
     named: str,
 ) -> None:
-    file = tmp_path / "c.npz"
+    file = ConfinedPath(tmp_path) / "c.npz"
     train(data, few_steps, Checkpoint(file, "cell", EVERY_STEP))
     state = checkpoint._load(file)
     *folders, name = member.split("/")

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import ast
+import importlib.util
 import os
 import re
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -45,3 +48,47 @@ def test_correct_use_passes_and_each_wrong_use_is_found(tmp_path: Path) -> None:
     assert {Path(file).name for file, _, _ in found} == {WRONG.name}, out
     assert {(int(line), code) for _, line, code in found} == expected_errors(), out
     assert len(expected_errors()) == 9
+
+
+@pytest.mark.slow
+def test_every_method_of_a_path_that_reaches_the_disk_is_refused_in_the_package(
+    tmp_path: Path,
+) -> None:
+    # A copy of the plugin takes the folder `xrgs` beside it for the package.
+    plugin = tmp_path / "tests" / "typing" / "file_access.py"
+    source = tmp_path / "xrgs" / "wrong_files.py"
+    for folder in (plugin.parent, source.parent):
+        folder.mkdir(parents=True)
+    shutil.copy(FOLDER / plugin.name, plugin)
+    shutil.copy(FOLDER / source.name, source)
+    (tmp_path / "mypy.ini").write_text(f"[mypy]\nplugins = {plugin}\n")
+    options = ["--strict", "--config-file=mypy.ini", "--follow-imports=silent"]
+    done = subprocess.run(
+        [sys.executable, "-m", "mypy", *options, str(source)],
+        cwd=tmp_path,
+        env=os.environ | {"MYPYPATH": str(Path(xrgs.__file__).parents[1])},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    found: dict[int, list[str]] = {}
+    pattern = r":(\d+): error: Path\.(\w+) in wrong_files: use ConfinedPath"
+    for number, method in re.findall(pattern, done.stdout):
+        found.setdefault(int(number), []).append(method)
+    lines = enumerate(source.read_text(encoding="utf-8").splitlines(), start=1)
+    marks = ((number, line.partition("# refused: ")[2]) for number, line in lines)
+    expected = {number: methods.split(", ") for number, methods in marks if methods}
+    assert found == expected, done.stdout + done.stderr
+    assert sum(map(len, found.values())) == done.stdout.count(": error: "), done.stdout
+
+
+def test_every_exception_to_the_rule_for_paths_is_needed() -> None:
+    spec = importlib.util.spec_from_file_location("file_access", FOLDER / "file_access.py")
+    assert spec is not None
+    assert spec.loader is not None
+    plugin = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(plugin)
+    for module, (methods, _) in plugin.ALLOWED.items():
+        tree = ast.parse((Path(xrgs.__file__).parent / f"{module}.py").read_text(encoding="utf-8"))
+        used = {node.attr for node in ast.walk(tree) if isinstance(node, ast.Attribute)}
+        assert set(methods.split()) <= used, module

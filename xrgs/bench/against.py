@@ -22,6 +22,7 @@ import numpy as np
 from xrgs.bench import loads
 from xrgs.errors import XrgsError
 from xrgs.runtime.progress import progress
+from xrgs.safeio.untrusted import parse_json
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -137,7 +138,7 @@ class _Worker:
         if not line:
             raise self._failure()
         try:
-            answer: dict[str, Any] = json.loads(line)
+            answer: dict[str, Any] = parse_json(line.encode())
         except ValueError:
             raise XrgsError(f"against: {self.python} answers {line.strip()!r}, not JSON") from None
         return answer

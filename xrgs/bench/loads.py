@@ -12,7 +12,8 @@ import torch
 from torch import Tensor
 
 from xrgs.errors import XrgsError
-from xrgs.safeio import npz, untrusted
+from xrgs.safeio import npz
+from xrgs.safeio.confined import confined
 from xrgs.splat.cameras import Camera
 
 if TYPE_CHECKING:
@@ -163,7 +164,7 @@ def read(path: Path) -> Load:
             finite or out of range; the message names the file and the key.
     """
     try:
-        with untrusted.open_regular(path) as file:
+        with confined(path).open() as file:
             arrays = npz.read(file)
     except (OSError, ValueError) as error:
         raise XrgsError(f"{path}: cannot be read as .npz: {error}") from error

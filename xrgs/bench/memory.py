@@ -12,6 +12,8 @@ import sys
 from pathlib import Path
 from typing import Any
 
+from xrgs.safeio.untrusted import parse_json
+
 _STEPS = 3  # in the first one, the optimizer has no state yet
 _PROCESS_STATUS = Path("/proc/self/status")
 
@@ -40,7 +42,7 @@ def measure(
     # not a checkout that happens to be the current folder.
     command = [sys.executable, "-P", "-m", "xrgs.bench.memory", *arguments]
     done = subprocess.run(command, check=True, stdout=subprocess.PIPE)  # noqa: S603
-    row: dict[str, Any] = json.loads(done.stdout)
+    row: dict[str, Any] = parse_json(done.stdout)
     return row
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -24,6 +23,8 @@ from xrgs.experiment import provenance
 from xrgs.runtime.machine import peak_rss, usable_cores
 from xrgs.runtime.progress import progress
 from xrgs.safeio.atomic import write_json
+from xrgs.safeio.records import table_text
+from xrgs.safeio.words import for_csv
 from xrgs.splat.backend import resolve_backend
 
 if TYPE_CHECKING:
@@ -248,11 +249,8 @@ def _write(results: dict[str, Any], settings: Settings) -> None:
 
 
 def _write_csv(path: Path, rows: Sequence[Row]) -> None:
-    with path.open("w", encoding="utf-8", newline="") as file:
-        fields = list(dict.fromkeys(key for row in rows for key in row))
-        writer = csv.DictWriter(file, fields, lineterminator="\n")
-        writer.writeheader()
-        writer.writerows(rows)
+    safe = [{key: for_csv(value) for key, value in row.items()} for row in rows]
+    path.write_text(table_text(safe), encoding="utf-8", newline="")
 
 
 def _write_json(name: str, results: dict[str, Any]) -> None:

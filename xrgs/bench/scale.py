@@ -24,6 +24,8 @@ from xrgs.capture import variant
 from xrgs.capture.scenes import motorcycle
 from xrgs.errors import XrgsError
 from xrgs.experiment.cell_folder import CellFolder
+from xrgs.safeio.records import read_object
+from xrgs.safeio.untrusted import parse_json
 from xrgs.sweep.session import HandOver, SweepSession
 
 if TYPE_CHECKING:
@@ -108,7 +110,7 @@ def _job_cost(template: Path, folder: Path) -> dict[str, float]:
     (folder / "session").mkdir()
     session = SweepSession(folder / "session")
     session.begin()
-    config_values = json.loads((template / "config.json").read_text(encoding="utf-8"))
+    config_values = read_object(template / "config.json")
     hand_over = HandOver("cell", config_values, cell.identity())
     session.hand_over(hand_over)
     works: dict[str, Callable[[], object]] = {
@@ -167,7 +169,7 @@ def _copy(template: Path, cell: Path, seed: int) -> None:
     """Copy a finished cell under another id and seed."""
     if cell == template:
         return
-    status = json.loads((template / "status.json").read_text(encoding="utf-8"))
+    status = read_object(template / "status.json")
     for name in (*status["files"], "log.txt"):
         file = cell / name
         file.parent.mkdir(parents=True, exist_ok=True)
@@ -176,7 +178,7 @@ def _copy(template: Path, cell: Path, seed: int) -> None:
             continue
         content = (template / name).read_bytes()
         if name == "identity.json":
-            content = json.dumps(json.loads(content) | {"seed": seed}).encode()
+            content = json.dumps(parse_json(content) | {"seed": seed}).encode()
             digest = hashlib.sha256(content).hexdigest()
             status["files"][name] = {"bytes": len(content), "sha256": digest}
         file.write_bytes(content)

@@ -11,6 +11,7 @@ from xrgs.capture import images
 from xrgs.capture.images import ImageError
 from xrgs.errors import UnreadableError
 from xrgs.runtime.progress import progress
+from xrgs.safeio.words import MAX_CELL, for_line
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -131,7 +132,8 @@ def _legend(sheet: Image.Image, variant: Variant, views: Sequence[View]) -> None
 
 
 def _shorten(draw: ImageDraw.ImageDraw, text: str, width: float) -> str:
-    """Shorten a text that is wider than `width` px by leaving out its middle."""
+    """Make a text one line, and shorten it to `width` px by leaving out its middle."""
+    text = for_line(text, MAX_CELL)
     if draw.textlength(text, _font()) <= width:
         return text
     for length in range(len(text) - 1, 1, -1):

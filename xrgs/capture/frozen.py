@@ -20,6 +20,7 @@ from xrgs.safeio.atomic import atomic_writer, write_json
 from xrgs.safeio.confined import ConfinedPath, confined, is_passing
 from xrgs.safeio.hashing import digest
 from xrgs.safeio.records import read_object
+from xrgs.safeio.words import for_line
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -60,9 +61,9 @@ def freeze(made: Variant, key: str, folder: ConfinedPath, variants: ConfinedPath
     Returns:
         The variant, as it is read from its new place.
     """
-    with atomic_writer(folder / POINTS) as stream:
+    with atomic_writer(folder / POINTS, durable=False) as stream:
         np.savez(stream, points=made.points, colors=made.colors)
-    write_json(folder / REPORT, made.report)
+    write_json(folder / REPORT, made.report, durable=False)
     images = {view.file.relative_to(folder) for view in made.views}
     content: dict[str, Any] = {
         "key": key,
@@ -73,9 +74,8 @@ def freeze(made: Variant, key: str, folder: ConfinedPath, variants: ConfinedPath
         "files": sealed.hashes(folder, [POINTS, *sorted(images)]),
     }
     content["id"] = variant_id(content)
-    write_json(folder / MANIFEST, content)
-    for inside in {name.rpartition("/")[0] for name in images} | {"images"}:
-        (folder / inside).sync_name()
+    write_json(folder / MANIFEST, content, durable=False)
+    folder.sync_tree()
     home = variants / content["id"]
     folder.rename(home)
     home.sync_name()
@@ -135,7 +135,7 @@ def verify(path: Path | ConfinedPath) -> list[str]:
                 _assembled(folder, content)
     except XrgsError as error:
         errors.append(error)
-    return [untrusted.one_line(str(error)) for error in errors]
+    return [for_line(str(error)) for error in errors]
 
 
 @contextmanager

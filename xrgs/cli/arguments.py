@@ -15,7 +15,9 @@ from omegaconf.errors import OmegaConfBaseException
 from xrgs import config
 from xrgs.config import escape_interpolations
 from xrgs.errors import XrgsError
+from xrgs.runtime.streams import say
 from xrgs.safeio.paths import user_path
+from xrgs.safeio.words import for_line
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
@@ -38,9 +40,9 @@ def errors_as_messages(command: str, hint: str = "") -> Iterator[None]:
     try:
         yield
     except XrgsError as error:
-        sys.exit(f"{command}: {error}")
+        sys.exit(for_line(f"{command}: {error}"))
     except (OmegaConfBaseException, HydraException) as error:
-        sys.exit(f"{command}: {config.error_line(error)}{hint}")
+        sys.exit(for_line(f"{command}: {config.error_line(error)}{hint}"))
 
 
 def with_quotes(words: Sequence[str]) -> list[str]:
@@ -122,6 +124,6 @@ def parse(schema: type[Any], help_text: str) -> DictConfig:
         SystemExit: With code 0, after the help was printed.
     """
     if {"-h", "--help"} & set(sys.argv[1:]):
-        print(help_text, end="")  # noqa: T201
+        say(help_text.rstrip())
         sys.exit()
     return cast("DictConfig", OmegaConf.merge(OmegaConf.structured(schema), dotlist(sys.argv[1:])))

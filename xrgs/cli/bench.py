@@ -9,6 +9,7 @@ from omegaconf import OmegaConf
 from xrgs.bench.settings import Settings
 from xrgs.cli.arguments import errors_as_messages, parse
 from xrgs.runtime.machine import set_passive_openmp_wait
+from xrgs.runtime.streams import say
 
 _HELP = """\
 xrgs-bench [KEY=VALUE]...
@@ -41,4 +42,4 @@ def main() -> None:
         settings = OmegaConf.to_object(parse(Settings, _HELP))
         from xrgs.bench.run import run
 
-        print(run(cast("Settings", settings)))  # noqa: T201
+        say(run(cast("Settings", settings)))

@@ -12,6 +12,7 @@ from xrgs import config
 from xrgs.cli.arguments import choices, errors_as_messages, with_quotes
 from xrgs.errors import XrgsError
 from xrgs.experiment.store import Store
+from xrgs.runtime.streams import say
 from xrgs.safeio.confined import ConfinedPath
 from xrgs.sweep import variants
 
@@ -33,7 +34,7 @@ def main() -> None:
     words = [argument for argument in sys.argv[1:] if "=" not in argument]
     values = dict(argument.split("=", 1) for argument in sys.argv[1:] if "=" in argument)
     if not sys.argv[1:] or {"-h", "--help"} & set(words):
-        print(_HELP.format(data=choices("data")), end="")  # noqa: T201
+        say(_HELP.format(data=choices("data")).rstrip())
         return
     with errors_as_messages("xrgs-data"):
         if words[:1] == ["download"]:
@@ -44,7 +45,7 @@ def main() -> None:
             text = _inspect(words[1:], values)
         else:
             raise XrgsError(f"{' '.join(words)}: there is no such command; see xrgs-data --help")
-        print(text)  # noqa: T201
+        say(text)
 
 
 def _lpips(values: dict[str, str]) -> str:

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from xrgs.cli.arguments import errors_as_messages, parse
+from xrgs.runtime.streams import say
 
 _HELP = """\
 xrgs-report [KEY=VALUE]...
@@ -41,4 +42,4 @@ def main() -> None:
 
         out = Path(conf.out) if conf.out else None
         pictures = {"all": None, "none": []}.get(conf.pictures, conf.pictures.split(","))
-        print(build(Path(conf.store), conf.sweep, out, pictures).text)  # noqa: T201
+        say(build(Path(conf.store), conf.sweep, out, pictures).text)

@@ -15,7 +15,7 @@ from omegaconf import MISSING, DictConfig, OmegaConf
 from xrgs import config
 from xrgs.cli.arguments import choices, dotlist, errors_as_messages, with_quotes
 from xrgs.runtime.signals import exit_on_signal
-from xrgs.runtime.streams import ignore_broken_pipe
+from xrgs.runtime.streams import ignore_broken_pipe, say
 
 _HELP = """\
 xrgs-sweep [+ablation=NAME[,NAME]...] [scene=NAME] [preset=NAME] [KEY=VALUE[,VALUE]...]...
@@ -84,7 +84,7 @@ def main() -> None:
     arguments = sys.argv[1:]
     if {"-h", "--help"} & set(arguments):  # Hydra's own help takes seconds to list its groups
         groups = ("ablation", "scene", "preset", "sweeps")
-        print(_HELP.format(**{group: choices(group) for group in groups}), end="")  # noqa: T201
+        say(_HELP.format(**{group: choices(group) for group in groups}).rstrip())
         return
     ignore_broken_pipe()
     if any(argument.startswith("rerun=") for argument in arguments):
@@ -111,6 +111,6 @@ def _rerun(arguments: list[str]) -> None:
         out, store = (Path(path) if path else None for path in (conf.out, conf.store))
         photographs, plugins = conf.scene.path, conf.plugins.split(",")
         result = rerun(Path(conf.rerun), out, store, conf.threads, photographs, plugins)
-    print(result)  # noqa: T201
+    say(str(result))
     if result.differences:
         sys.exit(1)

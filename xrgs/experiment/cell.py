@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import csv
-import io
 import logging
 import traceback
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from xrgs.capture import dataset
 from xrgs.evaluation import protocol
@@ -15,14 +13,14 @@ from xrgs.runtime import progress
 from xrgs.runtime.machine import peak_rss, set_torch_threads
 from xrgs.safeio.atomic import write_json, write_text
 from xrgs.safeio.hashing import digest
+from xrgs.safeio.records import table_text
+from xrgs.safeio.words import for_terminal
 from xrgs.splat.backend import resolve_backend
 from xrgs.splat.ply import save_ply
 from xrgs.training.checkpoint import Checkpoint, CheckpointError
 from xrgs.training.count_matching import train_cell
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
-
     from xrgs.capture.dataset import Dataset
     from xrgs.capture.views import Variant
     from xrgs.config import Conf
@@ -48,7 +46,7 @@ def run_cell(conf: Conf, variant: Variant, folder: CellFolder) -> None:
             views = _train_and_score(conf, variant, folder)
         folder.finish(views, protocol.PROTOCOL_VERSION)
     except Exception:
-        write_text(folder.folder / "error.txt", traceback.format_exc())
+        write_text(folder.folder / "error.txt", for_terminal(traceback.format_exc()))
         raise
 
 
@@ -61,11 +59,11 @@ def _train_and_score(conf: Conf, variant: Variant, folder: CellFolder) -> list[s
     trained = _train_or_resume(data, conf, folder)
     peak_rss_bytes = peak_rss()  # read before evaluation, which may load the network of LPIPS
     save_ply(folder.folder / "splats.ply", trained.gaussians)
-    write_text(folder.folder / "history.csv", _csv(trained.history))
+    write_text(folder.folder / "history.csv", table_text(trained.history))
     scores = protocol.score_views(
         trained.gaussians, data.test, conf.splat, folder.folder / "renders"
     )
-    write_text(folder.folder / "scores.csv", _csv(scores))
+    write_text(folder.folder / "scores.csv", table_text(scores))
     write_json(
         folder.folder / "summary.json",
         {
@@ -93,11 +91,3 @@ def _train_or_resume(data: Dataset, conf: Conf, folder: CellFolder) -> TrainingR
         _log.warning("training starts over: %s", error)
         checkpoint.set_aside()
     return train_cell(data, conf, checkpoint)
-
-
-def _csv(rows: Sequence[Mapping[str, Any]]) -> str:
-    text = io.StringIO()
-    writer = csv.DictWriter(text, fieldnames=list(rows[0]), lineterminator="\n")
-    writer.writeheader()
-    writer.writerows(rows)
-    return text.getvalue()

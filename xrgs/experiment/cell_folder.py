@@ -6,7 +6,10 @@ cell is done when that file says so and the listed files are present and unchang
 
 from __future__ import annotations
 
-import io
+import errno
+import secrets
+import shutil
+from contextlib import suppress
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -14,12 +17,13 @@ from xrgs.errors import StoreError, UnreadableError
 from xrgs.runtime import progress
 from xrgs.safeio import untrusted
 from xrgs.safeio.atomic import write_json, write_text
-from xrgs.safeio.confined import confined
+from xrgs.safeio.confined import ReplacedError, RootMissingError, confined, is_passing
 from xrgs.safeio.hashing import canonical_json, file_digest
-from xrgs.safeio.records import as_number, read_file, read_json, read_object, read_table
+from xrgs.safeio.records import as_number, read_json, read_object, read_table
+from xrgs.safeio.words import for_terminal
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
+    from collections.abc import Iterable, Mapping, Sequence
     from pathlib import Path
 
     import pandas as pd
@@ -39,8 +43,8 @@ _PROGRESS = "progress.json"
 _NOT_RESULTS = frozenset(
     {"log.txt", "status.json", _PROGRESS, _CHECKPOINT, f"refused-{_CHECKPOINT}"}
 )
-#: Files of a stopped attempt that are kept when the cell resumes from its checkpoint.
-_KEPT_ON_RESUME = frozenset({_CHECKPOINT, "identity.json", "log.txt"})
+#: Files of a stopped attempt that the next one gets.
+_KEPT_ON_RESUME = (_CHECKPOINT, "log.txt")
 
 
 @dataclass(frozen=True)
@@ -48,9 +52,26 @@ class CellState:
     """The state of a cell, and the reason for it."""
 
     name: str
-    """`absent`, `unfinished`, `running`, `failed`, `corrupt` or `done`; `unknown` where a file can't
-    be read now, so that nothing may be done with the cell but to look again."""
+    """`absent`, `unfinished`, `running`, `failed`, `corrupt` or `done`; `unknown` where a file can
+    not be read now, so that nothing may be done with the cell but to look again."""
     reason: str = ""
+
+    @classmethod
+    def of_error(cls, error: Exception) -> CellState:
+        """Return the state of a cell whose files can't be read, or are not what they should be.
+
+        Args:
+            error: What was raised when they were read.
+        """
+        if isinstance(error, (UnreadableError, OSError)):
+            return cls("unknown", f"it can't be read now: {error}")
+        if isinstance(error, StoreError):
+            return cls("corrupt", str(error))
+        return cls("corrupt", f"a file is malformed: {error!r}")
+
+
+#: What reading the files of a cell may raise, whatever is in them.
+READING_ERRORS = (StoreError, OSError, AttributeError, KeyError, TypeError, ValueError)
 
 
 @dataclass(frozen=True)
@@ -96,16 +117,15 @@ class CellFolder:
         """
         try:
             return self._look(verify=verify)
-        except (UnreadableError, OSError) as error:
-            return CellState("unknown", f"it can't be read now: {error}")
-        except (StoreError, AttributeError, KeyError, TypeError, ValueError) as error:
-            return CellState("corrupt", str(error))
+        except READING_ERRORS as error:
+            return CellState.of_error(error)
 
     def _look(self, *, verify: bool) -> CellState:
         if self.folder.is_link():
             return CellState("corrupt", "it is a symbolic link; a cell must be a folder")
         if not self.folder.is_dir():
-            return CellState("absent")
+            there = self.folder.exists()
+            return CellState("corrupt", "it is not a folder") if there else CellState("absent")
         if not self.status.exists():
             resumes = "; it resumes from its checkpoint" if self.checkpoint.exists() else ""
             return CellState("unfinished", f"it was stopped before it ended{resumes}")
@@ -141,6 +161,35 @@ class CellFolder:
         if verify and [view for view, _ in self.view_scores()] != status["views"]:
             raise StoreError("scores.csv does not have one row for each view that was to be scored")
 
+    def verify(self) -> list[str]:
+        """Hash every file of a finished cell.
+
+        Returns:
+            A line for each file that is missing, has changed, can't be read now or does not belong
+            there; empty for an intact cell.
+        """
+        try:
+            files = read_object(self.status)["files"]
+            wrong = [why for name, entry in files.items() if (why := self._wrong(name, entry))]
+            listed = files.keys() | _NOT_RESULTS
+            wrong += [
+                f"{self.folder}/{name}: it does not belong there"
+                for name, _ in self.folder.walk()
+                if name not in listed
+            ]
+        except READING_ERRORS as error:
+            return [f"{self.status}: {CellState.of_error(error).reason}"]
+        return wrong
+
+    def _wrong(self, name: str, entry: Mapping[str, Any]) -> str:
+        """Return what is wrong with one of the cell's files; empty where nothing is."""
+        try:
+            intact = file_digest(self.folder / name) == entry["sha256"]
+        except OSError as error:
+            again = "; try again" if is_passing(error) else ""
+            return f"{self.folder}/{name}: {error.strerror}{again}"
+        return "" if intact else f"{self.folder}/{name}: it has changed since the cell finished"
+
     def view_scores(self) -> list[tuple[str, dict[str, float]]]:
         """Return the name and the scores of every test view, NaN where a score is missing.
 
@@ -152,6 +201,8 @@ class CellFolder:
         views = [row[0] for row in rows]
         if header[:1] != ["view"] or not all(map(untrusted.is_name, views)):
             raise StoreError(f"{file}: the first column must hold names of views")
+        if len(set(views)) < len(views):
+            raise StoreError(f"{file}: a view has two rows")
         try:
             values = [map(as_number, row[1:]) for row in rows]
             scores = [dict(zip(header[1:], row, strict=True)) for row in values]
@@ -159,48 +210,122 @@ class CellFolder:
             raise StoreError(f"{file}: {error}") from error
         return list(zip(views, scores, strict=True))
 
-    def begin(self, config: Mapping[str, Any], identity: Mapping[str, Any]) -> None:
-        """Create the folder with the cell's config and identity, and without any result.
+    def begin(self, config: Mapping[str, Any], identity: Mapping[str, Any]) -> CellFolder:
+        """Begin an attempt at the cell: make a new folder with its config and identity alone.
 
-        The checkpoint and the log of an earlier attempt at the same cell are kept. A folder that
-        can't be resumed (another identity, or failed or corrupt without a checkpoint) is renamed to
-        `<cell id>.aside-<n>`, so that it can be inspected.
+        The checkpoint and the log of a stopped attempt at the same cell are copied into it. A
+        folder that can't be resumed (another identity, or failed or corrupt without a checkpoint)
+        is renamed to `<cell id>.aside-<n>`, so that it can be inspected.
+
+        The caller holds the cell's lock. Each attempt has a folder of its own, so that a process
+        that has lost the lock, and does not know it yet, writes into no folder but its own.
 
         Args:
             config: The cell's config as plain JSON values.
             identity: The values that the cell's id is the digest of.
+
+        Returns:
+            The folder of this attempt. All that is done by it is an error (`ReplacedError`) once
+            another attempt has begun; the folder of that attempt is never touched.
+
+        Raises:
+            UnreadableError: Nothing can be told of the folder now.
+            ReplacedError: Another process has begun the cell at the same time.
         """
-        if self._can_resume(identity):
-            self._clear()
-        elif self.folder.exists():
-            self.folder.rename(_free_name(self.folder))
-        self.folder.make_folder()
-        write_json(self.folder / "config.json", config)
-        write_json(self.folder / "identity.json", identity)
+        self.folder.make_parent()
+        before, stopped = self._identity(), self._stopped(identity)
+        new = self._hidden("new")
+        try:
+            new.make_folder(exclusive=True)
+            write_json(new / "config.json", config, durable=False)
+            write_json(new / "identity.json", identity, durable=False)
+            if stopped is not None:
+                _copy(_KEPT_ON_RESUME, stopped.folder, new)
+            new.sync_tree()
+            attempt = CellFolder(new.pinned(name=self.path))
+            self._set_aside(before)
+            new.rename(self.folder)
+        except BaseException:
+            _remove(new)
+            raise
+        self.folder.sync_name()
+        self._settle_leftovers(identity)
+        return attempt
+
+    def _identity(self) -> tuple[int, int] | None:
+        """Return device and inode of whatever has this name now; None if nothing has."""
+        try:
+            return self.folder.identity()
+        except RootMissingError:
+            raise
+        except FileNotFoundError:
+            return None
+
+    def _stopped(self, identity: Mapping[str, Any]) -> CellFolder | None:
+        """Return the attempt that a new one goes on from: the last, where it can be resumed.
+
+        A process that was killed while it began an attempt may have left the last one hidden.
+        """
+        last = [self] if self.folder.exists() else self._leftovers("old")
+        return next((attempt for attempt in last if attempt._can_resume(identity)), None)
+
+    def _hidden(self, kind: str) -> ConfinedPath:
+        """Return a name that no folder has, for one that `begin` makes or replaces."""
+        return self.folder.with_name(f".{self.id}.{kind}-{secrets.token_hex(4)}")
+
+    def _leftovers(self, kind: str) -> list[CellFolder]:
+        """Return the hidden folders of one kind, which only a killed process leaves."""
+        prefix = f".{self.id}.{kind}-"
+        names = [name for name in self.folder.siblings() if name.startswith(prefix)]
+        return [CellFolder(self.folder.with_name(name)) for name in names]
+
+    def _set_aside(self, before: tuple[int, int] | None) -> None:
+        """Free this name for a new attempt, unless another process has given it away meanwhile."""
+        if before is None:
+            return
+        old = self._hidden("old")
+        self.folder.rename(old)
+        if old.identity() != before:
+            old.rename(self.folder)
+            why = "another process has begun this cell at the same time"
+            raise ReplacedError(errno.ESTALE, why, str(self.path))
+        # Otherwise a power failure could keep the new folder's name and lose this one.
+        old.sync_name()
+
+    def _settle_leftovers(self, identity: Mapping[str, Any]) -> None:
+        """Remove stopped attempts, which the new one goes on from; keep every other one aside."""
+        for new in self._leftovers("new"):
+            _remove(new.folder)
+        for old in self._leftovers("old"):
+            if old._can_resume(identity):
+                _remove(old.folder)
+            else:
+                old.folder.rename(_free_name(self.folder))
 
     def _can_resume(self, identity: Mapping[str, Any]) -> bool:
-        state = self.state().name
-        if state != "unfinished" and not (state == "failed" and self.checkpoint.is_file()):
+        state = self.state()
+        if state.name == "unknown":
+            raise UnreadableError(f"{self.path}: {state.reason}")
+        failed_late = state.name == "failed" and self.checkpoint.is_file()
+        if state.name != "unfinished" and not failed_late:
             return False
         try:
             return canonical_json(self.identity()) == canonical_json(identity)
+        except UnreadableError:
+            raise
         except (StoreError, TypeError, ValueError):
-            # An attempt that was killed before it wrote its identity has not trained anything.
-            written = (self.folder / "identity.json", self.checkpoint)
-            return not any(file.exists() for file in written)
-
-    def _clear(self) -> None:
-        for entry in self.folder.iterdir():
-            if entry.name not in _KEPT_ON_RESUME or not entry.is_file():
-                entry.remove()
+            return False
 
     def finish(self, views: Sequence[str], protocol: int) -> None:
         """Declare the cell done, with the files that are in the folder now.
+
+        All of them are on the disk before the cell says that it is done.
 
         Args:
             views: Names of the test views, in the order of `scores.csv`.
             protocol: Version of the evaluation protocol.
         """
+        self.folder.sync_tree()
         files = {
             name: {"bytes": status.st_size, "sha256": file_digest(self.folder / name)}
             for name, status in sorted(self.folder.walk())
@@ -232,7 +357,7 @@ class CellFolder:
         """
         error = self.folder / "error.txt"
         if not error.exists():
-            write_text(error, f"{reason}\n")
+            write_text(error, for_terminal(f"{reason}\n"))
         self.progress.unlink(missing_ok=True)
         self._set_status({"state": "failed", "reason": reason, "views": [], "files": {}})
 
@@ -264,15 +389,23 @@ class CellFolder:
         return read_object(self.folder / "provenance.json")
 
     def history(self) -> pd.DataFrame:
-        """Return the training history, one row per logged step.
+        """Return the training history, one row per logged step; `view` is text, all else numbers.
 
         Raises:
-            StoreError: `history.csv` can't be read.
-            ValueError: `history.csv` is not a table.
+            StoreError: `history.csv` can't be read, or is not such a table.
         """
         import pandas as pd
 
-        return pd.read_csv(io.BytesIO(read_file(self.folder / "history.csv")))
+        file = self.folder / "history.csv"
+        header, rows = read_table(file)
+        table = pd.DataFrame(rows, columns=header, dtype=object)
+        try:
+            for name in header:
+                if name != "view":
+                    table[name] = pd.to_numeric(table[name].map(as_number), downcast="integer")
+        except ValueError as error:
+            raise StoreError(f"{file}: {name}: {error}") from error
+        return table
 
     def scores(self) -> pd.DataFrame:
         """Return the scores of the test views.
@@ -337,6 +470,28 @@ class CellFolder:
         return {
             split: {view.name: view.camera for view in views} for split, views in splits.items()
         }
+
+
+def _copy(names: Iterable[str], source: ConfinedPath, target: ConfinedPath) -> None:
+    """Copy the files that are there.
+
+    They are not moved: until the new attempt is in place, the old one must be whole, and its
+    process may have the log open.
+    """
+    for name in names:
+        if (source / name).is_file():
+            with (source / name).open() as stream, (target / name).create() as copy:
+                shutil.copyfileobj(stream, copy)
+
+
+def _remove(folder: ConfinedPath) -> None:
+    """Remove a folder that no process needs any more.
+
+    One that is still written to, by a process that has lost its lock, may resist: the next attempt
+    tries again.
+    """
+    with suppress(OSError):
+        folder.remove()
 
 
 def _free_name(path: ConfinedPath) -> ConfinedPath:

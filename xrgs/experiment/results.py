@@ -12,8 +12,9 @@ import pandas as pd
 from xrgs.errors import StoreError
 from xrgs.evaluation.metrics import METRICS
 from xrgs.safeio.confined import ConfinedPath
-from xrgs.safeio.records import as_number, read_object
-from xrgs.safeio.untrusted import is_name, printable
+from xrgs.safeio.records import MAX_BYTES, as_number, read_object
+from xrgs.safeio.untrusted import is_name
+from xrgs.safeio.words import for_line
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Mapping
@@ -24,6 +25,8 @@ if TYPE_CHECKING:
 CELL_NAMES = ("scene", "label", "condition")
 #: Groups of a cell's config that become columns; the others do not change a number.
 _CONFIG_GROUPS = ("scene", "variant", "splat", "train", "components")
+#: The largest config that becomes columns, in bytes: ten times what ours has.
+_MAX_CONFIG_BYTES = 1 << 16
 
 
 def cells_table(rows: Iterable[Mapping[str, Any]]) -> pd.DataFrame:
@@ -52,13 +55,15 @@ def cell_columns(folder: ConfinedPath, names: Mapping[str, str]) -> dict[str, An
         folder: The cell's folder; a file that is missing in it gives no columns.
         names: Scene, label and condition in the record of a sweep; empty where there is none.
     """
-    identity, config = (_object(folder / name) for name in ("identity.json", "config.json"))
+    identity = _object(folder / "identity.json")
+    config = _object(folder / "config.json", _MAX_CONFIG_BYTES)
     seed, variant = identity.get("seed"), identity.get("variant")
     settings = dict(_flat({name: config.get(name) for name in _CONFIG_GROUPS}))
+    scene = settings.get("scene.name")
     return {
         **{key: value for key, value in settings.items() if "." in key},
         "cell_id": folder.name,
-        "scene": names.get("scene") or settings.get("scene.name"),
+        "scene": names.get("scene") or (scene if isinstance(scene, str) else None),
         "label": names.get("label"),
         "condition": names.get("condition"),
         "seed": seed if type(seed) is int and abs(seed) < 1 << 63 else None,
@@ -66,10 +71,10 @@ def cell_columns(folder: ConfinedPath, names: Mapping[str, str]) -> dict[str, An
     }
 
 
-def _object(file: ConfinedPath) -> dict[str, Any]:
+def _object(file: ConfinedPath, max_bytes: int = MAX_BYTES) -> dict[str, Any]:
     """Read a JSON file of values under names; empty where it can't be read."""
     try:
-        return read_object(file)
+        return read_object(file, max_bytes)
     except StoreError:
         return {}
 
@@ -77,35 +82,30 @@ def _object(file: ConfinedPath) -> dict[str, Any]:
 def _flat(values: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
     """Yield nested values under dotted names, as `train.steps`."""
     for name, value in values.items():
-        key = printable(f"{prefix}{name}")
+        key = for_line(f"{prefix}{name}")
         if isinstance(value, dict):
             yield from _flat(value, f"{key}.")
         else:
-            yield key, printable(value) if isinstance(value, str) else value
+            yield key, for_line(value) if isinstance(value, str) else value
 
 
-def cell_metrics(folder: ConfinedPath, scores: pd.DataFrame) -> dict[str, float]:
+def cell_metrics(summary: Mapping[str, Any], scores: pd.DataFrame) -> dict[str, float]:
     """Return the metrics of a finished cell, by name.
 
     Args:
-        folder: The cell's folder.
+        summary: The numbers of the whole cell, as `CellFolder.summary` returns them.
         scores: The scores of its test views, as `CellFolder.scores` returns them.
 
     Returns:
-        Numbers of the whole cell from `summary.json`, and the means of scores over the test views;
-        a score that one view lacks has no mean (NaN).
+        Numbers of the whole cell, and the means of scores over the test views; a score that one
+        view lacks has no mean (NaN).
+
+    Raises:
+        ValueError: A value of the summary is not a number.
     """
-    summary, means = _object(folder / "summary.json"), scores.mean(skipna=False)
-    metrics = {}
-    for metric in METRICS:
-        if metric.name in means:
-            metrics[metric.name] = float(means[metric.name])
-        elif metric.name in summary:
-            try:
-                metrics[metric.name] = as_number(summary[metric.name])
-            except ValueError:
-                continue
-    return metrics
+    means = scores.mean(skipna=False)
+    whole = {m.name: as_number(summary[m.name]) for m in METRICS if m.name in summary}
+    return whole | {m.name: float(means[m.name]) for m in METRICS if m.name in means}
 
 
 def load_dataset(folder: ConfinedPath) -> Dataset:

@@ -13,13 +13,14 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from xrgs.errors import StoreError, UnreadableError
-from xrgs.experiment.cell_folder import CellFolder
+from xrgs.experiment.cell_folder import READING_ERRORS, CellFolder, CellState
 from xrgs.runtime.progress import log_line
 from xrgs.safeio import untrusted
 from xrgs.safeio.atomic import write_json
 from xrgs.safeio.confined import ConfinedPath, RootMissingError
 from xrgs.safeio.hashing import digest
-from xrgs.safeio.records import read_json
+from xrgs.safeio.records import list_folder, read_json
+from xrgs.safeio.words import for_line
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping, Sequence
@@ -31,6 +32,10 @@ if TYPE_CHECKING:
 BASELINE = "baseline"
 
 _RECORD_VERSION = 1
+#: The largest record of a sweep that is read, in bytes: 100,000 cells take 30 MB.
+_MAX_RECORD_BYTES = 1 << 25
+#: The longest scene, label or condition of a record, in characters.
+_MAX_NAME = 2000
 #: Bytes that must be writable before a sweep starts; any cell needs more than that.
 _MIN_FREE_BYTES = 1 << 15
 _MAX_SEED = (1 << 63) - 1
@@ -143,8 +148,8 @@ class Store:
             its key, as `train.steps`.
 
         Raises:
-            StoreError: There is no such store. A sweep's record that can't be read is named on
-                stderr.
+            StoreError: There is no such store, or its cells can't be listed. A sweep's record that
+                can't be read is named on stderr.
         """
         from xrgs.experiment.results import cell_columns, cell_metrics, cells_table
 
@@ -152,20 +157,25 @@ class Store:
             raise StoreError(f"{self.path}: no store; xrgs-sweep makes one with store={self.path}")
         names, rows = self._names(), []
         for cell in self.cell_folders():
-            state = cell.state(verify=verify)
-            row = cell_columns(cell.folder, names.get(cell.id, {}))
-            row |= {"state": state.name, "reason": untrusted.printable(state.reason)}
-            done = state.name == "done"
-            rows.append(row | (cell_metrics(cell.folder, cell.scores()) if done else {}))
+            state, metrics = cell.state(verify=verify), {}
+            if state.name == "done":
+                try:
+                    metrics = cell_metrics(cell.summary(), cell.scores())
+                except READING_ERRORS as error:
+                    state = CellState.of_error(error)
+            row: dict[str, Any] = cell_columns(cell.folder, names.get(cell.id, {}))
+            rows.append(row | metrics | {"state": state.name, "reason": for_line(state.reason)})
         return cells_table(rows)
 
     def cell_folders(self) -> list[CellFolder]:
         """Return the cells, sorted by id; folders of earlier attempts, whose names have a dot, not.
 
+        Whatever else has the name of a cell is among them, a link or a file: its state says so.
+
         Raises:
-            OSError: The folder of cells can't be read.
+            StoreError: The folder of cells can't be listed; the message names it.
         """
-        names = self.cells_folder.folders()
+        names = list_folder(self.cells_folder)
         return [self.cell(name) for name in names if "." not in name and untrusted.is_name(name)]
 
     def _names(self) -> dict[str, dict[str, str]]:
@@ -176,7 +186,7 @@ class Store:
         for message in damaged:
             log_line(f"{message}; its names of cells are left out")
         return {
-            row["cell_id"]: {key: untrusted.printable(row.get(key, "")) for key in CELL_NAMES}
+            row["cell_id"]: {key: for_line(row.get(key, "")) for key in CELL_NAMES}
             for record in records.values()
             for row in record["cells"]
             if row.get("cell_id") is not None
@@ -186,13 +196,11 @@ class Store:
         """Return the ids of the recorded sweeps, oldest first.
 
         Raises:
-            OSError: The folder of the records can't be read.
+            StoreError: The folder of the records can't be listed; the message names it.
         """
-        times = {
-            name.removesuffix(".json"): status.st_mtime_ns
-            for name, status in self.sweeps.walk()
-            if name.endswith(".json") and untrusted.is_name(name)
-        }
+        names = [name for name in list_folder(self.sweeps) if name.endswith(".json")]
+        files = [self.sweeps / name for name in names if untrusted.is_name(name)]
+        times = {file.stem: _modified_ns(file) for file in files}
         return sorted(times, key=lambda sweep_id: (times[sweep_id], sweep_id))
 
     def records(self) -> tuple[dict[str, dict[str, Any]], tuple[str, ...]]:
@@ -200,13 +208,14 @@ class Store:
 
         Returns:
             The records that can be read, by the sweep's id, oldest first, and for each other one a
-            message that names its file.
-
-        Raises:
-            OSError: The folder of the records can't be read.
+            message that names its file; for a folder that can't be listed, the message names that.
         """
+        try:
+            sweep_ids = self.sweep_ids()
+        except StoreError as error:
+            return {}, (str(error),)
         records, damaged = {}, []
-        for sweep_id in self.sweep_ids():
+        for sweep_id in sweep_ids:
             try:
                 records[sweep_id] = self.sweep_record(sweep_id)
             except StoreError as error:
@@ -230,20 +239,27 @@ class Store:
         return sweep_id
 
     def latest_sweep(self) -> str:
-        """Return the id of the sweep that was recorded last.
+        """Return the id of the sweep that was recorded last, of those that can be read.
+
+        A newer record that can't be read is named on stderr.
 
         Raises:
-            StoreError: The store has no record of a sweep, or can't be read.
+            StoreError: The store has no record of a sweep, or none that can be read.
         """
-        try:
-            ids = self.sweep_ids()
-        except (FileNotFoundError, NotADirectoryError):
-            ids = []
-        except OSError as error:
-            raise UnreadableError(f"{error.filename}: {error.strerror}; try again") from error
-        if not ids:
+        sweep_ids = self.sweep_ids()
+        if not sweep_ids:
             raise StoreError(f"store={self.path} holds no sweep: run xrgs-sweep first")
-        return ids[-1]
+        damaged = []
+        for sweep_id in reversed(sweep_ids):
+            try:
+                self.sweep_record(sweep_id)
+            except StoreError as error:
+                damaged.append(error)
+                continue
+            for newer in damaged:
+                log_line(f"{newer}; the sweep before it is taken")
+            return sweep_id
+        raise damaged[0]
 
     def sweep_record(self, sweep_id: str | None = None) -> dict[str, Any]:
         """Return the record of a sweep.
@@ -261,7 +277,7 @@ class Store:
         if not untrusted.is_name(sweep_id):
             raise StoreError(f"{sweep_id!r:.80} is not the id of a sweep")
         file = self.sweeps / f"{sweep_id}.json"
-        record = read_json(file)
+        record = read_json(file, _MAX_RECORD_BYTES)
         if not isinstance(record, dict) or record.get("version") != _RECORD_VERSION:
             raise StoreError(f"{file} is not a sweep record of version {_RECORD_VERSION}")
         command, cells = record.get("command"), record.get("cells")
@@ -271,6 +287,27 @@ class Store:
         if wrong:
             raise StoreError(f"{file}: cell {wrong[0] + 1} has a value of a wrong type or form")
         return record
+
+    def verify_sweep(self, sweep_id: str) -> None:
+        """Check that a sweep's record is the one that was written, by the hash that is its id.
+
+        Args:
+            sweep_id: The id of the record.
+
+        Raises:
+            StoreError: It can't be read, or has changed; the message names the file.
+        """
+        if digest(self.sweep_record(sweep_id)["cells"]) != sweep_id:
+            file = self.sweeps / f"{sweep_id}.json"
+            raise StoreError(f"{file}: its cells have changed since it was written")
+
+
+def _modified_ns(file: ConfinedPath) -> int:
+    """Return when a file was changed, or a link; 0 where that can't be told."""
+    try:
+        return file.lstat().st_mtime_ns
+    except OSError:
+        return 0
 
 
 def _is_list(value: object, kind: type) -> bool:
@@ -286,6 +323,7 @@ def _is_row(row: object) -> bool:
     seed, error = row.get("seed", 0), row.get("error")
     return (
         _is_list([*texts, error or ""], str)
+        and all(len(text) <= _MAX_NAME for text in texts)
         and all(one is None or untrusted.is_name(one) for one in ids)
         and type(seed) is int
         and 0 <= seed <= _MAX_SEED

@@ -5,13 +5,15 @@ Cells that are not done become rows with their state and reason, so that a repor
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pandas as pd
 
 from xrgs.errors import StoreError, XrgsError
+from xrgs.experiment.cell_folder import READING_ERRORS, CellState
+from xrgs.report.training import cell_totals
 from xrgs.runtime.progress import progress
 from xrgs.safeio.records import as_number
 
@@ -49,6 +51,8 @@ class Sweep:
     """One row for each entry of the record: its keys, `state`, `reason`, `protocol`, metrics."""
     views: pd.DataFrame
     """One row for each cell and test view: `cell_id`, `view` and the scores."""
+    training: dict[str, dict[str, float]]
+    """What training did in each done cell, by its id: `xrgs.report.training.cell_totals`."""
     provenance: dict[str, list[str]]
     """Provenance of the done cells: the distinct values of each entry, sorted."""
 
@@ -71,21 +75,20 @@ def read_sweep(store: Store, sweep_id: str, metrics: Sequence[Metric]) -> Sweep:
     record = store.sweep_record(sweep_id)
     entries = [_entry(sweep_id, row) for row in record["cells"]]
     ids = sorted({row["cell_id"] for row in entries if row["cell_id"] is not None})
-    columns: dict[str, dict[str, Any]] = {}
-    scores: list[dict[str, Any]] = []
+    bar = progress(ids, "reading cells", "cell")
+    cells = {cell_id: _read_cell(store.cell(cell_id), metrics) for cell_id in bar}
+    done = [cell for cell in cells.values() if cell.columns["state"] == "done"]
+    views = _views([row for cell in done for row in cell.scores], metrics)
     provenance: dict[str, set[str]] = {}
-    for cell_id in progress(ids, "reading cells", "cell"):
-        cell = store.cell(cell_id)
-        columns[cell_id] = _cell_columns(cell, metrics)
-        if columns[cell_id]["state"] == "done":
-            scores += _scores(cell, metrics)
-            _add_provenance(provenance, cell.provenance())
-    views = _views(scores)
+    for cell in done:
+        _add_provenance(provenance, cell.provenance)
+    columns = {cell_id: cell.columns for cell_id, cell in cells.items()}
     return Sweep(
         id=sweep_id,
         command=tuple(record["command"]),
         cells=_cells(sweep_id, entries, columns, _cell_means(views), metrics),
         views=views,
+        training={cell_id: cell.training for cell_id, cell in cells.items()},
         provenance={key: sorted(values) for key, values in sorted(provenance.items())},
     )
 
@@ -97,25 +100,50 @@ def _entry(sweep_id: str, row: Mapping[str, Any]) -> dict[str, Any]:
     return {key: row[key] for key in RECORD_KEYS}
 
 
-def _cell_columns(cell: CellFolder, metrics: Sequence[Metric]) -> dict[str, Any]:
-    """Return a cell's state and, where it is done, columns of its summary and its identity."""
+@dataclass(frozen=True)
+class _CellContent:
+    """What the files of one cell say; of a cell that is not done, its state alone."""
+
+    columns: dict[str, Any]
+    """Columns of `Sweep.cells`."""
+    scores: list[dict[str, Any]] = field(default_factory=list)
+    """Rows of `Sweep.views`."""
+    training: dict[str, float] = field(default_factory=dict)
+    provenance: dict[str, Any] = field(default_factory=dict)
+
+
+def _read_cell(cell: CellFolder, metrics: Sequence[Metric]) -> _CellContent:
+    """Read a cell. One whose files can't be read, or are malformed, is not done."""
     state = cell.state()
-    if state.name != "done":
-        # Without the store's path: the report is the same wherever the store is.
-        reason = state.reason.replace(f"{cell.path}/", "")
-        return {"state": state.name, "reason": reason or state.name}
-    try:
-        identity, summary = cell.identity(), cell.summary()
-        values = {m.name: as_number(summary[m.name]) for m in metrics if m.name in summary}
-        return values | {
-            "state": "done",
-            "reason": "",
-            "protocol": int(identity["protocol"]),
-            "true_variant": str(identity["variant"]),
-            "true_seed": int(identity["seed"]),
-        }
-    except (StoreError, KeyError, OverflowError, TypeError, ValueError) as error:
-        return {"state": "corrupt", "reason": f"identity.json or summary.json: {error!r}"}
+    if state.name == "done":
+        try:
+            return _CellContent(
+                _done_columns(cell, metrics),
+                _scores(cell, metrics),
+                cell_totals(cell),
+                cell.provenance(),
+            )
+        except READING_ERRORS as error:
+            state = CellState.of_error(error)
+    # Without the store's path: the report is the same wherever the store is.
+    reason = state.reason.replace(f"{cell.path}/", "")
+    return _CellContent({"state": state.name, "reason": reason or state.name})
+
+
+def _done_columns(cell: CellFolder, metrics: Sequence[Metric]) -> dict[str, Any]:
+    """Return columns of a finished cell's summary and its identity."""
+    identity, summary = cell.identity(), cell.summary()
+    values = {m.name: as_number(summary[m.name]) for m in metrics if m.name in summary}
+    for name in ("protocol", "seed"):
+        if type(identity[name]) is not int or not 0 <= identity[name] < 1 << 63:
+            raise StoreError(f"identity.json: {name}={identity[name]!r:.40} is no such number")
+    return values | {
+        "state": "done",
+        "reason": "",
+        "protocol": identity["protocol"],
+        "true_variant": str(identity["variant"]),
+        "true_seed": identity["seed"],
+    }
 
 
 def _scores(cell: CellFolder, metrics: Sequence[Metric]) -> list[dict[str, Any]]:
@@ -126,10 +154,11 @@ def _scores(cell: CellFolder, metrics: Sequence[Metric]) -> list[dict[str, Any]]
     ]
 
 
-def _views(scores: list[dict[str, Any]]) -> pd.DataFrame:
-    if not scores:
-        return pd.DataFrame({"cell_id": pd.Series(dtype=str), "view": pd.Series(dtype=str)})
-    return pd.DataFrame(scores)
+def _views(scores: list[dict[str, Any]], metrics: Sequence[Metric]) -> pd.DataFrame:
+    """Return the scores as a table, with a column for each score, whether a cell has it or not."""
+    names = [metric.name for metric in metrics if metric.score is not None]
+    views = pd.DataFrame(scores, columns=["cell_id", "view", *names])
+    return views.astype({"cell_id": object, "view": object} | dict.fromkeys(names, np.float64))
 
 
 def _cell_means(views: pd.DataFrame) -> pd.DataFrame:

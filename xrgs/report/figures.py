@@ -17,6 +17,8 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 from matplotlib.ticker import StrMethodFormatter
 
+from xrgs.safeio.words import MAX_CELL, for_line
+
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping, Sequence
 
@@ -33,6 +35,8 @@ _ABLATION, _BASELINE, _FRAME = "#D55E00", "#0072B2", "#FFD400"
 _DPI = 130
 _PANEL = 3.4  # inches
 _ZOOM = 5
+#: The longest name beside a figure's axes, in characters: a longer one would leave them no room.
+_MAX_NAME = 50
 
 
 class Panel(NamedTuple):
@@ -45,12 +49,14 @@ class Panel(NamedTuple):
 
 @contextmanager
 def _default_style() -> Iterator[None]:
-    """Use matplotlib's own style, without warnings for characters that its font lacks.
+    """Use matplotlib's own style, in which a name with dollar signs is not read as mathematics.
 
-    Such characters are drawn as boxes; the tables of the report have the name.
+    Nothing is said of characters that its font lacks, or of scripts that it can't shape: they are
+    drawn as boxes, or letter by letter; the tables of the report have the name.
     """
-    with style.context("default"), warnings.catch_warnings():
+    with style.context(["default", {"text.parse_math": False}]), warnings.catch_warnings():
         warnings.filterwarnings("ignore", message="Glyph .* missing from")
+        warnings.filterwarnings("ignore", message="Matplotlib currently does not support")
         yield
 
 
@@ -96,9 +102,9 @@ def side_by_side(
     cut_ratio = (rows.stop - rows.start) / (columns.stop - columns.start)
     ratios = [height / width, cut_ratio]
     figure = _figure(_PANEL * len(panels), _PANEL * sum(ratios) + 1.1)
-    figure.suptitle(title, fontsize=11, parse_math=False)
+    figure.suptitle(for_line(title, MAX_CELL), fontsize=11)
     figure.supxlabel(
-        f"framed, and enlarged in the second row: {note}", fontsize=9, parse_math=False
+        for_line(f"framed, and enlarged in the second row: {note}", MAX_CELL), fontsize=9
     )
     axes = figure.subplots(2, len(panels), height_ratios=ratios)
     corner = (columns.start - 0.5, rows.start - 0.5)
@@ -106,8 +112,8 @@ def side_by_side(
     for (upper, lower), panel in zip(axes.T, panels, strict=True):
         _show(upper, panel.image, "antialiased")
         upper.add_patch(Rectangle(corner, *size, fill=False, edgecolor=_FRAME, linewidth=1.5))
-        upper.set_title(panel.title, fontsize=10, parse_math=False)
-        upper.set_xlabel(panel.caption, fontsize=9, parse_math=False)
+        upper.set_title(for_line(panel.title, _MAX_NAME), fontsize=10)
+        upper.set_xlabel(for_line(panel.caption, _MAX_NAME), fontsize=9)
         _show(lower, panel.image[rows, columns], "nearest")
         for spine in lower.spines.values():
             spine.set(edgecolor=_FRAME, linewidth=1.5)
@@ -129,7 +135,7 @@ def curves(
         The bytes of a PNG.
     """
     figure = _figure(_PANEL * 1.5 * len(columns), _PANEL)
-    figure.suptitle(title, fontsize=11, parse_math=False)
+    figure.suptitle(for_line(title, MAX_CELL), fontsize=11)
     axes = figure.subplots(1, len(columns), squeeze=False)[0]
     styles = ({"color": _BASELINE}, {"color": _ABLATION, "linestyle": "--"})
     for axis, (column, name) in zip(axes, columns.items(), strict=True):
@@ -141,9 +147,8 @@ def curves(
         axis.set_title(name, fontsize=10)
         axis.grid(alpha=0.3)
         axis.spines[["top", "right"]].set_visible(False)
-    legend = axes[0].legend(lines, [label for label, _ in runs], frameon=False, fontsize=9)
-    for text in legend.get_texts():
-        text.set_parse_math(False)
+    names = [for_line(label, _MAX_NAME) for label, _ in runs]
+    axes[0].legend(lines, names, frameon=False, fontsize=9)
     return _png(figure)
 
 
@@ -167,18 +172,18 @@ def trade_off(
         The bytes of a PNG.
     """
     figure = _figure(_PANEL * 1.1 * len(axes) + 2, max(_PANEL, 0.2 * len(means)))
-    figure.suptitle(title, fontsize=11, parse_math=False)
+    figure.suptitle(for_line(title, MAX_CELL), fontsize=11)
     panels = figure.subplots(1, len(axes), squeeze=False)[0]
     for panel, metric in zip(panels, axes, strict=True):
         _dots(panel, means, scenes, metric.name)
         panel.set_xlabel("Gaussians, times the baseline's")
-        panel.set_title(f"{metric.label}, {metric.unit or '%'}", fontsize=10, parse_math=False)
+        panel.set_title(f"{metric.label}, {metric.unit or '%'}", fontsize=10)
         if not metric.higher_is_better:
             panel.invert_yaxis()
-    names = "\n".join(f"{at} {label}" for at, label in enumerate(means.index, start=1))
-    panels[-1].annotate(
-        names, (1.04, 1), xycoords="axes fraction", va="top", fontsize=8, parse_math=False
+    names = "\n".join(
+        f"{at} {for_line(label, _MAX_NAME)}" for at, label in enumerate(means.index, start=1)
     )
+    panels[-1].annotate(names, (1.04, 1), xycoords="axes fraction", va="top", fontsize=8)
     return _png(figure)
 
 

@@ -12,13 +12,13 @@ from xrgs.experiment.store import Store
 from xrgs.report.collect import RECORD_KEYS, ReportError, Sweep, read_sweep
 from xrgs.report.compare import compare
 from xrgs.report.pictures import Picture, draw
-from xrgs.report.render import TextTable, markdown, to_latex, to_markdown, to_text
+from xrgs.report.render import TextTable, to_latex, to_markdown, to_text
 from xrgs.report.tables import Tables
 from xrgs.report.training import table as training_table
 from xrgs.report.training import totals
 from xrgs.safeio.atomic import write_json, write_text
 from xrgs.safeio.confined import ConfinedPath
-from xrgs.safeio.untrusted import one_line
+from xrgs.safeio.words import for_csv, for_line, for_markdown
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -83,18 +83,31 @@ def build(
     tables = Tables(comparison)
     folder = ConfinedPath(out) if out else store.reports / sweep_id
     try:
-        folder.make_root()
+        if out:
+            folder.make_root()
+        _refuse_links(folder / "figures")
         (folder / "figures").make_folder()
         drawn = draw(store, comparison, sweep.views, folder / "figures", pictures)
-        _write_files(folder, sweep, tables, drawn, totals(store, comparison.cells))
+        _write_files(folder, sweep, tables, drawn, totals(comparison.cells, sweep.training))
     except OSError as error:
         raise ReportError(
             f"the report can't be written to {folder}: {error.filename}: {error.strerror};"
             " name another folder with out=..."
         ) from error
     written = {p.file for p in drawn if p.file} | {folder / name for name in _FILES}
-    text = _text(tables, _warnings(sweep)) + f"\nWritten to {folder}"
+    text = f"{_text(tables, _warnings(sweep))}\n{for_line(f'Written to {folder}')}"
     return Report(text=text, folder=folder.path, files=tuple(sorted(file.path for file in written)))
+
+
+def _refuse_links(folder: ConfinedPath) -> None:
+    """Refuse to write where a link would lead out of the store, or of the folder of the report."""
+    for depth in range(1, len(folder.parts) + 1):
+        above = ConfinedPath(folder.root, folder.parts[:depth])
+        if above.is_link():
+            raise ReportError(
+                f"{above} is a link, and what it leads to is not written to: remove it, or name"
+                " another folder with out=..."
+            )
 
 
 #: The files of every report, beside its pictures.
@@ -132,7 +145,8 @@ def _write_files(
 
 
 def _csv(table: pd.DataFrame) -> str:
-    return str(table.to_csv(index=False, lineterminator="\n"))
+    safe = table.rename(columns=for_csv).map(for_csv)
+    return str(safe.to_csv(index=False, lineterminator="\n"))
 
 
 def _all_tables(tables: Tables) -> list[TextTable]:
@@ -169,10 +183,10 @@ def _markdown_page(
     folder: ConfinedPath,
     training: pd.DataFrame,
 ) -> str:
-    command = one_line(shlex.join(["xrgs-sweep", *sweep.command]))
+    command = " ".join(for_markdown(shlex.quote(word)) for word in ("xrgs-sweep", *sweep.command))
     parts = [
-        f"# Change from baseline\n\nSweep {markdown(sweep.id)}: {markdown(command)}\n",
-        *(f"**{markdown(line)}**\n" for line in _warnings(sweep)),
+        f"# Change from baseline\n\nSweep {for_markdown(sweep.id)}: {command}\n",
+        *(f"**{for_markdown(line)}**\n" for line in _warnings(sweep)),
         *(to_markdown(table) for table in _all_tables(tables) if table.rows),
         *(to_markdown(table) for table in _training_tables(tables, training) if table.rows),
         *(_picture_link(picture, folder) for picture in pictures),
@@ -182,9 +196,9 @@ def _markdown_page(
 
 
 def _picture_link(picture: Picture, folder: ConfinedPath) -> str:
-    title = markdown(picture.title)
+    title = for_markdown(picture.title)
     if picture.file is None:
-        return f"No picture of {title}: {markdown(picture.why)}\n"
+        return f"No picture of {title}: {for_markdown(picture.why)}\n"
     return f"![{title}]({picture.file.relative_to(folder)})\n\n{title}\n"
 
 
@@ -195,6 +209,9 @@ def _provenance_table(sweep: Sweep) -> TextTable:
 
 def _warnings(sweep: Sweep) -> list[str]:
     warnings = []
+    unknown = sweep.cells.loc[sweep.cells["state"] == "unknown", "cell_id"].nunique()
+    if unknown:
+        warnings.append(f"{unknown} cells can't be read now: run the report again.")
     mixed = [key for key in _MACHINE_KEYS if len(sweep.provenance.get(key, ())) > 1]
     if mixed:
         differing = ", ".join(mixed)
@@ -221,4 +238,6 @@ def _text(tables: Tables, warnings: list[str]) -> str:
         more = len(missing.rows) - _MAX_PRINTED_MISSING
         notes = (f"and {more} more, in table.md",) if more > 0 else ()
         printed.append(replace(missing, rows=missing.rows[:_MAX_PRINTED_MISSING], notes=notes))
-    return "\n".join([*(to_text(table) for table in printed if table.rows), *warnings])
+    return "\n".join(
+        [*(to_text(table) for table in printed if table.rows), *map(for_line, warnings)]
+    )

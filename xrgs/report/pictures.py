@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import hashlib
-import re
 from dataclasses import dataclass
 from functools import partial
+from itertools import islice
 from typing import TYPE_CHECKING
 
 import pandas as pd
@@ -19,6 +18,7 @@ from xrgs.report.figures import Panel, curves, differing_crop, side_by_side, tra
 from xrgs.report.tables import titled
 from xrgs.runtime.progress import progress
 from xrgs.safeio.atomic import atomic_writer
+from xrgs.safeio.words import for_file_name
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
@@ -36,6 +36,10 @@ if TYPE_CHECKING:
 _CURVES = {"gaussians": "Gaussians", "loss": "loss of the step's view, as each run weighs it"}
 #: Largest image that is drawn; three are in memory at a time.
 _MAX_PIXELS = 50_000_000
+#: The most pictures that are drawn without being asked for by name; each takes up to a second.
+_MAX_PICTURES = 100
+#: The most ablations that one figure of trade-offs can name.
+_MAX_ABLATIONS = 200
 
 
 @dataclass(frozen=True)
@@ -64,7 +68,8 @@ def draw(
         comparison: The pairs of cells.
         views: The table `Sweep.views`.
         folder: The existing folder to write the files to.
-        names: Names of the pictures to draw, which are file names without suffix; None draws all.
+        names: Names of the pictures to draw, which are file names without suffix; None draws all,
+            but no more than the first 100.
 
     Returns:
         The pictures, in the order of the tables.
@@ -80,14 +85,29 @@ def draw(
     variants = comparison.cells.drop_duplicates("cell_id").set_index("cell_id")["variant_id"]
     drawings = _trade_offs(comparison)
     for _, pair in pairs.iterrows():
-        both = psnr[pair["baseline_id"]], psnr[pair["cell_id"]]
+        both = _same_views(psnr.get(pair["baseline_id"]), psnr.get(pair["cell_id"]))
         photographs = store.variants / variants[pair["cell_id"]] / "images" / "test"
-        stem = f"{slug(pair['scene'])}--{slug(pair['label'])}"
+        stem = f"{for_file_name(pair['scene'])}--{for_file_name(pair['label'])}"
         drawings[stem] = partial(_views, store, pair, both, photographs)
         drawings[f"{stem}--training"] = partial(_training, store, pair)
-    chosen = drawings if names is None else _chosen(drawings, names)
+    first_ones = dict(islice(drawings.items(), _MAX_PICTURES))
+    chosen = first_ones if names is None else _chosen(drawings, names)
     bar = progress(chosen.items(), "drawing", "picture", len(chosen))
-    return [drawing(folder / f"{name}.png") for name, drawing in bar]
+    drawn = [drawing(folder / f"{name}.png") for name, drawing in bar]
+    if names is None and len(chosen) < len(drawings):
+        why = f"only the first {len(chosen)} are drawn; pictures=NAMES draws others"
+        drawn.append(Picture(f"{len(drawings) - len(chosen)} more", None, why))
+    return drawn
+
+
+def _same_views(
+    baseline: pd.Series | None, ablation: pd.Series | None
+) -> tuple[pd.Series, pd.Series]:
+    """Return the PSNR of the views that both cells have, in their order; perhaps of none."""
+    if baseline is None or ablation is None:
+        return pd.Series(dtype=float), pd.Series(dtype=float)
+    both = ablation.index[ablation.index.isin(baseline.index)]
+    return baseline[both], ablation[both]
 
 
 def _chosen(drawings: dict[str, _Drawing], names: Sequence[str]) -> dict[str, _Drawing]:
@@ -110,10 +130,10 @@ def _trade_offs(comparison: Comparison) -> dict[str, _Drawing]:
             for table in (comparison.means, comparison.per_scene)
         )
         axes = [m for m in comparison.metrics if m.score is not None and m.name in means]
-        if len(means) < 2 or not axes:
+        if not 2 <= len(means) <= _MAX_ABLATIONS or not axes:
             continue
         title = titled("What each ablation trades, mean over scenes", condition)
-        name = f"trade-off{condition and f'.{slug(condition)}'}"
+        name = f"trade-off{condition and f'.{for_file_name(condition)}'}"
         drawings[name] = partial(_trade_off, title, means, scenes, axes)
     return drawings
 
@@ -168,6 +188,8 @@ def _views(
     photographs: ConfinedPath,
     file: ConfinedPath,
 ) -> Picture:
+    if psnr[0].empty:
+        return Picture(_title(pair), None, "the two cells have no test view in common")
     view = median_view(*psnr)
     title = f"{_title(pair)}: view {view}, by change of PSNR the median of {len(psnr[0])}"
     name = f"{view}.png"
@@ -195,9 +217,8 @@ def _training(store: Store, pair: pd.Series, file: ConfinedPath) -> Picture:
     runs = []
     for name, key in ((BASELINE, "baseline_id"), (str(pair["label"]), "cell_id")):
         try:
-            history = store.cell(pair[key]).history()[["step", *_CURVES]]
-            runs.append((name, history.apply(pd.to_numeric)))
-        except (StoreError, ValueError, TypeError, KeyError):
+            runs.append((name, store.cell(pair[key]).history()[["step", *_CURVES]]))
+        except (StoreError, KeyError):
             return Picture(title, None, f"cells/{pair[key]}/history.csv can't be read")
     with atomic_writer(file) as stream:
         stream.write(curves(title, runs, _CURVES))
@@ -215,18 +236,3 @@ def _image(file: ConfinedPath) -> NDArray[np.float32]:
     except (UnreadableError, ImageError) as error:
         # The path inside the store: the report is the same wherever the store is.
         raise ReportError(f"{'/'.join(file.parts)} can't be read") from error
-
-
-def slug(text: str) -> str:
-    """Return `text` as part of a file name that any system accepts.
-
-    Args:
-        text: The name of a scene, label or condition.
-
-    Returns:
-        At most 67 ASCII characters; different texts give different names.
-    """
-    plain = re.sub(r"[^A-Za-z0-9_.]+", "-", text).strip("-.")[:60]
-    if text and plain == text:
-        return text
-    return f"{plain}-{hashlib.sha256(text.encode()).hexdigest()[:6]}".lstrip("-")

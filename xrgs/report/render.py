@@ -2,28 +2,10 @@
 
 from __future__ import annotations
 
-import re
 import unicodedata
 from dataclasses import dataclass
 
-from xrgs.safeio.untrusted import one_line
-
-_MARKDOWN = str.maketrans({char: f"\\{char}" for char in "\\`*_{}[]<>#|~$&"})
-_LATEX = str.maketrans(
-    {char: f"\\{char}" for char in "&%$#_{}"}
-    | {
-        "\\": r"\textbackslash{}",
-        "~": r"\textasciitilde{}",
-        "^": r"\textasciicircum{}",
-        "<": r"\textless{}",
-        ">": r"\textgreater{}",
-        "|": r"\textbar{}",
-        "[": "{[}",  # bare at the start of a row it would be an argument of the row before
-        "]": "{]}",
-        "↑": r"$\uparrow$",
-        "↓": r"$\downarrow$",
-    }
-)
+from xrgs.safeio.words import MAX_CELL, for_latex, for_line, for_markdown
 
 
 @dataclass(frozen=True)
@@ -37,24 +19,6 @@ class TextTable:
     """`l` or `r` for each column."""
     notes: tuple[str, ...] = ()
     """Lines below the table."""
-
-
-def markdown(text: str) -> str:
-    """Escape `text` so that Markdown shows it as it is.
-
-    Args:
-        text: Any text; line breaks and control characters become spaces.
-    """
-    return one_line(text).translate(_MARKDOWN)
-
-
-def latex(text: str) -> str:
-    """Escape `text` so that LaTeX shows it as it is; scripts other than Latin need xelatex.
-
-    Args:
-        text: Any text; the hyphen of a negative number becomes a minus sign.
-    """
-    return re.sub(r"(?<!\S)-(?=\d)", "$-$", one_line(text).translate(_LATEX))
 
 
 def width(text: str) -> int:
@@ -81,6 +45,12 @@ def _padded(rows: list[tuple[str, ...]], align: str) -> tuple[list[list[str]], l
     return lines, sizes
 
 
+def _rows(table: TextTable) -> list[tuple[str, ...]]:
+    """Return the heads of the columns and the rows, in cells of one line of bounded length."""
+    rows = (table.columns, *table.rows)
+    return [tuple(for_line(text, MAX_CELL).strip() for text in row) for row in rows]
+
+
 def to_text(table: TextTable) -> str:
     """Write the table for a terminal.
 
@@ -90,11 +60,10 @@ def to_text(table: TextTable) -> str:
     Returns:
         Aligned lines under the title, with the notes below.
     """
-    rows = [tuple(map(one_line, row)) for row in (table.columns, *table.rows)]
-    lines, sizes = _padded(rows, table.align)
+    lines, sizes = _padded(_rows(table), table.align)
     lines.insert(1, ["─" * size for size in sizes])
     body = ["  ".join(line).rstrip() for line in lines]
-    return "\n".join([one_line(table.title), "", *body, *map(one_line, table.notes), ""])
+    return "\n".join([for_line(table.title), "", *body, *map(for_line, table.notes), ""])
 
 
 def to_markdown(table: TextTable) -> str:
@@ -103,7 +72,7 @@ def to_markdown(table: TextTable) -> str:
     Args:
         table: The table.
     """
-    rows = [tuple(map(markdown, row)) for row in (table.columns, *table.rows)]
+    rows = [tuple(map(for_markdown, row)) for row in _rows(table)]
     lines, sizes = _padded(rows, table.align)
     rule = [
         "-" * (size - 1) + (":" if side == "r" else "-")
@@ -111,8 +80,8 @@ def to_markdown(table: TextTable) -> str:
     ]
     lines.insert(1, rule)
     body = ["| " + " | ".join(line) + " |" for line in lines]
-    notes = [f"- {markdown(note)}" for note in table.notes]
-    parts = [[f"### {markdown(table.title)}"], body, notes]
+    notes = [f"- {for_markdown(note)}" for note in table.notes]
+    parts = [[f"### {for_markdown(table.title)}"], body, notes]
     return "\n\n".join("\n".join(part) for part in parts if part) + "\n"
 
 
@@ -122,13 +91,13 @@ def to_latex(table: TextTable) -> str:
     Args:
         table: The table.
     """
-    lines = [" & ".join(map(latex, row)) + r" \\" for row in (table.columns, *table.rows)]
-    notes = [rf"\par\footnotesize {latex(note)}" for note in table.notes]
+    lines = [" & ".join(map(for_latex, row)) + r" \\" for row in _rows(table)]
+    notes = [rf"\par\footnotesize {for_latex(note)}" for note in table.notes]
     return "\n".join(
         [
             r"\begin{table}[htbp]",
             r"\centering",
-            rf"\caption{{{latex(table.title)}}}",
+            rf"\caption{{{for_latex(table.title)}}}",
             rf"\begin{{tabular}}{{{table.align}}}",
             r"\toprule",
             lines[0],

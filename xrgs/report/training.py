@@ -15,10 +15,9 @@ from xrgs.report.render import TextTable
 from xrgs.safeio.records import as_number, read_table
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Mapping, Sequence
 
     from xrgs.experiment.cell_folder import CellFolder
-    from xrgs.experiment.store import Store
 
 _LABELS = {
     "steps_HR": "Steps on HR views",
@@ -34,28 +33,37 @@ _LABELS = {
 _SINGLE_STEP_COLUMNS = frozenset({"step", "view", "loss", "gaussians"})
 
 
-def totals(store: Store, cells: pd.DataFrame) -> pd.DataFrame:
+def totals(cells: pd.DataFrame, of_cells: Mapping[str, Mapping[str, float]]) -> pd.DataFrame:
     """Return what training did in each cell that is done.
 
     Args:
-        store: The store that holds the cells.
         cells: The table `Comparison.cells`.
+        of_cells: What `cell_totals` returns for each cell that is done, by its id.
 
     Returns:
         One row for each cell: `cell_id`, `scene`, `label`, `condition`, `seed`, and a column for
         each count of its history (over the whole training) and each value that a component logged
         (its mean over training); NaN where a cell has none.
-
-    Raises:
-        StoreError: A cell's history can't be read; the message names it.
     """
     done = cells[cells["state"] == "done"].drop_duplicates("cell_id")
     keys = done[["cell_id", "scene", "label", "condition", "seed"]].reset_index(drop=True)
-    return keys.join(pd.DataFrame([_totals(store.cell(name)) for name in keys["cell_id"]]))
+    return keys.join(pd.DataFrame([of_cells[name] for name in keys["cell_id"]]))
 
 
-def _totals(cell: CellFolder) -> dict[str, float]:
-    header, rows = read_table(cell.path / "history.csv")
+def cell_totals(cell: CellFolder) -> dict[str, float]:
+    """Return what training did in one cell.
+
+    Args:
+        cell: The cell.
+
+    Returns:
+        The counts of its history, and the means of what components logged.
+
+    Raises:
+        StoreError: Its history can't be read; the message names the file.
+        ValueError: A value of its history is not a number.
+    """
+    header, rows = read_table(cell.folder / "history.csv")
     if not rows:
         return {}
     result = {}

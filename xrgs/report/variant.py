@@ -13,7 +13,8 @@ from xrgs.report.render import TextTable, to_text
 from xrgs.safeio.atomic import atomic_writer
 from xrgs.safeio.confined import confined
 from xrgs.safeio.records import read_object
-from xrgs.safeio.untrusted import is_name, printable
+from xrgs.safeio.untrusted import is_name
+from xrgs.safeio.words import for_line
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping
@@ -21,8 +22,8 @@ if TYPE_CHECKING:
     from xrgs.capture.views import Variant
     from xrgs.safeio.confined import ConfinedPath
 
-#: The longest line of a report, in characters, and how many names of views and attempts are read.
-_MAX_LINE, _MAX_NAMES, _MAX_ATTEMPTS = 1000, 1 << 14, 10
+#: How many names of views and attempts of a report are read.
+_MAX_NAMES, _MAX_ATTEMPTS = 1 << 14, 10
 _REGISTERED, _NOT_REGISTERED = "yes", "no"
 
 
@@ -51,7 +52,7 @@ def describe(path: Path | ConfinedPath, out: Path | None = None) -> str:
     if folder.name.startswith(FAILED_PREFIX):
         report = read_object(folder / "report.json")
         failed = f"{report.get('scene')}: failed, so there are no views"
-        return "\n".join([_line(failed), *_sfm_lines(folder, report)])
+        return "\n".join([for_line(failed), *_sfm_lines(folder, report)])
     frozen = variant.load(folder)
     sfm = _sfm_lines(folder, frozen.report)
     table = to_text(views_table(frozen))
@@ -62,14 +63,8 @@ def describe(path: Path | ConfinedPath, out: Path | None = None) -> str:
             sheet.save(stream, "PNG")
     except OSError as error:
         raise XrgsError(f"out={file}: can't be written ({error})") from error
-    lines = [table, *sfm, f"Contact sheet: {file}", *(f"  {note}" for note in map(_line, notes))]
-    return "\n".join(lines)
-
-
-def _line(text: str) -> str:
-    """Return a text as one line that a terminal can show."""
-    line = printable(text[:_MAX_LINE])
-    return line if len(text) <= _MAX_LINE else f"{line} ..."
+    more = [f"Contact sheet: {file}", *(f"  {note}" for note in notes)]
+    return "\n".join([table, *sfm, *map(for_line, more)])
 
 
 def _sfm_lines(folder: ConfinedPath, report: Mapping[str, Any]) -> list[str]:
@@ -80,7 +75,7 @@ def _sfm_lines(folder: ConfinedPath, report: Mapping[str, Any]) -> list[str]:
     """
     try:
         _check_names(report)
-        return [_line(line) for line in _sfm(report)]
+        return [for_line(line) for line in _sfm(report)]
     except (AttributeError, LookupError, TypeError, ValueError, ArithmeticError) as error:
         file = folder / "report.json"
         raise XrgsError(f"{file}: not a variant's report ({error!r:.200})") from error

@@ -8,7 +8,6 @@ the cells of a sweep may run on other machines, and one line shows many of them.
 from __future__ import annotations
 
 import io
-import math
 import sys
 from contextlib import contextmanager, suppress
 from contextvars import ContextVar
@@ -17,9 +16,11 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 from tqdm import tqdm
 
+from xrgs.runtime.streams import say
 from xrgs.safeio import untrusted
 from xrgs.safeio.atomic import write_json
 from xrgs.safeio.confined import ConfinedPath
+from xrgs.safeio.words import for_line
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator
@@ -36,6 +37,10 @@ _BAR_S, _FILE_S, _LINE_S = 0.5, 2.0, 60.0
 _BAR_DELAY_S = 2.0
 #: The largest progress file that is read, in bytes.
 _MAX_BYTES = 1 << 12
+#: The most characters of a bar's words that are shown.
+_MAX_WORD = 80
+#: Counts, and units a second, beyond this are not valid.
+_MAX_COUNT = 1 << 53
 
 _file: ContextVar[ConfinedPath | None] = ContextVar("file", default=None)
 
@@ -105,7 +110,7 @@ class ProgressBar(_Tqdm):
         every, delay = (_BAR_S, _BAR_DELAY_S) if self._drawn else (_LINE_S, _LINE_S)
         super().__init__(
             items,
-            what,
+            for_line(what, _MAX_WORD),
             total,
             leave=False,
             file=sys.stderr if self._drawn else io.StringIO(),
@@ -201,15 +206,13 @@ def read(file: ConfinedPath) -> Progress | None:
     """
     try:
         content = untrusted.parse_json(file.read_bytes(_MAX_BYTES))
-        total, rate = content["total"], content["rate"]
-        return Progress(
-            str(content["what"]),
-            str(content["unit"]),
-            int(content["done"]),
-            None if total is None else int(total),
-            None if rate is None or not math.isfinite(rate) else float(rate),
-        )
-    except (OSError, ValueError, KeyError, TypeError, OverflowError):
+        what, unit = (for_line(str(content[key]), _MAX_WORD) for key in ("what", "unit"))
+        done, total, rate = content["done"], content["total"], content["rate"]
+        if not all(type(n) is int and 0 <= n < _MAX_COUNT for n in (done, total or 0)):
+            return None
+        known = rate is not None and 1 / _MAX_COUNT < rate < _MAX_COUNT
+        return Progress(what, unit, done, total, float(rate) if known else None)
+    except (OSError, ValueError, KeyError, TypeError):
         return None
 
 
@@ -217,10 +220,9 @@ def log_line(text: str) -> None:
     """Print one line on stderr; on a terminal it replaces a bar on the current line.
 
     Args:
-        text: The line, without its end.
+        text: The line, without its end; line breaks in it become spaces.
     """
-    clear = "\r\x1b[K" if sys.stderr.isatty() else ""
-    print(f"{clear}{text}", file=sys.stderr, flush=True)  # noqa: T201
+    say(for_line(text), sys.stderr)
 
 
 def format_duration(seconds: float | None) -> str:

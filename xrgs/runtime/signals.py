@@ -7,6 +7,8 @@ import sys
 from contextlib import contextmanager
 from typing import TYPE_CHECKING
 
+from xrgs.runtime.streams import say
+
 if TYPE_CHECKING:
     from collections.abc import Iterator
     from types import FrameType
@@ -43,7 +45,7 @@ def exit_on_signal(hint: str) -> Iterator[None]:
     try:
         yield
     except StopSignal as stop:
-        print(f"stopped by {signal.Signals(stop.number).name}. {hint}", file=sys.stderr)  # noqa: T201
+        say(f"stopped by {signal.Signals(stop.number).name}. {hint}", sys.stderr)
         sys.exit(128 + stop.number)
 
 

@@ -1,16 +1,61 @@
-"""Keeps the program running when its terminal is closed or the reader of its pipe has ended."""
+"""Writes text for people to stdout, stderr and logs: the only place of the package that prints.
+
+It keeps the program running when its terminal is closed or the reader of its pipe has ended.
+"""
 
 from __future__ import annotations
 
 import io
+import logging
 import sys
 from contextlib import suppress
 from typing import TYPE_CHECKING
 
+from xrgs.safeio.words import for_line, for_terminal
+
 if TYPE_CHECKING:
-    from typing import TextIO
+    from typing import Any, TextIO
 
     from _typeshed import ReadableBuffer
+
+
+def say(text: str, stream: TextIO | None = None) -> None:
+    """Print a text; on a terminal it replaces a bar on the current line.
+
+    Nothing in the text is obeyed by the terminal, and a character that the stream's encoding lacks
+    is written as its number.
+
+    Args:
+        text: The text, without its end. In a text of several lines, names from elsewhere must have
+            gone through `for_line`.
+        stream: Where to print it; None for stdout.
+    """
+    stream = sys.stdout if stream is None else stream
+    encoding = stream.encoding or "utf-8"  # a stream in memory has none
+    text = for_terminal(text).encode(encoding, "backslashreplace").decode(encoding)
+    clear = "\r\x1b[K" if stream.isatty() else ""
+    print(f"{clear}{text}", file=stream, flush=True)
+
+
+def log_to_stderr(level: int = logging.WARNING) -> None:
+    """Write what this process logs to stderr, each message on one line, safe for a terminal.
+
+    Args:
+        level: The least severe level that is written.
+    """
+    handler = logging.StreamHandler()
+    handler.setFormatter(_OneLineFormatter("%(asctime)s %(message)s"))
+    logging.basicConfig(handlers=[handler], level=level)
+
+
+class _OneLineFormatter(logging.Formatter):
+    """Formats a message as one line; only a traceback below it has several."""
+
+    def formatMessage(self, record: logging.LogRecord) -> str:  # noqa: N802 - logging's own name
+        return for_line(super().formatMessage(record))
+
+    def formatException(self, ei: Any) -> str:  # noqa: N802 - logging's own name
+        return for_terminal(super().formatException(ei))
 
 
 class _WriteErrorsIgnored(io.FileIO):

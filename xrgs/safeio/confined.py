@@ -3,7 +3,8 @@
 A store, a variant or the folder of a report may come from anybody, and may hold links, named pipes
 and files of any size. `ConfinedPath` is the one way into them. Its root is what a user has named:
 it may be a link, or lie behind links. Below the root no link is followed, only regular files are
-opened, and nothing is made in a root that is no longer there.
+opened, and nothing is made in a root that is no longer there. A root can be pinned: then nothing is
+written to another folder that has taken its name.
 
 The kernel resolves such a path in one call where it has openat2 (Linux from 5.6 on); elsewhere each
 folder on the way is opened from the one before, without following links.
@@ -16,7 +17,7 @@ import os
 import shutil
 import stat
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, BinaryIO
 
@@ -55,6 +56,10 @@ class RootMissingError(FileNotFoundError):
     """The root of a path is no longer there: it was moved or deleted."""
 
 
+class ReplacedError(RootMissingError):
+    """Another folder has the name of a root that was pinned."""
+
+
 def is_passing(error: OSError) -> bool:
     """Tell whether an error says nothing about what a file holds, so that it is to be tried again.
 
@@ -62,6 +67,38 @@ def is_passing(error: OSError) -> bool:
         error: The error of a system call that looked at a file or read it.
     """
     return isinstance(error, RootMissingError) or error.errno not in _CONCLUSIVE
+
+
+class _Pin:
+    """Keeps a folder open, so that its inode is given to no other folder meanwhile."""
+
+    def __init__(self, descriptor: int) -> None:
+        self._descriptor = descriptor
+        self.identity = _identity(os.fstat(descriptor))
+        """Device and inode."""
+
+    def open(self, name: Path) -> int:
+        """Return a descriptor of the folder, which the caller closes.
+
+        Args:
+            name: The path that has to lead to it still.
+
+        Raises:
+            RootMissingError: There is nothing of that name.
+            ReplacedError: Another folder has that name.
+        """
+        try:
+            now = _identity(name.stat())
+        except FileNotFoundError as error:
+            raise RootMissingError(error.errno, error.strerror, str(name)) from None
+        if now != self.identity:
+            why = "it was replaced by another folder while this process worked in it"
+            raise ReplacedError(errno.ESTALE, why, str(name))
+        # Not opened by its name: that may lead to another folder by now.
+        return os.dup(self._descriptor)
+
+    def __del__(self) -> None:
+        os.close(self._descriptor)
 
 
 @dataclass(frozen=True, order=True)
@@ -77,6 +114,8 @@ class ConfinedPath:
     """The folder (or the file) that a user has named."""
     parts: tuple[str, ...] = ()
     """The names from the root on."""
+    pin: _Pin | None = field(default=None, compare=False, repr=False)
+    """Which folder the root is, where it is pinned."""
 
     def __truediv__(self, inside: str) -> ConfinedPath:
         """Return a path further inside.
@@ -90,7 +129,7 @@ class ConfinedPath:
         parts = inside.split("/")
         if any(part in {"", ".", ".."} or "\0" in part for part in parts):
             raise ValueError(f"{inside!r:.200} is not a path inside {self}")
-        return ConfinedPath(self.root, (*self.parts, *parts))
+        return ConfinedPath(self.root, (*self.parts, *parts), self.pin)
 
     def __str__(self) -> str:
         return str(self.path)
@@ -124,7 +163,7 @@ class ConfinedPath:
         """
         if not self.parts:
             raise ValueError(f"{self} is the root")
-        return ConfinedPath(self.root, self.parts[:-1])
+        return ConfinedPath(self.root, self.parts[:-1], self.pin)
 
     def with_name(self, name: str) -> ConfinedPath:
         """Return a sibling.
@@ -159,6 +198,12 @@ class ConfinedPath:
         """Return what the system knows of the file, the folder, or the link itself."""
         with self._located() as (folder, name):
             return os.stat(name, dir_fd=folder, follow_symlinks=not self.parts)
+
+    def identity(self) -> tuple[int, int]:
+        """Return device and inode of whatever is there; no two things that exist share them."""
+        if self.pin is not None and not self.parts:
+            return self.pin.identity
+        return _identity(self.lstat())
 
     def exists(self) -> bool:
         """Tell whether something is there: a file, a folder, a link or anything else.
@@ -219,9 +264,14 @@ class ConfinedPath:
         with self._opened() as folder:
             return sorted(os.listdir(folder))  # noqa: PTH208  Path lists no descriptor
 
+    def siblings(self) -> list[str]:
+        """Return the names in the folder that this is in, sorted."""
+        with self._located() as (folder, _):
+            return sorted(os.listdir(folder))  # noqa: PTH208  Path lists no descriptor
+
     def iterdir(self) -> list[ConfinedPath]:
         """Return the paths in this folder, sorted by name."""
-        return [ConfinedPath(self.root, (*self.parts, name)) for name in self.names()]
+        return [ConfinedPath(self.root, (*self.parts, name), self.pin) for name in self.names()]
 
     def folders(self) -> list[str]:
         """Return the names of the folders in this folder, sorted; links are none."""
@@ -241,7 +291,7 @@ class ConfinedPath:
                 raise OSError(errno.ENAMETOOLONG, "folders are nested too deeply", str(folder))
             with folder._opened() as descriptor, os.scandir(descriptor) as entries:
                 for entry in entries:
-                    inside = ConfinedPath(self.root, (*folder.parts, entry.name))
+                    inside = ConfinedPath(self.root, (*folder.parts, entry.name), self.pin)
                     if entry.is_dir(follow_symlinks=False):
                         waiting.append(inside)
                     else:
@@ -302,18 +352,19 @@ class ConfinedPath:
         return os.fdopen(self._open_regular(os.O_WRONLY | os.O_CREAT | os.O_APPEND), "ab")
 
     def make_folder(self, *, exclusive: bool = False) -> None:
-        """Make this folder and those above it, but for the root.
+        """Make this folder and those above it, as far as they are below the root.
 
         Args:
-            exclusive: Whether it is an error that the folder exists.
+            exclusive: Whether it is an error that the folder exists. Only so is a root itself made.
 
         Raises:
             RootMissingError: The root is not there.
             OSError: A folder can't be made, or something else has its name.
         """
-        for depth in range(1, len(self.parts) + 1):
-            last = depth == len(self.parts)
-            ConfinedPath(self.root, self.parts[:depth])._make_one(exclusive=exclusive and last)
+        for depth in range(1, len(self.parts)):
+            ConfinedPath(self.root, self.parts[:depth], self.pin)._make_one(exclusive=False)
+        if self.parts or exclusive:
+            self._make_one(exclusive=exclusive)
 
     def make_parent(self) -> None:
         """Make the folder that this is in; for a root, with those above it, as a user asked."""
@@ -346,11 +397,13 @@ class ConfinedPath:
         """Remove a file or a link.
 
         Args:
-            missing_ok: Whether a missing file is no error.
+            missing_ok: Whether a missing file is no error; a missing root always is one.
         """
         try:
             with self._located() as (folder, name):
                 os.unlink(name, dir_fd=folder)
+        except RootMissingError:
+            raise
         except FileNotFoundError:
             if not missing_ok:
                 raise
@@ -384,11 +437,24 @@ class ConfinedPath:
         A file whose content was synced can still be lost with its name in a power failure.
         """
         with self._located() as (folder, _):
-            try:
-                os.fsync(folder)
-            except OSError as error:
-                if error.errno not in {errno.EINVAL, errno.ENOTSUP}:  # it has no such thing
-                    raise
+            _sync_folder(folder)
+
+    def sync_tree(self) -> None:
+        """Wait until the files in this folder and all folders below are on the disk, names and all.
+
+        The name of this folder itself is not, see `sync_name`.
+        """
+        folders = {self}
+        for name, status in self.walk():
+            file = folder = self / name
+            while (folder := folder.parent) not in folders:
+                folders.add(folder)
+            if stat.S_ISREG(status.st_mode):
+                with file.open() as stream, file._naming_errors():
+                    os.fsync(stream.fileno())
+        for folder in folders:
+            with folder._opened() as descriptor, folder._naming_errors():
+                _sync_folder(descriptor)
 
     def make_root(self) -> None:
         """Make the root, a folder, with those above it. A root that vanishes is not made again.
@@ -397,6 +463,29 @@ class ConfinedPath:
             OSError: It can't be made, or something else has its name.
         """
         self.root.mkdir(parents=True, exist_ok=True)
+
+    def pinned(
+        self, identity: tuple[int, int] | None = None, name: Path | None = None
+    ) -> ConfinedPath:
+        """Return this folder as a root that is this very folder, whatever else gets its name.
+
+        All that is done with paths below it is done in the folder that is open now, and only while
+        the name leads to it. It stays open as long as one of these paths exists.
+
+        Args:
+            identity: Device and inode that the folder must have.
+            name: The name by which the folder is to be known, once it is renamed to it.
+
+        Raises:
+            ReplacedError: The folder is another one.
+            OSError: It can't be opened.
+        """
+        with self._opened() as descriptor:
+            pin = _Pin(os.dup(descriptor))
+        if identity not in {None, pin.identity}:
+            why = "it was replaced by another folder before this process began to work in it"
+            raise ReplacedError(errno.ESTALE, why, str(self))
+        return ConfinedPath(name or self.path, pin=pin)
 
     # Resolving
 
@@ -427,10 +516,7 @@ class ConfinedPath:
     @contextmanager
     def _opened(self) -> Iterator[int]:
         """Open this folder; yield its descriptor."""
-        try:
-            descriptor = os.open(self.root, _FOLDER)
-        except FileNotFoundError as error:
-            raise RootMissingError(error.errno, error.strerror, str(self.root)) from None
+        descriptor = self._open_root()
         try:
             if self.parts:
                 root = descriptor
@@ -440,6 +526,14 @@ class ConfinedPath:
             yield descriptor
         finally:
             os.close(descriptor)
+
+    def _open_root(self) -> int:
+        if self.pin is not None:
+            return self.pin.open(self.root)
+        try:
+            return os.open(self.root, _FOLDER)
+        except FileNotFoundError as error:
+            raise RootMissingError(error.errno, error.strerror, str(self.root)) from None
 
     @contextmanager
     def _naming_errors(self) -> Iterator[None]:
@@ -458,3 +552,15 @@ def confined(path: Path | ConfinedPath) -> ConfinedPath:
         path: The path.
     """
     return path if isinstance(path, ConfinedPath) else ConfinedPath(path)
+
+
+def _identity(status: os.stat_result) -> tuple[int, int]:
+    return status.st_dev, status.st_ino
+
+
+def _sync_folder(descriptor: int) -> None:
+    try:
+        os.fsync(descriptor)
+    except OSError as error:
+        if error.errno not in {errno.EINVAL, errno.ENOTSUP}:  # the file system has no such thing
+            raise

@@ -109,6 +109,6 @@ def _groups(identity: Mapping[str, Any]) -> Iterator[str]:
 def _newest(store: Store) -> list[CellFolder]:
     try:
         cells = [(cell.folder.lstat().st_mtime, cell.id) for cell in store.cell_folders()]
-    except OSError:
+    except (OSError, StoreError):
         return []
     return [store.cell(cell_id) for _, cell_id in heapq.nlargest(_MAX_CELLS, cells)]

@@ -295,10 +295,11 @@ class Launches:
             for cell_id, state in states.items()
         }
         if all(unchanged.values()):
-            raise XrgsError(f"{reason}\nThe launcher began no cell.") from error
+            raise XrgsError(f"{reason}. The launcher began no cell.") from error
         self._suspects |= {cell_id for cell_id in states if states[cell_id] == "unfinished"}
         outcomes = {cell: self._after_silence(cell, state) for cell, state in states.items()}
-        log_line(f"{reason}\nof its {len(cells)} cells these are not finished:")
+        log_line(reason)
+        log_line(f"of its {len(cells)} cells these are not finished:")
         for cell in cells:
             outcome, state = outcomes[str(cell.cell_id)], states[str(cell.cell_id)]
             if state not in {"done", "failed"}:

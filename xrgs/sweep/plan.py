@@ -11,7 +11,7 @@ from xrgs.experiment.identity import cell_identity
 from xrgs.experiment.store import BASELINE
 from xrgs.runtime.progress import format_duration
 from xrgs.safeio.hashing import digest
-from xrgs.safeio.untrusted import printable
+from xrgs.safeio.words import for_line
 from xrgs.splat.backend import resolve_backend
 from xrgs.sweep.estimate import TORCH_SLOWDOWN, torch_seconds
 
@@ -150,11 +150,11 @@ def describe(plan: Sequence[PlannedCell]) -> str:
         to_train = not cell.error and state != "done"
         time_left = format_duration(cell.seconds) if to_train else ""
         line = f"  {state:<10} {cell_id:<18} {time_left:>8}  {cell.name}"
-        lines.append(printable(f"{line}  ({reason})" if reason else line))
+        lines.append(f"{line}  ({reason})" if reason else line)
     failed = any(cell.error or cell.state.name == "failed" for cell in plan)
     if plan[0].conf.retry != "failed" and failed:
         lines.append("failed cells are not trained again; retry=failed trains them again")
-    return "\n".join(lines)
+    return "\n".join(map(for_line, lines))
 
 
 def without_kernels(plan: Sequence[PlannedCell]) -> str:

@@ -24,7 +24,7 @@ from xrgs.runtime.machine import usable_cores
 from xrgs.runtime.progress import log_line
 from xrgs.safeio.confined import ConfinedPath
 from xrgs.safeio.hashing import digest, file_digest
-from xrgs.safeio.untrusted import printable
+from xrgs.safeio.words import for_line
 from xrgs.splat.backend import resolve_backend
 from xrgs.sweep import variants
 from xrgs.sweep.axes import CellSpec
@@ -41,6 +41,8 @@ if TYPE_CHECKING:
 _RESULTS = ("scores.csv", "history.csv", "splats.ply")
 #: Figures of the summary that are compared; times and memory differ from run to run.
 _COUNTS = ("steps", "gaussians", "evaluations", "grow_grad2d")
+#: The most characters of a value that differs.
+_MAX_VALUE = 60
 _ID = re.compile(r"[0-9a-f]{16}")
 _VARIANT = re.compile(rf"{_ID.pattern}-{_ID.pattern}")
 
@@ -64,7 +66,7 @@ class RerunResult:
         else:
             lines = [f"the same, bit for bit: {', '.join(_RESULTS)}, {', '.join(_COUNTS)}"]
             lines += _listed(self.before, "although these differ")
-        return "\n".join([*lines, f"Written to {self.folder.path}"])
+        return "\n".join(map(for_line, [*lines, f"Written to {self.folder.path}"]))
 
 
 def rerun(
@@ -147,7 +149,7 @@ def _check_plugins_allowed(original: CellFolder, conf: Conf, allowed: Sequence[s
     """
     names = set(conf.components.plugins)
     if not names <= set(allowed):
-        text = printable(",".join(sorted(names)))
+        text = ",".join(sorted(names))
         raise XrgsError(
             f"rerun={original.path}: this cell was trained with components of other packages, whose"
             " code would be imported. If you trust the packages that are installed here under these"
@@ -204,8 +206,7 @@ def _changes(then: Any, now: Any, path: str = "") -> Iterator[str]:
 
 
 def _short(value: object) -> str:
-    text = printable(str(value))
-    return text if len(text) < 60 else f"{text[:16]}..."
+    return for_line(str(value), _MAX_VALUE)
 
 
 def _store_of(folder: Path) -> Path:
@@ -259,7 +260,7 @@ def _train_again(
     original: CellFolder,
 ) -> None:
     """Train like a sweep's cell, but without a lock: no other process writes to the folder."""
-    repeated.begin(asdict(conf), identity)
+    attempt = repeated.begin(asdict(conf), identity)
     cell = PlannedCell(
         CellSpec("rerun", "", (), ()),
         conf,
@@ -271,10 +272,9 @@ def _train_again(
     try:
         with SweepMonitor(ConfinedPath(repeated.path.parent)) as monitor:
             monitor.watch([cell])
-            request = {"conf": asdict(conf), "variant": str(variant), "cell": str(repeated.path)}
-            worker.run_in_child("cell", request)
+            worker.run_in_child("cell", worker.cell_request(asdict(conf), variant, attempt))
     except XrgsError as error:
-        repeated.fail(str(error))
+        attempt.fail(str(error))
         raise XrgsError(f"{error} ({repeated.folder / 'log.txt'})") from error
 
 

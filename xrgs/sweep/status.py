@@ -2,29 +2,35 @@
 
 from __future__ import annotations
 
+import stat
 from collections import Counter
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from functools import partial
+from typing import TYPE_CHECKING, Any, TypeVar
 
 from xrgs.capture.failures import FAILED_PREFIX, failed_scenes
 from xrgs.errors import StoreError, XrgsError
 from xrgs.experiment.cell_folder import CellState
 from xrgs.experiment.identity import training_code
 from xrgs.experiment.store import Store
-from xrgs.safeio.records import read_json
-from xrgs.safeio.untrusted import printable
+from xrgs.experiment.verification import Verification
+from xrgs.experiment.verification import verify as verify_store
+from xrgs.safeio.records import list_folder, read_json
+from xrgs.safeio.untrusted import is_name
+from xrgs.safeio.words import MAX_CELL, for_line
 from xrgs.splat.backend import arithmetic
 from xrgs.sweep import locks
 from xrgs.training import plugins
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Iterator, Mapping, Sequence
+    from collections.abc import Callable, Iterable, Mapping, Sequence
     from pathlib import Path
 
     from xrgs.experiment.cell_folder import CellFolder
     from xrgs.safeio.confined import ConfinedPath
 
-_STATES = ("done", "running", "unfinished", "failed", "corrupt")
+_STATES = ("done", "running", "unfinished", "failed", "corrupt", "unknown")
+_T = TypeVar("_T")
 #: Cells of each state are listed by name up to this number.
 _MAX_NAMED = 20
 
@@ -59,48 +65,110 @@ class StoreStatus:
     """Scenes that no variant could be made of: the variant's key, the scene, and the reason."""
     sweeps: int
     """Number of recorded sweeps."""
-    sizes: Mapping[str, int]
-    """Bytes of each subfolder of the store."""
+    sizes: Mapping[str, int | None]
+    """Bytes of each subfolder of the store, links not counted; None where that can't be told."""
+    problems: tuple[str, ...]
+    """What can't be read, or is not what a store has: a line for each file or folder."""
+    verification: Verification | None
+    """What was hashed, where that was asked for."""
+
+    @property
+    def intact(self) -> bool:
+        """Whether nothing is damaged, and everything could be read."""
+        bad = any(cell.state.name in {"corrupt", "unknown"} for cell in self.cells)
+        damaged = self.verification is not None and self.verification.damage
+        return not (bad or self.problems or damaged)
 
 
 def read(path: Path, *, verify: bool = False) -> StoreStatus:
     """Read the state of a store; nothing is written.
 
+    What can't be read is named among the problems, and does not hide the rest.
+
     Args:
         path: The store's folder.
-        verify: Hash the files that reports are made from; otherwise only sizes are compared.
+        verify: Hash every file of the cells, variants, scenes and records; otherwise only the sizes
+            of the cells' files are compared.
 
     Raises:
-        StoreError: There is no such store.
+        StoreError: There is no such store, or it can't be read now.
     """
     store = Store(path)
     if not store.exists:
         raise StoreError(f"store={path} is not a store; xrgs-sweep makes one")
-    names, sweeps = _names(store)
+    problems = _Problems()
+    names, sweeps = _names(store, problems)
     holders = locks.holders(store.locks)
-    cells = store.cell_folders()
+    cells = problems.unless(store.cell_folders) or []
     return StoreStatus(
-        path,
-        tuple(_summarise(cell, names.get(cell.id), holders, verify=verify) for cell in cells),
-        len(store.cells_folder.folders()) - len(cells),
-        tuple(sorted(_variants(store))),
-        tuple((key, *why) for key, why in failed_scenes(store.variants).items()),
-        sweeps,
-        {name: _bytes(store.folder / name) for name in store.folder.folders()},
+        path=path,
+        cells=tuple(_summarise(cell, names.get(cell.id), holders, verify=verify) for cell in cells),
+        aside=_aside(store, problems),
+        variants=tuple(problems.unless(lambda: _variants(store, problems)) or []),
+        failed_scenes=tuple(problems.unless(lambda: _failed_scenes(store)) or []),
+        sweeps=sweeps,
+        sizes=_sizes(store, problems),
+        problems=tuple(problems),
+        verification=verify_store(store) if verify else None,
     )
 
 
-def _variants(store: Store) -> Iterator[str]:
-    """Yield the frozen variants: not those being built, and not the reports of failed ones."""
-    for name in store.variants.folders():
-        if "-" in name and not name.startswith((".", FAILED_PREFIX)):
-            yield name
+class _Problems(list[str]):
+    """Lines that name what can't be read."""
+
+    def unless(self, look: Callable[[], _T]) -> _T | None:
+        """Return what a function reads; where it can't, add a line, and return None.
+
+        Args:
+            look: Reads something of the store.
+        """
+        try:
+            return look()
+        except StoreError as error:
+            self.append(str(error))
+        except OSError as error:
+            self.append(f"{error.filename}: {error.strerror}")
+        return None
 
 
-def _names(store: Store) -> tuple[dict[str, tuple[str, str]], int]:
+def _aside(store: Store, problems: _Problems) -> int:
+    """Count the folders of earlier attempts; add a problem for each name that no cell has."""
+    names = problems.unless(lambda: list_folder(store.cells_folder)) or []
+    wrong = [name for name in names if not is_name(name)]
+    problems += [f"{store.cells_folder}/{name}: a cell can't have this name" for name in wrong]
+    return sum("." in name and is_name(name) for name in names)
+
+
+def _variants(store: Store, problems: _Problems) -> list[str]:
+    """Return the frozen variants: not those being built, and not the reports of failed ones."""
+    names = [name for name in list_folder(store.variants) if "-" in name]
+    names = [name for name in names if not name.startswith((".", FAILED_PREFIX))]
+    folders = set(store.variants.folders()) if names else set()
+    problems += [f"{store.variants}/{n}: not a folder" for n in names if n not in folders]
+    return [name for name in names if name in folders]
+
+
+def _failed_scenes(store: Store) -> list[tuple[str, str, str]]:
+    if not list_folder(store.variants):
+        return []
+    return [(key, *why) for key, why in failed_scenes(store.variants).items()]
+
+
+def _sizes(store: Store, problems: _Problems) -> dict[str, int | None]:
+    names = problems.unless(store.folder.folders) or []
+    return {name: problems.unless(partial(_bytes, store.folder / name)) for name in names}
+
+
+def _bytes(folder: ConfinedPath) -> int:
+    found = (status for _, status in folder.walk())
+    return sum(status.st_size for status in found if stat.S_ISREG(status.st_mode))
+
+
+def _names(store: Store, problems: _Problems) -> tuple[dict[str, tuple[str, str]], int]:
     """Return scene and label of every recorded cell, and the number of recorded sweeps."""
     names: dict[str, tuple[str, str]] = {}
     records, damaged = store.records()
+    problems += damaged
     for record in records.values():
         for row in record["cells"]:
             label = " ".join(row[key] for key in ("label", "condition") if row.get(key))
@@ -116,7 +184,7 @@ def _summarise(
     verify: bool,
 ) -> CellSummary:
     state = cell.state(verify=verify)
-    if state.name != "done" and cell.id in holders:
+    if state.name not in {"done", "unknown"} and cell.id in holders:
         state = cell.running(holders[cell.id])
     scene, label = name or (_scene(cell), "?")
     return CellSummary(cell.id, scene, label, state, _stale(cell) if state.name == "done" else ())
@@ -157,11 +225,7 @@ def _other_arithmetic(backend: str, trained: object) -> list[str]:
         here = arithmetic(backend)
     except XrgsError:
         return []
-    return [] if trained == here else [printable(f"arithmetic ({trained}, here {here})")]
-
-
-def _bytes(folder: ConfinedPath) -> int:
-    return sum(status.st_size for _, status in folder.walk())
+    return [] if trained == here else [f"arithmetic ({trained}, here {here})"]
 
 
 def describe(status: StoreStatus) -> str:
@@ -177,15 +241,14 @@ def describe(status: StoreStatus) -> str:
     if status.aside:
         lines.append(f"  {status.aside} folders of earlier attempts and reruns (*.*)")
     lines.append(f"  {len(status.variants)} variants, {status.sweeps} sweeps recorded")
-    sizes = ", ".join(f"{name} {_size(size)}" for name, size in sorted(status.sizes.items()))
-    lines += [f"  {_size(sum(status.sizes.values()))} on disk: {sizes}", ""]
+    lines += [_disk(status.sizes), ""]
     lines += _table(status.cells)
-    for state in ("running", "failed", "corrupt", "unfinished"):
+    for state in ("running", "failed", "corrupt", "unknown", "unfinished"):
         lines += _listed(state, [cell for cell in status.cells if cell.state.name == state])
     if status.failed_scenes:
         lines += ["", "failed scenes, not tried again; retry=failed tries them again"]
         lines += [
-            printable(f"  {key}  {scene}  {reason.partition(chr(10))[0]}")
+            f"  {key}  {scene}  {reason.partition(chr(10))[0]}"
             for key, scene, reason in status.failed_scenes[:_MAX_NAMED]
         ]
     if stale:
@@ -195,7 +258,34 @@ def describe(status: StoreStatus) -> str:
             f"stale: {len(stale)} done cells were trained with other code or arithmetic than here",
         ]
         lines += [f"  {file}: {count} cells" for file, count in files.most_common(_MAX_NAMED)]
-    return "\n".join(lines)
+    lines += _named("can't be read, or does not belong there:", status.problems, _MAX_NAMED)
+    lines += _verified(status)
+    return "\n".join(map(for_line, lines))
+
+
+def _disk(sizes: Mapping[str, int | None]) -> str:
+    """Return a line of the sizes of the store's folders."""
+    texts = [f"{name} {_size(size)}" for name, size in sorted(sizes.items())]
+    known = _size(sum(size or 0 for size in sizes.values()))
+    return f"  {known} on disk{' at least' * (None in sizes.values())}: {', '.join(texts)}"
+
+
+def _named(heading: str, names: Sequence[str], most: int) -> list[str]:
+    if not names:
+        return []
+    more = [f"  and {len(names) - most} more"] if len(names) > most else []
+    return ["", heading, *(f"  {name}" for name in names[:most]), *more]
+
+
+def _verified(status: StoreStatus) -> list[str]:
+    """Return what was hashed, and every damaged file."""
+    done = status.verification
+    if done is None:
+        return []
+    lines = _named("damaged, or can't be read now:", done.damage, len(done.damage))
+    extent = f"{done.files:,} files, {_size(done.bytes)}, in {done.seconds:.1f} s"
+    found = f"{len(done.damage)} damaged" if done.damage else "all of them as they were written"
+    return [*lines, "", f"hashed: {extent}; {found}"]
 
 
 def _table(cells: Sequence[CellSummary]) -> list[str]:
@@ -208,7 +298,10 @@ def _table(cells: Sequence[CellSummary]) -> list[str]:
     columns = [c for c in (*_STATES, "stale") if any(row[c] for row in counts.values())]
     rows = [("scene", "label", *columns)]
     rows += [
-        (*map(printable, key), *(str(row[column] or "") for column in columns))
+        (
+            *(for_line(name, MAX_CELL) for name in key),
+            *(str(row[column] or "") for column in columns),
+        )
         for key, row in sorted(counts.items())
     ]
     return _aligned(rows) if cells else []
@@ -227,18 +320,15 @@ def _aligned(rows: Iterable[tuple[str, ...]]) -> list[str]:
 
 
 def _listed(state: str, cells: Sequence[CellSummary]) -> list[str]:
-    if not cells:
-        return []
-    lines = ["", f"{state}:"]
-    for cell in cells[:_MAX_NAMED]:
-        reason = cell.state.reason.partition("\n")[0]
-        lines.append(printable(f"  {cell.id}  {cell.scene} / {cell.label}  {reason}"))
-    if len(cells) > _MAX_NAMED:
-        lines.append(f"  and {len(cells) - _MAX_NAMED} more")
-    return lines
+    reasons = [cell.state.reason.partition("\n")[0] for cell in cells]
+    names = [f"{cell.id}  {cell.scene} / {cell.label}" for cell in cells]
+    lines = [f"{name}  {reason}" for name, reason in zip(names, reasons, strict=True)]
+    return _named(f"{state}:", lines, _MAX_NAMED)
 
 
-def _size(count: int) -> str:
+def _size(count: int | None) -> str:
+    if count is None:
+        return "unknown"
     size = float(count)
     for unit in ("B", "kB", "MB"):
         if size < 999.5:

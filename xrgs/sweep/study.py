@@ -11,6 +11,7 @@ else is left to do.
 from __future__ import annotations
 
 import re
+import sys
 import time
 from dataclasses import replace
 from pathlib import Path
@@ -25,7 +26,9 @@ from xrgs.errors import StoreError, XrgsError
 from xrgs.evaluation.lpips import weights
 from xrgs.experiment.store import Store
 from xrgs.runtime.progress import log_line
+from xrgs.runtime.streams import say
 from xrgs.safeio.hashing import digest, to_plain
+from xrgs.safeio.words import for_line
 from xrgs.sweep import launch, locks, variants
 from xrgs.sweep.axes import CellSpec, expand
 from xrgs.sweep.estimate import RuntimeEstimator
@@ -84,13 +87,13 @@ class Study:
         try:
             complete = self._plan_and_train(arguments)
         except (XrgsError, OmegaConfBaseException) as error:
-            raise CompactHydraException(str(error)) from error
+            raise CompactHydraException(for_line(str(error))) from error
         except OSError as error:
             if not worker.unwritable(error):
                 raise
             store = self._config.store
             message = f"store={store}: {error}. {worker.NOTHING_LOST}"
-            raise CompactHydraException(message) from error
+            raise CompactHydraException(for_line(message)) from error
         if not complete:
             raise SystemExit(1)
 
@@ -105,7 +108,7 @@ class Study:
         plan = self._with_variants(plan, store, allow_build=not dry_run)
         plan = self._identified(plan, store)
         plan = estimated(plan, RuntimeEstimator(store))
-        log_line(describe(plan))
+        say(describe(plan), sys.stderr)
         if slow := without_kernels(plan):
             log_line(slow)
         if weights.find_weights() is None and any(cell.state.name != "done" for cell in plan):
@@ -122,7 +125,7 @@ class Study:
         sweep_id = store.write_sweep(arguments, record(plan))
         from xrgs.report import build
 
-        print(build(store.path, sweep_id).text)  # noqa: T201
+        say(build(store.path, sweep_id).text)
         return all(cell.error is None and cell.state.name == "done" for cell in plan)
 
     def _run_until_complete(

@@ -20,7 +20,7 @@ import torch
 from xrgs.errors import XrgsError
 from xrgs.safeio import npz, untrusted
 from xrgs.safeio.atomic import atomic_writer
-from xrgs.safeio.confined import ConfinedPath, confined
+from xrgs.safeio.confined import ConfinedPath, ReplacedError, confined
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -137,6 +137,9 @@ class Checkpoint:
 
         Returns:
             The seconds that it took.
+
+        Raises:
+            ReplacedError: Another process has begun the run again, in another folder.
         """
         start = time.monotonic()
         if self.file is None or self.every_s <= 0 or start - self._written_at < self.every_s:
@@ -144,6 +147,8 @@ class Checkpoint:
         states = {name: value.state_dict() for name, value in self._objects.items()}
         try:
             _save(self.file, {"cell": self.cell_id, "steps": step + 1, "states": states})
+        except ReplacedError:
+            raise
         except OSError as error:
             _log.warning(
                 "%s: no checkpoint was written after step %d (%s); training continues",

@@ -14,7 +14,7 @@ from xrgs.capture.scenes.scene import Scene
 from xrgs.errors import XrgsError
 from xrgs.safeio.confined import ConfinedPath
 from xrgs.safeio.paths import user_path
-from xrgs.safeio.untrusted import one_line
+from xrgs.safeio.words import for_line
 
 if TYPE_CHECKING:
     from xrgs.config import SceneConf
@@ -35,7 +35,7 @@ def label(conf: SceneConf) -> str:
         one line of at most 200 characters that can be printed.
     """
     name = conf.name or (user_path(conf.path).resolve().name if conf.path else "")
-    return one_line(name)[:200].strip() or conf.kind
+    return for_line(name, 200).strip() or conf.kind
 
 
 def fingerprint(conf: SceneConf, long_side: int = 0) -> str:

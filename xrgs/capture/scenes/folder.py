@@ -19,6 +19,7 @@ from xrgs.runtime.progress import progress
 from xrgs.safeio import untrusted
 from xrgs.safeio.hashing import file_digest
 from xrgs.safeio.paths import user_path
+from xrgs.safeio.words import for_line
 
 _log = logging.getLogger(__name__)
 
@@ -108,7 +109,7 @@ def _images_in(folder: Path) -> tuple[Path, ...]:
     for file in named:
         if not file.is_file() and not file.is_dir():
             why = "not a regular file, nor a link to one (a pipe, a device?)"
-            _log.warning("%s: %s; left out", untrusted.printable(str(file)), why)
+            _log.warning("%s: %s; left out", for_line(str(file)), why)
     return tuple(file for file in named if file.is_file())
 
 

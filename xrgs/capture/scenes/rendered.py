@@ -15,7 +15,8 @@ from xrgs.errors import StoreError, UnreadableError
 from xrgs.safeio.atomic import write_json
 from xrgs.safeio.confined import confined
 from xrgs.safeio.records import read_object
-from xrgs.safeio.untrusted import is_name, one_line
+from xrgs.safeio.untrusted import is_name
+from xrgs.safeio.words import for_line
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Collection
@@ -98,7 +99,8 @@ def _render(
     try:
         render(work)
         content = {"fingerprint": home.name, "files": sealed.hashes(work, sorted(images))}
-        write_json(work / _MANIFEST, content)
+        write_json(work / _MANIFEST, content, durable=False)
+        work.sync_tree()
         work.rename(home)
     except BaseException:
         with suppress(OSError):
@@ -121,6 +123,6 @@ def verify(path: Path | ConfinedPath) -> list[str]:
     try:
         files = _files(home)
     except StoreError as error:
-        return [one_line(str(error))]
+        return [for_line(str(error))]
     errors = [*sealed.changed(home, files), *sealed.unlisted(home, {_MANIFEST, *files})]
-    return [one_line(str(error)) for error in errors]
+    return [for_line(str(error)) for error in errors]

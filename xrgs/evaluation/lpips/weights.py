@@ -19,7 +19,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from xrgs.errors import XrgsError
-from xrgs.safeio import npz, untrusted
+from xrgs.safeio import npz
+from xrgs.safeio.confined import confined
 
 Weights = dict[str, NDArray[np.float32]]
 
@@ -117,7 +118,7 @@ def load(file: Path) -> Weights:
         WeightsError: The file is unreadable, or does not hold the published weights.
     """
     try:
-        content = untrusted.read_bytes(file, _MAX_BYTES)
+        content = confined(file).read_bytes(_MAX_BYTES)
     except OSError as error:
         raise WeightsError(f"{file}: can't be read ({error})") from error
     if not content.startswith(b"PK"):

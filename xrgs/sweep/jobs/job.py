@@ -83,9 +83,9 @@ def _run_under_lock(cell: HandOver, store: Store, session: SweepSession) -> str:
         if folder.state().name == "done":  # finished by another sweep since this one was planned
             return "done"
         cell.check_code()
-        folder.begin(cell.config, cell.identity)
+        attempt = folder.begin(cell.config, cell.identity)
         log_line(f"{cell.name}: training cell {folder.id}")
-        return _train_in_child(cell, variant, folder, lock, session)
+        return _train_in_child(cell, variant, attempt, lock, session)
     finally:
         lock.release()
 
@@ -106,7 +106,7 @@ def _train_in_child(
         if session.owner_dead:
             raise _CellLeftError(STOPPED, f"{folder.id} is left: its sweep's process has ended")
 
-    request = {"conf": cell.config, "variant": str(variant), "cell": str(folder.path)}
+    request = worker.cell_request(cell.config, variant, folder)
     limits = cell.config["limits"]
     try:
         worker.run_in_child(
@@ -115,6 +115,9 @@ def _train_in_child(
     except _CellLeftError as error:
         log_line(str(error))
         return error.outcome
+    except worker.AttemptLostError as error:
+        log_line(f"{folder.id} is left: {error}")
+        return LOCKED
     except worker.UnwritableError as error:
         # No fault of the cell: it stays unfinished, and the next sweep trains it without `retry`.
         log_line(f"{folder.id} stopped: {error}")

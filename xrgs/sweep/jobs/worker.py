@@ -21,13 +21,16 @@ from typing import TYPE_CHECKING, Any
 
 from xrgs.errors import XrgsError
 from xrgs.runtime.machine import set_passive_openmp_wait
-from xrgs.runtime.streams import ignore_broken_pipe
+from xrgs.runtime.streams import ignore_broken_pipe, log_to_stderr, say
 from xrgs.safeio.atomic import write_json
+from xrgs.safeio.confined import ConfinedPath, ReplacedError
 from xrgs.safeio.records import read_json
 from xrgs.sweep.jobs import supervise
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
+
+    from xrgs.experiment.cell_folder import CellFolder
 
 #: Said to the user when the store can't be written any more.
 NOTHING_LOST = (
@@ -40,6 +43,10 @@ _NO_LIMITS = supervise.Limits()
 
 class WorkerError(XrgsError):
     """The work failed in the child, or the child died before it answered."""
+
+
+class AttemptLostError(WorkerError):
+    """Another process has taken the cell over: what the child did is of no use to anybody."""
 
 
 class UnwritableError(WorkerError):
@@ -65,6 +72,7 @@ def run_in_child(
         The answer of the work, as plain JSON values.
 
     Raises:
+        AttemptLostError: Another attempt at the cell has begun.
         UnwritableError: The child could not write its files; nothing else is wrong with its work.
         WorkerError: The work failed; the message is the reason.
     """
@@ -82,10 +90,27 @@ def run_in_child(
         if not answer_file.exists():
             raise WorkerError(_death(ended.code))
         answer = dict(read_json(answer_file))
+    if answer.get("lost"):
+        raise AttemptLostError(str(answer["error"]))
     if "error" in answer:
         unwritable = answer.get("errno") in _UNWRITABLE
         raise (UnwritableError if unwritable else WorkerError)(str(answer["error"]))
     return answer
+
+
+def cell_request(
+    conf: Mapping[str, Any], variant: ConfinedPath, attempt: CellFolder
+) -> dict[str, Any]:
+    """Return the request to train a cell.
+
+    Args:
+        conf: The cell's config as plain JSON values.
+        variant: The folder of its variant.
+        attempt: What `CellFolder.begin` has returned. It must exist until the child has ended: the
+            child works in this very folder, and in no other of its name.
+    """
+    cell, identity = str(attempt.path), attempt.folder.identity()
+    return {"conf": dict(conf), "variant": str(variant), "cell": cell, "folder": identity}
 
 
 def unwritable(error: OSError) -> bool:
@@ -110,6 +135,7 @@ def _build_variant(request: Mapping[str, Any]) -> dict[str, Any]:
     from xrgs.config import from_dict
     from xrgs.experiment.store import Store
 
+    log_to_stderr()
     conf, store = from_dict(request["conf"]), Store(Path(request["store"]))
     built = variant.build(conf.scene, conf.variant, store.variants, store.scenes)
     return {"variant": built.id}
@@ -121,7 +147,8 @@ def _run_cell(request: Mapping[str, Any]) -> dict[str, Any]:
     from xrgs.experiment import cell
     from xrgs.experiment.cell_folder import CellFolder
 
-    folder = CellFolder(Path(request["cell"]))
+    device, inode = request["folder"]
+    folder = CellFolder(ConfinedPath(Path(request["cell"])).pinned((device, inode)))
     with (folder.folder / "log.txt").append() as log:
         # Everything that the cell, its libraries and its children print goes to the log. Progress
         # goes to a file instead: on a terminal the bars of several cells would mix.
@@ -130,7 +157,7 @@ def _run_cell(request: Mapping[str, Any]) -> dict[str, Any]:
         # A cell that is ended by SIGTERM writes its stack. It is given the descriptor, which stays
         # open when `log` is closed.
         faulthandler.register(signal.SIGTERM, 2, chain=True)
-        logging.basicConfig(format="%(asctime)s %(message)s", level=logging.INFO)
+        log_to_stderr(logging.INFO)
         frozen = variant.load(Path(request["variant"]))
         cell.run_cell(from_dict(request["conf"]), frozen, folder)
     return {}
@@ -157,17 +184,22 @@ def main(job: str, request: str, answer: str) -> None:
     set_passive_openmp_wait()
     try:
         result = _JOBS[job](json.loads(Path(request).read_text(encoding="utf-8")))
+    except ReplacedError as error:
+        why = f"{error.filename}: {error.strerror}: another attempt at the cell has begun"
+        result = {"error": why, "lost": True}
     except XrgsError as error:
         result = {"error": str(error)}
     except Exception as error:
-        traceback.print_exc()
+        say(traceback.format_exc(), sys.stderr)
         number = error.errno if isinstance(error, OSError) else None
         result = {"error": f"{type(error).__name__}: {error}", "errno": number}
     try:
         write_json(Path(answer), result)
     except OSError:
-        traceback.print_exc()
+        say(traceback.format_exc(), sys.stderr)
         sys.exit(os.EX_IOERR)
+    if result.get("lost"):
+        sys.exit(os.EX_TEMPFAIL)
 
 
 if __name__ == "__main__":

@@ -1,0 +1,134 @@
+"""Makes text that somebody else may have written safe for an output: one function a target.
+
+Names of scenes, labels, reasons and messages may come from a store, an archive or a server of
+somebody else. They may hold codes that a terminal obeys, formulas that a spreadsheet runs, markup
+that Markdown and LaTeX obey, or a megabyte of letters. Every script, accent and emoji passes.
+
+What is written for people goes through here. Files that this package reads back, such as a cell's
+`scores.csv`, keep each text exactly: whoever shows what was read from them calls this module.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import re
+
+#: The longest line, and the longest text in a cell of a table or in a picture, in characters.
+MAX_LINE, MAX_CELL = 4000, 300
+_MAX_TERMINAL_LINE = 20_000
+#: Characters that nobody sees although `str.isprintable` accepts them: fillers, joiners, and
+#: selectors of variants. U+FE0E and U+FE0F, which emoji need, are not among them.
+_INVISIBLE = re.compile(
+    "[\u034f\u115f\u1160\u17b4\u17b5\u180b-\u180f\u3164\ufe00-\ufe0d\uffa0\U000e0100-\U000e01ef]"
+)
+#: The start of a cell, also of one that a semicolon would begin in many countries, with a character
+#: after which a spreadsheet reads a formula. The wide ones are read like those of ASCII.
+_FORMULA = re.compile(r"(^|;\s*)(?=[=+\-@＝＋－＠])")
+#: A number with its sign, as tables print it; the arrow says whether a change is an improvement.
+_NUMBER = re.compile(r"[+-]?\d[\d,.]*(e[+-]?\d+)?( [↑↓=])?", re.ASCII)
+_MARKDOWN = str.maketrans(
+    {char: f"\\{char}" for char in "\\`*_{}[]<>#|~$&"}
+    | {"@": "@<!-- -->"}  # GitHub makes links of e-mail addresses whose characters are escaped
+)
+#: What begins a list or a rule where it begins a paragraph, and what is a link without brackets.
+_MARKDOWN_START = re.compile(r"^(\d{0,9})([-+.)])(?=[\s-]|$)")
+_MARKDOWN_LINK = re.compile(r":(?=//)|(?<=www)\.")
+_LATEX = str.maketrans(
+    {char: f"\\{char}" for char in "&%$#_{}"}
+    | {
+        "\\": r"\textbackslash{}",
+        "~": r"\textasciitilde{}",
+        "^": r"\textasciicircum{}",
+        "<": r"\textless{}",
+        ">": r"\textgreater{}",
+        "|": r"\textbar{}",
+        "[": "{[}",  # bare at the start of a row it would be an argument of the row before
+        "]": "{]}",
+        "↑": r"$\uparrow$",
+        "↓": r"$\downarrow$",
+    }
+)
+
+
+def for_line(text: str, limit: int = MAX_LINE) -> str:
+    """Make a text one line without control, format or invisible characters.
+
+    Args:
+        text: Any text.
+        limit: The most characters that are kept.
+
+    Returns:
+        The text with a space for each character that can't be printed, line breaks among them. A
+        text longer than `limit` ends with an ellipsis and a hash of all of it, so that texts that
+        differ only at their end can still be told apart.
+    """
+    if len(text) > limit:
+        mark = f"…{_hash(text)[:8]}"
+        text = text[: limit - len(mark)] + mark
+    if not text.isprintable():
+        text = "".join(char if char.isprintable() else " " for char in text)
+    return _INVISIBLE.sub(" ", text)
+
+
+def for_terminal(text: str) -> str:
+    """Make a whole text safe for a terminal or a log; its line breaks are kept.
+
+    Args:
+        text: Lines that are our own: a name in them may hold a line break, and goes through
+            `for_line` before.
+    """
+    return "\n".join(for_line(line, _MAX_TERMINAL_LINE) for line in text.split("\n"))
+
+
+def for_csv(value: object) -> object:
+    """Make a value safe for a cell of a table that is opened in a spreadsheet.
+
+    Args:
+        value: The value; all but texts are returned unchanged.
+
+    Returns:
+        The text as one line. Where a spreadsheet would read a formula, it has an apostrophe before
+        it; numbers with a sign are numbers.
+    """
+    if not isinstance(value, str):
+        return value
+    line = for_line(value).strip()
+    return line if _NUMBER.fullmatch(line) else _FORMULA.sub(r"\1'", line)
+
+
+def for_markdown(text: str) -> str:
+    """Escape a text so that GitHub's Markdown shows it as it is, without links or HTML.
+
+    Args:
+        text: Any text; it is shown on one line.
+    """
+    escaped = for_line(text).strip().translate(_MARKDOWN)
+    return _MARKDOWN_LINK.sub(r"\\\g<0>", _MARKDOWN_START.sub(r"\1\\\2", escaped))
+
+
+def for_latex(text: str) -> str:
+    """Escape a text so that LaTeX shows it as it is; scripts other than Latin need xelatex.
+
+    Args:
+        text: Any text; the hyphen of a negative number becomes a minus sign.
+    """
+    return re.sub(r"(?<!\S)-(?=\d)", "$-$", for_line(text).strip().translate(_LATEX))
+
+
+def for_file_name(text: str) -> str:
+    """Return a text as part of a file name that any system accepts.
+
+    Args:
+        text: The name of a scene, label or condition.
+
+    Returns:
+        At most 67 ASCII characters; different texts give different names.
+    """
+    plain = re.sub(r"[^A-Za-z0-9_.]+", "-", text).strip("-.")[:60]
+    if text and plain == text:
+        return text
+    return f"{plain}-{_hash(text)[:6]}".lstrip("-")
+
+
+def _hash(text: str) -> str:
+    return hashlib.sha256(text.encode(errors="surrogatepass")).hexdigest()
