@@ -192,18 +192,19 @@ def _to_array(image: Image.Image) -> ImageArray:
     return array
 
 
-def save(path: Path | ConfinedPath, image: ImageArray) -> None:
+def save(path: Path | ConfinedPath, image: ImageArray, *, durable: bool = True) -> None:
     """Write an 8-bit RGB PNG, clamped to 0..1 and rounded to nearest.
 
     Args:
         path: The file, which is replaced atomically; its folder is made where it is missing.
         image: [H, W, 3].
+        durable: As for `atomic_writer`.
 
     Raises:
         OSError: The file can't be written.
     """
     confined(path).make_parent()
-    with atomic_writer(path) as stream:
+    with atomic_writer(path, durable=durable) as stream:
         Image.fromarray(_to_8_bit(image)).save(stream, "PNG", compress_level=4)
 
 
