@@ -10,6 +10,7 @@ import shutil
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -19,7 +20,7 @@ from xrgs.capture import frozen, sealed
 from xrgs.capture.frozen import CorruptVariant
 from xrgs.capture.views import Variant, View
 from xrgs.errors import UnreadableError
-from xrgs.safeio import confined
+from xrgs.safeio import confined, npz
 from xrgs.safeio.confined import ConfinedPath
 
 Forge = Callable[..., Path]
@@ -103,10 +104,10 @@ def matrix(side: int, value: Any) -> list[list[Any]]:
         (first_view(tag={}), "not a complete variant"),
         (first_view(file="images/test/b.png"), "file of view 0"),
         (first_view(file={"images": "test"}), "file of view 0"),
-        (first_view(width=-4), "size of view 0"),
-        (first_view(width=True), "size of view 0"),
-        (first_view(width=10**9), "size of view 0"),
-        (first_view(height="3"), "size of view 0"),
+        (first_view(width=-4), "width of view 0"),
+        (first_view(width=True), "width of view 0"),
+        (first_view(width=10**9), "width of view 0"),
+        (first_view(height="3"), "height of view 0"),
         (first_view(rho=float("nan")), "rho of view 0"),
         (first_view(rho="1"), "rho of view 0"),
         (first_view(rho=10**400), "rho of view 0"),
@@ -119,28 +120,31 @@ def matrix(side: int, value: Any) -> list[list[Any]]:
         (first_view(viewmat=np.eye(3).tolist()), "viewmat of view 0"),
         (first_view(viewmat=(2 * np.eye(4)).tolist()), "viewmat of view 0"),
         (first_view(viewmat=matrix(4, float("nan"))), "viewmat of view 0"),
-        (first_view(more=1), "list of keys of view 0"),
-        (of(factor=0), "factor is wrong"),
-        (of(factor=True), "factor is wrong"),
-        (of(factor=10**9), "factor is wrong"),
-        (of(held_out=1), "held_out is wrong"),
-        (of(scene=["x"]), "scene is wrong"),
-        (of(scene="a\nb"), "scene is wrong"),
-        (of(scene="\x1b[31m"), "scene is wrong"),
-        (of(scene="s" * 10_000), "scene is wrong"),
-        (of(views=[]), "views is wrong"),
-        (of(views={"a": 1}), "views is wrong"),
-        (of(views=[[[]]]), "list of keys of view 0"),
-        (of(views=[0] * 20_000), "views is wrong"),
-        (of(files=[]), "files is wrong"),
-        (of(files={"points.npz": 1}), "files is wrong"),
-        (of(more=1), "more"),
-        (of(key=3), "id is wrong"),
-        (lambda content: content.pop("key"), "key"),
-        (lambda content: content["files"].update({"../secret.png": "0" * 64}), "files is wrong"),
-        (lambda content: content["files"].pop("images/test/a.png"), "files is wrong"),
-        (lambda content: content["views"].append(content["views"][0]), "two views of one name"),
-        (lambda content: content["views"].pop(), "files is wrong"),
+        (first_view(more=1), "wrong: keys of view 0"),
+        (of(factor=0), "wrong: factor"),
+        (of(factor=True), "wrong: factor"),
+        (of(factor=10**9), "wrong: factor"),
+        (of(held_out=1), "wrong: held_out"),
+        (of(scene=["x"]), "wrong: scene"),
+        (of(scene="a\nb"), "wrong: scene"),
+        (of(scene="\x1b[31m"), "wrong: scene"),
+        (of(scene="s" * 10_000), "wrong: scene"),
+        (of(views=[]), "wrong: views"),
+        (of(views={"a": 1}), "wrong: views"),
+        (of(views=[[[]]]), "wrong: keys of view 0"),
+        (of(views=[0] * 20_000), "wrong: views"),
+        (of(files=[]), "wrong: files"),
+        (of(files={"points.npz": 1}), "wrong: files"),
+        (of(more=1), "wrong: keys more"),
+        (of(key=3), "wrong: id"),
+        (lambda content: content.pop("key"), "wrong: keys key"),
+        (lambda content: content["files"].update({"../secret.png": "0" * 64}), "wrong: files"),
+        (lambda content: content["files"].pop("images/test/a.png"), "wrong: files"),
+        (
+            lambda content: content["views"].append(content["views"][0]),
+            "of which two have one name",
+        ),
+        (lambda content: content["views"].pop(), "wrong: files"),
     ],
 )
 def test_a_wrong_value_in_the_list_is_refused_and_named(
@@ -242,7 +246,7 @@ def test_verifying_names_every_file_that_is_not_as_it_was(forge: Forge) -> None:
         f"{folder}/images/train/b.png: it has changed since it was written",
         f"{folder}/notes.txt: it does not belong there",
     ]
-    shutil.rmtree(folder)
+    (folder / "variant.json").unlink()
     assert frozen.verify(folder) == [f"{folder}/variant.json: No such file or directory"]
 
 
@@ -263,6 +267,16 @@ def test_a_file_that_cant_be_read_now_says_nothing_of_the_variant(
         frozen.load(folder)
     (line,) = frozen.verify(folder)
     assert f"{name}: Input/output error" in line
+
+
+def test_a_disk_that_fails_within_the_points_says_nothing_of_the_variant(
+    forge: Forge, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder = forge()
+    failure = OSError(errno.EIO, os.strerror(errno.EIO))
+    monkeypatch.setattr(npz, "read", Mock(side_effect=failure))
+    with pytest.raises(UnreadableError, match=f"{folder.name}: Input/output error; try again"):
+        frozen.load(folder)
 
 
 def test_everything_is_on_the_disk_before_the_variant_has_its_name(

@@ -157,7 +157,9 @@ def _of_stores(store: Path, cell: Path) -> dict[str, Parser]:
             sweep, mutate_json, lambda _: str(Store(store).records()), (StoreError,)
         ),
         "lock": Parser(lock, mutate_json, lambda file: str(locks.signature(file))),
-        "locks": Parser(lock, mutate_json, lambda file: str(locks.holders(ConfinedPath(file.parent)))),
+        "locks": Parser(
+            lock, mutate_json, lambda file: str(locks.holders(ConfinedPath(file.parent)))
+        ),
         "cells-identity": Parser(cell / "identity.json", mutate_json, table, seal=seal),
         "cells-config": Parser(cell / "config.json", mutate_json, table, seal=seal),
         "cells-summary": Parser(cell / "summary.json", mutate_json, table, seal=seal),

@@ -61,9 +61,9 @@ def freeze(made: Variant, key: str, folder: ConfinedPath, variants: ConfinedPath
     Returns:
         The variant, as it is read from its new place.
     """
-    with atomic_writer(folder / POINTS) as stream:
+    with atomic_writer(folder / POINTS, durable=False) as stream:
         np.savez(stream, points=made.points, colors=made.colors)
-    write_json(folder / REPORT, made.report)
+    write_json(folder / REPORT, made.report, durable=False)
     images = {view.file.relative_to(folder) for view in made.views}
     content: dict[str, Any] = {
         "key": key,
@@ -74,7 +74,7 @@ def freeze(made: Variant, key: str, folder: ConfinedPath, variants: ConfinedPath
         "files": sealed.hashes(folder, [POINTS, *sorted(images)]),
     }
     content["id"] = variant_id(content)
-    write_json(folder / MANIFEST, content)
+    write_json(folder / MANIFEST, content, durable=False)
     folder.sync_tree()
     home = variants / content["id"]
     folder.rename(home)
@@ -107,7 +107,7 @@ def load(path: Path | ConfinedPath) -> Variant:
             variant has, or the folder's name is not the variant's id.
     """
     folder = confined(path)
-    with _errors_as_corrupt():
+    with _errors_as_corrupt(folder):
         content = _manifest(folder)
         for error in sealed.changed(folder, content["files"]):
             raise error
@@ -127,28 +127,29 @@ def verify(path: Path | ConfinedPath) -> list[str]:
     folder = confined(path)
     errors: list[XrgsError] = []
     try:
-        with _errors_as_corrupt():
+        with _errors_as_corrupt(folder):
             content = _manifest(folder)
             errors += sealed.changed(folder, content["files"])
             errors += sealed.unlisted(folder, {MANIFEST, REPORT, LOG, *content["files"]})
             if not errors:
                 _assembled(folder, content)
-    except (CorruptVariant, UnreadableError) as error:
+    except XrgsError as error:
         errors.append(error)
     return [for_line(str(error)) for error in errors]
 
 
 @contextmanager
-def _errors_as_corrupt() -> Iterator[None]:
+def _errors_as_corrupt(folder: ConfinedPath) -> Iterator[None]:
     """Raise `UnreadableError` for what may pass, and `CorruptVariant` for any other error."""
     try:
         yield
-    except UnreadableError:
-        raise
+    except UnreadableError as error:
+        raise UnreadableError(f"{error}; try again") from error
     except OSError as error:
+        why = f"{error.filename or folder}: {error.strerror or error}"  # a stream's has no name
         if is_passing(error):
-            raise UnreadableError(f"{error.filename}: {error.strerror}; try again") from error
-        raise CorruptVariant(f"{error.filename}: {error.strerror}") from error
+            raise UnreadableError(f"{why}; try again") from error
+        raise CorruptVariant(why) from error
     except StoreError as error:
         raise CorruptVariant(str(error)) from error
 
@@ -167,7 +168,7 @@ def _manifest(folder: ConfinedPath) -> dict[str, Any]:
     except (ValueError, KeyError, TypeError, AttributeError, ArithmeticError) as error:
         raise StoreError(f"{file}: not a complete variant ({error!r:.200})") from error
     if wrong:
-        raise StoreError(f"{file}: not a complete variant: {wrong} is wrong")
+        raise StoreError(f"{file}: not a complete variant; wrong: {wrong}")
     if content["id"] != variant_id(content):
         raise StoreError(f"{file}: it has changed since it was written")
     if sealed.own_name(folder) != content["id"]:
@@ -181,7 +182,7 @@ def _manifest(folder: ConfinedPath) -> dict[str, Any]:
 def _wrong_field(content: dict[str, Any]) -> str:
     """Return what is wrong in the content of `variant.json`; empty where nothing is."""
     if content.keys() != _FIELDS:
-        return f"the list of its keys ({', '.join(sorted(content.keys() ^ _FIELDS))[:200]})"
+        return f"keys {', '.join(sorted(content.keys() ^ _FIELDS)):.200}"
     scene, views, files = content["scene"], content["views"], content["files"]
     rules = {
         "id": untrusted.is_name(content["id"]) and untrusted.is_name(content["key"]),
@@ -198,29 +199,25 @@ def _wrong_field(content: dict[str, Any]) -> str:
             return f"{wrong_in_view} of view {number}"
     names = {(entry["split"], entry["name"]) for entry in views}
     if len(names) < len(views):
-        return "two views of one name"
+        return "views, of which two have one name"
     if files.keys() != {POINTS, *(entry["file"] for entry in views)}:
         return "files"
-    splits = {split for split, _ in names}
-    return (
-        "" if {"train", "test"} <= splits else "the list of views, of which none is of some split"
-    )
+    missing = {"train", "test"} - {split for split, _ in names}
+    return f"views, of which none is to {min(missing)}" if missing else ""
 
 
 def _wrong_in_view(entry: object) -> str:
     """Return which value of a view in `variant.json` is wrong; empty where none is."""
     if not isinstance(entry, dict) or entry.keys() != View.__dataclass_fields__.keys():
-        return "the list of keys"
+        return "keys"
     rho = entry["rho"]
     rules = {
         "name": untrusted.is_name(entry["name"]),
         "split": entry["split"] in _SPLITS,
         "file": entry["file"] == f"images/{entry['split']}/{entry['name']}.png",
         "tag": entry["tag"] in {"HR", "LR"},
-        "size": all(
-            type(side) is int and 0 < side <= _MAX_SIDE
-            for side in (entry["width"], entry["height"])
-        ),
+        "width": type(entry["width"]) is int and 0 < entry["width"] <= _MAX_SIDE,
+        "height": type(entry["height"]) is int and 0 < entry["height"] <= _MAX_SIDE,
         "rho": type(rho) in {int, float} and 0 < rho <= 1,
         "K": _is_intrinsics(_matrix(entry["K"], 3)),
         "viewmat": _is_rigid(_matrix(entry["viewmat"], 4)),

@@ -206,7 +206,7 @@ def _write_undistorted(
         height, width = image.shape[:2]
         lens = model.lenses[i].resized(width, height)
         file = out / "images" / part / f"{photos.names[i]}.png"
-        images.save(file, undistort(image, lens))
+        images.save(file, undistort(image, lens), durable=False)  # `freeze` syncs all
         K, name = lens.undistorted().K, photos.names[i]
         views.append(View(name, file, part, tag, width, height, K, model.viewmats[i], 1.0))
         rates.append(tagging.sampling_rate(K, depths[i]))

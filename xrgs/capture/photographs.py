@@ -122,7 +122,8 @@ class PhotoCollection:
         file = self.folder / self.file("up", index)
         if not file.exists():
             target = self.all[index].hr
-            images.save(file, images.resize(self.read("lr", index), target.width, target.height))
+            up = images.resize(self.read("lr", index), target.width, target.height)
+            images.save(file, up, durable=False)
 
 
 def prepare_hr_views(scene: Scene, conf: VariantConf, work: Path) -> PhotoCollection:
@@ -157,7 +158,8 @@ def prepare_hr_views(scene: Scene, conf: VariantConf, work: Path) -> PhotoCollec
             geometries[file] = hr = _checked_geometry(size, shrink, conf)
         except XrgsError as error:
             raise XrgsError(f"{file}: {error}") from None
-        images.save(work / "hr" / f"{len(geometries) - 1:05d}.png", _resize_and_crop(image, hr))
+        copy = work / "hr" / f"{len(geometries) - 1:05d}.png"
+        images.save(copy, _resize_and_crop(image, hr), durable=False)
     messages = tuple(unreadable[file] for file in scene.files if file in unreadable)
     for message in messages:
         _log.warning("%s; left out", message)
@@ -251,4 +253,4 @@ def write_degraded(photos: PhotoCollection, which: Sequence[int], conf: VariantC
     """
     for i in progress(which, "LR views", "view"):
         low = degrade.degrade(photos.read("hr", i), conf)
-        images.save(photos.folder / photos.file("lr", i), low)
+        images.save(photos.folder / photos.file("lr", i), low, durable=False)

@@ -63,7 +63,7 @@ def changed(folder: ConfinedPath, files: Mapping[str, str]) -> Iterator[StoreErr
                 yield StoreError(f"{file}: it has changed since it was written")
         except OSError as error:
             if is_passing(error):
-                yield UnreadableError(f"{file}: {error.strerror}; try again")
+                yield UnreadableError(f"{file}: {error.strerror}")
             else:
                 yield StoreError(f"{file}: {error.strerror}")
 

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from xrgs.capture.views import Variant
     from xrgs.safeio.confined import ConfinedPath
 
-#: How many names of views and attempts are read.
+#: How many names of views and attempts of a report are read.
 _MAX_NAMES, _MAX_ATTEMPTS = 1 << 14, 10
 _REGISTERED, _NOT_REGISTERED = "yes", "no"
 
@@ -41,7 +41,13 @@ def describe(path: Path | ConfinedPath, out: Path | None = None) -> str:
         XrgsError: The folder is not a variant or has changed, or the sheet can't be written.
     """
     folder = confined(path)
-    if not folder.is_dir():
+    try:
+        found = folder.is_dir()
+    except FileNotFoundError:
+        found = False
+    except OSError as error:
+        raise XrgsError(f"{folder}: {error.strerror}; try again") from error
+    if not found:
         raise XrgsError(f"{folder}: no such folder; variants are in <store>/variants/")
     if folder.name.startswith(FAILED_PREFIX):
         report = read_object(folder / "report.json")
@@ -57,8 +63,8 @@ def describe(path: Path | ConfinedPath, out: Path | None = None) -> str:
             sheet.save(stream, "PNG")
     except OSError as error:
         raise XrgsError(f"out={file}: can't be written ({error})") from error
-    lines = [table, *sfm, f"Contact sheet: {file}", *(f"  {note}" for note in map(for_line, notes))]
-    return "\n".join(lines)
+    more = [f"Contact sheet: {file}", *(f"  {note}" for note in notes)]
+    return "\n".join([table, *sfm, *map(for_line, more)])
 
 
 def _sfm_lines(folder: ConfinedPath, report: Mapping[str, Any]) -> list[str]:

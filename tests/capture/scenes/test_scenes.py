@@ -86,7 +86,7 @@ def test_other_images_do_not_become_the_procedural_scene(
 
 
 def test_a_label_is_one_printable_line(tmp_path: Path) -> None:
-    assert scenes.label(SceneConf("a\n\x1b[31mb", "procedural")) == "a [31mb"
+    assert scenes.label(SceneConf("a\n\x1b[31mb", "procedural")) == "a  [31mb"
     assert scenes.label(SceneConf("\n", "procedural")) == "procedural"
     assert scenes.label(SceneConf("", "folder", str(tmp_path / "a\tb"))) == "a b"
     assert len(scenes.label(SceneConf("x" * 9_999, "procedural"))) == 200

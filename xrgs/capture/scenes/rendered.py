@@ -52,7 +52,7 @@ def provide(
             raise UnreadableError(f"{home}: {error.strerror}; try again") from error
         damage = None if missing else _damage(home, images)
         if isinstance(damage, UnreadableError):
-            raise damage
+            raise UnreadableError(f"{damage}; try again")
         if damage is not None:
             aside = sealed.set_aside(home)
             _log.warning("%s; renamed to %s, and rendered anew", damage, aside.name)
@@ -99,7 +99,8 @@ def _render(
     try:
         render(work)
         content = {"fingerprint": home.name, "files": sealed.hashes(work, sorted(images))}
-        write_json(work / _MANIFEST, content)
+        write_json(work / _MANIFEST, content, durable=False)
+        work.sync_tree()
         work.rename(home)
     except BaseException:
         with suppress(OSError):

@@ -109,7 +109,7 @@ def textures() -> dict[str, Pyramid]:
 
 
 def render(folder: ConfinedPath, long_side: int, views: int) -> None:
-    """Render every view and write it as `<name>.png`.
+    """Render every view and write it as `<name>.png`; nothing waits for the disk.
 
     Args:
         folder: The folder for the images; it is made where it is missing.
@@ -123,7 +123,7 @@ def render(folder: ConfinedPath, long_side: int, views: int) -> None:
     def render_view(name: str, viewmat: NDArray[np.float64]) -> None:
         pose = torch.from_numpy(viewmat)
         image = raycast.render(scene, pyramids, K, pose, width, height, SUPERSAMPLE)
-        images.save(folder / f"{name}.png", image.numpy())
+        images.save(folder / f"{name}.png", image.numpy(), durable=False)
 
     names, poses = procedural.names(views), procedural.viewmats(views)
     # One thread per view, and none within: on a busy machine torch's threads wait for each other.

@@ -188,8 +188,6 @@ def _run_cell(request: Mapping[str, Any]) -> dict[str, Any]:
         faulthandler.register(signal.SIGTERM, 2, chain=True)
         log_to_stderr(logging.INFO)
         frozen = variant.load(Path(request["variant"]))
-        if frozen.id != frozen.path.name:
-            raise variant.CorruptVariant(f"{frozen.path} holds another variant: {frozen.id}")
         cell.run_cell(from_dict(request["conf"]), frozen, folder)
     return {}
 
