@@ -12,8 +12,9 @@ from typing import Any
 
 import pytest
 
+from xrgs.capture import scenes, variant
 from xrgs.errors import XrgsError
-from xrgs.experiment import identity, verification
+from xrgs.experiment import identity
 from xrgs.experiment.cell_folder import CellFolder
 from xrgs.experiment.store import Store
 from xrgs.runtime.progress import Progress
@@ -187,7 +188,7 @@ def test_variants_and_scenes_are_verified_each_by_its_own_rule(
     names = ("variants/a-b", "variants/failed-b", "variants/.a.building", "scenes/c", "scenes/.c")
     for name in names:
         (intact.folder / name).make_folder()
-    for module in (verification.variant, verification.scenes):
+    for module in (variant, scenes):
         monkeypatch.setattr(module, "verify", lambda folder: [f"{folder}/x: wrong"])
     done = read(intact.path, verify=True).verification
     assert done is not None

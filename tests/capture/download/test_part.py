@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from xrgs.capture.download import part as part_module
-from xrgs.capture.download.part import DownloadError, Version, open_part, sync_folder
+from xrgs.capture.download.part import DownloadError, Version, open_part
 
 VERSION = Version("http://a.org/x", '"1"', 7)
 
@@ -94,8 +94,3 @@ def test_a_part_that_has_become_the_file_meanwhile_is_not_appended_to(
     with pytest.raises(DownloadError, match="another process"):
         open_part(target).__enter__()
     assert target.read_bytes() == b""
-
-
-def test_a_folder_that_is_gone_can_not_be_synced(tmp_path: Path) -> None:
-    with pytest.raises(FileNotFoundError):
-        sync_folder(tmp_path / "gone")

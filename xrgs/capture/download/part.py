@@ -11,7 +11,7 @@ from typing import IO, TYPE_CHECKING
 from xrgs.errors import XrgsError
 from xrgs.safeio import untrusted
 from xrgs.safeio.atomic import write_json
-from xrgs.safeio.confined import confined
+from xrgs.safeio.confined import ConfinedPath
 from xrgs.safeio.hashing import file_digest
 
 if TYPE_CHECKING:
@@ -41,9 +41,9 @@ class Version:
 class Part:
     """The file `<target>.part`, and beside it `<target>.part.json` with its version."""
 
-    def __init__(self, target: Path, stream: IO[bytes]) -> None:
-        self.target = target
-        self._file, self._record = _file(target), target.with_name(f"{target.name}.part.json")
+    def __init__(self, target: ConfinedPath, stream: IO[bytes]) -> None:
+        self.target, self._file = target, _file_of(target)
+        self._record = target.with_name(f"{target.name}.part.json")
         self._stream = stream
         self.version = _read_version(self._record)
         self.joined = self.size > 0
@@ -106,9 +106,9 @@ class Part:
         """
         self._stream.flush()
         os.fsync(self._stream.fileno())
-        self._file.replace(self.target)
+        self._file.rename(self.target)
         self._record.unlink(missing_ok=True)
-        sync_folder(self.target.parent)
+        self.target.sync_name()
 
 
 @contextmanager
@@ -125,43 +125,29 @@ def open_part(target: Path) -> Iterator[Part]:
         DownloadError: Another process is downloading the file.
         OSError: The part can't be written.
     """
-    target.parent.mkdir(parents=True, exist_ok=True)
-    with _file(target).open("ab") as stream:
+    folder = ConfinedPath(target.parent)
+    folder.make_root()
+    file = _file_of(folder / target.name)
+    with file.append() as stream:
         try:
             fcntl.flock(stream, fcntl.LOCK_EX | fcntl.LOCK_NB)
             # The process that held the lock until now may have given the file its own name.
-            is_current = os.path.samestat(os.fstat(stream.fileno()), _file(target).stat())
+            is_current = os.path.samestat(os.fstat(stream.fileno()), file.lstat())
         except (BlockingIOError, FileNotFoundError):
             is_current = False
         if not is_current:
             raise DownloadError(f"{target}: another process is downloading it")
-        yield Part(target, stream)
+        yield Part(folder / target.name, stream)
 
 
-def sync_folder(folder: Path) -> None:
-    """Wait until the names in a folder are on the disk.
-
-    Args:
-        folder: The folder.
-
-    Raises:
-        OSError: The folder can't be opened or written.
-    """
-    descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
-    try:
-        os.fsync(descriptor)
-    finally:
-        os.close(descriptor)
-
-
-def _file(target: Path) -> Path:
+def _file_of(target: ConfinedPath) -> ConfinedPath:
     return target.with_name(f"{target.name}.part")
 
 
-def _read_version(record: Path) -> Version:
+def _read_version(record: ConfinedPath) -> Version:
     """Read the version that a part is of; an unknown one where the record is missing or damaged."""
     try:
-        content = untrusted.parse_json(confined(record).read_bytes(_MAX_BYTES))
+        content = untrusted.parse_json(record.read_bytes(_MAX_BYTES))
         version = Version(content["url"], content["validator"], content["total"])
         texts = isinstance(version.url, str) and isinstance(version.validator, str)
         # The validator becomes a header of a request.

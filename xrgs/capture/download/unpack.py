@@ -2,18 +2,20 @@
 
 from __future__ import annotations
 
-import os
 import re
+import secrets
 import shutil
 import stat
-import tempfile
 import zipfile
-from pathlib import Path, PurePosixPath
+from typing import TYPE_CHECKING
 
-from xrgs.capture.download.part import sync_folder
 from xrgs.errors import XrgsError
 from xrgs.runtime.progress import progress
+from xrgs.safeio.confined import ConfinedPath, confined
 from xrgs.safeio.words import for_line
+
+if TYPE_CHECKING:
+    from pathlib import Path
 
 #: Limits for one folder: unpacked bytes, far more than the largest LLFF scene has, and files.
 _MAX_BYTES = 8 << 30
@@ -44,20 +46,20 @@ def unpack(archive: Path, folder: str, target: Path) -> None:
             take it.
     """
     try:
-        with zipfile.ZipFile(archive) as opened:
+        with confined(archive).open() as stream, zipfile.ZipFile(stream) as opened:
             members = _members(opened, archive, folder)
-            target.parent.mkdir(parents=True, exist_ok=True)
-            # In the same file system as the target, so that a rename moves it. A new folder in
-            # the temporary one gets the permissions of the umask.
-            with tempfile.TemporaryDirectory(dir=target.parent, prefix=".unpacking-") as temporary:
-                made = Path(temporary) / target.name
+            home = ConfinedPath(target.parent)
+            home.make_root()
+            # In the same file system as the target, so that a rename moves it.
+            made = home / f".unpacking-{secrets.token_hex(4)}"
+            try:
                 for member in progress(members, f"unpacking {folder}", "file"):
-                    inside = PurePosixPath(member.filename).relative_to(folder)
-                    _write(opened, member, made.joinpath(*inside.parts))
-                for written in (made, *(path for path in made.rglob("*") if path.is_dir())):
-                    sync_folder(written)
-                made.rename(target)
-            sync_folder(target.parent)
+                    _write(opened, member, made / member.filename.removeprefix(f"{folder}/"))
+                made.sync_tree()
+                made.rename(home / target.name)
+            finally:
+                made.remove()
+            (home / target.name).sync_name()
     except UnpackError:
         raise
     except OSError as error:
@@ -104,10 +106,8 @@ def _why_refused(member: zipfile.ZipInfo) -> str:
     return "is encrypted" if member.flag_bits & _ENCRYPTED else ""
 
 
-def _write(opened: zipfile.ZipFile, member: zipfile.ZipInfo, file: Path) -> None:
+def _write(opened: zipfile.ZipFile, member: zipfile.ZipInfo, file: ConfinedPath) -> None:
     """Unpack one file; zipfile reads no more than its header declares, and checks its CRC."""
-    file.parent.mkdir(parents=True, exist_ok=True)
-    with opened.open(member) as source, file.open("xb") as stream:
+    file.parent.make_folder()
+    with opened.open(member) as source, file.create() as stream:
         shutil.copyfileobj(source, stream, _CHUNK)
-        stream.flush()
-        os.fsync(stream.fileno())
