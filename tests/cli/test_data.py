@@ -51,7 +51,7 @@ def test_inspect_builds_a_variant_that_the_store_lacks(
 ) -> None:
     jobs = []
 
-    def build(job: str, request: dict[str, Any]) -> dict[str, Any]:
+    def build(job: str, request: dict[str, Any], *_: object) -> dict[str, Any]:
         jobs.append((job, request["conf"]["scene"]["kind"]))
         return {"variant": "k-1"}
 

@@ -520,12 +520,12 @@ def freeze(baseline: Conf, monkeypatch: pytest.MonkeyPatch) -> Callable[[Store],
 
     def mix(_: object, __: object, ___: object, folder: ConfinedPath) -> Variant:
         views = []
-        for name in ("a", "b"):
-            file = folder / f"images/test/{name}.png"
+        for split in ("test", "train"):
+            file = folder / f"images/{split}/a.png"
             images.save(file, np.full((3, 4, 3), 0.5, np.float32))
-            views.append(View(name, file, "test", "HR", 4, 3, np.eye(3), np.eye(4), 1.0))
-        colors = np.zeros((2, 3), np.uint8)
-        return Variant("", folder, "scene", 5, True, tuple(views), np.ones((2, 3)), colors, {})
+            views.append(View("a", file, split, "HR", 4, 3, np.eye(3), np.eye(4), 1.0))
+        colors = np.zeros((4, 3), np.uint8)
+        return Variant("", folder, "scene", 5, True, tuple(views), np.ones((4, 3)), colors, {})
 
     monkeypatch.setattr(mixing, "mix_resolutions", mix)
     monkeypatch.setattr(scenes, "resolve", lambda *_: None)

@@ -25,12 +25,15 @@ def resolve(store: Path) -> None:
 
 
 def contents(store: Path) -> dict[str, bytes]:
-    """The rendered pictures by their paths; a link or a pipe has the content of its kind."""
+    """The rendered pictures by their paths, without folders that were set aside.
+
+    A link or a pipe has the content of its kind.
+    """
     return {
         str(file.relative_to(store)): file.read_bytes()
         if file.is_file() and not file.is_symlink()
         else b"not a regular file"
-        for file in sorted(store.glob("scenes/*/*.png"))
+        for file in sorted(store.glob("scenes/[!.]*/*.png"))
     }
 
 
@@ -87,7 +90,7 @@ def test_pictures_that_were_not_rendered_are_not_taken(
     shutil.copytree(rendered, store)
     expected = contents(store)
     assert len(expected) == 2
-    change(next(store.glob("scenes/*/*.png")))
+    change(next(store.glob("scenes/[!.]*/*.png")))
     refused = ""
     try:
         resolve(store)

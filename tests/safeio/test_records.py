@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import errno
 import math
+import os
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
@@ -10,8 +12,19 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from xrgs.errors import StoreError, XrgsError
-from xrgs.safeio.records import as_number, read_json, read_object, read_table, table_text
+from xrgs.errors import StoreError, UnreadableError, XrgsError
+from xrgs.safeio.confined import ConfinedPath
+from xrgs.safeio.records import (
+    MAX_BYTES,
+    as_number,
+    errors_named,
+    list_folder,
+    read_file,
+    read_json,
+    read_object,
+    read_table,
+    table_text,
+)
 
 
 @pytest.fixture
@@ -61,12 +74,17 @@ def test_numbers_are_read(value: object, number: float) -> None:
     assert as_number(value) == number
 
 
+@pytest.mark.parametrize("value", [math.inf, "-inf", "1e400", 1e30, "-1e30"])
+def test_infinity_and_the_largest_number_are_numbers(value: float | str) -> None:
+    assert as_number(value) == float(value)
+
+
 @pytest.mark.parametrize("value", [None, ""])
 def test_a_missing_number_is_nan(value: object) -> None:
     assert math.isnan(as_number(value))
 
 
-@pytest.mark.parametrize("value", [True, [], {}, "x", 10**400])
+@pytest.mark.parametrize("value", [True, [], {}, "x", 10**400, 1.1e30, "-1.1e30", "1e308"])
 def test_anything_else_is_not_a_number(value: object) -> None:
     with pytest.raises(ValueError):  # noqa: PT011 - float's own messages
         as_number(value)
@@ -86,3 +104,50 @@ def test_a_table_is_read_back_exactly(rows: list[list[str]]) -> None:
     assert header == (["view", "x", "y"] if rows else ["view", "x"])
     assert found[0][:2] == ["=1", "0.1"]
     assert [[row[0], row[2]] for row in found[1:]] == rows
+
+
+def test_a_file_of_exactly_the_bound_is_read_and_a_larger_one_is_named(file: Path) -> None:
+    file.write_bytes(bytes(MAX_BYTES))
+    assert len(read_file(file)) == MAX_BYTES
+    file.write_bytes(bytes(MAX_BYTES + 1))
+    with pytest.raises(StoreError, match=f"file: {MAX_BYTES + 1} bytes, at most {MAX_BYTES}"):
+        read_file(file)
+
+
+def test_a_table_has_at_most_20000_rows_and_1000_columns(file: Path) -> None:
+    file.write_text("a\n" + "1\n" * 20_000)
+    assert len(read_table(file)[1]) == 20_000
+    file.write_text("a\n" + "1\n" * 20_001)
+    with pytest.raises(StoreError, match="more than 20000 rows"):
+        read_table(file)
+    file.write_text(",".join(map(str, range(1000))))
+    assert len(read_table(file)[0]) == 1000
+    file.write_text(",".join(map(str, range(1001))))
+    with pytest.raises(StoreError, match="1000 columns"):
+        read_table(file)
+
+
+def test_a_folder_is_listed_or_named(tmp_path: Path) -> None:
+    root = ConfinedPath(tmp_path)
+    (tmp_path / "b").mkdir()
+    (tmp_path / "a").symlink_to("gone")
+    assert list_folder(root) == ["a", "b"]
+    assert list_folder(root / "none") == []
+    for name in ("a", "a/inside"):
+        with pytest.raises(StoreError, match=name) as refused:
+            list_folder(root / name)
+        assert not isinstance(refused.value, UnreadableError)
+    with pytest.raises(UnreadableError, match="none"):
+        list_folder(ConfinedPath(tmp_path / "none") / "cells")
+
+
+@pytest.mark.parametrize(
+    ("number", "passes"),
+    [(errno.EACCES, True), (errno.EIO, True), (errno.ESTALE, True), (errno.ENOENT, False)],
+)
+def test_an_error_that_may_pass_says_nothing_of_the_content(number: int, passes: bool) -> None:
+    with pytest.raises(StoreError, match=r"^a/b: ") as raised, errors_named(Path("a/b")):
+        raise OSError(number, os.strerror(number), "b")
+    assert isinstance(raised.value, UnreadableError) == passes
+    with pytest.raises(StoreError, match="a/b: is a link"), errors_named(Path("a/b")):
+        raise OSError(errno.ELOOP, "too many links")

@@ -61,7 +61,7 @@ ALLOWED: dict[str, tuple[str, str]] = {
         "its own folder in /tmp, and a file that the user names",
     ),
     "evaluation/lpips/weights": (
-        "expanduser is_file mkdir replace unlink",
+        "expanduser is_file mkdir",
         "the cache of the user, who may name a link",
     ),
     "experiment/provenance": ("read_text", "/proc"),

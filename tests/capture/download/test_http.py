@@ -292,21 +292,25 @@ def test_a_file_is_on_the_disk_before_it_has_its_name(
 ) -> None:
     """The bytes are synced before the rename, and the folder after it."""
     events: list[str] = []
-    sync, rename = os.fsync, Path.replace
+    sync, rename = os.fsync, os.rename
 
     def synced(descriptor: int) -> None:
         events.append("sync " + Path(f"/proc/self/fd/{descriptor}").readlink().name)
         sync(descriptor)
 
-    def renamed(self: Path, to: Path) -> Path:
-        events.append(f"rename to {to.name}")
-        return rename(self, to)
+    def renamed(old: str, new: str, **folders: int) -> None:
+        events.append(f"rename {old} to {new}")
+        rename(old, new, **folders)
 
     monkeypatch.setattr(os, "fsync", synced)
-    monkeypatch.setattr(Path, "replace", renamed)
+    monkeypatch.setattr(os, "rename", renamed)
     server.content = CONTENT
     download(server.url, target, MOST)
-    assert events[-3:] == ["sync scenes.zip.part", "rename to scenes.zip", "sync made"]
+    assert events[-3:] == [
+        "sync scenes.zip.part",
+        "rename scenes.zip.part to scenes.zip",
+        "sync made",
+    ]
 
 
 def test_a_disk_that_can_not_take_it_is_named(server: Any, tmp_path: Path) -> None:

@@ -132,7 +132,8 @@ def open_part(target: Path) -> Iterator[Part]:
         try:
             fcntl.flock(stream, fcntl.LOCK_EX | fcntl.LOCK_NB)
             # The process that held the lock until now may have given the file its own name.
-            is_current = os.path.samestat(os.fstat(stream.fileno()), file.lstat())
+            opened = os.fstat(stream.fileno())
+            is_current = file.identity() == (opened.st_dev, opened.st_ino)
         except (BlockingIOError, FileNotFoundError):
             is_current = False
         if not is_current:
