@@ -90,7 +90,6 @@ FILE_FUNCTIONS: dict[str, dict[str, str]] = {
     "tempfile.": {
         "bench/against": "a folder of its own in /tmp",
         "bench/scale": "a folder of its own in /tmp",
-        "capture/download/unpack": "a new folder beside the photographs",
         "capture/sfm": "a folder in /tmp for COLMAP, whose database takes a plain path",
         "evaluation/lpips/download": "a folder of its own in /tmp",
         "experiment/store": "a nameless file, to see whether the disk has room",
@@ -101,7 +100,6 @@ FILE_FUNCTIONS: dict[str, dict[str, str]] = {
     "json.load": {},
     "json.loads": {
         "bench/against_worker": "may run in an environment that has another version of xrgs",
-        "sweep/jobs/worker": "the request of its own parent process",
     },
     "csv.reader": {},
     "csv.DictReader": {},

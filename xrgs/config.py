@@ -497,7 +497,7 @@ def from_file(file: Path | ConfinedPath) -> Conf:
         ) from error
     except XrgsError as error:
         raise XrgsError(f"{file}: {error}") from error
-    except (ValueError, TypeError) as error:
+    except (OverflowError, ValueError, TypeError) as error:
         raise XrgsError(f"{file}: it holds no config ({error})") from error
 
 

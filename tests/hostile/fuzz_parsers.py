@@ -180,12 +180,18 @@ def _seal_cell(cell: Path, _: Path) -> None:
 
 
 def _of_variants(folder: Path) -> dict[str, Parser]:
-    def load(_: Path) -> object:
-        return variant.load(folder)
+    def load_sealed(_: Path) -> object:
+        sealed = folder
+        with suppress(Exception):  # a variant that can't be sealed is tried as it is
+            sealed = reference.seal_variant(folder)
+        try:
+            return variant.load(sealed)
+        finally:
+            sealed.rename(folder)
 
     def changed(name: str, mutate: Mutation, *, sealed: bool = True) -> Parser:
-        seal = partial(_seal_variant, folder) if sealed else (lambda _: None)
-        return Parser(folder / name, mutate, load, (variant.CorruptVariant,), seal=seal)
+        load = load_sealed if sealed else (lambda _: variant.load(folder))
+        return Parser(folder / name, mutate, load, (variant.CorruptVariant,))
 
     return {
         "variant": changed("variant.json", mutate_json),
@@ -194,11 +200,6 @@ def _of_variants(folder: Path) -> dict[str, Parser]:
         "variant-image": changed("images/train/left.png", mutate_image),
         "variant-unsealed": changed("variant.json", mutate_json, sealed=False),
     }
-
-
-def _seal_variant(folder: Path, _: Path) -> None:
-    with suppress(Exception):  # a variant that can't be sealed is tried as it is
-        reference.seal_variant(folder).rename(folder)
 
 
 def _of_images(folder: Path) -> dict[str, Parser]:

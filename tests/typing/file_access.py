@@ -66,8 +66,8 @@ ALLOWED: dict[str, tuple[str, str]] = {
     ),
     "experiment/provenance": ("read_text", "/proc"),
     "runtime/processes": ("exists iterdir read_text readlink write_text", "/proc"),
-    "sweep/jobs/worker": ("exists read_text", "its own folder in /tmp"),
-    "sweep/launch": ("expanduser mkdir", "the folder that Hydra is given, and a path of the user"),
+    "sweep/jobs/worker": ("exists", "its own folder in /tmp"),
+    "sweep/launch": ("expanduser", "the folder that Hydra is given, and a path of the user"),
     "sweep/rerun": ("exists resolve", "the folder of a cell that the user names"),
     "sweep/session": (
         "exists mkdir open read_text",

@@ -19,7 +19,7 @@ from xrgs.safeio import npz, untrusted
 from xrgs.safeio.atomic import atomic_writer, write_json
 from xrgs.safeio.confined import ConfinedPath, confined, is_passing
 from xrgs.safeio.hashing import digest
-from xrgs.safeio.records import read_object
+from xrgs.safeio.records import errors_named, read_object
 from xrgs.safeio.words import for_line
 
 if TYPE_CHECKING:
@@ -269,7 +269,7 @@ def _assembled(folder: ConfinedPath, content: dict[str, Any]) -> Variant:
     """
     file = folder / POINTS
     try:
-        with file.open() as stream:
+        with errors_named(file), file.open() as stream:
             arrays = npz.read(stream)
         points, colors = arrays["points"], arrays["colors"]
     except (ValueError, KeyError) as error:

@@ -154,6 +154,8 @@ def read_table(path: Path | ConfinedPath) -> tuple[list[str], list[list[str]]]:
         raise StoreError(f"{path}: {error}") from error
     if len(rows) > _MAX_ROWS - 2 or len(header) > _MAX_COLUMNS:
         raise StoreError(f"{path}: more than {_MAX_ROWS - 2} rows or {_MAX_COLUMNS} columns")
+    if not header:
+        raise StoreError(f"{path}: the header is empty")
     if len(set(header)) < len(header) or any(len(row) != len(header) for row in rows):
         raise StoreError(
             f"{path}: two columns have one name, or a row is not as long as the header"
