@@ -13,7 +13,6 @@ import json
 import os
 import random
 import shutil
-import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field
@@ -38,8 +37,9 @@ from xrgs.training.checkpoint import Checkpoint, CheckpointError
 
 pytestmark = pytest.mark.skipif(not Path("/proc/self/fd").exists(), reason="it reads /proc")
 
-#: Sampled states of each prefix beside the two in which nothing and all of what may be lost is.
-SAMPLES = 4
+#: Sampled states of each prefix beside those in which nothing or all of what may be lost is, or all
+#: of it is zeros.
+SAMPLES, ZEROED = 4, 2.0
 #: Calls of `os` that are recorded. A name that is made by any other is found out.
 CALLS = ("open", "mkdir", "rename", "replace", "unlink", "remove", "rmdir", "fsync")
 #: A tree of files: their contents by their path, None for a folder.
@@ -107,7 +107,11 @@ class Disk:
             self.durable |= {i for i, n in enumerate(self.names) if n.folder == event.node}
 
     def after_failure(self, chance: random.Random, kept: float) -> Tree:
-        """Return a tree that may be found; `kept` is how likely each step is that may be lost."""
+        """Return a tree that may be found.
+
+        `kept` is how likely each step is that may be lost; at `ZEROED`, all names are there and
+        all content that was not synced is zeros.
+        """
         steps = [n for i, n in enumerate(self.names) if i in self.durable or chance.random() < kept]
         entries: dict[int, dict[str, int]] = {}
         for step in steps:
@@ -128,6 +132,8 @@ class Disk:
         now, safe = self.contents[node], self.synced.get(node)
         if now == safe or kept == 1:
             return now
+        if kept == ZEROED:
+            return bytes(len(now))
         torn = [b"", now[: chance.randrange(len(now) + 1)], bytes(len(now)), now]
         return (safe or b"") if kept == 0 else chance.choice([*torn, *([safe] if safe else [])])
 
@@ -293,7 +299,7 @@ def states(recorder: Recorder, tmp_path: Path) -> Iterator[tuple[int, Path]]:
         patch.setattr(os, "fsync", lambda _: None)  # what is done then is not to fail again
         for count, disk in recorder.disks():
             stage = sum(count >= mark for mark in recorder.marks.values())
-            for kept in (0.0, 1.0, *[0.5] * SAMPLES):
+            for kept in (0.0, 1.0, ZEROED, *[0.5] * SAMPLES):
                 found = disk.after_failure(chance, kept)
                 key = hash(tuple(found.items()))
                 if key in seen.setdefault(stage, set()):
@@ -446,8 +452,6 @@ def test_what_is_not_synced_is_found(
             sync(recorder, path, **named)
 
     monkeypatch.setattr(Recorder, "_fsync", forgotten)
-    # Many, since few states show a file of the right size with other content.
-    monkeypatch.setattr(sys.modules[__name__], "SAMPLES", 100)
     for fault in attempts.faults(recorded_run(attempts)):
         found = found - {fault}
         if not found:
