@@ -275,7 +275,7 @@ def test_a_disk_that_fails_within_the_points_says_nothing_of_the_variant(
     folder = forge()
     failure = OSError(errno.EIO, os.strerror(errno.EIO))
     monkeypatch.setattr(npz, "read", Mock(side_effect=failure))
-    with pytest.raises(UnreadableError, match=f"{folder.name}: Input/output error; try again"):
+    with pytest.raises(UnreadableError, match=r"points\.npz: Input/output error; try again"):
         frozen.load(folder)
 
 

@@ -19,6 +19,8 @@ from tests.hostile.sandbox import Ended
 MAX_CPU_S = 5.0
 MAX_WALL_S = 30.0
 MAX_RSS = 1 << 30
+#: To verify a store is to read all of it.
+MAX_CPU_GB_S = 4.0
 #: Training a cell imports torch.
 MAX_CPU_TRAINING_S = 30.0
 #: Categories of characters that a terminal, an editor or a spreadsheet may obey.
@@ -28,7 +30,7 @@ _NUMBER = re.compile(r"[+-]?(\d[\d,]*(\.\d*)?|\.\d+)([eE][+-]?\d+)?( [↑↓=])?
 #: What would be run or loaded where the page or the table is shown.
 _ACTIVE = {
     "table.md": re.compile(
-        r"(?<!\\)<(script|img|iframe)|\]\((?!figures/)|(?<!\\)!\[[^\]]*\]\(http", re.I
+        r"(?<!\\)<(script|img|iframe)|(?<!\\)\]\((?!figures/)|(?<!\\)!\[[^\]]*\]\(http", re.I
     ),
     "table.tex": re.compile(r"\\(input|write|include|openout|catcode)\b"),
 }
@@ -37,7 +39,8 @@ _ACTIVE = {
 def verdicts(look: Look, ended: Ended) -> Iterator[str]:
     """Yield what is wrong with how a command ended and with what it printed."""
     text = ended.output.decode("utf-8", "replace")
-    if ended.hung or ended.cpu_s > (MAX_CPU_TRAINING_S if look.can_train else MAX_CPU_S):
+    most = MAX_CPU_TRAINING_S if look.can_train else MAX_CPU_S + look.hashed_gb * MAX_CPU_GB_S
+    if ended.hung or ended.cpu_s > most:
         yield "hang"
     elif ended.code < 0:
         yield f"signal {-ended.code}"

@@ -23,6 +23,8 @@ class Look:
     """What the output must hold of the healthy rest of the store."""
     succeeds: bool = False
     """Whether the command must end with 0: nothing that it reads is at fault."""
+    hashed_gb: float = 0.0
+    """Size of the files that the command is asked to hash, in units of 10^9 bytes."""
     can_train: bool = False
     """Whether the command trains a cell where it refuses nothing, which takes memory and time."""
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import struct
 import zlib
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from functools import cache, partial
 from pathlib import Path
 
@@ -113,7 +114,9 @@ def _declared(name: str, store: Path) -> list[Look]:
         folder / "variant.json",
         lambda d: [v.update(width=width, height=height) for v in d["views"]],
     )
-    return _listed(name, store)
+    inspected, others = _listed(name, store)
+    too_large = width * height > 1 << 26
+    return [replace(inspected, names=("variant.json" if too_large else ".png",)), others]
 
 
 CASES: Mapping[str, Maker] = {

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 from collections.abc import Mapping
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
@@ -34,6 +35,7 @@ def _declared(name: str, store: Path) -> list[Look]:
     hashed = name in {"scores.csv", "history.csv", "summary.json", "identity.json", "config.json"}
     named, done = (name, 3) if hashed else ("", None)
     verified = status(store, named, done=done, verify=True)
+    verified = replace(verified, succeeds=False, hashed_gb=_SIZE / 1e9)
     return [report(store, named), verified, plan(store, done=done)]
 
 

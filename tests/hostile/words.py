@@ -178,7 +178,7 @@ def _inspected(store: Path) -> list[Look]:
     edit(folder / "variant.json", lambda d: d.update(scene=evil(store)))
     values = {"tags": ESCAPES, "not_registered": [ESCAPES], "lr": [ESCAPES], "images": ESCAPES}
     edit(folder / "report.json", lambda d: d.update(values, attempts=[{"attempt": ESCAPES}]))
-    return [*all_looks(store), inspect(folder, shows=("view_1",))]
+    return _looks_at_damaged_variant(store, folder)
 
 
 def _inspected_view(store: Path) -> list[Look]:
@@ -191,7 +191,13 @@ def _inspected_view(store: Path) -> list[Look]:
 def _scene_of_lines(store: Path) -> list[Look]:
     folder = variant_of(store)
     edit(folder / "variant.json", lambda d: d.update(scene="one\ntwo\nthree\n"))
-    return [inspect(folder, shows=("view_1",)), *all_looks(store)]
+    return _looks_at_damaged_variant(store, folder)
+
+
+def _looks_at_damaged_variant(store: Path, folder: Path) -> list[Look]:
+    """A name that is not one line of text is refused, and no plan goes on with the variant."""
+    others = [status(store), report(store), cells(store), plan(store, done=None)]
+    return [*others, inspect(folder, "variant.json")]
 
 
 def _score_views(store: Path) -> list[Look]:

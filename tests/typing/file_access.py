@@ -69,10 +69,6 @@ ALLOWED: dict[str, tuple[str, str]] = {
     "sweep/jobs/worker": ("exists", "its own folder in /tmp"),
     "sweep/launch": ("expanduser", "the folder that Hydra is given, and a path of the user"),
     "sweep/rerun": ("exists resolve", "the folder of a cell that the user names"),
-    "sweep/session": (
-        "exists mkdir open read_text",
-        "the new folder that Hydra made for this call",
-    ),
     "training/plugins": ("is_file rglob", "installed packages"),
 }
 

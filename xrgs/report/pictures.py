@@ -34,8 +34,8 @@ if TYPE_CHECKING:
     _Drawing = Callable[[ConfinedPath], "Picture"]  # draws into the file
 
 _CURVES = {"gaussians": "Gaussians", "loss": "loss of the step's view, as each run weighs it"}
-#: Largest image that is drawn; three are in memory at a time.
-_MAX_PIXELS = 50_000_000
+#: Largest image that is drawn: three are in memory at a time, 12 bytes a pixel, and their drawing.
+_MAX_PIXELS = 1 << 24
 #: The most pictures that are drawn without being asked for by name; each takes up to a second.
 _MAX_PICTURES = 100
 #: The most ablations that one figure of trade-offs can name.

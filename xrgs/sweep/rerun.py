@@ -148,7 +148,7 @@ def _read(original: CellFolder) -> tuple[Conf, dict[str, Any]]:
     conf = config.from_file(original.folder / "config.json")
     try:
         identity, conf.threads = original.identity(), int(original.provenance()["threads"])
-    except (KeyError, TypeError, ValueError) as error:
+    except (KeyError, OverflowError, TypeError, ValueError) as error:
         raise XrgsError(f"{original.path}: identity.json or provenance.json: {error!r}") from error
     if not _VARIANT.fullmatch(str(identity.get("variant"))):
         raise XrgsError(f"{original.folder / 'identity.json'}: variant={identity.get('variant')}")
