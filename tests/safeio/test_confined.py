@@ -369,3 +369,19 @@ def test_a_root_is_made_on_its_own_only_where_nothing_has_its_name(tmp_path: Pat
     with pytest.raises(FileExistsError):
         made.make_folder(exclusive=True)
     assert made.siblings() == ["new"]
+
+
+def test_a_root_is_reached_through_a_folder_that_cant_be_listed(
+    root: ConfinedPath, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    opened = os.open
+
+    def refuse(path: str | Path, *arguments: int, **keywords: int) -> int:
+        if Path(path) == root.root.parent:
+            raise PermissionError(errno.EACCES, os.strerror(errno.EACCES), path)
+        return opened(path, *arguments, **keywords)
+
+    monkeypatch.setattr(os, "open", refuse)
+    assert ConfinedPath(root.root / "a/b/file").read_bytes() == b"abc"
+    assert root.is_dir()
+    assert not ConfinedPath(root.root / "none" / "file").exists()

@@ -274,8 +274,7 @@ class ConfinedPath:
 
     def siblings(self) -> list[str]:
         """Return the names in the folder that this is in, sorted."""
-        with self._located() as (folder, _):
-            return sorted(os.listdir(folder))  # noqa: PTH208  Path lists no descriptor
+        return self._around().names()
 
     def iterdir(self) -> list[ConfinedPath]:
         """Return the paths in this folder, sorted by name."""
@@ -457,7 +456,7 @@ class ConfinedPath:
 
         A file whose content was synced can still be lost with its name in a power failure.
         """
-        with self._located() as (folder, _):
+        with self._around()._opened() as folder, self._naming_errors():
             _sync_folder(folder)
 
     def sync_tree(self) -> None:
@@ -521,15 +520,20 @@ class ConfinedPath:
             raise OSError(errno.EINVAL, "not a regular file", str(self))
         return descriptor
 
+    def _around(self) -> ConfinedPath:
+        """Return the folder that this is in, of a root as well."""
+        return self.parent if self.parts else ConfinedPath(self.root.parent)
+
     @contextmanager
-    def _located(self) -> Iterator[tuple[int, str]]:
+    def _located(self) -> Iterator[tuple[int | None, str]]:
         """Open the folder that this is in; yield its descriptor and the last name.
 
-        An error in the block names the whole path, and not the last name alone.
+        For a root, which the user has named, the descriptor is None and the name its whole path:
+        the folder around it need not be readable. An error in the block names the whole path.
         """
         if not self.parts:
-            with ConfinedPath(self.root.parent)._opened() as folder, self._naming_errors():
-                yield folder, self.root.name or "."
+            with self._naming_errors():
+                yield None, str(self.root)
             return
         with self.parent._opened() as folder, self._naming_errors():
             yield folder, self.parts[-1]
