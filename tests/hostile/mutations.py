@@ -83,7 +83,9 @@ def _truncate(random: Random, content: bytes) -> bytes:
 
 
 def _append(random: Random, content: bytes) -> bytes:
-    return content + random.choice((b"\0", b"\xff", b"\n", content)) * random.choice((1, 3, 1000))
+    added = random.choice((b"\0", b"\xff", b"\n", content)) or b"\0"
+    most = max(1, _MAX_BYTES // len(added))
+    return content + added * min(most, random.choice((1, 3, 1000)))
 
 
 def _duplicate(random: Random, content: bytes) -> bytes:

@@ -115,7 +115,7 @@ def _declared(name: str, store: Path) -> list[Look]:
         lambda d: [v.update(width=width, height=height) for v in d["views"]],
     )
     inspected, others = _listed(name, store)
-    too_large = width * height > 1 << 26
+    too_large = max(width, height) > 1 << 16 or width * height > 1 << 26
     return [replace(inspected, names=("variant.json" if too_large else ".png",)), others]
 
 

@@ -42,7 +42,7 @@ def content(folder: Path) -> dict[str, bytes]:
 def test_a_report_is_the_same_byte_for_byte(study: Any) -> None:
     sweep_id = study.write()
     first = build(study.store.path)
-    assert first.folder == study.store.reports / sweep_id
+    assert first.folder == study.store.path / "reports" / sweep_id
     before = content(first.folder)
     shutil.rmtree(first.folder)
     assert build(study.store.path, sweep_id) == first

@@ -106,6 +106,7 @@ def test_a_file_that_cannot_be_written_stops_nothing(tmp_path: Path) -> None:
         "[]",
         "{}",
         '{"what": "a", "unit": "b", "done": "x", "total": 1, "rate": 1}',
+        '{"what": "a", "unit": "b", "done": 1, "total": "", "rate": 1}',
         '{"what": "a", "unit": "b", "done": Infinity, "total": 1, "rate": 1}',
         '{"what": "a", "unit": "b", "done": 1, "total": 1, "rate": "fast"}',
     ],

@@ -208,7 +208,8 @@ def read(file: ConfinedPath) -> Progress | None:
         content = untrusted.parse_json(file.read_bytes(_MAX_BYTES))
         what, unit = (for_line(str(content[key]), _MAX_WORD) for key in ("what", "unit"))
         done, total, rate = content["done"], content["total"], content["rate"]
-        if not all(type(n) is int and 0 <= n < _MAX_COUNT for n in (done, total or 0)):
+        counts = (done,) if total is None else (done, total)
+        if not all(type(n) is int and 0 <= n < _MAX_COUNT for n in counts):
             return None
         known = rate is not None and 1 / _MAX_COUNT < rate < _MAX_COUNT
         return Progress(what, unit, done, total, float(rate) if known else None)
