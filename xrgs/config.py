@@ -203,6 +203,18 @@ class RenderScaleConf:
 
 
 @dataclass
+class SupersampledConf:
+    """LR views rendered larger and brought down as their photographs were, not in the paper."""
+
+    factor: int = MISSING
+    """How many times the width and height of an LR photograph its view is rendered at; 1 is off."""
+    late_factor: int = MISSING
+    """The same from step `late_from` on."""
+    late_from: int = MISSING
+    """Step of a 30,000-step run."""
+
+
+@dataclass
 class ConsistencyConf:
     """Cross-resolution consistency loss (paper, section 5.6)."""
 
@@ -282,6 +294,7 @@ class ComponentsConf:
     densify: DensifyConf = field(default_factory=DensifyConf)
     curriculum: CurriculumConf = field(default_factory=CurriculumConf)
     render_scale: RenderScaleConf = field(default_factory=RenderScaleConf)
+    supersampled: SupersampledConf = field(default_factory=SupersampledConf)
     consistency: ConsistencyConf = field(default_factory=ConsistencyConf)
     adaptive_weighting: AdaptiveWeightingConf = field(default_factory=AdaptiveWeightingConf)
     region_weighting: RegionWeightingConf = field(default_factory=RegionWeightingConf)

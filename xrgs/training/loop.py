@@ -99,7 +99,7 @@ def _run_steps(run: _Run, checkpoint: Checkpoint) -> None:
     components, optimizer, densifier = run.components, run.optimizer, run.densifier
     sampler, recorder, gaussians = run.sampler, run.recorder, run.optimizer.gaussians
     for step in progress(sampler, "training", "step", run.steps, done=sampler.next_step):
-        view, camera = step.view, step.view.camera
+        view, camera = step.view, components.render_camera(step.view.camera, step)
         sh_degree = min(step.number // run.sh_every, raster.sh_degree)
         # Render the view of this step. The gradient of the offset is for densification.
         means2d_offset = torch.zeros(len(gaussians), 2, requires_grad=True)
@@ -112,7 +112,7 @@ def _run_steps(run: _Run, checkpoint: Checkpoint) -> None:
             backend=backend,
         )
         # Loss: L1 and SSIM against the photograph, then the terms and weights of the components.
-        image, target = render.image, run.targets[view.name]
+        image, target = components.to_photograph(render.image, step), run.targets[view.name]
         weights = components.pixel_weights(step)
         loss = photometric_loss(
             image, target, l1=1 - ssim, ssim=ssim, pixel_weight=weights, backend=backend

@@ -3,7 +3,8 @@
 One step of training runs these hooks, each for every component that is on:
 
 1. `allows_view` while the sampler chooses the step's view,
-2. `before_render` on the activated Gaussians, then the view is rendered,
+2. `before_render` on the activated Gaussians and `render_camera` on the view's camera, then the
+   view is rendered, and `to_photograph` brings the render to the size of the photograph,
 3. `pixel_weights` for the photometric loss, then `modify_loss` on that loss, then backward,
 4. `after_backward` on the gradients of the parameters, then the optimizer steps,
 5. `densification_grad2d` on the image-plane gradient, then densification reads it,
@@ -148,6 +149,35 @@ class Component:
         del step
         return activated
 
+    def render_camera(self, camera: Camera, step: Step) -> Camera:
+        """Choose the camera that the step's view is rendered with.
+
+        Args:
+            camera: The camera of the view, or what the components before this one made of it.
+            step: The step with its view.
+
+        Returns:
+            A camera that shows the same at any size in px.
+        """
+        del step
+        return camera
+
+    def to_photograph(self, image: Tensor, step: Step) -> Tensor:
+        """Bring a render to the size of the photograph, as the photograph was formed.
+
+        A component that changes the size in `render_camera` brings it back here.
+
+        Args:
+            image: The render [h, w, 3] of the step's view, or what the components behind this one
+                made of it: they are called in reverse order.
+            step: The step with its view.
+
+        Returns:
+            The image [H, W, 3] that is compared with the photograph, differentiable in `image`.
+        """
+        del step
+        return image
+
     def pixel_weights(self, step: Step) -> Tensor | None:
         """Weight the pixels of the view in the photometric loss.
 
@@ -165,7 +195,7 @@ class Component:
 
         Args:
             loss: Scalar; the photometric loss as the components before this one have changed it.
-            image: [H, W, 3] render of the view, not clamped to 0..1.
+            image: [H, W, 3] render of the view at the photograph's size, not clamped to 0..1.
             gaussians: The N Gaussians that are trained; a term may depend on their parameters.
             step: The step with its view.
 
@@ -262,6 +292,18 @@ class Components(tuple[Component, ...]):
         for component in self:
             activated = component.before_render(activated, step)
         return activated
+
+    def render_camera(self, camera: Camera, step: Step) -> Camera:
+        """Apply `Component.render_camera` of each component in turn."""
+        for component in self:
+            camera = component.render_camera(camera, step)
+        return camera
+
+    def to_photograph(self, image: Tensor, step: Step) -> Tensor:
+        """Apply `Component.to_photograph` of each component, the last one first."""
+        for component in reversed(self):
+            image = component.to_photograph(image, step)
+        return image
 
     def pixel_weights(self, step: Step) -> Tensor | None:
         """The product [H, W] of the components' pixel weights; None where none has any."""
