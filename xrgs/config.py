@@ -173,9 +173,8 @@ class DensifyConf:
     """Resolution-aware densification and pruning (paper, section 5.4)."""
 
     decide: str = MISSING
-    """Whose thresholds hold at a refinement: `nobody` (off: one set for all views), `per_class` or
-    `current_view`; `xrgs.training.components.densify` explains them. Our choice where the paper is
-    silent."""
+    """Whose thresholds hold at a refinement: `nobody` (off: one set for all views), `current_view`,
+    `per_class` or `own_threshold`; `xrgs.training.components.densify` explains them."""
     lr_grow: float = MISSING
     """Threshold to grow in LR views, times `splat.densify.grow_grad2d`, which is that of HR views.
     The paper gives no values, only threshold_HR < threshold_LR."""

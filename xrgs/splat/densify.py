@@ -32,6 +32,9 @@ from xrgs.splat.settings import DensifySettings
 SPLIT_SHRINK = 1.6
 """The scales of a split Gaussian are divided by this in its two halves (section 5.2)."""
 
+DECIDE = ("current_view", "per_class", "own_threshold")
+"""The values of `Groups.decide`."""
+
 _COUNTED_BY_GROUP = ("grown", "pruned_opacity")
 
 
@@ -85,18 +88,28 @@ class Thresholds:
 class Groups:
     """Groups of views with thresholds of their own.
 
-    Not `pooled`, each group has statistics of its own. A Gaussian grows where any group's mean
-    gradient is above that group's threshold. It is pruned by the threshold of one group: the first,
-    in the order given, in a view of which it had an image-plane gradient since the last refinement
-    (being in the view's frustum is not enough: in a forward-facing scene every Gaussian is in every
-    frustum), or the last group if it had none in any view.
+    `decide` says which of them hold:
 
-    `pooled`, all views add to one statistic, and the group of the view at whose step Gaussians are
-    refined sets both thresholds.
+    - `current_view`: all views add to one statistic, and the group of the view at whose step
+      Gaussians are refined sets both thresholds.
+    - `per_class`: each group has statistics of its own. A Gaussian grows where any group's mean
+      gradient is above that group's threshold. It is pruned by the threshold of one group: the
+      first, in the order given, in a view of which it had an image-plane gradient since the last
+      refinement (being in the view's frustum is not enough: in a forward-facing scene every
+      Gaussian is in every frustum), or the last group if it had none in any view.
+    - `own_threshold`: a Gaussian grows where the mean over all views of its gradient, each divided
+      by the threshold of the view's own group, is above 1. It is pruned as with `per_class`.
+
+    Raises:
+        ValueError: `decide` is none of these.
     """
 
     thresholds: Mapping[str, Thresholds]
-    pooled: bool = False
+    decide: str
+
+    def __post_init__(self) -> None:
+        if self.decide not in DECIDE:
+            raise ValueError(f"decide={self.decide}: must be one of {', '.join(DECIDE)}")
 
 
 class Densifier:
@@ -145,7 +158,8 @@ class Densifier:
         self.generator = generator
         self.shared_thresholds = Thresholds(settings.grow_grad2d, settings.prune_opacity)
         self.group_thresholds = {} if groups is None else dict(groups.thresholds)
-        self.per_group = groups is not None and not groups.pooled
+        self.decide = "current_view" if groups is None else groups.decide
+        self.per_group = self.decide != "current_view"
         #: Which of the G statistics the views of each group add to.
         self.group_rows = {
             name: row if self.per_group else 0 for row, name in enumerate(self.group_thresholds)
@@ -236,8 +250,12 @@ class Densifier:
         grow = self.grad2d_sum.new_tensor([t.grow_grad2d for t in deciding.values()])  # [G]
         mean_grad2d = self.grad2d_sum / self.visible_count.clamp_min(1)  # [G, N]
         above = mean_grad2d > grow[:, None]  # [G, N]
+        high_gradient = above.any(dim=0)  # [N]
+        if self.decide == "own_threshold":
+            of_threshold = (self.grad2d_sum / grow[:, None]).sum(dim=0)  # [N]
+            high_gradient = of_threshold > self.visible_count.sum(dim=0)
         deciding_row = self._deciding_row()  # [N], before growing
-        grown, parents = self._grow(above.any(dim=0))
+        grown, parents = self._grow(high_gradient)
         prune = self.grad2d_sum.new_tensor([t.prune_opacity for t in deciding.values()])  # [G]
         # Copies and halves are pruned by the threshold of their parent.
         pruned, low_opacity = self._prune(prune, deciding_row[parents], prune_large=prune_large)

@@ -111,7 +111,7 @@ class Other(Component):
 
     def densification_groups(self, settings: DensifySettings) -> Groups:
         del settings
-        return Groups({"HR": Thresholds(1.0, 1.0), "LR": Thresholds(1.0, 1.0)})
+        return Groups({"HR": Thresholds(1.0, 1.0), "LR": Thresholds(1.0, 1.0)}, "per_class")
 
     def state_dict(self) -> dict[str, Any]:
         return {"count": self.count} if self.count else {}
