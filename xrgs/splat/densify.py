@@ -15,7 +15,7 @@ On the native backend, nothing here depends on the number of threads or on the p
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from types import ModuleType
 from typing import Any
@@ -24,13 +24,16 @@ import torch
 from torch import Tensor
 
 from xrgs.splat.backend import implementation
-from xrgs.splat.gaussians import PARAMETERS
+from xrgs.splat.gaussians import PARAMETERS, Gaussians
 from xrgs.splat.optimizer import SplatOptimizer
 from xrgs.splat.quaternions import rotation_matrices
 from xrgs.splat.settings import DensifySettings
 
 SPLIT_SHRINK = 1.6
 """The scales of a split Gaussian are divided by this in its two halves (section 5.2)."""
+
+_OPAQUE = 1 - 2**-24
+"""The largest opacity whose logit is finite in float32."""
 
 DECIDE = ("current_view", "per_class", "own_threshold")
 """The values of `Groups.decide`."""
@@ -125,7 +128,9 @@ class Densifier:
 
     `groups` may replace `grow_grad2d` and `prune_opacity` by thresholds for each group of views.
     The cap is then that of the largest opacity threshold, since the next refinement would prune
-    every opacity that is capped below its threshold.
+    every opacity that is capped below its threshold. Where renders attenuate opacities, the
+    attenuated ones are capped, as by Mip-Splatting [yu2024]: capping the others would leave
+    Gaussians that are too faint to be rendered, and to be pruned.
 
     Attributes:
         grad2d_sum: [G, N] sum of the norms of the image-plane gradients, in normalised device
@@ -141,6 +146,7 @@ class Densifier:
         scene_scale: float,
         generator: torch.Generator,
         groups: Groups | None = None,
+        attenuation: Callable[[Gaussians], Tensor | None] = lambda _: None,
     ) -> None:
         """Start with empty statistics.
 
@@ -150,12 +156,15 @@ class Densifier:
             scene_scale: Extent of the scene, world units.
             generator: Random generator that draws the means of the two halves of a split.
             groups: Groups of views; None has one, with the thresholds of `settings`.
+            attenuation: Returns the factors [N] in 0..1 by which every render lowers the opacities
+                of the Gaussians, or None where it does not. A reset caps the lowered opacities.
         """
         self.optimizer = optimizer
         self.gaussians = optimizer.gaussians
         self.settings = settings
         self.scene_scale = scene_scale
         self.generator = generator
+        self.attenuation = attenuation
         self.shared_thresholds = Thresholds(settings.grow_grad2d, settings.prune_opacity)
         self.group_thresholds = {} if groups is None else dict(groups.thresholds)
         self.decide = "current_view" if groups is None else groups.decide
@@ -368,9 +377,12 @@ class Densifier:
         thresholds = self.group_thresholds.values() or [self.shared_thresholds]
         largest = max(threshold.prune_opacity for threshold in thresholds)
         cap_opacity = torch.tensor(self.settings.reset_opacity * largest, dtype=torch.float64)
-        cap = torch.logit(cap_opacity).item()
+        attenuation = self.attenuation(self.gaussians)  # [N]
+        if attenuation is not None:
+            cap_opacity = (cap_opacity / attenuation.double()).clamp(max=_OPAQUE)
         opacities = self.gaussians.opacities
-        self.optimizer.reset("opacities", opacities.clamp(max=cap))
+        cap = torch.logit(cap_opacity).to(opacities)
+        self.optimizer.reset("opacities", torch.minimum(opacities, cap))
         return int((opacities > cap).sum())
 
     @property

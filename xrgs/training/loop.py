@@ -161,6 +161,7 @@ def _set_up(data: Dataset, conf: Conf, extra_components: Iterable[Component]) ->
         scene_scale=data.scene_scale,
         generator=seeded_generator(conf.seed, "densify"),
         groups=components.densification_groups(splat.densify),
+        attenuation=components.opacity_attenuation,
     )
     return _Run(
         splat=splat,

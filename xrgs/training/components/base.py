@@ -10,7 +10,8 @@ One step of training runs these hooks, each for every component that is on:
 5. `densification_grad2d` on the image-plane gradient, then densification reads it,
 6. `on_gaussians_changed` where densification has added, removed or reset Gaussians.
 
-`densification_groups` is called once before the first step, `after_training` once after the last.
+`densification_groups` is called once before the first step, `after_training` once after the last,
+and `opacity_attenuation` where densification resets opacities.
 """
 
 from __future__ import annotations
@@ -241,6 +242,21 @@ class Component:
         del settings
         return None
 
+    def opacity_attenuation(self, gaussians: Gaussians) -> Tensor | None:
+        """Tell by how much `before_render` lowers opacities in every view.
+
+        Training asks when it resets the opacities, with Gaussians that `on_gaussians_changed` has
+        not been told of yet.
+
+        Args:
+            gaussians: The N Gaussians.
+
+        Returns:
+            Factors [N] above 0 and at most 1, or None where opacities stay as they are.
+        """
+        del gaussians
+        return None
+
     def on_gaussians_changed(self, gaussians: Gaussians) -> None:
         """Update what depends on the number and the order of the Gaussians.
 
@@ -344,6 +360,11 @@ class Components(tuple[Component, ...]):
                 " one of them off"
             )
         return next(iter(groups.values()), None)
+
+    def opacity_attenuation(self, gaussians: Gaussians) -> Tensor | None:
+        """The product [N] of the components' attenuations; None where none has any."""
+        factors = [f for c in self if (f := c.opacity_attenuation(gaussians)) is not None]
+        return functools.reduce(torch.mul, factors) if factors else None
 
     def on_gaussians_changed(self, gaussians: Gaussians) -> None:
         """Call `Component.on_gaussians_changed` of each component in turn."""

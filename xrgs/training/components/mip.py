@@ -50,7 +50,8 @@ class Mip(Component):
     since means move (as the authors' code does, the latter only after densification there). A
     Gaussian that no view sees has the lowest rate of those that are seen, as there; where none is
     seen, nothing is filtered. Densification reads the parameters without the filter, as there.
-    After training the filter becomes part of the scales and opacities that are saved.
+    A reset caps the opacities with the filter, as there. After training the filter becomes part of
+    the scales and opacities that are saved.
 
     Attributes:
         variance: [N] variance of each Gaussian's filter, s / nu_k^2, in world units squared.
@@ -80,6 +81,14 @@ class Mip(Component):
         if settings.variance == 0:
             return None
         return cls(settings, setup.data.train, setup.splat.raster.near)
+
+    def opacity_attenuation(self, gaussians: Gaussians) -> Tensor:
+        """Return the factors [N] by which the filter lowers the opacities."""
+        self._update_variance(gaussians.means)
+        # In double, which rounds to one float32 whatever computes its last digits.
+        scales = gaussians.scales.detach().double().exp()
+        _, lowered = smooth(scales, scales.new_ones(len(scales)), self.variance.double())
+        return lowered
 
     def on_gaussians_changed(self, gaussians: Gaussians) -> None:
         """Compute the filter of the Gaussians as they are now."""
