@@ -147,6 +147,9 @@ class TrainConf:
     views: str = MISSING
     """`mixed`: all views as the variant has them. The controls: `all_hr`, the originals in place of
     the degraded views; `hr_only` and `lr_only`, the views of one tag."""
+    evaluate_every: int = MISSING
+    """Steps of this run between two evaluations of the test views during training; 0 evaluates them
+    after the last step alone."""
 
 
 @dataclass
@@ -380,6 +383,7 @@ def to_conf(cfg: DictConfig) -> Conf:
     _check_plugins(conf.components)
     least_values = (
         ("train.steps", conf.train.steps, 1),
+        ("train.evaluate_every", conf.train.evaluate_every, 0),
         ("threads", conf.threads, 0),
         ("checkpoint_s", conf.checkpoint_s, 0),
         ("limits.minutes", conf.limits.minutes, 0),

@@ -14,7 +14,7 @@ import torch
 from xrgs.runtime.progress import progress
 from xrgs.splat.backend import resolve_backend
 from xrgs.splat.densify import Densifier, Refinement
-from xrgs.splat.gaussians import from_points
+from xrgs.splat.gaussians import PARAMETERS, Gaussians, from_points
 from xrgs.splat.loss import photometric_loss, prepare_target
 from xrgs.splat.optimizer import SplatOptimizer
 from xrgs.splat.rasterize import rasterize_parameters
@@ -27,12 +27,15 @@ from xrgs.training.sampler import EpochSampler
 from xrgs.training.seeding import seeded_generator
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable
+    from collections.abc import Callable, Iterable, Mapping
 
     from xrgs.capture.dataset import Dataset
     from xrgs.config import Conf, SplatConf
     from xrgs.splat.loss import Target
     from xrgs.training.components import Component
+
+    #: Scores of Gaussians by name; None where one is not available.
+    Evaluate = Callable[[Gaussians], Mapping[str, float | None]]
 
 
 def train(
@@ -40,6 +43,7 @@ def train(
     conf: Conf,
     checkpoint: Checkpoint | None = None,
     extra_components: Iterable[Component] = (),
+    evaluate: Evaluate | None = None,
 ) -> TrainingResult:
     """Train one configuration. The same data, config and seed give the same bits.
 
@@ -50,6 +54,8 @@ def train(
         checkpoint: Where the state of the run is written. A state that its `load` has read is
             continued from. None writes nothing.
         extra_components: Components that run behind those that the config switches on.
+        evaluate: Scores Gaussians as they would be saved, by names of its own; it is called after
+            every `train.evaluate_every` steps but the last, and its time is no training time.
 
     Returns:
         The trained Gaussians and the record of the training.
@@ -71,8 +77,9 @@ def train(
         sampler=run.sampler,
         recorder=run.recorder,
     )
-    _run_steps(run, checkpoint)
+    _run_steps(run, checkpoint, evaluate)
     gaussians = run.optimizer.gaussians
+    run.components.bake(gaussians)
     run.components.after_training(gaussians)
     return run.recorder.finish(gaussians)
 
@@ -83,6 +90,8 @@ class _Run:
 
     splat: SplatConf
     steps: int
+    evaluate_every: int
+    """Steps of this run between two evaluations; 0 evaluates nothing."""
     sh_every: int
     """Steps of this run after which one more SH band is switched on."""
     backend: str
@@ -93,8 +102,24 @@ class _Run:
     sampler: EpochSampler
     recorder: TrainingRecorder
 
+    def evaluates_after(self, step: int) -> bool:
+        """Whether the Gaussians are evaluated after a step; after the last, others do it."""
+        done, every = step + 1, self.evaluate_every
+        return bool(every) and done % every == 0 and done < self.steps
 
-def _run_steps(run: _Run, checkpoint: Checkpoint) -> None:
+    def score(self, evaluate: Evaluate) -> Callable[[], Mapping[str, float | None]]:
+        """Return what evaluates the Gaussians as they would be saved now."""
+        gaussians = self.optimizer.gaussians
+
+        def scores() -> Mapping[str, float | None]:
+            copy = Gaussians(**{name: gaussians[name].detach().clone() for name in PARAMETERS})
+            self.components.bake(copy)
+            return evaluate(copy)
+
+        return scores
+
+
+def _run_steps(run: _Run, checkpoint: Checkpoint, evaluate: Evaluate | None) -> None:
     raster, ssim, backend = run.splat.raster, run.splat.ssim_weight, run.backend
     components, optimizer, densifier = run.components, run.optimizer, run.densifier
     sampler, recorder, gaussians = run.sampler, run.recorder, run.optimizer.gaussians
@@ -135,7 +160,9 @@ def _run_steps(run: _Run, checkpoint: Checkpoint) -> None:
         if refinement != Refinement():
             components.on_gaussians_changed(gaussians)
         recorder.record_refinement(refinement)
-        # Write a checkpoint where one is due, which is no training time.
+        # Evaluate and write a checkpoint where one is due, which is no training time.
+        if evaluate is not None and run.evaluates_after(step.number):
+            recorder.record_scores(step.number + 1, len(gaussians), run.score(evaluate))
         recorder.exclude_time(checkpoint.save_if_due(step.number))
 
 
@@ -166,6 +193,7 @@ def _set_up(data: Dataset, conf: Conf, extra_components: Iterable[Component]) ->
     return _Run(
         splat=splat,
         steps=steps,
+        evaluate_every=conf.train.evaluate_every,
         sh_every=max(1, int(splat.sh_every * steps / NOMINAL_STEPS)),
         backend=backend,
         targets={view.name: prepare_target(view.image) for view in data.train},

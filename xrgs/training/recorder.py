@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections import Counter, defaultdict
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from statistics import fmean
 from typing import TYPE_CHECKING, Any
 
@@ -12,6 +12,8 @@ from xrgs.splat.densify import Refinement
 from xrgs.splat.gaussians import PARAMETERS
 
 if TYPE_CHECKING:
+    from collections.abc import Callable, Mapping
+
     import torch
 
     from xrgs.splat.gaussians import Gaussians
@@ -46,6 +48,9 @@ class TrainingResult:
     grow_grad2d: float
     """The threshold of densification that the Gaussians were trained with, in normalised device
     units (`splat.densify.grow_grad2d`)."""
+    scores: list[dict[str, Any]] = field(default_factory=list)
+    """One row for each evaluation during training: `step` (the number of steps done), `seconds` and
+    `evaluations` (of alpha, both since the start), `gaussians`, and the scores by their names."""
 
 
 class TrainingRecorder:
@@ -68,6 +73,7 @@ class TrainingRecorder:
         self.counts = Counter({"steps_HR": 0, "steps_LR": 0} | Refinement().counts())
         self.logged: defaultdict[str, list[float]] = defaultdict(list)
         self.history: list[dict[str, Any]] = []
+        self.scores: list[dict[str, Any]] = []
         self.memory_bytes = 0
         self.evaluations = 0
 
@@ -102,6 +108,26 @@ class TrainingRecorder:
         """
         self.counts.update(refinement.counts())
 
+    def record_scores(
+        self, steps: int, gaussians: int, evaluate: Callable[[], Mapping[str, float | None]]
+    ) -> None:
+        """Evaluate the Gaussians; the time that it takes is excluded.
+
+        Args:
+            steps: Number of steps done.
+            gaussians: Number of Gaussians.
+            evaluate: Returns the scores by name.
+        """
+        start = time.perf_counter()
+        row = {
+            "step": steps,
+            "seconds": start - self.started,
+            "evaluations": self.evaluations,
+            "gaussians": gaussians,
+        }
+        self.scores.append(row | dict(evaluate()))
+        self.exclude_time(time.perf_counter() - start)
+
     def exclude_time(self, seconds: float) -> None:
         """Exclude from the training time what has just passed with something else.
 
@@ -117,6 +143,7 @@ class TrainingRecorder:
             "counts": dict(self.counts),
             "logged": dict(self.logged),
             "history": self.history,
+            "scores": self.scores,
             "memory_bytes": self.memory_bytes,
             "evaluations": self.evaluations,
         }
@@ -136,6 +163,7 @@ class TrainingRecorder:
         self.counts = Counter(state["counts"])
         self.logged = defaultdict(list, state["logged"])
         self.history = list(state["history"])
+        self.scores = list(state["scores"])
         self.memory_bytes = int(state["memory_bytes"])
         self.evaluations = int(state["evaluations"])
 
@@ -157,6 +185,7 @@ class TrainingRecorder:
             self.memory_bytes,
             self.evaluations,
             self.grow_grad2d,
+            self.scores,
         )
 
 

@@ -157,6 +157,7 @@ def test_a_component_that_overrides_nothing_is_the_identity(
     assert parts.densification_groups(DensifySettings()) is None
     parts.after_backward(gaussians, step)
     parts.on_gaussians_changed(gaussians)
+    parts.bake(gaussians)
     parts.after_training(gaussians)
     for name, value in values.items():
         gradient_now = gaussians[name].grad

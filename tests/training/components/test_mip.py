@@ -201,7 +201,7 @@ def test_what_is_saved_renders_as_what_was_trained() -> None:
     trained = image(mip.before_render(gaussians.activated(), STEP))
     unfiltered = image(gaussians.activated())
     assert (trained - unfiltered).abs().max() > 0.01
-    mip.after_training(gaussians)
+    mip.bake(gaussians)
     torch.testing.assert_close(image(gaussians.activated()), trained, rtol=1e-5, atol=1e-6)
     assert gaussians.scales.is_leaf
     assert gaussians.scales.requires_grad
@@ -222,7 +222,7 @@ def test_extreme_gaussians_stay_finite() -> None:
         gradient = gaussians[name].grad
         assert gradient is not None
         assert torch.isfinite(gradient).all()
-    mip.after_training(gaussians)
+    mip.bake(gaussians)
     assert torch.isfinite(gaussians.scales).all()
     assert torch.isfinite(gaussians.opacities).all()
 

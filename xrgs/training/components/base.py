@@ -10,8 +10,9 @@ One step of training runs these hooks, each for every component that is on:
 5. `densification_grad2d` on the image-plane gradient, then densification reads it,
 6. `on_gaussians_changed` where densification has added, removed or reset Gaussians.
 
-`densification_groups` is called once before the first step, `after_training` once after the last,
-and `opacity_attenuation` where densification resets opacities.
+`densification_groups` is called once before the first step, `opacity_attenuation` where
+densification resets opacities, `bake` wherever the Gaussians are evaluated or saved, and
+`after_training` once after the last step.
 """
 
 from __future__ import annotations
@@ -267,8 +268,18 @@ class Component:
             gaussians: The N Gaussians as they are now.
         """
 
+    def bake(self, gaussians: Gaussians) -> None:
+        """Make what `before_render` does in every view part of the Gaussians, in place.
+
+        It is called on the trained Gaussians before they are saved, and on a copy of them whenever
+        they are evaluated during training.
+
+        Args:
+            gaussians: The N Gaussians.
+        """
+
     def after_training(self, gaussians: Gaussians) -> None:
-        """Change the trained Gaussians in place, before they are evaluated and saved.
+        """Look at the trained Gaussians, before they are saved.
 
         Args:
             gaussians: The N trained Gaussians.
@@ -370,6 +381,11 @@ class Components(tuple[Component, ...]):
         """Call `Component.on_gaussians_changed` of each component in turn."""
         for component in self:
             component.on_gaussians_changed(gaussians)
+
+    def bake(self, gaussians: Gaussians) -> None:
+        """Call `Component.bake` of each component in turn."""
+        for component in self:
+            component.bake(gaussians)
 
     def after_training(self, gaussians: Gaussians) -> None:
         """Call `Component.after_training` of each component in turn."""
