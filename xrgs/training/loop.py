@@ -22,6 +22,7 @@ from xrgs.splat.settings import NOMINAL_STEPS
 from xrgs.training.checkpoint import Checkpoint
 from xrgs.training.components import Components
 from xrgs.training.components import build as build_components
+from xrgs.training.memory import TrainingMemory
 from xrgs.training.recorder import TrainingRecorder, TrainingResult
 from xrgs.training.sampler import EpochSampler
 from xrgs.training.seeding import seeded_generator
@@ -76,12 +77,13 @@ def train(
         components=run.components,
         sampler=run.sampler,
         recorder=run.recorder,
+        memory=run.memory,
     )
     _run_steps(run, checkpoint, evaluate)
     gaussians = run.optimizer.gaussians
     run.components.bake(gaussians)
     run.components.after_training(gaussians)
-    return run.recorder.finish(gaussians)
+    return run.recorder.finish(gaussians, run.memory.largest_bytes)
 
 
 @dataclass(frozen=True)
@@ -101,6 +103,7 @@ class _Run:
     densifier: Densifier
     sampler: EpochSampler
     recorder: TrainingRecorder
+    memory: TrainingMemory
 
     def evaluates_after(self, step: int) -> bool:
         """Whether the Gaussians are evaluated after a step; after the last, others do it."""
@@ -126,30 +129,33 @@ def _run_steps(run: _Run, checkpoint: Checkpoint, evaluate: Evaluate | None) -> 
     for step in progress(sampler, "training", "step", run.steps, done=sampler.next_step):
         view, camera = step.view, components.render_camera(step.view.camera, step)
         sh_degree = min(step.number // run.sh_every, raster.sh_degree)
-        # Render the view of this step. The gradient of the offset is for densification.
+        # The gradient of the offset is for densification.
         means2d_offset = torch.zeros(len(gaussians), 2, requires_grad=True)
-        render = rasterize_parameters(
-            *components.before_render(gaussians.activated(backend=backend), step),
-            camera,
-            raster,
-            sh_degree=sh_degree,
-            means2d_offset=means2d_offset,
-            backend=backend,
-        )
-        # Loss: L1 and SSIM against the photograph, then the terms and weights of the components.
-        image, target = components.to_photograph(render.image, step), run.targets[view.name]
-        weights = components.pixel_weights(step)
-        loss = photometric_loss(
-            image, target, l1=1 - ssim, ssim=ssim, pixel_weight=weights, backend=backend
-        )
-        loss = components.modify_loss(loss, image, gaussians, step)
+        with run.memory.of_forward(step, len(gaussians)):
+            # Render the view of this step.
+            render = rasterize_parameters(
+                *components.before_render(gaussians.activated(backend=backend), step),
+                camera,
+                raster,
+                sh_degree=sh_degree,
+                means2d_offset=means2d_offset,
+                backend=backend,
+            )
+            # Loss: L1 and SSIM against the photograph, then terms and weights of the components.
+            image, target = components.to_photograph(render.image, step), run.targets[view.name]
+            weights = components.pixel_weights(step)
+            loss = photometric_loss(
+                image, target, l1=1 - ssim, ssim=ssim, pixel_weight=weights, backend=backend
+            )
+            loss = components.modify_loss(loss, image, gaussians, step)
         # Backward, then the components' changes of the gradients.
         optimizer.zero_grad()
         torch.autograd.backward(loss)
         components.after_backward(gaussians, step)
         # Optimise, and record the step while its gradients and buffers still exist.
         optimizer.step(camera, sh_degree=sh_degree)
-        recorder.record_step(step, loss, render, optimizer)
+        run.memory.record(render)
+        recorder.record_step(step, loss, render, len(gaussians))
         # Densify, prune and reset. There is no gradient where the render shows no Gaussian.
         grad2d, size = means2d_offset.grad, {"width": camera.width, "height": camera.height}
         if grad2d is not None:
@@ -190,16 +196,18 @@ def _set_up(data: Dataset, conf: Conf, extra_components: Iterable[Component]) ->
         groups=components.densification_groups(splat.densify),
         attenuation=components.opacity_attenuation,
     )
+    targets = {view.name: prepare_target(view.image) for view in data.train}
     return _Run(
         splat=splat,
         steps=steps,
         evaluate_every=conf.train.evaluate_every,
         sh_every=max(1, int(splat.sh_every * steps / NOMINAL_STEPS)),
         backend=backend,
-        targets={view.name: prepare_target(view.image) for view in data.train},
+        targets=targets,
         optimizer=optimizer,
         components=components,
         densifier=densifier,
         sampler=EpochSampler(data.train, conf.seed, steps, components.allows_view),
         recorder=TrainingRecorder(steps, splat.densify.grow_grad2d),
+        memory=TrainingMemory(optimizer, densifier, components, targets, data),
     )

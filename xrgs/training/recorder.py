@@ -9,7 +9,6 @@ from statistics import fmean
 from typing import TYPE_CHECKING, Any
 
 from xrgs.splat.densify import Refinement
-from xrgs.splat.gaussians import PARAMETERS
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
@@ -17,7 +16,6 @@ if TYPE_CHECKING:
     import torch
 
     from xrgs.splat.gaussians import Gaussians
-    from xrgs.splat.optimizer import SplatOptimizer
     from xrgs.splat.rasterize import Render
     from xrgs.training.checkpoint import State
     from xrgs.training.components import Step
@@ -41,8 +39,7 @@ class TrainingResult:
     seconds: float
     """Time of the training steps alone: no loading of data, no evaluation, no checkpoints."""
     memory_bytes: int
-    """Bytes of model, gradients, optimizer and renderer buffers, at the step where they were
-    largest."""
+    """Bytes that training held at the step where they were most (`TrainingMemory`)."""
     evaluations: int
     """Alpha evaluations of all forward passes: the amount of work, independent of the machine."""
     grow_grad2d: float
@@ -54,7 +51,7 @@ class TrainingResult:
 
 
 class TrainingRecorder:
-    """Records the history, time, memory and work of a training run.
+    """Records the history, time and work of a training run.
 
     Its clock starts when it is constructed.
     """
@@ -74,22 +71,17 @@ class TrainingRecorder:
         self.logged: defaultdict[str, list[float]] = defaultdict(list)
         self.history: list[dict[str, Any]] = []
         self.scores: list[dict[str, Any]] = []
-        self.memory_bytes = 0
         self.evaluations = 0
 
-    def record_step(
-        self, step: Step, loss: torch.Tensor, render: Render, optimizer: SplatOptimizer
-    ) -> None:
+    def record_step(self, step: Step, loss: torch.Tensor, render: Render, gaussians: int) -> None:
         """Record a step after its update and before its densification.
 
         Args:
             step: The step, with what the components logged of it.
             loss: Scalar, the loss of the step.
-            render: The step's render; its buffers count as memory.
-            optimizer: The optimizer, with the Gaussians and their gradients.
+            render: The step's render.
+            gaussians: The number of Gaussians.
         """
-        gaussians = optimizer.gaussians
-        self.memory_bytes = max(self.memory_bytes, _training_bytes(render, optimizer))
         self.evaluations += render.evaluations
         self.counts[f"steps_{step.view.tag}"] += 1
         for name, value in step.log.items():
@@ -97,7 +89,7 @@ class TrainingRecorder:
         if step.number % self.row_every == 0 or step.number == self.last_step:
             row = {"step": step.number, "view": step.view.name, "loss": loss.item()}
             means = {name: fmean(values) for name, values in self.logged.items()}
-            self.history.append(row | {"gaussians": len(gaussians)} | self.counts | means)
+            self.history.append(row | {"gaussians": gaussians} | self.counts | means)
             self.logged.clear()
 
     def record_refinement(self, refinement: Refinement) -> None:
@@ -144,7 +136,6 @@ class TrainingRecorder:
             "logged": dict(self.logged),
             "history": self.history,
             "scores": self.scores,
-            "memory_bytes": self.memory_bytes,
             "evaluations": self.evaluations,
         }
 
@@ -164,14 +155,14 @@ class TrainingRecorder:
         self.logged = defaultdict(list, state["logged"])
         self.history = list(state["history"])
         self.scores = list(state["scores"])
-        self.memory_bytes = int(state["memory_bytes"])
         self.evaluations = int(state["evaluations"])
 
-    def finish(self, gaussians: Gaussians) -> TrainingResult:
+    def finish(self, gaussians: Gaussians, memory_bytes: int) -> TrainingResult:
         """Stop the clock and return the result.
 
         Args:
             gaussians: The trained model.
+            memory_bytes: The memory that training held at its peak.
 
         Returns:
             The result; each row of its history has every column.
@@ -182,16 +173,8 @@ class TrainingRecorder:
             gaussians,
             [empty | row for row in self.history],
             seconds,
-            self.memory_bytes,
+            memory_bytes,
             self.evaluations,
             self.grow_grad2d,
             self.scores,
         )
-
-
-def _training_bytes(render: Render, optimizer: SplatOptimizer) -> int:
-    """Bytes of the model, its gradients, the optimizer's state and the renderer's buffers."""
-    model = [optimizer.gaussians[name] for name in PARAMETERS]
-    gradients = [value.grad for value in model if value.grad is not None]
-    tensors = sum(value.nbytes for value in model + gradients)
-    return tensors + optimizer.state_bytes() + render.buffer_bytes

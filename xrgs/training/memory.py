@@ -1,0 +1,133 @@
+"""Counts the memory that training holds: every tensor once, and the renderer's buffers."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import contextmanager
+from types import FunctionType, ModuleType
+from typing import TYPE_CHECKING, Any
+
+import torch
+from torch import Tensor
+
+if TYPE_CHECKING:
+    from xrgs.splat.rasterize import Render
+    from xrgs.training.checkpoint import State
+    from xrgs.training.components import Step
+
+
+_CODE = (type, ModuleType, FunctionType)
+
+
+class TrainingMemory:
+    """The largest number of bytes that a step of training held.
+
+    What a step holds is the model, its gradients and the optimizer's state, the statistics of
+    densification, the photographs with what the loss has prepared of them, the tensors of the
+    components, what autograd saves between forward and backward, and the buffers of the renderer.
+    All are counted as if they existed at once; tensors that share their memory count once. What
+    backward allocates and frees in between is not counted.
+
+    Between two changes of the Gaussians, steps on views of one size and class hold the same, so
+    that one of them is counted.
+
+    Attributes:
+        largest_bytes: The largest count so far.
+    """
+
+    def __init__(self, *holders: object) -> None:
+        """Start with nothing counted.
+
+        Args:
+            holders: Objects that hold tensors throughout training, in their attributes or items.
+        """
+        self.holders = holders
+        self.largest_bytes = 0
+        self._counted: set[tuple[object, ...]] = set()
+        self._saved: dict[int, int] | None = None
+
+    @contextmanager
+    def of_forward(self, step: Step, gaussians: int) -> Iterator[None]:
+        """Note what autograd saves in a block, if a step like this one has not been counted.
+
+        Args:
+            step: The step whose forward pass the block is.
+            gaussians: The number of Gaussians.
+        """
+        kind = (gaussians, step.view.tag, *step.view.image.shape, *sorted(step.log.items()))
+        if kind in self._counted:
+            self._saved = None
+            yield
+            return
+        self._counted.add(kind)
+        self._saved = saved = {}
+
+        def note(tensor: Tensor) -> Tensor:
+            saved.update(_storages([tensor]))
+            return tensor
+
+        with torch.autograd.graph.saved_tensors_hooks(note, lambda tensor: tensor):
+            yield
+
+    def state_dict(self) -> State:
+        """Return the largest count so far."""
+        return {"largest_bytes": self.largest_bytes}
+
+    def load_state_dict(self, state: State) -> None:
+        """Continue from a state that `state_dict` returned.
+
+        Args:
+            state: From a run of the same config and data.
+
+        Raises:
+            KeyError: The count is missing.
+            ValueError: It is not a number.
+        """
+        self.largest_bytes = int(state["largest_bytes"])
+
+    def record(self, render: Render) -> None:
+        """Count a step, if its forward pass was noted, while its gradients exist.
+
+        Args:
+            render: The step's render.
+        """
+        if self._saved is not None:
+            storages = _storages(tensors_in(self.holders)) | self._saved
+            self.largest_bytes = max(
+                self.largest_bytes, sum(storages.values()) + render.buffer_bytes
+            )
+            self._saved = None
+
+
+def tensors_in(value: object) -> Iterator[Tensor]:
+    """Yield the tensors that an object holds: itself, its items and its attributes, all the way.
+
+    Args:
+        value: Any object. Functions, classes and modules hold nothing of their own.
+
+    Yields:
+        Each tensor, and its gradient where it has one.
+    """
+    seen: set[int] = set()
+    waiting: list[Any] = [value]
+    while waiting:
+        inner = waiting.pop()
+        if id(inner) in seen:
+            continue
+        seen.add(id(inner))
+        if isinstance(inner, Tensor):
+            yield inner
+            if inner.is_leaf and inner.grad is not None:
+                yield inner.grad
+        elif isinstance(inner, Mapping):
+            waiting += inner.values()
+        elif isinstance(inner, (list, tuple, set, frozenset)):
+            waiting += inner
+        elif hasattr(inner, "__dict__") and not isinstance(inner, _CODE):
+            waiting += vars(inner).values()
+
+
+def _storages(tensors: Iterable[Tensor]) -> dict[int, int]:
+    """Return the bytes of the memory of tensors by its address."""
+    storages = (tensor.untyped_storage() for tensor in tensors)
+    return {storage.data_ptr(): storage.nbytes() for storage in storages}
