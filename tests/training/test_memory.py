@@ -44,7 +44,7 @@ def test_tensors_are_found_in_items_and_attributes_all_the_way() -> None:
 def test_tensors_that_share_memory_count_once_and_buffers_are_added(data: Dataset) -> None:
     base = torch.zeros(100)
     memory = TrainingMemory([base, base[10:20], base.view(10, 10)], torch.zeros(5).double())
-    with memory.of_forward(step(data), 1):
+    with memory.of_forward(step(data), 1, 0):
         pass
     memory.record(render(1000))
     assert memory.largest_bytes == 400 + 40 + 1000
@@ -53,7 +53,7 @@ def test_tensors_that_share_memory_count_once_and_buffers_are_added(data: Datase
 def test_what_autograd_saves_counts(data: Dataset) -> None:
     x = torch.rand(50, requires_grad=True)
     memory = TrainingMemory(x)
-    with memory.of_forward(step(data), 1):
+    with memory.of_forward(step(data), 1, 0):
         y = x.exp()  # saves its result
         z = y * 2.0 + 1  # saves nothing
         loss = (z * z).sum()  # saves z
@@ -68,7 +68,7 @@ def test_steps_alike_are_counted_once_until_the_gaussians_change(data: Dataset) 
 
     def count(gaussians: int, view: int, elements: int) -> int:
         held[:] = [torch.zeros(elements)]
-        with memory.of_forward(step(data, view), gaussians):
+        with memory.of_forward(step(data, view), gaussians, 0):
             pass
         memory.record(render(0))
         return memory.largest_bytes
@@ -81,10 +81,14 @@ def test_steps_alike_are_counted_once_until_the_gaussians_change(data: Dataset) 
 
 def test_the_state_is_the_largest_count(data: Dataset) -> None:
     memory, again = TrainingMemory(torch.zeros(3)), TrainingMemory()
-    with memory.of_forward(step(data), 1):
+    with memory.of_forward(step(data), 1, 0):
         pass
     memory.record(render(0))
     again.load_state_dict(memory.state_dict())
+    assert again.largest_bytes == 12
+    with again.of_forward(step(data), 1, 0):
+        pass
+    again.record(render(1000))  # a step like one that was counted before
     assert again.largest_bytes == 12
 
 

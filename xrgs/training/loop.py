@@ -131,7 +131,7 @@ def _run_steps(run: _Run, checkpoint: Checkpoint, evaluate: Evaluate | None) -> 
         sh_degree = min(step.number // run.sh_every, raster.sh_degree)
         # The gradient of the offset is for densification.
         means2d_offset = torch.zeros(len(gaussians), 2, requires_grad=True)
-        with run.memory.of_forward(step, len(gaussians)):
+        with run.memory.of_forward(step, len(gaussians), sh_degree):
             # Render the view of this step.
             render = rasterize_parameters(
                 *components.before_render(gaussians.activated(backend=backend), step),

@@ -28,8 +28,8 @@ class TrainingMemory:
     All are counted as if they existed at once; tensors that share their memory count once. What
     backward allocates and frees in between is not counted.
 
-    Between two changes of the Gaussians, steps on views of one size and class hold the same, so
-    that one of them is counted.
+    Steps with as many Gaussians and harmonics, on views of one size and class, hold the same, so
+    that the first of them is counted.
 
     Attributes:
         largest_bytes: The largest count so far.
@@ -43,24 +43,25 @@ class TrainingMemory:
         """
         self.holders = holders
         self.largest_bytes = 0
-        self._counted: set[tuple[object, ...]] = set()
-        self._saved: dict[int, int] | None = None
+        self._counted: set[str] = set()
+        self._saved_bytes: int | None = None
 
     @contextmanager
-    def of_forward(self, step: Step, gaussians: int) -> Iterator[None]:
+    def of_forward(self, step: Step, gaussians: int, sh_degree: int) -> Iterator[None]:
         """Note what autograd saves in a block, if a step like this one has not been counted.
 
         Args:
             step: The step whose forward pass the block is.
             gaussians: The number of Gaussians.
+            sh_degree: Highest band of the spherical harmonics that is rendered.
         """
-        kind = (gaussians, step.view.tag, *step.view.image.shape, *sorted(step.log.items()))
+        size, logged = list(step.view.image.shape), sorted(step.log.items())
+        kind = f"{gaussians} {sh_degree} {step.view.tag} {size} {logged}"
         if kind in self._counted:
-            self._saved = None
             yield
             return
         self._counted.add(kind)
-        self._saved = saved = {}
+        saved: dict[int, int] = {}
 
         def note(tensor: Tensor) -> Tensor:
             saved.update(_storages([tensor]))
@@ -68,10 +69,13 @@ class TrainingMemory:
 
         with torch.autograd.graph.saved_tensors_hooks(note, lambda tensor: tensor):
             yield
+        # Now, while all of it exists: later, other tensors may have the same addresses.
+        held = _storages(tensors_in(self.holders))
+        self._saved_bytes = sum(size for address, size in saved.items() if address not in held)
 
     def state_dict(self) -> State:
-        """Return the largest count so far."""
-        return {"largest_bytes": self.largest_bytes}
+        """Return the largest count so far, and which steps need not be counted again."""
+        return {"largest_bytes": self.largest_bytes, "counted": sorted(self._counted)}
 
     def load_state_dict(self, state: State) -> None:
         """Continue from a state that `state_dict` returned.
@@ -80,10 +84,12 @@ class TrainingMemory:
             state: From a run of the same config and data.
 
         Raises:
-            KeyError: The count is missing.
-            ValueError: It is not a number.
+            KeyError: An entry is missing.
+            TypeError: An entry is of another type.
+            ValueError: The count is not a number.
         """
         self.largest_bytes = int(state["largest_bytes"])
+        self._counted = set(state["counted"])
 
     def record(self, render: Render) -> None:
         """Count a step, if its forward pass was noted, while its gradients exist.
@@ -91,12 +97,11 @@ class TrainingMemory:
         Args:
             render: The step's render.
         """
-        if self._saved is not None:
-            storages = _storages(tensors_in(self.holders)) | self._saved
-            self.largest_bytes = max(
-                self.largest_bytes, sum(storages.values()) + render.buffer_bytes
-            )
-            self._saved = None
+        if self._saved_bytes is not None:
+            held = sum(_storages(tensors_in(self.holders)).values())
+            count = held + self._saved_bytes + render.buffer_bytes
+            self.largest_bytes = max(self.largest_bytes, count)
+            self._saved_bytes = None
 
 
 def tensors_in(value: object) -> Iterator[Tensor]:
