@@ -147,6 +147,9 @@ class TrainConf:
     views: str = MISSING
     """`mixed`: all views as the variant has them. The controls: `all_hr`, the originals in place of
     the degraded views; `hr_only` and `lr_only`, the views of one tag."""
+    evaluate_every: int = MISSING
+    """Steps of this run between two evaluations of the test views during training; 0 evaluates them
+    after the last step alone."""
 
 
 @dataclass
@@ -173,9 +176,8 @@ class DensifyConf:
     """Resolution-aware densification and pruning (paper, section 5.4)."""
 
     decide: str = MISSING
-    """Whose thresholds hold at a refinement: `nobody` (off: one set for all views), `per_class` or
-    `current_view`; `xrgs.training.components.densify` explains them. Our choice where the paper is
-    silent."""
+    """Whose thresholds hold at a refinement: `nobody` (off: one set for all views), `current_view`,
+    `per_class` or `own_threshold`; `xrgs.training.components.densify` explains them."""
     lr_grow: float = MISSING
     """Threshold to grow in LR views, times `splat.densify.grow_grad2d`, which is that of HR views.
     The paper gives no values, only threshold_HR < threshold_LR."""
@@ -200,6 +202,18 @@ class RenderScaleConf:
     """LR views are rendered with scales times (R_max / R)^gamma, where R is the longer side of the
     view in px; 0 is off. k(R), its values and the meaning of R are our choice where the paper is
     silent."""
+
+
+@dataclass
+class SupersampledConf:
+    """LR views rendered larger and brought down as their photographs were, not in the paper."""
+
+    factor: int = MISSING
+    """How many times the width and height of an LR photograph its view is rendered at; 1 is off."""
+    late_factor: int = MISSING
+    """The same from step `late_from` on."""
+    late_from: int = MISSING
+    """Step of a 30,000-step run."""
 
 
 @dataclass
@@ -282,6 +296,7 @@ class ComponentsConf:
     densify: DensifyConf = field(default_factory=DensifyConf)
     curriculum: CurriculumConf = field(default_factory=CurriculumConf)
     render_scale: RenderScaleConf = field(default_factory=RenderScaleConf)
+    supersampled: SupersampledConf = field(default_factory=SupersampledConf)
     consistency: ConsistencyConf = field(default_factory=ConsistencyConf)
     adaptive_weighting: AdaptiveWeightingConf = field(default_factory=AdaptiveWeightingConf)
     region_weighting: RegionWeightingConf = field(default_factory=RegionWeightingConf)
@@ -368,6 +383,7 @@ def to_conf(cfg: DictConfig) -> Conf:
     _check_plugins(conf.components)
     least_values = (
         ("train.steps", conf.train.steps, 1),
+        ("train.evaluate_every", conf.train.evaluate_every, 0),
         ("threads", conf.threads, 0),
         ("checkpoint_s", conf.checkpoint_s, 0),
         ("limits.minutes", conf.limits.minutes, 0),

@@ -41,3 +41,12 @@ def test_bad_input_is_named(field: str, value: Any, message: str) -> None:
 
 def test_an_image_of_one_pixel_is_accepted() -> None:
     assert Camera(torch.eye(4), torch.eye(3), width=1, height=1).width == 1
+
+
+def test_a_camera_of_another_size_projects_to_the_same_place_of_the_image() -> None:
+    camera = Camera(torch.eye(4), torch.tensor([[90.0, 0, 31], [0, 80, 22], [0, 0, 1]]), 60, 48)
+    resized = camera.resized(20, 96)
+    assert (resized.width, resized.height) == (20, 96)
+    points = torch.tensor([[0.3, -0.2, 2.0], [-0.1, 0.4, 1.5]])
+    before, after = ((c.K @ points.T)[:2] / points.T[2] for c in (camera, resized))  # [2, P]
+    torch.testing.assert_close(after, before * torch.tensor([[1 / 3], [2.0]]))

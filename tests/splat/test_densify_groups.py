@@ -139,7 +139,7 @@ def test_each_group_grows_by_its_own_statistics(
         for view in views:
             view.gradient = view.gradient.abs()
     fine, coarse = (Thresholds(each.grow_grad2d, 0.0) for each in (FINE, COARSE))
-    gaussians, refinement = ours(values, views, Groups({"HR": fine, "LR": coarse}))
+    gaussians, refinement = ours(values, views, Groups({"HR": fine, "LR": coarse}, "per_class"))
     expected: dict[str, set[int]] = {}
     for group, thresholds in (("HR", fine), ("LR", coarse)):
         seen = [view for view in views if view.group == group]
@@ -164,7 +164,7 @@ def test_an_hr_views_gaussian_is_pruned_by_the_hr_threshold(
     rng = np.random.default_rng(seed)
     values, views = values_of(count, rng), views_of(order, count, rng)
     fine, coarse = (Thresholds(float("inf"), each.prune_opacity) for each in (FINE, COARSE))
-    gaussians, refinement = ours(values, views, Groups({"HR": fine, "LR": coarse}))
+    gaussians, refinement = ours(values, views, Groups({"HR": fine, "LR": coarse}, "per_class"))
     drawn = torch.zeros(count, dtype=torch.bool)
     for view in views:
         if view.group == "HR":
@@ -182,8 +182,8 @@ def test_each_group_has_thresholds_of_its_own(ours: Refine) -> None:
     """What the two properties above compare does differ, group by group."""
     rng = np.random.default_rng(0)
     values, views = values_of(300, rng), views_of("hlhl", 300, rng)
-    _, refinement = ours(values, views, Groups({"HR": FINE, "LR": COARSE}))
-    _, swapped = ours(values, views, Groups({"HR": COARSE, "LR": FINE}))
+    _, refinement = ours(values, views, Groups({"HR": FINE, "LR": COARSE}, "per_class"))
+    _, swapped = ours(values, views, Groups({"HR": COARSE, "LR": FINE}, "per_class"))
     assert all(value > 5 for value in refinement.by_group.values())
     assert refinement.by_group["grown_HR"] > swapped.by_group["grown_HR"] + 20
     assert refinement.by_group["grown_LR"] < swapped.by_group["grown_LR"] - 20
@@ -198,7 +198,7 @@ def test_copies_and_halves_are_pruned_by_their_parents_threshold(ours: Refine) -
     every = torch.ones(4, dtype=torch.bool)
     by_hr = torch.tensor([True, False, True, False])  # a copy and a split of each
     views = [View("HR", gradient * by_hr[:, None], every), View("LR", gradient, every)]
-    gaussians, refinement = ours(values, views, Groups({"HR": FINE, "LR": COARSE}))
+    gaussians, refinement = ours(values, views, Groups({"HR": FINE, "LR": COARSE}, "per_class"))
     assert (refinement.duplicated, refinement.split, refinement.pruned_opacity) == (2, 2, 4)
     assert numbers(gaussians) == Counter({0: 2, 2: 2})
 
@@ -208,7 +208,7 @@ def test_pooled_the_last_view_decides_for_all(ours: Refine, order: str) -> None:
     rng = np.random.default_rng(1)
     values, views = values_of(200, rng), views_of(order, 200, rng)
     thresholds = {"HR": FINE, "LR": COARSE}
-    gaussians, refinement = ours(values, views, Groups(thresholds, pooled=True))
+    gaussians, refinement = ours(values, views, Groups(thresholds, "current_view"))
     last = views[-1].group
     assert numbers(gaussians) == gsplats(values, views, thresholds[last])
     others = {key: n for key, n in refinement.by_group.items() if not key.endswith(last)}
@@ -224,7 +224,7 @@ def test_pooled_groups_with_the_same_thresholds_are_as_none(
 ) -> None:
     rng = np.random.default_rng(2)
     values, views = values_of(200, rng), views_of(order, 200, rng)
-    same = Groups({"HR": FINE, "LR": FINE}, pooled=True)
+    same = Groups({"HR": FINE, "LR": FINE}, "current_view")
     (plain, without), (pooled, with_groups) = (
         ours(values, views, groups, step) for groups in (None, same)
     )
@@ -235,12 +235,49 @@ def test_pooled_groups_with_the_same_thresholds_are_as_none(
     assert without.by_group == {}
 
 
+@settings(max_examples=30, deadline=None)
+@given(
+    count=st.integers(1, 60),
+    order=st.text("hl", min_size=1, max_size=6),
+    seed=st.integers(0, 2**32 - 1),
+)
+def test_by_own_thresholds_all_views_share_one_mean(
+    ours: Refine, count: int, order: str, seed: int
+) -> None:
+    """As gsplat with a threshold of 1, and each gradient divided by its view's threshold."""
+    rng = np.random.default_rng(seed)
+    values, views = values_of(count, rng), views_of(order, count, rng)
+    thresholds = {
+        group: Thresholds(each.grow_grad2d, 0.0) for group, each in (("HR", FINE), ("LR", COARSE))
+    }
+    gaussians, _ = ours(values, views, Groups(thresholds, "own_threshold"))
+    scaled = [
+        View(view.group, view.gradient / thresholds[view.group].grow_grad2d, view.visible)
+        for view in views
+    ]
+    assert numbers(gaussians) == gsplats(values, scaled, Thresholds(1.0, 0.0))
+
+
+def test_by_own_thresholds_the_last_view_decides_nothing(ours: Refine) -> None:
+    rng = np.random.default_rng(5)
+    values, (first, second, third) = values_of(200, rng), views_of("hlh", 200, rng)
+    groups = Groups({"HR": FINE, "LR": COARSE}, "own_threshold")
+    one, other = (ours(values, v, groups) for v in ([first, second, third], [first, third, second]))
+    assert numbers(one[0]) == numbers(other[0])
+    assert len(one[0]) != 200
+
+
+def test_an_unknown_way_to_decide_is_refused() -> None:
+    with pytest.raises(ValueError, match="decide=everybody"):
+        Groups({"HR": FINE}, "everybody")
+
+
 def test_the_reset_is_above_every_threshold(ours: Refine) -> None:
     values = values_of(50, np.random.default_rng(3))
     values["opacities"] += 6
     for thresholds in ({"HR": FINE, "LR": COARSE}, {"HR": COARSE, "LR": FINE}):
         views = views_of("l", 50, np.random.default_rng(0))
-        gaussians, refinement = ours(values, views, Groups(thresholds), step=3000)
+        gaussians, refinement = ours(values, views, Groups(thresholds, "per_class"), step=3000)
         assert refinement.reset > 0
         highest = torch.sigmoid(gaussians.opacities.detach()).max().item()
         assert highest == pytest.approx(2 * COARSE.prune_opacity)
@@ -249,4 +286,4 @@ def test_the_reset_is_above_every_threshold(ours: Refine) -> None:
 def test_a_view_of_no_group_is_an_error(ours: Refine) -> None:
     rng = np.random.default_rng(4)
     with pytest.raises(KeyError, match="LR"):
-        ours(values_of(3, rng), views_of("l", 3, rng), Groups({"HR": NOTHING}))
+        ours(values_of(3, rng), views_of("l", 3, rng), Groups({"HR": NOTHING}, "per_class"))

@@ -264,7 +264,7 @@ def test_opacities_at_the_cap_are_not_counted_as_reset(densifier_of: MakeDensifi
 def test_the_group_of_a_gaussian_without_gradients_is_the_last(densifier_of: MakeDensifier) -> None:
     """A gradient of exactly 0 is none: the second group's higher threshold prunes."""
     thresholds = {"HR": Thresholds(1.0, 0.1), "LR": Thresholds(1.0, 0.9)}
-    densifier = densifier_of(uniform(2), groups=Groups(thresholds))
+    densifier = densifier_of(uniform(2), groups=Groups(thresholds, "per_class"))
     view = view_of(2)
     view.gradient[0] = 1e-3
     refinement = densifier.after_step(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -12,12 +13,13 @@ import torch
 from xrgs.capture.dataset import USES, Dataset
 from xrgs.config import CONF_DIR, Conf
 from xrgs.splat import rasterize
+from xrgs.splat.cameras import Camera
 from xrgs.splat.densify import Densifier
 from xrgs.splat.gaussians import PARAMETERS, ActivatedGaussians, Gaussians, from_points
 from xrgs.splat.loss import photometric_loss, prepare_target
 from xrgs.splat.optimizer import SplatOptimizer
 from xrgs.splat.settings import DensifySettings, OptimizerSettings, RasterSettings
-from xrgs.training import components, loop
+from xrgs.training import components, loop, recorder
 from xrgs.training.components import Step
 from xrgs.training.count_matching import train_cell
 from xrgs.training.loop import train
@@ -149,22 +151,91 @@ class HookRecorder(components.Component):
         self.calls.append(("on_gaussians_changed", None))
         self.sizes.append(len(gaussians))
 
-    def after_training(self, gaussians: Gaussians) -> None:
-        self.calls.append(("finish", None))
+    def render_camera(self, camera: Camera, step: Step) -> Camera:
+        self.calls.append(("render_camera", step.number))
+        return camera
+
+    def to_photograph(self, image: torch.Tensor, step: Step) -> torch.Tensor:
+        self.calls.append(("to_photograph", step.number))
+        return image
+
+    def bake(self, gaussians: Gaussians) -> None:
+        self.calls.append(("bake", None))
         gaussians.sh0.data.zero_()
+
+    def after_training(self, gaussians: Gaussians) -> None:
+        self.calls.append(("after_training", None))
+        assert (gaussians.sh0 == 0).all()
 
 
 def test_hooks_are_called_in_the_order_of_a_step(data: Dataset, short: Conf) -> None:
     recorder = HookRecorder()
     result = train(data, short, extra_components=[recorder])
-    each = ("activated", "pixel_weight", "loss", "after_backward", "densification_grad2d")
+    each = (
+        "render_camera",
+        "activated",
+        "to_photograph",
+        "pixel_weight",
+        "loss",
+        "after_backward",
+        "densification_grad2d",
+    )
     in_steps = [call for call in recorder.calls if call[1] is not None]
     assert in_steps == [(name, number) for number in range(short.train.steps) for name in each]
     assert recorder.calls[0] == ("on_gaussians_changed", None)
-    assert recorder.calls[-1] == ("finish", None)
+    assert recorder.calls[-2:] == [("bake", None), ("after_training", None)]
     # The hook was called after every refinement, or the sizes above would not agree.
     assert len(set(recorder.sizes)) > 3
-    assert (result.gaussians.sh0 == 0).all()  # the result is what `finish` made of the Gaussians
+    assert (result.gaussians.sh0 == 0).all()  # the result is what `bake` made of the Gaussians
+
+
+def test_evaluation_changes_no_bit_and_sees_what_would_be_saved(
+    data: Dataset, short: Conf, same: Same
+) -> None:
+    short.train.evaluate_every = 10
+    seen: list[int] = []
+
+    def evaluate(gaussians: Gaussians) -> dict[str, float | None]:
+        seen.append(len(gaussians))
+        assert (gaussians.sh0 == 0).all()  # `bake` was called
+        gaussians.means.fill_(torch.nan)  # a copy: training does not notice
+        return {"psnr": float(len(seen)), "lpips": None}
+
+    result = train(data, short, extra_components=[HookRecorder()], evaluate=evaluate)
+    plain = train(data, short, extra_components=[HookRecorder()])
+    assert same(result.gaussians, plain.gaussians)
+    assert plain.scores == []
+    assert [row["step"] for row in result.scores] == [10, 20, 30]  # not the last of 40
+    assert [row["gaussians"] for row in result.scores] == seen
+    assert [(row["psnr"], row["lpips"]) for row in result.scores] == [
+        (1, None),
+        (2, None),
+        (3, None),
+    ]
+    work = [row["evaluations"] for row in result.scores]
+    assert 0 < work[0] < work[1] < work[2] < result.evaluations
+
+
+def test_the_time_of_an_evaluation_is_no_training_time(
+    data: Dataset, short: Conf, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    now = [0.0]
+    monkeypatch.setattr(recorder, "time", SimpleNamespace(perf_counter=lambda: now[0]))
+    short.train.evaluate_every = 10
+
+    class Clock(components.Component):
+        def after_backward(self, gaussians: Gaussians, step: Step) -> None:
+            del gaussians, step
+            now[0] += 1.0
+
+    def evaluate(gaussians: Gaussians) -> dict[str, float | None]:
+        del gaussians
+        now[0] += 1000.0
+        return {}
+
+    result = train(data, short, extra_components=[Clock()], evaluate=evaluate)
+    assert [row["seconds"] for row in result.scores] == [10.0, 20.0, 30.0]
+    assert result.seconds == 40.0
 
 
 def test_extra_components_run_behind_those_of_the_config(data: Dataset, short: Conf) -> None:

@@ -52,6 +52,9 @@ class Dataset:
     `xrgs.splat.normalize`."""
     factor: int
     """How many times fewer pixels per side the method takes LR views to have."""
+    degradation: str = "downsample"
+    """How LR views were made of HR ones: `downsample`, `digital_zoom`, `jpeg`, or `none` where a
+    camera took them."""
 
 
 def load(variant: Variant, use: str = "mixed") -> Dataset:
@@ -95,6 +98,7 @@ def load(variant: Variant, use: str = "mixed") -> Dataset:
         colors=torch.from_numpy(variant.colors).float() / 255.0,
         scene_scale=world.scene_scale,
         factor=variant.factor,
+        degradation=str(variant.report.get("degradation", "downsample")),
     )
 
 

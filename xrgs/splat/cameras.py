@@ -62,6 +62,16 @@ class Camera:
         position: Tensor = -(first + second + third)  # [3]
         return position
 
+    def resized(self, width: int, height: int) -> Camera:
+        """Return this camera with an image of another size, which shows the same.
+
+        Args:
+            width: The new width, px.
+            height: The new height, px.
+        """
+        scale = self.K.new_tensor([[width / self.width], [height / self.height], [1.0]])  # [3, 1]
+        return Camera(self.viewmat, self.K * scale, width, height)
+
     def to_camera(self, points: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Transform points from the world to the camera.
 

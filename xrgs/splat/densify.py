@@ -15,7 +15,7 @@ On the native backend, nothing here depends on the number of threads or on the p
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from types import ModuleType
 from typing import Any
@@ -24,13 +24,19 @@ import torch
 from torch import Tensor
 
 from xrgs.splat.backend import implementation
-from xrgs.splat.gaussians import PARAMETERS
+from xrgs.splat.gaussians import PARAMETERS, Gaussians
 from xrgs.splat.optimizer import SplatOptimizer
 from xrgs.splat.quaternions import rotation_matrices
 from xrgs.splat.settings import DensifySettings
 
 SPLIT_SHRINK = 1.6
 """The scales of a split Gaussian are divided by this in its two halves (section 5.2)."""
+
+_OPAQUE = 1 - 2**-24
+"""The largest opacity whose logit is finite in float32."""
+
+DECIDE = ("current_view", "per_class", "own_threshold")
+"""The values of `Groups.decide`."""
 
 _COUNTED_BY_GROUP = ("grown", "pruned_opacity")
 
@@ -85,18 +91,28 @@ class Thresholds:
 class Groups:
     """Groups of views with thresholds of their own.
 
-    Not `pooled`, each group has statistics of its own. A Gaussian grows where any group's mean
-    gradient is above that group's threshold. It is pruned by the threshold of one group: the first,
-    in the order given, in a view of which it had an image-plane gradient since the last refinement
-    (being in the view's frustum is not enough: in a forward-facing scene every Gaussian is in every
-    frustum), or the last group if it had none in any view.
+    `decide` says which of them hold:
 
-    `pooled`, all views add to one statistic, and the group of the view at whose step Gaussians are
-    refined sets both thresholds.
+    - `current_view`: all views add to one statistic, and the group of the view at whose step
+      Gaussians are refined sets both thresholds.
+    - `per_class`: each group has statistics of its own. A Gaussian grows where any group's mean
+      gradient is above that group's threshold. It is pruned by the threshold of one group: the
+      first, in the order given, in a view of which it had an image-plane gradient since the last
+      refinement (being in the view's frustum is not enough: in a forward-facing scene every
+      Gaussian is in every frustum), or the last group if it had none in any view.
+    - `own_threshold`: a Gaussian grows where the mean over all views of its gradient, each divided
+      by the threshold of the view's own group, is above 1. It is pruned as with `per_class`.
+
+    Raises:
+        ValueError: `decide` is none of these.
     """
 
     thresholds: Mapping[str, Thresholds]
-    pooled: bool = False
+    decide: str
+
+    def __post_init__(self) -> None:
+        if self.decide not in DECIDE:
+            raise ValueError(f"decide={self.decide}: must be one of {', '.join(DECIDE)}")
 
 
 class Densifier:
@@ -112,7 +128,9 @@ class Densifier:
 
     `groups` may replace `grow_grad2d` and `prune_opacity` by thresholds for each group of views.
     The cap is then that of the largest opacity threshold, since the next refinement would prune
-    every opacity that is capped below its threshold.
+    every opacity that is capped below its threshold. Where renders attenuate opacities, the
+    attenuated ones are capped, as by Mip-Splatting [yu2024]: capping the others would leave
+    Gaussians that are too faint to be rendered, and to be pruned.
 
     Attributes:
         grad2d_sum: [G, N] sum of the norms of the image-plane gradients, in normalised device
@@ -128,6 +146,7 @@ class Densifier:
         scene_scale: float,
         generator: torch.Generator,
         groups: Groups | None = None,
+        attenuation: Callable[[Gaussians], Tensor | None] = lambda _: None,
     ) -> None:
         """Start with empty statistics.
 
@@ -137,15 +156,19 @@ class Densifier:
             scene_scale: Extent of the scene, world units.
             generator: Random generator that draws the means of the two halves of a split.
             groups: Groups of views; None has one, with the thresholds of `settings`.
+            attenuation: Returns the factors [N] in 0..1 by which every render lowers the opacities
+                of the Gaussians, or None where it does not. A reset caps the lowered opacities.
         """
         self.optimizer = optimizer
         self.gaussians = optimizer.gaussians
         self.settings = settings
         self.scene_scale = scene_scale
         self.generator = generator
+        self.attenuation = attenuation
         self.shared_thresholds = Thresholds(settings.grow_grad2d, settings.prune_opacity)
         self.group_thresholds = {} if groups is None else dict(groups.thresholds)
-        self.per_group = groups is not None and not groups.pooled
+        self.decide = "current_view" if groups is None else groups.decide
+        self.per_group = self.decide != "current_view"
         #: Which of the G statistics the views of each group add to.
         self.group_rows = {
             name: row if self.per_group else 0 for row, name in enumerate(self.group_thresholds)
@@ -236,8 +259,12 @@ class Densifier:
         grow = self.grad2d_sum.new_tensor([t.grow_grad2d for t in deciding.values()])  # [G]
         mean_grad2d = self.grad2d_sum / self.visible_count.clamp_min(1)  # [G, N]
         above = mean_grad2d > grow[:, None]  # [G, N]
+        high_gradient = above.any(dim=0)  # [N]
+        if self.decide == "own_threshold":
+            of_threshold = (self.grad2d_sum / grow[:, None]).sum(dim=0)  # [N]
+            high_gradient = of_threshold > self.visible_count.sum(dim=0)
         deciding_row = self._deciding_row()  # [N], before growing
-        grown, parents = self._grow(above.any(dim=0))
+        grown, parents = self._grow(high_gradient)
         prune = self.grad2d_sum.new_tensor([t.prune_opacity for t in deciding.values()])  # [G]
         # Copies and halves are pruned by the threshold of their parent.
         pruned, low_opacity = self._prune(prune, deciding_row[parents], prune_large=prune_large)
@@ -350,9 +377,12 @@ class Densifier:
         thresholds = self.group_thresholds.values() or [self.shared_thresholds]
         largest = max(threshold.prune_opacity for threshold in thresholds)
         cap_opacity = torch.tensor(self.settings.reset_opacity * largest, dtype=torch.float64)
-        cap = torch.logit(cap_opacity).item()
+        attenuation = self.attenuation(self.gaussians)  # [N]
+        if attenuation is not None:
+            cap_opacity = (cap_opacity / attenuation.double()).clamp(max=_OPAQUE)
         opacities = self.gaussians.opacities
-        self.optimizer.reset("opacities", opacities.clamp(max=cap))
+        cap = torch.logit(cap_opacity).to(opacities)
+        self.optimizer.reset("opacities", torch.minimum(opacities, cap))
         return int((opacities > cap).sum())
 
     @property

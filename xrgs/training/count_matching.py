@@ -24,6 +24,7 @@ if TYPE_CHECKING:  # xrgs.config imports Hydra, which training does not need
     from xrgs.capture.dataset import Dataset
     from xrgs.config import Conf
     from xrgs.splat.gaussians import Gaussians
+    from xrgs.training.loop import Evaluate
     from xrgs.training.recorder import TrainingResult
 
 _T = TypeVar("_T")
@@ -37,13 +38,19 @@ _POWER_RANGE = 0.5, 5.0
 """Bounds of the measured p; counts are noisy, and not quite monotone in the threshold."""
 
 
-def train_cell(data: Dataset, conf: Conf, checkpoint: Checkpoint | None = None) -> TrainingResult:
+def train_cell(
+    data: Dataset,
+    conf: Conf,
+    checkpoint: Checkpoint | None = None,
+    evaluate: Evaluate | None = None,
+) -> TrainingResult:
     """Train what a cell's config asks for: count-matched where that is switched on, else once.
 
     Args:
         data: The views to train on and the points to start from.
         conf: The config of the cell.
         checkpoint: Where the state of the run is written; None writes nothing.
+        evaluate: As for `train`.
 
     Returns:
         The trained Gaussians and the record of the training that gave them.
@@ -57,12 +64,15 @@ def train_cell(data: Dataset, conf: Conf, checkpoint: Checkpoint | None = None) 
     check_not_negative("components.count_matched.gaussians", count_matched.gaussians)
     check_not_negative("components.count_matched.tolerance", count_matched.tolerance)
     if count_matched.gaussians == 0:
-        return train(data, conf, checkpoint)
-    return train_count_matched(data, conf, checkpoint)
+        return train(data, conf, checkpoint, evaluate=evaluate)
+    return train_count_matched(data, conf, checkpoint, evaluate)
 
 
 def train_count_matched(
-    data: Dataset, conf: Conf, checkpoint: Checkpoint | None = None
+    data: Dataset,
+    conf: Conf,
+    checkpoint: Checkpoint | None = None,
+    evaluate: Evaluate | None = None,
 ) -> TrainingResult:
     """Train again and again until the number of Gaussians is the one that is asked for.
 
@@ -72,6 +82,7 @@ def train_count_matched(
             tolerance, and `splat.densify.grow_grad2d` is the first threshold.
         checkpoint: Where the state of the search and of the run in progress is written; None
             writes nothing.
+        evaluate: As for `train`.
 
     Returns:
         The result of the run that matched; its `grow_grad2d` is the threshold that was found.
@@ -86,7 +97,7 @@ def train_count_matched(
 
     def train_at(threshold: float) -> TrainingResult:
         splat = replace(conf.splat, densify=replace(densify, grow_grad2d=threshold))
-        return train(data, replace(conf, splat=splat), checkpoint, [count_check])
+        return train(data, replace(conf, splat=splat), checkpoint, [count_check], evaluate)
 
     search = ThresholdSearch(densify.grow_grad2d, count_matched.gaussians)
     checkpoint.register(search=search)

@@ -14,7 +14,7 @@ import torch
 from xrgs.runtime.progress import progress
 from xrgs.splat.backend import resolve_backend
 from xrgs.splat.densify import Densifier, Refinement
-from xrgs.splat.gaussians import from_points
+from xrgs.splat.gaussians import PARAMETERS, Gaussians, from_points
 from xrgs.splat.loss import photometric_loss, prepare_target
 from xrgs.splat.optimizer import SplatOptimizer
 from xrgs.splat.rasterize import rasterize_parameters
@@ -22,17 +22,21 @@ from xrgs.splat.settings import NOMINAL_STEPS
 from xrgs.training.checkpoint import Checkpoint
 from xrgs.training.components import Components
 from xrgs.training.components import build as build_components
+from xrgs.training.memory import TrainingMemory
 from xrgs.training.recorder import TrainingRecorder, TrainingResult
 from xrgs.training.sampler import EpochSampler
 from xrgs.training.seeding import seeded_generator
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable
+    from collections.abc import Callable, Iterable, Mapping
 
     from xrgs.capture.dataset import Dataset
     from xrgs.config import Conf, SplatConf
     from xrgs.splat.loss import Target
     from xrgs.training.components import Component
+
+    #: Scores of Gaussians by name; None where one is not available.
+    Evaluate = Callable[[Gaussians], Mapping[str, float | None]]
 
 
 def train(
@@ -40,6 +44,7 @@ def train(
     conf: Conf,
     checkpoint: Checkpoint | None = None,
     extra_components: Iterable[Component] = (),
+    evaluate: Evaluate | None = None,
 ) -> TrainingResult:
     """Train one configuration. The same data, config and seed give the same bits.
 
@@ -50,6 +55,8 @@ def train(
         checkpoint: Where the state of the run is written. A state that its `load` has read is
             continued from. None writes nothing.
         extra_components: Components that run behind those that the config switches on.
+        evaluate: Scores Gaussians as they would be saved, by names of its own; it is called after
+            every `train.evaluate_every` steps but the last, and its time is no training time.
 
     Returns:
         The trained Gaussians and the record of the training.
@@ -70,11 +77,13 @@ def train(
         components=run.components,
         sampler=run.sampler,
         recorder=run.recorder,
+        memory=run.memory,
     )
-    _run_steps(run, checkpoint)
+    _run_steps(run, checkpoint, evaluate)
     gaussians = run.optimizer.gaussians
+    run.components.bake(gaussians)
     run.components.after_training(gaussians)
-    return run.recorder.finish(gaussians)
+    return run.recorder.finish(gaussians, run.memory.largest_bytes)
 
 
 @dataclass(frozen=True)
@@ -83,6 +92,8 @@ class _Run:
 
     splat: SplatConf
     steps: int
+    evaluate_every: int
+    """Steps of this run between two evaluations; 0 evaluates nothing."""
     sh_every: int
     """Steps of this run after which one more SH band is switched on."""
     backend: str
@@ -92,39 +103,59 @@ class _Run:
     densifier: Densifier
     sampler: EpochSampler
     recorder: TrainingRecorder
+    memory: TrainingMemory
+
+    def evaluates_after(self, step: int) -> bool:
+        """Whether the Gaussians are evaluated after a step; after the last, others do it."""
+        done, every = step + 1, self.evaluate_every
+        return bool(every) and done % every == 0 and done < self.steps
+
+    def score(self, evaluate: Evaluate) -> Callable[[], Mapping[str, float | None]]:
+        """Return what evaluates the Gaussians as they would be saved now."""
+        gaussians = self.optimizer.gaussians
+
+        def scores() -> Mapping[str, float | None]:
+            copy = Gaussians(**{name: gaussians[name].detach().clone() for name in PARAMETERS})
+            self.components.bake(copy)
+            return evaluate(copy)
+
+        return scores
 
 
-def _run_steps(run: _Run, checkpoint: Checkpoint) -> None:
+def _run_steps(run: _Run, checkpoint: Checkpoint, evaluate: Evaluate | None) -> None:
     raster, ssim, backend = run.splat.raster, run.splat.ssim_weight, run.backend
     components, optimizer, densifier = run.components, run.optimizer, run.densifier
     sampler, recorder, gaussians = run.sampler, run.recorder, run.optimizer.gaussians
     for step in progress(sampler, "training", "step", run.steps, done=sampler.next_step):
-        view, camera = step.view, step.view.camera
+        view, camera = step.view, components.render_camera(step.view.camera, step)
         sh_degree = min(step.number // run.sh_every, raster.sh_degree)
-        # Render the view of this step. The gradient of the offset is for densification.
+        # The gradient of the offset is for densification.
         means2d_offset = torch.zeros(len(gaussians), 2, requires_grad=True)
-        render = rasterize_parameters(
-            *components.before_render(gaussians.activated(backend=backend), step),
-            camera,
-            raster,
-            sh_degree=sh_degree,
-            means2d_offset=means2d_offset,
-            backend=backend,
-        )
-        # Loss: L1 and SSIM against the photograph, then the terms and weights of the components.
-        image, target = render.image, run.targets[view.name]
-        weights = components.pixel_weights(step)
-        loss = photometric_loss(
-            image, target, l1=1 - ssim, ssim=ssim, pixel_weight=weights, backend=backend
-        )
-        loss = components.modify_loss(loss, image, gaussians, step)
+        with run.memory.of_forward(step, len(gaussians), sh_degree):
+            # Render the view of this step.
+            render = rasterize_parameters(
+                *components.before_render(gaussians.activated(backend=backend), step),
+                camera,
+                raster,
+                sh_degree=sh_degree,
+                means2d_offset=means2d_offset,
+                backend=backend,
+            )
+            # Loss: L1 and SSIM against the photograph, then terms and weights of the components.
+            image, target = components.to_photograph(render.image, step), run.targets[view.name]
+            weights = components.pixel_weights(step)
+            loss = photometric_loss(
+                image, target, l1=1 - ssim, ssim=ssim, pixel_weight=weights, backend=backend
+            )
+            loss = components.modify_loss(loss, image, gaussians, step)
         # Backward, then the components' changes of the gradients.
         optimizer.zero_grad()
         torch.autograd.backward(loss)
         components.after_backward(gaussians, step)
         # Optimise, and record the step while its gradients and buffers still exist.
         optimizer.step(camera, sh_degree=sh_degree)
-        recorder.record_step(step, loss, render, optimizer)
+        run.memory.record(render)
+        recorder.record_step(step, loss, render, len(gaussians))
         # Densify, prune and reset. There is no gradient where the render shows no Gaussian.
         grad2d, size = means2d_offset.grad, {"width": camera.width, "height": camera.height}
         if grad2d is not None:
@@ -135,7 +166,9 @@ def _run_steps(run: _Run, checkpoint: Checkpoint) -> None:
         if refinement != Refinement():
             components.on_gaussians_changed(gaussians)
         recorder.record_refinement(refinement)
-        # Write a checkpoint where one is due, which is no training time.
+        # Evaluate and write a checkpoint where one is due, which is no training time.
+        if evaluate is not None and run.evaluates_after(step.number):
+            recorder.record_scores(step.number + 1, len(gaussians), run.score(evaluate))
         recorder.exclude_time(checkpoint.save_if_due(step.number))
 
 
@@ -161,16 +194,20 @@ def _set_up(data: Dataset, conf: Conf, extra_components: Iterable[Component]) ->
         scene_scale=data.scene_scale,
         generator=seeded_generator(conf.seed, "densify"),
         groups=components.densification_groups(splat.densify),
+        attenuation=components.opacity_attenuation,
     )
+    targets = {view.name: prepare_target(view.image) for view in data.train}
     return _Run(
         splat=splat,
         steps=steps,
+        evaluate_every=conf.train.evaluate_every,
         sh_every=max(1, int(splat.sh_every * steps / NOMINAL_STEPS)),
         backend=backend,
-        targets={view.name: prepare_target(view.image) for view in data.train},
+        targets=targets,
         optimizer=optimizer,
         components=components,
         densifier=densifier,
         sampler=EpochSampler(data.train, conf.seed, steps, components.allows_view),
         recorder=TrainingRecorder(steps, splat.densify.grow_grad2d),
+        memory=TrainingMemory(optimizer, densifier, components, targets, data),
     )

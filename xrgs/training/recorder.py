@@ -4,18 +4,18 @@ from __future__ import annotations
 
 import time
 from collections import Counter, defaultdict
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from statistics import fmean
 from typing import TYPE_CHECKING, Any
 
 from xrgs.splat.densify import Refinement
-from xrgs.splat.gaussians import PARAMETERS
 
 if TYPE_CHECKING:
+    from collections.abc import Callable, Mapping
+
     import torch
 
     from xrgs.splat.gaussians import Gaussians
-    from xrgs.splat.optimizer import SplatOptimizer
     from xrgs.splat.rasterize import Render
     from xrgs.training.checkpoint import State
     from xrgs.training.components import Step
@@ -39,17 +39,19 @@ class TrainingResult:
     seconds: float
     """Time of the training steps alone: no loading of data, no evaluation, no checkpoints."""
     memory_bytes: int
-    """Bytes of model, gradients, optimizer and renderer buffers, at the step where they were
-    largest."""
+    """Bytes that training held at the step where they were most (`TrainingMemory`)."""
     evaluations: int
     """Alpha evaluations of all forward passes: the amount of work, independent of the machine."""
     grow_grad2d: float
     """The threshold of densification that the Gaussians were trained with, in normalised device
     units (`splat.densify.grow_grad2d`)."""
+    scores: list[dict[str, Any]] = field(default_factory=list)
+    """One row for each evaluation during training: `step` (the number of steps done), `seconds` and
+    `evaluations` (of alpha, both since the start), `gaussians`, and the scores by their names."""
 
 
 class TrainingRecorder:
-    """Records the history, time, memory and work of a training run.
+    """Records the history, time and work of a training run.
 
     Its clock starts when it is constructed.
     """
@@ -68,22 +70,18 @@ class TrainingRecorder:
         self.counts = Counter({"steps_HR": 0, "steps_LR": 0} | Refinement().counts())
         self.logged: defaultdict[str, list[float]] = defaultdict(list)
         self.history: list[dict[str, Any]] = []
-        self.memory_bytes = 0
+        self.scores: list[dict[str, Any]] = []
         self.evaluations = 0
 
-    def record_step(
-        self, step: Step, loss: torch.Tensor, render: Render, optimizer: SplatOptimizer
-    ) -> None:
+    def record_step(self, step: Step, loss: torch.Tensor, render: Render, gaussians: int) -> None:
         """Record a step after its update and before its densification.
 
         Args:
             step: The step, with what the components logged of it.
             loss: Scalar, the loss of the step.
-            render: The step's render; its buffers count as memory.
-            optimizer: The optimizer, with the Gaussians and their gradients.
+            render: The step's render.
+            gaussians: The number of Gaussians.
         """
-        gaussians = optimizer.gaussians
-        self.memory_bytes = max(self.memory_bytes, _training_bytes(render, optimizer))
         self.evaluations += render.evaluations
         self.counts[f"steps_{step.view.tag}"] += 1
         for name, value in step.log.items():
@@ -91,7 +89,7 @@ class TrainingRecorder:
         if step.number % self.row_every == 0 or step.number == self.last_step:
             row = {"step": step.number, "view": step.view.name, "loss": loss.item()}
             means = {name: fmean(values) for name, values in self.logged.items()}
-            self.history.append(row | {"gaussians": len(gaussians)} | self.counts | means)
+            self.history.append(row | {"gaussians": gaussians} | self.counts | means)
             self.logged.clear()
 
     def record_refinement(self, refinement: Refinement) -> None:
@@ -101,6 +99,26 @@ class TrainingRecorder:
             refinement: The counts of one step; all of them are 0 at most steps.
         """
         self.counts.update(refinement.counts())
+
+    def record_scores(
+        self, steps: int, gaussians: int, evaluate: Callable[[], Mapping[str, float | None]]
+    ) -> None:
+        """Evaluate the Gaussians; the time that it takes is excluded.
+
+        Args:
+            steps: Number of steps done.
+            gaussians: Number of Gaussians.
+            evaluate: Returns the scores by name.
+        """
+        start = time.perf_counter()
+        row = {
+            "step": steps,
+            "seconds": start - self.started,
+            "evaluations": self.evaluations,
+            "gaussians": gaussians,
+        }
+        self.scores.append(row | dict(evaluate()))
+        self.exclude_time(time.perf_counter() - start)
 
     def exclude_time(self, seconds: float) -> None:
         """Exclude from the training time what has just passed with something else.
@@ -117,7 +135,7 @@ class TrainingRecorder:
             "counts": dict(self.counts),
             "logged": dict(self.logged),
             "history": self.history,
-            "memory_bytes": self.memory_bytes,
+            "scores": self.scores,
             "evaluations": self.evaluations,
         }
 
@@ -136,14 +154,15 @@ class TrainingRecorder:
         self.counts = Counter(state["counts"])
         self.logged = defaultdict(list, state["logged"])
         self.history = list(state["history"])
-        self.memory_bytes = int(state["memory_bytes"])
+        self.scores = list(state["scores"])
         self.evaluations = int(state["evaluations"])
 
-    def finish(self, gaussians: Gaussians) -> TrainingResult:
+    def finish(self, gaussians: Gaussians, memory_bytes: int) -> TrainingResult:
         """Stop the clock and return the result.
 
         Args:
             gaussians: The trained model.
+            memory_bytes: The memory that training held at its peak.
 
         Returns:
             The result; each row of its history has every column.
@@ -154,15 +173,8 @@ class TrainingRecorder:
             gaussians,
             [empty | row for row in self.history],
             seconds,
-            self.memory_bytes,
+            memory_bytes,
             self.evaluations,
             self.grow_grad2d,
+            self.scores,
         )
-
-
-def _training_bytes(render: Render, optimizer: SplatOptimizer) -> int:
-    """Bytes of the model, its gradients, the optimizer's state and the renderer's buffers."""
-    model = [optimizer.gaussians[name] for name in PARAMETERS]
-    gradients = [value.grad for value in model if value.grad is not None]
-    tensors = sum(value.nbytes for value in model + gradients)
-    return tensors + optimizer.state_bytes() + render.buffer_bytes

@@ -111,7 +111,7 @@ class Other(Component):
 
     def densification_groups(self, settings: DensifySettings) -> Groups:
         del settings
-        return Groups({"HR": Thresholds(1.0, 1.0), "LR": Thresholds(1.0, 1.0)})
+        return Groups({"HR": Thresholds(1.0, 1.0), "LR": Thresholds(1.0, 1.0)}, "per_class")
 
     def state_dict(self) -> dict[str, Any]:
         return {"count": self.count} if self.count else {}
@@ -157,6 +157,7 @@ def test_a_component_that_overrides_nothing_is_the_identity(
     assert parts.densification_groups(DensifySettings()) is None
     parts.after_backward(gaussians, step)
     parts.on_gaussians_changed(gaussians)
+    parts.bake(gaussians)
     parts.after_training(gaussians)
     for name, value in values.items():
         gradient_now = gaussians[name].grad

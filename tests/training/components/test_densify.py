@@ -8,7 +8,7 @@ import pytest
 
 from xrgs.config import ComponentsConf
 from xrgs.errors import XrgsError
-from xrgs.splat.densify import Groups, Thresholds
+from xrgs.splat.densify import DECIDE, Groups, Thresholds
 from xrgs.splat.settings import DensifySettings
 from xrgs.training.components import Components
 
@@ -21,14 +21,14 @@ def on(off: ComponentsConf) -> ComponentsConf:
     return off
 
 
-@pytest.mark.parametrize(("decide", "pooled"), [("per_class", False), ("current_view", True)])
+@pytest.mark.parametrize("decide", DECIDE)
 def test_lr_views_have_other_thresholds_and_hr_views_gsplats(
-    decide: str, pooled: bool, build: Build, on: ComponentsConf
+    decide: str, build: Build, on: ComponentsConf
 ) -> None:
     on.densify.decide = decide
     groups = build(on).densification_groups(DensifySettings())
     hr, lr = Thresholds(2e-4, 0.005), Thresholds(4e-4, 0.015)
-    assert groups == Groups({"HR": hr, "LR": lr}, pooled)
+    assert groups == Groups({"HR": hr, "LR": lr}, decide)
     assert list(groups.thresholds) == ["HR", "LR"]  # the first has precedence in pruning
 
 
@@ -50,4 +50,10 @@ def test_the_baseline_has_no_groups_of_views(build: Build, off: ComponentsConf) 
 def test_an_unknown_value_of_decide_is_refused(build: Build, on: ComponentsConf) -> None:
     on.densify.decide = "everybody"
     with pytest.raises(XrgsError, match=r"^components\.densify\.decide=everybody"):
+        build(on)
+
+
+def test_own_thresholds_of_zero_are_refused(build: Build, on: ComponentsConf) -> None:
+    on.densify.decide, on.densify.lr_grow = "own_threshold", 0.0
+    with pytest.raises(XrgsError, match=r"^components\.densify\.lr_grow=0"):
         build(on)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 
 import pytest
@@ -11,9 +12,11 @@ from torch import Tensor
 from xrgs.capture.dataset import LoadedView
 from xrgs.config import ComponentsConf, MipConf
 from xrgs.splat.cameras import Camera
+from xrgs.splat.densify import Densifier
 from xrgs.splat.gaussians import ActivatedGaussians, Gaussians, from_points
+from xrgs.splat.optimizer import SplatOptimizer
 from xrgs.splat.rasterize import rasterize_parameters
-from xrgs.splat.settings import RasterSettings
+from xrgs.splat.settings import DensifySettings, OptimizerSettings, RasterSettings
 from xrgs.training.components import Components, Step
 from xrgs.training.components.mip import Mip, sampling_rates, smooth
 
@@ -198,7 +201,7 @@ def test_what_is_saved_renders_as_what_was_trained() -> None:
     trained = image(mip.before_render(gaussians.activated(), STEP))
     unfiltered = image(gaussians.activated())
     assert (trained - unfiltered).abs().max() > 0.01
-    mip.after_training(gaussians)
+    mip.bake(gaussians)
     torch.testing.assert_close(image(gaussians.activated()), trained, rtol=1e-5, atol=1e-6)
     assert gaussians.scales.is_leaf
     assert gaussians.scales.requires_grad
@@ -219,7 +222,7 @@ def test_extreme_gaussians_stay_finite() -> None:
         gradient = gaussians[name].grad
         assert gradient is not None
         assert torch.isfinite(gradient).all()
-    mip.after_training(gaussians)
+    mip.bake(gaussians)
     assert torch.isfinite(gaussians.scales).all()
     assert torch.isfinite(gaussians.opacities).all()
 
@@ -269,3 +272,26 @@ def test_a_gaussian_on_the_near_plane_is_not_seen() -> None:
     rates = sampling_rates(means, [at_near], float(depth[0]))
     assert rates[0] == 0
     assert rates[1] == pytest.approx(200.0)
+
+
+def test_a_reset_caps_what_is_rendered() -> None:
+    """Mip-Splatting's reset: the opacity with the filter is at most the cap, for every Gaussian."""
+    gaussians = splats((0, 0, 0), (0.1, 0.1, 0.3), (-0.1, 0, -0.2))
+    gaussians.scales = torch.full((3, 3), math.log(0.02)).requires_grad_()
+    gaussians.opacities = torch.tensor([3.0, -6.0, 1.0]).requires_grad_()
+    mip = on(FAR, CLOSE)
+    optimizer = SplatOptimizer(gaussians, OptimizerSettings(), scene_scale=1.0, steps=30_000)
+    densifier = Densifier(
+        optimizer,
+        DensifySettings(prune_opacity=0.001, reset_opacity=10.0),
+        scene_scale=1.0,
+        generator=torch.Generator(),
+        attenuation=Components([mip]).opacity_attenuation,
+    )
+    visible = torch.ones(3, dtype=torch.bool)
+    assert densifier.after_step(3000, None, visible, width=SIZE, height=SIZE).reset == 2
+    mip.on_gaussians_changed(gaussians)
+    rendered = mip.before_render(gaussians.activated(), STEP).opacities.detach()
+    torch.testing.assert_close(rendered[[0, 2]], torch.full((2,), 0.01))
+    assert gaussians.opacities[1] == -6.0  # it was below the cap before
+    assert (gaussians.opacities.detach().sigmoid()[[0, 2]] > 0.01).all()

@@ -28,6 +28,7 @@ from xrgs.training.components.densify import Densify
 from xrgs.training.components.gradient_scaling import GradientScaling
 from xrgs.training.components.mip import Mip
 from xrgs.training.components.render_scale import RenderScale
+from xrgs.training.components.supersampled import Supersampled
 from xrgs.training.components.weighting import Weighting
 
 if TYPE_CHECKING:  # xrgs.config loads Hydra, which training does without
@@ -57,6 +58,7 @@ BUILT_IN: Mapping[str, type[Component]] = {
     "curriculum": Curriculum,
     "mip": Mip,
     "render_scale": RenderScale,
+    "supersampled": Supersampled,
 }
 
 

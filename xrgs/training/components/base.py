@@ -3,13 +3,16 @@
 One step of training runs these hooks, each for every component that is on:
 
 1. `allows_view` while the sampler chooses the step's view,
-2. `before_render` on the activated Gaussians, then the view is rendered,
+2. `before_render` on the activated Gaussians and `render_camera` on the view's camera, then the
+   view is rendered, and `to_photograph` brings the render to the size of the photograph,
 3. `pixel_weights` for the photometric loss, then `modify_loss` on that loss, then backward,
 4. `after_backward` on the gradients of the parameters, then the optimizer steps,
 5. `densification_grad2d` on the image-plane gradient, then densification reads it,
 6. `on_gaussians_changed` where densification has added, removed or reset Gaussians.
 
-`densification_groups` is called once before the first step, `after_training` once after the last.
+`densification_groups` is called once before the first step, `opacity_attenuation` where
+densification resets opacities, `bake` wherever the Gaussians are evaluated or saved, and
+`after_training` once after the last step.
 """
 
 from __future__ import annotations
@@ -148,6 +151,35 @@ class Component:
         del step
         return activated
 
+    def render_camera(self, camera: Camera, step: Step) -> Camera:
+        """Choose the camera that the step's view is rendered with.
+
+        Args:
+            camera: The camera of the view, or what the components before this one made of it.
+            step: The step with its view.
+
+        Returns:
+            A camera that shows the same at any size in px.
+        """
+        del step
+        return camera
+
+    def to_photograph(self, image: Tensor, step: Step) -> Tensor:
+        """Bring a render to the size of the photograph, as the photograph was formed.
+
+        A component that changes the size in `render_camera` brings it back here.
+
+        Args:
+            image: The render [h, w, 3] of the step's view, or what the components behind this one
+                made of it: they are called in reverse order.
+            step: The step with its view.
+
+        Returns:
+            The image [H, W, 3] that is compared with the photograph, differentiable in `image`.
+        """
+        del step
+        return image
+
     def pixel_weights(self, step: Step) -> Tensor | None:
         """Weight the pixels of the view in the photometric loss.
 
@@ -165,7 +197,7 @@ class Component:
 
         Args:
             loss: Scalar; the photometric loss as the components before this one have changed it.
-            image: [H, W, 3] render of the view, not clamped to 0..1.
+            image: [H, W, 3] render of the view at the photograph's size, not clamped to 0..1.
             gaussians: The N Gaussians that are trained; a term may depend on their parameters.
             step: The step with its view.
 
@@ -211,6 +243,21 @@ class Component:
         del settings
         return None
 
+    def opacity_attenuation(self, gaussians: Gaussians) -> Tensor | None:
+        """Tell by how much `before_render` lowers opacities in every view.
+
+        Training asks when it resets the opacities, with Gaussians that `on_gaussians_changed` has
+        not been told of yet.
+
+        Args:
+            gaussians: The N Gaussians.
+
+        Returns:
+            Factors [N] above 0 and at most 1, or None where opacities stay as they are.
+        """
+        del gaussians
+        return None
+
     def on_gaussians_changed(self, gaussians: Gaussians) -> None:
         """Update what depends on the number and the order of the Gaussians.
 
@@ -221,8 +268,18 @@ class Component:
             gaussians: The N Gaussians as they are now.
         """
 
+    def bake(self, gaussians: Gaussians) -> None:
+        """Make what `before_render` does in every view part of the Gaussians, in place.
+
+        It is called on the trained Gaussians before they are saved, and on a copy of them whenever
+        they are evaluated during training.
+
+        Args:
+            gaussians: The N Gaussians.
+        """
+
     def after_training(self, gaussians: Gaussians) -> None:
-        """Change the trained Gaussians in place, before they are evaluated and saved.
+        """Look at the trained Gaussians, before they are saved.
 
         Args:
             gaussians: The N trained Gaussians.
@@ -262,6 +319,18 @@ class Components(tuple[Component, ...]):
         for component in self:
             activated = component.before_render(activated, step)
         return activated
+
+    def render_camera(self, camera: Camera, step: Step) -> Camera:
+        """Apply `Component.render_camera` of each component in turn."""
+        for component in self:
+            camera = component.render_camera(camera, step)
+        return camera
+
+    def to_photograph(self, image: Tensor, step: Step) -> Tensor:
+        """Apply `Component.to_photograph` of each component, the last one first."""
+        for component in reversed(self):
+            image = component.to_photograph(image, step)
+        return image
 
     def pixel_weights(self, step: Step) -> Tensor | None:
         """The product [H, W] of the components' pixel weights; None where none has any."""
@@ -303,10 +372,20 @@ class Components(tuple[Component, ...]):
             )
         return next(iter(groups.values()), None)
 
+    def opacity_attenuation(self, gaussians: Gaussians) -> Tensor | None:
+        """The product [N] of the components' attenuations; None where none has any."""
+        factors = [f for c in self if (f := c.opacity_attenuation(gaussians)) is not None]
+        return functools.reduce(torch.mul, factors) if factors else None
+
     def on_gaussians_changed(self, gaussians: Gaussians) -> None:
         """Call `Component.on_gaussians_changed` of each component in turn."""
         for component in self:
             component.on_gaussians_changed(gaussians)
+
+    def bake(self, gaussians: Gaussians) -> None:
+        """Call `Component.bake` of each component in turn."""
+        for component in self:
+            component.bake(gaussians)
 
     def after_training(self, gaussians: Gaussians) -> None:
         """Call `Component.after_training` of each component in turn."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Self
 
 from xrgs.errors import XrgsError
-from xrgs.splat.densify import Groups, Thresholds
+from xrgs.splat.densify import DECIDE, Groups, Thresholds
 from xrgs.training.components.base import Component, TrainingSetup, check_not_negative
 
 if TYPE_CHECKING:  # xrgs.config loads Hydra, which training does without
@@ -28,11 +28,17 @@ class Densify(Component):
     `conf/ablation/densify.yaml`. Nor does it say which thresholds apply at a refinement, whose
     statistics are averages over 100 steps on views of both kinds. `decide` chooses:
 
+    - `current_view`, in the ablations `densify` and `xrgs`: all views share one statistic, and the
+      view of the step at which Gaussians are refined sets both thresholds, for all Gaussians. It is
+      the literal reading of sections 5.1 and 5.4.
     - `per_class`: HR and LR views have separate statistics, and a Gaussian grows where either is
-      above its own threshold. The LR prune threshold applies to Gaussians to which no HR view has
-      contributed an image-plane gradient since the last refinement.
-    - `current_view`: all views share one statistic, and the view of the step at which Gaussians are
-      refined sets both thresholds, for all Gaussians. It is the literal reading of the section.
+      above its own threshold. With equal thresholds it is not the identity: either of two means of
+      fewer views is above a threshold more often than the mean of all. The LR prune threshold
+      applies to Gaussians to which no HR view has contributed an image-plane gradient since the
+      last refinement.
+    - `own_threshold`: a Gaussian grows where the mean over all views of its gradient over the
+      view's own threshold is above 1, so that nothing depends on which view the refinement falls
+      on. Pruned as with `per_class`.
 
     The opacity reset follows the larger prune threshold. Otherwise the refinement after a reset
     would prune every Gaussian to which the larger threshold applies.
@@ -47,10 +53,10 @@ class Densify(Component):
         Raises:
             XrgsError: `decide` is unknown.
         """
-        if settings.decide not in {"per_class", "current_view"}:
+        if settings.decide not in DECIDE:
             raise XrgsError(
-                f"components.densify.decide={settings.decide}: must be nobody, per_class or"
-                " current_view"
+                f"components.densify.decide={settings.decide}: must be one of nobody,"
+                f" {', '.join(DECIDE)}"
             )
         self.settings = settings
 
@@ -60,6 +66,8 @@ class Densify(Component):
         del setup
         check_not_negative("components.densify.lr_grow", settings.lr_grow)
         check_not_negative("components.densify.lr_prune", settings.lr_prune)
+        if settings.decide == "own_threshold" and settings.lr_grow == 0:
+            raise XrgsError("components.densify.lr_grow=0.0: must be above 0 with own_threshold")
         return None if settings.decide == "nobody" else cls(settings)
 
     def densification_groups(self, settings: DensifySettings) -> Groups:
@@ -68,4 +76,4 @@ class Densify(Component):
         lr = Thresholds(
             hr.grow_grad2d * self.settings.lr_grow, hr.prune_opacity * self.settings.lr_prune
         )
-        return Groups({"HR": hr, "LR": lr}, pooled=self.settings.decide == "current_view")
+        return Groups({"HR": hr, "LR": lr}, self.settings.decide)

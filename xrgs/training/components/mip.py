@@ -50,7 +50,8 @@ class Mip(Component):
     since means move (as the authors' code does, the latter only after densification there). A
     Gaussian that no view sees has the lowest rate of those that are seen, as there; where none is
     seen, nothing is filtered. Densification reads the parameters without the filter, as there.
-    After training the filter becomes part of the scales and opacities that are saved.
+    A reset caps the opacities with the filter, as there. The filter becomes part of the scales and
+    opacities that are evaluated and saved.
 
     Attributes:
         variance: [N] variance of each Gaussian's filter, s / nu_k^2, in world units squared.
@@ -81,6 +82,14 @@ class Mip(Component):
             return None
         return cls(settings, setup.data.train, setup.splat.raster.near)
 
+    def opacity_attenuation(self, gaussians: Gaussians) -> Tensor:
+        """Return the factors [N] by which the filter lowers the opacities."""
+        self._update_variance(gaussians.means)
+        # In double, which rounds to one float32 whatever computes its last digits.
+        scales = gaussians.scales.detach().double().exp()
+        _, lowered = smooth(scales, scales.new_ones(len(scales)), self.variance.double())
+        return lowered
+
     def on_gaussians_changed(self, gaussians: Gaussians) -> None:
         """Compute the filter of the Gaussians as they are now."""
         self._update_variance(gaussians.means)
@@ -99,7 +108,7 @@ class Mip(Component):
         return activated._replace(scales=scales, opacities=opacities)
 
     @torch.no_grad()
-    def after_training(self, gaussians: Gaussians) -> None:
+    def bake(self, gaussians: Gaussians) -> None:
         """Make the filter part of scales and opacities, so that what was rendered is saved."""
         # In double, which rounds to one float32 whatever computes its last digits.
         scales, opacities = smooth(

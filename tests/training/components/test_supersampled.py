@@ -1,0 +1,163 @@
+"""LR views are rendered larger and brought down as their photographs were; nothing else changes."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import pytest
+import torch
+from torch import Tensor
+from torch.nn.functional import avg_pool2d, interpolate
+
+from xrgs.capture.dataset import Dataset, LoadedView
+from xrgs.config import ComponentsConf, Conf
+from xrgs.errors import XrgsError
+from xrgs.splat.gaussians import from_points
+from xrgs.splat.rasterize import rasterize_parameters
+from xrgs.training import components
+from xrgs.training.components import Components, Step
+from xrgs.training.seeding import seeded_generator
+
+Build = Callable[..., Components]
+
+
+@pytest.fixture
+def on(off: ComponentsConf) -> ComponentsConf:
+    off.supersampled.factor = off.supersampled.late_factor = 2
+    return off
+
+
+def _bicubic(image: Tensor, height: int, width: int) -> Tensor:
+    batch = image.movedim(-1, 0)[None]
+    return interpolate(batch, (height, width), mode="bicubic", antialias=True)[0].movedim(0, -1)
+
+
+def _built(
+    conf: ComponentsConf, baseline: Conf, degradation: str, *views: LoadedView
+) -> Components:
+    points = torch.ones(2, 3)
+    data = Dataset(views, (), points, points, 1.0, 5, degradation)
+    return components.build(conf, data, baseline.splat)
+
+
+def test_it_is_off_in_the_baseline(build: Build, off: ComponentsConf) -> None:
+    assert build(off) == ()
+
+
+def test_an_lr_view_is_rendered_twice_as_large_and_shows_the_same(
+    build: Build, on: ComponentsConf, lr: Step
+) -> None:
+    camera = build(on).render_camera(lr.view.camera, lr)
+    assert (camera.width, camera.height) == (30, 24)
+    point = torch.tensor([[0.3, -0.2, 2.0], [-0.1, 0.4, 1.5]])
+    small, large = ((c.K @ point.T)[:2] / point.T[2] for c in (lr.view.camera, camera))
+    torch.testing.assert_close(large, 2 * small)  # pixel centres are at +0.5 in both
+    assert lr.log == {"supersampled.factor": 2}
+
+
+def test_an_hr_view_is_untouched(build: Build, on: ComponentsConf, hr: Step) -> None:
+    parts, image = build(on), torch.rand(60, 75, 3)
+    assert parts.render_camera(hr.view.camera, hr) is hr.view.camera
+    assert parts.to_photograph(image, hr) is image
+    assert hr.log == {}
+
+
+def test_a_downsampled_view_is_brought_down_by_the_kernel_that_made_it(
+    build: Build, on: ComponentsConf, lr: Step, noise: Callable[[int, int, int], Tensor]
+) -> None:
+    render = noise(24, 30, 3)
+    torch.testing.assert_close(
+        build(on).to_photograph(render, lr), _bicubic(render, 12, 15), rtol=0, atol=1e-12
+    )
+
+
+def test_a_zoomed_view_is_brought_down_to_what_it_resolves_and_up_again(
+    on: ComponentsConf,
+    baseline: Conf,
+    noise: Callable[[int, int, int], Tensor],
+    make_view: Callable[[str, Tensor], LoadedView],
+) -> None:
+    view = make_view("LR", noise(60, 75, 1))
+    parts, step = _built(on, baseline, "digital_zoom", view), Step(0, 1, view)
+    camera = parts.render_camera(view.camera, step)
+    assert (camera.width, camera.height) == (30, 24)
+    render = noise(24, 30, 3)
+    expected = _bicubic(_bicubic(render, 12, 15), 60, 75)
+    torch.testing.assert_close(parts.to_photograph(render, step), expected, rtol=0, atol=1e-12)
+
+
+def test_a_view_that_a_camera_took_averages_over_the_area_of_its_pixels(
+    on: ComponentsConf,
+    baseline: Conf,
+    noise: Callable[[int, int, int], Tensor],
+    make_view: Callable[[str, Tensor], LoadedView],
+) -> None:
+    on.supersampled.factor = 3
+    view = make_view("LR", noise(12, 15, 1))
+    parts, step = _built(on, baseline, "none", view), Step(0, 30_000, view)
+    render = noise(36, 45, 3)
+    pooled = avg_pool2d(render.movedim(-1, 0), 3).movedim(0, -1)
+    torch.testing.assert_close(parts.to_photograph(render, step), pooled, rtol=0, atol=1e-12)
+
+
+def test_the_factor_changes_at_its_step(build: Build, on: ComponentsConf, lr: Step) -> None:
+    on.supersampled.factor, on.supersampled.late_factor = 1, 3
+    on.supersampled.late_from = 15_000
+    parts, view = build(on), lr.view
+    widths = {
+        number: parts.render_camera(view.camera, Step(number, 300, view)).width
+        for number in (0, 149, 150, 299)
+    }
+    assert widths == {0: 15, 149: 15, 150: 45, 299: 45}
+    image = torch.rand(12, 15, 3)
+    assert parts.to_photograph(image, Step(149, 300, view)) is image
+
+
+@pytest.mark.parametrize("name", ["factor", "late_factor"])
+def test_a_factor_below_one_is_refused(build: Build, on: ComponentsConf, name: str) -> None:
+    setattr(on.supersampled, name, 0)
+    with pytest.raises(XrgsError, match=rf"components.supersampled.{name}=0"):
+        build(on)
+
+
+def test_compressed_views_have_nothing_to_supersample(
+    on: ComponentsConf, baseline: Conf, make_view: Callable[[str, Tensor], LoadedView]
+) -> None:
+    view = make_view("LR", torch.zeros(60, 75, 3))
+    with pytest.raises(XrgsError, match="jpeg"):
+        _built(on, baseline, "jpeg", view)
+
+
+def test_gradients_reach_the_gaussians_through_the_larger_render(
+    build: Build, on: ComponentsConf, lr: Step, baseline: Conf
+) -> None:
+    """The derivative of the projected loss, against central differences in float64."""
+    parts, points = build(on), torch.rand(20, 3, generator=torch.Generator().manual_seed(1))
+    points = points.double() + torch.tensor([-0.5, -0.5, 1.5], dtype=torch.float64)
+    model = from_points(
+        points, points.frac(), init_opacity=0.5, sh_degree=0, generator=seeded_generator(0, "init")
+    )
+    camera = parts.render_camera(lr.view.camera, lr)
+
+    def loss(sh0: Tensor) -> Tensor:
+        render = rasterize_parameters(
+            model.means.detach().double(),
+            model.quats.detach().double(),
+            model.scales.detach().double().exp(),
+            model.opacities.detach().double().sigmoid(),
+            sh0,
+            model.shN.detach().double(),
+            camera,
+            baseline.splat.raster,
+            sh_degree=0,
+        )
+        return (parts.to_photograph(render.image, lr) - lr.view.image).square().mean()
+
+    sh0 = model.sh0.detach().double().requires_grad_()
+    (gradient,) = torch.autograd.grad(loss(sh0), sh0)
+    direction = torch.rand(
+        sh0.shape, dtype=torch.float64, generator=torch.Generator().manual_seed(2)
+    )
+    with torch.no_grad():
+        slope = (loss(sh0 + 1e-5 * direction) - loss(sh0 - 1e-5 * direction)) / 2e-5
+    torch.testing.assert_close((gradient * direction).sum(), slope, rtol=1e-6, atol=1e-12)

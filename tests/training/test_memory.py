@@ -1,0 +1,105 @@
+"""The memory of training: every tensor once, and what autograd saves."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from types import SimpleNamespace
+
+import torch
+
+from xrgs.capture.dataset import Dataset
+from xrgs.config import Conf
+from xrgs.splat.gaussians import PARAMETERS
+from xrgs.splat.rasterize import Render
+from xrgs.training.components import Step
+from xrgs.training.loop import train
+from xrgs.training.memory import TrainingMemory, tensors_in
+
+
+@dataclass
+class Holder:
+    tensor: torch.Tensor
+    others: dict[str, list[torch.Tensor]]
+    function = print
+
+
+def render(buffer_bytes: int) -> Render:
+    empty = torch.empty(0)
+    return Render(empty, empty, empty, 0, buffer_bytes)
+
+
+def step(data: Dataset, view: int = 0) -> Step:
+    return Step(0, 1, data.train[view])
+
+
+def test_tensors_are_found_in_items_and_attributes_all_the_way() -> None:
+    a, b, c = (torch.zeros(n) for n in (1, 2, 3))
+    a.requires_grad_().grad = torch.zeros(1)
+    holder = Holder(a, {"b": [b]})
+    holder.others["self"] = [holder]  # type: ignore[list-item]
+    found = [id(t) for t in tensors_in((holder, SimpleNamespace(c={"c": (c,)}), None, 1, "text"))]
+    assert sorted(found) == sorted(map(id, (a, a.grad, b, c)))
+
+
+def test_tensors_that_share_memory_count_once_and_buffers_are_added(data: Dataset) -> None:
+    base = torch.zeros(100)
+    memory = TrainingMemory([base, base[10:20], base.view(10, 10)], torch.zeros(5).double())
+    with memory.of_forward(step(data), 1, 0):
+        pass
+    memory.record(render(1000))
+    assert memory.largest_bytes == 400 + 40 + 1000
+
+
+def test_what_autograd_saves_counts(data: Dataset) -> None:
+    x = torch.rand(50, requires_grad=True)
+    memory = TrainingMemory(x)
+    with memory.of_forward(step(data), 1, 0):
+        y = x.exp()  # saves its result
+        z = y * 2.0 + 1  # saves nothing
+        loss = (z * z).sum()  # saves z
+    torch.autograd.backward(loss)
+    memory.record(render(0))
+    assert memory.largest_bytes == 4 * 50 * (1 + 1 + 2)  # x, its gradient; y and z
+
+
+def test_steps_alike_are_counted_once_until_the_gaussians_change(data: Dataset) -> None:
+    held: list[torch.Tensor] = []
+    memory = TrainingMemory(held)
+
+    def count(gaussians: int, view: int, elements: int) -> int:
+        held[:] = [torch.zeros(elements)]
+        with memory.of_forward(step(data, view), gaussians, 0):
+            pass
+        memory.record(render(0))
+        return memory.largest_bytes
+
+    assert count(10, 0, 100) == 400
+    assert count(10, 0, 200) == 400  # taken for the same
+    assert count(11, 0, 50) == 400  # counted, and less
+    assert count(12, 0, 300) == 1200
+
+
+def test_the_state_is_the_largest_count(data: Dataset) -> None:
+    memory, again = TrainingMemory(torch.zeros(3)), TrainingMemory()
+    with memory.of_forward(step(data), 1, 0):
+        pass
+    memory.record(render(0))
+    again.load_state_dict(memory.state_dict())
+    assert again.largest_bytes == 12
+    with again.of_forward(step(data), 1, 0):
+        pass
+    again.record(render(1000))  # a step like one that was counted before
+    assert again.largest_bytes == 12
+
+
+def test_training_counts_model_photographs_and_loss(data: Dataset, short: Conf) -> None:
+    result = train(data, short)
+    model = sum(result.gaussians[name].nbytes for name in PARAMETERS)
+    photographs = sum(view.image.nbytes for view in (*data.train, *data.test))
+    assert result.memory_bytes > 4 * model + photographs  # gradients and two moments
+
+
+def test_a_component_that_holds_more_counts_more(data: Dataset, short: Conf) -> None:
+    plain = train(data, short).memory_bytes
+    short.components.consistency.weight = 0.1
+    assert train(data, short).memory_bytes > plain

@@ -1,0 +1,146 @@
+"""LR views rendered as their photographs were formed: larger, and then brought down."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Self
+
+from torch import Tensor
+
+from xrgs.errors import XrgsError
+from xrgs.splat.cameras import Camera
+from xrgs.splat.resample import resize
+from xrgs.training.components.base import Component, Step, TrainingSetup, TrainingView
+
+if TYPE_CHECKING:  # xrgs.config loads Hydra, which training does without
+    from xrgs.config import SupersampledConf
+
+
+@dataclass(frozen=True)
+class _Formation:
+    """How the photograph of an LR view was formed from a finer image of the same camera."""
+
+    camera: Camera
+    """The camera at the size of the pixels that the photograph resolves."""
+    width: int
+    """Width of the photograph, px; a digital zoom has more pixels than it resolves."""
+    height: int
+    """Height of the photograph, px."""
+
+
+class Supersampled(Component):
+    """Renders LR views at a larger size, and brings the render down as the photograph was.
+
+    An LR photograph is I = D(S): a finer image S of the same camera, brought down by a kernel D.
+    gsplat [ye2025] renders the view at the size of I, where the filter of `splat.raster.eps2d`,
+    0.3 px^2 of that size, is `factor`^2 times as large in pixels of an HR view. Here the view is
+    rendered at k times the width and height, and
+
+        loss = L(D(render_k), I)
+
+    is the loss of the view, with D the kernel by which the variant has made its LR views:
+
+    - `downsample`: antialiased bicubic to the size of I;
+    - `digital_zoom`: that, and bicubic up again; the pixels that I resolves are those of the size
+      between, and the render is k times as large as that;
+    - `none`, for LR views that a camera took: a pixel of a sensor averages over its area, so the
+      mean of k x k pixels.
+
+    `jpeg` has all the pixels of an HR view, and nothing to supersample.
+
+    Densification reads the image-plane gradients of the larger render in normalised device units,
+    which do not depend on its size. k is `factor` before step `late_from` and `late_factor` from
+    it on, so that a run may begin or end with direct renders (k = 1). HR views and the evaluation
+    are untouched.
+
+    Our choice: the whole component; super-resolution of 3D Gaussian Splatting trains through a
+    downsampled render too [feng2024srgs], but on LR views alone.
+    """
+
+    def __init__(
+        self,
+        settings: SupersampledConf,
+        views: Sequence[TrainingView],
+        degradation: str,
+        zoom: int,
+        backend: str = "torch",
+    ) -> None:
+        """Find out how the photograph of each LR view was formed.
+
+        Args:
+            settings: The component's settings.
+            views: All training views.
+            degradation: What was done to LR views: `downsample`, `digital_zoom`, `none`.
+            zoom: Of a digital zoom, how many times fewer pixels per side a photograph resolves.
+            backend: `torch` or `native`: the implementation of the resampling.
+        """
+        self.settings = settings
+        self.backend = backend
+        self.averages = degradation == "none"
+        resolved = zoom if degradation == "digital_zoom" else 1
+        self.formations = {
+            view.name: _Formation(
+                view.camera.resized(view.camera.width // resolved, view.camera.height // resolved),
+                view.camera.width,
+                view.camera.height,
+            )
+            for view in views
+            if view.tag == "LR"
+        }
+
+    @classmethod
+    def from_settings(cls, settings: SupersampledConf, setup: TrainingSetup) -> Self | None:
+        """Build the component; `factor` and `late_factor` of 1 leave it off.
+
+        Raises:
+            XrgsError: A factor is below 1, or the variant's LR views are compressed ones.
+        """
+        for name in ("factor", "late_factor"):
+            if (value := getattr(settings, name)) < 1:
+                raise XrgsError(f"components.supersampled.{name}={value}: must be 1 or more")
+        if settings.factor == settings.late_factor == 1:
+            return None
+        if setup.data.degradation == "jpeg":
+            raise XrgsError(
+                "components.supersampled: the LR views of variant.degradation=jpeg have as many"
+                " pixels as HR views; there is nothing to supersample"
+            )
+        data = setup.data
+        return cls(settings, data.train, data.degradation, data.factor, setup.backend)
+
+    def render_camera(self, camera: Camera, step: Step) -> Camera:
+        """Return the camera at k times the size that an LR photograph resolves."""
+        formation, factor = self.formations.get(step.view.name), self._factor(step)
+        if formation is None or factor == 1:
+            return camera
+        step.log["supersampled.factor"] = factor
+        small = formation.camera
+        return small.resized(small.width * factor, small.height * factor)
+
+    def to_photograph(self, image: Tensor, step: Step) -> Tensor:
+        """Bring the render [kH, kW, 3] of an LR view down to its photograph's size [H, W, 3]."""
+        formation, factor = self.formations.get(step.view.name), self._factor(step)
+        if formation is None or factor == 1:
+            return image
+        if self.averages:
+            return _block_means(image, factor)
+        small = formation.camera
+        image = resize(image, small.height, small.width, backend=self.backend)
+        if (formation.height, formation.width) == (small.height, small.width):
+            return image
+        return resize(image, formation.height, formation.width, backend=self.backend)
+
+    def _factor(self, step: Step) -> int:
+        late = step.nominal >= self.settings.late_from
+        return self.settings.late_factor if late else self.settings.factor
+
+
+def _block_means(image: Tensor, side: int) -> Tensor:
+    """Average the blocks of `side` x `side` pixels of an image [side * H, side * W, 3]."""
+    # Written out: the order in which torch's pooling adds depends on the processor.
+    total = image.new_zeros(())
+    for y in range(side):
+        for x in range(side):
+            total = total + image[y::side, x::side]
+    return total / side**2

@@ -1,0 +1,138 @@
+"""Counts the memory that training holds: every tensor once, and the renderer's buffers."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import contextmanager
+from types import FunctionType, ModuleType
+from typing import TYPE_CHECKING, Any
+
+import torch
+from torch import Tensor
+
+if TYPE_CHECKING:
+    from xrgs.splat.rasterize import Render
+    from xrgs.training.checkpoint import State
+    from xrgs.training.components import Step
+
+
+_CODE = (type, ModuleType, FunctionType)
+
+
+class TrainingMemory:
+    """The largest number of bytes that a step of training held.
+
+    What a step holds is the model, its gradients and the optimizer's state, the statistics of
+    densification, the photographs with what the loss has prepared of them, the tensors of the
+    components, what autograd saves between forward and backward, and the buffers of the renderer.
+    All are counted as if they existed at once; tensors that share their memory count once. What
+    backward allocates and frees in between is not counted.
+
+    Steps with as many Gaussians and harmonics, on views of one size and class, hold the same, so
+    that the first of them is counted.
+
+    Attributes:
+        largest_bytes: The largest count so far.
+    """
+
+    def __init__(self, *holders: object) -> None:
+        """Start with nothing counted.
+
+        Args:
+            holders: Objects that hold tensors throughout training, in their attributes or items.
+        """
+        self.holders = holders
+        self.largest_bytes = 0
+        self._counted: set[str] = set()
+        self._saved_bytes: int | None = None
+
+    @contextmanager
+    def of_forward(self, step: Step, gaussians: int, sh_degree: int) -> Iterator[None]:
+        """Note what autograd saves in a block, if a step like this one has not been counted.
+
+        Args:
+            step: The step whose forward pass the block is.
+            gaussians: The number of Gaussians.
+            sh_degree: Highest band of the spherical harmonics that is rendered.
+        """
+        size, logged = list(step.view.image.shape), sorted(step.log.items())
+        kind = f"{gaussians} {sh_degree} {step.view.tag} {size} {logged}"
+        if kind in self._counted:
+            yield
+            return
+        self._counted.add(kind)
+        saved: dict[int, int] = {}
+
+        def note(tensor: Tensor) -> Tensor:
+            saved.update(_storages([tensor]))
+            return tensor
+
+        with torch.autograd.graph.saved_tensors_hooks(note, lambda tensor: tensor):
+            yield
+        # Now, while all of it exists: later, other tensors may have the same addresses.
+        held = _storages(tensors_in(self.holders))
+        self._saved_bytes = sum(size for address, size in saved.items() if address not in held)
+
+    def state_dict(self) -> State:
+        """Return the largest count so far, and which steps need not be counted again."""
+        return {"largest_bytes": self.largest_bytes, "counted": sorted(self._counted)}
+
+    def load_state_dict(self, state: State) -> None:
+        """Continue from a state that `state_dict` returned.
+
+        Args:
+            state: From a run of the same config and data.
+
+        Raises:
+            KeyError: An entry is missing.
+            TypeError: An entry is of another type.
+            ValueError: The count is not a number.
+        """
+        self.largest_bytes = int(state["largest_bytes"])
+        self._counted = set(state["counted"])
+
+    def record(self, render: Render) -> None:
+        """Count a step, if its forward pass was noted, while its gradients exist.
+
+        Args:
+            render: The step's render.
+        """
+        if self._saved_bytes is not None:
+            held = sum(_storages(tensors_in(self.holders)).values())
+            count = held + self._saved_bytes + render.buffer_bytes
+            self.largest_bytes = max(self.largest_bytes, count)
+            self._saved_bytes = None
+
+
+def tensors_in(value: object) -> Iterator[Tensor]:
+    """Yield the tensors that an object holds: itself, its items and its attributes, all the way.
+
+    Args:
+        value: Any object. Functions, classes and modules hold nothing of their own.
+
+    Yields:
+        Each tensor, and its gradient where it has one.
+    """
+    seen: set[int] = set()
+    waiting: list[Any] = [value]
+    while waiting:
+        inner = waiting.pop()
+        if id(inner) in seen:
+            continue
+        seen.add(id(inner))
+        if isinstance(inner, Tensor):
+            yield inner
+            if inner.is_leaf and inner.grad is not None:
+                yield inner.grad
+        elif isinstance(inner, Mapping):
+            waiting += inner.values()
+        elif isinstance(inner, (list, tuple, set, frozenset)):
+            waiting += inner
+        elif hasattr(inner, "__dict__") and not isinstance(inner, _CODE):
+            waiting += vars(inner).values()
+
+
+def _storages(tensors: Iterable[Tensor]) -> dict[int, int]:
+    """Return the bytes of the memory of tensors by its address."""
+    storages = (tensor.untyped_storage() for tensor in tensors)
+    return {storage.data_ptr(): storage.nbytes() for storage in storages}
