@@ -74,3 +74,15 @@ def test_scores_are_the_same_for_any_number_of_threads(
     torch.set_num_threads(1)
     assert scores[0]["psnr"] > 1
     assert scores == [scores[0]] * 3
+
+
+def test_means_are_those_of_the_views(
+    gaussians: Gaussians, data: Dataset, baseline: Conf, tmp_path: Path
+) -> None:
+    views = (*data.test, *data.train)
+    rows = protocol.score_views(gaussians, views, baseline.splat, ConfinedPath(tmp_path) / "r")
+    means = protocol.mean_scores(gaussians, views, baseline.splat)
+    assert len(rows) > 1
+    for name in ("psnr", "ssim"):
+        assert means[name] == pytest.approx(np.mean([row[name] for row in rows]), rel=1e-12)
+    assert means["lpips"] is None

@@ -28,6 +28,7 @@ from xrgs.experiment.identity import cell_identity
 from xrgs.experiment.store import Store
 from xrgs.safeio.atomic import write_json
 from xrgs.safeio.hashing import digest
+from xrgs.safeio.records import read_object, read_table
 from xrgs.splat.backend import resolve_backend
 from xrgs.sweep.jobs import worker
 from xrgs.training import loop as train
@@ -202,3 +203,21 @@ def test_a_worker_that_is_killed_goes_on_in_another(
     assert json.loads((folder.path / "status.json").read_text())["files"].keys() == (
         json.loads((spared.path / "status.json").read_text())["files"].keys()
     )
+
+
+def test_the_test_views_are_scored_during_training_and_nothing_else_changes(
+    conf: Conf, tmp_path: Path
+) -> None:
+    plain = begin(conf, tmp_path / "plain")
+    cell.run_cell(conf, VARIANT, plain)
+    assert not (plain.path / "quality.csv").exists()
+    conf.train.evaluate_every = 5
+    scored = begin(conf, tmp_path / "scored")
+    cell.run_cell(conf, VARIANT, scored)
+    assert results(scored) == results(plain)
+    header, rows = read_table(scored.folder / "quality.csv")
+    assert header == ["step", "seconds", "evaluations", "gaussians", "lpips", "ssim", "psnr"]
+    table = [dict(zip(header, row, strict=True)) for row in rows]
+    assert [row["step"] for row in table] == ["5", "10"]
+    assert all(float(row["psnr"]) > 0 for row in table)
+    assert "quality.csv" in read_object(scored.folder / "status.json")["files"]

@@ -10,10 +10,13 @@ has them is not in a cell's identity: a cell scored without them is complete, an
 
 from __future__ import annotations
 
+from statistics import fmean
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
+
+    from torch import Tensor
 
     from xrgs.capture.dataset import LoadedView
     from xrgs.config import SplatConf
@@ -42,30 +45,61 @@ def score_views(
         One row per view: its name under `view`, and each metric's value under the metric's name,
         None where the metric is not available.
     """
+    from xrgs.capture import images
+    from xrgs.runtime.progress import progress
+
+    renders.make_folder()
+    rows = []
+    for view in progress(views, "evaluating", "view"):
+        image, scores = _score(gaussians, view, conf)
+        rows.append({"view": view.name} | scores)
+        images.save(renders / f"{view.name}.png", image.numpy(), durable=False)
+    return rows
+
+
+def mean_scores(
+    gaussians: Gaussians, views: Sequence[LoadedView], conf: SplatConf
+) -> dict[str, float | None]:
+    """Score each view as `score_views` does, without keeping the renders.
+
+    Args:
+        gaussians: The model as it would be saved.
+        views: The test views, at full size; at least one.
+        conf: The model's settings: the rasterizer's, and the backend.
+
+    Returns:
+        The mean of each metric over the views; None where it is not available.
+    """
+    rows = [_score(gaussians, view, conf)[1] for view in views]
+    means: dict[str, float | None] = {}
+    for name in rows[0]:
+        values = [row[name] for row in rows]
+        known = [value for value in values if value is not None]
+        means[name] = fmean(known) if len(known) == len(values) else None
+    return means
+
+
+def _score(
+    gaussians: Gaussians, view: LoadedView, conf: SplatConf
+) -> tuple[Tensor, dict[str, float | None]]:
+    """Return the clamped render [H, W, 3] of a view, and its scores by name."""
     import torch
 
-    from xrgs.capture import images
     from xrgs.evaluation import metrics
     from xrgs.runtime.machine import single_torch_thread
-    from xrgs.runtime.progress import progress
     from xrgs.splat.backend import resolve_backend
     from xrgs.splat.rasterize import rasterize_parameters
 
-    renders.make_folder()
     backend = resolve_backend(conf.backend)
-    rows = []
     with torch.no_grad():
-        for view in progress(views, "evaluating", "view"):
-            render = rasterize_parameters(
-                *gaussians.activated(backend=backend),
-                view.camera,
-                conf.raster,
-                sh_degree=conf.raster.sh_degree,
-                backend=backend,
-            )
-            image = render.image.clamp(0.0, 1.0)
-            with single_torch_thread():  # sums over several threads differ in the last digit
-                scores = {name: fn(image, view.image) for name, fn in metrics.VIEW_METRICS.items()}
-            rows.append({"view": view.name} | scores)
-            images.save(renders / f"{view.name}.png", image.numpy(), durable=False)
-    return rows
+        render = rasterize_parameters(
+            *gaussians.activated(backend=backend),
+            view.camera,
+            conf.raster,
+            sh_degree=conf.raster.sh_degree,
+            backend=backend,
+        )
+        image = render.image.clamp(0.0, 1.0)
+        with single_torch_thread():  # sums over several threads differ in the last digit
+            scores = {name: fn(image, view.image) for name, fn in metrics.VIEW_METRICS.items()}
+    return image, scores

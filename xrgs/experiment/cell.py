@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     from xrgs.capture.views import Variant
     from xrgs.config import Conf
     from xrgs.experiment.cell_folder import CellFolder
+    from xrgs.splat.gaussians import Gaussians
     from xrgs.training.recorder import TrainingResult
 
 _log = logging.getLogger(__name__)
@@ -64,6 +65,8 @@ def _train_and_score(conf: Conf, variant: Variant, folder: CellFolder) -> list[s
     peak_rss_bytes = peak_rss()  # read before evaluation, which may load the network of LPIPS
     save_ply(folder.folder / "splats.ply", trained.gaussians, durable=False)
     write_text(folder.folder / "history.csv", table_text(trained.history), durable=False)
+    if trained.scores:
+        write_text(folder.folder / "quality.csv", table_text(trained.scores), durable=False)
     scores = protocol.score_views(
         trained.gaussians, data.test, conf.splat, folder.folder / "renders"
     )
@@ -86,13 +89,17 @@ def _train_and_score(conf: Conf, variant: Variant, folder: CellFolder) -> list[s
 
 def _train_or_resume(data: Dataset, conf: Conf, folder: CellFolder) -> TrainingResult:
     """Train from the cell's checkpoint, or from the start if there is no usable one."""
+
+    def evaluate(gaussians: Gaussians) -> dict[str, float | None]:
+        return protocol.mean_scores(gaussians, data.test, conf.splat)
+
     checkpoint = Checkpoint(folder.checkpoint, digest(folder.identity()), conf.checkpoint_s)
     try:
         steps = checkpoint.load()
         if steps is not None:
             _log.info("going on from the checkpoint, %d steps done", steps)
-        return train_cell(data, conf, checkpoint)
+        return train_cell(data, conf, checkpoint, evaluate)
     except CheckpointError as error:
         _log.warning("training starts over: %s", error)
         checkpoint.set_aside()
-    return train_cell(data, conf, checkpoint)
+    return train_cell(data, conf, checkpoint, evaluate)
