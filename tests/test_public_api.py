@@ -73,7 +73,7 @@ def test_train_matches_counts_where_its_config_says_so(
     monkeypatch.setattr(
         count_matching,
         "train_count_matched",
-        lambda _, conf, __: matched.append(conf.components.count_matched.gaussians),
+        lambda _, conf, *__: matched.append(conf.components.count_matched.gaussians),
     )
     baseline.components.count_matched.gaussians = 70
     xrgs.train(data, baseline)
