@@ -7,6 +7,7 @@ import io
 import os
 import re
 import stat
+import tracemalloc
 import zlib
 from pathlib import Path
 from typing import Any
@@ -163,3 +164,19 @@ def test_only_this_module_decodes_images() -> None:
         if re.search(r"\bImage\.open\(|\bimread\(", file.read_text(encoding="utf-8"))
     }
     assert users == {"capture/images.py"}
+
+
+def test_a_large_photograph_has_the_bytes_for_its_pixels(tmp_path: Path) -> None:
+    """A header alone does not make this process take the memory of the image it declares."""
+    (tmp_path / "a.bmp").write_bytes(bitmap(16_000, 16_000))
+    tracemalloc.start()
+    with pytest.raises(ImageError, match=r"a\.bmp: .*58 bytes are too few for 16000 x 16000 px"):
+        images.read(tmp_path / "a.bmp")
+    assert tracemalloc.get_traced_memory()[1] < 10_000_000
+    tracemalloc.stop()
+
+
+def test_a_small_drawing_may_shrink_as_much_as_it_likes(tmp_path: Path) -> None:
+    Image.new("L", (4096, 4096)).save(tmp_path / "a.webp", lossless=True)
+    assert (tmp_path / "a.webp").stat().st_size < 3 * 4096**2 / 1032
+    assert images.read(tmp_path / "a.webp").shape == (4096, 4096, 3)

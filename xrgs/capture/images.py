@@ -29,8 +29,9 @@ _FORMATS = ("BMP", "JPEG", "PNG", "TIFF", "WEBP")
 MAX_PIXELS = 1 << 28
 #: The largest image of a store that is read. In training it takes 800 MB.
 MAX_PNG_PIXELS = 1 << 26
-#: Deflate, the compression of PNGs, makes at most 1032 bytes of one.
-_MAX_EXPANSION = 1032
+#: Deflate, the compression of PNGs, makes at most 1032 bytes of one, and no photograph of any
+#: format shrinks as much; a drawing may, but takes little memory up to so many pixels.
+_MAX_EXPANSION, _SMALL_PIXELS = 1032, 1 << 24
 _EXIF_ORIENTATION = 0x0112
 _EXIF_CAMERA = (0x010F, 0x0110)  # make, model
 _EXIF_DETAILS = 0x8769
@@ -124,6 +125,8 @@ def read(path: Path | ConfinedPath) -> ImageArray:
             per channel.
     """
     with _opened(path) as image:
+        if image.width * image.height > _SMALL_PIXELS:
+            _check_expansion(path, image)
         image.load()
         if image.mode[0] in "IF":
             raise ValueError(f"{image.mode} pixels; only 8 bits per channel are read")
@@ -178,13 +181,16 @@ def read_png_pil(
             )
         if image.mode != "RGB":
             raise ValueError(f"its pixels are {image.mode}, not 8-bit RGB")
-        file_bytes = confined(path).lstat().st_size
-        if 3 * image.width * image.height > _MAX_EXPANSION * file_bytes:
-            raise ValueError(
-                f"{file_bytes} bytes are too few for {image.width} x {image.height} px"
-            )
+        _check_expansion(path, image)
         image.load()
         return image
+
+
+def _check_expansion(path: Path | ConfinedPath, image: Image.Image) -> None:
+    """Refuse an image that no file of these bytes can hold, before memory is taken for it."""
+    file_bytes = confined(path).lstat().st_size
+    if 3 * image.width * image.height > _MAX_EXPANSION * file_bytes:
+        raise ValueError(f"{file_bytes} bytes are too few for {image.width} x {image.height} px")
 
 
 def _to_array(image: Image.Image) -> ImageArray:
