@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
@@ -14,6 +15,25 @@ from xrgs.capture import variant
 from xrgs.capture.views import Variant
 from xrgs.config import Conf, SceneConf, SfmConf, VariantConf
 from xrgs.safeio.confined import ConfinedPath
+
+
+@pytest.fixture
+def disk_events(monkeypatch: pytest.MonkeyPatch) -> list[str]:
+    """What is synced and renamed from now on, in its order: `sync NAME` and `rename OLD to NEW`."""
+    events: list[str] = []
+    sync, rename = os.fsync, os.rename
+
+    def synced(descriptor: int) -> None:
+        events.append("sync " + Path(f"/proc/self/fd/{descriptor}").readlink().name)
+        sync(descriptor)
+
+    def renamed(old: str, new: str, **folders: int) -> None:
+        events.append(f"rename {Path(old).name} to {Path(new).name}")
+        rename(old, new, **folders)
+
+    monkeypatch.setattr(os, "fsync", synced)
+    monkeypatch.setattr(os, "rename", renamed)
+    return events
 
 
 @pytest.fixture(scope="session")

@@ -280,27 +280,14 @@ def test_a_disk_that_fails_within_the_points_says_nothing_of_the_variant(
 
 
 def test_everything_is_on_the_disk_before_the_variant_has_its_name(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, disk_events: list[str]
 ) -> None:
     """Each folder that holds a new name is synced before the rename, and the last one after."""
-    events: list[str] = []
-    sync, rename = os.fsync, os.rename
-
-    def record_sync(descriptor: int) -> None:
-        events.append(str(Path(f"/proc/self/fd/{descriptor}").readlink()))
-        sync(descriptor)
-
-    def record_rename(*arguments: Any, **keywords: Any) -> None:
-        events.append(f"rename {arguments[0]}")
-        rename(*arguments, **keywords)
-
-    monkeypatch.setattr(os, "fsync", record_sync)
-    monkeypatch.setattr(os, "rename", record_rename)
     made = make(tmp_path)
-    frozen.freeze(made, "key", made.folder, ConfinedPath(tmp_path))
-    named = events.index("rename work")
-    assert {f"{tmp_path}/work", f"{tmp_path}/work/images"} <= set(events[:named])
-    assert events[named + 1 :] == [str(tmp_path)]
+    variant = frozen.freeze(made, "key", made.folder, ConfinedPath(tmp_path))
+    named = disk_events.index(f"rename work to {variant.id}")
+    assert {"sync work", "sync images", "sync points.npz"} <= set(disk_events[:named])
+    assert disk_events[named + 1 :] == [f"sync {tmp_path.name}"]
 
 
 def test_what_a_forger_declares_is_not_allocated(forge: Forge) -> None:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import fcntl
 import hashlib
 import json
-import os
 import random
 import socket
 from pathlib import Path
@@ -288,25 +287,12 @@ def test_a_malformed_address_is_refused(target: Path, url: str) -> None:
 
 
 def test_a_file_is_on_the_disk_before_it_has_its_name(
-    server: Any, target: Path, monkeypatch: pytest.MonkeyPatch
+    server: Any, target: Path, disk_events: list[str]
 ) -> None:
     """The bytes are synced before the rename, and the folder after it."""
-    events: list[str] = []
-    sync, rename = os.fsync, os.rename
-
-    def synced(descriptor: int) -> None:
-        events.append("sync " + Path(f"/proc/self/fd/{descriptor}").readlink().name)
-        sync(descriptor)
-
-    def renamed(old: str, new: str, **folders: int) -> None:
-        events.append(f"rename {old} to {new}")
-        rename(old, new, **folders)
-
-    monkeypatch.setattr(os, "fsync", synced)
-    monkeypatch.setattr(os, "rename", renamed)
     server.content = CONTENT
     download(server.url, target, MOST)
-    assert events[-3:] == [
+    assert disk_events[-3:] == [
         "sync scenes.zip.part",
         "rename scenes.zip.part to scenes.zip",
         "sync made",

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import stat
 import zipfile
 from pathlib import Path
@@ -100,25 +99,13 @@ def test_a_bomb_is_refused(tmp_path: Path) -> None:
 
 
 def test_a_folder_is_on_the_disk_before_it_has_its_name(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, disk_events: list[str]
 ) -> None:
     """Each file and folder is synced before the rename, and the folder around them after it."""
-    events: list[str] = []
-    sync, rename = os.fsync, os.rename
-
-    def synced(descriptor: int) -> None:
-        events.append("sync " + Path(f"/proc/self/fd/{descriptor}").readlink().name)
-        sync(descriptor)
-
-    def renamed(old: str, new: str, **folders: int) -> None:
-        events.append("rename")
-        rename(old, new, **folders)
-
-    monkeypatch.setattr(os, "fsync", synced)
-    monkeypatch.setattr(os, "rename", renamed)
     file = archive(tmp_path)
     unpack(file, "set/fern", tmp_path / "data" / "fern")
-    before, after = events[: events.index("rename")], events[events.index("rename") + 1 :]
+    (renamed,) = (n for n, event in enumerate(disk_events) if event.startswith("rename"))
+    before, after = disk_events[:renamed], disk_events[renamed + 1 :]
     *files, made = sorted(before, key=lambda event: ".unpacking" in event)
     assert sorted(files) == ["sync a.png", "sync images", "sync poses.npy"]
     assert made.startswith("sync .unpacking-")
