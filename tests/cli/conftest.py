@@ -117,7 +117,10 @@ class Children:
         return {}
 
     def find(self, variants: ConfinedPath, _: str) -> SimpleNamespace | None:
-        names = [name for name in variants.names() if name.startswith("0123456789abcdef-")]
+        try:
+            names = [name for name in variants.names() if name.startswith("0123456789abcdef-")]
+        except FileNotFoundError:  # there is no store yet
+            names = []
         return SimpleNamespace(id=names[0]) if names else None
 
 

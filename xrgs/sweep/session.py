@@ -179,6 +179,14 @@ class SweepSession:
         return self._owner is not None and self._owner.here and not self._owner.lives
 
     @property
+    def missing(self) -> bool:
+        """Whether the folder is not there: it vanished with its store, or was never shared."""
+        try:
+            return not self.folder.is_dir()
+        except OSError:
+            return False
+
+    @property
     def stopped(self) -> str:
         """Why no further job may begin; empty while they may."""
         file = self.folder / "stopped"

@@ -54,6 +54,12 @@ def run_job(session: SweepSession, cell_id: str) -> str:
     """
     if session.stopped:
         return STOPPED
+    if session.missing:
+        log_line(
+            f"{session.folder} is not there, so that {cell_id} is left: hydra.sweep.dir must be a"
+            " folder that every machine of the sweep can read"
+        )
+        return GONE
     cell = session.read(cell_id)
     store = Store(Path(cell.config["store"]))
     try:

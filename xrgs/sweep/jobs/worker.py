@@ -23,7 +23,7 @@ from xrgs.runtime import processes
 from xrgs.runtime.machine import set_passive_openmp_wait
 from xrgs.runtime.streams import ignore_broken_pipe, log_to_stderr, say
 from xrgs.safeio.atomic import write_json
-from xrgs.safeio.confined import ConfinedPath, ReplacedError
+from xrgs.safeio.confined import ConfinedPath, ReplacedError, RootMissingError
 from xrgs.safeio.records import read_object
 from xrgs.sweep import presence
 from xrgs.sweep.jobs import supervise
@@ -224,6 +224,8 @@ def main(job: str, request: str, answer: str) -> None:
     except ReplacedError as error:
         why = f"{error.filename}: {error.strerror}: another attempt at the cell has begun"
         result = {"error": why, "lost": True}
+    except RootMissingError as error:  # the sweep tells whether the store is gone
+        result = {"error": f"{error.filename}: it is no longer there"}
     except UnreadableError as error:
         result = {"error": str(error), "unreadable": True}
     except XrgsError as error:
