@@ -10,7 +10,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from xrgs.splat.densify import Densifier, Groups, Refinement, Thresholds
+from xrgs.splat.densify import Densifier, DensifierHooks, Groups, Refinement, Thresholds
 from xrgs.splat.gaussians import PARAMETERS
 from xrgs.splat.settings import DensifySettings
 
@@ -18,6 +18,7 @@ MakeDensifier = Callable[..., Densifier]
 
 SCENE_SCALE = 1.7
 WIDTH, HEIGHT = 40, 30
+NO_HOOKS = DensifierHooks()
 
 
 @dataclass
@@ -62,8 +63,15 @@ def view_of(count: int, norm: float = 0.0) -> View:
     return View(gradient, torch.ones(count, dtype=torch.bool))
 
 
-def densify(densifier: Densifier, step: int, view: View) -> Refinement:
-    return densifier.after_step(step, view.gradient, view.visible, width=WIDTH, height=HEIGHT)
+def densify(
+    densifier: Densifier,
+    step: int,
+    view: View,
+    hooks: DensifierHooks = NO_HOOKS,
+) -> Refinement:
+    return densifier.after_step(
+        step, view.gradient, view.visible, width=WIDTH, height=HEIGHT, hooks=hooks
+    )
 
 
 def take_step(densifier: Densifier, gradients: dict[str, Tensor]) -> None:
@@ -209,6 +217,37 @@ def test_statistics_start_again_after_a_refinement(densifier_of: MakeDensifier) 
     densify(densifier, 600, view_of(2, norm=1.0))
     assert (densifier.visible_count == 0).all()
     assert (densifier.grad2d_sum == 0).all()
+
+
+# --- what others decide -------------------------------------------------------------------------
+
+
+def test_hooks_restrict_what_grows(densifier_of: MakeDensifier) -> None:
+    """They are asked before what is not finite is dropped."""
+    values = uniform(4)
+    values["means"][1, 0] = torch.nan
+    densifier, view = densifier_of(values), view_of(4, norm=1.0)
+    last = torch.tensor([False, False, False, True])
+    hooks = DensifierHooks(may_grow=lambda gaussians: gaussians.means[:, 0].isnan() | last)
+    assert densify(densifier, 599, view, hooks) == Refinement()
+    assert densify(densifier, 600, view, hooks) == Refinement(pruned_non_finite=1, duplicated=1)
+    assert torch.equal(densifier.gaussians.means[3].detach(), values["means"][3])
+
+
+def test_removing_keeps_moments_and_statistics_in_step(densifier_of: MakeDensifier) -> None:
+    values = uniform(3)
+    densifier = densifier_of(values)
+    take_step(densifier, {name: value + 1 for name, value in values.items()})
+    moments = densifier.optimizer.adam.state[densifier.gaussians.means]["exp_avg"].clone()
+    densify(densifier, 1, View(torch.eye(3)[:, :2], torch.tensor([True, True, False])))
+    sums, counts = densifier.grad2d_sum.clone(), densifier.visible_count.clone()
+    assert densifier.remove(torch.tensor([False, True, False])) == 1
+    kept = torch.tensor([0, 2])
+    state = densifier.optimizer.adam.state[densifier.gaussians.means]
+    assert torch.equal(state["exp_avg"], moments[kept])
+    assert torch.equal(densifier.grad2d_sum, sums[:, kept])
+    assert torch.equal(densifier.visible_count, counts[:, kept])
+    assert counts.tolist() == [[1, 1, 0]]
 
 
 # --- exactly at a threshold ---------------------------------------------------------------------

@@ -265,6 +265,51 @@ def test_a_gradient_of_zero_grows_nothing(data: Dataset, short: Conf) -> None:
     assert last["duplicated"] == last["split"] == 0
 
 
+class Choosing(components.Component):
+    """Lets every second Gaussian grow, and removes the last three of them at some steps."""
+
+    def __init__(self, prune_at: tuple[int, ...] = ()) -> None:
+        self.prune_at = prune_at
+        self.size = 0
+        self.asked: list[int] = []
+
+    def on_gaussians_changed(self, gaussians: Gaussians) -> None:
+        self.size = len(gaussians)
+
+    def may_grow(self, gaussians: Gaussians, step: Step) -> torch.Tensor:
+        self.asked.append(step.number)
+        assert len(gaussians) == self.size
+        return torch.arange(len(gaussians)) % 2 == 0
+
+    def to_prune(self, gaussians: Gaussians, step: Step) -> torch.Tensor | None:
+        assert len(gaussians) == self.size
+        if step.number not in self.prune_at:
+            return None
+        return torch.arange(len(gaussians)) >= len(gaussians) - 3
+
+
+def test_components_restrict_what_grows(data: Dataset, compose: Compose) -> None:
+    conf = compose("train.steps=30", "splat.densify.every=5000", "splat.densify.grow_grad2d=0")
+    conf.splat.densify.start, conf.splat.densify.stop = 0, 6000  # one refinement, at step 5
+    chosen = Choosing()
+    last = train(data, conf, extra_components=[chosen]).history[-1]
+    assert chosen.asked == [5]
+    assert last["duplicated"] + last["split"] == 30  # of 60, all of them above the threshold
+
+
+def test_components_remove_gaussians_at_any_step(data: Dataset, short: Conf) -> None:
+    short.splat.densify.stop = 15_000  # step 20 of 40
+    result = train(data, short, extra_components=[Choosing(prune_at=(7, 10, 33))])
+    last = result.history[-1]
+    grown = last["duplicated"] + last["split"]
+    pruned = [row["pruned_by_components"] for row in result.history]
+    rules = last["pruned_opacity"] + last["pruned_scale"] + last["pruned_non_finite"]
+    assert next(row["step"] for row in result.history if row["pruned_by_components"] == 6) == 11
+    assert pruned[0] == 0
+    assert pruned[-1] == 9
+    assert len(result.gaussians) == 60 + grown - rules - 9 == last["gaussians"]
+
+
 @pytest.mark.parametrize("ablation", ABLATIONS)
 def test_each_ablation_changes_the_result(
     data: Dataset, compose: Compose, same: Same, ablation: str

@@ -27,6 +27,7 @@ _LABELS = {
     "pruned_opacity": "Pruned: transparent",
     "pruned_scale": "Pruned: too large",
     "pruned_non_finite": "Pruned: not finite",
+    "pruned_by_components": "Pruned: by components",
     "reset": "Opacities reset",
 }
 #: Columns of a history that describe the logged step alone, not the training up to it.

@@ -39,6 +39,7 @@ DECIDE = ("current_view", "per_class", "own_threshold")
 """The values of `Groups.decide`."""
 
 _COUNTED_BY_GROUP = ("grown", "pruned_opacity")
+_OPTIONAL = "pruned_by_components"
 
 
 @dataclass(frozen=True)
@@ -59,6 +60,8 @@ class Refinement:
     """Gaussians with an opacity below the threshold."""
     pruned_scale: int = 0
     """Gaussians that were too large, with an opacity that was high enough."""
+    pruned_by_components: int = 0
+    """Gaussians that components of training had removed (`Densifier.remove`)."""
     reset: int = 0
     """Gaussians whose opacity was lowered to the cap."""
     by_group: Mapping[str, int] = field(default_factory=dict)
@@ -69,11 +72,16 @@ class Refinement:
     @property
     def removed(self) -> int:
         """Number of Gaussians pruned; those that a split replaced are not among them."""
-        return self.pruned_non_finite + self.pruned_opacity + self.pruned_scale
+        rules = self.pruned_non_finite + self.pruned_opacity + self.pruned_scale
+        return rules + self.pruned_by_components
 
     def counts(self) -> dict[str, int]:
-        """Return all counts by name: those of the rules, then those of the groups."""
-        rules = {name: value for name, value in vars(self).items() if name != "by_group"}
+        """Return the counts by name: those of the rules, then those of the groups.
+
+        `pruned_by_components` is there where it is not 0, so that no other run has a column of it.
+        """
+        left_out = {"by_group"} if self.pruned_by_components else {"by_group", _OPTIONAL}
+        rules = {name: value for name, value in vars(self).items() if name not in left_out}
         return rules | dict(self.by_group)
 
 
@@ -115,6 +123,26 @@ class Groups:
             raise ValueError(f"decide={self.decide}: must be one of {', '.join(DECIDE)}")
 
 
+def _nothing(gaussians: Gaussians) -> None:
+    """The answer of a hook that changes nothing."""
+    del gaussians
+
+
+@dataclass(frozen=True)
+class DensifierHooks:
+    """What others decide at a step; each is asked with the N Gaussians, and None changes nothing.
+
+    All but `opacity_attenuation` are asked at refinements alone, with the Gaussians as the step's
+    optimizer has left them.
+    """
+
+    may_grow: Callable[[Gaussians], Tensor | None] = _nothing
+    """Returns [N] bool, which of the Gaussians above the growth threshold may grow."""
+    opacity_attenuation: Callable[[Gaussians], Tensor | None] = _nothing
+    """Returns the factors [N] in 0..1 by which every render lowers the opacities. A reset, which
+    asks after the step's refinement, caps the lowered opacities."""
+
+
 class Densifier:
     """Grows, prunes and resets Gaussians by the image-plane gradients since the last refinement.
 
@@ -146,7 +174,6 @@ class Densifier:
         scene_scale: float,
         generator: torch.Generator,
         groups: Groups | None = None,
-        attenuation: Callable[[Gaussians], Tensor | None] = lambda _: None,
     ) -> None:
         """Start with empty statistics.
 
@@ -156,15 +183,12 @@ class Densifier:
             scene_scale: Extent of the scene, world units.
             generator: Random generator that draws the means of the two halves of a split.
             groups: Groups of views; None has one, with the thresholds of `settings`.
-            attenuation: Returns the factors [N] in 0..1 by which every render lowers the opacities
-                of the Gaussians, or None where it does not. A reset caps the lowered opacities.
         """
         self.optimizer = optimizer
         self.gaussians = optimizer.gaussians
         self.settings = settings
         self.scene_scale = scene_scale
         self.generator = generator
-        self.attenuation = attenuation
         self.shared_thresholds = Thresholds(settings.grow_grad2d, settings.prune_opacity)
         self.group_thresholds = {} if groups is None else dict(groups.thresholds)
         self.decide = "current_view" if groups is None else groups.decide
@@ -186,6 +210,7 @@ class Densifier:
         width: int,
         height: int,
         group: str = "",
+        hooks: DensifierHooks = DensifierHooks(),
     ) -> Refinement:
         """Accumulate a step's statistics and, where the schedule says so, refine and reset.
 
@@ -197,6 +222,7 @@ class Densifier:
             width: Width of the view, px.
             height: Height of the view, px.
             group: Group of the view; not read where there are no groups.
+            hooks: What others decide at this step.
 
         Returns:
             The counts of what was done.
@@ -213,10 +239,28 @@ class Densifier:
         refinement = Refinement()
         if step > settings.start and step % settings.every == 0:
             prune_large = step > settings.reset_every
-            refinement = self._refine(self._deciding_thresholds(group), prune_large=prune_large)
+            refinement = self._refine(
+                self._deciding_thresholds(group), prune_large=prune_large, hooks=hooks
+            )
         if step > 0 and step % settings.reset_every == 0:
-            refinement = replace(refinement, reset=self._reset_opacities())
+            refinement = replace(refinement, reset=self._reset_opacities(hooks))
         return refinement
+
+    @torch.no_grad()
+    def remove(self, mask: Tensor) -> int:
+        """Remove Gaussians with their moments and statistics, at any step.
+
+        Args:
+            mask: [N] bool, which Gaussians.
+
+        Returns:
+            The number of Gaussians that were removed.
+        """
+        keep = ~mask
+        self._keep(keep)
+        self.grad2d_sum = self.grad2d_sum[:, keep]
+        self.visible_count = self.visible_count[:, keep]
+        return int(mask.sum())
 
     def state_dict(self) -> dict[str, Any]:
         """Return the statistics so far, and the state of the random generator."""
@@ -253,9 +297,12 @@ class Densifier:
         return {group: self.shared_thresholds}
 
     @torch.no_grad()
-    def _refine(self, deciding: Mapping[str, Thresholds], *, prune_large: bool) -> Refinement:
+    def _refine(
+        self, deciding: Mapping[str, Thresholds], *, prune_large: bool, hooks: DensifierHooks
+    ) -> Refinement:
         """Drop what is not finite, grow, prune, and start the statistics again."""
-        dropped = self._drop_non_finite()
+        may_grow, finite = hooks.may_grow(self.gaussians), self._finite()  # [N]
+        dropped = self.remove(~finite)  # before growing would copy it
         grow = self.grad2d_sum.new_tensor([t.grow_grad2d for t in deciding.values()])  # [G]
         mean_grad2d = self.grad2d_sum / self.visible_count.clamp_min(1)  # [G, N]
         above = mean_grad2d > grow[:, None]  # [G, N]
@@ -263,6 +310,8 @@ class Densifier:
         if self.decide == "own_threshold":
             of_threshold = (self.grad2d_sum / grow[:, None]).sum(dim=0)  # [N]
             high_gradient = of_threshold > self.visible_count.sum(dim=0)
+        if may_grow is not None:
+            high_gradient &= may_grow[finite]
         deciding_row = self._deciding_row()  # [N], before growing
         grown, parents = self._grow(high_gradient)
         prune = self.grad2d_sum.new_tensor([t.prune_opacity for t in deciding.values()])  # [G]
@@ -292,16 +341,12 @@ class Densifier:
         self.grad2d_sum = self.gaussians.opacities.new_zeros(count, len(self.gaussians))
         self.visible_count = torch.zeros_like(self.grad2d_sum)
 
-    @torch.no_grad()
-    def _drop_non_finite(self) -> int:
-        """Remove what is not finite, before growing would copy it; return how many that were."""
+    def _finite(self) -> Tensor:
+        """Return which Gaussians [N] are finite in all parameters and largest scale."""
         finite = torch.isfinite(self._largest_scale())  # [N]
         for name in PARAMETERS:
             finite &= torch.isfinite(self.gaussians[name][..., None]).flatten(1).all(dim=1)
-        self._keep(finite)
-        self.grad2d_sum = self.grad2d_sum[:, finite]
-        self.visible_count = self.visible_count[:, finite]
-        return int((~finite).sum())
+        return finite
 
     def _deciding_row(self) -> Tensor:
         """Return the first statistic [N] that is not 0 of each Gaussian, or else the last."""
@@ -372,12 +417,12 @@ class Densifier:
         return counts, by_row.tolist()
 
     @torch.no_grad()
-    def _reset_opacities(self) -> int:
+    def _reset_opacities(self, hooks: DensifierHooks) -> int:
         """Cap opacities above every threshold, with moments of zero; return how many fell."""
         thresholds = self.group_thresholds.values() or [self.shared_thresholds]
         largest = max(threshold.prune_opacity for threshold in thresholds)
         cap_opacity = torch.tensor(self.settings.reset_opacity * largest, dtype=torch.float64)
-        attenuation = self.attenuation(self.gaussians)  # [N]
+        attenuation = hooks.opacity_attenuation(self.gaussians)  # [N]
         if attenuation is not None:
             cap_opacity = (cap_opacity / attenuation.double()).clamp(max=_OPAQUE)
         opacities = self.gaussians.opacities

@@ -6,7 +6,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import torch
@@ -33,7 +33,7 @@ if TYPE_CHECKING:
     from xrgs.capture.dataset import Dataset
     from xrgs.config import Conf, SplatConf
     from xrgs.splat.loss import Target
-    from xrgs.training.components import Component
+    from xrgs.training.components import Component, Step
 
     #: Scores of Gaussians by name; None where one is not available.
     Evaluate = Callable[[Gaussians], Mapping[str, float | None]]
@@ -161,15 +161,32 @@ def _run_steps(run: _Run, checkpoint: Checkpoint, evaluate: Evaluate | None) -> 
         if grad2d is not None:
             grad2d = components.densification_grad2d(grad2d, step)
         refinement = densifier.after_step(
-            step.number, grad2d, render.visible, **size, group=view.tag
+            step.number,
+            grad2d,
+            render.visible,
+            **size,
+            group=view.tag,
+            hooks=components.densifier_hooks(step),
         )
         if refinement != Refinement():
             components.on_gaussians_changed(gaussians)
+        refinement = _prune_by_components(run, step, refinement)
         recorder.record_refinement(refinement)
         # Evaluate and write a checkpoint where one is due, which is no training time.
         if evaluate is not None and run.evaluates_after(step.number):
             recorder.record_scores(step.number + 1, len(gaussians), run.score(evaluate))
         recorder.exclude_time(checkpoint.save_if_due(step.number))
+
+
+def _prune_by_components(run: _Run, step: Step, refinement: Refinement) -> Refinement:
+    """Remove the Gaussians that components choose; return the step's counts with theirs."""
+    gaussians = run.optimizer.gaussians
+    mask = run.components.to_prune(gaussians, step)
+    if mask is None or not mask.any():
+        return refinement
+    removed = run.densifier.remove(mask)
+    run.components.on_gaussians_changed(gaussians)
+    return replace(refinement, pruned_by_components=removed)
 
 
 def _set_up(data: Dataset, conf: Conf, extra_components: Iterable[Component]) -> _Run:
@@ -194,7 +211,6 @@ def _set_up(data: Dataset, conf: Conf, extra_components: Iterable[Component]) ->
         scene_scale=data.scene_scale,
         generator=seeded_generator(conf.seed, "densify"),
         groups=components.densification_groups(splat.densify),
-        attenuation=components.opacity_attenuation,
     )
     targets = {view.name: prepare_target(view.image) for view in data.train}
     return _Run(

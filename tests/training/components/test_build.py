@@ -130,6 +130,38 @@ def test_the_states_of_two_components_of_one_class_are_kept_apart() -> None:
     assert [again[0].count, again[2].count, again[3].count] == [1, 2, 0]
 
 
+class Choosing(Component):
+    """A component that answers all that densification asks, from the same six numbers."""
+
+    def __init__(self, *numbers: float) -> None:
+        self.numbers = torch.tensor(numbers)
+
+    def may_grow(self, gaussians: Gaussians, step: Step) -> Tensor:
+        del gaussians, step
+        return self.numbers > 0
+
+    def growth_scores(self, gaussians: Gaussians, step: Step) -> Tensor:
+        del gaussians, step
+        return self.numbers
+
+    def to_prune(self, gaussians: Gaussians, step: Step) -> Tensor:
+        del gaussians, step
+        return self.numbers > 2
+
+
+def test_the_answers_of_components_are_combined(hr: Step, gaussians: Gaussians) -> None:
+    parts = Components([Choosing(0, 1, 2, 3, 0, 5), Component(), Choosing(3, 3, 0, 1, 0, 1)])
+    may_grow = parts.may_grow(gaussians, hr)
+    scores = parts.growth_scores(gaussians, hr)
+    pruned = parts.to_prune(gaussians, hr)
+    assert may_grow is not None
+    assert scores is not None
+    assert pruned is not None
+    assert may_grow.tolist() == [False, True, False, True, False, True]
+    assert scores.tolist() == [0, 3, 0, 3, 0, 5]
+    assert pruned.tolist() == [True, True, False, True, False, True]
+
+
 def test_a_component_without_from_settings_says_so() -> None:
     with pytest.raises(NotImplementedError, match="Other does not define from_settings"):
         Other.from_settings(None, TrainingSetup(None, None, None, "torch"))  # type: ignore[arg-type]
@@ -155,6 +187,9 @@ def test_a_component_that_overrides_nothing_is_the_identity(
     assert parts.modify_loss(loss, step.view.image, gaussians, step) is loss
     assert parts.densification_grad2d(gradient, step) is gradient
     assert parts.densification_groups(DensifySettings()) is None
+    assert parts.may_grow(gaussians, step) is None
+    assert parts.growth_scores(gaussians, step) is None
+    assert parts.to_prune(gaussians, step) is None
     parts.after_backward(gaussians, step)
     parts.on_gaussians_changed(gaussians)
     parts.bake(gaussians)

@@ -286,10 +286,11 @@ def test_a_reset_caps_what_is_rendered() -> None:
         DensifySettings(prune_opacity=0.001, reset_opacity=10.0),
         scene_scale=1.0,
         generator=torch.Generator(),
-        attenuation=Components([mip]).opacity_attenuation,
     )
     visible = torch.ones(3, dtype=torch.bool)
-    assert densifier.after_step(3000, None, visible, width=SIZE, height=SIZE).reset == 2
+    hooks = Components([mip]).densifier_hooks(STEP)
+    refinement = densifier.after_step(3000, None, visible, width=SIZE, height=SIZE, hooks=hooks)
+    assert refinement.reset == 2
     mip.on_gaussians_changed(gaussians)
     rendered = mip.before_render(gaussians.activated(), STEP).opacities.detach()
     torch.testing.assert_close(rendered[[0, 2]], torch.full((2,), 0.01))

@@ -7,8 +7,10 @@ One step of training runs these hooks, each for every component that is on:
    view is rendered, and `to_photograph` brings the render to the size of the photograph,
 3. `pixel_weights` for the photometric loss, then `modify_loss` on that loss, then backward,
 4. `after_backward` on the gradients of the parameters, then the optimizer steps,
-5. `densification_grad2d` on the image-plane gradient, then densification reads it,
-6. `on_gaussians_changed` where densification has added, removed or reset Gaussians.
+5. `densification_grad2d` on the image-plane gradient, then densification reads it; at its
+   refinements `may_grow` and, where a budget leaves room for some Gaussians only, `growth_scores`,
+6. `on_gaussians_changed` where densification has added, removed or reset Gaussians,
+7. `to_prune`, and `on_gaussians_changed` where that has removed Gaussians.
 
 `densification_groups` is called once before the first step, `opacity_attenuation` where
 densification resets opacities, `bake` wherever the Gaussians are evaluated or saved, and
@@ -25,10 +27,11 @@ from typing import TYPE_CHECKING, Any, ClassVar, Protocol, Self
 import torch
 
 from xrgs.errors import XrgsError
+from xrgs.splat.densify import DensifierHooks
 from xrgs.splat.settings import NOMINAL_STEPS
 
 if TYPE_CHECKING:  # xrgs.config loads Hydra, which training does without
-    from collections.abc import Mapping
+    from collections.abc import Callable, Iterable, Mapping
 
     from torch import Tensor
 
@@ -243,6 +246,53 @@ class Component:
         del settings
         return None
 
+    def may_grow(self, gaussians: Gaussians, step: Step) -> Tensor | None:
+        """Choose which Gaussians densification may grow, of those above its growth threshold.
+
+        Training asks at a refinement alone, before anything is grown or removed.
+
+        Args:
+            gaussians: The N Gaussians.
+            step: The step with its view.
+
+        Returns:
+            [N] bool, or None where all of them may.
+        """
+        del gaussians, step
+        return None
+
+    def growth_scores(self, gaussians: Gaussians, step: Step) -> Tensor | None:
+        """Rank Gaussians where a budget leaves room for some of those that would grow.
+
+        Training asks at such a refinement alone, before anything is grown or removed. Those of the
+        highest score grow.
+
+        Args:
+            gaussians: The N Gaussians.
+            step: The step with its view.
+
+        Returns:
+            Scores [N] of at least 0; None ranks by the mean image-plane gradient.
+        """
+        del gaussians, step
+        return None
+
+    def to_prune(self, gaussians: Gaussians, step: Step) -> Tensor | None:
+        """Choose Gaussians to remove, whatever densification does with the others.
+
+        Training asks after every step, also when densification has stopped already. The components
+        have been told of what densification changed in this step.
+
+        Args:
+            gaussians: The N Gaussians.
+            step: The step with its view.
+
+        Returns:
+            [N] bool, or None where all of them stay.
+        """
+        del gaussians, step
+        return None
+
     def opacity_attenuation(self, gaussians: Gaussians) -> Tensor | None:
         """Tell by how much `before_render` lowers opacities in every view.
 
@@ -261,8 +311,8 @@ class Component:
     def on_gaussians_changed(self, gaussians: Gaussians) -> None:
         """Update what depends on the number and the order of the Gaussians.
 
-        Training calls it before the first step, and after each densification that has added,
-        removed or reset Gaussians.
+        Training calls it before the first step, and whenever densification or `to_prune` has
+        added, removed or reset Gaussians.
 
         Args:
             gaussians: The N Gaussians as they are now.
@@ -334,8 +384,7 @@ class Components(tuple[Component, ...]):
 
     def pixel_weights(self, step: Step) -> Tensor | None:
         """The product [H, W] of the components' pixel weights; None where none has any."""
-        weights = [weight for c in self if (weight := c.pixel_weights(step)) is not None]
-        return functools.reduce(torch.mul, weights) if weights else None
+        return _combined(torch.mul, (c.pixel_weights(step) for c in self))
 
     def modify_loss(self, loss: Tensor, image: Tensor, gaussians: Gaussians, step: Step) -> Tensor:
         """Apply `Component.modify_loss` of each component in turn."""
@@ -372,10 +421,28 @@ class Components(tuple[Component, ...]):
             )
         return next(iter(groups.values()), None)
 
+    def may_grow(self, gaussians: Gaussians, step: Step) -> Tensor | None:
+        """Which Gaussians [N] every component lets grow; None where all of them may."""
+        return _combined(torch.logical_and, (c.may_grow(gaussians, step) for c in self))
+
+    def growth_scores(self, gaussians: Gaussians, step: Step) -> Tensor | None:
+        """The product [N] of the components' scores; None where none has any."""
+        return _combined(torch.mul, (c.growth_scores(gaussians, step) for c in self))
+
+    def to_prune(self, gaussians: Gaussians, step: Step) -> Tensor | None:
+        """Which Gaussians [N] any component removes; None where all of them stay."""
+        return _combined(torch.logical_or, (c.to_prune(gaussians, step) for c in self))
+
     def opacity_attenuation(self, gaussians: Gaussians) -> Tensor | None:
         """The product [N] of the components' attenuations; None where none has any."""
-        factors = [f for c in self if (f := c.opacity_attenuation(gaussians)) is not None]
-        return functools.reduce(torch.mul, factors) if factors else None
+        return _combined(torch.mul, (c.opacity_attenuation(gaussians) for c in self))
+
+    def densifier_hooks(self, step: Step) -> DensifierHooks:
+        """What the components decide about densification at a step."""
+        return DensifierHooks(
+            may_grow=lambda gaussians: self.may_grow(gaussians, step),
+            opacity_attenuation=self.opacity_attenuation,
+        )
 
     def on_gaussians_changed(self, gaussians: Gaussians) -> None:
         """Call `Component.on_gaussians_changed` of each component in turn."""
@@ -406,6 +473,14 @@ class Components(tuple[Component, ...]):
     def _named(self) -> list[tuple[str, Component]]:
         """Each component with a name that is unique even where class names are not."""
         return [(f"{i}.{type(component).__name__}", component) for i, component in enumerate(self)]
+
+
+def _combined(
+    combine: Callable[[Tensor, Tensor], Tensor], answers: Iterable[Tensor | None]
+) -> Tensor | None:
+    """The components' answers made one; None where no component has any."""
+    given = [answer for answer in answers if answer is not None]
+    return functools.reduce(combine, given) if given else None
 
 
 def check_not_negative(key: str, value: float) -> None:
