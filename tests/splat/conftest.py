@@ -11,10 +11,11 @@ import torch
 from torch import Tensor
 
 from xrgs.splat.cameras import Camera
-from xrgs.splat.densify import Densifier, Groups
+from xrgs.splat.densify import Densifier
 from xrgs.splat.gaussians import PARAMETERS, ActivatedGaussians, Gaussians
 from xrgs.splat.optimizer import SplatOptimizer
 from xrgs.splat.rasterize import rasterize_parameters
+from xrgs.splat.refinement import Groups
 from xrgs.splat.render_result import Render
 from xrgs.splat.settings import DensifySettings, OptimizerSettings, RasterSettings
 

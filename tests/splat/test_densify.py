@@ -16,8 +16,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor
 
-from xrgs.splat.densify import Densifier, Refinement
+from xrgs.splat.densify import Densifier
 from xrgs.splat.gaussians import PARAMETERS
+from xrgs.splat.refinement import Refinement
 from xrgs.splat.settings import DensifySettings, OptimizerSettings
 
 MakeBoth = Callable[..., tuple["Ours", "Theirs"]]

@@ -15,8 +15,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor
 
-from xrgs.splat.densify import Densifier, Groups, Refinement, Thresholds
+from xrgs.splat.densify import Densifier
 from xrgs.splat.gaussians import PARAMETERS, Gaussians
+from xrgs.splat.refinement import Groups, Refinement, Thresholds
 
 Refine = Callable[..., tuple[Gaussians, Refinement]]
 

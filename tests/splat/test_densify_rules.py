@@ -10,8 +10,9 @@ import pytest
 import torch
 from torch import Tensor
 
-from xrgs.splat.densify import Densifier, DensifierHooks, Groups, Refinement, Thresholds
+from xrgs.splat.densify import Densifier
 from xrgs.splat.gaussians import PARAMETERS
+from xrgs.splat.refinement import DensifierHooks, Groups, Refinement, Thresholds
 from xrgs.splat.settings import DensifySettings
 
 MakeDensifier = Callable[..., Densifier]

@@ -11,10 +11,10 @@ import torch
 
 from xrgs.capture.dataset import Dataset
 from xrgs.config import Conf
-from xrgs.splat.densify import Refinement
 from xrgs.splat.gaussians import PARAMETERS, Gaussians, from_points
 from xrgs.splat.optimizer import SplatOptimizer
 from xrgs.splat.rasterize import Render
+from xrgs.splat.refinement import Refinement
 from xrgs.splat.settings import OptimizerSettings
 from xrgs.training import components, loop, recorder
 from xrgs.training.components import Step

@@ -13,11 +13,12 @@ import torch
 
 from xrgs.runtime.progress import progress
 from xrgs.splat.backend import resolve_backend
-from xrgs.splat.densify import Densifier, Refinement
+from xrgs.splat.densify import Densifier
 from xrgs.splat.gaussians import PARAMETERS, Gaussians, from_points
 from xrgs.splat.loss import photometric_loss, prepare_target
 from xrgs.splat.optimizer import SplatOptimizer
 from xrgs.splat.rasterize import rasterize_parameters
+from xrgs.splat.refinement import Refinement
 from xrgs.splat.settings import NOMINAL_STEPS
 from xrgs.training.checkpoint import Checkpoint
 from xrgs.training.components import Components

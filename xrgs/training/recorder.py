@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from statistics import fmean
 from typing import TYPE_CHECKING, Any
 
-from xrgs.splat.densify import Refinement
+from xrgs.splat.refinement import Refinement
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping

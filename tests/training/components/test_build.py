@@ -15,8 +15,8 @@ from torch import Tensor
 from xrgs.capture.dataset import LoadedView
 from xrgs.config import ComponentsConf, DensifyConf
 from xrgs.errors import XrgsError
-from xrgs.splat.densify import Groups, Thresholds
 from xrgs.splat.gaussians import PARAMETERS, Gaussians
+from xrgs.splat.refinement import Groups, Thresholds
 from xrgs.splat.settings import DensifySettings
 from xrgs.training import components
 from xrgs.training.components import Component, Components, Step, TrainingSetup

@@ -8,7 +8,7 @@ import pytest
 
 from xrgs.config import ComponentsConf
 from xrgs.errors import XrgsError
-from xrgs.splat.densify import DECIDE, Groups, Thresholds
+from xrgs.splat.refinement import DECIDE, Groups, Thresholds
 from xrgs.splat.settings import DensifySettings
 from xrgs.training.components import Components
 

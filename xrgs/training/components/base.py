@@ -27,7 +27,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, Protocol, Self
 import torch
 
 from xrgs.errors import XrgsError
-from xrgs.splat.densify import DensifierHooks
+from xrgs.splat.refinement import DensifierHooks
 from xrgs.splat.settings import NOMINAL_STEPS
 
 if TYPE_CHECKING:  # xrgs.config loads Hydra, which training does without
@@ -38,8 +38,8 @@ if TYPE_CHECKING:  # xrgs.config loads Hydra, which training does without
     from xrgs.capture.dataset import Dataset
     from xrgs.config import ComponentsConf, SplatConf
     from xrgs.splat.cameras import Camera
-    from xrgs.splat.densify import Groups
     from xrgs.splat.gaussians import ActivatedGaussians, Gaussians
+    from xrgs.splat.refinement import Groups
     from xrgs.splat.settings import DensifySettings
 
 

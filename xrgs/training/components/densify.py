@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Self
 
 from xrgs.errors import XrgsError
-from xrgs.splat.densify import DECIDE, Groups, Thresholds
+from xrgs.splat.refinement import DECIDE, Groups, Thresholds
 from xrgs.training.components.base import Component, TrainingSetup, check_not_negative
 
 if TYPE_CHECKING:  # xrgs.config loads Hydra, which training does without
