@@ -115,6 +115,20 @@ def test_the_splat_librarys_defaults_are_the_baselines(group: str, compose: Comp
             assert type(given) is type(value), name
 
 
+@pytest.mark.parametrize(
+    "override",
+    [
+        "splat.densify.split=middle",
+        "splat.densify.budget=-0.1",
+        "splat.densify.budget=nan",
+        "splat.densify.budget=inf",
+    ],
+)
+def test_an_unknown_split_or_a_wrong_budget_is_refused(compose: Compose, override: str) -> None:
+    with pytest.raises(XrgsError, match=f"^{override.split('=', maxsplit=1)[0]}=.*: must be "):
+        compose(override)
+
+
 def test_numbers_are_numbers_to_any_reader_of_yaml() -> None:
     """YAML 1.1 reads `1e-15`, without a point, as a text."""
     for file in CONF_DIR.rglob("*.yaml"):

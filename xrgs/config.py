@@ -7,6 +7,7 @@ every component is present and off. The keys of the model itself are declared in
 
 from __future__ import annotations
 
+import math
 import re
 from dataclasses import dataclass, field, is_dataclass
 from pathlib import Path
@@ -21,7 +22,7 @@ from xrgs.errors import StoreError, XrgsError
 from xrgs.safeio.confined import ConfinedPath
 from xrgs.safeio.records import read_json
 from xrgs.splat.backend import CHOICES
-from xrgs.splat.settings import DensifySettings, OptimizerSettings, RasterSettings
+from xrgs.splat.settings import SPLITS, DensifySettings, OptimizerSettings, RasterSettings
 
 _PACKAGE = Path(__file__).parent
 #: `conf/` is inside the package in a wheel and beside it in a checkout.
@@ -394,6 +395,13 @@ def to_conf(cfg: DictConfig) -> Conf:
             raise XrgsError(f"{key}={value}: must be at least {least}")
     if conf.splat.backend not in CHOICES:
         raise XrgsError(f"splat.backend={conf.splat.backend}: must be one of {', '.join(CHOICES)}")
+    densify = conf.splat.densify
+    if densify.split not in SPLITS:
+        raise XrgsError(f"splat.densify.split={densify.split}: must be one of {', '.join(SPLITS)}")
+    if not (math.isfinite(densify.budget) and densify.budget >= 0):
+        raise XrgsError(
+            f"splat.densify.budget={densify.budget}: must be a finite number, 0 or more"
+        )
     if conf.retry not in _RETRY:
         raise XrgsError(f"retry={conf.retry}: must be one of {', '.join(_RETRY)}")
     return conf

@@ -156,6 +156,7 @@ def make_densifier() -> Callable[..., Densifier]:
         seed: int = 0,
         groups: Groups | None = None,
         backend: str = "torch",
+        view_pixels: int = 0,
     ) -> Densifier:
         """A densifier of Gaussians with these raw parameters, whose optimizer took no step."""
         leaves = {name: values[name].clone().requires_grad_() for name in PARAMETERS}
@@ -172,6 +173,7 @@ def make_densifier() -> Callable[..., Densifier]:
             scene_scale=scene_scale,
             generator=torch.Generator().manual_seed(seed),
             groups=groups,
+            view_pixels=view_pixels,
         )
 
     return make

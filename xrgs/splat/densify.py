@@ -25,7 +25,7 @@ from torch import Tensor
 
 from xrgs.splat.backend import implementation
 from xrgs.splat.gaussians import PARAMETERS
-from xrgs.splat.growth import split_at_random
+from xrgs.splat.growth import Budget, best, split_along_longest_axis, split_at_random
 from xrgs.splat.optimizer import SplatOptimizer
 from xrgs.splat.refinement import DensifierHooks, Groups, Refinement, Thresholds
 from xrgs.splat.settings import DensifySettings
@@ -48,6 +48,11 @@ class Densifier:
     below `stop` that `reset_every` divides, opacities are capped at `reset_opacity *
     prune_opacity`. Without Gaussians, all of it does nothing.
 
+    With `split=long_axis` all Gaussians that grow are split, along their longest axis. A budget
+    lets the best of them grow, so that there are never more than its cap at the refinement; the
+    last refinement's is the budget itself. Pruning, which follows, makes room for the next one.
+    Gaussians are never removed for a budget.
+
     `groups` may replace `grow_grad2d` and `prune_opacity` by thresholds for each group of views.
     The cap is then that of the largest opacity threshold, since the next refinement would prune
     every opacity that is capped below its threshold. Where renders attenuate opacities, the
@@ -68,6 +73,7 @@ class Densifier:
         scene_scale: float,
         generator: torch.Generator,
         groups: Groups | None = None,
+        view_pixels: int = 0,
     ) -> None:
         """Start with empty statistics.
 
@@ -77,12 +83,19 @@ class Densifier:
             scene_scale: Extent of the scene, world units.
             generator: Random generator that draws the means of the two halves of a split.
             groups: Groups of views; None has one, with the thresholds of `settings`.
+            view_pixels: Number of pixels of the training view that has the most of them, which
+                `settings.budget` is multiplied by; not read where it is 0.
         """
         self.optimizer = optimizer
         self.gaussians = optimizer.gaussians
         self.settings = settings
         self.scene_scale = scene_scale
         self.generator = generator
+        self.budget = (
+            Budget(len(self.gaussians), round(settings.budget * view_pixels))
+            if settings.budget
+            else None
+        )
         self.shared_thresholds = Thresholds(settings.grow_grad2d, settings.prune_opacity)
         self.group_thresholds = {} if groups is None else dict(groups.thresholds)
         self.decide = "current_view" if groups is None else groups.decide
@@ -132,10 +145,7 @@ class Densifier:
             self._accumulate(row, means2d_grad, visible, width, height)
         refinement = Refinement()
         if step > settings.start and step % settings.every == 0:
-            prune_large = step > settings.reset_every
-            refinement = self._refine(
-                self._deciding_thresholds(group), prune_large=prune_large, hooks=hooks
-            )
+            refinement = self._refine(step, self._deciding_thresholds(group), hooks)
         if step > 0 and step % settings.reset_every == 0:
             refinement = replace(refinement, reset=self._reset_opacities(hooks))
         return refinement
@@ -192,33 +202,62 @@ class Densifier:
 
     @torch.no_grad()
     def _refine(
-        self, deciding: Mapping[str, Thresholds], *, prune_large: bool, hooks: DensifierHooks
+        self, step: int, deciding: Mapping[str, Thresholds], hooks: DensifierHooks
     ) -> Refinement:
         """Drop what is not finite, grow, prune, and start the statistics again."""
-        may_grow, finite = hooks.may_grow(self.gaussians), self._finite()  # [N]
+        finite = self._finite()  # [N]
+        above, high_gradient = self._above_thresholds(deciding)  # [G, N], [N]
+        growing = self._choose(high_gradient & finite, step, int(finite.sum()), hooks)  # [N]
         dropped = self.remove(~finite)  # before growing would copy it
-        grow = self.grad2d_sum.new_tensor([t.grow_grad2d for t in deciding.values()])  # [G]
-        mean_grad2d = self.grad2d_sum / self.visible_count.clamp_min(1)  # [G, N]
-        above = mean_grad2d > grow[:, None]  # [G, N]
-        high_gradient = above.any(dim=0)  # [N]
-        if self.decide == "own_threshold":
-            of_threshold = (self.grad2d_sum / grow[:, None]).sum(dim=0)  # [N]
-            high_gradient = of_threshold > self.visible_count.sum(dim=0)
-        if may_grow is not None:
-            high_gradient &= may_grow[finite]
         deciding_row = self._deciding_row()  # [N], before growing
-        grown, parents = self._grow(high_gradient)
+        grown, parents = self._grow(growing[finite])
         prune = self.grad2d_sum.new_tensor([t.prune_opacity for t in deciding.values()])  # [G]
         # Copies and halves are pruned by the threshold of their parent.
-        pruned, low_opacity = self._prune(prune, deciding_row[parents], prune_large=prune_large)
+        pruned, low_opacity = self._prune(
+            prune, deciding_row[parents], prune_large=step > self.settings.reset_every
+        )
         self._clear_statistics()
         by_group = {
             f"{count}_{name}": 0 for count in _COUNTED_BY_GROUP for name in self.group_thresholds
         }
         for row, name in enumerate(deciding if self.group_thresholds else ()):
-            by_group[f"grown_{name}"] = int(above[row].sum())
+            by_group[f"grown_{name}"] = int((above[row] & finite).sum())
             by_group[f"pruned_opacity_{name}"] = low_opacity[row]
         return Refinement(pruned_non_finite=dropped, **grown, **pruned, by_group=by_group)
+
+    def _above_thresholds(self, deciding: Mapping[str, Thresholds]) -> tuple[Tensor, Tensor]:
+        """Which Gaussians are above each growth threshold [G, N], and above the one that holds."""
+        grow = self.grad2d_sum.new_tensor([t.grow_grad2d for t in deciding.values()])  # [G]
+        mean_grad2d = self.grad2d_sum / self.visible_count.clamp_min(1)  # [G, N]
+        above = mean_grad2d > grow[:, None]  # [G, N]
+        if self.decide != "own_threshold":
+            return above, above.any(dim=0)
+        of_threshold = (self.grad2d_sum / grow[:, None]).sum(dim=0)  # [N]
+        return above, of_threshold > self.visible_count.sum(dim=0)
+
+    def _choose(self, candidates: Tensor, step: int, count: int, hooks: DensifierHooks) -> Tensor:
+        """Return which of the candidates [N] grow.
+
+        Args:
+            candidates: [N] bool, Gaussians above the growth threshold.
+            step: Number of the step.
+            count: Number of Gaussians that growing starts from.
+            hooks: What others decide at this step.
+        """
+        may_grow = hooks.may_grow(self.gaussians)
+        if may_grow is not None:
+            candidates = candidates & may_grow
+        if self.budget is None:
+            return candidates
+        start, last = self.settings.start, self.settings.last_refinement
+        progress = (step - start) / (last - start)  # this step is above start, and at most last
+        room = max(0, self.budget.cap(progress) - count)
+        if int(candidates.sum()) <= room:
+            return candidates
+        scores = hooks.growth_scores(self.gaussians) if room else None
+        if scores is None:
+            scores = self.grad2d_sum.sum(dim=0) / self.visible_count.sum(dim=0).clamp_min(1)
+        return best(candidates, scores, room)
 
     @torch.no_grad()
     def _accumulate(
@@ -248,24 +287,34 @@ class Densifier:
         has_gradient[-1] = True
         return has_gradient.int().argmax(dim=0)
 
-    def _grow(self, high_gradient: Tensor) -> tuple[dict[str, int], Tensor]:
-        """Duplicate or split where `high_gradient` [N].
+    def _grow(self, growing: Tensor) -> tuple[dict[str, int], Tensor]:
+        """Duplicate or split where `growing` [N].
 
         Returns:
             Counts, and the former index [M] of each Gaussian that is there now, or of its parent.
         """
-        small = self._largest_scale() <= self.settings.grow_scale3d * self.scene_scale  # [N]
-        duplicate, split = high_gradient & small, high_gradient & ~small
+        split = growing
+        if self.settings.split == "random":
+            split = growing & (
+                self._largest_scale() > self.settings.grow_scale3d * self.scene_scale
+            )
+        duplicate = growing & ~split
         copies = {name: self.gaussians[name][duplicate] for name in PARAMETERS}
-        old = {name: self.gaussians[name][split] for name in PARAMETERS}
-        halves = split_at_random(old, self._activations.exp(old["scales"]), self.generator)
+        halves = self._halves({name: self.gaussians[name][split] for name in PARAMETERS})
         self._keep(~split)
         self.optimizer.append(
             {name: torch.cat([copies[name], halves[name]]) for name in PARAMETERS}
         )
-        index = torch.arange(len(high_gradient))
+        index = torch.arange(len(growing))
         parents = torch.cat([index[~split], index[duplicate], index[split].repeat(2)])
         return {"duplicated": int(duplicate.sum()), "split": int(split.sum())}, parents
+
+    def _halves(self, old: Mapping[str, Tensor]) -> dict[str, Tensor]:
+        """Return what replaces Gaussians that are split: raw parameters [2 M, ...] by name."""
+        scales = self._activations.exp(old["scales"])  # [M, 3]
+        if self.settings.split == "long_axis":
+            return split_along_longest_axis(old, scales)
+        return split_at_random(old, scales, self.generator)
 
     def _prune(
         self, thresholds: Tensor, deciding_row: Tensor, *, prune_large: bool

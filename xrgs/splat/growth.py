@@ -1,9 +1,10 @@
-"""What replaces the Gaussians that grow."""
+"""Which Gaussians grow within a budget, and what replaces those that grow."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
@@ -13,6 +14,62 @@ from xrgs.splat.quaternions import rotation_matrices
 SPLIT_SHRINK = 1.6
 """The scales of a Gaussian split at random are divided by this in its two halves [kerbl2023,
 section 5.2]."""
+
+LONG_AXIS_OFFSET = 0.5
+"""Distance of a half from the Gaussian split along its longest axis, in scales of that axis."""
+LONG_AXIS_SHRINK = 0.5
+"""Factor of the scale of the longest axis in a half."""
+SHORT_AXES_SHRINK = 0.85
+"""Factor of the other two scales in a half."""
+HALF_OPACITY = 0.6
+"""Factor of the opacity in a half."""
+
+
+@dataclass(frozen=True)
+class Budget:
+    """The most Gaussians that growing may lead to, which rises with densification.
+
+    The growth control of ImprovedGS [deng2025]: at a share p of the steps from the start of
+    densification to its last refinement, the most is
+
+        first + (most - first) * sqrt(p)
+
+    so that most Gaussians come early and have time to train. Its code has `most * sqrt(p)`, which
+    starts at 0 whatever the number of SfM points; to start at theirs is our choice. Where there
+    are more than `most` to begin with, nothing grows until pruning has brought them below it.
+    """
+
+    first: int
+    """The number of Gaussians before training."""
+    most: int
+    """The number of Gaussians at the end of densification."""
+
+    def cap(self, progress: float) -> int:
+        """Return the most Gaussians there may be, at a share of densification in 0..1."""
+        first = min(self.first, self.most)
+        return first + int((self.most - first) * math.sqrt(progress))
+
+
+def best(candidates: Tensor, scores: Tensor, count: int) -> Tensor:
+    """Choose the candidates of the highest scores, of equal ones those that come first.
+
+    ImprovedGS [deng2025] draws candidates, with probabilities in proportion to their scores. To
+    take the best is our choice: it needs no random numbers.
+
+    Args:
+        candidates: [N] bool.
+        scores: [N] floats; one that is infinite or NaN counts as 0.
+        count: How many to choose, at least 0; all of them where there are fewer.
+
+    Returns:
+        [N] bool, the chosen candidates.
+    """
+    index = candidates.nonzero()[:, 0]  # [M]
+    ranked = torch.nan_to_num(scores[index], nan=0.0, posinf=0.0, neginf=0.0)
+    order = torch.sort(ranked, descending=True, stable=True).indices
+    chosen = torch.zeros_like(candidates)
+    chosen[index[order[:count]]] = True
+    return chosen
 
 
 def split_at_random(
@@ -37,4 +94,38 @@ def split_at_random(
     halves = {name: torch.cat([value, value]) for name, value in old.items()}
     halves["means"] = (old["means"] + offsets).reshape(-1, 3)
     halves["scales"] = (old["scales"] - math.log(SPLIT_SHRINK)).repeat(2, 1)
+    return halves
+
+
+def split_along_longest_axis(old: Mapping[str, Tensor], scales: Tensor) -> dict[str, Tensor]:
+    """Return two smaller Gaussians for each, side by side along its longest axis.
+
+    The long-axis split of ImprovedGS [deng2025], with the constants of ImprovedGS+ [munoz2026]. For
+    a mean m, scales s with the largest at k, rotation R and opacity o, the halves have
+
+        m +- 0.5 s_k R e_k,  s_k' = 0.5 s_k,  s_j' = 0.85 s_j for the others,  o' = 0.6 o.
+
+    Rotation and colour stay. In ImprovedGS's own code the halves are 1.35 s_k away, with scales of
+    0.55 and 0.89. Of equal scales the first is the longest.
+
+    Args:
+        old: Raw parameters [M, ...] for each name of `PARAMETERS`.
+        scales: [M, 3] their scales, world units.
+
+    Returns:
+        Raw parameters [2 M, ...]: all halves on the positive side of the axis, then the others.
+    """
+    longest = old["scales"].argmax(dim=-1, keepdim=True)  # [M, 1]
+    axis = longest[:, None].expand(-1, 3, -1)  # [M, 3, 1]
+    direction = rotation_matrices(old["quats"]).gather(-1, axis)[..., 0]  # [M, 3]
+    offset = LONG_AXIS_OFFSET * scales.gather(-1, longest) * direction
+    shrink = torch.full_like(scales, math.log(SHORT_AXES_SHRINK))
+    shrink.scatter_(-1, longest, math.log(LONG_AXIS_SHRINK))
+    # logit(f sigmoid(x)), in double: float32's logarithms depend on the processor.
+    rest = torch.tensor(math.log(1 - HALF_OPACITY), dtype=torch.float64)
+    logits = math.log(HALF_OPACITY) - torch.logaddexp(rest, -old["opacities"].double())
+    halves = {name: torch.cat([value, value]) for name, value in old.items()}
+    halves["means"] = torch.cat([old["means"] + offset, old["means"] - offset])
+    halves["scales"] = (old["scales"] + shrink).repeat(2, 1)
+    halves["opacities"] = logits.to(old["opacities"]).repeat(2)
     return halves

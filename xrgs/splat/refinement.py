@@ -26,7 +26,8 @@ class Refinement:
     duplicated: int = 0
     """Small Gaussians with a high gradient, each of which a copy was added of."""
     split: int = 0
-    """Large Gaussians with a high gradient, each of which was replaced by two."""
+    """Gaussians with a high gradient, each of which was replaced by two: the large ones, or with
+    `split=long_axis` all that grow."""
     pruned_non_finite: int = 0
     """Gaussians with a parameter, or the exponential of a scale, that was infinite or NaN."""
     pruned_opacity: int = 0
@@ -111,6 +112,10 @@ class DensifierHooks:
 
     may_grow: Callable[[Gaussians], Tensor | None] = _nothing
     """Returns [N] bool, which of the Gaussians above the growth threshold may grow."""
+    growth_scores: Callable[[Gaussians], Tensor | None] = _nothing
+    """Returns scores [N] of at least 0. It is asked where a budget leaves room for some of the
+    Gaussians that would grow; those of the highest score do, None standing for the mean
+    image-plane gradient."""
     opacity_attenuation: Callable[[Gaussians], Tensor | None] = _nothing
     """Returns the factors [N] in 0..1 by which every render lowers the opacities. A reset, which
     asks after the step's refinement, caps the lowered opacities."""

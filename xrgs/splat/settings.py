@@ -12,6 +12,9 @@ from dataclasses import dataclass, replace
 NOMINAL_STEPS = 30_000
 """Length of the run that step counts in settings are written for."""
 
+SPLITS = ("random", "long_axis")
+"""The values of `DensifySettings.split`."""
+
 
 @dataclass
 class RasterSettings:
@@ -108,6 +111,18 @@ class DensifySettings:
     refinements after step `reset_every`."""
     reset_opacity: float = 2.0
     """Multiplied by `prune_opacity`: a reset caps opacities at this."""
+    split: str = "random"
+    """How Gaussians grow. `random`: as in gsplat, small ones are duplicated, and large ones split
+    into two with means drawn from the old one. `long_axis`: all of them are split into two side by
+    side along the longest axis (`xrgs.splat.growth.split_along_longest_axis`)."""
+    budget: float = 0.0
+    """The most Gaussians that growing may lead to, for each pixel of the training view that has the
+    most of them (`xrgs.splat.growth.Budget`); 0 sets no limit. The unit is our choice."""
+
+    @property
+    def last_refinement(self) -> int:
+        """The last step at which Gaussians are refined, if `start` is below it."""
+        return (self.stop - 1) // self.every * self.every
 
     def scaled(self, steps: int) -> DensifySettings:
         """Return the same schedule for a run of another length.

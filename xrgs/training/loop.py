@@ -212,6 +212,7 @@ def _set_up(data: Dataset, conf: Conf, extra_components: Iterable[Component]) ->
         scene_scale=data.scene_scale,
         generator=seeded_generator(conf.seed, "densify"),
         groups=components.densification_groups(splat.densify),
+        view_pixels=max((v.camera.width * v.camera.height for v in data.train), default=0),
     )
     targets = {view.name: prepare_target(view.image) for view in data.train}
     return _Run(

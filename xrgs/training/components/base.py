@@ -441,6 +441,7 @@ class Components(tuple[Component, ...]):
         """What the components decide about densification at a step."""
         return DensifierHooks(
             may_grow=lambda gaussians: self.may_grow(gaussians, step),
+            growth_scores=lambda gaussians: self.growth_scores(gaussians, step),
             opacity_attenuation=self.opacity_attenuation,
         )
 
