@@ -35,6 +35,8 @@ CASES = {
     "current_view": ["+ablation=densify", "components.densify.decide=current_view"],
     "xrgs": ["+ablation=xrgs"],
     "curriculum": ["+ablation=curriculum"],
+    # 60 Gaussians of at most 180: a limit that began with those at the restart would be another.
+    "budget": ["+ablation=budget", "splat.densify.budget=0.05"],
     # Its rates are found anew between refinements too, or they would be new at every restart.
     "mip": ["+ablation=mip", "components.mip.every=7"],
     # Without the reset, after which too few Gaussians are left for numbers to be matched.

@@ -310,6 +310,17 @@ def test_components_remove_gaussians_at_any_step(data: Dataset, short: Conf) -> 
     assert len(result.gaussians) == 60 + grown - rules - 9 == last["gaussians"]
 
 
+def test_the_budget_counts_by_pixels_of_the_largest_view(data: Dataset, compose: Compose) -> None:
+    schedule = ("splat.densify.every=3000", "splat.densify.start=0", "splat.densify.stop=13000")
+    conf = compose("train.steps=30", "splat.densify.grow_grad2d=0", *schedule)
+    conf.splat.densify.budget, conf.splat.densify.prune_opacity = 0.05, 0.0
+    conf.splat.densify.reset_every = 50_000  # never
+    history = train(data, conf).history
+    # 60 x 60 px allow 180; the refinements are at steps 3, 6, 9 and 12.
+    counts = [row["gaussians"] for row in history if row["step"] in (3, 4, 7, 10, 13, 29)]
+    assert counts == [60, 120, 144, 163, 180, 180]
+
+
 @pytest.mark.parametrize("ablation", ABLATIONS)
 def test_each_ablation_changes_the_result(
     data: Dataset, compose: Compose, same: Same, ablation: str

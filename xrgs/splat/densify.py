@@ -48,10 +48,9 @@ class Densifier:
     below `stop` that `reset_every` divides, opacities are capped at `reset_opacity *
     prune_opacity`. Without Gaussians, all of it does nothing.
 
-    With `split=long_axis` all Gaussians that grow are split, along their longest axis. A budget
-    lets the best of them grow, so that there are never more than its cap at the refinement; the
-    last refinement's is the budget itself. Pruning, which follows, makes room for the next one.
-    Gaussians are never removed for a budget.
+    With `split=long_axis` all Gaussians that grow are split, along their longest axis. Within a
+    budget (`xrgs.splat.growth.Budget`) the best of them grow, up to the refinement's cap. Pruning,
+    which follows, makes room for the next refinement; nothing is removed for the budget itself.
 
     `groups` may replace `grow_grad2d` and `prune_opacity` by thresholds for each group of views.
     The cap is then that of the largest opacity threshold, since the next refinement would prune

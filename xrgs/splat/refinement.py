@@ -107,7 +107,7 @@ class DensifierHooks:
     """What others decide at a step; each is asked with the N Gaussians, and None changes nothing.
 
     All but `opacity_attenuation` are asked at refinements alone, with the Gaussians as the step's
-    optimizer has left them.
+    optimizer has left them, and with gradients switched off.
     """
 
     may_grow: Callable[[Gaussians], Tensor | None] = _nothing
