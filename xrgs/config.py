@@ -150,6 +150,10 @@ class TrainConf:
     evaluate_every: int = MISSING
     """Steps of this run between two evaluations of the test views during training; 0 evaluates them
     after the last step alone."""
+    validation: float = MISSING
+    """Share of the HR training views, from 0 to below 1, that are drawn by `seed`, left out of
+    training, and scored in place of the test views; at least one of them. 0 scores the test
+    views."""
 
 
 @dataclass
@@ -392,6 +396,8 @@ def to_conf(cfg: DictConfig) -> Conf:
     for key, value, least in least_values:
         if not value >= least:
             raise XrgsError(f"{key}={value}: must be at least {least}")
+    if not 0 <= conf.train.validation < 1:
+        raise XrgsError(f"train.validation={conf.train.validation}: must be from 0 to below 1")
     if conf.splat.backend not in CHOICES:
         raise XrgsError(f"splat.backend={conf.splat.backend}: must be one of {', '.join(CHOICES)}")
     if conf.retry not in _RETRY:
