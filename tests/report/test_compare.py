@@ -87,7 +87,7 @@ def test_one_scene_has_its_interval_over_seeds(made: Any) -> None:
     row = mean_of(compared(made), "training_time_s")
     wanted = stats.t.interval(0.95, 2, loc=np.mean(changes), scale=stats.sem(changes))
     assert (row["low"], row["high"]) == pytest.approx(wanted, rel=1e-9)
-    assert (row["n"], row["unit"]) == (3, "seeds")
+    assert (row["n"], row["unit"]) == (3, "replicates")
 
 
 def test_one_seed_has_no_interval(made: Any) -> None:
@@ -266,7 +266,7 @@ def test_the_arithmetic_does_not_grow_faster_than_the_cells(made: Any) -> None:
             "scene": scenes, "condition": "", "label": "baseline", "seed": np.arange(n) // 50,
             "cell_id": [f"b{number}" for number in range(n)], "variant_id": scenes,
             "baseline_id": [f"b{number}" for number in range(n)], "error": None,
-            "state": "done", "reason": "", "protocol": 1,
+            "state": "done", "reason": "", "protocol": 1, "variant_seed": 0, "validation": 0.0,
         }
     )  # fmt: skip
     names = [metric.name for metric in METRICS]
