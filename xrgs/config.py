@@ -98,8 +98,8 @@ class VariantConf:
     """Every n-th view is held out for testing, beginning with the first; 0 trains on all views and
     tests on the same poses."""
     seed: int = MISSING
-    """Seed of `selection=random`. It is not the seed of training: all seeds of a study share one
-    variant."""
+    """Seed of `selection=random`. It is not the seed of training: training seeds share one variant
+    unless this follows them (`variant.seed=${seed}`). The two make a replicate."""
     tags: str = MISSING
     """How views are tagged: `flag` (by `selection`), or HR are those of most `megapixels`, of least
     `distance` to what they show, or of the highest `sampling_rate` (focal length in px over

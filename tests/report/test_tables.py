@@ -99,7 +99,8 @@ def test_psnr_has_decibels_beside_its_percentage(made: Any) -> None:
     table = tables(made).mean("consistency", "")
     rows = {row[0]: row for row in table.rows}
     assert rows["PSNR"] == (
-        "PSNR", "20.00 dB", "19.80 dB", "-1.00 ↓", "-0.20", "", "1 of 1", "one replicate: no interval",
+        "PSNR", "20.00 dB", "19.80 dB", "-1.00 ↓", "-0.20", "",
+        "1 of 1", "one replicate: no interval",
     )  # fmt: skip
     assert rows["SSIM"][4] == ""
     assert table.title == "consistency against baseline: scene fern, seed 0"
@@ -157,6 +158,32 @@ def test_a_title_lists_up_to_eight_seeds(made: Any, count: int, text: str) -> No
         made.add("consistency", seed=seed)
     title = tables(made).mean("consistency", "").title
     assert title == f"consistency against baseline: scene fern, {text}"
+
+
+def test_a_title_names_replicates_that_have_variants_of_their_own(made: Any) -> None:
+    for seed in range(3):
+        made.add(draw=seed, seed=seed, variant=f"v{seed}")
+        made.add("consistency", draw=seed, seed=seed, variant=f"v{seed}")
+    made.add(draw=3, variant="v3", state="failed")
+    built = tables(made)
+    title = built.mean("consistency", "").title
+    assert title.endswith("scene fern, replicates 0/0, 1/1, 2/2 (variant.seed/seed)")
+    missing = built.missing()
+    assert missing is not None
+    assert missing.rows[0][3:5] == ("3", "0")
+
+
+def test_pairs_that_agree_stand_beside_the_interval(made: Any) -> None:
+    for seed, factor in enumerate((1.5, 1.2, 0.9)):
+        made.add(seed=seed)
+        made.add("consistency", seed=seed, factors={"gaussians": factor})
+    table = tables(made).mean("consistency", "")
+    column = table.columns.index("pairs that agree")
+    assert table.columns[column - 1] == "95 % interval, %"
+    assert {row[0]: row[column] for row in table.rows}["Gaussians"] == "2 of 3"
+    long = tables(made).long()
+    rows = long[long["metric"] == "gaussians"]
+    assert rows[["agree", "pairs"]].to_numpy().tolist() == [[2, 3], [2, 3]]
 
 
 def test_several_ablations_stand_beside_each_other(made: Any) -> None:

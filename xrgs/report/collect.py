@@ -194,8 +194,8 @@ def _cells(
         for row in entries
     ]
     read = ["state", "reason", "protocol", "validation", "true_variant", "true_seed"]
-    columns = [*RECORD_KEYS, *read, *(metric.name for metric in metrics)]
-    cells = pd.DataFrame(rows, columns=columns)
+    names = [*RECORD_KEYS, *read, *(metric.name for metric in metrics)]
+    cells = pd.DataFrame(rows, columns=names)
     for metric in metrics:
         values = cells[metric.name]
         if metric.name in means.columns:

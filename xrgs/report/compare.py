@@ -116,7 +116,7 @@ def share_of_gap(
             np.isnan(all_hr),
             gap == 0,
             gap < 0 if higher_is_better else gap > 0,
-            ~np.isfinite(share),
+            ~np.isfinite(gap) | ~np.isfinite(share),
         ],
         [NOT_MEASURED, NO_ALL_HR, NO_GAP, WRONG_GAP, NOT_FINITE],
         default="",
