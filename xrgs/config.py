@@ -99,8 +99,8 @@ class VariantConf:
     """Every n-th view is held out for testing, beginning with the first; 0 trains on all views and
     tests on the same poses."""
     seed: int = MISSING
-    """Seed of `selection=random`. It is not the seed of training: all seeds of a study share one
-    variant."""
+    """Seed of `selection=random`. It is not the seed of training: training seeds share one variant
+    unless this follows them (`variant.seed=${seed}`). The two make a replicate."""
     tags: str = MISSING
     """How views are tagged: `flag` (by `selection`), or HR are those of most `megapixels`, of least
     `distance` to what they show, or of the highest `sampling_rate` (focal length in px over
@@ -151,6 +151,10 @@ class TrainConf:
     evaluate_every: int = MISSING
     """Steps of this run between two evaluations of the test views during training; 0 evaluates them
     after the last step alone."""
+    validation: float = MISSING
+    """Share of the HR training views, from 0 to below 1, that are drawn by `seed`, left out of
+    training, and scored in place of the test views; at least one of them. 0 scores the test
+    views."""
 
 
 @dataclass
@@ -393,6 +397,8 @@ def to_conf(cfg: DictConfig) -> Conf:
     for key, value, least in least_values:
         if not value >= least:
             raise XrgsError(f"{key}={value}: must be at least {least}")
+    if not 0 <= conf.train.validation < 1:
+        raise XrgsError(f"train.validation={conf.train.validation}: must be from 0 to below 1")
     if conf.splat.backend not in CHOICES:
         raise XrgsError(f"splat.backend={conf.splat.backend}: must be one of {', '.join(CHOICES)}")
     densify = conf.splat.densify

@@ -142,3 +142,60 @@ def test_a_world_that_cant_be_normalised_is_one_line(variant: Variant, of: str) 
         views = ()
     with pytest.raises(XrgsError, match="its cameras and points can't be of one scene"):
         dataset.load(replace(variant, points=points, views=views))
+
+
+@pytest.fixture
+def many(variant: Variant) -> Variant:
+    """One test view, eight HR and three LR training views, and originals of the latter."""
+    more = [make_view(variant.folder, f"v{i}", "train", "HR", HR) for i in range(5, 12)]
+    return replace(variant, views=(*variant.views, *more))
+
+
+def names(views: tuple[LoadedView, ...]) -> list[str]:
+    return [view.name for view in views]
+
+
+@pytest.mark.parametrize(("share", "count"), [(0.01, 1), (0.1, 1), (0.25, 2), (0.5, 4), (0.75, 6)])
+def test_a_share_of_the_hr_training_views_is_scored_and_not_trained_on(
+    many: Variant, share: float, count: int
+) -> None:
+    data, whole = dataset.load(many, validation=share), dataset.load(many)
+    assert len(data.test) == count
+    assert names(data.test) == [n for n in names(whole.train) if n not in names(data.train)]
+    assert "v0" not in names(data.test), "the test view"
+    assert {view.tag for view in data.test} == {"HR"}
+    trained = {view.name: view for view in whole.train}
+    for view in data.test:
+        assert torch.equal(view.image, trained[view.name].image), "not an original or a test view"
+        assert torch.equal(view.camera.viewmat, trained[view.name].camera.viewmat)
+
+
+def test_every_control_of_a_seed_holds_out_the_same_views(many: Variant) -> None:
+    mixed = dataset.load(many, validation=0.25, seed=3)
+    left = set(names(mixed.train))
+    for use in dataset.USES:
+        data = dataset.load(many, use, validation=0.25, seed=3)
+        assert names(data.test) == names(mixed.test)
+        assert names(data.train) == [n for n in names(dataset.load(many, use).train) if n in left]
+        assert data.scene_scale == dataset.load(many).scene_scale
+        assert torch.equal(data.points, mixed.points)
+    assert names(dataset.load(many, "lr_only", validation=0.25).train) == ["v2", "v3", "v4"]
+
+
+def test_the_seed_draws_the_held_out_views(many: Variant) -> None:
+    drawn = [names(dataset.load(many, validation=0.1, seed=seed).test)[0] for seed in range(12)]
+    assert drawn == [names(dataset.load(many, validation=0.1, seed=s).test)[0] for s in range(12)]
+    assert len(set(drawn)) > 3
+    assert names(dataset.load(many, seed=5).test) == ["v0"], "0 scores the test views"
+
+
+def test_held_out_views_must_leave_two_hr_views(many: Variant) -> None:
+    three = replace(many, views=many.views[:-5])
+    assert len(dataset.load(three, "hr_only", validation=0.1).train) == 2
+    two = replace(many, views=many.views[:-6])
+    for variant, share, use in ((two, 0.1, "mixed"), (two, 0.1, "lr_only"), (many, 0.9, "all_hr")):
+        with pytest.raises(XrgsError, match=rf"train\.validation={share}: .*at least 2 HR"):
+            dataset.load(variant, use, validation=share)
+    for share in (-0.1, 1.0, float("nan")):
+        with pytest.raises(XrgsError, match=rf"train\.validation={share}: must be 0, or a share"):
+            dataset.load(many, validation=share)

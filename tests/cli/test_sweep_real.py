@@ -23,7 +23,7 @@ def test_a_sweep_ends_with_the_table_and_where_it_is(swept: tuple[Path, str]) ->
     for label in ("Training time", "Gaussians", "Memory", "LPIPS", "SSIM", "PSNR"):
         assert label in out
     assert "n/a" in out
-    assert "one seed: no interval" in out
+    assert "one replicate: no interval" in out
     assert "↑" in out or "↓" in out
     written = folder / out.strip().rpartition("Written to ")[2]
     assert {"table.md", "table.tex", "table.csv"} <= {file.name for file in written.iterdir()}

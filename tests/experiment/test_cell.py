@@ -42,17 +42,18 @@ class LoadError(Exception):
 
 
 @pytest.mark.parametrize("ablation", ["baseline", *dataset.USES[1:]])
-def test_the_controls_choose_the_views_that_are_trained_on(
+def test_the_controls_choose_the_views_that_are_trained_on_and_scored(
     ablation: str, compose: Callable[..., Conf], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def load(variant: object, use: str) -> None:
+    def load(variant: object, use: str, *, validation: float, seed: int) -> None:
         del variant
-        raise LoadError(use)
+        raise LoadError(f"{use} {validation} {seed}")
 
     monkeypatch.setattr(dataset, "load", load)
     views = "mixed" if ablation == "baseline" else ablation
-    with pytest.raises(LoadError, match=views):
-        cell.run_cell(compose(f"+ablation={ablation}"), VARIANT, CellFolder(tmp_path))
+    conf = compose(f"+ablation={ablation}", "train.validation=0.1", "seed=7")
+    with pytest.raises(LoadError, match=rf"^{views} 0\.1 7$"):
+        cell.run_cell(conf, VARIANT, CellFolder(tmp_path))
 
 
 class Kill(BaseException):
@@ -94,7 +95,7 @@ def results(folder: CellFolder) -> dict[str, Any]:
 @pytest.fixture
 def conf(data: Dataset, baseline: Conf, monkeypatch: pytest.MonkeyPatch) -> Conf:
     """The config of a cell on `data` that writes a checkpoint after each step."""
-    monkeypatch.setattr(dataset, "load", lambda *_: data)
+    monkeypatch.setattr(dataset, "load", lambda *_, **__: data)
     baseline.checkpoint_s, baseline.threads = 1e-9, 1
     baseline.train.steps, baseline.splat.backend = 12, resolve_backend("auto")
     return baseline

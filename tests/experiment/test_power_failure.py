@@ -396,7 +396,7 @@ def attempts(
     data: Dataset, baseline: Conf, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> Attempts:
     """Attempts at a cell of three steps on `data`, with a checkpoint after each."""
-    monkeypatch.setattr(dataset, "load", lambda *_: data)
+    monkeypatch.setattr(dataset, "load", lambda *_, **__: data)
     baseline.checkpoint_s, baseline.threads = 1e-9, 1
     baseline.train.steps, baseline.splat.backend = 3, resolve_backend("auto")
     return Attempts(baseline, tmp_path)

@@ -11,6 +11,7 @@ from typing import Any
 import pytest
 import torch
 
+from xrgs.capture import dataset, variant
 from xrgs.capture.variant import CorruptVariant
 from xrgs.errors import StoreError, XrgsError
 from xrgs.experiment.cell_folder import CellFolder
@@ -153,6 +154,29 @@ def test_a_variant_elsewhere_is_refused(store: Store, identity: dict[str, Any]) 
     cell = finished(store, "abc")
     (cell.path / "identity.json").write_text(json.dumps(identity))
     with pytest.raises(StoreError, match=r"identity\.json: it names no variant"):
+        cell.dataset()
+
+
+@pytest.mark.parametrize(("train", "validation"), [({}, 0.0), ({"validation": 0.25}, 0.25)])
+def test_a_cells_views_are_those_that_it_was_trained_on_and_scored(
+    store: Store, train: dict[str, Any], validation: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    loaded: list[Any] = []
+    monkeypatch.setattr(variant, "load", lambda _: "frozen")
+    monkeypatch.setattr(dataset, "load", lambda *views, **held: loaded.append((views, held)))
+    cell = finished(store, "abc")
+    identity = {"variant": "v", "seed": 3, "train": {"views": "hr_only"} | train}
+    (cell.path / "identity.json").write_text(json.dumps(identity))
+    cell.dataset()
+    assert loaded == [(("frozen", "hr_only"), {"validation": validation, "seed": 3})]
+
+
+@pytest.mark.parametrize(("seed", "share"), [(-1, 0.0), ("0", 0.0), (0, 1.0), (0, "0.1")])
+def test_a_share_or_seed_that_is_none_is_refused(store: Store, seed: Any, share: Any) -> None:
+    cell = finished(store, "abc")
+    identity = {"variant": "v", "seed": seed, "train": {"views": "mixed", "validation": share}}
+    (cell.path / "identity.json").write_text(json.dumps(identity))
+    with pytest.raises(StoreError, match=r"train\.validation or seed is not a number"):
         cell.dataset()
 
 

@@ -91,6 +91,10 @@ def test_the_bounds_of_a_record(tmp_path: Path) -> None:
     many = store.write_sweep([], [row | {"seed": seed} for seed in range(100_000)])
     assert len(store.sweep_record(many)["cells"]) == 100_000
     store.verify_sweep(many)
+    for wrong in (-1, 0.5, None, True, 2**63):
+        malformed = store.write_sweep([], [row | {"variant_seed": wrong}])
+        with pytest.raises(StoreError, match=rf"{malformed}\.json: cell 1 "):
+            store.sweep_record(malformed)
     long = store.write_sweep([], [row | {"label": "x" * 2001}])
     with pytest.raises(StoreError, match=rf"{long}\.json: cell 1 "):
         store.sweep_record(long)

@@ -40,6 +40,8 @@ class MadeStore:
         scene: str = "fern",
         condition: str = "",
         seed: int = 0,
+        draw: int = 0,
+        validation: float | None = None,
         factors: dict[str, float] | None = None,
         values: dict[str, Any] | None = None,
         variant: str | None = None,
@@ -56,12 +58,13 @@ class MadeStore:
         found = SUMMARY | SCORES | (values or {})
         found |= {key: found[key] * factor for key, factor in (factors or {}).items()}
         folder = self.store.cell(cell_id)
-        folder.begin({}, {"variant": variant, "seed": seed, "protocol": protocol})
+        train = {} if validation is None else {"train": {"validation": validation}}
+        folder.begin({}, {"variant": variant, "seed": seed, "protocol": protocol} | train)
         base = [
             row["cell_id"]
             for row in self.rows
-            if (row["label"], row["scene"], row["condition"], row["seed"])
-            == ("baseline", scene, condition, seed)
+            if (row["label"], row["scene"], row["condition"], row["variant_seed"], row["seed"])
+            == ("baseline", scene, condition, draw, seed)
         ]
         self.rows.append(
             {
@@ -69,6 +72,7 @@ class MadeStore:
                 "label": label,
                 "condition": condition,
                 "scene": scene,
+                "variant_seed": draw,
                 "seed": seed,
                 "variant_id": variant,
                 "baseline_id": (base or [cell_id])[0],
@@ -81,7 +85,8 @@ class MadeStore:
         self._fill(folder, found, cpu, arithmetic)
         (folder.path / "history.csv").write_text(history)
         if pictures:
-            self._draw(folder, variant, noise=0.02 * len(self.rows))
+            split = "train" if validation else "test"
+            self._draw(folder, f"{variant}/images/{split}", noise=0.02 * len(self.rows))
         folder.finish(VIEWS, protocol)
         return folder
 
@@ -90,7 +95,7 @@ class MadeStore:
         keys = dict.fromkeys(("cell_id", "variant_id", "baseline_id"))
         self.rows.append(
             keys
-            | {"label": label, "condition": "", "scene": scene, "seed": seed}
+            | {"label": label, "condition": "", "scene": scene, "variant_seed": 0, "seed": seed}
             | {"error": f"{scene}: 3 of 24 views registered"}
         )
 
@@ -112,8 +117,8 @@ class MadeStore:
             lines.append(",".join([view, *scores]))
         (folder.path / "scores.csv").write_text("\n".join(lines) + "\n")
 
-    def _draw(self, folder: CellFolder, variant: str, noise: float) -> None:
-        photographs = self.store.path / "variants" / variant / "images" / "test"
+    def _draw(self, folder: CellFolder, images: str, noise: float) -> None:
+        photographs = self.store.path / "variants" / images
         photographs.mkdir(parents=True, exist_ok=True)
         (folder.path / "renders").mkdir()
         for number, view in enumerate(VIEWS):

@@ -1,5 +1,6 @@
 """The arithmetic of percentage changes, against numbers worked out elsewhere."""
 
+import json
 import math
 from itertools import pairwise
 from typing import Any
@@ -14,13 +15,17 @@ from scipy import stats
 from xrgs.evaluation.metrics import METRICS
 from xrgs.report.collect import ReportError, read_sweep
 from xrgs.report.compare import (
+    NO_ALL_HR,
+    NO_GAP,
     NOT_FINITE,
     NOT_MEASURED,
+    WRONG_GAP,
     ZERO_BASELINE,
     Comparison,
     compare,
     half_width,
     percent_change,
+    share_of_gap,
 )
 from xrgs.report.tables import percent
 
@@ -87,7 +92,7 @@ def test_one_scene_has_its_interval_over_seeds(made: Any) -> None:
     row = mean_of(compared(made), "training_time_s")
     wanted = stats.t.interval(0.95, 2, loc=np.mean(changes), scale=stats.sem(changes))
     assert (row["low"], row["high"]) == pytest.approx(wanted, rel=1e-9)
-    assert (row["n"], row["unit"]) == (3, "seeds")
+    assert (row["n"], row["unit"]) == (3, "replicates")
 
 
 def test_one_seed_has_no_interval(made: Any) -> None:
@@ -167,6 +172,164 @@ def test_variants_are_not_mixed(made: Any) -> None:
     made.add("consistency", variant="bbbb")
     with pytest.raises(ReportError, match=r"variant.*cell00000.*aaaa.*cell00001.*bbbb"):
         compared(made)
+
+
+def test_a_draw_of_the_hr_views_is_a_replicate_with_a_variant_of_its_own(made: Any) -> None:
+    """Three draws in a scene: paired within each, averaged over them, one interval of three."""
+    changes = (10.0, 20.0, 60.0)
+    for draw, change in enumerate(changes):
+        made.add(draw=draw, seed=draw, variant=f"v{draw}", factors={"psnr": 1.0 + draw})
+        factors = {"psnr": (1.0 + draw) * (1 + change / 100)}
+        made.add("consistency", draw=draw, seed=draw, variant=f"v{draw}", factors=factors)
+    comparison = compared(made)
+    pairs = comparison.pairs.query("metric == 'psnr'")
+    assert list(zip(pairs["variant_seed"], pairs["seed"], strict=True)) == [(0, 0), (1, 1), (2, 2)]
+    row = mean_of(comparison, "psnr")
+    wanted = stats.t.interval(0.95, 2, loc=np.mean(changes), scale=stats.sem(changes))
+    assert row["change"] == pytest.approx(30.0)
+    assert (row["low"], row["high"]) == pytest.approx(wanted, rel=1e-9)
+
+
+def test_variants_of_one_draw_are_not_mixed(made: Any) -> None:
+    made.add(draw=1, variant="aaaa")
+    made.add("consistency", draw=1, seed=1, variant="bbbb")
+    with pytest.raises(ReportError, match=r"variant.*cell00000.*aaaa.*cell00001.*bbbb"):
+        compared(made)
+
+
+def test_a_record_from_before_draws_were_replicates_is_read(made: Any) -> None:
+    for condition, variant in (("variant.seed=0", "v0"), ("variant.seed=1", "v1")):
+        made.add(condition=condition, variant=variant)
+        made.add("consistency", condition=condition, variant=variant, factors={"psnr": 1.5})
+    made.add("late", condition="variant.seed=0", variant="v1")
+    late = made.rows.pop()
+    for row in (*made.rows, late):
+        del row["variant_seed"]
+    means = compared(made).means["change"]
+    assert means["consistency", "variant.seed=0", "psnr"] == pytest.approx(50)
+    assert means["consistency", "variant.seed=1", "psnr"] == pytest.approx(50)
+    made.rows.append(late)
+    with pytest.raises(ReportError, match="different variants"):
+        compared(made)
+
+
+def test_pairs_that_agree_are_counted_by_the_sign_of_the_mean(made: Any) -> None:
+    """Scenes' means are +20 and -5, so the mean is up: 3 of 5 pairs are."""
+    for scene, changes in (("fern", (30.0, 10.0)), ("room", (-9.0, 3.0, -9.0))):
+        for seed, change in enumerate(changes):
+            made.add(scene=scene, seed=seed)
+            factors = {"gaussians": 1 + change / 100, "psnr": 1.0}
+            made.add("consistency", scene=scene, seed=seed, factors=factors)
+    comparison = compared(made)
+    row = mean_of(comparison, "gaussians")
+    assert row["change"] == pytest.approx(7.5)
+    assert (row["agree"], row["pairs"]) == (3, 5)
+    room = comparison.per_scene.xs(("consistency", "", "room", "gaussians"))
+    assert (room["agree"], room["pairs"]) == (2, 3)
+    assert tuple(mean_of(comparison, "psnr")[["agree", "pairs"]]) == (5, 5), "all are unchanged"
+
+
+def test_a_pair_without_a_change_neither_agrees_nor_counts(made: Any) -> None:
+    for seed, lpips in enumerate((None, 0.25)):
+        made.add(seed=seed, values={"lpips": lpips})
+        made.add("consistency", seed=seed, factors={"psnr": 1.1})
+    assert tuple(mean_of(compared(made), "lpips")[["agree", "pairs"]]) == (1, 1)
+
+
+def test_scores_of_held_out_training_views_are_not_mixed_with_scores_of_test_views(
+    made: Any,
+) -> None:
+    made.add(validation=0.0)
+    made.add("consistency")
+    compared(made)
+    made.add("late", validation=0.1)
+    with pytest.raises(ReportError, match=r"train\.validation.*cell00000.* 0\.0.*cell00002.* 0\.1"):
+        compared(made)
+    made.rows[-1]["condition"] = "train.validation=0.1"
+    with pytest.raises(ReportError, match=r"cell00002.* validation 0\.1.*cell00000.*: not a pair"):
+        compared(made)
+
+
+@pytest.mark.parametrize("share", [1, -0.1, "0.1", None])
+def test_a_share_of_held_out_views_that_is_none_makes_no_number(made: Any, share: Any) -> None:
+    made.add()
+    cell = made.add("consistency")
+    identity = json.loads((cell.path / "identity.json").read_text())
+    (cell.path / "identity.json").write_text(
+        json.dumps(identity | {"train": {"validation": share}})
+    )
+    sweep = read_sweep(made.store, made.write(), METRICS)
+    assert list(sweep.cells["state"]) == ["done", "corrupt"]
+
+
+GAP = {"lpips": (0.4, 0.3, 0.2), "ssim": (0.5, 0.6, 0.9), "psnr": (20.0, 23.0, 24.0)}
+
+
+def add_gap(made: Any, scene: str = "fern", *, seed: int = 0, **psnr: float | None) -> None:
+    """The three cells of a gap, of which the ablation closes 50, 25 and 75%."""
+    for number, label in enumerate(("baseline", "consistency", "all_hr")):
+        values: dict[str, float | None] = {name: of[number] for name, of in GAP.items()}
+        values["psnr"] = psnr.get(label, values["psnr"])
+        made.add(label, scene=scene, seed=seed, values=values)
+
+
+def test_the_share_of_the_gap_is_closed_form_and_for_scores_alone(made: Any) -> None:
+    add_gap(made)
+    gaps = compared(made).gaps
+    shares = gaps.reset_index().set_index("metric")["change"].to_dict()
+    assert shares == pytest.approx({"lpips": 50.0, "ssim": 25.0, "psnr": 75.0})
+    assert set(gaps.index.get_level_values("label")) == {"consistency"}
+
+
+def test_the_share_of_the_gap_is_averaged_by_scene_and_then_over_scenes(made: Any) -> None:
+    """Gaps of 4 dB: fern closes 75 and 25%, room -25%. A ratio of sums would give 25%."""
+    add_gap(made)
+    add_gap(made, seed=1, consistency=21.0)
+    add_gap(made, "room", consistency=19.0)
+    comparison = compared(made)
+    by_scene = comparison.gaps_per_scene["change"].xs("psnr", level="metric")
+    assert list(by_scene) == pytest.approx([50.0, -25.0])
+    row = comparison.gaps.xs(("consistency", "", "psnr"))
+    assert row["change"] == pytest.approx(12.5)
+    interval = stats.t.interval(0.95, 1, loc=12.5, scale=stats.sem([50.0, -25.0]))
+    assert (row["low"], row["high"]) == pytest.approx(interval, rel=1e-9)
+    assert (row["agree"], row["pairs"]) == (2, 3)
+
+
+@pytest.mark.parametrize(
+    ("all_hr", "why"),
+    [(20.0, NO_GAP), (19.5, WRONG_GAP), (None, NO_ALL_HR), (math.inf, NOT_FINITE)],
+)
+def test_a_gap_that_is_none_gives_no_share_and_the_reason(
+    made: Any, all_hr: float | None, why: str
+) -> None:
+    add_gap(made, all_hr=all_hr)
+    row = compared(made).gaps.xs(("consistency", "", "psnr"))
+    assert row["why"] == why
+    assert np.isnan(row["change"])
+
+
+def test_less_is_a_gap_where_less_is_better() -> None:
+    args = np.array([0.4]), np.array([0.1]), np.array([0.2])
+    assert share_of_gap(*args, higher_is_better=False)[0] == pytest.approx([150.0])
+    assert share_of_gap(*args, higher_is_better=True)[1] == [WRONG_GAP]
+
+
+def test_a_failed_all_hr_leaves_its_replicate_out(made: Any) -> None:
+    add_gap(made)
+    made.add(seed=1)
+    made.add("consistency", seed=1)
+    made.add("all_hr", seed=1, state="failed")
+    row = compared(made).gaps.xs(("consistency", "", "psnr"))
+    assert (row["change"], row["why"], row["pairs"]) == (pytest.approx(75.0), NO_ALL_HR, 1)
+
+
+def test_there_is_no_gap_without_all_hr_of_the_same_condition(made: Any) -> None:
+    made.add()
+    made.add("consistency")
+    made.add(condition="train.steps=9")
+    made.add("all_hr", condition="train.steps=9")
+    assert compared(made).gaps.empty
 
 
 def test_protocols_are_not_mixed(made: Any) -> None:
@@ -266,7 +429,7 @@ def test_the_arithmetic_does_not_grow_faster_than_the_cells(made: Any) -> None:
             "scene": scenes, "condition": "", "label": "baseline", "seed": np.arange(n) // 50,
             "cell_id": [f"b{number}" for number in range(n)], "variant_id": scenes,
             "baseline_id": [f"b{number}" for number in range(n)], "error": None,
-            "state": "done", "reason": "", "protocol": 1,
+            "state": "done", "reason": "", "protocol": 1, "variant_seed": 0, "validation": 0.0,
         }
     )  # fmt: skip
     names = [metric.name for metric in METRICS]

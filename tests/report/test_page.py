@@ -69,6 +69,27 @@ def test_an_odd_name_has_its_picture(made: Any) -> None:
     assert all(file.parent == report.folder / "figures" for file in pictures)
 
 
+def test_a_report_of_held_out_training_views_says_so_and_shows_them(made: Any) -> None:
+    for label in ("baseline", "consistency"):
+        made.add(label, condition="train.validation=0.1", validation=0.1, pictures=True)
+    made.write()
+    report = build(made.store.path)
+    said = "Scores are of held-out training views where the tables say train.validation=0.1"
+    assert said in report.text
+    assert f"**{said}" in (report.folder / "table.md").read_text()
+    assert (report.folder / "figures" / "fern--consistency.png").is_file()
+    assert not (made.store.variants / made.rows[0]["variant_id"] / "images" / "test").exists()
+    (row, _) = csv.DictReader((report.folder / "cells.csv").read_text().splitlines())
+    assert row["validation"] == "0.1"
+
+
+def test_a_report_of_test_views_says_nothing_of_held_out_ones(made: Any) -> None:
+    made.add()
+    made.add("consistency", validation=0.0)
+    made.write()
+    assert "held-out" not in build(made.store.path, pictures=[]).text
+
+
 @pytest.mark.slow
 def test_several_ablations_have_a_picture_of_what_they_trade(
     made: Any, monkeypatch: pytest.MonkeyPatch

@@ -31,7 +31,7 @@ def tables(made: Any) -> Tables:
 
 
 def change(mean: float, low: float = math.nan, high: float = math.nan, why: str = "") -> Change:
-    return Change(1.0, 1.0, mean, 0.0, 0.0, 2, low, high, "seeds", why)
+    return Change(1.0, 1.0, mean, 0.0, 0.0, 2, low, high, "replicates", why, 2, 2)
 
 
 @pytest.mark.parametrize("metric", METRICS, ids=lambda metric: metric.name)
@@ -74,7 +74,7 @@ def test_values_have_their_unit(value: float, unit: str, text: str) -> None:
 @pytest.mark.parametrize(
     ("row", "text"),
     [
-        (change(5.0), "one seed: no interval"),
+        (change(5.0), "one replicate: no interval"),
         (change(5.0, 1.0, 9.0), "better"),
         (change(-5.0, -9.0, -1.0), "worse"),
         (change(5.0, -1.0, 11.0), "inside noise"),
@@ -99,7 +99,8 @@ def test_psnr_has_decibels_beside_its_percentage(made: Any) -> None:
     table = tables(made).mean("consistency", "")
     rows = {row[0]: row for row in table.rows}
     assert rows["PSNR"] == (
-        "PSNR", "20.00 dB", "19.80 dB", "-1.00 ↓", "-0.20", "", "one seed: no interval",
+        "PSNR", "20.00 dB", "19.80 dB", "-1.00 ↓", "-0.20", "",
+        "1 of 1", "one replicate: no interval",
     )  # fmt: skip
     assert rows["SSIM"][4] == ""
     assert table.title == "consistency against baseline: scene fern, seed 0"
@@ -122,7 +123,7 @@ def test_failed_scenes_are_shown_as_failed(made: Any) -> None:
     missing = built.missing()
     assert missing is not None
     assert missing.title == "3 of 6 cells gave no number"
-    assert ("leaves", "baseline", "", "0", "failed", "leaves: 3 of 24 views registered") in (
+    assert ("leaves", "baseline", "", "0", "0", "failed", "leaves: 3 of 24 views registered") in (
         missing.rows
     )
 
@@ -143,11 +144,13 @@ def test_the_note_on_one_seed_is_for_scenes_that_all_have_one(
             made.add("consistency", scene=scene, seed=seed, factors={"gaussians": factor})
     (note,) = (n for n in tables(made).mean("consistency", "").notes if n.startswith("interval"))
     assert note.startswith("interval: Student's t over the scenes' means")
-    assert note.endswith("; with one seed, differences of runs and of scenes are mixed") == mixed
+    assert (
+        note.endswith("; with one replicate, differences of runs and of scenes are mixed") == mixed
+    )
 
 
 @pytest.mark.parametrize(
-    ("count", "text"), [(1, "seed 0"), (8, "seeds 0, 1, 2, 3, 4, 5, 6, 7"), (9, "9 seeds")]
+    ("count", "text"), [(1, "seed 0"), (8, "seeds 0, 1, 2, 3, 4, 5, 6, 7"), (9, "9 replicates")]
 )
 def test_a_title_lists_up_to_eight_seeds(made: Any, count: int, text: str) -> None:
     for seed in range(count):
@@ -155,6 +158,32 @@ def test_a_title_lists_up_to_eight_seeds(made: Any, count: int, text: str) -> No
         made.add("consistency", seed=seed)
     title = tables(made).mean("consistency", "").title
     assert title == f"consistency against baseline: scene fern, {text}"
+
+
+def test_a_title_names_replicates_that_have_variants_of_their_own(made: Any) -> None:
+    for seed in range(3):
+        made.add(draw=seed, seed=seed, variant=f"v{seed}")
+        made.add("consistency", draw=seed, seed=seed, variant=f"v{seed}")
+    made.add(draw=3, variant="v3", state="failed")
+    built = tables(made)
+    title = built.mean("consistency", "").title
+    assert title.endswith("scene fern, replicates 0/0, 1/1, 2/2 (variant.seed/seed)")
+    missing = built.missing()
+    assert missing is not None
+    assert missing.rows[0][3:5] == ("3", "0")
+
+
+def test_pairs_that_agree_stand_beside_the_interval(made: Any) -> None:
+    for seed, factor in enumerate((1.5, 1.2, 0.9)):
+        made.add(seed=seed)
+        made.add("consistency", seed=seed, factors={"gaussians": factor})
+    table = tables(made).mean("consistency", "")
+    column = table.columns.index("pairs that agree")
+    assert table.columns[column - 1] == "95 % interval, %"
+    assert {row[0]: row[column] for row in table.rows}["Gaussians"] == "2 of 3"
+    long = tables(made).long()
+    rows = long[long["metric"] == "gaussians"]
+    assert rows[["agree", "pairs"]].to_numpy().tolist() == [[2, 3], [2, 3]]
 
 
 def test_several_ablations_stand_beside_each_other(made: Any) -> None:
@@ -218,7 +247,7 @@ def test_the_long_table_has_every_number_at_full_precision(made: Any) -> None:
     assert float(rows[1]["change_percent"]) == fern
     assert float(rows[0]["change_percent"]) == pytest.approx((fern + room) / 2, rel=1e-15)
     assert rows[1]["printed"] == percent(fern, BY_NAME["training_time_s"]) == "-66.67 ↑"
-    assert rows[1]["reading"] == "one seed: no interval"
+    assert rows[1]["reading"] == "one replicate: no interval"
     assert rows[0]["n_of"] == "scenes"
 
 
@@ -228,9 +257,11 @@ def test_cells_without_results_are_listed_with_why(made: Any) -> None:
     table = tables(made).missing()
     assert table is not None
     assert table.title == "1 of 2 cells gave no number"
-    assert table.columns == ("Scene", "Label", "Condition", "Seed", "State", "Reason")
-    assert table.align == "lllrll"
-    assert [row[:5] for row in table.rows] == [("fern", "consistency", "", "0", "failed")]
+    assert table.columns == (
+        *("Scene", "Label", "Condition", "variant.seed", "seed", "State", "Reason"),
+    )
+    assert table.align == "lllrrll"
+    assert [row[:6] for row in table.rows] == [("fern", "consistency", "", "0", "0", "failed")]
 
 
 def test_tables_of_a_condition_name_it_and_align_numbers_to_the_right(made: Any) -> None:
@@ -240,7 +271,7 @@ def test_tables_of_a_condition_name_it_and_align_numbers_to_the_right(made: Any)
             made.add("consistency", scene=scene, condition=condition, state="failed")
     built = tables(made)
     values = built.values("train.steps=20")
-    assert values.title == "Values, means over the seeds that are done (train.steps=20)"
+    assert values.title == "Values, means over the replicates that are done (train.steps=20)"
     assert values.align == "llrr"
     rows = {row[:2]: row[2:] for row in values.rows}
     assert rows["fern", "Gaussians"] == ("30", "failed")

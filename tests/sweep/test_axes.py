@@ -67,13 +67,30 @@ def test_a_swept_value_is_a_condition_and_a_fixed_one_is_not() -> None:
     assert {spec.condition for spec in specs} == {"train.steps=10", "train.steps=20"}
 
 
-@pytest.mark.parametrize("axis", ["scene.path=a,b", "scene.views=8,9", "seed=0,1"])
-def test_values_of_the_scene_and_the_seed_are_no_condition(axis: str) -> None:
-    """Tables have columns of their own for the scene and the seed."""
+@pytest.mark.parametrize(
+    "axis", ["scene.path=a,b", "scene.views=8,9", "seed=0,1", "variant.seed=0,1"]
+)
+def test_values_of_the_scene_and_the_replicate_are_no_condition(axis: str) -> None:
+    """Tables have columns of their own for the scene and the replicate."""
     specs = expand(["+ablation=consistency", axis])
     assert len(specs) == 4
     assert {spec.condition for spec in specs} == {""}
     assert len({spec.shared for spec in specs}) == 2
+
+
+def test_a_draw_of_the_views_that_follows_the_seed_is_no_axis_of_its_own() -> None:
+    specs = expand(["+ablation=consistency", "seed=0,1,2", "variant.seed=${seed}"])
+    assert len(specs) == 6
+    assert {spec.condition for spec in specs} == {""}
+    assert [spec.shared[0] for spec in specs[::2]] == ["seed=0", "seed=1", "seed=2"]
+    assert len({spec.shared[1] for spec in specs}) == 1, "for Hydra to resolve in each cell"
+
+
+def test_other_seeds_and_values_of_the_variant_are_conditions() -> None:
+    for axis in ("variant.sfm.seed=0,1", "variant.factor=2,4"):
+        values = axis.partition("=")[2].split(",")
+        key = axis.partition("=")[0]
+        assert {spec.condition for spec in expand([axis])} == {f"{key}={v}" for v in values}
 
 
 def test_a_key_that_begins_like_the_scene_is_a_condition() -> None:

@@ -146,6 +146,35 @@ def test_a_seed_that_other_values_depend_on_is_composed_for_each(
     made._context = HydraContext(loader, None)  # type: ignore[arg-type]  # all that a study calls
     plan = made._plan(["seed=3,4", "variant.seed=${seed}"])
     assert [cell.conf.variant.seed for cell in plan] == [3, 4]
+    assert [cell.name.partition(" / ")[2] for cell in plan] == [
+        "baseline / variant.seed 3 / seed 3",
+        "baseline / variant.seed 4 / seed 4",
+    ]
+    rows = plan_module.record(plan)
+    assert [(row["variant_seed"], row["seed"], row["condition"]) for row in rows] == [
+        *((3, 3, ""), (4, 4, ""))
+    ]
+
+
+@pytest.mark.parametrize(
+    ("fixed", "conditions"),
+    [
+        ("train.validation=0.1", {"train.validation=0.1"}),
+        ("train.validation=0", {""}),
+        ("train.validation=0,0.1", {"train.validation=0", "train.validation=0.1"}),
+    ],
+)
+def test_a_condition_says_where_scores_are_of_held_out_training_views(
+    study: Callable[..., Study], fixed: str, conditions: set[str]
+) -> None:
+    made = study()
+    made._context = HydraContext(ConfigLoader(), None)  # type: ignore[arg-type]
+    matched = ("+ablation=count_matched", "matched_to=gradient_scaling")
+    plan = made._plan([*matched, fixed])
+    assert {cell.spec.condition for cell in plan} == conditions
+    assert len(plan) == 3 * len(conditions), "baseline, reference and matched"
+    assert len({cell.spec for cell in plan}) == len(plan)
+    assert all(cell.reference in {c.spec for c in plan} for cell in plan if cell.reference)
 
 
 def test_a_cell_that_waits_for_a_count_in_vain_says_so(compose: Callable[..., config.Conf]) -> None:

@@ -244,15 +244,13 @@ def load_cell_dataset(folder: Path) -> Dataset:
     Raises:
         XrgsError: The cell isn't done, or its variant isn't in the store.
     """
-    from xrgs.capture import dataset, variant
     from xrgs.experiment.cell_folder import CellFolder
-    from xrgs.safeio.records import read_json
 
-    state = CellFolder(folder).state()
+    cell = CellFolder(folder)
+    state = cell.state()
     if state.name != "done":
         raise XrgsError(f"cell={folder}: is {state.name} {state.reason}".rstrip())
-    variant_id = read_json(folder / "identity.json")["variant"]
-    return dataset.load(variant.load(folder.parents[1] / "variants" / variant_id))
+    return cell.dataset()
 
 
 def _check(path: Path, key: str, value: NDArray[np.generic], shape: tuple[object, ...]) -> None:

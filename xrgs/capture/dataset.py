@@ -21,6 +21,8 @@ if TYPE_CHECKING:
 
 #: The values of `train.views`: which training views a cell uses.
 USES = ("mixed", "all_hr", "hr_only", "lr_only")
+#: HR training views that `train.validation` must leave to train on; our choice.
+_MIN_HR_LEFT = 2
 
 
 @dataclass(frozen=True)
@@ -43,6 +45,8 @@ class Dataset:
 
     train: tuple[LoadedView, ...]
     test: tuple[LoadedView, ...]
+    """What scores are of: the variant's test views, or with `train.validation` the HR training
+    views that are held out."""
     points: torch.Tensor
     """SfM points [P, 3], float32."""
     colors: torch.Tensor
@@ -57,16 +61,24 @@ class Dataset:
     camera took them."""
 
 
-def load(variant: Variant, use: str = "mixed") -> Dataset:
+def load(
+    variant: Variant, use: str = "mixed", *, validation: float = 0.0, seed: int = 0
+) -> Dataset:
     """Read a variant's images and normalise its world.
 
-    Poses, points, world and test views do not depend on `use`: the controls differ from `mixed` in
-    the training views alone.
+    Poses, points, world and the views that are scored do not depend on `use`: the controls differ
+    from `mixed` in the training views alone. Poses, points and world do not depend on `validation`
+    either: SfM has placed held-out training views among the others, as it has test views.
 
     Args:
         variant: The frozen variant.
         use: Which training views to load: `mixed` for all as they are, `all_hr` with the originals
             in the place of the degraded ones, `hr_only` and `lr_only` for those of one tag.
+        validation: Share of the HR training views that are held out and scored in place of the
+            test views, which are not read then: round(validation * n) of n, at least one. 0 scores
+            the test views.
+        seed: The cell's seed, which draws the held-out views. The draw depends on the variant,
+            `validation` and `seed` alone.
 
     Returns:
         The dataset, with views in the order of the variant.
@@ -74,19 +86,21 @@ def load(variant: Variant, use: str = "mixed") -> Dataset:
     Raises:
         UnreadableError: An image can't be read now.
         ImageError: An image is missing, unreadable or not of its view's size; the message names it.
-        XrgsError: `use` is none of these, or the variant has no such views, or its cameras and
-            points can't be normalised.
+        XrgsError: `use` is none of these, or the variant has no such views; `validation` is not in
+            0..1, or leaves fewer than two HR training views; or the variant's cameras and points
+            can't be normalised.
     """
-    training = _training_views(variant, use)
+    scored = _held_out(variant, validation, seed) or [v for v in variant.views if v.split == "test"]
+    held_out = {view.name for view in scored if view.split == "train"}
+    training = [view for view in _training_views(variant, use) if view.name not in held_out]
     posed = [view for view in variant.views if view.split != "original"]
     world = _normalized(variant, posed)
     viewmats = {
         (view.split, view.name): viewmat
         for view, viewmat in zip(posed, world.viewmats, strict=True)
     }
-    tests = [view for view in posed if view.split == "test"]
     # An original has the pose of the training view that it replaces.
-    entries = [("train", view) for view in training] + [("test", view) for view in tests]
+    entries = [("train", view) for view in training] + [(view.split, view) for view in scored]
     loaded = tuple(
         _load_view(view, viewmats[split, view.name])
         for split, view in progress(entries, "loading", "view")
@@ -110,6 +124,21 @@ def _normalized(variant: Variant, posed: list[View]) -> NormalizedScene:
     except (FloatingPointError, ValueError, np.linalg.LinAlgError) as error:
         why = f"its cameras and points can't be of one scene ({error})"
         raise XrgsError(f"{variant.path}: {why}") from error
+
+
+def _held_out(variant: Variant, share: float, seed: int) -> list[View]:
+    """Draw the HR training views that are scored and not trained on, in the variant's order."""
+    if share == 0:
+        return []
+    views = [view for view in variant.views if view.split == "train" and view.tag == "HR"]
+    count = max(1, round(share * len(views))) if 0 < share < 1 else len(views)
+    if len(views) - count < _MIN_HR_LEFT:
+        raise XrgsError(
+            f"train.validation={share}: must be 0, or a share below 1 that leaves at least "
+            f"{_MIN_HR_LEFT} HR training views; variant {variant.id} has {len(views)}"
+        )
+    drawn = np.random.default_rng(seed).choice(len(views), count, replace=False)
+    return [views[i] for i in sorted(drawn)]
 
 
 def _training_views(variant: Variant, use: str) -> list[View]:

@@ -20,8 +20,8 @@ def build_dataset(conf: Conf) -> Dataset:
     sweep with the same scene and variant, finds it.
 
     Args:
-        conf: The config, as `compose` gives it; `scene`, `variant`, `store` and `train.views` are
-            read.
+        conf: The config, as `compose` gives it; `scene`, `variant`, `store`, `seed`, `train.views`
+            and `train.validation` are read.
 
     Returns:
         Photographs, cameras and points, in the normalised world that training takes place in.
@@ -33,7 +33,7 @@ def build_dataset(conf: Conf) -> Dataset:
     store = ConfinedPath(Path(conf.store))
     store.make_root()
     built = variant.build(conf.scene, conf.variant, store / "variants", store / "scenes")
-    return dataset.load(built, conf.train.views)
+    return dataset.load(built, conf.train.views, validation=conf.train.validation, seed=conf.seed)
 
 
 def load_dataset(folder: str | Path, views: str = "mixed") -> Dataset:

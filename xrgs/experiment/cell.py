@@ -60,7 +60,7 @@ def _train_and_score(conf: Conf, variant: Variant, folder: CellFolder) -> list[s
     backend = resolve_backend(conf.splat.backend)
     what = provenance.collect(threads, backend)
     write_json(folder.folder / "provenance.json", what, durable=False)
-    data = dataset.load(variant, conf.train.views)
+    data = dataset.load(variant, conf.train.views, validation=conf.train.validation, seed=conf.seed)
     trained = _train_or_resume(data, conf, folder)
     peak_rss_bytes = peak_rss()  # read before evaluation, which may load the network of LPIPS
     save_ply(folder.folder / "splats.ply", trained.gaussians, durable=False)

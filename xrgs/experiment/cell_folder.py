@@ -461,8 +461,9 @@ class CellFolder:
         return load_ply(self.folder / "splats.ply")
 
     def dataset(self) -> Dataset:
-        """Load the views that the cell was trained and tested on: photographs, cameras, points.
+        """Load what the cell was trained and scored on: photographs, cameras, points.
 
+        With `train.validation`, `test` has the held-out training views that its scores are of.
         The cameras and points are in the normalised world of the Gaussians.
 
         Raises:

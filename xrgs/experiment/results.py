@@ -109,13 +109,13 @@ def cell_metrics(summary: Mapping[str, Any], scores: pd.DataFrame) -> dict[str, 
 
 
 def load_dataset(folder: ConfinedPath) -> Dataset:
-    """Load the views that a cell was trained and tested on; see `CellFolder.dataset`.
+    """Load what a cell was trained and scored on; see `CellFolder.dataset`.
 
     Args:
         folder: The cell's folder, `<store>/cells/<id>`.
 
     Raises:
-        StoreError: `identity.json` can't be read, or names no variant or views.
+        StoreError: `identity.json` can't be read, or has no variant, views or seed.
         XrgsError: The variant is not in the store, or is damaged.
     """
     from xrgs.capture import dataset, variant
@@ -125,5 +125,24 @@ def load_dataset(folder: ConfinedPath) -> Dataset:
     views = train.get("views") if isinstance(train, dict) else None
     if not isinstance(variant_id, str) or not is_name(variant_id) or not isinstance(views, str):
         raise StoreError(f"{folder / 'identity.json'}: it names no variant or no train.views")
-    store = folder.path.parents[1]
-    return dataset.load(variant.load(ConfinedPath(store) / f"variants/{variant_id}"), views)
+    validation, seed = validation_share(identity), identity.get("seed")
+    if validation is None or type(seed) is not int or seed < 0:
+        raise StoreError(f"{folder / 'identity.json'}: train.validation or seed is not a number")
+    frozen = variant.load(ConfinedPath(folder.path.parents[1]) / f"variants/{variant_id}")
+    return dataset.load(frozen, views, validation=validation, seed=seed)
+
+
+def validation_share(identity: Mapping[str, Any]) -> float | None:
+    """Return the `train.validation` of a cell, which decides which views its scores are of.
+
+    Args:
+        identity: What the cell's `identity.json` holds.
+
+    Returns:
+        The share of the HR training views that were held out and scored, in [0, 1). 0 stands for
+        the test views: cells from before the key have no other. None where it is no such number.
+    """
+    train = identity.get("train")
+    share = train.get("validation", 0.0) if isinstance(train, dict) else 0.0
+    number = type(share) in {int, float} and 0 <= share < 1
+    return float(share) if number else None

@@ -337,11 +337,11 @@ def _is_row(row: object) -> bool:
         return False
     texts = [row.get(key, "") for key in ("scene", "label", "condition")]
     ids = [row.get(key) for key in ("cell_id", "variant_id", "baseline_id")]
-    seed, error = row.get("seed", 0), row.get("error")
+    seeds = [row.get("seed", 0), row.get("variant_seed", 0)]
+    error = row.get("error")
     return (
         _is_list([*texts, error or ""], str)
         and all(len(text) <= _MAX_NAME for text in texts)
         and all(one is None or untrusted.is_name(one) for one in ids)
-        and type(seed) is int
-        and 0 <= seed <= _MAX_SEED
+        and all(type(seed) is int and 0 <= seed <= _MAX_SEED for seed in seeds)
     )

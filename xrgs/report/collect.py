@@ -13,6 +13,7 @@ import pandas as pd
 
 from xrgs.errors import StoreError, XrgsError
 from xrgs.experiment.cell_folder import READING_ERRORS, CellState
+from xrgs.experiment.results import validation_share
 from xrgs.report.training import cell_totals
 from xrgs.runtime.progress import progress
 from xrgs.safeio.records import as_number
@@ -29,12 +30,17 @@ RECORD_KEYS = (
     "scene",
     "condition",
     "label",
+    "variant_seed",
     "seed",
     "cell_id",
     "variant_id",
     "baseline_id",
     "error",
 )
+
+
+#: Values of keys that earlier records lack. Those had a swept `variant.seed` in the condition.
+_DEFAULTS = {"variant_seed": 0}
 
 
 class ReportError(XrgsError):
@@ -48,9 +54,10 @@ class Sweep:
     id: str
     command: tuple[str, ...]
     cells: pd.DataFrame
-    """One row for each entry of the record: its keys, `state`, `reason`, `protocol`, metrics."""
+    """One row for each entry of the record: its keys, `state`, `reason`, `protocol`, `validation`
+    (`train.validation`: 0 where scores are of test views), metrics."""
     views: pd.DataFrame
-    """One row for each cell and test view: `cell_id`, `view` and the scores."""
+    """One row for each cell and scored view: `cell_id`, `view` and the scores."""
     training: dict[str, dict[str, float]]
     """What training did in each done cell, by its id: `xrgs.report.training.cell_totals`."""
     provenance: dict[str, list[str]]
@@ -94,6 +101,7 @@ def read_sweep(store: Store, sweep_id: str, metrics: Sequence[Metric]) -> Sweep:
 
 
 def _entry(sweep_id: str, row: Mapping[str, Any]) -> dict[str, Any]:
+    row = _DEFAULTS | dict(row)
     missing = [key for key in RECORD_KEYS if key not in row]
     if missing:
         raise ReportError(f"sweeps/{sweep_id}.json: a cell lacks {', '.join(missing)}")
@@ -137,10 +145,14 @@ def _done_columns(cell: CellFolder, metrics: Sequence[Metric]) -> dict[str, Any]
     for name in ("protocol", "seed"):
         if type(identity[name]) is not int or not 0 <= identity[name] < 1 << 63:
             raise StoreError(f"identity.json: {name}={identity[name]!r:.40} is no such number")
+    validation = validation_share(identity)
+    if validation is None:
+        raise StoreError("identity.json: train.validation is no share")
     return values | {
         "state": "done",
         "reason": "",
         "protocol": identity["protocol"],
+        "validation": validation,
         "true_variant": str(identity["variant"]),
         "true_seed": identity["seed"],
     }
@@ -181,14 +193,16 @@ def _cells(
         | columns.get(row["cell_id"], failed | {"reason": row["error"] or "no cell was planned"})
         for row in entries
     ]
-    leading = [*RECORD_KEYS, "state", "reason", "protocol", "true_variant", "true_seed"]
-    cells = pd.DataFrame(rows, columns=[*leading, *(metric.name for metric in metrics)])
+    read = ["state", "reason", "protocol", "validation", "true_variant", "true_seed"]
+    names = [*RECORD_KEYS, *read, *(metric.name for metric in metrics)]
+    cells = pd.DataFrame(rows, columns=names)
     for metric in metrics:
         values = cells[metric.name]
         if metric.name in means.columns:
             values = cells["cell_id"].map(means[metric.name])
         cells[metric.name] = pd.to_numeric(values).astype(np.float64)
     cells["protocol"] = cells["protocol"].astype("Int64")
+    cells["validation"] = cells["validation"].astype(np.float64)
     _check_identity(sweep_id, cells)
     return cells.drop(columns=["true_variant", "true_seed"])
 

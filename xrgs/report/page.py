@@ -11,6 +11,7 @@ from xrgs.evaluation.metrics import METRICS
 from xrgs.experiment.store import Store
 from xrgs.report.collect import RECORD_KEYS, ReportError, Sweep, read_sweep
 from xrgs.report.compare import compare
+from xrgs.report.gap import gap_tables
 from xrgs.report.pictures import Picture, draw
 from xrgs.report.render import TextTable, to_latex, to_markdown, to_text
 from xrgs.report.tables import Tables
@@ -25,6 +26,8 @@ if TYPE_CHECKING:
 
     import pandas as pd
 
+#: What a row of views.csv names its cell by.
+_VIEW_KEYS = ["cell_id", "scene", "label", "condition", "variant_seed", "seed"]
 #: Most ablations whose own tables are printed; the overview and the files have all.
 _MAX_PRINTED_ABLATIONS = 6
 _MAX_PRINTED_MISSING = 20
@@ -130,10 +133,10 @@ def _write_files(
     training: pd.DataFrame,
 ) -> None:
     cells = tables.comparison.cells
-    names = cells.drop_duplicates("cell_id")[["cell_id", "scene", "label", "condition", "seed"]]
+    names = cells.drop_duplicates("cell_id")[_VIEW_KEYS]
     views = names.merge(sweep.views, on="cell_id")
     metrics = [metric.name for metric in tables.comparison.metrics]
-    order = [*RECORD_KEYS, "state", "reason", "protocol", *metrics]
+    order = [*RECORD_KEYS, "state", "reason", "protocol", "validation", *metrics]
     write_text(folder / "table.md", _markdown_page(sweep, tables, pictures, folder, training))
     non_empty = [table for table in _all_tables(tables) if table.rows]
     write_text(folder / "table.tex", "\n".join(map(to_latex, non_empty)))
@@ -153,7 +156,7 @@ def _csv(table: pd.DataFrame) -> str:
 def _all_tables(tables: Tables) -> list[TextTable]:
     """Return every table of changes and values, overviews first."""
     comparison = tables.comparison
-    result = [*tables.overviews(), *_ablation_tables(tables)]
+    result = [*tables.overviews(), *gap_tables(comparison), *_ablation_tables(tables)]
     result += [tables.values(name) for name in dict.fromkeys(comparison.cells["condition"])]
     missing = tables.missing()
     return result + ([missing] if missing else [])
@@ -213,6 +216,13 @@ def _warnings(sweep: Sweep) -> list[str]:
     unknown = sweep.cells.loc[sweep.cells["state"] == "unknown", "cell_id"].nunique()
     if unknown:
         warnings.append(f"{unknown} cells can't be read now: run the report again.")
+    shares = sorted({share for share in sweep.cells["validation"].dropna() if share > 0})
+    if shares:
+        listed = ", ".join(f"train.validation={share:g}" for share in shares)
+        warnings.append(
+            f"Scores are of held-out training views where the tables say {listed}: to choose by,"
+            " not to compare with scores of test views."
+        )
     mixed = [key for key in _MACHINE_KEYS if len(sweep.provenance.get(key, ())) > 1]
     if mixed:
         differing = ", ".join(mixed)
@@ -229,7 +239,7 @@ def _warnings(sweep: Sweep) -> list[str]:
 def _text(tables: Tables, warnings: list[str]) -> str:
     """Return what a command prints: at most so many tables that they can be read."""
     comparison = tables.comparison
-    printed = tables.overviews()
+    printed = [*tables.overviews(), *gap_tables(comparison)]
     if len(comparison.groups) <= _MAX_PRINTED_ABLATIONS:
         printed += _ablation_tables(tables)
     if not comparison.groups:

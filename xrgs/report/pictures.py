@@ -61,7 +61,7 @@ def draw(
     """Draw what each ablation trades, and views and training curves of each scene and ablation.
 
     The trade-offs are drawn where there are several ablations, one figure for each condition. The
-    other pictures show the first condition and seed, which their titles name.
+    other pictures show the first condition and replicate, which their titles name.
 
     Args:
         store: The store with the photographs, renders and histories.
@@ -77,16 +77,18 @@ def draw(
     Raises:
         ReportError: There is no picture of such a name.
     """
-    first = comparison.pairs.sort_values("seed", kind="stable")
+    first = comparison.pairs.sort_values(["variant_seed", "seed"], kind="stable")
     pairs = first.drop_duplicates(["scene", "label"]).sort_values(["scene", "label"])
     shown = {*pairs["cell_id"], *pairs["baseline_id"]}
     scores = views[views["cell_id"].isin(shown)].groupby("cell_id")
     psnr = {cell_id: rows.set_index("view")["psnr"] for cell_id, rows in scores}
-    variants = comparison.cells.drop_duplicates("cell_id").set_index("cell_id")["variant_id"]
+    cells = comparison.cells.drop_duplicates("cell_id").set_index("cell_id")
     drawings = _trade_offs(comparison)
     for _, pair in pairs.iterrows():
         both = _same_views(psnr.get(pair["baseline_id"]), psnr.get(pair["cell_id"]))
-        photographs = store.variants / variants[pair["cell_id"]] / "images" / "test"
+        cell = cells.loc[pair["cell_id"]]
+        split = "train" if cell["validation"] > 0 else "test"
+        photographs = store.variants / cell["variant_id"] / "images" / split
         stem = f"{for_file_name(pair['scene'])}--{for_file_name(pair['label'])}"
         drawings[stem] = partial(_views, store, pair, both, photographs)
         drawings[f"{stem}--training"] = partial(_training, store, pair)
@@ -189,7 +191,7 @@ def _views(
     file: ConfinedPath,
 ) -> Picture:
     if psnr[0].empty:
-        return Picture(_title(pair), None, "the two cells have no test view in common")
+        return Picture(_title(pair), None, "the two cells have no scored view in common")
     view = median_view(*psnr)
     title = f"{_title(pair)}: view {view}, by change of PSNR the median of {len(psnr[0])}"
     name = f"{view}.png"

@@ -19,8 +19,13 @@ if TYPE_CHECKING:
 
 #: An arrow means improvement or degradation, as in the paper's tables, not larger or smaller.
 BETTER, WORSE, SAME = "↑", "↓", "="
-#: Longest list of seeds in a title; of more seeds it has the number.
+#: Longest list of replicates in a title; of more it has the number.
 _MAX_LISTED = 8
+AGREEMENT_NOTE = "pairs that agree: pairs of one scene and replicate that change as their mean does"
+#: Keys of a row of the long table.
+_LEVEL = ["level", "label", "condition", "scene", "metric"]
+#: Columns of the long table that have the share of the gap to all_hr, by their names elsewhere.
+_GAP = {"change": "gap_closed_percent", "low": "gap_low", "high": "gap_high", "why": "gap_why"}
 ARROWS_NOTE = f"{BETTER} improvement, {WORSE} degradation, {SAME} no change at this precision"
 
 
@@ -37,6 +42,8 @@ class Change(NamedTuple):
     high: float
     unit: str
     why: str
+    agree: int
+    pairs: int
 
 
 def number(value: float, unit: str) -> str:
@@ -107,12 +114,12 @@ def reading(row: Change, metric: Metric) -> str:
 
     Returns:
         `better` or `worse` where the interval does not contain 0, `inside noise` where it does,
-        `unchanged`, `one seed: no interval`, or `n/a` with the reason.
+        `unchanged`, `one replicate: no interval`, or `n/a` with the reason.
     """
     if math.isnan(row.change):
         return f"n/a: {row.why}"
     if math.isnan(row.low):
-        return "one seed: no interval"
+        return "one replicate: no interval"
     if row.low <= 0 <= row.high and row.low < row.high:
         return "inside noise"
     if arrow(row.change, metric) == SAME:
@@ -129,6 +136,31 @@ def interval(row: Change) -> str:
     return "" if math.isnan(row.low) else f"{signed(row.low)} to {signed(row.high)}"
 
 
+def agreement(row: Change) -> str:
+    """Write how many of the pairs changed in the direction of their mean, `11 of 12`.
+
+    Args:
+        row: The change with the numbers of its pairs.
+    """
+    return f"{row.agree} of {row.pairs}" if row.pairs else ""
+
+
+def interval_note(rows: Iterable[Change], *, one_each: bool) -> tuple[str, ...]:
+    """Say what the intervals of a table are over; nothing where there are none.
+
+    Args:
+        rows: The changes in the table.
+        one_each: Whether each scene has one replicate.
+    """
+    units = {row.unit for row in rows if not math.isnan(row.low)}
+    if not units:
+        return ()
+    if "scenes" not in units:
+        return ("interval: Student's t over the replicates",)
+    alone = "; with one replicate, differences of runs and of scenes are mixed" * one_each
+    return (f"interval: Student's t over the scenes' means{alone}",)
+
+
 class Tables:
     """Builds every table of one comparison.
 
@@ -141,25 +173,25 @@ class Tables:
 
     @cached_property
     def _means(self) -> dict[tuple[str, ...], Change]:
-        return _by_key(self.comparison.means)
+        return by_key(self.comparison.means)
 
     @cached_property
     def _per_scene(self) -> dict[tuple[str, ...], Change]:
-        return _by_key(self.comparison.per_scene)
+        return by_key(self.comparison.per_scene)
 
     @cached_property
-    def _seeds(self) -> dict[tuple[str, str, str], list[int]]:
-        """The seeds of the pairs, by (label, condition, scene)."""
+    def _replicates(self) -> dict[tuple[str, str, str], set[tuple[int, int]]]:
+        """The replicates (variant.seed, seed) of the pairs, by (label, condition, scene)."""
         pairs = self.comparison.pairs
         keys = zip(pairs["label"], pairs["condition"], pairs["scene"], strict=True)
-        seeds: dict[tuple[str, str, str], set[int]] = {}
-        for key, seed in zip(keys, pairs["seed"], strict=True):
-            seeds.setdefault(key, set()).add(seed)
-        return {key: sorted(values) for key, values in seeds.items()}
+        replicates: dict[tuple[str, str, str], set[tuple[int, int]]] = {}
+        for key, *one in zip(keys, pairs["variant_seed"], pairs["seed"], strict=True):
+            replicates.setdefault(key, set()).add((one[0], one[1]))
+        return replicates
 
     def scenes_of(self, label: str, condition: str) -> list[str]:
         """Return the scenes with at least one pair of this label and condition."""
-        return [s for s in self.comparison.scenes if (label, condition, s) in self._seeds]
+        return [s for s in self.comparison.scenes if (label, condition, s) in self._replicates]
 
     def overviews(self) -> list[TextTable]:
         """Return a table of all ablations for each condition that has several."""
@@ -196,7 +228,7 @@ class Tables:
             condition: The condition that it was run under.
         """
         rows = []
-        notes = [ARROWS_NOTE]
+        notes = [ARROWS_NOTE, AGREEMENT_NOTE]
         for metric in self.comparison.metrics:
             row = self._means.get((label, condition, metric.name))
             if row is None:
@@ -209,6 +241,7 @@ class Tables:
                     percent(row.change, metric),
                     signed(row.difference) if metric.unit == "dB" else "",
                     interval(row),
+                    agreement(row),
                     reading(row, metric),
                 )
             )
@@ -216,36 +249,31 @@ class Tables:
                 notes.append(f"{metric.label}: pairs left out ({row.why})")
         return TextTable(
             title=titled(f"{label} against baseline: {self._extent(label, condition)}", condition),
-            columns=("Metric", BASELINE, label, "change, %", "dB", "95 % interval, %", "reading"),
+            columns=(
+                *("Metric", BASELINE, label, "change, %", "dB", "95 % interval, %"),
+                *("pairs that agree", "reading"),
+            ),
             rows=tuple(rows),
-            align="lrrrrrl",
+            align="lrrrrrrl",
             notes=(*notes, *self._interval_note(label, condition)) if rows else (),
         )
 
     def _extent(self, label: str, condition: str) -> str:
-        """Say how many scenes and which seeds a mean is over."""
+        """Say how many scenes and which replicates a mean is over."""
         scenes = self.scenes_of(label, condition)
-        seeds = sorted({n for s in scenes for n in self._seeds[label, condition, s]})
+        replicates = {one for s in scenes for one in self._replicates[label, condition, s]}
         of = "" if len(scenes) == len(self.comparison.scenes) else (
             f" of {len(self.comparison.scenes)}"
         )  # fmt: skip
         names = f"{len(scenes)}{of} scenes" if len(scenes) != 1 or of else f"scene {scenes[0]}"
-        return f"{names}, {_list('seed', seeds)}"
+        return f"{names}, {_listed(replicates)}"
 
     def _interval_note(self, label: str, condition: str) -> tuple[str, ...]:
         """Say what the intervals of a table are over; nothing where there are none."""
-        units = [
-            row.unit
-            for metric in self.comparison.metrics
-            if (row := self._means.get((label, condition, metric.name))) and not math.isnan(row.low)
-        ]
-        if not units:
-            return ()
-        if "scenes" not in units:
-            return ("interval: Student's t over the seeds",)
-        seeds = {len(self._seeds[label, condition, s]) for s in self.scenes_of(label, condition)}
-        alone = "; with one seed, differences of runs and of scenes are mixed" * (seeds == {1})
-        return (f"interval: Student's t over the scenes' means{alone}",)
+        found = (self._means.get((label, condition, m.name)) for m in self.comparison.metrics)
+        scenes = self.scenes_of(label, condition)
+        counts = {len(self._replicates[label, condition, s]) for s in scenes}
+        return interval_note(filter(None, found), one_each=counts == {1})
 
     def per_scene(self, label: str, condition: str) -> TextTable:
         """Return a table with one column for each scene, failed ones too, and their mean.
@@ -276,7 +304,7 @@ class Tables:
         )
 
     def values(self, condition: str) -> TextTable:
-        """Return a table of each label's own values, means over the seeds that are done.
+        """Return a table of each label's own values, means over the replicates that are done.
 
         Args:
             condition: The condition that the cells were run under.
@@ -294,7 +322,7 @@ class Tables:
                          for v in found]  # fmt: skip
                 rows.append((scene, metric.label, *texts))
         return TextTable(
-            title=titled("Values, means over the seeds that are done", condition),
+            title=titled("Values, means over the replicates that are done", condition),
             columns=("Scene", "Metric", *labels),
             rows=tuple(rows),
             align="ll" + "r" * len(labels),
@@ -305,12 +333,12 @@ class Tables:
         rows = self.comparison.missing()
         if rows.empty:
             return None
-        keys = ["scene", "label", "condition", "seed", "state", "reason"]
+        keys = ["scene", "label", "condition", "variant_seed", "seed", "state", "reason"]
         return TextTable(
             title=f"{len(rows)} of {len(self.comparison.cells)} cells gave no number",
-            columns=("Scene", "Label", "Condition", "Seed", "State", "Reason"),
+            columns=("Scene", "Label", "Condition", "variant.seed", "seed", "State", "Reason"),
             rows=tuple(tuple(map(str, row)) for row in rows[keys].itertuples(index=False)),
-            align="lllrll",
+            align="lllrrll",
         )
 
     def long(self) -> pd.DataFrame:
@@ -319,6 +347,7 @@ class Tables:
         scenes = self.comparison.per_scene.reset_index()
         means = self.comparison.means.reset_index()
         table = pd.concat([means.assign(level="mean", scene=""), scenes.assign(level="scene")])
+        table = table.merge(self._long_gaps(), how="left", on=_LEVEL)
         rows = [Change(*row) for row in table[list(Change._fields)].itertuples(index=False)]
         of = [metrics[name] for name in table["metric"]]
         table["printed"] = [percent(r.change, m).rstrip() for r, m in zip(rows, of, strict=True)]
@@ -327,13 +356,24 @@ class Tables:
         table["higher_is_better"] = [m.higher_is_better for m in of]
         table = table.rename(columns={"n": "n_values", "unit": "n_of", "change": "change_percent"})
         return table[
-            ["level", "label", "condition", "scene", "metric", "metric_unit", "higher_is_better",
+            [*_LEVEL, "metric_unit", "higher_is_better",
              "baseline", "value", "change_percent", "difference", "low", "high", "spread",
-             "n_values", "n_of", "printed", "reading", "why"]
+             "n_values", "n_of", "agree", "pairs", "printed", "reading", "why", *_GAP.values()]
         ]  # fmt: skip
 
+    def _long_gaps(self) -> pd.DataFrame:
+        """Return the shares of the gap to all_hr, with the keys of `long`."""
+        scenes = self.comparison.gaps_per_scene.reset_index().assign(level="scene")
+        means = self.comparison.gaps.reset_index().assign(level="mean", scene="")
+        return pd.concat([means, scenes])[[*_LEVEL, *_GAP]].rename(columns=_GAP)
 
-def _by_key(table: pd.DataFrame) -> dict[tuple[str, ...], Change]:
+
+def by_key(table: pd.DataFrame) -> dict[tuple[str, ...], Change]:
+    """Return the rows of a table of means by their keys.
+
+    Args:
+        table: One of the tables of means of a `Comparison`.
+    """
     rows = table[list(Change._fields)].itertuples(index=False)
     return {key: Change(*row) for key, row in zip(table.index, rows, strict=True)}
 
@@ -348,9 +388,17 @@ def titled(text: str, condition: str) -> str:
     return f"{text} ({condition})" if condition else text
 
 
-def _list(word: str, values: Iterable[int]) -> str:
-    """List values after their name, `seeds 0, 1`; of many, say only how many there are."""
-    texts = [str(value) for value in values]
-    if len(texts) > _MAX_LISTED:
-        return f"{len(texts)} {word}s"
-    return f"{word}{'s' * (len(texts) > 1)} {', '.join(texts)}"
+def _listed(replicates: set[tuple[int, int]]) -> str:
+    """List the replicates of a mean; of many, say only how many there are.
+
+    Args:
+        replicates: Pairs (variant.seed, seed), which are named by `seed` where one draw of the HR
+            views, and so one variant, is all that a scene has.
+    """
+    if len(replicates) > _MAX_LISTED:
+        return f"{len(replicates)} replicates"
+    several = "s" * (len(replicates) > 1)
+    if len({draw for draw, _ in replicates}) == 1:
+        return f"seed{several} " + ", ".join(str(seed) for _, seed in sorted(replicates))
+    texts = (f"{draw}/{seed}" for draw, seed in sorted(replicates))
+    return f"replicate{several} {', '.join(texts)} (variant.seed/seed)"

@@ -24,7 +24,8 @@ class CellSpec:
     label: str
     """What is compared: the ablation, and component values that were set by hand."""
     condition: str
-    """Values of the other swept axes, except scene and seed; equal for a label and its baseline."""
+    """Values of the other swept axes, except scene and replicate; equal for a label and its
+    baseline. A replicate is a pair of `variant.seed`, which draws the HR views, and `seed`."""
     shared: tuple[str, ...]
     """Overrides that the matching baseline has too."""
     changes: tuple[str, ...]
@@ -87,8 +88,9 @@ def _is_change(name: str) -> bool:
 
 
 def _is_condition(name: str) -> bool:
-    """Return whether a swept key is part of the condition; scenes and seeds have own columns."""
-    return not _is_change(name) and name.partition(".")[0] not in {"scene", "seed"}
+    """Return whether a swept key is part of the condition; scenes, replicates have own columns."""
+    group = name.partition(".")[0]
+    return not _is_change(name) and group not in {"scene", "seed"} and name != "variant.seed"
 
 
 def _label(changes: Iterable[tuple[str, str]]) -> str:

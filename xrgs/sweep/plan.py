@@ -43,9 +43,16 @@ class PlannedCell:
 
     @property
     def name(self) -> str:
-        """The cell's name for people: scene, label, condition and seed."""
-        parts = (scenes.label(self.conf.scene), self.spec.label, self.spec.condition)
-        return " / ".join(part for part in parts if part) + f" / seed {self.conf.seed}"
+        """The cell's name for people: scene, label, condition and replicate."""
+        draw = self.conf.variant.seed
+        parts = (
+            scenes.label(self.conf.scene),
+            self.spec.label,
+            self.spec.condition,
+            f"variant.seed {draw}" if draw else "",
+            f"seed {self.conf.seed}",
+        )
+        return " / ".join(part for part in parts if part)
 
     @property
     def reference(self) -> CellSpec | None:
@@ -62,6 +69,23 @@ class PlannedCell:
     def waits(self) -> bool:
         """Whether the cell waits for the number of Gaussians of its reference."""
         return self.reference is not None and not self.conf.components.count_matched.gaussians
+
+
+def planned(spec: CellSpec, conf: Conf) -> PlannedCell:
+    """Return a cell whose condition says which views are scored, where they are no test views.
+
+    The value that is fixed for a whole sweep is said too, so that no table or figure of scores of
+    held-out training views is taken for one of test views.
+
+    Args:
+        spec: The cell's combination of axes.
+        conf: Its config.
+    """
+    key = "train.validation="
+    if conf.train.validation and key not in spec.condition:
+        condition = f"{spec.condition} {key}{conf.train.validation}".lstrip()
+        spec = replace(spec, condition=condition)
+    return PlannedCell(spec, conf)
 
 
 def identified(cell: PlannedCell, store: Store, holders: Mapping[str, str]) -> PlannedCell:
@@ -232,6 +256,7 @@ def record(plan: Sequence[PlannedCell]) -> list[dict[str, Any]]:
             "label": cell.spec.label,
             "condition": cell.spec.condition,
             "scene": scenes.label(cell.conf.scene),
+            "variant_seed": cell.conf.variant.seed,
             "seed": cell.conf.seed,
             "variant_id": cell.variant_id,
             "baseline_id": baselines[cell.spec.shared],

@@ -43,6 +43,7 @@ from xrgs.sweep.plan import (
     describe,
     estimated,
     identified,
+    planned,
     ready,
     record,
     without_kernels,
@@ -189,19 +190,19 @@ class Study:
         """Return every cell that is asked for, each after the cell that it takes a count from."""
         plan: dict[CellSpec, PlannedCell] = {}
         for spec in expand(arguments):
-            cell = PlannedCell(spec, self._compose(spec))
+            cell = planned(spec, self._compose(spec))
             if cell.reference is not None:
-                reference = PlannedCell(cell.reference, self._compose(cell.reference))
+                reference = planned(cell.reference, self._compose(cell.reference))
                 plan.setdefault(cell.reference, reference)
-            plan.setdefault(spec, cell)
+            plan.setdefault(cell.spec, cell)
         return list(plan.values())
 
     def _identified(self, plan: Sequence[PlannedCell], store: Store) -> list[PlannedCell]:
         """Return the cells with their counts, identities and states, as far as they are known."""
         cells: dict[CellSpec, PlannedCell] = {}
         holders = locks.holders(store.locks)
-        for planned in plan:
-            cell = identified(self._with_count(planned, cells, store), store, holders)
+        for known in plan:
+            cell = identified(self._with_count(known, cells, store), store, holders)
             cells[cell.spec] = cell
         return list(cells.values())
 
