@@ -6,7 +6,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import torch
@@ -30,10 +30,13 @@ from xrgs.training.seeding import seeded_generator
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Mapping
 
+    from torch import Tensor
+
     from xrgs.capture.dataset import Dataset
     from xrgs.config import Conf, SplatConf
+    from xrgs.splat.cameras import Camera
     from xrgs.splat.loss import Target
-    from xrgs.training.components import Component
+    from xrgs.training.components import Component, Step, TrainingView
 
     #: Scores of Gaussians by name; None where one is not available.
     Evaluate = Callable[[Gaussians], Mapping[str, float | None]]
@@ -86,6 +89,30 @@ def train(
     return run.recorder.finish(gaussians, run.memory.largest_bytes)
 
 
+class _Targets:
+    """What the loss needs of the photographs, prepared once for each view.
+
+    Where a component gives a view another photograph, what is prepared of that one is kept beside
+    until the view has another photograph again.
+    """
+
+    def __init__(self, views: Iterable[TrainingView]) -> None:
+        self.own = {view.name: prepare_target(view.image) for view in views}
+        self.images = {view.name: view.image for view in views}
+        self.others: dict[str, tuple[Tensor, Target]] = {}
+
+    def of(self, view: TrainingView) -> Target:
+        """Return the target of a view, which may be one that a component has changed."""
+        if view.image is self.images[view.name]:
+            self.others.pop(view.name, None)
+            return self.own[view.name]
+        image, target = self.others.get(view.name, (None, None))
+        if target is None or image is not view.image:
+            target = prepare_target(view.image)
+            self.others[view.name] = view.image, target
+        return target
+
+
 @dataclass(frozen=True)
 class _Run:
     """Everything that the steps of one run use."""
@@ -97,7 +124,7 @@ class _Run:
     sh_every: int
     """Steps of this run after which one more SH band is switched on."""
     backend: str
-    targets: dict[str, Target]
+    targets: _Targets
     optimizer: SplatOptimizer
     components: Components
     densifier: Densifier
@@ -126,7 +153,8 @@ def _run_steps(run: _Run, checkpoint: Checkpoint, evaluate: Evaluate | None) -> 
     raster, ssim, backend = run.splat.raster, run.splat.ssim_weight, run.backend
     components, optimizer, densifier = run.components, run.optimizer, run.densifier
     sampler, recorder, gaussians = run.sampler, run.recorder, run.optimizer.gaussians
-    for step in progress(sampler, "training", "step", run.steps, done=sampler.next_step):
+    for sampled in progress(sampler, "training", "step", run.steps, done=sampler.next_step):
+        step = replace(sampled, view=components.training_view(sampled.view, sampled))
         view, camera = step.view, components.render_camera(step.view.camera, step)
         sh_degree = min(step.number // run.sh_every, raster.sh_degree)
         # The gradient of the offset is for densification.
@@ -142,21 +170,22 @@ def _run_steps(run: _Run, checkpoint: Checkpoint, evaluate: Evaluate | None) -> 
                 backend=backend,
             )
             # Loss: L1 and SSIM against the photograph, then terms and weights of the components.
-            image, target = components.to_photograph(render.image, step), run.targets[view.name]
+            image, target = components.to_photograph(render.image, step), run.targets.of(view)
             weights = components.pixel_weights(step)
             loss = photometric_loss(
                 image, target, l1=1 - ssim, ssim=ssim, pixel_weight=weights, backend=backend
             )
             loss = components.modify_loss(loss, image, gaussians, step)
-        # Backward, then the components' changes of the gradients.
-        optimizer.zero_grad()
-        torch.autograd.backward(loss)
-        components.after_backward(gaussians, step)
-        # Optimise, and record the step while its gradients and buffers still exist.
-        optimizer.step(camera, sh_degree=sh_degree)
-        run.memory.record(render)
-        recorder.record_step(step, loss, render, len(gaussians))
-        # Densify, prune and reset. There is no gradient where the render shows no Gaussian.
+        # Update the Gaussians, and record the step while its gradients and buffers still exist.
+        if components.needs_backward(loss, step):
+            _update(run, step, loss, camera, sh_degree)
+            run.memory.record(render)
+            recorder.record_step(step, loss, render, len(gaussians))
+        else:
+            optimizer.skip_step()
+            recorder.record_step(step, loss, render, len(gaussians), skipped_backward=True)
+        # Densify, prune and reset. There is no gradient without a backward pass, nor where the
+        # render shows no Gaussian.
         grad2d, size = means2d_offset.grad, {"width": camera.width, "height": camera.height}
         if grad2d is not None:
             grad2d = components.densification_grad2d(grad2d, step)
@@ -170,6 +199,14 @@ def _run_steps(run: _Run, checkpoint: Checkpoint, evaluate: Evaluate | None) -> 
         if evaluate is not None and run.evaluates_after(step.number):
             recorder.record_scores(step.number + 1, len(gaussians), run.score(evaluate))
         recorder.exclude_time(checkpoint.save_if_due(step.number))
+
+
+def _update(run: _Run, step: Step, loss: Tensor, camera: Camera, sh_degree: int) -> None:
+    """Backward, the components' changes of the gradients, then the optimizer's step."""
+    run.optimizer.zero_grad()
+    torch.autograd.backward(loss)
+    run.components.after_backward(run.optimizer.gaussians, step)
+    run.optimizer.step(camera, sh_degree=sh_degree)
 
 
 def _set_up(data: Dataset, conf: Conf, extra_components: Iterable[Component]) -> _Run:
@@ -196,7 +233,7 @@ def _set_up(data: Dataset, conf: Conf, extra_components: Iterable[Component]) ->
         groups=components.densification_groups(splat.densify),
         attenuation=components.opacity_attenuation,
     )
-    targets = {view.name: prepare_target(view.image) for view in data.train}
+    targets = _Targets(data.train)
     return _Run(
         splat=splat,
         steps=steps,

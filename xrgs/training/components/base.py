@@ -2,13 +2,15 @@
 
 One step of training runs these hooks, each for every component that is on:
 
-1. `allows_view` while the sampler chooses the step's view,
+1. `allows_view` while the sampler chooses the step's view, then `training_view` on that view,
 2. `before_render` on the activated Gaussians and `render_camera` on the view's camera, then the
    view is rendered, and `to_photograph` brings the render to the size of the photograph,
-3. `pixel_weights` for the photometric loss, then `modify_loss` on that loss, then backward,
-4. `after_backward` on the gradients of the parameters, then the optimizer steps,
+3. `pixel_weights` for the photometric loss, then `modify_loss` on that loss, then `needs_backward`,
+4. backward, then `after_backward` on the gradients of the parameters, then the optimizer steps,
 5. `densification_grad2d` on the image-plane gradient, then densification reads it,
 6. `on_gaussians_changed` where densification has added, removed or reset Gaussians.
+
+A step that needs no backward pass leaves out 4 and 5.
 
 `densification_groups` is called once before the first step, `opacity_attenuation` where
 densification resets opacities, `bake` wherever the Gaussians are evaluated or saved, and
@@ -73,7 +75,7 @@ class Step:
     total: int
     """The number of steps of the whole run."""
     view: TrainingView
-    """The view that the step renders."""
+    """The view that the step renders, as `training_view` has left it."""
     log: dict[str, float] = field(default_factory=dict, compare=False)
     """Values that components record of the step, by column names `<component>.<quantity>`. A row of
     history.csv has the mean of each over the steps since the row before that recorded it."""
@@ -137,6 +139,23 @@ class Component:
         """
         del step
         return True
+
+    def training_view(self, view: TrainingView, step: Step) -> TrainingView:
+        """Choose the camera and the photograph of this step.
+
+        All that comes after it sees the view that it returns as the step's view. What the loss
+        prepares of a photograph is kept for as long as the same tensor comes back, so that a
+        component should make the photograph of a view once.
+
+        Args:
+            view: The view of the step, or what the components before this one made of it.
+            step: The step with the view that was sampled.
+
+        Returns:
+            A view with the name and the tag of `view`, and a photograph of its camera's size.
+        """
+        del step
+        return view
 
     def before_render(self, activated: ActivatedGaussians, step: Step) -> ActivatedGaussians:
         """Change the Gaussians for this step's render alone.
@@ -206,6 +225,22 @@ class Component:
         """
         del image, gaussians, step
         return loss
+
+    def needs_backward(self, loss: Tensor, step: Step) -> bool:
+        """Decide whether the step's loss is worth a backward pass.
+
+        Training calls it once in every step, whatever the other components answer.
+
+        Args:
+            loss: Scalar; the loss of the step, with all terms and weights.
+            step: The step with its view.
+
+        Returns:
+            False leaves out the backward pass, the optimizer's step and the step's part in the
+            statistics of densification. Schedules go on, that of the rate of the means too.
+        """
+        del loss, step
+        return True
 
     def after_backward(self, gaussians: Gaussians, step: Step) -> None:
         """Change the gradients of the parameters in place, before the optimizer reads them.
@@ -314,6 +349,12 @@ class Components(tuple[Component, ...]):
         """Whether every component allows the step's view."""
         return all(component.allows_view(step) for component in self)
 
+    def training_view(self, view: TrainingView, step: Step) -> TrainingView:
+        """Apply `Component.training_view` of each component in turn."""
+        for component in self:
+            view = component.training_view(view, step)
+        return view
+
     def before_render(self, activated: ActivatedGaussians, step: Step) -> ActivatedGaussians:
         """Apply `Component.before_render` of each component in turn."""
         for component in self:
@@ -342,6 +383,11 @@ class Components(tuple[Component, ...]):
         for component in self:
             loss = component.modify_loss(loss, image, gaussians, step)
         return loss
+
+    def needs_backward(self, loss: Tensor, step: Step) -> bool:
+        """Whether every component needs the backward pass; all of them are asked."""
+        answers = [component.needs_backward(loss, step) for component in self]
+        return all(answers)
 
     def after_backward(self, gaussians: Gaussians, step: Step) -> None:
         """Call `Component.after_backward` of each component in turn."""
