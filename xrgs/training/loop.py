@@ -35,7 +35,6 @@ if TYPE_CHECKING:
     from xrgs.capture.dataset import Dataset
     from xrgs.config import Conf, SplatConf
     from xrgs.splat.cameras import Camera
-    from xrgs.splat.loss import Target
     from xrgs.training.components import Component, Step, TrainingView
 
     #: Scores of Gaussians by name; None where one is not available.
@@ -89,28 +88,25 @@ def train(
     return run.recorder.finish(gaussians, run.memory.largest_bytes)
 
 
-class _Targets:
-    """What the loss needs of the photographs, prepared once for each view.
-
-    Where a component gives a view another photograph, what is prepared of that one is kept beside
-    until the view has another photograph again.
-    """
+class _Views:
+    """The training views by name, as components want them at present, and what the loss needs."""
 
     def __init__(self, views: Iterable[TrainingView]) -> None:
-        self.own = {view.name: prepare_target(view.image) for view in views}
-        self.images = {view.name: view.image for view in views}
-        self.others: dict[str, tuple[Tensor, Target]] = {}
+        self.own: Mapping[str, TrainingView] = {view.name: view for view in views}
+        self.present = self.own
+        self.targets = {name: prepare_target(view.image) for name, view in self.own.items()}
 
-    def of(self, view: TrainingView) -> Target:
-        """Return the target of a view, which may be one that a component has changed."""
-        if view.image is self.images[view.name]:
-            self.others.pop(view.name, None)
-            return self.own[view.name]
-        image, target = self.others.get(view.name, (None, None))
-        if target is None or image is not view.image:
-            target = prepare_target(view.image)
-            self.others[view.name] = view.image, target
-        return target
+    def change_to(self, views: Mapping[str, TrainingView]) -> None:
+        """Use other views; what is prepared of photographs that stay the same is kept."""
+        if views is self.present:
+            return
+        self.targets = {
+            name: self.targets[name]
+            if view.image is self.present[name].image
+            else prepare_target(view.image)
+            for name, view in views.items()
+        }
+        self.present = views
 
 
 @dataclass(frozen=True)
@@ -124,7 +120,7 @@ class _Run:
     sh_every: int
     """Steps of this run after which one more SH band is switched on."""
     backend: str
-    targets: _Targets
+    views: _Views
     optimizer: SplatOptimizer
     components: Components
     densifier: Densifier
@@ -154,7 +150,8 @@ def _run_steps(run: _Run, checkpoint: Checkpoint, evaluate: Evaluate | None) -> 
     components, optimizer, densifier = run.components, run.optimizer, run.densifier
     sampler, recorder, gaussians = run.sampler, run.recorder, run.optimizer.gaussians
     for sampled in progress(sampler, "training", "step", run.steps, done=sampler.next_step):
-        step = replace(sampled, view=components.training_view(sampled.view, sampled))
+        run.views.change_to(components.training_views(run.views.own, sampled))
+        step = replace(sampled, view=run.views.present[sampled.view.name])
         view, camera = step.view, components.render_camera(step.view.camera, step)
         sh_degree = min(step.number // run.sh_every, raster.sh_degree)
         # The gradient of the offset is for densification.
@@ -170,8 +167,8 @@ def _run_steps(run: _Run, checkpoint: Checkpoint, evaluate: Evaluate | None) -> 
                 backend=backend,
             )
             # Loss: L1 and SSIM against the photograph, then terms and weights of the components.
-            image, target = components.to_photograph(render.image, step), run.targets.of(view)
-            weights = components.pixel_weights(step)
+            image = components.to_photograph(render.image, step)
+            target, weights = run.views.targets[view.name], components.pixel_weights(step)
             loss = photometric_loss(
                 image, target, l1=1 - ssim, ssim=ssim, pixel_weight=weights, backend=backend
             )
@@ -233,18 +230,18 @@ def _set_up(data: Dataset, conf: Conf, extra_components: Iterable[Component]) ->
         groups=components.densification_groups(splat.densify),
         attenuation=components.opacity_attenuation,
     )
-    targets = _Targets(data.train)
+    views = _Views(data.train)
     return _Run(
         splat=splat,
         steps=steps,
         evaluate_every=conf.train.evaluate_every,
         sh_every=max(1, int(splat.sh_every * steps / NOMINAL_STEPS)),
         backend=backend,
-        targets=targets,
+        views=views,
         optimizer=optimizer,
         components=components,
         densifier=densifier,
         sampler=EpochSampler(data.train, conf.seed, steps, components.allows_view),
         recorder=TrainingRecorder(steps, splat.densify.grow_grad2d),
-        memory=TrainingMemory(optimizer, densifier, components, targets, data),
+        memory=TrainingMemory(optimizer, densifier, components, views, data),
     )

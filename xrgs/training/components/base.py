@@ -2,7 +2,7 @@
 
 One step of training runs these hooks, each for every component that is on:
 
-1. `allows_view` while the sampler chooses the step's view, then `training_view` on that view,
+1. `allows_view` while the sampler chooses the step's view, then `training_views` on all views,
 2. `before_render` on the activated Gaussians and `render_camera` on the view's camera, then the
    view is rendered, and `to_photograph` brings the render to the size of the photograph,
 3. `pixel_weights` for the photometric loss, then `modify_loss` on that loss, then `needs_backward`,
@@ -75,7 +75,7 @@ class Step:
     total: int
     """The number of steps of the whole run."""
     view: TrainingView
-    """The view that the step renders, as `training_view` has left it."""
+    """The view that the step renders, as `training_views` has left it."""
     log: dict[str, float] = field(default_factory=dict, compare=False)
     """Values that components record of the step, by column names `<component>.<quantity>`. A row of
     history.csv has the mean of each over the steps since the row before that recorded it."""
@@ -140,22 +140,26 @@ class Component:
         del step
         return True
 
-    def training_view(self, view: TrainingView, step: Step) -> TrainingView:
-        """Choose the camera and the photograph of this step.
+    def training_views(
+        self, views: Mapping[str, TrainingView], step: Step
+    ) -> Mapping[str, TrainingView]:
+        """Choose the cameras and the photographs that training uses at this step.
 
-        All that comes after it sees the view that it returns as the step's view. What the loss
-        prepares of a photograph is kept for as long as the same tensor comes back, so that a
-        component should make the photograph of a view once.
+        All that comes after it sees a view of those that it returns as the step's view. They must
+        be a function of the number of the step alone, so that a run that is continued has the same
+        ones. What the loss prepares of a photograph is kept while the same tensor comes back.
 
         Args:
-            view: The view of the step, or what the components before this one made of it.
-            step: The step with the view that was sampled.
+            views: All training views by name, or what the components before this one made of them.
+            step: The step with its view as it was sampled.
 
         Returns:
-            A view with the name and the tag of `view`, and a photograph of its camera's size.
+            Views of the same names and tags, each with a photograph of its camera's size; `views`
+            itself where nothing is changed, and the same object as at the step before where
+            nothing has changed since.
         """
         del step
-        return view
+        return views
 
     def before_render(self, activated: ActivatedGaussians, step: Step) -> ActivatedGaussians:
         """Change the Gaussians for this step's render alone.
@@ -349,11 +353,13 @@ class Components(tuple[Component, ...]):
         """Whether every component allows the step's view."""
         return all(component.allows_view(step) for component in self)
 
-    def training_view(self, view: TrainingView, step: Step) -> TrainingView:
-        """Apply `Component.training_view` of each component in turn."""
+    def training_views(
+        self, views: Mapping[str, TrainingView], step: Step
+    ) -> Mapping[str, TrainingView]:
+        """Apply `Component.training_views` of each component in turn."""
         for component in self:
-            view = component.training_view(view, step)
-        return view
+            views = component.training_views(views, step)
+        return views
 
     def before_render(self, activated: ActivatedGaussians, step: Step) -> ActivatedGaussians:
         """Apply `Component.before_render` of each component in turn."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Self
 
@@ -92,8 +92,8 @@ class ResolutionSchedule(Component):
         largest = min(_LARGEST_FACTOR, max(1, shortest // WINDOW))
         self.kept = kept_shares([view.image for view in high], range(1, largest + 1))
         self.factor = 1
-        self.reduced: dict[str, _ReducedView] = {}
-        """The HR views at the present factor, as far as they have been trained on."""
+        self.reduced: Mapping[str, TrainingView] = {}
+        """The views at the present factor; none where it is 1."""
 
     @classmethod
     def from_settings(cls, settings: ResolutionScheduleConf, setup: TrainingSetup) -> Self | None:
@@ -111,19 +111,28 @@ class ResolutionSchedule(Component):
             raise XrgsError(f"{key}.until={settings.until}: must be at least 1")
         return cls(settings, setup.data.train, setup.backend)
 
-    def training_view(self, view: TrainingView, step: Step) -> TrainingView:
-        """Return an HR view at its present size, and record k as `resolution_schedule.factor`."""
-        if view.tag != "HR":
-            return view
+    def training_views(
+        self, views: Mapping[str, TrainingView], step: Step
+    ) -> Mapping[str, TrainingView]:
+        """Return the HR views at the size of this step, and the others as they are.
+
+        A step on an HR view records k as `resolution_schedule.factor`.
+        """
         factor = self.factor_at(step)
-        step.log["resolution_schedule.factor"] = factor
-        if factor != self.factor:
-            self.factor, self.reduced = factor, {}
+        if step.view.tag == "HR":
+            step.log["resolution_schedule.factor"] = factor
         if factor == 1:
-            return view
-        if view.name not in self.reduced:
-            self.reduced[view.name] = self._reduce(view, factor)
-        return self.reduced[view.name]
+            self.factor, self.reduced = 1, {}
+            return views
+        if factor != self.factor:
+            self.factor, self.reduced = (
+                factor,
+                {
+                    name: self._reduce(view, factor) if view.tag == "HR" else view
+                    for name, view in views.items()
+                },
+            )
+        return self.reduced
 
     def factor_at(self, step: Step) -> int:
         """Return k at a step."""
