@@ -55,16 +55,11 @@ def optimizer_of(
     steps: int = 100,
     dtype: torch.dtype = torch.float64,
     backend: str = "torch",
-    **settings: int,
+    settings: OptimizerSettings | None = None,
 ) -> SplatOptimizer:
     gaussians = gaussians_of(random_values(count, 0, dtype))
-    return SplatOptimizer(
-        gaussians,
-        OptimizerSettings(**settings),
-        scene_scale=2.0,
-        steps=steps,
-        backend=backend,
-    )
+    settings = settings or OptimizerSettings()
+    return SplatOptimizer(gaussians, settings, scene_scale=2.0, steps=steps, backend=backend)
 
 
 def take_step(optimizer: SplatOptimizer, seed: int) -> dict[str, Tensor]:
@@ -128,12 +123,12 @@ def test_the_rate_of_means_decays_to_a_hundredth() -> None:
 
 
 def test_the_decay_of_the_rate_of_means_may_wait() -> None:
-    optimizer = optimizer_of(steps=20, means_decay_from=7500)  # a quarter of the run
+    optimizer = optimizer_of(steps=20, settings=OptimizerSettings(means_decay_from=7500))
     rates = []
     for seed in range(21):
         rates.append(optimizer.adam.param_groups[0]["lr"])
         take_step(optimizer, seed)
-    waiting = [3.2e-4] * 6  # after 0 to 5 steps
+    waiting = [3.2e-4] * 6  # after 0 to 5 steps, a quarter of the run
     assert rates == pytest.approx(waiting + [3.2e-4 * 0.01 ** (s / 15) for s in range(1, 16)])
 
 
@@ -156,7 +151,7 @@ def test_the_harmonics_move_at_every_third_step(backend: str, make_camera: MakeC
     if backend == "native":
         pytest.importorskip("xrgs._native")
     camera, dtype = make_camera(), torch.float32
-    optimizer = optimizer_of(dtype=dtype, backend=backend, shN_every=3)
+    optimizer = optimizer_of(dtype=dtype, backend=backend, settings=OptimizerSettings(shN_every=3))
     expected = random_values(5, 0, dtype)["shN"].requires_grad_()
     theirs = torch.optim.Adam([expected], lr=3 * GSPLAT_RATES["shN"], eps=1e-15)
     for step in range(7):
@@ -176,11 +171,13 @@ def test_the_harmonics_move_at_every_third_step(backend: str, make_camera: MakeC
 
 
 @pytest.mark.parametrize(
-    "settings", [{"means_decay_from": -1}, {"means_decay_from": 30_000}, {"shN_every": 0}]
+    ("name", "value"), [("means_decay_from", -1), ("means_decay_from", 30_000), ("shN_every", 0)]
 )
-def test_schedules_without_meaning_are_refused(settings: dict[str, int]) -> None:
-    with pytest.raises(ValueError, match=next(iter(settings))):
-        optimizer_of(**settings)
+def test_schedules_without_meaning_are_refused(name: str, value: int) -> None:
+    settings = OptimizerSettings()
+    setattr(settings, name, value)
+    with pytest.raises(ValueError, match=name):
+        optimizer_of(settings=settings)
 
 
 def test_appended_gaussians_start_without_momentum() -> None:

@@ -93,7 +93,7 @@ class _Views:
 
     def __init__(self, views: Iterable[TrainingView]) -> None:
         self.own: Mapping[str, TrainingView] = {view.name: view for view in views}
-        self.present = self.own
+        self.present: Mapping[str, TrainingView] = self.own
         self.targets = {name: prepare_target(view.image) for name, view in self.own.items()}
 
     def change_to(self, views: Mapping[str, TrainingView]) -> None:
