@@ -151,6 +151,8 @@ def test_a_value_that_is_missing_is_named(compose: Compose) -> None:
 @pytest.mark.parametrize(
     "override",
     [
+        "splat.optimizer.means_decay_from=-1",
+        "splat.optimizer.shN_every=0",
         "train.steps=0",
         "threads=-1",
         "checkpoint_s=-0.5",

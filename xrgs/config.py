@@ -22,7 +22,13 @@ from xrgs.errors import StoreError, XrgsError
 from xrgs.safeio.confined import ConfinedPath
 from xrgs.safeio.records import read_json
 from xrgs.splat.backend import CHOICES
-from xrgs.splat.settings import SPLITS, DensifySettings, OptimizerSettings, RasterSettings
+from xrgs.splat.settings import (
+    NOMINAL_STEPS,
+    SPLITS,
+    DensifySettings,
+    OptimizerSettings,
+    RasterSettings,
+)
 
 _PACKAGE = Path(__file__).parent
 #: `conf/` is inside the package in a wheel and beside it in a checkout.
@@ -222,6 +228,31 @@ class SupersampledConf:
 
 
 @dataclass
+class ResolutionScheduleConf:
+    """HR views at a reduced resolution early in training (DashGaussian), not in the paper."""
+
+    start_share: float = MISSING
+    """Share of the magnitude of the HR photographs' spectra that the first steps train on, above 0;
+    1 is off."""
+    until: int = MISSING
+    """Step of a 30,000-step run from which on HR views have their own resolution at the latest."""
+
+
+@dataclass
+class SkipBackwardConf:
+    """Steps without a backward pass after densification (SkipGS), not in the paper."""
+
+    share: float = MISSING
+    """Least share of the steps from `begin` on that have a backward pass, 0 to 1; 1 is off."""
+    tolerance: float = MISSING
+    """How far above the view's running mean the loss of a skipped step may be, relative to it."""
+    decay: float = MISSING
+    """Weight of the mean so far in the running mean of a view's loss, per step on the view."""
+    begin: int = MISSING
+    """Step of a 30,000-step run from which on steps may be skipped."""
+
+
+@dataclass
 class ConsistencyConf:
     """Cross-resolution consistency loss (paper, section 5.6)."""
 
@@ -302,6 +333,8 @@ class ComponentsConf:
     curriculum: CurriculumConf = field(default_factory=CurriculumConf)
     render_scale: RenderScaleConf = field(default_factory=RenderScaleConf)
     supersampled: SupersampledConf = field(default_factory=SupersampledConf)
+    resolution_schedule: ResolutionScheduleConf = field(default_factory=ResolutionScheduleConf)
+    skip_backward: SkipBackwardConf = field(default_factory=SkipBackwardConf)
     consistency: ConsistencyConf = field(default_factory=ConsistencyConf)
     adaptive_weighting: AdaptiveWeightingConf = field(default_factory=AdaptiveWeightingConf)
     region_weighting: RegionWeightingConf = field(default_factory=RegionWeightingConf)
@@ -387,6 +420,8 @@ def to_conf(cfg: DictConfig) -> Conf:
     _check_known(conf, "")
     _check_plugins(conf.components)
     least_values = (
+        ("splat.optimizer.means_decay_from", conf.splat.optimizer.means_decay_from, 0),
+        ("splat.optimizer.shN_every", conf.splat.optimizer.shN_every, 1),
         ("train.steps", conf.train.steps, 1),
         ("train.evaluate_every", conf.train.evaluate_every, 0),
         ("threads", conf.threads, 0),
@@ -399,6 +434,9 @@ def to_conf(cfg: DictConfig) -> Conf:
             raise XrgsError(f"{key}={value}: must be at least {least}")
     if not 0 <= conf.train.validation < 1:
         raise XrgsError(f"train.validation={conf.train.validation}: must be from 0 to below 1")
+    if (begin := conf.splat.optimizer.means_decay_from) >= NOMINAL_STEPS:
+        key = "splat.optimizer.means_decay_from"
+        raise XrgsError(f"{key}={begin}: must be below {NOMINAL_STEPS}, the length of a run")
     if conf.splat.backend not in CHOICES:
         raise XrgsError(f"splat.backend={conf.splat.backend}: must be one of {', '.join(CHOICES)}")
     densify = conf.splat.densify

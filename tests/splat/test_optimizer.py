@@ -7,11 +7,13 @@ from collections.abc import Callable
 import pytest
 import torch
 from torch import Tensor
+from torch.nn.functional import normalize
 
 from xrgs.splat.cameras import Camera
 from xrgs.splat.gaussians import PARAMETERS, Gaussians
 from xrgs.splat.optimizer import SplatOptimizer
 from xrgs.splat.settings import OptimizerSettings
+from xrgs.splat.sh import C0, sh_basis
 
 MakeCamera = Callable[..., Camera]
 MakeScene = Callable[..., dict[str, Tensor]]
@@ -48,10 +50,16 @@ def gaussians_of(values: dict[str, Tensor]) -> Gaussians:
 
 
 def optimizer_of(
-    count: int = 5, *, steps: int = 100, dtype: torch.dtype = torch.float64
+    count: int = 5,
+    *,
+    steps: int = 100,
+    dtype: torch.dtype = torch.float64,
+    backend: str = "torch",
+    settings: OptimizerSettings | None = None,
 ) -> SplatOptimizer:
     gaussians = gaussians_of(random_values(count, 0, dtype))
-    return SplatOptimizer(gaussians, OptimizerSettings(), scene_scale=2.0, steps=steps)
+    settings = settings or OptimizerSettings()
+    return SplatOptimizer(gaussians, settings, scene_scale=2.0, steps=steps, backend=backend)
 
 
 def take_step(optimizer: SplatOptimizer, seed: int) -> dict[str, Tensor]:
@@ -112,6 +120,64 @@ def test_the_rate_of_means_decays_to_a_hundredth() -> None:
     assert rates[-1] == pytest.approx(1.6e-4 * 2.0 * 0.01)
     others = {group["name"]: group["lr"] for group in optimizer.adam.param_groups[1:]}
     assert others == pytest.approx({k: v for k, v in GSPLAT_RATES.items() if k != "means"})
+
+
+def test_the_decay_of_the_rate_of_means_may_wait() -> None:
+    optimizer = optimizer_of(steps=20, settings=OptimizerSettings(means_decay_from=7500))
+    rates = []
+    for seed in range(21):
+        rates.append(optimizer.adam.param_groups[0]["lr"])
+        take_step(optimizer, seed)
+    waiting = [3.2e-4] * 6  # after 0 to 5 steps, a quarter of the run
+    assert rates == pytest.approx(waiting + [3.2e-4 * 0.01 ** (s / 15) for s in range(1, 16)])
+
+
+def test_a_skipped_step_moves_nothing_and_the_rate_goes_on() -> None:
+    skipping, other = optimizer_of(steps=8), optimizer_of(steps=8)
+    take_step(skipping, 1)
+    before = {name: skipping.gaussians[name].detach().clone() for name in PARAMETERS}
+    skipping.skip_step()
+    assert all(torch.equal(skipping.gaussians[name], before[name]) for name in PARAMETERS)
+    take_step(other, 1)
+    take_step(other, 2)
+    assert skipping.steps_done == other.steps_done == 2
+    assert skipping.adam.param_groups[0]["lr"] == other.adam.param_groups[0]["lr"]
+    assert skipping.adam.state[skipping.gaussians.means]["step"] == 1  # of Adam's own steps
+
+
+@pytest.mark.parametrize("backend", ["torch", "native"])
+def test_the_harmonics_move_at_every_third_step(backend: str, make_camera: MakeCamera) -> None:
+    """Against an Adam of three times the rate that steps as often, on the same gradients."""
+    if backend == "native":
+        pytest.importorskip("xrgs._native")
+    camera, dtype = make_camera(), torch.float32
+    optimizer = optimizer_of(dtype=dtype, backend=backend, settings=OptimizerSettings(shN_every=3))
+    expected = random_values(5, 0, dtype)["shN"].requires_grad_()
+    theirs = torch.optim.Adam([expected], lr=3 * GSPLAT_RATES["shN"], eps=1e-15)
+    for step in range(7):
+        values = random_values(5, 10 + step, dtype)
+        optimizer.zero_grad()
+        optimizer.gaussians.sh0.grad = values["sh0"].clone()
+        before = optimizer.gaussians.shN.detach().clone()
+        optimizer.step(camera, sh_degree=3)
+        after = optimizer.gaussians.shN.detach()
+        assert torch.equal(before, after) == (step % 3 != 0)
+        if step % 3 == 0:
+            dirs = normalize(optimizer.gaussians.means.detach() - camera.position.to(dtype), dim=-1)
+            basis = sh_basis(3, dirs)[:, 1:, None]
+            expected.grad = basis * values["sh0"] / C0
+            theirs.step()
+        torch.testing.assert_close(after, expected.detach(), rtol=1e-5, atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("name", "value"), [("means_decay_from", -1), ("means_decay_from", 30_000), ("shN_every", 0)]
+)
+def test_schedules_without_meaning_are_refused(name: str, value: int) -> None:
+    settings = OptimizerSettings()
+    setattr(settings, name, value)
+    with pytest.raises(ValueError, match=name):
+        optimizer_of(settings=settings)
 
 
 def test_appended_gaussians_start_without_momentum() -> None:

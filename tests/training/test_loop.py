@@ -3,24 +3,24 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from types import SimpleNamespace
 from typing import Any
 
 import pytest
 import torch
 
-from xrgs.capture.dataset import USES, Dataset
+from xrgs.capture.dataset import USES, Dataset, LoadedView
 from xrgs.config import CONF_DIR, Conf
 from xrgs.splat import rasterize
 from xrgs.splat.cameras import Camera
 from xrgs.splat.densify import Densifier
 from xrgs.splat.gaussians import PARAMETERS, ActivatedGaussians, Gaussians, from_points
-from xrgs.splat.loss import photometric_loss, prepare_target
+from xrgs.splat.loss import Target, photometric_loss, prepare_target
 from xrgs.splat.optimizer import SplatOptimizer
 from xrgs.splat.settings import DensifySettings, OptimizerSettings, RasterSettings
 from xrgs.training import components, loop, recorder
-from xrgs.training.components import Step
+from xrgs.training.components import Step, TrainingView
 from xrgs.training.count_matching import train_cell
 from xrgs.training.loop import train
 from xrgs.training.sampler import EpochSampler
@@ -138,6 +138,11 @@ class HookRecorder(components.Component):
         assert image.shape == step.view.image.shape
         return loss
 
+    def needs_backward(self, loss: torch.Tensor, step: Step) -> bool:
+        self.calls.append(("needs_backward", step.number))
+        assert loss.requires_grad
+        return True
+
     def after_backward(self, gaussians: Gaussians, step: Step) -> None:
         self.calls.append(("after_backward", step.number))
         assert gaussians.scales.grad is not None
@@ -150,6 +155,12 @@ class HookRecorder(components.Component):
     def on_gaussians_changed(self, gaussians: Gaussians) -> None:
         self.calls.append(("on_gaussians_changed", None))
         self.sizes.append(len(gaussians))
+
+    def training_views(
+        self, views: Mapping[str, TrainingView], step: Step
+    ) -> Mapping[str, TrainingView]:
+        self.calls.append(("training_views", step.number))
+        return views
 
     def render_camera(self, camera: Camera, step: Step) -> Camera:
         self.calls.append(("render_camera", step.number))
@@ -172,11 +183,13 @@ def test_hooks_are_called_in_the_order_of_a_step(data: Dataset, short: Conf) -> 
     recorder = HookRecorder()
     result = train(data, short, extra_components=[recorder])
     each = (
+        "training_views",
         "render_camera",
         "activated",
         "to_photograph",
         "pixel_weight",
         "loss",
+        "needs_backward",
         "after_backward",
         "densification_grad2d",
     )
@@ -253,6 +266,50 @@ def test_extra_components_run_behind_those_of_the_config(data: Dataset, short: C
     assert [row["loss"] for row in first] == [2 * row["loss.before"] for row in first]
     plain = train(data, short).history
     assert first[0]["loss.before"] == plain[0]["loss"]
+
+
+class SmallerFirst(components.Component):
+    """Trains on a smaller photograph before step 20, in the place of the view's own."""
+
+    def __init__(self, data: Dataset) -> None:
+        self.small = {view.name: self._crop(view) for view in data.train}
+
+    def _crop(self, view: LoadedView) -> LoadedView:
+        image = view.image[1:, 1:].clone()
+        camera = view.camera.resized(image.shape[1], image.shape[0])
+        return dataclasses.replace(view, camera=camera, image=image)
+
+    def training_views(
+        self, views: Mapping[str, TrainingView], step: Step
+    ) -> Mapping[str, TrainingView]:
+        return self.small if step.number < 20 else views
+
+
+def test_a_component_may_replace_the_view_of_a_step(
+    data: Dataset, short: Conf, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The render has the size of the photograph, which is prepared once."""
+    pairs = []
+
+    def spy(image: torch.Tensor, target: Target, **others: Any) -> torch.Tensor:
+        pairs.append((image.shape, target.image))
+        return photometric_loss(image, target, **others)
+
+    def prepare(image: torch.Tensor) -> Target:
+        prepared.append(image.shape)
+        return prepare_target(image)
+
+    prepared: list[torch.Size] = []
+    monkeypatch.setattr(loop, "photometric_loss", spy)
+    monkeypatch.setattr(loop, "prepare_target", prepare)
+    component = SmallerFirst(data)
+    train(data, short, extra_components=[component])
+    own = {view.image.data_ptr() for view in data.train}
+    small = {view.image.data_ptr() for view in component.small.values()}
+    assert all(shape == target.shape for shape, target in pairs)
+    assert {target.data_ptr() for _, target in pairs[:20]} == small
+    assert {target.data_ptr() for _, target in pairs[20:]} <= own
+    assert len(prepared) == 3 * len(data.train)  # once each time that the views change
 
 
 def test_a_gradient_of_zero_grows_nothing(data: Dataset, short: Conf) -> None:

@@ -79,6 +79,18 @@ def test_steps_alike_are_counted_once_until_the_gaussians_change(data: Dataset) 
     assert count(12, 0, 300) == 1200
 
 
+def test_a_step_without_backward_does_not_stand_for_its_kind(data: Dataset) -> None:
+    held: list[torch.Tensor] = []
+    memory = TrainingMemory(held)
+    with memory.of_forward(step(data), 1, 0):
+        pass  # and no `record`
+    held.append(torch.zeros(100))
+    with memory.of_forward(step(data), 1, 0):
+        pass
+    memory.record(render(0))
+    assert memory.largest_bytes == 400
+
+
 def test_the_state_is_the_largest_count(data: Dataset) -> None:
     memory, again = TrainingMemory(torch.zeros(3)), TrainingMemory()
     with memory.of_forward(step(data), 1, 0):

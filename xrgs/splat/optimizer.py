@@ -12,7 +12,7 @@ from torch import Tensor
 from xrgs.splat.backend import implementation, resolve_backend
 from xrgs.splat.cameras import Camera
 from xrgs.splat.gaussians import PARAMETERS, Gaussians
-from xrgs.splat.settings import OptimizerSettings
+from xrgs.splat.settings import NOMINAL_STEPS, OptimizerSettings
 
 
 class SplatOptimizer:
@@ -20,8 +20,20 @@ class SplatOptimizer:
 
     The rates are those of `examples/simple_trainer.py`. That of `means` is multiplied by the
     scene's scale and decays exponentially, from `settings.means * scene_scale` at the first step to
-    `settings.means_final` times that after the last. The state is torch's own:
+    `settings.means_final` times that after the last. With `settings.means_decay_from` it stays at
+    its first value until that step, and the same decay happens in the steps that are left:
+
+        rate(t) = means * scene_scale * means_final^(max(0, t - t0) / (steps - t0))
+
+    after t steps, where t0 is `means_decay_from * steps / 30,000`. DashGaussian [chen2025dash]
+    lets the decay wait so while it trains at a reduced resolution. The state is torch's own:
     `adam.state[gaussians.means]["exp_avg"]`.
+
+    With `settings.shN_every` of k the harmonics above band 0 move at every k-th step alone, the
+    first one included, by the gradient of that step, and at k times their rate: Adam's steps do not
+    depend on the size of the gradient, so that a coefficient whose gradient keeps its sign goes as
+    far as with k = 1. Their moments are updated at those steps alone. Our choice: the factor k of
+    the rate, and that the gradients of the steps between are dropped, which are never computed.
 
     Gaussians are added and removed through `append` and `keep` alone, so that the parameters and
     the state always fit. New Gaussians start with moments of zero and the step count of the others,
@@ -31,7 +43,7 @@ class SplatOptimizer:
         adam: The optimizer that holds groups and state.
         backend: `torch` or `native`: the backend that computes a step.
         gaussians: The Gaussians that are optimized.
-        steps_done: Number of steps taken so far.
+        steps_done: Number of training steps so far, those that `skip_step` left out included.
     """
 
     def __init__(
@@ -54,20 +66,30 @@ class SplatOptimizer:
             backend: `torch`, `native` or `auto` (`resolve_backend`), which computes the steps.
 
         Raises:
-            ValueError: `scene_scale` or `steps` is not above 0.
+            ValueError: `scene_scale` or `steps` is not above 0, or a setting is out of its range.
         """
         if not (math.isfinite(scene_scale) and scene_scale > 0):
             raise ValueError(f"scene_scale must be above 0, got {scene_scale}")
         if steps < 1:
             raise ValueError(f"steps must be at least 1, got {steps}")
+        if not 0 <= settings.means_decay_from < NOMINAL_STEPS:
+            raise ValueError(
+                f"means_decay_from must be 0 or more and below {NOMINAL_STEPS}, got"
+                f" {settings.means_decay_from}"
+            )
+        if settings.shN_every < 1:
+            raise ValueError(f"shN_every must be at least 1, got {settings.shN_every}")
         self.gaussians = gaussians
         self.means_rate = settings.means * scene_scale
         self.means_final = settings.means_final
+        self.means_decay_from = settings.means_decay_from * steps / NOMINAL_STEPS
+        self.shN_every = settings.shN_every
         self.steps = steps
         self.steps_done = 0
         self.backend = resolve_backend(backend)
         rates = {name: getattr(settings, name) for name in PARAMETERS}
         rates["means"] = self.means_rate
+        rates["shN"] *= self.shN_every
         self.adam = torch.optim.Adam(
             [{"name": name, "params": [gaussians[name]], "lr": rates[name]} for name in PARAMETERS],
             betas=(settings.beta1, settings.beta2),
@@ -78,7 +100,8 @@ class SplatOptimizer:
     def step(self, camera: Camera | None = None, *, sh_degree: int = 0) -> None:
         """Move every parameter that has a gradient, then decay the rate of `means`.
 
-        With a camera shN moves, too, by the gradient that sh0's implies. Seen from one place, a
+        With a camera shN moves, too, at every `shN_every`-th step, by the gradient that sh0's
+        implies. Seen from one place, a
         Gaussian has one colour c, which is linear in its harmonics: d c / d shN[k] = basis[k](dir)
         and d c / d sh0 = C0. So the gradient of shN[k] is that of sh0 times basis[k](dir) / C0.
 
@@ -86,12 +109,24 @@ class SplatOptimizer:
             camera: The view that the gradients come from, as the Gaussians were rendered in it.
             sh_degree: Highest band of the spherical harmonics that was rendered.
         """
-        implementation("optimizer", self.backend).step(self.adam, camera, sh_degree)
+        moves_harmonics = self.steps_done % self.shN_every == 0
+        implementation("optimizer", self.backend).step(
+            self.adam, camera if moves_harmonics else None, sh_degree
+        )
+        self.skip_step()
+
+    def skip_step(self) -> None:
+        """Count a training step and decay the rate of `means`, and move nothing.
+
+        The rate is that of the training step, however many steps were skipped before it. Adam
+        itself does not notice: its moments and the number of its steps stay as they are.
+        """
         self.steps_done += 1
         self._decay_means_rate()
 
     def _decay_means_rate(self) -> None:
-        decay: float = self.means_final ** (self.steps_done / self.steps)
+        decaying = max(0, self.steps_done - self.means_decay_from)
+        decay: float = self.means_final ** (decaying / (self.steps - self.means_decay_from))
         self._group("means")["lr"] = self.means_rate * decay
 
     def zero_grad(self) -> None:

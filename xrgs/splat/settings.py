@@ -71,6 +71,8 @@ class OptimizerSettings:
     """Multiplied by the scene's scale; decays exponentially from the first step to the last."""
     means_final: float = 0.01
     """The rate of means after the last step, as a share of the first."""
+    means_decay_from: int = 0
+    """Step of a 30,000-step run at which the rate of means begins to decay; 0 is gsplat's."""
     scales: float = 5e-3
     """Rate of log scales."""
     opacities: float = 5e-2
@@ -78,6 +80,8 @@ class OptimizerSettings:
     quats: float = 1e-3
     sh0: float = 2.5e-3
     shN: float = 2.5e-3 / 20  # noqa: N815
+    shN_every: int = 1  # noqa: N815
+    """Steps of this run between two steps of shN, whose rate is multiplied by it; 1 is gsplat's."""
     beta1: float = 0.9
     """Decay of the first moment, per step."""
     beta2: float = 0.999

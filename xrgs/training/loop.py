@@ -31,10 +31,12 @@ from xrgs.training.seeding import seeded_generator
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Mapping
 
+    from torch import Tensor
+
     from xrgs.capture.dataset import Dataset
     from xrgs.config import Conf, SplatConf
-    from xrgs.splat.loss import Target
-    from xrgs.training.components import Component, Step
+    from xrgs.splat.cameras import Camera
+    from xrgs.training.components import Component, Step, TrainingView
 
     #: Scores of Gaussians by name; None where one is not available.
     Evaluate = Callable[[Gaussians], Mapping[str, float | None]]
@@ -87,6 +89,27 @@ def train(
     return run.recorder.finish(gaussians, run.memory.largest_bytes)
 
 
+class _Views:
+    """The training views by name, as components want them at present, and what the loss needs."""
+
+    def __init__(self, views: Iterable[TrainingView]) -> None:
+        self.own: Mapping[str, TrainingView] = {view.name: view for view in views}
+        self.present: Mapping[str, TrainingView] = self.own
+        self.targets = {name: prepare_target(view.image) for name, view in self.own.items()}
+
+    def change_to(self, views: Mapping[str, TrainingView]) -> None:
+        """Use other views; what is prepared of photographs that stay the same is kept."""
+        if views is self.present:
+            return
+        self.targets = {
+            name: self.targets[name]
+            if view.image is self.present[name].image
+            else prepare_target(view.image)
+            for name, view in views.items()
+        }
+        self.present = views
+
+
 @dataclass(frozen=True)
 class _Run:
     """Everything that the steps of one run use."""
@@ -98,7 +121,7 @@ class _Run:
     sh_every: int
     """Steps of this run after which one more SH band is switched on."""
     backend: str
-    targets: dict[str, Target]
+    views: _Views
     optimizer: SplatOptimizer
     components: Components
     densifier: Densifier
@@ -127,7 +150,9 @@ def _run_steps(run: _Run, checkpoint: Checkpoint, evaluate: Evaluate | None) -> 
     raster, ssim, backend = run.splat.raster, run.splat.ssim_weight, run.backend
     components, optimizer, densifier = run.components, run.optimizer, run.densifier
     sampler, recorder, gaussians = run.sampler, run.recorder, run.optimizer.gaussians
-    for step in progress(sampler, "training", "step", run.steps, done=sampler.next_step):
+    for sampled in progress(sampler, "training", "step", run.steps, done=sampler.next_step):
+        run.views.change_to(components.training_views(run.views.own, sampled))
+        step = replace(sampled, view=run.views.present[sampled.view.name])
         view, camera = step.view, components.render_camera(step.view.camera, step)
         sh_degree = min(step.number // run.sh_every, raster.sh_degree)
         # The gradient of the offset is for densification.
@@ -143,21 +168,22 @@ def _run_steps(run: _Run, checkpoint: Checkpoint, evaluate: Evaluate | None) -> 
                 backend=backend,
             )
             # Loss: L1 and SSIM against the photograph, then terms and weights of the components.
-            image, target = components.to_photograph(render.image, step), run.targets[view.name]
-            weights = components.pixel_weights(step)
+            image = components.to_photograph(render.image, step)
+            target, weights = run.views.targets[view.name], components.pixel_weights(step)
             loss = photometric_loss(
                 image, target, l1=1 - ssim, ssim=ssim, pixel_weight=weights, backend=backend
             )
             loss = components.modify_loss(loss, image, gaussians, step)
-        # Backward, then the components' changes of the gradients.
-        optimizer.zero_grad()
-        torch.autograd.backward(loss)
-        components.after_backward(gaussians, step)
-        # Optimise, and record the step while its gradients and buffers still exist.
-        optimizer.step(camera, sh_degree=sh_degree)
-        run.memory.record(render)
-        recorder.record_step(step, loss, render, len(gaussians))
-        # Densify, prune and reset. There is no gradient where the render shows no Gaussian.
+        # Update the Gaussians, and record the step while its gradients and buffers still exist.
+        if components.needs_backward(loss, step):
+            _update(run, step, loss, camera, sh_degree)
+            run.memory.record(render)
+            recorder.record_step(step, loss, render, len(gaussians))
+        else:
+            optimizer.skip_step()
+            recorder.record_step(step, loss, render, len(gaussians), skipped_backward=True)
+        # Densify, prune and reset. There is no gradient without a backward pass, nor where the
+        # render shows no Gaussian.
         grad2d, size = means2d_offset.grad, {"width": camera.width, "height": camera.height}
         if grad2d is not None:
             grad2d = components.densification_grad2d(grad2d, step)
@@ -177,6 +203,14 @@ def _run_steps(run: _Run, checkpoint: Checkpoint, evaluate: Evaluate | None) -> 
         if evaluate is not None and run.evaluates_after(step.number):
             recorder.record_scores(step.number + 1, len(gaussians), run.score(evaluate))
         recorder.exclude_time(checkpoint.save_if_due(step.number))
+
+
+def _update(run: _Run, step: Step, loss: Tensor, camera: Camera, sh_degree: int) -> None:
+    """Backward, the components' changes of the gradients, then the optimizer's step."""
+    run.optimizer.zero_grad()
+    torch.autograd.backward(loss)
+    run.components.after_backward(run.optimizer.gaussians, step)
+    run.optimizer.step(camera, sh_degree=sh_degree)
 
 
 def _prune_by_components(run: _Run, step: Step, refinement: Refinement) -> Refinement:
@@ -214,18 +248,18 @@ def _set_up(data: Dataset, conf: Conf, extra_components: Iterable[Component]) ->
         groups=components.densification_groups(splat.densify),
         view_pixels=max((v.camera.width * v.camera.height for v in data.train), default=0),
     )
-    targets = {view.name: prepare_target(view.image) for view in data.train}
+    views = _Views(data.train)
     return _Run(
         splat=splat,
         steps=steps,
         evaluate_every=conf.train.evaluate_every,
         sh_every=max(1, int(splat.sh_every * steps / NOMINAL_STEPS)),
         backend=backend,
-        targets=targets,
+        views=views,
         optimizer=optimizer,
         components=components,
         densifier=densifier,
         sampler=EpochSampler(data.train, conf.seed, steps, components.allows_view),
         recorder=TrainingRecorder(steps, splat.densify.grow_grad2d),
-        memory=TrainingMemory(optimizer, densifier, components, targets, data),
+        memory=TrainingMemory(optimizer, densifier, components, views, data),
     )

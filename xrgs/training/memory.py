@@ -44,7 +44,8 @@ class TrainingMemory:
         self.holders = holders
         self.largest_bytes = 0
         self._counted: set[str] = set()
-        self._saved_bytes: int | None = None
+        self._noted: tuple[str, int] | None = None
+        """The kind of a step whose forward pass was noted, and the bytes that autograd saved."""
 
     @contextmanager
     def of_forward(self, step: Step, gaussians: int, sh_degree: int) -> Iterator[None]:
@@ -57,10 +58,10 @@ class TrainingMemory:
         """
         size, logged = list(step.view.image.shape), sorted(step.log.items())
         kind = f"{gaussians} {sh_degree} {step.view.tag} {size} {logged}"
+        self._noted = None
         if kind in self._counted:
             yield
             return
-        self._counted.add(kind)
         saved: dict[int, int] = {}
 
         def note(tensor: Tensor) -> Tensor:
@@ -71,7 +72,7 @@ class TrainingMemory:
             yield
         # Now, while all of it exists: later, other tensors may have the same addresses.
         held = _storages(tensors_in(self.holders))
-        self._saved_bytes = sum(size for address, size in saved.items() if address not in held)
+        self._noted = kind, sum(size for address, size in saved.items() if address not in held)
 
     def state_dict(self) -> State:
         """Return the largest count so far, and which steps need not be counted again."""
@@ -94,14 +95,17 @@ class TrainingMemory:
     def record(self, render: Render) -> None:
         """Count a step, if its forward pass was noted, while its gradients exist.
 
+        A step without a backward pass is not counted: another of its kind holds more.
+
         Args:
             render: The step's render.
         """
-        if self._saved_bytes is not None:
+        if self._noted is not None:
+            kind, saved_bytes = self._noted
             held = sum(_storages(tensors_in(self.holders)).values())
-            count = held + self._saved_bytes + render.buffer_bytes
-            self.largest_bytes = max(self.largest_bytes, count)
-            self._saved_bytes = None
+            self.largest_bytes = max(self.largest_bytes, held + saved_bytes + render.buffer_bytes)
+            self._counted.add(kind)
+            self._noted = None
 
 
 def tensors_in(value: object) -> Iterator[Tensor]:

@@ -32,10 +32,11 @@ class TrainingResult:
     """The trained model."""
     history: list[dict[str, Any]]
     """One row for each recorded step. `step`, `view`, `loss` and `gaussians` (their number before
-    the step's densification) are those of the step itself. `steps_HR`, `steps_LR` and the counts of
-    `Refinement` are totals since the start of training. Every other column is a component's log
-    (`Step.log`): its mean over the steps since the row before that logged it, or None where none
-    did. Every row has every column."""
+    the step's densification) are those of the step itself. `steps_HR`, `steps_LR`, the counts of
+    `Refinement` and `skipped_backward` (the steps without a backward pass; the column is absent
+    where there are none) are totals since the start of training. Every other column is a
+    component's log (`Step.log`): its mean over the steps since the row before that logged it, or
+    None where none did. Every row has every column."""
     seconds: float
     """Time of the training steps alone: no loading of data, no evaluation, no checkpoints."""
     memory_bytes: int
@@ -73,7 +74,15 @@ class TrainingRecorder:
         self.scores: list[dict[str, Any]] = []
         self.evaluations = 0
 
-    def record_step(self, step: Step, loss: torch.Tensor, render: Render, gaussians: int) -> None:
+    def record_step(
+        self,
+        step: Step,
+        loss: torch.Tensor,
+        render: Render,
+        gaussians: int,
+        *,
+        skipped_backward: bool = False,
+    ) -> None:
         """Record a step after its update and before its densification.
 
         Args:
@@ -81,9 +90,12 @@ class TrainingRecorder:
             loss: Scalar, the loss of the step.
             render: The step's render.
             gaussians: The number of Gaussians.
+            skipped_backward: Whether the step had neither a backward pass nor an update.
         """
         self.evaluations += render.evaluations
         self.counts[f"steps_{step.view.tag}"] += 1
+        if skipped_backward:
+            self.counts["skipped_backward"] += 1
         for name, value in step.log.items():
             self.logged[name].append(value)
         if step.number % self.row_every == 0 or step.number == self.last_step:

@@ -28,6 +28,8 @@ from xrgs.training.components.densify import Densify
 from xrgs.training.components.gradient_scaling import GradientScaling
 from xrgs.training.components.mip import Mip
 from xrgs.training.components.render_scale import RenderScale
+from xrgs.training.components.resolution_schedule import ResolutionSchedule
+from xrgs.training.components.skip_backward import SkipBackward
 from xrgs.training.components.supersampled import Supersampled
 from xrgs.training.components.weighting import Weighting
 
@@ -59,6 +61,8 @@ BUILT_IN: Mapping[str, type[Component]] = {
     "mip": Mip,
     "render_scale": RenderScale,
     "supersampled": Supersampled,
+    "resolution_schedule": ResolutionSchedule,
+    "skip_backward": SkipBackward,
 }
 
 

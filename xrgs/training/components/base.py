@@ -2,15 +2,17 @@
 
 One step of training runs these hooks, each for every component that is on:
 
-1. `allows_view` while the sampler chooses the step's view,
+1. `allows_view` while the sampler chooses the step's view, then `training_views` on all views,
 2. `before_render` on the activated Gaussians and `render_camera` on the view's camera, then the
    view is rendered, and `to_photograph` brings the render to the size of the photograph,
-3. `pixel_weights` for the photometric loss, then `modify_loss` on that loss, then backward,
-4. `after_backward` on the gradients of the parameters, then the optimizer steps,
+3. `pixel_weights` for the photometric loss, then `modify_loss` on that loss, then `needs_backward`,
+4. backward, then `after_backward` on the gradients of the parameters, then the optimizer steps,
 5. `densification_grad2d` on the image-plane gradient, then densification reads it; at its
    refinements `may_grow` and, where a budget leaves room for some Gaussians only, `growth_scores`,
 6. `on_gaussians_changed` where densification has added, removed or reset Gaussians,
 7. `to_prune`, and `on_gaussians_changed` where that has removed Gaussians.
+
+A step that needs no backward pass leaves out 4 and `densification_grad2d`.
 
 `densification_groups` is called once before the first step, `opacity_attenuation` where
 densification resets opacities, `bake` wherever the Gaussians are evaluated or saved, and
@@ -76,7 +78,7 @@ class Step:
     total: int
     """The number of steps of the whole run."""
     view: TrainingView
-    """The view that the step renders."""
+    """The view that the step renders, as `training_views` has left it."""
     log: dict[str, float] = field(default_factory=dict, compare=False)
     """Values that components record of the step, by column names `<component>.<quantity>`. A row of
     history.csv has the mean of each over the steps since the row before that recorded it."""
@@ -140,6 +142,27 @@ class Component:
         """
         del step
         return True
+
+    def training_views(
+        self, views: Mapping[str, TrainingView], step: Step
+    ) -> Mapping[str, TrainingView]:
+        """Choose the cameras and the photographs that training uses at this step.
+
+        All that comes after it sees a view of those that it returns as the step's view. They must
+        be a function of the number of the step alone, so that a run that is continued has the same
+        ones. What the loss prepares of a photograph is kept while the same tensor comes back.
+
+        Args:
+            views: All training views by name, or what the components before this one made of them.
+            step: The step with its view as it was sampled.
+
+        Returns:
+            Views of the same names and tags, each with a photograph of its camera's size; `views`
+            itself where nothing is changed, and the same object as at the step before where
+            nothing has changed since.
+        """
+        del step
+        return views
 
     def before_render(self, activated: ActivatedGaussians, step: Step) -> ActivatedGaussians:
         """Change the Gaussians for this step's render alone.
@@ -209,6 +232,22 @@ class Component:
         """
         del image, gaussians, step
         return loss
+
+    def needs_backward(self, loss: Tensor, step: Step) -> bool:
+        """Decide whether the step's loss is worth a backward pass.
+
+        Training calls it once in every step, whatever the other components answer.
+
+        Args:
+            loss: Scalar; the loss of the step, with all terms and weights.
+            step: The step with its view.
+
+        Returns:
+            False leaves out the backward pass, the optimizer's step and the step's part in the
+            statistics of densification. Schedules go on, that of the rate of the means too.
+        """
+        del loss, step
+        return True
 
     def after_backward(self, gaussians: Gaussians, step: Step) -> None:
         """Change the gradients of the parameters in place, before the optimizer reads them.
@@ -364,6 +403,14 @@ class Components(tuple[Component, ...]):
         """Whether every component allows the step's view."""
         return all(component.allows_view(step) for component in self)
 
+    def training_views(
+        self, views: Mapping[str, TrainingView], step: Step
+    ) -> Mapping[str, TrainingView]:
+        """Apply `Component.training_views` of each component in turn."""
+        for component in self:
+            views = component.training_views(views, step)
+        return views
+
     def before_render(self, activated: ActivatedGaussians, step: Step) -> ActivatedGaussians:
         """Apply `Component.before_render` of each component in turn."""
         for component in self:
@@ -391,6 +438,11 @@ class Components(tuple[Component, ...]):
         for component in self:
             loss = component.modify_loss(loss, image, gaussians, step)
         return loss
+
+    def needs_backward(self, loss: Tensor, step: Step) -> bool:
+        """Whether every component needs the backward pass; all of them are asked."""
+        answers = [component.needs_backward(loss, step) for component in self]
+        return all(answers)
 
     def after_backward(self, gaussians: Gaussians, step: Step) -> None:
         """Call `Component.after_backward` of each component in turn."""

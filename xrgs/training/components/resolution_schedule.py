@@ -1,0 +1,169 @@
+"""HR views at a reduced resolution early in training [chen2025dash]."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Self
+
+import torch
+from torch import Tensor
+
+from xrgs.errors import XrgsError
+from xrgs.splat.cameras import Camera
+from xrgs.splat.loss import WINDOW
+from xrgs.splat.resample import resize
+from xrgs.training.components.base import Component, Step, TrainingSetup, TrainingView
+
+if TYPE_CHECKING:  # xrgs.config loads Hydra, which training does without
+    from xrgs.config import ResolutionScheduleConf
+
+_LARGEST_FACTOR = 8
+"""As in the authors' code."""
+
+
+@dataclass(frozen=True)
+class _ReducedView:
+    """An HR view with fewer pixels."""
+
+    name: str
+    tag: str
+    rho: float
+    camera: Camera
+    image: Tensor
+    """[h, w, 3] at the camera's size."""
+
+
+class ResolutionSchedule(Component):
+    """Trains HR views at a resolution that grows with the step, by their frequency content.
+
+    DashGaussian [chen2025dash] trains on photographs that are brought down by a factor r, which
+    falls to 1 as training goes on. With F_n the discrete Fourier transform of photograph n, and the
+    sum over channels too, what a factor keeps of the photographs is
+
+        kept(r) = X(1 / (2 r)) / X(1 / 2)
+        X(f) = sum_n sum_{|fx| <= f, |fy| <= f} |F_n(fx, fy)|
+
+    with fx and fy in cycles per px. In the authors' code the step at which r is reached is
+    proportional to the logarithm of kept(r), from step 0 for the first r, of which kept(r) is a
+    quarter, to the step `until` for r = 1, the end of densification; and r is rounded down to a
+    whole number, at most 8. So at step t the photographs are brought down by the largest whole
+    number k with
+
+        kept(k) >= start_share^(1 - t / until)
+
+    and from `until` on by none. Frequencies are those of each photograph, and n goes over the HR
+    views. The camera is that of the view at the smaller size, round(W / k) x round(H / k) px, and
+    densification reads normalised device units, which do not depend on the size.
+
+    Our choice: LR views are never reduced; the photograph is brought down by the antialiased
+    bicubic kernel in place of a cut in the frequency domain; every HR view keeps at least the
+    pixels of the window of SSIM; shares are rounded to 6 digits, so that the last digits of a
+    Fourier transform, which depend on the processor, decide nothing. `splat.optimizer.
+    means_decay_from` lets the rate of the means wait, as the authors do until k is 1. The growth of
+    the number of Gaussians, which they schedule too, is left as it is.
+    """
+
+    def __init__(
+        self,
+        settings: ResolutionScheduleConf,
+        views: Sequence[TrainingView],
+        backend: str = "torch",
+    ) -> None:
+        """Compute the share of the spectrum that each factor keeps.
+
+        Args:
+            settings: The component's settings.
+            views: All training views; those that are tagged HR are reduced.
+            backend: `torch` or `native`: the implementation of the resampling.
+
+        Raises:
+            XrgsError: No view is tagged HR.
+        """
+        high = [view for view in views if view.tag == "HR"]
+        if not high:
+            raise XrgsError(
+                "components.resolution_schedule: there is no HR view to reduce; set start_share to"
+                " 1, or train on the mixed views (train.views=mixed)"
+            )
+        self.settings = settings
+        self.backend = backend
+        shortest = min(min(view.camera.width, view.camera.height) for view in high)
+        largest = min(_LARGEST_FACTOR, max(1, shortest // WINDOW))
+        self.kept = kept_shares([view.image for view in high], range(1, largest + 1))
+        self.factor = 1
+        self.reduced: Mapping[str, TrainingView] = {}
+        """The views at the present factor; none where it is 1."""
+
+    @classmethod
+    def from_settings(cls, settings: ResolutionScheduleConf, setup: TrainingSetup) -> Self | None:
+        """Build the component; a `start_share` of 1 leaves it off.
+
+        Raises:
+            XrgsError: A setting is out of its range, or there is no HR view.
+        """
+        key = "components.resolution_schedule"
+        if not 0 < settings.start_share <= 1:
+            raise XrgsError(f"{key}.start_share={settings.start_share}: must be in (0, 1]")
+        if settings.start_share == 1:
+            return None
+        if settings.until < 1:
+            raise XrgsError(f"{key}.until={settings.until}: must be at least 1")
+        return cls(settings, setup.data.train, setup.backend)
+
+    def training_views(
+        self, views: Mapping[str, TrainingView], step: Step
+    ) -> Mapping[str, TrainingView]:
+        """Return the HR views at the size of this step, and the others as they are.
+
+        A step on an HR view records k as `resolution_schedule.factor`.
+        """
+        factor = self.factor_at(step)
+        if step.view.tag == "HR":
+            step.log["resolution_schedule.factor"] = factor
+        if factor == 1:
+            self.factor, self.reduced = 1, {}
+            return views
+        if factor != self.factor:
+            self.factor, self.reduced = (
+                factor,
+                {
+                    name: self._reduce(view, factor) if view.tag == "HR" else view
+                    for name, view in views.items()
+                },
+            )
+        return self.reduced
+
+    def factor_at(self, step: Step) -> int:
+        """Return k at a step."""
+        left = max(0.0, 1 - step.nominal / self.settings.until)
+        needed = self.settings.start_share**left
+        return max(factor for factor, kept in self.kept.items() if kept >= needed)
+
+    def _reduce(self, view: TrainingView, factor: int) -> _ReducedView:
+        width, height = round(view.camera.width / factor), round(view.camera.height / factor)
+        image = resize(view.image, height, width, backend=self.backend)
+        camera = view.camera.resized(width, height)
+        return _ReducedView(view.name, view.tag, view.rho, camera, image)
+
+
+def kept_shares(images: Sequence[Tensor], factors: Iterable[int]) -> dict[int, float]:
+    """Compute the share of the spectra's magnitude that downsampling keeps.
+
+    Args:
+        images: Photographs [H, W, 3] of any sizes.
+        factors: Whole factors of downsampling, at least 1.
+
+    Returns:
+        For each factor the share in 0..1 of the sum of magnitudes, over all images, whose
+        frequencies are at most 1 / (2 factor) cycles per px on both axes; to 6 digits.
+    """
+    total, sums = 0.0, dict.fromkeys(factors, 0.0)
+    for image in images:
+        spectrum = torch.fft.fft2(image.double(), dim=(0, 1)).abs().sum(dim=2)  # [H, W]
+        total += spectrum.sum().item()
+        fy, fx = (torch.fft.fftfreq(size, dtype=torch.float64).abs() for size in spectrum.shape)
+        for factor in sums:
+            rows, columns = fy <= 0.5 / factor, fx <= 0.5 / factor
+            sums[factor] += spectrum[rows][:, columns].sum().item()
+    return {factor: round(value / total, 6) if total else 1.0 for factor, value in sums.items()}
