@@ -278,6 +278,16 @@ class MipConf:
 
 
 @dataclass
+class NaturalSelectionConf:
+    """Gaussians that fade under a common push are removed after densification, not in the paper."""
+
+    budget: float = MISSING
+    """Gaussians to keep, per pixel of the finest training view; 0 is off."""
+    until: int = MISSING
+    """Step of a 30,000-step run at which no more than that are left."""
+
+
+@dataclass
 class CountMatchedConf:
     """The baseline with as many Gaussians as another cell (`xrgs.training.count_matching`)."""
 
@@ -304,6 +314,7 @@ class ComponentsConf:
     hybrid_schedule: HybridScheduleConf = field(default_factory=HybridScheduleConf)
     continuous_weighting: ContinuousWeightingConf = field(default_factory=ContinuousWeightingConf)
     mip: MipConf = field(default_factory=MipConf)
+    natural_selection: NaturalSelectionConf = field(default_factory=NaturalSelectionConf)
     count_matched: CountMatchedConf = field(default_factory=CountMatchedConf)
     plugins: dict[str, Any] = field(default_factory=dict)
     """The settings of components that other installed packages provide, by the names of their entry

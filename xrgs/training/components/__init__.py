@@ -27,6 +27,7 @@ from xrgs.training.components.curriculum import Curriculum
 from xrgs.training.components.densify import Densify
 from xrgs.training.components.gradient_scaling import GradientScaling
 from xrgs.training.components.mip import Mip
+from xrgs.training.components.natural_selection import NaturalSelection
 from xrgs.training.components.render_scale import RenderScale
 from xrgs.training.components.supersampled import Supersampled
 from xrgs.training.components.weighting import Weighting
@@ -59,6 +60,7 @@ BUILT_IN: Mapping[str, type[Component]] = {
     "mip": Mip,
     "render_scale": RenderScale,
     "supersampled": Supersampled,
+    "natural_selection": NaturalSelection,
 }
 
 
