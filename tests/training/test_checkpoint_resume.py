@@ -39,6 +39,12 @@ CASES = {
     "budget": ["+ablation=budget", "splat.densify.budget=0.05"],
     # Its rates are found anew between refinements too, or they would be new at every restart.
     "mip": ["+ablation=mip", "components.mip.every=7"],
+    "multiview_score": ["+ablation=multiview_score"],
+    "natural_selection": [
+        "+ablation=natural_selection",
+        "components.natural_selection.budget=0.003",
+        "splat.densify.stop=10000",
+    ],
     # Without the reset, after which too few Gaussians are left for numbers to be matched.
     "count_matched": ["splat.densify.reset_every=50000"],
 }

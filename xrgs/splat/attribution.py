@@ -24,6 +24,7 @@ class Attribution:
     """Alpha evaluations of the forward pass (`Render.evaluations`)."""
 
 
+@torch.enable_grad()
 def attribute_pixels(
     pixels: Tensor,
     gaussians: ActivatedGaussians,
@@ -54,7 +55,8 @@ def attribute_pixels(
         backend: `torch`, `native` or `auto` (`resolve_backend`).
 
     Returns:
-        The sums and the number of alpha evaluations; nothing is differentiable.
+        The sums and the number of alpha evaluations; nothing is differentiable. Gradients need not
+        be enabled.
 
     Raises:
         ValueError: The map is not of the camera's size, or as for `rasterize_parameters`.

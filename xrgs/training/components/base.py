@@ -12,7 +12,8 @@ One step of training runs these hooks, each for every component that is on:
 6. `on_gaussians_changed` where densification has added, removed or reset Gaussians,
 7. `to_prune`, and `on_gaussians_changed` where that has removed Gaussians.
 
-`densification_groups` is called once before the first step, `opacity_attenuation` where
+`densification_groups` and `before_training` are called once before the first step,
+`opacity_attenuation` where
 densification resets opacities, `bake` wherever the Gaussians are evaluated or saved, and
 `after_training` once after the last step.
 """
@@ -41,6 +42,7 @@ if TYPE_CHECKING:  # xrgs.config loads Hydra, which training does without
     from xrgs.splat.gaussians import ActivatedGaussians, Gaussians
     from xrgs.splat.refinement import Groups
     from xrgs.splat.settings import DensifySettings
+    from xrgs.training.rendering import ViewRenderer
 
 
 class TrainingView(Protocol):
@@ -99,6 +101,8 @@ class TrainingSetup:
     """The settings of the model, its optimizer and its densification, `splat` of the config."""
     backend: str
     """`torch` or `native`: the implementation that renders and computes losses."""
+    seed: int = 0
+    """The seed of the run (`xrgs.training.seeding.seeded_generator`)."""
 
 
 class Component:
@@ -127,6 +131,15 @@ class Component:
             XrgsError: A setting is out of its range; the message names its key.
         """
         raise NotImplementedError(f"{cls.__name__} does not define from_settings")
+
+    def before_training(self, renderer: ViewRenderer) -> None:
+        """Keep what renders training views, for a component that looks at more than the step's own.
+
+        Training calls it once, before the first step, or before the first after a checkpoint.
+
+        Args:
+            renderer: Renders any training view with all components of the run.
+        """
 
     def allows_view(self, step: Step) -> bool:
         """Decide whether training may sample the step's view at that step.
@@ -359,6 +372,11 @@ class Components(tuple[Component, ...]):
     """The components that are on, in the order in which their hooks run; empty is the baseline."""
 
     __slots__ = ()
+
+    def before_training(self, renderer: ViewRenderer) -> None:
+        """Call `Component.before_training` of each component in turn."""
+        for component in self:
+            component.before_training(renderer)
 
     def allows_view(self, step: Step) -> bool:
         """Whether every component allows the step's view."""

@@ -60,8 +60,8 @@ class NaturalSelection(Component):
     at every 50th step would be worth a seventh of that. Opaque Gaussians are not pushed harder in
     the first 1,000 steps.
 
-    The budget is in Gaussians per pixel of the finest training view. Where densification left no
-    more than that, nothing happens.
+    The budget is in Gaussians for each pixel of the training view that has the most of them, as
+    `splat.densify.budget` is. Where densification left no more than that, nothing happens.
     """
 
     def __init__(self, settings: NaturalSelectionConf, budget: int, stop: int) -> None:
@@ -97,8 +97,7 @@ class NaturalSelection(Component):
                 f"components.natural_selection.until={settings.until}: must be above"
                 f" splat.densify.stop + {_LEAD} = {stop + _LEAD} and at most {NOMINAL_STEPS}"
             )
-        pixels = max(view.image.shape[0] * view.image.shape[1] for view in setup.data.train)
-        return cls(settings, max(1, int(settings.budget * pixels)), stop)
+        return cls(settings, max(1, round(settings.budget * setup.data.view_pixels)), stop)
 
     def after_backward(self, gaussians: Gaussians, step: Step) -> None:
         """Add the push to the gradient of the logit opacities.
