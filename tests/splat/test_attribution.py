@@ -13,6 +13,7 @@ from torch import Tensor
 from xrgs.splat.attribution import attribute_pixels
 from xrgs.splat.cameras import Camera
 from xrgs.splat.gaussians import ActivatedGaussians
+from xrgs.splat.render_result import Render
 from xrgs.splat.settings import RasterSettings
 
 Scene = dict[str, Tensor]
@@ -73,7 +74,7 @@ def test_it_is_the_sum_over_pixels_of_map_times_blending_weight(
 
 
 def test_a_map_of_ones_comes_to_the_alpha_of_the_image(
-    make_camera: MakeCamera, make_scene: MakeScene, draw: Callable[..., Tensor]
+    make_camera: MakeCamera, make_scene: MakeScene, draw: Callable[..., Render]
 ) -> None:
     camera = make_camera(turned=True)
     scene = make_scene(40, camera)

@@ -142,8 +142,8 @@ def test_fewer_than_the_budget_are_not_pushed(
 def test_a_run_ends_with_the_budget(data: Dataset, compose: Callable[..., Conf]) -> None:
     # Without resets, which would leave no more than the budget, and with a rate of the opacities at
     # which they can fade in 16 steps.
-    over = ("train.steps=60", "splat.backend=auto", "splat.densify.reset_every=50000")
-    over = (*over, "splat.optimizer.opacities=0.8")
+    without_resets = ("train.steps=60", "splat.backend=auto", "splat.densify.reset_every=50000")
+    over = (*without_resets, "splat.optimizer.opacities=0.8")
     plain = train(data, compose(*over)).gaussians
     conf = compose(*over, "components.natural_selection.budget=0.01")
     result = train(data, conf)
