@@ -24,7 +24,7 @@ from xrgs.training.components import Components
 from xrgs.training.components import build as build_components
 from xrgs.training.memory import TrainingMemory
 from xrgs.training.recorder import TrainingRecorder, TrainingResult
-from xrgs.training.rendering import ViewRenderer
+from xrgs.training.rendering import StepRenderer
 from xrgs.training.sampler import EpochSampler
 from xrgs.training.seeding import seeded_generator
 
@@ -103,7 +103,7 @@ class _Run:
     densifier: Densifier
     sampler: EpochSampler
     recorder: TrainingRecorder
-    renderer: ViewRenderer
+    renderer: StepRenderer
     memory: TrainingMemory
 
     def evaluates_after(self, step: int) -> bool:
@@ -221,6 +221,6 @@ def _set_up(data: Dataset, conf: Conf, extra_components: Iterable[Component]) ->
         densifier=densifier,
         sampler=EpochSampler(data.train, conf.seed, steps, components.allows_view),
         recorder=recorder,
-        renderer=ViewRenderer(components, splat.raster, sh_every, backend, recorder),
+        renderer=StepRenderer(components, splat.raster, sh_every, backend, recorder),
         memory=TrainingMemory(optimizer, densifier, components, targets, data),
     )

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True)
-class ViewRenderer:
+class StepRenderer:
     """Renders any training view as the step that trains on it does, with all components.
 
     Components that look at more views than the step's own get it before the first step

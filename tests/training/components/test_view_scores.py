@@ -22,7 +22,7 @@ from xrgs.training.components import Component, Components, Step
 from xrgs.training.components.view_scores import ErrorScore, edges
 from xrgs.training.loop import train
 from xrgs.training.recorder import TrainingRecorder
-from xrgs.training.rendering import ViewRenderer
+from xrgs.training.rendering import StepRenderer
 
 Build = Callable[..., Components]
 Scores = Callable[..., Tensor]
@@ -50,9 +50,9 @@ def fine(views: dict[str, LoadedView]) -> list[LoadedView]:
     return [views["HR"], replace(views["LR"], rho=0.2)]
 
 
-def renderer_of(parts: Components) -> ViewRenderer:
+def renderer_of(parts: Components) -> StepRenderer:
     recorder = TrainingRecorder(30_000, 0.0)
-    return ViewRenderer(parts, RasterSettings(sh_degree=0), 1000, "torch", recorder)
+    return StepRenderer(parts, RasterSettings(sh_degree=0), 1000, "torch", recorder)
 
 
 def ready(parts: Components) -> Components:

@@ -20,6 +20,7 @@ from xrgs.training.components.base import (
     Step,
     TrainingSetup,
     TrainingView,
+    ViewRenderer,
     check_not_negative,
 )
 from xrgs.training.components.consistency import Consistency
@@ -45,6 +46,7 @@ __all__ = [
     "Step",
     "TrainingSetup",
     "TrainingView",
+    "ViewRenderer",
     "build",
     "check_not_negative",
 ]

@@ -42,7 +42,6 @@ if TYPE_CHECKING:  # xrgs.config loads Hydra, which training does without
     from xrgs.splat.gaussians import ActivatedGaussians, Gaussians
     from xrgs.splat.refinement import Groups
     from xrgs.splat.settings import DensifySettings
-    from xrgs.training.rendering import ViewRenderer
 
 
 class TrainingView(Protocol):
@@ -87,6 +86,19 @@ class Step:
     def nominal(self) -> float:
         """The position of the step in a run of 30,000 steps, in which schedules are written."""
         return self.number * NOMINAL_STEPS / self.total
+
+
+class ViewRenderer(Protocol):
+    """What renders training views, as components see it; `xrgs.training.rendering` has it.
+
+    The work and the time that it takes are the run's.
+    """
+
+    def photograph(self, gaussians: Gaussians, step: Step) -> Tensor:
+        """Render the step's view as it is compared with its photograph: [H, W, 3], no graph."""
+
+    def attribute(self, pixels: Tensor, gaussians: Gaussians, step: Step) -> Tensor:
+        """Sum a map [H, W] of the view's photograph over what each Gaussian shows of it: [N]."""
 
 
 @dataclass(frozen=True)

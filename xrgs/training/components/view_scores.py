@@ -15,6 +15,7 @@ from xrgs.training.components.base import (
     Step,
     TrainingSetup,
     TrainingView,
+    ViewRenderer,
     check_not_negative,
 )
 from xrgs.training.seeding import seeded_generator
@@ -22,7 +23,6 @@ from xrgs.training.seeding import seeded_generator
 if TYPE_CHECKING:  # xrgs.config loads Hydra, which training does without
     from xrgs.config import ErrorScoreConf, MultiviewScoreConf
     from xrgs.splat.gaussians import Gaussians
-    from xrgs.training.rendering import ViewRenderer
 
 
 class _ViewScores(Component):
