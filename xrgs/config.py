@@ -313,6 +313,41 @@ class MipConf:
 
 
 @dataclass
+class MultiviewScoreConf:
+    """Growth only where several views have high errors (FastGS), not in the paper."""
+
+    views: int = MISSING
+    """Training views that are looked at in each refinement; 0 is off."""
+    error: float = MISSING
+    """Share of the largest error in a view from which on a pixel's error is high, 0 to 1."""
+    pixels: float = MISSING
+    """Pixels with a high error, in px^2 of the finest view and weighted as they are blended, above
+    which a Gaussian may grow."""
+
+
+@dataclass
+class ErrorScoreConf:
+    """What grows first where a budget leaves room for some (Improved-GS), not in the paper."""
+
+    of: str = MISSING
+    """What a Gaussian is ranked by: `edges` of the photographs that it shows, `errors` of their
+    renders, or `nothing` (off: the image-plane gradient)."""
+    views: int = MISSING
+    """Training views that are looked at in each refinement."""
+
+
+@dataclass
+class NaturalSelectionConf:
+    """Gaussians that fade under a common push are removed after densification, not in the paper."""
+
+    budget: float = MISSING
+    """Gaussians to keep, for each pixel of the training view that has the most of them; 0 is
+    off."""
+    until: int = MISSING
+    """Step of a 30,000-step run at which no more than that are left."""
+
+
+@dataclass
 class CountMatchedConf:
     """The baseline with as many Gaussians as another cell (`xrgs.training.count_matching`)."""
 
@@ -341,6 +376,9 @@ class ComponentsConf:
     hybrid_schedule: HybridScheduleConf = field(default_factory=HybridScheduleConf)
     continuous_weighting: ContinuousWeightingConf = field(default_factory=ContinuousWeightingConf)
     mip: MipConf = field(default_factory=MipConf)
+    multiview_score: MultiviewScoreConf = field(default_factory=MultiviewScoreConf)
+    error_score: ErrorScoreConf = field(default_factory=ErrorScoreConf)
+    natural_selection: NaturalSelectionConf = field(default_factory=NaturalSelectionConf)
     count_matched: CountMatchedConf = field(default_factory=CountMatchedConf)
     plugins: dict[str, Any] = field(default_factory=dict)
     """The settings of components that other installed packages provide, by the names of their entry

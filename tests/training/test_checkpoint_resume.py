@@ -42,6 +42,12 @@ CASES = {
     "skip_backward": ["+ablation=skip_backward", "components.skip_backward.begin=3000"],
     "resolution_schedule": ["+ablation=resolution_schedule"],
     "harmonics_every": ["+ablation=harmonics_every"],
+    "multiview_score": ["+ablation=multiview_score"],
+    "natural_selection": [
+        "+ablation=natural_selection",
+        "components.natural_selection.budget=0.003",
+        "splat.densify.stop=10000",
+    ],
     # Without the reset, after which too few Gaussians are left for numbers to be matched.
     "count_matched": ["splat.densify.reset_every=50000"],
 }

@@ -60,6 +60,14 @@ class Dataset:
     """How LR views were made of HR ones: `downsample`, `digital_zoom`, `jpeg`, or `none` where a
     camera took them."""
 
+    @property
+    def view_pixels(self) -> int:
+        """Number of pixels of the training view that has the most of them; 0 without views.
+
+        Budgets of Gaussians are in units of it.
+        """
+        return max((view.camera.width * view.camera.height for view in self.train), default=0)
+
 
 def load(
     variant: Variant, use: str = "mixed", *, validation: float = 0.0, seed: int = 0

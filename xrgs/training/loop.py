@@ -17,7 +17,6 @@ from xrgs.splat.densify import Densifier
 from xrgs.splat.gaussians import PARAMETERS, Gaussians, from_points
 from xrgs.splat.loss import photometric_loss, prepare_target
 from xrgs.splat.optimizer import SplatOptimizer
-from xrgs.splat.rasterize import rasterize_parameters
 from xrgs.splat.refinement import Refinement
 from xrgs.splat.settings import NOMINAL_STEPS
 from xrgs.training.checkpoint import Checkpoint
@@ -25,6 +24,7 @@ from xrgs.training.components import Components
 from xrgs.training.components import build as build_components
 from xrgs.training.memory import TrainingMemory
 from xrgs.training.recorder import TrainingRecorder, TrainingResult
+from xrgs.training.rendering import StepRenderer
 from xrgs.training.sampler import EpochSampler
 from xrgs.training.seeding import seeded_generator
 
@@ -71,6 +71,7 @@ def train(
     """
     checkpoint = checkpoint or Checkpoint()
     run = _set_up(data, conf, extra_components)
+    run.components.before_training(run.renderer)
     run.components.on_gaussians_changed(run.optimizer.gaussians)
     # Everything that a step changes. The Gaussians belong to the optimizer's state, which must be
     # restored first: the others' states have to fit the number of Gaussians.
@@ -118,8 +119,6 @@ class _Run:
     steps: int
     evaluate_every: int
     """Steps of this run between two evaluations; 0 evaluates nothing."""
-    sh_every: int
-    """Steps of this run after which one more SH band is switched on."""
     backend: str
     views: _Views
     optimizer: SplatOptimizer
@@ -127,6 +126,7 @@ class _Run:
     densifier: Densifier
     sampler: EpochSampler
     recorder: TrainingRecorder
+    renderer: StepRenderer
     memory: TrainingMemory
 
     def evaluates_after(self, step: int) -> bool:
@@ -147,26 +147,19 @@ class _Run:
 
 
 def _run_steps(run: _Run, checkpoint: Checkpoint, evaluate: Evaluate | None) -> None:
-    raster, ssim, backend = run.splat.raster, run.splat.ssim_weight, run.backend
+    ssim, backend, renderer = run.splat.ssim_weight, run.backend, run.renderer
     components, optimizer, densifier = run.components, run.optimizer, run.densifier
     sampler, recorder, gaussians = run.sampler, run.recorder, run.optimizer.gaussians
     for sampled in progress(sampler, "training", "step", run.steps, done=sampler.next_step):
         run.views.change_to(components.training_views(run.views.own, sampled))
         step = replace(sampled, view=run.views.present[sampled.view.name])
         view, camera = step.view, components.render_camera(step.view.camera, step)
-        sh_degree = min(step.number // run.sh_every, raster.sh_degree)
+        sh_degree = renderer.sh_degree(step)
         # The gradient of the offset is for densification.
         means2d_offset = torch.zeros(len(gaussians), 2, requires_grad=True)
         with run.memory.of_forward(step, len(gaussians), sh_degree):
             # Render the view of this step.
-            render = rasterize_parameters(
-                *components.before_render(gaussians.activated(backend=backend), step),
-                camera,
-                raster,
-                sh_degree=sh_degree,
-                means2d_offset=means2d_offset,
-                backend=backend,
-            )
+            render = renderer.render(gaussians, step, camera, means2d_offset)
             # Loss: L1 and SSIM against the photograph, then terms and weights of the components.
             image = components.to_photograph(render.image, step)
             target, weights = run.views.targets[view.name], components.pixel_weights(step)
@@ -238,7 +231,7 @@ def _set_up(data: Dataset, conf: Conf, extra_components: Iterable[Component]) ->
     optimizer = SplatOptimizer(
         gaussians, splat.optimizer, scene_scale=data.scene_scale, steps=steps, backend=backend
     )
-    built = build_components(conf.components, data, splat, backend)
+    built = build_components(conf.components, data, splat, backend, conf.seed)
     components = Components([*built, *extra_components])
     densifier = Densifier(
         optimizer,
@@ -246,20 +239,22 @@ def _set_up(data: Dataset, conf: Conf, extra_components: Iterable[Component]) ->
         scene_scale=data.scene_scale,
         generator=seeded_generator(conf.seed, "densify"),
         groups=components.densification_groups(splat.densify),
-        view_pixels=max((v.camera.width * v.camera.height for v in data.train), default=0),
+        view_pixels=data.view_pixels,
     )
     views = _Views(data.train)
+    recorder = TrainingRecorder(steps, splat.densify.grow_grad2d)
+    sh_every = max(1, int(splat.sh_every * steps / NOMINAL_STEPS))
     return _Run(
         splat=splat,
         steps=steps,
         evaluate_every=conf.train.evaluate_every,
-        sh_every=max(1, int(splat.sh_every * steps / NOMINAL_STEPS)),
         backend=backend,
         views=views,
         optimizer=optimizer,
         components=components,
         densifier=densifier,
         sampler=EpochSampler(data.train, conf.seed, steps, components.allows_view),
-        recorder=TrainingRecorder(steps, splat.densify.grow_grad2d),
+        recorder=recorder,
+        renderer=StepRenderer(components, splat.raster, sh_every, backend, recorder),
         memory=TrainingMemory(optimizer, densifier, components, views, data),
     )

@@ -104,6 +104,14 @@ class TrainingRecorder:
             self.history.append(row | {"gaussians": gaussians} | self.counts | means)
             self.logged.clear()
 
+    def record_evaluations(self, evaluations: int) -> None:
+        """Count the work of what is rendered beside the steps' own renders.
+
+        Args:
+            evaluations: Alpha evaluations of a forward pass.
+        """
+        self.evaluations += evaluations
+
     def record_refinement(self, refinement: Refinement) -> None:
         """Add what a step's densification did to the counts of the history.
 

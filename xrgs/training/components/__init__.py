@@ -20,6 +20,7 @@ from xrgs.training.components.base import (
     Step,
     TrainingSetup,
     TrainingView,
+    ViewRenderer,
     check_not_negative,
 )
 from xrgs.training.components.consistency import Consistency
@@ -27,10 +28,12 @@ from xrgs.training.components.curriculum import Curriculum
 from xrgs.training.components.densify import Densify
 from xrgs.training.components.gradient_scaling import GradientScaling
 from xrgs.training.components.mip import Mip
+from xrgs.training.components.natural_selection import NaturalSelection
 from xrgs.training.components.render_scale import RenderScale
 from xrgs.training.components.resolution_schedule import ResolutionSchedule
 from xrgs.training.components.skip_backward import SkipBackward
 from xrgs.training.components.supersampled import Supersampled
+from xrgs.training.components.view_scores import ErrorScore, MultiviewScore
 from xrgs.training.components.weighting import Weighting
 
 if TYPE_CHECKING:  # xrgs.config loads Hydra, which training does without
@@ -45,6 +48,7 @@ __all__ = [
     "Step",
     "TrainingSetup",
     "TrainingView",
+    "ViewRenderer",
     "build",
     "check_not_negative",
 ]
@@ -63,11 +67,14 @@ BUILT_IN: Mapping[str, type[Component]] = {
     "supersampled": Supersampled,
     "resolution_schedule": ResolutionSchedule,
     "skip_backward": SkipBackward,
+    "multiview_score": MultiviewScore,
+    "error_score": ErrorScore,
+    "natural_selection": NaturalSelection,
 }
 
 
 def build(
-    conf: ComponentsConf, data: Dataset, splat: SplatConf, backend: str = "torch"
+    conf: ComponentsConf, data: Dataset, splat: SplatConf, backend: str = "torch", seed: int = 0
 ) -> Components:
     """Build the components that a config switches on.
 
@@ -76,6 +83,7 @@ def build(
         data: The training data.
         splat: `splat` of the config.
         backend: `torch` or `native`: the implementation that renders and computes losses.
+        seed: `seed` of the config.
 
     Returns:
         The built-in components that are on, then those of other packages by their names.
@@ -84,7 +92,7 @@ def build(
         XrgsError: A value is out of its range, a view is too small for its paired target, a
             component has no view or weight to act on, or a plugin cannot be used.
     """
-    setup = TrainingSetup(conf, data, splat, backend)
+    setup = TrainingSetup(conf, data, splat, backend, seed)
     built = [kind.from_settings(getattr(conf, key), setup) for key, kind in BUILT_IN.items()]
     built += [_build_plugin(name, values, setup) for name, values in sorted(conf.plugins.items())]
     return Components(component for component in built if component is not None)

@@ -14,9 +14,9 @@ One step of training runs these hooks, each for every component that is on:
 
 A step that needs no backward pass leaves out 4 and `densification_grad2d`.
 
-`densification_groups` is called once before the first step, `opacity_attenuation` where
-densification resets opacities, `bake` wherever the Gaussians are evaluated or saved, and
-`after_training` once after the last step.
+`densification_groups` and `before_training` are called once before the first step,
+`opacity_attenuation` where densification resets opacities, `bake` wherever the Gaussians are
+evaluated or saved, and `after_training` once after the last step.
 """
 
 from __future__ import annotations
@@ -89,6 +89,19 @@ class Step:
         return self.number * NOMINAL_STEPS / self.total
 
 
+class ViewRenderer(Protocol):
+    """What renders training views, as components see it; `xrgs.training.rendering` has it.
+
+    The work and the time that it takes are the run's.
+    """
+
+    def photograph(self, gaussians: Gaussians, step: Step) -> Tensor:
+        """Render the step's view as it is compared with its photograph: [H, W, 3], no graph."""
+
+    def attribute(self, pixels: Tensor, gaussians: Gaussians, step: Step) -> Tensor:
+        """Sum a map [H, W] of the view's photograph over what each Gaussian shows of it: [N]."""
+
+
 @dataclass(frozen=True)
 class TrainingSetup:
     """Everything that a component may read when it is built."""
@@ -101,6 +114,8 @@ class TrainingSetup:
     """The settings of the model, its optimizer and its densification, `splat` of the config."""
     backend: str
     """`torch` or `native`: the implementation that renders and computes losses."""
+    seed: int = 0
+    """The seed of the run (`xrgs.training.seeding.seeded_generator`)."""
 
 
 class Component:
@@ -129,6 +144,15 @@ class Component:
             XrgsError: A setting is out of its range; the message names its key.
         """
         raise NotImplementedError(f"{cls.__name__} does not define from_settings")
+
+    def before_training(self, renderer: ViewRenderer) -> None:
+        """Keep what renders training views, for a component that looks at more than the step's own.
+
+        Training calls it once, before the first step, or before the first after a checkpoint.
+
+        Args:
+            renderer: Renders any training view with all components of the run.
+        """
 
     def allows_view(self, step: Step) -> bool:
         """Decide whether training may sample the step's view at that step.
@@ -398,6 +422,11 @@ class Components(tuple[Component, ...]):
     """The components that are on, in the order in which their hooks run; empty is the baseline."""
 
     __slots__ = ()
+
+    def before_training(self, renderer: ViewRenderer) -> None:
+        """Call `Component.before_training` of each component in turn."""
+        for component in self:
+            component.before_training(renderer)
 
     def allows_view(self, step: Step) -> bool:
         """Whether every component allows the step's view."""

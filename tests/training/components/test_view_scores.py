@@ -1,0 +1,200 @@
+"""Scores by several training views: the high errors, or the edges, that a Gaussian shows."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from scipy.ndimage import correlate
+from torch import Tensor
+
+from xrgs.capture.dataset import Dataset, LoadedView
+from xrgs.config import ComponentsConf, Conf
+from xrgs.errors import XrgsError
+from xrgs.splat.attribution import attribute_pixels
+from xrgs.splat.gaussians import ActivatedGaussians, Gaussians
+from xrgs.splat.rasterize import rasterize_parameters
+from xrgs.splat.settings import RasterSettings
+from xrgs.training.components import Component, Components, Step
+from xrgs.training.components.view_scores import ErrorScore, edges
+from xrgs.training.loop import train
+from xrgs.training.recorder import TrainingRecorder
+from xrgs.training.rendering import StepRenderer
+
+Build = Callable[..., Components]
+Scores = Callable[..., Tensor]
+
+
+@pytest.fixture
+def shown() -> Gaussians:
+    """Eight small Gaussians in front of the cameras of `views`, float64."""
+    generator = torch.Generator().manual_seed(4)
+    means = torch.rand(8, 3, generator=generator).double() * torch.tensor([1.4, 1.0, 0.5])
+    values = {
+        "means": means + torch.tensor([-0.7, -0.5, 2.0]),
+        "quats": torch.randn(8, 4, generator=generator).double(),
+        "scales": torch.rand(8, 3, generator=generator).double() - 3,
+        "opacities": torch.randn(8, generator=generator).double() + 1,
+        "sh0": torch.randn(8, 1, 3, generator=generator).double(),
+        "shN": torch.zeros(8, 0, 3).double(),
+    }
+    return Gaussians(**values)
+
+
+@pytest.fixture
+def fine(views: dict[str, LoadedView]) -> list[LoadedView]:
+    """The HR view, and the LR view with its sampling rate."""
+    return [views["HR"], replace(views["LR"], rho=0.2)]
+
+
+def renderer_of(parts: Components) -> StepRenderer:
+    recorder = TrainingRecorder(30_000, 0.0)
+    return StepRenderer(parts, RasterSettings(sh_degree=0), 1000, "torch", recorder)
+
+
+def ready(parts: Components) -> Components:
+    parts.before_training(renderer_of(parts))
+    return parts
+
+
+def attributed(pixels: Tensor, gaussians: Gaussians, view: LoadedView) -> Tensor:
+    settings = RasterSettings()
+    return attribute_pixels(pixels, gaussians.activated(), view.camera, settings).sums
+
+
+def image_of(gaussians: ActivatedGaussians, view: LoadedView) -> Tensor:
+    return rasterize_parameters(*gaussians, view.camera, RasterSettings(), sh_degree=0).image
+
+
+def test_a_gaussian_may_grow_where_it_shows_enough_high_errors(
+    build: Build, off: ComponentsConf, hr: Step, shown: Gaussians, fine: list[LoadedView]
+) -> None:
+    off.multiview_score.views, off.multiview_score.error = 2, 0.7
+    expected = torch.zeros(8, dtype=torch.float64)
+    for view, area in zip(fine, (1, 25), strict=True):
+        error = (image_of(shown.activated(), view) - view.image).abs().mean(dim=-1)
+        high = (error - error.min()) / (error.max() - error.min()) > 0.7
+        assert 5 < high.sum() < high.numel() / 2
+        expected += area * attributed(high.double(), shown, view) / 2
+    off.multiview_score.pixels = expected.median().item() * (1 + 1e-9)
+    grows = ready(build(off, *fine)).may_grow(shown, hr)
+    assert grows is not None
+    assert torch.equal(grows, expected > expected.median())
+    assert grows.sum() == 4
+
+
+def edges_in_scipy(image: Tensor) -> Tensor:
+    kernel = np.full((3, 3), -1.0)
+    kernel[1, 1] = 8
+    return torch.from_numpy(np.abs(correlate(image.sum(dim=-1).numpy(), kernel, mode="nearest")))
+
+
+def test_edges_are_scipys_laplacian(noise: Callable[[int, int, int], Tensor]) -> None:
+    image = noise(9, 13, 5)
+    torch.testing.assert_close(edges(image), edges_in_scipy(image))
+
+
+@pytest.mark.parametrize("of", ["edges", "errors"])
+def test_what_grows_is_ranked_by_edges_or_errors(
+    build: Build, off: ComponentsConf, hr: Step, shown: Gaussians, fine: list[LoadedView], of: str
+) -> None:
+    off.error_score.of, off.error_score.views = of, 5
+    expected = torch.zeros(8, dtype=torch.float64)
+    for view in fine:
+        pixels = (image_of(shown.activated(), view) - view.image).abs().mean(dim=-1)
+        if of == "edges":
+            laplacian = edges_in_scipy(view.image)
+            pixels = (laplacian - laplacian.min()) / (laplacian.max() - laplacian.min())
+        sums = attributed(pixels, shown, view)
+        expected += sums / sums[sums > 0].mean() / 2
+    scores = ready(build(off, *fine)).growth_scores(shown, hr)
+    assert scores is not None
+    torch.testing.assert_close(scores, expected)
+    assert scores.std() > 0.1
+
+
+class Lowered(Component):
+    """Lowers all opacities, so that a component that renders without it has other scores."""
+
+    def before_render(self, activated: ActivatedGaussians, step: Step) -> ActivatedGaussians:
+        del step
+        return activated._replace(opacities=activated.opacities * 0.1)
+
+
+def test_views_are_rendered_with_all_components(
+    build: Build, off: ComponentsConf, lr: Step, shown: Gaussians, fine: list[LoadedView]
+) -> None:
+    off.supersampled.factor = off.supersampled.late_factor = 2
+    parts = Components([*build(off, *fine), Lowered()])
+    renderer = renderer_of(parts)
+    lower = shown.activated()._replace(opacities=shown.activated().opacities * 0.1)
+    camera = parts.render_camera(lr.view.camera, lr)
+    assert camera.width == 2 * lr.view.camera.width
+    render = rasterize_parameters(*lower, camera, RasterSettings(), sh_degree=0)
+    down = parts.to_photograph(render.image, lr)
+    torch.testing.assert_close(renderer.photograph(shown, lr), down)
+    # A Gaussian's weights are what its colour alone makes of the photograph.
+    pixels = torch.rand(down.shape[:2], generator=torch.Generator().manual_seed(1)).double()
+    sums = renderer.attribute(pixels, shown, lr)
+    for index in range(len(shown)):
+        sh0 = torch.full((8, 1, 3), -9.0).double()
+        sh0[index] = 0.5 * np.sqrt(4 * np.pi)  # a colour of 1
+        only = rasterize_parameters(
+            *lower._replace(sh0=sh0), camera, RasterSettings(), sh_degree=0
+        ).image
+        expected = (parts.to_photograph(only, lr)[..., 0] * pixels).sum()
+        torch.testing.assert_close(sums[index], expected)
+    assert renderer.recorder.evaluations == 2 * render.evaluations
+
+
+def test_the_work_counts_as_the_runs(data: Dataset, compose: Callable[..., Conf]) -> None:
+    every_third_step = ("train.steps=20", "splat.backend=auto", "splat.densify.every=5000")
+    over = (*every_third_step, "splat.densify.grow_grad2d=1")  # nothing grows
+    plain = train(data, compose(*over))
+    scored = train(data, compose(*over, "+ablation=multiview_score"))
+    assert len(scored.gaussians) == len(plain.gaussians)
+    # Refinements at steps 3, 6 and 9 render each of the four views twice.
+    assert 1.5 * plain.evaluations < scored.evaluations < 3 * plain.evaluations
+
+
+def test_views_follow_from_the_seed_and_the_step(
+    build: Build, off: ComponentsConf, hr: Step, shown: Gaussians, fine: list[LoadedView]
+) -> None:
+    off.error_score.of, off.error_score.views = "edges", 1
+    many = [replace(fine[i % 2], name=f"v{i}") for i in range(6)]
+    for index, view in enumerate(many):
+        view.image[0, 0] = index / 6
+    (score,) = ready(build(off, *many))
+    assert isinstance(score, ErrorScore)
+    first, second, third, again = (
+        score.growth_scores(shown, replace(hr, number=number)) for number in (600, 700, 800, 600)
+    )
+    assert torch.equal(first, again)
+    assert not (torch.equal(first, second) and torch.equal(first, third))
+
+
+@pytest.mark.parametrize(
+    ("key", "value"),
+    [
+        ("multiview_score.views", -1),
+        ("multiview_score.error", -0.1),
+        ("multiview_score.error", 1.0),
+        ("multiview_score.pixels", float("nan")),
+        ("error_score.views", 0),
+        ("error_score.of", "all"),
+    ],
+)
+def test_a_value_out_of_range_is_named(
+    build: Build, off: ComponentsConf, key: str, value: float
+) -> None:
+    name, field = key.split(".")
+    setattr(getattr(off, name), field, value)
+    with pytest.raises(XrgsError, match=f"components.{key}={value}: must be"):
+        build(off)
+
+
+def test_both_are_off_in_the_baseline(build: Build, off: ComponentsConf) -> None:
+    assert not build(off)

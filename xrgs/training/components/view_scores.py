@@ -1,0 +1,216 @@
+"""Scores of the Gaussians by several training views, which choose what densification grows."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Self
+
+import torch
+from torch import Tensor
+from torch.nn.functional import pad
+
+from xrgs.errors import XrgsError
+from xrgs.training.components.base import (
+    Component,
+    Step,
+    TrainingSetup,
+    TrainingView,
+    ViewRenderer,
+    check_not_negative,
+)
+from xrgs.training.seeding import seeded_generator
+
+if TYPE_CHECKING:  # xrgs.config loads Hydra, which training does without
+    from xrgs.config import ErrorScoreConf, MultiviewScoreConf
+    from xrgs.splat.gaussians import Gaussians
+
+
+class _ViewScores(Component):
+    """Gives each Gaussian the mean over some training views of a score in each of them.
+
+    The views are drawn anew at each refinement, from all training views without repetition, by the
+    run's seed and the number of the step alone: there is no state. They are rendered with all
+    components of the run, and their alpha evaluations and time count as the run's.
+    """
+
+    renderer: ViewRenderer
+
+    def __init__(self, views: Sequence[TrainingView], count: int, seed: int) -> None:
+        self.views, self.count, self.seed = views, min(count, len(views)), seed
+
+    def before_training(self, renderer: ViewRenderer) -> None:
+        """Keep what renders the views."""
+        self.renderer = renderer
+
+    def score_in_view(self, gaussians: Gaussians, step: Step) -> Tensor:
+        """Return the scores [N] of the Gaussians in the step's view."""
+        raise NotImplementedError
+
+    def scores(self, gaussians: Gaussians, step: Step) -> Tensor:
+        """Return the mean scores [N] in the views of a refinement."""
+        generator = seeded_generator(self.seed, f"{type(self).__name__} {step.number}")
+        total = gaussians.opacities.new_zeros(len(gaussians))
+        for index in torch.randperm(len(self.views), generator=generator)[: self.count].tolist():
+            total += self.score_in_view(gaussians, Step(step.number, step.total, self.views[index]))
+        return total / self.count
+
+
+class MultiviewScore(_ViewScores):
+    """Lets only Gaussians grow that show many pixels with a high error, in the mean of some views.
+
+    Multi-view consistent densification [ren2025fastgs]. In each of `views` training views, the
+    absolute difference between render and photograph, averaged over the channels, is brought to
+    0..1 by its smallest and largest value in the view. A pixel's error is high where that is above
+    `error`. Of the Gaussians above the growth threshold, those may grow with
+
+        s_i = mean over the views of  (1 / rho^2) sum over p of [error of p is high] w_i(p)
+            > pixels
+
+    where w_i(p) is the weight with which Gaussian i is blended into pixel p (`attribute_pixels`).
+
+    Ours: FastGS counts the pixels of the footprint, whatever the weight, and asks for more than 5
+    of them. A sum of weights needs no kernel of its own, and a Gaussian that is faint or hidden
+    there does not answer for what is wrong in a pixel. It is a few hundredths of the count, so
+    that `pixels` is another number. rho is the sampling rate of the view relative to the finest
+    (`TrainingView.rho`), so that the sum is in px^2 of the finest view: a pixel of an LR view that
+    is 5 times smaller counts 25. FastGS's pruning by the same score is left out.
+    """
+
+    def __init__(
+        self, settings: MultiviewScoreConf, views: Sequence[TrainingView], seed: int
+    ) -> None:
+        """Take the views and the settings.
+
+        Args:
+            settings: The component's settings.
+            views: All training views.
+            seed: The seed of the run.
+        """
+        super().__init__(views, settings.views, seed)
+        self.error, self.pixels = settings.error, settings.pixels
+
+    @classmethod
+    def from_settings(cls, settings: MultiviewScoreConf, setup: TrainingSetup) -> Self | None:
+        """Build the component; 0 `views` leave it off.
+
+        Raises:
+            XrgsError: A value is below 0, or the error above 1.
+        """
+        for name in ("views", "error", "pixels"):
+            check_not_negative(f"components.multiview_score.{name}", getattr(settings, name))
+        if settings.error >= 1:
+            raise XrgsError(f"components.multiview_score.error={settings.error}: must be below 1")
+        return cls(settings, setup.data.train, setup.seed) if settings.views else None
+
+    def may_grow(self, gaussians: Gaussians, step: Step) -> Tensor:
+        """Return which Gaussians [N] show enough pixels with a high error."""
+        return self.scores(gaussians, step) > self.pixels
+
+    def score_in_view(self, gaussians: Gaussians, step: Step) -> Tensor:
+        """Return the weighted number [N] of pixels with a high error, px^2 of the finest view."""
+        error = _mean_error(self.renderer.photograph(gaussians, step), step.view.image)
+        high = _in_unit_range(error) > self.error
+        sums = self.renderer.attribute(high.to(error), gaussians, step)
+        return sums / step.view.rho**2
+
+
+class ErrorScore(_ViewScores):
+    """Ranks what would grow by the edges or errors that a Gaussian shows in some views.
+
+    Where a budget leaves room for some of the Gaussians above the growth threshold only, those with
+    the highest scores grow. The score is the edge-aware score of Improved-GS [deng2025],
+    as in the code of its authors:
+
+        s_i = mean over the views j of  a_ij / (mean of a_kj over the k with a_kj > 0),
+        a_ij = sum over p of e_j(p) w_i(p)
+
+    where w_i(p) is the weight with which Gaussian i is blended into pixel p (`attribute_pixels`).
+    Each view has the same mean score, so that HR and LR views count alike. The map e_j is one of
+
+    - `edges`: the absolute Laplacian of the photograph's brightness, over 3 x 3 pixels, brought to
+      0..1 by its smallest and largest value in the view;
+    - `errors`, ours: the absolute difference between the render and the photograph, averaged over
+      the channels.
+
+    Ours besides: the Laplacian's absolute value, where the image library of the authors cuts
+    negative values off, and the highest scores instead of a random choice by them.
+    """
+
+    def __init__(self, settings: ErrorScoreConf, views: Sequence[TrainingView], seed: int) -> None:
+        """Take the views and compute their edges.
+
+        Args:
+            settings: The component's settings.
+            views: All training views.
+            seed: The seed of the run.
+        """
+        super().__init__(views, settings.views, seed)
+        self.edges: dict[str, Tensor] | None = None
+        if settings.of == "edges":
+            self.edges = {view.name: _in_unit_range(edges(view.image)) for view in views}
+
+    @classmethod
+    def from_settings(cls, settings: ErrorScoreConf, setup: TrainingSetup) -> Self | None:
+        """Build the component; `of: nothing` leaves it off.
+
+        Raises:
+            XrgsError: `of` is unknown, or there are no views.
+        """
+        if settings.of not in ("nothing", "edges", "errors"):
+            raise XrgsError(
+                f"components.error_score.of={settings.of}: must be nothing, edges or errors"
+            )
+        if settings.views < 1:
+            raise XrgsError(f"components.error_score.views={settings.views}: must be at least 1")
+        return None if settings.of == "nothing" else cls(settings, setup.data.train, setup.seed)
+
+    def growth_scores(self, gaussians: Gaussians, step: Step) -> Tensor:
+        """Return the scores [N] by which Gaussians are ranked; their mean is about 1."""
+        return self.scores(gaussians, step)
+
+    def score_in_view(self, gaussians: Gaussians, step: Step) -> Tensor:
+        """Return the sums [N] over the view's map, relative to their mean where above 0."""
+        if self.edges is not None:
+            pixels = self.edges[step.view.name]
+        else:
+            pixels = _mean_error(self.renderer.photograph(gaussians, step), step.view.image)
+        # Bringing a render down weighs some pixels with less than 0.
+        sums = self.renderer.attribute(pixels, gaussians, step).clamp_min(0)
+        shown = sums > 0
+        mean = sums.sum(dtype=torch.float64) / shown.sum().clamp_min(1)
+        return sums / mean.clamp_min(torch.finfo(sums.dtype).tiny).to(sums)
+
+
+def edges(image: Tensor) -> Tensor:
+    """Return the absolute Laplacian of an image's brightness.
+
+    The brightness of a pixel is the sum of its channels; the Laplacian is 8 times it less its 8
+    neighbours'. The outermost pixels are repeated beyond the border.
+
+    Args:
+        image: [H, W, 3].
+
+    Returns:
+        [H, W], 0 and up.
+    """
+    height, width = image.shape[:2]
+    grey = image[..., 0] + image[..., 1] + image[..., 2]
+    wide = pad(grey[None, None], (1, 1, 1, 1), mode="replicate")[0, 0]
+    total = torch.zeros_like(grey)
+    for y in range(3):
+        for x in range(3):
+            total = total + wide[y : y + height, x : x + width]
+    return (9 * grey - total).abs()
+
+
+def _mean_error(image: Tensor, photograph: Tensor) -> Tensor:
+    """The mean over the channels [H, W] of the absolute difference of two images [H, W, 3]."""
+    error = (image - photograph).abs()
+    # Written out: the order in which torch adds depends on the processor.
+    return (error[..., 0] + error[..., 1] + error[..., 2]) / 3
+
+
+def _in_unit_range(values: Tensor) -> Tensor:
+    """Values brought to 0..1 by the smallest and the largest; all 0 where they are equal."""
+    low, high = values.min(), values.max()
+    return (values - low) / (high - low).clamp_min(torch.finfo(values.dtype).tiny)

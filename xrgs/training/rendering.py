@@ -1,0 +1,111 @@
+"""Renders training views as a step of training does."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import torch
+from torch import Tensor
+
+from xrgs.splat.attribution import attribute_pixels
+from xrgs.splat.rasterize import Render, rasterize_parameters
+
+if TYPE_CHECKING:
+    from xrgs.splat.cameras import Camera
+    from xrgs.splat.gaussians import Gaussians
+    from xrgs.splat.settings import RasterSettings
+    from xrgs.training.components import Components, Step
+    from xrgs.training.recorder import TrainingRecorder
+
+
+@dataclass(frozen=True)
+class StepRenderer:
+    """Renders any training view as the step that trains on it does, with all components.
+
+    Components that look at more views than the step's own get it before the first step
+    (`Component.before_training`). The alpha evaluations of what they render count as the run's.
+    """
+
+    components: Components
+    """The components of the run, whose `before_render`, `render_camera` and `to_photograph` make
+    the render of a view."""
+    raster: RasterSettings
+    """How Gaussians become pixels."""
+    sh_every: int
+    """Steps of this run after which one more band of the harmonics is on."""
+    backend: str
+    """`torch` or `native`."""
+    recorder: TrainingRecorder
+    """Counts the alpha evaluations."""
+
+    def sh_degree(self, step: Step) -> int:
+        """Return the highest band of the spherical harmonics that is on at a step."""
+        return min(step.number // self.sh_every, self.raster.sh_degree)
+
+    def render(
+        self, gaussians: Gaussians, step: Step, camera: Camera, means2d_offset: Tensor | None = None
+    ) -> Render:
+        """Render the step's view, differentiable in the Gaussians.
+
+        Args:
+            gaussians: The N Gaussians.
+            step: The step with the view to render.
+            camera: What the components' `render_camera` makes of the view's camera.
+            means2d_offset: [N, 2] as for `rasterize_parameters`.
+
+        Returns:
+            The render at the camera's size. Its evaluations have not been counted yet.
+        """
+        return rasterize_parameters(
+            *self.components.before_render(gaussians.activated(backend=self.backend), step),
+            camera,
+            self.raster,
+            sh_degree=self.sh_degree(step),
+            means2d_offset=means2d_offset,
+            backend=self.backend,
+        )
+
+    @torch.no_grad()
+    def photograph(self, gaussians: Gaussians, step: Step) -> Tensor:
+        """Render the step's view as it is compared with its photograph.
+
+        Args:
+            gaussians: The Gaussians.
+            step: The step with the view to render.
+
+        Returns:
+            [H, W, 3] at the photograph's size, not clamped to 0..1, without a graph.
+        """
+        camera = self.components.render_camera(step.view.camera, step)
+        render = self.render(gaussians, step, camera)
+        self.recorder.record_evaluations(render.evaluations)
+        return self.components.to_photograph(render.image, step)
+
+    @torch.no_grad()
+    def attribute(self, pixels: Tensor, gaussians: Gaussians, step: Step) -> Tensor:
+        """Sum a map of the view's photograph over what each Gaussian shows of it.
+
+        As `attribute_pixels`, where the weight of a Gaussian in a pixel of the photograph is what
+        `to_photograph` makes of its weights in the render. That is linear, so the map is brought to
+        the render's size by the transpose of it.
+
+        Args:
+            pixels: [H, W] the map, at the photograph's size.
+            gaussians: The N Gaussians.
+            step: The step with the view to render.
+
+        Returns:
+            Sums [N], in the unit of the map times px of the photograph.
+        """
+        camera = self.components.render_camera(step.view.camera, step)
+        with torch.enable_grad():
+            probe = pixels.new_zeros(camera.height, camera.width, 3).requires_grad_()
+            formed = self.components.to_photograph(probe, step)
+            (transposed,) = torch.autograd.grad((formed[..., 0] * pixels).sum(), probe)
+        activated = self.components.before_render(gaussians.activated(backend=self.backend), step)
+        found = attribute_pixels(
+            transposed[..., 0], activated, camera, self.raster, backend=self.backend
+        )
+        self.recorder.record_evaluations(found.evaluations)
+        return found.sums
