@@ -49,8 +49,8 @@ def record(data: Dataset, gaussians: Gaussians) -> Callable[..., None]:
     ) -> None:
         step = Step(number, of, data.train[number % 4], dict(log or {}))
         empty = torch.empty(0)
-        render = Render(empty, empty, empty, evaluations, buffer_bytes=0)
-        to.record_step(step, torch.tensor(number / 10), render, len(gaussians))
+        render = Render(empty, empty, empty, evaluations, 0, tile_evaluations=0)
+        to.record_step(step, torch.tensor(number / 10), render, gaussians, sh_degree=0)
 
     return recorded
 

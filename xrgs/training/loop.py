@@ -148,14 +148,17 @@ def _run_steps(run: _Run, checkpoint: Checkpoint, evaluate: Evaluate | None) -> 
                 image, target, l1=1 - ssim, ssim=ssim, pixel_weight=weights, backend=backend
             )
             loss = components.modify_loss(loss, image, gaussians, step)
+        recorder.lap("forward")
         # Backward, then the components' changes of the gradients.
         optimizer.zero_grad()
         torch.autograd.backward(loss)
         components.after_backward(gaussians, step)
+        recorder.lap("backward")
         # Optimise, and record the step while its gradients and buffers still exist.
         optimizer.step(camera, sh_degree=sh_degree)
+        recorder.lap("optimizer")
         run.memory.record(render)
-        recorder.record_step(step, loss, render, len(gaussians))
+        recorder.record_step(step, loss, render, gaussians, sh_degree)
         # Densify, prune and reset. There is no gradient where the render shows no Gaussian.
         grad2d, size = means2d_offset.grad, {"width": camera.width, "height": camera.height}
         if grad2d is not None:
