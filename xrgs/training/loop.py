@@ -211,6 +211,6 @@ def _set_up(data: Dataset, conf: Conf, extra_components: Iterable[Component]) ->
         components=components,
         densifier=densifier,
         sampler=EpochSampler(data.train, conf.seed, steps, components.allows_view),
-        recorder=TrainingRecorder(steps, splat.densify.grow_grad2d),
+        recorder=TrainingRecorder(steps, splat.densify.grow_grad2d, data.train),
         memory=TrainingMemory(optimizer, densifier, components, targets, data),
     )

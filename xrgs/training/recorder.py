@@ -12,14 +12,14 @@ from xrgs.splat.densify import Refinement
 from xrgs.training.work import StepWork
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping
+    from collections.abc import Callable, Iterable, Mapping
 
     import torch
 
     from xrgs.splat.gaussians import Gaussians
     from xrgs.splat.rasterize import Render
     from xrgs.training.checkpoint import State
-    from xrgs.training.components import Step
+    from xrgs.training.components import Step, TrainingView
 
 _HISTORY_ROWS = 200
 """A history has about as many rows, whatever the number of steps."""
@@ -62,12 +62,13 @@ class TrainingRecorder:
     Its clock starts when it is constructed.
     """
 
-    def __init__(self, steps: int, grow_grad2d: float) -> None:
+    def __init__(self, steps: int, grow_grad2d: float, views: Iterable[TrainingView]) -> None:
         """Start the clock, with an empty history.
 
         Args:
             steps: Number of steps of the whole run.
             grow_grad2d: The run's threshold of densification, for the result.
+            views: All training views, with the cameras of their photographs.
         """
         self.started = self.lap_started = time.perf_counter()
         self.grow_grad2d = grow_grad2d
@@ -78,7 +79,7 @@ class TrainingRecorder:
         self.history: list[dict[str, Any]] = []
         self.scores: list[dict[str, Any]] = []
         self.evaluations = 0
-        self.work = StepWork()
+        self.work = StepWork(views)
         self.stage_seconds: defaultdict[str, float] = defaultdict(float)
 
     def lap(self, stage: str) -> None:

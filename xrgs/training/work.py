@@ -8,10 +8,12 @@ from typing import TYPE_CHECKING
 from xrgs.splat.sh import bases
 
 if TYPE_CHECKING:
+    from collections.abc import Iterable
+
     from xrgs.splat.gaussians import Gaussians
     from xrgs.splat.rasterize import Render
     from xrgs.training.checkpoint import State
-    from xrgs.training.components import Step
+    from xrgs.training.components import Step, TrainingView
 
 
 class StepWork:
@@ -21,12 +23,18 @@ class StepWork:
     the number of visible Gaussians.
 
     Attributes:
+        photographs: Pixels of each view's photograph, by its name.
         counts: The totals of the steps.
         views: Names of the views that were trained on.
     """
 
-    def __init__(self) -> None:
-        """Start with nothing counted."""
+    def __init__(self, views: Iterable[TrainingView]) -> None:
+        """Start with nothing counted.
+
+        Args:
+            views: All training views, with the cameras of their photographs.
+        """
+        self.photographs = {v.name: v.camera.width * v.camera.height for v in views}
         self.counts: Counter[str] = Counter()
         self.views: set[str] = set()
 
@@ -40,7 +48,7 @@ class StepWork:
             sh_degree: Highest band of the spherical harmonics that was rendered.
         """
         visible, pixels = int(render.visible.count_nonzero()), render.alpha.numel()
-        photograph = step.view.camera.width * step.view.camera.height
+        photograph = self.photographs[step.view.name]
         stored = gaussians.shN.shape[1] + 1
         self.views.add(step.view.name)
         self.counts.update(
