@@ -196,14 +196,13 @@ def quality_curves(
         for panel, amount in zip(row, ("seconds", "evaluations"), strict=True):
             lines |= _quality_panel(panel, scenes, means, amount, metric.name)
         row[0].set_ylabel(f"{metric.label}{metric.unit and f', {metric.unit}'}")
-        if not metric.higher_is_better:
-            row[0].invert_yaxis()
+        _leave_out_the_start(row[0], scenes, metric)
     for panel, name in zip(panels[-1], ("training time, s", "alpha evaluations"), strict=True):
         panel.set_xlabel(name)
         panel.set_xlim(left=0)
     panels[-1][1].xaxis.set_major_formatter(EngFormatter(sep=" "))
     names = [for_line(label, _MAX_NAME) for label in lines]
-    figure.legend(lines.values(), names, loc="outside right upper", frameon=False, fontsize=9)
+    figure.legend(lines.values(), names, loc="outside right center", frameon=False, fontsize=9)
     return _png(figure)
 
 
@@ -221,13 +220,27 @@ def _quality_panel(
     lines = {}
     for label, (color, mark) in zip(labels, _ARMS, strict=False):
         curve = means[means["label"] == label]
-        look = {"color": color, "marker": mark, "markersize": 4.5, "linewidth": 2.0}
-        (lines[label],) = axis.plot(curve[amount], curve[quality], **look)
+        (lines[label],) = axis.plot(curve[amount], curve[quality], color=color, linewidth=1.8)
+        # A few marks, at other evaluations for each label.
+        every = max(1, len(curve) // 6)
+        lines[label].set(marker=mark, markersize=5, markevery=(len(lines) % every, every))
         if label == labels[0] and len(curve):
             axis.axhline(curve[quality].iloc[-1], color=color, linewidth=1.3, linestyle="--")
     axis.grid(alpha=0.3)
     axis.spines[["top", "right"]].set_visible(False)
     return lines
+
+
+def _leave_out_the_start(axis: Axes, scenes: pd.DataFrame, metric: Metric) -> None:
+    """Let better be up, and begin the axis at the worst value after a quarter of a curve."""
+    curves = scenes.groupby(["label", "scene"])[metric.name]
+    later = scenes.loc[curves.cumcount() >= curves.transform("size") // 4, metric.name]
+    worst, best = later[np.isfinite(later)].agg(["min", "max"])
+    if worst < best:
+        margin = 0.05 * (best - worst)
+        axis.set_ylim(worst - margin, best + margin)
+    if not metric.higher_is_better:
+        axis.invert_yaxis()
 
 
 @_default_style()
@@ -261,7 +274,7 @@ def trade_off(
             panel.invert_yaxis()
     most = int(means["scenes"].max())
     names = "\n".join(
-        f"{at} {for_line(label, _MAX_NAME)}" + f" ({of} of {most} scenes)" * bool(of < most)
+        f"{at} {for_line(str(label), _MAX_NAME)}" + f" ({of} of {most} scenes)" * bool(of < most)
         for at, (label, of) in enumerate(means["scenes"].items())
     )
     panels[-1].annotate(names, (1.04, 1), xycoords="axes fraction", va="top", fontsize=8)
@@ -285,7 +298,7 @@ def _dots(axis: Axes, means: pd.DataFrame, scenes: pd.DataFrame, quality: str) -
     for at, (spot, color) in enumerate(
         zip(means[["gaussians", quality]].to_numpy(), colors, strict=False)
     ):
-        axis.scatter(*spot, s=110, color=color, zorder=3)
+        axis.plot(*spot, color=color, marker="o", markersize=10.5, zorder=3)
         axis.annotate(
             str(at), tuple(spot), ha="center", va="center", color="white", fontsize=7, zorder=4
         )
