@@ -16,8 +16,7 @@ import pandas as pd
 from xrgs.errors import StoreError
 from xrgs.evaluation.metrics import VIEW_METRICS
 from xrgs.experiment.store import BASELINE
-from xrgs.report.render import TextTable
-from xrgs.report.tables import titled
+from xrgs.report.render import TextTable, titled
 from xrgs.safeio.records import as_number, read_table
 
 if TYPE_CHECKING:

@@ -24,7 +24,7 @@ from xrgs.report.figures import (
     side_by_side,
     trade_off,
 )
-from xrgs.report.tables import titled
+from xrgs.report.render import titled
 from xrgs.runtime.progress import progress
 from xrgs.safeio.atomic import atomic_writer
 from xrgs.safeio.words import for_file_name

@@ -12,8 +12,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import pandas as pd
 
 from xrgs.experiment.store import BASELINE
-from xrgs.report.render import TextTable
-from xrgs.report.tables import titled
+from xrgs.report.render import TextTable, titled
 from xrgs.safeio.records import as_number
 
 if TYPE_CHECKING:
