@@ -230,6 +230,8 @@ def _texts(row: pd.Series) -> tuple[str, str]:
 
 def _short(value: float) -> str:
     """Write a number with the prefix of the SI for thousands, millions and so on."""
+    if not math.isfinite(value):
+        return _UNKNOWN
     size = min(4, int(math.log10(value)) // 3) if value >= 1000 else 0
     return f"{value / 1000**size:,.4g} {('', 'k', 'M', 'G', 'T')[size]}".rstrip()
 
