@@ -147,7 +147,12 @@ def _write_cell(store: Store, conf: Conf, variant_id: str, made_with: dict[str, 
     (cell.path / "history.csv").write_text("\n".join([columns, *steps]) + "\n")
     scores = [f"{view},{20.5 + conf.seed},0.8,0.25" for view in TESTS]
     (cell.path / "scores.csv").write_text("\n".join(["view,psnr,ssim,lpips", *scores]) + "\n")
-    summary = {"training_time_s": 9.5, "gaussians": 20, "memory_bytes": 2**20, "steps": 60}
+    summary: dict[str, Any] = {
+        "training_time_s": 9.5,
+        "gaussians": 20,
+        "memory_bytes": 2**20,
+        "steps": 60,
+    }
     summary |= {"peak_rss_bytes": 2**28, "evaluations": 10**6, "grow_grad2d": 0.0002}
     summary |= {"work": _WORK, "stage_seconds": {"forward": 5, "backward": 3, "optimizer": 1}}
     (cell.path / "summary.json").write_text(json.dumps(summary))
