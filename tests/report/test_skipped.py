@@ -103,7 +103,7 @@ def test_the_table_has_what_some_run_left_out(made: Any) -> None:
     )
     number, cost = texts["Gaussians out of view or transparent, of all steps"]
     assert number[0] == "250 (25.0%)"
-    assert cost[0] == "10 G (10 times)"
+    assert cost[0] == "10 G (10.0 times)"
     assert texts["Harmonics of visible Gaussians in bands that were not on"][1][0] == "unknown"
 
 

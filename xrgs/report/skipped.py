@@ -237,4 +237,6 @@ def _short(value: float) -> str:
 
 
 def _share(value: float) -> str:
-    return f"{value:.1%}" if value < 1 else f"{value:,.3g} times"
+    if value < 1:
+        return f"{value:.1%}"
+    return f"{value:,.1f} times" if value < 100 else f"{value:,.0f} times"
