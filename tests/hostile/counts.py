@@ -41,6 +41,30 @@ def _summary(value: str, store: Path) -> list[Look]:
     return all_looks(store, done=None, planned=False)
 
 
+def _totals(value: str, store: Path) -> list[Look]:
+    cell = cell_of(store)
+    file, mark = cell / "summary.json", "\0the value\0"
+    for key in ("work", "stage_seconds"):
+        edit(file, lambda d, key=key: d.update({key: dict.fromkeys(d[key], mark)}))  # type: ignore[misc]
+    file.write_text(file.read_text().replace(json.dumps(mark), value))
+    seal(cell)
+    return [report(store), status(store)]
+
+
+def _work(value: str, store: Path) -> list[Look]:
+    cell = cell_of(store)
+    _with_json(cell / "summary.json", ("work", "stage_seconds"), value)
+    seal(cell)
+    return [report(store), status(store)]
+
+
+def _quality(value: str, store: Path) -> list[Look]:
+    cell = cell_of(store)
+    replace_column(cell / "quality.csv", value, range(7))
+    seal(cell)
+    return [report(store, drawn=True), status(store)]
+
+
 def _scores(value: str, store: Path) -> list[Look]:
     cell = cell_of(store)
     replace_column(cell / "scores.csv", value, range(1, 9))
@@ -143,6 +167,9 @@ CASES: Mapping[str, Maker] = {
         for value in values
     },
     **{f"summary {v:.10}": partial(_summary, v) for v in (*_JSON_NUMBERS, *_OTHER_TYPES)},
+    **{f"totals {v:.10}": partial(_totals, v) for v in (*_JSON_NUMBERS, *_OTHER_TYPES)},
+    **{f"work {v:.10}": partial(_work, v) for v in _OTHER_TYPES},
+    **{f"quality {value}": partial(_quality, value) for value in _CSV_NUMBERS},
     **{f"scores {value}": partial(_scores, value) for value in _CSV_NUMBERS},
     **_HISTORIES,
     "history steps 1e308": partial(_history, "1e308", (0,)),

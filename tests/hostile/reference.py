@@ -118,6 +118,22 @@ def _write_variant(variants: Path, conf: Conf) -> str:
     return seal_variant(folder).name
 
 
+#: The totals of a cell's steps.
+_WORK = {
+    "views": 3,
+    "gaussians": 1200,
+    "gaussians_visible": 1000,
+    "pixels": 9000,
+    "pixels_photograph": 10_000,
+    "pixels_left_out": 1000,
+    "pairs": 10**8,
+    "pairs_visible": 10**7,
+    "pairs_in_tiles": 2 * 10**6,
+    "sh_coefficients": 16_000,
+    "sh_coefficients_left_out": 4000,
+}
+
+
 def _write_cell(store: Store, conf: Conf, variant_id: str, made_with: dict[str, Any]) -> str:
     identity = cell_identity(conf, variant_id)
     cell = store.cell(digest(identity))
@@ -131,9 +147,18 @@ def _write_cell(store: Store, conf: Conf, variant_id: str, made_with: dict[str, 
     (cell.path / "history.csv").write_text("\n".join([columns, *steps]) + "\n")
     scores = [f"{view},{20.5 + conf.seed},0.8,0.25" for view in TESTS]
     (cell.path / "scores.csv").write_text("\n".join(["view,psnr,ssim,lpips", *scores]) + "\n")
-    summary = {"training_time_s": 9.5, "gaussians": 20, "memory_bytes": 2**20, "steps": 60}
+    summary: dict[str, Any] = {
+        "training_time_s": 9.5,
+        "gaussians": 20,
+        "memory_bytes": 2**20,
+        "steps": 60,
+    }
     summary |= {"peak_rss_bytes": 2**28, "evaluations": 10**6, "grow_grad2d": 0.0002}
+    summary |= {"work": _WORK, "stage_seconds": {"forward": 5, "backward": 3, "optimizer": 1}}
     (cell.path / "summary.json").write_text(json.dumps(summary))
+    quality = [f"{step},{step},{9000 * step},20,0.5,0.7,{step / 4}" for step in range(10, 60, 10)]
+    columns = "step,seconds,evaluations,gaussians,lpips,ssim,psnr"
+    (cell.path / "quality.csv").write_text("\n".join([columns, *quality]) + "\n")
     (cell.path / "log.txt").write_text("a line of the log\n")
     (cell.path / "renders").mkdir()
     for number, view in enumerate(TESTS):

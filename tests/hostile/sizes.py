@@ -21,6 +21,13 @@ def grow(file: Path, size: int = _SIZE) -> None:
         os.truncate(file, size)
 
 
+#: The files of a cell that are verified by their hash.
+_HASHED = (
+    *("scores.csv", "history.csv", "quality.csv"),
+    *("summary.json", "identity.json", "config.json"),
+)
+
+
 def _cell_file(name: str, store: Path) -> list[Look]:
     cell = cell_of(store)
     grow(cell / name)
@@ -32,7 +39,7 @@ def _declared(name: str, store: Path) -> list[Look]:
     cell = cell_of(store)
     grow(cell / name)
     edit(cell / "status.json", lambda d: d["files"][name].update(bytes=_SIZE))
-    hashed = name in {"scores.csv", "history.csv", "summary.json", "identity.json", "config.json"}
+    hashed = name in _HASHED
     named, done = (name, 3) if hashed else ("", None)
     verified = status(store, named, done=done, verify=True)
     verified = replace(verified, succeeds=False, hashed_gb=_SIZE / 1e9)
@@ -132,7 +139,7 @@ def _identity_of_many(store: Path) -> list[Look]:
 
 
 _LISTED = (
-    *("scores.csv", "history.csv", "summary.json", "identity.json", "config.json"),
+    *_HASHED,
     *("provenance.json", "splats.ply", "renders/view_1.png"),
 )
 CASES: Mapping[str, Maker] = {

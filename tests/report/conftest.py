@@ -51,8 +51,13 @@ class MadeStore:
         cpu: str = "a processor",
         arithmetic: str | None = None,
         history: str = HISTORY,
+        quality: str | None = None,
+        summary: dict[str, Any] | None = None,
     ) -> CellFolder:
-        """One cell: the made-up baseline's values times `factors`, or `values` outright."""
+        """One cell: the made-up baseline's values times `factors`, or `values` outright.
+
+        `summary` has more entries of its summary, `quality` the scores during training.
+        """
         cell_id = f"cell{len(self.rows):05d}"
         variant = variant or f"variant-of-{len(scene)}-{scene[:3]}".replace("/", "_")
         found = SUMMARY | SCORES | (values or {})
@@ -82,8 +87,10 @@ class MadeStore:
         if state == "failed":
             folder.fail("RuntimeError: out of luck")
             return folder
-        self._fill(folder, found, cpu, arithmetic)
+        self._fill(folder, found | (summary or {}), cpu, arithmetic)
         (folder.path / "history.csv").write_text(history)
+        if quality is not None:
+            (folder.path / "quality.csv").write_text(quality)
         if pictures:
             split = "train" if validation else "test"
             self._draw(folder, f"{variant}/images/{split}", noise=0.02 * len(self.rows))
@@ -105,7 +112,7 @@ class MadeStore:
 
     @staticmethod
     def _fill(folder: CellFolder, found: dict[str, Any], cpu: str, arithmetic: str | None) -> None:
-        summary = {key: found[key] for key in SUMMARY}
+        summary = {key: value for key, value in found.items() if key not in SCORES}
         (folder.path / "summary.json").write_text(json.dumps(summary))
         provenance = {"cpu": cpu, "threads": 2, "backend": "torch", "started": str(folder.path)}
         provenance |= {} if arithmetic is None else {"arithmetic": arithmetic}

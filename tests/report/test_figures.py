@@ -9,7 +9,15 @@ import pytest
 from PIL import Image
 
 from xrgs.evaluation.metrics import Metric
-from xrgs.report.figures import Panel, curves, differing_crop, side_by_side, trade_off
+from xrgs.report.figures import (
+    MAX_ARMS,
+    Panel,
+    curves,
+    differing_crop,
+    quality_curves,
+    side_by_side,
+    trade_off,
+)
 from xrgs.report.pictures import median_view
 
 RNG = np.random.default_rng(0)
@@ -78,6 +86,14 @@ def test_curves_are_drawn_for_both_runs() -> None:
 ORANGE, BLUE = (0xD5, 0x5E, 0x00), (0x00, 0x72, 0xB2)
 
 
+def traded(name: str, gaussians: list[float], quality: list[float]) -> tuple[pd.DataFrame, ...]:
+    """Means and scenes of the baseline and of an ablation, two scenes each."""
+    labels = ["baseline"] * 2 + [name] * 2
+    scenes = pd.DataFrame({"gaussians": gaussians, "q": quality}, index=labels)
+    means = scenes.groupby(level=0, sort=False).mean().assign(scenes=2)
+    return means, scenes.assign(scene=["fern", "horns"] * 2)
+
+
 @pytest.mark.parametrize("higher_is_better", [True, False])
 @pytest.mark.parametrize("better", [True, False])
 def test_a_trade_off_has_the_better_up_and_the_smaller_left(
@@ -85,8 +101,9 @@ def test_a_trade_off_has_the_better_up_and_the_smaller_left(
 ) -> None:
     quality = Metric("q", "quality", "dB", higher_is_better=higher_is_better)
     change = 2.0 if better == higher_is_better else -2.0
-    means = pd.DataFrame({"gaussians": [0.5], "q": [change]}, index=["_odd $"])
-    scenes = pd.DataFrame({"gaussians": [0.4, 0.6], "q": [0.0, 2 * change]}, index=["_odd $"] * 2)
+    means, scenes = traded(
+        "_odd $", [9e4, 11e4, 5e4, 6e4], [20.0, 24.0, 20.0 + change, 24.0 + 1.5 * change]
+    )
     png = trade_off("t", means, scenes, [quality])
     assert png == trade_off("t", means, scenes, [quality])
     shown = picture(png)
@@ -95,6 +112,56 @@ def test_a_trade_off_has_the_better_up_and_the_smaller_left(
     crossing = [np.bincount(lines[:, axis]).argmax() for axis in (0, 1)]
     assert (dot[0] < crossing[0]) == better
     assert dot[1] < crossing[1]
+
+
+def test_a_trade_off_of_many_has_one_colour_and_all_numbers() -> None:
+    labels = ["baseline", *(f"arm {number}" for number in range(30))]
+    scenes = pd.DataFrame({"gaussians": np.arange(1.0, 32), "q": np.arange(1.0, 32)}, index=labels)
+    metric = Metric("q", "quality", "", higher_is_better=True)
+    shown = picture(trade_off("t", scenes.assign(scenes=1), scenes.assign(scene="fern"), [metric]))
+    assert (shown == ORANGE).all(axis=2).sum() > 30 * 50
+    assert not (shown == (0x00, 0x9E, 0x73)).all(axis=2).any()  # the third colour of few labels
+
+
+METRICS = [
+    Metric("psnr", "PSNR", "dB", higher_is_better=True),
+    Metric("lpips", "LPIPS", "", higher_is_better=False),
+]
+
+
+def trained(label: str, scene: str, psnr: list[float]) -> pd.DataFrame:
+    amount = np.arange(1.0, len(psnr) + 1)
+    return pd.DataFrame(
+        {"label": label, "scene": scene, "seconds": amount, "evaluations": 1e9 * amount}
+        | {"psnr": psnr, "lpips": [1 - value / 40 for value in psnr]}
+    )
+
+
+def test_quality_curves_have_a_level_where_the_baseline_ends() -> None:
+    scenes = pd.concat(
+        [trained("baseline", "fern", [10, 16, 20]), trained("_odd $", "fern", [14, 22, 26])]
+    )
+    png = quality_curves("t", scenes, scenes.drop(columns="scene"), METRICS)
+    assert png == quality_curves("t", scenes, scenes.drop(columns="scene"), METRICS)
+    shown = picture(png)
+    panels = [half for part in np.array_split(shown, 2) for half in np.array_split(part, 2, axis=1)]
+    for panel in panels[0], panels[2]:  # against time: PSNR, and LPIPS, which is inverted
+        blue = (panel == BLUE).all(axis=2)
+        orange = np.argwhere((panel == ORANGE).all(axis=2))
+        level = np.bincount(np.argwhere(blue)[:, 0]).argmax()
+        assert blue[level].sum() > panel.shape[1] / 3
+        assert orange[:, 0].min() < level - 20, "the ablation ends above it"
+        assert orange[:, 0].max() > level + 20, "and begins below it"
+
+
+def test_quality_curves_tell_eight_labels_apart() -> None:
+    labels = ["baseline", *(f"arm {number}" for number in range(1, MAX_ARMS))]
+    scenes = pd.concat(
+        [trained(name, "fern", [10 + n, 15 + n, 18 + n]) for n, name in enumerate(labels)]
+    )
+    shown = picture(quality_curves("t", scenes, scenes.drop(columns="scene"), METRICS))
+    _, counts = np.unique(shown.reshape(-1, 3), axis=0, return_counts=True)
+    assert (counts > 1000).sum() >= MAX_ARMS + 1  # and white
 
 
 def test_the_view_shown_is_neither_the_best_nor_the_worst() -> None:
@@ -117,12 +184,14 @@ ODD_NAMES = {
 @pytest.mark.parametrize("name", ODD_NAMES.values(), ids=ODD_NAMES)
 def test_any_name_is_drawn_without_a_warning(name: str) -> None:
     history = pd.DataFrame({"step": [0, 1], "loss": [1.0, 0.5], "gaussians": [1, 2]})
-    means = pd.DataFrame({"gaussians": [0.5, 2.0], "psnr": [0.1, -0.1]}, index=[name, "other"])
-    metric = Metric("psnr", "PSNR", "dB", higher_is_better=True)
+    means, scenes = traded(name, [1e5, 2e5, 1e5, 3e5], [20.0, 21.0, 22.0, 23.0])
+    metric = Metric("q", "PSNR", "dB", higher_is_better=True)
+    runs = pd.concat([trained("baseline", name, [1, 2]), trained(name, name, [2, 3])])
     crop = differing_crop(PICTURE, 1 - PICTURE)
     for png in (
         side_by_side(name, [Panel(PICTURE, name, name)] * 3, crop, name),
         curves(name, [(name, history), (name, history)], {"loss": "loss", "gaussians": "x"}),
-        trade_off(name, means, means, [metric]),
+        trade_off(name, means, scenes, [metric]),
+        quality_curves(name, runs, runs.drop(columns="scene"), METRICS),
     ):
         assert picture(png).std() > 0

@@ -112,9 +112,10 @@ def test_several_ablations_have_a_picture_of_what_they_trade(
     assert "trade-off.png" in names
     for _, means, scenes, axes in drawn:
         assert [axis.name for axis in axes] == ["ssim", "psnr"]  # LPIPS was not measured
-        assert means.loc["densify", "gaussians"] == scenes.loc["densify", "gaussians"] == 2
-        assert means.loc["mip", "psnr"] == pytest.approx(2.0)  # dB: a tenth of the baseline's 20
-        assert means.loc["densify", "psnr"] == 0
+        assert list(means.index) == ["baseline", "densify", "mip"]
+        assert means.loc["densify", "gaussians"] == scenes.loc["densify", "gaussians"] == 10_000
+        assert means.loc["mip", "psnr"] == pytest.approx(22.0)
+        assert means.loc["densify", "psnr"] == pytest.approx(20.0)
     page = (report.folder / "table.md").read_text()
     assert all(f"figures/{name}" in page for name in names)
 

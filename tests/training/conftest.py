@@ -21,7 +21,7 @@ def _comparable(result: TrainingResult) -> dict[str, Any]:
     parameters = {name: result.gaussians[name].detach().numpy().tobytes() for name in PARAMETERS}
     others = {name: value for name, value in vars(result).items() if name != "gaussians"}
     columns = [list(row) for row in result.history]
-    return parameters | others | {"seconds": None, "columns": columns}
+    return parameters | others | {"seconds": None, "stage_seconds": None, "columns": columns}
 
 
 @pytest.fixture(scope="session")

@@ -91,7 +91,7 @@ class CheckpointEveryFewSteps(Checkpoint):
 
     def save_if_due(self, step: int) -> float:
         states = {name: value.state_dict() for name, value in self._objects.items()}
-        del states["recorder"]["seconds"]
+        del states["recorder"]["seconds"], states["recorder"]["stage_seconds"]
         attempt = len(states.get("search", {}).get("tried", ()))
         state = digest_of(states)
         assert self.losses.states.setdefault((attempt, step), state) == state

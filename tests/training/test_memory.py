@@ -25,7 +25,7 @@ class Holder:
 
 def render(buffer_bytes: int) -> Render:
     empty = torch.empty(0)
-    return Render(empty, empty, empty, 0, buffer_bytes)
+    return Render(empty, empty, empty, 0, buffer_bytes, 0)
 
 
 def step(data: Dataset, view: int = 0) -> Step:

@@ -49,8 +49,8 @@ def record(data: Dataset, gaussians: Gaussians) -> Callable[..., None]:
     ) -> None:
         step = Step(number, of, data.train[number % 4], dict(log or {}))
         empty = torch.empty(0)
-        render = Render(empty, empty, empty, evaluations, buffer_bytes=0)
-        to.record_step(step, torch.tensor(number / 10), render, len(gaussians))
+        render = Render(empty, empty, empty, evaluations, 0, tile_evaluations=0)
+        to.record_step(step, torch.tensor(number / 10), render, gaussians, sh_degree=0)
 
     return recorded
 
@@ -65,9 +65,13 @@ def record(data: Dataset, gaussians: Gaussians) -> Callable[..., None]:
     ],
 )
 def test_there_are_about_200_rows_and_one_of_the_last_step(
-    steps: int, expected: list[int], record: Callable[..., None], gaussians: Gaussians
+    steps: int,
+    expected: list[int],
+    record: Callable[..., None],
+    data: Dataset,
+    gaussians: Gaussians,
 ) -> None:
-    training = TrainingRecorder(steps, 2e-4)
+    training = TrainingRecorder(steps, 2e-4, data.train)
     for number in range(steps):
         record(training, number, steps)
     history = training.finish(gaussians, memory_bytes=0).history
@@ -77,8 +81,10 @@ def test_there_are_about_200_rows_and_one_of_the_last_step(
     assert {row["gaussians"] for row in history} == {60}
 
 
-def test_every_row_has_every_column(record: Callable[..., None], gaussians: Gaussians) -> None:
-    training = TrainingRecorder(3, 2e-4)
+def test_every_row_has_every_column(
+    record: Callable[..., None], data: Dataset, gaussians: Gaussians
+) -> None:
+    training = TrainingRecorder(3, 2e-4, data.train)
     record(training, 0, 3)
     training.record_refinement(Refinement(duplicated=2, by_group={"grown_HR": 1}))
     record(training, 1, 3, {"mip.filter": 3.0})
@@ -92,17 +98,17 @@ def test_every_row_has_every_column(record: Callable[..., None], gaussians: Gaus
 
 
 def test_a_row_has_the_mean_of_what_was_logged_since_the_row_before(
-    record: Callable[..., None], gaussians: Gaussians
+    record: Callable[..., None], data: Dataset, gaussians: Gaussians
 ) -> None:
-    training = TrainingRecorder(800, 2e-4)  # a row every 4 steps
+    training = TrainingRecorder(800, 2e-4, data.train)  # a row every 4 steps
     for number in range(9):
         record(training, number, 800, {"a": number} if number not in {2, 3} else None)
     history = training.finish(gaussians, memory_bytes=0).history
     assert [row["a"] for row in history] == [0, (1 + 4) / 2, (5 + 6 + 7 + 8) / 4]
 
 
-def test_work_is_summed(record: Callable[..., None], gaussians: Gaussians) -> None:
-    training = TrainingRecorder(3, 2e-4)
+def test_work_is_summed(record: Callable[..., None], data: Dataset, gaussians: Gaussians) -> None:
+    training = TrainingRecorder(3, 2e-4, data.train)
     for number in range(3):
         record(training, number, 3, evaluations=number + 1)
     result = training.finish(gaussians, memory_bytes=7)
@@ -111,24 +117,32 @@ def test_work_is_summed(record: Callable[..., None], gaussians: Gaussians) -> No
 
 
 def test_only_training_time_counts_and_a_restored_recorder_adds_to_it(
-    monkeypatch: pytest.MonkeyPatch, record: Callable[..., None], gaussians: Gaussians
+    monkeypatch: pytest.MonkeyPatch,
+    record: Callable[..., None],
+    data: Dataset,
+    gaussians: Gaussians,
 ) -> None:
     now = 50.0
     monkeypatch.setattr(recorder, "time", SimpleNamespace(perf_counter=lambda: now))
-    first = TrainingRecorder(2, 3e-4)
+    first = TrainingRecorder(2, 3e-4, data.train)
+    now += 2
+    first.lap("forward")
     record(first, 0, 2, {"a": 1.0}, evaluations=5)
+    now += 5
     first.record_refinement(Refinement(split=4))
-    now += 10
+    now += 3
     first.exclude_time(3.0)
     state = first.state_dict()
     now += 1000
-    second = TrainingRecorder(2, 3e-4)
+    second = TrainingRecorder(2, 3e-4, data.train)
     now += 1
     second.load_state_dict(state)
     now += 20
+    second.lap("forward")
     record(second, 1, 2, evaluations=6)
     result = second.finish(gaussians, memory_bytes=0)
-    assert result.seconds == 10 - 3 + 20
+    assert result.seconds == 2 + 5 + 20
+    assert result.stage_seconds == {"forward": 2 + 20, "densification": 5}
     assert result.evaluations == 11
     assert result.grow_grad2d == 3e-4
     assert [row["step"] for row in result.history] == [0, 1]

@@ -81,6 +81,8 @@ def _train_and_score(conf: Conf, variant: Variant, folder: CellFolder) -> list[s
             "evaluations": trained.evaluations,
             "steps": conf.train.steps,
             "grow_grad2d": trained.grow_grad2d,
+            "work": trained.work,
+            "stage_seconds": trained.stage_seconds,
         },
         durable=False,
     )

@@ -41,7 +41,7 @@ if TYPE_CHECKING:
 
 #: Reports are made from these files, so they are verified by their hash; others by their size.
 _VERIFIED_BY_HASH = frozenset(
-    {"config.json", "identity.json", "scores.csv", "summary.json", "history.csv"}
+    {"config.json", "identity.json", "scores.csv", "summary.json", "history.csv", "quality.csv"}
 )
 _CHECKPOINT = "checkpoint.npz"
 _PROGRESS = "progress.json"

@@ -14,6 +14,8 @@ import pandas as pd
 from xrgs.errors import StoreError, XrgsError
 from xrgs.experiment.cell_folder import READING_ERRORS, CellState
 from xrgs.experiment.results import validation_share
+from xrgs.report.curves import cell_curve
+from xrgs.report.skipped import cell_work
 from xrgs.report.training import cell_totals
 from xrgs.runtime.progress import progress
 from xrgs.safeio.records import as_number
@@ -60,6 +62,10 @@ class Sweep:
     """One row for each cell and scored view: `cell_id`, `view` and the scores."""
     training: dict[str, dict[str, float]]
     """What training did in each done cell, by its id: `xrgs.report.training.cell_totals`."""
+    curves: dict[str, list[dict[str, float]]]
+    """Quality during training of each done cell, by its id: `xrgs.report.curves.cell_curve`."""
+    work: dict[str, dict[str, float]]
+    """What each done cell did in all, by its id: `xrgs.report.skipped.cell_work`."""
     provenance: dict[str, list[str]]
     """Provenance of the done cells: the distinct values of each entry, sorted."""
 
@@ -96,6 +102,8 @@ def read_sweep(store: Store, sweep_id: str, metrics: Sequence[Metric]) -> Sweep:
         cells=_cells(sweep_id, entries, columns, _cell_means(views), metrics),
         views=views,
         training={cell_id: cell.training for cell_id, cell in cells.items()},
+        work={cell_id: cell.work for cell_id, cell in cells.items()},
+        curves={cell_id: cell.curve for cell_id, cell in cells.items()},
         provenance={key: sorted(values) for key, values in sorted(provenance.items())},
     )
 
@@ -117,6 +125,8 @@ class _CellContent:
     scores: list[dict[str, Any]] = field(default_factory=list)
     """Rows of `Sweep.views`."""
     training: dict[str, float] = field(default_factory=dict)
+    curve: list[dict[str, float]] = field(default_factory=list)
+    work: dict[str, float] = field(default_factory=dict)
     provenance: dict[str, Any] = field(default_factory=dict)
 
 
@@ -125,10 +135,13 @@ def _read_cell(cell: CellFolder, metrics: Sequence[Metric]) -> _CellContent:
     state = cell.state()
     if state.name == "done":
         try:
+            training = cell_totals(cell)
             return _CellContent(
                 _done_columns(cell, metrics),
                 _scores(cell, metrics),
-                cell_totals(cell),
+                training,
+                cell_curve(cell),
+                cell_work(cell, training),
                 cell.provenance(),
             )
         except READING_ERRORS as error:

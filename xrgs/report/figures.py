@@ -1,4 +1,4 @@
-"""Draws a comparison: renders side by side, training curves, number of Gaussians against quality.
+"""Draws a comparison: renders side by side, curves, number of Gaussians against quality.
 
 The same inputs give the same bytes: matplotlib's own style is used whatever the user's is, and no
 date or version is written. pyplot is not used, since it keeps figures in memory.
@@ -15,7 +15,7 @@ import numpy as np
 from matplotlib import style
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
-from matplotlib.ticker import StrMethodFormatter
+from matplotlib.ticker import EngFormatter, LogLocator, NullLocator
 
 from xrgs.safeio.words import MAX_CELL, for_line
 
@@ -24,6 +24,7 @@ if TYPE_CHECKING:
 
     import pandas as pd
     from matplotlib.axes import Axes
+    from matplotlib.lines import Line2D
     from numpy.typing import NDArray
 
     from xrgs.evaluation.metrics import Metric
@@ -32,6 +33,20 @@ if TYPE_CHECKING:
 
 #: Okabe and Ito's orange and blue, which colour-blind readers can distinguish, also in grey.
 _ABLATION, _BASELINE, _FRAME = "#D55E00", "#0072B2", "#FFD400"
+#: Colour and mark of the baseline, and of up to seven ablations: more of Okabe and Ito's colours,
+#: without their yellow, which is faint on white.
+_ARMS = (
+    (_BASELINE, "o"),
+    (_ABLATION, "s"),
+    ("#009E73", "^"),
+    ("#CC79A7", "D"),
+    ("#E69F00", "v"),
+    ("#56B4E9", "P"),
+    ("#000000", "X"),
+    ("#777777", "*"),
+)
+MAX_ARMS = len(_ARMS)
+"""The most labels that one figure of curves can tell apart."""
 _DPI = 130
 _PANEL = 3.4  # inches
 _ZOOM = 5
@@ -154,19 +169,95 @@ def curves(
 
 
 @_default_style()
+def quality_curves(
+    title: str, scenes: pd.DataFrame, means: pd.DataFrame, axes: Sequence[Metric]
+) -> bytes:
+    """Draw quality during training against time and against alpha evaluations.
+
+    Better is up. Each label has a colour: a thick line with marks is its mean over scenes, thin
+    ones are its scenes. Horizontal lines are where the baseline ends.
+
+    Args:
+        title: The title of the figure.
+        scenes: One row for each label, scene and evaluation: `label`, `scene`, `seconds`,
+            `evaluations`, and a column for each of `axes`. The first label is the baseline; there
+            are at most `MAX_ARMS`.
+        means: The means over scenes, with the same columns but `scene`.
+        axes: The scores to draw, a row of panels each.
+
+    Returns:
+        The bytes of a PNG.
+    """
+    figure = _figure(_PANEL * 3 + 2.2, _PANEL * len(axes) + 0.6)
+    figure.suptitle(for_line(title, MAX_CELL), fontsize=11)
+    panels = figure.subplots(len(axes), 2, squeeze=False, sharey="row", sharex="col")
+    lines: dict[str, Line2D] = {}
+    for row, metric in zip(panels, axes, strict=True):
+        for panel, amount in zip(row, ("seconds", "evaluations"), strict=True):
+            lines |= _quality_panel(panel, scenes, means, amount, metric.name)
+        row[0].set_ylabel(f"{metric.label}{metric.unit and f', {metric.unit}'}")
+        _leave_out_the_start(row[0], scenes, metric)
+    for panel, name in zip(panels[-1], ("training time, s", "alpha evaluations"), strict=True):
+        panel.set_xlabel(name)
+        panel.set_xlim(left=0)
+    panels[-1][1].xaxis.set_major_formatter(EngFormatter(sep=" "))
+    names = [for_line(label, _MAX_NAME) for label in lines]
+    figure.legend(lines.values(), names, loc="outside right center", frameon=False, fontsize=9)
+    return _png(figure)
+
+
+def _quality_panel(
+    axis: Axes, scenes: pd.DataFrame, means: pd.DataFrame, amount: str, quality: str
+) -> dict[str, Line2D]:
+    """Draw one panel of curves; returns a line for each label."""
+    labels = list(dict.fromkeys(scenes["label"]))
+    for label, (color, _) in zip(labels, _ARMS, strict=False):
+        for _, curve in scenes[scenes["label"] == label].groupby("scene"):
+            axis.plot(curve[amount], curve[quality], color=color, linewidth=0.7, alpha=0.45)
+            if label == labels[0]:
+                end = curve[quality].iloc[-1]
+                axis.axhline(end, color=color, linewidth=0.6, linestyle=":", alpha=0.6)
+    lines = {}
+    for label, (color, mark) in zip(labels, _ARMS, strict=False):
+        curve = means[means["label"] == label]
+        (lines[label],) = axis.plot(curve[amount], curve[quality], color=color, linewidth=1.8)
+        # A few marks, at other evaluations for each label.
+        every = max(1, len(curve) // 6)
+        lines[label].set(marker=mark, markersize=5, markevery=(len(lines) % every, every))
+        if label == labels[0] and len(curve):
+            axis.axhline(curve[quality].iloc[-1], color=color, linewidth=1.3, linestyle="--")
+    axis.grid(alpha=0.3)
+    axis.spines[["top", "right"]].set_visible(False)
+    return lines
+
+
+def _leave_out_the_start(axis: Axes, scenes: pd.DataFrame, metric: Metric) -> None:
+    """Let better be up, and begin the axis at the worst value after a quarter of a curve."""
+    curves = scenes.groupby(["label", "scene"])[metric.name]
+    later = scenes.loc[curves.cumcount() >= curves.transform("size") // 4, metric.name]
+    worst, best = later[np.isfinite(later)].agg(["min", "max"])
+    if worst < best:
+        margin = 0.05 * (best - worst)
+        axis.set_ylim(worst - margin, best + margin)
+    if not metric.higher_is_better:
+        axis.invert_yaxis()
+
+
+@_default_style()
 def trade_off(
     title: str, means: pd.DataFrame, scenes: pd.DataFrame, axes: Sequence[Metric]
 ) -> bytes:
     """Draw each ablation by its number of Gaussians and its quality, one panel for each score.
 
-    Better is up and left. A numbered dot is an ablation's mean; thin lines lead to its scenes.
+    Better is up and left. A numbered dot is a label's mean over scenes. Thin lines lead from the
+    baseline to the ablations in each scene, and blue ones cross at the baseline's mean.
 
     Args:
         title: The title of the figure.
-        means: One row for each label, in order: `gaussians`, as a multiple of the baseline's, above
-            0; and for each of `axes`, in a column of its name, its change from the baseline, in its
-            unit or, where it has none, in percent.
-        scenes: The same columns and index, one row for each label and scene.
+        means: One row for each label, the baseline first: `gaussians`, `scenes` (how many the mean
+            is over), and a column for each of `axes`.
+        scenes: One row for each label and scene, indexed by the label: `scene`, `gaussians`, and
+            the same scores.
         axes: The scores to draw.
 
     Returns:
@@ -177,31 +268,46 @@ def trade_off(
     panels = figure.subplots(1, len(axes), squeeze=False)[0]
     for panel, metric in zip(panels, axes, strict=True):
         _dots(panel, means, scenes, metric.name)
-        panel.set_xlabel("Gaussians, times the baseline's")
-        panel.set_title(f"{metric.label}, {metric.unit or '%'}", fontsize=10)
+        panel.set_xlabel("Gaussians")
+        panel.set_title(f"{metric.label}{metric.unit and f', {metric.unit}'}", fontsize=10)
         if not metric.higher_is_better:
             panel.invert_yaxis()
+    most = int(means["scenes"].max())
     names = "\n".join(
-        f"{at} {for_line(label, _MAX_NAME)}" for at, label in enumerate(means.index, start=1)
+        f"{at} {for_line(str(label), _MAX_NAME)}" + f" ({of} of {most} scenes)" * bool(of < most)
+        for at, (label, of) in enumerate(means["scenes"].items())
     )
     panels[-1].annotate(names, (1.04, 1), xycoords="axes fraction", va="top", fontsize=8)
     return _png(figure)
 
 
 def _dots(axis: Axes, means: pd.DataFrame, scenes: pd.DataFrame, quality: str) -> None:
-    """Draw one panel of a trade-off, with blue lines that cross where the baseline is."""
-    for label, row in scenes.iterrows():
-        ends = means.loc[[label], ["gaussians", quality]].to_numpy()[0], row[["gaussians", quality]]
-        axis.plot(*zip(*ends, strict=True), color="0.75", linewidth=0.7)
-    axis.scatter(means["gaussians"], means[quality], s=110, color=_ABLATION, zorder=3)
-    for at, spot in enumerate(means[["gaussians", quality]].to_numpy(), start=1):
+    """Draw one panel of a trade-off."""
+    baseline = means.index[0]
+    colors = (
+        [color for color, _ in _ARMS]
+        if len(means) <= MAX_ARMS
+        else [_BASELINE, *[_ABLATION] * len(means)]
+    )
+    start = scenes.loc[[baseline]].set_index("scene")
+    for label, color in zip(means.index, colors, strict=False):
+        for _, row in scenes.loc[[label]].iterrows():
+            spot, base = (at[["gaussians", quality]] for at in (row, start.loc[row["scene"]]))
+            axis.plot(*zip(base, spot, strict=True), color=color, linewidth=0.7, alpha=0.45)
+            axis.plot(*spot, color=color, marker=".", markersize=4, alpha=0.6)
+    for at, (spot, color) in enumerate(
+        zip(means[["gaussians", quality]].to_numpy(), colors, strict=False)
+    ):
+        axis.plot(*spot, color=color, marker="o", markersize=10.5, zorder=3)
         axis.annotate(
             str(at), tuple(spot), ha="center", va="center", color="white", fontsize=7, zorder=4
         )
-    axis.axhline(0, color=_BASELINE, linewidth=0.8)
-    axis.axvline(1, color=_BASELINE, linewidth=0.8)
-    axis.set_xscale("log", base=2)
-    axis.xaxis.set_major_formatter(StrMethodFormatter("{x:g}"))
+    axis.axhline(means[quality].iloc[0], color=_BASELINE, linewidth=0.8)
+    axis.axvline(means["gaussians"].iloc[0], color=_BASELINE, linewidth=0.8)
+    axis.set_xscale("log")
+    axis.xaxis.set_major_locator(LogLocator(subs=(1, 2, 3, 5, 7)))
+    axis.xaxis.set_minor_locator(NullLocator())
+    axis.xaxis.set_major_formatter(EngFormatter(sep=" "))
     axis.grid(alpha=0.3)
     axis.spines[["top", "right"]].set_visible(False)
 

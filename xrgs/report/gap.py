@@ -6,7 +6,7 @@ import math
 from typing import TYPE_CHECKING
 
 from xrgs.report.compare import ALL_HR
-from xrgs.report.render import TextTable
+from xrgs.report.render import TextTable, titled
 from xrgs.report.tables import (
     AGREEMENT_NOTE,
     agreement,
@@ -14,7 +14,6 @@ from xrgs.report.tables import (
     interval,
     interval_note,
     signed,
-    titled,
 )
 
 if TYPE_CHECKING:

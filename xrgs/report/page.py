@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 
 from xrgs.evaluation.metrics import METRICS
 from xrgs.experiment.store import Store
+from xrgs.report import curves, skipped
 from xrgs.report.collect import RECORD_KEYS, ReportError, Sweep, read_sweep
 from xrgs.report.compare import compare
 from xrgs.report.gap import gap_tables
@@ -57,6 +58,41 @@ class Report:
     """Every file that was written, sorted."""
 
 
+@dataclass(frozen=True)
+class Runs:
+    """What the report says of the trainings themselves, beside their results."""
+
+    training: pd.DataFrame
+    """What training did in each cell: `xrgs.report.training.totals`."""
+    curves: pd.DataFrame
+    """Quality during training: `xrgs.report.curves.joined`."""
+    times: pd.DataFrame
+    """Time and work to the baseline's final PSNR: `xrgs.report.curves.times`."""
+    skipped: pd.DataFrame
+    """What each cell left out: `xrgs.report.skipped.skipped`."""
+
+    @classmethod
+    def of(cls, sweep: Sweep, cells: pd.DataFrame) -> Runs:
+        """Gather the tables of a sweep whose compared cells are these."""
+        return cls(
+            totals(cells, sweep.training),
+            curves.joined(cells, sweep.curves),
+            curves.times(cells, sweep.curves),
+            skipped.skipped(cells, sweep.work),
+        )
+
+    def tables(self, cells: pd.DataFrame) -> list[TextTable]:
+        """Return the tables of each condition, time to quality first."""
+        labels = cells.groupby("condition", sort=False)["label"].unique()
+        by_condition = [(str(name), list(of)) for name, of in labels.items()]
+        kinds = (
+            (curves.table, self.times),
+            (skipped.table, self.skipped),
+            (training_table, self.training),
+        )
+        return [make(found, of, name) for make, found in kinds for name, of in by_condition]
+
+
 def build(
     store_path: Path,
     sweep_id: str | None = None,
@@ -90,8 +126,9 @@ def build(
             folder.make_root()
         _refuse_links(folder / "figures")
         (folder / "figures").make_folder()
-        drawn = draw(store, comparison, sweep.views, folder / "figures", pictures)
-        _write_files(folder, sweep, tables, drawn, totals(comparison.cells, sweep.training))
+        runs = Runs.of(sweep, comparison.cells)
+        drawn = draw(store, comparison, sweep.views, runs.curves, folder / "figures", pictures)
+        _write_files(folder, sweep, tables, drawn, runs)
     except OSError as error:
         raise ReportError(
             f"the report can't be written to {folder}: {error.filename}: {error.strerror};"
@@ -121,6 +158,9 @@ _FILES = (
     "cells.csv",
     "views.csv",
     "training.csv",
+    "curves.csv",
+    "time_to_quality.csv",
+    "skipped.csv",
     "provenance.json",
 )
 
@@ -130,20 +170,23 @@ def _write_files(
     sweep: Sweep,
     tables: Tables,
     pictures: list[Picture],
-    training: pd.DataFrame,
+    runs: Runs,
 ) -> None:
     cells = tables.comparison.cells
     names = cells.drop_duplicates("cell_id")[_VIEW_KEYS]
     views = names.merge(sweep.views, on="cell_id")
     metrics = [metric.name for metric in tables.comparison.metrics]
     order = [*RECORD_KEYS, "state", "reason", "protocol", "validation", *metrics]
-    write_text(folder / "table.md", _markdown_page(sweep, tables, pictures, folder, training))
+    write_text(folder / "table.md", _markdown_page(sweep, tables, pictures, folder, runs))
     non_empty = [table for table in _all_tables(tables) if table.rows]
     write_text(folder / "table.tex", "\n".join(map(to_latex, non_empty)))
     write_text(folder / "table.csv", _csv(tables.long()))
     write_text(folder / "cells.csv", _csv(cells[order]))
     write_text(folder / "views.csv", _csv(views))
-    write_text(folder / "training.csv", _csv(training))
+    write_text(folder / "training.csv", _csv(runs.training))
+    write_text(folder / "curves.csv", _csv(runs.curves))
+    write_text(folder / "time_to_quality.csv", _csv(runs.times))
+    write_text(folder / "skipped.csv", _csv(runs.skipped))
     provenance = {for_line(key): [*map(for_line, of)] for key, of in sweep.provenance.items()}
     write_json(folder / "provenance.json", provenance)
 
@@ -173,26 +216,19 @@ def _ablation_tables(tables: Tables) -> list[TextTable]:
     return result
 
 
-def _training_tables(tables: Tables, training: pd.DataFrame) -> list[TextTable]:
-    """Return one table of what training did for each condition."""
-    cells = tables.comparison.cells
-    labels = cells.groupby("condition", sort=False)["label"].unique()
-    return [training_table(training, list(of), str(name)) for name, of in labels.items()]
-
-
 def _markdown_page(
     sweep: Sweep,
     tables: Tables,
     pictures: list[Picture],
     folder: ConfinedPath,
-    training: pd.DataFrame,
+    runs: Runs,
 ) -> str:
     command = " ".join(for_markdown(shlex.quote(word)) for word in ("xrgs-sweep", *sweep.command))
     parts = [
         f"# Change from baseline\n\nSweep {for_markdown(sweep.id)}: {command}\n",
         *(f"**{for_markdown(line)}**\n" for line in _warnings(sweep)),
         *(to_markdown(table) for table in _all_tables(tables) if table.rows),
-        *(to_markdown(table) for table in _training_tables(tables, training) if table.rows),
+        *(to_markdown(table) for table in runs.tables(tables.comparison.cells) if table.rows),
         *(_picture_link(picture, folder) for picture in pictures),
         to_markdown(_provenance_table(sweep)),
     ]

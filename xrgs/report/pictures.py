@@ -14,8 +14,17 @@ from xrgs.capture.images import ImageError
 from xrgs.errors import StoreError, UnreadableError
 from xrgs.experiment.store import BASELINE
 from xrgs.report.collect import ReportError
-from xrgs.report.figures import Panel, curves, differing_crop, side_by_side, trade_off
-from xrgs.report.tables import titled
+from xrgs.report.curves import means_over_runs, means_over_scenes
+from xrgs.report.figures import (
+    MAX_ARMS,
+    Panel,
+    curves,
+    differing_crop,
+    quality_curves,
+    side_by_side,
+    trade_off,
+)
+from xrgs.report.render import titled
 from xrgs.runtime.progress import progress
 from xrgs.safeio.atomic import atomic_writer
 from xrgs.safeio.words import for_file_name
@@ -26,13 +35,15 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
-    from xrgs.evaluation.metrics import Metric
     from xrgs.experiment.store import Store
     from xrgs.report.compare import Comparison
     from xrgs.safeio.confined import ConfinedPath
 
     _Drawing = Callable[[ConfinedPath], "Picture"]  # draws into the file
 
+#: The scores whose curves are drawn.
+_QUALITY = ("psnr", "lpips")
+_QUALITY_TITLE = "Quality during training: scenes thin, mean thick, level where baseline ends"
 _CURVES = {"gaussians": "Gaussians", "loss": "loss of the step's view, as each run weighs it"}
 #: Largest image that is drawn: three are in memory at a time, 12 bytes a pixel, and their drawing.
 _MAX_PIXELS = 1 << 24
@@ -55,18 +66,21 @@ def draw(
     store: Store,
     comparison: Comparison,
     views: pd.DataFrame,
+    quality: pd.DataFrame,
     folder: ConfinedPath,
     names: Sequence[str] | None = None,
 ) -> list[Picture]:
     """Draw what each ablation trades, and views and training curves of each scene and ablation.
 
-    The trade-offs are drawn where there are several ablations, one figure for each condition. The
-    other pictures show the first condition and replicate, which their titles name.
+    The trade-offs are drawn where there are several ablations, and quality during training where
+    it was evaluated, for each condition. The other pictures show the first condition and replicate,
+    which their titles name.
 
     Args:
         store: The store with the photographs, renders and histories.
         comparison: The pairs of cells.
         views: The table `Sweep.views`.
+        quality: The table that `xrgs.report.curves.joined` returns.
         folder: The existing folder to write the files to.
         names: Names of the pictures to draw, which are file names without suffix; None draws all,
             but no more than the first 100.
@@ -83,7 +97,7 @@ def draw(
     scores = views[views["cell_id"].isin(shown)].groupby("cell_id")
     psnr = {cell_id: rows.set_index("view")["psnr"] for cell_id, rows in scores}
     cells = comparison.cells.drop_duplicates("cell_id").set_index("cell_id")
-    drawings = _trade_offs(comparison)
+    drawings = _curves_of_quality(comparison, quality) | _trade_offs(comparison)
     for _, pair in pairs.iterrows():
         both = _same_views(psnr.get(pair["baseline_id"]), psnr.get(pair["cell_id"]))
         cell = cells.loc[pair["cell_id"]]
@@ -127,46 +141,64 @@ def _trade_offs(comparison: Comparison) -> dict[str, _Drawing]:
     """Return the trade-off figures, one for each condition with several ablations."""
     drawings: dict[str, _Drawing] = {}
     for condition in dict.fromkeys(condition for _, condition in comparison.groups):
-        means, scenes = (
-            _traded(table, condition, comparison.metrics)
-            for table in (comparison.means, comparison.per_scene)
-        )
-        axes = [m for m in comparison.metrics if m.score is not None and m.name in means]
-        if not 2 <= len(means) <= _MAX_ABLATIONS or not axes:
+        scenes = _absolute(comparison, condition)
+        axes = [m for m in comparison.metrics if m.score is not None and m.name in scenes]
+        numbers = scenes.drop(columns="scene").groupby(level=0, sort=False)
+        means = numbers.mean().assign(scenes=numbers.size())
+        if not 3 <= len(means) <= _MAX_ABLATIONS or not axes:
             continue
-        title = titled("What each ablation trades, mean over scenes", condition)
+        title = titled("Quality against Gaussians, mean over scenes", condition)
         name = f"trade-off{condition and f'.{for_file_name(condition)}'}"
-        drawings[name] = partial(_trade_off, title, means, scenes, axes)
+        drawings[name] = partial(_drawn, title, partial(trade_off, title, means, scenes, axes))
     return drawings
 
 
-def _trade_off(
-    title: str,
-    means: pd.DataFrame,
-    scenes: pd.DataFrame,
-    axes: Sequence[Metric],
-    file: ConfinedPath,
-) -> Picture:
-    with atomic_writer(file) as stream:
-        stream.write(trade_off(title, means, scenes, axes))
-    return Picture(title, file)
+def _absolute(comparison: Comparison, condition: str) -> pd.DataFrame:
+    """Return Gaussians and measured scores of each label and scene, as means over its runs.
 
-
-def _traded(table: pd.DataFrame, condition: str, metrics: Sequence[Metric]) -> pd.DataFrame:
-    """Return Gaussians as a multiple of the baseline's, and the change of each measured score.
-
-    The index is the label. Scores in decibels change by their difference, others in percent. A
-    label that lacks a score has no row; the tables say why.
+    The index is the label, the baseline's first. A cell that lacks a score, or the result of its
+    baseline, has no row; the tables say why.
     """
-    here = table[table.index.get_level_values("condition") == condition].droplevel("condition")
-    of = here.index.get_level_values("metric")
-    columns = {"gaussians": 1 + here.loc[of == "gaussians", "change"].droplevel("metric") / 100}
-    for metric in metrics:
-        if metric.score is not None:
-            how = "difference" if metric.unit == "dB" else "change"
-            columns[metric.name] = here.loc[of == metric.name, how].droplevel("metric")
-    wide = pd.DataFrame(columns).dropna(axis="columns", how="all").dropna()
-    return wide.reset_index().set_index("label")
+    cells = comparison.cells
+    chosen = cells[(cells["condition"] == condition) & (cells["reason"] == "")]
+    names = ["gaussians", *(m.name for m in comparison.metrics if m.score is not None)]
+    means = chosen.groupby(["label", "scene"], sort=False)[names].mean()
+    measured = means.dropna(axis="columns", how="all").dropna().reset_index()
+    with_baseline = measured.loc[measured["label"] == BASELINE, "scene"]
+    return _baseline_first(measured[measured["scene"].isin(with_baseline)]).set_index("label")
+
+
+def _baseline_first(rows: pd.DataFrame) -> pd.DataFrame:
+    return rows.sort_values("label", key=lambda of: of != BASELINE, kind="stable")
+
+
+def _curves_of_quality(comparison: Comparison, curves: pd.DataFrame) -> dict[str, _Drawing]:
+    """Return figures of the quality during training: baseline and seven ablations on each."""
+    metrics = {metric.name: metric for metric in comparison.metrics}
+    drawings: dict[str, _Drawing] = {}
+    for condition in dict.fromkeys(curves["condition"]):
+        rows = _baseline_first(means_over_runs(curves, condition))
+        axes = [metrics[name] for name in _QUALITY if rows[name].notna().any()]
+        first, *ablations = dict.fromkeys(rows["label"])
+        if first != BASELINE or not axes:
+            continue
+        for at in range(0, len(ablations), MAX_ARMS - 1):
+            shown = (BASELINE, *ablations[at : at + MAX_ARMS - 1])
+            scenes = rows[rows["label"].isin(shown)]
+            means = means_over_scenes(scenes)
+            title = titled(_QUALITY_TITLE, condition)
+            name = f"time-to-quality{condition and f'.{for_file_name(condition)}'}"
+            name += f"-{at // (MAX_ARMS - 1) + 1}" * (at > 0)
+            drawings[name] = partial(
+                _drawn, title, partial(quality_curves, title, scenes, means, axes)
+            )
+    return drawings
+
+
+def _drawn(title: str, figure: Callable[[], bytes], file: ConfinedPath) -> Picture:
+    with atomic_writer(file) as stream:
+        stream.write(figure())
+    return Picture(title, file)
 
 
 def median_view(baseline: pd.Series, ablation: pd.Series) -> str:

@@ -21,6 +21,16 @@ class TextTable:
     """Lines below the table."""
 
 
+def titled(text: str, condition: str) -> str:
+    """Return a heading that names the condition, where there is one.
+
+    Args:
+        text: The heading.
+        condition: The condition; empty for none.
+    """
+    return f"{text} ({condition})" if condition else text
+
+
 def width(text: str) -> int:
     """Return the terminal columns that `text` takes.
 

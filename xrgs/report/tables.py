@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import pandas as pd
 
 from xrgs.experiment.store import BASELINE
-from xrgs.report.render import TextTable
+from xrgs.report.render import TextTable, titled
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
@@ -376,16 +376,6 @@ def by_key(table: pd.DataFrame) -> dict[tuple[str, ...], Change]:
     """
     rows = table[list(Change._fields)].itertuples(index=False)
     return {key: Change(*row) for key, row in zip(table.index, rows, strict=True)}
-
-
-def titled(text: str, condition: str) -> str:
-    """Return a heading that names the condition, where there is one.
-
-    Args:
-        text: The heading.
-        condition: The condition; empty for none.
-    """
-    return f"{text} ({condition})" if condition else text
 
 
 def _listed(replicates: set[tuple[int, int]]) -> str:

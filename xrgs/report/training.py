@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 
 import pandas as pd
 
-from xrgs.report.render import TextTable
+from xrgs.report.render import TextTable, titled
 from xrgs.safeio.records import as_number, read_table
 
 if TYPE_CHECKING:
@@ -106,9 +106,8 @@ def table(totals: pd.DataFrame, labels: Sequence[str], condition: str) -> TextTa
             ]
             if any(texts):
                 rows.append((scene, _LABELS.get(name, name.replace("_", " ")), *texts))
-    title = "What training did, means over the seeds that are done"
     return TextTable(
-        title=f"{title} ({condition})" if condition else title,
+        title=titled("What training did, means over the seeds that are done", condition),
         columns=("Scene", "", *labels),
         rows=tuple(rows),
         align="ll" + "r" * len(labels),

@@ -109,11 +109,15 @@ class SplatOptimizer:
             camera: The view that the gradients come from, as the Gaussians were rendered in it.
             sh_degree: Highest band of the spherical harmonics that was rendered.
         """
-        moves_harmonics = self.steps_done % self.shN_every == 0
         implementation("optimizer", self.backend).step(
-            self.adam, camera if moves_harmonics else None, sh_degree
+            self.adam, camera if self.moves_harmonics else None, sh_degree
         )
         self.skip_step()
+
+    @property
+    def moves_harmonics(self) -> bool:
+        """Whether the next step moves shN."""
+        return self.steps_done % self.shN_every == 0
 
     def skip_step(self) -> None:
         """Count a training step and decay the rate of `means`, and move nothing.

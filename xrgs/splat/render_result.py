@@ -18,3 +18,6 @@ class Render:
     """Number of (pixel, Gaussian) pairs whose alpha was computed."""
     buffer_bytes: int
     """Peak bytes that the renderer allocates beside the parameters and their gradients."""
+    tile_evaluations: int
+    """`evaluations` if every pixel of a tile met every Gaussian of the tile's list: what the lists
+    of tiles alone leave to compute."""

@@ -167,14 +167,15 @@ def _run_steps(run: _Run, checkpoint: Checkpoint, evaluate: Evaluate | None) -> 
                 image, target, l1=1 - ssim, ssim=ssim, pixel_weight=weights, backend=backend
             )
             loss = components.modify_loss(loss, image, gaussians, step)
+        recorder.lap("forward")
         # Update the Gaussians, and record the step while its gradients and buffers still exist.
         if components.needs_backward(loss, step):
             _update(run, step, loss, camera, sh_degree)
             run.memory.record(render)
-            recorder.record_step(step, loss, render, len(gaussians))
         else:
             optimizer.skip_step()
-            recorder.record_step(step, loss, render, len(gaussians), skipped_backward=True)
+            recorder.record_skipped("backward")
+        recorder.record_step(step, loss, render, gaussians, sh_degree)
         # Densify, prune and reset. There is no gradient without a backward pass, nor where the
         # render shows no Gaussian.
         grad2d, size = means2d_offset.grad, {"width": camera.width, "height": camera.height}
@@ -203,7 +204,11 @@ def _update(run: _Run, step: Step, loss: Tensor, camera: Camera, sh_degree: int)
     run.optimizer.zero_grad()
     torch.autograd.backward(loss)
     run.components.after_backward(run.optimizer.gaussians, step)
+    run.recorder.lap("backward")
+    if not run.optimizer.moves_harmonics:
+        run.recorder.record_skipped("shN")
     run.optimizer.step(camera, sh_degree=sh_degree)
+    run.recorder.lap("optimizer")
 
 
 def _prune_by_components(run: _Run, step: Step, refinement: Refinement) -> Refinement:
@@ -242,7 +247,7 @@ def _set_up(data: Dataset, conf: Conf, extra_components: Iterable[Component]) ->
         view_pixels=data.view_pixels,
     )
     views = _Views(data.train)
-    recorder = TrainingRecorder(steps, splat.densify.grow_grad2d)
+    recorder = TrainingRecorder(steps, splat.densify.grow_grad2d, data.train)
     sh_every = max(1, int(splat.sh_every * steps / NOMINAL_STEPS))
     return _Run(
         splat=splat,

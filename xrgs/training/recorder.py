@@ -9,16 +9,17 @@ from statistics import fmean
 from typing import TYPE_CHECKING, Any
 
 from xrgs.splat.refinement import Refinement
+from xrgs.training.work import StepWork
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping
+    from collections.abc import Callable, Iterable, Mapping
 
     import torch
 
     from xrgs.splat.gaussians import Gaussians
     from xrgs.splat.rasterize import Render
     from xrgs.training.checkpoint import State
-    from xrgs.training.components import Step
+    from xrgs.training.components import Step, TrainingView
 
 _HISTORY_ROWS = 200
 """A history has about as many rows, whatever the number of steps."""
@@ -33,16 +34,22 @@ class TrainingResult:
     history: list[dict[str, Any]]
     """One row for each recorded step. `step`, `view`, `loss` and `gaussians` (their number before
     the step's densification) are those of the step itself. `steps_HR`, `steps_LR`, the counts of
-    `Refinement` and `skipped_backward` (the steps without a backward pass; the column is absent
-    where there are none) are totals since the start of training. Every other column is a
-    component's log (`Step.log`): its mean over the steps since the row before that logged it, or
-    None where none did. Every row has every column."""
+    `Refinement`, `skipped_backward` (steps without a backward pass) and `skipped_shN` (steps that
+    did not move shN) are totals since the start of training; the last two are columns only where
+    there are such steps. Every other column is a component's log (`Step.log`): its mean over the
+    steps since the row before that logged it, or None where none did. Every row has every
+    column."""
     seconds: float
     """Time of the training steps alone: no loading of data, no evaluation, no checkpoints."""
     memory_bytes: int
     """Bytes that training held at the step where they were most (`TrainingMemory`)."""
     evaluations: int
     """Alpha evaluations of all forward passes: the amount of work, independent of the machine."""
+    work: dict[str, int]
+    """What the steps rendered and left out: `StepWork.totals`."""
+    stage_seconds: dict[str, float]
+    """`seconds` by the stages of a step: `forward` (render and loss), `backward`, `optimizer`, and
+    `densification` with all that follows."""
     grow_grad2d: float
     """The threshold of densification that the Gaussians were trained with, in normalised device
     units (`splat.densify.grow_grad2d`)."""
@@ -57,14 +64,15 @@ class TrainingRecorder:
     Its clock starts when it is constructed.
     """
 
-    def __init__(self, steps: int, grow_grad2d: float) -> None:
+    def __init__(self, steps: int, grow_grad2d: float, views: Iterable[TrainingView]) -> None:
         """Start the clock, with an empty history.
 
         Args:
             steps: Number of steps of the whole run.
             grow_grad2d: The run's threshold of densification, for the result.
+            views: All training views, with the cameras of their photographs.
         """
-        self.started = time.perf_counter()
+        self.started = self.lap_started = time.perf_counter()
         self.grow_grad2d = grow_grad2d
         self.row_every = max(1, steps // _HISTORY_ROWS)
         self.last_step = steps - 1
@@ -73,15 +81,30 @@ class TrainingRecorder:
         self.history: list[dict[str, Any]] = []
         self.scores: list[dict[str, Any]] = []
         self.evaluations = 0
+        self.work = StepWork(views)
+        self.stage_seconds: defaultdict[str, float] = defaultdict(float)
+
+    def lap(self, stage: str) -> None:
+        """Add the time since the last lap, or since the start, to a stage of the steps.
+
+        Args:
+            stage: A key of `TrainingResult.stage_seconds`.
+        """
+        now = time.perf_counter()
+        self.stage_seconds[stage] += now - self.lap_started
+        self.lap_started = now
+
+    def record_skipped(self, part: str) -> None:
+        """Count a part of a step that is left out, before `record_step` records the step.
+
+        Args:
+            part: `backward` (with the update), or `shN`. The history has the total as
+                `skipped_<part>`.
+        """
+        self.counts[f"skipped_{part}"] += 1
 
     def record_step(
-        self,
-        step: Step,
-        loss: torch.Tensor,
-        render: Render,
-        gaussians: int,
-        *,
-        skipped_backward: bool = False,
+        self, step: Step, loss: torch.Tensor, render: Render, gaussians: Gaussians, sh_degree: int
     ) -> None:
         """Record a step after its update and before its densification.
 
@@ -89,19 +112,18 @@ class TrainingRecorder:
             step: The step, with what the components logged of it.
             loss: Scalar, the loss of the step.
             render: The step's render.
-            gaussians: The number of Gaussians.
-            skipped_backward: Whether the step had neither a backward pass nor an update.
+            gaussians: The Gaussians that were rendered.
+            sh_degree: Highest band of the spherical harmonics that was rendered.
         """
         self.evaluations += render.evaluations
+        self.work.add(step, render, gaussians, sh_degree)
         self.counts[f"steps_{step.view.tag}"] += 1
-        if skipped_backward:
-            self.counts["skipped_backward"] += 1
         for name, value in step.log.items():
             self.logged[name].append(value)
         if step.number % self.row_every == 0 or step.number == self.last_step:
             row = {"step": step.number, "view": step.view.name, "loss": loss.item()}
             means = {name: fmean(values) for name, values in self.logged.items()}
-            self.history.append(row | {"gaussians": gaussians} | self.counts | means)
+            self.history.append(row | {"gaussians": len(gaussians)} | self.counts | means)
             self.logged.clear()
 
     def record_evaluations(self, evaluations: int) -> None:
@@ -113,12 +135,13 @@ class TrainingRecorder:
         self.evaluations += evaluations
 
     def record_refinement(self, refinement: Refinement) -> None:
-        """Add what a step's densification did to the counts of the history.
+        """Add what a step's densification did to the counts of the history; the step ends here.
 
         Args:
             refinement: The counts of one step; all of them are 0 at most steps.
         """
         self.counts.update(refinement.counts())
+        self.lap("densification")
 
     def record_scores(
         self, steps: int, gaussians: int, evaluate: Callable[[], Mapping[str, float | None]]
@@ -147,6 +170,7 @@ class TrainingRecorder:
             seconds: Time that was not training.
         """
         self.started += seconds
+        self.lap_started += seconds
 
     def state_dict(self) -> State:
         """Return everything recorded so far, and the seconds of training so far."""
@@ -157,6 +181,8 @@ class TrainingRecorder:
             "history": self.history,
             "scores": self.scores,
             "evaluations": self.evaluations,
+            "work": self.work.state_dict(),
+            "stage_seconds": dict(self.stage_seconds),
         }
 
     def load_state_dict(self, state: State) -> None:
@@ -170,12 +196,15 @@ class TrainingRecorder:
             TypeError: An entry is of another type.
             ValueError: An entry can't be converted to its type.
         """
-        self.started = time.perf_counter() - float(state["seconds"])
+        self.lap_started = time.perf_counter()
+        self.started = self.lap_started - float(state["seconds"])
         self.counts = Counter(state["counts"])
         self.logged = defaultdict(list, state["logged"])
         self.history = list(state["history"])
         self.scores = list(state["scores"])
         self.evaluations = int(state["evaluations"])
+        self.work.load_state_dict(state["work"])
+        self.stage_seconds = defaultdict(float, state["stage_seconds"])
 
     def finish(self, gaussians: Gaussians, memory_bytes: int) -> TrainingResult:
         """Stop the clock and return the result.
@@ -195,6 +224,8 @@ class TrainingRecorder:
             seconds,
             memory_bytes,
             self.evaluations,
+            self.work.totals(),
+            dict(self.stage_seconds),
             self.grow_grad2d,
             self.scores,
         )

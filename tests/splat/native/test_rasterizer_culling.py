@@ -81,6 +81,17 @@ def test_culling_makes_no_difference_thousands_of_pixels_away(
     check_culling(scene, Camera(camera.viewmat, K, 4500, 20), name)
 
 
+def test_tile_evaluations_are_those_without_the_culling_inside_tiles(
+    make_camera: MakeCamera, make_scene: MakeScene
+) -> None:
+    # The image has whole tiles: pixels beyond its edge are counted and never computed.
+    scene, camera = crowd(make_scene, make_camera(64, 48, focal=60.0, turned=True), 1500, 3.0)
+    every_pixel, _, _ = render_with(CullingOptions(blocks=False, saturated=False), scene, camera)
+    usual, _, _ = render_with(CullingOptions(), scene, camera)
+    assert usual.tile_evaluations == every_pixel.tile_evaluations == every_pixel.evaluations
+    assert 0 < usual.evaluations < usual.tile_evaluations
+
+
 def check_culling(scene: Scene, camera: Camera, name: str) -> None:
     """Compare renders with and without a kind of culling, or all, with each other and the truth."""
     names = [field.name for field in fields(CullingOptions)] if name == "all" else [name]

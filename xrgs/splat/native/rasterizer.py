@@ -22,6 +22,8 @@ from xrgs.splat.native.arguments import require_float32
 from xrgs.splat.render_result import Render
 from xrgs.splat.settings import CullingOptions, RasterSettings
 
+_TILE = 16
+"""Side of a tile, px: `kTileSize` of `xrgs/csrc/raster/types.h`."""
 _FIRST_PARAMETER = 2
 """Place of the first parameter among the arguments of `_Rasterize.forward`."""
 _SHN_INPUT = _FIRST_PARAMETER + PARAMETERS.index("shN")
@@ -99,6 +101,7 @@ def render_culled(
         visible=frame.visible(),
         evaluations=frame.evaluations,
         buffer_bytes=frame.bytes,
+        tile_evaluations=frame.pair_count * _TILE**2,
     )
 
 

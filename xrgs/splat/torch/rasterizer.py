@@ -79,12 +79,14 @@ def render(
     rgba = rgba[: camera.height, : camera.width]  # [H, W, 4]
     alpha = rgba[..., 3]  # [H, W]
     background = means.new_tensor(settings.background)  # [3]
+    evaluations = len(pairs[0]) * TILE**2
     return Render(
         image=rgba[..., :3] + (1 - alpha)[..., None] * background,
         alpha=alpha,
         visible=torch.zeros(len(means), dtype=torch.bool).index_fill(0, visible_ids, True),
-        evaluations=len(pairs[0]) * TILE**2,
+        evaluations=evaluations,
         buffer_bytes=_bytes(*projected, attributes, *pairs, lists) + canvas_bytes,
+        tile_evaluations=evaluations,
     )
 
 

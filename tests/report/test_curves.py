@@ -1,0 +1,203 @@
+"""Quality during training and the time to the baseline's quality, from curves written by hand."""
+
+import csv
+import math
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from xrgs.evaluation.metrics import METRICS
+from xrgs.report import build
+from xrgs.report.collect import read_sweep
+from xrgs.report.curves import (
+    COLUMNS,
+    first_reaches,
+    joined,
+    means_over_runs,
+    means_over_scenes,
+    table,
+    times,
+)
+
+
+def quality(psnr: list[float], seconds: float = 10.0, evaluations: float = 1e8) -> str:
+    """A cell's quality.csv: an evaluation every 100 steps, each after so much time and work."""
+    rows = [
+        f"{100 * n},{seconds * n},{evaluations * n:.0f},{1000 * n},0.5,0.7,{value}"
+        for n, value in enumerate(psnr, start=1)
+    ]
+    header = "step,seconds,evaluations,gaussians,lpips,ssim,psnr"
+    return "\n".join([header, *rows]) + "\n"
+
+
+BASELINE = quality([15.0, 17.0, 18.0, 19.0], seconds=20, evaluations=2e8)
+"""Of a cell that ends at 20 dB, after 500 steps, 100 s and 10^9 evaluations."""
+
+
+def read(made: Any) -> Any:
+    return read_sweep(made.store, made.write(), METRICS)
+
+
+@pytest.mark.parametrize(
+    ("psnr", "target", "expected"),
+    [
+        ([20.0, 22.0, 21.0], 21.5, 17.5),
+        ([20.0, 22.0], 22.0, 20.0),
+        ([20.0, 22.0], 20.0, 10.0),
+        ([20.0, 22.0], 19.0, 10.0),  # before the first evaluation
+        ([20.0, 19.0, 23.0, 18.0], 21.0, 25.0),  # after opacities were reset
+        ([20.0, math.nan, 22.0], 21.0, 20.0),  # between the evaluations that have a number
+        ([math.nan, 22.0], 21.0, 20.0),
+        ([20.0, 22.0], 22.1, math.nan),
+        ([math.nan], 1.0, math.nan),
+        ([], 1.0, math.nan),
+        ([20.0, math.inf], 21.0, 10.0),
+    ],
+)
+def test_a_target_is_reached_between_evaluations(
+    psnr: list[float], target: float, expected: float
+) -> None:
+    seconds = [10.0 * n for n in range(1, len(psnr) + 1)]
+    assert first_reaches(psnr, seconds, target) == pytest.approx(expected, nan_ok=True)
+
+
+def test_a_curve_ends_with_the_trained_cell(made: Any) -> None:
+    cell = made.add(quality=BASELINE)
+    made.add("plain")
+    sweep = read(made)
+    curves = joined(sweep.cells, sweep.curves)
+    assert list(curves["step"]) == [100, 200, 300, 400, 500]
+    assert set(curves["cell_id"]) == {cell.id}, "a cell without evaluations has no curve"
+    last = curves.iloc[-1]
+    assert (last["seconds"], last["evaluations"], last["gaussians"]) == (100.0, 1e9, 5000)
+    assert last["psnr"] == pytest.approx(20.0)
+    assert last["lpips"] == pytest.approx(0.25)
+
+
+def study(made: Any) -> Any:
+    """The baseline, an ablation that passes it and one that does not, on two scenes.
+
+    All baselines end at 20 dB. `fast` is there at 20 and 30 s of 100 (fern), and at 50 s (horns).
+    """
+    for seed, psnr in ((0, [18.0, 20.0, 22.0]), (1, [18.0, 19.0, 20.0])):
+        made.add(quality=BASELINE, seed=seed)
+        made.add("fast", quality=quality(psnr), seed=seed)
+        made.add("slow", quality=quality([18.0, 19.0]), values={"psnr": 20.5 - seed}, seed=seed)
+    made.add(quality=BASELINE, scene="horns")
+    made.add(
+        "fast",
+        quality=quality([18.0, 19.0], seconds=33.0),
+        scene="horns",
+        values={"psnr": 21.0, "training_time_s": 34.0 + 50.0},
+        factors={},
+    )
+    return made
+
+
+def test_times_are_shares_of_the_paired_baseline(made: Any) -> None:
+    sweep = read(study(made))
+    found = times(sweep.cells, sweep.curves).set_index(["scene", "label", "seed"])
+    assert found["target"].to_numpy() == pytest.approx(20.0)
+    assert found.loc[("fern", "fast", 0), "seconds"] == pytest.approx(20.0)
+    assert found.loc[("fern", "fast", 1), "seconds"] == pytest.approx(30.0)
+    assert found.loc[("fern", "fast", 1), "seconds_share"] == pytest.approx(0.3)
+    assert found.loc[("fern", "fast", 1), "evaluations_share"] == pytest.approx(0.3)
+    # From 66 s at 19 dB to 84 s at 21 dB.
+    assert found.loc[("horns", "fast", 0), "seconds"] == pytest.approx(75.0)
+    # From 20 s at 19 dB to the end at 100 s with 20.5 dB.
+    assert found.loc[("fern", "slow", 0), "seconds"] == pytest.approx(20 + 80 / 1.5)
+    assert found["seconds"].isna().sum() == 1
+    assert found["seconds"].isna()[("fern", "slow", 1)]
+    assert found.loc[("fern", "baseline", 0), "seconds_share"] == pytest.approx(1.0)
+
+
+def test_the_table_says_what_was_not_reached(made: Any) -> None:
+    sweep = read(study(made))
+    labels = ["baseline", "fast", "slow", "unknown"]
+    made_of = table(times(sweep.cells, sweep.curves), labels, "")
+    rows = {row[:2]: row[2:] for row in made_of.rows}
+    not_all = "not reached 1 of 2"
+    assert rows["fern", "Time, s"] == ("100.0", "25.0", not_all, "")
+    assert rows["fern", "Time, % of the baseline's"] == ("100", "25", not_all, "")
+    assert rows["fern", "Alpha evaluations, 10^9"] == ("1", "0.25", not_all, "")
+    assert rows["horns", "Time, s"] == ("100.0", "75.0", "", "")
+    mean = rows["mean over scenes", "Time, % of the baseline's"]
+    assert mean == ("100", "50", "not reached", "")  # 25 and 75: each scene counts once
+    assert len(rows) == 4 + 4 + 2
+
+
+def test_an_ablation_whose_baseline_failed_has_no_time(made: Any) -> None:
+    made.add(state="failed")
+    made.add("fast", quality=BASELINE)
+    sweep = read(made)
+    found = times(sweep.cells, sweep.curves)
+    assert found.empty
+    assert table(found, ["baseline", "fast"], "").rows == ()
+
+
+def curve(label: str, scene: str, psnr: dict[int, float], seed: int = 0) -> list[dict[str, Any]]:
+    keys = {"label": label, "scene": scene, "seed": seed, "condition": ""}
+    return [
+        keys | dict.fromkeys(COLUMNS, float(step)) | {"psnr": value} for step, value in psnr.items()
+    ]
+
+
+def test_means_are_over_what_all_have() -> None:
+    rows = [
+        *curve("baseline", "fern", {100: 10.0, 200: 12.0}),
+        *curve("baseline", "fern", {100: 14.0, 200: 16.0, 300: 18.0}, seed=1),
+        *curve("baseline", "horns", {100: 20.0, 200: math.nan}),
+        *curve("baseline", "leaves", {100: 0.0}),
+        *curve("plus", "fern", {100: 15.0}),
+        *curve("plus", "horns", {100: 25.0}),
+    ]
+    scenes = means_over_runs(pd.DataFrame(rows), "")
+    found = scenes.set_index(["label", "scene", "step"])["psnr"].to_dict()
+    assert found["baseline", "fern", 100] == 12.0
+    assert found["baseline", "fern", 200] == 14.0
+    assert ("baseline", "fern", 300) not in found, "one of two runs has it"
+    assert np.isnan(found["baseline", "horns", 200])
+    means = means_over_scenes(scenes).set_index(["label", "step"])["psnr"].to_dict()
+    assert means["baseline", 100] == 16.0, "leaves has no plus"
+    assert np.isnan(means["baseline", 200])
+    assert means["plus", 100] == 20.0
+
+
+def test_the_report_has_figure_tables_and_files(made: Any) -> None:
+    for number in range(9):
+        made.add(f"arm {number}" if number else "baseline", quality=BASELINE)
+    made.add(condition="factor=8/x")
+    made.write()
+    report = build(made.store.path, pictures=["time-to-quality", "time-to-quality-2"])
+    page = (report.folder / "table.md").read_text()
+    assert "Time and work to the PSNR at which the baseline ends" in page
+    assert "figures/time-to-quality-2.png" in page
+    with (report.folder / "curves.csv").open(newline="") as stream:
+        rows = list(csv.DictReader(stream))
+    assert len(rows) == 9 * 5
+    assert rows[0]["label"] == "baseline"
+    assert float(rows[0]["psnr"]) == 15.0
+    with (report.folder / "time_to_quality.csv").open(newline="") as stream:
+        assert {float(row["seconds_share"]) for row in csv.DictReader(stream)} == {1.0}
+
+
+@pytest.mark.parametrize(
+    "text", ["", "step,seconds\n1,2\n", "step,seconds,evaluations,gaussians\n1,x,3,4\n", "\xff"]
+)
+def test_a_malformed_curve_costs_its_cell_alone(made: Any, text: str) -> None:
+    made.add(quality=BASELINE)
+    made.add("plus", quality=text)
+    made.add("mip", quality=BASELINE)
+    made.write()
+    report = build(made.store.path, pictures=[])
+    assert "mip against baseline" in report.text
+    assert "corrupt" in report.text or "malformed" in report.text or "quality.csv" in report.text
+
+
+def test_a_changed_curve_is_not_trusted(made: Any) -> None:
+    cell = made.add(quality=BASELINE)
+    file = cell.path / "quality.csv"
+    file.write_text(file.read_text().replace("19.0", "29.0"))
+    assert cell.state().reason == "quality.csv has changed since the cell finished"

@@ -1,0 +1,242 @@
+"""What each run left out, how much of it, and what that would have cost.
+
+A cell's summary has the totals of `xrgs.training.work.StepWork` and the seconds of each stage. The
+costs are estimated from these totals of the run itself, and not from another run.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING, NamedTuple
+
+import pandas as pd
+
+from xrgs.experiment.store import BASELINE
+from xrgs.report.render import TextTable, titled
+from xrgs.safeio.records import as_number
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator, Mapping, Sequence
+
+    from xrgs.experiment.cell_folder import CellFolder
+
+_CELL = ["cell_id", "scene", "label", "condition", "variant_seed", "seed"]
+_NUMBERS = ["number", "share", "cost", "cost_share"]
+#: Counts of a history that begin so are of steps that left something out.
+_PREFIX = "skipped_"
+_UNKNOWN = "unknown"
+
+
+class _Kind(NamedTuple):
+    """A kind of work that a run can leave out."""
+
+    label: str
+    unit: str
+    """Unit of the cost: `s`, `evaluations` (of alpha), or empty where nothing is known of it."""
+    estimate: str
+    """How the cost is estimated."""
+
+
+_KINDS = {
+    "steps": _Kind("Steps that the baseline takes", "s", "at the run's mean time of a step"),
+    "views": _Kind(
+        "Views that the baseline trains on", "s", "none: these steps are taken on other views"
+    ),
+    "skipped_backward": _Kind(
+        "Backward passes and updates",
+        "s",
+        "at the mean time of those that the run did, of backward pass and optimizer",
+    ),
+    "pixels": _Kind(
+        "Pixels of the photographs that were not rendered",
+        "evaluations",
+        "at the run's evaluations of a rendered pixel",
+    ),
+    "gaussians": _Kind(
+        "Gaussians out of view or transparent, of all steps",
+        "evaluations",
+        "one for each pixel of the view",
+    ),
+    "tiles": _Kind(
+        "Pixels of tiles that a visible Gaussian does not reach",
+        "evaluations",
+        "one for each, which is exact but for the tiles at the edges",
+    ),
+    "blocks": _Kind(
+        "Pixels of such tiles in blocks that are not reached, or saturated",
+        "evaluations",
+        "one for each, which is exact; the two are not counted apart",
+    ),
+    "sh": _Kind(
+        "Harmonics of visible Gaussians in bands that were not on",
+        "",
+        "not estimated: the time of a band is not measured",
+    ),
+}
+
+
+def cell_work(cell: CellFolder, training: Mapping[str, float]) -> dict[str, float]:
+    """Return what one cell did in all, for what it left out.
+
+    Args:
+        cell: A cell that is done.
+        training: What `xrgs.report.training.cell_totals` returns for it.
+
+    Returns:
+        The totals of the summary's `work`, its stages as `seconds_<stage>`, `seconds`, `steps`,
+        `evaluations`, and the counts of the history that begin with `skipped_`. Cells of older
+        versions have no `work`.
+
+    Raises:
+        StoreError: The summary can't be read.
+        AttributeError: `work` or `stage_seconds` is not an object.
+        ValueError: A value is not a number.
+    """
+    summary = cell.summary()
+    stages = summary.get("stage_seconds", {})
+    return {
+        **{name: as_number(value) for name, value in summary.get("work", {}).items()},
+        **{f"seconds_{stage}": as_number(value) for stage, value in stages.items()},
+        **{name: as_number(summary.get(name)) for name in ("steps", "evaluations")},
+        "seconds": as_number(summary.get("training_time_s")),
+        **{name: value for name, value in training.items() if name.startswith(_PREFIX)},
+    }
+
+
+def skipped(cells: pd.DataFrame, of_cells: Mapping[str, Mapping[str, float]]) -> pd.DataFrame:
+    """Return what each cell left out.
+
+    Args:
+        cells: The table `Comparison.cells`.
+        of_cells: What `cell_work` returns for each cell that is done, by its id.
+
+    Returns:
+        One row for each cell and kind of work of which the counts are known: `cell_id`, `scene`,
+        `label`, `condition`, `seed`, `kind`; the `number` that was left out, and its `share` of
+        what there was; its estimated `cost` in the kind's `unit` (`s` or `evaluations`), and
+        `cost_share` of what the run took itself; NaN where it is not known.
+    """
+    rows = []
+    for _, cell in cells[cells["state"] == "done"].drop_duplicates(_CELL).iterrows():
+        work = of_cells[cell["cell_id"]]
+        base = cell["cell_id"] if cell["label"] == BASELINE else cell["baseline_id"]
+        for kind, number, of, cost in _left_out(work, of_cells.get(base, work)):
+            if math.isnan(number) or not of > 0:
+                continue
+            unit = _kind(kind).unit
+            total = work["seconds" if unit == "s" else "evaluations"]
+            rows.append(
+                dict(cell[_CELL])
+                | {"kind": kind, "number": number, "share": number / of, "cost": cost}
+                | {"unit": unit, "cost_share": cost / total if total else math.nan}
+            )
+    columns = [*_CELL, "kind", "number", "share", "cost", "unit", "cost_share"]
+    return pd.DataFrame(rows, columns=columns)
+
+
+def _left_out(
+    work: Mapping[str, float], baseline: Mapping[str, float]
+) -> Iterator[tuple[str, float, float, float]]:
+    """Yield each kind: how many were left out, of how many, and their cost."""
+
+    def total(name: str) -> float:
+        return work.get(name, math.nan)
+
+    def of_baseline(name: str) -> float:
+        return baseline.get(name, math.nan)
+
+    steps, evaluations = total("steps"), total("evaluations")
+    fewer = _above_zero(of_baseline("steps") - steps)
+    yield "steps", fewer, of_baseline("steps"), _times(fewer, total("seconds"), steps)
+    yield "views", _above_zero(of_baseline("views") - total("views")), of_baseline("views"), 0.0
+    for name in [name for name in work if name.startswith(_PREFIX)]:
+        cost = math.nan
+        if name == "skipped_backward":
+            seconds = total("seconds_backward") + total("seconds_optimizer")
+            cost = _times(work[name], seconds, steps - work[name])
+        yield name, work[name], steps, cost
+    left_out, rendered = total("pixels_left_out"), total("pixels")
+    yield "pixels", left_out, total("pixels_photograph"), _times(left_out, evaluations, rendered)
+    yield (
+        "gaussians",
+        total("gaussians") - total("gaussians_visible"),
+        total("gaussians"),
+        total("pairs") - total("pairs_visible"),
+    )
+    in_tiles = total("pairs_in_tiles")
+    elsewhere = _above_zero(total("pairs_visible") - in_tiles)
+    yield "tiles", elsewhere, total("pairs_visible"), elsewhere
+    yield "blocks", in_tiles - evaluations, in_tiles, in_tiles - evaluations
+    yield "sh", total("sh_coefficients_left_out"), total("sh_coefficients"), math.nan
+
+
+def _above_zero(value: float) -> float:
+    """Return 0 for a number below it; NaN stays NaN."""
+    return 0.0 if value < 0 else value
+
+
+def _times(number: float, amount: float, of: float) -> float:
+    """Return what `number` takes at the mean of `amount` over `of`; NaN where `of` is 0 or NaN."""
+    return number * amount / of if of > 0 else math.nan
+
+
+def _kind(name: str) -> _Kind:
+    words = name.removeprefix(_PREFIX).replace("_", " ")
+    return _KINDS.get(name, _Kind(f"Steps without {words}", "", "not estimated"))
+
+
+def table(found: pd.DataFrame, labels: Sequence[str], condition: str) -> TextTable:
+    """Return what the runs of one condition left out: means over a scene's runs, then over scenes.
+
+    Args:
+        found: The table that `skipped` returns.
+        labels: The labels of the columns, in order.
+        condition: The condition that the cells were run under.
+
+    Returns:
+        The table; a kind of which no run left anything out is not in it.
+    """
+    chosen = found[found["condition"] == condition]
+    by_scene = chosen.groupby(["kind", "label", "scene"], sort=False)[_NUMBERS].mean()
+    means = by_scene.groupby(level=["kind", "label"], sort=False).mean()
+    rows, notes = [], []
+    for name in dict.fromkeys(chosen["kind"]):
+        of_kind, kind = means.loc[name], _kind(name)
+        if not of_kind["number"].any():
+            continue
+        texts = [
+            _texts(of_kind.loc[label]) if label in of_kind.index else ("", "") for label in labels
+        ]
+        would = f"would have cost{kind.unit and f', {kind.unit}'}"
+        rows.append((kind.label, "number (share)", *(number for number, _ in texts)))
+        rows.append(("", f"{would} (of the run's own)", *(cost for _, cost in texts)))
+        notes.append(f"{kind.label}: cost {kind.estimate}")
+    return TextTable(
+        title=titled("What each run left out, mean over scenes", condition),
+        columns=("Left out", "", *labels),
+        rows=tuple(rows),
+        align="ll" + "r" * len(labels),
+        notes=tuple(notes),
+    )
+
+
+def _texts(row: pd.Series) -> tuple[str, str]:
+    """Return the number that was left out, and what it would have cost."""
+    number = f"{_short(row['number'])} ({_share(row['share'])})"
+    if math.isnan(row["cost"]):
+        return number, _UNKNOWN
+    return number, f"{_short(row['cost'])} ({_share(row['cost_share'])})"
+
+
+def _short(value: float) -> str:
+    """Write a number with the prefix of the SI for thousands, millions and so on."""
+    if not math.isfinite(value):
+        return _UNKNOWN
+    size = min(4, int(math.log10(value)) // 3) if value >= 1000 else 0
+    return f"{value / 1000**size:,.4g} {('', 'k', 'M', 'G', 'T')[size]}".rstrip()
+
+
+def _share(value: float) -> str:
+    if value < 1:
+        return f"{value:.1%}"
+    return f"{value:,.1f} times" if value < 100 else f"{value:,.0f} times"

@@ -1,0 +1,96 @@
+"""Counts what the steps of a training rendered and left out."""
+
+from __future__ import annotations
+
+from collections import Counter
+from typing import TYPE_CHECKING
+
+from xrgs.splat.sh import bases
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable
+
+    from xrgs.splat.gaussians import Gaussians
+    from xrgs.splat.rasterize import Render
+    from xrgs.training.checkpoint import State
+    from xrgs.training.components import Step, TrainingView
+
+
+class StepWork:
+    """Sums over the steps of what they rendered and what they left out.
+
+    It counts what is known without further work: none of it is computed for the count alone, but
+    the number of visible Gaussians.
+
+    Attributes:
+        photographs: Pixels of each view's photograph, by its name.
+        counts: The totals of the steps.
+        views: Names of the views that were trained on.
+    """
+
+    def __init__(self, views: Iterable[TrainingView]) -> None:
+        """Start with nothing counted.
+
+        Args:
+            views: All training views, with the cameras of their photographs.
+        """
+        self.photographs = {v.name: v.camera.width * v.camera.height for v in views}
+        self.counts: Counter[str] = Counter()
+        self.views: set[str] = set()
+
+    def add(self, step: Step, render: Render, gaussians: Gaussians, sh_degree: int) -> None:
+        """Count a step.
+
+        Args:
+            step: The step.
+            render: Its render.
+            gaussians: The N Gaussians that were rendered.
+            sh_degree: Highest band of the spherical harmonics that was rendered.
+        """
+        visible, pixels = int(render.visible.count_nonzero()), render.alpha.numel()
+        photograph = self.photographs[step.view.name]
+        stored = gaussians.shN.shape[1] + 1
+        self.views.add(step.view.name)
+        self.counts.update(
+            gaussians=len(gaussians),
+            gaussians_visible=visible,
+            pixels=pixels,
+            pixels_photograph=photograph,
+            pixels_left_out=max(0, photograph - pixels),
+            pairs=len(gaussians) * pixels,
+            pairs_visible=visible * pixels,
+            pairs_in_tiles=render.tile_evaluations,
+            sh_coefficients=visible * stored,
+            sh_coefficients_left_out=visible * (stored - bases(sh_degree)),
+        )
+
+    def totals(self) -> dict[str, int]:
+        """Return the totals over all steps.
+
+        Returns:
+            `views`: the number of views that were trained on. Sums over the steps: `gaussians` and
+            `gaussians_visible`; `pixels` that were rendered, `pixels_photograph` of the steps'
+            photographs, and `pixels_left_out`, by which renders were smaller than these; `pairs` of
+            a pixel and a Gaussian, `pairs_visible` of a pixel and a visible Gaussian, and
+            `pairs_in_tiles` (`Render.tile_evaluations`); `sh_coefficients` that visible Gaussians
+            have, and `sh_coefficients_left_out` of bands that were not on.
+        """
+        return {"views": len(self.views)} | dict(self.counts)
+
+    def state_dict(self) -> State:
+        """Return everything counted so far."""
+        return {"counts": dict(self.counts), "views": sorted(self.views)}
+
+    def load_state_dict(self, state: State) -> None:
+        """Continue from a state that `state_dict` returned.
+
+        Args:
+            state: From a run of the same config and data.
+
+        Raises:
+            KeyError: An entry is missing.
+            TypeError: An entry is of another type.
+            ValueError: The counts are not pairs.
+        """
+        self.counts = Counter(state["counts"])
+        self.views = set(state["views"])
