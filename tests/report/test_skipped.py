@@ -114,7 +114,7 @@ def test_an_ablation_without_its_baseline_is_listed(made: Any) -> None:
     report = build(made.store.path, pictures=[])
     assert "What each run left out" in (report.folder / "table.md").read_text()
     text = (report.folder / "skipped.csv").read_text()
-    assert ",lean,,0,pixels,2000.0,0.2," in text
+    assert ",lean,,0,0,pixels,2000.0,0.2," in text
 
 
 @pytest.mark.parametrize("work", [[], "x", {"views": "many"}, {"pairs": True}, 5])

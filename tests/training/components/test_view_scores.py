@@ -51,7 +51,7 @@ def fine(views: dict[str, LoadedView]) -> list[LoadedView]:
 
 
 def renderer_of(parts: Components) -> StepRenderer:
-    recorder = TrainingRecorder(30_000, 0.0)
+    recorder = TrainingRecorder(30_000, 0.0, [])
     return StepRenderer(parts, RasterSettings(sh_degree=0), 1000, "torch", recorder)
 
 
