@@ -16,13 +16,13 @@ from xrgs.errors import XrgsError
 from xrgs.training import plugins
 from xrgs.training.components.base import (
     Component,
-    Components,
     Step,
     TrainingSetup,
     TrainingView,
     ViewRenderer,
     check_not_negative,
 )
+from xrgs.training.components.combined import Components
 from xrgs.training.components.consistency import Consistency
 from xrgs.training.components.curriculum import Curriculum
 from xrgs.training.components.densify import Densify
