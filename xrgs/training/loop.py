@@ -36,6 +36,8 @@ if TYPE_CHECKING:
     from xrgs.capture.dataset import Dataset
     from xrgs.config import Conf, SplatConf
     from xrgs.splat.cameras import Camera
+    from xrgs.splat.loss import Target
+    from xrgs.splat.rasterize import Render
     from xrgs.training.components import Component, Step, TrainingView
 
     #: Scores of Gaussians by name; None where one is not available.
@@ -110,6 +112,10 @@ class _Views:
         }
         self.present = views
 
+    def target(self, step: Step) -> Target:
+        """Return what the loss needs of the photograph of the step's view."""
+        return self.targets[step.view.name]
+
 
 @dataclass(frozen=True)
 class _Run:
@@ -146,69 +152,92 @@ class _Run:
         return scores
 
 
+@dataclass(frozen=True)
+class _Forward:
+    """What the forward pass of a step gave."""
+
+    camera: Camera
+    """The camera of the render."""
+    sh_degree: int
+    """Highest band of the spherical harmonics that was rendered."""
+    means2d_offset: Tensor
+    """[N, 2] zeros; its gradient is the image-plane gradient that densification reads."""
+    render: Render
+    loss: Tensor
+    """Scalar."""
+
+
 def _run_steps(run: _Run, checkpoint: Checkpoint, evaluate: Evaluate | None) -> None:
-    ssim, backend, renderer = run.splat.ssim_weight, run.backend, run.renderer
-    components, optimizer, densifier = run.components, run.optimizer, run.densifier
-    sampler, recorder, gaussians = run.sampler, run.recorder, run.optimizer.gaussians
+    components, sampler, recorder = run.components, run.sampler, run.recorder
+    gaussians = run.optimizer.gaussians
     for sampled in progress(sampler, "training", "step", run.steps, done=sampler.next_step):
         run.views.change_to(components.training_views(run.views.own, sampled))
         step = replace(sampled, view=run.views.present[sampled.view.name])
-        view, camera = step.view, components.render_camera(step.view.camera, step)
-        sh_degree = renderer.sh_degree(step)
-        # The gradient of the offset is for densification.
-        means2d_offset = torch.zeros(len(gaussians), 2, requires_grad=True)
-        with run.memory.of_forward(step, len(gaussians), sh_degree):
-            # Render the view of this step.
-            render = renderer.render(gaussians, step, camera, means2d_offset)
-            # Loss: L1 and SSIM against the photograph, then terms and weights of the components.
-            image = components.to_photograph(render.image, step)
-            target, weights = run.views.targets[view.name], components.pixel_weights(step)
-            loss = photometric_loss(
-                image, target, l1=1 - ssim, ssim=ssim, pixel_weight=weights, backend=backend
-            )
-            loss = components.modify_loss(loss, image, gaussians, step)
+        forward = _forward(run, step)
         recorder.lap("forward")
         # Update the Gaussians, and record the step while its gradients and buffers still exist.
-        if components.needs_backward(loss, step):
-            _update(run, step, loss, camera, sh_degree)
-            run.memory.record(render)
+        if components.needs_backward(forward.loss, step):
+            _update(run, step, forward)
+            run.memory.record(forward.render)
         else:
-            optimizer.skip_step()
+            run.optimizer.skip_step()
             recorder.record_skipped("backward")
-        recorder.record_step(step, loss, render, gaussians, sh_degree)
-        # Densify, prune and reset. There is no gradient without a backward pass, nor where the
-        # render shows no Gaussian.
-        grad2d, size = means2d_offset.grad, {"width": camera.width, "height": camera.height}
-        if grad2d is not None:
-            grad2d = components.densification_grad2d(grad2d, step)
-        refinement = densifier.after_step(
-            step.number,
-            grad2d,
-            render.visible,
-            **size,
-            group=view.tag,
-            hooks=components.densifier_hooks(step),
-        )
-        if refinement != Refinement():
-            components.on_gaussians_changed(gaussians)
-        refinement = _prune_by_components(run, step, refinement)
-        recorder.record_refinement(refinement)
+        recorder.record_step(step, forward.loss, forward.render, gaussians, forward.sh_degree)
+        recorder.record_refinement(_densify(run, step, forward))
         # Evaluate and write a checkpoint where one is due, which is no training time.
         if evaluate is not None and run.evaluates_after(step.number):
             recorder.record_scores(step.number + 1, len(gaussians), run.score(evaluate))
         recorder.exclude_time(checkpoint.save_if_due(step.number))
 
 
-def _update(run: _Run, step: Step, loss: Tensor, camera: Camera, sh_degree: int) -> None:
+def _forward(run: _Run, step: Step) -> _Forward:
+    """Render the view of a step, and compute the loss against its photograph."""
+    components, gaussians, ssim = run.components, run.optimizer.gaussians, run.splat.ssim_weight
+    camera = components.render_camera(step.view.camera, step)
+    sh_degree = run.renderer.sh_degree(step)
+    means2d_offset = torch.zeros(len(gaussians), 2, requires_grad=True)
+    with run.memory.of_forward(step, len(gaussians), sh_degree):
+        render = run.renderer.render(gaussians, step, camera, means2d_offset)
+        # Loss: L1 and SSIM against the photograph, then terms and weights of the components.
+        image, target = components.to_photograph(render.image, step), run.views.target(step)
+        weights = components.pixel_weights(step)
+        loss = photometric_loss(
+            image, target, l1=1 - ssim, ssim=ssim, pixel_weight=weights, backend=run.backend
+        )
+        loss = components.modify_loss(loss, image, gaussians, step)
+    return _Forward(camera, sh_degree, means2d_offset, render, loss)
+
+
+def _update(run: _Run, step: Step, forward: _Forward) -> None:
     """Backward, the components' changes of the gradients, then the optimizer's step."""
     run.optimizer.zero_grad()
-    torch.autograd.backward(loss)
+    torch.autograd.backward(forward.loss)
     run.components.after_backward(run.optimizer.gaussians, step)
     run.recorder.lap("backward")
     if not run.optimizer.moves_harmonics:
         run.recorder.record_skipped("shN")
-    run.optimizer.step(camera, sh_degree=sh_degree)
+    run.optimizer.step(forward.camera, sh_degree=forward.sh_degree)
     run.recorder.lap("optimizer")
+
+
+def _densify(run: _Run, step: Step, forward: _Forward) -> Refinement:
+    """Densify, prune and reset; return the counts of what was done."""
+    # There is no gradient without a backward pass, nor where the render shows no Gaussian.
+    grad2d, camera = forward.means2d_offset.grad, forward.camera
+    if grad2d is not None:
+        grad2d = run.components.densification_grad2d(grad2d, step)
+    refinement = run.densifier.after_step(
+        step.number,
+        grad2d,
+        forward.render.visible,
+        width=camera.width,
+        height=camera.height,
+        group=step.view.tag,
+        hooks=run.components.densifier_hooks(step),
+    )
+    if refinement != Refinement():
+        run.components.on_gaussians_changed(run.optimizer.gaussians)
+    return _prune_by_components(run, step, refinement)
 
 
 def _prune_by_components(run: _Run, step: Step, refinement: Refinement) -> Refinement:
