@@ -17,6 +17,7 @@ from xrgs.errors import StoreError
 from xrgs.evaluation.metrics import VIEW_METRICS
 from xrgs.experiment.store import BASELINE
 from xrgs.report.render import TextTable, titled
+from xrgs.report.training import CELL_KEYS
 from xrgs.safeio.records import as_number, read_table
 
 if TYPE_CHECKING:
@@ -24,7 +25,6 @@ if TYPE_CHECKING:
 
     from xrgs.experiment.cell_folder import CellFolder
 
-_CELL = ["cell_id", "scene", "label", "condition", "variant_seed", "seed"]
 _AMOUNTS = ["step", "seconds", "evaluations", "gaussians"]
 #: Columns of `quality.csv`: steps done, time and alpha evaluations so far, Gaussians, mean scores.
 COLUMNS = [*_AMOUNTS, *VIEW_METRICS]
@@ -71,10 +71,10 @@ def joined(
         of_cells: What `cell_curve` returns for each cell that is done, by its id.
 
     Returns:
-        One row for each evaluation: `cell_id`, `scene`, `label`, `condition`, `seed`, and
-        `COLUMNS`, in the order of the cells and of the steps.
+        One row for each evaluation: `cell_id`, `scene`, `label`, `condition`, `variant_seed`,
+        `seed`, and `COLUMNS`, in the order of the cells and of the steps.
     """
-    done = cells.loc[cells["state"] == "done", _CELL].drop_duplicates()
+    done = cells.loc[cells["state"] == "done", CELL_KEYS].drop_duplicates()
     rows = [
         {"cell_id": cell_id, **row}
         for cell_id, curve in of_cells.items()
@@ -160,25 +160,25 @@ def times(
 
     Returns:
         One row for each cell that was evaluated during training and whose baseline is done:
-        `cell_id`, `scene`, `label`, `condition`, `seed`, `target` (the baseline's final PSNR of
-        this scene and seed, dB), `seconds` and `evaluations` until the mean PSNR of the test views
-        first is that, and their `seconds_share` and `evaluations_share` of the baseline's totals;
-        NaN where it is not reached.
+        the keys of the cell, `target` (the baseline's final PSNR of this scene and replicate, dB),
+        `seconds` and `evaluations` until the mean PSNR of the test views first is that, and their
+        `seconds_share` and `evaluations_share` of the baseline's totals; NaN where it is not
+        reached.
     """
     rows = []
-    for _, cell in cells[cells["state"] == "done"].drop_duplicates(_CELL).iterrows():
+    for _, cell in cells[cells["state"] == "done"].drop_duplicates(CELL_KEYS).iterrows():
         baseline = cell["cell_id"] if cell["label"] == BASELINE else cell["baseline_id"]
         curve, of_baseline = of_cells[cell["cell_id"]], of_cells.get(baseline)
         if len(curve) == 1 or not of_baseline or math.isnan(of_baseline[-1]["psnr"]):
             continue
         end = of_baseline[-1]
-        row = dict(cell[_CELL]) | {"target": end["psnr"]}
+        row = dict(cell[CELL_KEYS]) | {"target": end["psnr"]}
         for name in ("seconds", "evaluations"):
             quality, amounts = ([at[key] for at in curve] for key in ("psnr", name))
             row[name] = first_reaches(quality, amounts, end["psnr"])
             row[f"{name}_share"] = row[name] / end[name] if end[name] else math.nan
         rows.append(row)
-    return pd.DataFrame(rows, columns=[*_CELL, "target", *_ROWS])
+    return pd.DataFrame(rows, columns=[*CELL_KEYS, "target", *_ROWS])
 
 
 #: The rows of a table for each column of `times`: name, and factor and format of the number.
@@ -219,7 +219,7 @@ def table(found: pd.DataFrame, labels: Sequence[str], condition: str) -> TextTab
         align="ll" + "r" * len(labels),
         notes=(
             "until the mean PSNR of the test views first is the baseline's final one of the same"
-            " scene and seed, linear between two evaluations; mean over the runs of a scene",
+            " scene and replicate, linear between two evaluations; mean over the runs of a scene",
             "one that reaches it before the first evaluation has the time of that one",
         ),
     )

@@ -13,6 +13,7 @@ import pandas as pd
 
 from xrgs.experiment.store import BASELINE
 from xrgs.report.render import TextTable, titled
+from xrgs.report.training import CELL_KEYS
 from xrgs.safeio.records import as_number
 
 if TYPE_CHECKING:
@@ -20,7 +21,6 @@ if TYPE_CHECKING:
 
     from xrgs.experiment.cell_folder import CellFolder
 
-_CELL = ["cell_id", "scene", "label", "condition", "variant_seed", "seed"]
 _NUMBERS = ["number", "share", "cost", "cost_share"]
 #: Counts of a history that begin so are of steps that left something out.
 _PREFIX = "skipped_"
@@ -112,12 +112,12 @@ def skipped(cells: pd.DataFrame, of_cells: Mapping[str, Mapping[str, float]]) ->
 
     Returns:
         One row for each cell and kind of work of which the counts are known: `cell_id`, `scene`,
-        `label`, `condition`, `seed`, `kind`; the `number` that was left out, and its `share` of
-        what there was; its estimated `cost` in the kind's `unit` (`s` or `evaluations`), and
-        `cost_share` of what the run took itself; NaN where it is not known.
+        `label`, `condition`, `variant_seed`, `seed`, `kind`; the `number` that was left out, and
+        its `share` of what there was; its estimated `cost` in the kind's `unit` (`s` or
+        `evaluations`), and `cost_share` of what the run took itself; NaN where it is not known.
     """
     rows = []
-    for _, cell in cells[cells["state"] == "done"].drop_duplicates(_CELL).iterrows():
+    for _, cell in cells[cells["state"] == "done"].drop_duplicates(CELL_KEYS).iterrows():
         work = of_cells[cell["cell_id"]]
         base = cell["cell_id"] if cell["label"] == BASELINE else cell["baseline_id"]
         for kind, number, of, cost in _left_out(work, of_cells.get(base, work)):
@@ -126,11 +126,11 @@ def skipped(cells: pd.DataFrame, of_cells: Mapping[str, Mapping[str, float]]) ->
             unit = _kind(kind).unit
             total = work["seconds" if unit == "s" else "evaluations"]
             rows.append(
-                dict(cell[_CELL])
+                dict(cell[CELL_KEYS])
                 | {"kind": kind, "number": number, "share": number / of, "cost": cost}
                 | {"unit": unit, "cost_share": cost / total if total else math.nan}
             )
-    columns = [*_CELL, "kind", "number", "share", "cost", "unit", "cost_share"]
+    columns = [*CELL_KEYS, "kind", "number", "share", "cost", "unit", "cost_share"]
     return pd.DataFrame(rows, columns=columns)
 
 

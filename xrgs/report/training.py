@@ -19,6 +19,8 @@ if TYPE_CHECKING:
 
     from xrgs.experiment.cell_folder import CellFolder
 
+#: The columns that name a cell in the tables of what cells did.
+CELL_KEYS = ["cell_id", "scene", "label", "condition", "variant_seed", "seed"]
 _LABELS = {
     "steps_HR": "Steps on HR views",
     "steps_LR": "Steps on LR views",
@@ -29,6 +31,8 @@ _LABELS = {
     "pruned_non_finite": "Pruned: not finite",
     "pruned_by_components": "Pruned: by components",
     "reset": "Opacities reset",
+    "skipped_backward": "Steps without a backward pass",
+    "skipped_shN": "Steps that did not move shN",
 }
 #: Columns of a history that describe the logged step alone, not the training up to it.
 _SINGLE_STEP_COLUMNS = frozenset({"step", "view", "loss", "gaussians"})
@@ -42,12 +46,12 @@ def totals(cells: pd.DataFrame, of_cells: Mapping[str, Mapping[str, float]]) -> 
         of_cells: What `cell_totals` returns for each cell that is done, by its id.
 
     Returns:
-        One row for each cell: `cell_id`, `scene`, `label`, `condition`, `seed`, and a column for
-        each count of its history (over the whole training) and each value that a component logged
-        (its mean over training); NaN where a cell has none.
+        One row for each cell: `cell_id`, `scene`, `label`, `condition`, `variant_seed`, `seed`,
+        and a column for each count of its history (over the whole training) and each value that a
+        component logged (its mean over training); NaN where a cell has none.
     """
     done = cells[cells["state"] == "done"].drop_duplicates("cell_id")
-    keys = done[["cell_id", "scene", "label", "condition", "seed"]].reset_index(drop=True)
+    keys = done[CELL_KEYS].reset_index(drop=True)
     return keys.join(pd.DataFrame([of_cells[name] for name in keys["cell_id"]]))
 
 
@@ -107,7 +111,7 @@ def table(totals: pd.DataFrame, labels: Sequence[str], condition: str) -> TextTa
             if any(texts):
                 rows.append((scene, _LABELS.get(name, name.replace("_", " ")), *texts))
     return TextTable(
-        title=titled("What training did, means over the seeds that are done", condition),
+        title=titled("What training did, means over the replicates that are done", condition),
         columns=("Scene", "", *labels),
         rows=tuple(rows),
         align="ll" + "r" * len(labels),
@@ -117,7 +121,7 @@ def table(totals: pd.DataFrame, labels: Sequence[str], condition: str) -> TextTa
 
 def _ordered(totals: pd.DataFrame) -> list[str]:
     """Return the columns of numbers: known ones, then the components', each in their own order."""
-    numbers = [*totals.columns[5:]]
+    numbers = [name for name in totals.columns if name not in CELL_KEYS]
     return sorted(numbers, key=lambda name: (name not in _LABELS, _is_component_log(name)))
 
 
