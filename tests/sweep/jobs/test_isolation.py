@@ -37,7 +37,7 @@ if "xrgs.sweep.jobs.worker" in sys.orig_argv and "cell" in sys.orig_argv:
 
     def raises(*arguments):
         cell = real()
-        def load(*_):
+        def load(*_, **__):
             raise RuntimeError("this cell raises")
         cell.dataset.load = load
         cell.run_cell(*arguments)
