@@ -110,11 +110,11 @@ class NaturalSelection(Component):
         if len(gaussians) <= self.budget:
             self.done = True
             return
-        last = self._last_survivors_opacity(gaussians)
         if self.push == 0:
             self.push = rounded_mean(gradient.abs())
-            self.first_opacity = _START * last
+            self.first_opacity = _START * self._last_survivors_opacity(gaussians)
         elif _is_due(step, _ADJUST_EVERY):
+            last = self._last_survivors_opacity(gaussians)
             goal = self.first_opacity * self._share_left(step)
             if last < (1 - _TOLERANCE) * goal:
                 self.push *= _LESS
