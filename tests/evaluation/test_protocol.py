@@ -100,7 +100,7 @@ def test_render_time_is_the_median_of_renders_after_the_first_of_each_view(
         clock[0] += seconds[view.name].pop(0)
 
     monkeypatch.setattr(protocol, "_render", render)
-    monkeypatch.setattr(protocol.time, "perf_counter", lambda: clock[0])
+    monkeypatch.setattr(time, "perf_counter", lambda: clock[0])
     views = [replace(data.test[0], name=name) for name in seconds]
     time_ms = protocol.render_time(gaussians, views, baseline.splat)
     assert time_ms == pytest.approx(6.0)

@@ -96,7 +96,7 @@ def test_seeds_share_one_composed_config_and_each_cell_is_identified_once(
     seeds = [0, 1, 2]
     plan = made._plan(["+ablation=consistency", f"seed={','.join(map(str, seeds))}"])
     assert [cell.conf.seed for cell in plan] == [0, 0, 1, 1, 2, 2]
-    assert len(made._context.config_loader.composed) == 2
+    assert len(made._context.config_loader.composed) == 2  # type: ignore[attr-defined]
     store = Store(tmp_path / "s")
     store.prepare()
     plan = made._identified([replace(cell, variant_id="v") for cell in plan], store)
