@@ -8,12 +8,24 @@ from dataclasses import asdict
 from typing import Any
 
 import pytest
+from omegaconf import OmegaConf
 
 from xrgs.config import CONF_DIR, Conf
 from xrgs.experiment.identity import cell_identity
 from xrgs.safeio.hashing import digest
+from xrgs.sweep.axes import expand
 
 ABLATIONS = sorted({path.stem for path in (CONF_DIR / "ablation").glob("*.yaml")} - {"baseline"})
+SWEEPS = CONF_DIR / "sweeps" if (CONF_DIR / "sweeps").is_dir() else CONF_DIR.parent / "sweeps"
+#: The ablation whose value each sweep of sensitivity varies, and the number of values beside it.
+SENSITIVITY = {
+    "consistency": ("consistency", 4),
+    "decide": ("densify", 2),
+    "densify": ("densify", 8),
+    "loss_weight": ("loss_weighting", 3),
+    "render_scale": ("render_scale", 3),
+    "scale_gradient": ("gradient_scaling", 3),
+}
 
 Compose = Callable[..., Conf]
 
@@ -85,3 +97,25 @@ def test_ablations_can_be_combined(
     assert delta(combined, baseline) == {key: v for layer in layers for key, v in layer.items()}
     if whole is not None:
         assert combined == composed(f"+ablation={whole}")
+
+
+@pytest.mark.parametrize("name", SENSITIVITY)
+def test_a_sweep_of_sensitivity_varies_one_ablation_around_its_value(
+    name: str, composed: Compose
+) -> None:
+    params = OmegaConf.load(SWEEPS / f"sensitivity_{name}.yaml").hydra.sweeper.params
+    axes = [f"{key}={value}" for key, value in params.items() if key not in {"scene", "seed"}]
+    cells = [composed(*spec.overrides) for spec in expand(axes) if spec.changes]
+    around, others = SENSITIVITY[name]
+    equal = [f"components.densify.lr_{key}=1" for key in ("grow", "prune") if name == "decide"]
+    expected = composed(f"+ablation={around}", *equal)
+    assert sum(cell == expected for cell in cells) == 1
+    assert len({cell_id(cell) for cell in cells}) == len(cells) == others + 1
+    changed = {key.split(".")[1] for cell in cells for key in delta(cell, composed())}
+    assert len(changed) == 1, "one component"
+
+
+def test_every_sweep_of_sensitivity_is_tested() -> None:
+    assert {f"sensitivity_{name}" for name in SENSITIVITY} == {
+        file.stem for file in SWEEPS.glob("sensitivity_*.yaml")
+    }

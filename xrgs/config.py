@@ -349,7 +349,7 @@ class NaturalSelectionConf:
 
 @dataclass
 class CountMatchedConf:
-    """The baseline with as many Gaussians as another cell (`xrgs.training.count_matching`)."""
+    """A cell with as many Gaussians as another one (`xrgs.training.count_matching`)."""
 
     gaussians: int = MISSING
     """The number of Gaussians to reach; 0 is off. A sweep fills it in from the cell of
@@ -411,8 +411,8 @@ class Conf:
     components: ComponentsConf = field(default_factory=ComponentsConf)
     """The components of XR-GS."""
     matched_to: str | None = MISSING
-    """Name of the ablation whose number of Gaussians `components.count_matched` has to reach; None
-    for none."""
+    """The arm whose number of Gaussians `components.count_matched` has to reach: the name of an
+    ablation, several joined by `+`, or `baseline`; None for none."""
     seed: int = MISSING
     """Seed of training: initial rotations, order of the views, positions of split Gaussians."""
     store: str = MISSING

@@ -99,6 +99,8 @@ class Children:
     """Ids of the cells that were trained, in order."""
     failures: dict[int, str] = field(default_factory=dict)
     """The error of cells that fail, by their seed."""
+    unreachable: int | None = None
+    """A number of Gaussians that no count-matched cell reaches."""
     gaussians: int = 100
 
     def run(self, job: str, request: Mapping[str, Any], *_: object) -> dict[str, Any]:
@@ -110,6 +112,8 @@ class Children:
         self.trained.append(folder.id)
         if (seed := request["conf"]["seed"]) in self.failures:
             raise worker.WorkerError(self.failures[seed])
+        if request["conf"]["components"]["count_matched"]["gaussians"] == self.unreachable:
+            raise worker.WorkerError(f"no threshold gave {self.unreachable} Gaussians")
         (folder.path / "scores.csv").write_text("view\na\n")
         summary = {"gaussians": self.gaussians + len(self.trained), "training_time_s": 1.0}
         write_json(folder.path / "summary.json", summary)

@@ -122,6 +122,31 @@ def test_a_cell_that_takes_a_count_from_another_is_trained_after_it(
 
 
 @pytest.mark.slow
+def test_each_arm_and_replicate_has_a_control_and_a_count_out_of_reach_fails_one(
+    sweep_here: SweepHere, children: Any, tmp_path: Path
+) -> None:
+    arms = "consistency,gradient_scaling"
+    arguments = (f"+ablation={arms},count_matched", f"matched_to={arms}", "seed=0,1", *SCENE)
+    # Six baselines and arms come first; the last one trained is gradient_scaling's of seed 1.
+    children.unreachable = children.gaussians + 6
+    assert sweep_here(*arguments)[0] == 1
+    store = Store(tmp_path / "s")
+    rows = {(row["label"], row["seed"]): row["cell_id"] for row in store.sweep_record()["cells"]}
+    assert len(rows) == len(children.trained) == 10
+    missing = []
+    for arm in arms.split(","):
+        for seed in (0, 1):
+            count = store.cell(rows[arm, seed]).summary()["gaussians"]
+            control = store.cell(rows[f"count_matched to {arm}", seed])
+            assert control.identity()["components"]["count_matched"]["gaussians"] == count
+            if control.state().name != "done":
+                missing.append((count, control.state().reason))
+    assert missing == [
+        (children.unreachable, f"no threshold gave {children.unreachable} Gaussians")
+    ]
+
+
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("changes", "done"),
     [
@@ -159,7 +184,7 @@ def test_every_ablation_is_in_a_sweep(sweep_here: SweepHere) -> None:
     for name in ("ablations", "controls"):
         code, _, err = sweep_here(f"+sweeps={name}", "dry_run=true")
         assert code == 0, err
-        planned |= labels(err)
+        planned |= {label.partition(" to ")[0] for label in labels(err)}
     assert planned == {file.stem for file in (CONF_DIR / "ablation").glob("*.yaml")}
 
 

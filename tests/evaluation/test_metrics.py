@@ -128,6 +128,7 @@ def test_the_rows_of_the_tables() -> None:
     better_high = {metric.name: metric.higher_is_better for metric in metrics.METRICS}
     assert better_high == {
         "training_time_s": False,
+        "render_time_ms": False,
         "gaussians": False,
         "memory_bytes": False,
         "peak_rss_bytes": False,
@@ -140,6 +141,7 @@ def test_the_rows_of_the_tables() -> None:
     units = {metric.name: metric.unit for metric in metrics.METRICS if metric.unit}
     assert units == {
         "training_time_s": "s",
+        "render_time_ms": "ms",
         "memory_bytes": "bytes",
         "peak_rss_bytes": "bytes",
         "psnr": "dB",

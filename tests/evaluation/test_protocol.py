@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import time
 from dataclasses import replace
 from pathlib import Path
 
@@ -12,7 +13,7 @@ import torch
 from PIL import Image
 
 from xrgs.capture.dataset import Dataset, LoadedView
-from xrgs.config import Conf
+from xrgs.config import Conf, SplatConf
 from xrgs.evaluation import protocol
 from xrgs.safeio.confined import ConfinedPath
 from xrgs.splat.cameras import Camera
@@ -86,3 +87,33 @@ def test_means_are_those_of_the_views(
     for name in ("psnr", "ssim"):
         assert means[name] == pytest.approx(np.mean([row[name] for row in rows]), rel=1e-12)
     assert means["lpips"] is None
+
+
+def test_render_time_is_the_median_of_renders_after_the_first_of_each_view(
+    gaussians: Gaussians, data: Dataset, baseline: Conf, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    seconds = {"a": [9.0, 0.004], "b": [0.001, 0.5], "c": [7.0, 0.006]}
+    clock = [0.0]
+
+    def render(of: Gaussians, view: LoadedView, conf: SplatConf) -> None:
+        assert (of, conf) == (gaussians, baseline.splat)
+        clock[0] += seconds[view.name].pop(0)
+
+    monkeypatch.setattr(protocol, "_render", render)
+    monkeypatch.setattr(time, "perf_counter", lambda: clock[0])
+    views = [replace(data.test[0], name=name) for name in seconds]
+    time_ms = protocol.render_time(gaussians, views, baseline.splat)
+    assert time_ms == pytest.approx(6.0)
+    assert seconds == {name: [] for name in "abc"}, "each view is rendered twice"
+
+
+def test_render_time_is_that_of_the_render_that_is_scored(
+    gaussians: Gaussians, view: LoadedView, baseline: Conf
+) -> None:
+    """A view of 16 times as many pixels takes longer, and about as long as its render alone."""
+    small = replace(view, camera=replace(view.camera, width=60, height=45))
+    times = [protocol.render_time(gaussians, [v] * 3, baseline.splat) for v in (small, view)]
+    assert times[0] < times[1]
+    start = time.perf_counter()
+    protocol._render(gaussians, view, baseline.splat)
+    assert times[1] < 1e3 * 10 * (time.perf_counter() - start)

@@ -88,6 +88,7 @@ def results(folder: CellFolder) -> dict[str, Any]:
     names = ["splats.ply", "history.csv", "scores.csv"]
     names += [f"renders/{file.name}" for file in sorted((folder.path / "renders").iterdir())]
     summary = folder.summary()
+    assert summary.pop("render_time_ms") > 0
     del summary["training_time_s"], summary["stage_seconds"], summary["peak_rss_bytes"]
     return {name: (folder.path / name).read_bytes() for name in names} | summary
 

@@ -16,6 +16,7 @@ BY_NAME = {metric.name: metric for metric in METRICS}
 #: Whether more of it is better, from the metrics' own papers and common sense, not from the code.
 MORE_IS_BETTER = {
     "training_time_s": False,
+    "render_time_ms": False,
     "gaussians": False,
     "memory_bytes": False,
     "peak_rss_bytes": False,

@@ -7,13 +7,18 @@ from collections.abc import Callable
 from dataclasses import asdict, replace
 from pathlib import Path
 
+import hydra
 import pytest
+from hydra.types import HydraContext
+from omegaconf import DictConfig
 
+from xrgs import config
 from xrgs.config import Conf
 from xrgs.experiment.identity import cell_identity
 from xrgs.experiment.store import Store
 from xrgs.safeio.confined import ConfinedPath
 from xrgs.sweep.session import HandOver, SweepSession
+from xrgs.sweep.study import Study
 
 #: The id of a variant that is not built.
 VARIANT = "0123456789abcdef-0123456789abcdef"
@@ -45,6 +50,34 @@ def sick(monkeypatch: pytest.MonkeyPatch) -> Callable[[str, int], None]:
         monkeypatch.setattr(ConfinedPath, "_open_regular", fail)
 
     return sicken
+
+
+class ConfigLoader:
+    """Composes as Hydra's loader does, and counts."""
+
+    def __init__(self, always: list[str]) -> None:
+        self.always = always
+        self.composed: list[list[str]] = []
+
+    def load_sweep_config(self, _: DictConfig, overrides: list[str]) -> DictConfig:
+        self.composed.append(overrides)
+        with hydra.initialize_config_dir(str(config.CONF_DIR), version_base="1.3"):
+            return hydra.compose("config", [*self.always, *overrides], return_hydra_config=True)
+
+
+@pytest.fixture
+def study(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., Study]:
+    """(*overrides) -> a study in the test's folder, all of whose cells have the overrides."""
+    monkeypatch.chdir(tmp_path)
+
+    def made(*overrides: str) -> Study:
+        config.register()
+        loader = ConfigLoader(list(overrides))
+        with hydra.initialize_config_dir(str(config.CONF_DIR), version_base="1.3"):
+            composed = hydra.compose("config", list(overrides), return_hydra_config=True)
+        return Study(HydraContext(loader, None), len, composed)  # type: ignore[arg-type]
+
+    return made
 
 
 @pytest.fixture

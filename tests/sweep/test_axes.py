@@ -47,10 +47,21 @@ def test_a_cell_has_the_overrides_of_its_combination() -> None:
     assert cell.overrides == ["seed=3", "train.steps=10", "+ablation=consistency"]
 
 
-def test_a_count_to_match_is_a_change_of_the_program() -> None:
-    baseline, cell = expand(["matched_to=xrgs"])
-    assert (baseline.label, baseline.shared) == (BASELINE, ())
-    assert (cell.label, cell.changes) == ("matched_to=xrgs", ("matched_to=xrgs",))
+def test_a_count_to_match_is_a_change_of_the_program_and_no_part_of_its_label() -> None:
+    baseline, *cells = expand(["+ablation=count_matched", "matched_to=plus,lean"])
+    assert (baseline.label, baseline.shared, baseline.matched_to) == (BASELINE, (), None)
+    assert [cell.label for cell in cells] == ["count_matched"] * 2
+    assert [cell.matched_to for cell in cells] == ["plus", "lean"]
+    for cell in cells:
+        assert cell.shared == ()
+        assert cell.without_match.changes == ("+ablation=count_matched",)
+
+
+@pytest.mark.parametrize("ablation", [[], ["+ablation=baseline"]])
+def test_a_baseline_without_its_count_to_match_is_the_baseline(ablation: list[str]) -> None:
+    baseline, matched = expand([*ablation, "matched_to=plus", "seed=1"])
+    assert matched.matched_to == "plus"
+    assert matched.without_match == baseline
 
 
 def test_each_seed_and_scene_has_a_baseline_of_its_own() -> None:

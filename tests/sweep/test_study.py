@@ -10,12 +10,10 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 
-import hydra
 import pytest
 from hydra.core.plugins import Plugins
 from hydra.core.utils import JobReturn, JobStatus
 from hydra.errors import CompactHydraException
-from hydra.types import HydraContext
 from omegaconf import DictConfig
 
 from xrgs import config
@@ -55,20 +53,6 @@ class Launcher:
         return [raised, *[stopped] * (len(jobs) - 1)]
 
 
-@pytest.fixture
-def study(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., Study]:
-    """(*overrides) -> a study in the test's folder."""
-    monkeypatch.chdir(tmp_path)
-
-    def made(*overrides: str) -> Study:
-        config.register()
-        with hydra.initialize_config_dir(str(config.CONF_DIR), version_base="1.3"):
-            composed = hydra.compose("config", list(overrides), return_hydra_config=True)
-        return Study(HydraContext(None, None), len, composed)  # type: ignore[arg-type]
-
-    return made
-
-
 @pytest.mark.parametrize(
     ("reason", "fail_fast", "said"),
     [
@@ -105,27 +89,14 @@ def test_a_sweep_that_starts_nothing_more_says_why(
     assert lines == ([f"no further cell is started: {said}"] if said else [])
 
 
-class ConfigLoader:
-    """Composes as Hydra's loader does, and counts."""
-
-    def __init__(self) -> None:
-        self.composed: list[list[str]] = []
-
-    def load_sweep_config(self, _: DictConfig, overrides: list[str]) -> DictConfig:
-        self.composed.append(overrides)
-        with hydra.initialize_config_dir(str(config.CONF_DIR), version_base="1.3"):
-            return hydra.compose("config", overrides, return_hydra_config=True)
-
-
 def test_seeds_share_one_composed_config_and_each_cell_is_identified_once(
     study: Callable[..., Study], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    made, loader = study(), ConfigLoader()
-    made._context = HydraContext(loader, None)  # type: ignore[arg-type]  # all that a study calls
+    made = study()
     seeds = [0, 1, 2]
     plan = made._plan(["+ablation=consistency", f"seed={','.join(map(str, seeds))}"])
     assert [cell.conf.seed for cell in plan] == [0, 0, 1, 1, 2, 2]
-    assert len(loader.composed) == 2
+    assert len(made._context.config_loader.composed) == 2  # type: ignore[attr-defined]
     store = Store(tmp_path / "s")
     store.prepare()
     plan = made._identified([replace(cell, variant_id="v") for cell in plan], store)
@@ -142,8 +113,7 @@ def test_seeds_share_one_composed_config_and_each_cell_is_identified_once(
 def test_a_seed_that_other_values_depend_on_is_composed_for_each(
     study: Callable[..., Study],
 ) -> None:
-    made, loader = study(), ConfigLoader()
-    made._context = HydraContext(loader, None)  # type: ignore[arg-type]  # all that a study calls
+    made = study()
     plan = made._plan(["seed=3,4", "variant.seed=${seed}"])
     assert [cell.conf.variant.seed for cell in plan] == [3, 4]
     assert [cell.name.partition(" / ")[2] for cell in plan] == [
@@ -168,7 +138,6 @@ def test_a_condition_says_where_scores_are_of_held_out_training_views(
     study: Callable[..., Study], fixed: str, conditions: set[str]
 ) -> None:
     made = study()
-    made._context = HydraContext(ConfigLoader(), None)  # type: ignore[arg-type]
     matched = ("+ablation=count_matched", "matched_to=gradient_scaling")
     plan = made._plan([*matched, fixed])
     assert {cell.spec.condition for cell in plan} == conditions

@@ -200,6 +200,22 @@ def test_the_matched_run_is_the_plain_run_with_its_threshold(
     assert same(train_cell(data, short).gaussians, matched.gaussians)
 
 
+def test_more_gaussians_than_growing_can_give_are_an_error_that_names_what_it_gave(
+    data: Dataset, short: Conf
+) -> None:
+    short.train.steps = 20
+    short.components.count_matched.gaussians = 10**6
+    with pytest.raises(XrgsError, match=r"gaussians=1000000: no value of splat\.densify") as raised:
+        train_cell(data, short)
+    tried = [
+        text.split(": ") for text in str(raised.value).partition("Gaussians): ")[2].split(", ")
+    ]
+    thresholds = [float(threshold) for threshold, _ in tried]
+    assert thresholds == sorted(thresholds, reverse=True)
+    assert len(tried) == 10
+    assert all(0 < int(count) < 10**6 for _, count in tried)
+
+
 def test_one_training_does_not_read_the_count(
     data: Dataset, short: Conf, same: Callable[[Gaussians, Gaussians], bool]
 ) -> None:

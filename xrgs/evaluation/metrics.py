@@ -120,7 +120,7 @@ class Metric:
     label: str
     """The name shown in tables."""
     unit: str
-    """`s`, `bytes`, `dB`, or empty for a number without a unit."""
+    """`s`, `ms`, `bytes`, `dB`, or empty for a number without a unit."""
     higher_is_better: bool
     score: Callable[[Tensor, Tensor], float | None] | None = None
     """The function that scores a render and its photograph, both [H, W, 3] in 0..1; None for a
@@ -129,6 +129,7 @@ class Metric:
 
 METRICS = (
     Metric("training_time_s", "Training time", "s", higher_is_better=False),
+    Metric("render_time_ms", "Render time", "ms", higher_is_better=False),
     Metric("gaussians", "Gaussians", "", higher_is_better=False),
     Metric("memory_bytes", "Memory", "bytes", higher_is_better=False),
     Metric("peak_rss_bytes", "Peak RSS", "bytes", higher_is_better=False),

@@ -67,6 +67,7 @@ def _train_and_score(conf: Conf, variant: Variant, folder: CellFolder) -> list[s
     write_text(folder.folder / "history.csv", table_text(trained.history), durable=False)
     if trained.scores:
         write_text(folder.folder / "quality.csv", table_text(trained.scores), durable=False)
+    render_time_ms = protocol.render_time(trained.gaussians, data.test, conf.splat)
     scores = protocol.score_views(
         trained.gaussians, data.test, conf.splat, folder.folder / "renders"
     )
@@ -75,6 +76,7 @@ def _train_and_score(conf: Conf, variant: Variant, folder: CellFolder) -> list[s
         folder.folder / "summary.json",
         {
             "training_time_s": trained.seconds,
+            "render_time_ms": render_time_ms,
             "gaussians": len(trained.gaussians),
             "memory_bytes": trained.memory_bytes,
             "peak_rss_bytes": peak_rss_bytes,

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import itertools
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 from hydra.core.override_parser.overrides_parser import OverridesParser
@@ -22,14 +22,28 @@ class CellSpec:
     """One combination of the command line's axes."""
 
     label: str
-    """What is compared: the ablation, and component values that were set by hand."""
+    """What is compared: the ablation, component values that were set by hand, and the ablation
+    that it takes a number of Gaussians from."""
     condition: str
     """Values of the other swept axes, except scene and replicate; equal for a label and its
     baseline. A replicate is a pair of `variant.seed`, which draws the HR views, and `seed`."""
     shared: tuple[str, ...]
     """Overrides that the matching baseline has too."""
     changes: tuple[str, ...]
-    """Overrides that make this another program than the baseline."""
+    """Overrides that make this another program than the baseline; `matched_to` is among them only
+    where the ablation takes a number of Gaussians from another cell."""
+
+    @property
+    def matched_to(self) -> str | None:
+        """The `matched_to` among the changes; None if there is none."""
+        found = [text.partition("=")[2] for text in self.changes if _name(text) == "matched_to"]
+        return found[0] if found else None
+
+    @property
+    def without_match(self) -> CellSpec:
+        """The combination without `matched_to`; that of the baseline has no changes left."""
+        kept = tuple(text for text in self.changes if _name(text) != "matched_to")
+        return replace(self, changes=() if self.label == BASELINE else kept)
 
     @property
     def overrides(self) -> list[str]:
@@ -67,8 +81,9 @@ def expand(arguments: Sequence[str]) -> list[CellSpec]:
             if _is_change(name_of[key])
         )
         specs[CellSpec(BASELINE, condition, shared, ())] = None
-        if label != BASELINE:
-            specs[CellSpec(label, condition, shared, changes)] = None
+        spec = CellSpec(label, condition, shared, changes)
+        if label != BASELINE or spec.matched_to is not None:
+            specs[spec] = None
     return list(specs)
 
 
@@ -80,6 +95,11 @@ def _values(override: Override) -> list[str]:
     if not override.is_discrete_sweep():
         raise XrgsError(f"{override.input_line}: an axis must be a list of values")
     return [f"{key}={value}" for value in override.sweep_string_iterator()]
+
+
+def _name(text: str) -> str:
+    """Return the key of an override, without what stands before it in Hydra's grammar."""
+    return text.partition("=")[0].lstrip("+~")
 
 
 def _is_change(name: str) -> bool:
@@ -94,10 +114,12 @@ def _is_condition(name: str) -> bool:
 
 
 def _label(changes: Iterable[tuple[str, str]]) -> str:
+    """Return what changes as text; `matched_to` joins it where it turns out to have a meaning."""
     parts = [
         value.strip("[]").replace(",", "+").replace(" ", "").replace("'", "")
         if key == "ablation"
         else f"{key.removeprefix('components.')}={value}"
         for key, value in changes
+        if key != "matched_to"
     ]
     return " ".join(part for part in parts if part) or BASELINE

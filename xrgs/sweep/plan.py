@@ -56,9 +56,17 @@ class PlannedCell:
 
     @property
     def reference(self) -> CellSpec | None:
-        """The cell whose number of Gaussians this one is to match; None if there is none."""
-        name = self.conf.matched_to
-        return replace(self.spec, label=name, changes=(f"+ablation={name}",)) if name else None
+        """The cell whose number of Gaussians this one is to match; None if there is none.
+
+        It has this cell's scene, replicate and condition. Its label is the name of an ablation, the
+        names of several joined by `+`, or `baseline`.
+        """
+        label = self.conf.matched_to
+        if label is None:
+            return None
+        names = label.replace("+", ",")
+        changes = (f"+ablation={names if names == label else f'[{names}]'}",)
+        return replace(self.spec, label=label, changes=() if label == BASELINE else changes)
 
     @property
     def unknown(self) -> bool:
@@ -72,10 +80,11 @@ class PlannedCell:
 
 
 def planned(spec: CellSpec, conf: Conf) -> PlannedCell:
-    """Return a cell whose condition says which views are scored, where they are no test views.
+    """Return a cell whose names say what its config has and its combination of axes does not.
 
-    The value that is fixed for a whole sweep is said too, so that no table or figure of scores of
-    held-out training views is taken for one of test views.
+    The label says which cell's number of Gaussians is matched. The condition says which views are
+    scored, where they are no test views, even if that is fixed for a whole sweep: so no table or
+    figure of scores of held-out training views is taken for one of test views.
 
     Args:
         spec: The cell's combination of axes.
@@ -85,6 +94,8 @@ def planned(spec: CellSpec, conf: Conf) -> PlannedCell:
     if conf.train.validation and key not in spec.condition:
         condition = f"{spec.condition} {key}{conf.train.validation}".lstrip()
         spec = replace(spec, condition=condition)
+    if conf.matched_to is not None:
+        spec = replace(spec, label=f"{spec.label} to {conf.matched_to}")
     return PlannedCell(spec, conf)
 
 

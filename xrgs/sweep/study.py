@@ -32,7 +32,7 @@ from xrgs.runtime.streams import say
 from xrgs.safeio.confined import is_passing
 from xrgs.safeio.hashing import digest, to_plain
 from xrgs.safeio.words import for_line
-from xrgs.sweep import launch, locks, presence, variants
+from xrgs.sweep import controls, launch, locks, presence, variants
 from xrgs.sweep.axes import CellSpec, expand
 from xrgs.sweep.estimate import RuntimeEstimator
 from xrgs.sweep.jobs import worker
@@ -127,8 +127,8 @@ class Study:
         plan = self._identified(plan, store)
         plan = estimated(plan, RuntimeEstimator(store))
         say(describe(plan), sys.stderr)
-        if slow := without_kernels(plan):
-            log_line(slow)
+        for line in filter(None, (*controls.mixed_prune_rules(plan), without_kernels(plan))):
+            log_line(line)
         to_train = any(cell.state.name != "done" and not cell.unknown for cell in plan)
         if to_train and weights.find_weights() is None:
             log_line(
@@ -187,15 +187,32 @@ class Study:
                 time.sleep(_POLL_S)
 
     def _plan(self, arguments: Sequence[str]) -> list[PlannedCell]:
-        """Return every cell that is asked for, each after the cell that it takes a count from."""
+        """Return every cell that is asked for, each after the cell that it takes a count from.
+
+        Raises:
+            XrgsError: `matched_to` has no effect, or names a cell whose count can't be known.
+        """
         plan: dict[CellSpec, PlannedCell] = {}
-        for spec in expand(arguments):
+        combinations = expand(arguments)
+        for spec in dict.fromkeys(map(self._with_effective_match, combinations)):
             cell = planned(spec, self._compose(spec))
             if cell.reference is not None:
                 reference = planned(cell.reference, self._compose(cell.reference))
+                controls.check_reference(cell, reference)
                 plan.setdefault(cell.reference, reference)
             plan.setdefault(cell.spec, cell)
+        controls.check_effect(combinations, plan.values())
         return list(plan.values())
+
+    def _with_effective_match(self, spec: CellSpec) -> CellSpec:
+        """Return the combination, without `matched_to` where its ablation matches no count.
+
+        An ablation that does has a `matched_to` of its own, which that of the command line changes.
+        """
+        alone = spec.without_match
+        if alone == spec or self._compose(alone).matched_to is not None:
+            return spec
+        return alone
 
     def _identified(self, plan: Sequence[PlannedCell], store: Store) -> list[PlannedCell]:
         """Return the cells with their counts, identities and states, as far as they are known."""
@@ -223,6 +240,9 @@ class Study:
 
     def _compose(self, spec: CellSpec) -> Conf:
         """Return a cell's config. Seeds share one: composing takes Hydra tens of milliseconds."""
+        whole = tuple(spec.overrides)
+        if whole in self._composed:
+            return self._composed[whole]
         seeds = [seed[1] for text in spec.overrides if (seed := _SEED.fullmatch(text))]
         others = tuple(text for text in spec.overrides if not _SEED.fullmatch(text))
         known = self._composed.get(others)
@@ -231,8 +251,8 @@ class Study:
         composed = self._context.config_loader.load_sweep_config(self._config, spec.overrides)
         launch.check(self._config, composed)
         conf = to_conf(composed)
-        if "${seed" not in str(OmegaConf.to_container(composed, resolve=False)):
-            self._composed[others] = conf
+        follows_seed = "${seed" in str(OmegaConf.to_container(composed, resolve=False))
+        self._composed[whole if follows_seed else others] = conf
         return conf
 
     def _with_variants(

@@ -170,7 +170,7 @@ def contents(cell: Path) -> dict[str, tuple[int, ...]]:
 def results(cell: Path) -> dict[str, Any]:
     """All that a cell gives but where its store is, times and this machine's memory."""
     summary = json.loads((cell / "summary.json").read_text())
-    for name in ("training_time_s", "stage_seconds", "peak_rss_bytes"):
+    for name in ("training_time_s", "stage_seconds", "render_time_ms", "peak_rss_bytes"):
         del summary[name]
     names = sorted(json.loads((cell / "status.json").read_text())["files"])
     told = {"config.json", "provenance.json", "summary.json"}
