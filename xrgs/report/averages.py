@@ -48,7 +48,8 @@ def averaged(pairs: pd.DataFrame, ratios: Collection[str]) -> tuple[pd.DataFrame
     means, scenes = _with_interval(means), _with_interval(scenes)
     by_condition = means.groupby("condition")["p"]
     means["q"] = by_condition.transform(lambda p: false_discovery_rates(p.to_numpy(np.float64)))
-    return tuple(_in_percent(_with_agreement(table, pairs), ratios) for table in (scenes, means))
+    scenes, means = _with_agreement(scenes, pairs), _with_agreement(means, pairs)
+    return _in_percent(scenes, ratios), _in_percent(means, ratios)
 
 
 def _means(rows: pd.DataFrame, by: list[str]) -> pd.DataFrame:

@@ -213,8 +213,8 @@ def _pairs(cells: pd.DataFrame, metrics: Sequence[Metric], against: str) -> pd.D
     ablations = cells[(cells["label"] != against) & (cells["state"] == "done")]
     usable = ablations["base_id"].isin(bases.index[bases["state"] == "done"])
     reasons = ablations.loc[~usable, "base_id"].map(bases["reason"].astype(str))
-    why = reasons.fillna("not planned for its scene, condition and replicate")
-    cells.loc[why.index, "reason"] = f"no {against}: " + why.astype(str)
+    reasons = reasons.fillna("not planned for its scene, condition and replicate").astype(str)
+    cells.loc[reasons.index, "reason"] = f"no {against}: " + reasons
     paired = ablations[usable]
     matched = bases.loc[paired["base_id"]]
     parts = []
