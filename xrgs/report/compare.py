@@ -103,10 +103,10 @@ def compare(cells: pd.DataFrame, metrics: Sequence[Metric], against: str = BASEL
 
     Raises:
         ReportError: The sweep has no such label; a cell's baseline is of another scene, variant or
-            seed, or is not in the sweep;
-            cells of one scene, condition and `variant.seed` are of different variants; the cells
-            were scored by different evaluation protocols; or some of a condition were scored on
-            held-out training views and others not. The message names both cells.
+            seed, or is not in the sweep; cells of one scene, condition and `variant.seed` are of
+            different variants; the cells were scored by different evaluation protocols; or some of
+            a condition were scored on held-out training views and others not. The message names
+            both cells, or the labels.
     """
     cells = _with_base(cells, against)
     _check_comparable(cells, against)

@@ -219,7 +219,7 @@ def interval_note(rows: Iterable[Change], *, one_each: bool) -> tuple[str, ...]:
 
 
 def scale_note(comparison: Comparison) -> str:
-    """Say which metrics are compared by ratio and which by difference.
+    """Say which metrics are compared by ratio and which by percentage.
 
     Args:
         comparison: The comparison with the metrics.
@@ -227,7 +227,7 @@ def scale_note(comparison: Comparison) -> str:
     amounts = ", ".join(metric.label for metric in comparison.metrics if is_amount(metric))
     scores = ", ".join(metric.label for metric in comparison.metrics if not is_amount(metric))
     return (
-        f"means and intervals: of log(value / {comparison.base}), turned into %, for {amounts};"
+        f"means, intervals and sd: of log(value / {comparison.base}), turned into %, for {amounts};"
         f" of the change in % for {scores}"
     )
 
