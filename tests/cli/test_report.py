@@ -43,6 +43,20 @@ def test_a_report_has_the_pictures_that_are_named(
     assert "motorcycle--consistency--training" in err
 
 
+@pytest.mark.slow
+def test_a_report_against_another_label_or_none_there_is(
+    run_command: RunCommand, store: Path
+) -> None:
+    arguments = ("report", store.parent, "store=s", "pictures=none")
+    code, out, err = run_command(*arguments, "against=consistency")
+    assert code == 0, err
+    assert "baseline against consistency" in out
+    assert "change from consistency, %" in out
+    code, _, err = run_command(*arguments, "against=gone")
+    assert code == 1
+    assert "against=gone: the sweep has no such label; choose from: baseline, consistency" in err
+
+
 @pytest.mark.parametrize(
     ("arguments", "named"),
     [(["store=gone"], "gone"), (["stroe=x"], "stroe"), (["sweep=nope", "store=s"], "nope")],

@@ -2,32 +2,26 @@
 
 import json
 import math
-from itertools import pairwise
 from typing import Any
 
 import numpy as np
 import pandas as pd
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 from scipy import stats
 
 from xrgs.evaluation.metrics import METRICS
 from xrgs.report.collect import ReportError, read_sweep
-from xrgs.report.compare import (
+from xrgs.report.compare import Comparison, compare, is_amount
+from xrgs.report.inference import (
     NO_ALL_HR,
     NO_GAP,
     NOT_FINITE,
     NOT_MEASURED,
+    NOT_POSITIVE,
     WRONG_GAP,
-    ZERO_BASELINE,
-    Comparison,
-    compare,
-    half_width,
-    percent_change,
-    share_of_gap,
+    ZERO_BASE,
 )
-from xrgs.report.tables import percent
+from xrgs.report.writing import percent
 
 #: Table 1 of the paper: mean change over seven scenes, and the arrow printed beside it.
 TABLE_1 = {
@@ -43,8 +37,17 @@ SCENES = ("fern", "flower", "fortress", "horns", "orchids", "room", "trex")
 SCATTER = (-7.5, 3.25, 0.0, 1.25, -2.0, 4.0, 1.0)
 
 
-def compared(made: Any) -> Comparison:
-    return compare(read_sweep(made.store, made.write(), METRICS).cells, METRICS)
+#: The metrics that are compared by ratio.
+AMOUNTS = {"training_time_s", "gaussians", "memory_bytes", "peak_rss_bytes", "evaluations"}
+
+
+def interval_of(values: Any) -> Any:
+    """Student's 95 % interval of the mean, by scipy."""
+    return stats.ttest_1samp(values, 0).confidence_interval(0.95)
+
+
+def compared(made: Any, against: str = "baseline") -> Comparison:
+    return compare(read_sweep(made.store, made.write(), METRICS).cells, METRICS, against)
 
 
 def mean_of(comparison: Comparison, metric: str, label: str = "consistency") -> Any:
@@ -54,9 +57,11 @@ def mean_of(comparison: Comparison, metric: str, label: str = "consistency") -> 
 def test_the_papers_table_1(made: Any) -> None:
     for number, (scene, off) in enumerate(zip(SCENES, SCATTER, strict=True)):
         size = dict.fromkeys(TABLE_1, 1.0 + number)  # no ratio of means would give the answer
-        change = {
-            name: size[name] * (1 + (mean + off) / 100) for name, (mean, _) in TABLE_1.items()
-        }
+        change = dict(size)
+        for name, (mean, _) in TABLE_1.items():
+            ratio, percent_off = 1 + mean / 100, off / 100
+            ratio = ratio * math.exp(percent_off) if name in AMOUNTS else ratio + percent_off
+            change[name] *= ratio
         made.add(scene=scene, factors=size)
         made.add("xrgs", scene=scene, factors=change)
     comparison = compared(made)
@@ -68,28 +73,40 @@ def test_the_papers_table_1(made: Any) -> None:
         assert row["change"] == pytest.approx(expected, abs=1e-9)
         assert percent(row["change"], metric) == f"{expected:+.2f} {arrow}"
         assert row["n"] == 7
-        per_scene = comparison.per_scene.loc[("xrgs", "", slice(None), metric.name), "change"]
-        wanted = stats.ttest_1samp(per_scene, 0).confidence_interval(0.95)
+        offs = np.array(SCATTER) / 100
+        if metric.name in AMOUNTS:
+            offs += math.log(1 + expected / 100)
+            wanted = [100 * (math.exp(end) - 1) for end in interval_of(offs)]
+        else:
+            wanted = [100 * end for end in interval_of(offs + expected / 100)]
         assert (row["low"], row["high"]) == pytest.approx(wanted, rel=1e-9)
+
+
+def test_times_counts_and_memory_are_compared_by_ratio_and_scores_are_not() -> None:
+    assert {metric.name for metric in METRICS if is_amount(metric)} >= AMOUNTS
+    assert not any(is_amount(metric) for metric in METRICS if metric.name in {*GAP})
 
 
 def test_scenes_count_once_however_many_seeds_they_have(made: Any) -> None:
     for seed, factor in enumerate((1.1, 1.2, 1.3)):
         made.add(seed=seed)
-        made.add("consistency", seed=seed, factors={"gaussians": factor})
+        made.add("consistency", seed=seed, factors={"gaussians": factor, "ssim": factor})
     made.add(scene="room")
-    made.add("consistency", scene="room", factors={"gaussians": 2.0})
-    row = mean_of(compared(made), "gaussians")
+    made.add("consistency", scene="room", factors={"gaussians": 2.0, "ssim": 2.0})
+    comparison = compared(made)
+    row = mean_of(comparison, "ssim")
     assert row["change"] == pytest.approx((20 + 100) / 2)
-    assert (row["n"], row["unit"]) == (2, "scenes")
+    assert (row["n"], row["unit"], row["scenes"]) == (2, "scenes", 2)
+    geometric = math.sqrt((1.1 * 1.2 * 1.3) ** (1 / 3) * 2.0)
+    assert mean_of(comparison, "gaussians")["change"] == pytest.approx(100 * (geometric - 1))
 
 
 def test_one_scene_has_its_interval_over_seeds(made: Any) -> None:
     changes = (-3.0, -1.0, 5.0)
     for seed, change in enumerate(changes):
         made.add(seed=seed)
-        made.add("consistency", seed=seed, factors={"training_time_s": 1 + change / 100})
-    row = mean_of(compared(made), "training_time_s")
+        made.add("consistency", seed=seed, factors={"psnr": 1 + change / 100})
+    row = mean_of(compared(made), "psnr")
     wanted = stats.t.interval(0.95, 2, loc=np.mean(changes), scale=stats.sem(changes))
     assert (row["low"], row["high"]) == pytest.approx(wanted, rel=1e-9)
     assert (row["n"], row["unit"]) == (3, "replicates")
@@ -111,8 +128,8 @@ def test_pairs_are_of_one_seed(made: Any) -> None:
         made.add(seed=seed, factors={"gaussians": size})
     for seed, size in enumerate((1.5, 15.0)):
         made.add("consistency", seed=seed, factors={"gaussians": size})
-    comparison = compared(made)
-    assert list(comparison.pairs.query("metric == 'gaussians'")["change"]) == [50.0, 50.0]
+    pairs = compared(made).pairs.query("metric == 'gaussians'")
+    assert list(pairs["effect"]) == pytest.approx([math.log(1.5)] * 2)
 
 
 def test_conditions_are_compared_apart(made: Any) -> None:
@@ -120,8 +137,8 @@ def test_conditions_are_compared_apart(made: Any) -> None:
         made.add(condition=condition)
         made.add("consistency", condition=condition, factors={"gaussians": factor})
     means = compared(made).means["change"]
-    assert means["consistency", "train.steps=100", "gaussians"] == -50.0
-    assert means["consistency", "train.steps=200", "gaussians"] == 100.0
+    assert means["consistency", "train.steps=100", "gaussians"] == pytest.approx(-50.0)
+    assert means["consistency", "train.steps=200", "gaussians"] == pytest.approx(100.0)
 
 
 def test_a_failed_cell_is_left_out_and_said_to_be(made: Any) -> None:
@@ -130,7 +147,7 @@ def test_a_failed_cell_is_left_out_and_said_to_be(made: Any) -> None:
     made.add(scene="room")
     made.add("consistency", scene="room", factors={"gaussians": 3.0})
     comparison = compared(made)
-    assert mean_of(comparison, "gaussians")["change"] == 200.0
+    assert mean_of(comparison, "gaussians")["change"] == pytest.approx(200.0)
     assert list(comparison.missing()["reason"]) == ["RuntimeError: out of luck"]
 
 
@@ -159,12 +176,13 @@ def test_a_pair_that_is_left_out_does_not_narrow_the_interval(made: Any) -> None
         made.add(scene=scene, values={"gaussians": baseline})
         made.add("consistency", scene=scene, values={"gaussians": baseline * factor + 1})
     row = mean_of(compared(made), "gaussians")
-    changes = (100 * 0.1 + 100 / 100, 100 * 0.5 + 100 / 200)
-    interval = stats.t.interval(0.95, 1, loc=np.mean(changes), scale=stats.sem(changes))
-    assert row["n"] == 2
-    assert row["change"] == pytest.approx(np.mean(changes))
-    assert (row["low"], row["high"]) == pytest.approx(interval, rel=1e-9)
-    assert row["why"] == ZERO_BASELINE
+    logs = np.log([111 / 100, 301 / 200])
+    ends = [100 * (math.exp(end) - 1) for end in interval_of(logs)]
+    assert (row["n"], row["scenes"]) == (2, 2)
+    assert row["change"] == pytest.approx(100 * (math.exp(np.mean(logs)) - 1))
+    assert (row["low"], row["high"]) == pytest.approx(ends, rel=1e-9)
+    assert (row["base"], row["value"]) == pytest.approx((150, 206)), "of the same two pairs"
+    assert row["why"] == ZERO_BASE
 
 
 def test_variants_are_not_mixed(made: Any) -> None:
@@ -211,29 +229,6 @@ def test_a_record_from_before_draws_were_replicates_is_read(made: Any) -> None:
     made.rows.append(late)
     with pytest.raises(ReportError, match="different variants"):
         compared(made)
-
-
-def test_pairs_that_agree_are_counted_by_the_sign_of_the_mean(made: Any) -> None:
-    """Scenes' means are +20 and -5, so the mean is up: 3 of 5 pairs are."""
-    for scene, changes in (("fern", (30.0, 10.0)), ("room", (-9.0, 3.0, -9.0))):
-        for seed, change in enumerate(changes):
-            made.add(scene=scene, seed=seed)
-            factors = {"gaussians": 1 + change / 100, "psnr": 1.0}
-            made.add("consistency", scene=scene, seed=seed, factors=factors)
-    comparison = compared(made)
-    row = mean_of(comparison, "gaussians")
-    assert row["change"] == pytest.approx(7.5)
-    assert (row["agree"], row["pairs"]) == (3, 5)
-    room = comparison.per_scene.xs(("consistency", "", "room", "gaussians"))
-    assert (room["agree"], room["pairs"]) == (2, 3)
-    assert tuple(mean_of(comparison, "psnr")[["agree", "pairs"]]) == (5, 5), "all are unchanged"
-
-
-def test_a_pair_without_a_change_neither_agrees_nor_counts(made: Any) -> None:
-    for seed, lpips in enumerate((None, 0.25)):
-        made.add(seed=seed, values={"lpips": lpips})
-        made.add("consistency", seed=seed, factors={"psnr": 1.1})
-    assert tuple(mean_of(compared(made), "lpips")[["agree", "pairs"]]) == (1, 1)
 
 
 def test_scores_of_held_out_training_views_are_not_mixed_with_scores_of_test_views(
@@ -309,12 +304,6 @@ def test_a_gap_that_is_none_gives_no_share_and_the_reason(
     assert np.isnan(row["change"])
 
 
-def test_less_is_a_gap_where_less_is_better() -> None:
-    args = np.array([0.4]), np.array([0.1]), np.array([0.2])
-    assert share_of_gap(*args, higher_is_better=False)[0] == pytest.approx([150.0])
-    assert share_of_gap(*args, higher_is_better=True)[1] == [WRONG_GAP]
-
-
 def test_a_failed_all_hr_leaves_its_replicate_out(made: Any) -> None:
     add_gap(made)
     made.add(seed=1)
@@ -358,67 +347,6 @@ def test_a_baseline_outside_the_sweep_is_refused(made: Any) -> None:
         compared(made)
 
 
-FLOATS = st.floats(-1e6, 1e6, allow_subnormal=False).filter(lambda x: abs(x) > 1e-6)
-PAIRS = st.lists(st.tuples(FLOATS, FLOATS), min_size=1, max_size=20)
-
-
-@given(PAIRS, st.integers(-40, 40))
-def test_a_percentage_has_no_unit(pairs: list[tuple[float, float]], power: int) -> None:
-    baseline, value = np.array(pairs).T
-    scale = 2.0**power  # exact, so that the result must be too
-    assert np.array_equal(
-        percent_change(baseline, value)[0], percent_change(baseline * scale, value * scale)[0]
-    )
-
-
-@given(st.lists(st.floats(-1e300, 1e300), min_size=1))
-def test_a_baseline_against_itself_is_zero(values: list[float]) -> None:
-    change, why = percent_change(np.array(values), np.array(values))
-    assert np.array_equal(change, np.zeros(len(values)))
-    assert set(why) == {""}
-
-
-@given(FLOATS, FLOATS)
-def test_more_is_a_positive_change_even_below_zero(baseline: float, value: float) -> None:
-    change = percent_change(np.array([baseline]), np.array([value]))[0][0]
-    assert np.sign(change) == np.sign(value - baseline)
-
-
-@pytest.mark.parametrize(
-    ("baseline", "value", "why"),
-    [
-        (0.0, 1.0, ZERO_BASELINE),
-        (0.0, math.inf, NOT_FINITE),
-        (math.nan, 1.0, NOT_MEASURED),
-        (1.0, math.nan, NOT_MEASURED),
-        (math.inf, 1.0, NOT_FINITE),
-        (1.0, math.inf, NOT_FINITE),
-        (math.inf, math.inf, NOT_FINITE),
-        (1e-300, 1e300, NOT_FINITE),
-    ],
-)
-def test_where_there_is_no_percentage_the_reason_is_given(
-    baseline: float, value: float, why: str
-) -> None:
-    change, found = percent_change(np.array([baseline]), np.array([value]))
-    assert math.isnan(change[0])
-    assert list(found) == [why]
-
-
-@given(st.lists(st.floats(-100, 100), min_size=2, max_size=40))
-def test_the_interval_is_scipys(values: list[float]) -> None:
-    spread = float(np.std(values, ddof=1))
-    found = half_width(np.array([spread]), np.array([float(len(values))]))[0]
-    wanted = stats.t.ppf(0.975, len(values) - 1) * spread / math.sqrt(len(values))
-    assert found == pytest.approx(wanted, rel=1e-9)
-
-
-def test_more_values_make_a_narrower_interval() -> None:
-    widths = half_width(np.ones(30), np.arange(1.0, 31.0))
-    assert math.isnan(widths[0])
-    assert all(wide > narrow for wide, narrow in pairwise(widths[1:]))
-
-
 def test_the_arithmetic_does_not_grow_faster_than_the_cells(made: Any) -> None:
     """Ten thousand cells give the numbers that a plain loop gives."""
     rng = np.random.default_rng(0)
@@ -440,3 +368,65 @@ def test_the_arithmetic_does_not_grow_faster_than_the_cells(made: Any) -> None:
     change = 100 * (ablation["psnr"] / base["psnr"] - 1)
     by_scene = [np.mean(change[np.array(scenes) == name]) for name in dict.fromkeys(scenes)]
     assert mean_of(comparison, "psnr", "a")["change"] == pytest.approx(np.mean(by_scene))
+
+
+def test_an_amount_that_falls_to_zero_has_no_ratio(made: Any) -> None:
+    made.add()
+    made.add("consistency", values={"gaussians": 0})
+    assert mean_of(compared(made), "gaussians")["why"] == NOT_POSITIVE
+
+
+def test_another_label_is_the_base_of_its_own_scene_condition_and_replicate(made: Any) -> None:
+    for number, (scene, condition, seed) in enumerate(
+        [("fern", "", 0), ("fern", "", 1), ("room", "", 0), ("fern", "train.steps=9", 0)]
+    ):
+        for label, psnr in (("baseline", 10.0), ("plus", 20.0 + number), ("xrgs", 40.0)):
+            made.add(label, scene=scene, condition=condition, seed=seed, values={"psnr": psnr})
+    comparison = compared(made, "plus")
+    pairs = comparison.pairs.query("metric == 'psnr'")
+    xrgs, baseline = pairs[pairs["label"] == "xrgs"], pairs[pairs["label"] == "baseline"]
+    assert comparison.base == "plus"
+    assert dict.fromkeys(label for label, _ in comparison.groups) == {
+        "baseline": None,
+        "xrgs": None,
+    }
+    assert list(xrgs["base"]) == pytest.approx([20, 21, 22, 23])
+    assert list(baseline["effect"]) == pytest.approx(
+        [100 * (10 / base - 1) for base in (20, 21, 22, 23)]
+    )
+    assert comparison.means.loc[("xrgs", "train.steps=9", "psnr"), "base"] == pytest.approx(23)
+    assert comparison.missing().empty
+
+
+def test_an_unknown_label_names_those_there_are(made: Any) -> None:
+    made.add()
+    made.add("consistency")
+    with pytest.raises(ReportError, match=r"against=plus: .*choose from: baseline, consistency$"):
+        compared(made, "plus")
+
+
+def test_a_cell_whose_base_failed_or_was_not_planned_says_so(made: Any) -> None:
+    made.add()
+    made.add("plus", state="failed")
+    made.add("xrgs")
+    made.add(scene="room")
+    made.add("xrgs", scene="room")
+    made.add_error("trex", "plus")
+    made.add_error("trex", "xrgs")
+    comparison = compared(made, "plus")
+    assert comparison.pairs.empty
+    reasons = comparison.missing().set_index(["scene", "label"])["reason"].to_dict()
+    assert reasons["fern", "xrgs"] == "no plus: RuntimeError: out of luck"
+    assert reasons["fern", "baseline"] == "no plus: RuntimeError: out of luck"
+    assert reasons["room", "xrgs"] == "no plus: not planned for its scene, condition and replicate"
+    assert reasons["trex", "xrgs"] == "trex: 3 of 24 views registered"
+
+
+def test_the_gap_starts_at_the_base(made: Any) -> None:
+    add_gap(made)
+    made.add("plus", values={"psnr": 22.0})
+    gaps = compared(made, "plus").gaps["change"].xs("psnr", level="metric")
+    assert gaps.droplevel("condition").to_dict() == pytest.approx(
+        {"consistency": 50.0, "baseline": -100.0}
+    )
+    assert compared(made, "all_hr").gaps.empty

@@ -242,6 +242,42 @@ def test_a_folder_that_cannot_be_written_is_named(made: Any, tmp_path: Path) -> 
         build(made.store.path, out=tmp_path / "file" / "out")
 
 
+def test_another_base_has_a_report_of_its_own_that_names_it(made: Any) -> None:
+    for label, psnr in (("baseline", 1.0), ("a/b {x}", 1.25), ("c", 1.5)):
+        factors = {"psnr": psnr}
+        curve = "step,seconds,evaluations,gaussians,psnr\n9,1,1,1,30\n"
+        summary = {"steps": 500 - int(100 * psnr), "work": {"views": 10 / psnr}}
+        made.add(label, factors=factors, pictures=True, quality=curve, summary=summary)
+    sweep_id = made.write()
+    plain = build(made.store.path, pictures=[])
+    report = build(made.store.path, against="a/b {x}")
+    assert plain.folder == made.store.path / "reports" / sweep_id
+    assert report.folder.name.startswith(f"{sweep_id}.against-a-b-x-")
+    assert {file.name for file in plain.files} < {file.name for file in report.files}
+    page = (report.folder / "table.md").read_text()
+    assert page.startswith("# Change from a/b \\{x\\}\n")
+    for name in (plain.folder, report.folder):
+        text = (name / "table.md").read_text()
+        assert ("baseline against a/b" in text, "c against baseline" in text) == (
+            (name == report.folder), (name == plain.folder)
+        )  # fmt: skip
+    for title in ("at which a/b \\{x\\} ends", "% of a/b \\{x\\}'s", "c vs a/b \\{x\\}"):
+        assert title in page
+    assert "Steps that a/b \\{x\\} takes" in page
+    drawn = {file.stem for file in report.files if file.suffix == ".png"}
+    assert drawn >= {"trade-off", "time-to-quality", "fern--baseline", "fern--c"}
+    with (report.folder / "table.csv").open(newline="") as stream:
+        rows = [row for row in csv.DictReader(stream) if row["metric"] == "psnr"]
+    changes = {(row["label"], row["against"]): float(row["change_percent"]) for row in rows}
+    assert changes == pytest.approx({("baseline", "a/b {x}"): -20.0, ("c", "a/b {x}"): 20.0})
+
+
+def test_an_unknown_base_is_named_with_those_there_are(study: Any) -> None:
+    study.write()
+    with pytest.raises(ReportError, match=r"against=plus: .*: baseline, consistency"):
+        build(study.store.path, against="plus")
+
+
 def test_an_unknown_sweep_is_named(made: Any) -> None:
     with pytest.raises(StoreError, match="nosuch"):
         build(made.store.path, "nosuch")

@@ -7,91 +7,19 @@ from typing import Any
 
 import pytest
 
-from xrgs.evaluation.metrics import METRICS, Metric
+from tests.report.test_writing import MORE_IS_BETTER
+from xrgs.evaluation.metrics import METRICS
 from xrgs.report.collect import read_sweep
 from xrgs.report.compare import compare
-from xrgs.report.tables import ARROWS_NOTE, Change, Tables, arrow, number, percent, reading, signed
+from xrgs.report.tables import Tables
+from xrgs.report.writing import ARROWS_NOTE, LACKING_NOTE, percent, scale_note
 
 BY_NAME = {metric.name: metric for metric in METRICS}
-#: Whether more of it is better, from the metrics' own papers and common sense, not from the code.
-MORE_IS_BETTER = {
-    "training_time_s": False,
-    "render_time_ms": False,
-    "gaussians": False,
-    "memory_bytes": False,
-    "peak_rss_bytes": False,
-    "lpips": False,
-    "ssim": True,
-    "psnr": True,
-    "evaluations": False,
-}
 
 
-def tables(made: Any) -> Tables:
-    return Tables(compare(read_sweep(made.store, made.write(), METRICS).cells, METRICS))
-
-
-def change(mean: float, low: float = math.nan, high: float = math.nan, why: str = "") -> Change:
-    return Change(1.0, 1.0, mean, 0.0, 0.0, 2, low, high, "replicates", why, 2, 2)
-
-
-@pytest.mark.parametrize("metric", METRICS, ids=lambda metric: metric.name)
-def test_arrows_point_up_where_it_got_better(metric: Metric) -> None:
-    more = MORE_IS_BETTER[metric.name]
-    assert arrow(5.0, metric) == ("↑" if more else "↓")
-    assert arrow(-5.0, metric) == ("↓" if more else "↑")
-    assert arrow(0.0, metric) == "="
-    assert arrow(-0.004, metric) == "="  # what is printed is 0.00
-    assert arrow(math.nan, metric) == " "
-
-
-@pytest.mark.parametrize(
-    ("value", "text"),
-    [(-44.566, "-44.57"), (0.45, "+0.45"), (-0.001, "0.00"), (0.0, "0.00"), (-0.0, "0.00"),
-     (12345.678, "+12,345.68"), (math.nan, "n/a")],
-)  # fmt: skip
-def test_changes_are_signed(value: float, text: str) -> None:
-    assert signed(value) == text
-
-
-@pytest.mark.parametrize(
-    ("value", "unit", "text"),
-    [
-        (83.456, "s", "83.46 s"),
-        (1234.5, "s", "1,234 s"),
-        (123456.0, "", "123,456"),
-        (7.0, "", "7"),
-        (0.81234, "", "0.8123"),
-        (24.0, "dB", "24.00 dB"),
-        (3 * 2**20, "bytes", "3.0 MiB"),
-        (math.inf, "dB", "inf dB"),
-        (math.nan, "dB", "n/a"),
-    ],
-)
-def test_values_have_their_unit(value: float, unit: str, text: str) -> None:
-    assert number(value, unit) == text
-
-
-@pytest.mark.parametrize(
-    ("row", "text"),
-    [
-        (change(5.0), "one replicate: no interval"),
-        (change(5.0, 1.0, 9.0), "better"),
-        (change(-5.0, -9.0, -1.0), "worse"),
-        (change(5.0, -1.0, 11.0), "inside noise"),
-        (change(5.0, 0.0, 10.0), "inside noise"),
-        (change(0.0, 0.0, 0.0), "unchanged"),
-        (change(0.0, -1.0, 1.0), "inside noise"),
-        (change(0.002, 0.001, 0.003), "unchanged"),
-        (change(math.nan, why="not measured"), "n/a: not measured"),
-    ],
-)
-def test_what_an_interval_allows_to_be_said_of_psnr(row: Change, text: str) -> None:
-    assert reading(row, BY_NAME["psnr"]) == text
-
-
-def test_less_gaussians_outside_noise_are_better() -> None:
-    assert reading(change(-5.0, -9.0, -1.0), BY_NAME["gaussians"]) == "better"
+def tables(made: Any, against: str = "baseline") -> Tables:
+    cells = read_sweep(made.store, made.write(), METRICS).cells
+    return Tables(compare(cells, METRICS, against))
 
 
 def test_psnr_has_decibels_beside_its_percentage(made: Any) -> None:
@@ -101,7 +29,7 @@ def test_psnr_has_decibels_beside_its_percentage(made: Any) -> None:
     rows = {row[0]: row for row in table.rows}
     assert rows["PSNR"] == (
         "PSNR", "20.00 dB", "19.80 dB", "-1.00 ↓", "-0.20", "",
-        "1 of 1", "one replicate: no interval",
+        "1 of 1", "", "", "", "one replicate: no interval",
     )  # fmt: skip
     assert rows["SSIM"][4] == ""
     assert table.title == "consistency against baseline: scene fern, seed 0"
@@ -118,7 +46,7 @@ def test_failed_scenes_are_shown_as_failed(made: Any) -> None:
     table = built.per_scene("consistency", "")
     assert table.columns == ("Metric", "fern", "leaves", "room", "mean")
     rows = {row[0]: [text.strip() for text in row[1:]] for row in table.rows}
-    assert rows["Gaussians, %"] == ["-50.00 ↑", "failed", "failed", "-50.00 ↑"]
+    assert rows["Gaussians, %"] == ["-50.00 ↑", "failed", "failed", "-50.00 ↑ (1 of 3)"]
     assert rows["PSNR, dB"] == ["0.00", "failed", "failed", "0.00"]
     assert "1 of 3 scenes" in built.mean("consistency", "").title
     missing = built.missing()
@@ -191,12 +119,15 @@ def test_several_ablations_stand_beside_each_other(made: Any) -> None:
     made.add()
     made.add("consistency", factors={"gaussians": 0.5})
     made.add("loss_weighting", state="failed")
-    (table,) = tables(made).overviews()
-    assert table.columns == ("Metric", "consistency", "loss_weighting")
-    assert ("Gaussians", "-50.00 ↑", "failed  ") in table.rows
+    built = tables(made)
+    (table,) = built.overviews()
+    assert table.columns == ("Metric", "consistency vs baseline", "loss_weighting vs baseline")
+    assert ("Gaussians", "-50.00 ↑", "failed") in table.rows
     assert table.title == "Change from baseline, %, mean over scenes"
     assert table.align == "lrr"
-    assert table.notes == (ARROWS_NOTE,)
+    assert table.notes == (ARROWS_NOTE, scale_note(built.comparison))
+    assert "Gaussians" in table.notes[1].partition("of the change in %")[0]
+    assert "PSNR" in table.notes[1].partition("of the change in %")[2]
 
 
 def test_an_overview_of_each_condition_names_it(made: Any) -> None:
@@ -232,8 +163,8 @@ def test_pairs_left_out_of_a_mean_are_named(made: Any) -> None:
     made.add(scene="room")
     made.add("consistency", scene="room", factors={"gaussians": 2.0})
     table = tables(made).mean("consistency", "")
-    assert "Gaussians: pairs left out (the baseline is zero)" in table.notes
-    assert next(row for row in table.rows if row[0] == "Gaussians")[3] == "+100.00 ↓"
+    assert "Gaussians: pairs left out (compared with zero)" in table.notes
+    assert next(row for row in table.rows if row[0] == "Gaussians")[3] == "+100.00 ↓ (1 of 2)"
 
 
 def test_the_long_table_has_every_number_at_full_precision(made: Any) -> None:
@@ -244,9 +175,10 @@ def test_the_long_table_has_every_number_at_full_precision(made: Any) -> None:
     rows = [r for r in csv.DictReader(io.StringIO(text)) if r["metric"] == "training_time_s"]
     assert [row["level"] for row in rows] == ["mean", "scene", "scene"]
     assert [row["scene"] for row in rows] == ["", "fern", "room"]
-    fern, room = (100 * (100 * factor - 100) / 100 for factor in (1 / 3, 1 / 7))
-    assert float(rows[1]["change_percent"]) == fern
-    assert float(rows[0]["change_percent"]) == pytest.approx((fern + room) / 2, rel=1e-15)
+    fern = 100 * (1 / 3 - 1)
+    assert float(rows[1]["change_percent"]) == pytest.approx(fern, rel=1e-14)
+    mean = 100 * (math.sqrt(1 / 21) - 1)
+    assert float(rows[0]["change_percent"]) == pytest.approx(mean, rel=1e-14)
     assert rows[1]["printed"] == percent(fern, BY_NAME["training_time_s"]) == "-66.67 ↑"
     assert rows[1]["reading"] == "one replicate: no interval"
     assert rows[0]["n_of"] == "scenes"
@@ -279,7 +211,7 @@ def test_tables_of_a_condition_name_it_and_align_numbers_to_the_right(made: Any)
     by_scene = built.per_scene("consistency", "train.steps=20")
     assert by_scene.title == "consistency: change from baseline, scene by scene (train.steps=20)"
     assert by_scene.align == "lrrr"
-    assert by_scene.notes == (ARROWS_NOTE,)
+    assert by_scene.notes == (ARROWS_NOTE, scale_note(built.comparison))
 
 
 def test_the_long_table_has_each_metrics_unit_and_direction(made: Any) -> None:
@@ -294,3 +226,64 @@ def test_the_long_table_has_each_metrics_unit_and_direction(made: Any) -> None:
     assert set(long["scene"]) == {"", "fern"}
     (mean,) = long[(long["level"] == "mean") & (long["metric"] == "psnr")].to_dict("records")
     assert (mean["printed"], mean["scene"]) == ("-50.00 ↓", "")
+
+
+def add_three(made: Any, *labels: str) -> None:
+    """Three scenes in which the n-th label has n % more PSNR, give or take a little."""
+    for scene, noise in (("fern", -0.001), ("room", 0.0), ("trex", 0.001)):
+        made.add(scene=scene)
+        for number, label in enumerate(labels, start=1):
+            made.add(label, scene=scene, factors={"psnr": 1 + number / 100 + noise})
+
+
+def test_q_and_its_star_stand_in_the_tables(made: Any) -> None:
+    add_three(made, "a", "b")
+    built = tables(made)
+    (overview,) = built.overviews()
+    assert next(row for row in overview.rows if row[0] == "PSNR")[1:] == ("+1.00 ↑ *", "+2.00 ↑ *")
+    assert next(row for row in overview.rows if row[0] == "SSIM")[1:] == ("0.00 =", "0.00 =")
+    note = "q: Benjamini and Hochberg's rate of false discoveries over 16 t-tests, of all ablations"
+    assert any(text.startswith(note) for text in overview.notes)
+    mean = built.mean("a", "")
+    row = dict(zip(mean.columns, next(r for r in mean.rows if r[0] == "PSNR"), strict=True))
+    # t = 0.01 / (0.001 / sqrt(3)) with 2 degrees of freedom: p = 0.00332, the larger of two in 16.
+    assert row["q"] == "0.027 *"
+    assert row["reading"] == "better"
+    assert row["sd scenes, %"] == "0.10"
+    assert row["sd replicates, %"] == ""
+
+
+def test_two_scenes_allow_no_verdict_and_no_star(made: Any) -> None:
+    for scene, factor in (("fern", 1.5), ("room", 1.5001)):
+        made.add(scene=scene)
+        made.add("a", scene=scene, factors={"psnr": factor})
+    row = next(row for row in tables(made).mean("a", "").rows if row[0] == "PSNR")
+    assert row[-2:] == ("", "two values: no verdict")
+
+
+def test_a_mean_over_fewer_scenes_is_marked(made: Any) -> None:
+    add_three(made, "a", "b")
+    for label in ("baseline", "a", "b"):
+        made.add(label, scene="leaves", values={"lpips": None if label == "b" else 0.25})
+    built = tables(made)
+    (overview,) = built.overviews()
+    rows = {row[0]: row[1:] for row in overview.rows}
+    assert rows["LPIPS"] == ("0.00 =", "0.00 = (3 of 4)")
+    assert rows["SSIM"] == ("0.00 =", "0.00 =")
+    assert LACKING_NOTE in overview.notes
+    assert LACKING_NOTE in built.per_scene("b", "").notes
+    assert LACKING_NOTE not in built.per_scene("a", "").notes
+
+
+def test_every_title_and_column_names_the_base(made: Any) -> None:
+    add_three(made, "plus", "b")
+    built = tables(made, "plus")
+    (overview,) = built.overviews()
+    assert overview.title == "Change from plus, %, mean over scenes"
+    assert overview.columns == ("Metric", "baseline vs plus", "b vs plus")
+    assert next(row for row in overview.rows if row[0] == "PSNR")[1] == "-0.99 ↓ *"
+    mean = built.mean("b", "")
+    assert mean.title == "b against plus: 3 scenes, seed 0"
+    assert mean.columns[1:4] == ("plus", "b", "change from plus, %")
+    assert built.per_scene("b", "").title == "b: change from plus, scene by scene"
+    assert set(built.long()["against"]) == {"plus"}

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from xrgs.cli.arguments import errors_as_messages, parse
+from xrgs.experiment.store import BASELINE
 from xrgs.runtime.streams import say
 
 _HELP = """\
@@ -17,6 +18,8 @@ Makes the tables and figures of a sweep, from the store alone; the same store gi
   sweep=ID         id of the sweep; the latest by default
   out=FOLDER       folder to write to; STORE/reports/ID by default
   pictures=NAMES   all, none, or names of figures without their ending: trade-off,fern--plus
+  against=LABEL    the label that all others are compared with; baseline by default. The report of
+                   another one is in STORE/reports/ID.against-LABEL
 """
 
 
@@ -32,6 +35,8 @@ class ReportConf:
     """Folder to write to; None for `<store>/reports/<sweep>`."""
     pictures: str = "all"
     """`all`, `none`, or names of figures without their ending: `trade-off,fern--plus`."""
+    against: str = BASELINE
+    """The label that all others are compared with."""
 
 
 def main() -> None:
@@ -42,4 +47,4 @@ def main() -> None:
 
         out = Path(conf.out) if conf.out else None
         pictures = {"all": None, "none": []}.get(conf.pictures, conf.pictures.split(","))
-        say(build(Path(conf.store), conf.sweep, out, pictures).text)
+        say(build(Path(conf.store), conf.sweep, out, pictures, conf.against).text)

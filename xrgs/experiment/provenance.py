@@ -19,13 +19,28 @@ from xrgs.splat.backend import arithmetic
 _PACKAGES = ("torch", "numpy", "pycolmap", "kornia", "scikit-image", "hydra-core", "pandas")
 
 
+#: What a cell's numbers come from, in the root of a checkout: `git_diff_sha256` covers it.
+_SOURCES = ("xrgs", "conf", "sweeps", "hydra_plugins")
+
+
 def _git(*arguments: str) -> str | None:
-    command = ["git", "-C", str(Path(__file__).parent), *arguments]
+    root = Path(xrgs.__file__).parents[1]
+    command = ["git", "-C", str(root), *arguments]
     try:
         done = subprocess.run(command, capture_output=True, text=True, timeout=10, check=True)  # noqa: S603
     except (OSError, subprocess.SubprocessError):
         return None
     return done.stdout
+
+
+def _uncommitted() -> str:
+    """Return what differs from the commit: the diff of tracked sources, new files with hashes."""
+    new = (_git("ls-files", "--others", "--exclude-standard", "-z", "--", *_SOURCES) or "").split(
+        "\0"
+    )
+    names = [name for name in new if name]
+    hashes = _git("hash-object", "--", *names) if names else ""
+    return "\n".join([_git("diff", "HEAD", "--", *_SOURCES) or "", *names, hashes or ""]).strip()
 
 
 def _cpu() -> str:
@@ -58,7 +73,7 @@ def collect(threads: int, backend: str) -> dict[str, Any]:
             can't be scored is better stopped here than after its training.
         XrgsError: The backend is not available on this machine.
     """
-    diff = _git("diff", "HEAD", "--", ".")
+    diff = _uncommitted()
     return {
         "xrgs": xrgs.__version__,
         "git": (_git("rev-parse", "HEAD") or "").strip() or None,

@@ -1,4 +1,4 @@
-"""Quality during training, and the time to the baseline's final quality.
+"""Quality during training, and the time to the final quality of the base of the comparison.
 
 A cell that was trained with `train.evaluate_every` has the mean scores of its test views after
 every so many steps in `quality.csv`. Here the row of the trained cell is put behind these, and the
@@ -15,7 +15,6 @@ import pandas as pd
 
 from xrgs.errors import StoreError
 from xrgs.evaluation.metrics import VIEW_METRICS
-from xrgs.experiment.store import BASELINE
 from xrgs.report.render import TextTable, titled
 from xrgs.report.training import CELL_KEYS
 from xrgs.safeio.records import as_number, read_table
@@ -152,26 +151,25 @@ def first_reaches(quality: Sequence[float], amounts: Sequence[float], target: fl
 def times(
     cells: pd.DataFrame, of_cells: Mapping[str, Sequence[Mapping[str, float]]]
 ) -> pd.DataFrame:
-    """Return when each cell first reaches the PSNR at which its baseline ends.
+    """Return when each cell first reaches the PSNR at which its base ends.
 
     Args:
         cells: The table `Comparison.cells`.
         of_cells: What `cell_curve` returns for each cell that is done, by its id.
 
     Returns:
-        One row for each cell that was evaluated during training and whose baseline is done:
-        the keys of the cell, `target` (the baseline's final PSNR of this scene and replicate, dB),
+        One row for each cell that was evaluated during training and whose base is done:
+        the keys of the cell, `target` (the base's final PSNR of this scene and replicate, dB),
         `seconds` and `evaluations` until the mean PSNR of the test views first is that, and their
-        `seconds_share` and `evaluations_share` of the baseline's totals; NaN where it is not
+        `seconds_share` and `evaluations_share` of the base's totals; NaN where it is not
         reached.
     """
     rows = []
     for _, cell in cells[cells["state"] == "done"].drop_duplicates(CELL_KEYS).iterrows():
-        baseline = cell["cell_id"] if cell["label"] == BASELINE else cell["baseline_id"]
-        curve, of_baseline = of_cells[cell["cell_id"]], of_cells.get(baseline)
-        if len(curve) == 1 or not of_baseline or math.isnan(of_baseline[-1]["psnr"]):
+        curve, of_base = of_cells[cell["cell_id"]], of_cells.get(cell["base_id"])
+        if len(curve) == 1 or not of_base or math.isnan(of_base[-1]["psnr"]):
             continue
-        end = of_baseline[-1]
+        end = of_base[-1]
         row = dict(cell[CELL_KEYS]) | {"target": end["psnr"]}
         for name in ("seconds", "evaluations"):
             quality, amounts = ([at[key] for at in curve] for key in ("psnr", name))
@@ -181,22 +179,24 @@ def times(
     return pd.DataFrame(rows, columns=[*CELL_KEYS, "target", *_ROWS])
 
 
-#: The rows of a table for each column of `times`: name, and factor and format of the number.
+#: The rows of a table for each column of `times`: name, in which `{base}` is the label that all
+#: others are compared with, and factor and format of the number.
 _ROWS = {
     "seconds": ("Time, s", 1.0, ",.1f"),
-    "seconds_share": ("Time, % of the baseline's", 100.0, ".0f"),
+    "seconds_share": ("Time, % of {base}'s", 100.0, ".0f"),
     "evaluations": ("Alpha evaluations, 10^9", 1e-9, ",.3g"),
-    "evaluations_share": ("Alpha evaluations, % of the baseline's", 100.0, ".0f"),
+    "evaluations_share": ("Alpha evaluations, % of {base}'s", 100.0, ".0f"),
 }
 
 
-def table(found: pd.DataFrame, labels: Sequence[str], condition: str) -> TextTable:
+def table(found: pd.DataFrame, labels: Sequence[str], condition: str, base: str) -> TextTable:
     """Return the times of one condition, scene by scene, as means over the runs of a scene.
 
     Args:
         found: The table that `times` returns.
         labels: The labels of the columns, in order.
         condition: The condition that the cells were run under.
+        base: The label that all others are compared with.
 
     Returns:
         The table, with means over scenes of the shares where there are several.
@@ -205,20 +205,20 @@ def table(found: pd.DataFrame, labels: Sequence[str], condition: str) -> TextTab
     rows = [
         row
         for scene in sorted(chosen["scene"].unique())
-        for row in _rows_of(scene, chosen[chosen["scene"] == scene], labels, _ROWS)
+        for row in _rows_of(scene, chosen[chosen["scene"] == scene], labels, _ROWS, base)
     ]
     if len(set(chosen["scene"])) > 1:
         # Each scene counts once; it is NaN, not reached, where one of its runs is.
         scenes = chosen.groupby(["label", "scene"], sort=False)[[*_ROWS]].agg(_mean_of_all)
         shares = [name for name in _ROWS if name.endswith("_share")]
-        rows += _rows_of("mean over scenes", scenes.reset_index(), labels, shares)
+        rows += _rows_of("mean over scenes", scenes.reset_index(), labels, shares, base)
     return TextTable(
-        title=titled("Time and work to the PSNR at which the baseline ends", condition),
+        title=titled(f"Time and work to the PSNR at which {base} ends", condition),
         columns=("Scene", "", *labels),
         rows=tuple(rows),
         align="ll" + "r" * len(labels),
         notes=(
-            "until the mean PSNR of the test views first is the baseline's final one of the same"
+            f"until the mean PSNR of the test views first is {base}'s final one of the same"
             " scene and replicate, linear between two evaluations; mean over the runs of a scene",
             "one that reaches it before the first evaluation has the time of that one",
         ),
@@ -230,11 +230,15 @@ def _mean_of_all(values: pd.Series) -> float:
 
 
 def _rows_of(
-    head: str, chosen: pd.DataFrame, labels: Sequence[str], names: Iterable[str]
+    head: str, chosen: pd.DataFrame, labels: Sequence[str], names: Iterable[str], base: str
 ) -> list[tuple[str, ...]]:
     by_label = dict(iter(chosen.groupby("label")))
     return [
-        (head, _ROWS[name][0], *(_text(by_label.get(label), name) for label in labels))
+        (
+            head,
+            _ROWS[name][0].format(base=base),
+            *(_text(by_label.get(label), name) for label in labels),
+        )
         for name in names
     ]
 

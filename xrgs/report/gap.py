@@ -1,29 +1,26 @@
-"""Builds the tables of how much of the gap between the baseline and all_hr each ablation closes."""
+"""Builds the tables of how much of the gap between the base and all_hr each ablation closes."""
 
 from __future__ import annotations
 
 import math
 from typing import TYPE_CHECKING
 
-from xrgs.report.compare import ALL_HR
+from xrgs.report.inference import ALL_HR
 from xrgs.report.render import TextTable, titled
-from xrgs.report.tables import (
+from xrgs.report.writing import (
     AGREEMENT_NOTE,
+    LACKING_NOTE,
     agreement,
     by_key,
     interval,
     interval_note,
+    lacking,
     signed,
 )
 
 if TYPE_CHECKING:
     from xrgs.report.compare import Comparison
-    from xrgs.report.tables import Change
-
-_NOTE = (
-    "100 (ablation - baseline) / (all_hr - baseline): 0 is the baseline, 100 is all_hr, which"
-    " trains on the originals of the degraded photographs"
-)
+    from xrgs.report.writing import Change
 
 
 def gap_tables(comparison: Comparison) -> list[TextTable]:
@@ -48,36 +45,57 @@ def _table(
     means: dict[tuple[str, ...], Change],
     per_scene: dict[tuple[str, ...], Change],
 ) -> TextTable:
-    scenes = comparison.scenes
+    base, scenes = comparison.base, comparison.scenes
     labels = [name for name, of in comparison.groups if of == condition and name != ALL_HR]
     rows: list[tuple[str, ...]] = []
-    left_out: dict[str, list[str]] = {}
     for label in labels:
         for metric in comparison.metrics:
             mean = means.get((label, condition, metric.name))
             if mean is None:
                 continue
             found = [per_scene.get((label, condition, s, metric.name)) for s in scenes]
-            shares = ["failed" if row is None else signed(row.change) for row in (*found, mean)]
+            shares = ["failed" if row is None else signed(row.change) for row in found]
+            shares.append(f"{signed(mean.change)}{lacking(mean, len(scenes))}")
             rows.append((label, metric.label, *shares, interval(mean), agreement(mean)))
-            for scene, row in zip(scenes, found, strict=True):
+    here = [row for key, row in means.items() if key[1] == condition]
+    what = (
+        f"100 (ablation - {base}) / ({ALL_HR} - {base}): 0 is {base}, 100 is {ALL_HR}, which trains"
+        " on the originals of the degraded photographs"
+    )
+    notes = (
+        *(what, *_left_out(comparison, condition, labels, per_scene), AGREEMENT_NOTE),
+        *interval_note(here, one_each=_one_replicate(comparison, condition)),
+        *[LACKING_NOTE] * any(lacking(row, len(scenes)) for row in here),
+    )
+    return TextTable(
+        title=titled(f"Share of the gap from {base} to {ALL_HR} that is closed, %", condition),
+        columns=("Ablation", "Metric", *scenes, "mean", "95 % interval, %", "pairs that agree"),
+        rows=tuple(rows),
+        align="ll" + "r" * (len(scenes) + 3),
+        notes=notes,
+    )
+
+
+def _left_out(
+    comparison: Comparison,
+    condition: str,
+    labels: list[str],
+    per_scene: dict[tuple[str, ...], Change],
+) -> list[str]:
+    """Say why scenes have no share, or one of fewer pairs; once for ablations that share it."""
+    left_out: dict[str, list[str]] = {}
+    for label in labels:
+        for metric in comparison.metrics:
+            for scene in comparison.scenes:
+                row = per_scene.get((label, condition, scene, metric.name))
                 if row is not None and row.why:
                     what = "n/a" if math.isnan(row.change) else "pairs left out"
                     note = f"{metric.label}, {scene}: {what} ({row.why})"
                     left_out.setdefault(note, []).append(label)
-    notes = (
+    return [
         note if len(of) == len(labels) else f"{note}: {', '.join(of)}"
         for note, of in left_out.items()
-    )
-    here = [row for key, row in means.items() if key[1] == condition]
-    over = interval_note(here, one_each=_one_replicate(comparison, condition))
-    return TextTable(
-        title=titled(f"Share of the gap from baseline to {ALL_HR} that is closed, %", condition),
-        columns=("Ablation", "Metric", *scenes, "mean", "95 % interval, %", "pairs that agree"),
-        rows=tuple(rows),
-        align="ll" + "r" * (len(scenes) + 3),
-        notes=(_NOTE, *notes, AGREEMENT_NOTE, *over),
-    )
+    ]
 
 
 def _one_replicate(comparison: Comparison, condition: str) -> bool:

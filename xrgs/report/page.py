@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import shlex
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from xrgs.evaluation.metrics import METRICS
-from xrgs.experiment.store import Store
+from xrgs.experiment.store import BASELINE, Store
 from xrgs.report import curves, skipped
 from xrgs.report.collect import RECORD_KEYS, ReportError, Sweep, read_sweep
 from xrgs.report.compare import compare
@@ -20,12 +21,14 @@ from xrgs.report.training import table as training_table
 from xrgs.report.training import totals
 from xrgs.safeio.atomic import write_json, write_text
 from xrgs.safeio.confined import ConfinedPath
-from xrgs.safeio.words import for_csv, for_line, for_markdown
+from xrgs.safeio.words import for_csv, for_file_name, for_line, for_markdown
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
     import pandas as pd
+
+    from xrgs.report.compare import Comparison
 
 #: What a row of views.csv names its cell by.
 _VIEW_KEYS = ["cell_id", "scene", "label", "condition", "variant_seed", "seed"]
@@ -67,7 +70,7 @@ class Runs:
     curves: pd.DataFrame
     """Quality during training: `xrgs.report.curves.joined`."""
     times: pd.DataFrame
-    """Time and work to the baseline's final PSNR: `xrgs.report.curves.times`."""
+    """Time and work to the base's final PSNR: `xrgs.report.curves.times`."""
     skipped: pd.DataFrame
     """What each cell left out: `xrgs.report.skipped.skipped`."""
 
@@ -81,13 +84,14 @@ class Runs:
             skipped.skipped(cells, sweep.work),
         )
 
-    def tables(self, cells: pd.DataFrame) -> list[TextTable]:
+    def tables(self, comparison: Comparison) -> list[TextTable]:
         """Return the tables of each condition, time to quality first."""
-        labels = cells.groupby("condition", sort=False)["label"].unique()
+        base = comparison.base
+        labels = comparison.cells.groupby("condition", sort=False)["label"].unique()
         by_condition = [(str(name), list(of)) for name, of in labels.items()]
         kinds = (
-            (curves.table, self.times),
-            (skipped.table, self.skipped),
+            (partial(curves.table, base=base), self.times),
+            (partial(skipped.table, base=base), self.skipped),
             (training_table, self.training),
         )
         return [make(found, of, name) for make, found in kinds for name, of in by_condition]
@@ -98,29 +102,33 @@ def build(
     sweep_id: str | None = None,
     out: Path | None = None,
     pictures: Sequence[str] | None = None,
+    against: str = BASELINE,
 ) -> Report:
     """Write the tables, scores and figures of a sweep.
 
     Args:
         store_path: The store's folder.
         sweep_id: The id of the sweep; None takes the latest one.
-        out: The folder to write to; None takes `<store>/reports/<sweep id>`.
+        out: The folder to write to; None takes `<store>/reports/<sweep id>`, whose name ends with
+            `.against-<label>` where another label than the baseline is compared with.
         pictures: Names of the pictures to draw, as of `draw`; None draws all.
+        against: The label that all others are compared with.
 
     Returns:
         The report: its text and its files.
 
     Raises:
         StoreError: The store holds no such sweep.
-        ReportError: The sweep's cells can't be compared, there is no picture of such a name, or
-            `out` can't be written.
+        ReportError: The sweep's cells can't be compared, it has no such label, there is no picture
+            of such a name, or `out` can't be written.
     """
     store = Store(store_path)
     sweep_id = sweep_id or store.latest_sweep()
     sweep = read_sweep(store, sweep_id, METRICS)
-    comparison = compare(sweep.cells, METRICS)
+    comparison = compare(sweep.cells, METRICS, against)
     tables = Tables(comparison)
-    folder = ConfinedPath(out) if out else store.reports / sweep_id
+    name = sweep_id if against == BASELINE else f"{sweep_id}.against-{for_file_name(against)}"
+    folder = ConfinedPath(out) if out else store.reports / name
     try:
         if out:
             folder.make_root()
@@ -225,10 +233,11 @@ def _markdown_page(
 ) -> str:
     command = " ".join(for_markdown(shlex.quote(word)) for word in ("xrgs-sweep", *sweep.command))
     parts = [
-        f"# Change from baseline\n\nSweep {for_markdown(sweep.id)}: {command}\n",
+        f"# Change from {for_markdown(tables.comparison.base)}\n",
+        f"Sweep {for_markdown(sweep.id)}: {command}\n",
         *(f"**{for_markdown(line)}**\n" for line in _warnings(sweep)),
         *(to_markdown(table) for table in _all_tables(tables) if table.rows),
-        *(to_markdown(table) for table in runs.tables(tables.comparison.cells) if table.rows),
+        *(to_markdown(table) for table in runs.tables(tables.comparison) if table.rows),
         *(_picture_link(picture, folder) for picture in pictures),
         to_markdown(_provenance_table(sweep)),
     ]

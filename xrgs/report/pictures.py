@@ -12,7 +12,6 @@ import pandas as pd
 from xrgs.capture import images
 from xrgs.capture.images import ImageError
 from xrgs.errors import StoreError, UnreadableError
-from xrgs.experiment.store import BASELINE
 from xrgs.report.collect import ReportError
 from xrgs.report.curves import means_over_runs, means_over_scenes
 from xrgs.report.figures import (
@@ -43,7 +42,7 @@ if TYPE_CHECKING:
 
 #: The scores whose curves are drawn.
 _QUALITY = ("psnr", "lpips")
-_QUALITY_TITLE = "Quality during training: scenes thin, mean thick, level where baseline ends"
+_QUALITY_TITLE = "Quality during training: scenes thin, mean thick, level where {base} ends"
 _CURVES = {"gaussians": "Gaussians", "loss": "loss of the step's view, as each run weighs it"}
 #: Largest image that is drawn: three are in memory at a time, 12 bytes a pixel, and their drawing.
 _MAX_PIXELS = 1 << 24
@@ -93,19 +92,19 @@ def draw(
     """
     first = comparison.pairs.sort_values(["variant_seed", "seed"], kind="stable")
     pairs = first.drop_duplicates(["scene", "label"]).sort_values(["scene", "label"])
-    shown = {*pairs["cell_id"], *pairs["baseline_id"]}
+    shown = {*pairs["cell_id"], *pairs["base_id"]}
     scores = views[views["cell_id"].isin(shown)].groupby("cell_id")
     psnr = {cell_id: rows.set_index("view")["psnr"] for cell_id, rows in scores}
     cells = comparison.cells.drop_duplicates("cell_id").set_index("cell_id")
     drawings = _curves_of_quality(comparison, quality) | _trade_offs(comparison)
     for _, pair in pairs.iterrows():
-        both = _same_views(psnr.get(pair["baseline_id"]), psnr.get(pair["cell_id"]))
+        both = _same_views(psnr.get(pair["base_id"]), psnr.get(pair["cell_id"]))
         cell = cells.loc[pair["cell_id"]]
         split = "train" if cell["validation"] > 0 else "test"
         photographs = store.variants / cell["variant_id"] / "images" / split
         stem = f"{for_file_name(pair['scene'])}--{for_file_name(pair['label'])}"
-        drawings[stem] = partial(_views, store, pair, both, photographs)
-        drawings[f"{stem}--training"] = partial(_training, store, pair)
+        drawings[stem] = partial(_views, store, pair, comparison.base, both, photographs)
+        drawings[f"{stem}--training"] = partial(_training, store, pair, comparison.base)
     first_ones = dict(islice(drawings.items(), _MAX_PICTURES))
     chosen = first_ones if names is None else _chosen(drawings, names)
     bar = progress(chosen.items(), "drawing", "picture", len(chosen))
@@ -116,14 +115,12 @@ def draw(
     return drawn
 
 
-def _same_views(
-    baseline: pd.Series | None, ablation: pd.Series | None
-) -> tuple[pd.Series, pd.Series]:
+def _same_views(base: pd.Series | None, ablation: pd.Series | None) -> tuple[pd.Series, pd.Series]:
     """Return the PSNR of the views that both cells have, in their order; perhaps of none."""
-    if baseline is None or ablation is None:
+    if base is None or ablation is None:
         return pd.Series(dtype=float), pd.Series(dtype=float)
-    both = ablation.index[ablation.index.isin(baseline.index)]
-    return baseline[both], ablation[both]
+    both = ablation.index[ablation.index.isin(base.index)]
+    return base[both], ablation[both]
 
 
 def _chosen(drawings: dict[str, _Drawing], names: Sequence[str]) -> dict[str, _Drawing]:
@@ -156,37 +153,38 @@ def _trade_offs(comparison: Comparison) -> dict[str, _Drawing]:
 def _absolute(comparison: Comparison, condition: str) -> pd.DataFrame:
     """Return Gaussians and measured scores of each label and scene, as means over its runs.
 
-    The index is the label, the baseline's first. A cell that lacks a score, or the result of its
-    baseline, has no row; the tables say why.
+    The index is the label, the base's first. A cell that lacks a score, or the result of its base,
+    has no row; the tables say why.
     """
     cells = comparison.cells
     chosen = cells[(cells["condition"] == condition) & (cells["reason"] == "")]
     names = ["gaussians", *(m.name for m in comparison.metrics if m.score is not None)]
     means = chosen.groupby(["label", "scene"], sort=False)[names].mean()
     measured = means.dropna(axis="columns", how="all").dropna().reset_index()
-    with_baseline = measured.loc[measured["label"] == BASELINE, "scene"]
-    return _baseline_first(measured[measured["scene"].isin(with_baseline)]).set_index("label")
+    with_base = measured.loc[measured["label"] == comparison.base, "scene"]
+    rows = measured[measured["scene"].isin(with_base)]
+    return _base_first(rows, comparison.base).set_index("label")
 
 
-def _baseline_first(rows: pd.DataFrame) -> pd.DataFrame:
-    return rows.sort_values("label", key=lambda of: of != BASELINE, kind="stable")
+def _base_first(rows: pd.DataFrame, base: str) -> pd.DataFrame:
+    return rows.sort_values("label", key=lambda of: of != base, kind="stable")
 
 
 def _curves_of_quality(comparison: Comparison, curves: pd.DataFrame) -> dict[str, _Drawing]:
-    """Return figures of the quality during training: baseline and seven ablations on each."""
+    """Return figures of the quality during training: the base and seven ablations on each."""
     metrics = {metric.name: metric for metric in comparison.metrics}
     drawings: dict[str, _Drawing] = {}
     for condition in dict.fromkeys(curves["condition"]):
-        rows = _baseline_first(means_over_runs(curves, condition))
+        rows = _base_first(means_over_runs(curves, condition), comparison.base)
         axes = [metrics[name] for name in _QUALITY if rows[name].notna().any()]
         first, *ablations = dict.fromkeys(rows["label"])
-        if first != BASELINE or not axes:
+        if first != comparison.base or not axes:
             continue
         for at in range(0, len(ablations), MAX_ARMS - 1):
-            shown = (BASELINE, *ablations[at : at + MAX_ARMS - 1])
+            shown = (comparison.base, *ablations[at : at + MAX_ARMS - 1])
             scenes = rows[rows["label"].isin(shown)]
             means = means_over_scenes(scenes)
-            title = titled(_QUALITY_TITLE, condition)
+            title = titled(_QUALITY_TITLE.format(base=comparison.base), condition)
             name = f"time-to-quality{condition and f'.{for_file_name(condition)}'}"
             name += f"-{at // (MAX_ARMS - 1) + 1}" * (at > 0)
             drawings[name] = partial(
@@ -201,23 +199,24 @@ def _drawn(title: str, figure: Callable[[], bytes], file: ConfinedPath) -> Pictu
     return Picture(title, file)
 
 
-def median_view(baseline: pd.Series, ablation: pd.Series) -> str:
+def median_view(base: pd.Series, ablation: pd.Series) -> str:
     """Return the view whose change of PSNR is the median: neither the best nor the worst case.
 
     Args:
-        baseline: PSNR of the baseline in dB, indexed by view.
+        base: PSNR of the base in dB, indexed by view.
         ablation: PSNR of the ablation in dB, indexed by view.
 
     Returns:
         The name of the view; of an even number of views, the lower of the two in the middle.
     """
-    change = (ablation - baseline.reindex(ablation.index)).fillna(0.0).sort_index()
+    change = (ablation - base.reindex(ablation.index)).fillna(0.0).sort_index()
     return str(change.sort_values(kind="stable").index[(len(change) - 1) // 2])
 
 
 def _views(
     store: Store,
     pair: pd.Series,
+    base: str,
     psnr: tuple[pd.Series, pd.Series],
     photographs: ConfinedPath,
     file: ConfinedPath,
@@ -229,27 +228,27 @@ def _views(
     name = f"{view}.png"
     try:
         truth = _image(photographs / name)
-        baseline = _image(store.cell(pair["baseline_id"]).folder / "renders" / name)
+        before = _image(store.cell(pair["base_id"]).folder / "renders" / name)
         ablation = _image(store.cell(pair["cell_id"]).folder / "renders" / name)
     except ReportError as error:
         return Picture(title, None, str(error))
     panels = (
         Panel(truth, "photograph", f"{truth.shape[1]} × {truth.shape[0]} px"),
-        Panel(baseline, BASELINE, f"PSNR {psnr[0][view]:.2f} dB"),
+        Panel(before, base, f"PSNR {psnr[0][view]:.2f} dB"),
         Panel(ablation, str(pair["label"]), f"PSNR {psnr[1][view]:.2f} dB"),
     )
     if len({panel.image.shape for panel in panels}) > 1:
         return Picture(title, None, f"{view}: photograph and renders differ in size")
-    note = f"where baseline and {pair['label']} differ most"
+    note = f"where {base} and {pair['label']} differ most"
     with atomic_writer(file) as stream:
-        stream.write(side_by_side(title, panels, differing_crop(baseline, ablation), note))
+        stream.write(side_by_side(title, panels, differing_crop(before, ablation), note))
     return Picture(title, file)
 
 
-def _training(store: Store, pair: pd.Series, file: ConfinedPath) -> Picture:
+def _training(store: Store, pair: pd.Series, base: str, file: ConfinedPath) -> Picture:
     title = f"{_title(pair)}: training"
     runs = []
-    for name, key in ((BASELINE, "baseline_id"), (str(pair["label"]), "cell_id")):
+    for name, key in ((base, "base_id"), (str(pair["label"]), "cell_id")):
         try:
             runs.append((name, store.cell(pair[key]).history()[["step", *_CURVES]]))
         except (StoreError, KeyError):

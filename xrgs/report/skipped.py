@@ -11,7 +11,6 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import pandas as pd
 
-from xrgs.experiment.store import BASELINE
 from xrgs.report.render import TextTable, titled
 from xrgs.report.training import CELL_KEYS
 from xrgs.safeio.records import as_number
@@ -31,6 +30,7 @@ class _Kind(NamedTuple):
     """A kind of work that a run can leave out."""
 
     label: str
+    """Its name in the table, where `{base}` is the label that all others are compared with."""
     unit: str
     """Unit of the cost: `s`, `evaluations` (of alpha), or empty where nothing is known of it."""
     estimate: str
@@ -38,9 +38,9 @@ class _Kind(NamedTuple):
 
 
 _KINDS = {
-    "steps": _Kind("Steps that the baseline takes", "s", "at the run's mean time of a step"),
+    "steps": _Kind("Steps that {base} takes", "s", "at the run's mean time of a step"),
     "views": _Kind(
-        "Views that the baseline trains on", "s", "none: these steps are taken on other views"
+        "Views that {base} trains on", "s", "none: these steps are taken on other views"
     ),
     "skipped_backward": _Kind(
         "Backward passes and updates",
@@ -119,8 +119,7 @@ def skipped(cells: pd.DataFrame, of_cells: Mapping[str, Mapping[str, float]]) ->
     rows = []
     for _, cell in cells[cells["state"] == "done"].drop_duplicates(CELL_KEYS).iterrows():
         work = of_cells[cell["cell_id"]]
-        base = cell["cell_id"] if cell["label"] == BASELINE else cell["baseline_id"]
-        for kind, number, of, cost in _left_out(work, of_cells.get(base, work)):
+        for kind, number, of, cost in _left_out(work, of_cells.get(cell["base_id"], work)):
             if math.isnan(number) or not of > 0:
                 continue
             unit = _kind(kind).unit
@@ -135,20 +134,20 @@ def skipped(cells: pd.DataFrame, of_cells: Mapping[str, Mapping[str, float]]) ->
 
 
 def _left_out(
-    work: Mapping[str, float], baseline: Mapping[str, float]
+    work: Mapping[str, float], base: Mapping[str, float]
 ) -> Iterator[tuple[str, float, float, float]]:
     """Yield each kind: how many were left out, of how many, and their cost."""
 
     def total(name: str) -> float:
         return work.get(name, math.nan)
 
-    def of_baseline(name: str) -> float:
-        return baseline.get(name, math.nan)
+    def of_base(name: str) -> float:
+        return base.get(name, math.nan)
 
     steps, evaluations = total("steps"), total("evaluations")
-    fewer = _above_zero(of_baseline("steps") - steps)
-    yield "steps", fewer, of_baseline("steps"), _times(fewer, total("seconds"), steps)
-    yield "views", _above_zero(of_baseline("views") - total("views")), of_baseline("views"), 0.0
+    fewer = _above_zero(of_base("steps") - steps)
+    yield "steps", fewer, of_base("steps"), _times(fewer, total("seconds"), steps)
+    yield "views", _above_zero(of_base("views") - total("views")), of_base("views"), 0.0
     for name in [name for name in work if name.startswith(_PREFIX)]:
         cost = math.nan
         if name == "skipped_backward":
@@ -185,13 +184,14 @@ def _kind(name: str) -> _Kind:
     return _KINDS.get(name, _Kind(f"Steps without {words}", "", "not estimated"))
 
 
-def table(found: pd.DataFrame, labels: Sequence[str], condition: str) -> TextTable:
+def table(found: pd.DataFrame, labels: Sequence[str], condition: str, base: str) -> TextTable:
     """Return what the runs of one condition left out: means over a scene's runs, then over scenes.
 
     Args:
         found: The table that `skipped` returns.
         labels: The labels of the columns, in order.
         condition: The condition that the cells were run under.
+        base: The label that all others are compared with.
 
     Returns:
         The table; a kind of which no run left anything out is not in it.
@@ -208,9 +208,10 @@ def table(found: pd.DataFrame, labels: Sequence[str], condition: str) -> TextTab
             _texts(of_kind.loc[label]) if label in of_kind.index else ("", "") for label in labels
         ]
         would = f"would have cost{kind.unit and f', {kind.unit}'}"
-        rows.append((kind.label, "number (share)", *(number for number, _ in texts)))
+        label = kind.label.replace("{base}", base)
+        rows.append((label, "number (share)", *(number for number, _ in texts)))
         rows.append(("", f"{would} (of the run's own)", *(cost for _, cost in texts)))
-        notes.append(f"{kind.label}: cost {kind.estimate}")
+        notes.append(f"{label}: cost {kind.estimate}")
     return TextTable(
         title=titled("What each run left out, mean over scenes", condition),
         columns=("Left out", "", *labels),

@@ -1,164 +1,46 @@
-"""Builds the tables of a comparison: their rows and columns, and how a number is written."""
+"""Builds the tables of a comparison: their rows and columns."""
 
 from __future__ import annotations
 
 import math
 from functools import cached_property
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING
 
 import pandas as pd
 
-from xrgs.experiment.store import BASELINE
 from xrgs.report.render import TextTable, titled
+from xrgs.report.writing import (
+    AGREEMENT_NOTE,
+    ARROWS_NOTE,
+    LACKING_NOTE,
+    SCATTER_NOTE,
+    Change,
+    agreement,
+    by_key,
+    false_discovery,
+    false_discovery_note,
+    interval,
+    interval_note,
+    lacking,
+    marked,
+    number,
+    percent,
+    reading,
+    scale_note,
+    scatter,
+    signed,
+)
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable
-
     from xrgs.evaluation.metrics import Metric
     from xrgs.report.compare import Comparison
 
-#: An arrow means improvement or degradation, as in the paper's tables, not larger or smaller.
-BETTER, WORSE, SAME = "↑", "↓", "="
 #: Longest list of replicates in a title; of more it has the number.
 _MAX_LISTED = 8
-AGREEMENT_NOTE = "pairs that agree: pairs of one scene and replicate that change as their mean does"
 #: Keys of a row of the long table.
 _LEVEL = ["level", "label", "condition", "scene", "metric"]
 #: Columns of the long table that have the share of the gap to all_hr, by their names elsewhere.
 _GAP = {"change": "gap_closed_percent", "low": "gap_low", "high": "gap_high", "why": "gap_why"}
-ARROWS_NOTE = f"{BETTER} improvement, {WORSE} degradation, {SAME} no change at this precision"
-
-
-class Change(NamedTuple):
-    """One row of `Comparison.means` or `Comparison.per_scene`: the fields are its columns."""
-
-    baseline: float
-    value: float
-    change: float
-    difference: float
-    spread: float
-    n: int
-    low: float
-    high: float
-    unit: str
-    why: str
-    agree: int
-    pairs: int
-
-
-def number(value: float, unit: str) -> str:
-    """Write a value with its unit, at a precision that fits its size.
-
-    Args:
-        value: The value; NaN is written as n/a.
-        unit: Its unit, empty for none; bytes are written in MiB.
-    """
-    if math.isnan(value):
-        return "n/a"
-    if unit == "bytes":
-        return f"{value / 2**20:,.1f} MiB"
-    if math.isinf(value) or abs(value) >= 1000:
-        text = f"{value:,.0f}"
-    elif unit:
-        text = f"{value:.2f}"
-    else:
-        text = f"{value:.4f}" if value % 1 else f"{value:.0f}"
-    return f"{text} {unit}".rstrip()
-
-
-def signed(value: float) -> str:
-    """Write a number with two decimals and a sign, zero without sign.
-
-    Args:
-        value: The number; NaN is written as n/a.
-    """
-    if math.isnan(value):
-        return "n/a"
-    text = f"{value:+,.2f}"
-    return "0.00" if text in {"+0.00", "-0.00"} else text
-
-
-def arrow(change: float, metric: Metric) -> str:
-    """Return whether the printed change is an improvement, in the metric's own direction.
-
-    Args:
-        change: The change in percent.
-        metric: The metric that changed.
-
-    Returns:
-        `BETTER`, `WORSE`, `SAME` where the change is printed as 0.00, or a space for NaN.
-    """
-    if math.isnan(change):
-        return " "
-    if signed(change) == "0.00":
-        return SAME
-    return BETTER if (change > 0) == metric.higher_is_better else WORSE
-
-
-def percent(change: float, metric: Metric) -> str:
-    """Write a change as the paper's tables do: `-44.57 ↑`.
-
-    Args:
-        change: The change in percent.
-        metric: The metric that changed.
-    """
-    return f"{signed(change)} {arrow(change, metric)}"
-
-
-def reading(row: Change, metric: Metric) -> str:
-    """Say in words what the interval shows.
-
-    Args:
-        row: The change with its interval.
-        metric: The metric that changed.
-
-    Returns:
-        `better` or `worse` where the interval does not contain 0, `inside noise` where it does,
-        `unchanged`, `one replicate: no interval`, or `n/a` with the reason.
-    """
-    if math.isnan(row.change):
-        return f"n/a: {row.why}"
-    if math.isnan(row.low):
-        return "one replicate: no interval"
-    if row.low <= 0 <= row.high and row.low < row.high:
-        return "inside noise"
-    if arrow(row.change, metric) == SAME:
-        return "unchanged"
-    return "better" if (row.change > 0) == metric.higher_is_better else "worse"
-
-
-def interval(row: Change) -> str:
-    """Write the 95 % interval of a change in percent, empty where there is none.
-
-    Args:
-        row: The change with its interval.
-    """
-    return "" if math.isnan(row.low) else f"{signed(row.low)} to {signed(row.high)}"
-
-
-def agreement(row: Change) -> str:
-    """Write how many of the pairs changed in the direction of their mean, `11 of 12`.
-
-    Args:
-        row: The change with the numbers of its pairs.
-    """
-    return f"{row.agree} of {row.pairs}" if row.pairs else ""
-
-
-def interval_note(rows: Iterable[Change], *, one_each: bool) -> tuple[str, ...]:
-    """Say what the intervals of a table are over; nothing where there are none.
-
-    Args:
-        rows: The changes in the table.
-        one_each: Whether each scene has one replicate.
-    """
-    units = {row.unit for row in rows if not math.isnan(row.low)}
-    if not units:
-        return ()
-    if "scenes" not in units:
-        return ("interval: Student's t over the replicates",)
-    alone = "; with one replicate, differences of runs and of scenes are mixed" * one_each
-    return (f"interval: Student's t over the scenes' means{alone}",)
 
 
 class Tables:
@@ -203,22 +85,30 @@ class Tables:
         return overviews
 
     def _overview(self, labels: list[str], condition: str) -> TextTable:
+        base, scenes = self.comparison.base, len(self.comparison.scenes)
         rows = tuple(
-            (metric.label, *(self._cell(self._means.get((name, condition, metric.name)), metric)
+            (metric.label, *(marked(self._means.get((name, condition, metric.name)), metric, scenes)
                              for name in labels))
             for metric in self.comparison.metrics
         )  # fmt: skip
         return TextTable(
-            title=titled("Change from baseline, %, mean over scenes", condition),
-            columns=("Metric", *labels),
+            title=titled(f"Change from {base}, %, mean over scenes", condition),
+            columns=("Metric", *(f"{name} vs {base}" for name in labels)),
             rows=rows,
             align="l" + "r" * len(labels),
-            notes=(ARROWS_NOTE,),
+            notes=(ARROWS_NOTE, *self._mean_notes(labels, condition)),
         )
 
-    @staticmethod
-    def _cell(row: Change | None, metric: Metric) -> str:
-        return "failed  " if row is None else percent(row.change, metric)
+    def _mean_notes(self, labels: list[str], condition: str) -> tuple[str, ...]:
+        """Say how means of these labels were made, and what their marks are."""
+        keys = ((name, condition, m.name) for name in labels for m in self.comparison.metrics)
+        found = [self._means[key] for key in keys if key in self._means]
+        lacks = any(lacking(row, len(self.comparison.scenes)) for row in found)
+        return (
+            scale_note(self.comparison),
+            *false_discovery_note(self.comparison, condition),
+            *[LACKING_NOTE] * lacks,
+        )
 
     def mean(self, label: str, condition: str) -> TextTable:
         """Return the paper's Table 1 for one ablation, with values, intervals and what they show.
@@ -227,35 +117,31 @@ class Tables:
             label: The ablation.
             condition: The condition that it was run under.
         """
-        rows = []
-        notes = [ARROWS_NOTE, AGREEMENT_NOTE]
-        for metric in self.comparison.metrics:
-            row = self._means.get((label, condition, metric.name))
-            if row is None:
-                continue
-            rows.append(
-                (
-                    metric.label,
-                    number(row.baseline, metric.unit),
-                    number(row.value, metric.unit),
-                    percent(row.change, metric),
-                    signed(row.difference) if metric.unit == "dB" else "",
-                    interval(row),
-                    agreement(row),
-                    reading(row, metric),
-                )
-            )
-            if row.why and not math.isnan(row.change):
-                notes.append(f"{metric.label}: pairs left out ({row.why})")
+        base, scenes = self.comparison.base, len(self.scenes_of(label, condition))
+        keys = ((label, condition, metric.name) for metric in self.comparison.metrics)
+        found = [
+            (self._means[key], metric)
+            for key, metric in zip(keys, self.comparison.metrics, strict=True)
+            if key in self._means
+        ]
+        left_out = (
+            f"{metric.label}: pairs left out ({row.why})"
+            for row, metric in found
+            if row.why and not math.isnan(row.change)
+        )
+        notes = (
+            *(ARROWS_NOTE, AGREEMENT_NOTE, *left_out, *self._interval_note(label, condition)),
+            *(SCATTER_NOTE, *self._mean_notes([label], condition)),
+        )
         return TextTable(
-            title=titled(f"{label} against baseline: {self._extent(label, condition)}", condition),
+            title=titled(f"{label} against {base}: {self._extent(label, condition)}", condition),
             columns=(
-                *("Metric", BASELINE, label, "change, %", "dB", "95 % interval, %"),
-                *("pairs that agree", "reading"),
+                *("Metric", base, label, f"change from {base}, %", "dB", "95 % interval, %"),
+                *("pairs that agree", "sd replicates, %", "sd scenes, %", "q", "reading"),
             ),
-            rows=tuple(rows),
-            align="lrrrrrrl",
-            notes=(*notes, *self._interval_note(label, condition)) if rows else (),
+            rows=tuple(_mean_row(row, metric, scenes) for row, metric in found),
+            align="lrrrrrrrrrl",
+            notes=notes if found else (),
         )
 
     def _extent(self, label: str, condition: str) -> str:
@@ -287,20 +173,22 @@ class Tables:
         for metric in self.comparison.metrics:
             found = [self._per_scene.get((label, condition, s, metric.name)) for s in scenes]
             mean = self._means.get((label, condition, metric.name))
-            cells = [self._cell(row, metric) for row in (*found, mean)]
+            cells = [
+                *("failed" if row is None else percent(row.change, metric) for row in found),
+                marked(mean, metric, len(scenes)),
+            ]
             rows.append((f"{metric.label}, %", *cells))
             if metric.unit == "dB":
                 absolute = [
-                    "failed  " if row is None else f"{signed(row.difference)}  "
-                    for row in (*found, mean)
+                    "failed" if row is None else signed(row.difference) for row in (*found, mean)
                 ]
                 rows.append((f"{metric.label}, dB", *absolute))
         return TextTable(
-            title=titled(f"{label}: change from baseline, scene by scene", condition),
+            title=titled(f"{label}: change from {self.comparison.base}, scene by scene", condition),
             columns=("Metric", *scenes, "mean"),
             rows=tuple(rows),
             align="l" + "r" * (len(scenes) + 1),
-            notes=(ARROWS_NOTE,),
+            notes=(ARROWS_NOTE, *self._mean_notes([label], condition)),
         )
 
     def values(self, condition: str) -> TextTable:
@@ -353,12 +241,14 @@ class Tables:
         table["printed"] = [percent(r.change, m).rstrip() for r, m in zip(rows, of, strict=True)]
         table["reading"] = [reading(r, m) for r, m in zip(rows, of, strict=True)]
         table["metric_unit"] = [m.unit for m in of]
+        table["against"] = self.comparison.base
         table["higher_is_better"] = [m.higher_is_better for m in of]
         table = table.rename(columns={"n": "n_values", "unit": "n_of", "change": "change_percent"})
         return table[
             [*_LEVEL, "metric_unit", "higher_is_better",
-             "baseline", "value", "change_percent", "difference", "low", "high", "spread",
-             "n_values", "n_of", "agree", "pairs", "printed", "reading", "why", *_GAP.values()]
+             "against", "base", "value", "change_percent", "difference", "low", "high",
+             "n_values", "n_of", "scenes", "agree", "pairs", "scatter_replicates", "scatter_scenes",
+             "p", "q", "printed", "reading", "why", *_GAP.values()]
         ]  # fmt: skip
 
     def _long_gaps(self) -> pd.DataFrame:
@@ -368,14 +258,21 @@ class Tables:
         return pd.concat([means, scenes])[[*_LEVEL, *_GAP]].rename(columns=_GAP)
 
 
-def by_key(table: pd.DataFrame) -> dict[tuple[str, ...], Change]:
-    """Return the rows of a table of means by their keys.
-
-    Args:
-        table: One of the tables of means of a `Comparison`.
-    """
-    rows = table[list(Change._fields)].itertuples(index=False)
-    return {key: Change(*row) for key, row in zip(table.index, rows, strict=True)}
+def _mean_row(row: Change, metric: Metric, scenes: int) -> tuple[str, ...]:
+    """Return the row of a table of means that should be over so many scenes."""
+    return (
+        metric.label,
+        number(row.base, metric.unit),
+        number(row.value, metric.unit),
+        f"{percent(row.change, metric)}{lacking(row, scenes)}",
+        signed(row.difference) if metric.unit == "dB" else "",
+        interval(row),
+        agreement(row),
+        scatter(row.scatter_replicates),
+        scatter(row.scatter_scenes),
+        false_discovery(row),
+        reading(row, metric),
+    )
 
 
 def _listed(replicates: set[tuple[int, int]]) -> str:
