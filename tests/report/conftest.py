@@ -13,6 +13,7 @@ from xrgs.experiment.store import Store
 
 SUMMARY = {
     "training_time_s": 100.0,
+    "render_time_ms": 8.0,
     "gaussians": 5000,
     "memory_bytes": 2**26,
     "peak_rss_bytes": 2**29,

@@ -62,6 +62,18 @@ def test_what_autograd_saves_counts(data: Dataset) -> None:
     assert memory.largest_bytes == 4 * 50 * (1 + 1 + 2)  # x, its gradient; y and z
 
 
+def test_what_a_forward_pass_drops_does_not_count(data: Dataset) -> None:
+    """Or a count would depend on which of its addresses are used again."""
+    x = torch.rand(50, requires_grad=True)
+    memory = TrainingMemory(x)
+    with memory.of_forward(step(data), 1, 0):
+        (x.exp() * x.cos()).sum()
+        loss = x.exp().sum()
+    torch.autograd.backward(loss)
+    memory.record(render(0))
+    assert memory.largest_bytes == 4 * 50 * (1 + 1 + 1)  # x, its gradient, one exponential
+
+
 def test_steps_alike_are_counted_once_until_the_gaussians_change(data: Dataset) -> None:
     held: list[torch.Tensor] = []
     memory = TrainingMemory(held)

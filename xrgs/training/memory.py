@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import weakref
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from types import FunctionType, ModuleType
@@ -62,15 +63,17 @@ class TrainingMemory:
         if kind in self._counted:
             yield
             return
-        saved: dict[int, int] = {}
+        packed: list[weakref.ref[Tensor]] = []
 
         def note(tensor: Tensor) -> Tensor:
-            saved.update(_storages([tensor]))
+            packed.append(weakref.ref(tensor))
             return tensor
 
         with torch.autograd.graph.saved_tensors_hooks(note, lambda tensor: tensor):
             yield
-        # Now, while all of it exists: later, other tensors may have the same addresses.
+        # Now, while all of it exists: later, other tensors may have the same addresses, and those
+        # of results that the block has dropped already do.
+        saved = _storages(tensor for noted in packed if (tensor := noted()) is not None)
         held = _storages(tensors_in(self.holders))
         self._noted = kind, sum(size for address, size in saved.items() if address not in held)
 
