@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from torch import Tensor
 
 from xrgs.splat.densify import Densifier
-from xrgs.splat.gaussians import PARAMETERS
+from xrgs.splat.gaussians import PARAMETERS, Gaussians
 from xrgs.splat.growth import Budget, best, split_along_longest_axis
 from xrgs.splat.refinement import DensifierHooks, Refinement
 from xrgs.splat.settings import DensifySettings
@@ -184,13 +184,18 @@ def test_scores_take_the_place_of_the_gradient(make_densifier: MakeDensifier) ->
     assert torch.equal(densifier.gaussians.sh0[6:8].detach(), before[[0, 3]])
 
 
-def test_scores_of_gaussians_that_are_dropped_do_not_shift_the_others(
+def test_gaussians_that_are_not_finite_are_dropped_before_scores_are_asked_for(
     make_densifier: MakeDensifier,
 ) -> None:
     densifier = densifier_within(make_densifier, budget=8 / 400)
     densifier.gaussians.means.data[0] = torch.nan
     before = densifier.gaussians.sh0.detach().clone()
-    hooks = DensifierHooks(growth_scores=lambda _: torch.tensor([9.0, 0, 1, 2, 3, 4, 6, 5]))
+
+    def scores(gaussians: Gaussians) -> torch.Tensor:
+        assert gaussians.means.isfinite().all()  # what is rendered for the scores has to be
+        return torch.tensor([0.0, 1, 2, 3, 4, 6, 5])
+
+    hooks = DensifierHooks(growth_scores=scores)
     assert refine(densifier, 600, [1.0] * 8, hooks) == Refinement(pruned_non_finite=1, split=1)
     assert torch.equal(densifier.gaussians.sh0[-1].detach(), before[6])
 

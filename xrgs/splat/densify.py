@@ -25,7 +25,13 @@ from torch import Tensor
 
 from xrgs.splat.backend import implementation
 from xrgs.splat.gaussians import PARAMETERS
-from xrgs.splat.growth import Budget, best, split_along_longest_axis, split_at_random
+from xrgs.splat.growth import (
+    Budget,
+    best,
+    gaussians_of,
+    split_along_longest_axis,
+    split_at_random,
+)
 from xrgs.splat.optimizer import SplatOptimizer
 from xrgs.splat.refinement import DensifierHooks, Groups, Refinement, Thresholds
 from xrgs.splat.settings import DensifySettings
@@ -91,7 +97,7 @@ class Densifier:
         self.scene_scale = scene_scale
         self.generator = generator
         self.budget = (
-            Budget(len(self.gaussians), round(settings.budget * view_pixels))
+            Budget(len(self.gaussians), gaussians_of(settings.budget, view_pixels))
             if settings.budget
             else None
         )
@@ -204,12 +210,12 @@ class Densifier:
         self, step: int, deciding: Mapping[str, Thresholds], hooks: DensifierHooks
     ) -> Refinement:
         """Drop what is not finite, grow, prune, and start the statistics again."""
-        finite = self._finite()  # [N]
+        # Before growing would copy it, and before a hook renders.
+        dropped = self.remove(~self._finite())
         above, high_gradient = self._above_thresholds(deciding)  # [G, N], [N]
-        growing = self._choose(high_gradient & finite, step, int(finite.sum()), hooks)  # [N]
-        dropped = self.remove(~finite)  # before growing would copy it
+        growing = self._choose(high_gradient, step, hooks)  # [N]
         deciding_row = self._deciding_row()  # [N], before growing
-        grown, parents = self._grow(growing[finite])
+        grown, parents = self._grow(growing)
         prune = self.grad2d_sum.new_tensor([t.prune_opacity for t in deciding.values()])  # [G]
         # Copies and halves are pruned by the threshold of their parent.
         pruned, low_opacity = self._prune(
@@ -220,7 +226,7 @@ class Densifier:
             f"{count}_{name}": 0 for count in _COUNTED_BY_GROUP for name in self.group_thresholds
         }
         for row, name in enumerate(deciding if self.group_thresholds else ()):
-            by_group[f"grown_{name}"] = int((above[row] & finite).sum())
+            by_group[f"grown_{name}"] = int(above[row].sum())
             by_group[f"pruned_opacity_{name}"] = low_opacity[row]
         return Refinement(pruned_non_finite=dropped, **grown, **pruned, by_group=by_group)
 
@@ -234,13 +240,12 @@ class Densifier:
         of_threshold = (self.grad2d_sum / grow[:, None]).sum(dim=0)  # [N]
         return above, of_threshold > self.visible_count.sum(dim=0)
 
-    def _choose(self, candidates: Tensor, step: int, count: int, hooks: DensifierHooks) -> Tensor:
+    def _choose(self, candidates: Tensor, step: int, hooks: DensifierHooks) -> Tensor:
         """Return which of the candidates [N] grow.
 
         Args:
             candidates: [N] bool, Gaussians above the growth threshold.
             step: Number of the step.
-            count: Number of Gaussians that growing starts from.
             hooks: What others decide at this step.
         """
         may_grow = hooks.may_grow(self.gaussians)
@@ -250,7 +255,7 @@ class Densifier:
             return candidates
         start, last = self.settings.start, self.settings.last_refinement
         progress = (step - start) / (last - start)  # this step is above start, and at most last
-        room = max(0, self.budget.cap(progress) - count)
+        room = max(0, self.budget.cap(progress) - len(self.gaussians))
         if int(candidates.sum()) <= room:
             return candidates
         scores = hooks.growth_scores(self.gaussians) if room else None

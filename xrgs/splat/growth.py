@@ -50,6 +50,16 @@ class Budget:
         return first + int((self.most - first) * math.sqrt(progress))
 
 
+def gaussians_of(budget: float, view_pixels: int) -> int:
+    """Return the number of Gaussians of a budget, at least 1.
+
+    Args:
+        budget: Gaussians per pixel.
+        view_pixels: Number of pixels of the largest training view.
+    """
+    return max(1, round(budget * view_pixels))
+
+
 def best(candidates: Tensor, scores: Tensor, count: int) -> Tensor:
     """Choose the candidates of the highest scores, of equal ones those that come first.
 

@@ -66,8 +66,9 @@ class TrainingMemory:
         packed: list[weakref.ref[Tensor]] = []
 
         def note(tensor: Tensor) -> Tensor:
-            packed.append(weakref.ref(tensor))
-            return tensor
+            kept = tensor.detach()  # the tensor itself would make a cycle of references
+            packed.append(weakref.ref(kept))
+            return kept
 
         with torch.autograd.graph.saved_tensors_hooks(note, lambda tensor: tensor):
             yield

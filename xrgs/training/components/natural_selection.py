@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from xrgs.errors import XrgsError
+from xrgs.splat.growth import gaussians_of
 from xrgs.splat.rounding import rounded_mean
 from xrgs.splat.settings import NOMINAL_STEPS
 from xrgs.training.components.base import Component, Step, TrainingSetup, check_not_negative
@@ -97,7 +98,7 @@ class NaturalSelection(Component):
                 f"components.natural_selection.until={settings.until}: must be above"
                 f" splat.densify.stop + {_LEAD} = {stop + _LEAD} and at most {NOMINAL_STEPS}"
             )
-        return cls(settings, max(1, round(settings.budget * setup.data.view_pixels)), stop)
+        return cls(settings, gaussians_of(settings.budget, setup.data.view_pixels), stop)
 
     def after_backward(self, gaussians: Gaussians, step: Step) -> None:
         """Add the push to the gradient of the logit opacities.
