@@ -183,7 +183,7 @@ def cautions(
     ]
     not_held_out = sorted({shown(v.scene) for v in variants.values() if not v.held_out})
     lines += [
-        f"{scene} has too few views to hold any out: it is scored at the poses that it is trained on."
+        f"{scene} has too few views to hold any out: it is scored at the poses of training."
         for scene in not_held_out
     ]
     return lines

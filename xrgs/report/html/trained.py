@@ -197,7 +197,7 @@ class _Adder:
         weights = model.weights([view.camera for view in views[::step]])
         # Stable, so that equal weights keep the order of the file.
         order = torch.sort(weights, descending=True, stable=True).indices[: self.kept]
-        kept = order.sort().values
+        kept, _ = order.sort()
         share = float(weights[kept].double().sum() / weights.double().sum().clamp(min=1e-12))
         return {
             "label": model.label,

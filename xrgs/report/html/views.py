@@ -23,6 +23,8 @@ if TYPE_CHECKING:
 
 #: The largest image that is read.
 _MAX_PIXELS = 1 << 24
+#: Scores by cell and view.
+_Scores = dict[tuple[str, str], dict[str, float | None]]
 #: About how many more pixels error maps add to those of renders.
 _WITH_ERROR_MAPS = 1.25
 
@@ -46,11 +48,15 @@ def add_views(
         views: The table `Sweep.views`.
         max_bytes: The most bytes that the images may take; 0 for no images.
     """
-    scores = {cell_id: rows.set_index("view") for cell_id, rows in views.groupby("cell_id")}
+    scores: _Scores = {
+        (row["cell_id"], row["view"]): {name: finite(row[name]) for name in VIEW_METRICS}
+        for row in views.to_dict("records")
+    }
+    names = {name: list(rows["view"]) for name, rows in views.groupby("cell_id")}
     wanted = [
         (cells, view)
         for cells in runs(comparison)
-        for view in _names([scores.get(name) for name in cells["cell_id"]])
+        for view in dict.fromkeys(v for name in cells["cell_id"] for v in names.get(name, ()))
     ]
     pixels = sum(_pixels(store, cells, view) for cells, view in wanted) if max_bytes else 0
     album = Album(max_bytes, int(pixels * _WITH_ERROR_MAPS))
@@ -73,11 +79,6 @@ def _title(entry: dict[str, Any]) -> str:
     return ", ".join(filter(None, (entry[key] for key in ("scene", "condition", "view"))))
 
 
-def _names(scores: list[pd.DataFrame | None]) -> list[str]:
-    """Return the views that any of the cells was scored on, in their order."""
-    return list(dict.fromkeys(view for rows in scores if rows is not None for view in rows.index))
-
-
 def _files(store: Store, cells: pd.DataFrame, view: str) -> list[ConfinedPath]:
     """Return the files of the photograph and of the render of each cell."""
     first = cells.iloc[0]
@@ -96,13 +97,11 @@ def _pixels(store: Store, cells: pd.DataFrame, view: str) -> int:
     return width * height * (1 + len(cells))
 
 
-def _entry(cells: pd.DataFrame, view: str, scores: dict[str, pd.DataFrame]) -> dict[str, Any]:
-    arms = []
-    for cell_id, label in zip(cells["cell_id"], cells["label"], strict=True):
-        rows = scores.get(cell_id)
-        found = rows is not None and view in rows.index
-        of = {name: finite(rows.at[view, name]) if found else None for name in VIEW_METRICS}  # type: ignore[union-attr]
-        arms.append({"label": shown(label), "scores": of})
+def _entry(cells: pd.DataFrame, view: str, scores: _Scores) -> dict[str, Any]:
+    arms = [
+        {"label": shown(label), "scores": scores.get((cell_id, view), dict.fromkeys(VIEW_METRICS))}
+        for cell_id, label in zip(cells["cell_id"], cells["label"], strict=True)
+    ]
     return run_names(cells.iloc[0]) | {"view": shown(view), "arms": arms}
 
 
