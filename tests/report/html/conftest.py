@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import shutil
 from collections.abc import Callable, Iterator
 from dataclasses import asdict
@@ -76,6 +77,13 @@ def make_gaussians(seed: int, count: int = 200) -> Gaussians:
         "shN": np.zeros((count, 15, 3)),
     }
     return Gaussians(**{name: torch.from_numpy(a).float() for name, a in arrays.items()})
+
+
+def data_of(page: Path) -> dict[str, Any]:
+    """The JSON of a page."""
+    found = re.search(r'<script type="application/json" id="data">(.*?)</script>', page.read_text())
+    assert found is not None
+    return dict(json.loads(found[1]))
 
 
 def plain(value: Any) -> Any:

@@ -4,18 +4,16 @@ from __future__ import annotations
 
 import base64
 import hashlib
-import json
 import re
 from html.parser import HTMLParser
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 import torch
 from PIL import Image
 
-from tests.report.html.conftest import HOSTILE, make_gaussians, page_of
+from tests.report.html.conftest import HOSTILE, data_of, make_gaussians, page_of
 from xrgs.report import build
 from xrgs.report.html import document
 from xrgs.report.html.album import Album, error_map
@@ -39,13 +37,6 @@ class Parsed(HTMLParser):
 
     def handle_data(self, data: str) -> None:
         self.texts.setdefault(self._open, []).append(data)
-
-
-def data_of(page: Path) -> dict[str, Any]:
-    """The JSON of a page."""
-    found = re.search(r'<script type="application/json" id="data">(.*?)</script>', page.read_text())
-    assert found is not None
-    return dict(json.loads(found[1]))
 
 
 def test_the_same_store_gives_the_same_bytes(copied: Path, page: Path) -> None:

@@ -161,7 +161,7 @@ def _rendered(
         policy=_policy(style, script),
         style=style,
         script=script,
-        tables=texts,
+        tables=[_printable(table) for table in texts],
         changes=changes,
         change_columns=[*zip(listed.columns, listed.align, strict=True)],
         notes=list(dict.fromkeys(content.notes)),
@@ -175,6 +175,17 @@ def _rendered(
             "changes": _lines(listed),
             "scores": [_score(name) for name in VIEW_METRICS if _is_measured(content, name)],
         },
+    )
+
+
+def _printable(table: TextTable) -> TextTable:
+    """Return a table whose texts are lines of bounded length."""
+    return TextTable(
+        shown(table.title),
+        tuple(map(shown, table.columns)),
+        tuple(tuple(map(shown, row)) for row in table.rows),
+        table.align,
+        tuple(map(shown, table.notes)),
     )
 
 
