@@ -19,8 +19,8 @@ if TYPE_CHECKING:
 #: What the cells of one row of pictures have in common.
 RUN = ["scene", "condition", "variant_seed", "seed"]
 LOG_SCALES = (-9.0, 3.0)
-"""Natural logarithms of a model's scales that 8 bits cover, in the normalised world: what is smaller
-is far below a pixel, and a step is 5%."""
+"""Natural logarithms of a model's scales that 8 bits cover, in the normalised world. A step is 5%,
+and what is smaller is far below a pixel."""
 
 
 @dataclass
