@@ -13,7 +13,7 @@ _HELP = """\
 xrgs-report [KEY=VALUE]...
 
 Makes the tables and figures of a sweep, from the store alone; the same store gives the same bytes.
-report.html is a page with all of it, the photographs and the Gaussians: one file that needs no network.
+report.html is a page with all of it, the photographs and the Gaussians: one file, without network.
 
   store=FOLDER     the store; xrgs-store by default
   sweep=ID         id of the sweep; the latest by default

@@ -73,7 +73,7 @@ function seriesOf(one, x, y, xName, yName) {
     line.addEventListener("pointerleave", () => showTip(""));
     drawn.push(line);
   }
-  if (one.marks || one.points.length <= 12) {
+  if (one.marks || (one.points.length <= 12 && !one.faint)) {
     const radius = one.marks ? 6 : 3;
     for (const [px, py] of one.points) {
       const text = `${one.name}\n${xName} ${brief(px)}\n${yName} ${brief(py)}`;
@@ -110,6 +110,19 @@ function seriesFrom(rows, over, name) {
     .filter((one) => one.points.length);
 }
 
+// The series with the mean of each label that has several of one length, which are faint then.
+function withMeans(series) {
+  const means = distinct(series.map((one) => one.label)).flatMap((label) => {
+    const runs = series.filter((one) => one.label === label);
+    const count = runs[0].points.length;
+    if (runs.length < 2 || runs.some((one) => one.points.length !== count)) return [];
+    runs.forEach((one) => (one.faint = true));
+    const mean = (at, axis) => runs.reduce((sum, one) => sum + one.points[at][axis], 0) / runs.length;
+    return [{ name: `${label}: mean of ${runs.length} runs`, label, points: runs[0].points.map((_, at) => [mean(at, 0), mean(at, 1)]) }];
+  });
+  return [...series, ...means];
+}
+
 function startCurves() {
   const over = document.getElementById("curves-over");
   const rule = document.getElementById("curves-rule");
@@ -118,9 +131,9 @@ function startCurves() {
   const body = document.getElementById("curves-body");
   const draw = () => {
     const scores = data.scores.filter((score) => score.name !== "ssim" || filters.metric === "SSIM");
-    const charts = scores.map((score) => chart(`${score.label} of the test views`, seriesFrom(data.curves, over.value, score.name), OVER[over.value], score.label));
-    charts.push(chart("Gaussians", seriesFrom(data.history, "step", "gaussians"), OVER.step, "Gaussians"));
-    if (rule.value) charts.push(chart(RULES[rule.value], seriesFrom(data.history, "step", rule.value), OVER.step, "so far"));
+    const charts = scores.map((score) => chart(`${score.label} of the test views`, withMeans(seriesFrom(data.curves, over.value, score.name)), OVER[over.value], score.label));
+    charts.push(chart("Gaussians", withMeans(seriesFrom(data.history, "step", "gaussians")), OVER.step, "Gaussians"));
+    if (rule.value) charts.push(chart(RULES[rule.value], withMeans(seriesFrom(data.history, "step", rule.value)), OVER.step, "so far"));
     body.replaceChildren(...charts);
     const used = labels.filter((label) => passes({ label, scene: filters.scene }));
     document.getElementById("curves-legend").replaceChildren(...legend(used));
