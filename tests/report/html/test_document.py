@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import base64
 import hashlib
+import html
+import json
 import re
 from html.parser import HTMLParser
 from pathlib import Path
@@ -13,7 +15,8 @@ import pytest
 import torch
 from PIL import Image
 
-from tests.report.html.conftest import HOSTILE, data_of, make_gaussians, page_of
+from tests.report.html.conftest import HOSTILE, TEST_VIEWS, data_of, make_gaussians, page_of
+from xrgs.experiment.store import Store
 from xrgs.report import build
 from xrgs.report.html import document
 from xrgs.report.html.album import Album, error_map
@@ -162,3 +165,17 @@ def test_quantised_gaussians_are_close_to_the_original_ones() -> None:
     scales = np.exp(LOG_SCALES[0] + rest[:, :3] * (LOG_SCALES[1] - LOG_SCALES[0]))
     np.testing.assert_allclose(scales, activated.scales[kept].numpy(), rtol=0.024)
     np.testing.assert_allclose(rest[:, 10], activated.opacities[kept].numpy(), atol=1 / 255)
+
+
+def test_the_context_says_which_arm_differs(copied: Path) -> None:
+    """The prune rule of one arm is changed in its config, whose hash is declared anew."""
+    cell = Store(copied).cell("cell00001")
+    file = cell.path / "config.json"
+    config = json.loads(file.read_text())
+    config["splat"]["densify"]["prune_scale3d"] = 10.0
+    file.write_text(json.dumps(config))
+    cell.finish(TEST_VIEWS, 1)
+    text = html.unescape(build(copied, pictures=[]).folder.joinpath("report.html").read_text())
+    assert f"<td>0.1 (baseline, {HOSTILE}); 10.0 (consistency)</td>" in text
+    assert "<td>1 HR (48 × 36 px); 2 LR (24 × 18 px); 2 test (48 × 36 px)</td>" in text
+    assert "fern has 2 scored views: its scores are of little weight." in text

@@ -123,7 +123,9 @@ def context(
     ]
     configs = [cell_columns(store.cell(name).folder, {}) for name in done["cell_id"]]
     for key, name in _SETTINGS.items():
-        rows.append((name, _listed(config.get(key, "n/a") for config in configs)))
+        rows.append(
+            (name, _by_label(done["label"], [config.get(key, "n/a") for config in configs]))
+        )
     rows += [(shown(scene), text) for scene, text in _views(done, variants)]
     rows += [
         (name, _listed(sweep.provenance.get(key, ["n/a"]))) for key, name in _MADE_WITH.items()
@@ -133,6 +135,16 @@ def context(
 
 def _replicates(rows: pd.DataFrame) -> list[str]:
     return [f"{draw}/{seed}" for draw, seed in zip(rows["variant_seed"], rows["seed"], strict=True)]
+
+
+def _by_label(labels: Iterable[str], values: Iterable[Any]) -> str:
+    """List distinct values; where there are several, with the labels that have each."""
+    found: dict[str, list[str]] = {}
+    for label, value in zip(labels, values, strict=True):
+        found.setdefault(str(value), []).append(label)
+    if len(found) == 1:
+        return _listed(found)
+    return shown("; ".join(f"{value} ({_listed(of)})" for value, of in found.items()))
 
 
 def _listed(values: Iterable[Any]) -> str:
