@@ -22,6 +22,7 @@ from xrgs.report.html import document
 from xrgs.report.html.album import Album, error_map
 from xrgs.report.html.content import LOG_SCALES
 from xrgs.report.html.trained import quantise
+from xrgs.splat.ply import save_ply
 
 
 class Parsed(HTMLParser):
@@ -114,6 +115,16 @@ def test_a_damaged_file_costs_what_it_shows_alone(copied: Path, damaged: str, sa
     assert str(copied) not in data["notes"][0]
     others = [arm["label"] for arm in data["views"][1]["arms"] if "image" in arm]
     assert others == ["baseline", "consistency", HOSTILE]
+
+
+def test_gaussians_that_overflow_are_left_out_alone(copied: Path) -> None:
+    gaussians = make_gaussians(1)
+    gaussians.scales[3, 1] = 1e30
+    save_ply(copied / "cells/cell00001/splats.ply", gaussians)
+    data = data_of(page_of(copied))
+    assert [model["label"] for model in data["models"]] == ["baseline", HOSTILE]
+    assert [note for note in data["notes"] if "not finite" in note] == data["notes"]
+    assert len(data["notes"]) == 1
 
 
 def test_a_page_that_is_too_large_says_what_it_left_out(

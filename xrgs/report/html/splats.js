@@ -1,5 +1,6 @@
 // Two trained scenes side by side under one camera: Gaussians are projected, sorted and blended as
-// xrgs.splat does (EWA splatting), with WebGL2. OpenCV axes: x right, y down, z forward.
+// xrgs.splat does (EWA splatting), with WebGL2. OpenCV axes: x right, y down, z forward. viser's page
+// shows one scene with a camera of its own, and needs a policy that lets any script run.
 const GAUSSIAN_SHADER = `#version 300 es
 precision highp float;
 uniform highp sampler2D gaussians;

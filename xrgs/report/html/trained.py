@@ -109,7 +109,7 @@ def add_trained(
     for rows in progress(readable, "rendering training views", "run"):
         try:
             adder.add_run(rows, variants[rows["variant_id"].iloc[0]], album)
-        except XrgsError as error:
+        except (XrgsError, ValueError) as error:  # what can't be rendered is a ValueError
             title = f"{shown(rows['scene'].iloc[0])}: training views and models"
             content.notes.append(f"{title} are not shown, {why(error, store)}")
     content.images += album.urls
@@ -157,7 +157,14 @@ class _Adder:
             return None
         backend = resolve_backend(splat.backend)
         with torch.no_grad():
-            return _Model(label, gaussians.activated(backend=backend), splat.raster, backend)
+            activated = gaussians.activated(backend=backend)
+        if not all(bool(torch.isfinite(values).all()) for values in activated):
+            self.content.notes.append(
+                f"{shown(row['scene'])}, {label}: no training views and no model, its Gaussians"
+                " have scales that are not finite"
+            )
+            return None
+        return _Model(label, activated, splat.raster, backend)
 
     def _add_training(
         self,
