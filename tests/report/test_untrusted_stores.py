@@ -186,7 +186,7 @@ def test_a_report_is_not_written_through_links(made: Any, tmp_path: Path) -> Non
     for file in [*folder.glob("*.*"), *(folder / "figures").iterdir()]:
         file.unlink()
         file.symlink_to(precious)
-    assert len(build(made.store.path).files) == 12
+    assert len(build(made.store.path).files) == 13
     assert precious.read_text() == "mine"
     for place in (folder / "figures", folder, folder.parent):
         elsewhere = tmp_path / "elsewhere" / place.name

@@ -13,11 +13,13 @@ _HELP = """\
 xrgs-report [KEY=VALUE]...
 
 Makes the tables and figures of a sweep, from the store alone; the same store gives the same bytes.
+report.html is a page with all of it, the photographs and the Gaussians: one file, without network.
 
   store=FOLDER     the store; xrgs-store by default
   sweep=ID         id of the sweep; the latest by default
   out=FOLDER       folder to write to; STORE/reports/ID by default
-  pictures=NAMES   all, none, or names of figures without their ending: trade-off,fern--plus
+  pictures=NAMES   all, none, or names of figures without their ending: trade-off,fern--plus;
+                   none leaves the pictures of report.html out too
   against=LABEL    the label that all others are compared with; baseline by default. The report of
                    another one is in STORE/reports/ID.against-LABEL
 """

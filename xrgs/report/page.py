@@ -14,6 +14,7 @@ from xrgs.report import curves, skipped
 from xrgs.report.collect import RECORD_KEYS, ReportError, Sweep, read_sweep
 from xrgs.report.compare import compare
 from xrgs.report.gap import gap_tables
+from xrgs.report.html import write_document
 from xrgs.report.pictures import Picture, draw
 from xrgs.report.render import TextTable, to_latex, to_markdown, to_text
 from xrgs.report.tables import Tables
@@ -137,6 +138,16 @@ def build(
         runs = Runs.of(sweep, comparison.cells)
         drawn = draw(store, comparison, sweep.views, runs.curves, folder / "figures", pictures)
         _write_files(folder, sweep, tables, drawn, runs)
+        write_document(
+            folder / "report.html",
+            store,
+            sweep,
+            tables,
+            [*_all_tables(tables), *runs.tables(comparison), _provenance_table(sweep)],
+            runs.curves,
+            _warnings(sweep),
+            pictures=pictures is None or bool(pictures),
+        )
     except OSError as error:
         raise ReportError(
             f"the report can't be written to {folder}: {error.filename}: {error.strerror};"
@@ -160,6 +171,7 @@ def _refuse_links(folder: ConfinedPath) -> None:
 
 #: The files of every report, beside its pictures.
 _FILES = (
+    "report.html",
     "table.md",
     "table.tex",
     "table.csv",

@@ -1,0 +1,163 @@
+"""A store with photographs, renders and Gaussians, the page of its report, and a browser."""
+
+from __future__ import annotations
+
+import json
+import re
+import shutil
+from collections.abc import Callable, Iterator
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from tests.report.conftest import MadeStore
+from xrgs.capture import dataset, frozen, images
+from xrgs.capture.views import Variant, View
+from xrgs.config import Conf
+from xrgs.experiment.store import Store
+from xrgs.report import build
+from xrgs.safeio.confined import ConfinedPath
+from xrgs.splat.gaussians import Gaussians
+from xrgs.splat.ply import save_ply
+
+HR, LR = (48, 36), (24, 18)
+TEST_VIEWS = ("IMG_001", "IMG_009")
+TRAINING_VIEWS = {"IMG_002": "HR", "IMG_003": "LR", "IMG_004": "LR"}
+HOSTILE = "<img src=x onerror=alert(1)></script><script>document.title='taken'</script>{{7*7}}"
+QUALITY = "step,seconds,evaluations,gaussians,psnr,ssim,lpips\n" + "".join(
+    f"{step},{step / 10},{step * 10**6},{step * 5},{15 + step / 100},0.7,0.4\n"
+    for step in (100, 200, 300)
+)
+HISTORY = "step,loss,gaussians,duplicated,split,pruned_opacity,pruned_scale\n" + "".join(
+    f"{step},0.1,{100 + step},{step},{step // 2},{step // 3},0\n" for step in range(0, 500, 50)
+)
+
+
+def _view(folder: ConfinedPath, name: str, split: str, tag: str, number: int) -> View:
+    """A view of coloured noise; the cameras stand in a row, three units before the origin."""
+    width, height = HR if tag == "HR" else LR
+    file = folder / f"images/{split}/{name}.png"
+    rng = np.random.default_rng(number)
+    images.save(file, np.kron(rng.random((6, 8, 3)), np.ones((height // 6, width // 8, 1))))
+    viewmat = np.eye(4)
+    viewmat[:3, 3] = (-0.4 * number, 0.1 * (number % 2), 3.0)
+    K = np.array([[width, 0, width / 2], [0, width, height / 2], [0, 0, 1.0]])
+    return View(name, file, split, tag, width, height, K, viewmat, width / HR[0])
+
+
+def make_variant(store: Store) -> Variant:
+    """Freeze a variant of two test views and three training views into a store."""
+    folder = store.folder / "source"
+    views = [_view(folder, name, "test", "HR", at) for at, name in enumerate(TEST_VIEWS)]
+    for at, (name, tag) in enumerate(TRAINING_VIEWS.items(), 2):
+        views.append(_view(folder, name, "train", tag, at))
+        if tag == "LR":
+            views.append(_view(folder, name, "original", "HR", at))
+    points = np.random.default_rng(0).normal(0, 1, (50, 3))
+    views.sort(key=lambda view: (view.split, view.name))
+    made = Variant(
+        "id", folder, "fern", 2, True, tuple(views), points, np.zeros((50, 3), np.uint8), {}
+    )
+    return frozen.freeze(made, "0123456789abcdef", folder, store.variants)
+
+
+def make_gaussians(seed: int, count: int = 200) -> Gaussians:
+    """Opaque and faint Gaussians of all colours around the centre of the normalised world."""
+    rng = np.random.default_rng(seed)
+    arrays = {
+        "means": rng.normal(0, 0.25, (count, 3)),
+        "quats": rng.normal(size=(count, 4)),
+        "scales": rng.normal(-3.0, 0.4, (count, 3)),
+        "opacities": rng.normal(0.5, 1.5, count),
+        "sh0": rng.normal(0, 1.2, (count, 1, 3)),
+        "shN": np.zeros((count, 15, 3)),
+    }
+    return Gaussians(**{name: torch.from_numpy(a).float() for name, a in arrays.items()})
+
+
+def data_of(page: Path) -> dict[str, Any]:
+    """The JSON of a page."""
+    found = re.search(r'<script type="application/json" id="data">(.*?)</script>', page.read_text())
+    assert found is not None
+    return dict(json.loads(found[1]))
+
+
+def plain(value: Any) -> Any:
+    """A config as JSON values."""
+    return json.loads(json.dumps(asdict(value), default=str))
+
+
+def page_of(store: Path, out: Path | None = None) -> Path:
+    """The page of a store's report, of whose figures the fewest are drawn."""
+    return build(store, out=out, pictures=["trade-off"]).folder / "report.html"
+
+
+@pytest.fixture(scope="session")
+def pictured(tmp_path_factory: pytest.TempPathFactory, compose: Callable[..., Conf]) -> Path:
+    """A store of one scene, with everything that a page shows, and a hostile label."""
+    made = MadeStore(tmp_path_factory.mktemp("pictured") / "store")
+    variant = make_variant(made.store)
+    config = plain(compose())
+    for seed, label in enumerate(("baseline", "consistency", HOSTILE)):
+        factors = {"gaussians": 1 - 0.2 * seed, "psnr": 1 + 0.01 * seed}
+        cell = made.add(
+            label, variant=variant.id, factors=factors, quality=QUALITY, history=HISTORY
+        )
+        (cell.path / "config.json").write_text(json.dumps(config))
+        save_ply(cell.path / "splats.ply", make_gaussians(seed))
+        for number, view in enumerate(TEST_VIEWS):
+            photograph = images.read_png(variant.folder / f"images/test/{view}.png")
+            noise = np.random.default_rng(seed + number).normal(0, 0.05 * seed, photograph.shape)
+            images.save(cell.folder / f"renders/{view}.png", (photograph + noise).astype("f4"))
+        cell.finish(TEST_VIEWS, 1)
+    made.write(("+ablation=consistency", f"scene.name={HOSTILE}"))
+    return made.store.path
+
+
+@pytest.fixture
+def copied(pictured: Path, tmp_path: Path) -> Path:
+    """A copy of `pictured` that a test may damage."""
+    return Path(shutil.copytree(pictured, tmp_path / "store"))
+
+
+@pytest.fixture(scope="session")
+def page(pictured: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The page of the report of `pictured`."""
+    return page_of(pictured, tmp_path_factory.mktemp("page"))
+
+
+@pytest.fixture(scope="session")
+def cameras(pictured: Path) -> dataset.Dataset:
+    """The views of the store's variant in the normalised world."""
+    (folder,) = (pictured / "variants").glob("0123*")
+    return dataset.load(frozen.load(folder))
+
+
+@pytest.fixture(scope="session")
+def browser(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Any]:
+    """Debian's chromium without a screen or network; skipped where there is none."""
+    webdriver = pytest.importorskip("selenium.webdriver", reason="selenium is not installed")
+    found = {name: shutil.which(name) for name in ("chromium", "chromedriver")}
+    if missing := [name for name, path in found.items() if path is None]:
+        pytest.skip(f"there is no {' and no '.join(missing)}: apt-get install chromium-driver")
+    options = webdriver.ChromeOptions()
+    options.binary_location = found["chromium"]
+    for flag in (
+        *("headless=new", "no-sandbox", "disable-quic", "no-first-run", "disable-sync"),
+        *("disable-background-networking", "disable-component-update"),
+        *("use-angle=swiftshader", "enable-unsafe-swiftshader"),  # WebGL without a GPU
+        "force-prefers-reduced-motion",  # a click waits for no scrolling
+        "host-resolver-rules=MAP * ~NOTFOUND",
+        f"user-data-dir={tmp_path_factory.mktemp('chromium')}",
+        "window-size=1200,900",
+    ):
+        options.add_argument(f"--{flag}")
+    options.set_capability("goog:loggingPrefs", {"browser": "ALL"})
+    service = webdriver.ChromeService(found["chromedriver"])
+    driver = webdriver.Chrome(options=options, service=service)
+    yield driver
+    driver.quit()

@@ -1,0 +1,192 @@
+"""What is in the page, without a browser."""
+
+from __future__ import annotations
+
+import base64
+import hashlib
+import html
+import json
+import re
+from html.parser import HTMLParser
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+from tests.report.html.conftest import HOSTILE, TEST_VIEWS, data_of, make_gaussians, page_of
+from xrgs.experiment.store import Store
+from xrgs.report import build
+from xrgs.report.html import document
+from xrgs.report.html.album import Album, error_map
+from xrgs.report.html.content import LOG_SCALES
+from xrgs.report.html.trained import quantise
+from xrgs.splat.ply import save_ply
+
+
+class Parsed(HTMLParser):
+    """The elements of a page, and the text in each kind of them."""
+
+    def __init__(self, text: str) -> None:
+        super().__init__()
+        self.tags: list[tuple[str, dict[str, str | None]]] = []
+        self.texts: dict[str, list[str]] = {}
+        self._open = ""
+        self.feed(text)
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.tags.append((tag, dict(attrs)))
+        self._open = tag
+
+    def handle_data(self, data: str) -> None:
+        self.texts.setdefault(self._open, []).append(data)
+
+
+def test_the_same_store_gives_the_same_bytes(copied: Path, page: Path) -> None:
+    again = page_of(copied)
+    assert again.read_bytes() == page.read_bytes()
+    assert page.stat().st_size < document.MAX_BYTES
+
+
+def test_everything_of_the_store_is_there(page: Path) -> None:
+    data = data_of(page)
+    labels = ["baseline", "consistency", HOSTILE]
+    assert [view["view"] for view in data["views"]] == ["IMG_001", "IMG_009"]
+    for entry in data["views"] + data["training"]:
+        assert [arm["label"] for arm in entry["arms"]] == labels
+        urls = [data["images"][arm["image"]] for arm in entry["arms"]]
+        assert all(url.startswith("data:image/webp") for url in urls)
+    tags = [(view["view"], view["tag"], view["original"] is None) for view in data["training"]]
+    assert tags == [("IMG_003", "LR", False), ("IMG_004", "LR", False), ("IMG_002", "HR", True)]
+    assert [model["label"] for model in data["models"]] == labels
+    assert all(model["count"] == model["total"] == 200 for model in data["models"])
+    assert len(data["curves"]) == len(data["history"]) == len(data["trade_offs"]) == 3
+    assert [camera["kind"] for camera in data["cameras"][0]["cameras"]] == [
+        *("HR", "LR", "LR"),
+        *("test", "test"),
+    ]
+    assert data["notes"] == []
+
+
+def test_nothing_of_the_store_is_markup(page: Path) -> None:
+    parsed = Parsed(page.read_text())
+    assert [tag for tag, _ in parsed.tags].count("script") == 2
+    assert not [tag for tag, attributes in parsed.tags if "onerror" in attributes]
+    assert not [1 for _, attributes in parsed.tags if "style" in attributes]
+    assert HOSTILE in "".join(parsed.texts["h3"])
+    assert "49" not in re.findall(r"<h3>(.*?)</h3>", page.read_text())  # not a template either
+
+
+def test_the_policy_names_the_style_and_the_script_alone(page: Path) -> None:
+    parsed = Parsed(page.read_text())
+    policy = next(a["content"] or "" for tag, a in parsed.tags if a.get("http-equiv"))
+    assert policy.startswith("default-src 'none';")
+    assert "unsafe" not in policy
+    assert "http" not in policy
+    for tag in ("style", "script"):
+        text = re.findall(rf"<{tag}>(.*?)</{tag}>", page.read_text(), re.DOTALL)[0]
+        digest = base64.b64encode(hashlib.sha256(text.encode()).digest()).decode()
+        assert f"{tag}-src 'sha256-{digest}'" in policy
+
+
+def test_pictures_none_has_the_tables_alone(copied: Path) -> None:
+    page = build(copied, pictures=[]).folder / "report.html"
+    data = data_of(page)
+    assert data["images"] == data["models"] == data["training"] == []
+    assert [view["view"] for view in data["views"]] == ["IMG_001", "IMG_009"]
+    assert "pictures=none" in page.read_text()
+
+
+@pytest.mark.parametrize(
+    ("damaged", "said"),
+    [
+        ("cells/cell00001/splats.ply", "fern, consistency: no training views and no model"),
+        ("cells/cell00001/renders/IMG_001.png", "fern, IMG_001: no render of consistency"),
+    ],
+)
+def test_a_damaged_file_costs_what_it_shows_alone(copied: Path, damaged: str, said: str) -> None:
+    file = copied / damaged
+    content = file.read_bytes()
+    file.write_bytes(b"x" * len(content))  # of the same size: the cell is still done
+    data = data_of(page_of(copied))
+    assert len(data["notes"]) == 1
+    assert said in data["notes"][0]
+    assert str(copied) not in data["notes"][0]
+    others = [arm["label"] for arm in data["views"][1]["arms"] if "image" in arm]
+    assert others == ["baseline", "consistency", HOSTILE]
+
+
+def test_gaussians_that_overflow_are_left_out_alone(copied: Path) -> None:
+    gaussians = make_gaussians(1)
+    gaussians.scales[3, 1] = 1e30
+    save_ply(copied / "cells/cell00001/splats.ply", gaussians)
+    data = data_of(page_of(copied))
+    assert [model["label"] for model in data["models"]] == ["baseline", HOSTILE]
+    assert [note for note in data["notes"] if "not finite" in note] == data["notes"]
+    assert len(data["notes"]) == 1
+
+
+def test_a_page_that_is_too_large_says_what_it_left_out(
+    copied: Path, page: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(document, "MAX_BYTES", page.stat().st_size - 10)
+    data = data_of(page_of(copied))
+    assert data["history"] == []
+    assert data["models"]
+    assert data["notes"] == ["The page would be too large with its history, which is left out."]
+
+
+def test_images_that_do_not_fit_are_counted(copied: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(document, "_VIEW_BYTES", 10)
+    data = data_of(page_of(copied))
+    assert ["photograph" in view for view in data["views"]] == [False, False]
+    assert data["notes"][0].startswith("The images of 2 of 2 test views are left out")
+
+
+def test_an_album_keeps_an_image_once_and_its_size() -> None:
+    red, blue = (Image.new("RGB", (20, 10), name) for name in ("red", "blue"))
+    album = Album(10_000, 400)
+    assert album.add([red, blue]) == [0, 1]
+    assert album.add([blue, red]) == [1, 0]
+    assert len(album.urls) == 2
+    assert Album(10, 400).add([red]) is None
+
+
+def test_an_error_map_is_brightest_where_the_render_is_wrong() -> None:
+    photograph, render = np.zeros((8, 8, 3), np.uint8), np.zeros((8, 8, 3), np.uint8)
+    render[:4] = 128
+    drawn = np.asarray(error_map(Image.fromarray(photograph), Image.fromarray(render)), int)
+    assert drawn.shape == (4, 4, 3)
+    assert drawn[0].sum() > 10 * drawn[-1].sum()
+    with pytest.raises(ValueError, match="size"):
+        error_map(Image.fromarray(photograph), Image.new("RGB", (4, 4)))
+
+
+def test_quantised_gaussians_are_close_to_the_original_ones() -> None:
+    gaussians = make_gaussians(0, 50)
+    activated = gaussians.activated()
+    kept = torch.arange(5, 25)
+    content = quantise(activated, kept)
+    assert len(content) == 20 * 17
+    bounded = np.frombuffer(content[: 20 * 6], "<u2").reshape(20, 3) / 65535 * 2 - 1
+    means = bounded / (1 - np.abs(bounded))
+    np.testing.assert_allclose(means, activated.means[kept].numpy(), atol=2e-4)
+    rest = np.frombuffer(content[20 * 6 :], "u1").reshape(20, 11) / 255
+    scales = np.exp(LOG_SCALES[0] + rest[:, :3] * (LOG_SCALES[1] - LOG_SCALES[0]))
+    np.testing.assert_allclose(scales, activated.scales[kept].numpy(), rtol=0.024)
+    np.testing.assert_allclose(rest[:, 10], activated.opacities[kept].numpy(), atol=1 / 255)
+
+
+def test_the_context_says_which_arm_differs(copied: Path) -> None:
+    """The prune rule of one arm is changed in its config, whose hash is declared anew."""
+    cell = Store(copied).cell("cell00001")
+    file = cell.path / "config.json"
+    config = json.loads(file.read_text())
+    config["splat"]["densify"]["prune_scale3d"] = 10.0
+    file.write_text(json.dumps(config))
+    cell.finish(TEST_VIEWS, 1)
+    text = html.unescape(build(copied, pictures=[]).folder.joinpath("report.html").read_text())
+    assert f"<td>0.1 (baseline, {HOSTILE}); 10.0 (consistency)</td>" in text
+    assert "<td>1 HR (48 × 36 px); 2 LR (24 × 18 px); 2 test (48 × 36 px)</td>" in text
+    assert "fern has 2 scored views: its scores are of little weight." in text

@@ -1,0 +1,299 @@
+"""Writes the page: a template, its style and scripts, and the content, in one file.
+
+The page needs nothing but itself. Its Content-Security-Policy forbids the network, and runs the one
+script whose hash it names: what a store holds is text or JSON, and never markup or script.
+"""
+
+from __future__ import annotations
+
+import base64
+import hashlib
+from importlib import resources
+from itertools import islice
+from typing import TYPE_CHECKING, Any
+
+import pandas as pd
+from jinja2 import Environment, PackageLoader, StrictUndefined
+
+from xrgs.capture import variant
+from xrgs.capture.views import Variant
+from xrgs.errors import XrgsError
+from xrgs.evaluation.metrics import METRICS, VIEW_METRICS
+from xrgs.report.html import series, summary
+from xrgs.report.html.album import ERROR_RANGE
+from xrgs.report.html.content import LOG_SCALES, Content, finite, runs, shown, why
+from xrgs.report.html.figures import counterparts
+from xrgs.report.html.views import add_views
+from xrgs.report.render import TextTable, titled, to_latex, to_markdown
+from xrgs.report.writing import number, signed
+from xrgs.runtime.machine import set_passive_openmp_wait
+from xrgs.safeio.atomic import write_text
+from xrgs.safeio.words import for_csv
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator, Sequence
+
+    from xrgs.experiment.store import Store
+    from xrgs.report.collect import Sweep
+    from xrgs.report.tables import Tables
+    from xrgs.safeio.confined import ConfinedPath
+
+#: The largest page, in bytes, and what images and models may take of it.
+MAX_BYTES = 10_000_000
+_VIEW_BYTES, _TRAINING_BYTES, _MODEL_BYTES = 4_000_000, 1_500_000, 3_500_000
+#: The scripts, in the order that they need one another.
+_SCRIPTS = ("page.js", "tables.js", "views.js", "charts.js", "splats.js")
+#: The most runs of which training views and models are shown.
+_MAX_RUNS = 12
+
+
+def write_document(
+    file: ConfinedPath,
+    store: Store,
+    sweep: Sweep,
+    tables: Tables,
+    texts: Sequence[TextTable],
+    quality: pd.DataFrame,
+    warnings: Sequence[str],
+    *,
+    pictures: bool,
+) -> None:
+    """Write the report of a sweep as one HTML file of at most `MAX_BYTES`.
+
+    Args:
+        file: The file to write.
+        store: The store with photographs, renders, histories and Gaussians.
+        sweep: The sweep.
+        tables: The tables of its comparison.
+        texts: Every table of the report, in order.
+        quality: Quality during training, as `xrgs.report.curves.joined` returns it.
+        warnings: What a reader is warned of.
+        pictures: Whether to have photographs, renders and models.
+
+    Raises:
+        OSError: The file can't be written.
+    """
+    comparison, content = tables.comparison, Content()
+    variants = _variants(store, comparison.cells, content)
+    add_views(content, store, comparison, sweep.views, _VIEW_BYTES * pictures)
+    series.add_curves(content, quality)
+    series.add_history(content, store, comparison)
+    series.add_trade_offs(content, comparison)
+    if pictures:
+        _add_trained(content, store, list(runs(comparison)), variants)
+    else:
+        content.notes.append("Photographs, renders and models were left out: pictures=none.")
+    head = {
+        "id": shown(sweep.id),
+        "command": shown(" ".join(("xrgs-sweep", *sweep.command))),
+        "base": shown(comparison.base),
+        "answers": summary.answers(comparison),
+        "context": summary.context(store, sweep, comparison, variants),
+        "warnings": [
+            *map(shown, warnings),
+            *summary.cautions(comparison, sweep.views, variants),
+        ],
+    }
+    write_text(file, _fitting(head, content, tables, [table for table in texts if table.rows]))
+
+
+def _variants(store: Store, cells: pd.DataFrame, content: Content) -> dict[str, Variant]:
+    """Load the variants of the finished cells; note those that can't be read."""
+    found = {}
+    for name in cells.loc[cells["state"] == "done", "variant_id"].unique():
+        try:
+            found[name] = variant.load(store.variants / name)
+        except XrgsError as error:
+            content.notes.append(f"Variant {shown(name)}: {why(error, store)}")
+    return found
+
+
+def _add_trained(
+    content: Content, store: Store, found: list[pd.DataFrame], variants: dict[str, Variant]
+) -> None:
+    """Add training views and models of the first replicate of each scene and condition."""
+    first = {(rows["scene"].iloc[0], rows["condition"].iloc[0]): rows for rows in reversed(found)}
+    chosen = list(islice(reversed(first.values()), _MAX_RUNS))
+    if not any(rows["variant_id"].iloc[0] in variants for rows in chosen):
+        return
+    set_passive_openmp_wait()  # before torch is imported
+    from xrgs.report.html.trained import add_trained
+
+    add_trained(content, store, chosen, variants, _TRAINING_BYTES, _MODEL_BYTES)
+    if len(first) > len(chosen):
+        content.notes.append(
+            f"Training views and models are of {len(chosen)} of {len(first)} scenes and conditions."
+        )
+
+
+def _fitting(head: dict[str, Any], content: Content, tables: Tables, texts: list[TextTable]) -> str:
+    """Return the page, without what would make it larger than `MAX_BYTES`."""
+    long = tables.long()
+    for part in ("history", "models", "curves", ""):
+        text = _rendered(head, content, tables, texts, long)
+        if len(text.encode()) <= MAX_BYTES or not part:
+            break
+        setattr(content, part, [])
+        content.notes.append(f"The page would be too large with its {part}, which is left out.")
+    return text
+
+
+def _rendered(
+    head: dict[str, Any],
+    content: Content,
+    tables: Tables,
+    texts: list[TextTable],
+    long: pd.DataFrame,
+) -> str:
+    environment = Environment(
+        loader=PackageLoader("xrgs.report.html", "."),
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    environment.policies["json.dumps_kwargs"] = {"allow_nan": False, "separators": (",", ":")}
+    changes = [*_changes(long, len(tables.comparison.scenes))]
+    listed = _changes_table(changes, head["base"])
+    style, script = _source("page.css"), "\n".join(map(_source, _SCRIPTS))
+    return environment.get_template("page.html.jinja").render(
+        head,
+        policy=_policy(style, script),
+        style=style,
+        script=script,
+        tables=[_printable(table) for table in texts],
+        changes=changes,
+        change_columns=[*zip(listed.columns, listed.align, strict=True)],
+        notes=list(dict.fromkeys(content.notes)),
+        figures=counterparts(content, tables.comparison),
+        error_range=ERROR_RANGE,
+        data=vars(content)
+        | {
+            "base": head["base"],
+            "log_scales": LOG_SCALES,
+            "copies": [_copies(table) for table in texts],
+            "changes": _lines(listed),
+            "scores": [_score(name) for name in VIEW_METRICS if _is_measured(content, name)],
+        },
+    )
+
+
+def _printable(table: TextTable) -> TextTable:
+    """Return a table whose texts are lines of bounded length."""
+    return TextTable(
+        shown(table.title),
+        tuple(map(shown, table.columns)),
+        tuple(tuple(map(shown, row)) for row in table.rows),
+        table.align,
+        tuple(map(shown, table.notes)),
+    )
+
+
+def _source(name: str) -> str:
+    """Return a file of the package. It has no `</`, which could end the element that it is in."""
+    return resources.files("xrgs.report.html").joinpath(name).read_text(encoding="utf-8")
+
+
+def _policy(style: str, script: str) -> str:
+    """Return the Content-Security-Policy: this style and script, images that are in the page."""
+
+    def hashed(text: str) -> str:
+        digest = hashlib.sha256(text.encode()).digest()
+        return f"'sha256-{base64.b64encode(digest).decode()}'"
+
+    return (
+        f"default-src 'none'; style-src {hashed(style)}; script-src {hashed(script)};"
+        " img-src data:; base-uri 'none'; form-action 'none'"
+    )
+
+
+def _is_measured(content: Content, name: str) -> bool:
+    """Return whether any view has a score; LPIPS needs weights that a machine may lack."""
+    arms = (arm for entry in content.views for arm in entry["arms"])
+    return any(arm["scores"][name] is not None for arm in arms)
+
+
+def _score(name: str) -> dict[str, Any]:
+    metric = next(metric for metric in METRICS if metric.name == name)
+    label = f"{metric.label}{metric.unit and f', {metric.unit}'}"
+    return {"name": name, "label": label, "higher": metric.higher_is_better}
+
+
+def _copies(table: TextTable) -> dict[str, str]:
+    """Return a table in the forms that it can be copied in."""
+    rows = [[for_csv(text) for text in row] for row in table.rows]
+    columns = [for_csv(name) for name in table.columns]
+    csv = pd.DataFrame(rows, columns=columns).to_csv(index=False, lineterminator="\n")
+    return {"latex": to_latex(table), "markdown": to_markdown(table), "csv": str(csv)}
+
+
+#: How many lines each form has before the first row of a table.
+_HEAD_LINES = {"latex": 7, "markdown": 4, "csv": 1}
+
+
+def _lines(table: TextTable) -> dict[str, dict[str, list[str]]]:
+    """Return a table in the same forms, by lines, so that the page can copy some of the rows."""
+    found = {}
+    for form, text in _copies(table).items():
+        lines, first = text.split("\n"), _HEAD_LINES[form]
+        last = first + len(table.rows)
+        found[form] = {"head": lines[:first], "rows": lines[first:last], "foot": lines[last:]}
+    return found
+
+
+#: The columns of the table of all changes, and their alignment; `{base}` is what is compared with.
+_CHANGE_COLUMNS = {
+    "Ablation": "l", "Scene": "l", "Metric": "l", "Change, %": "r", "Reading": "l", "{base}": "r",
+    "Value": "r", "From, %": "r", "To, %": "r", "q": "r", "Pairs that agree": "l",
+}  # fmt: skip
+
+
+def _changes_table(rows: Sequence[dict[str, Any]], base: str) -> TextTable:
+    """Return the table of all changes, whose texts are those of `_changes`."""
+    columns = tuple(name.format(base=base) for name in _CHANGE_COLUMNS)
+    texts = tuple(tuple(text for text, _ in row["cells"]) for row in rows)
+    return TextTable(f"Changes from {base}", columns, texts, "".join(_CHANGE_COLUMNS.values()))
+
+
+def _changes(long: pd.DataFrame, scenes: int) -> Iterator[dict[str, Any]]:
+    """Yield the rows of the table of all changes, with the text and the number of each cell.
+
+    Args:
+        long: The table `Tables.long`.
+        scenes: How many scenes there are; of one, its row would say what the mean says.
+    """
+    metrics = {metric.name: metric for metric in METRICS}
+    for row in long.to_dict("records"):
+        if row["level"] == "scene" and scenes == 1:
+            continue
+        metric, printed = metrics[row["metric"]], str(row["printed"]).strip()
+        label, scene = shown(row["label"]), shown(row["scene"])
+        numbers = [
+            (text, finite(row[name]))
+            for name, text in (
+                ("base", number(row["base"], metric.unit)),
+                ("value", number(row["value"], metric.unit)),
+                ("low", _signed(row["low"])),
+                ("high", _signed(row["high"])),
+                ("q", "" if pd.isna(row["q"]) else f"{row['q']:.3f}"),
+            )
+        ]
+        yield {
+            "label": label,
+            "scene": scene,
+            "metric": metric.label,
+            "verdict": {"↑": "better", "↓": "worse"}.get(printed[-1:], ""),
+            "cells": [
+                (titled(label, shown(row["condition"])), None),
+                (scene or "mean", None),
+                (metric.label, None),
+                (printed, finite(row["change_percent"])),
+                (shown(row["reading"]), None),
+                *numbers,
+                (f"{row['agree']} of {row['pairs']}" if row["pairs"] else "", None),
+            ],
+        }
+
+
+def _signed(value: float) -> str:
+    return "" if pd.isna(value) else signed(value)

@@ -1,0 +1,201 @@
+"""The answer that the page begins with, and the context that a table needs."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+from xrgs.experiment.results import cell_columns
+from xrgs.report.html.content import shown
+from xrgs.report.writing import by_key, percent, reading, signed
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Mapping
+
+    import pandas as pd
+
+    from xrgs.capture.views import Variant
+    from xrgs.evaluation.metrics import Metric
+    from xrgs.experiment.store import Store
+    from xrgs.report.collect import Sweep
+    from xrgs.report.compare import Comparison
+    from xrgs.report.writing import Change
+
+#: Fewer test views than these in a scene are called few.
+_FEW_TEST_VIEWS = 3
+#: Keys of a cell's config that the context has, with what they are called there.
+_SETTINGS = {
+    "train.steps": "Steps",
+    "variant.long_side": "Longer side of HR views, px (0: the photographs')",
+    "variant.factor": "LR views are smaller by the factor",
+    "splat.densify.prune_scale3d": "Prune rule: largest scale that is kept, scene scales",
+}
+#: Entries of the provenance that the context has.
+_MADE_WITH = {
+    "cpu": "Processor",
+    "threads": "Threads",
+    "backend": "Backend",
+    "arithmetic": "Arithmetic",
+    "xrgs": "xrgs",
+    "git": "Commit",
+}
+
+
+@dataclass(frozen=True)
+class Answer:
+    """What one ablation changed."""
+
+    label: str
+    condition: str
+    pairs: str
+    """On how many scenes and pairs."""
+    better: tuple[str, ...]
+    """The metrics whose interval shows an improvement, with their change."""
+    worse: tuple[str, ...]
+    undecided: tuple[tuple[str, tuple[str, ...]], ...]
+    """Why nothing can be said of the other metrics, and which these are, with their change."""
+
+
+def answers(comparison: Comparison) -> list[Answer]:
+    """Return what each ablation changed, in the order of the tables.
+
+    Args:
+        comparison: The comparison.
+    """
+    means = by_key(comparison.means)
+    found = []
+    for label, condition in comparison.groups:
+        rows = [
+            (metric, means[label, condition, metric.name])
+            for metric in comparison.metrics
+            if (label, condition, metric.name) in means
+        ]
+        readings: dict[str, list[str]] = {}
+        for metric, row in rows:
+            readings.setdefault(shown(reading(row, metric)), []).append(_change(metric, row))
+        better, worse = (tuple(readings.pop(verdict, ())) for verdict in ("better", "worse"))
+        scenes = max((row.scenes for _, row in rows), default=0)
+        pairs = max((row.pairs for _, row in rows), default=0)
+        found.append(
+            Answer(
+                label=shown(label),
+                condition=shown(condition),
+                pairs=f"{_count(scenes, 'scene')}, {_count(pairs, 'pair')} of cells",
+                better=better,
+                worse=worse,
+                undecided=tuple((why, tuple(texts)) for why, texts in readings.items()),
+            )
+        )
+    return found
+
+
+def _change(metric: Metric, row: Change) -> str:
+    if math.isnan(row.change):
+        return metric.label
+    absolute = f" ({signed(row.difference)} dB)" if metric.unit == "dB" else ""
+    return f"{metric.label} {percent(row.change, metric)}{absolute}"
+
+
+def _count(number: int, of: str) -> str:
+    return f"{number} {of}{'s' * (number != 1)}"
+
+
+def context(
+    store: Store, sweep: Sweep, comparison: Comparison, variants: Mapping[str, Variant]
+) -> list[tuple[str, str]]:
+    """Return what the numbers of the page were made with: names and values.
+
+    Args:
+        store: The store with the cells' configs.
+        sweep: The sweep.
+        comparison: The comparison of its cells.
+        variants: The variants of the cells that can be read, by their ids.
+    """
+    cells = comparison.cells
+    done = cells[cells["state"] == "done"].drop_duplicates("cell_id")
+    replicates = done.drop_duplicates(["variant_seed", "seed"])
+    rows = [
+        ("Compared with", shown(comparison.base)),
+        ("Scenes", ", ".join(map(shown, comparison.scenes))),
+        ("Replicates (variant.seed/seed)", _listed(_replicates(replicates))),
+        ("Cells", f"{len(done)} of {cells['cell_id'].nunique()} are done"),
+    ]
+    configs = [cell_columns(store.cell(name).folder, {}) for name in done["cell_id"]]
+    for key, name in _SETTINGS.items():
+        rows.append(
+            (name, _by_label(done["label"], [config.get(key, "n/a") for config in configs]))
+        )
+    rows += [(shown(scene), text) for scene, text in _views(done, variants)]
+    rows += [
+        (name, _listed(sweep.provenance.get(key, ["n/a"]))) for key, name in _MADE_WITH.items()
+    ]
+    return rows
+
+
+def _replicates(rows: pd.DataFrame) -> list[str]:
+    return [f"{draw}/{seed}" for draw, seed in zip(rows["variant_seed"], rows["seed"], strict=True)]
+
+
+def _by_label(labels: Iterable[str], values: Iterable[Any]) -> str:
+    """List distinct values; where there are several, with the labels that have each."""
+    found: dict[str, list[str]] = {}
+    for label, value in zip(labels, values, strict=True):
+        found.setdefault(str(value), []).append(label)
+    if len(found) == 1:
+        return _listed(found)
+    return shown("; ".join(f"{value} ({_listed(of)})" for value, of in found.items()))
+
+
+def _listed(values: Iterable[Any]) -> str:
+    """List distinct values in their order."""
+    return shown(", ".join(dict.fromkeys(str(value) for value in values)))
+
+
+def _views(done: pd.DataFrame, variants: Mapping[str, Variant]) -> list[tuple[str, str]]:
+    """Return the numbers and sizes of the views of each scene's first variant."""
+    rows = []
+    for scene, variant_id in done.drop_duplicates("scene")[["scene", "variant_id"]].to_numpy():
+        variant = variants.get(variant_id)
+        if variant is None:
+            continue
+        by_kind = {
+            "HR": [v for v in variant.views if v.split == "train" and v.tag == "HR"],
+            "LR": [v for v in variant.views if v.split == "train" and v.tag == "LR"],
+            "test": [v for v in variant.views if v.split == "test"],
+        }
+        sizes = {
+            kind: _listed(f"{view.width} × {view.height}" for view in views)
+            for kind, views in by_kind.items()
+        }
+        text = "; ".join(
+            f"{len(views)} {kind} ({sizes[kind]} px)" for kind, views in by_kind.items() if views
+        )
+        rows.append((f"Views of {scene}", text))
+    return rows
+
+
+def cautions(
+    comparison: Comparison, views: pd.DataFrame, variants: Mapping[str, Variant]
+) -> list[str]:
+    """Return what a reader should know before trusting the scores.
+
+    Args:
+        comparison: The comparison.
+        views: The table `Sweep.views`.
+        variants: The variants of the cells that can be read, by their ids.
+    """
+    counts = views.groupby("cell_id").size()
+    scenes = comparison.cells.assign(views=comparison.cells["cell_id"].map(counts))
+    least = scenes.groupby("scene")["views"].min()
+    lines = [
+        f"{shown(scene)} has {_count(int(number), 'scored view')}: its scores are of little weight."
+        for scene, number in least.items()
+        if number < _FEW_TEST_VIEWS
+    ]
+    not_held_out = sorted({shown(v.scene) for v in variants.values() if not v.held_out})
+    lines += [
+        f"{scene} has too few views to hold any out: it is scored at the poses of training."
+        for scene in not_held_out
+    ]
+    return lines
