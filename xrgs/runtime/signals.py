@@ -1,4 +1,4 @@
-"""Ends a command in order on Ctrl-C and SIGTERM, with a line that says how to continue."""
+"""Ends a command in order on Ctrl-C and SIGTERM, or lets its work choose the moment of the end."""
 
 from __future__ import annotations
 
@@ -47,6 +47,27 @@ def exit_on_signal(hint: str) -> Iterator[None]:
     except StopSignal as stop:
         say(f"stopped by {signal.Signals(stop.number).name}. {hint}", sys.stderr)
         sys.exit(128 + stop.number)
+
+
+class StopRequest:
+    """Notes that this process was asked to end, for work that ends itself at a good moment."""
+
+    def __init__(self) -> None:
+        self.received = False
+        """Whether the signal has arrived."""
+
+    def watch(self) -> None:
+        """Note SIGTERM from now on, in place of ending this process."""
+        signal.signal(signal.SIGTERM, self._note)
+
+    def _note(self, _: int, __: FrameType | None) -> None:
+        self.received = True
+
+
+def end_by_sigterm() -> None:
+    """End this process as SIGTERM ends one that has no handler, so that its parent can tell."""
+    signal.signal(signal.SIGTERM, signal.SIG_DFL)
+    signal.raise_signal(signal.SIGTERM)
 
 
 def _raise_stop(number: int, _: FrameType | None) -> None:

@@ -16,9 +16,13 @@ from xrgs.runtime import processes
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
-#: Seconds between two polls of the child, and seconds it has after SIGTERM to end by itself.
+#: Seconds between two polls of the child.
 _POLL_S = 0.2
-_GRACE_S = 5.0
+#: Seconds that the child has after SIGTERM to write its checkpoint, or to finish what it is about
+#: to finish; and seconds that it has when it has exceeded a limit, or more of it would be harmful.
+_GRACE_S, _LIMIT_GRACE_S = 20.0, 5.0
+#: A child that has registered it with `faulthandler` writes its stack at this signal.
+STACK_SIGNAL = signal.SIGUSR1
 #: Waits for the end of the pipe on its standard input, to which nothing is ever written, and then
 #: kills its process group. It ignores the signals that the group gets when it is asked to end.
 _WATCHER = "trap '' TERM INT HUP; read -r _; kill -s KILL -- -$1"
@@ -66,10 +70,11 @@ def run_supervised(
             f"limits.memory_gb={limits.memory_gb:g} can't be kept: this system has no /proc"
         )
     child = subprocess.Popen(command, stdin=subprocess.PIPE, start_new_session=True)  # noqa: S603
+    reason = ""
     try:
         reason = _watch(child, limits, on_poll)
     finally:
-        _end(child)
+        _end(child, exceeded=bool(reason))
     return ProcessEnd(child.returncode, reason)
 
 
@@ -94,12 +99,17 @@ def _watch(child: subprocess.Popen[bytes], limits: Limits, on_poll: Callable[[in
     return ""
 
 
-def _end(child: subprocess.Popen[bytes]) -> None:
-    """End the child and all that it started, by SIGTERM first, so that it can log its stack."""
+def _end(child: subprocess.Popen[bytes], *, exceeded: bool) -> None:
+    """End the child and all that it started, by SIGTERM first, so that it can end in order.
+
+    A child that has exceeded a limit is asked for its stack, which tells what took so long.
+    """
     if child.poll() is None:
+        if exceeded:
+            child.send_signal(STACK_SIGNAL)
         _signal(child, signal.SIGTERM)
         with suppress(subprocess.TimeoutExpired):
-            child.wait(_GRACE_S)
+            child.wait(_LIMIT_GRACE_S if exceeded else _GRACE_S)
     _signal(child, signal.SIGKILL)
     child.wait()
     if child.stdin is not None:
