@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from omegaconf import DictConfig
 
     from xrgs.sweep.cleaning import Plan
-    from xrgs.sweep.inventory import CellSummary
+    from xrgs.sweep.inventory import CellSummary, Selection
 
 _HELP = """\
 xrgs-store list [FILTER]... [sort=name|age|size]
@@ -142,9 +142,9 @@ def _remove(conf: DictConfig, words: Sequence[str]) -> None:
     from xrgs.sweep.cleaning import plan_removal
 
     store = Store(Path(conf.store))
-    _, chosen = _chosen(conf, words)
-    if not words and not _restricts(conf):
+    if not _selection(conf, words).restricts:
         raise XrgsError("rm: name cells, or give a filter; see xrgs-store --help")
+    _, chosen = _chosen(conf, words)
     _carry_out(conf, store, plan_removal(store, chosen))
 
 
@@ -180,23 +180,21 @@ def _no_words(command: str, words: Sequence[str]) -> None:
         raise XrgsError(f"{command} {' '.join(words)}: {command} takes no cells")
 
 
-def _selection(conf: DictConfig, words: Sequence[str]) -> Any:
-    from xrgs.sweep.inventory import Selection
-
-    names = (names_in(conf[key]) for key in ("scenes", "ablations", "states"))
-    return Selection(tuple(words), *names, conf.older_days, conf.larger_mb)
-
-
-def _restricts(conf: DictConfig) -> bool:
-    return bool(_selection(conf, ()).restricts)
-
-
 def _chosen(conf: DictConfig, words: Sequence[str]) -> tuple[list[CellSummary], list[CellSummary]]:
     """Return all cells of the store, and those that are meant."""
     from xrgs.sweep.inventory import summaries
 
     cells = summaries(Store(Path(conf.store)))
     return cells, _selection(conf, words).of(cells)
+
+
+def _selection(conf: DictConfig, words: Sequence[str]) -> Selection:
+    from xrgs.sweep.inventory import Selection
+
+    scenes, ablations, states = map(names_in, (conf.scenes, conf.ablations, conf.states))
+    return Selection(
+        tuple(words), scenes, ablations, states, float(conf.older_days), float(conf.larger_mb)
+    )
 
 
 def _carry_out(conf: DictConfig, store: Store, plan: Plan) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import math
+import signal
 import sys
 import traceback
 from statistics import fmean
@@ -14,7 +15,7 @@ from xrgs.evaluation import protocol
 from xrgs.experiment import provenance
 from xrgs.runtime import progress
 from xrgs.runtime.machine import peak_rss, set_torch_threads
-from xrgs.runtime.signals import StopRequest
+from xrgs.runtime.signals import StopRequest, StopSignal
 from xrgs.safeio.atomic import write_json, write_text
 from xrgs.safeio.hashing import digest
 from xrgs.safeio.records import table_text
@@ -38,10 +39,6 @@ _log = logging.getLogger(__name__)
 
 #: The loss that is shown is the mean of so many rows of the history: each row is that of one view.
 _SHOWN_ROWS = 10
-
-
-class CellStopped(BaseException):
-    """The process was asked to end, and the cell's checkpoint is written."""
 
 
 class CellCheckpoint(Checkpoint):
@@ -82,7 +79,7 @@ class CellCheckpoint(Checkpoint):
             The seconds that it took.
 
         Raises:
-            CellStopped: The process was asked to end, and the file is written.
+            StopSignal: The process was asked to end, and the file is written.
             ReplacedError: Another process has begun the run again, in another folder.
         """
         if self._recorder is not None and self._recorder.history:
@@ -96,7 +93,7 @@ class CellCheckpoint(Checkpoint):
             _log.info("%d steps done: %s", step + 1, self._shown.note)
         if self._stop.received:
             _log.info("stopped after %d steps", step + 1)
-            raise CellStopped
+            raise StopSignal(signal.SIGTERM)
         return seconds
 
 
@@ -114,13 +111,15 @@ def run_cell(
             from but the checkpoint before.
 
     Raises:
-        CellStopped: It was ended like this; its checkpoint is written.
+        StopSignal: It was ended like this; its checkpoint is written.
         Exception: Whatever went wrong, after its traceback was written to `error.txt`.
     """
+    stop = stop or StopRequest()
     try:
-        with progress.written_to(folder.progress) as shown:
-            views = _train_and_score(conf, variant, folder, shown, stop or StopRequest())
-        folder.finish(views, protocol.PROTOCOL_VERSION)
+        with stop.deferred():
+            with progress.written_to(folder.progress) as shown:
+                views = _train_and_score(conf, variant, folder, shown, stop)
+            folder.finish(views, protocol.PROTOCOL_VERSION)
         _log.info("done")
     except Exception:
         write_text(folder.folder / "error.txt", for_terminal(traceback.format_exc()))

@@ -7,11 +7,12 @@ report needs the rows of all records, and finds each cell in the store where it 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 from xrgs.errors import StoreError
 from xrgs.experiment.store import BASELINE
 from xrgs.report.collect import ReportError
+from xrgs.safeio.confined import ConfinedPath
 from xrgs.safeio.words import for_file_name
 
 if TYPE_CHECKING:
@@ -19,8 +20,8 @@ if TYPE_CHECKING:
 
     from xrgs.experiment.cell_folder import CellFolder
     from xrgs.experiment.store import Store
-    from xrgs.safeio.confined import ConfinedPath
 
+_T = TypeVar("_T")
 #: What tells one cell of a study from another.
 _CELL = ("scene", "condition", "label", "variant_seed", "seed")
 #: The most ids that the name of a report lists.
@@ -89,7 +90,7 @@ class JoinedStore:
         Raises:
             StoreError: The id is not a valid name of a folder.
         """
-        return self._first([store.cell(cell_id) for store in self.stores], _is_done, _is_there)
+        return _first([store.cell(cell_id) for store in self.stores], _is_done, _is_there)
 
     def variant(self, variant_id: str) -> ConfinedPath:
         """Return the folder of a variant, in a store that has it if there is one.
@@ -101,19 +102,7 @@ class JoinedStore:
             StoreError: The id is not a valid name of a folder.
         """
         folders = [store.variant(variant_id) for store in self.stores]
-        return self._first(folders, lambda folder: folder.is_dir())
-
-    def _first(self, found: list[Any], *wanted: Callable[[Any], bool]) -> Any:
-        """Return the first that satisfies the first condition, else the next one; else the first.
-
-        With one store nothing is looked at.
-        """
-        if len(found) > 1:
-            for condition in wanted:
-                for one in found:
-                    if condition(one):
-                        return one
-        return found[0]
+        return _first(folders, ConfinedPath.is_dir)
 
     def latest_sweeps(self) -> tuple[str, ...]:
         """Return the id of each store's latest sweep, without repetitions.
@@ -154,6 +143,16 @@ class JoinedStore:
             paths = ", ".join(str(store.path) for store in self.stores)
             raise StoreError(f"sweep={sweep_id}: there is no such sweep in {paths}")
         return [store.sweep_record(sweep_id) for store in having or self.stores]
+
+
+def _first(found: Sequence[_T], *wanted: Callable[[_T], bool]) -> _T:
+    """Return the first that satisfies the first condition, else the next one; else the first.
+
+    Of one alone nothing is asked.
+    """
+    conditions = wanted if len(found) > 1 else ()
+    fitting = (one for condition in conditions for one in found if condition(one))
+    return next(fitting, found[0])
 
 
 def _is_done(cell: CellFolder) -> bool:

@@ -50,18 +50,34 @@ def exit_on_signal(hint: str) -> Iterator[None]:
 
 
 class StopRequest:
-    """Notes that this process was asked to end, for work that ends itself at a good moment."""
+    """Turns SIGTERM into an exception, which work can put off until it has kept its state."""
 
     def __init__(self) -> None:
         self.received = False
         """Whether the signal has arrived."""
+        self._is_deferred = False
 
     def watch(self) -> None:
-        """Note SIGTERM from now on, in place of ending this process."""
-        signal.signal(signal.SIGTERM, self._note)
+        """Raise `StopSignal` at SIGTERM from now on, in place of ending this process."""
+        signal.signal(signal.SIGTERM, self._on_signal)
 
-    def _note(self, _: int, __: FrameType | None) -> None:
+    @contextmanager
+    def deferred(self) -> Iterator[None]:
+        """Let the signal raise nothing during a block, which looks at `received` by itself.
+
+        Yields:
+            Nothing.
+        """
+        self._is_deferred = True
+        try:
+            yield
+        finally:
+            self._is_deferred = False
+
+    def _on_signal(self, number: int, _: FrameType | None) -> None:
         self.received = True
+        if not self._is_deferred:
+            raise StopSignal(number)
 
 
 def end_by_sigterm() -> None:

@@ -276,17 +276,29 @@ def one_cell(beginning: str, cells: Sequence[CellSummary]) -> CellSummary:
     return (exact or found)[0]
 
 
-def size_of(path: ConfinedPath) -> int | None:
-    """Return the bytes of the regular files at a path and below; None where that can't be told.
+def file_bytes(path: ConfinedPath) -> int:
+    """Return the bytes of the regular files at a path and below.
 
     Args:
         path: A file or a folder; a link is not followed, and has none.
+
+    Raises:
+        OSError: A folder can't be read, or they are nested too deeply.
+    """
+    found = [status for _, status in path.walk()] if path.is_dir() else [path.lstat()]
+    return sum(status.st_size for status in found if stat.S_ISREG(status.st_mode))
+
+
+def size_of(path: ConfinedPath) -> int | None:
+    """Return `file_bytes`, or None where that can't be told.
+
+    Args:
+        path: A file or a folder.
     """
     try:
-        found = [status for _, status in path.walk()] if path.is_dir() else [path.lstat()]
+        return file_bytes(path)
     except OSError:
         return None
-    return sum(status.st_size for status in found if stat.S_ISREG(status.st_mode))
 
 
 def size_text(count: int | None) -> str:
@@ -333,7 +345,7 @@ def list_cells(cells: Sequence[CellSummary], sort: str) -> str:
         raise XrgsError(f"sort={sort}: choose name, age or size")
     sized = [(cell, cell.age_s(), cell.bytes()) for cell in cells]
     if sort != "name":
-        sized.sort(key=lambda row: (row[1 if sort == "age" else 2]) or 0)
+        sized.sort(key=lambda row: (row[1] if sort == "age" else row[2]) or 0)
     rows = [
         (
             *(cell.id, cell.names.scene, cell.arm, str(cell.seed), _state(cell)),

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from dataclasses import dataclass
+from functools import partial
 from typing import TYPE_CHECKING, TypeVar
 
 from xrgs.capture.failures import FAILED_PREFIX, failed_scenes
@@ -13,7 +14,7 @@ from xrgs.safeio.records import list_folder
 from xrgs.safeio.untrusted import is_name
 from xrgs.safeio.words import MAX_CELL, for_line
 from xrgs.sweep import locks
-from xrgs.sweep.inventory import STATES, CellNames, recorded_names, size_of, size_text, summarise
+from xrgs.sweep.inventory import STATES, CellNames, file_bytes, recorded_names, size_text, summarise
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -121,7 +122,7 @@ def _failed_scenes(store: Store) -> list[tuple[str, str, str]]:
 
 def _sizes(store: Store, problems: _Problems) -> dict[str, int | None]:
     names = problems.unless(store.folder.folders) or []
-    return {name: size_of(store.folder / name) for name in names}
+    return {name: problems.unless(partial(file_bytes, store.folder / name)) for name in names}
 
 
 def _names(store: Store, problems: _Problems) -> tuple[dict[str, CellNames], int]:

@@ -118,9 +118,8 @@ def _find_or_build(conf: Conf, store: Store, *, allow_build: bool) -> PlannedVar
         frozen = variant.find(store.variants, key)
         if frozen is not None:
             return PlannedVariant(frozen.id)
-        if trimmed := trimming.trimmed_variant(
-            store.variants, key
-        ):  # its done cells are found by it
+        # The done cells of a trimmed variant are found by its id; a job refuses to train others.
+        if trimmed := trimming.trimmed_variant(store.variants, key):
             return PlannedVariant(trimmed)
         failure = None if conf.retry == "failed" else variant.failure(store.variants, key)
         if failure or not allow_build:

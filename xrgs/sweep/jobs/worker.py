@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING, Any
 from xrgs.errors import UnreadableError, XrgsError
 from xrgs.runtime import processes
 from xrgs.runtime.machine import set_passive_openmp_wait
-from xrgs.runtime.signals import StopRequest, end_by_sigterm
+from xrgs.runtime.signals import StopRequest, StopSignal, end_by_sigterm
 from xrgs.runtime.streams import ignore_broken_pipe, log_to_stderr, say
 from xrgs.safeio.atomic import write_json
 from xrgs.safeio.confined import ConfinedPath, ReplacedError, RootMissingError
@@ -177,8 +177,6 @@ def _run_cell(request: Mapping[str, Any]) -> dict[str, Any]:
     from xrgs.experiment import cell
     from xrgs.experiment.cell_folder import CellFolder
 
-    stop = StopRequest()
-    stop.watch()
     device, inode = request["folder"]
     folder = CellFolder(ConfinedPath(Path(request["cell"])).pinned((device, inode)))
     with (folder.folder / "log.txt").append() as log:
@@ -186,13 +184,15 @@ def _run_cell(request: Mapping[str, Any]) -> dict[str, Any]:
         # goes to a file instead: on a terminal the bars of several cells would mix.
         for descriptor in (1, 2):
             os.dup2(log.fileno(), descriptor)
+        stop = StopRequest()
+        stop.watch()
         # It is given the descriptor, which stays open when `log` is closed.
         faulthandler.register(supervise.STACK_SIGNAL, 2)
         log_to_stderr(logging.INFO)
-        frozen = variant.load(Path(request["variant"]))
         try:
+            frozen = variant.load(Path(request["variant"]))
             cell.run_cell(from_dict(request["conf"]), frozen, folder, stop)
-        except cell.CellStopped:
+        except StopSignal:
             end_by_sigterm()
     return {}
 
