@@ -129,7 +129,7 @@ def test_a_cell_that_is_trained_is_never_touched(store: Store) -> None:
     held = locks.acquire(store.locks, "half1")  # begun by another sweep after the plan
     assert held is not None
     _, left = carry_out(store, plan)
-    assert left == ["half1   ? / ?, unfinished: it is left: a sweep is training it"]
+    assert left == ["half1  ? / ?, unfinished: it is left: a sweep is training it"]
     assert store.cell("half1").state().name == "unfinished"
     assert not store.cell("done1").path.exists()
     plan = plan_removal(store, summaries(store))

@@ -53,8 +53,8 @@ def chosen(store: Store, **of: object) -> list[str]:
 
 
 def test_cells_are_chosen_by_name_state_age_and_size(store: Store) -> None:
-    assert chosen(store) == ["old3", "abc1", "abd2"]
-    assert chosen(store, ids=("abc", "o")) == ["old3", "abc1"]
+    assert chosen(store) == ["abc1", "abd2", "old3"]
+    assert chosen(store, ids=("abc", "o")) == ["abc1", "old3"]
     assert chosen(store, scenes=("fern",)) == ["abc1", "abd2"]
     assert chosen(store, ablations=("mip",)) == ["abd2"]
     assert chosen(store, states=("done",), scenes=("fern",)) == ["abc1"]
@@ -68,7 +68,7 @@ def test_cells_are_chosen_by_name_state_age_and_size(store: Store) -> None:
     [
         ({"ids": ("ab",)}, "ab: several cells have such an id: abc1, abd2"),
         ({"ids": ("x",)}, "x: no cell has such an id"),
-        ({"scenes": ("frn",)}, "scenes=frn: no cell has that; choose from: statue, fern"),
+        ({"scenes": ("frn",)}, "scenes=frn: no cell has that; choose from: fern, statue"),
         ({"states": ("dun",)}, "states=dun: .*choose from: done, running"),
     ],
 )

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 
 from xrgs.errors import XrgsError
 from xrgs.runtime import processes
+from xrgs.runtime.progress import log_line
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
@@ -20,7 +21,9 @@ if TYPE_CHECKING:
 _POLL_S = 0.2
 #: Seconds that the child has after SIGTERM to write its checkpoint, or to finish what it is about
 #: to finish; and seconds that it has when it has exceeded a limit, or more of it would be harmful.
-_GRACE_S, _LIMIT_GRACE_S = 20.0, 5.0
+_GRACE_S, _LIMIT_GRACE_S = 60.0, 5.0
+#: Seconds after which something is said of waiting for its end.
+_SILENT_S = 1.0
 #: A child that has registered it with `faulthandler` writes its stack at this signal.
 STACK_SIGNAL = signal.SIGUSR1
 #: Waits for the end of the pipe on its standard input, to which nothing is ever written, and then
@@ -108,12 +111,24 @@ def _end(child: subprocess.Popen[bytes], *, exceeded: bool) -> None:
         if exceeded:
             child.send_signal(STACK_SIGNAL)
         _signal(child, signal.SIGTERM)
-        with suppress(subprocess.TimeoutExpired):
-            child.wait(_LIMIT_GRACE_S if exceeded else _GRACE_S)
+        if exceeded:
+            _ends_within(child, _LIMIT_GRACE_S)
+        elif not _ends_within(child, min(_SILENT_S, _GRACE_S)):
+            log_line(
+                f"waiting at most {_GRACE_S:.0f} s for the cell to keep its state; another Ctrl-C"
+                " ends it at once"
+            )
+            _ends_within(child, _GRACE_S)
     _signal(child, signal.SIGKILL)
     child.wait()
     if child.stdin is not None:
         child.stdin.close()
+
+
+def _ends_within(child: subprocess.Popen[bytes], seconds: float) -> bool:
+    with suppress(subprocess.TimeoutExpired):
+        child.wait(seconds)
+    return child.returncode is not None
 
 
 def _signal(child: subprocess.Popen[bytes], number: int) -> None:
