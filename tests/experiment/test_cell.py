@@ -235,7 +235,8 @@ def test_a_cell_that_is_asked_to_end_keeps_every_step_and_says_what_happened(
     conf.checkpoint_s = 9999.0
     expected = whole(conf, tmp_path / "whole")
     folder, stop = begin(conf, tmp_path / "stopped"), StopRequest()
-    real, calls = train.photometric_loss, [0]
+    loop: Any = train
+    real, calls = loop.photometric_loss, [0]
 
     def signalled(*arguments: Any, **named: Any) -> Any:
         calls[0] += 1
