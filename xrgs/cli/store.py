@@ -109,7 +109,7 @@ def main() -> None:
     arguments = sys.argv[1:]
     if not arguments or {"-h", "--help"} & set(arguments):
         say(_HELP.rstrip())
-        return
+        sys.exit()
     command, cells = arguments[0], [word for word in arguments[1:] if "=" not in word]
     values = [word for word in arguments[1:] if "=" in word]
     with errors_as_messages("xrgs-store"):
