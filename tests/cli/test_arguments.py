@@ -20,10 +20,11 @@ from xrgs import config
 from xrgs.bench.settings import Settings
 from xrgs.capture import images
 from xrgs.capture.scenes import folder, motorcycle
-from xrgs.cli import bench, report, status
+from xrgs.cli import bench, report, status, store
 from xrgs.cli.arguments import dotlist, errors_as_messages, with_quotes
 from xrgs.cli.report import ReportConf
 from xrgs.cli.status import StatusConf
+from xrgs.cli.store import GcConf, ListConf, TrimConf
 from xrgs.errors import XrgsError
 
 RunCommand = Callable[..., tuple[int, str, str]]
@@ -115,7 +116,7 @@ def test_a_scene_with_odd_names_is_swept_and_reported(
         assert name in out
 
 
-@pytest.mark.parametrize("command", ["sweep", "report", "status", "bench", "data"])
+@pytest.mark.parametrize("command", ["sweep", "report", "status", "bench", "data", "store"])
 def test_help_answers_at_once(
     run_command: RunCommand, tmp_path: Path, without_heavy: str, command: str
 ) -> None:
@@ -134,11 +135,11 @@ def test_help_names_every_choice(run_command: RunCommand, tmp_path: Path) -> Non
         assert name in out
 
 
-@pytest.mark.parametrize("schema", [ReportConf, StatusConf, Settings])
+@pytest.mark.parametrize("schema", [ReportConf, StatusConf, Settings, ListConf, TrimConf, GcConf])
 def test_help_has_every_argument(
     schema: type, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    command = {ReportConf: report, StatusConf: status, Settings: bench}[schema]
+    command = {ReportConf: report, StatusConf: status, Settings: bench}.get(schema, store)
     monkeypatch.setattr(sys, "argv", ["command", "--help"])
     with pytest.raises(SystemExit) as end:
         command.main()

@@ -6,6 +6,7 @@ import json
 import logging
 import random
 import shutil
+import signal
 import subprocess
 import sys
 import time
@@ -26,6 +27,8 @@ from xrgs.experiment import cell
 from xrgs.experiment.cell_folder import CellFolder
 from xrgs.experiment.identity import cell_identity
 from xrgs.experiment.store import Store
+from xrgs.runtime import progress
+from xrgs.runtime.signals import StopRequest, StopSignal
 from xrgs.safeio.atomic import write_json
 from xrgs.safeio.hashing import digest
 from xrgs.safeio.records import read_object, read_table
@@ -223,3 +226,61 @@ def test_the_test_views_are_scored_during_training_and_nothing_else_changes(
     assert [row["step"] for row in table] == ["5", "10"]
     assert all(float(row["psnr"]) > 0 for row in table)
     assert "quality.csv" in read_object(scored.folder / "status.json")["files"]
+
+
+def test_a_cell_that_is_asked_to_end_keeps_every_step_and_says_what_happened(
+    conf: Conf, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    """Though its checkpoints are hours apart; and the next attempt ends as an undisturbed one."""
+    conf.checkpoint_s = 9999.0
+    expected = whole(conf, tmp_path / "whole")
+    folder, stop = begin(conf, tmp_path / "stopped"), StopRequest()
+    loop: Any = train
+    real, calls = loop.photometric_loss, [0]
+
+    def signalled(*arguments: Any, **named: Any) -> Any:
+        calls[0] += 1
+        if calls[0] == 5:
+            stop._on_signal(signal.SIGTERM, None)
+        return real(*arguments, **named)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(train, "photometric_loss", signalled)
+        with pytest.raises(StopSignal):
+            cell.run_cell(conf, VARIANT, folder, stop)
+    assert folder.state().name == "unfinished"
+    assert not (folder.path / "error.txt").exists()
+    assert not folder.progress.exists()
+    with caplog.at_level(logging.INFO):
+        again = folder.begin(asdict(conf), folder.identity())
+        cell.run_cell(conf, VARIANT, again)
+    assert results(again) == expected
+    for line in ("going on from the checkpoint, 5 steps done", "trained 12 steps in", "mean PSNR"):
+        assert line in caplog.text
+
+
+def test_a_cell_without_checkpoints_ends_at_once_and_writes_none(
+    conf: Conf, tmp_path: Path
+) -> None:
+    conf.checkpoint_s = 0.0
+    folder, stop = begin(conf, tmp_path / "stopped"), StopRequest()
+    stop.received = True
+    with pytest.raises(StopSignal):
+        cell.run_cell(conf, VARIANT, folder, stop)
+    assert not folder.checkpoint.exists()
+
+
+def test_the_progress_of_a_cell_has_its_gaussians_and_its_loss(
+    conf: Conf, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    seen = []
+    monkeypatch.setattr(progress, "_FILE_S", 0.0)
+    monkeypatch.setattr(progress, "_write", lambda _, now: seen.append(now))
+    folder = begin(conf, tmp_path / "shown")
+    cell.run_cell(conf, VARIANT, folder)
+    history = folder.history()
+    mean = history["loss"].iloc[:6].mean()  # of the steps so far, up to ten
+    (at,) = [now for now in seen if now.what == "training" and now.done == 6]
+    assert at.note == f"{history['gaussians'].iloc[5]:,} Gaussians, loss {mean:.3g}"
+    assert str(at).startswith(f"training 6 of 12 steps, {at.note}, ")
+    assert {now.note for now in seen if now.what != "training"} == {""}

@@ -33,11 +33,15 @@ Maker = Callable[[Path], list[Look]]
 """Makes a copy of the reference store hostile in place, and returns the looks at it."""
 
 
-def status(store: Path, *names: str, done: int | None = 4, verify: bool = False) -> Look:
+def status(store: Path, *names: str, done: int | None = 4) -> Look:
     """`xrgs-status`, which must count the healthy cells."""
-    arguments = (f"store={store}", *(["verify=true"] if verify else []))
     shows = () if done is None else (f"{done} done",)
-    return Look("status", "status", arguments, names, shows, succeeds=done is not None)
+    return Look("status", "status", (f"store={store}",), names, shows, succeeds=done is not None)
+
+
+def check(store: Path, *names: str) -> Look:
+    """`xrgs-store check`, which hashes every file and names what is damaged."""
+    return Look("check", "store", ("check", f"store={store}"), names, ("hashed:",))
 
 
 def report(store: Path, *names: str, pair: bool = True, drawn: bool = False) -> Look:

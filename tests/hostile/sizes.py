@@ -9,7 +9,7 @@ from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
-from tests.hostile.looks import Look, Maker, all_looks, inspect, plan, report, rerun, status
+from tests.hostile.looks import Look, Maker, all_looks, check, inspect, plan, report, rerun, status
 from tests.hostile.reference import all_cells, cell_of, edit, sweep_file, variant_of
 
 _SIZE = 2 << 30
@@ -41,8 +41,7 @@ def _declared(name: str, store: Path) -> list[Look]:
     edit(cell / "status.json", lambda d: d["files"][name].update(bytes=_SIZE))
     hashed = name in _HASHED
     named, done = (name, 3) if hashed else ("", None)
-    verified = status(store, named, done=done, verify=True)
-    verified = replace(verified, succeeds=False, hashed_gb=_SIZE / 1e9)
+    verified = replace(check(store, named), succeeds=False, hashed_gb=_SIZE / 1e9)
     return [report(store, named), verified, plan(store, done=done)]
 
 

@@ -8,8 +8,10 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from xrgs.evaluation.metrics import METRICS
 from xrgs.experiment.cell_folder import CellFolder
 from xrgs.experiment.store import Store
+from xrgs.report.collect import Sweep, read_cells
 
 SUMMARY = {
     "training_time_s": 100.0,
@@ -110,6 +112,12 @@ class MadeStore:
     def write(self, command: tuple[str, ...] = ("+ablation=consistency",)) -> str:
         """Record the sweep; returns its id."""
         return self.store.write_sweep(command, self.rows)
+
+    def read(self) -> Sweep:
+        """Record the sweep and read it, as a report does."""
+        record = self.store.sweep_record(sweep_id := self.write())
+        commands = {sweep_id: tuple(record["command"])}
+        return read_cells(self.store, commands, record["cells"], METRICS)
 
     @staticmethod
     def _fill(folder: CellFolder, found: dict[str, Any], cpu: str, arithmetic: str | None) -> None:

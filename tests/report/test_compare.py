@@ -10,7 +10,7 @@ import pytest
 from scipy import stats
 
 from xrgs.evaluation.metrics import METRICS
-from xrgs.report.collect import ReportError, read_sweep
+from xrgs.report.collect import ReportError
 from xrgs.report.compare import Comparison, compare, is_amount
 from xrgs.report.inference import (
     NO_ALL_HR,
@@ -47,7 +47,7 @@ def interval_of(values: Any) -> Any:
 
 
 def compared(made: Any, against: str = "baseline") -> Comparison:
-    return compare(read_sweep(made.store, made.write(), METRICS).cells, METRICS, against)
+    return compare(made.read().cells, METRICS, against)
 
 
 def mean_of(comparison: Comparison, metric: str, label: str = "consistency") -> Any:
@@ -253,7 +253,7 @@ def test_a_share_of_held_out_views_that_is_none_makes_no_number(made: Any, share
     (cell.path / "identity.json").write_text(
         json.dumps(identity | {"train": {"validation": share}})
     )
-    sweep = read_sweep(made.store, made.write(), METRICS)
+    sweep = made.read()
     assert list(sweep.cells["state"]) == ["done", "corrupt"]
 
 

@@ -11,7 +11,6 @@ import pytest
 
 from xrgs.evaluation.metrics import METRICS
 from xrgs.report import build
-from xrgs.report.collect import read_sweep
 from xrgs.report.compare import compare
 from xrgs.report.curves import (
     COLUMNS,
@@ -39,7 +38,7 @@ BASELINE = quality([15.0, 17.0, 18.0, 19.0], seconds=20, evaluations=2e8)
 
 
 def read(made: Any) -> Any:
-    sweep = read_sweep(made.store, made.write(), METRICS)
+    sweep = made.read()
     return replace(sweep, cells=compare(sweep.cells, METRICS).cells)
 
 

@@ -3,7 +3,6 @@
 from typing import Any
 
 from xrgs.evaluation.metrics import METRICS
-from xrgs.report.collect import read_sweep
 from xrgs.report.compare import Comparison, compare
 from xrgs.report.gap import gap_tables
 from xrgs.report.page import build
@@ -12,7 +11,7 @@ from xrgs.report.tables import Tables
 
 
 def compared(made: Any) -> Comparison:
-    return compare(read_sweep(made.store, made.write(), METRICS).cells, METRICS)
+    return compare(made.read().cells, METRICS)
 
 
 def add(made: Any, label: str, scene: str, psnr: float, **more: Any) -> None:

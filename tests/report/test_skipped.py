@@ -7,7 +7,6 @@ import pytest
 
 from xrgs.evaluation.metrics import METRICS
 from xrgs.report import build
-from xrgs.report.collect import read_sweep
 from xrgs.report.compare import compare
 from xrgs.report.skipped import skipped, table
 
@@ -30,7 +29,7 @@ HISTORY = "step,steps_HR,skipped_backward,skipped_shN\n0,1,0,0\n499,500,{skipped
 
 
 def found(made: Any) -> Any:
-    sweep = read_sweep(made.store, made.write(), METRICS)
+    sweep = made.read()
     return skipped(compare(sweep.cells, METRICS).cells, sweep.work)
 
 

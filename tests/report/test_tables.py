@@ -9,7 +9,6 @@ import pytest
 
 from tests.report.test_writing import MORE_IS_BETTER
 from xrgs.evaluation.metrics import METRICS
-from xrgs.report.collect import read_sweep
 from xrgs.report.compare import compare
 from xrgs.report.tables import Tables
 from xrgs.report.writing import ARROWS_NOTE, LACKING_NOTE, percent, scale_note
@@ -18,7 +17,7 @@ BY_NAME = {metric.name: metric for metric in METRICS}
 
 
 def tables(made: Any, against: str = "baseline") -> Tables:
-    cells = read_sweep(made.store, made.write(), METRICS).cells
+    cells = made.read().cells
     return Tables(compare(cells, METRICS, against))
 
 

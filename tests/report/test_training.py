@@ -3,8 +3,6 @@
 import math
 from typing import Any
 
-from xrgs.evaluation.metrics import METRICS
-from xrgs.report.collect import read_sweep
 from xrgs.report.training import table, totals
 
 _BASELINE = """\
@@ -22,7 +20,7 @@ step,view,loss,gaussians,steps_HR,steps_LR,split,reset,grown_HR,weighting.LR
 
 
 def _totals(made: Any) -> Any:
-    sweep = read_sweep(made.store, made.write(), METRICS)
+    sweep = made.read()
     return totals(sweep.cells, sweep.training)
 
 

@@ -16,6 +16,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from xrgs.errors import StoreError, XrgsError
+from xrgs.experiment import verification
 from xrgs.experiment.cell_folder import CellFolder
 from xrgs.experiment.store import Store
 from xrgs.report import build, page, pictures
@@ -111,7 +112,8 @@ def test_any_content_of_a_store_gives_a_report_or_an_xrgs_error(
         declared(cell)
     looks: tuple[Callable[[], str], ...] = (
         lambda: build(copy.path).text,
-        lambda: describe(read(copy.path, verify=True)),
+        lambda: describe(read(copy.path)),
+        lambda: verification.describe(verification.verify(copy)),
         lambda: copy.cells().to_csv(),
     )
     for look in looks:

@@ -12,7 +12,6 @@ from typing import Any
 
 import pytest
 
-from xrgs.capture import scenes, variant
 from xrgs.errors import XrgsError
 from xrgs.experiment import identity
 from xrgs.experiment.cell_folder import CellFolder
@@ -20,7 +19,7 @@ from xrgs.experiment.store import Store
 from xrgs.runtime.progress import Progress
 from xrgs.safeio.atomic import write_json
 from xrgs.safeio.confined import ConfinedPath
-from xrgs.sweep import locks, status
+from xrgs.sweep import inventory, locks
 from xrgs.sweep.status import describe, read
 
 
@@ -64,6 +63,7 @@ def store(tmp_path: Path) -> Store:
     (store.variants / "fa-bb").make_folder()
     (store.variants / "failed-aa").make_folder()
     rows = [("good", "statue", "baseline"), ("stale", "statue", "consistency"), (None, "fern", "x")]
+    rows.append(("busy", "statue", "mip"))
     store.write_sweep(
         ["a"],
         [
@@ -81,7 +81,8 @@ def test_every_cell_is_counted_and_told_why(store: Store) -> None:
     assert "1 folders of earlier attempts" in text
     assert "1 variants, 1 sweeps" in text
     assert "failed  statue / ?  ended by SIGKILL\n" in text
-    assert f"process {os.getpid()} on" in text
+    (sweep_id,) = store.sweep_ids()
+    assert f"busy  statue / mip  sweep {sweep_id}  by process {os.getpid()} on" in text
     assert ": training 20 of 80 steps, 3 steps/s, ~20 s left" in text
     assert "scores.csv is missing or has another size" in text
     lines = [line.split() for line in text.splitlines()]
@@ -105,7 +106,7 @@ def test_a_cell_of_another_arithmetic_is_stale(
     done(store, "unfused", code, arithmetic="no-fma", splat=native)
     # As a cell has it that was trained before the arithmetic was part of the identity.
     done(store, "old", code, arithmetic=None, splat=native)
-    monkeypatch.setattr(status, "arithmetic", lambda _: "fma")
+    monkeypatch.setattr(inventory, "arithmetic", lambda _: "fma")
     stale = {cell.id: cell.stale for cell in read(store.path).cells}
     assert stale["fused"] == ()
     assert stale["unfused"] == ("arithmetic (no-fma, here fma)",)
@@ -114,7 +115,7 @@ def test_a_cell_of_another_arithmetic_is_stale(
     def missing(_: str) -> str:
         raise XrgsError("not built on this machine")
 
-    monkeypatch.setattr(status, "arithmetic", missing)  # where stores are only read
+    monkeypatch.setattr(inventory, "arithmetic", missing)  # where stores are only read
     assert [cell.id for cell in read(store.path).cells if cell.stale] == ["stale"]
 
 
@@ -125,86 +126,6 @@ def intact(store: Store) -> Store:
         store.cell(name).folder.remove()
     (store.variants / "fa-bb").remove()
     return store
-
-
-@pytest.mark.parametrize(
-    ("name", "verified"), [("scores.csv", True), ("splats.ply", True), ("log.txt", False)]
-)
-def test_a_change_that_keeps_the_size_is_found_where_that_is_asked_for(
-    intact: Store, name: str, verified: bool
-) -> None:
-    cell = intact.cell("good")
-    for file in ("splats.ply", "log.txt"):
-        (cell.path / file).write_text("20 Gaussians")
-    cell.finish(["a"], 1)
-    assert read(intact.path, verify=True).intact
-    changed = cell.path / name
-    changed.write_text(changed.read_text().replace("20", "99"))
-    found = [read(intact.path, verify=verify) for verify in (False, True)]
-    assert [status.intact for status in found] == [True, not verified]
-    named = f"{changed}: it has changed since the cell finished"
-    assert (named in describe(found[1])) == verified
-    if name == "scores.csv":  # a report is made from it: the cell is not done any more
-        assert "scores.csv has changed" in describe(found[1])
-
-
-def test_every_file_is_verified_and_what_was_hashed_is_said(intact: Store) -> None:
-    found = read(intact.path, verify=True)
-    assert found.verification is not None
-    paths = [
-        path for name in ("good", "stale", "twice") for path in intact.cell(name).path.iterdir()
-    ]
-    paths += (intact.path / "sweeps").iterdir()
-    assert found.verification.files == len(paths)
-    assert found.verification.bytes == sum(path.stat().st_size for path in paths)
-    assert f"hashed: {len(paths)} files, " in describe(found)
-    assert describe(found).endswith("all of them as they were written")
-
-
-def test_files_that_do_not_belong_there_and_missing_ones_are_damage(intact: Store) -> None:
-    good, stale = intact.cell("good").path, intact.cell("stale").path
-    (good / "extra").mkdir()
-    (good / "extra" / "file").write_text("1")
-    os.mkfifo(stale / "pipe")
-    verification = read(intact.path, verify=True).verification
-    assert verification is not None
-    assert verification.damage == (
-        f"{good}/extra/file: it does not belong there",
-        f"{stale}/pipe: it does not belong there",
-    )
-
-
-def test_a_record_whose_cells_were_changed_is_damage(intact: Store) -> None:
-    (file,) = (intact.path / "sweeps").iterdir()
-    file.write_text(file.read_text().replace("consistency", "inconsistent"))
-    found = read(intact.path, verify=True)
-    assert not found.intact
-    assert f"{file}: its cells have changed since it was written" in describe(found)
-
-
-def test_variants_and_scenes_are_verified_each_by_its_own_rule(
-    intact: Store, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    names = ("variants/a-b", "variants/failed-b", "variants/.a.building", "scenes/c", "scenes/.c")
-    for name in names:
-        (intact.folder / name).make_folder()
-    for module in (variant, scenes):
-        monkeypatch.setattr(module, "verify", lambda folder: [f"{folder}/x: wrong"])
-    done = read(intact.path, verify=True).verification
-    assert done is not None
-    wrong = ("variants/a-b", "scenes/c")
-    assert done.damage == tuple(f"{intact.path}/{name}/x: wrong" for name in wrong)
-
-
-@pytest.mark.parametrize(("damaged", "code"), [(False, 0), (True, 1)])
-def test_the_command_ends_with_1_where_something_is_damaged(
-    run_command: Callable[..., tuple[int, str, str]], intact: Store, damaged: bool, code: int
-) -> None:
-    if damaged:
-        (intact.path / "sweeps" / "bad.json").write_text("{")
-    name = f"store={intact.path.name}"
-    assert run_command("status", intact.path.parent, name, "verify=true")[0] == code
-    assert run_command("status", intact.path.parent, name)[0] == 0
 
 
 def unreadable(monkeypatch: pytest.MonkeyPatch, name: str, number: int) -> None:
@@ -234,7 +155,6 @@ def test_a_cell_that_cannot_be_read_now_is_listed_with_the_reason(
     unreadable(monkeypatch, "status.json", number)
     found = read(intact.path)
     assert {cell.state.name for cell in found.cells} == {"unknown"}
-    assert not found.intact
     text = describe(found)
     assert "\nunknown:\n" in text
     assert f"good/status.json: {os.strerror(number)}" in text

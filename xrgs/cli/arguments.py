@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 from contextlib import contextmanager, suppress
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
 
 from hydra.core.override_parser.overrides_parser import OverridesParser
@@ -112,18 +113,39 @@ def choices(group: str) -> str:
     return ", ".join(file.relative_to(folder).with_suffix("").as_posix() for file in files)
 
 
-def parse(schema: type[Any], help_text: str) -> DictConfig:
+def names_in(text: str) -> tuple[str, ...]:
+    """Return the names in a value such as `fern,flower`, in their order; none of an empty one.
+
+    Args:
+        text: Names separated by commas.
+    """
+    return tuple(name for name in text.split(",") if name)
+
+
+def paths_in(text: str) -> list[Path]:
+    """Return the folders in a value such as `a,b`.
+
+    Args:
+        text: Folders separated by commas; a folder whose own name has a comma is one, if it exists.
+    """
+    return [Path(text)] if user_path(text).exists() else [*map(Path, names_in(text) or [text])]
+
+
+def parse(schema: type[Any], help_text: str, arguments: Sequence[str] | None = None) -> DictConfig:
     """Return the command line as a config of a schema, or print the help and end the command.
 
     Args:
         schema: A dataclass of the arguments, with their default values.
         help_text: What `--help` prints.
+        arguments: What to read in place of the whole command line, where that begins with the name
+            of a subcommand.
 
     Raises:
         OmegaConfBaseException: An argument is not in the schema, or its value is of another type.
         SystemExit: With code 0, after the help was printed.
     """
-    if {"-h", "--help"} & set(sys.argv[1:]):
+    words = sys.argv[1:] if arguments is None else arguments
+    if {"-h", "--help"} & set(words):
         say(help_text.rstrip())
         sys.exit()
-    return cast("DictConfig", OmegaConf.merge(OmegaConf.structured(schema), dotlist(sys.argv[1:])))
+    return cast("DictConfig", OmegaConf.merge(OmegaConf.structured(schema), dotlist(words)))

@@ -3,14 +3,19 @@
 from __future__ import annotations
 
 import logging
+import math
+import signal
+import sys
 import traceback
-from typing import TYPE_CHECKING
+from statistics import fmean
+from typing import TYPE_CHECKING, cast
 
 from xrgs.capture import dataset
 from xrgs.evaluation import protocol
 from xrgs.experiment import provenance
 from xrgs.runtime import progress
 from xrgs.runtime.machine import peak_rss, set_torch_threads
+from xrgs.runtime.signals import StopRequest, StopSignal
 from xrgs.safeio.atomic import write_json, write_text
 from xrgs.safeio.hashing import digest
 from xrgs.safeio.records import table_text
@@ -25,33 +30,105 @@ if TYPE_CHECKING:
     from xrgs.capture.views import Variant
     from xrgs.config import Conf
     from xrgs.experiment.cell_folder import CellFolder
+    from xrgs.runtime.progress import ProgressFile
     from xrgs.splat.gaussians import Gaussians
-    from xrgs.training.recorder import TrainingResult
+    from xrgs.training.checkpoint import Stateful
+    from xrgs.training.recorder import TrainingRecorder, TrainingResult
 
 _log = logging.getLogger(__name__)
 
+#: The loss that is shown is the mean of so many rows of the history: each row is that of one view.
+_SHOWN_ROWS = 10
 
-def run_cell(conf: Conf, variant: Variant, folder: CellFolder) -> None:
+
+class CellCheckpoint(Checkpoint):
+    """Writes the checkpoint of a cell, shows how far it is, and ends it when that is asked for."""
+
+    def __init__(
+        self, folder: CellFolder, every_s: float, shown: ProgressFile, stop: StopRequest
+    ) -> None:
+        """Set where the state is written, and what is looked at after every step.
+
+        Args:
+            folder: The cell's folder.
+            every_s: Seconds between two writes; 0 never writes, not even when the cell is ended.
+            shown: Its note gets the number of Gaussians and the loss.
+            stop: Whether the process was asked to end.
+        """
+        super().__init__(folder.checkpoint, digest(folder.identity()), every_s)
+        self._shown = shown
+        self._stop = stop
+        self._recorder: TrainingRecorder | None = None
+
+    def register(self, **objects: Stateful) -> None:
+        """Add objects whose state is to be written, as `Checkpoint.register`.
+
+        Args:
+            objects: Each by its name; the `recorder` is read after every step.
+        """
+        super().register(**objects)
+        self._recorder = cast("TrainingRecorder | None", objects.get("recorder", self._recorder))
+
+    def save_if_due(self, step: int) -> float:
+        """Write the file if the interval has passed or the process is to end.
+
+        Args:
+            step: The number of the step that is done, from 0.
+
+        Returns:
+            The seconds that it took.
+
+        Raises:
+            StopSignal: The process was asked to end, and the file is written.
+            ReplacedError: Another process has begun the run again, in another folder.
+        """
+        if self._recorder is not None and self._recorder.history:
+            rows = self._recorder.history[-_SHOWN_ROWS:]
+            loss = fmean(row["loss"] for row in rows)
+            self._shown.note = f"{rows[-1]['gaussians']:,} Gaussians, loss {loss:.3g}"
+        if self._stop.received and self.every_s > 0:
+            self.every_s = sys.float_info.min  # due now, whatever the interval
+        seconds = super().save_if_due(step)
+        if seconds:
+            _log.info("%d steps done: %s", step + 1, self._shown.note)
+        if self._stop.received:
+            _log.info("stopped after %d steps", step + 1)
+            raise StopSignal(signal.SIGTERM)
+        return seconds
+
+
+def run_cell(
+    conf: Conf, variant: Variant, folder: CellFolder, stop: StopRequest | None = None
+) -> None:
     """Train and evaluate a cell, and write its results; its status is written last.
 
     Args:
         conf: The cell's config.
         variant: The frozen variant that it trains on.
         folder: The cell's folder, in which `CellFolder.begin` has written config and identity.
+        stop: Whether this process was asked to end, which ends the cell after a step of training.
+            A cell that is being evaluated goes on: it is nearly done, and has nothing to resume
+            from but the checkpoint before.
 
     Raises:
+        StopSignal: It was ended like this; its checkpoint is written.
         Exception: Whatever went wrong, after its traceback was written to `error.txt`.
     """
+    stop = stop or StopRequest()
     try:
-        with progress.written_to(folder.progress):
-            views = _train_and_score(conf, variant, folder)
-        folder.finish(views, protocol.PROTOCOL_VERSION)
+        with stop.deferred():
+            with progress.written_to(folder.progress) as shown:
+                views = _train_and_score(conf, variant, folder, shown, stop)
+            folder.finish(views, protocol.PROTOCOL_VERSION)
+        _log.info("done")
     except Exception:
         write_text(folder.folder / "error.txt", for_terminal(traceback.format_exc()))
         raise
 
 
-def _train_and_score(conf: Conf, variant: Variant, folder: CellFolder) -> list[str]:
+def _train_and_score(
+    conf: Conf, variant: Variant, folder: CellFolder, shown: ProgressFile, stop: StopRequest
+) -> list[str]:
     """Write every file but the status; return the names of the views that were scored.
 
     None of the files is waited for until it is on the disk: `CellFolder.finish` does that.
@@ -61,7 +138,16 @@ def _train_and_score(conf: Conf, variant: Variant, folder: CellFolder) -> list[s
     what = provenance.collect(threads, backend)
     write_json(folder.folder / "provenance.json", what, durable=False)
     data = dataset.load(variant, conf.train.views, validation=conf.train.validation, seed=conf.seed)
-    trained = _train_or_resume(data, conf, folder)
+    _log.info(
+        "cell %s: variant %s, %d training views, %d points; xrgs %s, %s, %d threads",
+        *(folder.id, folder.identity()["variant"], len(data.train), len(data.points)),
+        *(what["xrgs"], backend, threads),
+    )
+    checkpoint = CellCheckpoint(folder, conf.checkpoint_s, shown, stop)
+    trained = _train_or_resume(data, conf, checkpoint)
+    shown.note = ""
+    count = len(trained.gaussians)
+    _log.info("trained %d steps in %.1f s: %d Gaussians", conf.train.steps, trained.seconds, count)
     peak_rss_bytes = peak_rss()  # read before evaluation, which may load the network of LPIPS
     save_ply(folder.folder / "splats.ply", trained.gaussians, durable=False)
     write_text(folder.folder / "history.csv", table_text(trained.history), durable=False)
@@ -72,12 +158,14 @@ def _train_and_score(conf: Conf, variant: Variant, folder: CellFolder) -> list[s
         trained.gaussians, data.test, conf.splat, folder.folder / "renders"
     )
     write_text(folder.folder / "scores.csv", table_text(scores), durable=False)
+    psnr = fmean(math.nan if row["psnr"] is None else row["psnr"] for row in scores)
+    _log.info("evaluated %d views: mean PSNR %.2f dB", len(scores), psnr)
     write_json(
         folder.folder / "summary.json",
         {
             "training_time_s": trained.seconds,
             "render_time_ms": render_time_ms,
-            "gaussians": len(trained.gaussians),
+            "gaussians": count,
             "memory_bytes": trained.memory_bytes,
             "peak_rss_bytes": peak_rss_bytes,
             "evaluations": trained.evaluations,
@@ -91,13 +179,12 @@ def _train_and_score(conf: Conf, variant: Variant, folder: CellFolder) -> list[s
     return [view.name for view in data.test]
 
 
-def _train_or_resume(data: Dataset, conf: Conf, folder: CellFolder) -> TrainingResult:
+def _train_or_resume(data: Dataset, conf: Conf, checkpoint: CellCheckpoint) -> TrainingResult:
     """Train from the cell's checkpoint, or from the start if there is no usable one."""
 
     def evaluate(gaussians: Gaussians) -> dict[str, float | None]:
         return protocol.mean_scores(gaussians, data.test, conf.splat)
 
-    checkpoint = Checkpoint(folder.checkpoint, digest(folder.identity()), conf.checkpoint_s)
     try:
         steps = checkpoint.load()
         if steps is not None:

@@ -48,6 +48,8 @@ _PROGRESS = "progress.json"
 _NOT_RESULTS = frozenset(
     {"log.txt", "status.json", _PROGRESS, _CHECKPOINT, f"refused-{_CHECKPOINT}"}
 )
+#: Files of a done cell that only pictures, viewers and `rerun=` need: most of a store's bytes.
+_HEAVY, _HEAVY_FOLDER = frozenset({"splats.ply"}), "renders"
 #: Files of a stopped attempt that the next one gets.
 _KEPT_ON_RESUME = (_CHECKPOINT, "log.txt")
 
@@ -195,7 +197,7 @@ class CellFolder:
         try:
             files = read_object(self.status)["files"]
             wrong = [why for name, entry in files.items() if (why := self._wrong(name, entry))]
-            listed = files.keys() | _NOT_RESULTS
+            listed = files.keys() | self.trimmed().keys() | _NOT_RESULTS
             wrong += [
                 f"{self.folder}/{name}: it does not belong there"
                 for name, _ in self.folder.walk()
@@ -366,6 +368,78 @@ class CellFolder:
         """
         self.checkpoint.unlink(missing_ok=True)
 
+    def trimmed(self) -> dict[str, dict[str, Any]]:
+        """Return the files that were removed on purpose: `bytes` and `sha256` by their names.
+
+        Empty for a cell that was not trimmed, and where its status can't be read.
+        """
+        try:
+            found = read_object(self.status).get("trimmed", {})
+        except StoreError:
+            return {}
+        return found if isinstance(found, dict) else {}
+
+    def check_not_trimmed(self, name: str) -> None:
+        """Refuse a file that was removed on purpose.
+
+        Args:
+            name: The file's path in the cell's folder, with `/`.
+
+        Raises:
+            StoreError: It was; the message says how to make it again.
+        """
+        if name in self.trimmed():
+            raise StoreError(
+                f"cells/{self.id}/{name} was removed by xrgs-store trim; xrgs-sweep rerun= trains"
+                " the cell again, in a folder of its own"
+            )
+
+    def heavy_bytes(self) -> int:
+        """Return the bytes that `trim` would free: those of the Gaussians and the renders."""
+        return sum(
+            status.st_size
+            for name, status in self.folder.walk()
+            if stat.S_ISREG(status.st_mode) and _is_heavy(name)
+        )
+
+    def trim(self) -> None:
+        """Remove the Gaussians and the renders of a done cell, and list them in its status.
+
+        The caller holds the cell's lock. The status is written first: a cell that is killed in
+        between is done, and the next call removes the rest.
+
+        Raises:
+            StoreError: The status can't be read, or is not that of a done cell.
+            OSError: A file can't be removed.
+        """
+        status = read_object(self.status)
+        if status.get("state") != "done" or not isinstance(status.get("files"), dict):
+            raise StoreError(f"{self.status}: the cell is not done")
+        heavy = {name: entry for name, entry in status["files"].items() if _is_heavy(name)}
+        if heavy:
+            kept = {name: of for name, of in status["files"].items() if name not in heavy}
+            self._set_status(status | {"files": kept, "trimmed": self.trimmed() | heavy})
+        for name in self.trimmed():
+            if untrusted.is_inside(name):
+                (self.folder / name).unlink(missing_ok=True)
+        renders = self.folder / _HEAVY_FOLDER
+        if renders.is_dir() and not renders.names():
+            renders.remove()
+
+    def remove(self) -> None:
+        """Remove the cell. The caller holds its lock.
+
+        It loses its name first: what a kill leaves of it is no cell, and is removed with the next
+        attempt or by `xrgs-store gc`.
+
+        Raises:
+            OSError: It can't be removed.
+        """
+        gone = self._hidden("new")
+        self.folder.rename(gone)
+        gone.sync_name()
+        gone.remove()
+
     def fail(self, reason: str) -> None:
         """Declare the cell failed, and write `error.txt` if its process did not.
 
@@ -454,10 +528,11 @@ class CellFolder:
         """Load the trained Gaussians, in the world of `cameras`.
 
         Raises:
-            XrgsError: `splats.ply` is missing or damaged.
+            XrgsError: `splats.ply` is missing or damaged, or was removed on purpose.
         """
         from xrgs.splat.ply import load_ply
 
+        self.check_not_trimmed("splats.ply")
         return load_ply(self.folder / "splats.ply")
 
     def dataset(self) -> Dataset:
@@ -488,6 +563,10 @@ class CellFolder:
         return {
             split: {view.name: view.camera for view in views} for split, views in splits.items()
         }
+
+
+def _is_heavy(name: str) -> bool:
+    return name in _HEAVY or name.startswith(f"{_HEAVY_FOLDER}/")
 
 
 def _copy(names: Iterable[str], source: ConfinedPath, target: ConfinedPath) -> None:

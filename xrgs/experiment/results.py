@@ -119,6 +119,7 @@ def load_dataset(folder: ConfinedPath) -> Dataset:
         XrgsError: The variant is not in the store, or is damaged.
     """
     from xrgs.capture import dataset, variant
+    from xrgs.experiment.trimming import check_images
 
     identity = read_object(folder / "identity.json")
     variant_id, train = identity.get("variant"), identity.get("train")
@@ -128,7 +129,9 @@ def load_dataset(folder: ConfinedPath) -> Dataset:
     validation, seed = validation_share(identity), identity.get("seed")
     if validation is None or type(seed) is not int or seed < 0:
         raise StoreError(f"{folder / 'identity.json'}: train.validation or seed is not a number")
-    frozen = variant.load(ConfinedPath(folder.path.parents[1]) / f"variants/{variant_id}")
+    variants = ConfinedPath(folder.path.parents[1]) / "variants"
+    check_images(variants, variant_id)
+    frozen = variant.load(variants / variant_id)
     return dataset.load(frozen, views, validation=validation, seed=seed)
 
 

@@ -146,6 +146,19 @@ class Store:
             raise StoreError(f"{cell_id!r:.80} is not the id of a cell")
         return CellFolder(self.cells_folder / cell_id)
 
+    def variant(self, variant_id: str) -> ConfinedPath:
+        """Return the folder of a variant, which need not exist.
+
+        Args:
+            variant_id: The variant's id.
+
+        Raises:
+            StoreError: The id is not a valid name of a folder.
+        """
+        if not untrusted.is_name(variant_id):
+            raise StoreError(f"{variant_id!r:.80} is not the id of a variant")
+        return self.variants / variant_id
+
     def cells(self, *, verify: bool = True) -> pd.DataFrame:
         """List the cells: what they are, whether they are done, and how they scored.
 
@@ -239,19 +252,32 @@ class Store:
                 damaged.append(str(error))
         return records, tuple(damaged)
 
-    def write_sweep(self, command: Sequence[str], cells: Iterable[Mapping[str, Any]]) -> str:
-        """Record which cells a sweep compared, for its report.
+    def write_sweep(
+        self,
+        command: Sequence[str],
+        cells: Iterable[Mapping[str, Any]],
+        sweep_id: str | None = None,
+    ) -> str:
+        """Record which cells a sweep compares, for its report: when it starts, and at its end.
 
         Args:
             command: Arguments of `xrgs-sweep`.
             cells: One row for each cell, as `xrgs.sweep.plan.record` makes them.
+            sweep_id: The id that the sweep has already, whose record is replaced; None when it
+                starts.
 
         Returns:
-            The id of the record; the same rows give the same id.
+            The id of the record. A sweep that asks for the same has the same id, however many of
+            its cells are done.
         """
         rows = [dict(cell) for cell in cells]
-        sweep_id = digest(rows)
-        record = {"version": _RECORD_VERSION, "command": list(command), "cells": rows}
+        sweep_id = sweep_id or digest([_asked_for(row) for row in rows])
+        record = {
+            "version": _RECORD_VERSION,
+            "command": list(command),
+            "cells": rows,
+            "digest": digest(rows),
+        }
         write_json(self.sweeps / f"{sweep_id}.json", record)
         return sweep_id
 
@@ -285,7 +311,8 @@ class Store:
             sweep_id: The id of the record; None for the latest.
 
         Returns:
-            `version`, `command` (the arguments of `xrgs-sweep`) and `cells` (one row per cell).
+            `version`, `command` (the arguments of `xrgs-sweep`), `cells` (one row per cell) and
+            `digest` (of the cells; records of earlier versions lack it).
 
         Raises:
             StoreError: There is no such record, or it is malformed or of another version.
@@ -306,7 +333,7 @@ class Store:
         return record
 
     def verify_sweep(self, sweep_id: str) -> None:
-        """Check that a sweep's record is the one that was written, by the hash that is its id.
+        """Check that a sweep's record is the one that was written, by the hash in it.
 
         Args:
             sweep_id: The id of the record.
@@ -314,9 +341,18 @@ class Store:
         Raises:
             StoreError: It can't be read, or has changed; the message names the file.
         """
-        if digest(self.sweep_record(sweep_id)["cells"]) != sweep_id:
+        record = self.sweep_record(sweep_id)
+        # Records from before a sweep was recorded at its start have the hash as their id.
+        if digest(record["cells"]) != record.get("digest", sweep_id):
             file = self.sweeps / f"{sweep_id}.json"
             raise StoreError(f"{file}: its cells have changed since it was written")
+
+
+def _asked_for(row: Mapping[str, Any]) -> dict[str, Any]:
+    """Return what a row of a record says of a cell before any cell is trained."""
+    names = ("scene", "label", "condition", "variant_seed", "seed", "variant_id")
+    known = {name: row[name] for name in names if name in row}
+    return known | {"planned_id": row.get("planned_id", row.get("cell_id"))}
 
 
 def _modified_ns(file: ConfinedPath) -> int:

@@ -11,8 +11,10 @@ from typing import TYPE_CHECKING
 from xrgs.capture import scenes, variant
 from xrgs.capture.failures import FAILED_PREFIX
 from xrgs.errors import StoreError
+from xrgs.experiment import trimming
 from xrgs.runtime.progress import ProgressBar
 from xrgs.safeio.records import list_folder
+from xrgs.safeio.words import for_line
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
@@ -53,7 +55,12 @@ def verify(store: Store) -> Verification:
 
     Returns:
         What was hashed, and what is wrong.
+
+    Raises:
+        StoreError: There is no such store, or it can't be read now.
     """
+    if not store.exists:
+        raise StoreError(f"store={store.path} is not a store; xrgs-sweep makes one")
     start = time.perf_counter()
     damage: list[str] = []
     parts = list(_parts(store, damage))
@@ -64,6 +71,20 @@ def verify(store: Store) -> Verification:
             bar.update(part.bytes)
     seconds = time.perf_counter() - start
     return Verification(sum(part.files for part in parts), total, seconds, tuple(damage))
+
+
+def describe(verification: Verification) -> str:
+    """Return what was hashed, and every damaged file, as lines for a terminal.
+
+    Args:
+        verification: What `verify` returns.
+    """
+    damage = verification.damage
+    lines = ["damaged, or can't be read now:", *(f"  {line}" for line in damage)] if damage else []
+    extent = f"{verification.files:,} files, {verification.bytes / 1e6:,.1f} MB"
+    found = f"{len(damage)} damaged" if damage else "all of them as they were written"
+    lines.append(f"hashed: {extent}, in {verification.seconds:.1f} s; {found}")
+    return "\n".join(map(for_line, lines))
 
 
 def _parts(store: Store, damage: list[str]) -> Iterator[_Part]:
@@ -85,15 +106,20 @@ def _parts(store: Store, damage: list[str]) -> Iterator[_Part]:
 
 def _cells(store: Store) -> _Checks:
     for cell in store.cell_folders():
-        if cell.state(verify=False).name == "done":
+        state = cell.state(verify=False)
+        if state.name == "done":
             yield cell.folder, cell.verify
+        elif state.name in {"corrupt", "unknown"}:
+            yield cell.folder, partial(list, [f"{cell.folder}: {state.reason}"])
 
 
 def _variants(store: Store) -> _Checks:
     for name in list_folder(store.variants):
         if not name.startswith((".", FAILED_PREFIX)):
             folder = store.variants / name
-            yield folder, partial(variant.verify, folder)
+            is_trimmed = name.startswith(trimming.TRIMMED_PREFIX)
+            check = trimming.verify_variant if is_trimmed else variant.verify
+            yield folder, partial(check, folder)
 
 
 def _scenes(store: Store) -> _Checks:

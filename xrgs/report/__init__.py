@@ -1,5 +1,6 @@
 """Tables and figures of a sweep, made from its store alone, without training and without torch."""
 
+from xrgs.report.joined import Choice
 from xrgs.report.page import Report, build
 
-__all__ = ["Report", "build"]
+__all__ = ["Choice", "Report", "build"]

@@ -6,7 +6,7 @@ Cells that are not done become rows with their state and reason, so that a repor
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 import pandas as pd
@@ -25,7 +25,6 @@ if TYPE_CHECKING:
 
     from xrgs.evaluation.metrics import Metric
     from xrgs.experiment.cell_folder import CellFolder
-    from xrgs.experiment.store import Store
 
 #: Keys of each row of a sweep's record.
 RECORD_KEYS = (
@@ -41,6 +40,12 @@ RECORD_KEYS = (
 )
 
 
+#: Reasons of cells that are not done and did not fail, by the state of their folder. They do not
+#: say how far a cell is, which would be another text a second later.
+_PENDING = {
+    "absent": "not trained yet",
+    "unfinished": "begun and not done yet: it is being trained, or was stopped",
+}
 #: Values of keys that earlier records lack. Those had a swept `variant.seed` in the condition.
 _DEFAULTS = {"variant_seed": 0}
 
@@ -53,8 +58,8 @@ class ReportError(XrgsError):
 class Sweep:
     """One sweep as the store holds it: its cells, their scores, and what they were made with."""
 
-    id: str
-    command: tuple[str, ...]
+    commands: Mapping[str, tuple[str, ...]]
+    """The arguments of `xrgs-sweep` by the sweep's id; several where sweeps are joined."""
     cells: pd.DataFrame
     """One row for each entry of the record: its keys, `state`, `reason`, `protocol`, `validation`
     (`train.validation`: 0 where scores are of test views), metrics."""
@@ -69,24 +74,45 @@ class Sweep:
     provenance: dict[str, list[str]]
     """Provenance of the done cells: the distinct values of each entry, sorted."""
 
+    @property
+    def id(self) -> str:
+        """The id of the sweep; of several that are joined, all ids with a plus between them."""
+        return "+".join(self.commands)
 
-def read_sweep(store: Store, sweep_id: str, metrics: Sequence[Metric]) -> Sweep:
-    """Read a sweep's record and every cell that it names.
+
+class CellSource(Protocol):
+    """Where the cells of a sweep are: a store, or several."""
+
+    def cell(self, cell_id: str) -> CellFolder:
+        """Return the folder of a cell, which need not exist.
+
+        Args:
+            cell_id: The cell's id.
+        """
+
+
+def read_cells(
+    store: CellSource,
+    commands: Mapping[str, tuple[str, ...]],
+    rows: Sequence[Mapping[str, Any]],
+    metrics: Sequence[Metric],
+) -> Sweep:
+    """Read every cell that rows of records name.
 
     Args:
-        store: The store that holds the sweep.
-        sweep_id: The id of the sweep.
+        store: Where the cells are.
+        commands: The arguments of `xrgs-sweep` by the ids of the sweeps that the rows are from.
+        rows: The rows.
         metrics: The metrics to read from each cell's scores or its summary.
 
     Returns:
         The sweep's tables.
 
     Raises:
-        StoreError: There is no such sweep.
-        ReportError: The record lacks a key, or contradicts a cell's identity.
+        ReportError: A row lacks a key, or contradicts a cell's identity.
     """
-    record = store.sweep_record(sweep_id)
-    entries = [_entry(sweep_id, row) for row in record["cells"]]
+    sweep_id = "+".join(commands)
+    entries = [_entry(sweep_id, row) for row in rows]
     ids = sorted({row["cell_id"] for row in entries if row["cell_id"] is not None})
     bar = progress(ids, "reading cells", "cell")
     cells = {cell_id: _read_cell(store.cell(cell_id), metrics) for cell_id in bar}
@@ -97,8 +123,7 @@ def read_sweep(store: Store, sweep_id: str, metrics: Sequence[Metric]) -> Sweep:
         _add_provenance(provenance, cell.provenance)
     columns = {cell_id: cell.columns for cell_id, cell in cells.items()}
     return Sweep(
-        id=sweep_id,
-        command=tuple(record["command"]),
+        commands=commands,
         cells=_cells(sweep_id, entries, columns, _cell_means(views), metrics),
         views=views,
         training={cell_id: cell.training for cell_id, cell in cells.items()},
@@ -146,6 +171,8 @@ def _read_cell(cell: CellFolder, metrics: Sequence[Metric]) -> _CellContent:
             )
         except READING_ERRORS as error:
             state = CellState.of_error(error)
+    if state.name in _PENDING:
+        return _CellContent({"state": "pending", "reason": _PENDING[state.name]})
     # Without the store's path: the report is the same wherever the store is.
     reason = state.reason.replace(f"{cell.path}/", "")
     return _CellContent({"state": state.name, "reason": reason or state.name})
@@ -200,12 +227,7 @@ def _cells(
     means: pd.DataFrame,
     metrics: Sequence[Metric],
 ) -> pd.DataFrame:
-    failed = {"state": "failed"}
-    rows = [
-        row
-        | columns.get(row["cell_id"], failed | {"reason": row["error"] or "no cell was planned"})
-        for row in entries
-    ]
+    rows = [row | columns.get(row["cell_id"], _without_cell(row["error"])) for row in entries]
     read = ["state", "reason", "protocol", "validation", "true_variant", "true_seed"]
     names = [*RECORD_KEYS, *read, *(metric.name for metric in metrics)]
     cells = pd.DataFrame(rows, columns=names)
@@ -218,6 +240,13 @@ def _cells(
     cells["validation"] = cells["validation"].astype(np.float64)
     _check_identity(sweep_id, cells)
     return cells.drop(columns=["true_variant", "true_seed"])
+
+
+def _without_cell(error: str | None) -> dict[str, str]:
+    """Return state and reason of a row that has no cell: it can't be trained, or not yet."""
+    if error:
+        return {"state": "failed", "reason": error}
+    return {"state": "pending", "reason": "not trained yet: it waits for another cell's count"}
 
 
 def _check_identity(sweep_id: str, cells: pd.DataFrame) -> None:

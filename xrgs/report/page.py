@@ -11,10 +11,11 @@ from typing import TYPE_CHECKING
 from xrgs.evaluation.metrics import METRICS
 from xrgs.experiment.store import BASELINE, Store
 from xrgs.report import curves, skipped
-from xrgs.report.collect import RECORD_KEYS, ReportError, Sweep, read_sweep
+from xrgs.report.collect import RECORD_KEYS, ReportError, Sweep, read_cells
 from xrgs.report.compare import compare
 from xrgs.report.gap import gap_tables
 from xrgs.report.html import write_document
+from xrgs.report.joined import Choice, JoinedStore, report_name
 from xrgs.report.pictures import Picture, draw
 from xrgs.report.render import TextTable, to_latex, to_markdown, to_text
 from xrgs.report.tables import Tables
@@ -48,6 +49,10 @@ _PROVENANCE_KEYS = (
     "arithmetic",
     *_MACHINE_KEYS,
 )
+
+
+#: The choice of every scene and ablation.
+_EVERYTHING = Choice()
 
 
 @dataclass(frozen=True)
@@ -99,37 +104,47 @@ class Runs:
 
 
 def build(
-    store_path: Path,
-    sweep_id: str | None = None,
+    store_paths: Path | Sequence[Path],
+    sweep_ids: str | Sequence[str] | None = None,
     out: Path | None = None,
     pictures: Sequence[str] | None = None,
     against: str = BASELINE,
+    choice: Choice = _EVERYTHING,
 ) -> Report:
-    """Write the tables, scores and figures of a sweep.
+    """Write the tables, scores and figures of a sweep, or of several that are joined.
 
     Args:
-        store_path: The store's folder.
-        sweep_id: The id of the sweep; None takes the latest one.
-        out: The folder to write to; None takes `<store>/reports/<sweep id>`, whose name ends with
-            `.against-<label>` where another label than the baseline is compared with.
+        store_paths: The store's folder, or the folders of the stores that have the cells.
+        sweep_ids: The id of the sweep, or the ids of those to join; None takes the latest one of
+            each store.
+        out: The folder to write to; None takes `reports/<sweep ids>` in the first store. The name
+            ends with `.scenes-`, `.ablations-` and what is chosen where that is not everything, and
+            with `.against-<label>` where another label than the baseline is compared with.
         pictures: Names of the pictures to draw, as of `draw`; None draws all.
         against: The label that all others are compared with.
+        choice: Which scenes and ablations of the sweeps the report has.
 
     Returns:
         The report: its text and its files.
 
     Raises:
-        StoreError: The store holds no such sweep.
-        ReportError: The sweep's cells can't be compared, it has no such label, there is no picture
-            of such a name, or `out` can't be written.
+        StoreError: No store holds such a sweep.
+        ReportError: The sweeps contradict each other, have nothing that is chosen, have cells that
+            can't be compared, or have no such label; there is no picture of such a name; or `out`
+            can't be written.
     """
-    store = Store(store_path)
-    sweep_id = sweep_id or store.latest_sweep()
-    sweep = read_sweep(store, sweep_id, METRICS)
+    paths = [store_paths] if isinstance(store_paths, Path) else store_paths
+    store = JoinedStore(tuple(map(Store, paths)))
+    named = (sweep_ids,) if isinstance(sweep_ids, str) else sweep_ids
+    ids = tuple(dict.fromkeys(named or store.latest_sweeps()))
+    record = store.sweep_record(ids)
+    rows = choice.rows(record["cells"], against)
+    sweep = read_cells(store, record["commands"], rows, METRICS)
     comparison = compare(sweep.cells, METRICS, against)
     tables = Tables(comparison)
-    name = sweep_id if against == BASELINE else f"{sweep_id}.against-{for_file_name(against)}"
-    folder = ConfinedPath(out) if out else store.reports / name
+    name = report_name(ids) + choice.suffix
+    name += "" if against == BASELINE else f".against-{for_file_name(against)}"
+    folder = ConfinedPath(out) if out else store.stores[0].reports / name
     try:
         if out:
             folder.make_root()
@@ -243,10 +258,9 @@ def _markdown_page(
     folder: ConfinedPath,
     runs: Runs,
 ) -> str:
-    command = " ".join(for_markdown(shlex.quote(word)) for word in ("xrgs-sweep", *sweep.command))
     parts = [
         f"# Change from {for_markdown(tables.comparison.base)}\n",
-        f"Sweep {for_markdown(sweep.id)}: {command}\n",
+        *(_command_line(sweep_id, command) for sweep_id, command in sweep.commands.items()),
         *(f"**{for_markdown(line)}**\n" for line in _warnings(sweep)),
         *(to_markdown(table) for table in _all_tables(tables) if table.rows),
         *(to_markdown(table) for table in runs.tables(tables.comparison) if table.rows),
@@ -254,6 +268,11 @@ def _markdown_page(
         to_markdown(_provenance_table(sweep)),
     ]
     return "\n".join(parts)
+
+
+def _command_line(sweep_id: str, command: Sequence[str]) -> str:
+    words = " ".join(for_markdown(shlex.quote(word)) for word in ("xrgs-sweep", *command))
+    return f"Sweep {for_markdown(sweep_id)}: {words}\n"
 
 
 def _picture_link(picture: Picture, folder: ConfinedPath) -> str:
@@ -270,6 +289,12 @@ def _provenance_table(sweep: Sweep) -> TextTable:
 
 def _warnings(sweep: Sweep) -> list[str]:
     warnings = []
+    states = sweep.cells["state"]
+    if pending := int((states == "pending").sum()):
+        warnings.append(
+            f"{pending} of {len(states)} cells are not done yet: the same xrgs-sweep command trains"
+            " them, and the tables are of those that are done."
+        )
     unknown = sweep.cells.loc[sweep.cells["state"] == "unknown", "cell_id"].nunique()
     if unknown:
         warnings.append(f"{unknown} cells can't be read now: run the report again.")

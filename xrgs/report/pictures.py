@@ -12,6 +12,7 @@ import pandas as pd
 from xrgs.capture import images
 from xrgs.capture.images import ImageError
 from xrgs.errors import StoreError, UnreadableError
+from xrgs.experiment.trimming import check_images
 from xrgs.report.collect import ReportError
 from xrgs.report.curves import means_over_runs, means_over_scenes
 from xrgs.report.figures import (
@@ -34,8 +35,8 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
-    from xrgs.experiment.store import Store
     from xrgs.report.compare import Comparison
+    from xrgs.report.joined import JoinedStore
     from xrgs.safeio.confined import ConfinedPath
 
     _Drawing = Callable[[ConfinedPath], "Picture"]  # draws into the file
@@ -62,7 +63,7 @@ class Picture:
 
 
 def draw(
-    store: Store,
+    store: JoinedStore,
     comparison: Comparison,
     views: pd.DataFrame,
     quality: pd.DataFrame,
@@ -76,7 +77,7 @@ def draw(
     which their titles name.
 
     Args:
-        store: The store with the photographs, renders and histories.
+        store: The stores with the photographs, renders and histories.
         comparison: The pairs of cells.
         views: The table `Sweep.views`.
         quality: The table that `xrgs.report.curves.joined` returns.
@@ -101,7 +102,7 @@ def draw(
         both = _same_views(psnr.get(pair["base_id"]), psnr.get(pair["cell_id"]))
         cell = cells.loc[pair["cell_id"]]
         split = "train" if cell["validation"] > 0 else "test"
-        photographs = store.variants / cell["variant_id"] / "images" / split
+        photographs = store.variant(cell["variant_id"]) / "images" / split
         stem = f"{for_file_name(pair['scene'])}--{for_file_name(pair['label'])}"
         drawings[stem] = partial(_views, store, pair, comparison.base, both, photographs)
         drawings[f"{stem}--training"] = partial(_training, store, pair, comparison.base)
@@ -214,7 +215,7 @@ def median_view(base: pd.Series, ablation: pd.Series) -> str:
 
 
 def _views(
-    store: Store,
+    store: JoinedStore,
     pair: pd.Series,
     base: str,
     psnr: tuple[pd.Series, pd.Series],
@@ -227,10 +228,11 @@ def _views(
     title = f"{_title(pair)}: view {view}, by change of PSNR the median of {len(psnr[0])}"
     name = f"{view}.png"
     try:
+        _check_not_trimmed(store, pair, photographs.parent.parent.name, f"renders/{name}")
         truth = _image(photographs / name)
         before = _image(store.cell(pair["base_id"]).folder / "renders" / name)
         ablation = _image(store.cell(pair["cell_id"]).folder / "renders" / name)
-    except ReportError as error:
+    except (ReportError, StoreError) as error:
         return Picture(title, None, str(error))
     panels = (
         Panel(truth, "photograph", f"{truth.shape[1]} × {truth.shape[0]} px"),
@@ -245,7 +247,7 @@ def _views(
     return Picture(title, file)
 
 
-def _training(store: Store, pair: pd.Series, base: str, file: ConfinedPath) -> Picture:
+def _training(store: JoinedStore, pair: pd.Series, base: str, file: ConfinedPath) -> Picture:
     title = f"{_title(pair)}: training"
     runs = []
     for name, key in ((base, "base_id"), (str(pair["label"]), "cell_id")):
@@ -261,6 +263,17 @@ def _training(store: Store, pair: pd.Series, base: str, file: ConfinedPath) -> P
 def _title(pair: pd.Series) -> str:
     parts = (pair["scene"], pair["label"], pair["condition"], f"seed {pair['seed']}")
     return ", ".join(str(part) for part in parts if part)
+
+
+def _check_not_trimmed(store: JoinedStore, pair: pd.Series, variant_id: str, render: str) -> None:
+    """Refuse a picture whose images were removed on purpose.
+
+    Raises:
+        StoreError: They were; the message says which.
+    """
+    for key in ("base_id", "cell_id"):
+        store.cell(pair[key]).check_not_trimmed(render)
+    check_images(store.variant(variant_id).parent, variant_id)
 
 
 def _image(file: ConfinedPath) -> NDArray[np.float32]:

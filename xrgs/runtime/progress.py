@@ -42,7 +42,17 @@ _MAX_WORD = 80
 #: Counts, and units a second, beyond this are not valid.
 _MAX_COUNT = 1 << 53
 
-_file: ContextVar[ConfinedPath | None] = ContextVar("file", default=None)
+
+@dataclass
+class ProgressFile:
+    """The file that progress is kept in while a `with` block of `written_to` runs."""
+
+    path: ConfinedPath
+    note: str = ""
+    """What else is to be shown of the work now; written with the next count."""
+
+
+_file: ContextVar[ProgressFile | None] = ContextVar("file", default=None)
 
 
 @dataclass(frozen=True)
@@ -58,6 +68,8 @@ class Progress:
     """How many there are in all; None where that is not known."""
     rate: float | None
     """Recent units per second; None where that is not known yet."""
+    note: str = ""
+    """What else is known of the work, for example `84,000 Gaussians, loss 0.041`."""
 
     @property
     def remaining_s(self) -> float | None:
@@ -66,9 +78,9 @@ class Progress:
 
     @property
     def count(self) -> str:
-        """A phrase such as `training 1,200 of 3,000 steps`."""
+        """A phrase such as `training 1,200 of 3,000 steps`, with the note."""
         of = "" if self.total is None else f" of {self.total:,}"
-        return f"{self.what} {self.done:,}{of} {self.unit}s"
+        return f"{self.what} {self.done:,}{of} {self.unit}s" + (self.note and f", {self.note}")
 
     def __str__(self) -> str:
         parts = [self.count]
@@ -137,11 +149,12 @@ class ProgressBar(_Tqdm):
             return draw(msg, pos)
         if msg is None:
             total = None if self.total is None else int(self.total)
-            now = Progress(self.desc, self.unit, int(self.n), total, self._rate())
+            note = "" if self._file is None else self._file.note
+            now = Progress(self.desc, self.unit, int(self.n), total, self._rate(), note)
             if self._file is None:
                 log_line(str(now))
             else:
-                _write(self._file, now)
+                _write(self._file.path, now)
         return None
 
     def _rate(self) -> float | None:
@@ -177,18 +190,19 @@ def _write(file: ConfinedPath, now: Progress) -> None:
 
 
 @contextmanager
-def written_to(file: ConfinedPath) -> Iterator[None]:
+def written_to(file: ConfinedPath) -> Iterator[ProgressFile]:
     """Keep the progress of all bars made within a block in a file, and show none of them.
 
     Args:
         file: The file; it holds the latest state of the latest bar, and is removed at the end.
 
     Yields:
-        Nothing.
+        The file, whose note can be set.
     """
-    token = _file.set(file)
+    target = ProgressFile(file)
+    token = _file.set(target)
     try:
-        yield
+        yield target
     finally:
         _file.reset(token)
         with suppress(OSError):
@@ -206,13 +220,14 @@ def read(file: ConfinedPath) -> Progress | None:
     """
     try:
         content = untrusted.parse_json(file.read_bytes(_MAX_BYTES))
-        what, unit = (for_line(str(content[key]), _MAX_WORD) for key in ("what", "unit"))
+        texts = (content["what"], content["unit"], content.get("note", ""))
+        what, unit, note = (for_line(str(text), _MAX_WORD) for text in texts)
         done, total, rate = content["done"], content["total"], content["rate"]
         counts = (done,) if total is None else (done, total)
         if not all(type(n) is int and 0 <= n < _MAX_COUNT for n in counts):
             return None
         known = rate is not None and 1 / _MAX_COUNT < rate < _MAX_COUNT
-        return Progress(what, unit, done, total, float(rate) if known else None)
+        return Progress(what, unit, done, total, float(rate) if known else None, note)
     except (OSError, ValueError, KeyError, TypeError):
         return None
 

@@ -1,4 +1,4 @@
-"""Ends a command in order on Ctrl-C and SIGTERM, with a line that says how to continue."""
+"""Ends a command in order on Ctrl-C and SIGTERM, or lets its work choose the moment of the end."""
 
 from __future__ import annotations
 
@@ -47,6 +47,43 @@ def exit_on_signal(hint: str) -> Iterator[None]:
     except StopSignal as stop:
         say(f"stopped by {signal.Signals(stop.number).name}. {hint}", sys.stderr)
         sys.exit(128 + stop.number)
+
+
+class StopRequest:
+    """Turns SIGTERM into an exception, which work can put off until it has kept its state."""
+
+    def __init__(self) -> None:
+        self.received = False
+        """Whether the signal has arrived."""
+        self._is_deferred = False
+
+    def watch(self) -> None:
+        """Raise `StopSignal` at SIGTERM from now on, in place of ending this process."""
+        signal.signal(signal.SIGTERM, self._on_signal)
+
+    @contextmanager
+    def deferred(self) -> Iterator[None]:
+        """Let the signal raise nothing during a block, which looks at `received` by itself.
+
+        Yields:
+            Nothing.
+        """
+        self._is_deferred = True
+        try:
+            yield
+        finally:
+            self._is_deferred = False
+
+    def _on_signal(self, number: int, _: FrameType | None) -> None:
+        self.received = True
+        if not self._is_deferred:
+            raise StopSignal(number)
+
+
+def end_by_sigterm() -> None:
+    """End this process as SIGTERM ends one that has no handler, so that its parent can tell."""
+    signal.signal(signal.SIGTERM, signal.SIG_DFL)
+    signal.raise_signal(signal.SIGTERM)
 
 
 def _raise_stop(number: int, _: FrameType | None) -> None:

@@ -10,7 +10,7 @@ from xrgs.experiment.cell_folder import CellState
 from xrgs.experiment.identity import cell_identity
 from xrgs.experiment.store import BASELINE
 from xrgs.runtime.progress import format_duration
-from xrgs.safeio.hashing import digest
+from xrgs.safeio.hashing import digest, to_plain
 from xrgs.safeio.words import for_line
 from xrgs.splat.backend import resolve_backend
 from xrgs.sweep.estimate import TORCH_SLOWDOWN, torch_seconds
@@ -264,6 +264,7 @@ def record(plan: Sequence[PlannedCell]) -> list[dict[str, Any]]:
     return [
         {
             "cell_id": cell.cell_id,
+            "planned_id": _planned_id(cell),
             "label": cell.spec.label,
             "condition": cell.spec.condition,
             "scene": scenes.label(cell.conf.scene),
@@ -276,6 +277,22 @@ def record(plan: Sequence[PlannedCell]) -> list[dict[str, Any]]:
         | _unknown(cell)
         for cell in plan
     ]
+
+
+def _planned_id(cell: PlannedCell) -> str:
+    """Return what the cell is asked to be, which is known before any cell is trained.
+
+    For most cells that is their id. The id of one that takes a count follows from another cell.
+    """
+    if cell.cell_id is not None and cell.reference is None:
+        return cell.cell_id
+    matched = cell.conf.components.count_matched
+    conf = replace(
+        cell.conf,
+        components=replace(cell.conf.components, count_matched=replace(matched, gaussians=0)),
+    )
+    parts = (conf.scene, conf.variant, conf.splat, conf.train, conf.components)
+    return digest([*map(to_plain, parts), conf.seed, cell.variant_id])
 
 
 def _unknown(cell: PlannedCell) -> dict[str, str]:

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 
 from xrgs import config
 from xrgs.errors import StoreError, XrgsError
-from xrgs.experiment import provenance
+from xrgs.experiment import provenance, trimming
 from xrgs.experiment.cell_folder import CellFolder
 from xrgs.experiment.identity import cell_identity
 from xrgs.experiment.store import Store
@@ -236,10 +236,12 @@ def _provide(variant_id: str, conf: Conf, store: Store) -> None:
     """Make sure that the variant is in the store.
 
     Raises:
-        XrgsError: It is not, and building it again gives another variant.
+        XrgsError: It is not, and building it again gives another variant; or its images were
+            removed on purpose.
     """
     if (store.variants / variant_id).is_dir():
         return
+    trimming.check_images(store.variants, variant_id)
     log_line(f"variant {variant_id} is not in {store.path} and is built again")
     store.prepare()
     try:
@@ -328,9 +330,11 @@ def _differences(original: CellFolder, repeated: CellFolder) -> Iterator[str]:
             yield f"{name}: {_number(then)} -> {_number(now)}"
     for name in _RESULTS:
         then, now = original.folder / name, repeated.folder / name
-        if not then.is_file():
+        kept = file_digest(then) if then.is_file() else None
+        digest_then = kept or original.trimmed().get(name, {}).get("sha256")
+        if digest_then is None:
             yield f"{name}: missing in {original.path}"
-        elif file_digest(then) != file_digest(now):
+        elif digest_then != file_digest(now):
             yield f"{name}: the bytes differ"
 
 

@@ -2,52 +2,29 @@
 
 from __future__ import annotations
 
-import stat
 from collections import Counter
 from dataclasses import dataclass
 from functools import partial
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, TypeVar
 
 from xrgs.capture.failures import FAILED_PREFIX, failed_scenes
-from xrgs.errors import StoreError, XrgsError
-from xrgs.experiment.cell_folder import CellState
-from xrgs.experiment.identity import training_code
+from xrgs.errors import StoreError
 from xrgs.experiment.store import Store
-from xrgs.experiment.verification import Verification
-from xrgs.experiment.verification import verify as verify_store
-from xrgs.safeio.records import list_folder, read_json
+from xrgs.safeio.records import list_folder
 from xrgs.safeio.untrusted import is_name
 from xrgs.safeio.words import MAX_CELL, for_line
-from xrgs.splat.backend import arithmetic
 from xrgs.sweep import locks
-from xrgs.training import plugins
+from xrgs.sweep.inventory import STATES, CellNames, file_bytes, recorded_names, size_text, summarise
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Mapping, Sequence
     from pathlib import Path
 
-    from xrgs.experiment.cell_folder import CellFolder
-    from xrgs.safeio.confined import ConfinedPath
+    from xrgs.sweep.inventory import CellSummary
 
-_STATES = ("done", "running", "unfinished", "failed", "corrupt", "unknown")
 _T = TypeVar("_T")
 #: Cells of each state are listed by name up to this number.
 _MAX_NAMED = 20
-
-
-@dataclass(frozen=True)
-class CellSummary:
-    """The state of one cell's folder."""
-
-    id: str
-    scene: str
-    """The scene's label in the latest sweep that has the cell, else from the cell's config."""
-    label: str
-    """The cell's label and condition in that sweep, `?` if no sweep has the cell."""
-    state: CellState
-    stale: tuple[str, ...]
-    """For a done cell, source files that have changed since it was trained, and its arithmetic if
-    this machine has another. A sweep would train the cell again."""
 
 
 @dataclass(frozen=True)
@@ -69,26 +46,16 @@ class StoreStatus:
     """Bytes of each subfolder of the store, links not counted; None where that can't be told."""
     problems: tuple[str, ...]
     """What can't be read, or is not what a store has: a line for each file or folder."""
-    verification: Verification | None
-    """What was hashed, where that was asked for."""
-
-    @property
-    def intact(self) -> bool:
-        """Whether nothing is damaged, and everything could be read."""
-        bad = any(cell.state.name in {"corrupt", "unknown"} for cell in self.cells)
-        damaged = self.verification is not None and self.verification.damage
-        return not (bad or self.problems or damaged)
 
 
-def read(path: Path, *, verify: bool = False) -> StoreStatus:
+def read(path: Path) -> StoreStatus:
     """Read the state of a store; nothing is written.
 
-    What can't be read is named among the problems, and does not hide the rest.
+    Of the cells' files the sizes are compared. What can't be read is named among the problems, and
+    does not hide the rest.
 
     Args:
         path: The store's folder.
-        verify: Hash every file of the cells, variants, scenes and records; otherwise only the sizes
-            of the cells' files are compared.
 
     Raises:
         StoreError: There is no such store, or it can't be read now.
@@ -102,14 +69,13 @@ def read(path: Path, *, verify: bool = False) -> StoreStatus:
     cells = problems.unless(store.cell_folders) or []
     return StoreStatus(
         path=path,
-        cells=tuple(_summarise(cell, names.get(cell.id), holders, verify=verify) for cell in cells),
+        cells=tuple(summarise(cell, names, holders) for cell in cells),
         aside=_aside(store, problems),
         variants=tuple(problems.unless(lambda: _variants(store, problems)) or []),
         failed_scenes=tuple(problems.unless(lambda: _failed_scenes(store)) or []),
         sweeps=sweeps,
         sizes=_sizes(store, problems),
         problems=tuple(problems),
-        verification=verify_store(store) if verify else None,
     )
 
 
@@ -156,76 +122,14 @@ def _failed_scenes(store: Store) -> list[tuple[str, str, str]]:
 
 def _sizes(store: Store, problems: _Problems) -> dict[str, int | None]:
     names = problems.unless(store.folder.folders) or []
-    return {name: problems.unless(partial(_bytes, store.folder / name)) for name in names}
+    return {name: problems.unless(partial(file_bytes, store.folder / name)) for name in names}
 
 
-def _bytes(folder: ConfinedPath) -> int:
-    found = (status for _, status in folder.walk())
-    return sum(status.st_size for status in found if stat.S_ISREG(status.st_mode))
-
-
-def _names(store: Store, problems: _Problems) -> tuple[dict[str, tuple[str, str]], int]:
-    """Return scene and label of every recorded cell, and the number of recorded sweeps."""
-    names: dict[str, tuple[str, str]] = {}
+def _names(store: Store, problems: _Problems) -> tuple[dict[str, CellNames], int]:
+    """Return the names of every recorded cell, and the number of recorded sweeps."""
     records, damaged = problems.unless(store.records) or ({}, ())
     problems += damaged
-    for record in records.values():
-        for row in record["cells"]:
-            label = " ".join(row[key] for key in ("label", "condition") if row.get(key))
-            names[row.get("cell_id")] = (row.get("scene", "?"), label)
-    return names, len(records) + len(damaged)
-
-
-def _summarise(
-    cell: CellFolder,
-    name: tuple[str, str] | None,
-    holders: Mapping[str, str],
-    *,
-    verify: bool,
-) -> CellSummary:
-    state = cell.state(verify=verify)
-    if state.name not in {"done", "unknown"} and cell.id in holders:
-        state = cell.running(holders[cell.id])
-    scene, label = name or (_scene(cell), "?")
-    return CellSummary(cell.id, scene, label, state, _stale(cell) if state.name == "done" else ())
-
-
-def _scene(cell: CellFolder) -> str:
-    """Return the scene of a cell that no sweep has recorded yet."""
-    try:
-        scene = read_json(cell.folder / "config.json")["scene"]
-        return str(scene["name"] or scene["path"] or scene["kind"])
-    except (StoreError, KeyError, TypeError):
-        return "?"
-
-
-def _stale(cell: CellFolder) -> tuple[str, ...]:
-    """Return the source files that are not the ones that the cell was trained with.
-
-    The cell's arithmetic is among them where it is not this machine's.
-    """
-    try:
-        identity = cell.identity()
-        then: dict[str, Any] = identity["code"]
-        backend = identity["splat"]["backend"]
-        now = training_code(backend) | plugins.digests_now(then)
-        files = then.keys() | now.keys() if then != now else ()
-        changed = sorted(file for file in files if then.get(file) != now.get(file))
-        return (*changed, *_other_arithmetic(backend, identity.get("arithmetic", "not recorded")))
-    except (XrgsError, AttributeError, KeyError, TypeError, ValueError):
-        return ("identity.json",)
-
-
-def _other_arithmetic(backend: str, trained: object) -> list[str]:
-    """Return how a cell's arithmetic differs from this machine's; empty if it does not.
-
-    A machine on which the backend is not available, where stores are only read, has none.
-    """
-    try:
-        here = arithmetic(backend)
-    except XrgsError:
-        return []
-    return [] if trained == here else [f"arithmetic ({trained}, here {here})"]
+    return recorded_names(records), len(records) + len(damaged)
 
 
 def describe(status: StoreStatus) -> str:
@@ -236,7 +140,7 @@ def describe(status: StoreStatus) -> str:
     """
     counts = Counter(cell.state.name for cell in status.cells)
     stale = [cell for cell in status.cells if cell.stale]
-    parts = [f"{counts[state]} {state}" for state in _STATES if counts[state]]
+    parts = [f"{counts[state]} {state}" for state in STATES if counts[state]]
     lines = [f"store {status.path}: {len(status.cells)} cells", "  " + (", ".join(parts) or "none")]
     if status.aside:
         lines.append(f"  {status.aside} folders of earlier attempts and reruns (*.*)")
@@ -259,14 +163,13 @@ def describe(status: StoreStatus) -> str:
         ]
         lines += [f"  {file}: {count} cells" for file, count in files.most_common(_MAX_NAMED)]
     lines += _named("can't be read, or does not belong there:", status.problems, _MAX_NAMED)
-    lines += _verified(status)
     return "\n".join(map(for_line, lines))
 
 
 def _disk(sizes: Mapping[str, int | None]) -> str:
     """Return a line of the sizes of the store's folders."""
-    texts = [f"{name} {_size(size)}" for name, size in sorted(sizes.items())]
-    known = _size(sum(size or 0 for size in sizes.values()))
+    texts = [f"{name} {size_text(size)}" for name, size in sorted(sizes.items())]
+    known = size_text(sum(size or 0 for size in sizes.values()))
     return f"  {known} on disk{' at least' * (None in sizes.values())}: {', '.join(texts)}"
 
 
@@ -277,25 +180,14 @@ def _named(heading: str, names: Sequence[str], most: int) -> list[str]:
     return ["", heading, *(f"  {name}" for name in names[:most]), *more]
 
 
-def _verified(status: StoreStatus) -> list[str]:
-    """Return what was hashed, and every damaged file."""
-    done = status.verification
-    if done is None:
-        return []
-    lines = _named("damaged, or can't be read now:", done.damage, len(done.damage))
-    extent = f"{done.files:,} files, {_size(done.bytes)}, in {done.seconds:.1f} s"
-    found = f"{len(done.damage)} damaged" if done.damage else "all of them as they were written"
-    return [*lines, "", f"hashed: {extent}; {found}"]
-
-
 def _table(cells: Sequence[CellSummary]) -> list[str]:
     """Return a table of the cells of each scene and label by state, without empty columns."""
     counts: dict[tuple[str, str], Counter[str]] = {}
     for cell in cells:
-        row = counts.setdefault((cell.scene, cell.label), Counter())
+        row = counts.setdefault((cell.names.scene, cell.arm), Counter())
         row[cell.state.name] += 1
         row["stale"] += bool(cell.stale)
-    columns = [c for c in (*_STATES, "stale") if any(row[c] for row in counts.values())]
+    columns = [c for c in (*STATES, "stale") if any(row[c] for row in counts.values())]
     rows = [("scene", "label", *columns)]
     rows += [
         (
@@ -321,17 +213,11 @@ def _aligned(rows: Iterable[tuple[str, ...]]) -> list[str]:
 
 def _listed(state: str, cells: Sequence[CellSummary]) -> list[str]:
     reasons = [cell.state.reason.partition("\n")[0] for cell in cells]
-    names = [f"{cell.id}  {cell.scene} / {cell.label}" for cell in cells]
+    # The latest of the sweeps that have it is the one that trains it now.
+    sweeps = [cell.names.sweeps[-1:] if state == "running" else () for cell in cells]
+    names = [
+        cell.name + "".join(f"  sweep {sweep_id}" for sweep_id in of)
+        for cell, of in zip(cells, sweeps, strict=True)
+    ]
     lines = [f"{name}  {reason}" for name, reason in zip(names, reasons, strict=True)]
     return _named(f"{state}:", lines, _MAX_NAMED)
-
-
-def _size(count: int | None) -> str:
-    if count is None:
-        return "unknown"
-    size = float(count)
-    for unit in ("B", "kB", "MB"):
-        if size < 999.5:
-            return f"{size:.0f} {unit}"
-        size /= 1000
-    return f"{size:.1f} GB"

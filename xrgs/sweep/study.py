@@ -1,6 +1,6 @@
 """One study: a call of `xrgs-sweep`, from the axes of its command line to the table.
 
-expand (axes, matching baselines) -> compose -> variants -> identities -> launch -> record -> table
+expand (axes, matching baselines) -> compose -> variants -> identities -> record -> launch -> table
 
 A cell with `matched_to` takes a number of Gaussians from another cell, so it has no identity before
 that one is done: cells are launched as they become ready, and those that wait for others after
@@ -138,10 +138,12 @@ class Study:
         if dry_run:
             return True
         _tidy({cell.cell_id for cell in plan if cell.cell_id and cell.state.name == "done"}, store)
+        # At the start, so that a report can be made while it runs, and after it was stopped.
+        sweep_id = store.write_sweep(arguments, record(plan))
         with SweepMonitor(store.cells_folder) as monitor:
             plan = self._run_until_complete(plan, store, monitor)
         plan = [_without_reference(cell) for cell in plan]
-        sweep_id = store.write_sweep(arguments, record(plan))
+        store.write_sweep(arguments, record(plan), sweep_id)
         from xrgs.report import build
 
         say(build(store.path, sweep_id).text)

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 from xrgs.capture import scenes, variant
 from xrgs.errors import StoreError, UnreadableError, XrgsError
+from xrgs.experiment import trimming
 from xrgs.runtime.progress import log_line
 from xrgs.safeio.confined import is_passing
 from xrgs.sweep import presence
@@ -117,6 +118,9 @@ def _find_or_build(conf: Conf, store: Store, *, allow_build: bool) -> PlannedVar
         frozen = variant.find(store.variants, key)
         if frozen is not None:
             return PlannedVariant(frozen.id)
+        # The done cells of a trimmed variant are found by its id; a job refuses to train others.
+        if trimmed := trimming.trimmed_variant(store.variants, key):
+            return PlannedVariant(trimmed)
         failure = None if conf.retry == "failed" else variant.failure(store.variants, key)
         if failure or not allow_build:
             return PlannedVariant(error=failure)

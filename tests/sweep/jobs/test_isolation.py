@@ -59,7 +59,7 @@ if "xrgs.sweep.jobs.worker" in sys.orig_argv and "cell" in sys.orig_argv:
         os.fsync = fsync
         real().run_cell(*arguments)
 
-    def run_cell(conf, variant, folder):
+    def run_cell(conf, variant, folder, stop):
         fault = {
             1: raises,
             2: lambda *_: os.kill(os.getpid(), signal.SIGKILL),
@@ -69,7 +69,7 @@ if "xrgs.sweep.jobs.worker" in sys.orig_argv and "cell" in sys.orig_argv:
             6: finds_the_disk_full,
         }.get(conf.seed)
         if fault is None:
-            real().run_cell(conf, variant, folder)
+            real().run_cell(conf, variant, folder, stop)
         else:
             fault(conf, variant, folder)
 

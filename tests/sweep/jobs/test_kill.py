@@ -45,7 +45,7 @@ PHASES = {
     "train": ("cells/*/checkpoint.npz", 0.5),
     "evaluate": ("cells/*/renders", 0.1),
     "finish": ("cells/*/scores.csv", 0.02),
-    "report": ("sweeps/*.json", 1.0),
+    "report": ("reports/*", 1.0),
 }
 
 

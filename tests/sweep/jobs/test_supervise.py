@@ -28,6 +28,7 @@ from pathlib import Path
 from xrgs.sweep.jobs import supervise
 supervise.follow_parent()
 signal.signal(signal.SIGTERM, signal.SIG_IGN)
+signal.signal(signal.SIGUSR1, signal.SIG_IGN)
 child = subprocess.Popen([sys.executable, "-c", "import time; time.sleep(600)"])
 file = Path(sys.argv[1])
 file.with_suffix(".part").write_text(json.dumps([os.getpid(), child.pid]))
@@ -75,7 +76,7 @@ def test_a_process_that_ends_by_itself_gives_its_code_or_signal() -> None:
 def test_a_process_that_hangs_is_killed_with_its_children_though_it_ignores_sigterm(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(supervise, "_GRACE_S", 0.5)
+    monkeypatch.setattr(supervise, "_LIMIT_GRACE_S", 0.5)
     pids = tmp_path / "pids"
     ended = supervise.run_supervised(python(_STUBBORN, str(pids)), Limits(minutes=0.05))
     assert "limits.minutes=0.05" in ended.reason

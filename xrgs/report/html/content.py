@@ -13,8 +13,8 @@ from xrgs.safeio.words import MAX_CELL, for_line
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping
 
-    from xrgs.experiment.store import Store
     from xrgs.report.compare import Comparison
+    from xrgs.report.joined import JoinedStore
 
 #: What the cells of one row of pictures have in common.
 RUN = ["scene", "condition", "variant_seed", "seed"]
@@ -52,14 +52,17 @@ def shown(text: object) -> str:
     return for_line(str(text), MAX_CELL)
 
 
-def why(error: Exception, store: Store) -> str:
-    """Return what an error says, without the store's path.
+def why(error: Exception, store: JoinedStore) -> str:
+    """Return what an error says, without the paths of the stores.
 
     Args:
         error: The error.
-        store: The store; the page is the same wherever it is.
+        store: The stores; the page is the same wherever they are.
     """
-    return shown(str(error).replace(f"{store.path}/", ""))
+    text = str(error)
+    for one in store.stores:
+        text = text.replace(f"{one.path}/", "")
+    return shown(text)
 
 
 def finite(value: float) -> float | None:

@@ -33,8 +33,8 @@ from xrgs.safeio.words import for_csv
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
 
-    from xrgs.experiment.store import Store
     from xrgs.report.collect import Sweep
+    from xrgs.report.joined import JoinedStore
     from xrgs.report.tables import Tables
     from xrgs.safeio.confined import ConfinedPath
 
@@ -49,7 +49,7 @@ _MAX_RUNS = 12
 
 def write_document(
     file: ConfinedPath,
-    store: Store,
+    store: JoinedStore,
     sweep: Sweep,
     tables: Tables,
     texts: Sequence[TextTable],
@@ -85,7 +85,7 @@ def write_document(
         content.notes.append("Photographs, renders and models were left out: pictures=none.")
     head = {
         "id": shown(sweep.id),
-        "command": shown(" ".join(("xrgs-sweep", *sweep.command))),
+        "commands": [shown(" ".join(("xrgs-sweep", *words))) for words in sweep.commands.values()],
         "base": shown(comparison.base),
         "answers": summary.answers(comparison),
         "context": summary.context(store, sweep, comparison, variants),
@@ -97,19 +97,19 @@ def write_document(
     write_text(file, _fitting(head, content, tables, [table for table in texts if table.rows]))
 
 
-def _variants(store: Store, cells: pd.DataFrame, content: Content) -> dict[str, Variant]:
+def _variants(store: JoinedStore, cells: pd.DataFrame, content: Content) -> dict[str, Variant]:
     """Load the variants of the finished cells; note those that can't be read."""
     found = {}
     for name in cells.loc[cells["state"] == "done", "variant_id"].unique():
         try:
-            found[name] = variant.load(store.variants / name)
+            found[name] = variant.load(store.variant(name))
         except XrgsError as error:
             content.notes.append(f"Variant {shown(name)}: {why(error, store)}")
     return found
 
 
 def _add_trained(
-    content: Content, store: Store, found: list[pd.DataFrame], variants: dict[str, Variant]
+    content: Content, store: JoinedStore, found: list[pd.DataFrame], variants: dict[str, Variant]
 ) -> None:
     """Add training views and models of the first replicate of each scene and condition."""
     first = {(rows["scene"].iloc[0], rows["condition"].iloc[0]): rows for rows in reversed(found)}

@@ -14,9 +14,9 @@ if TYPE_CHECKING:
     import pandas as pd
 
     from xrgs.experiment.cell_folder import CellFolder
-    from xrgs.experiment.store import Store
     from xrgs.report.compare import Comparison
     from xrgs.report.html.content import Content
+    from xrgs.report.joined import JoinedStore
 
 #: What a history counts, in the order of the page.
 RULES = (
@@ -46,7 +46,7 @@ def add_curves(content: Content, quality: pd.DataFrame) -> None:
         content.curves.append(run_names(first) | {"label": shown(first["label"])} | columns)
 
 
-def add_history(content: Content, store: Store, comparison: Comparison) -> None:
+def add_history(content: Content, store: JoinedStore, comparison: Comparison) -> None:
     """Add Gaussians over steps, and what each rule grew and pruned, of each finished cell.
 
     Args:

@@ -17,9 +17,9 @@ if TYPE_CHECKING:
 
     from xrgs.capture.views import Variant
     from xrgs.evaluation.metrics import Metric
-    from xrgs.experiment.store import Store
     from xrgs.report.collect import Sweep
     from xrgs.report.compare import Comparison
+    from xrgs.report.joined import JoinedStore
     from xrgs.report.writing import Change
 
 #: Fewer test views than these in a scene are called few.
@@ -102,7 +102,7 @@ def _count(number: int, of: str) -> str:
 
 
 def context(
-    store: Store, sweep: Sweep, comparison: Comparison, variants: Mapping[str, Variant]
+    store: JoinedStore, sweep: Sweep, comparison: Comparison, variants: Mapping[str, Variant]
 ) -> list[tuple[str, str]]:
     """Return what the numbers of the page were made with: names and values.
 

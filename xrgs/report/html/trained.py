@@ -31,8 +31,8 @@ if TYPE_CHECKING:
 
     from xrgs.capture.dataset import Dataset, LoadedView
     from xrgs.capture.views import Variant
-    from xrgs.experiment.store import Store
     from xrgs.report.html.content import Content
+    from xrgs.report.joined import JoinedStore
     from xrgs.splat.cameras import Camera
     from xrgs.splat.gaussians import ActivatedGaussians
     from xrgs.splat.settings import RasterSettings
@@ -80,7 +80,7 @@ class _Model:
 
 def add_trained(
     content: Content,
-    store: Store,
+    store: JoinedStore,
     cells: Sequence[pd.DataFrame],
     variants: dict[str, Variant],
     max_image_bytes: int,
@@ -124,7 +124,7 @@ class _Adder:
     """Adds what is made of one run after another."""
 
     content: Content
-    store: Store
+    store: JoinedStore
     kept: int
     """The most Gaussians of a model."""
     models_left: int

@@ -16,9 +16,9 @@ if TYPE_CHECKING:
     import pandas as pd
     from PIL import Image
 
-    from xrgs.experiment.store import Store
     from xrgs.report.compare import Comparison
     from xrgs.report.html.content import Content
+    from xrgs.report.joined import JoinedStore
     from xrgs.safeio.confined import ConfinedPath
 
 #: The largest image that is read.
@@ -31,7 +31,7 @@ _WITH_ERROR_MAPS = 1.25
 
 def add_views(
     content: Content,
-    store: Store,
+    store: JoinedStore,
     comparison: Comparison,
     views: pd.DataFrame,
     max_bytes: int,
@@ -79,16 +79,16 @@ def _title(entry: dict[str, Any]) -> str:
     return ", ".join(filter(None, (entry[key] for key in ("scene", "condition", "view"))))
 
 
-def _files(store: Store, cells: pd.DataFrame, view: str) -> list[ConfinedPath]:
+def _files(store: JoinedStore, cells: pd.DataFrame, view: str) -> list[ConfinedPath]:
     """Return the files of the photograph and of the render of each cell."""
     first = cells.iloc[0]
     split = "train" if first["validation"] > 0 else "test"
-    photograph = store.variants / first["variant_id"] / "images" / split / f"{view}.png"
+    photograph = store.variant(first["variant_id"]) / "images" / split / f"{view}.png"
     renders = (store.cell(name).folder / "renders" / f"{view}.png" for name in cells["cell_id"])
     return [photograph, *renders]
 
 
-def _pixels(store: Store, cells: pd.DataFrame, view: str) -> int:
+def _pixels(store: JoinedStore, cells: pd.DataFrame, view: str) -> int:
     """Return the number of pixels of a view's images, 0 where its photograph can't be read."""
     try:
         width, height = images.size(_files(store, cells, view)[0])
@@ -106,7 +106,7 @@ def _entry(cells: pd.DataFrame, view: str, scores: _Scores) -> dict[str, Any]:
 
 
 def _read(
-    content: Content, store: Store, cells: pd.DataFrame, view: str, title: str
+    content: Content, store: JoinedStore, cells: pd.DataFrame, view: str, title: str
 ) -> tuple[Image.Image, dict[int, Image.Image]] | None:
     """Read a view's photograph, and the renders of it by the place of their cell.
 

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 
 from xrgs.errors import UnreadableError, XrgsError
 from xrgs.experiment.store import Store
+from xrgs.experiment.trimming import check_images
 from xrgs.runtime.progress import log_line
 from xrgs.safeio.confined import is_passing
 from xrgs.sweep import locks, presence
@@ -50,7 +51,7 @@ def run_job(session: SweepSession, cell_id: str) -> str:
 
     Raises:
         XrgsError: The cell was not handed over by this sweep's plan, its code is not the planned
-            one, or its variant is missing.
+            one, or its variant is missing or trimmed.
     """
     if session.stopped:
         return STOPPED
@@ -88,9 +89,11 @@ def _outcome_of(error: OSError, store: Store) -> str:
 
 def _run_under_lock(cell: HandOver, store: Store, session: SweepSession) -> str:
     """Train the cell unless another process is training it, or has finished it meanwhile."""
-    # The plan has verified the variant's files, and the child process verifies them again.
+    # The plan has verified the variant's files, and the child process verifies them again. Of a
+    # trimmed variant the plan knows the id alone.
     variant = store.variants / cell.variant_id
     if not variant.is_dir():
+        check_images(store.variants, cell.variant_id)
         raise XrgsError(f"{cell.name}: its variant {variant} is missing")
     folder = store.cell(cell.cell_id)
     lock = locks.acquire(store.locks, folder.id, cell.dead_locks)

@@ -12,13 +12,20 @@ from typing import TYPE_CHECKING
 
 from xrgs.errors import XrgsError
 from xrgs.runtime import processes
+from xrgs.runtime.progress import log_line
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
-#: Seconds between two polls of the child, and seconds it has after SIGTERM to end by itself.
+#: Seconds between two polls of the child.
 _POLL_S = 0.2
-_GRACE_S = 5.0
+#: Seconds that the child has after SIGTERM to write its checkpoint, or to finish what it is about
+#: to finish; and seconds that it has when it has exceeded a limit, or more of it would be harmful.
+_GRACE_S, _LIMIT_GRACE_S = 60.0, 5.0
+#: Seconds after which something is said of waiting for its end.
+_SILENT_S = 1.0
+#: A child that has registered it with `faulthandler` writes its stack at this signal.
+STACK_SIGNAL = signal.SIGUSR1
 #: Waits for the end of the pipe on its standard input, to which nothing is ever written, and then
 #: kills its process group. It ignores the signals that the group gets when it is asked to end.
 _WATCHER = "trap '' TERM INT HUP; read -r _; kill -s KILL -- -$1"
@@ -66,10 +73,11 @@ def run_supervised(
             f"limits.memory_gb={limits.memory_gb:g} can't be kept: this system has no /proc"
         )
     child = subprocess.Popen(command, stdin=subprocess.PIPE, start_new_session=True)  # noqa: S603
+    reason = ""
     try:
         reason = _watch(child, limits, on_poll)
     finally:
-        _end(child)
+        _end(child, exceeded=bool(reason))
     return ProcessEnd(child.returncode, reason)
 
 
@@ -94,16 +102,33 @@ def _watch(child: subprocess.Popen[bytes], limits: Limits, on_poll: Callable[[in
     return ""
 
 
-def _end(child: subprocess.Popen[bytes]) -> None:
-    """End the child and all that it started, by SIGTERM first, so that it can log its stack."""
+def _end(child: subprocess.Popen[bytes], *, exceeded: bool) -> None:
+    """End the child and all that it started, by SIGTERM first, so that it can end in order.
+
+    A child that has exceeded a limit is asked for its stack, which tells what took so long.
+    """
     if child.poll() is None:
+        if exceeded:
+            child.send_signal(STACK_SIGNAL)
         _signal(child, signal.SIGTERM)
-        with suppress(subprocess.TimeoutExpired):
-            child.wait(_GRACE_S)
+        if exceeded:
+            _ends_within(child, _LIMIT_GRACE_S)
+        elif not _ends_within(child, min(_SILENT_S, _GRACE_S)):
+            log_line(
+                f"waiting at most {_GRACE_S:.0f} s for the cell to keep its state; another Ctrl-C"
+                " ends it at once"
+            )
+            _ends_within(child, _GRACE_S)
     _signal(child, signal.SIGKILL)
     child.wait()
     if child.stdin is not None:
         child.stdin.close()
+
+
+def _ends_within(child: subprocess.Popen[bytes], seconds: float) -> bool:
+    with suppress(subprocess.TimeoutExpired):
+        child.wait(seconds)
+    return child.returncode is not None
 
 
 def _signal(child: subprocess.Popen[bytes], number: int) -> None:

@@ -21,6 +21,7 @@ from typing import TYPE_CHECKING, Any
 from xrgs.errors import UnreadableError, XrgsError
 from xrgs.runtime import processes
 from xrgs.runtime.machine import set_passive_openmp_wait
+from xrgs.runtime.signals import StopRequest, StopSignal, end_by_sigterm
 from xrgs.runtime.streams import ignore_broken_pipe, log_to_stderr, say
 from xrgs.safeio.atomic import write_json
 from xrgs.safeio.confined import ConfinedPath, ReplacedError, RootMissingError
@@ -183,12 +184,16 @@ def _run_cell(request: Mapping[str, Any]) -> dict[str, Any]:
         # goes to a file instead: on a terminal the bars of several cells would mix.
         for descriptor in (1, 2):
             os.dup2(log.fileno(), descriptor)
-        # A cell that is ended by SIGTERM writes its stack. It is given the descriptor, which stays
-        # open when `log` is closed.
-        faulthandler.register(signal.SIGTERM, 2, chain=True)
+        stop = StopRequest()
+        stop.watch()
+        # It is given the descriptor, which stays open when `log` is closed.
+        faulthandler.register(supervise.STACK_SIGNAL, 2)
         log_to_stderr(logging.INFO)
-        frozen = variant.load(Path(request["variant"]))
-        cell.run_cell(from_dict(request["conf"]), frozen, folder)
+        try:
+            frozen = variant.load(Path(request["variant"]))
+            cell.run_cell(from_dict(request["conf"]), frozen, folder, stop)
+        except StopSignal:
+            end_by_sigterm()
     return {}
 
 

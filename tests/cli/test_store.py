@@ -1,0 +1,125 @@
+"""Tests of `xrgs-store`; what it lists and removes has tests of its own."""
+
+from __future__ import annotations
+
+import io
+import sys
+from collections.abc import Callable
+from contextlib import nullcontext
+from pathlib import Path
+
+import pytest
+
+from xrgs.cli import store as command
+from xrgs.experiment.store import Store
+
+Call = Callable[..., tuple[int, str, str]]
+
+
+@pytest.fixture
+def xrgs_store(call_command: Call, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Call:
+    """(*arguments) -> exit code, stdout and message of `xrgs-store` on a store of two cells."""
+    monkeypatch.setattr(command, "exit_on_signal", nullcontext)  # keep pytest's own handlers
+    store = Store(tmp_path / "s")
+    store.prepare()
+    for name in ("abc", "abd"):
+        folder = store.cell(name)
+        folder.begin({"train": {"steps": 3 if name == "abc" else 4}}, {"variant": "v", "seed": 0})
+        (folder.path / "splats.ply").write_bytes(bytes(1000))
+        (folder.path / "scores.csv").write_text("view,psnr\na,20\nb,22\n")
+        (folder.path / "summary.json").write_text('{"gaussians": 17}')
+        folder.finish(["a", "b"], 1)
+    rows = [
+        {"cell_id": name, "label": label, "scene": "fern", "condition": "", "baseline_id": "abc"}
+        for name, label in (("abc", "baseline"), ("abd", "mip"))
+    ]
+    store.write_sweep([], rows)
+
+    def run(*arguments: str) -> tuple[int, str, str]:
+        return call_command("store", *arguments, "store=s")
+
+    return run
+
+
+def cells(tmp_path: Path) -> list[str]:
+    return sorted(path.name for path in (tmp_path / "s" / "cells").iterdir())
+
+
+def test_cells_are_listed_and_one_is_shown(xrgs_store: Call) -> None:
+    code, out, _ = xrgs_store("list", "ablations=mip")
+    assert code == 0
+    assert out.startswith("1 cells, ")
+    assert "abd   fern   mip" in out
+    code, out, _ = xrgs_store("show", "abd")
+    assert code == 0
+    assert "differs from its baseline abc in:\n  train.steps: 3 -> 4\n" in out
+    assert "psnr: 21 dB" in out
+    assert "gaussians: 17" in out
+    assert "splats.ply  1 kB" in out
+
+
+def test_nothing_is_removed_without_a_yes(
+    xrgs_store: Call, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    code, out, _ = xrgs_store("rm", "abd", "dry_run=true")
+    assert code == 0
+    assert "to remove: 1 cells: " in out
+    assert "abd  fern / mip, done" in out
+    monkeypatch.setattr(sys, "stdin", io.StringIO("y\n"))  # no terminal: nobody has answered
+    code, _, err = xrgs_store("rm", "abd")
+    assert code == 1
+    assert "nothing was done; yes=true" in err
+    assert cells(tmp_path) == ["abc", "abd"]
+    code, out, _ = xrgs_store("rm", "abd", "yes=true")
+    assert code == 0
+    assert "freed " in out
+    assert cells(tmp_path) == ["abc"]
+
+
+@pytest.mark.parametrize(("answer", "left"), [("y\n", []), ("n\n", ["abd"]), ("", ["abd"])])
+def test_a_terminal_is_asked(
+    xrgs_store: Call, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, answer: str, left: list[str]
+) -> None:
+    terminal = io.StringIO(answer)
+    monkeypatch.setattr(terminal, "isatty", lambda: True)
+    monkeypatch.setattr(sys, "stdin", terminal)
+    assert xrgs_store("rm", "abd")[0] == bool(left)
+    assert cells(tmp_path) == ["abc", *left]
+
+
+def test_trim_keeps_what_tables_are_made_of(xrgs_store: Call, tmp_path: Path) -> None:
+    code, out, _ = xrgs_store("trim", "yes=true")
+    assert code == 0
+    assert out.splitlines()[-1] == "freed 2 kB"
+    assert "done (trimmed)" in xrgs_store("list")[1]
+    assert "removed by xrgs-store trim: 1 files" in xrgs_store("show", "abc")[1]
+    assert len(Store(tmp_path / "s").cells()) == 2
+    assert xrgs_store("check")[0] == 0
+
+
+def test_check_ends_with_1_where_something_is_damaged(xrgs_store: Call, tmp_path: Path) -> None:
+    assert xrgs_store("check")[0] == 0
+    (tmp_path / "s" / "cells" / "abc" / "splats.ply").write_bytes(bytes(999) + b"1")
+    code, out, _ = xrgs_store("check")
+    assert code == 1
+    assert "abc/splats.ply: it has changed" in out
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["rm", "yes=true"], "rm: name cells, or give a filter"),
+        (["remove"], "remove: there is no such command; choose from: list, show, rm"),
+        (["gc", "abc"], "gc abc: gc takes no cells"),
+        (["show"], "show: give the id of one cell"),
+        (["list", "sceens=fern"], "sceens"),
+        (["rm", "ab", "yes=true"], "ab: several cells have such an id"),
+    ],
+)
+def test_bad_input_is_named_and_removes_nothing(
+    xrgs_store: Call, tmp_path: Path, arguments: list[str], message: str
+) -> None:
+    code, _, err = xrgs_store(*arguments)
+    assert code == 1
+    assert message in err
+    assert cells(tmp_path) == ["abc", "abd"]

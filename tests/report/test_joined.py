@@ -1,0 +1,152 @@
+"""Tests of reports of several stores and sweeps, of chosen rows, and of sweeps that still run."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from xrgs.errors import StoreError
+from xrgs.experiment.store import Store
+from xrgs.report import Choice, build
+from xrgs.report.collect import ReportError
+from xrgs.report.joined import JoinedStore, report_name
+from xrgs.safeio.records import read_table
+
+
+def table(folder: Path) -> dict[str, float]:
+    """Return the change of PSNR of each scene and of the mean, in percent."""
+    header, rows = read_table(folder / "table.csv")
+    found = [dict(zip(header, row, strict=True)) for row in rows]
+    return {
+        f"{row['label']} {row['level']} {row['scene']}".rstrip(): float(row["change_percent"])
+        for row in found
+        if row["metric"] == "psnr"
+    }
+
+
+@pytest.fixture
+def two(made: Any, tmp_path: Path) -> tuple[Path, Path, str, str]:
+    """Two stores, each with a sweep of one scene: PSNR changes by 10 % and by 20 %."""
+    ids = []
+    for name, scene, factor in (("a", "fern", 1.1), ("b", "room", 1.2)):
+        made.rows.clear()
+        first = len(list(made.store.cells_folder.names()))
+        made.add(scene=scene)
+        made.add("plus", scene=scene, factors={"psnr": factor})
+        for number, row in enumerate(made.rows):  # ids of their own, as other scenes have
+            new = f"cell{first + number}{name}"
+            made.store.cell(row["cell_id"]).folder.rename(made.store.cells_folder / new)
+            row["cell_id"] = new
+        for row in made.rows:
+            row["baseline_id"] = made.rows[0]["cell_id"]
+        ids.append(made.write())
+        shutil.copytree(made.store.path, tmp_path / name)
+    return tmp_path / "a", tmp_path / "b", ids[0], ids[1]
+
+
+def test_sweeps_of_two_stores_are_joined(two: tuple[Path, Path, str, str], tmp_path: Path) -> None:
+    a, b, first, second = two
+    report = build([a, b], pictures=[])
+    assert report.folder == a / "reports" / f"{first}+{second}"
+    changes = table(report.folder)
+    assert changes["plus scene fern"] == pytest.approx(10)
+    assert changes["plus scene room"] == pytest.approx(20)
+    assert changes["plus mean"] == pytest.approx(15)
+    text = (report.folder / "table.md").read_text()
+    assert f"Sweep {first}: " in text
+    assert f"Sweep {second}: " in text
+    assert table(build(b, [first, second], pictures=[]).folder) == changes  # b has both
+
+
+def test_a_cell_is_found_in_the_store_that_has_done_it(
+    two: tuple[Path, Path, str, str],
+) -> None:
+    a, b, first, _ = two
+    store = JoinedStore((Store(a), Store(b)))
+    (cell_id,) = [
+        row["cell_id"] for row in Store(a).sweep_record(first)["cells"] if row["label"] == "plus"
+    ]
+    (a / "cells" / cell_id / "scores.csv").unlink()
+    assert store.cell(cell_id).path == b / "cells" / cell_id
+    shutil.rmtree(b / "cells" / cell_id)
+    assert store.cell(cell_id).path == a / "cells" / cell_id
+
+
+def test_rows_are_chosen_and_the_folder_says_so(two: tuple[Path, Path, str, str]) -> None:
+    _, b, first, second = two
+    report = build(b, [first, second], None, [], choice=Choice(("room",), ("plus",)))
+    assert report.folder.name == f"{first}+{second}.scenes-room.ablations-plus"
+    assert set(table(report.folder)) == {"plus mean", "plus scene room"}
+    for choice, message in (
+        (Choice(scenes=("rom",)), "scenes=rom: .* choose from: fern, room"),
+        (Choice(ablations=("x",)), "ablations=x: .* choose from: baseline, plus"),
+    ):
+        with pytest.raises(ReportError, match=message):
+            build(b, [first, second], None, [], choice=choice)
+
+
+def test_two_different_cells_in_one_place_are_refused(
+    two: tuple[Path, Path, str, str],
+) -> None:
+    _, b, first, second = two
+    store = Store(b)
+    rows = [row | {"scene": "fern"} for row in store.sweep_record(second)["cells"]]
+    other = store.write_sweep([], rows)
+    with pytest.raises(ReportError, match=rf"fern / baseline / seed 0 is cell .*{first} and"):
+        build(b, [first, other], pictures=[])
+
+
+def test_a_sweep_of_no_store_is_named(two: tuple[Path, Path, str, str]) -> None:
+    a, b, _, _ = two
+    with pytest.raises(StoreError, match=r"sweep=nope: there is no such sweep in .*a, .*b"):
+        build([a, b], "nope", pictures=[])
+
+
+def test_a_long_list_of_sweeps_has_a_short_name() -> None:
+    ids = [f"{number:016x}" for number in range(40)]
+    assert len(report_name(ids)) < 150
+    assert report_name(ids) != report_name(ids[:-1])
+
+
+def test_a_sweep_that_runs_is_reported_with_what_is_done(made: Any) -> None:
+    for seed in range(2):
+        made.add(seed=seed)
+        made.add("plus", seed=seed, factors={"psnr": 1.1})
+    begun = made.rows[2]["cell_id"]
+    (made.store.cell(begun).path / "status.json").unlink()
+    made.store.cell(made.rows[3]["cell_id"]).remove()
+    made.rows.append(made.rows[1] | {"cell_id": None, "label": "count_matched"})
+    report = build(made.store.path, made.write(), pictures=[])
+    assert table(report.folder)["plus mean"] == pytest.approx(10)
+    assert "3 of 5 cells are not done yet" in report.text
+    assert "3 of 5 cells gave no number" in report.text
+    for reason in (
+        "pending  begun and not done yet",
+        "pending  not trained yet\n",
+        "pending  not trained yet: it waits for another cell's count",
+    ):
+        assert reason in report.text
+
+
+def test_a_report_in_which_nothing_is_done_yet_says_so(made: Any) -> None:
+    for label in ("baseline", "plus"):
+        made.add(label)
+        made.store.cell(made.rows[-1]["cell_id"]).remove()
+    report = build(made.store.path, made.write(), pictures=[])
+    assert "2 of 2 cells are not done yet" in report.text
+
+
+def test_a_picture_of_a_trimmed_cell_says_that_its_images_were_removed(made: Any) -> None:
+    made.add(pictures=True)
+    cell = made.add("plus", pictures=True)
+    before = build(made.store.path, made.write(), pictures=["fern--plus"])
+    tables = (before.folder / "table.csv").read_bytes()
+    cell.trim()
+    after = build(made.store.path, pictures=["fern--plus"])
+    text = (after.folder / "table.md").read_text()
+    assert "No picture of fern, plus, seed 0" in text
+    assert f"cells/{cell.id}/renders/IMG\\_001.png was removed by xrgs-store trim" in text
+    assert (after.folder / "table.csv").read_bytes() == tables

@@ -1,0 +1,176 @@
+"""Tests of what is removed from a store, what is left, and that locks are respected."""
+
+from __future__ import annotations
+
+import os
+import time
+from pathlib import Path
+
+import pytest
+
+from xrgs.errors import XrgsError
+from xrgs.experiment import identity
+from xrgs.experiment.cell_folder import CellFolder
+from xrgs.experiment.store import Store
+from xrgs.sweep import locks
+from xrgs.sweep.cleaning import GARBAGE, Plan, carry_out, plan_gc, plan_removal, plan_trim
+from xrgs.sweep.inventory import summaries
+
+
+def add(store: Store, name: str, state: str, variant: str = "aa-used", **changes: str) -> None:
+    folder = store.cell(name)
+    code = dict(identity.training_code("torch")) | changes
+    what = {"splat": {"backend": "torch"}, "code": code, "seed": 0, "variant": variant}
+    folder.begin({}, what)
+    if state == "failed":
+        folder.fail("out of luck")
+    if state == "done":
+        (folder.path / "renders").mkdir()
+        (folder.path / "renders" / "a.png").write_bytes(bytes(1000))
+        (folder.path / "splats.ply").write_bytes(bytes(2000))
+        (folder.path / "scores.csv").write_text("view,psnr\na,20\n")
+        folder.finish(["a"], 1)
+
+
+def add_variant(store: Store, name: str, age_s: float = 86400) -> None:
+    images = store.variants / name / "images"
+    images.make_folder()
+    (images.path / "a.png").write_bytes(bytes(5000))
+    os.utime((store.variants / name).path, (0, time.time() - age_s))
+
+
+@pytest.fixture
+def store(tmp_path: Path) -> Store:
+    """A store with something of each kind."""
+    store = Store(tmp_path / "s")
+    store.prepare()
+    add(store, "done1", "done")
+    add(store, "half1", "unfinished")
+    add(store, "fail1", "failed")
+    add(store, "fail1", "failed")  # which sets the first try aside
+    add(store, "old1", "done", "aa-old", **{"splat/densify.py": "0"})
+    for name in ("aa-used", "aa-old", "trimmed-aa-orphan", "failed-aa"):
+        add_variant(store, name)
+    add_variant(store, "aa-new", age_s=60)
+    (store.variants / ".aa-used.aside-1").make_folder()
+    (store.cells_folder / "done1.rerun-1").make_folder()
+    (store.cells_folder / ".done1.old-0a").make_folder()
+    store.write_sweep([], [{"cell_id": name, "scene": "s", "label": "l"} for name in ("old1",)])
+    return store
+
+
+def names(store: Store) -> set[str]:
+    return {f"c/{n}" for n in store.cells_folder.names()} | {
+        f"v/{n}" for n in store.variants.names()
+    }
+
+
+def gc(store: Store, *of: str) -> Plan:
+    return plan_gc(store, summaries(store), of or GARBAGE)
+
+
+def test_gc_says_what_it_removes_and_removes_that_alone(store: Store) -> None:
+    before = names(store)
+    plan = gc(store)
+    text = str(plan)
+    assert "1 cells of old code, 1 failed cells, 1 failed scenes" in text
+    assert "1 of the cells are done: 1 sweeps lose them from their reports" in text
+    assert "1 variants without a cell are left alone: they are new" in text
+    assert names(store) == before
+    freed, left = carry_out(store, plan)
+    assert left == []
+    assert freed == sum(item.bytes for item in plan.items) > 15_000
+    assert before - names(store) == {
+        *("c/old1", "c/fail1", "c/fail1.aside-1"),
+        *("v/aa-old", "v/trimmed-aa-orphan", "v/failed-aa", "v/.aa-used.aside-1"),
+    }
+    assert names(store) < before
+    assert store.locks.names() == []
+    assert gc(store).items == ()
+
+
+@pytest.mark.parametrize(
+    ("of", "kinds"),
+    [
+        ("old_code", {"cells of old code"}),
+        ("failed", {"failed cells", "failed scenes"}),
+        ("aside", {"folders that were set aside"}),
+        ("variants", {"variants without a cell"}),
+    ],
+)
+def test_gc_removes_one_kind(store: Store, of: str, kinds: set[str]) -> None:
+    assert {item.kind for item in gc(store, of).items} == kinds
+    if of == "variants":  # the cell of old code is still there, and so is its variant
+        assert [item.name for item in gc(store, of).items] == ["variants/trimmed-aa-orphan"]
+
+
+def test_an_unknown_kind_is_refused(store: Store) -> None:
+    with pytest.raises(XrgsError, match="of=cells: choose from: old_code, failed"):
+        gc(store, "cells")
+
+
+def test_no_variant_is_removed_or_trimmed_while_a_cell_is_trained(store: Store) -> None:
+    assert locks.acquire(store.locks, "half1") is not None
+    notes = ("variants are left alone: a sweep is running, and may need any of them",)
+    assert gc(store, "variants") == Plan("remove", (), notes)
+    cells = summaries(store)
+    assert plan_trim(store, cells, cells[:1], variants=True).notes[-1:] == notes
+
+
+def test_no_variant_is_removed_where_an_identity_cannot_be_read(store: Store) -> None:
+    (store.cell("half1").path / "identity.json").write_text("{")
+    assert gc(store, "variants").items == ()
+
+
+def test_a_cell_that_is_trained_is_never_touched(store: Store) -> None:
+    chosen = summaries(store)
+    plan = plan_removal(store, chosen)
+    assert len(plan.items) == 4
+    held = locks.acquire(store.locks, "half1")  # begun by another sweep after the plan
+    assert held is not None
+    _, left = carry_out(store, plan)
+    assert left == ["half1  ? / ?, unfinished: it is left: a sweep is training it"]
+    assert store.cell("half1").state().name == "unfinished"
+    assert not store.cell("done1").path.exists()
+    plan = plan_removal(store, summaries(store))
+    assert plan == Plan("remove", (), ("1 cells are left alone: they are being trained",))
+
+
+def test_a_cell_that_has_changed_since_the_plan_is_left(store: Store) -> None:
+    plan = plan_removal(store, [cell for cell in summaries(store) if cell.id == "fail1"])
+    add(store, "fail1", "done")
+    assert "it was failed, and is done now" in carry_out(store, plan)[1][0]
+    assert store.cell("fail1").state().name == "done"
+
+
+def test_what_cannot_be_removed_hides_no_other(
+    store: Store, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    real = CellFolder.remove
+
+    def remove(cell: CellFolder) -> None:
+        if cell.id == "old1":
+            raise PermissionError(13, "Permission denied", "cells/old1")
+        real(cell)
+
+    monkeypatch.setattr(CellFolder, "remove", remove)
+    _, left = carry_out(store, gc(store))
+    assert len(left) == 1
+    assert "Permission denied" in left[0]
+    assert not store.cell("fail1").path.exists()
+    assert store.locks.names() == []
+
+
+def test_trimmed_cells_stay_done_and_variants_in_use_are_left(store: Store) -> None:
+    cells = summaries(store)
+    plan = plan_trim(store, cells, cells, variants=True)
+    assert plan.total == "2 cells, 1 variants: 11 kB"
+    assert "2 cells are left alone: they are not done" in str(plan)
+    assert "1 variants are left alone: cells of them are not done" in str(plan)
+    assert carry_out(store, plan) == (11_000, [])
+    assert store.cell("done1").state().name == "done"
+    assert not (store.cell("done1").path / "renders").exists()
+    assert (store.variants / "trimmed-aa-old").is_dir()
+    assert (store.variants / "aa-used/images/a.png").exists()
+    cells = summaries(store)
+    assert plan_trim(store, cells, cells, variants=True).items == ()

@@ -1,0 +1,315 @@
+"""Removes cells and variants from a store, or their heavy files: plans first, then does it.
+
+A plan says what would be removed and how much it is; nothing is touched before `carry_out`. Each
+cell is removed or trimmed under its lock, so that a cell that is being trained, here or on another
+machine, is left alone.
+"""
+
+from __future__ import annotations
+
+import re
+import time
+from collections import Counter
+from dataclasses import dataclass
+from functools import partial
+from typing import TYPE_CHECKING
+
+from xrgs.capture.failures import FAILED_PREFIX
+from xrgs.errors import StoreError, XrgsError
+from xrgs.experiment import trimming
+from xrgs.safeio.records import list_folder
+from xrgs.safeio.untrusted import is_name
+from xrgs.safeio.words import for_line
+from xrgs.sweep import locks
+from xrgs.sweep.inventory import size_of, size_text
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterable, Iterator, Sequence
+
+    from xrgs.experiment.store import Store
+    from xrgs.safeio.confined import ConfinedPath
+    from xrgs.sweep.inventory import CellSummary
+
+#: What `gc` removes, by the names that choose it.
+GARBAGE = ("old_code", "failed", "aside", "variants")
+#: What an attempt leaves that was set aside, and what is left of a removal: names in `cells/` and
+#: `variants/`. The group is the name of the lock.
+_ASIDE = re.compile(r"\.?(?P<id>[^.]+)\.aside-\d+|\.(?P<rest>[^.]+)\.new-[0-9a-f]+")
+#: A variant that was built so few seconds ago may wait for the first cell of its sweep.
+_NEW_S = 3600.0
+_RUNNING = "variants are left alone: a sweep is running, and may need any of them"
+#: The most names that a plan lists of each kind.
+_MAX_NAMED = 20
+
+
+@dataclass(frozen=True)
+class Item:
+    """One thing that is removed or trimmed."""
+
+    kind: str
+    """What it is, in the plural: `cells of old code`."""
+    name: str
+    """Its name for people."""
+    bytes: int
+    lock: str | None
+    """The name of the lock that it is done under; None where there is none to hold."""
+    act: Callable[[], str]
+    """Does it; returns why it was left, or nothing."""
+
+
+@dataclass(frozen=True)
+class Plan:
+    """What is to be removed or trimmed, and what is left alone."""
+
+    verb: str
+    """`remove` or `trim`."""
+    items: tuple[Item, ...]
+    notes: tuple[str, ...] = ()
+    """What is left alone, and what else there is to know."""
+
+    @property
+    def total(self) -> str:
+        """How much it is, for people: `12 cells of old code, 3 variants: 340 MB`."""
+        counts = Counter(item.kind for item in self.items)
+        size = size_text(sum(item.bytes for item in self.items))
+        return f"{', '.join(f'{count} {kind}' for kind, count in counts.items())}: {size}"
+
+    def __str__(self) -> str:
+        lines = [f"to {self.verb}: {self.total}" if self.items else f"nothing to {self.verb}"]
+        for kind in dict.fromkeys(item.kind for item in self.items):
+            of_kind = [item for item in self.items if item.kind == kind]
+            lines.append(f"{kind}: {size_text(sum(item.bytes for item in of_kind))}")
+            lines += [f"  {item.name}  {size_text(item.bytes)}" for item in of_kind[:_MAX_NAMED]]
+            more = len(of_kind) - _MAX_NAMED
+            lines += [f"  and {more} more"] if more > 0 else []
+        return "\n".join(map(for_line, [*lines, *self.notes]))
+
+
+def plan_removal(store: Store, cells: Sequence[CellSummary]) -> Plan:
+    """Plan to remove cells.
+
+    Args:
+        store: The store.
+        cells: The cells; those that are being trained are left alone.
+    """
+    chosen, notes = _without_running(cells)
+    return Plan("remove", tuple(_removals(store, "cells", chosen)), (*notes, *_recorded(chosen)))
+
+
+def plan_trim(
+    store: Store, cells: Sequence[CellSummary], chosen: Sequence[CellSummary], *, variants: bool
+) -> Plan:
+    """Plan to remove the Gaussians and renders of done cells, and the images of their variants.
+
+    Args:
+        store: The store.
+        cells: All cells of the store.
+        chosen: The cells to trim; those that are not done are left alone.
+        variants: Also remove the images of the chosen cells' variants, where all cells of the store
+            that use them are done, and no sweep is running.
+    """
+    done = [cell for cell in chosen if cell.state.name == "done"]
+    left = len(chosen) - len(done)
+    notes = [f"{left} cells are left alone: they are not done"] if left else []
+    items = [
+        Item("cells", cell.name, size, cell.id, partial(_trim_cell, cell))
+        for cell in done
+        if (size := _heavy_bytes(cell))
+    ]
+    if variants and any(cell.state.name == "running" for cell in cells):
+        notes.append(_RUNNING)
+    elif variants:
+        needed = {cell.variant_id for cell in cells if cell.state.name != "done"}
+        used = {cell.variant_id for cell in done if cell.variant_id is not None}
+        if kept := used & needed:
+            notes.append(f"{len(kept)} variants are left alone: cells of them are not done")
+        items += [
+            Item("variants", name, size, None, partial(_trim_variant, store, name))
+            for name in sorted(used - needed)
+            if (size := trimming.image_bytes(store.variants, name))
+        ]
+    return Plan("trim", tuple(items), tuple(notes))
+
+
+def plan_gc(store: Store, cells: Sequence[CellSummary], of: Sequence[str]) -> Plan:
+    """Plan to remove what no sweep of the installed code needs.
+
+    Args:
+        store: The store.
+        cells: All cells of the store.
+        of: Names of `GARBAGE`: cells of old code, failed tries (of cells and of scenes), folders
+            that were set aside, and variants of which no cell is left.
+
+    Raises:
+        XrgsError: A name is none of these.
+        StoreError: A folder of the store can't be listed.
+    """
+    for name in of:
+        if name not in GARBAGE:
+            raise XrgsError(f"of={name}: choose from: {', '.join(GARBAGE)}")
+    idle, _ = _without_running(cells)
+    old = [cell for cell in idle if cell.old_code] if "old_code" in of else []
+    failed = [cell for cell in idle if cell.state.name == "failed"] if "failed" in of else []
+    failed = [cell for cell in failed if cell not in old]
+    gone = {cell.id for cell in (*old, *failed)}
+    items = [*_removals(store, "cells of old code", old)]
+    items += _removals(store, "failed cells", failed)
+    if "failed" in of:
+        names = [n for n in _names(store.variants) if n.startswith(FAILED_PREFIX)]
+        items += _folders("failed scenes", store.variants, names)
+    if "aside" in of:
+        items += _aside_items(store.cells_folder, locked=True)
+        items += _aside_items(store.variants, locked=False)
+    notes = [*_recorded([cell for cell in cells if cell.id in gone])]
+    if "variants" in of:
+        found, why = _orphans(store, cells, gone)
+        items += found
+        notes += why
+    return Plan("remove", tuple(items), tuple(notes))
+
+
+def carry_out(store: Store, plan: Plan) -> tuple[int, list[str]]:
+    """Do what a plan says, each thing for itself.
+
+    Args:
+        store: The store.
+        plan: The plan.
+
+    Returns:
+        The number of bytes that were freed, and a line for each thing that was left, with the
+        reason.
+    """
+    freed, left = 0, []
+    for item in plan.items:
+        try:
+            why = _under_lock(store, item)
+        except (OSError, StoreError) as error:
+            why = str(error)
+        if why:
+            left.append(for_line(f"{item.name}: {why}"))
+        else:
+            freed += item.bytes
+    return freed, left
+
+
+def _under_lock(store: Store, item: Item) -> str:
+    if item.lock is None:
+        return item.act()
+    lock = locks.acquire(store.locks, item.lock)
+    if lock is None:
+        return "it is left: a sweep is training it"
+    try:
+        return item.act()
+    finally:
+        lock.release()
+
+
+def _without_running(cells: Iterable[CellSummary]) -> tuple[list[CellSummary], list[str]]:
+    """Return the cells that are not being trained, and a note of the others."""
+    cells = list(cells)
+    idle = [cell for cell in cells if cell.state.name != "running"]
+    running = len(cells) - len(idle)
+    return idle, [f"{running} cells are left alone: they are being trained"] if running else []
+
+
+def _recorded(cells: Sequence[CellSummary]) -> list[str]:
+    """Return a note of the done cells whose numbers reports of sweeps would lose."""
+    done = [cell for cell in cells if cell.state.name == "done" and cell.names.sweeps]
+    if not done:
+        return []
+    sweeps = {sweep_id for cell in done for sweep_id in cell.names.sweeps}
+    return [f"{len(done)} of the cells are done: {len(sweeps)} sweeps lose them from their reports"]
+
+
+def _removals(store: Store, kind: str, cells: Iterable[CellSummary]) -> Iterator[Item]:
+    for cell in cells:
+        act = partial(_remove_cell, store, cell)
+        yield Item(kind, f"{cell.name}, {cell.state.name}", cell.bytes() or 0, cell.id, act)
+
+
+def _remove_cell(store: Store, cell: CellSummary) -> str:
+    """Remove a cell whose lock is held, unless another sweep has changed it since it was looked at.
+
+    The folder of a store that was moved since is looked for in vain, and nothing is made there.
+    """
+    state = store.cell(cell.id).state(verify=False).name
+    if state == "absent":
+        return "it is no longer there"
+    if state != cell.state.name:
+        return f"it is left: it was {cell.state.name}, and is {state} now"
+    cell.folder.remove()
+    return ""
+
+
+def _heavy_bytes(cell: CellSummary) -> int:
+    try:
+        return cell.folder.heavy_bytes()
+    except OSError:
+        return 0
+
+
+def _trim_cell(cell: CellSummary) -> str:
+    cell.folder.trim()
+    return ""
+
+
+def _trim_variant(store: Store, variant_id: str) -> str:
+    trimming.trim_variant(store.variants, variant_id)
+    return ""
+
+
+def _remove_folder(folder: ConfinedPath) -> str:
+    folder.remove()
+    return ""
+
+
+def _names(folder: ConfinedPath) -> list[str]:
+    return [name for name in list_folder(folder) if is_name(name)]
+
+
+def _folders(kind: str, above: ConfinedPath, names: Iterable[str]) -> Iterator[Item]:
+    for name in names:
+        folder = above / name
+        act = partial(_remove_folder, folder)
+        yield Item(kind, f"{above.name}/{name}", size_of(folder) or 0, None, act)
+
+
+def _aside_items(above: ConfinedPath, *, locked: bool) -> Iterator[Item]:
+    """Yield the folders that were set aside; those of cells are removed under the cell's lock."""
+    for name in _names(above):
+        found = _ASIDE.fullmatch(name)
+        if found is None:
+            continue
+        lock = (found["id"] or found["rest"]) if locked else None
+        folder = above / name
+        act = partial(_remove_folder, folder)
+        shown = f"{above.name}/{name}"
+        yield Item("folders that were set aside", shown, size_of(folder) or 0, lock, act)
+
+
+def _orphans(
+    store: Store, cells: Sequence[CellSummary], gone: set[str]
+) -> tuple[list[Item], list[str]]:
+    """Return the variants of which no cell is left, and why others are left alone.
+
+    A running sweep has variants that none of its cells uses yet.
+    """
+    if any(cell.state.name == "running" for cell in cells):
+        return [], [_RUNNING]
+    used = {cell.variant_id for cell in cells if cell.id not in gone}
+    if None in used:
+        return [], ["variants are left alone: the identity of a cell can't be read"]
+    orphans, new = [], 0
+    for name in _names(store.variants):
+        if name.startswith((".", FAILED_PREFIX)) or "-" not in name:
+            continue
+        if name.removeprefix(trimming.TRIMMED_PREFIX) in used:
+            continue
+        try:
+            is_new = time.time() - (store.variants / name).lstat().st_mtime < _NEW_S
+        except OSError:
+            is_new = True
+        new += is_new
+        orphans += [] if is_new else [name]
+    notes = [f"{new} variants without a cell are left alone: they are new"] if new else []
+    return [*_folders("variants without a cell", store.variants, orphans)], notes
