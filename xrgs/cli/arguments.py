@@ -123,7 +123,32 @@ def parse(schema: type[Any], help_text: str) -> DictConfig:
         OmegaConfBaseException: An argument is not in the schema, or its value is of another type.
         SystemExit: With code 0, after the help was printed.
     """
-    if {"-h", "--help"} & set(sys.argv[1:]):
+    _help_if_asked(help_text)
+    return _of_schema(schema, sys.argv[1:])
+
+
+def parse_with_words(schema: type[Any], help_text: str) -> tuple[list[str], DictConfig]:
+    """Return the words of a command line that have no `=`, and the others as `parse` does.
+
+    Args:
+        schema: As for `parse`.
+        help_text: As for `parse`.
+
+    Raises:
+        OmegaConfBaseException: As `parse`.
+        SystemExit: As `parse`, also where there is no argument at all.
+    """
+    _help_if_asked(help_text, needed=True)
+    words = [argument for argument in sys.argv[1:] if "=" not in argument]
+    keys = [argument for argument in sys.argv[1:] if "=" in argument]
+    return words, _of_schema(schema, keys)
+
+
+def _help_if_asked(help_text: str, *, needed: bool = False) -> None:
+    if {"-h", "--help"} & set(sys.argv[1:]) or (needed and not sys.argv[1:]):
         say(help_text.rstrip())
         sys.exit()
-    return cast("DictConfig", OmegaConf.merge(OmegaConf.structured(schema), dotlist(sys.argv[1:])))
+
+
+def _of_schema(schema: type[Any], keys: Sequence[str]) -> DictConfig:
+    return cast("DictConfig", OmegaConf.merge(OmegaConf.structured(schema), dotlist(keys)))

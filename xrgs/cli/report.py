@@ -20,6 +20,10 @@ Makes the tables and figures of a sweep, from the store alone; the same store gi
   pictures=NAMES   all, none, or names of figures without their ending: trade-off,fern--plus
   against=LABEL    the label that all others are compared with; baseline by default. The report of
                    another one is in STORE/reports/ID.against-LABEL
+  external=[LABEL:]FOLDER[,...]
+                   renders of the test views by another program become one more label: FOLDER has
+                   SCENE/VIEW.png, or VIEW.png where there is one scene, as 8-bit RGB of the
+                   photograph's size
 """
 
 
@@ -37,14 +41,17 @@ class ReportConf:
     """`all`, `none`, or names of figures without their ending: `trade-off,fern--plus`."""
     against: str = BASELINE
     """The label that all others are compared with."""
+    external: str = ""
+    """Folders of other programs' renders, each with its label: `gsplat:FOLDER,other:FOLDER`."""
 
 
 def main() -> None:
     """Run `xrgs-report [KEY=VALUE]...`."""
     with errors_as_messages("xrgs-report"):
         conf = parse(ReportConf, _HELP)
-        from xrgs.report import build
+        from xrgs.report import build, external
 
         out = Path(conf.out) if conf.out else None
         pictures = {"all": None, "none": []}.get(conf.pictures, conf.pictures.split(","))
-        say(build(Path(conf.store), conf.sweep, out, pictures, conf.against).text)
+        others = external.parse(conf.external)
+        say(build(Path(conf.store), conf.sweep, out, pictures, conf.against, others).text)

@@ -170,7 +170,7 @@ class Store:
 
         if not self.exists:
             raise StoreError(f"{self.path}: no store; xrgs-sweep makes one with store={self.path}")
-        names, rows = self._names(), []
+        names, rows = self.cell_names(), []
         for cell in self.cell_folders():
             state, metrics = cell.state(verify=verify), {}
             if state.name == "done":
@@ -193,8 +193,11 @@ class Store:
         names = list_folder(self.cells_folder)
         return [self.cell(name) for name in names if "." not in name and untrusted.is_name(name)]
 
-    def _names(self) -> dict[str, dict[str, str]]:
-        """Return scene, label and condition of recorded cells by id, as the latest sweep has it."""
+    def cell_names(self) -> dict[str, dict[str, str]]:
+        """Return scene, label and condition of recorded cells by id, as the latest sweep has it.
+
+        A sweep's record that can't be read is named on stderr, and left out.
+        """
         from xrgs.experiment.results import CELL_NAMES
 
         try:

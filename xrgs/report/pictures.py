@@ -29,7 +29,7 @@ from xrgs.safeio.atomic import atomic_writer
 from xrgs.safeio.words import for_file_name
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
+    from collections.abc import Callable, Mapping, Sequence
 
     import numpy as np
     from numpy.typing import NDArray
@@ -68,6 +68,7 @@ def draw(
     quality: pd.DataFrame,
     folder: ConfinedPath,
     names: Sequence[str] | None = None,
+    external: Mapping[str, ConfinedPath] | None = None,
 ) -> list[Picture]:
     """Draw what each ablation trades, and views and training curves of each scene and ablation.
 
@@ -83,6 +84,7 @@ def draw(
         folder: The existing folder to write the files to.
         names: Names of the pictures to draw, which are file names without suffix; None draws all,
             but no more than the first 100.
+        external: Folders of renders that another program made, `Sweep.renders`.
 
     Returns:
         The pictures, in the order of the tables.
@@ -97,14 +99,20 @@ def draw(
     psnr = {cell_id: rows.set_index("view")["psnr"] for cell_id, rows in scores}
     cells = comparison.cells.drop_duplicates("cell_id").set_index("cell_id")
     drawings = _curves_of_quality(comparison, quality) | _trade_offs(comparison)
+    external = external or {}
     for _, pair in pairs.iterrows():
         both = _same_views(psnr.get(pair["base_id"]), psnr.get(pair["cell_id"]))
         cell = cells.loc[pair["cell_id"]]
         split = "train" if cell["validation"] > 0 else "test"
         photographs = store.variants / cell["variant_id"] / "images" / split
         stem = f"{for_file_name(pair['scene'])}--{for_file_name(pair['label'])}"
-        drawings[stem] = partial(_views, store, pair, comparison.base, both, photographs)
-        drawings[f"{stem}--training"] = partial(_training, store, pair, comparison.base)
+        renders = [
+            external.get(cell_id, store.cells_folder / cell_id / "renders")
+            for cell_id in (pair["base_id"], pair["cell_id"])
+        ]
+        drawings[stem] = partial(_views, pair, comparison.base, both, photographs, renders)
+        if not external.keys() & {pair["base_id"], pair["cell_id"]}:
+            drawings[f"{stem}--training"] = partial(_training, store, pair, comparison.base)
     first_ones = dict(islice(drawings.items(), _MAX_PICTURES))
     chosen = first_ones if names is None else _chosen(drawings, names)
     bar = progress(chosen.items(), "drawing", "picture", len(chosen))
@@ -214,11 +222,11 @@ def median_view(base: pd.Series, ablation: pd.Series) -> str:
 
 
 def _views(
-    store: Store,
     pair: pd.Series,
     base: str,
     psnr: tuple[pd.Series, pd.Series],
     photographs: ConfinedPath,
+    renders: Sequence[ConfinedPath],
     file: ConfinedPath,
 ) -> Picture:
     if psnr[0].empty:
@@ -227,9 +235,7 @@ def _views(
     title = f"{_title(pair)}: view {view}, by change of PSNR the median of {len(psnr[0])}"
     name = f"{view}.png"
     try:
-        truth = _image(photographs / name)
-        before = _image(store.cell(pair["base_id"]).folder / "renders" / name)
-        ablation = _image(store.cell(pair["cell_id"]).folder / "renders" / name)
+        truth, before, ablation = (_image(of / name) for of in (photographs, *renders))
     except ReportError as error:
         return Picture(title, None, str(error))
     panels = (
