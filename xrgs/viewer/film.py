@@ -162,9 +162,10 @@ def _write_film(frames: Iterable[Frame], out: Path, fps: int) -> None:
     ConfinedPath(out).make_parent()
     with atomic_writer(out) as stream, av.open(stream, "w", format="mp4") as container:
         video: Any = container.add_stream("libx264", rate=fps, options={"crf": _CRF})
-        for frame in frames:
-            video.height, video.width = frame.shape[:2]
-            video.pix_fmt = "yuv420p"  # what browsers and players show
+        video.pix_fmt = "yuv420p"  # what browsers and players show
+        for number, frame in enumerate(frames):
+            if number == 0:
+                video.height, video.width = frame.shape[:2]
             container.mux(video.encode(av.VideoFrame.from_ndarray(frame, format="rgb24")))
         container.mux(video.encode())
 

@@ -8,13 +8,13 @@ loopback interface alone.
 from __future__ import annotations
 
 import html
+import io
+import math
 import threading
 import time
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, redirect_stdout
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from typing import TYPE_CHECKING, Any
-
-import numpy as np
 
 from xrgs.capture.contact_sheet import COLOURS
 from xrgs.errors import XrgsError
@@ -28,6 +28,7 @@ if TYPE_CHECKING:
 
     from viser import CameraHandle, ClientHandle, ViserServer
 
+    from xrgs.splat.cameras import Camera
     from xrgs.viewer.models import Model
 
 HOST = "127.0.0.1"
@@ -76,8 +77,9 @@ def shown(models: Sequence[Model], port: int, limit: int) -> Iterator[str]:
         cameras, frames = _SharedCamera(), []
         for number, model in enumerate(models):
             wanted = port and port + 1 + number
-            server = viser.ViserServer(HOST, wanted, verbose=False)
-            stack.callback(server.stop)
+            with _without_banners():
+                server = viser.ViserServer(HOST, wanted, verbose=False)
+            stack.callback(_stop, server)
             _fill(server, model, reference(models), limit)
             server.on_client_connect(cameras.join)
             server.on_client_disconnect(cameras.leave)
@@ -87,6 +89,18 @@ def shown(models: Sequence[Model], port: int, limit: int) -> Iterator[str]:
         threading.Thread(target=page.serve_forever, name="xrgs-view", daemon=True).start()
         stack.callback(page.shutdown)
         yield f"http://{HOST}:{page.server_port}"
+
+
+def _stop(server: ViserServer) -> None:
+    with _without_banners():
+        server.stop()
+
+
+@contextmanager
+def _without_banners() -> Iterator[None]:
+    """Keep back what viser prints: addresses of single frames, which nobody should open."""
+    with redirect_stdout(io.StringIO()):
+        yield
 
 
 def _viser() -> Any:
@@ -166,10 +180,10 @@ def _add_cameras(server: ViserServer, world: Model) -> None:
         views = [view for view in world.views if view.kind == kind]
         parent = server.scene.add_frame(f"/{kind}", show_axes=False)
         for number, view in enumerate(views):
-            camera, K = view.camera, view.camera.K
+            camera = view.camera
             frustum = server.scene.add_camera_frustum(
                 f"/{kind}/{number}",
-                fov=2 * float(np.arctan2(camera.height / 2, K[1, 1])),
+                fov=_vertical_fov(camera),
                 aspect=camera.width / camera.height,
                 scale=_FRUSTUM_SCALE,
                 color=tuple(int(colour[at : at + 2], 16) for at in (1, 3, 5)),
@@ -185,7 +199,12 @@ def _add_cameras(server: ViserServer, world: Model) -> None:
     start = server.initial_camera
     start.position, start.up = first.position.double().numpy(), up
     start.look_at = look_at_point(world.poses)
-    start.fov = 2 * float(np.arctan2(first.height / 2, first.K[1, 1]))
+    start.fov = _vertical_fov(first)
+
+
+def _vertical_fov(camera: Camera) -> float:
+    """Return the angle from the upper to the lower edge of a camera's image, radians."""
+    return 2 * math.atan2(camera.height / 2, float(camera.K[1, 1]))
 
 
 def _go_to(event: Any) -> None:

@@ -66,7 +66,7 @@ def load_models(words: Sequence[str], store: Store) -> list[Model]:
         store: The store that has the cells.
 
     Returns:
-        The models, under different names.
+        The models, in the order of the words.
 
     Raises:
         XrgsError: There are none or too many words, a word names no finished cell, a file is
