@@ -98,7 +98,7 @@ def test_mlflow_reads_each_cell(swept: tuple[Store, str], monkeypatch: pytest.Mo
     monkeypatch.delenv("MLFLOW_TRACKING_URI", raising=False)
     for _ in range(2):  # the second time finds them
         track.track("mlflow", store, sweep_id)
-    client = MlflowClient((store.path / "tracking" / "mlflow").as_uri())
+    client = MlflowClient(f"sqlite:///{store.path}/tracking/mlflow.db")
     (experiment,) = [e for e in client.search_experiments() if e.name == "xrgs"]
     runs = {run.data.tags["cell_id"]: run for run in client.search_runs([experiment.experiment_id])}
     assert runs.keys() == {"abc", "def"}
@@ -139,6 +139,11 @@ def test_a_link_leads_nowhere(
     (store.path / "tracking").symlink_to(tmp_path / "outside")
     track.track("tensorboard", store, sweep_id)
     assert "track=tensorboard: " in capsys.readouterr().err
+    (store.path / "tracking").unlink()
+    (store.path / "tracking").mkdir()
+    (store.path / "tracking" / "mlflow.db").symlink_to(tmp_path / "outside" / "file")
+    track.track("mlflow", store, sweep_id)
+    assert "mlflow.db is not a regular file" in capsys.readouterr().err
     assert not list((tmp_path / "outside").iterdir())
 
 

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import builtins
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 import pytest
@@ -13,6 +15,22 @@ from xrgs.splat.gaussians import Gaussians
 from xrgs.splat.settings import RasterSettings
 from xrgs.viewer.models import Model, PosedView
 from xrgs.viewer.paths import Poses
+
+
+@pytest.fixture
+def without(monkeypatch: pytest.MonkeyPatch) -> Callable[[str], None]:
+    """(name) -> from now on the package of that name is as if it were not installed."""
+    real = builtins.__import__
+
+    def hide(hidden: str) -> None:
+        def imported(name: str, *others: Any) -> Any:
+            if name == hidden:
+                raise ImportError(name)
+            return real(name, *others)
+
+        monkeypatch.setattr(builtins, "__import__", imported)
+
+    return hide
 
 
 @pytest.fixture

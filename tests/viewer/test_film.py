@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import builtins
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -132,16 +131,9 @@ def test_a_ply_alone_has_no_path(model: MakeModel, tmp_path: Path) -> None:
 
 
 def test_without_pyav_the_extra_is_named(
-    model: MakeModel, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    model: MakeModel, tmp_path: Path, without: Callable[[str], None]
 ) -> None:
-    real = builtins.__import__
-
-    def without_av(name: str, *others: Any) -> Any:
-        if name == "av":
-            raise ImportError(name)
-        return real(name, *others)
-
-    monkeypatch.setattr(builtins, "__import__", without_av)
+    without("av")
     with pytest.raises(XrgsError, match=r"pip install 'xrgs\[film\]'; out=FOLDER writes PNG"):
         make_film([model()], tmp_path / "film.mp4")
     assert not list(tmp_path.iterdir())

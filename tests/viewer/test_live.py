@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import builtins
 import re
 import socket
 import urllib.request
@@ -85,17 +84,8 @@ def test_what_is_left_out_is_said(model: MakeModel) -> None:
     assert live.count_text(model(), 30) == "the 30 most opaque of 40 Gaussians (limit=30)"
 
 
-def test_without_viser_the_extra_is_named(
-    model: MakeModel, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    real = builtins.__import__
-
-    def without_viser(name: str, *others: Any) -> Any:
-        if name == "viser":
-            raise ImportError(name)
-        return real(name, *others)
-
-    monkeypatch.setattr(builtins, "__import__", without_viser)
+def test_without_viser_the_extra_is_named(without: Callable[[str], None]) -> None:
+    without("viser")
     with pytest.raises(XrgsError, match=r"pip install 'xrgs\[view\]'"), live.shown([], 0, 1):
         pass
 

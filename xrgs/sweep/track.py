@@ -36,9 +36,10 @@ FOLDER = "tracking"
 _PACKAGES = {"tensorboard": "tensorboard", "mlflow": "mlflow"}
 #: What a record of a sweep names a cell by.
 _NAMES = ("scene", "label", "condition", "variant_seed", "seed")
-#: The most metrics and parameters that MLflow takes at once, and its variable for a server.
+#: The most metrics and parameters that MLflow takes at once.
 _MAX_METRICS, _MAX_PARAMS = 1000, 100
-_SERVER = "MLFLOW_TRACKING_URI"
+#: The variable that names MLflow's server, and the name of the experiment there.
+_SERVER, _EXPERIMENT = "MLFLOW_TRACKING_URI", "xrgs"
 
 
 class Point(NamedTuple):
@@ -212,10 +213,13 @@ def _to_mlflow(runs: Iterable[Run], folder: ConfinedPath, sweep_id: str) -> str:
     from mlflow import MlflowClient
     from mlflow.entities import Metric, Param
 
-    uri = os.environ.get(_SERVER) or (folder / "mlflow").path.absolute().as_uri()
+    file = folder / "mlflow.db"
+    if file.exists() and not file.is_file():  # SQLite would follow a link out of the store
+        raise XrgsError(f"{file} is not a regular file")
+    uri = os.environ.get(_SERVER) or f"sqlite:///{file.path.absolute()}"
     client = MlflowClient(uri)
-    found = client.get_experiment_by_name("xrgs")
-    experiment = found.experiment_id if found else client.create_experiment("xrgs")
+    found = client.get_experiment_by_name(_EXPERIMENT)
+    experiment = found.experiment_id if found else client.create_experiment(_EXPERIMENT)
     for run in runs:
         tag = f"tags.cell_id = '{run.cell_id}' and attributes.status = 'FINISHED'"
         if client.search_runs([experiment], tag, max_results=1):
