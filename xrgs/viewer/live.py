@@ -144,7 +144,7 @@ class _PageHandler(BaseHTTPRequestHandler):
 def _fill(server: ViserServer, model: Model, world: Model | None, limit: int) -> None:
     """Add the splats of a model, and the cameras of the world that it is in."""
     splats = to_splats(model.gaussians, limit)
-    server.gui.configure_theme(show_share_button=False, show_logo=False)
+    server.gui.configure_theme(control_width="small", show_share_button=False, show_logo=False)
     server.scene.add_gaussian_splats(
         "/splats",
         splats.centers,

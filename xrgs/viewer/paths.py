@@ -209,7 +209,8 @@ def _look_at(position: Array, forward: Array, up: Array) -> Array:
     right = np.cross(forward, up)
     axes = np.stack([right, np.cross(forward, right), forward])
     rotation = axes / np.linalg.norm(axes, axis=1, keepdims=True)
-    return _viewmats(rotation[None], position[None])[0]
+    viewmat: Array = _viewmats(rotation[None], position[None])[0]
+    return viewmat
 
 
 def _viewmats(rotations: Array, positions: Array) -> Array:
