@@ -16,7 +16,20 @@ from xrgs.errors import XrgsError
 from xrgs.experiment.store import Store
 from xrgs.sweep import track
 
-CONFIG = {"scene": {"name": "fern"}, "train": {"steps": 20}, "seed": 3, "store": "/elsewhere"}
+CONFIG = {
+    "scene": {"name": "fern", "path": None},
+    "splat": {"raster": {"background": [0.0, 0.5, 0.0]}},
+    "train": {"steps": 20},
+    "seed": 3,
+    "store": "/elsewhere",
+}
+#: What is tracked of it: the groups that can change a number, lists and None as texts.
+SETTINGS = {
+    "scene.name": "fern",
+    "scene.path": "None",
+    "splat.raster.background": "[0.0, 0.5, 0.0]",
+    "train.steps": 20,
+}
 HISTORY = "step,view,loss,mip.sigma\n0,a,0.5,\n10,b,0.25,0.125\n"
 QUALITY = "step,seconds,psnr\n10,1.5,18.5\n"
 EXPECTED = {
@@ -109,7 +122,7 @@ def test_mlflow_reads_each_cell(swept: tuple[Store, str], monkeypatch: pytest.Mo
         for name in run.data.metrics
     }
     assert found == EXPECTED
-    assert run.data.params == {"scene.name": "fern", "train.steps": "20"}
+    assert run.data.params == {key: str(value) for key, value in SETTINGS.items()}
     assert run.data.tags["label"] == "baseline"
     assert run.info.status == "FINISHED"
 
@@ -186,4 +199,4 @@ def test_no_value_is_nan(swept: tuple[Store, str]) -> None:
     names = dict.fromkeys(track._NAMES, "x")
     run = track.run_of(store.cell("abc"), names)
     assert not any(math.isnan(point.value) for point in run.points)
-    assert run.config == {"scene.name": "fern", "train.steps": 20}
+    assert run.config == SETTINGS

@@ -128,7 +128,7 @@ def run_of(cell: CellFolder, names: Mapping[str, Any]) -> Run:
     return Run(
         cell.id,
         {key: names[key] for key in _NAMES},
-        {key: "" if value is None else value for key, value in config.items()},
+        {k: v if isinstance(v, (str, float, int)) else str(v) for k, v in config.items()},
         tuple(point for point in points if not math.isnan(point.value)),
     )
 
