@@ -94,7 +94,7 @@ def test_the_report_has_one_more_column(
 ) -> None:
     variant = frozen_variant()
     for seed in (0, 1):
-        made.add(variant=variant, seed=seed)
+        rendered(made.add(variant=variant, seed=seed).path / "renders", 30)
         made.add("consistency", variant=variant, seed=seed)
     sweep_id = made.write()
     others = (External("gsplat", rendered(tmp_path / "a")),

@@ -1,9 +1,9 @@
 """Renders of the test views that another program made, as one more label of a sweep's report.
 
 They are scored by the metrics of the frozen protocol against the photographs of the variant, and
-compared by the same statistics. They are 8-bit PNGs, and our own cells are scored as float32 images:
-the rounding costs PSNR 0.005 dB at 30 dB and 0.05 dB at 40 dB, and SSIM 0.0004 on the embedded
-scene, whose dark sky is hit most. Nothing is known of time, Gaussians and memory: these are n/a.
+compared by the same statistics. They are 8-bit PNGs, where our own cells are scored as float32
+images: the rounding costs PSNR 0.005 dB at 30 dB and 0.05 dB at 40 dB, and SSIM 0.0004 on the
+embedded scene. Nothing is known of time, Gaussians and memory: these are n/a.
 """
 
 from __future__ import annotations
