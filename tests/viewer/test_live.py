@@ -110,14 +110,14 @@ class Client:
 @pytest.fixture
 def clock(monkeypatch: pytest.MonkeyPatch) -> SimpleNamespace:
     now = SimpleNamespace(s=100.0)
-    monkeypatch.setattr(live.time, "monotonic", lambda: now.s)
+    monkeypatch.setattr("xrgs.viewer.live.time.monotonic", lambda: now.s)
     return now
 
 
 def test_the_camera_that_is_moved_moves_the_others(clock: SimpleNamespace) -> None:
     shared, clients = live._SharedCamera(), [Client(), Client()]
     for client in clients:
-        shared.join(client)  # type: ignore[arg-type]
+        shared.join(client)
     first, second = clients
     first.camera.fov = 0.5
     first.move(1.0)
@@ -129,7 +129,7 @@ def test_the_camera_that_is_moved_moves_the_others(clock: SimpleNamespace) -> No
     clock.s += 1.0
     second.move(7.0)
     assert first.camera.position[0] == 7.0
-    shared.leave(first)  # type: ignore[arg-type]
+    shared.leave(first)
     clock.s += 1.0
     second.move(8.0)
     assert first.camera.position[0] == 7.0
@@ -146,7 +146,7 @@ def test_places_are_set_together(clock: SimpleNamespace) -> None:
 
     shared, first, second = live._SharedCamera(), Client(), Client()
     second.atomic = atomic
-    shared.join(first)  # type: ignore[arg-type]
-    shared.join(second)  # type: ignore[arg-type]
+    shared.join(first)
+    shared.join(second)
     first.move(3.0)
     assert opened == ["begin", "end"]

@@ -20,7 +20,8 @@ TARGET = np.array([1.0, -2.0, 0.5])
 def looking_at(position: Array, target: Array) -> Array:
     """The viewmat of a camera with z up, by the package's own camera."""
     camera = Camera.look_at(position.tolist(), target.tolist(), width=8, height=6)
-    return camera.viewmat.double().numpy()
+    viewmat: Array = camera.viewmat.double().numpy()
+    return viewmat
 
 
 def ring(degrees: Array, radius: float = 2.0, height: float = 0.75) -> Poses:
@@ -53,8 +54,10 @@ def azimuths(viewmats: Array) -> Array:
 
 
 def test_cameras_around_a_point_look_at_it() -> None:
-    assert paths.look_at_point(ring(np.arange(0, 360, 30))) == pytest.approx(TARGET, abs=0.01)
-    assert paths.up_direction(ring(np.arange(0, 360, 30))) == pytest.approx([0, 0, 1], abs=1e-6)
+    assert paths.look_at_point(ring(np.arange(0.0, 360.0, 30.0))) == pytest.approx(TARGET, abs=0.01)
+    assert paths.up_direction(ring(np.arange(0.0, 360.0, 30.0))) == pytest.approx(
+        [0, 0, 1], abs=1e-6
+    )
 
 
 def test_parallel_cameras_look_at_the_depth_of_the_points() -> None:
@@ -66,7 +69,7 @@ def test_parallel_cameras_look_at_the_depth_of_the_points() -> None:
 
 
 def test_an_orbit_of_surrounding_cameras_is_a_closed_circle() -> None:
-    path = paths.orbit(ring(np.arange(0, 360, 30)), 12)
+    path = paths.orbit(ring(np.arange(0.0, 360.0, 30.0)), 12)
     offsets = camera_positions(path) - TARGET
     assert np.hypot(offsets[:, 0], offsets[:, 1]) == pytest.approx(2.0, abs=0.02)
     assert offsets[:, 2] == pytest.approx(0.75, abs=0.01)
@@ -126,7 +129,7 @@ def test_the_spiral_is_llffs() -> None:
 
 def test_a_spiral_needs_cameras_that_face_one_way() -> None:
     with pytest.raises(XrgsError, match=r"path=spiral: .* path=orbit"):
-        paths.spiral(ring(np.arange(0, 360, 30)), 4)
+        paths.spiral(ring(np.arange(0.0, 360.0, 30.0)), 4)
 
 
 def test_the_path_through_test_views_meets_each_of_them() -> None:

@@ -25,7 +25,7 @@ from xrgs.safeio.untrusted import is_inside
 from xrgs.safeio.words import for_file_name
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Hashable, Mapping, Sequence
     from pathlib import Path
 
     from xrgs.capture.views import View
@@ -127,7 +127,7 @@ def _with_one(sweep: Sweep, store: Store, one: External) -> Sweep:
     return replace(sweep, cells=cells, views=both, renders=renders)
 
 
-def _folder(one: External, cell: dict[str, Any], done: pd.DataFrame) -> ConfinedPath:
+def _folder(one: External, cell: Mapping[Hashable, Any], done: pd.DataFrame) -> ConfinedPath:
     """Return the folder with the renders of a cell's variant: the first of these that is there."""
     scene, draw = str(cell["scene"]), int(cell["variant_seed"])
     draws = done.loc[done["scene"] == scene, "variant_seed"].nunique()

@@ -193,7 +193,7 @@ def _write_events(run: Run, folder: str) -> None:
     from tensorboard.summary.writer.event_file_writer import EventFileWriter
 
     names = sorted({point.series for point in run.points if point.series.startswith("score/")})
-    config = run.config | dict(run.names)
+    config = {**run.config, **run.names}
     writer = EventFileWriter(folder)
     metrics = [summary_v2.Metric(name) for name in names]
     parameters = [summary_v2.HParam(name) for name in config]

@@ -157,8 +157,10 @@ def _is_like(value: object, default: object) -> bool:
             and len(value) == len(default)
             and all(map(_is_like, value, default))
         )
-    numbers = {int, float} if type(default) is float else {type(default)}
-    return type(value) in numbers and (type(value) is bool or abs(value) <= MAX_NUMBER)
+    if isinstance(default, bool) or isinstance(value, bool) or not isinstance(value, (int, float)):
+        return type(value) is type(default)
+    is_kind = isinstance(default, float) or isinstance(value, int)
+    return is_kind and abs(value) <= MAX_NUMBER
 
 
 def _load(word: str, store: Store) -> Model:
@@ -169,10 +171,10 @@ def _load(word: str, store: Store) -> Model:
     data = cell.dataset()
     train = [PosedView(view.name, view.tag, view.camera) for view in data.train]
     test = [PosedView(view.name, "test", view.camera) for view in data.test]
-    poses = Poses(
-        *(np.stack([view.camera.viewmat.double().numpy() for view in of]) for of in (train, test)),
-        data.points.double().numpy(),
-    )
+    viewmats = [
+        np.stack([view.camera.viewmat.double().numpy() for view in of]) for of in (train, test)
+    ]
+    poses = Poses(viewmats[0], viewmats[1], data.points.double().numpy())
     names = store.cell_names().get(cell.id, {})
     label = " ".join(filter(None, (names.get("label"), names.get("condition"))))
     return Model(
