@@ -29,6 +29,7 @@ FLOW = (
     "training",
     "evaluation",
     "experiment",
+    "viewer",
     "report",
     "sweep",
     "bench",
@@ -46,16 +47,22 @@ ONLY_IN = {
     "kornia": ("evaluation/metrics", "bench"),
     "gsplat": (),
     "tqdm": ("runtime/progress", "sweep/monitor"),
+    "av": ("viewer/film",),
+    "viser": ("viewer/live",),
+    "tensorboard": ("sweep/track",),
+    "mlflow": ("sweep/track",),
 }
 #: Modules that must load without torch, pycolmap, kornia, scikit-image and aiohttp: planning and
 #: reporting.
 LIGHT = (
     "capture.variant",
     "cli.data",
+    "cli.render",
     "cli.report",
     "cli.status",
     "cli.store",
     "cli.sweep",
+    "cli.view",
     "report",
     "sweep.cleaning",
     "sweep.inventory",

@@ -432,6 +432,9 @@ class Conf:
     """Whether no further cell starts after the first that fails."""
     dry_run: bool = MISSING
     """Whether the plan is printed and nothing is run."""
+    track: str = MISSING
+    """Where the history and the scores of finished cells are written beside the store's own files:
+    `none`, `csv`, `tensorboard` or `mlflow` (`xrgs.sweep.track`)."""
 
 
 def register() -> None:

@@ -145,7 +145,40 @@ def parse(schema: type[Any], help_text: str, arguments: Sequence[str] | None = N
         SystemExit: With code 0, after the help was printed.
     """
     words = sys.argv[1:] if arguments is None else arguments
-    if {"-h", "--help"} & set(words):
+    help_if_asked(help_text, words)
+    return cast("DictConfig", OmegaConf.merge(OmegaConf.structured(schema), dotlist(words)))
+
+
+def parse_with_words(
+    schema: type[Any], help_text: str, arguments: Sequence[str] | None = None
+) -> tuple[list[str], DictConfig]:
+    """Return the words of a command line that have no `=`, and the others as `parse` does.
+
+    Args:
+        schema: As for `parse`.
+        help_text: As for `parse`.
+        arguments: As for `parse`.
+
+    Raises:
+        OmegaConfBaseException: As `parse`.
+        SystemExit: As `parse`, also where the command line has no argument at all.
+    """
+    given = sys.argv[1:] if arguments is None else arguments
+    help_if_asked(help_text, sys.argv[1:] or ["--help"])
+    words = [argument for argument in given if "=" not in argument]
+    return words, parse(schema, help_text, [key for key in given if "=" in key])
+
+
+def help_if_asked(help_text: str, arguments: Sequence[str]) -> None:
+    """Print the help and end the command if a command line asks for it.
+
+    Args:
+        help_text: The help.
+        arguments: The command line.
+
+    Raises:
+        SystemExit: With code 0, after the help was printed.
+    """
+    if {"-h", "--help"} & set(arguments):
         say(help_text.rstrip())
         sys.exit()
-    return cast("DictConfig", OmegaConf.merge(OmegaConf.structured(schema), dotlist(words)))

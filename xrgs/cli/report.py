@@ -28,6 +28,10 @@ Of a sweep that runs or was stopped, they have the cells that are done.
                    none leaves the pictures of report.html out too
   against=LABEL    the label that all others are compared with; baseline by default. The report of
                    another one is in STORE/reports/ID.against-LABEL
+  external=[LABEL:]FOLDER[,...]
+                   renders of the test views by another program become one more label: FOLDER has
+                   SCENE/VIEW.png, or VIEW.png where there is one scene, as 8-bit RGB of the
+                   photograph's size
 
 xrgs-report list [store=FOLDER]
 
@@ -53,6 +57,8 @@ class ReportConf:
     """`all`, `none`, or names of figures without their ending: `trade-off,fern--plus`."""
     against: str = BASELINE
     """The label that all others are compared with."""
+    external: str = ""
+    """Folders of other programs' renders, each with its label: `gsplat:FOLDER,other:FOLDER`."""
 
 
 @dataclass
@@ -73,10 +79,11 @@ def main() -> None:
             say(list_sweeps(Path(listed.store)))
             return
         conf = parse(ReportConf, _HELP)
-        from xrgs.report import Choice, build
+        from xrgs.report import Choice, build, external
 
         out = Path(conf.out) if conf.out else None
         pictures = {"all": None, "none": []}.get(conf.pictures, conf.pictures.split(","))
         choice = Choice(names_in(conf.scenes), names_in(conf.ablations))
         sweeps = names_in(conf.sweep or "") or None
-        say(build(paths_in(conf.store), sweeps, out, pictures, conf.against, choice).text)
+        others = external.parse(conf.external)
+        say(build(paths_in(conf.store), sweeps, out, pictures, conf.against, choice, others).text)

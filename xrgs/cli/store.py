@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from xrgs.cli.arguments import errors_as_messages, names_in, parse
+from xrgs.cli.arguments import errors_as_messages, help_if_asked, names_in, parse_with_words
 from xrgs.errors import XrgsError
 from xrgs.experiment.store import Store
 from xrgs.runtime.signals import exit_on_signal
@@ -106,19 +106,16 @@ class StoreConf:
 
 def main() -> None:
     """Run `xrgs-store COMMAND [CELL]... [KEY=VALUE]...`."""
-    arguments = sys.argv[1:]
-    if not arguments or {"-h", "--help"} & set(arguments):
-        say(_HELP.rstrip())
-        sys.exit()
-    command, cells = arguments[0], [word for word in arguments[1:] if "=" not in word]
-    values = [word for word in arguments[1:] if "=" in word]
+    help_if_asked(_HELP, sys.argv[1:] or ["--help"])
+    command = sys.argv[1]
     with errors_as_messages("xrgs-store"):
         if command not in _COMMANDS:
             known = ", ".join(_COMMANDS)
             raise XrgsError(f"{command}: there is no such command; choose from: {known}")
         schema, run = _COMMANDS[command]
         with exit_on_signal("What was not removed yet is unchanged."):
-            run(parse(schema, _HELP, values), cells)
+            words, conf = parse_with_words(schema, _HELP, sys.argv[2:])
+            run(conf, words)
 
 
 def _list(conf: DictConfig, words: Sequence[str]) -> None:

@@ -39,6 +39,8 @@ _MAX_NAME = 2000
 #: Bytes that must be writable before a sweep starts; any cell needs more than that.
 _MIN_FREE_BYTES = 1 << 15
 _MAX_SEED = (1 << 63) - 1
+#: The most ids of cells that a message lists.
+_MAX_LISTED = 6
 
 
 @dataclass(frozen=True)
@@ -183,7 +185,7 @@ class Store:
 
         if not self.exists:
             raise StoreError(f"{self.path}: no store; xrgs-sweep makes one with store={self.path}")
-        names, rows = self._names(), []
+        names, rows = self.cell_names(), []
         for cell in self.cell_folders():
             state, metrics = cell.state(verify=verify), {}
             if state.name == "done":
@@ -194,6 +196,19 @@ class Store:
             row: dict[str, Any] = cell_columns(cell.folder, names.get(cell.id, {}))
             rows.append(row | metrics | {"state": state.name, "reason": for_line(state.reason)})
         return cells_table(rows)
+
+    def find_cell(self, beginning: str) -> CellFolder:
+        """Return the cell whose id begins with a text.
+
+        Args:
+            beginning: The id, or so much of it that it is that of one cell.
+
+        Raises:
+            StoreError: There is no store, no id begins with it, or several do.
+        """
+        if not self.exists:
+            raise StoreError(f"store={self.path} is not a store; xrgs-sweep makes one")
+        return self.cell(full_id(beginning, [cell.id for cell in self.cell_folders()]))
 
     def cell_folders(self) -> list[CellFolder]:
         """Return the cells, sorted by id; folders of earlier attempts, whose names have a dot, not.
@@ -206,8 +221,11 @@ class Store:
         names = list_folder(self.cells_folder)
         return [self.cell(name) for name in names if "." not in name and untrusted.is_name(name)]
 
-    def _names(self) -> dict[str, dict[str, str]]:
-        """Return scene, label and condition of recorded cells by id, as the latest sweep has it."""
+    def cell_names(self) -> dict[str, dict[str, str]]:
+        """Return scene, label and condition of recorded cells by id, as the latest sweep has it.
+
+        A sweep's record that can't be read is named on stderr, and left out.
+        """
         from xrgs.experiment.results import CELL_NAMES
 
         try:
@@ -381,3 +399,21 @@ def _is_row(row: object) -> bool:
         and all(one is None or untrusted.is_name(one) for one in ids)
         and all(type(seed) is int and 0 <= seed <= _MAX_SEED for seed in seeds)
     )
+
+
+def full_id(beginning: str, ids: Sequence[str]) -> str:
+    """Return the id that begins with a text.
+
+    Args:
+        beginning: The id, or so much of it that it is the only one.
+        ids: The ids of all cells.
+
+    Raises:
+        StoreError: No id begins with it, or several do.
+    """
+    found = [cell_id for cell_id in ids if cell_id.startswith(beginning)]
+    if beginning not in found and len(found) != 1:
+        some = ", ".join([*found[:_MAX_LISTED], *["..."] * (len(found) > _MAX_LISTED)])
+        why = f"several cells have such an id: {some}" if found else "no cell has such an id"
+        raise StoreError(f"{beginning}: {why}; xrgs-store list shows them")
+    return beginning if beginning in found else found[0]

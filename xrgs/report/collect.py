@@ -25,6 +25,7 @@ if TYPE_CHECKING:
 
     from xrgs.evaluation.metrics import Metric
     from xrgs.experiment.cell_folder import CellFolder
+    from xrgs.safeio.confined import ConfinedPath
 
 #: Keys of each row of a sweep's record.
 RECORD_KEYS = (
@@ -73,6 +74,9 @@ class Sweep:
     """What each done cell did in all, by its id: `xrgs.report.skipped.cell_work`."""
     provenance: dict[str, list[str]]
     """Provenance of the done cells: the distinct values of each entry, sorted."""
+    renders: dict[str, ConfinedPath] = field(default_factory=dict)
+    """Folders of renders that another program made, by the ids of their rows, which are no cells
+    of the store (`xrgs.report.external`)."""
 
     @property
     def id(self) -> str:
@@ -124,7 +128,7 @@ def read_cells(
     columns = {cell_id: cell.columns for cell_id, cell in cells.items()}
     return Sweep(
         commands=commands,
-        cells=_cells(sweep_id, entries, columns, _cell_means(views), metrics),
+        cells=_cells(sweep_id, entries, columns, cell_means(views), metrics),
         views=views,
         training={cell_id: cell.training for cell_id, cell in cells.items()},
         work={cell_id: cell.work for cell_id, cell in cells.items()},
@@ -213,8 +217,15 @@ def _views(scores: list[dict[str, Any]], metrics: Sequence[Metric]) -> pd.DataFr
     return views.astype({"cell_id": object, "view": object} | dict.fromkeys(names, np.float64))
 
 
-def _cell_means(views: pd.DataFrame) -> pd.DataFrame:
-    """Return the mean of each score over a cell's views, NaN where one view lacks the score."""
+def cell_means(views: pd.DataFrame) -> pd.DataFrame:
+    """Return the mean of each score over a cell's views, NaN where one view lacks the score.
+
+    Args:
+        views: The table `Sweep.views`.
+
+    Returns:
+        One row a cell, indexed by its id, with a column for each score.
+    """
     grouped = views.drop(columns="view").groupby("cell_id")
     means: pd.DataFrame = grouped.mean()
     return means.mask(grouped.count().lt(grouped.size(), axis=0))

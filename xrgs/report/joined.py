@@ -6,7 +6,7 @@ report needs the rows of all records, and finds each cell in the store where it 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, TypeVar
 
 from xrgs.errors import StoreError
@@ -16,7 +16,7 @@ from xrgs.safeio.confined import ConfinedPath
 from xrgs.safeio.words import for_file_name
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Sequence
+    from collections.abc import Callable, Iterable, Mapping, Sequence
 
     from xrgs.experiment.cell_folder import CellFolder
     from xrgs.experiment.store import Store
@@ -80,6 +80,8 @@ class JoinedStore:
 
     stores: tuple[Store, ...]
     """The stores; of a cell that several have done, the first counts."""
+    external: Mapping[str, ConfinedPath] = field(default_factory=dict)
+    """Folders of renders that another program made, `Sweep.renders`."""
 
     def cell(self, cell_id: str) -> CellFolder:
         """Return the folder of a cell, in the store where it is done if there is one.
@@ -103,6 +105,22 @@ class JoinedStore:
         """
         folders = [store.variant(variant_id) for store in self.stores]
         return _first(folders, ConfinedPath.is_dir)
+
+    def render(self, cell_id: str, view: str) -> ConfinedPath:
+        """Return the file of the render of a view, which need not exist.
+
+        Args:
+            cell_id: The id of a cell, or of a row of another program's renders.
+            view: The name of the view.
+
+        Raises:
+            StoreError: The cell's renders were removed on purpose, or its id is not a valid name.
+        """
+        if cell_id in self.external:
+            return self.external[cell_id] / f"{view}.png"
+        cell, name = self.cell(cell_id), f"renders/{view}.png"
+        cell.check_not_trimmed(name)
+        return cell.folder / name
 
     def latest_sweeps(self) -> tuple[str, ...]:
         """Return the id of each store's latest sweep, without repetitions.

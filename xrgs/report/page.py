@@ -13,6 +13,7 @@ from xrgs.experiment.store import BASELINE, Store
 from xrgs.report import curves, skipped
 from xrgs.report.collect import RECORD_KEYS, ReportError, Sweep, read_cells
 from xrgs.report.compare import compare
+from xrgs.report.external import with_external
 from xrgs.report.gap import gap_tables
 from xrgs.report.html import write_document
 from xrgs.report.joined import Choice, JoinedStore, report_name
@@ -30,7 +31,7 @@ if TYPE_CHECKING:
 
     import pandas as pd
 
-    from xrgs.report.compare import Comparison
+    from xrgs.report.external import External
 
 #: What a row of views.csv names its cell by.
 _VIEW_KEYS = ["cell_id", "scene", "label", "condition", "variant_seed", "seed"]
@@ -71,6 +72,8 @@ class Report:
 class Runs:
     """What the report says of the trainings themselves, beside their results."""
 
+    labels: dict[str, list[str]]
+    """The labels of each condition's cells, in the sweep's order."""
     training: pd.DataFrame
     """What training did in each cell: `xrgs.report.training.totals`."""
     curves: pd.DataFrame
@@ -83,24 +86,24 @@ class Runs:
     @classmethod
     def of(cls, sweep: Sweep, cells: pd.DataFrame) -> Runs:
         """Gather the tables of a sweep whose compared cells are these."""
+        cells = cells[~cells["cell_id"].isin(sweep.renders)]  # nothing is known of other programs
+        labels = cells.groupby("condition", sort=False)["label"].unique()
         return cls(
+            {str(name): list(of) for name, of in labels.items()},
             totals(cells, sweep.training),
             curves.joined(cells, sweep.curves),
             curves.times(cells, sweep.curves),
             skipped.skipped(cells, sweep.work),
         )
 
-    def tables(self, comparison: Comparison) -> list[TextTable]:
+    def tables(self, base: str) -> list[TextTable]:
         """Return the tables of each condition, time to quality first."""
-        base = comparison.base
-        labels = comparison.cells.groupby("condition", sort=False)["label"].unique()
-        by_condition = [(str(name), list(of)) for name, of in labels.items()]
         kinds = (
             (partial(curves.table, base=base), self.times),
             (partial(skipped.table, base=base), self.skipped),
             (training_table, self.training),
         )
-        return [make(found, of, name) for make, found in kinds for name, of in by_condition]
+        return [make(found, of, name) for make, found in kinds for name, of in self.labels.items()]
 
 
 def build(
@@ -110,6 +113,7 @@ def build(
     pictures: Sequence[str] | None = None,
     against: str = BASELINE,
     choice: Choice = _EVERYTHING,
+    externals: Sequence[External] = (),
 ) -> Report:
     """Write the tables, scores and figures of a sweep, or of several that are joined.
 
@@ -123,6 +127,8 @@ def build(
         pictures: Names of the pictures to draw, as of `draw`; None draws all.
         against: The label that all others are compared with.
         choice: Which scenes and ablations of the sweeps the report has.
+        externals: Renders of other programs, each of which becomes one more label. The default
+            folder's name then ends with `.with-<label>` for each.
 
     Returns:
         The report: its text and its files.
@@ -140,10 +146,13 @@ def build(
     record = store.sweep_record(ids)
     rows = choice.rows(record["cells"], against)
     sweep = read_cells(store, record["commands"], rows, METRICS)
+    sweep = with_external(sweep, store, externals)
+    store = replace(store, external=sweep.renders)
     comparison = compare(sweep.cells, METRICS, against)
     tables = Tables(comparison)
     name = report_name(ids) + choice.suffix
     name += "" if against == BASELINE else f".against-{for_file_name(against)}"
+    name += "".join(f".with-{for_file_name(one.label)}" for one in externals)
     folder = ConfinedPath(out) if out else store.stores[0].reports / name
     try:
         if out:
@@ -158,7 +167,7 @@ def build(
             store,
             sweep,
             tables,
-            [*_all_tables(tables), *runs.tables(comparison), _provenance_table(sweep)],
+            [*_all_tables(tables), *runs.tables(comparison.base), _provenance_table(sweep)],
             runs.curves,
             _warnings(sweep),
             pictures=pictures is None or bool(pictures),
@@ -263,7 +272,7 @@ def _markdown_page(
         *(_command_line(sweep_id, command) for sweep_id, command in sweep.commands.items()),
         *(f"**{for_markdown(line)}**\n" for line in _warnings(sweep)),
         *(to_markdown(table) for table in _all_tables(tables) if table.rows),
-        *(to_markdown(table) for table in runs.tables(tables.comparison) if table.rows),
+        *(to_markdown(table) for table in runs.tables(tables.comparison.base) if table.rows),
         *(_picture_link(picture, folder) for picture in pictures),
         to_markdown(_provenance_table(sweep)),
     ]
@@ -295,6 +304,11 @@ def _warnings(sweep: Sweep) -> list[str]:
             f"{pending} of {len(states)} cells are not done yet: the same xrgs-sweep command trains"
             " them, and the tables are of those that are done."
         )
+    if others := ", ".join(_other_programs(sweep)):
+        warnings.append(
+            f"Renders of another program: {others}. Their PNGs are scored, and compared with the"
+            " cells of the lowest seed; of time, Gaussians and memory nothing is known."
+        )
     unknown = sweep.cells.loc[sweep.cells["state"] == "unknown", "cell_id"].nunique()
     if unknown:
         warnings.append(f"{unknown} cells can't be read now: run the report again.")
@@ -316,6 +330,12 @@ def _warnings(sweep: Sweep) -> list[str]:
             " what is compared, they differ as cells of different seeds do."
         )
     return warnings
+
+
+def _other_programs(sweep: Sweep) -> list[str]:
+    """Return the labels of renders that another program made."""
+    rows = sweep.cells[sweep.cells["cell_id"].isin(sweep.renders)]
+    return list(dict.fromkeys(rows["label"]))
 
 
 def _text(tables: Tables, warnings: list[str]) -> str:

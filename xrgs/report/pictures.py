@@ -105,7 +105,8 @@ def draw(
         photographs = store.variant(cell["variant_id"]) / "images" / split
         stem = f"{for_file_name(pair['scene'])}--{for_file_name(pair['label'])}"
         drawings[stem] = partial(_views, store, pair, comparison.base, both, photographs)
-        drawings[f"{stem}--training"] = partial(_training, store, pair, comparison.base)
+        if not store.external.keys() & {pair["base_id"], pair["cell_id"]}:
+            drawings[f"{stem}--training"] = partial(_training, store, pair, comparison.base)
     first_ones = dict(islice(drawings.items(), _MAX_PICTURES))
     chosen = first_ones if names is None else _chosen(drawings, names)
     bar = progress(chosen.items(), "drawing", "picture", len(chosen))
@@ -228,10 +229,10 @@ def _views(
     title = f"{_title(pair)}: view {view}, by change of PSNR the median of {len(psnr[0])}"
     name = f"{view}.png"
     try:
-        _check_not_trimmed(store, pair, photographs.parent.parent.name, f"renders/{name}")
+        check_images(photographs.parent.parent.parent, photographs.parent.parent.name)
         truth = _image(photographs / name)
-        before = _image(store.cell(pair["base_id"]).folder / "renders" / name)
-        ablation = _image(store.cell(pair["cell_id"]).folder / "renders" / name)
+        before = _image(store.render(pair["base_id"], view))
+        ablation = _image(store.render(pair["cell_id"], view))
     except (ReportError, StoreError) as error:
         return Picture(title, None, str(error))
     panels = (
@@ -263,17 +264,6 @@ def _training(store: JoinedStore, pair: pd.Series, base: str, file: ConfinedPath
 def _title(pair: pd.Series) -> str:
     parts = (pair["scene"], pair["label"], pair["condition"], f"seed {pair['seed']}")
     return ", ".join(str(part) for part in parts if part)
-
-
-def _check_not_trimmed(store: JoinedStore, pair: pd.Series, variant_id: str, render: str) -> None:
-    """Refuse a picture whose images were removed on purpose.
-
-    Raises:
-        StoreError: They were; the message says which.
-    """
-    for key in ("base_id", "cell_id"):
-        store.cell(pair[key]).check_not_trimmed(render)
-    check_images(store.variant(variant_id).parent, variant_id)
 
 
 def _image(file: ConfinedPath) -> NDArray[np.float32]:

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 from xrgs.errors import StoreError, XrgsError
 from xrgs.experiment.identity import training_code
-from xrgs.experiment.store import Store
+from xrgs.experiment.store import Store, full_id
 from xrgs.report.render import TextTable, to_text
 from xrgs.runtime.progress import log_line
 from xrgs.safeio.records import read_json
@@ -265,15 +265,10 @@ def one_cell(beginning: str, cells: Sequence[CellSummary]) -> CellSummary:
         cells: All cells.
 
     Raises:
-        XrgsError: No id begins with it, or several do.
+        StoreError: No id begins with it, or several do.
     """
-    found = [cell for cell in cells if cell.id.startswith(beginning)]
-    exact = [cell for cell in found if cell.id == beginning]
-    if len(exact or found) != 1:
-        many = ", ".join(cell.id for cell in found[:_MAX_LISTED])
-        why = f"several cells have such an id: {many}" if found else "no cell has such an id"
-        raise XrgsError(f"{beginning}: {why}; xrgs-store list shows them")
-    return (exact or found)[0]
+    by_id = {cell.id: cell for cell in cells}
+    return by_id[full_id(beginning, [*by_id])]
 
 
 def file_bytes(path: ConfinedPath) -> int:

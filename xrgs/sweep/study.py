@@ -32,7 +32,7 @@ from xrgs.runtime.streams import say
 from xrgs.safeio.confined import is_passing
 from xrgs.safeio.hashing import digest, to_plain
 from xrgs.safeio.words import for_line
-from xrgs.sweep import controls, launch, locks, presence, variants
+from xrgs.sweep import controls, launch, locks, presence, track, variants
 from xrgs.sweep.axes import CellSpec, expand
 from xrgs.sweep.estimate import RuntimeEstimator
 from xrgs.sweep.jobs import worker
@@ -118,6 +118,7 @@ class Study:
         """Return whether every cell is done, or the run was a dry one."""
         launch.check(self._config)
         plan = self._plan(arguments)
+        track.check(plan[0].conf.track)
         store = Store(Path(plan[0].conf.store))
         dry_run = plan[0].conf.dry_run
         if not dry_run:
@@ -147,6 +148,7 @@ class Study:
         from xrgs.report import build
 
         say(build(store.path, sweep_id).text)
+        track.track(plan[0].conf.track, store, sweep_id)
         return all(cell.error is None and cell.state.name == "done" for cell in plan)
 
     def _run_until_complete(

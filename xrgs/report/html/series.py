@@ -55,7 +55,7 @@ def add_history(content: Content, store: JoinedStore, comparison: Comparison) ->
         comparison: The comparison of the cells.
     """
     for rows in runs(comparison):
-        for _, row in rows.iterrows():
+        for _, row in rows[~rows["cell_id"].isin(store.external)].iterrows():
             try:
                 columns = _history(store.cell(row["cell_id"]))
             except (StoreError, ValueError) as error:

@@ -113,7 +113,8 @@ def context(
         variants: The variants of the cells that can be read, by their ids.
     """
     cells = comparison.cells
-    done = cells[cells["state"] == "done"].drop_duplicates("cell_id")
+    own = cells[(cells["state"] == "done") & ~cells["cell_id"].isin(store.external)]
+    done = own.drop_duplicates("cell_id")
     replicates = done.drop_duplicates(["variant_seed", "seed"])
     rows = [
         ("Compared with", shown(comparison.base)),

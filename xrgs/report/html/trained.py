@@ -22,6 +22,7 @@ from xrgs.splat.attribution import attribute_pixels
 from xrgs.splat.backend import resolve_backend
 from xrgs.splat.rasterize import rasterize_parameters
 from xrgs.splat.sh import C0
+from xrgs.viewer.models import raster_settings
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -138,7 +139,8 @@ class _Adder:
         data = dataset.load(variant, "mixed")
         names = run_names(rows.iloc[0])
         self.content.cameras.append(names | {"cameras": [*_cameras(data)]})
-        models = [model for _, row in rows.iterrows() if (model := self._load(row)) is not None]
+        own = rows[~rows["cell_id"].isin(self.store.external)]
+        models = [model for _, row in own.iterrows() if (model := self._load(row)) is not None]
         self._add_training(names, models, variant, data, album)
         for model in models[: self.models_left]:
             self.content.models.append(names | self._quantised(model, data.train))
@@ -148,14 +150,14 @@ class _Adder:
         """Load the Gaussians of a cell; None, and a note, where they can't be read."""
         cell, label = self.store.cell(row["cell_id"]), shown(row["label"])
         try:
-            splat, gaussians = cell.config().splat, cell.gaussians()
+            raster, gaussians = raster_settings(cell), cell.gaussians()
         except (XrgsError, OSError) as error:
             self.content.notes.append(
                 f"{shown(row['scene'])}, {label}: no training views and no model,"
                 f" {why(error, self.store)}"
             )
             return None
-        backend = resolve_backend(splat.backend)
+        backend = resolve_backend("auto")
         with torch.no_grad():
             activated = gaussians.activated(backend=backend)
         if not all(bool(torch.isfinite(values).all()) for values in activated):
@@ -164,7 +166,7 @@ class _Adder:
                 " have scales that are not finite"
             )
             return None
-        return _Model(label, activated, splat.raster, backend)
+        return _Model(label, activated, raster, backend)
 
     def _add_training(
         self,

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 from xrgs.capture import images
 from xrgs.capture.images import ImageError
-from xrgs.errors import UnreadableError
+from xrgs.errors import StoreError, UnreadableError
 from xrgs.evaluation.metrics import VIEW_METRICS
 from xrgs.report.html.album import Album, error_map
 from xrgs.report.html.content import finite, run_names, runs, shown, why
@@ -79,19 +79,17 @@ def _title(entry: dict[str, Any]) -> str:
     return ", ".join(filter(None, (entry[key] for key in ("scene", "condition", "view"))))
 
 
-def _files(store: JoinedStore, cells: pd.DataFrame, view: str) -> list[ConfinedPath]:
-    """Return the files of the photograph and of the render of each cell."""
+def _photograph(store: JoinedStore, cells: pd.DataFrame, view: str) -> ConfinedPath:
+    """Return the file of the photograph of a view that cells are scored on."""
     first = cells.iloc[0]
     split = "train" if first["validation"] > 0 else "test"
-    photograph = store.variant(first["variant_id"]) / "images" / split / f"{view}.png"
-    renders = (store.cell(name).folder / "renders" / f"{view}.png" for name in cells["cell_id"])
-    return [photograph, *renders]
+    return store.variant(first["variant_id"]) / "images" / split / f"{view}.png"
 
 
 def _pixels(store: JoinedStore, cells: pd.DataFrame, view: str) -> int:
     """Return the number of pixels of a view's images, 0 where its photograph can't be read."""
     try:
-        width, height = images.size(_files(store, cells, view)[0])
+        width, height = images.size(_photograph(store, cells, view))
     except (UnreadableError, ImageError):
         return 0
     return width * height * (1 + len(cells))
@@ -113,17 +111,17 @@ def _read(
     What can't be read, or is not of the photograph's size, is left out and noted. Without a
     photograph there is nothing to show.
     """
-    photograph, *renders = _files(store, cells, view)
     found: dict[int, Image.Image] = {}
     try:
-        truth = images.read_png_pil(photograph, max_pixels=_MAX_PIXELS)
+        truth = images.read_png_pil(_photograph(store, cells, view), max_pixels=_MAX_PIXELS)
     except (UnreadableError, ImageError) as error:
         content.notes.append(f"{title}: no photograph, {why(error, store)}")
         return None
-    for place, file in enumerate(renders):
+    for place, cell_id in enumerate(cells["cell_id"]):
         try:
+            file = store.render(cell_id, view)
             found[place] = images.read_png_pil(file, truth.size, _MAX_PIXELS)
-        except (UnreadableError, ImageError) as error:
+        except (StoreError, ImageError) as error:
             label = shown(cells["label"].iloc[place])
             content.notes.append(f"{title}: no render of {label}, {why(error, store)}")
     return truth, found

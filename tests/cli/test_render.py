@@ -1,0 +1,58 @@
+"""`xrgs-render` from the command line, on cells of a real sweep."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from xrgs.experiment.store import Store
+
+RunCommand = Callable[..., tuple[int, str, str]]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["path=orbit"], "give one cell or 2"),
+        (["abc"], "store=xrgs-store: there is no store"),
+        (["abc", "size=504"], "size=504: must be WIDTHxHEIGHT, as 504x378"),
+        (["abc", "views=many"], "views"),
+        (["abc", "pth=orbit"], "pth"),
+    ],
+    ids=" ".join,
+)
+def test_bad_input_is_named(call_command: RunCommand, arguments: list[str], message: str) -> None:
+    code, out, err = call_command("render", *arguments)
+    assert (code, out) == (1, "")
+    assert err.startswith("xrgs-render: ")
+    assert message in err
+
+
+@pytest.mark.slow
+def test_frames_at_the_test_views_are_the_renders_that_were_scored(
+    run_command: RunCommand, store: Path
+) -> None:
+    cells = Store(store).cells(verify=False).set_index("label")["cell_id"]
+    for label, cell_id in cells.items():
+        renders = sorted((store / "cells" / cell_id / "renders").iterdir())
+        code, out, err = run_command(
+            *("render", store.parent, cell_id[:10], "store=s", "path=test"),
+            *(f"views={len(renders)}", f"out={label}"),
+        )
+        assert code == 0, err
+        assert out.startswith(f"{label}: {len(renders)} frames of ")
+        frames = sorted((store.parent / str(label)).iterdir())
+        for frame, render in zip(frames, renders, strict=True):
+            found, expected = (np.asarray(Image.open(f)).astype(int) for f in (frame, render))
+            height, width = found.shape[:2]
+            assert np.abs(found - expected[:height, :width]).max() <= 1
+            assert (found == expected[:height, :width]).mean() > 0.999
+    code, out, err = run_command(
+        "render", store.parent, *cells, "store=s", "views=3", "size=64x48", "out=both.mp4"
+    )
+    assert code == 0, err
+    assert out == "both.mp4: 3 frames of 128 x 48 px, 0.1 s\n"

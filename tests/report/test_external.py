@@ -1,0 +1,209 @@
+"""Another program's renders: their scores against scikit-image, and what is refused."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import pytest
+from numpy.typing import NDArray
+from PIL import Image
+from skimage.metrics import peak_signal_noise_ratio
+
+from xrgs.capture import frozen
+from xrgs.capture.views import Variant, View
+from xrgs.report import build
+from xrgs.report.collect import ReportError
+from xrgs.report.external import External, parse, with_external
+from xrgs.report.joined import JoinedStore
+from xrgs.safeio.confined import ConfinedPath
+
+SIZE = (32, 24)
+VIEWS = ("IMG_001", "IMG_009")
+MakeStore = Any  # MadeStore of conftest.py
+
+
+def save(file: Path, pixels: NDArray[np.uint8]) -> None:
+    file.parent.mkdir(parents=True, exist_ok=True)
+    Image.fromarray(pixels).save(file)
+
+
+def noise(seed: int, size: tuple[int, int] = SIZE) -> NDArray[np.uint8]:
+    shape = (size[1], size[0], 3)
+    return np.random.default_rng(seed).integers(0, 256, shape).astype(np.uint8)
+
+
+@pytest.fixture
+def frozen_variant(made: MakeStore) -> Callable[[int], str]:
+    """(draw) -> the id of a real variant in the store, with the test views of the made-up cells."""
+
+    def make(draw: int = 0) -> str:
+        folder = ConfinedPath(made.store.path) / "variants" / f".made-{draw}"
+        views = []
+        for number, (split, name) in enumerate([("train", "a"), *(("test", v) for v in VIEWS)]):
+            save(folder.path / "images" / split / f"{name}.png", noise(number))
+            file = folder / f"images/{split}/{name}.png"
+            K = np.array([[30.0 + draw, 0, 16], [0, 30, 12], [0, 0, 1]])
+            views.append(View(name, file, split, "HR", *SIZE, K, np.eye(4), 1.0))
+        points = np.random.default_rng(0).normal(size=(5, 3))
+        colors = np.zeros((5, 3), np.uint8)
+        variant = Variant("", folder, "fern", 5, True, tuple(views), points, colors, {})
+        return frozen.freeze(variant, f"{draw:016x}", folder, made.store.variants).id
+
+    return make
+
+
+def rendered(folder: Path, offset: int = 10) -> Path:
+    """Renders of the two test views: the photographs, each value changed by so much."""
+    for number, view in enumerate(VIEWS, start=1):
+        pixels = noise(number).astype(int)
+        changed = np.where(pixels > 127, pixels - offset, pixels + offset)
+        save(folder / f"{view}.png", changed.astype(np.uint8))
+    return folder
+
+
+@pytest.mark.parametrize("inside", ["", "fern", "fern/0"])
+def test_renders_are_scored_against_the_photographs(
+    made: MakeStore, frozen_variant: Callable[..., str], tmp_path: Path, inside: str
+) -> None:
+    variant = frozen_variant()
+    made.add(variant=variant)
+    made.add("consistency", variant=variant, factors={"psnr": 1.1})
+    sweep = made.read()
+    other = External("gsplat", tmp_path / "renders")
+    rendered(other.folder / inside)
+    joined = with_external(sweep, JoinedStore((made.store,)), [other])
+    row = joined.cells.iloc[-1]
+    assert list(joined.cells["label"]) == ["baseline", "consistency", "gsplat"]
+    assert (row["scene"], row["state"], row["variant_id"]) == ("fern", "done", variant)
+    views = joined.views[joined.views["cell_id"] == row["cell_id"]].set_index("view")
+    for number, view in enumerate(VIEWS, start=1):
+        render = np.asarray(Image.open(other.folder / inside / f"{view}.png"))
+        expected = peak_signal_noise_ratio(noise(number), render, data_range=255)
+        assert views.loc[view, "psnr"] == pytest.approx(expected, rel=1e-6)
+    assert row["psnr"] == pytest.approx(views["psnr"].mean())
+    assert pd.isna(row[["training_time_s", "gaussians", "lpips"]]).all()
+
+
+def test_the_report_has_one_more_column(
+    made: MakeStore, frozen_variant: Callable[..., str], tmp_path: Path
+) -> None:
+    variant = frozen_variant()
+    for seed in (0, 1):
+        rendered(made.add(variant=variant, seed=seed).path / "renders", 30)
+        made.add("consistency", variant=variant, seed=seed)
+    sweep_id = made.write()
+    others = (External("gsplat", rendered(tmp_path / "a")),
+              External("b", rendered(tmp_path / "c", 40)))  # fmt: skip
+    report = build(made.store.path, sweep_id, None, ["fern--gsplat"], externals=others)
+    assert report.folder.name == f"{sweep_id}.with-gsplat.with-b"
+    assert "Renders of another program: gsplat, b." in report.text
+    header = report.text.splitlines()[2]
+    assert header.split("  ")[-2].strip() == "gsplat vs baseline"
+    table = pd.read_csv(report.folder / "table.csv").set_index(["level", "label", "metric"])
+    mean = table.xs(("mean", "gsplat"))
+    psnr = mean.loc["psnr"]
+    assert psnr["pairs"] == 1, "the lowest seed alone"
+    assert psnr["value"] == pytest.approx(20 * np.log10(255 / 10), abs=0.01)
+    assert mean["change_percent"].isna()["gaussians"]
+    assert (report.folder / "figures" / "fern--gsplat.png").is_file()
+    training = pd.read_csv(report.folder / "training.csv")
+    assert set(training["label"]) == {"baseline", "consistency"}
+    against = build(made.store.path, sweep_id, tmp_path / "out", [], "gsplat", externals=others)
+    assert "consistency against gsplat" in against.text
+
+
+def test_each_draw_of_a_variant_has_a_folder_of_its_own(
+    made: MakeStore, frozen_variant: Callable[..., str], tmp_path: Path
+) -> None:
+    for draw in (0, 1):
+        made.add(variant=frozen_variant(draw), draw=draw)
+    sweep = made.read()
+    other = External("gsplat", tmp_path / "renders")
+    rendered(other.folder)
+    rendered(other.folder / "fern")
+    with pytest.raises(ReportError, match=r"fern with variant.seed=0: \S+/fern/0 is exp"):
+        with_external(sweep, JoinedStore((made.store,)), [other])
+    for draw, offset in ((0, 10), (1, 20)):
+        rendered(other.folder / "fern" / str(draw), offset)
+    rows = with_external(sweep, JoinedStore((made.store,)), [other]).cells.tail(2)
+    assert list(rows["variant_seed"]) == [0, 1]
+    assert rows["psnr"].iloc[0] - rows["psnr"].iloc[1] == pytest.approx(20 * np.log10(2), abs=0.01)
+
+
+def broken(folder: Path, how: str) -> None:
+    file = folder / f"{VIEWS[1]}.png"
+    file.unlink()
+    if how == "size":
+        save(file, noise(0, (33, 24)))
+    elif how == "mode":
+        Image.fromarray(noise(0)).convert("RGBA").save(file)
+    elif how == "text":
+        file.write_text("no image")
+    elif how == "link":
+        file.symlink_to(folder / f"{VIEWS[0]}.png")
+
+
+@pytest.mark.parametrize(
+    ("how", "why"),
+    [
+        ("missing", "No such file"),
+        ("size", "33 x 24 pixels, not 32 x 24"),
+        ("mode", "RGBA, not 8-bit RGB"),
+        ("text", "unreadable or truncated"),
+        ("link", "symbolic link"),
+    ],
+)
+def test_a_render_that_can_not_be_scored_is_named(
+    made: MakeStore, frozen_variant: Callable[..., str], tmp_path: Path, how: str, why: str
+) -> None:
+    made.add(variant=frozen_variant())
+    sweep = made.read()
+    folder = rendered(tmp_path / "renders")
+    broken(folder, how)
+    with pytest.raises(ReportError) as caught:
+        with_external(sweep, JoinedStore((made.store,)), [External("gsplat", folder)])
+    message = str(caught.value)
+    assert message.startswith(str(folder / "IMG_009.png"))
+    assert why in message
+    assert "expected is an 8-bit RGB PNG of 32 x 24 px, the render of the view IMG_009" in message
+
+
+def test_a_label_of_the_sweep_is_refused(
+    made: MakeStore, frozen_variant: Callable[..., str], tmp_path: Path
+) -> None:
+    made.add(variant=frozen_variant())
+    sweep = made.read()
+    with pytest.raises(ReportError, match="external=baseline: cells of the sweep have that label"):
+        with_external(
+            sweep, JoinedStore((made.store,)), [External("baseline", rendered(tmp_path / "r"))]
+        )
+
+
+def test_a_damaged_variant_is_no_truth(
+    made: MakeStore, frozen_variant: Callable[..., str], tmp_path: Path
+) -> None:
+    variant = frozen_variant()
+    made.add(variant=variant)
+    sweep = made.read()
+    photograph = made.store.path / "variants" / variant / "images" / "test" / "IMG_001.png"
+    shutil.copy(rendered(tmp_path / "r") / "IMG_001.png", photograph)
+    with pytest.raises(frozen.CorruptVariant, match=r"IMG_001\.png"):
+        with_external(sweep, JoinedStore((made.store,)), [External("gsplat", tmp_path / "r")])
+
+
+def test_folders_have_labels_or_their_own_names() -> None:
+    assert parse("") == ()
+    assert parse("gsplat:out/a,/data/other,c:d:e") == (
+        External("gsplat", Path("out/a")),
+        External("other", Path("/data/other")),
+        External("c", Path("d:e")),
+    )
+    assert parse("./a:b") == (External("a:b", Path("a:b")),)
+    for wrong in ("gsplat:", "a:x,b/a"):
+        with pytest.raises(ReportError, match="external="):
+            parse(wrong)

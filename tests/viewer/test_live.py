@@ -1,0 +1,152 @@
+"""The live viewer: its page, its servers, how it ends, and that one camera moves the others."""
+
+from __future__ import annotations
+
+import asyncio
+import re
+import socket
+import urllib.request
+from collections.abc import Callable
+from contextlib import contextmanager, nullcontext
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from xrgs.errors import XrgsError
+from xrgs.viewer import live
+from xrgs.viewer.models import Model
+
+MakeModel = Callable[..., Model]
+
+
+def fetch(url: str) -> tuple[str, Any]:
+    with urllib.request.urlopen(url, timeout=10) as answer:  # noqa: S310 - on this machine
+        return answer.read().decode(), answer.headers
+
+
+def is_open(url: str) -> bool:
+    with socket.socket() as tried:
+        return tried.connect_ex(("127.0.0.1", int(url.rpartition(":")[2]))) == 0
+
+
+def test_a_page_has_a_frame_for_each_model_until_it_ends(model: MakeModel) -> None:
+    models = [model("baseline"), model("<b>&", seed=1)]
+    with live.shown(models, 0, 30) as address:
+        page, headers = fetch(address)
+        assert page.count("<iframe") == 2
+        assert "<b>" not in page
+        assert "&lt;b&gt;&amp;" in page
+        assert headers["Content-Security-Policy"].startswith("default-src 'none'")
+        frames = re.findall(r'src="(http://127\.0\.0\.1:\d+)"', page)
+        assert len(set(frames)) == 2
+        for url in frames:
+            assert "<html" in fetch(url)[0]
+    assert not any(map(is_open, [address, *frames]))
+
+
+def test_the_viewer_listens_on_this_machine_alone(
+    model: MakeModel, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    bound = []
+    bind = socket.socket.bind
+
+    def noted(own: socket.socket, address: Any) -> None:
+        bound.append(address[0])
+        bind(own, address)
+
+    monkeypatch.setattr(socket.socket, "bind", noted)
+    with live.shown([model()], 0, 30):
+        pass
+    assert set(bound) == {"127.0.0.1"}
+
+
+def test_a_port_in_use_is_named(model: MakeModel) -> None:
+    with socket.socket() as taken:
+        taken.bind(("127.0.0.1", 0))
+        taken.listen()
+        port = taken.getsockname()[1]
+        with (
+            pytest.raises(XrgsError, match=rf"port={port}: can't be used"),
+            live.shown([model()], port, 30),
+        ):
+            pass
+    with (
+        pytest.raises(XrgsError, match="port=70000: can't be used"),
+        live.shown([model()], 70_000, 30),
+    ):
+        pass
+
+
+def test_what_is_left_out_is_said(model: MakeModel) -> None:
+    assert live.count_text(model(), 40) == "40 Gaussians"
+    assert live.count_text(model(), 30) == "the 30 most opaque of 40 Gaussians (limit=30)"
+
+
+def test_without_viser_the_extra_is_named(without: Callable[[str], None]) -> None:
+    without("viser")
+    with pytest.raises(XrgsError, match=r"pip install 'xrgs\[view\]'"), live.shown([], 0, 1):
+        pass
+
+
+class Client:
+    """A frame of the page, with the camera that its browser has reported."""
+
+    def __init__(self) -> None:
+        self.callbacks: list[Any] = []
+        self.camera = SimpleNamespace(
+            client=self, on_update=self.callbacks.append, position=np.zeros(3),
+            look_at=np.ones(3), up_direction=np.array([0.0, 0, 1]), fov=1.0,
+        )  # fmt: skip
+        self.atomic: Callable[[], Any] = nullcontext
+
+    def move(self, x: float) -> None:
+        self.camera.position = np.array([x, 0.0, 0.0])
+        for callback in self.callbacks:
+            asyncio.run(callback(self.camera))
+
+
+@pytest.fixture
+def clock(monkeypatch: pytest.MonkeyPatch) -> SimpleNamespace:
+    now = SimpleNamespace(s=100.0)
+    monkeypatch.setattr("xrgs.viewer.live.time.monotonic", lambda: now.s)
+    return now
+
+
+def test_the_camera_that_is_moved_moves_the_others(clock: SimpleNamespace) -> None:
+    shared, clients = live._SharedCamera(), [Client(), Client()]
+    for client in clients:
+        shared.join(client)
+    first, second = clients
+    first.camera.fov = 0.5
+    first.move(1.0)
+    assert (second.camera.position[0], second.camera.fov) == (1.0, 0.5)
+    clock.s += 0.1
+    first.move(2.0)
+    second.move(1.0)  # the second browser reports where it was told to be a moment ago
+    assert first.camera.position[0] == 2.0, "which is no move of the user"
+    clock.s += 1.0
+    second.move(7.0)
+    assert first.camera.position[0] == 7.0
+    shared.leave(first)
+    clock.s += 1.0
+    second.move(8.0)
+    assert first.camera.position[0] == 7.0
+
+
+def test_places_are_set_together(clock: SimpleNamespace) -> None:
+    opened = []
+
+    @contextmanager
+    def atomic() -> Any:
+        opened.append("begin")
+        yield
+        opened.append("end")
+
+    shared, first, second = live._SharedCamera(), Client(), Client()
+    second.atomic = atomic
+    shared.join(first)
+    shared.join(second)
+    first.move(3.0)
+    assert opened == ["begin", "end"]

@@ -1,0 +1,112 @@
+"""What a word of the command line stands for: a cell of a store, or a .ply file."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from xrgs.errors import StoreError, XrgsError
+from xrgs.experiment.store import Store
+from xrgs.splat.ply import save_ply
+from xrgs.splat.settings import RasterSettings
+from xrgs.viewer import models
+from xrgs.viewer.models import Model
+
+
+@pytest.fixture
+def store(tmp_path: Path) -> Store:
+    """A store with the finished cells abc1 and abd2, and the failed one abd3."""
+    made = Store(tmp_path / "s")
+    made.prepare()
+    for cell_id in ("abc1", "abd2", "abd3"):
+        cell = made.cell(cell_id)
+        cell.begin({"splat": {"raster": {"antialiased": True}}}, {"variant": "v"})
+        if cell_id == "abd3":
+            cell.fail("out of memory")
+        else:
+            (cell.path / "scores.csv").write_text("view\na\n")
+            cell.finish(["a"], 1)
+    return made
+
+
+def test_a_cell_is_found_by_the_beginning_of_its_id(store: Store) -> None:
+    assert models.find_cell("abc", store).id == "abc1"
+    assert models.find_cell("abd2", store).id == "abd2"
+
+
+@pytest.mark.parametrize(
+    ("word", "message"),
+    [
+        ("ab", "ab: the ids of 3 cells begin so: abc1, abd2, abd3 in store="),
+        ("x", "x: no such cell in store="),
+        ("../abc1", "../abc1: no such cell in store="),
+        ("abd3", "abd3: it is failed and not done: out of memory"),
+    ],
+)
+def test_a_word_that_names_no_finished_cell_is_refused(
+    store: Store, word: str, message: str
+) -> None:
+    with pytest.raises(StoreError) as caught:
+        models.find_cell(word, store)
+    assert str(caught.value).startswith(message)
+
+
+def test_a_store_that_is_not_there_is_named(tmp_path: Path) -> None:
+    with pytest.raises(StoreError, match=r"gone: there is no store; name another with store="):
+        models.find_cell("a", Store(tmp_path / "gone"))
+
+
+def test_settings_are_the_trainings(store: Store) -> None:
+    assert models.raster_settings(store.cell("abc1")) == RasterSettings(antialiased=True)
+
+
+@pytest.mark.parametrize(
+    "raster",
+    [
+        {"antialiased": 1},
+        {"near": "0.01"},
+        {"eps2d": 1e300},
+        {"sh_degree": 2.0},
+        {"background": [0, 0]},
+        {"background": "abc"},
+        [],
+        None,
+    ],
+)
+def test_settings_of_a_wrong_type_are_refused(store: Store, raster: Any) -> None:
+    file = store.path / "cells" / "abc1" / "config.json"
+    file.write_text(json.dumps({"splat": {"raster": raster}}))
+    with pytest.raises(StoreError, match=r"config\.json: .*splat\.raster"):
+        models.raster_settings(store.cell("abc1"))
+
+
+def test_a_ply_file_has_the_default_settings(
+    model: Callable[..., Model], store: Store, tmp_path: Path
+) -> None:
+    save_ply(tmp_path / "an\x1b[31m.PLY", model().gaussians)
+    (loaded,) = models.load_models([str(tmp_path / "an\x1b[31m.PLY")], store)
+    assert (loaded.name, loaded.views, loaded.poses) == ("an [31m.PLY", (), None)
+    assert loaded.settings == RasterSettings()
+    assert len(loaded.gaussians) == 40
+    assert models.reference([loaded]) is None
+
+
+@pytest.mark.parametrize("words", [[], ["a", "b", "c"]])
+def test_one_or_two_cells_are_shown(store: Store, words: list[str]) -> None:
+    with pytest.raises(XrgsError, match="give one cell or 2"):
+        models.load_models(words, store)
+
+
+def test_cells_of_different_variants_share_no_camera(
+    model: Callable[..., Model], store: Store, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    made = {"a": model("a"), "b": model("b")}
+    made["b"] = Model(**(vars(made["b"]) | {"variant": "variant-2"}))
+    monkeypatch.setattr(models, "_load", lambda word, _: made[word])
+    assert [one.name for one in models.load_models(["a", "a"], store)] == ["a", "a"]
+    with pytest.raises(XrgsError, match=r"different variants \(variant-1, variant-2\)"):
+        models.load_models(["a", "b"], store)

@@ -1,0 +1,171 @@
+"""Renders of the test views that another program made, as one more label of a sweep's report.
+
+They are scored by the metrics of the frozen protocol against the photographs of the variant, and
+compared by the same statistics. They are 8-bit PNGs, where our own cells are scored as float32
+images: the rounding costs PSNR 0.005 dB at 30 dB and 0.05 dB at 40 dB, and SSIM 0.0004 on the
+embedded scene. Nothing is known of time, Gaussians and memory: these are n/a.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any
+
+import pandas as pd
+
+from xrgs.capture import images, variant
+from xrgs.capture.images import ImageError
+from xrgs.evaluation.metrics import VIEW_METRICS
+from xrgs.report.collect import ReportError, Sweep, cell_means
+from xrgs.runtime.machine import single_torch_thread
+from xrgs.runtime.progress import progress
+from xrgs.safeio.confined import ConfinedPath
+from xrgs.safeio.paths import user_path
+from xrgs.safeio.untrusted import is_inside
+from xrgs.safeio.words import for_file_name
+
+if TYPE_CHECKING:
+    from collections.abc import Hashable, Mapping, Sequence
+    from pathlib import Path
+
+    from xrgs.capture.views import View
+    from xrgs.report.joined import JoinedStore
+
+#: What the cells that another program's renders are compared with have in common.
+_VARIANT = ["scene", "condition", "variant_seed"]
+_SHARED = ["variant_id", "baseline_id", "seed", "protocol", "validation"]
+
+
+@dataclass(frozen=True)
+class External:
+    """Where another program's renders are, and what the tables call them."""
+
+    label: str
+    folder: Path
+
+
+def parse(text: str) -> tuple[External, ...]:
+    """Read the argument `external=LABEL:FOLDER,LABEL:FOLDER`.
+
+    Args:
+        text: Folders, each with a label before it or named by the folder's own name; empty for
+            none.
+
+    Raises:
+        ReportError: A label or a folder is empty, or two labels are the same.
+    """
+    found = []
+    for part in filter(None, text.split(",")):
+        label, colon, folder = part.partition(":")
+        if not colon or "/" in label:  # a path may have a colon
+            label, folder = "", part
+        path = user_path(folder)
+        found.append(External(label or path.name, path))
+        if not folder or not found[-1].label:
+            raise ReportError(f"external={part}: must be FOLDER or LABEL:FOLDER")
+    labels = [one.label for one in found]
+    if len(set(labels)) < len(labels):
+        raise ReportError(f"external={text}: two folders have the same label; use LABEL:FOLDER")
+    return tuple(found)
+
+
+def with_external(sweep: Sweep, store: JoinedStore, externals: Sequence[External]) -> Sweep:
+    """Return a sweep with a row for each variant that another program has rendered.
+
+    A program has one set of renders for a variant. They are paired with the cells of the lowest
+    seed, in each condition.
+
+    Args:
+        sweep: The sweep.
+        store: The stores that have its variants.
+        externals: The programs' renders. A folder has `<view>.png` for each scored view, in
+            `<scene>/<variant.seed>/`; where a scene has one draw of HR views, `<scene>/` will do,
+            and where there is one scene too, the folder itself.
+
+    Returns:
+        The sweep with these rows in `cells` and `views`, and their folders in `renders`.
+
+    Raises:
+        ReportError: A label is that of cells, a folder or a render is missing, or a render is not
+            an 8-bit RGB PNG of its view's size; the message names the file and what is expected.
+        CorruptVariant: A variant is damaged.
+    """
+    for one in externals:
+        if one.label in set(sweep.cells["label"]):
+            raise ReportError(f"external={one.label}: cells of the sweep have that label")
+        sweep = _with_one(sweep, store, one)
+    return sweep
+
+
+def _with_one(sweep: Sweep, store: JoinedStore, one: External) -> Sweep:
+    done = sweep.cells[sweep.cells["state"] == "done"].sort_values("seed", kind="stable")
+    done = done[~done["cell_id"].isin(sweep.renders)]
+    rows: list[dict[str, Any]] = []
+    scores: list[dict[str, Any]] = []
+    renders = dict(sweep.renders)
+    groups = done.drop_duplicates(_VARIANT).to_dict("records")
+    for number, cell in enumerate(groups):
+        views = sweep.views.loc[sweep.views["cell_id"] == cell["cell_id"], "view"]
+        folder = _folder(one, cell, done)
+        cell_id = f"{for_file_name(one.label)}.{number}"  # no cell's id has a dot
+        split = "train" if cell["validation"] > 0 else "test"
+        expected = _expected(store, str(cell["variant_id"]), split)
+        bar = progress(list(views), f"scoring {one.label}", "view")
+        scores += [{"cell_id": cell_id} | _score(folder, expected[name]) for name in bar]
+        renders[cell_id] = folder
+        rows.append(
+            {key: cell[key] for key in (*_VARIANT, *_SHARED)}
+            | {"cell_id": cell_id, "label": one.label, "state": "done", "reason": ""}
+        )
+    means = cell_means(pd.DataFrame(scores, columns=list(sweep.views.columns)))
+    added = pd.DataFrame(rows, columns=list(sweep.cells.columns))
+    for name in means.columns:
+        added[name] = added["cell_id"].map(means[name])
+    cells = pd.concat([sweep.cells, added.astype(sweep.cells.dtypes)], ignore_index=True)
+    views = pd.DataFrame(scores, columns=list(sweep.views.columns)).astype(sweep.views.dtypes)
+    both = pd.concat([sweep.views, views], ignore_index=True)
+    return replace(sweep, cells=cells, views=both, renders=renders)
+
+
+def _folder(one: External, cell: Mapping[Hashable, Any], done: pd.DataFrame) -> ConfinedPath:
+    """Return the folder with the renders of a cell's variant: the first of these that is there."""
+    scene, draw = str(cell["scene"]), int(cell["variant_seed"])
+    draws = done.loc[done["scene"] == scene, "variant_seed"].nunique()
+    root, inside = ConfinedPath(one.folder), []
+    if is_inside(scene):
+        inside = [root / scene / str(draw)] + [root / scene] * (draws == 1)
+    if draws == 1 and set(done["scene"]) == {scene}:
+        inside.append(root)
+    try:
+        found = [folder for folder in inside if folder.is_dir()]
+    except OSError as error:
+        raise ReportError(f"external={one.label}: {one.folder}: {error.strerror}") from error
+    if not found:
+        wanted = " or ".join(map(str, inside)) or "a folder of that scene, whose name can be none"
+        raise ReportError(
+            f"external={one.label}: there are no renders of {scene} with variant.seed={draw}: "
+            f"{wanted} is expected, with <view>.png for each view that is scored"
+        )
+    return found[0]
+
+
+def _expected(store: JoinedStore, variant_id: str, split: str) -> dict[str, View]:
+    """Return the views of a variant that cells are scored on, by name."""
+    frozen = variant.load(store.variant(variant_id))
+    return {view.name: view for view in frozen.views if view.split == split}
+
+
+def _score(folder: ConfinedPath, view: View) -> dict[str, Any]:
+    """Score the render of a view, as `xrgs.evaluation.protocol` does."""
+    import torch
+
+    file, size = folder / f"{view.name}.png", (view.width, view.height)
+    wanted = f"expected is an 8-bit RGB PNG of {view.width} x {view.height} px, the render of the"
+    try:
+        image = torch.from_numpy(images.read_png(file, size))
+    except ImageError as error:
+        raise ReportError(f"{error}; {wanted} view {view.name}") from error
+    photograph = torch.from_numpy(images.read_png(view.file, size))
+    with torch.no_grad(), single_torch_thread():
+        scores = {name: score(image, photograph) for name, score in VIEW_METRICS.items()}
+    return {"view": view.name} | scores

@@ -1,0 +1,1 @@
+"""Shows trained Gaussians: live in a browser, and as films along paths of cameras."""

@@ -1,0 +1,181 @@
+"""Renders models along a path of cameras, side by side, into an MP4 film or PNG frames.
+
+The renderer is that of the evaluation protocol with the same settings, so that a frame at a test
+camera is the render that was scored.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from PIL import Image, ImageDraw, ImageFont
+
+from xrgs.errors import XrgsError
+from xrgs.runtime.progress import progress
+from xrgs.safeio.atomic import atomic_writer
+from xrgs.safeio.confined import ConfinedPath
+from xrgs.splat.cameras import Camera
+from xrgs.splat.rendering import rasterize
+from xrgs.viewer.models import reference
+from xrgs.viewer.paths import PATHS
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Iterator, Sequence
+    from pathlib import Path
+
+    from xrgs.viewer.models import Model
+
+    Frame = NDArray[np.uint8]  # [H, W, 3]
+
+_MP4 = ".mp4"
+#: Smallest and largest side of a panel, px, and the most frames of a film.
+_SIDES, _MAX_FRAMES = (16, 8192), 100_000
+#: x264's constant rate factor: 18 is taken to be visually lossless.
+_CRF = "18"
+#: The share of a panel's height that a label takes, and its smallest size, px.
+_LABEL_SHARE, _MIN_LABEL = 0.04, 12
+
+
+def make_film(
+    models: Sequence[Model],
+    out: Path,
+    *,
+    path: str = "orbit",
+    views: int = 120,
+    size: tuple[int, int] | None = None,
+    fps: int = 30,
+) -> str:
+    """Render models along a path that is fitted to the cameras of the first one that has any.
+
+    Args:
+        models: One model, or several of one world, which are shown side by side with their names.
+        out: An .mp4 file, which is replaced, or a folder that is new or empty, for one PNG a frame.
+        path: `orbit`, `spiral` or `test`, see `xrgs.viewer.paths`.
+        views: Number of frames.
+        size: Width and height of one model's panel, px, both even; None for the size of the first
+            test view, without its last row or column where that is odd.
+        fps: Frames a second of a film.
+
+    Returns:
+        A line that says what was written.
+
+    Raises:
+        XrgsError: An argument is out of its range, no model has cameras, PyAV is missing, or `out`
+            can't be written; the message names the argument.
+    """
+    _check(path, views, fps, size)
+    is_film = _is_film(out)
+    world = reference(models)
+    if world is None or world.poses is None:
+        raise XrgsError("the path is fitted to the cameras of a cell: give a cell beside the .ply")
+    first_test = next(view for view in world.views if view.kind == "test")
+    camera = _panel_camera(first_test.camera, size)
+    cameras = [
+        Camera(torch.from_numpy(viewmat).float(), camera.K, camera.width, camera.height)
+        for viewmat in PATHS[path](world.poses, views)
+    ]
+    frames = _frames(models, cameras)
+    try:
+        (_write_film if is_film else _write_pngs)(frames, out, fps)
+    except OSError as error:
+        raise XrgsError(f"out={out}: can't be written ({error.strerror or error})") from error
+    shown = f"{len(models) * camera.width} x {camera.height} px"
+    length = f", {views / fps:.1f} s" if is_film else ""
+    return f"{out}: {views} frames of {shown}{length}"
+
+
+def _check(path: str, views: int, fps: int, size: tuple[int, int] | None) -> None:
+    if path not in PATHS:
+        raise XrgsError(f"path={path}: must be one of {', '.join(PATHS)}")
+    if not 1 <= views <= _MAX_FRAMES:
+        raise XrgsError(f"views={views}: must be from 1 to {_MAX_FRAMES}")
+    if not 1 <= fps <= 240:
+        raise XrgsError(f"fps={fps}: must be from 1 to 240")
+    low, high = _SIDES
+    if size is not None and not all(low <= side <= high and side % 2 == 0 for side in size):
+        raise XrgsError(f"size={size[0]}x{size[1]}: must be even numbers from {low} to {high}")
+
+
+def _is_film(out: Path) -> bool:
+    """Tell a film from a folder of frames, and see that a film can be made."""
+    if out.suffix.lower() != _MP4:
+        if out.suffix:
+            raise XrgsError(f"out={out}: must end with {_MP4}, or be a folder, without a suffix")
+        return False
+    try:
+        import av  # noqa: F401
+    except ImportError as error:
+        raise XrgsError(
+            f"out={out}: a film needs PyAV: pip install 'xrgs[film]'; out=FOLDER writes PNG frames"
+        ) from error
+    return True
+
+
+def _panel_camera(view: Camera, size: tuple[int, int] | None) -> Camera:
+    """Return the intrinsics of a panel, which shows as much from left to right as a view does."""
+    width, height = size or (view.width - view.width % 2, view.height - view.height % 2)
+    scale = width / view.width if size else 1.0
+    K = view.K.clone()
+    K[:2] *= scale
+    if size:  # the rows that are added or left out are so at the top and at the bottom alike
+        K[1, 2] += (height - scale * view.height) / 2
+    return Camera(view.viewmat, K, width, height)
+
+
+def _frames(models: Sequence[Model], cameras: Sequence[Camera]) -> Iterator[Frame]:
+    """Yield one frame a camera: the renders of all models from left to right."""
+    for camera in progress(cameras, "rendering", "frame"):
+        panels = [_panel(model, camera) for model in models]
+        if len(models) > 1:
+            panels = [
+                _labelled(panel, model.name) for panel, model in zip(panels, models, strict=True)
+            ]
+        yield np.concatenate(panels, axis=1)
+
+
+@torch.no_grad()
+def _panel(model: Model, camera: Camera) -> Frame:
+    image = rasterize(model.gaussians, camera, settings=model.settings).image
+    return np.asarray(image.clamp(0, 1).mul(255).round().to(torch.uint8).numpy())
+
+
+def _labelled(panel: Frame, name: str) -> Frame:
+    """Write a name into the upper left corner, white on a dark box."""
+    image = Image.fromarray(panel)
+    draw = ImageDraw.Draw(image)
+    height = max(_MIN_LABEL, round(_LABEL_SHARE * image.height))
+    font, margin = ImageFont.load_default(height), height // 2
+    box = draw.textbbox((margin, margin), name, font)
+    pad = height // 4
+    draw.rectangle((box[0] - pad, box[1] - pad, box[2] + pad, box[3] + pad), fill="#202020")
+    draw.text((margin, margin), name, "white", font)
+    return np.asarray(image)
+
+
+def _write_film(frames: Iterable[Frame], out: Path, fps: int) -> None:
+    """Encode frames as H.264 in an MP4 file, which appears when it is complete."""
+    import av
+
+    ConfinedPath(out).make_parent()
+    with atomic_writer(out) as stream, av.open(stream, "w", format="mp4") as container:
+        video: Any = container.add_stream("libx264", rate=fps, options={"crf": _CRF})
+        video.pix_fmt = "yuv420p"  # what browsers and players show
+        for number, frame in enumerate(frames):
+            if number == 0:
+                video.height, video.width = frame.shape[:2]
+            container.mux(video.encode(av.VideoFrame.from_ndarray(frame, format="rgb24")))
+        container.mux(video.encode())
+
+
+def _write_pngs(frames: Iterable[Frame], out: Path, _: int) -> None:
+    """Write `0000.png` and so on into a folder that is new or empty."""
+    folder = ConfinedPath(out)
+    folder.make_root()
+    if folder.names():
+        raise XrgsError(f"out={out}: the folder is not empty; name a new one")
+    for number, frame in enumerate(frames):
+        with atomic_writer(folder / f"{number:04}.png", durable=False) as stream:
+            Image.fromarray(frame).save(stream, "PNG", compress_level=4)

@@ -1,0 +1,253 @@
+"""Shows models live in a browser: viser draws the splats, one frame a model under one camera.
+
+Each model has a server of its own, since a page of viser shows one scene. One page holds the frames
+of all of them, and whichever camera is moved moves the others. Everything listens on this machine's
+loopback interface alone.
+"""
+
+from __future__ import annotations
+
+import html
+import io
+import math
+import threading
+import time
+from contextlib import ExitStack, contextmanager, redirect_stdout
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from typing import TYPE_CHECKING, Any
+
+from xrgs.capture.contact_sheet import COLOURS
+from xrgs.errors import XrgsError
+from xrgs.safeio.words import for_markdown
+from xrgs.viewer.models import reference
+from xrgs.viewer.paths import look_at_point, up_direction
+from xrgs.viewer.splats import to_splats
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator, Sequence
+
+    from viser import CameraHandle, ClientHandle, ViserServer
+
+    from xrgs.splat.cameras import Camera
+    from xrgs.viewer.models import Model
+
+HOST = "127.0.0.1"
+#: A camera that was not moved by the user follows the one that was; what it reports of that arrives
+#: within so many seconds.
+_ECHO_S = 0.3
+#: The size of a drawn camera, as a share of the cameras' median distance from what they look at.
+_FRUSTUM_SCALE = 0.04
+_PAGE = """<!doctype html>
+<html lang="en"><meta charset="utf-8"><title>xrgs-view</title>
+<style>
+body {{ margin: 0; display: flex; height: 100vh; background: #202020; gap: 2px; }}
+figure {{ margin: 0; flex: 1; display: flex; flex-direction: column; min-width: 0; }}
+figcaption {{ color: white; font: 15px sans-serif; padding: 6px 10px; }}
+iframe {{ flex: 1; border: 0; }}
+</style>
+{frames}
+</html>
+"""
+_FRAME = (
+    '<figure><figcaption>{name}</figcaption><iframe title="{name}" src="{url}"></iframe></figure>'
+)
+_POLICY = f"default-src 'none'; style-src 'unsafe-inline'; frame-src http://{HOST}:*"
+
+
+@contextmanager
+def shown(models: Sequence[Model], port: int, limit: int) -> Iterator[str]:
+    """Show models for the length of a block.
+
+    Args:
+        models: One model, or several of one world.
+        port: The port of the page; viser's servers take the next ones that are free. 0 lets the
+            system choose all of them.
+        limit: The most Gaussians of a model that are drawn, see `xrgs.viewer.splats.to_splats`.
+
+    Yields:
+        The address of the page.
+
+    Raises:
+        XrgsError: viser is missing, or the port can't be used.
+    """
+    viser = _viser()
+    with ExitStack() as stack:
+        page = _PageServer(port)
+        stack.callback(page.server_close)
+        cameras, frames = _SharedCamera(), []
+        for number, model in enumerate(models):
+            wanted = port and port + 1 + number
+            with _without_banners():
+                server = viser.ViserServer(HOST, wanted, verbose=False)
+            stack.callback(_stop, server)
+            _fill(server, model, reference(models), limit)
+            server.on_client_connect(cameras.join)
+            server.on_client_disconnect(cameras.leave)
+            url = f"http://{HOST}:{server.get_port()}"
+            frames.append(_FRAME.format(name=html.escape(model.name), url=url))
+        page.content = _PAGE.format(frames="\n".join(frames)).encode()
+        threading.Thread(target=page.serve_forever, name="xrgs-view", daemon=True).start()
+        stack.callback(page.shutdown)
+        yield f"http://{HOST}:{page.server_port}"
+
+
+def _stop(server: ViserServer) -> None:
+    with _without_banners():
+        server.stop()
+
+
+@contextmanager
+def _without_banners() -> Iterator[None]:
+    """Keep back what viser prints: addresses of single frames, which nobody should open."""
+    with redirect_stdout(io.StringIO()):
+        yield
+
+
+def _viser() -> Any:
+    try:
+        import viser
+    except ImportError as error:
+        raise XrgsError("the live viewer needs viser: pip install 'xrgs[view]'") from error
+    return viser
+
+
+class _PageServer(ThreadingHTTPServer):
+    """Serves one page."""
+
+    daemon_threads = True
+
+    def __init__(self, port: int) -> None:
+        try:
+            super().__init__((HOST, port), _PageHandler)
+        except (OSError, OverflowError) as error:
+            why = getattr(error, "strerror", None) or error
+            raise XrgsError(f"port={port}: can't be used ({why}); name another one") from error
+        self.content = b""
+
+
+class _PageHandler(BaseHTTPRequestHandler):
+    server: _PageServer
+
+    def do_GET(self) -> None:
+        found = self.path == "/"
+        self.send_response(200 if found else 404)
+        self.send_header("Content-Type", "text/html; charset=utf-8")
+        self.send_header("Content-Security-Policy", _POLICY)
+        self.end_headers()
+        if found:
+            self.wfile.write(self.server.content)
+
+    def log_message(self, *_: object) -> None:
+        """Write no log of requests."""
+
+
+def _fill(server: ViserServer, model: Model, world: Model | None, limit: int) -> None:
+    """Add the splats of a model, and the cameras of the world that it is in."""
+    splats = to_splats(model.gaussians, limit)
+    server.gui.configure_theme(control_width="small", show_share_button=False, show_logo=False)
+    server.scene.add_gaussian_splats(
+        "/splats",
+        splats.centers,
+        splats.covariances,
+        splats.colors,
+        splats.opacities[:, None],
+    )
+    server.gui.add_markdown(f"**{for_markdown(model.name)}**\n\n{count_text(model, limit)}")
+    if world is not None:
+        _add_cameras(server, world)
+
+
+def count_text(model: Model, limit: int) -> str:
+    """Say how many Gaussians of a model are drawn.
+
+    Args:
+        model: The model.
+        limit: The most Gaussians that are drawn.
+    """
+    count = len(model.gaussians)
+    if count <= limit:
+        return f"{count:,} Gaussians"
+    return f"the {limit:,} most opaque of {count:,} Gaussians (limit={limit})"
+
+
+def _add_cameras(server: ViserServer, world: Model) -> None:
+    """Draw the views' cameras in the colours of their kinds, and start at the first test view."""
+    from viser.transforms import SO3
+
+    if world.poses is None:
+        return
+    for kind, colour in COLOURS.items():
+        views = [view for view in world.views if view.kind == kind]
+        parent = server.scene.add_frame(f"/{kind}", show_axes=False)
+        for number, view in enumerate(views):
+            camera = view.camera
+            frustum = server.scene.add_camera_frustum(
+                f"/{kind}/{number}",
+                fov=_vertical_fov(camera),
+                aspect=camera.width / camera.height,
+                scale=_FRUSTUM_SCALE,
+                color=tuple(int(colour[at : at + 2], 16) for at in (1, 3, 5)),
+                wxyz=SO3.from_matrix(camera.viewmat[:3, :3].T.double().numpy()).wxyz,
+                position=camera.position.double().numpy(),
+            )
+            frustum.on_click(_go_to)
+        box = server.gui.add_checkbox(f"{kind}: {len(views)} cameras", initial_value=True)
+        box.on_update(lambda event, parent=parent: setattr(parent, "visible", event.target.value))
+    up = up_direction(world.poses)
+    server.scene.set_up_direction(tuple(up))
+    first = next(view.camera for view in world.views if view.kind == "test")
+    start = server.initial_camera
+    start.position, start.up = first.position.double().numpy(), up
+    start.look_at = look_at_point(world.poses)
+    start.fov = _vertical_fov(first)
+
+
+def _vertical_fov(camera: Camera) -> float:
+    """Return the angle from the upper to the lower edge of a camera's image, radians."""
+    return 2 * math.atan2(camera.height / 2, float(camera.K[1, 1]))
+
+
+def _go_to(event: Any) -> None:
+    """Move the camera of the browser to the camera that was clicked."""
+    camera, clicked = event.client.camera, event.target
+    camera.position, camera.wxyz = clicked.position, clicked.wxyz
+
+
+class _SharedCamera:
+    """Lets the cameras of all frames follow the one that the user moves.
+
+    A camera that follows reports its new place like one that is moved. So only one camera leads at
+    a time, and another one can lead when that has been at rest for a moment.
+    """
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        self._clients: list[ClientHandle] = []
+        self._leader: ClientHandle | None = None
+        self._led_at = -_ECHO_S
+
+    def join(self, client: ClientHandle) -> None:
+        """Let a frame's camera follow and lead."""
+        with self._lock:
+            self._clients.append(client)
+        client.camera.on_update(self._moved)
+
+    def leave(self, client: ClientHandle) -> None:
+        """Forget a frame that was closed."""
+        with self._lock:
+            if client in self._clients:
+                self._clients.remove(client)
+
+    async def _moved(self, camera: CameraHandle) -> None:
+        with self._lock:
+            now, client = time.monotonic(), camera.client
+            if self._leader is not client and now - self._led_at < _ECHO_S:
+                return
+            self._leader, self._led_at = client, now
+            for other in self._clients:
+                if other is not client:
+                    with other.atomic():
+                        other.camera.position = camera.position
+                        other.camera.look_at = camera.look_at
+                        other.camera.up_direction = camera.up_direction
+                        other.camera.fov = camera.fov

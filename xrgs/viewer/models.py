@@ -1,0 +1,180 @@
+"""Loads what is looked at: the Gaussians of a cell with its cameras, or those of a .ply file."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from xrgs.errors import StoreError, XrgsError
+from xrgs.safeio.paths import user_path
+from xrgs.safeio.records import MAX_NUMBER, read_object
+from xrgs.safeio.words import for_line
+from xrgs.splat.ply import load_ply
+from xrgs.splat.settings import RasterSettings
+from xrgs.viewer.paths import Poses
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from xrgs.experiment.cell_folder import CellFolder
+    from xrgs.experiment.store import Store
+    from xrgs.splat.cameras import Camera
+    from xrgs.splat.gaussians import Gaussians
+
+#: The most models that are shown beside each other.
+MAX_MODELS = 2
+_PLY = ".ply"
+#: The longest name of a model, in characters.
+_MAX_NAME = 60
+
+
+@dataclass(frozen=True)
+class PosedView:
+    """A view that a cell was trained or scored on."""
+
+    name: str
+    kind: str
+    """`HR` or `LR` of a training view, `test` of one that is scored."""
+    camera: Camera
+
+
+@dataclass(frozen=True)
+class Model:
+    """Gaussians to look at, and what is known of where they come from."""
+
+    name: str
+    """What it is called for people: one printable line."""
+    gaussians: Gaussians
+    settings: RasterSettings
+    """How its Gaussians become pixels: those of its training; of a .ply file the default ones."""
+    views: tuple[PosedView, ...] = ()
+    """Its views, training views first; none of a .ply file."""
+    poses: Poses | None = None
+    """The same as arrays, for paths; None of a .ply file."""
+    variant: str = ""
+    """The id of its variant, which decides the world that it is in; empty of a .ply file."""
+
+
+def load_models(words: Sequence[str], store: Store) -> list[Model]:
+    """Load one model, or two of one world.
+
+    Args:
+        words: The cells, each as its id, the beginning of its id that no other cell shares, or the
+            path of a .ply file.
+        store: The store that has the cells.
+
+    Returns:
+        The models, in the order of the words.
+
+    Raises:
+        XrgsError: There are none or too many words, a word names no finished cell, a file is
+            damaged, or the cells are of different variants; the message names the word or the file.
+    """
+    if not 1 <= len(words) <= MAX_MODELS:
+        raise XrgsError(f"give one cell or {MAX_MODELS}, each by its id or as a .ply file")
+    models = [_load(word, store) for word in words]
+    variants = sorted({model.variant for model in models if model.variant})
+    if len(variants) > 1:
+        raise XrgsError(
+            f"{' and '.join(words)} are of different variants ({', '.join(variants)}): each has a "
+            "world of its own, so no camera shows the same in both"
+        )
+    return models
+
+
+def reference(models: Sequence[Model]) -> Model | None:
+    """Return the first model that has views; None where all are .ply files.
+
+    Args:
+        models: The models, all of one world.
+    """
+    return next((model for model in models if model.views), None)
+
+
+def find_cell(word: str, store: Store) -> CellFolder:
+    """Find a finished cell by its id or the beginning of it.
+
+    Args:
+        word: The id, or a beginning that no other cell's id has.
+        store: The store.
+
+    Returns:
+        The cell.
+
+    Raises:
+        StoreError: There is no such store or cell, several ids begin so, or it is not finished.
+    """
+    cell = store.find_cell(word)
+    state = cell.state(verify=False)
+    if state.name != "done":
+        raise StoreError(f"{cell.id}: it is {state.name} and not done: {state.reason}")
+    return cell
+
+
+def raster_settings(cell: CellFolder) -> RasterSettings:
+    """Return how a cell's Gaussians become pixels.
+
+    Only this part of its config is read, so that cells of other versions can be looked at.
+
+    Args:
+        cell: The cell.
+
+    Raises:
+        StoreError: `config.json` can't be read, or has no such settings; the message names it.
+    """
+    file, default = cell.folder / "config.json", vars(RasterSettings())
+    try:
+        stored = read_object(file)["splat"]["raster"]
+        wrong = [
+            name
+            for name, value in stored.items()
+            if name in default and not _is_like(value, default[name])
+        ]
+        known = {name: stored[name] for name in default if name in stored}
+    except (AttributeError, KeyError, TypeError) as error:
+        raise StoreError(f"{file}: it has no settings splat.raster") from error
+    if wrong:
+        raise StoreError(f"{file}: splat.raster.{wrong[0]} is of a wrong type")
+    if "background" in known:
+        known["background"] = tuple(known["background"])
+    return RasterSettings(**known)
+
+
+def _is_like(value: object, default: object) -> bool:
+    """Return whether a value of JSON can stand in the place of a default."""
+    if isinstance(default, tuple):
+        return (
+            isinstance(value, list)
+            and len(value) == len(default)
+            and all(map(_is_like, value, default))
+        )
+    if isinstance(default, bool) or isinstance(value, bool) or not isinstance(value, (int, float)):
+        return type(value) is type(default)
+    is_kind = isinstance(default, float) or isinstance(value, int)
+    return is_kind and abs(value) <= MAX_NUMBER
+
+
+def _load(word: str, store: Store) -> Model:
+    if word.lower().endswith(_PLY):
+        file = user_path(word)
+        return Model(for_line(file.name, _MAX_NAME), load_ply(file), RasterSettings())
+    cell = find_cell(word, store)
+    data = cell.dataset()
+    train = [PosedView(view.name, view.tag, view.camera) for view in data.train]
+    test = [PosedView(view.name, "test", view.camera) for view in data.test]
+    viewmats = [
+        np.stack([view.camera.viewmat.double().numpy() for view in of]) for of in (train, test)
+    ]
+    poses = Poses(viewmats[0], viewmats[1], data.points.double().numpy())
+    names = store.cell_names().get(cell.id, {})
+    label = " ".join(filter(None, (names.get("label"), names.get("condition"))))
+    return Model(
+        for_line(f"{label or 'cell'} {cell.id[:8]}", _MAX_NAME),
+        cell.gaussians(),
+        raster_settings(cell),
+        (*train, *test),
+        poses,
+        str(cell.identity()["variant"]),
+    )

@@ -1,0 +1,221 @@
+"""Paths of cameras through a scene, fitted to the cameras that it was photographed from.
+
+All computations are in float64, in the normalised world of `xrgs.splat.normalize`, whose unit is
+the median distance of the cameras from what they look at. Cameras have OpenCV axes.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.interpolate import PchipInterpolator
+from scipy.spatial.transform import Rotation, Slerp
+
+from xrgs.errors import XrgsError
+from xrgs.splat.normalize import camera_positions
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+Array = NDArray[np.float64]
+
+#: How much the depth of the points counts for the focus, beside the distances from the optical
+#: axes: at axes that are 6 degrees apart both weigh the same. Our choice.
+_DEPTH_WEIGHT = 0.01
+#: Cameras that leave no gap as wide as this around the focus, in degrees, surround it. Our choice.
+_LARGEST_GAP = 90.0
+#: The length of the mean of the viewing directions, 0 to 1, from which cameras face one way.
+_MIN_FACING = 0.5
+#: LLFF's spiral: percentile of the cameras' offsets that is its radius, percentiles of the points'
+#: depths that are its bounds with their factors, weight of the near one, turns, and how many turns
+#: along the optical axis there are for each around it.
+_RADIUS_PERCENTILE, _DEPTH_PERCENTILES = 90.0, (0.1, 99.9)
+_NEAR_FACTOR, _FAR_FACTOR, _NEAR_WEIGHT = 0.9, 5.0, 0.25
+_TURNS, _AXIAL_RATE = 2, 0.5
+
+
+@dataclass(frozen=True)
+class Poses:
+    """The cameras that a path is fitted to, and the points that they see."""
+
+    train: Array
+    """[C, 4, 4] world to camera, of the training views; at least one."""
+    test: Array
+    """[T, 4, 4] world to camera, of the test views in their order; at least one."""
+    points: Array
+    """[P, 3] SfM points, world units; may be empty."""
+
+
+def orbit(poses: Poses, views: int) -> Array:
+    """Move on a circle around the point that the training cameras look at, and look at it.
+
+    The circle is level, at the median height and the median distance of the cameras. Where they
+    surround the point, it is closed. Where they leave a gap of more than 90 degrees, as those of a
+    forward-facing scene, the path swings to and fro over the arc that they span: nothing is known
+    of how the scene looks from elsewhere.
+
+    Args:
+        poses: What the path is fitted to.
+        views: Number of cameras, at least 1.
+
+    Returns:
+        [views, 4, 4] world to camera. The path can be repeated without a jump.
+    """
+    focus, up = look_at_point(poses), _up(poses.train)
+    first = _perpendicular(up)
+    second = np.cross(up, first)
+    offsets = camera_positions(poses.train) - focus  # [C, 3]
+    across, along = offsets @ first, offsets @ second
+    radius, height = np.median(np.hypot(across, along)), np.median(offsets @ up)
+    start, arc = _widest_arc(np.arctan2(along, across))
+    phase = np.arange(views) / views
+    if 2 * np.pi - arc < np.radians(_LARGEST_GAP):
+        angles = start + 2 * np.pi * phase
+    else:
+        angles = start + arc * (1 + np.sin(2 * np.pi * phase)) / 2
+    circle = np.cos(angles)[:, None] * first + np.sin(angles)[:, None] * second
+    positions = focus + radius * circle + height * up
+    return np.stack([_look_at(position, focus - position, up) for position in positions])
+
+
+def spiral(poses: Poses, views: int) -> Array:
+    """Move on LLFF's spiral around the mean training camera, and look at one point.
+
+    As `render_path_spiral` of [mildenhall2019]: two turns, whose radii along the axes of the mean
+    camera are the 90th percentiles of the cameras' offsets. All look at one point on the mean
+    camera's axis, at the harmonic mean of 0.9 times the nearest and 5 times the farthest depth of
+    the points, with weights 1/4 and 3/4.
+
+    Args:
+        poses: What the path is fitted to.
+        views: Number of cameras, at least 1.
+
+    Returns:
+        [views, 4, 4] world to camera. The path can be repeated without a jump.
+
+    Raises:
+        XrgsError: The cameras don't face one way.
+    """
+    directions = poses.train[:, 2, :3]
+    forward = directions.mean(axis=0)
+    if np.linalg.norm(forward) < _MIN_FACING:
+        raise XrgsError("path=spiral: the cameras don't face one way; take path=orbit")
+    positions, up = camera_positions(poses.train), _up(poses.train)
+    centre = positions.mean(axis=0)
+    mean_camera = _look_at(centre, forward, up)
+    rotation = mean_camera[:3, :3]  # its rows are the axes right, down, forward
+    offsets = (positions - centre) @ rotation.T  # [C, 3]
+    radii = np.percentile(np.abs(offsets), _RADIUS_PERCENTILE, axis=0)
+    near, far = np.percentile(_depths(poses), _DEPTH_PERCENTILES)
+    depth = 1 / (_NEAR_WEIGHT / (_NEAR_FACTOR * near) + (1 - _NEAR_WEIGHT) / (_FAR_FACTOR * far))
+    target = centre + depth * rotation[2]
+    angles = 2 * np.pi * _TURNS * np.arange(views) / views
+    # The minus signs of LLFF are of its axes up and backward; these are down and forward.
+    turns = np.stack([np.cos(angles), np.sin(angles), np.sin(_AXIAL_RATE * angles)], axis=1)
+    places = centre + (turns * radii) @ rotation
+    return np.stack([_look_at(place, target - place, up) for place in places])
+
+
+def through_test_views(poses: Poses, views: int) -> Array:
+    """Move through the test cameras in their order, at equal numbers of steps between two.
+
+    Positions are interpolated by cubic Hermite polynomials that don't overshoot (PCHIP), rotations
+    at constant angular velocity. The first camera is the first test view, the last one the last.
+
+    Args:
+        poses: What the path is fitted to.
+        views: Number of cameras, at least 1.
+
+    Returns:
+        [views, 4, 4] world to camera.
+    """
+    count = len(poses.test)
+    if count == 1:
+        return np.repeat(poses.test, views, axis=0)
+    keys, times = np.arange(count), np.linspace(0, count - 1, views)
+    positions = PchipInterpolator(keys, camera_positions(poses.test))(times)  # [views, 3]
+    rotations = Slerp(keys, Rotation.from_matrix(poses.test[:, :3, :3]))(times).as_matrix()
+    return _viewmats(rotations, positions)
+
+
+PATHS: dict[str, Callable[[Poses, int], Array]] = {
+    "orbit": orbit,
+    "spiral": spiral,
+    "test": through_test_views,
+}
+"""The kinds of paths by name."""
+
+
+def look_at_point(poses: Poses) -> Array:
+    """Return the point that the training cameras look at.
+
+    It is the point of least squared distance from the optical axes, and, with a small weight, from
+    the points on the axes at the median depth of what each camera sees. The latter decides where
+    the axes are nearly parallel, and leave the depth open.
+
+    Args:
+        poses: The cameras and points.
+
+    Returns:
+        [3]
+    """
+    positions, forward = camera_positions(poses.train), poses.train[:, 2, :3]
+    targets = positions + np.median(_depths(poses)) * forward  # [C, 3]
+    away = np.eye(3) - forward[:, :, None] * forward[:, None, :]  # [C, 3, 3] off the axis
+    matrix = away.sum(axis=0) + _DEPTH_WEIGHT * len(forward) * np.eye(3)
+    vector = np.einsum("cij,cj->i", away, positions) + _DEPTH_WEIGHT * targets.sum(axis=0)
+    focus: Array = np.linalg.solve(matrix, vector)
+    return focus
+
+
+def up_direction(poses: Poses) -> Array:
+    """Return the unit vector [3] that is up in the images of the training cameras, in the mean."""
+    return _up(poses.train)
+
+
+def _up(viewmats: Array) -> Array:
+    up = -viewmats[:, 1, :3].mean(axis=0)
+    return np.asarray(up / np.linalg.norm(up))
+
+
+def _depths(poses: Poses) -> Array:
+    """Return the depths above 0 of the points in all training cameras; 1 where there is none."""
+    viewmats = poses.train
+    depths = (poses.points @ viewmats[:, 2, :3].T + viewmats[:, 2, 3]).ravel()  # [P C]
+    in_front: Array = depths[depths > 0]
+    return in_front if len(in_front) else np.ones(1)
+
+
+def _perpendicular(axis: Array) -> Array:
+    """Return a unit vector [3] at a right angle to a unit vector."""
+    vector = np.cross(axis, np.eye(3)[np.abs(axis).argmin()])
+    return np.asarray(vector / np.linalg.norm(vector))
+
+
+def _widest_arc(angles: Array) -> tuple[float, float]:
+    """Return the start and the length, radians, of the arc that is left by the largest gap."""
+    ordered = np.sort(angles % (2 * np.pi))
+    gaps = np.diff(ordered, append=ordered[0] + 2 * np.pi)
+    largest = int(gaps.argmax())
+    start = ordered[(largest + 1) % len(ordered)]
+    return float(start), float(2 * np.pi - gaps[largest])
+
+
+def _look_at(position: Array, forward: Array, up: Array) -> Array:
+    """Return the viewmat [4, 4] of a camera that stands at a position and looks forward."""
+    right = np.cross(forward, up)
+    axes = np.stack([right, np.cross(forward, right), forward])
+    rotation = axes / np.linalg.norm(axes, axis=1, keepdims=True)
+    viewmat: Array = _viewmats(rotation[None], position[None])[0]
+    return viewmat
+
+
+def _viewmats(rotations: Array, positions: Array) -> Array:
+    """Return viewmats [n, 4, 4] of rotations from the world [n, 3, 3] and positions [n, 3]."""
+    viewmats = np.repeat(np.eye(4)[None], len(rotations), axis=0)
+    viewmats[:, :3, :3] = rotations
+    viewmats[:, :3, 3] = -np.einsum("nij,nj->ni", rotations, positions)
+    return viewmats

@@ -1,0 +1,62 @@
+"""Gaussians as the arrays that viewers in a browser draw: positions, covariances and flat colours.
+
+Such viewers sort and blend all Gaussians of a scene themselves. Beyond some hundred thousand that
+is slow, so the least opaque ones can be left out.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from xrgs.splat.quaternions import rotation_matrices
+from xrgs.splat.sh import sh_to_colors
+
+if TYPE_CHECKING:
+    from xrgs.splat.gaussians import Gaussians
+
+Array = NDArray[np.float32]
+
+
+@dataclass(frozen=True)
+class Splats:
+    """N Gaussians without harmonics above band 0, in the order of the model."""
+
+    centers: Array
+    """[N, 3] world units."""
+    covariances: Array
+    """[N, 3, 3] world units squared."""
+    colors: Array
+    """[N, 3] in 0..1."""
+    opacities: Array
+    """[N] in 0..1."""
+
+
+@torch.no_grad()
+def to_splats(gaussians: Gaussians, limit: int) -> Splats:
+    """Return the Gaussians of a model, at most so many of them.
+
+    Args:
+        gaussians: The model.
+        limit: The most Gaussians that are kept: those of the highest opacity; of equal ones, the
+            first.
+
+    Returns:
+        The Gaussians that are kept.
+    """
+    kept = gaussians.opacities.argsort(descending=True, stable=True)[:limit].sort().values
+    rotations, scales = rotation_matrices(gaussians.quats[kept]), gaussians.scales[kept].exp()
+    factor = rotations * scales[:, None, :]  # [N, 3, 3], each axis times its length
+    means, sh0 = gaussians.means[kept], gaussians.sh0[kept]
+    any_direction = torch.zeros_like(means)
+    arrays = (
+        means,
+        factor @ factor.transpose(1, 2),
+        sh_to_colors(0, any_direction, sh0, gaussians.shN[kept]).clamp(0, 1),
+        gaussians.opacities[kept].sigmoid(),
+    )
+    return Splats(*(array.numpy() for array in arrays))
