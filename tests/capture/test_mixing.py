@@ -55,7 +55,7 @@ def reconstruction(
     """SfM of the undegraded photographs, run once for all tests of what comes before and after."""
     work = tmp_path_factory.mktemp("work")
     inputs = []
-    for file in rendered.files:
+    for file in rendered.files.values():
         shutil.copy(str(file), work / file.name)
         inputs.append(SfmImage(file.name, "all"))
     return sfm.reconstruct(inputs, work, work, conf.sfm)
@@ -145,7 +145,7 @@ def test_by_megapixels_the_larger_photographs_are_hr(
     mix: Mix, rendered: Scene, tmp_path: Path, given: list[list[str]]
 ) -> None:
     files = []
-    for i, file in enumerate(rendered.files):
+    for i, file in enumerate(rendered.files.values()):
         files.append(ConfinedPath(tmp_path / file.name))
         photo = images.read(file)
         images.save(files[-1], images.resize(photo, 80, 60) if i % 3 else photo)
@@ -336,7 +336,7 @@ def test_a_collection_of_many_cameras_is_registered(
     conf = configured(long_side=320, tags="sampling_rate", factor=2, sfm=few)
     (tmp_path / "out").mkdir()
     made = mixing.mix_resolutions(
-        Scene("reichstag", "", tuple(map(ConfinedPath, files))),
+        Scene("reichstag", "", {file.stem: ConfinedPath(file) for file in files}),
         conf,
         tmp_path,
         ConfinedPath(tmp_path / "out"),

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
 
 #: Keys whose values are paths.
-_PATHS = frozenset({"scene.path", "store", "data_root"})
+_PATHS = frozenset({"scene.path", "store", "data_root", "variant.poses"})
 
 
 @contextmanager

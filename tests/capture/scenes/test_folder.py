@@ -30,7 +30,7 @@ def test_an_llff_scene_gives_the_smallest_copies_that_suffice(
     scene = scenes.resolve(
         SceneConf("fern", "folder", str(tmp_path)), ConfinedPath(tmp_path), long_side
     )
-    assert images.size(scene.files[0])[0] == width
+    assert images.size(next(iter(scene.files.values())))[0] == width
 
 
 def test_copies_are_measured_by_their_largest_photograph(fill: Fill, tmp_path: Path) -> None:
@@ -40,7 +40,7 @@ def test_copies_are_measured_by_their_largest_photograph(fill: Fill, tmp_path: P
     fill(tmp_path / "images_4", "b.png", size=(100, 75))
     (tmp_path / "images_4" / "c.png").write_text("no image")
     scene = scenes.resolve(SceneConf("x", "folder", str(tmp_path)), ConfinedPath(tmp_path), 100)
-    assert scene.files[0].path.parent.name == "images_4"
+    assert next(iter(scene.files.values())).path.parent.name == "images_4"
 
 
 @pytest.mark.parametrize(
@@ -78,7 +78,7 @@ def test_what_is_no_regular_file_is_left_out_with_a_warning(
     (folder / "f.png").symlink_to(folder / "c.png")
     (folder / "g.png").mkdir()
     scene = scenes.resolve(conf, ConfinedPath(tmp_path))
-    assert [file.name for file in scene.files] == ["a.png", "b.png"]
+    assert [file.name for file in scene.files.values()] == ["a.png", "b.png"]
     assert scene.fingerprint == only
     for name in "cdef":
         assert f"{folder}/{name}.png: not a regular file" in caplog.text
@@ -91,7 +91,7 @@ def test_a_link_to_a_photograph_is_one(fill: Fill, tmp_path: Path) -> None:
     for name in ("a.png", "b.png"):
         (tmp_path / "x" / name).symlink_to(tmp_path / "originals" / name)
     scene = scenes.resolve(SceneConf("", "folder", str(tmp_path / "x")), ConfinedPath(tmp_path))
-    assert [images.read(file).shape for file in scene.files] == [(30, 40, 3)] * 2
+    assert [images.read(file).shape for file in scene.files.values()] == [(30, 40, 3)] * 2
 
 
 def test_a_photograph_that_cant_be_read_now_stops_the_plan(
