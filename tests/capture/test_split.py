@@ -9,6 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from xrgs.capture.split import (
+    check_test_names,
     check_variant_conf,
     hr_geometry,
     shrink_factor,
@@ -226,3 +227,17 @@ def test_every_documented_value_and_limit_is_accepted(
     configured: Make, change: dict[str, Any]
 ) -> None:
     check_variant_conf(configured(**change))
+
+
+def test_named_views_are_held_out_in_place_of_every_nth(configured: Make) -> None:
+    conf = configured(test=["view_005", "view_002"], test_every=3)
+    parts = split_views(names(9), conf)
+    assert parts.test == (2, 5)
+    assert sorted(parts.hr + parts.lr) == [0, 1, 3, 4, 6, 7, 8]
+
+
+def test_an_unknown_test_view_is_refused_with_the_nearest_name(configured: Make) -> None:
+    check_test_names(names(9), configured(test=["view_004"]))
+    message = r"variant\.test: the scene has no view view_04\.png; did you mean view_004\?"
+    with pytest.raises(XrgsError, match=message):
+        check_test_names(names(9), configured(test=["view_003", "view_04.png"]))

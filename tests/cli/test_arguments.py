@@ -92,7 +92,7 @@ def test_a_scene_with_odd_names_is_swept_and_reported(
     scene = tmp_path / f"-部屋 🙂 {{it's}} 50%=#1; {ACCENT}, a"
     scene.mkdir()
     views = ['-a b\'s & "c" (1) 🙂', f"[{ACCENT}]=50%#, $x.y"]
-    for name, file in zip(views, motorcycle.files(), strict=True):
+    for name, file in zip(views, motorcycle.files().values(), strict=True):
         shutil.copy(file, scene / f"{name}.png")
     conf = ["preset=smoke", "train.steps=2", "variant.test_every=0", "variant.min_hr=1"]
     conf += ["variant.long_side=185", "variant.sfm.reference=false"]

@@ -254,5 +254,4 @@ def _viewmat(rows: object) -> NDArray[np.float64]:
         raise ValueError("transform_matrix is no rotation with a translation")
     pose = np.eye(4)
     pose[:3, :3], pose[:3, 3] = U @ Vt, matrix[:3, 3]
-    viewmat: NDArray[np.float64] = np.linalg.inv(pose @ _OPENGL)
-    return viewmat
+    return np.linalg.inv(pose @ _OPENGL).astype(np.float64)

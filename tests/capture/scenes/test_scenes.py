@@ -130,3 +130,16 @@ def test_fingerprints_need_neither_torch_nor_scikit_image() -> None:
         [sys.executable, "-P", "-c", script], capture_output=True, text=True, check=True
     )
     assert done.stdout.strip() == "[]"
+
+
+def test_folders_called_images_have_the_name_of_the_folder_around_them(tmp_path: Path) -> None:
+    for path in ("pa/images", "pb/images", "pa/other", "pb/other"):
+        (tmp_path / path).mkdir(parents=True)
+
+    def confs(*paths: str) -> list[SceneConf]:
+        return [SceneConf("", "folder", str(tmp_path / path)) for path in paths]
+
+    assert [scenes.label(conf) for conf in confs("pa/images", "pb/images")] == ["pa", "pb"]
+    scenes.check_labels(confs("pa/images", "pb/images", "pa/images"))
+    with pytest.raises(XrgsError, match=r"pa/other and .*pb/other: both are called other"):
+        scenes.check_labels(confs("pa/other", "pb/other"))

@@ -82,7 +82,7 @@ def names(conf: SceneConf, long_side: int = 0) -> list[str]:
         return list(folder.list_photographs(conf.path, long_side))
     if conf.kind == "motorcycle":
         return list(motorcycle.files())
-    return (video if conf.kind == "video" else procedural).names(conf.views)
+    return video.names(conf.views) if conf.kind == "video" else procedural.names(conf.views)
 
 
 def fingerprint(conf: SceneConf, long_side: int = 0) -> str:

@@ -153,7 +153,7 @@ def _frames(file: ConfinedPath) -> Iterator[VideoFrame]:
     try:
         with (
             file.open() as stream,
-            av.open(stream, options={"format_whitelist": _CONTAINERS}) as container,
+            av.open(stream, "r", options={"format_whitelist": _CONTAINERS}) as container,
         ):
             if not container.streams.video:
                 raise images.ImageError(f"{file}: it has no video")
