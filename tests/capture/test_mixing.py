@@ -340,7 +340,7 @@ def test_every_variant_in_conf_is_tested() -> None:
 
 
 def write_poses(folder: Path, names: Sequence[str]) -> None:
-    """Write a model with the exact cameras of the embedded scene, at twice its photographs' size."""
+    """Write a model with the embedded scene's exact cameras, at twice its photographs' size."""
     model = pycolmap.Reconstruction()
     fx, fy, cx, cy = (procedural.intrinsics(320)[i] for i in ((0, 0), (1, 1), (0, 2), (1, 2)))
     camera = pycolmap.Camera(

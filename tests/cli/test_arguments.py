@@ -85,6 +85,12 @@ def test_photographs_that_would_be_one_file_somewhere_are_named(
         folder.list_photographs(str(tmp_path), 0)
 
 
+def test_a_path_with_commas_may_end_with_all_folders_below(tmp_path: Path) -> None:
+    (tmp_path / "a, b").mkdir()
+    (override,) = with_quotes([f"scene.path={tmp_path}/a, b/**"])
+    assert override == f"scene.path='{tmp_path}/a, b/**'"
+
+
 @pytest.mark.slow
 def test_a_scene_with_odd_names_is_swept_and_reported(
     run_command: RunCommand, tmp_path: Path

@@ -150,7 +150,7 @@ def test_a_variant_is_exported_without_splats_and_read_as_poses(
 ) -> None:
     variant = next((store / "variants").glob("*-*"))
     for layout in ("colmap", "nerfstudio"):
-        code, said, err = xrgs_data("export", str(variant), f"format={layout}", f"out={layout}")
+        code, _, err = xrgs_data("export", str(variant), f"format={layout}", f"out={layout}")
         assert code == 0, err
         assert not (tmp_path / layout / "splats.ply").exists()
     poses.fingerprint(str(tmp_path / "colmap" / "sparse" / "0"))

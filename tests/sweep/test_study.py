@@ -17,6 +17,7 @@ from hydra.errors import CompactHydraException
 from omegaconf import DictConfig
 
 from xrgs import config
+from xrgs.errors import XrgsError
 from xrgs.experiment.identity import cell_identity
 from xrgs.experiment.store import BASELINE, Store
 from xrgs.safeio.hashing import digest
