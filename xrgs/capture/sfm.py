@@ -307,11 +307,9 @@ def to_numpy(model: Any, index: Mapping[str, int], report: Mapping[str, Any]) ->
         own = {number[p.point3D_id] for p in image.points2D if p.has_point3D()}
         observed[i] = np.array(sorted(own), dtype=np.intp)
     points, colors = points_of(model)
-    results = {
-        "registered": len(viewmats),
-        "points": len(points),
-        "reprojection_error_px": float(model.compute_mean_reprojection_error()),
-    }
+    results: dict[str, Any] = {"registered": len(viewmats), "points": len(points)}
+    if model.compute_num_observations():  # a model of another program may have none
+        results["reprojection_error_px"] = float(model.compute_mean_reprojection_error())
     return Reconstruction(lenses, viewmats, points, colors, observed, {**report, **results})
 
 

@@ -158,6 +158,12 @@ def test_what_is_not_read_is_named(
     assert "images left out: 1 of a format that is not read (c.DNG)" in caplog.text
     assert f"videos left out: 1 (scene=video scene.path={tmp_path / 'x' / 'd.mov'}" in caplog.text
     assert "notes.txt" not in caplog.text
+    caplog.clear()
+    fill(tmp_path / "y" / "one", "a.png", "b.png")
+    (tmp_path / "y" / "films").mkdir()
+    (tmp_path / "y" / "films" / "e.mp4").write_bytes(b"content")
+    scenes.fingerprint(SceneConf("", "folder", f"{tmp_path / 'y'}/**"))
+    assert "films/e.mp4" in caplog.text
 
 
 def test_heic_is_listed_and_needs_its_package(

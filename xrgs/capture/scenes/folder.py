@@ -76,7 +76,8 @@ def list_photographs(path: str | None, long_side: int) -> dict[str, Path]:
         nested = path.endswith(ALL_BELOW)
         taken = _all_below(folder) if nested else _select(folder, long_side)
         left_out = [] if nested else _in_other_folders(folder, taken)
-        for parent in sorted({folder, *(file.parent for file in taken)}):
+        looked_in = _folders(folder) if nested else {folder, *(file.parent for file in taken)}
+        for parent in sorted(looked_in):
             left_out += _not_read(parent)
     except OSError as error:
         raise UnreadableError(f"{error.filename}: {error.strerror}; try again") from error
@@ -88,16 +89,11 @@ def list_photographs(path: str | None, long_side: int) -> dict[str, Path]:
     for line in left_out:
         _log.warning("%s", for_line(f"{folder}: {line}"))
     _check_heic(taken)
-    return _by_name([(view_name(file, folder if nested else file.parent), file) for file in taken])
+    return _by_name([(_view_name(file, folder if nested else file.parent), file) for file in taken])
 
 
-def view_name(file: Path, folder: Path) -> str:
-    """Return the name of the view of a photograph.
-
-    Args:
-        file: The photograph, in or below the folder.
-        folder: The folder that names are relative to.
-    """
+def _view_name(file: Path, folder: Path) -> str:
+    """Return the name of the view of a photograph in or below a folder."""
     return "_".join(file.relative_to(folder).with_suffix("").parts)
 
 
