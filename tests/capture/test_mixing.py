@@ -342,7 +342,7 @@ def test_every_variant_in_conf_is_tested() -> None:
 def write_poses(folder: Path, names: Sequence[str]) -> None:
     """Write a model with the embedded scene's exact cameras, at twice its photographs' size."""
     model = pycolmap.Reconstruction()
-    fx, fy, cx, cy = (procedural.intrinsics(320)[i] for i in ((0, 0), (1, 1), (0, 2), (1, 2)))
+    fx, fy, cx, cy = (procedural.intrinsics(320, 240)[i] for i in ((0, 0), (1, 1), (0, 2), (1, 2)))
     camera = pycolmap.Camera(
         camera_id=1, model="PINHOLE", width=320, height=240, params=[fx, fy, cx, cy]
     )
@@ -366,7 +366,7 @@ def test_given_poses_replace_sfm_and_are_scaled_for_lr_views(
     assert given == [], "no SfM, nor one of the undegraded photographs"
     assert made.report["not_registered"] == names[-1:]
     assert {view.name for view in made.views} == set(names[:-1])
-    exact = procedural.intrinsics(160)
+    exact = procedural.intrinsics(160, 120)
     for view in made.views:
         assert np.allclose(view.viewmat, procedural.viewmats(VIEWS)[number(view)], atol=1e-9)
         scale = view.width / 160
