@@ -41,7 +41,7 @@ ONLY_IN = {
     "aiohttp": ("capture/download/exchange",),
     "hydra": ("config", "sweep", "cli"),
     "omegaconf": ("config", "sweep", "cli"),
-    "pycolmap": ("capture/sfm",),
+    "pycolmap": ("capture/colmap", "capture/sfm"),
     "matplotlib": ("report",),
     "pandas": ("experiment", "report"),
     "kornia": ("evaluation/metrics", "bench"),
@@ -97,6 +97,7 @@ FILE_FUNCTIONS: dict[str, dict[str, str]] = {
     "shutil.copyfileobj": {
         "capture/download/unpack": "from stream to stream",
         "experiment/cell_folder": "from stream to stream",
+        "experiment/export": "from stream to stream",
     },
     "tempfile.": {
         "bench/against": "a folder of its own in /tmp",

@@ -46,11 +46,13 @@ class SceneConf:
     name: str = MISSING
     """Label in tables; where it is empty, the name of the folder."""
     kind: str = MISSING
-    """`procedural`, `motorcycle` or `folder`, each a module of `xrgs.capture.scenes`."""
+    """`procedural`, `motorcycle`, `folder` or `video`, each a module of `xrgs.capture.scenes`."""
     path: str | None = MISSING
-    """With `kind=folder`: the folder of photographs, or an LLFF scene (images/, images_4/, ...)."""
+    """With `kind=folder`: the folder of photographs, or an LLFF scene (images/, images_4/, ...);
+    with `/**` at its end, the photographs of all folders below. With `kind=video`: the file."""
     views: int = MISSING
-    """With `kind=procedural`: number of views that are rendered."""
+    """With `kind=procedural`: number of views that are rendered; with `kind=video`: number of
+    frames that are taken."""
 
 
 @dataclass
@@ -104,6 +106,12 @@ class VariantConf:
     test_every: int = MISSING
     """Every n-th view is held out for testing, beginning with the first; 0 trains on all views and
     tests on the same poses."""
+    test: list[str] = MISSING
+    """Names of the views that are held out for testing, in place of every n-th; empty goes by
+    `test_every`."""
+    poses: str | None = MISSING
+    """Cameras and points to take in place of a new SfM: a folder of COLMAP's (`sparse/0`) or a
+    `transforms.json`; None runs SfM. The variant's identity has its content."""
     seed: int = MISSING
     """Seed of `selection=random`. It is not the seed of training: training seeds share one variant
     unless this follows them (`variant.seed=${seed}`). The two make a replicate."""

@@ -1,8 +1,10 @@
 from __future__ import annotations
 
+import sys
 from pathlib import Path
 
 import numpy as np
+import pillow_heif
 import pytest
 from PIL import Image
 
@@ -86,3 +88,29 @@ def test_shrinking_is_pillows_antialiased_bicubic(noise: images.ImageArray) -> N
 
 def test_resizing_to_the_same_size_changes_nothing(noise: images.ImageArray) -> None:
     assert images.resize(noise, 60, 40) is noise
+
+
+@pytest.mark.parametrize(("orientation", "turns"), [(1, 0), (6, -1)])
+def test_heic_is_read_upright(
+    tmp_path: Path, noise: images.ImageArray, orientation: int, turns: int
+) -> None:
+    stored = Image.fromarray((noise * 255).astype(np.uint8))
+    exif = Image.Exif()
+    exif[0x0112], exif[0x010F] = orientation, "Maker"
+    heif = pillow_heif.from_pillow(stored)
+    lossless = {"quality": -1, "chroma": 444, "matrix_coefficients": 0}
+    heif.save(tmp_path / "a.heic", **lossless, exif=exif.tobytes())
+    read = images.read(tmp_path / "a.heic")
+    expected = np.rot90(np.asarray(stored), turns)
+    assert np.array_equal(np.round(read * 255), expected)
+    assert images.size(tmp_path / "a.heic") == (expected.shape[1], expected.shape[0])
+    assert images.exif_camera(tmp_path / "a.heic") == "Maker"
+
+
+def test_heic_without_its_package_says_what_to_install(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(sys.modules, "pillow_heif", None)
+    (tmp_path / "a.heic").write_bytes(b"\0\0\0\x18ftypheic" + bytes(100))
+    with pytest.raises(ImageError, match=r"a\.heic: .*pip install 'xrgs\[heic\]'"):
+        images.size(tmp_path / "a.heic")

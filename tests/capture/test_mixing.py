@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shutil
+import zlib  # noqa: F401  pycolmap corrupts the heap where it is imported before zlib
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
@@ -10,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pycolmap
 import pytest
 
 from xrgs import config
@@ -55,7 +57,7 @@ def reconstruction(
     """SfM of the undegraded photographs, run once for all tests of what comes before and after."""
     work = tmp_path_factory.mktemp("work")
     inputs = []
-    for file in rendered.files:
+    for file in rendered.files.values():
         shutil.copy(str(file), work / file.name)
         inputs.append(SfmImage(file.name, "all"))
     return sfm.reconstruct(inputs, work, work, conf.sfm)
@@ -123,6 +125,22 @@ def test_by_sampling_rate_the_highest_are_hr_and_nothing_is_degraded(
     assert made.report["rho"]["HR"][0] == min(v.rho for v in high)
 
 
+def test_photographs_of_one_resolution_are_said_to_make_no_mixture(
+    mix: Mix, caplog: pytest.LogCaptureFixture
+) -> None:
+    """The embedded scene's cameras are all about as far away: rho differs by 15 % at most."""
+    made = mix(tags="sampling_rate")
+    (note,) = made.report["notes"]
+    rho = [view.rho for view in made.views if view.split == "train"]
+    assert "variant.tags=sampling_rate is meaningless" in note
+    assert f"rho is {min(rho):.3f} to {max(rho):.3f}" in note
+    assert note in caplog.text
+
+
+def test_a_mixture_is_not_said_to_be_none(mix: Mix) -> None:
+    assert mix(tags="flag").report["notes"] == []
+
+
 def test_a_threshold_of_the_rate_takes_those_above_it(mix: Mix) -> None:
     made = mix(tags="sampling_rate", hr_above=0.93)
     assert of(made, "train", "HR")
@@ -144,12 +162,11 @@ def test_by_distance_the_closest_are_hr(mix: Mix) -> None:
 def test_by_megapixels_the_larger_photographs_are_hr(
     mix: Mix, rendered: Scene, tmp_path: Path, given: list[list[str]]
 ) -> None:
-    files = []
-    for i, file in enumerate(rendered.files):
-        files.append(ConfinedPath(tmp_path / file.name))
+    files = {name: ConfinedPath(tmp_path / file.name) for name, file in rendered.files.items()}
+    for i, (name, file) in enumerate(rendered.files.items()):
         photo = images.read(file)
-        images.save(files[-1], images.resize(photo, 80, 60) if i % 3 else photo)
-    scene = replace(rendered, files=tuple(files), viewmats={})
+        images.save(files[name], images.resize(photo, 80, 60) if i % 3 else photo)
+    scene = replace(rendered, files=files, viewmats={})
     made = mix(scene, tags="megapixels", hr_above=0.75)
     assert {number(v) for v in of(made, "train", "HR")} == {3, 6, 9}
     assert all((v.width, v.height) == (80, 60) for v in of(made, "train", "LR"))
@@ -319,6 +336,58 @@ def test_every_variant_in_conf_is_tested() -> None:
     assert files == {"digital_zoom", "distance", "jpeg", "megapixels", "sampling_rate"}
 
 
+# what the user gives
+
+
+def write_poses(folder: Path, names: Sequence[str]) -> None:
+    """Write a model with the embedded scene's exact cameras, at twice its photographs' size."""
+    model = pycolmap.Reconstruction()
+    fx, fy, cx, cy = (procedural.intrinsics(320, 240)[i] for i in ((0, 0), (1, 1), (0, 2), (1, 2)))
+    camera = pycolmap.Camera(
+        camera_id=1, model="PINHOLE", width=320, height=240, params=[fx, fy, cx, cy]
+    )
+    model.add_camera_with_trivial_rig(camera)
+    for i, name in enumerate(names):
+        matrix = procedural.viewmats(VIEWS)[int(name[-3:])]
+        image = pycolmap.Image(name=f"{name}.jpg", camera_id=1, image_id=i + 1)
+        model.add_image_with_trivial_frame(image, pycolmap.Rigid3d(matrix[:3]))
+    for point in np.random.default_rng(0).uniform((-1, -1, 5), (1, 1, 6), (20, 3)):
+        model.add_point3D(point, pycolmap.Track())
+    folder.mkdir()
+    model.write_binary(folder)
+
+
+def test_given_poses_replace_sfm_and_are_scaled_for_lr_views(
+    mix: Mix, rendered: Scene, given: list[list[str]], tmp_path: Path
+) -> None:
+    names = list(rendered.files)
+    write_poses(tmp_path / "poses", names[:-1])
+    made = mix(poses=str(tmp_path / "poses"))
+    assert given == [], "no SfM, nor one of the undegraded photographs"
+    assert made.report["not_registered"] == names[-1:]
+    assert {view.name for view in made.views} == set(names[:-1])
+    exact = procedural.intrinsics(160, 120)
+    for view in made.views:
+        assert np.allclose(view.viewmat, procedural.viewmats(VIEWS)[number(view)], atol=1e-9)
+        scale = view.width / 160
+        assert scale in {1, 1 / 5}
+        assert np.allclose(view.K, np.diag([scale, scale, 1]) @ exact, atol=1e-9)
+    assert {v.name for v in of(made, "train", "LR")} == set(made.report["lr"]) - {names[-1]}
+
+
+def test_too_few_given_poses_are_refused(mix: Mix, rendered: Scene, tmp_path: Path) -> None:
+    write_poses(tmp_path / "poses", list(rendered.files)[:5])
+    with pytest.raises(SceneFailed, match=r"variant\.poses has 5 of 12 views .* and 20 points"):
+        mix(poses=str(tmp_path / "poses"))
+
+
+def test_named_test_views_are_held_out(mix: Mix) -> None:
+    made = mix(test=["view_001", "view_006"], test_every=0)
+    assert {v.name for v in made.views if v.split == "test"} == {"view_001", "view_006"}
+    assert not {"view_001", "view_006"} & {v.name for v in made.views if v.split == "train"}
+    assert made.held_out
+
+
 # real photographs
 
 
@@ -336,7 +405,7 @@ def test_a_collection_of_many_cameras_is_registered(
     conf = configured(long_side=320, tags="sampling_rate", factor=2, sfm=few)
     (tmp_path / "out").mkdir()
     made = mixing.mix_resolutions(
-        Scene("reichstag", "", tuple(map(ConfinedPath, files))),
+        Scene("reichstag", "", {file.stem: ConfinedPath(file) for file in files}),
         conf,
         tmp_path,
         ConfinedPath(tmp_path / "out"),

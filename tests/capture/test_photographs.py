@@ -79,7 +79,7 @@ def test_a_photograph_taken_sideways_is_prepared_upright(tmp_path: Path) -> None
         write_photograph(tmp_path / "a.png"),
         write_photograph(tmp_path / "b.png", orientation=6),
     ]
-    photos = prepare_hr_views(Scene("x", "", tuple(files)), CONF, tmp_path)
+    photos = prepare_hr_views(Scene("x", "", {file.stem: file for file in files}), CONF, tmp_path)
     assert [photo.size for photo in photos.all] == [(60, 40), (40, 60)]
     assert photos[0].camera != photos[1].camera
     upright = photos.read("hr", 1)
@@ -91,7 +91,7 @@ def test_all_are_shrunk_by_one_scale(tmp_path: Path) -> None:
     sizes = [(200, 100), (100, 200), (120, 60), (50, 50)]
     files = [write_photograph(tmp_path / f"{i}.png", size) for i, size in enumerate(sizes)]
     conf = VariantConf(long_side=100, factor=2, sfm=SfmConf(camera="auto"))
-    photos = prepare_hr_views(Scene("x", "", tuple(files)), conf, tmp_path)
+    photos = prepare_hr_views(Scene("x", "", {file.stem: file for file in files}), conf, tmp_path)
     assert [p.hr.resized for p in photos.all] == [(100, 50), (50, 100), (60, 30), (25, 25)]
     assert [(p.hr.width, p.hr.height) for p in photos.all][-1] == (24, 24)
     assert photos.size("hr", 3) == (24, 24)
@@ -100,7 +100,7 @@ def test_all_are_shrunk_by_one_scale(tmp_path: Path) -> None:
 def test_a_photograph_too_small_for_its_copy_is_named(tmp_path: Path) -> None:
     files = [write_photograph(tmp_path / "a.png"), write_photograph(tmp_path / "b.png", (60, 21))]
     with pytest.raises(XrgsError, match=r"b\.png: variant\.factor=2: LR views of 30x10 px"):
-        prepare_hr_views(Scene("x", "", tuple(files)), CONF, tmp_path)
+        prepare_hr_views(Scene("x", "", {file.stem: file for file in files}), CONF, tmp_path)
 
 
 def test_a_file_without_a_header_is_left_out_too(tmp_path: Path) -> None:
@@ -110,7 +110,7 @@ def test_a_file_without_a_header_is_left_out_too(tmp_path: Path) -> None:
         ConfinedPath(tmp_path / "b.png"),
         write_photograph(tmp_path / "c.png"),
     ]
-    photos = prepare_hr_views(Scene("x", "", tuple(files)), CONF, tmp_path)
+    photos = prepare_hr_views(Scene("x", "", {file.stem: file for file in files}), CONF, tmp_path)
     assert photos.names == ["a", "c"]
     assert "b.png" in photos.unreadable[0]
 
@@ -130,7 +130,7 @@ def test_a_photograph_that_cant_be_read_now_is_not_left_out(
 
     monkeypatch.setattr(images, failing, fails)
     with pytest.raises(UnreadableError, match=r"b\.png"):
-        prepare_hr_views(Scene("x", "", tuple(files)), CONF, tmp_path)
+        prepare_hr_views(Scene("x", "", {file.stem: file for file in files}), CONF, tmp_path)
 
 
 def test_an_hr_view_that_no_variant_may_have_names_the_key(
@@ -139,7 +139,7 @@ def test_an_hr_view_that_no_variant_may_have_names_the_key(
     monkeypatch.setattr(images, "MAX_PNG_PIXELS", 60 * 40 - 1)
     files = [write_photograph(tmp_path / f"{name}.png") for name in "ab"]
     with pytest.raises(XrgsError, match=r"a\.png: an HR view of 60x40 px .*variant\.long_side=0"):
-        prepare_hr_views(Scene("x", "", tuple(files)), CONF, tmp_path)
+        prepare_hr_views(Scene("x", "", {file.stem: file for file in files}), CONF, tmp_path)
 
 
 def test_a_camera_with_damaged_exif_is_one_without(

@@ -60,7 +60,7 @@ def stereo_pair(tmp_path_factory: pytest.TempPathFactory, sfm_conf: SfmConf) -> 
     work = tmp_path_factory.mktemp("pair")
     scene = scenes.resolve(SceneConf("motorcycle", "motorcycle"), ConfinedPath(work))
     inputs = []
-    for file in scene.files:
+    for file in scene.files.values():
         images.save(work / file.name, images.read(file))
         inputs.append(sfm.SfmImage(file.name, file.stem, scene.intrinsics[file.stem]))
     return work, sfm.reconstruct(inputs, work, work, sfm_conf)

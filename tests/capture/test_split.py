@@ -9,6 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from xrgs.capture.split import (
+    check_test_names,
     check_variant_conf,
     hr_geometry,
     shrink_factor,
@@ -19,6 +20,11 @@ from xrgs.errors import XrgsError
 from xrgs.splat.ssim import WINDOW
 
 Make = Callable[..., VariantConf]
+
+
+def names(views: int) -> list[str]:
+    return [f"view_{i:03d}" for i in range(views)]
+
 
 CHANGES = st.fixed_dictionaries(
     {
@@ -35,7 +41,7 @@ CHANGES = st.fixed_dictionaries(
 def test_the_parts_are_disjoint_ordered_and_cover_all(
     configured: Make, views: int, changes: dict[str, Any]
 ) -> None:
-    parts = split_views(views, configured(**changes))
+    parts = split_views(names(views), configured(**changes))
     assert sorted(parts.test + parts.hr + parts.lr) == list(range(views))
     for part in (parts.test, parts.hr, parts.lr):
         assert list(part) == sorted(part)
@@ -46,7 +52,7 @@ def test_the_share_that_stays_hr_is_exact(
     configured: Make, views: int, changes: dict[str, Any]
 ) -> None:
     conf = configured(**changes)
-    parts = split_views(views, conf)
+    parts = split_views(names(views), conf)
     train = len(parts.hr) + len(parts.lr)
     expected = max(conf.min_hr, round(conf.hr_fraction * train))
     assert len(parts.hr) == min(train, expected)
@@ -58,25 +64,27 @@ def test_every_nth_view_is_held_out_and_none_where_it_is_zero(
 ) -> None:
     conf = configured(**changes)
     expected = [i for i in range(views) if conf.test_every and i % conf.test_every == 0]
-    assert list(split_views(views, conf).test) == expected
+    assert list(split_views(names(views), conf).test) == expected
 
 
 @given(st.integers(2, 200), CHANGES)
 def test_the_split_is_a_function_of_its_config(
     configured: Make, views: int, changes: dict[str, Any]
 ) -> None:
-    assert split_views(views, configured(**changes)) == split_views(views, configured(**changes))
+    assert split_views(names(views), configured(**changes)) == split_views(
+        names(views), configured(**changes)
+    )
 
 
 def test_another_seed_chooses_other_views_and_holds_out_the_same(configured: Make) -> None:
-    a, b = split_views(40, configured()), split_views(40, configured(seed=1))
+    a, b = split_views(names(40), configured()), split_views(names(40), configured(seed=1))
     assert a.test == b.test == (0, 8, 16, 24, 32)
     assert a.hr != b.hr
 
 
 def test_a_uniform_selection_is_evenly_spaced(configured: Make) -> None:
     conf = configured(selection="uniform", test_every=0, hr_fraction=0.25, min_hr=0)
-    assert split_views(16, conf).hr == (2, 6, 10, 14)
+    assert split_views(names(16), conf).hr == (2, 6, 10, 14)
 
 
 scored = st.lists(st.floats(0.01, 1), min_size=2, max_size=60, unique=True)
@@ -97,9 +105,9 @@ def test_of_scored_views_the_best_share_is_hr(
     count = round(fraction * len(train))
     if 0 < fraction < 1 and count in (0, len(train)):
         with pytest.raises(XrgsError, match=r"variant\.hr_fraction"):
-            split_views(len(scores), conf, scores)
+            split_views(names(len(scores)), conf, scores)
         return
-    parts = split_views(len(scores), conf, scores)
+    parts = split_views(names(len(scores)), conf, scores)
     best = sorted(train, key=lambda i: scores[i], reverse=True)[:count]
     assert parts.hr == tuple(sorted(best))
     assert parts.lr == tuple(i for i in train if i not in best)
@@ -107,17 +115,19 @@ def test_of_scored_views_the_best_share_is_hr(
 
 def test_views_of_equal_score_are_of_one_class(by_rate: Make) -> None:
     conf = by_rate(hr_fraction=0.5, test_every=0)
-    assert split_views(6, conf, [1, 0.5, 0.5, 0.5, 0.5, 0.2]).hr == (0, 1, 2, 3, 4)
+    assert split_views(names(6), conf, [1, 0.5, 0.5, 0.5, 0.5, 0.2]).hr == (0, 1, 2, 3, 4)
 
 
 def test_a_view_without_a_score_is_lr_and_not_counted(by_rate: Make) -> None:
     conf = by_rate(hr_fraction=0.5, test_every=0)
-    assert split_views(5, conf, [0.5, float("nan"), 1, float("nan"), float("nan")]).hr == (2,)
+    assert split_views(names(5), conf, [0.5, float("nan"), 1, float("nan"), float("nan")]).hr == (
+        2,
+    )
 
 
 def test_a_threshold_of_the_score_is_inclusive(by_rate: Make) -> None:
     conf = by_rate(hr_above=0.75, test_every=0)
-    assert split_views(4, conf, [1, 0.75, 0.7499, 0.1]).hr == (0, 1)
+    assert split_views(names(4), conf, [1, 0.75, 0.7499, 0.1]).hr == (0, 1)
 
 
 def test_one_factor_brings_the_longest_side_to_long_side(configured: Make) -> None:
@@ -217,3 +227,17 @@ def test_every_documented_value_and_limit_is_accepted(
     configured: Make, change: dict[str, Any]
 ) -> None:
     check_variant_conf(configured(**change))
+
+
+def test_named_views_are_held_out_in_place_of_every_nth(configured: Make) -> None:
+    conf = configured(test=["view_005", "view_002"], test_every=3)
+    parts = split_views(names(9), conf)
+    assert parts.test == (2, 5)
+    assert sorted(parts.hr + parts.lr) == [0, 1, 3, 4, 6, 7, 8]
+
+
+def test_an_unknown_test_view_is_refused_with_the_nearest_name(configured: Make) -> None:
+    check_test_names(names(9), configured(test=["view_004"]))
+    message = r"variant\.test: the scene has no view view_04\.png; did you mean view_004\?"
+    with pytest.raises(XrgsError, match=message):
+        check_test_names(names(9), configured(test=["view_003", "view_04.png"]))

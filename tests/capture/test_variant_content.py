@@ -164,7 +164,7 @@ def photographs(tmp_path: Path, procedural_scene: SceneConf) -> Callable[[str, i
         (tmp_path / name).mkdir()
         cache = ConfinedPath(tmp_path) / "scenes"
         rendered = scenes.resolve(replace(procedural_scene, views=count), cache, 252)
-        for i, file in enumerate(rendered.files):
+        for i, file in enumerate(rendered.files.values()):
             shutil.copy(str(file), tmp_path / name / f"vue d'été {i}, x.png")
         return SceneConf("", "folder", str(tmp_path / name))
 

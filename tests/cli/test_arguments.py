@@ -86,6 +86,12 @@ def test_photographs_that_would_be_one_file_somewhere_are_named(
         folder.list_photographs(str(tmp_path), 0)
 
 
+def test_a_path_with_commas_may_end_with_all_folders_below(tmp_path: Path) -> None:
+    (tmp_path / "a, b").mkdir()
+    (override,) = with_quotes([f"scene.path={tmp_path}/a, b/**"])
+    assert override == f"scene.path='{tmp_path}/a, b/**'"
+
+
 @pytest.mark.slow
 def test_a_scene_with_odd_names_is_swept_and_reported(
     run_command: RunCommand, tmp_path: Path
@@ -93,7 +99,7 @@ def test_a_scene_with_odd_names_is_swept_and_reported(
     scene = tmp_path / f"-部屋 🙂 {{it's}} 50%=#1; {ACCENT}, a"
     scene.mkdir()
     views = ['-a b\'s & "c" (1) 🙂', f"[{ACCENT}]=50%#, $x.y"]
-    for name, file in zip(views, motorcycle.files(), strict=True):
+    for name, file in zip(views, motorcycle.files().values(), strict=True):
         shutil.copy(file, scene / f"{name}.png")
     conf = ["preset=smoke", "train.steps=2", "variant.test_every=0", "variant.min_hr=1"]
     conf += ["variant.long_side=185", "variant.sfm.reference=false"]

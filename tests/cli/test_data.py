@@ -2,15 +2,24 @@
 
 from __future__ import annotations
 
+import json
+import zlib  # noqa: F401  pycolmap corrupts the heap where it is imported before zlib
 from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
+import numpy as np
+import pycolmap
 import pytest
+import torch
+from numpy.typing import NDArray
+from PIL import Image
+from plyfile import PlyData
 
+import xrgs
 import xrgs.report.variant
-from xrgs.capture import variant
+from xrgs.capture import poses, variant
 from xrgs.sweep.jobs import worker
 
 XrgsData = Callable[..., tuple[int, str, str]]
@@ -62,3 +71,102 @@ def test_inspect_builds_a_variant_that_the_store_lacks(
     assert code == 0, err
     assert out.strip() == "s/variants/k-1 x.png"
     assert jobs == ([] if built else [("variant", "motorcycle")])
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("layout", ["colmap", "nerfstudio"])
+def test_exported_splats_cameras_and_points_are_in_one_frame(
+    xrgs_data: XrgsData, store: Path, tmp_path: Path, layout: str
+) -> None:
+    """The exported splats are rendered with the exported cameras, as other programs read them."""
+    cell = sorted((store / "cells").iterdir())[0]
+    out = tmp_path / "out"
+    code, said, err = xrgs_data("export", str(cell), f"format={layout}", f"out={out}")
+    assert code == 0, err
+    assert "2 training and 2 test views" in said
+    cameras, points = (read_colmap if layout == "colmap" else read_transforms)(out)
+    split = json.loads((out / "split.json").read_text())["images"]
+    assert {entry["file"] for entry in split} == cameras.keys()
+    assert {(entry["split"], entry["tag"]) for entry in split} == {
+        *(("train", "HR"), ("train", "LR"), ("test", "HR"))
+    }
+    gaussians = xrgs.load_ply(out / "splats.ply")
+    for entry in split:
+        viewmat, K, size = cameras[entry["file"]]
+        with Image.open(out / "images" / entry["file"]) as image:
+            assert image.size == size
+        if entry["split"] == "test":
+            camera = xrgs.Camera(viewmat.float(), K.float(), *size)
+            render = xrgs.rasterize(gaussians, camera).image.detach().clamp(0, 1)
+            with Image.open(cell / "renders" / f"{entry['view']}.png") as stored:
+                expected = torch.from_numpy(np.array(stored)) / 255.0
+            assert expected.std() > 0.03, "an empty render would look the same from anywhere"
+            assert (render - expected).abs().max() < 0.6 / 255
+    variant = next((store / "variants").glob("*-*"))
+    transform = np.array(json.loads((out / "transform.json").read_text())["sfm_to_export"])
+    with np.load(variant / "points.npz") as arrays:
+        moved = arrays["points"] @ transform[:3, :3].T + transform[:3, 3]
+    assert np.allclose(moved, points, atol=1e-5)
+
+
+Cameras = dict[str, tuple[torch.Tensor, torch.Tensor, tuple[int, int]]]
+
+
+def read_colmap(out: Path) -> tuple[Cameras, NDArray[np.float64]]:
+    """Viewmats, intrinsics and sizes by image, and the points, as pycolmap reads them."""
+    model = pycolmap.Reconstruction(out / "sparse" / "0")
+    cameras = {}
+    for image in model.images.values():
+        camera = model.cameras[image.camera_id]
+        viewmat = torch.eye(4, dtype=torch.float64)
+        viewmat[:3] = torch.from_numpy(image.cam_from_world().matrix())
+        K = torch.from_numpy(camera.calibration_matrix())
+        cameras[image.name] = viewmat, K, (camera.width, camera.height)
+    tests = (out / "sparse" / "0" / "test.txt").read_text().splitlines()
+    assert tests == [name for name in cameras if name.startswith("test_")]
+    return cameras, np.array([point.xyz for _, point in sorted(model.points3D.items())])
+
+
+def read_transforms(out: Path) -> tuple[Cameras, NDArray[np.float64]]:
+    """The same of transforms.json, by nerfstudio's convention of axes."""
+    content = json.loads((out / "transforms.json").read_text())
+    cameras = {}
+    for frame in content["frames"]:
+        pose = torch.tensor(frame["transform_matrix"], dtype=torch.float64)
+        pose[:3, 1:3] *= -1
+        K = torch.tensor(
+            [[frame["fl_x"], 0, frame["cx"]], [0, frame["fl_y"], frame["cy"]], [0, 0, 1]]
+        )
+        name = frame["file_path"].removeprefix("images/")
+        cameras[name] = pose.inverse(), K, (frame["w"], frame["h"])
+    assert content["train_filenames"] == [f"images/{name}" for name in cameras if "train" in name]
+    assert content["test_filenames"] == [f"images/{name}" for name in cameras if "test" in name]
+    vertices = PlyData.read(out / content["ply_file_path"])["vertex"]
+    return cameras, np.stack([vertices[axis] for axis in "xyz"], axis=1)
+
+
+@pytest.mark.slow
+def test_a_variant_is_exported_without_splats_and_read_as_poses(
+    xrgs_data: XrgsData, store: Path, tmp_path: Path
+) -> None:
+    variant = next((store / "variants").glob("*-*"))
+    for layout in ("colmap", "nerfstudio"):
+        code, _, err = xrgs_data("export", str(variant), f"format={layout}", f"out={layout}")
+        assert code == 0, err
+        assert not (tmp_path / layout / "splats.ply").exists()
+    poses.fingerprint(str(tmp_path / "colmap" / "sparse" / "0"))
+    poses.fingerprint(str(tmp_path / "nerfstudio" / "transforms.json"))
+
+
+def test_what_cant_be_exported_is_named(xrgs_data: XrgsData, tmp_path: Path) -> None:
+    (tmp_path / "empty").mkdir()
+    for arguments, message in (
+        ([], "export: give the folder of a cell or a variant"),
+        (["gone"], "gone: No such file or directory; give the folder"),
+        (["empty"], "empty: neither a cell nor a variant"),
+        (["empty", "format=obj"], "format=obj: must be one of colmap, nerfstudio"),
+        (["empty", "to=x"], "export: give the folder"),
+    ):
+        code, out, err = xrgs_data("export", *arguments)
+        assert (code, out) == (1, "")
+        assert message in err

@@ -17,6 +17,7 @@ from hydra.errors import CompactHydraException
 from omegaconf import DictConfig
 
 from xrgs import config
+from xrgs.errors import XrgsError
 from xrgs.experiment.identity import cell_identity
 from xrgs.experiment.store import BASELINE, Store
 from xrgs.safeio.hashing import digest
@@ -144,6 +145,39 @@ def test_a_condition_says_where_scores_are_of_held_out_training_views(
     assert len(plan) == 3 * len(conditions), "baseline, reference and matched"
     assert len({cell.spec for cell in plan}) == len(plan)
     assert all(cell.reference in {c.spec for c in plan} for cell in plan if cell.reference)
+
+
+@pytest.mark.parametrize(
+    ("fixed", "conditions"),
+    [
+        ("variant.test_every=0", {"scored on the training views"}),
+        ("variant.test_every=8", {""}),
+        (
+            "variant.test_every=0,8",
+            {"variant.test_every=0 scored on the training views", "variant.test_every=8"},
+        ),
+    ],
+)
+def test_a_condition_says_where_scores_are_of_the_training_views(
+    study: Callable[..., Study], fixed: str, conditions: set[str]
+) -> None:
+    plan = study()._plan(["+ablation=consistency", fixed])
+    assert {cell.spec.condition for cell in plan} == conditions
+    rows = plan_module.record(plan)
+    assert all(row["condition"] in conditions for row in rows)
+
+
+def test_named_test_views_are_no_training_views(study: Callable[..., Study]) -> None:
+    plan = study()._plan(["variant.test_every=0", "variant.test=[a,b]"])
+    assert {cell.spec.condition for cell in plan} == {""}
+
+
+def test_two_folders_of_one_name_are_refused_before_anything_is_trained(
+    study: Callable[..., Study], tmp_path: Path
+) -> None:
+    paths = f"scene.path={tmp_path}/pa/room,{tmp_path}/pb/room"
+    with pytest.raises(XrgsError, match=r"pa/room and .*pb/room: both are called room"):
+        study()._plan(["scene=folder", paths])
 
 
 def test_a_cell_that_waits_for_a_count_in_vain_says_so(compose: Callable[..., config.Conf]) -> None:

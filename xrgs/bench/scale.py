@@ -103,7 +103,7 @@ def _job_cost(template: Path, folder: Path) -> dict[str, float]:
     conf = config.from_file(template / "config.json")
     photographs = folder / "photographs"
     photographs.mkdir()
-    content = motorcycle.files()[0].read_bytes()
+    content = motorcycle.files()["motorcycle_left"].read_bytes()
     for number in range(_PHOTOGRAPHS):
         (photographs / f"{number}.png").write_bytes(content)
     conf.scene.kind, conf.scene.path = "folder", str(photographs)

@@ -1,8 +1,8 @@
 """Reads, resizes and saves photographs: float32 arrays [H, W, 3] in 0..1 in memory.
 
-Photographs of users are read in five formats, with their EXIF orientation. The images of a store,
-which may come from anybody, are PNGs as `save` writes them, and are read by `read_png` alone.
-Nothing here imports torch before it is called.
+Photographs of users are read in six formats, with their EXIF orientation; HEIC needs pillow-heif,
+which is an extra. The images of a store, which may come from anybody, are PNGs as `save` writes
+them, and are read by `read_png` alone. Nothing here imports torch before it is called.
 """
 
 from __future__ import annotations
@@ -11,6 +11,7 @@ import io
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,11 +21,16 @@ from xrgs.errors import UnreadableError, XrgsError
 from xrgs.safeio.atomic import atomic_writer
 from xrgs.safeio.confined import ConfinedPath, confined, is_passing
 
+if TYPE_CHECKING:
+    from typing import BinaryIO
+
 ImageArray = NDArray[np.float32]  # [H, W, 3]
 
 #: The formats that are read. PIL goes by the content of a file and not by its suffix, and it hands
 #: some of the other formats that it knows to external programs.
-_FORMATS = ("BMP", "JPEG", "PNG", "TIFF", "WEBP")
+_FORMATS = ("BMP", "HEIF", "JPEG", "PNG", "TIFF", "WEBP")
+#: What a HEIC file has after its first four bytes, as other files of its container do.
+_HEIF_MAGIC = b"ftyp"
 #: The largest photograph that is read: cameras give 200 megapixels, and PIL takes 1 GB for this.
 MAX_PIXELS = 1 << 28
 #: The largest image of a store that is read. In training it takes 800 MB.
@@ -56,7 +62,10 @@ def _opened(
     Every error of the block names the file.
     """
     try:
-        with confined(path).open() as stream, Image.open(stream, formats=formats) as image:
+        with (
+            confined(path).open() as stream,
+            Image.open(stream, formats=_known(formats, stream)) as image,
+        ):
             if image.width * image.height > max_pixels:
                 size = f"{image.width} x {image.height}"
                 raise ValueError(f"it has {size} pixels; at most {max_pixels} in all are read")
@@ -69,6 +78,22 @@ def _opened(
             raise UnreadableError(f"{path}: {error.strerror}; try again") from error
         why = error.strerror if isinstance(error, OSError) and error.strerror else error
         raise ImageError(f"{path}: unreadable or truncated image ({why})") from error
+
+
+def _known(formats: tuple[str, ...], stream: BinaryIO) -> tuple[str, ...]:
+    """Return the formats that PIL knows; of HEIF it is told where a file may be of it."""
+    if "HEIF" not in formats:
+        return formats
+    start = stream.read(8)
+    stream.seek(0)
+    if start[4:] != _HEIF_MAGIC:
+        return tuple(name for name in formats if name != "HEIF")
+    try:
+        from pillow_heif import register_heif_opener
+    except ImportError as error:
+        raise ValueError("HEIC needs pillow-heif: pip install 'xrgs[heic]'") from error
+    register_heif_opener()
+    return formats
 
 
 def size(path: Path | ConfinedPath) -> tuple[int, int]:

@@ -8,8 +8,22 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from xrgs.errors import XrgsError
+
 if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+
     from xrgs.capture.images import ImageArray
+
+UNDISTORT = "Undistort the photographs first, as `colmap image_undistorter` does"
+#: The parameters of those of COLMAP's camera models that can have no more than one radial term.
+_MODELS = {
+    "SIMPLE_PINHOLE": ("f", "cx", "cy"),
+    "PINHOLE": ("fx", "fy", "cx", "cy"),
+    "SIMPLE_RADIAL": ("f", "cx", "cy", "k1"),
+    "RADIAL": ("f", "cx", "cy", "k1", "k2"),
+    "OPENCV": ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2"),
+}
 
 
 @dataclass(frozen=True)
@@ -119,3 +133,52 @@ def undistort(image: ImageArray, lens: Lens) -> ImageArray:
     coords = source[..., ::-1].transpose(2, 0, 1)  # [2, H, W] row, column
     bands = [warp(image[..., c], coords, order=3, mode="edge") for c in range(3)]
     return np.stack(bands, axis=-1).astype(np.float32)
+
+
+def lens_of_model(model: str, size: tuple[int, int], params: Sequence[float]) -> Lens:
+    """Convert a camera of COLMAP.
+
+    Args:
+        model: The name of COLMAP's camera model.
+        size: Width and height of its images, px.
+        params: The model's parameters, in COLMAP's order.
+
+    Returns:
+        The camera.
+
+    Raises:
+        XrgsError: The model, or a distortion term that is not 0, is not served.
+    """
+    if model not in _MODELS:
+        served = ", ".join(_MODELS)
+        raise XrgsError(f"camera model {model} is not served, but {served}. {UNDISTORT}")
+    return lens_of_terms(model, size, dict(zip(_MODELS[model], params, strict=True)))
+
+
+def lens_of_terms(model: str, size: tuple[int, int], terms: Mapping[str, float]) -> Lens:
+    """Make a camera of the terms of OpenCV's model.
+
+    Args:
+        model: What a message calls the camera.
+        size: Width and height of its images, px.
+        terms: `f`, or `fx` and `fy`, and `cx`, `cy`, px; distortion terms by their names.
+
+    Returns:
+        The camera.
+
+    Raises:
+        XrgsError: A focal length is not above 0, a value is not finite, or a distortion term other
+            than `k1` is not 0.
+    """
+    values = dict(terms)
+    fx, fy = (values.pop(name, values.get("f", 0.0)) for name in ("fx", "fy"))
+    values.pop("f", None)
+    cx, cy, k = values.pop("cx"), values.pop("cy"), values.pop("k1", 0.0)
+    if not np.isfinite([fx, fy, cx, cy, k]).all() or min(fx, fy, *size) <= 0:
+        raise XrgsError(f"camera {model}: its size, focal length or centre is no such number")
+    if others := [f"{name}={value:g}" for name, value in values.items() if value != 0]:
+        raise XrgsError(
+            f"camera {model} has distortion terms that are not served ({', '.join(others)}). "
+            f"{UNDISTORT}"
+        )
+    return Lens(*size, fx, fy, cx, cy, k)

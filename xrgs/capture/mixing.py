@@ -6,6 +6,7 @@ they are known only after SfM, which then gets the photographs as they are.
 
 from __future__ import annotations
 
+import logging
 import time
 from collections import Counter
 from collections.abc import Mapping
@@ -15,10 +16,11 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from xrgs.capture import degrade, images, registration, tagging
+from xrgs.capture import degrade, images, poses, registration, tagging
 from xrgs.capture.alignment import pose_error
 from xrgs.capture.lens import undistort
 from xrgs.capture.photographs import PhotoCollection, prepare_hr_views, write_degraded
+from xrgs.capture.registration import Registration
 from xrgs.capture.split import Split, check_variant_conf, split_views
 from xrgs.capture.views import SceneFailed, Variant, View
 from xrgs.runtime.progress import progress
@@ -29,6 +31,12 @@ if TYPE_CHECKING:
     from xrgs.capture.scenes import Scene
     from xrgs.capture.sfm import Reconstruction
     from xrgs.config import VariantConf
+
+_log = logging.getLogger(__name__)
+
+#: How much finer HR views must sample the scene than LR views for the two to be called so, in their
+#: medians; our choice. The paper has 5.
+_LEAST_RATIO = 1.25
 
 
 @dataclass(frozen=True)
@@ -67,9 +75,7 @@ def mix_resolutions(scene: Scene, conf: VariantConf, work: Path, out: ConfinedPa
     photos = prepare_hr_views(scene, conf, work)
     inputs = _Inputs(scene, conf, photos, _split_before_sfm(photos, conf))
     write_degraded(photos, inputs.degraded, conf)
-    registered = registration.register(
-        photos, inputs.degraded, conf.sfm, work, lambda model: _refusal(inputs, model)
-    )
+    registered = _register(inputs, work)
     model = registered.model
     _write_log(work, out)
     report = _sfm_report(inputs, model) | {"attempts": registered.attempts}
@@ -82,10 +88,23 @@ def mix_resolutions(scene: Scene, conf: VariantConf, work: Path, out: ConfinedPa
         write_degraded(photos, inputs.degraded, conf)
     views = _write_undistorted(inputs, model, depths, out)
     report |= _tags_report(inputs, views)
+    for note in report["notes"]:
+        _log.warning("scene %s: %s", scene.name, note)
     report["seconds"] = round(time.perf_counter() - start, 1)
-    held_out = conf.test_every > 0
+    held_out = bool(inputs.split.test)
     return Variant(
         "", out, scene.name, conf.factor, held_out, views, model.points, model.colors, report
+    )
+
+
+def _register(inputs: _Inputs, work: Path) -> Registration:
+    """Run SfM, or take the poses that the user gives."""
+    photos, conf = inputs.photos, inputs.conf
+    if conf.poses is not None:
+        model = poses.read_poses(conf.poses, photos)
+        return Registration(model, _refusal(inputs, model), [])
+    return registration.register(
+        photos, inputs.degraded, conf.sfm, work, lambda model: _refusal(inputs, model)
     )
 
 
@@ -93,16 +112,16 @@ def _split_before_sfm(photos: PhotoCollection, conf: VariantConf) -> Split:
     """Split the views; where the tags depend on depth, all training views are HR for now."""
     if conf.tags == "megapixels":
         scores = tagging.megapixel_scores([photo.size for photo in photos.all])
-        return split_views(len(photos), conf, scores)
+        return split_views(photos.names, conf, scores)
     if conf.tags in tagging.DEPTH_POLICIES:
-        return split_views(len(photos), replace(conf, hr_fraction=1.0))
-    return split_views(len(photos), conf)
+        return split_views(photos.names, replace(conf, hr_fraction=1.0))
+    return split_views(photos.names, conf)
 
 
 def _split_by_depth(inputs: _Inputs, model: Reconstruction, depths: Mapping[int, float]) -> Split:
     lenses = {i: lens.undistorted() for i, lens in model.lenses.items()}
-    conf, views = inputs.conf, len(inputs.photos)
-    return split_views(views, conf, tagging.depth_scores(conf.tags, views, lenses, depths))
+    conf, names = inputs.conf, inputs.photos.names
+    return split_views(names, conf, tagging.depth_scores(conf.tags, len(names), lenses, depths))
 
 
 def _refusal(inputs: _Inputs, model: Reconstruction) -> str:
@@ -110,12 +129,13 @@ def _refusal(inputs: _Inputs, model: Reconstruction) -> str:
     split, names, conf = inputs.split, inputs.photos.names, inputs.conf
     registered = model.viewmats.keys()
     hr, lr = registered & set(split.hr), registered & set(split.lr)
-    tests = registered & set(split.test) if conf.test_every else registered
+    tests = registered & set(split.test) if conf.test or split.test else registered
     missing = [name for i, name in enumerate(names) if i not in registered]
-    summary = f"COLMAP registered {len(registered)} of {len(names)} views"
+    source = "COLMAP registered" if conf.poses is None else "variant.poses has"
+    summary = f"{source} {len(registered)} of {len(names)} views"
     if missing:
         summary += f" (not {', '.join(missing[:6])}{', ...' if len(missing) > 6 else ''})"
-    summary += f" and found {len(model.points)} points"
+    summary += f" and {'found ' if conf.poses is None else ''}{len(model.points)} points"
     fraction = conf.sfm.min_registered
     if len(registered) < fraction * len(names):
         return f"{summary}; variant.sfm.min_registered={fraction} requires more."
@@ -154,7 +174,8 @@ def _pose_report(inputs: _Inputs, model: Reconstruction, work: Path) -> dict[str
     estimated = {photos.names[i]: matrix for i, matrix in model.viewmats.items()}
     if exact:
         return {"pose_error": pose_error(estimated, exact), "pose_error_against": "exact cameras"}
-    if not inputs.conf.sfm.reference or not inputs.degraded:
+    given = inputs.conf.poses is not None
+    if given or not inputs.conf.sfm.reference or not inputs.degraded:
         return {"pose_error": {}, "pose_error_against": ""}
     start = time.perf_counter()
     reference = registration.reconstruct_undegraded(photos, inputs.conf.sfm, work)
@@ -177,6 +198,7 @@ def _tags_report(inputs: _Inputs, views: tuple[View, ...]) -> dict[str, Any]:
         for tag in ("HR", "LR")
     }
     return {
+        "notes": _split_notes(inputs, rates),
         "tags": inputs.conf.tags,
         "degradation": degrade.resolve_degradation(inputs.conf),
         "tests": len(split.test),
@@ -188,6 +210,21 @@ def _tags_report(inputs: _Inputs, views: tuple[View, ...]) -> dict[str, Any]:
             if values
         },
     }
+
+
+def _split_notes(inputs: _Inputs, rates: Mapping[str, list[float]]) -> list[str]:
+    """Say where photographs that are not degraded differ too little to be told HR and LR."""
+    if inputs.degraded or not rates["HR"] or not rates["LR"]:
+        return []
+    ratio = float(np.median(rates["HR"]) / np.median(rates["LR"]))
+    if ratio >= _LEAST_RATIO:
+        return []
+    both = rates["HR"] + rates["LR"]
+    return [
+        f"the split by variant.tags={inputs.conf.tags} is meaningless: rho is {min(both):.3f} to "
+        f"{max(both):.3f}, and its median in HR views {ratio:.2f} times that in LR views, so that "
+        "all show the scene at about one resolution; variant.tags=flag makes a mixture"
+    ]
 
 
 def _write_undistorted(

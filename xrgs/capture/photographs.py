@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -30,7 +30,7 @@ class Photograph:
     """One readable photograph of a scene."""
 
     name: str
-    """Its file name without the suffix."""
+    """The name that its view gets."""
     number: str
     """The name of its copies on disk, because COLMAP need not accept people's file names."""
     size: tuple[int, int]
@@ -47,10 +47,24 @@ class Photograph:
         """The camera of the HR view, after resize and crop; None where it is not known."""
         if self.K is None:
             return None
-        K, (left, top) = self.K, self.hr.crop_offset
-        lens = Lens(*self.size, K[0, 0], K[1, 1], K[0, 2], K[1, 2]).resized(*self.hr.resized)
-        cx, cy = lens.cx - left, lens.cy - top
-        return Lens(self.hr.width, self.hr.height, lens.fx, lens.fy, cx, cy)
+        K = self.K
+        return self.to_hr(Lens(*self.size, K[0, 0], K[1, 1], K[0, 2], K[1, 2]))
+
+    def to_hr(self, lens: Lens) -> Lens:
+        """Return the camera of the HR view, after resize and crop.
+
+        Args:
+            lens: The camera of the whole photograph, at any size.
+        """
+        left, top = self.hr.crop_offset
+        resized = lens.resized(*self.hr.resized)
+        return replace(
+            resized,
+            width=self.hr.width,
+            height=self.hr.height,
+            cx=resized.cx - left,
+            cy=resized.cy - top,
+        )
 
 
 @dataclass(frozen=True)
@@ -147,31 +161,31 @@ def prepare_hr_views(scene: Scene, conf: VariantConf, work: Path) -> PhotoCollec
     """
     sizes, unreadable = _read_sizes(scene.files)
     shrink = shrink_factor(list(sizes.values()), conf) if sizes else 1.0
-    geometries: dict[ConfinedPath, HrGeometry] = {}
-    for file, size in progress(sizes.items(), "HR views", "view"):
+    geometries: dict[str, HrGeometry] = {}
+    for name, size in progress(sizes.items(), "HR views", "view"):
+        file = scene.files[name]
         try:
             image = images.read(file)
         except images.ImageError as error:
-            unreadable[file] = str(error)
+            unreadable[name] = str(error)
             continue
         try:
-            geometries[file] = hr = _checked_geometry(size, shrink, conf)
+            geometries[name] = hr = _checked_geometry(size, shrink, conf)
         except XrgsError as error:
             raise XrgsError(f"{file}: {error}") from None
         copy = work / "hr" / f"{len(geometries) - 1:05d}.png"
         images.save(copy, _resize_and_crop(image, hr), durable=False)
-    messages = tuple(unreadable[file] for file in scene.files if file in unreadable)
+    messages = tuple(unreadable[name] for name in scene.files if name in unreadable)
     for message in messages:
         _log.warning("%s; left out", message)
     if len(geometries) < 2:
         count = f"{len(geometries)} readable image(s), two are needed"
         raise XrgsError(f"scene {scene.name}: {count}: {list(messages)}")
-    cameras = assign_cameras(
-        list(geometries), [sizes[file] for file in geometries], conf.sfm.camera
-    )
+    files = [scene.files[name] for name in geometries]
+    cameras = assign_cameras(files, [sizes[name] for name in geometries], conf.sfm.camera)
     photos = (
-        Photograph(file.stem, f"{i:05d}", sizes[file], hr, camera, scene.intrinsics.get(file.stem))
-        for i, ((file, hr), camera) in enumerate(zip(geometries.items(), cameras, strict=True))
+        Photograph(name, f"{i:05d}", sizes[name], hr, camera, scene.intrinsics.get(name))
+        for i, ((name, hr), camera) in enumerate(zip(geometries.items(), cameras, strict=True))
     )
     return PhotoCollection(tuple(photos), work, messages)
 
@@ -192,16 +206,16 @@ def _resize_and_crop(image: images.ImageArray, hr: HrGeometry) -> images.ImageAr
 
 
 def _read_sizes(
-    files: Sequence[ConfinedPath],
-) -> tuple[dict[ConfinedPath, tuple[int, int]], dict[ConfinedPath, str]]:
-    """Read the size of each file, or the message that says why it has none."""
-    sizes: dict[ConfinedPath, tuple[int, int]] = {}
-    unreadable: dict[ConfinedPath, str] = {}
-    for file in files:
+    files: Mapping[str, ConfinedPath],
+) -> tuple[dict[str, tuple[int, int]], dict[str, str]]:
+    """Read the size of each file, or the message that says why it has none, by its name."""
+    sizes: dict[str, tuple[int, int]] = {}
+    unreadable: dict[str, str] = {}
+    for name, file in files.items():
         try:
-            sizes[file] = images.size(file)
+            sizes[name] = images.size(file)
         except images.ImageError as error:
-            unreadable[file] = str(error)
+            unreadable[name] = str(error)
     return sizes, unreadable
 
 

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import tempfile
 import zlib  # noqa: F401  pycolmap 4.2.1 corrupts the heap where it is imported before zlib
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -17,7 +17,7 @@ import pycolmap
 from numpy.typing import NDArray
 
 from xrgs.capture import images
-from xrgs.capture.lens import Lens
+from xrgs.capture.lens import Lens, lens_of_model
 from xrgs.runtime.machine import usable_cores
 from xrgs.runtime.progress import ProgressBar
 
@@ -145,7 +145,8 @@ def reconstruct(
         no_points = np.zeros((0, 3))
         return Reconstruction({}, {}, no_points, no_points.astype(np.uint8), {}, report)
     largest = max(models, key=lambda m: (m.num_reg_images(), m.num_points3D()))
-    return _to_numpy(largest, sfm_images, report)
+    index = {image.file: i for i, image in enumerate(sfm_images)}
+    return to_numpy(largest, index, report)
 
 
 def _log_to(work: Path) -> None:
@@ -278,33 +279,50 @@ def mapping_options(conf: SfmConf, count: int, *, known: bool) -> Any:
     return options
 
 
-def _to_numpy(model: Any, sfm_images: Sequence[SfmImage], report: dict[str, Any]) -> Reconstruction:
-    """Convert pycolmap's model into numpy arrays, with the points in the order of their ids."""
-    index = {image.file: i for i, image in enumerate(sfm_images)}
+def to_numpy(model: Any, index: Mapping[str, int], report: Mapping[str, Any]) -> Reconstruction:
+    """Convert pycolmap's model into numpy arrays, with the points in the order of their ids.
+
+    Args:
+        model: pycolmap's `Reconstruction`.
+        index: The index of each image by its name in the model; others are left out.
+        report: What is reported beside the results.
+
+    Returns:
+        The cameras of the images that have a pose, and all points.
+
+    Raises:
+        XrgsError: A camera can't be served.
+    """
     order = sorted(model.points3D)
     number = {point: p for p, point in enumerate(order)}
     lenses, viewmats, observed = {}, {}, {}
     for image in model.images.values():
-        if not image.has_pose:
+        if not image.has_pose or image.name not in index:
             continue
         i = index[image.name]
         viewmats[i] = np.vstack([image.cam_from_world().matrix(), [0.0, 0.0, 0.0, 1.0]])
-        lenses[i] = _lens(model.cameras[image.camera_id])
+        camera = model.cameras[image.camera_id]
+        params = [float(value) for value in camera.params]
+        lenses[i] = lens_of_model(camera.model_name, (camera.width, camera.height), params)
         own = {number[p.point3D_id] for p in image.points2D if p.has_point3D()}
         observed[i] = np.array(sorted(own), dtype=np.intp)
+    points, colors = points_of(model)
+    results: dict[str, Any] = {"registered": len(viewmats), "points": len(points)}
+    if model.compute_num_observations():  # a model of another program may have none
+        results["reprojection_error_px"] = float(model.compute_mean_reprojection_error())
+    return Reconstruction(lenses, viewmats, points, colors, observed, {**report, **results})
+
+
+def points_of(model: Any) -> tuple[NDArray[np.float64], NDArray[np.uint8]]:
+    """Return the points of a model in the order of their ids, and their colours.
+
+    Args:
+        model: pycolmap's `Reconstruction`.
+
+    Returns:
+        Points [P, 3], in the model's world, and colours [P, 3].
+    """
+    order = sorted(model.points3D)
     points = np.array([model.points3D[p].xyz for p in order], dtype=np.float64).reshape(-1, 3)
     colors = np.array([model.points3D[p].color for p in order], dtype=np.uint8).reshape(-1, 3)
-    report |= {
-        "registered": len(viewmats),
-        "points": len(order),
-        "reprojection_error_px": float(model.compute_mean_reprojection_error()),
-    }
-    return Reconstruction(lenses, viewmats, points, colors, observed, report)
-
-
-def _lens(camera: Any) -> Lens:
-    if camera.model_name == "PINHOLE":
-        fx, fy, cx, cy = (float(p) for p in camera.params)
-        return Lens(camera.width, camera.height, fx, fy, cx, cy)
-    f, cx, cy, k = (float(p) for p in camera.params)  # SIMPLE_RADIAL
-    return Lens(camera.width, camera.height, f, f, cx, cy, k)
+    return points, colors

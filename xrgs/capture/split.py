@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from difflib import get_close_matches
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -91,11 +92,33 @@ def _one_of(value: str, *choices: str) -> tuple[bool, str]:
     return value in choices, " or ".join(choices)
 
 
-def split_views(views: int, conf: VariantConf, scores: Sequence[float] | None = None) -> Split:
-    """Hold out every `test_every`-th view, and divide the others into HR and LR.
+def check_test_names(names: Sequence[str], conf: VariantConf) -> None:
+    """Refuse test views that the scene does not have.
 
     Args:
-        views: The number of views.
+        names: The names of the scene's photographs.
+        conf: The variant's config.
+
+    Raises:
+        XrgsError: A name in `variant.test` is none of these; the message has the most similar one.
+    """
+    for name in conf.test:
+        if name not in names:
+            similar = get_close_matches(name, names, n=1, cutoff=0.0)
+            meant = f"did you mean {similar[0]}?" if similar else "it has none"
+            raise XrgsError(
+                f"variant.test: the scene has no view {name}; {meant} The name of a view is that of"
+                " its file without the suffix"
+            )
+
+
+def split_views(
+    names: Sequence[str], conf: VariantConf, scores: Sequence[float] | None = None
+) -> Split:
+    """Hold out the views of `test`, or else every n-th, and divide the others into HR and LR.
+
+    Args:
+        names: The names of the views, sorted.
         conf: The variant's config: HR is a fraction of the training views, at least `min_hr` of
             them, or every view that scores `hr_above` or more.
         scores: One score per view in 0..1, higher for HR; NaN where it is not known, which makes
@@ -108,9 +131,12 @@ def split_views(views: int, conf: VariantConf, scores: Sequence[float] | None = 
     Raises:
         XrgsError: The scores put all training views into one class though the config asks for two.
     """
-    every = conf.test_every
-    test = tuple(range(0, views, every)) if every else ()
-    train = [i for i in range(views) if i not in test]
+    every, views = conf.test_every, range(len(names))
+    if conf.test:
+        test = tuple(i for i in views if names[i] in conf.test)
+    else:
+        test = tuple(views[::every]) if every else ()
+    train = [i for i in views if i not in test]
     chosen = _select(train, conf) if scores is None else _select_by_score(train, scores, conf)
     hr = tuple(i for i in train if i in chosen)
     return Split(test, hr, tuple(i for i in train if i not in chosen))

@@ -11,7 +11,7 @@ from contextlib import suppress
 from dataclasses import asdict
 from typing import TYPE_CHECKING
 
-from xrgs.capture import scenes, sealed, split
+from xrgs.capture import poses, scenes, sealed, split
 from xrgs.capture.failures import FAILED_PREFIX, read_failure
 from xrgs.capture.frozen import CorruptVariant, freeze, load, verify
 from xrgs.capture.views import SceneFailed, Variant
@@ -32,12 +32,14 @@ _log = logging.getLogger(__name__)
 #: The source files that decide what a variant is: a change in one of them changes every key.
 _SOURCES = (
     "capture/alignment.py",
+    "capture/colmap.py",
     "capture/degrade.py",
     "capture/frozen.py",
     "capture/images.py",
     "capture/lens.py",
     "capture/mixing.py",
     "capture/photographs.py",
+    "capture/poses.py",
     "capture/registration.py",
     "capture/sealed.py",
     "capture/sfm.py",
@@ -49,7 +51,7 @@ _SOURCES = (
 
 
 def key(scene: SceneConf, conf: VariantConf) -> str:
-    """Hash what a variant is made from: photographs, variant config and code, without running SfM.
+    """Hash what a variant is made from: photographs, poses, config and code, without running SfM.
 
     Args:
         scene: The scene's config.
@@ -59,10 +61,16 @@ def key(scene: SceneConf, conf: VariantConf) -> str:
         16 hexadecimal digits.
 
     Raises:
-        XrgsError: The photographs are not there.
+        XrgsError: The photographs or the poses are not there, or the config is not usable; the
+            message names what is wrong.
     """
+    split.check_variant_conf(conf)
+    split.check_test_names(scenes.names(scene, conf.long_side) if conf.test else (), conf)
+    settings = asdict(conf)
+    if conf.poses is not None:
+        settings["poses"] = poses.fingerprint(conf.poses)
     fingerprint = scenes.fingerprint(scene, conf.long_side)
-    return digest([fingerprint, asdict(conf), source_digests(*_SOURCES)])
+    return digest([fingerprint, settings, source_digests(*_SOURCES)])
 
 
 def find(variants: Path | ConfinedPath, wanted_key: str) -> Variant | None:
@@ -142,7 +150,6 @@ def build(
         SceneFailed: SfM can't register enough views; its report is in `variants/failed-<key>`.
         XrgsError: The config or the photographs are not usable; the message names what is wrong.
     """
-    split.check_variant_conf(conf)
     wanted_key = key(scene, conf)
     variants.make_folder()
     report = variants / f"{FAILED_PREFIX}{wanted_key}" / "report.json"

@@ -14,6 +14,7 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from xrgs import config
+from xrgs.capture.scenes.folder import ALL_BELOW
 from xrgs.config import escape_interpolations
 from xrgs.errors import XrgsError
 from xrgs.runtime.streams import say
@@ -24,7 +25,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
 
 #: Keys whose values are paths.
-_PATHS = frozenset({"scene.path", "store", "data_root"})
+_PATHS = frozenset({"scene.path", "store", "data_root", "variant.poses"})
 
 
 @contextmanager
@@ -69,7 +70,7 @@ def _with_quotes(word: str) -> str:
     key, _, value = word.partition("=")
     if key not in _PATHS or not value or value[0] in "'\"":
         return word
-    exists = user_path(value).exists()
+    exists = user_path(value.removesuffix(ALL_BELOW)).exists()
     if exists or key != "scene.path":
         return f"{key}={_quoted(key, escape_interpolations(value) if exists else value)}"
     return f"{key}={','.join(_quoted(key, part) for part in value.split(','))}"

@@ -1,4 +1,4 @@
-"""`xrgs-data`: downloads photographs and the weights of LPIPS, and shows a variant."""
+"""`xrgs-data`: downloads photographs and the weights of LPIPS, shows and exports variants."""
 
 from __future__ import annotations
 
@@ -27,6 +27,8 @@ xrgs-data inspect VARIANT_FOLDER [out=FILE.png]
 xrgs-data inspect scene=NAME [KEY=VALUE]... [out=FILE.png]
     Prints a table of a variant's views and the result of SfM, and draws all views on one sheet.
     The keys are those of xrgs-sweep; a variant that is not in the store is built.
+xrgs-data export CELL_OR_VARIANT_FOLDER [format=colmap|nerfstudio] [out=FOLDER]
+    Writes images, cameras, points and split, and the splats of a cell, for other programs.
 """
 
 
@@ -44,6 +46,8 @@ def main() -> None:
             text = _lpips(values)
         elif words[:1] == ["inspect"]:
             text = _inspect(words[1:], values)
+        elif words[:1] == ["export"]:
+            text = _export(words[1:], values)
         else:
             raise XrgsError(f"{' '.join(words)}: there is no such command; see xrgs-data --help")
         say(text)
@@ -89,3 +93,13 @@ def _inspect(words: list[str], values: dict[str, str]) -> str:
         store = Store(Path(conf.store))
         folder = store.variants / variants.find_or_build(conf, store)
     return variant.describe(folder, Path(out) if out else None)
+
+
+def _export(words: list[str], values: dict[str, str]) -> str:
+    layout, out = values.pop("format", "colmap"), values.pop("out", None)
+    if values or len(words) != 1:
+        raise XrgsError("export: give the folder of a cell or a variant, and format= or out= alone")
+    from xrgs.experiment.export import export
+
+    path = Path(words[0]).expanduser()
+    return export(path, layout, Path(out or f"{path.name}-{layout}").expanduser())

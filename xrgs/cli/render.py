@@ -24,7 +24,7 @@ side with their names. CELL is a cell's id, the beginning of one, or a .ply file
                    spiral: LLFF's, for forward-facing scenes
                    test: through the test cameras in their order
   views=120        number of frames
-  out=film.mp4     an .mp4 file, which needs PyAV (pip install 'xrgs[film]'), or a new folder for
+  out=film.mp4     an .mp4 file, which needs PyAV (pip install 'xrgs[video]'), or a new folder for
                    PNG frames
   size=WxH         size of one cell's picture, px, both even; the size of the test views by default
   fps=30           frames a second

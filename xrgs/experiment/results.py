@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Mapping
 
     from xrgs.capture.dataset import Dataset
+    from xrgs.capture.views import Variant
 
 #: What a sweep's record names a cell by.
 CELL_NAMES = ("scene", "label", "condition")
@@ -118,21 +119,38 @@ def load_dataset(folder: ConfinedPath) -> Dataset:
         StoreError: `identity.json` can't be read, or has no variant, views or seed.
         XrgsError: The variant is not in the store, or is damaged.
     """
-    from xrgs.capture import dataset, variant
-    from xrgs.experiment.trimming import check_images
+    from xrgs.capture import dataset
 
     identity = read_object(folder / "identity.json")
-    variant_id, train = identity.get("variant"), identity.get("train")
+    train = identity.get("train")
     views = train.get("views") if isinstance(train, dict) else None
-    if not isinstance(variant_id, str) or not is_name(variant_id) or not isinstance(views, str):
-        raise StoreError(f"{folder / 'identity.json'}: it names no variant or no train.views")
+    if not isinstance(views, str):
+        raise StoreError(f"{folder / 'identity.json'}: it names no train.views")
     validation, seed = validation_share(identity), identity.get("seed")
     if validation is None or type(seed) is not int or seed < 0:
         raise StoreError(f"{folder / 'identity.json'}: train.validation or seed is not a number")
+    return dataset.load(load_variant(folder), views, validation=validation, seed=seed)
+
+
+def load_variant(folder: ConfinedPath) -> Variant:
+    """Load the variant that a cell was trained on.
+
+    Args:
+        folder: The cell's folder, `<store>/cells/<id>`.
+
+    Raises:
+        StoreError: `identity.json` can't be read, or names no variant.
+        XrgsError: The variant is not in the store, or is damaged.
+    """
+    from xrgs.capture import variant
+    from xrgs.experiment.trimming import check_images
+
+    variant_id = read_object(folder / "identity.json").get("variant")
+    if not isinstance(variant_id, str) or not is_name(variant_id):
+        raise StoreError(f"{folder / 'identity.json'}: it names no variant")
     variants = ConfinedPath(folder.path.parents[1]) / "variants"
     check_images(variants, variant_id)
-    frozen = variant.load(variants / variant_id)
-    return dataset.load(frozen, views, validation=validation, seed=seed)
+    return variant.load(variants / variant_id)
 
 
 def validation_share(identity: Mapping[str, Any]) -> float | None:

@@ -126,17 +126,21 @@ def _counts(frozen: Variant) -> Iterator[str]:
 
 def _sfm(report: Mapping[str, Any]) -> Iterator[str]:
     """Yield lines on how SfM went, as far as the report has them."""
+    source = "Poses given" if "poses" in report else "SfM"
     yield (
-        f"SfM: {report.get('registered', 0)} of {report.get('images', '?')} views placed, "
+        f"{source}: {report.get('registered', 0)} of {report.get('images', '?')} views placed, "
         f"{report.get('points', 0)} points"
         + _number(report, "reprojection_error_px", ", {:.2f} px")
     )
-    yield f"  LR images {report.get('lr_images')}, {report.get('max_num_features')} features a view"
+    if "lr_images" in report:
+        features = report.get("max_num_features")
+        yield f"  LR images {report['lr_images']}, {features} features a view"
     for attempt in report.get("attempts", ())[:_MAX_ATTEMPTS]:
         verdict = attempt.get("refused") or f"accepted, {attempt.get('registered')} placed"
         yield f"  recipe {attempt.get('attempt')}: {verdict}"
     if "tags" in report:
         yield f"  tags by {report['tags']}, degradation {report.get('degradation')}"
+    yield from (f"  {note}" for note in report.get("notes", ())[:_MAX_ATTEMPTS])
     if error := report.get("pose_error"):
         against = report.get("pose_error_against", "exact cameras")
         yield f"  poses against {against}: " + "; ".join(_pose(error))

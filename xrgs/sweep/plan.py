@@ -23,6 +23,9 @@ if TYPE_CHECKING:
     from xrgs.sweep.axes import CellSpec
     from xrgs.sweep.estimate import RuntimeEstimator
 
+#: The part of a condition that says that no view is held out.
+TRAINING_VIEWS = "scored on the training views"
+
 
 @dataclass(frozen=True)
 class PlannedCell:
@@ -90,10 +93,13 @@ def planned(spec: CellSpec, conf: Conf) -> PlannedCell:
         spec: The cell's combination of axes.
         conf: Its config.
     """
-    key = "train.validation="
-    if conf.train.validation and key not in spec.condition:
-        condition = f"{spec.condition} {key}{conf.train.validation}".lstrip()
-        spec = replace(spec, condition=condition)
+    said = spec.condition
+    if conf.train.validation:
+        key = "train.validation="
+        said = said if key in said else f"{said} {key}{conf.train.validation}"
+    elif conf.variant.test_every == 0 and not conf.variant.test and TRAINING_VIEWS not in said:
+        said = f"{said} {TRAINING_VIEWS}"
+    spec = replace(spec, condition=said.lstrip())
     if conf.matched_to is not None:
         spec = replace(spec, label=f"{spec.label} to {conf.matched_to}")
     return PlannedCell(spec, conf)

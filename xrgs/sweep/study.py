@@ -22,6 +22,7 @@ from hydra.errors import CompactHydraException
 from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
+from xrgs.capture import scenes
 from xrgs.config import to_conf
 from xrgs.errors import StoreError, UnreadableError, XrgsError
 from xrgs.evaluation.lpips import weights
@@ -206,6 +207,7 @@ class Study:
                 plan.setdefault(cell.reference, reference)
             plan.setdefault(cell.spec, cell)
         controls.check_effect(combinations, plan.values())
+        scenes.check_labels(cell.conf.scene for cell in plan.values())
         return list(plan.values())
 
     def _with_effective_match(self, spec: CellSpec) -> CellSpec:

@@ -11,6 +11,7 @@ from pathlib import Path
 import pytest
 
 from xrgs.capture import images, scenes
+from xrgs.capture.scenes import folder as scenes_folder
 from xrgs.config import SceneConf
 from xrgs.errors import UnreadableError, XrgsError
 from xrgs.safeio.confined import ConfinedPath
@@ -30,7 +31,7 @@ def test_an_llff_scene_gives_the_smallest_copies_that_suffice(
     scene = scenes.resolve(
         SceneConf("fern", "folder", str(tmp_path)), ConfinedPath(tmp_path), long_side
     )
-    assert images.size(scene.files[0])[0] == width
+    assert images.size(next(iter(scene.files.values())))[0] == width
 
 
 def test_copies_are_measured_by_their_largest_photograph(fill: Fill, tmp_path: Path) -> None:
@@ -40,7 +41,7 @@ def test_copies_are_measured_by_their_largest_photograph(fill: Fill, tmp_path: P
     fill(tmp_path / "images_4", "b.png", size=(100, 75))
     (tmp_path / "images_4" / "c.png").write_text("no image")
     scene = scenes.resolve(SceneConf("x", "folder", str(tmp_path)), ConfinedPath(tmp_path), 100)
-    assert scene.files[0].path.parent.name == "images_4"
+    assert next(iter(scene.files.values())).path.parent.name == "images_4"
 
 
 @pytest.mark.parametrize(
@@ -78,7 +79,7 @@ def test_what_is_no_regular_file_is_left_out_with_a_warning(
     (folder / "f.png").symlink_to(folder / "c.png")
     (folder / "g.png").mkdir()
     scene = scenes.resolve(conf, ConfinedPath(tmp_path))
-    assert [file.name for file in scene.files] == ["a.png", "b.png"]
+    assert [file.name for file in scene.files.values()] == ["a.png", "b.png"]
     assert scene.fingerprint == only
     for name in "cdef":
         assert f"{folder}/{name}.png: not a regular file" in caplog.text
@@ -91,7 +92,7 @@ def test_a_link_to_a_photograph_is_one(fill: Fill, tmp_path: Path) -> None:
     for name in ("a.png", "b.png"):
         (tmp_path / "x" / name).symlink_to(tmp_path / "originals" / name)
     scene = scenes.resolve(SceneConf("", "folder", str(tmp_path / "x")), ConfinedPath(tmp_path))
-    assert [images.read(file).shape for file in scene.files] == [(30, 40, 3)] * 2
+    assert [images.read(file).shape for file in scene.files.values()] == [(30, 40, 3)] * 2
 
 
 def test_a_photograph_that_cant_be_read_now_stops_the_plan(
@@ -109,3 +110,68 @@ def test_a_photograph_that_cant_be_read_now_stops_the_plan(
     monkeypatch.setattr(ConfinedPath, "_open_regular", fails)
     with pytest.raises(UnreadableError, match=r"x/b\.png: Permission denied; try again, or move"):
         scenes.fingerprint(conf)
+
+
+def test_all_folders_below_are_taken_where_the_path_asks_for_them(
+    fill: Fill, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    fill(tmp_path / "x", "a.png", "b.png")
+    fill(tmp_path / "x" / "day" / "one", "a.png")
+    fill(tmp_path / "x" / ".cache", "z.png")
+    (tmp_path / "x" / "loop").symlink_to(tmp_path / "x")
+    flat = SceneConf("", "folder", str(tmp_path / "x"))
+    assert list(scenes.resolve(flat, ConfinedPath(tmp_path)).files) == ["a", "b"]
+    assert "images left out: 1 in day/one" in caplog.text
+    assert f"scene.path={tmp_path / 'x'}/** takes those of all folders" in caplog.text
+    caplog.clear()
+    nested = SceneConf("", "folder", f"{tmp_path / 'x'}/**")
+    scene = scenes.resolve(nested, ConfinedPath(tmp_path))
+    assert {n: f.path.relative_to(tmp_path / "x").as_posix() for n, f in scene.files.items()} == {
+        "a": "a.png",
+        "b": "b.png",
+        "day_one_a": "day/one/a.png",
+    }
+    assert (scene.name, caplog.text) == ("x", "")
+    assert scenes.fingerprint(nested) != scenes.fingerprint(flat)
+
+
+def test_a_folder_of_folders_says_how_to_read_them(fill: Fill, tmp_path: Path) -> None:
+    fill(tmp_path / "x" / "one", "a.png", "b.png")
+    with pytest.raises(XrgsError, match=r"no image in it.*images left out: 2 in one .*/\*\* takes"):
+        scenes.fingerprint(SceneConf("", "folder", str(tmp_path / "x")))
+
+
+def test_names_that_nested_folders_share_are_refused(fill: Fill, tmp_path: Path) -> None:
+    fill(tmp_path / "x" / "a_b", "c.png")
+    fill(tmp_path / "x" / "a", "b_c.png")
+    with pytest.raises(XrgsError, match=r"two images of one name"):
+        scenes.fingerprint(SceneConf("", "folder", f"{tmp_path / 'x'}/**"))
+
+
+def test_what_is_not_read_is_named(
+    fill: Fill, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    conf = fill(tmp_path / "x", "a.png", "b.png")
+    for name in ("c.DNG", "d.mov", "notes.txt"):
+        (tmp_path / "x" / name).write_bytes(b"content")
+    scenes.fingerprint(conf)
+    assert "images left out: 1 of a format that is not read (c.DNG)" in caplog.text
+    assert f"videos left out: 1 (scene=video scene.path={tmp_path / 'x' / 'd.mov'}" in caplog.text
+    assert "notes.txt" not in caplog.text
+    caplog.clear()
+    fill(tmp_path / "y" / "one", "a.png", "b.png")
+    (tmp_path / "y" / "films").mkdir()
+    (tmp_path / "y" / "films" / "e.mp4").write_bytes(b"content")
+    scenes.fingerprint(SceneConf("", "folder", f"{tmp_path / 'y'}/**"))
+    assert "films/e.mp4" in caplog.text
+
+
+def test_heic_is_listed_and_needs_its_package(
+    fill: Fill, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    conf = fill(tmp_path / "x", "a.png")
+    (tmp_path / "x" / "b.HEIC").write_bytes(b"content")
+    assert scenes.names(conf) == ["a", "b"]
+    monkeypatch.setattr(scenes_folder, "find_spec", lambda _: None)
+    with pytest.raises(XrgsError, match=r"b\.HEIC: 1 of 2 .*pip install 'xrgs\[heic\]'"):
+        scenes.names(conf)

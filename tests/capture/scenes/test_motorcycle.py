@@ -17,10 +17,10 @@ from xrgs.safeio.confined import ConfinedPath
 def test_the_motorcycle_calibration_fits_its_disparity(tmp_path: Path) -> None:
     """With depth = baseline f / (disparity + cx_right - cx_left), left pixels reproject right."""
     scene = scenes.resolve(SceneConf("motorcycle", "motorcycle"), ConfinedPath(tmp_path))
-    assert [file.stem for file in scene.files] == ["motorcycle_left", "motorcycle_right"]
-    assert images.size(scene.files[0]) == (741, 500)
+    assert list(scene.files) == ["motorcycle_left", "motorcycle_right"]
+    assert images.size(next(iter(scene.files.values()))) == (741, 500)
     disparity = np.load(bundled_photograph("motorcycle_disp.npz"))["arr_0"]
-    left, right = (images.read(file).mean(-1) for file in scene.files)
+    left, right = (images.read(file).mean(-1) for file in scene.files.values())
     Ks, poses = motorcycle.intrinsics(), motorcycle.viewmats()
     rng, differences, shuffled = np.random.default_rng(0), [], []
     for x, y in zip(rng.integers(150, 700, 400), rng.integers(50, 450, 400), strict=True):

@@ -23,7 +23,7 @@ PROCEDURAL = SceneConf("procedural", "procedural", None, 3)
 
 
 def stems(scene: scenes.Scene) -> list[str]:
-    return [file.stem for file in scene.files]
+    return list(scene.files)
 
 
 def test_a_folder_is_its_images_sorted_by_name(fill: Fill, tmp_path: Path) -> None:
@@ -65,12 +65,12 @@ def test_an_unknown_kind_names_the_key(tmp_path: Path) -> None:
 def test_the_procedural_scene_is_rendered_once(tmp_path: Path) -> None:
     first = scenes.resolve(PROCEDURAL, ConfinedPath(tmp_path), 60)
     assert stems(first) == ["view_000", "view_001", "view_002"]
-    assert images.size(first.files[0]) == (60, 45)
+    assert images.size(next(iter(first.files.values()))) == (60, 45)
     assert first.viewmats.keys() == set(stems(first))
     assert not first.intrinsics  # SfM is to find them, as in a real capture
-    times = [file.lstat().st_mtime_ns for file in first.files]
+    times = [file.lstat().st_mtime_ns for file in first.files.values()]
     again = scenes.resolve(PROCEDURAL, ConfinedPath(tmp_path), 60)
-    assert [file.lstat().st_mtime_ns for file in again.files] == times
+    assert [file.lstat().st_mtime_ns for file in again.files.values()] == times
     assert [p.name for p in tmp_path.iterdir() if p.name[0] != "."] == [first.fingerprint]
 
 
@@ -78,10 +78,10 @@ def test_other_images_do_not_become_the_procedural_scene(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     first = scenes.resolve(PROCEDURAL, ConfinedPath(tmp_path), 60)
-    genuine = first.files[1].read_bytes()
-    images.save(first.files[1], np.full((45, 60, 3), (1, 0, 0), np.float32))
+    genuine = list(first.files.values())[1].read_bytes()
+    images.save(list(first.files.values())[1], np.full((45, 60, 3), (1, 0, 0), np.float32))
     again = scenes.resolve(PROCEDURAL, ConfinedPath(tmp_path), 60)
-    assert again.files[1].read_bytes() == genuine
+    assert list(again.files.values())[1].read_bytes() == genuine
     assert "view_001.png: it has changed" in caplog.text
 
 
@@ -98,7 +98,7 @@ def test_two_processes_that_render_at_once_get_one_complete_scene(tmp_path: Path
             pool.map(lambda _: scenes.resolve(PROCEDURAL, ConfinedPath(tmp_path), 60), range(2))
         )
     assert found[0].files == found[1].files
-    assert all(images.read(file).shape == (45, 60, 3) for file in found[0].files)
+    assert all(images.read(file).shape == (45, 60, 3) for file in found[0].files.values())
     assert [p.name for p in tmp_path.iterdir() if p.name[0] != "."] == [found[0].fingerprint]
 
 
@@ -130,3 +130,16 @@ def test_fingerprints_need_neither_torch_nor_scikit_image() -> None:
         [sys.executable, "-P", "-c", script], capture_output=True, text=True, check=True
     )
     assert done.stdout.strip() == "[]"
+
+
+def test_folders_called_images_have_the_name_of_the_folder_around_them(tmp_path: Path) -> None:
+    for path in ("pa/images", "pb/images", "pa/other", "pb/other"):
+        (tmp_path / path).mkdir(parents=True)
+
+    def confs(*paths: str) -> list[SceneConf]:
+        return [SceneConf("", "folder", str(tmp_path / path)) for path in paths]
+
+    assert [scenes.label(conf) for conf in confs("pa/images", "pb/images")] == ["pa", "pb"]
+    scenes.check_labels(confs("pa/images", "pb/images", "pa/images"))
+    with pytest.raises(XrgsError, match=r"pa/other and .*pb/other: both are called other"):
+        scenes.check_labels(confs("pa/other", "pb/other"))

@@ -20,16 +20,16 @@ _CX = {"motorcycle_left": 311.193, "motorcycle_right": 342.279}
 _BASELINE = {"motorcycle_left": 0.0, "motorcycle_right": 193.001}
 
 
-def files() -> tuple[Path, ...]:
+def files() -> dict[str, Path]:
     """Find both photographs in scikit-image's wheel.
 
     Returns:
-        The left and the right one.
+        The left and the right one, by name.
 
     Raises:
         XrgsError: scikit-image, or a file in it, is not installed.
     """
-    return tuple(bundled_photograph(f"{name}.png") for name in _CX)
+    return {name: bundled_photograph(f"{name}.png") for name in _CX}
 
 
 def intrinsics() -> dict[str, NDArray[np.float64]]:

@@ -15,14 +15,14 @@ from xrgs.safeio.confined import ConfinedPath
 class Scene:
     """The photographs of a scene, and the cameras where they are known.
 
-    The key of both mappings is the name of a photograph: its file name without the suffix.
+    The key of all mappings is the name of a photograph, which its view gets.
     """
 
     name: str
     """The name of the scene in tables."""
     fingerprint: str
     """A hash of the photographs' names and bytes, or of what they are rendered from."""
-    files: tuple[ConfinedPath, ...]
+    files: Mapping[str, ConfinedPath]
     """The photographs, sorted by name; one that a user named is a path by itself."""
     intrinsics: Mapping[str, NDArray[np.float64]] = field(default_factory=dict)
     """Exact intrinsics [3, 3] in px of the file, without distortion; SfM gets them, and does not

@@ -1,0 +1,126 @@
+"""Reads and writes COLMAP's models, and points as .ply, with pycolmap."""
+
+from __future__ import annotations
+
+import zlib  # noqa: F401  pycolmap 4.2.1 corrupts the heap where it is imported before zlib
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pycolmap
+from numpy.typing import NDArray
+
+from xrgs.capture import sfm
+from xrgs.errors import XrgsError
+
+
+@dataclass(frozen=True)
+class PinholeImage:
+    """An image with a pinhole camera of its own, as it is written to a model."""
+
+    name: str
+    """Its path below the folder of images."""
+    width: int
+    height: int
+    K: NDArray[np.float64]
+    """Intrinsics [3, 3], px."""
+    viewmat: NDArray[np.float64]
+    """World to camera [4, 4], OpenCV axes."""
+
+
+def read_model(
+    folder: Path, match: Callable[[Sequence[str]], Mapping[str, int]]
+) -> sfm.Reconstruction:
+    """Read COLMAP's model, binary or text.
+
+    Args:
+        folder: The folder of `cameras`, `images` and `points3D`.
+        match: Gives the index of each image that is wanted, from the names of all that have a pose.
+
+    Returns:
+        The cameras of these images, and all points.
+
+    Raises:
+        XrgsError: The files are no model, or a camera can't be served.
+    """
+    try:
+        model = pycolmap.Reconstruction(folder)
+    except (RuntimeError, ValueError, IndexError) as error:
+        raise XrgsError(f"not a model of COLMAP ({error})") from error
+    names = [image.name for image in model.images.values() if image.has_pose]
+    return sfm.to_numpy(model, match(names), {})
+
+
+def read_points(file: Path) -> tuple[NDArray[np.float64], NDArray[np.uint8]]:
+    """Read coloured points from a .ply file.
+
+    Args:
+        file: The file, ASCII or binary.
+
+    Returns:
+        Points [P, 3] and their colours [P, 3].
+
+    Raises:
+        XrgsError: The file is no such .ply.
+    """
+    model = pycolmap.Reconstruction()
+    try:
+        model.import_PLY(file)
+    except (RuntimeError, ValueError, IndexError) as error:
+        raise XrgsError(f"not a .ply of points with colours ({error})") from error
+    return sfm.points_of(model)
+
+
+def write_model(
+    folder: Path,
+    images: Iterable[PinholeImage],
+    points: NDArray[np.float64],
+    colors: NDArray[np.uint8],
+) -> None:
+    """Write a binary model of COLMAP without observations.
+
+    Args:
+        folder: An existing folder.
+        images: The images; each gets a PINHOLE camera of its own.
+        points: Points [P, 3].
+        colors: Their colours [P, 3].
+
+    Raises:
+        OSError: The files can't be written.
+    """
+    model = _with_points(points, colors)
+    for number, image in enumerate(images, 1):
+        K = image.K
+        camera = pycolmap.Camera(
+            camera_id=number,
+            model="PINHOLE",
+            width=image.width,
+            height=image.height,
+            params=[K[0, 0], K[1, 1], K[0, 2], K[1, 2]],
+        )
+        model.add_camera_with_trivial_rig(camera)
+        posed = pycolmap.Image(name=image.name, camera_id=number, image_id=number)
+        model.add_image_with_trivial_frame(posed, pycolmap.Rigid3d(image.viewmat[:3]))
+    model.write_binary(folder)
+
+
+def write_points(file: Path, points: NDArray[np.float64], colors: NDArray[np.uint8]) -> None:
+    """Write coloured points to a .ply file.
+
+    Args:
+        file: The file.
+        points: Points [P, 3].
+        colors: Their colours [P, 3].
+
+    Raises:
+        OSError: The file can't be written.
+    """
+    _with_points(points, colors).export_PLY(file)
+
+
+def _with_points(points: NDArray[np.float64], colors: NDArray[np.uint8]) -> pycolmap.Reconstruction:
+    model = pycolmap.Reconstruction()
+    for point, color in zip(points, colors, strict=True):
+        model.add_point3D(point, pycolmap.Track(), color)
+    return model

@@ -1,0 +1,186 @@
+"""Takes the sharpest frames of a video, evenly spread, as the photographs of a scene.
+
+The frames are divided into as many parts as views are wanted, and the sharpest of each part is
+taken. Sharpness is the variance of the Laplacian of the brightness [pechpacheco2000], at a reduced
+size, where the noise of the sensor counts little. Nothing here imports av before frames are read.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import logging
+from importlib.util import find_spec
+from itertools import pairwise
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from xrgs.capture import images
+from xrgs.errors import UnreadableError, XrgsError
+from xrgs.runtime.progress import ProgressBar
+from xrgs.safeio.confined import ConfinedPath, is_passing
+from xrgs.safeio.hashing import file_digest
+from xrgs.safeio.paths import user_path
+from xrgs.safeio.words import for_line
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    from av.video.frame import VideoFrame
+    from numpy.typing import NDArray
+
+_log = logging.getLogger(__name__)
+
+#: The longer side at which sharpness is measured, px; our choice.
+_SHARPNESS_SIDE = 640
+#: The containers that are read, by FFmpeg's names. Others, such as playlists, lead to other files.
+_CONTAINERS = "mov,mp4,m4a,3gp,3g2,mj2,matroska,webm,avi,mpegts,mpeg"
+
+
+def names(views: int) -> list[str]:
+    """Name the frames that are taken.
+
+    Args:
+        views: The number of frames.
+
+    Returns:
+        `frame_0000`, `frame_0001`, ...
+    """
+    return [f"frame_{index:04d}" for index in range(views)]
+
+
+def digest(path: str | None, views: int) -> str:
+    """Hash everything that the frames depend on: the video's bytes, their number, source code.
+
+    Args:
+        path: `scene.path`, the video.
+        views: The number of frames that are taken.
+
+    Returns:
+        All 64 hexadecimal digits of a SHA-256.
+
+    Raises:
+        UnreadableError: The video can't be read now.
+        XrgsError: There is no such file, or the package that reads videos is not installed.
+    """
+    file = _file(path)
+    try:
+        content = file_digest(file)
+    except OSError as error:
+        kind = UnreadableError if is_passing(error) else XrgsError
+        raise kind(f"scene.path={file}: {error.strerror}") from error
+    if find_spec("av") is None:
+        raise XrgsError(f"scene.path={file}: a video needs PyAV: pip install 'xrgs[video]'")
+    sha256 = hashlib.sha256(repr((content, views)).encode())
+    here = Path(__file__)
+    for source in (here, here.parents[1] / "images.py"):
+        sha256.update(file_digest(source).encode())
+    return sha256.hexdigest()
+
+
+def _file(path: str | None) -> ConfinedPath:
+    if not path:
+        raise XrgsError("scene.path is empty: give the video, scene.path=...")
+    return ConfinedPath(user_path(path))
+
+
+def extract(path: str | None, views: int, folder: ConfinedPath) -> None:
+    """Write the sharpest frames of a video as `<name>.png`, as its player would show them.
+
+    Args:
+        path: `scene.path`, the video.
+        views: The number of frames to take.
+        folder: The folder to write to.
+
+    Raises:
+        ImageError: The file is not a video, or its frames are too large.
+        XrgsError: It has fewer frames than `views`.
+    """
+    file = _file(path)
+    with ProgressBar("sharpness of frames", "frame", None) as bar:
+        sharpness = []
+        for frame in _frames(file):
+            sharpness.append(measure_sharpness(_brightness(frame)))
+            bar.update(1)
+    if len(sharpness) < views:
+        raise XrgsError(f"scene.views={views}: {file} has {len(sharpness)} frames")
+    chosen = sharpest(sharpness, views)
+    with ProgressBar("frames", "frame", views) as bar:
+        for number, frame in enumerate(_frames(file)):
+            if number in chosen:
+                name = names(views)[chosen.index(number)]
+                images.save(folder / f"{name}.png", _upright(frame), durable=False)
+                bar.update(1)
+
+
+def sharpest(sharpness: list[float], parts: int) -> list[int]:
+    """Choose the sharpest of each of some equal parts of a row.
+
+    Args:
+        sharpness: One value for each frame, at least as many as `parts`.
+        parts: The number of parts; their sizes differ by one at most.
+
+    Returns:
+        Ascending indices, one for each part; the first where several are equal.
+    """
+    ends = [round(part * len(sharpness) / parts) for part in range(parts + 1)]
+    return [max(range(a, b), key=lambda i: sharpness[i]) for a, b in pairwise(ends)]
+
+
+def measure_sharpness(brightness: NDArray[np.uint8]) -> float:
+    """Measure the sharpness of an image: the variance of its Laplacian.
+
+    Args:
+        brightness: [H, W] in 0..255.
+
+    Returns:
+        The variance over all pixels; 0 for an image without detail.
+    """
+    from scipy.ndimage import laplace
+
+    return float(laplace(brightness.astype(np.float32)).var())
+
+
+def _frames(file: ConfinedPath) -> Iterator[VideoFrame]:
+    """Decode the frames of the first video stream.
+
+    What can't be decoded ends the video with a warning where frames came before it.
+    """
+    import av
+
+    number = 0
+    try:
+        with (
+            file.open() as stream,
+            av.open(stream, "r", options={"format_whitelist": _CONTAINERS}) as container,
+        ):
+            if not container.streams.video:
+                raise images.ImageError(f"{file}: it has no video")
+            container.streams.video[0].thread_type = "AUTO"
+            for frame in container.decode(video=0):
+                if frame.width * frame.height > images.MAX_PIXELS:
+                    size = f"{frame.width} x {frame.height}"
+                    raise images.ImageError(f"{file}: its frames have {size} pixels, too many")
+                yield frame
+                number += 1
+    except (av.FFmpegError, OSError) as error:
+        if number == 0:
+            raise images.ImageError(f"{file}: unreadable as a video ({error})") from error
+        _log.warning("%s", for_line(f"{file}: ends after frame {number} ({error})"))
+
+
+def _brightness(frame: VideoFrame) -> NDArray[np.uint8]:
+    """Return the brightness [H, W] of a frame, at the size at which sharpness is measured."""
+    scale = min(1.0, _SHARPNESS_SIDE / max(frame.width, frame.height))
+    small = frame.reformat(
+        max(1, round(frame.width * scale)), max(1, round(frame.height * scale)), format="gray"
+    )
+    return small.to_ndarray().astype(np.uint8)
+
+
+def _upright(frame: VideoFrame) -> images.ImageArray:
+    """Return a frame [H, W, 3] in 0..1, turned as its player would."""
+    image = frame.to_ndarray(format="rgb24")
+    turned = np.rot90(image, round(frame.rotation / 90) % 4)
+    return np.ascontiguousarray(turned, dtype=np.float32) / np.float32(255)

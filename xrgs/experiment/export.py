@@ -1,0 +1,197 @@
+"""Writes a variant or a cell in the layouts that other programs read: COLMAP's and nerfstudio's.
+
+All that is written is in one world, the normalised one of training: cameras, points and splats.
+`transform.json` leads to it from the world of SfM. Images are undistorted, each with a pinhole
+camera of its own.
+"""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from xrgs.errors import XrgsError
+from xrgs.experiment.cell_folder import CellFolder
+from xrgs.experiment.results import load_variant
+from xrgs.safeio.atomic import write_json, write_text
+from xrgs.safeio.confined import ConfinedPath
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from xrgs.capture.colmap import PinholeImage
+    from xrgs.capture.dataset import Dataset, LoadedView
+    from xrgs.capture.views import Variant
+
+_SPLATS = "splats.ply"
+
+
+def export(path: Path, layout: str, out: Path) -> str:
+    """Write a cell or a variant for another program.
+
+    The folder gets `images/`, named `<split>_<view>.png`; `split.json`, which says of each image
+    its view, split and tag; `transform.json`, a similarity from the world of SfM to that of all
+    other files; and of a cell `splats.ply`. Cameras and points are in `sparse/0` (`colmap`), or in
+    `transforms.json` and `points.ply` (`nerfstudio`).
+
+    Of a cell, the images are those that it was trained on and scored with.
+
+    Args:
+        path: The folder of a finished cell, or of a variant, in its store.
+        layout: `colmap` or `nerfstudio`.
+        out: The folder to write to, which is made; it may exist if it is empty.
+
+    Returns:
+        A line that says what was written.
+
+    Raises:
+        XrgsError: The folder is neither, or damaged; there is no such layout; or `out` can't be
+            written, or holds something.
+    """
+    if layout not in _LAYOUTS:
+        raise XrgsError(f"format={layout}: must be one of {', '.join(_LAYOUTS)}")
+    folder = ConfinedPath(path)
+    cell = _cell(folder)
+    variant, data = _load(folder, cell)
+    target = ConfinedPath(out)
+    try:
+        target.make_root()
+        if target.names():
+            raise XrgsError(f"out={out}: it holds files; name a new folder")
+        images = _write_images(data, target)
+        write_json(target / "transform.json", {"sfm_to_export": transform(variant).tolist()})
+        _LAYOUTS[layout](data, images, target)
+        if cell is not None:
+            with (cell.folder / _SPLATS).open() as stream, (target / _SPLATS).create() as copy:
+                shutil.copyfileobj(stream, copy)
+    except OSError as error:
+        raise XrgsError(f"out={out}: {error.filename}: {error.strerror}") from error
+    splats = "" if cell is None else f", {_SPLATS}"
+    counts = f"{len(data.train)} training and {len(data.test)} test views"
+    return f"{counts}, {len(data.points)} points{splats}: written to {out}"
+
+
+def transform(variant: Variant) -> NDArray[np.float64]:
+    """Compute the similarity from the world of SfM to the normalised world of training.
+
+    Args:
+        variant: The variant.
+
+    Returns:
+        [4, 4]; its upper left part is a rotation times the scale.
+    """
+    from xrgs.splat.normalize import normalize_scene
+
+    posed = [view.viewmat for view in variant.views if view.split != "original"]
+    return normalize_scene(np.stack(posed), variant.points).transform
+
+
+def _cell(folder: ConfinedPath) -> CellFolder | None:
+    """Return the finished cell in a folder; None where it holds a variant."""
+    try:
+        names = folder.names()
+    except OSError as error:
+        raise XrgsError(
+            f"{folder}: {error.strerror}; give the folder of a cell or a variant"
+        ) from error
+    if "variant.json" in names:
+        return None
+    if "identity.json" not in names:
+        raise XrgsError(f"{folder}: neither a cell nor a variant")
+    cell = CellFolder(ConfinedPath(folder.path.parent) / folder.path.name)
+    state = cell.state()
+    if state.name != "done":
+        raise XrgsError(f"{folder}: this cell is {state.name}, not done ({state.reason})")
+    return cell
+
+
+def _load(folder: ConfinedPath, cell: CellFolder | None) -> tuple[Variant, Dataset]:
+    from xrgs.capture import dataset, variant
+
+    if cell is not None:
+        return load_variant(cell.folder), cell.dataset()
+    frozen = variant.load(folder)
+    return frozen, dataset.load(frozen)
+
+
+def _views(data: Dataset) -> Iterator[tuple[str, str, LoadedView]]:
+    """Yield file name, split and view of each image. Names alone may occur in both splits."""
+    for split, views in (("train", data.train), ("test", data.test)):
+        for view in views:
+            yield f"{split}_{view.name}.png", split, view
+
+
+def _write_images(data: Dataset, target: ConfinedPath) -> list[PinholeImage]:
+    """Write the images and `split.json`; return the cameras."""
+    from xrgs.capture.colmap import PinholeImage
+    from xrgs.capture.images import save
+
+    images, entries = [], []
+    for name, split, view in _views(data):
+        save(target / "images" / name, view.image.numpy(), durable=False)
+        entries.append({"file": name, "view": view.name, "split": split, "tag": view.tag})
+        camera = view.camera
+        K, viewmat = camera.K.double().numpy(), camera.viewmat.double().numpy()
+        images.append(PinholeImage(name, camera.width, camera.height, K, viewmat))
+    write_json(target / "split.json", {"images": entries})
+    return images
+
+
+def _write_colmap(data: Dataset, images: list[PinholeImage], target: ConfinedPath) -> None:
+    """Write a binary model, and the list of test views that the trainer of 3DGS reads."""
+    from xrgs.capture import colmap
+
+    model = target / "sparse/0"
+    model.make_folder()
+    colmap.write_model(model.path, images, *_points(data))
+    tests = [name for name, split, _ in _views(data) if split == "test"]
+    write_text(model / "test.txt", "".join(f"{name}\n" for name in tests))
+
+
+def _write_nerfstudio(data: Dataset, images: list[PinholeImage], target: ConfinedPath) -> None:
+    from xrgs.capture import colmap
+
+    colmap.write_points(target.path / "points.ply", *_points(data))
+    files = {"train": [], "test": []}  # type: dict[str, list[str]]
+    for name, split, _ in _views(data):
+        files[split].append(f"images/{name}")
+    content = {
+        "camera_model": "OPENCV",
+        "orientation_override": "none",  # the splats would not turn with the cameras
+        "ply_file_path": "points.ply",
+        "train_filenames": files["train"],
+        "val_filenames": files["test"],
+        "test_filenames": files["test"],
+        "frames": [_frame(image) for image in images],
+    }
+    write_json(target / "transforms.json", content)
+
+
+def _frame(image: PinholeImage) -> dict[str, Any]:
+    """Return a frame of transforms.json, whose cameras look along -z with y up."""
+    camera_to_world = np.linalg.inv(image.viewmat) @ np.diag([1.0, -1.0, -1.0, 1.0])
+    return {
+        "file_path": f"images/{image.name}",
+        "w": image.width,
+        "h": image.height,
+        "fl_x": float(image.K[0, 0]),
+        "fl_y": float(image.K[1, 1]),
+        "cx": float(image.K[0, 2]),
+        "cy": float(image.K[1, 2]),
+        "transform_matrix": camera_to_world.tolist(),
+    }
+
+
+def _points(data: Dataset) -> tuple[NDArray[np.float64], NDArray[np.uint8]]:
+    colors = (data.colors * 255).round().byte().numpy()
+    return data.points.double().numpy(), colors
+
+
+_LAYOUTS: dict[str, Callable[[Dataset, list[PinholeImage], ConfinedPath], None]] = {
+    "colmap": _write_colmap,
+    "nerfstudio": _write_nerfstudio,
+}
