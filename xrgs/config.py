@@ -10,15 +10,16 @@ from __future__ import annotations
 import math
 import re
 from dataclasses import dataclass, field, is_dataclass
+from functools import cache
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any, get_type_hints
 
 import hydra
 from hydra.core.config_store import ConfigStore
 from omegaconf import MISSING, DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from xrgs.errors import StoreError, XrgsError
+from xrgs.errors import StoreError, XrgsError, did_you_mean
 from xrgs.safeio.confined import ConfinedPath
 from xrgs.safeio.records import read_json
 from xrgs.splat.backend import CHOICES
@@ -30,6 +31,9 @@ from xrgs.splat.settings import (
     RasterSettings,
 )
 
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
 _PACKAGE = Path(__file__).parent
 #: `conf/` is inside the package in a wheel and beside it in a checkout.
 CONF_DIR = _PACKAGE / "conf" if (_PACKAGE / "conf").is_dir() else _PACKAGE.parent / "conf"
@@ -37,6 +41,10 @@ CONF_DIR = _PACKAGE / "conf" if (_PACKAGE / "conf").is_dir() else _PACKAGE.paren
 #: The start of an interpolation, with the backslashes before it: an odd number of them escapes it.
 _INTERPOLATION = re.compile(r"(\\*)\$\{")
 _RETRY = ("none", "failed")
+#: The groups of files that a sweep is made of. The first two are not in the defaults list of
+#: `conf/config.yaml`, so that Hydra requires a plus before them.
+PLUS_GROUPS = ("ablation", "sweeps")
+GROUPS = (*PLUS_GROUPS, "scene", "preset", "variant")
 
 
 @dataclass
@@ -439,6 +447,24 @@ def register() -> None:
     ConfigStore.instance().store(name="xrgs_schema", node=Conf)
 
 
+@cache
+def known_keys() -> tuple[str, ...]:
+    """Return what may stand before the `=` of an override.
+
+    Returns:
+        The groups of files (`scene`), and every key of the schema with the keys that contain others
+        (`train`, `train.steps`).
+    """
+    return tuple(dict.fromkeys((*GROUPS, *_keys_of(Conf, ""))))
+
+
+def _keys_of(schema: type[Any], prefix: str) -> Iterator[str]:
+    for name, kind in get_type_hints(schema).items():
+        yield f"{prefix}{name}"
+        if is_dataclass(kind):
+            yield from _keys_of(kind, f"{prefix}{name}.")
+
+
 def to_conf(cfg: DictConfig) -> Conf:
     """Convert a composed Hydra config to dataclasses, every value present and of its type.
 
@@ -454,7 +480,11 @@ def to_conf(cfg: DictConfig) -> Conf:
     """
     # The schema is in the config's own defaults, so its nodes are typed and checked already. To
     # merge it in once more takes twenty times as long, and a plan composes many configs.
-    conf = Conf(**{name: _as_object(cfg, name) for name in Conf.__dataclass_fields__})
+    names = Conf.__dataclass_fields__
+    for name in cfg:
+        if name not in names and name != "hydra":
+            raise XrgsError(f"{name}: there is no such key{did_you_mean(str(name), known_keys())}")
+    conf = Conf(**{name: _as_object(cfg, name) for name in names})
     _check_known(conf, "")
     _check_plugins(conf.components)
     least_values = (
@@ -519,7 +549,8 @@ def _check_known(value: Any, path: str) -> None:
     """Raise `XrgsError` where a `+` has added a key to the schema, which nothing would read."""
     for name, inner in vars(value).items():
         if name not in value.__dataclass_fields__:
-            raise XrgsError(f"{path}{name}: there is no such key")
+            key = f"{path}{name}"
+            raise XrgsError(f"{key}: there is no such key{did_you_mean(key, known_keys())}")
         if is_dataclass(inner):
             _check_known(inner, f"{path}{name}.")
 

@@ -2,19 +2,20 @@
 
 from __future__ import annotations
 
+import re
 import sys
 from contextlib import contextmanager, suppress
 from typing import TYPE_CHECKING, Any, cast
 
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.override_parser.types import Quote, QuotedString
-from hydra.errors import HydraException
+from hydra.errors import HydraException, MissingConfigException, OverrideParseException
 from omegaconf import DictConfig, OmegaConf
-from omegaconf.errors import OmegaConfBaseException
+from omegaconf.errors import ConfigAttributeError, ConfigKeyError, OmegaConfBaseException
 
 from xrgs import config
 from xrgs.config import escape_interpolations
-from xrgs.errors import XrgsError
+from xrgs.errors import XrgsError, did_you_mean
 from xrgs.runtime.streams import say
 from xrgs.safeio.paths import user_path
 from xrgs.safeio.words import for_line
@@ -22,6 +23,8 @@ from xrgs.safeio.words import for_line
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
 
+#: How Hydra says that a key of an override is unknown.
+_NOT_OVERRIDDEN = re.compile(r"Could not override '([^']+)'")
 #: Keys whose values are paths.
 _PATHS = frozenset({"scene.path", "store", "data_root"})
 
@@ -42,7 +45,39 @@ def errors_as_messages(command: str, hint: str = "") -> Iterator[None]:
     except XrgsError as error:
         sys.exit(for_line(f"{command}: {error}"))
     except (OmegaConfBaseException, HydraException) as error:
-        sys.exit(for_line(f"{command}: {config.error_line(error)}{hint}"))
+        sys.exit(for_line(f"{command}: {_explained(error)}{hint}"))
+
+
+def _explained(error: Exception) -> str:
+    """Return what an error of Hydra or OmegaConf says, with names like one that does not exist.
+
+    Hydra's own advice is left out: `steps=100` would be told to become `+steps=100`, which adds a
+    key that nothing reads.
+    """
+    if isinstance(error, MissingConfigException) and error.missing_cfg_file:
+        return _missing_file(error.missing_cfg_file, error.options or ())
+    if isinstance(error, OverrideParseException):
+        return f"{error.override}: {config.error_line(error)}"
+    if found := _NOT_OVERRIDDEN.search(str(error)):
+        key = found[1].partition("@")[0]
+        return f"{key}: there is no such key{did_you_mean(key, config.known_keys())}"
+    if isinstance(error, (ConfigKeyError, ConfigAttributeError)):
+        parent = error.parent_node
+        known = tuple(map(str, parent)) if isinstance(parent, DictConfig) else ()
+        return config.error_line(error) + did_you_mean(str(error.key), known)
+    if isinstance(error.__cause__, OmegaConfBaseException):  # it names the key and the value
+        return _explained(error.__cause__)
+    return config.error_line(error)
+
+
+def _missing_file(file: str, options: Sequence[str]) -> str:
+    """Return what is said of `GROUP/NAME` where there is no such file of the config."""
+    group = next((g for g in config.GROUPS if file.startswith(f"{g}/")), file.rpartition("/")[0])
+    name = file.removeprefix(f"{group}/")
+    if not (known := sorted({*files(group), *options})):
+        return f"{group}: there is no such key{did_you_mean(group, config.known_keys())}"
+    offered = did_you_mean(name, known) or f"; choose from: {', '.join(known)}"
+    return f"{group}={name}: there is no such choice{offered}"
 
 
 def with_quotes(words: Sequence[str]) -> list[str]:
@@ -100,16 +135,25 @@ def dotlist(words: Sequence[str]) -> DictConfig:
     return conf
 
 
+def files(group: str) -> list[str]:
+    """Return the names of a config group's files, sorted; empty where there is no such group.
+
+    Args:
+        group: Name of the group's folder, as `scene`.
+    """
+    folder = config.CONF_DIR / group
+    folder = folder if folder.is_dir() else config.CONF_DIR.parent / group
+    names = (file.relative_to(folder).with_suffix("") for file in folder.rglob("*.yaml"))
+    return sorted(name.as_posix() for name in names)
+
+
 def choices(group: str) -> str:
     """Return the names of a config group's files, for a command's help: `fern, flower`.
 
     Args:
         group: Name of the group's folder.
     """
-    folder = config.CONF_DIR / group
-    folder = folder if folder.is_dir() else config.CONF_DIR.parent / group
-    files = sorted(folder.rglob("*.yaml"))
-    return ", ".join(file.relative_to(folder).with_suffix("").as_posix() for file in files)
+    return ", ".join(files(group))
 
 
 def parse(schema: type[Any], help_text: str) -> DictConfig:
