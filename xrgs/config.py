@@ -41,6 +41,8 @@ CONF_DIR = _PACKAGE / "conf" if (_PACKAGE / "conf").is_dir() else _PACKAGE.paren
 #: The start of an interpolation, with the backslashes before it: an odd number of them escapes it.
 _INTERPOLATION = re.compile(r"(\\*)\$\{")
 _RETRY = ("none", "failed")
+#: The values of `train.views`.
+TRAINING_VIEWS = ("mixed", "all_hr", "hr_only", "lr_only")
 #: The groups of files that a sweep is made of. The first two are not in the defaults list of
 #: `conf/config.yaml`, so that Hydra requires a plus before them.
 PLUS_GROUPS = ("ablation", "sweeps")
@@ -405,6 +407,15 @@ class LimitsConf:
 
 
 @dataclass
+class LpipsConf:
+    """The weights of LPIPS, which are not shipped."""
+
+    fetch: bool = True
+    """Whether a sweep fetches them from the package index where this machine has none. It has a
+    value here as well, so that configs from before the key are read."""
+
+
+@dataclass
 class Conf:
     """The config of one cell, and how to run it."""
 
@@ -434,6 +445,8 @@ class Conf:
     writes none."""
     limits: LimitsConf = field(default_factory=LimitsConf)
     """What a cell may use."""
+    lpips: LpipsConf = field(default_factory=LpipsConf)
+    """The weights of LPIPS."""
     retry: str = MISSING
     """`failed` runs failed cells again; `none` reports them and leaves them."""
     fail_fast: bool = MISSING
@@ -490,6 +503,8 @@ def to_conf(cfg: DictConfig) -> Conf:
     least_values = (
         ("splat.optimizer.means_decay_from", conf.splat.optimizer.means_decay_from, 0),
         ("splat.optimizer.shN_every", conf.splat.optimizer.shN_every, 1),
+        ("seed", conf.seed, 0),
+        ("variant.seed", conf.variant.seed, 0),
         ("train.steps", conf.train.steps, 1),
         ("train.evaluate_every", conf.train.evaluate_every, 0),
         ("threads", conf.threads, 0),
@@ -500,6 +515,9 @@ def to_conf(cfg: DictConfig) -> Conf:
     for key, value, least in least_values:
         if not value >= least:
             raise XrgsError(f"{key}={value}: must be at least {least}")
+    if conf.train.views not in TRAINING_VIEWS:
+        choices = ", ".join(TRAINING_VIEWS)
+        raise XrgsError(f"train.views={conf.train.views}: must be one of {choices}")
     if not 0 <= conf.train.validation < 1:
         raise XrgsError(f"train.validation={conf.train.validation}: must be from 0 to below 1")
     if (begin := conf.splat.optimizer.means_decay_from) >= NOMINAL_STEPS:

@@ -13,6 +13,7 @@ from hydra.errors import HydraException, MissingConfigException, OverrideParseEx
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import ConfigAttributeError, ConfigKeyError, OmegaConfBaseException
 
+import xrgs
 from xrgs import config
 from xrgs.config import escape_interpolations
 from xrgs.errors import XrgsError, did_you_mean
@@ -156,8 +157,34 @@ def choices(group: str) -> str:
     return ", ".join(files(group))
 
 
+def answer_version(command: str) -> None:
+    """Print the version of xrgs and end the command, where `--version` is asked for.
+
+    Args:
+        command: Name of the command.
+
+    Raises:
+        SystemExit: With code 0, after the version was printed.
+    """
+    if "--version" in sys.argv[1:]:
+        say(f"{command} {xrgs.__version__}")
+        sys.exit()
+
+
+def completion(command: str, words: Sequence[str]) -> str:
+    """Return the line of bash that completes the words of a command, and names of files.
+
+    Args:
+        command: Name of the command.
+        words: What may be written behind it; none of them holds a space or a quote.
+    """
+    return f"complete -o default -o nospace -W '{' '.join(words)}' {command}"
+
+
 def parse(schema: type[Any], help_text: str) -> DictConfig:
-    """Return the command line as a config of a schema, or print the help and end the command.
+    """Return the command line as a config of a schema, or print what it asks for and end.
+
+    `--help`, `--version` and `--completion` ask for the help, the version and a line of bash.
 
     Args:
         schema: A dataclass of the arguments, with their default values.
@@ -165,9 +192,14 @@ def parse(schema: type[Any], help_text: str) -> DictConfig:
 
     Raises:
         OmegaConfBaseException: An argument is not in the schema, or its value is of another type.
-        SystemExit: With code 0, after the help was printed.
+        SystemExit: With code 0, after the help, the version or the completion was printed.
     """
+    command = help_text.split(maxsplit=1)[0]
+    answer_version(command)
     if {"-h", "--help"} & set(sys.argv[1:]):
         say(help_text.rstrip())
+        sys.exit()
+    if "--completion" in sys.argv[1:]:
+        say(completion(command, [f"{name}=" for name in schema.__dataclass_fields__]))
         sys.exit()
     return cast("DictConfig", OmegaConf.merge(OmegaConf.structured(schema), dotlist(sys.argv[1:])))

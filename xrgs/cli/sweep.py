@@ -15,7 +15,14 @@ from hydra.errors import CompactHydraException
 from omegaconf import MISSING, DictConfig, OmegaConf
 
 from xrgs import config
-from xrgs.cli.arguments import choices, dotlist, errors_as_messages, with_quotes
+from xrgs.cli.arguments import (
+    answer_version,
+    choices,
+    dotlist,
+    errors_as_messages,
+    with_quotes,
+)
+from xrgs.cli.key_help import explain
 from xrgs.runtime.signals import exit_on_signal
 from xrgs.runtime.streams import ignore_broken_pipe, say
 
@@ -43,7 +50,8 @@ xrgs-sweep rerun=CELL_FOLDER [out=FOLDER] [store=FOLDER] [threads=N] [scene.path
            [plugins=NAME[,NAME]...]
   trains a finished cell again in another folder, and prints "the same, bit for bit" or what differs
 
---cfg job prints every key with its value; --hydra-help explains Hydra's own options.
+help=KEY explains a key, e.g. help=train.steps or help=variant; --cfg job prints all keys with their
+values; --config-dir FOLDER adds YAML files of your own; --hydra-help explains Hydra's own options.
 """
 
 
@@ -95,6 +103,11 @@ def main() -> None:
         say(_HELP.format(**{group: choices(group) for group in groups}).rstrip())
         return
     ignore_broken_pipe()
+    answer_version("xrgs-sweep")
+    if len(arguments) == 1 and arguments[0].startswith("help="):
+        with errors_as_messages("xrgs-sweep"):
+            say(explain(arguments[0].removeprefix("help=")))
+        return
     if any(argument.startswith("rerun=") for argument in arguments):
         with exit_on_signal(
             "The cell is unchanged; the folder that was begun beside it has no result."

@@ -41,6 +41,8 @@ TORCH_SLOWDOWN = 50.0
 #: Seconds beyond which the time of a cell beside its training is none: a store that was copied has
 #: other dates.
 _MAX_OVERHEAD_S = 600.0
+#: Resident memory of a process that has imported torch and trains nothing.
+_PROCESS_BYTES = 4e8
 #: Standard deviations of logarithms: of a cell around its estimate, and of the priors of effects.
 #: Chosen for the cells of 12 variants that were left out in turn.
 _RESIDUAL, _LEVEL, _NAME, _TORCH = 0.15, 1.0, 0.2, 0.3
@@ -69,7 +71,7 @@ class Prior:
 _PRIORS = {
     "step_s": Prior(0.03, {"pixels": 0.8, "steps": 0.1, "threads": -0.85}, TORCH_SLOWDOWN),
     "overhead_s": Prior(4.0, {"pixels": 0.3}),
-    "memory_bytes": Prior(8e8, {"pixels": 0.3, "steps": 0.1}),
+    "memory_bytes": Prior(4.5e8, {"pixels": 0.8, "steps": 0.3}),
     "disk_bytes": Prior(3e7, {"pixels": 0.8, "steps": 0.2}),
 }
 
@@ -152,7 +154,7 @@ class CostEstimator:
         what = features.of_identity(identity, provenance.get("threads"), self._store)
         training_s = as_number(summary["training_time_s"])
         costs = {"step_s": training_s / identity["train"]["steps"]}
-        costs["memory_bytes"] = as_number(summary.get("peak_rss_bytes"))
+        costs["memory_bytes"] = as_number(summary.get("peak_rss_bytes")) - _PROCESS_BYTES
         if status:
             costs["disk_bytes"] = sum(as_number(e["bytes"]) for e in status["files"].values())
             started = datetime.fromisoformat(provenance["started"]).timestamp()
@@ -197,7 +199,7 @@ class CostEstimator:
         return Cost(
             training_s,
             training_s + expected["overhead_s"],
-            expected["memory_bytes"],
+            expected["memory_bytes"] + _PROCESS_BYTES,
             expected["disk_bytes"],
         )
 

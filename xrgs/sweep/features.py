@@ -56,7 +56,10 @@ def of_identity(identity: Mapping[str, Any], threads: object, store: Store) -> F
         TypeError: A value of it is of another type.
     """
     train, variant = identity["train"], identity["variant"]
-    names, torch = _names(identity) | {f"variant={variant}"}, identity["splat"]["backend"] == "torch"
+    names, torch = (
+        _names(identity) | {f"variant={variant}"},
+        identity["splat"]["backend"] == "torch",
+    )
     sizes = {"steps": train["steps"], "threads": threads}
     sizes |= _variant_sizes(store, variant, train["views"])
     return Features(names, _logarithms(sizes), torch)

@@ -49,7 +49,7 @@ def list_photographs(path: str | None, long_side: int) -> tuple[Path, ...]:
     folder = user_path(path)
     try:
         if not folder.is_dir():
-            why = "no such folder (scene=llff/... looks in data_root)"
+            why = "no such folder (scenes of llff/ and captures/ are looked for in data_root)"
             raise XrgsError(f"scene.path={folder}: {why}")
         copies = [_images_in(f) for f in sorted(folder.iterdir()) if _is_llff_folder(f)]
         files = _select_copies([c for c in copies if c], long_side) or _images_in(folder)
