@@ -50,7 +50,7 @@ def _default_signal_handlers() -> Iterator[None]:
 
 @pytest.fixture(scope="session", autouse=True)
 def lpips_weights(tmp_path_factory: pytest.TempPathFactory) -> Iterator[weights.Weights | None]:
-    """Hide this machine's LPIPS weights from all tests, which see the same everywhere, and fetch none.
+    """Hide this machine's LPIPS weights from all tests, which then see the same and fetch none.
 
     The value is the weights, or None if the machine has none; tests get them as `published`.
     """

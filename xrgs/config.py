@@ -500,6 +500,13 @@ def to_conf(cfg: DictConfig) -> Conf:
     conf = Conf(**{name: _as_object(cfg, name) for name in names})
     _check_known(conf, "")
     _check_plugins(conf.components)
+    _check_ranges(conf)
+    _check_choices(conf)
+    return conf
+
+
+def _check_ranges(conf: Conf) -> None:
+    """Raise `XrgsError` where a number is out of its range; the message names its key."""
     least_values = (
         ("splat.optimizer.means_decay_from", conf.splat.optimizer.means_decay_from, 0),
         ("splat.optimizer.shN_every", conf.splat.optimizer.shN_every, 1),
@@ -515,26 +522,26 @@ def to_conf(cfg: DictConfig) -> Conf:
     for key, value, least in least_values:
         if not value >= least:
             raise XrgsError(f"{key}={value}: must be at least {least}")
-    if conf.train.views not in TRAINING_VIEWS:
-        choices = ", ".join(TRAINING_VIEWS)
-        raise XrgsError(f"train.views={conf.train.views}: must be one of {choices}")
     if not 0 <= conf.train.validation < 1:
         raise XrgsError(f"train.validation={conf.train.validation}: must be from 0 to below 1")
     if (begin := conf.splat.optimizer.means_decay_from) >= NOMINAL_STEPS:
         key = "splat.optimizer.means_decay_from"
         raise XrgsError(f"{key}={begin}: must be below {NOMINAL_STEPS}, the length of a run")
-    if conf.splat.backend not in CHOICES:
-        raise XrgsError(f"splat.backend={conf.splat.backend}: must be one of {', '.join(CHOICES)}")
-    densify = conf.splat.densify
-    if densify.split not in SPLITS:
-        raise XrgsError(f"splat.densify.split={densify.split}: must be one of {', '.join(SPLITS)}")
-    if not (math.isfinite(densify.budget) and densify.budget >= 0):
-        raise XrgsError(
-            f"splat.densify.budget={densify.budget}: must be a finite number, 0 or more"
-        )
-    if conf.retry not in _RETRY:
-        raise XrgsError(f"retry={conf.retry}: must be one of {', '.join(_RETRY)}")
-    return conf
+    budget = conf.splat.densify.budget
+    if not (math.isfinite(budget) and budget >= 0):
+        raise XrgsError(f"splat.densify.budget={budget}: must be a finite number, 0 or more")
+
+
+def _check_choices(conf: Conf) -> None:
+    """Raise `XrgsError` where a word is none of those that its key may have."""
+    for key, value, accepted in (
+        ("train.views", conf.train.views, TRAINING_VIEWS),
+        ("splat.backend", conf.splat.backend, CHOICES),
+        ("splat.densify.split", conf.splat.densify.split, SPLITS),
+        ("retry", conf.retry, _RETRY),
+    ):
+        if value not in accepted:
+            raise XrgsError(f"{key}={value}: must be one of {', '.join(accepted)}")
 
 
 def compose(*overrides: str) -> Conf:

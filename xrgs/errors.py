@@ -29,7 +29,7 @@ class UnreadableError(StoreError):
 
 
 def did_you_mean(name: str, known: Iterable[str]) -> str:
-    """Return the end of a message about a name that does not exist: the names that are most like it.
+    """Return the end of a message about a name that does not exist: names that are like it.
 
     A name is like another one whose last part is the same as its own (`fern` and `llff/fern`,
     `steps` and `train.steps`) or has nearly the same letters; if there is none, like one that has

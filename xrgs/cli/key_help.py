@@ -1,4 +1,4 @@
-"""Explains keys of the config by the comments of `conf/config.yaml`: `xrgs-sweep help=train.steps`."""
+"""Explains keys of the config by the comments of `conf/config.yaml`, for `xrgs-sweep help=KEY`."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ if TYPE_CHECKING:
     from collections.abc import Iterator
 
 _WHERE = (
-    "Values are those of the baseline. A preset, a scene, a variant or an ablation may set others;\n"
-    "xrgs-sweep --cfg job prints the values in effect."
+    "Values are those of the baseline. A preset, a scene, a variant or an ablation may set\n"
+    "others; xrgs-sweep --cfg job prints the values in effect."
 )
 
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import cache
 from statistics import fmean
 from typing import TYPE_CHECKING, Any
 
@@ -61,7 +62,7 @@ def of_identity(identity: Mapping[str, Any], threads: object, store: Store) -> F
         identity["splat"]["backend"] == "torch",
     )
     sizes = {"steps": train["steps"], "threads": threads}
-    sizes |= _variant_sizes(store, variant, train["views"])
+    sizes |= _variant_sizes(store, str(variant), str(train["views"]))
     return Features(names, _logarithms(sizes), torch)
 
 
@@ -111,14 +112,15 @@ def _logarithms(sizes: Mapping[str, object]) -> dict[str, float]:
     }
 
 
-def _variant_sizes(store: Store, variant: object, views: object) -> dict[str, object]:
+@cache
+def _variant_sizes(store: Store, variant: str, views: str) -> dict[str, object]:
     """Return what the files of a frozen variant tell, without verifying them."""
     if not is_name(variant):
         return {}
-    folder = store.variants / str(variant)
+    folder = store.variants / variant
     try:
         entries = read_object(folder / frozen.MANIFEST)["views"]
-        tag = {"hr_only": "HR", "lr_only": "LR"}.get(str(views))
+        tag = {"hr_only": "HR", "lr_only": "LR"}.get(views)
         splits = ("train", "original") if views == "all_hr" else ("train",)  # originals replace
         pixels = {
             entry["name"]: entry["width"] * entry["height"]
