@@ -21,7 +21,9 @@ def test_a_group_shows_its_keys() -> None:
 
 
 def test_an_unknown_key_is_named_with_one_like_it() -> None:
-    with pytest.raises(XrgsError, match=r"help=stesp: there is no such key; did you mean train\.steps"):
+    with pytest.raises(
+        XrgsError, match=r"help=stesp: there is no such key; did you mean train\.steps"
+    ):
         explain("stesp")
 
 
