@@ -35,6 +35,10 @@ if TYPE_CHECKING:
 
 #: Number of finished cells that are read, the newest first; more would take long and help little.
 _MAX_CELLS = 500
+#: The most names of effects of all these cells; a store of ours has some hundred.
+_MAX_NAMES = 10_000
+#: Largest logarithm of a cost: that of 10^26.
+_MAX_LOG = 60.0
 #: How many times longer the torch backend takes for a training step than the native one: rendering
 #: and loss, forward and backward, of 10,000 to 100,000 Gaussians took 32 to 69 times as long.
 TORCH_SLOWDOWN = 50.0
@@ -96,34 +100,29 @@ class _Regression:
     def __init__(self, prior: Prior, past: Iterable[tuple[Features, float]]) -> None:
         known = [(cell, cost) for cell, cost in past if 0 < cost < math.inf]
         self._prior = prior
+        # What all cells have is part of the level.
         shared = frozenset.intersection(*(cell.names for cell, _ in known)) if known else ()
         names = {name for cell, _ in known for name in cell.names} - frozenset(shared)
         self._column = {name: number for number, name in enumerate(sorted(names))}
-        if not known:
-            self._effects = np.zeros(self._leading)
-            return
-        X = np.stack([self._row(cell) for cell, _ in known])
-        y = np.array([math.log(cost) - prior.log(cell) for cell, cost in known])
         deviations = [_LEVEL, _TORCH, *_EXPONENTS.values(), *[_NAME] * len(names)]
-        penalty = np.diag((_RESIDUAL / np.array(deviations)) ** 2)
-        self._effects = np.linalg.solve(X.T @ X + penalty, X.T @ y)
-
-    @property
-    def _leading(self) -> int:
-        """The number of effects before those that have a name."""
-        return 2 + len(_EXPONENTS)
+        variances = np.array(deviations) ** 2
+        X = np.array([self._row(cell) for cell, _ in known]).reshape(-1, len(variances))
+        y = np.array([math.log(cost) - prior.log(cell) for cell, cost in known])
+        # As many equations as cells: there may be more effects.
+        covariance = (X * variances) @ X.T + _RESIDUAL**2 * np.eye(len(known))
+        self._effects = variances * (X.T @ np.linalg.solve(covariance, y))
 
     def _row(self, cell: Features) -> NDArray[np.float64]:
         """Return how often each effect is in the cost of a cell."""
-        row = np.zeros(self._leading + len(self._column))
-        row[: self._leading] = [1, cell.torch, *(cell.sizes.get(name, 0) for name in _EXPONENTS)]
-        found = [self._column[name] for name in cell.names if name in self._column]
-        row[self._leading :][found] = 1
-        return row
+        sizes = [cell.sizes.get(name, 0.0) for name in _EXPONENTS]
+        named = np.zeros(len(self._column))
+        named[[self._column[name] for name in cell.names if name in self._column]] = 1
+        return np.array([1.0, cell.torch, *sizes, *named])
 
     def __call__(self, cell: Features) -> float:
         """Return the expected cost of a cell."""
-        return math.exp(self._prior.log(cell) + float(self._row(cell) @ self._effects))
+        logarithm = self._prior.log(cell) + float(self._row(cell) @ self._effects)
+        return math.exp(min(max(logarithm, -_MAX_LOG), _MAX_LOG))
 
 
 class CostEstimator:
@@ -133,11 +132,17 @@ class CostEstimator:
         """Read the newest cells of a store."""
         self._store = store
         self._past: list[tuple[Features, dict[str, float]]] = []
+        names = set[str]()
         for cell in _newest(store):
             try:
-                self._past.append(self._read(cell))
-            except (StoreError, OSError, ArithmeticError, KeyError, TypeError, ValueError):
+                what, costs = self._read(cell)
+            except (StoreError, OSError, AttributeError, ArithmeticError, KeyError, TypeError,
+                    ValueError):  # fmt: skip
                 continue
+            names |= what.names
+            if len(names) > _MAX_NAMES:
+                break
+            self._past.append((what, costs))
 
     @property
     def known(self) -> int:

@@ -28,6 +28,8 @@ if TYPE_CHECKING:
 #: LLFF at `preset=laptop`: pixels of the mean training view, steps, SfM points, training views, and
 #: threads.
 UNITS = {"pixels": 6e4, "steps": 3e3, "points": 3e3, "views": 24.0, "threads": 1.0}
+#: Sizes from this on are none.
+_MAX_SIZE = 1e12
 #: Width times height of photographs over the square of their longer side: 4 to 3.
 _ASPECT = 0.75
 
@@ -108,7 +110,7 @@ def _logarithms(sizes: Mapping[str, object]) -> dict[str, float]:
     return {
         name: math.log(size / UNITS[name])
         for name, size in sizes.items()
-        if isinstance(size, (int, float)) and 0 < size < math.inf
+        if isinstance(size, (int, float)) and 0 < size < _MAX_SIZE
     }
 
 
