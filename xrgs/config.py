@@ -471,7 +471,7 @@ def known_keys() -> tuple[str, ...]:
     return tuple(dict.fromkeys((*GROUPS, *_keys_of(Conf, ""))))
 
 
-def _keys_of(schema: type[Any], prefix: str) -> Iterator[str]:
+def _keys_of(schema: Any, prefix: str) -> Iterator[str]:
     for name, kind in get_type_hints(schema).items():
         yield f"{prefix}{name}"
         if is_dataclass(kind):
@@ -494,9 +494,9 @@ def to_conf(cfg: DictConfig) -> Conf:
     # The schema is in the config's own defaults, so its nodes are typed and checked already. To
     # merge it in once more takes twenty times as long, and a plan composes many configs.
     names = Conf.__dataclass_fields__
-    for name in cfg:
+    for name in map(str, cfg):
         if name not in names and name != "hydra":
-            raise XrgsError(f"{name}: there is no such key{did_you_mean(str(name), known_keys())}")
+            raise XrgsError(f"{name}: there is no such key{did_you_mean(name, known_keys())}")
     conf = Conf(**{name: _as_object(cfg, name) for name in names})
     _check_known(conf, "")
     _check_plugins(conf.components)

@@ -214,8 +214,8 @@ def test_a_launcher_named_in_an_ablation_is_refused(sweep_here: SweepHere, tmp_p
 @pytest.mark.parametrize(
     ("arguments", "named"),
     [
-        (["+ablation=nope"], ["ablation/nope", "consistency"]),
-        (["scene=nope"], ["scene/nope", "procedural"]),
+        (["+ablation=nope"], ["ablation=nope", "consistency"]),
+        (["scene=nope"], ["scene=nope", "procedural"]),
         (["train.stpes=3"], ["train.stpes"]),
         (["train.steps=many"], ["train.steps", "many"]),
         (["seed=interval(0,1)"], ["interval"]),
@@ -284,9 +284,15 @@ def test_bad_input_that_a_child_finds_is_named(
 
 
 def test_a_dry_run_plans_without_torch_and_writes_nothing(
-    run_command: RunCommand, tmp_path: Path, without_heavy: str
+    run_command: RunCommand,
+    tmp_path: Path,
+    tmp_path_factory: pytest.TempPathFactory,
+    photographs: Callable[..., Path],
+    without_heavy: str,
 ) -> None:
+    scene = photographs(tmp_path_factory.mktemp("scene"), 5)
     arguments = ("+ablation=consistency,loss_weighting", "seed=0,1", "dry_run=true", "store=s")
+    arguments += ("scene=folder", f"scene.path={scene}")
     code, _, err = run_command("sweep", tmp_path, *arguments, PYTHONPATH=without_heavy)
     assert code == 0, err
     assert "plan: 6 cells" in err

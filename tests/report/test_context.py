@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
+from tests.report.conftest import VIEWS
 from xrgs.evaluation.metrics import METRICS
 from xrgs.report.collect import read_sweep
 from xrgs.report.context import Context, contexts
@@ -23,9 +24,10 @@ CONFIG = {
 
 
 def configured(folder: Any, **changes: Any) -> None:
-    """Give a finished cell the config above, with changes by group."""
+    """Give a cell the config above, with changes by group, and finish it again with that file."""
     config = {name: values | changes.get(name, {}) for name, values in CONFIG.items()}
     write_json(folder.folder / "config.json", config)
+    folder.finish(VIEWS, 1)
 
 
 def found(made: Any) -> dict[str, Context]:
