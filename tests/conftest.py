@@ -50,7 +50,7 @@ def _default_signal_handlers() -> Iterator[None]:
 
 @pytest.fixture(scope="session", autouse=True)
 def lpips_weights(tmp_path_factory: pytest.TempPathFactory) -> Iterator[weights.Weights | None]:
-    """Hide this machine's LPIPS weights from all tests, which then see the same everywhere.
+    """Hide this machine's LPIPS weights from all tests, which then see the same and fetch none.
 
     The value is the weights, or None if the machine has none; tests get them as `published`.
     """
@@ -58,6 +58,7 @@ def lpips_weights(tmp_path_factory: pytest.TempPathFactory) -> Iterator[weights.
     with pytest.MonkeyPatch.context() as patch:
         patch.delenv(weights.PATH_VARIABLE, raising=False)
         patch.setenv("XRGS_CACHE", str(tmp_path_factory.mktemp("cache")))
+        patch.setenv("XRGS_LPIPS_FETCH", "false")
         yield found
 
 

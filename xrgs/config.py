@@ -10,15 +10,16 @@ from __future__ import annotations
 import math
 import re
 from dataclasses import dataclass, field, is_dataclass
+from functools import cache
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any, get_type_hints
 
 import hydra
 from hydra.core.config_store import ConfigStore
 from omegaconf import MISSING, DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from xrgs.errors import StoreError, XrgsError
+from xrgs.errors import StoreError, XrgsError, did_you_mean
 from xrgs.safeio.confined import ConfinedPath
 from xrgs.safeio.records import read_json
 from xrgs.splat.backend import CHOICES
@@ -30,6 +31,9 @@ from xrgs.splat.settings import (
     RasterSettings,
 )
 
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
 _PACKAGE = Path(__file__).parent
 #: `conf/` is inside the package in a wheel and beside it in a checkout.
 CONF_DIR = _PACKAGE / "conf" if (_PACKAGE / "conf").is_dir() else _PACKAGE.parent / "conf"
@@ -37,6 +41,12 @@ CONF_DIR = _PACKAGE / "conf" if (_PACKAGE / "conf").is_dir() else _PACKAGE.paren
 #: The start of an interpolation, with the backslashes before it: an odd number of them escapes it.
 _INTERPOLATION = re.compile(r"(\\*)\$\{")
 _RETRY = ("none", "failed")
+#: The values of `train.views`.
+TRAINING_VIEWS = ("mixed", "all_hr", "hr_only", "lr_only")
+#: The groups of files that a sweep is made of. The first two are not in the defaults list of
+#: `conf/config.yaml`, so that Hydra requires a plus before them.
+PLUS_GROUPS = ("ablation", "sweeps")
+GROUPS = (*PLUS_GROUPS, "scene", "preset", "variant")
 
 
 @dataclass
@@ -405,6 +415,15 @@ class LimitsConf:
 
 
 @dataclass
+class LpipsConf:
+    """The weights of LPIPS, which are not shipped."""
+
+    fetch: bool = True
+    """Whether a sweep fetches them from the package index where this machine has none. It has a
+    value here as well, so that configs from before the key are read."""
+
+
+@dataclass
 class Conf:
     """The config of one cell, and how to run it."""
 
@@ -434,6 +453,8 @@ class Conf:
     writes none."""
     limits: LimitsConf = field(default_factory=LimitsConf)
     """What a cell may use."""
+    lpips: LpipsConf = field(default_factory=LpipsConf)
+    """The weights of LPIPS."""
     retry: str = MISSING
     """`failed` runs failed cells again; `none` reports them and leaves them."""
     fail_fast: bool = MISSING
@@ -448,6 +469,24 @@ class Conf:
 def register() -> None:
     """Give Hydra the schema that `conf/config.yaml` is checked against."""
     ConfigStore.instance().store(name="xrgs_schema", node=Conf)
+
+
+@cache
+def known_keys() -> tuple[str, ...]:
+    """Return what may stand before the `=` of an override.
+
+    Returns:
+        The groups of files (`scene`), and every key of the schema with the keys that contain others
+        (`train`, `train.steps`).
+    """
+    return tuple(dict.fromkeys((*GROUPS, *_keys_of(Conf, ""))))
+
+
+def _keys_of(schema: Any, prefix: str) -> Iterator[str]:
+    for name, kind in get_type_hints(schema).items():
+        yield f"{prefix}{name}"
+        if is_dataclass(kind):
+            yield from _keys_of(kind, f"{prefix}{name}.")
 
 
 def to_conf(cfg: DictConfig) -> Conf:
@@ -465,12 +504,25 @@ def to_conf(cfg: DictConfig) -> Conf:
     """
     # The schema is in the config's own defaults, so its nodes are typed and checked already. To
     # merge it in once more takes twenty times as long, and a plan composes many configs.
-    conf = Conf(**{name: _as_object(cfg, name) for name in Conf.__dataclass_fields__})
+    names = Conf.__dataclass_fields__
+    for name in map(str, cfg):
+        if name not in names and name != "hydra":
+            raise XrgsError(f"{name}: there is no such key{did_you_mean(name, known_keys())}")
+    conf = Conf(**{name: _as_object(cfg, name) for name in names})
     _check_known(conf, "")
     _check_plugins(conf.components)
+    _check_ranges(conf)
+    _check_choices(conf)
+    return conf
+
+
+def _check_ranges(conf: Conf) -> None:
+    """Raise `XrgsError` where a number is out of its range; the message names its key."""
     least_values = (
         ("splat.optimizer.means_decay_from", conf.splat.optimizer.means_decay_from, 0),
         ("splat.optimizer.shN_every", conf.splat.optimizer.shN_every, 1),
+        ("seed", conf.seed, 0),
+        ("variant.seed", conf.variant.seed, 0),
         ("train.steps", conf.train.steps, 1),
         ("train.evaluate_every", conf.train.evaluate_every, 0),
         ("threads", conf.threads, 0),
@@ -486,18 +538,21 @@ def to_conf(cfg: DictConfig) -> Conf:
     if (begin := conf.splat.optimizer.means_decay_from) >= NOMINAL_STEPS:
         key = "splat.optimizer.means_decay_from"
         raise XrgsError(f"{key}={begin}: must be below {NOMINAL_STEPS}, the length of a run")
-    if conf.splat.backend not in CHOICES:
-        raise XrgsError(f"splat.backend={conf.splat.backend}: must be one of {', '.join(CHOICES)}")
-    densify = conf.splat.densify
-    if densify.split not in SPLITS:
-        raise XrgsError(f"splat.densify.split={densify.split}: must be one of {', '.join(SPLITS)}")
-    if not (math.isfinite(densify.budget) and densify.budget >= 0):
-        raise XrgsError(
-            f"splat.densify.budget={densify.budget}: must be a finite number, 0 or more"
-        )
-    if conf.retry not in _RETRY:
-        raise XrgsError(f"retry={conf.retry}: must be one of {', '.join(_RETRY)}")
-    return conf
+    budget = conf.splat.densify.budget
+    if not (math.isfinite(budget) and budget >= 0):
+        raise XrgsError(f"splat.densify.budget={budget}: must be a finite number, 0 or more")
+
+
+def _check_choices(conf: Conf) -> None:
+    """Raise `XrgsError` where a word is none of those that its key may have."""
+    for key, value, accepted in (
+        ("train.views", conf.train.views, TRAINING_VIEWS),
+        ("splat.backend", conf.splat.backend, CHOICES),
+        ("splat.densify.split", conf.splat.densify.split, SPLITS),
+        ("retry", conf.retry, _RETRY),
+    ):
+        if value not in accepted:
+            raise XrgsError(f"{key}={value}: must be one of {', '.join(accepted)}")
 
 
 def compose(*overrides: str) -> Conf:
@@ -530,7 +585,8 @@ def _check_known(value: Any, path: str) -> None:
     """Raise `XrgsError` where a `+` has added a key to the schema, which nothing would read."""
     for name, inner in vars(value).items():
         if name not in value.__dataclass_fields__:
-            raise XrgsError(f"{path}{name}: there is no such key")
+            key = f"{path}{name}"
+            raise XrgsError(f"{key}: there is no such key{did_you_mean(key, known_keys())}")
         if is_dataclass(inner):
             _check_known(inner, f"{path}{name}.")
 

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import importlib
 import os
 import shutil
+import subprocess
 import sys
 from collections.abc import Callable
 from dataclasses import fields
@@ -16,6 +18,7 @@ from hydra.errors import HydraException
 from omegaconf.errors import ConfigKeyError
 from PIL import Image
 
+import xrgs
 from xrgs import config
 from xrgs.bench.settings import Settings
 from xrgs.capture import images
@@ -166,6 +169,61 @@ def test_an_error_that_the_user_can_correct_is_a_message(error: Exception, messa
     with pytest.raises(SystemExit) as end, errors_as_messages("xrgs-x", " (hint)"):
         raise error
     assert end.value.code == message
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["scene=fern"], "scene=fern: there is no such choice; did you mean llff/fern?"),
+        (["scene=q"], "choose from: captures/ollie"),
+        (["steps=100"], "steps: there is no such key; did you mean train.steps"),
+        (["+steps=100"], "steps: there is no such key; did you mean train.steps"),
+        (["+train.stesp=4"], "train.stesp: there is no such key; did you mean train.steps?"),
+        (["ablaton=consistency"], "ablaton: there is no such key; did you mean ablation?"),
+        (["+ablation=consistancy"], "did you mean consistency?"),
+        (["sweeps=tabel1"], "sweeps=tabel1: there is no such choice; did you mean table1?"),
+        (["hydra/launcher=jobli"], "hydra/launcher=jobli: there is no such choice"),
+        (["dry_run=maybe"], "dry_run: Value 'maybe' is not a valid bool"),
+        (["seed=["], "seed=[: "),
+    ],
+    ids=lambda value: value[0] if isinstance(value, list) else "",
+)
+def test_a_typo_is_one_line_with_what_was_meant(
+    sweep_here: RunCommand, words: list[str], message: str
+) -> None:
+    code, out, err = sweep_here(*words, *[] if "dry_run" in words[0] else ["dry_run=true"])
+    assert (code, out) == (1, "")
+    assert err.startswith("xrgs-sweep: ")
+    assert message in err
+    assert "HYDRA_FULL_ERROR" not in err
+    assert len(err.splitlines()) == 1
+
+
+@pytest.mark.parametrize("command", ["sweep", "report", "status", "bench", "data"])
+def test_every_command_says_the_version_of_xrgs(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], command: str
+) -> None:
+    monkeypatch.setattr(sys, "argv", [f"xrgs-{command}", "--version"])
+    with pytest.raises(SystemExit) as end:
+        importlib.import_module(f"xrgs.cli.{command}").main()
+    assert not end.value.code
+    assert capsys.readouterr().out == f"xrgs-{command} {xrgs.__version__}\n"
+
+
+def test_bash_completes_arguments(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    if (bash := shutil.which("bash")) is None:
+        pytest.skip("there is no bash")
+    monkeypatch.setattr(sys, "argv", ["xrgs-report", "--completion"])
+    with pytest.raises(SystemExit):
+        report.main()
+    # bash itself says which words it has for the command
+    script = f"{capsys.readouterr().out}\ncomplete -p xrgs-report"
+    done = subprocess.run([bash, "-c", script], capture_output=True, text=True, check=True)
+    words = done.stdout.split("'")[1].split()
+    assert words == [f"{field.name}=" for field in fields(ReportConf)]
+    assert done.stdout.split()[-1] == "xrgs-report"
 
 
 def test_other_errors_are_not_hidden() -> None:

@@ -214,8 +214,8 @@ def test_a_launcher_named_in_an_ablation_is_refused(sweep_here: SweepHere, tmp_p
 @pytest.mark.parametrize(
     ("arguments", "named"),
     [
-        (["+ablation=nope"], ["ablation/nope", "consistency"]),
-        (["scene=nope"], ["scene/nope", "procedural"]),
+        (["+ablation=nope"], ["ablation=nope", "consistency"]),
+        (["scene=nope"], ["scene=nope", "procedural"]),
         (["train.stpes=3"], ["train.stpes"]),
         (["train.steps=many"], ["train.steps", "many"]),
         (["seed=interval(0,1)"], ["interval"]),
@@ -284,9 +284,15 @@ def test_bad_input_that_a_child_finds_is_named(
 
 
 def test_a_dry_run_plans_without_torch_and_writes_nothing(
-    run_command: RunCommand, tmp_path: Path, without_heavy: str
+    run_command: RunCommand,
+    tmp_path: Path,
+    tmp_path_factory: pytest.TempPathFactory,
+    photographs: Callable[..., Path],
+    without_heavy: str,
 ) -> None:
-    arguments = ("+ablation=consistency,loss_weighting", "seed=0,1", "dry_run=true", "store=s")
+    scene = photographs(tmp_path_factory.mktemp("scene"), 5)
+    arguments = ["+ablation=consistency,loss_weighting", "seed=0,1", "dry_run=true", "store=s"]
+    arguments += ["scene=folder", f"scene.path={scene}"]
     code, _, err = run_command("sweep", tmp_path, *arguments, PYTHONPATH=without_heavy)
     assert code == 0, err
     assert "plan: 6 cells" in err
@@ -314,3 +320,59 @@ def test_a_dry_run_without_kernels_says_how_long_torch_takes(
     (line,) = (line for line in err.splitlines() if "not built on this machine" in line)
     assert "torch trains 4 cells, ~" in line
     assert " instead of ~" in line
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["variant.factor=0", "seed=0,1"], "variant.factor=0: must be 1 or more"),
+        (["variant.hr_fraction=2", "+ablation=consistency"], "variant.hr_fraction=2.0"),
+        (["seed=-1"], "seed=-1: must be at least 0"),
+        (["train.views=foo"], "train.views=foo: must be one of mixed"),
+        (["limits.minutes=-1"], "limits.minutes=-1.0: must be at least 0"),
+        (["store=a.txt/s"], "store=a.txt/s can't be written"),
+    ],
+    ids=lambda value: value[0] if isinstance(value, list) else "",
+)
+def test_a_dry_run_says_each_error_once_and_fails(
+    sweep_here: SweepHere, children: Any, tmp_path: Path, arguments: list[str], message: str
+) -> None:
+    (tmp_path / "a.txt").write_text("not a folder")
+    given = [word for word in SCENE if not (word[:5] == arguments[0][:5] == "store")]
+    code, out, err = sweep_here(*given, *arguments, "dry_run=true")
+    assert (code, out) == (1, "")
+    assert err.count(message) == 1
+    assert len(err.splitlines()) == 1
+    assert [path.name for path in tmp_path.iterdir()] == ["a.txt"]
+
+
+def test_a_dry_run_fails_where_photographs_are_missing_and_says_so_once(
+    sweep_here: SweepHere, tmp_path: Path
+) -> None:
+    scene = ("scene=folder", "scene.path=gone", "preset=smoke", "seed=0,1,2")
+    code, _, err = sweep_here(*scene, "dry_run=true")
+    assert code == 1
+    assert err.count("scene.path=gone: no such folder") == 1
+    assert err.count("(the same)") == 2
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_captures_are_looked_for_in_data_root(sweep_here: SweepHere, tmp_path: Path) -> None:
+    code, _, err = sweep_here("scene=captures/ollie", "data_root=x/y", "dry_run=true")
+    assert code == 1
+    assert "scene.path=x/y/ollie: no such folder" in err
+    code, _, err = sweep_here("scene=captures/ollie", "dry_run=true")
+    assert "scene.path=data/captures/ollie" in err
+
+
+def test_an_ablation_that_changes_nothing_is_named_in_the_plan(sweep_here: SweepHere) -> None:
+    off = ("+ablation=consistency", "components.consistency.weight=0")
+    code, _, err = sweep_here(*SCENE, *off, "dry_run=true")
+    assert code == 0, err
+    assert "consistency consistency.weight=0 changes nothing here" in err
+
+
+def test_the_plan_says_what_a_sweep_takes(sweep_here: SweepHere) -> None:
+    _, _, err = sweep_here(*SCENE, "dry_run=true")
+    assert "of memory, all of them" in err
+    assert "LPIPS will be n/a" in err  # lpips.fetch is off in tests

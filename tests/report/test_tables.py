@@ -10,6 +10,7 @@ import pytest
 from tests.report.test_writing import MORE_IS_BETTER
 from xrgs.evaluation.metrics import METRICS
 from xrgs.report.compare import compare
+from xrgs.report.context import Context
 from xrgs.report.tables import Tables
 from xrgs.report.writing import ARROWS_NOTE, LACKING_NOTE, percent, scale_note
 
@@ -241,12 +242,12 @@ def test_q_and_its_star_stand_in_the_tables(made: Any) -> None:
     (overview,) = built.overviews()
     assert next(row for row in overview.rows if row[0] == "PSNR")[1:] == ("+1.00 ↑ *", "+2.00 ↑ *")
     assert next(row for row in overview.rows if row[0] == "SSIM")[1:] == ("0.00 =", "0.00 =")
-    note = "q: Benjamini and Hochberg's rate of false discoveries over 16 t-tests, of all ablations"
+    note = "q: Benjamini and Hochberg's rate of false discoveries over 18 t-tests, of all ablations"
     assert any(text.startswith(note) for text in overview.notes)
     mean = built.mean("a", "")
     row = dict(zip(mean.columns, next(r for r in mean.rows if r[0] == "PSNR"), strict=True))
-    # t = 0.01 / (0.001 / sqrt(3)) with 2 degrees of freedom: p = 0.00332, the larger of two in 16.
-    assert row["q"] == "0.027 *"
+    # t = 0.01 / (0.001 / sqrt(3)) with 2 degrees of freedom: p = 0.00332, the larger of two in 18.
+    assert row["q"] == "0.030 *"
     assert row["reading"] == "better"
     assert row["sd scenes, %"] == "0.10"
     assert row["sd replicates, %"] == ""
@@ -286,3 +287,66 @@ def test_every_title_and_column_names_the_base(made: Any) -> None:
     assert mean.columns[1:4] == ("plus", "b", "change from plus, %")
     assert built.per_scene("b", "").title == "b: change from plus, scene by scene"
     assert set(built.long()["against"]) == {"plus"}
+
+
+def test_an_ablation_that_is_the_baseline_is_said_to_change_nothing(made: Any) -> None:
+    made.add()
+    made.rows.append(made.rows[0] | {"label": "idle"})
+    made.add("consistency", factors={"psnr": 0.99})
+    built = tables(made)
+    table = built.mean("idle", "")
+    assert table.rows == (("idle changes nothing: its cells are those of baseline",),)
+    assert built.per_scene("idle", "").rows == ()
+    (overview,) = built.overviews()
+    assert {row[1] for row in overview.rows} == {"="}
+    assert "idle changes nothing: its cells are those of baseline" in overview.notes
+
+
+@pytest.mark.parametrize(("metric", "same"), [("training_time_s", True), ("gaussians", False)])
+def test_equal_results_change_nothing_and_times_do_not_count(
+    made: Any, metric: str, same: bool
+) -> None:
+    made.add()
+    made.add("idle", factors={metric: 1.1})
+    why = tables(made).unchanged("idle", "")
+    assert bool(why) == same
+    assert why in {"", "changes nothing: all its scores, counts and amounts of work are those of"
+                   " baseline"}  # fmt: skip
+
+
+def test_scores_stand_by_method_and_scene_with_the_best_in_bold(made: Any) -> None:
+    for scene in ("fern", "room"):
+        made.add(scene=scene)
+        made.add("consistency", scene=scene, values={"psnr": 21.0, "ssim": 0.7, "lpips": None})
+    made.add("plus", values={"psnr": 21.0, "ssim": 0.9, "lpips": 0.3})
+    table = tables(made).scores("")
+    assert table.columns == ("Method", *("PSNR ↑", "SSIM ↑", "LPIPS ↓") * 3)
+    assert table.spans == (("", 1), ("fern", 3), ("room", 3), ("mean", 3))
+    assert table.rows == (
+        ("baseline", *("20.00", "0.800", "0.250") * 3),
+        ("consistency", *("21.00", "0.700", "n/a") * 3),
+        ("plus", "21.00", "0.900", "0.300", *("n/a",) * 6),
+    )
+    bold = {(table.rows[row][0], column) for row, column in table.best}
+    assert bold == {
+        *(("consistency", 1), ("plus", 1), ("plus", 2), ("baseline", 3)),  # fern
+        *(("consistency", 4), ("baseline", 5)),  # room; only one has LPIPS
+        *(("consistency", 7), ("baseline", 8)),  # mean
+    }
+
+
+def test_every_table_with_arrows_has_their_legend_and_its_context(made: Any) -> None:
+    for scene in ("fern", "room"):
+        made.add(scene=scene)
+        made.add("consistency", scene=scene, factors={"gaussians": 0.5})
+        made.add("plus", scene=scene, factors={"gaussians": 0.6})
+    comparison = tables(made).comparison
+    built = Tables(comparison, {"": Context(("3 steps",), ("a machine",), ("Caution: few",))})
+    changes = [*built.overviews(), built.mean("plus", ""), built.per_scene("plus", "")]
+    for table in changes:
+        assert any("↑" in text for row in table.rows for text in row)
+        assert ARROWS_NOTE in table.notes
+        assert table.context == "3 steps; a machine"
+    assert "Caution: few" in built.mean("plus", "").notes
+    assert built.scores("").context == "3 steps"  # it has no times
+    assert "Caution: few" in built.scores("").notes

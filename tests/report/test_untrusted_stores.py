@@ -21,7 +21,7 @@ from xrgs.experiment.cell_folder import CellFolder
 from xrgs.experiment.store import Store
 from xrgs.report import build, page, pictures
 from xrgs.safeio.confined import ConfinedPath
-from xrgs.sweep.estimate import RuntimeEstimator
+from xrgs.sweep.estimate import CostEstimator
 from xrgs.sweep.status import describe, read
 
 VALUES = st.recursive(
@@ -122,7 +122,7 @@ def test_any_content_of_a_store_gives_a_report_or_an_xrgs_error(
         except XrgsError as error:
             text = str(error)
         assert not set("\x1b\0") & set(text)
-    RuntimeEstimator(copy)
+    CostEstimator(copy)
 
 
 @pytest.mark.parametrize("cell_id", ["../cells/cell00001", "..", "/tmp", "a\0"])  # noqa: S108

@@ -1,110 +1,190 @@
-"""Estimates come from the finished cells that are most like the one that is asked for."""
+"""Costs are learned from the finished cells of a store, and scaled to cells of other sizes."""
 
 from __future__ import annotations
 
+import math
+import os
 from collections.abc import Callable
 from dataclasses import replace
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
 import pytest
 
 from xrgs.config import Conf
+from xrgs.experiment.identity import cell_identity
 from xrgs.experiment.store import Store
 from xrgs.safeio.atomic import write_json
-from xrgs.sweep.estimate import TORCH_SLOWDOWN, RuntimeEstimator, torch_seconds
+from xrgs.sweep.estimate import TORCH_SLOWDOWN, CostEstimator
+
+VARIANT = "v{}-0123456789abcdef"
 
 
-def identity(
-    variant: str, steps: int, weight: float = 1.0, seed: int = 0, backend: str = "native"
-) -> dict[str, Any]:
-    return {
-        "splat": {"backend": backend},
-        "components": {"weight": weight},
-        "train": {"steps": steps, "views": "mixed"},
-        "variant": variant,
-        "seed": seed,
-        "code": {"train.py": str(seed)},
-    }
+class Past:
+    """Writes the finished cells of a store whose costs follow a law."""
+
+    def __init__(self, path: Path, conf: Conf) -> None:
+        self.store = Store(path)
+        self.store.prepare()
+        self.conf = conf
+        self.written = 0
+
+    def variant(self, number: int, side: int = 300) -> str:
+        """Freeze the manifest of a variant with views of so many px a side."""
+        name = VARIANT.format(number)
+        folder = self.store.variants / name
+        folder.make_folder()
+        view = {"name": "a", "split": "train", "tag": "HR", "width": side, "height": side}
+        write_json(folder / "variant.json", {"views": [view]})
+        write_json(folder / "report.json", {"points": 3000})
+        return name
+
+    def identity(self, variant: str, steps: int, weight: float = 0.0) -> dict[str, Any]:
+        consistency = replace(self.conf.components.consistency, weight=weight)
+        parts = replace(self.conf.components, consistency=consistency)
+        train = replace(self.conf.train, steps=steps)
+        return cell_identity(replace(self.conf, train=train, components=parts), variant)
+
+    def add(
+        self,
+        identity: dict[str, Any],
+        seconds: float,
+        *,
+        threads: int = 1,
+        rss: float = 1e9,
+        disk: int = 1000,
+        overhead: float | None = None,
+    ) -> None:
+        folder = self.store.cell(f"cell{self.written:04d}").folder
+        self.written += 1
+        folder.make_folder()
+        summary = {"training_time_s": seconds, "peak_rss_bytes": rss}
+        started = datetime(2026, 1, 1, tzinfo=UTC)
+        write_json(folder / "identity.json", identity)
+        write_json(folder / "summary.json", summary)
+        write_json(folder / "provenance.json", {"threads": threads, "started": started.isoformat()})
+        write_json(folder / "status.json", {"files": {"splats.ply": {"bytes": disk}}})
+        if overhead is not None:
+            end = started.timestamp() + seconds + overhead
+            os.utime(folder.path / "status.json", (end, end))
 
 
 @pytest.fixture
-def past(tmp_path: Path) -> RuntimeEstimator:
-    """Seconds a step: 1 and 3 of the same at 10 steps, 4 at 20 steps, 5 with another weight."""
-    cells = {
-        "a": (identity("v", 10, seed=0), 10.0),
-        "b": (identity("v", 10, seed=1), 30.0),
-        "c": (identity("v", 20), 80.0),
-        "d": (identity("v", 10, weight=2.0), 50.0),
-        "a.aside-1": (identity("v", 10), 1e9),
-        "broken": ({}, 1e9),
-    }
-    for name, (what, seconds) in cells.items():
-        folder = tmp_path / "cells" / name
-        folder.mkdir(parents=True)
-        write_json(folder / "identity.json", what)
-        write_json(folder / "summary.json", {"training_time_s": seconds})
-    (tmp_path / "cells" / "unfinished").mkdir()
-    return RuntimeEstimator(Store(tmp_path))
+def past(tmp_path: Path, compose: Callable[..., Conf]) -> Past:
+    return Past(tmp_path / "s", compose("splat.backend=torch", "train.steps=100"))
 
 
-@pytest.mark.parametrize(
-    ("asked", "seconds"),
-    [
-        (identity("v", 10, seed=7), 20.0),  # the same but for seed and code: a, b
-        (identity("v", 100), 800 / 3),  # but for the number of steps: a, b, c
-        (identity("v", 10, weight=9.0), 32.5),  # of the variant: all
-        (identity("w", 10), 32.5),  # any
-    ],
-)
-def test_the_most_like_it_count(
-    past: RuntimeEstimator, asked: dict[str, Any], seconds: float
+def cost(past: Past, identity: dict[str, Any], threads: int = 1) -> Any:
+    conf = replace(past.conf, train=replace(past.conf.train, steps=identity["train"]["steps"]))
+    found = CostEstimator(past.store).cost(conf, identity["variant"], identity, threads)
+    assert found is not None
+    return found
+
+
+def test_cells_like_it_decide(past: Past) -> None:
+    variant = past.variant(0)
+    for _ in range(8):
+        past.add(past.identity(variant, 100), 40.0, rss=2e9, disk=5_000_000, overhead=9.0)
+    found = cost(past, past.identity(variant, 100))
+    assert found.training_s == pytest.approx(40.0, rel=0.05)
+    assert found.seconds == pytest.approx(49.0, rel=0.1)
+    assert found.memory_bytes == pytest.approx(2e9, rel=0.1)
+    assert found.disk_bytes == pytest.approx(5e6, rel=0.15)
+
+
+@pytest.mark.parametrize("left_out", range(4))
+def test_a_new_variant_is_within_a_factor_of_1_5(past: Past, left_out: int) -> None:
+    """Four scenes, that differ in size and by themselves, and two programs: one scene is new."""
+    own = (0.9, 1.1, 0.95, 1.05)
+    sides = (200, 300, 400, 500)
+
+    def truth(scene: int, weight: float) -> float:
+        size: float = (sides[scene] ** 2 / 6e4) ** 0.9
+        return 10 * own[scene] * size * (1.6 if weight else 1.0)
+
+    variants = [past.variant(number, side) for number, side in enumerate(sides)]
+    for scene, variant in enumerate(variants):
+        for weight in (0.0, 0.5):
+            if scene != left_out:
+                past.add(past.identity(variant, 100, weight=weight), truth(scene, weight))
+    for weight in (0.0, 0.5):
+        found = cost(past, past.identity(variants[left_out], 100, weight=weight)).training_s
+        assert 1 / 1.5 < found / truth(left_out, weight) < 1.5
+
+
+def test_a_cell_on_more_threads_or_with_more_steps_is_scaled(past: Past) -> None:
+    variant = past.variant(0)
+    past.add(past.identity(variant, 1000), 100.0, threads=1)
+    one = cost(past, past.identity(variant, 1000)).training_s
+    assert 0.5 < cost(past, past.identity(variant, 1000), threads=2).training_s / one < 0.7
+    assert 2 < cost(past, past.identity(variant, 2000)).training_s / one < 2.4
+
+
+def test_an_empty_store_gives_the_prior_and_torch_is_slower(
+    past: Past, compose: Callable[..., Conf]
 ) -> None:
-    assert past.seconds(asked) == pytest.approx(seconds)
+    nothing = CostEstimator(past.store)
+    assert nothing.known == 0
+    torch = nothing.cost(past.conf, None, None, 1)
+    assert torch is not None
+    assert 10 < torch.training_s < 1000  # 100 steps of 504 px, at about a second each
+    native = compose("train.steps=100")
+    if cell_identity(native, "")["splat"]["backend"] == "native":
+        found = nothing.cost(native, None, None, 1)
+        assert found is not None
+        assert torch.training_s / found.training_s == pytest.approx(TORCH_SLOWDOWN)
 
 
-def test_a_store_without_cells_knows_nothing(tmp_path: Path) -> None:
-    assert RuntimeEstimator(Store(tmp_path)).seconds(identity("v", 10)) is None
-
-
-@pytest.mark.parametrize("backend", ["native", "torch"])
-def test_cells_of_the_other_backend_count_by_its_speed_until_there_are_own_ones(
-    tmp_path: Path, backend: str
+def test_before_the_variant_is_built_the_config_tells_the_size(
+    past: Past, compose: Callable[..., Conf]
 ) -> None:
-    other = {"native": "torch", "torch": "native"}[backend]
+    nothing = CostEstimator(past.store)
 
-    def finished(name: str, what: dict[str, Any], seconds: float) -> RuntimeEstimator:
-        folder = tmp_path / "cells" / name
-        folder.mkdir(parents=True)
-        write_json(folder / "identity.json", what)
-        write_json(folder / "summary.json", {"training_time_s": seconds})
-        return RuntimeEstimator(Store(tmp_path))
-
-    asked = identity("v", 20, backend=backend)
-    past = finished("other", identity("v", 10, backend=other), 3.0)
-    times = TORCH_SLOWDOWN if backend == "torch" else 1 / TORCH_SLOWDOWN
-    assert past.seconds(asked) == pytest.approx(6.0 * times)
-    past = finished("own", identity("w", 10, weight=2.0, backend=backend), 7.0)
-    assert past.seconds(asked) == pytest.approx(14.0)
-
-
-def test_torch_takes_as_long_as_the_pixels_of_the_views(compose: Callable[..., Conf]) -> None:
-    conf = compose("variant.long_side=400", "train.steps=100", "variant.hr_fraction=0.3")
-    seconds = torch_seconds(conf)
-    assert seconds is not None
-
-    def times(**train: object) -> float | None:
-        other = torch_seconds(replace(conf, train=replace(conf.train, **train)))  # type: ignore[arg-type]  # names of fields, as given
-        return None if other is None else other / seconds
+    def seconds(*overrides: str) -> float:
+        given = compose("splat.backend=torch", "train.steps=100", *overrides)
+        found = nothing.cost(given, None, None, 1)
+        return math.nan if found is None else found.training_s
 
     mixed = 0.3 + 0.7 / 25  # of the pixels of an HR view, in the mean
-    assert times(steps=300) == pytest.approx(3)
-    assert times(views="lr_only") == pytest.approx(1 / 25 / mixed)
-    assert times(views="hr_only") == pytest.approx(1 / mixed)
-    assert times(views="all_hr") == pytest.approx(1 / mixed)
-    twice = replace(conf, variant=replace(conf.variant, long_side=800))
-    assert torch_seconds(twice) == pytest.approx(4 * seconds)
-    kept = replace(conf, variant=replace(conf.variant, degradation="jpeg"))
-    assert torch_seconds(kept) == pytest.approx(seconds / mixed)
-    unknown = replace(conf, variant=replace(conf.variant, long_side=0))
-    assert torch_seconds(unknown) is None
+    base = seconds("variant.long_side=400")
+    assert seconds("variant.long_side=800") / base == pytest.approx(4**0.8)
+    assert seconds("variant.long_side=400", "train.views=all_hr") / base == pytest.approx(
+        (1 / mixed) ** 0.8
+    )
+    assert seconds("variant.long_side=400", "variant.degradation=jpeg") / base == pytest.approx(
+        (1 / mixed) ** 0.8
+    )
+    assert math.isnan(seconds("variant.long_side=0"))
+
+
+@pytest.mark.parametrize("spoilt", ["identity.json", "summary.json", "provenance.json"])
+def test_malformed_cells_are_left_out(past: Past, spoilt: str) -> None:
+    variant = past.variant(0)
+    past.add(past.identity(variant, 100), 40.0)
+    past.add(past.identity(variant, 100), 40.0)
+    file = past.store.cell("cell0001").folder / spoilt
+    file.unlink()
+    write_json(file, {"training_time_s": "soon", "started": 3, "splat": []})
+    estimator = CostEstimator(past.store)
+    assert estimator.known == 1
+    assert cost(past, past.identity(variant, 100)).training_s == pytest.approx(40, rel=0.1)
+
+
+def test_a_store_of_a_stranger_costs_neither_memory_nor_time(past: Past) -> None:
+    variant = past.variant(0)
+    for number in range(3):
+        identity = past.identity(variant, 100)
+        identity["splat"] |= {f"{number}-{key}": key for key in range(6000)}
+        identity["train"] |= {"steps": 10**18}
+        past.add(identity, 1e30)
+    estimator = CostEstimator(past.store)
+    assert estimator.known <= 1
+    assert math.isfinite(cost(past, past.identity(variant, 100)).training_s)
+
+
+def test_a_store_that_was_copied_does_not_tell_the_time_beside_training(past: Past) -> None:
+    variant = past.variant(0)
+    past.add(past.identity(variant, 100), 40.0)  # its status is dated now, years after its start
+    found = cost(past, past.identity(variant, 100))
+    assert found.seconds - found.training_s < 60

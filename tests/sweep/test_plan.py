@@ -16,14 +16,17 @@ from xrgs.runtime.progress import format_duration
 from xrgs.safeio.atomic import write_json
 from xrgs.splat import backend
 from xrgs.sweep.axes import CellSpec
-from xrgs.sweep.estimate import TORCH_SLOWDOWN, RuntimeEstimator, torch_seconds
+from xrgs.sweep.estimate import TORCH_SLOWDOWN, CostEstimator
 from xrgs.sweep.plan import (
     PlannedCell,
     describe,
     estimated,
     expected_length,
+    expected_use,
     identified,
     ready,
+    unchanged,
+    will_fail,
     without_kernels,
 )
 
@@ -74,7 +77,7 @@ def test_an_unknown_cell_is_neither_to_train_nor_failed(
     plan = [known, cell("b", "unknown", 50.0), replace(cell("c", "unknown", 50.0), cell_id=None)]
     text = describe(plan)
     assert text.splitlines()[0] == "plan: 3 cells, 1 done"
-    assert text.count("run the same command again") == 2
+    assert text.count("run the same command again") == text.count("(the same)") == 1
     assert "variant unknown" in text
     assert "failed" not in text
     assert "~" not in text
@@ -142,22 +145,66 @@ def test_with_kernels_the_plan_says_nothing_of_torch(
     assert without_kernels([cell("a", seconds=1e9)]) == ""
 
 
-def test_torch_is_estimated_by_size_where_the_store_says_nothing(
-    cell: Callable[..., PlannedCell], no_kernels: None, tmp_path: Path
+def test_cells_that_are_not_done_are_estimated(
+    cell: Callable[..., PlannedCell], tmp_path: Path
 ) -> None:
-    nothing = RuntimeEstimator(Store(tmp_path))
-    plan = [replace(cell("a"), variant_id=None), cell("b"), cell("c", "done")]
-    seconds = torch_seconds(plan[0].conf)
-    assert seconds is not None
-    assert [each.seconds for each in estimated(plan, nothing)] == [seconds, seconds, None]
+    plan = [replace(cell("a"), variant_id=None, identity=None), cell("c", "done")]
+    first, done = estimated(plan, CostEstimator(Store(tmp_path)), threads=1)
+    assert first.seconds is not None
+    assert first.memory_bytes is not None
+    assert done.seconds is None
+    (faster,) = estimated(plan[:1], CostEstimator(Store(tmp_path)), threads=4)
+    assert faster.seconds is not None
+    assert faster.seconds < first.seconds
 
 
-def test_native_cells_have_no_estimate_before_the_first_is_done(
-    cell: Callable[..., PlannedCell], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+def test_the_use_of_memory_and_disk_is_that_of_the_cells_that_are_left(
+    cell: Callable[..., PlannedCell],
 ) -> None:
-    monkeypatch.setattr(importlib.util, "find_spec", lambda name: name)
-    (only,) = estimated([cell("a")], RuntimeEstimator(Store(tmp_path)))
-    assert only.seconds is None
+    plan = [
+        replace(cell("a"), memory_bytes=1.2e9, disk_bytes=30e6),
+        replace(cell("b"), memory_bytes=8e8, disk_bytes=40e6),
+        replace(cell("c", "done"), memory_bytes=9e9, disk_bytes=9e9),
+    ]
+    line = expected_use(plan, 63)
+    assert "learned from 63 finished cells" in line
+    assert "up to ~1.2 GB of memory, all of them ~70 MB of disk" in line
+    assert "within a factor of 3" in expected_use(plan, 0)
+    assert expected_use(plan[2:], 63) == ""
+
+
+def test_a_reason_that_cells_share_is_said_once(cell: Callable[..., PlannedCell]) -> None:
+    plan = [
+        replace(cell(name), cell_id=None, error=why)
+        for name, why in (("a", "gone"), ("b", "gone"), ("c", "other"))
+    ]
+    _, *rows = describe(plan).splitlines()
+    assert [row.partition("(")[2] for row in rows[:3]] == ["gone)", "the same)", "other)"]
+
+
+def test_a_label_whose_cells_have_the_config_of_the_baseline_is_named(
+    cell: Callable[..., PlannedCell],
+) -> None:
+    base = cell("baseline")
+    same = replace(base, spec=CellSpec("idle", "", (), ("x=1",)))
+    steps = replace(base.conf, train=replace(base.conf.train, steps=11))
+    other = replace(base, spec=CellSpec("other", "", (), ("y=1",)), conf=steps)
+    assert unchanged([base, same, other]) == [
+        "idle changes nothing here: its cells are those of baseline"
+    ]
+
+
+@pytest.mark.parametrize(
+    ("state", "retry", "fails"),
+    [("absent", "none", False), ("failed", "none", True), ("failed", "failed", False)],
+)
+def test_a_dry_run_knows_whether_the_run_would_fail(
+    cell: Callable[..., PlannedCell], state: str, retry: str, fails: bool
+) -> None:
+    one = cell("a", state)
+    plan = [replace(one, conf=replace(one.conf, retry=retry))]
+    assert will_fail(plan) == fails
+    assert will_fail([replace(plan[0], error="no photographs")])
 
 
 def test_a_cell_whose_lock_is_held_is_running_unless_it_is_done(

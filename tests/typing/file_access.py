@@ -69,6 +69,7 @@ ALLOWED: dict[str, tuple[str, str]] = {
         "the cache of the user, who may name a link",
     ),
     "experiment/provenance": ("read_text", "/proc"),
+    "experiment/store": ("exists is_symlink", "the folders above the store that the user names"),
     "runtime/processes": ("exists iterdir read_text readlink write_text", "/proc"),
     "sweep/jobs/worker": ("exists", "its own folder in /tmp"),
     "sweep/launch": ("expanduser", "the folder that Hydra is given, and a path of the user"),

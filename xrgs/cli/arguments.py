@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import sys
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -9,14 +10,15 @@ from typing import TYPE_CHECKING, Any, cast
 
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.override_parser.types import Quote, QuotedString
-from hydra.errors import HydraException
+from hydra.errors import HydraException, MissingConfigException, OverrideParseException
 from omegaconf import DictConfig, OmegaConf
-from omegaconf.errors import OmegaConfBaseException
+from omegaconf.errors import ConfigAttributeError, ConfigKeyError, OmegaConfBaseException
 
+import xrgs
 from xrgs import config
 from xrgs.capture.scenes.folder import ALL_BELOW
 from xrgs.config import escape_interpolations
-from xrgs.errors import XrgsError
+from xrgs.errors import XrgsError, did_you_mean
 from xrgs.runtime.streams import say
 from xrgs.safeio.paths import user_path
 from xrgs.safeio.words import for_line
@@ -24,6 +26,8 @@ from xrgs.safeio.words import for_line
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
 
+#: How Hydra says that a key of an override is unknown.
+_NOT_OVERRIDDEN = re.compile(r"Could not override '([^']+)'")
 #: Keys whose values are paths.
 _PATHS = frozenset({"scene.path", "store", "data_root", "variant.poses"})
 
@@ -44,7 +48,39 @@ def errors_as_messages(command: str, hint: str = "") -> Iterator[None]:
     except XrgsError as error:
         sys.exit(for_line(f"{command}: {error}"))
     except (OmegaConfBaseException, HydraException) as error:
-        sys.exit(for_line(f"{command}: {config.error_line(error)}{hint}"))
+        sys.exit(for_line(f"{command}: {_explained(error)}{hint}"))
+
+
+def _explained(error: Exception) -> str:
+    """Return what an error of Hydra or OmegaConf says, with names like one that does not exist.
+
+    Hydra's own advice is left out: `steps=100` would be told to become `+steps=100`, which adds a
+    key that nothing reads.
+    """
+    if isinstance(error, MissingConfigException) and error.missing_cfg_file:
+        return _missing_file(error.missing_cfg_file, error.options or ())
+    if isinstance(error, OverrideParseException):
+        return f"{error.override}: {config.error_line(error)}"
+    if found := _NOT_OVERRIDDEN.search(str(error)):
+        key = found[1].partition("@")[0]
+        return f"{key}: there is no such key{did_you_mean(key, config.known_keys())}"
+    if isinstance(error, (ConfigKeyError, ConfigAttributeError)):
+        parent = error.parent_node
+        known = tuple(map(str, parent)) if isinstance(parent, DictConfig) else ()
+        return config.error_line(error) + did_you_mean(str(error.key), known)
+    if isinstance(error.__cause__, OmegaConfBaseException):  # it names the key and the value
+        return _explained(error.__cause__)
+    return config.error_line(error)
+
+
+def _missing_file(file: str, options: Sequence[str]) -> str:
+    """Return what is said of `GROUP/NAME` where there is no such file of the config."""
+    group = next((g for g in config.GROUPS if file.startswith(f"{g}/")), file.rpartition("/")[0])
+    name = file.removeprefix(f"{group}/")
+    if not (known := sorted({*files(group), *options})):
+        return f"{group}: there is no such key{did_you_mean(group, config.known_keys())}"
+    offered = did_you_mean(name, known) or f"; choose from: {', '.join(known)}"
+    return f"{group}={name}: there is no such choice{offered}"
 
 
 def with_quotes(words: Sequence[str]) -> list[str]:
@@ -102,16 +138,49 @@ def dotlist(words: Sequence[str]) -> DictConfig:
     return conf
 
 
+def files(group: str) -> list[str]:
+    """Return the names of a config group's files, sorted; empty where there is no such group.
+
+    Args:
+        group: Name of the group's folder, as `scene`.
+    """
+    folder = config.CONF_DIR / group
+    folder = folder if folder.is_dir() else config.CONF_DIR.parent / group
+    names = (file.relative_to(folder).with_suffix("") for file in folder.rglob("*.yaml"))
+    return sorted(name.as_posix() for name in names)
+
+
 def choices(group: str) -> str:
     """Return the names of a config group's files, for a command's help: `fern, flower`.
 
     Args:
         group: Name of the group's folder.
     """
-    folder = config.CONF_DIR / group
-    folder = folder if folder.is_dir() else config.CONF_DIR.parent / group
-    files = sorted(folder.rglob("*.yaml"))
-    return ", ".join(file.relative_to(folder).with_suffix("").as_posix() for file in files)
+    return ", ".join(files(group))
+
+
+def answer_version(command: str) -> None:
+    """Print the version of xrgs and end the command, where `--version` is asked for.
+
+    Args:
+        command: Name of the command.
+
+    Raises:
+        SystemExit: With code 0, after the version was printed.
+    """
+    if "--version" in sys.argv[1:]:
+        say(f"{command} {xrgs.__version__}")
+        sys.exit()
+
+
+def completion(command: str, words: Sequence[str]) -> str:
+    """Return the line of bash that completes the words of a command, and names of files.
+
+    Args:
+        command: Name of the command.
+        words: What may be written behind it; none of them holds a space or a quote.
+    """
+    return f"complete -o default -o nospace -W '{' '.join(words)}' {command}"
 
 
 def names_in(text: str) -> tuple[str, ...]:
@@ -133,7 +202,9 @@ def paths_in(text: str) -> list[Path]:
 
 
 def parse(schema: type[Any], help_text: str, arguments: Sequence[str] | None = None) -> DictConfig:
-    """Return the command line as a config of a schema, or print the help and end the command.
+    """Return the command line as a config of a schema, or print what it asks for and end.
+
+    `--help`, `--version` and `--completion` ask for the help, the version and a line of bash.
 
     Args:
         schema: A dataclass of the arguments, with their default values.
@@ -143,10 +214,10 @@ def parse(schema: type[Any], help_text: str, arguments: Sequence[str] | None = N
 
     Raises:
         OmegaConfBaseException: An argument is not in the schema, or its value is of another type.
-        SystemExit: With code 0, after the help was printed.
+        SystemExit: With code 0, after the help, the version or the completion was printed.
     """
     words = sys.argv[1:] if arguments is None else arguments
-    help_if_asked(help_text, words)
+    answer(schema, help_text, words)
     return cast("DictConfig", OmegaConf.merge(OmegaConf.structured(schema), dotlist(words)))
 
 
@@ -165,21 +236,27 @@ def parse_with_words(
         SystemExit: As `parse`, also where the command line has no argument at all.
     """
     given = sys.argv[1:] if arguments is None else arguments
-    help_if_asked(help_text, sys.argv[1:] or ["--help"])
+    answer(schema, help_text, sys.argv[1:] or ["--help"])
     words = [argument for argument in given if "=" not in argument]
     return words, parse(schema, help_text, [key for key in given if "=" in key])
 
 
-def help_if_asked(help_text: str, arguments: Sequence[str]) -> None:
-    """Print the help and end the command if a command line asks for it.
+def answer(schema: type[Any], help_text: str, arguments: Sequence[str]) -> None:
+    """Print the help, the version or a line of bash and end, if a command line asks for one.
 
     Args:
-        help_text: The help.
+        schema: A dataclass of the arguments, whose names are completed.
+        help_text: The help, which begins with the name of the command.
         arguments: The command line.
 
     Raises:
-        SystemExit: With code 0, after the help was printed.
+        SystemExit: With code 0, after it was printed.
     """
+    command = help_text.split(maxsplit=1)[0]
+    answer_version(command)
     if {"-h", "--help"} & set(arguments):
         say(help_text.rstrip())
+        sys.exit()
+    if "--completion" in arguments:
+        say(completion(command, [f"{name}=" for name in schema.__dataclass_fields__]))
         sys.exit()

@@ -9,7 +9,13 @@ from typing import cast
 from omegaconf import OmegaConf
 
 from xrgs import config
-from xrgs.cli.arguments import choices, errors_as_messages, with_quotes
+from xrgs.cli.arguments import (
+    answer_version,
+    choices,
+    completion,
+    errors_as_messages,
+    with_quotes,
+)
 from xrgs.errors import XrgsError
 from xrgs.experiment.store import Store
 from xrgs.runtime.streams import say
@@ -36,6 +42,10 @@ def main() -> None:
     """Run `xrgs-data COMMAND [WORD]... [KEY=VALUE]...`."""
     words = [argument for argument in sys.argv[1:] if "=" not in argument]
     values = dict(argument.split("=", 1) for argument in sys.argv[1:] if "=" in argument)
+    answer_version("xrgs-data")
+    if "--completion" in words:
+        say(completion("xrgs-data", ["download", "lpips", "inspect"]))
+        return
     if not sys.argv[1:] or {"-h", "--help"} & set(words):
         say(_HELP.format(data=choices("data")).rstrip())
         return

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from xrgs.cli.arguments import errors_as_messages, help_if_asked, names_in, parse_with_words
+from xrgs.cli.arguments import answer, errors_as_messages, names_in, parse_with_words
 from xrgs.errors import XrgsError
 from xrgs.experiment.store import Store
 from xrgs.runtime.signals import exit_on_signal
@@ -106,7 +106,7 @@ class StoreConf:
 
 def main() -> None:
     """Run `xrgs-store COMMAND [CELL]... [KEY=VALUE]...`."""
-    help_if_asked(_HELP, sys.argv[1:] or ["--help"])
+    answer(ListConf, _HELP, sys.argv[1:] or ["--help"])
     command = sys.argv[1]
     with errors_as_messages("xrgs-store"):
         if command not in _COMMANDS:

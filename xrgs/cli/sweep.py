@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import os
 import sys
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import hydra
 from hydra.core.hydra_config import HydraConfig
@@ -13,9 +15,22 @@ from hydra.errors import CompactHydraException
 from omegaconf import MISSING, DictConfig, OmegaConf
 
 from xrgs import config
-from xrgs.cli.arguments import choices, dotlist, errors_as_messages, with_quotes
+from xrgs.cli.arguments import (
+    answer_version,
+    choices,
+    dotlist,
+    errors_as_messages,
+    with_quotes,
+)
+from xrgs.cli.key_help import explain
 from xrgs.runtime.signals import exit_on_signal
 from xrgs.runtime.streams import ignore_broken_pipe, say
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+#: The variable of the environment by which Hydra leaves errors to its caller.
+_FULL_ERROR = "HYDRA_FULL_ERROR"
 
 _HELP = """\
 xrgs-sweep [+ablation=NAME[,NAME]...] [scene=NAME] [preset=NAME] [KEY=VALUE[,VALUE]...]...
@@ -35,7 +50,8 @@ xrgs-sweep rerun=CELL_FOLDER [out=FOLDER] [store=FOLDER] [threads=N] [scene.path
            [plugins=NAME[,NAME]...]
   trains a finished cell again in another folder, and prints "the same, bit for bit" or what differs
 
---cfg job prints every key with its value; --hydra-help explains Hydra's own options.
+help=KEY explains a key, e.g. help=train.steps or help=variant; --cfg job prints all keys with their
+values; --config-dir FOLDER adds YAML files of your own; --hydra-help explains Hydra's own options.
 """
 
 
@@ -87,6 +103,11 @@ def main() -> None:
         say(_HELP.format(**{group: choices(group) for group in groups}).rstrip())
         return
     ignore_broken_pipe()
+    answer_version("xrgs-sweep")
+    if len(arguments) == 1 and arguments[0].startswith("help="):
+        with errors_as_messages("xrgs-sweep"):
+            say(explain(arguments[0].removeprefix("help=")))
+        return
     if any(argument.startswith("rerun=") for argument in arguments):
         with exit_on_signal(
             "The cell is unchanged; the folder that was begun beside it has no result."
@@ -94,12 +115,32 @@ def main() -> None:
             _rerun(arguments)
         return
     config.register()
-    # `ablation` is not in the defaults list, so that Hydra requires the plus, which is forgotten.
-    words = ["+" + word if word.startswith("ablation=") else word for word in arguments]
-    with errors_as_messages("xrgs-sweep"):
+    # The plus that Hydra requires before these two is forgotten easily.
+    words = ["+" + w if w.partition("=")[0] in config.PLUS_GROUPS else w for w in arguments]
+    with (
+        exit_on_signal("Finished cells are kept: run the same command again to continue."),
+        _hydra_errors("xrgs-sweep"),
+    ):
         sys.argv[1:] = with_quotes(words)
-    with exit_on_signal("Finished cells are kept: run the same command again to continue."):
         _run_job()
+
+
+@contextmanager
+def _hydra_errors(command: str) -> Iterator[None]:
+    """Say errors that the user can correct in one line, and show any other one with its traceback.
+
+    Hydra would add to each that a variable of the environment shows a traceback. It leaves errors
+    to us where that variable is set; users who set it themselves see a traceback of every error.
+    """
+    if _FULL_ERROR in os.environ:
+        yield
+        return
+    os.environ[_FULL_ERROR] = "1"
+    try:
+        with errors_as_messages(command):
+            yield
+    finally:
+        del os.environ[_FULL_ERROR]
 
 
 def _rerun(arguments: list[str]) -> None:

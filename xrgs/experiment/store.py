@@ -123,10 +123,26 @@ class Store:
         Raises:
             StoreError: As `prepare`.
         """
+        self._write_nameless(self.path)
+
+    def check_writable(self) -> None:
+        """Check that `prepare` could write, and leave nothing behind.
+
+        Raises:
+            StoreError: As `prepare`.
+        """
+        folder = self.path.absolute()
+        while not folder.exists() and not folder.is_symlink():
+            folder = folder.parent
+        self._write_nameless(folder)
+
+    def _write_nameless(self, folder: Path) -> None:
+        """Write a file that has no name into a folder, and so leave nothing behind."""
         try:
-            with tempfile.TemporaryFile(dir=self.path) as file:
+            with tempfile.TemporaryFile(dir=folder) as file:
                 file.write(bytes(_MIN_FREE_BYTES))
         except OSError as error:
+            error.filename = str(folder)  # and not the name of the file, which is random
             raise self._unwritable(error) from error
 
     def _unwritable(self, error: OSError) -> StoreError:

@@ -13,12 +13,13 @@ from xrgs.experiment.store import BASELINE, Store
 from xrgs.report import curves, skipped
 from xrgs.report.collect import RECORD_KEYS, ReportError, Sweep, read_cells
 from xrgs.report.compare import compare
+from xrgs.report.context import contexts
 from xrgs.report.external import with_external
 from xrgs.report.gap import gap_tables
 from xrgs.report.html import write_document
 from xrgs.report.joined import Choice, JoinedStore, report_name
 from xrgs.report.pictures import Picture, draw
-from xrgs.report.render import TextTable, to_latex, to_markdown, to_text
+from xrgs.report.render import LATEX_PREAMBLE, TextTable, to_latex, to_markdown, to_text
 from xrgs.report.tables import Tables
 from xrgs.report.training import table as training_table
 from xrgs.report.training import totals
@@ -149,7 +150,7 @@ def build(
     sweep = with_external(sweep, store, externals)
     store = replace(store, external=sweep.renders)
     comparison = compare(sweep.cells, METRICS, against)
-    tables = Tables(comparison)
+    tables = Tables(comparison, contexts(store, sweep.cells, sweep.views))
     name = report_name(ids) + choice.suffix
     name += "" if against == BASELINE else f".against-{for_file_name(against)}"
     name += "".join(f".with-{for_file_name(one.label)}" for one in externals)
@@ -223,7 +224,7 @@ def _write_files(
     order = [*RECORD_KEYS, "state", "reason", "protocol", "validation", *metrics]
     write_text(folder / "table.md", _markdown_page(sweep, tables, pictures, folder, runs))
     non_empty = [table for table in _all_tables(tables) if table.rows]
-    write_text(folder / "table.tex", "\n".join(map(to_latex, non_empty)))
+    write_text(folder / "table.tex", LATEX_PREAMBLE + "\n".join(map(to_latex, non_empty)))
     write_text(folder / "table.csv", _csv(tables.long()))
     write_text(folder / "cells.csv", _csv(cells[order]))
     write_text(folder / "views.csv", _csv(views))
@@ -244,7 +245,9 @@ def _all_tables(tables: Tables) -> list[TextTable]:
     """Return every table of changes and values, overviews first."""
     comparison = tables.comparison
     result = [*tables.overviews(), *gap_tables(comparison), *_ablation_tables(tables)]
-    result += [tables.values(name) for name in dict.fromkeys(comparison.cells["condition"])]
+    conditions = dict.fromkeys(comparison.cells["condition"])
+    result += [tables.scores(name) for name in conditions]
+    result += [tables.values(name) for name in conditions]
     missing = tables.missing()
     return result + ([missing] if missing else [])
 

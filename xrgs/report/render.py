@@ -5,7 +5,7 @@ from __future__ import annotations
 import unicodedata
 from dataclasses import dataclass
 
-from xrgs.safeio.words import MAX_CELL, for_latex, for_line, for_markdown
+from xrgs.safeio.words import MAX_CELL, for_file_name, for_latex, for_line, for_markdown
 
 
 @dataclass(frozen=True)
@@ -19,6 +19,14 @@ class TextTable:
     """`l` or `r` for each column."""
     notes: tuple[str, ...] = ()
     """Lines below the table."""
+    context: str = ""
+    """What the table has to be read with, below its title."""
+    name: str = ""
+    """What LaTeX's label is made of; the title where it is empty."""
+    spans: tuple[tuple[str, int], ...] = ()
+    """Headings over the columns, from the left, with how many each is over; empty for none."""
+    best: frozenset[tuple[int, int]] = frozenset()
+    """Row and column of the cells that are printed bold, where that can be done."""
 
 
 def titled(text: str, condition: str) -> str:
@@ -57,8 +65,15 @@ def _padded(rows: list[tuple[str, ...]], align: str) -> tuple[list[list[str]], l
 
 def _rows(table: TextTable) -> list[tuple[str, ...]]:
     """Return the heads of the columns and the rows, in cells of one line of bounded length."""
-    rows = (table.columns, *table.rows)
-    return [tuple(for_line(text, MAX_CELL).strip() for text in row) for row in rows]
+    above = [head for head, columns in table.spans for _ in range(columns)] or [""] * len(
+        table.columns
+    )
+    heads = tuple(f"{head} {own}" for head, own in zip(above, table.columns, strict=True))
+    return [_cells(row) for row in (heads, *table.rows)]
+
+
+def _cells(row: tuple[str, ...]) -> tuple[str, ...]:
+    return tuple(for_line(text, MAX_CELL).strip() for text in row)
 
 
 def to_text(table: TextTable) -> str:
@@ -73,7 +88,8 @@ def to_text(table: TextTable) -> str:
     lines, sizes = _padded(_rows(table), table.align)
     lines.insert(1, ["─" * size for size in sizes])
     body = ["  ".join(line).rstrip() for line in lines]
-    return "\n".join([for_line(table.title), "", *body, *map(for_line, table.notes), ""])
+    head = [for_line(text) for text in (table.title, table.context) if text]
+    return "\n".join([*head, "", *body, *map(for_line, table.notes), ""])
 
 
 def to_markdown(table: TextTable) -> str:
@@ -82,41 +98,78 @@ def to_markdown(table: TextTable) -> str:
     Args:
         table: The table.
     """
-    rows = [tuple(map(for_markdown, row)) for row in _rows(table)]
+    heads, *body = (tuple(map(for_markdown, row)) for row in _rows(table))
+    rows = [heads, *_marked(body, table.best, "**{}**")]
     lines, sizes = _padded(rows, table.align)
     rule = [
         "-" * (size - 1) + (":" if side == "r" else "-")
         for size, side in zip(sizes, table.align, strict=True)
     ]
     lines.insert(1, rule)
-    body = ["| " + " | ".join(line) + " |" for line in lines]
+    body_lines = ["| " + " | ".join(line) + " |" for line in lines]
     notes = [f"- {for_markdown(note)}" for note in table.notes]
-    parts = [[f"### {for_markdown(table.title)}"], body, notes]
+    context = [for_markdown(table.context)] if table.context else []
+    parts = [[f"### {for_markdown(table.title)}"], context, body_lines, notes]
     return "\n\n".join("\n".join(part) for part in parts if part) + "\n"
 
 
+def _marked(
+    rows: list[tuple[str, ...]], best: frozenset[tuple[int, int]], form: str
+) -> list[tuple[str, ...]]:
+    """Return the rows with `form` around the cells that are best."""
+    return [
+        tuple(form.format(text) if (i, j) in best else text for j, text in enumerate(row))
+        for i, row in enumerate(rows)
+    ]
+
+
+#: A table of more columns is shrunk to the width of the page.
+_MAX_LATEX_COLUMNS = 8
+#: What a document needs for the tables of `to_latex`.
+LATEX_PREAMBLE = "% The document needs \\usepackage{booktabs} and \\usepackage{graphicx}.\n"
+
+
 def to_latex(table: TextTable) -> str:
-    """Write the table as LaTeX of the package `booktabs`.
+    """Write the table as LaTeX of the packages `booktabs` and `graphicx`, with caption and label.
 
     Args:
         table: The table.
     """
-    lines = [" & ".join(map(for_latex, row)) + r" \\" for row in _rows(table)]
+    heads, *body = (tuple(map(for_latex, _cells(row))) for row in (table.columns, *table.rows))
+    lines = [" & ".join(row) + r" \\" for row in _marked(body, table.best, r"\textbf{{{}}}")]
     notes = [rf"\par\footnotesize {for_latex(note)}" for note in table.notes]
+    caption = ". ".join(for_latex(text) for text in (table.title, table.context) if text)
+    wide = len(table.columns) > _MAX_LATEX_COLUMNS
     return "\n".join(
         [
             r"\begin{table}[htbp]",
             r"\centering",
-            rf"\caption{{{for_latex(table.title)}}}",
+            rf"\caption{{{caption}}}",
+            rf"\label{{tab:{for_file_name(table.name or table.title)}}}",
+            *[r"\resizebox{\linewidth}{!}{%"] * wide,
             rf"\begin{{tabular}}{{{table.align}}}",
             r"\toprule",
-            lines[0],
+            *_latex_spans(table),
+            " & ".join(heads) + r" \\",
             r"\midrule",
-            *lines[1:],
+            *lines,
             r"\bottomrule",
-            r"\end{tabular}",
+            r"\end{tabular}" + "}" * wide,
             *notes,
             r"\end{table}",
             "",
         ]
     )
+
+
+def _latex_spans(table: TextTable) -> list[str]:
+    """Return the row of headings over the columns, and the rules below them; nothing for none."""
+    if not table.spans:
+        return []
+    cells, rules, column = [], [], 1
+    for head, columns in table.spans:
+        cells.append(rf"\multicolumn{{{columns}}}{{c}}{{{for_latex(for_line(head, MAX_CELL))}}}")
+        if head:
+            rules.append(rf"\cmidrule(lr){{{column}-{column + columns - 1}}}")
+        column += columns
+    return [" & ".join(cells) + r" \\", " ".join(rules)]

@@ -6,13 +6,17 @@ import math
 from functools import cached_property
 from typing import TYPE_CHECKING
 
+import numpy as np
 import pandas as pd
 
+from xrgs.report.compare import is_amount
+from xrgs.report.context import Context
 from xrgs.report.render import TextTable, titled
 from xrgs.report.writing import (
     AGREEMENT_NOTE,
     ARROWS_NOTE,
     LACKING_NOTE,
+    SAME,
     SCATTER_NOTE,
     Change,
     agreement,
@@ -32,11 +36,18 @@ from xrgs.report.writing import (
 )
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping
+
     from xrgs.evaluation.metrics import Metric
     from xrgs.report.compare import Comparison
 
+#: Metrics that differ between two runs of one program.
+_NOISY = frozenset({"training_time_s", "render_time_ms", "peak_rss_bytes"})
 #: Longest list of replicates in a title; of more it has the number.
 _MAX_LISTED = 8
+#: The order of the scores in a compact table, and the arrows in its heads: those of papers.
+_PAPER_ORDER = {"psnr": 0, "ssim": 1, "lpips": 2}
+_DIRECTION = {True: "↑", False: "↓"}
 #: Keys of a row of the long table.
 _LEVEL = ["level", "label", "condition", "scene", "metric"]
 #: Columns of the long table that have the share of the gap to all_hr, by their names elsewhere.
@@ -48,10 +59,17 @@ class Tables:
 
     Args:
         comparison: The pairs of cells and their means.
+        contexts: How the cells of each condition were trained and scored.
     """
 
-    def __init__(self, comparison: Comparison) -> None:
+    def __init__(
+        self, comparison: Comparison, contexts: Mapping[str, Context] | None = None
+    ) -> None:
         self.comparison = comparison
+        self._contexts = contexts or {}
+
+    def _context(self, condition: str) -> Context:
+        return self._contexts.get(condition, Context())
 
     @cached_property
     def _means(self) -> dict[tuple[str, ...], Change]:
@@ -86,18 +104,46 @@ class Tables:
 
     def _overview(self, labels: list[str], condition: str) -> TextTable:
         base, scenes = self.comparison.base, len(self.comparison.scenes)
+        same = {name for name in labels if self.unchanged(name, condition)}
         rows = tuple(
-            (metric.label, *(marked(self._means.get((name, condition, metric.name)), metric, scenes)
+            (metric.label, *(SAME if name in same else
+                             marked(self._means.get((name, condition, metric.name)), metric, scenes)
                              for name in labels))
             for metric in self.comparison.metrics
         )  # fmt: skip
+        without_effect = tuple(f"{name} {self.unchanged(name, condition)}" for name in sorted(same))
         return TextTable(
             title=titled(f"Change from {base}, %, mean over scenes", condition),
             columns=("Metric", *(f"{name} vs {base}" for name in labels)),
             rows=rows,
             align="l" + "r" * len(labels),
-            notes=(ARROWS_NOTE, *self._mean_notes(labels, condition)),
+            notes=(ARROWS_NOTE, *without_effect, *self._mean_notes(labels, condition)),
+            context=self._context(condition).of_all,
+            name=f"overview {condition}".strip(),
         )
+
+    def unchanged(self, label: str, condition: str) -> str:
+        """Say why an ablation has nothing to compare: it is the base, or gave the same results.
+
+        Args:
+            label: The ablation.
+            condition: The condition that it was run under.
+
+        Returns:
+            The end of a sentence that begins with the label; empty where something changed. Times
+            and the memory of the process always differ, and don't count.
+        """
+        pairs, base = self.comparison.pairs, self.comparison.base
+        here = pairs[(pairs["label"] == label) & (pairs["condition"] == condition)]
+        if here.empty:
+            return ""
+        if (here["cell_id"] == here["base_id"]).all():
+            return f"changes nothing: its cells are those of {base}"
+        steady = here[~here["metric"].isin(_NOISY)]
+        known = steady[steady["base"].notna() | steady["value"].notna()]
+        if known.empty or not (known["base"] == known["value"]).all():
+            return ""
+        return f"changes nothing: all its scores, counts and amounts of work are those of {base}"
 
     def _mean_notes(self, labels: list[str], condition: str) -> tuple[str, ...]:
         """Say how means of these labels were made, and what their marks are."""
@@ -124,6 +170,9 @@ class Tables:
             for key, metric in zip(keys, self.comparison.metrics, strict=True)
             if key in self._means
         ]
+        title = titled(f"{label} against {base}: {self._extent(label, condition)}", condition)
+        if why := self.unchanged(label, condition):
+            return TextTable(title, ("Result",), ((f"{label} {why}",),), "l")
         left_out = (
             f"{metric.label}: pairs left out ({row.why})"
             for row, metric in found
@@ -134,14 +183,16 @@ class Tables:
             *(SCATTER_NOTE, *self._mean_notes([label], condition)),
         )
         return TextTable(
-            title=titled(f"{label} against {base}: {self._extent(label, condition)}", condition),
+            title=title,
             columns=(
                 *("Metric", base, label, f"change from {base}, %", "dB", "95 % interval, %"),
                 *("pairs that agree", "sd replicates, %", "sd scenes, %", "q", "reading"),
             ),
             rows=tuple(_mean_row(row, metric, scenes) for row, metric in found),
             align="lrrrrrrrrrl",
-            notes=notes if found else (),
+            notes=(*self._context(condition).cautions, *notes) if found else (),
+            context=self._context(condition).of_all,
+            name=f"{label} {condition}".strip(),
         )
 
     def _extent(self, label: str, condition: str) -> str:
@@ -170,7 +221,7 @@ class Tables:
         """
         scenes = self.comparison.scenes
         rows: list[tuple[str, ...]] = []
-        for metric in self.comparison.metrics:
+        for metric in () if self.unchanged(label, condition) else self.comparison.metrics:
             found = [self._per_scene.get((label, condition, s, metric.name)) for s in scenes]
             mean = self._means.get((label, condition, metric.name))
             cells = [
@@ -189,6 +240,8 @@ class Tables:
             rows=tuple(rows),
             align="l" + "r" * (len(scenes) + 1),
             notes=(ARROWS_NOTE, *self._mean_notes([label], condition)),
+            context=self._context(condition).of_all,
+            name=f"scenes {label} {condition}".strip(),
         )
 
     def values(self, condition: str) -> TextTable:
@@ -214,7 +267,61 @@ class Tables:
             columns=("Scene", "Metric", *labels),
             rows=tuple(rows),
             align="ll" + "r" * len(labels),
+            notes=self._context(condition).cautions,
+            context=self._context(condition).of_all,
+            name=f"values {condition}".strip(),
         )
+
+    def scores(self, condition: str) -> TextTable:
+        """Return the compact table of papers: a row for each method, the scores scene by scene.
+
+        Args:
+            condition: The condition that the cells were run under.
+
+        Returns:
+            Means over the replicates that are done, and, of several scenes, the mean over all of
+            them, which a method that lacks one has not. The best of each column is bold.
+        """
+        cells = self.comparison.cells
+        here = cells[cells["condition"] == condition]
+        labels, metrics = list(dict.fromkeys(here["label"])), self._scores()
+        done = here[here["state"] == "done"]
+        means = done.groupby(["label", "scene"])[[metric.name for metric in metrics]].mean()
+        columns = [(scene, metric) for scene in self.comparison.scenes for metric in metrics]
+        values = {
+            label: [_at(means[metric.name], (label, scene)) for scene, metric in columns]
+            for label in labels
+        }
+        if len(self.comparison.scenes) > 1:
+            columns += [("mean", metric) for metric in metrics]
+            for row in values.values():
+                row += [float(np.mean(row[first :: len(metrics)])) for first in range(len(metrics))]
+        texts = [[_score(v, m) for v, (_, m) in zip(values[label], columns, strict=True)]
+                 for label in labels]  # fmt: skip
+        best = {
+            (row, column + 1)
+            for column, (_, metric) in enumerate(columns)
+            for row in _best([values[label][column] for label in labels], metric)
+        }
+        heads = [f"{metric.label} {_DIRECTION[metric.higher_is_better]}" for _, metric in columns]
+        spans = [(scene, len(metrics)) for scene in dict.fromkeys(scene for scene, _ in columns)]
+        return TextTable(
+            title=titled("Scores by method and scene, means over replicates", condition),
+            columns=("Method", *heads),
+            rows=tuple((label, *row) for label, row in zip(labels, texts, strict=True)),
+            align="l" + "r" * len(columns),
+            notes=(f"{_DIRECTION[True]} higher is better, {_DIRECTION[False]} lower is better",
+                   *self._context(condition).cautions),
+            context=self._context(condition).of_scores,
+            name=f"scores {condition}".strip(),
+            spans=(("", 1), *spans),
+            best=frozenset(best),
+        )  # fmt: skip
+
+    def _scores(self) -> list[Metric]:
+        """Return the scores of views, in the order of papers."""
+        known = [metric for metric in self.comparison.metrics if not is_amount(metric)]
+        return sorted(known, key=lambda metric: _PAPER_ORDER.get(metric.name, len(_PAPER_ORDER)))
 
     def missing(self) -> TextTable | None:
         """Return a table of the cells without results and why; None where there are none."""
@@ -256,6 +363,24 @@ class Tables:
         scenes = self.comparison.gaps_per_scene.reset_index().assign(level="scene")
         means = self.comparison.gaps.reset_index().assign(level="mean", scene="")
         return pd.concat([means, scenes])[[*_LEVEL, *_GAP]].rename(columns=_GAP)
+
+
+def _at(means: pd.Series, key: tuple[str, str]) -> float:
+    return float(means[key]) if key in means.index else math.nan
+
+
+def _score(value: float, metric: Metric) -> str:
+    """Write a score as papers do: dB with two decimals, the others with three."""
+    return "n/a" if math.isnan(value) else f"{value:.{2 if metric.unit == 'dB' else 3}f}"
+
+
+def _best(values: list[float], metric: Metric) -> list[int]:
+    """Return which of the values are best as they are printed; none where there is only one."""
+    known = {_score(v, metric): v for v in values if not math.isnan(v)}
+    if len(known) < 2:
+        return []
+    best = (max if metric.higher_is_better else min)(known, key=lambda text: known[text])
+    return [row for row, value in enumerate(values) if _score(value, metric) == best]
 
 
 def _mean_row(row: Change, metric: Metric, scenes: int) -> tuple[str, ...]:

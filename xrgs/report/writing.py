@@ -26,6 +26,8 @@ SCATTER_NOTE = (
 )
 LACKING_NOTE = "(k of n): a mean over k of the n scenes"
 _MARK = "*"
+#: Counts from this on are written in units of 10^6 or 10^9, as 17.9 G.
+_LARGE = 1e7
 
 
 class Change(NamedTuple):
@@ -54,13 +56,17 @@ def number(value: float, unit: str) -> str:
 
     Args:
         value: The value; NaN is written as n/a.
-        unit: Its unit, empty for none; bytes are written in MiB.
+        unit: Its unit, empty for none; bytes are written in MiB, and counts from ten million on
+            with three digits in units of 10^6 or 10^9: `17.9 G`.
     """
     if math.isnan(value):
         return "n/a"
     if unit == "bytes":
         return f"{value / 2**20:,.1f} MiB"
-    if math.isinf(value) or abs(value) >= 1000:
+    if not unit and _LARGE <= abs(value) < math.inf:
+        scale, prefix = (1e9, "G") if abs(value) >= 999.5e6 else (1e6, "M")
+        return f"{value / scale:#.3g} {prefix}".replace(". ", " ")
+    if math.isinf(value) or abs(value) >= (10 if unit == "s" else 1000):
         text = f"{value:,.0f}"
     elif unit:
         text = f"{value:.2f}"

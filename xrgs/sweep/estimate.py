@@ -1,109 +1,212 @@
-"""Estimates the training time of a cell: from the finished cells of the store, or from its size."""
+"""Estimates what a cell will take: its time, its memory and its disk.
+
+The logarithm of each cost is a sum of effects: of every setting with its value, of all settings
+together, of the variant, and of sizes, each with an exponent (pixels, steps, points, views,
+threads). The effects are fitted to the store's finished cells by ridge regression, which is a
+normal prior on each: so a setting or a variant that no cell had counts as average, a variant of
+another size is scaled, and a store without cells gives the prior, for a common machine. The times
+are of whatever machine a cell was trained on, and of what else that was doing.
+"""
 
 from __future__ import annotations
 
 import heapq
-from collections import defaultdict
-from statistics import fmean
+import math
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
+from datetime import datetime
+from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
-from xrgs.capture.degrade import resolve_degradation
+import numpy as np
+
 from xrgs.errors import StoreError
-from xrgs.safeio.hashing import canonical_json
+from xrgs.experiment.identity import cell_identity
+from xrgs.safeio.records import as_number, read_object
+from xrgs.sweep import features
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Mapping
+    from numpy.typing import NDArray
 
     from xrgs.config import Conf
     from xrgs.experiment.cell_folder import CellFolder
     from xrgs.experiment.store import Store
+    from xrgs.sweep.features import Features
 
 #: Number of finished cells that are read, the newest first; more would take long and help little.
 _MAX_CELLS = 500
+#: The most names of effects of all these cells; a store of ours has some hundred.
+_MAX_NAMES = 10_000
+#: Largest logarithm of a cost: that of 10^26.
+_MAX_LOG = 60.0
 #: How many times longer the torch backend takes for a training step than the native one: rendering
 #: and loss, forward and backward, of 10,000 to 100,000 Gaussians took 32 to 69 times as long.
 TORCH_SLOWDOWN = 50.0
-#: Seconds of a training step of the torch backend for each pixel of the mean view, with as many
-#: Gaussians as training makes at that size. Measured: 1.0e-5 to 1.8e-5.
-_TORCH_STEP_S = 1.5e-5
+#: Seconds beyond which the time of a cell beside its training is none: a store that was copied has
+#: other dates.
+_MAX_OVERHEAD_S = 600.0
+#: Resident memory of a process that has imported torch and trains nothing.
+_PROCESS_BYTES = 4e8
+#: Standard deviations of logarithms: of a cell around its estimate, and of the priors of effects.
+#: Chosen for the cells of 12 variants that were left out in turn.
+_RESIDUAL, _LEVEL, _NAME, _TORCH = 0.15, 1.0, 0.2, 0.3
+_EXPONENTS = {"pixels": 0.2, "steps": 0.1, "points": 0.15, "views": 0.15, "threads": 0.15}
 
 
-class RuntimeEstimator:
-    """Training times per step of the store's finished cells, grouped by what cells have in common.
+@dataclass(frozen=True)
+class Prior:
+    """What one cost is taken for where no cell tells otherwise."""
 
-    The times are of training alone, on whatever machine a cell was trained.
-    """
+    typical: float
+    """The cost of the native backend where every size is its unit: a scene of LLFF at 504 px,
+    3,000 steps, one thread."""
+    exponents: Mapping[str, float] = field(default_factory=dict)
+    """The power of each size that the cost is proportional to; 0 for the others."""
+    torch: float = 1.0
+    """The factor of the torch backend."""
+
+    def log(self, cell: Features) -> float:
+        """Return the logarithm of the cost of a cell."""
+        sizes = sum(power * cell.sizes.get(name, 0.0) for name, power in self.exponents.items())
+        return math.log(self.typical) + sizes + math.log(self.torch) * cell.torch
+
+
+#: The costs, by the names of `_costs_of`. Measured on two cores of an Intel Xeon.
+_PRIORS = {
+    "step_s": Prior(0.03, {"pixels": 0.8, "steps": 0.1, "threads": -0.85}, TORCH_SLOWDOWN),
+    "overhead_s": Prior(4.0, {"pixels": 0.3}),
+    "memory_bytes": Prior(4.5e8, {"pixels": 0.8, "steps": 0.3}),
+    "disk_bytes": Prior(3e7, {"pixels": 0.8, "steps": 0.2}),
+}
+
+
+@dataclass(frozen=True)
+class Cost:
+    """What a cell is expected to take."""
+
+    training_s: float
+    """Time of training."""
+    seconds: float
+    """Time from its start to its end: training, loading and scoring."""
+    memory_bytes: float
+    """Resident memory of its process where that is largest."""
+    disk_bytes: float
+    """Size of its files when it is done."""
+
+
+class _Regression:
+    """The effects on one cost that were fitted to past cells."""
+
+    def __init__(self, prior: Prior, past: Iterable[tuple[Features, float]]) -> None:
+        known = [(cell, cost) for cell, cost in past if 0 < cost < math.inf]
+        self._prior = prior
+        # What all cells have is part of the level.
+        shared = frozenset.intersection(*(cell.names for cell, _ in known)) if known else ()
+        names = {name for cell, _ in known for name in cell.names} - frozenset(shared)
+        self._column = {name: number for number, name in enumerate(sorted(names))}
+        deviations = [_LEVEL, _TORCH, *_EXPONENTS.values(), *[_NAME] * len(names)]
+        variances = np.array(deviations) ** 2
+        X = np.array([self._row(cell) for cell, _ in known]).reshape(-1, len(variances))
+        y = np.array([math.log(cost) - prior.log(cell) for cell, cost in known])
+        # As many equations as cells: there may be more effects.
+        covariance = (X * variances) @ X.T + _RESIDUAL**2 * np.eye(len(known))
+        self._effects = variances * (X.T @ np.linalg.solve(covariance, y))
+
+    def _row(self, cell: Features) -> NDArray[np.float64]:
+        """Return how often each effect is in the cost of a cell."""
+        sizes = [cell.sizes.get(name, 0.0) for name in _EXPONENTS]
+        named = np.zeros(len(self._column))
+        named[[self._column[name] for name in cell.names if name in self._column]] = 1
+        return np.array([1.0, cell.torch, *sizes, *named])
+
+    def __call__(self, cell: Features) -> float:
+        """Return the expected cost of a cell."""
+        logarithm = self._prior.log(cell) + float(self._row(cell) @ self._effects)
+        return math.exp(min(max(logarithm, -_MAX_LOG), _MAX_LOG))
+
+
+class CostEstimator:
+    """Estimates what cells will take from the finished cells of a store."""
 
     def __init__(self, store: Store) -> None:
         """Read the newest cells of a store."""
-        self._seconds_per_step: defaultdict[str, list[float]] = defaultdict(list)
+        self._store = store
+        self._past: list[tuple[Features, dict[str, float]]] = []
+        names = set[str]()
         for cell in _newest(store):
             try:
-                identity, summary = cell.identity(), cell.summary()
-                seconds = summary["training_time_s"] / identity["train"]["steps"]
-                groups = list(_groups(identity))
-            except (StoreError, ArithmeticError, KeyError, TypeError, ValueError):
+                what, costs = self._read(cell)
+            except (StoreError, OSError, AttributeError, ArithmeticError, KeyError, TypeError,
+                    ValueError):  # fmt: skip
                 continue
-            for group in groups:
-                self._seconds_per_step[group].append(seconds)
+            names |= what.names
+            if len(names) > _MAX_NAMES:
+                break
+            self._past.append((what, costs))
 
     @property
-    def known(self) -> bool:
-        """Whether the store has a finished cell to go by."""
-        return bool(self._seconds_per_step)
+    def known(self) -> int:
+        """Number of finished cells that the estimates are learned from."""
+        return len(self._past)
 
-    def seconds(self, identity: Mapping[str, Any]) -> float | None:
-        """Return the expected training time of a cell.
+    def _read(self, cell: CellFolder) -> tuple[Features, dict[str, float]]:
+        """Return the features and the costs of a finished cell."""
+        identity, summary = cell.identity(), cell.summary()
+        try:
+            provenance, status = cell.provenance(), read_object(cell.status)
+        except StoreError:  # of them only the overhead, the disk and the threads are known
+            provenance, status = {}, {}
+        what = features.of_identity(identity, provenance.get("threads"), self._store)
+        training_s = as_number(summary["training_time_s"])
+        costs = {"step_s": training_s / identity["train"]["steps"]}
+        costs["memory_bytes"] = as_number(summary.get("peak_rss_bytes")) - _PROCESS_BYTES
+        if status:
+            costs["disk_bytes"] = sum(as_number(e["bytes"]) for e in status["files"].values())
+            started = datetime.fromisoformat(provenance["started"]).timestamp()
+            overhead = cell.status.lstat().st_mtime - started - training_s
+            if 0 < overhead < _MAX_OVERHEAD_S:
+                costs["overhead_s"] = overhead
+        return what, costs
 
-        It is the mean over the most similar cells that exist: those that differ in seed and code
-        only; else those that differ in the number of steps as well; else those of the same variant;
-        else all. Cells of the other backend count only where this one has none, and by
-        `TORCH_SLOWDOWN`. Times are taken to be proportional to the number of steps.
+    @cached_property
+    def _regressions(self) -> dict[str, _Regression]:
+        return {
+            name: _Regression(
+                prior, [(cell, costs[name]) for cell, costs in self._past if name in costs]
+            )
+            for name, prior in _PRIORS.items()
+        }
+
+    def cost(
+        self, conf: Conf, variant_id: str | None, identity: Mapping[str, Any] | None, threads: int
+    ) -> Cost | None:
+        """Return what a cell is expected to take.
 
         Args:
-            identity: The cell's identity.
+            conf: The cell's config.
+            variant_id: The id of its variant; None while that is not built.
+            identity: Its identity, where that is known.
+            threads: Number of threads that train it.
 
         Returns:
-            Seconds; None if there is no finished cell.
+            The cost; None where the variant is not built and keeps the photographs' own size.
         """
-        torch = identity["splat"]["backend"] == "torch"
-        other = {"backend": "native" if torch else "torch"}
-        ratio = TORCH_SLOWDOWN if torch else 1 / TORCH_SLOWDOWN
-        of_other = {**identity, "splat": {**identity["splat"], **other}}
-        for similar, factor in ((identity, 1.0), (of_other, ratio)):
-            for group in _groups(similar):
-                if group in self._seconds_per_step:
-                    seconds = factor * fmean(self._seconds_per_step[group])
-                    return seconds * float(identity["train"]["steps"])
-        return None
+        if variant_id is None:
+            what = features.of_conf(conf, cell_identity(conf, ""), threads)
+        else:
+            identity = identity or cell_identity(conf, variant_id)
+            what = features.of_identity(identity, threads, self._store)
+        return None if what is None else self._cost(what, conf.train.steps)
 
-
-def torch_seconds(conf: Conf) -> float | None:
-    """Return roughly how long the torch backend trains a cell, from the size of its images alone.
-
-    Args:
-        conf: The cell's config.
-
-    Returns:
-        Seconds, within a factor of about two; None if the photographs' own size is not changed,
-        which the config does not tell.
-    """
-    side, hr = conf.variant.long_side, conf.variant.hr_fraction
-    if not side:
-        return None
-    lr_area = conf.variant.factor**-2 if resolve_degradation(conf.variant) == "downsample" else 1.0
-    share = {"mixed": hr + (1 - hr) * lr_area, "lr_only": lr_area}.get(conf.train.views, 1.0)
-    pixels = 0.75 * side**2 * share  # photographs of 4 to 3
-    return _TORCH_STEP_S * pixels * conf.train.steps
-
-
-def _groups(identity: Mapping[str, Any]) -> Iterator[str]:
-    """Yield the keys of the groups that a cell belongs to, from the most to the least similar."""
-    program = {key: identity[key] for key in ("splat", "components", "variant")}
-    yield canonical_json(program | {"train": identity["train"]})
-    yield canonical_json(program | {"views": identity["train"]["views"]})
-    yield f"{identity['splat']['backend']} {identity['variant']}"
-    yield str(identity["splat"]["backend"])
+    def _cost(self, what: Features, steps: int) -> Cost:
+        expected = {name: regression(what) for name, regression in self._regressions.items()}
+        training_s = expected["step_s"] * steps
+        return Cost(
+            training_s,
+            training_s + expected["overhead_s"],
+            expected["memory_bytes"] + _PROCESS_BYTES,
+            expected["disk_bytes"],
+        )
 
 
 def _newest(store: Store) -> list[CellFolder]:

@@ -13,7 +13,7 @@ from xrgs.runtime.progress import format_duration
 from xrgs.safeio.hashing import digest, to_plain
 from xrgs.safeio.words import for_line
 from xrgs.splat.backend import resolve_backend
-from xrgs.sweep.estimate import TORCH_SLOWDOWN, torch_seconds
+from xrgs.sweep.estimate import TORCH_SLOWDOWN
 
 if TYPE_CHECKING:
     from collections.abc import Container, Mapping, Sequence
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from xrgs.config import Conf
     from xrgs.experiment.store import Store
     from xrgs.sweep.axes import CellSpec
-    from xrgs.sweep.estimate import RuntimeEstimator
+    from xrgs.sweep.estimate import CostEstimator
 
 #: The part of a condition that says that no view is held out.
 TRAINING_VIEWS = "scored on the training views"
@@ -42,7 +42,11 @@ class PlannedCell:
     error: str | None = None
     """Why the cell can't be trained: its scene failed, or the cell that it takes a count from."""
     seconds: float | None = None
-    """Expected seconds of training; None where nothing is known to go by."""
+    """Expected seconds from its start to its end; None where nothing is known to go by."""
+    memory_bytes: float | None = None
+    """Expected resident memory where that is largest."""
+    disk_bytes: float | None = None
+    """Expected size of its files when it is done."""
 
     @property
     def name(self) -> str:
@@ -125,28 +129,29 @@ def identified(cell: PlannedCell, store: Store, holders: Mapping[str, str]) -> P
     return replace(cell, identity=identity, cell_id=cell_id, state=state)
 
 
-def estimated(plan: Sequence[PlannedCell], past: RuntimeEstimator) -> list[PlannedCell]:
-    """Return the cells with the expected seconds of training, as far as they are known.
-
-    Where the store's finished cells say nothing, the torch backend, which takes hours, is estimated
-    by the size of the images.
+def estimated(plan: Sequence[PlannedCell], past: CostEstimator, threads: int) -> list[PlannedCell]:
+    """Return the cells with what they are expected to take, as far as that is known.
 
     Args:
         plan: The cells.
         past: Estimates from the store's finished cells.
+        threads: Threads of a cell that asks for no number.
     """
-    return [
-        cell if cell.state.name == "done" else replace(cell, seconds=_expected_seconds(cell, past))
-        for cell in plan
-    ]
+    return [cell if cell.state.name == "done" else _with_cost(cell, past, threads) for cell in plan]
 
 
-def _expected_seconds(cell: PlannedCell, past: RuntimeEstimator) -> float | None:
-    """Return a cell's seconds of training; while it waits for a count, with the count it has."""
-    if cell.variant_id is not None and past.known:
-        return past.seconds(cell.identity or cell_identity(cell.conf, cell.variant_id))
-    torch = resolve_backend(cell.conf.splat.backend) == "torch"
-    return torch_seconds(cell.conf) if torch else None
+def _with_cost(cell: PlannedCell, past: CostEstimator, threads: int) -> PlannedCell:
+    """Return a cell with its cost; while it waits for a count, with the count it has."""
+    threads = cell.conf.threads or threads
+    cost = past.cost(cell.conf, cell.variant_id, cell.identity, threads)
+    if cost is None:
+        return cell
+    return replace(
+        cell,
+        seconds=cost.seconds,
+        memory_bytes=cost.memory_bytes,
+        disk_bytes=cost.disk_bytes,
+    )
 
 
 def expected_length(cell: PlannedCell) -> tuple[float, int]:
@@ -184,13 +189,20 @@ def ready(
 def describe(plan: Sequence[PlannedCell]) -> str:
     """Return the plan as text: one line per cell with its state, id, expected time and name.
 
+    The reason that several cells share is said once.
+
     Args:
         plan: All cells.
     """
     done = sum(cell.state.name == "done" for cell in plan)
     lines = [f"plan: {len(plan)} cells, {done} done{_remaining(plan)}"]
+    said = set[str]()
     for cell in plan:
         state, reason = _shown_state(cell)
+        if reason in said:
+            reason = "the same"
+        elif reason:
+            said.add(reason)
         missing = {"unknown": "variant unknown", "waits": "no count yet"}
         cell_id = cell.cell_id or missing.get(state, "variant not built")
         to_train = not cell.error and state not in {"done", "unknown"}
@@ -224,7 +236,7 @@ def without_kernels(plan: Sequence[PlannedCell]) -> str:
     """
     cells = [
         cell
-        for cell in _left(plan)
+        for cell in left_to_train(plan)
         if cell.conf.splat.backend == "auto" and resolve_backend("auto") == "torch"
     ]
     if not cells:
@@ -240,8 +252,76 @@ def without_kernels(plan: Sequence[PlannedCell]) -> str:
     )
 
 
-def _left(plan: Sequence[PlannedCell]) -> list[PlannedCell]:
-    """Return the cells that are to be trained, those whose variant or count is missing as well."""
+def expected_use(plan: Sequence[PlannedCell], past: int) -> str:
+    """Return a line on the memory and the disk that the cells will take.
+
+    Args:
+        plan: All cells, with what they are expected to take.
+        past: Number of finished cells that the estimates were learned from.
+
+    Returns:
+        The line; empty where no cell is left to train, or nothing is known of any.
+    """
+    memory = [cell.memory_bytes for cell in left_to_train(plan) if cell.memory_bytes is not None]
+    disk = [cell.disk_bytes for cell in left_to_train(plan) if cell.disk_bytes is not None]
+    if not memory or not disk:
+        return ""
+    learned = (
+        f"learned from {past} finished cells of this store"
+        if past
+        else "of a common machine, since this store has no finished cell: within a factor of 3"
+    )
+    return (
+        f"estimates {learned}; a cell takes up to {_size(max(memory))} of memory, all of them"
+        f" {_size(sum(disk))} of disk"
+    )
+
+
+def _size(count: float) -> str:
+    """Write a number of bytes: `~300 MB`, `~1.2 GB`."""
+    return f"~{count / 1e9:.1f} GB" if count >= 1e9 else f"~{count / 1e6:.0f} MB"
+
+
+def unchanged(plan: Sequence[PlannedCell]) -> list[str]:
+    """Return a line for each label whose cells have the config of their baselines.
+
+    Args:
+        plan: All cells.
+    """
+    bases = {cell.spec.shared: cell.conf for cell in plan if cell.spec.label == BASELINE}
+    differs: dict[str, bool] = {}
+    for cell in plan:
+        if cell.spec.label != BASELINE and (base := bases.get(cell.spec.shared)) is not None:
+            same = all(
+                getattr(cell.conf, name) == getattr(base, name)
+                for name in ("splat", "train", "components", "variant", "scene", "seed")
+            )
+            differs[cell.spec.label] = differs.get(cell.spec.label, False) or not same
+    return [
+        f"{label} changes nothing here: its cells are those of {BASELINE}"
+        for label, any_differs in differs.items()
+        if not any_differs
+    ]
+
+
+def will_fail(plan: Sequence[PlannedCell]) -> bool:
+    """Return whether a run of this plan would end with code 1, as far as can be told before it.
+
+    Args:
+        plan: All cells.
+    """
+    retry = plan[0].conf.retry == "failed"
+    return any(
+        cell.error or cell.unknown or (cell.state.name == "failed" and not retry) for cell in plan
+    )
+
+
+def left_to_train(plan: Sequence[PlannedCell]) -> list[PlannedCell]:
+    """Return the cells that are to be trained, those whose variant or count is missing as well.
+
+    Args:
+        plan: All cells.
+    """
     retry = plan[0].conf.retry == "failed"
     unidentified = [
         cell for cell in plan if cell.cell_id is None and not cell.error and not cell.unknown
@@ -251,7 +331,7 @@ def _left(plan: Sequence[PlannedCell]) -> list[PlannedCell]:
 
 def _remaining(plan: Sequence[PlannedCell]) -> str:
     """Return how long the remaining training takes, as far as that is known."""
-    remaining = _left(plan)
+    remaining = left_to_train(plan)
     known = [cell.seconds for cell in remaining if cell.seconds is not None]
     if not known:
         return ""

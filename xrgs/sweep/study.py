@@ -25,17 +25,18 @@ from omegaconf.errors import OmegaConfBaseException
 from xrgs.capture import scenes
 from xrgs.config import to_conf
 from xrgs.errors import StoreError, UnreadableError, XrgsError
-from xrgs.evaluation.lpips import weights
 from xrgs.experiment.cell_folder import CellState
 from xrgs.experiment.store import Store
+from xrgs.runtime.machine import usable_cores
 from xrgs.runtime.progress import log_line
 from xrgs.runtime.streams import say
 from xrgs.safeio.confined import is_passing
 from xrgs.safeio.hashing import digest, to_plain
 from xrgs.safeio.words import for_line
-from xrgs.sweep import controls, launch, locks, presence, track, variants
+from xrgs.sweep import controls, launch, locks, lpips, presence, track, variants
 from xrgs.sweep.axes import CellSpec, expand
-from xrgs.sweep.estimate import RuntimeEstimator
+from xrgs.sweep.checks import check
+from xrgs.sweep.estimate import CostEstimator
 from xrgs.sweep.jobs import worker
 from xrgs.sweep.jobs.job import FAIL_FAST, LOCKED, UNWRITABLE
 from xrgs.sweep.monitor import SweepMonitor
@@ -43,10 +44,14 @@ from xrgs.sweep.plan import (
     PlannedCell,
     describe,
     estimated,
+    expected_use,
     identified,
+    left_to_train,
     planned,
     ready,
     record,
+    unchanged,
+    will_fail,
     without_kernels,
 )
 
@@ -116,29 +121,34 @@ class Study:
         raise error
 
     def _plan_and_train(self, arguments: Sequence[str]) -> bool:
-        """Return whether every cell is done, or the run was a dry one."""
+        """Return whether every cell is done; after a dry run, whether none is known to fail.
+
+        Raises:
+            StoreError: The store can't be written, or is no longer there.
+            XrgsError: A value of a cell's config is out of its range.
+        """
         launch.check(self._config)
         plan = self._plan(arguments)
         track.check(plan[0].conf.track)
         store = Store(Path(plan[0].conf.store))
         dry_run = plan[0].conf.dry_run
-        if not dry_run:
+        if dry_run:
+            store.check_writable()
+        else:
             store.prepare()
             self._store = store
         plan = self._with_variants(plan, store, allow_build=not dry_run)
         plan = self._identified(plan, store)
-        plan = estimated(plan, RuntimeEstimator(store))
+        past = CostEstimator(store)
+        plan = estimated(plan, past, self._threads(len(plan)))
         say(describe(plan), sys.stderr)
-        for line in filter(None, (*controls.mixed_prune_rules(plan), without_kernels(plan))):
+        remarks = (*controls.mixed_prune_rules(plan), *unchanged(plan), without_kernels(plan))
+        for line in filter(None, (*remarks, expected_use(plan, past.known))):
             log_line(line)
-        to_train = any(cell.state.name != "done" and not cell.unknown for cell in plan)
-        if to_train and weights.find_weights() is None:
-            log_line(
-                "LPIPS is not computed for the cells trained now (n/a in tables): "
-                f"{weights.FETCH_HINT}"
-            )
+        if any(left_to_train(plan)):
+            lpips.provide(fetch=plan[0].conf.lpips.fetch, dry_run=dry_run)
         if dry_run:
-            return True
+            return not will_fail(plan)
         _tidy({cell.cell_id for cell in plan if cell.cell_id and cell.state.name == "done"}, store)
         # At the start, so that a report can be made while it runs, and after it was stopped.
         sweep_id = store.write_sweep(arguments, record(plan))
@@ -151,6 +161,11 @@ class Study:
         say(build(store.path, sweep_id).text)
         track.track(plan[0].conf.track, store, sweep_id)
         return all(cell.error is None and cell.state.name == "done" for cell in plan)
+
+    def _threads(self, cells: int) -> int:
+        """Return the threads that a cell gets which asks for no number."""
+        launcher, machine = self._config.hydra.launcher, usable_cores()
+        return launch.capacity(launcher, 0, machine).threads(cells, machine) or machine
 
     def _run_until_complete(
         self, plan: Sequence[PlannedCell], store: Store, monitor: SweepMonitor
@@ -257,6 +272,7 @@ class Study:
         composed = self._context.config_loader.load_sweep_config(self._config, spec.overrides)
         launch.check(self._config, composed)
         conf = to_conf(composed)
+        check(conf)
         follows_seed = "${seed" in str(OmegaConf.to_container(composed, resolve=False))
         self._composed[whole if follows_seed else others] = conf
         return conf

