@@ -9,6 +9,7 @@ store: a launcher that breaks loses its answers, but not the sweep.
 from __future__ import annotations
 
 import copy
+import os
 import time
 from collections import Counter
 from dataclasses import dataclass, field
@@ -113,7 +114,11 @@ def capacity(launcher: DictConfig, threads: int, machine: int) -> Capacity:
         return Capacity(cores=cores, settings={"cpus_per_task": cores})
     if kind == "RayLauncher":
         cores = max(1, int(launcher["ray"]["remote"].get("num_cpus", threads or 1)))
-        return Capacity(cores=cores, settings={"ray.remote.num_cpus": cores})
+        settings: dict[str, Any] = {"ray.remote.num_cpus": cores}
+        if launcher["ray"]["init"].get("address") or os.environ.get("RAY_ADDRESS"):
+            # The launcher would fill this in, and Ray refuses it for a cluster that runs already.
+            settings["ray.init.object_store_memory"] = None
+        return Capacity(cores=cores, settings=settings)
     return Capacity(cores=threads)
 
 
