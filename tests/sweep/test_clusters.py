@@ -46,7 +46,8 @@ RAY = """
 import sys
 from ray.cluster_utils import Cluster
 
-cluster = Cluster(True, head_node_args={"num_cpus": 1, "temp_dir": sys.argv[1]})
+head = {"num_cpus": 1, "include_dashboard": False, "temp_dir": sys.argv[1]}
+cluster = Cluster(True, head_node_args=head)
 cluster.add_node(num_cpus=1)
 print(cluster.address, flush=True)
 sys.stdin.read()
