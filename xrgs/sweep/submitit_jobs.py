@@ -8,7 +8,6 @@ learns the end of a SLURM job from `sacct`, up to ten minutes late; where SLURM 
 from __future__ import annotations
 
 import os
-from dataclasses import dataclass
 from typing import Any
 
 from hydra.core.utils import JobReturn, JobStatus
@@ -31,23 +30,6 @@ _ENDED = frozenset(
 
 class JobLostError(XrgsError):
     """A job ended without an answer."""
-
-
-@dataclass
-class LostJob(JobReturn):
-    """Stands for the answer of a job that gave none."""
-
-    reason: str = ""
-    """What is known of its end."""
-
-    @property
-    def return_value(self) -> Any:
-        """Never returns.
-
-        Raises:
-            JobLostError: Always.
-        """
-        raise JobLostError(self.reason)
 
 
 class QueueWatcher(SlurmInfoWatcher):
@@ -95,9 +77,5 @@ def _results(job: Job[Any], wait: Any = Job.results) -> list[JobReturn]:
     except Exception:
         if job.state == "CANCELLED":
             return [JobReturn(status=JobStatus.COMPLETED, _return_value=INTERRUPTED)]
-        return [
-            LostJob(
-                reason=f"job {job.job_id} ({job.state}) gave no answer; its log is "
-                f"{job.paths.stderr}"
-            )
-        ]
+        known = f"job {job.job_id} ({job.state}) gave no answer; its log is {job.paths.stderr}"
+        return [JobReturn([job.job_id], status=JobStatus.FAILED, _return_value=JobLostError(known))]
