@@ -46,7 +46,7 @@ RAY = """
 import sys
 from ray.cluster_utils import Cluster
 
-head = {"num_cpus": 1, "include_dashboard": False, "temp_dir": sys.argv[1]}
+head = {"num_cpus": 1, "include_dashboard": False}
 cluster = Cluster(True, head_node_args=head)
 cluster.add_node(num_cpus=1)
 print(cluster.address, flush=True)
@@ -81,24 +81,19 @@ def ray_address(tmp_path: Path) -> Iterator[str]:
     """The address of a Ray cluster of two nodes of one core each."""
     if find_spec("hydra_plugins.hydra_ray_launcher") is None:
         pytest.skip("pip install 'xrgs[ray]', which is large")
-    # The paths of Ray's sockets may have at most 107 bytes.
-    with tempfile.TemporaryDirectory(prefix="ray-") as folder, (tmp_path / "ray").open("w") as log:
+    with (tmp_path / "ray").open("w") as log:
         cluster = subprocess.Popen(
-            [sys.executable, "-c", RAY, folder],
+            [sys.executable, "-c", RAY],
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             stderr=log,
             text=True,
         )
-        assert cluster.stdin is not None
-        assert cluster.stdout is not None
-        lines = (line.strip() for line in cluster.stdout)
-        address = next((line for line in lines if line.startswith("127.0.0.1:")), "")
-        assert address, (tmp_path / "ray").read_text()
-        yield address
-        cluster.stdin.close()
-        assert cluster.wait(60) == 0
-        cluster.stdout.close()
+        with cluster:  # closes its pipes and waits for its end
+            assert cluster.stdout is not None
+            address = cluster.stdout.readline().strip()
+            assert ":" in address, (tmp_path / "ray").read_text()
+            yield address
 
 
 def wait_for(file: Path, process: subprocess.Popen[bytes]) -> str:
