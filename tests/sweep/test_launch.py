@@ -5,16 +5,17 @@ from __future__ import annotations
 import errno
 import pickle
 import shutil
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import hydra
 import pytest
 from hydra.core.plugins import Plugins
 from hydra.core.utils import JobReturn, JobStatus
 from hydra.types import HydraContext
-from omegaconf import DictConfig
+from omegaconf import DictConfig, OmegaConf
 
 from xrgs import config
 from xrgs.cli.arguments import with_quotes
@@ -25,7 +26,7 @@ from xrgs.safeio.atomic import write_json
 from xrgs.safeio.hashing import digest
 from xrgs.sweep import launch, locks
 from xrgs.sweep.axes import CellSpec
-from xrgs.sweep.jobs.job import UNKNOWN
+from xrgs.sweep.jobs.job import INTERRUPTED, UNKNOWN
 from xrgs.sweep.launch import LOST, Launches, capacity
 from xrgs.sweep.plan import PlannedCell
 from xrgs.sweep.session import SweepSession
@@ -66,6 +67,21 @@ def test_a_last_cell_has_the_machine_to_itself(composed: Callable[..., DictConfi
     allowed = capacity(composed("hydra/launcher=joblib").hydra.launcher, 0, machine=8)
     assert allowed.threads(1, machine=8) == 8
     assert allowed.threads(3, machine=8) == 2
+
+
+def test_a_ray_cluster_that_runs_already_is_given_no_size(monkeypatch: pytest.MonkeyPatch) -> None:
+    def settings(address: str | None) -> Mapping[str, Any]:
+        ray = {"init": {"address": address}, "remote": {}}
+        launcher = OmegaConf.create({"_target_": "hydra_plugins.x.RayLauncher", "ray": ray})
+        return capacity(launcher, 2, machine=8).settings
+
+    monkeypatch.delenv("RAY_ADDRESS", raising=False)
+    assert settings(None) == {"ray.remote.num_cpus": 2}
+    # Ray refuses a cluster's address together with a size, which the launcher would fill in.
+    joined = {"ray.remote.num_cpus": 2, "ray.init.object_store_memory": None}
+    assert settings("auto") == joined
+    monkeypatch.setenv("RAY_ADDRESS", "127.0.0.1:6379")
+    assert settings(None) == joined
 
 
 def test_no_jobs_at_all_are_refused(composed: Callable[..., DictConfig]) -> None:
@@ -120,12 +136,14 @@ class FakeLauncher:
             if self.fatal & set(pair):
                 raise RuntimeError("a worker was killed")
             for name in pair:
-                if {f"late {name}", f"raise {name}"}.isdisjoint(self.fatal):
+                if {f"{how} {name}" for how in ("late", "raise", "ask")}.isdisjoint(self.fatal):
                     finish(self.store, self.ids[name])
         return [self.answer(name) for name in names]
 
     def answer(self, name: str) -> JobReturn:
-        if f"late {name}" in self.fatal:
+        if f"ask {name}" in self.fatal:
+            return JobReturn(status=JobStatus.COMPLETED, _return_value=INTERRUPTED)
+        if {f"late {name}", f"mute {name}"} & self.fatal:
             return JobReturn(status=JobStatus.FAILED, _return_value=RuntimeError("timed out"))
         if f"raise {name}" in self.fatal:
             shutil.rmtree(self.store.cell(self.ids[name]).path)
@@ -195,6 +213,16 @@ def test_a_job_out_of_its_time_is_launched_again_and_another_s_failure_is_final(
     outcomes, fake = launch_cells("abc", {"late a", "raise b"})
     assert outcomes == {"a": "unfinished", "b": "failed", "c": "done"}
     assert fake.launches == [["a", "b", "c"], ["a"], ["a"]]
+
+
+def test_a_job_that_was_asked_to_end_is_not_launched_again_nor_one_whose_cell_is_done(
+    launch_cells: Callable[..., tuple[dict[str, str], FakeLauncher]],
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    outcomes, fake = launch_cells("abc", {"ask a", "mute b"})
+    assert outcomes == {"a": INTERRUPTED, "b": "done", "c": "done"}
+    assert fake.launches == [["a", "b", "c"]]
+    assert "its job was asked to end; the next sweep continues it" in capsys.readouterr().err
 
 
 def test_a_launcher_that_begins_nothing_ends_the_sweep_with_its_own_words(

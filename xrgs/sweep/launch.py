@@ -9,6 +9,7 @@ store: a launcher that breaks loses its answers, but not the sweep.
 from __future__ import annotations
 
 import copy
+import os
 import time
 from collections import Counter
 from dataclasses import dataclass, field
@@ -29,7 +30,7 @@ from xrgs.safeio.words import for_line
 from xrgs.splat.backend import resolve_backend
 from xrgs.sweep import locks, presence
 from xrgs.sweep.jobs import worker
-from xrgs.sweep.jobs.job import STOPPED, UNKNOWN
+from xrgs.sweep.jobs.job import INTERRUPTED, STOPPED, UNKNOWN
 from xrgs.sweep.plan import expected_length
 from xrgs.sweep.session import HandOver, SweepSession
 
@@ -113,7 +114,11 @@ def capacity(launcher: DictConfig, threads: int, machine: int) -> Capacity:
         return Capacity(cores=cores, settings={"cpus_per_task": cores})
     if kind == "RayLauncher":
         cores = max(1, int(launcher["ray"]["remote"].get("num_cpus", threads or 1)))
-        return Capacity(cores=cores, settings={"ray.remote.num_cpus": cores})
+        settings: dict[str, Any] = {"ray.remote.num_cpus": cores}
+        if launcher["ray"]["init"].get("address") or os.environ.get("RAY_ADDRESS"):
+            # The launcher would fill this in, and Ray refuses it for a cluster that runs already.
+            settings["ray.init.object_store_memory"] = None
+        return Capacity(cores=cores, settings=settings)
     return Capacity(cores=threads)
 
 
@@ -262,6 +267,10 @@ class Launches:
         overrides = [[f"cell={session.hand_over(job)}"] for job in jobs]
         first, self._jobs = self._jobs, self._jobs + len(cells)
         try:
+            if "submitit" in str(self._config.hydra.launcher["_target_"]):
+                from xrgs.sweep import submitit_jobs  # submitit is an extra
+
+                submitit_jobs.follow()
             launcher = Plugins.instance().instantiate_launcher(
                 hydra_context=self._context, task_function=self._task, config=self._config
             )
@@ -280,13 +289,19 @@ class Launches:
         submitit raises in a job that ran out of time, when it has been requeued often enough.
         """
         try:
-            return str(job.return_value)
+            answer = str(job.return_value)
         except Exception as error:
             log_line(f"{cell.name}: {_first_line(error)}")
+        else:
+            if answer == INTERRUPTED:
+                log_line(f"{cell.name}: its job was asked to end; the next sweep continues it")
+            return answer
         state = store.cell(str(cell.cell_id)).state().name
         if state == "unknown":
             return UNKNOWN
-        return self._after_silence(str(cell.cell_id), state) if state == "unfinished" else "failed"
+        if state == "unfinished":
+            return self._after_silence(str(cell.cell_id), state)
+        return "done" if state == "done" else "failed"
 
     def _after_silence(self, cell_id: str, state: str) -> str:
         """Return the outcome of a job that gave no answer, from the state it left its cell in."""

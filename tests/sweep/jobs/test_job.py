@@ -23,6 +23,7 @@ from xrgs.sweep.jobs import worker
 from xrgs.sweep.jobs.job import (
     FAIL_FAST,
     GONE,
+    INTERRUPTED,
     LOCKED,
     STOPPED,
     STORE_FULL,
@@ -371,6 +372,32 @@ def test_a_file_that_can_not_be_read_fails_no_cell(
     monkeypatch.setattr(worker, "run_in_child", train)
     assert run_job(session, cell_id) == UNKNOWN
     assert not (store.cell(cell_id).path / "error.txt").exists()
+    assert not session.stopped
+
+
+@pytest.mark.parametrize(("executor", "ends"), [("local", False), ("slurm", True)])
+def test_a_cell_that_is_asked_to_end_is_unfinished_and_slurm_decides_on_its_job(
+    session: SweepSession,
+    job_config: DictConfig,
+    store: Store,
+    hand_over_of: HandOverOf,
+    monkeypatch: pytest.MonkeyPatch,
+    executor: str,
+    ends: bool,
+) -> None:
+    def train(*_: object) -> None:
+        raise worker.InterruptedWorkError("its process was ended by SIGTERM")
+
+    monkeypatch.setattr(worker, "run_in_child", train)
+    monkeypatch.setenv("SUBMITIT_EXECUTOR", executor)
+    job_config.cell = session.hand_over(hand_over_of(fail_fast=True))
+    if ends:
+        with pytest.raises(SystemExit, match=str(os.EX_TEMPFAIL)):
+            command._run_job(job_config)
+    else:
+        assert command._run_job(job_config) == INTERRUPTED
+    assert store.cell(job_config.cell).state().name == "unfinished"
+    assert not list(store.locks.iterdir())
     assert not session.stopped
 
 

@@ -19,6 +19,7 @@ from xrgs.sweep.jobs import supervise, worker
 from xrgs.sweep.jobs.supervise import ProcessEnd
 from xrgs.sweep.jobs.worker import (
     AttemptLostError,
+    InterruptedWorkError,
     PassingError,
     UnwritableError,
     WorkerError,
@@ -61,6 +62,8 @@ def test_the_answer_of_the_child_is_returned(child: Callable[..., None]) -> None
         (ProcessEnd(-signal.SIGTERM, "it took too long"), None, WorkerError, "it took too long"),
         (ProcessEnd(os.EX_IOERR), None, UnwritableError, "is the disk full?"),
         (ProcessEnd(3), None, WorkerError, "ended with exit code 3 before it answered"),
+        (ProcessEnd(-signal.SIGTERM), None, InterruptedWorkError, "ended by SIGTERM$"),
+        (ProcessEnd(-signal.SIGUSR2), None, InterruptedWorkError, "ended by SIGUSR2$"),
         (ProcessEnd(-signal.SIGSEGV), None, WorkerError, "ended by SIGSEGV$"),
         (ProcessEnd(-signal.SIGKILL), None, WorkerError, r"ended by SIGKILL \(out of memory\?\)"),
     ],

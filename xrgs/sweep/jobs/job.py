@@ -25,9 +25,17 @@ if TYPE_CHECKING:
 #: Outcomes of a job beside the states of a cell. LOCKED: another sweep is training the cell.
 #: STOPPED: the sweep is over, or no further job may begin. UNWRITABLE: the store can't be written.
 #: GONE: the store is no longer there. UNKNOWN: a file can't be read now, and the cell was left.
+#: INTERRUPTED: a signal asked the cell's process to end, and the next sweep continues the cell.
 LOCKED, STOPPED, UNWRITABLE, GONE, UNKNOWN = "locked", "stopped", "unwritable", "gone", "unknown"
+INTERRUPTED = "interrupted"
 #: Reasons for which no further job of a sweep begins, see `SweepSession.stop`.
 FAIL_FAST, STORE_FULL = "fail_fast, and a cell failed", "the store can't be written"
+#: Outcomes of errors that are no fault of the cell: the next sweep trains it without `retry`.
+_NO_FAULT = {
+    worker.InterruptedWorkError: INTERRUPTED,
+    worker.UnwritableError: UNWRITABLE,
+    UnreadableError: UNKNOWN,
+}
 
 
 class _CellLeftError(XrgsError):
@@ -47,7 +55,7 @@ def run_job(session: SweepSession, cell_id: str) -> str:
         cell_id: The cell's id; the session's folder holds its config and identity.
 
     Returns:
-        The cell's state, or `LOCKED`, `STOPPED`, `UNWRITABLE`, `GONE` or `UNKNOWN`.
+        The cell's state, or `LOCKED`, `STOPPED`, `UNWRITABLE`, `GONE`, `UNKNOWN` or `INTERRUPTED`.
 
     Raises:
         XrgsError: The cell was not handed over by this sweep's plan, its code is not the planned
@@ -163,13 +171,10 @@ def _after_error(error: XrgsError, store: Store, folder: CellFolder, lock: locks
     # The cell is another process's now, though its own may have failed before.
     if isinstance(error, worker.AttemptLostError) or not lock.is_held():
         return _lost(folder)
-    # The first two are no fault of the cell, which the next sweep trains without `retry`.
-    if isinstance(error, worker.UnwritableError):
-        log_line(f"{folder.id} stopped: {error}")
-        return UNWRITABLE
-    if isinstance(error, UnreadableError):
-        log_line(f"{folder.id} is left: {error}")
-        return UNKNOWN
+    for kind, outcome in _NO_FAULT.items():
+        if isinstance(error, kind):
+            log_line(f"{folder.id} is left: {error}")
+            return outcome
     state = folder.state().name
     if state in {"done", "unknown"}:  # it may be finished although its process died at its exit
         return state

@@ -42,6 +42,10 @@ NOTHING_LOST = (
 _UNWRITABLE = frozenset({errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EIO})
 #: Errors that say nothing of the work, and may be gone when it is tried again.
 _PASSING = frozenset({errno.EACCES, errno.EPERM, errno.ESTALE, errno.ETIMEDOUT})
+#: Signals that ask a process to end: `scancel` and a cluster's time limits send them, and `kill`.
+_ASK_TO_END = frozenset(
+    {signal.SIGHUP, signal.SIGINT, signal.SIGTERM, signal.SIGUSR1, signal.SIGUSR2}
+)
 _NO_LIMITS = supervise.Limits()
 
 
@@ -51,6 +55,10 @@ class WorkerError(XrgsError):
 
 class AttemptLostError(WorkerError):
     """Another process has taken the cell over: what the child did is of no use to anybody."""
+
+
+class InterruptedWorkError(WorkerError):
+    """Somebody asked the child to end by a signal: nothing is known to be wrong with its work."""
 
 
 class UnwritableError(WorkerError):
@@ -81,6 +89,7 @@ def run_in_child(
 
     Raises:
         AttemptLostError: Another attempt at the cell has begun.
+        InterruptedWorkError: A signal asked the child to end.
         UnwritableError: The child could not write its files; nothing else is wrong with its work.
         PassingError: The child could not read a file now.
         WorkerError: The work failed; the message is the reason.
@@ -98,7 +107,7 @@ def run_in_child(
         if not answer_file.exists() and ended.code == os.EX_IOERR:
             raise UnwritableError(f"it could not write its answer to {folder}: is the disk full?")
         if not answer_file.exists():
-            raise WorkerError(_death(ended.code))
+            raise _death(ended.code)
         answer = read_object(answer_file)
     if answer.get("lost"):
         raise AttemptLostError(str(answer["error"]))
@@ -139,12 +148,13 @@ def unwritable(error: OSError) -> bool:
     return error.errno in _UNWRITABLE
 
 
-def _death(code: int) -> str:
+def _death(code: int) -> WorkerError:
     if code >= 0:
-        return f"its process ended with exit code {code} before it answered"
-    name = signal.Signals(-code).name
-    hint = " (out of memory?)" if -code == signal.SIGKILL else ""
-    return f"its process was ended by {name}{hint}"
+        return WorkerError(f"its process ended with exit code {code} before it answered")
+    number = signal.Signals(-code)
+    hint = " (out of memory?)" if number == signal.SIGKILL else ""
+    kind = InterruptedWorkError if number in _ASK_TO_END else WorkerError
+    return kind(f"its process was ended by {number.name}{hint}")
 
 
 def _build_variant(request: Mapping[str, Any]) -> dict[str, Any]:
