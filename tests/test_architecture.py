@@ -47,7 +47,7 @@ ONLY_IN = {
     "kornia": ("evaluation/metrics", "bench"),
     "gsplat": (),
     "tqdm": ("runtime/progress", "sweep/monitor"),
-    "av": ("viewer/film",),
+    "av": ("capture/scenes/video", "viewer/film"),
     "viser": ("viewer/live",),
     "tensorboard": ("sweep/track",),
     "mlflow": ("sweep/track",),

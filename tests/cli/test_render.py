@@ -18,7 +18,7 @@ RunCommand = Callable[..., tuple[int, str, str]]
     ("arguments", "message"),
     [
         (["path=orbit"], "give one cell or 2"),
-        (["abc"], "store=xrgs-store: there is no store"),
+        (["abc"], "store=xrgs-store is not a store"),
         (["abc", "size=504"], "size=504: must be WIDTHxHEIGHT, as 504x378"),
         (["abc", "views=many"], "views"),
         (["abc", "pth=orbit"], "pth"),

@@ -21,7 +21,7 @@ from xrgs.splat.ply import save_ply
     ("arguments", "message"),
     [
         (["port=8080"], "give one cell or 2"),
-        (["abc"], "store=xrgs-store: there is no store"),
+        (["abc"], "store=xrgs-store is not a store"),
         (["abc", "limit=0"], "limit=0: must be at least 1"),
         (["abc", "prot=1"], "prot"),
         (["gone.ply"], "gone.ply: cannot be read"),

@@ -148,12 +148,18 @@ def test_a_config_of_another_schema_is_named(store: Store) -> None:
 
 
 @pytest.mark.parametrize(
-    "identity", [{"variant": "../x", "train": {"views": "mixed"}}, {"variant": "v"}, {"train": 1}]
+    "identity",
+    [
+        {"variant": "../x", "seed": 0, "train": {"views": "mixed"}},
+        {"seed": 0, "train": {"views": "mixed"}},
+        {"variant": "v"},
+        {"train": 1},
+    ],
 )
 def test_a_variant_elsewhere_is_refused(store: Store, identity: dict[str, Any]) -> None:
     cell = finished(store, "abc")
     (cell.path / "identity.json").write_text(json.dumps(identity))
-    with pytest.raises(StoreError, match=r"identity\.json: it names no variant"):
+    with pytest.raises(StoreError, match=r"identity\.json: it names no (variant|train\.views)"):
         cell.dataset()
 
 

@@ -49,7 +49,7 @@ def report(store: Path, *names: str, pair: bool = True, drawn: bool = False) -> 
 
     Drawing takes most of the time of a report, so that only cases that change a picture draw.
     """
-    shows = ("consistency against baseline", "PSNR") if pair else ()
+    shows = ("consistency against baseline",) if pair else ()
     arguments = (f"store={store}", f"pictures={'all' if drawn else 'none'}")
     return Look("report", "report", arguments, names, shows, succeeds=pair)
 

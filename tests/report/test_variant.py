@@ -325,4 +325,4 @@ def test_what_a_failed_variant_says_is_not_obeyed(tmp_path: Path) -> None:
     (folder / "report.json").write_text(json.dumps(report))
     lines = inspect.describe(folder).split("\n")
     assert lines[0] == "x  [2J: failed, so there are no views"
-    assert lines[3:] == ["  recipe a b [2J:  ]0;t ", "  unreadable:  y"]
+    assert lines[2:] == ["  recipe a b [2J:  ]0;t ", "  unreadable:  y"]

@@ -41,9 +41,9 @@ def test_a_cell_is_found_by_the_beginning_of_its_id(store: Store) -> None:
 @pytest.mark.parametrize(
     ("word", "message"),
     [
-        ("ab", "ab: the ids of 3 cells begin so: abc1, abd2, abd3 in store="),
-        ("x", "x: no such cell in store="),
-        ("../abc1", "../abc1: no such cell in store="),
+        ("ab", "ab: several cells have such an id: abc1, abd2, abd3"),
+        ("x", "x: no cell has such an id"),
+        ("../abc1", "../abc1: no cell has such an id"),
         ("abd3", "abd3: it is failed and not done: out of memory"),
     ],
 )
@@ -56,7 +56,7 @@ def test_a_word_that_names_no_finished_cell_is_refused(
 
 
 def test_a_store_that_is_not_there_is_named(tmp_path: Path) -> None:
-    with pytest.raises(StoreError, match=r"gone: there is no store; name another with store="):
+    with pytest.raises(StoreError, match=r"gone is not a store"):
         models.find_cell("a", Store(tmp_path / "gone"))
 
 

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 
 from xrgs.capture import frozen, sealed
 from xrgs.errors import StoreError
-from xrgs.safeio.records import list_folder, read_object
+from xrgs.safeio.records import errors_named, read_object
 
 if TYPE_CHECKING:
     from xrgs.safeio.confined import ConfinedPath
@@ -44,7 +44,11 @@ def trimmed_variant(variants: ConfinedPath, key: str) -> str | None:
         StoreError: The folder of variants can't be listed.
     """
     start = f"{TRIMMED_PREFIX}{key}-"
-    names = [name for name in list_folder(variants) if name.startswith(start)]
+    with errors_named(variants):
+        try:
+            names = [name for name in variants.names() if name.startswith(start)]
+        except FileNotFoundError:  # of the folder, or of a store that is not there yet
+            return None
     return names[0].removeprefix(TRIMMED_PREFIX) if names else None
 
 

@@ -17,7 +17,6 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 from xrgs.errors import XrgsError
 from xrgs.experiment.cell_folder import READING_ERRORS
-from xrgs.experiment.results import cell_columns, cell_metrics
 from xrgs.runtime.progress import log_line, progress
 from xrgs.safeio.atomic import atomic_writer
 from xrgs.safeio.records import as_number, read_table
@@ -117,6 +116,8 @@ def run_of(cell: CellFolder, names: Mapping[str, Any]) -> Run:
         StoreError: A file can't be read; the message names it.
         ValueError: A value is not a number.
     """
+    from xrgs.experiment.results import cell_columns, cell_metrics  # pandas is slow to load
+
     points = _points(cell.folder / "history.csv", "history")
     if (cell.folder / "quality.csv").is_file():
         points += _points(cell.folder / "quality.csv", "quality")
