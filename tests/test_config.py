@@ -96,7 +96,8 @@ def test_only_the_splat_library_has_values_of_its_own() -> None:
     """Every other value has its one home in `conf/`."""
     defaults = {name for name, default in schema_keys(Conf()) if default not in (MISSING, {})}
     own = {f"splat.{group}.{entry.name}" for group in SETTINGS for entry in fields(SETTINGS[group])}
-    assert defaults == own
+    # Configs of cells from before this key are read too.
+    assert defaults == own | {"lpips.fetch"}
 
 
 @pytest.mark.parametrize("group", SETTINGS)

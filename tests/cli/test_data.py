@@ -26,7 +26,7 @@ XrgsData = Callable[..., tuple[int, str, str]]
         (["lpips", "to=x"], "to=: lpips takes only from="),
         (["inspect"], "inspect: give a variant's folder, or scene=NAME"),
         (["inspect", "folder", "scene=x"], "inspect: give a variant's folder, or scene=NAME"),
-        (["inspect", "scene=nope"], "scene/nope"),
+        (["inspect", "scene=nope"], "scene=nope"),
         (["inspect", "gone"], "gone"),
     ],
     ids=lambda value: " ".join(value) if isinstance(value, list) else "",

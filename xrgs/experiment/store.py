@@ -129,10 +129,16 @@ class Store:
         Raises:
             StoreError: As `prepare`.
         """
-        folder = self.path.absolute()
-        while not folder.exists() and not folder.is_symlink():
-            folder = folder.parent
-        self._write_nameless(folder)
+        home = self.path.absolute()
+        for folder in (home, *home.parents):
+            try:
+                (ConfinedPath(folder) / "cells").exists()
+            except RootMissingError:
+                continue
+            except OSError:  # what is wrong with it shows when it is written
+                pass
+            self._write_nameless(folder)
+            return
 
     def _write_nameless(self, folder: Path) -> None:
         """Write a file that has no name into a folder, and so leave nothing behind."""
