@@ -35,7 +35,7 @@ XrgsData = Callable[..., tuple[int, str, str]]
         (["lpips", "to=x"], "to=: lpips takes only from="),
         (["inspect"], "inspect: give a variant's folder, or scene=NAME"),
         (["inspect", "folder", "scene=x"], "inspect: give a variant's folder, or scene=NAME"),
-        (["inspect", "scene=nope"], "scene=nope: there is no such choice"),
+        (["inspect", "scene=nope"], "scene=nope"),
         (["inspect", "gone"], "gone"),
     ],
     ids=lambda value: " ".join(value) if isinstance(value, list) else "",

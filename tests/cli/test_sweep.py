@@ -291,9 +291,9 @@ def test_a_dry_run_plans_without_torch_and_writes_nothing(
     without_heavy: str,
 ) -> None:
     scene = photographs(tmp_path_factory.mktemp("scene"), 5)
-    arguments = ["+ablation=consistency,loss_weighting", "seed=0,1", "dry_run=true", "store=s"]
-    arguments += ["scene=folder", f"scene.path={scene}"]
-    code, _, err = run_command("sweep", tmp_path, *arguments, PYTHONPATH=without_heavy)
+    arguments = ("+ablation=consistency,loss_weighting", "seed=0,1", "dry_run=true", "store=s")
+    words = ("scene=folder", f"scene.path={scene}", *arguments)
+    code, _, err = run_command("sweep", tmp_path, *words, PYTHONPATH=without_heavy)
     assert code == 0, err
     assert "plan: 6 cells" in err
     assert err.count("variant not built") == 6

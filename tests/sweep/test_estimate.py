@@ -41,8 +41,10 @@ class Past:
         return name
 
     def identity(self, variant: str, steps: int, weight: float = 0.0) -> dict[str, Any]:
-        consistency = replace(self.conf.components.consistency, weight=weight)
-        parts = replace(self.conf.components, consistency=consistency)
+        parts = replace(
+            self.conf.components,
+            consistency=replace(self.conf.components.consistency, weight=weight),
+        )
         train = replace(self.conf.train, steps=steps)
         return cell_identity(replace(self.conf, train=train, components=parts), variant)
 
@@ -100,8 +102,9 @@ def test_a_new_variant_is_within_a_factor_of_1_5(past: Past, left_out: int) -> N
     sides = (200, 300, 400, 500)
 
     def truth(scene: int, weight: float) -> float:
-        size: float = (sides[scene] ** 2 / 6e4) ** 0.9
-        return 10 * own[scene] * size * (1.6 if weight else 1.0)
+        return (
+            10.0 * own[scene] * float((sides[scene] ** 2 / 6e4) ** 0.9) * (1.6 if weight else 1.0)
+        )
 
     variants = [past.variant(number, side) for number, side in enumerate(sides)]
     for scene, variant in enumerate(variants):

