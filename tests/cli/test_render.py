@@ -33,9 +33,10 @@ def test_bad_input_is_named(call_command: RunCommand, arguments: list[str], mess
 
 
 @pytest.mark.slow
-def test_frames_at_the_test_views_are_the_renders_that_were_scored(
+def test_a_frame_at_the_first_test_view_is_the_render_that_was_scored(
     run_command: RunCommand, store: Path
 ) -> None:
+    """The two views of this scene differ in intrinsics; a film has those of the first."""
     cells = Store(store).cells(verify=False).set_index("label")["cell_id"]
     for label, cell_id in cells.items():
         renders = sorted((store / "cells" / cell_id / "renders").iterdir())
@@ -46,11 +47,11 @@ def test_frames_at_the_test_views_are_the_renders_that_were_scored(
         assert code == 0, err
         assert out.startswith(f"{label}: {len(renders)} frames of ")
         frames = sorted((store.parent / str(label)).iterdir())
-        for frame, render in zip(frames, renders, strict=True):
-            found, expected = (np.asarray(Image.open(f)).astype(int) for f in (frame, render))
-            height, width = found.shape[:2]
-            assert np.abs(found - expected[:height, :width]).max() <= 1
-            assert (found == expected[:height, :width]).mean() > 0.999
+        assert len(frames) == len(renders)
+        found, expected = (np.asarray(Image.open(f[0])).astype(int) for f in (frames, renders))
+        height, width = found.shape[:2]
+        assert np.abs(found - expected[:height, :width]).max() <= 1
+        assert (found == expected[:height, :width]).mean() > 0.999
     code, out, err = run_command(
         "render", store.parent, *cells, "store=s", "views=3", "size=64x48", "out=both.mp4"
     )

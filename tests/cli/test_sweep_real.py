@@ -58,7 +58,7 @@ def test_a_second_run_trains_nothing(
     code, out, err = run_command("sweep", store.parent, "+ablation=consistency", *SMOKE, "store=s")
     assert code == 0, err
     assert "plan: 2 cells, 2 done" in err
-    assert "training" not in err
+    assert "training cell" not in err
     assert "consistency against baseline" in out
     assert contents(store / "cells") == before
 

@@ -1,7 +1,7 @@
 """Renders models along a path of cameras, side by side, into an MP4 film or PNG frames.
 
 The renderer is that of the evaluation protocol with the same settings, so that a frame at a test
-camera is the render that was scored.
+camera is the render that was scored, where that has the intrinsics of the first one.
 """
 
 from __future__ import annotations
