@@ -40,10 +40,19 @@ def not_ok(rows: list[dict[str, str]]) -> list[str]:
 
 
 @pytest.mark.slow
+@pytest.mark.exhaustive
 @pytest.mark.parametrize("theme", THEMES)
 def test_commands_withstand_every_hostile_store(theme: str, tmp_path: Path) -> None:
     rows = run(tmp_path, "--theme", theme)
     assert {row["case"] for row in rows} == set(THEMES[theme])
+    assert not not_ok(rows), "\n".join(not_ok(rows))
+
+
+@pytest.mark.slow
+def test_commands_withstand_a_store_of_each_theme(tmp_path: Path) -> None:
+    names = [f"{theme}/{next(iter(cases))}" for theme, cases in THEMES.items()]
+    rows = run(tmp_path, *(word for name in names for word in ("--case", name)))
+    assert {row["theme"] for row in rows} == set(THEMES)
     assert not not_ok(rows), "\n".join(not_ok(rows))
 
 

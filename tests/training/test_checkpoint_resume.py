@@ -134,7 +134,10 @@ def train_with_checkpoints(
     return train_cell(data, conf, written)
 
 
-@pytest.mark.parametrize("backend", ["native", pytest.param("torch", marks=pytest.mark.slow)])
+@pytest.mark.parametrize(
+    "backend",
+    ["native", pytest.param("torch", marks=[pytest.mark.slow, pytest.mark.exhaustive])],
+)
 @pytest.mark.parametrize("case", CASES)
 def test_a_killed_run_ends_as_one_never_killed(
     case: str,
