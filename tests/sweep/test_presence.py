@@ -24,7 +24,7 @@ if "xrgs.sweep.jobs.worker" in sys.orig_argv and "cell" in sys.orig_argv:
     import os, time, types
     from pathlib import Path
 
-    def run_cell(conf, variant, folder):
+    def run_cell(conf, variant, folder, stop):
         from xrgs.safeio.atomic import write_json
         (Path(os.environ["SWEEPS_OF"]) / "begun").touch()
         while True:
