@@ -53,8 +53,8 @@ Cells that are being trained, here or on another machine, are never touched.
 
 
 @dataclass
-class ListConf:
-    """Arguments of `xrgs-store list`."""
+class FilterConf:
+    """Which cells of which store are meant."""
 
     store: str = "xrgs-store"
     """The store's folder."""
@@ -63,19 +63,19 @@ class ListConf:
     states: str = ""
     older_days: float = 0.0
     larger_mb: float = 0.0
+
+
+@dataclass
+class ListConf(FilterConf):
+    """Arguments of `xrgs-store list`."""
+
     sort: str = "name"
 
 
 @dataclass
-class RemoveConf:
+class RemoveConf(FilterConf):
     """Arguments of `xrgs-store rm`."""
 
-    store: str = "xrgs-store"
-    scenes: str = ""
-    ablations: str = ""
-    states: str = ""
-    older_days: float = 0.0
-    larger_mb: float = 0.0
     dry_run: bool = False
     yes: bool = False
 
