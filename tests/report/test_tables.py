@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-from tests.report.test_writing import MORE_IS_BETTER
+from tests.evaluation.test_metrics import MORE_IS_BETTER
 from xrgs.evaluation.metrics import METRICS
 from xrgs.report.compare import compare
 from xrgs.report.context import Context

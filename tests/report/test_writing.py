@@ -5,6 +5,7 @@ from typing import Any
 
 import pytest
 
+from tests.evaluation.test_metrics import MORE_IS_BETTER
 from xrgs.evaluation.metrics import METRICS, Metric
 from xrgs.report.writing import (
     Change,
@@ -19,18 +20,6 @@ from xrgs.report.writing import (
 )
 
 BY_NAME = {metric.name: metric for metric in METRICS}
-#: Whether more of it is better, from the metrics' own papers and common sense, not from the code.
-MORE_IS_BETTER = {
-    "training_time_s": False,
-    "render_time_ms": False,
-    "gaussians": False,
-    "memory_bytes": False,
-    "peak_rss_bytes": False,
-    "lpips": False,
-    "ssim": True,
-    "psnr": True,
-    "evaluations": False,
-}
 
 
 def change(mean: float, low: float = math.nan, high: float = math.nan, **more: Any) -> Change:
