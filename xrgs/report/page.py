@@ -158,21 +158,7 @@ def build(
     try:
         if out:
             folder.make_root()
-        _refuse_links(folder / "figures")
-        (folder / "figures").make_folder()
-        runs = Runs.of(sweep, comparison.cells)
-        drawn = draw(store, comparison, sweep.views, runs.curves, folder / "figures", pictures)
-        _write_files(folder, sweep, tables, drawn, runs)
-        write_document(
-            folder / "report.html",
-            store,
-            sweep,
-            tables,
-            [*_all_tables(tables), *runs.tables(comparison.base), _provenance_table(sweep)],
-            runs.curves,
-            _warnings(sweep),
-            pictures=pictures is None or bool(pictures),
-        )
+        drawn = _write(folder, store, sweep, tables, pictures)
     except OSError as error:
         raise ReportError(
             f"the report can't be written to {folder}: {error.filename}: {error.strerror};"
@@ -181,6 +167,33 @@ def build(
     written = {p.file for p in drawn if p.file} | {folder / name for name in _FILES}
     text = f"{_text(tables, _warnings(sweep))}\n{for_line(f'Written to {folder}')}"
     return Report(text=text, folder=folder.path, files=tuple(sorted(file.path for file in written)))
+
+
+def _write(
+    folder: ConfinedPath,
+    store: JoinedStore,
+    sweep: Sweep,
+    tables: Tables,
+    pictures: Sequence[str] | None,
+) -> list[Picture]:
+    """Draw the pictures, and write them with all other files; return the pictures."""
+    _refuse_links(folder / "figures")
+    (folder / "figures").make_folder()
+    comparison = tables.comparison
+    runs = Runs.of(sweep, comparison.cells)
+    drawn = draw(store, comparison, sweep.views, runs.curves, folder / "figures", pictures)
+    _write_files(folder, sweep, tables, drawn, runs)
+    write_document(
+        folder / "report.html",
+        store,
+        sweep,
+        tables,
+        [*_all_tables(tables), *runs.tables(comparison.base), _provenance_table(sweep)],
+        runs.curves,
+        _warnings(sweep),
+        pictures=pictures is None or bool(pictures),
+    )
+    return drawn
 
 
 def _refuse_links(folder: ConfinedPath) -> None:

@@ -102,9 +102,9 @@ def draw(
         both = _same_views(psnr.get(pair["base_id"]), psnr.get(pair["cell_id"]))
         cell = cells.loc[pair["cell_id"]]
         split = "train" if cell["validation"] > 0 else "test"
-        photographs = store.variant(cell["variant_id"]) / "images" / split
+        variant = store.variant(cell["variant_id"])
         stem = f"{for_file_name(pair['scene'])}--{for_file_name(pair['label'])}"
-        drawings[stem] = partial(_views, store, pair, comparison.base, both, photographs)
+        drawings[stem] = partial(_views, store, pair, comparison.base, both, variant, split)
         if not store.external.keys() & {pair["base_id"], pair["cell_id"]}:
             drawings[f"{stem}--training"] = partial(_training, store, pair, comparison.base)
     first_ones = dict(islice(drawings.items(), _MAX_PICTURES))
@@ -220,7 +220,8 @@ def _views(
     pair: pd.Series,
     base: str,
     psnr: tuple[pd.Series, pd.Series],
-    photographs: ConfinedPath,
+    variant: ConfinedPath,
+    split: str,
     file: ConfinedPath,
 ) -> Picture:
     if psnr[0].empty:
@@ -229,8 +230,8 @@ def _views(
     title = f"{_title(pair)}: view {view}, by change of PSNR the median of {len(psnr[0])}"
     name = f"{view}.png"
     try:
-        check_images(photographs.parent.parent.parent, photographs.parent.parent.name)
-        truth = _image(photographs / name)
+        check_images(variant.parent, variant.name)
+        truth = _image(variant / "images" / split / name)
         before = _image(store.render(pair["base_id"], view))
         ablation = _image(store.render(pair["cell_id"], view))
     except (ReportError, StoreError) as error:
