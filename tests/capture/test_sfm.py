@@ -6,6 +6,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+import pycolmap
 import pytest
 
 from xrgs.capture import images, scenes, sfm
@@ -131,3 +132,33 @@ def test_unrelated_images_give_an_empty_model(
     assert model.report["models"] == []
     assert model.report["registered"] == 0
     assert capfd.readouterr().err == ""
+
+
+def test_an_image_whose_camera_came_out_impossible_is_left_out_alone(
+    sfm_conf: SfmConf,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    """COLMAP's last adjustment of 16 tourists' photographs once ended with f = -29,911 px."""
+    options = pycolmap.SyntheticDatasetOptions()
+    options.num_rigs, options.num_frames_per_rig = 4, 1
+    model = pycolmap.synthesize_dataset(options)
+    files = sorted(image.name for image in model.images.values())
+    inputs = [sfm.SfmImage(file, file) for file in files]
+    for file in files:
+        (tmp_path / file).parent.mkdir(parents=True, exist_ok=True)
+        images.save(tmp_path / file, np.zeros((36, 48, 3), dtype=np.float32))
+    assert sfm.bogus_cameras(model, inputs) == {}
+    bad = model.find_image_with_name(files[2]).camera
+    bad.params = [-29911.0, *bad.params[1:]]
+    monkeypatch.setattr(sfm, "_map", lambda *_: [model])
+    (tmp_path / "database.db").touch()
+    made = sfm.reconstruct(inputs, tmp_path, tmp_path, sfm_conf)
+    assert sorted(made.viewmats) == sorted(made.lenses) == sorted(made.observed) == [0, 1, 3]
+    assert made.report["registered"] == 3
+    (line,) = (record.getMessage() for record in caplog.records)
+    assert line.startswith(f"SfM: {files[2]}: its camera came out as -29911")
+    assert line.endswith("; the image is left out")
+    given = replace(inputs[2], K=np.eye(3))
+    assert sfm.bogus_cameras(model, [given]) == {}, "known intrinsics are not judged"

@@ -121,7 +121,7 @@ def test_a_cancelled_job_of_slurm_is_its_own_cell_s_loss_and_the_next_sweep_cont
     done, left = (sweeps.cells()[seed] for seed in (0, 1))
     assert (done / "status.json").exists()
     assert not (left / "status.json").exists()
-    assert "unfinished" in out
+    assert "begun and not done yet" in out
     assert not list((tmp_path / "s" / "locks").iterdir())
     code, out, err = sweeps.run(*SMOKE, *SLURM, faults=False)
     assert code == 0, err

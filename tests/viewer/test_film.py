@@ -69,16 +69,19 @@ def test_two_models_are_side_by_side_with_their_names(model: MakeModel, tmp_path
         assert (half[:40] == 255).all(axis=-1).any(), "in white"
 
 
-def test_a_film_can_be_played_and_is_the_same_again(model: MakeModel, tmp_path: Path) -> None:
-    make_film([model()], tmp_path / "frames", views=5, size=(64, 48))
-    for name in ("a.mp4", "b.mp4"):
-        line = make_film([model()], tmp_path / name, views=5, size=(64, 48), fps=10)
-        assert line.endswith("5 frames of 64 x 48 px, 0.5 s")
-    assert (tmp_path / "a.mp4").read_bytes() == (tmp_path / "b.mp4").read_bytes()
+def test_frames_are_the_same_again_and_a_film_of_them_can_be_played(
+    model: MakeModel, tmp_path: Path
+) -> None:
+    """The bytes of two films of the same frames may differ: x264 reads memory it never wrote."""
+    for name in ("frames", "again"):
+        make_film([model()], tmp_path / name, views=5, size=(64, 48))
+    expected = pictures(tmp_path / "frames")
+    np.testing.assert_array_equal(pictures(tmp_path / "again"), expected)
+    line = make_film([model()], tmp_path / "a.mp4", views=5, size=(64, 48), fps=10)
+    assert line.endswith("5 frames of 64 x 48 px, 0.5 s")
     with av.open(str(tmp_path / "a.mp4")) as film:
         assert film.streams.video[0].average_rate == 10
         decoded = [frame.to_ndarray(format="rgb24") for frame in film.decode(video=0)]
-    expected = pictures(tmp_path / "frames")
     assert len(decoded) == len(expected) == 5
     for frame, picture in zip(decoded, expected, strict=True):
         assert np.abs(frame.astype(float) - picture).mean() < 6, "colours are halved in size"

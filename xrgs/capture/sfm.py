@@ -5,6 +5,7 @@ COLMAP's own log goes to files in the work folder; the user sees one progress ba
 
 from __future__ import annotations
 
+import logging
 import tempfile
 import zlib  # noqa: F401  pycolmap 4.2.1 corrupts the heap where it is imported before zlib
 from collections.abc import Iterator, Mapping, Sequence
@@ -20,9 +21,12 @@ from xrgs.capture import images
 from xrgs.capture.lens import Lens, lens_of_model
 from xrgs.runtime.machine import usable_cores
 from xrgs.runtime.progress import ProgressBar
+from xrgs.safeio.words import for_line
 
 if TYPE_CHECKING:
     from xrgs.config import SfmConf
+
+_log = logging.getLogger(__name__)
 
 #: The number of features in all images with which exhaustive matching takes minutes on two cores.
 _TOTAL_FEATURES = 100_000
@@ -146,7 +150,39 @@ def reconstruct(
         return Reconstruction({}, {}, no_points, no_points.astype(np.uint8), {}, report)
     largest = max(models, key=lambda m: (m.num_reg_images(), m.num_points3D()))
     index = {image.file: i for i, image in enumerate(sfm_images)}
+    for file, reason in bogus_cameras(largest, sfm_images).items():
+        del index[file]
+        _log.warning("SfM: %s", for_line(f"{file}: {reason}; the image is left out"))
     return to_numpy(largest, index, report)
+
+
+def bogus_cameras(model: Any, sfm_images: Sequence[SfmImage]) -> dict[str, str]:
+    """Find images whose camera can't be one, by COLMAP's own limits for its parameters.
+
+    COLMAP drops such images after every bundle adjustment but the last, so that a model may end
+    with a focal length below 0.
+
+    Args:
+        model: pycolmap's `Reconstruction`.
+        sfm_images: The images; the intrinsics of those with `K` are known, and are not judged.
+
+    Returns:
+        What is wrong with the camera, by the `file` of its image.
+    """
+    limits = pycolmap.IncrementalMapperOptions()
+    refined = {image.file for image in sfm_images if image.K is None}
+    found = {}
+    for image in model.images.values():
+        camera = model.cameras[image.camera_id]
+        if (
+            image.has_pose
+            and image.name in refined
+            and camera.has_bogus_params(
+                limits.min_focal_length_ratio, limits.max_focal_length_ratio, limits.max_extra_param
+            )
+        ):
+            found[image.name] = f"its camera came out as {camera.params_to_string()}"
+    return found
 
 
 def _log_to(work: Path) -> None:
