@@ -187,6 +187,7 @@ def test_the_context_says_which_arm_differs(copied: Path) -> None:
     file.write_text(json.dumps(config))
     cell.finish(TEST_VIEWS, 1)
     text = html.unescape(build(copied, pictures=[]).folder.joinpath("report.html").read_text())
-    assert f"<td>0.1 (baseline, {HOSTILE}); 10.0 (consistency)</td>" in text
+    assert f"Gaussians above 0.1 (baseline, {HOSTILE}), 10 (consistency) times" in text
     assert "<td>1 HR (48 × 36 px); 2 LR (24 × 18 px); 2 test (48 × 36 px)</td>" in text
-    assert "fern has 2 scored views: its scores are of little weight." in text
+    caution = '<p class="warning">Caution: fern has 2 scored views: its scores say little of other'
+    assert caution in text

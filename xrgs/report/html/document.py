@@ -24,7 +24,7 @@ from xrgs.report.html.album import ERROR_RANGE
 from xrgs.report.html.content import LOG_SCALES, Content, finite, runs, shown, why
 from xrgs.report.html.figures import counterparts
 from xrgs.report.html.views import add_views
-from xrgs.report.render import TextTable, titled, to_latex, to_markdown
+from xrgs.report.render import TextTable, heads, titled, to_latex, to_markdown
 from xrgs.report.writing import number, signed
 from xrgs.runtime.machine import set_passive_openmp_wait
 from xrgs.safeio.atomic import write_text
@@ -88,11 +88,8 @@ def write_document(
         "commands": [shown(" ".join(("xrgs-sweep", *words))) for words in sweep.commands.values()],
         "base": shown(comparison.base),
         "answers": summary.answers(comparison),
-        "context": summary.context(store, sweep, comparison, variants),
-        "warnings": [
-            *map(shown, warnings),
-            *summary.cautions(comparison, sweep.views, variants),
-        ],
+        "context": summary.context(store, sweep, comparison, tables.contexts, variants),
+        "warnings": [shown(text) for text in (*warnings, *tables.cautions)],
     }
     write_text(file, _fitting(head, content, tables, [table for table in texts if table.rows]))
 
@@ -180,12 +177,13 @@ def _rendered(
 
 def _printable(table: TextTable) -> TextTable:
     """Return a table whose texts are lines of bounded length."""
+    notes = (table.context, *table.notes) if table.context else table.notes
     return TextTable(
         shown(table.title),
-        tuple(map(shown, table.columns)),
+        tuple(map(shown, heads(table))),
         tuple(tuple(map(shown, row)) for row in table.rows),
         table.align,
-        tuple(map(shown, table.notes)),
+        tuple(map(shown, notes)),
     )
 
 
