@@ -60,7 +60,9 @@ def test_what_differs_among_cells_is_listed(made: Any) -> None:
     assert "2 test views a scene" in text
 
 
-@pytest.mark.parametrize(("count", "said"), [(1, "1 scored view:"), (2, "2 scored views:"), (3, "")])
+@pytest.mark.parametrize(
+    ("count", "said"), [(1, "1 scored view:"), (2, "2 scored views:"), (3, "")]
+)
 def test_fewer_than_three_scored_views_are_cautioned(made: Any, count: int, said: str) -> None:
     cell = made.add()
     configured(cell)

@@ -4,8 +4,12 @@ from __future__ import annotations
 
 import unicodedata
 from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
 
 from xrgs.safeio.words import MAX_CELL, for_file_name, for_latex, for_line, for_markdown
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
 
 
 @dataclass(frozen=True)
@@ -63,13 +67,24 @@ def _padded(rows: list[tuple[str, ...]], align: str) -> tuple[list[list[str]], l
     return lines, sizes
 
 
+def filled_places(rows: Sequence[tuple[str, ...]]) -> list[int]:
+    """Return the places of the columns that have a text in any row.
+
+    Args:
+        rows: The rows of a table, each as long as the others.
+    """
+    return [place for place, texts in enumerate(zip(*rows, strict=True)) if any(texts)]
+
+
 def filled(table: TextTable) -> TextTable:
-    """Return a table without the columns that are empty in every row.
+    """Return a table without the columns that are empty in every row; as it is without rows.
 
     Args:
         table: The table, without `spans` and `best`, which name columns by their place.
     """
-    kept = [place for place, texts in enumerate(zip(*table.rows, strict=True)) if any(texts)]
+    if not table.rows:
+        return table
+    kept = filled_places(table.rows)
     return replace(
         table,
         columns=tuple(table.columns[place] for place in kept),

@@ -37,7 +37,7 @@ from xrgs.report.writing import (
 )
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from collections.abc import Mapping, Sequence
 
     from xrgs.evaluation.metrics import Metric
     from xrgs.report.compare import Comparison
@@ -182,19 +182,8 @@ class Tables:
         title = titled(f"{label} against {base}: {self._extent(label, condition)}", condition)
         if why := self.unchanged(label, condition):
             return TextTable(title, ("Result",), ((f"{label} {why}",),), "l")
-        left_out = (
-            f"{metric.label}: pairs left out ({row.why})"
-            for row, metric in found
-            if row.why and not math.isnan(row.change)
-        )
-        changes = [row for row, _ in found]
-        notes = (
-            *(ARROWS_NOTE, *agreement_note(changes), *left_out),
-            *(*self._interval_note(label, condition), *scatter_note(changes)),
-            *self._mean_notes([label], condition),
-        )
         # What holds of every row is said once.
-        alone = NO_INTERVAL if all(math.isnan(row.low) for row in changes) else ""
+        alone = NO_INTERVAL if all(math.isnan(row.low) for row, _ in found) else ""
         table = TextTable(
             title=title,
             columns=(
@@ -203,11 +192,27 @@ class Tables:
             ),
             rows=tuple(_mean_row(row, metric, scenes, alone) for row, metric in found),
             align="lrrrrrrrrrl",
-            notes=(*self._context(condition).cautions, *notes) if found else (),
+            notes=self._change_notes(found, label, condition) if found else (),
             context="; ".join(filter(None, (alone, self._context(condition).of_all))),
             name=f"{label} {condition}".strip(),
         )
         return filled(table)
+
+    def _change_notes(
+        self, found: Sequence[tuple[Change, Metric]], label: str, condition: str
+    ) -> tuple[str, ...]:
+        """Say what the columns of an ablation's table mean, and what its means leave out."""
+        changes = [row for row, _ in found]
+        left_out = (
+            f"{metric.label}: pairs left out ({row.why})"
+            for row, metric in found
+            if row.why and not math.isnan(row.change)
+        )
+        return (
+            *(*self._context(condition).cautions, ARROWS_NOTE, *agreement_note(changes), *left_out),
+            *(*self._interval_note(label, condition), *scatter_note(changes)),
+            *self._mean_notes([label], condition),
+        )
 
     def _extent(self, label: str, condition: str) -> str:
         """Say how many scenes and which replicates a mean is over."""

@@ -15,6 +15,7 @@ import pytest
 import torch
 from PIL import Image
 
+from tests.report.conftest import MadeStore
 from tests.report.html.conftest import HOSTILE, TEST_VIEWS, data_of, make_gaussians, page_of
 from xrgs.experiment.store import Store
 from xrgs.report import build
@@ -67,6 +68,37 @@ def test_everything_of_the_store_is_there(page: Path) -> None:
         *("test", "test"),
     ]
     assert data["notes"] == []
+
+
+def test_the_table_of_changes_has_no_column_that_is_empty_in_every_row(
+    made: MadeStore, page: Path
+) -> None:
+    assert _heads(page) == ["Ablation", "Metric", "Change, %", "baseline", "Value"]
+    for scene, factor in (("fern", 1.1), ("leaves", 1.3)):
+        made.add(scene=scene)
+        made.add("consistency", scene=scene, factors={"psnr": factor})
+    made.write()
+    several = build(made.store.path, pictures=[]).folder / "report.html"
+    assert _heads(several)[:5] == ["Ablation", "Scene", "Metric", "Change, %", "Reading"]
+    assert _heads(several)[7:] == ["From, %", "To, %", "Pairs that agree"]  # two values have no q
+    scenes = re.findall(r'data-scene="(.*?)"', page.read_text())
+    assert set(scenes) == {"fern"}  # the filter of scenes finds the only one
+
+
+def _heads(page: Path) -> list[str]:
+    """The heads of the table of all changes."""
+    table = page.read_text().partition('id="changes-table"')[2].partition("</thead>")[0]
+    return re.findall(r"<th(?: [^>]*)?>(.*?)</th>", table)
+
+
+def test_the_page_has_each_tables_context_and_headings(made: MadeStore) -> None:
+    for scene in ("fern", "leaves"):
+        made.add(scene=scene)
+        made.add("consistency", scene=scene)
+    made.write()
+    text = (build(made.store.path, pictures=[]).folder / "report.html").read_text()
+    assert re.search(r"<th[^>]*>leaves PSNR ↑</th>", text)
+    assert '<p class="note">2 test views a scene</p>' in text
 
 
 def test_nothing_of_the_store_is_markup(page: Path) -> None:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 from xrgs.report.html.content import shown
 from xrgs.report.render import titled
-from xrgs.report.writing import by_key, percent, reading, signed
+from xrgs.report.writing import arrow, by_key, reading, signed
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping
@@ -83,7 +83,7 @@ def _change(metric: Metric, row: Change) -> str:
     if math.isnan(row.change):
         return metric.label
     absolute = f" ({signed(row.difference)} dB)" if metric.unit == "dB" else ""
-    return f"{metric.label} {percent(row.change, metric)}{absolute}"
+    return f"{metric.label} {signed(row.change)} % {arrow(row.change, metric)}{absolute}"
 
 
 def _count(number: int, of: str) -> str:
