@@ -161,8 +161,8 @@ def _marked(
     ]
 
 
-#: A table of more columns is shrunk to the width of the page.
-_MAX_LATEX_COLUMNS = 8
+#: Shrinks a table that is wider than the text.
+_LATEX_FITTED = r"\resizebox{\ifdim\width>\linewidth\linewidth\else\width\fi}{!}{%"
 #: What a document needs for the tables of `to_latex`.
 LATEX_PREAMBLE = "% The document needs \\usepackage{booktabs} and \\usepackage{graphicx}.\n"
 
@@ -177,14 +177,13 @@ def to_latex(table: TextTable) -> str:
     lines = [" & ".join(row) + r" \\" for row in _marked(body, table.best, r"\textbf{{{}}}")]
     notes = [rf"\par\footnotesize {for_latex(note)}" for note in table.notes]
     caption = ". ".join(for_latex(text) for text in (table.title, table.context) if text)
-    wide = len(table.columns) > _MAX_LATEX_COLUMNS
     return "\n".join(
         [
             r"\begin{table}[htbp]",
             r"\centering",
             rf"\caption{{{caption}}}",
             rf"\label{{tab:{for_file_name(table.name or table.title)}}}",
-            *[r"\resizebox{\linewidth}{!}{%"] * wide,
+            _LATEX_FITTED,
             rf"\begin{{tabular}}{{{table.align}}}",
             r"\toprule",
             *_latex_spans(table),
@@ -192,7 +191,7 @@ def to_latex(table: TextTable) -> str:
             r"\midrule",
             *lines,
             r"\bottomrule",
-            r"\end{tabular}" + "}" * wide,
+            r"\end{tabular}}",
             *notes,
             r"\end{table}",
             "",

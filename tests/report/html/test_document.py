@@ -101,6 +101,17 @@ def test_the_page_has_each_tables_context_and_headings(made: MadeStore) -> None:
     assert '<p class="note">2 test views a scene</p>' in text
 
 
+@pytest.mark.parametrize("form", ["latex", "markdown", "csv"])
+def test_a_copy_of_some_changes_has_whole_rows(page: Path, form: str) -> None:
+    changes = data_of(page)["changes"][form]
+    rows = re.findall(r'data-label="(.*?)" data-scene=".*?" data-metric="(.*?)"', page.read_text())
+    assert len(rows) == len(changes["rows"]) == 18
+    for (label, metric), line in zip(rows, changes["rows"], strict=True):
+        assert metric in line
+        assert label in line or label != "consistency"
+    assert not any("PSNR" in line for line in changes["head"] + changes["foot"])
+
+
 def test_nothing_of_the_store_is_markup(page: Path) -> None:
     parsed = Parsed(page.read_text())
     assert [tag for tag, _ in parsed.tags].count("script") == 2

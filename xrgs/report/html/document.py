@@ -235,7 +235,7 @@ def _copies(table: TextTable) -> dict[str, str]:
 
 
 #: How many lines each form has before the first row of a table.
-_HEAD_LINES = {"latex": 7, "markdown": 4, "csv": 1}
+_HEAD_LINES = {"latex": 9, "markdown": 4, "csv": 1}
 
 
 def _lines(table: TextTable) -> dict[str, dict[str, list[str]]]:
