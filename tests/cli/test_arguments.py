@@ -23,7 +23,7 @@ from xrgs import config
 from xrgs.bench.settings import Settings
 from xrgs.capture import images
 from xrgs.capture.scenes import folder, motorcycle
-from xrgs.cli import bench, report, status, store
+from xrgs.cli import bench, data, report, status, store
 from xrgs.cli.arguments import dotlist, errors_as_messages, with_quotes
 from xrgs.cli.report import ReportConf
 from xrgs.cli.status import StatusConf
@@ -224,6 +224,15 @@ def test_bash_completes_arguments(
     words = done.stdout.split("'")[1].split()
     assert words == [f"{field.name}=" for field in fields(ReportConf)]
     assert done.stdout.split()[-1] == "xrgs-report"
+
+
+def test_the_commands_of_a_command_are_completed(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for module, wanted in ((store, {"gc", "rm", "of=", "yes="}), (data, {"download", "export"})):
+        monkeypatch.setattr(sys, "argv", ["xrgs", "--completion"])
+        module.main()
+        assert wanted <= set(capsys.readouterr().out.split("'")[1].split())
 
 
 def test_other_errors_are_not_hidden() -> None:

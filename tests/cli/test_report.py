@@ -6,10 +6,12 @@ import shutil
 import sys
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 from xrgs.cli import report
+from xrgs.experiment.store import Store
 
 RunCommand = Callable[..., tuple[int, str, str]]
 
@@ -24,6 +26,18 @@ def test_the_report_is_rebuilt_byte_for_byte(
     assert code == 0, err
     assert "consistency against baseline" in out
     assert contents(store / "reports") == before
+
+
+@pytest.mark.parametrize("words", [("list", "store={}"), ("store={}", "list")])
+def test_the_sweeps_are_listed_wherever_the_word_stands(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], words: Any
+) -> None:
+    store = Store(tmp_path)
+    store.prepare()
+    sweep = store.write_sweep(["+ablation=mip"], [])
+    monkeypatch.setattr(sys, "argv", ["xrgs-report", *(word.format(tmp_path) for word in words)])
+    report.main()
+    assert sweep in capsys.readouterr().out
 
 
 @pytest.mark.slow

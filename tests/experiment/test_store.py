@@ -27,6 +27,8 @@ def test_the_same_comparison_has_the_same_sweep_id(tmp_path: Path) -> None:
 def test_a_store_without_sweeps_says_so(tmp_path: Path) -> None:
     store = Store(tmp_path)
     store.prepare()
+    with pytest.raises(StoreError, match="is not a store; xrgs-sweep makes one"):
+        Store(tmp_path / "nothing").latest_sweep()
     with pytest.raises(StoreError, match="holds no sweep"):
         store.sweep_record()
 

@@ -4,6 +4,9 @@ from __future__ import annotations
 
 from typing import Any
 
+import pandas as pd
+import pytest
+
 from tests.report.conftest import VIEWS
 from xrgs.report.context import Context, contexts
 from xrgs.report.joined import JoinedStore
@@ -42,8 +45,8 @@ def test_it_names_what_a_reader_has_to_know(made: Any) -> None:
         "3,000 steps; HR views of at most 504 px; LR views 5 times smaller; 2 test views; "
         "Gaussians above 0.1 times the scene's scale are pruned"
     )
-    assert context.of_all == f"{context.of_scores}; a processor; 2 threads; torch backend"
-    assert context.cautions == ()
+    assert context.of_times == "a processor; 2 threads; torch backend"
+    assert context.of_all == f"{context.of_scores}; {context.of_times}"
 
 
 def test_what_differs_among_cells_is_listed(made: Any) -> None:
@@ -57,15 +60,34 @@ def test_what_differs_among_cells_is_listed(made: Any) -> None:
     assert "2 test views a scene" in text
 
 
-def test_one_test_view_and_views_that_were_trained_on_are_cautioned(made: Any) -> None:
+@pytest.mark.parametrize(
+    ("count", "said"), [(1, "1 scored view:"), (2, "2 scored views:"), (3, "")]
+)
+def test_fewer_than_three_scored_views_are_cautioned(made: Any, count: int, said: str) -> None:
     cell = made.add()
-    configured(cell, variant={"test_every": 0})
-    lines = (cell.path / "scores.csv").read_text().splitlines()
+    configured(cell)
     sweep = made.read()
-    views = sweep.views[sweep.views["view"] == lines[1].partition(",")[0]]
-    first, second = contexts(JoinedStore((made.store,)), sweep.cells, views)[""].cautions
-    assert "the scores of fern are of one test view" in first
-    assert "no view was held out" in second
+    views = pd.DataFrame({"cell_id": [cell.id] * count, "view": [f"v{n}" for n in range(count)]})
+    cautions = contexts(JoinedStore((made.store,)), sweep.cells, views)[""].cautions
+    wanted = f"Caution: fern has {said} its scores say little of other views"
+    assert cautions == ((wanted,) if said else ())
+
+
+@pytest.mark.parametrize(
+    ("changes", "cautioned"),
+    [
+        ({"variant": {"test_every": 0}}, True),
+        ({"variant": {"test_every": 0, "test": ["IMG_001"]}}, False),
+        ({"variant": {"test_every": 0}, "train": {"validation": 0.1}}, False),
+        ({}, False),
+    ],
+)
+def test_scores_of_views_that_were_trained_on_are_cautioned(
+    made: Any, changes: Any, cautioned: bool
+) -> None:
+    configured(made.add(), **changes)
+    text = " ".join(found(made)[""].cautions)
+    assert ("fern has no view held out (variant.test_every=0)" in text) == cautioned
 
 
 def test_a_mixture_that_was_not_made_is_said(made: Any) -> None:

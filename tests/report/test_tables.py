@@ -27,12 +27,43 @@ def test_psnr_has_decibels_beside_its_percentage(made: Any) -> None:
     made.add("consistency", factors={"psnr": 0.99})
     table = tables(made).mean("consistency", "")
     rows = {row[0]: row for row in table.rows}
-    assert rows["PSNR"] == (
-        "PSNR", "20.00 dB", "19.80 dB", "-1.00 ↓", "-0.20", "",
-        "1 of 1", "", "", "", "one replicate: no interval",
-    )  # fmt: skip
+    assert rows["PSNR"] == ("PSNR", "20.00 dB", "19.80 dB", "-1.00 ↓", "-0.20")
     assert rows["SSIM"][4] == ""
     assert table.title == "consistency against baseline: scene fern, seed 0"
+
+
+def test_one_replicate_has_no_empty_columns_and_says_once_why(made: Any) -> None:
+    made.add()
+    made.add("consistency", factors={"psnr": 0.99})
+    context = {"": Context(("3 steps",))}
+    table = Tables(tables(made).comparison, context).mean("consistency", "")
+    head = ("Metric", "baseline", "consistency", "change from baseline, %", "dB")
+    assert (table.columns, table.align) == (head, "lrrrr")
+    assert table.context == "one replicate: no interval; 3 steps"
+    assert not any("one replicate" in text for row in table.rows for text in row)
+    assert not any(note.startswith(("pairs that", "sd ")) for note in table.notes)
+
+
+def test_what_has_no_change_says_why_in_a_table_of_one_replicate(made: Any) -> None:
+    made.add(values={"gaussians": 0})
+    made.add("consistency")
+    table = tables(made).mean("consistency", "")
+    readings = {row[0]: row[-1] for row in table.rows}
+    assert table.columns[-1] == "reading"
+    assert readings["Gaussians"] == "n/a: compared with zero"
+    assert readings["PSNR"] == ""
+
+
+def test_a_second_replicate_brings_the_columns_back(made: Any) -> None:
+    for seed, factor in enumerate((1.5, 1.2)):
+        made.add(seed=seed)
+        made.add("consistency", seed=seed, factors={"gaussians": factor})
+    table = tables(made).mean("consistency", "")
+    assert table.columns[5:] == (
+        "95 % interval, %", "pairs that agree", "sd replicates, %", "reading",
+    )  # fmt: skip
+    assert table.context == ""
+    assert any(note.startswith("sd replicates") for note in table.notes)
 
 
 def test_failed_scenes_are_shown_as_failed(made: Any) -> None:
@@ -250,15 +281,17 @@ def test_q_and_its_star_stand_in_the_tables(made: Any) -> None:
     assert row["q"] == "0.030 *"
     assert row["reading"] == "better"
     assert row["sd scenes, %"] == "0.10"
-    assert row["sd replicates, %"] == ""
+    assert "sd replicates, %" not in row  # each scene has one
 
 
 def test_two_scenes_allow_no_verdict_and_no_star(made: Any) -> None:
     for scene, factor in (("fern", 1.5), ("room", 1.5001)):
         made.add(scene=scene)
         made.add("a", scene=scene, factors={"psnr": factor})
-    row = next(row for row in tables(made).mean("a", "").rows if row[0] == "PSNR")
-    assert row[-2:] == ("", "two values: no verdict")
+    table = tables(made).mean("a", "")
+    row = dict(zip(table.columns, next(r for r in table.rows if r[0] == "PSNR"), strict=True))
+    assert row["reading"] == "two values: no verdict"
+    assert "q" not in row
 
 
 def test_a_mean_over_fewer_scenes_is_marked(made: Any) -> None:
@@ -347,6 +380,7 @@ def test_every_table_with_arrows_has_their_legend_and_its_context(made: Any) -> 
         assert any("↑" in text for row in table.rows for text in row)
         assert ARROWS_NOTE in table.notes
         assert table.context == "3 steps; a machine"
+    assert "Caution: few" in built.overviews()[0].notes
     assert "Caution: few" in built.mean("plus", "").notes
     assert built.scores("").context == "3 steps"  # it has no times
     assert "Caution: few" in built.scores("").notes

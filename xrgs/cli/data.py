@@ -44,7 +44,7 @@ def main() -> None:
     values = dict(argument.split("=", 1) for argument in sys.argv[1:] if "=" in argument)
     answer_version("xrgs-data")
     if "--completion" in words:
-        say(completion("xrgs-data", ["download", "lpips", "inspect"]))
+        say(completion("xrgs-data", ["download", "lpips", "inspect", "export"]))
         return
     if not sys.argv[1:] or {"-h", "--help"} & set(words):
         say(_HELP.format(data=choices("data")).rstrip())

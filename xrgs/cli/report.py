@@ -72,10 +72,10 @@ class ListConf:
 def main() -> None:
     """Run `xrgs-report [KEY=VALUE]...` or `xrgs-report list [store=FOLDER]`."""
     with errors_as_messages("xrgs-report"):
-        if sys.argv[1:2] == ["list"]:
+        if "list" in sys.argv[1:]:
             from xrgs.sweep.inventory import list_sweeps
 
-            listed = parse(ListConf, _HELP, sys.argv[2:])
+            listed = parse(ListConf, _HELP, [word for word in sys.argv[1:] if word != "list"])
             say(list_sweeps(Path(listed.store)))
             return
         conf = parse(ReportConf, _HELP)

@@ -7,7 +7,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from xrgs.cli.arguments import answer, errors_as_messages, names_in, parse_with_words
+from xrgs.cli.arguments import (
+    answer,
+    completion,
+    errors_as_messages,
+    names_in,
+    parse_with_words,
+)
 from xrgs.errors import XrgsError
 from xrgs.experiment.store import Store
 from xrgs.runtime.signals import exit_on_signal
@@ -106,6 +112,10 @@ class StoreConf:
 
 def main() -> None:
     """Run `xrgs-store COMMAND [CELL]... [KEY=VALUE]...`."""
+    if "--completion" in sys.argv[1:]:
+        keys = dict.fromkeys(f"{key}=" for conf, _ in _COMMANDS.values() for key in vars(conf()))
+        say(completion("xrgs-store", [*_COMMANDS, *keys]))
+        return
     answer(ListConf, _HELP, sys.argv[1:] or ["--help"])
     command = sys.argv[1]
     with errors_as_messages("xrgs-store"):

@@ -321,8 +321,10 @@ class Store:
         A newer record that can't be read is named on stderr.
 
         Raises:
-            StoreError: The store has no record of a sweep, or none that can be read.
+            StoreError: There is no store, or it has no record of a sweep, or none that can be read.
         """
+        if not self.exists:
+            raise StoreError(f"store={self.path} is not a store; xrgs-sweep makes one")
         sweep_ids = self.sweep_ids()
         if not sweep_ids:
             raise StoreError(f"store={self.path} holds no sweep: run xrgs-sweep first")

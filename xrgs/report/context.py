@@ -1,7 +1,8 @@
 """What a table of one condition has to be read with: how its cells were trained and scored.
 
-It is read from the files of the cells, which anybody may have written: values are shown as they
-are, and a file that can't be read leaves out what it would have told.
+Text, Markdown, LaTeX and the page all have it from here. It is read from the files of the cells,
+which anybody may have written: values are shown as they are, and a file that can't be read leaves
+out what it would have told.
 """
 
 from __future__ import annotations
@@ -23,10 +24,11 @@ if TYPE_CHECKING:
 #: Keys of a cell's config that the context names.
 _KEYS = (
     *("train.steps", "train.validation", "variant.long_side", "variant.factor"),
-    *("variant.degradation", "variant.tags", "variant.test_every", "splat.densify.prune_scale3d"),
+    *("variant.degradation", "variant.tags", "variant.test_every", "variant.test"),
+    "splat.densify.prune_scale3d",
 )
-#: Scores of so few views say little: one more view may turn their order.
-_FEW_VIEWS = 1
+#: Scores of fewer views than these say little: one more view may turn their order.
+_ENOUGH_VIEWS = 3
 #: The longest value of a config, a processor's name or a list that is shown, in characters.
 _MAX_SHOWN = 120
 
@@ -46,6 +48,11 @@ class Context:
     def of_scores(self) -> str:
         """The context of a table without times; empty where nothing is known."""
         return "; ".join(self.training)
+
+    @property
+    def of_times(self) -> str:
+        """What times depend on beside the training; empty where nothing is known."""
+        return "; ".join(self.machine)
 
     @property
     def of_all(self) -> str:
@@ -77,7 +84,7 @@ def contexts(store: JoinedStore, cells: pd.DataFrame, views: pd.DataFrame) -> di
         found[str(condition)] = Context(
             (*_training(settings, tests), *_prune_rule(rows["label"], settings)),
             _machine(settings),
-            _cautions(settings, tests),
+            _cautions(rows["scene"], settings, tests),
         )
     return {name: found.get(name, Context()) for name in cells["condition"].unique()}
 
@@ -156,18 +163,30 @@ def _machine(settings: Sequence[Mapping[str, Any]]) -> tuple[str, ...]:
     return tuple(phrase for phrase in phrases if phrase)
 
 
-def _cautions(settings: Sequence[Mapping[str, Any]], tests: Mapping[str, int]) -> tuple[str, ...]:
+def _cautions(
+    scenes: Iterable[str], settings: Sequence[Mapping[str, Any]], tests: Mapping[str, int]
+) -> tuple[str, ...]:
     """Return sentences on scores of too few views, and of views that were trained on."""
-    few = [scene for scene, count in tests.items() if count <= _FEW_VIEWS]
-    cautions = []
-    if few:
-        cautions.append(
-            f"Caution: the scores of {', '.join(few)} are of one test view, which says little of"
-            " other views"
-        )
-    if "0" in _distinct(settings, "variant.test_every"):
-        cautions.append(
-            "Caution: no view was held out (variant.test_every=0); the scores are of views that"
-            " were trained on"
-        )
-    return tuple(for_line(text, 2 * _MAX_SHOWN) for text in cautions)
+    few = [
+        f"{scene} has {count} scored view{'s' * (count != 1)}: its scores say little of other views"
+        for scene, count in tests.items()
+        if count < _ENOUGH_VIEWS
+    ]
+    trained_on = [
+        f"{scene} has no view held out (variant.test_every=0): its scores are of views that were"
+        " trained on"
+        for scene, one in zip(scenes, settings, strict=True)
+        if not _holds_out(one)
+    ]
+    return tuple(
+        for_line(f"Caution: {text}", 2 * _MAX_SHOWN) for text in dict.fromkeys((*few, *trained_on))
+    )
+
+
+def _holds_out(settings: Mapping[str, Any]) -> bool:
+    """Return whether a cell is scored on views that it was not trained on, as far as is known."""
+    return bool(
+        settings.get("variant.test_every", 1)
+        or settings.get("variant.test")
+        or settings.get("train.validation")
+    )

@@ -6,11 +6,11 @@ import math
 from typing import TYPE_CHECKING
 
 from xrgs.report.inference import ALL_HR
-from xrgs.report.render import TextTable, titled
+from xrgs.report.render import TextTable, filled, titled
 from xrgs.report.writing import (
-    AGREEMENT_NOTE,
     LACKING_NOTE,
     agreement,
+    agreement_note,
     by_key,
     interval,
     interval_note,
@@ -63,17 +63,18 @@ def _table(
         " on the originals of the degraded photographs"
     )
     notes = (
-        *(what, *_left_out(comparison, condition, labels, per_scene), AGREEMENT_NOTE),
+        *(what, *_left_out(comparison, condition, labels, per_scene), *agreement_note(here)),
         *interval_note(here, one_each=_one_replicate(comparison, condition)),
         *[LACKING_NOTE] * any(lacking(row, len(scenes)) for row in here),
     )
-    return TextTable(
+    table = TextTable(
         title=titled(f"Share of the gap from {base} to {ALL_HR} that is closed, %", condition),
         columns=("Ablation", "Metric", *scenes, "mean", "95 % interval, %", "pairs that agree"),
         rows=tuple(rows),
         align="ll" + "r" * (len(scenes) + 3),
         notes=notes,
     )
+    return filled(table)
 
 
 def _left_out(

@@ -3,9 +3,13 @@
 from __future__ import annotations
 
 import unicodedata
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
 
 from xrgs.safeio.words import MAX_CELL, for_file_name, for_latex, for_line, for_markdown
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
 
 
 @dataclass(frozen=True)
@@ -63,13 +67,47 @@ def _padded(rows: list[tuple[str, ...]], align: str) -> tuple[list[list[str]], l
     return lines, sizes
 
 
+def filled_places(rows: Sequence[tuple[str, ...]]) -> list[int]:
+    """Return the places of the columns that have a text in any row.
+
+    Args:
+        rows: The rows of a table, each as long as the others.
+    """
+    return [place for place, texts in enumerate(zip(*rows, strict=True)) if any(texts)]
+
+
+def filled(table: TextTable) -> TextTable:
+    """Return a table without the columns that are empty in every row; as it is without rows.
+
+    Args:
+        table: The table, without `spans` and `best`, which name columns by their place.
+    """
+    if not table.rows:
+        return table
+    kept = filled_places(table.rows)
+    return replace(
+        table,
+        columns=tuple(table.columns[place] for place in kept),
+        rows=tuple(tuple(row[place] for place in kept) for row in table.rows),
+        align="".join(table.align[place] for place in kept),
+    )
+
+
+def heads(table: TextTable) -> tuple[str, ...]:
+    """Return the heads of the columns, each after the heading over it.
+
+    Args:
+        table: The table.
+    """
+    if not table.spans:
+        return table.columns
+    above = [head for head, columns in table.spans for _ in range(columns)]
+    return tuple(f"{head} {own}".strip() for head, own in zip(above, table.columns, strict=True))
+
+
 def _rows(table: TextTable) -> list[tuple[str, ...]]:
     """Return the heads of the columns and the rows, in cells of one line of bounded length."""
-    above = [head for head, columns in table.spans for _ in range(columns)] or [""] * len(
-        table.columns
-    )
-    heads = tuple(f"{head} {own}" for head, own in zip(above, table.columns, strict=True))
-    return [_cells(row) for row in (heads, *table.rows)]
+    return [_cells(row) for row in (heads(table), *table.rows)]
 
 
 def _cells(row: tuple[str, ...]) -> tuple[str, ...]:
@@ -98,8 +136,8 @@ def to_markdown(table: TextTable) -> str:
     Args:
         table: The table.
     """
-    heads, *body = (tuple(map(for_markdown, row)) for row in _rows(table))
-    rows = [heads, *_marked(body, table.best, "**{}**")]
+    head, *body = (tuple(map(for_markdown, row)) for row in _rows(table))
+    rows = [head, *_marked(body, table.best, "**{}**")]
     lines, sizes = _padded(rows, table.align)
     rule = [
         "-" * (size - 1) + (":" if side == "r" else "-")
@@ -123,8 +161,8 @@ def _marked(
     ]
 
 
-#: A table of more columns is shrunk to the width of the page.
-_MAX_LATEX_COLUMNS = 8
+#: Shrinks a table that is wider than the text.
+_LATEX_FITTED = r"\resizebox{\ifdim\width>\linewidth\linewidth\else\width\fi}{!}{%"
 #: What a document needs for the tables of `to_latex`.
 LATEX_PREAMBLE = "% The document needs \\usepackage{booktabs} and \\usepackage{graphicx}.\n"
 
@@ -135,26 +173,25 @@ def to_latex(table: TextTable) -> str:
     Args:
         table: The table.
     """
-    heads, *body = (tuple(map(for_latex, _cells(row))) for row in (table.columns, *table.rows))
+    head, *body = (tuple(map(for_latex, _cells(row))) for row in (table.columns, *table.rows))
     lines = [" & ".join(row) + r" \\" for row in _marked(body, table.best, r"\textbf{{{}}}")]
     notes = [rf"\par\footnotesize {for_latex(note)}" for note in table.notes]
     caption = ". ".join(for_latex(text) for text in (table.title, table.context) if text)
-    wide = len(table.columns) > _MAX_LATEX_COLUMNS
     return "\n".join(
         [
             r"\begin{table}[htbp]",
             r"\centering",
             rf"\caption{{{caption}}}",
             rf"\label{{tab:{for_file_name(table.name or table.title)}}}",
-            *[r"\resizebox{\linewidth}{!}{%"] * wide,
+            _LATEX_FITTED,
             rf"\begin{{tabular}}{{{table.align}}}",
             r"\toprule",
             *_latex_spans(table),
-            " & ".join(heads) + r" \\",
+            " & ".join(head) + r" \\",
             r"\midrule",
             *lines,
             r"\bottomrule",
-            r"\end{tabular}" + "}" * wide,
+            r"\end{tabular}}",
             *notes,
             r"\end{table}",
             "",

@@ -11,15 +11,15 @@ import pandas as pd
 
 from xrgs.report.compare import is_amount
 from xrgs.report.context import Context
-from xrgs.report.render import TextTable, titled
+from xrgs.report.render import TextTable, filled, titled
 from xrgs.report.writing import (
-    AGREEMENT_NOTE,
     ARROWS_NOTE,
     LACKING_NOTE,
+    NO_INTERVAL,
     SAME,
-    SCATTER_NOTE,
     Change,
     agreement,
+    agreement_note,
     by_key,
     false_discovery,
     false_discovery_note,
@@ -32,11 +32,12 @@ from xrgs.report.writing import (
     reading,
     scale_note,
     scatter,
+    scatter_note,
     signed,
 )
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from collections.abc import Mapping, Sequence
 
     from xrgs.evaluation.metrics import Metric
     from xrgs.report.compare import Comparison
@@ -66,10 +67,15 @@ class Tables:
         self, comparison: Comparison, contexts: Mapping[str, Context] | None = None
     ) -> None:
         self.comparison = comparison
-        self._contexts = contexts or {}
+        self.contexts = contexts or {}
+
+    @property
+    def cautions(self) -> tuple[str, ...]:
+        """What is cautioned of any condition, each sentence once."""
+        return tuple(dict.fromkeys(text for one in self.contexts.values() for text in one.cautions))
 
     def _context(self, condition: str) -> Context:
-        return self._contexts.get(condition, Context())
+        return self.contexts.get(condition, Context())
 
     @cached_property
     def _means(self) -> dict[tuple[str, ...], Change]:
@@ -117,7 +123,10 @@ class Tables:
             columns=("Metric", *(f"{name} vs {base}" for name in labels)),
             rows=rows,
             align="l" + "r" * len(labels),
-            notes=(ARROWS_NOTE, *without_effect, *self._mean_notes(labels, condition)),
+            notes=(
+                *(*self._context(condition).cautions, ARROWS_NOTE, *without_effect),
+                *self._mean_notes(labels, condition),
+            ),
             context=self._context(condition).of_all,
             name=f"overview {condition}".strip(),
         )
@@ -173,26 +182,36 @@ class Tables:
         title = titled(f"{label} against {base}: {self._extent(label, condition)}", condition)
         if why := self.unchanged(label, condition):
             return TextTable(title, ("Result",), ((f"{label} {why}",),), "l")
-        left_out = (
-            f"{metric.label}: pairs left out ({row.why})"
-            for row, metric in found
-            if row.why and not math.isnan(row.change)
-        )
-        notes = (
-            *(ARROWS_NOTE, AGREEMENT_NOTE, *left_out, *self._interval_note(label, condition)),
-            *(SCATTER_NOTE, *self._mean_notes([label], condition)),
-        )
-        return TextTable(
+        # What holds of every row is said once.
+        alone = NO_INTERVAL if all(math.isnan(row.low) for row, _ in found) else ""
+        table = TextTable(
             title=title,
             columns=(
                 *("Metric", base, label, f"change from {base}, %", "dB", "95 % interval, %"),
                 *("pairs that agree", "sd replicates, %", "sd scenes, %", "q", "reading"),
             ),
-            rows=tuple(_mean_row(row, metric, scenes) for row, metric in found),
+            rows=tuple(_mean_row(row, metric, scenes, alone) for row, metric in found),
             align="lrrrrrrrrrl",
-            notes=(*self._context(condition).cautions, *notes) if found else (),
-            context=self._context(condition).of_all,
+            notes=self._change_notes(found, label, condition) if found else (),
+            context="; ".join(filter(None, (alone, self._context(condition).of_all))),
             name=f"{label} {condition}".strip(),
+        )
+        return filled(table)
+
+    def _change_notes(
+        self, found: Sequence[tuple[Change, Metric]], label: str, condition: str
+    ) -> tuple[str, ...]:
+        """Say what the columns of an ablation's table mean, and what its means leave out."""
+        changes = [row for row, _ in found]
+        left_out = (
+            f"{metric.label}: pairs left out ({row.why})"
+            for row, metric in found
+            if row.why and not math.isnan(row.change)
+        )
+        return (
+            *(*self._context(condition).cautions, ARROWS_NOTE, *agreement_note(changes), *left_out),
+            *(*self._interval_note(label, condition), *scatter_note(changes)),
+            *self._mean_notes([label], condition),
         )
 
     def _extent(self, label: str, condition: str) -> str:
@@ -383,8 +402,12 @@ def _best(values: list[float], metric: Metric) -> list[int]:
     return [row for row, value in enumerate(values) if _score(value, metric) == best]
 
 
-def _mean_row(row: Change, metric: Metric, scenes: int) -> tuple[str, ...]:
-    """Return the row of a table of means that should be over so many scenes."""
+def _mean_row(row: Change, metric: Metric, scenes: int, said: str) -> tuple[str, ...]:
+    """Return the row of a table of means that should be over so many scenes.
+
+    A reading that is said above the table is left out.
+    """
+    read = reading(row, metric)
     return (
         metric.label,
         number(row.base, metric.unit),
@@ -396,7 +419,7 @@ def _mean_row(row: Change, metric: Metric, scenes: int) -> tuple[str, ...]:
         scatter(row.scatter_replicates),
         scatter(row.scatter_scenes),
         false_discovery(row),
-        reading(row, metric),
+        "" if read == said else read,
     )
 
 

@@ -18,12 +18,9 @@ if TYPE_CHECKING:
 
 #: An arrow means improvement or degradation, as in the paper's tables, not larger or smaller.
 BETTER, WORSE, SAME = "↑", "↓", "="
-AGREEMENT_NOTE = "pairs that agree: pairs of one scene and replicate that change as their mean does"
+#: What is said of a change without an interval.
+NO_INTERVAL = "one replicate: no interval"
 ARROWS_NOTE = f"{BETTER} improvement, {WORSE} degradation, {SAME} no change at this precision"
-SCATTER_NOTE = (
-    "sd replicates: standard deviation of the replicates, pooled within scenes; sd scenes: that of"
-    " the scenes' means"
-)
 LACKING_NOTE = "(k of n): a mean over k of the n scenes"
 _MARK = "*"
 #: Counts from this on are written in units of 10^6 or 10^9, as 17.9 G.
@@ -129,7 +126,7 @@ def reading(row: Change, metric: Metric) -> str:
     if math.isnan(row.change):
         return f"n/a: {row.why}"
     if math.isnan(row.low):
-        return "one replicate: no interval"
+        return NO_INTERVAL
     if row.n < MIN_VALUES:
         return "two values: no verdict"
     if row.low <= 0 <= row.high and row.low < row.high:
@@ -203,9 +200,34 @@ def agreement(row: Change) -> str:
     """Write how many of the pairs changed in the direction of their mean, `11 of 12`.
 
     Args:
-        row: The change with the numbers of its pairs.
+        row: The change with the numbers of its pairs; one pair agrees with itself, which is empty.
     """
-    return f"{row.agree} of {row.pairs}" if row.pairs else ""
+    return f"{row.agree} of {row.pairs}" if row.pairs > 1 else ""
+
+
+def agreement_note(rows: Iterable[Change]) -> tuple[str, ...]:
+    """Say what pairs that agree are; nothing where no row has several pairs.
+
+    Args:
+        rows: The changes in the table.
+    """
+    if not any(map(agreement, rows)):
+        return ()
+    return ("pairs that agree: pairs of one scene and replicate that change as their mean does",)
+
+
+def scatter_note(rows: Iterable[Change]) -> tuple[str, ...]:
+    """Say what the standard deviations of a table are over; nothing where there are none.
+
+    Args:
+        rows: The changes in the table.
+    """
+    if not any(scatter(row.scatter_replicates) or scatter(row.scatter_scenes) for row in rows):
+        return ()
+    return (
+        "sd replicates: standard deviation of the replicates, pooled within scenes; sd scenes: that"
+        " of the scenes' means",
+    )
 
 
 def interval_note(rows: Iterable[Change], *, one_each: bool) -> tuple[str, ...]:

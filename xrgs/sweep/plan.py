@@ -195,7 +195,7 @@ def describe(plan: Sequence[PlannedCell]) -> str:
         plan: All cells.
     """
     done = sum(cell.state.name == "done" for cell in plan)
-    lines = [f"plan: {len(plan)} cells, {done} done{_remaining(plan)}"]
+    lines = [f"plan: {len(plan)} cell{'s' * (len(plan) != 1)}, {done} done{_remaining(plan)}"]
     said = set[str]()
     for cell in plan:
         state, reason = _shown_state(cell)

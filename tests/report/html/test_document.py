@@ -15,6 +15,7 @@ import pytest
 import torch
 from PIL import Image
 
+from tests.report.conftest import MadeStore
 from tests.report.html.conftest import HOSTILE, TEST_VIEWS, data_of, make_gaussians, page_of
 from xrgs.experiment.store import Store
 from xrgs.report import build
@@ -67,6 +68,48 @@ def test_everything_of_the_store_is_there(page: Path) -> None:
         *("test", "test"),
     ]
     assert data["notes"] == []
+
+
+def test_the_table_of_changes_has_no_column_that_is_empty_in_every_row(
+    made: MadeStore, page: Path
+) -> None:
+    assert _heads(page) == ["Ablation", "Metric", "Change, %", "baseline", "Value"]
+    for scene, factor in (("fern", 1.1), ("leaves", 1.3)):
+        made.add(scene=scene)
+        made.add("consistency", scene=scene, factors={"psnr": factor})
+    made.write()
+    several = build(made.store.path, pictures=[]).folder / "report.html"
+    assert _heads(several)[:5] == ["Ablation", "Scene", "Metric", "Change, %", "Reading"]
+    assert _heads(several)[7:] == ["From, %", "To, %", "Pairs that agree"]  # two values have no q
+    scenes = re.findall(r'data-scene="(.*?)"', page.read_text())
+    assert set(scenes) == {"fern"}  # the filter of scenes finds the only one
+
+
+def _heads(page: Path) -> list[str]:
+    """The heads of the table of all changes."""
+    table = page.read_text().partition('id="changes-table"')[2].partition("</thead>")[0]
+    return re.findall(r"<th(?: [^>]*)?>(.*?)</th>", table)
+
+
+def test_the_page_has_each_tables_context_and_headings(made: MadeStore) -> None:
+    for scene in ("fern", "leaves"):
+        made.add(scene=scene)
+        made.add("consistency", scene=scene)
+    made.write()
+    text = (build(made.store.path, pictures=[]).folder / "report.html").read_text()
+    assert re.search(r"<th[^>]*>leaves PSNR ↑</th>", text)
+    assert '<p class="note">2 test views a scene</p>' in text
+
+
+@pytest.mark.parametrize("form", ["latex", "markdown", "csv"])
+def test_a_copy_of_some_changes_has_whole_rows(page: Path, form: str) -> None:
+    changes = data_of(page)["changes"][form]
+    rows = re.findall(r'data-label="(.*?)" data-scene=".*?" data-metric="(.*?)"', page.read_text())
+    assert len(rows) == len(changes["rows"]) == 18
+    for (label, metric), line in zip(rows, changes["rows"], strict=True):
+        assert metric in line
+        assert label in line or label != "consistency"
+    assert not any("PSNR" in line for line in changes["head"] + changes["foot"])
 
 
 def test_nothing_of_the_store_is_markup(page: Path) -> None:
@@ -187,6 +230,7 @@ def test_the_context_says_which_arm_differs(copied: Path) -> None:
     file.write_text(json.dumps(config))
     cell.finish(TEST_VIEWS, 1)
     text = html.unescape(build(copied, pictures=[]).folder.joinpath("report.html").read_text())
-    assert f"<td>0.1 (baseline, {HOSTILE}); 10.0 (consistency)</td>" in text
+    assert f"Gaussians above 0.1 (baseline, {HOSTILE}), 10 (consistency) times" in text
     assert "<td>1 HR (48 × 36 px); 2 LR (24 × 18 px); 2 test (48 × 36 px)</td>" in text
-    assert "fern has 2 scored views: its scores are of little weight." in text
+    caution = '<p class="warning">Caution: fern has 2 scored views: its scores say little of other'
+    assert caution in text

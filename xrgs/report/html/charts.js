@@ -11,9 +11,11 @@ const RULES = {
 };
 const OVER = { step: "step", seconds: "seconds of training", evaluations: "alpha evaluations" };
 
-// A number with three digits, or with as many as tell it from others that are `step` away.
-function brief(value, step) {
-  const [from, unit] = [[1e9, " G"], [1e6, " M"], [1e3, " k"]].find(([size]) => Math.abs(value) >= Math.max(size, 1e4)) ?? [1, ""];
+// A number with four digits, or with as many as tell it from others that are `step` away. Numbers up
+// to `most` have one unit.
+function brief(value, step, most = value) {
+  if (value === 0) return "0";
+  const [from, unit] = [[1e9, " G"], [1e6, " M"], [1e3, " k"]].find(([size]) => Math.abs(most) >= Math.max(size, 1e4)) ?? [1, ""];
   const digits = step ? Math.max(0, -Math.floor(Math.log10(step / from) + 1e-9)) : undefined;
   return `${step ? (value / from).toFixed(Math.min(digits, 6)) : Number((value / from).toPrecision(4))}${unit}`;
 }
@@ -24,7 +26,7 @@ function ticks(least, most) {
   const power = 10 ** Math.floor(Math.log10(rough));
   const step = [1, 2, 5, 10].map((by) => by * power).find((by) => by >= rough * 0.999);
   const found = [];
-  for (let value = Math.ceil(least / step) * step; value <= most + step * 1e-6; value += step) found.push([value, brief(value, step)]);
+  for (let value = Math.ceil(least / step) * step; value <= most + step * 1e-6; value += step) found.push([value, brief(value, step, Math.max(Math.abs(least), Math.abs(most)))]);
   return found;
 }
 

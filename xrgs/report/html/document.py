@@ -24,8 +24,16 @@ from xrgs.report.html.album import ERROR_RANGE
 from xrgs.report.html.content import LOG_SCALES, Content, finite, runs, shown, why
 from xrgs.report.html.figures import counterparts
 from xrgs.report.html.views import add_views
-from xrgs.report.render import TextTable, titled, to_latex, to_markdown
-from xrgs.report.writing import number, signed
+from xrgs.report.render import (
+    TextTable,
+    filled,
+    filled_places,
+    heads,
+    titled,
+    to_latex,
+    to_markdown,
+)
+from xrgs.report.writing import NO_INTERVAL, number, signed
 from xrgs.runtime.machine import set_passive_openmp_wait
 from xrgs.safeio.atomic import write_text
 from xrgs.safeio.words import for_csv
@@ -88,11 +96,8 @@ def write_document(
         "commands": [shown(" ".join(("xrgs-sweep", *words))) for words in sweep.commands.values()],
         "base": shown(comparison.base),
         "answers": summary.answers(comparison),
-        "context": summary.context(store, sweep, comparison, variants),
-        "warnings": [
-            *map(shown, warnings),
-            *summary.cautions(comparison, sweep.views, variants),
-        ],
+        "context": summary.context(store, sweep, comparison, tables.contexts, variants),
+        "warnings": [shown(text) for text in (*warnings, *tables.cautions)],
     }
     write_text(file, _fitting(head, content, tables, [table for table in texts if table.rows]))
 
@@ -153,8 +158,9 @@ def _rendered(
         lstrip_blocks=True,
     )
     environment.policies["json.dumps_kwargs"] = {"allow_nan": False, "separators": (",", ":")}
-    changes = [*_changes(long, len(tables.comparison.scenes))]
-    listed = _changes_table(changes, head["base"])
+    changes = [*_changes(long, tables.comparison.scenes)]
+    kept = filled_places([_texts(row) for row in changes])
+    listed = filled(_changes_table(changes, head["base"]))
     style, script = _source("page.css"), "\n".join(map(_source, _SCRIPTS))
     return environment.get_template("page.html.jinja").render(
         head,
@@ -162,7 +168,7 @@ def _rendered(
         style=style,
         script=script,
         tables=[_printable(table) for table in texts],
-        changes=changes,
+        changes=[row | {"cells": [row["cells"][place] for place in kept]} for row in changes],
         change_columns=[*zip(listed.columns, listed.align, strict=True)],
         notes=list(dict.fromkeys(content.notes)),
         figures=counterparts(content, tables.comparison),
@@ -180,12 +186,13 @@ def _rendered(
 
 def _printable(table: TextTable) -> TextTable:
     """Return a table whose texts are lines of bounded length."""
+    notes = (table.context, *table.notes) if table.context else table.notes
     return TextTable(
         shown(table.title),
-        tuple(map(shown, table.columns)),
+        tuple(map(shown, heads(table))),
         tuple(tuple(map(shown, row)) for row in table.rows),
         table.align,
-        tuple(map(shown, table.notes)),
+        tuple(map(shown, notes)),
     )
 
 
@@ -228,7 +235,7 @@ def _copies(table: TextTable) -> dict[str, str]:
 
 
 #: How many lines each form has before the first row of a table.
-_HEAD_LINES = {"latex": 7, "markdown": 4, "csv": 1}
+_HEAD_LINES = {"latex": 9, "markdown": 4, "csv": 1}
 
 
 def _lines(table: TextTable) -> dict[str, dict[str, list[str]]]:
@@ -251,25 +258,32 @@ _CHANGE_COLUMNS = {
 def _changes_table(rows: Sequence[dict[str, Any]], base: str) -> TextTable:
     """Return the table of all changes, whose texts are those of `_changes`."""
     columns = tuple(name.format(base=base) for name in _CHANGE_COLUMNS)
-    texts = tuple(tuple(text for text, _ in row["cells"]) for row in rows)
+    texts = tuple(map(_texts, rows))
     return TextTable(f"Changes from {base}", columns, texts, "".join(_CHANGE_COLUMNS.values()))
 
 
-def _changes(long: pd.DataFrame, scenes: int) -> Iterator[dict[str, Any]]:
-    """Yield the rows of the table of all changes, with the text and the number of each cell.
+def _texts(row: dict[str, Any]) -> tuple[str, ...]:
+    return tuple(text for text, _, _ in row["cells"])
+
+
+def _changes(long: pd.DataFrame, scenes: Sequence[str]) -> Iterator[dict[str, Any]]:
+    """Yield the rows of the table of all changes, with text, number and class of each cell.
 
     Args:
         long: The table `Tables.long`.
-        scenes: How many scenes there are; of one, its row would say what the mean says.
+        scenes: The scenes; of one, its rows would say what the means say, which stand for them.
     """
     metrics = {metric.name: metric for metric in METRICS}
+    only = scenes[0] if len(scenes) == 1 else ""
     for row in long.to_dict("records"):
-        if row["level"] == "scene" and scenes == 1:
+        if row["level"] == "scene" and only:
             continue
         metric, printed = metrics[row["metric"]], str(row["printed"]).strip()
-        label, scene = shown(row["label"]), shown(row["scene"])
+        label, scene = shown(row["label"]), shown(row["scene"] or only)
+        verdict = {"↑": "better", "↓": "worse"}.get(printed[-1:], "")
+        read = "" if row["reading"] == NO_INTERVAL else shown(row["reading"])
         numbers = [
-            (text, finite(row[name]))
+            (text, finite(row[name]), "")
             for name, text in (
                 ("base", number(row["base"], metric.unit)),
                 ("value", number(row["value"], metric.unit)),
@@ -282,15 +296,14 @@ def _changes(long: pd.DataFrame, scenes: int) -> Iterator[dict[str, Any]]:
             "label": label,
             "scene": scene,
             "metric": metric.label,
-            "verdict": {"↑": "better", "↓": "worse"}.get(printed[-1:], ""),
             "cells": [
-                (titled(label, shown(row["condition"])), None),
-                (scene or "mean", None),
-                (metric.label, None),
-                (printed, finite(row["change_percent"])),
-                (shown(row["reading"]), None),
+                (titled(label, shown(row["condition"])), None, ""),
+                ("" if only else scene or "mean", None, ""),
+                (metric.label, None, ""),
+                (printed, finite(row["change_percent"]), verdict),
+                (read, None, ""),
                 *numbers,
-                (f"{row['agree']} of {row['pairs']}" if row["pairs"] else "", None),
+                (f"{row['agree']} of {row['pairs']}" if row["pairs"] > 1 else "", None, ""),
             ],
         }
 

@@ -6,9 +6,9 @@ import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
-from xrgs.experiment.results import cell_columns
 from xrgs.report.html.content import shown
-from xrgs.report.writing import by_key, percent, reading, signed
+from xrgs.report.render import titled
+from xrgs.report.writing import arrow, by_key, reading, signed
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping
@@ -19,23 +19,12 @@ if TYPE_CHECKING:
     from xrgs.evaluation.metrics import Metric
     from xrgs.report.collect import Sweep
     from xrgs.report.compare import Comparison
+    from xrgs.report.context import Context
     from xrgs.report.joined import JoinedStore
     from xrgs.report.writing import Change
 
-#: Fewer test views than these in a scene are called few.
-_FEW_TEST_VIEWS = 3
-#: Keys of a cell's config that the context has, with what they are called there.
-_SETTINGS = {
-    "train.steps": "Steps",
-    "variant.long_side": "Longer side of HR views, px (0: the photographs')",
-    "variant.factor": "LR views are smaller by the factor",
-    "splat.densify.prune_scale3d": "Prune rule: largest scale that is kept, scene scales",
-}
 #: Entries of the provenance that the context has.
 _MADE_WITH = {
-    "cpu": "Processor",
-    "threads": "Threads",
-    "backend": "Backend",
     "arithmetic": "Arithmetic",
     "xrgs": "xrgs",
     "git": "Commit",
@@ -94,7 +83,7 @@ def _change(metric: Metric, row: Change) -> str:
     if math.isnan(row.change):
         return metric.label
     absolute = f" ({signed(row.difference)} dB)" if metric.unit == "dB" else ""
-    return f"{metric.label} {percent(row.change, metric)}{absolute}"
+    return f"{metric.label} {signed(row.change)} % {arrow(row.change, metric)}{absolute}"
 
 
 def _count(number: int, of: str) -> str:
@@ -102,14 +91,19 @@ def _count(number: int, of: str) -> str:
 
 
 def context(
-    store: JoinedStore, sweep: Sweep, comparison: Comparison, variants: Mapping[str, Variant]
+    store: JoinedStore,
+    sweep: Sweep,
+    comparison: Comparison,
+    contexts: Mapping[str, Context],
+    variants: Mapping[str, Variant],
 ) -> list[tuple[str, str]]:
     """Return what the numbers of the page were made with: names and values.
 
     Args:
-        store: The store with the cells' configs.
+        store: The store with the cells.
         sweep: The sweep.
         comparison: The comparison of its cells.
+        contexts: How the cells of each condition were trained and scored.
         variants: The variants of the cells that can be read, by their ids.
     """
     cells = comparison.cells
@@ -122,30 +116,18 @@ def context(
         ("Replicates (variant.seed/seed)", _listed(_replicates(replicates))),
         ("Cells", f"{len(done)} of {cells['cell_id'].nunique()} are done"),
     ]
-    configs = [cell_columns(store.cell(name).folder, {}) for name in done["cell_id"]]
-    for key, name in _SETTINGS.items():
-        rows.append(
-            (name, _by_label(done["label"], [config.get(key, "n/a") for config in configs]))
-        )
+    for condition, of in contexts.items():
+        rows.append((shown(titled("Training and scores", condition)), of.of_scores))
+        rows.append((shown(titled("Times", condition)), of.of_times))
     rows += [(shown(scene), text) for scene, text in _views(done, variants)]
     rows += [
         (name, _listed(sweep.provenance.get(key, ["n/a"]))) for key, name in _MADE_WITH.items()
     ]
-    return rows
+    return [(name, text) for name, text in rows if text]
 
 
 def _replicates(rows: pd.DataFrame) -> list[str]:
     return [f"{draw}/{seed}" for draw, seed in zip(rows["variant_seed"], rows["seed"], strict=True)]
-
-
-def _by_label(labels: Iterable[str], values: Iterable[Any]) -> str:
-    """List distinct values; where there are several, with the labels that have each."""
-    found: dict[str, list[str]] = {}
-    for label, value in zip(labels, values, strict=True):
-        found.setdefault(str(value), []).append(label)
-    if len(found) == 1:
-        return _listed(found)
-    return shown("; ".join(f"{value} ({_listed(of)})" for value, of in found.items()))
 
 
 def _listed(values: Iterable[Any]) -> str:
@@ -174,29 +156,3 @@ def _views(done: pd.DataFrame, variants: Mapping[str, Variant]) -> list[tuple[st
         )
         rows.append((f"Views of {scene}", text))
     return rows
-
-
-def cautions(
-    comparison: Comparison, views: pd.DataFrame, variants: Mapping[str, Variant]
-) -> list[str]:
-    """Return what a reader should know before trusting the scores.
-
-    Args:
-        comparison: The comparison.
-        views: The table `Sweep.views`.
-        variants: The variants of the cells that can be read, by their ids.
-    """
-    counts = views.groupby("cell_id").size()
-    scenes = comparison.cells.assign(views=comparison.cells["cell_id"].map(counts))
-    least = scenes.groupby("scene")["views"].min()
-    lines = [
-        f"{shown(scene)} has {_count(int(number), 'scored view')}: its scores are of little weight."
-        for scene, number in least.items()
-        if number < _FEW_TEST_VIEWS
-    ]
-    not_held_out = sorted({shown(v.scene) for v in variants.values() if not v.held_out})
-    lines += [
-        f"{scene} has too few views to hold any out: it is scored at the poses of training."
-        for scene in not_held_out
-    ]
-    return lines

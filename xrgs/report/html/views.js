@@ -175,7 +175,7 @@ function trainingPictures(entry) {
   const at = `training view ${entry.view}, ${entry.scene}`;
   const size = `${entry.size[0]} × ${entry.size[1]} px`;
   const found = [{ name: `${entry.tag} photograph`, caption: `as trained on, ${size}`, image: entry.photograph, coarse: entry.tag === "LR", alt: `${entry.tag} photograph, ${size}: ${at}` }];
-  if (entry.original !== null) found.push({ name: "original", caption: "before it was degraded; no method saw it", image: entry.original, alt: `The photograph before it was degraded: ${at}` });
+  if (entry.original !== null) found.push({ name: "original", caption: "before it was degraded; only all_hr trains on it", image: entry.original, alt: `The photograph before it was degraded: ${at}` });
   return [...found, ...entry.arms.map((arm) => ({ name: arm.label, label: arm.label, caption: "render", image: arm.image, alt: `Render by ${arm.label}: ${at}` }))];
 }
 
