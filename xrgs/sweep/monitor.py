@@ -11,7 +11,7 @@ import sys
 import threading
 import time
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from statistics import fmean
 from typing import TYPE_CHECKING, Any, Self
 
@@ -31,6 +31,8 @@ if TYPE_CHECKING:
 #: Seconds between two snapshots, at least; and the pause in multiples of the time that a snapshot
 #: takes, so that a slow store is not kept busy.
 _POLL_S, _PAUSE_FACTOR = 1.0, 20
+#: What a cell that took as long as was expected weighs beside those of a sweep.
+_CERTAIN = 0.2
 #: A log gets a line when a cell has ended, and after so many seconds without one.
 _LINE_S = 600.0
 #: A cell whose progress file has not changed for so many seconds is not running: its process died
@@ -248,6 +250,8 @@ class SweepMonitor:
             else:
                 in_other_sweep = cell.state.name == "running"
                 (elsewhere if in_other_sweep else running).append(self._running(cell, now))
+        slowness = self._slowness(running)
+        running = [replace(cell, slowness=slowness) for cell in running]
         paces = [cell.pace for cell in running if cell.pace]
         self._pace = fmean(paces) if paces else self._pace
         self._at_once = max(self._at_once, len(running))
@@ -259,18 +263,33 @@ class SweepMonitor:
             tuple(waiting),
             self._pace,
             self._at_once,
-            self._slowness,
+            slowness,
         )
 
-    @property
-    def _slowness(self) -> float:
-        return self._took / self._expected if self._expected else 1.0
+    def _slowness(self, running: Sequence[RunningCell]) -> float:
+        """Return how many times longer this sweep's cells take than was expected of them.
+
+        It is the ratio of both sums over the cells that are done and what is done of others,
+        together with a part of a cell that took as long as was expected: the first steps of a
+        cell, which has few Gaussians then, say little.
+        """
+        took, expected = self._took, self._expected
+        known = [cell.seconds for cell in self._plan if cell.seconds is not None]
+        for cell in running:
+            since, left = self._begun[str(cell.cell.cell_id)]
+            if cell.cell.seconds is not None:
+                took += time.monotonic() - since
+                expected += (cell.share - (1 - left)) * cell.cell.seconds
+        if not expected or not any(known):
+            return 1.0
+        certain = _CERTAIN * fmean(known)
+        return (took + certain) / (expected + certain)
 
     def _running(self, cell: PlannedCell, now: Progress) -> RunningCell:
         name = str(cell.cell_id)
         if now.unit == "step":
             self._steps[name] = now.done
-        running = RunningCell(cell, now, self._steps.get(name, 0), self._slowness)
+        running = RunningCell(cell, now, self._steps.get(name, 0))
         if cell.state.name != "running":
             self._begun.setdefault(name, (time.monotonic(), 1 - running.share))
         return running
