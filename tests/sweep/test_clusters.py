@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import os
+import secrets
 import shutil
 import socket
 import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack, contextmanager
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
@@ -41,18 +43,23 @@ if "xrgs.sweep.jobs.worker" in sys.orig_argv and "cell" in sys.orig_argv:
         (folder / "job.new").rename(folder / "job")
         time.sleep(600)
 """
-#: Two nodes of Ray, until standard input ends.
-RAY = """
-import sys
-from ray.cluster_utils import Cluster
+#: The same in every process of the nodes of Ray: a cell waits until another one has begun.
+RAY_SITE = """
+import os, sys, time
+from pathlib import Path
 
-head = {"num_cpus": 1, "include_dashboard": False}
-cluster = Cluster(True, head_node_args=head)
-cluster.add_node(num_cpus=1)
-print(cluster.address, flush=True)
-sys.stdin.read()
-cluster.shutdown()
+if "xrgs.sweep.jobs.worker" in sys.orig_argv and "cell" in sys.orig_argv:
+    end = time.monotonic() + 240
+    while len(list(Path({store!r}, "cells").glob("*/identity.json"))) < 2:
+        if time.monotonic() > end:
+            os._exit(3)
+        time.sleep(0.05)
 """
+#: Seconds that Ray may take for its nodes on a machine that does much else.
+RAY_S = 240
+#: Ports of a node of Ray. Where they are not given, its raylet waits for its agents to choose them,
+#: and ends itself when that takes longer than 15 s.
+PORTS = ("metrics-export", "dashboard-agent-grpc", "dashboard-agent-listen", "runtime-env-agent")
 
 
 @pytest.fixture(scope="module")
@@ -77,23 +84,67 @@ def slurm() -> Iterator[None]:
 
 
 @pytest.fixture
-def ray_address(tmp_path: Path) -> Iterator[str]:
-    """The address of a Ray cluster of two nodes of one core each."""
+def ray_address(
+    tmp_path: Path, sweeps_in: Callable[..., Any], monkeypatch: pytest.MonkeyPatch
+) -> Iterator[str]:
+    """The address of a Ray cluster of two nodes, each of which has one core for cells."""
     if find_spec("hydra_plugins.hydra_ray_launcher") is None:
         pytest.skip("pip install 'xrgs[ray]', which is large")
-    with (tmp_path / "ray").open("w") as log:
-        cluster = subprocess.Popen(
-            [sys.executable, "-c", RAY],
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-            stderr=log,
-            text=True,
+    monkeypatch.setenv("RAY_AUTH_MODE", "token")
+    monkeypatch.setenv("RAY_AUTH_TOKEN", secrets.token_hex(32))
+    (tmp_path / "sitecustomize.py").write_text(RAY_SITE.format(store=str(tmp_path / "s")))
+    path = os.pathsep.join(filter(None, [str(tmp_path), os.environ.get("PYTHONPATH", "")]))
+    changes = {"PYTHONPATH": path, "SWEEPS_OF": str(tmp_path / "ray")}
+    changes["RAY_worker_register_timeout_seconds"] = str(RAY_S)
+    ports = free_ports(1 + 2 * len(PORTS))
+    # The paths of its sockets may have at most 107 bytes.
+    with tempfile.TemporaryDirectory(prefix="xrgs-ray-") as folder, ExitStack() as nodes:
+        head = ("--head", f"--port={ports[0]}", "--include-dashboard=false", f"--temp-dir={folder}")
+        nodes.enter_context(ray_node(tmp_path / "head", head, ports[1::2], changes))
+        address = Path(folder, "ray_current_cluster").read_text().strip()
+        other = (f"--address={address}",)
+        nodes.enter_context(ray_node(tmp_path / "other", other, ports[2::2], changes))
+        yield address
+        nodes.close()
+        sweeps_in(tmp_path / "ray").leave_nothing_running()
+
+
+def free_ports(count: int) -> list[int]:
+    with ExitStack() as held:
+        free = [held.enter_context(socket.socket()) for _ in range(count)]
+        for each in free:
+            each.bind(("127.0.0.1", 0))
+        return [each.getsockname()[1] for each in free]
+
+
+@contextmanager
+def ray_node(
+    printed: Path, options: Sequence[str], ports: Sequence[int], changes: dict[str, str]
+) -> Iterator[None]:
+    """Start a node of Ray; at the end, end it and all processes of it."""
+    given = [f"--{name}-port={port}" for name, port in zip(PORTS, ports, strict=True)]
+    command = [sys.executable, "-m", "ray.scripts.scripts", "start", "--block", "--num-cpus=1"]
+    with printed.open("wb") as out:
+        node = subprocess.Popen(
+            [*command, "--disable-usage-stats", *options, *given],
+            env=os.environ | changes,
+            stdout=out,
+            stderr=out,
         )
-        with cluster:  # closes its pipes and waits for its end
-            assert cluster.stdout is not None
-            address = cluster.stdout.readline().strip()
-            assert ":" in address, (tmp_path / "ray").read_text()
-            yield address
+    try:
+        end = time.monotonic() + RAY_S
+        while "Ray runtime started." not in printed.read_text():
+            assert node.poll() is None, printed.read_text()
+            assert time.monotonic() < end, printed.read_text()
+            time.sleep(0.1)
+        yield
+    finally:
+        node.terminate()  # ends its processes before itself
+        try:
+            node.wait(60)
+        except subprocess.TimeoutExpired:
+            node.kill()  # Linux ends them with it
+            node.wait()
 
 
 def wait_for(file: Path, process: subprocess.Popen[bytes]) -> str:
@@ -142,7 +193,11 @@ def test_a_partition_that_slurm_does_not_have_ends_the_sweep_with_sbatch_s_words
 def test_the_nodes_of_a_ray_cluster_share_the_cells(
     tmp_path: Path, sweeps_in: Callable[..., Any], ray_address: str
 ) -> None:
+    """Each cell waits for the other one to begin, and a node has room for one."""
+    sweeps = sweeps_in(tmp_path)
     address = f"hydra.launcher.ray.init.address='{ray_address}'"
-    code, out, err = sweeps_in(tmp_path).run(*SMOKE, "hydra/launcher=ray", address)
+    code, out, err = sweeps.run(*SMOKE, "hydra/launcher=ray", address)
     assert code == 0, err
+    assert "hydra/launcher=ray: 2 cells, threads=1 each" in err
     assert "PSNR" in out
+    assert all((sweeps.cells()[seed] / "status.json").exists() for seed in (0, 1))

@@ -36,16 +36,21 @@ class Past:
         folder = self.store.variants / name
         folder.make_folder()
         view = {"name": "a", "split": "train", "tag": "HR", "width": side, "height": side}
-        write_json(folder / "variant.json", {"views": [view]})
+        test = view | {"name": "b", "split": "test"}
+        write_json(folder / "variant.json", {"views": [view, test]})
         write_json(folder / "report.json", {"points": 3000})
         return name
 
-    def identity(self, variant: str, steps: int, weight: float = 0.0) -> dict[str, Any]:
+    def identity(
+        self, variant: str, steps: int, weight: float = 0.0, budget: float = 0.0, every: int = 0
+    ) -> dict[str, Any]:
+        given = self.conf.components
         parts = replace(
-            self.conf.components,
-            consistency=replace(self.conf.components.consistency, weight=weight),
+            given,
+            consistency=replace(given.consistency, weight=weight),
+            natural_selection=replace(given.natural_selection, budget=budget),
         )
-        train = replace(self.conf.train, steps=steps)
+        train = replace(self.conf.train, steps=steps, evaluate_every=every)
         return cell_identity(replace(self.conf, train=train, components=parts), variant)
 
     def add(
@@ -56,12 +61,13 @@ class Past:
         threads: int = 1,
         rss: float = 1e9,
         disk: int = 1000,
+        gaussians: int = 100_000,
         overhead: float | None = None,
     ) -> None:
         folder = self.store.cell(f"cell{self.written:04d}").folder
         self.written += 1
         folder.make_folder()
-        summary = {"training_time_s": seconds, "peak_rss_bytes": rss}
+        summary = {"training_time_s": seconds, "peak_rss_bytes": rss, "gaussians": gaussians}
         started = datetime(2026, 1, 1, tzinfo=UTC)
         write_json(folder / "identity.json", identity)
         write_json(folder / "summary.json", summary)
@@ -78,7 +84,9 @@ def past(tmp_path: Path, compose: Callable[..., Conf]) -> Past:
 
 
 def cost(past: Past, identity: dict[str, Any], threads: int = 1) -> Any:
-    conf = replace(past.conf, train=replace(past.conf.train, steps=identity["train"]["steps"]))
+    steps, every = identity["train"]["steps"], identity["train"]["evaluate_every"]
+    train = replace(past.conf.train, steps=steps, evaluate_every=every)
+    conf = replace(past.conf, train=train)
     found = CostEstimator(past.store).cost(conf, identity["variant"], identity, threads)
     assert found is not None
     return found
@@ -122,6 +130,32 @@ def test_a_cell_on_more_threads_or_with_more_steps_is_scaled(past: Past) -> None
     one = cost(past, past.identity(variant, 1000)).training_s
     assert 0.5 < cost(past, past.identity(variant, 1000), threads=2).training_s / one < 0.7
     assert 2 < cost(past, past.identity(variant, 2000)).training_s / one < 2.4
+
+
+def test_a_budget_that_no_cell_had_limits_the_disk(past: Past) -> None:
+    """Files of 250 bytes for a Gaussian, in cells that a budget limited and in one that none did.
+
+    The views have 90,000 pixels.
+    """
+    variant = past.variant(0)
+    for budget, count in ((0.0, 160_000), (0.5, 45_000)):
+        identity = past.identity(variant, 100, budget=budget)
+        past.add(identity, 40.0, gaussians=count, disk=250 * count)
+    found = cost(past, past.identity(variant, 100, budget=0.2)).disk_bytes
+    assert found == pytest.approx(250 * 18_000, rel=0.2)
+    free = cost(past, past.identity(variant, 100, weight=1.0)).disk_bytes
+    assert free == pytest.approx(250 * 160_000, rel=0.2)
+
+
+def test_evaluations_amid_training_take_time_beside_it(past: Past) -> None:
+    variant = past.variant(0)
+    for _ in range(3):
+        past.add(past.identity(variant, 100), 40.0, overhead=5.0)
+        past.add(past.identity(variant, 100, every=10), 40.0, overhead=50.0)
+    few, many = (cost(past, past.identity(variant, 100, every=every)) for every in (50, 10))
+    assert 40 < many.seconds - many.training_s < 60
+    assert 5 < few.seconds - few.training_s < 14  # two of them
+    assert 2 < many.scoring_s < 10
 
 
 def test_an_empty_store_gives_the_prior_and_torch_is_slower(

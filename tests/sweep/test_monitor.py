@@ -238,3 +238,50 @@ def test_a_store_out_of_reach_is_read_again(cells: Cells) -> None:
     cells.begin("a")
     cells.finish("a")
     assert str(monitor.snapshot()) == "1 of 1 cells done"
+
+
+def test_what_this_sweep_s_cells_took_tells_of_those_that_wait(
+    cells: Cells, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Two at once that take three times as long as past cells did, and two more of them."""
+    now = 1000.0
+    monkeypatch.setattr(time, "monotonic", lambda: now)
+    monitor = SweepMonitor(cells.store.cells_folder)
+    monitor.watch([cells.plan(name, seconds=100.0) for name in ("a", "b", "c", "d")])
+    for name in ("a", "b"):
+        cells.begin(name)
+        cells.step(name, 0, None)
+    assert monitor.snapshot().left_s == pytest.approx(200)
+    now += 150
+    for name in ("a", "b"):
+        cells.step(name, 50, 1 / 3)
+    # Each of the four takes almost 300 s in all, of which 150 s are over for two.
+    assert monitor.snapshot().left_s == pytest.approx(450, rel=0.15)
+    now += 150
+    for name in ("a", "b"):
+        cells.finish(name)
+    assert monitor.snapshot().left_s == pytest.approx(300, rel=0.1)  # two at once, as before
+
+
+def test_a_cell_that_is_evaluated_amid_its_steps_is_not_at_their_end(
+    cells: Cells, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A cell that takes as long as was expected: a second for a step, and ten beside them."""
+    last = 0
+    monkeypatch.setattr(time, "monotonic", lambda: 1000.0 + last)
+    conf = replace(cells.conf, train=replace(cells.conf.train, evaluate_every=40))
+    monitor = SweepMonitor(cells.store.cells_folder)
+    plan = replace(cells.plan("a", seconds=110.0), conf=conf, scoring_s=10.0)
+    monitor.watch([plan])
+    cells.begin("a")
+    for last, after in ((39, 40), (79, 80), (97, 100)):
+        cells.step("a", last, 1.0)
+        shown = monitor.snapshot().running[0]
+        cells.step("a", 2, 0.5, "evaluating")
+        evaluated = monitor.snapshot().running[0]
+        assert shown.share == last / 100
+        assert evaluated.share == after / 100
+        left = 196 if after == 100 else 110 - after  # at the end, of the 98 views that are left
+        assert evaluated.left_s == pytest.approx(left, rel=0.1)
+    cells.step("a", 97, 1.0)
+    assert monitor.snapshot().left_s == pytest.approx(13, rel=0.1)

@@ -11,7 +11,7 @@ import pytest
 
 from xrgs.config import Conf
 from xrgs.experiment.cell_folder import CellState
-from xrgs.experiment.store import Store
+from xrgs.experiment.store import BASELINE, Store
 from xrgs.runtime.progress import format_duration
 from xrgs.safeio.atomic import write_json
 from xrgs.splat import backend
@@ -192,6 +192,17 @@ def test_a_label_whose_cells_have_the_config_of_the_baseline_is_named(
     assert unchanged([base, same, other]) == [
         "idle changes nothing here: its cells are those of baseline"
     ]
+
+
+def test_of_a_cell_that_waits_for_a_count_nothing_is_said(
+    cell: Callable[..., PlannedCell],
+) -> None:
+    """What it will be is the baseline with a count, which is not known yet."""
+    base = replace(cell("a"), spec=CellSpec(BASELINE, "", (), ()))
+    spec = CellSpec("count_matched to plus", "", (), ("+ablation=count_matched",))
+    control = replace(base, spec=spec, conf=replace(base.conf, matched_to="plus"))
+    assert control.waits
+    assert unchanged([base, control]) == []
 
 
 @pytest.mark.parametrize(

@@ -1,8 +1,9 @@
 """Estimates what a cell will take: its time, its memory and its disk.
 
 The logarithm of each cost is a sum of effects: of every setting with its value, of all settings
-together, of the variant, and of sizes, each with an exponent (pixels, steps, points, views,
-threads). The effects are fitted to the store's finished cells by ridge regression, which is a
+together, of the variant, and of sizes, each with an exponent (pixels, steps, Gaussians and others).
+The number of Gaussians of a cell that is planned is estimated in the same way, up to what its
+settings allow. The effects are fitted to the store's finished cells by ridge regression, which is a
 normal prior on each: so a setting or a variant that no cell had counts as average, a variant of
 another size is scaled, and a store without cells gives the prior, for a common machine. The times
 are of whatever machine a cell was trained on, and of what else that was doing.
@@ -13,7 +14,7 @@ from __future__ import annotations
 import heapq
 import math
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from datetime import datetime
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
@@ -28,7 +29,7 @@ from xrgs.sweep import features
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from xrgs.config import Conf
+    from xrgs.config import Conf, TrainConf
     from xrgs.experiment.cell_folder import CellFolder
     from xrgs.experiment.store import Store
     from xrgs.sweep.features import Features
@@ -48,9 +49,17 @@ _MAX_OVERHEAD_S = 600.0
 #: Resident memory of a process that has imported torch and trains nothing.
 _PROCESS_BYTES = 4e8
 #: Standard deviations of logarithms: of a cell around its estimate, and of the priors of effects.
-#: Chosen for the cells of 12 variants that were left out in turn.
+#: Chosen, as the priors, for the cells of 12 variants of 4 scenes that were left out in turn.
 _RESIDUAL, _LEVEL, _NAME, _TORCH = 0.15, 1.0, 0.2, 0.3
-_EXPONENTS = {"pixels": 0.2, "steps": 0.1, "points": 0.15, "views": 0.15, "threads": 0.15}
+_EXPONENTS = {
+    "pixels": 0.2,
+    "steps": 0.1,
+    "points": 0.15,
+    "views": 0.15,
+    "threads": 0.15,
+    "scored": 0.15,
+    "gaussians": 0.1,
+}
 
 
 @dataclass(frozen=True)
@@ -61,7 +70,7 @@ class Prior:
     """The cost of the native backend where every size is its unit: a scene of LLFF at 504 px,
     3,000 steps, one thread."""
     exponents: Mapping[str, float] = field(default_factory=dict)
-    """The power of each size that the cost is proportional to; 0 for the others."""
+    """The power of each size that the cost is proportional to, before any cell is known."""
     torch: float = 1.0
     """The factor of the torch backend."""
 
@@ -73,11 +82,19 @@ class Prior:
 
 #: The costs, by the names of `_costs_of`. Measured on two cores of an Intel Xeon.
 _PRIORS = {
-    "step_s": Prior(0.03, {"pixels": 0.8, "steps": 0.1, "threads": -0.85}, TORCH_SLOWDOWN),
-    "overhead_s": Prior(4.0, {"pixels": 0.3}),
-    "memory_bytes": Prior(4.5e8, {"pixels": 0.8, "steps": 0.3}),
-    "disk_bytes": Prior(3e7, {"pixels": 0.8, "steps": 0.2}),
+    "step_s": Prior(
+        0.03,
+        {"pixels": 0.5, "gaussians": 0.5, "steps": 0.1, "views": 0.3, "threads": -0.85},
+        TORCH_SLOWDOWN,
+    ),
+    "overhead_s": Prior(6.0, {"pixels": 0.3, "scored": 0.7}),
+    "memory_bytes": Prior(4e8, {"pixels": 0.4, "gaussians": 0.4, "steps": 0.1, "views": 0.15}),
+    "disk_bytes": Prior(2.6e7, {"pixels": 0.05, "gaussians": 0.95}),
 }
+#: The number of Gaussians at the end.
+_COUNT = Prior(1.2e5, {"pixels": 0.6, "steps": 0.2, "views": 0.15, "points": 0.0})
+#: A cell that ended with more than this share of what its settings allow was limited by them.
+_LIMITED = 0.95
 
 
 @dataclass(frozen=True)
@@ -92,6 +109,8 @@ class Cost:
     """Resident memory of its process where that is largest."""
     disk_bytes: float
     """Size of its files when it is done."""
+    scoring_s: float
+    """Those of its seconds that are neither training nor evaluations amid it."""
 
 
 class _Regression:
@@ -104,7 +123,8 @@ class _Regression:
         shared = frozenset.intersection(*(cell.names for cell, _ in known)) if known else ()
         names = {name for cell, _ in known for name in cell.names} - frozenset(shared)
         self._column = {name: number for number, name in enumerate(sorted(names))}
-        deviations = [_LEVEL, _TORCH, *_EXPONENTS.values(), *[_NAME] * len(names)]
+        exponents = [_EXPONENTS[name] for name in prior.exponents]
+        deviations = [_LEVEL, _TORCH, *exponents, *[_NAME] * len(names)]
         variances = np.array(deviations) ** 2
         X = np.array([self._row(cell) for cell, _ in known]).reshape(-1, len(variances))
         y = np.array([math.log(cost) - prior.log(cell) for cell, cost in known])
@@ -114,7 +134,7 @@ class _Regression:
 
     def _row(self, cell: Features) -> NDArray[np.float64]:
         """Return how often each effect is in the cost of a cell."""
-        sizes = [cell.sizes.get(name, 0.0) for name in _EXPONENTS]
+        sizes = [cell.sizes.get(name, 0.0) for name in self._prior.exponents]
         named = np.zeros(len(self._column))
         named[[self._column[name] for name in cell.names if name in self._column]] = 1
         return np.array([1.0, cell.torch, *sizes, *named])
@@ -156,9 +176,10 @@ class CostEstimator:
             provenance, status = cell.provenance(), read_object(cell.status)
         except StoreError:  # of them only the overhead, the disk and the threads are known
             provenance, status = {}, {}
-        what = features.of_identity(identity, provenance.get("threads"), self._store)
+        count = as_number(summary["gaussians"])
+        what = features.of_identity(identity, provenance.get("threads"), self._store, count)
         training_s = as_number(summary["training_time_s"])
-        costs = {"step_s": training_s / identity["train"]["steps"]}
+        costs = {"gaussians": count, "step_s": training_s / identity["train"]["steps"]}
         costs["memory_bytes"] = as_number(summary.get("peak_rss_bytes")) - _PROCESS_BYTES
         if status:
             costs["disk_bytes"] = sum(as_number(e["bytes"]) for e in status["files"].values())
@@ -167,6 +188,15 @@ class CostEstimator:
             if 0 < overhead < _MAX_OVERHEAD_S:
                 costs["overhead_s"] = overhead
         return what, costs
+
+    @cached_property
+    def _count(self) -> _Regression:
+        """The regression of the number of Gaussians, from the cells that no budget limited."""
+        found = [(cell, costs["gaussians"]) for cell, costs in self._past]
+        return _Regression(
+            _COUNT,
+            [(_planned(cell), count) for cell, count in found if count < _LIMITED * cell.most],
+        )
 
     @cached_property
     def _regressions(self) -> dict[str, _Regression]:
@@ -196,17 +226,30 @@ class CostEstimator:
         else:
             identity = identity or cell_identity(conf, variant_id)
             what = features.of_identity(identity, threads, self._store)
-        return None if what is None else self._cost(what, conf.train.steps)
+        return None if what is None else self._cost(what, conf.train)
 
-    def _cost(self, what: Features, steps: int) -> Cost:
+    def _cost(self, what: Features, train: TrainConf) -> Cost:
+        count = min(self._count(what), what.most)
+        log_count = math.log(count / features.UNITS["gaussians"])
+        what = replace(what, sizes={**what.sizes, "gaussians": log_count})
         expected = {name: regression(what) for name, regression in self._regressions.items()}
-        training_s = expected["step_s"] * steps
+        training_s = expected["step_s"] * train.steps
+        evaluations = features.evaluations(train.steps, train.evaluate_every)
+        scored = what.sizes.get("scored", 0.0) - math.log(evaluations)
+        once = replace(what, sizes={**what.sizes, "scored": scored})
         return Cost(
             training_s,
             training_s + expected["overhead_s"],
             expected["memory_bytes"] + _PROCESS_BYTES,
             expected["disk_bytes"],
+            self._regressions["overhead_s"](once),
         )
+
+
+def _planned(cell: Features) -> Features:
+    """Return the features of a cell as they are before it is trained."""
+    sizes = {name: size for name, size in cell.sizes.items() if name != "gaussians"}
+    return replace(cell, sizes=sizes)
 
 
 def _newest(store: Store) -> list[CellFolder]:

@@ -11,7 +11,7 @@ import sys
 import threading
 import time
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from statistics import fmean
 from typing import TYPE_CHECKING, Any, Self
 
@@ -31,6 +31,8 @@ if TYPE_CHECKING:
 #: Seconds between two snapshots, at least; and the pause in multiples of the time that a snapshot
 #: takes, so that a slow store is not kept busy.
 _POLL_S, _PAUSE_FACTOR = 1.0, 20
+#: What a cell that took as long as was expected weighs beside those of a sweep.
+_CERTAIN = 0.2
 #: A log gets a line when a cell has ended, and after so many seconds without one.
 _LINE_S = 600.0
 #: A cell whose progress file has not changed for so many seconds is not running: its process died
@@ -48,13 +50,24 @@ class RunningCell:
     cell: PlannedCell
     progress: Progress
     """The content of its progress file."""
+    steps: int = 0
+    """Number of its steps when it was last seen to train."""
+    slowness: float = 1.0
+    """How many times longer this sweep's cells took than was expected of them."""
 
     @property
     def share(self) -> float:
         """The share of its training that is done, 0 to 1."""
-        if self.progress.unit != "step":
-            return float(self.progress.what == "evaluating")
-        return self.progress.done / self.progress.total if self.progress.total else 0.0
+        if self.progress.unit == "step":
+            return self.progress.done / self.progress.total if self.progress.total else 0.0
+        if self.progress.what != "evaluating":
+            return 0.0
+        train = self.cell.conf.train
+        if not train.evaluate_every:
+            return 1.0
+        # Evaluated at a multiple of so many steps, that the last count was before, or at the end.
+        evaluated = (self.steps // train.evaluate_every + 1) * train.evaluate_every
+        return min(1.0, evaluated / train.steps)
 
     @property
     def pace(self) -> float | None:
@@ -68,9 +81,16 @@ class RunningCell:
 
         Its own pace says little at first, when it has few Gaussians. The times of past cells say
         less and less towards the end. The two are averaged, weighted by the share that is done.
+        What comes after its steps is known from past cells alone.
         """
-        past = None if self.cell.seconds is None else (1 - self.share) * self.cell.seconds
-        own = self.progress.remaining_s
+        after = (self.cell.scoring_s or 0.0) * self.slowness
+        past, own = self.cell.seconds, self.progress.remaining_s
+        if past is not None:
+            past = (1 - self.share) * (past * self.slowness - after) + after
+        if own is not None and self.progress.unit == "step":
+            own += after
+        elif self.share < 1:  # of the views that it loads or evaluates amid its steps
+            own = None
         if past is None or own is None:
             return own if past is None else past
         return (1 - self.share) * past + self.share * own
@@ -88,6 +108,10 @@ class SweepSnapshot:
     waiting: tuple[PlannedCell, ...]
     pace: float | None
     """Mean seconds per step of this sweep's running cells; None before any is known."""
+    at_once: int = 1
+    """The most cells that this sweep was seen to train at once."""
+    slowness: float = 1.0
+    """How many times longer this sweep's cells took than was expected of them."""
 
     @property
     def ended(self) -> int:
@@ -101,7 +125,7 @@ class SweepSnapshot:
 
     @property
     def left_s(self) -> float | None:
-        """Expected seconds of training left, if as many cells run at once as do now."""
+        """Expected seconds left, if as many cells run at once as did so far."""
         waiting = [self._expected(cell) for cell in self.waiting]
         running = [cell.left_s for cell in self.running]
         others = [cell.left_s for cell in self.elsewhere]
@@ -109,11 +133,11 @@ class SweepSnapshot:
         if len(known) < len(waiting) + len(running):
             return None
         longest = max((s for s in (*known, *others) if s is not None), default=None)
-        return longest and max(longest, sum(known) / max(1, len(running)))
+        return longest and max(longest, sum(known) / self.at_once)
 
     def _expected(self, cell: PlannedCell) -> float | None:
         if cell.seconds is not None:
-            return cell.seconds
+            return cell.seconds * self.slowness
         return None if self.pace is None else cell.conf.train.steps * self.pace
 
     def __str__(self) -> str:
@@ -152,6 +176,13 @@ class SweepMonitor:
         self._moved: dict[str, tuple[_FileStamp, float]] = {}
         """The progress file of each cell, and when it was first seen like that."""
         self._pace: float | None = None
+        self._steps: dict[str, int] = {}
+        """The last count of steps of each cell that was seen to train."""
+        self._begun: dict[str, tuple[float, float]] = {}
+        """When each cell of this sweep was first seen to run, and what was left of it, 0 to 1."""
+        self._took, self._expected = 0.0, 0.0
+        """Seconds that this sweep's cells took that are done, and that they were expected to."""
+        self._at_once = 1
         self._shown, self._shown_at = 0, time.monotonic()
         """Number of ended cells in the last line of a log, and when that was written."""
         self._bar: tqdm[Any] | None = None
@@ -218,9 +249,12 @@ class SweepMonitor:
                 waiting.append(cell)
             else:
                 in_other_sweep = cell.state.name == "running"
-                (elsewhere if in_other_sweep else running).append(RunningCell(cell, now))
+                (elsewhere if in_other_sweep else running).append(self._running(cell, now))
+        slowness = self._slowness(running)
+        running = [replace(cell, slowness=slowness) for cell in running]
         paces = [cell.pace for cell in running if cell.pace]
         self._pace = fmean(paces) if paces else self._pace
+        self._at_once = max(self._at_once, len(running))
         return SweepSnapshot(
             counts["done"],
             counts["failed"],
@@ -228,7 +262,47 @@ class SweepMonitor:
             tuple(elsewhere),
             tuple(waiting),
             self._pace,
+            self._at_once,
+            slowness,
         )
+
+    def _slowness(self, running: Sequence[RunningCell]) -> float:
+        """Return how many times longer this sweep's cells take than was expected of them.
+
+        It is the ratio of both sums over the cells that are done and what is done of others,
+        together with a part of a cell that took as long as was expected: the first steps of a
+        cell, which has few Gaussians then, say little.
+        """
+        took, expected = self._took, self._expected
+        known = [cell.seconds for cell in self._plan if cell.seconds is not None]
+        for cell in running:
+            since, left = self._begun[str(cell.cell.cell_id)]
+            if cell.cell.seconds is not None:
+                took += time.monotonic() - since
+                expected += (cell.share - (1 - left)) * cell.cell.seconds
+        if not expected or not any(known):
+            return 1.0
+        certain = _CERTAIN * fmean(known)
+        return (took + certain) / (expected + certain)
+
+    def _running(self, cell: PlannedCell, now: Progress) -> RunningCell:
+        name = str(cell.cell_id)
+        if now.unit == "step":
+            self._steps[name] = now.done
+        running = RunningCell(cell, now, self._steps.get(name, 0))
+        if cell.state.name != "running":
+            self._begun.setdefault(name, (time.monotonic(), 1 - running.share))
+        return running
+
+    def _end(self, cell: PlannedCell, state: str) -> None:
+        """Keep the state of a cell that has ended, and how long it took if it is done."""
+        name = str(cell.cell_id)
+        self._ended[name] = state
+        begun = self._begun.get(name)
+        if state == "done" and begun is not None and cell.seconds is not None:
+            since, left = begun
+            self._took += time.monotonic() - since
+            self._expected += left * cell.seconds
 
     def _state(self, cell: PlannedCell, begun: set[str]) -> str:
         """Return `done`, `failed`, or nothing while the cell is neither."""
@@ -246,7 +320,7 @@ class SweepMonitor:
             state = folder.state(verify=False).name
             if state == "unknown":  # it is read again
                 return ""
-            self._ended[name] = "done" if state == "done" else "failed"
+            self._end(cell, "done" if state == "done" else "failed")
         return self._ended[name]
 
     def _progress(self, cell: PlannedCell, begun: set[str]) -> Progress | None:

@@ -43,6 +43,8 @@ class PlannedCell:
     """Why the cell can't be trained: its scene failed, or the cell that it takes a count from."""
     seconds: float | None = None
     """Expected seconds from its start to its end; None where nothing is known to go by."""
+    scoring_s: float | None = None
+    """Those of them that come after its last step."""
     memory_bytes: float | None = None
     """Expected resident memory where that is largest."""
     disk_bytes: float | None = None
@@ -149,6 +151,7 @@ def _with_cost(cell: PlannedCell, past: CostEstimator, threads: int) -> PlannedC
     return replace(
         cell,
         seconds=cost.seconds,
+        scoring_s=cost.scoring_s,
         memory_bytes=cost.memory_bytes,
         disk_bytes=cost.disk_bytes,
     )
@@ -285,6 +288,8 @@ def _size(count: float) -> str:
 def unchanged(plan: Sequence[PlannedCell]) -> list[str]:
     """Return a line for each label whose cells have the config of their baselines.
 
+    The config of a cell that waits for a count is not complete, so that nothing is said of it.
+
     Args:
         plan: All cells.
     """
@@ -292,7 +297,7 @@ def unchanged(plan: Sequence[PlannedCell]) -> list[str]:
     differs: dict[str, bool] = {}
     for cell in plan:
         if cell.spec.label != BASELINE and (base := bases.get(cell.spec.shared)) is not None:
-            same = all(
+            same = not cell.waits and all(
                 getattr(cell.conf, name) == getattr(base, name)
                 for name in ("splat", "train", "components", "variant", "scene", "seed")
             )
