@@ -224,3 +224,27 @@ def test_sweeps_of_a_scene_that_sfm_can_not_place(
     assert code == 1
     assert BUILDING in err
     assert HINT not in err
+
+
+@pytest.mark.parametrize("readable", [1, 2])
+def test_a_dry_run_reads_the_headers_of_photographs(
+    compose: Callable[..., Conf],
+    store: Store,
+    tmp_path: Path,
+    readable: int,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    scene = tmp_path / "scene"
+    scene.mkdir()
+    for number in range(readable):
+        Image.new("RGB", (60, 40), (number, 0, 0)).save(scene / f"{number}.png")
+    (scene / "x.jpg").write_bytes(b"xx")
+    conf = compose("scene=folder", f"scene.path={scene}")
+    planned = variants.plan(conf, store, allow_build=False)
+    assert "x.jpg: unreadable or truncated image" in capsys.readouterr().err
+    if readable == 2:
+        assert planned == PlannedVariant()
+    else:
+        assert planned.error is not None
+        assert "scene scene: 1 readable image(s), two are needed: [" in planned.error
+    assert not list(store.variants.path.iterdir())

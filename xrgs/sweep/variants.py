@@ -5,7 +5,8 @@ from __future__ import annotations
 from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING
 
-from xrgs.capture import scenes, variant
+from xrgs.capture import images, scenes, variant
+from xrgs.capture.scenes import folder
 from xrgs.errors import StoreError, UnreadableError, XrgsError
 from xrgs.experiment import trimming
 from xrgs.runtime.progress import log_line
@@ -122,9 +123,12 @@ def _find_or_build(conf: Conf, store: Store, *, allow_build: bool) -> PlannedVar
         if trimmed := trimming.trimmed_variant(store.variants, key):
             return PlannedVariant(trimmed)
         failure = None if conf.retry == "failed" else variant.failure(store.variants, key)
-        if failure or not allow_build:
+        if failure:
             return PlannedVariant(error=failure)
-        return PlannedVariant(build(conf, store))
+        if allow_build:
+            return PlannedVariant(build(conf, store))
+        _check_headers(conf)
+        return PlannedVariant()
     except (UnreadableError, worker.UnwritableError, presence.StoreGoneError):
         raise
     except XrgsError as error:
@@ -136,3 +140,26 @@ def _find_or_build(conf: Conf, store: Store, *, allow_build: bool) -> PlannedVar
         # gives the same record.
         remembered = variant.failure(store.variants, key) if key else None
         return PlannedVariant(error=remembered or str(error))
+
+
+def _check_headers(conf: Conf) -> None:
+    """See that a folder has two photographs whose headers can be read, without decoding any.
+
+    Raises:
+        UnreadableError: A photograph can't be read now.
+        XrgsError: Fewer than two can be; the message says what is wrong with the others.
+    """
+    if conf.scene.kind != "folder":
+        return
+    files = folder.list_photographs(conf.scene.path, conf.variant.long_side)
+    reasons = []
+    for file in files.values():
+        try:
+            images.size(file)
+        except images.ImageError as error:
+            reasons.append(str(error))
+    for reason in reasons:
+        log_line(f"{reason}; it would be left out")
+    if len(files) - len(reasons) < 2:
+        count = f"{len(files) - len(reasons)} readable image(s), two are needed"
+        raise XrgsError(f"scene {scenes.label(conf.scene)}: {count}: {reasons}")
