@@ -680,7 +680,7 @@ def from_file(file: Path | ConfinedPath) -> tuple[Conf, dict[str, Any]]:
 
 def _baseline() -> dict[str, Any]:
     """Return the values of `conf/config.yaml` itself; those that it leaves open are `???`."""
-    conf = OmegaConf.load(CONF_DIR / "config.yaml")
+    conf = cast("DictConfig", OmegaConf.load(CONF_DIR / "config.yaml"))
     names = [*Conf.__dataclass_fields__]
     values = OmegaConf.to_container(OmegaConf.masked_copy(conf, names), resolve=True)
     return cast("dict[str, Any]", values)

@@ -175,7 +175,7 @@ def test_what_cant_be_exported_is_named(xrgs_data: XrgsData, tmp_path: Path) -> 
         ([], "export: give one cell or variant"),
         (["gone"], "store=xrgs-store is not a store"),
         (["gone", "store=s"], "gone: no cells or variants have such an id"),
-        (["c", "store=s"], "c: several cells or variants have such an id: cd, c1-ab"),
+        (["c", "store=s"], "c: several cells or variants have such an id: c1-ab, cd"),
         (["./gone"], "gone: No such file or directory; give the folder"),
         (["empty"], "empty: neither a cell nor a variant"),
         (["empty", "format=obj"], "format=obj: must be one of colmap, nerfstudio"),
