@@ -179,7 +179,7 @@ def test_what_cant_be_exported_is_named(xrgs_data: XrgsData, tmp_path: Path) -> 
         (["./gone"], "gone: No such file or directory; give the folder"),
         (["empty"], "empty: neither a cell nor a variant"),
         (["empty", "format=obj"], "format=obj: must be one of colmap, nerfstudio"),
-        (["empty", "to=x"], "export: give the folder"),
+        (["empty", "to=x"], "export: give one cell or variant"),
     ):
         code, out, err = xrgs_data("export", *arguments)
         assert (code, out) == (1, "")
