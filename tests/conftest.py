@@ -6,6 +6,7 @@ import contextlib
 import importlib
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -359,3 +360,29 @@ def xrgs_data(
 ) -> Callable[..., tuple[int, str, str]]:
     """Return `call_command` for `xrgs-data`."""
     return partial(call_command, "data")
+
+
+@pytest.fixture(scope="session")
+def browser(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Any]:
+    """Debian's chromium without a screen, that reaches this machine alone; skipped without it."""
+    webdriver = pytest.importorskip("selenium.webdriver", reason="selenium is not installed")
+    found = {name: shutil.which(name) for name in ("chromium", "chromedriver")}
+    if missing := [name for name, path in found.items() if path is None]:
+        pytest.skip(f"there is no {' and no '.join(missing)}: apt-get install chromium-driver")
+    options = webdriver.ChromeOptions()
+    options.binary_location = found["chromium"]
+    for flag in (
+        *("headless=new", "no-sandbox", "disable-quic", "no-first-run", "disable-sync"),
+        *("disable-background-networking", "disable-component-update"),
+        *("use-angle=swiftshader", "enable-unsafe-swiftshader"),  # WebGL without a GPU
+        "force-prefers-reduced-motion",  # a click waits for no scrolling
+        "host-resolver-rules=MAP * ~NOTFOUND , EXCLUDE 127.0.0.1",
+        f"user-data-dir={tmp_path_factory.mktemp('chromium')}",
+        "window-size=1200,900",
+    ):
+        options.add_argument(f"--{flag}")
+    options.set_capability("goog:loggingPrefs", {"browser": "ALL"})
+    service = webdriver.ChromeService(found["chromedriver"])
+    driver = webdriver.Chrome(options=options, service=service)
+    yield driver
+    driver.quit()

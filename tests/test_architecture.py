@@ -146,7 +146,10 @@ FILE_FUNCTIONS: dict[str, dict[str, str]] = {
     "torch.load": {},
     "torch.save": {},
     "pandas.read_": {},
-    "omegaconf.OmegaConf.load": {"cli/data": "the package's own config"},
+    "omegaconf.OmegaConf.load": {
+        "cli/data": "the package's own config",
+        "config": "the package's own config",
+    },
     "omegaconf.OmegaConf.save": {},
     "yaml.": {},
 }

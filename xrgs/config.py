@@ -12,7 +12,7 @@ import re
 from dataclasses import dataclass, field, is_dataclass
 from functools import cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, get_type_hints
+from typing import TYPE_CHECKING, Any, cast, get_type_hints
 
 import hydra
 from hydra.core.config_store import ConfigStore
@@ -32,7 +32,7 @@ from xrgs.splat.settings import (
 )
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Iterator, Mapping
 
 _PACKAGE = Path(__file__).parent
 #: `conf/` is inside the package in a wheel and beside it in a checkout.
@@ -646,21 +646,26 @@ def escape_interpolations(value: Any) -> Any:
     return _INTERPOLATION.sub(lambda match: 2 * match[1] + r"\${", value)
 
 
-def from_file(file: Path | ConfinedPath) -> Conf:
+def from_file(file: Path | ConfinedPath) -> tuple[Conf, dict[str, Any]]:
     """Read the config that a cell's folder holds as JSON.
+
+    A file from before a key was added lacks it. The key's value in the baseline is taken, with
+    which all that was added is off.
 
     Args:
         file: The JSON file.
 
     Returns:
-        The config.
+        The config, and the keys that the file lacks with the values that were taken.
 
     Raises:
         XrgsError: The file can't be read, or has another schema; the message names the file and
             the key.
     """
     try:
-        return from_dict(read_json(file))
+        values = read_json(file)
+        added = dict(_fill_in(values, _baseline(), ""))
+        return from_dict(values), added
     except StoreError:
         raise
     except OmegaConfBaseException as error:
@@ -671,6 +676,29 @@ def from_file(file: Path | ConfinedPath) -> Conf:
         raise XrgsError(f"{file}: {error}") from error
     except (OverflowError, ValueError, TypeError) as error:
         raise XrgsError(f"{file}: it holds no config ({error})") from error
+
+
+def _baseline() -> dict[str, Any]:
+    """Return the values of `conf/config.yaml` itself; those that it leaves open are `???`."""
+    conf = cast("DictConfig", OmegaConf.load(CONF_DIR / "config.yaml"))
+    names = [*Conf.__dataclass_fields__]
+    values = OmegaConf.to_container(OmegaConf.masked_copy(conf, names), resolve=True)
+    return cast("dict[str, Any]", values)
+
+
+def _fill_in(values: Any, baseline: Mapping[str, Any], path: str) -> Iterator[tuple[str, Any]]:
+    """Add to a config what it lacks of the baseline; yield the keys that were added, with values.
+
+    What is no mapping is left to the schema to refuse.
+    """
+    if not isinstance(values, dict):
+        return
+    for name, value in baseline.items():
+        if isinstance(value, dict):
+            yield from _fill_in(values.setdefault(name, {}), value, f"{path}{name}.")
+        elif name not in values and value != MISSING:
+            values[name] = value
+            yield f"{path}{name}", value
 
 
 def error_line(error: Exception) -> str:

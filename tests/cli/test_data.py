@@ -81,7 +81,8 @@ def test_exported_splats_cameras_and_points_are_in_one_frame(
     """The exported splats are rendered with the exported cameras, as other programs read them."""
     cell = sorted((store / "cells").iterdir())[0]
     out = tmp_path / "out"
-    code, said, err = xrgs_data("export", str(cell), f"format={layout}", f"out={out}")
+    named = [str(cell)] if layout == "colmap" else [cell.name[:8], f"store={store}"]
+    code, said, err = xrgs_data("export", *named, f"format={layout}", f"out={out}")
     assert code == 0, err
     assert "2 training and 2 test views" in said
     cameras, points = (read_colmap if layout == "colmap" else read_transforms)(out)
@@ -159,7 +160,8 @@ def test_a_variant_is_exported_without_splats_and_read_as_poses(
 ) -> None:
     variant = next((store / "variants").glob("*-*"))
     for layout in ("colmap", "nerfstudio"):
-        code, _, err = xrgs_data("export", str(variant), f"format={layout}", f"out={layout}")
+        named = variant.name[:20], f"store={store}"
+        code, _, err = xrgs_data("export", *named, f"format={layout}", f"out={layout}")
         assert code == 0, err
         assert not (tmp_path / layout / "splats.ply").exists()
     poses.fingerprint(str(tmp_path / "colmap" / "sparse" / "0"))
@@ -167,13 +169,17 @@ def test_a_variant_is_exported_without_splats_and_read_as_poses(
 
 
 def test_what_cant_be_exported_is_named(xrgs_data: XrgsData, tmp_path: Path) -> None:
-    (tmp_path / "empty").mkdir()
+    for folder in ("empty", "s/cells/cd", "s/variants/c1-ab", "s/variants/failed-c2"):
+        (tmp_path / folder).mkdir(parents=True)
     for arguments, message in (
-        ([], "export: give the folder of a cell or a variant"),
-        (["gone"], "gone: No such file or directory; give the folder"),
+        ([], "export: give one cell or variant"),
+        (["gone"], "store=xrgs-store is not a store"),
+        (["gone", "store=s"], "gone: no cells or variants have such an id"),
+        (["c", "store=s"], "c: several cells or variants have such an id: c1-ab, cd"),
+        (["./gone"], "gone: No such file or directory; give the folder"),
         (["empty"], "empty: neither a cell nor a variant"),
         (["empty", "format=obj"], "format=obj: must be one of colmap, nerfstudio"),
-        (["empty", "to=x"], "export: give the folder"),
+        (["empty", "to=x"], "export: give one cell or variant"),
     ):
         code, out, err = xrgs_data("export", *arguments)
         assert (code, out) == (1, "")

@@ -67,7 +67,7 @@ def test_cells_are_chosen_by_name_state_age_and_size(store: Store) -> None:
     ("of", "message"),
     [
         ({"ids": ("ab",)}, "ab: several cells have such an id: abc1, abd2"),
-        ({"ids": ("x",)}, "x: no cell has such an id"),
+        ({"ids": ("x",)}, "x: no cells have such an id"),
         ({"scenes": ("frn",)}, "scenes=frn: no cell has that; choose from: fern, statue"),
         ({"states": ("dun",)}, "states=dun: .*choose from: done, running"),
     ],

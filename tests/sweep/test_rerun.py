@@ -108,6 +108,30 @@ def test_other_numbers_are_reported(cell: CellFolder, train: Callable[..., None]
     )
 
 
+def test_a_cell_that_is_older_than_a_key_is_trained_with_the_baselines_value(
+    cell: CellFolder, train: Callable[..., None]
+) -> None:
+    file = cell.path / "config.json"
+    older = json.loads(file.read_text())
+    del older["track"], older["train"]["validation"], older["components"]["mip"]
+    file.write_text(json.dumps(older))
+    identity = cell.identity()
+    del identity["train"]["validation"], identity["components"]["mip"]
+    (cell.path / "identity.json").write_text(json.dumps(identity))
+    train()
+    result = rerun(cell.path)
+    (line,) = [line for line in result.before if line.startswith("config.json")]
+    assert line == (
+        "config.json lacks newer keys; their values in the baseline are taken: track=none,"
+        " train.validation=0.0, components.mip.variance=0.0, components.mip.every=100"
+    )
+    assert CellFolder(result.folder.path).config().train.validation == 0
+    identity["train"]["validation"] = 0.5  # which the config does not have
+    (cell.path / "identity.json").write_text(json.dumps(identity))
+    told = rerun(cell.path).before
+    assert "identity.json against config.json: train.validation: 0.5 -> 0.0" in told
+
+
 def test_scores_that_were_changed_are_reported(
     cell: CellFolder, train: Callable[..., None]
 ) -> None:
@@ -258,8 +282,8 @@ def spoil_config(cell: CellFolder, change: Callable[[dict[str, Any]], object]) -
         (lambda cell: (cell.path / "config.json").write_text("{"), r"config\.json"),
         (lambda cell: (cell.path / "config.json").write_text("[]"), r"config\.json"),
         (lambda cell: spoil_config(cell, lambda c: c["train"].update(fast=1)), r"train\.fast"),
-        (lambda cell: spoil_config(cell, lambda c: c["splat"].pop("sh_every")), r"splat\.sh_every"),
         (lambda cell: spoil_config(cell, lambda c: c["train"].update(steps="x")), r"train\.steps"),
+        (lambda cell: spoil_config(cell, lambda c: c["scene"].pop("kind")), r"scene\.kind"),
         (
             lambda cell: write_json(cell.path / "identity.json", {"variant": "../../elsewhere"}),
             "variant=",

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import io
 import re
 import socket
 import urllib.request
@@ -13,6 +14,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from PIL import Image
 
 from xrgs.errors import XrgsError
 from xrgs.viewer import live
@@ -102,7 +104,10 @@ class Client:
         self.atomic: Callable[[], Any] = nullcontext
 
     def move(self, x: float) -> None:
-        self.camera.position = np.array([x, 0.0, 0.0])
+        self.report(np.array([x, 0.0, 0.0]))
+
+    def report(self, position: Any) -> None:
+        self.camera.position = position
         for callback in self.callbacks:
             asyncio.run(callback(self.camera))
 
@@ -115,7 +120,7 @@ def clock(monkeypatch: pytest.MonkeyPatch) -> SimpleNamespace:
 
 
 def test_the_camera_that_is_moved_moves_the_others(clock: SimpleNamespace) -> None:
-    shared, clients = live._SharedCamera(), [Client(), Client()]
+    shared, clients = live._SharedCamera(None), [Client(), Client()]
     for client in clients:
         shared.join(client)
     first, second = clients
@@ -125,6 +130,7 @@ def test_the_camera_that_is_moved_moves_the_others(clock: SimpleNamespace) -> No
     clock.s += 0.1
     first.move(2.0)
     second.move(1.0)  # the second browser reports where it was told to be a moment ago
+    second.move(2.0)
     assert first.camera.position[0] == 2.0, "which is no move of the user"
     clock.s += 1.0
     second.move(7.0)
@@ -144,9 +150,62 @@ def test_places_are_set_together(clock: SimpleNamespace) -> None:
         yield
         opened.append("end")
 
-    shared, first, second = live._SharedCamera(), Client(), Client()
+    shared, first, second = live._SharedCamera(None), Client(), Client()
     second.atomic = atomic
     shared.join(first)
     shared.join(second)
     first.move(3.0)
     assert opened == ["begin", "end"]
+
+
+def test_a_frame_that_is_opened_takes_the_place_of_the_others(clock: SimpleNamespace) -> None:
+    place = {"position": np.ones(3), "look_at": np.zeros(3), "up_direction": np.ones(3), "fov": 0.5}
+    shared, first, second = live._SharedCamera(place), Client(), Client()
+    shared.join(first)
+    shared.join(second)
+    assert np.array_equal(second.camera.position, np.ones(3))
+    first.move(3.0)  # what its browser reports from before it was put to its place
+    assert np.array_equal(second.camera.position, np.ones(3))
+    for client in (first, second):
+        client.report(np.ones(3))
+    clock.s += 1.0
+    second.move(7.0)
+    assert first.camera.position[0] == 7.0
+
+
+@pytest.mark.slow
+def test_in_a_browser_both_models_move_as_one(model: MakeModel, browser: Any) -> None:
+    from selenium.webdriver.common.action_chains import ActionChains
+    from selenium.webdriver.support.wait import WebDriverWait
+
+    def panes() -> list[Any]:
+        """The lower left of both frames, where viser's panel is not, [300, 350, 3] each."""
+        with Image.open(io.BytesIO(browser.get_screenshot_as_png())) as screen:
+            pixels = np.asarray(screen.convert("RGB"), dtype=np.float64)
+        left, right = browser.execute_script(
+            "return [...document.querySelectorAll('iframe')].map(f => f.getBoundingClientRect().x)"
+        )
+        return [pixels[-300:, round(x) : round(x) + 350] for x in (left, right)]
+
+    def same(_: Any = None) -> bool:
+        first, second = panes()
+        return bool(first.std() > 5 and abs(first - second).mean() < 0.5)
+
+    browser.get_log("browser")
+    one = model()
+    with live.shown([one, one], 0, 40) as address:
+        browser.get(address)
+        WebDriverWait(browser, 60).until(same)
+        before = panes()
+        frame = browser.find_elements("css selector", "iframe")[1]
+        drag = ActionChains(browser).move_to_element_with_offset(frame, -150, 150).click_and_hold()
+        drag.move_by_offset(80, -20).release().perform()
+        WebDriverWait(browser, 60).until(
+            lambda _: all(abs(a - b).mean() > 3 for a, b in zip(before, panes(), strict=True))
+        )
+        WebDriverWait(browser, 60).until(same)
+        said = [entry["message"] for entry in browser.get_log("browser")]
+        # three.js says this of the splats of any page of viser's, once for each frame
+        errors = [text for text in said if "rror" in text and "computeBoundingSphere" not in text]
+        assert errors == []
+        browser.get("about:blank")

@@ -42,8 +42,8 @@ def test_a_cell_is_found_by_the_beginning_of_its_id(store: Store) -> None:
     ("word", "message"),
     [
         ("ab", "ab: several cells have such an id: abc1, abd2, abd3"),
-        ("x", "x: no cell has such an id"),
-        ("../abc1", "../abc1: no cell has such an id"),
+        ("x", "x: no cells have such an id"),
+        ("../abc1", "../abc1: no cells have such an id"),
         ("abd3", "abd3: it is failed and not done: out of memory"),
     ],
 )

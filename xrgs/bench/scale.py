@@ -100,7 +100,7 @@ def _job_cost(template: Path, folder: Path) -> dict[str, float]:
     hashes every photograph of a scene, once for all of its cells.
     """
     cell = CellFolder(template)
-    conf = config.from_file(template / "config.json")
+    conf, _ = config.from_file(template / "config.json")
     photographs = folder / "photographs"
     photographs.mkdir()
     content = motorcycle.files()["motorcycle_left"].read_bytes()

@@ -20,6 +20,7 @@ from xrgs.errors import XrgsError
 from xrgs.experiment.store import Store
 from xrgs.runtime.streams import say
 from xrgs.safeio.confined import ConfinedPath
+from xrgs.safeio.paths import user_path
 from xrgs.sweep import variants
 
 _HELP = """\
@@ -33,8 +34,9 @@ xrgs-data inspect VARIANT_FOLDER [out=FILE.png]
 xrgs-data inspect scene=NAME [KEY=VALUE]... [out=FILE.png]
     Prints a table of a variant's views and the result of SfM, and draws all views on one sheet.
     The keys are those of xrgs-sweep; a variant that is not in the store is built.
-xrgs-data export CELL_OR_VARIANT_FOLDER [format=colmap|nerfstudio] [out=FOLDER]
+xrgs-data export CELL_OR_VARIANT [format=colmap|nerfstudio] [out=FOLDER] [store=FOLDER]
     Writes images, cameras, points and split, and the splats of a cell, for other programs.
+    CELL_OR_VARIANT is a folder, or an id in the store or the beginning of one.
 """
 
 
@@ -107,9 +109,12 @@ def _inspect(words: list[str], values: dict[str, str]) -> str:
 
 def _export(words: list[str], values: dict[str, str]) -> str:
     layout, out = values.pop("format", "colmap"), values.pop("out", None)
+    store = Store(user_path(values.pop("store", "xrgs-store")))
     if values or len(words) != 1:
-        raise XrgsError("export: give the folder of a cell or a variant, and format= or out= alone")
+        raise XrgsError("export: give one cell or variant, and format=, out= or store= alone")
     from xrgs.experiment.export import export
 
-    path = Path(words[0]).expanduser()
-    return export(path, layout, Path(out or f"{path.name}-{layout}").expanduser())
+    path = user_path(words[0])
+    if not path.exists() and path.name == words[0]:
+        path = store.find_folder(words[0]).path
+    return export(path, layout, user_path(out or f"{path.name}-{layout}"))

@@ -22,7 +22,8 @@ side with their names. CELL is a cell's id, the beginning of one, or a .ply file
   path=orbit       orbit: around the point that the cameras look at; where they see it from one side
                    alone, to and fro over the arc that they span
                    spiral: LLFF's, for forward-facing scenes
-                   test: through the test cameras in their order
+                   test: through the test cameras in their order; as on every path, all frames
+                   have the focal length of the first one, also where the cameras' differ
   views=120        number of frames
   out=film.mp4     an .mp4 file, which needs PyAV (pip install 'xrgs[video]'), or a new folder for
                    PNG frames

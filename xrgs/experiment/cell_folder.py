@@ -517,12 +517,14 @@ class CellFolder:
     def config(self) -> Conf:
         """Return the config that the cell was trained with.
 
+        Keys that were added since have their values in the baseline.
+
         Raises:
             XrgsError: `config.json` can't be read, or is of another version's schema.
         """
         from xrgs.config import from_file
 
-        return from_file(self.folder / "config.json")
+        return from_file(self.folder / "config.json")[0]
 
     def gaussians(self) -> Gaussians:
         """Load the trained Gaussians, in the world of `cameras`.

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from xrgs.capture.failures import FAILED_PREFIX
 from xrgs.errors import StoreError, UnreadableError
 from xrgs.experiment.cell_folder import READING_ERRORS, CellFolder, CellState
 from xrgs.runtime.progress import log_line
@@ -226,6 +227,26 @@ class Store:
             raise StoreError(f"store={self.path} is not a store; xrgs-sweep makes one")
         return self.cell(full_id(beginning, [cell.id for cell in self.cell_folders()]))
 
+    def find_folder(self, beginning: str) -> ConfinedPath:
+        """Return the folder of the cell or the variant whose id begins with a text.
+
+        Args:
+            beginning: The id, or so much of it that it is that of one cell or variant.
+
+        Raises:
+            StoreError: There is no store, no id begins with it, or several do.
+        """
+        if not self.exists:
+            raise StoreError(f"store={self.path} is not a store; xrgs-sweep makes one")
+        variants = [
+            self.variant(name)
+            for name in list_folder(self.variants)
+            if "." not in name and not name.startswith(FAILED_PREFIX) and untrusted.is_name(name)
+        ]
+        folders = {folder.name: folder for folder in variants}
+        folders |= {cell.id: cell.folder for cell in self.cell_folders()}
+        return folders[full_id(beginning, list(folders), "cells or variants")]
+
     def cell_folders(self) -> list[CellFolder]:
         """Return the cells, sorted by id; folders of earlier attempts, whose names have a dot, not.
 
@@ -419,12 +440,13 @@ def _is_row(row: object) -> bool:
     )
 
 
-def full_id(beginning: str, ids: Sequence[str]) -> str:
+def full_id(beginning: str, ids: Sequence[str], kinds: str = "cells") -> str:
     """Return the id that begins with a text.
 
     Args:
         beginning: The id, or so much of it that it is the only one.
-        ids: The ids of all cells.
+        ids: The ids of all that may be meant.
+        kinds: What these are, for messages.
 
     Raises:
         StoreError: No id begins with it, or several do.
@@ -432,6 +454,6 @@ def full_id(beginning: str, ids: Sequence[str]) -> str:
     found = [cell_id for cell_id in ids if cell_id.startswith(beginning)]
     if beginning not in found and len(found) != 1:
         some = ", ".join([*found[:_MAX_LISTED], *["..."] * (len(found) > _MAX_LISTED)])
-        why = f"several cells have such an id: {some}" if found else "no cell has such an id"
+        why = f"several {kinds} have such an id: {some}" if found else f"no {kinds} have such an id"
         raise StoreError(f"{beginning}: {why}; xrgs-store list shows them")
     return beginning if beginning in found else found[0]

@@ -95,8 +95,8 @@ def rerun(
         The comparison.
 
     Raises:
-        XrgsError: The folder holds no finished cell, or the config of another version; the variant
-            is missing and can't be built again; or the training failed.
+        XrgsError: The folder holds no finished cell, or a config with keys that there are no more;
+            the variant is missing and can't be built again; or the training failed.
     """
     try:
         return _rerun(folder, out, store, threads, photographs, plugins)
@@ -113,7 +113,7 @@ def _rerun(
     plugins: Sequence[str],
 ) -> RerunResult:
     original = CellFolder(folder)
-    conf, identity = _read(original)
+    conf, identity, added = _read(original)
     _check_plugins_allowed(original, conf, plugins)
     home = Store(store or _store_of(folder))
     conf.threads = conf.threads if threads is None else threads
@@ -123,7 +123,11 @@ def _rerun(
     repeated = CellFolder(_free_folder(out, folder))
     conf.splat.backend = resolve_backend(conf.splat.backend)
     now = cell_identity(conf, str(identity["variant"]))
-    before = [*_own_contradictions(original, identity, now), *_other_program(original, conf, now)]
+    before = [
+        *_newer_keys(added),
+        *_own_contradictions(original, identity, now, added),
+        *_other_program(original, conf, now),
+    ]
     title = "differences from when the cell was trained"
     for line in _listed(before, title) or ["code, libraries and machine are the same"]:
         log_line(line)
@@ -132,8 +136,11 @@ def _rerun(
     return RerunResult(repeated, before, [*_differences(original, repeated)])
 
 
-def _read(original: CellFolder) -> tuple[Conf, dict[str, Any]]:
-    """Return the cell's config, with the threads that it was trained with, and its identity."""
+def _read(original: CellFolder) -> tuple[Conf, dict[str, Any], dict[str, Any]]:
+    """Return the cell's config, its identity, and what was added to the config.
+
+    The config has the threads that the cell was trained with.
+    """
     if not original.folder.is_dir():
         raise XrgsError(f"rerun={original.path}: there is no such folder")
     for name in ("config.json", "identity.json", "provenance.json", "status.json"):
@@ -145,14 +152,14 @@ def _read(original: CellFolder) -> tuple[Conf, dict[str, Any]]:
     if state.name == "failed":
         reason = state.reason.partition("\n")[0]
         raise XrgsError(f"rerun={original.path}: the cell failed and has no results ({reason})")
-    conf = config.from_file(original.folder / "config.json")
+    conf, added = config.from_file(original.folder / "config.json")
     try:
         identity, conf.threads = original.identity(), int(original.provenance()["threads"])
     except (KeyError, OverflowError, TypeError, ValueError) as error:
         raise XrgsError(f"{original.path}: identity.json or provenance.json: {error!r}") from error
     if not _VARIANT.fullmatch(str(identity.get("variant"))):
         raise XrgsError(f"{original.folder / 'identity.json'}: variant={identity.get('variant')}")
-    return conf, identity
+    return conf, identity, added
 
 
 def _check_plugins_allowed(original: CellFolder, conf: Conf, allowed: Sequence[str]) -> None:
@@ -171,10 +178,23 @@ def _check_plugins_allowed(original: CellFolder, conf: Conf, allowed: Sequence[s
         )
 
 
+def _newer_keys(added: Mapping[str, Any]) -> Iterator[str]:
+    """Yield a line about the keys that the cell's config lacks, which is older than they are."""
+    if added:
+        values = ", ".join(f"{key}={value}" for key, value in added.items())
+        yield f"config.json lacks newer keys; their values in the baseline are taken: {values}"
+
+
 def _own_contradictions(
-    original: CellFolder, then: Mapping[str, Any], now: Mapping[str, Any]
+    original: CellFolder,
+    then: Mapping[str, Any],
+    now: Mapping[str, Any],
+    added: Mapping[str, Any],
 ) -> Iterator[str]:
-    """Yield contradictions between the folder's own files, which somebody must have changed."""
+    """Yield contradictions between the folder's own files, which somebody must have changed.
+
+    Its identity lacks the keys that were added to its config, too.
+    """
     state = original.state()
     if state.name != "done":
         yield f"the folder: {state.name}: {state.reason}"
@@ -182,8 +202,10 @@ def _own_contradictions(
     if _ID.fullmatch(named) and digest(then) != named:
         yield f"the folder: identity.json is that of cell {digest(then)}, not of {named}"
     not_in_config = {"arithmetic", "code", "protocol", "variant"}
+    newer = {f"{key}: None -> {_short(value)}" for key, value in added.items()}
     for line in _changes(_without(then, not_in_config), _without(now, not_in_config)):
-        yield f"identity.json against config.json: {line}"
+        if line not in newer:
+            yield f"identity.json against config.json: {line}"
 
 
 def _other_program(original: CellFolder, conf: Conf, now: Mapping[str, Any]) -> Iterator[str]:
@@ -211,6 +233,7 @@ def _without(values: Mapping[str, Any], names: set[str]) -> dict[str, Any]:
 
 
 def _changes(then: Any, now: Any, path: str = "") -> Iterator[str]:
+    then = {} if then is None and isinstance(now, dict) else then
     if not isinstance(then, dict) or not isinstance(now, dict):
         if then != now:
             yield f"{path}: {_short(then)} -> {_short(now)}"

@@ -54,7 +54,7 @@ def make_film(
         models: One model, or several of one world, which are shown side by side with their names.
         out: An .mp4 file, which is replaced, or a folder that is new or empty, for one PNG a frame.
         path: `orbit`, `spiral` or `test`, see `xrgs.viewer.paths`.
-        views: Number of frames.
+        views: Number of frames. All have the intrinsics of the first test view.
         size: Width and height of one model's panel, px, both even; None for the size of the first
             test view, without its last row or column where that is odd.
         fps: Frames a second of a film.

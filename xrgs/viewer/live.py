@@ -16,6 +16,8 @@ from contextlib import ExitStack, contextmanager, redirect_stdout
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
 from xrgs.capture.contact_sheet import COLOURS
 from xrgs.errors import XrgsError
 from xrgs.safeio.words import for_markdown
@@ -31,10 +33,16 @@ if TYPE_CHECKING:
     from xrgs.splat.cameras import Camera
     from xrgs.viewer.models import Model
 
+    _Place = dict[str, Any]  # by the names of _PLACE
+
 HOST = "127.0.0.1"
 #: A camera that was not moved by the user follows the one that was; what it reports of that arrives
 #: within so many seconds.
 _ECHO_S = 0.3
+#: How near to its place a camera is that has arrived there, world units.
+_NEAR = 1e-3
+#: What a place is: attributes of viser's cameras.
+_PLACE = ("position", "look_at", "up_direction", "fov")
 #: The size of a drawn camera, as a share of the cameras' median distance from what they look at.
 _FRUSTUM_SCALE = 0.04
 _PAGE = """<!doctype html>
@@ -74,13 +82,18 @@ def shown(models: Sequence[Model], port: int, limit: int) -> Iterator[str]:
     with ExitStack() as stack:
         page = _PageServer(port)
         stack.callback(page.server_close)
-        cameras, frames = _SharedCamera(), []
+        start = _start(reference(models))
+        cameras, frames = _SharedCamera(start), []
         for number, model in enumerate(models):
             wanted = port and port + 1 + number
             with _without_banners():
                 server = viser.ViserServer(HOST, wanted, verbose=False)
             stack.callback(_stop, server)
             _fill(server, model, reference(models), limit)
+            if start is not None:  # to which viser's own button leads back
+                home = server.initial_camera
+                home.position, home.look_at = start["position"], start["look_at"]
+                home.up, home.fov = start["up_direction"], start["fov"]
             server.on_client_connect(cameras.join)
             server.on_client_disconnect(cameras.leave)
             url = f"http://{HOST}:{server.get_port()}"
@@ -171,7 +184,7 @@ def count_text(model: Model, limit: int) -> str:
 
 
 def _add_cameras(server: ViserServer, world: Model) -> None:
-    """Draw the views' cameras in the colours of their kinds, and start at the first test view."""
+    """Draw the views' cameras in the colours of their kinds."""
     from viser.transforms import SO3
 
     if world.poses is None:
@@ -193,13 +206,20 @@ def _add_cameras(server: ViserServer, world: Model) -> None:
             frustum.on_click(_go_to)
         box = server.gui.add_checkbox(f"{kind}: {len(views)} cameras", initial_value=True)
         box.on_update(lambda event, parent=parent: setattr(parent, "visible", event.target.value))
-    up = up_direction(world.poses)
-    server.scene.set_up_direction(tuple(up))
+    server.scene.set_up_direction(tuple(up_direction(world.poses)))
+
+
+def _start(world: Model | None) -> _Place | None:
+    """Return the place of the first test view, which looks at what all cameras look at."""
+    if world is None or world.poses is None:
+        return None
     first = next(view.camera for view in world.views if view.kind == "test")
-    start = server.initial_camera
-    start.position, start.up = first.position.double().numpy(), up
-    start.look_at = look_at_point(world.poses)
-    start.fov = _vertical_fov(first)
+    return {
+        "position": first.position.double().numpy(),
+        "look_at": look_at_point(world.poses),
+        "up_direction": up_direction(world.poses),
+        "fov": _vertical_fov(first),
+    }
 
 
 def _vertical_fov(camera: Camera) -> float:
@@ -217,12 +237,16 @@ class _SharedCamera:
     """Lets the cameras of all frames follow the one that the user moves.
 
     A camera that follows reports its new place like one that is moved. So only one camera leads at
-    a time, and another one can lead when that has been at rest for a moment.
+    a time, and another one can lead when that has been at rest for a moment. A frame that is opened
+    first reports a place of the browser's own choice; it can lead once it has reported the place
+    that it was put to.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, start: _Place | None) -> None:
         self._lock = threading.Lock()
+        self._place = start
         self._clients: list[ClientHandle] = []
+        self._arrived: list[ClientHandle] = []
         self._leader: ClientHandle | None = None
         self._led_at = -_ECHO_S
 
@@ -230,24 +254,36 @@ class _SharedCamera:
         """Let a frame's camera follow and lead."""
         with self._lock:
             self._clients.append(client)
+            if self._place is not None:
+                _put(client, self._place)
         client.camera.on_update(self._moved)
 
     def leave(self, client: ClientHandle) -> None:
         """Forget a frame that was closed."""
         with self._lock:
-            if client in self._clients:
-                self._clients.remove(client)
+            for clients in (self._clients, self._arrived):
+                if client in clients:
+                    clients.remove(client)
 
     async def _moved(self, camera: CameraHandle) -> None:
         with self._lock:
             now, client = time.monotonic(), camera.client
+            if client not in self._arrived:
+                if self._place and not np.allclose(
+                    camera.position, self._place["position"], atol=_NEAR
+                ):
+                    return
+                self._arrived.append(client)
             if self._leader is not client and now - self._led_at < _ECHO_S:
                 return
             self._leader, self._led_at = client, now
+            self._place = {name: getattr(camera, name) for name in _PLACE}
             for other in self._clients:
                 if other is not client:
-                    with other.atomic():
-                        other.camera.position = camera.position
-                        other.camera.look_at = camera.look_at
-                        other.camera.up_direction = camera.up_direction
-                        other.camera.fov = camera.fov
+                    _put(other, self._place)
+
+
+def _put(client: ClientHandle, place: _Place) -> None:
+    with client.atomic():
+        for name in _PLACE:
+            setattr(client.camera, name, place[name])
