@@ -25,7 +25,7 @@ import numpy as np
 import pytest
 import torch
 
-from xrgs import config
+from xrgs import composing, config
 from xrgs.capture.dataset import Dataset, LoadedView
 from xrgs.capture.download import http
 from xrgs.evaluation.lpips import weights
@@ -89,7 +89,7 @@ def random_weights() -> weights.Weights:
 @pytest.fixture(scope="session")
 def compose() -> Callable[..., config.Conf]:
     """Return the function (*overrides) -> the config that `conf/` gives with these overrides."""
-    return config.compose
+    return composing.compose
 
 
 @pytest.fixture

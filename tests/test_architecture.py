@@ -25,6 +25,7 @@ FLOW = (
     "runtime",
     "splat",
     "config",
+    "composing",
     "capture",
     "training",
     "evaluation",
@@ -39,8 +40,8 @@ LAYER = {name: number for number, name in enumerate(FLOW)}
 #: Libraries that only these packages or modules may import.
 ONLY_IN = {
     "aiohttp": ("capture/download/exchange",),
-    "hydra": ("config", "sweep", "cli"),
-    "omegaconf": ("config", "sweep", "cli"),
+    "hydra": ("config", "composing", "sweep", "cli"),
+    "omegaconf": ("config", "composing", "sweep", "cli"),
     "pycolmap": ("capture/colmap", "capture/sfm"),
     "matplotlib": ("report",),
     "pandas": ("experiment", "report"),

@@ -15,15 +15,8 @@ from hypothesis import strategies as st
 from omegaconf import MISSING, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from xrgs.config import (
-    CONF_DIR,
-    Conf,
-    SplatConf,
-    error_line,
-    escape_interpolations,
-    from_dict,
-    from_file,
-)
+from xrgs.composing import error_line, escape_interpolations, from_dict, from_file
+from xrgs.config import CONF_DIR, Conf, SplatConf
 from xrgs.errors import XrgsError
 from xrgs.splat.settings import DensifySettings, OptimizerSettings, RasterSettings
 

@@ -22,7 +22,7 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from xrgs.capture.prepare import build_dataset, load_dataset
-    from xrgs.config import compose
+    from xrgs.composing import compose
     from xrgs.errors import XrgsError
     from xrgs.experiment.store import Store
     from xrgs.splat.cameras import Camera
@@ -64,7 +64,7 @@ _MODULES = {
     "Store": "xrgs.experiment.store",
     "XrgsError": "xrgs.errors",
     "build_dataset": "xrgs.capture.prepare",
-    "compose": "xrgs.config",
+    "compose": "xrgs.composing",
     "load_dataset": "xrgs.capture.prepare",
     "load_ply": "xrgs.splat.ply",
     "rasterization": "xrgs.splat.gsplat_api",

@@ -35,7 +35,7 @@ from tests.hostile.mutations import (
     mutate_json,
     mutate_npz,
 )
-from xrgs import config
+from xrgs import composing
 from xrgs.capture import failures, images, variant
 from xrgs.errors import StoreError, XrgsError
 from xrgs.experiment.cell_folder import CellFolder
@@ -122,7 +122,7 @@ def _of_cells(cell: Path) -> dict[str, Parser]:
         ),
         "json-object": Parser(cell / "summary.json", mutate_json, records.read_object, store_error),
         "table": Parser(cell / "scores.csv", mutate_csv, records.read_table, store_error),
-        "config": Parser(cell / "config.json", mutate_json, config.from_file, (XrgsError,)),
+        "config": Parser(cell / "config.json", mutate_json, composing.from_file, (XrgsError,)),
         "progress": Parser(
             cell / "progress.json", mutate_json, lambda file: str(progress.read(ConfinedPath(file)))
         ),

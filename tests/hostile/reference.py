@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
-from xrgs import config
+from xrgs import composing
 from xrgs.capture import variant
 from xrgs.config import Conf
 from xrgs.evaluation.protocol import PROTOCOL_VERSION
@@ -64,7 +64,7 @@ def build(path: Path) -> None:
 
 def _conf(label: str, seed: int) -> Conf:
     ablation = () if label == "baseline" else (f"+ablation={label}",)
-    return config.compose(*ablation, "scene=motorcycle", "preset=smoke", f"seed={seed}")
+    return composing.compose(*ablation, "scene=motorcycle", "preset=smoke", f"seed={seed}")
 
 
 def picture(seed: int, width: int, height: int) -> Image.Image:

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 from PIL import Image
 
-from xrgs import config
+from xrgs import composing
 from xrgs.capture import scenes
 from xrgs.errors import XrgsError
 from xrgs.experiment.store import Store
@@ -19,7 +19,7 @@ LONG_SIDE = 64
 
 
 def resolve(store: Path) -> None:
-    conf = config.compose("scene=procedural").scene
+    conf = composing.compose("scene=procedural").scene
     conf.views = 2
     scenes.resolve(conf, Store(store).scenes, LONG_SIDE)
 

@@ -17,7 +17,7 @@ from hydra.core.utils import JobReturn, JobStatus
 from hydra.types import HydraContext
 from omegaconf import DictConfig, OmegaConf
 
-from xrgs import config
+from xrgs import composing, config
 from xrgs.cli.arguments import with_quotes
 from xrgs.errors import XrgsError
 from xrgs.experiment.identity import cell_identity
@@ -260,7 +260,7 @@ def test_a_job_finds_its_folders_wherever_it_runs(
     monkeypatch.chdir(odd)
     hand_over = launch._job_of(cell, threads=3)
     monkeypatch.chdir(odd.parent)
-    given = config.from_dict(hand_over.config)
+    given = composing.from_dict(hand_over.config)
     assert (given.store, given.scene.path) == (str(odd / "s"), str(odd / "p"))
     assert (given.seed, given.threads) == (1, 3)
     assert given.splat.backend in {"native", "torch"}

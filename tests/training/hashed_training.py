@@ -13,7 +13,7 @@ import sys
 import torch
 from torch import Tensor
 
-from xrgs import config
+from xrgs import composing
 from xrgs.capture.dataset import Dataset, LoadedView
 from xrgs.splat.cameras import Camera
 from xrgs.splat.gaussians import PARAMETERS
@@ -53,7 +53,7 @@ _OVERRIDES = (
 
 def training_hash() -> str:
     """Train, and return the SHA-256 of the Gaussians and of the history, in hexadecimal digits."""
-    data, conf = _dataset(), config.compose(*_OVERRIDES)
+    data, conf = _dataset(), composing.compose(*_OVERRIDES)
     result = train(data, conf)
     counts = result.history[-1]
     rules = ("split", "duplicated", "pruned_opacity", "pruned_scale", "reset")

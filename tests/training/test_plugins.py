@@ -11,7 +11,8 @@ import pytest
 import torch
 
 from xrgs.capture.dataset import Dataset
-from xrgs.config import Conf, from_dict
+from xrgs.composing import from_dict
+from xrgs.config import Conf
 from xrgs.errors import XrgsError
 from xrgs.experiment import identity
 from xrgs.experiment.identity import cell_identity, changed_code

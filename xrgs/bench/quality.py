@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import torch
 
-from xrgs import config
+from xrgs import composing
 from xrgs.bench.loads import load_cell_dataset
 from xrgs.evaluation import metrics
 from xrgs.safeio.records import read_json
@@ -46,7 +46,7 @@ def compare(folder: Path, steps: int) -> list[dict[str, Any]]:
         XrgsError: The cell isn't done, or its variant isn't in the store.
     """
     data = load_cell_dataset(folder)
-    conf = config.from_dict(read_json(folder / "config.json"))
+    conf = composing.from_dict(read_json(folder / "config.json"))
     conf.train.steps = steps
     rows: list[dict[str, Any]] = []
     for name, changed in _changes(conf).items():
@@ -73,7 +73,7 @@ def _changes(conf: Conf) -> dict[str, Conf]:
     modes = [mode for mode in ("exact", "fold", "off") if mode != consistency.lr_mode]
     if consistency.weight != 0:
         names += [f"LR consistency {mode}" for mode in modes]
-    configs = {name: config.from_dict(asdict(conf)) for name in names}
+    configs = {name: composing.from_dict(asdict(conf)) for name in names}
     configs["another seed"].seed += 1
     configs["alpha cut 4/255"].splat.raster.alpha_min = 4 / 255
     configs["alpha cut 1/1020"].splat.raster.alpha_min = 1 / 1020

@@ -19,7 +19,7 @@ from pathlib import Path
 from statistics import median
 from typing import TYPE_CHECKING, Any
 
-from xrgs import config
+from xrgs import composing
 from xrgs.capture import variant
 from xrgs.capture.scenes import motorcycle
 from xrgs.errors import XrgsError
@@ -100,7 +100,7 @@ def _job_cost(template: Path, folder: Path) -> dict[str, float]:
     hashes every photograph of a scene, once for all of its cells.
     """
     cell = CellFolder(template)
-    conf, _ = config.from_file(template / "config.json")
+    conf, _ = composing.from_file(template / "config.json")
     photographs = folder / "photographs"
     photographs.mkdir()
     content = motorcycle.files()["motorcycle_left"].read_bytes()

@@ -15,9 +15,9 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import ConfigAttributeError, ConfigKeyError, OmegaConfBaseException
 
 import xrgs
-from xrgs import config
+from xrgs import composing, config
 from xrgs.capture.scenes.folder import ALL_BELOW
-from xrgs.config import escape_interpolations
+from xrgs.composing import escape_interpolations
 from xrgs.errors import XrgsError, did_you_mean
 from xrgs.runtime.streams import say
 from xrgs.safeio.paths import user_path
@@ -60,17 +60,17 @@ def _explained(error: Exception) -> str:
     if isinstance(error, MissingConfigException) and error.missing_cfg_file:
         return _missing_file(error.missing_cfg_file, error.options or ())
     if isinstance(error, OverrideParseException):
-        return f"{error.override}: {config.error_line(error)}"
+        return f"{error.override}: {composing.error_line(error)}"
     if found := _NOT_OVERRIDDEN.search(str(error)):
         key = found[1].partition("@")[0]
         return f"{key}: there is no such key{did_you_mean(key, config.known_keys())}"
     if isinstance(error, (ConfigKeyError, ConfigAttributeError)):
         parent = error.parent_node
         known = tuple(map(str, parent)) if isinstance(parent, DictConfig) else ()
-        return config.error_line(error) + did_you_mean(str(error.key), known)
+        return composing.error_line(error) + did_you_mean(str(error.key), known)
     if isinstance(error.__cause__, OmegaConfBaseException):  # it names the key and the value
         return _explained(error.__cause__)
-    return config.error_line(error)
+    return composing.error_line(error)
 
 
 def _missing_file(file: str, options: Sequence[str]) -> str:

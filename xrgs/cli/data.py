@@ -8,7 +8,7 @@ from typing import cast
 
 from omegaconf import OmegaConf
 
-from xrgs import config
+from xrgs import composing, config
 from xrgs.cli.arguments import (
     answer_version,
     choices,
@@ -101,7 +101,7 @@ def _inspect(words: list[str], values: dict[str, str]) -> str:
         folder = Path(words[0]).expanduser()
     else:
         overrides = with_quotes([f"{key}={value}" for key, value in values.items()])
-        conf = config.compose(*overrides)
+        conf = composing.compose(*overrides)
         store = Store(Path(conf.store))
         folder = store.variants / variants.find_or_build(conf, store)
     return variant.describe(folder, Path(out) if out else None)

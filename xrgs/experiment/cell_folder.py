@@ -522,7 +522,7 @@ class CellFolder:
         Raises:
             XrgsError: `config.json` can't be read, or is of another version's schema.
         """
-        from xrgs.config import from_file
+        from xrgs.composing import from_file
 
         return from_file(self.folder / "config.json")[0]
 

@@ -19,7 +19,7 @@ _MIN_SIDE = SSIM_WINDOW // 2 + 1
 def check(conf: Conf) -> None:
     """Refuse a config with which every cell of a sweep would fail.
 
-    `xrgs.config.to_conf` has checked what needs no knowledge of photographs.
+    `xrgs.composing.to_conf` has checked what needs no knowledge of photographs.
 
     Args:
         conf: A cell's config.

@@ -14,7 +14,7 @@ from itertools import count
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from xrgs import config
+from xrgs import composing
 from xrgs.errors import StoreError, XrgsError
 from xrgs.experiment import provenance, trimming
 from xrgs.experiment.cell_folder import CellFolder
@@ -152,7 +152,7 @@ def _read(original: CellFolder) -> tuple[Conf, dict[str, Any], dict[str, Any]]:
     if state.name == "failed":
         reason = state.reason.partition("\n")[0]
         raise XrgsError(f"rerun={original.path}: the cell failed and has no results ({reason})")
-    conf, added = config.from_file(original.folder / "config.json")
+    conf, added = composing.from_file(original.folder / "config.json")
     try:
         identity, conf.threads = original.identity(), int(original.provenance()["threads"])
     except (KeyError, OverflowError, TypeError, ValueError) as error:

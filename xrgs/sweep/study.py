@@ -23,7 +23,7 @@ from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from xrgs.capture import scenes
-from xrgs.config import to_conf
+from xrgs.composing import to_conf
 from xrgs.errors import StoreError, UnreadableError, XrgsError
 from xrgs.experiment.cell_folder import CellState
 from xrgs.experiment.store import Store

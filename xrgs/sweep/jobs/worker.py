@@ -159,7 +159,7 @@ def _death(code: int) -> WorkerError:
 
 def _build_variant(request: Mapping[str, Any]) -> dict[str, Any]:
     from xrgs.capture import variant
-    from xrgs.config import from_dict
+    from xrgs.composing import from_dict
     from xrgs.experiment.store import Store
 
     log_to_stderr()
@@ -183,7 +183,7 @@ def _import_colmap() -> None:
 
 def _run_cell(request: Mapping[str, Any]) -> dict[str, Any]:
     from xrgs.capture import variant
-    from xrgs.config import from_dict
+    from xrgs.composing import from_dict
     from xrgs.experiment import cell
     from xrgs.experiment.cell_folder import CellFolder
 
