@@ -149,7 +149,7 @@ FILE_FUNCTIONS: dict[str, dict[str, str]] = {
     "pandas.read_": {},
     "omegaconf.OmegaConf.load": {
         "cli/data": "the package's own config",
-        "config": "the package's own config",
+        "composing": "the package's own config",
     },
     "omegaconf.OmegaConf.save": {},
     "yaml.": {},
