@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import io
+import os
+import subprocess
 import sys
 from collections.abc import Callable
 from contextlib import nullcontext
@@ -39,6 +41,22 @@ def xrgs_store(call_command: Call, tmp_path: Path, monkeypatch: pytest.MonkeyPat
         return call_command("store", *arguments, "store=s")
 
     return run
+
+
+@pytest.mark.usefixtures("xrgs_store")
+def test_a_reader_of_the_list_that_ends_first_is_no_error(tmp_path: Path) -> None:
+    reader, writer = os.pipe()
+    os.close(reader)
+    words = ["-c", "from xrgs.cli.store import main; main()", "list", "store=s"]
+    done = subprocess.run(
+        [sys.executable, "-P", *words],
+        cwd=tmp_path,
+        stdout=writer,
+        stderr=subprocess.PIPE,
+        check=False,
+    )
+    os.close(writer)
+    assert (done.returncode, done.stderr) == (0, b"")
 
 
 def cells(tmp_path: Path) -> list[str]:

@@ -19,7 +19,7 @@ from xrgs import composing, config
 from xrgs.capture.scenes.folder import ALL_BELOW
 from xrgs.composing import escape_interpolations
 from xrgs.errors import XrgsError, did_you_mean
-from xrgs.runtime.streams import say
+from xrgs.runtime.streams import ignore_broken_pipe, say
 from xrgs.safeio.paths import user_path
 from xrgs.safeio.words import for_line
 
@@ -36,6 +36,8 @@ _PATHS = frozenset({"scene.path", "store", "data_root", "variant.poses"})
 def errors_as_messages(command: str, hint: str = "") -> Iterator[None]:
     """End the command with a message and code 1 on errors that the user can correct.
 
+    A reader of its output that ends first, as `head` does, is no error.
+
     Args:
         command: Name of the command, which begins the message.
         hint: Added to the message about an invalid argument.
@@ -43,6 +45,7 @@ def errors_as_messages(command: str, hint: str = "") -> Iterator[None]:
     Raises:
         SystemExit: With the message, in place of the error.
     """
+    ignore_broken_pipe()
     try:
         yield
     except XrgsError as error:
