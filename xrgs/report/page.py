@@ -21,6 +21,7 @@ from xrgs.report.joined import Choice, JoinedStore, report_name
 from xrgs.report.pictures import Picture, draw
 from xrgs.report.render import LATEX_PREAMBLE, TextTable, to_latex, to_markdown, to_text
 from xrgs.report.tables import Tables
+from xrgs.report.texture import texture_tables, with_texture
 from xrgs.report.training import table as training_table
 from xrgs.report.training import totals
 from xrgs.safeio.atomic import write_json, write_text
@@ -149,6 +150,7 @@ def build(
     sweep = read_cells(store, record["commands"], rows, METRICS)
     sweep = with_external(sweep, store, externals)
     store = replace(store, external=sweep.renders)
+    sweep = replace(sweep, views=with_texture(store, sweep.cells, sweep.views))
     comparison = compare(sweep.cells, METRICS, against)
     tables = Tables(comparison, contexts(store, sweep.cells, sweep.views))
     name = report_name(ids) + choice.suffix
@@ -188,7 +190,7 @@ def _write(
         store,
         sweep,
         tables,
-        [*_all_tables(tables), *runs.tables(comparison.base), _provenance_table(sweep)],
+        [*_page_tables(sweep, tables, runs), _provenance_table(sweep)],
         runs.curves,
         _warnings(sweep),
         pictures=pictures is None or bool(pictures),
@@ -254,6 +256,12 @@ def _csv(table: pd.DataFrame) -> str:
     return str(safe.to_csv(index=False, lineterminator="\n"))
 
 
+def _page_tables(sweep: Sweep, tables: Tables, runs: Runs) -> list[TextTable]:
+    """Return every table of a page but that of the provenance, in order."""
+    textures = texture_tables(tables.comparison, sweep.views)
+    return [*_all_tables(tables), *textures, *runs.tables(tables.comparison.base)]
+
+
 def _all_tables(tables: Tables) -> list[TextTable]:
     """Return every table of changes and values, overviews first."""
     comparison = tables.comparison
@@ -287,8 +295,7 @@ def _markdown_page(
         f"# Change from {for_markdown(tables.comparison.base)}\n",
         *(_command_line(sweep_id, command) for sweep_id, command in sweep.commands.items()),
         *(f"**{for_markdown(line)}**\n" for line in _warnings(sweep)),
-        *(to_markdown(table) for table in _all_tables(tables) if table.rows),
-        *(to_markdown(table) for table in runs.tables(tables.comparison.base) if table.rows),
+        *(to_markdown(table) for table in _page_tables(sweep, tables, runs) if table.rows),
         *(_picture_link(picture, folder) for picture in pictures),
         to_markdown(_provenance_table(sweep)),
     ]
