@@ -18,8 +18,9 @@ from xrgs.runtime.progress import Progress
 from xrgs.safeio.atomic import write_json
 from xrgs.sweep import monitor as monitor_module
 from xrgs.sweep.axes import CellSpec
-from xrgs.sweep.monitor import RunningCell, SweepMonitor
+from xrgs.sweep.monitor import SweepMonitor
 from xrgs.sweep.plan import PlannedCell
+from xrgs.sweep.snapshot import RunningCell
 
 
 class Cells:

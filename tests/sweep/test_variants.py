@@ -92,12 +92,13 @@ def test_a_scene_that_failed_is_not_tried_again_unless_asked(
 ) -> None:
     remember_failure(conf, store)
     monkeypatch.setattr(worker, "run_in_child", unexpected)
-    assert variants.plan(conf, store, allow_build=True) == PlannedVariant(error="no first pair")
+    failed_before = PlannedVariant(error="no first pair", remembered=True)
+    assert variants.plan(conf, store, allow_build=True) == failed_before
     conf.retry = "failed"
     assert variants.plan(conf, store, allow_build=False) == PlannedVariant()
     monkeypatch.setattr(worker, "run_in_child", fail)
     # The reason is the remembered one, so that the record of a repeated sweep is the same.
-    assert variants.plan(conf, store, allow_build=True) == PlannedVariant(error="no first pair")
+    assert variants.plan(conf, store, allow_build=True) == failed_before
 
 
 def test_a_failure_is_the_reason_in_the_plan_and_an_error_elsewhere(
@@ -223,6 +224,15 @@ def test_sweeps_of_a_scene_that_sfm_can_not_place(
     code, table, err = sweeps.run(*scene, "retry=failed", "fail_fast=true")
     assert code == 1
     assert BUILDING in err
+    assert HINT not in err
+
+
+def test_a_folder_that_is_missing_is_looked_for_again_without_retry(
+    sweeps_in: Callable[..., Any], tmp_path: Path
+) -> None:
+    code, _, err = sweeps_in(tmp_path).run("scene=folder", "scene.path=nowhere", "dry_run=true")
+    assert code == 1
+    assert "no such folder" in err
     assert HINT not in err
 
 

@@ -11,7 +11,7 @@ import sys
 import threading
 import time
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from statistics import fmean
 from typing import TYPE_CHECKING, Any, Self
 
@@ -19,7 +19,8 @@ from tqdm import tqdm
 
 from xrgs.experiment.cell_folder import CellFolder
 from xrgs.runtime import progress
-from xrgs.runtime.progress import format_duration, log_line
+from xrgs.runtime.progress import log_line
+from xrgs.sweep.snapshot import RunningCell, SweepSnapshot
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
@@ -43,118 +44,49 @@ _SILENT_S = 120.0
 _FileStamp = tuple[int, int] | None
 
 
-@dataclass(frozen=True)
-class RunningCell:
-    """A cell whose process is training or evaluating it."""
+class _Slowness:
+    """How many times longer the cells of this sweep take than was expected of them."""
 
-    cell: PlannedCell
-    progress: Progress
-    """The content of its progress file."""
-    steps: int = 0
-    """Number of its steps when it was last seen to train."""
-    slowness: float = 1.0
-    """How many times longer this sweep's cells took than was expected of them."""
+    def __init__(self) -> None:
+        """Start with a sweep of which no cell has begun."""
+        self._begun: dict[str, tuple[float, float]] = {}
+        """When each cell was first seen to run, and what was left of it, 0 to 1."""
+        self._took, self._expected = 0.0, 0.0
+        """Seconds that the cells took that are done, and that they were expected to take."""
 
-    @property
-    def share(self) -> float:
-        """The share of its training that is done, 0 to 1."""
-        if self.progress.unit == "step":
-            return self.progress.done / self.progress.total if self.progress.total else 0.0
-        if self.progress.what != "evaluating":
-            return 0.0
-        train = self.cell.conf.train
-        if not train.evaluate_every:
-            return 1.0
-        # Evaluated at a multiple of so many steps, that the last count was before, or at the end.
-        evaluated = (self.steps // train.evaluate_every + 1) * train.evaluate_every
-        return min(1.0, evaluated / train.steps)
+    def begin(self, running: RunningCell) -> None:
+        """Note a cell that runs; what is known of it already stays."""
+        self._begun.setdefault(str(running.cell.cell_id), (time.monotonic(), 1 - running.share))
 
-    @property
-    def pace(self) -> float | None:
-        """Recent seconds per step; None if it is not training, or its rate is not known yet."""
-        rate = self.progress.rate
-        return 1 / rate if self.progress.unit == "step" and rate else None
+    def end(self, cell: PlannedCell) -> None:
+        """Note a cell that is done; one that was not seen to run tells nothing."""
+        begun = self._begun.get(str(cell.cell_id))
+        if begun is not None and cell.seconds is not None:
+            since, left = begun
+            self._took += time.monotonic() - since
+            self._expected += left * cell.seconds
 
-    @property
-    def left_s(self) -> float | None:
-        """Expected seconds to its end; None if unknown.
+    def ratio(self, plan: Sequence[PlannedCell], running: Sequence[RunningCell]) -> float:
+        """Return the ratio of both sums over the cells that are done and what is done of others.
 
-        Its own pace says little at first, when it has few Gaussians. The times of past cells say
-        less and less towards the end. The two are averaged, weighted by the share that is done.
-        What comes after its steps is known from past cells alone.
+        A part of a cell that took as long as was expected is added: the first steps of a cell,
+        which has few Gaussians then, say little.
+
+        Args:
+            plan: All cells of the sweep.
+            running: Those that run now, which have begun.
         """
-        after = (self.cell.scoring_s or 0.0) * self.slowness
-        past, own = self.cell.seconds, self.progress.remaining_s
-        if past is not None:
-            past = (1 - self.share) * (past * self.slowness - after) + after
-        if own is not None and self.progress.unit == "step":
-            own += after
-        elif self.share < 1:  # of the views that it loads or evaluates amid its steps
-            own = None
-        if past is None or own is None:
-            return own if past is None else past
-        return (1 - self.share) * past + self.share * own
-
-
-@dataclass(frozen=True)
-class SweepSnapshot:
-    """The states of a plan's cells at one moment."""
-
-    done: int
-    failed: int
-    running: tuple[RunningCell, ...]
-    elsewhere: tuple[RunningCell, ...]
-    """Cells that another sweep is training."""
-    waiting: tuple[PlannedCell, ...]
-    pace: float | None
-    """Mean seconds per step of this sweep's running cells; None before any is known."""
-    at_once: int = 1
-    """The most cells that this sweep was seen to train at once."""
-    slowness: float = 1.0
-    """How many times longer this sweep's cells took than was expected of them."""
-
-    @property
-    def ended(self) -> int:
-        """Number of cells that are done or failed."""
-        return self.done + self.failed
-
-    @property
-    def total(self) -> int:
-        """Number of all cells."""
-        return self.ended + len(self.running) + len(self.elsewhere) + len(self.waiting)
-
-    @property
-    def left_s(self) -> float | None:
-        """Expected seconds left, if as many cells run at once as did so far."""
-        waiting = [self._expected(cell) for cell in self.waiting]
-        running = [cell.left_s for cell in self.running]
-        others = [cell.left_s for cell in self.elsewhere]
-        known = [seconds for seconds in (*waiting, *running) if seconds is not None]
-        if len(known) < len(waiting) + len(running):
-            return None
-        longest = max((s for s in (*known, *others) if s is not None), default=None)
-        return longest and max(longest, sum(known) / self.at_once)
-
-    def _expected(self, cell: PlannedCell) -> float | None:
-        if cell.seconds is not None:
-            return cell.seconds * self.slowness
-        return None if self.pace is None else cell.conf.train.steps * self.pace
-
-    def __str__(self) -> str:
-        parts = [f"{self.done} of {self.total} cells done"]
-        if self.failed:
-            parts.append(f"{self.failed} failed")
-        if self.elsewhere:
-            parts.append(f"{len(self.elsewhere)} in another sweep")
-        if len(self.running) == 1:
-            parts.append(self.running[0].progress.count)
-        elif self.running:
-            parts.append(f"{len(self.running)} in training")
-        if rate := sum(1 / cell.pace for cell in self.running if cell.pace):
-            parts.append(f"{rate:.3g} steps/s")
-        if self.left_s is not None:
-            parts.append(f"{format_duration(self.left_s)} left")
-        return ", ".join(parts)
+        took, expected = self._took, self._expected
+        for cell in running:
+            since, left = self._begun[str(cell.cell.cell_id)]
+            if cell.cell.seconds is not None:
+                took += time.monotonic() - since
+                expected += (cell.share - (1 - left)) * cell.cell.seconds
+        known = [cell.seconds for cell in plan if cell.seconds is not None]
+        if not expected or not any(known):
+            return 1.0
+        certain = _CERTAIN * fmean(known)
+        return (took + certain) / (expected + certain)
 
 
 class SweepMonitor:
@@ -178,10 +110,7 @@ class SweepMonitor:
         self._pace: float | None = None
         self._steps: dict[str, int] = {}
         """The last count of steps of each cell that was seen to train."""
-        self._begun: dict[str, tuple[float, float]] = {}
-        """When each cell of this sweep was first seen to run, and what was left of it, 0 to 1."""
-        self._took, self._expected = 0.0, 0.0
-        """Seconds that this sweep's cells took that are done, and that they were expected to."""
+        self._slowness = _Slowness()
         self._at_once = 1
         self._shown, self._shown_at = 0, time.monotonic()
         """Number of ended cells in the last line of a log, and when that was written."""
@@ -250,7 +179,7 @@ class SweepMonitor:
             else:
                 in_other_sweep = cell.state.name == "running"
                 (elsewhere if in_other_sweep else running).append(self._running(cell, now))
-        slowness = self._slowness(running)
+        slowness = self._slowness.ratio(self._plan, running)
         running = [replace(cell, slowness=slowness) for cell in running]
         paces = [cell.pace for cell in running if cell.pace]
         self._pace = fmean(paces) if paces else self._pace
@@ -266,43 +195,14 @@ class SweepMonitor:
             slowness,
         )
 
-    def _slowness(self, running: Sequence[RunningCell]) -> float:
-        """Return how many times longer this sweep's cells take than was expected of them.
-
-        It is the ratio of both sums over the cells that are done and what is done of others,
-        together with a part of a cell that took as long as was expected: the first steps of a
-        cell, which has few Gaussians then, say little.
-        """
-        took, expected = self._took, self._expected
-        known = [cell.seconds for cell in self._plan if cell.seconds is not None]
-        for cell in running:
-            since, left = self._begun[str(cell.cell.cell_id)]
-            if cell.cell.seconds is not None:
-                took += time.monotonic() - since
-                expected += (cell.share - (1 - left)) * cell.cell.seconds
-        if not expected or not any(known):
-            return 1.0
-        certain = _CERTAIN * fmean(known)
-        return (took + certain) / (expected + certain)
-
     def _running(self, cell: PlannedCell, now: Progress) -> RunningCell:
         name = str(cell.cell_id)
         if now.unit == "step":
             self._steps[name] = now.done
         running = RunningCell(cell, now, self._steps.get(name, 0))
         if cell.state.name != "running":
-            self._begun.setdefault(name, (time.monotonic(), 1 - running.share))
+            self._slowness.begin(running)
         return running
-
-    def _end(self, cell: PlannedCell, state: str) -> None:
-        """Keep the state of a cell that has ended, and how long it took if it is done."""
-        name = str(cell.cell_id)
-        self._ended[name] = state
-        begun = self._begun.get(name)
-        if state == "done" and begun is not None and cell.seconds is not None:
-            since, left = begun
-            self._took += time.monotonic() - since
-            self._expected += left * cell.seconds
 
     def _state(self, cell: PlannedCell, begun: set[str]) -> str:
         """Return `done`, `failed`, or nothing while the cell is neither."""
@@ -320,7 +220,9 @@ class SweepMonitor:
             state = folder.state(verify=False).name
             if state == "unknown":  # it is read again
                 return ""
-            self._end(cell, "done" if state == "done" else "failed")
+            if state == "done":
+                self._slowness.end(cell)
+            self._ended[name] = "done" if state == "done" else "failed"
         return self._ended[name]
 
     def _progress(self, cell: PlannedCell, begun: set[str]) -> Progress | None:

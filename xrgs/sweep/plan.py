@@ -41,6 +41,8 @@ class PlannedCell:
     state: CellState = field(default_factory=lambda: CellState("absent"))
     error: str | None = None
     """Why the cell can't be trained: its scene failed, or the cell that it takes a count from."""
+    remembered: bool = False
+    """Whether the store keeps the error of its scene, as it keeps that of a failed cell."""
     seconds: float | None = None
     """Expected seconds from its start to its end; None where nothing is known to go by."""
     scoring_s: float | None = None
@@ -212,7 +214,7 @@ def describe(plan: Sequence[PlannedCell]) -> str:
         time_left = format_duration(cell.seconds) if to_train else ""
         line = f"  {state:<10} {cell_id:<18} {time_left:>8}  {cell.name}"
         lines.append(f"{line}  ({reason})" if reason else line)
-    failed = any(cell.error or cell.state.name == "failed" for cell in plan)
+    failed = any(cell.remembered or cell.state.name == "failed" for cell in plan)
     if plan[0].conf.retry != "failed" and failed:
         lines.append("failed cells are not trained again; retry=failed trains them again")
     return "\n".join(map(for_line, lines))

@@ -289,7 +289,15 @@ class Study:
                 results[key] = variants.plan(cell.conf, store, allow_build=allow_build)
             found = results[key]
             state = CellState("unknown", found.unknown) if found.unknown else CellState("absent")
-            cells.append(replace(cell, variant_id=found.id, error=found.error, state=state))
+            cells.append(
+                replace(
+                    cell,
+                    variant_id=found.id,
+                    error=found.error,
+                    remembered=found.remembered,
+                    state=state,
+                )
+            )
         return cells
 
     def _looked_again(self, plan: Sequence[PlannedCell], store: Store) -> list[PlannedCell]:

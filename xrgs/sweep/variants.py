@@ -27,6 +27,8 @@ class PlannedVariant:
     id: str | None = None
     error: str | None = None
     """Why its scene can't be made into a variant."""
+    remembered: bool = False
+    """Whether the store keeps the error, so that only `retry=failed` tries the scene again."""
     unknown: str | None = None
     """Which file can't be read now, so that nothing is known of it."""
 
@@ -124,7 +126,7 @@ def _find_or_build(conf: Conf, store: Store, *, allow_build: bool) -> PlannedVar
             return PlannedVariant(trimmed)
         failure = None if conf.retry == "failed" else variant.failure(store.variants, key)
         if failure:
-            return PlannedVariant(error=failure)
+            return PlannedVariant(error=failure, remembered=True)
         if allow_build:
             return PlannedVariant(build(conf, store))
         _check_headers(conf)
@@ -139,7 +141,7 @@ def _find_or_build(conf: Conf, store: Store, *, allow_build: bool) -> PlannedVar
         # The plan says why, in the words that the store remembers: a sweep that is planned again
         # gives the same record.
         remembered = variant.failure(store.variants, key) if key else None
-        return PlannedVariant(error=remembered or str(error))
+        return PlannedVariant(error=remembered or str(error), remembered=remembered is not None)
 
 
 def _check_headers(conf: Conf) -> None:
