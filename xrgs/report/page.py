@@ -18,6 +18,7 @@ from xrgs.report.external import with_external
 from xrgs.report.gap import gap_tables
 from xrgs.report.html import write_document
 from xrgs.report.joined import Choice, JoinedStore, report_name
+from xrgs.report.paper import paper_tables
 from xrgs.report.pictures import Picture, draw
 from xrgs.report.render import LATEX_PREAMBLE, TextTable, to_latex, to_markdown, to_text
 from xrgs.report.tables import Tables
@@ -265,12 +266,18 @@ def _page_tables(sweep: Sweep, tables: Tables, runs: Runs) -> list[TextTable]:
 def _all_tables(tables: Tables) -> list[TextTable]:
     """Return every table of changes and values, overviews first."""
     comparison = tables.comparison
-    result = [*tables.overviews(), *gap_tables(comparison), *_ablation_tables(tables)]
+    result = [*_overviews(tables), *_ablation_tables(tables)]
     conditions = dict.fromkeys(comparison.cells["condition"])
     result += [tables.scores(name) for name in conditions]
     result += [tables.values(name) for name in conditions]
     missing = tables.missing()
     return result + ([missing] if missing else [])
+
+
+def _overviews(tables: Tables) -> list[TextTable]:
+    """Return the tables of all ablations: what changes, what the paper says, what gap is closed."""
+    comparison = tables.comparison
+    return [*tables.overviews(), *paper_tables(comparison), *gap_tables(comparison)]
 
 
 def _ablation_tables(tables: Tables) -> list[TextTable]:
@@ -364,7 +371,7 @@ def _other_programs(sweep: Sweep) -> list[str]:
 def _text(tables: Tables, warnings: list[str]) -> str:
     """Return what a command prints: at most so many tables that they can be read."""
     comparison = tables.comparison
-    printed = [*tables.overviews(), *gap_tables(comparison)]
+    printed = _overviews(tables)
     if len(comparison.groups) <= _MAX_PRINTED_ABLATIONS:
         printed += _ablation_tables(tables)
     if not comparison.groups:
