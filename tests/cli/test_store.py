@@ -66,7 +66,7 @@ def cells(tmp_path: Path) -> list[str]:
 def test_cells_are_listed_and_one_is_shown(xrgs_store: Call) -> None:
     code, out, _ = xrgs_store("list", "ablations=mip")
     assert code == 0
-    assert out.startswith("1 cells, ")
+    assert out.startswith("1 cell, ")
     assert "abd   fern   mip" in out
     code, out, _ = xrgs_store("show", "abd")
     assert code == 0
@@ -81,7 +81,7 @@ def test_nothing_is_removed_without_a_yes(
 ) -> None:
     code, out, _ = xrgs_store("rm", "abd", "dry_run=true")
     assert code == 0
-    assert "to remove: 1 cells: " in out
+    assert "to remove: cells (1): " in out
     assert "abd  fern / mip, done" in out
     monkeypatch.setattr(sys, "stdin", io.StringIO("y\n"))  # no terminal: nobody has answered
     code, _, err = xrgs_store("rm", "abd")

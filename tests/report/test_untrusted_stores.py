@@ -224,7 +224,7 @@ def test_a_cell_that_cannot_be_read_now_is_a_row_with_the_reason(
     report = build(store.path)
     page = (report.folder / "table.md").read_text()
     for text in (report.text, page):
-        assert "1 cells can't be read now: run the report again" in text.replace("\\", "")
+        assert "1 cell can't be read now: run the report again" in text.replace("\\", "")
     (row,) = [line for line in report.text.splitlines() if "unknown" in line]
     assert "summary.json: " in row
     assert os.strerror(errno.EIO) in row

@@ -73,9 +73,9 @@ def test_gc_says_what_it_removes_and_removes_that_alone(store: Store) -> None:
     before = names(store)
     plan = gc(store)
     text = str(plan)
-    assert "1 cells of old code, 1 failed cells, 1 failed scenes" in text
-    assert "1 of the cells are done: 1 sweeps lose them from their reports" in text
-    assert "1 variants without a cell are left alone: they are new" in text
+    assert "cells of old code (1), failed cells (1), failed scenes (1)" in text
+    assert "done, and in reports of 1 sweep: 1 cell" in text
+    assert "left alone, new and without a cell: 1 variant" in text
     assert names(store) == before
     freed, left = carry_out(store, plan)
     assert left == []
@@ -133,7 +133,7 @@ def test_a_cell_that_is_trained_is_never_touched(store: Store) -> None:
     assert store.cell("half1").state().name == "unfinished"
     assert not store.cell("done1").path.exists()
     plan = plan_removal(store, summaries(store))
-    assert plan == Plan("remove", (), ("1 cells are left alone: they are being trained",))
+    assert plan == Plan("remove", (), ("left alone, being trained: 1 cell",))
 
 
 def test_a_cell_that_has_changed_since_the_plan_is_left(store: Store) -> None:
@@ -164,9 +164,9 @@ def test_what_cannot_be_removed_hides_no_other(
 def test_trimmed_cells_stay_done_and_variants_in_use_are_left(store: Store) -> None:
     cells = summaries(store)
     plan = plan_trim(store, cells, cells, variants=True)
-    assert plan.total == "2 cells, 1 variants: 11 kB"
-    assert "2 cells are left alone: they are not done" in str(plan)
-    assert "1 variants are left alone: cells of them are not done" in str(plan)
+    assert plan.total == "cells (2), variants (1): 11 kB"
+    assert "left alone, not done: 2 cells" in str(plan)
+    assert "left alone, with cells that are not done: 1 variant" in str(plan)
     assert carry_out(store, plan) == (11_000, [])
     assert store.cell("done1").state().name == "done"
     assert not (store.cell("done1").path / "renders").exists()

@@ -110,7 +110,7 @@ def test_the_plan_says_how_long_the_remaining_training_takes(
     ]
     first, *rows = describe(plan).splitlines()
     assert first.startswith("plan: 5 cells, 1 done; left to train, one after another: ~70 s")
-    assert "1 cells without an estimate" in first
+    assert "1 cell without an estimate" in first
     assert "~40 s" in rows[1]
     assert "retry=failed" in rows[-1]
     again = [replace(each, conf=replace(each.conf, retry="failed")) for each in plan]

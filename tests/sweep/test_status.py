@@ -78,8 +78,8 @@ def test_every_cell_is_counted_and_told_why(store: Store) -> None:
     text = describe(read(store.path))
     assert "7 cells" in text
     assert "3 done, 1 running, 1 unfinished, 1 failed, 1 corrupt" in text
-    assert "1 folders of earlier attempts" in text
-    assert "1 variants, 1 sweeps" in text
+    assert "1 folder of earlier attempts" in text
+    assert "1 variant, 1 sweep" in text
     assert "failed  statue / ?  ended by SIGKILL\n" in text
     (sweep_id,) = store.sweep_ids()
     assert f"busy  statue / mip  sweep {sweep_id}  by process {os.getpid()} on" in text
@@ -94,8 +94,8 @@ def test_a_stale_cell_names_the_files_that_are_others_now(store: Store) -> None:
     stale = {cell.id: cell.stale for cell in read(store.path).cells if cell.stale}
     assert stale == {"stale": ("gone.py", "splat/densify.py")}
     text = describe(read(store.path))
-    assert "stale: 1 done cells" in text
-    assert "  splat/densify.py: 1 cells" in text
+    assert "stale: 1 done cell of" in text
+    assert "  splat/densify.py: 1 cell" in text
 
 
 def test_a_cell_of_another_arithmetic_is_stale(
@@ -184,7 +184,7 @@ def test_a_folder_that_cannot_be_listed_is_named_and_hides_no_other(
     text = describe(read(intact.path))
     assert (f"  {path}: " in text) == (folder != "locks" or kind == "unreadable")
     assert ("3 done" in text) == (folder != "cells")
-    assert ("1 sweeps recorded" in text) == (folder != "sweeps")
+    assert ("1 sweep recorded" in text) == (folder != "sweeps")
 
 
 def test_what_is_no_cell_is_named(intact: Store, tmp_path: Path) -> None:
@@ -264,7 +264,7 @@ def test_names_of_a_store_are_not_obeyed_and_stay_on_their_lines(store: Store) -
     assert text.replace("\n", "").isprintable()
     assert [line for line in text.split("\n") if line.startswith(("store", "stale:"))] == [
         f"store {path.parent}/s [2J store s: 99 cells: 8 cells",
-        "stale: 2 done cells were trained with other code or arithmetic than here",
+        "stale: 2 done cells of other code or arithmetic than here",
     ]
 
 

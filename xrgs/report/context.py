@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 from xrgs.experiment.cell_folder import READING_ERRORS
 from xrgs.experiment.results import cell_columns
-from xrgs.safeio.words import for_line
+from xrgs.safeio.words import counted, for_line
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping, Sequence
@@ -168,7 +168,7 @@ def _cautions(
 ) -> tuple[str, ...]:
     """Return sentences on scores of too few views, and of views that were trained on."""
     few = [
-        f"{scene} has {count} scored view{'s' * (count != 1)}: its scores say little of other views"
+        f"{scene} has {counted(count, 'scored view')}: its scores say little of other views"
         for scene, count in tests.items()
         if count < _ENOUGH_VIEWS
     ]

@@ -27,7 +27,7 @@ from xrgs.report.training import table as training_table
 from xrgs.report.training import totals
 from xrgs.safeio.atomic import write_json, write_text
 from xrgs.safeio.confined import ConfinedPath
-from xrgs.safeio.words import for_csv, for_file_name, for_line, for_markdown
+from xrgs.safeio.words import counted, for_csv, for_file_name, for_line, for_markdown
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -341,7 +341,7 @@ def _warnings(sweep: Sweep) -> list[str]:
         )
     unknown = sweep.cells.loc[sweep.cells["state"] == "unknown", "cell_id"].nunique()
     if unknown:
-        warnings.append(f"{unknown} cells can't be read now: run the report again.")
+        warnings.append(f"{counted(unknown, 'cell')} can't be read now: run the report again.")
     shares = sorted({share for share in sweep.cells["validation"].dropna() if share > 0})
     if shares:
         listed = ", ".join(f"train.validation={share:g}" for share in shares)

@@ -17,6 +17,7 @@ from xrgs.report.writing import (
     lacking,
     percent,
 )
+from xrgs.safeio.words import counted
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -124,7 +125,7 @@ def _table(
         if metric.name in column.changes
         and (found := changes.get((label, condition, metric.name))) is not None
     ]
-    of = scene or f"mean over {scenes} scene{'s' * (scenes != 1)}"
+    of = scene or f"mean over {counted(scenes, 'scene')}"
     table = TextTable(
         title=titled(f"Beside {column.title}: {of}", condition),
         columns=(

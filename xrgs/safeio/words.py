@@ -71,6 +71,16 @@ def for_line(text: str, limit: int = MAX_LINE) -> str:
     return _INVISIBLE.sub(" ", text)
 
 
+def counted(number: int, noun: str) -> str:
+    """Write a number with its noun: `1 cell`, `2 cells`.
+
+    Args:
+        number: How many there are.
+        noun: What they are, in the singular; its plural has an s more.
+    """
+    return f"{number} {noun}{'s' * (number != 1)}"
+
+
 def for_terminal(text: str) -> str:
     """Make a whole text safe for a terminal or a log; its line breaks are kept.
 

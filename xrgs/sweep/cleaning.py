@@ -19,7 +19,7 @@ from xrgs.errors import StoreError, XrgsError
 from xrgs.experiment import trimming
 from xrgs.safeio.records import list_folder
 from xrgs.safeio.untrusted import is_name
-from xrgs.safeio.words import for_line
+from xrgs.safeio.words import counted, for_line
 from xrgs.sweep import locks
 from xrgs.sweep.inventory import size_of, size_text
 
@@ -69,10 +69,10 @@ class Plan:
 
     @property
     def total(self) -> str:
-        """How much it is, for people: `12 cells of old code, 3 variants: 340 MB`."""
+        """How much it is, for people: `cells of old code (12), variants (3): 340 MB`."""
         counts = Counter(item.kind for item in self.items)
         size = size_text(sum(item.bytes for item in self.items))
-        return f"{', '.join(f'{count} {kind}' for kind, count in counts.items())}: {size}"
+        return f"{', '.join(f'{kind} ({count})' for kind, count in counts.items())}: {size}"
 
     def __str__(self) -> str:
         lines = [f"to {self.verb}: {self.total}" if self.items else f"nothing to {self.verb}"]
@@ -110,7 +110,7 @@ def plan_trim(
     """
     done = [cell for cell in chosen if cell.state.name == "done"]
     left = len(chosen) - len(done)
-    notes = [f"{left} cells are left alone: they are not done"] if left else []
+    notes = [f"left alone, not done: {counted(left, 'cell')}"] if left else []
     items = [
         Item("cells", cell.name, size, cell.id, partial(_trim_cell, cell))
         for cell in done
@@ -122,7 +122,9 @@ def plan_trim(
         needed = {cell.variant_id for cell in cells if cell.state.name != "done"}
         used = {cell.variant_id for cell in done if cell.variant_id is not None}
         if kept := used & needed:
-            notes.append(f"{len(kept)} variants are left alone: cells of them are not done")
+            notes.append(
+                f"left alone, with cells that are not done: {counted(len(kept), 'variant')}"
+            )
         items += [
             Item("variants", name, size, None, partial(_trim_variant, store, name))
             for name in sorted(used - needed)
@@ -209,7 +211,7 @@ def _without_running(cells: Iterable[CellSummary]) -> tuple[list[CellSummary], l
     cells = list(cells)
     idle = [cell for cell in cells if cell.state.name != "running"]
     running = len(cells) - len(idle)
-    return idle, [f"{running} cells are left alone: they are being trained"] if running else []
+    return idle, [f"left alone, being trained: {counted(running, 'cell')}"] if running else []
 
 
 def _recorded(cells: Sequence[CellSummary]) -> list[str]:
@@ -218,7 +220,9 @@ def _recorded(cells: Sequence[CellSummary]) -> list[str]:
     if not done:
         return []
     sweeps = {sweep_id for cell in done for sweep_id in cell.names.sweeps}
-    return [f"{len(done)} of the cells are done: {len(sweeps)} sweeps lose them from their reports"]
+    return [
+        f"done, and in reports of {counted(len(sweeps), 'sweep')}: {counted(len(done), 'cell')}"
+    ]
 
 
 def _removals(store: Store, kind: str, cells: Iterable[CellSummary]) -> Iterator[Item]:
@@ -311,5 +315,5 @@ def _orphans(
             is_new = True
         new += is_new
         orphans += [] if is_new else [name]
-    notes = [f"{new} variants without a cell are left alone: they are new"] if new else []
+    notes = [f"left alone, new and without a cell: {counted(new, 'variant')}"] if new else []
     return [*_folders("variants without a cell", store.variants, orphans)], notes

@@ -16,6 +16,7 @@ from xrgs.report.render import TextTable, to_text
 from xrgs.runtime.progress import log_line
 from xrgs.safeio.records import read_json
 from xrgs.safeio.untrusted import is_name
+from xrgs.safeio.words import counted
 from xrgs.splat.backend import arithmetic
 from xrgs.sweep import locks
 from xrgs.training import plugins
@@ -351,7 +352,7 @@ def list_cells(cells: Sequence[CellSummary], sort: str) -> str:
     total = size_text(sum(size or 0 for _, _, size in sized))
     return to_text(
         TextTable(
-            f"{len(rows)} cells, {total}",
+            f"{counted(len(rows), 'cell')}, {total}",
             ("cell", "scene", "ablation", "seed", "state", "age", "size"),
             tuple(rows),
             "lllrlrr",

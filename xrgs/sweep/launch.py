@@ -26,7 +26,7 @@ from xrgs.runtime.machine import usable_cores
 from xrgs.runtime.progress import log_line
 from xrgs.safeio.confined import ConfinedPath, RootMissingError
 from xrgs.safeio.hashing import to_plain
-from xrgs.safeio.words import for_line
+from xrgs.safeio.words import counted, for_line
 from xrgs.splat.backend import resolve_backend
 from xrgs.sweep import locks, presence
 from xrgs.sweep.jobs import worker
@@ -260,7 +260,8 @@ class Launches:
         self, cells: Sequence[PlannedCell], threads: int, store: Store
     ) -> dict[str, str]:
         if self._name != "basic":
-            log_line(f"hydra/launcher={self._name}: {len(cells)} cells, threads={threads} each")
+            number = counted(len(cells), "cell")
+            log_line(f"hydra/launcher={self._name}: {number}, threads={threads} each")
         session = cast("SweepSession", self._session)
         dead = locks.confirmed(store.locks)
         jobs = [_job_of(cell, threads, dead.get(str(cell.cell_id), ())) for cell in cells]

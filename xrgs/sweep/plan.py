@@ -11,7 +11,7 @@ from xrgs.experiment.identity import cell_identity
 from xrgs.experiment.store import BASELINE
 from xrgs.runtime.progress import format_duration
 from xrgs.safeio.hashing import digest, to_plain
-from xrgs.safeio.words import for_line
+from xrgs.safeio.words import counted, for_line
 from xrgs.splat.backend import resolve_backend
 from xrgs.sweep.estimate import TORCH_SLOWDOWN
 
@@ -200,7 +200,7 @@ def describe(plan: Sequence[PlannedCell]) -> str:
         plan: All cells.
     """
     done = sum(cell.state.name == "done" for cell in plan)
-    lines = [f"plan: {len(plan)} cell{'s' * (len(plan) != 1)}, {done} done{_remaining(plan)}"]
+    lines = [f"plan: {counted(len(plan), 'cell')}, {done} done{_remaining(plan)}"]
     said = set[str]()
     for cell in plan:
         state, reason = _shown_state(cell)
@@ -251,7 +251,8 @@ def without_kernels(plan: Sequence[PlannedCell]) -> str:
     complete = len(known) == len(cells)
     instead = f"{torch} instead of {native}" if complete else "30 to 60 times longer"
     return (
-        f"the kernels were not built on this machine: torch trains {len(cells)} cells, {instead}; "
+        f"the kernels were not built on this machine: torch trains"
+        f" {counted(len(cells), 'cell')}, {instead}; "
         "`pip install --force-reinstall --no-deps .` builds them with a C++17 compiler or with "
         "PyPI's ziglang"
     )
@@ -343,7 +344,7 @@ def _remaining(plan: Sequence[PlannedCell]) -> str:
     if not known:
         return ""
     unknown = len(remaining) - len(known)
-    more = f" and {unknown} cells without an estimate" if unknown else ""
+    more = f" and {counted(unknown, 'cell')} without an estimate" if unknown else ""
     return f"; left to train, one after another: {format_duration(sum(known))}{more}"
 
 

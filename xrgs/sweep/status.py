@@ -12,7 +12,7 @@ from xrgs.errors import StoreError
 from xrgs.experiment.store import Store
 from xrgs.safeio.records import list_folder
 from xrgs.safeio.untrusted import is_name
-from xrgs.safeio.words import MAX_CELL, for_line
+from xrgs.safeio.words import MAX_CELL, counted, for_line
 from xrgs.sweep import locks
 from xrgs.sweep.inventory import STATES, CellNames, file_bytes, recorded_names, size_text, summarise
 
@@ -141,10 +141,12 @@ def describe(status: StoreStatus) -> str:
     counts = Counter(cell.state.name for cell in status.cells)
     stale = [cell for cell in status.cells if cell.stale]
     parts = [f"{counts[state]} {state}" for state in STATES if counts[state]]
-    lines = [f"store {status.path}: {len(status.cells)} cells", "  " + (", ".join(parts) or "none")]
+    lines = [f"store {status.path}: {counted(len(status.cells), 'cell')}"]
+    lines.append(f"  {', '.join(parts) or 'none'}")
     if status.aside:
-        lines.append(f"  {status.aside} folders of earlier attempts and reruns (*.*)")
-    lines.append(f"  {len(status.variants)} variants, {status.sweeps} sweeps recorded")
+        lines.append(f"  {counted(status.aside, 'folder')} of earlier attempts and reruns (*.*)")
+    variants, sweeps = len(status.variants), status.sweeps
+    lines.append(f"  {counted(variants, 'variant')}, {counted(sweeps, 'sweep')} recorded")
     lines += [_disk(status.sizes), ""]
     lines += _table(status.cells)
     for state in ("running", "failed", "corrupt", "unknown", "unfinished"):
@@ -159,9 +161,11 @@ def describe(status: StoreStatus) -> str:
         files = Counter(file for cell in stale for file in cell.stale)
         lines += [
             "",
-            f"stale: {len(stale)} done cells were trained with other code or arithmetic than here",
+            f"stale: {counted(len(stale), 'done cell')} of other code or arithmetic than here",
         ]
-        lines += [f"  {file}: {count} cells" for file, count in files.most_common(_MAX_NAMED)]
+        lines += [
+            f"  {file}: {counted(count, 'cell')}" for file, count in files.most_common(_MAX_NAMED)
+        ]
     lines += _named("can't be read, or does not belong there:", status.problems, _MAX_NAMED)
     return "\n".join(map(for_line, lines))
 

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 from xrgs.report.html.content import shown
 from xrgs.report.render import titled
 from xrgs.report.writing import arrow, by_key, reading, signed
+from xrgs.safeio.words import counted
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping
@@ -70,7 +71,7 @@ def answers(comparison: Comparison) -> list[Answer]:
             Answer(
                 label=shown(label),
                 condition=shown(condition),
-                pairs=f"{_count(scenes, 'scene')}, {_count(pairs, 'pair')} of cells",
+                pairs=f"{counted(scenes, 'scene')}, {counted(pairs, 'pair')} of cells",
                 better=better,
                 worse=worse,
                 undecided=tuple((why, tuple(texts)) for why, texts in readings.items()),
@@ -84,10 +85,6 @@ def _change(metric: Metric, row: Change) -> str:
         return metric.label
     absolute = f" ({signed(row.difference)} dB)" if metric.unit == "dB" else ""
     return f"{metric.label} {signed(row.change)} % {arrow(row.change, metric)}{absolute}"
-
-
-def _count(number: int, of: str) -> str:
-    return f"{number} {of}{'s' * (number != 1)}"
 
 
 def context(
