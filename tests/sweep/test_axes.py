@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 
 from xrgs.errors import XrgsError
 from xrgs.experiment.store import BASELINE
-from xrgs.sweep.axes import expand
+from xrgs.sweep.axes import effective, expand
 
 
 def labels_and_conditions(*arguments: str) -> list[tuple[str, str]]:
@@ -62,6 +62,14 @@ def test_a_baseline_without_its_count_to_match_is_the_baseline(ablation: list[st
     baseline, matched = expand([*ablation, "matched_to=plus", "seed=1"])
     assert matched.matched_to == "plus"
     assert matched.without_match == baseline
+
+
+def test_what_a_later_argument_replaces_is_left_out() -> None:
+    file = ["scene=a,b", "+ablation=mip,absgrad", "seed=0,1"]
+    typed = ["+sweeps=study", "+ablation=[mip, absgrad]", "seed=2", "threads=1"]
+    kept = ["scene=a,b", "+ablation=[mip, absgrad]", "seed=2", "+sweeps=study", "threads=1"]
+    assert effective([*file, *typed]) == kept
+    assert expand(kept) == expand([*file, *typed])
 
 
 def test_each_seed_and_scene_has_a_baseline_of_its_own() -> None:

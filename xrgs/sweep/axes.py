@@ -51,6 +51,19 @@ class CellSpec:
         return [*self.shared, *self.changes]
 
 
+def effective(arguments: Sequence[str]) -> list[str]:
+    """Return the arguments without those that a later one of the same key replaces.
+
+    The axes of a sweep's file come first, and the command line may name some of them again.
+
+    Args:
+        arguments: Hydra overrides.
+    """
+    overrides = OverridesParser.create().parse_overrides(list(arguments))
+    last = {override.get_key_element(): override.input_line for override in overrides}
+    return [line for line in last.values() if line is not None]
+
+
 def expand(arguments: Sequence[str]) -> list[CellSpec]:
     """Return every combination of the axes, each group with its matching baseline first.
 

@@ -34,7 +34,7 @@ from xrgs.safeio.confined import is_passing
 from xrgs.safeio.hashing import digest, to_plain
 from xrgs.safeio.words import for_line
 from xrgs.sweep import controls, launch, locks, lpips, presence, track, variants
-from xrgs.sweep.axes import CellSpec, expand
+from xrgs.sweep.axes import CellSpec, effective, expand
 from xrgs.sweep.checks import check
 from xrgs.sweep.estimate import CostEstimator
 from xrgs.sweep.jobs import worker
@@ -128,6 +128,7 @@ class Study:
             XrgsError: A value of a cell's config is out of its range.
         """
         launch.check(self._config)
+        arguments = effective(arguments)
         plan = self._plan(arguments)
         track.check(plan[0].conf.track)
         store = Store(Path(plan[0].conf.store))
