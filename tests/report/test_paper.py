@@ -6,6 +6,7 @@ import pytest
 
 from xrgs.evaluation.metrics import METRICS
 from xrgs.report.compare import compare
+from xrgs.report.context import Context
 from xrgs.report.page import build
 from xrgs.report.paper import paper_tables
 from xrgs.report.render import TextTable
@@ -14,7 +15,7 @@ SCENES = ("fern", "flower", "horns")
 
 
 def tables(made: Any, against: str = "baseline") -> list[TextTable]:
-    return paper_tables(compare(made.read().cells, METRICS, against))
+    return paper_tables(compare(made.read().cells, METRICS, against), {"": Context(("500 steps",))})
 
 
 def add(made: Any, scene: str, label: str = "xrgs", *, seed: int = 0, **factors: float) -> None:
@@ -34,6 +35,7 @@ def test_a_sign_is_confirmed_refuted_or_open(made: Any) -> None:
         add(made, scene, gaussians=gaussians, ssim=ssim, psnr=psnr)
     (table,) = tables(made)
     assert table.title == "Beside the paper's Table 1: mean over 3 scenes"
+    assert table.context == "500 steps"
     found = signs(table)
     assert found["Gaussians"] == "confirmed"  # -69.68 in the paper
     assert found["SSIM"] == "refuted"  # +0.45

@@ -277,7 +277,11 @@ def _all_tables(tables: Tables) -> list[TextTable]:
 def _overviews(tables: Tables) -> list[TextTable]:
     """Return the tables of all ablations: what changes, what the paper says, what gap is closed."""
     comparison = tables.comparison
-    return [*tables.overviews(), *paper_tables(comparison), *gap_tables(comparison)]
+    return [
+        *tables.overviews(),
+        *paper_tables(comparison, tables.contexts),
+        *gap_tables(comparison),
+    ]
 
 
 def _ablation_tables(tables: Tables) -> list[TextTable]:

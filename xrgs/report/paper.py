@@ -6,6 +6,7 @@ import math
 from typing import TYPE_CHECKING, NamedTuple
 
 from xrgs.experiment.store import BASELINE
+from xrgs.report.context import Context
 from xrgs.report.inference import MIN_VALUES
 from xrgs.report.render import TextTable, filled, titled
 from xrgs.report.writing import (
@@ -81,11 +82,12 @@ _TABLE_2 = (
 )
 
 
-def paper_tables(comparison: Comparison) -> list[TextTable]:
+def paper_tables(comparison: Comparison, contexts: Mapping[str, Context]) -> list[TextTable]:
     """Return the paper's tables beside the changes of full XR-GS from the baseline.
 
     Args:
         comparison: The pairs of cells.
+        contexts: How the cells of each condition were trained and scored.
 
     Returns:
         A table for each condition and column of the paper of which the comparison has scenes: none
@@ -96,8 +98,9 @@ def paper_tables(comparison: Comparison) -> list[TextTable]:
     means, per_scene = by_key(comparison.means), by_key(comparison.per_scene)
     tables = []
     for condition in dict.fromkeys(condition for _, condition in comparison.groups):
+        context = contexts.get(condition, Context()).of_all
         if _LLFF.issuperset(comparison.scenes):
-            tables.append(_table(comparison, condition, _TABLE_1, means, ""))
+            tables.append(_table(comparison, condition, _TABLE_1, means, "", context))
         for column in _TABLE_2:
             for scene in sorted(column.scenes.intersection(comparison.scenes)):
                 here: dict[tuple[str, ...], Change] = {
@@ -105,7 +108,7 @@ def paper_tables(comparison: Comparison) -> list[TextTable]:
                     for (label, of, name, metric), row in per_scene.items()
                     if name == scene
                 }
-                tables.append(_table(comparison, condition, column, here, scene))
+                tables.append(_table(comparison, condition, column, here, scene, context))
     return [table for table in tables if table.rows]
 
 
@@ -115,6 +118,7 @@ def _table(
     column: _Column,
     changes: Mapping[tuple[str, ...], Change],
     scene: str,
+    context: str,
 ) -> TextTable:
     """Return a column of the paper beside changes of one scene, or means over scenes."""
     scenes = 1 if scene else len(comparison.scenes)
@@ -140,6 +144,7 @@ def _table(
             ARROWS_NOTE,
             *agreement_note(changes.values()),
         ),
+        context=context,
     )
     return filled(table)
 
