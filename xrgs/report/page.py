@@ -154,9 +154,7 @@ def build(
     sweep = replace(sweep, views=with_texture(store, sweep.cells, sweep.views))
     comparison = compare(sweep.cells, METRICS, against)
     tables = Tables(comparison, contexts(store, sweep.cells, sweep.views))
-    name = report_name(ids) + choice.suffix
-    name += "" if against == BASELINE else f".against-{for_file_name(against)}"
-    name += "".join(f".with-{for_file_name(one.label)}" for one in externals)
+    name = _folder_name(ids, choice, against, externals)
     folder = ConfinedPath(out) if out else store.stores[0].reports / name
     try:
         if out:
@@ -170,6 +168,15 @@ def build(
     written = {p.file for p in drawn if p.file} | {folder / name for name in _FILES}
     text = f"{_text(tables, _warnings(sweep))}\n{for_line(f'Written to {folder}')}"
     return Report(text=text, folder=folder.path, files=tuple(sorted(file.path for file in written)))
+
+
+def _folder_name(
+    ids: Sequence[str], choice: Choice, against: str, externals: Sequence[External]
+) -> str:
+    """Return the default name of a report's folder, which says what differs from all of a sweep."""
+    base = "" if against == BASELINE else f".against-{for_file_name(against)}"
+    others = "".join(f".with-{for_file_name(one.label)}" for one in externals)
+    return f"{report_name(ids)}{choice.suffix}{base}{others}"
 
 
 def _write(

@@ -157,11 +157,11 @@ def _row(label: str, metric: Metric, paper: float, found: Change, scenes: int) -
         f"{percent(found.change, metric)}{lacking(found, scenes)}",
         interval(found),
         agreement(found),
-        verdict(found, paper),
+        _verdict(found, paper),
     )
 
 
-def verdict(found: Change, paper: float) -> str:
+def _verdict(found: Change, paper: float) -> str:
     """Say whether a change has the sign that the paper gives.
 
     Args:

@@ -251,7 +251,7 @@ def without_kernels(plan: Sequence[PlannedCell]) -> str:
     complete = len(known) == len(cells)
     instead = f"{torch} instead of {native}" if complete else "30 to 60 times longer"
     return (
-        f"the kernels were not built on this machine: torch trains"
+        "the kernels were not built on this machine: torch trains"
         f" {counted(len(cells), 'cell')}, {instead}; "
         "`pip install --force-reinstall --no-deps .` builds them with a C++17 compiler or with "
         "PyPI's ziglang"
