@@ -4,10 +4,13 @@ from typing import Any
 
 from xrgs.evaluation.metrics import METRICS
 from xrgs.report.compare import Comparison, compare
+from xrgs.report.context import Context
 from xrgs.report.gap import gap_tables
 from xrgs.report.page import build
 from xrgs.report.render import TextTable
 from xrgs.report.tables import Tables
+
+CONTEXTS = {"": Context(("500 steps",), ("a machine",))}
 
 
 def compared(made: Any) -> Comparison:
@@ -19,7 +22,7 @@ def add(made: Any, label: str, scene: str, psnr: float, **more: Any) -> None:
 
 
 def table(made: Any) -> TextTable:
-    (one,) = gap_tables(compared(made))
+    (one,) = gap_tables(compared(made), CONTEXTS)
     return one
 
 
@@ -52,6 +55,11 @@ def test_why_there_is_no_share_is_said_once_for_all_ablations(made: Any) -> None
     assert notes.count("SSIM, fern: n/a (all_hr has the same value)") == 1
 
 
+def test_the_table_says_how_its_scores_were_made(made: Any) -> None:
+    add_two_scenes(made)
+    assert table(made).context == "500 steps"
+
+
 def test_an_ablation_alone_without_a_share_is_named(made: Any) -> None:
     add_two_scenes(made)
     made.add("c", scene="fern", values={"psnr": None})
@@ -73,9 +81,9 @@ def test_the_interval_is_over_scenes_or_replicates(made: Any) -> None:
 
 def test_a_sweep_without_all_hr_or_with_nothing_else_has_no_table(made: Any) -> None:
     made.add()
-    assert gap_tables(compared(made)) == []
+    assert gap_tables(compared(made), CONTEXTS) == []
     made.add("all_hr")
-    assert gap_tables(compared(made)) == []
+    assert gap_tables(compared(made), CONTEXTS) == []
 
 
 def test_the_share_is_in_every_file_of_tables(made: Any) -> None:

@@ -14,6 +14,7 @@ from scipy.stats import spearmanr
 
 from xrgs.evaluation.metrics import METRICS
 from xrgs.report.compare import compare
+from xrgs.report.context import Context
 from xrgs.report.joined import JoinedStore
 from xrgs.report.page import build
 from xrgs.report.render import TextTable
@@ -21,6 +22,7 @@ from xrgs.report.texture import texture, texture_tables, with_texture
 from xrgs.training.components.texture import gradient_magnitude
 
 SCENES = ("room", "fern", "trex")  # from the flattest to the most textured, as drawn below
+CONTEXTS = {"": Context(("500 steps",), ("a machine",))}
 
 
 def test_texture_is_the_mean_of_the_gradient_that_components_use() -> None:
@@ -60,7 +62,7 @@ def add_scenes(made: Any, scenes: tuple[str, ...] = SCENES) -> None:
 def tables(made: Any) -> list[TextTable]:
     sweep = made.read()
     views = with_texture(JoinedStore((made.store,)), sweep.cells, sweep.views)
-    return texture_tables(compare(sweep.cells, METRICS), views)
+    return texture_tables(compare(sweep.cells, METRICS), views, CONTEXTS)
 
 
 def test_scenes_are_in_the_order_of_their_texture(made: Any) -> None:
@@ -72,6 +74,11 @@ def test_scenes_are_in_the_order_of_their_texture(made: Any) -> None:
     assert rows["a", "PSNR"] == ("+5.00 ↑", "+10.00 ↑", "+15.00 ↑", "+1.00")
     assert rows["a", "LPIPS"] == ("0.00 =", "0.00 =", "0.00 =", "")
     assert {metric for _, metric in rows} == {"LPIPS", "SSIM", "PSNR"}
+
+
+def test_the_table_says_how_its_scores_were_made(made: Any) -> None:
+    add_scenes(made)
+    assert tables(made)[0].context == "500 steps"
 
 
 def test_the_correlation_is_one_of_ranks(made: Any) -> None:

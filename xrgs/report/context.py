@@ -60,6 +60,16 @@ class Context:
         return "; ".join((*self.training, *self.machine))
 
 
+def context_of(contexts: Mapping[str, Context], condition: str) -> Context:
+    """Return the context of a condition; an empty one where none is known.
+
+    Args:
+        contexts: What `contexts` returns.
+        condition: The condition.
+    """
+    return contexts.get(condition, Context())
+
+
 def contexts(store: JoinedStore, cells: pd.DataFrame, views: pd.DataFrame) -> dict[str, Context]:
     """Read the context of each condition of a sweep.
 

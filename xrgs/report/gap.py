@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from typing import TYPE_CHECKING
 
+from xrgs.report.context import context_of
 from xrgs.report.inference import ALL_HR
 from xrgs.report.render import TextTable, filled, titled
 from xrgs.report.writing import (
@@ -19,15 +20,19 @@ from xrgs.report.writing import (
 )
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping
+
     from xrgs.report.compare import Comparison
+    from xrgs.report.context import Context
     from xrgs.report.writing import Change
 
 
-def gap_tables(comparison: Comparison) -> list[TextTable]:
+def gap_tables(comparison: Comparison, contexts: Mapping[str, Context]) -> list[TextTable]:
     """Return a table for each condition that has all_hr and another ablation.
 
     Args:
         comparison: The pairs of cells, and the means of the shares that they close.
+        contexts: How the cells of each condition were trained and scored.
 
     Returns:
         Tables with a row for each ablation and score: the share in percent, scene by scene and in
@@ -36,11 +41,12 @@ def gap_tables(comparison: Comparison) -> list[TextTable]:
     """
     means, per_scene = by_key(comparison.gaps), by_key(comparison.gaps_per_scene)
     conditions = dict.fromkeys(condition for _, condition, _ in means)
-    return [_table(comparison, condition, means, per_scene) for condition in conditions]
+    return [_table(comparison, contexts, condition, means, per_scene) for condition in conditions]
 
 
 def _table(
     comparison: Comparison,
+    contexts: Mapping[str, Context],
     condition: str,
     means: dict[tuple[str, ...], Change],
     per_scene: dict[tuple[str, ...], Change],
@@ -73,6 +79,7 @@ def _table(
         rows=tuple(rows),
         align="ll" + "r" * (len(scenes) + 3),
         notes=notes,
+        context=context_of(contexts, condition).of_scores,
     )
     return filled(table)
 

@@ -34,6 +34,7 @@ if TYPE_CHECKING:
 
     import pandas as pd
 
+    from xrgs.report.compare import Comparison
     from xrgs.report.external import External
 
 #: What a row of views.csv names its cell by.
@@ -192,13 +193,21 @@ def _write(
     comparison = tables.comparison
     runs = Runs.of(sweep, comparison.cells)
     drawn = draw(store, comparison, sweep.views, runs.curves, folder / "figures", pictures)
-    _write_files(folder, sweep, tables, drawn, runs)
+    _write_data(folder, sweep, comparison, runs)
+    changes = _change_tables(tables)
+    latex = [to_latex(table) for table in changes if table.rows]
+    write_text(folder / "table.tex", LATEX_PREAMBLE + "\n".join(latex))
+    textures = texture_tables(comparison, sweep.views, tables.contexts)
+    everything = [*changes, *textures, *runs.tables(comparison.base), _provenance_table(sweep)]
+    page = _markdown_page(sweep, comparison.base, everything, drawn, folder)
+    write_text(folder / "table.md", page)
+    write_text(folder / "table.csv", _csv(tables.long()))
     write_document(
         folder / "report.html",
         store,
         sweep,
         tables,
-        [*_page_tables(sweep, tables, runs), _provenance_table(sweep)],
+        everything,
         runs.curves,
         _warnings(sweep),
         pictures=pictures is None or bool(pictures),
@@ -233,22 +242,13 @@ _FILES = (
 )
 
 
-def _write_files(
-    folder: ConfinedPath,
-    sweep: Sweep,
-    tables: Tables,
-    pictures: list[Picture],
-    runs: Runs,
-) -> None:
-    cells = tables.comparison.cells
+def _write_data(folder: ConfinedPath, sweep: Sweep, comparison: Comparison, runs: Runs) -> None:
+    """Write what was compared and measured, for other programs."""
+    cells = comparison.cells
     names = cells.drop_duplicates("cell_id")[_VIEW_KEYS]
     views = names.merge(sweep.views, on="cell_id")
-    metrics = [metric.name for metric in tables.comparison.metrics]
+    metrics = [metric.name for metric in comparison.metrics]
     order = [*RECORD_KEYS, "state", "reason", "protocol", "validation", *metrics]
-    write_text(folder / "table.md", _markdown_page(sweep, tables, pictures, folder, runs))
-    non_empty = [table for table in _all_tables(tables) if table.rows]
-    write_text(folder / "table.tex", LATEX_PREAMBLE + "\n".join(map(to_latex, non_empty)))
-    write_text(folder / "table.csv", _csv(tables.long()))
     write_text(folder / "cells.csv", _csv(cells[order]))
     write_text(folder / "views.csv", _csv(views))
     write_text(folder / "training.csv", _csv(runs.training))
@@ -264,13 +264,7 @@ def _csv(table: pd.DataFrame) -> str:
     return str(safe.to_csv(index=False, lineterminator="\n"))
 
 
-def _page_tables(sweep: Sweep, tables: Tables, runs: Runs) -> list[TextTable]:
-    """Return every table of a page but that of the provenance, in order."""
-    textures = texture_tables(tables.comparison, sweep.views)
-    return [*_all_tables(tables), *textures, *runs.tables(tables.comparison.base)]
-
-
-def _all_tables(tables: Tables) -> list[TextTable]:
+def _change_tables(tables: Tables) -> list[TextTable]:
     """Return every table of changes and values, overviews first."""
     comparison = tables.comparison
     result = [*_overviews(tables), *_ablation_tables(tables)]
@@ -287,7 +281,7 @@ def _overviews(tables: Tables) -> list[TextTable]:
     return [
         *tables.overviews(),
         *paper_tables(comparison, tables.contexts),
-        *gap_tables(comparison),
+        *gap_tables(comparison, tables.contexts),
     ]
 
 
@@ -304,18 +298,17 @@ def _ablation_tables(tables: Tables) -> list[TextTable]:
 
 def _markdown_page(
     sweep: Sweep,
-    tables: Tables,
-    pictures: list[Picture],
+    base: str,
+    tables: Sequence[TextTable],
+    pictures: Sequence[Picture],
     folder: ConfinedPath,
-    runs: Runs,
 ) -> str:
     parts = [
-        f"# Change from {for_markdown(tables.comparison.base)}\n",
+        f"# Change from {for_markdown(base)}\n",
         *(_command_line(sweep_id, command) for sweep_id, command in sweep.commands.items()),
         *(f"**{for_markdown(line)}**\n" for line in _warnings(sweep)),
-        *(to_markdown(table) for table in _page_tables(sweep, tables, runs) if table.rows),
+        *(to_markdown(table) for table in tables if table.rows),
         *(_picture_link(picture, folder) for picture in pictures),
-        to_markdown(_provenance_table(sweep)),
     ]
     return "\n".join(parts)
 

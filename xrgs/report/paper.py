@@ -6,7 +6,7 @@ import math
 from typing import TYPE_CHECKING, NamedTuple
 
 from xrgs.experiment.store import BASELINE
-from xrgs.report.context import Context
+from xrgs.report.context import context_of
 from xrgs.report.inference import MIN_VALUES
 from xrgs.report.render import TextTable, filled, titled
 from xrgs.report.writing import (
@@ -25,6 +25,7 @@ if TYPE_CHECKING:
 
     from xrgs.evaluation.metrics import Metric
     from xrgs.report.compare import Comparison
+    from xrgs.report.context import Context
     from xrgs.report.writing import Change
 
 #: Labels of the full XR-GS, with one reading of section 5.4 each.
@@ -98,7 +99,7 @@ def paper_tables(comparison: Comparison, contexts: Mapping[str, Context]) -> lis
     means, per_scene = by_key(comparison.means), by_key(comparison.per_scene)
     tables = []
     for condition in dict.fromkeys(condition for _, condition in comparison.groups):
-        context = contexts.get(condition, Context()).of_all
+        context = context_of(contexts, condition).of_all
         if _LLFF.issuperset(comparison.scenes):
             tables.append(_table(comparison, condition, _TABLE_1, means, "", context))
         for column in _TABLE_2:

@@ -10,7 +10,7 @@ import numpy as np
 import pandas as pd
 
 from xrgs.report.compare import is_amount
-from xrgs.report.context import Context
+from xrgs.report.context import context_of
 from xrgs.report.render import TextTable, filled, titled
 from xrgs.report.writing import (
     ARROWS_NOTE,
@@ -41,6 +41,7 @@ if TYPE_CHECKING:
 
     from xrgs.evaluation.metrics import Metric
     from xrgs.report.compare import Comparison
+    from xrgs.report.context import Context
 
 #: Metrics that differ between two runs of one program.
 _NOISY = frozenset({"training_time_s", "render_time_ms", "peak_rss_bytes"})
@@ -75,7 +76,7 @@ class Tables:
         return tuple(dict.fromkeys(text for one in self.contexts.values() for text in one.cautions))
 
     def _context(self, condition: str) -> Context:
-        return self.contexts.get(condition, Context())
+        return context_of(self.contexts, condition)
 
     @cached_property
     def _means(self) -> dict[tuple[str, ...], Change]:

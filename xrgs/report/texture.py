@@ -18,15 +18,19 @@ from xrgs.capture.images import ImageError
 from xrgs.errors import StoreError, UnreadableError
 from xrgs.experiment.trimming import check_images
 from xrgs.report.compare import is_amount
+from xrgs.report.context import context_of
 from xrgs.report.inference import MIN_VALUES
 from xrgs.report.render import TextTable, titled
 from xrgs.report.writing import ARROWS_NOTE, by_key, percent, signed
 from xrgs.runtime.progress import progress
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping
+
     from numpy.typing import NDArray
 
     from xrgs.report.compare import Comparison
+    from xrgs.report.context import Context
     from xrgs.report.joined import JoinedStore
 
 _PHOTOGRAPH = ["variant_id", "split", "view"]
@@ -83,12 +87,15 @@ def texture(image: NDArray[np.float32]) -> float:
     return float(np.sqrt(squared.mean(axis=2)).mean())
 
 
-def texture_tables(comparison: Comparison, views: pd.DataFrame) -> list[TextTable]:
+def texture_tables(
+    comparison: Comparison, views: pd.DataFrame, contexts: Mapping[str, Context]
+) -> list[TextTable]:
     """Return a table for each condition that has at least three scenes of known texture.
 
     Args:
         comparison: The pairs of cells.
         views: What `with_texture` returns.
+        contexts: How the cells of each condition were trained and scored.
 
     Returns:
         Tables with a row for each ablation and score: the change in percent of each scene, from the
@@ -102,11 +109,13 @@ def texture_tables(comparison: Comparison, views: pd.DataFrame) -> list[TextTabl
     for condition in by_scene.index.unique("condition"):
         scenes = by_scene.loc[condition].sort_values(kind="stable")
         if len(scenes) >= MIN_VALUES:
-            tables.append(_table(comparison, condition, scenes))
+            tables.append(_table(comparison, contexts, condition, scenes))
     return tables
 
 
-def _table(comparison: Comparison, condition: str, scenes: pd.Series) -> TextTable:
+def _table(
+    comparison: Comparison, contexts: Mapping[str, Context], condition: str, scenes: pd.Series
+) -> TextTable:
     """Return the table of a condition; `scenes` has its textures by scene, in rising order."""
     per_scene = by_key(comparison.per_scene)
     rows: list[tuple[str, ...]] = []
@@ -132,6 +141,7 @@ def _table(comparison: Comparison, condition: str, scenes: pd.Series) -> TextTab
             " these scenes, and so few are no test",
             ARROWS_NOTE,
         ),
+        context=context_of(contexts, condition).of_scores,
     )
 
 
