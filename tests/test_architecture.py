@@ -97,7 +97,7 @@ FILE_FUNCTIONS: dict[str, dict[str, str]] = {
     "shutil.": {},
     "shutil.copyfileobj": {
         "capture/download/unpack": "from stream to stream",
-        "experiment/cell_folder": "from stream to stream",
+        "experiment/attempts": "from stream to stream",
         "experiment/export": "from stream to stream",
     },
     "tempfile.": {

@@ -13,6 +13,7 @@ from pathlib import Path
 import pytest
 
 from xrgs.cli import store as command
+from xrgs.experiment.attempts import begin_attempt
 from xrgs.experiment.store import Store
 
 Call = Callable[..., tuple[int, str, str]]
@@ -26,7 +27,9 @@ def xrgs_store(call_command: Call, tmp_path: Path, monkeypatch: pytest.MonkeyPat
     store.prepare()
     for name in ("abc", "abd"):
         folder = store.cell(name)
-        folder.begin({"train": {"steps": 3 if name == "abc" else 4}}, {"variant": "v", "seed": 0})
+        begin_attempt(
+            folder, {"train": {"steps": 3 if name == "abc" else 4}}, {"variant": "v", "seed": 0}
+        )
         (folder.path / "splats.ply").write_bytes(bytes(1000))
         (folder.path / "scores.csv").write_text("view,psnr\na,20\nb,22\n")
         (folder.path / "summary.json").write_text('{"gaussians": 17}')

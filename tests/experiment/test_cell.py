@@ -24,6 +24,7 @@ from xrgs.capture.views import Variant
 from xrgs.config import Conf
 from xrgs.evaluation import protocol
 from xrgs.experiment import cell
+from xrgs.experiment.attempts import begin_attempt
 from xrgs.experiment.cell_folder import CellFolder
 from xrgs.experiment.identity import cell_identity
 from xrgs.experiment.store import Store
@@ -81,7 +82,7 @@ def begin(conf: Conf, root: Path, variant_id: str = "v") -> CellFolder:
     identity = cell_identity(conf, variant_id)
     root.mkdir(exist_ok=True)
     folder = CellFolder(root / digest(identity))
-    return folder.begin(asdict(conf), identity)
+    return begin_attempt(folder, asdict(conf), identity)
 
 
 def results(folder: CellFolder) -> dict[str, Any]:
@@ -252,7 +253,7 @@ def test_a_cell_that_is_asked_to_end_keeps_every_step_and_says_what_happened(
     assert not (folder.path / "error.txt").exists()
     assert not folder.progress.exists()
     with caplog.at_level(logging.INFO):
-        again = folder.begin(asdict(conf), folder.identity())
+        again = begin_attempt(folder, asdict(conf), folder.identity())
         cell.run_cell(conf, VARIANT, again)
     assert results(again) == expected
     for line in ("going on from the checkpoint, 5 steps done", "trained 12 steps in", "mean PSNR"):

@@ -28,6 +28,7 @@ from xrgs.capture.dataset import Dataset
 from xrgs.capture.views import Variant, View
 from xrgs.config import Conf
 from xrgs.experiment import cell
+from xrgs.experiment.attempts import begin_attempt
 from xrgs.experiment.cell_folder import CellFolder
 from xrgs.experiment.store import Store
 from xrgs.safeio.confined import ConfinedPath
@@ -330,7 +331,7 @@ class Attempts:
         self.store = Store(tmp_path / "s")
 
     def begin(self, store: Store) -> CellFolder:
-        return store.cell(self.id).begin(asdict(self.conf), self.identity)
+        return begin_attempt(store.cell(self.id), asdict(self.conf), self.identity)
 
     def run(self) -> None:
         cell.run_cell(self.conf, cast(Variant, SimpleNamespace()), self.begin(self.store))

@@ -14,6 +14,7 @@ import torch
 from xrgs.capture import dataset, variant
 from xrgs.capture.variant import CorruptVariant
 from xrgs.errors import StoreError, XrgsError
+from xrgs.experiment.attempts import begin_attempt
 from xrgs.experiment.cell_folder import CellFolder
 from xrgs.experiment.store import Store
 from xrgs.splat.gaussians import PARAMETERS, Gaussians
@@ -30,7 +31,7 @@ def config(steps: int) -> dict[str, Any]:
 def finished(store: Store, cell_id: str, *, steps: int = 10, seed: int = 0) -> CellFolder:
     cell = store.cell(cell_id)
     identity = {"variant": "key-hash", "seed": seed, "train": {"views": "mixed"}}
-    cell.begin(config(steps), identity)
+    begin_attempt(cell, config(steps), identity)
     (cell.path / "scores.csv").write_text(SCORES)
     (cell.path / "history.csv").write_text("step,loss\n0,0.5\n")
     (cell.path / "summary.json").write_text('{"gaussians": 7, "training_time_s": 1.5}')
@@ -72,7 +73,7 @@ def test_cells_are_sorted_and_those_that_are_not_done_are_rows_too(store: Store)
     finished(store, "b", seed=1)
     finished(store, "a", seed=0)
     failed = store.cell("d")
-    failed.begin(config(5), {"seed": 7, "variant": "key-hash"})
+    begin_attempt(failed, config(5), {"seed": 7, "variant": "key-hash"})
     failed.fail("out of memory")
     (store.cells_folder / "c.aside-1").make_folder()
     (store.cells_folder / "e").make_folder()

@@ -10,6 +10,7 @@ import pytest
 from xrgs.capture import frozen
 from xrgs.errors import StoreError
 from xrgs.experiment import trimming
+from xrgs.experiment.attempts import begin_attempt, remove_cell
 from xrgs.experiment.cell_folder import CellFolder
 from xrgs.experiment.store import Store
 from xrgs.safeio.confined import ConfinedPath
@@ -23,7 +24,7 @@ def cell(tmp_path: Path) -> CellFolder:
     """A done cell with two heavy files."""
     folder = CellFolder(tmp_path / "cells" / "c")
     (tmp_path / "cells").mkdir()
-    folder.begin({}, {"variant": "k-v", "train": {"views": "mixed"}, "seed": 0})
+    begin_attempt(folder, {}, {"variant": "k-v", "train": {"views": "mixed"}, "seed": 0})
     (folder.path / "renders").mkdir()
     for name, content in FILES.items():
         (folder.path / name).write_bytes(content)
@@ -85,7 +86,7 @@ def test_a_cell_that_is_not_done_is_not_trimmed(cell: CellFolder) -> None:
 
 
 def test_a_removed_cell_is_gone_with_all_of_its_files(cell: CellFolder) -> None:
-    cell.remove()
+    remove_cell(cell)
     assert list(cell.path.parent.iterdir()) == []
     assert cell.state().name == "absent"
 

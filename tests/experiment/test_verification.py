@@ -10,6 +10,7 @@ import pytest
 
 from xrgs.capture import scenes, variant
 from xrgs.errors import StoreError
+from xrgs.experiment.attempts import begin_attempt
 from xrgs.experiment.store import Store
 from xrgs.experiment.verification import describe, verify
 
@@ -21,7 +22,7 @@ def store(tmp_path: Path) -> Store:
     store.prepare()
     for name in ("good", "other"):
         folder = store.cell(name)
-        folder.begin({}, {"name": name})
+        begin_attempt(folder, {}, {"name": name})
         (folder.path / "splats.ply").write_text("20 Gaussians")
         (folder.path / "log.txt").write_text("20 steps")
         (folder.path / "scores.csv").write_text("view,psnr\na,20\n")

@@ -22,6 +22,7 @@ from xrgs.capture import variant
 from xrgs.config import Conf
 from xrgs.evaluation.protocol import PROTOCOL_VERSION
 from xrgs.experiment import provenance
+from xrgs.experiment.attempts import begin_attempt
 from xrgs.experiment.identity import cell_identity
 from xrgs.experiment.store import Store
 from xrgs.safeio.hashing import digest
@@ -137,7 +138,7 @@ _WORK = {
 def _write_cell(store: Store, conf: Conf, variant_id: str, made_with: dict[str, Any]) -> str:
     identity = cell_identity(conf, variant_id)
     cell = store.cell(digest(identity))
-    cell.begin(asdict(conf), identity)
+    begin_attempt(cell, asdict(conf), identity)
     (cell.path / "provenance.json").write_text(json.dumps(made_with))
     rng = np.random.default_rng(conf.seed)
     vertices = rng.normal(size=(20, len(_PLY_COLUMNS))).astype("<f4")

@@ -9,6 +9,7 @@ import pytest
 from PIL import Image
 
 from xrgs.evaluation.metrics import METRICS
+from xrgs.experiment.attempts import begin_attempt
 from xrgs.experiment.cell_folder import CellFolder
 from xrgs.experiment.store import Store
 from xrgs.report.collect import Sweep, read_cells
@@ -67,7 +68,7 @@ class MadeStore:
         found |= {key: found[key] * factor for key, factor in (factors or {}).items()}
         folder = self.store.cell(cell_id)
         train = {} if validation is None else {"train": {"validation": validation}}
-        folder.begin({}, {"variant": variant, "seed": seed, "protocol": protocol} | train)
+        begin_attempt(folder, {}, {"variant": variant, "seed": seed, "protocol": protocol} | train)
         base = [
             row["cell_id"]
             for row in self.rows

@@ -9,6 +9,7 @@ from typing import Any
 import pytest
 
 from xrgs.errors import StoreError
+from xrgs.experiment.attempts import remove_cell
 from xrgs.experiment.store import Store
 from xrgs.report import Choice, build
 from xrgs.report.collect import ReportError
@@ -117,7 +118,7 @@ def test_a_sweep_that_runs_is_reported_with_what_is_done(made: Any) -> None:
         made.add("plus", seed=seed, factors={"psnr": 1.1})
     begun = made.rows[2]["cell_id"]
     (made.store.cell(begun).path / "status.json").unlink()
-    made.store.cell(made.rows[3]["cell_id"]).remove()
+    remove_cell(made.store.cell(made.rows[3]["cell_id"]))
     made.rows.append(made.rows[1] | {"cell_id": None, "label": "count_matched"})
     report = build(made.store.path, made.write(), pictures=[])
     assert table(report.folder)["plus mean"] == pytest.approx(10)
@@ -134,7 +135,7 @@ def test_a_sweep_that_runs_is_reported_with_what_is_done(made: Any) -> None:
 def test_a_report_in_which_nothing_is_done_yet_says_so(made: Any) -> None:
     for label in ("baseline", "plus"):
         made.add(label)
-        made.store.cell(made.rows[-1]["cell_id"]).remove()
+        remove_cell(made.store.cell(made.rows[-1]["cell_id"]))
     report = build(made.store.path, made.write(), pictures=[])
     assert "2 of 2 cells are not done yet" in report.text
 

@@ -17,6 +17,7 @@ from hypothesis import strategies as st
 
 from xrgs.errors import StoreError, XrgsError
 from xrgs.experiment import verification
+from xrgs.experiment.attempts import begin_attempt
 from xrgs.experiment.cell_folder import CellFolder
 from xrgs.experiment.store import Store
 from xrgs.report import build, page, pictures
@@ -333,10 +334,10 @@ def test_a_cell_that_goes_on_does_not_write_through_links(store: Store, tmp_path
     precious = tmp_path / "precious"
     precious.write_text("mine")
     cell = store.cell("going")
-    cell.begin({}, {"seed": 0})
+    begin_attempt(cell, {}, {"seed": 0})
     cell.checkpoint.path.write_bytes(b"state")
     (cell.path / "log.txt").symlink_to(precious)
-    cell.begin({}, {"seed": 0})
+    begin_attempt(cell, {}, {"seed": 0})
     assert cell.checkpoint.read_bytes() == b"state"
     assert not (cell.path / "log.txt").exists()
     assert precious.read_text() == "mine"

@@ -10,6 +10,7 @@ import pytest
 
 from xrgs.errors import XrgsError
 from xrgs.experiment import identity
+from xrgs.experiment.attempts import begin_attempt, remove_cell
 from xrgs.experiment.cell_folder import CellFolder
 from xrgs.experiment.store import Store
 from xrgs.sweep import locks
@@ -21,7 +22,7 @@ def add(store: Store, name: str, state: str, variant: str = "aa-used", **changes
     folder = store.cell(name)
     code = dict(identity.training_code("torch")) | changes
     what = {"splat": {"backend": "torch"}, "code": code, "seed": 0, "variant": variant}
-    folder.begin({}, what)
+    begin_attempt(folder, {}, what)
     if state == "failed":
         folder.fail("out of luck")
     if state == "done":
@@ -146,14 +147,12 @@ def test_a_cell_that_has_changed_since_the_plan_is_left(store: Store) -> None:
 def test_what_cannot_be_removed_hides_no_other(
     store: Store, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    real = CellFolder.remove
-
     def remove(cell: CellFolder) -> None:
         if cell.id == "old1":
             raise PermissionError(13, "Permission denied", "cells/old1")
-        real(cell)
+        remove_cell(cell)
 
-    monkeypatch.setattr(CellFolder, "remove", remove)
+    monkeypatch.setattr("xrgs.sweep.cleaning.remove_cell", remove)
     _, left = carry_out(store, gc(store))
     assert len(left) == 1
     assert "Permission denied" in left[0]

@@ -10,6 +10,7 @@ import pytest
 
 from xrgs.errors import XrgsError
 from xrgs.experiment import identity
+from xrgs.experiment.attempts import begin_attempt
 from xrgs.experiment.store import Store
 from xrgs.sweep import locks
 from xrgs.sweep.inventory import Selection, list_cells, list_sweeps, summaries
@@ -19,7 +20,7 @@ def add(store: Store, name: str, *, done: bool = True, code: dict[str, str] | No
     """Add a cell of the torch backend, of the installed code or of another one."""
     folder = store.cell(name)
     what = {"splat": {"backend": "torch"}, "arithmetic": "torch", "seed": 0, "variant": "v-w"}
-    folder.begin({"scene": {"name": "statue"}}, what | {"code": code or installed()})
+    begin_attempt(folder, {"scene": {"name": "statue"}}, what | {"code": code or installed()})
     if done:
         (folder.path / "splats.ply").write_bytes(bytes(3_000_000 if name == "abc1" else 10))
         (folder.path / "scores.csv").write_text("view,psnr\na,20\n")

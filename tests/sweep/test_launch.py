@@ -20,6 +20,7 @@ from omegaconf import DictConfig, OmegaConf
 from xrgs import composing, config
 from xrgs.cli.arguments import with_quotes
 from xrgs.errors import XrgsError
+from xrgs.experiment.attempts import begin_attempt
 from xrgs.experiment.identity import cell_identity
 from xrgs.experiment.store import Store
 from xrgs.safeio.atomic import write_json
@@ -132,7 +133,7 @@ class FakeLauncher:
             if "nothing" in self.fatal:
                 raise RuntimeError("no such cluster\nand more")
             for name in pair:
-                self.store.cell(self.ids[name]).begin({}, {})
+                begin_attempt(self.store.cell(self.ids[name]), {}, {})
             if self.fatal & set(pair):
                 raise RuntimeError("a worker was killed")
             for name in pair:

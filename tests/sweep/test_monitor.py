@@ -12,6 +12,7 @@ from pathlib import Path
 import pytest
 
 from xrgs.config import Conf
+from xrgs.experiment.attempts import begin_attempt
 from xrgs.experiment.cell_folder import CellState
 from xrgs.experiment.store import Store
 from xrgs.runtime.progress import Progress
@@ -37,7 +38,7 @@ class Cells:
         )
 
     def begin(self, name: str) -> None:
-        self.store.cell(name).begin({}, {"name": name})
+        begin_attempt(self.store.cell(name), {}, {"name": name})
 
     def step(self, name: str, done: int, rate: float | None, what: str = "training") -> None:
         unit = "step" if what == "training" else "view"

@@ -10,6 +10,7 @@ from pathlib import Path
 import pytest
 
 from xrgs.config import Conf
+from xrgs.experiment.attempts import begin_attempt
 from xrgs.experiment.cell_folder import CellState
 from xrgs.experiment.store import BASELINE, Store
 from xrgs.runtime.progress import format_duration
@@ -222,7 +223,7 @@ def test_a_cell_whose_lock_is_held_is_running_unless_it_is_done(
     cell: Callable[..., PlannedCell], tmp_path: Path
 ) -> None:
     store = Store(tmp_path)
-    store.cell("a").begin({}, {})
+    begin_attempt(store.cell("a"), {}, {})
     assert identified(cell("a"), store, {"a": "process 1"}).state.name == "running"
     assert identified(cell("a"), store, {}).state.name == "unfinished"
     folder = store.cell("a")

@@ -16,6 +16,7 @@ import pytest
 from xrgs.config import Conf
 from xrgs.errors import XrgsError
 from xrgs.experiment import provenance
+from xrgs.experiment.attempts import begin_attempt
 from xrgs.experiment.cell_folder import CellFolder
 from xrgs.experiment.identity import cell_identity
 from xrgs.experiment.store import Store
@@ -37,7 +38,7 @@ def trained(compose: Callable[..., Conf], tmp_path_factory: pytest.TempPathFacto
     variant_id = "0123456789abcdef-0123456789abcdef"
     identity = cell_identity(conf, variant_id)
     folder = store.cell(digest(identity))
-    folder.begin(asdict(conf), identity)
+    begin_attempt(folder, asdict(conf), identity)
     write_json(folder.path / "provenance.json", provenance.collect(1, "torch"))
     scores = "view,lpips,ssim,psnr\nmotorcycle_left,,0.02,6.50\nmotorcycle_right,,0.03,7.50\n"
     (folder.path / "scores.csv").write_text(scores)

@@ -14,6 +14,7 @@ import pytest
 
 from xrgs.errors import XrgsError
 from xrgs.experiment import identity
+from xrgs.experiment.attempts import begin_attempt
 from xrgs.experiment.cell_folder import CellFolder
 from xrgs.experiment.store import Store
 from xrgs.runtime.progress import Progress
@@ -31,7 +32,9 @@ def cell(
     what: dict[str, object] = {"splat": {"backend": "torch"}, "arithmetic": "torch"}
     what["code"] = code or identity.training_code("torch")
     what |= changes
-    folder.begin({"scene": {"name": "statue"}}, {k: v for k, v in what.items() if v is not None})
+    begin_attempt(
+        folder, {"scene": {"name": "statue"}}, {k: v for k, v in what.items() if v is not None}
+    )
     return folder
 
 

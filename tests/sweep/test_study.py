@@ -18,6 +18,7 @@ from omegaconf import DictConfig
 
 from xrgs import config
 from xrgs.errors import XrgsError
+from xrgs.experiment.attempts import begin_attempt
 from xrgs.experiment.identity import cell_identity
 from xrgs.experiment.store import BASELINE, Store
 from xrgs.safeio.hashing import digest
@@ -208,7 +209,7 @@ class Trainer:
 
 def finish(store: Store, cell_id: str) -> None:
     cell = store.cell(cell_id)
-    cell.begin({}, {})
+    begin_attempt(cell, {}, {})
     (cell.path / "scores.csv").write_text("view\na\n")
     cell.finish(["a"], 1)
 

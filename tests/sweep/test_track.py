@@ -13,6 +13,7 @@ from mlflow import MlflowClient
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from xrgs.errors import XrgsError
+from xrgs.experiment.attempts import begin_attempt
 from xrgs.experiment.store import Store
 from xrgs.sweep import track
 
@@ -44,7 +45,7 @@ EXPECTED = {
 
 def add(store: Store, cell_id: str, label: str, *, quality: bool = True) -> dict[str, Any]:
     cell = store.cell(cell_id)
-    cell.begin(CONFIG, {"variant": "v", "seed": 3})
+    begin_attempt(cell, CONFIG, {"variant": "v", "seed": 3})
     (cell.path / "scores.csv").write_text("view,psnr,lpips\na,20.5,\nb,30.0,\n")
     (cell.path / "history.csv").write_text(HISTORY)
     (cell.path / "summary.json").write_text('{"gaussians": 7, "steps": 20}')
@@ -62,7 +63,7 @@ def swept(tmp_path: Path) -> tuple[Store, str]:
     store.prepare()
     rows = [add(store, "abc", "baseline"), add(store, "def", "=cmd|'x'\x1b", quality=False)]
     failed = store.cell("bad")
-    failed.begin(CONFIG, {})
+    begin_attempt(failed, CONFIG, {})
     failed.fail("out of memory")
     rows += [rows[0] | {"cell_id": "bad"}, rows[0] | {"cell_id": None}]
     return store, store.write_sweep([], rows)

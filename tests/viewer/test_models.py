@@ -10,6 +10,7 @@ from typing import Any
 import pytest
 
 from xrgs.errors import StoreError, XrgsError
+from xrgs.experiment.attempts import begin_attempt
 from xrgs.experiment.store import Store
 from xrgs.splat.ply import save_ply
 from xrgs.splat.settings import RasterSettings
@@ -24,7 +25,7 @@ def store(tmp_path: Path) -> Store:
     made.prepare()
     for cell_id in ("abc1", "abd2", "abd3"):
         cell = made.cell(cell_id)
-        cell.begin({"splat": {"raster": {"antialiased": True}}}, {"variant": "v"})
+        begin_attempt(cell, {"splat": {"raster": {"antialiased": True}}}, {"variant": "v"})
         if cell_id == "abd3":
             cell.fail("out of memory")
         else:

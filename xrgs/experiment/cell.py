@@ -105,7 +105,7 @@ def run_cell(
     Args:
         conf: The cell's config.
         variant: The frozen variant that it trains on.
-        folder: The cell's folder, in which `CellFolder.begin` has written config and identity.
+        folder: The cell's folder, in which `begin_attempt` has written config and identity.
         stop: Whether this process was asked to end, which ends the cell after a step of training.
             A cell that is being evaluated goes on: it is nearly done, and has nothing to resume
             from but the checkpoint before.

@@ -2,19 +2,11 @@
 
 A cell's `status.json` is written last, by atomic rename, and lists every other file of the cell: a
 cell is done when that file says so and the listed files are present and unchanged.
-
-Each attempt at a cell has a folder of its own, which takes the place of the one before it. Its
-process works in that very folder, whatever gets the name afterwards. What a kill leaves between two
-attempts are folders `.<cell id>.old-*` and `.new-*`; the next attempt settles them.
 """
 
 from __future__ import annotations
 
-import errno
-import secrets
-import shutil
 import stat
-from contextlib import suppress
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -22,13 +14,13 @@ from xrgs.errors import StoreError, UnreadableError
 from xrgs.runtime import progress
 from xrgs.safeio import untrusted
 from xrgs.safeio.atomic import write_json, write_text
-from xrgs.safeio.confined import ReplacedError, confined, is_passing
-from xrgs.safeio.hashing import canonical_json, file_digest
+from xrgs.safeio.confined import confined, is_passing
+from xrgs.safeio.hashing import file_digest
 from xrgs.safeio.records import MAX_BYTES, as_number, read_object, read_table
 from xrgs.safeio.words import for_terminal
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Mapping, Sequence
+    from collections.abc import Mapping, Sequence
     from pathlib import Path
 
     import pandas as pd
@@ -43,15 +35,12 @@ if TYPE_CHECKING:
 _VERIFIED_BY_HASH = frozenset(
     {"config.json", "identity.json", "scores.csv", "summary.json", "history.csv", "quality.csv"}
 )
-_CHECKPOINT = "checkpoint.npz"
+#: Name of the training checkpoint, which is there while the cell is not done.
+CHECKPOINT = "checkpoint.npz"
 _PROGRESS = "progress.json"
-_NOT_RESULTS = frozenset(
-    {"log.txt", "status.json", _PROGRESS, _CHECKPOINT, f"refused-{_CHECKPOINT}"}
-)
+_NOT_RESULTS = frozenset({"log.txt", "status.json", _PROGRESS, CHECKPOINT, f"refused-{CHECKPOINT}"})
 #: Files of a done cell that only pictures, viewers and `rerun=` need: most of a store's bytes.
 _HEAVY, _HEAVY_FOLDER = frozenset({"splats.ply"}), "renders"
-#: Files of a stopped attempt that the next one gets.
-_KEPT_ON_RESUME = (_CHECKPOINT, "log.txt")
 
 
 @dataclass(frozen=True)
@@ -107,7 +96,7 @@ class CellFolder:
     @property
     def checkpoint(self) -> ConfinedPath:
         """File of the training checkpoint; it exists while the cell is not done."""
-        return self.folder / _CHECKPOINT
+        return self.folder / CHECKPOINT
 
     @property
     def progress(self) -> ConfinedPath:
@@ -236,105 +225,6 @@ class CellFolder:
             raise StoreError(f"{file}: {error}") from error
         return list(zip(views, scores, strict=True))
 
-    def begin(self, config: Mapping[str, Any], identity: Mapping[str, Any]) -> CellFolder:
-        """Begin an attempt at the cell: make a new folder with its config and identity alone.
-
-        The checkpoint and the log of a stopped attempt at the same cell are copied into it. A
-        folder that can't be resumed (another identity, or failed or corrupt without a checkpoint)
-        is renamed to `<cell id>.aside-<n>`, so that it can be inspected.
-
-        The caller holds the cell's lock. Each attempt has a folder of its own, so that a process
-        that has lost the lock, and does not know it yet, writes into no folder but its own.
-
-        Args:
-            config: The cell's config as plain JSON values.
-            identity: The values that the cell's id is the digest of.
-
-        Returns:
-            The folder of this attempt. All that is done by it is an error (`ReplacedError`) once
-            another attempt has begun; the folder of that attempt is never touched.
-
-        Raises:
-            UnreadableError: Nothing can be told of the folder now.
-            ReplacedError: Another process has begun the cell at the same time.
-        """
-        self.folder.make_parent()
-        before = self.folder.identity() if self.folder.exists() else None
-        stopped = self._stopped(identity)
-        new = self._hidden("new")
-        try:
-            new.make_folder(exclusive=True)
-            write_json(new / "config.json", config, durable=False)
-            write_json(new / "identity.json", identity, durable=False)
-            if stopped is not None:
-                _copy(_KEPT_ON_RESUME, stopped.folder, new)
-            new.sync_tree()
-            attempt = CellFolder(new.pinned(name=self.path))
-            self._set_aside(before)
-            new.rename(self.folder)
-        except BaseException:
-            _remove(new)
-            raise
-        self.folder.sync_name()
-        self._settle_leftovers(identity)
-        return attempt
-
-    def _stopped(self, identity: Mapping[str, Any]) -> CellFolder | None:
-        """Return the attempt that a new one goes on from: the last, where it can be resumed.
-
-        A process that was killed while it began an attempt may have left the last one hidden.
-        """
-        last = [self] if self.folder.exists() else self._leftovers("old")
-        return next((attempt for attempt in last if attempt._can_resume(identity)), None)
-
-    def _hidden(self, kind: str) -> ConfinedPath:
-        """Return a name that no folder has, for one that `begin` makes or replaces."""
-        return self.folder.with_name(f".{self.id}.{kind}-{secrets.token_hex(4)}")
-
-    def _leftovers(self, kind: str) -> list[CellFolder]:
-        """Return the hidden folders of one kind: the last attempt, or what nobody needs (`new`)."""
-        prefix = f".{self.id}.{kind}-"
-        names = [name for name in self.folder.siblings() if name.startswith(prefix)]
-        return [CellFolder(self.folder.with_name(name)) for name in names]
-
-    def _set_aside(self, before: tuple[int, int] | None) -> None:
-        """Free this name for a new attempt, unless another process has given it away meanwhile."""
-        if before is None:
-            return
-        old = self._hidden("old")
-        self.folder.rename(old)
-        if old.identity() != before:
-            old.rename(self.folder)
-            why = "another process has begun this cell at the same time"
-            raise ReplacedError(errno.ESTALE, why, str(self.path))
-        # Otherwise a power failure could keep the new folder's name and lose this one.
-        old.sync_name()
-
-    def _settle_leftovers(self, identity: Mapping[str, Any]) -> None:
-        """Remove stopped attempts, which the new one goes on from; keep every other one aside."""
-        for old in self._leftovers("old"):
-            stopped = old._can_resume(identity)
-            name = self._hidden("new") if stopped else _free_name(self.folder)
-            old.folder.rename(name)
-            # What a power failure leaves of a removal must not pass for an attempt.
-            name.sync_name()
-        for new in self._leftovers("new"):
-            _remove(new.folder)
-
-    def _can_resume(self, identity: Mapping[str, Any]) -> bool:
-        state = self.state()
-        if state.name == "unknown":
-            raise UnreadableError(f"{self.path}: {state.reason}")
-        failed_late = state.name == "failed" and self.checkpoint.is_file()
-        if state.name != "unfinished" and not failed_late:
-            return False
-        try:
-            return canonical_json(self.identity()) == canonical_json(identity)
-        except UnreadableError:
-            raise
-        except (StoreError, TypeError, ValueError):
-            return False
-
     def finish(self, views: Sequence[str], protocol: int) -> None:
         """Declare the cell done, with the files that are in the folder now.
 
@@ -425,20 +315,6 @@ class CellFolder:
         renders = self.folder / _HEAVY_FOLDER
         if renders.is_dir() and not renders.names():
             renders.remove()
-
-    def remove(self) -> None:
-        """Remove the cell. The caller holds its lock.
-
-        It loses its name first: what a kill leaves of it is no cell, and is removed with the next
-        attempt or by `xrgs-store gc`.
-
-        Raises:
-            OSError: It can't be removed.
-        """
-        gone = self._hidden("new")
-        self.folder.rename(gone)
-        gone.sync_name()
-        gone.remove()
 
     def fail(self, reason: str) -> None:
         """Declare the cell failed, and write `error.txt` if its process did not.
@@ -569,33 +445,3 @@ class CellFolder:
 
 def _is_heavy(name: str) -> bool:
     return name in _HEAVY or name.startswith(f"{_HEAVY_FOLDER}/")
-
-
-def _copy(names: Iterable[str], source: ConfinedPath, target: ConfinedPath) -> None:
-    """Copy the files that are there.
-
-    They are not moved: until the new attempt is in place, the old one must be whole, and its
-    process may have the log open.
-    """
-    for name in names:
-        if (source / name).is_file():
-            with (source / name).open() as stream, (target / name).create() as copy:
-                shutil.copyfileobj(stream, copy)
-
-
-def _remove(folder: ConfinedPath) -> None:
-    """Remove a folder that no process needs any more.
-
-    One that is still written to, by a process that has lost its lock, may resist: the next attempt
-    tries again.
-    """
-    with suppress(OSError):
-        folder.remove()
-
-
-def _free_name(path: ConfinedPath) -> ConfinedPath:
-    """Return the first sibling that does not exist: `<name>.aside-1`, `<name>.aside-2`, ..."""
-    number = 1
-    while (free := path.with_name(f"{path.name}.aside-{number}")).exists():
-        number += 1
-    return free

@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING
 from xrgs.capture.failures import FAILED_PREFIX
 from xrgs.errors import StoreError, XrgsError
 from xrgs.experiment import trimming
+from xrgs.experiment.attempts import remove_cell
 from xrgs.safeio.records import list_folder
 from xrgs.safeio.untrusted import is_name
 from xrgs.safeio.words import counted, for_line
@@ -241,7 +242,7 @@ def _remove_cell(store: Store, cell: CellSummary) -> str:
         return "it is no longer there"
     if state != cell.state.name:
         return f"it is left: it was {cell.state.name}, and is {state} now"
-    cell.folder.remove()
+    remove_cell(cell.folder)
     return ""
 
 

@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Any
 from xrgs import composing
 from xrgs.errors import StoreError, XrgsError
 from xrgs.experiment import provenance, trimming
+from xrgs.experiment.attempts import begin_attempt
 from xrgs.experiment.cell_folder import CellFolder
 from xrgs.experiment.identity import cell_identity
 from xrgs.experiment.store import Store
@@ -311,7 +312,7 @@ def _train_again(
     original: CellFolder,
 ) -> None:
     """Train like a sweep's cell, but without a lock: no other process writes to the folder."""
-    attempt = repeated.begin(asdict(conf), identity)
+    attempt = begin_attempt(repeated, asdict(conf), identity)
     cell = PlannedCell(
         CellSpec("rerun", "", (), ()),
         conf,

@@ -17,6 +17,7 @@ import pytest
 from xrgs.capture import variant
 from xrgs.capture.views import Variant
 from xrgs.config import Conf
+from xrgs.experiment.attempts import begin_attempt
 from xrgs.experiment.cell_folder import CellFolder
 from xrgs.experiment.store import Store
 from xrgs.safeio.atomic import write_json, write_text
@@ -78,13 +79,13 @@ def test_a_worker_that_wakes_up_after_a_takeover_changes_nothing_and_says_so(
 ) -> None:
     store, identity = Store(tmp_path), {"variant": built.id, "seed": 0}
     store.prepare()
-    first = store.cell("c").begin(asdict(conf), identity)
+    first = begin_attempt(store.cell("c"), asdict(conf), identity)
     write_json(tmp_path / "request", worker.cell_request(asdict(conf), built.folder, first))
     arguments = [call, file, str(tmp_path / "request"), str(tmp_path / "answer")]
     child = subprocess.Popen([sys.executable, "-P", "-c", STOPPED, *arguments])
     assert os.WIFSTOPPED(os.waitpid(child.pid, os.WUNTRACED)[1])
 
-    second = store.cell("c").begin(asdict(conf), identity)
+    second = begin_attempt(store.cell("c"), asdict(conf), identity)
     if done:
         finish(second)
     before = files(second.path)
@@ -110,9 +111,9 @@ def test_a_worker_that_starts_after_a_takeover_does_nothing(
     """Its parent was suspended between the beginning of the cell and the start of this worker."""
     store, identity = Store(tmp_path), {"variant": built.id, "seed": 0}
     store.prepare()
-    first = store.cell("c").begin(asdict(conf), identity)
+    first = begin_attempt(store.cell("c"), asdict(conf), identity)
     request: dict[str, Any] = worker.cell_request(asdict(conf), built.folder, first)
-    second = store.cell("c").begin(asdict(conf), identity)
+    second = begin_attempt(store.cell("c"), asdict(conf), identity)
     before = files(second.path)
     with pytest.raises(worker.AttemptLostError, match="another attempt at the cell has begun"):
         worker.run_in_child("cell", request)

@@ -17,6 +17,7 @@ from omegaconf import DictConfig, OmegaConf
 from xrgs.capture import scenes, variant
 from xrgs.cli import sweep as command
 from xrgs.errors import XrgsError
+from xrgs.experiment.attempts import begin_attempt
 from xrgs.experiment.store import Store
 from xrgs.sweep import locks
 from xrgs.sweep.jobs import worker
@@ -234,7 +235,7 @@ def test_a_cell_that_was_taken_over_is_left_as_it_is(
     made = hand_over_of()
 
     def lose(_: str, request: Mapping[str, Any], *__: object) -> None:
-        folder = store.cell(Path(request["cell"]).name).begin(made.config, made.identity)
+        folder = begin_attempt(store.cell(Path(request["cell"]).name), made.config, made.identity)
         (folder.path / "scores.csv").write_text("view\na\n")
         folder.finish(["a"], 1)
         raise worker.AttemptLostError("another attempt at the cell has begun")

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from xrgs.errors import UnreadableError, XrgsError
+from xrgs.experiment.attempts import begin_attempt
 from xrgs.experiment.store import Store
 from xrgs.experiment.trimming import check_images
 from xrgs.runtime.progress import log_line
@@ -117,7 +118,7 @@ def _run_under_lock(cell: HandOver, store: Store, session: SweepSession) -> str:
         cell.check_code()
         if not lock.is_held():
             return _lost(folder)
-        attempt = folder.begin(cell.config, cell.identity)
+        attempt = begin_attempt(folder, cell.config, cell.identity)
         log_line(f"{cell.name}: training cell {folder.id}")
         return _train_in_child(cell, store, variant, attempt, lock, session)
     finally:

@@ -132,7 +132,7 @@ def cell_request(
     Args:
         conf: The cell's config as plain JSON values.
         variant: The folder of its variant.
-        attempt: What `CellFolder.begin` has returned. It must exist until the child has ended: the
+        attempt: What `begin_attempt` has returned. It must exist until the child has ended: the
             child works in this very folder, and in no other of its name.
     """
     cell, identity = str(attempt.path), attempt.folder.identity()
