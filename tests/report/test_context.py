@@ -90,6 +90,13 @@ def test_scores_of_views_that_were_trained_on_are_cautioned(
     assert ("fern has no view held out (variant.test_every=0)" in text) == cautioned
 
 
+def test_a_sweep_without_lr_views_names_none(made: Any) -> None:
+    configured(made.add(), variant={"hr_fraction": 1.0})
+    text = found(made)[""].of_scores
+    assert "all views HR" in text
+    assert "LR" not in text
+
+
 def test_a_mixture_that_was_not_made_is_said(made: Any) -> None:
     configured(made.add(), variant={"tags": "sampling_rate"})
     assert "LR by sampling_rate, nothing degraded" in found(made)[""].of_scores

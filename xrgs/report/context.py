@@ -24,7 +24,8 @@ if TYPE_CHECKING:
 #: Keys of a cell's config that the context names.
 _KEYS = (
     *("train.steps", "train.validation", "variant.long_side", "variant.factor"),
-    *("variant.degradation", "variant.tags", "variant.test_every", "variant.test"),
+    *("variant.hr_fraction", "variant.degradation", "variant.tags"),
+    *("variant.test_every", "variant.test"),
     "splat.densify.prune_scale3d",
 )
 #: Scores of fewer views than these say little: one more view may turn their order.
@@ -140,6 +141,8 @@ def _training(settings: Sequence[Mapping[str, Any]], tests: Mapping[str, int]) -
 def _mixture(settings: Sequence[Mapping[str, Any]]) -> list[str]:
     """Return a phrase on what was done to LR views."""
     tags, kinds = _distinct(settings, "variant.tags"), _distinct(settings, "variant.degradation")
+    if tags == ["flag"] and _distinct(settings, "variant.hr_fraction") == ["1"]:
+        return ["all views HR"]
     kinds = ["downsample" if kind == "auto" and tags == ["flag"] else kind for kind in kinds]
     if kinds == ["downsample"]:
         return [f"LR views {' or '.join(_distinct(settings, 'variant.factor'))} times smaller"]
