@@ -13,6 +13,7 @@ from xrgs.report.figures import (
     MAX_ARMS,
     Panel,
     curves,
+    dependence,
     differing_crop,
     quality_curves,
     side_by_side,
@@ -121,6 +122,42 @@ def test_a_trade_off_of_many_has_one_colour_and_all_numbers() -> None:
     shown = picture(trade_off("t", scenes.assign(scenes=1), scenes.assign(scene="fern"), [metric]))
     assert (shown == ORANGE).all(axis=2).sum() > 30 * 50
     assert not (shown == (0x00, 0x9E, 0x73)).all(axis=2).any()  # the third colour of few labels
+
+
+def changes_over(values: list[float], changes: list[float], series: str = "") -> pd.DataFrame:
+    rows = pd.DataFrame({"value": values, "change": changes, "series": series, "metric": "q"})
+    levels = [("pair", "fern"), ("scene", "fern"), ("mean", None)]
+    return pd.concat(rows.assign(level=level, scene=scene) for level, scene in levels)
+
+
+@pytest.mark.parametrize("higher_is_better", [True, False])
+@pytest.mark.parametrize("better", [True, False])
+def test_a_better_change_over_a_setting_is_above_the_line_of_the_base(
+    higher_is_better: bool, better: bool
+) -> None:
+    quality = Metric("q", "quality", "", higher_is_better=higher_is_better)
+    sign = 1.0 if better == higher_is_better else -1.0
+    changes = changes_over([0.1, 0.5, 1.0], [sign * 2, sign * 3, sign * 2.5])
+    png = dependence("$t_", "a_$b", changes, [quality])
+    assert png == dependence("$t_", "a_$b", changes, [quality])
+    shown = picture(png)
+    curve = np.argwhere((shown == ORANGE).all(axis=2))[:, 0].mean()
+    base = np.bincount(np.argwhere((shown == BLUE).all(axis=2))[:, 0]).argmax()
+    assert (curve < base) == better
+
+
+def test_each_series_over_a_setting_has_its_colour_and_is_named() -> None:
+    both = pd.concat(
+        [changes_over([1, 2, 4], [1, 2, 3], "a"), changes_over([1, 2, 4], [2, 3, 4], "b")]
+    )
+    metric = Metric("q", "quality", "", higher_is_better=True)
+    shown, one = (
+        picture(dependence("t", "k", rows, [metric]))
+        for rows in (both, both[both["series"] == "a"])
+    )
+    assert (shown == (0x00, 0x9E, 0x73)).all(axis=2).any()
+    assert not (one == (0x00, 0x9E, 0x73)).all(axis=2).any()
+    assert shown.shape == one.shape
 
 
 METRICS = [

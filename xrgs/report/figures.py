@@ -50,6 +50,8 @@ MAX_ARMS = len(_ARMS)
 _DPI = 130
 _PANEL = 3.4  # inches
 _ZOOM = 5
+#: A setting whose largest value is this many times the smallest one has a logarithmic axis.
+_LOG_FROM = 4
 #: The longest name beside a figure's axes, in characters: a longer one would leave them no room.
 _MAX_NAME = 40
 
@@ -310,6 +312,68 @@ def _dots(axis: Axes, means: pd.DataFrame, scenes: pd.DataFrame, quality: str) -
     axis.xaxis.set_major_formatter(EngFormatter(sep=" "))
     axis.grid(alpha=0.3)
     axis.spines[["top", "right"]].set_visible(False)
+
+
+@_default_style()
+def dependence(title: str, key: str, changes: pd.DataFrame, axes: Sequence[Metric]) -> bytes:
+    """Draw how changes depend on a setting, one panel for each metric.
+
+    Better is up, and the dashed line is the base. Each series has a colour: a thick line with marks
+    is its mean over scenes, thin ones are its scenes, and dots are its pairs.
+
+    Args:
+        title: The title of the figure.
+        key: The key of the setting.
+        changes: What `xrgs.report.sensitivity.sensitivities` returns for it, of at most `MAX_ARMS`
+            series.
+        axes: The metrics to draw.
+
+    Returns:
+        The bytes of a PNG.
+    """
+    figure = _figure(_PANEL * len(axes), _PANEL + 0.6)
+    figure.suptitle(for_line(title, MAX_CELL), fontsize=11)
+    panels = figure.subplots(1, len(axes), squeeze=False)[0]
+    series = list(dict.fromkeys(changes["series"]))
+    for panel, metric in zip(panels, axes, strict=True):
+        rows = changes[changes["metric"] == metric.name]
+        lines = [
+            _dependence_line(panel, rows[rows["series"] == name], look)
+            for name, look in zip(series, _ARMS[1:], strict=False)
+        ]
+        _scaled(panel, sorted(rows["value"].unique()))
+        panel.axhline(0, color=_BASELINE, linewidth=1.3, linestyle="--")
+        panel.set_title(f"{metric.label}, %", fontsize=10)
+        panel.set_xlabel(for_line(key, _MAX_NAME))
+        panel.grid(alpha=0.3)
+        panel.spines[["top", "right"]].set_visible(False)
+        if not metric.higher_is_better:
+            panel.invert_yaxis()
+    if len(series) > 1:
+        names = [for_line(name, _MAX_NAME) for name in series]
+        figure.legend(lines, names, loc="outside lower center", frameon=False, fontsize=9, ncols=4)
+    return _png(figure)
+
+
+def _dependence_line(axis: Axes, rows: pd.DataFrame, look: tuple[str, str]) -> Line2D:
+    """Draw one series of a panel; returns the line of its mean."""
+    color, mark = look
+    of = {level: rows[rows["level"] == level] for level in ("pair", "scene", "mean")}
+    axis.plot(
+        of["pair"]["value"], of["pair"]["change"], color=color, marker=".", linestyle="", alpha=0.45
+    )
+    for _, curve in of["scene"].groupby("scene"):
+        axis.plot(curve["value"], curve["change"], color=color, linewidth=0.7, alpha=0.45)
+    mean = of["mean"]
+    return axis.plot(mean["value"], mean["change"], color=color, marker=mark, linewidth=1.8)[0]
+
+
+def _scaled(axis: Axes, values: Sequence[float]) -> None:
+    """Mark the values of a setting, on a logarithmic axis where they spread over a factor."""
+    if values[0] > 0 and values[-1] >= _LOG_FROM * values[0]:
+        axis.set_xscale("log")
+        axis.xaxis.set_minor_locator(NullLocator())
+    axis.set_xticks(values, [f"{value:g}" for value in values])
 
 
 def _figure(width: float, height: float) -> Figure:

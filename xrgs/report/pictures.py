@@ -19,12 +19,14 @@ from xrgs.report.figures import (
     MAX_ARMS,
     Panel,
     curves,
+    dependence,
     differing_crop,
     quality_curves,
     side_by_side,
     trade_off,
 )
 from xrgs.report.render import titled
+from xrgs.report.sensitivity import sensitivities
 from xrgs.runtime.progress import progress
 from xrgs.safeio.atomic import atomic_writer
 from xrgs.safeio.words import for_file_name
@@ -44,6 +46,11 @@ if TYPE_CHECKING:
 #: The scores whose curves are drawn.
 _QUALITY = ("psnr", "lpips")
 _QUALITY_TITLE = "Quality during training: scenes thin, mean thick, level where {base} ends"
+#: The metrics whose changes over a setting are drawn.
+_DEPENDENT = frozenset({"gaussians", "lpips", "ssim", "psnr"})
+_SENSITIVITY_TITLE = (
+    "Change from {base} over {key}: replicates as dots, scenes thin, mean thick, better is up"
+)
 _CURVES = {"gaussians": "Gaussians", "loss": "loss of the step's view, as each run weighs it"}
 #: Largest image that is drawn: three are in memory at a time, 12 bytes a pixel, and their drawing.
 _MAX_PIXELS = 1 << 24
@@ -72,9 +79,9 @@ def draw(
 ) -> list[Picture]:
     """Draw what each ablation trades, and views and training curves of each scene and ablation.
 
-    The trade-offs are drawn where there are several ablations, and quality during training where
-    it was evaluated, for each condition. The other pictures show the first condition and replicate,
-    which their titles name.
+    For each condition the trade-offs are drawn where there are several ablations, quality during
+    training where it was evaluated, and changes over a setting that has three values. The other
+    pictures show the first condition and replicate, which their titles name.
 
     Args:
         store: The stores with the photographs, renders and histories.
@@ -97,7 +104,8 @@ def draw(
     scores = views[views["cell_id"].isin(shown)].groupby("cell_id")
     psnr = {cell_id: rows.set_index("view")["psnr"] for cell_id, rows in scores}
     cells = comparison.cells.drop_duplicates("cell_id").set_index("cell_id")
-    drawings = _curves_of_quality(comparison, quality) | _trade_offs(comparison)
+    drawings = _curves_of_quality(comparison, quality)
+    drawings |= _trade_offs(comparison) | _sensitivities(comparison)
     for _, pair in pairs.iterrows():
         both = _same_views(psnr.get(pair["base_id"]), psnr.get(pair["cell_id"]))
         cell = cells.loc[pair["cell_id"]]
@@ -152,6 +160,24 @@ def _trade_offs(comparison: Comparison) -> dict[str, _Drawing]:
     return drawings
 
 
+def _sensitivities(comparison: Comparison) -> dict[str, _Drawing]:
+    """Return the figures of changes over a setting, one for each condition and setting."""
+    drawings: dict[str, _Drawing] = {}
+    for condition in dict.fromkeys(condition for _, condition in comparison.groups):
+        for key, changes in sensitivities(comparison, condition).items():
+            known = set(changes.dropna(subset="change")["metric"])
+            axes = [metric for metric in comparison.metrics if metric.name in known & _DEPENDENT]
+            if not axes:
+                continue
+            title = titled(_SENSITIVITY_TITLE.format(base=comparison.base, key=key), condition)
+            name = f"sensitivity-{for_file_name(key)}{condition and f'.{for_file_name(condition)}'}"
+            drawings[name] = partial(_drawn, title, partial(dependence, title, key, changes, axes))
+            if (count := changes["series"].nunique()) >= MAX_ARMS:
+                why = f"{count} curves, of which a figure can tell {MAX_ARMS - 1} apart"
+                drawings[name] = partial(_not_drawn, title, why)
+    return drawings
+
+
 def _absolute(comparison: Comparison, condition: str) -> pd.DataFrame:
     """Return Gaussians and measured scores of each label and scene, as means over its runs.
 
@@ -199,6 +225,10 @@ def _drawn(title: str, figure: Callable[[], bytes], file: ConfinedPath) -> Pictu
     with atomic_writer(file) as stream:
         stream.write(figure())
     return Picture(title, file)
+
+
+def _not_drawn(title: str, why: str, _: ConfinedPath) -> Picture:
+    return Picture(title, None, why)
 
 
 def median_view(base: pd.Series, ablation: pd.Series) -> str:
