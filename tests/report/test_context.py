@@ -90,6 +90,13 @@ def test_scores_of_views_that_were_trained_on_are_cautioned(
     assert ("fern has no view held out (variant.test_every=0)" in text) == cautioned
 
 
+def test_scenes_whose_lr_views_differ_are_both_said(made: Any) -> None:
+    configured(made.add())
+    configured(made.add(scene="leaves"), variant={"tags": "sampling_rate", "factor": 2})
+    text = found(made)[""].of_scores
+    assert "LR views 5 times smaller or LR by sampling_rate, nothing degraded" in text
+
+
 def test_a_sweep_without_lr_views_names_none(made: Any) -> None:
     configured(made.add(), variant={"hr_fraction": 1.0})
     text = found(made)[""].of_scores

@@ -115,8 +115,13 @@ def _settings(store: JoinedStore, cell_id: str) -> dict[str, Any]:
 def _distinct(settings: Iterable[Mapping[str, Any]], key: str) -> list[str]:
     """Return the distinct values of a key as text, in the order in which they are found."""
     values = (one[key] for one in settings if one.get(key) is not None)
-    texts = (f"{v:,g}" if type(v) in {int, float} else str(v) for v in values)
-    return list(dict.fromkeys(for_line(text, _MAX_SHOWN) for text in texts))
+    return list(dict.fromkeys(map(_shown, values)))
+
+
+def _shown(value: object) -> str:
+    """Return a value of a config as a text of one line, whatever it is."""
+    text = f"{value:,g}" if type(value) in {int, float} else str(value)
+    return for_line(text, _MAX_SHOWN)
 
 
 def _training(settings: Sequence[Mapping[str, Any]], tests: Mapping[str, int]) -> list[str]:
@@ -129,7 +134,8 @@ def _training(settings: Sequence[Mapping[str, Any]], tests: Mapping[str, int]) -
         if values := _distinct(settings, key):
             phrases.append(phrase.format(" or ".join(values)))
     phrases = [text.replace("of at most 0 px", "at the photographs' size") for text in phrases]
-    phrases += _mixture(settings)
+    mixtures = dict.fromkeys(filter(None, map(_mixture, settings)))
+    phrases += [" or ".join(mixtures)] if mixtures else []
     least, most = min(tests.values()), max(tests.values())
     count = f"{least}" if least == most else f"{least} to {most}"
     held_out = any(one.get("train.validation") for one in settings)
@@ -138,17 +144,17 @@ def _training(settings: Sequence[Mapping[str, Any]], tests: Mapping[str, int]) -
     return phrases
 
 
-def _mixture(settings: Sequence[Mapping[str, Any]]) -> list[str]:
-    """Return a phrase on what was done to LR views."""
-    tags, kinds = _distinct(settings, "variant.tags"), _distinct(settings, "variant.degradation")
-    if tags == ["flag"] and _distinct(settings, "variant.hr_fraction") == ["1"]:
-        return ["all views HR"]
-    kinds = ["downsample" if kind == "auto" and tags == ["flag"] else kind for kind in kinds]
-    if kinds == ["downsample"]:
-        return [f"LR views {' or '.join(_distinct(settings, 'variant.factor'))} times smaller"]
-    if kinds in (["auto"], ["none"]):
-        return [f"LR by {' or '.join(tags)}, nothing degraded"]
-    return [f"LR views by {' or '.join(kinds)}"] if kinds else []
+def _mixture(one: Mapping[str, Any]) -> str:
+    """Return a phrase on what was done to the LR views of a cell; empty where that is not known."""
+    tags, kind = one.get("variant.tags"), one.get("variant.degradation")
+    made = tags == "flag"
+    if made and one.get("variant.hr_fraction") == 1:
+        return "all views HR"
+    if kind == "downsample" or (made and kind == "auto"):
+        return f"LR views {_shown(one.get('variant.factor'))} times smaller"
+    if kind in ("auto", "none"):
+        return f"LR by {_shown(tags)}, nothing degraded"
+    return f"LR views by {_shown(kind)}" if kind is not None else ""
 
 
 def _prune_rule(labels: Iterable[str], settings: Sequence[Mapping[str, Any]]) -> list[str]:
