@@ -94,7 +94,7 @@ def test_scenes_whose_lr_views_differ_are_both_said(made: Any) -> None:
     configured(made.add())
     configured(made.add(scene="leaves"), variant={"tags": "sampling_rate", "factor": 2})
     text = found(made)[""].of_scores
-    assert "LR views 5 times smaller or LR by sampling_rate, nothing degraded" in text
+    assert "LR views 5 times smaller or LR by sampling_rate (nothing degraded)" in text
 
 
 def test_a_sweep_without_lr_views_names_none(made: Any) -> None:
@@ -106,7 +106,7 @@ def test_a_sweep_without_lr_views_names_none(made: Any) -> None:
 
 def test_a_mixture_that_was_not_made_is_said(made: Any) -> None:
     configured(made.add(), variant={"tags": "sampling_rate"})
-    assert "LR by sampling_rate, nothing degraded" in found(made)[""].of_scores
+    assert "LR by sampling_rate (nothing degraded)" in found(made)[""].of_scores
 
 
 def test_values_of_a_stranger_are_shown_as_they_are(made: Any) -> None:

@@ -153,7 +153,7 @@ def _mixture(one: Mapping[str, Any]) -> str:
     if kind == "downsample" or (made and kind == "auto"):
         return f"LR views {_shown(one.get('variant.factor'))} times smaller"
     if kind in ("auto", "none"):
-        return f"LR by {_shown(tags)}, nothing degraded"
+        return f"LR by {_shown(tags)} (nothing degraded)"
     return f"LR views by {_shown(kind)}" if kind is not None else ""
 
 
