@@ -162,8 +162,7 @@ def curves(
         ]
         axis.set_xlabel("step")
         axis.set_title(name, fontsize=10)
-        axis.grid(alpha=0.3)
-        axis.spines[["top", "right"]].set_visible(False)
+        _with_grid(axis)
     names = [for_line(label, _MAX_NAME) for label, _ in runs]
     legend = axes[0].legend(lines, names, frameon=False, fontsize=9)
     legend.set_in_layout(False)  # a long name lies over the curves, and takes none of their room
@@ -228,8 +227,7 @@ def _quality_panel(
         lines[label].set(marker=mark, markersize=5, markevery=(len(lines) % every, every))
         if label == labels[0] and len(curve):
             axis.axhline(curve[quality].iloc[-1], color=color, linewidth=1.3, linestyle="--")
-    axis.grid(alpha=0.3)
-    axis.spines[["top", "right"]].set_visible(False)
+    _with_grid(axis)
     return lines
 
 
@@ -310,8 +308,7 @@ def _dots(axis: Axes, means: pd.DataFrame, scenes: pd.DataFrame, quality: str) -
     axis.xaxis.set_major_locator(LogLocator(subs=(1, 2, 3, 5, 7)))
     axis.xaxis.set_minor_locator(NullLocator())
     axis.xaxis.set_major_formatter(EngFormatter(sep=" "))
-    axis.grid(alpha=0.3)
-    axis.spines[["top", "right"]].set_visible(False)
+    _with_grid(axis)
 
 
 @_default_style()
@@ -345,8 +342,7 @@ def dependence(title: str, key: str, changes: pd.DataFrame, axes: Sequence[Metri
         panel.axhline(0, color=_BASELINE, linewidth=1.3, linestyle="--")
         panel.set_title(f"{metric.label}, %", fontsize=10)
         panel.set_xlabel(for_line(key, _MAX_NAME))
-        panel.grid(alpha=0.3)
-        panel.spines[["top", "right"]].set_visible(False)
+        _with_grid(panel)
         if not metric.higher_is_better:
             panel.invert_yaxis()
     if len(series) > 1:
@@ -374,6 +370,12 @@ def _scaled(axis: Axes, values: Sequence[float]) -> None:
         axis.set_xscale("log")
         axis.xaxis.set_minor_locator(NullLocator())
     axis.set_xticks(values, [f"{value:g}" for value in values])
+
+
+def _with_grid(axis: Axes) -> None:
+    """Give a panel a faint grid, and no frame at the top and on the right."""
+    axis.grid(alpha=0.3)
+    axis.spines[["top", "right"]].set_visible(False)
 
 
 def _figure(width: float, height: float) -> Figure:
