@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 
-from xrgs.capture import frozen
-from xrgs.errors import StoreError
+from xrgs.capture import frozen, restore
+from xrgs.config import Conf
+from xrgs.errors import StoreError, UnreadableError
 from xrgs.experiment import trimming
 from xrgs.experiment.attempts import begin_attempt, remove_cell
 from xrgs.experiment.cell_folder import CellFolder
@@ -133,3 +135,78 @@ def test_a_cell_of_a_trimmed_variant_has_no_dataset_and_says_why(
     (tmp_path / "variants" / "trimmed-k-v").mkdir(parents=True)
     with pytest.raises(StoreError, match="variant k-v: its images were removed"):
         cell.dataset()
+
+
+# images that are made again
+
+
+@pytest.fixture
+def trimmed(variants: ConfinedPath) -> str:
+    """The id of a variant that was trimmed."""
+    (name,) = variants.names()
+    trimming.trim_variant(variants, name)
+    return name
+
+
+@pytest.fixture
+def again(
+    variants: ConfinedPath, compose: Callable[..., Conf], monkeypatch: pytest.MonkeyPatch
+) -> Callable[..., None]:
+    """(id, error=None) -> restores a variant, whose images are written here; or fails after one."""
+
+    def run(variant_id: str, error: BaseException | None = None) -> None:
+        def images(folder: ConfinedPath, *_: object) -> None:
+            (folder / "images").make_folder()
+            (folder.path / "images" / "a.png").write_bytes(b"image")
+            if error:
+                raise error
+
+        monkeypatch.setattr(restore, "restore_images", images)
+        conf = compose("scene=motorcycle")
+        trimming.restore_variant(variants, variant_id, conf.scene, conf.variant, variants)
+
+    return run
+
+
+def names(folder: ConfinedPath) -> list[str]:
+    return [name for name in folder.names() if not name.endswith(".lock")]
+
+
+def test_a_restored_variant_has_its_name_and_its_images(
+    variants: ConfinedPath, trimmed: str, again: Callable[..., None]
+) -> None:
+    again(trimmed)
+    assert names(variants) == [trimmed]
+    assert (variants / trimmed / "images" / "a.png").read_bytes() == b"image"
+    trimming.check_images(variants, trimmed)
+
+
+def test_a_variant_that_has_its_images_is_left_alone(
+    variants: ConfinedPath, trimmed: str, again: Callable[..., None]
+) -> None:
+    again(trimmed)
+    again(trimmed, AssertionError("nothing is made"))
+    assert names(variants) == [trimmed]
+
+
+def test_images_that_cant_be_made_again_leave_the_variant_trimmed(
+    variants: ConfinedPath, trimmed: str, again: Callable[..., None]
+) -> None:
+    with pytest.raises(StoreError, match=rf"variant {trimmed}: .* made again: another image\. Rem"):
+        again(trimmed, StoreError("another image"))
+    assert names(variants) == [f"trimmed-{trimmed}"]
+    assert (variants / f"trimmed-{trimmed}").names() == ["points.npz", "variant.json"]
+    with pytest.raises(UnreadableError, match="a server is away"):
+        again(trimmed, UnreadableError("a server is away"))
+    assert (variants / f"trimmed-{trimmed}").names() == ["points.npz", "variant.json"]
+
+
+def test_a_restoration_that_was_killed_midway_is_begun_again(
+    variants: ConfinedPath, trimmed: str, again: Callable[..., None]
+) -> None:
+    with pytest.raises(KeyboardInterrupt):
+        again(trimmed, KeyboardInterrupt())
+    (variants / f".{trimmed}.restoring").make_folder()
+    assert trimming.trimmed_variant(variants, "key") == trimmed
+    again(trimmed)
+    assert names(variants) == [trimmed]

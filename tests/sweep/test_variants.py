@@ -6,6 +6,7 @@ import errno
 import os
 import tempfile
 from collections.abc import Callable
+from dataclasses import asdict
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -258,3 +259,37 @@ def test_a_dry_run_reads_the_headers_of_photographs(
         assert planned.error is not None
         assert "scene scene: 1 readable image(s), two are needed: [" in planned.error
     assert not list(store.variants.path.iterdir())
+
+
+@pytest.mark.slow
+def test_a_cell_on_a_trimmed_variant_is_trained_on_the_same_variant(
+    sweeps_in: Callable[..., Any], run_command: Callable[..., Any], tmp_path: Path
+) -> None:
+    sweeps, smoke = sweeps_in(tmp_path), ("scene=motorcycle", "preset=smoke", "train.steps=2")
+    assert sweeps.run(*smoke)[0] == 0
+    (built,) = Store(tmp_path / "s").variants.names()[-1:]
+    trim = ("trim", "store=s", "variants=true", "yes=true")
+    assert run_command("store", tmp_path, *trim)[0::2] == (0, "")
+    assert f"trimmed-{built}" in Store(tmp_path / "s").variants.names()
+    code, table, err = sweeps.run(*smoke, "+ablation=consistency")
+    assert code == 0
+    assert f"variant {built}: making the images again that xrgs-store trim has removed" in err
+    assert BUILDING not in err
+    assert "consistency" in table
+    assert [n for n in Store(tmp_path / "s").variants.names() if n[0] != "."] == [built]
+    assert variant.verify(Store(tmp_path / "s").variants / built) == []
+
+
+def test_images_are_made_again_of_trimmed_variants_alone(
+    conf: Conf, store: Store, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    requests = []
+    monkeypatch.setattr(worker, "run_in_child", lambda *given: requests.append(given[:2]))
+    variants.restore(asdict(conf), store, "k-1")
+    assert requests == []
+    (store.variants / "trimmed-k-1").make_folder()
+    variants.restore(asdict(conf), store, "k-1")
+    ((job, request),) = requests
+    assert job == "restore"
+    assert (request["variant"], request["store"]) == ("k-1", str(store.path))
+    assert request["conf"]["scene"]["kind"] == "motorcycle"

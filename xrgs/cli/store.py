@@ -36,8 +36,8 @@ xrgs-store rm [CELL]... [FILTER]... [dry_run=true] [yes=true]
     Removes cells; at least one must be named or a filter given.
 xrgs-store trim [CELL]... [FILTER]... [variants=true] [dry_run=true] [yes=true]
     Removes the Gaussians and renders of done cells, of all by default. The cells stay done, and
-    tables of them can be made. variants=true also removes the images of their variants: no further
-    cell can be trained on these then.
+    tables of them can be made. variants=true also removes the images of their variants, which a
+    sweep with further cells makes again from the photographs.
 xrgs-store gc [of=NAMES] [dry_run=true] [yes=true]
     Removes what no sweep of the installed code needs; of= chooses among old_code (cells that other
     code has trained), failed (tries of cells and scenes), aside (folders of earlier attempts that

@@ -2,8 +2,9 @@
 
 A trimmed cell stays done: everything that tables are made of is kept, and its `status.json` lists
 what was removed, with sizes and hashes. A trimmed variant keeps its list of views, cameras, points
-and SfM report, in the folder `variants/trimmed-<id>`. Its cells are still found and reported. A new
-cell can't be trained on it, because its images are gone and another SfM would give another variant.
+and SfM report, in the folder `variants/trimmed-<id>`. Its cells are still found and reported.
+Before a new cell is trained on it, its images are made again from the photographs: another SfM
+would give another variant.
 """
 
 from __future__ import annotations
@@ -12,10 +13,11 @@ import stat
 from typing import TYPE_CHECKING
 
 from xrgs.capture import frozen, sealed
-from xrgs.errors import StoreError
+from xrgs.errors import StoreError, UnreadableError, XrgsError
 from xrgs.safeio.records import errors_named, read_object
 
 if TYPE_CHECKING:
+    from xrgs.config import SceneConf, VariantConf
     from xrgs.safeio.confined import ConfinedPath
 
 #: The beginning of the name of a trimmed variant's folder; the variant's id follows.
@@ -65,9 +67,8 @@ def check_images(variants: ConfinedPath, variant_id: str) -> None:
     folder = trimmed_folder(variants, variant_id)
     if folder.is_dir():
         raise StoreError(
-            f"variant {variant_id}: its images were removed by xrgs-store trim, so that no cell can"
-            f" be trained on it. Remove {folder} to let another variant be built, on which all"
-            " cells of the comparison are trained anew; the reports of the old ones stay"
+            f"variant {variant_id}: its images were removed by xrgs-store trim; xrgs-sweep makes"
+            " them again when it trains a cell on this variant"
         )
 
 
@@ -89,6 +90,57 @@ def trim_variant(variants: ConfinedPath, variant_id: str) -> None:
         folder.rename(trimmed)
         trimmed.sync_name()
     (trimmed / _IMAGES).remove()
+
+
+def restore_variant(
+    variants: ConfinedPath,
+    variant_id: str,
+    scene: SceneConf,
+    conf: VariantConf,
+    cache: ConfinedPath,
+) -> None:
+    """Make the images of a trimmed variant again; any number of processes may call this at once.
+
+    Nothing happens to a variant that has its images.
+
+    Args:
+        variants: The store's folder of variants.
+        variant_id: The variant's id.
+        scene: The config of its scene.
+        conf: The config that it was built with.
+        cache: The store's folder of rendered scenes.
+
+    Raises:
+        UnreadableError: A photograph can't be read now.
+        StoreError: The images can't be made again; the message says why. The variant stays trimmed.
+        OSError: The store can't be written.
+    """
+    from xrgs.capture.restore import restore_images
+
+    folder, key = trimmed_folder(variants, variant_id), variant_id.rpartition("-")[0]
+    with sealed.lock(variants / f".{key}.lock"):
+        if not folder.is_dir():
+            return
+        work = variants / f".{variant_id}.restoring"
+        work.remove()  # what a killed process left, as in the variant's own folder
+        (folder / _IMAGES).remove()
+        work.make_folder()
+        try:
+            restore_images(folder, scene, conf, work, cache)
+        except XrgsError as error:
+            (folder / _IMAGES).remove()
+            if isinstance(error, UnreadableError):
+                raise
+            raise StoreError(
+                f"variant {variant_id}: its images were removed by xrgs-store trim, and can't be"
+                f" made again: {error}. Remove {folder} to let another variant be built, on which"
+                " all cells of the comparison are trained anew; the reports of the old ones stay"
+            ) from error
+        finally:
+            work.remove()
+        folder.sync_tree()
+        folder.rename(variants / variant_id)
+        (variants / variant_id).sync_name()
 
 
 def image_bytes(variants: ConfinedPath, variant_id: str) -> int:

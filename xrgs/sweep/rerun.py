@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 
 from xrgs import composing
 from xrgs.errors import StoreError, XrgsError
-from xrgs.experiment import provenance, trimming
+from xrgs.experiment import provenance
 from xrgs.experiment.attempts import begin_attempt
 from xrgs.experiment.cell_folder import CellFolder
 from xrgs.experiment.identity import cell_identity
@@ -261,11 +261,11 @@ def _provide(variant_id: str, conf: Conf, store: Store) -> None:
 
     Raises:
         XrgsError: It is not, and building it again gives another variant; or its images were
-            removed on purpose.
+            removed on purpose, and can't be made again.
     """
+    variants.restore(asdict(conf), store, variant_id)
     if (store.variants / variant_id).is_dir():
         return
-    trimming.check_images(store.variants, variant_id)
     log_line(f"variant {variant_id} is not in {store.path} and is built again")
     store.prepare()
     try:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import asdict, dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from xrgs.capture import images, scenes, variant
 from xrgs.capture.scenes import folder
@@ -16,6 +16,8 @@ from xrgs.sweep.jobs import worker
 from xrgs.sweep.jobs.supervise import Limits
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping
+
     from xrgs.config import Conf
     from xrgs.experiment.store import Store
 
@@ -67,6 +69,28 @@ def build(conf: Conf, store: Store) -> str:
     request = {"conf": asdict(conf), "store": str(store.path)}
     answer = worker.run_in_child("variant", request, Limits(), lambda _: presence.check(store))
     return str(answer["variant"])
+
+
+def restore(conf: Mapping[str, Any], store: Store, variant_id: str) -> None:
+    """Make the images of a trimmed variant again, in a process of its own.
+
+    Args:
+        conf: The config of a cell of the variant, as plain JSON values; only its scene and its
+            variant are read.
+        store: The store.
+        variant_id: The variant's id; one that is not trimmed is left as it is.
+
+    Raises:
+        UnwritableError: The disk is full or can't be written.
+        UnreadableError: A file can't be read now.
+        StoreGoneError: The store is no longer there.
+        XrgsError: The photographs are missing, or give other images.
+    """
+    if not trimming.trimmed_folder(store.variants, variant_id).is_dir():
+        return
+    log_line(f"variant {variant_id}: making the images again that xrgs-store trim has removed")
+    request = {"conf": dict(conf), "store": str(store.path), "variant": variant_id}
+    worker.run_in_child("restore", request, Limits(), lambda _: presence.check(store))
 
 
 def find_or_build(conf: Conf, store: Store) -> str:
@@ -121,7 +145,8 @@ def _find_or_build(conf: Conf, store: Store, *, allow_build: bool) -> PlannedVar
         frozen = variant.find(store.variants, key)
         if frozen is not None:
             return PlannedVariant(frozen.id)
-        # The done cells of a trimmed variant are found by its id; a job refuses to train others.
+        # The done cells of a trimmed variant are found by its id; a job that trains another cell
+        # makes the images again.
         if trimmed := trimming.trimmed_variant(store.variants, key):
             return PlannedVariant(trimmed)
         failure = None if conf.retry == "failed" else variant.failure(store.variants, key)

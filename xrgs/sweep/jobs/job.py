@@ -11,10 +11,9 @@ from typing import TYPE_CHECKING
 from xrgs.errors import UnreadableError, XrgsError
 from xrgs.experiment.attempts import begin_attempt
 from xrgs.experiment.store import Store
-from xrgs.experiment.trimming import check_images
 from xrgs.runtime.progress import log_line
 from xrgs.safeio.confined import is_passing
-from xrgs.sweep import locks, presence
+from xrgs.sweep import locks, presence, variants
 from xrgs.sweep.jobs import worker
 from xrgs.sweep.jobs.supervise import Limits
 
@@ -60,7 +59,7 @@ def run_job(session: SweepSession, cell_id: str) -> str:
 
     Raises:
         XrgsError: The cell was not handed over by this sweep's plan, its code is not the planned
-            one, or its variant is missing or trimmed.
+            one, or its variant is missing, or trimmed and its images can't be made again.
     """
     if session.stopped:
         return STOPPED
@@ -102,7 +101,8 @@ def _run_under_lock(cell: HandOver, store: Store, session: SweepSession) -> str:
     # trimmed variant the plan knows the id alone.
     variant = store.variants / cell.variant_id
     if not variant.is_dir():
-        check_images(store.variants, cell.variant_id)
+        variants.restore(cell.config, store, cell.variant_id)
+    if not variant.is_dir():
         raise XrgsError(f"{cell.name}: its variant {variant} is missing")
     folder = store.cell(cell.cell_id)
     lock = locks.acquire(store.locks, folder.id, cell.dead_locks)

@@ -78,7 +78,8 @@ def run_in_child(
     """Do one piece of work in a child process and return its answer.
 
     Args:
-        job: `variant` to build a variant, or `cell` to train a cell.
+        job: `variant` to build a variant, `restore` to make the images of a trimmed one again, or
+            `cell` to train a cell.
         request: The arguments of the work, as plain JSON values.
         limits: The child is ended when it exceeds them.
         on_poll: Called repeatedly while the child runs, with its process id. An exception that it
@@ -169,6 +170,17 @@ def _build_variant(request: Mapping[str, Any]) -> dict[str, Any]:
     return {"variant": built.id}
 
 
+def _restore_variant(request: Mapping[str, Any]) -> dict[str, Any]:
+    from xrgs.composing import from_dict
+    from xrgs.experiment.store import Store
+    from xrgs.experiment.trimming import restore_variant
+
+    log_to_stderr()
+    conf, store = from_dict(request["conf"]), Store(Path(request["store"]))
+    restore_variant(store.variants, request["variant"], conf.scene, conf.variant, store.scenes)
+    return {}
+
+
 def _import_colmap() -> None:
     """Import COLMAP, without the stack that it prints when its process is ended by SIGTERM.
 
@@ -215,6 +227,7 @@ def _store_is_gone(request: Mapping[str, Any]) -> bool:
 
 _JOBS: dict[str, Callable[[Mapping[str, Any]], dict[str, Any]]] = {
     "variant": _build_variant,
+    "restore": _restore_variant,
     "cell": _run_cell,
 }
 
@@ -223,7 +236,7 @@ def main(job: str, request: str, answer: str) -> None:
     """Do one piece of work in the child, and write its answer or the reason why it failed.
 
     Args:
-        job: `variant` or `cell`.
+        job: `variant`, `restore` or `cell`.
         request: JSON file with the arguments.
         answer: File for the answer.
     """
