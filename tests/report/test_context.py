@@ -119,3 +119,10 @@ def test_values_of_a_stranger_are_shown_as_they_are(made: Any) -> None:
 def test_without_finished_cells_there_is_no_context(made: Any) -> None:
     made.add(state="failed")
     assert found(made) == {"": Context()}
+
+
+def test_a_factor_that_is_not_known_is_not_named(made: Any) -> None:
+    configured(made.add(), variant={"factor": None})
+    text = found(made)[""].of_scores
+    assert "times smaller" not in text
+    assert "None" not in text

@@ -69,6 +69,7 @@ def test_two_settings_are_one_curve_for_each_value_of_the_other(made: Any) -> No
         ("densify.decide=current_view", "densify.decide=per_class", "densify.decide=own_threshold"),
         ("a.b=1", "a.b=2"),
         ("a.b=1", "a.b=nan", "a.b=inf"),
+        ("a.b=1", "a.b=2", "a.b=1e300"),
         ("a.b=1", "a.b=1.0", "a.b=2"),
         ("a.b=1", "c a.b=2", "d a.b=3"),
     ],

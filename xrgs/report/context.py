@@ -151,7 +151,8 @@ def _mixture(one: Mapping[str, Any]) -> str:
     if made and one.get("variant.hr_fraction") == 1:
         return "all views HR"
     if kind == "downsample" or (made and kind == "auto"):
-        return f"LR views {_shown(one.get('variant.factor'))} times smaller"
+        factor = one.get("variant.factor")
+        return f"LR views {_shown(factor)} times smaller" if factor is not None else ""
     if kind in ("auto", "none"):
         return f"LR by {_shown(tags)} (nothing degraded)"
     return f"LR views by {_shown(kind)}" if kind is not None else ""

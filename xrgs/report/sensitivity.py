@@ -21,6 +21,8 @@ if TYPE_CHECKING:
 
 #: The fewest values of a setting that show how a change depends on it.
 _MIN_VALUES = 3
+#: The largest value of a setting that an axis can show: the space beside it needs more of float64.
+_MAX_SHOWN = 1e100
 _POINT = ["label", "scene", "metric", "change"]
 
 
@@ -72,7 +74,7 @@ def _settings(labels: Iterable[str]) -> dict[str, pd.DataFrame]:
         words = label.split(" ")
         for at, word in enumerate(words):
             key, _, text = word.partition("=")
-            if math.isfinite(value := _number(text)):
+            if abs(value := _number(text)) <= _MAX_SHOWN:
                 rest = " ".join(words[:at] + words[at + 1 :])
                 found.setdefault(key, []).append((label, rest, value))
     columns = ["label", "series", "value"]

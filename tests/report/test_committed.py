@@ -1,0 +1,41 @@
+"""The numbers of reports/ are what its cells say: reports are made again from packed stores."""
+
+from __future__ import annotations
+
+import tarfile
+from pathlib import Path
+
+import pytest
+
+from xrgs.experiment.store import Store
+from xrgs.report.page import build
+
+REPORTS = Path(__file__).parents[2] / "reports"
+PACKED = sorted(REPORTS.glob("*/store.tar.xz"))
+#: Files of a report that no photograph has a part in, which a packed store does not have.
+FILES = (
+    "cells.csv",
+    "curves.csv",
+    "provenance.json",
+    "skipped.csv",
+    "table.csv",
+    "table.tex",
+    "time_to_quality.csv",
+    "training.csv",
+)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("packed", PACKED, ids=lambda path: path.parent.name)
+def test_a_packed_store_gives_the_committed_tables(packed: Path, tmp_path: Path) -> None:
+    with tarfile.open(packed) as archive:
+        archive.extractall(tmp_path, filter="data")
+    store = Store(tmp_path / "xrgs-store")
+    made = build(store.path, store.sweep_ids(), tmp_path / "report", pictures=[])
+    for name in FILES:
+        committed = (packed.parent / name).read_text(encoding="utf-8")
+        assert (made.folder / name).read_text(encoding="utf-8") == committed, name
+
+
+def test_there_are_packed_stores() -> None:
+    assert PACKED
