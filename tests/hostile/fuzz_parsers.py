@@ -37,6 +37,8 @@ from tests.hostile.mutations import (
 )
 from xrgs import composing
 from xrgs.capture import failures, images, variant
+from xrgs.capture.lens import Lens
+from xrgs.capture.restore import restore_images
 from xrgs.errors import StoreError, XrgsError
 from xrgs.experiment.cell_folder import CellFolder
 from xrgs.experiment.store import Store
@@ -95,6 +97,7 @@ def parsers(folder: Path) -> dict[str, Parser]:
     cell = reference.cell_of(store)
     _add_running_files(cell, store)
     made = _of_cells(cell) | _of_stores(store, cell) | _of_variants(reference.variant_of(store))
+    made |= _of_trimmed_variants(folder / "trimmed")
     return made | _of_images(folder / "images") | _of_arrays(folder, cell)
 
 
@@ -199,6 +202,40 @@ def _of_variants(folder: Path) -> dict[str, Parser]:
         "variant-report": changed("report.json", mutate_json),
         "variant-image": changed("images/train/left.png", mutate_image),
         "variant-unsealed": changed("variant.json", mutate_json, sealed=False),
+    }
+
+
+def _of_trimmed_variants(folder: Path) -> dict[str, Parser]:
+    """A trimmed variant whose images are made again, of two photographs, one of them degraded."""
+    photographs, trimmed, work = (folder / name for name in ("photographs", "trimmed", "work"))
+    for made in (photographs, trimmed, work):
+        made.mkdir(parents=True)
+    for seed, name in enumerate(("left", "right")):
+        reference.picture(seed, 60, 55).save(photographs / f"{name}.png")
+    conf = composing.compose(
+        "scene=folder", f"scene.path={photographs}", "variant.long_side=0", "variant.min_hr=1"
+    )
+    lens = Lens(60, 55, 70.0, 70.0, 30.0, 27.5, 0.01)
+    views = [
+        {"name": name, "split": split, "K": lens.resized(width, height).undistorted().K.tolist()}
+        for name, split, width, height in (
+            ("left", "original", 60, 55),
+            ("left", "train", 12, 11),
+            ("right", "test", 60, 55),
+        )
+    ]
+    (trimmed / "variant.json").write_text(json.dumps({"views": views, "files": {}}))
+    (trimmed / "report.json").write_text(json.dumps({"lenses": [repr(lens)]}))
+
+    def restore(_: Path) -> None:
+        restore_images(
+            *(ConfinedPath(trimmed), conf.scene, conf.variant),
+            *(ConfinedPath(work), ConfinedPath(folder)),
+        )
+
+    return {
+        "trimmed-variant": Parser(trimmed / "variant.json", mutate_json, restore, (XrgsError,)),
+        "trimmed-report": Parser(trimmed / "report.json", mutate_json, restore, (XrgsError,)),
     }
 
 

@@ -26,7 +26,7 @@ NAMES = (
     *("history", "identity", "sweep", "sweep-names", "lock", "locks", "cells-identity"),
     *("cells-config", "cells-summary", "failed-scene", "variant", "variant-points"),
     *("variant-report", "variant-image", "variant-unsealed", "image-header", "image", "exif"),
-    *("npz", "checkpoint", "ply"),
+    *("npz", "checkpoint", "ply", "trimmed-variant", "trimmed-report"),
 )
 
 
