@@ -227,11 +227,10 @@ def _of_trimmed_variants(folder: Path) -> dict[str, Parser]:
     (trimmed / "variant.json").write_text(json.dumps({"views": views, "files": {}}))
     (trimmed / "report.json").write_text(json.dumps({"lenses": [repr(lens)]}))
 
-    def restore(_: Path) -> None:
-        restore_images(
-            *(ConfinedPath(trimmed), conf.scene, conf.variant),
-            *(ConfinedPath(work), ConfinedPath(folder)),
-        )
+    def restore(_: Path) -> list[str]:
+        restored, store = ConfinedPath(trimmed), ConfinedPath(folder)
+        restore_images(restored, conf.scene, conf.variant, ConfinedPath(work), store)
+        return (restored / "images").names()
 
     return {
         "trimmed-variant": Parser(trimmed / "variant.json", mutate_json, restore, (XrgsError,)),

@@ -25,8 +25,8 @@ NAMES = (
     *("json", "json-object", "table", "config", "progress", "status", "scores", "scores-sealed"),
     *("history", "identity", "sweep", "sweep-names", "lock", "locks", "cells-identity"),
     *("cells-config", "cells-summary", "failed-scene", "variant", "variant-points"),
-    *("variant-report", "variant-image", "variant-unsealed", "image-header", "image", "exif"),
-    *("npz", "checkpoint", "ply", "trimmed-variant", "trimmed-report"),
+    *("variant-report", "variant-image", "variant-unsealed", "trimmed-variant", "trimmed-report"),
+    *("image-header", "image", "exif", "npz", "checkpoint", "ply"),
 )
 
 
