@@ -66,7 +66,7 @@ def test_an_ablation_alone_without_a_share_is_named(made: Any) -> None:
     made.add("c", scene="room", state="failed")
     built = table(made)
     assert "PSNR, fern: n/a (not measured): c" in built.notes
-    assert {row[:2]: row[2:4] for row in built.rows}["c", "PSNR"] == ("n/a", "failed")
+    assert {row[:2]: row[2:4] for row in built.rows}["c", "PSNR"] == ("n/a", "missing")
 
 
 def test_the_interval_is_over_scenes_or_replicates(made: Any) -> None:

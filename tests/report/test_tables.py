@@ -77,8 +77,8 @@ def test_failed_scenes_are_shown_as_failed(made: Any) -> None:
     table = built.per_scene("consistency", "")
     assert table.columns == ("Metric", "fern", "leaves", "room", "mean")
     rows = {row[0]: [text.strip() for text in row[1:]] for row in table.rows}
-    assert rows["Gaussians, %"] == ["-50.00 ↑", "failed", "failed", "-50.00 ↑ (1 of 3)"]
-    assert rows["PSNR, dB"] == ["0.00", "failed", "failed", "0.00"]
+    assert rows["Gaussians, %"] == ["-50.00 ↑", "missing", "missing", "-50.00 ↑ (1 of 3)"]
+    assert rows["PSNR, dB"] == ["0.00", "missing", "missing", "0.00"]
     assert "1 of 3 scenes" in built.mean("consistency", "").title
     missing = built.missing()
     assert missing is not None
@@ -153,7 +153,7 @@ def test_several_ablations_stand_beside_each_other(made: Any) -> None:
     built = tables(made)
     (table,) = built.overviews()
     assert table.columns == ("Metric", "consistency vs baseline", "loss_weighting vs baseline")
-    assert ("Gaussians", "-50.00 ↑", "failed") in table.rows
+    assert ("Gaussians", "-50.00 ↑", "missing") in table.rows
     assert table.title == "Change from baseline, %, mean over scenes"
     assert table.align == "lrr"
     assert table.notes == (ARROWS_NOTE, scale_note(built.comparison))
@@ -238,7 +238,7 @@ def test_tables_of_a_condition_name_it_and_align_numbers_to_the_right(made: Any)
     assert values.title == "Values, means over the replicates that are done (train.steps=20)"
     assert values.align == "llrr"
     rows = {row[:2]: row[2:] for row in values.rows}
-    assert rows["fern", "Gaussians"] == ("30", "failed")
+    assert rows["fern", "Gaussians"] == ("30", "missing")
     by_scene = built.per_scene("consistency", "train.steps=20")
     assert by_scene.title == "consistency: change from baseline, scene by scene (train.steps=20)"
     assert by_scene.align == "lrrr"

@@ -109,8 +109,8 @@ def test_a_mean_that_lacks_a_scene_says_so(scenes: int, text: str) -> None:
     assert marked(change(5.0, scenes=scenes, q=0.01), BY_NAME["psnr"], 3) == f"+5.00 ↑ *{text}"
 
 
-def test_what_failed_has_no_mark() -> None:
-    assert marked(None, BY_NAME["psnr"], 3) == "failed"
+def test_what_is_missing_has_no_mark() -> None:
+    assert marked(None, BY_NAME["psnr"], 3) == "missing"
 
 
 def test_a_deviation_has_no_sign() -> None:

@@ -10,6 +10,7 @@ from xrgs.report.inference import ALL_HR
 from xrgs.report.render import TextTable, filled, titled
 from xrgs.report.writing import (
     LACKING_NOTE,
+    MISSING,
     agreement,
     agreement_note,
     by_key,
@@ -60,7 +61,7 @@ def _table(
             if mean is None:
                 continue
             found = [per_scene.get((label, condition, s, metric.name)) for s in scenes]
-            shares = ["failed" if row is None else signed(row.change) for row in found]
+            shares = [MISSING if row is None else signed(row.change) for row in found]
             shares.append(f"{signed(mean.change)}{lacking(mean, len(scenes))}")
             rows.append((label, metric.label, *shares, interval(mean), agreement(mean)))
     here = [row for key, row in means.items() if key[1] == condition]

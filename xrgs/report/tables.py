@@ -15,6 +15,7 @@ from xrgs.report.render import TextTable, filled, titled
 from xrgs.report.writing import (
     ARROWS_NOTE,
     LACKING_NOTE,
+    MISSING,
     NO_INTERVAL,
     SAME,
     Change,
@@ -245,13 +246,13 @@ class Tables:
             found = [self._per_scene.get((label, condition, s, metric.name)) for s in scenes]
             mean = self._means.get((label, condition, metric.name))
             cells = [
-                *("failed" if row is None else percent(row.change, metric) for row in found),
+                *(MISSING if row is None else percent(row.change, metric) for row in found),
                 marked(mean, metric, len(scenes)),
             ]
             rows.append((f"{metric.label}, %", *cells))
             if metric.unit == "dB":
                 absolute = [
-                    "failed" if row is None else signed(row.difference) for row in (*found, mean)
+                    MISSING if row is None else signed(row.difference) for row in (*found, mean)
                 ]
                 rows.append((f"{metric.label}, dB", *absolute))
         return TextTable(
@@ -279,7 +280,7 @@ class Tables:
         for scene in self.comparison.scenes:
             for metric in self.comparison.metrics:
                 found = [means.get((scene, label)) for label in labels]
-                texts = ["failed" if v is None else number(v[metric.name], metric.unit)
+                texts = [MISSING if v is None else number(v[metric.name], metric.unit)
                          for v in found]  # fmt: skip
                 rows.append((scene, metric.label, *texts))
         return TextTable(

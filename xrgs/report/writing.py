@@ -18,6 +18,8 @@ if TYPE_CHECKING:
 
 #: An arrow means improvement or degradation, as in the paper's tables, not larger or smaller.
 BETTER, WORSE, SAME = "↑", "↓", "="
+#: What stands for a number of cells of which none is done: they failed, or were not trained yet.
+MISSING = "missing"
 #: What is said of a change without an interval.
 NO_INTERVAL = "one replicate: no interval"
 ARROWS_NOTE = f"{BETTER} improvement, {WORSE} degradation, {SAME} no change at this precision"
@@ -140,7 +142,7 @@ def marked(row: Change | None, metric: Metric, scenes: int) -> str:
     """Write a mean change with its marks: `-44.57 ↑ * (3 of 4)`.
 
     Args:
-        row: The change; None is written as failed.
+        row: The change; None where no pair of cells is done.
         metric: The metric that changed.
         scenes: How many scenes the mean should be over.
 
@@ -149,7 +151,7 @@ def marked(row: Change | None, metric: Metric, scenes: int) -> str:
         are lacking.
     """
     if row is None:
-        return "failed"
+        return MISSING
     return f"{percent(row.change, metric)}{_star(row)}{lacking(row, scenes)}"
 
 
