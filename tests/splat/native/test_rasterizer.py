@@ -420,9 +420,13 @@ def test_gradients_of_needles_are_as_exact_as_float32_in_torch(antialiased: bool
 def test_gradients_are_nearly_as_exact_as_float32_in_torch(
     make_camera: MakeCamera, make_scene: MakeScene
 ) -> None:
-    """In the median of many small scenes: 2.5 times torch's for scales, up to 1.6 for others."""
+    """In the median of many small scenes: 2.5 times torch's for scales, up to 1.9 for others.
+
+    Random scenes differ from processor to processor. With 200 of them the ratio of the medians for
+    scales is 2.3 to 2.5 with vector instructions and 2.9 without; with 40 it was 2.3 to 3.6.
+    """
     errors: dict[str, dict[str, list[float]]] = {"native": {}, "torch": {}}
-    for seed in range(40):
+    for seed in range(200):
         camera = rounded(make_camera(9 + seed % 30, 7 + seed % 20, turned=bool(seed % 2)))
         scene = single(make_scene(1 + seed % 12, camera, seed=seed, size=0.3 * (1 + seed % 20)))
         exact, _ = run(scene, camera, RasterSettings(), "torch", torch.float64)
