@@ -123,7 +123,10 @@ FILE_FUNCTIONS: dict[str, dict[str, str]] = {
         "capture/download/unpack": "the archive that was downloaded",
         "training/checkpoint": "writes a stream",
     },
-    "tarfile.": {"evaluation/lpips/download": "a stream, of which one file is read"},
+    "tarfile.": {
+        "evaluation/lpips/download": "a stream, of which one file is read",
+        "sweep/packing": "writes a stream",
+    },
     "gzip.": {"evaluation/lpips/download": "a stream, of which a bounded part is read"},
     "bz2.": {},
     "lzma.": {},

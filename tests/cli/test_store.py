@@ -6,6 +6,7 @@ import io
 import os
 import subprocess
 import sys
+import tarfile
 from collections.abc import Callable
 from contextlib import nullcontext
 from pathlib import Path
@@ -116,6 +117,25 @@ def test_trim_keeps_what_tables_are_made_of(xrgs_store: Call, tmp_path: Path) ->
     assert "removed by xrgs-store trim: 1 files" in xrgs_store("show", "abc")[1]
     assert len(Store(tmp_path / "s").cells()) == 2
     assert xrgs_store("check")[0] == 0
+
+
+def test_packed_cells_are_a_store_again(xrgs_store: Call, tmp_path: Path) -> None:
+    begin_attempt(Store(tmp_path / "s").cell("abe"), {}, {})
+    for out in ("", "out=study.zip"):
+        code, _, err = xrgs_store("pack", *filter(None, [out]))
+        assert code == 1
+        assert "name the archive to write, FILE.tar.xz" in err
+    code, out, _ = xrgs_store("pack", "out=study.tar.xz")
+    assert code == 1  # their variant is not there
+    assert out.startswith("study.tar.xz: 2 cells, 0 variants, 1 record of sweeps; ")
+    assert out.splitlines()[1] == "left out, not done: 1 cell"
+    with tarfile.open(tmp_path / "study.tar.xz") as archive:
+        archive.extractall(tmp_path, filter="data")
+    store = Store(tmp_path / "xrgs-store")
+    assert [(cell.id, cell.state().name) for cell in store.cell_folders()] == [
+        ("abc", "done"),
+        ("abd", "done"),
+    ]
 
 
 def test_check_ends_with_1_where_something_is_damaged(xrgs_store: Call, tmp_path: Path) -> None:

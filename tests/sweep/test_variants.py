@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 import os
+import tarfile
 import tempfile
 from collections.abc import Callable
 from dataclasses import asdict
@@ -262,22 +263,26 @@ def test_a_dry_run_reads_the_headers_of_photographs(
 
 
 @pytest.mark.slow
-def test_a_cell_on_a_trimmed_variant_is_trained_on_the_same_variant(
+def test_a_sweep_goes_on_from_a_packed_store(
     sweeps_in: Callable[..., Any], run_command: Callable[..., Any], tmp_path: Path
 ) -> None:
-    sweeps, smoke = sweeps_in(tmp_path), ("scene=motorcycle", "preset=smoke", "train.steps=2")
-    assert sweeps.run(*smoke)[0] == 0
+    smoke = ("scene=motorcycle", "preset=smoke", "train.steps=2")
+    assert sweeps_in(tmp_path).run(*smoke)[0] == 0
     (built,) = Store(tmp_path / "s").variants.names()[-1:]
-    trim = ("trim", "store=s", "variants=true", "yes=true")
-    assert run_command("store", tmp_path, *trim)[0::2] == (0, "")
-    assert f"trimmed-{built}" in Store(tmp_path / "s").variants.names()
-    code, table, err = sweeps.run(*smoke, "+ablation=consistency")
+    assert run_command("store", tmp_path, "pack", "store=s", "out=a.tar.xz")[0::2] == (0, "")
+    with tarfile.open(tmp_path / "a.tar.xz") as archive:
+        archive.extractall(tmp_path / "other", filter="data")
+    store = Store((tmp_path / "other" / "xrgs-store").rename(tmp_path / "other" / "s"))
+    assert store.variants.names() == [f"trimmed-{built}"]
+    (baseline,) = store.cell_folders()
+    code, table, err = sweeps_in(tmp_path / "other").run(*smoke, "+ablation=consistency")
     assert code == 0
     assert f"variant {built}: making the images again that xrgs-store trim has removed" in err
     assert BUILDING not in err
+    assert f"training cell {baseline.id}" not in err
     assert "consistency" in table
-    assert [n for n in Store(tmp_path / "s").variants.names() if n[0] != "."] == [built]
-    assert variant.verify(Store(tmp_path / "s").variants / built) == []
+    assert [n for n in store.variants.names() if n[0] != "."] == [built]
+    assert variant.verify(store.variants / built) == []
 
 
 def test_images_are_made_again_of_trimmed_variants_alone(

@@ -1,4 +1,4 @@
-"""`xrgs-store`: lists, shows, removes, trims and verifies what a store keeps."""
+"""`xrgs-store`: lists, shows, removes, trims, packs and verifies what a store keeps."""
 
 from __future__ import annotations
 
@@ -18,6 +18,8 @@ from xrgs.errors import XrgsError
 from xrgs.experiment.store import Store
 from xrgs.runtime.signals import exit_on_signal
 from xrgs.runtime.streams import say
+from xrgs.safeio.paths import user_path
+from xrgs.safeio.words import counted
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
@@ -38,6 +40,10 @@ xrgs-store trim [CELL]... [FILTER]... [variants=true] [dry_run=true] [yes=true]
     Removes the Gaussians and renders of done cells, of all by default. The cells stay done, and
     tables of them can be made. variants=true also removes the images of their variants, which a
     sweep with further cells makes again from the photographs.
+xrgs-store pack [CELL]... [FILTER]... out=FILE.tar.xz
+    Packs done cells, all by default, into an archive for others: without Gaussians and renders,
+    with their variants without images, and with the records of their sweeps. Full paths in configs
+    and commands become relative. Unpacked, it is a store: reports can be made, sweeps continued.
 xrgs-store gc [of=NAMES] [dry_run=true] [yes=true]
     Removes what no sweep of the installed code needs; of= chooses among old_code (cells that other
     code has trained), failed (tries of cells and scenes), aside (folders of earlier attempts that
@@ -91,6 +97,13 @@ class TrimConf(RemoveConf):
     """Arguments of `xrgs-store trim`."""
 
     variants: bool = False
+
+
+@dataclass
+class PackConf(FilterConf):
+    """Arguments of `xrgs-store pack`."""
+
+    out: str = ""
 
 
 @dataclass
@@ -163,6 +176,22 @@ def _trim(conf: DictConfig, words: Sequence[str]) -> None:
     _carry_out(conf, store, plan_trim(store, cells, chosen, variants=conf.variants))
 
 
+def _pack(conf: DictConfig, words: Sequence[str]) -> None:
+    from xrgs.sweep.inventory import size_text
+    from xrgs.sweep.packing import pack
+
+    out = user_path(conf.out)
+    if not out.name.endswith(".tar.xz"):
+        raise XrgsError(f"pack: out={conf.out}: name the archive to write, FILE.tar.xz")
+    _, chosen = _chosen(conf, words)
+    done = [cell for cell in chosen if cell.state.name == "done"]
+    packed = pack(Store(Path(conf.store)), done, out, Path.cwd())
+    say(f"{out}: {packed}; {size_text(packed.bytes)}")
+    if len(done) < len(chosen):
+        say(f"left out, not done: {counted(len(chosen) - len(done), 'cell')}")
+    _say_left(packed.left_out)
+
+
 def _gc(conf: DictConfig, words: Sequence[str]) -> None:
     from xrgs.sweep.cleaning import plan_gc
     from xrgs.sweep.inventory import summaries
@@ -220,9 +249,18 @@ def _carry_out(conf: DictConfig, store: Store, plan: Plan) -> None:
         sys.exit("xrgs-store: nothing was done; yes=true does it without asking")
     freed, left = carry_out(store, plan)
     say(f"freed {size_text(freed)}")
-    for line in left:
+    _say_left(left)
+
+
+def _say_left(lines: Sequence[str]) -> None:
+    """Say what was left, and why.
+
+    Raises:
+        SystemExit: With code 1, where anything was.
+    """
+    for line in lines:
         say(line, sys.stderr)
-    if left:
+    if lines:
         sys.exit(1)
 
 
@@ -239,6 +277,7 @@ _COMMANDS: dict[str, tuple[type[Any], Callable[[Any, Sequence[str]], None]]] = {
     "show": (StoreConf, _show),
     "rm": (RemoveConf, _remove),
     "trim": (TrimConf, _trim),
+    "pack": (PackConf, _pack),
     "gc": (GcConf, _gc),
     "check": (StoreConf, _check),
 }

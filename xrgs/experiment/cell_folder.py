@@ -292,6 +292,21 @@ class CellFolder:
             if stat.S_ISREG(status.st_mode) and _is_heavy(name)
         )
 
+    def trimmed_status(self) -> dict[str, Any]:
+        """Return what the status of a done cell is once it is trimmed.
+
+        Raises:
+            StoreError: The status can't be read, or is not that of a done cell.
+        """
+        status = read_object(self.status)
+        if status.get("state") != "done" or not isinstance(status.get("files"), dict):
+            raise StoreError(f"{self.status}: the cell is not done")
+        heavy = {name: entry for name, entry in status["files"].items() if _is_heavy(name)}
+        if not heavy:
+            return status
+        kept = {name: of for name, of in status["files"].items() if name not in heavy}
+        return status | {"files": kept, "trimmed": self.trimmed() | heavy}
+
     def trim(self) -> None:
         """Remove the Gaussians and the renders of a done cell, and list them in its status.
 
@@ -302,13 +317,7 @@ class CellFolder:
             StoreError: The status can't be read, or is not that of a done cell.
             OSError: A file can't be removed.
         """
-        status = read_object(self.status)
-        if status.get("state") != "done" or not isinstance(status.get("files"), dict):
-            raise StoreError(f"{self.status}: the cell is not done")
-        heavy = {name: entry for name, entry in status["files"].items() if _is_heavy(name)}
-        if heavy:
-            kept = {name: of for name, of in status["files"].items() if name not in heavy}
-            self._set_status(status | {"files": kept, "trimmed": self.trimmed() | heavy})
+        self._set_status(self.trimmed_status())
         for name in self.trimmed():
             if untrusted.is_inside(name):
                 (self.folder / name).unlink(missing_ok=True)

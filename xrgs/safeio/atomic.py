@@ -77,5 +77,13 @@ def write_json(path: Path | ConfinedPath, value: object, *, durable: bool = True
     Raises:
         OSError: The file can't be written.
     """
-    text = json.dumps(value, indent=1, sort_keys=True, ensure_ascii=False) + "\n"
-    write_text(path, text, durable=durable)
+    write_text(path, json_text(value), durable=durable)
+
+
+def json_text(value: object) -> str:
+    """Return the JSON that `write_json` writes.
+
+    Args:
+        value: Anything that `json.dumps` accepts.
+    """
+    return json.dumps(value, indent=1, sort_keys=True, ensure_ascii=False) + "\n"

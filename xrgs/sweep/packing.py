@@ -1,0 +1,172 @@
+"""Packs done cells, their variants and the records of sweeps into one archive, to publish a study.
+
+The archive has what tables are made of and what a sweep goes on from: everything that is left when
+cells and variants are trimmed, without logs, and without the full paths of photographs and stores
+that configs and commands name. Unpacked, it is a store. The store that is packed does not change.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import io
+import tarfile
+from dataclasses import dataclass
+from functools import partial
+from pathlib import PurePath
+from typing import TYPE_CHECKING, Any
+
+from xrgs.capture import frozen
+from xrgs.errors import StoreError
+from xrgs.experiment import trimming
+from xrgs.experiment.cell_folder import READING_ERRORS, CellState
+from xrgs.safeio import untrusted
+from xrgs.safeio.atomic import atomic_writer, json_text
+from xrgs.safeio.records import errors_named, read_file
+from xrgs.safeio.words import counted, for_line
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterable, Sequence
+    from pathlib import Path
+
+    from xrgs.experiment.store import Store
+    from xrgs.safeio.confined import ConfinedPath
+    from xrgs.sweep.inventory import CellSummary
+
+#: The folder in the archive; the default of `store=`, so that commands find it once it is unpacked.
+_ROOT = "xrgs-store"
+_CONFIG = "config.json"
+#: The largest file of points that is packed, in bytes: twenty million points.
+_MAX_POINTS_BYTES = 1 << 30
+
+#: Contents of files by their paths in the archive, each with the time it was modified.
+_Files = dict[str, tuple[bytes, float]]
+
+
+@dataclass(frozen=True)
+class Packed:
+    """What was packed, and what was not."""
+
+    cells: int
+    variants: int
+    sweeps: int
+    bytes: int
+    """The size of the archive."""
+    left_out: tuple[str, ...]
+    """A line for each cell, variant and record that should have been packed, with the reason."""
+
+    def __str__(self) -> str:
+        parts = (
+            counted(self.cells, "cell"),
+            counted(self.variants, "variant"),
+            counted(self.sweeps, "record") + " of sweeps",
+        )
+        return ", ".join(parts)
+
+
+def pack(store: Store, cells: Sequence[CellSummary], out: Path, here: Path) -> Packed:
+    """Write an archive of done cells.
+
+    Args:
+        store: The store.
+        cells: The cells to pack, all of them done.
+        out: The archive to write or replace, `.tar.xz`; its folder must exist.
+        here: The folder below which full paths in configs and commands are made relative; of a path
+            elsewhere only the last name is kept.
+
+    Returns:
+        What was packed. What is damaged, or can't be read now, is left out and named.
+
+    Raises:
+        StoreError: `out` can't be written.
+    """
+    left_out: list[str] = []
+
+    def packed(name: str, files: Callable[[], _Files]) -> _Files:
+        try:
+            return files()
+        except READING_ERRORS as error:
+            left_out.append(for_line(f"{name}: {CellState.of_error(error).reason}"))
+            return {}
+
+    done = {
+        cell: files for cell in cells if (files := packed(cell.name, partial(_cell, cell, here)))
+    }
+    variant_ids = sorted({cell.variant_id for cell in done if cell.variant_id is not None})
+    sweep_ids = sorted({sweep_id for cell in done for sweep_id in cell.names.sweeps})
+    variants = [packed(name, partial(_variant, store, name)) for name in variant_ids]
+    sweeps = [packed(name, partial(_record, store, name, here)) for name in sweep_ids]
+    with errors_named(out):
+        size = _write(out, [*done.values(), *variants, *sweeps])
+    count = [len(of) - of.count({}) for of in (variants, sweeps)]
+    return Packed(len(done), count[0], count[1], size, tuple(left_out))
+
+
+def _write(out: Path, groups: Iterable[_Files]) -> int:
+    """Write the archive; equal files give equal bytes, whoever packs them."""
+    with atomic_writer(out) as stream:
+        with tarfile.open(fileobj=stream, mode="w:xz", preset=9) as archive:
+            for files in groups:
+                for name, (content, modified) in sorted(files.items()):
+                    member = tarfile.TarInfo(f"{_ROOT}/{name}")
+                    member.size, member.mtime = len(content), modified
+                    archive.addfile(member, io.BytesIO(content))
+        return stream.tell()
+
+
+def _cell(cell: CellSummary, here: Path) -> _Files:
+    """Return the files of a done cell as if it were trimmed, with its config's paths relative."""
+    folder, status = cell.folder.folder, cell.folder.trimmed_status()
+    contents = {name: _verified(folder, name, of["sha256"]) for name, of in status["files"].items()}
+    config = json_text(_relative(untrusted.parse_json(contents[_CONFIG]), here)).encode()
+    entry = {"bytes": len(config), "sha256": hashlib.sha256(config).hexdigest()}
+    status["files"][_CONFIG] = entry
+    contents |= {_CONFIG: config, cell.folder.status.name: json_text(status).encode()}
+    modified = cell.folder.status.lstat().st_mtime
+    return {f"cells/{cell.id}/{name}": (content, modified) for name, content in contents.items()}
+
+
+def _verified(folder: ConfinedPath, name: str, sha256: str) -> bytes:
+    if not untrusted.is_inside(name):
+        raise StoreError(f"status.json: {name!r:.80} is not a file of this cell")
+    content = read_file(folder / name)
+    if hashlib.sha256(content).hexdigest() != sha256:
+        raise StoreError(f"{folder / name}: it has changed since the cell finished")
+    return content
+
+
+def _variant(store: Store, variant_id: str) -> _Files:
+    """Return the files of a variant as if it were trimmed, under a trimmed variant's name."""
+    trimmed = trimming.trimmed_folder(store.variants, variant_id)
+    folder = trimmed if trimmed.is_dir() else store.variants / variant_id
+    if damage := trimming.verify_variant(folder):
+        raise StoreError("; ".join(damage))
+    modified = (folder / frozen.MANIFEST).lstat().st_mtime
+    return {
+        f"variants/{trimmed.name}/{name}": (read_file(folder / name, _MAX_POINTS_BYTES), modified)
+        for name in (frozen.MANIFEST, frozen.POINTS, frozen.REPORT)
+    }
+
+
+def _record(store: Store, sweep_id: str, here: Path) -> _Files:
+    store.verify_sweep(sweep_id)
+    record, file = store.sweep_record(sweep_id), store.sweeps / f"{sweep_id}.json"
+    record["command"] = [_relative_argument(word, here) for word in record["command"]]
+    return {f"sweeps/{file.name}": (json_text(record).encode(), file.lstat().st_mtime)}
+
+
+def _relative(value: Any, here: Path) -> Any:
+    """Return a JSON value with every text that is a full path made relative."""
+    if isinstance(value, dict):
+        return {key: _relative(item, here) for key, item in value.items()}
+    if isinstance(value, list):
+        return [_relative(item, here) for item in value]
+    if not (isinstance(value, str) and PurePath(value).is_absolute()):
+        return value
+    path = PurePath(value)
+    return str(path.relative_to(here)) if path.is_relative_to(here) else path.name
+
+
+def _relative_argument(word: str, here: Path) -> str:
+    """Make the values of an argument relative: `scene.path=/a/fern,/a/horns`."""
+    key, equals, values = word.rpartition("=")
+    return key + equals + ",".join(_relative(value, here) for value in values.split(","))
