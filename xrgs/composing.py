@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import re
 from dataclasses import is_dataclass
+from functools import cache
 from typing import TYPE_CHECKING, Any, cast
 
 import hydra
@@ -162,11 +163,18 @@ def from_dict(values: Any) -> Conf:
         TypeError: `values` is no dict of a config.
     """
     escaped = escape_interpolations(values)
-    conf = OmegaConf.to_object(OmegaConf.merge(OmegaConf.structured(Conf), escaped))
+    conf = OmegaConf.to_object(OmegaConf.merge(_schema(), escaped))
     if not isinstance(conf, Conf):
         raise TypeError(f"expected a config of schema Conf, got {type(conf).__name__}")
     _check_plugins(conf.components)
     return conf
+
+
+@cache
+def _schema() -> DictConfig:
+    """Return the schema of a config, which `OmegaConf.merge` copies."""
+    schema: DictConfig = OmegaConf.structured(Conf)
+    return schema
 
 
 def escape_interpolations(value: Any) -> Any:
@@ -219,12 +227,13 @@ def from_file(file: Path | ConfinedPath) -> tuple[Conf, dict[str, Any]]:
         raise XrgsError(f"{file}: it holds no config ({error})") from error
 
 
-def _baseline() -> dict[str, Any]:
+@cache
+def _baseline() -> Mapping[str, Any]:
     """Return the values of `conf/config.yaml` itself; those that it leaves open are `???`."""
     conf = cast("DictConfig", OmegaConf.load(CONF_DIR / "config.yaml"))
     names = [*Conf.__dataclass_fields__]
     values = OmegaConf.to_container(OmegaConf.masked_copy(conf, names), resolve=True)
-    return cast("dict[str, Any]", values)
+    return cast("Mapping[str, Any]", values)
 
 
 def _fill_in(values: Any, baseline: Mapping[str, Any], path: str) -> Iterator[tuple[str, Any]]:
