@@ -59,6 +59,7 @@ def test_cells_are_chosen_by_name_state_age_and_size(store: Store) -> None:
     assert chosen(store, scenes=("fern",)) == ["abc1", "abd2"]
     assert chosen(store, ablations=("mip",)) == ["abd2"]
     assert chosen(store, states=("done",), scenes=("fern",)) == ["abc1"]
+    assert chosen(store, sweeps=(store.sweep_ids()[0],)) == ["abc1", "abd2"]
     assert chosen(store, older_days=2.9) == ["old3"]
     assert chosen(store, older_days=3.1) == []
     assert chosen(store, larger_mb=2.9) == ["abc1"]
@@ -71,6 +72,7 @@ def test_cells_are_chosen_by_name_state_age_and_size(store: Store) -> None:
         ({"ids": ("x",)}, "x: no cells have such an id"),
         ({"scenes": ("frn",)}, "scenes=frn: no cell has that; choose from: fern, statue"),
         ({"states": ("dun",)}, "states=dun: .*choose from: done, running"),
+        ({"sweeps": ("0",)}, "sweep=0: no cell has that; choose from: [0-9a-f]{16}$"),
     ],
 )
 def test_a_name_of_nothing_is_refused(

@@ -123,6 +123,17 @@ def test_full_paths_become_relative(store: Store, tmp_path: Path) -> None:
     assert command == ["+ablation=x,y", "scene.path=data/fern,horns", "threads=1"]
 
 
+def test_the_records_are_those_of_the_sweeps_that_are_named(store: Store, tmp_path: Path) -> None:
+    (first,) = store.sweep_ids()
+    second = store.write_sweep(["+ablation=x"], [{"cell_id": "c1", "scene": "fern", "label": "x"}])
+    cells = summaries(store)
+    for sweeps, ids in (((), {first, second}), ((second,), {second})):
+        packed = pack(store, cells, tmp_path / "a.tar.xz", tmp_path, sweeps)
+        assert (packed.cells, packed.sweeps) == (2, len(ids))
+        other = unpacked(tmp_path / "a.tar.xz", tmp_path / f"of {len(ids)}")
+        assert {*other.sweep_ids()} == ids
+
+
 def test_equal_stores_give_equal_archives(store: Store, tmp_path: Path) -> None:
     pack_all(store, tmp_path / "a.tar.xz")
     pack_all(store, tmp_path / "b.tar.xz")

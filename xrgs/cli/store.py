@@ -42,8 +42,9 @@ xrgs-store trim [CELL]... [FILTER]... [variants=true] [dry_run=true] [yes=true]
     sweep with further cells makes again from the photographs.
 xrgs-store pack [CELL]... [FILTER]... out=FILE.tar.xz
     Packs done cells, all by default, into an archive for others: without Gaussians and renders,
-    with their variants without images, and with the records of their sweeps. Full paths in configs
-    and commands become relative. Unpacked, it is a store: reports can be made, sweeps continued.
+    with their variants without images, and with the records of their sweeps, or of those that
+    sweep= names. Full paths in configs and commands become relative. Unpacked, it is a store:
+    reports can be made, sweeps continued.
 xrgs-store gc [of=NAMES] [dry_run=true] [yes=true]
     Removes what no sweep of the installed code needs; of= chooses among old_code (cells that other
     code has trained), failed (tries of cells and scenes), aside (folders of earlier attempts that
@@ -54,8 +55,9 @@ xrgs-store check
 
   store=FOLDER     the store; xrgs-store by default
   CELL             id of a cell, or as much of it as no other id begins with
-  FILTER           scenes=NAMES ablations=NAMES states=NAMES older_days=N larger_mb=N; names are
-                   separated by commas, states are done, unfinished, failed, corrupt and unknown
+  FILTER           scenes=NAMES ablations=NAMES states=NAMES sweep=IDS older_days=N larger_mb=N;
+                   names and ids are separated by commas; states are done, running, unfinished,
+                   failed, corrupt and unknown; sweep= chooses the cells of these sweeps
   dry_run=true     say what would be removed, and how much, and stop
   yes=true         remove it without asking; without it, and without a terminal to ask on, nothing
                    is removed
@@ -73,6 +75,7 @@ class FilterConf:
     scenes: str = ""
     ablations: str = ""
     states: str = ""
+    sweep: str = ""
     older_days: float = 0.0
     larger_mb: float = 0.0
 
@@ -185,7 +188,7 @@ def _pack(conf: DictConfig, words: Sequence[str]) -> None:
         raise XrgsError(f"pack: out={conf.out}: name the archive to write, FILE.tar.xz")
     _, chosen = _chosen(conf, words)
     done = [cell for cell in chosen if cell.state.name == "done"]
-    packed = pack(Store(Path(conf.store)), done, out, Path.cwd())
+    packed = pack(Store(Path(conf.store)), done, out, Path.cwd(), names_in(conf.sweep))
     say(f"{out}: {packed}; {size_text(packed.bytes)}")
     if len(done) < len(chosen):
         say(f"left out, not done: {counted(len(chosen) - len(done), 'cell')}")
@@ -227,9 +230,14 @@ def _chosen(conf: DictConfig, words: Sequence[str]) -> tuple[list[CellSummary], 
 def _selection(conf: DictConfig, words: Sequence[str]) -> Selection:
     from xrgs.sweep.inventory import Selection
 
-    scenes, ablations, states = map(names_in, (conf.scenes, conf.ablations, conf.states))
     return Selection(
-        tuple(words), scenes, ablations, states, float(conf.older_days), float(conf.larger_mb)
+        tuple(words),
+        names_in(conf.scenes),
+        names_in(conf.ablations),
+        names_in(conf.states),
+        names_in(conf.sweep),
+        float(conf.older_days),
+        float(conf.larger_mb),
     )
 
 

@@ -218,6 +218,8 @@ class Selection:
     scenes: tuple[str, ...] = ()
     ablations: tuple[str, ...] = ()
     states: tuple[str, ...] = ()
+    sweeps: tuple[str, ...] = ()
+    """Ids of sweeps, one of which must have the cell."""
     older_days: float = 0.0
     larger_mb: float = 0.0
 
@@ -239,6 +241,7 @@ class Selection:
         self._check("scenes", self.scenes, [cell.names.scene for cell in cells])
         self._check("ablations", self.ablations, [cell.names.label for cell in cells])
         self._check("states", self.states, STATES)
+        self._check("sweep", self.sweeps, [name for cell in cells for name in cell.names.sweeps])
         return [
             cell
             for cell in cells
@@ -246,6 +249,7 @@ class Selection:
             and (not self.scenes or cell.names.scene in self.scenes)
             and (not self.ablations or cell.names.label in self.ablations)
             and (not self.states or cell.state.name in self.states)
+            and (not self.sweeps or not {*self.sweeps}.isdisjoint(cell.names.sweeps))
             and (not self.older_days or (cell.age_s() or 0.0) >= 86400 * self.older_days)
             and (not self.larger_mb or (cell.bytes() or 0) >= 1e6 * self.larger_mb)
         ]

@@ -63,7 +63,9 @@ class Packed:
         return ", ".join(parts)
 
 
-def pack(store: Store, cells: Sequence[CellSummary], out: Path, here: Path) -> Packed:
+def pack(
+    store: Store, cells: Sequence[CellSummary], out: Path, here: Path, sweeps: Sequence[str] = ()
+) -> Packed:
     """Write an archive of done cells.
 
     Args:
@@ -72,6 +74,7 @@ def pack(store: Store, cells: Sequence[CellSummary], out: Path, here: Path) -> P
         out: The archive to write or replace, `.tar.xz`; its folder must exist.
         here: The folder below which full paths in configs and commands are made relative; of a path
             elsewhere only the last name is kept.
+        sweeps: Ids of the sweeps whose records are packed; empty for all that have such a cell.
 
     Returns:
         What was packed. What is damaged, or can't be read now, is left out and named.
@@ -92,12 +95,12 @@ def pack(store: Store, cells: Sequence[CellSummary], out: Path, here: Path) -> P
         cell: files for cell in cells if (files := packed(cell.name, partial(_cell, cell, here)))
     }
     variant_ids = sorted({cell.variant_id for cell in done if cell.variant_id is not None})
-    sweep_ids = sorted({sweep_id for cell in done for sweep_id in cell.names.sweeps})
+    sweep_ids = sorted({*sweeps} or {sweep for cell in done for sweep in cell.names.sweeps})
     variants = [packed(name, partial(_variant, store, name)) for name in variant_ids]
-    sweeps = [packed(name, partial(_record, store, name, here)) for name in sweep_ids]
+    records = [packed(name, partial(_record, store, name, here)) for name in sweep_ids]
     with errors_named(out):
-        size = _write(out, [*done.values(), *variants, *sweeps])
-    count = [len(of) - of.count({}) for of in (variants, sweeps)]
+        size = _write(out, [*done.values(), *variants, *records])
+    count = [len(of) - of.count({}) for of in (variants, records)]
     return Packed(len(done), count[0], count[1], size, tuple(left_out))
 
 
