@@ -446,11 +446,6 @@ class ConfinedPath:
                 why = "folders are nested too deeply to be removed"
                 raise OSError(errno.ENAMETOOLONG, why, str(self)) from None
 
-    def touch(self) -> None:
-        """Set the time of the last change of an existing file to now."""
-        with self._located() as (folder, name):
-            os.utime(name, dir_fd=folder, follow_symlinks=False)
-
     def sync_name(self) -> None:
         """Wait until this name is on the disk, as after creating or renaming the file or folder.
 
