@@ -85,6 +85,10 @@ def test_a_cell_can_be_matched_to_the_baseline(study: Callable[..., Study]) -> N
             ["+ablation=count_matched", "matched_to=count_matched"],
             "matched_to=count_matched: that cell is matched to xrgs itself",
         ),
+        (
+            ["+ablation=count_matched", "matched_to=null"],
+            "matched_to=null: count_matched takes a number of Gaussians",
+        ),
     ],
 )
 def test_a_count_to_match_without_meaning_is_refused(
@@ -93,6 +97,12 @@ def test_a_count_to_match_without_meaning_is_refused(
     made = study()
     with pytest.raises(XrgsError, match=f"^{message}"):
         made._plan(arguments)
+
+
+@pytest.mark.parametrize("arguments", [["+ablation=plus"], []])
+def test_null_asks_for_no_control(study: Callable[..., Study], arguments: list[str]) -> None:
+    made = study()
+    assert made._plan([*arguments, "matched_to=null"]) == made._plan(arguments)
 
 
 def test_a_count_to_match_of_every_cell_of_a_file_is_refused(study: Callable[..., Study]) -> None:

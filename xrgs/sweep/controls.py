@@ -49,15 +49,23 @@ def check_effect(combinations: Iterable[CellSpec], plan: Iterable[PlannedCell]) 
         plan: The cells that are planned for them.
 
     Raises:
-        XrgsError: No planned cell takes its count from the cell that is named.
+        XrgsError: No planned cell takes its count from the cell that is named, or a planned cell
+            takes one and is given none.
     """
+    plan = list(plan)
+    for cell in plan:
+        if "matched_to=null" in cell.spec.changes:
+            raise XrgsError(
+                f"matched_to=null: {cell.spec.label} takes a number of Gaussians; name the ablation"
+                " that it takes it from"
+            )
     wanted = {spec.matched_to: None for spec in combinations if spec.matched_to is not None}
     found = {cell.conf.matched_to for cell in plan}
     for name in wanted:
         if name not in found:
             raise XrgsError(
-                f"matched_to={name}: no ablation of this sweep takes a number of Gaussians;"
-                " +ablation=count_matched does"
+                f"matched_to={name}: no ablation of this sweep takes a number of Gaussians; add"
+                " count_matched to +ablation, or set matched_to=null"
             )
 
 
