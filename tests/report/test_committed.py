@@ -5,6 +5,7 @@ from __future__ import annotations
 import tarfile
 from pathlib import Path
 
+import pandas as pd
 import pytest
 
 from xrgs.experiment.store import Store
@@ -33,8 +34,13 @@ def test_a_packed_store_gives_the_committed_tables(packed: Path, tmp_path: Path)
     store = Store(tmp_path / "xrgs-store")
     made = build(store.path, store.sweep_ids(), tmp_path / "report", pictures=[])
     for name in FILES:
-        committed = (packed.parent / name).read_text(encoding="utf-8")
-        assert (made.folder / name).read_text(encoding="utf-8") == committed, name
+        now, committed = made.folder / name, packed.parent / name
+        if name.endswith(".csv"):
+            # numpy's log and exp differ in their last digit between instruction sets.
+            numbers = (pd.read_csv(file) for file in (now, committed))
+            pd.testing.assert_frame_equal(*numbers, rtol=1e-13, atol=0)
+        else:
+            assert now.read_text(encoding="utf-8") == committed.read_text(encoding="utf-8"), name
 
 
 def test_there_are_packed_stores() -> None:

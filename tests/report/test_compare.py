@@ -18,6 +18,7 @@ from xrgs.report.inference import (
     NOT_FINITE,
     NOT_MEASURED,
     NOT_POSITIVE,
+    OTHER_MACHINE,
     WRONG_GAP,
     ZERO_BASE,
 )
@@ -183,6 +184,32 @@ def test_a_pair_that_is_left_out_does_not_narrow_the_interval(made: Any) -> None
     assert (row["low"], row["high"]) == pytest.approx(ends, rel=1e-9)
     assert (row["base"], row["value"]) == pytest.approx((150, 206)), "of the same two pairs"
     assert row["why"] == ZERO_BASE
+
+
+@pytest.mark.parametrize("against", ["baseline", "consistency"])
+def test_times_of_another_machine_are_left_out(made: Any, against: str) -> None:
+    changed = {"factors": {"training_time_s": 2.0, "render_time_ms": 2.0, "gaussians": 2.0}}
+    for scene, cpu in (("fern", "a processor"), ("horns", "another"), ("room", "a processor")):
+        made.add(scene=scene)
+        made.add("consistency", scene=scene, cpu=cpu, **changed)
+    comparison = compared(made, against)
+    (label,) = {"baseline", "consistency"} - {against}
+    change = 100.0 if against == "baseline" else -50.0
+    for name, scenes, why in (
+        ("training_time_s", 2, OTHER_MACHINE),
+        ("render_time_ms", 2, OTHER_MACHINE),
+        ("gaussians", 3, ""),
+    ):
+        mean = mean_of(comparison, name, label)
+        assert (mean["change"], mean["scenes"], mean["why"]) == (pytest.approx(change), scenes, why)
+
+
+def test_times_of_an_unknown_machine_are_compared(made: Any) -> None:
+    made.add()
+    made.add("consistency", cpu="another")
+    cells = made.read().cells
+    cells.loc[cells["label"] == "baseline", "machine"] = ""
+    assert mean_of(compare(cells, METRICS), "training_time_s")["why"] == ""
 
 
 def test_variants_are_not_mixed(made: Any) -> None:
@@ -358,6 +385,7 @@ def test_the_arithmetic_does_not_grow_faster_than_the_cells(made: Any) -> None:
             "cell_id": [f"b{number}" for number in range(n)], "variant_id": scenes,
             "baseline_id": [f"b{number}" for number in range(n)], "error": None,
             "state": "done", "reason": "", "protocol": 1, "variant_seed": 0, "validation": 0.0,
+            "machine": "",
         }
     )  # fmt: skip
     names = [metric.name for metric in METRICS]

@@ -19,6 +19,7 @@ from xrgs.report.skipped import cell_work
 from xrgs.report.training import cell_totals
 from xrgs.runtime.progress import progress
 from xrgs.safeio.records import as_number
+from xrgs.safeio.words import for_line
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -47,6 +48,9 @@ _PENDING = {
     "absent": "not trained yet",
     "unfinished": "begun and not done yet: it is being trained, or was stopped",
 }
+#: Entries of a cell's provenance that times depend on, beside the program.
+MACHINE_KEYS = ("cpu", "instruction_set", "threads", "backend")
+_MAX_MACHINE = 120
 #: Values of keys that earlier records lack. Those had a swept `variant.seed` in the condition.
 _DEFAULTS = {"variant_seed": 0}
 
@@ -63,7 +67,8 @@ class Sweep:
     """The arguments of `xrgs-sweep` by the sweep's id; several where sweeps are joined."""
     cells: pd.DataFrame
     """One row for each entry of the record: its keys, `state`, `reason`, `protocol`, `validation`
-    (`train.validation`: 0 where scores are of test views), metrics."""
+    (`train.validation`: 0 where scores are of test views), `machine` (what times depend on beside
+    the program, as a text; empty where it is not known), metrics."""
     views: pd.DataFrame
     """One row for each cell and scored view: `cell_id`, `view` and the scores."""
     training: dict[str, dict[str, float]]
@@ -164,14 +169,14 @@ def _read_cell(cell: CellFolder, metrics: Sequence[Metric]) -> _CellContent:
     state = cell.state()
     if state.name == "done":
         try:
-            training = cell_totals(cell)
+            training, provenance = cell_totals(cell), cell.provenance()
             return _CellContent(
-                _done_columns(cell, metrics),
+                _done_columns(cell, metrics) | {"machine": _machine(provenance)},
                 _scores(cell, metrics),
                 training,
                 cell_curve(cell),
                 cell_work(cell, training),
-                cell.provenance(),
+                provenance,
             )
         except READING_ERRORS as error:
             state = CellState.of_error(error)
@@ -200,6 +205,13 @@ def _done_columns(cell: CellFolder, metrics: Sequence[Metric]) -> dict[str, Any]
         "true_variant": str(identity["variant"]),
         "true_seed": identity["seed"],
     }
+
+
+def _machine(provenance: Mapping[str, Any]) -> str:
+    """Return what a cell's times depend on, for example `AMD EPYC, avx2, threads 1, native`."""
+    known = {key: provenance[key] for key in MACHINE_KEYS if provenance.get(key) is not None}
+    texts = (f"threads {value}" if key == "threads" else str(value) for key, value in known.items())
+    return for_line(", ".join(texts), _MAX_MACHINE)
 
 
 def _scores(cell: CellFolder, metrics: Sequence[Metric]) -> list[dict[str, Any]]:
@@ -239,7 +251,7 @@ def _cells(
     metrics: Sequence[Metric],
 ) -> pd.DataFrame:
     rows = [row | columns.get(row["cell_id"], _without_cell(row["error"])) for row in entries]
-    read = ["state", "reason", "protocol", "validation", "true_variant", "true_seed"]
+    read = ["state", "reason", "protocol", "validation", "machine", "true_variant", "true_seed"]
     names = [*RECORD_KEYS, *read, *(metric.name for metric in metrics)]
     cells = pd.DataFrame(rows, columns=names)
     for metric in metrics:
@@ -249,6 +261,7 @@ def _cells(
         cells[metric.name] = pd.to_numeric(values).astype(np.float64)
     cells["protocol"] = cells["protocol"].astype("Int64")
     cells["validation"] = cells["validation"].astype(np.float64)
+    cells["machine"] = cells["machine"].astype(object).fillna("")
     _check_identity(sweep_id, cells)
     return cells.drop(columns=["true_variant", "true_seed"])
 

@@ -9,6 +9,9 @@ Amounts (times, counts, memory) are compared by log(value / base), and means and
 turned into percent at the end: 100 (exp(mean) - 1). A scene's change is the mean over its
 replicates, and the sweep's change is the mean over scenes, in which each scene counts once.
 
+Times are compared where both cells were trained on the same machine, with as many threads: a pair
+of different machines has no change in them.
+
 The 95 % interval is Student's t around that mean. With more than one scene it is taken over the
 scenes' means: it then says how far the mean would move with other scenes like these, and includes
 the noise between replicates. With one scene it is taken over replicates. One scene with one
@@ -35,7 +38,13 @@ import pandas as pd
 from xrgs.experiment.store import BASELINE
 from xrgs.report.averages import averaged
 from xrgs.report.collect import ReportError
-from xrgs.report.inference import ALL_HR, log_ratio, percent_change, share_of_gap
+from xrgs.report.inference import (
+    ALL_HR,
+    OTHER_MACHINE,
+    log_ratio,
+    percent_change,
+    share_of_gap,
+)
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -43,6 +52,8 @@ if TYPE_CHECKING:
     from xrgs.evaluation.metrics import Metric
 
 _GROUP = ["label", "condition"]
+#: The units of the metrics that depend on the machine.
+_TIMES = frozenset({"s", "ms"})
 #: What a cell and the one that it is compared with have in common.
 _PAIR = ["scene", "condition", "variant_seed", "seed"]
 
@@ -69,8 +80,9 @@ class Comparison:
     """(label, condition) of each ablation, in the sweep's order; the baseline is one of them where
     something else is the base."""
     cells: pd.DataFrame
-    """`Sweep.cells` with `base_id`, the cell that each is compared with. An ablation without a
-    finished base has that as its reason."""
+    """`Sweep.cells` with `base_id`, the cell that each is compared with, and `elsewhere`, whether
+    that is of another machine as far as is known. An ablation without a finished base has that as
+    its reason."""
     pairs: pd.DataFrame
     """One row for each metric of each ablation's cell: `base`, `value`, `effect` (the log of their
     ratio, or the change in %), `difference` (in the metric's unit) and `why` there is no effect."""
@@ -130,7 +142,10 @@ def compare(cells: pd.DataFrame, metrics: Sequence[Metric], against: str = BASEL
 
 
 def _with_base(cells: pd.DataFrame, against: str) -> pd.DataFrame:
-    """Return the cells with `base_id`: the record names the baseline, a key finds another base."""
+    """Return the cells with `base_id` and `elsewhere`, as `Comparison.cells` has them.
+
+    The record names the baseline, a key finds another base.
+    """
     if against == BASELINE:
         base_id = cells["baseline_id"]
     else:
@@ -141,7 +156,11 @@ def _with_base(cells: pd.DataFrame, against: str) -> pd.DataFrame:
             )
         bases = cells[cells["label"] == against].drop_duplicates(_PAIR).set_index(_PAIR)
         base_id = cells[_PAIR].join(bases["cell_id"], on=_PAIR)["cell_id"]
-    return cells.assign(base_id=base_id.where(cells["label"] != against, cells["cell_id"]))
+    base_id = base_id.where(cells["label"] != against, cells["cell_id"])
+    machines = cells.drop_duplicates("cell_id").set_index("cell_id")["machine"]
+    machine, of_base = cells["machine"], base_id.map(machines).astype(object).fillna("")
+    elsewhere = (machine != of_base) & (machine != "") & (of_base != "")
+    return cells.assign(base_id=base_id, elsewhere=elsewhere)
 
 
 def _check_comparable(cells: pd.DataFrame, against: str) -> None:
@@ -217,11 +236,15 @@ def _pairs(cells: pd.DataFrame, metrics: Sequence[Metric], against: str) -> pd.D
     cells.loc[reasons.index, "reason"] = f"no {against}: " + reasons
     paired = ablations[usable]
     matched = bases.loc[paired["base_id"]]
+    elsewhere = paired["elsewhere"].to_numpy()
     parts = []
     for metric in metrics:
         base = matched[metric.name].to_numpy(np.float64)
         value = paired[metric.name].to_numpy(np.float64)
         effect, why = (log_ratio if is_amount(metric) else percent_change)(base, value)
+        if metric.unit in _TIMES:
+            effect = np.where(elsewhere, np.nan, effect)
+            why = np.where(elsewhere & (why == ""), OTHER_MACHINE, why)
         with np.errstate(invalid="ignore"):  # inf - inf gives NaN, as it should
             difference = value - base
         part = paired[[*_GROUP, "scene", "variant_seed", "seed", "cell_id", "base_id"]]

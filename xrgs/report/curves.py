@@ -162,7 +162,7 @@ def times(
         the keys of the cell, `target` (the base's final PSNR of this scene and replicate, dB),
         `seconds` and `evaluations` until the mean PSNR of the test views first is that, and their
         `seconds_share` and `evaluations_share` of the base's totals; NaN where it is not
-        reached.
+        reached, and no share of a time that another machine took.
     """
     rows = []
     for _, cell in cells[cells["state"] == "done"].drop_duplicates(CELL_KEYS).iterrows():
@@ -175,6 +175,8 @@ def times(
             quality, amounts = ([at[key] for at in curve] for key in ("psnr", name))
             row[name] = first_reaches(quality, amounts, end["psnr"])
             row[f"{name}_share"] = row[name] / end[name] if end[name] else math.nan
+        if cell["elsewhere"]:
+            row["seconds_share"] = math.nan
         rows.append(row)
     return pd.DataFrame(rows, columns=[*CELL_KEYS, "target", *_ROWS])
 
@@ -244,13 +246,14 @@ def _rows_of(
 
 
 def _text(rows: pd.DataFrame | None, name: str) -> str:
-    """Return a mean, or that the target was not reached; empty where there is no row."""
+    """Return a mean, or why there is none; empty where there is no row."""
     if rows is None:
         return ""
-    reached = int(rows[name].notna().sum())
+    reached = int(rows[name.removesuffix("_share")].notna().sum())
     if reached < len(rows):
         return (
             _NOT_REACHED if reached == 0 else f"{_NOT_REACHED} {len(rows) - reached} of {len(rows)}"
         )
     _, factor, how = _ROWS[name]
-    return format(factor * rows[name].mean(), how)
+    mean = _mean_of_all(rows[name])
+    return "n/a" if math.isnan(mean) else format(factor * mean, how)

@@ -116,6 +116,7 @@ def _with_one(sweep: Sweep, store: JoinedStore, one: External) -> Sweep:
         rows.append(
             {key: cell[key] for key in (*_VARIANT, *_SHARED)}
             | {"cell_id": cell_id, "label": one.label, "state": "done", "reason": ""}
+            | {"machine": ""}
         )
     means = cell_means(pd.DataFrame(scores, columns=list(sweep.views.columns)))
     added = pd.DataFrame(rows, columns=list(sweep.cells.columns))

@@ -23,6 +23,7 @@ MIN_VALUES = 3
 #: The rate of false discoveries up to which a change is marked: our choice, as usual.
 FALSE_DISCOVERIES = 0.05
 NOT_MEASURED = "not measured"
+OTHER_MACHINE = "timed on another machine"
 ZERO_BASE = "compared with zero"
 NOT_FINITE = "not finite"
 NOT_POSITIVE = "not above zero"

@@ -11,7 +11,13 @@ from typing import TYPE_CHECKING
 from xrgs.evaluation.metrics import METRICS
 from xrgs.experiment.store import BASELINE, Store
 from xrgs.report import curves, skipped
-from xrgs.report.collect import RECORD_KEYS, ReportError, Sweep, read_cells
+from xrgs.report.collect import (
+    MACHINE_KEYS,
+    RECORD_KEYS,
+    ReportError,
+    Sweep,
+    read_cells,
+)
 from xrgs.report.compare import compare
 from xrgs.report.context import contexts
 from xrgs.report.external import with_external
@@ -42,8 +48,6 @@ _VIEW_KEYS = ["cell_id", "scene", "label", "condition", "variant_seed", "seed"]
 #: Most ablations whose own tables are printed; the overview and the files have all.
 _MAX_PRINTED_ABLATIONS = 6
 _MAX_PRINTED_MISSING = 20
-#: Entries of a cell's provenance that training time depends on, beside the program.
-_MACHINE_KEYS = ("cpu", "threads", "backend")
 _PROVENANCE_KEYS = (
     "xrgs",
     "git",
@@ -52,7 +56,7 @@ _PROVENANCE_KEYS = (
     "packages.torch",
     "platform",
     "arithmetic",
-    *_MACHINE_KEYS,
+    *MACHINE_KEYS,
 )
 
 
@@ -248,7 +252,7 @@ def _write_data(folder: ConfinedPath, sweep: Sweep, comparison: Comparison, runs
     names = cells.drop_duplicates("cell_id")[_VIEW_KEYS]
     views = names.merge(sweep.views, on="cell_id")
     metrics = [metric.name for metric in comparison.metrics]
-    order = [*RECORD_KEYS, "state", "reason", "protocol", "validation", *metrics]
+    order = [*RECORD_KEYS, "state", "reason", "protocol", "validation", "machine", *metrics]
     write_text(folder / "cells.csv", _csv(cells[order]))
     write_text(folder / "views.csv", _csv(views))
     write_text(folder / "training.csv", _csv(runs.training))
@@ -353,10 +357,12 @@ def _warnings(sweep: Sweep) -> list[str]:
             f"Scores are of held-out training views where the tables say {listed}: to choose by,"
             " not to compare with scores of test views."
         )
-    mixed = [key for key in _MACHINE_KEYS if len(sweep.provenance.get(key, ())) > 1]
-    if mixed:
-        differing = ", ".join(mixed)
-        warnings.append(f"The cells differ in {differing}: their training times do not compare.")
+    machines = sorted(set(sweep.cells["machine"]) - {""})
+    if len(machines) > 1:
+        warnings.append(
+            f"The cells were trained on different machines ({'; '.join(machines)}): times are"
+            " compared where a cell and what it is compared with are of the same one."
+        )
     arithmetics = sweep.provenance.get("arithmetic", ())
     if len(arithmetics) > 1:
         warnings.append(
