@@ -190,8 +190,7 @@ def test_times_of_different_machines_are_warned_of(made: Any) -> None:
     report = build(made.store.path)
     warning = (
         "The cells were trained on different machines (a processor, threads 2, torch; another"
-        " processor, threads 2, torch): times are compared where a cell and what it is compared with"
-        " are of the same one."
+        " processor, threads 2, torch): times are compared between cells of one machine alone."
     )
     assert warning in report.text
     assert warning in (report.folder / "table.md").read_text()

@@ -361,7 +361,7 @@ def _warnings(sweep: Sweep) -> list[str]:
     if len(machines) > 1:
         warnings.append(
             f"The cells were trained on different machines ({'; '.join(machines)}): times are"
-            " compared where a cell and what it is compared with are of the same one."
+            " compared between cells of one machine alone."
         )
     arithmetics = sweep.provenance.get("arithmetic", ())
     if len(arithmetics) > 1:
