@@ -171,7 +171,7 @@ def test_a_value_that_changes_a_number_is_another_cell(
 @pytest.mark.slow
 @pytest.mark.parametrize("name", sorted(file.stem for file in SWEEPS.glob("*.yaml")))
 def test_every_sweep_file_plans(sweep_here: SweepHere, name: str) -> None:
-    code, _, err = sweep_here(f"+sweeps={name}", "scene=motorcycle", "dry_run=true")
+    code, _, err = sweep_here(f"+sweeps={name}", "scene=motorcycle", "seed=0", "dry_run=true")
     assert code == 0, err
     assert labels(err) > {"baseline"}
 
