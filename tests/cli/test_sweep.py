@@ -180,7 +180,8 @@ def test_every_sweep_file_plans(sweep_here: SweepHere, name: str) -> None:
 def test_every_ablation_is_in_a_sweep(sweep_here: SweepHere) -> None:
     planned = set()
     for name in ("ablations", "further_ablations"):
-        _, _, err = sweep_here(f"+sweeps={name}", "scene=motorcycle", "seed=0", "dry_run=true")
+        code, _, err = sweep_here(f"+sweeps={name}", "scene=motorcycle", "seed=0", "dry_run=true")
+        assert code == 0, err
         planned |= {label.partition(" to ")[0] for label in labels(err)}
     assert planned == {file.stem for file in (CONF_DIR / "ablation").glob("*.yaml")}
 

@@ -115,8 +115,7 @@ def _with_one(sweep: Sweep, store: JoinedStore, one: External) -> Sweep:
         renders[cell_id] = folder
         rows.append(
             {key: cell[key] for key in (*_VARIANT, *_SHARED)}
-            | {"cell_id": cell_id, "label": one.label, "state": "done", "reason": ""}
-            | {"machine": ""}
+            | {"cell_id": cell_id, "label": one.label, "state": "done", "reason": "", "machine": ""}
         )
     means = cell_means(pd.DataFrame(scores, columns=list(sweep.views.columns)))
     added = pd.DataFrame(rows, columns=list(sweep.cells.columns))
