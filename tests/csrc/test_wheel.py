@@ -55,6 +55,7 @@ sys.meta_path[:] = [f for f in sys.meta_path if not type(f).__module__.startswit
 
 
 @pytest.mark.slow
+@pytest.mark.exhaustive  # compiling the kernels with ziglang takes minutes
 def test_a_machine_without_a_compiler_builds_the_same_kernels(tmp_path: Path) -> None:
     """A wheel that is built with an empty PATH has kernels that give the installed ones' bits."""
     pip = [sys.executable, "-P", "-m", "pip"]

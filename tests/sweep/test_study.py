@@ -112,12 +112,13 @@ def test_seeds_share_one_composed_config_and_each_cell_is_identified_once(
     assert made._identified(plan, store) == plan
 
 
-def test_a_seed_that_other_values_depend_on_is_composed_for_each(
+def test_values_that_depend_on_the_seed_follow_it_in_one_composed_config(
     study: Callable[..., Study],
 ) -> None:
     made = study()
     plan = made._plan(["seed=3,4", "variant.seed=${seed}"])
     assert [cell.conf.variant.seed for cell in plan] == [3, 4]
+    assert len(made._context.config_loader.composed) == 1  # type: ignore[attr-defined]
     assert [cell.name.partition(" / ")[2] for cell in plan] == [
         "baseline / variant.seed 3 / seed 3",
         "baseline / variant.seed 4 / seed 4",
