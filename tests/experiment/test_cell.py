@@ -144,6 +144,32 @@ def test_a_cell_killed_in_training_and_again_in_evaluation_goes_on(
     assert [path.name for path in folder.path.parent.iterdir()] == [folder.id]  # nothing aside
 
 
+def test_a_cell_that_goes_on_elsewhere_names_both_machines(conf: Conf, tmp_path: Path) -> None:
+    killed(conf, tmp_path, 6)
+    key, several = "machines_in_turn", ["threads 1", "threads 2"]
+    for conf.threads in (2, 1, 2):  # here, where it began, and here again
+        folder = begin(conf, tmp_path)
+        with pytest.MonkeyPatch.context() as patch:
+            kill_at(patch, protocol, "score_views", 1)
+            with pytest.raises(Kill):
+                cell.run_cell(conf, VARIANT, folder)
+        found = folder.provenance()[key].split("; ")
+        assert len(found) == 2
+        assert all(word in name for word, name in zip(several, found, strict=True))
+    # Where training starts over, the last machine is the only one.
+    _truncate(folder.checkpoint.path, folder.checkpoint.path)
+    folder = begin(conf, tmp_path)
+    cell.run_cell(conf, VARIANT, folder)
+    assert key not in folder.provenance()
+
+
+def test_a_cell_that_goes_on_where_it_was_has_one_machine(conf: Conf, tmp_path: Path) -> None:
+    killed(conf, tmp_path, 6)
+    folder = begin(conf, tmp_path)
+    cell.run_cell(conf, VARIANT, folder)
+    assert "machines_in_turn" not in folder.provenance()
+
+
 def _truncate(checkpoint: Path, other: Path) -> None:
     checkpoint.write_bytes(checkpoint.read_bytes()[:-1000])
 

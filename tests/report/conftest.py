@@ -53,14 +53,15 @@ class MadeStore:
         state: str = "done",
         pictures: bool = False,
         cpu: str = "a processor",
-        arithmetic: str | None = None,
+        provenance: dict[str, Any] | None = None,
         history: str = HISTORY,
         quality: str | None = None,
         summary: dict[str, Any] | None = None,
     ) -> CellFolder:
         """One cell: the made-up baseline's values times `factors`, or `values` outright.
 
-        `summary` has more entries of its summary, `quality` the scores during training.
+        `provenance` and `summary` have more entries of its files, `quality` the scores during
+        training.
         """
         cell_id = f"cell{len(self.rows):05d}"
         variant = variant or f"variant-of-{len(scene)}-{scene[:3]}".replace("/", "_")
@@ -91,7 +92,7 @@ class MadeStore:
         if state == "failed":
             folder.fail("RuntimeError: out of luck")
             return folder
-        self._fill(folder, found | (summary or {}), cpu, arithmetic)
+        self._fill(folder, found | (summary or {}), {"cpu": cpu} | (provenance or {}))
         (folder.path / "history.csv").write_text(history)
         if quality is not None:
             (folder.path / "quality.csv").write_text(quality)
@@ -121,12 +122,11 @@ class MadeStore:
         return read_cells(self.store, commands, record["cells"], METRICS)
 
     @staticmethod
-    def _fill(folder: CellFolder, found: dict[str, Any], cpu: str, arithmetic: str | None) -> None:
+    def _fill(folder: CellFolder, found: dict[str, Any], provenance: dict[str, Any]) -> None:
         summary = {key: value for key, value in found.items() if key not in SCORES}
         (folder.path / "summary.json").write_text(json.dumps(summary))
-        provenance = {"cpu": cpu, "threads": 2, "backend": "torch", "started": str(folder.path)}
-        provenance |= {} if arithmetic is None else {"arithmetic": arithmetic}
-        (folder.path / "provenance.json").write_text(json.dumps(provenance))
+        same = {"threads": 2, "backend": "torch", "started": str(folder.path)}
+        (folder.path / "provenance.json").write_text(json.dumps(same | provenance))
         # The views differ, their mean is the value asked for.
         lines = ["view,psnr,ssim,lpips"]
         for view, offset in zip(VIEWS, (0.05, -0.05), strict=True):

@@ -204,6 +204,14 @@ def test_times_of_another_machine_are_left_out(made: Any, against: str) -> None:
         assert (mean["change"], mean["scenes"], mean["why"]) == (pytest.approx(change), scenes, why)
 
 
+def test_times_of_several_machines_in_turn_are_like_those_of_no_other_cell(made: Any) -> None:
+    for label in ("baseline", "consistency"):
+        made.add(label, provenance={"machines_in_turn": "a processor; another"})
+    comparison = compared(made)
+    assert mean_of(comparison, "training_time_s")["why"] == OTHER_MACHINE
+    assert mean_of(comparison, "gaussians")["why"] == ""
+
+
 def test_times_of_an_unknown_machine_are_compared(made: Any) -> None:
     made.add()
     made.add("consistency", cpu="another")

@@ -324,8 +324,8 @@ def test_cells_of_different_arithmetic_are_warned_of(
 ) -> None:
     """A cell of an older version says none."""
     baseline, ablation = arithmetics
-    made.add(arithmetic=baseline)
-    made.add("consistency", arithmetic=ablation)
+    made.add(provenance={} if baseline is None else {"arithmetic": baseline})
+    made.add("consistency", provenance={"arithmetic": ablation})
     made.write()
     report = build(made.store.path, pictures=[])
     page = (report.folder / "table.md").read_text()

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, cast
 from xrgs.capture import dataset
 from xrgs.evaluation import protocol
 from xrgs.experiment import provenance
+from xrgs.experiment.provenance import Machines
 from xrgs.runtime import progress
 from xrgs.runtime.machine import peak_rss, set_torch_threads
 from xrgs.runtime.signals import StopRequest, StopSignal
@@ -144,7 +145,10 @@ def _train_and_score(
         *(what["xrgs"], backend, threads),
     )
     checkpoint = CellCheckpoint(folder, conf.checkpoint_s, shown, stop)
-    trained = _train_or_resume(data, conf, checkpoint)
+    trained, machines = _train_or_resume(data, conf, checkpoint, provenance.machine(what))
+    if len(machines) > 1:
+        what["machines_in_turn"] = "; ".join(machines)
+        write_json(folder.folder / "provenance.json", what, durable=False)
     shown.note = ""
     count = len(trained.gaussians)
     _log.info("trained %d steps in %.1f s: %d Gaussians", conf.train.steps, trained.seconds, count)
@@ -179,18 +183,27 @@ def _train_and_score(
     return [view.name for view in data.test]
 
 
-def _train_or_resume(data: Dataset, conf: Conf, checkpoint: CellCheckpoint) -> TrainingResult:
-    """Train from the cell's checkpoint, or from the start if there is no usable one."""
+def _train_or_resume(
+    data: Dataset, conf: Conf, checkpoint: CellCheckpoint, here: str
+) -> tuple[TrainingResult, list[str]]:
+    """Train from the cell's checkpoint, or from the start if there is no usable one.
+
+    Returns the result and the names of the machines that it comes from; `here` is the last.
+    """
 
     def evaluate(gaussians: Gaussians) -> dict[str, float | None]:
         return protocol.mean_scores(gaussians, data.test, conf.splat)
+
+    def train_on(machines: Machines) -> tuple[TrainingResult, list[str]]:
+        checkpoint.register(machines=machines)
+        return train_cell(data, conf, checkpoint, evaluate), machines.names
 
     try:
         steps = checkpoint.load()
         if steps is not None:
             _log.info("going on from the checkpoint, %d steps done", steps)
-        return train_cell(data, conf, checkpoint, evaluate)
+        return train_on(Machines(here))
     except CheckpointError as error:
         _log.warning("training starts over: %s", error)
         checkpoint.set_aside()
-    return train_cell(data, conf, checkpoint, evaluate)
+    return train_on(Machines(here))

@@ -9,15 +9,19 @@ import sys
 from datetime import UTC, datetime
 from importlib import metadata
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import xrgs
 from xrgs.evaluation.lpips import weights
 from xrgs.runtime.machine import usable_cores
 from xrgs.splat.backend import arithmetic
 
-_PACKAGES = ("torch", "numpy", "pycolmap", "kornia", "scikit-image", "hydra-core", "pandas")
+if TYPE_CHECKING:
+    from collections.abc import Mapping
 
+_PACKAGES = ("torch", "numpy", "pycolmap", "kornia", "scikit-image", "hydra-core", "pandas")
+#: Entries that times depend on, beside the program.
+MACHINE_KEYS = ("cpu", "instruction_set", "threads", "backend")
 
 #: What a cell's numbers come from, in the root of a checkout: `git_diff_sha256` covers it.
 _SOURCES = ("xrgs", "conf", "sweeps", "hydra_plugins")
@@ -92,3 +96,45 @@ def collect(threads: int, backend: str) -> dict[str, Any]:
         else weights.CONTENT_SHA256,
         "started": datetime.now(UTC).isoformat(timespec="seconds"),
     }
+
+
+def machine(provenance: Mapping[str, Any]) -> str:
+    """Return what a cell's times depend on, for example `AMD EPYC, avx2, threads 1, native`.
+
+    Args:
+        provenance: What `collect` has returned; entries may be missing.
+    """
+    known = {key: provenance[key] for key in MACHINE_KEYS if provenance.get(key) is not None}
+    texts = (f"threads {value}" if key == "threads" else str(value) for key, value in known.items())
+    return ", ".join(texts)
+
+
+class Machines:
+    """The machines that train a cell in turn; its checkpoint hands their names on to the next."""
+
+    def __init__(self, here: str) -> None:
+        """Begin with the machine of this process.
+
+        Args:
+            here: Its name, see `machine`.
+        """
+        self.names = [here]
+
+    def state_dict(self) -> dict[str, Any]:
+        """Return the state for a checkpoint."""
+        return {"names": [*self.names]}
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Put the machines that have trained before in front of this one.
+
+        Args:
+            state: What `state_dict` returned.
+
+        Raises:
+            KeyError: It has no names.
+            TypeError: They are no texts.
+        """
+        before = state["names"]
+        if not isinstance(before, list) or not all(isinstance(name, str) for name in before):
+            raise TypeError(f"names: {before!r:.40} are no texts")
+        self.names = list(dict.fromkeys([*before, *self.names]))

@@ -13,6 +13,7 @@ import pandas as pd
 
 from xrgs.errors import StoreError, XrgsError
 from xrgs.experiment.cell_folder import READING_ERRORS, CellState
+from xrgs.experiment.provenance import machine
 from xrgs.experiment.results import validation_share
 from xrgs.report.curves import cell_curve
 from xrgs.report.skipped import cell_work
@@ -48,8 +49,6 @@ _PENDING = {
     "absent": "not trained yet",
     "unfinished": "begun and not done yet: it is being trained, or was stopped",
 }
-#: Entries of a cell's provenance that times depend on, beside the program.
-MACHINE_KEYS = ("cpu", "instruction_set", "threads", "backend")
 _MAX_MACHINE = 120
 #: Values of keys that earlier records lack. Those had a swept `variant.seed` in the condition.
 _DEFAULTS = {"variant_seed": 0}
@@ -171,7 +170,7 @@ def _read_cell(cell: CellFolder, metrics: Sequence[Metric]) -> _CellContent:
         try:
             training, provenance = cell_totals(cell), cell.provenance()
             return _CellContent(
-                _done_columns(cell, metrics) | {"machine": _machine(provenance)},
+                _done_columns(cell, metrics) | {"machine": _machine(cell, provenance)},
                 _scores(cell, metrics),
                 training,
                 cell_curve(cell),
@@ -207,11 +206,14 @@ def _done_columns(cell: CellFolder, metrics: Sequence[Metric]) -> dict[str, Any]
     }
 
 
-def _machine(provenance: Mapping[str, Any]) -> str:
-    """Return what a cell's times depend on, for example `AMD EPYC, avx2, threads 1, native`."""
-    known = {key: provenance[key] for key in MACHINE_KEYS if provenance.get(key) is not None}
-    texts = (f"threads {value}" if key == "threads" else str(value) for key, value in known.items())
-    return for_line(", ".join(texts), _MAX_MACHINE)
+def _machine(cell: CellFolder, provenance: Mapping[str, Any]) -> str:
+    """Return what a cell's times depend on.
+
+    Several machines that trained a cell in turn get its id: its times are like those of no other.
+    """
+    several = provenance.get("machines_in_turn")
+    text = machine(provenance) if several is None else f"cell {cell.id} in turn: {several}"
+    return for_line(text, _MAX_MACHINE)
 
 
 def _scores(cell: CellFolder, metrics: Sequence[Metric]) -> list[dict[str, Any]]:

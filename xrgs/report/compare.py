@@ -10,7 +10,7 @@ turned into percent at the end: 100 (exp(mean) - 1). A scene's change is the mea
 replicates, and the sweep's change is the mean over scenes, in which each scene counts once.
 
 Times are compared where both cells were trained on the same machine, with as many threads: a pair
-of different machines has no change in them.
+of different machines has no change in them, and neither has a cell that several trained in turn.
 
 The 95 % interval is Student's t around that mean. With more than one scene it is taken over the
 scenes' means: it then says how far the mean would move with other scenes like these, and includes

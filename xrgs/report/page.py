@@ -9,10 +9,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from xrgs.evaluation.metrics import METRICS
+from xrgs.experiment.provenance import MACHINE_KEYS
 from xrgs.experiment.store import BASELINE, Store
 from xrgs.report import curves, skipped
 from xrgs.report.collect import (
-    MACHINE_KEYS,
     RECORD_KEYS,
     ReportError,
     Sweep,

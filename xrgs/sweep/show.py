@@ -19,7 +19,10 @@ if TYPE_CHECKING:
     from xrgs.sweep.inventory import CellSummary
 
 #: Entries of a cell's provenance that are shown, the others are in `provenance.json`.
-_PROVENANCE = ("started", "xrgs", "git", "git_diff_sha256", "backend", "threads", "cpu", "platform")
+_PROVENANCE = (
+    *("started", "xrgs", "git", "git_diff_sha256", "backend", "threads", "cpu", "platform"),
+    "machines_in_turn",
+)
 #: Columns of a cell's config that say where it is, and not what it is.
 _NAMES = frozenset({"cell_id", "scene", "label", "condition", "variant"})
 
