@@ -13,7 +13,6 @@ from typing import TYPE_CHECKING, cast
 from xrgs.capture import dataset
 from xrgs.evaluation import protocol
 from xrgs.experiment import provenance
-from xrgs.experiment.provenance import Machines
 from xrgs.runtime import progress
 from xrgs.runtime.machine import peak_rss, set_torch_threads
 from xrgs.runtime.signals import StopRequest, StopSignal
@@ -194,7 +193,8 @@ def _train_or_resume(
     def evaluate(gaussians: Gaussians) -> dict[str, float | None]:
         return protocol.mean_scores(gaussians, data.test, conf.splat)
 
-    def train_on(machines: Machines) -> tuple[TrainingResult, list[str]]:
+    def train_here() -> tuple[TrainingResult, list[str]]:
+        machines = provenance.Machines(here)
         checkpoint.register(machines=machines)
         return train_cell(data, conf, checkpoint, evaluate), machines.names
 
@@ -202,8 +202,8 @@ def _train_or_resume(
         steps = checkpoint.load()
         if steps is not None:
             _log.info("going on from the checkpoint, %d steps done", steps)
-        return train_on(Machines(here))
+        return train_here()
     except CheckpointError as error:
         _log.warning("training starts over: %s", error)
         checkpoint.set_aside()
-    return train_on(Machines(here))
+    return train_here()

@@ -122,7 +122,7 @@ class Machines:
 
     def state_dict(self) -> dict[str, Any]:
         """Return the state for a checkpoint."""
-        return {"names": [*self.names]}
+        return {"names": self.names}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Put the machines that have trained before in front of this one.
