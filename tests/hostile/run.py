@@ -27,12 +27,14 @@ from pathlib import Path
 from tests.hostile import judge, reference, sandbox
 from tests.hostile.looks import Look, Maker
 from tests.hostile.themes import THEMES
+from xrgs.runtime.machine import set_passive_openmp_wait
 
 #: Imported before the first fork, since every command would import them anew.
 _PRELOADED = (
     *(f"xrgs.cli.{name}" for name in ("data", "report", "status", "sweep")),
-    *("xrgs.report", "xrgs.report.figures", "xrgs.report.variant", "xrgs.sweep.status"),
-    *("xrgs.sweep.rerun", "xrgs.sweep.study", "xrgs.experiment.results", "hydra_plugins"),
+    *("xrgs.report", "xrgs.report.figures", "xrgs.report.html.trained", "xrgs.report.variant"),
+    *("xrgs.sweep.status", "xrgs.sweep.rerun", "xrgs.sweep.study", "xrgs.experiment.results"),
+    "hydra_plugins",
 )
 
 #: How many times longer a command may take that trains a cell.
@@ -143,6 +145,7 @@ def chosen(themes: Sequence[str], names: Sequence[str]) -> dict[str, Maker]:
 
 def run_cases(cases: dict[str, Maker], work: Path, wall_s: float, *, keep: bool) -> Iterator[Row]:
     """Run cases one after another, each in a folder of its own, which is removed unless `keep`."""
+    set_passive_openmp_wait()  # before torch is imported
     for module in _PRELOADED:
         import_module(module)
     base = work / "reference"
