@@ -27,6 +27,7 @@ from xrgs.report.joined import Choice, JoinedStore, report_name
 from xrgs.report.paper import paper_tables
 from xrgs.report.pictures import Picture, draw
 from xrgs.report.render import LATEX_PREAMBLE, TextTable, to_latex, to_markdown, to_text
+from xrgs.report.single_views import decided_by_one_view
 from xrgs.report.tables import Tables
 from xrgs.report.texture import texture_tables, with_texture
 from xrgs.report.training import table as training_table
@@ -158,7 +159,11 @@ def build(
     store = replace(store, external=sweep.renders)
     sweep = replace(sweep, views=with_texture(store, sweep.cells, sweep.views))
     comparison = compare(sweep.cells, METRICS, against)
-    tables = Tables(comparison, contexts(store, sweep.cells, sweep.views))
+    tables = Tables(
+        comparison,
+        contexts(store, sweep.cells, sweep.views),
+        decided_by_one_view(comparison, sweep.views),
+    )
     name = _folder_name(ids, choice, against, externals)
     folder = ConfinedPath(out) if out else store.stores[0].reports / name
     try:
