@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -92,7 +93,7 @@ def test_it_is_what_leaving_out_each_view_in_turn_says(hundredths: list[int]) ->
             for number, score in enumerate(row)
         ]
     )
-    comparison: Any = type("OnlyPairs", (), {"pairs": pairs})
+    comparison: Any = SimpleNamespace(pairs=pairs)
     found = decided_by_one_view(comparison, views).get(("a", ""), [])
     change = scores - 20.0
     expected = []
