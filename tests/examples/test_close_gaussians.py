@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-import importlib.util
 import math
+from collections.abc import Callable
 from pathlib import Path
 from types import ModuleType
 
@@ -16,18 +16,7 @@ from tests.hostile import reference
 from xrgs import Gaussians, Store, rasterize, save_ply
 from xrgs.evaluation.protocol import mean_scores
 
-SCRIPT = Path(__file__).parents[2] / "examples" / "close_gaussians.py"
 COUNT = 4
-
-
-@pytest.fixture(scope="module")
-def script() -> ModuleType:
-    spec = importlib.util.spec_from_file_location("close_gaussians", SCRIPT)
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
 
 
 def joined(first: Gaussians, second: Gaussians) -> Gaussians:
@@ -36,7 +25,7 @@ def joined(first: Gaussians, second: Gaussians) -> Gaussians:
 
 
 def test_what_is_close_to_one_camera_is_counted_and_left_out(
-    script: ModuleType, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    script: Callable[[str], ModuleType], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     reference.build(tmp_path)
     cell = Store(tmp_path).cell_folders()[0]
@@ -57,7 +46,9 @@ def test_what_is_close_to_one_camera_is_counted_and_left_out(
 
     png = tmp_path / "pair.png"
 
-    script.main([cell.id, "--store", str(tmp_path), "--share", str(share), "--image", str(png)])
+    script("close_gaussians").main(
+        [cell.id, "--store", str(tmp_path), "--share", str(share), "--image", str(png)]
+    )
 
     header, *lines = capsys.readouterr().out.splitlines()
     assert header.split() == ["close", "psnr", "lpips", "psnr", "without", "lpips", "without"]

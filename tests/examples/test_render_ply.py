@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-import importlib.util
 import subprocess
 import sys
+from collections.abc import Callable
 from pathlib import Path
 from types import ModuleType
 
@@ -21,13 +21,8 @@ RED, BLUE = [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]
 
 
 @pytest.fixture(scope="session")
-def render_ply() -> ModuleType:
-    spec = importlib.util.spec_from_file_location("render_ply", SCRIPT)
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
+def render_ply(script: Callable[[str], ModuleType]) -> ModuleType:
+    return script("render_ply")
 
 
 @pytest.fixture
