@@ -26,7 +26,8 @@ def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     parser.add_argument("cell", help="the id of a trained cell, or the beginning of one")
     parser.add_argument("--store", default="xrgs-store", help="default: %(default)s")
-    parser.add_argument("--share", type=float, default=0.25, help="default: %(default)s")
+    share = "of the points' median depth, within which a Gaussian is close (default: %(default)s)"
+    parser.add_argument("--share", type=float, default=0.25, help=share)
     parser.add_argument("--image", help="PNG of the view that gains most, with and without them")
     return parser.parse_args(arguments)
 
