@@ -43,7 +43,6 @@ def test_what_is_close_to_one_camera_is_counted_and_left_out(
     truth = [mean_scores(scene, [view], conf)["psnr"] for view in views]
     harmed = [mean_scores(joined(scene, close), [view], conf)["psnr"] for view in views]
     save_ply(cell.path / "splats.ply", joined(scene, close))
-
     png = tmp_path / "pair.png"
 
     script("close_gaussians").main(

@@ -31,7 +31,8 @@ def views_of(comparison: Comparison, changes: dict[str, list[float]]) -> pd.Data
             name = f"view{number}"
             rows.append({"cell_id": pair["base_id"], "view": name, "psnr": 20.0})
             rows.append({"cell_id": pair["cell_id"], "view": name, "psnr": 20.0 + change})
-    return pd.DataFrame(rows, columns=["cell_id", "view", "psnr"]).astype({"psnr": float})
+    views = pd.DataFrame(rows, columns=["cell_id", "view", "psnr"]).astype({"psnr": float})
+    return views.drop_duplicates(["cell_id", "view"])  # labels share their base
 
 
 def compared(made: Any, *labels: str, seeds: tuple[int, ...] = (0,)) -> Comparison:
@@ -114,8 +115,7 @@ def test_it_is_what_leaving_out_each_view_in_turn_says(hundredths: list[int]) ->
 
 def test_the_caution_stands_under_the_table_of_its_label_alone(made: Any) -> None:
     comparison = compared(made, "plus", "lean")
-    cautions = {("plus", ""): ["Caution: one view decides"]}
-    tables = Tables(comparison, cautions=cautions)
+    tables = Tables(comparison, notes={("plus", ""): ["Caution: one view decides"]})
     assert "Caution: one view decides" in tables.mean("plus", "").notes
     assert "Caution: one view decides" not in tables.mean("lean", "").notes
 

@@ -158,12 +158,7 @@ def build(
     sweep = with_external(sweep, store, externals)
     store = replace(store, external=sweep.renders)
     sweep = replace(sweep, views=with_texture(store, sweep.cells, sweep.views))
-    comparison = compare(sweep.cells, METRICS, against)
-    tables = Tables(
-        comparison,
-        contexts(store, sweep.cells, sweep.views),
-        decided_by_one_view(comparison, sweep.views),
-    )
+    tables = _tables(store, sweep, against)
     name = _folder_name(ids, choice, against, externals)
     folder = ConfinedPath(out) if out else store.stores[0].reports / name
     try:
@@ -178,6 +173,13 @@ def build(
     written = {p.file for p in drawn if p.file} | {folder / name for name in _FILES}
     text = f"{_text(tables, _warnings(sweep))}\n{for_line(f'Written to {folder}')}"
     return Report(text=text, folder=folder.path, files=tuple(sorted(file.path for file in written)))
+
+
+def _tables(store: JoinedStore, sweep: Sweep, against: str) -> Tables:
+    """Compare the cells of a sweep."""
+    comparison = compare(sweep.cells, METRICS, against)
+    context = contexts(store, sweep.cells, sweep.views)
+    return Tables(comparison, context, decided_by_one_view(comparison, sweep.views))
 
 
 def _folder_name(

@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from xrgs.report.compare import Comparison
 
 _PAIR = ["label", "condition", "scene", "variant_seed", "seed"]
+_CELLS = ["cell_id", "base_id"]
 #: With fewer views, none can be told from the others.
 _MIN_VIEWS = 3
 #: A view decides where, without it, the mean change differs by more than this share of the mean and
@@ -65,11 +66,11 @@ def decided_by_one_view(
 
 def _changes_of_views(comparison: Comparison, views: pd.DataFrame) -> pd.DataFrame:
     """Return the change in PSNR of each view of each pair, dB, where it is finite."""
-    pairs = comparison.pairs.loc[comparison.pairs["metric"] == "psnr"]
-    scores = views[["cell_id", "view", "psnr"]].drop_duplicates(["cell_id", "view"])
+    pairs = comparison.pairs.loc[comparison.pairs["metric"] == "psnr", [*_PAIR, *_CELLS]]
+    scores = views[["cell_id", "view", "psnr"]]
     of_base = scores.rename(columns={"cell_id": "base_id", "psnr": "base_psnr"})
-    rows = pairs[[*_PAIR, "cell_id", "base_id"]].merge(scores, on="cell_id")
-    rows = rows.merge(of_base, on=["base_id", "view"])
+    pairs = pairs.drop_duplicates()  # a record may have a row twice
+    rows = pairs.merge(scores, on="cell_id").merge(of_base, on=["base_id", "view"])
     with np.errstate(invalid="ignore"):  # inf - inf gives NaN, as it should
         rows["change"] = rows["psnr"] - rows["base_psnr"]
     finite: pd.DataFrame = rows[np.isfinite(rows["change"])].reset_index(drop=True)

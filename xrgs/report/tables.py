@@ -63,18 +63,18 @@ class Tables:
     Args:
         comparison: The pairs of cells and their means.
         contexts: How the cells of each condition were trained and scored.
-        cautions: Sentences on the change of a label under a condition.
+        notes: Sentences under the table of a label and a condition.
     """
 
     def __init__(
         self,
         comparison: Comparison,
         contexts: Mapping[str, Context] | None = None,
-        cautions: Mapping[tuple[str, str], Sequence[str]] | None = None,
+        notes: Mapping[tuple[str, str], Sequence[str]] | None = None,
     ) -> None:
         self.comparison = comparison
         self.contexts = contexts or {}
-        self._of_change = cautions or {}
+        self._notes = notes or {}
 
     @property
     def cautions(self) -> tuple[str, ...]:
@@ -216,7 +216,7 @@ class Tables:
             if row.why and not math.isnan(row.change)
         )
         return (
-            *(*self._context(condition).cautions, *self._of_change.get((label, condition), ())),
+            *(*self._context(condition).cautions, *self._notes.get((label, condition), ())),
             *(ARROWS_NOTE, *agreement_note(changes), *left_out),
             *(*self._interval_note(label, condition), *scatter_note(changes)),
             *self._mean_notes([label], condition),
