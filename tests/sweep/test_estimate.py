@@ -16,6 +16,7 @@ from xrgs.config import Conf
 from xrgs.experiment.identity import cell_identity
 from xrgs.experiment.store import Store
 from xrgs.safeio.atomic import write_json
+from xrgs.sweep import estimate
 from xrgs.sweep.estimate import TORCH_SLOWDOWN, CostEstimator
 
 VARIANT = "v{}-0123456789abcdef"
@@ -63,6 +64,7 @@ class Past:
         disk: int = 1000,
         gaussians: int = 100_000,
         overhead: float | None = None,
+        **provenance: Any,
     ) -> None:
         folder = self.store.cell(f"cell{self.written:04d}").folder
         self.written += 1
@@ -71,7 +73,8 @@ class Past:
         started = datetime(2026, 1, 1, tzinfo=UTC)
         write_json(folder / "identity.json", identity)
         write_json(folder / "summary.json", summary)
-        write_json(folder / "provenance.json", {"threads": threads, "started": started.isoformat()})
+        provenance |= {"threads": threads, "started": started.isoformat()}
+        write_json(folder / "provenance.json", provenance)
         write_json(folder / "status.json", {"files": {"splats.ply": {"bytes": disk}}})
         if overhead is not None:
             end = started.timestamp() + seconds + overhead
@@ -130,6 +133,22 @@ def test_a_cell_on_more_threads_or_with_more_steps_is_scaled(past: Past) -> None
     one = cost(past, past.identity(variant, 1000)).training_s
     assert 0.5 < cost(past, past.identity(variant, 1000), threads=2).training_s / one < 0.7
     assert 2 < cost(past, past.identity(variant, 2000)).training_s / one < 2.4
+
+
+def test_times_are_those_of_this_processor(past: Past, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Twenty cells of a slow processor, the newest ones, and four of a fast one."""
+    identity = past.identity(past.variant(0), 100)
+    for number in range(24):
+        here = number < 4
+        cpu, seconds = ("fast", 10.0) if here else ("slow", 30.0)
+        past.add(identity, seconds, rss=2e9, cpu=cpu, instruction_set="avx2")
+    for _ in range(20):  # of both in turn: they tell nothing of either
+        past.add(identity, 30.0, rss=2e9, cpu="fast", machines_in_turn=["fast", "slow"])
+    for cpu, seconds in (("fast", 10.0), ("slow", 30.0)):
+        monkeypatch.setattr(estimate, "this_processor", lambda _, cpu=cpu: f"{cpu}, avx2")
+        found = cost(past, identity)
+        assert found.training_s == pytest.approx(seconds, rel=0.2)
+        assert found.memory_bytes == pytest.approx(2e9, rel=0.05)
 
 
 def test_a_budget_that_no_cell_had_limits_the_disk(past: Past) -> None:

@@ -7,6 +7,7 @@ import platform
 import subprocess
 import sys
 from datetime import UTC, datetime
+from functools import cache
 from importlib import metadata
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -17,11 +18,12 @@ from xrgs.runtime.machine import usable_cores
 from xrgs.splat.backend import arithmetic
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from collections.abc import Mapping, Sequence
 
 _PACKAGES = ("torch", "numpy", "pycolmap", "kornia", "scikit-image", "hydra-core", "pandas")
+_PROCESSOR_KEYS = ("cpu", "instruction_set")
 #: Entries that times depend on, beside the program.
-MACHINE_KEYS = ("cpu", "instruction_set", "threads", "backend")
+MACHINE_KEYS = (*_PROCESSOR_KEYS, "threads", "backend")
 
 #: What a cell's numbers come from, in the root of a checkout: `git_diff_sha256` covers it.
 _SOURCES = ("xrgs", "conf", "sweeps", "hydra_plugins")
@@ -85,17 +87,19 @@ def collect(threads: int, backend: str) -> dict[str, Any]:
         "python": sys.version.split()[0],
         "packages": {name: metadata.version(name) for name in _PACKAGES},
         "platform": platform.platform(),
-        "cpu": _cpu(),
         "cores": usable_cores(),
         "threads": threads,
         "backend": backend,
         "arithmetic": arithmetic(backend),
-        "instruction_set": _instruction_set(backend),
         "lpips_weights_sha256": None
         if weights.load_published() is None
         else weights.CONTENT_SHA256,
         "started": datetime.now(UTC).isoformat(timespec="seconds"),
-    }
+    } | _processor(backend)
+
+
+def _processor(backend: str) -> dict[str, str | None]:
+    return {"cpu": _cpu(), "instruction_set": _instruction_set(backend)}
 
 
 def machine(provenance: Mapping[str, Any]) -> str:
@@ -104,7 +108,33 @@ def machine(provenance: Mapping[str, Any]) -> str:
     Args:
         provenance: What `collect` has returned; entries may be missing.
     """
-    known = {key: provenance[key] for key in MACHINE_KEYS if provenance.get(key) is not None}
+    return _text(provenance, MACHINE_KEYS)
+
+
+def processor(provenance: Mapping[str, Any]) -> str:
+    """Return the processor that trained a cell and what of it was used: `AMD EPYC, avx2`.
+
+    Args:
+        provenance: What `collect` has returned; entries may be missing.
+
+    Returns:
+        The text; empty where several machines have trained the cell in turn.
+    """
+    return "" if "machines_in_turn" in provenance else _text(provenance, _PROCESSOR_KEYS)
+
+
+@cache
+def this_processor(backend: str) -> str:
+    """Return `processor` of a cell that this machine trains.
+
+    Args:
+        backend: The rasterizer in use, `native` or `torch`.
+    """
+    return processor(_processor(backend))
+
+
+def _text(provenance: Mapping[str, Any], keys: Sequence[str]) -> str:
+    known = {key: provenance[key] for key in keys if provenance.get(key) is not None}
     texts = (f"threads {value}" if key == "threads" else str(value) for key, value in known.items())
     return ", ".join(texts)
 

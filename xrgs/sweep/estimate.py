@@ -5,8 +5,9 @@ together, of the variant, and of sizes, each with an exponent (pixels, steps, Ga
 The number of Gaussians of a cell that is planned is estimated in the same way, up to what its
 settings allow. The effects are fitted to the store's finished cells by ridge regression, which is a
 normal prior on each: so a setting or a variant that no cell had counts as average, a variant of
-another size is scaled, and a store without cells gives the prior, for a common machine. The times
-are of whatever machine a cell was trained on, and of what else that was doing.
+another size is scaled, and a store without cells gives the prior, for a common machine. For times
+the processor has an effect too: a cell that is planned counts as one of this machine, also where a
+launcher will run it on another.
 """
 
 from __future__ import annotations
@@ -23,6 +24,7 @@ import numpy as np
 
 from xrgs.errors import StoreError
 from xrgs.experiment.identity import cell_identity
+from xrgs.experiment.provenance import processor, this_processor
 from xrgs.safeio.records import as_number, read_object
 from xrgs.sweep import features
 
@@ -73,6 +75,14 @@ class Prior:
     """The power of each size that the cost is proportional to, before any cell is known."""
     torch: float = 1.0
     """The factor of the torch backend."""
+    timed: bool = False
+    """Whether it depends on the processor."""
+
+    def names(self, cell: Features) -> frozenset[str]:
+        """Return the names of the effects on this cost of a cell."""
+        if not (self.timed and cell.processor):
+            return cell.names
+        return cell.names | {f"processor={cell.processor:.200}"}
 
     def log(self, cell: Features) -> float:
         """Return the logarithm of the cost of a cell."""
@@ -80,14 +90,15 @@ class Prior:
         return math.log(self.typical) + sizes + math.log(self.torch) * cell.torch
 
 
-#: The costs, by the names of `_costs_of`. Measured on two cores of an Intel Xeon.
+#: The costs, by their names in `CostEstimator._read`. Measured on two cores of an Intel Xeon.
 _PRIORS = {
     "step_s": Prior(
         0.03,
         {"pixels": 0.5, "gaussians": 0.5, "steps": 0.1, "views": 0.3, "threads": -0.85},
         TORCH_SLOWDOWN,
+        timed=True,
     ),
-    "overhead_s": Prior(6.0, {"pixels": 0.3, "scored": 0.7}),
+    "overhead_s": Prior(6.0, {"pixels": 0.3, "scored": 0.7}, timed=True),
     "memory_bytes": Prior(4e8, {"pixels": 0.4, "gaussians": 0.4, "steps": 0.1, "views": 0.15}),
     "disk_bytes": Prior(2.6e7, {"pixels": 0.05, "gaussians": 0.95}),
 }
@@ -120,8 +131,9 @@ class _Regression:
         known = [(cell, cost) for cell, cost in past if 0 < cost < math.inf]
         self._prior = prior
         # What all cells have is part of the level.
-        shared = frozenset.intersection(*(cell.names for cell, _ in known)) if known else ()
-        names = {name for cell, _ in known for name in cell.names} - frozenset(shared)
+        named = [prior.names(cell) for cell, _ in known]
+        shared = frozenset[str].intersection(*named) if named else frozenset[str]()
+        names = frozenset[str]().union(*named) - shared
         self._column = {name: number for number, name in enumerate(sorted(names))}
         exponents = [_EXPONENTS[name] for name in prior.exponents]
         deviations = [_LEVEL, _TORCH, *exponents, *[_NAME] * len(names)]
@@ -136,7 +148,8 @@ class _Regression:
         """Return how often each effect is in the cost of a cell."""
         sizes = [cell.sizes.get(name, 0.0) for name in self._prior.exponents]
         named = np.zeros(len(self._column))
-        named[[self._column[name] for name in cell.names if name in self._column]] = 1
+        names = self._prior.names(cell) & self._column.keys()
+        named[[self._column[name] for name in names]] = 1
         return np.array([1.0, cell.torch, *sizes, *named])
 
     def __call__(self, cell: Features) -> float:
@@ -177,7 +190,10 @@ class CostEstimator:
         except StoreError:  # of them only the overhead, the disk and the threads are known
             provenance, status = {}, {}
         count = as_number(summary["gaussians"])
-        what = features.of_identity(identity, provenance.get("threads"), self._store, count)
+        what = replace(
+            features.of_identity(identity, provenance.get("threads"), self._store, count),
+            processor=processor(provenance),
+        )
         training_s = as_number(summary["training_time_s"])
         costs = {"gaussians": count, "step_s": training_s / identity["train"]["steps"]}
         costs["memory_bytes"] = as_number(summary.get("peak_rss_bytes")) - _PROCESS_BYTES
@@ -221,12 +237,15 @@ class CostEstimator:
         Returns:
             The cost; None where the variant is not built and keeps the photographs' own size.
         """
+        identity = identity or cell_identity(conf, variant_id or "")
         if variant_id is None:
-            what = features.of_conf(conf, cell_identity(conf, ""), threads)
+            what = features.of_conf(conf, identity, threads)
         else:
-            identity = identity or cell_identity(conf, variant_id)
             what = features.of_identity(identity, threads, self._store)
-        return None if what is None else self._cost(what, conf.train)
+        if what is None:
+            return None
+        here = this_processor(identity["splat"]["backend"])
+        return self._cost(replace(what, processor=here), conf.train)
 
     def _cost(self, what: Features, train: TrainConf) -> Cost:
         count = min(self._count(what), what.most)

@@ -54,6 +54,8 @@ class Features:
     """Whether the torch backend renders."""
     most: float = math.inf
     """The most Gaussians that the settings leave at the end."""
+    processor: str = ""
+    """What trains it, and its instruction set; empty where that is not known."""
 
 
 def of_identity(
