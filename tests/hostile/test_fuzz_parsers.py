@@ -81,7 +81,7 @@ def test_a_parser_reads_or_refuses_any_bytes(known: dict[str, Parser], name: str
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("count", [250, pytest.param(1000, marks=pytest.mark.exhaustive)])
+@pytest.mark.parametrize("count", [100, pytest.param(1000, marks=pytest.mark.exhaustive)])
 @pytest.mark.parametrize("part", range(4))
 def test_a_parser_reads_or_refuses_mutations(part: int, count: int) -> None:
     # In a process of its own, so that a crash is a failure of this test alone.

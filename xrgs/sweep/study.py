@@ -84,6 +84,7 @@ class Study:
         self._task = task
         self._config = config
         self._composed: dict[tuple[bool, tuple[str, ...]], DictConfig] = {}
+        self._confs: dict[tuple[str, ...], Conf] = {}
         self._store: Store | None = None
         """The store, once it is prepared."""
 
@@ -260,19 +261,25 @@ class Study:
         return replace(cell, spec=spec, conf=self._compose(spec))
 
     def _compose(self, spec: CellSpec) -> Conf:
-        """Return a cell's config. Seeds share what Hydra composes, which takes it 0.1 s."""
-        seeds = [int(seed[1]) for text in spec.overrides if (seed := _SEED.fullmatch(text))]
-        others = tuple(text for text in spec.overrides if not _SEED.fullmatch(text))
+        """Return a cell's config; that of a reference is asked for by each cell that it has."""
+        overrides = tuple(spec.overrides)
+        if overrides not in self._confs:
+            conf = self._confs[overrides] = to_conf(self._hydra_config(overrides))
+            check(conf)
+        return self._confs[overrides]
+
+    def _hydra_config(self, overrides: tuple[str, ...]) -> DictConfig:
+        """Return what Hydra composes, which takes it 0.1 s; seeds share it."""
+        seeds = [int(seed[1]) for text in overrides if (seed := _SEED.fullmatch(text))]
+        others = tuple(text for text in overrides if not _SEED.fullmatch(text))
         composed = self._composed.get((bool(seeds), others))
         if composed is None:
-            composed = self._context.config_loader.load_sweep_config(self._config, spec.overrides)
+            composed = self._context.config_loader.load_sweep_config(self._config, [*overrides])
             launch.check(self._config, composed)
             self._composed[bool(seeds), others] = composed
         elif seeds:
             composed.seed = seeds[-1]  # what is set to ${seed} follows it
-        conf = to_conf(composed)
-        check(conf)
-        return conf
+        return composed
 
     def _with_variants(
         self, plan: Sequence[PlannedCell], store: Store, *, allow_build: bool
