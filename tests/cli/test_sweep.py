@@ -21,6 +21,14 @@ SweepHere = Callable[..., tuple[int, str, str]]
 RunCommand = Callable[..., tuple[int, str, str]]
 SCENE = ("scene=motorcycle", "preset=smoke", "store=s")
 SWEEPS = CONF_DIR / "sweeps" if (CONF_DIR / "sweeps").is_dir() else CONF_DIR.parent / "sweeps"
+#: The sweeps that have every ablation between them.
+WHOLE = ("ablations", "further_ablations")
+
+
+def named(sweep: str) -> set[str]:
+    """Return the ablations that a sweep's file names, and the baseline, which all have."""
+    axes = OmegaConf.load(SWEEPS / f"{sweep}.yaml").hydra.sweeper.params
+    return {word.strip() for word in axes["+ablation"].split(",")} | {"baseline"}
 
 
 def labels(plan: str) -> set[str]:
@@ -174,14 +182,14 @@ def test_a_value_that_changes_a_number_is_another_cell(
 def test_every_sweep_file_plans(sweep_here: SweepHere, name: str) -> None:
     code, _, err = sweep_here(f"+sweeps={name}", "scene=motorcycle", "seed=0", "dry_run=true")
     assert code == 0, err
-    assert labels(err) > {"baseline"}
+    planned = labels(err)
+    assert planned > {"baseline"}
+    if name in WHOLE:
+        assert {label.partition(" to ")[0] for label in planned} == named(name)
 
 
 def test_every_ablation_is_in_a_sweep() -> None:
-    swept = {"baseline"}  # of every sweep
-    for name in ("ablations", "further_ablations"):
-        axes = OmegaConf.load(SWEEPS / f"{name}.yaml").hydra.sweeper.params
-        swept |= {word.strip() for word in axes["+ablation"].split(",")}
+    swept = set().union(*map(named, WHOLE))
     assert swept == {file.stem for file in (CONF_DIR / "ablation").glob("*.yaml")}
 
 

@@ -261,11 +261,12 @@ class Study:
         return replace(cell, spec=spec, conf=self._compose(spec))
 
     def _compose(self, spec: CellSpec) -> Conf:
-        """Return a cell's config; that of a reference is asked for by each cell that it has."""
+        """Return a cell's config, converted once: each cell asks for that of its reference too."""
         overrides = tuple(spec.overrides)
         if overrides not in self._confs:
-            conf = self._confs[overrides] = to_conf(self._hydra_config(overrides))
+            conf = to_conf(self._hydra_config(overrides))
             check(conf)
+            self._confs[overrides] = conf
         return self._confs[overrides]
 
     def _hydra_config(self, overrides: tuple[str, ...]) -> DictConfig:
