@@ -23,7 +23,6 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from xrgs.config import ComponentsConf
-    from xrgs.safeio.confined import ConfinedPath
 
 #: The start of an interpolation, with the backslashes before it: an odd number of them escapes it.
 _INTERPOLATION = re.compile(r"(\\*)\$\{")
@@ -195,7 +194,7 @@ def escape_interpolations(value: Any) -> Any:
     return _INTERPOLATION.sub(lambda match: 2 * match[1] + r"\${", value)
 
 
-def from_file(file: Path | ConfinedPath) -> tuple[Conf, dict[str, Any]]:
+def from_file(file: Path) -> tuple[Conf, dict[str, Any]]:
     """Read the config that a cell's folder holds as JSON.
 
     A file from before a key was added lacks it. The key's value in the baseline is taken, with
