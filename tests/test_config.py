@@ -17,7 +17,7 @@ import pytest
 import yaml
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
-from omegaconf import OmegaConf
+from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from xrgs.composing import error_line, escape_interpolations, from_dict, from_file
@@ -84,6 +84,7 @@ def test_the_file_of_the_baseline_has_every_key_of_the_schema() -> None:
 def test_the_values_of_the_baseline_are_of_the_schemas_types() -> None:
     """As they are in the file: OmegaConf would convert `"1"` for a number."""
     conf = OmegaConf.load(CONF_DIR / "config.yaml")
+    assert isinstance(conf, DictConfig)
     OmegaConf.update(conf, "scene", {"name": "x", "kind": "folder"}, merge=True)
     names = [entry.name for entry in fields(Conf)]
     values = OmegaConf.to_container(OmegaConf.masked_copy(conf, names), resolve=True)

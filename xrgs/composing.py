@@ -158,7 +158,7 @@ def from_dict(values: Any) -> Conf:
     return conf
 
 
-def _missing(values: Any, schema: type[Any], path: str = "") -> Iterator[tuple[Any, str, str]]:
+def _missing(values: Any, schema: Any, path: str = "") -> Iterator[tuple[Any, str, str]]:
     """Yield the keys of a schema that nested dicts lack: the dict, the name in it, the dotted key.
 
     msgspec would take the defaults of `xrgs.splat.settings` for missing keys, and ignore unknown

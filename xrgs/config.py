@@ -367,6 +367,6 @@ def _keys_of(schema: Any, prefix: str) -> Iterator[str]:
 
 
 @cache
-def types_of(schema: type[Any]) -> Mapping[str, Any]:
+def types_of(schema: Any) -> Mapping[str, Any]:
     """Return the types of a group's keys, by name."""
     return get_type_hints(schema)
