@@ -117,7 +117,6 @@ def main() -> None:
         ):
             _rerun(arguments)
         return
-    config.register()
     # The plus that Hydra requires before these two is forgotten easily.
     words = ["+" + w if w.partition("=")[0] in config.PLUS_GROUPS else w for w in arguments]
     with (
