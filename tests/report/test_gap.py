@@ -7,8 +7,8 @@ from xrgs.report.compare import Comparison, compare
 from xrgs.report.context import Context
 from xrgs.report.gap import gap_tables
 from xrgs.report.page import build
-from xrgs.report.render import TextTable
 from xrgs.report.tables import Tables
+from xrgs.runtime.text import TextTable
 
 CONTEXTS = {"": Context(("500 steps",), ("a machine",))}
 

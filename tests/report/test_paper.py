@@ -9,7 +9,7 @@ from xrgs.report.compare import compare
 from xrgs.report.context import Context
 from xrgs.report.page import build
 from xrgs.report.paper import paper_tables
-from xrgs.report.render import TextTable
+from xrgs.runtime.text import TextTable
 
 SCENES = ("fern", "flower", "horns")
 

@@ -17,8 +17,8 @@ from xrgs.report.compare import compare
 from xrgs.report.context import Context
 from xrgs.report.joined import JoinedStore
 from xrgs.report.page import build
-from xrgs.report.render import TextTable
 from xrgs.report.texture import texture, texture_tables, with_texture
+from xrgs.runtime.text import TextTable
 from xrgs.training.components.texture import gradient_magnitude
 
 SCENES = ("room", "fern", "trex")  # from the flattest to the most textured, as drawn below

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from xrgs.cli.arguments import errors_as_messages, names_in, parse, paths_in
-from xrgs.experiment.store import BASELINE
+from xrgs.experiment.store import BASELINE, Store
 from xrgs.runtime.streams import say
 
 _HELP = """\
@@ -76,7 +76,7 @@ def main() -> None:
             from xrgs.sweep.inventory import list_sweeps
 
             listed = parse(ListConf, _HELP, [word for word in sys.argv[1:] if word != "list"])
-            say(list_sweeps(Path(listed.store)))
+            say(list_sweeps(Store(Path(listed.store)).sweep_rows()))
             return
         conf = parse(ReportConf, _HELP)
         from xrgs.report import Choice, build, external

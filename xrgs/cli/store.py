@@ -26,8 +26,8 @@ if TYPE_CHECKING:
 
     from omegaconf import DictConfig
 
+    from xrgs.experiment.listing import CellRow, Selection
     from xrgs.sweep.cleaning import Plan
-    from xrgs.sweep.inventory import CellSummary, Selection
 
 _HELP = """\
 xrgs-store list [FILTER]... [sort=name|age|size]
@@ -152,13 +152,14 @@ def _list(conf: DictConfig, words: Sequence[str]) -> None:
 
 
 def _show(conf: DictConfig, words: Sequence[str]) -> None:
-    from xrgs.sweep.inventory import one_cell, summaries
-    from xrgs.sweep.show import show
+    from xrgs.experiment.listing import Selection
+    from xrgs.sweep.inventory import show
 
     if len(words) != 1:
         raise XrgsError("show: give the id of one cell, or its beginning")
     store = Store(Path(conf.store))
-    say(show(store, one_cell(words[0], summaries(store))))
+    (cell,) = Selection(ids=(words[0],)).of(store.cell_rows())
+    say(show(store, cell))
 
 
 def _remove(conf: DictConfig, words: Sequence[str]) -> None:
@@ -180,7 +181,7 @@ def _trim(conf: DictConfig, words: Sequence[str]) -> None:
 
 
 def _pack(conf: DictConfig, words: Sequence[str]) -> None:
-    from xrgs.sweep.inventory import size_text
+    from xrgs.runtime.text import format_size
     from xrgs.sweep.packing import pack
 
     out = user_path(conf.out)
@@ -189,7 +190,7 @@ def _pack(conf: DictConfig, words: Sequence[str]) -> None:
     _, chosen = _chosen(conf, words)
     done = [cell for cell in chosen if cell.state.name == "done"]
     packed = pack(Store(Path(conf.store)), done, out, Path.cwd(), names_in(conf.sweep))
-    say(f"{out}: {packed}; {size_text(packed.bytes)}")
+    say(f"{out}: {packed}; {format_size(packed.bytes)}")
     if len(done) < len(chosen):
         say(f"left out, not done: {counted(len(chosen) - len(done), 'cell')}")
     _say_left(packed.left_out)
@@ -197,11 +198,10 @@ def _pack(conf: DictConfig, words: Sequence[str]) -> None:
 
 def _gc(conf: DictConfig, words: Sequence[str]) -> None:
     from xrgs.sweep.cleaning import plan_gc
-    from xrgs.sweep.inventory import summaries
 
     _no_words("gc", words)
     store = Store(Path(conf.store))
-    _carry_out(conf, store, plan_gc(store, summaries(store), names_in(conf.of)))
+    _carry_out(conf, store, plan_gc(store, store.cell_rows(), names_in(conf.of)))
 
 
 def _check(conf: DictConfig, words: Sequence[str]) -> None:
@@ -219,16 +219,14 @@ def _no_words(command: str, words: Sequence[str]) -> None:
         raise XrgsError(f"{command} {' '.join(words)}: {command} takes no cells")
 
 
-def _chosen(conf: DictConfig, words: Sequence[str]) -> tuple[list[CellSummary], list[CellSummary]]:
+def _chosen(conf: DictConfig, words: Sequence[str]) -> tuple[list[CellRow], list[CellRow]]:
     """Return all cells of the store, and those that are meant."""
-    from xrgs.sweep.inventory import summaries
-
-    cells = summaries(Store(Path(conf.store)))
+    cells = Store(Path(conf.store)).cell_rows()
     return cells, _selection(conf, words).of(cells)
 
 
 def _selection(conf: DictConfig, words: Sequence[str]) -> Selection:
-    from xrgs.sweep.inventory import Selection
+    from xrgs.experiment.listing import Selection
 
     return Selection(
         tuple(words),
@@ -247,8 +245,8 @@ def _carry_out(conf: DictConfig, store: Store, plan: Plan) -> None:
     Raises:
         SystemExit: With a message and code 1 where it is not confirmed, or something was left.
     """
+    from xrgs.runtime.text import format_size
     from xrgs.sweep.cleaning import carry_out
-    from xrgs.sweep.inventory import size_text
 
     say(str(plan))
     if conf.dry_run or not plan.items:
@@ -256,7 +254,7 @@ def _carry_out(conf: DictConfig, store: Store, plan: Plan) -> None:
     if not (conf.yes or _confirmed(f"{plan.verb} {plan.total}?")):
         sys.exit("xrgs-store: nothing was done; yes=true does it without asking")
     freed, left = carry_out(store, plan)
-    say(f"freed {size_text(freed)}")
+    say(f"freed {format_size(freed)}")
     _say_left(left)
 
 

@@ -155,21 +155,20 @@ def refactorings() -> dict[str, dict[str, str]]:
     return declared
 
 
-def changed_code(identity: Identity) -> list[str]:
+def changed_code(identity: Identity, *, cached: bool = False) -> list[str]:
     """Return the parts of the installed code that differ from those of an identity, sorted.
+
+    Args:
+        identity: The identity of a cell.
+        cached: Take digests that this process has computed before. Otherwise every file is read as
+            it is now: it may have been edited while a sweep runs.
 
     Raises:
         XrgsError: A plugin is not installed.
     """
-    return sorted(
-        part
-        for part in identity.code.keys() | current_code(identity).keys()
-        if identity.code.get(part) != current_code(identity).get(part)
-    )
-
-
-def current_code(identity: Identity) -> dict[str, str]:
-    """Return the digests that the code of an identity has in the installed package."""
-    names = tuple(sorted(identity.components.get("plugins", {})))
+    plugin_names = tuple(sorted(identity.components.get("plugins", {})))
     components = tuple(key for key in identity.components if key != "plugins")
-    return code_now(str(identity.splat["backend"]), components, names)
+    backend = str(identity.splat["backend"])
+    here = (training_code if cached else code_now)(backend, components, plugin_names)
+    then = identity.code
+    return sorted(part for part in then.keys() | here.keys() if then.get(part) != here.get(part))

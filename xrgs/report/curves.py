@@ -15,8 +15,9 @@ import pandas as pd
 
 from xrgs.errors import StoreError
 from xrgs.evaluation.metrics import VIEW_METRICS
-from xrgs.report.render import TextTable, titled
+from xrgs.report.render import titled
 from xrgs.report.training import CELL_KEYS
+from xrgs.runtime.text import TextTable
 from xrgs.safeio.records import as_number, read_table
 
 if TYPE_CHECKING:

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 from xrgs.report.context import context_of
 from xrgs.report.inference import ALL_HR
-from xrgs.report.render import TextTable, filled, titled
+from xrgs.report.render import filled, titled
 from xrgs.report.writing import (
     LACKING_NOTE,
     MISSING,
@@ -19,6 +19,7 @@ from xrgs.report.writing import (
     lacking,
     signed,
 )
+from xrgs.runtime.text import TextTable
 
 if TYPE_CHECKING:
     from collections.abc import Mapping

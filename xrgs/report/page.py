@@ -26,12 +26,13 @@ from xrgs.report.html import write_document
 from xrgs.report.joined import Choice, JoinedStore, report_name
 from xrgs.report.paper import paper_tables
 from xrgs.report.pictures import Picture, draw
-from xrgs.report.render import LATEX_PREAMBLE, TextTable, to_latex, to_markdown, to_text
+from xrgs.report.render import LATEX_PREAMBLE, to_latex, to_markdown
 from xrgs.report.single_views import decided_by_one_view
 from xrgs.report.tables import Tables
 from xrgs.report.texture import texture_tables, with_texture
 from xrgs.report.training import table as training_table
 from xrgs.report.training import totals
+from xrgs.runtime.text import TextTable, to_text
 from xrgs.safeio.atomic import write_json, write_text
 from xrgs.safeio.sanitize import counted, for_csv, for_file_name, for_line, for_markdown
 

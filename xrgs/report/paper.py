@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, NamedTuple
 from xrgs.experiment.store import BASELINE
 from xrgs.report.context import context_of
 from xrgs.report.inference import MIN_VALUES
-from xrgs.report.render import TextTable, filled, titled
+from xrgs.report.render import filled, titled
 from xrgs.report.writing import (
     ARROWS_NOTE,
     agreement,
@@ -18,6 +18,7 @@ from xrgs.report.writing import (
     lacking,
     percent,
 )
+from xrgs.runtime.text import TextTable
 from xrgs.safeio.sanitize import counted
 
 if TYPE_CHECKING:

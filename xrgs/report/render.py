@@ -1,36 +1,17 @@
-"""Writes a table of strings as aligned text, Markdown or LaTeX, whatever characters it holds."""
+"""Writes tables of strings as Markdown and LaTeX, whatever characters they hold."""
 
 from __future__ import annotations
 
-import unicodedata
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
+from xrgs.runtime.text import one_line, padded, table_cells
 from xrgs.safeio.sanitize import MAX_CELL, for_file_name, for_latex, for_line, for_markdown
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-
-@dataclass(frozen=True)
-class TextTable:
-    """A titled table of plain text, in which every row is as long as `columns`."""
-
-    title: str
-    columns: tuple[str, ...]
-    rows: tuple[tuple[str, ...], ...]
-    align: str
-    """`l` or `r` for each column."""
-    notes: tuple[str, ...] = ()
-    """Lines below the table."""
-    context: str = ""
-    """What the table has to be read with, below its title."""
-    name: str = ""
-    """What LaTeX's label is made of; the title where it is empty."""
-    spans: tuple[tuple[str, int], ...] = ()
-    """Headings over the columns, from the left, with how many each is over; empty for none."""
-    best: frozenset[tuple[int, int]] = frozenset()
-    """Row and column of the cells that are printed bold, where that can be done."""
+    from xrgs.runtime.text import TextTable
 
 
 def titled(text: str, condition: str) -> str:
@@ -41,30 +22,6 @@ def titled(text: str, condition: str) -> str:
         condition: The condition; empty for none.
     """
     return f"{text} ({condition})" if condition else text
-
-
-def width(text: str) -> int:
-    """Return the terminal columns that `text` takes.
-
-    Args:
-        text: One line; East Asian wide characters take two columns, combining accents none.
-    """
-    wide = sum(unicodedata.east_asian_width(char) in "WF" for char in text)
-    return len(text) + wide - sum(unicodedata.combining(char) > 0 for char in text)
-
-
-def _pad(text: str, size: int, align: str) -> str:
-    space = " " * (size - width(text))
-    return space + text if align == "r" else text + space
-
-
-def _padded(rows: list[tuple[str, ...]], align: str) -> tuple[list[list[str]], list[int]]:
-    sizes = [max(3, *(width(text) for text in column)) for column in zip(*rows, strict=True)]
-    lines = [
-        [_pad(text, size, side) for text, size, side in zip(row, sizes, align, strict=True)]
-        for row in rows
-    ]
-    return lines, sizes
 
 
 def filled_places(rows: Sequence[tuple[str, ...]]) -> list[int]:
@@ -93,52 +50,15 @@ def filled(table: TextTable) -> TextTable:
     )
 
 
-def heads(table: TextTable) -> tuple[str, ...]:
-    """Return the heads of the columns, each after the heading over it.
-
-    Args:
-        table: The table.
-    """
-    if not table.spans:
-        return table.columns
-    above = [head for head, columns in table.spans for _ in range(columns)]
-    return tuple(f"{head} {own}".strip() for head, own in zip(above, table.columns, strict=True))
-
-
-def _rows(table: TextTable) -> list[tuple[str, ...]]:
-    """Return the heads of the columns and the rows, in cells of one line of bounded length."""
-    return [_cells(row) for row in (heads(table), *table.rows)]
-
-
-def _cells(row: tuple[str, ...]) -> tuple[str, ...]:
-    return tuple(for_line(text, MAX_CELL).strip() for text in row)
-
-
-def to_text(table: TextTable) -> str:
-    """Write the table for a terminal.
-
-    Args:
-        table: The table.
-
-    Returns:
-        Aligned lines under the title, with the notes below.
-    """
-    lines, sizes = _padded(_rows(table), table.align)
-    lines.insert(1, ["─" * size for size in sizes])
-    body = ["  ".join(line).rstrip() for line in lines]
-    head = [for_line(text) for text in (table.title, table.context) if text]
-    return "\n".join([*head, "", *body, *map(for_line, table.notes), ""])
-
-
 def to_markdown(table: TextTable) -> str:
     """Write the table as GitHub-flavoured Markdown under a heading, aligned in the source as well.
 
     Args:
         table: The table.
     """
-    head, *body = (tuple(map(for_markdown, row)) for row in _rows(table))
+    head, *body = (tuple(map(for_markdown, row)) for row in table_cells(table))
     rows = [head, *_marked(body, table.best, "**{}**")]
-    lines, sizes = _padded(rows, table.align)
+    lines, sizes = padded(rows, table.align)
     rule = [
         "-" * (size - 1) + (":" if side == "r" else "-")
         for size, side in zip(sizes, table.align, strict=True)
@@ -173,7 +93,7 @@ def to_latex(table: TextTable) -> str:
     Args:
         table: The table.
     """
-    head, *body = (tuple(map(for_latex, _cells(row))) for row in (table.columns, *table.rows))
+    head, *body = (tuple(map(for_latex, one_line(row))) for row in (table.columns, *table.rows))
     lines = [" & ".join(row) + r" \\" for row in _marked(body, table.best, r"\textbf{{{}}}")]
     notes = [rf"\par\footnotesize {for_latex(note)}" for note in table.notes]
     caption = ". ".join(for_latex(text) for text in (table.title, table.context) if text)

@@ -11,8 +11,9 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import pandas as pd
 
-from xrgs.report.render import TextTable, titled
+from xrgs.report.render import titled
 from xrgs.report.training import CELL_KEYS
+from xrgs.runtime.text import TextTable
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping, Sequence

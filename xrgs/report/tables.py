@@ -11,7 +11,7 @@ import pandas as pd
 
 from xrgs.report.compare import is_amount
 from xrgs.report.context import context_of
-from xrgs.report.render import TextTable, filled, titled
+from xrgs.report.render import filled, titled
 from xrgs.report.writing import (
     ARROWS_NOTE,
     LACKING_NOTE,
@@ -36,6 +36,7 @@ from xrgs.report.writing import (
     scatter_note,
     signed,
 )
+from xrgs.runtime.text import TextTable
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence

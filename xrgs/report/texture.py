@@ -20,9 +20,10 @@ from xrgs.experiment.trimming import check_images
 from xrgs.report.compare import is_amount
 from xrgs.report.context import context_of
 from xrgs.report.inference import MIN_VALUES
-from xrgs.report.render import TextTable, titled
+from xrgs.report.render import titled
 from xrgs.report.writing import ARROWS_NOTE, by_key, percent, signed
 from xrgs.runtime.progress import progress
+from xrgs.runtime.text import TextTable
 
 if TYPE_CHECKING:
     from collections.abc import Mapping

@@ -11,7 +11,8 @@ from typing import TYPE_CHECKING
 
 import pandas as pd
 
-from xrgs.report.render import TextTable, titled
+from xrgs.report.render import titled
+from xrgs.runtime.text import TextTable
 from xrgs.safeio.records import as_number, read_table
 
 if TYPE_CHECKING:

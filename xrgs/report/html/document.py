@@ -24,17 +24,10 @@ from xrgs.report.html.album import ERROR_RANGE
 from xrgs.report.html.content import LOG_SCALES, Content, finite, runs, shown, why
 from xrgs.report.html.figures import counterparts
 from xrgs.report.html.views import add_views
-from xrgs.report.render import (
-    TextTable,
-    filled,
-    filled_places,
-    heads,
-    titled,
-    to_latex,
-    to_markdown,
-)
+from xrgs.report.render import filled, filled_places, titled, to_latex, to_markdown
 from xrgs.report.writing import NO_INTERVAL, number, signed
 from xrgs.runtime.machine import set_passive_openmp_wait
+from xrgs.runtime.text import TextTable, heads
 from xrgs.safeio.atomic import write_text
 from xrgs.safeio.sanitize import for_csv
 
