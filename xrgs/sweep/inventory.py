@@ -83,8 +83,9 @@ def list_sweeps(sweeps: Sequence[SweepRow]) -> str:
 
 def _counts(sweep: SweepRow) -> str:
     """Return a text such as `3 of 12 done, 1 running, 8 pending`."""
-    others = [f"{count} {name}" for name, count in sorted(sweep.states.items()) if name != "done"]
-    return ", ".join([f"{sweep.states['done']} of {len(sweep.record.cells)} done", *others])
+    done = f"{sweep.states['done']} of {len(sweep.record.cells)} done"
+    names = sorted(sweep.states.keys() - {"done"}, key=lambda name: (name == "pending", name))
+    return ", ".join([done, *(f"{sweep.states[name]} {name}" for name in names)])
 
 
 def _distinct(names: Iterable[str]) -> str:
