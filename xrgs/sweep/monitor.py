@@ -114,12 +114,10 @@ class SweepSnapshot:
         """Return the expected seconds to the end of a running cell; None if unknown."""
         cost, whole = running.cell.cost, self.whole_s(running.cell)
         scoring = cost.scoring_s * self.slowness if cost else 0.0
+        past = None if whole is None else (1 - running.share) * (whole - scoring) + scoring
         own = running.progress.remaining_s if running.trains else None
-        if whole is None:
-            return own
-        past = (1 - running.share) * (whole - scoring) + scoring
-        if own is None:
-            return past
+        if own is None or past is None or cost is None:
+            return past if own is None else own
         # A cell's own pace says little at first, when it has few Gaussians, and all at the end.
         return (1 - running.share) * past + running.share * (own + scoring)
 
@@ -155,7 +153,7 @@ class _Slowness:
 
     def end(self, cell: PlannedCell) -> None:
         """Note a cell that is done."""
-        self._ended.append(self._times(cell, 1.0))
+        self._ended.append(self._times(cell, 1.0, scored=True))
 
     def ratio(self, running: Sequence[RunningCell]) -> float:
         """Return the time that cells took, relative to their estimates; 1 until it is known."""
@@ -163,12 +161,15 @@ class _Slowness:
         took, expected = (sum(seconds) for seconds in zip((0.0, 0.0), *times, strict=True))
         return took / expected if expected else 1.0
 
-    def _times(self, cell: PlannedCell, share: float) -> tuple[float, float]:
+    def _times(
+        self, cell: PlannedCell, share: float, *, scored: bool = False
+    ) -> tuple[float, float]:
         """Return the seconds that a cell took so far, and its estimate; zeros if not judged yet."""
         begun, before = self._begun.get(str(cell.cell_id), (0.0, 1.0))
         if cell.cost is None or share - before < _JUDGED:
             return 0.0, 0.0
-        return time.monotonic() - begun, (share - before) * cell.cost.seconds
+        steps = (share - before) * (cell.cost.seconds - cell.cost.scoring_s)
+        return time.monotonic() - begun, steps + (cell.cost.scoring_s if scored else 0.0)
 
 
 class SweepMonitor:
