@@ -12,13 +12,13 @@ import torch
 
 from xrgs.capture.dataset import USES, Dataset, LoadedView
 from xrgs.config import CONF_DIR, Conf
-from xrgs.splat import rasterize
 from xrgs.splat.cameras import Camera
-from xrgs.splat.densify import Densifier
 from xrgs.splat.gaussians import PARAMETERS, ActivatedGaussians, Gaussians, from_points
 from xrgs.splat.loss import Target, photometric_loss, prepare_target
 from xrgs.splat.optimizer import SplatOptimizer
+from xrgs.splat.rendering import Render, rasterize_parameters
 from xrgs.splat.settings import DensifySettings, OptimizerSettings, RasterSettings
+from xrgs.splat.strategy.default import DefaultStrategy
 from xrgs.training import components, loop, recorder, rendering
 from xrgs.training.components import Step, TrainingView
 from xrgs.training.count_matching import train_cell
@@ -63,7 +63,7 @@ def plain_loop(data: Dataset, conf: Conf) -> Gaussians:
     optimizer = SplatOptimizer(
         gaussians, OptimizerSettings(), scene_scale=data.scene_scale, steps=steps, backend="auto"
     )
-    densifier = Densifier(
+    strategy = DefaultStrategy(
         optimizer,
         DensifySettings(start=0, stop=steps // 2, every=5, reset_every=steps // 3),
         scene_scale=data.scene_scale,
@@ -72,7 +72,7 @@ def plain_loop(data: Dataset, conf: Conf) -> Gaussians:
     for step in EpochSampler(data.train, seed, steps, lambda _: True):
         camera, degree = step.view.camera, min(step.number, 3)
         offset = torch.zeros(len(gaussians), 2, requires_grad=True)
-        render = rasterize.rasterize_parameters(
+        render = rasterize_parameters(
             *gaussians.activated(backend="auto"),
             camera,
             RasterSettings(),
@@ -85,7 +85,7 @@ def plain_loop(data: Dataset, conf: Conf) -> Gaussians:
         optimizer.zero_grad()
         torch.autograd.backward(loss)
         optimizer.step(camera, sh_degree=degree)
-        densifier.after_step(
+        strategy.after_step(
             step.number, offset.grad, render.visible, width=camera.width, height=camera.height
         )
     return gaussians
@@ -454,9 +454,9 @@ def test_the_sh_bands_are_switched_on_in_turn(
 ) -> None:
     degrees = []
 
-    def spy(*arguments: Any, sh_degree: int, **others: Any) -> rasterize.Render:
+    def spy(*arguments: Any, sh_degree: int, **others: Any) -> Render:
         degrees.append(sh_degree)
-        return rasterize.rasterize_parameters(*arguments, sh_degree=sh_degree, **others)
+        return rasterize_parameters(*arguments, sh_degree=sh_degree, **others)
 
     monkeypatch.setattr(rendering, "rasterize_parameters", spy)
     short.train.steps = 60

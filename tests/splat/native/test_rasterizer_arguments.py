@@ -19,8 +19,7 @@ from torch import Tensor
 
 from xrgs.splat.cameras import Camera
 from xrgs.splat.gaussians import ActivatedGaussians
-from xrgs.splat.rasterize import rasterize_parameters
-from xrgs.splat.render_result import Render
+from xrgs.splat.rendering import Render, rasterize_parameters
 from xrgs.splat.settings import RasterSettings
 
 Scene = dict[str, Tensor]
@@ -293,8 +292,8 @@ import resource, torch
 from xrgs.splat.cameras import Camera
 from xrgs.splat.cameras import Camera
 from xrgs.splat.gaussians import ActivatedGaussians
-from xrgs.splat.rasterize import rasterize_parameters
-from xrgs.splat.render_result import Render
+from xrgs.splat.rendering import rasterize_parameters
+from xrgs.splat.rendering import Render
 from xrgs.splat.settings import RasterSettings
 
 n = 30_000
@@ -328,7 +327,7 @@ def test_lists_beyond_memory_are_a_clear_error() -> None:
 AFTER_FAILURE = """
 import resource, torch
 from xrgs.splat.cameras import Camera
-from xrgs.splat.rasterize import rasterize_parameters
+from xrgs.splat.rendering import rasterize_parameters
 from xrgs.splat.settings import RasterSettings
 
 def render(n):

@@ -16,8 +16,8 @@ from xrgs.capture.dataset import LoadedView
 from xrgs.config import ComponentsConf, DensifyConf
 from xrgs.errors import XrgsError
 from xrgs.splat.gaussians import PARAMETERS, Gaussians
-from xrgs.splat.refinement import Groups, Thresholds
 from xrgs.splat.settings import DensifySettings
+from xrgs.splat.strategy.refinement import Groups, Thresholds
 from xrgs.training import components
 from xrgs.training.components import Component, Components, Step, TrainingSetup
 from xrgs.training.components.consistency import Consistency
