@@ -7,13 +7,19 @@ import torch, so that planning is quick. Step counts are for a run of 30,000 ste
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
+from typing import Any
 
 NOMINAL_STEPS = 30_000
 """Length of the run that step counts in settings are written for."""
 
 SPLITS = ("random", "long_axis")
 """The values of `DensifySettings.split`."""
+
+
+def off_by_default(value: Any) -> Any:
+    """Declare a setting with a default that changes nothing; identities leave it out there."""
+    return field(default=value, metadata={"off": value})
 
 
 @dataclass
@@ -33,11 +39,11 @@ class RasterSettings:
     1.5.3)."""
     transmittance_min: float = 1e-4
     """A pixel ends before the Gaussian that would leave it this transmittance or less."""
-    antialiased: bool = False
+    antialiased: bool = off_by_default(False)
     """Compensate the opacity for `eps2d`, as the 2D Mip filter of Mip-Splatting [yu2024] does."""
     background: tuple[float, float, float] = (0.0, 0.0, 0.0)
     """Colour behind the last Gaussian."""
-    absgrad: bool = False
+    absgrad: bool = off_by_default(False)
     """Make the gradient of `means2d_offset` the sum, for each axis, of the absolute values of the
     pixels' gradients, so that pixels which pull a Gaussian apart do not cancel (AbsGS
     [ye2024absgs]; gsplat's `absgrad`)."""
@@ -119,7 +125,7 @@ class DensifySettings:
     """How Gaussians grow. `random`: as in gsplat, small Gaussians are duplicated, and large ones
     split into two with means drawn from the Gaussian. `long_axis`: all are split into two side by
     side along the longest axis (`xrgs.splat.strategy.ops.split_along_longest_axis`)."""
-    budget: float = 0.0
+    budget: float = off_by_default(0.0)
     """The largest number of Gaussians to which growth may lead, for each pixel of the largest
     training view (`xrgs.splat.strategy.ops.Budget`); 0 sets no limit. The unit is our choice."""
 

@@ -1,8 +1,8 @@
 """The components of XR-GS [xrgs], and the hooks by which training calls them.
 
-A component that is off is not built, so that the baseline executes none of its code. Each class
-decides by `Component.from_settings` whether the config switches it on. What the paper leaves open
-is fixed in the docstrings of the components, under "our choice where the paper is silent".
+A component that is off is not even imported, so that the baseline executes none of its code. What
+the paper leaves open is fixed in the docstrings of the components, under "our choice where the
+paper is silent".
 
 `registry` lists the components. A component of another package is not in it:
 `xrgs.training.plugins` finds it by its entry point. CONTRIBUTING.md says how to write either kind.
@@ -13,6 +13,7 @@ from __future__ import annotations
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
+from xrgs.config import is_on
 from xrgs.errors import XrgsError
 from xrgs.training import plugins
 from xrgs.training.components.base import (
@@ -65,7 +66,9 @@ def build(
     """
     setup = TrainingSetup(conf, data, splat, backend, seed)
     built = [
-        _import(entry).from_settings(getattr(conf, key), setup) for key, entry in BUILT_IN.items()
+        _import(entry).from_settings(getattr(conf, key), setup)
+        for key, entry in BUILT_IN.items()
+        if any(is_on(getattr(conf, name)) for name in (key, *entry.reads))
     ]
     built += [_build_plugin(name, values, setup) for name, values in sorted(conf.plugins.items())]
     return Components(component for component in built if component is not None)

@@ -59,15 +59,13 @@ def modules_of(key: str) -> tuple[str, ...]:
     """Return the source files that implement a key of `components`.
 
     Args:
-        key: A key of `BUILT_IN`, or one that an entry reads.
+        key: A key of `BUILT_IN`, or one that an entry reads. `plugins` and `count_matched` have no
+            component here.
 
     Returns:
-        Paths in the package, such as `training/components/weighting.py`.
-
-    Raises:
-        KeyError: No component has or reads this key.
+        Paths in the package, such as `training/components/weighting.py`; none without a component.
     """
     for own_key, entry in BUILT_IN.items():
         if key == own_key or key in entry.reads:
             return tuple(f"{_FOLDER}/{name}.py" for name in (entry.module, *entry.helpers))
-    raise KeyError(key)
+    return ()
