@@ -30,7 +30,7 @@ def target(tmp_path: Path) -> Path:
 def part(server: Any, target: Path) -> Path:
     """The first 300,000 bytes, as an interrupted download leaves them."""
     server.content, server.cuts = CONTENT, [300_000] + [0] * http._TRIES
-    with pytest.raises(DownloadError, match=r"ended after 300000 of 700000 bytes.*zip\.part"):
+    with pytest.raises(DownloadError, match=r"ended after 300000 of 700000.*zip\.part has 300000"):
         download(server.url, target, MOST)
     assert len(server.asked) == 1 + http._TRIES
     assert not target.exists()
@@ -219,7 +219,9 @@ def test_an_unreachable_server_is_named(target: Path, pauses: list[float]) -> No
     with socket.socket() as held:
         held.bind(("127.0.0.1", 0))  # it does not listen, and nobody else can
         url = f"http://127.0.0.1:{held.getsockname()[1]}/x.zip"
-        with pytest.raises(DownloadError, match=rf"{url}: can't be downloaded \(Connection ref"):
+        with pytest.raises(
+            DownloadError, match=rf"{url}: can't be downloaded \(Connection refused\)$"
+        ):
             download(url, target, MOST)
     assert len(pauses) == http._TRIES - 1
 
@@ -297,7 +299,7 @@ def test_five_redirects_are_followed_and_no_more(server: Any, target: Path) -> N
 )
 def test_where_a_redirect_may_lead(url: str, location: str, why: str | None) -> None:
     handler = http._RedirectHandler("http://a.org/x", ["C.org:8"])
-    arguments: Any = (Request(url), None, 302, "Found", {}, location)
+    arguments: Any = (Request(url), None, 302, "Found", {}, location)  # noqa: S310  nothing is opened
     if why is None:
         followed = handler.redirect_request(*arguments)
         assert followed is not None

@@ -75,7 +75,7 @@ def download(
     try:
         target.parent.mkdir(parents=True, exist_ok=True)
         with part.open("ab") as stream:
-            fcntl.flock(stream, fcntl.LOCK_EX | fcntl.LOCK_NB)  # two that append would spoil it
+            fcntl.flock(stream, fcntl.LOCK_EX | fcntl.LOCK_NB)  # one process appends
             if target.exists():  # another process may have renamed the part since it was opened
                 raise DownloadError(f"{target}: there already")
             _Download(url, stream, version, max_bytes, redirect_hosts).run()
@@ -117,9 +117,9 @@ class _Download:
                 failures = 0 if self._size >= most + _LEAST_BYTES else failures + 1
                 most = max(most, self._size)
                 if failures == _TRIES:
+                    so_far = f"; {self._stream.name} has {self._size} bytes" * (self._size > 0)
                     raise DownloadError(
-                        f"{self._url}: can't be downloaded ({lost}); {self._size} bytes so far are "
-                        f"in {self._stream.name}"
+                        f"{self._url}: can't be downloaded ({lost}){so_far}"
                     ) from lost
                 pause = _PAUSE_S * 2 ** max(0, failures - 1)
                 log_line(f"{self._url}: {lost}; trying again in {pause:g} s")
@@ -145,7 +145,7 @@ class _Download:
         except HTTPError as error:
             words = f"the server says {error.code} {for_line(error.reason, _MAX_WORDS)}"
             error.close()
-            if error.code == 416:  # range not satisfiable: its file is shorter than the part
+            if error.code == 416:  # range not satisfiable: the file ends before it
                 self._begin("")
             elif error.code != 429 and error.code < 500:
                 raise DownloadError(f"{self._url}: {words}") from error
