@@ -39,8 +39,8 @@ FLOW = (
 LAYER = {name: number for number, name in enumerate(FLOW)}
 #: Libraries that only these packages or modules may import.
 ONLY_IN = {
-    "hydra": ("config", "composing", "sweep", "cli"),
-    "omegaconf": ("config", "composing", "sweep", "cli"),
+    "hydra": ("composing", "sweep", "cli"),
+    "omegaconf": ("composing", "sweep", "cli"),
     "pycolmap": ("capture/colmap", "capture/sfm"),
     "matplotlib": ("report",),
     "pandas": ("experiment", "report"),

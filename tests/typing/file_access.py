@@ -48,7 +48,7 @@ ALLOWED: dict[str, tuple[str, str]] = {
         "exists is_dir iterdir read_text",
         "the folder that the user names",
     ),
-    "capture/download/unpack": ("mkdir open rename", "the folder that the user names"),
+    "capture/download/unpack": ("mkdir rename", "the folder that the user names"),
     "capture/mixing": ("read_text rglob", "COLMAP's logs, in a new folder of its own"),
     "capture/photographs": ("exists", "a new folder of its own"),
     "capture/poses": ("is_file", "the path that the user names"),

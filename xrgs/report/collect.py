@@ -20,14 +20,14 @@ from xrgs.report.skipped import cell_work
 from xrgs.report.training import cell_totals
 from xrgs.runtime.progress import progress
 from xrgs.safeio.records import as_number
-from xrgs.safeio.words import for_line
+from xrgs.safeio.sanitize import for_line
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
+    from pathlib import Path
 
     from xrgs.evaluation.metrics import Metric
     from xrgs.experiment.cell_folder import CellFolder
-    from xrgs.safeio.confined import ConfinedPath
 
 #: Keys of each row of a sweep's record.
 RECORD_KEYS = (
@@ -78,7 +78,7 @@ class Sweep:
     """What each done cell did in all, by its id: `xrgs.report.skipped.cell_work`."""
     provenance: dict[str, list[str]]
     """Provenance of the done cells: the distinct values of each entry, sorted."""
-    renders: dict[str, ConfinedPath] = field(default_factory=dict)
+    renders: dict[str, Path] = field(default_factory=dict)
     """Folders of renders that another program made, by the ids of their rows, which are no cells
     of the store (`xrgs.report.external`)."""
 

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 from xrgs.experiment.cell_folder import READING_ERRORS
 from xrgs.experiment.results import cell_columns
-from xrgs.safeio.words import counted, for_line
+from xrgs.safeio.sanitize import counted, for_line
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping, Sequence

@@ -7,13 +7,13 @@ report needs the rows of all records, and finds each cell in the store where it 
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
 from xrgs.errors import StoreError
 from xrgs.experiment.store import BASELINE
 from xrgs.report.collect import ReportError
-from xrgs.safeio.confined import ConfinedPath
-from xrgs.safeio.words import for_file_name
+from xrgs.safeio.sanitize import for_file_name
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -80,7 +80,7 @@ class JoinedStore:
 
     stores: tuple[Store, ...]
     """The stores; of a cell that several have done, the first counts."""
-    external: Mapping[str, ConfinedPath] = field(default_factory=dict)
+    external: Mapping[str, Path] = field(default_factory=dict)
     """Folders of renders that another program made, `Sweep.renders`."""
 
     def cell(self, cell_id: str) -> CellFolder:
@@ -94,7 +94,7 @@ class JoinedStore:
         """
         return _first([store.cell(cell_id) for store in self.stores], _is_done, _is_there)
 
-    def variant(self, variant_id: str) -> ConfinedPath:
+    def variant(self, variant_id: str) -> Path:
         """Return the folder of a variant, in a store that has it if there is one.
 
         Args:
@@ -104,9 +104,9 @@ class JoinedStore:
             StoreError: The id is not a valid name of a folder.
         """
         folders = [store.variant(variant_id) for store in self.stores]
-        return _first(folders, ConfinedPath.is_dir)
+        return _first(folders, Path.is_dir)
 
-    def render(self, cell_id: str, view: str) -> ConfinedPath:
+    def render(self, cell_id: str, view: str) -> Path:
         """Return the file of the render of a view, which need not exist.
 
         Args:

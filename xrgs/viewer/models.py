@@ -10,7 +10,7 @@ import numpy as np
 from xrgs.errors import StoreError, XrgsError
 from xrgs.safeio.paths import user_path
 from xrgs.safeio.records import MAX_NUMBER, read_object
-from xrgs.safeio.words import for_line
+from xrgs.safeio.sanitize import for_line
 from xrgs.splat.ply import load_ply
 from xrgs.splat.settings import RasterSettings
 from xrgs.viewer.paths import Poses
@@ -176,5 +176,5 @@ def _load(word: str, store: Store) -> Model:
         raster_settings(cell),
         (*train, *test),
         poses,
-        str(cell.identity()["variant"]),
+        cell.identity().variant,
     )

@@ -18,7 +18,7 @@ from xrgs.errors import XrgsError
 from xrgs.runtime.progress import ProgressBar, log_line
 from xrgs.safeio.atomic import write_text
 from xrgs.safeio.hashing import file_digest
-from xrgs.safeio.words import for_line
+from xrgs.safeio.sanitize import for_line
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator

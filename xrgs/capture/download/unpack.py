@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-import os
 import tempfile
 import zipfile
 from pathlib import Path
 
 from xrgs.errors import XrgsError
 from xrgs.runtime.progress import progress
-from xrgs.safeio.words import for_line
+from xrgs.safeio.files import sync_name, sync_tree
+from xrgs.safeio.sanitize import for_line
 
 #: Limits for one folder: unpacked bytes, far more than the largest LLFF scene has, and files.
 _MAX_BYTES = 8 << 30
@@ -42,9 +42,10 @@ def unpack(archive: Path, folder: str, target: Path) -> None:
             members = _members(opened, archive, folder)
             for member in progress(members, f"unpacking {folder}", "file"):
                 # zipfile reads no more than the declared size, checks the CRC and makes no links.
-                with Path(opened.extract(member, made)).open("rb") as stream:
-                    os.fsync(stream.fileno())
+                opened.extract(member, made)
+            sync_tree(Path(made) / folder)
             (Path(made) / folder).rename(target)
+            sync_name(target)
     except UnpackError:
         raise
     except OSError as error:
