@@ -100,7 +100,7 @@ def _provide_archive(conf: DatasetConf, archive: Path, record: Path) -> str:
         if not archive.exists():
             download(conf.url, archive, conf.max_bytes, expected, conf.redirect_hosts)
     except DownloadError as error:
-        hint = f" ({expected} is {source})" if expected else ""
+        hint = f" (expected: {source})" if expected else ""
         raise XrgsError(
             f"{error}{hint}. By hand: fetch {conf.file} from {conf.page or conf.url} with a "
             f"browser, put it at {archive} and run this again; or put the scenes' own folders into "
