@@ -18,7 +18,7 @@ import msgspec
 
 from xrgs.config import CONF_DIR, TRAINING_VIEWS, Conf, known_keys, types_of
 from xrgs.errors import XrgsError, did_you_mean
-from xrgs.safeio.records import read_json
+from xrgs.safeio.records import read_struct
 from xrgs.splat.backend import CHOICES
 from xrgs.splat.settings import NOMINAL_STEPS, SPLITS
 
@@ -210,7 +210,7 @@ def from_file(file: Path) -> tuple[Conf, dict[str, Any]]:
         XrgsError: The file can't be read, or has another schema; the message names the file and
             the key.
     """
-    values = read_json(file)
+    values = read_struct(file, Any)
     added = {}
     try:
         for group, name, key in _missing(values, Conf):

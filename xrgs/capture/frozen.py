@@ -1,8 +1,8 @@
 """Writes, verifies and reads the folder of a frozen variant. Nothing here imports torch.
 
-The folder is named by the variant's id. `variant.json` (`Manifest`) lists the views and the hash of
-every other file that decides a number: `images/<split>/<view>.png` and `points.npz`, the SfM points.
-`report.json` says how SfM went, and `colmap.log` is COLMAP's log.
+The folder is named by the variant's id. `variant.json` (`Manifest`) lists the views and the hash
+of every other file that decides a number: `images/<split>/<view>.png` and `points.npz`, the SfM
+points. `report.json` says how SfM went, and `colmap.log` is COLMAP's log.
 """
 
 from __future__ import annotations

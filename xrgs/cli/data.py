@@ -114,5 +114,5 @@ def _export(words: list[str], values: dict[str, str]) -> str:
 
     path = user_path(words[0])
     if not path.exists() and path.name == words[0]:
-        path = store.find_folder(words[0]).path
+        path = store.find_folder(words[0])
     return export(path, layout, user_path(out or f"{path.name}-{layout}"))

@@ -1,10 +1,10 @@
 """Plans and begins attempts at a cell, and removes cells: what changes the folder of a cell's name.
 
-A sweep first writes a cell's config and identity (`plan_cell`). Each attempt at the cell then gets a
-folder of its own, which takes the place of the one before. The process of an attempt works in that
-very folder, because the folder is its working directory, whatever folder gets the name afterwards.
-A kill between two attempts leaves folders `.<cell id>.old-*` and `.new-*`, which the next attempt
-settles.
+A sweep first writes a cell's config and identity (`plan_cell`). Each attempt at the cell then gets
+a folder of its own, which takes the place of the one before. The process of an attempt works in
+that very folder, because the folder is its working directory, whatever folder gets the name
+afterwards. A kill between two attempts leaves folders `.<cell id>.old-*` and `.new-*`, which the
+next attempt settles.
 """
 
 from __future__ import annotations

@@ -130,7 +130,7 @@ def training_code(
 def code_now(
     backend: str, components: tuple[str, ...] = (), plugin_names: tuple[str, ...] = ()
 ) -> dict[str, str]:
-    """Return `training_code` of the files as they are now, edited since this process began or not."""
+    """Return `training_code` of the files as they are now, edited meanwhile or not."""
     files: dict[str, tuple[str, ...]] = {"core": CORE}
     if backend == "native":
         files["native"] = NATIVE
@@ -148,7 +148,7 @@ def canonical(part: str, code: str) -> str:
 
 
 def refactorings() -> dict[str, dict[str, str]]:
-    """Return the declared refactorings: the old digest by the new one, for each part of the code."""
+    """Return the declared refactorings: old digests by new ones, for each part of the code."""
     if not REFACTORINGS.is_file():
         return {}
     declared: dict[str, dict[str, str]] = json.loads(REFACTORINGS.read_text(encoding="utf-8"))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
 from dataclasses import asdict
 from typing import TYPE_CHECKING, Any
 
@@ -50,11 +51,9 @@ def cell_columns(cell: CellFolder, names: RecordedCell | None) -> dict[str, Any]
         cell: The cell; a file that is missing or damaged in it gives no columns.
         names: The cell's row in the record of a sweep; None where there is none.
     """
-    try:
+    identity = None
+    with suppress(StoreError):
         identity = cell.identity()
-        seed, variant = identity.seed, identity.variant
-    except StoreError:
-        seed = variant = None
     try:
         config = asdict(cell.config())
     except XrgsError:
@@ -66,8 +65,8 @@ def cell_columns(cell: CellFolder, names: RecordedCell | None) -> dict[str, Any]
         "scene": for_line(names.scene) if names else settings.get("scene.name"),
         "label": for_line(names.label) if names else None,
         "condition": for_line(names.condition) if names else None,
-        "seed": seed,
-        "variant": variant,
+        "seed": identity.seed if identity else None,
+        "variant": identity.variant if identity else None,
     }
 
 

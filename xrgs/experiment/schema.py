@@ -51,7 +51,7 @@ class Status(Struct, frozen=True):
 
 
 class Identity(Struct, frozen=True):
-    """`identity.json`: every value that can change a trained number. Its digest is the cell's id."""
+    """`identity.json`: every value that can change a trained number. The id is its digest."""
 
     variant: Name
     seed: Count

@@ -139,7 +139,7 @@ def restore_variant(
             remove_path(work)
         sync_tree(folder)
         folder.rename(variants / variant_id)
-        (variants / variant_id).sync_name()
+        sync_name(variants / variant_id)
 
 
 def image_bytes(variants: Path, variant_id: str) -> int:

@@ -10,6 +10,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
+import msgspec
+
 from xrgs.errors import StoreError
 from xrgs.experiment.store import BASELINE
 from xrgs.report.collect import ReportError
@@ -19,6 +21,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Mapping, Sequence
 
     from xrgs.experiment.cell_folder import CellFolder
+    from xrgs.experiment.schema import SweepRecord
     from xrgs.experiment.store import Store
 
 _T = TypeVar("_T")
@@ -120,7 +123,7 @@ class JoinedStore:
             return self.external[cell_id] / f"{view}.png"
         cell, name = self.cell(cell_id), f"renders/{view}.png"
         cell.check_not_trimmed(name)
-        return cell.folder / name
+        return cell.path / name
 
     def latest_sweeps(self) -> tuple[str, ...]:
         """Return the id of each store's latest sweep, without repetitions.
@@ -149,13 +152,13 @@ class JoinedStore:
         rows: dict[tuple[Any, ...], tuple[str, dict[str, Any]]] = {}
         for sweep_id in sweep_ids:
             for record in self._records(sweep_id):
-                commands[sweep_id] = tuple(record["command"])
-                for row in record["cells"]:
+                commands[sweep_id] = record.command
+                for row in msgspec.to_builtins(record.cells):
                     key = tuple(row.get(name, 0) for name in _CELL)
                     rows[key] = sweep_id, _same(rows.get(key), sweep_id, row)
         return {"commands": commands, "cells": [row for _, row in rows.values()]}
 
-    def _records(self, sweep_id: str) -> Iterable[dict[str, Any]]:
+    def _records(self, sweep_id: str) -> Iterable[SweepRecord]:
         having = [store for store in self.stores if sweep_id in store.sweep_ids()]
         if not having and len(self.stores) > 1:
             paths = ", ".join(str(store.path) for store in self.stores)
@@ -178,7 +181,7 @@ def _is_done(cell: CellFolder) -> bool:
 
 
 def _is_there(cell: CellFolder) -> bool:
-    return cell.folder.is_dir()
+    return cell.path.is_dir()
 
 
 def _same(

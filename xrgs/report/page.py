@@ -161,8 +161,7 @@ def build(
     name = _folder_name(ids, choice, against, externals)
     folder = out if out else store.stores[0].reports / name
     try:
-        if out:
-            folder.mkdir(parents=True, exist_ok=True)
+        folder.mkdir(parents=True, exist_ok=True)
         drawn = _write(folder, store, sweep, tables, pictures)
     except OSError as error:
         raise ReportError(
@@ -171,7 +170,7 @@ def build(
         ) from error
     written = {p.file for p in drawn if p.file} | {folder / name for name in _FILES}
     text = f"{_text(tables, _warnings(sweep))}\n{for_line(f'Written to {folder}')}"
-    return Report(text=text, folder=folder.path, files=tuple(sorted(file.path for file in written)))
+    return Report(text=text, folder=folder, files=tuple(sorted(written)))
 
 
 def _tables(store: JoinedStore, sweep: Sweep, against: str) -> Tables:
@@ -198,7 +197,6 @@ def _write(
     pictures: Sequence[str] | None,
 ) -> list[Picture]:
     """Draw the pictures, and write them with all other files; return the pictures."""
-    _refuse_links(folder / "figures")
     (folder / "figures").mkdir(exist_ok=True)
     comparison = tables.comparison
     runs = Runs.of(sweep, comparison.cells)
@@ -223,17 +221,6 @@ def _write(
         pictures=pictures is None or bool(pictures),
     )
     return drawn
-
-
-def _refuse_links(folder: Path) -> None:
-    """Refuse to write where a link would lead out of the store, or of the folder of the report."""
-    for depth in range(1, len(folder.parts) + 1):
-        above = Path(folder.root, folder.parts[:depth])
-        if above.is_link():
-            raise ReportError(
-                f"{above} is a link, and what it leads to is not written to: remove it, or name"
-                " another folder with out=..."
-            )
 
 
 #: The files of every report, beside its pictures.

@@ -12,7 +12,7 @@ from xrgs.errors import XrgsError
 from xrgs.report.render import TextTable, to_text
 from xrgs.safeio.atomic import atomic_writer
 from xrgs.safeio.files import is_name
-from xrgs.safeio.records import read_object
+from xrgs.safeio.records import read_struct
 from xrgs.safeio.sanitize import for_line
 
 if TYPE_CHECKING:
@@ -48,7 +48,7 @@ def describe(path: Path, out: Path | None = None) -> str:
     if not found:
         raise XrgsError(f"{folder}: no such folder; variants are in <store>/variants/")
     if folder.name.startswith(FAILED_PREFIX):
-        report = read_object(folder / "report.json")
+        report = read_struct(folder / "report.json", dict[str, Any])
         failed = f"{report.get('scene')}: failed, so there are no views"
         return "\n".join([for_line(failed), *_sfm_lines(folder, report)])
     frozen = variant.load(folder)

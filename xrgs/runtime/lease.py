@@ -21,13 +21,14 @@ An owner is alive or dead by these rules:
   and time have stood still for `CONFIRM_S` seconds of the observer's own clock, which nobody sets.
   Until then the owner counts as alive.
 - A file without a signature is free when it is older than `_UNSIGNED_S` seconds. Its creator signs
-  it at once, and looks for other owners only then: a creator that was killed or suspended in between
-  does not hold the lease yet. Such a file that is dated in the future is watched like the others.
+  it at once, and looks for other owners only then: a creator that was killed or suspended in
+  between does not hold the lease yet. Such a file that is dated in the future is watched like the
+  others.
 - The owner of a file that can't be read now counts as alive.
 
-Watching does not wait: `acquire` and `holders` look at a file, and what they saw counts at the next
-look of this process. Between two looks at most `BEAT_S` seconds are counted, so that an owner is not
-dead before its next heartbeat when a file server has answered nobody for a while.
+Watching does not wait: `acquire` and `holders` look at a file, and what they saw counts at the
+next look of this process. Between two looks at most `BEAT_S` seconds are counted, so that an owner
+is not dead before its next heartbeat when a file server has answered nobody for a while.
 """
 
 from __future__ import annotations
@@ -70,8 +71,8 @@ _AHEAD_S = 5.0
 _UNSIGNED_S = 30.0
 #: Seconds between two tries of `waited_for`.
 _POLL_S = 0.5
-#: Bytes of a lease's file, filled with spaces so that each heartbeat replaces all of it at once; and
-#: the most that is read.
+#: Bytes of a lease's file, filled with spaces so that each heartbeat replaces all of it at once,
+#: and the most that is read.
 _BYTES, _MAX_BYTES = 1024, 4096
 
 

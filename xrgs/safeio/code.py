@@ -112,12 +112,13 @@ def _python_spans(text: str) -> list[_Span]:
         end = position(node.end_lineno or node.lineno, node.end_col_offset or 0)
         return position(node.lineno, node.col_offset), end
 
-    spans = [span(node) for node in ast.walk(ast.parse(text)) if _is_idle(node)]
+    statements = (node for node in ast.walk(ast.parse(text)) if isinstance(node, ast.stmt))
+    spans = [span(node) for node in statements if _is_idle(node)]
     tokens = tokenize.generate_tokens(io.StringIO(text).readline)
     return spans + [(token.start, token.end) for token in tokens if token.type == tokenize.COMMENT]
 
 
-def _is_idle(node: ast.AST) -> bool:
+def _is_idle(node: ast.stmt) -> bool:
     """Return whether a statement is a docstring, or an import or a block for types alone."""
     match node:
         case ast.Expr(value=ast.Constant(value=str())):  # docstrings of attributes too

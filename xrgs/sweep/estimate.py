@@ -1,8 +1,8 @@
 """Estimates what a cell will take from the nearest finished cell of the store.
 
 The nearest cell is the one whose config differs in the fewest keys, on the same variant and kind of
-processor where there is one. Its seconds, memory and disk are scaled by steps, pixels and the budget
-of Gaussians. A store without finished cells gives no estimate.
+processor where there is one. Its seconds, memory and disk are scaled by steps, pixels and the
+budget of Gaussians. A store without finished cells gives no estimate.
 """
 
 from __future__ import annotations
@@ -158,7 +158,7 @@ def _scaled(past: _Finished, conf: Conf, sizes: _Sizes, threads: int, backend: s
     most = conf.splat.densify.budget * sizes.largest
     count = min(past.gaussians, most) if most else past.gaussians
     gaussians = count / max(1, past.gaussians)
-    # About half of a step's time goes with the pixels and half with the Gaussians, and so does memory.
+    # About half of a step's time and memory goes with the pixels and half with the Gaussians.
     step = (pixels + gaussians) / 2
     if backend != past.backend:
         step *= TORCH_SLOWDOWN if backend == "torch" else 1 / TORCH_SLOWDOWN

@@ -368,8 +368,8 @@ def _states(store: Store, records: Mapping[str, SweepRecord]) -> dict[str, str]:
     holders = lease.holders(store.leases)
     ids = {row.cell_id for record in records.values() for row in record.cells}
     states = {}
-    for cell_id in ids - {None}:
-        state = store.cell(str(cell_id)).state(verify=False).name
+    for cell_id in filter(None, ids):
+        state = store.cell(cell_id).state(verify=False).name
         states[cell_id] = "running" if state == "unfinished" and cell_id in holders else state
     return states
 

@@ -183,7 +183,7 @@ def _to_tensorboard(runs: Iterable[Run], folder: Path, _: str) -> str:
             continue
         remove_path(new)
         new.mkdir(exist_ok=True)
-        _write_events(run, str(new.path))
+        _write_events(run, str(new))
         new.rename(done)
     return f"tensorboard --logdir {home}"
 
@@ -218,7 +218,7 @@ def _to_mlflow(runs: Iterable[Run], folder: Path, sweep_id: str) -> str:
     file = folder / "mlflow.db"
     if file.exists() and not file.is_file():  # SQLite would follow a link out of the store
         raise XrgsError(f"{file} is not a regular file")
-    uri = os.environ.get(_SERVER) or f"sqlite:///{file.path.absolute()}"
+    uri = os.environ.get(_SERVER) or f"sqlite:///{file.absolute()}"
     client = MlflowClient(uri)
     found = client.get_experiment_by_name(_EXPERIMENT)
     experiment = found.experiment_id if found else client.create_experiment(_EXPERIMENT)

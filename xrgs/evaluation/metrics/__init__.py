@@ -1,8 +1,9 @@
 """Every metric: its name, label, unit and direction, in the order of the tables.
 
 To add a score of views, add a file with its function, and an entry to `METRICS`; `xrgs-store
-rescore` then computes it for cells that are done. Any other entry is a figure of the cell's summary.
-torch and kornia are imported where they are used, because plans and reports are made without them.
+rescore` then computes it for cells that are done. Any other entry is a figure of the cell's
+summary. torch and kornia are imported where they are used, because plans and reports are made
+without them.
 """
 
 from __future__ import annotations
