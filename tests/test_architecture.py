@@ -52,8 +52,7 @@ ONLY_IN = {
     "tensorboard": ("sweep/track",),
     "mlflow": ("sweep/track",),
 }
-#: Modules that must load without torch, pycolmap, kornia and scikit-image: planning and
-#: reporting.
+#: Modules that must load without torch, pycolmap, kornia and scikit-image: planning, reporting.
 LIGHT = (
     "capture.variant",
     "cli.data",
