@@ -1,20 +1,71 @@
-"""The registry of components: temporary, see the merge of the training packages."""
+"""The components of xrgs, by the keys of `components` in the config.
+
+To add a component, write its module in this folder and add its entry here. This module imports
+neither torch nor the components, so that planning can read it.
+"""
 
 from __future__ import annotations
 
-_MODULES = {
-    "loss_weighting": ("weighting", "loss_weighting", "texture"),
-    "continuous_weighting": ("weighting", "continuous_weighting"),
-    "adaptive_weighting": ("weighting", "adaptive_weighting", "texture"),
-    "hybrid_schedule": ("weighting", "hybrid_schedule"),
-    "region_weighting": ("weighting", "region_weighting", "texture"),
-    "multiview_score": ("view_scores",),
-    "error_score": ("view_scores", "texture"),
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+_FOLDER = "training/components"
+
+
+@dataclass(frozen=True)
+class ComponentEntry:
+    """Where a component is."""
+
+    module: str
+    """Module of `xrgs.training.components`."""
+    name: str
+    """Class in that module."""
+    reads: tuple[str, ...] = ()
+    """Further keys of `components` that the class reads."""
+    helpers: tuple[str, ...] = ()
+    """Further modules of `xrgs.training.components` that only this component uses."""
+
+
+#: In the order in which hooks run. `loss_weighting` comes after `consistency`, since the weight of
+#: a view multiplies its consistency loss as well.
+BUILT_IN: Mapping[str, ComponentEntry] = {
+    "consistency": ComponentEntry("consistency", "Consistency"),
+    "loss_weighting": ComponentEntry(
+        "weighting",
+        "Weighting",
+        reads=(
+            "continuous_weighting",
+            "adaptive_weighting",
+            "region_weighting",
+            "hybrid_schedule",
+        ),
+        helpers=("texture",),
+    ),
+    "gradient_scaling": ComponentEntry("gradient_scaling", "GradientScaling"),
+    "densify": ComponentEntry("densify", "Densify"),
+    "curriculum": ComponentEntry("curriculum", "Curriculum"),
+    "mip": ComponentEntry("mip", "Mip"),
+    "render_scale": ComponentEntry("render_scale", "RenderScale"),
+    "supersampled": ComponentEntry("supersampled", "Supersampled"),
+    "resolution_schedule": ComponentEntry("resolution_schedule", "ResolutionSchedule"),
+    "skip_backward": ComponentEntry("skip_backward", "SkipBackward"),
+    "multiview_score": ComponentEntry("view_scores", "MultiviewScore"),
+    "error_score": ComponentEntry("view_scores", "ErrorScore"),
+    "natural_selection": ComponentEntry("natural_selection", "NaturalSelection"),
 }
 
 
 def modules_of(key: str) -> tuple[str, ...]:
-    """Return the source files of a component."""
-    if key in {"plugins", "count_matched"}:
-        return ()
-    return tuple(f"training/components/{name}.py" for name in _MODULES.get(key, (key,)))
+    """Return the source files that implement a key of `components`.
+
+    Args:
+        key: A key of `BUILT_IN`, or one that an entry reads. `plugins` and `count_matched` have no
+            component here.
+
+    Returns:
+        Paths in the package, such as `training/components/weighting.py`; none without a component.
+    """
+    for own_key, entry in BUILT_IN.items():
+        if key == own_key or key in entry.reads:
+            return tuple(f"{_FOLDER}/{name}.py" for name in (entry.module, *entry.helpers))
+    return ()
