@@ -44,7 +44,7 @@ ONLY_IN = {
     "pycolmap": ("capture/colmap", "capture/sfm"),
     "matplotlib": ("report",),
     "pandas": ("experiment", "report"),
-    "kornia": ("evaluation/metrics", "bench"),
+    "kornia": ("evaluation/metrics/ssim", "bench"),
     "gsplat": (),
     "tqdm": ("runtime/progress", "sweep/monitor"),
     "av": ("capture/scenes/video", "viewer/film"),

@@ -33,7 +33,7 @@ from xrgs.safeio.code import code_digest
 from xrgs.safeio.hashing import digest
 from xrgs.splat.backend import arithmetic, resolve_backend
 from xrgs.training import plugins
-from xrgs.training.components.registry import modules_of
+from xrgs.training.registry import modules_of, order_of
 
 if TYPE_CHECKING:
     from xrgs.config import Conf
@@ -129,9 +129,17 @@ def code_now(
     backend: str, components: tuple[str, ...] = (), plugin_names: tuple[str, ...] = ()
 ) -> dict[str, str]:
     """Return `training_code` of the files as they are now, edited meanwhile or not."""
-    files = _files(backend, components)
-    code = {part: canonical(part, code_digest(*names)) for part, names in files.items()}
+    exact = _exact(backend, components)
+    code = {part: canonical(part, of_part) for part, of_part in exact.items()}
     return code | {f"plugins/{name}": plugins.code_digest(name) for name in plugin_names}
+
+
+def _exact(backend: str, components: tuple[str, ...]) -> dict[str, str]:
+    """Return the digest of each part of the code, and the order of the components' hooks."""
+    files = _files(backend, components)
+    code = {part: code_digest(*names) for part, names in files.items()}
+    order = order_of(components)
+    return code | {"order": order} if order else code
 
 
 def _files(backend: str, components: tuple[str, ...]) -> dict[str, tuple[str, ...]]:
@@ -177,5 +185,4 @@ def current_code(identity: Identity) -> dict[str, str]:
 
 def exact_code(identity: Identity) -> dict[str, str]:
     """Return `current_code` without declared refactorings and plugins."""
-    files = _files(str(identity.splat["backend"]), tuple(identity.components))
-    return {part: code_digest(*names) for part, names in files.items()}
+    return _exact(str(identity.splat["backend"]), tuple(identity.components))

@@ -28,7 +28,7 @@ from xrgs.training.components.densify import Densify
 from xrgs.training.components.gradient_scaling import GradientScaling
 from xrgs.training.components.mip import Mip
 from xrgs.training.components.natural_selection import NaturalSelection
-from xrgs.training.components.registry import BUILT_IN, modules_of
+from xrgs.training.registry import BUILT_IN, modules_of
 from xrgs.training.components.render_scale import RenderScale
 from xrgs.training.components.resolution_schedule import ResolutionSchedule
 from xrgs.training.components.skip_backward import SkipBackward
@@ -103,7 +103,7 @@ def test_the_weight_of_a_view_multiplies_its_consistency_loss() -> None:
 
 def test_every_module_implements_a_component_or_is_shared() -> None:
     folder = Path(components.__file__).parent
-    shared = {"__init__", "base", "combined", "registry"}
+    shared = {"__init__", "base", "combined"}
     modules = {file.stem for file in folder.glob("*.py")} - shared
     keys = [key for name, entry in BUILT_IN.items() for key in (name, *entry.reads)]
     paths = {path for key in keys for path in modules_of(key)}
@@ -298,11 +298,11 @@ def test_all_are_on_together(build: Build, off: ComponentsConf) -> None:
 
 @pytest.mark.parametrize(
     ("module", "unused"),
-    [("", {"hydra"}), (".registry", {"torch", "numpy", "omegaconf", "hydra"})],
+    [(".components", {"hydra"}), (".registry", {"torch", "numpy", "omegaconf", "hydra"})],
 )
 def test_what_is_imported(module: str, unused: set[str]) -> None:
     """Training needs no Hydra, and planning reads the registry without torch."""
-    code = f"import sys, xrgs.training.components{module}; print({unused!r} & set(sys.modules))"
+    code = f"import sys, xrgs.training{module}; print({unused!r} & set(sys.modules))"
     run = subprocess.run([sys.executable, "-P", "-c", code], capture_output=True, check=True)
     assert run.stdout.strip() == b"set()"
 

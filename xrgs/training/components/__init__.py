@@ -4,7 +4,7 @@ A component that is off is not even imported, so that the baseline executes none
 the paper leaves open is fixed in the docstrings of the components, under "our choice where the
 paper is silent".
 
-`registry` lists the components. A component of another package is not in it:
+`xrgs.training.registry` lists the components. A component of another package is not in it:
 `xrgs.training.plugins` finds it by its entry point. CONTRIBUTING.md says how to write either kind.
 """
 
@@ -25,7 +25,7 @@ from xrgs.training.components.base import (
     check_not_negative,
 )
 from xrgs.training.components.combined import Components
-from xrgs.training.components.registry import BUILT_IN, ComponentEntry
+from xrgs.training.registry import BUILT_IN, ComponentEntry
 
 if TYPE_CHECKING:
     from collections.abc import Mapping

@@ -1,12 +1,12 @@
 """The components of xrgs, by the keys of `components` in the config.
 
-To add a component, write its module in this folder and add its entry here. This module imports
+To add a component, write its module in `components/` and add its entry here. This module imports
 neither torch nor the components, so that planning can read it.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 
 _FOLDER = "training/components"
@@ -69,3 +69,10 @@ def modules_of(key: str) -> tuple[str, ...]:
         if key == own_key or key in entry.reads:
             return tuple(f"{_FOLDER}/{name}.py" for name in (entry.module, *entry.helpers))
     return ()
+
+
+def order_of(keys: Iterable[str]) -> str:
+    """Return the classes of the components that are on, in the order in which their hooks run."""
+    on = set(keys)
+    entries = (entry for key, entry in BUILT_IN.items() if on & {key, *entry.reads})
+    return " ".join(f"{entry.module}:{entry.name}" for entry in entries)
