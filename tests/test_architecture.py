@@ -43,9 +43,9 @@ ONLY_IN = {
     "hydra": ("config", "composing", "sweep", "cli"),
     "omegaconf": ("config", "composing", "sweep", "cli"),
     "pycolmap": ("capture/colmap", "capture/sfm"),
-    "matplotlib": ("report",),
-    "pandas": ("experiment", "report"),
-    "kornia": ("evaluation/metrics", "bench"),
+    "matplotlib": ("report", "bench"),
+    "pandas": ("experiment", "report", "bench"),
+    "kornia": ("evaluation/metrics",),
     "gsplat": (),
     "tqdm": ("runtime/progress", "sweep/monitor"),
     "av": ("capture/scenes/video", "viewer/film"),
@@ -92,7 +92,7 @@ FILE_FUNCTIONS: dict[str, dict[str, str]] = {
         )
     },
     "os.access": {"bench/against": "the executable that the user names"},
-    "os.link": {"bench/scale": "in its own folder in /tmp"},
+    "os.link": {},
     "os.path.": {},
     "shutil.": {},
     "shutil.copyfileobj": {
@@ -102,7 +102,6 @@ FILE_FUNCTIONS: dict[str, dict[str, str]] = {
     },
     "tempfile.": {
         "bench/against": "a folder of its own in /tmp",
-        "bench/scale": "a folder of its own in /tmp",
         "capture/sfm": "a folder in /tmp for COLMAP, whose database takes a plain path",
         "evaluation/lpips/download": "a folder of its own in /tmp",
         "experiment/store": "a nameless file, to see whether the disk has room",
@@ -111,9 +110,7 @@ FILE_FUNCTIONS: dict[str, dict[str, str]] = {
     "glob.": {},
     "io.open": {},
     "json.load": {},
-    "json.loads": {
-        "bench/against_worker": "may run in an environment that has another version of xrgs",
-    },
+    "json.loads": {},
     "csv.reader": {},
     "csv.DictReader": {},
     "configparser.": {},
@@ -132,9 +129,7 @@ FILE_FUNCTIONS: dict[str, dict[str, str]] = {
     "lzma.": {},
     "mmap.": {},
     "PIL.Image.open": {"capture/images": "a stream, of which a bounded part is decoded"},
-    "numpy.load": {
-        "bench/against_worker": "may run in an environment that has another version of xrgs"
-    },
+    "numpy.load": {},
     "numpy.loadtxt": {},
     "numpy.genfromtxt": {},
     "numpy.fromfile": {},
@@ -142,7 +137,7 @@ FILE_FUNCTIONS: dict[str, dict[str, str]] = {
     "numpy.save": {},
     "numpy.savetxt": {},
     "numpy.savez": {
-        "bench/loads": "writes the file that the user names",
+        "bench/loads": "writes a stream",
         "capture/frozen": "writes a stream",
         "evaluation/lpips/weights": "writes the user's cache",
     },

@@ -33,13 +33,9 @@ METHODS = frozenset(
 #: Why a module may use some of the methods.
 ALLOWED: dict[str, tuple[str, str]] = {
     "bench/against": ("is_file open read_text", "its own folder in /tmp"),
-    "bench/loads": ("open", "the file that the user names is written"),
-    "bench/memory": ("exists read_text", "/proc"),
-    "bench/run": ("mkdir write_bytes write_text", "the folder that the user names is written"),
-    "bench/scale": (
-        "is_dir is_file iterdir mkdir read_bytes rglob stat write_bytes write_text",
-        "its own folder in /tmp",
-    ),
+    "bench/loads": ("open", "the file that the user names"),
+    "bench/run": ("mkdir", "the folder that the user names is written"),
+    "bench/training": ("exists read_text", "/proc"),
     "capture/download/scenes": ("exists is_dir is_file iterdir", "the folder that the user names"),
     "capture/mixing": ("read_text rglob", "COLMAP's logs, in a new folder of its own"),
     "capture/photographs": ("exists", "a new folder of its own"),
