@@ -45,8 +45,9 @@ def main() -> None:
     for line in sys.stdin:
         request = parse_json(line.encode())
         torch.set_num_threads(request["threads"])
-        for work in (scene, *steps.values()):
-            work.threads = request["threads"]
+        scene.threads = request["threads"]
+        for step in steps.values():
+            step.threads = request["threads"]
         start = time.perf_counter()
         tasks[request["task"]]()
         _answer({"ms": 1e3 * (time.perf_counter() - start)})

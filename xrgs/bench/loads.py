@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
@@ -162,7 +162,7 @@ def read(path: Path) -> Load:
     return Load(name=path.stem, camera=camera, **tensors)
 
 
-def _check(key: str, value: NDArray[np.generic], shape: tuple[int | str, ...]) -> None:
+def _check(key: str, value: NDArray[Any], shape: tuple[int | str, ...]) -> None:
     if value.shape != shape:
         raise ValueError(f"{key} must be {list(SHAPES[key])}, got {list(value.shape)}")
     if value.dtype.kind not in "fiu":

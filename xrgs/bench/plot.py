@@ -21,10 +21,9 @@ from xrgs.bench.timing import Row
 from xrgs.bench.training import STEP_PARTS
 
 _DPI = 150
-_PANELS_PER_ROW = 3
 _SIZE = (4.6, 4.2)  # of a panel, inches
 _MIN_ERROR = 1e-9  # an error of 0 has no logarithm
-_ROOM = 0.35  # beside bars, for the legend, as a share of the longest bar
+_ROOM = 0.6  # beside bars, for the legend, as a share of the longest bar
 _TIME = "forward + backward, ms"
 
 
@@ -52,16 +51,17 @@ def draw_figure(results: Mapping[str, Any]) -> Figure:
         partial(_draw_shortcuts, rows=results["shortcuts"]),
     ]
     if results["growth"]:
-        panels += [partial(_draw_growth, rows=results["growth"], grows="Gaussians")]
-        panels += [partial(_draw_growth, rows=results["growth"], grows="pixels")]
+        panels += [
+            partial(_draw_growth, rows=results["growth"], grows=grows)
+            for grows in ("Gaussians", "pixels")
+        ]
     panels.append(partial(_draw_steps, rows=results["steps"]))
-    height = -(-len(panels) // _PANELS_PER_ROW)
+    columns = len(panels) // 2
     with style.context("default"):  # whatever the user's own style is
-        size = (_SIZE[0] * _PANELS_PER_ROW, _SIZE[1] * height)
-        figure = Figure(figsize=size, layout="constrained")
+        figure = Figure(figsize=(_SIZE[0] * columns, _SIZE[1] * 2), layout="constrained")
         FigureCanvasAgg(figure)
         for number, panel in enumerate(panels, start=1):
-            panel(figure.add_subplot(height, _PANELS_PER_ROW, number))
+            panel(figure.add_subplot(2, columns, number))
     return figure
 
 

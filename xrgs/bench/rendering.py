@@ -132,8 +132,8 @@ def time_load(
 ) -> list[Row]:
     """Time all methods on a load in turn, and compute their errors.
 
-    The torch backend is left out where the load is too large for it. Elsewhere it is timed in turn
-    with the first native method, and its rows have `times_slower`, its time over that method's.
+    The torch backend is left out where the load is too large for it. Elsewhere its rows have
+    `times_slower`, its time over that of the first native method.
 
     Args:
         load: What is rendered.
@@ -147,14 +147,12 @@ def time_load(
     fast = [method for method in methods if method.backend != "torch"]
     slow = [method for method in methods if method.backend == "torch"]
     rows = time_methods(load, fast, counts, repeats)
-    pixels = load.camera.width * load.camera.height
-    if len(load) <= _TORCH_GAUSSIANS and pixels <= _TORCH_PIXELS:
-        compared = time_methods(load, [*fast[:1], *slow], counts, min(repeats, _TORCH_REPEATS))
-        if fast:
-            ms = {(row["method"], row["threads"]): total_ms(row) for row in compared}
-            for row in compared:
-                row["times_slower"] = total_ms(row) / ms[fast[0].name, row["threads"]]
-        rows += [row for row in compared if row["backend"] == "torch"]
+    if len(load) <= _TORCH_GAUSSIANS and load.camera.width * load.camera.height <= _TORCH_PIXELS:
+        usual = {row["threads"]: total_ms(row) for row in reversed(rows)}  # of the first method
+        for row in time_methods(load, slow, counts, min(repeats, _TORCH_REPEATS)):
+            threads = row["threads"]
+            slower = {"times_slower": total_ms(row) / usual[threads]} if fast else {}
+            rows.append(row | slower)
     error = errors(load, methods)
     return [row | error[row["method"]] for row in rows]
 

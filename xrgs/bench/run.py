@@ -70,7 +70,7 @@ def run(settings: Settings) -> str:
         XrgsError: An argument is wrong, or a file cannot be read or written.
     """
     if settings.save is not None:
-        return _save(settings)
+        return _save(settings.save, settings)
     if settings.repeats < 1 or settings.threads < 0:
         raise XrgsError("repeats must be at least 1 and threads at least 0")
     counts = sorted({1, settings.threads or usable_cores()})
@@ -88,13 +88,12 @@ def run(settings: Settings) -> str:
     return tables.text(results)
 
 
-def _save(settings: Settings) -> str:
-    if settings.save is None or settings.cell is None or settings.view is None:
+def _save(file: str, settings: Settings) -> str:
+    if settings.cell is None or settings.view is None:
         raise XrgsError("save=FILE.npz needs cell=FOLDER and view=NAME")
     load = loads.load_from_cell(Path(settings.cell), settings.view)
-    loads.write(Path(settings.save), load)
-    size = f"{load.camera.width} x {load.camera.height} px"
-    return f"{settings.save}: {len(load)} Gaussians, {size}"
+    loads.write(Path(file), load)
+    return f"{file}: {tables.describe(load.sizes)}"
 
 
 def _compare(
@@ -104,9 +103,9 @@ def _compare(
     counts: Sequence[int],
     settings: Settings,
 ) -> str:
-    seed = settings.seed
-    scene = load or loads.random_load(*sizes.scene, seed, SCENE_SIZE_PER_SPACING)
-    step = loads.random_load(*sizes.step, seed)
+    scene, step = load, loads.random_load(*sizes.step, settings.seed)
+    if scene is None:
+        scene = loads.random_load(*sizes.scene, settings.seed, SCENE_SIZE_PER_SPACING)
     views = (step, step.downscaled(_LR_FACTOR))
     result = against.measure(python, scene, views, counts, settings.repeats)
     _write({"against.csv": _csv(result["rows"])}, result, settings)
@@ -119,20 +118,19 @@ def _measure(
     """Return the results by name: rows by column, or a row."""
     backends = ["native", "torch"] if resolve_backend("auto") == "native" else ["torch"]
     backend, repeats = backends[0], settings.repeats
-    rendered = (
-        [load]
-        if load
-        else [
+    if load is None:
+        step = loads.random_load(*sizes.step, settings.seed)
+        rendered = [
             loads.random_load(count, *size, settings.seed)
             for size in sizes.images
             for count in sizes.gaussians
         ]
-    )
+    else:
+        step, rendered = load, [load]
     methods = rendering.default_methods(backends)
     rows: list[Row] = []
     for one in progress(rendered, "rendering", "load", len(rendered)):
         rows += rendering.time_load(one, methods, counts, repeats)
-    step = load or loads.random_load(*sizes.step, settings.seed)
     views = {"HR": step, "LR": step.downscaled(_LR_FACTOR)}
     shortcuts: list[Row] = []
     for view in views.values():
@@ -146,7 +144,7 @@ def _measure(
         "step_shortcuts": training.time_shortcuts(step, backend, repeats),
     }
     if load is None:
-        results["memory"] = training.measure_memory(*sizes.memory, backend, counts[-1])
+        results["memory"] = training.measure_memory(backend, *sizes.memory, counts[-1])
     return results
 
 

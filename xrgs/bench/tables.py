@@ -114,16 +114,18 @@ def text(results: Mapping[str, Any]) -> str:
 def against(result: Mapping[str, Any]) -> str:
     """Format the result of `xrgs.bench.against.measure`."""
     sides = [f"{side}: {result[side]['package']}, {result[side]['isa']}" for side in SIDES]
-    scene, step = (
-        "{gaussians} Gaussians at {width}x{height}".format(**result[key])
-        for key in ("scene", "step")
-    )
+    scene, step = (describe(result[key]) for key in ("scene", "step"))
     note = (
         "Medians; the other's time over this one's, repetition by repetition, and its quartiles.\n"
         f"speed-up: over one thread. render: forward and backward, {scene}.\n"
         f"steps: every part of a training step, {step}; mean: {HR_SHARE:.0%} HR, the others LR."
     )
     return "\n".join([*sides, table(result["rows"], _AGAINST), note])
+
+
+def describe(sizes: Row) -> str:
+    """Return the sizes of a load as text."""
+    return "{gaussians} Gaussians at {width}x{height}".format(**sizes)
 
 
 def table(rows: Sequence[Row], columns: Mapping[str, str]) -> str:

@@ -99,9 +99,14 @@ class TrainingStep:
         self._densify_after(1)
 
     def _densify_after(self, step: int) -> None:
-        size = {"width": self.camera.width, "height": self.camera.height}
         with use_threads(self.threads):
-            self.densifier.after_step(step, self.offset.grad, self.rendered.visible, **size)
+            self.densifier.after_step(
+                step,
+                self.offset.grad,
+                self.rendered.visible,
+                width=self.camera.width,
+                height=self.camera.height,
+            )
 
     def parts(self) -> list[Callable[[], None]]:
         """Return the functions of the parts, in the order of `STEP_PARTS`."""
@@ -145,7 +150,7 @@ def time_steps(
     for (view, count), step in steps.items():
         ms = {part: min(times[view, count, part]) for part in STEP_PARTS}
         ms["densify"] /= step.settings.every
-        row = {"view": view, "backend": backend, "threads": count, **step.load.sizes}
+        row: Row = {"view": view, "backend": backend, "threads": count, **step.load.sizes}
         row |= {f"{part}_ms": value for part, value in ms.items()} | {"step_ms": sum(ms.values())}
         one = next((other for other in rows if other["view"] == view), row)
         rows.append(row | {"speedup": one["step_ms"] / row["step_ms"]})
@@ -193,7 +198,8 @@ def loss_gradients(load: Load, backend: str) -> tuple[Callable[[], Tensor], ...]
         with use_threads(1):
             used = target if prepared else prepare_target(photograph)
             loss = photometric_loss(image, used, l1=L1, ssim=SSIM, backend=backend)
-            return torch.autograd.grad(loss, image)[0]
+            found: Tensor = torch.autograd.grad(loss, image)[0]
+            return found
 
     return partial(gradient, prepared=True), partial(gradient, prepared=False)
 
@@ -210,14 +216,14 @@ def steps_of_sh_degrees(load: Load, backend: str) -> tuple[TrainingStep, Trainin
     return before, after
 
 
-def measure_memory(gaussians: int, width: int, height: int, backend: str, threads: int) -> Row:
+def measure_memory(backend: str, gaussians: int, width: int, height: int, threads: int) -> Row:
     """Train a random load for a few steps in a new process and measure its memory.
 
     Args:
+        backend: "native" or "torch".
         gaussians: Number of Gaussians.
         width: Width of the view, px.
         height: Height of the view, px.
-        backend: "native" or "torch".
         threads: Number of threads.
 
     Returns:
@@ -228,19 +234,21 @@ def measure_memory(gaussians: int, width: int, height: int, backend: str, thread
     """
     # A process of its own, because this one has held other loads before. -P keeps the current
     # folder, which may be another checkout, out of the child's sys.path.
-    arguments = [str(value) for value in (gaussians, width, height, threads, backend)]
+    arguments = [str(value) for value in (backend, gaussians, width, height, threads)]
     command = [sys.executable, "-P", "-m", "xrgs.bench.training", *arguments]
     done = subprocess.run(command, check=True, stdout=subprocess.PIPE)  # noqa: S603
     row: Row = parse_json(done.stdout)
     return row
 
 
-def _memory_of_this_process(*sizes: int, threads: int, backend: str) -> Row:
+def _memory_of_this_process(
+    backend: str, gaussians: int, width: int, height: int, threads: int
+) -> Row:
     # A tiny step loads what is loaded on first use, so that it belongs to the base.
     _train(TrainingStep(random_load(50, 16, 16, seed=0), backend, threads))
     base, _ = _resident_mib()
-    step = TrainingStep(random_load(*sizes, seed=0), backend, threads)
-    row = {"backend": backend, "threads": threads, **step.load.sizes}
+    step = TrainingStep(random_load(gaussians, width, height, seed=0), backend, threads)
+    row: Row = {"backend": backend, "threads": threads, **step.load.sizes}
     row["counted_mib"] = _train(step) / 2**20
     _, peak = _resident_mib()
     if peak:
@@ -266,7 +274,5 @@ def _resident_mib() -> tuple[float, float]:
 
 
 if __name__ == "__main__":
-    *numbers, chosen = sys.argv[1:]
-    *load_sizes, thread_count = map(int, numbers)
-    measured = _memory_of_this_process(*load_sizes, threads=thread_count, backend=chosen)
-    sys.stdout.write(json.dumps(measured))
+    chosen, *numbers = sys.argv[1:]
+    sys.stdout.write(json.dumps(_memory_of_this_process(chosen, *map(int, numbers))))
