@@ -110,7 +110,11 @@ FILE_FUNCTIONS: dict[str, dict[str, str]] = {
     "glob.": {},
     "io.open": {},
     "json.load": {},
-    "json.loads": {},
+    "json.loads": {
+        "bench/against": "the answers of its own process",
+        "bench/against_worker": "the requests of the process that started it",
+        "bench/training": "the answer of its own process",
+    },
     "csv.reader": {},
     "csv.DictReader": {},
     "configparser.": {},

@@ -27,12 +27,11 @@ from xrgs import _native
 from xrgs.bench import loads
 from xrgs.bench.rendering import RenderMethod, RenderTask
 from xrgs.bench.training import TrainingStep
-from xrgs.safeio.untrusted import parse_json
 
 
 def main() -> None:
     """Answer the requests of standard input until it ends."""
-    setup = parse_json(sys.stdin.readline().encode())
+    setup = json.loads(sys.stdin.readline())
     threads = torch.get_num_threads()
     scene = RenderTask(loads.read(Path(setup["scene"])), RenderMethod("native", "native"), threads)
     steps = {
@@ -43,7 +42,7 @@ def main() -> None:
     tasks |= {name: step.run_step for name, step in steps.items()}
     _answer({"package": str(Path(str(xrgs.__file__)).parent), "isa": _native.isa()})
     for line in sys.stdin:
-        request = parse_json(line.encode())
+        request = json.loads(line)
         torch.set_num_threads(request["threads"])
         scene.threads = request["threads"]
         for step in steps.values():

@@ -15,7 +15,6 @@ from torch import Tensor
 
 from xrgs.bench.loads import Load, random_load
 from xrgs.bench.timing import Row, time_interleaved, use_threads
-from xrgs.safeio.untrusted import parse_json
 from xrgs.splat.densify import Densifier
 from xrgs.splat.gaussians import PARAMETERS, Gaussians
 from xrgs.splat.loss import photometric_loss, prepare_target
@@ -237,7 +236,7 @@ def measure_memory(backend: str, gaussians: int, width: int, height: int, thread
     arguments = [str(value) for value in (backend, gaussians, width, height, threads)]
     command = [sys.executable, "-P", "-m", "xrgs.bench.training", *arguments]
     done = subprocess.run(command, check=True, stdout=subprocess.PIPE)  # noqa: S603
-    row: Row = parse_json(done.stdout)
+    row: Row = json.loads(done.stdout)
     return row
 
 
