@@ -44,7 +44,7 @@ def draw_figure(results: Mapping[str, Any]) -> Figure:
     load = largest_common_load(rows)
     usual = rows[0]["method"]
     plain = [row for row in load if row["method"] in {row["backend"], TORCH_FLOAT64}]
-    cutoffs = [row for row in load if row["method"].startswith(usual)]
+    cutoffs = [row for row in load if f"{row['method']},".startswith(f"{usual},")]
     panels: list[Callable[[Axes], None]] = [
         partial(_draw_errors, rows=plain, title="Which backend?", yscale="log"),
         partial(_draw_errors, rows=cutoffs, title="What do cutoffs cost?", yscale="linear"),

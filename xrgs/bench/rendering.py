@@ -70,8 +70,9 @@ class RenderTask:
 
     Attributes:
         image: The last image, [H, W, 3], after a call of `backward`.
-        work: Counts of the last render: `visible` Gaussians, `evaluations` of alpha, `buffer_bytes`
-            and, with the native backend, (tile, Gaussian) `pairs`.
+        work: Counts of the last render: `visible` Gaussians, `evaluations` of alpha and, with the
+            native backend, (tile, Gaussian) `pairs`.
+        buffer_bytes: Size of the buffers of the last render.
         stages: The shortest time of each stage in ms, native backend only.
     """
 
@@ -85,6 +86,7 @@ class RenderTask:
         self.render: Render | None = None
         self.image = torch.empty(0)
         self.work: dict[str, int] = {}
+        self.buffer_bytes = 0
         self.stages: dict[str, float] = {}
 
     def forward(self) -> None:
@@ -109,11 +111,8 @@ class RenderTask:
         with use_threads(self.threads):
             gradients = torch.autograd.grad(render.image, self.leaves, self.image_grad)
         self.image = render.image.detach()
-        self.work = {
-            "visible": int(render.visible.sum()),
-            "evaluations": render.evaluations,
-            "buffer_bytes": render.buffer_bytes,
-        }
+        self.work = {"visible": int(render.visible.sum()), "evaluations": render.evaluations}
+        self.buffer_bytes = render.buffer_bytes
         if self.method.backend == "native":
             self.work["pairs"] = graph.frame.pair_count
             for stage, ms in graph.frame.timings.items():
@@ -130,16 +129,10 @@ class RenderTask:
 def time_load(
     load: Load, methods: Sequence[RenderMethod], counts: Sequence[int], repeats: int
 ) -> list[Row]:
-    """Time all methods on a load in turn, and compute their errors.
+    """Time all methods on a load with each number of threads, and compute their errors.
 
-    The torch backend is left out where the load is too large for it. Elsewhere its rows have
-    `times_slower`, its time over that of the first native method.
-
-    Args:
-        load: What is rendered.
-        methods: The methods.
-        counts: Numbers of threads, the first of them 1.
-        repeats: Number of timed runs; the torch backend has at most two.
+    The torch backend is left out where the load is too large for it. Elsewhere it runs at most
+    twice, and its rows have `times_slower`, its time over the first native method's.
 
     Returns:
         The rows of `time_methods`, with the errors of `errors`.
@@ -150,9 +143,9 @@ def time_load(
     if len(load) <= _TORCH_GAUSSIANS and load.camera.width * load.camera.height <= _TORCH_PIXELS:
         usual = {row["threads"]: total_ms(row) for row in reversed(rows)}  # of the first method
         for row in time_methods(load, slow, counts, min(repeats, _TORCH_REPEATS)):
-            threads = row["threads"]
-            slower = {"times_slower": total_ms(row) / usual[threads]} if fast else {}
-            rows.append(row | slower)
+            if fast:
+                row["times_slower"] = total_ms(row) / usual[row["threads"]]
+            rows.append(row)
     error = errors(load, methods)
     return [row | error[row["method"]] for row in rows]
 
@@ -177,7 +170,6 @@ def time_methods(
         forward, backward = times[*key, "forward"], times[*key, "backward"]
         compositing = task.stages.get("composite", min(forward))
         parameter_bytes = sum(leaf.nbytes for leaf in task.leaves)
-        counted = {name: value for name, value in task.work.items() if name != "buffer_bytes"}
         row = {
             **load.sizes,
             "method": task.method.name,
@@ -188,10 +180,10 @@ def time_methods(
             "forward_median_ms": median(forward),
             "backward_median_ms": median(backward),
             **{f"{stage}_ms": ms for stage, ms in task.stages.items()},
-            **counted,
+            **task.work,
             "evaluations_per_s": 1e3 * task.work["evaluations"] / compositing,
             # Parameters and their gradients, and the buffers.
-            "memory_mib": (2 * parameter_bytes + task.work["buffer_bytes"]) / 2**20,
+            "memory_mib": (2 * parameter_bytes + task.buffer_bytes) / 2**20,
         }
         one = next((other for other in rows if other["method"] == row["method"]), row)
         rows.append(row | {"speedup": total_ms(one) / total_ms(row)})
@@ -208,9 +200,7 @@ def errors(load: Load, methods: Sequence[RenderMethod]) -> dict[str, dict[str, f
 
     Only the middle of the view (`ERROR_CROP`) is rendered, as a view of its own.
 
-    Args:
-        load: What is rendered.
-        methods: The methods, all with one `sh_degree`.
+    All methods must have one `sh_degree`.
 
     Returns:
         For each method's name, `image_mean_error` and `image_max_error`, the absolute error of the
@@ -243,11 +233,6 @@ def time_shortcuts(load: Load, backend: str, repeats: int) -> list[Row]:
     A shortcut leaves out work that does not change the result. The kinds of culling
     (`CullingOptions`) are shortcuts of the native backend. Both backends leave out the bands of the
     spherical harmonics above the degree that training has reached.
-
-    Args:
-        load: What is rendered.
-        backend: "native" or "torch".
-        repeats: Number of timed runs.
 
     Returns:
         A row for each shortcut: `shortcut`, sizes, `times` (off over on), `same_bits` (whether

@@ -131,6 +131,10 @@ def _measure(
     rows: list[Row] = []
     for one in progress(rendered, "rendering", "load", len(rendered)):
         rows += rendering.time_load(one, methods, counts, repeats)
+    if not rows:
+        raise XrgsError(
+            f"load={settings.load}: is too large to time the torch backend on; build the native one"
+        )
     views = {"HR": step, "LR": step.downscaled(_LR_FACTOR)}
     shortcuts: list[Row] = []
     for view in views.values():

@@ -161,11 +161,6 @@ def time_shortcuts(load: Load, backend: str, repeats: int) -> list[Row]:
 
     Neither of them changes a bit.
 
-    Args:
-        load: What is rendered and trained.
-        backend: "native" or "torch".
-        repeats: Number of timed runs.
-
     Returns:
         A row for each shortcut: `shortcut`, the `part` of the step, sizes, `on_ms`, `off_ms` and
         `times` (off over on).
@@ -217,13 +212,6 @@ def steps_of_sh_degrees(load: Load, backend: str) -> tuple[TrainingStep, Trainin
 
 def measure_memory(backend: str, gaussians: int, width: int, height: int, threads: int) -> Row:
     """Train a random load for a few steps in a new process and measure its memory.
-
-    Args:
-        backend: "native" or "torch".
-        gaussians: Number of Gaussians.
-        width: Width of the view, px.
-        height: Height of the view, px.
-        threads: Number of threads.
 
     Returns:
         A row with the sizes and, in MiB: `counted_mib`, of parameters, gradients, Adam's state and
