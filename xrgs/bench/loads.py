@@ -185,7 +185,7 @@ def write(path: Path, load: Load) -> None:
     tensors = {key: getattr(camera if key in {"viewmat", "K"} else load, key) for key in _TENSORS}
     arrays = {key: value.numpy() for key, value in tensors.items()}
     try:
-        with atomic_writer(path.absolute()) as file:
+        with atomic_writer(path) as file:
             np.savez(file, **arrays, width=camera.width, height=camera.height)
     except OSError as error:
         raise XrgsError(f"{path}: cannot be written: {error.strerror}") from error

@@ -121,7 +121,8 @@ def _draw_growth(axes: Axes, rows: Sequence[Row], grows: str) -> None:
     axes.set(xscale="log", yscale="log", title=f"How does time grow with {grows}?")
     axes.set(xlabel=f"{grows}, 1 thread", ylabel=_TIME)
     axes.xaxis.set_minor_formatter(NullFormatter())
-    axes.set_ylim(bottom=axes.dataLim.y0 / 12)  # room for the legend
+    low, high = axes.dataLim.intervaly
+    axes.set_ylim(low / 12, high * 1.5)  # below, room for the legend
     axes.legend(loc="lower right")
 
 

@@ -5,6 +5,8 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
+import msgspec
+
 from xrgs.bench import against, growth, loads, plot, rendering, tables, training
 from xrgs.errors import XrgsError
 from xrgs.experiment import provenance
@@ -12,7 +14,7 @@ from xrgs.runtime.machine import usable_cores
 from xrgs.runtime.progress import progress
 from xrgs.safeio.atomic import atomic_writer, write_json
 from xrgs.safeio.records import table_text
-from xrgs.safeio.words import for_csv
+from xrgs.safeio.sanitize import for_csv
 from xrgs.splat.backend import resolve_backend
 
 if TYPE_CHECKING:
@@ -140,7 +142,7 @@ def _measure(
     for view in views.values():
         shortcuts += rendering.time_shortcuts(view, backend, repeats)
     results = {
-        "machine": provenance.collect(counts[-1], backend),
+        "machine": msgspec.to_builtins(provenance.collect(counts[-1], backend)),
         "rows": rows,
         "growth": growth.fit_growth(rows),
         "steps": training.time_steps(views, backend, counts, repeats),
@@ -158,13 +160,13 @@ def _csv(rows: Sequence[Row]) -> bytes:
 
 
 def _write(files: Mapping[str, bytes], results: dict[str, Any], settings: Settings) -> None:
-    folder = Path(settings.out).absolute()
+    folder = Path(settings.out)
     try:
         folder.mkdir(parents=True, exist_ok=True)
         for name, content in files.items():
             with atomic_writer(folder / name) as stream:
                 stream.write(content)
         if settings.json is not None:
-            write_json(Path(settings.json).absolute(), results)
+            write_json(Path(settings.json), results)
     except OSError as error:
         raise XrgsError(f"{error.filename}: cannot be written: {error.strerror}") from error

@@ -21,7 +21,7 @@ from xrgs.composing import escape_interpolations
 from xrgs.errors import XrgsError, did_you_mean
 from xrgs.runtime.streams import ignore_broken_pipe, say
 from xrgs.safeio.paths import user_path
-from xrgs.safeio.words import for_line
+from xrgs.safeio.sanitize import for_line
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence

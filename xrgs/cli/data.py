@@ -19,7 +19,6 @@ from xrgs.cli.arguments import (
 from xrgs.errors import XrgsError
 from xrgs.experiment.store import Store
 from xrgs.runtime.streams import say
-from xrgs.safeio.confined import ConfinedPath
 from xrgs.safeio.paths import user_path
 from xrgs.sweep import variants
 
@@ -96,7 +95,7 @@ def _inspect(words: list[str], values: dict[str, str]) -> str:
     out = values.pop("out", None)
     if bool(words) == bool(values) or len(words) > 1:
         raise XrgsError("inspect: give a variant's folder, or scene=NAME and other keys")
-    folder: Path | ConfinedPath
+    folder: Path
     if words:
         folder = Path(words[0]).expanduser()
     else:
@@ -116,5 +115,5 @@ def _export(words: list[str], values: dict[str, str]) -> str:
 
     path = user_path(words[0])
     if not path.exists() and path.name == words[0]:
-        path = store.find_folder(words[0]).path
+        path = store.find_folder(words[0])
     return export(path, layout, user_path(out or f"{path.name}-{layout}"))

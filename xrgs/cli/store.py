@@ -19,7 +19,7 @@ from xrgs.experiment.store import Store
 from xrgs.runtime.signals import exit_on_signal
 from xrgs.runtime.streams import say
 from xrgs.safeio.paths import user_path
-from xrgs.safeio.words import counted
+from xrgs.safeio.sanitize import counted
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence

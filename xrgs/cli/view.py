@@ -12,7 +12,7 @@ from xrgs.experiment.store import Store
 from xrgs.runtime.signals import StopSignal, exit_on_signal
 from xrgs.runtime.streams import say
 from xrgs.safeio.paths import user_path
-from xrgs.safeio.words import for_line
+from xrgs.safeio.sanitize import for_line
 
 _HELP = """\
 xrgs-view CELL [CELL] [KEY=VALUE]...

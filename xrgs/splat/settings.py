@@ -7,13 +7,19 @@ a 30,000-step run; `scaled` shrinks them with the run, as the trainer's `adjust_
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
+from typing import Any
 
 NOMINAL_STEPS = 30_000
 """Length of the run that step counts in settings are written for."""
 
 SPLITS = ("random", "long_axis")
 """The values of `DensifySettings.split`."""
+
+
+def off_by_default(value: Any) -> Any:
+    """Declare a setting with a default that changes nothing; identities leave it out there."""
+    return field(default=value, metadata={"off": value})
 
 
 @dataclass
@@ -33,11 +39,11 @@ class RasterSettings:
     1.5.3)."""
     transmittance_min: float = 1e-4
     """A pixel ends before the Gaussian that would leave it this transmittance or less."""
-    antialiased: bool = False
+    antialiased: bool = off_by_default(False)
     """Compensate the opacity for `eps2d`, as the 2D Mip filter of Mip-Splatting [yu2024] does."""
     background: tuple[float, float, float] = (0.0, 0.0, 0.0)
     """Colour behind the last Gaussian."""
-    absgrad: bool = False
+    absgrad: bool = off_by_default(False)
     """Make the gradient of `means2d_offset`, for each axis, the sum of the absolute values of the
     pixels' gradients, so that pixels which pull a Gaussian apart do not cancel (AbsGS
     [ye2024absgs]; gsplat's `absgrad`)."""
@@ -119,7 +125,7 @@ class DensifySettings:
     """How Gaussians grow. `random`: as in gsplat, small ones are duplicated, and large ones split
     into two with means drawn from the old one. `long_axis`: all of them are split into two side by
     side along the longest axis (`xrgs.splat.growth.split_along_longest_axis`)."""
-    budget: float = 0.0
+    budget: float = off_by_default(0.0)
     """The most Gaussians that growing may lead to, for each pixel of the training view that has the
     most of them (`xrgs.splat.growth.Budget`); 0 sets no limit. The unit is our choice."""
 

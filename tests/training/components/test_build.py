@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from xrgs.capture.dataset import LoadedView
-from xrgs.config import ComponentsConf, DensifyConf
+from xrgs.config import ComponentsConf, DensifyConf, identity_values, is_on
 from xrgs.errors import XrgsError
 from xrgs.splat.gaussians import PARAMETERS, Gaussians
 from xrgs.splat.refinement import Groups, Thresholds
@@ -26,7 +26,12 @@ from xrgs.training.components.densify import Densify
 from xrgs.training.components.gradient_scaling import GradientScaling
 from xrgs.training.components.loss_weighting import LossWeighting
 from xrgs.training.components.mip import Mip
+from xrgs.training.components.natural_selection import NaturalSelection
 from xrgs.training.components.render_scale import RenderScale
+from xrgs.training.components.resolution_schedule import ResolutionSchedule
+from xrgs.training.components.skip_backward import SkipBackward
+from xrgs.training.components.supersampled import Supersampled
+from xrgs.training.components.view_scores import ErrorScore, MultiviewScore
 from xrgs.training.components.weighting import Weighting
 
 Build = Callable[..., Components]
@@ -40,6 +45,26 @@ ON: dict[str, tuple[Any, type[Component]]] = {
     "render_scale.gamma": (0.25, RenderScale),
     "consistency.weight": (0.1, Consistency),
     "mip.variance": (0.2, Mip),
+    "supersampled.factor": (2, Supersampled),
+    "supersampled.late_factor": (2, Supersampled),
+    "resolution_schedule.start_share": (0.5, ResolutionSchedule),
+    "skip_backward.share": (0.5, SkipBackward),
+    "multiview_score.views": (2, MultiviewScore),
+    "error_score.of": ("edges", ErrorScore),
+    "natural_selection.budget": (0.5, NaturalSelection),
+    "continuous_weighting.gamma": (1.0, Weighting),
+}
+#: Keys that `off` declares too, with another value: they build no component by themselves. The
+#: first changes a weight that another key switches on, as do those of `ATTENUATIONS`, which are
+#: refused without one; the last is read by `xrgs.training.count_matching`.
+OTHERS: dict[str, Any] = {
+    "loss_weighting.stat_from": "unweighted",
+    "count_matched.gaussians": 100,
+}
+ATTENUATIONS: dict[str, Any] = {
+    "adaptive_weighting.texture": 0.1,
+    "region_weighting.texture": 0.1,
+    "hybrid_schedule.ramp": 100,
 }
 
 
@@ -48,8 +73,17 @@ def put(conf: ComponentsConf, key: str, value: Any) -> None:
     setattr(getattr(conf, group), name, value)
 
 
+def groups_on(conf: ComponentsConf) -> list[str]:
+    """The groups of settings in the identities of cells."""
+    assert [*identity_values(conf)] == [
+        group for group, values in vars(conf).items() if group != "plugins" and is_on(values)
+    ]
+    return [*identity_values(conf)]
+
+
 def test_the_baseline_has_no_component(build: Build, off: ComponentsConf) -> None:
     assert build(off) == ()
+    assert groups_on(off) == []
 
 
 def test_every_setting_has_a_component() -> None:
@@ -97,7 +131,7 @@ def test_at_the_value_that_is_off_each_changes_nothing(
 
 
 def test_two_components_with_thresholds_are_refused() -> None:
-    densify = Densify(DensifyConf("per_class", 2.0, 2.0))
+    densify = Densify(DensifyConf(decide="per_class", lr_grow=2.0, lr_prune=2.0))
     assert Components([Component(), densify]).densification_groups(DensifySettings()) is not None
     with pytest.raises(XrgsError, match=r"^components: Densify and Other both set thresholds"):
         Components([densify, Other()]).densification_groups(DensifySettings())
@@ -206,6 +240,49 @@ def test_each_is_on_alone(key: str, build: Build, off: ComponentsConf) -> None:
     value, kind = ON[key]
     put(off, key, value)
     assert [type(component) for component in build(off)] == [kind]
+    assert groups_on(off) == [key.partition(".")[0]]
+
+
+@pytest.mark.parametrize("key", OTHERS)
+def test_other_keys_build_nothing_and_are_in_the_identity(
+    key: str, build: Build, off: ComponentsConf
+) -> None:
+    put(off, key, OTHERS[key])
+    assert build(off) == ()
+    assert groups_on(off) == [key.partition(".")[0]]
+
+
+@pytest.mark.parametrize("key", ATTENUATIONS)
+def test_an_attenuation_is_refused_alone_and_is_in_the_identity(
+    key: str, build: Build, off: ComponentsConf
+) -> None:
+    put(off, key, ATTENUATIONS[key])
+    with pytest.raises(XrgsError, match=rf"^components\.{key}="):
+        build(off)
+    off.loss_weighting.lr_weight = 0.5
+    assert [type(component) for component in build(off)] == [Weighting]
+    assert set(groups_on(off)) == {"loss_weighting", key.partition(".")[0]}
+
+
+def test_every_key_that_is_declared_off_is_one_of_these(off: ComponentsConf) -> None:
+    declared = {
+        f"{group.name}.{key.name}"
+        for group in dataclasses.fields(off)
+        if group.name != "plugins"
+        for key in dataclasses.fields(getattr(off, group.name))
+        if "off" in key.metadata
+    }
+    assert declared == ON.keys() | OTHERS.keys() | ATTENUATIONS.keys()
+    assert {key.partition(".")[0] for key in declared} | {"plugins"} == set(vars(off))
+
+
+@pytest.mark.parametrize("key", ["consistency.l1", "densify.lr_grow", "supersampled.late_from"])
+def test_a_key_of_a_component_that_is_off_switches_nothing_on(
+    key: str, build: Build, off: ComponentsConf
+) -> None:
+    put(off, key, 3)
+    assert build(off) == ()
+    assert groups_on(off) == []
 
 
 def test_all_are_on_together(build: Build, off: ComponentsConf) -> None:

@@ -99,7 +99,7 @@ def views(rows: int = 10) -> list[LoadedView]:
 
 
 def test_textured_and_covered_pixels_alone_are_attenuated() -> None:
-    attenuations = region_attenuations(RegionWeightingConf(0.07), views(), wall(2.0), NEAR)
+    attenuations = region_attenuations(RegionWeightingConf(texture=0.07), views(), wall(2.0), NEAR)
     assert set(attenuations) == {"low"}
     attenuation = attenuations["low"]
     assert (attenuation[:9, 10:] == 1).all()
@@ -108,8 +108,10 @@ def test_textured_and_covered_pixels_alone_are_attenuated() -> None:
 
 
 def test_the_attenuation_is_proportional_to_the_texture() -> None:
-    coarse = region_attenuations(RegionWeightingConf(8.0), views(), wall(2.0), NEAR)["low"]
-    coarser = region_attenuations(RegionWeightingConf(16.0), views(), wall(2.0), NEAR)["low"]
+    coarse = region_attenuations(RegionWeightingConf(texture=8.0), views(), wall(2.0), NEAR)["low"]
+    coarser = region_attenuations(RegionWeightingConf(texture=16.0), views(), wall(2.0), NEAR)[
+        "low"
+    ]
     # The gradient of a chequered pattern is 1 along both axes.
     torch.testing.assert_close(coarse[:7, 10:], torch.full((7, 10), 2**0.5 / 8))
     torch.testing.assert_close(coarser, coarse / 2)

@@ -18,7 +18,7 @@ from yarl import URL  # aiohttp's own class for addresses
 
 from xrgs.capture.download.part import DownloadError, Version
 from xrgs.runtime.progress import ProgressBar
-from xrgs.safeio.words import for_line
+from xrgs.safeio.sanitize import for_line
 
 if TYPE_CHECKING:
     from collections.abc import Mapping

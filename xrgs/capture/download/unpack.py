@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 from xrgs.errors import XrgsError
 from xrgs.runtime.progress import progress
 from xrgs.safeio.confined import ConfinedPath, confined
-from xrgs.safeio.words import for_line
+from xrgs.safeio.sanitize import for_line
 
 if TYPE_CHECKING:
     from pathlib import Path
