@@ -28,13 +28,13 @@ from xrgs.training.components.densify import Densify
 from xrgs.training.components.gradient_scaling import GradientScaling
 from xrgs.training.components.mip import Mip
 from xrgs.training.components.natural_selection import NaturalSelection
-from xrgs.training.registry import BUILT_IN, modules_of
 from xrgs.training.components.render_scale import RenderScale
 from xrgs.training.components.resolution_schedule import ResolutionSchedule
 from xrgs.training.components.skip_backward import SkipBackward
 from xrgs.training.components.supersampled import Supersampled
 from xrgs.training.components.view_scores import ErrorScore, MultiviewScore
 from xrgs.training.components.weighting import Weighting, weight_by_tag
+from xrgs.training.registry import BUILT_IN, modules_of
 
 Build = Callable[..., Components]
 
