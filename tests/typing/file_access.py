@@ -54,11 +54,12 @@ ALLOWED: dict[str, tuple[str, str]] = {
     "capture/scenes/procedural": ("read_bytes", "the installed package"),
     "capture/sealed": ("resolve", "the name of the folder that the user names"),
     "capture/sfm": ("exists write_text", "a new folder of its own, for COLMAP"),
-    "cli/arguments": (
+    "cli/hydra_words": (
         "exists is_dir rglob",
         "the paths on the command line, the package's configs",
     ),
-    "cli/data": ("exists expanduser", "a path on the command line"),
+    "cli/options": ("exists", "a word of the command line"),
+    "cli/data": ("exists", "a path on the command line"),
     "config": ("is_dir", "the installed package"),
     "evaluation/lpips/download": (
         "expanduser glob is_file open write_text",
