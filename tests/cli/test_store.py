@@ -42,7 +42,7 @@ def xrgs_store(call_command: Call, tmp_path: Path, monkeypatch: pytest.MonkeyPat
     store.write_sweep([], rows)
 
     def run(*arguments: str) -> tuple[int, str, str]:
-        return call_command("store", *arguments, "store=s")
+        return call_command("store", *arguments, "--store", "s")
 
     return run
 
@@ -51,7 +51,7 @@ def xrgs_store(call_command: Call, tmp_path: Path, monkeypatch: pytest.MonkeyPat
 def test_a_reader_of_the_list_that_ends_first_is_no_error(tmp_path: Path) -> None:
     reader, writer = os.pipe()
     os.close(reader)
-    words = ["-c", "from xrgs.cli.store import main; main()", "list", "store=s"]
+    words = ["-c", "from xrgs.cli.store import main; main()", "list", "--store", "s"]
     done = subprocess.run(
         [sys.executable, "-P", *words],
         cwd=tmp_path,
@@ -68,7 +68,7 @@ def cells(tmp_path: Path) -> list[str]:
 
 
 def test_cells_are_listed_and_one_is_shown(xrgs_store: Call) -> None:
-    code, out, _ = xrgs_store("list", "ablations=mip")
+    code, out, _ = xrgs_store("list", "--ablations", "mip")
     assert code == 0
     assert out.startswith("1 cell, ")
     assert "abd   fern   mip" in out
@@ -83,16 +83,16 @@ def test_cells_are_listed_and_one_is_shown(xrgs_store: Call) -> None:
 def test_nothing_is_removed_without_a_yes(
     xrgs_store: Call, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    code, out, _ = xrgs_store("rm", "abd", "dry_run=true")
+    code, out, _ = xrgs_store("rm", "abd", "--dry-run")
     assert code == 0
     assert "to remove: cells (1): " in out
     assert "abd  fern / mip, done" in out
     monkeypatch.setattr(sys, "stdin", io.StringIO("y\n"))  # no terminal: nobody has answered
     code, _, err = xrgs_store("rm", "abd")
     assert code == 1
-    assert "nothing was done; yes=true" in err
+    assert "nothing was done; --yes" in err
     assert cells(tmp_path) == ["abc", "abd"]
-    code, out, _ = xrgs_store("rm", "abd", "yes=true")
+    code, out, _ = xrgs_store("rm", "abd", "--yes")
     assert code == 0
     assert "freed " in out
     assert cells(tmp_path) == ["abc"]
@@ -110,7 +110,7 @@ def test_a_terminal_is_asked(
 
 
 def test_trim_keeps_what_tables_are_made_of(xrgs_store: Call, tmp_path: Path) -> None:
-    code, out, _ = xrgs_store("trim", "yes=true")
+    code, out, _ = xrgs_store("trim", "--yes")
     assert code == 0
     assert out.splitlines()[-1] == "freed 2 kB"
     assert "done (trimmed)" in xrgs_store("list")[1]
@@ -121,11 +121,10 @@ def test_trim_keeps_what_tables_are_made_of(xrgs_store: Call, tmp_path: Path) ->
 
 def test_packed_cells_are_a_store_again(xrgs_store: Call, tmp_path: Path) -> None:
     begin_attempt(Store(tmp_path / "s").cell("abe"), {}, {})
-    for out in ("", "out=study.zip"):
-        code, _, err = xrgs_store("pack", *filter(None, [out]))
-        assert code == 1
-        assert "name the archive to write, FILE.tar.xz" in err
-    code, out, _ = xrgs_store("pack", "out=study.tar.xz")
+    code, _, err = xrgs_store("pack", "--out", "study.zip")
+    assert code == 1
+    assert "--out study.zip: name the archive to write, FILE.tar.xz" in err
+    code, out, _ = xrgs_store("pack", "--out", "study.tar.xz")
     assert code == 1  # their variant is not there
     assert out.startswith("study.tar.xz: 2 cells, 0 variants, 1 record of sweeps; ")
     assert out.splitlines()[1] == "left out, not done: 1 cell"
@@ -149,12 +148,10 @@ def test_check_ends_with_1_where_something_is_damaged(xrgs_store: Call, tmp_path
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["rm", "yes=true"], "rm: name cells, or give a filter"),
-        (["remove"], "remove: there is no such command; choose from: list, show, rm"),
-        (["gc", "abc"], "gc abc: gc takes no cells"),
-        (["show"], "show: give the id of one cell"),
-        (["list", "sceens=fern"], "sceens"),
-        (["rm", "ab", "yes=true"], "ab: several cells have such an id"),
+        (["rm", "--yes"], "rm: name cells, or choose them by an option"),
+        (["rm", "ab", "--yes"], "ab: several cells have such an id"),
+        (["rm", "--scenes", "horns", "--yes"], "--scenes horns: no cell has that"),
+        (["gc", "--of", "cells", "--yes"], "--of cells: choose from: old_code"),
     ],
 )
 def test_bad_input_is_named_and_removes_nothing(

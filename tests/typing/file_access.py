@@ -58,8 +58,7 @@ ALLOWED: dict[str, tuple[str, str]] = {
         "exists is_dir rglob",
         "the paths on the command line, the package's configs",
     ),
-    "cli/options": ("exists", "a word of the command line"),
-    "cli/data": ("exists", "a path on the command line"),
+    "cli/data": ("exists glob", "a path on the command line, the package's configs"),
     "config": ("is_dir", "the installed package"),
     "evaluation/lpips/download": (
         "expanduser glob is_file open write_text",

@@ -1,4 +1,4 @@
-"""Compares this installation with another one, in one run: `xrgs-bench against=PYTHON`.
+"""Compares this installation with another one, in one run: `xrgs-bench --against PYTHON`.
 
 Each installation has a process of its own that stays alive (`xrgs.bench.against_worker`, run by its
 interpreter) and is asked for one repetition at a time. The two take turns, A B A B, so whatever

@@ -115,7 +115,7 @@ def run(settings: Settings) -> str:
 
 def _save(settings: Settings) -> str:
     if settings.save is None or settings.cell is None or settings.view is None:
-        raise XrgsError("save=FILE.npz needs cell=FOLDER and view=NAME")
+        raise XrgsError("--save FILE.npz needs --cell FOLDER and --view NAME")
     load = loads.load_from_cell(Path(settings.cell), settings.view)
     loads.write(Path(settings.save), load)
     size = f"{load.camera.width} x {load.camera.height} px"
@@ -134,7 +134,7 @@ def _quality(settings: Settings) -> str:
     from xrgs.bench.timing import use_threads
 
     if settings.cell is None or settings.steps < 1:
-        raise XrgsError("quality=true needs cell=FOLDER and steps of at least 1")
+        raise XrgsError("--quality needs --cell FOLDER and --steps of at least 1")
     with use_threads(settings.threads or usable_cores()):
         rows = quality.compare(Path(settings.cell), settings.steps)
     if settings.json is not None:

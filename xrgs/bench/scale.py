@@ -87,8 +87,8 @@ def _time_commands(folder: Path, axes: tuple[str, ...]) -> dict[str, tuple[float
     commands = {
         "plan, all done": ("sweep", *axes, "dry_run=true"),
         "sweep, all done: plan, record and report": ("sweep", *axes),
-        "report": ("report", "store=store"),
-        "status": ("status", "store=store"),
+        "report": ("report", "--store", "store"),
+        "status": ("status", "--store", "store"),
     }
     return {what: _run(folder, *command)[1] for what, command in commands.items()}
 

@@ -6,25 +6,24 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
-from omegaconf import OmegaConf
 from tyro.conf import Positional, arg
 from tyro.extras import literal_type_from_choices
 
-from xrgs import composing, config
+from xrgs import config
 from xrgs.cli import options
-from xrgs.cli.hydra_words import explained, files, with_quotes
 from xrgs.cli.options import STORE, Folder, Names, OptionalFolder, shown_as
 from xrgs.errors import XrgsError
 from xrgs.experiment.store import Store
 from xrgs.runtime.streams import say
-from xrgs.sweep import variants
 
 if TYPE_CHECKING:
     from xrgs.safeio.confined import ConfinedPath
 
     Dataset = str
 else:
-    Dataset = literal_type_from_choices(files("data"))
+    Dataset = literal_type_from_choices(
+        sorted(file.stem for file in (config.CONF_DIR / "data").glob("*.yaml"))
+    )
 
 
 def download(
@@ -47,6 +46,8 @@ def download(
         max_bytes: The largest size that is downloaded, in place of the known one.
         redirect_hosts: Hosts to which the address may redirect; no others are followed.
     """
+    from omegaconf import OmegaConf
+
     from xrgs.capture.download.scenes import fetch_scenes
     from xrgs.capture.download.settings import DatasetConf
 
@@ -86,11 +87,13 @@ def inspect(
             takes them: scene=llff/fern variant.factor=4. A variant that the store lacks is built.
         out: The file of the sheet; by default it is named after the variant.
     """
+    from xrgs import composing
+    from xrgs.cli.hydra_words import explained, with_quotes
     from xrgs.report.variant import describe
+    from xrgs.sweep import variants
 
     if not variant:
         raise XrgsError("inspect: give a variant's folder, or scene=NAME and other keys")
-    options.refuse_assignments("xrgs-data", [word for word in variant if word.startswith("out=")])
     folder: Path | ConfinedPath = Path(variant[0])
     if len(variant) > 1 or ("=" in variant[0] and not folder.exists()):
         with explained():

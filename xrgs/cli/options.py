@@ -23,7 +23,7 @@ from xrgs.runtime.streams import ignore_broken_pipe, say
 from xrgs.safeio.words import for_line
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator, Mapping, Sequence
+    from collections.abc import Callable, Iterator, Mapping
 
 STORE = Path("xrgs-store")
 
@@ -45,7 +45,6 @@ _CONFIG = (
     FlagCreatePairsOff,  # no --no-dry-run beside --dry-run
     OmitArgPrefixes,  # --scenes, not --which.scenes, for an option in a dataclass
 )
-_ASSIGNMENT = re.compile(r"([a-z][a-z_]*)=(.*)", re.DOTALL)
 _WRONG_USAGE = 2  # as tyro and argparse end
 
 
@@ -70,9 +69,11 @@ def run(
         SystemExit: With code 1 on an `XrgsError`, and with code 2 on wrong usage.
     """
     answer_version(command)
-    with errors_as_messages(command):
-        if not overrides or sys.argv[1:2] != [overrides]:
-            refuse_assignments(command, sys.argv[1:])
+    # Of a subcommand with overrides, `out` alone is an option that is no key of Hydra's config.
+    name = "out" if sys.argv[1:2] == [overrides] else "[a-z][a-z_]*"
+    assignment = re.compile(f"({name})=(.*)", re.DOTALL)
+    with errors_as_messages(command, assignment):
+        _refuse_assignments(command, assignment)
         if callable(target):
             tyro.cli(_unwrapped(target), prog=command, config=_CONFIG)
             return
@@ -88,30 +89,30 @@ def _unwrapped(function: Callable[..., None]) -> Callable[..., None]:
     return function
 
 
-def refuse_assignments(command: str, words: Sequence[str]) -> None:
-    """End a command that was given `KEY=VALUE`, and say how its options are written.
+def _refuse_assignments(command: str, assignment: re.Pattern[str]) -> None:
+    """End a command that was given `KEY=VALUE`, and say how its options are written."""
+    for word in sys.argv[1:]:
+        if found := assignment.fullmatch(word):
+            values = [] if found[2] == "true" else found[2].split(",")
+            written = shlex.join([_option(found[1]), *values])
+            say(for_line(f"{command}: {word}: options are written {written}"), sys.stderr)
+            sys.exit(_WRONG_USAGE)
 
-    Raises:
-        SystemExit: With code 2, after the message was printed.
-    """
-    for word in words:
-        found = _ASSIGNMENT.fullmatch(word)
-        if found is None or Path(word).exists():
-            continue
-        option, value = f"--{found[1].replace('_', '-')}", found[2]
-        written = shlex.join([option, *([] if value == "true" else value.split(","))])
-        say(for_line(f"{command}: {word}: options are written {written}"), sys.stderr)
-        sys.exit(_WRONG_USAGE)
+
+def _option(name: str) -> str:
+    return f"--{name.replace('_', '-')}"
 
 
 @contextmanager
-def errors_as_messages(command: str) -> Iterator[None]:
+def errors_as_messages(command: str, argument: re.Pattern[str] | None = None) -> Iterator[None]:
     """End the command with a message and code 1 on errors that the user can correct.
 
     A reader of its output that ends first, as `head` does, is no error.
 
     Args:
         command: Name of the command, which begins the message.
+        argument: Finds the name and the rest of a message about a function's argument, as
+            `out=FOLDER: it exists`. It is printed as one about the option: `--out FOLDER: ...`.
 
     Raises:
         SystemExit: With the message, in place of the error.
@@ -120,7 +121,10 @@ def errors_as_messages(command: str) -> Iterator[None]:
     try:
         yield
     except XrgsError as error:
-        sys.exit(for_line(f"{command}: {error}"))
+        message = str(error)
+        if argument and (found := argument.fullmatch(message)):
+            message = f"{_option(found[1])} {found[2]}"
+        sys.exit(for_line(f"{command}: {message}"))
 
 
 def answer_version(command: str) -> None:

@@ -23,7 +23,7 @@ from xrgs.runtime.signals import exit_on_signal
 from xrgs.runtime.streams import ignore_broken_pipe, say
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Iterator, Sequence
 
 #: The variable of the environment by which Hydra leaves errors to its caller.
 _FULL_ERROR = "HYDRA_FULL_ERROR"
@@ -146,7 +146,7 @@ def _rerun(arguments: list[str]) -> None:
 
     hint = " (rerun= takes out=, store=, threads=, scene.path= and plugins=)"
     with errors_as_messages("xrgs-sweep"), explained(hint):
-        conf = OmegaConf.merge(OmegaConf.structured(RerunConf), _texts(arguments))
+        conf = OmegaConf.merge(OmegaConf.structured(RerunConf), texts(arguments))
         out, store = (Path(path) if path else None for path in (conf.out, conf.store))
         photographs, plugins = conf.scene.path, conf.plugins.split(",")
         result = rerun(Path(conf.rerun), out, store, conf.threads, photographs, plugins)
@@ -155,7 +155,7 @@ def _rerun(arguments: list[str]) -> None:
         sys.exit(1)
 
 
-def _texts(words: list[str]) -> DictConfig:
+def texts(words: Sequence[str]) -> DictConfig:
     """Return `KEY=VALUE` words as a config of texts, which a merge into a schema converts."""
     conf = OmegaConf.create({})
     for word in words:

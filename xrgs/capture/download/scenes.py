@@ -90,7 +90,7 @@ def _download(conf: DatasetConf, archive: Path, root: Path, expected: str) -> No
     try:
         download(conf.url, archive, conf.max_bytes, expected, conf.redirect_hosts)
     except TooLargeError as error:
-        raise XrgsError(f"{error}: if it is the right file, give a larger max_bytes=") from error
+        raise XrgsError(f"{error}: if it is the right file, give a larger --max-bytes") from error
     except XrgsError as error:
         record = _digest_file(archive)
         hint = f" ({record} has that of its first use)" if expected and not conf.sha256 else ""
@@ -130,6 +130,6 @@ def _record_digest(conf: DatasetConf, archive: Path, digest: str) -> str:
     if is_first:
         return (
             f"{archive}: sha256 not verified: none in config. It is {digest}, from now on verified "
-            f"by {record}; sha256={digest} verifies it elsewhere"
+            f"by {record}; --sha256 {digest} verifies it elsewhere"
         )
     return f"{archive}: sha256 verified: {digest}"
