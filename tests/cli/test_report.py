@@ -68,4 +68,4 @@ def test_a_sweep_that_is_not_there_is_named(call_command: RunCommand, tmp_path: 
     (tmp_path / "s" / "sweeps").mkdir(parents=True)
     code, _, err = call_command("report", "--sweep", "nope", "--store", "s")
     assert code == 1
-    assert err.startswith("xrgs-report: --sweep nope: ")
+    assert err.startswith("xrgs-report: s/sweeps/nope.json: ")
