@@ -2,21 +2,17 @@
 
 from __future__ import annotations
 
-import os
 import shutil
 from collections.abc import Callable
 from pathlib import Path
 
-import numpy as np
 import pytest
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.errors import HydraException
 from omegaconf.errors import ConfigKeyError
-from PIL import Image
 
 from xrgs import config
-from xrgs.capture import images
-from xrgs.capture.scenes import folder, motorcycle
+from xrgs.capture.scenes import motorcycle
 from xrgs.cli.hydra_words import explained, with_quotes
 from xrgs.cli.sweep import texts
 from xrgs.errors import XrgsError
@@ -60,24 +56,9 @@ def test_lists_quotes_and_other_keys_stay_as_they_are() -> None:
     assert with_quotes(["store=é,b c"]) == ["store='é,b c'"]
 
 
-def test_bytes_that_are_not_unicode_are_named(tmp_path: Path) -> None:
+def test_bytes_that_are_not_unicode_are_named() -> None:
     with pytest.raises(XrgsError, match=r"store=\\udcff.*not valid Unicode"):
         with_quotes(["store=\udcff"])
-    for name in (b"a.png", b"\xff.png"):
-        Image.new("RGB", (9, 9)).save(os.path.join(os.fsencode(tmp_path), name), "PNG")  # noqa: PTH118
-    with pytest.raises(XrgsError, match=r"udcff.*rename it"):
-        folder.list_photographs(str(tmp_path), 0)
-
-
-@pytest.mark.parametrize("names", [("a.png", "a.jpg"), ("A.png", "a.png"), (ACCENT, WHOLE)])
-def test_photographs_that_would_be_one_file_somewhere_are_named(
-    tmp_path: Path, names: tuple[str, str]
-) -> None:
-    for name in names:
-        file = tmp_path / (name if "." in name else f"{name}.png")
-        images.save(file, np.zeros((9, 9, 3), np.float32))
-    with pytest.raises(XrgsError, match="two images of one name"):
-        folder.list_photographs(str(tmp_path), 0)
 
 
 def test_a_path_with_commas_may_end_with_all_folders_below(tmp_path: Path) -> None:
