@@ -1,4 +1,4 @@
-"""Registers the sweeper with Hydra, the folder `sweeps/`, and launchers that can be installed.
+"""Registers with Hydra the schema, the sweeper, the folder `sweeps/`, and missing launchers.
 
 Hydra loads plugins from this namespace package only. It imports every plugin when it starts, so
 this file stays light: the work is done in `xrgs.sweep.study`. Hydra executes the file before adding
@@ -17,7 +17,7 @@ from hydra.plugins.sweeper import Sweeper
 from hydra.types import HydraContext, TaskFunction
 from omegaconf import DictConfig, OmegaConf
 
-from xrgs.config import CONF_DIR
+from xrgs.config import CONF_DIR, Conf
 
 
 @dataclass
@@ -29,6 +29,8 @@ class XrgsSweeperConf:
     """Axes that a file of `sweeps/` sets: comma-separated values by the override's key."""
 
 
+#: `conf/config.yaml` is checked against it.
+ConfigStore.instance().store(name="xrgs_schema", node=Conf, provider="xrgs")
 ConfigStore.instance().store(
     group="hydra/sweeper", name="xrgs", node=XrgsSweeperConf, provider="xrgs"
 )

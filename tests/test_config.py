@@ -2,21 +2,34 @@
 
 from __future__ import annotations
 
+import json
 import re
+import subprocess
+import sys
 from collections.abc import Callable, Iterator
-from dataclasses import asdict, fields, is_dataclass, replace
+from dataclasses import MISSING, Field, asdict, dataclass, fields, is_dataclass, replace
+from functools import reduce
+from operator import getitem
 from pathlib import Path
-from typing import Any
+from typing import Any, get_type_hints
 
 import pytest
 import yaml
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
-from omegaconf import MISSING, OmegaConf
+from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from xrgs.composing import error_line, escape_interpolations, from_dict, from_file
-from xrgs.config import CONF_DIR, Conf, SplatConf
+from xrgs.config import (
+    CONF_DIR,
+    ComponentsConf,
+    Conf,
+    MipConf,
+    SupersampledConf,
+    identity_values,
+    off,
+)
 from xrgs.errors import XrgsError
 from xrgs.splat.settings import DensifySettings, OptimizerSettings, RasterSettings
 
@@ -30,14 +43,14 @@ SETTINGS: dict[str, RasterSettings | OptimizerSettings | DensifySettings] = {
 }
 
 
-def schema_keys(schema: Any, prefix: str = "") -> Iterator[tuple[str, Any]]:
-    """Every key of a schema that is no group of keys, with its default."""
+def schema_keys(schema: type[Any] = Conf, prefix: str = "") -> Iterator[tuple[str, Field[Any]]]:
+    """Every key of a schema that is no group of keys, with its declaration."""
+    types = get_type_hints(schema)
     for entry in fields(schema):
-        default = getattr(schema, entry.name)
-        if is_dataclass(default):
-            yield from schema_keys(default, f"{prefix}{entry.name}.")
+        if is_dataclass(types[entry.name]):
+            yield from schema_keys(types[entry.name], f"{prefix}{entry.name}.")
         else:
-            yield prefix + entry.name, default
+            yield prefix + entry.name, entry
 
 
 def yaml_leaves(file: Path) -> Iterator[tuple[str, int, Any]]:
@@ -65,7 +78,19 @@ def baseline_leaves() -> dict[str, int]:
 
 def test_the_file_of_the_baseline_has_every_key_of_the_schema() -> None:
     keys = {name for name in baseline_leaves() if not name.startswith("hydra.")}
-    assert keys == {name for name, _ in schema_keys(Conf())}
+    assert keys == {name for name, _ in schema_keys()}
+
+
+def test_the_values_of_the_baseline_are_of_the_schemas_types() -> None:
+    """As they are in the file: OmegaConf would convert `"1"` for a number."""
+    conf = OmegaConf.load(CONF_DIR / "config.yaml")
+    assert isinstance(conf, DictConfig)
+    OmegaConf.update(conf, "scene", {"name": "x", "kind": "folder"}, merge=True)
+    names = [entry.name for entry in fields(Conf)]
+    values = OmegaConf.to_container(OmegaConf.masked_copy(conf, names), resolve=True)
+    assert isinstance(values, dict)
+    values["lpips"] = {"fetch": True}  # from a variable of the environment, always a text
+    assert asdict(from_dict(values)).keys() == values.keys()
 
 
 def test_every_key_of_the_baseline_has_a_comment() -> None:
@@ -87,7 +112,11 @@ def test_lines_of_the_baseline_fit_a_screen() -> None:
 
 def test_only_the_splat_library_has_values_of_its_own() -> None:
     """Every other value has its one home in `conf/`."""
-    defaults = {name for name, default in schema_keys(Conf()) if default not in (MISSING, {})}
+    defaults = {
+        name
+        for name, entry in schema_keys()
+        if not (entry.default is MISSING and entry.default_factory is MISSING)
+    }
     own = {f"splat.{group}.{entry.name}" for group in SETTINGS for entry in fields(SETTINGS[group])}
     assert defaults == own
 
@@ -192,6 +221,151 @@ def test_texts_are_taken_literally(baseline: Conf, text: str) -> None:
     assert from_dict(asdict(conf)) == conf
 
 
+@pytest.mark.parametrize("group", ["ablation", "preset", "variant"])
+def test_every_config_is_read_back_from_json(group: str, compose: Compose) -> None:
+    plus = "+" if group == "ablation" else ""
+    for file in sorted((CONF_DIR / group).glob("*.yaml")):
+        conf = compose(f"{plus}{group}={file.stem}")
+        assert from_dict(json.loads(json.dumps(asdict(conf)))) == conf, file
+
+
+@pytest.mark.parametrize(
+    ("key", "value", "message"),
+    [
+        ("train.steps", "many", "train.steps: Expected `int`"),
+        ("train.steps", 1.5, "train.steps: Expected `int`"),
+        ("train.validation", True, "train.validation: Expected `float`"),
+        ("train.validation", 10**400, "train.validation: "),
+        ("variant.test", ["a", 1], "variant.test[1]: Expected `str`"),
+        ("splat.raster.background", [0.0, 0.0], "splat.raster.background: Expected `array`"),
+        ("components", [], "components: Expected `object`"),
+        ("components.mip.bogus", 1, "components.mip.bogus: there is no such key"),
+    ],
+)
+def test_a_wrong_value_is_refused_by_its_key(
+    baseline: Conf, key: str, value: object, message: str
+) -> None:
+    values = asdict(baseline)
+    *groups, name = key.split(".")
+    reduce(getitem, groups, values)[name] = value
+    with pytest.raises(XrgsError, match=f"^{re.escape(message)}"):
+        from_dict(values)
+
+
+@pytest.mark.parametrize("key", ["seed", "train.steps", "splat.raster.eps2d", "components"])
+def test_a_missing_key_is_refused_by_its_name(baseline: Conf, key: str) -> None:
+    values = asdict(baseline)
+    *groups, name = key.split(".")
+    del reduce(getitem, groups, values)[name]
+    with pytest.raises(XrgsError, match=rf"^{key}.*: is missing"):
+        from_dict(values)
+
+
+def test_whole_numbers_become_floats(baseline: Conf) -> None:
+    values = asdict(baseline)
+    values["train"]["validation"] = 0
+    conf = from_dict(values)
+    assert type(conf.train.validation) is float
+    assert conf == baseline
+
+
+def test_a_file_from_before_a_key_was_added_takes_the_baselines_value(
+    baseline: Conf, tmp_path: Path
+) -> None:
+    values = asdict(baseline)
+    del (
+        values["components"]["skip_backward"],
+        values["splat"]["raster"]["absgrad"],
+        values["limits"],
+    )
+    (file := tmp_path / "config.json").write_text(json.dumps(values))
+    conf, added = from_file(file)
+    assert conf == baseline
+    assert added == {
+        "splat.raster.absgrad": False,
+        "components.skip_backward.share": 1.0,
+        "components.skip_backward.tolerance": 0.0,
+        "components.skip_backward.decay": 0.95,
+        "components.skip_backward.begin": 15_000,  # in the file, splat.densify.stop
+        "limits.minutes": 0.0,
+        "limits.memory_gb": 0.0,
+    }
+
+
+def test_the_process_of_a_cell_reads_its_config_without_hydra(
+    baseline: Conf, tmp_path: Path
+) -> None:
+    (file := tmp_path / "config.json").write_text(json.dumps(asdict(baseline)))
+    script = (
+        "import sys; from pathlib import Path; import xrgs.sweep.jobs.worker, xrgs.experiment.cell;"
+        "from xrgs.composing import from_dict, from_file;"
+        f"conf, _ = from_file(Path({str(file)!r}));"
+        "from dataclasses import asdict; assert from_dict(asdict(conf)) == conf;"
+        "sys.exit(str({'hydra', 'omegaconf'} & sys.modules.keys() or ''))"
+    )
+    done = subprocess.run(
+        [sys.executable, "-P", "-c", script], capture_output=True, text=True, check=False
+    )
+    assert done.stderr.strip() == ""
+
+
+def test_the_baseline_has_no_component_in_its_identity(compose: Compose) -> None:
+    conf = compose()
+    assert identity_values(conf.components) == {}
+    assert identity_values(conf.train) == {"steps": conf.train.steps, "views": "mixed"}
+
+
+def test_an_identity_has_what_is_on(compose: Compose) -> None:
+    conf = compose(
+        "components.mip.variance=0.2",
+        "components.supersampled.late_factor=2",
+        "components.consistency.l1=0.5",
+        "+components.plugins.one.weight=0.5",
+        "splat.raster.antialiased=true",
+    )
+    assert identity_values(conf.components) == {
+        "supersampled": {"late_factor": 2, "late_from": 15_000},
+        "mip": {"variance": 0.2, "every": 100},
+        "plugins": {"one": {"weight": 0.5}},
+    }
+    raster = identity_values(conf.splat)["raster"]
+    assert raster["antialiased"] is True
+    assert "absgrad" not in raster
+    assert json.loads(json.dumps(raster)) == raster
+
+
+@dataclass(kw_only=True)
+class NewMipConf(MipConf):
+    """A component with a key that was added."""
+
+    added: int = off(3)
+
+
+@dataclass(kw_only=True)
+class NewComponentsConf(ComponentsConf):
+    """The components, and one that was added."""
+
+    mip: NewMipConf
+    added: SupersampledConf
+
+
+@settings(deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(variance=st.sampled_from([0.0, 0.2]), every=st.integers(), late_from=st.integers())
+def test_what_is_added_and_off_changes_no_identity(
+    baseline: Conf, variance: float, every: int, late_from: int
+) -> None:
+    old = replace(baseline.components, mip=MipConf(variance=variance, every=every))
+    new = NewComponentsConf(
+        **vars(old) | {"mip": NewMipConf(variance=variance, every=every, added=3)},
+        added=SupersampledConf(factor=1, late_factor=1, late_from=late_from),
+    )
+    assert identity_values(new) == identity_values(old)
+    new.added.factor = 2
+    assert identity_values(new)["added"] == {"factor": 2, "late_from": late_from}
+    new.mip.added = 4
+    assert identity_values(new)["mip"]["added"] == 4
+
+
 @given(text=texts)
 def test_omegaconf_takes_an_escaped_text_literally(text: str) -> None:
     nested = {"a": [text, {"b": text}], "c": 1, "d": None}
@@ -202,10 +376,12 @@ def test_omegaconf_takes_an_escaped_text_literally(text: str) -> None:
 @pytest.mark.parametrize(
     ("content", "named"),
     [
-        (b"", r"config\.json: Expecting value"),
+        (b"", r"config\.json: not valid JSON"),
         (b"[1]", r"config\.json: "),
-        (b'{"train": {"steps": "many"}}', r"config\.json: .*train\.steps"),
-        (b'{"bogus": 1}', r"config\.json: .*bogus.*another version"),
+        (b'{"scene": {"name": 1, "kind": "folder"}}', r"config\.json: scene\.name: Expected"),
+        (b'{"bogus": 1}', r"config\.json: bogus: there is no such key.*another version"),
+        (b'{"scene": 3}', r"config\.json: scene: Expected"),
+        (b"{}", r"config\.json: scene\.name: is missing"),
     ],
 )
 def test_a_file_of_no_config_is_named(tmp_path: Path, content: bytes, named: str) -> None:
@@ -216,7 +392,7 @@ def test_a_file_of_no_config_is_named(tmp_path: Path, content: bytes, named: str
 
 
 def test_the_line_of_an_error_has_its_key_once() -> None:
-    conf = OmegaConf.structured(SplatConf)
+    conf = OmegaConf.create({"raster": RasterSettings})
     with pytest.raises(OmegaConfBaseException) as raised:
         conf.raster.near = "far"
     line = error_line(raised.value)

@@ -1,37 +1,66 @@
-"""Makes configs and checks them: of a command line, of nested dicts, of the file of a cell."""
+"""Makes configs and checks them: of a command line, of nested dicts, of the file of a cell.
+
+Hydra and OmegaConf are imported where a config is composed, and not where one is read back: the
+process of a cell works without them.
+"""
 
 from __future__ import annotations
 
 import math
 import re
+from copy import deepcopy
 from dataclasses import is_dataclass
-from functools import cache
+from functools import cache, reduce
+from operator import getitem
 from typing import TYPE_CHECKING, Any, cast
 
-import hydra
-from omegaconf import MISSING, DictConfig, OmegaConf
-from omegaconf.errors import OmegaConfBaseException
+import msgspec
 
-from xrgs.config import CONF_DIR, TRAINING_VIEWS, Conf, known_keys, register
-from xrgs.errors import StoreError, XrgsError, did_you_mean
-from xrgs.safeio.records import read_json
+from xrgs.config import CONF_DIR, TRAINING_VIEWS, Conf, known_keys, types_of
+from xrgs.errors import XrgsError, did_you_mean
+from xrgs.safeio.records import read_struct
 from xrgs.splat.backend import CHOICES
 from xrgs.splat.settings import NOMINAL_STEPS, SPLITS
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Mapping
+    from collections.abc import Iterator
     from pathlib import Path
 
-    from xrgs.config import ComponentsConf
-    from xrgs.safeio.confined import ConfinedPath
+    from omegaconf import DictConfig
 
 #: The start of an interpolation, with the backslashes before it: an odd number of them escapes it.
 _INTERPOLATION = re.compile(r"(\\*)\$\{")
+#: Where msgspec found an error, at the end of its message: "... - at `$.train.steps`".
+_AT = re.compile(r" - at `\$\.?(.*)`$")
+#: What `conf/config.yaml` has in place of a value that a file of `conf/scene/` sets.
+_OPEN = "???"
 _RETRY = ("none", "failed")
 
 
+def compose(*overrides: str) -> Conf:
+    """Return the config that a command line of `xrgs-sweep` would give to a cell.
+
+    Args:
+        overrides: Hydra overrides without axes, as `preset=smoke`, `+ablation=consistency` or
+            `train.steps=100`; none gives the baseline of `conf/config.yaml`.
+
+    Raises:
+        HydraException: An override is malformed, or there is no such key or file.
+        OmegaConfBaseException: A value is missing or of another type; the message names its key.
+        XrgsError: A value is out of its range; the message names its key.
+
+    Example:
+        >>> compose("preset=smoke", "train.steps=100").train.steps
+        100
+    """
+    import hydra
+
+    with hydra.initialize_config_dir(str(CONF_DIR), version_base="1.3"):
+        return to_conf(hydra.compose("config", list(overrides)))
+
+
 def to_conf(cfg: DictConfig) -> Conf:
-    """Convert a composed Hydra config to dataclasses, every value present and of its type.
+    """Convert a config that Hydra composed, and check its ranges and choices.
 
     Args:
         cfg: A config composed from `conf/config.yaml`, whose defaults contain the schema.
@@ -40,18 +69,19 @@ def to_conf(cfg: DictConfig) -> Conf:
         The config, its interpolations resolved.
 
     Raises:
-        OmegaConfBaseException: A value is missing or of another type; the message names its key.
-        XrgsError: A value is out of its range, or a key is unknown; the message names the key.
+        OmegaConfBaseException: A value is missing; the message names its key.
+        XrgsError: A value is out of its range or of another type, or a key is unknown; the message
+            names the key.
     """
-    # The schema is in the config's own defaults, so its nodes are typed and checked already. To
-    # merge it in once more takes twenty times as long, and a plan composes many configs.
-    names = Conf.__dataclass_fields__
-    for name in map(str, cfg):
-        if name not in names and name != "hydra":
-            raise XrgsError(f"{name}: there is no such key{did_you_mean(name, known_keys())}")
-    conf = Conf(**{name: _as_object(cfg, name) for name in names})
-    _check_known(conf, "")
-    _check_plugins(conf.components)
+    from omegaconf import OmegaConf
+
+    def plain(name: str) -> Any:
+        value = cfg[name]
+        if not OmegaConf.is_config(value):
+            return value
+        return OmegaConf.to_container(value, resolve=True, throw_on_missing=True)
+
+    conf = from_dict({name: plain(name) for name in map(str, cfg) if name != "hydra"})
     _check_ranges(conf)
     _check_choices(conf)
     return conf
@@ -96,56 +126,6 @@ def _check_choices(conf: Conf) -> None:
             raise XrgsError(f"{key}={value}: must be one of {', '.join(accepted)}")
 
 
-def compose(*overrides: str) -> Conf:
-    """Return the config that a command line of `xrgs-sweep` would give to a cell.
-
-    Args:
-        overrides: Hydra overrides without axes, as `preset=smoke`, `+ablation=consistency` or
-            `train.steps=100`; none gives the baseline of `conf/config.yaml`.
-
-    Raises:
-        HydraException: An override is malformed, or there is no such key or file.
-        OmegaConfBaseException: A value is missing or of another type; the message names its key.
-        XrgsError: A value is out of its range; the message names its key.
-
-    Example:
-        >>> compose("preset=smoke", "train.steps=100").train.steps
-        100
-    """
-    register()
-    with hydra.initialize_config_dir(str(CONF_DIR), version_base="1.3"):
-        return to_conf(hydra.compose("config", list(overrides)))
-
-
-def _as_object(cfg: DictConfig, name: str) -> Any:
-    value = cfg[name]
-    return OmegaConf.to_object(value) if OmegaConf.is_config(value) else value
-
-
-def _check_known(value: Any, path: str) -> None:
-    """Raise `XrgsError` where a `+` has added a key to the schema, which nothing would read."""
-    for name, inner in vars(value).items():
-        if name not in value.__dataclass_fields__:
-            key = f"{path}{name}"
-            raise XrgsError(f"{key}: there is no such key{did_you_mean(key, known_keys())}")
-        if is_dataclass(inner):
-            _check_known(inner, f"{path}{name}.")
-
-
-def _check_plugins(components: ComponentsConf) -> None:
-    """Check that every plugin's settings are a mapping; the plugin itself checks what is in it.
-
-    Raises:
-        XrgsError: One is something else; the message names its key.
-    """
-    for name, settings in components.plugins.items():
-        if not isinstance(settings, dict):
-            key = f"components.plugins.{name}"
-            raise XrgsError(
-                f"{key}={settings}: must be a mapping of settings, e.g. +{key}.weight=0.1"
-            )
-
-
 def from_dict(values: Any) -> Conf:
     """Convert what `dataclasses.asdict` made of a config back to the config.
 
@@ -153,28 +133,47 @@ def from_dict(values: Any) -> Conf:
     this process's environment.
 
     Args:
-        values: Nested dicts of plain values.
-
-    Returns:
-        The config.
+        values: Nested dicts of plain values, with every key.
 
     Raises:
-        OmegaConfBaseException: A key is unknown, or a value is missing or of another type.
-        TypeError: `values` is no dict of a config.
+        XrgsError: A key is unknown or missing, or a value is of another type; the message names
+            the key.
     """
-    escaped = escape_interpolations(values)
-    conf = OmegaConf.to_object(OmegaConf.merge(_schema(), escaped))
-    if not isinstance(conf, Conf):
-        raise TypeError(f"expected a config of schema Conf, got {type(conf).__name__}")
-    _check_plugins(conf.components)
+    for _, _, key in _missing(values, Conf):
+        raise XrgsError(f"{key}: is missing")
+    try:
+        conf = msgspec.convert(values, Conf)
+    except msgspec.ValidationError as error:
+        message = str(error)
+        at = _AT.search(message)
+        raise XrgsError(f"{at[1]}: {message[: at.start()]}" if at else message) from error
+    for name, settings in conf.components.plugins.items():
+        if not isinstance(settings, dict):  # the plugin itself checks what is in it
+            key = f"components.plugins.{name}"
+            raise XrgsError(
+                f"{key}={settings}: must be a mapping of settings, e.g. +{key}.weight=0.1"
+            )
     return conf
 
 
-@cache
-def _schema() -> DictConfig:
-    """Return the schema of a config, which `OmegaConf.merge` copies."""
-    schema: DictConfig = OmegaConf.structured(Conf)
-    return schema
+def _missing(values: Any, schema: Any, path: str = "") -> Iterator[tuple[Any, str, str]]:
+    """Yield the keys of a schema that nested dicts lack: the dict, the name in it, the dotted key.
+
+    msgspec would take the defaults of `xrgs.splat.settings` for missing keys, and ignore unknown
+    ones, for which this raises `XrgsError`.
+    """
+    if not isinstance(values, dict):
+        return  # msgspec refuses it
+    types = types_of(schema)
+    for name in values:
+        if name not in types:
+            key = f"{path}{name}"
+            raise XrgsError(f"{key}: there is no such key{did_you_mean(key, known_keys())}")
+    for name, kind in types.items():
+        if is_dataclass(kind):
+            yield from _missing(values.setdefault(name, {}), kind, f"{path}{name}.")
+        elif name not in values:
+            yield values, name, f"{path}{name}"
 
 
 def escape_interpolations(value: Any) -> Any:
@@ -195,11 +194,11 @@ def escape_interpolations(value: Any) -> Any:
     return _INTERPOLATION.sub(lambda match: 2 * match[1] + r"\${", value)
 
 
-def from_file(file: Path | ConfinedPath) -> tuple[Conf, dict[str, Any]]:
+def from_file(file: Path) -> tuple[Conf, dict[str, Any]]:
     """Read the config that a cell's folder holds as JSON.
 
-    A file from before a key was added lacks it. The key's value in the baseline is taken, with
-    which all that was added is off.
+    A file from before a key was added lacks it. The key's value in `conf/config.yaml` is taken,
+    with which all that was added is off.
 
     Args:
         file: The JSON file.
@@ -211,44 +210,25 @@ def from_file(file: Path | ConfinedPath) -> tuple[Conf, dict[str, Any]]:
         XrgsError: The file can't be read, or has another schema; the message names the file and
             the key.
     """
+    values = read_struct(file, Any)
+    added = {}
     try:
-        values = read_json(file)
-        added = dict(_fill_in(values, _baseline(), ""))
+        for group, name, key in _missing(values, Conf):
+            value = reduce(getitem, key.split("."), _baseline())
+            if value != _OPEN:
+                group[name] = added[key] = deepcopy(value)
         return from_dict(values), added
-    except StoreError:
-        raise
-    except OmegaConfBaseException as error:
-        raise XrgsError(
-            f"{file}: {error_line(error)} (another version of xrgs may have written it)"
-        ) from error
     except XrgsError as error:
-        raise XrgsError(f"{file}: {error}") from error
-    except (OverflowError, ValueError, TypeError) as error:
-        raise XrgsError(f"{file}: it holds no config ({error})") from error
+        raise XrgsError(f"{file}: {error} (another version of xrgs may have written it)") from error
 
 
 @cache
-def _baseline() -> Mapping[str, Any]:
-    """Return the values of `conf/config.yaml` itself; those that it leaves open are `???`."""
+def _baseline() -> Any:
+    """Return the values of `conf/config.yaml` itself as nested dicts."""
+    from omegaconf import OmegaConf
+
     conf = cast("DictConfig", OmegaConf.load(CONF_DIR / "config.yaml"))
-    names = [*Conf.__dataclass_fields__]
-    values = OmegaConf.to_container(OmegaConf.masked_copy(conf, names), resolve=True)
-    return cast("Mapping[str, Any]", values)
-
-
-def _fill_in(values: Any, baseline: Mapping[str, Any], path: str) -> Iterator[tuple[str, Any]]:
-    """Add to a config what it lacks of the baseline; yield the keys that were added, with values.
-
-    What is no mapping is left to the schema to refuse.
-    """
-    if not isinstance(values, dict):
-        return
-    for name, value in baseline.items():
-        if isinstance(value, dict):
-            yield from _fill_in(values.setdefault(name, {}), value, f"{path}{name}.")
-        elif name not in values and value != MISSING:
-            values[name] = value
-            yield f"{path}{name}", value
+    return OmegaConf.to_container(OmegaConf.masked_copy(conf, list(types_of(Conf))), resolve=True)
 
 
 def error_line(error: Exception) -> str:

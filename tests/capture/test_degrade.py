@@ -8,9 +8,9 @@ import pytest
 from PIL import Image
 
 from xrgs.capture import degrade, images
-from xrgs.config import VariantConf
+from xrgs.composing import compose
 
-CONF = VariantConf(factor=5, tags="flag", degradation="downsample", jpeg_quality=10)
+CONF = compose("variant.degradation=downsample").variant
 
 
 @pytest.fixture

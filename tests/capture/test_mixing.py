@@ -46,7 +46,9 @@ def conf(configured: Make) -> VariantConf:
 def rendered(tmp_path_factory: pytest.TempPathFactory, conf: VariantConf) -> Scene:
     cache = tmp_path_factory.mktemp("scenes")
     return scenes.resolve(
-        SceneConf("p", "procedural", None, VIEWS), ConfinedPath(cache), conf.long_side
+        SceneConf(name="p", kind="procedural", path=None, views=VIEWS),
+        ConfinedPath(cache),
+        conf.long_side,
     )
 
 

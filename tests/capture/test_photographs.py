@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from unittest.mock import Mock
 
@@ -10,11 +11,11 @@ from PIL import Image
 from xrgs.capture import images
 from xrgs.capture.photographs import assign_cameras, prepare_hr_views
 from xrgs.capture.scenes import Scene
-from xrgs.config import SfmConf, VariantConf
+from xrgs.composing import compose
 from xrgs.errors import UnreadableError, XrgsError
 from xrgs.safeio.confined import ConfinedPath
 
-CONF = VariantConf(long_side=0, factor=2, sfm=SfmConf(camera="auto"))
+CONF = compose("variant.long_side=0", "variant.factor=2").variant
 
 
 def write_photograph(
@@ -90,7 +91,7 @@ def test_a_photograph_taken_sideways_is_prepared_upright(tmp_path: Path) -> None
 def test_all_are_shrunk_by_one_scale(tmp_path: Path) -> None:
     sizes = [(200, 100), (100, 200), (120, 60), (50, 50)]
     files = [write_photograph(tmp_path / f"{i}.png", size) for i, size in enumerate(sizes)]
-    conf = VariantConf(long_side=100, factor=2, sfm=SfmConf(camera="auto"))
+    conf = replace(CONF, long_side=100)
     photos = prepare_hr_views(Scene("x", "", {file.stem: file for file in files}), conf, tmp_path)
     assert [p.hr.resized for p in photos.all] == [(100, 50), (50, 100), (60, 30), (25, 25)]
     assert [(p.hr.width, p.hr.height) for p in photos.all][-1] == (24, 24)

@@ -22,7 +22,9 @@ Make = Callable[..., VariantConf]
 @pytest.fixture
 def photos(configured: Make, tmp_path: Path) -> PhotoCollection:
     """The stereo pair, and a degraded copy of the right view that is 5 times smaller."""
-    scene = scenes.resolve(SceneConf("motorcycle", "motorcycle"), ConfinedPath(tmp_path))
+    scene = scenes.resolve(
+        SceneConf(name="motorcycle", kind="motorcycle", path=None, views=24), ConfinedPath(tmp_path)
+    )
     conf = configured(long_side=185, degradation="downsample")
     made = prepare_hr_views(scene, conf, tmp_path)
     write_degraded(made, [1], conf)
@@ -142,7 +144,9 @@ def test_small_images_are_upsampled_or_have_a_camera_of_their_own(
 def test_a_degraded_copy_of_full_size_is_given_as_it_is(
     configured: Make, sfm_conf: SfmConf, tmp_path: Path
 ) -> None:
-    scene = scenes.resolve(SceneConf("motorcycle", "motorcycle"), ConfinedPath(tmp_path))
+    scene = scenes.resolve(
+        SceneConf(name="motorcycle", kind="motorcycle", path=None, views=24), ConfinedPath(tmp_path)
+    )
     conf = configured(long_side=185, degradation="jpeg")
     assert degrade.resolve_degradation(conf) == "jpeg"
     made = prepare_hr_views(scene, conf, tmp_path)

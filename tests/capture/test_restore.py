@@ -135,8 +135,8 @@ def test_photographs_that_changed_and_are_missing_are_named(
 ) -> None:
     photographs = tmp_path / "photographs"
     photographs.mkdir()
-    scene = SceneConf("motorcycle", "folder", str(photographs))
-    conf = small_conf(SceneConf("motorcycle", "motorcycle"))
+    scene = SceneConf(name="motorcycle", kind="folder", path=str(photographs), views=24)
+    conf = small_conf(SceneConf(name="motorcycle", kind="motorcycle", path=None, views=24))
     folder = without_images(stereo_variant, tmp_path / stereo_variant.id)
     with pytest.raises(XrgsError, match="photographs"):
         made_again(folder, scene, conf)

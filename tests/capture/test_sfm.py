@@ -59,7 +59,9 @@ def test_two_views_keep_the_points_that_only_two_see(sfm_conf: SfmConf) -> None:
 def stereo_pair(tmp_path_factory: pytest.TempPathFactory, sfm_conf: SfmConf) -> StereoPair:
     """The motorcycle pair at its own size, intrinsics given."""
     work = tmp_path_factory.mktemp("pair")
-    scene = scenes.resolve(SceneConf("motorcycle", "motorcycle"), ConfinedPath(work))
+    scene = scenes.resolve(
+        SceneConf(name="motorcycle", kind="motorcycle", path=None, views=24), ConfinedPath(work)
+    )
     inputs = []
     for file in scene.files.values():
         images.save(work / file.name, images.read(file))

@@ -166,7 +166,7 @@ def photographs(tmp_path: Path, procedural_scene: SceneConf) -> Callable[[str, i
         rendered = scenes.resolve(replace(procedural_scene, views=count), cache, 252)
         for i, file in enumerate(rendered.files.values()):
             shutil.copy(str(file), tmp_path / name / f"vue d'été {i}, x.png")
-        return SceneConf("", "folder", str(tmp_path / name))
+        return SceneConf(name="", kind="folder", path=str(tmp_path / name), views=24)
 
     return copied
 
@@ -228,7 +228,10 @@ def test_fern_is_registered_at_a_reduced_size(build: Build, data_root: Path) -> 
     path = data_root / "llff" / "fern"
     if not path.is_dir():
         pytest.skip(f"{path} is not there")
-    built = build(SceneConf("fern", "folder", str(path)), sfm={"max_num_features": 2000})
+    built = build(
+        SceneConf(name="fern", kind="folder", path=str(path), views=24),
+        sfm={"max_num_features": 2000},
+    )
     assert built.report["registered"] == 20
     assert len(select(built, "test", "HR")) == 3
     assert len(select(built, "train", "HR")) == 5

@@ -22,7 +22,7 @@ from xrgs.errors import XrgsError
 from xrgs.report import variant as inspect
 from xrgs.report.render import to_text
 from xrgs.safeio.confined import ConfinedPath
-from xrgs.safeio.words import MAX_LINE
+from xrgs.safeio.sanitize import MAX_LINE
 
 Run = Callable[..., tuple[int, str, str]]
 

@@ -17,7 +17,7 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 
 import xrgs
-from xrgs.safeio import words
+from xrgs.safeio import sanitize
 
 PACKAGE = Path(xrgs.__file__).parent
 EVIL = (

@@ -71,7 +71,6 @@ def study(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., Stud
     monkeypatch.chdir(tmp_path)
 
     def made(*overrides: str) -> Study:
-        config.register()
         loader = ConfigLoader(list(overrides))
         with hydra.initialize_config_dir(str(config.CONF_DIR), version_base="1.3"):
             composed = hydra.compose("config", list(overrides), return_hydra_config=True)

@@ -96,7 +96,6 @@ def composed(tmp_path: Path) -> Callable[..., DictConfig]:
     """(*overrides) -> a sweep's config with Hydra's own part, its store in the test's folder."""
 
     def compose(*overrides: str) -> DictConfig:
-        config.register()
         with hydra.initialize_config_dir(str(config.CONF_DIR), version_base="1.3"):
             store = with_quotes([f"store={tmp_path / 's'}"])
             return hydra.compose("config", [*store, *overrides], return_hydra_config=True)

@@ -211,8 +211,8 @@ def test_a_compressed_file_is_refused_before_it_fills_the_memory(tmp_path: Path)
         ("states/optimizer/gaussians/shN", np.zeros((60, 15, 3)), "optimizer"),
         ("states/optimizer/adam/sh0/exp_avg", np.zeros((1, 1, 3), np.float32), "optimizer"),
         ("states/optimizer/adam/quats/step", np.zeros(4, np.float32), "optimizer"),
-        ("states/densifier/visible_count", np.zeros((2, 60), np.float32), "densifier"),
-        ("states/densifier/generator", np.zeros(7, np.uint8), "densifier"),
+        ("states/strategy/visible_count", np.zeros((2, 60), np.float32), "strategy"),
+        ("states/strategy/generator", np.zeros(7, np.uint8), "strategy"),
         ("states/sampler/generator", np.zeros(5056, np.float32), "sampler"),
     ],
 )

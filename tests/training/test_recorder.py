@@ -13,9 +13,9 @@ from xrgs.capture.dataset import Dataset
 from xrgs.config import Conf
 from xrgs.splat.gaussians import PARAMETERS, Gaussians, from_points
 from xrgs.splat.optimizer import SplatOptimizer
-from xrgs.splat.rasterize import Render
-from xrgs.splat.refinement import Refinement
+from xrgs.splat.rendering import Render
 from xrgs.splat.settings import OptimizerSettings
+from xrgs.splat.strategy.refinement import Refinement
 from xrgs.training import components, loop, recorder
 from xrgs.training.components import Step
 from xrgs.training.recorder import TrainingRecorder

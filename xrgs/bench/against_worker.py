@@ -64,7 +64,7 @@ def render_task(load: Load) -> Callable[[], None]:
     Args:
         load: What is rendered.
     """
-    rasterize = _find("xrgs.splat.rasterize", "rasterize_parameters", "rasterize")
+    rasterize = _find("xrgs.splat.rendering", "rasterize_parameters", "rasterize")
     settings = _find("xrgs.splat.settings", "RasterSettings")()
     leaves = [value.clone().requires_grad_() for value in load.parameters]
     shape = (load.camera.height, load.camera.width, 3)
@@ -86,7 +86,7 @@ def step_task(load: Load) -> Callable[[], None]:
     Args:
         load: What is trained.
     """
-    rasterize = _find("xrgs.splat.rasterize", "rasterize_parameters", "rasterize")
+    rasterize = _find("xrgs.splat.rendering", "rasterize_parameters", "rasterize")
     settings = _find("xrgs.splat.settings", "RasterSettings")()
     loss = _find("xrgs.splat.loss", "photometric_loss")
     camera = load.camera
@@ -107,7 +107,7 @@ def step_task(load: Load) -> Callable[[], None]:
     never = _find("xrgs.splat.settings", "DensifySettings")(
         start=0, grow_grad2d=math.inf, prune_opacity=0.0, prune_scale3d=math.inf
     )
-    densifier = _find("xrgs.splat.densify", "Densifier")(
+    strategy = _find("xrgs.splat.strategy.default", "DefaultStrategy")(
         optimizer, never, scene_scale=1.0, generator=torch.Generator()
     )
 
@@ -134,7 +134,7 @@ def step_task(load: Load) -> Callable[[], None]:
         optimizer.step(camera, sh_degree=SH_DEGREE)
         # Step 1 gathers statistics; only every hundredth or so refines.
         size = {"width": camera.width, "height": camera.height}
-        densifier.after_step(1, offset.grad, rendered.visible, **size)
+        strategy.after_step(1, offset.grad, rendered.visible, **size)
 
     return run
 

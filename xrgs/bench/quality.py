@@ -16,7 +16,7 @@ from xrgs.bench.loads import load_cell_dataset
 from xrgs.evaluation import metrics
 from xrgs.safeio.records import read_json
 from xrgs.splat.backend import resolve_backend
-from xrgs.splat.rasterize import rasterize_parameters
+from xrgs.splat.rendering import rasterize_parameters
 from xrgs.training.count_matching import train_cell
 
 if TYPE_CHECKING:

@@ -13,7 +13,7 @@ from torch import Tensor
 from xrgs.bench.loads import Load
 from xrgs.bench.timing import Timings, time_interleaved, use_threads
 from xrgs.splat.gaussians import ActivatedGaussians
-from xrgs.splat.rasterize import Render, rasterize_parameters
+from xrgs.splat.rendering import Render, rasterize_parameters
 from xrgs.splat.settings import CullingOptions, RasterSettings
 
 #: Width and height, px, of the view in which a render is compared to one in float64.

@@ -24,7 +24,7 @@ from xrgs.runtime.machine import peak_rss, usable_cores
 from xrgs.runtime.progress import progress
 from xrgs.safeio.atomic import write_json
 from xrgs.safeio.records import table_text
-from xrgs.safeio.words import for_csv
+from xrgs.safeio.sanitize import for_csv
 from xrgs.splat.backend import resolve_backend
 
 if TYPE_CHECKING:

@@ -13,13 +13,13 @@ from torch.nn.functional import interpolate
 
 from xrgs.bench.loads import Load
 from xrgs.bench.timing import Timings, time_interleaved, use_threads
-from xrgs.splat.densify import Densifier
 from xrgs.splat.gaussians import PARAMETERS, Gaussians
 from xrgs.splat.loss import photometric_loss, prepare_target
 from xrgs.splat.optimizer import SplatOptimizer
-from xrgs.splat.rasterize import rasterize_parameters
+from xrgs.splat.rendering import rasterize_parameters
 from xrgs.splat.resample import resize
 from xrgs.splat.settings import DensifySettings, OptimizerSettings, RasterSettings
+from xrgs.splat.strategy.default import DefaultStrategy
 
 L1, SSIM = 0.8, 0.2  # weights of the photometric loss
 #: Computes the loss; returns its gradient with respect to the image.
@@ -220,7 +220,7 @@ class TrainingStep:
         self.settings = DensifySettings(
             start=0, grow_grad2d=math.inf, prune_opacity=0.0, prune_scale3d=math.inf
         )
-        self.densifier = Densifier(
+        self.strategy = DefaultStrategy(
             self.optimizer, self.settings, scene_scale=1.0, generator=torch.Generator()
         )
         self.render()
@@ -271,7 +271,7 @@ class TrainingStep:
     def _after_step(self, step: int) -> None:
         camera = self.camera
         with use_threads(self.threads):
-            self.densifier.after_step(
+            self.strategy.after_step(
                 step,
                 self.offset.grad,
                 self.rendered.visible,

@@ -11,7 +11,7 @@ from xrgs.capture import images
 from xrgs.capture.images import ImageError
 from xrgs.errors import UnreadableError
 from xrgs.runtime.progress import progress
-from xrgs.safeio.words import MAX_CELL, for_line
+from xrgs.safeio.sanitize import MAX_CELL, for_line
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence

@@ -131,7 +131,7 @@ def _normalized(variant: Variant, posed: list[View]) -> NormalizedScene:
             return normalize_scene(np.stack([view.viewmat for view in posed]), variant.points)
     except (FloatingPointError, ValueError, np.linalg.LinAlgError) as error:
         why = f"its cameras and points can't be of one scene ({error})"
-        raise XrgsError(f"{variant.path}: {why}") from error
+        raise XrgsError(f"{variant.folder}: {why}") from error
 
 
 def _held_out(variant: Variant, share: float, seed: int) -> list[View]:

@@ -8,20 +8,28 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+from msgspec import Struct
+
 from xrgs.errors import StoreError
-from xrgs.safeio.confined import confined
-from xrgs.safeio.records import read_object
+from xrgs.safeio.files import list_names
+from xrgs.safeio.records import read_struct
 
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from xrgs.safeio.confined import ConfinedPath
 
 #: The beginning of the name of a failed scene's folder; the key of its variant follows.
 FAILED_PREFIX = "failed-"
 
 
-def read_failure(folder: ConfinedPath) -> tuple[str, str]:
+class _FailureReport(Struct):
+    """What is read of `report.json`; the rest says how SfM went."""
+
+    scene: str
+    reason: str
+
+
+def read_failure(folder: Path) -> tuple[str, str]:
     """Read which scene could not be made into a variant, and why.
 
     Args:
@@ -35,14 +43,11 @@ def read_failure(folder: ConfinedPath) -> tuple[str, str]:
         StoreError: The report is missing or damaged.
     """
     file = folder / "report.json"
-    report = read_object(file)
-    scene, reason = report.get("scene"), report.get("reason")
-    if not isinstance(scene, str) or not isinstance(reason, str):
-        raise StoreError(f"{file}: it has no scene or no reason")
-    return scene, reason
+    report = read_struct(file, _FailureReport)
+    return report.scene, report.reason
 
 
-def failed_scenes(variants: Path | ConfinedPath) -> dict[str, tuple[str, str]]:
+def failed_scenes(variants: Path) -> dict[str, tuple[str, str]]:
     """List the scenes that could not be made into a variant.
 
     Args:
@@ -55,13 +60,12 @@ def failed_scenes(variants: Path | ConfinedPath) -> dict[str, tuple[str, str]]:
     Raises:
         OSError: The folder can't be read; it may be missing.
     """
-    folder = confined(variants)
     failed = {}
-    for name in folder.folders():
+    for name in list_names(variants):
         if not name.startswith(FAILED_PREFIX):
             continue
         try:
-            why = read_failure(folder / name)
+            why = read_failure(variants / name)
         except StoreError as error:
             why = "?", str(error)
         failed[name.removeprefix(FAILED_PREFIX)] = why

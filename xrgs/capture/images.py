@@ -19,7 +19,7 @@ from PIL import Image, ImageOps
 
 from xrgs.errors import UnreadableError, XrgsError
 from xrgs.safeio.atomic import atomic_writer
-from xrgs.safeio.confined import ConfinedPath, confined, is_passing
+from xrgs.safeio.files import is_transient
 
 if TYPE_CHECKING:
     from typing import BinaryIO
@@ -55,7 +55,7 @@ if Image.MAX_IMAGE_PIXELS is not None:
 
 @contextmanager
 def _opened(
-    path: Path | ConfinedPath, formats: tuple[str, ...] = _FORMATS, max_pixels: int = MAX_PIXELS
+    path: Path, formats: tuple[str, ...] = _FORMATS, max_pixels: int = MAX_PIXELS
 ) -> Iterator[Image.Image]:
     """Open an image whose header declares at most so many pixels.
 
@@ -63,7 +63,7 @@ def _opened(
     """
     try:
         with (
-            confined(path).open() as stream,
+            path.open("rb") as stream,
             Image.open(stream, formats=_known(formats, stream)) as image,
         ):
             if image.width * image.height > max_pixels:
@@ -74,7 +74,7 @@ def _opened(
         raise
     except Exception as error:  # PIL raises nearly anything on a damaged file
         # PIL's own OSErrors, of truncated files, have no number.
-        if isinstance(error, OSError) and error.errno is not None and is_passing(error):
+        if isinstance(error, OSError) and error.errno is not None and is_transient(error):
             raise UnreadableError(f"{path}: {error.strerror}; try again") from error
         why = error.strerror if isinstance(error, OSError) and error.strerror else error
         raise ImageError(f"{path}: unreadable or truncated image ({why})") from error
@@ -96,7 +96,7 @@ def _known(formats: tuple[str, ...], stream: BinaryIO) -> tuple[str, ...]:
     return formats
 
 
-def size(path: Path | ConfinedPath) -> tuple[int, int]:
+def size(path: Path) -> tuple[int, int]:
     """Read the size that `read` would give a photograph; most formats have it in the header.
 
     Args:
@@ -114,7 +114,7 @@ def size(path: Path | ConfinedPath) -> tuple[int, int]:
         return (image.height, image.width) if transposed else (image.width, image.height)
 
 
-def exif_camera(path: Path | ConfinedPath) -> str:
+def exif_camera(path: Path) -> str:
     """Read from EXIF which camera and focal length took a photograph.
 
     Args:
@@ -135,7 +135,7 @@ def exif_camera(path: Path | ConfinedPath) -> str:
     return "/".join("" if value is None else str(value).strip("\0 ") for value in values).strip("/")
 
 
-def read(path: Path | ConfinedPath) -> ImageArray:
+def read(path: Path) -> ImageArray:
     """Read a photograph as RGB, with the EXIF orientation applied.
 
     Args:
@@ -159,7 +159,7 @@ def read(path: Path | ConfinedPath) -> ImageArray:
 
 
 def read_png(
-    path: Path | ConfinedPath,
+    path: Path,
     size: tuple[int, int] | None = None,
     max_pixels: int = MAX_PNG_PIXELS,
 ) -> ImageArray:
@@ -182,7 +182,7 @@ def read_png(
 
 
 def read_png_pil(
-    path: Path | ConfinedPath,
+    path: Path,
     size: tuple[int, int] | None = None,
     max_pixels: int = MAX_PNG_PIXELS,
 ) -> Image.Image:
@@ -211,9 +211,9 @@ def read_png_pil(
         return image
 
 
-def _check_expansion(path: Path | ConfinedPath, image: Image.Image) -> None:
+def _check_expansion(path: Path, image: Image.Image) -> None:
     """Refuse an image that no file of these bytes can hold, before memory is taken for it."""
-    file_bytes = confined(path).lstat().st_size
+    file_bytes = path.lstat().st_size
     if 3 * image.width * image.height > _MAX_EXPANSION * file_bytes:
         raise ValueError(f"{file_bytes} bytes are too few for {image.width} x {image.height} px")
 
@@ -223,18 +223,18 @@ def _to_array(image: Image.Image) -> ImageArray:
     return array
 
 
-def save(path: Path | ConfinedPath, image: ImageArray, *, durable: bool = True) -> None:
+def save(path: Path, image: ImageArray, *, durable: bool = True) -> None:
     """Write an 8-bit RGB PNG, clamped to 0..1 and rounded to nearest.
 
     Args:
-        path: The file, which is replaced atomically; its folder is made where it is missing.
+        path: The file, which is replaced atomically; its folder is made in an existing one.
         image: [H, W, 3].
         durable: As for `atomic_writer`.
 
     Raises:
         OSError: The file can't be written.
     """
-    confined(path).make_parent()
+    path.parent.mkdir(exist_ok=True)  # not parents: a store that vanished stays away
     with atomic_writer(path, durable=durable) as stream:
         Image.fromarray(_to_8_bit(image)).save(stream, "PNG", compress_level=4)
 

@@ -25,7 +25,6 @@ from xrgs.capture.split import Split, check_variant_conf, split_views
 from xrgs.capture.views import SceneFailed, Variant, View
 from xrgs.runtime.progress import progress
 from xrgs.safeio.atomic import write_text
-from xrgs.safeio.confined import ConfinedPath
 
 if TYPE_CHECKING:
     from xrgs.capture.scenes import Scene
@@ -54,7 +53,7 @@ class _Inputs:
         return () if degrade.resolve_degradation(self.conf) == "none" else self.split.lr
 
 
-def mix_resolutions(scene: Scene, conf: VariantConf, work: Path, out: ConfinedPath) -> Variant:
+def mix_resolutions(scene: Scene, conf: VariantConf, work: Path, out: Path) -> Variant:
     """Make the views, poses and points of a variant.
 
     Args:
@@ -146,7 +145,7 @@ def _refusal(inputs: _Inputs, model: Reconstruction) -> str:
     return ""
 
 
-def _write_log(work: Path, out: ConfinedPath) -> None:
+def _write_log(work: Path, out: Path) -> None:
     """Join COLMAP's log files; each of them begins with its own name."""
     files = sorted(work.rglob("colmap-*"))
     text = "".join(file.read_text(encoding="utf-8", errors="replace") for file in files)
@@ -228,7 +227,7 @@ def _split_notes(inputs: _Inputs, rates: Mapping[str, list[float]]) -> list[str]
 
 
 def _write_undistorted(
-    inputs: _Inputs, model: Reconstruction, depths: Mapping[int, float], out: ConfinedPath
+    inputs: _Inputs, model: Reconstruction, depths: Mapping[int, float], out: Path
 ) -> tuple[View, ...]:
     """Undistort every registered view at its own size, and write it."""
     photos, split = inputs.photos, inputs.split

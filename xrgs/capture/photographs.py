@@ -16,7 +16,6 @@ from xrgs.capture.lens import Lens
 from xrgs.capture.split import HrGeometry, hr_geometry, shrink_factor
 from xrgs.errors import XrgsError
 from xrgs.runtime.progress import progress
-from xrgs.safeio.confined import ConfinedPath
 
 if TYPE_CHECKING:
     from xrgs.capture.scenes import Scene
@@ -206,7 +205,7 @@ def _resize_and_crop(image: images.ImageArray, hr: HrGeometry) -> images.ImageAr
 
 
 def _read_sizes(
-    files: Mapping[str, ConfinedPath],
+    files: Mapping[str, Path],
 ) -> tuple[dict[str, tuple[int, int]], dict[str, str]]:
     """Read the size of each file, or the message that says why it has none, by its name."""
     sizes: dict[str, tuple[int, int]] = {}
@@ -220,7 +219,7 @@ def _read_sizes(
 
 
 def assign_cameras(
-    files: Sequence[ConfinedPath], sizes: Sequence[tuple[int, int]], policy: str
+    files: Sequence[Path], sizes: Sequence[tuple[int, int]], policy: str
 ) -> list[str]:
     """Name the camera of each photograph; photographs with one name share it in SfM.
 

@@ -21,12 +21,11 @@ import numpy as np
 
 from xrgs.capture.lens import Lens, lens_of_terms
 from xrgs.errors import StoreError, UnreadableError, XrgsError
-from xrgs.safeio import untrusted
-from xrgs.safeio.confined import ConfinedPath, is_passing
+from xrgs.safeio.files import is_inside, is_transient, list_names
 from xrgs.safeio.hashing import file_digest
 from xrgs.safeio.paths import user_path
-from xrgs.safeio.records import as_number, read_object
-from xrgs.safeio.words import for_line
+from xrgs.safeio.records import as_number, read_struct
+from xrgs.safeio.sanitize import for_line
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -69,19 +68,19 @@ def fingerprint(path: str) -> str:
         for file in _files(path):
             sha256.update(f"{file.name}\0{file_digest(file)}\n".encode())
     except OSError as error:
-        kind = UnreadableError if is_passing(error) else XrgsError
+        kind = UnreadableError if is_transient(error) else XrgsError
         raise kind(f"variant.poses={path}: {error.filename}: {error.strerror}") from error
     return sha256.hexdigest()
 
 
-def _files(path: str) -> list[ConfinedPath]:
+def _files(path: str) -> list[Path]:
     """Return the files that are read."""
-    root = ConfinedPath(user_path(path))
+    root = user_path(path)
     if not root.exists():
         raise XrgsError(f"variant.poses={path}: no such folder or file")
     if not root.is_dir():
         return [root, _points_file(root, _transforms(root))]
-    names = root.names()
+    names = list_names(root)
     for suffix in (".bin", ".txt"):  # pycolmap prefers the binary files, too
         if all(f"{name}{suffix}" in names for name in _REQUIRED):
             found = [f"{name}{suffix}" for name in (*_REQUIRED, *_OPTIONAL)]
@@ -182,8 +181,8 @@ def _read_transforms(file: Path, photos: PhotoCollection) -> Reconstruction:
     from xrgs.capture import colmap
     from xrgs.capture.sfm import Reconstruction
 
-    content = _transforms(ConfinedPath(file))
-    points, colors = colmap.read_points(_points_file(ConfinedPath(file), content).path)
+    content = _transforms(file)
+    points, colors = colmap.read_points(_points_file(file, content))
     frames = {frame["file_path"]: frame for frame in content["frames"]}
     found = match_names(list(frames), photos.names)
     lenses, viewmats = {}, {}
@@ -198,10 +197,10 @@ def _read_transforms(file: Path, photos: PhotoCollection) -> Reconstruction:
     return Reconstruction(lenses, viewmats, points, colors, observed, report)
 
 
-def _transforms(file: ConfinedPath) -> dict[str, Any]:
+def _transforms(file: Path) -> dict[str, Any]:
     """Read a transforms.json, and check that its frames have names."""
     try:
-        content = read_object(file, _MAX_JSON_BYTES)
+        content = read_struct(file, dict[str, Any], _MAX_JSON_BYTES)
     except UnreadableError:
         raise
     except StoreError as error:
@@ -216,7 +215,7 @@ def _transforms(file: ConfinedPath) -> dict[str, Any]:
     return content
 
 
-def _points_file(file: ConfinedPath, content: Mapping[str, Any]) -> ConfinedPath:
+def _points_file(file: Path, content: Mapping[str, Any]) -> Path:
     """Return the .ply of points that a transforms.json names, which lies in or below its folder."""
     name = content.get("ply_file_path")
     if name is None:
@@ -225,9 +224,9 @@ def _points_file(file: ConfinedPath, content: Mapping[str, Any]) -> ConfinedPath
             " coloured points there, as ns-process-data does (sparse_pc.ply)"
         )
     inside = str(PurePosixPath(name)) if isinstance(name, str) else ""
-    if not untrusted.is_inside(inside):
+    if not is_inside(inside):
         raise XrgsError(f"{file}: ply_file_path must be a path below the folder of this file")
-    return ConfinedPath(file.root.parent) / inside
+    return file.parent / inside
 
 
 def _lens(entry: Mapping[str, Any], size: tuple[int, int]) -> Lens:

@@ -6,7 +6,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from xrgs.capture import dataset, variant
-from xrgs.safeio.confined import ConfinedPath
 
 if TYPE_CHECKING:
     from xrgs.capture.dataset import Dataset
@@ -30,8 +29,8 @@ def build_dataset(conf: Conf) -> Dataset:
         SceneFailed: COLMAP can't place enough views.
         XrgsError: A value of the config or a photograph is wrong; the message names it.
     """
-    store = ConfinedPath(Path(conf.store))
-    store.make_root()
+    store = Path(conf.store)
+    store.mkdir(parents=True, exist_ok=True)
     built = variant.build(conf.scene, conf.variant, store / "variants", store / "scenes")
     return dataset.load(built, conf.train.views, validation=conf.train.validation, seed=conf.seed)
 

@@ -17,24 +17,24 @@ from xrgs.capture.lens import Lens, undistort
 from xrgs.capture.photographs import PhotoCollection, prepare_hr_views, write_degraded
 from xrgs.errors import StoreError
 from xrgs.runtime.progress import progress
-from xrgs.safeio.records import read_object
+from xrgs.safeio.records import read_struct
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping, Sequence
+    from pathlib import Path
 
     from xrgs.config import SceneConf, VariantConf
-    from xrgs.safeio.confined import ConfinedPath
 
 #: A field of a lens in `report.json`, where each lens is written as `Lens(width=500, ..., k=0.01)`.
 _FIELD = re.compile(r"(\w+)=([^,()]+)")
 
 
 def restore_images(
-    folder: ConfinedPath,
+    folder: Path,
     scene: SceneConf,
     conf: VariantConf,
-    work: ConfinedPath,
-    cache: ConfinedPath,
+    work: Path,
+    cache: Path,
 ) -> None:
     """Make the images of a variant, and verify them by its hashes.
 
@@ -50,16 +50,15 @@ def restore_images(
             are not those that were removed; the message names the first that differs.
         XrgsError: The photographs can't be read.
     """
-    content = read_object(folder / frozen.MANIFEST)
+    manifest = frozen.read_manifest(folder)
     found = scenes.resolve(scene, cache, conf.long_side)
-    photos = prepare_hr_views(found, conf, work.path)
+    photos = prepare_hr_views(found, conf, work)
     try:
-        lenses = _lenses(read_object(folder / frozen.REPORT))
-        _write_images(folder, content["views"], photos, lenses, conf)
-        files = dict(content["files"])
+        lenses = _lenses(read_struct(folder / frozen.REPORT, dict[str, Any]))
+        _write_images(folder, manifest.views, photos, lenses, conf)
     except (AttributeError, KeyError, TypeError, ValueError, ArithmeticError) as error:
         raise StoreError(f"{folder}: not a complete variant ({error!r:.200})") from error
-    for wrong in sealed.changed(folder, files):
+    for wrong in sealed.changed(folder, manifest.files):
         raise StoreError(
             f"{wrong}: made again from the photographs it is another image, as other versions of"
             " the libraries that read and resize photographs may give"
@@ -67,29 +66,27 @@ def restore_images(
 
 
 def _write_images(
-    folder: ConfinedPath,
-    entries: Sequence[Mapping[str, Any]],
+    folder: Path,
+    entries: Sequence[frozen.ViewEntry],
     photos: PhotoCollection,
     lenses: Sequence[Lens],
     conf: VariantConf,
 ) -> None:
-    """Write the image of each view that the list of a variant has.
-
-    Names of files come from the photographs and not from the list, which anybody may have written.
-    """
+    """Write the image of each view of a variant."""
+    (folder / "images").mkdir()
     numbers = {name: number for number, name in enumerate(photos.names)}
     # Each view that was degraded is also there as it was before.
-    degraded = {numbers[entry["name"]] for entry in entries if entry["split"] == "original"}
+    degraded = {numbers[entry.name] for entry in entries if entry.split == "original"}
     write_degraded(photos, sorted(degraded), conf)
     by_size: dict[tuple[int, int], dict[bytes, Lens]] = {}
     for entry in progress(entries, "undistorting", "view"):
-        number, part = numbers[entry["name"]], entry["split"]
+        number, part = numbers[entry.name], entry.split
         copies = {"train": "lr" if number in degraded else "hr", "test": "hr", "original": "hr"}
         image = photos.read(copies[part], number)
         size = image.shape[1], image.shape[0]
         if size not in by_size:
             by_size[size] = _by_intrinsics([lens.resized(*size) for lens in lenses])
-        lens = by_size[size].get(np.array(entry["K"], dtype=np.float64).tobytes())
+        lens = by_size[size].get(np.array(entry.K, dtype=np.float64).tobytes())
         if lens is None:
             raise ValueError(f"{frozen.REPORT} has no lens of view {photos.names[number]}")
         file = folder / "images" / part / f"{photos.names[number]}.png"

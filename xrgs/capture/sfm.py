@@ -21,7 +21,7 @@ from xrgs.capture import images
 from xrgs.capture.lens import Lens, lens_of_model
 from xrgs.runtime.machine import usable_cores
 from xrgs.runtime.progress import ProgressBar
-from xrgs.safeio.words import for_line
+from xrgs.safeio.sanitize import for_line
 
 if TYPE_CHECKING:
     from xrgs.config import SfmConf

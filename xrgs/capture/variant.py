@@ -8,17 +8,19 @@ from __future__ import annotations
 
 import logging
 from contextlib import suppress
-from dataclasses import asdict
 from typing import TYPE_CHECKING
 
 from xrgs.capture import poses, scenes, sealed, split
 from xrgs.capture.failures import FAILED_PREFIX, read_failure
 from xrgs.capture.frozen import CorruptVariant, freeze, load, verify
 from xrgs.capture.views import SceneFailed, Variant
+from xrgs.config import identity_values
 from xrgs.errors import StoreError, UnreadableError
+from xrgs.runtime import lease
 from xrgs.safeio.atomic import write_json
-from xrgs.safeio.confined import ConfinedPath, confined
-from xrgs.safeio.hashing import digest, source_digests
+from xrgs.safeio.code import code_digest
+from xrgs.safeio.files import list_names, remove_path
+from xrgs.safeio.hashing import digest
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -66,14 +68,14 @@ def key(scene: SceneConf, conf: VariantConf) -> str:
     """
     split.check_variant_conf(conf)
     split.check_test_names(scenes.names(scene, conf.long_side) if conf.test else (), conf)
-    settings = asdict(conf)
+    settings = identity_values(conf)
     if conf.poses is not None:
         settings["poses"] = poses.fingerprint(conf.poses)
     fingerprint = scenes.fingerprint(scene, conf.long_side)
-    return digest([fingerprint, settings, source_digests(*_SOURCES)])
+    return digest([fingerprint, settings, code_digest(*_SOURCES)])
 
 
-def find(variants: Path | ConfinedPath, wanted_key: str) -> Variant | None:
+def find(variants: Path, wanted_key: str) -> Variant | None:
     """Find the frozen variant of a key, and verify it; a corrupt one is logged and passed over.
 
     Args:
@@ -86,7 +88,7 @@ def find(variants: Path | ConfinedPath, wanted_key: str) -> Variant | None:
     Raises:
         UnreadableError: A variant can't be read now; nothing is known of it.
     """
-    for folder in _of_key(confined(variants), wanted_key):
+    for folder in _of_key(variants, wanted_key):
         try:
             return load(folder)
         except CorruptVariant as error:
@@ -94,21 +96,21 @@ def find(variants: Path | ConfinedPath, wanted_key: str) -> Variant | None:
     return None
 
 
-def _of_key(variants: ConfinedPath, wanted_key: str) -> list[ConfinedPath]:
+def _of_key(variants: Path, wanted_key: str) -> list[Path]:
     """Return the folders of the variants of a key."""
     return [variants / name for name in _names(variants) if name.startswith(f"{wanted_key}-")]
 
 
-def _names(variants: ConfinedPath) -> list[str]:
+def _names(variants: Path) -> list[str]:
     try:
-        return variants.names()
+        return list_names(variants)
     except FileNotFoundError:  # nothing was built yet
         return []
     except OSError as error:
         raise UnreadableError(f"{variants}: {error.strerror}; try again") from error
 
 
-def failure(variants: Path | ConfinedPath, wanted_key: str) -> str | None:
+def failure(variants: Path, wanted_key: str) -> str | None:
     """Read why the scene of a key could not be made into a variant when it was last tried.
 
     Args:
@@ -122,7 +124,7 @@ def failure(variants: Path | ConfinedPath, wanted_key: str) -> str | None:
     Raises:
         UnreadableError: The report can't be read now.
     """
-    home, name = confined(variants), f"{FAILED_PREFIX}{wanted_key}"
+    home, name = variants, f"{FAILED_PREFIX}{wanted_key}"
     try:
         return read_failure(home / name)[1] if name in _names(home) else None
     except UnreadableError:
@@ -131,9 +133,7 @@ def failure(variants: Path | ConfinedPath, wanted_key: str) -> str | None:
         return None
 
 
-def build(
-    scene: SceneConf, conf: VariantConf, variants: ConfinedPath, cache: ConfinedPath
-) -> Variant:
+def build(scene: SceneConf, conf: VariantConf, variants: Path, cache: Path) -> Variant:
     """Find the variant of a scene, or make it; any number of processes may call this at once.
 
     Args:
@@ -151,10 +151,10 @@ def build(
         XrgsError: The config or the photographs are not usable; the message names what is wrong.
     """
     wanted_key = key(scene, conf)
-    variants.make_folder()
+    variants.mkdir(exist_ok=True)
     report = variants / f"{FAILED_PREFIX}{wanted_key}" / "report.json"
     report_before = _modified_ns(report)
-    with sealed.lock(variants / f".{wanted_key}.lock"):
+    with lease.waited_for(variants, f".{wanted_key}.lock"):
         found = find(variants, wanted_key)
         if found is not None:
             return found
@@ -167,27 +167,26 @@ def build(
         return _make(resolved, conf, wanted_key, variants)
 
 
-def _modified_ns(file: ConfinedPath) -> int | None:
+def _modified_ns(file: Path) -> int | None:
     try:
         return file.lstat().st_mtime_ns
     except OSError:
         return None
 
 
-def _make(
-    scene: scenes.Scene, conf: VariantConf, wanted_key: str, variants: ConfinedPath
-) -> Variant:
+def _make(scene: scenes.Scene, conf: VariantConf, wanted_key: str, variants: Path) -> Variant:
     """Make and freeze a variant, after what a killed process left of it is removed."""
     from xrgs.capture import mixing
 
     work = variants / f".{wanted_key}.building"
     failed = variants / f"{FAILED_PREFIX}{wanted_key}"
-    work.remove()
-    failed.remove()
+    remove_path(work)
+    remove_path(failed)
     frozen = work / "frozen"
-    frozen.make_folder()
+    for folder in (work, frozen, frozen / "images"):
+        folder.mkdir()
     try:
-        made = mixing.mix_resolutions(scene, conf, work.path, frozen)
+        made = mixing.mix_resolutions(scene, conf, work, frozen)
         return freeze(made, wanted_key, frozen, variants)
     except SceneFailed as error:
         write_json(frozen / "report.json", error.report | {"reason": str(error)})
@@ -195,4 +194,4 @@ def _make(
         raise SceneFailed(f"{error} Report: {failed}", error.report) from None
     finally:
         with suppress(OSError):
-            work.remove()
+            remove_path(work)

@@ -10,7 +10,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from xrgs.errors import XrgsError
-from xrgs.safeio.confined import ConfinedPath
 
 
 class SceneFailed(XrgsError):  # noqa: N818
@@ -27,7 +26,7 @@ class View:
 
     name: str
     """The photograph's file name without its suffix."""
-    file: ConfinedPath
+    file: Path
     """A PNG, 8-bit RGB, of exactly `width` x `height` px."""
     split: str
     """`train`, `test` or `original`. An original is a degraded training view before it was
@@ -52,7 +51,7 @@ class Variant:
 
     id: str
     """`<key>-<hash>`, where the hash covers the images, the cameras and the SfM points."""
-    folder: ConfinedPath
+    folder: Path
     """The folder that it was loaded from."""
     scene: str
     """The scene's name when the variant was built; a label that is not part of the hash."""
@@ -70,8 +69,3 @@ class Variant:
     """Their colours [P, 3]."""
     report: dict[str, Any]
     """How SfM went: registered views, points, reprojection error, every attempt."""
-
-    @property
-    def path(self) -> Path:
-        """The folder's path. What is in the folder may come from anybody: `folder` opens it."""
-        return self.folder.path

@@ -17,8 +17,6 @@ from xrgs.experiment.store import Store
 from xrgs.runtime.streams import say
 
 if TYPE_CHECKING:
-    from xrgs.safeio.confined import ConfinedPath
-
     Dataset = str
 else:
     Dataset = literal_type_from_choices(
@@ -48,8 +46,7 @@ def download(
     """
     from omegaconf import OmegaConf
 
-    from xrgs.capture.download.scenes import fetch_scenes
-    from xrgs.capture.download.settings import DatasetConf
+    from xrgs.capture.download.scenes import DatasetConf, fetch_scenes
 
     known: Any = OmegaConf.to_container(
         OmegaConf.load(config.CONF_DIR / "data" / f"{dataset}.yaml")
@@ -94,7 +91,7 @@ def inspect(
 
     if not variant:
         raise XrgsError("inspect: give a variant's folder, or scene=NAME and other keys")
-    folder: Path | ConfinedPath = Path(variant[0])
+    folder = Path(variant[0])
     if len(variant) > 1 or ("=" in variant[0] and not folder.exists()):
         with explained():
             conf = composing.compose(*with_quotes(variant))
@@ -121,7 +118,7 @@ def export(
 
     path = Path(name)
     if not path.exists() and path.name == name:
-        path = Store(store).find_folder(name).path
+        path = Store(store).find_folder(name)
     say(write(path, layout, out or Path(f"{path.name}-{layout}")))
 
 

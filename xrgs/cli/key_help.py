@@ -1,16 +1,15 @@
-"""Explains keys of the config by the comments of `conf/config.yaml`, for `xrgs-sweep help=KEY`."""
+"""`xrgs-sweep help=KEY`: explains keys by the comments of `conf/config.yaml`."""
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+import re
 
 from xrgs import config
 from xrgs.errors import XrgsError, did_you_mean
 from xrgs.safeio.records import read_file
 
-if TYPE_CHECKING:
-    from collections.abc import Iterator
-
+_COMMENT = re.compile(r" *# (.*)")
+_KEY = re.compile(r"( *)(\w+):(.*?)(?:  # (.*))?")
 _WHERE = (
     "Values are those of the baseline. A preset, a scene, a variant or an ablation may set\n"
     "others; xrgs-sweep --cfg job prints the values in effect."
@@ -18,44 +17,40 @@ _WHERE = (
 
 
 def explain(key: str) -> str:
-    """Return a key's value in the baseline and its comment; of a group those of all keys in it.
+    """Return a key's value in the baseline and its comment; of a group also those of its keys.
 
     Args:
-        key: A key as it stands before `=` on the command line, or the beginning of several: `train`
-            for `train.steps` and others.
+        key: A key as it stands before `=` on the command line, as `train.steps` or `train`.
 
     Raises:
-        XrgsError: There is no such key; the message offers those that are like it.
+        XrgsError: There is no such key; the message offers similar ones.
     """
-    known = dict(_commented())
-    found = [name for name in known if name == key or name.startswith(f"{key}.")]
+    texts = _texts()
+    found = [text for name, text in texts.items() if f"{name}.".startswith(f"{key}.")]
     if not found:
-        raise XrgsError(f"help={key}: there is no such key{did_you_mean(key, known)}")
-    return "\n\n".join([*(known[name] for name in found), _WHERE])
+        raise XrgsError(f"help={key}: there is no such key{did_you_mean(key, texts)}")
+    return "\n\n".join([*found, _WHERE])
 
 
-def _commented() -> Iterator[tuple[str, str]]:
-    """Yield each key of `conf/config.yaml` with its value and its comments, as one text.
+def _texts() -> dict[str, str]:
+    """Return what `conf/config.yaml` says of each key: its value, and the comment above or behind.
 
-    A comment stands above its key, or behind its value. Of YAML only what the file uses is read:
-    mappings by indentation.
+    Of YAML only what the file uses is read: a key with its value on one line, and two more spaces
+    before each key of a group.
     """
-    text = read_file(config.CONF_DIR / "config.yaml").decode()
-    parents: list[tuple[int, str]] = []
+    texts: dict[str, str] = {}
+    path: list[str] = []
     above: list[str] = []
-    for line in text.partition("\ndefaults:")[2].splitlines():
-        content = line.strip()
-        if content.startswith("#"):
-            above.append(content.lstrip("# "))
+    content = read_file(config.CONF_DIR / "config.yaml").decode()
+    for line in content.partition("\ndefaults:")[2].splitlines():
+        if comment := _COMMENT.fullmatch(line):
+            above.append(comment[1])
             continue
-        name, colon, rest = content.partition(":")
-        if not colon or name.startswith("-"):
-            above = []
-            continue
-        indent = len(line) - len(line.lstrip())
-        parents = [*(parent for parent in parents if parent[0] < indent), (indent, name)]
-        value, _, behind = rest.partition("#")
-        comment = [*above, *filter(None, [behind.strip()])]
-        key = ".".join(part for _, part in parents)
-        yield key, "\n".join([f"{key}={value.strip()}", *(f"  {part}" for part in comment)])
+        if entry := _KEY.fullmatch(line):
+            indent, name, value, behind = entry.groups()
+            path = [*path[: len(indent) // 2], name]
+            key = ".".join(path)
+            first = f"{key}={value.strip()}" if value.strip() else key
+            texts[key] = "\n  ".join([first, *above, *([behind] if behind else [])])
         above = []
+    return texts

@@ -20,7 +20,7 @@ from tyro.conf import CascadeSubcommandArgs, DisallowNone, FlagCreatePairsOff, O
 import xrgs
 from xrgs.errors import XrgsError
 from xrgs.runtime.streams import ignore_broken_pipe, say
-from xrgs.safeio.words import for_line
+from xrgs.safeio.sanitize import for_line
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Mapping

@@ -15,7 +15,7 @@ from xrgs.errors import XrgsError
 from xrgs.experiment.store import Store
 from xrgs.runtime.signals import exit_on_signal
 from xrgs.runtime.streams import say
-from xrgs.safeio.words import counted
+from xrgs.safeio.sanitize import counted
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence

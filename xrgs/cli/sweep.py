@@ -81,11 +81,12 @@ def _run_job(cfg: DictConfig) -> str:
     """Run one job; Hydra's launcher calls this, while Hydra's sweeper plans and launches."""
     if "cell" not in cfg:
         raise CompactHydraException("hydra.mode must be MULTIRUN, as conf/config.yaml sets it")
+    from xrgs.experiment.store import Store
     from xrgs.sweep.jobs.job import INTERRUPTED, run_job
     from xrgs.sweep.session import SweepSession
 
     session = SweepSession(Path(HydraConfig.get().sweep.dir))
-    outcome = run_job(session, cfg.cell)
+    outcome = run_job(session, Store(Path(cfg.store)), cfg.cell, cfg.name)
     if session.owner_dead:  # a worker of joblib would wait for ever to hand over its answer
         os._exit(os.EX_TEMPFAIL)
     if outcome == INTERRUPTED and os.environ.get("SUBMITIT_EXECUTOR") == "slurm":
@@ -112,7 +113,6 @@ def main() -> None:
         ):
             _rerun(arguments)
         return
-    config.register()
     # The plus that Hydra requires before these two is forgotten easily.
     words = ["+" + w if w.partition("=")[0] in config.PLUS_GROUPS else w for w in arguments]
     with (

@@ -13,7 +13,7 @@ from xrgs.errors import XrgsError
 from xrgs.experiment.store import Store
 from xrgs.runtime.signals import StopSignal, exit_on_signal
 from xrgs.runtime.streams import say
-from xrgs.safeio.words import for_line
+from xrgs.safeio.sanitize import for_line
 
 
 def view(

@@ -1,7 +1,7 @@
-"""The frozen evaluation protocol: scores every test view at its full size, one by one.
+"""The evaluation protocol: scores every test view at its full size, one by one.
 
-Version 1: render with the settings of the training and all SH bands, clamp to 0..1, and score the
-float32 image against the 8-bit photograph / 255 with every metric of
+Each view is rendered with the settings of the training and all SH bands, and clamped to 0..1. The
+float32 image is scored against the 8-bit photograph / 255 with every metric of
 `xrgs.evaluation.metrics.VIEW_METRICS`.
 
 LPIPS needs weights that are not shipped. Only the published ones are accepted, so whether a machine
@@ -16,21 +16,17 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
+    from pathlib import Path
 
     from torch import Tensor
 
     from xrgs.capture.dataset import LoadedView
     from xrgs.config import SplatConf
-    from xrgs.safeio.confined import ConfinedPath
     from xrgs.splat.gaussians import Gaussians
-
-#: The version of this protocol, part of a cell's identity: increment it when a change here or in
-#: the metrics changes scores.
-PROTOCOL_VERSION = 1
 
 
 def score_views(
-    gaussians: Gaussians, views: Sequence[LoadedView], conf: SplatConf, renders: ConfinedPath
+    gaussians: Gaussians, views: Sequence[LoadedView], conf: SplatConf, renders: Path
 ) -> list[dict[str, Any]]:
     """Render and score each view, and write its clamped render as `<view>.png`.
 
@@ -49,7 +45,7 @@ def score_views(
     from xrgs.capture import images
     from xrgs.runtime.progress import progress
 
-    renders.make_folder()
+    renders.mkdir(exist_ok=True)
     rows = []
     for view in progress(views, "evaluating", "view"):
         image, scores = _score(gaussians, view, conf)
@@ -109,7 +105,7 @@ def _render(gaussians: Gaussians, view: LoadedView, conf: SplatConf) -> Tensor:
     import torch
 
     from xrgs.splat.backend import resolve_backend
-    from xrgs.splat.rasterize import rasterize_parameters
+    from xrgs.splat.rendering import rasterize_parameters
 
     backend = resolve_backend(conf.backend)
     with torch.no_grad():

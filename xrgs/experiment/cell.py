@@ -10,22 +10,27 @@ import traceback
 from statistics import fmean
 from typing import TYPE_CHECKING, cast
 
+import msgspec
+
 from xrgs.capture import dataset
 from xrgs.evaluation import protocol
+from xrgs.evaluation.scoring import scoring_code
 from xrgs.experiment import provenance
+from xrgs.experiment.schema import Summary
 from xrgs.runtime import progress
 from xrgs.runtime.machine import peak_rss, set_torch_threads
 from xrgs.runtime.signals import StopRequest, StopSignal
 from xrgs.safeio.atomic import write_json, write_text
-from xrgs.safeio.hashing import digest
 from xrgs.safeio.records import table_text
-from xrgs.safeio.words import for_terminal
+from xrgs.safeio.sanitize import for_terminal
 from xrgs.splat.backend import resolve_backend
 from xrgs.splat.ply import save_ply
 from xrgs.training.checkpoint import Checkpoint, CheckpointError
 from xrgs.training.count_matching import train_cell
 
 if TYPE_CHECKING:
+    from pathlib import Path
+
     from xrgs.capture.dataset import Dataset
     from xrgs.capture.views import Variant
     from xrgs.config import Conf
@@ -55,7 +60,7 @@ class CellCheckpoint(Checkpoint):
             shown: Its note gets the number of Gaussians and the loss.
             stop: Whether the process was asked to end.
         """
-        super().__init__(folder.checkpoint, digest(folder.identity()), every_s)
+        super().__init__(folder.checkpoint, folder.id, every_s)
         self._shown = shown
         self._stop = stop
         self._recorder: TrainingRecorder | None = None
@@ -80,7 +85,6 @@ class CellCheckpoint(Checkpoint):
 
         Raises:
             StopSignal: The process was asked to end, and the file is written.
-            ReplacedError: Another process has begun the run again, in another folder.
         """
         if self._recorder is not None and self._recorder.history:
             rows = self._recorder.history[-_SHOWN_ROWS:]
@@ -119,10 +123,10 @@ def run_cell(
         with stop.deferred():
             with progress.written_to(folder.progress) as shown:
                 views = _train_and_score(conf, variant, folder, shown, stop)
-            folder.finish(views, protocol.PROTOCOL_VERSION)
+            folder.finish(views, scoring_code())
         _log.info("done")
     except Exception:
-        write_text(folder.folder / "error.txt", for_terminal(traceback.format_exc()))
+        write_text(folder.path / "error.txt", for_terminal(traceback.format_exc()))
         raise
 
 
@@ -136,49 +140,44 @@ def _train_and_score(
     threads = set_torch_threads(conf.threads)
     backend = resolve_backend(conf.splat.backend)
     what = provenance.collect(threads, backend)
-    write_json(folder.folder / "provenance.json", what, durable=False)
+    _write_struct(folder.path / "provenance.json", what)
     data = dataset.load(variant, conf.train.views, validation=conf.train.validation, seed=conf.seed)
     _log.info(
         "cell %s: variant %s, %d training views, %d points; xrgs %s, %s, %d threads",
-        *(folder.id, folder.identity()["variant"], len(data.train), len(data.points)),
-        *(what["xrgs"], backend, threads),
+        *(folder.id, variant.id, len(data.train), len(data.points)),
+        *(what.xrgs, backend, threads),
     )
     checkpoint = CellCheckpoint(folder, conf.checkpoint_s, shown, stop)
     trained, machines = _train_or_resume(data, conf, checkpoint, provenance.machine(what))
     if len(machines) > 1:
-        what["machines_in_turn"] = "; ".join(machines)
-        write_json(folder.folder / "provenance.json", what, durable=False)
+        what = msgspec.structs.replace(what, machines_in_turn="; ".join(machines))
+        _write_struct(folder.path / "provenance.json", what)
     shown.note = ""
     count = len(trained.gaussians)
     _log.info("trained %d steps in %.1f s: %d Gaussians", conf.train.steps, trained.seconds, count)
     peak_rss_bytes = peak_rss()  # read before evaluation, which may load the network of LPIPS
-    save_ply(folder.folder / "splats.ply", trained.gaussians, durable=False)
-    write_text(folder.folder / "history.csv", table_text(trained.history), durable=False)
+    save_ply(folder.path / "splats.ply", trained.gaussians, durable=False)
+    write_text(folder.path / "history.csv", table_text(trained.history), durable=False)
     if trained.scores:
-        write_text(folder.folder / "quality.csv", table_text(trained.scores), durable=False)
+        write_text(folder.path / "quality.csv", table_text(trained.scores), durable=False)
     render_time_ms = protocol.render_time(trained.gaussians, data.test, conf.splat)
-    scores = protocol.score_views(
-        trained.gaussians, data.test, conf.splat, folder.folder / "renders"
-    )
-    write_text(folder.folder / "scores.csv", table_text(scores), durable=False)
+    scores = protocol.score_views(trained.gaussians, data.test, conf.splat, folder.path / "renders")
+    write_text(folder.path / "scores.csv", table_text(scores), durable=False)
     psnr = fmean(math.nan if row["psnr"] is None else row["psnr"] for row in scores)
     _log.info("evaluated %d views: mean PSNR %.2f dB", len(scores), psnr)
-    write_json(
-        folder.folder / "summary.json",
-        {
-            "training_time_s": trained.seconds,
-            "render_time_ms": render_time_ms,
-            "gaussians": count,
-            "memory_bytes": trained.memory_bytes,
-            "peak_rss_bytes": peak_rss_bytes,
-            "evaluations": trained.evaluations,
-            "steps": conf.train.steps,
-            "grow_grad2d": trained.grow_grad2d,
-            "work": trained.work,
-            "stage_seconds": trained.stage_seconds,
-        },
-        durable=False,
+    summary = Summary(
+        training_time_s=trained.seconds,
+        render_time_ms=render_time_ms,
+        gaussians=count,
+        memory_bytes=trained.memory_bytes,
+        peak_rss_bytes=peak_rss_bytes,
+        evaluations=trained.evaluations,
+        steps=conf.train.steps,
+        grow_grad2d=trained.grow_grad2d,
+        work=dict(trained.work),
+        stage_seconds=dict(trained.stage_seconds),
     )
+    _write_struct(folder.path / "summary.json", summary)
     return [view.name for view in data.test]
 
 
@@ -207,3 +206,7 @@ def _train_or_resume(
         _log.warning("training starts over: %s", error)
         checkpoint.set_aside()
     return train_here()
+
+
+def _write_struct(file: Path, value: msgspec.Struct) -> None:
+    write_json(file, msgspec.to_builtins(value), durable=False)

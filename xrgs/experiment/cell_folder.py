@@ -1,23 +1,26 @@
 """One cell's folder in a store: its files, its state, and its results.
 
-A cell's `status.json` is written last, by atomic rename, and lists every other file of the cell: a
-cell is done when that file says so and the listed files are present and unchanged.
+`config.json` and `identity.json` are there first. `status.json` is written last, by an atomic
+rename, and lists every result: a cell is done when that file says so and the listed files are
+present and unchanged.
 """
 
 from __future__ import annotations
 
 import stat
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
+
+import msgspec
 
 from xrgs.errors import StoreError, UnreadableError
+from xrgs.experiment.schema import FileEntry, Identity, Provenance, Status, Summary
 from xrgs.runtime import progress
-from xrgs.safeio import untrusted
 from xrgs.safeio.atomic import write_json, write_text
-from xrgs.safeio.confined import confined, is_passing
+from xrgs.safeio.files import is_name, is_transient, sync_tree, walk_files
 from xrgs.safeio.hashing import file_digest
-from xrgs.safeio.records import MAX_BYTES, as_number, read_object, read_table
-from xrgs.safeio.words import for_terminal
+from xrgs.safeio.records import MAX_BYTES, as_number, read_struct, read_table
+from xrgs.safeio.sanitize import for_terminal
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -26,8 +29,8 @@ if TYPE_CHECKING:
     import pandas as pd
 
     from xrgs.capture.dataset import Dataset
+    from xrgs.capture.views import Variant
     from xrgs.config import Conf
-    from xrgs.safeio.confined import ConfinedPath
     from xrgs.splat.cameras import Camera
     from xrgs.splat.gaussians import Gaussians
 
@@ -35,12 +38,8 @@ if TYPE_CHECKING:
 _VERIFIED_BY_HASH = frozenset(
     {"config.json", "identity.json", "scores.csv", "summary.json", "history.csv", "quality.csv"}
 )
-#: Name of the training checkpoint, which is there while the cell is not done.
-CHECKPOINT = "checkpoint.npz"
-_PROGRESS = "progress.json"
-_NOT_RESULTS = frozenset({"log.txt", "status.json", _PROGRESS, CHECKPOINT, f"refused-{CHECKPOINT}"})
-#: Files of a done cell that only pictures, viewers and `rerun=` need: most of a store's bytes.
-_HEAVY, _HEAVY_FOLDER = frozenset({"splats.ply"}), "renders"
+CONFIG, IDENTITY, CHECKPOINT, LOG = "config.json", "identity.json", "checkpoint.npz", "log.txt"
+_NOT_RESULTS = frozenset({LOG, "status.json", "progress.json", CHECKPOINT, f"refused-{CHECKPOINT}"})
 
 
 @dataclass(frozen=True)
@@ -48,132 +47,101 @@ class CellState:
     """The state of a cell, and the reason for it."""
 
     name: str
-    """`absent`, `unfinished`, `running`, `failed`, `corrupt` or `done`; `unknown` where a file can
-    not be read now, so that nothing may be done with the cell but to look again."""
+    """`absent`, `planned` (a sweep has written its config), `unfinished`, `running`, `failed`,
+    `corrupt` or `done`; `unknown` where a file can't be read now: look again later."""
     reason: str = ""
 
     @classmethod
-    def of_error(cls, error: Exception) -> CellState:
-        """Return the state of a cell whose files can't be read, or are not what they should be.
-
-        Args:
-            error: What was raised when they were read.
-        """
+    def of_error(cls, error: StoreError | OSError) -> CellState:
+        """Return the state of a cell whose files can't be read, or are damaged."""
         if isinstance(error, UnreadableError):
             return cls("unknown", f"it can't be read now: {error}")
         if isinstance(error, OSError):
-            kind = "unknown" if is_passing(error) else "corrupt"
+            kind = "unknown" if is_transient(error) else "corrupt"
             return cls(kind, f"{error.filename}: {error.strerror}")
-        if isinstance(error, StoreError):
-            return cls("corrupt", str(error))
-        return cls("corrupt", f"a file is malformed: {error!r}")
-
-
-#: What reading the files of a cell may raise, whatever is in them.
-READING_ERRORS = (StoreError, OSError, AttributeError, KeyError, TypeError, ValueError)
+        return cls("corrupt", str(error))
 
 
 @dataclass(frozen=True)
 class CellFolder:
     """The folder of one cell: its config, its results and its state."""
 
-    folder: ConfinedPath
-    """The folder, named by the cell's id."""
-
-    def __init__(self, folder: Path | ConfinedPath) -> None:
-        object.__setattr__(self, "folder", confined(folder))
-
-    @property
-    def path(self) -> Path:
-        """The folder's path. What is in the folder may come from anybody: `folder` opens it."""
-        return self.folder.path
+    path: Path
+    name: str = ""
+    """The cell's id, where the folder's own name is another one."""
 
     @property
     def id(self) -> str:
         """The cell's id: the digest of its identity."""
-        return self.folder.name
+        return self.name or self.path.name
 
     @property
-    def checkpoint(self) -> ConfinedPath:
+    def checkpoint(self) -> Path:
         """File of the training checkpoint; it exists while the cell is not done."""
-        return self.folder / CHECKPOINT
+        return self.path / CHECKPOINT
 
     @property
-    def progress(self) -> ConfinedPath:
+    def progress(self) -> Path:
         """File that says how far the cell is; a process that is killed leaves it behind."""
-        return self.folder / _PROGRESS
+        return self.path / "progress.json"
 
     @property
-    def status(self) -> ConfinedPath:
+    def status_file(self) -> Path:
         """File of the final state, written after all other files."""
-        return self.folder / "status.json"
+        return self.path / "status.json"
+
+    # State
 
     def state(self, *, verify: bool = True) -> CellState:
-        """Return whether this cell's result is present and can be trusted.
+        """Return whether this cell's result is present and intact.
 
         Args:
             verify: Hash the files that reports are made from; otherwise only sizes are compared.
         """
         try:
-            return self._look(verify=verify)
-        except READING_ERRORS as error:
-            return CellState.of_error(error)
-
-    def _look(self, *, verify: bool) -> CellState:
-        try:
-            status = read_object(self.status)
-        except StoreError:
-            if (state := self._without_status()) is None:
-                raise
-            return state
-        try:
-            if status["state"] == "failed":
-                return CellState("failed", str(status["reason"]))
+            if not self.status_file.exists():
+                return self._state_without_status()
+            status = self.status()
+            if status.state == "failed":
+                return CellState("failed", status.reason)
             self._check(status, verify=verify)
-        except (AttributeError, KeyError, TypeError, ValueError) as error:
-            raise StoreError(f"{self.status}: it is malformed ({error!r})") from error
+        except (StoreError, OSError) as error:
+            return CellState.of_error(error)
         return CellState("done")
 
-    def _without_status(self) -> CellState | None:
-        """Return the state of a cell that has no status; None where it has one."""
-        found = self.folder.look()
-        if found is not None and stat.S_ISLNK(found.st_mode):
-            return CellState("corrupt", "it is a symbolic link; a cell must be a folder")
-        if found is None:
+    def _state_without_status(self) -> CellState:
+        if not self.path.exists():
             return CellState("absent")
-        if not stat.S_ISDIR(found.st_mode):
+        if not self.path.is_dir():
             return CellState("corrupt", "it is not a folder")
-        if self.status.exists():
-            return None
-        resumes = "; it resumes from its checkpoint" if self.checkpoint.exists() else ""
-        return CellState("unfinished", f"it was stopped before it ended{resumes}")
+        if self.checkpoint.exists():
+            resumes = "it was stopped before it ended; it resumes from its checkpoint"
+            return CellState("unfinished", resumes)
+        if not (self.path / LOG).exists():
+            return CellState("planned", "it has not begun")
+        return CellState("unfinished", "it was stopped before it ended")
 
     def running(self, owner: str) -> CellState:
-        """Return the state of a cell whose lock is held.
-
-        Args:
-            owner: Description of the process that holds the lock.
-        """
+        """Return the state of a cell whose lease the described process holds."""
         now = progress.read(self.progress)
         return CellState("running", f"by {owner}" + (f": {now}" if now else ""))
 
-    def _check(self, status: Mapping[str, Any], *, verify: bool) -> None:
-        if status["state"] != "done":
-            raise StoreError(f"status.json: unknown state {status['state']!r}")
-        files = status["files"]
-        for name in files:
-            if not untrusted.is_inside(name):
-                raise StoreError(f"status.json: {name!r:.80} is not a file of this cell")
-        sizes = self.folder.sizes(list(files))
-        for name, entry in files.items():
-            if sizes[name] != entry["bytes"]:
+    def _check(self, status: Status, *, verify: bool) -> None:
+        """Raise `StoreError` where a file of a done cell is missing or has changed."""
+        for name, entry in status.files.items():
+            file = self.path / name
+            try:
+                size = file.stat().st_size
+            except (FileNotFoundError, NotADirectoryError):
+                size = -1
+            if size != entry.bytes:
                 raise StoreError(f"{name} is missing or has another size")
             is_read = name in _VERIFIED_BY_HASH
-            if is_read and sizes[name] > MAX_BYTES:
-                raise StoreError(f"{name} has {sizes[name]} bytes, at most {MAX_BYTES} are read")
-            if is_read and verify and file_digest(self.folder / name) != entry["sha256"]:
+            if is_read and size > MAX_BYTES:
+                raise StoreError(f"{name} has {size} bytes, at most {MAX_BYTES} are read")
+            if is_read and verify and file_digest(file) != entry.sha256:
                 raise StoreError(f"{name} has changed since the cell finished")
-        if verify and [view for view, _ in self.view_scores()] != status["views"]:
+        if verify and tuple(view for view, _ in self.view_scores()) != status.views:
             raise StoreError("scores.csv does not have one row for each view that was to be scored")
 
     def verify(self) -> list[str]:
@@ -184,220 +152,156 @@ class CellFolder:
             there; empty for an intact cell.
         """
         try:
-            files = read_object(self.status)["files"]
-            wrong = [why for name, entry in files.items() if (why := self._wrong(name, entry))]
-            listed = files.keys() | self.trimmed().keys() | _NOT_RESULTS
+            status = self.status()
+            wrong = [line for name, of in status.files.items() if (line := self._wrong(name, of))]
+            listed = status.files.keys() | status.trimmed.keys() | _NOT_RESULTS
             wrong += [
-                f"{self.folder}/{name}: it does not belong there"
-                for name, _ in self.folder.walk()
+                f"{self.path}/{name}: it does not belong there"
+                for name, _ in walk_files(self.path)
                 if name not in listed
             ]
-        except READING_ERRORS as error:
-            return [f"{self.status}: {CellState.of_error(error).reason}"]
+        except (StoreError, OSError) as error:
+            return [f"{self.status_file}: {CellState.of_error(error).reason}"]
         return wrong
 
-    def _wrong(self, name: str, entry: Mapping[str, Any]) -> str:
+    def _wrong(self, name: str, entry: FileEntry) -> str:
         """Return what is wrong with one of the cell's files; empty where nothing is."""
         try:
-            intact = file_digest(self.folder / name) == entry["sha256"]
+            intact = file_digest(self.path / name) == entry.sha256
         except OSError as error:
-            again = "; try again" if is_passing(error) else ""
-            return f"{self.folder}/{name}: {error.strerror}{again}"
-        return "" if intact else f"{self.folder}/{name}: it has changed since the cell finished"
+            again = "; try again" if is_transient(error) else ""
+            return f"{self.path}/{name}: {error.strerror}{again}"
+        return "" if intact else f"{self.path}/{name}: it has changed since the cell finished"
 
-    def view_scores(self) -> list[tuple[str, dict[str, float]]]:
-        """Return the name and the scores of every test view, NaN where a score is missing.
+    # Ending a cell
 
-        Raises:
-            StoreError: `scores.csv` is missing or malformed.
-        """
-        file = self.folder / "scores.csv"
-        header, rows = read_table(file)
-        views = [row[0] for row in rows]
-        if header[:1] != ["view"] or not all(map(untrusted.is_name, views)):
-            raise StoreError(f"{file}: the first column must hold names of views")
-        if len(set(views)) < len(views):
-            raise StoreError(f"{file}: a view has two rows")
-        try:
-            values = [map(as_number, row[1:]) for row in rows]
-            scores = [dict(zip(header[1:], row, strict=True)) for row in values]
-        except ValueError as error:
-            raise StoreError(f"{file}: {error}") from error
-        return list(zip(views, scores, strict=True))
-
-    def finish(self, views: Sequence[str], protocol: int) -> None:
+    def finish(self, views: Sequence[str], scored_by: Mapping[str, str]) -> None:
         """Declare the cell done, with the files that are in the folder now.
 
         All of them are on the disk before the cell says that it is done.
 
         Args:
-            views: Names of the test views, in the order of `scores.csv`.
-            protocol: Version of the evaluation protocol.
+            views: Names of the scored views, in the order of `scores.csv`.
+            scored_by: Digests of the code that scored, see `xrgs.evaluation.scoring`.
         """
-        self.folder.sync_tree()
+        sync_tree(self.path)
         files = {
-            name: {"bytes": status.st_size, "sha256": file_digest(self.folder / name)}
-            for name, status in sorted(self.folder.walk())
+            name: FileEntry(status.st_size, file_digest(self.path / name))
+            for name, status in sorted(walk_files(self.path))
             if name not in _NOT_RESULTS
         }
-        self._set_status(
-            {
-                "state": "done",
-                "reason": "",
-                "views": list(views),
-                "protocol": protocol,
-                "files": files,
-            }
+        self._write_status(
+            Status("done", views=tuple(views), files=files, scored_by=dict(scored_by))
         )
         self.drop_checkpoint()  # after the status: a cell that is killed before needs it
 
-    def drop_checkpoint(self) -> None:
-        """Remove the checkpoint, which a finished cell no longer needs.
-
-        `finish` does this too, but its process may be killed in between.
-        """
-        self.checkpoint.unlink(missing_ok=True)
-
-    def trimmed(self) -> dict[str, dict[str, Any]]:
-        """Return the files that were removed on purpose: `bytes` and `sha256` by their names.
-
-        Empty for a cell that was not trimmed, and where its status can't be read.
-        """
-        try:
-            found = read_object(self.status).get("trimmed", {})
-        except StoreError:
-            return {}
-        return found if isinstance(found, dict) else {}
-
-    def check_not_trimmed(self, name: str) -> None:
-        """Refuse a file that was removed on purpose.
+    def rescored(self, names: Sequence[str], scored_by: Mapping[str, str]) -> None:
+        """Keep new scores of a done cell: the caller has written them and holds the lease.
 
         Args:
-            name: The file's path in the cell's folder, with `/`.
+            names: Files that were written anew.
+            scored_by: Digests of the code that scored.
+        """
+        status = self.status()
+        new = {
+            name: FileEntry((self.path / name).stat().st_size, file_digest(self.path / name))
+            for name in names
+        }
+        files = status.files | new
+        self._write_status(msgspec.structs.replace(status, files=files, scored_by=dict(scored_by)))
+
+    def fail(self, reason: str) -> None:
+        """Declare the cell failed, and write `error.txt` if its process did not."""
+        error = self.path / "error.txt"
+        if not error.exists():
+            write_text(error, for_terminal(f"{reason}\n"))
+        self.progress.unlink(missing_ok=True)
+        self._write_status(Status("failed", reason))
+
+    def drop_checkpoint(self) -> None:
+        """Remove the checkpoint, which a finished cell no longer needs."""
+        self.checkpoint.unlink(missing_ok=True)
+
+    def _write_status(self, status: Status) -> None:
+        write_json(self.status_file, msgspec.to_builtins(status))
+
+    # Trimming
+
+    def trimmed_status(self) -> Status:
+        """Return the status that a done cell has once it is trimmed.
 
         Raises:
-            StoreError: It was; the message says how to make it again.
+            StoreError: The status can't be read, or the cell is not done.
         """
-        if name in self.trimmed():
+        status = self.status()
+        if status.state != "done":
+            raise StoreError(f"{self.status_file}: the cell is not done")
+        heavy = {name: entry for name, entry in status.files.items() if _is_heavy(name)}
+        kept = {name: entry for name, entry in status.files.items() if name not in heavy}
+        return msgspec.structs.replace(status, files=kept, trimmed=status.trimmed | heavy)
+
+    def trim(self) -> None:
+        """Remove the Gaussians and the renders of a done cell, and list them in its status.
+
+        The caller holds the cell's lease. The status is written first: a cell that is killed in
+        between is done, and the next call removes the rest.
+
+        Raises:
+            StoreError: The status can't be read, or the cell is not done.
+            OSError: A file can't be removed.
+        """
+        status = self.trimmed_status()
+        self._write_status(status)
+        for name in status.trimmed:
+            (self.path / name).unlink(missing_ok=True)
+        renders = self.path / "renders"
+        if renders.is_dir() and not any(renders.iterdir()):
+            renders.rmdir()
+
+    def is_trimmed(self) -> bool:
+        """Return whether files of the cell were removed by `xrgs-store trim`."""
+        try:
+            return bool(self.status().trimmed)
+        except StoreError:
+            return False
+
+    def check_not_trimmed(self, name: str) -> None:
+        """Refuse a file that was removed on purpose; the message says how to make it again.
+
+        Raises:
+            StoreError: The file was removed.
+        """
+        if self.status_file.exists() and name in self.status().trimmed:
             raise StoreError(
                 f"cells/{self.id}/{name} was removed by xrgs-store trim; xrgs-sweep rerun= trains"
                 " the cell again, in a folder of its own"
             )
 
     def heavy_bytes(self) -> int:
-        """Return the bytes that `trim` would free: those of the Gaussians and the renders."""
+        """Return the bytes of the Gaussians and the renders, which `trim` would free."""
         return sum(
             status.st_size
-            for name, status in self.folder.walk()
+            for name, status in walk_files(self.path)
             if stat.S_ISREG(status.st_mode) and _is_heavy(name)
         )
 
-    def trimmed_status(self) -> dict[str, Any]:
-        """Return what the status of a done cell is once it is trimmed.
+    # Files
 
-        Raises:
-            StoreError: The status can't be read, or is not that of a done cell.
-        """
-        status = read_object(self.status)
-        if status.get("state") != "done" or not isinstance(status.get("files"), dict):
-            raise StoreError(f"{self.status}: the cell is not done")
-        heavy = {name: entry for name, entry in status["files"].items() if _is_heavy(name)}
-        if not heavy:
-            return status
-        kept = {name: of for name, of in status["files"].items() if name not in heavy}
-        return status | {"files": kept, "trimmed": self.trimmed() | heavy}
+    def status(self) -> Status:
+        """Read `status.json`; raises StoreError where it is missing or damaged."""
+        return read_struct(self.status_file, Status)
 
-    def trim(self) -> None:
-        """Remove the Gaussians and the renders of a done cell, and list them in its status.
+    def identity(self) -> Identity:
+        """Read `identity.json`; raises StoreError where it is missing or damaged."""
+        return read_struct(self.path / IDENTITY, Identity)
 
-        The caller holds the cell's lock. The status is written first: a cell that is killed in
-        between is done, and the next call removes the rest.
+    def summary(self) -> Summary:
+        """Read `summary.json`; raises StoreError where it is missing or damaged."""
+        return read_struct(self.path / "summary.json", Summary)
 
-        Raises:
-            StoreError: The status can't be read, or is not that of a done cell.
-            OSError: A file can't be removed.
-        """
-        self._set_status(self.trimmed_status())
-        for name in self.trimmed():
-            if untrusted.is_inside(name):
-                (self.folder / name).unlink(missing_ok=True)
-        renders = self.folder / _HEAVY_FOLDER
-        if renders.is_dir() and not renders.names():
-            renders.remove()
-
-    def fail(self, reason: str) -> None:
-        """Declare the cell failed, and write `error.txt` if its process did not.
-
-        Args:
-            reason: Why it failed, for the status and for people.
-        """
-        error = self.folder / "error.txt"
-        if not error.exists():
-            write_text(error, for_terminal(f"{reason}\n"))
-        self.progress.unlink(missing_ok=True)
-        self._set_status({"state": "failed", "reason": reason, "views": [], "files": {}})
-
-    def _set_status(self, status: Mapping[str, Any]) -> None:
-        write_json(self.status, status)
-
-    def identity(self) -> dict[str, Any]:
-        """Return the values that the cell's id is the digest of.
-
-        Raises:
-            StoreError: `identity.json` is missing or malformed.
-        """
-        return read_object(self.folder / "identity.json")
-
-    def summary(self) -> dict[str, Any]:
-        """Return the figures of the whole cell: training time, Gaussians, memory and others.
-
-        Raises:
-            StoreError: `summary.json` is missing or malformed.
-        """
-        return read_object(self.folder / "summary.json")
-
-    def provenance(self) -> dict[str, Any]:
-        """Return where, when and with which software the cell was trained.
-
-        Raises:
-            StoreError: `provenance.json` is missing or malformed.
-        """
-        return read_object(self.folder / "provenance.json")
-
-    def history(self) -> pd.DataFrame:
-        """Return the training history, one row per logged step; `view` is text, all else numbers.
-
-        Raises:
-            StoreError: `history.csv` can't be read, or is not such a table.
-        """
-        import pandas as pd
-
-        file = self.folder / "history.csv"
-        header, rows = read_table(file)
-        table = pd.DataFrame(rows, columns=header, dtype=object)
-        try:
-            for name in header:
-                if name != "view":
-                    table[name] = pd.to_numeric(table[name].map(as_number), downcast="integer")
-        except ValueError as error:
-            raise StoreError(f"{file}: {name}: {error}") from error
-        return table
-
-    def scores(self) -> pd.DataFrame:
-        """Return the scores of the test views.
-
-        Returns:
-            One row a view, indexed by its name (`view`), one column a score (`psnr` in dB, `ssim`,
-            `lpips`); NaN where a score was not computed.
-
-        Raises:
-            StoreError: `scores.csv` is missing or is not such a table.
-        """
-        import pandas as pd
-
-        scores = self.view_scores()
-        index = pd.Index([name for name, _ in scores], name="view", dtype=object)
-        return pd.DataFrame([values for _, values in scores], index=index)
+    def provenance(self) -> Provenance:
+        """Read `provenance.json`; raises StoreError where it is missing or damaged."""
+        return read_struct(self.path / "provenance.json", Provenance)
 
     def config(self) -> Conf:
         """Return the config that the cell was trained with.
@@ -409,7 +313,62 @@ class CellFolder:
         """
         from xrgs.composing import from_file
 
-        return from_file(self.folder / "config.json")[0]
+        return from_file(self.path / CONFIG)[0]
+
+    def view_scores(self) -> list[tuple[str, dict[str, float]]]:
+        """Return the name and the scores of every scored view, NaN where a score is missing.
+
+        Raises:
+            StoreError: `scores.csv` is missing or damaged.
+        """
+        file = self.path / "scores.csv"
+        header, rows = read_table(file)
+        views = [row[0] for row in rows]
+        if header[:1] != ["view"] or not all(map(is_name, views)):
+            raise StoreError(f"damaged: {file}: the first column must hold names of views")
+        if len(set(views)) < len(views):
+            raise StoreError(f"damaged: {file}: a view has two rows")
+        try:
+            values = [map(as_number, row[1:]) for row in rows]
+            scores = [dict(zip(header[1:], row, strict=True)) for row in values]
+        except ValueError as error:
+            raise StoreError(f"damaged: {file}: {error}") from error
+        return list(zip(views, scores, strict=True))
+
+    def scores(self) -> pd.DataFrame:
+        """Return the scores of the scored views.
+
+        Returns:
+            One row a view, indexed by its name (`view`), one column a score (`psnr` in dB, `ssim`,
+            `lpips`); NaN where a score was not computed.
+
+        Raises:
+            StoreError: `scores.csv` is missing or damaged.
+        """
+        import pandas as pd
+
+        scores = self.view_scores()
+        index = pd.Index([name for name, _ in scores], name="view", dtype=object)
+        return pd.DataFrame([values for _, values in scores], index=index)
+
+    def history(self) -> pd.DataFrame:
+        """Return the training history, one row per logged step; `view` is text, all else numbers.
+
+        Raises:
+            StoreError: `history.csv` is missing or damaged.
+        """
+        import pandas as pd
+
+        file = self.path / "history.csv"
+        header, rows = read_table(file)
+        table = pd.DataFrame(rows, columns=header, dtype=object)
+        try:
+            for name in header:
+                if name != "view":
+                    table[name] = pd.to_numeric(table[name].map(as_number), downcast="integer")
+        except ValueError as error:
+            raise StoreError(f"damaged: {file}: {name}: {error}") from error
+        return table
 
     def gaussians(self) -> Gaussians:
         """Load the trained Gaussians, in the world of `cameras`.
@@ -420,7 +379,20 @@ class CellFolder:
         from xrgs.splat.ply import load_ply
 
         self.check_not_trimmed("splats.ply")
-        return load_ply(self.folder / "splats.ply")
+        return load_ply(self.path / "splats.ply")
+
+    def variant(self) -> Variant:
+        """Load the variant that the cell was trained on, from the store that the cell is in.
+
+        Raises:
+            XrgsError: `identity.json` can't be read, or the variant is not in the store or damaged.
+        """
+        from xrgs.capture import variant
+        from xrgs.experiment.trimming import check_images
+
+        variants, variant_id = self.path.parents[1] / "variants", self.identity().variant
+        check_images(variants, variant_id)
+        return variant.load(variants / variant_id)
 
     def dataset(self) -> Dataset:
         """Load what the cell was trained and scored on: photographs, cameras, points.
@@ -429,12 +401,13 @@ class CellFolder:
         The cameras and points are in the normalised world of the Gaussians.
 
         Raises:
-            StoreError: `identity.json` can't be read.
-            XrgsError: The variant is not in the store, or is damaged.
+            XrgsError: As `config` and `variant`.
         """
-        from xrgs.experiment.results import load_dataset
+        from xrgs.capture import dataset
 
-        return load_dataset(self.folder)
+        conf = self.config()
+        validation = conf.train.validation
+        return dataset.load(self.variant(), conf.train.views, validation=validation, seed=conf.seed)
 
     def cameras(self) -> dict[str, dict[str, Camera]]:
         """Load the cameras of the cell's views, in the normalised world of its Gaussians.
@@ -443,7 +416,7 @@ class CellFolder:
             `{"train": {name: camera}, "test": {name: camera}}`, in the variant's order.
 
         Raises:
-            XrgsError: As `dataset`, whose photographs are read with them.
+            XrgsError: As `dataset`, which reads the photographs too.
         """
         data = self.dataset()
         splits = {"train": data.train, "test": data.test}
@@ -453,4 +426,5 @@ class CellFolder:
 
 
 def _is_heavy(name: str) -> bool:
-    return name in _HEAVY or name.startswith(f"{_HEAVY_FOLDER}/")
+    """Return whether only pictures, viewers and `rerun=` need a file of a done cell."""
+    return name == "splats.ply" or name.startswith("renders/")

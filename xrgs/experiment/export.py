@@ -16,9 +16,8 @@ import numpy as np
 
 from xrgs.errors import XrgsError
 from xrgs.experiment.cell_folder import CellFolder
-from xrgs.experiment.results import load_variant
 from xrgs.safeio.atomic import write_json, write_text
-from xrgs.safeio.confined import ConfinedPath
+from xrgs.safeio.files import list_names
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -54,20 +53,17 @@ def export(path: Path, layout: str, out: Path) -> str:
     """
     if layout not in _LAYOUTS:
         raise XrgsError(f"format={layout}: must be one of {', '.join(_LAYOUTS)}")
-    folder = ConfinedPath(path)
-    cell = _cell(folder)
-    variant, data = _load(folder, cell)
-    target = ConfinedPath(out)
+    cell = _cell(path)
+    variant, data = _load(path, cell)
     try:
-        target.make_root()
-        if target.names():
+        out.mkdir(parents=True, exist_ok=True)
+        if any(out.iterdir()):
             raise XrgsError(f"out={out}: it holds files; name a new folder")
-        images = _write_images(data, target)
-        write_json(target / "transform.json", {"sfm_to_export": transform(variant).tolist()})
-        _LAYOUTS[layout](data, images, target)
+        images = _write_images(data, out)
+        write_json(out / "transform.json", {"sfm_to_export": transform(variant).tolist()})
+        _LAYOUTS[layout](data, images, out)
         if cell is not None:
-            with (cell.folder / _SPLATS).open() as stream, (target / _SPLATS).create() as copy:
-                shutil.copyfileobj(stream, copy)
+            shutil.copyfile(cell.path / _SPLATS, out / _SPLATS)
     except OSError as error:
         raise XrgsError(f"out={out}: {error.filename}: {error.strerror}") from error
     splats = "" if cell is None else f", {_SPLATS}"
@@ -90,10 +86,10 @@ def transform(variant: Variant) -> NDArray[np.float64]:
     return normalize_scene(np.stack(posed), variant.points).transform
 
 
-def _cell(folder: ConfinedPath) -> CellFolder | None:
+def _cell(folder: Path) -> CellFolder | None:
     """Return the finished cell in a folder; None where it holds a variant."""
     try:
-        names = folder.names()
+        names = list_names(folder)
     except OSError as error:
         raise XrgsError(
             f"{folder}: {error.strerror}; give the folder of a cell or a variant"
@@ -102,18 +98,18 @@ def _cell(folder: ConfinedPath) -> CellFolder | None:
         return None
     if "identity.json" not in names:
         raise XrgsError(f"{folder}: neither a cell nor a variant")
-    cell = CellFolder(ConfinedPath(folder.path.parent) / folder.path.name)
+    cell = CellFolder(folder.absolute())
     state = cell.state()
     if state.name != "done":
         raise XrgsError(f"{folder}: this cell is {state.name}, not done ({state.reason})")
     return cell
 
 
-def _load(folder: ConfinedPath, cell: CellFolder | None) -> tuple[Variant, Dataset]:
+def _load(folder: Path, cell: CellFolder | None) -> tuple[Variant, Dataset]:
     from xrgs.capture import dataset, variant
 
     if cell is not None:
-        return load_variant(cell.folder), cell.dataset()
+        return cell.variant(), cell.dataset()
     frozen = variant.load(folder)
     return frozen, dataset.load(frozen)
 
@@ -125,7 +121,7 @@ def _views(data: Dataset) -> Iterator[tuple[str, str, LoadedView]]:
             yield f"{split}_{view.name}.png", split, view
 
 
-def _write_images(data: Dataset, target: ConfinedPath) -> list[PinholeImage]:
+def _write_images(data: Dataset, target: Path) -> list[PinholeImage]:
     """Write the images and `split.json`; return the cameras."""
     from xrgs.capture.colmap import PinholeImage
     from xrgs.capture.images import save
@@ -141,21 +137,21 @@ def _write_images(data: Dataset, target: ConfinedPath) -> list[PinholeImage]:
     return images
 
 
-def _write_colmap(data: Dataset, images: list[PinholeImage], target: ConfinedPath) -> None:
+def _write_colmap(data: Dataset, images: list[PinholeImage], target: Path) -> None:
     """Write a binary model, and the list of test views that the trainer of 3DGS reads."""
     from xrgs.capture import colmap
 
     model = target / "sparse/0"
-    model.make_folder()
-    colmap.write_model(model.path, images, *_points(data))
+    model.mkdir(parents=True)
+    colmap.write_model(model, images, *_points(data))
     tests = [name for name, split, _ in _views(data) if split == "test"]
     write_text(model / "test.txt", "".join(f"{name}\n" for name in tests))
 
 
-def _write_nerfstudio(data: Dataset, images: list[PinholeImage], target: ConfinedPath) -> None:
+def _write_nerfstudio(data: Dataset, images: list[PinholeImage], target: Path) -> None:
     from xrgs.capture import colmap
 
-    colmap.write_points(target.path / "points.ply", *_points(data))
+    colmap.write_points(target / "points.ply", *_points(data))
     files = {"train": [], "test": []}  # type: dict[str, list[str]]
     for name, split, _ in _views(data):
         files[split].append(f"images/{name}")
@@ -191,7 +187,7 @@ def _points(data: Dataset) -> tuple[NDArray[np.float64], NDArray[np.uint8]]:
     return data.points.double().numpy(), colors
 
 
-_LAYOUTS: dict[str, Callable[[Dataset, list[PinholeImage], ConfinedPath], None]] = {
+_LAYOUTS: dict[str, Callable[[Dataset, list[PinholeImage], Path], None]] = {
     "colmap": _write_colmap,
     "nerfstudio": _write_nerfstudio,
 }

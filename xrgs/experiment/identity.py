@@ -1,110 +1,188 @@
-"""The identity of a cell: every value that can change one of its numbers, and nothing else.
+"""The identity of a cell: every value that can change one of its trained numbers, nothing else.
 
-Paths, thread counts, logging and labels are not part of it, so a finished cell is found again under
-another label, in another folder or on another machine. Of a machine it has the arithmetic
-(`xrgs.splat.backend.arithmetic`): the native backend gives the same bits on all machines of the
-same arithmetic. The last digits of the torch backend differ among machines, and this is not part of
-it.
+1. Words don't count: comments, docstrings and blank lines of the code change no id.
+2. What is off is absent: a component that is off, its settings and its module are not in the
+   identity, nor is any key at its `off` value (`xrgs.config.off`).
+3. The module of a component counts where the component is on. The core counts always, and the
+   native kernels count where the native backend trains.
+4. Scores are apart: metrics and the evaluation protocol have digests of their own
+   (`xrgs.evaluation.scoring`), and `xrgs-store rescore` makes scores anew.
+5. A refactoring that changes no number keeps its cells: `xrgs-store prove` trains a sample of cells
+   again, and declares the digests of the old and the new code equal where all bits are.
+6. Any other change of the hashed code makes new ids.
+
+Paths, thread counts, logging and labels are not part of it, so that a finished cell is found again
+under another label, in another folder or on another machine. Of a machine the identity has the
+arithmetic (`xrgs.splat.backend.arithmetic`): the native backend gives the same bits on all machines
+of the same arithmetic. The last digits of the torch backend differ among machines, and this is not
+part of it.
 """
 
 from __future__ import annotations
 
+import json
 from functools import cache
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import TYPE_CHECKING
 
-from xrgs.evaluation.protocol import PROTOCOL_VERSION
-from xrgs.safeio.hashing import source_digests, to_plain
+import msgspec
+
+from xrgs.config import identity_values
+from xrgs.experiment.schema import Identity
+from xrgs.safeio.code import code_digest
+from xrgs.safeio.hashing import digest
 from xrgs.splat.backend import arithmetic, resolve_backend
 from xrgs.training import plugins
+from xrgs.training.registry import modules_of, order_of
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
-
     from xrgs.config import Conf
 
-#: Files whose change can change a trained number; a folder stands for every source file inside.
-_TRAINING_CODE = (
-    "splat",
-    "training",
+#: Source files whose change can change a trained number, whatever components are on.
+CORE = (
     "capture/dataset.py",
-    "evaluation/lpips/network.py",
-    "evaluation/lpips/weights.py",
-    "evaluation/metrics.py",
-    "evaluation/protocol.py",
     "safeio/npz.py",
+    "splat/attribution.py",
+    "splat/backend.py",
+    "splat/bicubic.py",
+    "splat/cameras.py",
+    "splat/gaussians.py",
+    "splat/loss.py",
+    "splat/native",
+    "splat/normalize.py",
+    "splat/optimizer.py",
+    "splat/quaternions.py",
+    "splat/rendering.py",
+    "splat/resample.py",
+    "splat/rounding.py",
+    "splat/settings.py",
+    "splat/sh.py",
+    "splat/ssim.py",
+    "splat/strategy",
+    "splat/torch",
+    "training/checkpoint.py",
+    "training/components/__init__.py",
+    "training/components/base.py",
+    "training/components/combined.py",
+    "training/count_matching.py",
+    "training/loop.py",
+    "training/memory.py",
+    "training/recorder.py",
+    "training/rendering.py",
+    "training/sampler.py",
+    "training/seeding.py",
+    "training/work.py",
 )
-#: The C++ sources of the native backend. The compiled module itself is not hashed: two builds of
-#: the same sources differ in their bytes and give the same numbers.
-_NATIVE_CODE = "csrc"
+#: The C++ sources of the native backend. The compiled module is not hashed: two builds of the same
+#: sources differ in their bytes and give the same numbers.
+NATIVE = ("csrc",)
+#: Declared refactorings: for each part of the code, old digests by the new ones that are equal.
+REFACTORINGS = Path(__file__).with_name("refactorings.json")
+
+
+def cell_identity(conf: Conf, variant_id: str) -> Identity:
+    """Return everything that decides a cell's trained numbers; its digest is the cell's id.
+
+    Args:
+        conf: The cell's config.
+        variant_id: The id of the frozen variant that the cell trains on.
+
+    Raises:
+        XrgsError: The configured backend is not available on this machine, or a plugin is missing.
+    """
+    backend = resolve_backend(conf.splat.backend)
+    components = identity_values(conf.components)
+    return Identity(
+        variant=variant_id,
+        seed=conf.seed,
+        train=identity_values(conf.train),
+        splat=identity_values(conf.splat) | {"backend": backend},
+        components=components,
+        arithmetic=arithmetic(backend),
+        code=training_code(backend, tuple(components), tuple(sorted(conf.components.plugins))),
+    )
+
+
+def cell_id(identity: Identity) -> str:
+    """Return the id of a cell: 16 hexadecimal digits."""
+    return digest(msgspec.to_builtins(identity))
 
 
 @cache
-def training_code(backend: str, plugin_names: tuple[str, ...] = ()) -> dict[str, str]:
-    """Return the SHA-256 of each source file that trains with a backend; they are read once.
-
-    All cells of the same backend and plugins share the returned object: a plan of ten thousand
-    cells would else hold as many copies.
+def training_code(
+    backend: str, components: tuple[str, ...] = (), plugin_names: tuple[str, ...] = ()
+) -> dict[str, str]:
+    """Return the digest of each part of the code that trains a cell; files are read once.
 
     Args:
         backend: `native` or `torch`.
-        plugin_names: The names of components of other packages, sorted.
-
-    Returns:
-        The digests, keyed by the file's path in the package; those of other packages by
-        `plugins/<name>/<path in the package>`.
+        components: Keys of the components that are on.
+        plugin_names: Names of components of other packages, sorted.
 
     Raises:
         XrgsError: A plugin is not installed, or has no source file.
     """
-    digests = _installed_code(backend)
-    for name in plugin_names:
-        digests |= plugins.source_digests(name)
-    return digests
+    return code_now(backend, components, plugin_names)
 
 
-def _installed_code(backend: str) -> dict[str, str]:
-    names = (*_TRAINING_CODE, _NATIVE_CODE) if backend == "native" else _TRAINING_CODE
-    return source_digests(*names)
+def code_now(
+    backend: str, components: tuple[str, ...] = (), plugin_names: tuple[str, ...] = ()
+) -> dict[str, str]:
+    """Return `training_code` of the files as they are now, edited meanwhile or not."""
+    exact = _exact(backend, components)
+    code = {part: canonical(part, of_part) for part, of_part in exact.items()}
+    return code | {f"plugins/{name}": plugins.code_digest(name) for name in plugin_names}
 
 
-def changed_code(code: Mapping[str, str], backend: str) -> list[str]:
-    """Return the source files that are not the ones that an identity was computed with.
-
-    The installed files are read anew, so that a file edited since this process started counts too.
-
-    Args:
-        code: The `code` of an identity.
-        backend: `native` or `torch`.
-
-    Returns:
-        Paths in the package of files that were changed, added or removed; sorted.
-    """
-    installed = _installed_code(backend) | plugins.digests_now(code)
-    files = code.keys() | installed.keys()
-    return sorted(file for file in files if code.get(file) != installed.get(file))
+def _exact(backend: str, components: tuple[str, ...]) -> dict[str, str]:
+    """Return the digest of each part of the code, and the order of the components' hooks."""
+    files = _files(backend, components)
+    code = {part: code_digest(*names) for part, names in files.items()}
+    order = order_of(components)
+    return code | {"order": order} if order else code
 
 
-def cell_identity(conf: Conf, variant_id: str) -> dict[str, Any]:
-    """Return everything that decides a cell's numbers, as plain JSON values.
+def _files(backend: str, components: tuple[str, ...]) -> dict[str, tuple[str, ...]]:
+    """Return the source files of each part of the code, relative to the package."""
+    files: dict[str, tuple[str, ...]] = {"core": CORE}
+    if backend == "native":
+        files["native"] = NATIVE
+    return files | {key: modules_of(key) for key in components if modules_of(key)}
 
-    Args:
-        conf: The cell's config.
-        variant_id: The id of the frozen variant that it trains on.
 
-    Returns:
-        The identity. Its digest is the cell's id.
+def canonical(part: str, code: str) -> str:
+    """Return the oldest digest that a refactoring has declared equal to this digest of a part."""
+    declared = refactorings().get(part, {})
+    while code in declared:
+        code = declared[code]
+    return code
+
+
+def refactorings() -> dict[str, dict[str, str]]:
+    """Return the declared refactorings: old digests by new ones, for each part of the code."""
+    if not REFACTORINGS.is_file():
+        return {}
+    declared: dict[str, dict[str, str]] = json.loads(REFACTORINGS.read_text(encoding="utf-8"))
+    return declared
+
+
+def changed_code(identity: Identity) -> list[str]:
+    """Return the parts of the installed code that differ from those of an identity, sorted.
 
     Raises:
-        XrgsError: The backend that is configured is not available on this machine.
+        XrgsError: A plugin is not installed.
     """
-    backend = resolve_backend(conf.splat.backend)
-    return {
-        "splat": to_plain(conf.splat) | {"backend": backend},
-        "train": to_plain(conf.train),
-        "components": to_plain(conf.components),
-        "seed": conf.seed,
-        "variant": variant_id,
-        "protocol": PROTOCOL_VERSION,
-        "arithmetic": arithmetic(backend),
-        "code": training_code(backend, tuple(sorted(conf.components.plugins))),
-    }
+    now = current_code(identity)
+    parts = identity.code.keys() | now.keys()
+    return sorted(part for part in parts if identity.code.get(part) != now.get(part))
+
+
+def current_code(identity: Identity) -> dict[str, str]:
+    """Return the digests that the parts of an identity's code have in the installed package."""
+    names = tuple(sorted(identity.components.get("plugins", {})))
+    return code_now(str(identity.splat["backend"]), tuple(identity.components), names)
+
+
+def exact_code(identity: Identity) -> dict[str, str]:
+    """Return `current_code` without declared refactorings and plugins."""
+    return _exact(str(identity.splat["backend"]), tuple(identity.components))

@@ -14,17 +14,16 @@ from typing import TYPE_CHECKING, Any
 
 import xrgs
 from xrgs.evaluation.lpips import weights
+from xrgs.experiment.schema import Provenance
 from xrgs.runtime.machine import usable_cores
 from xrgs.splat.backend import arithmetic
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
+    from collections.abc import Mapping
 
 _PACKAGES = ("torch", "numpy", "pycolmap", "kornia", "scikit-image", "hydra-core", "pandas")
-_PROCESSOR_KEYS = ("cpu", "instruction_set")
 #: Entries that times depend on, beside the program.
-MACHINE_KEYS = (*_PROCESSOR_KEYS, "threads", "backend")
-
+MACHINE_KEYS = ("cpu", "instruction_set", "threads", "backend")
 #: What a cell's numbers come from, in the root of a checkout: `git_diff_sha256` covers it.
 _SOURCES = ("xrgs", "conf", "sweeps", "hydra_plugins")
 
@@ -67,8 +66,8 @@ def _instruction_set(backend: str) -> str | None:
     return str(_native.isa())
 
 
-def collect(threads: int, backend: str) -> dict[str, Any]:
-    """Return the program, its libraries, the machine and the time, as plain JSON values.
+def collect(threads: int, backend: str) -> Provenance:
+    """Return the program, its libraries, the machine and the time.
 
     Args:
         threads: Number of threads that the cell uses.
@@ -80,47 +79,37 @@ def collect(threads: int, backend: str) -> dict[str, Any]:
         XrgsError: The backend is not available on this machine.
     """
     diff = _uncommitted()
-    return {
-        "xrgs": xrgs.__version__,
-        "git": (_git("rev-parse", "HEAD") or "").strip() or None,
-        "git_diff_sha256": hashlib.sha256(diff.encode()).hexdigest() if diff else None,
-        "python": sys.version.split()[0],
-        "packages": {name: metadata.version(name) for name in _PACKAGES},
-        "platform": platform.platform(),
-        "cores": usable_cores(),
-        "threads": threads,
-        "backend": backend,
-        "arithmetic": arithmetic(backend),
-        "lpips_weights_sha256": None
-        if weights.load_published() is None
-        else weights.CONTENT_SHA256,
-        "started": datetime.now(UTC).isoformat(timespec="seconds"),
-    } | _processor(backend)
+    published = weights.load_published()
+    return Provenance(
+        xrgs=xrgs.__version__,
+        git=(_git("rev-parse", "HEAD") or "").strip() or None,
+        git_diff_sha256=hashlib.sha256(diff.encode()).hexdigest() if diff else None,
+        python=sys.version.split()[0],
+        packages={name: metadata.version(name) for name in _PACKAGES},
+        platform=platform.platform(),
+        cores=usable_cores(),
+        threads=threads,
+        backend=backend,
+        arithmetic=arithmetic(backend),
+        lpips_weights_sha256=None if published is None else weights.CONTENT_SHA256,
+        started=datetime.now(UTC).isoformat(timespec="seconds"),
+        cpu=_cpu(),
+        instruction_set=_instruction_set(backend),
+    )
 
 
-def _processor(backend: str) -> dict[str, str | None]:
-    return {"cpu": _cpu(), "instruction_set": _instruction_set(backend)}
+def machine(made: Provenance) -> str:
+    """Return what a cell's times depend on, for example `AMD EPYC, avx2, threads 1, native`."""
+    parts = (made.cpu, made.instruction_set, f"threads {made.threads}", made.backend)
+    return ", ".join(filter(None, parts))
 
 
-def machine(provenance: Mapping[str, Any]) -> str:
-    """Return what a cell's times depend on, for example `AMD EPYC, avx2, threads 1, native`.
+def processor(made: Provenance) -> str:
+    """Return the processor that trained a cell, for example `AMD EPYC, avx2`.
 
-    Args:
-        provenance: What `collect` has returned; entries may be missing.
+    The text is empty where several machines have trained the cell in turn.
     """
-    return _text(provenance, MACHINE_KEYS)
-
-
-def processor(provenance: Mapping[str, Any]) -> str:
-    """Return the processor that trained a cell and what of it was used: `AMD EPYC, avx2`.
-
-    Args:
-        provenance: What `collect` has returned; entries may be missing.
-
-    Returns:
-        The text; empty where several machines have trained the cell in turn.
-    """
-    return "" if "machines_in_turn" in provenance else _text(provenance, _PROCESSOR_KEYS)
+    return "" if made.machines_in_turn else _processor(made.cpu, made.instruction_set)
 
 
 @cache
@@ -130,13 +119,11 @@ def this_processor(backend: str) -> str:
     Args:
         backend: The rasterizer in use, `native` or `torch`.
     """
-    return processor(_processor(backend))
+    return _processor(_cpu(), _instruction_set(backend))
 
 
-def _text(provenance: Mapping[str, Any], keys: Sequence[str]) -> str:
-    known = {key: provenance[key] for key in keys if provenance.get(key) is not None}
-    texts = (f"threads {value}" if key == "threads" else str(value) for key, value in known.items())
-    return ", ".join(texts)
+def _processor(cpu: str | None, instruction_set: str | None) -> str:
+    return ", ".join(filter(None, (cpu, instruction_set)))
 
 
 class Machines:

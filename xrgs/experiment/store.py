@@ -12,34 +12,34 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import msgspec
+
 from xrgs.capture.failures import FAILED_PREFIX
 from xrgs.errors import StoreError, UnreadableError
-from xrgs.experiment.cell_folder import READING_ERRORS, CellFolder, CellState
+from xrgs.experiment.cell_folder import CellFolder, CellState
+from xrgs.experiment.schema import SweepRecord
 from xrgs.runtime.progress import log_line
-from xrgs.safeio import untrusted
 from xrgs.safeio.atomic import write_json
-from xrgs.safeio.confined import ConfinedPath, RootMissingError
+from xrgs.safeio.files import is_name, sync_name
 from xrgs.safeio.hashing import digest
-from xrgs.safeio.records import list_folder, read_json
-from xrgs.safeio.words import for_line
+from xrgs.safeio.records import list_folder, read_struct
+from xrgs.safeio.sanitize import for_line
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Mapping, Sequence
+    from collections.abc import Sequence
 
     import pandas as pd
+
+    from xrgs.experiment.schema import RecordedCell
 
 
 #: Label of the cells that all others are compared to.
 BASELINE = "baseline"
 
-_RECORD_VERSION = 1
 #: The largest record of a sweep that is read, in bytes: 100,000 cells take 30 MB.
 _MAX_RECORD_BYTES = 1 << 25
-#: The longest scene, label or condition of a record, in characters.
-_MAX_NAME = 2000
 #: Bytes that must be writable before a sweep starts; any cell needs more than that.
 _MIN_FREE_BYTES = 1 << 15
-_MAX_SEED = (1 << 63) - 1
 #: The most ids of cells that a message lists.
 _MAX_LISTED = 6
 
@@ -55,39 +55,34 @@ class Store:
         object.__setattr__(self, "path", Path(path))
 
     @property
-    def folder(self) -> ConfinedPath:
-        """The folder as the root of everything in it, which may come from anybody."""
-        return ConfinedPath(self.path)
-
-    @property
-    def scenes(self) -> ConfinedPath:
+    def scenes(self) -> Path:
         """Folder of the rendered photographs of procedural scenes."""
-        return self.folder / "scenes"
+        return self.path / "scenes"
 
     @property
-    def variants(self) -> ConfinedPath:
+    def variants(self) -> Path:
         """Folder of the frozen variants."""
-        return self.folder / "variants"
+        return self.path / "variants"
 
     @property
-    def cells_folder(self) -> ConfinedPath:
+    def cells_folder(self) -> Path:
         """Folder of the cells."""
-        return self.folder / "cells"
+        return self.path / "cells"
 
     @property
-    def locks(self) -> ConfinedPath:
-        """Folder of the locks of cells that are being trained."""
-        return self.folder / "locks"
+    def leases(self) -> Path:
+        """Folder of the leases of cells that are being trained."""
+        return self.path / "locks"
 
     @property
-    def sweeps(self) -> ConfinedPath:
+    def sweeps(self) -> Path:
         """Folder of the records of sweeps."""
-        return self.folder / "sweeps"
+        return self.path / "sweeps"
 
     @property
-    def reports(self) -> ConfinedPath:
+    def reports(self) -> Path:
         """Folder of the reports: tables and figures."""
-        return self.folder / "reports"
+        return self.path / "reports"
 
     @property
     def exists(self) -> bool:
@@ -98,8 +93,6 @@ class Store:
         """
         try:
             return self.cells_folder.is_dir()
-        except (RootMissingError, NotADirectoryError):
-            return False
         except OSError as error:
             raise UnreadableError(f"store={self.path}: {error.strerror}; try again") from error
 
@@ -110,10 +103,10 @@ class Store:
             StoreError: The folder can't be written; the message names it and the `store` key.
         """
         try:
-            self.folder.make_root()
-            for folder in (self.scenes, self.variants, self.cells_folder, self.locks, self.sweeps):
-                folder.make_folder()
-            self.cells_folder.sync_name()  # and the names of the others, which are beside it
+            self.path.mkdir(parents=True, exist_ok=True)
+            for folder in (self.scenes, self.variants, self.cells_folder, self.leases, self.sweeps):
+                folder.mkdir(exist_ok=True)
+            sync_name(self.cells_folder)  # and the names of the others, which are beside it
         except OSError as error:
             raise self._unwritable(error) from error
         self.check_room()
@@ -161,11 +154,11 @@ class Store:
         Raises:
             StoreError: The id is not a valid name of a folder.
         """
-        if not untrusted.is_name(cell_id):
+        if not is_name(cell_id):
             raise StoreError(f"{cell_id!r:.80} is not the id of a cell")
         return CellFolder(self.cells_folder / cell_id)
 
-    def variant(self, variant_id: str) -> ConfinedPath:
+    def variant(self, variant_id: str) -> Path:
         """Return the folder of a variant, which need not exist.
 
         Args:
@@ -174,7 +167,7 @@ class Store:
         Raises:
             StoreError: The id is not a valid name of a folder.
         """
-        if not untrusted.is_name(variant_id):
+        if not is_name(variant_id):
             raise StoreError(f"{variant_id!r:.80} is not the id of a variant")
         return self.variants / variant_id
 
@@ -208,9 +201,9 @@ class Store:
             if state.name == "done":
                 try:
                     metrics = cell_metrics(cell.summary(), cell.scores())
-                except READING_ERRORS as error:
+                except (StoreError, OSError) as error:
                     state = CellState.of_error(error)
-            row: dict[str, Any] = cell_columns(cell.folder, names.get(cell.id, {}))
+            row: dict[str, Any] = cell_columns(cell, names.get(cell.id))
             rows.append(row | metrics | {"state": state.name, "reason": for_line(state.reason)})
         return cells_table(rows)
 
@@ -227,7 +220,7 @@ class Store:
             raise StoreError(f"store={self.path} is not a store; xrgs-sweep makes one")
         return self.cell(full_id(beginning, [cell.id for cell in self.cell_folders()]))
 
-    def find_folder(self, beginning: str) -> ConfinedPath:
+    def find_folder(self, beginning: str) -> Path:
         """Return the folder of the cell or the variant whose id begins with a text.
 
         Args:
@@ -241,10 +234,10 @@ class Store:
         variants = [
             self.variant(name)
             for name in list_folder(self.variants)
-            if "." not in name and not name.startswith(FAILED_PREFIX) and untrusted.is_name(name)
+            if "." not in name and not name.startswith(FAILED_PREFIX) and is_name(name)
         ]
         folders = {folder.name: folder for folder in variants}
-        folders |= {cell.id: cell.folder for cell in self.cell_folders()}
+        folders |= {cell.id: cell.path for cell in self.cell_folders()}
         return folders[full_id(beginning, list(folders), "cells or variants")]
 
     def cell_folders(self) -> list[CellFolder]:
@@ -256,27 +249,21 @@ class Store:
             StoreError: The folder of cells can't be listed; the message names it.
         """
         names = list_folder(self.cells_folder)
-        return [self.cell(name) for name in names if "." not in name and untrusted.is_name(name)]
+        return [self.cell(name) for name in names if "." not in name and is_name(name)]
 
-    def cell_names(self) -> dict[str, dict[str, str]]:
-        """Return scene, label and condition of recorded cells by id, as the latest sweep has it.
+    def cell_names(self) -> dict[str, RecordedCell]:
+        """Return the row of the latest sweep that has each recorded cell, by the cell's id.
 
         A sweep's record that can't be read is named on stderr, and left out.
         """
-        from xrgs.experiment.results import CELL_NAMES
-
         try:
             records, damaged = self.records()
         except StoreError as error:
             records, damaged = {}, (str(error),)
         for message in damaged:
             log_line(f"{message}; its names of cells are left out")
-        return {
-            row["cell_id"]: {key: for_line(row.get(key, "")) for key in CELL_NAMES}
-            for record in records.values()
-            for row in record["cells"]
-            if row.get("cell_id") is not None
-        }
+        rows = (row for record in records.values() for row in record.cells)
+        return {row.cell_id: row for row in rows if row.cell_id is not None}
 
     def sweep_ids(self) -> list[str]:
         """Return the ids of the recorded sweeps, oldest first.
@@ -285,11 +272,11 @@ class Store:
             StoreError: The folder of the records can't be listed; the message names it.
         """
         names = [name for name in list_folder(self.sweeps) if name.endswith(".json")]
-        files = [self.sweeps / name for name in names if untrusted.is_name(name)]
+        files = [self.sweeps / name for name in names if is_name(name)]
         times = {file.stem: _modified_ns(file) for file in files}
         return sorted(times, key=lambda sweep_id: (times[sweep_id], sweep_id))
 
-    def records(self) -> tuple[dict[str, dict[str, Any]], tuple[str, ...]]:
+    def records(self) -> tuple[dict[str, SweepRecord], tuple[str, ...]]:
         """Read the records of all sweeps.
 
         Returns:
@@ -308,32 +295,24 @@ class Store:
         return records, tuple(damaged)
 
     def write_sweep(
-        self,
-        command: Sequence[str],
-        cells: Iterable[Mapping[str, Any]],
-        sweep_id: str | None = None,
+        self, command: Sequence[str], cells: Sequence[RecordedCell], sweep_id: str | None = None
     ) -> str:
         """Record which cells a sweep compares, for its report: when it starts, and at its end.
 
         Args:
             command: Arguments of `xrgs-sweep`.
-            cells: One row for each cell, as `xrgs.sweep.plan.record` makes them.
+            cells: The cells.
             sweep_id: The id that the sweep has already, whose record is replaced; None when it
                 starts.
 
         Returns:
-            The id of the record. A sweep that asks for the same has the same id, however many of
-            its cells are done.
+            The id of the record. Sweeps that ask for the same cells have the same id, however many
+            of the cells are done.
         """
-        rows = [dict(cell) for cell in cells]
+        rows = msgspec.to_builtins(tuple(cells))
+        record = SweepRecord(1, tuple(command), tuple(cells), digest(rows))
         sweep_id = sweep_id or digest([_asked_for(row) for row in rows])
-        record = {
-            "version": _RECORD_VERSION,
-            "command": list(command),
-            "cells": rows,
-            "digest": digest(rows),
-        }
-        write_json(self.sweeps / f"{sweep_id}.json", record)
+        write_json(self.sweeps / f"{sweep_id}.json", msgspec.to_builtins(record))
         return sweep_id
 
     def latest_sweep(self) -> str:
@@ -361,83 +340,41 @@ class Store:
             return sweep_id
         raise damaged[0]
 
-    def sweep_record(self, sweep_id: str | None = None) -> dict[str, Any]:
-        """Return the record of a sweep.
-
-        Args:
-            sweep_id: The id of the record; None for the latest.
-
-        Returns:
-            `version`, `command` (the arguments of `xrgs-sweep`), `cells` (one row per cell) and
-            `digest` (of the cells; records of earlier versions lack it).
+    def sweep_record(self, sweep_id: str | None = None) -> SweepRecord:
+        """Return the record of a sweep; None for the latest.
 
         Raises:
-            StoreError: There is no such record, or it is malformed or of another version.
+            StoreError: There is no such record, or it is damaged or of another version.
         """
         sweep_id = sweep_id or self.latest_sweep()
-        if not untrusted.is_name(sweep_id):
+        if not is_name(sweep_id):
             raise StoreError(f"{sweep_id!r:.80} is not the id of a sweep")
-        file = self.sweeps / f"{sweep_id}.json"
-        record = read_json(file, _MAX_RECORD_BYTES)
-        if not isinstance(record, dict) or record.get("version") != _RECORD_VERSION:
-            raise StoreError(f"{file} is not a sweep record of version {_RECORD_VERSION}")
-        command, cells = record.get("command"), record.get("cells")
-        if not _is_list(command, str) or not isinstance(cells, list):
-            raise StoreError(f"{file}: command or cells is missing or malformed")
-        wrong = [number for number, row in enumerate(cells) if not _is_row(row)]
-        if wrong:
-            raise StoreError(f"{file}: cell {wrong[0] + 1} has a value of a wrong type or form")
-        return record
+        return read_struct(self.sweeps / f"{sweep_id}.json", SweepRecord, _MAX_RECORD_BYTES)
 
     def verify_sweep(self, sweep_id: str) -> None:
         """Check that a sweep's record is the one that was written, by the hash in it.
 
-        Args:
-            sweep_id: The id of the record.
-
         Raises:
-            StoreError: It can't be read, or has changed; the message names the file.
+            StoreError: The record can't be read, or has changed; the message names the file.
         """
         record = self.sweep_record(sweep_id)
-        # Records from before a sweep was recorded at its start have the hash as their id.
-        if digest(record["cells"]) != record.get("digest", sweep_id):
+        if digest(msgspec.to_builtins(record.cells)) != record.digest:
             file = self.sweeps / f"{sweep_id}.json"
             raise StoreError(f"{file}: its cells have changed since it was written")
 
 
-def _asked_for(row: Mapping[str, Any]) -> dict[str, Any]:
+def _asked_for(row: dict[str, Any]) -> dict[str, Any]:
     """Return what a row of a record says of a cell before any cell is trained."""
-    names = ("scene", "label", "condition", "variant_seed", "seed", "variant_id")
-    known = {name: row[name] for name in names if name in row}
-    return known | {"planned_id": row.get("planned_id", row.get("cell_id"))}
+    names = ("scene", "label", "condition", "variant_seed", "seed", "variant_id", "planned_id")
+    return {name: row[name] for name in names}
 
 
-def _modified_ns(file: ConfinedPath) -> int:
-    """Return when a file was changed, or a link; 0 where that can't be told."""
+def _modified_ns(file: Path) -> int:
+    """Return when a file was changed; 0 where that can't be told."""
     try:
-        return file.lstat().st_mtime_ns
+        return file.stat().st_mtime_ns
     except OSError:
         return 0
-
-
-def _is_list(value: object, kind: type) -> bool:
-    return isinstance(value, list) and all(isinstance(inner, kind) for inner in value)
-
-
-def _is_row(row: object) -> bool:
-    """Return whether the values that a record has for a cell are of the right types."""
-    if not isinstance(row, dict):
-        return False
-    texts = [row.get(key, "") for key in ("scene", "label", "condition")]
-    ids = [row.get(key) for key in ("cell_id", "variant_id", "baseline_id")]
-    seeds = [row.get("seed", 0), row.get("variant_seed", 0)]
-    error = row.get("error")
-    return (
-        _is_list([*texts, error or ""], str)
-        and all(len(text) <= _MAX_NAME for text in texts)
-        and all(one is None or untrusted.is_name(one) for one in ids)
-        and all(type(seed) is int and 0 <= seed <= _MAX_SEED for seed in seeds)
-    )
 
 
 def full_id(beginning: str, ids: Sequence[str], kinds: str = "cells") -> str:

@@ -14,18 +14,21 @@ from typing import TYPE_CHECKING
 
 from xrgs.capture import frozen, sealed
 from xrgs.errors import StoreError, UnreadableError, XrgsError
-from xrgs.safeio.records import errors_named, read_object
+from xrgs.runtime import lease
+from xrgs.safeio.files import remove_path, sync_name, sync_tree, walk_files
+from xrgs.safeio.records import list_folder
 
 if TYPE_CHECKING:
+    from pathlib import Path
+
     from xrgs.config import SceneConf, VariantConf
-    from xrgs.safeio.confined import ConfinedPath
 
 #: The beginning of the name of a trimmed variant's folder; the variant's id follows.
 TRIMMED_PREFIX = "trimmed-"
 _IMAGES = "images"
 
 
-def trimmed_folder(variants: ConfinedPath, variant_id: str) -> ConfinedPath:
+def trimmed_folder(variants: Path, variant_id: str) -> Path:
     """Return the folder that a variant has when it is trimmed; it need not exist.
 
     Args:
@@ -35,7 +38,7 @@ def trimmed_folder(variants: ConfinedPath, variant_id: str) -> ConfinedPath:
     return variants / f"{TRIMMED_PREFIX}{variant_id}"
 
 
-def trimmed_variant(variants: ConfinedPath, key: str) -> str | None:
+def trimmed_variant(variants: Path, key: str) -> str | None:
     """Return the id of the trimmed variant of a key; None where there is none.
 
     Args:
@@ -46,15 +49,11 @@ def trimmed_variant(variants: ConfinedPath, key: str) -> str | None:
         StoreError: The folder of variants can't be listed.
     """
     start = f"{TRIMMED_PREFIX}{key}-"
-    with errors_named(variants):
-        try:
-            names = [name for name in variants.names() if name.startswith(start)]
-        except FileNotFoundError:  # of the folder, or of a store that is not there yet
-            return None
+    names = [name for name in list_folder(variants) if name.startswith(start)]
     return names[0].removeprefix(TRIMMED_PREFIX) if names else None
 
 
-def check_images(variants: ConfinedPath, variant_id: str) -> None:
+def check_images(variants: Path, variant_id: str) -> None:
     """Refuse a variant whose images were removed on purpose.
 
     Args:
@@ -72,7 +71,7 @@ def check_images(variants: ConfinedPath, variant_id: str) -> None:
         )
 
 
-def trim_variant(variants: ConfinedPath, variant_id: str) -> None:
+def trim_variant(variants: Path, variant_id: str) -> None:
     """Remove the images of a variant, and mark it as trimmed by the name of its folder.
 
     Nothing happens to a variant that is trimmed already, except that a removal that was stopped
@@ -88,16 +87,16 @@ def trim_variant(variants: ConfinedPath, variant_id: str) -> None:
     folder, trimmed = variants / variant_id, trimmed_folder(variants, variant_id)
     if folder.is_dir():
         folder.rename(trimmed)
-        trimmed.sync_name()
-    (trimmed / _IMAGES).remove()
+        sync_name(trimmed)
+    remove_path(trimmed / _IMAGES)
 
 
 def restore_variant(
-    variants: ConfinedPath,
+    variants: Path,
     variant_id: str,
     scene: SceneConf,
     conf: VariantConf,
-    cache: ConfinedPath,
+    cache: Path,
 ) -> None:
     """Make the images of a trimmed variant again; any number of processes may call this at once.
 
@@ -118,17 +117,17 @@ def restore_variant(
     from xrgs.capture.restore import restore_images
 
     folder, key = trimmed_folder(variants, variant_id), variant_id.rpartition("-")[0]
-    with sealed.lock(variants / f".{key}.lock"):
+    with lease.waited_for(variants, f".{key}.lock"):
         if not folder.is_dir():
             return
         work = variants / f".{variant_id}.restoring"
-        work.remove()  # what a killed process left, as in the variant's own folder
-        (folder / _IMAGES).remove()
-        work.make_folder()
+        remove_path(work)  # what a killed process left, as in the variant's own folder
+        remove_path(folder / _IMAGES)
+        work.mkdir()
         try:
             restore_images(folder, scene, conf, work, cache)
         except XrgsError as error:
-            (folder / _IMAGES).remove()
+            remove_path(folder / _IMAGES)
             if isinstance(error, UnreadableError):
                 raise
             raise StoreError(
@@ -137,13 +136,13 @@ def restore_variant(
                 " all cells of the comparison are trained anew; the reports of the old ones stay"
             ) from error
         finally:
-            work.remove()
-        folder.sync_tree()
+            remove_path(work)
+        sync_tree(folder)
         folder.rename(variants / variant_id)
-        (variants / variant_id).sync_name()
+        sync_name(variants / variant_id)
 
 
-def image_bytes(variants: ConfinedPath, variant_id: str) -> int:
+def image_bytes(variants: Path, variant_id: str) -> int:
     """Return the bytes of a variant's images, which trimming it would free.
 
     Args:
@@ -152,11 +151,11 @@ def image_bytes(variants: ConfinedPath, variant_id: str) -> int:
     """
     homes = (variants / variant_id, trimmed_folder(variants, variant_id))
     images = [home / _IMAGES for home in homes if (home / _IMAGES).is_dir()]
-    found = [status for folder in images for _, status in folder.walk()]
+    found = [status for folder in images for _, status in walk_files(folder)]
     return sum(status.st_size for status in found if stat.S_ISREG(status.st_mode))
 
 
-def verify_variant(folder: ConfinedPath) -> list[str]:
+def verify_variant(folder: Path) -> list[str]:
     """Say what is wrong with what a trimmed variant has kept.
 
     Args:
@@ -165,14 +164,9 @@ def verify_variant(folder: ConfinedPath) -> list[str]:
     Returns:
         A line for each file that is missing, has changed or can't be read now.
     """
-    manifest = folder / frozen.MANIFEST
     try:
-        content = read_object(manifest)
-        same = frozen.variant_id(content) == folder.name.removeprefix(TRIMMED_PREFIX)
-        kept = {frozen.POINTS: content["files"][frozen.POINTS]}
+        content = frozen.read_manifest(folder)
     except StoreError as error:
         return [str(error)]
-    except (AttributeError, KeyError, TypeError, ValueError) as error:
-        return [f"{manifest}: not a complete variant ({error!r:.200})"]
-    wrong = [] if same else [f"{manifest}: it has changed since it was written"]
-    return [*wrong, *map(str, sealed.changed(folder, kept))]
+    kept = {frozen.POINTS: content.files[frozen.POINTS]}
+    return list(map(str, sealed.changed(folder, kept)))

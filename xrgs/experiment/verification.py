@@ -13,16 +13,17 @@ from xrgs.capture.failures import FAILED_PREFIX
 from xrgs.errors import StoreError
 from xrgs.experiment import trimming
 from xrgs.runtime.progress import ProgressBar
+from xrgs.safeio.files import walk_files
 from xrgs.safeio.records import list_folder
-from xrgs.safeio.words import for_line
+from xrgs.safeio.sanitize import for_line
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
+    from pathlib import Path
 
     from xrgs.experiment.store import Store
-    from xrgs.safeio.confined import ConfinedPath
 
-    _Checks = Iterator[tuple[ConfinedPath, Callable[[], list[str]]]]
+    _Checks = Iterator[tuple[Path, Callable[[], list[str]]]]
 
 
 @dataclass(frozen=True)
@@ -41,7 +42,7 @@ class Verification:
 class _Part:
     """A file or a folder that is verified as one: a cell, a variant, a scene or a record."""
 
-    path: ConfinedPath
+    path: Path
     files: int
     bytes: int
     verify: Callable[[], list[str]]
@@ -108,9 +109,9 @@ def _cells(store: Store) -> _Checks:
     for cell in store.cell_folders():
         state = cell.state(verify=False)
         if state.name == "done":
-            yield cell.folder, cell.verify
+            yield cell.path, cell.verify
         elif state.name in {"corrupt", "unknown"}:
-            yield cell.folder, partial(list, [f"{cell.folder}: {state.reason}"])
+            yield cell.path, partial(list, [f"{cell.path}: {state.reason}"])
 
 
 def _variants(store: Store) -> _Checks:
@@ -142,8 +143,8 @@ def _record(store: Store, sweep_id: str) -> list[str]:
     return []
 
 
-def _extent(path: ConfinedPath) -> tuple[int, int]:
+def _extent(path: Path) -> tuple[int, int]:
     """Return the number of regular files at a path or below, and their bytes."""
-    found = [status for _, status in path.walk()] if path.is_dir() else [path.lstat()]
+    found = [status for _, status in walk_files(path)] if path.is_dir() else [path.lstat()]
     sizes = [status.st_size for status in found if stat.S_ISREG(status.st_mode)]
     return len(sizes), sum(sizes)

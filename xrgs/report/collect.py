@@ -8,26 +8,27 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Protocol
 
+import msgspec
 import numpy as np
 import pandas as pd
 
 from xrgs.errors import StoreError, XrgsError
-from xrgs.experiment.cell_folder import READING_ERRORS, CellState
+from xrgs.evaluation.scoring import PROTOCOL
+from xrgs.experiment.cell_folder import CellState
 from xrgs.experiment.provenance import machine
-from xrgs.experiment.results import validation_share
 from xrgs.report.curves import cell_curve
 from xrgs.report.skipped import cell_work
 from xrgs.report.training import cell_totals
 from xrgs.runtime.progress import progress
-from xrgs.safeio.records import as_number
-from xrgs.safeio.words import for_line
+from xrgs.safeio.sanitize import for_line
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
+    from pathlib import Path
 
     from xrgs.evaluation.metrics import Metric
     from xrgs.experiment.cell_folder import CellFolder
-    from xrgs.safeio.confined import ConfinedPath
+    from xrgs.experiment.schema import Provenance
 
 #: Keys of each row of a sweep's record.
 RECORD_KEYS = (
@@ -47,6 +48,7 @@ RECORD_KEYS = (
 #: say how far a cell is, which would be another text a second later.
 _PENDING = {
     "absent": "not trained yet",
+    "planned": "not trained yet",
     "unfinished": "begun and not done yet: it is being trained, or was stopped",
 }
 _MAX_MACHINE = 120
@@ -78,7 +80,7 @@ class Sweep:
     """What each done cell did in all, by its id: `xrgs.report.skipped.cell_work`."""
     provenance: dict[str, list[str]]
     """Provenance of the done cells: the distinct values of each entry, sorted."""
-    renders: dict[str, ConfinedPath] = field(default_factory=dict)
+    renders: dict[str, Path] = field(default_factory=dict)
     """Folders of renders that another program made, by the ids of their rows, which are no cells
     of the store (`xrgs.report.external`)."""
 
@@ -175,9 +177,9 @@ def _read_cell(cell: CellFolder, metrics: Sequence[Metric]) -> _CellContent:
                 training,
                 cell_curve(cell),
                 cell_work(cell, training),
-                provenance,
+                msgspec.structs.asdict(provenance),
             )
-        except READING_ERRORS as error:
+        except (StoreError, OSError) as error:
             state = CellState.of_error(error)
     if state.name in _PENDING:
         return _CellContent({"state": "pending", "reason": _PENDING[state.name]})
@@ -187,33 +189,26 @@ def _read_cell(cell: CellFolder, metrics: Sequence[Metric]) -> _CellContent:
 
 
 def _done_columns(cell: CellFolder, metrics: Sequence[Metric]) -> dict[str, Any]:
-    """Return columns of a finished cell's summary and its identity."""
-    identity, summary = cell.identity(), cell.summary()
-    values = {m.name: as_number(summary[m.name]) for m in metrics if m.name in summary}
-    for name in ("protocol", "seed"):
-        if type(identity[name]) is not int or not 0 <= identity[name] < 1 << 63:
-            raise StoreError(f"identity.json: {name}={identity[name]!r:.40} is no such number")
-    validation = validation_share(identity)
-    if validation is None:
-        raise StoreError("identity.json: train.validation is no share")
+    """Return columns of a finished cell's summary, identity and config."""
+    identity, figures = cell.identity(), msgspec.structs.asdict(cell.summary())
+    values = {m.name: figures[m.name] for m in metrics if m.name in figures}
     return values | {
         "state": "done",
         "reason": "",
-        "protocol": identity["protocol"],
-        "validation": validation,
-        "true_variant": str(identity["variant"]),
-        "true_seed": identity["seed"],
+        "protocol": cell.status().scored_by.get(PROTOCOL, ""),
+        "validation": float(identity.train.get("validation", 0.0)),
+        "true_variant": identity.variant,
+        "true_seed": identity.seed,
     }
 
 
-def _machine(cell: CellFolder, provenance: Mapping[str, Any]) -> str:
+def _machine(cell: CellFolder, made: Provenance) -> str:
     """Return what a cell's times depend on.
 
     Several machines that trained a cell in turn get its id: its times are like those of no other.
     """
-    several = provenance.get("machines_in_turn")
-    text = machine(provenance) if several is None else f"cell {cell.id} in turn: {several}"
-    return for_line(text, _MAX_MACHINE)
+    turns = made.machines_in_turn
+    return for_line(f"cell {cell.id} in turn: {turns}" if turns else machine(made), _MAX_MACHINE)
 
 
 def _scores(cell: CellFolder, metrics: Sequence[Metric]) -> list[dict[str, Any]]:
@@ -261,7 +256,7 @@ def _cells(
         if metric.name in means.columns:
             values = cells["cell_id"].map(means[metric.name])
         cells[metric.name] = pd.to_numeric(values).astype(np.float64)
-    cells["protocol"] = cells["protocol"].astype("Int64")
+    cells["protocol"] = cells["protocol"].astype(object).fillna("")
     cells["validation"] = cells["validation"].astype(np.float64)
     cells["machine"] = cells["machine"].astype(object).fillna("")
     _check_identity(sweep_id, cells)

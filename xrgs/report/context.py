@@ -10,9 +10,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
-from xrgs.experiment.cell_folder import READING_ERRORS
+from xrgs.errors import StoreError
 from xrgs.experiment.results import cell_columns
-from xrgs.safeio.words import counted, for_line
+from xrgs.safeio.sanitize import counted, for_line
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping, Sequence
@@ -103,13 +103,13 @@ def contexts(store: JoinedStore, cells: pd.DataFrame, views: pd.DataFrame) -> di
 def _settings(store: JoinedStore, cell_id: str) -> dict[str, Any]:
     """Return what the context needs of one cell's config and provenance."""
     cell = store.cell(cell_id)
-    columns = cell_columns(cell.folder, {})
+    columns = cell_columns(cell, None)
     settings = {key: columns[key] for key in _KEYS if columns.get(key) is not None}
     try:
         provenance = cell.provenance()
-    except READING_ERRORS:
+    except StoreError:
         return settings
-    return settings | {key: provenance.get(key) for key in ("cpu", "threads", "backend")}
+    return settings | {key: getattr(provenance, key) for key in ("cpu", "threads", "backend")}
 
 
 def _distinct(settings: Iterable[Mapping[str, Any]], key: str) -> list[str]:

@@ -27,8 +27,6 @@ if TYPE_CHECKING:
 _AMOUNTS = ["step", "seconds", "evaluations", "gaussians"]
 #: Columns of `quality.csv`: steps done, time and alpha evaluations so far, Gaussians, mean scores.
 COLUMNS = [*_AMOUNTS, *VIEW_METRICS]
-#: What a summary calls the amounts of a trained cell.
-_SUMMARY = {"step": "steps", "seconds": "training_time_s"}
 _NOT_REACHED = "not reached"
 
 
@@ -47,10 +45,15 @@ def cell_curve(cell: CellFolder) -> list[dict[str, float]]:
         ValueError: A value is not a number.
     """
     summary, views = cell.summary(), [scores for _, scores in cell.view_scores()]
-    last = {name: as_number(summary.get(_SUMMARY.get(name, name))) for name in _AMOUNTS}
+    last: dict[str, float] = {
+        "step": summary.steps,
+        "seconds": summary.training_time_s,
+        "evaluations": summary.evaluations,
+        "gaussians": summary.gaussians,
+    }
     for name in VIEW_METRICS:
         last[name] = fmean(view.get(name, math.nan) for view in views) if views else math.nan
-    file = cell.folder / "quality.csv"
+    file = cell.path / "quality.csv"
     if not file.is_file():
         return [last]
     header, rows = read_table(file)

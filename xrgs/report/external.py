@@ -19,10 +19,9 @@ from xrgs.evaluation.metrics import VIEW_METRICS
 from xrgs.report.collect import ReportError, Sweep, cell_means
 from xrgs.runtime.machine import single_torch_thread
 from xrgs.runtime.progress import progress
-from xrgs.safeio.confined import ConfinedPath
+from xrgs.safeio.files import is_inside
 from xrgs.safeio.paths import user_path
-from xrgs.safeio.untrusted import is_inside
-from xrgs.safeio.words import for_file_name
+from xrgs.safeio.sanitize import for_file_name
 
 if TYPE_CHECKING:
     from collections.abc import Hashable, Mapping, Sequence
@@ -128,11 +127,11 @@ def _with_one(sweep: Sweep, store: JoinedStore, one: External) -> Sweep:
     return replace(sweep, cells=cells, views=both, renders=renders)
 
 
-def _folder(one: External, cell: Mapping[Hashable, Any], done: pd.DataFrame) -> ConfinedPath:
+def _folder(one: External, cell: Mapping[Hashable, Any], done: pd.DataFrame) -> Path:
     """Return the folder with the renders of a cell's variant: the first of these that is there."""
     scene, draw = str(cell["scene"]), int(cell["variant_seed"])
     draws = done.loc[done["scene"] == scene, "variant_seed"].nunique()
-    root, inside = ConfinedPath(one.folder), []
+    root, inside = one.folder, []
     if is_inside(scene):
         inside = [root / scene / str(draw)] + [root / scene] * (draws == 1)
     if draws == 1 and set(done["scene"]) == {scene}:
@@ -156,7 +155,7 @@ def _expected(store: JoinedStore, variant_id: str, split: str) -> dict[str, View
     return {view.name: view for view in frozen.views if view.split == split}
 
 
-def _score(folder: ConfinedPath, view: View) -> dict[str, Any]:
+def _score(folder: Path, view: View) -> dict[str, Any]:
     """Score the render of a view, as `xrgs.evaluation.protocol` does."""
     import torch
 

@@ -17,7 +17,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 from matplotlib.ticker import EngFormatter, LogLocator, NullLocator
 
-from xrgs.safeio.words import MAX_CELL, for_line
+from xrgs.safeio.sanitize import MAX_CELL, for_line
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping, Sequence

@@ -7,18 +7,21 @@ report needs the rows of all records, and finds each cell in the store where it 
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
+
+import msgspec
 
 from xrgs.errors import StoreError
 from xrgs.experiment.store import BASELINE
 from xrgs.report.collect import ReportError
-from xrgs.safeio.confined import ConfinedPath
-from xrgs.safeio.words import for_file_name
+from xrgs.safeio.sanitize import for_file_name
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Mapping, Sequence
 
     from xrgs.experiment.cell_folder import CellFolder
+    from xrgs.experiment.schema import SweepRecord
     from xrgs.experiment.store import Store
 
 _T = TypeVar("_T")
@@ -80,7 +83,7 @@ class JoinedStore:
 
     stores: tuple[Store, ...]
     """The stores; of a cell that several have done, the first counts."""
-    external: Mapping[str, ConfinedPath] = field(default_factory=dict)
+    external: Mapping[str, Path] = field(default_factory=dict)
     """Folders of renders that another program made, `Sweep.renders`."""
 
     def cell(self, cell_id: str) -> CellFolder:
@@ -94,7 +97,7 @@ class JoinedStore:
         """
         return _first([store.cell(cell_id) for store in self.stores], _is_done, _is_there)
 
-    def variant(self, variant_id: str) -> ConfinedPath:
+    def variant(self, variant_id: str) -> Path:
         """Return the folder of a variant, in a store that has it if there is one.
 
         Args:
@@ -104,9 +107,9 @@ class JoinedStore:
             StoreError: The id is not a valid name of a folder.
         """
         folders = [store.variant(variant_id) for store in self.stores]
-        return _first(folders, ConfinedPath.is_dir)
+        return _first(folders, Path.is_dir)
 
-    def render(self, cell_id: str, view: str) -> ConfinedPath:
+    def render(self, cell_id: str, view: str) -> Path:
         """Return the file of the render of a view, which need not exist.
 
         Args:
@@ -120,7 +123,7 @@ class JoinedStore:
             return self.external[cell_id] / f"{view}.png"
         cell, name = self.cell(cell_id), f"renders/{view}.png"
         cell.check_not_trimmed(name)
-        return cell.folder / name
+        return cell.path / name
 
     def latest_sweeps(self) -> tuple[str, ...]:
         """Return the id of each store's latest sweep, without repetitions.
@@ -149,13 +152,13 @@ class JoinedStore:
         rows: dict[tuple[Any, ...], tuple[str, dict[str, Any]]] = {}
         for sweep_id in sweep_ids:
             for record in self._records(sweep_id):
-                commands[sweep_id] = tuple(record["command"])
-                for row in record["cells"]:
+                commands[sweep_id] = record.command
+                for row in msgspec.to_builtins(record.cells):
                     key = tuple(row.get(name, 0) for name in _CELL)
                     rows[key] = sweep_id, _same(rows.get(key), sweep_id, row)
         return {"commands": commands, "cells": [row for _, row in rows.values()]}
 
-    def _records(self, sweep_id: str) -> Iterable[dict[str, Any]]:
+    def _records(self, sweep_id: str) -> Iterable[SweepRecord]:
         having = [store for store in self.stores if sweep_id in store.sweep_ids()]
         if not having and len(self.stores) > 1:
             paths = ", ".join(str(store.path) for store in self.stores)
@@ -178,7 +181,7 @@ def _is_done(cell: CellFolder) -> bool:
 
 
 def _is_there(cell: CellFolder) -> bool:
-    return cell.folder.is_dir()
+    return cell.path.is_dir()
 
 
 def _same(

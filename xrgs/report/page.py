@@ -33,8 +33,7 @@ from xrgs.report.texture import texture_tables, with_texture
 from xrgs.report.training import table as training_table
 from xrgs.report.training import totals
 from xrgs.safeio.atomic import write_json, write_text
-from xrgs.safeio.confined import ConfinedPath
-from xrgs.safeio.words import counted, for_csv, for_file_name, for_line, for_markdown
+from xrgs.safeio.sanitize import counted, for_csv, for_file_name, for_line, for_markdown
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -160,10 +159,9 @@ def build(
     sweep = replace(sweep, views=with_texture(store, sweep.cells, sweep.views))
     tables = _tables(store, sweep, against)
     name = _folder_name(ids, choice, against, externals)
-    folder = ConfinedPath(out) if out else store.stores[0].reports / name
+    folder = out if out else store.stores[0].reports / name
     try:
-        if out:
-            folder.make_root()
+        folder.mkdir(parents=True, exist_ok=True)
         drawn = _write(folder, store, sweep, tables, pictures)
     except OSError as error:
         raise ReportError(
@@ -172,7 +170,7 @@ def build(
         ) from error
     written = {p.file for p in drawn if p.file} | {folder / name for name in _FILES}
     text = f"{_text(tables, _warnings(sweep))}\n{for_line(f'Written to {folder}')}"
-    return Report(text=text, folder=folder.path, files=tuple(sorted(file.path for file in written)))
+    return Report(text=text, folder=folder, files=tuple(sorted(written)))
 
 
 def _tables(store: JoinedStore, sweep: Sweep, against: str) -> Tables:
@@ -192,15 +190,14 @@ def _folder_name(
 
 
 def _write(
-    folder: ConfinedPath,
+    folder: Path,
     store: JoinedStore,
     sweep: Sweep,
     tables: Tables,
     pictures: Sequence[str] | None,
 ) -> list[Picture]:
     """Draw the pictures, and write them with all other files; return the pictures."""
-    _refuse_links(folder / "figures")
-    (folder / "figures").make_folder()
+    (folder / "figures").mkdir(exist_ok=True)
     comparison = tables.comparison
     runs = Runs.of(sweep, comparison.cells)
     drawn = draw(store, comparison, sweep.views, runs.curves, folder / "figures", pictures)
@@ -226,17 +223,6 @@ def _write(
     return drawn
 
 
-def _refuse_links(folder: ConfinedPath) -> None:
-    """Refuse to write where a link would lead out of the store, or of the folder of the report."""
-    for depth in range(1, len(folder.parts) + 1):
-        above = ConfinedPath(folder.root, folder.parts[:depth])
-        if above.is_link():
-            raise ReportError(
-                f"{above} is a link, and what it leads to is not written to: remove it, or name"
-                " another folder with out=..."
-            )
-
-
 #: The files of every report, beside its pictures.
 _FILES = (
     "report.html",
@@ -253,7 +239,7 @@ _FILES = (
 )
 
 
-def _write_data(folder: ConfinedPath, sweep: Sweep, comparison: Comparison, runs: Runs) -> None:
+def _write_data(folder: Path, sweep: Sweep, comparison: Comparison, runs: Runs) -> None:
     """Write what was compared and measured, for other programs."""
     cells = comparison.cells
     names = cells.drop_duplicates("cell_id")[_VIEW_KEYS]
@@ -312,7 +298,7 @@ def _markdown_page(
     base: str,
     tables: Sequence[TextTable],
     pictures: Sequence[Picture],
-    folder: ConfinedPath,
+    folder: Path,
 ) -> str:
     parts = [
         f"# Change from {for_markdown(base)}\n",
@@ -329,7 +315,7 @@ def _command_line(sweep_id: str, command: Sequence[str]) -> str:
     return f"Sweep {for_markdown(sweep_id)}: {words}\n"
 
 
-def _picture_link(picture: Picture, folder: ConfinedPath) -> str:
+def _picture_link(picture: Picture, folder: Path) -> str:
     title = for_markdown(picture.title)
     if picture.file is None:
         return f"No picture of {title}: {for_markdown(picture.why)}\n"

@@ -18,7 +18,7 @@ from xrgs.report.writing import (
     lacking,
     percent,
 )
-from xrgs.safeio.words import counted
+from xrgs.safeio.sanitize import counted
 
 if TYPE_CHECKING:
     from collections.abc import Mapping

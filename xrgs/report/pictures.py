@@ -29,19 +29,19 @@ from xrgs.report.render import titled
 from xrgs.report.sensitivity import sensitivities
 from xrgs.runtime.progress import progress
 from xrgs.safeio.atomic import atomic_writer
-from xrgs.safeio.words import for_file_name
+from xrgs.safeio.sanitize import for_file_name
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
+    from pathlib import Path
 
     import numpy as np
     from numpy.typing import NDArray
 
     from xrgs.report.compare import Comparison
     from xrgs.report.joined import JoinedStore
-    from xrgs.safeio.confined import ConfinedPath
 
-    _Drawing = Callable[[ConfinedPath], "Picture"]  # draws into the file
+    _Drawing = Callable[[Path], "Picture"]  # draws into the file
 
 #: The scores whose curves are drawn.
 _QUALITY = ("psnr", "lpips")
@@ -65,7 +65,7 @@ class Picture:
     """The file of a figure, or the reason why there is none."""
 
     title: str
-    file: ConfinedPath | None
+    file: Path | None
     why: str = ""
 
 
@@ -74,7 +74,7 @@ def draw(
     comparison: Comparison,
     views: pd.DataFrame,
     quality: pd.DataFrame,
-    folder: ConfinedPath,
+    folder: Path,
     names: Sequence[str] | None = None,
 ) -> list[Picture]:
     """Draw what each ablation trades, and views and training curves of each scene and ablation.
@@ -221,13 +221,13 @@ def _curves_of_quality(comparison: Comparison, curves: pd.DataFrame) -> dict[str
     return drawings
 
 
-def _drawn(title: str, figure: Callable[[], bytes], file: ConfinedPath) -> Picture:
+def _drawn(title: str, figure: Callable[[], bytes], file: Path) -> Picture:
     with atomic_writer(file) as stream:
         stream.write(figure())
     return Picture(title, file)
 
 
-def _not_drawn(title: str, why: str, _: ConfinedPath) -> Picture:
+def _not_drawn(title: str, why: str, _: Path) -> Picture:
     return Picture(title, None, why)
 
 
@@ -250,9 +250,9 @@ def _views(
     pair: pd.Series,
     base: str,
     psnr: tuple[pd.Series, pd.Series],
-    variant: ConfinedPath,
+    variant: Path,
     split: str,
-    file: ConfinedPath,
+    file: Path,
 ) -> Picture:
     if psnr[0].empty:
         return Picture(_title(pair), None, "the two cells have no scored view in common")
@@ -279,7 +279,7 @@ def _views(
     return Picture(title, file)
 
 
-def _training(store: JoinedStore, pair: pd.Series, base: str, file: ConfinedPath) -> Picture:
+def _training(store: JoinedStore, pair: pd.Series, base: str, file: Path) -> Picture:
     title = f"{_title(pair)}: training"
     runs = []
     for name, key in ((base, "base_id"), (str(pair["label"]), "cell_id")):
@@ -297,7 +297,7 @@ def _title(pair: pd.Series) -> str:
     return ", ".join(str(part) for part in parts if part)
 
 
-def _image(file: ConfinedPath) -> NDArray[np.float32]:
+def _image(file: Path) -> NDArray[np.float32]:
     try:
         return images.read_png(file, max_pixels=_MAX_PIXELS)
     except (UnreadableError, ImageError) as error:

@@ -6,7 +6,7 @@ import unicodedata
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
-from xrgs.safeio.words import MAX_CELL, for_file_name, for_latex, for_line, for_markdown
+from xrgs.safeio.sanitize import MAX_CELL, for_file_name, for_latex, for_line, for_markdown
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

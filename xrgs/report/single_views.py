@@ -12,7 +12,7 @@ import numpy as np
 import pandas as pd
 
 from xrgs.report.writing import signed
-from xrgs.safeio.words import for_line
+from xrgs.safeio.sanitize import for_line
 
 if TYPE_CHECKING:
     from xrgs.report.compare import Comparison

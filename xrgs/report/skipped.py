@@ -13,7 +13,6 @@ import pandas as pd
 
 from xrgs.report.render import TextTable, titled
 from xrgs.report.training import CELL_KEYS
-from xrgs.safeio.records import as_number
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping, Sequence
@@ -89,16 +88,14 @@ def cell_work(cell: CellFolder, training: Mapping[str, float]) -> dict[str, floa
 
     Raises:
         StoreError: The summary can't be read.
-        AttributeError: `work` or `stage_seconds` is not an object.
-        ValueError: A value is not a number.
     """
     summary = cell.summary()
-    stages = summary.get("stage_seconds", {})
     return {
-        **{name: as_number(value) for name, value in summary.get("work", {}).items()},
-        **{f"seconds_{stage}": as_number(value) for stage, value in stages.items()},
-        **{name: as_number(summary.get(name)) for name in ("steps", "evaluations")},
-        "seconds": as_number(summary.get("training_time_s")),
+        **summary.work,
+        **{f"seconds_{stage}": value for stage, value in summary.stage_seconds.items()},
+        "steps": float(summary.steps),
+        "evaluations": summary.evaluations,
+        "seconds": summary.training_time_s,
         **{name: value for name, value in training.items() if name.startswith(_PREFIX)},
     }
 

@@ -68,7 +68,7 @@ def cell_totals(cell: CellFolder) -> dict[str, float]:
         StoreError: Its history can't be read; the message names the file.
         ValueError: A value of its history is not a number.
     """
-    header, rows = read_table(cell.folder / "history.csv")
+    header, rows = read_table(cell.path / "history.csv")
     if not rows:
         return {}
     result = {}

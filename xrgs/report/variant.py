@@ -11,23 +11,21 @@ from xrgs.capture.failures import FAILED_PREFIX
 from xrgs.errors import XrgsError
 from xrgs.report.render import TextTable, to_text
 from xrgs.safeio.atomic import atomic_writer
-from xrgs.safeio.confined import confined
-from xrgs.safeio.records import read_object
-from xrgs.safeio.untrusted import is_name
-from xrgs.safeio.words import for_line
+from xrgs.safeio.files import is_name
+from xrgs.safeio.records import read_struct
+from xrgs.safeio.sanitize import for_line
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping
 
     from xrgs.capture.views import Variant
-    from xrgs.safeio.confined import ConfinedPath
 
 #: How many names of views and attempts of a report are read.
 _MAX_NAMES, _MAX_ATTEMPTS = 1 << 14, 10
 _REGISTERED, _NOT_REGISTERED = "yes", "no"
 
 
-def describe(path: Path | ConfinedPath, out: Path | None = None) -> str:
+def describe(path: Path, out: Path | None = None) -> str:
     """Describe a frozen variant and draw its contact sheet; for a failed one, say why it failed.
 
     Args:
@@ -40,7 +38,7 @@ def describe(path: Path | ConfinedPath, out: Path | None = None) -> str:
     Raises:
         XrgsError: The folder is not a variant or has changed, or the sheet can't be written.
     """
-    folder = confined(path)
+    folder = path
     try:
         found = folder.is_dir()
     except FileNotFoundError:
@@ -50,7 +48,7 @@ def describe(path: Path | ConfinedPath, out: Path | None = None) -> str:
     if not found:
         raise XrgsError(f"{folder}: no such folder; variants are in <store>/variants/")
     if folder.name.startswith(FAILED_PREFIX):
-        report = read_object(folder / "report.json")
+        report = read_struct(folder / "report.json", dict[str, Any])
         failed = f"{report.get('scene')}: failed, so there are no views"
         return "\n".join([for_line(failed), *_sfm_lines(folder, report)])
     frozen = variant.load(folder)
@@ -67,7 +65,7 @@ def describe(path: Path | ConfinedPath, out: Path | None = None) -> str:
     return "\n".join([table, *sfm, *map(for_line, more)])
 
 
-def _sfm_lines(folder: ConfinedPath, report: Mapping[str, Any]) -> list[str]:
+def _sfm_lines(folder: Path, report: Mapping[str, Any]) -> list[str]:
     """Check a report, which anybody may have written, and return lines on how SfM went.
 
     Raises:

@@ -8,6 +8,7 @@ the cells of a sweep may run on other machines, and one line shows many of them.
 from __future__ import annotations
 
 import io
+import json
 import sys
 from contextlib import contextmanager, suppress
 from contextvars import ContextVar
@@ -17,13 +18,13 @@ from typing import TYPE_CHECKING, Any, TypeVar
 from tqdm import tqdm
 
 from xrgs.runtime.streams import say
-from xrgs.safeio import untrusted
 from xrgs.safeio.atomic import write_json
-from xrgs.safeio.confined import ConfinedPath
-from xrgs.safeio.words import for_line
+from xrgs.safeio.files import read_bytes
+from xrgs.safeio.sanitize import for_line
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator
+    from pathlib import Path
 
     _Tqdm = tqdm[Any]
 else:
@@ -47,7 +48,7 @@ _MAX_COUNT = 1 << 53
 class ProgressFile:
     """The file that progress is kept in while a `with` block of `written_to` runs."""
 
-    path: ConfinedPath
+    path: Path
     note: str = ""
     """What else is to be shown of the work now; written with the next count."""
 
@@ -183,14 +184,14 @@ def progress(
     return iter(ProgressBar(what, unit, total, items=items, done=done))
 
 
-def _write(file: ConfinedPath, now: Progress) -> None:
+def _write(file: Path, now: Progress) -> None:
     # Progress is no result: it does no harm that it can't be written, or is lost with the power.
     with suppress(OSError):
         write_json(file, asdict(now), durable=False)
 
 
 @contextmanager
-def written_to(file: ConfinedPath) -> Iterator[ProgressFile]:
+def written_to(file: Path) -> Iterator[ProgressFile]:
     """Keep the progress of all bars made within a block in a file, and show none of them.
 
     Args:
@@ -209,7 +210,7 @@ def written_to(file: ConfinedPath) -> Iterator[ProgressFile]:
             file.unlink(missing_ok=True)
 
 
-def read(file: ConfinedPath) -> Progress | None:
+def read(file: Path) -> Progress | None:
     """Read the progress that another process keeps in a file.
 
     Args:
@@ -219,7 +220,7 @@ def read(file: ConfinedPath) -> Progress | None:
         The progress; None where there is no such file or its content is not valid.
     """
     try:
-        content = untrusted.parse_json(file.read_bytes(_MAX_BYTES))
+        content = json.loads(read_bytes(file, _MAX_BYTES))
         texts = (content["what"], content["unit"], content.get("note", ""))
         what, unit, note = (for_line(str(text), _MAX_WORD) for text in texts)
         done, total, rate = content["done"], content["total"], content["rate"]

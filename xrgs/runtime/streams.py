@@ -11,7 +11,7 @@ import sys
 from contextlib import suppress
 from typing import TYPE_CHECKING
 
-from xrgs.safeio.words import for_line, for_terminal
+from xrgs.safeio.sanitize import for_line, for_terminal
 
 if TYPE_CHECKING:
     from typing import Any, TextIO

@@ -8,17 +8,15 @@ import secrets
 from contextlib import contextmanager
 from typing import IO, TYPE_CHECKING
 
-from xrgs.safeio.confined import confined
+from xrgs.safeio.files import sync_name
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
     from pathlib import Path
 
-    from xrgs.safeio.confined import ConfinedPath
-
 
 @contextmanager
-def atomic_writer(path: Path | ConfinedPath, *, durable: bool = True) -> Iterator[IO[bytes]]:
+def atomic_writer(path: Path, *, durable: bool = True) -> Iterator[IO[bytes]]:
     """Open a binary stream whose content replaces a file when the block ends without an exception.
 
     The content is written to a temporary file in the same folder, which is renamed at the end.
@@ -34,24 +32,23 @@ def atomic_writer(path: Path | ConfinedPath, *, durable: bool = True) -> Iterato
     Raises:
         OSError: The file can't be written. The old file is then as it was.
     """
-    file = confined(path)
     # Not mkstemp: only the owner could read its files, and a store is shared by a team.
-    temporary = file.with_name(f".{file.name}.{os.getpid()}-{secrets.token_hex(4)}")
+    temporary = path.with_name(f".{path.name}.{os.getpid()}-{secrets.token_hex(4)}")
     try:
-        with temporary.create() as stream:
+        with temporary.open("xb") as stream:
             yield stream
             stream.flush()
             if durable:
                 os.fsync(stream.fileno())
-        temporary.rename(file)
+        temporary.replace(path)
     except BaseException:
         temporary.unlink(missing_ok=True)
         raise
     if durable:
-        file.sync_name()
+        sync_name(path)
 
 
-def write_text(path: Path | ConfinedPath, text: str, *, durable: bool = True) -> None:
+def write_text(path: Path, text: str, *, durable: bool = True) -> None:
     """Write a UTF-8 text file atomically.
 
     Args:
@@ -66,7 +63,7 @@ def write_text(path: Path | ConfinedPath, text: str, *, durable: bool = True) ->
         stream.write(text.encode("utf-8"))
 
 
-def write_json(path: Path | ConfinedPath, value: object, *, durable: bool = True) -> None:
+def write_json(path: Path, value: object, *, durable: bool = True) -> None:
     """Write a value atomically as indented JSON with sorted keys.
 
     Args:

@@ -1,19 +1,14 @@
-"""Hashes of values, files and source code, from which results get their ids."""
+"""Hashes of values and files, from which results get their ids."""
 
 from __future__ import annotations
 
 import hashlib
 import json
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from xrgs.safeio.confined import confined
-
 if TYPE_CHECKING:
-    from xrgs.safeio.confined import ConfinedPath
+    from pathlib import Path
 
-_PACKAGE = Path(__file__).parents[1]
-_SOURCE_SUFFIXES = frozenset({".py", ".cpp", ".h", ".txt"})
 _CHUNK = 1 << 16  # bytes
 
 
@@ -58,7 +53,7 @@ def to_plain(value: Any) -> Any:
     return value
 
 
-def file_digest(path: Path | ConfinedPath) -> str:
+def file_digest(path: Path) -> str:
     """Hash a regular file's bytes.
 
     Args:
@@ -72,26 +67,7 @@ def file_digest(path: Path | ConfinedPath) -> str:
     """
     sha256 = hashlib.sha256()
     # hashlib.file_digest zeroes a buffer of 256 kB first, which takes longer than a small file.
-    with confined(path).open() as stream:
+    with path.open("rb") as stream:
         while chunk := stream.read(_CHUNK):
             sha256.update(chunk)
     return sha256.hexdigest()
-
-
-def source_digests(*names: str) -> dict[str, str]:
-    """Hash source files of this package.
-
-    Args:
-        names: Files and folders, relative to the package; a folder stands for every source file
-            below it.
-
-    Returns:
-        The SHA-256 of each file, keyed by its path in the package, with `/`, in sorted order.
-    """
-    roots = [_PACKAGE / name for name in names]
-    files = [f for root in roots for f in ([root] if root.is_file() else root.rglob("*"))]
-    return {
-        file.relative_to(_PACKAGE).as_posix(): file_digest(file)
-        for file in sorted(files)
-        if file.suffix in _SOURCE_SUFFIXES
-    }

@@ -1,176 +1,129 @@
-"""Reads a store's JSON files and CSV tables, whoever wrote them, and writes such tables."""
+"""Reads the JSON and CSV files of a store: each decoded in one place, by its declared type."""
 
 from __future__ import annotations
 
 import csv
-import errno
 import io
 import math
 from contextlib import contextmanager
 from itertools import islice
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, TypeVar
+
+import msgspec
 
 from xrgs.errors import StoreError, UnreadableError
-from xrgs.safeio import untrusted
-from xrgs.safeio.confined import RootMissingError, confined, is_passing
+from xrgs.safeio.files import is_transient, list_names, read_bytes
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping, Sequence
     from pathlib import Path
 
-    from xrgs.safeio.confined import ConfinedPath
+_T = TypeVar("_T")
 
-
-#: The largest JSON or CSV file of a cell or a variant that is read, in bytes. The longest are the
-#: status of a cell (110 bytes for each of its files: 1.2 MB with 10,000 test views) and its history
-#: (at most 1,000 rows). Read into Python's objects, a hostile file takes thirty times as much.
+#: The largest file that is decoded, in bytes. A configuration has 10 kB, a history 0.5 MB.
 MAX_BYTES = 1 << 22
-#: The largest magnitude of a number in a file. Nothing that is measured comes near it, and with it
-#: no mean, spread or difference of numbers leaves the range of a float.
+#: The largest magnitude of a number in a file. No measured value comes near it, and sums and
+#: squares of such numbers stay in the range of a float.
 MAX_NUMBER = 1e30
-#: The most lines and columns of a table. A cell's scores have a row for each test view.
-_MAX_ROWS, _MAX_COLUMNS = 20_002, 1000
+#: The most rows and columns of a table. A cell's scores have a row for each test view.
+_MAX_ROWS, _MAX_COLUMNS = 20_000, 1000
 
 
 @contextmanager
-def errors_named(path: Path | ConfinedPath) -> Iterator[None]:
-    """Turn each OSError of a block into a StoreError whose message names a file.
-
-    Args:
-        path: The file or folder that the block works on.
-
-    Yields:
-        Nothing.
+def errors_named(path: Path) -> Iterator[None]:
+    """Turn each OSError of a block into a StoreError that names the file.
 
     Raises:
-        UnreadableError: The system can't read it now; nothing is known of its content.
-        StoreError: It is missing, too large, a link, or not what it should be.
+        UnreadableError: The file can't be read now; nothing is known of its content.
+        StoreError: The file is missing, too large, or not a regular file.
     """
     try:
         yield
     except OSError as error:
-        kind = UnreadableError if is_passing(error) else StoreError
-        why = "is a link, which is not followed" if error.errno == errno.ELOOP else error.strerror
-        raise kind(f"{path}: {why}") from error
+        kind = UnreadableError if is_transient(error) else StoreError
+        raise kind(f"{path}: {error.strerror}") from error
 
 
-def read_file(path: Path | ConfinedPath, max_bytes: int = MAX_BYTES) -> bytes:
-    """Read a regular file of a store.
-
-    Args:
-        path: The file.
-        max_bytes: The largest size that is read.
-
-    Returns:
-        The content.
-
-    Raises:
-        StoreError: As `errors_named`.
-    """
+def read_file(path: Path, max_bytes: int = MAX_BYTES) -> bytes:
+    """Read a file of a store; raises as `errors_named`."""
     with errors_named(path):
-        return confined(path).read_bytes(max_bytes)
+        return read_bytes(path, max_bytes)
 
 
-def list_folder(path: ConfinedPath) -> list[str]:
-    """Return the names in a folder of a store, sorted; none where there is no such folder.
-
-    Args:
-        path: The folder.
-
-    Returns:
-        The names; any of them may be a link or a pipe, or not be UTF-8 (it has lone surrogates).
+def list_folder(path: Path) -> list[str]:
+    """Return the sorted names in a folder of a store; none where there is no such folder.
 
     Raises:
-        UnreadableError: It can't be read now, or its root is gone.
-        StoreError: It is a link or not a folder.
+        UnreadableError: The folder can't be read now.
+        StoreError: The path is not a folder.
     """
     with errors_named(path):
         try:
-            return path.names()
-        except RootMissingError:
-            raise
+            return list_names(path)
         except FileNotFoundError:
             return []
 
 
-def read_json(path: Path | ConfinedPath, max_bytes: int = MAX_BYTES) -> Any:
-    """Read the JSON value in a file.
+def read_struct(path: Path, kind: type[_T], max_bytes: int = MAX_BYTES) -> _T:
+    """Read a JSON file of a declared type.
 
     Args:
         path: The file.
+        kind: A `msgspec.Struct`, or another type that msgspec decodes.
         max_bytes: The largest size that is read.
 
-    Returns:
-        Dicts, lists, strings, numbers, booleans and None.
-
     Raises:
-        UnreadableError: As `read_file`.
-        StoreError: The file is missing or not JSON; the message names it.
+        UnreadableError: The file can't be read now.
+        StoreError: The file is missing or damaged; the message names the file and the field.
     """
-    content = read_file(path, max_bytes)
+    return decode_struct(read_file(path, max_bytes), kind, path)
+
+
+def decode_struct(content: bytes, kind: type[_T], path: Path | str) -> _T:
+    """Decode JSON of a declared type; `path` names its file in errors, see `read_struct`."""
     try:
-        return untrusted.parse_json(content)
-    except ValueError as error:
-        raise StoreError(f"{path}: {error}") from error
+        return msgspec.json.decode(content, type=kind)
+    except msgspec.ValidationError as error:  # "Expected `int`, got `str` - at `$.views[0]`"
+        what, _, where = str(error).partition(" - at ")
+        field = where.strip("`").removeprefix("$.") or "the file"
+        raise StoreError(f"damaged: {path}: {field}: {what}") from error
+    except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
+        raise StoreError(f"damaged: {path}: not valid JSON ({error})") from error
 
 
-def read_object(path: Path | ConfinedPath, max_bytes: int = MAX_BYTES) -> dict[str, Any]:
-    """Read the JSON object in a file.
-
-    Args:
-        path: The file.
-        max_bytes: The largest size that is read.
-
-    Returns:
-        The object's values by key.
-
-    Raises:
-        StoreError: As `read_json`, or the value is not an object.
-    """
-    value = read_json(path, max_bytes)
-    if not isinstance(value, dict):
-        raise StoreError(f"{path}: not a JSON object")
-    return value
-
-
-def read_table(path: Path | ConfinedPath) -> tuple[list[str], list[list[str]]]:
+def read_table(path: Path) -> tuple[list[str], list[list[str]]]:
     """Read a CSV table.
-
-    Args:
-        path: The file.
 
     Returns:
         The header, whose names are distinct, and the rows, each as long as the header.
 
     Raises:
-        UnreadableError: As `read_file`.
-        StoreError: The file is missing or not such a table; the message names it.
+        UnreadableError: The file can't be read now.
+        StoreError: The file is missing or damaged; the message names it.
     """
     content = read_file(path)
     try:
-        text = content.decode("utf-8")
-        header, *rows = islice(csv.reader(io.StringIO(text, newline=""), strict=True), _MAX_ROWS)
+        reader = csv.reader(io.StringIO(content.decode("utf-8"), newline=""), strict=True)
+        header, *rows = islice(reader, _MAX_ROWS + 2)
     except (ValueError, csv.Error) as error:
-        raise StoreError(f"{path}: {error}") from error
-    if len(rows) > _MAX_ROWS - 2 or len(header) > _MAX_COLUMNS:
-        raise StoreError(f"{path}: more than {_MAX_ROWS - 2} rows or {_MAX_COLUMNS} columns")
-    if not header:
-        raise StoreError(f"{path}: the header is empty")
-    if len(set(header)) < len(header) or any(len(row) != len(header) for row in rows):
-        raise StoreError(
-            f"{path}: two columns have one name, or a row is not as long as the header"
-        )
+        raise StoreError(f"damaged: {path}: {error}") from error
+    if len(rows) > _MAX_ROWS or len(header) > _MAX_COLUMNS:
+        raise StoreError(f"{path}: more than {_MAX_ROWS} rows or {_MAX_COLUMNS} columns")
+    if not header or len(set(header)) < len(header):
+        raise StoreError(f"damaged: {path}: the header is empty or has one name twice")
+    short = next((number for number, row in enumerate(rows) if len(row) != len(header)), None)
+    if short is not None:
+        raise StoreError(f"damaged: {path}: row {short + 1} is not as long as the header")
     return header, rows
 
 
 def table_text(rows: Sequence[Mapping[str, object]]) -> str:
-    """Return a CSV table whose texts are exactly as they are given, so that they can be read back.
+    """Return a CSV table whose texts are kept exactly, so that `read_table` gives them back.
 
-    In a table that is made for people, each text must have gone through `words.for_csv`.
+    In a table that is made for people, each text must have gone through `sanitize.for_csv`.
 
     Args:
-        rows: One mapping a row, of values by column, whose texts have no control characters. A
-            value that a row lacks is empty.
+        rows: One mapping a row, of values by column. A value that a row lacks is empty.
     """
     text = io.StringIO()
     columns = list(dict.fromkeys(column for row in rows for column in row))
@@ -181,16 +134,10 @@ def table_text(rows: Sequence[Mapping[str, object]]) -> str:
 
 
 def as_number(value: object) -> float:
-    """Convert a value of a JSON or CSV file to a float.
-
-    Args:
-        value: A number, its text, None or the empty string.
-
-    Returns:
-        The number; NaN for None and the empty string.
+    """Convert a value of a JSON or CSV file to a float; NaN for None and the empty string.
 
     Raises:
-        ValueError: The value is something else, or finite and beyond `MAX_NUMBER`.
+        ValueError: The value is not a number, or is finite and beyond `MAX_NUMBER`.
     """
     if value is None or value == "":
         return math.nan

@@ -17,7 +17,6 @@ from numpy.typing import NDArray
 
 from xrgs.errors import XrgsError
 from xrgs.safeio.atomic import atomic_writer
-from xrgs.safeio.confined import ConfinedPath, confined
 from xrgs.splat.gaussians import Gaussians
 from xrgs.splat.sh import MAX_DEGREE, bases
 
@@ -28,9 +27,7 @@ _MAGIC = b"ply\n"
 _FORMAT = "format binary_little_endian 1.0"
 
 
-def save_ply(
-    path: str | Path | ConfinedPath, gaussians: Gaussians, *, durable: bool = True
-) -> None:
+def save_ply(path: str | Path, gaussians: Gaussians, *, durable: bool = True) -> None:
     """Write Gaussians to a .ply file, which is replaced atomically.
 
     Args:
@@ -61,7 +58,7 @@ def save_ply(
         file.write(table.numpy().astype("<f4").tobytes())
 
 
-def load_ply(path: str | Path | ConfinedPath) -> Gaussians:
+def load_ply(path: str | Path) -> Gaussians:
     """Read Gaussians that `save_ply`, or any 3D Gaussian Splatting trainer, wrote.
 
     Args:
@@ -75,7 +72,7 @@ def load_ply(path: str | Path | ConfinedPath) -> Gaussians:
     """
     path = Path(path) if isinstance(path, str) else path
     try:
-        with confined(path).open() as file:
+        with path.open("rb") as file:
             count, names = _read_header(file, path)
             body_bytes = os.fstat(file.fileno()).st_size - file.tell()
             if body_bytes != count * len(names) * 4:  # before reading: the file may be huge
@@ -107,7 +104,7 @@ def _properties(rest: int) -> list[str]:
     ]
 
 
-def _read_header(file: BinaryIO, path: Path | ConfinedPath) -> tuple[int, list[str]]:
+def _read_header(file: BinaryIO, path: Path) -> tuple[int, list[str]]:
     """Return the number of vertices and their columns; leave `file` at the first vertex."""
     if file.readline(len(_MAGIC)) != _MAGIC:
         raise XrgsError(f"{path}: is not a .ply file")
@@ -140,9 +137,7 @@ def _is_count(digits: str) -> bool:
     return digits.isascii() and digits.isdigit() and len(digits) <= 12
 
 
-def _gaussians(
-    table: NDArray[np.float32], names: list[str], path: Path | ConfinedPath
-) -> Gaussians:
+def _gaussians(table: NDArray[np.float32], names: list[str], path: Path) -> Gaussians:
     """Return the parameters in a table [N, columns] of named columns."""
     stored = sum(name.startswith("f_rest_") for name in names)
     if stored not in {3 * (bases(degree) - 1) for degree in range(MAX_DEGREE + 1)}:

@@ -18,17 +18,17 @@ from xrgs.capture.failures import FAILED_PREFIX
 from xrgs.errors import StoreError, XrgsError
 from xrgs.experiment import trimming
 from xrgs.experiment.attempts import remove_cell
+from xrgs.runtime import lease
+from xrgs.safeio.files import is_name, remove_path
 from xrgs.safeio.records import list_folder
-from xrgs.safeio.untrusted import is_name
-from xrgs.safeio.words import counted, for_line
-from xrgs.sweep import locks
+from xrgs.safeio.sanitize import counted, for_line
 from xrgs.sweep.inventory import size_of, size_text
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator, Sequence
+    from pathlib import Path
 
     from xrgs.experiment.store import Store
-    from xrgs.safeio.confined import ConfinedPath
     from xrgs.sweep.inventory import CellSummary
 
 #: What `gc` removes, by the names that choose it.
@@ -151,7 +151,7 @@ def plan_gc(store: Store, cells: Sequence[CellSummary], of: Sequence[str]) -> Pl
         if name not in GARBAGE:
             raise XrgsError(f"of={name}: choose from: {', '.join(GARBAGE)}")
     idle, _ = _without_running(cells)
-    old = [cell for cell in idle if cell.old_code] if "old_code" in of else []
+    old = [cell for cell in idle if cell.stale] if "old_code" in of else []
     failed = [cell for cell in idle if cell.state.name == "failed"] if "failed" in of else []
     failed = [cell for cell in failed if cell not in old]
     gone = {cell.id for cell in (*old, *failed)}
@@ -198,7 +198,7 @@ def carry_out(store: Store, plan: Plan) -> tuple[int, list[str]]:
 def _under_lock(store: Store, item: Item) -> str:
     if item.lock is None:
         return item.act()
-    lock = locks.acquire(store.locks, item.lock)
+    lock = lease.acquire(store.leases, item.lock)
     if lock is None:
         return "it is left: a sweep is training it"
     try:
@@ -263,23 +263,23 @@ def _trim_variant(store: Store, variant_id: str) -> str:
     return ""
 
 
-def _remove_folder(folder: ConfinedPath) -> str:
-    folder.remove()
+def _remove_folder(folder: Path) -> str:
+    remove_path(folder)
     return ""
 
 
-def _names(folder: ConfinedPath) -> list[str]:
+def _names(folder: Path) -> list[str]:
     return [name for name in list_folder(folder) if is_name(name)]
 
 
-def _folders(kind: str, above: ConfinedPath, names: Iterable[str]) -> Iterator[Item]:
+def _folders(kind: str, above: Path, names: Iterable[str]) -> Iterator[Item]:
     for name in names:
         folder = above / name
         act = partial(_remove_folder, folder)
         yield Item(kind, f"{above.name}/{name}", size_of(folder) or 0, None, act)
 
 
-def _aside_items(above: ConfinedPath, *, locked: bool) -> Iterator[Item]:
+def _aside_items(above: Path, *, locked: bool) -> Iterator[Item]:
     """Yield the folders that were set aside; those of cells are removed under the cell's lock."""
     for name in _names(above):
         found = _ASIDE.fullmatch(name)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import stat
 import time
 from collections import Counter
 from dataclasses import dataclass
@@ -10,26 +9,24 @@ from datetime import UTC, datetime
 from typing import TYPE_CHECKING, Any
 
 from xrgs.errors import StoreError, XrgsError
-from xrgs.experiment.identity import training_code
+from xrgs.experiment.identity import changed_code
 from xrgs.experiment.store import Store, full_id
 from xrgs.report.render import TextTable, to_text
+from xrgs.runtime import lease
 from xrgs.runtime.progress import log_line
-from xrgs.safeio.records import read_json
-from xrgs.safeio.untrusted import is_name
-from xrgs.safeio.words import counted
+from xrgs.safeio.files import file_bytes
+from xrgs.safeio.sanitize import counted
 from xrgs.splat.backend import arithmetic
-from xrgs.sweep import locks
-from xrgs.training import plugins
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
     from pathlib import Path
 
     from xrgs.experiment.cell_folder import CellFolder, CellState
-    from xrgs.safeio.confined import ConfinedPath
+    from xrgs.experiment.schema import Identity, RecordedCell, SweepRecord
 
 #: The states that a cell of a store can have.
-STATES = ("done", "running", "unfinished", "failed", "corrupt", "unknown")
+STATES = ("done", "running", "planned", "unfinished", "failed", "corrupt", "unknown")
 #: The most names of scenes or labels that a line lists.
 _MAX_LISTED = 6
 
@@ -57,11 +54,9 @@ class CellSummary:
     """The id of its variant; None where its identity can't be read."""
     seed: int | None
     state: CellState
-    old_code: tuple[str, ...]
-    """Source files of this package that are not those of its identity, whatever its state."""
     stale: tuple[str, ...]
-    """For a done cell, the same with those of plugins, and its arithmetic if this machine has
-    another. A sweep would train the cell again."""
+    """Parts of the program, and the arithmetic, that differ from those of its identity: a sweep
+    trains such a cell again."""
 
     @property
     def id(self) -> str:
@@ -80,7 +75,7 @@ class CellSummary:
 
     def age_s(self) -> float | None:
         """Return the seconds since it ended, or since its folder changed; None if unknown."""
-        for file in (self.folder.status, self.folder.folder):
+        for file in (self.folder.status_file, self.folder.path):
             try:
                 return max(0.0, time.time() - file.lstat().st_mtime)
             except OSError:
@@ -89,10 +84,10 @@ class CellSummary:
 
     def bytes(self) -> int | None:
         """Return the bytes of its files; None where that can't be told."""
-        return size_of(self.folder.folder)
+        return size_of(self.folder.path)
 
 
-def recorded_names(records: Mapping[str, Mapping[str, Any]]) -> dict[str, CellNames]:
+def recorded_names(records: Mapping[str, SweepRecord]) -> dict[str, CellNames]:
     """Return how the records of sweeps name each cell, by the cell's id.
 
     Args:
@@ -100,17 +95,13 @@ def recorded_names(records: Mapping[str, Mapping[str, Any]]) -> dict[str, CellNa
     """
     names: dict[str, CellNames] = {}
     for sweep_id, record in records.items():
-        for row in record["cells"]:
-            cell_id = row.get("cell_id")
-            if cell_id is None:
+        for row in record.cells:
+            if row.cell_id is None:
                 continue
-            before = names.get(cell_id, CellNames()).sweeps
-            names[cell_id] = CellNames(
-                row.get("scene", "?"),
-                row.get("label", "?"),
-                row.get("condition", ""),
-                tuple(dict.fromkeys([*before, sweep_id])),
-                row.get("baseline_id"),
+            before = names.get(row.cell_id, CellNames()).sweeps
+            sweeps = tuple(dict.fromkeys([*before, sweep_id]))
+            names[row.cell_id] = CellNames(
+                row.scene, row.label, row.condition, sweeps, row.baseline_id
             )
     return names
 
@@ -136,17 +127,14 @@ def summarise(
     try:
         identity = cell.identity()
     except StoreError:
-        identity = {}
-    variant, seed = identity.get("variant"), identity.get("seed")
-    old, stale = _changed(identity)
+        identity = None
     return CellSummary(
         cell,
         names.get(cell.id) or CellNames(_scene(cell)),
-        variant if isinstance(variant, str) and is_name(variant) else None,
-        seed if type(seed) is int else None,
+        identity.variant if identity else None,
+        identity.seed if identity else None,
         state,
-        old,
-        stale if state.name == "done" else (),
+        _other_code(identity) if identity else (),
     )
 
 
@@ -165,7 +153,7 @@ def summaries(store: Store) -> list[CellSummary]:
     records, damaged = store.records()
     for message in damaged:
         log_line(f"{message}; its names of cells are left out")
-    names, holders = recorded_names(records), locks.holders(store.locks)
+    names, holders = recorded_names(records), lease.holders(store.leases)
     cells = [summarise(cell, names, holders) for cell in store.cell_folders()]
     return sorted(cells, key=lambda c: (c.names.scene, c.arm, c.seed or 0, c.id))
 
@@ -173,40 +161,26 @@ def summaries(store: Store) -> list[CellSummary]:
 def _scene(cell: CellFolder) -> str:
     """Return the scene of a cell that no sweep has recorded."""
     try:
-        scene = read_json(cell.folder / "config.json")["scene"]
-        return str(scene["name"] or scene["path"] or scene["kind"])
-    except (StoreError, KeyError, TypeError):
-        return "?"
-
-
-def _changed(identity: Mapping[str, Any]) -> tuple[tuple[str, ...], tuple[str, ...]]:
-    """Return the package's source files that differ from an identity's, and all that differs.
-
-    All that differs includes plugins and the arithmetic. An identity that can't be read differs in
-    the file that it should be in, which is no old code.
-    """
-    try:
-        then: dict[str, Any] = identity["code"]
-        backend = identity["splat"]["backend"]
-        now = training_code(backend) | plugins.digests_now(then)
-        files = then.keys() | now.keys() if then != now else ()
-        changed = sorted(file for file in files if then.get(file) != now.get(file))
-        other = _other_arithmetic(backend, identity.get("arithmetic", "not recorded"))
-    except (XrgsError, AttributeError, KeyError, TypeError, ValueError):
-        return (), ("identity.json",)
-    return tuple(f for f in changed if not f.startswith("plugins/")), (*changed, *other)
-
-
-def _other_arithmetic(backend: str, trained: object) -> list[str]:
-    """Return how a cell's arithmetic differs from this machine's; empty if it does not.
-
-    A machine on which the backend is not available, where stores are only read, has none.
-    """
-    try:
-        here = arithmetic(backend)
+        scene = cell.config().scene
     except XrgsError:
-        return []
-    return [] if trained == here else [f"arithmetic ({trained}, here {here})"]
+        return "?"
+    return scene.name or scene.path or scene.kind
+
+
+def _other_code(identity: Identity) -> tuple[str, ...]:
+    """Return what of the installed program differs from an identity's: parts, and arithmetic.
+
+    A machine on which the backend is not available, where stores are only read, has no arithmetic.
+    """
+    try:
+        changed = changed_code(identity)
+        here = arithmetic(str(identity.splat["backend"]))
+    except XrgsError as error:
+        return (str(error),)
+    other = (
+        [] if identity.arithmetic == here else [f"arithmetic ({identity.arithmetic}, here {here})"]
+    )
+    return (*changed, *other)
 
 
 @dataclass(frozen=True)
@@ -276,20 +250,7 @@ def one_cell(beginning: str, cells: Sequence[CellSummary]) -> CellSummary:
     return by_id[full_id(beginning, [*by_id])]
 
 
-def file_bytes(path: ConfinedPath) -> int:
-    """Return the bytes of the regular files at a path and below.
-
-    Args:
-        path: A file or a folder; a link is not followed, and has none.
-
-    Raises:
-        OSError: A folder can't be read, or they are nested too deeply.
-    """
-    found = [status for _, status in path.walk()] if path.is_dir() else [path.lstat()]
-    return sum(status.st_size for status in found if stat.S_ISREG(status.st_mode))
-
-
-def size_of(path: ConfinedPath) -> int | None:
+def size_of(path: Path) -> int | None:
     """Return `file_bytes`, or None where that can't be told.
 
     Args:
@@ -366,8 +327,8 @@ def list_cells(cells: Sequence[CellSummary], sort: str) -> str:
 
 def _state(cell: CellSummary) -> str:
     """Return a cell's state in a word, with what else one wants to know at a glance."""
-    marks = ["trimmed"] if cell.folder.trimmed() else []
-    marks += ["old code"] if cell.old_code else []
+    marks = ["trimmed"] if cell.folder.is_trimmed() else []
+    marks += ["old code"] if cell.stale else []
     return cell.state.name + (f" ({', '.join(marks)})" if marks else "")
 
 
@@ -392,9 +353,9 @@ def list_sweeps(path: Path) -> str:
         (
             sweep_id,
             _date(store.sweeps / f"{sweep_id}.json"),
-            _distinct(row.get("scene", "?") for row in record["cells"]),
-            _distinct(row.get("label", "?") for row in record["cells"]),
-            _counts(record["cells"], states),
+            _distinct(row.scene for row in record.cells),
+            _distinct(row.label for row in record.cells),
+            _counts(record.cells, states),
         )
         for sweep_id, record in records.items()
     ]
@@ -402,25 +363,24 @@ def list_sweeps(path: Path) -> str:
     return to_text(TextTable(f"{len(rows)} sweeps", columns, tuple(rows), "lllll")).rstrip()
 
 
-def _states(store: Store, records: Mapping[str, Mapping[str, Any]]) -> dict[str, str]:
+def _states(store: Store, records: Mapping[str, SweepRecord]) -> dict[str, str]:
     """Return the state of every recorded cell by its id."""
-    holders = locks.holders(store.locks)
-    ids = {row.get("cell_id") for record in records.values() for row in record["cells"]}
+    holders = lease.holders(store.leases)
+    ids = {row.cell_id for record in records.values() for row in record.cells}
     states = {}
-    for cell_id in ids - {None}:
+    for cell_id in filter(None, ids):
         state = store.cell(cell_id).state(verify=False).name
         states[cell_id] = "running" if state == "unfinished" and cell_id in holders else state
     return states
 
 
-def _counts(rows: Sequence[Mapping[str, Any]], states: Mapping[str, str]) -> str:
+def _counts(rows: Sequence[RecordedCell], states: Mapping[str, str]) -> str:
     """Return how many cells of a sweep have which state: `3 of 12 done, 1 running, 8 pending`."""
     names = Counter(
-        "failed" if row.get("error") else states.get(row.get("cell_id") or "", "absent")
-        for row in rows
+        "failed" if row.error else states.get(row.cell_id or "", "absent") for row in rows
     )
     done = f"{names.pop('done', 0)} of {len(rows)} done"
-    names["pending"] = names.pop("absent", 0) + names.pop("unfinished", 0)
+    names["pending"] = sum(names.pop(name, 0) for name in ("absent", "planned", "unfinished"))
     return ", ".join([done, *(f"{count} {name}" for name, count in names.items() if count)])
 
 
@@ -431,7 +391,7 @@ def _distinct(names: Any) -> str:
     return ", ".join(distinct[:_MAX_LISTED]) + (f" and {more} more" if more > 0 else "")
 
 
-def _date(file: ConfinedPath) -> str:
+def _date(file: Path) -> str:
     """Return when a file was written, local time; `?` where that can't be told."""
     try:
         written = datetime.fromtimestamp(file.lstat().st_mtime, UTC).astimezone()

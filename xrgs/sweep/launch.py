@@ -1,9 +1,9 @@
 """Hands a sweep's cells to Hydra's launcher, whichever is configured, and copes with its failures.
 
 A launcher runs jobs here or elsewhere, in processes with a working folder of their own. A job is
-given the session's folder and the id of its cell; the session's folder holds the config, with full
-paths, the rasterizer and the job's share of the cores. What has become of a cell is read from the
-store: a launcher that breaks loses its answers, but not the sweep.
+given the session's folder, the store and the id of its cell. The cell's folder in the store holds
+the config, with full paths, the rasterizer and the job's share of the cores. What has become of a
+cell is read from the store: a launcher that breaks loses its answers, but not the sweep.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ import copy
 import os
 import time
 from collections import Counter
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
 
@@ -22,17 +22,17 @@ from omegaconf import OmegaConf, flag_override
 
 from xrgs.composing import escape_interpolations
 from xrgs.errors import XrgsError
+from xrgs.experiment.attempts import plan_cell
+from xrgs.runtime import lease
 from xrgs.runtime.machine import usable_cores
 from xrgs.runtime.progress import log_line
-from xrgs.safeio.confined import ConfinedPath, RootMissingError
-from xrgs.safeio.hashing import to_plain
-from xrgs.safeio.words import counted, for_line
+from xrgs.safeio.sanitize import counted, for_line
 from xrgs.splat.backend import resolve_backend
-from xrgs.sweep import locks, presence
+from xrgs.sweep import presence
 from xrgs.sweep.jobs import worker
 from xrgs.sweep.jobs.job import INTERRUPTED, STOPPED, UNKNOWN
 from xrgs.sweep.plan import expected_length
-from xrgs.sweep.session import HandOver, SweepSession
+from xrgs.sweep.session import SweepSession
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping, Sequence
@@ -145,7 +145,7 @@ def check(config: DictConfig, cell: DictConfig | None = None) -> None:
 
 
 class _JobConfigLoader:
-    """Gives each job Hydra's own settings and its cell's id, without composing any config.
+    """Gives each job Hydra's own settings and what it trains, without composing any config.
 
     Launchers ask the config loader for a job's config, on the machine that runs the job. The plan
     has composed the cell's config already, so that Hydra's loader would compose it a second time.
@@ -156,10 +156,10 @@ class _JobConfigLoader:
 
         Args:
             master_config: The sweep's config.
-            overrides: `cell=<cell id>` alone.
+            overrides: `cell=<cell id>`, `store=<full path>` and `name=<for people>`.
 
         Returns:
-            The sweep's `hydra` node, and `cell`.
+            The sweep's `hydra` node, and these three.
 
         Raises:
             XrgsError: The session's folder is no longer there. Hydra would make it again.
@@ -169,11 +169,13 @@ class _JobConfigLoader:
             raise XrgsError(f"hydra.sweep.dir={folder} is no longer there")
         config = OmegaConf.masked_copy(master_config, ["hydra"])
         with flag_override(config, ["readonly", "struct"], False):
-            # As text: an id of digits alone, or like 12e4567..., would be parsed as a number.
-            config.cell = overrides[0].removeprefix("cell=")
+            for override in overrides:
+                # As text: an id of digits alone, or like 12e4567..., would be parsed as a number.
+                key, _, value = override.partition("=")
+                config[key] = escape_interpolations(value)
         with flag_override(config.hydra, ["readonly", "struct"], False):
-            config.hydra.overrides.task = list(overrides)
-            config.hydra.job.override_dirname = ",".join(overrides)
+            config.hydra.overrides.task = overrides[:1]
+            config.hydra.job.override_dirname = overrides[0]
         OmegaConf.set_readonly(config.hydra, False)
         return config
 
@@ -206,7 +208,7 @@ class Launches:
         """
         folder = _create_unique(Path(self._config.hydra.sweep.dir).absolute(), store)
         self._set("sweep.dir", escape_interpolations(str(folder)))
-        session = SweepSession(folder.path)
+        session = SweepSession(folder)
         session.begin()
         return session
 
@@ -262,10 +264,7 @@ class Launches:
         if self._name != "basic":
             number = counted(len(cells), "cell")
             log_line(f"hydra/launcher={self._name}: {number}, threads={threads} each")
-        session = cast("SweepSession", self._session)
-        dead = locks.confirmed(store.locks)
-        jobs = [_job_of(cell, threads, dead.get(str(cell.cell_id), ())) for cell in cells]
-        overrides = [[f"cell={session.hand_over(job)}"] for job in jobs]
+        overrides = [_hand_over(cell, threads, store) for cell in cells]
         first, self._jobs = self._jobs, self._jobs + len(cells)
         try:
             if "submitit" in str(self._config.hydra.launcher["_target_"]):
@@ -316,11 +315,11 @@ class Launches:
         """Return the outcomes of a batch whose launcher broke, begun or not."""
         reason = f"hydra/launcher={self._name}: {_first_line(error)}"
         before = {str(cell.cell_id): cell.state.name for cell in cells}
-        while before.keys() & locks.holders(store.locks).keys():
+        while before.keys() & lease.holders(store.leases).keys():
             time.sleep(_POLL_S)  # jobs that outlive their launcher still use their cores
         states = {cell_id: store.cell(cell_id).state().name for cell_id in before}
         unchanged = {
-            cell_id: state != "unfinished" and state in {before[cell_id], "absent"}
+            cell_id: state != "unfinished" and state in {before[cell_id], "planned"}
             for cell_id, state in states.items()
         }
         if all(unchanged.values()):
@@ -341,58 +340,50 @@ def _first_line(error: Exception) -> str:
     return for_line(f"{type(error).__name__}: {str(error).strip().partition(chr(10))[0]}")
 
 
-def _create_unique(preferred: Path, store: Store) -> ConfinedPath:
-    """Create a folder, or one with a number appended if another call has it already."""
-    folder = wanted = _located(preferred, store)
-    number = 1
-    try:
-        wanted.make_parent()
-        while not _make(folder):
-            number += 1
-            folder = wanted.with_name(f"{wanted.name}-{number}")
-    except RootMissingError:
-        raise
-    except OSError as error:
-        if worker.unwritable(error):
-            raise
-        raise XrgsError(f"hydra.sweep.dir={preferred}: {error}") from error
-    return folder
-
-
-def _make(folder: ConfinedPath) -> bool:
-    """Make a folder; return False if another call has made it."""
-    try:
-        folder.make_folder(exclusive=True)
-    except FileExistsError:
-        return False
-    return True
-
-
-def _located(folder: Path, store: Store) -> ConfinedPath:
-    """Return a folder as one in the store, which is not made again, or in the one it is to be in.
+def _create_unique(preferred: Path, store: Store) -> Path:
+    """Create a folder, or one with a number appended if another call has it already.
 
     Raises:
         XrgsError: The folder that it is to be in can't be made.
     """
     home = store.path.absolute()
-    if folder != home and folder.is_relative_to(home) and ".." not in folder.parts:
-        return ConfinedPath(home) / folder.relative_to(home).as_posix()
-    above = ConfinedPath(folder.parent)
     try:
-        above.make_root()
-        return above / folder.name
-    except (OSError, ValueError) as error:
-        raise XrgsError(f"hydra.sweep.dir={folder}: {error}") from error
+        # The store itself is not made again: it may have been moved since the plan.
+        above = preferred.parent
+        if not above.is_relative_to(home) or home.is_dir():
+            above.mkdir(parents=True, exist_ok=True)
+        folder, number = preferred, 1
+        while True:
+            try:
+                folder.mkdir()
+            except FileExistsError:
+                number += 1
+                folder = preferred.with_name(f"{preferred.name}-{number}")
+            else:
+                return folder
+    except OSError as error:
+        if worker.unwritable(error):
+            raise
+        raise XrgsError(f"hydra.sweep.dir={preferred}: {error}") from error
 
 
-def _job_of(cell: PlannedCell, threads: int, dead_locks: tuple[str, ...] = ()) -> HandOver:
-    """Return what a job on any machine needs: paths in full, the backend chosen, its threads."""
-    if cell.identity is None:
+def _hand_over(cell: PlannedCell, threads: int, store: Store) -> list[str]:
+    """Write what a job on any machine needs into the cell's folder; return the job's overrides.
+
+    Paths are written in full, the backend is chosen, and the job has its share of the cores.
+    """
+    if cell.identity is None or cell.cell_id is None:
         raise ValueError(f"{cell.name}: launched without an identity")
-    conf = to_plain(cell.conf)
-    conf["store"] = str(Path(cell.conf.store).absolute())
-    conf["splat"]["backend"] = resolve_backend(cell.conf.splat.backend)
-    conf["threads"] = cell.conf.threads or threads
-    if cell.conf.scene.path:
-        conf["scene"]["path"] = str(Path(cell.conf.scene.path).expanduser().absolute())
-    return HandOver(cell.name, conf, cell.identity, dead_locks)
+    home, scene = store.path.absolute(), cell.conf.scene
+    path = str(Path(scene.path).expanduser().absolute()) if scene.path else scene.path
+    conf = replace(
+        cell.conf,
+        store=str(home),
+        splat=replace(cell.conf.splat, backend=resolve_backend(cell.conf.splat.backend)),
+        threads=cell.conf.threads or threads,
+        scene=replace(scene, path=path),
+    )
+    # What this process has watched for long enough need not be watched again by the job.
+    lease.free_if_dead(store.leases, cell.cell_id)
+    plan_cell(store.cell(cell.cell_id), conf, cell.identity)
+    return [f"cell={cell.cell_id}", f"store={home}", f"name={cell.name}"]

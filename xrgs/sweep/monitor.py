@@ -20,13 +20,14 @@ from tqdm import tqdm
 from xrgs.experiment.cell_folder import CellFolder
 from xrgs.runtime import progress
 from xrgs.runtime.progress import log_line
+from xrgs.safeio.files import list_names
 from xrgs.sweep.snapshot import RunningCell, SweepSnapshot
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
+    from pathlib import Path
 
     from xrgs.runtime.progress import Progress
-    from xrgs.safeio.confined import ConfinedPath
     from xrgs.sweep.plan import PlannedCell
 
 #: Seconds between two snapshots, at least; and the pause in multiples of the time that a snapshot
@@ -92,7 +93,7 @@ class _Slowness:
 class SweepMonitor:
     """Shows a sweep while a `with` block runs: a bar on a terminal, occasional lines in a log."""
 
-    def __init__(self, cells: ConfinedPath) -> None:
+    def __init__(self, cells: Path) -> None:
         """Prepare to show; nothing is shown before `watch` is called.
 
         Args:
@@ -132,8 +133,10 @@ class SweepMonitor:
             if name is None or name in self._before:
                 continue
             folder = self._folder(name)
-            self._before[name] = None if state == "absent" else _stamp(folder.status)
-            if state not in {"absent", "running"}:
+            self._before[name] = (
+                None if state in {"absent", "planned"} else _stamp(folder.status_file)
+            )
+            if state not in {"absent", "planned", "running"}:
                 # A progress file that a killed attempt left does not mean that the cell runs.
                 self._moved[name] = (_stamp(folder.progress), -math.inf)
         if first:
@@ -159,7 +162,7 @@ class SweepMonitor:
     def snapshot(self) -> SweepSnapshot:
         """Return the states of the cells now."""
         try:
-            begun = set(self._cells.names())
+            begun = set(list_names(self._cells))
         except OSError:
             begun = set()
         return self._take_snapshot(begun)
@@ -215,7 +218,7 @@ class SweepMonitor:
             return ""
         if name not in self._ended:
             folder = self._folder(name)
-            if (status := _stamp(folder.status)) is None or status == self._before[name]:
+            if (status := _stamp(folder.status_file)) is None or status == self._before[name]:
                 return ""
             state = folder.state(verify=False).name
             if state == "unknown":  # it is read again
@@ -261,7 +264,7 @@ class SweepMonitor:
         self._bar.set_description_str(str(snapshot))
 
 
-def _stamp(file: ConfinedPath) -> _FileStamp:
+def _stamp(file: Path) -> _FileStamp:
     """Return what changes when a file is written again; None if there is no file."""
     try:
         status = file.lstat()

@@ -9,27 +9,29 @@ from __future__ import annotations
 
 import hashlib
 import io
+import json
 import tarfile
 from dataclasses import dataclass
 from functools import partial
 from pathlib import PurePath
 from typing import TYPE_CHECKING, Any
 
+import msgspec
+
 from xrgs.capture import frozen
 from xrgs.errors import StoreError
 from xrgs.experiment import trimming
-from xrgs.experiment.cell_folder import READING_ERRORS, CellState
-from xrgs.safeio import untrusted
+from xrgs.experiment.cell_folder import CellState
+from xrgs.experiment.schema import FileEntry
 from xrgs.safeio.atomic import atomic_writer, json_text
 from xrgs.safeio.records import errors_named, read_file
-from xrgs.safeio.words import counted, for_line
+from xrgs.safeio.sanitize import counted, for_line
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Sequence
     from pathlib import Path
 
     from xrgs.experiment.store import Store
-    from xrgs.safeio.confined import ConfinedPath
     from xrgs.sweep.inventory import CellSummary
 
 #: The folder in the archive; the default of `store=`, so that commands find it once it is unpacked.
@@ -87,7 +89,7 @@ def pack(
     def packed(name: str, files: Callable[[], _Files]) -> _Files:
         try:
             return files()
-        except READING_ERRORS as error:
+        except (StoreError, OSError) as error:
             left_out.append(for_line(f"{name}: {CellState.of_error(error).reason}"))
             return {}
 
@@ -118,19 +120,18 @@ def _write(out: Path, groups: Iterable[_Files]) -> int:
 
 def _cell(cell: CellSummary, here: Path) -> _Files:
     """Return the files of a done cell as if it were trimmed, with its config's paths relative."""
-    folder, status = cell.folder.folder, cell.folder.trimmed_status()
-    contents = {name: _verified(folder, name, of["sha256"]) for name, of in status["files"].items()}
-    config = json_text(_relative(untrusted.parse_json(contents[_CONFIG]), here)).encode()
-    entry = {"bytes": len(config), "sha256": hashlib.sha256(config).hexdigest()}
-    status["files"][_CONFIG] = entry
-    contents |= {_CONFIG: config, cell.folder.status.name: json_text(status).encode()}
-    modified = cell.folder.status.lstat().st_mtime
+    folder, status = cell.folder.path, cell.folder.trimmed_status()
+    contents = {name: _verified(folder, name, of.sha256) for name, of in status.files.items()}
+    config = json_text(_relative(json.loads(contents[_CONFIG]), here)).encode()
+    entry = FileEntry(len(config), hashlib.sha256(config).hexdigest())
+    status = msgspec.structs.replace(status, files=status.files | {_CONFIG: entry})
+    text = json_text(msgspec.to_builtins(status))
+    contents |= {_CONFIG: config, cell.folder.status_file.name: text.encode()}
+    modified = cell.folder.status_file.stat().st_mtime
     return {f"cells/{cell.id}/{name}": (content, modified) for name, content in contents.items()}
 
 
-def _verified(folder: ConfinedPath, name: str, sha256: str) -> bytes:
-    if not untrusted.is_inside(name):
-        raise StoreError(f"status.json: {name!r:.80} is not a file of this cell")
+def _verified(folder: Path, name: str, sha256: str) -> bytes:
     content = read_file(folder / name)
     if hashlib.sha256(content).hexdigest() != sha256:
         raise StoreError(f"{folder / name}: it has changed since the cell finished")
@@ -153,8 +154,9 @@ def _variant(store: Store, variant_id: str) -> _Files:
 def _record(store: Store, sweep_id: str, here: Path) -> _Files:
     store.verify_sweep(sweep_id)
     record, file = store.sweep_record(sweep_id), store.sweeps / f"{sweep_id}.json"
-    record["command"] = [_relative_argument(word, here) for word in record["command"]]
-    return {f"sweeps/{file.name}": (json_text(record).encode(), file.lstat().st_mtime)}
+    command = tuple(_relative_argument(word, here) for word in record.command)
+    text = json_text(msgspec.to_builtins(msgspec.structs.replace(record, command=command)))
+    return {f"sweeps/{file.name}": (text.encode(), file.stat().st_mtime)}
 
 
 def _relative(value: Any, here: Path) -> Any:

@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from xrgs.capture import scenes
 from xrgs.experiment.cell_folder import CellState
-from xrgs.experiment.identity import cell_identity
+from xrgs.experiment.identity import cell_id, cell_identity
+from xrgs.experiment.schema import RecordedCell
 from xrgs.experiment.store import BASELINE
 from xrgs.runtime.progress import format_duration
 from xrgs.safeio.hashing import digest, to_plain
-from xrgs.safeio.words import counted, for_line
+from xrgs.safeio.sanitize import counted, for_line
 from xrgs.splat.backend import resolve_backend
 from xrgs.sweep.estimate import TORCH_SLOWDOWN
 
@@ -19,6 +20,7 @@ if TYPE_CHECKING:
     from collections.abc import Container, Mapping, Sequence
 
     from xrgs.config import Conf
+    from xrgs.experiment.schema import Identity
     from xrgs.experiment.store import Store
     from xrgs.sweep.axes import CellSpec
     from xrgs.sweep.estimate import CostEstimator
@@ -35,7 +37,7 @@ class PlannedCell:
     conf: Conf
     variant_id: str | None = None
     """The id of its frozen variant; None while that is not built."""
-    identity: Mapping[str, Any] | None = None
+    identity: Identity | None = None
     """What the cell's id is the digest of; None while the variant or a count is missing."""
     cell_id: str | None = None
     state: CellState = field(default_factory=lambda: CellState("absent"))
@@ -126,11 +128,11 @@ def identified(cell: PlannedCell, store: Store, holders: Mapping[str, str]) -> P
     if cell.variant_id is None or cell.waits or cell.state.name == "done":
         return cell
     identity = cell.identity or cell_identity(cell.conf, cell.variant_id)
-    cell_id = cell.cell_id or digest(identity)
-    state = store.cell(cell_id).state()
-    if state.name != "done" and cell_id in holders:
-        state = store.cell(cell_id).running(holders[cell_id])
-    return replace(cell, identity=identity, cell_id=cell_id, state=state)
+    name = cell.cell_id or cell_id(identity)
+    state = store.cell(name).state()
+    if state.name != "done" and name in holders:
+        state = store.cell(name).running(holders[name])
+    return replace(cell, identity=identity, cell_id=name, state=state)
 
 
 def estimated(plan: Sequence[PlannedCell], past: CostEstimator, threads: int) -> list[PlannedCell]:
@@ -147,7 +149,7 @@ def estimated(plan: Sequence[PlannedCell], past: CostEstimator, threads: int) ->
 def _with_cost(cell: PlannedCell, past: CostEstimator, threads: int) -> PlannedCell:
     """Return a cell with its cost; while it waits for a count, with the count it has."""
     threads = cell.conf.threads or threads
-    cost = past.cost(cell.conf, cell.variant_id, cell.identity, threads)
+    cost = past.cost(cell.conf, cell.variant_id, threads)
     if cost is None:
         return cell
     return replace(
@@ -272,13 +274,8 @@ def expected_use(plan: Sequence[PlannedCell], past: int) -> str:
     disk = [cell.disk_bytes for cell in left_to_train(plan) if cell.disk_bytes is not None]
     if not memory or not disk:
         return ""
-    learned = (
-        f"learned from {past} finished cells of this store"
-        if past
-        else "of a common machine, since this store has no finished cell: within a factor of 3"
-    )
     return (
-        f"estimates {learned}; a cell takes up to {_size(max(memory))} of memory, all of them"
+        f"estimates from {counted(past, 'finished cell')} of this store; a cell takes up to {_size(max(memory))} of memory, all of them"
         f" {_size(sum(disk))} of disk"
     )
 
@@ -348,7 +345,7 @@ def _remaining(plan: Sequence[PlannedCell]) -> str:
     return f"; left to train, one after another: {format_duration(sum(known))}{more}"
 
 
-def record(plan: Sequence[PlannedCell]) -> list[dict[str, Any]]:
+def record(plan: Sequence[PlannedCell]) -> list[RecordedCell]:
     """Return the rows that a report is made from: each cell with its matching baseline's id.
 
     Args:
@@ -356,21 +353,27 @@ def record(plan: Sequence[PlannedCell]) -> list[dict[str, Any]]:
     """
     baselines = {cell.spec.shared: cell.cell_id for cell in plan if cell.spec.label == BASELINE}
     return [
-        {
-            "cell_id": cell.cell_id,
-            "planned_id": _planned_id(cell),
-            "label": cell.spec.label,
-            "condition": cell.spec.condition,
-            "scene": scenes.label(cell.conf.scene),
-            "variant_seed": cell.conf.variant.seed,
-            "seed": cell.conf.seed,
-            "variant_id": cell.variant_id,
-            "baseline_id": baselines[cell.spec.shared],
-            "error": cell.error,
-        }
-        | _unknown(cell)
+        RecordedCell(
+            cell_id=cell.cell_id,
+            planned_id=_planned_id(cell),
+            label=cell.spec.label,
+            condition=cell.spec.condition,
+            scene=scenes.label(cell.conf.scene),
+            variant_seed=cell.conf.variant.seed,
+            seed=cell.conf.seed,
+            variant_id=cell.variant_id,
+            baseline_id=baselines[cell.spec.shared],
+            # The state of a cell that has an id is read when a report is made.
+            error=cell.state.reason if _lacks_id_for_now(cell) else cell.error,
+            state="unknown" if _lacks_id_for_now(cell) else None,
+        )
         for cell in plan
     ]
+
+
+def _lacks_id_for_now(cell: PlannedCell) -> bool:
+    """Return whether a file that could not be read is the reason why the cell has no id."""
+    return cell.cell_id is None and cell.unknown
 
 
 def _planned_id(cell: PlannedCell) -> str:
@@ -387,13 +390,3 @@ def _planned_id(cell: PlannedCell) -> str:
     )
     parts = (conf.scene, conf.variant, conf.splat, conf.train, conf.components)
     return digest([*map(to_plain, parts), conf.seed, cell.variant_id])
-
-
-def _unknown(cell: PlannedCell) -> dict[str, str]:
-    """Return what a record says of a cell whose id is not known because its variant is not.
-
-    The state of a cell that has an id is read when a report is made, and may be another one then.
-    """
-    if cell.cell_id is not None or not cell.unknown:
-        return {}
-    return {"state": "unknown", "error": cell.state.reason}

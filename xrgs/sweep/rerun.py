@@ -9,23 +9,24 @@ from __future__ import annotations
 
 import math
 import re
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from itertools import count
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import msgspec
+
 from xrgs import composing
-from xrgs.errors import StoreError, XrgsError
+from xrgs.errors import XrgsError
 from xrgs.experiment import provenance
-from xrgs.experiment.attempts import begin_attempt
+from xrgs.experiment.attempts import begin_attempt, plan_cell
 from xrgs.experiment.cell_folder import CellFolder
-from xrgs.experiment.identity import cell_identity
+from xrgs.experiment.identity import cell_id, cell_identity
 from xrgs.experiment.store import Store
 from xrgs.runtime.machine import usable_cores
 from xrgs.runtime.progress import log_line
-from xrgs.safeio.confined import ConfinedPath
-from xrgs.safeio.hashing import digest, file_digest
-from xrgs.safeio.words import for_line
+from xrgs.safeio.hashing import file_digest
+from xrgs.safeio.sanitize import for_line
 from xrgs.splat.backend import resolve_backend
 from xrgs.sweep import variants
 from xrgs.sweep.axes import CellSpec
@@ -37,6 +38,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping, Sequence
 
     from xrgs.config import Conf
+    from xrgs.experiment.schema import Identity
 
 #: Files of results that are compared byte for byte.
 _RESULTS = ("scores.csv", "history.csv", "splats.ply")
@@ -123,7 +125,7 @@ def _rerun(
         raise XrgsError(f"threads={conf.threads}: must be at least 0")
     repeated = CellFolder(_free_folder(out, folder))
     conf.splat.backend = resolve_backend(conf.splat.backend)
-    now = cell_identity(conf, str(identity["variant"]))
+    now = cell_identity(conf, identity.variant)
     before = [
         *_newer_keys(added),
         *_own_contradictions(original, identity, now, added),
@@ -132,20 +134,20 @@ def _rerun(
     title = "differences from when the cell was trained"
     for line in _listed(before, title) or ["code, libraries and machine are the same"]:
         log_line(line)
-    _provide(str(identity["variant"]), conf, home)
-    _train_again(conf, home.variants / str(identity["variant"]), repeated, now, original)
+    _provide(identity.variant, conf, home)
+    _train_again(conf, home.variants / identity.variant, repeated, now, original)
     return RerunResult(repeated, before, [*_differences(original, repeated)])
 
 
-def _read(original: CellFolder) -> tuple[Conf, dict[str, Any], dict[str, Any]]:
+def _read(original: CellFolder) -> tuple[Conf, Identity, dict[str, Any]]:
     """Return the cell's config, its identity, and what was added to the config.
 
     The config has the threads that the cell was trained with.
     """
-    if not original.folder.is_dir():
+    if not original.path.is_dir():
         raise XrgsError(f"rerun={original.path}: there is no such folder")
     for name in ("config.json", "identity.json", "provenance.json", "status.json"):
-        if not (original.folder / name).is_file():
+        if not (original.path / name).is_file():
             raise XrgsError(f"rerun={original.path} is not a finished cell: it has no {name}")
     state = original.state()
     if state.name == "unknown":
@@ -153,13 +155,8 @@ def _read(original: CellFolder) -> tuple[Conf, dict[str, Any], dict[str, Any]]:
     if state.name == "failed":
         reason = state.reason.partition("\n")[0]
         raise XrgsError(f"rerun={original.path}: the cell failed and has no results ({reason})")
-    conf, added = composing.from_file(original.folder / "config.json")
-    try:
-        identity, conf.threads = original.identity(), int(original.provenance()["threads"])
-    except (KeyError, OverflowError, TypeError, ValueError) as error:
-        raise XrgsError(f"{original.path}: identity.json or provenance.json: {error!r}") from error
-    if not _VARIANT.fullmatch(str(identity.get("variant"))):
-        raise XrgsError(f"{original.folder / 'identity.json'}: variant={identity.get('variant')}")
+    conf, added = composing.from_file(original.path / "config.json")
+    identity, conf.threads = original.identity(), original.provenance().threads
     return conf, identity, added
 
 
@@ -187,10 +184,7 @@ def _newer_keys(added: Mapping[str, Any]) -> Iterator[str]:
 
 
 def _own_contradictions(
-    original: CellFolder,
-    then: Mapping[str, Any],
-    now: Mapping[str, Any],
-    added: Mapping[str, Any],
+    original: CellFolder, then: Identity, now: Identity, added: Mapping[str, Any]
 ) -> Iterator[str]:
     """Yield contradictions between the folder's own files, which somebody must have changed.
 
@@ -200,33 +194,31 @@ def _own_contradictions(
     if state.name != "done":
         yield f"the folder: {state.name}: {state.reason}"
     named = original.id.partition(".")[0]
-    if _ID.fullmatch(named) and digest(then) != named:
-        yield f"the folder: identity.json is that of cell {digest(then)}, not of {named}"
-    not_in_config = {"arithmetic", "code", "protocol", "variant"}
+    if _ID.fullmatch(named) and cell_id(then) != named:
+        yield f"the folder: identity.json is that of cell {cell_id(then)}, not of {named}"
+    not_in_config = {"arithmetic", "code", "variant"}
     newer = {f"{key}: None -> {_short(value)}" for key, value in added.items()}
-    for line in _changes(_without(then, not_in_config), _without(now, not_in_config)):
+    before, after = (_without(msgspec.to_builtins(one), not_in_config) for one in (then, now))
+    for line in _changes(before, after):
         if line not in newer:
             yield f"identity.json against config.json: {line}"
 
 
-def _other_program(original: CellFolder, conf: Conf, now: Mapping[str, Any]) -> Iterator[str]:
+def _other_program(original: CellFolder, conf: Conf, now: Identity) -> Iterator[str]:
     """Yield differences of the program, its libraries and the machine."""
     then = original.identity()
-    if then.get("protocol") != now["protocol"]:
-        yield f"evaluation protocol: {then.get('protocol')} -> {now['protocol']}"
-    arithmetic = then.get("arithmetic", "not recorded")
-    if arithmetic != now["arithmetic"]:
-        yield f"arithmetic, which decides the last digits: {arithmetic} -> {now['arithmetic']}"
-    code = then.get("code") or {}
-    for file in sorted(code.keys() | now["code"].keys()):
-        if code.get(file) != now["code"].get(file):
-            change = "new" if file not in code else "changed" if file in now["code"] else "removed"
-            yield f"code: {file} ({change})"
+    if then.arithmetic != now.arithmetic:
+        change = f"{then.arithmetic} -> {now.arithmetic}"
+        yield f"arithmetic, which decides the last digits: {change}"
+    for part in sorted(then.code.keys() | now.code.keys()):
+        if then.code.get(part) != now.code.get(part):
+            yield f"code: {part}: {then.code.get(part)} -> {now.code.get(part)}"
     here = provenance.collect(conf.threads or usable_cores(), conf.splat.backend)
-    made_with = original.provenance()
-    new = here.keys() - made_with.keys()  # values that an older version did not record
-    told = {"started", "arithmetic"}
-    yield from _changes(_without(made_with, told), _without(here, told | new))
+    told = {"started", "arithmetic", "machines_in_turn"}
+    before, after = (
+        _without(msgspec.to_builtins(one), told) for one in (original.provenance(), here)
+    )
+    yield from _changes(before, after)
 
 
 def _without(values: Mapping[str, Any], names: set[str]) -> dict[str, Any]:
@@ -263,7 +255,7 @@ def _provide(variant_id: str, conf: Conf, store: Store) -> None:
         XrgsError: It is not, and building it again gives another variant; or its images were
             removed on purpose, and can't be made again.
     """
-    variants.restore(asdict(conf), store, variant_id)
+    variants.restore(conf, store, variant_id)
     if (store.variants / variant_id).is_dir():
         return
     log_line(f"variant {variant_id} is not in {store.path} and is built again")
@@ -286,7 +278,7 @@ def _provide(variant_id: str, conf: Conf, store: Store) -> None:
     )
 
 
-def _free_folder(out: Path | None, folder: Path) -> ConfinedPath:
+def _free_folder(out: Path | None, folder: Path) -> Path:
     """Return the folder to write to, which does not exist, in one that does.
 
     Raises:
@@ -294,71 +286,50 @@ def _free_folder(out: Path | None, folder: Path) -> ConfinedPath:
     """
     if out is None:
         beside = folder.resolve()
-        above = ConfinedPath(beside.parent)
-        names = (above / f"{beside.name}.rerun-{number}" for number in count(1))
+        names = (beside.with_name(f"{beside.name}.rerun-{number}") for number in count(1))
         return next(name for name in names if not name.exists())
-    above = ConfinedPath(out.absolute().parent)
-    above.make_root()
-    if (above / out.name).exists():
+    if out.exists():
         raise XrgsError(f"out={out} exists already")
-    return above / out.name
+    out.absolute().parent.mkdir(parents=True, exist_ok=True)
+    return out.absolute()
 
 
 def _train_again(
-    conf: Conf,
-    variant: ConfinedPath,
-    repeated: CellFolder,
-    identity: dict[str, Any],
-    original: CellFolder,
+    conf: Conf, variant: Path, repeated: CellFolder, identity: Identity, original: CellFolder
 ) -> None:
-    """Train like a sweep's cell, but without a lock: no other process writes to the folder."""
-    attempt = begin_attempt(repeated, asdict(conf), identity)
+    """Train like a sweep's cell, but without a lease: no other process writes to the folder."""
+    plan_cell(repeated, conf, identity)
+    begin_attempt(repeated)
     cell = PlannedCell(
         CellSpec("rerun", "", (), ()),
         conf,
         variant.name,
         identity,
         repeated.id,
-        seconds=_seconds(original),
+        seconds=original.summary().training_time_s,
     )
     try:
-        with SweepMonitor(repeated.folder.parent) as monitor:
+        with SweepMonitor(repeated.path.parent) as monitor:
             monitor.watch([cell])
-            worker.run_in_child("cell", worker.cell_request(asdict(conf), variant, attempt))
+            worker.run_in_child("cell", worker.cell_request(variant, repeated))
     except XrgsError as error:
-        attempt.fail(str(error))
-        raise XrgsError(f"{error} ({repeated.folder / 'log.txt'})") from error
-
-
-def _seconds(original: CellFolder) -> float | None:
-    try:
-        return float(_summary(original)["training_time_s"])
-    except (KeyError, TypeError, ValueError):
-        return None
-
-
-def _summary(cell: CellFolder) -> dict[str, Any]:
-    try:
-        return cell.summary()
-    except (StoreError, TypeError, ValueError):
-        return {}
+        repeated.fail(str(error))
+        raise XrgsError(f"{error} ({repeated.path / 'log.txt'})") from error
 
 
 def _differences(original: CellFolder, repeated: CellFolder) -> Iterator[str]:
     """Yield the differences of two cells' results, scores first."""
     yield from _score_differences(original, repeated)
-    summaries = _summary(original), _summary(repeated)
     for name in _COUNTS:
-        then, now = (summary.get(name) for summary in summaries)
+        then, now = (getattr(cell.summary(), name) for cell in (original, repeated))
         if then != now:
             yield f"{name}: {_number(then)} -> {_number(now)}"
     for name in _RESULTS:
-        then, now = original.folder / name, repeated.folder / name
-        kept = file_digest(then) if then.is_file() else None
-        digest_then = kept or original.trimmed().get(name, {}).get("sha256")
-        if digest_then is None:
+        status = original.status()
+        then = status.files.get(name) or status.trimmed.get(name)
+        if then is None:
             yield f"{name}: missing in {original.path}"
-        elif digest_then != file_digest(now):
+        elif then.sha256 != file_digest(repeated.path / name):
             yield f"{name}: the bytes differ"
 
 
@@ -380,12 +351,8 @@ def _score_differences(original: CellFolder, repeated: CellFolder) -> Iterator[s
 
 
 def _scores(cell: CellFolder) -> dict[tuple[str, str], float]:
-    """Return the scores by view and metric, NaN where one is missing; empty if unreadable."""
-    try:
-        scores = cell.view_scores()
-    except StoreError:
-        return {}
-    return {(view, name): value for view, row in scores for name, value in row.items()}
+    """Return the scores by view and metric, NaN where one is missing."""
+    return {(view, name): value for view, row in cell.view_scores() for name, value in row.items()}
 
 
 def _number(value: object) -> str:

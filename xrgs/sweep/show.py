@@ -4,11 +4,13 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
+import msgspec
+
 from xrgs.errors import StoreError
 from xrgs.evaluation.metrics import METRICS
-from xrgs.experiment.cell_folder import READING_ERRORS
 from xrgs.experiment.results import cell_columns, cell_metrics
-from xrgs.safeio.words import MAX_CELL, for_line
+from xrgs.safeio.files import walk_files
+from xrgs.safeio.sanitize import MAX_CELL, for_line
 from xrgs.sweep.inventory import age_text, size_text
 
 if TYPE_CHECKING:
@@ -55,10 +57,8 @@ def _head(cell: CellSummary) -> Iterator[str]:
     yield f"  {cell.state.name}{reason}, {age_text(cell.age_s())} ago, {size_text(cell.bytes())}"
     yield f"  variant {cell.variant_id}"
     yield f"  sweeps {', '.join(reversed(cell.names.sweeps)) or 'none'}"
-    if cell.old_code:
-        yield f"  trained with other code than is installed: {', '.join(cell.old_code)}"
-    elif cell.stale:
-        yield f"  other than here: {', '.join(cell.stale)}"
+    if cell.stale:
+        yield f"  trained with another program than is installed: {', '.join(cell.stale)}"
 
 
 def _difference_title(cell: CellSummary) -> str:
@@ -75,10 +75,10 @@ def _differences(store: Store, cell: CellSummary) -> Iterator[str]:
         yield "nothing: it is the baseline"
         return
     base = store.cell(base_id)
-    if not (base.folder / "config.json").exists():
+    if not (base.path / "config.json").exists():
         yield "(its baseline is not in this store)"
         return
-    then, now = (cell_columns(folder.folder, {}) for folder in (base, cell.folder))
+    then, now = (cell_columns(folder, None) for folder in (base, cell.folder))
     for key in sorted((then.keys() | now.keys()) - _NAMES):
         if then.get(key) != now.get(key):
             yield f"{key}: {_short(then.get(key))} -> {_short(now.get(key))}"
@@ -91,7 +91,7 @@ def _short(value: Any) -> str:
 def _scores(folder: CellFolder) -> Iterator[str]:
     try:
         metrics = cell_metrics(folder.summary(), folder.scores())
-    except READING_ERRORS:
+    except (StoreError, OSError):
         return  # a cell that is not done has none, and its state says why
     for metric in METRICS:
         if metric.name in metrics:
@@ -100,15 +100,15 @@ def _scores(folder: CellFolder) -> Iterator[str]:
 
 def _provenance(folder: CellFolder) -> Iterator[str]:
     try:
-        found = folder.provenance()
+        found = msgspec.structs.asdict(folder.provenance())
     except StoreError:
         return
-    yield from (f"{key}: {_short(found[key])}" for key in _PROVENANCE if key in found)
+    yield from (f"{key}: {_short(found[key])}" for key in _PROVENANCE if found[key])
 
 
 def _files(folder: CellFolder) -> Iterator[str]:
     try:
-        files = sorted(folder.folder.walk())
+        files = sorted(walk_files(folder.path))
     except OSError as error:
         yield f"{error.filename}: {error.strerror}"
         return
@@ -118,5 +118,6 @@ def _files(folder: CellFolder) -> Iterator[str]:
             yield f"{name}  {size_text(status.st_size)}"
     if renders:
         yield f"renders/  {len(renders)} files, {size_text(sum(renders))}"
-    if trimmed := folder.trimmed():
+    if folder.is_trimmed():
+        trimmed = folder.status().trimmed
         yield f"removed by xrgs-store trim: {len(trimmed)} files (Gaussians and renders)"

@@ -10,11 +10,11 @@ from typing import TYPE_CHECKING, TypeVar
 from xrgs.capture.failures import FAILED_PREFIX, failed_scenes
 from xrgs.errors import StoreError
 from xrgs.experiment.store import Store
+from xrgs.runtime import lease
+from xrgs.safeio.files import file_bytes, is_name
 from xrgs.safeio.records import list_folder
-from xrgs.safeio.untrusted import is_name
-from xrgs.safeio.words import MAX_CELL, counted, for_line
-from xrgs.sweep import locks
-from xrgs.sweep.inventory import STATES, CellNames, file_bytes, recorded_names, size_text, summarise
+from xrgs.safeio.sanitize import MAX_CELL, counted, for_line
+from xrgs.sweep.inventory import STATES, CellNames, recorded_names, size_text, summarise
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -65,7 +65,7 @@ def read(path: Path) -> StoreStatus:
         raise StoreError(f"store={path} is not a store; xrgs-sweep makes one")
     problems = _Problems()
     names, sweeps = _names(store, problems)
-    holders = locks.holders(store.locks)
+    holders = lease.holders(store.leases)
     cells = problems.unless(store.cell_folders) or []
     return StoreStatus(
         path=path,
@@ -109,7 +109,7 @@ def _variants(store: Store, problems: _Problems) -> list[str]:
     """Return the frozen variants: not those being built, and not the reports of failed ones."""
     names = [name for name in list_folder(store.variants) if "-" in name]
     names = [name for name in names if not name.startswith((".", FAILED_PREFIX))]
-    folders = set(store.variants.folders()) if names else set()
+    folders = {name for name in names if (store.variants / name).is_dir()}
     problems += [f"{store.variants}/{n}: not a folder" for n in names if n not in folders]
     return [name for name in names if name in folders]
 
@@ -121,8 +121,9 @@ def _failed_scenes(store: Store) -> list[tuple[str, str, str]]:
 
 
 def _sizes(store: Store, problems: _Problems) -> dict[str, int | None]:
-    names = problems.unless(store.folder.folders) or []
-    return {name: problems.unless(partial(file_bytes, store.folder / name)) for name in names}
+    names = problems.unless(lambda: list_folder(store.path)) or []
+    folders = [name for name in names if (store.path / name).is_dir()]
+    return {name: problems.unless(partial(file_bytes, store.path / name)) for name in folders}
 
 
 def _names(store: Store, problems: _Problems) -> tuple[dict[str, CellNames], int]:

@@ -26,13 +26,14 @@ from xrgs.composing import to_conf
 from xrgs.errors import StoreError, UnreadableError, XrgsError
 from xrgs.experiment.cell_folder import CellState
 from xrgs.experiment.store import Store
+from xrgs.runtime import lease
 from xrgs.runtime.machine import usable_cores
 from xrgs.runtime.progress import log_line
 from xrgs.runtime.streams import say
-from xrgs.safeio.confined import is_passing
+from xrgs.safeio.files import is_transient
 from xrgs.safeio.hashing import digest, to_plain
-from xrgs.safeio.words import for_line
-from xrgs.sweep import controls, launch, locks, lpips, presence, track, variants
+from xrgs.safeio.sanitize import for_line
+from xrgs.sweep import controls, launch, lpips, presence, track, variants
 from xrgs.sweep.axes import CellSpec, effective, expand
 from xrgs.sweep.checks import check
 from xrgs.sweep.estimate import CostEstimator
@@ -116,7 +117,7 @@ class Study:
             return str(error)
         if worker.unwritable(error):
             return f"store={self._config.store}: {error}. {worker.NOTHING_LOST}"
-        if is_passing(error):
+        if is_transient(error):
             return f"store={self._config.store}: {error}; run the same command again"
         raise error
 
@@ -239,7 +240,7 @@ class Study:
     def _identified(self, plan: Sequence[PlannedCell], store: Store) -> list[PlannedCell]:
         """Return the cells with their counts, identities and states, as far as they are known."""
         cells: dict[CellSpec, PlannedCell] = {}
-        holders = locks.holders(store.locks)
+        holders = lease.holders(store.leases)
         for known in plan:
             cell = identified(self._with_count(known, cells, store), store, holders)
             cells[cell.spec] = cell
@@ -253,7 +254,7 @@ class Study:
         if reference is None or reference.cell_id is None or reference.state.name != "done":
             return cell
         try:
-            count = store.cell(reference.cell_id).summary()["gaussians"]
+            count = store.cell(reference.cell_id).summary().gaussians
         except UnreadableError as error:
             return replace(cell, state=CellState("unknown", f"it can't be read now: {error}"))
         changes = (*cell.spec.changes, f"components.count_matched.gaussians={count}")
@@ -317,10 +318,8 @@ def _tidy(done: set[str], store: Store) -> None:
     with suppress(OSError):  # they disturb nobody, and the next sweep removes them
         for cell_id in done:
             store.cell(cell_id).drop_checkpoint()
-        for cell_id in done & locks.names(store.locks):
-            lock = locks.acquire(store.locks, cell_id)
-            if lock is not None:
-                lock.release()
+        for cell_id in done & lease.names(store.leases):
+            lease.free_if_dead(store.leases, cell_id)
 
 
 def _without_reference(cell: PlannedCell) -> PlannedCell:

@@ -13,21 +13,22 @@ import math
 import os
 from dataclasses import dataclass
 from importlib.util import find_spec
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
-from xrgs.errors import XrgsError
-from xrgs.experiment.cell_folder import READING_ERRORS
+from xrgs.errors import StoreError, XrgsError
 from xrgs.runtime.progress import log_line, progress
 from xrgs.safeio.atomic import atomic_writer
+from xrgs.safeio.files import remove_path
 from xrgs.safeio.records import as_number, read_table
-from xrgs.safeio.words import for_csv, for_file_name, for_line
+from xrgs.safeio.sanitize import for_csv, for_file_name, for_line
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Mapping
+    from pathlib import Path
 
     from xrgs.experiment.cell_folder import CellFolder
+    from xrgs.experiment.schema import RecordedCell
     from xrgs.experiment.store import Store
-    from xrgs.safeio.confined import ConfinedPath
 
 #: The folder of a store that has what is written here.
 FOLDER = "tracking"
@@ -95,9 +96,9 @@ def track(kind: str, store: Store, sweep_id: str) -> None:
     """
     if kind == "none":
         return
-    folder = store.folder / FOLDER
+    folder = store.path / FOLDER
     try:
-        folder.make_folder()
+        folder.mkdir(exist_ok=True)
         where = _WRITERS[kind](_runs(store, sweep_id), folder, sweep_id)
     except Exception as error:  # of a package, a server or a disk: no cell may fail by it
         log_line(f"track={kind}: {type(error).__name__}: {error}; the cells are in the store")
@@ -105,7 +106,7 @@ def track(kind: str, store: Store, sweep_id: str) -> None:
         log_line(f"track={kind}: {where}")
 
 
-def run_of(cell: CellFolder, names: Mapping[str, Any]) -> Run:
+def run_of(cell: CellFolder, names: RecordedCell) -> Run:
     """Read what is written of a finished cell.
 
     Args:
@@ -118,23 +119,23 @@ def run_of(cell: CellFolder, names: Mapping[str, Any]) -> Run:
     """
     from xrgs.experiment.results import cell_columns, cell_metrics  # pandas is slow to load
 
-    points = _points(cell.folder / "history.csv", "history")
-    if (cell.folder / "quality.csv").is_file():
-        points += _points(cell.folder / "quality.csv", "quality")
+    points = _points(cell.path / "history.csv", "history")
+    if (cell.path / "quality.csv").is_file():
+        points += _points(cell.path / "quality.csv", "quality")
     summary = cell.summary()
-    steps = int(as_number(summary["steps"]))
+    steps = summary.steps
     scores = cell_metrics(summary, cell.scores())
     points += [Point(f"score/{name}", steps, value) for name, value in scores.items()]
-    config = {key: value for key, value in cell_columns(cell.folder, {}).items() if "." in key}
+    config = {key: value for key, value in cell_columns(cell, None).items() if "." in key}
     return Run(
         cell.id,
-        {key: names[key] for key in _NAMES},
+        {key: getattr(names, key) for key in _NAMES},
         {k: v if isinstance(v, (str, float, int)) else str(v) for k, v in config.items()},
         tuple(point for point in points if not math.isnan(point.value)),
     )
 
 
-def _points(file: ConfinedPath, group: str) -> list[Point]:
+def _points(file: Path, group: str) -> list[Point]:
     """Return the numbers of a table with a column `step`."""
     header, rows = read_table(file)
     table = [dict(zip(header, row, strict=True)) for row in rows]
@@ -148,17 +149,17 @@ def _points(file: ConfinedPath, group: str) -> list[Point]:
 
 def _runs(store: Store, sweep_id: str) -> Iterator[Run]:
     """Yield the finished cells of a sweep, each once; one that can't be read is named."""
-    rows = {row["cell_id"]: row for row in store.sweep_record(sweep_id)["cells"]}
+    rows = {row.cell_id: row for row in store.sweep_record(sweep_id).cells}
     for cell_id, row in progress(rows.items(), "tracking", "cell", len(rows)):
         if cell_id is None or store.cell(cell_id).state(verify=False).name != "done":
             continue
         try:
             yield run_of(store.cell(cell_id), row)
-        except READING_ERRORS as error:
+        except (StoreError, OSError, ValueError) as error:
             log_line(f"{cell_id}: it is left out of what is tracked: {error}")
 
 
-def _to_csv(runs: Iterable[Run], folder: ConfinedPath, sweep_id: str) -> str:
+def _to_csv(runs: Iterable[Run], folder: Path, sweep_id: str) -> str:
     """Write one row for each value of each cell."""
     file = folder / f"{sweep_id}.csv"
     with atomic_writer(file) as stream:
@@ -172,17 +173,17 @@ def _to_csv(runs: Iterable[Run], folder: ConfinedPath, sweep_id: str) -> str:
     return str(file)
 
 
-def _to_tensorboard(runs: Iterable[Run], folder: ConfinedPath, _: str) -> str:
+def _to_tensorboard(runs: Iterable[Run], folder: Path, _: str) -> str:
     """Write a folder of events for each cell; one that is there already is left alone."""
     home = folder / "tensorboard"
-    home.make_folder()
+    home.mkdir(exist_ok=True)
     for run in runs:
         done, new = home / run.name, home / f".{run.name}.new"
         if done.exists():
             continue
-        new.remove()
-        new.make_folder()
-        _write_events(run, str(new.path))
+        remove_path(new)
+        new.mkdir(exist_ok=True)
+        _write_events(run, str(new))
         new.rename(done)
     return f"tensorboard --logdir {home}"
 
@@ -209,7 +210,7 @@ def _write_events(run: Run, folder: str) -> None:
     writer.close()
 
 
-def _to_mlflow(runs: Iterable[Run], folder: ConfinedPath, sweep_id: str) -> str:
+def _to_mlflow(runs: Iterable[Run], folder: Path, sweep_id: str) -> str:
     """Log a run for each cell, on the server that the environment names or in the store."""
     from mlflow import MlflowClient
     from mlflow.entities import Metric, Param
@@ -217,7 +218,7 @@ def _to_mlflow(runs: Iterable[Run], folder: ConfinedPath, sweep_id: str) -> str:
     file = folder / "mlflow.db"
     if file.exists() and not file.is_file():  # SQLite would follow a link out of the store
         raise XrgsError(f"{file} is not a regular file")
-    uri = os.environ.get(_SERVER) or f"sqlite:///{file.path.absolute()}"
+    uri = os.environ.get(_SERVER) or f"sqlite:///{file.absolute()}"
     client = MlflowClient(uri)
     found = client.get_experiment_by_name(_EXPERIMENT)
     experiment = found.experiment_id if found else client.create_experiment(_EXPERIMENT)

@@ -3,21 +3,19 @@
 from __future__ import annotations
 
 from dataclasses import asdict, dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from xrgs.capture import images, scenes, variant
 from xrgs.capture.scenes import folder
 from xrgs.errors import StoreError, UnreadableError, XrgsError
 from xrgs.experiment import trimming
 from xrgs.runtime.progress import log_line
-from xrgs.safeio.confined import is_passing
+from xrgs.safeio.files import is_transient
 from xrgs.sweep import presence
 from xrgs.sweep.jobs import worker
 from xrgs.sweep.jobs.supervise import Limits
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
-
     from xrgs.config import Conf
     from xrgs.experiment.store import Store
 
@@ -71,12 +69,11 @@ def build(conf: Conf, store: Store) -> str:
     return str(answer["variant"])
 
 
-def restore(conf: Mapping[str, Any], store: Store, variant_id: str) -> None:
+def restore(conf: Conf, store: Store, variant_id: str) -> None:
     """Make the images of a trimmed variant again, in a process of its own.
 
     Args:
-        conf: The config of a cell of the variant, as plain JSON values; only its scene and its
-            variant are read.
+        conf: The config of a cell of the variant; only its scene and its variant are read.
         store: The store.
         variant_id: The variant's id; one that is not trimmed is left as it is.
 
@@ -89,7 +86,7 @@ def restore(conf: Mapping[str, Any], store: Store, variant_id: str) -> None:
     if not trimming.trimmed_folder(store.variants, variant_id).is_dir():
         return
     log_line(f"variant {variant_id}: making the images again that xrgs-store trim has removed")
-    request = {"conf": dict(conf), "store": str(store.path), "variant": variant_id}
+    request = {"conf": asdict(conf), "store": str(store.path), "variant": variant_id}
     worker.run_in_child("restore", request, Limits(), lambda _: presence.check(store))
 
 
@@ -132,7 +129,7 @@ def plan(conf: Conf, store: Store, *, allow_build: bool) -> PlannedVariant:
     except UnreadableError as error:
         reason = str(error)
     except OSError as error:
-        if not is_passing(error):
+        if not is_transient(error):
             raise
         reason = str(error)
     return PlannedVariant(unknown=f"its variant can't be read now: {reason}")

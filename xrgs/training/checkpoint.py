@@ -18,9 +18,8 @@ import numpy as np
 import torch
 
 from xrgs.errors import XrgsError
-from xrgs.safeio import npz, untrusted
+from xrgs.safeio import npz
 from xrgs.safeio.atomic import atomic_writer
-from xrgs.safeio.confined import ConfinedPath, ReplacedError, confined
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -63,9 +62,7 @@ class Stateful(Protocol):
 class Checkpoint:
     """Writes the state of the registered objects to a file every so often, and restores it."""
 
-    def __init__(
-        self, file: Path | ConfinedPath | None = None, cell_id: str = "", every_s: float = 0.0
-    ) -> None:
+    def __init__(self, file: Path | None = None, cell_id: str = "", every_s: float = 0.0) -> None:
         """Set where and how often the state is written.
 
         Args:
@@ -73,7 +70,7 @@ class Checkpoint:
             cell_id: The cell whose state it is. The file of another cell is refused.
             every_s: Seconds between two writes; 0 never writes.
         """
-        self.file = None if file is None else confined(file)
+        self.file = file
         self.cell_id = cell_id
         self.every_s = every_s
         self._objects: dict[str, Stateful] = {}
@@ -105,21 +102,21 @@ class Checkpoint:
         return steps
 
     def register(self, **objects: Stateful) -> None:
-        """Add objects whose state is to be written; they replace those of the same name.
+        """Add objects whose state is written; they replace objects of the same names.
 
-        The first object registered under a name takes over the state that `load` has read for it.
+        The objects take over the states that `load` has read, in their order.
 
         Args:
-            objects: Each by the name of its state in the file. They are restored in their order.
+            objects: Each by the name of its state in the file.
 
         Raises:
-            CheckpointError: A state does not fit its object. The objects may be half restored, and
-                must not be used.
+            CheckpointError: A state is missing or does not fit its object. The objects may be half
+                restored, and must not be used.
         """
         self._objects |= objects
+        if not self._loaded:
+            return
         for name, value in objects.items():
-            if name not in self._loaded:
-                continue
             try:
                 value.load_state_dict(self._loaded.pop(name))
             except (KeyError, TypeError, ValueError, AttributeError, RuntimeError) as error:
@@ -137,9 +134,6 @@ class Checkpoint:
 
         Returns:
             The seconds that it took.
-
-        Raises:
-            ReplacedError: Another process has begun the run again, in another folder.
         """
         start = time.monotonic()
         if self.file is None or self.every_s <= 0 or start - self._written_at < self.every_s:
@@ -147,8 +141,6 @@ class Checkpoint:
         states = {name: value.state_dict() for name, value in self._objects.items()}
         try:
             _save(self.file, {"cell": self.cell_id, "steps": step + 1, "states": states})
-        except ReplacedError:
-            raise
         except OSError as error:
             _log.warning(
                 "%s: no checkpoint was written after step %d (%s); training continues",
@@ -166,7 +158,7 @@ class Checkpoint:
             self.file.rename(self.file.with_name(f"refused-{self.file.name}"))
 
 
-def _save(file: ConfinedPath, state: State) -> None:
+def _save(file: Path, state: State) -> None:
     arrays: dict[str, NDArray[Any]] = {}
     text = json.dumps(_split_off_tensors(state, "", arrays))
     arrays[_JSON_MEMBER] = np.frombuffer(text.encode(), np.uint8)
@@ -189,10 +181,10 @@ def _split_off_tensors(state: State, path: str, arrays: dict[str, NDArray[Any]])
     return plain
 
 
-def _load(file: ConfinedPath) -> State:
-    with file.open() as stream:
+def _load(file: Path) -> State:
+    with file.open("rb") as stream:
         arrays = npz.read(stream)
-    state: State = untrusted.parse_json(arrays.pop(_JSON_MEMBER).tobytes())
+    state: State = json.loads(arrays.pop(_JSON_MEMBER).tobytes())
     _put_back_tensors(state, arrays)
     return state
 

@@ -1,11 +1,11 @@
 """Components of other installed packages, found by their entry points.
 
 A package offers a component by an entry point in the group `xrgs.components`; its name is the key
-under `components.plugins` of the config. Finding a plugin and hashing its source, which its cells'
-identities contain, execute none of its code. Only `load` does, and training calls it only for the
-names in the config of the cell that it trains. The config comes from the user's command line and
-files; a config that is read from a store is used for training again only where the user has named
-its plugins (`xrgs.sweep.rerun`). So a store from elsewhere never makes xrgs import a package.
+under `components.plugins` of the config. To find a plugin and to hash its source for identities
+executes none of its code. `load` does; training calls it for the names in the config of its cell
+alone. The config comes from the user's command line and files; a config from a store is trained
+again only if the user has named its plugins (`xrgs.sweep.rerun`). So a store from elsewhere never
+makes xrgs import a package.
 
 This module does not import torch, so that planning and reporting can use it.
 """
@@ -20,7 +20,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar, get_type_hints
 
 from xrgs.errors import XrgsError
-from xrgs.safeio.hashing import digest, file_digest
+from xrgs.safeio.code import digest_files
+from xrgs.safeio.hashing import digest
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping
@@ -65,19 +66,15 @@ def find(name: str) -> EntryPoint:
     return points[0]
 
 
-def source_digests(name: str) -> dict[str, str]:
-    """Hash the source of a plugin, without importing its package.
+def code_digest(name: str) -> str:
+    """Return a digest of a plugin's source, without importing its package.
 
-    The files are read anew at each call. The hashes cover the entry point's value and every file of
-    the package that it names (or of the module, where that is a single file) but bytecode and
-    hidden files. What the package imports from other packages is not covered.
+    It covers the entry point's value and every file of the package that the entry point names (or
+    of the module, where that is a single file) but bytecode and hidden files. What the package
+    imports from other packages is not covered.
 
     Args:
         name: The name of the plugin.
-
-    Returns:
-        SHA-256 of each file by `plugins/<name>/<path from the folder of the package>`, and a digest
-        of the entry point's value by `plugins/<name>`.
 
     Raises:
         XrgsError: The plugin is not installed, or has no source file.
@@ -89,28 +86,11 @@ def source_digests(name: str) -> dict[str, str]:
             f"components.plugins.{name}: the entry point {point.value} names no module whose files"
             " can be hashed for the identity of cells; install the package again"
         )
-    files = _package_files(origin.parent) if origin.stem == "__init__" else [origin]
-    base = origin.parent.parent if origin.stem == "__init__" else origin.parent
-    digests = {f"plugins/{name}": digest(point.value)}
-    for file in files:
-        digests[f"plugins/{name}/{file.relative_to(base).as_posix()}"] = file_digest(file)
-    return digests
-
-
-def digests_now(code: Mapping[str, str]) -> dict[str, str]:
-    """Hash the installed source of the plugins that the `code` of an identity contains.
-
-    Args:
-        code: The `code` of an identity, from a store of any origin.
-
-    Returns:
-        As `source_digests`; a plugin that is not installed any more adds nothing.
-    """
-    names = {key.removeprefix("plugins/") for key in code if key.startswith("plugins/")}
-    digests: dict[str, str] = {}
-    for name in names & set(installed()):
-        digests |= source_digests(name)
-    return digests
+    is_package = origin.stem == "__init__"
+    base = origin.parent.parent if is_package else origin.parent
+    files = _package_files(origin.parent) if is_package else [origin]
+    found = {file.relative_to(base).as_posix(): file for file in files}
+    return digest([point.value, digest_files(found)])
 
 
 def load(name: str) -> object:

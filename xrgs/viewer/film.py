@@ -16,7 +16,7 @@ from PIL import Image, ImageDraw, ImageFont
 from xrgs.errors import XrgsError
 from xrgs.runtime.progress import progress
 from xrgs.safeio.atomic import atomic_writer
-from xrgs.safeio.confined import ConfinedPath
+from xrgs.safeio.files import list_names
 from xrgs.splat.cameras import Camera
 from xrgs.splat.rendering import rasterize
 from xrgs.viewer.models import reference
@@ -160,7 +160,7 @@ def _write_film(frames: Iterable[Frame], out: Path, fps: int) -> None:
     """Encode frames as H.264 in an MP4 file, which appears when it is complete."""
     import av
 
-    ConfinedPath(out).make_parent()
+    out.parent.mkdir(parents=True, exist_ok=True)
     with atomic_writer(out) as stream, av.open(stream, "w", format="mp4") as container:
         video: Any = container.add_stream("libx264", rate=fps, options={"crf": _CRF})
         video.pix_fmt = "yuv420p"  # what browsers and players show
@@ -173,9 +173,9 @@ def _write_film(frames: Iterable[Frame], out: Path, fps: int) -> None:
 
 def _write_pngs(frames: Iterable[Frame], out: Path, _: int) -> None:
     """Write `0000.png` and so on into a folder that is new or empty."""
-    folder = ConfinedPath(out)
-    folder.make_root()
-    if folder.names():
+    folder = out
+    folder.mkdir(parents=True, exist_ok=True)
+    if list_names(folder):
         raise XrgsError(f"out={out}: the folder is not empty; name a new one")
     for number, frame in enumerate(frames):
         with atomic_writer(folder / f"{number:04}.png", durable=False) as stream:

@@ -9,8 +9,7 @@ import numpy as np
 
 from xrgs.errors import StoreError, XrgsError
 from xrgs.safeio.paths import user_path
-from xrgs.safeio.records import MAX_NUMBER, read_object
-from xrgs.safeio.words import for_line
+from xrgs.safeio.sanitize import for_line
 from xrgs.splat.ply import load_ply
 from xrgs.splat.settings import RasterSettings
 from xrgs.viewer.paths import Poses
@@ -113,49 +112,6 @@ def find_cell(word: str, store: Store) -> CellFolder:
     return cell
 
 
-def raster_settings(cell: CellFolder) -> RasterSettings:
-    """Return how a cell's Gaussians become pixels.
-
-    Only this part of its config is read, so that cells of other versions can be looked at.
-
-    Args:
-        cell: The cell.
-
-    Raises:
-        StoreError: `config.json` can't be read, or has no such settings; the message names it.
-    """
-    file, default = cell.folder / "config.json", vars(RasterSettings())
-    try:
-        stored = read_object(file)["splat"]["raster"]
-        wrong = [
-            name
-            for name, value in stored.items()
-            if name in default and not _is_like(value, default[name])
-        ]
-        known = {name: stored[name] for name in default if name in stored}
-    except (AttributeError, KeyError, TypeError) as error:
-        raise StoreError(f"{file}: it has no settings splat.raster") from error
-    if wrong:
-        raise StoreError(f"{file}: splat.raster.{wrong[0]} is of a wrong type")
-    if "background" in known:
-        known["background"] = tuple(known["background"])
-    return RasterSettings(**known)
-
-
-def _is_like(value: object, default: object) -> bool:
-    """Return whether a value of JSON can stand in the place of a default."""
-    if isinstance(default, tuple):
-        return (
-            isinstance(value, list)
-            and len(value) == len(default)
-            and all(map(_is_like, value, default))
-        )
-    if isinstance(default, bool) or isinstance(value, bool) or not isinstance(value, (int, float)):
-        return type(value) is type(default)
-    is_kind = isinstance(default, float) or isinstance(value, int)
-    return is_kind and abs(value) <= MAX_NUMBER
-
-
 def _load(word: str, store: Store) -> Model:
     if word.lower().endswith(_PLY):
         file = user_path(word)
@@ -168,13 +124,13 @@ def _load(word: str, store: Store) -> Model:
         np.stack([view.camera.viewmat.double().numpy() for view in of]) for of in (train, test)
     ]
     poses = Poses(viewmats[0], viewmats[1], data.points.double().numpy())
-    names = store.cell_names().get(cell.id, {})
-    label = " ".join(filter(None, (names.get("label"), names.get("condition"))))
+    names = store.cell_names().get(cell.id)
+    label = f"{names.label} {names.condition}".rstrip() if names else ""
     return Model(
         for_line(f"{label or 'cell'} {cell.id[:8]}", _MAX_NAME),
         cell.gaussians(),
-        raster_settings(cell),
+        cell.config().splat.raster,
         (*train, *test),
         poses,
-        str(cell.identity()["variant"]),
+        cell.identity().variant,
     )

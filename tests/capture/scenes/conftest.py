@@ -22,6 +22,6 @@ def fill() -> Callable[..., SceneConf]:
         for name in names:
             pixels = rng.integers(0, 255, (size[1], size[0], 3), dtype=np.uint8)
             Image.fromarray(pixels).save(folder / name)
-        return SceneConf("", "folder", str(folder))
+        return SceneConf(name="", kind="folder", path=str(folder), views=24)
 
     return filled

@@ -29,7 +29,9 @@ def test_an_llff_scene_gives_the_smallest_copies_that_suffice(
         fill(tmp_path / folder, "a.png", "b.png", size=(size, size * 3 // 4))
     (tmp_path / "poses_bounds.npy").write_bytes(b"never read")
     scene = scenes.resolve(
-        SceneConf("fern", "folder", str(tmp_path)), ConfinedPath(tmp_path), long_side
+        SceneConf(name="fern", kind="folder", path=str(tmp_path), views=24),
+        ConfinedPath(tmp_path),
+        long_side,
     )
     assert images.size(next(iter(scene.files.values())))[0] == width
 
@@ -40,7 +42,11 @@ def test_copies_are_measured_by_their_largest_photograph(fill: Fill, tmp_path: P
     fill(tmp_path / "images_4", "a.png", size=(60, 45))
     fill(tmp_path / "images_4", "b.png", size=(100, 75))
     (tmp_path / "images_4" / "c.png").write_text("no image")
-    scene = scenes.resolve(SceneConf("x", "folder", str(tmp_path)), ConfinedPath(tmp_path), 100)
+    scene = scenes.resolve(
+        SceneConf(name="x", kind="folder", path=str(tmp_path), views=24),
+        ConfinedPath(tmp_path),
+        100,
+    )
     assert next(iter(scene.files.values())).path.parent.name == "images_4"
 
 
@@ -69,9 +75,14 @@ def test_a_folder_without_a_scene_is_refused(
 
 def test_a_missing_folder_or_path_names_the_key(tmp_path: Path) -> None:
     with pytest.raises(XrgsError, match=r"scene\.path=.*nowhere: no such folder"):
-        scenes.resolve(SceneConf("x", "folder", str(tmp_path / "nowhere")), ConfinedPath(tmp_path))
+        scenes.resolve(
+            SceneConf(name="x", kind="folder", path=str(tmp_path / "nowhere"), views=24),
+            ConfinedPath(tmp_path),
+        )
     with pytest.raises(XrgsError, match=r"scene\.path is empty"):
-        scenes.resolve(SceneConf("x", "folder", None), ConfinedPath(tmp_path))
+        scenes.resolve(
+            SceneConf(name="x", kind="folder", path=None, views=24), ConfinedPath(tmp_path)
+        )
 
 
 def test_what_is_no_regular_file_is_left_out_with_a_warning(
@@ -98,7 +109,10 @@ def test_a_link_to_a_photograph_is_one(fill: Fill, tmp_path: Path) -> None:
     (tmp_path / "x").mkdir()
     for name in ("a.png", "b.png"):
         (tmp_path / "x" / name).symlink_to(tmp_path / "originals" / name)
-    scene = scenes.resolve(SceneConf("", "folder", str(tmp_path / "x")), ConfinedPath(tmp_path))
+    scene = scenes.resolve(
+        SceneConf(name="", kind="folder", path=str(tmp_path / "x"), views=24),
+        ConfinedPath(tmp_path),
+    )
     assert [images.read(file).shape for file in scene.files.values()] == [(30, 40, 3)] * 2
 
 
@@ -126,12 +140,12 @@ def test_all_folders_below_are_taken_where_the_path_asks_for_them(
     fill(tmp_path / "x" / "day" / "one", "a.png")
     fill(tmp_path / "x" / ".cache", "z.png")
     (tmp_path / "x" / "loop").symlink_to(tmp_path / "x")
-    flat = SceneConf("", "folder", str(tmp_path / "x"))
+    flat = SceneConf(name="", kind="folder", path=str(tmp_path / "x"), views=24)
     assert list(scenes.resolve(flat, ConfinedPath(tmp_path)).files) == ["a", "b"]
     assert "images left out: 1 in day/one" in caplog.text
     assert f"scene.path={tmp_path / 'x'}/** takes those of all folders" in caplog.text
     caplog.clear()
-    nested = SceneConf("", "folder", f"{tmp_path / 'x'}/**")
+    nested = SceneConf(name="", kind="folder", path=f"{tmp_path / 'x'}/**", views=24)
     scene = scenes.resolve(nested, ConfinedPath(tmp_path))
     assert {n: f.path.relative_to(tmp_path / "x").as_posix() for n, f in scene.files.items()} == {
         "a": "a.png",
@@ -145,14 +159,14 @@ def test_all_folders_below_are_taken_where_the_path_asks_for_them(
 def test_a_folder_of_folders_says_how_to_read_them(fill: Fill, tmp_path: Path) -> None:
     fill(tmp_path / "x" / "one", "a.png", "b.png")
     with pytest.raises(XrgsError, match=r"no image in it.*images left out: 2 in one .*/\*\* takes"):
-        scenes.fingerprint(SceneConf("", "folder", str(tmp_path / "x")))
+        scenes.fingerprint(SceneConf(name="", kind="folder", path=str(tmp_path / "x"), views=24))
 
 
 def test_names_that_nested_folders_share_are_refused(fill: Fill, tmp_path: Path) -> None:
     fill(tmp_path / "x" / "a_b", "c.png")
     fill(tmp_path / "x" / "a", "b_c.png")
     with pytest.raises(XrgsError, match=r"two images of one name"):
-        scenes.fingerprint(SceneConf("", "folder", f"{tmp_path / 'x'}/**"))
+        scenes.fingerprint(SceneConf(name="", kind="folder", path=f"{tmp_path / 'x'}/**", views=24))
 
 
 def test_what_is_not_read_is_named(
@@ -169,7 +183,7 @@ def test_what_is_not_read_is_named(
     fill(tmp_path / "y" / "one", "a.png", "b.png")
     (tmp_path / "y" / "films").mkdir()
     (tmp_path / "y" / "films" / "e.mp4").write_bytes(b"content")
-    scenes.fingerprint(SceneConf("", "folder", f"{tmp_path / 'y'}/**"))
+    scenes.fingerprint(SceneConf(name="", kind="folder", path=f"{tmp_path / 'y'}/**", views=24))
     assert "films/e.mp4" in caplog.text
 
 

@@ -16,7 +16,9 @@ from xrgs.safeio.confined import ConfinedPath
 
 def test_the_motorcycle_calibration_fits_its_disparity(tmp_path: Path) -> None:
     """With depth = baseline f / (disparity + cx_right - cx_left), left pixels reproject right."""
-    scene = scenes.resolve(SceneConf("motorcycle", "motorcycle"), ConfinedPath(tmp_path))
+    scene = scenes.resolve(
+        SceneConf(name="motorcycle", kind="motorcycle", path=None, views=24), ConfinedPath(tmp_path)
+    )
     assert list(scene.files) == ["motorcycle_left", "motorcycle_right"]
     assert images.size(next(iter(scene.files.values()))) == (741, 500)
     disparity = np.load(bundled_photograph("motorcycle_disp.npz"))["arr_0"]

@@ -19,7 +19,7 @@ from xrgs.errors import XrgsError
 from xrgs.safeio.confined import ConfinedPath
 
 Fill = Callable[..., SceneConf]
-PROCEDURAL = SceneConf("procedural", "procedural", None, 3)
+PROCEDURAL = SceneConf(name="procedural", kind="procedural", path=None, views=3)
 
 
 def stems(scene: scenes.Scene) -> list[str]:
@@ -59,7 +59,9 @@ def test_the_fingerprint_follows_names_and_bytes_alone(fill: Fill, tmp_path: Pat
 
 def test_an_unknown_kind_names_the_key(tmp_path: Path) -> None:
     with pytest.raises(XrgsError, match=r"scene\.kind=llff: unknown; must be one of procedural"):
-        scenes.resolve(SceneConf("x", "llff", str(tmp_path)), ConfinedPath(tmp_path))
+        scenes.resolve(
+            SceneConf(name="x", kind="llff", path=str(tmp_path), views=24), ConfinedPath(tmp_path)
+        )
 
 
 def test_the_procedural_scene_is_rendered_once(tmp_path: Path) -> None:
@@ -86,10 +88,21 @@ def test_other_images_do_not_become_the_procedural_scene(
 
 
 def test_a_label_is_one_printable_line(tmp_path: Path) -> None:
-    assert scenes.label(SceneConf("a\n\x1b[31mb", "procedural")) == "a  [31mb"
-    assert scenes.label(SceneConf("\n", "procedural")) == "procedural"
-    assert scenes.label(SceneConf("", "folder", str(tmp_path / "a\tb"))) == "a b"
-    assert len(scenes.label(SceneConf("x" * 9_999, "procedural"))) == 200
+    assert (
+        scenes.label(SceneConf(name="a\n\x1b[31mb", kind="procedural", path=None, views=24))
+        == "a  [31mb"
+    )
+    assert (
+        scenes.label(SceneConf(name="\n", kind="procedural", path=None, views=24)) == "procedural"
+    )
+    assert (
+        scenes.label(SceneConf(name="", kind="folder", path=str(tmp_path / "a\tb"), views=24))
+        == "a b"
+    )
+    assert (
+        len(scenes.label(SceneConf(name="x" * 9_999, kind="procedural", path=None, views=24)))
+        == 200
+    )
 
 
 def test_two_processes_that_render_at_once_get_one_complete_scene(tmp_path: Path) -> None:
@@ -107,7 +120,9 @@ def test_size_and_number_of_views_are_in_the_fingerprint() -> None:
         scenes.fingerprint(PROCEDURAL, 60),
         scenes.fingerprint(PROCEDURAL, 64),
         scenes.fingerprint(replace(PROCEDURAL, views=4), 60),
-        scenes.fingerprint(SceneConf("motorcycle", "motorcycle"), 60),
+        scenes.fingerprint(
+            SceneConf(name="motorcycle", kind="motorcycle", path=None, views=24), 60
+        ),
     }
     assert len(marks) == 4
     full = scenes.fingerprint(PROCEDURAL, procedural.FULL_SIDE)
@@ -122,8 +137,8 @@ def test_one_view_is_too_few(tmp_path: Path) -> None:
 def test_fingerprints_need_neither_torch_nor_scikit_image() -> None:
     script = (
         "import sys; from xrgs.capture import scenes; from xrgs.config import SceneConf;"
-        "scenes.fingerprint(SceneConf('p', 'procedural', views=24), 100);"
-        "scenes.fingerprint(SceneConf('m', 'motorcycle'));"
+        "scenes.fingerprint(SceneConf(name='p', kind='procedural', path=None, views=24), 100);"
+        "scenes.fingerprint(SceneConf(name='m', kind='motorcycle', path=None, views=24));"
         "print(sorted({'torch', 'skimage', 'pycolmap'} & set(sys.modules)))"
     )
     done = subprocess.run(
@@ -137,7 +152,9 @@ def test_folders_called_images_have_the_name_of_the_folder_around_them(tmp_path:
         (tmp_path / path).mkdir(parents=True)
 
     def confs(*paths: str) -> list[SceneConf]:
-        return [SceneConf("", "folder", str(tmp_path / path)) for path in paths]
+        return [
+            SceneConf(name="", kind="folder", path=str(tmp_path / path), views=24) for path in paths
+        ]
 
     assert [scenes.label(conf) for conf in confs("pa/images", "pb/images")] == ["pa", "pb"]
     scenes.check_labels(confs("pa/images", "pb/images", "pa/images"))

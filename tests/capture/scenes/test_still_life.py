@@ -23,7 +23,7 @@ def test_every_pixel_shows_a_solid() -> None:
 
 
 def test_the_same_scene_is_rendered_to_the_same_bytes(tmp_path: Path) -> None:
-    conf = SceneConf("procedural", "procedural", None, 3)
+    conf = SceneConf(name="procedural", kind="procedural", path=None, views=3)
     a = scenes.resolve(conf, ConfinedPath(tmp_path) / "a", 60)
     b = scenes.resolve(conf, ConfinedPath(tmp_path) / "b", 60)
     assert [f.read_bytes() for f in a.files.values()] == [f.read_bytes() for f in b.files.values()]

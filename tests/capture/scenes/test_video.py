@@ -42,7 +42,7 @@ def write_video(file: Path, frames: Sequence[NDArray[np.uint8]]) -> None:
 
 
 def conf(file: Path, views: int) -> SceneConf:
-    return SceneConf("", "video", str(file), views)
+    return SceneConf(name="", kind="video", path=str(file), views=views)
 
 
 def test_the_sharpest_frame_of_each_part_is_taken(tmp_path: Path) -> None:
@@ -92,7 +92,9 @@ def test_too_few_frames_no_video_and_no_package_are_named(
     with pytest.raises(XrgsError, match=r"scene\.path=.*gone\.mp4: No such file"):
         scenes.fingerprint(conf(tmp_path / "gone.mp4", 2))
     with pytest.raises(XrgsError, match=r"not a folder; .*scene=video"):
-        scenes.fingerprint(SceneConf("", "folder", str(tmp_path / "a.mp4")))
+        scenes.fingerprint(
+            SceneConf(name="", kind="folder", path=str(tmp_path / "a.mp4"), views=24)
+        )
     monkeypatch.setattr(video, "find_spec", lambda _: None)
     with pytest.raises(XrgsError, match=r"pip install 'xrgs\[video\]'"):
         scenes.fingerprint(conf(tmp_path / "a.mp4", 2))

@@ -14,7 +14,7 @@ from xrgs.evaluation import protocol
 from xrgs.safeio.confined import ConfinedPath
 from xrgs.splat.cameras import Camera
 from xrgs.splat.gaussians import Gaussians
-from xrgs.splat.rasterize import rasterize_parameters
+from xrgs.splat.rendering import rasterize_parameters
 from xrgs.splat.settings import RasterSettings
 
 SIZE = 31

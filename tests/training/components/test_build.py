@@ -6,6 +6,8 @@ import dataclasses
 import subprocess
 import sys
 from collections.abc import Callable, Mapping
+from functools import partial
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -13,21 +15,26 @@ import torch
 from torch import Tensor
 
 from xrgs.capture.dataset import LoadedView
-from xrgs.config import ComponentsConf, DensifyConf
+from xrgs.config import ComponentsConf, DensifyConf, identity_values, is_on
 from xrgs.errors import XrgsError
 from xrgs.splat.gaussians import PARAMETERS, Gaussians
-from xrgs.splat.refinement import Groups, Thresholds
 from xrgs.splat.settings import DensifySettings
+from xrgs.splat.strategy.refinement import Groups, Thresholds
 from xrgs.training import components
 from xrgs.training.components import Component, Components, Step, TrainingSetup
 from xrgs.training.components.consistency import Consistency
 from xrgs.training.components.curriculum import Curriculum
 from xrgs.training.components.densify import Densify
 from xrgs.training.components.gradient_scaling import GradientScaling
-from xrgs.training.components.loss_weighting import LossWeighting
 from xrgs.training.components.mip import Mip
+from xrgs.training.components.natural_selection import NaturalSelection
+from xrgs.training.registry import BUILT_IN, modules_of
 from xrgs.training.components.render_scale import RenderScale
-from xrgs.training.components.weighting import Weighting
+from xrgs.training.components.resolution_schedule import ResolutionSchedule
+from xrgs.training.components.skip_backward import SkipBackward
+from xrgs.training.components.supersampled import Supersampled
+from xrgs.training.components.view_scores import ErrorScore, MultiviewScore
+from xrgs.training.components.weighting import Weighting, weight_by_tag
 
 Build = Callable[..., Components]
 
@@ -40,6 +47,26 @@ ON: dict[str, tuple[Any, type[Component]]] = {
     "render_scale.gamma": (0.25, RenderScale),
     "consistency.weight": (0.1, Consistency),
     "mip.variance": (0.2, Mip),
+    "supersampled.factor": (2, Supersampled),
+    "supersampled.late_factor": (2, Supersampled),
+    "resolution_schedule.start_share": (0.5, ResolutionSchedule),
+    "skip_backward.share": (0.5, SkipBackward),
+    "multiview_score.views": (2, MultiviewScore),
+    "error_score.of": ("edges", ErrorScore),
+    "natural_selection.budget": (0.5, NaturalSelection),
+    "continuous_weighting.gamma": (1.0, Weighting),
+}
+#: Keys that `off` declares too, with another value: they build no component by themselves. The
+#: first changes a weight that another key switches on, as do those of `ATTENUATIONS`, which are
+#: refused without one; the last is read by `xrgs.training.count_matching`.
+OTHERS: dict[str, Any] = {
+    "loss_weighting.stat_from": "unweighted",
+    "count_matched.gaussians": 100,
+}
+ATTENUATIONS: dict[str, Any] = {
+    "adaptive_weighting.texture": 0.1,
+    "region_weighting.texture": 0.1,
+    "hybrid_schedule.ramp": 100,
 }
 
 
@@ -48,25 +75,41 @@ def put(conf: ComponentsConf, key: str, value: Any) -> None:
     setattr(getattr(conf, group), name, value)
 
 
+def groups_on(conf: ComponentsConf) -> list[str]:
+    """The groups of settings in the identities of cells."""
+    assert [*identity_values(conf)] == [
+        group for group, values in vars(conf).items() if group != "plugins" and is_on(values)
+    ]
+    return [*identity_values(conf)]
+
+
 def test_the_baseline_has_no_component(build: Build, off: ComponentsConf) -> None:
     assert build(off) == ()
+    assert groups_on(off) == []
 
 
 def test_every_setting_has_a_component() -> None:
-    """A built-in component of its own, the weight of a view, count matching or the plugins."""
-    weights = {
-        "continuous_weighting",
-        "adaptive_weighting",
-        "region_weighting",
-        "hybrid_schedule",
-    }
+    """A component of its own, one that reads it, count matching or the plugins."""
     keys = {field.name for field in dataclasses.fields(ComponentsConf)}
-    assert keys == set(components.BUILT_IN) | weights | {"count_matched", "plugins"}
+    read = {key for entry in BUILT_IN.values() for key in entry.reads}
+    assert keys == set(BUILT_IN) | read | {"count_matched", "plugins"}
+    assert not read & set(BUILT_IN)
 
 
 def test_the_weight_of_a_view_multiplies_its_consistency_loss() -> None:
-    order = list(components.BUILT_IN)
+    order = list(BUILT_IN)
     assert order.index("consistency") < order.index("loss_weighting")
+
+
+def test_every_module_implements_a_component_or_is_shared() -> None:
+    folder = Path(components.__file__).parent
+    shared = {"__init__", "base", "combined"}
+    modules = {file.stem for file in folder.glob("*.py")} - shared
+    keys = [key for name, entry in BUILT_IN.items() for key in (name, *entry.reads)]
+    paths = {path for key in keys for path in modules_of(key)}
+    assert paths == {f"training/components/{name}.py" for name in modules}
+    assert "training/components/weighting.py" in modules_of("hybrid_schedule")
+    assert modules_of("count_matched") == modules_of("plugins") == ()
 
 
 @pytest.mark.parametrize("tag", ["HR", "LR"])
@@ -80,12 +123,8 @@ def test_at_the_value_that_is_off_each_changes_nothing(
 ) -> None:
     """Built at its off value, which `build` does not do, a component is the identity too."""
     step, loss = steps[tag], torch.tensor(0.3)
-    assert (
-        Weighting(LossWeighting(off.loss_weighting)).modify_loss(
-            loss, step.view.image, gaussians, step
-        )
-        is loss
-    )
+    weighting = Weighting(partial(weight_by_tag, lr_weight=off.loss_weighting.lr_weight))
+    assert weighting.modify_loss(loss, step.view.image, gaussians, step) is loss
     scaling = GradientScaling(off.gradient_scaling)
     scaling.after_backward(gaussians, step)
     assert gaussians.scales.grad is not None
@@ -97,7 +136,7 @@ def test_at_the_value_that_is_off_each_changes_nothing(
 
 
 def test_two_components_with_thresholds_are_refused() -> None:
-    densify = Densify(DensifyConf("per_class", 2.0, 2.0))
+    densify = Densify(DensifyConf(decide="per_class", lr_grow=2.0, lr_prune=2.0))
     assert Components([Component(), densify]).densification_groups(DensifySettings()) is not None
     with pytest.raises(XrgsError, match=r"^components: Densify and Other both set thresholds"):
         Components([densify, Other()]).densification_groups(DensifySettings())
@@ -206,6 +245,49 @@ def test_each_is_on_alone(key: str, build: Build, off: ComponentsConf) -> None:
     value, kind = ON[key]
     put(off, key, value)
     assert [type(component) for component in build(off)] == [kind]
+    assert groups_on(off) == [key.partition(".")[0]]
+
+
+@pytest.mark.parametrize("key", OTHERS)
+def test_other_keys_build_nothing_and_are_in_the_identity(
+    key: str, build: Build, off: ComponentsConf
+) -> None:
+    put(off, key, OTHERS[key])
+    assert build(off) == ()
+    assert groups_on(off) == [key.partition(".")[0]]
+
+
+@pytest.mark.parametrize("key", ATTENUATIONS)
+def test_an_attenuation_is_refused_alone_and_is_in_the_identity(
+    key: str, build: Build, off: ComponentsConf
+) -> None:
+    put(off, key, ATTENUATIONS[key])
+    with pytest.raises(XrgsError, match=rf"^components\.{key}="):
+        build(off)
+    off.loss_weighting.lr_weight = 0.5
+    assert [type(component) for component in build(off)] == [Weighting]
+    assert set(groups_on(off)) == {"loss_weighting", key.partition(".")[0]}
+
+
+def test_every_key_that_is_declared_off_is_one_of_these(off: ComponentsConf) -> None:
+    declared = {
+        f"{group.name}.{key.name}"
+        for group in dataclasses.fields(off)
+        if group.name != "plugins"
+        for key in dataclasses.fields(getattr(off, group.name))
+        if "off" in key.metadata
+    }
+    assert declared == ON.keys() | OTHERS.keys() | ATTENUATIONS.keys()
+    assert {key.partition(".")[0] for key in declared} | {"plugins"} == set(vars(off))
+
+
+@pytest.mark.parametrize("key", ["consistency.l1", "densify.lr_grow", "supersampled.late_from"])
+def test_a_key_of_a_component_that_is_off_switches_nothing_on(
+    key: str, build: Build, off: ComponentsConf
+) -> None:
+    put(off, key, 3)
+    assert build(off) == ()
+    assert groups_on(off) == []
 
 
 def test_all_are_on_together(build: Build, off: ComponentsConf) -> None:
@@ -214,11 +296,15 @@ def test_all_are_on_together(build: Build, off: ComponentsConf) -> None:
     assert {type(component) for component in build(off)} == {kind for _, kind in ON.values()}
 
 
-@pytest.mark.slow
-def test_training_needs_no_hydra() -> None:
-    code = "import sys, xrgs.training.components; sys.exit('hydra' in sys.modules)"
-    run = subprocess.run([sys.executable, "-P", "-c", code], check=False)
-    assert run.returncode == 0
+@pytest.mark.parametrize(
+    ("module", "unused"),
+    [(".components", {"hydra"}), (".registry", {"torch", "numpy", "omegaconf", "hydra"})],
+)
+def test_what_is_imported(module: str, unused: set[str]) -> None:
+    """Training needs no Hydra, and planning reads the registry without torch."""
+    code = f"import sys, xrgs.training{module}; print({unused!r} & set(sys.modules))"
+    run = subprocess.run([sys.executable, "-P", "-c", code], capture_output=True, check=True)
+    assert run.stdout.strip() == b"set()"
 
 
 @pytest.mark.parametrize(
@@ -245,6 +331,9 @@ def test_training_needs_no_hydra() -> None:
 def test_a_value_out_of_range_names_its_key(
     key: str, value: Any, build: Build, off: ComponentsConf
 ) -> None:
+    for name, (on, _) in ON.items():
+        if name.partition(".")[0] == key.partition(".")[0]:
+            put(off, name, on)
     put(off, key, value)
     with pytest.raises(XrgsError) as caught:
         build(off)

@@ -12,11 +12,11 @@ from torch import Tensor
 from xrgs.capture.dataset import LoadedView
 from xrgs.config import ComponentsConf, MipConf
 from xrgs.splat.cameras import Camera
-from xrgs.splat.densify import Densifier
 from xrgs.splat.gaussians import ActivatedGaussians, Gaussians, from_points
 from xrgs.splat.optimizer import SplatOptimizer
-from xrgs.splat.rasterize import rasterize_parameters
+from xrgs.splat.rendering import rasterize_parameters
 from xrgs.splat.settings import DensifySettings, OptimizerSettings, RasterSettings
+from xrgs.splat.strategy.default import DefaultStrategy
 from xrgs.training.components import Components, Step
 from xrgs.training.components.mip import Mip, sampling_rates, smooth
 
@@ -281,15 +281,15 @@ def test_a_reset_caps_what_is_rendered() -> None:
     gaussians.opacities = torch.tensor([3.0, -6.0, 1.0]).requires_grad_()
     mip = on(FAR, CLOSE)
     optimizer = SplatOptimizer(gaussians, OptimizerSettings(), scene_scale=1.0, steps=30_000)
-    densifier = Densifier(
+    strategy = DefaultStrategy(
         optimizer,
         DensifySettings(prune_opacity=0.001, reset_opacity=10.0),
         scene_scale=1.0,
         generator=torch.Generator(),
     )
     visible = torch.ones(3, dtype=torch.bool)
-    hooks = Components([mip]).densifier_hooks(STEP)
-    refinement = densifier.after_step(3000, None, visible, width=SIZE, height=SIZE, hooks=hooks)
+    hooks = Components([mip]).strategy_hooks(STEP)
+    refinement = strategy.after_step(3000, None, visible, width=SIZE, height=SIZE, hooks=hooks)
     assert refinement.reset == 2
     mip.on_gaussians_changed(gaussians)
     rendered = mip.before_render(gaussians.activated(), STEP).opacities.detach()

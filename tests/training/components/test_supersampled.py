@@ -13,7 +13,7 @@ from xrgs.capture.dataset import Dataset, LoadedView
 from xrgs.config import ComponentsConf, Conf
 from xrgs.errors import XrgsError
 from xrgs.splat.gaussians import from_points
-from xrgs.splat.rasterize import rasterize_parameters
+from xrgs.splat.rendering import rasterize_parameters
 from xrgs.training import components
 from xrgs.training.components import Components, Step
 from xrgs.training.seeding import seeded_generator

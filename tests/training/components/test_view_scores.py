@@ -16,7 +16,7 @@ from xrgs.config import ComponentsConf, Conf
 from xrgs.errors import XrgsError
 from xrgs.splat.attribution import attribute_pixels
 from xrgs.splat.gaussians import ActivatedGaussians, Gaussians
-from xrgs.splat.rasterize import rasterize_parameters
+from xrgs.splat.rendering import rasterize_parameters
 from xrgs.splat.settings import RasterSettings
 from xrgs.training.components import Component, Components, Step
 from xrgs.training.components.view_scores import ErrorScore, edges

@@ -12,12 +12,11 @@ from xrgs.capture.scenes import folder, motorcycle, procedural, video
 from xrgs.capture.scenes.rendered import provide, verify
 from xrgs.capture.scenes.scene import Scene
 from xrgs.errors import XrgsError
-from xrgs.safeio.confined import ConfinedPath
 from xrgs.safeio.paths import user_path
-from xrgs.safeio.words import for_line
+from xrgs.safeio.sanitize import for_line
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Mapping
+    from collections.abc import Iterable
     from pathlib import Path
 
     from xrgs.config import SceneConf
@@ -112,7 +111,7 @@ def fingerprint(conf: SceneConf, long_side: int = 0) -> str:
     return hashlib.sha256(f"{conf.kind}\0{content}".encode()).hexdigest()[:16]
 
 
-def resolve(conf: SceneConf, cache: ConfinedPath, long_side: int = 0) -> Scene:
+def resolve(conf: SceneConf, cache: Path, long_side: int = 0) -> Scene:
     """Find a scene's photographs on disk; frames and rendered views are made where they are not.
 
     Args:
@@ -130,10 +129,10 @@ def resolve(conf: SceneConf, cache: ConfinedPath, long_side: int = 0) -> Scene:
     """
     name, scene_hash = label(conf), fingerprint(conf, long_side)
     if conf.kind == "folder":
-        return Scene(name, scene_hash, _confined(folder.list_photographs(conf.path, long_side)))
+        return Scene(name, scene_hash, folder.list_photographs(conf.path, long_side))
     if conf.kind == "motorcycle":
         known, exact = motorcycle.intrinsics(), motorcycle.viewmats()
-        return Scene(name, scene_hash, _confined(motorcycle.files()), known, exact)
+        return Scene(name, scene_hash, motorcycle.files(), known, exact)
     views, home = names(conf), cache / scene_hash
     files = {view: home / f"{view}.png" for view in views}
     provide(home, [file.name for file in files.values()], lambda work: _make(work, conf, long_side))
@@ -144,10 +143,6 @@ def resolve(conf: SceneConf, cache: ConfinedPath, long_side: int = 0) -> Scene:
     return Scene(name, scene_hash, files, viewmats=exact)
 
 
-def _confined(files: Mapping[str, Path]) -> dict[str, ConfinedPath]:
-    return {name: ConfinedPath(file) for name, file in files.items()}
-
-
 def _check(conf: SceneConf) -> None:
     if conf.kind not in _KINDS:
         raise XrgsError(f"scene.kind={conf.kind}: unknown; must be one of {', '.join(_KINDS)}")
@@ -155,7 +150,7 @@ def _check(conf: SceneConf) -> None:
         raise XrgsError(f"scene.views={conf.views}: must be 2 or more")
 
 
-def _make(work: ConfinedPath, conf: SceneConf, long_side: int) -> None:
+def _make(work: Path, conf: SceneConf, long_side: int) -> None:
     """Write the photographs of a scene that has none on the disk."""
     if conf.kind == "video":
         video.extract(conf.path, conf.views, work)

@@ -21,10 +21,10 @@ from typing import TYPE_CHECKING
 from xrgs.capture import images
 from xrgs.errors import UnreadableError, XrgsError
 from xrgs.runtime.progress import progress
-from xrgs.safeio import untrusted
+from xrgs.safeio.files import is_name
 from xrgs.safeio.hashing import file_digest
 from xrgs.safeio.paths import user_path
-from xrgs.safeio.words import for_line
+from xrgs.safeio.sanitize import for_line
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping, Sequence
@@ -101,7 +101,7 @@ def _by_name(named: Sequence[tuple[str, Path]]) -> dict[str, Path]:
     """Return files by name, sorted; refuse names that can't be used, and two that are one."""
     seen: dict[str, Path] = {}
     for name, file in named:
-        if not untrusted.is_name(name):
+        if not is_name(name):
             raise XrgsError(
                 f"{str(file)!r}: its name has a backslash, a control character or bytes that are "
                 "not valid Unicode, or is too long; rename it"

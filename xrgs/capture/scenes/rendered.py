@@ -10,27 +10,34 @@ import logging
 from contextlib import suppress
 from typing import TYPE_CHECKING
 
+from msgspec import Struct
+
 from xrgs.capture import sealed
 from xrgs.errors import StoreError, UnreadableError
+from xrgs.runtime import lease
 from xrgs.safeio.atomic import write_json
-from xrgs.safeio.confined import confined
-from xrgs.safeio.records import read_object
-from xrgs.safeio.untrusted import is_name
-from xrgs.safeio.words import for_line
+from xrgs.safeio.files import remove_path, sync_name, sync_tree
+from xrgs.safeio.records import read_struct
+from xrgs.safeio.sanitize import for_line
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Collection
     from pathlib import Path
 
-    from xrgs.safeio.confined import ConfinedPath
 
 _log = logging.getLogger(__name__)
 _MANIFEST = "scene.json"
 
 
-def provide(
-    home: ConfinedPath, images: Collection[str], render: Callable[[ConfinedPath], None]
-) -> None:
+class RenderedScene(Struct, frozen=True):
+    """The content of `scene.json`."""
+
+    fingerprint: str
+    files: dict[str, str]
+    """The SHA-256 of each image by its name."""
+
+
+def provide(home: Path, images: Collection[str], render: Callable[[Path], None]) -> None:
     """Verify rendered images, and render them where they are not there or damaged.
 
     Any number of processes may call this at once. A damaged folder is renamed, not removed.
@@ -44,8 +51,8 @@ def provide(
     Raises:
         UnreadableError: The folder is there, but can't be read now.
     """
-    home.make_parent()
-    with sealed.lock(home.with_name(f".{home.name}.lock")):
+    home.parent.mkdir(exist_ok=True)
+    with lease.waited_for(home.parent, f".{home.name}.lock"):
         try:
             missing = not home.exists()
         except OSError as error:
@@ -60,7 +67,7 @@ def provide(
             _render(home, images, render)
 
 
-def _damage(home: ConfinedPath, images: Collection[str]) -> StoreError | None:
+def _damage(home: Path, images: Collection[str]) -> StoreError | None:
     """Return the first thing that is wrong with a rendered scene; None where it is intact."""
     try:
         files = _files(home)
@@ -71,55 +78,47 @@ def _damage(home: ConfinedPath, images: Collection[str]) -> StoreError | None:
     return next(sealed.changed(home, files), None)
 
 
-def _files(home: ConfinedPath) -> dict[str, str]:
+def _files(home: Path) -> dict[str, str]:
     """Read the hash of each file from `scene.json`.
 
     Raises:
         StoreError: It is missing, can't be read or is malformed.
     """
     file = home / _MANIFEST
-    content = read_object(file)
-    files = content.get("files")
-    if not isinstance(files, dict) or not all(
-        is_name(name) and isinstance(sha256, str) for name, sha256 in files.items()
-    ):
-        raise StoreError(f"{file}: it has no list of files")
-    if content.get("fingerprint") != sealed.own_name(home):
+    content = read_struct(file, RenderedScene)
+    if content.fingerprint not in {home.name, home.resolve().name}:
         raise StoreError(f"{file}: it is of another scene than its folder's name says")
-    return files
+    return content.files
 
 
-def _render(
-    home: ConfinedPath, images: Collection[str], render: Callable[[ConfinedPath], None]
-) -> None:
+def _render(home: Path, images: Collection[str], render: Callable[[Path], None]) -> None:
     """Render into another folder, after what a killed process left of it is removed."""
     work = home.with_name(f".{home.name}.rendering")
-    work.remove()
-    work.make_folder()
+    remove_path(work)
+    work.mkdir()
     try:
         render(work)
         content = {"fingerprint": home.name, "files": sealed.hashes(work, sorted(images))}
         write_json(work / _MANIFEST, content, durable=False)
-        work.sync_tree()
+        sync_tree(work)
         work.rename(home)
     except BaseException:
         with suppress(OSError):
-            work.remove()
+            remove_path(work)
         raise
-    home.sync_name()
+    sync_name(home)
 
 
-def verify(path: Path | ConfinedPath) -> list[str]:
+def verify(home: Path) -> list[str]:
     """Say everything that is wrong with the files of a rendered scene.
 
     Args:
-        path: The scene's folder in the store's `scenes/`, which may come from anybody.
+        home: The scene's folder in the store's `scenes/`.
 
     Returns:
         A line for each file that is missing, has changed, can't be read now or does not belong
         there; empty for an intact scene.
     """
-    home = confined(path)
     try:
         files = _files(home)
     except StoreError as error:

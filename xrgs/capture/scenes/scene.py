@@ -4,11 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
-
-from xrgs.safeio.confined import ConfinedPath
 
 
 @dataclass(frozen=True)
@@ -22,7 +21,7 @@ class Scene:
     """The name of the scene in tables."""
     fingerprint: str
     """A hash of the photographs' names and bytes, or of what they are rendered from."""
-    files: Mapping[str, ConfinedPath]
+    files: Mapping[str, Path]
     """The photographs, sorted by name; one that a user named is a path by itself."""
     intrinsics: Mapping[str, NDArray[np.float64]] = field(default_factory=dict)
     """Exact intrinsics [3, 3] in px of the file, without distortion; SfM gets them, and does not

@@ -6,6 +6,7 @@ import itertools
 import math
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
 
 import numpy as np
 import torch
@@ -17,7 +18,6 @@ from xrgs.capture.scenes.bundled import bundled_photograph
 from xrgs.capture.scenes.raycast import Ball, Pyramid, Quad, pyramid
 from xrgs.runtime.machine import single_torch_thread
 from xrgs.runtime.progress import progress
-from xrgs.safeio.confined import ConfinedPath
 
 #: Samples per pixel along each axis.
 SUPERSAMPLE = 3
@@ -108,7 +108,7 @@ def textures() -> dict[str, Pyramid]:
     }
 
 
-def render(folder: ConfinedPath, long_side: int, views: int) -> None:
+def render(folder: Path, long_side: int, views: int) -> None:
     """Render every view and write it as `<name>.png`; nothing waits for the disk.
 
     Args:

@@ -19,10 +19,10 @@ import numpy as np
 from xrgs.capture import images
 from xrgs.errors import UnreadableError, XrgsError
 from xrgs.runtime.progress import ProgressBar
-from xrgs.safeio.confined import ConfinedPath, is_passing
+from xrgs.safeio.files import is_transient
 from xrgs.safeio.hashing import file_digest
 from xrgs.safeio.paths import user_path
-from xrgs.safeio.words import for_line
+from xrgs.safeio.sanitize import for_line
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -68,7 +68,7 @@ def digest(path: str | None, views: int) -> str:
     try:
         content = file_digest(file)
     except OSError as error:
-        kind = UnreadableError if is_passing(error) else XrgsError
+        kind = UnreadableError if is_transient(error) else XrgsError
         raise kind(f"scene.path={file}: {error.strerror}") from error
     if find_spec("av") is None:
         raise XrgsError(f"scene.path={file}: a video needs PyAV: pip install 'xrgs[video]'")
@@ -79,13 +79,13 @@ def digest(path: str | None, views: int) -> str:
     return sha256.hexdigest()
 
 
-def _file(path: str | None) -> ConfinedPath:
+def _file(path: str | None) -> Path:
     if not path:
         raise XrgsError("scene.path is empty: give the video, scene.path=...")
-    return ConfinedPath(user_path(path))
+    return user_path(path)
 
 
-def extract(path: str | None, views: int, folder: ConfinedPath) -> None:
+def extract(path: str | None, views: int, folder: Path) -> None:
     """Write the sharpest frames of a video as `<name>.png`, as its player would show them.
 
     Args:
@@ -142,7 +142,7 @@ def measure_sharpness(brightness: NDArray[np.uint8]) -> float:
     return float(laplace(brightness.astype(np.float32)).var())
 
 
-def _frames(file: ConfinedPath) -> Iterator[VideoFrame]:
+def _frames(file: Path) -> Iterator[VideoFrame]:
     """Decode the frames of the first video stream.
 
     What can't be decoded ends the video with a warning where frames came before it.
@@ -152,7 +152,7 @@ def _frames(file: ConfinedPath) -> Iterator[VideoFrame]:
     number = 0
     try:
         with (
-            file.open() as stream,
+            file.open("rb") as stream,
             av.open(stream, "r", options={"format_whitelist": _CONTAINERS}) as container,
         ):
             if not container.streams.video:

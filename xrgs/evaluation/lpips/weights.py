@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from xrgs.errors import XrgsError
 from xrgs.safeio import npz
 from xrgs.safeio.atomic import atomic_writer
-from xrgs.safeio.confined import confined
+from xrgs.safeio.files import read_bytes
 
 Weights = dict[str, NDArray[np.float32]]
 
@@ -119,7 +119,7 @@ def load(file: Path) -> Weights:
         WeightsError: The file is unreadable, or does not hold the published weights.
     """
     try:
-        content = confined(file).read_bytes(_MAX_BYTES)
+        content = read_bytes(file, _MAX_BYTES)
     except OSError as error:
         raise WeightsError(f"{file}: can't be read ({error})") from error
     if not content.startswith(b"PK"):

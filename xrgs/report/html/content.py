@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import pandas as pd
 
-from xrgs.safeio.words import MAX_CELL, for_line
+from xrgs.safeio.sanitize import MAX_CELL, for_line
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping

@@ -36,15 +36,15 @@ from xrgs.report.render import (
 from xrgs.report.writing import NO_INTERVAL, number, signed
 from xrgs.runtime.machine import set_passive_openmp_wait
 from xrgs.safeio.atomic import write_text
-from xrgs.safeio.words import for_csv
+from xrgs.safeio.sanitize import for_csv
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
+    from pathlib import Path
 
     from xrgs.report.collect import Sweep
     from xrgs.report.joined import JoinedStore
     from xrgs.report.tables import Tables
-    from xrgs.safeio.confined import ConfinedPath
 
 #: The largest page, in bytes, and what images and models may take of it.
 MAX_BYTES = 10_000_000
@@ -56,7 +56,7 @@ _MAX_RUNS = 12
 
 
 def write_document(
-    file: ConfinedPath,
+    file: Path,
     store: JoinedStore,
     sweep: Sweep,
     tables: Tables,

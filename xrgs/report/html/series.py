@@ -66,7 +66,7 @@ def add_history(content: Content, store: JoinedStore, comparison: Comparison) ->
 
 
 def _history(cell: CellFolder) -> dict[str, list[float | None]]:
-    header, rows = read_table(cell.folder / "history.csv")
+    header, rows = read_table(cell.path / "history.csv")
     step = max(1, -(-len(rows) // _MAX_ROWS))
     kept = rows[::step] + (rows[-1:] if (len(rows) - 1) % step else [])
     found: dict[str, list[float | None]] = {}

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 from xrgs.report.html.content import shown
 from xrgs.report.render import titled
 from xrgs.report.writing import arrow, by_key, reading, signed
-from xrgs.safeio.words import counted
+from xrgs.safeio.sanitize import counted
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping

@@ -20,9 +20,8 @@ from xrgs.report.html.content import LOG_SCALES, run_names, shown, why
 from xrgs.runtime.progress import progress
 from xrgs.splat.attribution import attribute_pixels
 from xrgs.splat.backend import resolve_backend
-from xrgs.splat.rasterize import rasterize_parameters
+from xrgs.splat.rendering import rasterize_parameters
 from xrgs.splat.sh import C0
-from xrgs.viewer.models import raster_settings
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -150,7 +149,7 @@ class _Adder:
         """Load the Gaussians of a cell; None, and a note, where they can't be read."""
         cell, label = self.store.cell(row["cell_id"]), shown(row["label"])
         try:
-            raster, gaussians = raster_settings(cell), cell.gaussians()
+            raster, gaussians = cell.config().splat.raster, cell.gaussians()
         except (XrgsError, OSError) as error:
             self.content.notes.append(
                 f"{shown(row['scene'])}, {label}: no training views and no model,"

@@ -13,13 +13,14 @@ from xrgs.report.html.content import finite, run_names, runs, shown, why
 from xrgs.runtime.progress import progress
 
 if TYPE_CHECKING:
+    from pathlib import Path
+
     import pandas as pd
     from PIL import Image
 
     from xrgs.report.compare import Comparison
     from xrgs.report.html.content import Content
     from xrgs.report.joined import JoinedStore
-    from xrgs.safeio.confined import ConfinedPath
 
 #: The largest image that is read.
 _MAX_PIXELS = 1 << 24
@@ -79,7 +80,7 @@ def _title(entry: dict[str, Any]) -> str:
     return ", ".join(filter(None, (entry[key] for key in ("scene", "condition", "view"))))
 
 
-def _photograph(store: JoinedStore, cells: pd.DataFrame, view: str) -> ConfinedPath:
+def _photograph(store: JoinedStore, cells: pd.DataFrame, view: str) -> Path:
     """Return the file of the photograph of a view that cells are scored on."""
     first = cells.iloc[0]
     split = "train" if first["validation"] > 0 else "test"

@@ -5,22 +5,27 @@ A cell that fails is a state and not an exception, so that no launcher drops the
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 from xrgs.errors import UnreadableError, XrgsError
 from xrgs.experiment.attempts import begin_attempt
-from xrgs.experiment.store import Store
+from xrgs.experiment.identity import changed_code
+from xrgs.runtime import lease
 from xrgs.runtime.progress import log_line
-from xrgs.safeio.confined import is_passing
-from xrgs.sweep import locks, presence, variants
+from xrgs.safeio.files import is_transient
+from xrgs.splat.backend import arithmetic
+from xrgs.sweep import presence, variants
 from xrgs.sweep.jobs import worker
 from xrgs.sweep.jobs.supervise import Limits
 
 if TYPE_CHECKING:
+    from pathlib import Path
+
+    from xrgs.config import Conf
     from xrgs.experiment.cell_folder import CellFolder
-    from xrgs.safeio.confined import ConfinedPath
-    from xrgs.sweep.session import HandOver, SweepSession
+    from xrgs.experiment.schema import Identity
+    from xrgs.experiment.store import Store
+    from xrgs.sweep.session import SweepSession
 
 #: Outcomes of a job beside the states of a cell. LOCKED: another sweep is training the cell.
 #: STOPPED: the sweep is over, or no further job may begin. UNWRITABLE: the store can't be written.
@@ -47,39 +52,41 @@ class _CellLeftError(XrgsError):
         """The outcome of the job."""
 
 
-def run_job(session: SweepSession, cell_id: str) -> str:
+def run_job(session: SweepSession, store: Store, cell_id: str, name: str) -> str:
     """Run one cell of a sweep, unless there is a reason not to.
 
     Args:
         session: The call of `xrgs-sweep` that the job belongs to.
-        cell_id: The cell's id; the session's folder holds its config and identity.
+        store: The store, whose folder of the cell has its config and identity.
+        cell_id: The cell's id.
+        name: The cell's name for people.
 
     Returns:
         The cell's state, or `LOCKED`, `STOPPED`, `UNWRITABLE`, `GONE`, `UNKNOWN` or `INTERRUPTED`.
 
     Raises:
-        XrgsError: The cell was not handed over by this sweep's plan, its code is not the planned
-            one, or its variant is missing, or trimmed and its images can't be made again.
+        XrgsError: The installed code is not the planned one, or the variant of the cell is missing,
+            or trimmed and its images can't be made again.
     """
-    if session.stopped:
-        return STOPPED
-    if session.missing:
+    if not session.folder.is_dir():
         log_line(
             f"{session.folder} is not there, so that {cell_id} is left: hydra.sweep.dir must be a"
             " folder that every machine of the sweep can read"
         )
         return GONE
-    cell = session.read(cell_id)
-    store = Store(Path(cell.config["store"]))
+    if session.stopped:
+        return STOPPED
+    cell = store.cell(cell_id)
     try:
-        outcome = _run_under_lock(cell, store, session)
+        conf = cell.config()
+        outcome = _run_under_lease(cell, name, conf, store, session)
     except OSError as error:
-        outcome = _outcome_of(error, store)
+        outcome, conf = _outcome_of(error, store), None
         if outcome != GONE:
             log_line(f"store={store.path}: {error}")
     if outcome == UNWRITABLE:
         session.stop(STORE_FULL)
-    if cell.config["fail_fast"] and outcome == "failed":
+    if conf is not None and conf.fail_fast and outcome == "failed":
         session.stop(FAIL_FAST)
     return outcome
 
@@ -90,43 +97,65 @@ def _outcome_of(error: OSError, store: Store) -> str:
         return GONE
     if worker.unwritable(error):
         return UNWRITABLE
-    if not is_passing(error):
+    if not is_transient(error):
         raise error
     return UNKNOWN
 
 
-def _run_under_lock(cell: HandOver, store: Store, session: SweepSession) -> str:
+def _run_under_lease(
+    cell: CellFolder, name: str, conf: Conf, store: Store, session: SweepSession
+) -> str:
     """Train the cell unless another process is training it, or has finished it meanwhile."""
+    identity = cell.identity()
     # The plan has verified the variant's files, and the child process verifies them again. Of a
     # trimmed variant the plan knows the id alone.
-    variant = store.variants / cell.variant_id
+    variant = store.variants / identity.variant
     if not variant.is_dir():
-        variants.restore(cell.config, store, cell.variant_id)
+        variants.restore(conf, store, identity.variant)
     if not variant.is_dir():
-        raise XrgsError(f"{cell.name}: its variant {variant} is missing")
-    folder = store.cell(cell.cell_id)
-    lock = locks.acquire(store.locks, folder.id, cell.dead_locks)
-    if lock is None:
-        log_line(f"{folder.id}: another sweep is training this cell; this sweep leaves it")
+        raise XrgsError(f"{name}: its variant {variant} is missing")
+    held = lease.acquire(store.leases, cell.id)
+    if held is None:
+        log_line(f"{cell.id}: another sweep is training this cell; this sweep leaves it")
         return LOCKED
     try:
-        state = folder.state()
+        state = cell.state()
         if state.name == "unknown":
-            log_line(f"{folder.id} is left: {state.reason}")
+            log_line(f"{cell.id} is left: {state.reason}")
         if state.name in {"done", "unknown"}:  # done by another sweep since this one was planned
             return state.name
-        cell.check_code()
-        if not lock.is_held():
-            return _lost(folder)
-        attempt = begin_attempt(folder, cell.config, cell.identity)
-        log_line(f"{cell.name}: training cell {folder.id}")
-        return _train_in_child(cell, store, variant, attempt, lock, session)
+        _check_code(name, cell.id, conf, identity)
+        if not begin_attempt(cell, held.beat):
+            return _lost(cell)
+        log_line(f"{name}: training cell {cell.id}")
+        return _train_in_child(cell, conf, store, variant, held, session)
     finally:
-        lock.release()
+        held.release()
+
+
+def _check_code(name: str, cell_id: str, conf: Conf, planned: Identity) -> None:
+    """Refuse to train with other code or other arithmetic than the cell was planned with.
+
+    Raises:
+        XrgsError: They differ; the message names the parts of the program that do.
+    """
+    if parts := changed_code(planned):
+        raise XrgsError(
+            f"{name}: cell {cell_id} was planned with other code than is installed here and now"
+            f" ({', '.join(parts)}). Install the same version of xrgs wherever cells are trained,"
+            " and start the sweep again"
+        )
+    here = arithmetic(conf.splat.backend)
+    if planned.arithmetic != here:
+        raise XrgsError(
+            f"{name}: cell {cell_id} was planned with the arithmetic {planned.arithmetic}, and this"
+            f" machine has {here}, which gives other last digits. Start the sweep on a machine like"
+            " those that train, or set splat.backend=torch"
+        )
 
 
 def _lost(folder: CellFolder) -> str:
-    """Say that the lock is lost; from then on this job does not touch the cell's folder."""
+    """Say that the lease is lost; from then on this job does not touch the cell's folder."""
     log_line(
         f"{folder.id} is left: this process gave no sign of life for too long, and another has"
         " taken over"
@@ -135,42 +164,39 @@ def _lost(folder: CellFolder) -> str:
 
 
 def _train_in_child(
-    cell: HandOver,
+    cell: CellFolder,
+    conf: Conf,
     store: Store,
-    variant: ConfinedPath,
-    folder: CellFolder,
-    lock: locks.Lock,
+    variant: Path,
+    held: lease.Lease,
     session: SweepSession,
 ) -> str:
     """Train the cell in a child process; return the job's outcome."""
 
-    def on_poll(pid: int) -> None:
+    def on_poll(_: int) -> None:
         presence.check(store)
-        if not lock.beat(pid):
-            raise _CellLeftError(_lost(folder))
+        if held.lost:
+            raise _CellLeftError(_lost(cell))
         if session.owner_dead:
-            log_line(f"{folder.id} is left: its sweep's process has ended")
+            log_line(f"{cell.id} is left: its sweep's process has ended")
             raise _CellLeftError(STOPPED)
 
-    request = worker.cell_request(cell.config, variant, folder)
-    limits = cell.config["limits"]
+    limits = Limits(conf.limits.minutes, conf.limits.memory_gb)
     try:
-        worker.run_in_child(
-            "cell", request, Limits(limits["minutes"], limits["memory_gb"]), on_poll
-        )
+        worker.run_in_child("cell", worker.cell_request(variant, cell), limits, on_poll)
     except _CellLeftError as error:
         return error.outcome
     except XrgsError as error:
-        return _after_error(error, store, folder, lock)
-    return folder.state().name
+        return _after_error(error, store, cell, held)
+    return cell.state().name
 
 
-def _after_error(error: XrgsError, store: Store, folder: CellFolder, lock: locks.Lock) -> str:
+def _after_error(error: XrgsError, store: Store, folder: CellFolder, held: lease.Lease) -> str:
     """Return the outcome of a cell whose process failed, and write it where that is its fault."""
     if presence.is_gone(store):
         return GONE
     # The cell is another process's now, though its own may have failed before.
-    if isinstance(error, worker.AttemptLostError) or not lock.is_held():
+    if isinstance(error, worker.AttemptLostError) or not held.beat():
         return _lost(folder)
     for kind, outcome in _NO_FAULT.items():
         if isinstance(error, kind):

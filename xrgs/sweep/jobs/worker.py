@@ -18,14 +18,15 @@ import traceback
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import msgspec
+
 from xrgs.errors import UnreadableError, XrgsError
 from xrgs.runtime import processes
 from xrgs.runtime.machine import set_passive_openmp_wait
 from xrgs.runtime.signals import StopRequest, StopSignal, end_by_sigterm
 from xrgs.runtime.streams import ignore_broken_pipe, log_to_stderr, say
 from xrgs.safeio.atomic import write_json
-from xrgs.safeio.confined import ConfinedPath, ReplacedError, RootMissingError
-from xrgs.safeio.records import read_object
+from xrgs.safeio.records import read_struct
 from xrgs.sweep import presence
 from xrgs.sweep.jobs import supervise
 
@@ -49,12 +50,30 @@ _ASK_TO_END = frozenset(
 _NO_LIMITS = supervise.Limits()
 
 
+class _LostError(Exception):
+    """Another attempt at the cell has begun before this one did."""
+
+
+class Answer(msgspec.Struct, frozen=True):
+    """What the child writes when its work has ended."""
+
+    result: dict[str, Any] = {}
+    """The answer of the work, as plain JSON values."""
+    error: str | None = None
+    """Why the work failed."""
+    errno: int | None = None
+    unreadable: bool = False
+    """Whether a file could not be read now."""
+    lost: bool = False
+    """Whether another attempt at the cell has begun."""
+
+
 class WorkerError(XrgsError):
     """The work failed in the child, or the child died before it answered."""
 
 
 class AttemptLostError(WorkerError):
-    """Another process has taken the cell over: what the child did is of no use to anybody."""
+    """Another process has taken the cell over before the child began."""
 
 
 class InterruptedWorkError(WorkerError):
@@ -95,8 +114,8 @@ def run_in_child(
         PassingError: The child could not read a file now.
         WorkerError: The work failed; the message is the reason.
     """
-    with tempfile.TemporaryDirectory(prefix="xrgs-") as folder:
-        files = ConfinedPath(Path(folder))
+    with tempfile.TemporaryDirectory(prefix="xrgs-") as name:
+        files = Path(name)
         request_file, answer_file = files / "request.json", files / "answer.json"
         write_json(request_file, dict(request))
         # -P keeps the working folder off sys.path: the child imports the package its parent did.
@@ -106,38 +125,32 @@ def run_in_child(
         if ended.reason:
             raise WorkerError(ended.reason)
         if not answer_file.exists() and ended.code == os.EX_IOERR:
-            raise UnwritableError(f"it could not write its answer to {folder}: is the disk full?")
+            raise UnwritableError(f"it could not write its answer to {name}: is the disk full?")
         if not answer_file.exists():
             raise _death(ended.code)
-        answer = read_object(answer_file)
-    if answer.get("lost"):
-        raise AttemptLostError(str(answer["error"]))
-    if "error" in answer:
-        raise _kind(answer)(str(answer["error"]))
-    return answer
+        answer = read_struct(answer_file, Answer)
+    if answer.error is not None:
+        raise _kind(answer)(answer.error)
+    return answer.result
 
 
-def _kind(answer: Mapping[str, Any]) -> type[WorkerError]:
-    if answer.get("errno") in _UNWRITABLE:
+def _kind(answer: Answer) -> type[WorkerError]:
+    if answer.lost:
+        return AttemptLostError
+    if answer.errno in _UNWRITABLE:
         return UnwritableError
-    return (
-        PassingError if answer.get("errno") in _PASSING or "unreadable" in answer else WorkerError
-    )
+    return PassingError if answer.errno in _PASSING or answer.unreadable else WorkerError
 
 
-def cell_request(
-    conf: Mapping[str, Any], variant: ConfinedPath, attempt: CellFolder
-) -> dict[str, Any]:
-    """Return the request to train a cell.
+def cell_request(variant: Path, cell: CellFolder) -> dict[str, Any]:
+    """Return the request to train a cell, whose folder `begin_attempt` has just put in place.
 
     Args:
-        conf: The cell's config as plain JSON values.
-        variant: The folder of its variant.
-        attempt: What `begin_attempt` has returned. It must exist until the child has ended: the
-            child works in this very folder, and in no other of its name.
+        variant: The folder of the cell's variant.
+        cell: The cell.
     """
-    cell, identity = str(attempt.path), attempt.folder.identity()
-    return {"conf": dict(conf), "variant": str(variant), "cell": cell, "folder": identity}
+    paths = {"variant": str(variant.absolute()), "cell": str(cell.path.absolute())}
+    return {**paths, "id": cell.id, "inode": cell.path.stat().st_ino}
 
 
 def unwritable(error: OSError) -> bool:
@@ -195,13 +208,16 @@ def _import_colmap() -> None:
 
 def _run_cell(request: Mapping[str, Any]) -> dict[str, Any]:
     from xrgs.capture import variant
-    from xrgs.composing import from_dict
     from xrgs.experiment import cell
-    from xrgs.experiment.cell_folder import CellFolder
+    from xrgs.experiment.cell_folder import LOG, CellFolder
 
-    device, inode = request["folder"]
-    folder = CellFolder(ConfinedPath(Path(request["cell"])).pinned((device, inode)))
-    with (folder.folder / "log.txt").append() as log:
+    # The working directory stays this very folder, whatever folder gets its name: a process whose
+    # cell was taken over never writes into the files of the new owner.
+    os.chdir(request["cell"])
+    if Path.cwd().stat().st_ino != request["inode"]:
+        raise _LostError(f"{request['cell']}: another attempt at the cell has begun")
+    folder = CellFolder(Path(), request["id"])
+    with (folder.path / LOG).open("ab") as log:
         # Everything that the cell, its libraries and its children print goes to the log. Progress
         # goes to a file instead: on a terminal the bars of several cells would mix.
         for descriptor in (1, 2):
@@ -213,7 +229,7 @@ def _run_cell(request: Mapping[str, Any]) -> dict[str, Any]:
         log_to_stderr(logging.INFO)
         try:
             frozen = variant.load(Path(request["variant"]))
-            cell.run_cell(from_dict(request["conf"]), frozen, folder, stop)
+            cell.run_cell(folder.config(), frozen, folder, stop)
         except StopSignal:
             end_by_sigterm()
     return {}
@@ -247,28 +263,25 @@ def main(job: str, request: str, answer: str) -> None:
     set_passive_openmp_wait()
     given: dict[str, Any] = {}
     try:
-        given = read_object(Path(request))
-        result = _JOBS[job](given)
-    except ReplacedError as error:
-        why = f"{error.filename}: {error.strerror}: another attempt at the cell has begun"
-        result = {"error": why, "lost": True}
-    except RootMissingError as error:  # the sweep tells whether the store is gone
-        result = {"error": f"{error.filename}: it is no longer there"}
+        given = read_struct(Path(request), dict[str, Any])
+        result = Answer(_JOBS[job](given))
+    except _LostError as error:
+        result = Answer(error=str(error), lost=True)
     except UnreadableError as error:
-        result = {"error": str(error), "unreadable": True}
+        result = Answer(error=str(error), unreadable=True)
     except XrgsError as error:
-        result = {"error": str(error)}
+        result = Answer(error=str(error))
     except Exception as error:
         if not _store_is_gone(given):  # the sweep notices that by itself
             say(traceback.format_exc(), sys.stderr)
         number = error.errno if isinstance(error, OSError) else None
-        result = {"error": f"{type(error).__name__}: {error}", "errno": number}
+        result = Answer(error=f"{type(error).__name__}: {error}", errno=number)
     try:
-        write_json(Path(answer), result)
+        write_json(Path(answer).absolute(), msgspec.to_builtins(result))
     except OSError:
         say(traceback.format_exc(), sys.stderr)
         sys.exit(os.EX_IOERR)
-    if result.get("lost"):
+    if result.lost:
         sys.exit(os.EX_TEMPFAIL)
 
 

@@ -1,0 +1,42 @@
+"""Perceptual distance LPIPS."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from xrgs.evaluation.lpips import weights
+from xrgs.evaluation.metrics.base import check_pair
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+
+def lpips(image: Tensor, target: Tensor) -> float | None:
+    """Compute the perceptual distance LPIPS, version 0.1, with AlexNet (`alex` in gsplat).
+
+    Source: [zhang2018] "The unreasonable effectiveness of deep features as a perceptual
+    metric"; see `xrgs.evaluation.lpips.network`.
+
+    Args:
+        image: The render, [H, W, 3] in 0..1.
+        target: The photograph, [H, W, 3] in 0..1.
+
+    Returns:
+        The distance, 0 where the images are identical; None (n/a in the tables) where this machine
+        has no weights, or a side of the images is too short for the network.
+
+    Raises:
+        ValueError: The shapes differ or are not [H, W, 3].
+        WeightsError: This machine's weights are not the published ones.
+    """
+    check_pair(image, target)
+    published = weights.load_published()
+    if published is None:
+        return None
+    import torch
+
+    from xrgs.evaluation.lpips.network import MIN_SIDE, distance
+
+    if min(image.shape[:2]) < MIN_SIDE:
+        return None
+    return float(distance(image, target, {k: torch.from_numpy(v) for k, v in published.items()}))

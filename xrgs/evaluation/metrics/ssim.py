@@ -1,0 +1,46 @@
+"""Structural similarity, as kornia computes it."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from xrgs.evaluation.metrics.base import check_pair
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+#: Width of the window, px. It is part of the evaluation protocol and not taken from the training
+#: loss: another window there must not change what the scores mean.
+SSIM_WINDOW = 11
+
+
+def ssim(image: Tensor, target: Tensor) -> float:
+    """Compute the structural similarity, averaged over channels and pixels.
+
+    It is `kornia.metrics.ssim`: a Gaussian window of 11 x 11 px and sigma 1.5, data range 1,
+    borders reflected. gsplat's evaluation gives the same to the fourth digit.
+
+    Source: [wang2004] "Image quality assessment: from error visibility to structural
+    similarity".
+
+    Args:
+        image: The render, [H, W, 3] in 0..1.
+        target: The photograph, [H, W, 3] in 0..1.
+
+    Returns:
+        A value in -1..1; 1 where the images are identical.
+
+    Raises:
+        ValueError: The shapes differ, are not [H, W, 3], or a side is too short to be reflected.
+    """
+    from kornia import metrics
+
+    check_pair(image, target)
+    height, width = image.shape[:2]
+    if min(height, width) <= SSIM_WINDOW // 2:
+        raise ValueError(
+            f"an image of {width} x {height} px is too small for SSIM: each side must have more "
+            f"than {SSIM_WINDOW // 2} px"
+        )
+    planes, reference = (x.permute(2, 0, 1)[None] for x in (image, target))  # [1, 3, H, W]
+    return float(metrics.ssim(planes, reference, window_size=SSIM_WINDOW).mean())

@@ -1,0 +1,143 @@
+"""Digests of source code by its meaning: comments, docstrings and blank lines do not count.
+
+The digest is of text and not of a syntax tree, whose dump differs between versions of Python: the
+spans that `ast` and `tokenize` find are cut out of the text, and blank lines are dropped.
+"""
+
+from __future__ import annotations
+
+import ast
+import hashlib
+import io
+import re
+import tokenize
+from functools import cache
+from pathlib import Path
+
+from xrgs.errors import XrgsError
+
+PACKAGE = Path(__file__).parents[1]
+_SUFFIXES = frozenset({".py", ".cpp", ".h", ".txt"})
+#: Modules that define types alone: an import from them changes no result.
+_TYPING = frozenset({"__future__", "typing", "typing_extensions", "collections.abc", "_typeshed"})
+_TYPING |= {"numpy.typing"}
+#: Strings, raw strings and character literals of C++, which may hold what looks like a comment, and
+#: comments. A raw string ends with the delimiter that it begins with.
+_CPP = re.compile(
+    r'R"(?P<mark>[^(]*)\(.*?\)(?P=mark)"'
+    r"|\"(?:\\.|[^\"\\\n])*\"|(?<![0-9A-Fa-f])'(?:\\.|[^'\\\n])*'"  # but for the ' of 1'000
+    r"|(?P<comment>//[^\n]*|/\*.*?\*/)",
+    re.DOTALL,
+)
+#: Strings and line comments of CMake.
+_CMAKE = re.compile(r'"(?:\\.|[^"\\])*"|(?P<comment>#[^\n]*)', re.DOTALL)
+
+
+def code_digest(*names: str) -> str:
+    """Return a digest of source files of this package, 16 hexadecimal digits.
+
+    Args:
+        names: Files and folders, relative to the package; a folder stands for every source file
+            below it.
+    """
+    return digest_files({file.relative_to(PACKAGE).as_posix(): file for file in sources(*names)})
+
+
+def sources(*names: str) -> list[Path]:
+    """Return the source files that names stand for, see `code_digest`; sorted.
+
+    Raises:
+        XrgsError: There is no such file or folder.
+    """
+    found: set[Path] = set()
+    for name in names:
+        path = PACKAGE / name
+        if not path.exists():
+            raise XrgsError(f"{path}: this source file is missing; install xrgs again")
+        found.update(path.rglob("*") if path.is_dir() else [path])
+    return sorted(file for file in found if file.suffix in _SUFFIXES)
+
+
+def digest_files(files: dict[str, Path]) -> str:
+    """Return a digest of source files, 16 hexadecimal digits.
+
+    Args:
+        files: The files by the names that count for the digest.
+    """
+    sha256 = hashlib.sha256()
+    for name, file in sorted(files.items()):
+        sha256.update(f"{name}\0{_meaning_of(file, file.stat().st_mtime_ns)}\0".encode())
+    return sha256.hexdigest()[:16]
+
+
+@cache
+def _meaning_of(file: Path, _modified_ns: int) -> str:
+    """Return `meaning` of a file; a plan asks for the same files for each of its cells."""
+    content = file.read_bytes()
+    try:
+        return meaning(content.decode("utf-8"), file.suffix)
+    except UnicodeDecodeError:  # data in the package of a plugin
+        return hashlib.sha256(content).hexdigest()
+
+
+def meaning(text: str, suffix: str) -> str:
+    """Return source code without what does not change its results.
+
+    Args:
+        text: The source code.
+        suffix: `.py`, `.cpp`, `.h`, `.cu` or `.txt` (CMake); other text is returned as it is.
+    """
+    if suffix == ".py":
+        text = _cut(text, _python_spans(text))
+    elif suffix in {".cpp", ".h"}:
+        text = _CPP.sub(lambda match: " " if match["comment"] else match[0], text)
+    elif suffix == ".txt":
+        text = _CMAKE.sub(lambda match: "" if match["comment"] else match[0], text)
+    return "\n".join(line for line in map(str.rstrip, text.splitlines()) if line.strip())
+
+
+_Span = tuple[tuple[int, int], tuple[int, int]]
+"""Start and end of a part of a text: lines from 1, columns from 0."""
+
+
+def _python_spans(text: str) -> list[_Span]:
+    """Return the parts of Python code that change no result, in characters."""
+    lines = text.splitlines(keepends=True)
+
+    def span(node: ast.stmt) -> _Span:
+        # `ast` counts columns in bytes of UTF-8.
+        def position(line: int, column: int) -> tuple[int, int]:
+            return line, len(lines[line - 1].encode()[:column].decode())
+
+        end = position(node.end_lineno or node.lineno, node.end_col_offset or 0)
+        return position(node.lineno, node.col_offset), end
+
+    statements = (node for node in ast.walk(ast.parse(text)) if isinstance(node, ast.stmt))
+    spans = [span(node) for node in statements if _is_idle(node)]
+    tokens = tokenize.generate_tokens(io.StringIO(text).readline)
+    return spans + [(token.start, token.end) for token in tokens if token.type == tokenize.COMMENT]
+
+
+def _is_idle(node: ast.stmt) -> bool:
+    """Return whether a statement is a docstring, or an import or a block for types alone."""
+    match node:
+        case ast.Expr(value=ast.Constant(value=str())):  # docstrings of attributes too
+            return True
+        case ast.ImportFrom(module=str(module)):
+            return module in _TYPING
+        case ast.If(test=ast.Name(id="TYPE_CHECKING"), orelse=[]):
+            return True
+    return False
+
+
+def _cut(text: str, spans: list[_Span]) -> str:
+    """Return a text without some of its parts, which may overlap."""
+    lines = text.splitlines(keepends=True)
+    for (first, start), (last, end) in spans:
+        for number in range(first - 1, last):
+            line = lines[number].rstrip("\n")
+            left = start if number == first - 1 else 0
+            right = end if number == last - 1 else len(line)
+            # Columns stay what they are for other parts of the same line.
+            lines[number] = line[:left] + " " * (right - left) + line[right:] + "\n"
+    return "".join(lines)

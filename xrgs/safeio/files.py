@@ -1,0 +1,156 @@
+"""What `pathlib` lacks: bounded reads, walks, removal of whatever is there, and fsync.
+
+A store is its owner's: paths in it are plain `Path`s, and links in it are followed. What comes from
+somebody else is checked once, by `xrgs-store import`.
+"""
+
+from __future__ import annotations
+
+import errno
+import os
+import re
+import shutil
+import stat
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+#: The largest file that is read whole, in bytes. A sweep's record of ten thousand cells has 3 MB.
+MAX_BYTES = 1 << 26
+#: Errors that say what is there, or that nothing is. Every other error may be gone at the next try:
+#: permissions, a disk or a server that fails, too many open files.
+_CONCLUSIVE = frozenset(
+    {
+        errno.ENOENT,
+        errno.ENOTDIR,
+        errno.EISDIR,
+        errno.ELOOP,
+        errno.EINVAL,
+        errno.EFBIG,
+        errno.ENAMETOOLONG,
+        errno.ENXIO,
+    }
+)
+#: The longest name in bytes: file systems end at 255, and `.png` may be appended.
+_MAX_NAME_BYTES = 251
+_NOT_IN_NAMES = re.compile(r"[/\\\x00-\x1f\x7f-\x9f\ud800-\udfff]")
+
+
+def is_transient(error: OSError) -> bool:
+    """Return True for an I/O error that says nothing about the file's content: try again later.
+
+    Errors that libraries raise without a number are about the content.
+    """
+    return error.errno is not None and error.errno not in _CONCLUSIVE
+
+
+def is_name(value: object) -> bool:
+    """Return whether a value can name one file or folder on any file system.
+
+    A name is a string of at most 251 bytes without slash, backslash, control character or lone
+    surrogate, and is neither empty, `.` nor `..`. It may have any script, spaces and quotes.
+    """
+    if not isinstance(value, str) or value in {"", ".", ".."} or _NOT_IN_NAMES.search(value):
+        return False
+    return len(value.encode("utf-8")) <= _MAX_NAME_BYTES
+
+
+def is_inside(value: object) -> bool:
+    """Return whether a value is a relative path with `/` whose parts all satisfy `is_name`."""
+    return isinstance(value, str) and all(is_name(part) for part in value.split("/"))
+
+
+def list_names(folder: Path) -> list[str]:
+    """Return the sorted names in a folder; names that aren't UTF-8 have lone surrogates."""
+    return sorted(path.name for path in folder.iterdir())
+
+
+def walk_files(folder: Path) -> Iterator[tuple[str, os.stat_result]]:
+    """Yield each file below a folder: its path from there, with `/`, and its status.
+
+    Links to folders are files here, so that no walk is endless.
+    """
+    waiting = [""]
+    while waiting:
+        inside = waiting.pop()
+        with os.scandir(folder / inside) as entries:
+            for entry in entries:
+                name = f"{inside}{entry.name}"
+                if entry.is_dir(follow_symlinks=False):
+                    waiting.append(f"{name}/")
+                else:
+                    yield name, entry.stat(follow_symlinks=False)
+
+
+def file_bytes(path: Path) -> int:
+    """Return the bytes of the regular files at a path and below."""
+    found = [status for _, status in walk_files(path)] if path.is_dir() else [path.lstat()]
+    return sum(status.st_size for status in found if stat.S_ISREG(status.st_mode))
+
+
+def read_bytes(path: Path, max_bytes: int = MAX_BYTES) -> bytes:
+    """Read a regular file of at most `max_bytes`.
+
+    Raises:
+        OSError: The file is missing, larger (EFBIG) or not a regular file (EINVAL); it has the
+            path as `filename`.
+    """
+    # Opening a named pipe without O_NONBLOCK waits for its writer.
+    descriptor = os.open(path, os.O_RDONLY | os.O_CLOEXEC | os.O_NONBLOCK)
+    with open(descriptor, "rb") as stream:  # noqa: PTH123  of a descriptor
+        status = os.fstat(descriptor)
+        if not stat.S_ISREG(status.st_mode):
+            raise OSError(errno.EINVAL, "not a regular file", str(path))
+        if status.st_size > max_bytes:
+            why = f"{status.st_size} bytes, at most {max_bytes} are read"
+            raise OSError(errno.EFBIG, why, str(path))
+        return stream.read(max_bytes)
+
+
+def remove_path(path: Path) -> None:
+    """Remove a file, a link, or a folder with its content; do nothing where nothing is there.
+
+    The target of a link is never touched.
+    """
+    if path.is_dir() and not path.is_symlink():
+        shutil.rmtree(path)
+    else:
+        path.unlink(missing_ok=True)
+
+
+def sync_name(path: Path) -> None:
+    """Wait until the name of a file or folder is on the disk, after it was created or renamed.
+
+    Without this, a power failure can lose the name of a file whose content was synced.
+    """
+    _sync_folder(path.parent)
+
+
+def sync_tree(folder: Path) -> None:
+    """Wait until all files below a folder are on the disk, with their names.
+
+    The name of the folder itself is not waited for, see `sync_name`.
+    """
+    folders = {folder}
+    for name, status in walk_files(folder):
+        file = folder / name
+        folders.update(above for above in file.parents if above.is_relative_to(folder))
+        if stat.S_ISREG(status.st_mode):
+            with file.open("rb") as stream:
+                os.fsync(stream.fileno())
+    for inside in folders:
+        _sync_folder(inside)
+
+
+def _sync_folder(folder: Path) -> None:
+    descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
+    try:
+        os.fsync(descriptor)
+    except OSError as error:
+        # Some file systems cannot sync a folder.
+        if error.errno not in {errno.EINVAL, errno.ENOTSUP}:
+            raise OSError(error.errno, error.strerror, str(folder)) from None
+    finally:
+        os.close(descriptor)
