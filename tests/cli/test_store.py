@@ -13,32 +13,49 @@ from pathlib import Path
 
 import pytest
 
+from tests.cli.conftest import finish
 from xrgs.cli import store as command
-from xrgs.experiment.attempts import begin_attempt
+from xrgs.config import Conf
+from xrgs.experiment.attempts import begin_attempt, plan_cell
+from xrgs.experiment.cell_folder import CellFolder
+from xrgs.experiment.identity import cell_identity
+from xrgs.experiment.schema import RecordedCell
 from xrgs.experiment.store import Store
 
 Call = Callable[..., tuple[int, str, str]]
 
 
 @pytest.fixture
-def xrgs_store(call_command: Call, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Call:
-    """(*arguments) -> exit code, stdout and message of `xrgs-store` on a store of two cells."""
+def begun(tmp_path: Path, compose: Callable[..., Conf]) -> Callable[[str, int], CellFolder]:
+    """(id, steps) -> the folder of a cell whose training has begun."""
+
+    def begin(name: str, steps: int) -> CellFolder:
+        folder = Store(tmp_path / "s").cell(name)
+        conf = compose(f"train.steps={steps}")
+        plan_cell(folder, conf, cell_identity(conf, "v"))
+        begin_attempt(folder)
+        return folder
+
+    return begin
+
+
+@pytest.fixture
+def xrgs_store(
+    call_command: Call,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    begun: Callable[[str, int], CellFolder],
+) -> Call:
+    """(*arguments) -> exit code, stdout and stderr of `xrgs-store` on a store of two cells."""
     monkeypatch.setattr(command, "exit_on_signal", nullcontext)  # keep pytest's own handlers
     store = Store(tmp_path / "s")
     store.prepare()
-    for name in ("abc", "abd"):
-        folder = store.cell(name)
-        begin_attempt(
-            folder, {"train": {"steps": 3 if name == "abc" else 4}}, {"variant": "v", "seed": 0}
-        )
+    for name, steps in (("abc", 3), ("abd", 4)):
+        folder = begun(name, steps)
         (folder.path / "splats.ply").write_bytes(bytes(1000))
-        (folder.path / "scores.csv").write_text("view,psnr\na,20\nb,22\n")
-        (folder.path / "summary.json").write_text('{"gaussians": 17}')
-        folder.finish(["a", "b"], 1)
-    rows = [
-        {"cell_id": name, "label": label, "scene": "fern", "condition": "", "baseline_id": "abc"}
-        for name, label in (("abc", "baseline"), ("abd", "mip"))
-    ]
+        finish(folder, gaussians=17)
+    names = (("abc", "baseline"), ("abd", "mip"))
+    rows = [RecordedCell(name, label, "", "fern", 0, 0, "v", "abc") for name, label in names]
     store.write_sweep([], rows)
 
     def run(*arguments: str) -> tuple[int, str, str]:
@@ -119,8 +136,10 @@ def test_trim_keeps_what_tables_are_made_of(xrgs_store: Call, tmp_path: Path) ->
     assert xrgs_store("check")[0] == 0
 
 
-def test_packed_cells_are_a_store_again(xrgs_store: Call, tmp_path: Path) -> None:
-    begin_attempt(Store(tmp_path / "s").cell("abe"), {}, {})
+def test_packed_cells_are_a_store_again(
+    xrgs_store: Call, tmp_path: Path, begun: Callable[[str, int], CellFolder]
+) -> None:
+    begun("abe", 5)
     code, _, err = xrgs_store("pack", "--out", "study.zip")
     assert code == 1
     assert "--out study.zip: name the archive to write, FILE.tar.xz" in err
