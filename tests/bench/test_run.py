@@ -104,13 +104,11 @@ def test_a_file_is_timed(file: Path, tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["load=none.npz"], "none.npz: cannot be read"),
-        (["save=a.npz"], "save=FILE.npz needs cell=FOLDER and view=NAME"),
-        (["save=a.npz", "cell=nowhere", "view=a"], "cell=nowhere: is absent"),
-        (["repeats=0"], "repeats must be at least 1"),
-        (["against=none"], "against=none: must be the Python executable of an environment"),
-        (["repeats=many"], "repeats"),
-        (["lod=a.npz"], "lod"),
+        (["--load=none.npz"], "none.npz: cannot be read"),
+        (["--save=a.npz"], "--save FILE.npz needs --cell FOLDER and --view NAME"),
+        (["--save=a.npz", "--cell=nowhere", "--view=a"], "--cell nowhere: is absent"),
+        (["--repeats=0"], "repeats must be at least 1"),
+        (["--against=none"], "--against none: must be the Python executable of an environment"),
     ],
 )
 def test_bad_arguments_end_in_one_line(

@@ -92,7 +92,7 @@ def run(settings: Settings) -> str:
 
 def _save(file: str, settings: Settings) -> str:
     if settings.cell is None or settings.view is None:
-        raise XrgsError("save=FILE.npz needs cell=FOLDER and view=NAME")
+        raise XrgsError("--save FILE.npz needs --cell FOLDER and --view NAME")
     load = loads.load_from_cell(Path(settings.cell), settings.view)
     loads.write(Path(file), load)
     return f"{file}: {tables.describe(load.sizes)}"
@@ -135,7 +135,7 @@ def _measure(
         rows += rendering.time_load(one, methods, counts, repeats)
     if not rows:
         raise XrgsError(
-            f"load={settings.load}: is too large to time the torch backend on; build the native one"
+            f"--load {settings.load}: is too large to time the torch backend on; build the native one"
         )
     views = {"HR": step, "LR": step.downscaled(_LR_FACTOR)}
     shortcuts: list[Row] = []
