@@ -74,8 +74,7 @@ def _lpips(values: dict[str, str]) -> str:
 
 
 def _download(words: list[str], values: dict[str, str]) -> str:
-    from xrgs.capture.download.scenes import fetch_scenes
-    from xrgs.capture.download.settings import DatasetConf
+    from xrgs.capture.download.scenes import DatasetConf, fetch_scenes
 
     file = config.CONF_DIR / "data" / f"{words[0] if words else ''}.yaml"
     if not words or words[0] not in choices("data").split(", "):
