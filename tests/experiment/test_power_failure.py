@@ -22,6 +22,7 @@ from typing import Any, cast
 
 import numpy as np
 import pytest
+from xrgs.safeio.confined import ConfinedPath
 
 from xrgs.capture import dataset, images, mixing, scenes, variant
 from xrgs.capture.dataset import Dataset
@@ -31,7 +32,6 @@ from xrgs.experiment import cell
 from xrgs.experiment.attempts import begin_attempt
 from xrgs.experiment.cell_folder import CellFolder
 from xrgs.experiment.store import Store
-from xrgs.safeio.confined import ConfinedPath
 from xrgs.safeio.hashing import digest
 from xrgs.splat.backend import resolve_backend
 from xrgs.training.checkpoint import Checkpoint, CheckpointError
