@@ -12,7 +12,6 @@ from xrgs.experiment.schema import Identity, Provenance, RecordedCell, Summary
 from xrgs.safeio.atomic import write_json
 
 if TYPE_CHECKING:
-
     from xrgs.config import Conf
     from xrgs.experiment.cell_folder import CellFolder
 
