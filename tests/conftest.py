@@ -323,7 +323,7 @@ def call_command(
     """Return a function that runs a command in this process, in the folder `tmp_path`.
 
     Its arguments are (name, *arguments), the name without "xrgs-"; it returns the exit code, stdout
-    and the message of the error.
+    and stderr.
     """
 
     def call(name: str, *arguments: str) -> tuple[int, str, str]:
@@ -331,11 +331,14 @@ def call_command(
         monkeypatch.chdir(tmp_path)
         monkeypatch.setenv("OMP_WAIT_POLICY", os.environ.get("OMP_WAIT_POLICY", "passive"))
         monkeypatch.setattr(sys, "argv", [f"xrgs-{name}", *arguments])
+        code, message = 0, ""
         try:
             main()
         except SystemExit as end:
-            return 1, capsys.readouterr().out, str(end.code)
-        return 0, capsys.readouterr().out, ""
+            message = end.code if isinstance(end.code, str) else ""
+            code = 1 if message else int(end.code or 0)
+        out, err = capsys.readouterr()
+        return code, out, err + message
 
     return call
 

@@ -201,13 +201,13 @@ def test_a_damaged_variant_is_no_truth(
 
 
 def test_folders_have_labels_or_their_own_names() -> None:
-    assert parse("") == ()
-    assert parse("gsplat:out/a,/data/other,c:d:e") == (
+    assert parse([]) == ()
+    assert parse(["gsplat:out/a", "/data/other", "c:d:e"]) == (
         External("gsplat", Path("out/a")),
         External("other", Path("/data/other")),
         External("c", Path("d:e")),
     )
-    assert parse("./a:b") == (External("a:b", Path("a:b")),)
-    for wrong in ("gsplat:", "a:x,b/a"):
+    assert parse(["./a:b"]) == (External("a:b", Path("a:b")),)
+    for wrong in ("gsplat:", "a:x b/a"):
         with pytest.raises(ReportError, match="external="):
-            parse(wrong)
+            parse(wrong.split())

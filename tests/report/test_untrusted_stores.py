@@ -324,7 +324,7 @@ def test_of_many_pictures_the_first_are_drawn_and_the_rest_said(
 
     page, files = drawn()
     assert files == {"trade-off", "fern--a--training"}  # the baseline has no renders to show
-    assert "No picture of 4 more: only the first 3 are drawn; pictures=NAMES draws others" in page
+    assert "No picture of 4 more: only the first 3 are drawn; --pictures NAMES draws others" in page
     page, files = drawn(["fern--b--training", "fern--c--training", "trade-off", "fern--b"])
     assert files == {"fern--b--training", "fern--c--training", "trade-off"}
     assert "only the first" not in page

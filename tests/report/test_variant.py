@@ -68,21 +68,21 @@ def rgb(colour: str) -> list[int]:
 
 @pytest.mark.slow
 def test_a_variant_is_built_described_and_drawn(xrgs_data: Run, tmp_path: Path) -> None:
-    arguments = ("scene=motorcycle", "preset=smoke", "store=s", "out=sheet.png")
+    arguments = ("scene=motorcycle", "preset=smoke", "store=s", "--out=sheet.png")
     code, out, err = xrgs_data("inspect", *arguments)
     assert code == 0, err
     for text in ("motorcycle_left", "motorcycle_right", "250 x 165", "50 x 33", "2 of 2 views"):
         assert text in out
     drawn = (tmp_path / "sheet.png").read_bytes()
     folder = next((tmp_path / "s" / "variants").glob("[!.]*"))
-    code, again, err = xrgs_data("inspect", str(folder.relative_to(tmp_path)), "out=sheet.png")
+    code, again, err = xrgs_data("inspect", str(folder.relative_to(tmp_path)), "--out=sheet.png")
     assert code == 0, err
     assert again == out
     assert (tmp_path / "sheet.png").read_bytes() == drawn
 
-    code, out, err = xrgs_data("inspect", *arguments[:-1], "out=no/sheet.png")
+    code, out, err = xrgs_data("inspect", *arguments[:-1], "--out=no/sheet.png")
     assert code == 1
-    assert "out=no/sheet.png: can't be written" in err
+    assert "--out no/sheet.png: can't be written" in err
     image = next(folder.rglob("motorcycle_left.png"))
     image.write_bytes(image.read_bytes()[:-1])
     code, out, err = xrgs_data("inspect", str(folder))

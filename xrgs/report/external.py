@@ -43,18 +43,17 @@ class External:
     folder: Path
 
 
-def parse(text: str) -> tuple[External, ...]:
-    """Read the argument `external=LABEL:FOLDER,LABEL:FOLDER`.
+def parse(words: Sequence[str]) -> tuple[External, ...]:
+    """Read the words of `xrgs-report --external LABEL:FOLDER LABEL:FOLDER`.
 
     Args:
-        text: Folders, each with a label before it or named by the folder's own name; empty for
-            none.
+        words: Folders, each with a label before it or named by the folder's own name.
 
     Raises:
         ReportError: A label or a folder is empty, or two labels are the same.
     """
     found = []
-    for part in filter(None, text.split(",")):
+    for part in words:
         label, colon, folder = part.partition(":")
         if not colon or "/" in label:  # a path may have a colon
             label, folder = "", part
@@ -64,7 +63,9 @@ def parse(text: str) -> tuple[External, ...]:
             raise ReportError(f"external={part}: must be FOLDER or LABEL:FOLDER")
     labels = [one.label for one in found]
     if len(set(labels)) < len(labels):
-        raise ReportError(f"external={text}: two folders have the same label; use LABEL:FOLDER")
+        raise ReportError(
+            f"external={' '.join(words)}: two folders have the same label; use LABEL:FOLDER"
+        )
     return tuple(found)
 
 

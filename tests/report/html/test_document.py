@@ -138,7 +138,7 @@ def test_pictures_none_has_the_tables_alone(copied: Path) -> None:
     data = data_of(page)
     assert data["images"] == data["models"] == data["training"] == []
     assert [view["view"] for view in data["views"]] == ["IMG_001", "IMG_009"]
-    assert "pictures=none" in page.read_text()
+    assert "--pictures none" in page.read_text()
 
 
 @pytest.mark.parametrize(

