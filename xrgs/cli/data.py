@@ -89,7 +89,7 @@ def _download(words: list[str], values: dict[str, str]) -> str:
 
 
 def _inspect(words: list[str], values: dict[str, str]) -> str:
-    from xrgs.report import variant
+    from xrgs.capture.description import describe
 
     out = values.pop("out", None)
     if bool(words) == bool(values) or len(words) > 1:
@@ -102,7 +102,7 @@ def _inspect(words: list[str], values: dict[str, str]) -> str:
         conf = composing.compose(*overrides)
         store = Store(Path(conf.store))
         folder = store.variants / variants.find_or_build(conf, store)
-    return variant.describe(folder, Path(out) if out else None)
+    return describe(folder, Path(out) if out else None)
 
 
 def _export(words: list[str], values: dict[str, str]) -> str:
