@@ -1,4 +1,4 @@
-"""`xrgs-bench`: measures the run time, error and memory of the rasterizers, and of a store."""
+"""`xrgs-bench`: measures the run time, error and memory of rendering and training."""
 
 from __future__ import annotations
 
@@ -15,23 +15,19 @@ _HELP = """\
 xrgs-bench [KEY=VALUE]...
 
 Measures the run time of rendering and training on random loads, against their numerical error.
-With store_cells=N it measures planning, reporting and the cost of a job over a store of N cells.
 
-  repeats=9        times that each thing is measured, in turn with what it is compared to
-  threads=0        number of threads to measure beside 1; 0 for every core
+  repeats=9        how often each task is timed; tasks that are compared take turns
+  threads=0        number of threads to measure besides 1; 0 for one for each core
   seed=0           seed of the random loads
-  smoke=true       use tiny loads, to see whether everything runs
-  out=FOLDER       folder of the .csv files and bench.png; xrgs-bench by default
-  json=FILE        also write every figure to a JSON file
+  smoke=true       use tiny loads, to check that everything runs
+  out=FOLDER       folder of the .csv files and of bench.png; xrgs-bench by default
+  json=FILE        also write all results to a JSON file
 
-  load=FILE.npz    measure this load instead of the random ones
-  against=PYTHON   render and train with this installation and another in turn, the one of the
-                   environment of that Python executable; into against.csv
+  load=FILE.npz    measure the Gaussians and the view in this file instead of random ones
   save=FILE.npz cell=FOLDER view=NAME
-                   make such a load from a view of a trained cell, and measure nothing
-  quality=true cell=FOLDER steps=600
-                   train the cell again with each culling option changed, and compare renders
-  store_cells=N    measure planning, reporting and status over a store of N cells
+                   write such a file from a view of a trained cell, and measure nothing
+  against=PYTHON   time this installation and another in turn, the one in the environment of that
+                   Python executable; into against.csv
 """
 
 

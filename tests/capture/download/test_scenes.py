@@ -165,19 +165,6 @@ def test_offline_says_what_to_do_by_hand(
     assert (tmp_path / "data" / "llff" / "fern" / "images_4" / "1.png").is_file()
 
 
-def test_a_traversing_archive_writes_nothing(
-    xrgs_data: Run, server: Any, tmp_path: Path, llff: bytes
-) -> None:
-    archive = io.BytesIO(llff)
-    with zipfile.ZipFile(archive, "a") as made:
-        made.writestr("nerf_llff_data/fern/../../../../out.txt", b"x")
-    server.content = archive.getvalue()
-    code, _, err = xrgs_data("download", "llff", "fern", f"url={server.url}")
-    assert code == 1
-    assert "leads out of its folder" in err
-    assert {f.name for f in tmp_path.rglob("*") if f.is_file()} == {"nerf_llff_data.zip"}
-
-
 def test_a_folder_in_the_way_is_left_alone(
     xrgs_data: Run, server: Any, tmp_path: Path, llff: bytes
 ) -> None:

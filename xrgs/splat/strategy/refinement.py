@@ -1,13 +1,16 @@
-"""What densification is told at a step, and what it reports of it."""
+"""What a strategy is told at a step, and what it reports."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
 
-from torch import Tensor
+if TYPE_CHECKING:
+    from collections.abc import Callable, Mapping
 
-from xrgs.splat.gaussians import Gaussians
+    from torch import Tensor
+
+    from xrgs.splat.gaussians import Gaussians
 
 DECIDE = ("current_view", "per_class", "own_threshold")
 """The values of `Groups.decide`."""
@@ -17,16 +20,16 @@ _OPTIONAL = "pruned_by_components"
 
 @dataclass(frozen=True)
 class Refinement:
-    """What a step's densification did; all counts are 0 at most steps.
+    """What a strategy did after a step; all counts are 0 at most steps.
 
-    Each Gaussian removed is counted once, by the first rule that holds in the order below, so that
-    the number of Gaussians grows by exactly `duplicated + split - removed`.
+    A removed Gaussian is counted once, by the first rule that holds in the order below. So the
+    number of Gaussians grows by exactly `duplicated + split - removed`.
     """
 
     duplicated: int = 0
-    """Small Gaussians with a high gradient, each of which a copy was added of."""
+    """Small Gaussians with a high gradient that were copied."""
     split: int = 0
-    """Gaussians with a high gradient, each of which was replaced by two: the large ones, or with
+    """Gaussians with a high gradient that were replaced by two: the large ones, or with
     `split=long_axis` all that grow."""
     pruned_non_finite: int = 0
     """Gaussians with a parameter, or the exponential of a scale, that was infinite or NaN."""
@@ -35,7 +38,7 @@ class Refinement:
     pruned_scale: int = 0
     """Gaussians that were too large, with an opacity that was high enough."""
     pruned_by_components: int = 0
-    """Gaussians that components of training had removed (`Densifier.remove`)."""
+    """Gaussians that components of training chose (`Component.to_prune`)."""
     reset: int = 0
     """Gaussians whose opacity was lowered to the cap."""
     by_group: Mapping[str, int] = field(default_factory=dict)
@@ -45,15 +48,13 @@ class Refinement:
 
     @property
     def removed(self) -> int:
-        """Number of Gaussians pruned; those that a split replaced are not among them."""
+        """Number of pruned Gaussians, without the ones that a split replaced."""
         rules = self.pruned_non_finite + self.pruned_opacity + self.pruned_scale
         return rules + self.pruned_by_components
 
     def counts(self) -> dict[str, int]:
-        """Return the counts by name: those of the rules, then those of the groups.
-
-        `pruned_by_components` is there where it is not 0, so that no other run has a column of it.
-        """
+        """Return the counts of the rules by their names, then the counts of the groups."""
+        # `pruned_by_components` only where it is not 0: other runs have no column for it.
         left_out = {"by_group"} if self.pruned_by_components else {"by_group", _OPTIONAL}
         rules = {name: value for name, value in vars(self).items() if name not in left_out}
         return rules | dict(self.by_group)
@@ -61,7 +62,7 @@ class Refinement:
 
 @dataclass(frozen=True)
 class Thresholds:
-    """The two thresholds that groups of views may have of their own."""
+    """The two thresholds that may differ between groups of views."""
 
     grow_grad2d: float
     """A Gaussian grows if its mean image-plane gradient is above this (`DensifySettings`)."""
@@ -73,15 +74,15 @@ class Thresholds:
 class Groups:
     """Groups of views with thresholds of their own.
 
-    `decide` says which of them hold:
+    `decide` says which thresholds hold at a refinement:
 
     - `current_view`: all views add to one statistic, and the group of the view at whose step
       Gaussians are refined sets both thresholds.
     - `per_class`: each group has statistics of its own. A Gaussian grows where any group's mean
-      gradient is above that group's threshold. It is pruned by the threshold of one group: the
-      first, in the order given, in a view of which it had an image-plane gradient since the last
-      refinement (being in the view's frustum is not enough: in a forward-facing scene every
-      Gaussian is in every frustum), or the last group if it had none in any view.
+      gradient is above that group's threshold. It is pruned by the threshold of the first group,
+      in the order given, with a view in which the Gaussian had an image-plane gradient since the
+      last refinement, or of the last group if there is no such view. (To be in a view's frustum is
+      not enough: in a forward-facing scene every Gaussian is in every frustum.)
     - `own_threshold`: a Gaussian grows where the mean over all views of its gradient, each divided
       by the threshold of the view's own group, is above 1. It is pruned as with `per_class`.
 
@@ -103,19 +104,18 @@ def _nothing(gaussians: Gaussians) -> None:
 
 
 @dataclass(frozen=True)
-class DensifierHooks:
-    """What others decide at a step; each is asked with the N Gaussians, and None changes nothing.
+class StrategyHooks:
+    """What components of training decide; a hook takes the N Gaussians, None changes nothing.
 
-    All but `opacity_attenuation` are asked at refinements alone, with the Gaussians as the step's
-    optimizer has left them, and with gradients switched off.
+    A strategy calls `may_grow` and `growth_scores` at refinements alone, before it changes
+    anything, and without gradients.
     """
 
     may_grow: Callable[[Gaussians], Tensor | None] = _nothing
     """Returns [N] bool, which of the Gaussians above the growth threshold may grow."""
     growth_scores: Callable[[Gaussians], Tensor | None] = _nothing
-    """Returns scores [N] of at least 0. It is asked where a budget leaves room for some of the
-    Gaussians that would grow; those of the highest score do, None standing for the mean
-    image-plane gradient."""
+    """Returns scores [N] of at least 0, by which the Gaussians that grow are chosen where a budget
+    leaves room for some of them; None stands for the mean image-plane gradient."""
     opacity_attenuation: Callable[[Gaussians], Tensor | None] = _nothing
-    """Returns the factors [N] in 0..1 by which every render lowers the opacities. A reset, which
-    asks after the step's refinement, caps the lowered opacities."""
+    """Returns the factors [N] in 0..1 by which every render lowers the opacities. A reset caps the
+    lowered opacities; it comes after the step's refinement."""

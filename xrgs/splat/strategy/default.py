@@ -1,15 +1,11 @@
-"""Adaptive density control: growing, pruning and resetting Gaussians.
+"""Adaptive density control [kerbl2023, section 5.2] as gsplat's default strategy has it.
 
-3D Gaussian Splatting [kerbl2023, section 5.2], as `DefaultStrategy` of gsplat [ye2025]
-(`strategy/default.py` and `strategy/ops.py` of release 1.5.3) computes it: given the same inputs,
-the results are the same.
+Given the same inputs, the results are those of `DefaultStrategy` of gsplat [ye2025] 1.5.3, with two
+exceptions. Opacities are reset; gsplat 1.5.3 means to, but its `step % reset_every == 0 & step > 0`
+compares with `0 & step`, which pull request 776 mends. And a split draws its random numbers in
+double.
 
-One thing is as gsplat intends it and not as its release 1.5.3 does it. There the opacity reset
-never happens, since `step % reset_every == 0 & step > 0` compares with `0 & step` (its pull request
-776 mends it). And the random numbers of a split are drawn in double: those that torch draws in
-float32 depend on the processor.
-
-On the native backend, nothing here depends on the number of threads or on the processor.
+On the native backend the results do not depend on the number of threads or on the processor.
 """
 
 from __future__ import annotations
@@ -25,49 +21,62 @@ from torch import Tensor
 
 from xrgs.splat.backend import implementation
 from xrgs.splat.gaussians import PARAMETERS
-from xrgs.splat.growth import (
+from xrgs.splat.optimizer import SplatOptimizer
+from xrgs.splat.settings import DensifySettings
+from xrgs.splat.strategy.base import NO_HOOKS, Strategy
+from xrgs.splat.strategy.ops import (
     Budget,
-    best,
     gaussians_of,
     split_along_longest_axis,
     split_at_random,
+    top_k,
 )
-from xrgs.splat.optimizer import SplatOptimizer
-from xrgs.splat.refinement import DensifierHooks, Groups, Refinement, Thresholds
-from xrgs.splat.settings import DensifySettings
+from xrgs.splat.strategy.refinement import Groups, Refinement, StrategyHooks, Thresholds
 
 _OPAQUE = 1 - 2**-24
 """The largest opacity whose logit is finite in float32."""
 
 _COUNTED_BY_GROUP = ("grown", "pruned_opacity")
-_NO_HOOKS = DensifierHooks()
 
 
-class Densifier:
-    """Grows, prunes and resets Gaussians by the image-plane gradients since the last refinement.
+class DefaultStrategy(Strategy):
+    """Grows and prunes by the image-plane gradient: the default of 3D Gaussian Splatting.
 
-    Gaussians are refined at steps above `start` and below `stop` that `every` divides. Those whose
-    image-plane gradient, averaged over the views in which they were visible, is above `grow_grad2d`
-    are duplicated (where the largest scale is at most `grow_scale3d * scene_scale`) or split in
-    two. Then those with an opacity below `prune_opacity` are removed and, after step
-    `reset_every`, those with a scale above `prune_scale3d * scene_scale`. At steps above 0 and
-    below `stop` that `reset_every` divides, opacities are capped at `reset_opacity *
-    prune_opacity`. Without Gaussians, all of it does nothing.
+    gsplat's `DefaultStrategy` (`strategy/default.py`):
 
-    With `split=long_axis` all Gaussians that grow are split, along their longest axis. Within a
-    budget (`xrgs.splat.growth.Budget`) the best of them grow, up to the refinement's cap. Pruning,
-    which follows, makes room for the next refinement; nothing is removed for the budget itself.
+    - It refines at the steps above `start` and below `stop` that `every` divides. A Gaussian grows
+      if the mean norm of its image-plane gradient, over the views that showed it since the last
+      refinement, is above `grow_grad2d`.
+    - A growing Gaussian is duplicated if its largest scale is at most `grow_scale3d * scene_scale`,
+      else split in two.
+    - Then it prunes Gaussians with an opacity below `prune_opacity` and, after step `reset_every`,
+      those with a scale above `prune_scale3d * scene_scale`.
+    - At the steps above 0 and below `stop` that `reset_every` divides, it caps opacities at
+      `reset_opacity * prune_opacity`.
 
-    `groups` may replace `grow_grad2d` and `prune_opacity` by thresholds for each group of views.
-    The cap is then that of the largest opacity threshold, since the next refinement would prune
-    every opacity that is capped below its threshold. Where renders attenuate opacities, the
-    attenuated ones are capped, as by Mip-Splatting [yu2024]: capping the others would leave
-    Gaussians that are too faint to be rendered, and to be pruned.
+    gsplat has no counterpart of three options:
+
+    - With `split=long_axis` every growing Gaussian is split, along its longest axis.
+    - Within a budget (`xrgs.splat.strategy.ops.Budget`) the Gaussians of the highest scores grow,
+      up to the refinement's cap. Nothing is removed for the budget itself: what pruning removes
+      makes room for the next refinement.
+    - `groups` replaces `grow_grad2d` and `prune_opacity` by thresholds for each group of views.
 
     Attributes:
         grad2d_sum: [G, N] sum of the norms of the image-plane gradients, in normalised device
             units; G statistics, 1 unless each group has its own.
         visible_count: [G, N] number of views that were summed.
+
+    Example:
+        >>> strategy = DefaultStrategy(  # doctest: +SKIP
+        ...     optimizer, settings, scene_scale=1.0, generator=torch.Generator()
+        ... )
+        >>> for step in range(steps):  # doctest: +SKIP
+        ...     offset = torch.zeros(len(gaussians), 2, requires_grad=True)
+        ...     render = rasterize_parameters(..., means2d_offset=offset)
+        ...     photometric_loss(render.image, target, l1=0.8, ssim=0.2).backward()
+        ...     optimizer.step(camera)
+        ...     strategy.after_step(step, offset.grad, render.visible, width=w, height=h)
     """
 
     def __init__(
@@ -80,22 +89,15 @@ class Densifier:
         groups: Groups | None = None,
         view_pixels: int = 0,
     ) -> None:
-        """Start with empty statistics.
-
-        Args:
-            optimizer: The optimizer of the Gaussians, through which they are added and removed.
-            settings: The schedule, already scaled to the run's length, and the thresholds.
-            scene_scale: Extent of the scene, world units.
-            generator: Random generator that draws the means of the two halves of a split.
-            groups: Groups of views; None has one, with the thresholds of `settings`.
-            view_pixels: Number of pixels of the training view that has the most of them, which
-                `settings.budget` is multiplied by; not read where it is 0.
-        """
-        self.optimizer = optimizer
-        self.gaussians = optimizer.gaussians
-        self.settings = settings
-        self.scene_scale = scene_scale
-        self.generator = generator
+        """Start with empty statistics; `Strategy` explains the arguments."""
+        super().__init__(
+            optimizer,
+            settings,
+            scene_scale=scene_scale,
+            generator=generator,
+            groups=groups,
+            view_pixels=view_pixels,
+        )
         self.budget = (
             Budget(len(self.gaussians), gaussians_of(settings.budget, view_pixels))
             if settings.budget
@@ -122,26 +124,9 @@ class Densifier:
         width: int,
         height: int,
         group: str = "",
-        hooks: DensifierHooks = _NO_HOOKS,
+        hooks: StrategyHooks = NO_HOOKS,
     ) -> Refinement:
-        """Accumulate a step's statistics and, where the schedule says so, refine and reset.
-
-        Args:
-            step: Number of the step, from 0; the optimizer's step has been taken.
-            means2d_grad: [N, 2] gradient of the loss by the projected means, per px; None where
-                the render depends on no Gaussian: then there is nothing to accumulate.
-            visible: [N] bool, whether this step's view shows the Gaussian.
-            width: Width of the view, px.
-            height: Height of the view, px.
-            group: Group of the view; not read where there are no groups.
-            hooks: What others decide at this step.
-
-        Returns:
-            The counts of what was done.
-
-        Raises:
-            KeyError: There are groups, and the view's is none of them.
-        """
+        """Add to the statistics and, where the schedule says so, refine and reset."""
         settings = self.settings
         if step >= settings.stop:
             return Refinement()
@@ -157,14 +142,7 @@ class Densifier:
 
     @torch.no_grad()
     def remove(self, mask: Tensor) -> int:
-        """Remove Gaussians with their moments and statistics, at any step.
-
-        Args:
-            mask: [N] bool, which Gaussians.
-
-        Returns:
-            The number of Gaussians that were removed.
-        """
+        """Remove the Gaussians of `mask` [N] with their moments and statistics."""
         keep = ~mask
         self._keep(keep)
         self.grad2d_sum = self.grad2d_sum[:, keep]
@@ -180,20 +158,15 @@ class Densifier:
         }
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Set statistics and random generator to those of `state_dict`.
-
-        Args:
-            state: A result of `state_dict`. The optimizer has loaded its Gaussians already.
-
-        Raises:
-            KeyError: A part of the state is missing.
-            ValueError: The statistics are not of these groups and Gaussians.
-        """
+        """Restore the statistics and the state of the random generator."""
         self._clear_statistics()
         for name in ("grad2d_sum", "visible_count"):
             value, current = state[name], self.grad2d_sum
             if value.shape != current.shape or value.dtype != current.dtype:
-                raise ValueError(f"{name}: {value.dtype} {list(value.shape)} does not fit")
+                raise ValueError(
+                    f"{name} must be {current.dtype} {list(current.shape)}, got {value.dtype}"
+                    f" {list(value.shape)}"
+                )
         self.grad2d_sum, self.visible_count = state["grad2d_sum"], state["visible_count"]
         self.generator.set_state(state["generator"])
 
@@ -207,10 +180,10 @@ class Densifier:
 
     @torch.no_grad()
     def _refine(
-        self, step: int, deciding: Mapping[str, Thresholds], hooks: DensifierHooks
+        self, step: int, deciding: Mapping[str, Thresholds], hooks: StrategyHooks
     ) -> Refinement:
-        """Drop what is not finite, grow, prune, and start the statistics again."""
-        # Before growing would copy it, and before a hook renders.
+        """Remove what is not finite, grow, prune, and clear the statistics."""
+        # First, so that growing copies no such Gaussian and no hook renders one.
         dropped = self.remove(~self._finite())
         above, high_gradient = self._above_thresholds(deciding)  # [G, N], [N]
         growing = self._choose(high_gradient, step, hooks)  # [N]
@@ -231,7 +204,7 @@ class Densifier:
         return Refinement(pruned_non_finite=dropped, **grown, **pruned, by_group=by_group)
 
     def _above_thresholds(self, deciding: Mapping[str, Thresholds]) -> tuple[Tensor, Tensor]:
-        """Which Gaussians are above each growth threshold [G, N], and above the one that holds."""
+        """Return which Gaussians are above each growth threshold [G, N], and which may grow [N]."""
         grow = self.grad2d_sum.new_tensor([t.grow_grad2d for t in deciding.values()])  # [G]
         mean_grad2d = self.grad2d_sum / self.visible_count.clamp_min(1)  # [G, N]
         above = mean_grad2d > grow[:, None]  # [G, N]
@@ -240,28 +213,22 @@ class Densifier:
         of_threshold = (self.grad2d_sum / grow[:, None]).sum(dim=0)  # [N]
         return above, of_threshold > self.visible_count.sum(dim=0)
 
-    def _choose(self, candidates: Tensor, step: int, hooks: DensifierHooks) -> Tensor:
-        """Return which of the candidates [N] grow.
-
-        Args:
-            candidates: [N] bool, Gaussians above the growth threshold.
-            step: Number of the step.
-            hooks: What others decide at this step.
-        """
+    def _choose(self, candidates: Tensor, step: int, hooks: StrategyHooks) -> Tensor:
+        """Return which of the Gaussians above the growth threshold, `candidates` [N], grow."""
         may_grow = hooks.may_grow(self.gaussians)
         if may_grow is not None:
             candidates = candidates & may_grow
         if self.budget is None:
             return candidates
         start, last = self.settings.start, self.settings.last_refinement
-        progress = (step - start) / (last - start)  # this step is above start, and at most last
+        progress = (step - start) / (last - start)  # start < step <= last
         room = max(0, self.budget.cap(progress) - len(self.gaussians))
         if int(candidates.sum()) <= room:
             return candidates
         scores = hooks.growth_scores(self.gaussians) if room else None
         if scores is None:
             scores = self.grad2d_sum.sum(dim=0) / self.visible_count.sum(dim=0).clamp_min(1)
-        return best(candidates, scores, room)
+        return top_k(candidates, scores, room)
 
     @torch.no_grad()
     def _accumulate(
@@ -286,7 +253,7 @@ class Densifier:
         return finite
 
     def _deciding_row(self) -> Tensor:
-        """Return the first statistic [N] that is not 0 of each Gaussian, or else the last."""
+        """Return the first of the G statistics in which each Gaussian [N] is not 0, or the last."""
         has_gradient = self.grad2d_sum > 0  # [G, N]
         has_gradient[-1] = True
         return has_gradient.int().argmax(dim=0)
@@ -314,7 +281,7 @@ class Densifier:
         return {"duplicated": int(duplicate.sum()), "split": int(split.sum())}, parents
 
     def _halves(self, old: Mapping[str, Tensor]) -> dict[str, Tensor]:
-        """Return what replaces Gaussians that are split: raw parameters [2 M, ...] by name."""
+        """Return the halves of Gaussians that are split: raw parameters [2 M, ...] by name."""
         scales = self._activations.exp(old["scales"])  # [M, 3]
         if self.settings.split == "long_axis":
             return split_along_longest_axis(old, scales)
@@ -347,11 +314,14 @@ class Densifier:
         return counts, by_row.tolist()
 
     @torch.no_grad()
-    def _reset_opacities(self, hooks: DensifierHooks) -> int:
-        """Cap opacities above every threshold, with moments of zero; return how many fell."""
+    def _reset_opacities(self, hooks: StrategyHooks) -> int:
+        """Cap the opacities, with moments of zero; return how many were above the cap."""
+        # Above every group's threshold: the next refinement would prune what is capped below it.
         thresholds = self.group_thresholds.values() or [self.shared_thresholds]
         largest = max(threshold.prune_opacity for threshold in thresholds)
         cap_opacity = torch.tensor(self.settings.reset_opacity * largest, dtype=torch.float64)
+        # Where renders attenuate opacities, the attenuated ones are capped, as by Mip-Splatting
+        # [yu2024]: a cap of the others would leave Gaussians that are too faint to be rendered.
         attenuation = hooks.opacity_attenuation(self.gaussians)  # [N]
         if attenuation is not None:
             cap_opacity = (cap_opacity / attenuation.double()).clamp(max=_OPAQUE)
@@ -371,6 +341,6 @@ class Densifier:
         return largest
 
     def _keep(self, mask: Tensor) -> None:
-        """Remove all Gaussians but those of `mask` [N]; nothing is copied where it is all true."""
-        if not mask.all():
+        """Keep the Gaussians of `mask` [N] and remove all others."""
+        if not mask.all():  # else nothing needs to be copied
             self.optimizer.keep(mask)

@@ -15,9 +15,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor
 
-from xrgs.splat.densify import Densifier
 from xrgs.splat.gaussians import PARAMETERS, Gaussians
-from xrgs.splat.refinement import Groups, Refinement, Thresholds
+from xrgs.splat.strategy.default import DefaultStrategy
+from xrgs.splat.strategy.refinement import Groups, Refinement, Thresholds
 
 Refine = Callable[..., tuple[Gaussians, Refinement]]
 
@@ -64,17 +64,17 @@ def views_of(groups: str, count: int, rng: np.random.Generator) -> list[View]:
 
 
 @pytest.fixture(scope="session")
-def ours(make_densifier: Callable[..., Densifier]) -> Refine:
+def ours(make_strategy: Callable[..., DefaultStrategy]) -> Refine:
     def refine(
         values: dict[str, Tensor], views: list[View], groups: Groups | None, step: int = 600
     ) -> tuple[Gaussians, Refinement]:
         """The Gaussians after steps on some views, at the last of which they are refined."""
-        densifier = make_densifier(values, scene_scale=SCENE_SCALE, groups=groups)
+        strategy = make_strategy(values, scene_scale=SCENE_SCALE, groups=groups)
         refinement = Refinement()
         for view in views:
             width, height = SIZES[view.group]
             assert refinement == Refinement()
-            refinement = densifier.after_step(
+            refinement = strategy.after_step(
                 step if view is views[-1] else 1,
                 view.gradient,
                 view.visible,
@@ -82,7 +82,7 @@ def ours(make_densifier: Callable[..., Densifier]) -> Refine:
                 height=height,
                 group=view.group,
             )
-        return densifier.gaussians, refinement
+        return strategy.gaussians, refinement
 
     return refine
 
@@ -100,11 +100,11 @@ def gsplats(
     absgrad: bool = False,
 ) -> Counter[int]:
     """The same by gsplat, which has one pair of thresholds."""
-    from gsplat.strategy import DefaultStrategy
+    from gsplat.strategy import DefaultStrategy as GsplatStrategy
 
     params = {name: torch.nn.Parameter(value.clone()) for name, value in values.items()}
     optimizers = {name: torch.optim.Adam([params[name]]) for name in PARAMETERS}
-    strategy = DefaultStrategy(
+    strategy = GsplatStrategy(
         grow_grad2d=thresholds.grow_grad2d, prune_opa=thresholds.prune_opacity, absgrad=absgrad
     )
     state = strategy.initialize_state(SCENE_SCALE)

@@ -16,10 +16,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor
 
-from xrgs.splat.densify import Densifier
 from xrgs.splat.gaussians import PARAMETERS
-from xrgs.splat.refinement import Refinement
 from xrgs.splat.settings import DensifySettings, OptimizerSettings
+from xrgs.splat.strategy.default import DefaultStrategy
+from xrgs.splat.strategy.refinement import Refinement
 
 MakeBoth = Callable[..., tuple["Ours", "Theirs"]]
 
@@ -64,9 +64,9 @@ def random_view(count: int, rng: np.random.Generator, size: float = 2e-5) -> Vie
 
 
 class Ours:
-    def __init__(self, densifier: Densifier) -> None:
-        self.densifier = densifier
-        self.gaussians, self.optimizer = densifier.gaussians, densifier.optimizer
+    def __init__(self, strategy: DefaultStrategy) -> None:
+        self.strategy = strategy
+        self.gaussians, self.optimizer = strategy.gaussians, strategy.optimizer
 
     def descend(self, gradients: dict[str, Tensor]) -> None:
         for name in PARAMETERS:
@@ -74,7 +74,7 @@ class Ours:
         self.optimizer.step()
 
     def densify(self, step: int, view: View) -> Refinement:
-        return self.densifier.after_step(
+        return self.strategy.after_step(
             step, view.gradient, view.visible, width=WIDTH, height=HEIGHT
         )
 
@@ -88,7 +88,7 @@ class Theirs:
     """gsplat's strategy with an Adam a parameter, as its trainer has them."""
 
     def __init__(self, values: dict[str, Tensor], config: DensifySettings, seed: int) -> None:
-        from gsplat.strategy import DefaultStrategy
+        from gsplat.strategy import DefaultStrategy as GsplatStrategy
 
         self.params = {name: torch.nn.Parameter(value.clone()) for name, value in values.items()}
         rates = OptimizerSettings()
@@ -101,7 +101,7 @@ class Theirs:
             )
             for name in PARAMETERS
         }
-        self.strategy = DefaultStrategy(
+        self.strategy = GsplatStrategy(
             prune_opa=config.prune_opacity,
             grow_grad2d=config.grow_grad2d,
             grow_scale3d=config.grow_scale3d,
@@ -145,9 +145,9 @@ class Theirs:
 
 
 @pytest.fixture(scope="session")
-def make_both(make_densifier: Callable[..., Densifier]) -> MakeBoth:
+def make_both(make_strategy: Callable[..., DefaultStrategy]) -> MakeBoth:
     def make(values: dict[str, Tensor], config: DensifySettings, seed: int) -> tuple[Ours, Theirs]:
-        ours = Ours(make_densifier(values, config, scene_scale=SCENE_SCALE, seed=seed))
+        ours = Ours(make_strategy(values, config, scene_scale=SCENE_SCALE, seed=seed))
         return ours, Theirs(values, config, seed)
 
     return make
@@ -166,8 +166,8 @@ def assert_same(ours: Ours, theirs: Theirs) -> None:
         for key, value in their_state.items():
             assert torch.equal(mine_state[key], value), (name, key)
     if theirs.state["grad2d"] is not None:
-        assert torch.equal(ours.densifier.grad2d_sum[0], theirs.state["grad2d"])
-        assert torch.equal(ours.densifier.visible_count[0], theirs.state["count"])
+        assert torch.equal(ours.strategy.grad2d_sum[0], theirs.state["grad2d"])
+        assert torch.equal(ours.strategy.visible_count[0], theirs.state["count"])
 
 
 @settings(max_examples=60, deadline=None)

@@ -1,4 +1,4 @@
-"""Which Gaussians grow within a budget, and what replaces those that grow."""
+"""What strategies share: budgets, the choice of the highest scores, and splits."""
 
 from __future__ import annotations
 
@@ -27,16 +27,16 @@ HALF_OPACITY = 0.6
 
 @dataclass(frozen=True)
 class Budget:
-    """The most Gaussians that growing may lead to, which rises with densification.
+    """The largest number of Gaussians to which growth may lead, which rises during densification.
 
     The growth control of ImprovedGS [deng2025]: at a share p of the steps from the start of
-    densification to its last refinement, the most is
+    densification to its last refinement, the number is
 
         first + (most - first) * sqrt(p)
 
-    so that most Gaussians come early and have time to train. Its code has `most * sqrt(p)`, which
-    starts at 0 whatever the number of SfM points; to start at theirs is our choice. Where there
-    are more than `most` to begin with, nothing grows until pruning has brought them below it.
+    so that most Gaussians come early and have time to train. Our choice: the number starts at that
+    of the SfM points, where the authors' code has `most * sqrt(p)`. If there are more than `most`
+    points, nothing grows until pruning has left fewer.
     """
 
     first: int
@@ -45,7 +45,7 @@ class Budget:
     """The number of Gaussians at the end of densification."""
 
     def cap(self, progress: float) -> int:
-        """Return the most Gaussians there may be, at a share of densification in 0..1."""
+        """Return the largest number of Gaussians at a share of densification in 0..1."""
         first = min(self.first, self.most)
         return first + int((self.most - first) * math.sqrt(progress))
 
@@ -60,16 +60,16 @@ def gaussians_of(budget: float, view_pixels: int) -> int:
     return max(1, round(budget * view_pixels))
 
 
-def best(candidates: Tensor, scores: Tensor, count: int) -> Tensor:
-    """Choose the candidates of the highest scores, of equal ones those that come first.
+def top_k(candidates: Tensor, scores: Tensor, count: int) -> Tensor:
+    """Choose the candidates with the highest scores; of equal scores the first ones.
 
-    ImprovedGS [deng2025] draws candidates, with probabilities in proportion to their scores. To
-    take the best is our choice: it needs no random numbers.
+    ImprovedGS [deng2025] draws candidates with probabilities in proportion to their scores. Our
+    choice: the highest scores, which needs no random numbers.
 
     Args:
         candidates: [N] bool.
-        scores: [N] floats; one that is infinite or NaN counts as 0.
-        count: How many to choose, at least 0; all of them where there are fewer.
+        scores: [N] floats; a score that is infinite or NaN counts as 0.
+        count: How many to choose, at least 0; all candidates where there are fewer.
 
     Returns:
         [N] bool, the chosen candidates.
@@ -85,20 +85,20 @@ def best(candidates: Tensor, scores: Tensor, count: int) -> Tensor:
 def split_at_random(
     old: Mapping[str, Tensor], scales: Tensor, generator: torch.Generator
 ) -> dict[str, Tensor]:
-    """Return two smaller Gaussians for each, their means drawn from it (gsplat's `split`).
+    """Split each Gaussian into two smaller ones, with means drawn from it (gsplat's `split`).
 
     Args:
         old: Raw parameters [M, ...] for each name of `PARAMETERS`.
-        scales: [M, 3] their scales, world units.
+        scales: [M, 3] world units.
         generator: Draws the means.
 
     Returns:
-        Raw parameters [2 M, ...]: the first of each pair, then the second.
+        Raw parameters [2 M, ...]: the first half of every Gaussian, then the second.
     """
     # In double, since the numbers that torch draws in float32 depend on the processor.
     noise = torch.randn(2, len(scales), 3, generator=generator, dtype=torch.float64)
     along_axes = (noise.to(scales) * scales)[..., None, :]  # [2, M, 1, 3]
-    # [2, M, 3] each; added one by one, in an order that does not depend on the processor.
+    # [2, M, 3] each; written out, since the order in which torch adds depends on the processor.
     first, second, third = (rotation_matrices(old["quats"]) * along_axes).unbind(-1)
     offsets = first + second + third
     halves = {name: torch.cat([value, value]) for name, value in old.items()}
@@ -108,7 +108,7 @@ def split_at_random(
 
 
 def split_along_longest_axis(old: Mapping[str, Tensor], scales: Tensor) -> dict[str, Tensor]:
-    """Return two smaller Gaussians for each, side by side along its longest axis.
+    """Split each Gaussian into two smaller ones, side by side along its longest axis.
 
     The long-axis split of ImprovedGS [deng2025], with the constants of ImprovedGS+ [munoz2026]. For
     a mean m, scales s with the largest at k, rotation R and opacity o, the halves have
@@ -120,7 +120,7 @@ def split_along_longest_axis(old: Mapping[str, Tensor], scales: Tensor) -> dict[
 
     Args:
         old: Raw parameters [M, ...] for each name of `PARAMETERS`.
-        scales: [M, 3] their scales, world units.
+        scales: [M, 3] world units.
 
     Returns:
         Raw parameters [2 M, ...]: all halves on the positive side of the axis, then the others.
@@ -131,7 +131,7 @@ def split_along_longest_axis(old: Mapping[str, Tensor], scales: Tensor) -> dict[
     offset = LONG_AXIS_OFFSET * scales.gather(-1, longest) * direction
     shrink = torch.full_like(scales, math.log(SHORT_AXES_SHRINK))
     shrink.scatter_(-1, longest, math.log(LONG_AXIS_SHRINK))
-    # logit(f sigmoid(x)), in double: float32's logarithms depend on the processor.
+    # logit(f sigmoid(x)), in double, since float32's logarithms depend on the processor.
     rest = torch.tensor(math.log(1 - HALF_OPACITY), dtype=torch.float64)
     logits = math.log(HALF_OPACITY) - torch.logaddexp(rest, -old["opacities"].double())
     halves = {name: torch.cat([value, value]) for name, value in old.items()}

@@ -12,13 +12,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 from torch import Tensor
 
-from xrgs.splat.densify import Densifier
 from xrgs.splat.gaussians import PARAMETERS, Gaussians
-from xrgs.splat.growth import Budget, best, split_along_longest_axis
-from xrgs.splat.refinement import DensifierHooks, Refinement
 from xrgs.splat.settings import DensifySettings
+from xrgs.splat.strategy.default import DefaultStrategy
+from xrgs.splat.strategy.ops import Budget, split_along_longest_axis, top_k
+from xrgs.splat.strategy.refinement import Refinement, StrategyHooks
 
-MakeDensifier = Callable[..., Densifier]
+MakeStrategy = Callable[..., DefaultStrategy]
 
 SIDE = 20
 
@@ -38,14 +38,14 @@ def random_values(count: int, seed: int = 0) -> dict[str, Tensor]:
 
 
 def refine(
-    densifier: Densifier, step: int, norms: list[float], hooks: DensifierHooks | None = None
+    strategy: DefaultStrategy, step: int, norms: list[float], hooks: StrategyHooks | None = None
 ) -> Refinement:
     """Refine after one view in which all Gaussians have gradients of these norms."""
     gradient = torch.zeros(len(norms), 2)
     gradient[:, 1] = torch.tensor(norms) / (SIDE / 2)
     visible = torch.ones(len(norms), dtype=torch.bool)
-    return densifier.after_step(
-        step, gradient, visible, width=SIDE, height=SIDE, hooks=hooks or DensifierHooks()
+    return strategy.after_step(
+        step, gradient, visible, width=SIDE, height=SIDE, hooks=hooks or StrategyHooks()
     )
 
 
@@ -99,18 +99,18 @@ def test_an_extreme_opacity_stays_finite(opacity: float) -> None:
 
 
 def test_all_that_grow_are_split_and_no_random_number_is_drawn(
-    make_densifier: MakeDensifier,
+    make_strategy: MakeStrategy,
 ) -> None:
     values = random_values(6)
-    densifier = make_densifier(values, DensifySettings(split="long_axis"))
-    state = densifier.generator.get_state()
-    assert refine(densifier, 600, [1.0, 0, 1, 0, 1, 1]) == Refinement(split=4)
-    assert torch.equal(densifier.generator.get_state(), state)
+    strategy = make_strategy(values, DensifySettings(split="long_axis"))
+    state = strategy.generator.get_state()
+    assert refine(strategy, 600, [1.0, 0, 1, 0, 1, 1]) == Refinement(split=4)
+    assert torch.equal(strategy.generator.get_state(), state)
     grown = {name: value[[0, 2, 4, 5]] for name, value in values.items()}
     halves = split_along_longest_axis(grown, grown["scales"].exp())
     for name in PARAMETERS:
-        assert torch.equal(densifier.gaussians[name][:2].detach(), values[name][[1, 3]])
-        torch.testing.assert_close(densifier.gaussians[name][2:].detach(), halves[name])
+        assert torch.equal(strategy.gaussians[name][:2].detach(), values[name][[1, 3]])
+        torch.testing.assert_close(strategy.gaussians[name][2:].detach(), halves[name])
 
 
 # --- the budget ---------------------------------------------------------------------------------
@@ -153,96 +153,96 @@ def test_the_best_are_those_of_a_sorted_list(
         (index for index, candidate in enumerate(candidates) if candidate),
         key=lambda index: -scores[index] if math.isfinite(scores[index]) else 0.0,
     )
-    chosen = best(torch.tensor(candidates), torch.tensor(scores), count)
+    chosen = top_k(torch.tensor(candidates), torch.tensor(scores), count)
     assert chosen.nonzero()[:, 0].tolist() == sorted(ranked[:count])
 
 
-def densifier_within(
-    make_densifier: MakeDensifier, budget: float, count: int = 8, **settings: float
-) -> Densifier:
+def strategy_within(
+    make_strategy: MakeStrategy, budget: float, count: int = 8, **settings: float
+) -> DefaultStrategy:
     """A budget for each of 400 pixels, with refinements at steps 600, 700, 800 and 900."""
     schedule = DensifySettings(stop=1000, budget=budget, split="long_axis", **settings)  # type: ignore[arg-type]
-    return make_densifier(random_values(count), schedule, view_pixels=SIDE * SIDE)
+    return make_strategy(random_values(count), schedule, view_pixels=SIDE * SIDE)
 
 
-def test_the_best_candidates_grow_within_the_budget(make_densifier: MakeDensifier) -> None:
-    densifier = densifier_within(make_densifier, budget=12 / 400)
-    before = densifier.gaussians.sh0.detach().clone()
+def test_the_best_candidates_grow_within_the_budget(make_strategy: MakeStrategy) -> None:
+    strategy = strategy_within(make_strategy, budget=12 / 400)
+    before = strategy.gaussians.sh0.detach().clone()
     # A quarter of densification has passed: there may be 8 + 4 / 2, so two of the four grow.
     norms = [3e-4, 9e-4, 0.0, 5e-4, 1e-5, 7e-4, 0.0, 0.0]
-    assert refine(densifier, 600, norms) == Refinement(split=2)
-    assert torch.equal(densifier.gaussians.sh0[6:8].detach(), before[[1, 5]])
+    assert refine(strategy, 600, norms) == Refinement(split=2)
+    assert torch.equal(strategy.gaussians.sh0[6:8].detach(), before[[1, 5]])
 
 
-def test_scores_take_the_place_of_the_gradient(make_densifier: MakeDensifier) -> None:
-    densifier = densifier_within(make_densifier, budget=12 / 400)
-    before = densifier.gaussians.sh0.detach().clone()
+def test_scores_take_the_place_of_the_gradient(make_strategy: MakeStrategy) -> None:
+    strategy = strategy_within(make_strategy, budget=12 / 400)
+    before = strategy.gaussians.sh0.detach().clone()
     scores = torch.tensor([4.0, 1, 9, 3, 9, 2, 9, 9])
     norms = [3e-4, 9e-4, 0.0, 5e-4, 1e-5, 7e-4, 0.0, 0.0]
-    hooks = DensifierHooks(growth_scores=lambda _: scores)
-    assert refine(densifier, 600, norms, hooks) == Refinement(split=2)
-    assert torch.equal(densifier.gaussians.sh0[6:8].detach(), before[[0, 3]])
+    hooks = StrategyHooks(growth_scores=lambda _: scores)
+    assert refine(strategy, 600, norms, hooks) == Refinement(split=2)
+    assert torch.equal(strategy.gaussians.sh0[6:8].detach(), before[[0, 3]])
 
 
 def test_gaussians_that_are_not_finite_are_dropped_before_scores_are_asked_for(
-    make_densifier: MakeDensifier,
+    make_strategy: MakeStrategy,
 ) -> None:
-    densifier = densifier_within(make_densifier, budget=8 / 400)
-    densifier.gaussians.means.data[0] = torch.nan
-    before = densifier.gaussians.sh0.detach().clone()
+    strategy = strategy_within(make_strategy, budget=8 / 400)
+    strategy.gaussians.means.data[0] = torch.nan
+    before = strategy.gaussians.sh0.detach().clone()
 
     def scores(gaussians: Gaussians) -> torch.Tensor:
         assert gaussians.means.isfinite().all()  # what is rendered for the scores has to be
         return torch.tensor([0.0, 1, 2, 3, 4, 6, 5])
 
-    hooks = DensifierHooks(growth_scores=scores)
-    assert refine(densifier, 600, [1.0] * 8, hooks) == Refinement(pruned_non_finite=1, split=1)
-    assert torch.equal(densifier.gaussians.sh0[-1].detach(), before[6])
+    hooks = StrategyHooks(growth_scores=scores)
+    assert refine(strategy, 600, [1.0] * 8, hooks) == Refinement(pruned_non_finite=1, split=1)
+    assert torch.equal(strategy.gaussians.sh0[-1].detach(), before[6])
 
 
-def test_scores_are_asked_for_where_they_decide(make_densifier: MakeDensifier) -> None:
+def test_scores_are_asked_for_where_they_decide(make_strategy: MakeStrategy) -> None:
     asked = []
-    hooks = DensifierHooks(growth_scores=lambda gaussians: asked.append(len(gaussians)))
+    hooks = StrategyHooks(growth_scores=lambda gaussians: asked.append(len(gaussians)))
     for budget, norms in ((0.0, [1.0] * 8), (1.0, [1.0] * 8), (12 / 400, [0.0] * 8)):
-        refine(densifier_within(make_densifier, budget), 600, norms, hooks)
-    refine(densifier_within(make_densifier, 4 / 400), 600, [1.0] * 8, hooks)  # there is no room
+        refine(strategy_within(make_strategy, budget), 600, norms, hooks)
+    refine(strategy_within(make_strategy, 4 / 400), 600, [1.0] * 8, hooks)  # there is no room
     assert asked == []
-    refine(densifier_within(make_densifier, 12 / 400), 600, [1.0] * 8, hooks)
+    refine(strategy_within(make_strategy, 12 / 400), 600, [1.0] * 8, hooks)
     assert asked == [8]
 
 
-def test_pruning_makes_room_for_the_next_refinement(make_densifier: MakeDensifier) -> None:
-    densifier = densifier_within(make_densifier, budget=24 / 400)
+def test_pruning_makes_room_for_the_next_refinement(make_strategy: MakeStrategy) -> None:
+    strategy = strategy_within(make_strategy, budget=24 / 400)
     counts = []
     for step in (600, 700, 800, 900):
-        refine(densifier, step, [1.0] * len(densifier.gaussians))
-        counts.append(len(densifier.gaussians))
+        refine(strategy, step, [1.0] * len(strategy.gaussians))
+        counts.append(len(strategy.gaussians))
     # 8 + 16 sqrt(1/4, 2/4, 3/4, 1); all 8 may grow in the first.
     assert counts == [16, 19, 21, 24]
-    densifier = densifier_within(make_densifier, budget=24 / 400)
-    refine(densifier, 600, [1.0] * 8)
-    densifier.gaussians.opacities.data[:10] = -9.0
-    assert refine(densifier, 700, [0.0] * 16) == Refinement(pruned_opacity=10)
-    assert refine(densifier, 800, [1.0] * 6) == Refinement(split=6)
+    strategy = strategy_within(make_strategy, budget=24 / 400)
+    refine(strategy, 600, [1.0] * 8)
+    strategy.gaussians.opacities.data[:10] = -9.0
+    assert refine(strategy, 700, [0.0] * 16) == Refinement(pruned_opacity=10)
+    assert refine(strategy, 800, [1.0] * 6) == Refinement(split=6)
 
 
-def test_more_gaussians_than_the_budget_stay_and_do_not_grow(make_densifier: MakeDensifier) -> None:
-    densifier = densifier_within(make_densifier, budget=5 / 400)
+def test_more_gaussians_than_the_budget_stay_and_do_not_grow(make_strategy: MakeStrategy) -> None:
+    strategy = strategy_within(make_strategy, budget=5 / 400)
     for step in (600, 900):
-        assert refine(densifier, step, [1.0] * 8) == Refinement()
-    densifier.remove(torch.arange(8) >= 4)
-    densifier.settings.stop = 1100
-    assert refine(densifier, 1000, [1.0] * 4) == Refinement(split=1)
+        assert refine(strategy, step, [1.0] * 8) == Refinement()
+    strategy.remove(torch.arange(8) >= 4)
+    strategy.settings.stop = 1100
+    assert refine(strategy, 1000, [1.0] * 4) == Refinement(split=1)
 
 
-def test_a_budget_that_is_never_reached_changes_nothing(make_densifier: MakeDensifier) -> None:
+def test_a_budget_that_is_never_reached_changes_nothing(make_strategy: MakeStrategy) -> None:
     runs = []
     for budget in (0.0, 1e3):
         settings = DensifySettings(budget=budget)
-        densifier = make_densifier(random_values(30), settings, view_pixels=SIDE * SIDE)
+        strategy = make_strategy(random_values(30), settings, view_pixels=SIDE * SIDE)
         for step in (600, 700):
-            refine(densifier, step, [1.0] * len(densifier.gaussians))
-        runs.append(densifier.gaussians)
+            refine(strategy, step, [1.0] * len(strategy.gaussians))
+        runs.append(strategy.gaussians)
     assert all(torch.equal(runs[0][name], runs[1][name]) for name in PARAMETERS)
 
 
