@@ -86,7 +86,7 @@ def inspect(
     """
     from xrgs import composing
     from xrgs.cli.hydra_words import explained, with_quotes
-    from xrgs.report.variant import describe
+    from xrgs.capture.description import describe
     from xrgs.sweep import variants
 
     if not variant:
