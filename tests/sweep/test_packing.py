@@ -8,61 +8,64 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import msgspec
+import numpy as np
 import pytest
 
 from xrgs.capture import frozen
+from xrgs.capture.frozen import Manifest, ViewEntry
 from xrgs.errors import StoreError
-from xrgs.experiment.attempts import begin_attempt
 from xrgs.experiment.store import Store
 from xrgs.safeio.atomic import write_json
 from xrgs.safeio.hashing import file_digest
-from xrgs.sweep.inventory import summaries
 from xrgs.sweep.packing import Packed, pack
 
 CELLS = ("c1", "c2")
 
 
 @pytest.fixture
-def store(tmp_path: Path) -> Store:
+def store(cells: Any, tmp_path: Path) -> Store:
     """A store of two done cells on one variant, and the record of their sweep."""
-    store = Store(tmp_path / "my store")
-    store.prepare()
-    folder = store.variants / "new"
-    (folder / "images").make_folder()
-    (folder / "images" / "a.png").path.write_bytes(b"photograph")
-    (folder / frozen.LOG).path.write_text(f"{tmp_path}: matched")
-    for name in (frozen.POINTS, frozen.REPORT):
-        (folder / name).path.write_text(name)
-    manifest = {"key": "k", "files": {frozen.POINTS: file_digest(folder / frozen.POINTS)}}
-    variant_id = frozen.variant_id(manifest)
-    write_json(folder / frozen.MANIFEST, manifest)
-    folder.rename(store.variants / variant_id)
+    store: Store = cells.store
+    next(store.variants.iterdir()).rmdir()
+    variant_id = freeze(store)
     for name in CELLS:
-        add_cell(store, name, variant_id, tmp_path)
-    rows = [{"cell_id": name, "scene": "fern", "label": name} for name in CELLS]
+        path = f"{tmp_path}/data/fern" if name == "c1" else "/elsewhere/horns"
+        scene = replace(cells.conf.scene, path=path, name="a/b")
+        cell = cells.begin(name, {"variant": variant_id}, scene=scene)
+        (cell.path / "renders").mkdir()
+        (cell.path / "renders" / "a.png").write_bytes(b"render")
+        (cell.path / "splats.ply").write_bytes(b"Gaussians")
+        (cell.path / "log.txt").write_text(f"{tmp_path}: begun")
+        cells.finish(cell)
     command = ["+ablation=x,y", f"scene.path={tmp_path}/data/fern,/elsewhere/horns", "threads=1"]
-    store.write_sweep(command, rows)
+    store.write_sweep(command, [cells.row(name, "fern", name) for name in CELLS])
     return store
 
 
-def add_cell(store: Store, name: str, variant_id: str, here: Path) -> None:
-    config = {
-        "store": str(store.path),
-        "scene": {"path": f"{here}/data/fern", "views": [f"/elsewhere/{name}", 3], "name": "a/b"},
-    }
-    folder = store.cell(name)
-    begin_attempt(folder, config, {"variant": variant_id, "seed": 0})
-    (folder.path / "renders").mkdir()
-    (folder.path / "renders" / "a.png").write_bytes(b"render")
-    (folder.path / "splats.ply").write_bytes(b"Gaussians")
-    (folder.path / "log.txt").write_text(f"{here}: begun")
-    (folder.path / "scores.csv").write_text("view,psnr\na,20\n")
-    (folder.path / "summary.json").write_text('{"gaussians": 17}')
-    folder.finish(["a"], 1)
+def freeze(store: Store) -> str:
+    """Freeze a variant of two photographs; return its id."""
+    folder = store.variants / "new"
+    (folder / "images").mkdir(parents=True)
+    (folder / frozen.LOG).write_text("/home: matched")
+    for name in (frozen.POINTS, frozen.REPORT):
+        (folder / name).write_text(name)
+    views = []
+    for split in ("train", "test"):
+        (folder / "images" / f"{split}.png").write_bytes(b"photograph")
+        size, eye = (60, 40), np.eye(4).tolist()
+        file = f"images/{split}.png"
+        views.append(ViewEntry(split, split, file, "HR", *size, np.eye(3).tolist(), eye, 1.0))
+    files = {name: file_digest(folder / name) for name in (frozen.POINTS, *(v.file for v in views))}
+    manifest = Manifest("0123456789abcdef", "fern", 5, False, tuple(views), files)
+    manifest = msgspec.structs.replace(manifest, id=manifest.computed_id())
+    write_json(folder / frozen.MANIFEST, msgspec.to_builtins(manifest))
+    folder.rename(store.variants / manifest.id)
+    return manifest.id
 
 
 def pack_all(store: Store, out: Path) -> Packed:
-    return pack(store, summaries(store), out, out.parent)
+    return pack(store, store.cell_rows(), out, out.parent)
 
 
 def unpacked(archive: Path, folder: Path) -> Store:
@@ -89,17 +92,17 @@ def test_an_unpacked_store_is_the_store_trimmed(store: Store, tmp_path: Path) ->
         store.cell(name).trim()
         assert other.cell(name).state().name == "done"
         assert other.cell(name).verify() == []
-        assert other.cell(name).trimmed() == store.cell(name).trimmed() != {}
+        assert other.cell(name).status().trimmed == store.cell(name).status().trimmed != {}
     other.verify_sweep(other.sweep_ids()[0])
     columns = ["cell_id", "psnr", "gaussians"]
     assert other.cells()[columns].equals(store.cells()[columns])
     kept = set(contents(other))
-    (variant,) = other.variants.names()
+    (variant,) = (path.name for path in other.variants.iterdir())
     assert kept == {
         *(
             f"cells/{cell}/{file}"
             for cell in CELLS
-            for file in store.cell(cell).trimmed_status()["files"]
+            for file in store.cell(cell).trimmed_status().files
         ),
         *(f"cells/{cell}/status.json" for cell in CELLS),
         *(f"variants/{variant}/{file}" for file in (frozen.MANIFEST, frozen.POINTS, frozen.REPORT)),
@@ -115,20 +118,23 @@ def test_full_paths_become_relative(store: Store, tmp_path: Path) -> None:
     pack_all(store, tmp_path / "a.tar.xz")
     other = unpacked(tmp_path / "a.tar.xz", tmp_path / "other")
     assert not any(str(tmp_path).encode() in content for content in contents(other).values())
-    assert json.loads((other.cell("c1").path / "config.json").read_text()) == {
-        "store": "my store",
-        "scene": {"path": "data/fern", "views": ["c1", 3], "name": "a/b"},
-    }
-    command = other.sweep_record()["command"]
-    assert command == ["+ablation=x,y", "scene.path=data/fern,horns", "threads=1"]
+    confs = [other.cell(name).config() for name in CELLS]
+    assert [(conf.store, conf.scene.path, conf.scene.name) for conf in confs] == [
+        ("s", "data/fern", "a/b"),
+        ("s", "horns", "a/b"),
+    ]
+    command = other.sweep_record().command
+    assert command == ("+ablation=x,y", "scene.path=data/fern,horns", "threads=1")
 
 
-def test_the_records_are_those_of_the_sweeps_that_are_named(store: Store, tmp_path: Path) -> None:
+def test_the_records_are_those_of_the_sweeps_that_are_named(
+    store: Store, cells: Any, tmp_path: Path
+) -> None:
     (first,) = store.sweep_ids()
-    second = store.write_sweep(["+ablation=x"], [{"cell_id": "c1", "scene": "fern", "label": "x"}])
-    cells = summaries(store)
+    second = cells.record(("c1", "fern", "x"))
+    rows = store.cell_rows()
     for sweeps, ids in (((), {first, second}), ((second,), {second})):
-        packed = pack(store, cells, tmp_path / "a.tar.xz", tmp_path, sweeps)
+        packed = pack(store, rows, tmp_path / "a.tar.xz", tmp_path, sweeps)
         assert (packed.cells, packed.sweeps) == (2, len(ids))
         other = unpacked(tmp_path / "a.tar.xz", tmp_path / f"of {len(ids)}")
         assert {*other.sweep_ids()} == ids
@@ -145,25 +151,15 @@ def damage_scores(cell: Path) -> str:
     return "scores.csv: it has changed since the cell finished"
 
 
-def escape(cell: Path) -> str:
-    return change_files(
-        cell, {"../../sweeps/x": {"bytes": 1, "sha256": ""}}, "not a file of this cell"
-    )
-
-
 def malformed(cell: Path) -> str:
-    return change_files(cell, {"scores.csv": 3}, "a file is malformed")
-
-
-def change_files(cell: Path, files: dict[str, Any], message: str) -> str:
     status = json.loads((cell / "status.json").read_text())
-    write_json(cell / "status.json", status | {"files": status["files"] | files})
-    return message
+    write_json(cell / "status.json", status | {"files": status["files"] | {"../x": 3}})
+    return "damaged: "
 
 
-@pytest.mark.parametrize("damage", [damage_scores, escape, malformed])
+@pytest.mark.parametrize("damage", [damage_scores, malformed])
 def test_a_damaged_cell_is_left_out_and_named(store: Store, tmp_path: Path, damage: Any) -> None:
-    cells = summaries(store)
+    cells = store.cell_rows()
     message = damage(store.cell("c1").path)
     packed = pack(store, cells, tmp_path / "a.tar.xz", tmp_path)
     assert packed.cells == 1
@@ -175,10 +171,10 @@ def test_a_damaged_cell_is_left_out_and_named(store: Store, tmp_path: Path, dama
 
 
 def test_a_damaged_variant_or_record_is_left_out_and_named(store: Store, tmp_path: Path) -> None:
-    cells = summaries(store)
-    (variant_id,) = store.variants.names()
-    (store.variants / variant_id / frozen.POINTS).path.write_bytes(b"other points")
-    cells = [replace(cell, names=replace(cell.names, sweeps=("gone",))) for cell in cells]
+    cells = store.cell_rows()
+    (folder,) = store.variants.iterdir()
+    (folder / frozen.POINTS).write_bytes(b"other points")
+    cells = [replace(cell, sweeps=("gone",)) for cell in cells]
     packed = pack(store, cells, tmp_path / "a.tar.xz", tmp_path)
     assert (packed.cells, packed.variants, packed.sweeps) == (2, 0, 0)
     variant, record = packed.left_out
@@ -201,4 +197,4 @@ def test_what_can_not_be_written_is_named_and_an_old_archive_is_kept(
     with pytest.raises(StoreError, match=r"a\.tar\.xz: No space left on device"):
         pack_all(store, out)
     assert out.read_bytes() == b"old"
-    assert {path.name for path in tmp_path.iterdir()} == {"a.tar.xz", "my store"}
+    assert {path.name for path in tmp_path.iterdir()} == {"a.tar.xz", "s"}

@@ -29,7 +29,7 @@ STATES = ("done", "running", "planned", "unfinished", "failed", "corrupt", "unkn
 _MAX_LISTED = 6
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class CellRow:
     """One cell of a store."""
 

@@ -1,8 +1,8 @@
 """Trains a finished cell again from its folder alone, and compares the results.
 
 The cell's config says how to train, and its identity names the variant to train on. Differences of
-the program, its libraries and the machine are reported before the training; they are the cause if
-the numbers differ.
+the program, its libraries and the machine are reported before the training: they explain other
+numbers.
 """
 
 from __future__ import annotations
@@ -58,7 +58,7 @@ class RerunResult:
     folder: CellFolder
     """The folder of the cell that was trained again."""
     before: list[str]
-    """Differences that were known before the training: of code, libraries and machine."""
+    """Differences of code, libraries and machine, known before the training."""
     differences: list[str]
     """Differences of the results; none if they are equal bit for bit."""
 
@@ -86,21 +86,20 @@ def rerun(
     Args:
         folder: The cell's folder, in a store or elsewhere.
         out: Folder to write to; by default `<folder>.rerun-1`, or the next free number.
-        store: The store that has the cell's variant, or in which it is built; by default the store
-            that the folder is in. The config's own store is not used: the folder may come from
-            another person.
+        store: The store that has the cell's variant, or in which the variant is built; by default
+            the store that the folder is in.
         threads: Number of threads; by default as many as the cell was trained with. No result
             should depend on it.
         photographs: Replaces the config's `scene.path`, if the variant has to be built.
-        plugins: Names of the components of other packages that may be imported. A cell that was
-            trained with one that is not named is refused: a store must not decide what is imported.
+        plugins: Names of the components of other packages that may be imported. A cell that needs
+            another one is refused: a store must not decide what is imported.
 
     Returns:
         The comparison.
 
     Raises:
-        XrgsError: The folder holds no finished cell, or a config with keys that there are no more;
-            the variant is missing and can't be built again; or the training failed.
+        XrgsError: The folder has no finished cell, or a config with unknown keys; the variant is
+            missing and can't be built again; or the training failed.
     """
     try:
         return _rerun(folder, out, store, threads, photographs, plugins)
@@ -141,10 +140,7 @@ def _rerun(
 
 
 def _read(original: CellFolder) -> tuple[Conf, Identity, dict[str, Any]]:
-    """Return the cell's config, its identity, and what was added to the config.
-
-    The config has the threads that the cell was trained with.
-    """
+    """Return the cell's config, with the threads of its training, its identity, and added keys."""
     if not original.path.is_dir():
         raise XrgsError(f"rerun={original.path}: there is no such folder")
     for name in ("config.json", "identity.json", "provenance.json", "status.json"):
@@ -178,7 +174,7 @@ def _check_plugins_allowed(original: CellFolder, conf: Conf, allowed: Sequence[s
 
 
 def _newer_keys(added: Mapping[str, Any]) -> Iterator[str]:
-    """Yield a line about the keys that the cell's config lacks, which is older than they are."""
+    """Yield a line on the keys that are newer than the cell's config."""
     if added:
         values = ", ".join(f"{key}={value}" for key, value in added.items())
         yield f"config.json lacks newer keys; their values in the baseline are taken: {values}"
@@ -187,10 +183,7 @@ def _newer_keys(added: Mapping[str, Any]) -> Iterator[str]:
 def _own_contradictions(
     original: CellFolder, then: Identity, now: Identity, added: Mapping[str, Any]
 ) -> Iterator[str]:
-    """Yield contradictions between the folder's own files, which somebody must have changed.
-
-    Its identity lacks the keys that were added to its config, too.
-    """
+    """Yield contradictions between the folder's own files: somebody has changed one of them."""
     state = original.state()
     if state.name != "done":
         yield f"the folder: {state.name}: {state.reason}"
@@ -198,6 +191,7 @@ def _own_contradictions(
     if _ID.fullmatch(named) and cell_id(then) != named:
         yield f"the folder: identity.json is that of cell {cell_id(then)}, not of {named}"
     not_in_config = {"arithmetic", "code", "variant"}
+    # The identity of an older cell lacks the newer keys too.
     newer = {f"{key}: None -> {_short(value)}" for key, value in added.items()}
     before, after = (_without(msgspec.to_builtins(one), not_in_config) for one in (then, now))
     for line in _changes(before, after):
@@ -325,12 +319,16 @@ def _differences(original: CellFolder, repeated: CellFolder) -> Iterator[str]:
         then, now = (getattr(cell.summary(), name) for cell in (original, repeated))
         if then != now:
             yield f"{name}: {_number(then)} -> {_number(now)}"
+    trimmed = original.status().trimmed
     for name in _RESULTS:
-        status = original.status()
-        then = status.files.get(name) or status.trimmed.get(name)
-        if then is None:
+        if name in trimmed:
+            then = trimmed[name].sha256
+        elif (original.path / name).is_file():
+            then = file_digest(original.path / name)
+        else:
             yield f"{name}: missing in {original.path}"
-        elif then.sha256 != file_digest(repeated.path / name):
+            continue
+        if then != file_digest(repeated.path / name):
             yield f"{name}: the bytes differ"
 
 
