@@ -1,8 +1,8 @@
 """Packs done cells, their variants and the records of sweeps into one archive, to publish a study.
 
-The archive has what tables are made of and what a sweep goes on from: everything that is left when
-cells and variants are trimmed, without logs, and without the full paths of photographs and stores
-that configs and commands name. Unpacked, it is a store. The store that is packed does not change.
+The archive is enough for tables, and for a sweep to continue. It has the files that trimmed cells
+and variants keep, without logs. Full paths of photographs and stores become relative. Unpacked, the
+archive is a store. The packed store does not change.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ _Files = dict[str, tuple[bytes, float]]
 
 @dataclass(frozen=True)
 class Packed:
-    """What was packed, and what was not."""
+    """The content of an archive."""
 
     cells: int
     variants: int
@@ -54,7 +54,7 @@ class Packed:
     bytes: int
     """The size of the archive."""
     left_out: tuple[str, ...]
-    """A line for each cell, variant and record that should have been packed, with the reason."""
+    """A line for each cell, variant and record that could not be packed, with the reason."""
 
     def __str__(self) -> str:
         parts = (
@@ -72,14 +72,11 @@ def pack(
 
     Args:
         store: The store.
-        cells: The cells to pack, all of them done.
+        cells: The cells to pack, which are done.
         out: The archive to write or replace, `.tar.xz`; its folder must exist.
-        here: The folder below which full paths in configs and commands are made relative; of a path
-            elsewhere only the last name is kept.
-        sweeps: Ids of the sweeps whose records are packed; empty for all that have such a cell.
-
-    Returns:
-        What was packed. What is damaged, or can't be read now, is left out and named.
+        here: Full paths below this folder become relative to it; other paths lose all but their
+            last name.
+        sweeps: Ids of the sweeps to pack; empty for every sweep with one of the cells.
 
     Raises:
         StoreError: `out` can't be written.

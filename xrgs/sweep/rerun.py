@@ -8,7 +8,6 @@ numbers.
 from __future__ import annotations
 
 import math
-import re
 from dataclasses import dataclass
 from itertools import count
 from pathlib import Path
@@ -21,7 +20,7 @@ from xrgs.errors import XrgsError
 from xrgs.experiment import provenance
 from xrgs.experiment.attempts import begin_attempt, plan_cell
 from xrgs.experiment.cell_folder import CellFolder
-from xrgs.experiment.identity import cell_id, cell_identity
+from xrgs.experiment.identity import cell_identity
 from xrgs.experiment.store import Store
 from xrgs.runtime.machine import usable_cores
 from xrgs.runtime.progress import log_line
@@ -47,8 +46,6 @@ _RESULTS = ("scores.csv", "history.csv", "splats.ply")
 _COUNTS = ("steps", "gaussians", "evaluations", "grow_grad2d")
 #: The most characters of a value that differs.
 _MAX_VALUE = 60
-_ID = re.compile(r"[0-9a-f]{16}")
-_VARIANT = re.compile(rf"{_ID.pattern}-{_ID.pattern}")
 
 
 @dataclass(frozen=True)
@@ -128,7 +125,7 @@ def _rerun(
     now = cell_identity(conf, identity.variant)
     before = [
         *_newer_keys(added),
-        *_own_contradictions(original, identity, now, added),
+        *_damage(original),
         *_other_program(original, conf, now),
     ]
     title = "differences from when the cell was trained"
@@ -180,23 +177,11 @@ def _newer_keys(added: Mapping[str, Any]) -> Iterator[str]:
         yield f"config.json lacks newer keys; their values in the baseline are taken: {values}"
 
 
-def _own_contradictions(
-    original: CellFolder, then: Identity, now: Identity, added: Mapping[str, Any]
-) -> Iterator[str]:
-    """Yield contradictions between the folder's own files: somebody has changed one of them."""
+def _damage(original: CellFolder) -> Iterator[str]:
+    """Yield a line on a folder with files that have changed since the cell finished."""
     state = original.state()
     if state.name != "done":
         yield f"the folder: {state.name}: {state.reason}"
-    named = original.id.partition(".")[0]
-    if _ID.fullmatch(named) and cell_id(then) != named:
-        yield f"the folder: identity.json is that of cell {cell_id(then)}, not of {named}"
-    not_in_config = {"arithmetic", "code", "variant"}
-    # The identity of an older cell lacks the newer keys too.
-    newer = {f"{key}: None -> {_short(value)}" for key, value in added.items()}
-    before, after = (_without(msgspec.to_builtins(one), not_in_config) for one in (then, now))
-    for line in _changes(before, after):
-        if line not in newer:
-            yield f"identity.json against config.json: {line}"
 
 
 def _other_program(original: CellFolder, conf: Conf, now: Identity) -> Iterator[str]:
