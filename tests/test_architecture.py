@@ -69,7 +69,6 @@ LIGHT = (
     "sweep.monitor",
     "sweep.rerun",
     "sweep.session",
-    "sweep.show",
     "sweep.status",
     "sweep.study",
     "sweep.variants",

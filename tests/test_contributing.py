@@ -133,6 +133,21 @@ def test_a_metric_is_added_rescored_and_in_the_table(copy: Copy) -> None:
     copy.run("store", "check", "--store", "s")
 
 
+def test_a_launcher(copy: Copy) -> None:
+    copy.follow("launcher")
+    script = (
+        "from xrgs.sweep.launch import capacity\n"
+        "found = capacity({'_target_': 'hydra_plugins.rq.RQLauncher'}, 3, machine=8)\n"
+        "assert found.threads(2, 8) == 3 and found.at_once is None, found\n"
+    )
+    done = subprocess.run(
+        [sys.executable, "-P", "-c", script],
+        env=os.environ | {"PYTHONPATH": str(copy.root)},
+        check=False,
+    )
+    assert done.returncode == 0
+
+
 def test_a_refactoring_is_proven_and_keeps_its_cells(copy: Copy) -> None:
     copy.edit("splat/settings.py", "NOMINAL_STEPS = 30_000", "NOMINAL_STEPS = 3 * 10_000")
     assert "2 cells, 0 done" in done_cells(copy)

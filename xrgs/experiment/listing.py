@@ -268,7 +268,7 @@ def full_id(beginning: str, ids: Iterable[str], kinds: str = "cells") -> str:
     Args:
         beginning: An id, or the beginning of one id alone.
         ids: The ids to choose from.
-        kinds: What has these ids, for messages.
+        kinds: The things with these ids, for messages.
 
     Raises:
         StoreError: No id begins with it, or several do.

@@ -26,8 +26,8 @@ An owner is alive or dead by these rules:
   others.
 - The owner of a file that can't be read now counts as alive.
 
-Watching does not wait: `acquire` and `holders` look at a file, and what they saw counts at the
-next look of this process. Between two looks at most `BEAT_S` seconds are counted, so that an owner
+Watching does not wait: `acquire` and `holders` look at a file, and compare it with the last look of
+this process. Between two looks at most `BEAT_S` seconds are counted, so that an owner
 is not dead before its next heartbeat when a file server has answered nobody for a while.
 """
 
@@ -243,7 +243,7 @@ def holders(folder: Path) -> dict[str, str]:
 
 def _silent(age: float) -> str:
     if age < 0:
-        return f", whose lease is dated {format_duration(-age)} in the future; it may be dead"
+        return f"; its lease is dated {format_duration(-age)} in the future; it may be dead"
     return f", silent for {format_duration(age)}; it may be dead"
 
 
@@ -308,7 +308,7 @@ def _look(file: Path) -> tuple[_State, float]:
     except FileNotFoundError:
         return _State.RELEASED, 0.0
     except OSError as error:
-        # A folder or a pipe is no lease: no process holds anything by it.
+        # A folder or a pipe is not a lease of any process.
         return (_State.ALIVE if is_transient(error) else _State.DEAD), 0.0
     owner = _parse(content)
     if owner is None or not owner.here:

@@ -50,7 +50,7 @@ class ProgressFile:
 
     path: Path
     note: str = ""
-    """What else is to be shown of the work now; written with the next count."""
+    """More on the work, shown with the next count."""
 
 
 _file: ContextVar[ProgressFile | None] = ContextVar("file", default=None)
@@ -62,7 +62,7 @@ class Progress(msgspec.Struct, frozen=True):
     what: str
     """The work, for example `training`."""
     unit: str
-    """What is counted, in the singular, for example `step`."""
+    """The counted thing, in the singular, for example `step`."""
     done: _Count
     total: _Count | None
     """How many there are in all; None if unknown."""
@@ -113,9 +113,9 @@ class ProgressBar(_Tqdm):
 
         Args:
             what: The work, for example `training`.
-            unit: What is counted, in the singular; `byte` is shown in kB and MB.
+            unit: The counted thing, in the singular; `byte` is shown in kB and MB.
             total: How many there are in all; by default the length of `items`, if they have one.
-            items: What to iterate over and count; None to call `update` instead.
+            items: Items to iterate over and count; None to call `update` instead.
             done: How many were done before `items`.
         """
         self._file = _file.get()
@@ -166,7 +166,7 @@ def progress(
 
 
 def _write(file: Path, now: Progress) -> None:
-    # Progress is no result: it does no harm that it can't be written, or is lost with the power.
+    # Progress is not a result: nothing is lost when it can't be written.
     with suppress(OSError):
         write_json(file, msgspec.structs.asdict(now), durable=False)
 

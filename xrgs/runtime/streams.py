@@ -57,7 +57,7 @@ class _WriteErrorsIgnored(io.FileIO):
     """A file descriptor that reports every write as complete, whether it succeeded or not."""
 
     def write(self, data: ReadableBuffer) -> int:
-        """Write what can be written, and return the size of all of it."""
+        """Write as much as possible, and return the size of all data."""
         with suppress(OSError):
             return super().write(data)
         return memoryview(data).nbytes

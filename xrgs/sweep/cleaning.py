@@ -48,7 +48,7 @@ class Item:
     """One thing that is removed or trimmed."""
 
     kind: str
-    """What it is, in the plural: `cells of old code`."""
+    """The kind of thing, in the plural: `cells of old code`."""
     name: str
     """Its name for people."""
     bytes: int
@@ -60,7 +60,7 @@ class Item:
 
 @dataclass(frozen=True)
 class Plan:
-    """What is to be removed or trimmed, and what is left alone."""
+    """Things to remove or trim, and notes on things that are left alone."""
 
     verb: str
     """`remove` or `trim`."""
@@ -130,16 +130,16 @@ def plan_trim(
 
 
 def plan_gc(store: Store, cells: Sequence[CellRow], of: Sequence[str]) -> Plan:
-    """Plan to remove what no sweep of the installed code needs.
+    """Plan to remove everything that no sweep of the installed code needs.
 
     Args:
         store: The store.
         cells: All cells of the store.
-        of: Names of `GARBAGE`: cells of old code, failed tries (of cells and of scenes), folders
-            that were set aside, and variants of which no cell is left.
+        of: Names of `GARBAGE`: cells of old code, failed cells and scenes, folders that were set
+            aside, and variants without a cell.
 
     Raises:
-        XrgsError: A name is none of these.
+        XrgsError: A name is not one of these.
         StoreError: A folder of the store can't be listed.
     """
     for name in of:
@@ -209,7 +209,7 @@ def _without_running(cells: Iterable[CellRow]) -> tuple[list[CellRow], list[str]
 
 
 def _recorded(cells: Sequence[CellRow]) -> list[str]:
-    """Return a note of the done cells whose numbers reports of sweeps would lose."""
+    """Return a note on done cells that reports of sweeps would lose."""
     done = [cell for cell in cells if cell.state.name == "done" and cell.sweeps]
     if not done:
         return []
@@ -259,10 +259,8 @@ def _folders(kind: str, folders: Iterable[Path], *, leased: bool = False) -> Ite
 def _orphans(
     store: Store, cells: Sequence[CellRow], gone: set[str]
 ) -> tuple[list[Item], list[str]]:
-    """Return the variants of which no cell is left, and why others are left alone.
-
-    A running sweep has variants that none of its cells uses yet.
-    """
+    """Return the variants without a cell, and notes on variants that are left alone."""
+    # A running sweep has variants that none of its cells uses yet.
     if any(cell.state.name == "running" for cell in cells):
         return [], [_RUNNING]
     used = {cell.variant_id for cell in cells if cell.id not in gone}

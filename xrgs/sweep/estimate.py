@@ -1,4 +1,4 @@
-"""Estimates what a cell will take from the nearest finished cell of the store.
+"""Estimates the time, memory and disk of a cell from the nearest finished cell of the store.
 
 The config of the nearest cell differs in the fewest keys; another variant, processor or backend
 counts as several keys. Seconds, memory and disk are scaled by steps, pixels and the budget of
@@ -50,7 +50,7 @@ class _Sizes(NamedTuple):
 
 @dataclass(frozen=True)
 class Cost:
-    """What a cell is expected to take."""
+    """The expected time, memory and disk of a cell."""
 
     seconds: float
     """Time from its start to its end: training, loading and scoring."""
@@ -84,7 +84,7 @@ class CostEstimator:
     """Estimates the cost of cells from the finished cells of a store."""
 
     def __init__(self, store: Store) -> None:
-        """Read the newest finished cells; what can't be read is left out."""
+        """Read the newest finished cells; a cell that can't be read is left out."""
         self._store = store
         self._finished: list[_Finished] = []
         for cell in _newest(store):
@@ -121,7 +121,7 @@ class CostEstimator:
         )
 
     def cost(self, conf: Conf, variant_id: str | None, threads: int) -> Cost | None:
-        """Return what a cell is expected to take; None where no finished cell tells.
+        """Return the expected cost of a cell; None if the store has no finished cell.
 
         Args:
             conf: The cell's config.

@@ -160,7 +160,7 @@ def check(config: DictConfig, cell: DictConfig | None = None) -> None:
 
 
 class _JobConfigLoader:
-    """Gives each job Hydra's own settings and what it trains, without composing any config.
+    """Gives each job Hydra's own settings and the id of its cell, and composes no config.
 
     Launchers ask the config loader for a job's config, on the machine that runs the job. Hydra's
     loader would compose the cell's config a second time.
@@ -368,7 +368,7 @@ def _hand_over(cell: PlannedCell, threads: int, store: Store) -> list[str]:
         threads=cell.conf.threads or threads,
         scene=replace(scene, path=path),
     )
-    # What this process has watched for long enough need not be watched again by the job.
+    # The job need not watch a dead owner that this process has watched for long enough.
     lease.free_if_dead(store.leases, cell.cell_id)
     plan_cell(store.cell(cell.cell_id), conf, cell.identity)
     return [f"cell={cell.cell_id}", f"store={home}", f"name={cell.name}"]

@@ -155,11 +155,7 @@ def _read(original: CellFolder) -> tuple[Conf, Identity, dict[str, Any]]:
 
 
 def _check_plugins_allowed(original: CellFolder, conf: Conf, allowed: Sequence[str]) -> None:
-    """Refuse a cell whose config names a plugin that the user has not named.
-
-    Raises:
-        XrgsError: It names one; the message says what to add to the command.
-    """
+    """Refuse a cell with a plugin that the user has not named; the message says what to add."""
     names = set(conf.components.plugins)
     if not names <= set(allowed):
         text = ",".join(sorted(names))

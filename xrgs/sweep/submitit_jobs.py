@@ -1,6 +1,6 @@
-"""Follows the jobs of submitit's launchers one by one, and those of SLURM by its queue.
+"""Follows the jobs of submitit's launchers one by one, and SLURM's jobs by its queue.
 
-submitit raises at the first job that ends without an answer, which loses those of all others. It
+submitit raises at the first job that ends without an answer, and loses all other answers. It
 learns the end of a SLURM job from `sacct`, up to ten minutes late; where SLURM has no accounting,
 `sacct` does not answer, and submitit would wait for a killed job without end.
 """
@@ -57,7 +57,7 @@ class QueueWatcher(SlurmInfoWatcher):
 def follow() -> None:
     """Make submitit follow each job of this process by itself."""
     SlurmJob.watcher = QueueWatcher(delay_s=_LOOK_S)
-    # The launcher calls nothing else. Its jobs return what Hydra makes of their answers.
+    # The launcher calls nothing else of a job. A job returns a `JobReturn` of Hydra.
     Job.results = _results  # type: ignore[assignment, method-assign]
 
 

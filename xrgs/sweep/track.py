@@ -142,7 +142,7 @@ def _runs(store: Store, sweep_id: str) -> Iterator[Run]:
         try:
             yield run_of(store.cell(cell_id), row)
         except (StoreError, OSError, ValueError) as error:
-            log_line(f"{cell_id}: it is left out of what is tracked: {error}")
+            log_line(f"{cell_id}: it is not tracked: {error}")
 
 
 def _to_csv(runs: Iterable[Run], folder: Path, sweep_id: str) -> str:

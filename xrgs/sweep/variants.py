@@ -137,7 +137,7 @@ def _find_or_build(conf: Conf, store: Store, *, allow_build: bool) -> PlannedVar
     except XrgsError as error:
         if allow_build:
             store.check_not_gone()
-            # COLMAP dies of a full disk without saying so, which is no fault of the scene.
+            # COLMAP dies of a full disk without saying so. The scene is not at fault then.
             store.check_room()
         # The reason that the store keeps: a sweep that is planned again has the same record then.
         remembered = variant.failure(store.variants, key) if key else None

@@ -152,8 +152,8 @@ def _check_code(name: str, cell_id: str, conf: Conf, planned: Identity) -> None:
     if planned.arithmetic != here:
         raise XrgsError(
             f"{name}: cell {cell_id} was planned with the arithmetic {planned.arithmetic}, and this"
-            f" machine has {here}, which gives other last digits. Start the sweep on a machine like"
-            " those that train, or set splat.backend=torch"
+            f" machine has {here}, which gives other last digits. Start the sweep on a machine of"
+            " the same kind as the training ones, or set splat.backend=torch"
         )
 
 
