@@ -14,7 +14,6 @@ from xrgs.capture import degrade, images, registration, scenes, sfm
 from xrgs.capture.photographs import PhotoCollection, prepare_hr_views, write_degraded
 from xrgs.capture.sfm import Reconstruction
 from xrgs.config import SceneConf, SfmConf, VariantConf
-from xrgs.safeio.confined import ConfinedPath
 
 Make = Callable[..., VariantConf]
 
@@ -23,7 +22,7 @@ Make = Callable[..., VariantConf]
 def photos(configured: Make, tmp_path: Path) -> PhotoCollection:
     """The stereo pair, and a degraded copy of the right view that is 5 times smaller."""
     scene = scenes.resolve(
-        SceneConf(name="motorcycle", kind="motorcycle", path=None, views=24), ConfinedPath(tmp_path)
+        SceneConf(name="motorcycle", kind="motorcycle", path=None, views=24), tmp_path
     )
     conf = configured(long_side=185, degradation="downsample")
     made = prepare_hr_views(scene, conf, tmp_path)
@@ -145,7 +144,7 @@ def test_a_degraded_copy_of_full_size_is_given_as_it_is(
     configured: Make, sfm_conf: SfmConf, tmp_path: Path
 ) -> None:
     scene = scenes.resolve(
-        SceneConf(name="motorcycle", kind="motorcycle", path=None, views=24), ConfinedPath(tmp_path)
+        SceneConf(name="motorcycle", kind="motorcycle", path=None, views=24), tmp_path
     )
     conf = configured(long_side=185, degradation="jpeg")
     assert degrade.resolve_degradation(conf) == "jpeg"

@@ -10,7 +10,7 @@ import logging
 import time
 from collections import Counter
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -163,7 +163,7 @@ def _sfm_report(inputs: _Inputs, model: Reconstruction) -> dict[str, Any]:
         "cameras": len({photo.camera for photo in photos.all}),
         "unreadable": list(photos.unreadable),
         "not_registered": [n for i, n in enumerate(photos.names) if i not in model.viewmats],
-        "lenses": sorted({repr(lens) for lens in model.lenses.values()}),
+        "lenses": [asdict(lens) for lens in sorted(set(model.lenses.values()), key=repr)],
     }
 
 
