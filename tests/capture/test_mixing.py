@@ -15,7 +15,8 @@ import pycolmap
 import pytest
 
 from xrgs import config
-from xrgs.capture import degrade, images, mixing, registration, scenes, sfm
+from xrgs.capture import images, mixing, registration, scenes, sfm
+from xrgs.capture.degradations import resolve_degradation
 from xrgs.capture.scenes import Scene, procedural
 from xrgs.capture.sfm import Reconstruction, SfmImage
 from xrgs.capture.split import check_variant_conf
@@ -329,7 +330,7 @@ def test_every_variant_in_conf_is_valid(
 ) -> None:
     conf = compose(*([f"variant={name}"] if name else [])).variant
     check_variant_conf(conf)
-    assert (conf.tags, degrade.resolve_degradation(conf)) == (tags, degradation)
+    assert (conf.tags, resolve_degradation(conf)) == (tags, degradation)
 
 
 def test_every_variant_in_conf_is_tested() -> None:

@@ -16,7 +16,7 @@ from omegaconf.errors import ConfigAttributeError, ConfigKeyError, OmegaConfBase
 
 import xrgs
 from xrgs import composing, config
-from xrgs.capture.scenes.folder import ALL_BELOW
+from xrgs.capture.scenes.scene import ALL_BELOW
 from xrgs.composing import escape_interpolations
 from xrgs.errors import XrgsError, did_you_mean
 from xrgs.runtime.streams import ignore_broken_pipe, say

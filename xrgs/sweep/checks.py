@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from xrgs.capture.degrade import resolve_degradation
+from xrgs.capture.degradations import resolve_degradation
 from xrgs.capture.split import check_variant_conf
 from xrgs.errors import XrgsError
 from xrgs.evaluation.metrics import SSIM_WINDOW

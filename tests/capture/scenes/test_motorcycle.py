@@ -9,7 +9,7 @@ import pytest
 
 from xrgs.capture import images, scenes
 from xrgs.capture.scenes import motorcycle
-from xrgs.capture.scenes.bundled import bundled_photograph
+from xrgs.capture.scenes.scene import bundled_photograph
 from xrgs.config import SceneConf
 
 

@@ -12,7 +12,7 @@ from xrgs.capture import scenes
 from xrgs.capture.scenes import rendered
 from xrgs.errors import UnreadableError
 
-IMAGES = ("a.png", "b.png")
+VIEWS = ("a", "b")
 
 
 class Renderer:
@@ -23,21 +23,21 @@ class Renderer:
 
     def __call__(self, work: Path) -> None:
         self.count += 1
-        for name in IMAGES:
-            (work / name).write_text(f"the image {name}")
+        for view in VIEWS:
+            (work / f"{view}.png").write_text(f"the image {view}")
 
 
 @pytest.fixture
 def home(tmp_path: Path) -> Path:
     """The folder of a rendered scene."""
     home = tmp_path / "scenes/0123456789abcdef"
-    rendered.provide(home, IMAGES, Renderer())
+    rendered.provide(home, VIEWS, Renderer())
     return home
 
 
 def test_an_intact_scene_is_rendered_once(home: Path) -> None:
     render = Renderer()
-    rendered.provide(home, IMAGES, render)
+    rendered.provide(home, VIEWS, render)
     assert render.count == 0
     assert rendered.verify(home) == scenes.verify(home) == []
     assert json.loads((home / "scene.json").read_text())["fingerprint"] == home.name
@@ -69,7 +69,7 @@ def test_a_damaged_scene_is_set_aside_and_rendered_anew(
     (home / "mine.txt").write_text("kept")
     assert any(named in line for line in rendered.verify(home)) or damage == "other views"
     render = Renderer()
-    rendered.provide(home, IMAGES, render)
+    rendered.provide(home, VIEWS, render)
     assert render.count == 1
     assert rendered.verify(home) == []
     aside = tmp_path / "scenes" / ".0123456789abcdef.aside-1"
@@ -88,10 +88,10 @@ def test_a_scene_that_cant_be_read_now_is_not_rendered_over(
     unreadable(name)
     render = Renderer()
     with pytest.raises(UnreadableError, match=f"{name}: Input/output error"):
-        rendered.provide(home, IMAGES, render)
+        rendered.provide(home, VIEWS, render)
     assert f"{name}: Input/output error" in rendered.verify(home)[0]
     monkeypatch.undo()
-    rendered.provide(home, IMAGES, render)
+    rendered.provide(home, VIEWS, render)
     assert render.count == 0
 
 
@@ -118,5 +118,5 @@ def test_an_interrupted_rendering_leaves_no_scene(tmp_path: Path) -> None:
         raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        rendered.provide(home, IMAGES, fail)
+        rendered.provide(home, VIEWS, fail)
     assert not list((tmp_path / "scenes").iterdir())

@@ -14,6 +14,7 @@ import pytest
 
 from xrgs.capture import images, scenes
 from xrgs.capture.scenes import procedural
+from xrgs.capture.scenes.scene import bundled_photograph
 from xrgs.config import SceneConf
 from xrgs.errors import XrgsError
 
@@ -57,7 +58,7 @@ def test_the_fingerprint_follows_names_and_bytes_alone(fill: Fill, tmp_path: Pat
 
 
 def test_an_unknown_kind_names_the_key(tmp_path: Path) -> None:
-    with pytest.raises(XrgsError, match=r"scene\.kind=llff: unknown; must be one of procedural"):
+    with pytest.raises(XrgsError, match=r"scene.kind=llff: must be one of procedural"):
         scenes.resolve(SceneConf(name="x", kind="llff", path=str(tmp_path), views=24), tmp_path)
 
 
@@ -108,6 +109,16 @@ def test_two_processes_that_render_at_once_get_one_complete_scene(tmp_path: Path
     assert found[0].files == found[1].files
     assert all(images.read(file).shape == (45, 60, 3) for file in found[0].files.values())
     assert [p.name for p in tmp_path.iterdir() if p.name[0] != "."] == [found[0].fingerprint]
+
+
+@pytest.mark.parametrize("name", [file for file, _ in procedural.TEXTURES.values()])
+def test_the_photographs_are_in_the_installed_wheel(name: str) -> None:
+    assert images.read(bundled_photograph(name)).ndim == 3
+
+
+def test_a_photograph_that_the_wheel_lacks_is_named() -> None:
+    with pytest.raises(XrgsError, match=r"nothing\.png"):
+        bundled_photograph("nothing.png")
 
 
 def test_size_and_number_of_views_are_in_the_fingerprint() -> None:
