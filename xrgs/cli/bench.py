@@ -1,4 +1,4 @@
-"""`xrgs-bench`: measures the run time, error and memory of the rasterizers, and of a store."""
+"""`xrgs-bench`: measures the run time, error and memory of rendering and training."""
 
 from __future__ import annotations
 

@@ -14,7 +14,7 @@ from xrgs.splat.gaussians import ActivatedGaussians, Gaussians
 from xrgs.splat.settings import RasterSettings
 from xrgs.splat.sh import check_sh_degree
 
-#: Shape of one Gaussian's value; that of shN depends on how many bands it has.
+#: Shape of one Gaussian's value; the shape of shN depends on the number of bands.
 _SHAPES: dict[str, tuple[int, ...]] = {
     "means": (3,),
     "quats": (4,),

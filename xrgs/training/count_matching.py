@@ -76,7 +76,7 @@ def train_count_matched(
 ) -> TrainingResult:
     """Train until the number of Gaussians is `components.count_matched.gaussians`, above 0.
 
-    `splat.densify.grow_grad2d` is the first threshold. The other arguments are those of `train`;
+    `splat.densify.grow_grad2d` is the first threshold. The arguments are as for `train`;
     the checkpoint has the state of the search too.
 
     Returns:

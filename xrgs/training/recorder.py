@@ -33,7 +33,7 @@ class TrainingResult:
     """The trained model."""
     history: list[dict[str, Any]]
     """One row for each recorded step. `step`, `view`, `loss` and `gaussians` (their number before
-    the step's densification) are those of the step itself. `steps_HR`, `steps_LR`, the counts of
+    the step's densification) belong to the step itself. `steps_HR`, `steps_LR`, the counts of
     `Refinement`, `skipped_backward` (steps without a backward pass) and `skipped_shN` (steps that
     did not move shN) are totals since the start of training; the last two are columns only where
     there are such steps. Every other column is a component's log (`Step.log`): its mean over the

@@ -28,13 +28,13 @@ from xrgs.training.components.densify import Densify
 from xrgs.training.components.gradient_scaling import GradientScaling
 from xrgs.training.components.mip import Mip
 from xrgs.training.components.natural_selection import NaturalSelection
-from xrgs.training.registry import BUILT_IN, modules_of
 from xrgs.training.components.render_scale import RenderScale
 from xrgs.training.components.resolution_schedule import ResolutionSchedule
 from xrgs.training.components.skip_backward import SkipBackward
 from xrgs.training.components.supersampled import Supersampled
 from xrgs.training.components.view_scores import ErrorScore, MultiviewScore
 from xrgs.training.components.weighting import Weighting, weight_by_tag
+from xrgs.training.registry import BUILT_IN, modules_of
 
 Build = Callable[..., Components]
 
@@ -298,10 +298,13 @@ def test_all_are_on_together(build: Build, off: ComponentsConf) -> None:
 
 @pytest.mark.parametrize(
     ("module", "unused"),
-    [(".components", {"hydra"}), (".registry", {"torch", "numpy", "omegaconf", "hydra"})],
+    [
+        (".loop", {"hydra", *(f"xrgs.training.components.{e.module}" for e in BUILT_IN.values())}),
+        (".registry", {"torch", "numpy", "omegaconf", "hydra"}),
+    ],
 )
 def test_what_is_imported(module: str, unused: set[str]) -> None:
-    """Training needs no Hydra, and planning reads the registry without torch."""
+    """Training needs no Hydra and no component; planning reads the registry without torch."""
     code = f"import sys, xrgs.training{module}; print({unused!r} & set(sys.modules))"
     run = subprocess.run([sys.executable, "-P", "-c", code], capture_output=True, check=True)
     assert run.stdout.strip() == b"set()"

@@ -40,10 +40,6 @@ def _built(
     return components.build(conf, data, baseline.splat)
 
 
-def test_it_is_off_in_the_baseline(build: Build, off: ComponentsConf) -> None:
-    assert build(off) == ()
-
-
 def test_an_lr_view_is_rendered_twice_as_large_and_shows_the_same(
     build: Build, on: ComponentsConf, lr: Step
 ) -> None:

@@ -38,7 +38,7 @@ def step(adam: torch.optim.Adam, camera: Camera | None = None, sh_degree: int = 
     beta1, beta2 = adam.defaults["betas"]
     groups = {group["name"]: group for group in adam.param_groups}
     if camera is not None and groups["sh0"]["params"][0].grad is not None:
-        # Before the means move: directions of view are those of the render.
+        # Before the means move: the directions of view must be the render's.
         _step_harmonics(adam, groups, camera, sh_degree)
     entries, changed = [], []
     for name, group in groups.items():

@@ -47,7 +47,7 @@ class Strategy(ABC):
             settings: Schedule and thresholds; `DensifySettings.scaled` fits them to the run.
             scene_scale: Extent of the scene, world units.
             generator: Draws all random numbers of the strategy.
-            groups: Thresholds of groups of views; None has those of `settings` for all views.
+            groups: Thresholds of groups of views; None takes the ones in `settings` for all views.
             view_pixels: Number of pixels of the largest training view, which `settings.budget` is
                 multiplied by; only read where there is a budget.
         """

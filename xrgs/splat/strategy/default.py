@@ -89,7 +89,7 @@ class DefaultStrategy(Strategy):
         groups: Groups | None = None,
         view_pixels: int = 0,
     ) -> None:
-        """Start with empty statistics; the arguments are those of `Strategy`."""
+        """Start with empty statistics; `Strategy` explains the arguments."""
         super().__init__(
             optimizer,
             settings,
@@ -341,6 +341,6 @@ class DefaultStrategy(Strategy):
         return largest
 
     def _keep(self, mask: Tensor) -> None:
-        """Remove all Gaussians but those of `mask` [N]; nothing is copied where it is all true."""
-        if not mask.all():
+        """Keep the Gaussians of `mask` [N] and remove all others."""
+        if not mask.all():  # else nothing needs to be copied
             self.optimizer.keep(mask)

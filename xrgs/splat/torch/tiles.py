@@ -24,7 +24,7 @@ RADIUS_MARGIN = 0.01
 
 @dataclass(frozen=True)
 class TileGrid:
-    """The square tiles that cover an image; those of the last row and column may overhang it."""
+    """The square tiles that cover an image; the last row and column may overhang it."""
 
     width: int  # px
     height: int  # px

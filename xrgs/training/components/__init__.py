@@ -58,7 +58,7 @@ def build(
         seed: `seed` of the config.
 
     Returns:
-        The built-in components that are on, then those of other packages by their names.
+        The built-in components that are on, then other packages' components by their names.
 
     Raises:
         XrgsError: A value is out of its range, a view is too small for its paired target, a

@@ -36,7 +36,7 @@ class Consistency(Component):
 
     where phi is bicubic resampling to the opposite resolution and I_pair = phi(I) is the paired
     image, computed once for each photograph I. Here w is `weight`, lambda_1 is `l1` and lambda_2 is
-    `ssim`; the L1 term is a mean over pixels and channels, SSIM is that of the photometric loss
+    `ssim`; the L1 term is a mean over pixels and channels, SSIM is as in the photometric loss
     [wang2004].
 
     Our choice where the paper is silent:

@@ -43,9 +43,10 @@ class NaturalSelection(Component):
         d L / d logit_i  +  g,
 
     so that a Gaussian keeps its opacity where the photographs resist with a gradient of their own,
-    and fades where they do not. Those with an opacity below 0.001 are removed, the most transparent
-    first and never more than down to the budget. Within 5% of the budget, or at step `until`, the
-    most transparent of the rest are removed at once, and training goes on without the push.
+    and fades where they do not. Gaussians with an opacity below 0.001 are removed, the most
+    transparent first, until the budget is met. Within 5% of the budget, or at step `until`, the
+    most transparent Gaussians beyond the budget are removed at once, and training goes on without
+    the push.
 
     g follows a path, as in the authors' code. With B the budget, the opacity of the B-th most
     opaque Gaussian, the last one to keep, shall fall linearly from 0.8 of its first value to 0, and

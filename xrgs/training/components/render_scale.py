@@ -30,9 +30,9 @@ class RenderScale(Component):
     largest training view. LR views that were degraded at full size have k = 1. Only LR views are
     scaled, as in section 6.3. The paper gives no values; gamma 0.25 makes k 1.5 at factor 5.
 
-    The scales in world units are multiplied for the render alone. The Gaussians that are optimised,
-    evaluated and saved stay as they are, and the gradient of their log-scales is that of the scaled
-    ones. The paper found that it blurs; it is off in the full system.
+    The scales in world units are multiplied for the render alone: the log-scales get the gradients
+    of the scaled Gaussians. The Gaussians that are optimised, evaluated and saved stay as they are.
+    The paper found that it blurs; it is off in the full system.
     """
 
     def __init__(self, settings: RenderScaleConf, views: Sequence[TrainingView]) -> None:
