@@ -62,7 +62,7 @@ def measure(
     # finds the environment by it.
     other = str(Path(python).absolute())
     if not (Path(other).is_file() and os.access(other, os.X_OK)):
-        raise XrgsError(f"against={python}: must be the Python executable of an environment")
+        raise XrgsError(f"--against {python}: must be the Python executable of an environment")
     with ExitStack() as stack:
         folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="xrgs-bench-")))
         files = {}

@@ -1,4 +1,4 @@
-"""`xrgs-store`: lists, shows, removes, trims, packs and verifies what a store keeps."""
+"""`xrgs-store`: lists, removes, packs, scores anew and verifies what a store keeps."""
 
 from __future__ import annotations
 
@@ -13,6 +13,7 @@ from xrgs.cli import options
 from xrgs.cli.options import STORE, Cells, Flag, Folder, Names, shown_as
 from xrgs.errors import XrgsError
 from xrgs.experiment.store import Store
+from xrgs.runtime.machine import set_passive_openmp_wait
 from xrgs.runtime.signals import exit_on_signal
 from xrgs.runtime.streams import say
 from xrgs.safeio.sanitize import counted
@@ -191,6 +192,43 @@ def gc(
     removal.carry_out(Store(store), plan_gc(Store(store), summaries(Store(store)), of))
 
 
+def rescore(cells: Filter) -> None:
+    """Score done cells anew where a metric was added or changed; nothing is trained.
+
+    The cells' Gaussians are rendered and scored by the installed metrics. Cells whose scores are of
+    the installed code already are left as they are.
+
+    Args:
+        cells: The cells that pass all of these options.
+    """
+    from xrgs.experiment import rescoring
+
+    set_passive_openmp_wait()
+    _, chosen = cells.chosen()
+    done = [cell.folder for cell in chosen if cell.folder.status_file.exists()]
+    scored = rescoring.rescore(Store(cells.store), done)
+    say(str(scored))
+    if scored.left:
+        sys.exit(1)
+
+
+def prove(cells: Filter, sample: Annotated[int, shown_as("N")] = 2) -> None:
+    """Prove that a refactoring changes no number, so that finished cells keep their ids.
+
+    Some done cells, which the code before the refactoring has trained, are trained again with the
+    installed code. If all bits are equal, the new code is declared equal to the old one, in
+    xrgs/experiment/refactorings.json of the installed package.
+
+    Args:
+        cells: The cells that pass all of these options.
+        sample: Number of cells that are trained again for each part of the code that has changed.
+    """
+    from xrgs.sweep.refactoring import prove as proven
+
+    _, chosen = cells.chosen()
+    say(str(proven(Store(cells.store), [cell.folder for cell in chosen], sample)))
+
+
 def check(store: Folder = STORE) -> None:
     """Hash every file of the finished cells, the variants, the rendered scenes and the sweeps.
 
@@ -230,7 +268,7 @@ def _confirmed(question: str) -> bool:
 def main() -> None:
     """Run `xrgs-store`."""
     description = (
-        "List, show, remove, trim, pack and verify what a store keeps. Cells that are being"
+        "List, remove, pack, score anew and verify what a store keeps. Cells that are being"
         " trained, here or on another machine, are never touched."
     )
     functions: dict[str, Callable[..., None]] = {
@@ -240,6 +278,8 @@ def main() -> None:
         "trim": trim,
         "pack": pack,
         "gc": gc,
+        "rescore": rescore,
+        "prove": prove,
         "check": check,
     }
     with exit_on_signal("What was not removed yet is unchanged."):

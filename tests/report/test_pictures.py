@@ -9,7 +9,7 @@ import pytest
 from xrgs.evaluation.metrics import METRICS
 from xrgs.report.compare import compare
 from xrgs.report.page import build
-from xrgs.report.sensitivity import sensitivities
+from xrgs.report.pictures import sensitivities
 
 WEIGHTS = {"0.05": 21.0, "0.2": 22.0, "1": 19.0}
 

@@ -1,7 +1,9 @@
-"""What each run left out, how much of it, and what that would have cost.
+"""Tables of what each training did, what it left out, and what that would have cost.
 
-A cell's summary has the totals of `xrgs.training.work.StepWork` and the seconds of each stage. The
-costs are estimated from these totals of the run itself, and not from another run.
+They show why a component changes nothing or makes results worse, and where a run saves time. Counts
+are of the history of a cell; the totals of `xrgs.training.work.StepWork` and the seconds of each
+stage are of its summary. The costs are estimated from the totals of the run itself, and not from
+another run.
 """
 
 from __future__ import annotations
@@ -11,14 +13,28 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import pandas as pd
 
-from xrgs.report.render import TextTable, titled
-from xrgs.report.training import CELL_KEYS
+from xrgs.report.collect import CELL_KEYS, is_component_log
+from xrgs.report.markup import titled
+from xrgs.runtime.text_table import TextTable
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping, Sequence
 
-    from xrgs.experiment.cell_folder import CellFolder
+    from xrgs.report.collect import DoneCell
 
+_LABELS = {
+    "steps_HR": "Steps on HR views",
+    "steps_LR": "Steps on LR views",
+    "duplicated": "Gaussians duplicated",
+    "split": "Gaussians split",
+    "pruned_opacity": "Pruned: transparent",
+    "pruned_scale": "Pruned: too large",
+    "pruned_non_finite": "Pruned: not finite",
+    "pruned_by_components": "Pruned: by components",
+    "reset": "Opacities reset",
+    "skipped_backward": "Steps without a backward pass",
+    "skipped_shN": "Steps that did not move shN",
+}
 _NUMBERS = ["number", "share", "cost", "cost_share"]
 #: Counts of a history that begin so are of steps that left something out.
 _PREFIX = "skipped_"
@@ -29,7 +45,7 @@ class _Kind(NamedTuple):
     """A kind of work that a run can leave out."""
 
     label: str
-    """Its name in the table, where `{base}` is the label that all others are compared with."""
+    """Its name in the table, where `{base}` stands for the label of the base."""
     unit: str
     """Unit of the cost: `s`, `evaluations` (of alpha), or empty where nothing is known of it."""
     estimate: str
@@ -74,49 +90,93 @@ _KINDS = {
 }
 
 
-def cell_work(cell: CellFolder, training: Mapping[str, float]) -> dict[str, float]:
-    """Return what one cell did in all, for what it left out.
+def totals(cells: pd.DataFrame, done: Mapping[str, DoneCell]) -> pd.DataFrame:
+    """Return what training did in each cell that is done.
 
     Args:
-        cell: A cell that is done.
-        training: What `xrgs.report.training.cell_totals` returns for it.
+        cells: The table `Comparison.cells`.
+        done: The cells that are done, by their ids.
 
     Returns:
-        The totals of the summary's `work`, its stages as `seconds_<stage>`, `seconds`, `steps`,
-        `evaluations`, and the counts of the history that begin with `skipped_`. Cells of older
-        versions have no `work`.
-
-    Raises:
-        StoreError: The summary can't be read.
+        One row for each cell: `CELL_KEYS`, and a column for each count of its history (over the
+        whole training) and each value that a component logged (its mean over training); NaN where a
+        cell has none.
     """
-    summary = cell.summary()
+    keys = cells.loc[cells["cell_id"].isin(done), CELL_KEYS].drop_duplicates("cell_id")
+    keys = keys.reset_index(drop=True)
+    return keys.join(pd.DataFrame([done[name].totals for name in keys["cell_id"]]))
+
+
+def totals_table(totals: pd.DataFrame, labels: Sequence[str], condition: str) -> TextTable:
+    """Return the table of `totals` of one condition, scene by scene, as means over seeds."""
+    chosen = totals[totals["condition"] == condition]
+    names = [name for name in _ordered(totals) if chosen[name].notna().any()]
+    means = chosen.groupby(["scene", "label"])[names].mean().to_dict("index")
+    rows = []
+    for scene in sorted(chosen["scene"].unique()):
+        of_scene = [means.get((scene, label), {}) for label in labels]
+        for name in names:
+            texts = [
+                _count(values.get(name), is_component_log=is_component_log(name))
+                for values in of_scene
+            ]
+            if any(texts):
+                rows.append((scene, _LABELS.get(name, name.replace("_", " ")), *texts))
+    return TextTable(
+        title=titled("What training did, means over the replicates that are done", condition),
+        columns=("Scene", "", *labels),
+        rows=tuple(rows),
+        align="ll" + "r" * len(labels),
+        notes=("names with a dot: values that a component logged, means over training",),
+    )
+
+
+def _ordered(totals: pd.DataFrame) -> list[str]:
+    """Return the columns of numbers: known ones, then the components', each in their own order."""
+    numbers = [name for name in totals.columns if name not in CELL_KEYS]
+    return sorted(numbers, key=lambda name: (name not in _LABELS, is_component_log(name)))
+
+
+def _count(value: float | None, *, is_component_log: bool) -> str:
+    if value is None or pd.isna(value):
+        return ""
+    return f"{value:.4g}" if is_component_log else f"{value:,.0f}"
+
+
+def _work(cell: DoneCell) -> dict[str, float]:
+    """Return the totals of a cell: its summary's, and the counts of steps that skipped something.
+
+    Cells of older versions have no `work` and no seconds of stages.
+    """
+    summary = cell.summary
     return {
         **summary.work,
         **{f"seconds_{stage}": value for stage, value in summary.stage_seconds.items()},
         "steps": float(summary.steps),
         "evaluations": summary.evaluations,
         "seconds": summary.training_time_s,
-        **{name: value for name, value in training.items() if name.startswith(_PREFIX)},
+        **{name: value for name, value in cell.totals.items() if name.startswith(_PREFIX)},
     }
 
 
-def skipped(cells: pd.DataFrame, of_cells: Mapping[str, Mapping[str, float]]) -> pd.DataFrame:
+def skipped(cells: pd.DataFrame, done: Mapping[str, DoneCell]) -> pd.DataFrame:
     """Return what each cell left out.
 
     Args:
         cells: The table `Comparison.cells`.
-        of_cells: What `cell_work` returns for each cell that is done, by its id.
+        done: The cells that are done, by their ids.
 
     Returns:
-        One row for each cell and kind of work of which the counts are known: `cell_id`, `scene`,
-        `label`, `condition`, `variant_seed`, `seed`, `kind`; the `number` that was left out, and
-        its `share` of what there was; its estimated `cost` in the kind's `unit` (`s` or
-        `evaluations`), and `cost_share` of what the run took itself; NaN where it is not known.
+        One row for each cell and kind of work with known counts: `CELL_KEYS` and `kind`; the
+        `number` that was left out, and its `share` of what there was; its estimated `cost` in the
+        kind's `unit` (`s` or `evaluations`), and `cost_share` of what the run took itself. The
+        costs are NaN where they are not known.
     """
     rows = []
-    for _, cell in cells[cells["state"] == "done"].drop_duplicates(CELL_KEYS).iterrows():
-        work = of_cells[cell["cell_id"]]
-        for kind, number, of, cost in _left_out(work, of_cells.get(cell["base_id"], work)):
+    for _, cell in cells[cells["cell_id"].isin(done)].drop_duplicates(CELL_KEYS).iterrows():
+        own = done[cell["cell_id"]]
+        work = _work(own)
+        for kind, number, of, cost in _left_out(work, _work(done.get(cell["base_id"], own))):
             if math.isnan(number) or not of > 0:
                 continue
             unit = _kind(kind).unit
@@ -181,17 +241,12 @@ def _kind(name: str) -> _Kind:
     return _KINDS.get(name, _Kind(f"Steps without {words}", "", "not estimated"))
 
 
-def table(found: pd.DataFrame, labels: Sequence[str], condition: str, base: str) -> TextTable:
-    """Return what the runs of one condition left out: means over a scene's runs, then over scenes.
+def skipped_table(
+    found: pd.DataFrame, labels: Sequence[str], condition: str, base: str
+) -> TextTable:
+    """Return the table of `skipped` of one condition: means over a scene's runs, then over scenes.
 
-    Args:
-        found: The table that `skipped` returns.
-        labels: The labels of the columns, in order.
-        condition: The condition that the cells were run under.
-        base: The label that all others are compared with.
-
-    Returns:
-        The table; a kind of which no run left anything out is not in it.
+    It has no row for a kind of work that no run left out.
     """
     chosen = found[found["condition"] == condition]
     by_scene = chosen.groupby(["kind", "label", "scene"], sort=False)[_NUMBERS].mean()

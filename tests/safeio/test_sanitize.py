@@ -44,12 +44,12 @@ def spaced(text: str) -> str:
 
 @pytest.mark.parametrize("text", SCRIPTS)
 def test_every_script_passes_unchanged(text: str) -> None:
-    assert words.for_line(text) == words.for_terminal(text) == words.for_csv(text) == text
+    assert sanitize.for_line(text) == sanitize.for_terminal(text) == sanitize.for_csv(text) == text
 
 
 @given(st.text(max_size=200))
 def test_a_line_has_no_character_that_is_obeyed_or_hidden(text: str) -> None:
-    line = words.for_line(text)
+    line = sanitize.for_line(text)
     assert len(line) == len(text)
     for char, found in zip(text, line, strict=True):
         hidden = unicodedata.category(char) in {"Cc", "Cf", "Cs", "Zl", "Zp"}
@@ -64,16 +64,16 @@ HIDDEN = (
 
 @pytest.mark.parametrize("char", HIDDEN)
 def test_a_character_that_changes_or_hides_the_text_is_a_space(char: str) -> None:
-    assert words.for_line(f"a{char}b") == "a b"
-    assert words.for_csv(f"a{char}b") == "a b"
-    assert words.for_terminal(f"a{char}b") == ("a\nb" if char == "\n" else "a b")
+    assert sanitize.for_line(f"a{char}b") == "a b"
+    assert sanitize.for_csv(f"a{char}b") == "a b"
+    assert sanitize.for_terminal(f"a{char}b") == ("a\nb" if char == "\n" else "a b")
 
 
 @given(st.lists(TEXTS, min_size=1, max_size=4))
 @example([EVIL, "\x1b[1;1Hover", "\x1b[?1049h", "\x1b(0q", "\x9b2J", "\x1b]0;t\x07"])
 def test_a_terminal_shows_the_lines_one_below_the_other_and_does_nothing(lines: list[str]) -> None:
-    safe = [words.for_line(line) for line in lines]
-    shown = words.for_terminal("\n".join(safe))
+    safe = [sanitize.for_line(line) for line in lines]
+    shown = sanitize.for_terminal("\n".join(safe))
     rows, screen = shown.split("\n"), pyte.Screen(400, 8)
     title = screen.title
     screen.set_mode(pyte.modes.LNM)  # a line feed also returns the carriage, as on a terminal
@@ -91,22 +91,27 @@ def test_a_terminal_shows_the_lines_one_below_the_other_and_does_nothing(lines: 
 
 
 def test_a_whole_text_keeps_its_lines_and_one_word_of_it_does_not() -> None:
-    assert words.for_terminal("a\n  b\x1b[2J\n") == "a\n  b [2J\n"
-    assert words.for_line("a\nb") == "a b"
+    assert sanitize.for_terminal("a\n  b\x1b[2J\n") == "a\n  b [2J\n"
+    assert sanitize.for_line("a\nb") == "a b"
 
 
 def test_a_long_text_is_shortened_and_still_distinct() -> None:
     texts = ["x" * 1_000_000 + end for end in ("", "a", "b", "ab")]
-    for limit in (words.MAX_CELL, words.MAX_LINE):
-        found = [words.for_line(text, limit) for text in texts]
+    for limit in (sanitize.MAX_CELL, sanitize.MAX_LINE):
+        found = [sanitize.for_line(text, limit) for text in texts]
         assert [len(text) for text in found] == [limit] * 4
         assert len(set(found)) == 4
-        assert found == [words.for_line(text, limit) for text in texts]
-        assert words.for_line("y" * limit, limit) == "y" * limit
-        assert words.for_line("y" * (limit + 1), limit).startswith("y" * (limit - 9) + "…")
-    for target in (words.for_terminal, words.for_markdown, words.for_latex, words.for_csv):
+        assert found == [sanitize.for_line(text, limit) for text in texts]
+        assert sanitize.for_line("y" * limit, limit) == "y" * limit
+        assert sanitize.for_line("y" * (limit + 1), limit).startswith("y" * (limit - 9) + "…")
+    for target in (
+        sanitize.for_terminal,
+        sanitize.for_markdown,
+        sanitize.for_latex,
+        sanitize.for_csv,
+    ):
         assert len(str(target(texts[0]))) < 25_000
-    assert words.for_line(words.for_line(texts[0])) == words.for_line(texts[0])
+    assert sanitize.for_line(sanitize.for_line(texts[0])) == sanitize.for_line(texts[0])
 
 
 def runs_a_formula(cell: str) -> bool:
@@ -125,24 +130,24 @@ def runs_a_formula(cell: str) -> bool:
 @example(["=cmd|' /C calc'!A0", "@SUM(1)", "-2+3", "＝1", "\t=1", "\r=1", " =1", "a;=1", '"=1'])
 def test_a_spreadsheet_reads_texts_and_no_formula(cells: list[str]) -> None:
     stream = io.StringIO()
-    csv.writer(stream, lineterminator="\n").writerow([words.for_csv(cell) for cell in cells])
+    csv.writer(stream, lineterminator="\n").writerow([sanitize.for_csv(cell) for cell in cells])
     content = stream.getvalue()
     for separator in ",;\t":
         for row in csv.reader(io.StringIO(content, newline=""), delimiter=separator):
             assert not any(runs_a_formula(cell) for cell in row if separator != "\t")
     (row,) = csv.reader(io.StringIO(content, newline=""))
     for cell, found in zip(cells, row, strict=True):
-        assert found.replace("'", "") == words.for_line(cell).strip().replace("'", "")
+        assert found.replace("'", "") == sanitize.for_line(cell).strip().replace("'", "")
 
 
 @pytest.mark.parametrize("cell", ["-1", "+0.80 ↑", "-44.57 ↓", "-1e-05", "1,000", "-12", "", "a=b"])
 def test_numbers_and_other_texts_stay(cell: str) -> None:
-    assert words.for_csv(cell) == cell
+    assert sanitize.for_csv(cell) == cell
 
 
 @pytest.mark.parametrize("value", [1, -1.5, None, True, float("inf")])
 def test_values_that_are_no_text_stay(value: object) -> None:
-    assert words.for_csv(value) is value
+    assert sanitize.for_csv(value) is value
 
 
 def html(markdown: str) -> str:
@@ -171,23 +176,23 @@ class Shown(HTMLParser):
 @example(EVIL)
 @example("http://a.example https://a.example ftp://a.example WWW.a.example mailto:a@b.example")
 def test_markdown_shows_the_text_without_links_images_or_html(text: str) -> None:
-    escaped = words.for_markdown(text)
+    escaped = sanitize.for_markdown(text)
     page = Shown(html(escaped))
     # Other parsers read mathematics, and links and HTML in other ways: no bare character begins it.
     assert not set("$[<`") & set(re.sub(r"\\.", "", escaped).replace("@<!-- -->", "@"))
-    assert spaced(page.text) == spaced(words.for_line(text))
+    assert spaced(page.text) == spaced(sanitize.for_line(text))
     assert set(page.tags) <= {"p"}
 
 
 @given(TEXTS)
 @example(EVIL)
 def test_markdown_stays_in_a_cell_a_heading_and_a_list(text: str) -> None:
-    name = words.for_markdown(text)
+    name = sanitize.for_markdown(text)
     source = f"### {name}\n\n| a | b |\n| - | - |\n| {name} | 1 |\n\n- {name}\n\n**x {name} x**\n"
     page = Shown(html(source))
     cells = ["table", "thead", "tr", "th", "th", "tbody", "tr", "td", "td"]
     assert page.tags == ["h3", *cells, "ul", "li", "p", "strong"]
-    line = words.for_line(text)
+    line = sanitize.for_line(text)
     assert spaced(page.text) == spaced(f"{line} a b {line} 1 {line} x {line} x")
 
 
@@ -211,10 +216,10 @@ _TOKEN = re.compile("|".join(map(re.escape, sorted(_LATEX, key=len, reverse=True
 @given(TEXTS)
 @example(EVIL)
 def test_latex_shows_the_text_and_no_character_is_active(text: str) -> None:
-    escaped = words.for_latex(text)
+    escaped = sanitize.for_latex(text)
     assert not set("\\{}$&#_%~^<>|[]\n\r") & set(_TOKEN.sub("", escaped))
     shown = _TOKEN.sub(lambda found: _LATEX[found[0]], escaped)
-    assert shown == words.for_line(text).strip()
+    assert shown == sanitize.for_line(text).strip()
 
 
 @pytest.mark.parametrize(
@@ -228,7 +233,7 @@ def test_latex_shows_the_text_and_no_character_is_active(text: str) -> None:
     ],
 )
 def test_latex_characters(text: str, escaped: str) -> None:
-    assert words.for_latex(text) == escaped
+    assert sanitize.for_latex(text) == escaped
 
 
 @given(TEXTS)
@@ -237,7 +242,7 @@ def test_latex_characters(text: str, escaped: str) -> None:
 @example("..")
 @example("x" * 300)
 def test_a_file_name_is_plain(text: str) -> None:
-    found = words.for_file_name(text)
+    found = sanitize.for_file_name(text)
     assert re.fullmatch(r"[A-Za-z0-9_-][A-Za-z0-9_.-]*", found)
     assert len(found) <= 67
     assert "--" not in found  # it separates the names in the name of a picture
@@ -245,8 +250,8 @@ def test_a_file_name_is_plain(text: str) -> None:
 
 def test_different_names_have_different_files() -> None:
     texts = ("a b", "a/b", "a-b", "a|b", "a--b", "x" * 61, "x" * 62, "\ud800", "")
-    assert len({words.for_file_name(text) for text in texts}) == len(texts)
-    assert words.for_file_name("loss_weighting") == "loss_weighting"
+    assert len({sanitize.for_file_name(text) for text in texts}) == len(texts)
+    assert sanitize.for_file_name("loss_weighting") == "loss_weighting"
 
 
 #: Calls that put words somewhere, and the modules that may make them.

@@ -10,14 +10,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from xrgs.report.render import (
-    LATEX_PREAMBLE,
-    TextTable,
-    to_latex,
-    to_markdown,
-    to_text,
-    width,
-)
+from xrgs.report.markup import LATEX_PREAMBLE, to_latex, to_markdown
+from xrgs.runtime.text_table import TextTable, to_text, width
 
 TABLE = TextTable(
     title="a_b & c",
