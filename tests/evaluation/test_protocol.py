@@ -11,11 +11,11 @@ import numpy as np
 import pytest
 import torch
 from PIL import Image
+from xrgs.safeio.confined import ConfinedPath
 
 from xrgs.capture.dataset import Dataset, LoadedView
 from xrgs.config import Conf, SplatConf
 from xrgs.evaluation import protocol
-from xrgs.safeio.confined import ConfinedPath
 from xrgs.splat.cameras import Camera
 from xrgs.splat.gaussians import Gaussians, from_points
 from xrgs.splat.rendering import rasterize_parameters
