@@ -13,12 +13,12 @@ import numpy as np
 import pycolmap
 import pytest
 import torch
-import xrgs.report.variant
 from numpy.typing import NDArray
 from PIL import Image
 from plyfile import PlyData
 
 import xrgs
+import xrgs.capture.description
 from xrgs.capture import poses, variant
 from xrgs.sweep.jobs import worker
 
