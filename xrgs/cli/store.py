@@ -107,6 +107,7 @@ def show(cell: Positional[Annotated[str, arg(metavar="CELL")]], store: Folder = 
         cell: The cell's id, or the beginning of it.
         store: The store.
     """
+    from xrgs.experiment.listing import Selection
     from xrgs.sweep.inventory import show as described
 
     (chosen,) = Selection(ids=(cell,)).of(Store(store).cell_rows())
