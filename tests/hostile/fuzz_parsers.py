@@ -26,6 +26,8 @@ from functools import partial
 from pathlib import Path
 from random import Random
 
+from xrgs.safeio.confined import ConfinedPath
+
 from tests.hostile import reference
 from tests.hostile.mutations import (
     Mutation,
@@ -44,7 +46,6 @@ from xrgs.experiment.cell_folder import CellFolder
 from xrgs.experiment.store import Store
 from xrgs.runtime import progress
 from xrgs.safeio import npz, records, untrusted
-from xrgs.safeio.confined import ConfinedPath
 from xrgs.splat.ply import load_ply
 from xrgs.sweep import locks
 from xrgs.training.checkpoint import Checkpoint

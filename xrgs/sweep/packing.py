@@ -90,15 +90,14 @@ def pack(
             left_out.append(for_line(f"{name}: {CellState.of_error(error).reason}"))
             return {}
 
-    done = {
-        cell: files for cell in cells if (files := packed(cell.name, partial(_cell, cell, here)))
-    }
-    variant_ids = sorted({cell.variant_id for cell in done if cell.variant_id is not None})
-    sweep_ids = sorted({*sweeps} or {sweep for cell in done for sweep in cell.sweeps})
+    found = [(cell, packed(cell.name, partial(_cell, cell, here))) for cell in cells]
+    done = [(cell, files) for cell, files in found if files]
+    variant_ids = sorted({cell.variant_id for cell, _ in done if cell.variant_id is not None})
+    sweep_ids = sorted({*sweeps} or {sweep for cell, _ in done for sweep in cell.sweeps})
     variants = [packed(name, partial(_variant, store, name)) for name in variant_ids]
     records = [packed(name, partial(_record, store, name, here)) for name in sweep_ids]
     with errors_named(out):
-        size = _write(out, [*done.values(), *variants, *records])
+        size = _write(out, [*(files for _, files in done), *variants, *records])
     count = [len(of) - of.count({}) for of in (variants, records)]
     return Packed(len(done), count[0], count[1], size, tuple(left_out))
 

@@ -21,7 +21,7 @@ from hydra.errors import CompactHydraException
 from omegaconf.errors import OmegaConfBaseException
 
 from xrgs.capture import scenes
-from xrgs.capture.degrade import resolve_degradation
+from xrgs.capture.degradations import resolve_degradation
 from xrgs.capture.split import check_variant_conf
 from xrgs.composing import to_conf
 from xrgs.errors import StoreError, UnreadableError, XrgsError

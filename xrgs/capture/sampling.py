@@ -1,4 +1,4 @@
-"""Measures how finely each view samples the scene, and scores views for tagging them HR or LR.
+"""Measures how finely each view samples the scene.
 
 The sampling rate nu = focal length (px) / depth is the number of px per scene unit in which a view
 shows the scene. A pixel count stands for the focal length (the paper's Camera Keychain), a distance
@@ -7,11 +7,14 @@ for the depth (its Dining Room).
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
+
+from xrgs.errors import XrgsError
 
 if TYPE_CHECKING:
     from xrgs.capture.lens import Lens
@@ -19,10 +22,20 @@ if TYPE_CHECKING:
 
 Array = NDArray[np.float64]
 
-#: The values of `variant.tags` that need cameras and points, and so are applied after SfM.
-DEPTH_POLICIES = ("distance", "sampling_rate")
 #: A view that observes fewer points takes the depth of all points inside its image instead.
 _MIN_OBSERVED = 8
+
+
+@dataclass(frozen=True)
+class Measures:
+    """What a tagging policy may score a view by."""
+
+    size: tuple[int, int]
+    """Width and height of the photograph as it was taken, px."""
+    K: Array
+    """Intrinsics [3, 3] of the undistorted HR view, px; NaN where they are not known."""
+    depth: float
+    """Median depth of the view's points, in world units; NaN where it is not known."""
 
 
 def median_depth(
@@ -55,77 +68,37 @@ def median_depth(
 
 
 def median_depths(model: Reconstruction) -> dict[int, float]:
-    """Compute the median depth of every registered view.
+    """Return the `median_depth` of every registered view, by index.
 
-    Args:
-        model: What SfM found.
+    A view that observes no point gets the median of the others.
 
-    Returns:
-        `median_depth` by index of the view; a view that observes no point gets the median of the
-        others.
+    Raises:
+        XrgsError: No view observes a point.
     """
     depths = {
         i: median_depth(model.points, viewmat, model.lenses[i], model.observed[i])
         for i, viewmat in model.viewmats.items()
     }
-    typical = float(np.nanmedian(list(depths.values()))) if depths else float("nan")
+    if np.isnan(list(depths.values())).all():
+        raise XrgsError(
+            "none of the points is in front of a camera and inside its image: poses and points "
+            "must be of one world, and the poses' axes those of their file format"
+        )
+    typical = float(np.nanmedian(list(depths.values())))
     return {i: typical if np.isnan(depth) else depth for i, depth in depths.items()}
 
 
 def sampling_rate(K: Array, depth: float) -> float:
-    """Compute the sampling rate nu of a view: focal length over depth.
+    """Return the sampling rate nu, px per world unit.
 
     Args:
-        K: Intrinsics [3, 3], px.
+        K: Intrinsics [3, 3], px. The geometric mean of both axes' focal lengths is taken.
         depth: The median depth, in world units.
-
-    Returns:
-        px per world unit, with the geometric mean of both axes' focal lengths.
     """
     return float(np.sqrt(K[0, 0] * K[1, 1]) / depth)
 
 
 def relative_to_largest(values: Sequence[float]) -> list[float]:
-    """Divide values by the largest of them.
-
-    Args:
-        values: Positive numbers; NaN where one is not known.
-
-    Returns:
-        Numbers in (0, 1]; NaN stays NaN.
-    """
+    """Divide positive numbers by the largest of them; NaN stays NaN."""
     largest = np.nanmax(values)
     return [float(value / largest) for value in values]
-
-
-def megapixel_scores(sizes: Sequence[tuple[int, int]]) -> list[float]:
-    """Score views by the pixel counts of their photographs (the paper's Camera Keychain).
-
-    Args:
-        sizes: Width and height of each photograph as it was taken, px.
-
-    Returns:
-        Pixel counts over the largest, in (0, 1].
-    """
-    return relative_to_largest([float(width * height) for width, height in sizes])
-
-
-def depth_scores(
-    policy: str, views: int, lenses: Mapping[int, Lens], depths: Mapping[int, float]
-) -> list[float]:
-    """Score views by a policy that needs their depth.
-
-    Args:
-        policy: `distance` for 1 / depth (the paper's Dining Room), `sampling_rate` for focal length
-            / depth.
-        views: The number of views.
-        lenses: The undistorted HR cameras of the registered views, by index.
-        depths: Their median depths, by index.
-
-    Returns:
-        One score per view over the largest, in (0, 1]; NaN for a view that is not registered.
-    """
-    scores = [float("nan")] * views
-    for i, lens in lenses.items():
-        scores[i] = 1 / depths[i] if policy == "distance" else sampling_rate(lens.K, depths[i])
-    return relative_to_largest(scores)

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from xrgs.capture import degrade, images
+from xrgs.capture.degradations import DEGRADATIONS, resolve_degradation
 from xrgs.composing import compose
 
 CONF = compose("variant.degradation=downsample").variant
@@ -24,21 +24,17 @@ def photo() -> np.ndarray:
 
 def test_auto_degrades_views_drawn_at_random_and_no_others() -> None:
     kinds = {
-        tags: degrade.resolve_degradation(replace(CONF, tags=tags, degradation="auto"))
+        tags: resolve_degradation(replace(CONF, tags=tags, degradation="auto"))
         for tags in ("flag", "megapixels", "distance", "sampling_rate")
     }
     assert kinds.pop("flag") == "downsample"
     assert set(kinds.values()) == {"none"}
-    assert degrade.resolve_degradation(replace(CONF, tags="distance", degradation="jpeg")) == "jpeg"
-
-
-def test_none_is_the_photograph_itself(photo: np.ndarray) -> None:
-    assert degrade.degrade(photo, replace(CONF, degradation="none")) is photo
+    assert resolve_degradation(replace(CONF, tags="distance", degradation="jpeg")) == "jpeg"
 
 
 def test_digital_zoom_is_the_small_copy_enlarged(photo: np.ndarray) -> None:
-    small = degrade.degrade(photo, CONF)
-    zoomed = degrade.degrade(photo, replace(CONF, degradation="digital_zoom"))
+    small = DEGRADATIONS["downsample"](photo, CONF)
+    zoomed = DEGRADATIONS["digital_zoom"](photo, CONF)
     assert small.shape == (16, 20, 3)
     assert zoomed.shape == photo.shape
     for c in range(3):  # PIL's bicubic as the other implementation
@@ -50,7 +46,7 @@ def test_digital_zoom_is_the_small_copy_enlarged(photo: np.ndarray) -> None:
 
 def test_digital_zoom_keeps_what_is_coarse_and_nothing_finer(photo: np.ndarray) -> None:
     """Of the power beyond twice the small copy's Nyquist frequency, bicubic leaves a few %."""
-    zoomed = degrade.degrade(photo, replace(CONF, degradation="digital_zoom"))
+    zoomed = DEGRADATIONS["digital_zoom"](photo, CONF)
     power = [np.abs(np.fft.fft2(p[..., 1] - p[..., 1].mean())) ** 2 for p in (photo, zoomed)]
     fine = np.maximum(*np.abs(np.meshgrid(np.fft.fftfreq(100), np.fft.fftfreq(80)))) > 0.2
     coarse = ~fine
@@ -63,12 +59,13 @@ def test_jpeg_is_what_pillows_encoder_gives(photo: np.ndarray) -> None:
     pixels = Image.fromarray(np.round(photo * 255).astype(np.uint8))
     pixels.save(stream, "JPEG", quality=10, subsampling=2)
     expected = np.asarray(Image.open(stream), dtype=np.float32) / np.float32(255)
-    found = degrade.degrade(photo, replace(CONF, degradation="jpeg"))
+    found = DEGRADATIONS["jpeg"](photo, CONF)
     assert np.array_equal(found, expected)
 
 
 def test_jpeg_loses_more_at_lower_quality(photo: np.ndarray) -> None:
     grey = np.repeat(photo.mean(-1, keepdims=True), 3, -1)  # colour noise is lost at any quality
-    errors = [np.abs(images.through_jpeg(grey, q) - grey).mean() for q in (5, 20, 60, 95)]
+    confs = [replace(CONF, jpeg_quality=quality) for quality in (5, 20, 60, 95)]
+    errors = [np.abs(DEGRADATIONS["jpeg"](grey, conf) - grey).mean() for conf in confs]
     assert errors == sorted(errors, reverse=True)
     assert errors[0] > 2 * errors[-1] > 0
