@@ -466,7 +466,7 @@ def test_a_sweep_without_all_hr_or_with_nothing_else_has_no_table(made: Any) -> 
 
 def test_the_share_is_in_every_file_of_tables(made: Any) -> None:
     add_two_scenes(made)
-    report = build(made.store.path, made.write())
+    report = build(made.store.path, made.write(), pictures=[])
     title = "Share of the gap from baseline to all\\_hr that is closed"
     for name in ("table.md", "table.tex"):
         assert title in (report.folder / name).read_text()
