@@ -338,9 +338,10 @@ def _check_identity(
 ) -> None:
     """Refuse a record that contradicts a cell: it would pair cells that do not belong together."""
     for row in rows:
-        if row.cell_id not in done:
+        cell = done.get(row.cell_id or "")
+        if cell is None:
             continue
-        identity = done[row.cell_id].identity
+        identity = cell.identity
         for key, said, true in (
             ("variant_id", row.variant_id, identity.variant),
             ("seed", row.seed, identity.seed),
