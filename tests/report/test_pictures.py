@@ -110,7 +110,7 @@ def test_more_curves_than_colours_are_not_drawn_and_said(made: Any, tmp_path: Pa
     made.write()
     page = build(made.store.path, out=tmp_path / "many", pictures=["sensitivity-a.b"]).folder
     said = (page / "table.md").read_text()
-    assert "8 curves, of which a figure can tell 7 apart" in said
+    assert "8 curves, and a figure can tell 7 apart" in said
     assert not list((page / "figures").iterdir())
 
 

@@ -33,8 +33,8 @@ if TYPE_CHECKING:
 
 #: Okabe and Ito's orange and blue, which colour-blind readers can distinguish, also in grey.
 _ABLATION, _BASELINE, _FRAME = "#D55E00", "#0072B2", "#FFD400"
-#: Colour and mark of the baseline, and of up to seven ablations: more of Okabe and Ito's colours,
-#: without their yellow, which is faint on white.
+#: Colour and mark of the baseline, and of up to seven ablations: more of Okabe and Ito's colours.
+#: Their yellow is left out, since it is faint on white.
 _ARMS = (
     (_BASELINE, "o"),
     (_ABLATION, "s"),
@@ -50,7 +50,7 @@ MAX_ARMS = len(_ARMS)
 _DPI = 130
 _PANEL = 3.4  # inches
 _ZOOM = 5
-#: A setting whose largest value is this many times the smallest one has a logarithmic axis.
+#: An axis is logarithmic where the largest value is this many times the smallest one.
 _LOG_FROM = 4
 #: The longest name beside a figure's axes, in characters: a longer one would leave them no room.
 _MAX_NAME = 40
@@ -68,8 +68,8 @@ class Panel(NamedTuple):
 def _default_style() -> Iterator[None]:
     """Use matplotlib's own style, in which a name with dollar signs is not read as mathematics.
 
-    Nothing is said of characters that its font lacks, or of scripts that it can't shape: they are
-    drawn as boxes, or letter by letter; the tables of the report have the name.
+    Characters that its font lacks are drawn as boxes, and scripts that it can't shape letter by
+    letter, without a warning: the tables of the report have the name.
     """
     with style.context(["default", {"text.parse_math": False}]), warnings.catch_warnings():
         warnings.filterwarnings("ignore", message="Glyph .* missing from")
@@ -109,7 +109,7 @@ def side_by_side(
         title: The title of the figure.
         panels: The images, of one size: photograph, baseline and ablation.
         crop: The rows and columns of the crop, as `differing_crop` returns them.
-        note: What the crop shows, for example "where the two differ most".
+        note: Says how the crop was chosen, for example "where the two differ most".
 
     Returns:
         The bytes of a PNG.

@@ -1,7 +1,7 @@
 """The statistics of a report: changes of pairs, Student's intervals and tests, false discoveries.
 
-All functions take and return float64 arrays [N], one element for each pair or mean. What can't be
-computed is NaN, and a reason says why.
+All functions take and return float64 arrays [N], one element for each pair or mean. A number that
+can't be computed is NaN, and a reason says why.
 """
 
 from __future__ import annotations
@@ -73,8 +73,8 @@ def percent_change(base: Floats, value: Floats) -> tuple[Floats, NDArray[np.str_
 def log_ratio(base: Floats, value: Floats) -> tuple[Floats, NDArray[np.str_]]:
     """Return log(value / base), the change of an amount that is above zero.
 
-    Halving and doubling are then changes of the same size, whose mean is no change, and an interval
-    never reaches below -100 %.
+    Halving and doubling are then changes of the same size with a mean of 0, and an interval never
+    reaches below -100 %.
 
     Args:
         base: [N] amounts that are compared with.

@@ -173,7 +173,7 @@ def test_a_page_that_is_too_large_says_what_it_left_out(
     data = data_of(page_of(copied))
     assert data["history"] == []
     assert data["models"]
-    assert data["notes"] == ["The page would be too large with its history, which is left out."]
+    assert data["notes"] == ["The page has no history: with it, it would be too large."]
 
 
 def test_images_that_do_not_fit_are_counted(copied: Path, monkeypatch: pytest.MonkeyPatch) -> None:

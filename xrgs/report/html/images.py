@@ -49,7 +49,7 @@ _QUALITIES = ((90, 0.40), (80, 0.22), (60, 0.13), (40, 0.09))
 _MAX_PIXELS = 1 << 24
 #: Scores by cell and view.
 _Scores = dict[tuple[str, str], dict[str, float | None]]
-#: About how many more pixels error maps add to those of renders.
+#: The pixels of photographs and renders, times this, are about those of error maps as well.
 _WITH_ERROR_MAPS = 1.25
 
 
