@@ -392,4 +392,4 @@ def test_cells_csv_has_steps_size_and_factor(made: Any) -> None:
         (row["steps"], row["long_side"], row["factor"])
         for row in csv.DictReader(file.read_text().splitlines())
     ]
-    assert rows == [("700.0", "250.0", "3.0"), ("500.0", "", "")]
+    assert rows == [("700", "250", "3"), ("500", "", "")]

@@ -44,12 +44,11 @@ def percent_change(base: Floats, value: Floats) -> tuple[Floats, NDArray[np.str_
     PSNR can be negative.
 
     Args:
-        base: [N] values that are compared with.
+        base: [N] values of the base.
         value: [N] values of the ablation, in the same unit.
 
     Returns:
-        The changes in percent [N], NaN where there is none, and the reasons why there is none [N],
-        empty where there is one.
+        The changes in percent [N], and why there is none [N], empty where there is one.
 
     Example:
         >>> percent_change(np.array([20.0, 0.0]), np.array([25.0, 1.0]))[0]
@@ -77,12 +76,12 @@ def log_ratio(base: Floats, value: Floats) -> tuple[Floats, NDArray[np.str_]]:
     reaches below -100 %.
 
     Args:
-        base: [N] amounts that are compared with.
+        base: [N] amounts of the base.
         value: [N] amounts of the ablation, in the same unit.
 
     Returns:
-        The logarithms [N], NaN where there is none, and the reasons why there is none [N], empty
-        where there is one. Equal amounts have 0, also where both are zero.
+        The logarithms [N], and why there is none [N], empty where there is one. Equal amounts have
+        0, also where both are zero.
 
     Example:
         >>> log_ratio(np.array([2.0, 2.0]), np.array([2.0, 0.0]))[0]
@@ -103,15 +102,14 @@ def share_of_gap(
     """Return the share of the gap between the base and all_hr that is closed, in percent.
 
     Args:
-        base: [N] values that are compared with.
+        base: [N] values of the base.
         value: [N] values of the ablation, in the same unit.
         all_hr: [N] values of all_hr, in the same unit; NaN where it gave none.
         higher_is_better: The direction of the metric.
 
     Returns:
-        The shares [N], NaN where there is none, and the reasons why there is none [N], empty where
-        there is one. A share is negative where the ablation is worse than the base, and above
-        100 where it is better than all_hr.
+        The shares [N], and why there is none [N], empty where there is one. A share is negative
+        where the ablation is worse than the base, and above 100 where it is better than all_hr.
 
     Example:
         >>> args = np.array([20.0]), np.array([23.0]), np.array([24.0])

@@ -233,9 +233,10 @@ def _write_data(folder: Path, sweep: Sweep, comparison: Comparison, runs: Runs) 
     names = cells.drop_duplicates("cell_id")[CELL_KEYS]
     views = names.merge(sweep.views, on="cell_id")
     metrics = [metric.name for metric in comparison.metrics]
-    order = [*RECORD_KEYS, "state", "reason", "steps", "long_side", "factor", "protocol"]
-    order += ["stale", "validation", "machine", *metrics]
-    write_text(folder / "cells.csv", _csv(cells[order]))
+    counts = ["steps", "long_side", "factor"]
+    order = [*RECORD_KEYS, "state", "reason", *counts, "protocol", "stale", "validation", "machine"]
+    whole = cells[[*order, *metrics]].astype(dict.fromkeys(counts, "Int64"))  # which may be missing
+    write_text(folder / "cells.csv", _csv(whole))
     write_text(folder / "views.csv", _csv(views))
     write_text(folder / "training.csv", _csv(runs.training))
     write_text(folder / "curves.csv", _csv(runs.curves))

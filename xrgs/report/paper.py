@@ -303,7 +303,7 @@ def _rank_correlation(textures: pd.Series, changes: pd.Series) -> str:
     known = changes.notna()
     if known.sum() < MIN_VALUES or changes[known].nunique() < 2 or textures[known].nunique() < 2:
         return ""
-    return signed(textures[known].rank().corr(changes[known].rank()))
+    return signed(textures[known].corr(changes[known], method="spearman"))
 
 
 class _Figure(NamedTuple):

@@ -69,7 +69,7 @@ def write_document(
         file: The file to write.
         store: The store with photographs, renders, histories and Gaussians.
         sweep: The sweep.
-        tables: The tables of its comparison.
+        tables: Builds the tables of the sweep's comparison.
         texts: Every table of the report, in order.
         quality: Quality during training, as `xrgs.report.curves.joined` returns it.
         warnings: Sentences that a reader has to know.
