@@ -242,23 +242,18 @@ class Server:
     """The state of the test web server: what it serves, its faults, and the requests so far."""
 
     content: bytes = b""
-    ranges: bool = True
-    """Whether the server answers requests for a range of bytes with that range."""
-    cuts: list[int] = field(default_factory=list)
-    """Number of bytes after which each of the first answers breaks off."""
-    status: int | None = None
-    """HTTP status of an error to answer every request with."""
-    busy: list[tuple[int, dict[str, str]]] = field(default_factory=list)
-    """HTTP status and further headers of each of the first answers, which are errors."""
-    date: str = ""
-    """The time in the Date header; empty for the real one."""
-    content_type: str = "application/zip"
-    length: bool = True
-    """Whether the headers give the length of the file."""
     etag: str = '"first"'
-    """The version of the content; other requests than those for this version get all of it."""
+    """The version of the content; a range of another version is answered by all of it."""
+    ranges: bool = True
+    """Whether requests for a range are answered by that range."""
+    cuts: list[int] = field(default_factory=list)
+    """Number of bytes after which the body of each of the first answers breaks off."""
+    answers: list[bytes] = field(default_factory=list)
+    """Whole answers, headers included, to the first requests, in place of the content."""
+    drips: bool = False
+    """Whether the body is sent byte by byte, 100 in a second."""
     asked: list[str | None] = field(default_factory=list)
-    """The Range header of each request so far, None where there was none."""
+    """The Range header of each request so far, None if there was none."""
     url: str = ""
 
 
@@ -268,41 +263,32 @@ class _Handler(BaseHTTPRequestHandler):
     def do_GET(self) -> None:
         state, byte_range = self.state, self.headers.get("Range")
         state.asked.append(byte_range)
-        if state.status is not None:
-            self.send_error(state.status)
-            return
-        if state.busy:
-            status, headers = state.busy.pop(0)
-            self.send_response(status)
-            for name, value in headers.items():
-                self.send_header(name, value)
-            self.end_headers()
-            return
-        start, size = 0, len(state.content)
-        is_same = self.headers.get("If-Range") in (None, state.etag)
-        if byte_range and state.ranges and is_same:
+        with contextlib.suppress(ConnectionError):  # the client may close the connection first
+            if state.answers:
+                self.wfile.write(state.answers.pop(0))
+            else:
+                self._send_content(byte_range)
+
+    def _send_content(self, byte_range: str | None) -> None:
+        state, start, size = self.state, 0, len(self.state.content)
+        if byte_range and state.ranges and self.headers.get("If-Range") == state.etag:
             start = int(byte_range.removeprefix("bytes=").removesuffix("-"))
             if start >= size:
-                self.send_response(416)
-                self.send_header("Content-Range", f"bytes */{size}")
-                self.end_headers()
+                self.send_error(416)
                 return
             self.send_response(206)
-            whole = size if state.length else "*"
-            self.send_header("Content-Range", f"bytes {start}-{size - 1}/{whole}")
+            self.send_header("Content-Range", f"bytes {start}-{size - 1}/{size}")
         else:
             self.send_response(200)
         body = state.content[start:]
-        self.send_header("Content-Type", state.content_type)
         self.send_header("ETag", state.etag)
-        if state.length:
-            self.send_header("Content-Length", str(len(body)))
+        self.send_header("Content-Length", str(len(body)))
         self.end_headers()
-        with contextlib.suppress(ConnectionError):  # the client may have closed the connection
-            self.wfile.write(body[: state.cuts.pop(0)] if state.cuts else body)
-
-    def date_time_string(self, timestamp: float | None = None) -> str:
-        return self.state.date or super().date_time_string(timestamp)
+        if state.drips:
+            for byte in body:
+                self.wfile.write(bytes([byte]))
+                time.sleep(0.01)
+        self.wfile.write(body[: state.cuts.pop(0)] if state.cuts else body)
 
     def log_message(self, format: str, *args: Any) -> None:  # noqa: A002
         pass
@@ -312,7 +298,7 @@ class _Handler(BaseHTTPRequestHandler):
 def pauses(monkeypatch: pytest.MonkeyPatch) -> list[float]:
     """Let downloads try again at once; return the seconds that they would have waited."""
     waited: list[float] = []
-    monkeypatch.setattr(http, "_wait", waited.append)
+    monkeypatch.setattr(http, "sleep", waited.append)
     return waited
 
 
@@ -337,7 +323,7 @@ def call_command(
     """Return a function that runs a command in this process, in the folder `tmp_path`.
 
     Its arguments are (name, *arguments), the name without "xrgs-"; it returns the exit code, stdout
-    and the message of the error.
+    and stderr.
     """
 
     def call(name: str, *arguments: str) -> tuple[int, str, str]:
@@ -345,11 +331,14 @@ def call_command(
         monkeypatch.chdir(tmp_path)
         monkeypatch.setenv("OMP_WAIT_POLICY", os.environ.get("OMP_WAIT_POLICY", "passive"))
         monkeypatch.setattr(sys, "argv", [f"xrgs-{name}", *arguments])
+        code, message = 0, ""
         try:
             main()
         except SystemExit as end:
-            return 1, capsys.readouterr().out, str(end.code)
-        return 0, capsys.readouterr().out, ""
+            message = end.code if isinstance(end.code, str) else ""
+            code = 1 if message else int(end.code or 0)
+        out, err = capsys.readouterr()
+        return code, out, err + message
 
     return call
 

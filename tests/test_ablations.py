@@ -11,8 +11,7 @@ import pytest
 from omegaconf import OmegaConf
 
 from xrgs.config import CONF_DIR, Conf
-from xrgs.experiment.identity import cell_identity
-from xrgs.safeio.hashing import digest
+from xrgs.experiment import identity
 from xrgs.sweep.axes import expand
 
 ABLATIONS = sorted({path.stem for path in (CONF_DIR / "ablation").glob("*.yaml")} - {"baseline"})
@@ -37,7 +36,7 @@ def composed(compose: Compose) -> Compose:
 
 
 def cell_id(conf: Conf) -> str:
-    return digest(cell_identity(conf, "variant"))
+    return identity.cell_id(identity.cell_identity(conf, "variant"))
 
 
 def flat(values: dict[str, Any], prefix: str = "") -> dict[str, Any]:

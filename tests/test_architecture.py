@@ -39,13 +39,12 @@ FLOW = (
 LAYER = {name: number for number, name in enumerate(FLOW)}
 #: Libraries that only these packages or modules may import.
 ONLY_IN = {
-    "aiohttp": ("capture/download/exchange",),
     "hydra": ("composing", "sweep", "cli"),
     "omegaconf": ("composing", "sweep", "cli"),
     "pycolmap": ("capture/colmap", "capture/sfm"),
-    "matplotlib": ("report",),
-    "pandas": ("experiment", "report"),
-    "kornia": ("evaluation/metrics", "bench"),
+    "matplotlib": ("report", "bench"),
+    "pandas": ("experiment", "report", "bench"),
+    "kornia": ("evaluation/metrics/ssim",),
     "gsplat": (),
     "tqdm": ("runtime/progress", "sweep/monitor"),
     "av": ("capture/scenes/video", "viewer/film"),
@@ -53,8 +52,7 @@ ONLY_IN = {
     "tensorboard": ("sweep/track",),
     "mlflow": ("sweep/track",),
 }
-#: Modules that must load without torch, pycolmap, kornia, scikit-image and aiohttp: planning and
-#: reporting.
+#: Modules that must load without torch, pycolmap, kornia and scikit-image: planning, reporting.
 LIGHT = (
     "capture.variant",
     "cli.data",
@@ -161,7 +159,7 @@ def test_planning_and_reporting_run_without_torch() -> None:
         "import importlib, sys\n"
         f"for module in {LIGHT!r}:\n"
         "    importlib.import_module(f'xrgs.{module}')\n"
-        "    heavy = {'torch', 'pycolmap', 'kornia', 'skimage', 'aiohttp'} & set(sys.modules)\n"
+        "    heavy = {'torch', 'pycolmap', 'kornia', 'skimage'} & set(sys.modules)\n"
         "    assert not heavy, (module, heavy)\n"
     )
     subprocess.run([sys.executable, "-P", "-c", script], check=True)

@@ -376,7 +376,7 @@ def test_omegaconf_takes_an_escaped_text_literally(text: str) -> None:
 @pytest.mark.parametrize(
     ("content", "named"),
     [
-        (b"", r"config\.json: Expecting value"),
+        (b"", r"config\.json: not valid JSON"),
         (b"[1]", r"config\.json: "),
         (b'{"scene": {"name": 1, "kind": "folder"}}', r"config\.json: scene\.name: Expected"),
         (b'{"bogus": 1}', r"config\.json: bogus: there is no such key.*another version"),

@@ -29,8 +29,7 @@ if TYPE_CHECKING:
     from xrgs.splat.gaussians import Gaussians
     from xrgs.splat.gsplat_api import rasterization
     from xrgs.splat.ply import load_ply, save_ply
-    from xrgs.splat.render_result import Render
-    from xrgs.splat.rendering import rasterize
+    from xrgs.splat.rendering import Render, rasterize
     from xrgs.splat.settings import RasterSettings
     from xrgs.training.count_matching import train_cell as train
 
@@ -60,7 +59,7 @@ _MODULES = {
     "Camera": "xrgs.splat.cameras",
     "Gaussians": "xrgs.splat.gaussians",
     "RasterSettings": "xrgs.splat.settings",
-    "Render": "xrgs.splat.render_result",
+    "Render": "xrgs.splat.rendering",
     "Store": "xrgs.experiment.store",
     "XrgsError": "xrgs.errors",
     "build_dataset": "xrgs.capture.prepare",

@@ -70,7 +70,6 @@ def resample(
     column_weights: Tensor,
     threads: int,
 ) -> Tensor: ...
-def multiply_adds_per_second(threads: int) -> float: ...
 
 class RenderConfig:
     def __init__(

@@ -1,24 +1,20 @@
-"""Two installations are compared in turn."""
+"""The comparison of two installations."""
 
 from __future__ import annotations
 
 import csv
-import math
 import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
-import torch
 
-from xrgs.bench import against, against_worker, loads, run, training
+from xrgs.bench import against, run
 from xrgs.bench.against import HR_STEP, LR_STEP, MEAN_STEP, RENDER, SIDES
 from xrgs.bench.loads import Load
 from xrgs.bench.settings import Settings
 from xrgs.errors import XrgsError
 from xrgs.splat.backend import resolve_backend
-from xrgs.splat.settings import RasterSettings
-from xrgs.splat.torch.projection import project
 
 
 def test_ratios_are_taken_repetition_by_repetition() -> None:
@@ -78,40 +74,3 @@ def test_an_installation_that_cannot_run_is_named_with_its_reason(
         against.measure(str(python), load, (load, load), [1], 1)
     with pytest.raises(XrgsError, match="must be the Python executable"):
         against.measure(str(tmp_path), load, (load, load), [1], 1)
-
-
-def test_the_worker_takes_the_step_of_the_benchmark() -> None:
-    assert (against_worker.L1, against_worker.SSIM) == (training.L1, training.SSIM)
-
-
-def test_the_worker_finds_a_function_under_the_name_of_its_release() -> None:
-    assert against_worker._find("math", "rasterize_parameters", "hypot") is math.hypot
-    with pytest.raises(AttributeError, match="math has none of a, b"):
-        against_worker._find("math", "a", "b")
-
-
-def test_larger_gaussians_overlap_more() -> None:
-    usual = loads.random_load(50, 40, 30, seed=0)
-    larger = loads.random_load(50, 40, 30, 0, size_per_spacing=3.0)
-    np.testing.assert_allclose(larger.scales, 2 * usual.scales, rtol=1e-6)
-    np.testing.assert_array_equal(larger.means, usual.means)
-
-
-@pytest.mark.slow
-def test_the_scene_is_as_heavy_as_a_trained_one() -> None:
-    """56 Gaussians contribute to a pixel, counted by Eq. 8 and 14 at pixels of its middle rows."""
-    scene = loads.random_load(*run.FULL.scene, 0, run._SCENE_SIZE_PER_SPACING)
-    means, quats, scales, opacities, *_ = (value.double() for value in scene.parameters)
-    settings = RasterSettings()
-    projected = project(means, quats, scales, opacities, scene.camera, settings)
-    xx, xy, yy = projected.cov.unbind(-1)
-    order = projected.depths.argsort()
-    counts = []
-    for x in range(8, scene.camera.width, 16):
-        y = scene.camera.height // 2 + x % 7 - 3
-        dx, dy = (torch.tensor([x + 0.5, y + 0.5]) - projected.means2d).unbind(-1)
-        power = (yy * dx**2 - 2 * xy * dx * dy + xx * dy**2) / (2 * projected.det)
-        alpha = (projected.opacities * torch.exp(-power)).clamp_max(settings.alpha_max)[order]
-        alpha = alpha[alpha >= settings.alpha_min]
-        counts.append(int(((1 - alpha).cumprod(0) > settings.transmittance_min).sum()))
-    assert 52 < sum(counts) / len(counts) < 60

@@ -20,9 +20,9 @@ from PIL import Image
 import xrgs.report
 from xrgs.capture import variant
 from xrgs.cli import sweep
+from xrgs.experiment.cell_folder import CellFolder
 from xrgs.experiment.store import Store
 from xrgs.safeio.atomic import write_json
-from xrgs.safeio.confined import ConfinedPath
 from xrgs.sweep.jobs import worker
 
 RunCommand = Callable[..., tuple[int, str, str]]
@@ -106,26 +106,30 @@ class Children:
     def run(self, job: str, request: Mapping[str, Any], *_: object) -> dict[str, Any]:
         if job == "variant":
             made = Store(Path(request["store"])).variants / "0123456789abcdef-0123456789abcdef"
-            made.make_folder()
+            made.mkdir(parents=True)
             return {"variant": made.name}
-        folder = Store(Path(request["conf"]["store"])).cell(Path(request["cell"]).name)
+        folder = CellFolder(Path(request["cell"]))
+        conf = folder.config()
         self.trained.append(folder.id)
-        if (seed := request["conf"]["seed"]) in self.failures:
-            raise worker.WorkerError(self.failures[seed])
-        if request["conf"]["components"]["count_matched"]["gaussians"] == self.unreachable:
+        if conf.seed in self.failures:
+            raise worker.WorkerError(self.failures[conf.seed])
+        if conf.components.count_matched.gaussians == self.unreachable:
             raise worker.WorkerError(f"no threshold gave {self.unreachable} Gaussians")
-        (folder.path / "scores.csv").write_text("view\na\n")
-        summary = {"gaussians": self.gaussians + len(self.trained), "training_time_s": 1.0}
-        write_json(folder.path / "summary.json", summary)
-        folder.finish(["a"], 1)
+        finish(folder, gaussians=self.gaussians + len(self.trained))
         return {}
 
-    def find(self, variants: ConfinedPath, _: str) -> SimpleNamespace | None:
-        try:
-            names = [name for name in variants.names() if name.startswith("0123456789abcdef-")]
-        except FileNotFoundError:  # there is no store yet
-            names = []
+    def find(self, variants: Path, _: str) -> SimpleNamespace | None:
+        names = [path.name for path in variants.glob("0123456789abcdef-*")]
         return SimpleNamespace(id=names[0]) if names else None
+
+
+def finish(cell: CellFolder, gaussians: int) -> None:
+    """Write the least that a done cell has."""
+    (cell.path / "scores.csv").write_text("view,psnr\na,20\nb,22\n")
+    times = {"training_time_s": 1.0, "render_time_ms": 1.0}
+    sizes = {"memory_bytes": 1.0, "evaluations": 1.0, "steps": 8}
+    write_json(cell.path / "summary.json", {"gaussians": gaussians} | times | sizes)
+    cell.finish(["a", "b"], {})
 
 
 @pytest.fixture

@@ -20,7 +20,8 @@ def test_a_trained_cell_becomes_a_load_of_the_benchmark(
     folder, _ = swept
     cell = sorted((folder / "s" / "cells").iterdir())[0]
     view = json.loads((cell / "status.json").read_text())["views"][0]
-    code, out, err = run_command("bench", folder, "save=a.npz", f"cell={cell}", f"view={view}")
+    save = ("--save", "a.npz", "--cell", str(cell), "--view")
+    code, out, err = run_command("bench", folder, *save, view)
     assert code == 0, err
     with np.load(folder / "a.npz") as stored:
         count = json.loads((cell / "summary.json").read_text())["gaussians"]
@@ -30,7 +31,7 @@ def test_a_trained_cell_becomes_a_load_of_the_benchmark(
         with Image.open(cell / "renders" / f"{view}.png") as picture:
             assert picture.size == (stored["width"], stored["height"])
     assert f"{count} Gaussians" in out
-    code, _, err = run_command("bench", folder, "save=a.npz", f"cell={cell}", "view=none")
+    code, _, err = run_command("bench", folder, *save, "none")
     assert code != 0
-    assert "view=none" in err
+    assert "--view none: " in err
     assert view in err

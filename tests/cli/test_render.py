@@ -14,24 +14,6 @@ from xrgs.experiment.store import Store
 RunCommand = Callable[..., tuple[int, str, str]]
 
 
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        (["path=orbit"], "give one cell or 2"),
-        (["abc"], "store=xrgs-store is not a store"),
-        (["abc", "size=504"], "size=504: must be WIDTHxHEIGHT, as 504x378"),
-        (["abc", "views=many"], "views"),
-        (["abc", "pth=orbit"], "pth"),
-    ],
-    ids=" ".join,
-)
-def test_bad_input_is_named(call_command: RunCommand, arguments: list[str], message: str) -> None:
-    code, out, err = call_command("render", *arguments)
-    assert (code, out) == (1, "")
-    assert err.startswith("xrgs-render: ")
-    assert message in err
-
-
 @pytest.mark.slow
 def test_a_frame_at_the_first_test_view_is_the_render_that_was_scored(
     run_command: RunCommand, store: Path
@@ -41,8 +23,8 @@ def test_a_frame_at_the_first_test_view_is_the_render_that_was_scored(
     for label, cell_id in cells.items():
         renders = sorted((store / "cells" / cell_id / "renders").iterdir())
         code, out, err = run_command(
-            *("render", store.parent, cell_id[:10], "store=s", "path=test"),
-            *(f"views={len(renders)}", f"out={label}"),
+            *("render", store.parent, cell_id[:10], "--store", "s", "--path", "test"),
+            *("--views", str(len(renders)), "--out", str(label)),
         )
         assert code == 0, err
         assert out.startswith(f"{label}: {len(renders)} frames of ")
@@ -52,8 +34,7 @@ def test_a_frame_at_the_first_test_view_is_the_render_that_was_scored(
         height, width = found.shape[:2]
         assert np.abs(found - expected[:height, :width]).max() <= 1
         assert (found == expected[:height, :width]).mean() > 0.999
-    code, out, err = run_command(
-        "render", store.parent, *cells, "store=s", "views=3", "size=64x48", "out=both.mp4"
-    )
+    both = ("--store", "s", "--views", "3", "--size", "64", "48", "--out", "both.mp4")
+    code, out, err = run_command("render", store.parent, *cells, *both)
     assert code == 0, err
     assert out == "both.mp4: 3 frames of 128 x 48 px, 0.1 s\n"

@@ -13,36 +13,53 @@ from pathlib import Path
 
 import pytest
 
+from tests.cli.conftest import finish
 from xrgs.cli import store as command
-from xrgs.experiment.attempts import begin_attempt
+from xrgs.config import Conf
+from xrgs.experiment.attempts import begin_attempt, plan_cell
+from xrgs.experiment.cell_folder import CellFolder
+from xrgs.experiment.identity import cell_identity
+from xrgs.experiment.schema import RecordedCell
 from xrgs.experiment.store import Store
 
 Call = Callable[..., tuple[int, str, str]]
 
 
 @pytest.fixture
-def xrgs_store(call_command: Call, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Call:
-    """(*arguments) -> exit code, stdout and message of `xrgs-store` on a store of two cells."""
+def begun(tmp_path: Path, compose: Callable[..., Conf]) -> Callable[[str, int], CellFolder]:
+    """(id, steps) -> the folder of a cell whose training has begun."""
+
+    def begin(name: str, steps: int) -> CellFolder:
+        folder = Store(tmp_path / "s").cell(name)
+        conf = compose(f"train.steps={steps}")
+        plan_cell(folder, conf, cell_identity(conf, "v"))
+        begin_attempt(folder)
+        return folder
+
+    return begin
+
+
+@pytest.fixture
+def xrgs_store(
+    call_command: Call,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    begun: Callable[[str, int], CellFolder],
+) -> Call:
+    """(*arguments) -> exit code, stdout and stderr of `xrgs-store` on a store of two cells."""
     monkeypatch.setattr(command, "exit_on_signal", nullcontext)  # keep pytest's own handlers
     store = Store(tmp_path / "s")
     store.prepare()
-    for name in ("abc", "abd"):
-        folder = store.cell(name)
-        begin_attempt(
-            folder, {"train": {"steps": 3 if name == "abc" else 4}}, {"variant": "v", "seed": 0}
-        )
+    for name, steps in (("abc", 3), ("abd", 4)):
+        folder = begun(name, steps)
         (folder.path / "splats.ply").write_bytes(bytes(1000))
-        (folder.path / "scores.csv").write_text("view,psnr\na,20\nb,22\n")
-        (folder.path / "summary.json").write_text('{"gaussians": 17}')
-        folder.finish(["a", "b"], 1)
-    rows = [
-        {"cell_id": name, "label": label, "scene": "fern", "condition": "", "baseline_id": "abc"}
-        for name, label in (("abc", "baseline"), ("abd", "mip"))
-    ]
+        finish(folder, gaussians=17)
+    names = (("abc", "baseline"), ("abd", "mip"))
+    rows = [RecordedCell(name, label, "", "fern", 0, 0, "v", "abc") for name, label in names]
     store.write_sweep([], rows)
 
     def run(*arguments: str) -> tuple[int, str, str]:
-        return call_command("store", *arguments, "store=s")
+        return call_command("store", *arguments, "--store", "s")
 
     return run
 
@@ -51,7 +68,7 @@ def xrgs_store(call_command: Call, tmp_path: Path, monkeypatch: pytest.MonkeyPat
 def test_a_reader_of_the_list_that_ends_first_is_no_error(tmp_path: Path) -> None:
     reader, writer = os.pipe()
     os.close(reader)
-    words = ["-c", "from xrgs.cli.store import main; main()", "list", "store=s"]
+    words = ["-c", "from xrgs.cli.store import main; main()", "list", "--store", "s"]
     done = subprocess.run(
         [sys.executable, "-P", *words],
         cwd=tmp_path,
@@ -68,7 +85,7 @@ def cells(tmp_path: Path) -> list[str]:
 
 
 def test_cells_are_listed_and_one_is_shown(xrgs_store: Call) -> None:
-    code, out, _ = xrgs_store("list", "ablations=mip")
+    code, out, _ = xrgs_store("list", "--ablations", "mip")
     assert code == 0
     assert out.startswith("1 cell, ")
     assert "abd   fern   mip" in out
@@ -83,16 +100,16 @@ def test_cells_are_listed_and_one_is_shown(xrgs_store: Call) -> None:
 def test_nothing_is_removed_without_a_yes(
     xrgs_store: Call, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    code, out, _ = xrgs_store("rm", "abd", "dry_run=true")
+    code, out, _ = xrgs_store("rm", "abd", "--dry-run")
     assert code == 0
     assert "to remove: cells (1): " in out
     assert "abd  fern / mip, done" in out
     monkeypatch.setattr(sys, "stdin", io.StringIO("y\n"))  # no terminal: nobody has answered
     code, _, err = xrgs_store("rm", "abd")
     assert code == 1
-    assert "nothing was done; yes=true" in err
+    assert "nothing was done; --yes" in err
     assert cells(tmp_path) == ["abc", "abd"]
-    code, out, _ = xrgs_store("rm", "abd", "yes=true")
+    code, out, _ = xrgs_store("rm", "abd", "--yes")
     assert code == 0
     assert "freed " in out
     assert cells(tmp_path) == ["abc"]
@@ -110,7 +127,7 @@ def test_a_terminal_is_asked(
 
 
 def test_trim_keeps_what_tables_are_made_of(xrgs_store: Call, tmp_path: Path) -> None:
-    code, out, _ = xrgs_store("trim", "yes=true")
+    code, out, _ = xrgs_store("trim", "--yes")
     assert code == 0
     assert out.splitlines()[-1] == "freed 2 kB"
     assert "done (trimmed)" in xrgs_store("list")[1]
@@ -119,13 +136,14 @@ def test_trim_keeps_what_tables_are_made_of(xrgs_store: Call, tmp_path: Path) ->
     assert xrgs_store("check")[0] == 0
 
 
-def test_packed_cells_are_a_store_again(xrgs_store: Call, tmp_path: Path) -> None:
-    begin_attempt(Store(tmp_path / "s").cell("abe"), {}, {})
-    for out in ("", "out=study.zip"):
-        code, _, err = xrgs_store("pack", *filter(None, [out]))
-        assert code == 1
-        assert "name the archive to write, FILE.tar.xz" in err
-    code, out, _ = xrgs_store("pack", "out=study.tar.xz")
+def test_packed_cells_are_a_store_again(
+    xrgs_store: Call, tmp_path: Path, begun: Callable[[str, int], CellFolder]
+) -> None:
+    begun("abe", 5)
+    code, _, err = xrgs_store("pack", "--out", "study.zip")
+    assert code == 1
+    assert "--out study.zip: name the archive to write, FILE.tar.xz" in err
+    code, out, _ = xrgs_store("pack", "--out", "study.tar.xz")
     assert code == 1  # their variant is not there
     assert out.startswith("study.tar.xz: 2 cells, 0 variants, 1 record of sweeps; ")
     assert out.splitlines()[1] == "left out, not done: 1 cell"
@@ -149,12 +167,10 @@ def test_check_ends_with_1_where_something_is_damaged(xrgs_store: Call, tmp_path
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["rm", "yes=true"], "rm: name cells, or give a filter"),
-        (["remove"], "remove: there is no such command; choose from: list, show, rm"),
-        (["gc", "abc"], "gc abc: gc takes no cells"),
-        (["show"], "show: give the id of one cell"),
-        (["list", "sceens=fern"], "sceens"),
-        (["rm", "ab", "yes=true"], "ab: several cells have such an id"),
+        (["rm", "--yes"], "rm: name cells, or choose them by an option"),
+        (["rm", "ab", "--yes"], "ab: several cells have such an id"),
+        (["rm", "--scenes", "horns", "--yes"], "--scenes horns: no cell has that"),
+        (["gc", "--of", "cells", "--yes"], "--of cells: choose from: old_code"),
     ],
 )
 def test_bad_input_is_named_and_removes_nothing(

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import json
-import os
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -15,7 +13,6 @@ from PIL import Image
 from xrgs.capture import variant
 from xrgs.config import CONF_DIR
 from xrgs.experiment.store import Store
-from xrgs.splat.backend import REQUIRE_NATIVE
 
 SweepHere = Callable[..., tuple[int, str, str]]
 RunCommand = Callable[..., tuple[int, str, str]]
@@ -51,8 +48,8 @@ def test_a_sweep_trains_each_cell_once_and_ends_with_the_table(
     assert "plan: 4 cells, 4 done" in err
     assert len(children.trained) == 4
     record = Store(tmp_path / "s").sweep_record()
-    assert [row["label"] for row in record["cells"]] == ["baseline", "consistency"] * 2
-    assert record["cells"][1]["baseline_id"] == record["cells"][0]["cell_id"]
+    assert [row.label for row in record.cells] == ["baseline", "consistency"] * 2
+    assert record.cells[1].baseline_id == record.cells[0].cell_id
 
 
 def test_a_cell_keeps_the_config_and_identity_of_its_plan(
@@ -61,11 +58,9 @@ def test_a_cell_keeps_the_config_and_identity_of_its_plan(
     sweep_here(*SCENE, "threads=3")
     (cell_id,) = children.trained
     folder = Store(tmp_path / "s").cell(cell_id)
-    (handed_over,) = (tmp_path / "s" / "hydra").glob(f"*/cells/{cell_id}.json")
-    content = json.loads(handed_over.read_text())
-    conf = json.loads((folder.path / "config.json").read_text())
-    assert (content["config"], content["identity"]) == (conf, folder.identity())
-    assert (conf["store"], conf["threads"]) == (str(tmp_path / "s"), 3)
+    conf = folder.config()
+    assert (conf.store, conf.threads) == (str(tmp_path / "s"), 3)
+    assert folder.identity().train["steps"] == conf.train.steps
 
 
 def test_photographs_are_hashed_once_for_all_cells_of_a_scene(
@@ -121,11 +116,11 @@ def test_a_cell_that_takes_a_count_from_another_is_trained_after_it(
     code, _, err = sweep_here(*control)
     assert code == 0, err
     store = Store(tmp_path / "s")
-    rows = {row["label"].split()[0]: row["cell_id"] for row in store.sweep_record()["cells"]}
+    rows = {row.label.split()[0]: row.cell_id for row in store.sweep_record().cells}
     assert children.trained[-1] == rows["count_matched"]
-    count = store.cell(rows["gradient_scaling"]).summary()["gaussians"]
+    count = store.cell(rows["gradient_scaling"]).summary().gaussians
     identity = store.cell(rows["count_matched"]).identity()
-    assert identity["components"]["count_matched"]["gaussians"] == count
+    assert identity.components["count_matched"]["gaussians"] == count
     assert "plan: 3 cells, 3 done" in sweep_here(*control)[2]
     assert len(children.trained) == 3
 
@@ -140,14 +135,14 @@ def test_each_arm_and_replicate_has_a_control_and_a_count_out_of_reach_fails_one
     children.unreachable = children.gaussians + 6
     assert sweep_here(*arguments)[0] == 1
     store = Store(tmp_path / "s")
-    rows = {(row["label"], row["seed"]): row["cell_id"] for row in store.sweep_record()["cells"]}
+    rows = {(row.label, row.seed): row.cell_id for row in store.sweep_record().cells}
     assert len(rows) == len(children.trained) == 10
     missing = []
     for arm in arms.split(","):
         for seed in (0, 1):
-            count = store.cell(rows[arm, seed]).summary()["gaussians"]
+            count = store.cell(rows[arm, seed]).summary().gaussians
             control = store.cell(rows[f"count_matched to {arm}", seed])
-            assert control.identity()["components"]["count_matched"]["gaussians"] == count
+            assert control.identity().components["count_matched"]["gaussians"] == count
             if control.state().name != "done":
                 missing.append((count, control.state().reason))
     assert missing == [
@@ -219,9 +214,6 @@ def test_a_launcher_named_in_an_ablation_is_refused(sweep_here: SweepHere, tmp_p
 @pytest.mark.parametrize(
     ("arguments", "named"),
     [
-        (["+ablation=nope"], ["ablation=nope", "consistency"]),
-        (["scene=nope"], ["scene=nope", "procedural"]),
-        (["train.stpes=3"], ["train.stpes"]),
         (["train.steps=many"], ["train.steps", "many"]),
         (["seed=interval(0,1)"], ["interval"]),
         (["scene=folder"], ["scene.path"]),
@@ -232,12 +224,11 @@ def test_a_launcher_named_in_an_ablation_is_refused(sweep_here: SweepHere, tmp_p
         (["train.steps=0"], ["train.steps"]),
         (["checkpoint_s=nan"], ["checkpoint_s"]),
         (["splat.backend=cuda"], ["splat.backend=cuda", "native"]),
-        (["store=\udcff"], ["not valid Unicode"]),
         (["rerun=gone"], ["rerun=gone", "no such folder"]),
         (["rerun=gone", "seed=1"], ["seed", "rerun= takes out="]),
         (["rerun=gone", "threads=x"], ["threads"]),
     ],
-    ids=lambda value: " ".join(value).encode(errors="replace").decode(),
+    ids=" ".join,
 )
 def test_bad_input_is_named(
     sweep_here: SweepHere,
@@ -305,28 +296,6 @@ def test_a_dry_run_plans_without_torch_and_writes_nothing(
     assert not list(tmp_path.iterdir())
 
 
-def test_a_dry_run_without_kernels_says_how_long_torch_takes(
-    run_command: RunCommand,
-    tmp_path: Path,
-    without_heavy: str,
-    photographs: Callable[..., Path],
-) -> None:
-    (tmp_path / "sitecustomize.py").write_text(
-        "import importlib.util as u\n"
-        "find = u.find_spec\n"
-        "u.find_spec = lambda name, *a: None if name == 'xrgs._native' else find(name, *a)\n"
-    )
-    variables = {"PYTHONPATH": f"{tmp_path}{os.pathsep}{without_heavy}", REQUIRE_NATIVE: "0"}
-    scene = ("scene=folder", f"scene.path={photographs(tmp_path / 'photographs', 5)}")
-    arguments = ("+ablation=consistency", "seed=0,1", "dry_run=true", "store=s")
-    code, _, err = run_command("sweep", tmp_path, *scene, *arguments, **variables)
-    assert code == 0, err
-    assert "left to train, one after another: ~" in err
-    (line,) = (line for line in err.splitlines() if "not built on this machine" in line)
-    assert "torch trains 4 cells, ~" in line
-    assert " instead of ~" in line
-
-
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
@@ -377,7 +346,6 @@ def test_an_ablation_that_changes_nothing_is_named_in_the_plan(sweep_here: Sweep
     assert "consistency consistency.weight=0 changes nothing here" in err
 
 
-def test_the_plan_says_what_a_sweep_takes(sweep_here: SweepHere) -> None:
+def test_the_plan_says_that_lpips_has_no_weights(sweep_here: SweepHere) -> None:
     _, _, err = sweep_here(*SCENE, "dry_run=true")
-    assert "of memory, all of them" in err
     assert "LPIPS will be n/a" in err  # lpips.fetch is off in tests

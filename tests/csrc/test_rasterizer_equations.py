@@ -14,7 +14,7 @@ from torch import Tensor
 from torch.linalg import cross
 
 from xrgs.splat.cameras import Camera
-from xrgs.splat.rasterize import rasterize_parameters
+from xrgs.splat.rendering import rasterize_parameters
 from xrgs.splat.settings import RasterSettings
 from xrgs.splat.sh import sh_basis
 

@@ -20,7 +20,7 @@ import hashlib, sys
 import torch
 from xrgs import _native
 from xrgs.splat.cameras import Camera
-from xrgs.splat.rasterize import rasterize_parameters
+from xrgs.splat.rendering import rasterize_parameters
 from xrgs.splat.settings import RasterSettings
 
 def digest():

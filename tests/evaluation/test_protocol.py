@@ -18,7 +18,7 @@ from xrgs.evaluation import protocol
 from xrgs.safeio.confined import ConfinedPath
 from xrgs.splat.cameras import Camera
 from xrgs.splat.gaussians import Gaussians, from_points
-from xrgs.splat.rasterize import rasterize_parameters
+from xrgs.splat.rendering import rasterize_parameters
 
 
 @pytest.fixture

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import logging
 import random
 import shutil
@@ -11,34 +10,33 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable
-from dataclasses import asdict
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, cast
 
+import msgspec
 import pytest
 
+from tests.experiment.cells import begun
 from xrgs.capture import dataset, variant
 from xrgs.capture.dataset import Dataset
 from xrgs.capture.views import Variant
 from xrgs.config import Conf
 from xrgs.evaluation import protocol
 from xrgs.experiment import cell
-from xrgs.experiment.attempts import begin_attempt
 from xrgs.experiment.cell_folder import CellFolder
-from xrgs.experiment.identity import cell_identity
+from xrgs.experiment.identity import cell_id, cell_identity
 from xrgs.experiment.store import Store
 from xrgs.runtime import progress
 from xrgs.runtime.signals import StopRequest, StopSignal
 from xrgs.safeio.atomic import write_json
-from xrgs.safeio.hashing import digest
-from xrgs.safeio.records import read_object, read_table
+from xrgs.safeio.records import read_table
 from xrgs.splat.backend import resolve_backend
 from xrgs.sweep.jobs import worker
 from xrgs.training import loop as train
 
 #: Stands in for a variant that is never read.
-VARIANT = cast(Variant, SimpleNamespace())
+VARIANT = cast(Variant, SimpleNamespace(id="v"))
 
 
 class LoadError(Exception):
@@ -79,10 +77,8 @@ def kill_at(monkeypatch: pytest.MonkeyPatch, module: Any, name: str, call: int) 
 
 def begin(conf: Conf, root: Path, variant_id: str = "v") -> CellFolder:
     """Begin a cell's folder as a job does."""
-    identity = cell_identity(conf, variant_id)
-    root.mkdir(exist_ok=True)
-    folder = CellFolder(root / digest(identity))
-    return begin_attempt(folder, asdict(conf), identity)
+    what = cell_identity(conf, variant_id)
+    return begun(CellFolder(root / cell_id(what)), conf, what)
 
 
 def results(folder: CellFolder) -> dict[str, Any]:
@@ -91,7 +87,7 @@ def results(folder: CellFolder) -> dict[str, Any]:
     assert not folder.checkpoint.exists()
     names = ["splats.ply", "history.csv", "scores.csv"]
     names += [f"renders/{file.name}" for file in sorted((folder.path / "renders").iterdir())]
-    summary = folder.summary()
+    summary = msgspec.structs.asdict(folder.summary())
     assert summary.pop("render_time_ms") > 0
     del summary["training_time_s"], summary["stage_seconds"], summary["peak_rss_bytes"]
     return {name: (folder.path / name).read_bytes() for name in names} | summary
@@ -146,28 +142,28 @@ def test_a_cell_killed_in_training_and_again_in_evaluation_goes_on(
 
 def test_a_cell_that_goes_on_elsewhere_names_both_machines(conf: Conf, tmp_path: Path) -> None:
     killed(conf, tmp_path, 6)
-    key, several = "machines_in_turn", ["threads 1", "threads 2"]
+    several = ["threads 1", "threads 2"]
     for conf.threads in (2, 1, 2):  # here, where it began, and here again
         folder = begin(conf, tmp_path)
         with pytest.MonkeyPatch.context() as patch:
             kill_at(patch, protocol, "score_views", 1)
             with pytest.raises(Kill):
                 cell.run_cell(conf, VARIANT, folder)
-        found = folder.provenance()[key].split("; ")
+        found = folder.provenance().machines_in_turn.split("; ")
         assert len(found) == 2
         assert all(word in name for word, name in zip(several, found, strict=True))
     # Where training starts over, the last machine is the only one.
-    _truncate(folder.checkpoint.path, folder.checkpoint.path)
+    _truncate(folder.checkpoint, folder.checkpoint)
     folder = begin(conf, tmp_path)
     cell.run_cell(conf, VARIANT, folder)
-    assert key not in folder.provenance()
+    assert not folder.provenance().machines_in_turn
 
 
 def test_a_cell_that_goes_on_where_it_was_has_one_machine(conf: Conf, tmp_path: Path) -> None:
     killed(conf, tmp_path, 6)
     folder = begin(conf, tmp_path)
     cell.run_cell(conf, VARIANT, folder)
-    assert "machines_in_turn" not in folder.provenance()
+    assert not folder.provenance().machines_in_turn
 
 
 def _truncate(checkpoint: Path, other: Path) -> None:
@@ -190,7 +186,7 @@ def test_an_unusable_checkpoint_is_logged_and_training_starts_over(
     conf.seed = 1
     other = killed(conf, tmp_path / "other", 9)
     conf.seed = 0
-    spoil(folder.checkpoint.path, other.checkpoint.path)
+    spoil(folder.checkpoint, other.checkpoint)
     folder = begin(conf, tmp_path / "a")
     with caplog.at_level(logging.WARNING):
         cell.run_cell(conf, VARIANT, folder)
@@ -211,11 +207,8 @@ def test_a_worker_that_is_killed_goes_on_in_another(
     store.prepare()
     built = variant.build(conf.scene, conf.variant, store.variants, store.scenes)
 
-    def request(folder: CellFolder) -> dict[str, Any]:
-        return worker.cell_request(asdict(conf), built.folder, folder)
-
     folder = begin(conf, tmp_path / "killed", built.id)
-    write_json(tmp_path / "request.json", request(folder))
+    write_json(tmp_path / "request.json", worker.cell_request(built.folder, folder))
     files = [str(tmp_path / "request.json"), str(tmp_path / "answer.json")]
     child = subprocess.Popen([sys.executable, "-P", "-m", "xrgs.sweep.jobs.worker", "cell", *files])
     while not folder.checkpoint.exists() and child.poll() is None:
@@ -226,15 +219,13 @@ def test_a_worker_that_is_killed_goes_on_in_another(
     folder.fail("its process was ended by SIGKILL")  # as the job does that started it
 
     folder = begin(conf, tmp_path / "killed", built.id)
-    worker.run_in_child("cell", request(folder))
+    worker.run_in_child("cell", worker.cell_request(built.folder, folder))
     log = (folder.path / "log.txt").read_text()
     assert "going on from the checkpoint" in log
     spared = begin(conf, tmp_path / "spared", built.id)
-    worker.run_in_child("cell", request(spared))
+    worker.run_in_child("cell", worker.cell_request(built.folder, spared))
     assert results(folder) == results(spared)
-    assert json.loads((folder.path / "status.json").read_text())["files"].keys() == (
-        json.loads((spared.path / "status.json").read_text())["files"].keys()
-    )
+    assert folder.status().files.keys() == spared.status().files.keys()
 
 
 def test_the_test_views_are_scored_during_training_and_nothing_else_changes(
@@ -247,12 +238,12 @@ def test_the_test_views_are_scored_during_training_and_nothing_else_changes(
     scored = begin(conf, tmp_path / "scored")
     cell.run_cell(conf, VARIANT, scored)
     assert results(scored) == results(plain)
-    header, rows = read_table(scored.folder / "quality.csv")
+    header, rows = read_table(scored.path / "quality.csv")
     assert header == ["step", "seconds", "evaluations", "gaussians", "lpips", "ssim", "psnr"]
     table = [dict(zip(header, row, strict=True)) for row in rows]
     assert [row["step"] for row in table] == ["5", "10"]
     assert all(float(row["psnr"]) > 0 for row in table)
-    assert "quality.csv" in read_object(scored.folder / "status.json")["files"]
+    assert "quality.csv" in scored.status().files
 
 
 def test_a_cell_that_is_asked_to_end_keeps_every_step_and_says_what_happened(
@@ -279,9 +270,8 @@ def test_a_cell_that_is_asked_to_end_keeps_every_step_and_says_what_happened(
     assert not (folder.path / "error.txt").exists()
     assert not folder.progress.exists()
     with caplog.at_level(logging.INFO):
-        again = begin_attempt(folder, asdict(conf), folder.identity())
-        cell.run_cell(conf, VARIANT, again)
-    assert results(again) == expected
+        cell.run_cell(conf, VARIANT, begun(folder, conf, folder.identity()))
+    assert results(folder) == expected
     for line in ("going on from the checkpoint, 5 steps done", "trained 12 steps in", "mean PSNR"):
         assert line in caplog.text
 

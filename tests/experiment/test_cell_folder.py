@@ -4,46 +4,50 @@ from __future__ import annotations
 
 import pytest
 
+from tests.experiment.cells import SCORES, SUMMARY, identity
+from xrgs.experiment.attempts import plan_cell
 from xrgs.experiment.cell_folder import CellFolder
 from xrgs.safeio.atomic import write_json
 
 
 def test_a_finished_cell_is_done_and_gives_back_what_was_written(done: CellFolder) -> None:
     assert done.state().name == "done"
-    assert done.summary() == {"gaussians": 7}
-    assert done.identity() == {"seed": 0}
+    assert done.summary() == SUMMARY
+    assert done.identity() == identity()
+    assert done.config().scene.name == "motorcycle"
     assert done.history()["loss"].tolist() == [0.5]
 
 
 def test_declaring_a_cell_done_twice_keeps_it_done(done: CellFolder) -> None:
-    done.finish(["a", "b"], protocol=1)
+    done.finish(["a", "b"], {})
     assert done.state().name == "done"
 
 
-def test_a_cell_without_status_is_unfinished_and_an_absent_one_absent(done: CellFolder) -> None:
-    (done.path / "status.json").unlink()
+def test_a_cell_without_status_is_unfinished_planned_or_absent(done: CellFolder) -> None:
+    done.status_file.unlink()
     assert done.state().name == "unfinished"
-    assert CellFolder(done.path.with_name("other")).state().name == "absent"
+    other = CellFolder(done.path.with_name("other"))
+    assert other.state().name == "absent"
+    plan_cell(other, done.config(), identity())
+    assert other.state().name == "planned"
 
 
 @pytest.mark.parametrize(
     ("name", "content"),
     [
-        ("scores.csv", "view,psnr,ssim,lpips\na,99.9,0.75,\nb,30.0,0.5,\n"),
+        ("scores.csv", SCORES.replace("20.5", "99.5")),
         ("scores.csv", "view,psnr,ssim,lpips\na,20.5,0.75,\n"),
         ("config.json", '{"seed": 1}'),
         ("identity.json", '{\n "seed": 1\n}\n'),
-        ("history.csv", "step,loss\n0,0.7\n"),  # of the same size, as a report would read it
-        ("summary.json", '{\n "gaussians": 8\n}\n'),
+        ("history.csv", "step,view,gaussians,loss\n0,c,7,0.7\n"),  # of the same size
+        ("summary.json", "{}"),
         ("renders/a.png", "12345"),
         ("status.json", "{"),
-        ("status.json", '{"state": "done"}'),
+        ("status.json", '{"state": "finished"}'),
         ("status.json", "[]"),
     ],
 )
-def test_a_cell_that_was_tampered_with_is_corrupt(
-    done: CellFolder, name: str, content: str
-) -> None:
+def test_a_cell_that_was_changed_is_corrupt(done: CellFolder, name: str, content: str) -> None:
     (done.path / name).write_text(content)
     assert done.state().name == "corrupt"
     assert done.state().reason
@@ -51,7 +55,7 @@ def test_a_cell_that_was_tampered_with_is_corrupt(
 
 @pytest.mark.parametrize("views", [["a"], ["a", "c"], ["b", "a"], ["a", "b", "b"]])
 def test_scores_of_other_views_than_planned_are_corrupt(done: CellFolder, views: list[str]) -> None:
-    done.finish(views, protocol=1)
+    done.finish(views, {})
     assert done.state().name == "corrupt"
     assert "one row for each view" in done.state().reason
     assert done.state(verify=False).name == "done"  # sizes alone do not show it
@@ -60,8 +64,7 @@ def test_scores_of_other_views_than_planned_are_corrupt(done: CellFolder, views:
 def test_the_state_of_a_cell_in_training_names_its_owner(done: CellFolder) -> None:
     assert done.running("process 7 on host").reason == "by process 7 on host"
     write_json(
-        done.progress,
-        {"what": "training", "unit": "step", "done": 5, "total": 10, "rate": None},
+        done.progress, {"what": "training", "unit": "step", "done": 5, "total": 10, "rate": None}
     )
     state = done.running("process 7 on host")
     assert (state.name, state.reason) == ("running", "by process 7 on host: training 5 of 10 steps")
@@ -81,9 +84,16 @@ def test_a_failed_cell_says_why(done: CellFolder) -> None:
 
 
 def test_a_finished_cell_has_no_checkpoint(stopped: CellFolder) -> None:
-    stopped.finish(["a", "b"], protocol=1)
-    stopped.progress.unlink()  # of a process that is no more: no part of the result
+    stopped.finish(["a", "b"], {})
+    stopped.progress.unlink()  # of a process that has ended: no result
     assert stopped.state().name == "done"
     assert not stopped.checkpoint.exists()
-    stopped.checkpoint.path.write_bytes(b"killed before it was removed")
+    stopped.checkpoint.write_bytes(b"killed before it was removed")
     assert stopped.state().name == "done"
+
+
+def test_new_scores_of_a_done_cell_are_part_of_it(done: CellFolder) -> None:
+    (done.path / "scores.csv").write_text(SCORES.replace("20.5", "21.5"))
+    done.rescored(["scores.csv"], {"psnr": "4567"})
+    assert done.state().name == "done"
+    assert done.status().scored_by == {"psnr": "4567"}

@@ -1,31 +1,163 @@
-"""Tests that a cell's identity has everything that can change a number, and nothing else."""
+"""Tests that a cell's identity has everything that can change a trained number, and nothing else.
+
+Code is edited in a copy of the package, whose digests then stand for the installed package's.
+"""
 
 from __future__ import annotations
 
 import copy
 import dataclasses
 import importlib
-import json
+import shutil
 import subprocess
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
 import pytest
 
+from xrgs import config
 from xrgs.config import Conf
 from xrgs.errors import XrgsError
-from xrgs.evaluation.protocol import PROTOCOL_VERSION
+from xrgs.evaluation import metrics, scoring
 from xrgs.experiment import identity
-from xrgs.experiment.identity import cell_identity
-from xrgs.safeio import hashing
-from xrgs.safeio.hashing import digest
-from xrgs.splat.backend import arithmetic, resolve_backend
+from xrgs.safeio import code
+from xrgs.splat.backend import resolve_backend
+from xrgs.training.registry import BUILT_IN, modules_of
+
+PACKAGE = Path(identity.__file__).parents[1]
+#: Python files of the model and of training whose change changes no trained number.
+NO_NUMBERS = {
+    "splat/__init__.py",
+    "splat/gsplat_api.py",  # gsplat's signature, for users
+    "splat/ply.py",  # saves the trained Gaussians, exactly as its own tests say
+    "training/__init__.py",
+    "training/registry.py",  # identities have the order of the components that are on
+    "training/plugins.py",
+}
 
 
 def cell_id(conf: Conf, variant: str = "v") -> str:
-    return digest(cell_identity(conf, variant))
+    return identity.cell_id(identity.cell_identity(conf, variant))
+
+
+@pytest.fixture(scope="module")
+def confs(compose: Callable[..., Conf]) -> dict[str, Conf]:
+    """Configs with and without components, on both backends."""
+    arms = {"baseline": (), "mip": ("+ablation=mip",), "xrgs": ("+ablation=xrgs",)}
+    return {
+        f"{arm} {backend}": compose(*changes, f"splat.backend={backend}")
+        for arm, changes in arms.items()
+        for backend in ("torch", "native")
+    }
+
+
+@pytest.fixture
+def package(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
+    """A copy of the package's source, which is hashed instead of the installed one."""
+    ignored = shutil.ignore_patterns("*.so", "__pycache__", "html")
+    home = shutil.copytree(PACKAGE, tmp_path / "xrgs", ignore=ignored)
+    monkeypatch.setattr(code, "PACKAGE", home)
+    monkeypatch.setattr(identity, "REFACTORINGS", home / "experiment" / "refactorings.json")
+    caches = (identity.training_code, scoring.scoring_code)
+    for cached in caches:
+        cached.cache_clear()
+    yield home
+    for cached in caches:
+        cached.cache_clear()
+
+
+def ids_after(edit: Callable[[], object], confs: dict[str, Conf]) -> tuple[set[str], set[str]]:
+    """Make an edit; return the names of configs whose id is the same and is another one."""
+    before = {name: cell_id(conf) for name, conf in confs.items()}
+    edit()
+    identity.training_code.cache_clear()
+    same = {name for name, conf in confs.items() if cell_id(conf) == before[name]}
+    return same, confs.keys() - same
+
+
+def edited(file: Path, old: str, new: str) -> Callable[[], object]:
+    text = file.read_text()
+    assert old in text
+    return lambda: file.write_text(text.replace(old, new, 1))
+
+
+def native_missing() -> bool:
+    return importlib.util.find_spec("xrgs._native") is None
+
+
+pytestmark = pytest.mark.skipif(native_missing(), reason="the kernels are not built")
+
+# 1. Words don't count.
+
+
+@pytest.mark.parametrize(
+    ("name", "old", "new"),
+    [
+        ("training/loop.py", '"""The training loop', '"""The loop of training'),
+        ("training/loop.py", "import torch\n", "import torch  # the model's library\n\n\n"),
+        ("training/loop.py", "if TYPE_CHECKING:\n", "if TYPE_CHECKING:\n    import decimal\n"),
+        ("splat/optimizer.py", "import math\n", "import math\nfrom typing import Protocol\n"),
+        ("splat/optimizer.py", "    def __init__(\n", "    # Words.\n    def __init__(\n"),
+        ("csrc/exp2.h", "#pragma once\n", "#pragma once\n// A word\n/* and\n others */\n\n"),
+        ("csrc/CMakeLists.txt", "\n", "\n# A word\n"),
+    ],
+)
+def test_words_change_no_id(
+    package: Path, confs: dict[str, Conf], name: str, old: str, new: str
+) -> None:
+    if not (package / name).exists():
+        name = next(
+            f.relative_to(package).as_posix()
+            for f in sorted((package / "csrc").rglob("*.h"))
+            if old in f.read_text()
+        )
+    assert ids_after(edited(package / name, old, new), confs) == (confs.keys(), set())
+
+
+def test_every_python_version_gives_the_same_digest() -> None:
+    """Tokens of f-strings and the dump of a syntax tree differ between versions."""
+    expected = code.code_digest("splat", "training", "csrc", "report")
+    script = (
+        "import sys; sys.path.insert(0, sys.argv[1]); from xrgs.safeio import code;"
+        "print(code.code_digest('splat', 'training', 'csrc', 'report'))"
+    )
+    compared = 0
+    for minor in range(11, 20):
+        if (python := shutil.which(f"python3.{minor}")) is None:
+            continue
+        command = [python, "-I", "-c", script, str(PACKAGE.parent)]
+        done = subprocess.run(command, capture_output=True, text=True, check=False)
+        if done.returncode == 0:  # a version manager's stub may name a version that is not there
+            assert done.stdout.strip() == expected, python
+            compared += 1
+    if not compared:
+        pytest.skip("no python3.N of 3.11 or later is on the path")
+
+
+# 2. What is off is absent.
+
+
+def test_a_new_component_metric_scene_and_key_change_no_id(
+    package: Path, confs: dict[str, Conf], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def add() -> None:
+        (package / "training/components/new.py").write_text("class New: ...\n")
+        (package / "evaluation/metrics/new.py").write_text("def new(a, b): return 0.0\n")
+        (package / "capture/scenes/new.py").write_text("def names(conf): return []\n")
+
+    assert ids_after(add, confs)[1] == set()
+    new_key = dataclasses.make_dataclass(
+        "TrainConf", [("new", float, config.off(0.0))], bases=(type(confs["mip torch"].train),),
+        kw_only=True,
+    )  # fmt: skip
+    for conf in confs.values():
+        before = cell_id(conf)
+        wider = dataclasses.replace(conf, train=new_key(**vars(conf.train), new=0.0))
+        assert cell_id(wider) == before
+        wider.train.new = 1.0  # type: ignore[attr-defined]
+        assert cell_id(wider) != before
 
 
 def leaves(value: Any, path: tuple[str, ...] = ()) -> list[tuple[str, ...]]:
@@ -36,38 +168,40 @@ def leaves(value: Any, path: tuple[str, ...] = ()) -> list[tuple[str, ...]]:
 
 
 def change(conf: Any, path: tuple[str, ...]) -> None:
-    """Another value of the same type at a path of the config."""
+    """Set another value of the same type at a path of a config."""
     for name in path[:-1]:
         conf = getattr(conf, name)
-    old = getattr(conf, path[-1])
-    match old:
+    match old := getattr(conf, path[-1]):
         case bool():
             new: Any = not old
         case int() | float():
             new = old + 1
         case str():
-            new = "torch" if path[-1] == "backend" and old != "torch" else old + "x"
+            new = old + "x"
         case None:
             new = "x"
+        case dict():
+            new = {**old, "x": {}}
         case _:
-            new = [value + 1 for value in old]
+            new = type(old)(value + 1 for value in old)
     setattr(conf, path[-1], new)
 
 
-def test_every_value_of_training_is_in_it_and_no_other(baseline: Conf) -> None:
-    baseline.splat.backend = "torch"
-    paths = [p for p in leaves(baseline) if p != ("splat", "backend")]
-    assert len(paths) > 40
-    before = json.dumps(dataclasses.asdict(baseline))
+def test_every_value_of_training_counts_where_it_is_on(baseline: Conf) -> None:
+    """A key of a component that is off counts only where it switches the component on."""
+    paths = [p for p in leaves(baseline) if p[:2] not in {("splat", "backend")}]
+    assert len(paths) > 60
     for path in paths:
+        if path == ("components", "plugins"):  # its package would have to be installed
+            continue
         changed = copy.deepcopy(baseline)
         change(changed, path)
-        counts = path[0] in {"splat", "train", "components", "seed"}
-        assert (cell_id(changed) != cell_id(baseline)) == counts, path
-    assert json.dumps(dataclasses.asdict(baseline)) == before
+        group = getattr(changed.components, path[1]) if path[0] == "components" else None
+        counts = path[0] in {"splat", "train", "seed"} or (group and config.is_on(group))
+        assert (cell_id(changed) != cell_id(baseline)) == bool(counts), path
 
 
-def test_the_variant_is_in_it(baseline: Conf) -> None:
+def test_the_variant_counts(baseline: Conf) -> None:
     assert cell_id(baseline, "v") != cell_id(baseline, "w")
 
 
@@ -78,89 +212,106 @@ def test_naming_the_backend_that_auto_chooses_is_no_change(baseline: Conf) -> No
     assert cell_id(auto) == cell_id(named)
 
 
-PACKAGE = Path(identity.__file__).parents[1]
+# 3. Components where they are on, the core always, kernels where they train.
 
 
-def test_the_code_is_every_file_that_can_change_a_number() -> None:
-    names = identity.training_code("torch").keys()
-    for folder in ("splat", "training"):
-        files = {file.relative_to(PACKAGE).as_posix() for file in (PACKAGE / folder).rglob("*.py")}
-        assert files
-        assert files <= names
-    assert {name for name in names if name.partition("/")[0] not in {"splat", "training"}} == {
-        "capture/dataset.py",
-        "evaluation/lpips/network.py",
-        "evaluation/lpips/weights.py",
-        "evaluation/metrics.py",
-        "evaluation/protocol.py",
-        "safeio/npz.py",  # reads the points that training starts from
-    }
-    native = identity.training_code("native").keys()
-    sources = native - names
-    assert names < native
-    assert all(name.startswith("csrc/") for name in sources)
-    assert any(name.endswith(".cpp") for name in sources)
-    assert any(name.endswith(".h") for name in sources)
-
-
-@pytest.fixture
-def copied_package(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
-    """A copy of the training code, which is hashed instead of the installed package's."""
-    for name in identity.training_code("torch"):
-        file = tmp_path / name
-        file.parent.mkdir(parents=True, exist_ok=True)
-        file.write_bytes((PACKAGE / name).read_bytes())
-    monkeypatch.setattr(hashing, "_PACKAGE", tmp_path)
-    identity.training_code.cache_clear()
-    yield tmp_path
-    identity.training_code.cache_clear()
-
-
-@pytest.mark.parametrize("name", ["splat/densify.py", "safeio/npz.py"])
-def test_a_changed_file_of_the_training_code_is_another_cell(
-    baseline: Conf, copied_package: Path, name: str
+def test_the_code_of_a_component_counts_where_it_is_on(
+    package: Path, confs: dict[str, Conf]
 ) -> None:
-    before = cell_id(baseline)
-    with (copied_package / name).open("a") as file:
-        file.write("\n# changed\n")
-    assert cell_id(baseline) == before  # read once a process: a plan has one code
-    identity.training_code.cache_clear()
-    assert cell_id(baseline) != before
+    edit = edited(package / "training/components/mip.py", "MARGIN = 0.15", "MARGIN = 0.16")
+    assert ids_after(edit, confs)[1] == {"mip torch", "mip native"}
 
 
-def test_files_that_were_changed_added_or_removed_are_named(copied_package: Path) -> None:
-    planned = dict(identity.training_code("torch"))
-    assert identity.changed_code(planned, "torch") == []
-    (copied_package / "splat" / "densify.py").write_text("changed")
-    (copied_package / "splat" / "added.py").write_text("")
-    (copied_package / "safeio" / "npz.py").unlink()
-    names = ["safeio/npz.py", "splat/added.py", "splat/densify.py"]
-    assert identity.changed_code(planned, "torch") == names
+@pytest.mark.parametrize(
+    ("name", "old", "new"),
+    [
+        ("splat/settings.py", "NOMINAL_STEPS = 30_000", "NOMINAL_STEPS = 30_001"),
+        ("splat/ssim.py", "return ", "return  +"),
+        ("training/loop.py", "steps / NOMINAL_STEPS", "steps // NOMINAL_STEPS"),
+        ("capture/dataset.py", "255.0", "256.0"),
+    ],
+)
+def test_a_number_anywhere_in_the_core_changes_all_ids(
+    package: Path, confs: dict[str, Conf], name: str, old: str, new: str
+) -> None:
+    if old not in (package / name).read_text():
+        pytest.fail(f"{name} has no {old!r}: edit another number of it")
+    assert ids_after(edited(package / name, old, new), confs) == (set(), confs.keys())
 
 
-@pytest.mark.parametrize("backend", ["torch", "auto"])
-def test_an_identity_has_these_keys_and_values(baseline: Conf, backend: str) -> None:
-    """The hand-over to jobs, status and reports read identities by these keys."""
-    baseline.splat.backend = backend
-    resolved = resolve_backend(backend)
-    values = dataclasses.asdict(baseline)
-    assert cell_identity(baseline, "v") == {
-        "splat": values["splat"] | {"backend": resolved},
-        "train": values["train"],
-        "components": values["components"],
-        "seed": baseline.seed,
-        "variant": "v",
-        "protocol": PROTOCOL_VERSION,
-        "arithmetic": arithmetic(resolved),
-        "code": identity.training_code(resolved),
+def test_the_kernels_count_where_they_train(package: Path, confs: dict[str, Conf]) -> None:
+    file = next(f for f in sorted((package / "csrc").rglob("*.cpp")))
+
+    def edit() -> None:
+        file.write_text(file.read_text() + "\nstatic int more = 1;\n")
+
+    native = {name for name in confs if name.endswith("native")}
+    assert ids_after(edit, confs) == (confs.keys() - native, native)
+
+
+def test_every_file_of_the_model_and_of_training_is_hashed_or_changes_no_number() -> None:
+    hashed = {
+        file.relative_to(PACKAGE).as_posix()
+        for file in code.sources(*identity.CORE, *(m for key in BUILT_IN for m in modules_of(key)))
     }
+    files = {
+        file.relative_to(PACKAGE).as_posix()
+        for folder in ("splat", "training")
+        for file in (PACKAGE / folder).rglob("*.py")
+    }
+    assert files - hashed == NO_NUMBERS
+    assert hashed - files == {"capture/dataset.py", "safeio/npz.py"}
 
 
-def test_code_is_compared_for_the_backend_that_is_named() -> None:
-    for backend in ("torch", "native"):
-        assert identity.changed_code(identity.training_code(backend), backend) == []
-    native, torch = (identity.training_code(backend) for backend in ("native", "torch"))
-    assert identity.changed_code(native, "torch") == sorted(native.keys() - torch.keys())
+def test_each_component_of_the_config_has_a_module() -> None:
+    keys = {field.name for field in dataclasses.fields(config.ComponentsConf)}
+    for key in keys - {"plugins", "count_matched"}:
+        assert all((PACKAGE / name).is_file() for name in modules_of(key)), key
+        assert modules_of(key), key
+
+
+# 4. Scores are apart.
+
+
+def test_a_metric_makes_scores_stale_and_no_training(package: Path, confs: dict[str, Conf]) -> None:
+    before = scoring.scoring_code()
+    edit = edited(package / "evaluation/metrics/psnr.py", "10 *", "11 *")
+    assert ids_after(edit, confs)[1] == set()
+    scoring.scoring_code.cache_clear()
+    assert scoring.stale_scores(before) == ["psnr"]
+
+
+def test_scores_that_are_missing_or_of_other_code_are_stale(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    now = scoring.scoring_code()
+    assert scoring.stale_scores(now) == []
+    assert set(now) == {"protocol", *metrics.VIEW_METRICS}
+    assert scoring.stale_scores(now | {"ssim": "0"}) == ["ssim"]
+    assert scoring.stale_scores({"protocol": now["protocol"]}) == list(metrics.VIEW_METRICS)
+
+
+# 5. A declared refactoring keeps ids.
+
+
+def test_a_declared_refactoring_keeps_all_ids(package: Path, confs: dict[str, Conf]) -> None:
+    conf = confs["mip torch"]
+    trained = identity.cell_identity(conf, "v")
+
+    def refactor() -> None:
+        edited(package / "splat/settings.py", "30_000", "3 * 10_000")()
+
+    assert ids_after(refactor, confs)[0] == set()
+    assert identity.changed_code(trained) == ["core"]
+    exact = identity.exact_code(trained)["core"]
+    text = f'{{"core": {{"{exact}": "{trained.code["core"]}"}}}}'
+    identity.REFACTORINGS.write_text(text)
+    assert identity.changed_code(trained) == []
+    identity.training_code.cache_clear()
+    assert identity.cell_id(identity.cell_identity(conf, "v")) == identity.cell_id(trained)
+
+
+# 6. Of the machine the arithmetic counts.
 
 
 def test_the_native_backend_on_a_machine_without_fused_multiply_add_is_another_cell(
@@ -189,7 +340,6 @@ def test_a_native_module_that_cannot_be_loaded_is_an_error_of_one_line(
     baseline: Conf, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Built for another Python or C library: the module is found, and its import fails."""
-    pytest.importorskip("xrgs._native")
     baseline.splat.backend = "native"
 
     def fail(name: str) -> None:
@@ -201,9 +351,9 @@ def test_a_native_module_that_cannot_be_loaded_is_an_error_of_one_line(
 
 
 def test_planning_a_native_cell_needs_no_torch() -> None:
-    pytest.importorskip("xrgs._native")
     script = (
-        "import sys\nfrom xrgs.splat.backend import arithmetic\n"
-        "assert arithmetic('native') in {'fma', 'no-fma'}\nassert 'torch' not in sys.modules\n"
+        "import sys\nfrom xrgs.composing import compose\nfrom xrgs.experiment import identity\n"
+        "identity.cell_identity(compose('splat.backend=native', '+ablation=plus'), 'v')\n"
+        "assert 'torch' not in sys.modules\n"
     )
     subprocess.run([sys.executable, "-P", "-c", script], check=True)

@@ -1,21 +1,24 @@
 """Tests that a power failure at any moment leaves a store that goes on.
 
-What a real run asks of the file system is recorded, in its order. Each prefix of it is replayed
-under a model of a disk that promises no more than POSIX does: a file has its content from when it
-was last synced, and a folder its names. What was asked later may have happened, each of it on its
-own: a name may be there or not, and a file may be empty, cut off, or full of zeros. A rename is one
-step. The sampled states are written to a folder, in which the real code looks and begins again.
+The calls of the file system that a real run makes are recorded in their order. Each prefix of them
+is replayed under a model of a disk that promises no more than POSIX does: a file has the content of
+its last fsync, and a folder has the names of its last fsync. Each later call may or may not have
+happened: a name may be there or not, and a file may be empty, cut off, or full of zeros. A rename
+is one step. The sampled states are written to a folder, where the real code looks and begins again.
 """
 
 from __future__ import annotations
 
+import builtins
+import io
 import json
 import os
 import random
 import shutil
+import subprocess
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, cast
@@ -23,16 +26,16 @@ from typing import Any, cast
 import numpy as np
 import pytest
 
+from tests.experiment.cells import begun, identity, row
 from xrgs.capture import dataset, images, mixing, scenes, variant
 from xrgs.capture.dataset import Dataset
 from xrgs.capture.views import Variant, View
 from xrgs.config import Conf
 from xrgs.experiment import cell
-from xrgs.experiment.attempts import begin_attempt
 from xrgs.experiment.cell_folder import CellFolder
+from xrgs.experiment.identity import cell_id
 from xrgs.experiment.store import Store
-from xrgs.safeio.confined import ConfinedPath
-from xrgs.safeio.hashing import digest
+from xrgs.safeio.files import list_names
 from xrgs.splat.backend import resolve_backend
 from xrgs.training.checkpoint import Checkpoint, CheckpointError
 
@@ -41,7 +44,7 @@ pytestmark = pytest.mark.skipif(not Path("/proc/self/fd").exists(), reason="it r
 #: Sampled states of each prefix beside those in which nothing or all of what may be lost is, or all
 #: of it is zeros.
 SAMPLES, ZEROED = 4, 2.0
-#: Calls of `os` that are recorded. A name that is made by any other is found out.
+#: Calls of `os` that are recorded, beside `open`. A name that another call makes is found out.
 CALLS = ("open", "mkdir", "rename", "replace", "unlink", "remove", "rmdir", "fsync")
 #: A tree of files: their contents by their path, None for a folder.
 Tree = dict[str, bytes | None]
@@ -151,8 +154,8 @@ def _paths(
 class Recorder:
     """Records what is asked of the file system below a folder while a `with` block runs.
 
-    It sees the calls of `os` alone. Whoever writes by another way is found out: before each call,
-    and at the end, the folder must be as the recorded events make it.
+    It sees `open` and the calls of `os`, which `pathlib` and `shutil` use. Before each call, and at
+    the end, the folder must be as the recorded events make it: other ways to write are found out.
     """
 
     def __init__(self, root: Path) -> None:
@@ -191,6 +194,13 @@ class Recorder:
             for name in CALLS:
                 recorded = self._recorded(getattr(os, name), getattr(self, f"_{name}"))
                 patch.setattr(os, name, recorded)
+            read, write = open, self._recorded(open, self._open, paths=1)
+
+            def opened(file: Any, mode: str = "r", *options: Any, **named: Any) -> Any:
+                return (read if "r" in mode else write)(file, mode, *options, **named)
+
+            for module in (io, builtins):  # for `Path.open` and `open`
+                patch.setattr(module, "open", opened)
             yield
         self._look()
         disk = Disk()
@@ -199,16 +209,18 @@ class Recorder:
         assert disk.after_failure(random.Random(0), 1) == tree(self.root)
 
     def _recorded(
-        self, call: Callable[..., Any], record: Callable[..., None]
+        self, call: Callable[..., Any], record: Callable[..., None], paths: int = 2
     ) -> Callable[..., Any]:
+        """Return a call that is recorded; so many of its first arguments may be paths."""
+
         def recorded(*arguments: Any, **named: Any) -> Any:
-            paths = list(self._below_root(arguments, named))
-            if not paths:
+            found = list(self._below_root(arguments[:paths], named))
+            if not found:
                 return call(*arguments, **named)
             self._look()
-            existed = all(os.path.lexists(self.root / path) for path in paths)
+            existed = all(os.path.lexists(self.root / path) for path in found)
             result = call(*arguments, **named)
-            record(*paths, flags=arguments[1:2], existed=existed)
+            record(*found, flags=arguments[1:2], existed=existed)
             return result
 
         return recorded
@@ -249,8 +261,10 @@ class Recorder:
         above, _, name = path.rpartition("/")
         self.events.append(Link(self._count, self._nodes[above], name))
 
-    def _open(self, path: str, flags: tuple[int], existed: bool) -> None:
-        if flags[0] & os.O_CREAT and not existed:
+    def _open(self, path: str, flags: tuple[int | str], existed: bool) -> None:
+        # `os.open` has flags, `open` a mode.
+        creates = flags[0] & os.O_CREAT if isinstance(flags[0], int) else True
+        if creates and not existed:
             self._link(path, b"")
 
     def _mkdir(self, path: str, **_: object) -> None:
@@ -325,16 +339,16 @@ class Attempts:
 
     def __init__(self, conf: Conf, tmp_path: Path) -> None:
         self.conf, self.tmp_path = conf, tmp_path
-        self.identity = {"variant": "v", "seed": conf.seed}
-        self.id = digest(self.identity)
+        self.identity = identity(conf.seed)
+        self.id = cell_id(self.identity)
         (tmp_path / "s").mkdir()
         self.store = Store(tmp_path / "s")
 
     def begin(self, store: Store) -> CellFolder:
-        return begin_attempt(store.cell(self.id), asdict(self.conf), self.identity)
+        return begun(store.cell(self.id), self.conf, self.identity)
 
     def run(self) -> None:
-        cell.run_cell(self.conf, cast(Variant, SimpleNamespace()), self.begin(self.store))
+        cell.run_cell(self.conf, cast(Variant, SimpleNamespace(id="v")), self.begin(self.store))
 
     def stop_after(self, steps: int, monkeypatch: pytest.MonkeyPatch) -> None:
         """Leave what a process leaves that is killed after a step's checkpoint."""
@@ -366,9 +380,10 @@ class Attempts:
         finished = tree(self.store.path / CELL / self.id)
         for count, folder in states(recorder, self.tmp_path):
             home, state = folder / CELL / self.id, Store(folder).cell(self.id).state().name
-            for name in ("status.json", "identity.json", "config.json"):
-                if (home / name).exists() and (home / name).read_bytes() not in written:
-                    yield f"half of {name}"
+            if (home / "status.json").exists():
+                for name in ("status.json", "identity.json", "config.json"):
+                    if (home / name).read_bytes() not in written:
+                        yield f"half of {name}"
             if state == "done":
                 files, now = json.loads((home / "status.json").read_text())["files"], tree(home)
                 yield from (f"another {name}" for name in files if now.get(name) != finished[name])
@@ -381,11 +396,11 @@ class Attempts:
         """Begin the next attempt, which should be alone and go on from the last checkpoint."""
         attempt = self.begin(store)
         assert attempt.state().name == "unfinished"
-        assert attempt.identity() == self.identity
-        if store.cells_folder.names() != [self.id]:
+        assert (attempt.identity(), attempt.config()) == (self.identity, self.conf)
+        if list_names(store.cells_folder) != [self.id]:
             yield "a stopped attempt was kept"
         try:
-            done = Checkpoint(attempt.checkpoint, digest(self.identity), 1).load() or 0
+            done = Checkpoint(attempt.checkpoint, self.id, 1).load() or 0
         except CheckpointError:
             yield "half of a checkpoint"
         else:
@@ -460,10 +475,19 @@ def test_what_is_not_synced_is_found(
     pytest.fail(f"not found: {found}")
 
 
-def test_who_writes_past_the_recorder_is_found(tmp_path: Path) -> None:
+def test_a_write_past_the_recorder_is_found(tmp_path: Path) -> None:
     recorder = Recorder(tmp_path)
     with pytest.raises(AssertionError, match="past the recorder"), recorder.recording():
-        (tmp_path / "file").write_text("by another way")
+        subprocess.run(["/usr/bin/touch", str(tmp_path / "file")], check=True)
+
+
+def results(folder: Path) -> Tree:
+    """All of a cell but what the plan of the next attempt writes."""
+    return {
+        name: content
+        for name, content in tree(folder).items()
+        if not name.startswith((".", "config.json", "identity.json"))
+    }
 
 
 @pytest.mark.parametrize("damaged", [False, True])
@@ -473,7 +497,7 @@ def test_what_a_cell_had_is_kept_when_it_is_set_aside(attempts: Attempts, damage
     folder = attempts.store.cell(attempts.id)
     if damaged:
         (folder.path / "scores.csv").write_text("view\n")
-    before = tree(folder.path)
+    before = results(folder.path)
     recorder = Recorder(attempts.store.path)
     with recorder.recording():
         attempts.begin(attempts.store)
@@ -481,7 +505,7 @@ def test_what_a_cell_had_is_kept_when_it_is_set_aside(attempts: Attempts, damage
     for _, after in states(recorder, attempts.tmp_path):
         attempts.begin(Store(after))
         kept = [path for path in (after / CELL).iterdir() if ".aside-" in path.name]
-        assert before in [tree(path) for path in kept]
+        assert before in [results(path) for path in kept]
 
 
 def test_a_cell_that_failed_has_its_reason(attempts: Attempts) -> None:
@@ -506,16 +530,15 @@ def test_a_cell_that_failed_has_its_reason(attempts: Attempts) -> None:
 def test_a_record_of_a_sweep_is_whole_or_missing(tmp_path: Path) -> None:
     store = Store(tmp_path / "s")
     store.prepare()
-    row = {"scene": "a", "label": "b", "condition": "", "cell_id": "c", "seed": 0}
     recorder, ids = Recorder(store.path), []
     with recorder.recording():
         for seed, command in ((0, ["a"]), (1, ["b"]), (1, ["c"])):
-            ids.append(store.write_sweep(command, [row | {"seed": seed}]))
+            ids.append(store.write_sweep(command, [row("c", seed=seed)]))
             recorder.mark(command[0])
     for count, after in states(recorder, tmp_path):
         records, damaged = Store(after).records()
         assert not damaged
-        commands = {sweep: record["command"] for sweep, record in records.items()}
+        commands = {sweep: list(record.command) for sweep, record in records.items()}
         assert commands.get(ids[0], ["a"]) == ["a"]
         assert commands.get(ids[1], ["b"]) in (["b"], ["c"])
         assert ids[0] in commands or count < recorder.marks["a"]
@@ -526,7 +549,7 @@ def test_a_record_of_a_sweep_is_whole_or_missing(tmp_path: Path) -> None:
 def freeze(baseline: Conf, monkeypatch: pytest.MonkeyPatch) -> Callable[[Store], Variant]:
     """(store) -> a small variant that is built in it, without photographs and without SfM."""
 
-    def mix(_: object, __: object, ___: object, folder: ConfinedPath) -> Variant:
+    def mix(_: object, __: object, ___: object, folder: Path) -> Variant:
         views = []
         for split in ("test", "train"):
             file = folder / f"images/{split}/a.png"
@@ -550,10 +573,12 @@ def test_a_variant_is_whole_or_missing(tmp_path: Path, freeze: Callable[[Store],
     with recorder.recording():
         made = freeze(store)
         recorder.mark("frozen")
-    whole, key = tree(made.path), made.id.partition("-")[0]
+    whole, key = tree(made.folder), made.id.partition("-")[0]
     for count, after in states(recorder, tmp_path):
         found = variant.find(Store(after).variants, key)
         assert found is not None or count < recorder.marks["frozen"]
-        assert found is None or tree(found.path) == whole
+        assert found is None or tree(found.folder) == whole
+        for lease in Store(after).variants.glob(".*.lock.*"):
+            lease.unlink()  # its owner ended when the power failed; here, it is this very process
         assert freeze(Store(after)).id == made.id
-        assert tree(Store(after).variants.path / made.id) == whole
+        assert tree(Store(after).variants / made.id) == whole

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import subprocess
 from pathlib import Path
-from typing import Any
 
 import pytest
 
 import xrgs
 from xrgs.experiment import provenance
+from xrgs.experiment.schema import Provenance
 
 FILES = ("xrgs/__init__.py", "conf/ablation/plus.yaml", "sweeps/all.yaml", "README.md")
 
@@ -34,7 +34,7 @@ def checkout(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return tmp_path
 
 
-def made_with() -> dict[str, Any]:
+def made_with() -> Provenance:
     return provenance.collect(1, "torch")
 
 
@@ -42,23 +42,23 @@ def test_a_clean_checkout_has_its_commit_and_no_difference(checkout: Path) -> No
     (checkout / "xrgs/_native.so").write_text("built")
     (checkout / "README.md").write_text("no source")
     (checkout / "notes").write_text("no source")
-    assert made_with()["git"] == git(checkout, "rev-parse", "HEAD").strip()
-    assert made_with()["git_diff_sha256"] is None
+    assert made_with().git == git(checkout, "rev-parse", "HEAD").strip()
+    assert made_with().git_diff_sha256 is None
 
 
 @pytest.mark.parametrize("name", [*FILES[:3], "conf/ablation/néw one.yaml", "xrgs/new.py"])
 def test_a_source_that_is_not_committed_is_a_difference(checkout: Path, name: str) -> None:
     """Also a new file: an ablation that exists at no commit."""
-    found = {made_with()["git_diff_sha256"]}
+    found = {made_with().git_diff_sha256}
     for text in ("a: 2\n", "a: 3\n"):
         (checkout / name).write_text(text)
-        found.add(made_with()["git_diff_sha256"])
+        found.add(made_with().git_diff_sha256)
     git(checkout, "add", name)
     assert None in found
     assert len(found) == 3
-    assert made_with()["git_diff_sha256"] is not None
+    assert made_with().git_diff_sha256 is not None
 
 
 def test_without_git_there_is_no_commit(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(xrgs, "__file__", str(tmp_path / "xrgs/__init__.py"))
-    assert (made_with()["git"], made_with()["git_diff_sha256"]) == (None, None)
+    assert (made_with().git, made_with().git_diff_sha256) == (None, None)

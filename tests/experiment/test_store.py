@@ -5,10 +5,14 @@ from __future__ import annotations
 import json
 import os
 from pathlib import Path
+from typing import Any
 
 import pytest
+from msgspec.structs import replace
 
+from tests.experiment.cells import row
 from xrgs.errors import StoreError
+from xrgs.experiment.schema import RecordedCell
 from xrgs.experiment.store import Store
 from xrgs.safeio.atomic import write_json
 
@@ -16,12 +20,12 @@ from xrgs.safeio.atomic import write_json
 def test_the_same_comparison_has_the_same_sweep_id(tmp_path: Path) -> None:
     store = Store(tmp_path)
     store.prepare()
-    first = store.write_sweep(["a=1"], [{"cell_id": "x"}])
-    second = store.write_sweep(["a=1"], [{"cell_id": "y"}])
-    assert store.write_sweep(["b=2"], [{"cell_id": "x"}]) == first != second
+    first = store.write_sweep(["a=1"], [row("x")])
+    second = store.write_sweep(["a=1"], [row("x", seed=1)])
+    assert store.write_sweep(["b=2"], [row("y")]) == first != second
     os.utime(tmp_path / "sweeps" / f"{second}.json", ns=(0, 0))
     assert store.latest_sweep() == first
-    assert store.sweep_record()["cells"] == [{"cell_id": "x"}]
+    assert store.sweep_record().cells == (row("y"),)
 
 
 def test_a_store_without_sweeps_says_so(tmp_path: Path) -> None:
@@ -80,23 +84,24 @@ def test_an_interrupted_write_leaves_the_old_file(
 def test_the_bounds_of_a_record(tmp_path: Path) -> None:
     store = Store(tmp_path)
     store.prepare()
-    row = {
-        "cell_id": "0123456789abcdef",
-        "variant_id": "0123456789abcdef-0123456789abcdef",
-        "baseline_id": "0123456789abcdef",
-        "scene": "garden",
-        "label": "consistency",
-        "condition": "variant.factor=4",
-        "seed": 0,
-        "error": None,
-    }
-    many = store.write_sweep([], [row | {"seed": seed} for seed in range(100_000)])
-    assert len(store.sweep_record(many)["cells"]) == 100_000
+    cell = RecordedCell(
+        cell_id="0123456789abcdef",
+        label="consistency",
+        condition="variant.factor=4",
+        scene="garden",
+        variant_seed=0,
+        seed=0,
+        variant_id="0123456789abcdef-0123456789abcdef",
+        baseline_id="0123456789abcdef",
+    )
+    many = store.write_sweep([], [replace(cell, seed=seed) for seed in range(100_000)])
+    assert len(store.sweep_record(many).cells) == 100_000
     store.verify_sweep(many)
+    wrong: Any
     for wrong in (-1, 0.5, None, True, 2**63):
-        malformed = store.write_sweep([], [row | {"variant_seed": wrong}])
-        with pytest.raises(StoreError, match=rf"{malformed}\.json: cell 1 "):
+        malformed = store.write_sweep([], [replace(cell, variant_seed=wrong)])
+        with pytest.raises(StoreError, match=rf"{malformed}\.json: cells\[0\]\.variant_seed: "):
             store.sweep_record(malformed)
-    long = store.write_sweep([], [row | {"label": "x" * 2001}])
-    with pytest.raises(StoreError, match=rf"{long}\.json: cell 1 "):
+    long = store.write_sweep([], [replace(cell, label="x" * 2001)])
+    with pytest.raises(StoreError, match=rf"{long}\.json: cells\[0\]\.label: "):
         store.sweep_record(long)

@@ -6,50 +6,46 @@ import json
 from collections.abc import Callable
 from pathlib import Path
 
+import msgspec
 import pytest
 
+from tests.experiment.cells import finished
 from xrgs.capture import frozen, restore
 from xrgs.config import Conf
 from xrgs.errors import StoreError, UnreadableError
 from xrgs.experiment import trimming
-from xrgs.experiment.attempts import begin_attempt, remove_cell
+from xrgs.experiment.attempts import remove_cell
 from xrgs.experiment.cell_folder import CellFolder
 from xrgs.experiment.store import Store
-from xrgs.safeio.confined import ConfinedPath
+from xrgs.safeio.atomic import write_json
+from xrgs.safeio.files import list_names
 from xrgs.safeio.hashing import file_digest
 
-FILES = {"splats.ply": b"ply", "renders/a.png": b"png", "scores.csv": b"view,psnr\na,20\n"}
+HEAVY = ("renders/a.png", "renders/b.png", "splats.ply")
+BYTES = 20
 
 
 @pytest.fixture
 def cell(tmp_path: Path) -> CellFolder:
-    """A done cell with two heavy files."""
-    folder = CellFolder(tmp_path / "cells" / "c")
-    (tmp_path / "cells").mkdir()
-    begin_attempt(folder, {}, {"variant": "k-v", "train": {"views": "mixed"}, "seed": 0})
-    (folder.path / "renders").mkdir()
-    for name, content in FILES.items():
-        (folder.path / name).write_bytes(content)
-    folder.finish(["a"], 1)
-    return folder
+    """A done cell with three heavy files."""
+    return finished(CellFolder(tmp_path / "cells" / "c"))
 
 
 def test_a_trimmed_cell_is_done_and_says_what_it_lacks(cell: CellFolder) -> None:
-    hashes = {name: file_digest(cell.path / name) for name in FILES}
-    assert cell.heavy_bytes() == 6
+    hashes = {name: file_digest(cell.path / name) for name in HEAVY}
+    assert cell.heavy_bytes() == BYTES
     cell.trim()
     assert cell.state().name == "done"
     assert cell.verify() == []
     assert cell.heavy_bytes() == 0
-    trimmed = cell.trimmed()
-    assert {name: of["sha256"] for name, of in trimmed.items()} == {
-        name: hashes[name] for name in ("splats.ply", "renders/a.png")
-    }
+    trimmed = cell.status().trimmed
+    assert {name: of.sha256 for name, of in trimmed.items()} == hashes
+    assert not (cell.path / "renders").exists()
     with pytest.raises(StoreError, match=r"cells/c/splats\.ply was removed by xrgs-store trim"):
         cell.gaussians()
     cell.check_not_trimmed("scores.csv")
     cell.trim()
-    assert cell.trimmed() == trimmed
+    assert cell.status().trimmed == trimmed
 
 
 def test_a_trim_that_was_killed_midway_is_done_and_is_completed(
@@ -59,23 +55,23 @@ def test_a_trim_that_was_killed_midway_is_done_and_is_completed(
         raise KeyboardInterrupt
 
     with monkeypatch.context() as patch:
-        patch.setattr(ConfinedPath, "unlink", killed)
+        patch.setattr(Path, "unlink", killed)
         with pytest.raises(KeyboardInterrupt):
             cell.trim()
     assert (cell.path / "splats.ply").exists()
     assert cell.state().name == "done"
     assert cell.verify() == []
-    assert cell.heavy_bytes() == 6
+    assert cell.heavy_bytes() == BYTES
     cell.trim()
     assert cell.heavy_bytes() == 0
 
 
-def test_a_hostile_status_removes_nothing_elsewhere(cell: CellFolder) -> None:
+def test_a_status_that_names_files_elsewhere_is_refused(cell: CellFolder) -> None:
     (cell.path.parent / "other").write_text("kept")
-    status = json.loads((cell.path / "status.json").read_text())
-    status["trimmed"] = {"../other": {"bytes": 4, "sha256": "0"}, "renders": 3}
-    (cell.path / "status.json").write_text(json.dumps(status))
-    with pytest.raises(OSError, match="irectory"):  # `renders` is no file
+    status = json.loads(cell.status_file.read_text())
+    status["trimmed"] = {"../other": {"bytes": 4, "sha256": "0"}}
+    cell.status_file.write_text(json.dumps(status))
+    with pytest.raises(StoreError, match=r"status\.json: key in trimmed: not a name"):
         cell.trim()
     assert (cell.path.parent / "other").read_text() == "kept"
 
@@ -94,46 +90,55 @@ def test_a_removed_cell_is_gone_with_all_of_its_files(cell: CellFolder) -> None:
 
 
 @pytest.fixture
-def variants(tmp_path: Path) -> ConfinedPath:
+def variants(tmp_path: Path) -> Path:
     """The folder of the variants of a store, with one."""
     store = Store(tmp_path)
     store.prepare()
-    folder = store.variants.path / "new"
+    folder = store.variants / "new"
     (folder / "images").mkdir(parents=True)
-    (folder / "images" / "a.png").write_bytes(b"image")
+    for name in ("a", "b"):
+        (folder / "images" / f"{name}.png").write_bytes(b"image")
     (folder / "points.npz").write_bytes(b"points")
-    files = {"points.npz": file_digest(folder / "points.npz"), "images/a.png": "0"}
-    content = {"key": "key", "files": files}
-    content["id"] = frozen.variant_id(content)
-    (folder / "variant.json").write_text(json.dumps(content))
-    folder.rename(folder.with_name(str(content["id"])))
+    eye = [[1.0 * (row == column) for column in range(4)] for row in range(4)]
+    views = [
+        {"name": name, "split": split, "file": f"images/{name}.png", "tag": "HR"}
+        | {"width": 2, "height": 2, "K": [row[:3] for row in eye[:3]], "viewmat": eye, "rho": 1.0}
+        for name, split in (("a", "train"), ("b", "test"))
+    ]
+    files = {"points.npz": file_digest(folder / "points.npz")}
+    files |= {f"images/{name}.png": "0" for name in ("a", "b")}
+    content = {"key": "key", "scene": "fern", "factor": 4, "held_out": False}
+    manifest = msgspec.convert(content | {"views": views, "files": files}, frozen.Manifest)
+    manifest = msgspec.structs.replace(manifest, id=manifest.computed_id())
+    write_json(folder / "variant.json", msgspec.to_builtins(manifest))
+    folder.rename(folder.with_name(manifest.id))
     return store.variants
 
 
-def test_a_trimmed_variant_keeps_its_list_and_is_found_by_its_key(variants: ConfinedPath) -> None:
-    (name,) = variants.names()
+def test_a_trimmed_variant_keeps_its_list_and_is_found_by_its_key(variants: Path) -> None:
+    (name,) = list_names(variants)
     assert trimming.trimmed_variant(variants, "key") is None
-    assert trimming.image_bytes(variants, name) == 5
+    assert trimming.image_bytes(variants, name) == 10
     trimming.check_images(variants, name)
     trimming.trim_variant(variants, name)
     trimming.trim_variant(variants, name)
-    assert variants.names() == [f"trimmed-{name}"]
+    assert list_names(variants) == [f"trimmed-{name}"]
     folder = variants / f"trimmed-{name}"
-    assert folder.names() == ["points.npz", "variant.json"]
+    assert list_names(folder) == ["points.npz", "variant.json"]
     assert trimming.verify_variant(folder) == []
     assert trimming.trimmed_variant(variants, "key") == name
     assert trimming.image_bytes(variants, name) == 0
     with pytest.raises(StoreError, match=f"variant {name}: its images were removed"):
         trimming.check_images(variants, name)
-    (folder.path / "points.npz").write_bytes(b"others")
+    (folder / "points.npz").write_bytes(b"others")
     assert "points.npz: it has changed" in trimming.verify_variant(folder)[0]
 
 
 def test_a_cell_of_a_trimmed_variant_has_no_dataset_and_says_why(
     cell: CellFolder, tmp_path: Path
 ) -> None:
-    (tmp_path / "variants" / "trimmed-k-v").mkdir(parents=True)
-    with pytest.raises(StoreError, match="variant k-v: its images were removed"):
+    (tmp_path / "variants" / "trimmed-key-hash").mkdir(parents=True)
+    with pytest.raises(StoreError, match="variant key-hash: its images were removed"):
         cell.dataset()
 
 
@@ -141,23 +146,23 @@ def test_a_cell_of_a_trimmed_variant_has_no_dataset_and_says_why(
 
 
 @pytest.fixture
-def trimmed(variants: ConfinedPath) -> str:
+def trimmed(variants: Path) -> str:
     """The id of a variant that was trimmed."""
-    (name,) = variants.names()
+    (name,) = list_names(variants)
     trimming.trim_variant(variants, name)
     return name
 
 
 @pytest.fixture
 def again(
-    variants: ConfinedPath, compose: Callable[..., Conf], monkeypatch: pytest.MonkeyPatch
+    variants: Path, compose: Callable[..., Conf], monkeypatch: pytest.MonkeyPatch
 ) -> Callable[..., None]:
     """(id, error=None) -> restores a variant, whose images are written here; or fails after one."""
 
     def run(variant_id: str, error: BaseException | None = None) -> None:
-        def images(folder: ConfinedPath, *_: object) -> None:
-            (folder / "images").make_folder()
-            (folder.path / "images" / "a.png").write_bytes(b"image")
+        def images(folder: Path, *_: object) -> None:
+            (folder / "images").mkdir()
+            (folder / "images" / "a.png").write_bytes(b"image")
             if error:
                 raise error
 
@@ -168,12 +173,12 @@ def again(
     return run
 
 
-def names(folder: ConfinedPath) -> list[str]:
-    return [name for name in folder.names() if not name.endswith(".lock")]
+def names(folder: Path) -> list[str]:
+    return [name for name in list_names(folder) if not name.endswith(".lock")]
 
 
 def test_a_restored_variant_has_its_name_and_its_images(
-    variants: ConfinedPath, trimmed: str, again: Callable[..., None]
+    variants: Path, trimmed: str, again: Callable[..., None]
 ) -> None:
     again(trimmed)
     assert names(variants) == [trimmed]
@@ -182,7 +187,7 @@ def test_a_restored_variant_has_its_name_and_its_images(
 
 
 def test_a_variant_that_has_its_images_is_left_alone(
-    variants: ConfinedPath, trimmed: str, again: Callable[..., None]
+    variants: Path, trimmed: str, again: Callable[..., None]
 ) -> None:
     again(trimmed)
     again(trimmed, AssertionError("nothing is made"))
@@ -190,23 +195,23 @@ def test_a_variant_that_has_its_images_is_left_alone(
 
 
 def test_images_that_cant_be_made_again_leave_the_variant_trimmed(
-    variants: ConfinedPath, trimmed: str, again: Callable[..., None]
+    variants: Path, trimmed: str, again: Callable[..., None]
 ) -> None:
     with pytest.raises(StoreError, match=rf"variant {trimmed}: .* made again: another image\. Rem"):
         again(trimmed, StoreError("another image"))
     assert names(variants) == [f"trimmed-{trimmed}"]
-    assert (variants / f"trimmed-{trimmed}").names() == ["points.npz", "variant.json"]
+    assert list_names(variants / f"trimmed-{trimmed}") == ["points.npz", "variant.json"]
     with pytest.raises(UnreadableError, match="a server is away"):
         again(trimmed, UnreadableError("a server is away"))
-    assert (variants / f"trimmed-{trimmed}").names() == ["points.npz", "variant.json"]
+    assert list_names(variants / f"trimmed-{trimmed}") == ["points.npz", "variant.json"]
 
 
 def test_a_restoration_that_was_killed_midway_is_begun_again(
-    variants: ConfinedPath, trimmed: str, again: Callable[..., None]
+    variants: Path, trimmed: str, again: Callable[..., None]
 ) -> None:
     with pytest.raises(KeyboardInterrupt):
         again(trimmed, KeyboardInterrupt())
-    (variants / f".{trimmed}.restoring").make_folder()
+    (variants / f".{trimmed}.restoring").mkdir()
     assert trimming.trimmed_variant(variants, "key") == trimmed
     again(trimmed)
     assert names(variants) == [trimmed]

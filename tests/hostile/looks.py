@@ -36,12 +36,12 @@ Maker = Callable[[Path], list[Look]]
 def status(store: Path, *names: str, done: int | None = 4) -> Look:
     """`xrgs-status`, which must count the healthy cells."""
     shows = () if done is None else (f"{done} done",)
-    return Look("status", "status", (f"store={store}",), names, shows, succeeds=done is not None)
+    return Look("status", "status", (f"--store={store}",), names, shows, succeeds=done is not None)
 
 
 def check(store: Path, *names: str) -> Look:
     """`xrgs-store check`, which hashes every file and names what is damaged."""
-    return Look("check", "store", ("check", f"store={store}"), names, ("hashed:",))
+    return Look("check", "store", ("check", f"--store={store}"), names, ("hashed:",))
 
 
 def report(store: Path, *names: str, pair: bool = True, drawn: bool = False) -> Look:
@@ -50,13 +50,13 @@ def report(store: Path, *names: str, pair: bool = True, drawn: bool = False) -> 
     Drawing takes most of the time of a report, so that only cases that change a picture draw.
     """
     shows = ("consistency against baseline",) if pair else ()
-    arguments = (f"store={store}", f"pictures={'all' if drawn else 'none'}")
+    arguments = (f"--store={store}", f"--pictures={'all' if drawn else 'none'}")
     return Look("report", "report", arguments, names, shows, succeeds=pair)
 
 
 def inspect(folder: Path, *names: str, shows: tuple[str, ...] = ()) -> Look:
     """`xrgs-data inspect`; the sheet is written to the working folder."""
-    return Look("inspect", "data", ("inspect", str(folder), "out=sheet.png"), names, shows)
+    return Look("inspect", "data", ("inspect", str(folder), "--out=sheet.png"), names, shows)
 
 
 def rerun(cell: Path, *names: str, can_train: bool = False) -> Look:

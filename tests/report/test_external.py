@@ -13,6 +13,7 @@ import pytest
 from numpy.typing import NDArray
 from PIL import Image
 from skimage.metrics import peak_signal_noise_ratio
+from xrgs.safeio.confined import ConfinedPath
 
 from xrgs.capture import frozen
 from xrgs.capture.views import Variant, View
@@ -20,7 +21,6 @@ from xrgs.report import build
 from xrgs.report.collect import ReportError
 from xrgs.report.external import External, parse, with_external
 from xrgs.report.joined import JoinedStore
-from xrgs.safeio.confined import ConfinedPath
 
 SIZE = (32, 24)
 VIEWS = ("IMG_001", "IMG_009")
@@ -201,13 +201,13 @@ def test_a_damaged_variant_is_no_truth(
 
 
 def test_folders_have_labels_or_their_own_names() -> None:
-    assert parse("") == ()
-    assert parse("gsplat:out/a,/data/other,c:d:e") == (
+    assert parse([]) == ()
+    assert parse(["gsplat:out/a", "/data/other", "c:d:e"]) == (
         External("gsplat", Path("out/a")),
         External("other", Path("/data/other")),
         External("c", Path("d:e")),
     )
-    assert parse("./a:b") == (External("a:b", Path("a:b")),)
-    for wrong in ("gsplat:", "a:x,b/a"):
+    assert parse(["./a:b"]) == (External("a:b", Path("a:b")),)
+    for wrong in ("gsplat:", "a:x b/a"):
         with pytest.raises(ReportError, match="external="):
-            parse(wrong)
+            parse(wrong.split())

@@ -83,7 +83,7 @@ def recorded():
     assert "torch" not in sys.modules
     print("called")
 xrgs.runtime.machine.set_passive_openmp_wait = recorded
-sys.argv[1:] = ["repeats=none"]
+sys.argv[1:] = ["--repeats=none"]
 {command}
 """
     done = subprocess.run(

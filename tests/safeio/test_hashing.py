@@ -1,4 +1,4 @@
-"""Hashes of values, files and source code."""
+"""Hashes of values and files."""
 
 from __future__ import annotations
 
@@ -9,9 +9,8 @@ from pathlib import Path
 
 import pytest
 
-import xrgs
 from xrgs.config import Conf
-from xrgs.safeio.hashing import canonical_json, digest, file_digest, source_digests, to_plain
+from xrgs.safeio.hashing import canonical_json, digest, file_digest, to_plain
 
 
 def test_equal_values_have_one_text_and_one_hash() -> None:
@@ -32,12 +31,3 @@ def test_a_file_is_hashed_to_its_end(tmp_path: Path, size: int) -> None:
     content = b"ab" * (size // 2) + b"c" * (size % 2)
     (tmp_path / "file").write_bytes(content)
     assert file_digest(tmp_path / "file") == hashlib.sha256(content).hexdigest()
-
-
-def test_source_files_are_hashed_one_by_one_and_folders_with_all_inside() -> None:
-    package = Path(xrgs.__file__).parent
-    found = source_digests("evaluation/lpips", "errors.py")
-    names = ["__init__", "download", "network", "weights"]
-    assert list(found) == ["errors.py", *(f"evaluation/lpips/{name}.py" for name in names)]
-    for name, value in found.items():
-        assert value == hashlib.sha256((package / name).read_bytes()).hexdigest()

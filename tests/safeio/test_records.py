@@ -1,4 +1,4 @@
-"""JSON files and CSV tables that anybody may have written."""
+"""JSON files and CSV tables of a store, damaged ones too."""
 
 from __future__ import annotations
 
@@ -7,21 +7,21 @@ import math
 import os
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from typing import Annotated, Any
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from msgspec import Meta, Struct
 
 from xrgs.errors import StoreError, UnreadableError, XrgsError
-from xrgs.safeio.confined import ConfinedPath
 from xrgs.safeio.records import (
     MAX_BYTES,
     as_number,
     errors_named,
     list_folder,
     read_file,
-    read_json,
-    read_object,
+    read_struct,
     read_table,
     table_text,
 )
@@ -32,25 +32,50 @@ def file(tmp_path: Path) -> Path:
     return tmp_path / "file"
 
 
-def test_json_is_read_or_refused_by_name(file: Path) -> None:
-    file.write_text("[1, null]")
-    assert read_json(file) == [1, None]
-    for content in (b"", b"{", b"\xff"):
-        file.write_bytes(content)
-        with pytest.raises(StoreError, match=f"{file}: "):
-            read_json(file)
-    file.unlink()
-    with pytest.raises(StoreError, match=str(file)):
-        read_json(file)
+class Cell(Struct):
+    """A file of a store."""
+
+    seed: Annotated[int, Meta(ge=0)]
+    views: tuple[str, ...] = ()
+
+
+def test_a_struct_is_read(file: Path) -> None:
+    file.write_text('{"seed": 3, "views": ["部屋"], "of a later version": {}}')
+    assert read_struct(file, Cell) == Cell(3, ("部屋",))
     assert issubclass(StoreError, XrgsError)
 
 
-def test_an_object_is_read_and_nothing_else(file: Path) -> None:
-    file.write_text('{"a": 1}')
-    assert read_object(file) == {"a": 1}
-    file.write_text("[1]")
-    with pytest.raises(StoreError, match="not a JSON object"):
-        read_object(file)
+@pytest.mark.parametrize(
+    ("content", "what"),
+    [
+        ("", "not valid JSON"),
+        ('{"seed": 3', "not valid JSON"),
+        ('{"seed":' + "[" * 100_000, "seed: Expected `int`, got `array`"),
+        ('{"seed": NaN}', "not valid JSON"),
+        ('{"seed": "\\ud800"}', "not valid JSON"),
+        ("[]", "the file: Expected `object`"),
+        ("{}", "the file: Object missing required field `seed`"),
+        ('{"seed": -1}', "seed: Expected `int` >= 0"),
+        ('{"seed": "3"}', "seed: Expected `int`, got `str`"),
+        ('{"seed": 1e400}', "seed: Number out of range"),
+        ('{"seed": 3, "views": [null]}', r"views\[0\]: Expected `str`, got `null`"),
+    ],
+)
+def test_a_damaged_struct_is_named_with_its_field(file: Path, content: str, what: str) -> None:
+    file.write_text(content)
+    with pytest.raises(StoreError, match=f"^damaged: {file}: {what}"):
+        read_struct(file, Cell)
+
+
+def test_json_of_any_depth_is_read_or_refused(file: Path) -> None:
+    file.write_text("[" * 100_000 + "]" * 100_000)
+    with pytest.raises(StoreError, match=f"damaged: {file}: not valid JSON"):
+        read_struct(file, Any)
+
+
+def test_a_missing_struct_is_named(file: Path) -> None:
+    with pytest.raises(StoreError, match=f"{file}: No such file"):
+        read_struct(file, Cell)
 
 
 def test_a_table_is_header_and_rows(file: Path) -> None:
@@ -128,17 +153,14 @@ def test_a_table_has_at_most_20000_rows_and_1000_columns(file: Path) -> None:
 
 
 def test_a_folder_is_listed_or_named(tmp_path: Path) -> None:
-    root = ConfinedPath(tmp_path)
     (tmp_path / "b").mkdir()
-    (tmp_path / "a").symlink_to("gone")
-    assert list_folder(root) == ["a", "b"]
-    assert list_folder(root / "none") == []
+    (tmp_path / "a").touch()
+    assert list_folder(tmp_path) == ["a", "b"]
+    assert list_folder(tmp_path / "none") == []
     for name in ("a", "a/inside"):
         with pytest.raises(StoreError, match=name) as refused:
-            list_folder(root / name)
+            list_folder(tmp_path / name)
         assert not isinstance(refused.value, UnreadableError)
-    with pytest.raises(UnreadableError, match="none"):
-        list_folder(ConfinedPath(tmp_path / "none") / "cells")
 
 
 @pytest.mark.parametrize(
@@ -149,5 +171,3 @@ def test_an_error_that_may_pass_says_nothing_of_the_content(number: int, passes:
     with pytest.raises(StoreError, match=r"^a/b: ") as raised, errors_named(Path("a/b")):
         raise OSError(number, os.strerror(number), "b")
     assert isinstance(raised.value, UnreadableError) == passes
-    with pytest.raises(StoreError, match="a/b: is a link"), errors_named(Path("a/b")):
-        raise OSError(errno.ELOOP, "too many links")

@@ -1,4 +1,4 @@
-"""Small random scenes, cameras and densifiers for the tests of the model."""
+"""Small random scenes, cameras and strategies for the tests of the model."""
 
 from __future__ import annotations
 
@@ -11,13 +11,12 @@ import torch
 from torch import Tensor
 
 from xrgs.splat.cameras import Camera
-from xrgs.splat.densify import Densifier
 from xrgs.splat.gaussians import PARAMETERS, ActivatedGaussians, Gaussians
 from xrgs.splat.optimizer import SplatOptimizer
-from xrgs.splat.rasterize import rasterize_parameters
-from xrgs.splat.refinement import Groups
-from xrgs.splat.render_result import Render
+from xrgs.splat.rendering import Render, rasterize_parameters
 from xrgs.splat.settings import DensifySettings, OptimizerSettings, RasterSettings
+from xrgs.splat.strategy.default import DefaultStrategy
+from xrgs.splat.strategy.refinement import Groups
 
 Scene = dict[str, Tensor]
 
@@ -147,7 +146,7 @@ def single_pixel() -> Callable[..., Scene]:
 
 
 @pytest.fixture(scope="session")
-def make_densifier() -> Callable[..., Densifier]:
+def make_strategy() -> Callable[..., DefaultStrategy]:
     def make(
         values: Scene,
         settings: DensifySettings | None = None,
@@ -157,8 +156,8 @@ def make_densifier() -> Callable[..., Densifier]:
         groups: Groups | None = None,
         backend: str = "torch",
         view_pixels: int = 0,
-    ) -> Densifier:
-        """A densifier of Gaussians with these raw parameters, whose optimizer took no step."""
+    ) -> DefaultStrategy:
+        """A strategy of Gaussians with these raw parameters, whose optimizer took no step."""
         leaves = {name: values[name].clone().requires_grad_() for name in PARAMETERS}
         optimizer = SplatOptimizer(
             Gaussians(**leaves),
@@ -167,7 +166,7 @@ def make_densifier() -> Callable[..., Densifier]:
             steps=1,
             backend=backend,
         )
-        return Densifier(
+        return DefaultStrategy(
             optimizer,
             settings or DensifySettings(),
             scene_scale=scene_scale,

@@ -20,7 +20,7 @@ from xrgs.splat.normalize import (
     transform_points,
     transform_viewmats,
 )
-from xrgs.splat.rasterize import rasterize_parameters
+from xrgs.splat.rendering import rasterize_parameters
 from xrgs.splat.settings import RasterSettings
 
 Array = NDArray[np.float64]

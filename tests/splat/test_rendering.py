@@ -5,10 +5,9 @@ from __future__ import annotations
 import pytest
 import torch
 
-from xrgs.splat import rasterize as parameters
 from xrgs.splat.cameras import Camera
 from xrgs.splat.gaussians import PARAMETERS, Gaussians
-from xrgs.splat.rendering import rasterize
+from xrgs.splat.rendering import rasterize, rasterize_parameters
 from xrgs.splat.settings import RasterSettings
 
 
@@ -33,7 +32,7 @@ def test_the_image_is_that_of_the_activated_parameters(
 ) -> None:
     settings = RasterSettings(background=(0.1, 0.2, 0.3))
     render = rasterize(gaussians, camera, settings=settings, backend=backend)
-    expected = parameters.rasterize_parameters(
+    expected = rasterize_parameters(
         *gaussians.activated(backend=backend), camera, settings, sh_degree=2, backend=backend
     )
     assert torch.equal(render.image, expected.image)

@@ -18,7 +18,7 @@ from hydra.types import HydraContext
 from omegaconf import DictConfig, OmegaConf
 
 from xrgs import composing, config
-from xrgs.cli.arguments import with_quotes
+from xrgs.cli.hydra_words import with_quotes
 from xrgs.errors import XrgsError
 from xrgs.experiment.attempts import begin_attempt
 from xrgs.experiment.identity import cell_identity

@@ -241,7 +241,7 @@ def test_it_writes_nothing_and_needs_no_torch(
     (tmp_path / "torch.py").write_text("raise ImportError('torch was imported')")
     before = sorted(store.path.rglob("*"))
     path = f"{tmp_path}:{os.environ.get('PYTHONPATH', '')}"
-    code, out, err = run_command("status", tmp_path, "store=s", PYTHONPATH=path)
+    code, out, err = run_command("status", tmp_path, "--store=s", PYTHONPATH=path)
     assert code == 0, err
     assert "7 cells" in out
     assert sorted(store.path.rglob("*")) == before

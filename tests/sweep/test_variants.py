@@ -269,7 +269,7 @@ def test_a_sweep_goes_on_from_a_packed_store(
     smoke = ("scene=motorcycle", "preset=smoke", "train.steps=2")
     assert sweeps_in(tmp_path).run(*smoke)[0] == 0
     (built,) = Store(tmp_path / "s").variants.names()[-1:]
-    assert run_command("store", tmp_path, "pack", "store=s", "out=a.tar.xz")[0::2] == (0, "")
+    assert run_command("store", tmp_path, "pack", "--store=s", "--out=a.tar.xz")[0::2] == (0, "")
     with tarfile.open(tmp_path / "a.tar.xz") as archive:
         archive.extractall(tmp_path / "other", filter="data")
     store = Store((tmp_path / "other" / "xrgs-store").rename(tmp_path / "other" / "s"))

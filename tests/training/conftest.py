@@ -1,13 +1,16 @@
-"""How the tests of training compare two results."""
+"""How the tests of training compare two results, and the configs that they train."""
 
 from __future__ import annotations
 
+import copy
+import functools
 from collections.abc import Callable
 from typing import Any
 
 import pytest
 import torch
 
+from xrgs import composing
 from xrgs.config import Conf
 from xrgs.splat.gaussians import PARAMETERS, Gaussians
 from xrgs.training.recorder import TrainingResult
@@ -34,6 +37,15 @@ def same() -> Callable[[Gaussians, Gaussians], bool]:
 def comparable() -> Callable[[TrainingResult], dict[str, Any]]:
     """(result) -> everything in it but the training time, as values that `==` compares exactly."""
     return _comparable
+
+
+_composed = functools.cache(composing.compose)
+
+
+@pytest.fixture(scope="session")
+def compose() -> Callable[..., Conf]:
+    """(*overrides) -> a copy of the config: Hydra composes the same overrides once."""
+    return lambda *overrides: copy.deepcopy(_composed(*overrides))
 
 
 @pytest.fixture

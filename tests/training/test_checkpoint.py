@@ -21,7 +21,6 @@ from numpy.typing import NDArray
 
 from xrgs.capture.dataset import Dataset
 from xrgs.config import Conf
-from xrgs.safeio.confined import ConfinedPath, ReplacedError
 from xrgs.training import checkpoint
 from xrgs.training.checkpoint import Checkpoint, CheckpointError
 from xrgs.training.loop import train
@@ -204,6 +203,13 @@ def test_a_compressed_file_is_refused_before_it_fills_the_memory(tmp_path: Path)
         Checkpoint(file, "cell").load()
 
 
+def test_a_missing_state_is_refused(tmp_path: Path) -> None:
+    loaded = Checkpoint(write(tmp_path / "c.npz", first={"a": 1}), "cell")
+    loaded.load()
+    with pytest.raises(CheckpointError, match=r"c\.npz: second: KeyError"):
+        loaded.register(first=Holder(), second=Holder())
+
+
 @pytest.mark.parametrize(
     ("member", "value", "named"),
     [
@@ -211,8 +217,8 @@ def test_a_compressed_file_is_refused_before_it_fills_the_memory(tmp_path: Path)
         ("states/optimizer/gaussians/shN", np.zeros((60, 15, 3)), "optimizer"),
         ("states/optimizer/adam/sh0/exp_avg", np.zeros((1, 1, 3), np.float32), "optimizer"),
         ("states/optimizer/adam/quats/step", np.zeros(4, np.float32), "optimizer"),
-        ("states/densifier/visible_count", np.zeros((2, 60), np.float32), "densifier"),
-        ("states/densifier/generator", np.zeros(7, np.uint8), "densifier"),
+        ("states/strategy/visible_count", np.zeros((2, 60), np.float32), "strategy"),
+        ("states/strategy/generator", np.zeros(7, np.uint8), "strategy"),
         ("states/sampler/generator", np.zeros(5056, np.float32), "sampler"),
     ],
 )
@@ -225,7 +231,7 @@ def test_a_state_that_does_not_fit_is_refused_by_its_object(
     value: NDArray[Any],
     named: str,
 ) -> None:
-    file = ConfinedPath(tmp_path) / "c.npz"
+    file = tmp_path / "c.npz"
     train(data, few_steps, Checkpoint(file, "cell", EVERY_STEP))
     state = checkpoint._load(file)
     *folders, name = member.split("/")
@@ -273,15 +279,3 @@ def test_any_program_can_read_its_json_and_arrays(
         state = json.loads(arrays["state.json"].tobytes())
         assert state["steps"] == few_steps.train.steps
         assert arrays["states/optimizer/gaussians/means"].shape[1] == 3
-
-
-def test_training_ends_where_another_process_has_begun_the_run_again(
-    data: Dataset, few_steps: Conf, tmp_path: Path
-) -> None:
-    (tmp_path / "c").mkdir()
-    file = ConfinedPath(tmp_path / "c").pinned() / "checkpoint.npz"
-    (tmp_path / "c").rename(tmp_path / "old")
-    (tmp_path / "c").mkdir()
-    with pytest.raises(ReplacedError):
-        train(data, few_steps, Checkpoint(file, "cell", EVERY_STEP))
-    assert not list((tmp_path / "c").iterdir())

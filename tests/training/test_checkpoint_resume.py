@@ -31,8 +31,7 @@ STEPS = 24
 SHORT = (f"train.steps={STEPS}", "splat.densify.every=5000", "splat.densify.stop=25000")
 CASES = {
     "baseline": [],
-    "groups": ["+ablation=densify"],
-    "current_view": ["+ablation=densify", "components.densify.decide=current_view"],
+    "groups": ["+ablation=densify_per_class"],
     "xrgs": ["+ablation=xrgs"],
     "curriculum": ["+ablation=curriculum"],
     # 60 Gaussians of at most 180: a limit that began with those at the restart would be another.

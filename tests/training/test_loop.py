@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import dataclasses
+import inspect
+import re
 from collections.abc import Callable, Mapping
 from types import SimpleNamespace
 from typing import Any
@@ -12,15 +14,14 @@ import torch
 
 from xrgs.capture.dataset import USES, Dataset, LoadedView
 from xrgs.config import CONF_DIR, Conf
-from xrgs.splat import rasterize
-from xrgs.splat.cameras import Camera
-from xrgs.splat.densify import Densifier
 from xrgs.splat.gaussians import PARAMETERS, ActivatedGaussians, Gaussians, from_points
 from xrgs.splat.loss import Target, photometric_loss, prepare_target
 from xrgs.splat.optimizer import SplatOptimizer
+from xrgs.splat.rendering import Render, rasterize_parameters
 from xrgs.splat.settings import DensifySettings, OptimizerSettings, RasterSettings
+from xrgs.splat.strategy.default import DefaultStrategy
 from xrgs.training import components, loop, recorder, rendering
-from xrgs.training.components import Step, TrainingView
+from xrgs.training.components import Step, TrainingView, base
 from xrgs.training.count_matching import train_cell
 from xrgs.training.loop import train
 from xrgs.training.sampler import EpochSampler
@@ -63,7 +64,7 @@ def plain_loop(data: Dataset, conf: Conf) -> Gaussians:
     optimizer = SplatOptimizer(
         gaussians, OptimizerSettings(), scene_scale=data.scene_scale, steps=steps, backend="auto"
     )
-    densifier = Densifier(
+    strategy = DefaultStrategy(
         optimizer,
         DensifySettings(start=0, stop=steps // 2, every=5, reset_every=steps // 3),
         scene_scale=data.scene_scale,
@@ -72,7 +73,7 @@ def plain_loop(data: Dataset, conf: Conf) -> Gaussians:
     for step in EpochSampler(data.train, seed, steps, lambda _: True):
         camera, degree = step.view.camera, min(step.number, 3)
         offset = torch.zeros(len(gaussians), 2, requires_grad=True)
-        render = rasterize.rasterize_parameters(
+        render = rasterize_parameters(
             *gaussians.activated(backend="auto"),
             camera,
             RasterSettings(),
@@ -85,7 +86,7 @@ def plain_loop(data: Dataset, conf: Conf) -> Gaussians:
         optimizer.zero_grad()
         torch.autograd.backward(loss)
         optimizer.step(camera, sh_degree=degree)
-        densifier.after_step(
+        strategy.after_step(
             step.number, offset.grad, render.visible, width=camera.width, height=camera.height
         )
     return gaussians
@@ -115,91 +116,97 @@ def test_components_that_change_nothing_change_no_bit(
 
 
 class HookRecorder(components.Component):
-    """Records which hook was called at which step, and for how many Gaussians."""
+    """Asserts what hooks are called with, and bakes black Gaussians."""
 
     def __init__(self) -> None:
-        self.calls: list[tuple[str, int | None]] = []
         self.sizes: list[int] = []
 
     def before_render(self, activated: ActivatedGaussians, step: Step) -> ActivatedGaussians:
-        self.calls.append(("activated", step.number))
+        del step
         assert len(activated.means) == self.sizes[-1]
         return activated
 
     def pixel_weights(self, step: Step) -> torch.Tensor:
-        self.calls.append(("pixel_weight", step.number))
         return torch.ones(step.view.image.shape[:2])
 
     def modify_loss(
         self, loss: torch.Tensor, image: torch.Tensor, gaussians: Gaussians, step: Step
     ) -> torch.Tensor:
         del gaussians
-        self.calls.append(("loss", step.number))
         assert image.shape == step.view.image.shape
         return loss
 
     def needs_backward(self, loss: torch.Tensor, step: Step) -> bool:
-        self.calls.append(("needs_backward", step.number))
+        del step
         assert loss.requires_grad
         return True
 
     def after_backward(self, gaussians: Gaussians, step: Step) -> None:
-        self.calls.append(("after_backward", step.number))
+        del step
         assert gaussians.scales.grad is not None
 
     def densification_grad2d(self, gradient: torch.Tensor, step: Step) -> torch.Tensor:
-        self.calls.append(("densification_grad2d", step.number))
+        del step
         assert len(gradient) == self.sizes[-1]
         return gradient
 
     def on_gaussians_changed(self, gaussians: Gaussians) -> None:
-        self.calls.append(("on_gaussians_changed", None))
         self.sizes.append(len(gaussians))
 
-    def training_views(
-        self, views: Mapping[str, TrainingView], step: Step
-    ) -> Mapping[str, TrainingView]:
-        self.calls.append(("training_views", step.number))
-        return views
-
-    def render_camera(self, camera: Camera, step: Step) -> Camera:
-        self.calls.append(("render_camera", step.number))
-        return camera
-
-    def to_photograph(self, image: torch.Tensor, step: Step) -> torch.Tensor:
-        self.calls.append(("to_photograph", step.number))
-        return image
-
     def bake(self, gaussians: Gaussians) -> None:
-        self.calls.append(("bake", None))
         gaussians.sh0.data.zero_()
 
     def after_training(self, gaussians: Gaussians) -> None:
-        self.calls.append(("after_training", None))
         assert (gaussians.sh0 == 0).all()
 
 
-def test_hooks_are_called_in_the_order_of_a_step(data: Dataset, short: Conf) -> None:
+def test_hooks_see_the_gaussians_of_the_step(data: Dataset, short: Conf) -> None:
     recorder = HookRecorder()
     result = train(data, short, extra_components=[recorder])
-    each = (
-        "training_views",
-        "render_camera",
-        "activated",
-        "to_photograph",
-        "pixel_weight",
-        "loss",
-        "needs_backward",
-        "after_backward",
-        "densification_grad2d",
-    )
-    in_steps = [call for call in recorder.calls if call[1] is not None]
-    assert in_steps == [(name, number) for number in range(short.train.steps) for name in each]
-    assert recorder.calls[0] == ("on_gaussians_changed", None)
-    assert recorder.calls[-2:] == [("bake", None), ("after_training", None)]
-    # The hook was called after every refinement, or the sizes above would not agree.
+    # The hook was called after every refinement, or the sizes would not agree.
     assert len(set(recorder.sizes)) > 3
     assert (result.gaussians.sh0 == 0).all()  # the result is what `bake` made of the Gaussians
+
+
+class CallRecorder(components.Component):
+    """Records the calls of every hook, and the number of the step; removes a Gaussian a step."""
+
+    def __init__(self) -> None:
+        self.calls: list[tuple[str, int | None]] = []
+
+    def to_prune(self, gaussians: Gaussians, step: Step) -> torch.Tensor:
+        self.calls.append(("to_prune", step.number))
+        return torch.arange(len(gaussians)) == 0
+
+
+def _recording(name: str, hook: Callable[..., Any]) -> Callable[..., Any]:
+    def record(self: CallRecorder, *arguments: Any) -> Any:
+        numbers = [value.number for value in arguments if isinstance(value, Step)]
+        self.calls.append((name, numbers[0] if numbers else None))
+        return hook(self, *arguments)
+
+    return record
+
+
+for _name, _hook in vars(components.Component).items():
+    if inspect.isfunction(_hook) and _name not in vars(CallRecorder):
+        setattr(CallRecorder, _name, _recording(_name, _hook))
+
+
+def test_hooks_are_called_in_the_documented_order(data: Dataset, compose: Compose) -> None:
+    """At a step that refines within a budget, resets opacities and prunes for a component."""
+    conf = compose("train.steps=2", "splat.densify.start=0", "splat.densify.grow_grad2d=0")
+    densify = conf.splat.densify
+    densify.every = densify.reset_every = 1
+    densify.stop, densify.budget = 30_000, 0.02  # 72 Gaussians, of 120 that would be there
+    recorder = CallRecorder()
+    train(data, conf, extra_components=[recorder])
+    names = [name for name, _ in recorder.calls]
+    assert names[:3] == ["densification_groups", "before_training", "on_gaussians_changed"]
+    assert names[-2:] == ["bake", "after_training"]
+    begin = next(place for place, (_, number) in enumerate(recorder.calls) if number == 1)
+    documented = re.findall(r"^\d+\. `(\w+)`", inspect.getdoc(base) or "", re.MULTILINE)
+    assert names[begin:-2] == documented
 
 
 def test_evaluation_changes_no_bit_and_sees_what_would_be_saved(
@@ -454,9 +461,9 @@ def test_the_sh_bands_are_switched_on_in_turn(
 ) -> None:
     degrees = []
 
-    def spy(*arguments: Any, sh_degree: int, **others: Any) -> rasterize.Render:
+    def spy(*arguments: Any, sh_degree: int, **others: Any) -> Render:
         degrees.append(sh_degree)
-        return rasterize.rasterize_parameters(*arguments, sh_degree=sh_degree, **others)
+        return rasterize_parameters(*arguments, sh_degree=sh_degree, **others)
 
     monkeypatch.setattr(rendering, "rasterize_parameters", spy)
     short.train.steps = 60

@@ -10,7 +10,7 @@ import torch
 from xrgs.capture.dataset import Dataset
 from xrgs.config import Conf
 from xrgs.splat.gaussians import PARAMETERS
-from xrgs.splat.rasterize import Render
+from xrgs.splat.rendering import Render
 from xrgs.training.components import Step
 from xrgs.training.loop import train
 from xrgs.training.memory import TrainingMemory, tensors_in

@@ -137,6 +137,6 @@ def test_without_pyav_the_extra_is_named(
     model: MakeModel, tmp_path: Path, without: Callable[[str], None]
 ) -> None:
     without("av")
-    with pytest.raises(XrgsError, match=r"pip install 'xrgs\[video\]'; out=FOLDER writes PNG"):
+    with pytest.raises(XrgsError, match=r"pip install 'xrgs\[video\]'; --out FOLDER writes PNG"):
         make_film([model()], tmp_path / "film.mp4")
     assert not list(tmp_path.iterdir())

@@ -83,7 +83,7 @@ def test_a_port_in_use_is_named(model: MakeModel) -> None:
 
 def test_what_is_left_out_is_said(model: MakeModel) -> None:
     assert live.count_text(model(), 40) == "40 Gaussians"
-    assert live.count_text(model(), 30) == "the 30 most opaque of 40 Gaussians (limit=30)"
+    assert live.count_text(model(), 30) == "the 30 most opaque of 40 Gaussians (--limit 30)"
 
 
 def test_without_viser_the_extra_is_named(without: Callable[[str], None]) -> None:

@@ -129,7 +129,7 @@ def test_the_spiral_is_llffs() -> None:
 
 
 def test_a_spiral_needs_cameras_that_face_one_way() -> None:
-    with pytest.raises(XrgsError, match=r"path=spiral: .* path=orbit"):
+    with pytest.raises(XrgsError, match=r"path=spiral: .* --path orbit"):
         paths.spiral(ring(np.arange(0.0, 360.0, 30.0)), 4)
 
 

@@ -1,1 +1,1 @@
-"""The benchmark `xrgs-bench`: run time against error, from small loads to large."""
+"""The benchmark of `xrgs-bench`: run time against error, training steps, skips, memory, growth."""

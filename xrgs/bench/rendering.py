@@ -1,27 +1,39 @@
-"""Measures rendering forward and backward: time by stage, work, memory and error."""
+"""Measures rendering forward and backward: time, work, memory and error, with and without skips."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass, field, replace
-from functools import partial
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, fields, replace
+from statistics import median
 from typing import Any
 
 import torch
 from torch import Tensor
 
 from xrgs.bench.loads import Load
-from xrgs.bench.timing import Timings, time_interleaved, use_threads
+from xrgs.bench.timing import Row, time_interleaved, use_threads
 from xrgs.splat.gaussians import ActivatedGaussians
-from xrgs.splat.rasterize import Render, rasterize_parameters
+from xrgs.splat.rendering import Render, rasterize_parameters
 from xrgs.splat.settings import CullingOptions, RasterSettings
+from xrgs.splat.sh import bases
 
-#: Width and height, px, of the view in which a render is compared to one in float64.
+#: Width and height, px, of the part of a view that is compared to a render in float64. All of a
+#: large view would take minutes in float64.
 ERROR_CROP = (96, 72)
-#: Above these sizes the torch backend would take minutes, and isn't timed.
+#: The torch backend is timed on loads of at most this size only, because it is slow.
 _TORCH_GAUSSIANS, _TORCH_PIXELS, _TORCH_REPEATS = 100_000, 504 * 378, 2
-#: The name of the method whose results are the reference of all errors.
+#: The stages of the native backend, forward and backward.
+STAGES = (
+    "project",
+    "sort",
+    "intersect_tiles",
+    "composite",
+    "composite_backward",
+    "project_backward",
+)
+#: Name of the method that is the reference of all errors.
 TORCH_FLOAT64 = "torch float64"
+INACTIVE_BANDS = "inactive SH bands"
 
 
 @dataclass(frozen=True)
@@ -33,15 +45,15 @@ class RenderMethod:
     settings: RasterSettings = field(default_factory=RasterSettings)
     sh_degree: int = 3
     culling: CullingOptions | None = None
-    """The kinds of culling that the native backend uses; None means all of them."""
+    """What the native backend culls; None means everything that it can."""
     dtype: torch.dtype = torch.float32
 
 
 def default_methods(backends: Sequence[str]) -> list[RenderMethod]:
-    """Return each backend at gsplat's settings, torch in float64, and the first with other cutoffs.
+    """Return each backend at gsplat's settings, torch in float64, and three other cutoffs.
 
     Args:
-        backends: Names of the backends, the fastest first.
+        backends: Names of the backends; the first is measured with the other cutoffs.
     """
     first, usual = backends[0], RasterSettings()
     return [
@@ -57,40 +69,39 @@ class RenderTask:
     """Renders one load with one method and number of threads, any number of times.
 
     Attributes:
-        image: The last image, [H, W, 3], once `backward` was called.
-        work: Visible Gaussians, alpha evaluations and bytes of buffers of the last render; with the
-            native backend also the (tile, Gaussian) pairs.
+        image: The last image, [H, W, 3], after a call of `backward`.
+        work: Counts of the last render: `visible` Gaussians, `evaluations` of alpha and, with the
+            native backend, (tile, Gaussian) `pairs`.
+        buffer_bytes: Size of the buffers of the last render.
         stages: The shortest time of each stage in ms, native backend only.
     """
 
     def __init__(self, load: Load, method: RenderMethod, count: int) -> None:
         self.camera, self.method, self.threads = load.camera, method, count
-        self.leaves = [p.to(method.dtype).clone().requires_grad_() for p in load.parameters]
+        leaves = (value.to(method.dtype).clone().requires_grad_() for value in load.parameters)
+        self.leaves = ActivatedGaussians(*leaves)
         generator = torch.Generator().manual_seed(0)
         shape = (load.camera.height, load.camera.width, 3)
         self.image_grad = torch.randn(shape, generator=generator).to(method.dtype)  # dL/d(image)
         self.render: Render | None = None
-        self.image: Tensor | None = None
+        self.image = torch.empty(0)
         self.work: dict[str, int] = {}
+        self.buffer_bytes = 0
         self.stages: dict[str, float] = {}
 
     def forward(self) -> None:
         """Render the load and keep the graph for one call of `backward`."""
-        means, quats, scales, opacities, sh0, rest = self.leaves
-        parameters = means, quats, scales, opacities, sh0, rest
         view, degree = (self.camera, self.method.settings), self.method.sh_degree
         with use_threads(self.threads):
             if self.method.culling is None:
-                backend = self.method.backend
                 self.render = rasterize_parameters(
-                    *parameters, *view, sh_degree=degree, backend=backend
+                    *self.leaves, *view, sh_degree=degree, backend=self.method.backend
                 )
             else:
                 from xrgs.splat.native import rasterizer as native
 
-                gaussians = ActivatedGaussians(*parameters)
                 culling = self.method.culling
-                self.render = native.render_culled(gaussians, *view, degree, None, culling)
+                self.render = native.render_culled(self.leaves, *view, degree, None, culling)
 
     def backward(self) -> tuple[Tensor, ...]:
         """Return the gradients of the six parameters for the last render, and free its graph."""
@@ -100,196 +111,181 @@ class RenderTask:
         with use_threads(self.threads):
             gradients = torch.autograd.grad(render.image, self.leaves, self.image_grad)
         self.image = render.image.detach()
-        self.work = {
-            "visible": int(render.visible.sum()),
-            "evaluations": render.evaluations,
-            "buffer_bytes": render.buffer_bytes,
-        }
+        self.work = {"visible": int(render.visible.sum()), "evaluations": render.evaluations}
+        self.buffer_bytes = render.buffer_bytes
         if self.method.backend == "native":
             self.work["pairs"] = graph.frame.pair_count
             for stage, ms in graph.frame.timings.items():
                 self.stages[stage] = min(ms, self.stages.get(stage, ms))
         return gradients
 
+    def results(self) -> tuple[Tensor, ...]:
+        """Render forward and backward; return the image and the six gradients."""
+        self.forward()
+        gradients = self.backward()
+        return self.image, *gradients
+
 
 def time_load(
-    load: Load, chosen: Sequence[RenderMethod], counts: Sequence[int], repeats: int
-) -> list[Any]:
-    """Time all methods on a load, in turn.
+    load: Load, methods: Sequence[RenderMethod], counts: Sequence[int], repeats: int
+) -> list[Row]:
+    """Time all methods on a load with each number of threads, and compute their errors.
 
-    The torch backend is left out if the load is too large for it. Otherwise it is timed in turn
-    with the first native method, with fewer repeats, and its rows have `times_slower`: its time
-    over that method's.
-
-    Args:
-        load: What is rendered.
-        chosen: The methods.
-        counts: Numbers of threads.
-        repeats: Number of timed runs.
+    The torch backend is left out where the load is too large for it. Elsewhere it runs at most
+    twice, and its rows have `times_slower`, its time over the first native method's.
 
     Returns:
-        A row for each method and number of threads, as `time_methods` gives it.
+        The rows of `time_methods`, with the errors of `errors`.
     """
-    fast = [method for method in chosen if method.backend != "torch"]
-    rows = list(time_methods(load, fast, counts, repeats).values())
-    if len(load) > _TORCH_GAUSSIANS or load.pixels > _TORCH_PIXELS:
-        return rows
-    slow = [method for method in chosen if method.backend == "torch"]
-    timed = time_methods(load, [*fast[:1], *slow], counts, min(repeats, _TORCH_REPEATS))
-    for method in slow:
-        for count in counts:
-            row = timed[method.name, count]
+    fast = [method for method in methods if method.backend != "torch"]
+    slow = [method for method in methods if method.backend == "torch"]
+    rows = time_methods(load, fast, counts, repeats)
+    if len(load) <= _TORCH_GAUSSIANS and load.camera.width * load.camera.height <= _TORCH_PIXELS:
+        usual = {row["threads"]: total_ms(row) for row in reversed(rows)}  # of the first method
+        for row in time_methods(load, slow, counts, min(repeats, _TORCH_REPEATS)):
             if fast:
-                row["times_slower"] = _total_ms(row) / _total_ms(timed[fast[0].name, count])
+                row["times_slower"] = total_ms(row) / usual[row["threads"]]
             rows.append(row)
-    return rows
-
-
-def _total_ms(row: dict[str, Any]) -> float:
-    return float(row["forward_median_ms"] + row["backward_median_ms"])
+    error = errors(load, methods)
+    return [row | error[row["method"]] for row in rows]
 
 
 def time_methods(
-    load: Load, chosen: Sequence[RenderMethod], counts: Sequence[int], repeats: int
-) -> dict[tuple[str, int], dict[str, Any]]:
+    load: Load, methods: Sequence[RenderMethod], counts: Sequence[int], repeats: int
+) -> list[Row]:
     """Time each method with each number of threads, all in turn.
 
-    Args:
-        load: What is rendered.
-        chosen: The methods.
-        counts: Numbers of threads.
-        repeats: Number of timed runs.
-
     Returns:
-        A row for each name of a method and number of threads: sizes, times in ms, work and memory.
+        A row for each method and number of threads: sizes, the shortest and the median times in
+        ms, the speed-up over the first number of threads, work, and memory in MiB.
     """
-    renderings = {
-        (method.name, count): RenderTask(load, method, count)
-        for method in chosen
-        for count in counts
-    }
-    tasks: dict[str, Callable[[], object]] = {}
-    for (name, count), rendering in renderings.items():
-        tasks[f"{name} {count} forward"] = rendering.forward
-        tasks[f"{name} {count} backward"] = rendering.backward
-    times = time_interleaved(tasks, repeats)
-    return {
-        (name, count): _row(
-            load,
-            rendering,
-            times[f"{name} {count} forward"],
-            times[f"{name} {count} backward"],
-        )
-        for (name, count), rendering in renderings.items()
-    }
-
-
-def _row(load: Load, rendering: RenderTask, forward: Timings, backward: Timings) -> dict[str, Any]:
-    work, stages = rendering.work, rendering.stages
-    model = sum(leaf.nbytes for leaf in rendering.leaves)
-    compositing = stages.get("composite", forward.minimum)
-    return {
-        "load": load.name,
-        "method": rendering.method.name,
-        "backend": rendering.method.backend,
-        "threads": rendering.threads,
-        "gaussians": len(load),
-        "visible": work["visible"],
-        "width": load.camera.width,
-        "height": load.camera.height,
-        "forward_ms": forward.minimum,
-        "backward_ms": backward.minimum,
-        "forward_median_ms": forward.median,
-        "backward_median_ms": backward.median,
-        "stages_ms": dict(stages),
-        "pairs": work.get("pairs"),
-        "evaluations": work["evaluations"],
-        "evaluations_per_s": 1e3 * work["evaluations"] / compositing,
-        "memory_bytes": 2 * model + work["buffer_bytes"],  # 2: parameters and gradients
-    }
-
-
-def errors(load: Load, chosen: Sequence[RenderMethod]) -> dict[str, dict[str, float]]:
-    """Compare each method to the torch backend at gsplat's settings in float64.
-
-    Only the middle of the view (`ERROR_CROP`) is rendered, as a view of its own: a large view would
-    take minutes in float64.
-
-    Args:
-        load: What is rendered.
-        chosen: The methods.
-
-    Returns:
-        For each method's name, `image_mean` and `image_max`, the absolute error of the image, and
-        `gradient`, the norm of the gradient's error over the gradient's norm, for the parameter
-        of the six where it is largest.
-    """
-    crop = load.center_crop(*ERROR_CROP)
-    reference = RenderMethod("exact", "torch", sh_degree=chosen[0].sh_degree, dtype=torch.float64)
-    exact = RenderTask(crop, reference, torch.get_num_threads())
-    exact.forward()
-    expected = exact.backward()
-    errors_by_name = {}
-    for method in chosen:
-        rendering = RenderTask(crop, method, torch.get_num_threads())
-        rendering.forward()
-        gradients = rendering.backward()
-        difference = (_image(rendering).double() - _image(exact)).abs()
-        errors_by_name[method.name] = {
-            "image_mean": difference.mean().item(),
-            "image_max": difference.max().item(),
-            "gradient": max(map(_relative, gradients, expected)),
+    tasks = {(m.name, count): RenderTask(load, m, count) for m in methods for count in counts}
+    passes: dict[tuple[str, int, str], Callable[[], object]] = {}
+    for key, task in tasks.items():
+        passes[*key, "forward"] = task.forward
+        passes[*key, "backward"] = task.backward
+    times = time_interleaved(passes, repeats)
+    rows: list[Row] = []
+    for key, task in tasks.items():
+        forward, backward = times[*key, "forward"], times[*key, "backward"]
+        compositing = task.stages.get("composite", min(forward))
+        parameter_bytes = sum(leaf.nbytes for leaf in task.leaves)
+        row = {
+            **load.sizes,
+            "method": task.method.name,
+            "backend": task.method.backend,
+            "threads": task.threads,
+            "forward_ms": min(forward),
+            "backward_ms": min(backward),
+            "forward_median_ms": median(forward),
+            "backward_median_ms": median(backward),
+            **{f"{stage}_ms": ms for stage, ms in task.stages.items()},
+            **task.work,
+            "evaluations_per_s": 1e3 * task.work["evaluations"] / compositing,
+            # Parameters and their gradients, and the buffers.
+            "memory_mib": (2 * parameter_bytes + task.buffer_bytes) / 2**20,
         }
-    return errors_by_name
+        one = next((other for other in rows if other["method"] == row["method"]), row)
+        rows.append(row | {"speedup": total_ms(one) / total_ms(row)})
+    return rows
 
 
-def _image(rendering: RenderTask) -> Tensor:
-    assert rendering.image is not None, "backward() must be called first"  # noqa: S101
-    return rendering.image
+def total_ms(row: Row) -> float:
+    """Return the time of a render forward and backward, in ms."""
+    return float(row["forward_ms"] + row["backward_ms"])
 
 
-def _relative(value: Tensor, exact: Tensor) -> float:
+def errors(load: Load, methods: Sequence[RenderMethod]) -> dict[str, dict[str, float]]:
+    """Compare each method to the torch backend in float64 at gsplat's settings.
+
+    Only the middle of the view (`ERROR_CROP`) is rendered, as a view of its own.
+
+    All methods must have one `sh_degree`.
+
+    Returns:
+        For each method's name, `image_mean_error` and `image_max_error`, the absolute error of the
+        image, and `gradient_error`, the norm of the gradient's error over the gradient's norm, for
+        the parameter of the six where it is largest.
+    """
+    crop, threads = load.center_crop(*ERROR_CROP), torch.get_num_threads()
+    exact = RenderMethod("exact", "torch", sh_degree=methods[0].sh_degree, dtype=torch.float64)
+    exact_image, *exact_gradients = RenderTask(crop, exact, threads).results()
+    found = {}
+    for method in methods:
+        image, *gradients = RenderTask(crop, method, threads).results()
+        difference = (image.double() - exact_image).abs()
+        found[method.name] = {
+            "image_mean_error": difference.mean().item(),
+            "image_max_error": difference.max().item(),
+            "gradient_error": max(map(_relative_error, gradients, exact_gradients)),
+        }
+    return found
+
+
+def _relative_error(value: Tensor, exact: Tensor) -> float:
     norm = exact.norm()
     return ((value.double() - exact).norm() / norm).item() if norm > 0 else 0.0
 
 
-def time_views(load: Load, backend: str, counts: Sequence[int], repeats: int) -> list[Any]:
-    """Time the forward and backward passes of several views, one after the other.
+def time_shortcuts(load: Load, backend: str, repeats: int) -> list[Row]:
+    """Time rendering on one thread with each shortcut on and off, in turn.
 
-    Args:
-        load: The Gaussians and the first view; the others are beside it.
-        backend: "native" or "torch".
-        counts: Numbers of views.
-        repeats: Number of timed runs.
+    A shortcut leaves out work that does not change the result. The kinds of culling
+    (`CullingOptions`) are shortcuts of the native backend. Both backends leave out the bands of the
+    spherical harmonics above the degree that training has reached.
 
     Returns:
-        A row for each number of views: `views` and `ms`.
+        A row for each shortcut: `shortcut`, sizes, `times` (off over on), `same_bits` (whether
+        image and gradients are equal with and without it) and, with the prefixes `on_` and `off_`,
+        times in ms, alpha evaluations and errors.
     """
-    baseline = 0.02 * load.means[:, 2].median().item()  # between cameras, world units
-    renderings = []
-    for number in range(max(counts)):
-        viewmat = load.camera.viewmat.clone()
-        viewmat[0, 3] += baseline * number
-        view = load.with_camera(replace(load.camera, viewmat=viewmat))
-        renderings.append(RenderTask(view, RenderMethod(backend, backend), torch.get_num_threads()))
+    usual = RenderMethod("on", backend)
+    rows = []
+    if backend == "native":
+        without = [
+            replace(
+                usual,
+                name=option.name.replace("_", " "),
+                culling=replace(CullingOptions(), **{option.name: False}),
+            )
+            for option in fields(CullingOptions)
+        ]
+        rows += _compare_shortcuts(load, usual, without, repeats)
+    # Early in training only band 0 is on. Without the shortcut all bands are evaluated, as zeros.
+    sh = torch.cat([load.sh[:, :1], torch.zeros_like(load.sh[:, 1:])], dim=1)
+    without = [replace(usual, name=INACTIVE_BANDS)]
+    usual = replace(usual, sh_degree=0)
+    return rows + _compare_shortcuts(replace(load, sh=sh), usual, without, repeats)
 
-    def render_views(count: int) -> None:
-        for rendering in renderings[:count]:
-            rendering.forward()
-            rendering.backward()
 
-    times = time_interleaved(
-        {str(count): partial(render_views, count) for count in counts}, repeats
-    )
-    return [{"views": count, "ms": times[str(count)].minimum} for count in counts]
-
-
-def describe(method: RenderMethod) -> Mapping[str, Any]:
-    """Return a method with all of its settings as JSON values.
-
-    Args:
-        method: What is described.
-    """
-    dtype = str(method.dtype).removeprefix("torch.")
-    settings = asdict(method.settings)
-    return {"name": method.name, "backend": method.backend, "dtype": dtype, "settings": settings}
+def _compare_shortcuts(
+    load: Load, usual: RenderMethod, without: Sequence[RenderMethod], repeats: int
+) -> list[Row]:
+    methods = [usual, *without]
+    timed = {row["method"]: row for row in time_methods(load, methods, [1], repeats)}
+    error = errors(load, methods)
+    sides = {
+        name: {key: row[key] for key in ("forward_ms", "backward_ms", "evaluations")} | error[name]
+        for name, row in timed.items()
+    }
+    active = bases(usual.sh_degree) - 1  # bases of shN whose gradients are compared
+    *expected, expected_harmonics = RenderTask(load, usual, 1).results()
+    rows = []
+    for method in without:
+        *found, harmonics = RenderTask(load, method, 1).results()
+        same = all(map(torch.equal, found, expected))
+        same &= torch.equal(harmonics[:, :active], expected_harmonics[:, :active])
+        on, off = sides[usual.name], sides[method.name]
+        rows.append(
+            {
+                "shortcut": method.name,
+                **load.sizes,
+                "backend": usual.backend,
+                "threads": 1,
+                **{f"on_{key}": value for key, value in on.items()},
+                **{f"off_{key}": value for key, value in off.items()},
+                "times": total_ms(off) / total_ms(on),
+                "same_bits": same,
+            }
+        )
+    return rows

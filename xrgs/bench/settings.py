@@ -1,4 +1,4 @@
-"""The arguments of `xrgs-bench`, without torch, so that `--help` and mistakes answer at once."""
+"""The arguments of `xrgs-bench`. This module needs no torch, so that `--help` answers at once."""
 
 from __future__ import annotations
 
@@ -10,30 +10,24 @@ class Settings:
     """What to measure, and where to write the results."""
 
     load: str | None = None
-    """A .npz file to time instead of the random loads: Gaussians and a view, see `save`."""
+    """Measure the Gaussians and the view in this .npz file instead of random ones (see `save`)."""
     save: str | None = None
-    """Write such a .npz file from `cell` and `view` instead of timing anything."""
+    """Write a .npz file with the Gaussians of `cell` and one view of it, and measure nothing."""
     cell: str | None = None
-    """Folder of a trained cell in its store, for `save` and `quality`."""
+    """Folder of a trained cell in its store, for `save`."""
     view: str | None = None
     """Name of a training or test view of `cell`, for `save`."""
     out: str = "xrgs-bench"
-    """Folder for bench.csv, shortcuts.csv and bench.png, or for against.csv."""
+    """Folder of the .csv files and of bench.png."""
     json: str | None = None
-    """File for all results as JSON."""
+    """Also write all results to this JSON file."""
     repeats: int = 9
-    """Number of times that each task is timed, in turn with those it is compared to."""
+    """How often each task is timed; tasks that are compared take turns."""
     threads: int = 0
-    """Number of threads to time besides 1; 0 means one for each core."""
+    """Number of threads to measure besides 1; 0 means one for each core."""
     smoke: bool = False
     """Use tiny loads, to check that everything runs."""
     against: str | None = None
-    """Instead, time this installation and another in turn: the Python executable of the other."""
-    quality: bool = False
-    """Train `cell` again with each approximation changed and compare PSNR, instead of timing."""
-    steps: int = 600
-    """Number of training steps of each run of `quality`."""
-    store_cells: int = 0
-    """Instead, time planning, reporting and status over a store of this many cells."""
+    """Time this installation and another in turn; the Python executable of the other."""
     seed: int = 0
     """Seed of the random loads."""

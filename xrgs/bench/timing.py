@@ -1,67 +1,47 @@
-"""Times alternatives against one another on a machine that does other work too."""
+"""Times tasks in turn, so that a machine with other work still gives true ratios."""
 
 from __future__ import annotations
 
-import statistics
 import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass
+from typing import Any, TypeVar
 
 import torch
 
-
-@dataclass(frozen=True)
-class Timings:
-    """The durations of one task."""
-
-    milliseconds: tuple[float, ...]
-    """Duration of each run, in the order of the runs."""
-
-    @property
-    def minimum(self) -> float:
-        """The shortest run in ms: the duration when nothing else disturbs the task."""
-        return min(self.milliseconds)
-
-    @property
-    def median(self) -> float:
-        """The median run in ms."""
-        return statistics.median(self.milliseconds)
+Row = dict[str, Any]  # one result: values by column
+_Key = TypeVar("_Key")
 
 
-def time_interleaved(tasks: Mapping[str, Callable[[], object]], repeats: int) -> dict[str, Timings]:
-    """Run each task once to warm up, then all of them in turn, A B A B, `repeats` times.
-
-    Whatever slows the machine down for a while then slows all tasks down, so that the ratios of
-    their durations stay true.
+def time_interleaved(
+    tasks: Mapping[_Key, Callable[[], object]], repeats: int
+) -> dict[_Key, list[float]]:
+    """Run each task once to warm up, then all tasks in turn (A B A B ...).
 
     Args:
-        tasks: The tasks by name.
+        tasks: The tasks, each under a key.
         repeats: Number of timed runs of each task.
 
     Returns:
-        The durations of each task, by its name.
+        For each key, the duration of each run in ms.
     """
     for task in tasks.values():
         task()
-    durations: dict[str, list[float]] = {name: [] for name in tasks}
+    durations: dict[_Key, list[float]] = {key: [] for key in tasks}
+    # In turn: other work on the machine then slows all tasks down, and their ratios stay true.
     for _ in range(repeats):
-        for name, task in tasks.items():
+        for key, task in tasks.items():
             start = time.perf_counter()
             task()
-            durations[name].append(1e3 * (time.perf_counter() - start))
-    return {name: Timings(tuple(values)) for name, values in durations.items()}
+            durations[key].append(1e3 * (time.perf_counter() - start))
+    return durations
 
 
 @contextmanager
 def use_threads(count: int) -> Iterator[None]:
-    """Set the number of threads of torch, and with it of the native kernels, for a `with` block.
-
-    Args:
-        count: Number of threads.
-    """
+    """Set the number of threads of torch and of the native kernels for a `with` block."""
     before = torch.get_num_threads()
-    torch.set_num_threads(count)
+    torch.set_num_threads(count)  # the native kernels read torch's number
     try:
         yield
     finally:

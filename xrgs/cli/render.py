@@ -2,76 +2,54 @@
 
 from __future__ import annotations
 
-import re
-from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Literal
 
-from xrgs.cli.arguments import errors_as_messages, parse_with_words
-from xrgs.errors import XrgsError
+from tyro.conf import Positional, arg
+
+from xrgs.cli import options
+from xrgs.cli.options import STORE, Cells, Folder, shown_as
 from xrgs.experiment.store import Store
 from xrgs.runtime.machine import set_passive_openmp_wait
 from xrgs.runtime.signals import exit_on_signal
 from xrgs.runtime.streams import say
-from xrgs.safeio.paths import user_path
-
-_HELP = """\
-xrgs-render CELL [CELL] [KEY=VALUE]...
-
-Renders trained cells along a path that is fitted to their training cameras, two of them side by
-side with their names. CELL is a cell's id, the beginning of one, or a .ply file.
-
-  path=orbit       orbit: around the point that the cameras look at; where they see it from one side
-                   alone, to and fro over the arc that they span
-                   spiral: LLFF's, for forward-facing scenes
-                   test: through the test cameras in their order; as on every path, all frames
-                   have the focal length of the first one, also where the cameras' differ
-  views=120        number of frames
-  out=film.mp4     an .mp4 file, which needs PyAV (pip install 'xrgs[video]'), or a new folder for
-                   PNG frames
-  size=WxH         size of one cell's picture, px, both even; the size of the test views by default
-  fps=30           frames a second
-  store=FOLDER     the store; xrgs-store by default
-"""
-_SIZE = re.compile(r"(\d{1,5})x(\d{1,5})")
 
 
-@dataclass
-class RenderConf:
-    """Arguments of `xrgs-render`."""
+def render(
+    cells: Positional[Cells],
+    path: Literal["orbit", "spiral", "test"] = "orbit",
+    views: int = 120,
+    out: Annotated[Path, arg(metavar="FILE.mp4|FOLDER")] = Path("film.mp4"),
+    size: Annotated[tuple[int, int] | None, shown_as("WIDTH HEIGHT")] = None,
+    fps: int = 30,
+    store: Folder = STORE,
+) -> None:
+    """Render trained cells along a path of cameras; two of them side by side with their names.
 
-    path: str = "orbit"
-    """`orbit`, `spiral` or `test`."""
-    views: int = 120
-    """Number of frames."""
-    out: str = "film.mp4"
-    """An .mp4 file, or a folder for PNG frames."""
-    size: str | None = None
-    """Width and height of one cell's panel as `504x378`, px; None for that of the test views."""
-    fps: int = 30
-    """Frames a second."""
-    store: str = "xrgs-store"
-    """The store's folder."""
+    Args:
+        cells: One cell or two, each by its id, the beginning of its id, or a .ply file.
+        path: The path, fitted to the training cameras. `orbit` circles around the point that they
+            look at; where they see it from one side alone, it swings over the arc that they span.
+            `spiral` is LLFF's, for forward-facing scenes. `test` goes through the test cameras in
+            their order. On every path, all frames have the focal length of the first one.
+        views: Number of frames.
+        out: An .mp4 file, which needs PyAV (pip install 'xrgs[video]'), or a new folder for PNG
+            frames.
+        size: Size of one cell's picture in pixels, both even; by default the size of the test
+            views.
+        fps: Frames a second.
+        store: The store that has the cells.
+    """
+    from xrgs.viewer.film import make_film
+    from xrgs.viewer.models import load_models
+
+    with exit_on_signal("A film that is not complete is not kept; single frames are."):
+        models = load_models(cells, Store(store))
+        line = make_film(models, out, path=path, views=views, size=size, fps=fps)
+    say(line)
 
 
 def main() -> None:
-    """Run `xrgs-render CELL [CELL] [KEY=VALUE]...`."""
+    """Run `xrgs-render`."""
     set_passive_openmp_wait()  # as in training
-    with errors_as_messages("xrgs-render"):
-        words, conf = parse_with_words(RenderConf, _HELP)
-        size = _size(conf.size)
-        from xrgs.viewer.film import make_film
-        from xrgs.viewer.models import load_models
-
-        with exit_on_signal("A film that is not complete is not kept; single frames are."):
-            models = load_models(words, Store(user_path(conf.store)))
-            out = user_path(conf.out)
-            line = make_film(models, out, path=conf.path, views=conf.views, size=size, fps=conf.fps)
-        say(line)
-
-
-def _size(text: str | None) -> tuple[int, int] | None:
-    if text is None:
-        return None
-    match = _SIZE.fullmatch(text)
-    if not match:
-        raise XrgsError(f"size={text}: must be WIDTHxHEIGHT, as 504x378")
-    return int(match[1]), int(match[2])
+    options.run("xrgs-render", render)

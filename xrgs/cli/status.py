@@ -2,34 +2,25 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from pathlib import Path
-
-from xrgs.cli.arguments import errors_as_messages, parse
+from xrgs.cli import options
+from xrgs.cli.options import STORE, Folder
 from xrgs.runtime.streams import say
 
-_HELP = """\
-xrgs-status [KEY=VALUE]...
 
-Prints what a store holds: cells by state, which cell is trained now and for which sweep, why cells
-failed, which cells are stale, and sizes. xrgs-store lists single cells, and verifies them.
+def status(store: Folder = STORE) -> None:
+    """Print what a store holds: cells by state, why cells failed, which are stale, and sizes.
 
-  store=FOLDER     the store; xrgs-store by default
-"""
+    It also says which cell is trained now, and for which sweep. `xrgs-store list` lists single
+    cells, and `xrgs-store check` verifies them.
 
+    Args:
+        store: The store.
+    """
+    from xrgs.sweep.status import describe, read
 
-@dataclass
-class StatusConf:
-    """Arguments of `xrgs-status`."""
-
-    store: str = "xrgs-store"
-    """The store's folder."""
+    say(describe(read(store)))
 
 
 def main() -> None:
-    """Run `xrgs-status [KEY=VALUE]...`."""
-    with errors_as_messages("xrgs-status"):
-        conf = parse(StatusConf, _HELP)
-        from xrgs.sweep.status import describe, read
-
-        say(describe(read(Path(conf.store))))
+    """Run `xrgs-status`."""
+    options.run("xrgs-status", status)

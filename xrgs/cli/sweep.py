@@ -7,7 +7,7 @@ import sys
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import hydra
 from hydra.core.hydra_config import HydraConfig
@@ -15,19 +15,15 @@ from hydra.errors import CompactHydraException
 from omegaconf import MISSING, DictConfig, OmegaConf
 
 from xrgs import config
-from xrgs.cli.arguments import (
-    answer_version,
-    choices,
-    dotlist,
-    errors_as_messages,
-    with_quotes,
-)
+from xrgs.cli.hydra_words import explained, files, with_quotes
 from xrgs.cli.key_help import explain
+from xrgs.cli.options import answer_version, errors_as_messages
+from xrgs.composing import escape_interpolations
 from xrgs.runtime.signals import exit_on_signal
 from xrgs.runtime.streams import ignore_broken_pipe, say
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Iterator, Sequence
 
 #: The variable of the environment by which Hydra leaves errors to its caller.
 _FULL_ERROR = "HYDRA_FULL_ERROR"
@@ -103,7 +99,7 @@ def main() -> None:
     arguments = sys.argv[1:]
     if {"-h", "--help"} & set(arguments):  # Hydra's own help takes seconds to list its groups
         groups = ("ablation", "scene", "preset", "sweeps")
-        say(_HELP.format(**{group: choices(group) for group in groups}).rstrip())
+        say(_HELP.format(**{group: ", ".join(files(group)) for group in groups}).rstrip())
         return
     ignore_broken_pipe()
     answer_version("xrgs-sweep")
@@ -139,7 +135,7 @@ def _hydra_errors(command: str) -> Iterator[None]:
         return
     os.environ[_FULL_ERROR] = "1"
     try:
-        with errors_as_messages(command):
+        with errors_as_messages(command), explained():
             yield
     finally:
         del os.environ[_FULL_ERROR]
@@ -149,11 +145,21 @@ def _rerun(arguments: list[str]) -> None:
     from xrgs.sweep.rerun import rerun
 
     hint = " (rerun= takes out=, store=, threads=, scene.path= and plugins=)"
-    with errors_as_messages("xrgs-sweep", hint):
-        conf = OmegaConf.merge(OmegaConf.structured(RerunConf), dotlist(arguments))
+    with errors_as_messages("xrgs-sweep"), explained(hint):
+        conf = OmegaConf.merge(OmegaConf.structured(RerunConf), texts(arguments))
         out, store = (Path(path) if path else None for path in (conf.out, conf.store))
         photographs, plugins = conf.scene.path, conf.plugins.split(",")
         result = rerun(Path(conf.rerun), out, store, conf.threads, photographs, plugins)
     say(str(result))
     if result.differences:
         sys.exit(1)
+
+
+def texts(words: Sequence[str]) -> DictConfig:
+    """Return `KEY=VALUE` words as a config of texts, which a merge into a schema converts."""
+    conf = OmegaConf.create({})
+    for word in words:
+        key, _, value = word.partition("=")
+        text: Any = escape_interpolations(value)
+        OmegaConf.update(conf, key, text)
+    return conf

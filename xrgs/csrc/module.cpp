@@ -5,7 +5,6 @@
 #include <nanobind/stl/vector.h>
 
 #include "activations/bind.h"
-#include "bench/bind.h"
 #include "densify/bind.h"
 #include "isa.h"
 #include "loss/bind.h"
@@ -81,5 +80,4 @@ NB_MODULE(_native, m) {
   bind_loss(m);
   bind_optim(m);
   bind_resample(m);
-  bind_bench(m);
 }

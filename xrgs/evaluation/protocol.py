@@ -105,7 +105,7 @@ def _render(gaussians: Gaussians, view: LoadedView, conf: SplatConf) -> Tensor:
     import torch
 
     from xrgs.splat.backend import resolve_backend
-    from xrgs.splat.rasterize import rasterize_parameters
+    from xrgs.splat.rendering import rasterize_parameters
 
     backend = resolve_backend(conf.backend)
     with torch.no_grad():

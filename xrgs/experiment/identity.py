@@ -33,7 +33,7 @@ from xrgs.safeio.code import code_digest
 from xrgs.safeio.hashing import digest
 from xrgs.splat.backend import arithmetic, resolve_backend
 from xrgs.training import plugins
-from xrgs.training.components.registry import modules_of
+from xrgs.training.registry import modules_of, order_of
 
 if TYPE_CHECKING:
     from xrgs.config import Conf
@@ -41,26 +41,28 @@ if TYPE_CHECKING:
 #: Source files whose change can change a trained number, whatever components are on.
 CORE = (
     "capture/dataset.py",
+    "safeio/npz.py",
     "splat/attribution.py",
     "splat/backend.py",
     "splat/bicubic.py",
     "splat/cameras.py",
-    "splat/densify.py",
     "splat/gaussians.py",
-    "splat/growth.py",
     "splat/loss.py",
     "splat/native",
     "splat/normalize.py",
     "splat/optimizer.py",
     "splat/quaternions.py",
-    "splat/rasterize.py",
-    "splat/refinement.py",
-    "splat/render_result.py",
+    "splat/rendering.py",
     "splat/resample.py",
     "splat/rounding.py",
     "splat/settings.py",
     "splat/sh.py",
     "splat/ssim.py",
+    "splat/strategy/__init__.py",
+    "splat/strategy/base.py",
+    "splat/strategy/default.py",
+    "splat/strategy/ops.py",
+    "splat/strategy/refinement.py",
     "splat/torch",
     "training/checkpoint.py",
     "training/components/__init__.py",
@@ -131,12 +133,25 @@ def code_now(
     backend: str, components: tuple[str, ...] = (), plugin_names: tuple[str, ...] = ()
 ) -> dict[str, str]:
     """Return `training_code` of the files as they are now, edited meanwhile or not."""
+    exact = _exact(backend, components)
+    code = {part: canonical(part, of_part) for part, of_part in exact.items()}
+    return code | {f"plugins/{name}": plugins.code_digest(name) for name in plugin_names}
+
+
+def _exact(backend: str, components: tuple[str, ...]) -> dict[str, str]:
+    """Return the digest of each part of the code, and the order of the components' hooks."""
+    files = _files(backend, components)
+    code = {part: code_digest(*names) for part, names in files.items()}
+    order = order_of(components)
+    return code | {"order": order} if order else code
+
+
+def _files(backend: str, components: tuple[str, ...]) -> dict[str, tuple[str, ...]]:
+    """Return the source files of each part of the code, relative to the package."""
     files: dict[str, tuple[str, ...]] = {"core": CORE}
     if backend == "native":
         files["native"] = NATIVE
-    files |= {key: modules_of(key) for key in components if modules_of(key)}
-    code = {part: canonical(part, code_digest(*names)) for part, names in files.items()}
-    return code | {f"plugins/{name}": plugins.code_digest(name) for name in plugin_names}
+    return files | {key: modules_of(key) for key in components if modules_of(key)}
 
 
 def canonical(part: str, code: str) -> str:
@@ -161,15 +176,17 @@ def changed_code(identity: Identity) -> list[str]:
     Raises:
         XrgsError: A plugin is not installed.
     """
-    return sorted(
-        part
-        for part in identity.code.keys() | current_code(identity).keys()
-        if identity.code.get(part) != current_code(identity).get(part)
-    )
+    now = current_code(identity)
+    parts = identity.code.keys() | now.keys()
+    return sorted(part for part in parts if identity.code.get(part) != now.get(part))
 
 
 def current_code(identity: Identity) -> dict[str, str]:
-    """Return the digests that the code of an identity has in the installed package."""
+    """Return the digests that the parts of an identity's code have in the installed package."""
     names = tuple(sorted(identity.components.get("plugins", {})))
-    components = tuple(key for key in identity.components if key != "plugins")
-    return code_now(str(identity.splat["backend"]), components, names)
+    return code_now(str(identity.splat["backend"]), tuple(identity.components), names)
+
+
+def exact_code(identity: Identity) -> dict[str, str]:
+    """Return `current_code` without declared refactorings and plugins."""
+    return _exact(str(identity.splat["backend"]), tuple(identity.components))

@@ -99,14 +99,17 @@ def read_bytes(path: Path, max_bytes: int = MAX_BYTES) -> bytes:
     """
     # Opening a named pipe without O_NONBLOCK waits for its writer.
     descriptor = os.open(path, os.O_RDONLY | os.O_CLOEXEC | os.O_NONBLOCK)
-    with open(descriptor, "rb") as stream:  # noqa: PTH123  of a descriptor
+    try:
         status = os.fstat(descriptor)
         if not stat.S_ISREG(status.st_mode):
             raise OSError(errno.EINVAL, "not a regular file", str(path))
         if status.st_size > max_bytes:
             why = f"{status.st_size} bytes, at most {max_bytes} are read"
             raise OSError(errno.EFBIG, why, str(path))
-        return stream.read(max_bytes)
+        with open(descriptor, "rb", closefd=False) as stream:
+            return stream.read(max_bytes)
+    finally:
+        os.close(descriptor)
 
 
 def remove_path(path: Path) -> None:

@@ -43,14 +43,14 @@ def to_plain(value: Any) -> Any:
     cells converts each config several times. The values are shared, not copied.
 
     Args:
-        value: A dataclass instance, a tuple, or any other value, which is returned as it is.
+        value: A dataclass instance; any other value is returned as it is.
 
     Returns:
-        A dict with the fields in their order, a list for a tuple, as in JSON, or the value itself.
+        A dict with the fields in their order, or the value itself.
     """
     if hasattr(value, "__dataclass_fields__"):
         return {name: to_plain(getattr(value, name)) for name in value.__dataclass_fields__}
-    return list(value) if isinstance(value, tuple) else value
+    return value
 
 
 def file_digest(path: Path) -> str:

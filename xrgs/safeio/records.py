@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import io
 import math
+import re
 from contextlib import contextmanager
 from itertools import islice
 from typing import TYPE_CHECKING, TypeVar
@@ -27,6 +28,8 @@ MAX_BYTES = 1 << 22
 MAX_NUMBER = 1e30
 #: The most rows and columns of a table. A cell's scores have a row for each test view.
 _MAX_ROWS, _MAX_COLUMNS = 20_000, 1000
+#: What msgspec says of a text that does not match its pattern. Only names and paths have patterns.
+_PATTERN = re.compile(r"Expected `str` matching regex .*")
 
 
 @contextmanager
@@ -83,9 +86,11 @@ def decode_struct(content: bytes, kind: type[_T], path: Path | str) -> _T:
     """Decode JSON of a declared type; `path` names its file in errors, see `read_struct`."""
     try:
         return msgspec.json.decode(content, type=kind)
-    except msgspec.ValidationError as error:  # "Expected `int`, got `str` - at `$.views[0]`"
+    except msgspec.ValidationError as error:
+        # "Expected `int`, got `str` - at `$.views[0]`"; "... - at `key` in `$.files`"
         what, _, where = str(error).partition(" - at ")
-        field = where.strip("`").removeprefix("$.") or "the file"
+        field = where.replace("`", "").replace("$.", "") or "the file"
+        what = _PATTERN.sub("not a name, or not a path inside the folder", what)
         raise StoreError(f"damaged: {path}: {field}: {what}") from error
     except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
         raise StoreError(f"damaged: {path}: not valid JSON ({error})") from error

@@ -1,4 +1,4 @@
-"""Attributes the pixels of a view to the Gaussians that show in them."""
+"""Attributes the pixels of a view to the Gaussians that are blended into them."""
 
 from __future__ import annotations
 
@@ -9,17 +9,17 @@ from torch import Tensor
 
 from xrgs.splat.cameras import Camera
 from xrgs.splat.gaussians import ActivatedGaussians
-from xrgs.splat.rasterize import rasterize_parameters
+from xrgs.splat.rendering import rasterize_parameters
 from xrgs.splat.settings import RasterSettings
 from xrgs.splat.sh import C0
 
 
 @dataclass(frozen=True)
 class Attribution:
-    """What the pixels of a view came to for each Gaussian, and the work that it took."""
+    """A map of a view's pixels, summed for each Gaussian."""
 
     sums: Tensor
-    """[N] sums over the pixels, in the unit of the map times px; 0 for what the view hides."""
+    """[N] sums over the pixels, in the unit of the map times px; 0 for hidden Gaussians."""
     evaluations: int
     """Alpha evaluations of the forward pass (`Render.evaluations`)."""
 
@@ -33,19 +33,18 @@ def attribute_pixels(
     *,
     backend: str = "torch",
 ) -> Attribution:
-    """Sum a map of a view's pixels over what each Gaussian shows of them.
+    """Sum a map of a view's pixels, weighted by each Gaussian's part in them.
 
     The sum of Gaussian i is
 
         sum over p of e(p) w_i(p),   w_i(p) = alpha_i(p) T_i(p)
 
     where e is the map and w_i the weight with which the Gaussian's colour is blended into pixel p
-    [kerbl2023, equation 3]. A render is linear in the colours, so it is the gradient of
+    [kerbl2023, equation 3]. A render is linear in the colours, so the sum is the gradient of
 
         sum over p of e(p) image(p)
 
-    with respect to the Gaussian's colour: one forward and one backward pass. The colours are
-    constant meanwhile (0.5), since the gradient of a colour that is clamped at 0 is 0.
+    with respect to the Gaussian's colour: one forward and one backward pass.
 
     Args:
         pixels: [H, W] the map e, of the type of the Gaussians.
@@ -55,8 +54,7 @@ def attribute_pixels(
         backend: `torch`, `native` or `auto` (`resolve_backend`).
 
     Returns:
-        The sums and the number of alpha evaluations; nothing is differentiable. Gradients need not
-        be enabled.
+        The sums, without a graph, and the number of alpha evaluations.
 
     Raises:
         ValueError: The map is not of the camera's size, or as for `rasterize_parameters`.
@@ -66,6 +64,7 @@ def attribute_pixels(
             f"pixels must be {[camera.height, camera.width]} [H, W], got {list(pixels.shape)}"
         )
     constant = ActivatedGaussians(*(value.detach() for value in gaussians))
+    # Colours of 0.5: the gradient of a colour that is clamped at 0 would be 0.
     constant = constant._replace(sh0=torch.zeros_like(constant.sh0).requires_grad_())
     render = rasterize_parameters(*constant, camera, settings, sh_degree=0, backend=backend)
     total = (pixels.detach() * render.image[..., 0]).sum()

@@ -27,9 +27,9 @@ def resolve_backend(name: str) -> str:
     """Return the backend that a configured name means on this machine.
 
     Args:
-        name: `native`, `torch`, or `auto`. `auto` means native where the extension was built.
-            Where it was not, `auto` means torch and logs one warning, or fails if the environment
-            variable XRGS_REQUIRE_NATIVE is 1.
+        name: `native`, `torch`, or `auto`. `auto` means native if the extension was built. If not,
+            `auto` means torch and logs one warning, or fails if the environment variable
+            XRGS_REQUIRE_NATIVE is 1.
 
     Returns:
         `native` or `torch`.
@@ -72,18 +72,18 @@ def implementation(operation: Operation, backend: str) -> ModuleType:
 
 
 def arithmetic(backend: str) -> str:
-    """Return what decides the last bits of a backend's results, beside its source code.
+    """Return the arithmetic that decides the last bits of a backend's results.
 
     All instruction sets with a fused multiply-add, which rounds a product and a sum once, give the
-    same bits in the native kernels. Those without one round twice and give others.
+    same bits in the native kernels. Instruction sets without it round twice and give other bits.
 
     Args:
         backend: `native` or `torch`.
 
     Returns:
-        `fma` or `no-fma` for the instruction set that the native kernels use in this process;
-        `torch` for torch, which chooses its own for each operation, and whose last bits differ from
-        processor to processor and with the number of threads.
+        `fma` or `no-fma` for the instruction set that the native kernels use in this process, or
+        `torch`: torch chooses an instruction set for each operation, and its last bits depend on
+        the processor and the number of threads.
 
     Raises:
         XrgsError: The backend is native and its module can't be loaded on this machine.

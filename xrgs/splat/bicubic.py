@@ -21,7 +21,7 @@ def bicubic_matrix(old: int, new: int) -> Tensor:
         new: Number of samples after it.
 
     Returns:
-        [new, old] float64. The tensor is cached: callers must not write to it.
+        [new, old] float64, cached: callers must not write to it.
     """
     identity = torch.eye(old, dtype=torch.float64)[None, None]  # [1, 1, old, old]
     return interpolate(identity, size=(new, old), mode="bicubic", antialias=True)[0, 0]

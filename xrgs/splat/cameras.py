@@ -10,8 +10,8 @@ import torch
 from torch import Tensor
 
 ORTHONORMAL_TOLERANCE = 1e-3
-"""Largest entry of R R^T - I that a viewmat's rotation R may have: float32 exports of SfM err by
-1e-6, a matrix with a scale by that scale."""
+"""Largest entry of R R^T - I for the rotation R of a viewmat. The float32 exports of SfM are at
+1e-6; a matrix with a scale is far above."""
 
 
 @dataclass(frozen=True)
@@ -63,12 +63,7 @@ class Camera:
         return position
 
     def resized(self, width: int, height: int) -> Camera:
-        """Return this camera with an image of another size, which shows the same.
-
-        Args:
-            width: The new width, px.
-            height: The new height, px.
-        """
+        """Return this camera with the same view at another size, px."""
         scale = self.K.new_tensor([[width / self.width], [height / self.height], [1.0]])  # [3, 1]
         return Camera(self.viewmat, self.K * scale, width, height)
 

@@ -23,10 +23,7 @@ MIN_SPACING = 1e-7
 
 
 class ActivatedGaussians(NamedTuple):
-    """Gaussians after their activation functions, as `rasterize_parameters` takes them.
-
-    The fields are in the order of `PARAMETERS`.
-    """
+    """Gaussians after their activation functions; the fields are in the order of `PARAMETERS`."""
 
     means: Tensor  # [N, 3] world units
     quats: Tensor  # [N, 4] wxyz, any length
@@ -75,7 +72,7 @@ class Gaussians:
         sh_degree: int = 3,
         generator: torch.Generator | None = None,
     ) -> Gaussians:
-        """Start Gaussians on the points of a point cloud, one a point.
+        """Place one Gaussian on each point of a point cloud.
 
         Args:
             points: [P, 3] world units, at least 4 points.
@@ -88,7 +85,7 @@ class Gaussians:
             P Gaussians, float32, with gradients on.
 
         Raises:
-            ValueError: As the function `from_points`, which does the work.
+            ValueError: As for the function `from_points`.
         """
         generator = generator or torch.Generator().manual_seed(0)
         return from_points(
@@ -98,13 +95,12 @@ class Gaussians:
     def activated(self, *, backend: str = "torch") -> ActivatedGaussians:
         """Apply the activation functions: exp to scales, the logistic function to opacities.
 
-        shN is detached, so that its gradient, three quarters of all, is never computed. The
-        optimizer derives it from that of sh0 (`SplatOptimizer.step`).
+        shN is detached, so that its gradient, three quarters of all gradients, is never computed.
+        The optimizer derives it from the gradient of sh0 (`SplatOptimizer.step`).
 
         Args:
-            backend: `torch`, `native` or `auto` (`resolve_backend`), which computes the functions.
-                The native backend takes float32 on the CPU only, and gives the same bits for any
-                number of threads, which torch does not.
+            backend: `torch`, `native` or `auto` (`resolve_backend`). The native backend takes
+                float32 on the CPU only, and gives the same bits for any number of threads.
 
         Returns:
             The Gaussians, differentiable in all parameters but shN; once on the native backend.

@@ -1,7 +1,7 @@
 """gsplat's `rasterization` on the CPU: the signature and the results of gsplat 1.5.3.
 
-Code that calls `gsplat.rasterization` on a GPU runs here by importing it from `xrgs` instead. What
-is not served is refused by an error that names the argument.
+Code that calls `gsplat.rasterization` on a GPU runs here by importing it from `xrgs` instead. An
+argument that is not served raises an error that names it.
 """
 
 from __future__ import annotations
@@ -12,8 +12,7 @@ import torch
 from torch.nn.functional import pad
 
 from xrgs.splat.cameras import Camera
-from xrgs.splat.rasterize import rasterize_parameters
-from xrgs.splat.rendering import backend_for
+from xrgs.splat.rendering import backend_for, rasterize_parameters
 from xrgs.splat.settings import RasterSettings
 from xrgs.splat.sh import C0, MAX_DEGREE, bases
 from xrgs.splat.torch.projection import depths as camera_depths
@@ -29,11 +28,11 @@ RasterizeMode = Literal["classic", "antialiased"]
 ALPHA_MIN, ALPHA_MAX, TRANSMITTANCE_MIN = 1.0 / 255.0, 0.999, 1e-4
 MAX_RADIUS_SIGMAS = 3.33
 MIN_DEPTH_ALPHA = 1e-10
-"""Alpha that the expected depth is divided by at least."""
+"""Smallest alpha by which the expected depth is divided."""
 
 
 class _Shapes(NamedTuple):
-    """What decides where the Gaussians are drawn, and how opaque they are."""
+    """The parameters that decide where Gaussians are drawn, and how opaque they are."""
 
     means: Tensor  # [N, 3]
     quats: Tensor  # [N, 4]
@@ -218,7 +217,7 @@ def _check_choice(name: str, value: str, choices: tuple[str, ...]) -> None:
 def _check_shapes(
     shapes: _Shapes, colors: Tensor, cameras: int, sh_degree: int | None, backgrounds: Tensor | None
 ) -> None:
-    """Check everything whose shape decides how the arguments are taken apart."""
+    """Check the shapes that the code below relies on."""
     count = len(shapes.means) if shapes.means.ndim else 0
     for (name, value), tail in zip(shapes._asdict().items(), ((3,), (4,), (3,), ()), strict=True):
         if value.shape != (count, *tail):
@@ -305,7 +304,7 @@ def _meta(
 ) -> tuple[dict[str, Any], Tensor]:
     """Make gsplat's `meta`, and the offsets [C, N, 2] that send gradients to its `means2d`.
 
-    The offsets are zeros: the rasterizer adds them to its own projected means, so that the gradient
+    The offsets are zeros. The rasterizer adds them to its own projected means, so that the gradient
     of an offset is the gradient of a projected mean.
     """
     drawn = (projections.radii > 0).all(dim=-1)  # [C, N]
@@ -344,7 +343,7 @@ class _AbsoluteGradient(torch.autograd.Function):
 
 
 class _Renderer(NamedTuple):
-    """What all cameras of a call share."""
+    """The arguments that all cameras of a call share."""
 
     shapes: _Shapes
     settings: RasterSettings
@@ -413,8 +412,8 @@ class _Renderer(NamedTuple):
         """Render features [N, D] of any sign and size, three channels a pass.
 
         The rasterizer draws max(C0 sh0 + 1/2, 0). So that nothing is cut off at 0, features are
-        scaled to -1..1, by a power of two, which is exact, and raised to at least 1/2: compositing
-        is linear, so what was added comes off again as so many times alpha.
+        scaled to -1..1 by a power of two, which is exact, and raised to at least 1/2. Compositing
+        is linear: what was added is subtracted again, times alpha.
         """
         layers = []
         for group in features.split(3, dim=1):

@@ -34,7 +34,7 @@ def prepare_target(image: Tensor) -> Target:
             f"image of {width} x {height} px is smaller than the SSIM window of {WINDOW} px"
         )
     image = image.detach().contiguous()
-    # In double, since a variance is a small difference of squares, and this is done once a view.
+    # In double, since a variance is a small difference of squares; once for each view.
     mean, variance = (moment.to(image.dtype) for moment in window_moments(image.double()))
     return Target(image, mean.contiguous(), variance.contiguous())
 
@@ -64,8 +64,7 @@ def photometric_loss(
         ssim: Weight of the structural dissimilarity.
         pixel_weight: [H, W]; None weighs all pixels 1.
         backend: `torch`, `native` or `auto` (`resolve_backend`). The native backend takes float32
-            on the CPU only, `pixel_weight` included, and computes the gradient along with the
-            value, by `image` only.
+            on the CPU only, and has a gradient with respect to `image` alone.
 
     Returns:
         A scalar.

@@ -1,12 +1,11 @@
-"""Normalisation of a scene's world, which learning rates and thresholds are written for.
+"""Normalisation of a scene's world, for which learning rates and thresholds are written.
 
-The method is that of gsplat's `examples/datasets/normalize.py`: a similarity from the cameras (up
-is -y, the point they look at is the origin, the median camera is at distance 1), then a rotation to
-the principal axes of the points (z the thinnest). Everything is numpy float64, as the output of SfM
-is.
+The method of gsplat's `examples/datasets/normalize.py`: a similarity from the cameras (up is -y,
+the point they look at is the origin, the median camera is at distance 1), then a rotation to the
+principal axes of the points (z is the thinnest). Everything is numpy float64, as SfM's output is.
 
-Medians are taken coordinate by coordinate, and the focus is found from the world's origin, as in
-gsplat: so the result is the same for a world of any scale, but not for any origin.
+As in gsplat, medians are taken coordinate by coordinate, and the focus is found from the world's
+origin. So the result does not depend on the scale of the world, but on its origin.
 """
 
 from __future__ import annotations
@@ -34,7 +33,7 @@ class NormalizedScene:
 
 
 def normalize_scene(viewmats: Array, points: Array) -> NormalizedScene:
-    """Normalise cameras and points together, so that images of both worlds are the same.
+    """Normalise cameras and points together: images of both worlds are the same.
 
     Args:
         viewmats: [C, 4, 4] world to camera, rigid.
@@ -74,9 +73,9 @@ def camera_positions(viewmats: Array) -> Array:
 def similarity_from_cameras(viewmats: Array) -> Array:
     """Return the similarity that turns the cameras' mean up axis to -y and moves their focus to 0.
 
-    The focus is the median of the points of the optical axes that are nearest to the (turned)
-    origin, as in gsplat's `center_method="focus"`. The median distance of the cameras from it
-    becomes 1.
+    The focus is the median, over the cameras, of the point of the optical axis nearest to the
+    origin after the turn, as in gsplat's `center_method="focus"`. The median distance of the
+    cameras from the focus becomes 1.
 
     Args:
         viewmats: [C, 4, 4] world to camera, rigid.
@@ -91,7 +90,7 @@ def similarity_from_cameras(viewmats: Array) -> Array:
     nearest = positions - (forward * positions).sum(axis=1, keepdims=True) * forward
     focus = np.median(nearest, axis=0)
     distance = np.median(np.linalg.norm(positions - focus, axis=1))
-    # A single camera whose axis passes through the origin's nearest point can sit on its focus.
+    # The distance of a single camera may be 0.
     scale = 1.0 / distance if distance > 0 else 1.0
     similarity = np.eye(4)
     similarity[:3, :3] = scale * turn
@@ -100,15 +99,7 @@ def similarity_from_cameras(viewmats: Array) -> Array:
 
 
 def rotation_between(start: Array, end: Array) -> Array:
-    """Return the shortest rotation from one unit vector to another.
-
-    Args:
-        start: [3] unit vector.
-        end: [3] unit vector.
-
-    Returns:
-        [3, 3] matrix R with R start = end.
-    """
+    """Return the shortest rotation R [3, 3] between unit vectors [3]: R start = end."""
     cosine = float(start @ end)
     if cosine <= -1.0 + 1e-12:
         # Opposite vectors: half a turn about any axis perpendicular to them.
@@ -123,14 +114,9 @@ def rotation_between(start: Array, end: Array) -> Array:
 
 
 def principal_axes(points: Array) -> Array:
-    """Return the rigid transform of points to their principal axes.
+    """Return the rigid transform [4, 4] of points [P, 3] to their principal axes.
 
-    Args:
-        points: [P, 3]
-
-    Returns:
-        [4, 4] transform that moves the points' median to 0, turns the axis of their largest
-        variance to x and that of their smallest to z.
+    It moves the median to 0 and turns the axis of the largest variance to x, of the smallest to z.
     """
     centre = np.median(points, axis=0)
     _, vectors = np.linalg.eigh(np.cov(points - centre, rowvar=False))
@@ -152,7 +138,7 @@ def transform_points(transform: Array, points: Array) -> Array:
 def transform_viewmats(transform: Array, viewmats: Array) -> Array:
     """Return the viewmats of the same cameras in a transformed world.
 
-    They stay rigid: the scale of the transform goes into the translations.
+    The viewmats stay rigid: the scale of the transform goes into the translations.
 
     Args:
         transform: [4, 4] similarity from the old world to the new one.

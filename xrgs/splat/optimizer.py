@@ -18,32 +18,28 @@ from xrgs.splat.settings import NOMINAL_STEPS, OptimizerSettings
 class SplatOptimizer:
     """One `torch.optim.Adam` with a named group for each parameter, at gsplat's learning rates.
 
-    The rates are those of `examples/simple_trainer.py`. That of `means` is multiplied by the
-    scene's scale and decays exponentially, from `settings.means * scene_scale` at the first step to
-    `settings.means_final` times that after the last. With `settings.means_decay_from` it stays at
-    its first value until that step, and the same decay happens in the steps that are left:
+    The rates are from gsplat's `examples/simple_trainer.py`. The rate of `means` after t steps is
 
         rate(t) = means * scene_scale * means_final^(max(0, t - t0) / (steps - t0))
 
-    after t steps, where t0 is `means_decay_from * steps / 30,000`. DashGaussian [chen2025dash]
-    lets the decay wait so while it trains at a reduced resolution. The state is torch's own:
-    `adam.state[gaussians.means]["exp_avg"]`.
+    where t0 is `means_decay_from * steps / 30,000`, 0 in gsplat. DashGaussian [chen2025dash] lets
+    the decay wait while it trains at a reduced resolution.
 
-    With `settings.shN_every` of k the harmonics above band 0 move at every k-th step alone, the
-    first one included, by the gradient of that step, and at k times their rate: Adam's steps do not
-    depend on the size of the gradient, so that a coefficient whose gradient keeps its sign goes as
-    far as with k = 1. Their moments are updated at those steps alone. Our choice: the factor k of
-    the rate, and that the gradients of the steps between are dropped, which are never computed.
+    With `shN_every` of k, the harmonics above band 0 move at every k-th step alone, the first one
+    included, by the gradient of that step, and at k times their rate. Their moments are updated at
+    these steps alone. Our choice: the gradients of the other steps are never computed, and the rate
+    has the factor k. Adam's steps do not depend on the size of the gradient, so that a coefficient
+    with a gradient of constant sign goes as far as with k = 1.
 
-    Gaussians are added and removed through `append` and `keep` alone, so that the parameters and
-    the state always fit. New Gaussians start with moments of zero and the step count of the others,
-    as in gsplat (`strategy/ops.py`).
+    Gaussians are added and removed through `append` and `keep` alone, so that parameters and state
+    always fit. New Gaussians start with moments of zero and the step count of the others, as in
+    gsplat (`strategy/ops.py`).
 
     Attributes:
-        adam: The optimizer that holds groups and state.
+        adam: Holds groups and state: `adam.state[gaussians.means]["exp_avg"]`.
         backend: `torch` or `native`: the backend that computes a step.
-        gaussians: The Gaussians that are optimized.
-        steps_done: Number of training steps so far, those that `skip_step` left out included.
+        gaussians: The optimized Gaussians.
+        steps_done: Number of training steps so far, with the steps that `skip_step` counted.
     """
 
     def __init__(
@@ -58,7 +54,7 @@ class SplatOptimizer:
         """Start with no state.
 
         Args:
-            gaussians: The Gaussians to optimize; their tensors are replaced as Gaussians come and
+            gaussians: The Gaussians to optimize, whose tensors are replaced as Gaussians come and
                 go.
             settings: Learning rates and Adam's constants.
             scene_scale: Extent of the scene in world units, above 0.
@@ -69,7 +65,7 @@ class SplatOptimizer:
             ValueError: `scene_scale` or `steps` is not above 0, or a setting is out of its range.
         """
         if not (math.isfinite(scene_scale) and scene_scale > 0):
-            raise ValueError(f"scene_scale must be above 0, got {scene_scale}")
+            raise ValueError(f"scene_scale must be finite and above 0, got {scene_scale}")
         if steps < 1:
             raise ValueError(f"steps must be at least 1, got {steps}")
         if not 0 <= settings.means_decay_from < NOMINAL_STEPS:
@@ -100,10 +96,10 @@ class SplatOptimizer:
     def step(self, camera: Camera | None = None, *, sh_degree: int = 0) -> None:
         """Move every parameter that has a gradient, then decay the rate of `means`.
 
-        With a camera shN moves, too, at every `shN_every`-th step, by the gradient that sh0's
-        implies. Seen from one place, a
-        Gaussian has one colour c, which is linear in its harmonics: d c / d shN[k] = basis[k](dir)
-        and d c / d sh0 = C0. So the gradient of shN[k] is that of sh0 times basis[k](dir) / C0.
+        With a camera, shN moves too, at every `shN_every`-th step, by the gradient that sh0's
+        implies. Seen from one place, a Gaussian has one colour c, which is linear in its harmonics:
+        d c / d shN[k] = basis[k](dir) and d c / d sh0 = C0. So the gradient of shN[k] is the
+        gradient of sh0 times basis[k](dir) / C0.
 
         Args:
             camera: The view that the gradients come from, as the Gaussians were rendered in it.
@@ -120,10 +116,9 @@ class SplatOptimizer:
         return self.steps_done % self.shN_every == 0
 
     def skip_step(self) -> None:
-        """Count a training step and decay the rate of `means`, and move nothing.
+        """Count a training step and decay the rate of `means`, but move nothing.
 
-        The rate is that of the training step, however many steps were skipped before it. Adam
-        itself does not notice: its moments and the number of its steps stay as they are.
+        Adam's moments and the number of its steps stay as they are.
         """
         self.steps_done += 1
         self._decay_means_rate()
@@ -153,15 +148,11 @@ class SplatOptimizer:
         return {"gaussians": values, "adam": adam, "steps_done": self.steps_done}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Set Gaussians, moments and learning rates to those of `state_dict`; drop gradients.
-
-        Args:
-            state: A result of `state_dict`, perhaps of another number of Gaussians.
+        """Restore Gaussians, of any number, moments and learning rates; drop gradients.
 
         Raises:
             KeyError: A parameter or moment is missing.
-            ValueError: A parameter or moment has another shape or type than the one here; nothing
-                is changed then.
+            ValueError: A parameter or moment has another shape or type; nothing is changed.
         """
         values, adam = state["gaussians"], state["adam"]
         count = len(values["means"])
@@ -170,9 +161,12 @@ class SplatOptimizer:
             moments = [adam[name][key] for key in ("exp_avg", "exp_avg_sq") if adam[name]]
             for value in (values[name], *moments):
                 if value.shape != (count, *current.shape[1:]) or value.dtype != current.dtype:
-                    raise ValueError(f"{name}: {value.dtype} {list(value.shape)} does not fit")
+                    raise ValueError(
+                        f"{name} must be {current.dtype} {[count, *current.shape[1:]]}, got"
+                        f" {value.dtype} {list(value.shape)}"
+                    )
             if adam[name] and adam[name]["step"].shape != ():
-                raise ValueError(f"{name}: the number of its steps is not a scalar")
+                raise ValueError(f"{name}: Adam's step must be a scalar")
         for name in PARAMETERS:
             self._replace(name, values[name], torch.zeros_like)
             self.adam.state.pop(self.gaussians[name], None)
@@ -182,10 +176,10 @@ class SplatOptimizer:
         self._decay_means_rate()
 
     def keep(self, index: Tensor) -> None:
-        """Remove all Gaussians but these, with their moments.
+        """Remove all other Gaussians, with their moments.
 
         Args:
-            index: [M] int64 indices in the order that the Gaussians shall have, or [N] bool.
+            index: The Gaussians to keep: [N] bool, or [M] int64 indices in their new order.
         """
         for name in PARAMETERS:
             values = self.gaussians[name].detach()[index]
@@ -207,12 +201,7 @@ class SplatOptimizer:
             self._replace(name, longer, lengthen)
 
     def reset(self, name: str, value: Tensor) -> None:
-        """Give one parameter new values and moments of zero.
-
-        Args:
-            name: One of `PARAMETERS`.
-            value: [N, ...] its new values.
-        """
+        """Give the parameter `name` new values [N, ...] and moments of zero."""
         self._replace(name, value, torch.zeros_like)
 
     def _replace(self, name: str, value: Tensor, moment: Callable[[Tensor], Tensor]) -> None:

@@ -11,9 +11,9 @@ from xrgs.splat.rounding import rounded_sqrt
 def rotation_matrices(quats: Tensor) -> Tensor:
     """Convert quaternions of any length to rotation matrices.
 
-    gsplat's `_quat_to_rotmat` (`cuda/_torch_impl.py`), with two cases settled that it leaves open:
-    a zero quaternion is the identity, with a gradient of zero, and a quaternion whose squares
-    overflow or underflow is normalised all the same.
+    gsplat's `_quat_to_rotmat` (`cuda/_torch_impl.py`), which leaves two cases open. Here a zero
+    quaternion is the identity, with a gradient of zero, and a quaternion is also normalised if its
+    squares overflow or underflow.
 
     Args:
         quats: [M, 4] w, x, y, z.
@@ -21,8 +21,8 @@ def rotation_matrices(quats: Tensor) -> Tensor:
     Returns:
         [M, 3, 3], differentiable.
     """
-    # Divided by its largest component first, a tiny or huge quaternion has a finite norm. The
-    # rotation does not depend on the length, so this factor needs no gradient.
+    # After a division by the largest component the norm is finite. The rotation does not depend on
+    # the length, so this factor needs no gradient.
     largest = quats.detach().abs().amax(dim=-1, keepdim=True)  # [M, 1]
     zero = largest < torch.finfo(quats.dtype).tiny ** 0.5
     identity = quats.new_tensor([1.0, 0.0, 0.0, 0.0])

@@ -1,22 +1,43 @@
-"""The simple way to render: Gaussians and a camera in, an image out."""
+"""Rendering: Gaussians and a camera in, an image out, on either backend."""
 
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING
+from dataclasses import dataclass
 
 import torch
+from torch import Tensor
 
-from xrgs.splat.backend import implementation
-from xrgs.splat.rasterize import rasterize_parameters
-from xrgs.splat.render_result import Render
+from xrgs.splat.backend import implementation, resolve_backend
+from xrgs.splat.cameras import Camera
+from xrgs.splat.gaussians import ActivatedGaussians, Gaussians
 from xrgs.splat.settings import RasterSettings
+from xrgs.splat.sh import check_sh_degree
 
-if TYPE_CHECKING:
-    from torch import Tensor
+#: Shape of one Gaussian's value; the shape of shN depends on the number of bands.
+_SHAPES: dict[str, tuple[int, ...]] = {
+    "means": (3,),
+    "quats": (4,),
+    "scales": (3,),
+    "opacities": (),
+    "sh0": (1, 3),
+    "means2d_offset": (2,),
+}
 
-    from xrgs.splat.cameras import Camera
-    from xrgs.splat.gaussians import Gaussians
+
+@dataclass(frozen=True)
+class Render:
+    """A rendered image, and the work and memory that it took."""
+
+    image: Tensor  # [H, W, 3], 0 and up: not clamped at 1
+    alpha: Tensor  # [H, W], 1 - transmittance
+    visible: Tensor  # [N] bool
+    evaluations: int
+    """Number of (pixel, Gaussian) pairs whose alpha was computed."""
+    buffer_bytes: int
+    """Peak bytes that the renderer allocates beside the parameters and their gradients."""
+    tile_evaluations: int
+    """`evaluations` if every pixel of a tile met every Gaussian in the tile's list."""
 
 
 def rasterize(
@@ -29,8 +50,8 @@ def rasterize(
 ) -> Render:
     """Render Gaussians into one view.
 
-    The render is differentiable in all six parameters of the Gaussians. Scales and opacities are
-    activated here: `Gaussians` holds natural logarithms of scales and logits of opacities.
+    The render is differentiable in all six parameters of the Gaussians. `Gaussians` holds natural
+    logarithms of scales and logits of opacities, which are activated here.
 
     Args:
         gaussians: The N Gaussians, in raw parameters.
@@ -74,6 +95,66 @@ def rasterize(
     )
 
 
+def rasterize_parameters(
+    means: Tensor,
+    quats: Tensor,
+    scales: Tensor,
+    opacities: Tensor,
+    sh0: Tensor,
+    shN: Tensor,
+    camera: Camera,
+    settings: RasterSettings,
+    *,
+    sh_degree: int,
+    means2d_offset: Tensor | None = None,
+    backend: str = "torch",
+) -> Render:
+    """Render Gaussians into one view (3D Gaussian Splatting, with gsplat's constants).
+
+    A Gaussian is visible if it is in front of `settings.near`, its opacity is at least
+    `settings.alpha_min`, and the bounding box of the ellipse within which its alpha reaches
+    `settings.alpha_min` overlaps the image.
+
+    Args:
+        means: [N, 3] world units.
+        quats: [N, 4] wxyz, any length; zero is no rotation.
+        scales: [N, 3] world units, at least 0.
+        opacities: [N] in 0..1.
+        sh0: [N, 1, 3] coefficients of band 0 of the spherical harmonics.
+        shN: [N, K - 1, 3] coefficients of the higher bands.
+        camera: The view.
+        settings: How Gaussians become pixels.
+        sh_degree: Highest band that is on, at most the bands of shN.
+        means2d_offset: [N, 2] px, added to the projected means: its gradient is the image-plane
+            gradient that densification reads (with `settings.absgrad`, of absolute values).
+        backend: `torch`, `native` or `auto` (`resolve_backend`).
+
+    Returns:
+        The render, differentiable in every float argument. On the native backend it is
+        differentiable once, and its backward pass raises ValueError where a gradient is not finite
+        (`native.rasterizer.render`).
+
+    Raises:
+        ValueError: A parameter has the wrong shape or type, or values that are not finite or out
+            of range; `sh_degree` is not 0 to 3, or above the bands of shN; or shN has more than 15
+            coefficients. The message names the parameter.
+        MemoryError: The tile lists of the view do not fit in memory.
+    """
+    gaussians = ActivatedGaussians(means, quats, scales, opacities, sh0, shN)
+    named = gaussians._asdict()
+    if means2d_offset is not None:
+        named["means2d_offset"] = means2d_offset
+    _check_shapes(named)
+    check_sh_degree(sh_degree, shN)
+    backend = resolve_backend(backend)
+    if backend == "torch":  # the native backend checks values as it reads them
+        _check_values(named)
+    render: Render = implementation("rasterizer", backend).render(
+        gaussians, camera, settings, sh_degree, means2d_offset
+    )
+    return render
+
+
 def backend_for(means: Tensor, backend: str) -> str:
     """Choose the backend that can render parameters of this floating type.
 
@@ -90,3 +171,30 @@ def backend_for(means: Tensor, backend: str) -> str:
     if means.device.type != "cpu":
         raise ValueError(f"means is on {means.device}: xrgs renders on the CPU, use means.cpu()")
     return "torch" if backend == "auto" and means.dtype != torch.float32 else backend
+
+
+def _check_shapes(values: dict[str, Tensor]) -> None:
+    means = values["means"]
+    count = means.shape[0] if means.ndim else 0
+    shapes = _SHAPES | {"shN": (*values["shN"].shape[1:2], 3)}
+    for name, value in values.items():
+        _check_shape_and_type(name, value, (count, *shapes[name]), means.dtype)
+
+
+def _check_shape_and_type(
+    name: str, value: Tensor, shape: tuple[int, ...], dtype: torch.dtype
+) -> None:
+    if value.shape != shape:
+        raise ValueError(f"{name} must be {list(shape)}, got {list(value.shape)}")
+    if not value.is_floating_point() or value.dtype != dtype:
+        raise ValueError(f"{name} must be of the floating type of means, got {value.dtype}")
+
+
+def _check_values(values: dict[str, Tensor]) -> None:
+    for name, value in values.items():
+        if not torch.isfinite(value).all():
+            raise ValueError(f"{name} has values that are not finite")
+    if (values["scales"] < 0).any():
+        raise ValueError("scales has values below 0")
+    if ((values["opacities"] < 0) | (values["opacities"] > 1)).any():
+        raise ValueError("opacities has values outside 0..1")

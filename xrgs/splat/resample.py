@@ -10,9 +10,9 @@ from xrgs.splat.backend import implementation
 def resize(image: Tensor, height: int, width: int, *, backend: str = "torch") -> Tensor:
     """Resample an image to another size with an antialiased bicubic filter, unclamped.
 
-    The result is that of torch's `interpolate(mode="bicubic", antialias=True)` to rounding. It is
-    computed as a product with one matrix an axis: forward and backward take a quarter of the time
-    of `interpolate`, and a tenth of that on the native backend.
+    The result is torch's `interpolate(mode="bicubic", antialias=True)` to rounding, computed as a
+    product with one matrix for each axis: forward and backward take a quarter of the time of
+    `interpolate`, and a fortieth on the native backend.
 
     Args:
         image: [H, W, 3], of any strides.

@@ -1,8 +1,8 @@
 """The settings of the splatting model, with gsplat 1.5.3's defaults.
 
-Those are of `examples/simple_trainer.py` and `strategy/default.py`. The settings are plain
-dataclasses without torch, so that a plan can be made without importing it. Step counts are those of
-a 30,000-step run; `scaled` shrinks them with the run, as the trainer's `adjust_steps` does.
+The defaults are from `examples/simple_trainer.py` and `strategy/default.py`. This module does not
+import torch, so that planning is quick. Step counts are for a run of 30,000 steps;
+`DensifySettings.scaled` shrinks them with the run, as the trainer's `adjust_steps` does.
 """
 
 from __future__ import annotations
@@ -44,29 +44,29 @@ class RasterSettings:
     background: tuple[float, float, float] = (0.0, 0.0, 0.0)
     """Colour behind the last Gaussian."""
     absgrad: bool = off_by_default(False)
-    """Make the gradient of `means2d_offset`, for each axis, the sum of the absolute values of the
+    """Make the gradient of `means2d_offset` the sum, for each axis, of the absolute values of the
     pixels' gradients, so that pixels which pull a Gaussian apart do not cancel (AbsGS
     [ye2024absgs]; gsplat's `absgrad`)."""
 
 
 @dataclass(frozen=True)
 class CullingOptions:
-    """Which work without effect the native rasterizer leaves out.
+    """Which work without effect the native rasterizer skips; off in measurements alone.
 
-    A Gaussian's ellipse is where its alpha is at least `alpha_min`. The image is the same with any
-    of the kinds off, to rounding at the cut-offs; they can be switched off to be measured.
+    A Gaussian's ellipse is where its alpha is at least `alpha_min`. The image does not depend on
+    these options, to rounding at the cut-offs.
     """
 
     out_of_view: bool = True
-    """Leave out Gaussians whose ellipse's bounding box does not overlap the image."""
+    """Skip Gaussians if the bounding box of the ellipse does not overlap the image."""
     sub_threshold: bool = True
-    """Leave out Gaussians whose opacity is below `alpha_min`."""
+    """Skip Gaussians with an opacity below `alpha_min`."""
     tiles: bool = True
-    """Leave out 16x16 px tiles that the bounding box overlaps, but not the ellipse."""
+    """Skip 16x16 px tiles that the bounding box overlaps, but the ellipse does not."""
     blocks: bool = True
-    """Leave out 4x4 px blocks of a tile that the ellipse does not overlap."""
+    """Skip 4x4 px blocks of a tile that the ellipse does not overlap."""
     saturated: bool = True
-    """Leave out what lies behind the last Gaussian that any pixel of a block composites."""
+    """Skip Gaussians behind the last one that any pixel of a block composites."""
 
 
 @dataclass
@@ -122,12 +122,12 @@ class DensifySettings:
     reset_opacity: float = 2.0
     """Multiplied by `prune_opacity`: a reset caps opacities at this."""
     split: str = "random"
-    """How Gaussians grow. `random`: as in gsplat, small ones are duplicated, and large ones split
-    into two with means drawn from the old one. `long_axis`: all of them are split into two side by
-    side along the longest axis (`xrgs.splat.growth.split_along_longest_axis`)."""
+    """How Gaussians grow. `random`: as in gsplat, small Gaussians are duplicated, and large ones
+    split into two with means drawn from the Gaussian. `long_axis`: all are split into two side by
+    side along the longest axis (`xrgs.splat.strategy.ops.split_along_longest_axis`)."""
     budget: float = off_by_default(0.0)
-    """The most Gaussians that growing may lead to, for each pixel of the training view that has the
-    most of them (`xrgs.splat.growth.Budget`); 0 sets no limit. The unit is our choice."""
+    """The largest number of Gaussians to which growth may lead, for each pixel of the largest
+    training view (`xrgs.splat.strategy.ops.Budget`); 0 sets no limit. The unit is our choice."""
 
     @property
     def last_refinement(self) -> int:
@@ -135,13 +135,9 @@ class DensifySettings:
         return (self.stop - 1) // self.every * self.every
 
     def scaled(self, steps: int) -> DensifySettings:
-        """Return the same schedule for a run of another length.
+        """Return the schedule for a run of `steps` steps.
 
-        Args:
-            steps: Number of steps of the run; the schedule here is for `NOMINAL_STEPS`.
-
-        Returns:
-            Settings with step counts in proportion, rounded down; periods of at least 1.
+        Step counts shrink in proportion and are rounded down; periods are at least 1.
         """
         factor = steps / NOMINAL_STEPS
         return replace(

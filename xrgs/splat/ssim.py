@@ -1,9 +1,6 @@
-"""The Gaussian window of the SSIM, and a photograph's statistics under it.
+"""The Gaussian window of the SSIM [wang2004, section III-C], and statistics under it.
 
-Z. Wang, A. Bovik, H. Sheikh, E. Simoncelli, "Image Quality Assessment: From Error Visibility to
-Structural Similarity", IEEE Transactions on Image Processing 13(4), 2004; section III-B has the
-index, III-C its window and constants. This module is the home of their values for the training
-loss; the compiled loss repeats them in its kernels.
+The constants here are the training loss's; the compiled loss repeats them in its kernels.
 """
 
 from __future__ import annotations
@@ -27,7 +24,7 @@ C2 = 0.03**2
 
 @dataclass(frozen=True)
 class Target:
-    """A photograph and its half of the SSIM, which never change and are computed once a view."""
+    """A photograph and its statistics for the SSIM, which are computed once for each view."""
 
     image: Tensor  # [H, W, 3]
     mean: Tensor  # [H - 10, W - 10, 3] under the window
@@ -46,8 +43,7 @@ def window_mean(image: Tensor) -> Tensor:
     channels = image.shape[-1]
     kernel = image.new_tensor(_weights())  # [11]
     # `image[None].permute`, not `image.permute()[None]`: only then is it channels-last to oneDNN,
-    # whose depth-wise kernel is five times as fast as one that gathers planes (2 threads, 504 x
-    # 378).
+    # and the depth-wise kernel five times as fast (2 threads, 504 x 378).
     planes: Tensor = image[None].permute(0, 3, 1, 2)  # [1, C, H, W]
     planes = conv2d(planes, kernel.view(1, 1, 1, -1).expand(channels, 1, 1, -1), groups=channels)
     planes = conv2d(planes, kernel.view(1, 1, -1, 1).expand(channels, 1, -1, 1), groups=channels)
@@ -58,15 +54,14 @@ def window_mean(image: Tensor) -> Tensor:
 def window_moments(image: Tensor) -> tuple[Tensor, Tensor]:
     """Return the mean and the variance of the window around each pixel that it fits around.
 
-    They are summed in one order, whatever the processor: a convolution's order depends on it, and a
-    variance, as a difference of squares, shows that in many more digits than the last one.
-
     Args:
         image: [H, W, C], at least `WINDOW` px along each axis.
 
     Returns:
         Mean and variance, [H - 10, W - 10, C] each. A variance that rounding makes negative is 0.
     """
+    # Summed in a fixed order. A convolution's order depends on the processor, and a variance, as a
+    # difference of squares, shows that in many more digits than the last one.
     moments = torch.cat([image, image * image], dim=-1)
     for axis in (0, 1):
         moments = _weighted_sum(moments, axis)

@@ -11,9 +11,9 @@ from typing import TYPE_CHECKING, Any
 from xrgs.errors import StoreError, XrgsError
 from xrgs.experiment.identity import changed_code
 from xrgs.experiment.store import Store, full_id
-from xrgs.report.render import TextTable, to_text
 from xrgs.runtime import lease
 from xrgs.runtime.progress import log_line
+from xrgs.runtime.text_table import TextTable, to_text
 from xrgs.safeio.files import file_bytes
 from xrgs.safeio.sanitize import counted
 from xrgs.splat.backend import arithmetic

@@ -31,7 +31,7 @@ def provide(*, fetch: bool, dry_run: bool) -> None:
     )
     if dry_run:
         return
-    from xrgs.evaluation.lpips.download import fetch_weights  # imports aiohttp
+    from xrgs.evaluation.lpips.download import fetch_weights  # loads ssl: not for planning
 
     try:
         log_line(fetch_weights(patient=False))

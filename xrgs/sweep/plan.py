@@ -275,8 +275,8 @@ def expected_use(plan: Sequence[PlannedCell], past: int) -> str:
     if not memory or not disk:
         return ""
     return (
-        f"estimates from {counted(past, 'finished cell')} of this store; a cell takes up to {_size(max(memory))} of memory, all of them"
-        f" {_size(sum(disk))} of disk"
+        f"estimates from {counted(past, 'finished cell')} of this store; a cell takes up to"
+        f" {_size(max(memory))} of memory, all of them {_size(sum(disk))} of disk"
     )
 
 

@@ -102,21 +102,21 @@ class Checkpoint:
         return steps
 
     def register(self, **objects: Stateful) -> None:
-        """Add objects whose state is to be written; they replace those of the same name.
+        """Add objects whose state is written; they replace objects of the same names.
 
-        The first object registered under a name takes over the state that `load` has read for it.
+        The objects take over the states that `load` has read, in their order.
 
         Args:
-            objects: Each by the name of its state in the file. They are restored in their order.
+            objects: Each by the name of its state in the file.
 
         Raises:
-            CheckpointError: A state does not fit its object. The objects may be half restored, and
-                must not be used.
+            CheckpointError: A state is missing or does not fit its object. The objects may be half
+                restored, and must not be used.
         """
         self._objects |= objects
+        if not self._loaded:
+            return
         for name, value in objects.items():
-            if name not in self._loaded:
-                continue
             try:
                 value.load_state_dict(self._loaded.pop(name))
             except (KeyError, TypeError, ValueError, AttributeError, RuntimeError) as error:

@@ -1,10 +1,10 @@
 """Trains the baseline to as many Gaussians as another cell has: a control for claims of efficiency.
 
-A method that ends with fewer Gaussians has to be better than the baseline with as few. Only one
-thing is changed in the baseline: `splat.densify.grow_grad2d`, the gradient above which
-densification grows a Gaussian. It is searched for: training runs with one threshold, ends as soon
-as densification has stopped at too many or too few Gaussians, and starts again with another
-threshold. The paper has no such control.
+A method that ends with fewer Gaussians has to be better than the baseline with as few. The control
+changes one value of the baseline: `splat.densify.grow_grad2d`, the gradient above which
+densification grows a Gaussian. Training runs with one threshold, ends as soon as densification has
+stopped at too many or too few Gaussians, and starts again with another threshold. The paper has no
+such control.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from xrgs.training.checkpoint import Checkpoint
 from xrgs.training.components.base import Component, Step, check_not_negative
 from xrgs.training.loop import train
 
-if TYPE_CHECKING:  # xrgs.config imports Hydra, which training does not need
+if TYPE_CHECKING:
     from xrgs.capture.dataset import Dataset
     from xrgs.config import Conf
     from xrgs.splat.gaussians import Gaussians
@@ -44,16 +44,16 @@ def train_cell(
     checkpoint: Checkpoint | None = None,
     evaluate: Evaluate | None = None,
 ) -> TrainingResult:
-    """Train what a cell's config asks for: count-matched where that is switched on, else once.
+    """Train a config: several times if count matching is on, else once.
 
     Args:
         data: The views to train on and the points to start from.
-        conf: The config of the cell.
+        conf: The config.
         checkpoint: Where the state of the run is written; None writes nothing.
         evaluate: As for `train`.
 
     Returns:
-        The trained Gaussians and the record of the training that gave them.
+        The trained Gaussians and the record of their training.
 
     Raises:
         CheckpointError: The state that was read does not fit this config and data.
@@ -74,22 +74,17 @@ def train_count_matched(
     checkpoint: Checkpoint | None = None,
     evaluate: Evaluate | None = None,
 ) -> TrainingResult:
-    """Train again and again until the number of Gaussians is the one that is asked for.
+    """Train until the number of Gaussians is `components.count_matched.gaussians`, above 0.
 
-    Args:
-        data: The views to train on and the points to start from.
-        conf: The config; `components.count_matched` has the number of Gaussians, above 0, and the
-            tolerance, and `splat.densify.grow_grad2d` is the first threshold.
-        checkpoint: Where the state of the search and of the run in progress is written; None
-            writes nothing.
-        evaluate: As for `train`.
+    `splat.densify.grow_grad2d` is the first threshold. The arguments are as for `train`;
+    the checkpoint has the state of the search too.
 
     Returns:
         The result of the run that matched; its `grow_grad2d` is the threshold that was found.
 
     Raises:
         CheckpointError: The state that was read does not fit this config and data.
-        XrgsError: Ten thresholds gave other numbers of Gaussians, or as `train` raises it.
+        XrgsError: Ten thresholds gave other numbers of Gaussians, or as for `train`.
     """
     checkpoint = checkpoint or Checkpoint()
     count_matched, densify = conf.components.count_matched, conf.splat.densify
@@ -130,11 +125,7 @@ class CountCheck(Component):
         self.target, self.tolerance, self.stop = target, tolerance, stop
 
     def after_backward(self, gaussians: Gaussians, step: Step) -> None:
-        """Check the number of Gaussians from the step on at which densification has stopped.
-
-        Args:
-            gaussians: The model, whose number of Gaussians is checked.
-            step: The step of the run.
+        """Check the number of Gaussians once densification has stopped.
 
         Raises:
             CountMismatchError: The number is outside the tolerance.
@@ -144,9 +135,6 @@ class CountCheck(Component):
 
     def after_training(self, gaussians: Gaussians) -> None:
         """Check the number of Gaussians.
-
-        Args:
-            gaussians: The model, whose number of Gaussians is checked.
 
         Raises:
             CountMismatchError: The number is outside the tolerance.
@@ -158,11 +146,11 @@ class CountCheck(Component):
 class ThresholdSearch:
     """Searches the threshold of densification that gives a number of Gaussians.
 
-    The method is a secant of log(count) over log(threshold), kept within the bracket of thresholds
-    that gave too many and too few.
+    The method is a secant of log(count) over log(threshold), within the bracket of the thresholds
+    that gave too many Gaussians and too few.
 
     Attributes:
-        tried: The (threshold, count) of each attempt that did not match, in their order.
+        tried: The (threshold, count) of each attempt that did not match, in order.
     """
 
     def __init__(self, start: float, target: int) -> None:
@@ -179,11 +167,11 @@ class ThresholdSearch:
         """Try thresholds until one matches.
 
         Args:
-            train_at: Trains with a threshold, and raises `CountMismatchError` where the number of
+            train_at: Trains with a threshold, and raises `CountMismatchError` if the number of
                 Gaussians is outside the tolerance.
 
         Returns:
-            What `train_at` returned.
+            The result of `train_at`.
 
         Raises:
             XrgsError: Ten thresholds gave other numbers; the message lists them.
@@ -208,20 +196,11 @@ class ThresholdSearch:
         )
 
     def state_dict(self) -> dict[str, Any]:
-        """Return the attempts so far; the threshold in use follows from them."""
+        """Return the attempts so far, from which the present threshold follows."""
         return {"tried": self.tried}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Continue from a state that `state_dict` returned.
-
-        Args:
-            state: From a search with the same start and target.
-
-        Raises:
-            KeyError: The attempts are missing.
-            TypeError: An attempt is of another type.
-            ValueError: An attempt is not a threshold and a count.
-        """
+        """Continue a search with the same start and target."""
         self.tried = [(float(threshold), int(count)) for threshold, count in state["tried"]]
 
 
@@ -229,13 +208,13 @@ def next_threshold(tried: Sequence[tuple[float, int]], target: int) -> float:
     """Choose the threshold to try next.
 
     Args:
-        tried: (threshold, count) of each attempt so far, in their order; at least one.
+        tried: (threshold, count) of each attempt so far, in order; at least one.
         target: The number of Gaussians to reach.
 
     Returns:
-        The threshold where count ~ threshold^-p through the last attempt reaches the target, with p
-        measured by the last two; the bracket's geometric mean where that lies outside the bracket;
-        and a step of 10% beyond the former where there is no bracket to stay within.
+        The threshold at which count ~ threshold^-p through the last attempt reaches the target,
+        with p from the last two attempts. If it lies outside the bracket, the geometric mean of the
+        bracket; without a bracket, a step of 10% beyond it.
     """
     low = max((threshold for threshold, count in tried if count > target), default=0.0)
     high = min((threshold for threshold, count in tried if count <= target), default=math.inf)

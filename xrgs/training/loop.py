@@ -1,8 +1,4 @@
-"""The training loop: gsplat's default training, with the hooks of the XR-GS components.
-
-`train` trains one configuration. What trains more than once to answer a question, as the control of
-`xrgs.training.count_matching` does, calls it and is not known here.
-"""
+"""The training loop: gsplat's default training, with the hooks of the XR-GS components."""
 
 from __future__ import annotations
 
@@ -13,12 +9,12 @@ import torch
 
 from xrgs.runtime.progress import progress
 from xrgs.splat.backend import resolve_backend
-from xrgs.splat.densify import Densifier
 from xrgs.splat.gaussians import PARAMETERS, Gaussians, from_points
 from xrgs.splat.loss import photometric_loss, prepare_target
 from xrgs.splat.optimizer import SplatOptimizer
-from xrgs.splat.refinement import Refinement
 from xrgs.splat.settings import NOMINAL_STEPS
+from xrgs.splat.strategy.default import DefaultStrategy
+from xrgs.splat.strategy.refinement import Refinement
 from xrgs.training.checkpoint import Checkpoint
 from xrgs.training.components import Components
 from xrgs.training.components import build as build_components
@@ -37,11 +33,15 @@ if TYPE_CHECKING:
     from xrgs.config import Conf, SplatConf
     from xrgs.splat.cameras import Camera
     from xrgs.splat.loss import Target
-    from xrgs.splat.rasterize import Render
+    from xrgs.splat.rendering import Render
+    from xrgs.splat.strategy.base import Strategy
     from xrgs.training.components import Component, Step, TrainingView
 
     #: Scores of Gaussians by name; None where one is not available.
     Evaluate = Callable[[Gaussians], Mapping[str, float | None]]
+
+#: The strategies of densification, by the names of gsplat's.
+STRATEGIES: Mapping[str, type[Strategy]] = {"default": DefaultStrategy}
 
 
 def train(
@@ -57,11 +57,11 @@ def train(
         data: The views to train on and the points to start from.
         conf: The config. `components.count_matched`, which asks for several trainings, is not
             read: `xrgs.training.count_matching.train_cell` does that.
-        checkpoint: Where the state of the run is written. A state that its `load` has read is
-            continued from. None writes nothing.
-        extra_components: Components that run behind those that the config switches on.
-        evaluate: Scores Gaussians as they would be saved, by names of its own; it is called after
-            every `train.evaluate_every` steps but the last, and its time is no training time.
+        checkpoint: Where the state of the run is written. Training continues from a state that
+            `Checkpoint.load` has read. None writes nothing.
+        extra_components: Components that run after the ones that the config switches on.
+        evaluate: Scores the Gaussians after every `train.evaluate_every` steps but the last, as
+            they would be saved. Its time does not count as training time.
 
     Returns:
         The trained Gaussians and the record of the training.
@@ -75,11 +75,11 @@ def train(
     run = _set_up(data, conf, extra_components)
     run.components.before_training(run.renderer)
     run.components.on_gaussians_changed(run.optimizer.gaussians)
-    # Everything that a step changes. The Gaussians belong to the optimizer's state, which must be
-    # restored first: the others' states have to fit the number of Gaussians.
+    # Everything that a step changes. The optimizer comes first: it restores the Gaussians, whose
+    # number the other states must fit.
     checkpoint.register(
         optimizer=run.optimizer,
-        densifier=run.densifier,
+        strategy=run.strategy,
         components=run.components,
         sampler=run.sampler,
         recorder=run.recorder,
@@ -93,7 +93,7 @@ def train(
 
 
 class _Views:
-    """The training views by name, as components want them at present, and what the loss needs."""
+    """The training views as components want them at present, and their targets for the loss."""
 
     def __init__(self, views: Iterable[TrainingView]) -> None:
         self.own: Mapping[str, TrainingView] = {view.name: view for view in views}
@@ -101,7 +101,7 @@ class _Views:
         self.targets = {name: prepare_target(view.image) for name, view in self.own.items()}
 
     def change_to(self, views: Mapping[str, TrainingView]) -> None:
-        """Use other views; what is prepared of photographs that stay the same is kept."""
+        """Use other views, and prepare the targets of the photographs that changed."""
         if views is self.present:
             return
         self.targets = {
@@ -113,7 +113,7 @@ class _Views:
         self.present = views
 
     def target(self, step: Step) -> Target:
-        """Return what the loss needs of the photograph of the step's view."""
+        """Return the target of the step's view."""
         return self.targets[step.view.name]
 
 
@@ -129,19 +129,20 @@ class _Run:
     views: _Views
     optimizer: SplatOptimizer
     components: Components
-    densifier: Densifier
+    strategy: Strategy
     sampler: EpochSampler
     recorder: TrainingRecorder
     renderer: StepRenderer
     memory: TrainingMemory
 
     def evaluates_after(self, step: int) -> bool:
-        """Whether the Gaussians are evaluated after a step; after the last, others do it."""
+        """Whether the Gaussians are evaluated after a step."""
+        # Not after the last: the caller scores the trained Gaussians.
         done, every = step + 1, self.evaluate_every
         return bool(every) and done % every == 0 and done < self.steps
 
     def score(self, evaluate: Evaluate) -> Callable[[], Mapping[str, float | None]]:
-        """Return what evaluates the Gaussians as they would be saved now."""
+        """Return a closure that bakes a copy of the Gaussians and scores it."""
         gaussians = self.optimizer.gaussians
 
         def scores() -> Mapping[str, float | None]:
@@ -154,7 +155,7 @@ class _Run:
 
 @dataclass(frozen=True)
 class _Forward:
-    """What the forward pass of a step gave."""
+    """The result of a step's forward pass."""
 
     camera: Camera
     """The camera of the render."""
@@ -184,7 +185,7 @@ def _run_steps(run: _Run, checkpoint: Checkpoint, evaluate: Evaluate | None) -> 
             recorder.record_skipped("backward")
         recorder.record_step(step, forward.loss, forward.render, gaussians, forward.sh_degree)
         recorder.record_refinement(_densify(run, step, forward))
-        # Evaluate and write a checkpoint where one is due, which is no training time.
+        # Evaluation and checkpoints do not count as training time.
         if evaluate is not None and run.evaluates_after(step.number):
             recorder.record_scores(step.number + 1, len(gaussians), run.score(evaluate))
         recorder.exclude_time(checkpoint.save_if_due(step.number))
@@ -222,18 +223,18 @@ def _update(run: _Run, step: Step, forward: _Forward) -> None:
 
 def _densify(run: _Run, step: Step, forward: _Forward) -> Refinement:
     """Densify, prune and reset; return the counts of what was done."""
-    # There is no gradient without a backward pass, nor where the render shows no Gaussian.
+    # None without a backward pass, or if the render shows no Gaussian.
     grad2d, camera = forward.means2d_offset.grad, forward.camera
     if grad2d is not None:
         grad2d = run.components.densification_grad2d(grad2d, step)
-    refinement = run.densifier.after_step(
+    refinement = run.strategy.after_step(
         step.number,
         grad2d,
         forward.render.visible,
         width=camera.width,
         height=camera.height,
         group=step.view.tag,
-        hooks=run.components.densifier_hooks(step),
+        hooks=run.components.strategy_hooks(step),
     )
     if refinement != Refinement():
         run.components.on_gaussians_changed(run.optimizer.gaussians)
@@ -246,13 +247,13 @@ def _prune_by_components(run: _Run, step: Step, refinement: Refinement) -> Refin
     mask = run.components.to_prune(gaussians, step)
     if mask is None or not mask.any():
         return refinement
-    removed = run.densifier.remove(mask)
+    removed = run.strategy.remove(mask)
     run.components.on_gaussians_changed(gaussians)
     return replace(refinement, pruned_by_components=removed)
 
 
 def _set_up(data: Dataset, conf: Conf, extra_components: Iterable[Component]) -> _Run:
-    """Everything that the steps use, before the first step; the recorder's clock starts last."""
+    """Build everything that the steps use."""
     splat, steps = conf.splat, conf.train.steps
     backend = resolve_backend(splat.backend)
     gaussians = from_points(
@@ -267,7 +268,7 @@ def _set_up(data: Dataset, conf: Conf, extra_components: Iterable[Component]) ->
     )
     built = build_components(conf.components, data, splat, backend, conf.seed)
     components = Components([*built, *extra_components])
-    densifier = Densifier(
+    strategy = STRATEGIES["default"](
         optimizer,
         splat.densify.scaled(steps),
         scene_scale=data.scene_scale,
@@ -276,6 +277,7 @@ def _set_up(data: Dataset, conf: Conf, extra_components: Iterable[Component]) ->
         view_pixels=data.view_pixels,
     )
     views = _Views(data.train)
+    # After all preparation, since its clock starts here.
     recorder = TrainingRecorder(steps, splat.densify.grow_grad2d, data.train)
     sh_every = max(1, int(splat.sh_every * steps / NOMINAL_STEPS))
     return _Run(
@@ -286,9 +288,9 @@ def _set_up(data: Dataset, conf: Conf, extra_components: Iterable[Component]) ->
         views=views,
         optimizer=optimizer,
         components=components,
-        densifier=densifier,
+        strategy=strategy,
         sampler=EpochSampler(data.train, conf.seed, steps, components.allows_view),
         recorder=recorder,
         renderer=StepRenderer(components, splat.raster, sh_every, backend, recorder),
-        memory=TrainingMemory(optimizer, densifier, components, views, data),
+        memory=TrainingMemory(optimizer, strategy, components, views, data),
     )

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 if TYPE_CHECKING:
-    from xrgs.splat.rasterize import Render
+    from xrgs.splat.rendering import Render
     from xrgs.training.checkpoint import State
     from xrgs.training.components import Step
 
@@ -23,14 +23,14 @@ _CODE = (type, ModuleType, FunctionType)
 class TrainingMemory:
     """The largest number of bytes that a step of training held.
 
-    What a step holds is the model, its gradients and the optimizer's state, the statistics of
-    densification, the photographs with what the loss has prepared of them, the tensors of the
-    components, what autograd saves between forward and backward, and the buffers of the renderer.
-    All are counted as if they existed at once; tensors that share their memory count once. What
-    backward allocates and frees in between is not counted.
+    A step holds the model, its gradients and the optimizer's state, the statistics of
+    densification, the photographs and their targets for the loss, the tensors of the components,
+    what autograd saves between forward and backward, and the buffers of the renderer. All count as
+    if they existed at once; tensors that share their memory count once. What backward allocates and
+    frees in between does not count.
 
-    Steps with as many Gaussians and harmonics, on views of one size and class, hold the same, so
-    that the first of them is counted.
+    Steps with the same number of Gaussians and harmonics, on views of one size and class, hold the
+    same. Only the first of them is counted.
 
     Attributes:
         largest_bytes: The largest count so far.
@@ -50,10 +50,10 @@ class TrainingMemory:
 
     @contextmanager
     def of_forward(self, step: Step, gaussians: int, sh_degree: int) -> Iterator[None]:
-        """Note what autograd saves in a block, if a step like this one has not been counted.
+        """Note what autograd saves in the forward pass of a step that has not been counted.
 
         Args:
-            step: The step whose forward pass the block is.
+            step: The step.
             gaussians: The number of Gaussians.
             sh_degree: Highest band of the spherical harmonics that is rendered.
         """
@@ -72,37 +72,24 @@ class TrainingMemory:
 
         with torch.autograd.graph.saved_tensors_hooks(note, lambda tensor: tensor):
             yield
-        # Now, while all of it exists: later, other tensors may have the same addresses, and those
-        # of results that the block has dropped already do.
+        # Only what still exists, and now: other tensors will have the addresses of dropped ones.
         saved = _storages(tensor for noted in packed if (tensor := noted()) is not None)
         held = _storages(tensors_in(self.holders))
         self._noted = kind, sum(size for address, size in saved.items() if address not in held)
 
     def state_dict(self) -> State:
-        """Return the largest count so far, and which steps need not be counted again."""
+        """Return the largest count so far, and the kinds of steps that have been counted."""
         return {"largest_bytes": self.largest_bytes, "counted": sorted(self._counted)}
 
     def load_state_dict(self, state: State) -> None:
-        """Continue from a state that `state_dict` returned.
-
-        Args:
-            state: From a run of the same config and data.
-
-        Raises:
-            KeyError: An entry is missing.
-            TypeError: An entry is of another type.
-            ValueError: The count is not a number.
-        """
+        """Continue a run of the same config and data."""
         self.largest_bytes = int(state["largest_bytes"])
         self._counted = set(state["counted"])
 
     def record(self, render: Render) -> None:
-        """Count a step, if its forward pass was noted, while its gradients exist.
+        """Count the step of a render, if its forward pass was noted, while its gradients exist.
 
         A step without a backward pass is not counted: another of its kind holds more.
-
-        Args:
-            render: The step's render.
         """
         if self._noted is not None:
             kind, saved_bytes = self._noted
@@ -113,14 +100,7 @@ class TrainingMemory:
 
 
 def tensors_in(value: object) -> Iterator[Tensor]:
-    """Yield the tensors that an object holds: itself, its items and its attributes, all the way.
-
-    Args:
-        value: Any object. Functions, classes and modules hold nothing of their own.
-
-    Yields:
-        Each tensor, and its gradient where it has one.
-    """
+    """Yield all tensors in an object, its items and attributes, and their gradients."""
     seen: set[int] = set()
     waiting: list[Any] = [value]
     while waiting:

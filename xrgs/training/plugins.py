@@ -1,11 +1,11 @@
 """Components of other installed packages, found by their entry points.
 
 A package offers a component by an entry point in the group `xrgs.components`; its name is the key
-under `components.plugins` of the config. Finding a plugin and hashing its source, which its cells'
-identities contain, execute none of its code. Only `load` does, and training calls it only for the
-names in the config of the cell that it trains. The config comes from the user's command line and
-files; a config that is read from a store is used for training again only where the user has named
-its plugins (`xrgs.sweep.rerun`). So a store from elsewhere never makes xrgs import a package.
+under `components.plugins` of the config. To find a plugin and to hash its source for identities
+executes none of its code. `load` does; training calls it for the names in the config of its cell
+alone. The config comes from the user's command line and files; a config from a store is trained
+again only if the user has named its plugins (`xrgs.sweep.rerun`). So a store from elsewhere never
+makes xrgs import a package.
 
 This module does not import torch, so that planning and reporting can use it.
 """

@@ -1,4 +1,4 @@
-"""What a training run is measured by: its history, time, memory and amount of work."""
+"""The record of a training run: its history, time, memory and amount of work."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from statistics import fmean
 from typing import TYPE_CHECKING, Any
 
-from xrgs.splat.refinement import Refinement
+from xrgs.splat.strategy.refinement import Refinement
 from xrgs.training.work import StepWork
 
 if TYPE_CHECKING:
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     import torch
 
     from xrgs.splat.gaussians import Gaussians
-    from xrgs.splat.rasterize import Render
+    from xrgs.splat.rendering import Render
     from xrgs.training.checkpoint import State
     from xrgs.training.components import Step, TrainingView
 
@@ -27,13 +27,13 @@ _HISTORY_ROWS = 200
 
 @dataclass(frozen=True)
 class TrainingResult:
-    """The Gaussians that training gave, and what training took."""
+    """The trained Gaussians, and the record of their training."""
 
     gaussians: Gaussians
     """The trained model."""
     history: list[dict[str, Any]]
     """One row for each recorded step. `step`, `view`, `loss` and `gaussians` (their number before
-    the step's densification) are those of the step itself. `steps_HR`, `steps_LR`, the counts of
+    the step's densification) belong to the step itself. `steps_HR`, `steps_LR`, the counts of
     `Refinement`, `skipped_backward` (steps without a backward pass) and `skipped_shN` (steps that
     did not move shN) are totals since the start of training; the last two are columns only where
     there are such steps. Every other column is a component's log (`Step.log`): its mean over the
@@ -46,13 +46,12 @@ class TrainingResult:
     evaluations: int
     """Alpha evaluations of all forward passes: the amount of work, independent of the machine."""
     work: dict[str, int]
-    """What the steps rendered and left out: `StepWork.totals`."""
+    """Further counts of work: `StepWork.totals`."""
     stage_seconds: dict[str, float]
     """`seconds` by the stages of a step: `forward` (render and loss), `backward`, `optimizer`, and
     `densification` with all that follows."""
     grow_grad2d: float
-    """The threshold of densification that the Gaussians were trained with, in normalised device
-    units (`splat.densify.grow_grad2d`)."""
+    """`splat.densify.grow_grad2d` of this training, in normalised device units."""
     scores: list[dict[str, Any]] = field(default_factory=list)
     """One row for each evaluation during training: `step` (the number of steps done), `seconds` and
     `evaluations` (of alpha, both since the start), `gaussians`, and the scores by their names."""
@@ -95,7 +94,7 @@ class TrainingRecorder:
         self.lap_started = now
 
     def record_skipped(self, part: str) -> None:
-        """Count a part of a step that is left out, before `record_step` records the step.
+        """Count a part of a step that is left out; call it before `record_step`.
 
         Args:
             part: `backward` (with the update), or `shN`. The history has the total as
@@ -127,26 +126,18 @@ class TrainingRecorder:
             self.logged.clear()
 
     def record_evaluations(self, evaluations: int) -> None:
-        """Count the work of what is rendered beside the steps' own renders.
-
-        Args:
-            evaluations: Alpha evaluations of a forward pass.
-        """
+        """Count the alpha evaluations of a render beside the steps' own renders."""
         self.evaluations += evaluations
 
     def record_refinement(self, refinement: Refinement) -> None:
-        """Add what a step's densification did to the counts of the history; the step ends here.
-
-        Args:
-            refinement: The counts of one step; all of them are 0 at most steps.
-        """
+        """Add a step's refinement to the counts of the history; the step ends here."""
         self.counts.update(refinement.counts())
         self.lap("densification")
 
     def record_scores(
         self, steps: int, gaussians: int, evaluate: Callable[[], Mapping[str, float | None]]
     ) -> None:
-        """Evaluate the Gaussians; the time that it takes is excluded.
+        """Evaluate the Gaussians, and exclude the time from the training time.
 
         Args:
             steps: Number of steps done.
@@ -164,11 +155,7 @@ class TrainingRecorder:
         self.exclude_time(time.perf_counter() - start)
 
     def exclude_time(self, seconds: float) -> None:
-        """Exclude from the training time what has just passed with something else.
-
-        Args:
-            seconds: Time that was not training.
-        """
+        """Exclude the seconds that have just passed from the training time."""
         self.started += seconds
         self.lap_started += seconds
 
@@ -186,16 +173,7 @@ class TrainingRecorder:
         }
 
     def load_state_dict(self, state: State) -> None:
-        """Continue from a state that `state_dict` returned; the time since then is excluded.
-
-        Args:
-            state: From a recorder of a run of as many steps.
-
-        Raises:
-            KeyError: An entry is missing.
-            TypeError: An entry is of another type.
-            ValueError: An entry can't be converted to its type.
-        """
+        """Continue a run of as many steps; the time since `state_dict` is excluded."""
         self.lap_started = time.perf_counter()
         self.started = self.lap_started - float(state["seconds"])
         self.counts = Counter(state["counts"])
@@ -207,15 +185,7 @@ class TrainingRecorder:
         self.stage_seconds = defaultdict(float, state["stage_seconds"])
 
     def finish(self, gaussians: Gaussians, memory_bytes: int) -> TrainingResult:
-        """Stop the clock and return the result.
-
-        Args:
-            gaussians: The trained model.
-            memory_bytes: The memory that training held at its peak.
-
-        Returns:
-            The result; each row of its history has every column.
-        """
+        """Stop the clock and return the result; each row of its history has every column."""
         seconds = time.perf_counter() - self.started
         empty = {name: None for row in self.history for name in row} | dict.fromkeys(self.counts, 0)
         return TrainingResult(

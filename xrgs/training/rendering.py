@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from xrgs.splat.attribution import attribute_pixels
-from xrgs.splat.rasterize import Render, rasterize_parameters
+from xrgs.splat.rendering import Render, rasterize_parameters
 
 if TYPE_CHECKING:
     from xrgs.splat.cameras import Camera
@@ -21,15 +21,14 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class StepRenderer:
-    """Renders any training view as the step that trains on it does, with all components.
+    """Renders any training view as a step on that view does, with all components.
 
-    Components that look at more views than the step's own get it before the first step
-    (`Component.before_training`). The alpha evaluations of what they render count as the run's.
+    Components get it before the first step (`Component.before_training`). The alpha evaluations of
+    `photograph` and `attribute` count as the run's.
     """
 
     components: Components
-    """The components of the run, whose `before_render`, `render_camera` and `to_photograph` make
-    the render of a view."""
+    """The components of the run."""
     raster: RasterSettings
     """How Gaussians become pixels."""
     sh_every: int
@@ -51,7 +50,7 @@ class StepRenderer:
         Args:
             gaussians: The N Gaussians.
             step: The step with the view to render.
-            camera: What the components' `render_camera` makes of the view's camera.
+            camera: The view's camera after the components' `render_camera`.
             means2d_offset: [N, 2] as for `rasterize_parameters`.
 
         Returns:
@@ -70,10 +69,6 @@ class StepRenderer:
     def photograph(self, gaussians: Gaussians, step: Step) -> Tensor:
         """Render the step's view as it is compared with its photograph.
 
-        Args:
-            gaussians: The Gaussians.
-            step: The step with the view to render.
-
         Returns:
             [H, W, 3] at the photograph's size, not clamped to 0..1, without a graph.
         """
@@ -84,11 +79,10 @@ class StepRenderer:
 
     @torch.no_grad()
     def attribute(self, pixels: Tensor, gaussians: Gaussians, step: Step) -> Tensor:
-        """Sum a map of the view's photograph over what each Gaussian shows of it.
+        """Sum a map of the view's photograph, weighted by each Gaussian's part in it.
 
-        As `attribute_pixels`, where the weight of a Gaussian in a pixel of the photograph is what
-        `to_photograph` makes of its weights in the render. That is linear, so the map is brought to
-        the render's size by the transpose of it.
+        As `attribute_pixels`, but `to_photograph` is applied to the weights of a Gaussian. Since
+        that is linear, its transpose brings the map to the render's size.
 
         Args:
             pixels: [H, W] the map, at the photograph's size.

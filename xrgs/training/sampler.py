@@ -1,4 +1,4 @@
-"""Which view each training step is trained on."""
+"""The order of the training views."""
 
 from __future__ import annotations
 
@@ -21,8 +21,8 @@ class EpochSampler:
     """Samples training views epoch by epoch, one view a step.
 
     An epoch is a random permutation of the views that `allows_view` allows when the epoch begins. A
-    view that it no longer allows when the view's turn comes is skipped; one that becomes allowed
-    during an epoch takes part from the next epoch on.
+    view that is no longer allowed at its turn is skipped. A view that becomes allowed during an
+    epoch takes part from the next epoch on.
 
     Attributes:
         next_step: The number of the next step, from 0.
@@ -91,15 +91,10 @@ class EpochSampler:
         }
 
     def load_state_dict(self, state: State) -> None:
-        """Continue from a state that `state_dict` returned.
-
-        Args:
-            state: From a sampler of the same views, seed and number of steps.
+        """Continue a run of the same views, seed and number of steps.
 
         Raises:
-            KeyError: An entry is missing, or names a view that there is not.
-            RuntimeError: The generator's state is of another size.
-            TypeError: The generator's state is of another type.
+            KeyError: An entry is missing, or names an unknown view.
         """
         by_name = {view.name: view for view in self.views}
         self.next_step = int(state["next_step"])

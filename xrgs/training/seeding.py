@@ -10,12 +10,12 @@ from xrgs.safeio.hashing import digest
 def seeded_generator(seed: int, purpose: str) -> torch.Generator:
     """Make the random generator of one purpose.
 
-    Each purpose has a generator of its own, so that a change in how many numbers one of them draws
-    does not change what the others draw.
+    Each purpose has its own generator, so that drawing more numbers for one purpose does not change
+    the numbers for another.
 
     Args:
         seed: `seed` of the config.
-        purpose: What the numbers are drawn for: `init`, `views` or `densify`.
+        purpose: `init`, `views`, `densify`, or a component's own.
 
     Returns:
         A generator on the CPU, in the same state for the same arguments.

@@ -1,4 +1,4 @@
-"""Counts what the steps of a training rendered and left out."""
+"""Counts the work of training steps, and the work that they skipped."""
 
 from __future__ import annotations
 
@@ -11,16 +11,15 @@ if TYPE_CHECKING:
     from collections.abc import Iterable
 
     from xrgs.splat.gaussians import Gaussians
-    from xrgs.splat.rasterize import Render
+    from xrgs.splat.rendering import Render
     from xrgs.training.checkpoint import State
     from xrgs.training.components import Step, TrainingView
 
 
 class StepWork:
-    """Sums over the steps of what they rendered and what they left out.
+    """Sums of the work that steps did and skipped.
 
-    It counts what is known without further work: none of it is computed for the count alone, but
-    the number of visible Gaussians.
+    Everything but the number of visible Gaussians is known without further work.
 
     Attributes:
         photographs: Pixels of each view's photograph, by its name.
@@ -82,15 +81,6 @@ class StepWork:
         return {"counts": dict(self.counts), "views": sorted(self.views)}
 
     def load_state_dict(self, state: State) -> None:
-        """Continue from a state that `state_dict` returned.
-
-        Args:
-            state: From a run of the same config and data.
-
-        Raises:
-            KeyError: An entry is missing.
-            TypeError: An entry is of another type.
-            ValueError: The counts are not pairs.
-        """
+        """Continue a run of the same config and data."""
         self.counts = Counter(state["counts"])
         self.views = set(state["views"])

@@ -109,7 +109,8 @@ def _is_film(out: Path) -> bool:
         import av  # noqa: F401
     except ImportError as error:
         raise XrgsError(
-            f"out={out}: a film needs PyAV: pip install 'xrgs[video]'; out=FOLDER writes PNG frames"
+            f"out={out}: a film needs PyAV: pip install 'xrgs[video]';"
+            " --out FOLDER writes PNG frames"
         ) from error
     return True
 

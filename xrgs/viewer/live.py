@@ -180,7 +180,7 @@ def count_text(model: Model, limit: int) -> str:
     count = len(model.gaussians)
     if count <= limit:
         return f"{count:,} Gaussians"
-    return f"the {limit:,} most opaque of {count:,} Gaussians (limit={limit})"
+    return f"the {limit:,} most opaque of {count:,} Gaussians (--limit {limit})"
 
 
 def _add_cameras(server: ViserServer, world: Model) -> None:

@@ -102,7 +102,7 @@ def spiral(poses: Poses, views: int) -> Array:
     directions = poses.train[:, 2, :3]
     forward = directions.mean(axis=0)
     if np.linalg.norm(forward) < _MIN_FACING:
-        raise XrgsError("path=spiral: the cameras don't face one way; take path=orbit")
+        raise XrgsError("path=spiral: the cameras don't face one way; take --path orbit")
     positions, up = camera_positions(poses.train), _up(poses.train)
     centre = positions.mean(axis=0)
     mean_camera = _look_at(centre, forward, up)

@@ -54,6 +54,13 @@ def test_copies_are_measured_by_their_largest_photograph(fill: Fill, tmp_path: P
         ([], "no image in it"),
         (["only.png"], r"only only\.png in it; two or more"),
         (["a.png", "a.jpg"], r"a\.jpg and a\.png: two images of one name"),
+        # One file where a file system ignores case, or composes accents.
+        (["A.png", "a.png"], "two images of one name"),
+        (
+            ["e\N{COMBINING ACUTE ACCENT}.png", "\N{LATIN SMALL LETTER E WITH ACUTE}.png"],
+            "one name",
+        ),
+        (["a.png", "\udcff.png"], "udcff.*rename it"),
     ],
 )
 def test_a_folder_without_a_scene_is_refused(

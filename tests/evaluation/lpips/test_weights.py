@@ -165,10 +165,9 @@ def test_the_cache_is_where_the_system_says(monkeypatch: pytest.MonkeyPatch) -> 
 
 
 def test_a_cells_provenance_has_the_hash_of_the_weights(nowhere: Path, known: Weights) -> None:
-    key = "lpips_weights_sha256"
-    assert provenance.collect(1, "torch")[key] is None
+    assert provenance.collect(1, "torch").lpips_weights_sha256 is None
     weights.save(known, weights.cache_file())
-    assert provenance.collect(1, "torch")[key] == weights.content_digest(known)
+    assert provenance.collect(1, "torch").lpips_weights_sha256 == weights.content_digest(known)
 
 
 def test_spoilt_weights_stop_a_cell_before_it_trains(

@@ -14,15 +14,15 @@ import numpy as np
 import pytest
 import torch
 from PIL import Image
+from xrgs.report.html.album import Album, error_map
+from xrgs.report.html.trained import quantise
 
 from tests.report.conftest import MadeStore
 from tests.report.html.conftest import HOSTILE, TEST_VIEWS, data_of, make_gaussians, page_of
 from xrgs.experiment.store import Store
 from xrgs.report import build
 from xrgs.report.html import document
-from xrgs.report.html.album import Album, error_map
 from xrgs.report.html.content import LOG_SCALES
-from xrgs.report.html.trained import quantise
 from xrgs.splat.ply import save_ply
 
 
@@ -138,7 +138,7 @@ def test_pictures_none_has_the_tables_alone(copied: Path) -> None:
     data = data_of(page)
     assert data["images"] == data["models"] == data["training"] == []
     assert [view["view"] for view in data["views"]] == ["IMG_001", "IMG_009"]
-    assert "pictures=none" in page.read_text()
+    assert "--pictures none" in page.read_text()
 
 
 @pytest.mark.parametrize(

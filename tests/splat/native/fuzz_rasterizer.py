@@ -27,7 +27,7 @@ from xrgs.splat.backend import implementation
 from xrgs.splat.cameras import Camera
 from xrgs.splat.gaussians import PARAMETERS, ActivatedGaussians
 from xrgs.splat.native.rasterizer import render_culled
-from xrgs.splat.render_result import Render
+from xrgs.splat.rendering import Render
 from xrgs.splat.settings import CullingOptions, RasterSettings
 
 SIZES = (1, 2, 3, 15, 16, 17)

@@ -8,9 +8,9 @@ import pytest
 import torch
 from torch import Tensor
 
-from xrgs.splat.densify import Densifier
+from xrgs.splat.strategy.default import DefaultStrategy
 
-MakeDensifier = Callable[..., Densifier]
+MakeStrategy = Callable[..., DefaultStrategy]
 
 native = pytest.importorskip("xrgs._native")
 
@@ -25,8 +25,8 @@ def step(count: int, seed: int = 0) -> tuple[Tensor, Tensor]:
 
 
 @pytest.fixture
-def densifier(make_densifier: MakeDensifier) -> MakeDensifier:
-    def make(count: int, backend: str, dtype: torch.dtype = torch.float32) -> Densifier:
+def strategy(make_strategy: MakeStrategy) -> MakeStrategy:
+    def make(count: int, backend: str, dtype: torch.dtype = torch.float32) -> DefaultStrategy:
         generator = torch.Generator().manual_seed(1)
         shapes = {"means": (3,), "quats": (4,), "scales": (3,), "opacities": ()}
         shapes |= {"sh0": (1, 3), "shN": (15, 3)}
@@ -34,14 +34,14 @@ def densifier(make_densifier: MakeDensifier) -> MakeDensifier:
             name: torch.randn(count, *shape, generator=generator).to(dtype)
             for name, shape in shapes.items()
         }
-        return make_densifier(values, backend=backend)
+        return make_strategy(values, backend=backend)
 
     return make
 
 
 @pytest.mark.parametrize("count", COUNTS)
-def test_sums_are_those_in_double(densifier: MakeDensifier, isa: str, count: int) -> None:
-    ours, exact = densifier(count, "native"), densifier(count, "torch", torch.float64)
+def test_sums_are_those_in_double(strategy: MakeStrategy, isa: str, count: int) -> None:
+    ours, exact = strategy(count, "native"), strategy(count, "torch", torch.float64)
     for number in range(3):
         gradient, visible = step(count, number)
         width = 100 + number
@@ -51,10 +51,10 @@ def test_sums_are_those_in_double(densifier: MakeDensifier, isa: str, count: int
     torch.testing.assert_close(ours.grad2d_sum.double(), exact.grad2d_sum, rtol=4e-7, atol=0)
 
 
-def test_what_is_not_visible_adds_nothing(densifier: MakeDensifier, isa: str) -> None:
+def test_what_is_not_visible_adds_nothing(strategy: MakeStrategy, isa: str) -> None:
     gradient, visible = step(50)
     gradient[~visible] = torch.nan
-    ours = densifier(50, "native")
+    ours = strategy(50, "native")
     ours.after_step(1, gradient, visible, width=9, height=9)
     assert ours.grad2d_sum.isfinite().all()
     assert not ours.grad2d_sum[:, ~visible].any()
@@ -62,12 +62,12 @@ def test_what_is_not_visible_adds_nothing(densifier: MakeDensifier, isa: str) ->
 
 
 @pytest.mark.usefixtures("threads")
-def test_threads_change_no_bit(densifier: MakeDensifier) -> None:
+def test_threads_change_no_bit(strategy: MakeStrategy) -> None:
     gradient, visible = step(40_000)
     results = []
     for count in (1, 2, 3, 4):
         torch.set_num_threads(count)
-        ours = densifier(40_000, "native")
+        ours = strategy(40_000, "native")
         ours.after_step(1, gradient, visible, width=100, height=75)
         results.append(ours.grad2d_sum)
     assert all(torch.equal(result, results[0]) for result in results)

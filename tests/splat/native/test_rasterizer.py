@@ -22,8 +22,7 @@ from torch import Tensor
 
 from xrgs.splat.cameras import Camera
 from xrgs.splat.gaussians import ActivatedGaussians
-from xrgs.splat.rasterize import rasterize_parameters
-from xrgs.splat.render_result import Render
+from xrgs.splat.rendering import Render, rasterize_parameters
 from xrgs.splat.settings import RasterSettings
 
 Scene = dict[str, Tensor]
@@ -388,7 +387,7 @@ def test_gradients_of_needles_are_as_exact_as_float32_in_torch(antialiased: bool
     )
     for length, width in ((100, 0.3), (1000, 0.05)):
         errors: dict[str, dict[str, list[float]]] = {"native": {}, "torch": {}}
-        for seed in range(40):
+        for seed in range(20):
             generator = torch.Generator().manual_seed(seed)
             half_angle = 0.15 + 0.5 * torch.rand(1, generator=generator).item()
             scene = single(
@@ -425,19 +424,18 @@ def test_gradients_are_nearly_as_exact_as_float32_in_torch(
     Random scenes differ from processor to processor. With 200 of them the ratio of the medians for
     scales is 2.3 to 2.5 with vector instructions and 2.9 without; with 40 it was 2.3 to 3.6.
     """
+    raster = RasterSettings(alpha_min=0.0, alpha_max=1.0, transmittance_min=0.0)  # has no band
     errors: dict[str, dict[str, list[float]]] = {"native": {}, "torch": {}}
     for seed in range(200):
         camera = rounded(make_camera(9 + seed % 30, 7 + seed % 20, turned=bool(seed % 2)))
         scene = single(make_scene(1 + seed % 12, camera, seed=seed, size=0.3 * (1 + seed % 20)))
-        exact, _ = run(scene, camera, RasterSettings(), "torch", torch.float64)
-        outside = (~band_of(scene, camera, RasterSettings(), exact.image, 3)).float()
         generator = torch.Generator().manual_seed(seed)
-        v_image = torch.randn(*outside.shape, 3, generator=generator) * outside[..., None]
-        v_alpha = torch.randn(*outside.shape, generator=generator) * outside
-        v = v_image, v_alpha
-        _, expected = run(scene, camera, RasterSettings(), "torch", torch.float64, v)
+        shape = camera.height, camera.width
+        v_image = torch.randn(*shape, 3, generator=generator)
+        v = v_image, torch.randn(*shape, generator=generator)
+        _, expected = run(scene, camera, raster, "torch", torch.float64, v)
         for backend, of_backend in errors.items():
-            _, got = run(scene, camera, RasterSettings(), backend, torch.float32, v)
+            _, got = run(scene, camera, raster, backend, torch.float32, v)
             for name, value in expected.items():
                 error = (got[name] - value).norm() / value.norm().clamp_min(1e-30)
                 of_backend.setdefault(name, []).append(float(error))

@@ -10,8 +10,7 @@ from torch import Tensor
 
 from xrgs.splat.cameras import Camera
 from xrgs.splat.gaussians import PARAMETERS, ActivatedGaussians
-from xrgs.splat.rasterize import rasterize_parameters
-from xrgs.splat.render_result import Render
+from xrgs.splat.rendering import Render, rasterize_parameters
 from xrgs.splat.settings import RasterSettings
 
 Scene = dict[str, Tensor]

@@ -12,7 +12,7 @@ from scipy.special import sph_harm_y
 from torch import Tensor
 
 from xrgs.splat.cameras import Camera
-from xrgs.splat.render_result import Render
+from xrgs.splat.rendering import Render
 from xrgs.splat.settings import RasterSettings
 
 Array = NDArray[np.float64]

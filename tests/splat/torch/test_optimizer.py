@@ -11,7 +11,7 @@ from torch import Tensor
 from xrgs.splat.cameras import Camera
 from xrgs.splat.gaussians import PARAMETERS, ActivatedGaussians, Gaussians
 from xrgs.splat.optimizer import SplatOptimizer
-from xrgs.splat.rasterize import rasterize_parameters
+from xrgs.splat.rendering import rasterize_parameters
 from xrgs.splat.settings import OptimizerSettings, RasterSettings
 
 MakeCamera = Callable[..., Camera]

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from xrgs.splat.cameras import Camera
 from xrgs.splat.gaussians import ActivatedGaussians
-from xrgs.splat.render_result import Render
+from xrgs.splat.rendering import Render
 from xrgs.splat.settings import RasterSettings
 from xrgs.splat.torch import rasterizer as torch_rasterizer
 

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from xrgs.splat.cameras import Camera
-from xrgs.splat.render_result import Render
+from xrgs.splat.rendering import Render
 from xrgs.splat.settings import RasterSettings
 
 Scene = dict[str, Tensor]

@@ -11,10 +11,9 @@ import torch
 from xrgs.capture.dataset import LoadedView
 from xrgs.config import Conf
 from xrgs.evaluation import protocol
-from xrgs.safeio.confined import ConfinedPath
 from xrgs.splat.cameras import Camera
 from xrgs.splat.gaussians import Gaussians
-from xrgs.splat.rasterize import rasterize_parameters
+from xrgs.splat.rendering import rasterize_parameters
 from xrgs.splat.settings import RasterSettings
 
 SIZE = 31
@@ -86,7 +85,7 @@ def test_evaluation_renders_as_training_does(
     scores = {}
     for setting in (False, True):
         baseline.splat.raster.antialiased = setting
-        (row,) = protocol.score_views(gaussians, [view], baseline.splat, ConfinedPath(tmp_path))
+        (row,) = protocol.score_views(gaussians, [view], baseline.splat, tmp_path)
         scores[setting] = row["psnr"]
     assert scores[antialiased] > 100
     assert scores[not antialiased] < 60

@@ -6,6 +6,8 @@ import dataclasses
 import subprocess
 import sys
 from collections.abc import Callable, Mapping
+from functools import partial
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -16,15 +18,14 @@ from xrgs.capture.dataset import LoadedView
 from xrgs.config import ComponentsConf, DensifyConf, identity_values, is_on
 from xrgs.errors import XrgsError
 from xrgs.splat.gaussians import PARAMETERS, Gaussians
-from xrgs.splat.refinement import Groups, Thresholds
 from xrgs.splat.settings import DensifySettings
+from xrgs.splat.strategy.refinement import Groups, Thresholds
 from xrgs.training import components
 from xrgs.training.components import Component, Components, Step, TrainingSetup
 from xrgs.training.components.consistency import Consistency
 from xrgs.training.components.curriculum import Curriculum
 from xrgs.training.components.densify import Densify
 from xrgs.training.components.gradient_scaling import GradientScaling
-from xrgs.training.components.loss_weighting import LossWeighting
 from xrgs.training.components.mip import Mip
 from xrgs.training.components.natural_selection import NaturalSelection
 from xrgs.training.components.render_scale import RenderScale
@@ -32,7 +33,8 @@ from xrgs.training.components.resolution_schedule import ResolutionSchedule
 from xrgs.training.components.skip_backward import SkipBackward
 from xrgs.training.components.supersampled import Supersampled
 from xrgs.training.components.view_scores import ErrorScore, MultiviewScore
-from xrgs.training.components.weighting import Weighting
+from xrgs.training.components.weighting import Weighting, weight_by_tag
+from xrgs.training.registry import BUILT_IN, modules_of
 
 Build = Callable[..., Components]
 
@@ -87,20 +89,27 @@ def test_the_baseline_has_no_component(build: Build, off: ComponentsConf) -> Non
 
 
 def test_every_setting_has_a_component() -> None:
-    """A built-in component of its own, the weight of a view, count matching or the plugins."""
-    weights = {
-        "continuous_weighting",
-        "adaptive_weighting",
-        "region_weighting",
-        "hybrid_schedule",
-    }
+    """A component of its own, one that reads it, count matching or the plugins."""
     keys = {field.name for field in dataclasses.fields(ComponentsConf)}
-    assert keys == set(components.BUILT_IN) | weights | {"count_matched", "plugins"}
+    read = {key for entry in BUILT_IN.values() for key in entry.reads}
+    assert keys == set(BUILT_IN) | read | {"count_matched", "plugins"}
+    assert not read & set(BUILT_IN)
 
 
 def test_the_weight_of_a_view_multiplies_its_consistency_loss() -> None:
-    order = list(components.BUILT_IN)
+    order = list(BUILT_IN)
     assert order.index("consistency") < order.index("loss_weighting")
+
+
+def test_every_module_implements_a_component_or_is_shared() -> None:
+    folder = Path(components.__file__).parent
+    shared = {"__init__", "base", "combined"}
+    modules = {file.stem for file in folder.glob("*.py")} - shared
+    keys = [key for name, entry in BUILT_IN.items() for key in (name, *entry.reads)]
+    paths = {path for key in keys for path in modules_of(key)}
+    assert paths == {f"training/components/{name}.py" for name in modules}
+    assert "training/components/weighting.py" in modules_of("hybrid_schedule")
+    assert modules_of("count_matched") == modules_of("plugins") == ()
 
 
 @pytest.mark.parametrize("tag", ["HR", "LR"])
@@ -114,12 +123,8 @@ def test_at_the_value_that_is_off_each_changes_nothing(
 ) -> None:
     """Built at its off value, which `build` does not do, a component is the identity too."""
     step, loss = steps[tag], torch.tensor(0.3)
-    assert (
-        Weighting(LossWeighting(off.loss_weighting)).modify_loss(
-            loss, step.view.image, gaussians, step
-        )
-        is loss
-    )
+    weighting = Weighting(partial(weight_by_tag, lr_weight=off.loss_weighting.lr_weight))
+    assert weighting.modify_loss(loss, step.view.image, gaussians, step) is loss
     scaling = GradientScaling(off.gradient_scaling)
     scaling.after_backward(gaussians, step)
     assert gaussians.scales.grad is not None
@@ -291,11 +296,18 @@ def test_all_are_on_together(build: Build, off: ComponentsConf) -> None:
     assert {type(component) for component in build(off)} == {kind for _, kind in ON.values()}
 
 
-@pytest.mark.slow
-def test_training_needs_no_hydra() -> None:
-    code = "import sys, xrgs.training.components; sys.exit('hydra' in sys.modules)"
-    run = subprocess.run([sys.executable, "-P", "-c", code], check=False)
-    assert run.returncode == 0
+@pytest.mark.parametrize(
+    ("module", "unused"),
+    [
+        (".loop", {"hydra", *(f"xrgs.training.components.{e.module}" for e in BUILT_IN.values())}),
+        (".registry", {"torch", "numpy", "omegaconf", "hydra"}),
+    ],
+)
+def test_what_is_imported(module: str, unused: set[str]) -> None:
+    """Training needs no Hydra and no component; planning reads the registry without torch."""
+    code = f"import sys, xrgs.training{module}; print({unused!r} & set(sys.modules))"
+    run = subprocess.run([sys.executable, "-P", "-c", code], capture_output=True, check=True)
+    assert run.stdout.strip() == b"set()"
 
 
 @pytest.mark.parametrize(
@@ -322,6 +334,9 @@ def test_training_needs_no_hydra() -> None:
 def test_a_value_out_of_range_names_its_key(
     key: str, value: Any, build: Build, off: ComponentsConf
 ) -> None:
+    for name, (on, _) in ON.items():
+        if name.partition(".")[0] == key.partition(".")[0]:
+            put(off, name, on)
     put(off, key, value)
     with pytest.raises(XrgsError) as caught:
         build(off)

@@ -8,8 +8,8 @@ import pytest
 
 from xrgs.config import ComponentsConf
 from xrgs.errors import XrgsError
-from xrgs.splat.refinement import DECIDE, Groups, Thresholds
 from xrgs.splat.settings import DensifySettings
+from xrgs.splat.strategy.refinement import DECIDE, Groups, Thresholds
 from xrgs.training.components import Components
 
 Build = Callable[..., Components]

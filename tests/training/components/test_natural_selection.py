@@ -60,10 +60,6 @@ def indices(mask: Tensor | None) -> list[int]:
     return [] if mask is None else torch.nonzero(mask)[:, 0].tolist()
 
 
-def test_a_budget_of_0_is_off(build: Build, off: ComponentsConf) -> None:
-    assert not build(off)
-
-
 def test_the_push_is_the_mean_gradient_and_follows_the_path(
     selection: NaturalSelection, gaussians: Gaussians, at: Callable[[int], Step]
 ) -> None:

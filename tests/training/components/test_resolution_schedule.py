@@ -44,10 +44,6 @@ def _views(parts: Components, *steps: Step) -> TrainingView:
     return views[step.view.name]
 
 
-def test_it_is_off_in_the_baseline(build: Build, off: ComponentsConf) -> None:
-    assert build(off) == ()
-
-
 def test_waves_are_kept_up_to_their_frequency() -> None:
     """Cosines of amplitude a have two lines of magnitude a / 2 times the number of pixels."""
     x, y = torch.arange(48, dtype=torch.float64), torch.arange(96, dtype=torch.float64)

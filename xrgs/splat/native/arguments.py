@@ -16,10 +16,7 @@ def require_float32(name: str, value: Tensor) -> None:
 
 
 def require_contiguous(name: str, value: Tensor) -> None:
-    """Raise ValueError unless a tensor, named in the message, is float32, contiguous, on the CPU.
-
-    A kernel that changes a tensor in place cannot take a copy of it.
-    """
+    """Raise ValueError unless a tensor that a kernel changes in place is float32 and contiguous."""
     require_float32(name, value)
     if not value.is_contiguous():
         raise ValueError(

@@ -21,13 +21,12 @@ def accumulate_statistics(
     Args:
         means2d_grad: [N, 2] float32 gradient of the loss by the projected means, per px.
         visible: [N] bool; Gaussians that are not visible add nothing, whatever their gradient.
-        half_size: Half the view's width and height, px, which bring the gradient to normalised
-            device units.
+        half_size: Half the view's width and height, px: the factors to normalised device units.
         grad2d_sum: [N] float32 to which the gradients' norms are added in place.
         visible_count: [N] float32 to which 1 is added in place where visible.
 
     Raises:
-        ValueError: A tensor does not have its type or shape, or a sum is not contiguous.
+        ValueError: A tensor has another type or shape, or a sum is not contiguous.
     """
     require_float32("means2d_grad", means2d_grad)
     if visible.dtype != torch.bool:

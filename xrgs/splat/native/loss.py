@@ -17,9 +17,9 @@ def photometric_loss(
 ) -> Tensor:
     """Return `xrgs.splat.loss.photometric_loss`; once differentiable, by the image only.
 
-    Sums are kept in double and added in a fixed order: value and gradient are bitwise the same for
-    any number of threads. Where the image, its target or the weight of a window is NaN, so are the
-    loss and the gradient of the pixels under the same windows.
+    Sums are in double and in a fixed order: value and gradient have the same bits for any number of
+    threads. If the image, its target or the weight of a window is NaN, so are the loss and the
+    gradient of the pixels under the same windows.
 
     Args:
         image: [H, W, 3] render, float32 on the CPU, of any strides.
@@ -41,7 +41,7 @@ def photometric_loss(
         require_float32("pixel_weight", pixel_weight)
         if pixel_weight.requires_grad:
             raise ValueError(
-                "pixel_weight must not require a gradient: the native backend has none by it"
+                "pixel_weight must not require a gradient: the native backend computes none for it"
             )
         pixel_weight = pixel_weight.contiguous()
     loss: Tensor = _Photometric.apply(image, target, l1, ssim, pixel_weight)
@@ -77,5 +77,5 @@ class _Photometric(torch.autograd.Function):
     @torch.autograd.function.once_differentiable
     def backward(ctx: Any, v_loss: Tensor) -> tuple[Tensor, None, None, None, None]:
         (gradient,) = ctx.saved_tensors
-        # A loss that nothing multiplies spares a pass over the image.
+        # Without a factor, a pass over the image is saved.
         return gradient if v_loss == 1 else gradient * v_loss, None, None, None, None

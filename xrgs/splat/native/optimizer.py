@@ -16,21 +16,20 @@ if TYPE_CHECKING:
 def step(adam: torch.optim.Adam, camera: Camera | None = None, sh_degree: int = 0) -> None:
     """Move every parameter that has a gradient, in one pass over memory.
 
-    The formula is torch's own, in torch's own order, with one rounding fewer where a multiplication
-    and an addition are fused: the two differ by rounding alone (`tests/splat/native/
-    test_optimizer.py` has the bounds). Values whose gradient and moments are all zero, such as
-    those of harmonics that are not on yet, are not written. The result is bitwise the same for any
-    number of threads.
+    The formula is torch's, in torch's order, with one rounding fewer where a multiplication and an
+    addition are fused (`tests/splat/native/test_optimizer.py` has the bounds). A value is not
+    written if its gradient and moments are zero, as for harmonics that are not on yet. The result
+    has the same bits for any number of threads.
 
-    With a camera, the gradient of shN is computed from that of sh0 as the moments of shN are moved:
-    it is never written to memory.
+    With a camera, the gradient of shN is computed from the gradient of sh0 as shN moves, and never
+    written to memory.
 
     Args:
         adam: Named groups of one parameter each, float32 [N, ...] on the CPU, contiguous, with
             betas and eps in common and without weight decay. Parameters without a gradient stay as
             they are.
-        camera: The view that the gradients come from; with it shN moves, too, by the gradient that
-            sh0's implies (`SplatOptimizer.step`).
+        camera: The view that the gradients come from; None leaves shN as it is, unless it has a
+            gradient (`SplatOptimizer.step`).
         sh_degree: Highest band of the spherical harmonics that was rendered.
 
     Raises:
@@ -39,7 +38,7 @@ def step(adam: torch.optim.Adam, camera: Camera | None = None, sh_degree: int = 
     beta1, beta2 = adam.defaults["betas"]
     groups = {group["name"]: group for group in adam.param_groups}
     if camera is not None and groups["sh0"]["params"][0].grad is not None:
-        # Before the means move: directions of view are those of the render.
+        # Before the means move: the directions of view must be the render's.
         _step_harmonics(adam, groups, camera, sh_degree)
     entries, changed = [], []
     for name, group in groups.items():

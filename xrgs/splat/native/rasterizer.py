@@ -1,8 +1,8 @@
 """The compiled rasterizer (`xrgs/csrc/raster`) as a torch operation.
 
 It renders the same image as `xrgs.splat.torch.rasterizer`, many times faster, in float32 on the
-CPU. What a forward pass keeps for its backward pass lives in a `Frame`, whose memory is used again
-by the next render.
+CPU. A `Frame` holds what a forward pass keeps for its backward pass; the next render uses its
+memory again.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from xrgs import _native
 from xrgs.splat.cameras import Camera
 from xrgs.splat.gaussians import PARAMETERS, ActivatedGaussians
 from xrgs.splat.native.arguments import require_float32
-from xrgs.splat.render_result import Render
+from xrgs.splat.rendering import Render
 from xrgs.splat.settings import CullingOptions, RasterSettings
 
 _TILE = 16
@@ -37,10 +37,10 @@ def render(
     sh_degree: int,
     means2d_offset: Tensor | None,
 ) -> Render:
-    """Render Gaussians into one view as `xrgs.splat.rasterize.rasterize_parameters` does.
+    """Render Gaussians into one view as `xrgs.splat.rendering.rasterize_parameters` does.
 
-    Uses as many threads as torch (`torch.set_num_threads`); the result is bitwise the same for any
-    number of them.
+    It uses as many threads as torch (`torch.set_num_threads`). The result has the same bits for any
+    number of threads.
 
     Args:
         gaussians: N Gaussians, float32, whose shapes have been checked.
@@ -51,13 +51,13 @@ def render(
 
     Returns:
         The render, once differentiable in every parameter and the offset. Its backward pass raises
-        ValueError where a gradient that is asked for is not finite, and names the parameter or, if
-        that is where it comes from, `v_image` or `v_alpha`.
+        ValueError if a needed gradient is not finite. The message names the parameter, or the
+        incoming gradient, `v_image` or `v_alpha`, if this is not finite already.
 
     Raises:
         ValueError: A parameter is not float32 on the CPU, or has values that are not finite or out
-            of range; or float32 can't hold a number of the camera or the settings. Harmonics are
-            read, and so checked, for visible Gaussians only.
+            of range; or float32 cannot hold a number of the camera or the settings. Harmonics are
+            only checked for visible Gaussians.
         MemoryError: The tile lists of the view do not fit in memory.
     """
     return render_culled(gaussians, camera, settings, sh_degree, means2d_offset, CullingOptions())
@@ -73,23 +73,8 @@ def render_culled(
 ) -> Render:
     """Render as `render` does, with some kinds of culling off, so that these can be measured.
 
-    The image is the same and takes longer. Without `out_of_view` or `sub_threshold`, what these
-    would cull counts as visible.
-
-    Args:
-        gaussians: N Gaussians, float32, whose shapes have been checked.
-        camera: The view.
-        settings: How Gaussians become pixels.
-        sh_degree: Highest band of the spherical harmonics that is on.
-        means2d_offset: [N, 2] px, added to the projected means; None for zeros.
-        culling: The kinds of culling that are on.
-
-    Returns:
-        The render, once differentiable in every parameter and the offset.
-
-    Raises:
-        ValueError: As for `render`.
-        MemoryError: As for `render`.
+    The image is the same and takes longer. Without `out_of_view` or `sub_threshold`, the Gaussians
+    that these would cull count as visible.
     """
     require_float32("means", gaussians.means)
     frame = _native.Frame()
@@ -108,19 +93,10 @@ def render_culled(
 def render_config(
     camera: Camera, settings: RasterSettings, sh_degree: int, culling: CullingOptions
 ) -> _native.RenderConfig:
-    """Return a view and settings as the compiled rasterizer takes them.
-
-    Args:
-        camera: The view.
-        settings: How Gaussians become pixels.
-        sh_degree: Highest band of the spherical harmonics that is on.
-        culling: The kinds of culling that are on.
-
-    Returns:
-        The config of `_native.Frame.forward`.
+    """Return the config of `_native.Frame.forward`.
 
     Raises:
-        ValueError: A number of the view or the settings is one that float32 does not hold.
+        ValueError: float32 cannot hold a number of the camera or the settings.
     """
     K = camera.K
     return _native.RenderConfig(

@@ -23,9 +23,9 @@ class BandedMatrix(NamedTuple):
 def resize(image: Tensor, height: int, width: int) -> Tensor:
     """Resample an image as `xrgs.splat.resample.resize` does; once differentiable.
 
-    The gradient is the product with the exact transpose. Image and gradient are bitwise the same
-    for any number of threads. A value that is not finite reaches only the samples in which its
-    pixel has a weight.
+    The gradient is the product with the exact transpose. Image and gradient have the same bits for
+    any number of threads. A value that is not finite reaches only the samples in which its pixel
+    has a weight.
 
     Args:
         image: [H, W, 3] float32 on the CPU, of any strides.

@@ -7,24 +7,10 @@ from torch import Tensor
 
 
 def exp(x: Tensor) -> Tensor:
-    """Return e^x: scales of their natural logarithms.
-
-    Args:
-        x: A tensor of any shape.
-
-    Returns:
-        A tensor of the same shape and type, differentiable.
-    """
+    """Return e^x: scales from their natural logarithms."""
     return torch.exp(x)
 
 
 def logistic(x: Tensor) -> Tensor:
-    """Return 1 / (1 + e^-x): opacities of their logits.
-
-    Args:
-        x: A tensor of any shape.
-
-    Returns:
-        A tensor of the same shape and type, differentiable.
-    """
+    """Return 1 / (1 + e^-x): opacities from their logits."""
     return torch.sigmoid(x)

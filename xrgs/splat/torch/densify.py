@@ -20,8 +20,7 @@ def accumulate_statistics(
     Args:
         means2d_grad: [N, 2] gradient of the loss by the projected means, per px.
         visible: [N] bool; Gaussians that are not visible add nothing, whatever their gradient.
-        half_size: Half the view's width and height, px, which bring the gradient to normalised
-            device units.
+        half_size: Half the view's width and height, px: the factors to normalised device units.
         grad2d_sum: [N] to which the gradients' norms are added in place.
         visible_count: [N] to which 1 is added in place where visible.
     """

@@ -39,8 +39,8 @@ def dissimilarity_map(image: Tensor, target: Target) -> Tensor:
     `fused_ssim(padding="valid")`.
 
     SSIM is luminance times structure. Where the image is almost its target both are almost 1, and
-    in float32 their difference from 1 would be rounding. They are computed from the moments of the
-    difference d = x - t of image and target instead, in which nothing cancels:
+    in float32 their difference from 1 would be rounding. So that nothing cancels, the differences
+    are computed from the moments of d = x - t, the difference of image and target:
 
         1 - luminance = E[d]^2 / (mean_x^2 + mean_t^2 + C1)
         1 - structure = var_d / (var_x + var_t + C2), where var_x = var_t + 2 cov(t, d) + var_d
@@ -51,8 +51,7 @@ def dissimilarity_map(image: Tensor, target: Target) -> Tensor:
         target: The photograph, of the same shape and type.
 
     Returns:
-        [H - 10, W - 10, 3], in 0..2 but for rounding, each value that of the window around the
-        pixel.
+        [H - 10, W - 10, 3], one value for each window, in 0..2 but for rounding.
     """
     difference = image - target.image
     products = torch.cat(
@@ -60,7 +59,7 @@ def dissimilarity_map(image: Tensor, target: Target) -> Tensor:
     )  # [H, W, 9]
     mean, square, product = window_mean(products).chunk(3, dim=-1)  # [H - 10, W - 10, 3] each
     covariance = product - target.mean * mean
-    # Rounding makes the variance of a flat image negative; far outside 0..1 that could outgrow C2.
+    # Rounding makes the variance of a flat image negative, and far outside 0..1 below -C2.
     variance = (square - mean * mean).clamp_min(0)
     image_variance = (target.variance + 2 * covariance + variance).clamp_min(0)
     image_mean = target.mean + mean

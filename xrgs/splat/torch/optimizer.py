@@ -18,8 +18,8 @@ def step(adam: torch.optim.Adam, camera: Camera | None = None, sh_degree: int = 
 
     Args:
         adam: Named groups of one parameter each.
-        camera: The view that the gradients come from; with it shN moves, too, by the gradient that
-            sh0's implies (`SplatOptimizer.step`).
+        camera: The view that the gradients come from; None leaves shN as it is, unless it has a
+            gradient (`SplatOptimizer.step`).
         sh_degree: Highest band of the spherical harmonics that was rendered.
     """
     if camera is not None:

@@ -1,9 +1,8 @@
-"""Projection of Gaussians to ellipses on the image plane, and culling of those out of view.
+"""Projection of Gaussians to ellipses on the image plane, and culling.
 
-Elliptical weighted averaging [zwicker2001] as 3D Gaussian Splatting has it (Kerbl et al.
-2023, section 4, equations 5 and 6) and as gsplat 1.5 computes it (`_fully_fused_projection` of
-`cuda/_torch_impl.py`). The one difference is that the determinant and the quadratic form are
-written so that nothing cancels in float32.
+Elliptical weighted averaging [zwicker2001], as in 3D Gaussian Splatting [kerbl2023, section 4,
+equations 5 and 6] and in gsplat 1.5 (`_fully_fused_projection` of `cuda/_torch_impl.py`). The one
+difference: the determinant and the quadratic form are written so that nothing cancels in float32.
 """
 
 from __future__ import annotations
@@ -18,8 +17,8 @@ from xrgs.splat.quaternions import rotation_matrices
 from xrgs.splat.settings import RasterSettings
 
 CLAMP_MARGIN = 0.3
-"""Share of half the field of view by which the Jacobian's point may lie beyond the image (gsplat
-holds it within 1.3 tan(fov / 2))."""
+"""Share of half the field of view by which the point of the Jacobian may lie outside the image
+(gsplat: within 1.3 tan(fov / 2))."""
 
 
 class ProjectedGaussians(NamedTuple):

@@ -1,7 +1,7 @@
 """The reference rasterizer: 3D Gaussian Splatting in plain torch, with gradients by autograd.
 
-Every faster rasterizer is tested against it, so it runs in any floating type. Compositing is that
-of gsplat's CUDA kernels.
+The native rasterizer is tested against it, so it runs in any floating type. It composites as
+gsplat's CUDA kernels do.
 
 A render finds the visible Gaussians, front to back; projects them; lists for every tile the
 Gaussians that reach it; and composites tiles in padded batches of similar list length.
@@ -18,7 +18,7 @@ from torch.utils.checkpoint import checkpoint
 
 from xrgs.splat.cameras import Camera
 from xrgs.splat.gaussians import ActivatedGaussians
-from xrgs.splat.render_result import Render
+from xrgs.splat.rendering import Render
 from xrgs.splat.settings import RasterSettings
 from xrgs.splat.sh import sh_to_colors
 from xrgs.splat.torch.projection import (
@@ -34,7 +34,7 @@ TILE = 8
 """Side of a tile, px. Any gives the same image; 8 was the fastest of 4, 8 and 16 in torch."""
 
 BATCH_ELEMENTS = 1 << 18
-"""Alpha values of a batch of tiles: 1 MB in float32, so that a pass stays in the cache."""
+"""Alpha values in a batch of tiles: 1 MB in float32, so that a pass stays in the cache."""
 
 _LOG_OPACITY = 5
 """Column of the log opacity among the attributes of a Gaussian."""
@@ -47,7 +47,7 @@ def render(
     sh_degree: int,
     means2d_offset: Tensor | None,
 ) -> Render:
-    """Render Gaussians into one view as `xrgs.splat.rasterize.rasterize_parameters` does.
+    """Render Gaussians into one view as `xrgs.splat.rendering.rasterize_parameters` does.
 
     Args:
         gaussians: N Gaussians of one floating type, whose checks have passed.
@@ -101,8 +101,8 @@ def _project_visible(
 
     Returns:
         Their indices [M], the projected Gaussians, and the attributes that compositing reads:
-        [M, 9] x, y, the Cholesky factor of the conic, log opacity, colour; with absgrad [M, 11],
-        the offset, whose value is zero, behind them.
+        [M, 9] x, y, the Cholesky factor of the conic, log opacity, colour; with absgrad [M, 11]:
+        the offset, of value zero, comes last.
     """
     means, quats, scales, opacities, sh0, shN = gaussians
     # With absgrad the means hold the offset's value, and pixels its gradient: see `_PixelOffset`.
@@ -116,8 +116,8 @@ def _project_visible(
     with torch.no_grad():
         in_front = torch.nonzero(depths(means, camera) > settings.near)[:, 0]
         ids = in_front[visible_by_depth(project_some(in_front), camera, settings)]  # [M]
-    # Projected again rather than masked: what is behind the camera or overflows must stay out of
-    # the graph, where its gradient would be 0 * inf.
+    # Projected again, not masked: a Gaussian that is behind the camera or overflows must stay out
+    # of the graph, where its gradient would be 0 * inf.
     projected = project_some(ids)
     dirs = normalize(means[ids] - camera.position.to(means), dim=-1)  # [M, 3]
     colors = sh_to_colors(sh_degree, dirs, sh0[ids], shN[ids])  # [M, 3]
@@ -163,18 +163,14 @@ def _composite_batches(
 
 
 def alpha_bytes(itemsize: int, *, absgrad: bool = False) -> int:
-    """Return the bytes an alpha value that `composite` keeps for its backward pass.
-
-    These are u, the exponential, alpha, 1 - alpha, the transmittances before and behind, weights,
-    and two masks; with absgrad also v and the two coordinates of the offset.
+    """Return the bytes that `composite` keeps for backward, for each pixel and Gaussian of a batch.
 
     Args:
         itemsize: Bytes of one number of the floating type.
         absgrad: Whether pixels have offsets of their own.
-
-    Returns:
-        Bytes for each (pixel, Gaussian) pair of a batch.
     """
+    # u, the exponential, alpha, 1 - alpha, the transmittances before and behind, weights, and two
+    # masks; with absgrad also v and the two coordinates of the offset.
     return (10 if absgrad else 7) * itemsize + 2
 
 
@@ -203,8 +199,8 @@ def composite(entries: Tensor, corner: Tensor, tile: int, settings: RasterSettin
 
     Args:
         entries: [B, K, 9] attributes of each tile's Gaussians, front to back: x, y, the Cholesky
-            factor of the conic, log opacity, colour; with absgrad [B, K, 11], the offset, whose
-            value is zero, behind them.
+            factor of the conic, log opacity, colour; with absgrad [B, K, 11]: the offset, of value
+            zero, comes last.
         corner: [B, 2] top left corner of each tile, px.
         tile: Side of a tile, px.
         settings: The cut-offs.
@@ -227,7 +223,7 @@ def composite(entries: Tensor, corner: Tensor, tile: int, settings: RasterSettin
     alpha = alpha.flatten(2)  # [B, K, tile^2]
     alpha = torch.where(alpha < settings.alpha_min, 0.0, alpha)
 
-    # The product goes on falling behind the pixel's end: what is composited is exactly a prefix.
+    # The product only falls, so the composited Gaussians are exactly a prefix of the list.
     behind = torch.cumprod(1 - alpha, dim=1)  # [B, K, tile^2] transmittance behind each
     before = torch.cat([torch.ones_like(behind[:, :1]), behind[:, :-1]], dim=1)
     weights = torch.where(behind > settings.transmittance_min, alpha * before, 0.0)

@@ -1,8 +1,7 @@
 """The Gaussians that each tile of the image composites, and tiles grouped into batches.
 
-The tiles of 3D Gaussian Splatting [kerbl2023, section 6] (gsplat's `_isect_tiles`). Where
-those list every tile that a bounding box overlaps, these find the ellipse's extent in each row of
-tiles.
+The tiles of 3D Gaussian Splatting [kerbl2023, section 6] (gsplat's `_isect_tiles`). gsplat lists
+every tile that a bounding box overlaps; here the lists follow the ellipse in each row of tiles.
 """
 
 from __future__ import annotations
@@ -17,7 +16,7 @@ from xrgs.splat.settings import RasterSettings
 from xrgs.splat.torch.projection import ProjectedGaussians, cutoff_radius_sq
 
 MAX_PAIRS = 1 << 27
-"""Number of (tile, Gaussian) pairs that fit in memory: some 80 bytes each, so 10 GB."""
+"""Largest number of (tile, Gaussian) pairs: at some 80 bytes each, 10 GB."""
 
 RADIUS_MARGIN = 0.01
 """Added to the squared cutoff radius (in standard deviations), so that rounding drops no pixel."""
@@ -25,7 +24,7 @@ RADIUS_MARGIN = 0.01
 
 @dataclass(frozen=True)
 class TileGrid:
-    """The square tiles that cover an image; those of the last row and column may overhang it."""
+    """The square tiles that cover an image; the last row and column may overhang it."""
 
     width: int  # px
     height: int  # px

@@ -1,17 +1,19 @@
-"""The components of XR-GS [xrgs], one file each, and the hooks by which training calls them.
+"""The components of XR-GS [xrgs], and the hooks by which training calls them.
 
-A component that is off is not built, so that the baseline executes none of its code. Each class
-decides by `Component.from_settings` whether the config switches it on. What the paper leaves open
-is fixed in the docstrings of the components, under "our choice where the paper is silent".
+A component that is off is not even imported, so that the baseline executes none of its code. What
+the paper leaves open is fixed in the docstrings of the components, under "our choice where the
+paper is silent".
 
-A component of another package needs no change here: `xrgs.training.plugins` finds it by its entry
-point. CONTRIBUTING.md says how to write either kind.
+`xrgs.training.registry` lists the components. A component of another package is not in it:
+`xrgs.training.plugins` finds it by its entry point. CONTRIBUTING.md says how to write either kind.
 """
 
 from __future__ import annotations
 
+from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
+from xrgs.config import is_on
 from xrgs.errors import XrgsError
 from xrgs.training import plugins
 from xrgs.training.components.base import (
@@ -23,20 +25,9 @@ from xrgs.training.components.base import (
     check_not_negative,
 )
 from xrgs.training.components.combined import Components
-from xrgs.training.components.consistency import Consistency
-from xrgs.training.components.curriculum import Curriculum
-from xrgs.training.components.densify import Densify
-from xrgs.training.components.gradient_scaling import GradientScaling
-from xrgs.training.components.mip import Mip
-from xrgs.training.components.natural_selection import NaturalSelection
-from xrgs.training.components.render_scale import RenderScale
-from xrgs.training.components.resolution_schedule import ResolutionSchedule
-from xrgs.training.components.skip_backward import SkipBackward
-from xrgs.training.components.supersampled import Supersampled
-from xrgs.training.components.view_scores import ErrorScore, MultiviewScore
-from xrgs.training.components.weighting import Weighting
+from xrgs.training.registry import BUILT_IN, ComponentEntry
 
-if TYPE_CHECKING:  # xrgs.config loads Hydra, which training does without
+if TYPE_CHECKING:
     from collections.abc import Mapping
 
     from xrgs.capture.dataset import Dataset
@@ -53,25 +44,6 @@ __all__ = [
     "check_not_negative",
 ]
 
-#: The class that each key of `components` builds, in the order in which their hooks run. Weighting
-#: follows consistency, because the weight of a view multiplies its consistency loss as well. The
-#: keys that only change the weight of a view are read by `Weighting`.
-BUILT_IN: Mapping[str, type[Component]] = {
-    "consistency": Consistency,
-    "loss_weighting": Weighting,
-    "gradient_scaling": GradientScaling,
-    "densify": Densify,
-    "curriculum": Curriculum,
-    "mip": Mip,
-    "render_scale": RenderScale,
-    "supersampled": Supersampled,
-    "resolution_schedule": ResolutionSchedule,
-    "skip_backward": SkipBackward,
-    "multiview_score": MultiviewScore,
-    "error_score": ErrorScore,
-    "natural_selection": NaturalSelection,
-}
-
 
 def build(
     conf: ComponentsConf, data: Dataset, splat: SplatConf, backend: str = "torch", seed: int = 0
@@ -86,16 +58,26 @@ def build(
         seed: `seed` of the config.
 
     Returns:
-        The built-in components that are on, then those of other packages by their names.
+        The built-in components that are on, then other packages' components by their names.
 
     Raises:
         XrgsError: A value is out of its range, a view is too small for its paired target, a
             component has no view or weight to act on, or a plugin cannot be used.
     """
     setup = TrainingSetup(conf, data, splat, backend, seed)
-    built = [kind.from_settings(getattr(conf, key), setup) for key, kind in BUILT_IN.items()]
+    built = [
+        _import(entry).from_settings(getattr(conf, key), setup)
+        for key, entry in BUILT_IN.items()
+        if any(is_on(getattr(conf, name)) for name in (key, *entry.reads))
+    ]
     built += [_build_plugin(name, values, setup) for name, values in sorted(conf.plugins.items())]
     return Components(component for component in built if component is not None)
+
+
+def _import(entry: ComponentEntry) -> type[Component]:
+    module = import_module(f"{__name__}.{entry.module}")
+    component: type[Component] = getattr(module, entry.name)
+    return component
 
 
 def _build_plugin(name: str, values: Mapping[str, Any], setup: TrainingSetup) -> Component | None:

@@ -1,22 +1,28 @@
-"""The interface of a component: the hooks that training calls, in the order of a step.
+"""The interface of a component: the hooks that training calls.
 
-One step of training runs these hooks, each for every component that is on:
+Before the first step training calls `densification_groups`, `before_training` and
+`on_gaussians_changed`. Then every step calls these hooks of each component that is on, in this
+order:
 
-1. `allows_view` while the sampler chooses the step's view, then `training_views` on all views,
-2. `before_render` on the activated Gaussians and `render_camera` on the view's camera, then the
-   view is rendered, and `to_photograph` brings the render to the size of the photograph,
-3. `pixel_weights` for the photometric loss, then `modify_loss` on that loss, then `needs_backward`,
-4. backward, then `after_backward` on the gradients of the parameters, then the optimizer steps,
-5. `densification_grad2d` on the image-plane gradient, then densification reads it; at its
-   refinements `may_grow` and, where a budget leaves room for some Gaussians only, `growth_scores`,
-6. `on_gaussians_changed` where densification has added, removed or reset Gaussians,
-7. `to_prune`, and `on_gaussians_changed` where that has removed Gaussians.
+1. `allows_view`: may the sampler choose this view?
+2. `training_views`: the cameras and photographs of this step,
+3. `render_camera`: the camera of the render,
+4. `before_render`: the Gaussians of the render, which follows,
+5. `to_photograph`: the render at the size of the photograph,
+6. `pixel_weights`: the weights of the pixels in the photometric loss, which follows,
+7. `modify_loss`: further terms and factors of the loss,
+8. `needs_backward`: is the loss worth a backward pass? It follows.
+9. `after_backward`: the gradients of the parameters, before the optimizer's step, which follows,
+10. `densification_grad2d`: the image-plane gradient that densification reads,
+11. `may_grow`: at a refinement, which Gaussians may grow,
+12. `growth_scores`: at a refinement with a budget, which Gaussians grow first,
+13. `opacity_attenuation`: at a reset of the opacities,
+14. `on_gaussians_changed`: after a refinement or a reset that changed anything,
+15. `to_prune`: further Gaussians to remove,
+16. `on_gaussians_changed`: after that has removed any.
 
-A step that needs no backward pass leaves out 4 and `densification_grad2d`.
-
-`densification_groups` and `before_training` are called once before the first step,
-`opacity_attenuation` where densification resets opacities, `bake` wherever the Gaussians are
-evaluated or saved, and `after_training` once after the last step.
+A step without a backward pass leaves out 9 and 10. After the last step training calls `bake` and
+`after_training`; `bake` also runs on a copy of the Gaussians wherever they are evaluated.
 """
 
 from __future__ import annotations
@@ -28,7 +34,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, Protocol, Self
 from xrgs.errors import XrgsError
 from xrgs.splat.settings import NOMINAL_STEPS
 
-if TYPE_CHECKING:  # xrgs.config loads Hydra, which training does without
+if TYPE_CHECKING:
     from collections.abc import Mapping
 
     from torch import Tensor
@@ -37,8 +43,8 @@ if TYPE_CHECKING:  # xrgs.config loads Hydra, which training does without
     from xrgs.config import ComponentsConf, SplatConf
     from xrgs.splat.cameras import Camera
     from xrgs.splat.gaussians import ActivatedGaussians, Gaussians
-    from xrgs.splat.refinement import Groups
     from xrgs.splat.settings import DensifySettings
+    from xrgs.splat.strategy.refinement import Groups
 
 
 class TrainingView(Protocol):
@@ -62,7 +68,7 @@ class TrainingView(Protocol):
 
     @property
     def image(self) -> Tensor:
-        """The photograph [H, W, 3] in 0..1, at the size at which the view is rendered."""
+        """The photograph [H, W, 3] in 0..1."""
 
 
 @dataclass(frozen=True)
@@ -74,10 +80,10 @@ class Step:
     total: int
     """The number of steps of the whole run."""
     view: TrainingView
-    """The view that the step renders, as `training_views` has left it."""
+    """The view that the step renders, as `training_views` returned it."""
     log: dict[str, float] = field(default_factory=dict, compare=False)
-    """Values that components record of the step, by column names `<component>.<quantity>`. A row of
-    history.csv has the mean of each over the steps since the row before that recorded it."""
+    """Values that components record, by column names `<component>.<quantity>`. A row of history.csv
+    has the mean of each column over the steps since the row before that recorded it."""
 
     @property
     def nominal(self) -> float:
@@ -86,16 +92,16 @@ class Step:
 
 
 class ViewRenderer(Protocol):
-    """What renders training views, as components see it; `xrgs.training.rendering` has it.
+    """Renders training views for components (`xrgs.training.rendering.StepRenderer`).
 
-    The work and the time that it takes are the run's.
+    Its work and its time count as the run's.
     """
 
     def photograph(self, gaussians: Gaussians, step: Step) -> Tensor:
         """Render the step's view as it is compared with its photograph: [H, W, 3], no graph."""
 
     def attribute(self, pixels: Tensor, gaussians: Gaussians, step: Step) -> Tensor:
-        """Sum a map [H, W] of the view's photograph over what each Gaussian shows of it: [N]."""
+        """Sum a map [H, W] of the step's view over the weights of each Gaussian in it: [N]."""
 
 
 @dataclass(frozen=True)
@@ -142,9 +148,9 @@ class Component:
         raise NotImplementedError(f"{cls.__name__} does not define from_settings")
 
     def before_training(self, renderer: ViewRenderer) -> None:
-        """Keep what renders training views, for a component that looks at more than the step's own.
+        """Take the renderer, for a component that renders other views than the step's own.
 
-        Training calls it once, before the first step, or before the first after a checkpoint.
+        Training calls it once, before the first step or the first step after a checkpoint.
 
         Args:
             renderer: Renders any training view with all components of the run.
@@ -152,9 +158,6 @@ class Component:
 
     def allows_view(self, step: Step) -> bool:
         """Decide whether training may sample the step's view at that step.
-
-        Args:
-            step: The step with the view in question.
 
         Returns:
             False excludes the view. The sampler skips it, and leaves it out of epochs that begin
@@ -168,18 +171,17 @@ class Component:
     ) -> Mapping[str, TrainingView]:
         """Choose the cameras and the photographs that training uses at this step.
 
-        All that comes after it sees a view of those that it returns as the step's view. They must
-        be a function of the number of the step alone, so that a run that is continued has the same
-        ones. What the loss prepares of a photograph is kept while the same tensor comes back.
+        All later hooks see a view of the result as the step's view. The result must depend on the
+        number of the step alone, so that a continued run has the same views.
 
         Args:
-            views: All training views by name, or what the components before this one made of them.
-            step: The step with its view as it was sampled.
+            views: All training views by name, as the components before this one changed them.
+            step: The step with the sampled view.
 
         Returns:
-            Views of the same names and tags, each with a photograph of its camera's size; `views`
-            itself where nothing is changed, and the same object as at the step before where
-            nothing has changed since.
+            Views of the same names and tags, each with a photograph of its camera's size: `views`
+            itself if nothing is changed, the same object as at the step before if nothing has
+            changed since. The loss prepares a photograph anew if its tensor is another one.
         """
         del step
         return views
@@ -188,11 +190,11 @@ class Component:
         """Change the Gaussians for this step's render alone.
 
         Args:
-            activated: N Gaussians with their scales in world units and their opacities in 0..1.
+            activated: N Gaussians with scales in world units and opacities in 0..1.
             step: The step with its view.
 
         Returns:
-            The N Gaussians to render, differentiable in those given.
+            The N Gaussians to render, differentiable in `activated`.
         """
         del step
         return activated
@@ -201,11 +203,11 @@ class Component:
         """Choose the camera that the step's view is rendered with.
 
         Args:
-            camera: The camera of the view, or what the components before this one made of it.
+            camera: The camera of the view, as the components before this one changed it.
             step: The step with its view.
 
         Returns:
-            A camera that shows the same at any size in px.
+            A camera with the same view, of any size in px.
         """
         del step
         return camera
@@ -213,28 +215,21 @@ class Component:
     def to_photograph(self, image: Tensor, step: Step) -> Tensor:
         """Bring a render to the size of the photograph, as the photograph was formed.
 
-        A component that changes the size in `render_camera` brings it back here.
+        A component that changes the size in `render_camera` restores it here. Components are called
+        in reverse order.
 
         Args:
-            image: The render [h, w, 3] of the step's view, or what the components behind this one
-                made of it: they are called in reverse order.
+            image: The render [h, w, 3], as the components after this one changed it.
             step: The step with its view.
 
         Returns:
-            The image [H, W, 3] that is compared with the photograph, differentiable in `image`.
+            The image [H, W, 3] that is compared with the photograph, linear in `image`.
         """
         del step
         return image
 
     def pixel_weights(self, step: Step) -> Tensor | None:
-        """Weight the pixels of the view in the photometric loss.
-
-        Args:
-            step: The step with its view.
-
-        Returns:
-            Weights [H, W] of the view's pixels, or None where every pixel has weight 1.
-        """
+        """Return weights [H, W] of the pixels in the photometric loss; None if all are 1."""
         del step
         return None
 
@@ -242,13 +237,13 @@ class Component:
         """Change the loss before backward, by a further term or a factor.
 
         Args:
-            loss: Scalar; the photometric loss as the components before this one have changed it.
+            loss: Scalar; the photometric loss, as the components before this one changed it.
             image: [H, W, 3] render of the view at the photograph's size, not clamped to 0..1.
-            gaussians: The N Gaussians that are trained; a term may depend on their parameters.
+            gaussians: The N trained Gaussians; a term may depend on their parameters.
             step: The step with its view.
 
         Returns:
-            The scalar to call backward on.
+            The changed loss, a scalar.
         """
         del image, gaussians, step
         return loss
@@ -264,7 +259,7 @@ class Component:
 
         Returns:
             False leaves out the backward pass, the optimizer's step and the step's part in the
-            statistics of densification. Schedules go on, that of the rate of the means too.
+            statistics of densification. Schedules go on, the decay of the learning rate too.
         """
         del loss, step
         return True
@@ -273,8 +268,8 @@ class Component:
         """Change the gradients of the parameters in place, before the optimizer reads them.
 
         Args:
-            gaussians: The N Gaussians with their gradients. A change of the gradient of `shN` has
-                no effect: the optimizer computes it from the gradient of `sh0`.
+            gaussians: N Gaussians with their gradients. A change of the gradient of `shN` has no
+                effect: the optimizer computes it from the gradient of `sh0`.
             step: The step with its view.
         """
 
@@ -286,49 +281,38 @@ class Component:
             step: The step with its view.
 
         Returns:
-            The gradient [N, 2] that densification reads in its place.
+            The gradient [N, 2] for densification.
         """
         del step
         return grad2d
 
     def densification_groups(self, settings: DensifySettings) -> Groups | None:
-        """Give groups of views their own thresholds of densification and pruning.
+        """Return thresholds of densification and pruning by the views' tags, or None.
 
         Training calls it once, before the first step. At most one component may return groups.
 
         Args:
             settings: The settings of densification.
-
-        Returns:
-            The thresholds by the views' tags, or None to leave densification as it is.
         """
         del settings
         return None
 
     def may_grow(self, gaussians: Gaussians, step: Step) -> Tensor | None:
-        """Choose which Gaussians densification may grow, of those above its growth threshold.
+        """Choose which of the Gaussians above the growth threshold may grow.
 
-        Training asks at a refinement alone, before anything is grown or removed.
-
-        Args:
-            gaussians: The N Gaussians.
-            step: The step with its view.
+        Training calls it at refinements, before anything grows.
 
         Returns:
-            [N] bool, or None where all of them may.
+            [N] bool, or None if all Gaussians may grow.
         """
         del gaussians, step
         return None
 
     def growth_scores(self, gaussians: Gaussians, step: Step) -> Tensor | None:
-        """Rank Gaussians where a budget leaves room for some of those that would grow.
+        """Rank the Gaussians that would grow where a budget leaves room for some of them.
 
-        Training asks at such a refinement alone, before anything is grown or removed. Those of the
-        highest score grow.
-
-        Args:
-            gaussians: The N Gaussians.
-            step: The step with its view.
+        Training calls it at such refinements alone, before anything grows. The Gaussians with the
+        highest scores grow.
 
         Returns:
             Scores [N] of at least 0; None ranks by the mean image-plane gradient.
@@ -337,32 +321,25 @@ class Component:
         return None
 
     def to_prune(self, gaussians: Gaussians, step: Step) -> Tensor | None:
-        """Choose Gaussians to remove, whatever densification does with the others.
+        """Choose further Gaussians to remove.
 
-        Training asks after every step, also when densification has stopped already. The components
-        have been told of what densification changed in this step.
-
-        Args:
-            gaussians: The N Gaussians.
-            step: The step with its view.
+        Training calls it in every step, also after densification has stopped. If densification
+        changed the Gaussians in this step, `on_gaussians_changed` was called before.
 
         Returns:
-            [N] bool, or None where all of them stay.
+            [N] bool, or None if all Gaussians stay.
         """
         del gaussians, step
         return None
 
     def opacity_attenuation(self, gaussians: Gaussians) -> Tensor | None:
-        """Tell by how much `before_render` lowers opacities in every view.
+        """Tell by which factors `before_render` lowers opacities in every view.
 
-        Training asks when it resets the opacities, with Gaussians that `on_gaussians_changed` has
-        not been told of yet.
-
-        Args:
-            gaussians: The N Gaussians.
+        Training calls it when it resets opacities. If the step was a refinement too,
+        `on_gaussians_changed` has not been called yet.
 
         Returns:
-            Factors [N] above 0 and at most 1, or None where opacities stay as they are.
+            Factors [N] above 0 and at most 1, or None if opacities are not lowered.
         """
         del gaussians
         return None
@@ -372,33 +349,23 @@ class Component:
 
         Training calls it before the first step, and whenever densification or `to_prune` has
         added, removed or reset Gaussians.
-
-        Args:
-            gaussians: The N Gaussians as they are now.
         """
 
     def bake(self, gaussians: Gaussians) -> None:
-        """Make what `before_render` does in every view part of the Gaussians, in place.
+        """Apply to the Gaussians, in place, what `before_render` does in every view.
 
-        It is called on the trained Gaussians before they are saved, and on a copy of them whenever
-        they are evaluated during training.
-
-        Args:
-            gaussians: The N Gaussians.
+        Training calls it on the trained Gaussians before they are saved, and on a copy of the
+        Gaussians whenever they are evaluated during training.
         """
 
     def after_training(self, gaussians: Gaussians) -> None:
-        """Look at the trained Gaussians, before they are saved.
-
-        Args:
-            gaussians: The N trained Gaussians.
-        """
+        """Look at the trained Gaussians before they are saved."""
 
     def state_dict(self) -> dict[str, Any]:
         """Return what the steps so far have changed in the component, for a checkpoint.
 
         Returns:
-            Tensors and JSON values by name; empty for a component without state.
+            Tensors and JSON values by name; empty if there is no state.
         """
         return {}
 
@@ -415,14 +382,6 @@ class Component:
 
 
 def check_not_negative(key: str, value: float) -> None:
-    """Check that a setting is a finite number of at least 0.
-
-    Args:
-        key: The key of the setting in the config, for the message.
-        value: The value of the setting.
-
-    Raises:
-        XrgsError: It is not; the message names the key.
-    """
+    """Raise XrgsError, naming the key of the config, unless a value is finite and at least 0."""
     if not (math.isfinite(value) and value >= 0):
         raise XrgsError(f"{key}={value}: must be a finite number, 0 or more")

@@ -1,14 +1,13 @@
-"""All components of a run as one: each hook of `base` combines the answers of the components."""
+"""All components of a run as one: each hook combines the answers of the components."""
 
 from __future__ import annotations
 
 import functools
+import operator
 from typing import TYPE_CHECKING, Any
 
-import torch
-
 from xrgs.errors import XrgsError
-from xrgs.splat.refinement import DensifierHooks
+from xrgs.splat.strategy.refinement import StrategyHooks
 from xrgs.training.components.base import Component
 
 if TYPE_CHECKING:
@@ -18,8 +17,8 @@ if TYPE_CHECKING:
 
     from xrgs.splat.cameras import Camera
     from xrgs.splat.gaussians import ActivatedGaussians, Gaussians
-    from xrgs.splat.refinement import Groups
     from xrgs.splat.settings import DensifySettings
+    from xrgs.splat.strategy.refinement import Groups
     from xrgs.training.components.base import Step, TrainingView, ViewRenderer
 
 
@@ -65,7 +64,7 @@ class Components(tuple[Component, ...]):
 
     def pixel_weights(self, step: Step) -> Tensor | None:
         """The product [H, W] of the components' pixel weights; None where none has any."""
-        return _combined(torch.mul, (c.pixel_weights(step) for c in self))
+        return _combined(operator.mul, (c.pixel_weights(step) for c in self))
 
     def modify_loss(self, loss: Tensor, image: Tensor, gaussians: Gaussians, step: Step) -> Tensor:
         """Apply `Component.modify_loss` of each component in turn."""
@@ -74,7 +73,8 @@ class Components(tuple[Component, ...]):
         return loss
 
     def needs_backward(self, loss: Tensor, step: Step) -> bool:
-        """Whether every component needs the backward pass; all of them are asked."""
+        """Whether every component needs the backward pass."""
+        # A list, so that every component is asked: some count their calls.
         answers = [component.needs_backward(loss, step) for component in self]
         return all(answers)
 
@@ -109,23 +109,23 @@ class Components(tuple[Component, ...]):
 
     def may_grow(self, gaussians: Gaussians, step: Step) -> Tensor | None:
         """Which Gaussians [N] every component lets grow; None where all of them may."""
-        return _combined(torch.logical_and, (c.may_grow(gaussians, step) for c in self))
+        return _combined(operator.and_, (c.may_grow(gaussians, step) for c in self))
 
     def growth_scores(self, gaussians: Gaussians, step: Step) -> Tensor | None:
         """The product [N] of the components' scores; None where none has any."""
-        return _combined(torch.mul, (c.growth_scores(gaussians, step) for c in self))
+        return _combined(operator.mul, (c.growth_scores(gaussians, step) for c in self))
 
     def to_prune(self, gaussians: Gaussians, step: Step) -> Tensor | None:
         """Which Gaussians [N] any component removes; None where all of them stay."""
-        return _combined(torch.logical_or, (c.to_prune(gaussians, step) for c in self))
+        return _combined(operator.or_, (c.to_prune(gaussians, step) for c in self))
 
     def opacity_attenuation(self, gaussians: Gaussians) -> Tensor | None:
         """The product [N] of the components' attenuations; None where none has any."""
-        return _combined(torch.mul, (c.opacity_attenuation(gaussians) for c in self))
+        return _combined(operator.mul, (c.opacity_attenuation(gaussians) for c in self))
 
-    def densifier_hooks(self, step: Step) -> DensifierHooks:
+    def strategy_hooks(self, step: Step) -> StrategyHooks:
         """What the components decide about densification at a step."""
-        return DensifierHooks(
+        return StrategyHooks(
             may_grow=lambda gaussians: self.may_grow(gaussians, step),
             growth_scores=lambda gaussians: self.growth_scores(gaussians, step),
             opacity_attenuation=self.opacity_attenuation,
@@ -165,6 +165,6 @@ class Components(tuple[Component, ...]):
 def _combined(
     combine: Callable[[Tensor, Tensor], Tensor], answers: Iterable[Tensor | None]
 ) -> Tensor | None:
-    """The components' answers made one; None where no component has any."""
+    """Reduce the answers that are not None; None where there is none."""
     given = [answer for answer in answers if answer is not None]
     return functools.reduce(combine, given) if given else None

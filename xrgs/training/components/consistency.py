@@ -20,7 +20,7 @@ from xrgs.training.components.base import (
     check_not_negative,
 )
 
-if TYPE_CHECKING:  # xrgs.config loads Hydra, which training does without
+if TYPE_CHECKING:
     from xrgs.config import ConsistencyConf
     from xrgs.splat.gaussians import Gaussians
 
@@ -36,7 +36,7 @@ class Consistency(Component):
 
     where phi is bicubic resampling to the opposite resolution and I_pair = phi(I) is the paired
     image, computed once for each photograph I. Here w is `weight`, lambda_1 is `l1` and lambda_2 is
-    `ssim`; the L1 term is a mean over pixels and channels, SSIM is that of the photometric loss
+    `ssim`; the L1 term is a mean over pixels and channels, SSIM is as in the photometric loss
     [wang2004].
 
     Our choice where the paper is silent:
@@ -47,19 +47,22 @@ class Consistency(Component):
       makes an HR view `factor` times smaller and an LR view `factor` times larger.
     - The view's weight multiplies L_cons as well (`xrgs.training.components.weighting`). Otherwise
       this term would give back to LR views the influence that loss weighting takes from them.
-    - An LR view is downsampled as an HR view is where its longer side is nearer to that of the HR
-      views than to 1 / `factor` of it. Such views are not small: they are zoomed digitally,
-      compressed, or tagged by distance.
+    - An LR view is downsampled like an HR view if its longer side is nearer to the HR views' than
+      to 1 / `factor` of it. Such views are not small: they are zoomed digitally, compressed, or
+      tagged by distance.
 
     phi is linear, so that phi(I_rend) - phi(I) = phi(I_rend - I): for an LR view the term contains
     no information that the photometric loss lacks, and costs factor^2 times as many pixels.
-    `lr_mode` chooses what happens there. `exact` is the paper's term. `off` leaves LR views out.
-    `fold` adds `weight * l1 * mean |I_rend - I|` at the view's own size, which is what the L1 term
-    would be if phi kept L1 norms, and leaves out the SSIM term. The rows of phi sum to 1 and its
-    columns to factor^2 (to 3% at a corner), so that `fold` equals the exact L1 term where the error
-    keeps its sign. Elsewhere it is larger where signs alternate from pixel to pixel and phi
-    averages them out (1.23 times for white noise at factor 5), and never less than 0.7 times the
-    exact term, since the absolute columns sum to at most 1.19 factor along an axis.
+    `lr_mode` chooses what happens in LR views:
+
+    - `exact` is the paper's term.
+    - `off` leaves LR views out.
+    - `fold` adds `weight * l1 * mean |I_rend - I|` at the view's own size, the L1 term if phi kept
+      L1 norms, and leaves out the SSIM term. The rows of phi sum to 1 and its columns to factor^2
+      (to 3% at a corner), so that `fold` equals the exact L1 term where the error keeps its sign.
+      It is larger where signs alternate from pixel to pixel and phi averages them out (1.23 times
+      for white noise at factor 5). It is never less than 0.7 times the exact term, since the
+      absolute columns sum to at most 1.19 factor along an axis.
     """
 
     def __init__(
@@ -72,7 +75,7 @@ class Consistency(Component):
         """Compute the paired images.
 
         Args:
-            settings: The component's settings.
+            settings: `components.consistency` of the config.
             views: All training views.
             factor: How many times smaller an LR view is than an HR view.
             backend: `torch` or `native`: the implementation of the loss and of the resampling.
@@ -130,7 +133,7 @@ class Consistency(Component):
 
 
 def _paired_target(view: TrainingView, factor: int, hr_long_side: float, backend: str) -> Target:
-    """The photograph at the opposite resolution; `hr_long_side` is the longest of HR views, px."""
+    """The photograph at the opposite resolution; `hr_long_side` is of the largest HR view, px."""
     height, width = view.image.shape[:2]
     if view.tag == "HR" or max(height, width) > hr_long_side / math.sqrt(factor):
         height, width = round(height / factor), round(width / factor)

@@ -14,7 +14,7 @@ from xrgs.training.components.base import (
     check_not_negative,
 )
 
-if TYPE_CHECKING:  # xrgs.config loads Hydra, which training does without
+if TYPE_CHECKING:
     from xrgs.config import CurriculumConf
 
 
@@ -33,15 +33,7 @@ class Curriculum(Component):
     """
 
     def __init__(self, settings: CurriculumConf, views: Sequence[TrainingView]) -> None:
-        """Set the length of the warm-up.
-
-        Args:
-            settings: The component's settings.
-            views: All training views.
-
-        Raises:
-            XrgsError: No view is tagged LR.
-        """
+        """Set the length of the warm-up; XrgsError if none of the training views is tagged LR."""
         if not any(view.tag == "LR" for view in views):
             raise XrgsError(
                 f"components.curriculum.lr_only={settings.lr_only}: there is no LR view to warm up"

@@ -5,10 +5,10 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Self
 
 from xrgs.errors import XrgsError
-from xrgs.splat.refinement import DECIDE, Groups, Thresholds
+from xrgs.splat.strategy.refinement import DECIDE, Groups, Thresholds
 from xrgs.training.components.base import Component, TrainingSetup, check_not_negative
 
-if TYPE_CHECKING:  # xrgs.config loads Hydra, which training does without
+if TYPE_CHECKING:
     from xrgs.config import DensifyConf
     from xrgs.splat.settings import DensifySettings
 
@@ -24,35 +24,28 @@ class Densify(Component):
     HR views have the thresholds of `splat.densify`: `grow_grad2d` 2e-4 in normalised device units,
     `prune_opacity` 0.005. LR views have `lr_grow` and `lr_prune` times those.
 
-    Our choice where the paper is silent: it gives no values, and both factors are 2 in
-    `conf/ablation/densify.yaml`. Nor does it say which thresholds apply at a refinement, whose
+    Our choice where the paper is silent: it gives no values; both factors are 2 in
+    `conf/ablation/densify.yaml`. Nor does it say which thresholds apply at a refinement, where the
     statistics are averages over 100 steps on views of both kinds. `decide` chooses:
 
     - `current_view`, in the ablations `densify` and `xrgs`: all views share one statistic, and the
-      view of the step at which Gaussians are refined sets both thresholds, for all Gaussians. It is
-      the literal reading of sections 5.1 and 5.4.
-    - `per_class`: HR and LR views have separate statistics, and a Gaussian grows where either is
-      above its own threshold. With equal thresholds it is not the identity: either of two means of
-      fewer views is above a threshold more often than the mean of all. The LR prune threshold
+      view of the step at which Gaussians are refined sets both thresholds, for all Gaussians. This
+      is the literal reading of sections 5.1 and 5.4.
+    - `per_class`: HR and LR views have separate statistics, and a Gaussian grows if either is above
+      its own threshold. With equal thresholds this is not the identity: one of two means over fewer
+      views is above a threshold more often than the mean over all views. The LR prune threshold
       applies to Gaussians to which no HR view has contributed an image-plane gradient since the
       last refinement.
-    - `own_threshold`: a Gaussian grows where the mean over all views of its gradient over the
-      view's own threshold is above 1, so that nothing depends on which view the refinement falls
-      on. Pruned as with `per_class`.
+    - `own_threshold`: each view's gradient is divided by the view's own threshold, and a Gaussian
+      grows if the mean over all views is above 1. Nothing depends on the view of the refinement.
+      Pruning is as with `per_class`.
 
     The opacity reset follows the larger prune threshold. Otherwise the refinement after a reset
     would prune every Gaussian to which the larger threshold applies.
     """
 
     def __init__(self, settings: DensifyConf) -> None:
-        """Take the factors and the rule from the settings.
-
-        Args:
-            settings: The component's settings.
-
-        Raises:
-            XrgsError: `decide` is unknown.
-        """
+        """Take the factors and the rule from the settings; XrgsError if `decide` is unknown."""
         if settings.decide not in DECIDE:
             raise XrgsError(
                 f"components.densify.decide={settings.decide}: must be one of nobody,"

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Self
 from xrgs.splat.rounding import rounded_norm
 from xrgs.training.components.base import Component, Step, TrainingSetup, check_not_negative
 
-if TYPE_CHECKING:  # xrgs.config loads Hydra, which training does without
+if TYPE_CHECKING:
     from xrgs.config import GradientScalingConf
     from xrgs.splat.gaussians import Gaussians
 
@@ -39,8 +39,8 @@ class GradientScaling(Component):
     def after_backward(self, gaussians: Gaussians, step: Step) -> None:
         """Multiply the gradient of the log-scales by `lr_scale` in an LR view.
 
-        The norm of the gradient before that is recorded as `gradient_scaling.norm_<tag>`: it shows
-        how much of what moves the scales comes from which views.
+        `gradient_scaling.norm_<tag>` records the norm of the gradient before that: it shows which
+        views move the scales.
         """
         gradient = gaussians.scales.grad
         if gradient is None:

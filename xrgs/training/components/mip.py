@@ -18,7 +18,7 @@ from xrgs.training.components.base import (
     check_not_negative,
 )
 
-if TYPE_CHECKING:  # xrgs.config loads Hydra, which training does without
+if TYPE_CHECKING:
     from xrgs.config import MipConf
     from xrgs.splat.cameras import Camera
     from xrgs.splat.gaussians import ActivatedGaussians, Gaussians
@@ -28,30 +28,30 @@ MARGIN = 0.15
 
 
 class Mip(Component):
-    """Limits Gaussians to the detail that the finest training view which sees them can resolve.
+    """Limits the detail of Gaussians to what the finest training view that sees them resolves.
 
-    Mip-Splatting [yu2024, section 4.1] renders each Gaussian k convolved with an
-    isotropic Gaussian, the 3D smoothing filter:
+    Mip-Splatting [yu2024, section 4.1] renders each Gaussian k convolved with an isotropic
+    Gaussian, the 3D smoothing filter:
 
         Sigma_k <- Sigma_k + (s / nu_k^2) I,
         o_k <- o_k sqrt(|Sigma_k| / |Sigma_k + (s / nu_k^2) I|)
 
     so that its integral stays the same. nu_k, in px per world unit, is the highest sampling rate
     f_i / z_ik of a view i that sees it, with focal length f_i in px and depth z_ik in world units.
-    s is `variance`, in px^2; Mip-Splatting's is 0.2. The paper's code tests visibility with the
-    margin of 15% that is used here as well.
+    s is `variance`, in px^2; Mip-Splatting's is 0.2. Visibility is tested with a margin of 15% of
+    the image, as in the authors' code.
 
     Our choice for mixed resolution: nu_k is the maximum of f_i / z_ik over the views. The authors'
     code divides the largest focal length of all views by the nearest distance. Both are the same
-    where all focal lengths are equal; with LR and HR views the latter combines the distance of one
-    view with the focal length of another. The XR-GS paper has no such filter.
+    where all focal lengths are equal; with LR and HR views the authors' code combines the distance
+    of one view with the focal length of another. The XR-GS paper has no such filter.
 
     The rates are computed anew whenever Gaussians were added or removed, and every `every` steps,
-    since means move (as the authors' code does, the latter only after densification there). A
-    Gaussian that no view sees has the lowest rate of those that are seen, as there; where none is
-    seen, nothing is filtered. Densification reads the parameters without the filter, as there.
-    A reset caps the opacities with the filter, as there. The filter becomes part of the scales and
-    opacities that are evaluated and saved.
+    since means move; the authors' code does the latter only after densification. As in that code, a
+    Gaussian that no view sees gets the lowest rate of the seen Gaussians, densification reads the
+    parameters without the filter, and a reset caps the opacities with the filter. If no Gaussian is
+    seen, nothing is filtered. The filter becomes part of the scales and opacities that are
+    evaluated and saved.
 
     Attributes:
         variance: [N] variance of each Gaussian's filter, s / nu_k^2, in world units squared.
@@ -59,10 +59,10 @@ class Mip(Component):
     """
 
     def __init__(self, settings: MipConf, views: Sequence[TrainingView], near: float) -> None:
-        """Take the cameras; the filter is computed when the Gaussians are there.
+        """Take the cameras; `on_gaussians_changed` computes the filter.
 
         Args:
-            settings: The component's settings.
+            settings: `components.mip` of the config.
             views: All training views.
             near: Depth below which a Gaussian is not rendered, world units.
         """
@@ -85,7 +85,7 @@ class Mip(Component):
     def opacity_attenuation(self, gaussians: Gaussians) -> Tensor:
         """Return the factors [N] by which the filter lowers the opacities."""
         self._update_variance(gaussians.means)
-        # In double, which rounds to one float32 whatever computes its last digits.
+        # In double, since the last digits in float32 depend on the processor.
         scales = gaussians.scales.detach().double().exp()
         _, lowered = smooth(scales, scales.new_ones(len(scales)), self.variance.double())
         return lowered
@@ -97,8 +97,8 @@ class Mip(Component):
     def before_render(self, activated: ActivatedGaussians, step: Step) -> ActivatedGaussians:
         """Apply the filter to scales and opacities; gradients do not reach the filter itself.
 
-        The mean standard deviation and the number of Gaussians that no view sees are recorded as
-        `mip.sigma`, in world units, and `mip.unseen`.
+        `mip.sigma` records the mean standard deviation, in world units, and `mip.unseen` the number
+        of Gaussians that no view sees.
         """
         if step.number % self.every == 0:
             self._update_variance(activated.means)
@@ -109,8 +109,8 @@ class Mip(Component):
 
     @torch.no_grad()
     def bake(self, gaussians: Gaussians) -> None:
-        """Make the filter part of scales and opacities, so that what was rendered is saved."""
-        # In double, which rounds to one float32 whatever computes its last digits.
+        """Apply the filter to the scales and opacities that are saved."""
+        # In double, since the last digits in float32 depend on the processor.
         scales, opacities = smooth(
             gaussians.scales.double().exp(),
             gaussians.opacities.double().sigmoid(),
@@ -136,7 +136,7 @@ class Mip(Component):
         self.unseen_count = int((~seen).sum())
         lowest = rates[seen].min() if seen.any() else rates.new_tensor(torch.inf)
         variance = self.strength / torch.where(seen, rates, lowest).square()
-        # Above 0, since the opacity of a Gaussian with a scale of 0 would be 0 / 0.
+        # Above 0: `smooth` would compute 0 / 0 for a scale of 0.
         self.variance = variance.clamp_min(torch.finfo(variance.dtype).tiny)
 
 

@@ -1,4 +1,4 @@
-"""Fewer Gaussians after densification: those that the photographs do not hold up fade away."""
+"""Fewer Gaussians after densification, by a push on all opacities [deng2025gns]."""
 
 from __future__ import annotations
 
@@ -10,12 +10,12 @@ import torch
 from torch import Tensor
 
 from xrgs.errors import XrgsError
-from xrgs.splat.growth import gaussians_of
 from xrgs.splat.rounding import rounded_mean
 from xrgs.splat.settings import NOMINAL_STEPS
+from xrgs.splat.strategy.ops import gaussians_of
 from xrgs.training.components.base import Component, Step, TrainingSetup, check_not_negative
 
-if TYPE_CHECKING:  # xrgs.config loads Hydra, which training does without
+if TYPE_CHECKING:
     from xrgs.config import NaturalSelectionConf
     from xrgs.splat.gaussians import Gaussians
 
@@ -43,33 +43,36 @@ class NaturalSelection(Component):
         d L / d logit_i  +  g,
 
     so that a Gaussian keeps its opacity where the photographs resist with a gradient of their own,
-    and fades where they do not. Those with an opacity below 0.001 are removed, the most transparent
-    first and never more than down to the budget. Within 5% of the budget, or at step `until`, the
-    most transparent of the rest are removed at once, and training goes on without the push.
+    and fades where they do not. Gaussians with an opacity below 0.001 are removed, the most
+    transparent first, until the budget is met. Within 5% of the budget, or at step `until`, the
+    most transparent Gaussians beyond the budget are removed at once, and training goes on without
+    the push.
 
-    g follows a path, as in the authors' code: with B the budget, the opacity of the B-th most
-    opaque Gaussian, which must live, shall fall linearly from 0.8 of what it was to 0, at 1,000
-    steps of 30,000 before `until`. Every 100 such steps g is multiplied by 0.8 where that opacity
-    is more than 10% below the path, and by 1.2 where it is more than 10% above it.
+    g follows a path, as in the authors' code. With B the budget, the opacity of the B-th most
+    opaque Gaussian, the last one to keep, shall fall linearly from 0.8 of its first value to 0, and
+    reach 0 at 1,000 steps of 30,000 before `until`. Every 100 such steps g is multiplied by 0.8 if
+    that opacity is more than 10% below the path, and by 1.2 if it is more than 10% above it.
 
-    Ours, where the authors' code differs: g begins as the mean absolute gradient of the logit
-    opacities in the first step, which has no unit of the image's or the scene's to be tuned to
-    (theirs is that of a quadratic term with a weight of 2e-4); it is added at every step, not at
-    every 50th with four times the learning rate. Adam divides by the root of the second moment, so
-    a constant is worth a full step of the learning rate, 0.05 of logit, for a Gaussian whose own
-    gradients are small beside g, which is enough for 13 units of logit in 270 steps, and a pulse
-    at every 50th step would be worth a seventh of that. Opaque Gaussians are not pushed harder in
-    the first 1,000 steps.
+    Ours, where the authors' code differs:
 
-    The budget is in Gaussians for each pixel of the training view that has the most of them, as
-    `splat.densify.budget` is. Where densification left no more than that, nothing happens.
+    - g begins as the mean absolute gradient of the logit opacities in the first step, so that no
+      unit of the image or the scene has to be tuned to. The authors' g is the gradient of a
+      quadratic term with a weight of 2e-4.
+    - g is added at every step, not at every 50th with four times the learning rate. Adam divides by
+      the root of the second moment. If a Gaussian's own gradients are small beside g, a constant is
+      worth a full step of the learning rate, 0.05 of logit: enough for 13 units of logit in 270
+      steps. A pulse at every 50th step would be worth a seventh of that.
+    - Opaque Gaussians are not pushed harder in the first 1,000 steps.
+
+    The budget is in Gaussians for each pixel of the largest training view, like
+    `splat.densify.budget`. If densification left no more Gaussians, nothing happens.
     """
 
     def __init__(self, settings: NaturalSelectionConf, budget: int, stop: int) -> None:
-        """Take the schedule; the push is found at its first step.
+        """Take the schedule.
 
         Args:
-            settings: The component's settings.
+            settings: `components.natural_selection` of the config.
             budget: The number of Gaussians to keep.
             stop: Step of a 30,000-step run at which densification ends.
         """
@@ -77,7 +80,7 @@ class NaturalSelection(Component):
         self.push = 0.0
         """g, in units of the gradient; 0 before the first step of the selection."""
         self.first_opacity = 0.0
-        """Where the path starts: a share of the opacity of the last Gaussian that must live."""
+        """Where the path starts: a share of the opacity of the last Gaussian to keep."""
         self.done = False
         """Whether the budget has been met."""
 
@@ -103,7 +106,7 @@ class NaturalSelection(Component):
     def after_backward(self, gaussians: Gaussians, step: Step) -> None:
         """Add the push to the gradient of the logit opacities.
 
-        It is recorded as `natural_selection.push`, in units of the gradient.
+        `natural_selection.push` records it, in units of the gradient.
         """
         gradient = gaussians.opacities.grad
         if self.done or step.nominal < self.start or gradient is None:
@@ -138,16 +141,16 @@ class NaturalSelection(Component):
         return lowest if self.done else lowest & (logits < _LOGIT_OF_DEATH)
 
     def state_dict(self) -> dict[str, Any]:
-        """Return how far the selection is."""
+        """Return the push, the start of the path, and whether the budget has been met."""
         return {"push": self.push, "first_opacity": self.first_opacity, "done": self.done}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Continue from where `state_dict` was."""
+        """Restore what `state_dict` returned."""
         self.push, self.first_opacity = float(state["push"]), float(state["first_opacity"])
         self.done = bool(state["done"])
 
     def _last_survivors_opacity(self, gaussians: Gaussians) -> float:
-        """The opacity of the last Gaussian within the budget, by opacity."""
+        """The opacity of the last Gaussian to keep."""
         rank = len(gaussians) - self.budget + 1  # from the most transparent one, 1
         logit = gaussians.opacities.detach().kthvalue(rank).values.item()
         return 1 / (1 + math.exp(-logit))
@@ -159,5 +162,5 @@ class NaturalSelection(Component):
 
 
 def _is_due(step: Step, every: int) -> bool:
-    """Whether the step is the first of the run in its period of so many nominal steps."""
+    """Whether the step is the first one in a period of `every` nominal steps."""
     return step.nominal // every != (step.number - 1) * NOMINAL_STEPS / step.total // every

@@ -14,7 +14,7 @@ from xrgs.training.components.base import (
     check_not_negative,
 )
 
-if TYPE_CHECKING:  # xrgs.config loads Hydra, which training does without
+if TYPE_CHECKING:
     from xrgs.config import RenderScaleConf
 
 
@@ -26,22 +26,17 @@ class RenderScale(Component):
         sigma' = k(R) sigma
 
     Our choice where the paper is silent: `k = (R_max / R)^gamma`, where R is the longer side of the
-    view in px, which does not change when a camera is turned by 90 degrees, and R_max that of the
-    largest training view. So LR views that were degraded at full size have k = 1. Only LR views are
+    view in px, so that turning a camera by 90 degrees changes nothing, and R_max is R of the
+    largest training view. LR views that were degraded at full size have k = 1. Only LR views are
     scaled, as in section 6.3. The paper gives no values; gamma 0.25 makes k 1.5 at factor 5.
 
-    The scales in world units are multiplied for the render alone. The Gaussians that are optimised,
-    evaluated and saved stay as they are, and the gradient of their log-scales is that of the scaled
-    ones. The paper found that it blurs; it is off in the full system.
+    The scales in world units are multiplied for the render alone: the log-scales get the gradients
+    of the scaled Gaussians. The Gaussians that are optimised, evaluated and saved stay as they are.
+    The paper found that it blurs; it is off in the full system.
     """
 
     def __init__(self, settings: RenderScaleConf, views: Sequence[TrainingView]) -> None:
-        """Compute k of each LR view.
-
-        Args:
-            settings: The component's settings.
-            views: All training views.
-        """
+        """Compute k of each LR view among all training views."""
         largest = max(_long_side(view) for view in views)
         self.factors = {
             view.name: (largest / _long_side(view)) ** settings.gamma

@@ -15,7 +15,7 @@ from xrgs.splat.loss import WINDOW
 from xrgs.splat.resample import resize
 from xrgs.training.components.base import Component, Step, TrainingSetup, TrainingView
 
-if TYPE_CHECKING:  # xrgs.config loads Hydra, which training does without
+if TYPE_CHECKING:
     from xrgs.config import ResolutionScheduleConf
 
 _LARGEST_FACTOR = 8
@@ -38,30 +38,33 @@ class ResolutionSchedule(Component):
     """Trains HR views at a resolution that grows with the step, by their frequency content.
 
     DashGaussian [chen2025dash] trains on photographs that are brought down by a factor r, which
-    falls to 1 as training goes on. With F_n the discrete Fourier transform of photograph n, and the
-    sum over channels too, what a factor keeps of the photographs is
+    falls to 1 as training goes on. With F_n the discrete Fourier transform of photograph n, the
+    share of the photographs that a factor keeps is
 
         kept(r) = X(1 / (2 r)) / X(1 / 2)
         X(f) = sum_n sum_{|fx| <= f, |fy| <= f} |F_n(fx, fy)|
 
-    with fx and fy in cycles per px. In the authors' code the step at which r is reached is
-    proportional to the logarithm of kept(r), from step 0 for the first r, of which kept(r) is a
-    quarter, to the step `until` for r = 1, the end of densification; and r is rounded down to a
-    whole number, at most 8. So at step t the photographs are brought down by the largest whole
-    number k with
+    with fx and fy in cycles per px of each photograph, summed over channels too; n goes over the HR
+    views. In the authors' code the step at which r is reached is proportional to the logarithm of
+    kept(r): step 0 for the first r, with kept(r) of a quarter, and the step `until`, the end of
+    densification, for r = 1. r is rounded down to a whole number, at most 8. So at step t the
+    photographs are brought down by the largest whole number k with
 
         kept(k) >= start_share^(1 - t / until)
 
-    and from `until` on by none. Frequencies are those of each photograph, and n goes over the HR
-    views. The camera is that of the view at the smaller size, round(W / k) x round(H / k) px, and
-    densification reads normalised device units, which do not depend on the size.
+    and not at all from `until` on. The camera has the smaller size, round(W / k) x round(H / k) px.
+    Densification reads normalised device units, which do not depend on the size.
 
-    Our choice: LR views are never reduced; the photograph is brought down by the antialiased
-    bicubic kernel in place of a cut in the frequency domain; every HR view keeps at least the
-    pixels of the window of SSIM; shares are rounded to 6 digits, so that the last digits of a
-    Fourier transform, which depend on the processor, decide nothing. `splat.optimizer.
-    means_decay_from` lets the rate of the means wait, as the authors do until k is 1. The growth of
-    the number of Gaussians, which they schedule too, is left as it is.
+    Our choice:
+
+    - LR views are never reduced.
+    - The antialiased bicubic kernel reduces the photographs, in place of a cut in the frequency
+      domain.
+    - Every HR view keeps at least the pixels of the window of SSIM.
+    - The growth of the number of Gaussians, which the authors schedule too, is left as it is.
+
+    The authors let the rate of the means wait until k is 1; `splat.optimizer.means_decay_from` does
+    so here.
     """
 
     def __init__(
@@ -73,8 +76,8 @@ class ResolutionSchedule(Component):
         """Compute the share of the spectrum that each factor keeps.
 
         Args:
-            settings: The component's settings.
-            views: All training views; those that are tagged HR are reduced.
+            settings: `components.resolution_schedule` of the config.
+            views: All training views; the HR views are reduced.
             backend: `torch` or `native`: the implementation of the resampling.
 
         Raises:
@@ -93,7 +96,7 @@ class ResolutionSchedule(Component):
         self.kept = kept_shares([view.image for view in high], range(1, largest + 1))
         self.factor = 1
         self.reduced: Mapping[str, TrainingView] = {}
-        """The views at the present factor; none where it is 1."""
+        """The views at the present factor; empty where it is 1."""
 
     @classmethod
     def from_settings(cls, settings: ResolutionScheduleConf, setup: TrainingSetup) -> Self | None:
@@ -166,4 +169,6 @@ def kept_shares(images: Sequence[Tensor], factors: Iterable[int]) -> dict[int, f
         for factor in sums:
             rows, columns = fy <= 0.5 / factor, fx <= 0.5 / factor
             sums[factor] += spectrum[rows][:, columns].sum().item()
+    # To 6 digits, so that the last digits of the Fourier transforms, which depend on the processor,
+    # decide nothing.
     return {factor: round(value / total, 6) if total else 1.0 for factor, value in sums.items()}

@@ -11,18 +11,18 @@ from torch import Tensor
 from xrgs.errors import XrgsError
 from xrgs.training.components.base import Component, Step, TrainingSetup, check_not_negative
 
-if TYPE_CHECKING:  # xrgs.config loads Hydra, which training does without
+if TYPE_CHECKING:
     from xrgs.config import SkipBackwardConf
 
 
 class SkipBackward(Component):
     """Skips the backward pass where the loss of a view is no higher than its running mean.
 
-    SkipGS [li2026skipgs] renders every step, and after densification has stopped it skips backward
-    and the optimizer's step where the view's loss is consistent with its recent values, as long as
-    a least share of the steps has a backward pass. From step `begin` on, with L the loss of a step
-    on view v, of n such steps so far (this one included) and b backward passes so far, the step is
-    skipped if
+    SkipGS [li2026skipgs] renders every step. After densification has stopped it skips the backward
+    pass and the optimizer's step if the view's loss is consistent with its recent values, as long
+    as a given share of the steps has a backward pass. From step `begin` on, let L be the loss of a
+    step on view v, n the number of such steps so far, this one included, and b the number of
+    backward passes so far. The step is skipped if
 
         L <= (1 + tolerance) mean_v    and    b >= share n
 
@@ -30,19 +30,15 @@ class SkipBackward(Component):
     on a view is never skipped, and makes L its mean. A loss that is not finite leaves the mean as
     it is.
 
-    The decay of 0.95, the tolerance of 0 and the comparison from above alone are those that the
-    documentation of the authors' code gives. Our choice: `share` is a setting, where they derive it
-    from a period without skipping; there is no such period; and L has all terms and weights of the
-    other components. A loss that falls from visit to visit is below its mean, so that in a short
-    training `share` alone decides how many steps are skipped.
+    The decay of 0.95, the tolerance of 0 and the comparison from above alone are from the
+    documentation of the authors' code. Our choice: `share` is a setting, which the authors derive
+    from a period without skipping; there is no such period here; and L has all terms and weights of
+    the other components. A loss that falls from visit to visit is below its mean, so that in a
+    short training `share` alone decides how many steps are skipped.
     """
 
     def __init__(self, settings: SkipBackwardConf) -> None:
-        """Start without any mean.
-
-        Args:
-            settings: The component's settings.
-        """
+        """Start without any mean."""
         self.settings = settings
         self.means: dict[str, float] = {}
         self.steps = 0
@@ -68,8 +64,8 @@ class SkipBackward(Component):
     def needs_backward(self, loss: Tensor, step: Step) -> bool:
         """Compare the loss with the view's mean, and update the mean.
 
-        From `begin` on, `skip_backward.<tag>` records 1 for a skipped step and 0 for another one,
-        so that a row of the history has the share that was skipped.
+        From `begin` on, `skip_backward.<tag>` records 1 for a skipped step and 0 for any other, so
+        that a row of the history has the share of skipped steps.
         """
         if step.nominal < self.settings.begin:
             return True

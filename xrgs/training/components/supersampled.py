@@ -13,7 +13,7 @@ from xrgs.splat.cameras import Camera
 from xrgs.splat.resample import resize
 from xrgs.training.components.base import Component, Step, TrainingSetup, TrainingView
 
-if TYPE_CHECKING:  # xrgs.config loads Hydra, which training does without
+if TYPE_CHECKING:
     from xrgs.config import SupersampledConf
 
 
@@ -42,16 +42,16 @@ class Supersampled(Component):
     is the loss of the view, with D the kernel by which the variant has made its LR views:
 
     - `downsample`: antialiased bicubic to the size of I;
-    - `digital_zoom`: that, and bicubic up again; the pixels that I resolves are those of the size
-      between, and the render is k times as large as that;
-    - `none`, for LR views that a camera took: a pixel of a sensor averages over its area, so the
-      mean of k x k pixels.
+    - `digital_zoom`: the same to the size between, which is the size that I resolves, and bicubic
+      up again; the render is k times as large as the size between;
+    - `none`, for LR views that a camera took: the mean of k x k pixels, since a pixel of a sensor
+      averages over its area.
 
     `jpeg` has all the pixels of an HR view, and nothing to supersample.
 
-    Densification reads the image-plane gradients of the larger render in normalised device units,
-    which do not depend on its size. k is `factor` before step `late_from` and `late_factor` from
-    it on, so that a run may begin or end with direct renders (k = 1). HR views and the evaluation
+    k is `factor` before step `late_from` and `late_factor` from there on, so that a run may begin
+    or end with direct renders (k = 1). Densification reads the image-plane gradients of the larger
+    render in normalised device units, which do not depend on its size. HR views and the evaluation
     are untouched.
 
     Our choice: the whole component; super-resolution of 3D Gaussian Splatting trains through a
@@ -69,10 +69,10 @@ class Supersampled(Component):
         """Find out how the photograph of each LR view was formed.
 
         Args:
-            settings: The component's settings.
+            settings: `components.supersampled` of the config.
             views: All training views.
             degradation: What was done to LR views: `downsample`, `digital_zoom`, `none`.
-            zoom: Of a digital zoom, how many times fewer pixels per side a photograph resolves.
+            zoom: With `digital_zoom`, how many times fewer px per side a photograph resolves.
             backend: `torch` or `native`: the implementation of the resampling.
         """
         self.settings = settings

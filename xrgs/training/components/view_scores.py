@@ -20,17 +20,17 @@ from xrgs.training.components.base import (
 )
 from xrgs.training.seeding import seeded_generator
 
-if TYPE_CHECKING:  # xrgs.config loads Hydra, which training does without
+if TYPE_CHECKING:
     from xrgs.config import ErrorScoreConf, MultiviewScoreConf
     from xrgs.splat.gaussians import Gaussians
 
 
 class _ViewScores(Component):
-    """Gives each Gaussian the mean over some training views of a score in each of them.
+    """Gives each Gaussian the mean of its scores in some training views.
 
-    The views are drawn anew at each refinement, from all training views without repetition, by the
-    run's seed and the number of the step alone: there is no state. They are rendered with all
-    components of the run, and their alpha evaluations and time count as the run's.
+    The views are drawn anew at each refinement, from all training views without repetition. They
+    are rendered with all components of the run, and their alpha evaluations and time count as the
+    run's.
     """
 
     renderer: ViewRenderer
@@ -48,6 +48,7 @@ class _ViewScores(Component):
 
     def scores(self, gaussians: Gaussians, step: Step) -> Tensor:
         """Return the mean scores [N] in the views of a refinement."""
+        # By the seed and the number of the step alone, so that a checkpoint needs no state.
         generator = seeded_generator(self.seed, f"{type(self).__name__} {step.number}")
         total = gaussians.opacities.new_zeros(len(gaussians))
         for index in torch.randperm(len(self.views), generator=generator)[: self.count].tolist():
@@ -60,8 +61,8 @@ class MultiviewScore(_ViewScores):
 
     Multi-view consistent densification [ren2025fastgs]. In each of `views` training views, the
     absolute difference between render and photograph, averaged over the channels, is brought to
-    0..1 by its smallest and largest value in the view. A pixel's error is high where that is above
-    `error`. Of the Gaussians above the growth threshold, those may grow with
+    0..1 by its smallest and largest value in the view. A pixel's error is high if the result is
+    above `error`. A Gaussian above the growth threshold may grow if
 
         s_i = mean over the views of  (1 / rho^2) sum over p of [error of p is high] w_i(p)
             > pixels
@@ -69,9 +70,9 @@ class MultiviewScore(_ViewScores):
     where w_i(p) is the weight with which Gaussian i is blended into pixel p (`attribute_pixels`).
 
     Ours: FastGS counts the pixels of the footprint, whatever the weight, and asks for more than 5
-    of them. A sum of weights needs no kernel of its own, and a Gaussian that is faint or hidden
-    there does not answer for what is wrong in a pixel. It is a few hundredths of the count, so
-    that `pixels` is another number. rho is the sampling rate of the view relative to the finest
+    pixels. A sum of weights needs no kernel of its own, and a Gaussian that is faint or hidden in a
+    pixel does not answer for its error. The sum is a few hundredths of the count, so that `pixels`
+    is another number than 5. rho is the sampling rate of the view relative to the finest view
     (`TrainingView.rho`), so that the sum is in px^2 of the finest view: a pixel of an LR view that
     is 5 times smaller counts 25. FastGS's pruning by the same score is left out.
     """
@@ -79,13 +80,7 @@ class MultiviewScore(_ViewScores):
     def __init__(
         self, settings: MultiviewScoreConf, views: Sequence[TrainingView], seed: int
     ) -> None:
-        """Take the views and the settings.
-
-        Args:
-            settings: The component's settings.
-            views: All training views.
-            seed: The seed of the run.
-        """
+        """Take the settings, all training views and the seed of the run."""
         super().__init__(views, settings.views, seed)
         self.error, self.pixels = settings.error, settings.pixels
 
@@ -115,11 +110,11 @@ class MultiviewScore(_ViewScores):
 
 
 class ErrorScore(_ViewScores):
-    """Ranks what would grow by the edges or errors that a Gaussian shows in some views.
+    """Ranks the Gaussians that would grow by the edges or errors that they show in some views.
 
-    Where a budget leaves room for some of the Gaussians above the growth threshold only, those with
-    the highest scores grow. The score is the edge-aware score of Improved-GS [deng2025],
-    as in the code of its authors:
+    If a budget leaves room for only some of the Gaussians above the growth threshold, the Gaussians
+    with the highest scores grow. The score is the edge-aware score of Improved-GS [deng2025], as in
+    the authors' code:
 
         s_i = mean over the views j of  a_ij / (mean of a_kj over the k with a_kj > 0),
         a_ij = sum over p of e_j(p) w_i(p)
@@ -137,13 +132,7 @@ class ErrorScore(_ViewScores):
     """
 
     def __init__(self, settings: ErrorScoreConf, views: Sequence[TrainingView], seed: int) -> None:
-        """Take the views and compute their edges.
-
-        Args:
-            settings: The component's settings.
-            views: All training views.
-            seed: The seed of the run.
-        """
+        """Take the settings, all training views and the seed of the run; compute the edges."""
         super().__init__(views, settings.views, seed)
         self.edges: dict[str, Tensor] | None = None
         if settings.of == "edges":
@@ -184,8 +173,8 @@ class ErrorScore(_ViewScores):
 def edges(image: Tensor) -> Tensor:
     """Return the absolute Laplacian of an image's brightness.
 
-    The brightness of a pixel is the sum of its channels; the Laplacian is 8 times it less its 8
-    neighbours'. The outermost pixels are repeated beyond the border.
+    The brightness of a pixel is the sum of its channels. The Laplacian is 8 times the brightness
+    less the brightness of the 8 neighbours. The outermost pixels are repeated beyond the border.
 
     Args:
         image: [H, W, 3].

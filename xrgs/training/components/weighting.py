@@ -1,16 +1,23 @@
-"""The weight of a view in the loss, whichever settings decide it [xrgs, sections 5.2 and 7.2]."""
+"""The weight of a view in the loss, by every setting that changes it [xrgs, 5.2 and 7.2].
+
+`Weighting` is the component. The functions below it give the weight of a view and its attenuations,
+one for each key of the config that `Weighting` reads.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from math import prod
 from typing import TYPE_CHECKING, Self
 
+import torch
+from scipy.spatial import KDTree
 from torch import Tensor
+from torch.nn.functional import avg_pool2d
 
 from xrgs.errors import XrgsError
 from xrgs.splat.rounding import rounded_mean
-from xrgs.training.components.adaptive_weighting import AdaptiveWeighting
 from xrgs.training.components.base import (
     Component,
     Step,
@@ -18,19 +25,22 @@ from xrgs.training.components.base import (
     TrainingView,
     check_not_negative,
 )
-from xrgs.training.components.continuous_weighting import ContinuousWeighting
-from xrgs.training.components.hybrid_schedule import HybridSchedule
-from xrgs.training.components.loss_weighting import LossWeighting
-from xrgs.training.components.region_weighting import region_attenuations
+from xrgs.training.components.texture import gradient_magnitude
 
-if TYPE_CHECKING:  # xrgs.config loads Hydra, which training does without
+if TYPE_CHECKING:
     from xrgs.config import ComponentsConf, LossWeightingConf
+    from xrgs.splat.cameras import Camera
     from xrgs.splat.gaussians import Gaussians
 
+WINDOW = 5
+"""Side, in px, of the square over which the texture of a pixel is averaged."""
+NEAREST_POINTS = 5
+"""Number of SfM points whose median depth is the depth of a pixel."""
+
 ViewWeight = Callable[[TrainingView], float]
-"""The weight of a view that its resolution alone gives, the lowest that it can have."""
+"""The lowest weight of a view, which its resolution alone gives."""
 Attenuation = Callable[[Step], float]
-"""The part, in 0..1, of the reduction `1 - view_weight` that applies at a step."""
+"""The share, in 0..1, of the reduction `1 - view_weight` that applies at a step."""
 
 _STATISTICS = ("weighted", "unweighted")
 
@@ -40,10 +50,11 @@ class Weighting(Component):
 
         weight = view_weight + (1 - view_weight) (1 - a_1 a_2 ...)
 
-    `view_weight` is the weight by tag of loss weighting [xrgs, section 5.2], or the weight by
-    sampling rate of continuous weighting in its place. Each attenuation a in 0..1 comes from
-    adaptive weighting, the hybrid schedule or region weighting [xrgs, section 7.2]: 1 applies the
-    whole reduction, 0 none of it.
+    `view_weight` is the weight by tag of loss weighting (`weight_by_tag`), or the weight by
+    sampling rate of continuous weighting in its place (`weight_by_sampling_rate`). Each attenuation
+    a in 0..1 comes from adaptive weighting (`scene_attenuation`), the hybrid schedule
+    (`scheduled_attenuation`) or region weighting (`region_attenuations`): 1 applies the whole
+    reduction, 0 none of it.
 
     Our choice where the paper is silent: the paper proposes these separately. We multiply the
     attenuations, so that any of them can be combined, no view weighs less than its `view_weight`,
@@ -65,12 +76,11 @@ class Weighting(Component):
         """Combine a weight with its attenuations.
 
         Args:
-            view_weight: The weight of each view, in 0..1.
-            attenuations: The attenuations at each step, in 0..1.
-            regions: The attenuations [H, W] in 0..1 of the pixels, by the names of the views that
-                have them.
-            stat_from: `weighted`, or `unweighted` where densification is to read image-plane
-                gradients without the weights.
+            view_weight: Gives the weight of a view, in 0..1.
+            attenuations: Each gives the attenuation at a step, in 0..1.
+            regions: Attenuations [H, W] in 0..1 of the pixels, by the names of the views.
+            stat_from: `weighted`, or `unweighted` if densification is to read image-plane gradients
+                without the weights.
 
         Raises:
             XrgsError: `stat_from` is neither.
@@ -89,13 +99,8 @@ class Weighting(Component):
     def from_settings(cls, settings: LossWeightingConf, setup: TrainingSetup) -> Self | None:
         """Build the component from `loss_weighting` and the settings that change its weight.
 
-        Args:
-            settings: `components.loss_weighting` of the config; an `lr_weight` of 1 is off.
-            setup: Has the settings of continuous, adaptive and region weighting and of the hybrid
-                schedule, each of which is off at 0.
-
-        Returns:
-            The component, or None where every view has weight 1.
+        It is off where every view has weight 1: `lr_weight` is 1, and the `gamma` of continuous
+        weighting is 0.
 
         Raises:
             XrgsError: A setting is out of its range, or attenuates a weight that is off.
@@ -104,21 +109,23 @@ class Weighting(Component):
         _check_ranges(conf)
         view_weight: ViewWeight
         if conf.continuous_weighting.gamma != 0:  # in place of the tag where both are set
-            view_weight = ContinuousWeighting(conf.continuous_weighting)
+            view_weight = partial(weight_by_sampling_rate, gamma=conf.continuous_weighting.gamma)
         elif settings.lr_weight != 1:
-            view_weight = LossWeighting(settings)
+            view_weight = partial(weight_by_tag, lr_weight=settings.lr_weight)
         else:
             _check_no_attenuation(conf)
             return None
         attenuations: list[Attenuation] = []
         if conf.adaptive_weighting.texture != 0:
-            attenuations.append(AdaptiveWeighting(conf.adaptive_weighting, data.train))
+            of_scene = scene_attenuation(data.train, conf.adaptive_weighting.texture)
+            attenuations.append(lambda _: of_scene)
         if conf.hybrid_schedule.ramp != 0:
-            attenuations.append(HybridSchedule(conf.hybrid_schedule, setup.splat.densify.stop))
+            start, ramp = setup.splat.densify.stop, conf.hybrid_schedule.ramp
+            attenuations.append(partial(scheduled_attenuation, start=start, ramp=ramp))
         regions = None
         if conf.region_weighting.texture != 0:
-            near = setup.splat.raster.near
-            regions = region_attenuations(conf.region_weighting, data.train, data.points, near)
+            texture, near = conf.region_weighting.texture, setup.splat.raster.near
+            regions = region_attenuations(data.train, data.points, texture=texture, near=near)
         return cls(view_weight, attenuations, regions, stat_from=settings.stat_from)
 
     def weight(self, step: Step) -> float:
@@ -154,6 +161,200 @@ class Weighting(Component):
 
     def _attenuation(self, step: Step) -> float:
         return prod(attenuation(step) for attenuation in self.attenuations)
+
+
+def weight_by_tag(view: TrainingView, lr_weight: float) -> float:
+    """Weight a view by its tag: loss weighting [xrgs, section 5.2].
+
+    Section 5.2 of the paper multiplies the loss of a view:
+
+        L = 1.0 L_base for an HR view, 0.25 L_base for an LR view.
+
+    The weight scales the view's image-plane gradients too, and so changes what is densified. Adam
+    [kingma2015] divides a gradient by its recent size, so that parameters which only LR views reach
+    move as fast as without a weight. The weight decides where LR and HR views reach the same
+    parameters, and what is densified.
+
+    Our choice where the paper is silent: densification reads the gradients of the weighted loss
+    (`stat_from: weighted`), as the formula has it. With `stat_from: unweighted` it reads the
+    gradients without the weight; a weight of 0 leaves no gradient to read.
+
+    Args:
+        view: The view.
+        lr_weight: Weight of an LR view.
+    """
+    return lr_weight if view.tag == "LR" else 1.0
+
+
+def weight_by_sampling_rate(view: TrainingView, gamma: float) -> float:
+    """Weight a view by its sampling rate, `rho ** gamma`, whatever its tag [xrgs, conclusion].
+
+    `rho`, in (0, 1], is the sampling rate of the view (focal length in px over the median depth of
+    the scene) divided by the highest rate of all views. For synthetic LR views it is about
+    1 / factor; for real photographs it follows from focal length and distance. A view that was
+    degraded without shrinking it has the rate of its size in pixels.
+
+    Our choice where the paper is silent: the conclusion proposes "a continuous, texture-aware
+    weighting scheme" and gives no formula. The power law is ours. gamma = 0.86, log 4 / log 5,
+    gives an LR view at factor 5 the paper's weight of 0.25. (As a power of the number of pixels,
+    which goes with rho squared, it would be 0.43.)
+
+    Args:
+        view: The view.
+        gamma: The power.
+    """
+    return float(view.rho**gamma)
+
+
+def scene_attenuation(views: Sequence[TrainingView], texture: float) -> float:
+    """Attenuate LR views in proportion to the texture of the scene [xrgs, 7.2, proposal 1].
+
+    Adaptive weighting: the attenuation is `min(1, g / texture)`, where g is the mean of
+    `gradient_magnitude` over all pixels of all LR views. A flat scene, whose LR views lack no
+    detail, is not attenuated at all; from `texture` on the attenuation is complete.
+
+    Our choice where the paper is silent: section 7.2 proposes to "estimate image texture (e.g., via
+    Fourier or gradient magnitude) and increase LR weighting when the scene is globally
+    low-frequency", without measure or weights. Measure, ramp and threshold are ours. `texture` 0.07
+    lies between the LLFF scenes that the paper calls cluttered (fern, flower, horns: 0.074 to 0.12
+    at factor 5 of 504 and 1008 px) and the simple ones (fortress 0.055; a single object 0.03 to
+    0.04).
+
+    Args:
+        views: All training views.
+        texture: Intensity per px, above 0.
+    """
+    magnitudes = [rounded_mean(gradient_magnitude(v.image)) for v in views if v.tag == "LR"]
+    mean_gradient = sum(magnitudes) / len(magnitudes) if magnitudes else 0.0
+    return min(1.0, mean_gradient / texture)
+
+
+def scheduled_attenuation(step: Step, start: float, ramp: float) -> float:
+    """Attenuate LR views until densification stops, then less and less [xrgs, 7.2, proposal 3].
+
+    The hybrid schedule: the attenuation is 1 until `start` and falls linearly to 0 over the `ramp`
+    steps that follow.
+
+    Our choice where the paper is silent: section 7.2 proposes to "reintroduce LR influence in late
+    training stages" and names no step. We start where densification ends: from there on LR views
+    can refine the Gaussians that HR views have shaped, and cannot create new ones.
+
+    Args:
+        step: The step.
+        start: Step of a 30,000-step run at which densification stops.
+        ramp: Number of steps of a 30,000-step run, above 0.
+    """
+    return 1 - min(1.0, max(0.0, (step.nominal - start) / ramp))
+
+
+def region_attenuations(
+    views: Sequence[TrainingView], points: Tensor, *, texture: float, near: float
+) -> dict[str, Tensor]:
+    """Attenuate textured parts of LR views that an HR view covers [xrgs, 7.2, proposal 2].
+
+    Region weighting: the attenuation of a pixel is `min(1, g / texture)` where an HR view covers it
+    (`coverage`), and 0 elsewhere, where g is `gradient_magnitude` averaged over 5 x 5 px. Smooth
+    regions, and regions that no HR view sees, keep the full weight of LR supervision.
+
+    Our choice where the paper is silent: section 7.2 proposes "spatially varying loss/gradient
+    scaling so smooth regions retain LR supervision while textured regions benefit from XR-GS
+    attenuation". The measure, its window and the condition of coverage are ours; `texture` is 0.07,
+    as in adaptive weighting.
+
+    Args:
+        views: All training views.
+        points: [P, 3] SfM points, world units.
+        texture: Intensity per px, above 0.
+        near: Depth below which a point is not seen, world units.
+
+    Returns:
+        Attenuations [H, W] in 0..1, by the name of each LR view.
+    """
+    hr_cameras = [view.camera for view in views if view.tag == "HR"]
+    attenuations = {}
+    for view in views:
+        if view.tag == "LR":
+            share = _box_mean(gradient_magnitude(view.image)) / texture
+            covered = coverage(view.camera, hr_cameras, points, near)
+            attenuations[view.name] = share.clamp_max(1.0) * covered
+    return attenuations
+
+
+def coverage(camera: Camera, others: Sequence[Camera], points: Tensor, near: float) -> Tensor:
+    """Find the pixels of a view whose content another view samples more finely.
+
+    The depth of a pixel is the median depth of the five SfM points that project nearest to it. The
+    pixel is covered if its point at that depth projects into one of the other views, at more px per
+    world unit than in its own. Occlusion is not tested, since a few points per view cannot separate
+    the two sides of a depth edge: what an object hides from every other view counts as covered.
+
+    Args:
+        camera: The view.
+        others: The other views.
+        points: [P, 3] SfM points, world units.
+        near: Depth below which a point is not seen, world units.
+
+    Returns:
+        [H, W] bool; False everywhere if no point projects into the view.
+    """
+    depth = _pixel_depths(camera, points, near)
+    if depth is None:
+        return torch.zeros(camera.height, camera.width, dtype=torch.bool)
+    x, y = _pixel_centres(camera).unbind(-1)
+    K = camera.K.to(points)
+    rays = torch.stack([(x - K[0, 2]) / K[0, 0], (y - K[1, 2]) / K[1, 1], torch.ones_like(x)], -1)
+    viewmat = camera.viewmat.to(points)
+    # The product with the transposed rotation, written out, since the order in which torch adds
+    # depends on the processor.
+    at_depth = (rays * depth[:, None] - viewmat[:3, 3])[..., None] * viewmat[:3, :3]
+    world = at_depth[:, 0] + at_depth[:, 1] + at_depth[:, 2]  # [H W, 3]
+    covered = torch.zeros(len(world), dtype=torch.bool)
+    for other in others:
+        pixels, z = _project(other, world)
+        finer = other.K[0, 0] / z > K[0, 0] / depth
+        covered |= (z > near) & _inside(pixels, other) & finer
+    return covered.reshape(camera.height, camera.width)
+
+
+def _pixel_depths(camera: Camera, points: Tensor, near: float) -> Tensor | None:
+    """The depth of each pixel [H W] in row-major order; None where no point is in view."""
+    pixels, z = _project(camera, points)
+    seen = (z > near) & _inside(pixels, camera)
+    count = int(seen.sum())
+    if count == 0:
+        return None
+    ranks = range(1, min(NEAREST_POINTS, count) + 1)
+    tree = KDTree(pixels[seen].numpy())
+    _, nearest = tree.query(_pixel_centres(camera).numpy(), k=ranks)  # [H W, k]
+    return z[seen][torch.from_numpy(nearest)].median(dim=1).values
+
+
+def _pixel_centres(camera: Camera) -> Tensor:
+    """The centres [H W, 2] of the pixels, x and y, in row-major order."""
+    y, x = torch.meshgrid(torch.arange(camera.height), torch.arange(camera.width), indexing="ij")
+    return torch.stack([x, y], dim=-1).reshape(-1, 2) + 0.5
+
+
+def _project(camera: Camera, points: Tensor) -> tuple[Tensor, Tensor]:
+    """The projections [P, 2] of points [P, 3], px, which need a depth above 0, and depths [P]."""
+    K = camera.K.to(points)
+    x, y, z = camera.to_camera(points)
+    pixels = torch.stack([x, y], dim=-1) / z[:, None] * K[[0, 1], [0, 1]] + K[:2, 2]
+    return pixels, z
+
+
+def _inside(pixels: Tensor, camera: Camera) -> Tensor:
+    """Whether each of the pixels [P, 2] lies on the image."""
+    return ((pixels > 0) & (pixels < pixels.new_tensor([camera.width, camera.height]))).all(dim=-1)
+
+
+def _box_mean(values: Tensor) -> Tensor:
+    """The mean [H, W] over the window around each pixel, over the part inside the image."""
+    pooled = avg_pool2d(
+        values[None, None], WINDOW, stride=1, padding=WINDOW // 2, count_include_pad=False
+    )
+    mean: Tensor = pooled[0, 0]
+    return mean
 
 
 def _attenuating_settings(conf: ComponentsConf) -> dict[str, float]:

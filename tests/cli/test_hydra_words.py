@@ -1,0 +1,138 @@
+"""Tests of Hydra's overrides on a command line: paths with any character, and typos."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+from hydra.core.override_parser.overrides_parser import OverridesParser
+from hydra.errors import HydraException
+from omegaconf.errors import ConfigKeyError
+
+from xrgs import config
+from xrgs.capture.scenes import motorcycle
+from xrgs.cli.hydra_words import explained, with_quotes
+from xrgs.cli.sweep import texts
+from xrgs.errors import XrgsError
+
+RunCommand = Callable[..., tuple[int, str, str]]
+ACCENT = "e\N{COMBINING ACUTE ACCENT}"
+WHOLE = "\N{LATIN SMALL LETTER E WITH ACUTE}"
+ODD = (
+    *("a b", " lead", "trail ", "-x", "~nobody", "50%", "a=b", "it's", 'q"q', "a;b", "a&b", "#h"),
+    *("!x", "[x]", "{y}", "(p)", "$x", "a:b", "*", ACCENT, WHOLE, "部屋", "🙂", "1e3", "true"),
+    *("007", "a\\b'"),
+)
+
+
+def parsed(word: str) -> object:
+    """Return what Hydra reads from a word that was given quotes."""
+    (override,) = OverridesParser.create().parse_overrides(with_quotes([word]))
+    return override.value()
+
+
+@pytest.mark.parametrize("name", ODD)
+def test_hydra_reads_a_path_as_it_was_written(name: str) -> None:
+    found = parsed(f"scene.path={name}")
+    assert getattr(found, "text", found) == name
+    assert texts([f"store={name}"]).store == name
+
+
+@pytest.mark.parametrize("name", ["a,b", "null", "${y}", "a\\b", f"{WHOLE},b"])
+def test_a_word_that_hydra_reads_otherwise_is_a_path_if_it_exists(
+    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, compose: Callable[..., config.Conf]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / name).mkdir()
+    assert compose(*with_quotes([f"scene.path={name}"])).scene.path == name
+
+
+def test_lists_quotes_and_other_keys_stay_as_they_are() -> None:
+    words = ["scene.path=a,b", "scene.path='é'", "seed=range(0,9)", "label=é", "+ablation=[a,b]"]
+    assert with_quotes(words) == words
+    assert with_quotes(["scene.path=é,b c"]) == ["scene.path='é',b c"]
+    assert with_quotes(["store=é,b c"]) == ["store='é,b c'"]
+
+
+def test_bytes_that_are_not_unicode_are_named() -> None:
+    with pytest.raises(XrgsError, match=r"store=\\udcff.*not valid Unicode"):
+        with_quotes(["store=\udcff"])
+
+
+def test_a_path_with_commas_may_end_with_all_folders_below(tmp_path: Path) -> None:
+    (tmp_path / "a, b").mkdir()
+    (override,) = with_quotes([f"scene.path={tmp_path}/a, b/**"])
+    assert override == f"scene.path='{tmp_path}/a, b/**'"
+
+
+@pytest.mark.slow
+def test_a_scene_with_odd_names_is_swept_and_reported(
+    run_command: RunCommand, tmp_path: Path
+) -> None:
+    scene = tmp_path / f"-部屋 🙂 {{it's}} 50%=#1; {ACCENT}, a"
+    scene.mkdir()
+    views = ['-a b\'s & "c" (1) 🙂', f"[{ACCENT}]=50%#, $x.y"]
+    for name, file in zip(views, motorcycle.files().values(), strict=True):
+        shutil.copy(file, scene / f"{name}.png")
+    conf = ["preset=smoke", "train.steps=2", "variant.test_every=0", "variant.min_hr=1"]
+    conf += ["variant.long_side=185", "variant.sfm.reference=false"]
+    words = ("+ablation=curriculum", "scene=folder", f"scene.path={scene.name}", *conf)
+    store = "st öre, 'a' {b} 🙂"
+    code, out, err = run_command("sweep", tmp_path, *words, f"store={store}")
+    assert code == 0, err
+    assert scene.name in out
+    home = tmp_path / store
+    for cell in (home / "cells").iterdir():
+        assert {file.stem for file in (cell / "renders").iterdir()} == set(views)
+    (report,) = (home / "reports").iterdir()
+    pictures = list((report / "figures").iterdir())
+    assert len(pictures) == 2
+    page = (report / "table.md").read_text()
+    assert all(f"](figures/{file.name})" in page and file.name.isascii() for file in pictures)
+    for command, name in (("report", str(Path(*report.parts[-3:]))), ("status", scene.name)):
+        code, out, err = run_command(command, tmp_path, "--store", store)
+        assert code == 0, err
+        assert name in out
+
+
+def test_help_names_every_choice(run_command: RunCommand, tmp_path: Path) -> None:
+    code, out, _ = run_command("sweep", tmp_path, "--help")
+    assert code == 0
+    for name in ("consistency", "llff/fern", "motorcycle", "laptop", "smoke"):
+        assert name in out
+
+
+@pytest.mark.parametrize("kind", [HydraException, ConfigKeyError])
+def test_an_error_of_hydra_is_one_line_with_a_hint(kind: type[Exception]) -> None:
+    with pytest.raises(XrgsError, match=r"^two \(hint\)$"), explained(" (hint)"):
+        raise kind("two\nlines")
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["scene=fern"], "scene=fern: there is no such choice; did you mean llff/fern?"),
+        (["scene=q"], "choose from: captures/ollie"),
+        (["steps=100"], "steps: there is no such key; did you mean train.steps"),
+        (["+steps=100"], "steps: there is no such key; did you mean train.steps"),
+        (["+train.stesp=4"], "train.stesp: there is no such key; did you mean train.steps?"),
+        (["ablaton=consistency"], "ablaton: there is no such key; did you mean ablation?"),
+        (["+ablation=consistancy"], "did you mean consistency?"),
+        (["sweeps=tabel1"], "sweeps=tabel1: there is no such choice; did you mean table1?"),
+        (["hydra/launcher=jobli"], "hydra/launcher=jobli: there is no such choice"),
+        (["dry_run=maybe"], "dry_run: Value 'maybe' is not a valid bool"),
+        (["seed=["], "seed=[: "),
+    ],
+    ids=lambda value: value[0] if isinstance(value, list) else "",
+)
+def test_a_typo_is_one_line_with_what_was_meant(
+    sweep_here: RunCommand, words: list[str], message: str
+) -> None:
+    code, out, err = sweep_here(*words, *[] if "dry_run" in words[0] else ["dry_run=true"])
+    assert (code, out) == (1, "")
+    assert err.startswith("xrgs-sweep: ")
+    assert message in err
+    assert "HYDRA_FULL_ERROR" not in err
+    assert len(err.splitlines()) == 1

@@ -1,0 +1,67 @@
+"""Makes the folders of cells without training."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import msgspec
+
+from xrgs import composing
+from xrgs.experiment.attempts import begin_attempt, plan_cell
+from xrgs.experiment.schema import Identity, Provenance, RecordedCell, Summary
+from xrgs.safeio.atomic import write_json
+
+if TYPE_CHECKING:
+    from xrgs.config import Conf
+    from xrgs.experiment.cell_folder import CellFolder
+
+SUMMARY = Summary(1.5, 2.0, 7, 1e6, 1e4, steps=10)
+PROVENANCE = Provenance(
+    xrgs="0.2.0",
+    git=None,
+    git_diff_sha256=None,
+    python="3.12.0",
+    packages={"torch": "2.13.0"},
+    platform="Linux",
+    threads=1,
+    backend="torch",
+    started="2026-01-01T00:00:00+00:00",
+)
+SCORES = "view,psnr,ssim,lpips\na,20.5,0.75,\nb,30.0,0.5,0.25\n"
+
+
+def identity(seed: int = 0, variant: str = "key-hash") -> Identity:
+    """The identity of a cell that is never trained."""
+    return Identity(variant, seed, {"views": "mixed"}, {"backend": "torch"}, {})
+
+
+def row(
+    cell_id: str | None, label: str = "baseline", *, scene: str = "fern", seed: int = 0
+) -> RecordedCell:
+    """A cell in the record of a sweep."""
+    return RecordedCell(cell_id, label, "", scene, 0, seed, "key-hash", None)
+
+
+def begun(cell: CellFolder, conf: Conf | None = None, what: Identity | None = None) -> CellFolder:
+    """Begin an attempt at a cell, as a sweep does."""
+    cell.path.parent.mkdir(parents=True, exist_ok=True)
+    plan_cell(cell, conf or composing.compose("scene=motorcycle"), what or identity())
+    assert begin_attempt(cell)
+    return cell
+
+
+def finished(
+    cell: CellFolder, conf: Conf | None = None, what: Identity | None = None
+) -> CellFolder:
+    """Begin a cell, and write every file of a done one."""
+    begun(cell, conf, what)
+    write_json(cell.path / "summary.json", msgspec.to_builtins(SUMMARY))
+    write_json(cell.path / "provenance.json", msgspec.to_builtins(PROVENANCE))
+    (cell.path / "scores.csv").write_text(SCORES)
+    (cell.path / "history.csv").write_text("step,view,gaussians,loss\n0,c,7,0.5\n")
+    (cell.path / "splats.ply").write_bytes(b"20 Gaussians")
+    (cell.path / "renders").mkdir()
+    for view in ("a", "b"):
+        (cell.path / "renders" / f"{view}.png").write_bytes(b"1234")
+    cell.finish(["a", "b"], {"psnr": "0123"})
+    return cell

@@ -1,0 +1,167 @@
+"""Follows each recipe of CONTRIBUTING.md to the letter, in a copy of the package.
+
+A comment before a block of the document says where the block goes. The copy comes first on the path
+of the commands that are then run as a contributor would run them.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import shutil
+import subprocess
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+
+import pytest
+
+import xrgs
+from xrgs.capture.scenes import motorcycle
+from xrgs.config import CONF_DIR
+
+pytestmark = pytest.mark.slow
+
+ROOT = Path(__file__).parents[1]
+#: Comment and block: recipe, what to do with the block, and its text.
+BLOCK = re.compile(r"<!-- recipe: (\w+), (.*?) -->\n```\w+\n(.*?)```", re.DOTALL)
+NEW, EDIT = re.compile(r"new file (\S+)"), re.compile(r"in (\S+) (before|after) (.*)", re.DOTALL)
+SMOKE = ("scene=motorcycle", "preset=smoke", "threads=1", "store=s")
+
+
+@dataclass(frozen=True)
+class Copy:
+    """A copy of the package with its configs, in which recipes are followed."""
+
+    root: Path
+
+    def follow(self, recipe: str) -> None:
+        """Put every block of a recipe where its comment says."""
+        text = (ROOT / "CONTRIBUTING.md").read_text(encoding="utf-8")
+        blocks = [(where, block) for name, where, block in BLOCK.findall(text) if name == recipe]
+        assert blocks, recipe
+        for where, block in blocks:
+            if new := NEW.fullmatch(where):
+                file = self.root / new[1]
+                assert not file.exists()
+                file.write_text(block)
+                continue
+            edit = EDIT.fullmatch(where)
+            assert edit, where
+            name, side, anchor = edit.groups()
+            anchor = anchor.replace("\\n", "\n")
+            file, content = self.root / name, (self.root / name).read_text()
+            assert content.count(anchor) == 1, (name, anchor, content.count(anchor))
+            around = f"{block}{anchor}" if side == "before" else f"{anchor}\n{block.rstrip()}"
+            file.write_text(content.replace(anchor, around))
+
+    def edit(self, name: str, old: str, new: str) -> None:
+        """Replace a text of a file of the package."""
+        file = self.root / "xrgs" / name
+        text = file.read_text()
+        assert text.count(old) == 1
+        file.write_text(text.replace(old, new))
+
+    def run(self, command: str, *arguments: str) -> str:
+        """Run `xrgs-<command>` of the copy in its root; return what it printed, without errors."""
+        code = f"import sys; sys.argv[0] = 'xrgs-{command}'; from xrgs.cli.{command} import main"
+        done = subprocess.run(
+            [sys.executable, "-P", "-c", f"{code}; main()", *arguments],
+            cwd=self.root,
+            env=os.environ | {"PYTHONPATH": str(self.root)},
+            capture_output=True,
+            text=True,
+            check=False,
+        )
+        assert done.returncode == 0, done.stdout + done.stderr
+        return done.stdout + done.stderr
+
+
+@pytest.fixture(scope="module")
+def trained(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The root of a copy with a store `s` of two trained cells."""
+    root = tmp_path_factory.mktemp("trained")
+    ignored = shutil.ignore_patterns("__pycache__", "conf", "sweeps")
+    shutil.copytree(Path(xrgs.__file__).parent, root / "xrgs", ignore=ignored)
+    shutil.copytree(CONF_DIR, root / "conf", ignore=shutil.ignore_patterns("sweeps"))
+    sweeps = CONF_DIR / "sweeps"
+    shutil.copytree(sweeps if sweeps.is_dir() else CONF_DIR.parent / "sweeps", root / "sweeps")
+    shutil.copytree(ROOT / "hydra_plugins", root / "hydra_plugins")
+    Copy(root).run("sweep", "+ablation=consistency", *SMOKE)
+    return root
+
+
+@pytest.fixture
+def copy(trained: Path, tmp_path: Path) -> Copy:
+    """A copy of that root for one test."""
+    return Copy(shutil.copytree(trained, tmp_path / "copy", symlinks=True))
+
+
+def done_cells(copy: Copy, *arguments: str) -> str:
+    """The plan's first line of the sweep that `trained` has run, after an edit."""
+    printed = copy.run("sweep", "+ablation=consistency", *SMOKE, "dry_run=true", *arguments)
+    return next(line for line in printed.splitlines() if line.startswith("plan:"))
+
+
+def test_an_ablation(copy: Copy) -> None:
+    copy.follow("ablation")
+    printed = copy.run("sweep", "+ablation=half_weight", *SMOKE, "dry_run=true")
+    assert "plan: 2 cells, 1 done" in printed
+    assert "half_weight" in printed
+
+
+def test_a_component(copy: Copy) -> None:
+    copy.follow("component")
+    assert "2 cells, 2 done" in done_cells(copy)  # what is off is in no id
+    printed = copy.run("sweep", "components.fade.weight=0.1", *SMOKE)
+    assert "fade.weight=0.1 against baseline" in printed
+    assert "components.fade.weight" in copy.run("sweep", "help=components.fade")
+
+
+def test_a_metric_is_added_rescored_and_in_the_table(copy: Copy) -> None:
+    copy.follow("metric")
+    assert "2 cells, 2 done" in done_cells(copy)
+    splats = {f: f.read_bytes() for f in (copy.root / "s").rglob("splats.ply")}
+    assert "scored 2 cells anew" in copy.run("store", "rescore", "--store", "s")
+    assert {f: f.read_bytes() for f in splats} == splats
+    table = copy.run("report", "--store", "s")
+    row = next(line for line in table.splitlines() if line.startswith("MAE"))
+    assert re.search(r"0\.\d+ +0\.\d+", row)
+    again = copy.run("store", "rescore", "--store", "s")
+    assert "2 cells had the scores of this code already" in again
+    assert "2 cells, 2 done" in done_cells(copy)
+    copy.run("store", "check", "--store", "s")
+
+
+def test_a_scene(copy: Copy) -> None:
+    copy.follow("scene")
+    assert "2 cells, 2 done" in done_cells(copy)
+    data = Path(motorcycle.files()["motorcycle_left"]).parent
+    names = ("motorcycle_left.png", "motorcycle_right.png")
+    (copy.root / "pair.txt").write_text("".join(f"{data / name}\n" for name in names))
+    listed = ("scene=folder", "scene.kind=listed", "scene.path=pair.txt", "store=s")
+    assert "1 cell" in copy.run("sweep", *listed, "preset=smoke", "dry_run=true")
+
+
+def test_a_degradation(copy: Copy) -> None:
+    copy.follow("degradation")
+    assert "2 cells, 2 done" in done_cells(copy)
+    assert "2 cells, 0 done" in done_cells(copy, "variant.degradation=blur")
+
+
+def test_a_refactoring_is_proven_and_keeps_its_cells(copy: Copy) -> None:
+    copy.edit("splat/settings.py", "NOMINAL_STEPS = 30_000", "NOMINAL_STEPS = 3 * 10_000")
+    assert "2 cells, 0 done" in done_cells(copy)
+    printed = copy.run("store", "prove", "--store", "s", "--sample", "1")
+    assert "1 cell trained again, the same bit for bit" in printed
+    declared = json.loads((copy.root / "xrgs/experiment/refactorings.json").read_text())
+    assert declared.keys() == {"core"}
+    assert "2 cells, 2 done" in done_cells(copy)
+
+
+def test_a_change_of_a_number_is_not_declared(copy: Copy) -> None:
+    copy.edit("splat/settings.py", "NOMINAL_STEPS = 30_000", "NOMINAL_STEPS = 29_000")
+    with pytest.raises(AssertionError, match="nothing is declared"):
+        copy.run("store", "prove", "--store", "s", "--sample", "1")
+    assert not (copy.root / "xrgs/experiment/refactorings.json").exists()

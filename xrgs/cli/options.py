@@ -1,0 +1,138 @@
+"""What all commands but `xrgs-sweep` share: their options, by tyro, and errors as messages.
+
+tyro makes help, completion and messages about wrong usage from typed functions and their
+docstrings. `xrgs-sweep` takes Hydra's overrides instead, see `hydra_words`.
+"""
+
+from __future__ import annotations
+
+import inspect
+import re
+import shlex
+import sys
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, TypeAlias
+
+import tyro
+from tyro.conf import CascadeSubcommandArgs, DisallowNone, FlagCreatePairsOff, OmitArgPrefixes, arg
+
+import xrgs
+from xrgs.errors import XrgsError
+from xrgs.runtime.streams import ignore_broken_pipe, say
+from xrgs.safeio.sanitize import for_line
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator, Mapping
+
+STORE = Path("xrgs-store")
+
+
+def shown_as(metavar: str) -> object:
+    """Describe an option: what the help calls its value; the help leaves its default out."""
+    return arg(metavar=metavar, help_behavior_hint="")
+
+
+Cells: TypeAlias = Annotated[tuple[str, ...], shown_as("CELL ...")]
+Flag: TypeAlias = Annotated[bool, arg(help_behavior_hint="")]
+Folder: TypeAlias = Annotated[Path, arg(metavar="FOLDER")]
+Names: TypeAlias = Annotated[tuple[str, ...], shown_as("NAME ...")]
+OptionalFolder: TypeAlias = Annotated[Path | None, shown_as("FOLDER")]
+
+_CONFIG = (
+    CascadeSubcommandArgs,  # options without a subcommand belong to the default one
+    DisallowNone,  # no word "None" for an option that was not given
+    FlagCreatePairsOff,  # no --no-dry-run beside --dry-run
+    OmitArgPrefixes,  # --scenes, not --which.scenes, for an option in a dataclass
+)
+_WRONG_USAGE = 2  # as tyro and argparse end
+
+
+def run(
+    command: str,
+    target: Callable[..., None] | Mapping[str, Callable[..., None]],
+    description: str | None = None,
+    default: str = "",
+    overrides: str = "",
+) -> None:
+    """Parse the command line, and call the function that it asks for.
+
+    Args:
+        command: Name of the command.
+        target: A function, whose typed parameters are the options and whose docstring is the help;
+            or one for each subcommand.
+        description: What the help of a command with subcommands says first.
+        default: The subcommand that is meant where none is named.
+        overrides: The subcommand that takes Hydra's overrides, `KEY=VALUE`.
+
+    Raises:
+        SystemExit: With code 1 on an `XrgsError`, and with code 2 on wrong usage.
+    """
+    answer_version(command)
+    # Of a subcommand with overrides, `out` alone is an option that is no key of Hydra's config.
+    name = "out" if sys.argv[1:2] == [overrides] else "[a-z][a-z_]*"
+    assignment = re.compile(f"({name})=(.*)", re.DOTALL)
+    with errors_as_messages(command, assignment):
+        _refuse_assignments(command, assignment)
+        if callable(target):
+            tyro.cli(_unwrapped(target), prog=command, config=_CONFIG)
+            return
+        app = tyro.extras.SubcommandApp()
+        for name, function in target.items():
+            app.command(name=name, is_default=name == default)(_unwrapped(function))
+        app.cli(prog=command, description=description, config=_CONFIG)
+
+
+def _unwrapped(function: Callable[..., None]) -> Callable[..., None]:
+    """Join the lines of each entry under Args, whose line breaks tyro would keep in the help."""
+    function.__doc__ = re.sub(r"\n {8,}", " ", inspect.cleandoc(function.__doc__ or ""))
+    return function
+
+
+def _refuse_assignments(command: str, assignment: re.Pattern[str]) -> None:
+    """End a command that was given `KEY=VALUE`, and say how its options are written."""
+    for word in sys.argv[1:]:
+        if found := assignment.fullmatch(word):
+            values = [] if found[2] == "true" else found[2].split(",")
+            written = shlex.join([_option(found[1]), *values])
+            say(for_line(f"{command}: {word}: options are written {written}"), sys.stderr)
+            sys.exit(_WRONG_USAGE)
+
+
+def _option(name: str) -> str:
+    return f"--{name.replace('_', '-')}"
+
+
+@contextmanager
+def errors_as_messages(command: str, argument: re.Pattern[str] | None = None) -> Iterator[None]:
+    """End the command with a message and code 1 on errors that the user can correct.
+
+    A reader of its output that ends first, as `head` does, is no error.
+
+    Args:
+        command: Name of the command, which begins the message.
+        argument: Finds the name and the rest of a message about a function's argument, as
+            `out=FOLDER: it exists`. It is printed as one about the option: `--out FOLDER: ...`.
+
+    Raises:
+        SystemExit: With the message, in place of the error.
+    """
+    ignore_broken_pipe()
+    try:
+        yield
+    except XrgsError as error:
+        message = str(error)
+        if argument and (found := argument.fullmatch(message)):
+            message = f"{_option(found[1])} {found[2]}"
+        sys.exit(for_line(f"{command}: {message}"))
+
+
+def answer_version(command: str) -> None:
+    """Print the version of xrgs and end the command, where `--version` is asked for.
+
+    Raises:
+        SystemExit: With code 0, after the version was printed.
+    """
+    if "--version" in sys.argv[1:]:
+        say(f"{command} {xrgs.__version__}")
+        sys.exit()

@@ -1,0 +1,141 @@
+"""What strategies share: budgets, the choice of the highest scores, and splits."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from xrgs.splat.quaternions import rotation_matrices
+
+SPLIT_SHRINK = 1.6
+"""The scales of a Gaussian split at random are divided by this in its two halves [kerbl2023,
+section 5.2]."""
+
+LONG_AXIS_OFFSET = 0.5
+"""Distance of a half from the Gaussian split along its longest axis, in scales of that axis."""
+LONG_AXIS_SHRINK = 0.5
+"""Factor of the scale of the longest axis in a half."""
+SHORT_AXES_SHRINK = 0.85
+"""Factor of the other two scales in a half."""
+HALF_OPACITY = 0.6
+"""Factor of the opacity in a half."""
+
+
+@dataclass(frozen=True)
+class Budget:
+    """The largest number of Gaussians to which growth may lead, which rises during densification.
+
+    The growth control of ImprovedGS [deng2025]: at a share p of the steps from the start of
+    densification to its last refinement, the number is
+
+        first + (most - first) * sqrt(p)
+
+    so that most Gaussians come early and have time to train. Our choice: the number starts at that
+    of the SfM points, where the authors' code has `most * sqrt(p)`. If there are more than `most`
+    points, nothing grows until pruning has left fewer.
+    """
+
+    first: int
+    """The number of Gaussians before training."""
+    most: int
+    """The number of Gaussians at the end of densification."""
+
+    def cap(self, progress: float) -> int:
+        """Return the largest number of Gaussians at a share of densification in 0..1."""
+        first = min(self.first, self.most)
+        return first + int((self.most - first) * math.sqrt(progress))
+
+
+def gaussians_of(budget: float, view_pixels: int) -> int:
+    """Return the number of Gaussians of a budget, at least 1.
+
+    Args:
+        budget: Gaussians per pixel.
+        view_pixels: Number of pixels of the largest training view.
+    """
+    return max(1, round(budget * view_pixels))
+
+
+def top_k(candidates: Tensor, scores: Tensor, count: int) -> Tensor:
+    """Choose the candidates with the highest scores; of equal scores the first ones.
+
+    ImprovedGS [deng2025] draws candidates with probabilities in proportion to their scores. Our
+    choice: the highest scores, which needs no random numbers.
+
+    Args:
+        candidates: [N] bool.
+        scores: [N] floats; a score that is infinite or NaN counts as 0.
+        count: How many to choose, at least 0; all candidates where there are fewer.
+
+    Returns:
+        [N] bool, the chosen candidates.
+    """
+    index = candidates.nonzero()[:, 0]  # [M]
+    ranked = torch.nan_to_num(scores[index], nan=0.0, posinf=0.0, neginf=0.0)
+    order = torch.sort(ranked, descending=True, stable=True).indices
+    chosen = torch.zeros_like(candidates)
+    chosen[index[order[:count]]] = True
+    return chosen
+
+
+def split_at_random(
+    old: Mapping[str, Tensor], scales: Tensor, generator: torch.Generator
+) -> dict[str, Tensor]:
+    """Split each Gaussian into two smaller ones, with means drawn from it (gsplat's `split`).
+
+    Args:
+        old: Raw parameters [M, ...] for each name of `PARAMETERS`.
+        scales: [M, 3] world units.
+        generator: Draws the means.
+
+    Returns:
+        Raw parameters [2 M, ...]: the first half of every Gaussian, then the second.
+    """
+    # In double, since the numbers that torch draws in float32 depend on the processor.
+    noise = torch.randn(2, len(scales), 3, generator=generator, dtype=torch.float64)
+    along_axes = (noise.to(scales) * scales)[..., None, :]  # [2, M, 1, 3]
+    # [2, M, 3] each; written out, since the order in which torch adds depends on the processor.
+    first, second, third = (rotation_matrices(old["quats"]) * along_axes).unbind(-1)
+    offsets = first + second + third
+    halves = {name: torch.cat([value, value]) for name, value in old.items()}
+    halves["means"] = (old["means"] + offsets).reshape(-1, 3)
+    halves["scales"] = (old["scales"] - math.log(SPLIT_SHRINK)).repeat(2, 1)
+    return halves
+
+
+def split_along_longest_axis(old: Mapping[str, Tensor], scales: Tensor) -> dict[str, Tensor]:
+    """Split each Gaussian into two smaller ones, side by side along its longest axis.
+
+    The long-axis split of ImprovedGS [deng2025], with the constants of ImprovedGS+ [munoz2026]. For
+    a mean m, scales s with the largest at k, rotation R and opacity o, the halves have
+
+        m +- 0.5 s_k R e_k,  s_k' = 0.5 s_k,  s_j' = 0.85 s_j for the others,  o' = 0.6 o.
+
+    Rotation and colour stay. In ImprovedGS's own code the halves are 1.35 s_k away, with scales of
+    0.55 and 0.89. Of equal scales the first is the longest.
+
+    Args:
+        old: Raw parameters [M, ...] for each name of `PARAMETERS`.
+        scales: [M, 3] world units.
+
+    Returns:
+        Raw parameters [2 M, ...]: all halves on the positive side of the axis, then the others.
+    """
+    longest = old["scales"].argmax(dim=-1, keepdim=True)  # [M, 1]
+    axis = longest[:, None].expand(-1, 3, -1)  # [M, 3, 1]
+    direction = rotation_matrices(old["quats"]).gather(-1, axis)[..., 0]  # [M, 3]
+    offset = LONG_AXIS_OFFSET * scales.gather(-1, longest) * direction
+    shrink = torch.full_like(scales, math.log(SHORT_AXES_SHRINK))
+    shrink.scatter_(-1, longest, math.log(LONG_AXIS_SHRINK))
+    # logit(f sigmoid(x)), in double, since float32's logarithms depend on the processor.
+    rest = torch.tensor(math.log(1 - HALF_OPACITY), dtype=torch.float64)
+    logits = math.log(HALF_OPACITY) - torch.logaddexp(rest, -old["opacities"].double())
+    halves = {name: torch.cat([value, value]) for name, value in old.items()}
+    halves["means"] = torch.cat([old["means"] + offset, old["means"] - offset])
+    halves["scales"] = (old["scales"] + shrink).repeat(2, 1)
+    halves["opacities"] = logits.to(old["opacities"]).repeat(2)
+    return halves

@@ -1,0 +1,78 @@
+"""The components of xrgs, by the keys of `components` in the config.
+
+To add a component, write its module in `components/` and add its entry here. This module imports
+neither torch nor the components, so that planning can read it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+
+_FOLDER = "training/components"
+
+
+@dataclass(frozen=True)
+class ComponentEntry:
+    """Where a component is."""
+
+    module: str
+    """Module of `xrgs.training.components`."""
+    name: str
+    """Class in that module."""
+    reads: tuple[str, ...] = ()
+    """Further keys of `components` that the class reads."""
+    helpers: tuple[str, ...] = ()
+    """Further modules of `xrgs.training.components` that only this component uses."""
+
+
+#: In the order in which hooks run. `loss_weighting` comes after `consistency`, since the weight of
+#: a view multiplies its consistency loss as well.
+BUILT_IN: Mapping[str, ComponentEntry] = {
+    "consistency": ComponentEntry("consistency", "Consistency"),
+    "loss_weighting": ComponentEntry(
+        "weighting",
+        "Weighting",
+        reads=(
+            "continuous_weighting",
+            "adaptive_weighting",
+            "region_weighting",
+            "hybrid_schedule",
+        ),
+        helpers=("texture",),
+    ),
+    "gradient_scaling": ComponentEntry("gradient_scaling", "GradientScaling"),
+    "densify": ComponentEntry("densify", "Densify"),
+    "curriculum": ComponentEntry("curriculum", "Curriculum"),
+    "mip": ComponentEntry("mip", "Mip"),
+    "render_scale": ComponentEntry("render_scale", "RenderScale"),
+    "supersampled": ComponentEntry("supersampled", "Supersampled"),
+    "resolution_schedule": ComponentEntry("resolution_schedule", "ResolutionSchedule"),
+    "skip_backward": ComponentEntry("skip_backward", "SkipBackward"),
+    "multiview_score": ComponentEntry("view_scores", "MultiviewScore"),
+    "error_score": ComponentEntry("view_scores", "ErrorScore"),
+    "natural_selection": ComponentEntry("natural_selection", "NaturalSelection"),
+}
+
+
+def modules_of(key: str) -> tuple[str, ...]:
+    """Return the source files that implement a key of `components`.
+
+    Args:
+        key: A key of `BUILT_IN`, or one that an entry reads. `plugins` and `count_matched` have no
+            component here.
+
+    Returns:
+        Paths in the package, such as `training/components/weighting.py`; none without a component.
+    """
+    for own_key, entry in BUILT_IN.items():
+        if key == own_key or key in entry.reads:
+            return tuple(f"{_FOLDER}/{name}.py" for name in (entry.module, *entry.helpers))
+    return ()
+
+
+def order_of(keys: Iterable[str]) -> str:
+    """Return the classes of the components that are on, in the order in which their hooks run."""
+    on = set(keys)
+    entries = (entry for key, entry in BUILT_IN.items() if on & {key, *entry.reads})
+    return " ".join(f"{entry.module}:{entry.name}" for entry in entries)
