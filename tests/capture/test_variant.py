@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from xrgs.capture import images, variant
-from xrgs.capture.failures import failed_scenes
+from xrgs.capture.folders import failed_scenes
 from xrgs.capture.variant import CorruptVariant
 from xrgs.capture.views import SceneFailed, Variant
 from xrgs.config import SceneConf, VariantConf

@@ -26,6 +26,8 @@ from functools import partial
 from pathlib import Path
 from random import Random
 
+from xrgs.safeio.confined import ConfinedPath
+
 from tests.hostile import reference
 from tests.hostile.mutations import (
     Mutation,
@@ -36,7 +38,7 @@ from tests.hostile.mutations import (
     mutate_npz,
 )
 from xrgs import composing
-from xrgs.capture import failures, images, variant
+from xrgs.capture import folders, images, variant
 from xrgs.capture.lens import Lens
 from xrgs.capture.restore import restore_images
 from xrgs.errors import StoreError, XrgsError
@@ -44,7 +46,6 @@ from xrgs.experiment.cell_folder import CellFolder
 from xrgs.experiment.store import Store
 from xrgs.runtime import progress
 from xrgs.safeio import npz, records, untrusted
-from xrgs.safeio.confined import ConfinedPath
 from xrgs.splat.ply import load_ply
 from xrgs.sweep import locks
 from xrgs.training.checkpoint import Checkpoint
@@ -169,7 +170,7 @@ def _of_stores(store: Path, cell: Path) -> dict[str, Parser]:
         "failed-scene": Parser(
             store / "variants" / "failed-0123456789abcdef" / "report.json",
             mutate_json,
-            lambda file: failures.failed_scenes(file.parents[1]),
+            lambda file: folders.failed_scenes(file.parents[1]),
         ),
     }
 

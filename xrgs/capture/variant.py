@@ -10,9 +10,8 @@ import logging
 from contextlib import suppress
 from typing import TYPE_CHECKING
 
-from xrgs.capture import poses, scenes, sealed, split
+from xrgs.capture import folders, poses, scenes, sealed, split
 from xrgs.capture.degradations import DEGRADATIONS, resolve_degradation
-from xrgs.capture.failures import FAILED_PREFIX, read_failure
 from xrgs.capture.frozen import CorruptVariant, freeze, load, verify
 from xrgs.capture.tags import POLICIES
 from xrgs.capture.views import SceneFailed, Variant
@@ -21,8 +20,9 @@ from xrgs.errors import StoreError, UnreadableError
 from xrgs.runtime import lease
 from xrgs.safeio.atomic import write_json
 from xrgs.safeio.code import code_digest
-from xrgs.safeio.files import list_names, remove_path
+from xrgs.safeio.files import remove_path
 from xrgs.safeio.hashing import digest
+from xrgs.safeio.records import list_folder
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -115,16 +115,7 @@ def find(variants: Path, wanted_key: str) -> Variant | None:
 
 def _of_key(variants: Path, wanted_key: str) -> list[Path]:
     """Return the folders of the variants of a key."""
-    return [variants / name for name in _names(variants) if name.startswith(f"{wanted_key}-")]
-
-
-def _names(variants: Path) -> list[str]:
-    try:
-        return list_names(variants)
-    except FileNotFoundError:  # nothing was built yet
-        return []
-    except OSError as error:
-        raise UnreadableError(f"{variants}: {error.strerror}; try again") from error
+    return [variants / name for name in list_folder(variants) if name.startswith(f"{wanted_key}-")]
 
 
 def failure(variants: Path, wanted_key: str) -> str | None:
@@ -141,9 +132,9 @@ def failure(variants: Path, wanted_key: str) -> str | None:
     Raises:
         UnreadableError: The report can't be read now.
     """
-    home, name = variants, f"{FAILED_PREFIX}{wanted_key}"
+    folder = folders.failed_folder(variants, wanted_key)
     try:
-        return read_failure(home / name)[1] if name in _names(home) else None
+        return folders.read_failure(folder)[1] if folder.name in list_folder(variants) else None
     except UnreadableError:
         raise
     except StoreError:
@@ -169,7 +160,7 @@ def build(scene: SceneConf, conf: VariantConf, variants: Path, cache: Path) -> V
     """
     wanted_key = key(scene, conf)
     variants.mkdir(exist_ok=True)
-    report = variants / f"{FAILED_PREFIX}{wanted_key}" / "report.json"
+    report = folders.failed_folder(variants, wanted_key) / "report.json"
     report_before = _modified_ns(report)
     with lease.waited_for(variants, f".{wanted_key}.lock"):
         found = find(variants, wanted_key)
@@ -196,7 +187,7 @@ def _make(scene: scenes.Scene, conf: VariantConf, wanted_key: str, variants: Pat
     from xrgs.capture import mixing
 
     work = variants / f".{wanted_key}.building"
-    failed = variants / f"{FAILED_PREFIX}{wanted_key}"
+    failed = folders.failed_folder(variants, wanted_key)
     remove_path(work)
     remove_path(failed)
     frozen = work / "frozen"

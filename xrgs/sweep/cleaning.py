@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from functools import partial
 from typing import TYPE_CHECKING
 
-from xrgs.capture.failures import FAILED_PREFIX
+from xrgs.capture import folders
 from xrgs.errors import StoreError, XrgsError
 from xrgs.experiment import trimming
 from xrgs.experiment.attempts import remove_cell
@@ -158,7 +158,7 @@ def plan_gc(store: Store, cells: Sequence[CellSummary], of: Sequence[str]) -> Pl
     items = [*_removals(store, "cells of old code", old)]
     items += _removals(store, "failed cells", failed)
     if "failed" in of:
-        names = [n for n in _names(store.variants) if n.startswith(FAILED_PREFIX)]
+        names = filter(folders.is_failed, _names(store.variants))
         items += _folders("failed scenes", store.variants, names)
     if "aside" in of:
         items += _aside_items(store.cells_folder, locked=True)
@@ -305,10 +305,8 @@ def _orphans(
     if None in used:
         return [], ["variants are left alone: the identity of a cell can't be read"]
     orphans, new = [], 0
-    for name in _names(store.variants):
-        if name.startswith((".", FAILED_PREFIX)) or "-" not in name:
-            continue
-        if name.removeprefix(trimming.TRIMMED_PREFIX) in used:
+    for name in filter(folders.is_variant, _names(store.variants)):
+        if folders.id_of(name) in used:
             continue
         try:
             is_new = time.time() - (store.variants / name).lstat().st_mtime < _NEW_S
