@@ -54,11 +54,7 @@ POSES = ("capture/colmap.py", "capture/poses.py")
 
 
 def key(scene: SceneConf, conf: VariantConf) -> str:
-    """Hash what a variant is made from: photographs, poses, config and code, without running SfM.
-
-    Args:
-        scene: The scene's config.
-        conf: The variant's config.
+    """Hash the photographs, poses, config and code of a variant, without running SfM.
 
     Returns:
         16 hexadecimal digits.
@@ -95,10 +91,6 @@ def sources(conf: VariantConf) -> dict[str, tuple[str, ...]]:
 def find(variants: Path, wanted_key: str) -> Variant | None:
     """Find the frozen variant of a key, and verify it; a corrupt one is logged and passed over.
 
-    Args:
-        variants: The store's folder of variants.
-        wanted_key: What `key` gives.
-
     Returns:
         The variant; None where there is no intact one.
 
@@ -121,10 +113,7 @@ def _of_key(variants: Path, wanted_key: str) -> list[Path]:
 def failure(variants: Path, wanted_key: str) -> str | None:
     """Read why the scene of a key could not be made into a variant when it was last tried.
 
-    Args:
-        variants: The store's folder of variants.
-        wanted_key: What `key` gives. It covers photographs, config and code, so that a failure says
-            nothing about any others.
+    A key covers photographs, config and code, so that a failure says nothing about any others.
 
     Returns:
         The reason; None where the key did not fail, or its report is damaged.
@@ -147,11 +136,8 @@ def build(scene: SceneConf, conf: VariantConf, variants: Path, cache: Path) -> V
     Args:
         scene: The scene's config.
         conf: The variant's config.
-        variants: The store's folder of variants; it is made where it is missing, but for the store.
+        variants: The store's folder of variants; it is made where the store exists.
         cache: The store's folder of rendered scenes.
-
-    Returns:
-        The frozen variant.
 
     Raises:
         UnreadableError: The variant is there, but can't be read now; it is left as it is.

@@ -132,7 +132,7 @@ def test_all_folders_below_are_taken_where_the_path_asks_for_them(
     flat = SceneConf(name="", kind="folder", path=str(tmp_path / "x"), views=24)
     assert list(scenes.resolve(flat, tmp_path).files) == ["a", "b"]
     assert "images left out: 1 in day/one" in caplog.text
-    assert f"scene.path={tmp_path / 'x'}/** takes those of all folders" in caplog.text
+    assert f"scene.path={tmp_path / 'x'}/** takes the images of all folders" in caplog.text
     caplog.clear()
     nested = SceneConf(name="", kind="folder", path=f"{tmp_path / 'x'}/**", views=24)
     scene = scenes.resolve(nested, tmp_path)

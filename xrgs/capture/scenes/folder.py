@@ -147,7 +147,7 @@ def _images_in(folder: Path) -> tuple[Path, ...]:
 
 
 def _with_suffix(folder: Path, suffixes: frozenset[str]) -> list[Path]:
-    """List what has one of these suffixes in a folder, sorted; hidden files are none."""
+    """List the files of these suffixes in a folder, sorted, without hidden files."""
     files = sorted(folder.iterdir(), key=lambda file: file.name)
     return [f for f in files if f.suffix.lower() in suffixes and not f.name.startswith(".")]
 
@@ -163,7 +163,7 @@ def _all_below(folder: Path) -> tuple[Path, ...]:
 
 
 def _folders(folder: Path, depth: int = 0) -> Iterator[Path]:
-    """Yield a folder and all that are below it; hidden ones and links are not followed."""
+    """Yield a folder and all folders below it, without hidden folders and links."""
     if depth > _MAX_DEPTH:
         raise XrgsError(f"{folder}: folders are nested more than {_MAX_DEPTH} deep")
     yield folder
@@ -184,7 +184,7 @@ def _in_other_folders(folder: Path, taken: Sequence[Path]) -> list[str]:
     inside = Counter(file.parent for file in others if not _is_llff_folder(file.parent))
     return [
         f"images left out: {count} in {parent.relative_to(folder) if parent != folder else 'it'}"
-        f" (scene.path={folder}{ALL_BELOW} takes those of all folders)"
+        f" (scene.path={folder}{ALL_BELOW} takes the images of all folders)"
         for parent, count in sorted(inside.items())
     ]
 
