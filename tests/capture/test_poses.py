@@ -130,7 +130,7 @@ def test_a_radial_term_is_kept_and_others_are_refused(
     path = write_colmap(tmp_path / "b", "OPENCV", (*PARAMS, 0.1, 0.0, 0.0, 0.0))
     assert {lens.k for lens in poses.read_poses(str(path), photos).lenses.values()} == {0.1}
     path = write_colmap(tmp_path / "c", "OPENCV", (*PARAMS, 0.1, 0.2, 0.0, 0.0))
-    with pytest.raises(XrgsError, match=r"/c: camera OPENCV .*\(k2=0\.2\).*undistorter"):
+    with pytest.raises(XrgsError, match=r"/c: camera OPENCV: .*\(k2=0\.2\).*undistorter"):
         poses.read_poses(str(path), photos)
     path = write_colmap(tmp_path / "d", "OPENCV_FISHEYE", (*PARAMS, 0.1, 0.0, 0.0, 0.0))
     with pytest.raises(XrgsError, match=r"camera model OPENCV_FISHEYE: must be one of"):
