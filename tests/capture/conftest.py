@@ -123,8 +123,8 @@ def shared_store(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def procedural_variant(
     build_in: Callable[..., Variant], shared_store: Path, procedural_scene: SceneConf
 ) -> Variant:
-    """The embedded scene at 252 px, with fewer features than by default, which takes seconds."""
-    return build_in(shared_store, procedural_scene, sfm={"max_num_features": 1200})
+    """The embedded scene with the default settings, at 252 px. Building it takes seconds."""
+    return build_in(shared_store, procedural_scene)
 
 
 @pytest.fixture(scope="session")

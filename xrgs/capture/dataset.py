@@ -71,9 +71,9 @@ def load(
 ) -> Dataset:
     """Read a variant's images and normalise its world.
 
-    Poses, points, world and the views that are scored do not depend on `use`: the controls differ
-    from `mixed` in the training views alone. Poses, points and world do not depend on `validation`
-    either: SfM has placed held-out training views among the others, as it has test views.
+    Poses, points and world depend neither on `use` nor on `validation`: SfM has placed held-out
+    training views among the others, as it has placed test views. The controls differ from `mixed`
+    in the training views alone.
 
     Args:
         variant: The frozen variant.
@@ -91,9 +91,8 @@ def load(
     Raises:
         UnreadableError: An image can't be read now.
         ImageError: An image is missing, unreadable or not of its view's size; the message names it.
-        XrgsError: `use` is none of these, or the variant has no such views; `validation` is not in
-            0..1, or leaves fewer than two HR training views; or the variant's cameras and points
-            can't be normalised.
+        XrgsError: The variant has no such views, too few HR training views are left, or its cameras
+            and points can't be normalised; the message names the key.
     """
     scored = _held_out(variant, validation, seed) or [v for v in variant.views if v.split == "test"]
     held_out = {view.name for view in scored if view.split == "train"}

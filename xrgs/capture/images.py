@@ -35,7 +35,7 @@ MAX_PIXELS = 1 << 28
 #: The largest image of a store that is read. In training it takes 800 MB.
 MAX_PNG_PIXELS = 1 << 26
 #: Deflate, the compression of PNGs, makes at most 1032 bytes of one, and no photograph of any
-#: format shrinks as much; a drawing may, but takes little memory up to so many pixels.
+#: format shrinks as much. A drawing may; up to so many pixels it takes little memory.
 _MAX_EXPANSION, _SMALL_PIXELS = 1032, 1 << 24
 _EXIF_ORIENTATION = 0x0112
 _EXIF_CAMERA = (0x010F, 0x0110)  # make, model

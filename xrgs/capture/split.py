@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Split:
-    """Ascending indices into the views sorted by name; the three are disjoint and cover all."""
+    """Indices of the views in the order of their names; the three are disjoint and cover all."""
 
     test: tuple[int, ...]
     """The held-out views: never trained on, never degraded."""

@@ -70,13 +70,13 @@ def list_photographs(path: str | None, long_side: int) -> dict[str, Path]:
             has at least so many px are taken; the largest where none has, or where this is 0.
 
     Returns:
-        At least two files by the names of their views, sorted by these: the name of the file
-        without its suffix. With `/**` the folders on the way come before it, joined by `_`.
+        At least two files by the names of their views, sorted by name: the name of the file without
+        its suffix. With `/**` the folders on the way come before it, joined by `_`.
 
     Raises:
         UnreadableError: The folder can't be read now.
-        XrgsError: There is no such folder, it holds fewer than two images or two of one name, a
-            name can't be used, or images are HEIC and the package that reads it is not installed.
+        XrgsError: The folder is missing, has fewer than two images or two of one name, a name can't
+            be used, or images are HEIC and the package that reads it is not installed.
     """
     if not path:
         raise XrgsError("scene.path is empty: give the folder of photographs, scene.path=...")
