@@ -15,13 +15,13 @@ from typing import Any
 import numpy as np
 import pytest
 from PIL import Image
-from xrgs.report.render import to_text
 from xrgs.safeio.confined import ConfinedPath
 
 from xrgs.capture.contact_sheet import COLOURS, contact_sheet
 from xrgs.capture.views import Variant, View
 from xrgs.errors import XrgsError
 from xrgs.report import variant as inspect
+from xrgs.runtime.text import to_text
 from xrgs.safeio.sanitize import MAX_LINE
 
 Run = Callable[..., tuple[int, str, str]]

@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from xrgs.report.markup import LATEX_PREAMBLE, to_latex, to_markdown
-from xrgs.runtime.text_table import TextTable, to_text, width
+from xrgs.runtime.text import TextTable, to_text, width
 
 TABLE = TextTable(
     title="a_b & c",

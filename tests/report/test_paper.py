@@ -18,7 +18,7 @@ from xrgs.report.context import Context
 from xrgs.report.joined import JoinedStore
 from xrgs.report.page import build
 from xrgs.report.paper import paper_tables, texture, texture_tables, with_texture
-from xrgs.runtime.text_table import TextTable
+from xrgs.runtime.text import TextTable
 from xrgs.training.components.texture import gradient_magnitude
 
 SCENES = ("fern", "flower", "horns")

@@ -14,7 +14,7 @@ from xrgs.report.context import Context
 from xrgs.report.page import build
 from xrgs.report.tables import Tables
 from xrgs.report.writing import ARROWS_NOTE, LACKING_NOTE, percent, scale_note
-from xrgs.runtime.text_table import TextTable
+from xrgs.runtime.text import TextTable
 
 BY_NAME = {metric.name: metric for metric in METRICS}
 

@@ -11,7 +11,7 @@ from xrgs.capture import variant
 from xrgs.capture.contact_sheet import contact_sheet
 from xrgs.capture.folders import is_failed
 from xrgs.errors import XrgsError
-from xrgs.runtime.text_table import TextTable, to_text
+from xrgs.runtime.text import TextTable, to_text
 from xrgs.safeio.atomic import atomic_writer
 from xrgs.safeio.records import read_struct
 from xrgs.safeio.sanitize import for_line

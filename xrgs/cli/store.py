@@ -21,8 +21,8 @@ from xrgs.safeio.sanitize import counted
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
+    from xrgs.experiment.listing import CellRow, Selection
     from xrgs.sweep.cleaning import Plan
-    from xrgs.sweep.inventory import CellSummary, Selection
 
 
 @dataclass(frozen=True)
@@ -48,16 +48,14 @@ class Filter:
 
     def selection(self) -> Selection:
         """Return the options as the functions of the store take them."""
-        from xrgs.sweep.inventory import Selection
+        from xrgs.experiment.listing import Selection
 
         names = self.ids, self.scenes, self.ablations, self.states, self.sweep
         return Selection(*names, self.older_days, self.larger_mb)
 
-    def chosen(self) -> tuple[list[CellSummary], list[CellSummary]]:
+    def chosen(self) -> tuple[list[CellRow], list[CellRow]]:
         """Return all cells of the store, and the cells that are meant."""
-        from xrgs.sweep.inventory import summaries
-
-        cells = summaries(Store(self.store))
+        cells = Store(self.store).cell_rows()
         return cells, self.selection().of(cells)
 
 
@@ -77,8 +75,8 @@ class Removal:
             XrgsError: It is not confirmed.
             SystemExit: With code 1, where something was left.
         """
+        from xrgs.runtime.text import format_size
         from xrgs.sweep.cleaning import carry_out
-        from xrgs.sweep.inventory import size_text
 
         say(str(plan))
         if self.dry_run or not plan.items:
@@ -86,7 +84,7 @@ class Removal:
         if not (self.yes or _confirmed(f"{plan.verb} {plan.total}?")):
             raise XrgsError("nothing was done; --yes does it without asking")
         freed, left = carry_out(store, plan)
-        say(f"freed {size_text(freed)}")
+        say(f"freed {format_size(freed)}")
         _say_left(left)
 
 
@@ -109,10 +107,11 @@ def show(cell: Positional[Annotated[str, arg(metavar="CELL")]], store: Folder = 
         cell: The cell's id, or the beginning of it.
         store: The store.
     """
-    from xrgs.sweep.inventory import one_cell, summaries
-    from xrgs.sweep.show import show as described
+    from xrgs.experiment.listing import Selection
+    from xrgs.sweep.inventory import show as described
 
-    say(described(Store(store), one_cell(cell, summaries(Store(store)))))
+    (chosen,) = Selection(ids=(cell,)).of(Store(store).cell_rows())
+    say(described(Store(store), chosen))
 
 
 def rm(cells: Filter, removal: Removal) -> None:
@@ -158,15 +157,15 @@ def pack(cells: Filter, out: Annotated[Path, arg(metavar="FILE.tar.xz")]) -> Non
         cells: The cells that pass all of these options.
         out: The archive to write.
     """
+    from xrgs.runtime.text import format_size
     from xrgs.sweep import packing
-    from xrgs.sweep.inventory import size_text
 
     if not out.name.endswith(".tar.xz"):
         raise XrgsError(f"--out {out}: name the archive to write, FILE.tar.xz")
     _, chosen = cells.chosen()
     done = [cell for cell in chosen if cell.state.name == "done"]
     packed = packing.pack(Store(cells.store), done, out, Path.cwd(), cells.sweep)
-    say(f"{out}: {packed}; {size_text(packed.bytes)}")
+    say(f"{out}: {packed}; {format_size(packed.bytes)}")
     if len(done) < len(chosen):
         say(f"left out, not done: {counted(len(chosen) - len(done), 'cell')}")
     _say_left(packed.left_out)
@@ -187,9 +186,8 @@ def gc(
         store: The store.
     """
     from xrgs.sweep.cleaning import plan_gc
-    from xrgs.sweep.inventory import summaries
 
-    removal.carry_out(Store(store), plan_gc(Store(store), summaries(Store(store)), of))
+    removal.carry_out(Store(store), plan_gc(Store(store), Store(store).cell_rows(), of))
 
 
 def rescore(cells: Filter) -> None:

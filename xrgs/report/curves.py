@@ -13,7 +13,7 @@ import pandas as pd
 
 from xrgs.report.collect import CELL_KEYS, CURVE_COLUMNS
 from xrgs.report.markup import titled
-from xrgs.runtime.text_table import TextTable
+from xrgs.runtime.text import TextTable
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping, Sequence

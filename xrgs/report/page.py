@@ -23,7 +23,7 @@ from xrgs.report.markup import LATEX_PREAMBLE, to_latex, to_markdown
 from xrgs.report.paper import paper_tables, texture_tables, with_texture
 from xrgs.report.pictures import Picture, draw
 from xrgs.report.tables import Tables
-from xrgs.runtime.text_table import TextTable, to_text
+from xrgs.runtime.text import TextTable, to_text
 from xrgs.safeio.atomic import write_json, write_text
 from xrgs.safeio.sanitize import counted, for_csv, for_file_name, for_line, for_markdown
 

@@ -34,7 +34,7 @@ from xrgs.report.writing import (
     signed,
 )
 from xrgs.runtime.progress import progress
-from xrgs.runtime.text_table import TextTable
+from xrgs.runtime.text import TextTable
 from xrgs.safeio.sanitize import counted
 
 if TYPE_CHECKING:

@@ -37,7 +37,7 @@ from xrgs.report.writing import (
     scatter_note,
     signed,
 )
-from xrgs.runtime.text_table import TextTable
+from xrgs.runtime.text import TextTable
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence

@@ -15,7 +15,7 @@ import pandas as pd
 
 from xrgs.report.collect import CELL_KEYS, is_component_log
 from xrgs.report.markup import titled
-from xrgs.runtime.text_table import TextTable
+from xrgs.runtime.text import TextTable
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping, Sequence

@@ -32,8 +32,8 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Sequence
     from pathlib import Path
 
+    from xrgs.experiment.listing import CellRow
     from xrgs.experiment.store import Store
-    from xrgs.sweep.inventory import CellSummary
 
 #: The folder in the archive; the default of `store=`, so that commands find it once it is unpacked.
 _ROOT = "xrgs-store"
@@ -67,7 +67,7 @@ class Packed:
 
 
 def pack(
-    store: Store, cells: Sequence[CellSummary], out: Path, here: Path, sweeps: Sequence[str] = ()
+    store: Store, cells: Sequence[CellRow], out: Path, here: Path, sweeps: Sequence[str] = ()
 ) -> Packed:
     """Write an archive of done cells.
 
@@ -94,15 +94,14 @@ def pack(
             left_out.append(for_line(f"{name}: {CellState.of_error(error).reason}"))
             return {}
 
-    done = {
-        cell: files for cell in cells if (files := packed(cell.name, partial(_cell, cell, here)))
-    }
-    variant_ids = sorted({cell.variant_id for cell in done if cell.variant_id is not None})
-    sweep_ids = sorted({*sweeps} or {sweep for cell in done for sweep in cell.names.sweeps})
+    found = [(cell, packed(cell.name, partial(_cell, cell, here))) for cell in cells]
+    done = [(cell, files) for cell, files in found if files]
+    variant_ids = sorted({cell.variant_id for cell, _ in done if cell.variant_id is not None})
+    sweep_ids = sorted({*sweeps} or {sweep for cell, _ in done for sweep in cell.sweeps})
     variants = [packed(name, partial(_variant, store, name)) for name in variant_ids]
     records = [packed(name, partial(_record, store, name, here)) for name in sweep_ids]
     with errors_named(out):
-        size = _write(out, [*done.values(), *variants, *records])
+        size = _write(out, [*(files for _, files in done), *variants, *records])
     count = [len(of) - of.count({}) for of in (variants, records)]
     return Packed(len(done), count[0], count[1], size, tuple(left_out))
 
@@ -119,7 +118,7 @@ def _write(out: Path, groups: Iterable[_Files]) -> int:
         return stream.tell()
 
 
-def _cell(cell: CellSummary, here: Path) -> _Files:
+def _cell(cell: CellRow, here: Path) -> _Files:
     """Return the files of a done cell as if it were trimmed, with its config's paths relative."""
     folder, status = cell.folder.path, cell.folder.trimmed_status()
     contents = {name: _verified(folder, name, of.sha256) for name, of in status.files.items()}

@@ -32,7 +32,7 @@ from xrgs.report.html.images import ERROR_RANGE, add_trained, add_views
 from xrgs.report.markup import filled, filled_places, titled, to_latex, to_markdown
 from xrgs.report.paper import counterparts
 from xrgs.report.writing import NO_INTERVAL, number, signed
-from xrgs.runtime.text_table import TextTable
+from xrgs.runtime.text import TextTable
 from xrgs.safeio.atomic import write_text
 from xrgs.safeio.sanitize import for_csv
 

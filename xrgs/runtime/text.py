@@ -1,4 +1,4 @@
-"""Tables of strings, and how a terminal shows them."""
+"""Text for people: sizes, ages and durations with their units, and aligned tables."""
 
 from __future__ import annotations
 
@@ -10,6 +10,38 @@ from xrgs.safeio.sanitize import MAX_CELL, for_line
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
+
+
+def format_size(count: float | None) -> str:
+    """Write a number of bytes: `12 MB`, `1.2 GB`, or `unknown` for None."""
+    if count is None:
+        return "unknown"
+    for unit in ("B", "kB", "MB"):
+        if count < 999.5:
+            return f"{count:.0f} {unit}"
+        count /= 1000
+    return f"{count:.1f} GB"
+
+
+def format_age(seconds: float | None) -> str:
+    """Write an age: `40 s`, `12 min`, `3 h`, `5 d`, or `?` for None."""
+    if seconds is None:
+        return "?"
+    for unit, length in (("d", 86400.0), ("h", 3600.0), ("min", 60.0)):
+        if seconds >= length:
+            return f"{seconds / length:.0f} {unit}"
+    return f"{seconds:.0f} s"
+
+
+def format_duration(seconds: float | None) -> str:
+    """Write an expected duration: `~40 s`, `~12 min`, `~3.5 h`, or `?` for None."""
+    if seconds is None:
+        return "?"
+    if seconds < 99.5:
+        return f"~{seconds:.0f} s"
+    if seconds < 99.5 * 60:
+        return f"~{seconds / 60:.0f} min"
+    return f"~{seconds / 3600:.1f} h"
 
 
 @dataclass(frozen=True)

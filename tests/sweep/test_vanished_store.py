@@ -12,10 +12,7 @@ from typing import Any
 
 import pytest
 
-from xrgs.experiment.store import Store
-from xrgs.safeio.confined import ConfinedPath
-from xrgs.sweep import presence
-from xrgs.sweep.presence import StoreGoneError
+from xrgs.experiment.store import Store, StoreGoneError
 
 #: Every cell's process reports that it has begun, and then writes into its folder for ever.
 WRITES_ON = """
@@ -28,7 +25,7 @@ if "xrgs.sweep.jobs.worker" in sys.orig_argv and "cell" in sys.orig_argv:
         from xrgs.safeio.atomic import write_json
         (Path(os.environ["SWEEPS_OF"]) / "begun").touch()
         while True:
-            write_json(folder.folder / "provenance.json", {})
+            write_json(folder.path / "provenance.json", {})
             time.sleep(0.01)
 
     sys.modules["xrgs.experiment.cell"] = types.ModuleType("xrgs.experiment.cell")
@@ -58,22 +55,22 @@ VANISHES = pytest.mark.parametrize("vanishes", [rename, delete, unmount])
 def test_a_store_that_was_moved_is_gone_and_says_where_its_cells_are(
     store: Store, vanishes: Callable[[Path], None]
 ) -> None:
-    presence.check(store)
+    store.check_not_gone()
     vanishes(store.path)
-    assert presence.is_gone(store)
+    assert store.is_gone
     with pytest.raises(StoreGoneError, match=r"no longer there .*finished cells are where"):
-        presence.check(store)
+        store.check_not_gone()
 
 
 @pytest.mark.parametrize("number", [errno.EACCES, errno.EIO, errno.ESTALE])
 def test_a_store_that_can_not_be_looked_at_now_is_not_gone(
     store: Store, monkeypatch: pytest.MonkeyPatch, number: int
 ) -> None:
-    def fail(path: ConfinedPath) -> bool:
+    def fail(path: Path, **_: object) -> os.stat_result:
         raise OSError(number, os.strerror(number), str(path))
 
-    monkeypatch.setattr(ConfinedPath, "is_dir", fail)
-    presence.check(store)
+    monkeypatch.setattr(Path, "stat", fail)
+    store.check_not_gone()
 
 
 def wait_for(what: Callable[[], object], sweep: Any) -> None:
