@@ -104,7 +104,7 @@ def render(folder: Path, long_side: int, views: int) -> None:
     """Render every view and write it as `<name>.png`; nothing waits for the disk.
 
     Args:
-        folder: The folder for the images; it is made where it is missing.
+        folder: An existing folder for the images.
         long_side: The width of the views, px; 0 for the full size.
         views: The number of views.
     """
