@@ -49,7 +49,7 @@ _QUALITIES = ((90, 0.40), (80, 0.22), (60, 0.13), (40, 0.09))
 _MAX_PIXELS = 1 << 24
 #: Scores by cell and view.
 _Scores = dict[tuple[str, str], dict[str, float | None]]
-#: About how many more pixels error maps add to those of renders.
+#: The pixels of photographs and renders, times this, are about those of error maps as well.
 _WITH_ERROR_MAPS = 1.25
 
 
@@ -76,10 +76,7 @@ class Album:
         self._quality = next(fitting, _QUALITIES[-1][0])
 
     def add(self, images: Sequence[Image.Image]) -> list[int] | None:
-        """Add images that belong together.
-
-        Args:
-            images: Images of mode RGB.
+        """Add RGB images that belong together.
 
         Returns:
             The place of each in `urls`. Where they do not fit, none is added, and the result is
@@ -98,14 +95,9 @@ class Album:
 
 
 def data_url(image: Image.Image, quality: int) -> str:
-    """Encode an image.
+    """Encode an RGB image as WebP in a data URL; a side of more than 1008 px is shrunk to that.
 
-    Args:
-        image: An image of mode RGB; a side of more than 1008 px is shrunk to it.
-        quality: 1 to 100, libwebp's scale.
-
-    Returns:
-        The data URL of a WebP.
+    `quality` is on libwebp's scale, 1 to 100.
     """
     if max(image.size) > _MAX_SIDE:
         image = image.copy()
@@ -150,17 +142,10 @@ def add_views(
     views: pd.DataFrame,
     max_bytes: int,
 ) -> None:
-    """Add every scored view of every cell, with as many images as fit.
+    """Add every scored view of every cell, with as many images as fit into `max_bytes`.
 
-    The first replicates of all scenes come first. A view without images has its scores, and the
-    notes say how many there are.
-
-    Args:
-        content: The content of the page, to which views, images and notes are added.
-        store: The store with photographs and renders.
-        comparison: The comparison of the cells.
-        views: The table `Sweep.views`.
-        max_bytes: The most bytes that the images may take; 0 for no images.
+    The first replicates of all scenes come first. A view whose images do not fit has its scores
+    alone, and the notes count such views.
     """
     scores: _Scores = {
         (row["cell_id"], row["view"]): {name: finite(row[name]) for name in VIEW_METRICS}
@@ -271,14 +256,13 @@ def add_trained(
 ) -> None:
     """Add training views with renders of them, models for 3D, and the cameras.
 
-    They are of the first replicate of each scene and condition, and of the variants that can be
-    read.
+    They are of the first replicate of each scene and condition, where its variant can be read.
 
     Args:
-        content: The content of the page, to which they and notes are added.
+        content: The content of the page.
         store: The store with the cells.
         comparison: The comparison of the cells.
-        variants: The variants of the cells that can be read, by their ids.
+        variants: The variants that can be read, by their ids.
         max_image_bytes: The most bytes that the images may take.
         max_model_bytes: The most bytes that the models may take as base64.
     """
@@ -340,11 +324,7 @@ def _add_run(
         models_left: The most models that are added.
 
     Returns:
-        How many models were added.
-
-    Raises:
-        XrgsError: The variant's images can't be read.
-        ValueError: A view can't be rendered.
+        The number of models that were added.
     """
     from xrgs.viewer.trained import TrainedScene
 
