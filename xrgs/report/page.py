@@ -155,7 +155,7 @@ def build(
     except OSError as error:
         raise ReportError(
             f"the report can't be written to {folder}: {error.filename}: {error.strerror};"
-            " name another folder with out=..."
+            " name another folder with --out"
         ) from error
     written = {p.file for p in drawn if p.file} | {folder / name for name in _FILES}
     text = f"{_text(tables, _warnings(sweep))}\n{for_line(f'Written to {folder}')}"
