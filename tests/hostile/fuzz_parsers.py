@@ -38,7 +38,7 @@ from tests.hostile.mutations import (
     mutate_npz,
 )
 from xrgs import composing
-from xrgs.capture import failures, images, variant
+from xrgs.capture import folders, images, variant
 from xrgs.capture.lens import Lens
 from xrgs.capture.restore import restore_images
 from xrgs.errors import StoreError, XrgsError
@@ -170,7 +170,7 @@ def _of_stores(store: Path, cell: Path) -> dict[str, Parser]:
         "failed-scene": Parser(
             store / "variants" / "failed-0123456789abcdef" / "report.json",
             mutate_json,
-            lambda file: failures.failed_scenes(file.parents[1]),
+            lambda file: folders.failed_scenes(file.parents[1]),
         ),
     }
 

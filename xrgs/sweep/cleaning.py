@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from functools import partial
 from typing import TYPE_CHECKING
 
-from xrgs.capture.failures import FAILED_PREFIX
+from xrgs.capture import folders
 from xrgs.errors import StoreError, XrgsError
 from xrgs.experiment import trimming
 from xrgs.experiment.attempts import remove_cell
@@ -153,7 +153,7 @@ def plan_gc(store: Store, cells: Sequence[CellRow], of: Sequence[str]) -> Plan:
     items = [*_removals(store, "cells of old code", old)]
     items += _removals(store, "failed cells", failed)
     if "failed" in of:
-        scenes = [path for path in _paths(store.variants) if path.name.startswith(FAILED_PREFIX)]
+        scenes = [path for path in _paths(store.variants) if folders.is_failed(path.name)]
         items += _folders("failed scenes", scenes)
     if "aside" in of:
         for above in (store.cells_folder, store.variants):
@@ -268,9 +268,7 @@ def _orphans(
         return [], ["variants are left alone: the identity of a cell can't be read"]
     orphans, new = [], 0
     for path in _paths(store.variants):
-        if path.name.startswith((".", FAILED_PREFIX)) or "-" not in path.name:
-            continue
-        if path.name.removeprefix(trimming.TRIMMED_PREFIX) in used:
+        if not folders.is_variant(path.name) or folders.id_of(path.name) in used:
             continue
         is_new = time.time() - path.stat().st_mtime < _NEW_S
         new += is_new

@@ -16,6 +16,7 @@ from statistics import fmean
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from xrgs.capture import frozen
+from xrgs.capture.folders import trimmed_folder
 from xrgs.errors import StoreError, XrgsError
 from xrgs.experiment.provenance import processor, this_processor
 from xrgs.splat.backend import resolve_backend
@@ -189,7 +190,7 @@ def _sizes(variants: Path, variant_id: str, views: str) -> _Sizes:
     """
     folder = variants / variant_id
     if not folder.is_dir():
-        folder = variants / f"trimmed-{variant_id}"
+        folder = trimmed_folder(variants, variant_id)
     manifest = frozen.read_manifest(folder)
     tag = {"hr_only": "HR", "lr_only": "LR"}.get(views)
     splits = ("train", "original") if views == "all_hr" else ("train",)  # originals replace

@@ -19,6 +19,7 @@ from typing import TYPE_CHECKING, Any
 import msgspec
 
 from xrgs.capture import frozen
+from xrgs.capture.folders import trimmed_folder
 from xrgs.errors import StoreError
 from xrgs.experiment import trimming
 from xrgs.experiment.cell_folder import CellState
@@ -136,7 +137,7 @@ def _verified(folder: Path, name: str, sha256: str) -> bytes:
 
 def _variant(store: Store, variant_id: str) -> _Files:
     """Return the files of a variant as if it were trimmed, under a trimmed variant's name."""
-    trimmed = trimming.trimmed_folder(store.variants, variant_id)
+    trimmed = trimmed_folder(store.variants, variant_id)
     folder = trimmed if trimmed.is_dir() else store.variants / variant_id
     if damage := trimming.verify_variant(folder):
         raise StoreError("; ".join(damage))

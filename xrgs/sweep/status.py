@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from functools import partial
 from typing import TYPE_CHECKING, TypeVar
 
-from xrgs.capture.failures import FAILED_PREFIX, failed_scenes
+from xrgs.capture.folders import failed_scenes, is_variant
 from xrgs.errors import StoreError
 from xrgs.experiment.listing import STATES
 from xrgs.experiment.store import Store
@@ -101,8 +101,7 @@ def _aside(store: Store, problems: _Problems) -> int:
 
 def _variants(store: Store, problems: _Problems) -> list[str]:
     """Return the frozen variants, without unfinished ones and reports of failed scenes."""
-    names = [name for name in list_folder(store.variants) if "-" in name]
-    names = [name for name in names if not name.startswith((".", FAILED_PREFIX))]
+    names = [name for name in list_folder(store.variants) if is_variant(name)]
     folders = {name for name in names if (store.variants / name).is_dir()}
     problems += [f"{store.variants}/{n}: not a folder" for n in names if n not in folders]
     return [name for name in names if name in folders]

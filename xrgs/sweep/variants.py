@@ -6,6 +6,7 @@ from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING
 
 from xrgs.capture import images, scenes, variant
+from xrgs.capture.folders import trimmed_folder
 from xrgs.capture.scenes import folder
 from xrgs.errors import StoreError, UnreadableError, XrgsError
 from xrgs.experiment import trimming
@@ -66,7 +67,7 @@ def restore(conf: Conf, store: Store, variant_id: str) -> None:
         StoreGoneError: The store is no longer there.
         XrgsError: The photographs are missing, or give other images.
     """
-    if not trimming.trimmed_folder(store.variants, variant_id).is_dir():
+    if not trimmed_folder(store.variants, variant_id).is_dir():
         return
     log_line(f"variant {variant_id}: making the images again that xrgs-store trim has removed")
     request = {"conf": asdict(conf), "store": str(store.path), "variant": variant_id}
