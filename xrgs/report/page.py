@@ -68,7 +68,7 @@ class Report:
 
 @dataclass(frozen=True)
 class Runs:
-    """Tables of the trainings themselves, beside those of their results."""
+    """Tables of what the trainings of a sweep did."""
 
     labels: dict[str, list[str]]
     """The labels of each condition's cells, in the sweep's order."""
@@ -347,8 +347,8 @@ def _warnings(sweep: Sweep) -> list[str]:
     arithmetics = sweep.provenance.get("arithmetic", ())
     if len(arithmetics) > 1:
         warnings.append(
-            f"The cells were trained with different arithmetic ({', '.join(arithmetics)}): its"
-            " differences, as large as between seeds, are mixed with those that are compared."
+            f"The cells were trained with different arithmetic ({', '.join(arithmetics)}): that alone"
+            " makes cells differ as much as another seed does."
         )
     return warnings
 
