@@ -85,8 +85,6 @@ def test_the_number_of_threads_changes_no_bit_and_they_are_the_held_ones() -> No
 )
 @pytest.mark.slow
 @pytest.mark.parametrize(("isa", "capability", "libraries"), PROCESSORS)
-def test_no_processor_changes_a_bit(
-    isa: str, capability: str, libraries: dict[str, str]
-) -> None:
+def test_no_processor_changes_a_bit(isa: str, capability: str, libraries: dict[str, str]) -> None:
     found = hashes(1, XRGS_ISA=isa, ATEN_CPU_CAPABILITY=capability, **libraries)
     assert found == [HELD], UPDATE
