@@ -2,32 +2,26 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
 import pytest
 import torch
-from torch import Tensor
 
+from tests.splat.scenes import (
+    draw,
+    gradients_of,
+    make_camera,
+    make_scene,
+    single_pixel,
+    with_gradients,
+)
 from xrgs.splat.cameras import Camera
-from xrgs.splat.rendering import Render
 from xrgs.splat.settings import RasterSettings
-
-Scene = dict[str, Tensor]
-MakeCamera = Callable[..., Camera]
-MakeScene = Callable[..., dict[str, Tensor]]
-Draw = Callable[..., Render]
 
 # --- compositing, on one pixel --------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_a_pixel_ends_before_the_gaussian_that_leaves_too_little(
-    draw: Draw,
-    with_gradients: Callable[[Scene], Scene],
-    gradients_of: Callable[[Scene], Scene],
-    single_pixel: MakeScene,
-    pixel: Camera,
-    dtype: torch.dtype,
+    pixel: Camera, dtype: torch.dtype
 ) -> None:
     scene = single_pixel(6, opacity=0.95, dtype=dtype)
     scene["opacities"][4:] = 0.01  # these would leave enough, but the pixel has ended
@@ -43,7 +37,7 @@ def test_a_pixel_ends_before_the_gaussian_that_leaves_too_little(
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_a_transmittance_of_exactly_the_least_ends_the_pixel(
-    draw: Draw, single_pixel: MakeScene, pixel: Camera, dtype: torch.dtype
+    pixel: Camera, dtype: torch.dtype
 ) -> None:
     # Three alphas of exactly 1/2: the third would leave a transmittance of exactly 1/8.
     scene = single_pixel(3, opacity=0.5, dtype=dtype)
@@ -53,9 +47,7 @@ def test_a_transmittance_of_exactly_the_least_ends_the_pixel(
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_an_alpha_of_exactly_the_least_is_composited(
-    draw: Draw, single_pixel: MakeScene, pixel: Camera, dtype: torch.dtype
-) -> None:
+def test_an_alpha_of_exactly_the_least_is_composited(pixel: Camera, dtype: torch.dtype) -> None:
     scene = single_pixel(1, opacity=0.5, dtype=dtype)
     for least, alpha in ((0.5, 0.5), (0.5001, 0.0)):
         render = draw(scene, pixel, RasterSettings(alpha_min=least), sh_degree=0)
@@ -63,13 +55,7 @@ def test_an_alpha_of_exactly_the_least_is_composited(
         assert render.visible.tolist() == [alpha > 0]
 
 
-def test_a_capped_alpha_has_no_gradient(
-    draw: Draw,
-    with_gradients: Callable[[Scene], Scene],
-    gradients_of: Callable[[Scene], Scene],
-    single_pixel: MakeScene,
-    pixel: Camera,
-) -> None:
+def test_a_capped_alpha_has_no_gradient(pixel: Camera) -> None:
     leaves = with_gradients(single_pixel(2, opacity=0.995, dtype=torch.float64))
     with torch.no_grad():
         leaves["opacities"][1] = 0.5
@@ -84,18 +70,14 @@ def test_a_capped_alpha_has_no_gradient(
 
 
 @pytest.mark.parametrize(("opacity", "seen"), [(0.99 / 255, False), (1.01 / 255, True)])
-def test_a_contribution_below_the_cut_is_skipped(
-    draw: Draw, single_pixel: MakeScene, pixel: Camera, opacity: float, seen: bool
-) -> None:
+def test_a_contribution_below_the_cut_is_skipped(pixel: Camera, opacity: float, seen: bool) -> None:
     render = draw(single_pixel(1, opacity=opacity), pixel, sh_degree=0)
     assert (render.alpha > 0).item() == seen
     assert render.visible.tolist() == [seen]
 
 
 @pytest.mark.parametrize("order", [(0, 1), (1, 0)])
-def test_of_equal_depths_the_lower_index_is_in_front(
-    draw: Draw, single_pixel: MakeScene, pixel: Camera, order: tuple[int, int]
-) -> None:
+def test_of_equal_depths_the_lower_index_is_in_front(pixel: Camera, order: tuple[int, int]) -> None:
     scene = single_pixel(2, opacity=0.9)
     scene["means"][:, 2] = 2.0
     scene["sh0"] = torch.tensor([[[1.0, 0, -9]], [[-9.0, 0, 1]]])[list(order)]
@@ -103,13 +85,7 @@ def test_of_equal_depths_the_lower_index_is_in_front(
     assert (red > 5 * blue) if order == (0, 1) else (blue > 5 * red)
 
 
-def test_opacity_one_without_a_cap_is_opaque(
-    draw: Draw,
-    with_gradients: Callable[[Scene], Scene],
-    gradients_of: Callable[[Scene], Scene],
-    single_pixel: MakeScene,
-    pixel: Camera,
-) -> None:
+def test_opacity_one_without_a_cap_is_opaque(pixel: Camera) -> None:
     leaves = with_gradients(single_pixel(3, opacity=1.0, dtype=torch.float64))
     raster = RasterSettings(alpha_max=1.0, transmittance_min=-1.0)
     render = draw(leaves, pixel, raster, sh_degree=0)
@@ -121,13 +97,7 @@ def test_opacity_one_without_a_cap_is_opaque(
 # --- what is not seen ---------------------------------------------------------------------------
 
 
-def test_behind_or_nearer_than_near_is_not_seen_and_has_no_gradient(
-    draw: Draw,
-    with_gradients: Callable[[Scene], Scene],
-    gradients_of: Callable[[Scene], Scene],
-    make_camera: MakeCamera,
-    make_scene: MakeScene,
-) -> None:
+def test_behind_or_nearer_than_near_is_not_seen_and_has_no_gradient() -> None:
     camera = make_camera()
     scene = make_scene(8, camera, seed=1, dtype=torch.float32)
     depths = torch.tensor([-3.0, -1e-3, 0.0, 1e-30, 0.009, 0.01])
@@ -143,13 +113,7 @@ def test_behind_or_nearer_than_near_is_not_seen_and_has_no_gradient(
         assert gradient.isfinite().all()
 
 
-def test_a_covariance_that_overflows_is_dropped(
-    draw: Draw,
-    with_gradients: Callable[[Scene], Scene],
-    gradients_of: Callable[[Scene], Scene],
-    make_camera: MakeCamera,
-    make_scene: MakeScene,
-) -> None:
+def test_a_covariance_that_overflows_is_dropped() -> None:
     camera = make_camera()
     scene = make_scene(8, camera, seed=1, dtype=torch.float32)
     scene["scales"][0] = 1e30
@@ -165,9 +129,7 @@ def test_a_covariance_that_overflows_is_dropped(
     assert torch.equal(render.image, expected.image)
 
 
-def test_a_singular_covariance_is_dropped(
-    draw: Draw, single_pixel: MakeScene, pixel: Camera
-) -> None:
+def test_a_singular_covariance_is_dropped(pixel: Camera) -> None:
     scene = single_pixel(2, opacity=0.5)
     scene["scales"][0] = 0  # a point, which without dilation has no inverse covariance
     render = draw(scene, pixel, RasterSettings(eps2d=0.0), sh_degree=0)
@@ -175,9 +137,7 @@ def test_a_singular_covariance_is_dropped(
     assert render.alpha.item() == 0.5
 
 
-def test_a_box_that_only_touches_the_image_is_not_visible(
-    draw: Draw, single_pixel: MakeScene, pixel: Camera
-) -> None:
+def test_a_box_that_only_touches_the_image_is_not_visible(pixel: Camera) -> None:
     # At an opacity of exactly alpha_min the box is the mean itself, px; the image is 1 x 1 px.
     scene = single_pixel(1, opacity=0.5)
     for x, y, visible in (
@@ -193,14 +153,7 @@ def test_a_box_that_only_touches_the_image_is_not_visible(
 
 
 @pytest.mark.parametrize("count", [0, 5])
-def test_none_or_none_visible_shows_the_background(
-    draw: Draw,
-    with_gradients: Callable[[Scene], Scene],
-    gradients_of: Callable[[Scene], Scene],
-    make_camera: MakeCamera,
-    make_scene: MakeScene,
-    count: int,
-) -> None:
+def test_none_or_none_visible_shows_the_background(count: int) -> None:
     camera = make_camera()
     scene = with_gradients(make_scene(count, camera, dtype=torch.float32))
     with torch.no_grad():
