@@ -109,17 +109,6 @@ def test_flat_images_stay_finite(levels: tuple[float, float], noisy: bool) -> No
     assert image.grad.isfinite().all()
 
 
-def test_a_strided_image_counts_the_same() -> None:
-    image, photograph = similar_pair(20, 24)
-    target = prepare_target(photograph)
-    planar = image.permute(2, 0, 1).contiguous().permute(1, 2, 0)
-    assert not planar.is_contiguous()
-    loss = photometric_loss(image, target, l1=0.8, ssim=0.2)
-    torch.testing.assert_close(
-        photometric_loss(planar, target, l1=0.8, ssim=0.2), loss, rtol=1e-12, atol=0
-    )
-
-
 def test_a_target_keeps_no_graph() -> None:
     target = prepare_target(noise(12, 12).requires_grad_())
     assert not any(x.requires_grad for x in (target.image, target.mean, target.variance))

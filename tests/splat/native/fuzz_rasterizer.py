@@ -457,8 +457,8 @@ def compare_with_torch(scene: Scene, rendered: Render) -> None:
     if not scene.cases:
         try:
             oracle.compare(*arguments, sh_degree=scene.sh_degree)
-        except AssertionError as error:
-            raise FuzzError(f"a plain scene differs from torch's: {error}") from error
+        except AssertionError as failure:
+            raise FuzzError(f"a plain scene differs from torch's: {failure}") from failure
         return
     exact, single = (
         oracle.run(*arguments, "torch", dtype, sh_degree=scene.sh_degree)[0].image.detach()

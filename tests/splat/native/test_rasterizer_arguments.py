@@ -20,8 +20,9 @@ from torch import Tensor
 from tests.splat.scenes import Scene, make_camera, make_scene
 from xrgs.splat.cameras import Camera
 from xrgs.splat.gaussians import ActivatedGaussians
+from xrgs.splat.native.rasterizer import render_config
 from xrgs.splat.rendering import Render, rasterize_parameters
-from xrgs.splat.settings import RasterSettings
+from xrgs.splat.settings import CullingOptions, RasterSettings
 
 native = pytest.importorskip("xrgs._native")
 
@@ -41,6 +42,10 @@ def render(scene: Scene, camera: Camera) -> tuple[Render, list[Tensor]]:
         backend="native",
     )
     return made, [*leaves.values(), offset]
+
+
+def config_of(camera: Camera, sh_degree: int = 3) -> Any:
+    return render_config(camera, RasterSettings(), sh_degree, CullingOptions())
 
 
 def gradient(leaf: Tensor) -> Tensor:
@@ -116,7 +121,7 @@ def test_harmonics_whose_gradient_is_not_wanted_is_not_computed(isa: str) -> Non
 
 def test_a_forked_child_renders(large: tuple[Scene, Camera]) -> None:
     scene, camera = large
-    values, view = [scene[name] for name in NAMES], make_view(camera)
+    values, view = [scene[name] for name in NAMES], config_of(camera)
 
     def image() -> bytes:
         # Only our threads: torch's own do not outlive a fork.
@@ -134,43 +139,20 @@ def test_a_forked_child_renders(large: tuple[Scene, Camera]) -> None:
 # --- bad input ----------------------------------------------------------------------------------
 
 
-def make_view(camera: Camera, **changes: Any) -> Any:
-    options: dict[str, Any] = {
-        "viewmat": camera.viewmat.flatten().tolist(),
-        "intrinsics": [camera.K[0, 0], camera.K[1, 1], camera.K[0, 2], camera.K[1, 2]],
-        "width": camera.width,
-        "height": camera.height,
-        "near": 0.01,
-        "eps2d": 0.3,
-        "alpha_min": 1 / 255,
-        "alpha_max": 0.99,
-        "transmittance_min": 1e-4,
-        "antialiased": False,
-        "absgrad": False,
-        "background": (0.0, 0.0, 0.0),
-        "sh_degree": 3,
-        "culling": (True,) * 5,
-    }
-    options["intrinsics"] = [float(value) for value in options["intrinsics"]]
-    return native.RenderConfig(**(options | changes))
-
-
 def test_shapes_are_checked() -> None:
     camera = make_camera()
     scene = make_scene(10, camera, dtype=torch.float32)
     values = [scene[key] for key in NAMES]
     frame = native.Frame()
     with pytest.raises(ValueError, match="opacities must have 10 rows, got 9"):
-        frame.forward(make_view(camera), *values[:3], values[3][:9], *values[4:], None, 1)
+        frame.forward(config_of(camera), *values[:3], values[3][:9], *values[4:], None, 1)
     with pytest.raises(ValueError, match="shN has fewer bands"):
-        frame.forward(make_view(camera), *values[:5], values[5][:, :8].contiguous(), None, 1)
+        frame.forward(config_of(camera), *values[:5], values[5][:, :8].contiguous(), None, 1)
     with pytest.raises(ValueError, match="shN must have at most 15 bands, got 24"):
-        frame.forward(make_view(camera), *values[:5], torch.zeros(10, 24, 3), None, 1)
+        frame.forward(config_of(camera), *values[:5], torch.zeros(10, 24, 3), None, 1)
     with pytest.raises(ValueError, match="sh_degree"):
-        make_view(camera, sh_degree=4)
-    with pytest.raises(ValueError, match="at least 1"):
-        make_view(camera, width=0)
-    frame.forward(make_view(camera), *values, None, 1)
+        config_of(camera, sh_degree=4)
+    frame.forward(config_of(camera), *values, None, 1)
     with pytest.raises(ValueError, match="image's size"):
         frame.backward(torch.zeros(3, 3, 3), torch.zeros(3, 3), *values, None, True, 1)
     v_image, v_alpha = torch.zeros(camera.height, camera.width, 3), torch.zeros(camera.height, 20)
@@ -201,12 +183,12 @@ def test_a_frame_without_a_render_is_refused() -> None:
                 use()
 
     assert_all_refused()
-    frame.forward(make_view(camera), *values, None, 1)
+    frame.forward(config_of(camera), *values, None, 1)
     for use in uses:
         use()
     values[0] = torch.full((10, 3), torch.nan)
     with pytest.raises(ValueError, match="means has values that are not finite"):
-        frame.forward(make_view(camera), *values, None, 1)
+        frame.forward(config_of(camera), *values, None, 1)
     values[0] = scene["means"]
     assert_all_refused()
 
@@ -214,6 +196,7 @@ def test_a_frame_without_a_render_is_refused() -> None:
 AFTER_FAILURE = """
 import resource, torch
 from xrgs.splat.cameras import Camera
+from xrgs.splat.native.rasterizer import render_config
 from xrgs.splat.rendering import rasterize_parameters
 from xrgs.splat.settings import RasterSettings
 

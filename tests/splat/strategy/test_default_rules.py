@@ -76,16 +76,6 @@ def take_step(strategy: DefaultStrategy, gradients: dict[str, Tensor]) -> None:
 
 
 @pytest.mark.parametrize(
-    ("step", "refines"),
-    [(0, False), (500, False), (550, False), (600, True), (14_900, True), (15_000, False)],
-)
-def test_when_it_refines(step: int, refines: bool) -> None:
-    strategy = strategy_of(uniform(3))
-    refinement = densify(strategy, step, view_of(3, norm=1.0))
-    assert refinement.duplicated == (3 if refines else 0)
-
-
-@pytest.mark.parametrize(
     ("step", "resets"),
     [(0, False), (2999, False), (3000, True), (12_000, True), (15_000, False), (18_000, False)],
 )
@@ -103,16 +93,6 @@ def test_when_it_resets(step: int, resets: bool) -> None:
         assert strategy.gaussians.opacities[0] == before[0]
     else:
         assert torch.equal(strategy.gaussians.opacities, before)
-
-
-def test_the_mean_is_over_the_views_in_which_a_gaussian_is_visible() -> None:
-    strategy = strategy_of(uniform(2))
-    view = View(torch.zeros(2, 2), torch.tensor([True, False]))
-    densify(strategy, 1, view)
-    densify(strategy, 2, view)
-    # 3e-4 once: a mean of 1e-4 for the first, visible in three views, and of 3e-4 for the second.
-    assert densify(strategy, 600, view_of(2, norm=3e-4)).duplicated == 1
-    assert torch.equal(strategy.gaussians.means[2], strategy.gaussians.means[1])
 
 
 def test_each_rule_is_counted_once() -> None:
@@ -183,31 +163,12 @@ def test_the_halves_of_a_split_follow_the_old_gaussians_shape() -> None:
     torch.testing.assert_close(scales, (sigma / 1.6).repeat(2 * count, 1))
 
 
-def test_the_same_seed_splits_the_same() -> None:
-    runs = [strategy_of(uniform(30, scale=0.1), seed=seed) for seed in (5, 5, 6)]
-    for run in runs:
-        torch.rand(3)  # the global generator is another
-        densify(run, 600, view_of(30, norm=1.0))
-    assert torch.equal(runs[0].gaussians.means, runs[1].gaussians.means)
-    assert not torch.equal(runs[0].gaussians.means, runs[2].gaussians.means)
-
-
 def test_a_view_that_depends_on_no_gaussian_adds_nothing() -> None:
     strategy = strategy_of(uniform(2))
     densify(strategy, 599, view_of(2, norm=1.0))
     nothing = torch.zeros(2, dtype=torch.bool)
     refinement = strategy.after_step(600, None, nothing, width=WIDTH, height=HEIGHT)
     assert refinement == Refinement(duplicated=2)
-
-
-def test_statistics_start_again_after_a_refinement() -> None:
-    strategy = strategy_of(uniform(2), DensifySettings(grow_grad2d=10.0))
-    densify(strategy, 599, view_of(2, norm=1.0))
-    assert (strategy.visible_count == 1).all()
-    assert (strategy.grad2d_sum == 1).all()
-    densify(strategy, 600, view_of(2, norm=1.0))
-    assert (strategy.visible_count == 0).all()
-    assert (strategy.grad2d_sum == 0).all()
 
 
 # --- what others decide -------------------------------------------------------------------------
@@ -274,12 +235,6 @@ def test_a_scale_of_exactly_the_largest_stays() -> None:
     strategy = make_strategy(values, DensifySettings(prune_scale3d=0.5), scene_scale=2.0)
     assert densify(strategy, 3100, view_of(3)) == Refinement(pruned_scale=1)
     assert torch.equal(strategy.gaussians.means.detach(), values["means"][[0, 2]])
-
-
-@pytest.mark.parametrize(("step", "pruned"), [(2900, 0), (3000, 0), (3100, 1)])
-def test_large_gaussians_are_pruned_after_the_first_reset(step: int, pruned: int) -> None:
-    strategy = strategy_of(uniform(1, scale=1.0))
-    assert densify(strategy, step, view_of(1)).pruned_scale == pruned
 
 
 def test_opacities_at_the_cap_are_not_counted_as_reset() -> None:

@@ -8,7 +8,7 @@ import torch
 from numpy.typing import NDArray
 from scipy.special import sph_harm_y
 
-from tests.splat.scenes import Scene, draw, make_camera, make_scene, single_pixel
+from tests.splat.scenes import Scene, draw, make_camera, make_scene
 from xrgs.splat.cameras import Camera
 from xrgs.splat.settings import RasterSettings
 
@@ -122,12 +122,3 @@ def test_sizes_that_are_no_multiple_of_a_tile(width: int, height: int) -> None:
     render = draw(scene, camera)
     assert render.image.shape == (height, width, 3)
     np.testing.assert_allclose(render.image, naive(scene, camera, RasterSettings())[0], atol=1e-10)
-
-
-def test_pixel_centres_are_at_a_half() -> None:
-    camera = Camera(torch.eye(4), torch.tensor([[10.0, 0, 3.5], [0, 10, 2.5], [0, 0, 1]]), 8, 6)
-    scene = single_pixel(1, opacity=0.5)
-    alpha = draw(scene, camera, sh_degree=0).alpha
-    assert alpha[2, 3] == alpha.max()
-    torch.testing.assert_close(alpha[2, 2], alpha[2, 4])
-    torch.testing.assert_close(alpha[1, 3], alpha[3, 3])

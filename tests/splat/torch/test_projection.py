@@ -192,14 +192,3 @@ def test_the_cholesky_factor_is_of_half_the_conic() -> None:
         rtol=1e-9,
         atol=1e-12,
     )
-
-
-def test_equal_depths_keep_their_order() -> None:
-    camera = Camera(torch.eye(4), torch.diag(torch.tensor([9.0, 9.0, 1.0])), 40, 40)
-    generator = torch.Generator().manual_seed(0)
-    means = torch.rand(100, 3, generator=generator)
-    means[:, 2] = torch.arange(100) % 3 + 1.0
-    scales, quats = torch.full((100, 3), 0.1), torch.ones(100, 4)
-    projected = project(means, quats, scales, torch.ones(100), camera, RasterSettings())
-    order = visible_by_depth(projected, camera, RasterSettings()).tolist()
-    assert order == sorted(range(100), key=lambda i: (i % 3, i))

@@ -61,18 +61,6 @@ def test_float32_is_float64_outside_a_band_around_the_thresholds() -> None:
     assert error.max() < 2 * base.alpha_min * exact.max()
 
 
-def test_render_is_the_same_twice() -> None:
-    camera = make_camera()
-    scene = make_scene(50, camera, dtype=torch.float32)
-    results = []
-    for _ in range(2):
-        leaves = with_gradients(scene)
-        render = draw(leaves, camera)
-        torch.autograd.backward(render.image.sum())
-        results.append([render.image, *gradients_of(leaves).values()])
-    assert all(torch.equal(a, b) for a, b in zip(*results, strict=True))
-
-
 @given(
     seed=st.integers(0, 2**31),
     count=st.integers(0, 30),

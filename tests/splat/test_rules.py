@@ -70,18 +70,22 @@ def test_a_capped_alpha_has_no_gradient(pixel: Camera) -> None:
 
 
 @pytest.mark.parametrize(("opacity", "seen"), [(0.99 / 255, False), (1.01 / 255, True)])
-def test_a_contribution_below_the_cut_is_skipped(pixel: Camera, opacity: float, seen: bool) -> None:
-    render = draw(single_pixel(1, opacity=opacity), pixel, sh_degree=0)
+def test_a_contribution_below_the_cut_is_skipped(
+    backend: str, pixel: Camera, opacity: float, seen: bool
+) -> None:
+    render = draw(single_pixel(1, opacity=opacity), pixel, sh_degree=0, backend=backend)
     assert (render.alpha > 0).item() == seen
     assert render.visible.tolist() == [seen]
 
 
 @pytest.mark.parametrize("order", [(0, 1), (1, 0)])
-def test_of_equal_depths_the_lower_index_is_in_front(pixel: Camera, order: tuple[int, int]) -> None:
+def test_of_equal_depths_the_lower_index_is_in_front(
+    backend: str, pixel: Camera, order: tuple[int, int]
+) -> None:
     scene = single_pixel(2, opacity=0.9)
     scene["means"][:, 2] = 2.0
     scene["sh0"] = torch.tensor([[[1.0, 0, -9]], [[-9.0, 0, 1]]])[list(order)]
-    red, _, blue = draw(scene, pixel, sh_degree=0).image[0, 0]
+    red, _, blue = draw(scene, pixel, sh_degree=0, backend=backend).image[0, 0]
     assert (red > 5 * blue) if order == (0, 1) else (blue > 5 * red)
 
 
@@ -97,15 +101,15 @@ def test_opacity_one_without_a_cap_is_opaque(pixel: Camera) -> None:
 # --- what is not seen ---------------------------------------------------------------------------
 
 
-def test_behind_or_nearer_than_near_is_not_seen_and_has_no_gradient() -> None:
+def test_behind_or_nearer_than_near_is_not_seen_and_has_no_gradient(backend: str) -> None:
     camera = make_camera()
     scene = make_scene(8, camera, seed=1, dtype=torch.float32)
     depths = torch.tensor([-3.0, -1e-3, 0.0, 1e-30, 0.009, 0.01])
     scene["means"][:6] = depths[:, None] * torch.tensor([0.01, 0.01, 1.0])
     leaves = with_gradients(scene)
-    render = draw(leaves, camera)
+    render = draw(leaves, camera, backend=backend)
     assert not render.visible[:6].any()
-    expected = draw({name: value[6:] for name, value in scene.items()}, camera)
+    expected = draw({name: value[6:] for name, value in scene.items()}, camera, backend=backend)
     assert torch.equal(render.image, expected.image)
     torch.autograd.backward(render.image.sum())
     for gradient in gradients_of(leaves).values():
@@ -113,7 +117,7 @@ def test_behind_or_nearer_than_near_is_not_seen_and_has_no_gradient() -> None:
         assert gradient.isfinite().all()
 
 
-def test_a_covariance_that_overflows_is_dropped() -> None:
+def test_a_covariance_that_overflows_is_dropped(backend: str) -> None:
     camera = make_camera()
     scene = make_scene(8, camera, seed=1, dtype=torch.float32)
     scene["scales"][0] = 1e30
@@ -121,18 +125,18 @@ def test_a_covariance_that_overflows_is_dropped() -> None:
     scene["means"][2] = torch.tensor([3e38, 3e38, 3e38])
     scene["scales"][3] = 1e12  # the covariance has room, its determinant has not
     leaves = with_gradients(scene)
-    render = draw(leaves, camera)
+    render = draw(leaves, camera, backend=backend)
     assert not render.visible[:4].any()
     torch.autograd.backward(render.image.sum())
     assert all(gradient.isfinite().all() for gradient in gradients_of(leaves).values())
-    expected = draw({name: value[4:] for name, value in scene.items()}, camera)
+    expected = draw({name: value[4:] for name, value in scene.items()}, camera, backend=backend)
     assert torch.equal(render.image, expected.image)
 
 
-def test_a_singular_covariance_is_dropped(pixel: Camera) -> None:
+def test_a_singular_covariance_is_dropped(backend: str, pixel: Camera) -> None:
     scene = single_pixel(2, opacity=0.5)
     scene["scales"][0] = 0  # a point, which without dilation has no inverse covariance
-    render = draw(scene, pixel, RasterSettings(eps2d=0.0), sh_degree=0)
+    render = draw(scene, pixel, RasterSettings(eps2d=0.0), sh_degree=0, backend=backend)
     assert render.visible.tolist() == [False, True]
     assert render.alpha.item() == 0.5
 
@@ -153,12 +157,12 @@ def test_a_box_that_only_touches_the_image_is_not_visible(pixel: Camera) -> None
 
 
 @pytest.mark.parametrize("count", [0, 5])
-def test_none_or_none_visible_shows_the_background(count: int) -> None:
+def test_none_or_none_visible_shows_the_background(backend: str, count: int) -> None:
     camera = make_camera()
     scene = with_gradients(make_scene(count, camera, dtype=torch.float32))
     with torch.no_grad():
         scene["means"][:, 2] = -1
-    render = draw(scene, camera, RasterSettings(background=(0.1, 0.2, 0.3)))
+    render = draw(scene, camera, RasterSettings(background=(0.1, 0.2, 0.3)), backend=backend)
     assert torch.equal(render.image, torch.tensor([0.1, 0.2, 0.3]).expand(14, 20, 3))
     assert torch.equal(render.alpha, torch.zeros(14, 20))
     assert render.visible.tolist() == [False] * count
