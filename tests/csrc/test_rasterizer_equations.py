@@ -13,13 +13,14 @@ import torch
 from torch import Tensor
 from torch.linalg import cross
 
+from tests.splat.scenes import make_camera, make_scene
 from xrgs.splat.cameras import Camera
 from xrgs.splat.rendering import rasterize_parameters
 from xrgs.splat.settings import RasterSettings
 from xrgs.splat.sh import sh_basis
 
 N, WIDTH, HEIGHT = 14, 14, 10
-FX, FY, CX, CY = 13.0, 14.0, 6.3, 6.0
+FX, FY, CX, CY = 13.0, 14.3, 6.3, 6.0
 SETTINGS = RasterSettings()
 NAMES = ("means", "quats", "scales", "opacities", "sh0", "shN")
 
@@ -34,31 +35,16 @@ def random(*shape: int, generator: torch.Generator) -> Tensor:
 
 @pytest.fixture(scope="module")
 def camera() -> Camera:
-    K = torch.tensor([[FX, 0, CX], [0, FY, CY], [0, 0, 1]], dtype=torch.float64)
-    rotation, _ = torch.linalg.qr(random(3, 3, generator=torch.Generator().manual_seed(5)))
-    viewmat = torch.eye(4, dtype=torch.float64)
-    viewmat[:3, :3] = rotation * torch.linalg.det(rotation)
-    viewmat[:3, 3] = torch.tensor([0.3, -0.2, 0.5])
-    return Camera(viewmat, K, WIDTH, HEIGHT)
+    return make_camera(WIDTH, HEIGHT, focal=FX, turned=True)
 
 
 @pytest.fixture(scope="module")
 def scene(camera: Camera) -> dict[str, Tensor]:
     """Gaussians in and around the image; some are so far outside that slopes are clamped."""
-    g = torch.Generator().manual_seed(1)
-    z = 2 + 3 * torch.rand(N, generator=g, dtype=torch.float64)
-    pixel = (torch.rand(N, 2, generator=g, dtype=torch.float64) * 1.9 - 0.45) * torch.tensor(
-        [WIDTH, HEIGHT]
-    )
-    local = torch.stack([(pixel[:, 0] - CX) / FX * z, (pixel[:, 1] - CY) / FY * z, z], dim=-1)
-    return {
-        "means": (local - camera.viewmat[:3, 3]) @ camera.viewmat[:3, :3],
-        "quats": random(N, 4, generator=g),
-        "scales": torch.exp(0.5 * random(N, 3, generator=g)) * 3 * z[:, None] / FX,
-        "opacities": 0.1 + 0.89 * torch.rand(N, generator=g, dtype=torch.float64),
-        "sh0": random(N, 1, 3, generator=g),
-        "shN": 0.3 * random(N, 15, 3, generator=g),
-    }
+    made = make_scene(N, camera, seed=1, size=3.0)
+    outward = made["means"] - made["means"].mean(0)
+    made["means"][::3] += outward[::3]
+    return made
 
 
 @dataclass

@@ -51,6 +51,8 @@ CASES = {
     # Without the reset, after which too few Gaussians are left for numbers to be matched.
     "count_matched": ["splat.densify.reset_every=50000"],
 }
+#: The others are marked slow.
+FAST = ("baseline", "xrgs", "mip", "skip_backward", "count_matched")
 
 
 class Kill(BaseException):
@@ -135,7 +137,10 @@ def train_with_checkpoints(
     "backend",
     ["native", pytest.param("torch", marks=[pytest.mark.slow, pytest.mark.exhaustive])],
 )
-@pytest.mark.parametrize("case", CASES)
+@pytest.mark.parametrize(
+    "case",
+    [case if case in FAST else pytest.param(case, marks=pytest.mark.slow) for case in CASES],
+)
 def test_a_killed_run_ends_as_one_never_killed(
     case: str, backend: str, data: Dataset, losses: Losses, tmp_path: Path
 ) -> None:

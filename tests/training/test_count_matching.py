@@ -83,27 +83,6 @@ def test_a_number_that_no_threshold_gives_is_an_error_after_ten_attempts() -> No
     assert len(calls) == 10
 
 
-def test_a_restored_search_continues_with_the_same_thresholds() -> None:
-    train_at, thresholds = simulated_training(0.4, 50_000, 5_000, 0.02)
-    ThresholdSearch(2e-4, 5_000).run(train_at)
-    expected = thresholds.copy()
-    assert len(expected) > 3
-    first = ThresholdSearch(2e-4, 5_000)
-
-    def killed_at_the_third(threshold: float) -> None:
-        if threshold == expected[2]:
-            raise KeyboardInterrupt
-        train_at(threshold)
-
-    with pytest.raises(KeyboardInterrupt):
-        first.run(killed_at_the_third)
-    second = ThresholdSearch(2e-4, 5_000)
-    second.load_state_dict(first.state_dict())
-    train_again, continued = simulated_training(0.4, 50_000, 5_000, 0.02)
-    second.run(train_again)
-    assert continued == expected[2:]
-
-
 def test_the_second_threshold_assumes_a_power_of_one_and_a_half() -> None:
     assert next_threshold([(2e-4, 8000)], 1000) == pytest.approx(2e-4 * 8 ** (2 / 3))
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import inspect
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from types import SimpleNamespace
 from typing import Any
 
@@ -13,16 +13,16 @@ import pytest
 import torch
 
 from tests.training.conftest import compose, same
-from xrgs.capture.dataset import USES, Dataset, LoadedView
+from xrgs.capture.dataset import USES, Dataset
 from xrgs.config import CONF_DIR, Conf
 from xrgs.splat.gaussians import ActivatedGaussians, Gaussians, from_points
-from xrgs.splat.loss import Target, photometric_loss, prepare_target
+from xrgs.splat.loss import photometric_loss, prepare_target
 from xrgs.splat.optimizer import SplatOptimizer
 from xrgs.splat.rendering import Render, rasterize_parameters
 from xrgs.splat.settings import DensifySettings, OptimizerSettings, RasterSettings
 from xrgs.splat.strategy.default import DefaultStrategy
-from xrgs.training import components, loop, recorder, rendering
-from xrgs.training.components import Step, TrainingView, base
+from xrgs.training import components, recorder, rendering
+from xrgs.training.components import Step, base
 from xrgs.training.count_matching import train_cell
 from xrgs.training.loop import train
 from xrgs.training.sampler import EpochSampler
@@ -269,50 +269,6 @@ def test_extra_components_run_behind_those_of_the_config(data: Dataset, short: C
     assert first[0]["loss.before"] == plain[0]["loss"]
 
 
-class SmallerFirst(components.Component):
-    """Trains on a smaller photograph before step 20, in the place of the view's own."""
-
-    def __init__(self, data: Dataset) -> None:
-        self.small = {view.name: self._crop(view) for view in data.train}
-
-    def _crop(self, view: LoadedView) -> LoadedView:
-        image = view.image[1:, 1:].clone()
-        camera = view.camera.resized(image.shape[1], image.shape[0])
-        return dataclasses.replace(view, camera=camera, image=image)
-
-    def training_views(
-        self, views: Mapping[str, TrainingView], step: Step
-    ) -> Mapping[str, TrainingView]:
-        return self.small if step.number < 20 else views
-
-
-def test_a_component_may_replace_the_view_of_a_step(
-    data: Dataset, short: Conf, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """The render has the size of the photograph, which is prepared once."""
-    pairs = []
-
-    def spy(image: torch.Tensor, target: Target, **others: Any) -> torch.Tensor:
-        pairs.append((image.shape, target.image))
-        return photometric_loss(image, target, **others)
-
-    def prepare(image: torch.Tensor) -> Target:
-        prepared.append(image.shape)
-        return prepare_target(image)
-
-    prepared: list[torch.Size] = []
-    monkeypatch.setattr(loop, "photometric_loss", spy)
-    monkeypatch.setattr(loop, "prepare_target", prepare)
-    component = SmallerFirst(data)
-    train(data, short, extra_components=[component])
-    own = {view.image.data_ptr() for view in data.train}
-    small = {view.image.data_ptr() for view in component.small.values()}
-    assert all(shape == target.shape for shape, target in pairs)
-    assert {target.data_ptr() for _, target in pairs[:20]} == small
-    assert {target.data_ptr() for _, target in pairs[20:]} <= own
-    assert len(prepared) == 3 * len(data.train)  # once each time that the views change
-
-
 def test_a_gradient_of_zero_grows_nothing(data: Dataset, short: Conf) -> None:
     class Zero(components.Component):
         def densification_grad2d(self, gradient: torch.Tensor, step: Step) -> torch.Tensor:
@@ -379,6 +335,7 @@ def test_the_budget_counts_by_pixels_of_the_largest_view(data: Dataset) -> None:
     assert counts == [60, 120, 144, 163, 180, 180]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("ablation", ABLATIONS)
 def test_each_ablation_changes_the_result(data: Dataset, ablation: str) -> None:
     overrides = ["train.steps=20", "splat.backend=auto"]
@@ -389,17 +346,6 @@ def test_each_ablation_changes_the_result(data: Dataset, ablation: str) -> None:
     if ablation == "natural_selection":  # its budget is for more Gaussians than there are here
         conf.components.natural_selection.budget = 0.01
     assert not same(plain.gaussians, train_cell(data, conf).gaussians)
-
-
-def test_the_result_is_no_smaller_than_the_mip_filter(data: Dataset) -> None:
-    smallest = {}
-    for variance in (0.0, 2.0):
-        conf = compose(
-            "train.steps=20", "splat.backend=auto", f"components.mip.variance={variance}"
-        )
-        smallest[variance] = train(data, conf).gaussians.activated().scales.min().item()
-    # The finest view has a focal length of 72 px, and no Gaussian is nearer to it than 1.
-    assert smallest[0.0] < 2**0.5 / 72 < smallest[2.0]
 
 
 @pytest.mark.parametrize(

@@ -103,19 +103,6 @@ def test_a_step_without_backward_does_not_stand_for_its_kind(data: Dataset) -> N
     assert memory.largest_bytes == 400
 
 
-def test_the_state_is_the_largest_count(data: Dataset) -> None:
-    memory, again = TrainingMemory(torch.zeros(3)), TrainingMemory()
-    with memory.of_forward(step(data), 1, 0):
-        pass
-    memory.record(render(0))
-    again.load_state_dict(memory.state_dict())
-    assert again.largest_bytes == 12
-    with again.of_forward(step(data), 1, 0):
-        pass
-    again.record(render(1000))  # a step like one that was counted before
-    assert again.largest_bytes == 12
-
-
 def test_training_counts_model_photographs_and_loss(data: Dataset, short: Conf) -> None:
     result = train(data, short)
     model = sum(result.gaussians[name].nbytes for name in PARAMETERS)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Callable, Mapping
 from types import SimpleNamespace
 
@@ -17,10 +16,9 @@ from xrgs.splat.optimizer import SplatOptimizer
 from xrgs.splat.rendering import Render
 from xrgs.splat.settings import OptimizerSettings
 from xrgs.splat.strategy.refinement import Refinement
-from xrgs.training import components, loop, recorder
+from xrgs.training import loop, recorder
 from xrgs.training.components import Step
 from xrgs.training.recorder import TrainingRecorder
-from xrgs.training.sampler import EpochSampler
 
 
 @pytest.fixture
@@ -164,25 +162,3 @@ def test_the_history_counts_by_group(data: Dataset) -> None:
     grown = last["duplicated"] + last["split"]
     assert max(last["grown_HR"], last["grown_LR"]) <= grown <= last["grown_HR"] + last["grown_LR"]
     assert last["pruned_opacity_HR"] + last["pruned_opacity_LR"] == last["pruned_opacity"]
-
-
-def test_the_history_has_what_components_log(data: Dataset, short: Conf) -> None:
-    class Logging(components.Component):
-        def modify_loss(
-            self, loss: torch.Tensor, image: torch.Tensor, gaussians: Gaussians, step: Step
-        ) -> torch.Tensor:
-            del image, gaussians
-            if step.number >= 300 and step.view.tag == "LR":
-                step.log["logging.number"] = step.number
-            return loss
-
-    short.train.steps, short.splat.densify.stop = 400, 0
-    history = loop.train(data, short, extra_components=[Logging()]).history
-    lr = {view.name for view in data.train if view.tag == "LR"}
-    sampler = EpochSampler(data.train, short.seed, 400, lambda _: True)
-    logged = [step.number for step in sampler if step.view.name in lr and step.number >= 300]
-    for before, row in itertools.pairwise(history):
-        numbers = [number for number in logged if before["step"] < number <= row["step"]]
-        mean = sum(numbers) / len(numbers) if numbers else None
-        assert row["logging.number"] == mean
-    assert history[-1]["steps_HR"] == history[-1]["steps_LR"] == 200

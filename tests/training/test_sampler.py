@@ -74,14 +74,3 @@ def test_a_view_that_is_no_longer_allowed_is_skipped_within_the_epoch(data: Data
 def test_it_is_an_error_where_no_view_is_allowed(data: Dataset) -> None:
     with pytest.raises(XrgsError, match=r"step 7: the components .* leave no view to train on"):
         sampled_names(data, 40, lambda step: step.number < 7)
-
-
-@pytest.mark.parametrize("steps_before", [0, 5, 8, 40])
-def test_a_restored_sampler_continues_with_the_same_views(data: Dataset, steps_before: int) -> None:
-    first = EpochSampler(data.train, 0, 40, always)
-    for _ in range(steps_before):
-        next(first)
-    second = EpochSampler(data.train, 0, 40, always)
-    second.load_state_dict(first.state_dict())
-    assert second.next_step == steps_before
-    assert list(second) == list(first)

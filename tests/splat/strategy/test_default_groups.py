@@ -3,9 +3,6 @@
 from __future__ import annotations
 
 from collections import Counter
-from dataclasses import dataclass
-from types import SimpleNamespace
-from typing import Any
 
 import numpy as np
 import pytest
@@ -15,23 +12,13 @@ from hypothesis import strategies as st
 from torch import Tensor
 
 from tests.splat.scenes import make_strategy
+from tests.splat.strategy.gsplats import SCENE_SCALE, SIZES, Theirs, View
 from xrgs.splat.gaussians import PARAMETERS, Gaussians
+from xrgs.splat.settings import DensifySettings
 from xrgs.splat.strategy.refinement import Groups, Refinement, Thresholds
 
-SCENE_SCALE = 1.7
-#: LR views are five times smaller; gradients in normalised device units do not depend on it.
-SIZES = {"HR": (40, 30), "LR": (8, 6)}
 FINE, COARSE = Thresholds(2e-4, 0.005), Thresholds(4e-4, 0.02)
 NOTHING = Thresholds(float("inf"), 0.0)
-
-
-@dataclass
-class View:
-    """The image-plane gradients and visibility of a step."""
-
-    group: str
-    gradient: Tensor  # [N, 2] per px
-    visible: Tensor  # [N]
 
 
 def values_of(count: int, rng: np.random.Generator) -> dict[str, Tensor]:
@@ -53,7 +40,7 @@ def view_of(group: str, count: int, rng: np.random.Generator) -> View:
     drawn = visible & torch.from_numpy(rng.random(count) < 0.6)
     half = max(SIZES[group]) / 2
     gradient = rng.normal(size=(count, 2)) * rng.exponential(5e-4, size=(count, 1)) / half
-    return View(group, torch.from_numpy(gradient).float() * drawn[:, None], visible)
+    return View(torch.from_numpy(gradient).float() * drawn[:, None], visible, group=group)
 
 
 def views_of(groups: str, count: int, rng: np.random.Generator) -> list[View]:
@@ -93,28 +80,16 @@ def gsplats(
     absgrad: bool = False,
 ) -> Counter[int]:
     """The same by gsplat, which has one pair of thresholds."""
-    from gsplat.strategy import DefaultStrategy as GsplatStrategy
-
-    params = {name: torch.nn.Parameter(value.clone()) for name, value in values.items()}
-    optimizers = {name: torch.optim.Adam([params[name]]) for name in PARAMETERS}
-    strategy = GsplatStrategy(
-        grow_grad2d=thresholds.grow_grad2d, prune_opa=thresholds.prune_opacity, absgrad=absgrad
+    config = DensifySettings(
+        grow_grad2d=thresholds.grow_grad2d, prune_opacity=thresholds.prune_opacity
     )
-    state = strategy.initialize_state(SCENE_SCALE)
+    theirs = Theirs(values, config)
+    theirs.strategy.absgrad = absgrad
     for view in views:
-        width, height = SIZES[view.group]
         signed = torch.full_like(view.gradient, torch.nan) if absgrad else view.gradient
-        info: dict[str, Any] = {
-            "width": width,
-            "height": height,
-            "n_cameras": 1,
-            "gaussian_ids": None,
-            "radii": view.visible[None, :, None].expand(-1, -1, 2).int(),
-            "means2d": SimpleNamespace(grad=signed[None], absgrad=view.gradient[None]),
-        }
-        step = 600 if view is views[-1] else 1
-        strategy.step_post_backward(params, optimizers, state, step, info)
-    return Counter(params["sh0"][:, 0, 0].int().tolist())
+        seen = View(signed, view.visible, view.gradient, view.group)
+        theirs.densify(600 if view is views[-1] else 1, seen)
+    return Counter(theirs.params["sh0"][:, 0, 0].int().tolist())
 
 
 @settings(max_examples=30, deadline=None)
@@ -191,7 +166,7 @@ def test_copies_and_halves_are_pruned_by_their_parents_threshold() -> None:
     gradient = torch.ones(4, 2)
     every = torch.ones(4, dtype=torch.bool)
     by_hr = torch.tensor([True, False, True, False])  # a copy and a split of each
-    views = [View("HR", gradient * by_hr[:, None], every), View("LR", gradient, every)]
+    views = [View(gradient * by_hr[:, None], every, group="HR"), View(gradient, every, group="LR")]
     gaussians, refinement = ours(values, views, Groups({"HR": FINE, "LR": COARSE}, "per_class"))
     assert (refinement.duplicated, refinement.split, refinement.pruned_opacity) == (2, 2, 4)
     assert numbers(gaussians) == Counter({0: 2, 2: 2})
@@ -242,7 +217,7 @@ def test_by_own_thresholds_all_views_share_one_mean(count: int, order: str, seed
     }
     gaussians, _ = ours(values, views, Groups(thresholds, "own_threshold"))
     scaled = [
-        View(view.group, view.gradient / thresholds[view.group].grow_grad2d, view.visible)
+        View(view.gradient / thresholds[view.group].grow_grad2d, view.visible, group=view.group)
         for view in views
     ]
     assert numbers(gaussians) == gsplats(values, scaled, Thresholds(1.0, 0.0))

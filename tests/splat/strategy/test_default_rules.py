@@ -3,29 +3,20 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 
 import pytest
 import torch
 from torch import Tensor
 
 from tests.splat.scenes import make_strategy
+from tests.splat.strategy.gsplats import SCENE_SCALE, SIZES, View
 from xrgs.splat.gaussians import PARAMETERS
 from xrgs.splat.settings import DensifySettings
 from xrgs.splat.strategy.default import DefaultStrategy
 from xrgs.splat.strategy.refinement import Groups, Refinement, StrategyHooks, Thresholds
 
-SCENE_SCALE = 1.7
-WIDTH, HEIGHT = 40, 30
+WIDTH, HEIGHT = SIZES["HR"]
 NO_HOOKS = StrategyHooks()
-
-
-@dataclass
-class View:
-    """The image-plane gradients and visibility of a step."""
-
-    gradient: Tensor  # [N, 2] per px
-    visible: Tensor  # [N]
 
 
 def strategy_of(
@@ -257,15 +248,6 @@ def test_the_group_of_a_gaussian_without_gradients_is_the_last() -> None:
 
 
 # --- state --------------------------------------------------------------------------------------
-
-
-def test_state_is_taken_over() -> None:
-    first, second = strategy_of(uniform(4, scale=0.1), seed=1), strategy_of(uniform(4, scale=0.1))
-    densify(first, 1, view_of(4, norm=1.0))
-    second.load_state_dict(first.state_dict())
-    for strategy in (first, second):
-        assert densify(strategy, 600, view_of(4)) == Refinement(split=4)
-    assert torch.equal(first.gaussians.means, second.gaussians.means)
 
 
 @pytest.mark.parametrize("name", ["grad2d_sum", "visible_count"])

@@ -234,6 +234,7 @@ def test_all_are_on_together(build: Build, off: ComponentsConf) -> None:
         (".registry", {"torch", "numpy", "omegaconf", "hydra"}),
     ],
 )
+@pytest.mark.slow
 def test_what_is_imported(module: str, unused: set[str]) -> None:
     """Training needs no Hydra and no component; planning reads the registry without torch."""
     code = f"import sys, xrgs.training{module}; print({unused!r} & set(sys.modules))"

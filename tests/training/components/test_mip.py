@@ -158,19 +158,6 @@ def test_its_gradient_is_that_of_finite_differences() -> None:
     assert torch.autograd.gradcheck(lambda s, o: smooth(s, o, variance), (scales, opacities))
 
 
-def test_gradients_reach_the_parameters_and_not_the_rates() -> None:
-    gaussians = splats((0.0, 0.0, 0.0), (0.1, 0.0, 0.5))
-    mip = on(FAR, CLOSE)
-    mip.on_gaussians_changed(gaussians)
-    filtered = mip.before_render(gaussians.activated(), STEP)
-    torch.autograd.backward(filtered.scales.sum() + filtered.opacities.sum())
-    for name in ("scales", "opacities"):
-        gradient = gaussians[name].grad
-        assert gradient is not None
-        assert bool((gradient != 0).all())
-    assert gaussians.means.grad is None
-
-
 def test_what_is_saved_renders_as_what_was_trained() -> None:
     gaussians = splats((0.0, 0.0, 0.0), (0.1, 0.05, 0.5), (50.0, 0.0, 0.0))
     mip = on(FAR, CLOSE)
@@ -229,17 +216,6 @@ def test_a_rate_below_one_pixel_a_unit_is_seen() -> None:
     mip.on_gaussians_changed(gaussians)
     torch.testing.assert_close(mip.variance, 0.2 / torch.tensor([25.0, 0.25]) ** 2)
     assert mip.unseen_count == 0
-
-
-def test_the_state_is_the_filter() -> None:
-    gaussians = splats((0.0, 0.0, 0.0), (0.0, 0.0, 1.0))
-    mip, resumed = on(FAR, CLOSE), on(FAR, CLOSE)
-    mip.on_gaussians_changed(gaussians)
-    resumed.load_state_dict({"variance": mip.state_dict()["variance"].clone()})
-    assert torch.equal(resumed.variance, mip.variance)
-    between = Step(1, 30_000, view("LR", CLOSE))
-    filtered = (m.before_render(gaussians.activated(), between).scales for m in (resumed, mip))
-    assert torch.equal(*filtered)
 
 
 def test_a_reset_caps_what_is_rendered() -> None:

@@ -134,6 +134,7 @@ def test_fewer_than_the_budget_are_not_pushed(
     assert selection.to_prune(gaussians, at(UNTIL)) is None
 
 
+@pytest.mark.slow
 def test_a_run_ends_with_the_budget(data: Dataset) -> None:
     # Without resets, which would leave no more than the budget, and with a rate of the opacities at
     # which they can fade in 16 steps.

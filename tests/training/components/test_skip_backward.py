@@ -14,7 +14,6 @@ from xrgs.capture.dataset import Dataset
 from xrgs.config import ComponentsConf, Conf
 from xrgs.splat.gaussians import Gaussians
 from xrgs.training.components import Component, Components, Step
-from xrgs.training.components.skip_backward import SkipBackward
 from xrgs.training.loop import train
 
 Build = Callable[..., Components]
@@ -152,14 +151,3 @@ def test_training_skips_at_most_what_the_share_allows(data: Dataset) -> None:
     skipped = train(data, conf).history[-1]["skipped_backward"]
     assert 0 < skipped <= 10  # half of the 20 steps after densification
     assert isinstance(conf.components.skip_backward.begin, int)
-
-
-def test_the_state_is_what_the_steps_have_changed(
-    build: Build, on: ComponentsConf, hr: Step
-) -> None:
-    first, again = build(on), build(on)
-    _needs(first, hr, 1.0, 0.5, 0.7)
-    again.load_state_dict(first.state_dict())
-    assert isinstance(again[0], SkipBackward)
-    assert again[0].means == pytest.approx({"hr": 0.95 * (0.95 + 0.025) + 0.05 * 0.7})
-    assert _needs(again, hr, 0.9, 0.99) == _needs(first, hr, 0.9, 0.99)
