@@ -107,13 +107,6 @@ def test_an_operation_has_the_same_functions_on_both_backends(operation: Operati
     assert {name: reference[name] for name in shared} == {name: compiled[name] for name in shared}
 
 
-@pytest.mark.parametrize("operation", OPERATIONS)
-def test_an_implementation_lies_in_the_backends_folder(operation: Operation) -> None:
-    module = implementation(operation, "torch")
-    assert module.__name__ == f"xrgs.splat.torch.{operation}"
-    assert module is implementation(operation, "torch")
-
-
 def test_every_module_of_the_native_backend_is_an_operation() -> None:
     folder = Path(backend.__file__).parent / "native"
     modules = {path.stem for path in folder.glob("*.py")}

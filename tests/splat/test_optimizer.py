@@ -171,48 +171,6 @@ def test_a_run_without_meaning_is_refused(name: str, value: float) -> None:
         SplatOptimizer(gaussians, OptimizerSettings(), **options)
 
 
-def test_appended_gaussians_start_without_momentum() -> None:
-    optimizer = optimizer_of(5)
-    take_step(optimizer, 1)
-    old = {name: optimizer.gaussians[name].detach().clone() for name in PARAMETERS}
-    before = {name: [m.clone() for m in moments(optimizer, name)] for name in PARAMETERS}
-    new = normal_parameters(3, 2, dtype=torch.float64)
-    optimizer.append(new)
-    assert len(optimizer.gaussians) == 8
-    for name in PARAMETERS:
-        leaf = optimizer.gaussians[name]
-        assert leaf.is_leaf
-        assert leaf.requires_grad
-        assert torch.equal(leaf, torch.cat([old[name], new[name]]))
-        for moment, start in zip(moments(optimizer, name), before[name], strict=True):
-            assert torch.equal(moment[:5], start)
-            assert (start != 0).all()
-            assert (moment[5:] == 0).all()
-            assert moment.shape == leaf.shape
-
-
-@pytest.mark.parametrize("index", [torch.tensor([4, 0, 2]), torch.arange(5) % 2 == 0])
-def test_kept_gaussians_keep_their_momentum(index: Tensor) -> None:
-    optimizer = optimizer_of(5)
-    take_step(optimizer, 1)
-    old = {name: optimizer.gaussians[name].detach().clone() for name in PARAMETERS}
-    before = {name: [m.clone() for m in moments(optimizer, name)] for name in PARAMETERS}
-    optimizer.keep(index)
-    for name in PARAMETERS:
-        assert torch.equal(optimizer.gaussians[name], old[name][index])
-        for moment, start in zip(moments(optimizer, name), before[name], strict=True):
-            assert torch.equal(moment, start[index])
-
-
-def test_a_reset_touches_one_parameter() -> None:
-    optimizer = optimizer_of(5)
-    take_step(optimizer, 1)
-    optimizer.reset("opacities", torch.full((5,), -2.0, dtype=torch.float64))
-    assert (optimizer.gaussians.opacities == -2).all()
-    assert all((moment == 0).all() for moment in moments(optimizer, "opacities"))
-    assert all((moment != 0).all() for moment in moments(optimizer, "scales"))
-
-
 def test_training_goes_on_after_a_change() -> None:
     optimizer = optimizer_of(5)
     take_step(optimizer, 1)

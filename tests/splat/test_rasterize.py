@@ -7,10 +7,8 @@ from typing import Any
 
 import pytest
 import torch
-from torch import Tensor
 
 from tests.splat.scenes import make_camera, make_scene
-from xrgs.splat.gaussians import ActivatedGaussians
 from xrgs.splat.rendering import Render, rasterize_parameters
 from xrgs.splat.settings import RasterSettings
 
@@ -21,22 +19,10 @@ SCENE = make_scene(6, make_camera(), dtype=torch.float32)
 SCENE["means"][:2] = torch.tensor([0.0, 0.0, 3.0])  # in view: their harmonics are read
 
 
-def draw(
-    *,
-    sh_degree: int = 3,
-    means2d_offset: Tensor | None = None,
-    backend: str = "torch",
-    **change: Tensor,
-) -> Render:
-    """Render `SCENE` with some of its parameters changed."""
-    return rasterize_parameters(
-        *ActivatedGaussians(**(SCENE | change)),
-        make_camera(),
-        RasterSettings(),
-        sh_degree=sh_degree,
-        means2d_offset=means2d_offset,
-        backend=backend,
-    )
+def draw(**changes: Any) -> Render:
+    """Render `SCENE` with some of its parameters or some options changed."""
+    options = {"camera": make_camera(), "settings": RasterSettings(), "sh_degree": 3}
+    return rasterize_parameters(**(SCENE | options | changes))
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])

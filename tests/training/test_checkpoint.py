@@ -194,13 +194,6 @@ def test_a_pickle_is_never_run(
     assert folder.exists()
 
 
-def test_a_compressed_file_is_refused_before_it_fills_the_memory(tmp_path: Path) -> None:
-    file = tmp_path / "c.npz"
-    np.savez_compressed(file, zeros=np.zeros(10**6))
-    with pytest.raises(CheckpointError, match="compressed"):
-        Checkpoint(file, "cell").load()
-
-
 def test_a_missing_state_is_refused(tmp_path: Path) -> None:
     loaded = Checkpoint(write(tmp_path / "c.npz", first={"a": 1}), "cell")
     loaded.load()

@@ -405,14 +405,7 @@ def gradients_of(scene: Scene, rendered: Render, leaves: Mapping[str, Tensor]) -
 
 
 def check_scene(scene: Scene, *, compare: bool = False) -> str | None:
-    """Render a scene and check what comes back.
-
-    Args:
-        scene: The scene.
-        compare: Compare with torch in float64 as well, unless a case is lossy.
-
-    Returns:
-        None, or the message of the error where the scene is refused.
+    """Check what a scene gives; return the message of the error where it is refused, else None.
 
     Raises:
         FuzzError: A value is not finite or out of range, an error names nothing, a plain scene is
@@ -491,15 +484,9 @@ def _threshold_step(settings: RasterSettings) -> float:
 def fuzz(
     seeds: Iterable[int], compare_every: int, report: Callable[[int], None]
 ) -> dict[str, list[int]]:
-    """Check the scenes of some seeds.
+    """Check the scenes of some seeds; return the errors with the seeds that were refused.
 
-    Args:
-        seeds: The seeds.
-        compare_every: A scene whose seed is a multiple of this is compared with torch.
-        report: Called with each seed that passed.
-
-    Returns:
-        The errors that were given, with the seeds of the scenes that were refused.
+    A scene whose seed is a multiple of `compare_every` is compared with torch.
 
     Raises:
         FuzzError: As `check_scene` raises it, with the seed and the cases of the scene.

@@ -103,15 +103,10 @@ def compare(
     seed: int = 0,
     floor: float | None = None,
 ) -> Comparison:
-    """Assert that image, alpha and gradients are the oracle's but for rounding.
+    """Assert that image, alpha and gradients of a random loss are the oracle's but for rounding.
 
-    Args:
-        scene: In float32.
-        camera: In float32.
-        raster: The settings of both.
-        sh_degree: The degree of both.
-        seed: Of the random loss.
-        floor: A share of each gradient's norm, in place of those where few pixels are left.
+    `scene` and `camera` are in float32. `floor` is a share of each gradient's norm, in place of
+    those where few pixels are left to cancel.
     """
     exact, _ = run(scene, camera, raster, "torch", torch.float64, sh_degree=sh_degree)
     band = band_of(scene, camera, raster, exact.image, sh_degree)

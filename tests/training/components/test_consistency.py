@@ -93,20 +93,6 @@ def test_it_is_the_papers_formula(
     assert step.log == {f"consistency.{tag}": pytest.approx(expected)}
 
 
-@pytest.mark.parametrize("tag", ["HR", "LR"])
-def test_its_gradient_reaches_the_render(
-    tag: str, build: Build, on: ComponentsConf, steps: dict[str, Step]
-) -> None:
-    image = (steps[tag].view.image * 0.9).requires_grad_()
-    torch.autograd.backward(
-        build(on).modify_loss(
-            torch.tensor(0.0, dtype=torch.float64), image, NO_GAUSSIANS, steps[tag]
-        )
-    )
-    assert image.grad is not None
-    assert (image.grad != 0).float().mean() > 0.9
-
-
 def test_the_weight_of_a_view_multiplies_its_consistency(
     build: Build, on: ComponentsConf, lr: Step
 ) -> None:

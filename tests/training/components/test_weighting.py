@@ -12,6 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from torch import Tensor
 
+from tests.splat.scenes import noise
 from tests.training.components.conftest import make_view
 from xrgs.capture.dataset import Dataset, LoadedView
 from xrgs.config import ComponentsConf, Conf
@@ -62,11 +63,11 @@ def test_attenuations_multiply(attenuations: tuple[float, ...], expected: float)
     assert weight(component, VIEW) == pytest.approx(expected, rel=1e-12)
 
 
-@given(base=unit, attenuations=st.lists(unit, max_size=3), pixels=st.lists(unit, min_size=180))
+@given(base=unit, attenuations=st.lists(unit, max_size=3), seed=st.integers(0, 10**6))
 def test_every_weight_lies_between_the_view_weight_and_1(
-    base: float, attenuations: list[float], pixels: list[float]
+    base: float, attenuations: list[float], seed: int
 ) -> None:
-    region = torch.tensor(pixels[:180], dtype=torch.float64).reshape(12, 15)
+    region = noise(12, 15, seed)[..., 0].round(decimals=seed % 3)  # of 0 and 1 alone, or between
     component = weighting(base, *attenuations, regions={"low": region})
     of_view = component.weight(STEP)
     assert base - 1e-12 <= of_view <= 1 + 1e-12
