@@ -347,8 +347,8 @@ def _warnings(sweep: Sweep) -> list[str]:
     arithmetics = sweep.provenance.get("arithmetic", ())
     if len(arithmetics) > 1:
         warnings.append(
-            f"The cells were trained with different arithmetic ({', '.join(arithmetics)}): that alone"
-            " makes cells differ as much as another seed does."
+            f"The cells were trained with different arithmetic ({', '.join(arithmetics)}): that"
+            " alone makes cells differ as much as another seed does."
         )
     return warnings
 
