@@ -23,9 +23,6 @@ from xrgs.experiment.store import Store
 from xrgs.safeio.atomic import write_json
 from xrgs.sweep.jobs import worker
 from xrgs.sweep.rerun import RerunResult, rerun
-from xrgs.sweep.status import read
-
-RunCommand = Callable[..., tuple[int, str, str]]
 
 
 @pytest.fixture(scope="module")
@@ -81,24 +78,6 @@ def train(trained: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., None]
         monkeypatch.setattr(worker, "run_in_child", run)
 
     return fake
-
-
-@pytest.mark.slow
-def test_the_same_program_gives_the_same_bits(run_command: RunCommand, tmp_path: Path) -> None:
-    smallest = ("scene=motorcycle", "preset=smoke", "train.steps=2", "threads=1", "store=s")
-    code, _, err = run_command("sweep", tmp_path, *smallest)
-    assert code == 0, err
-    (original,) = (tmp_path / "s" / "cells").iterdir()
-    before = {file: file.stat().st_mtime_ns for file in original.rglob("*")}
-    code, out, err = run_command("sweep", tmp_path, f"rerun={original}")
-    assert code == 0, out + err
-    assert out.startswith("the same, bit for bit: scores.csv, history.csv, splats.ply")
-    assert "code, libraries and machine are the same" in err
-    repeated = original.with_name(f"{original.name}.rerun-1")
-    assert f"Written to {repeated}" in out
-    assert (repeated / "splats.ply").read_bytes() == (original / "splats.ply").read_bytes()
-    assert {file: file.stat().st_mtime_ns for file in original.rglob("*")} == before
-    assert [summary.id for summary in read(tmp_path / "s").cells] == [original.name]
 
 
 def test_other_numbers_are_reported(cell: CellFolder, train: Callable[..., None]) -> None:

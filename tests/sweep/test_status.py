@@ -36,8 +36,8 @@ def store(cells: Any) -> Store:
     cells.begin("stopped")
     cells.begin("failed").fail("ended by SIGKILL\nand more")
     busy = cells.begin("busy")
-    now = Progress("training", "step", 20, 80, 3.0)
-    write_json(busy.progress, msgspec.structs.asdict(now))
+    shown = Progress("training", "step", 20, 80, 3.0)
+    write_json(busy.progress, msgspec.structs.asdict(shown))
     assert lease.acquire(store.leases, "busy") is not None
     (store.variants / "failed-aa").mkdir()
     cells.record(

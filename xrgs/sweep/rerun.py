@@ -216,7 +216,7 @@ def _short(value: object) -> str:
 
 
 def _store_of(folder: Path) -> Path:
-    cells = folder.resolve().parent
+    cells = folder.absolute().parent  # not resolved: `cells` may be a link to another disk
     if cells.name != "cells":
         raise XrgsError(
             f"rerun={folder} is not in a store; name the store that has its variant with store=..."
@@ -261,7 +261,7 @@ def _free_folder(out: Path | None, folder: Path) -> Path:
         XrgsError: `out` exists.
     """
     if out is None:
-        beside = folder.resolve()
+        beside = folder.absolute()
         names = (beside.with_name(f"{beside.name}.rerun-{number}") for number in count(1))
         return next(name for name in names if not name.exists())
     if out.exists():
