@@ -1,7 +1,9 @@
 """A report of a store: whole, the same each time, and made without torch."""
 
 import csv
+import errno
 import json
+import os
 import re
 import shutil
 import subprocess
@@ -13,11 +15,12 @@ import cmarkgfm
 import pytest
 
 import xrgs
-from tests.report.conftest import configured
+from tests.report.conftest import VIEWS, configured, finish_again
 from xrgs.errors import StoreError
 from xrgs.report import build
 from xrgs.report.collect import ReportError
 from xrgs.report.figures import trade_off
+from xrgs.safeio import files, records
 
 
 @pytest.fixture
@@ -393,3 +396,47 @@ def test_cells_csv_has_steps_size_and_factor(made: Any) -> None:
         for row in csv.DictReader(file.read_text().splitlines())
     ]
     assert rows == [("700", "250", "3"), ("500", "", "")]
+
+
+@pytest.mark.parametrize("value", ["inf", "nan", "1e30", "1e-320", "0"])
+def test_extreme_numbers_are_reported_without_a_warning(made: Any, value: str) -> None:
+    for label in ("baseline", "consistency"):
+        rows = f"0,{value},1,{value}\n1,{value},2,{value}\n"
+        cell = made.add(label, history=f"step,loss,gaussians,mip.value\n{rows}")
+        scores = ",".join([value] * 3)
+        lines = ["view,psnr,ssim,lpips", *(f"{view},{scores}" for view in VIEWS)]
+        (cell.path / "scores.csv").write_text("\n".join(lines) + "\n")
+        finish_again(cell)
+    made.write()
+    report = build(made.store.path, pictures=["fern--consistency--training"])
+    assert "of 2 cells" not in report.text, "both are done"
+
+
+def test_a_cell_that_cannot_be_read_now_is_a_row_with_the_reason(
+    made: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    made.add()
+    cell = made.add("consistency")
+    real = files.read_bytes
+
+    def failing(path: Path, max_bytes: int) -> bytes:
+        if path == cell.path / "summary.json":
+            raise OSError(errno.EIO, os.strerror(errno.EIO), str(path))
+        return real(path, max_bytes)
+
+    monkeypatch.setattr(records, "read_bytes", failing)
+    made.write()
+    report = build(made.store.path, pictures=[])
+    assert "1 cell can't be read now: run the report again" in report.text
+    (row,) = [line for line in report.text.splitlines() if "unknown" in line]
+    assert "summary.json: " in row
+    assert os.strerror(errno.EIO) in row
+
+
+def test_a_sweep_that_could_not_read_a_variant_says_so(made: Any) -> None:
+    made.add()
+    row = made.rows[0] | {"label": "consistency", "state": "unknown"}
+    made.rows.append(row | dict.fromkeys(("cell_id", "variant_id", "baseline_id")))
+    made.write()
+    text = build(made.store.path, pictures=[]).text
+    assert "unknown  a file could not be read when the sweep was planned" in text

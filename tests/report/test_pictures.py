@@ -7,6 +7,7 @@ from typing import Any
 import pytest
 
 from xrgs.evaluation.metrics import METRICS
+from xrgs.report import pictures
 from xrgs.report.compare import compare
 from xrgs.report.page import build
 from xrgs.report.pictures import sensitivities
@@ -119,3 +120,17 @@ def test_a_score_that_is_not_known_leaves_out_its_panel(made: Any) -> None:
     changes = found(made)["consistency.weight"]
     psnr = changes[(changes["metric"] == "psnr") & (changes["level"] == "mean")]
     assert psnr["change"].isna().tolist() == [False, True, False]
+
+
+def test_of_many_pictures_the_first_are_drawn_and_the_rest_said(
+    made: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(pictures, "_MAX_PICTURES", 1)
+    made.add()
+    for label in ("a", "b"):
+        made.add(label)
+    made.write()
+    folder = build(made.store.path).folder
+    assert [file.stem for file in (folder / "figures").iterdir()] == ["trade-off"]
+    said = "No picture of 4 more: only the first 1 are drawn; --pictures NAMES draws others"
+    assert said in (folder / "table.md").read_text()

@@ -14,7 +14,7 @@ import msgspec
 import numpy as np
 import pandas as pd
 
-from xrgs.errors import StoreError, XrgsError
+from xrgs.errors import StoreError, UnreadableError, XrgsError
 from xrgs.evaluation.metrics import METRICS, VIEW_METRICS
 from xrgs.evaluation.scoring import PROTOCOL, stale_scores
 from xrgs.experiment.cell_folder import CellState
@@ -178,6 +178,8 @@ def _read_done(cell: CellFolder) -> DoneCell:
     summary, scores = cell.summary(), cell.view_scores()
     try:
         config = cell.config()
+    except UnreadableError:
+        raise
     except XrgsError:
         config = None
     return DoneCell(

@@ -68,7 +68,7 @@ class Report:
 
 @dataclass(frozen=True)
 class Runs:
-    """Tables of the trainings themselves, beside those of their results."""
+    """Tables of what the trainings of a sweep did."""
 
     labels: dict[str, list[str]]
     """The labels of each condition's cells, in the sweep's order."""
@@ -155,7 +155,7 @@ def build(
     except OSError as error:
         raise ReportError(
             f"the report can't be written to {folder}: {error.filename}: {error.strerror};"
-            " name another folder with out=..."
+            " name another folder with --out"
         ) from error
     written = {p.file for p in drawn if p.file} | {folder / name for name in _FILES}
     text = f"{_text(tables, _warnings(sweep))}\n{for_line(f'Written to {folder}')}"
@@ -347,8 +347,8 @@ def _warnings(sweep: Sweep) -> list[str]:
     arithmetics = sweep.provenance.get("arithmetic", ())
     if len(arithmetics) > 1:
         warnings.append(
-            f"The cells were trained with different arithmetic ({', '.join(arithmetics)}): its"
-            " differences, as large as between seeds, are mixed with those that are compared."
+            f"The cells were trained with different arithmetic ({', '.join(arithmetics)}): that"
+            " alone makes cells differ as much as another seed does."
         )
     return warnings
 

@@ -161,7 +161,7 @@ def _trade_offs(comparison: Comparison) -> dict[str, _Drawing]:
         if not 3 <= len(means) <= _MAX_ABLATIONS or not axes:
             continue
         title = titled("Quality against Gaussians, mean over scenes", condition)
-        name = f"trade-off{condition and f'.{for_file_name(condition)}'}"
+        name = _file_name("trade-off", condition)
         drawings[name] = partial(_drawn, title, partial(trade_off, title, means, scenes, axes))
     return drawings
 
@@ -176,7 +176,7 @@ def _sensitivities(comparison: Comparison) -> dict[str, _Drawing]:
             if not axes:
                 continue
             title = titled(_SENSITIVITY_TITLE.format(base=comparison.base, key=key), condition)
-            name = f"sensitivity-{for_file_name(key)}{condition and f'.{for_file_name(condition)}'}"
+            name = _file_name(f"sensitivity-{for_file_name(key)}", condition)
             drawings[name] = partial(_drawn, title, partial(dependence, title, key, changes, axes))
             if (count := changes["series"].nunique()) >= MAX_ARMS:
                 why = f"{count} curves, and a figure can tell {MAX_ARMS - 1} apart"
@@ -286,12 +286,16 @@ def _curves_of_quality(comparison: Comparison, curves: pd.DataFrame) -> dict[str
             scenes = rows[rows["label"].isin(shown)]
             means = means_over_scenes(scenes)
             title = titled(_QUALITY_TITLE.format(base=comparison.base), condition)
-            name = f"time-to-quality{condition and f'.{for_file_name(condition)}'}"
+            name = _file_name("time-to-quality", condition)
             name += f"-{at // (MAX_ARMS - 1) + 1}" * (at > 0)
             drawings[name] = partial(
                 _drawn, title, partial(quality_curves, title, scenes, means, axes)
             )
     return drawings
+
+
+def _file_name(kind: str, condition: str) -> str:
+    return f"{kind}.{for_file_name(condition)}" if condition else kind
 
 
 def _drawn(title: str, figure: Callable[[], bytes], file: Path) -> Picture:

@@ -185,11 +185,12 @@ def test_images_that_do_not_fit_are_counted(copied: Path, monkeypatch: pytest.Mo
 
 def test_an_album_keeps_an_image_once_and_its_size() -> None:
     red, blue = (Image.new("RGB", (20, 10), name) for name in ("red", "blue"))
-    album = Album(10_000, 400)
-    assert album.add([red, blue]) == [0, 1]
-    assert album.add([blue, red]) == [1, 0]
-    assert len(album.urls) == 2
-    assert Album(10, 400).add([red]) is None
+    urls = ["data:another"]
+    album = Album(urls, 10_000, 400)
+    assert album.add([red, blue]) == [1, 2]
+    assert album.add([blue, red]) == [2, 1]
+    assert len(urls) == 3
+    assert Album(urls, 10, 400).add([red]) is None
 
 
 def test_an_error_map_is_brightest_where_the_render_is_wrong() -> None:
