@@ -4,20 +4,20 @@ from __future__ import annotations
 
 import json
 import tarfile
-from dataclasses import replace
+from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import pytest
 
+from tests.experiment.cells import finished, identity, row, write_variant
+from xrgs import composing
 from xrgs.capture import frozen
 from xrgs.errors import StoreError
-from xrgs.experiment.attempts import begin_attempt
+from xrgs.experiment.archive import Packed, pack
+from xrgs.experiment.cell_folder import CellFolder
 from xrgs.experiment.store import Store
 from xrgs.safeio.atomic import write_json
-from xrgs.safeio.hashing import file_digest
-from xrgs.sweep.inventory import summaries
-from xrgs.sweep.packing import Packed, pack
+from xrgs.safeio.files import list_names
 
 CELLS = ("c1", "c2")
 
@@ -27,42 +27,19 @@ def store(tmp_path: Path) -> Store:
     """A store of two done cells on one variant, and the record of their sweep."""
     store = Store(tmp_path / "my store")
     store.prepare()
-    folder = store.variants / "new"
-    (folder / "images").make_folder()
-    (folder / "images" / "a.png").path.write_bytes(b"photograph")
-    (folder / frozen.LOG).path.write_text(f"{tmp_path}: matched")
-    for name in (frozen.POINTS, frozen.REPORT):
-        (folder / name).path.write_text(name)
-    manifest = {"key": "k", "files": {frozen.POINTS: file_digest(folder / frozen.POINTS)}}
-    variant_id = frozen.variant_id(manifest)
-    write_json(folder / frozen.MANIFEST, manifest)
-    folder.rename(store.variants / variant_id)
-    for name in CELLS:
-        add_cell(store, name, variant_id, tmp_path)
-    rows = [{"cell_id": name, "scene": "fern", "label": name} for name in CELLS]
+    variant_id = write_variant(store.variants)
+    (store.variants / variant_id / frozen.LOG).write_text(f"{tmp_path}: matched")
+    for name, path in zip(CELLS, (f"{tmp_path}/data/fern", "/elsewhere/horns"), strict=True):
+        conf = composing.compose("scene=folder", f"scene.path={path}", f"store='{store.path}'")
+        cell = finished(store.cell(name), conf, identity(0, variant_id))
+        (cell.path / "log.txt").write_text(f"{tmp_path}: begun")
     command = ["+ablation=x,y", f"scene.path={tmp_path}/data/fern,/elsewhere/horns", "threads=1"]
-    store.write_sweep(command, rows)
+    store.write_sweep(command, [row(name) for name in CELLS])
     return store
 
 
-def add_cell(store: Store, name: str, variant_id: str, here: Path) -> None:
-    config = {
-        "store": str(store.path),
-        "scene": {"path": f"{here}/data/fern", "views": [f"/elsewhere/{name}", 3], "name": "a/b"},
-    }
-    folder = store.cell(name)
-    begin_attempt(folder, config, {"variant": variant_id, "seed": 0})
-    (folder.path / "renders").mkdir()
-    (folder.path / "renders" / "a.png").write_bytes(b"render")
-    (folder.path / "splats.ply").write_bytes(b"Gaussians")
-    (folder.path / "log.txt").write_text(f"{here}: begun")
-    (folder.path / "scores.csv").write_text("view,psnr\na,20\n")
-    (folder.path / "summary.json").write_text('{"gaussians": 17}')
-    folder.finish(["a"], 1)
-
-
 def pack_all(store: Store, out: Path) -> Packed:
-    return pack(store, summaries(store), out, out.parent)
+    return pack(store, store.cell_folders(), out, out.parent)
 
 
 def unpacked(archive: Path, folder: Path) -> Store:
@@ -89,19 +66,14 @@ def test_an_unpacked_store_is_the_store_trimmed(store: Store, tmp_path: Path) ->
         store.cell(name).trim()
         assert other.cell(name).state().name == "done"
         assert other.cell(name).verify() == []
-        assert other.cell(name).trimmed() == store.cell(name).trimmed() != {}
+        assert other.cell(name).status().trimmed == store.cell(name).status().trimmed != {}
     other.verify_sweep(other.sweep_ids()[0])
     columns = ["cell_id", "psnr", "gaussians"]
     assert other.cells()[columns].equals(store.cells()[columns])
-    kept = set(contents(other))
-    (variant,) = other.variants.names()
-    assert kept == {
-        *(
-            f"cells/{cell}/{file}"
-            for cell in CELLS
-            for file in store.cell(cell).trimmed_status()["files"]
-        ),
-        *(f"cells/{cell}/status.json" for cell in CELLS),
+    (variant,) = list_names(other.variants)
+    assert set(contents(other)) == {
+        *(f"cells/{name}/{file}" for name in CELLS for file in store.cell(name).status().files),
+        *(f"cells/{name}/status.json" for name in CELLS),
         *(f"variants/{variant}/{file}" for file in (frozen.MANIFEST, frozen.POINTS, frozen.REPORT)),
         f"sweeps/{store.sweep_ids()[0]}.json",
     }
@@ -115,19 +87,18 @@ def test_full_paths_become_relative(store: Store, tmp_path: Path) -> None:
     pack_all(store, tmp_path / "a.tar.xz")
     other = unpacked(tmp_path / "a.tar.xz", tmp_path / "other")
     assert not any(str(tmp_path).encode() in content for content in contents(other).values())
-    assert json.loads((other.cell("c1").path / "config.json").read_text()) == {
-        "store": "my store",
-        "scene": {"path": "data/fern", "views": ["c1", 3], "name": "a/b"},
-    }
-    command = other.sweep_record()["command"]
-    assert command == ["+ablation=x,y", "scene.path=data/fern,horns", "threads=1"]
+    assert [other.cell(name).config().scene.path for name in CELLS] == ["data/fern", "horns"]
+    assert other.cell("c1").config().store == "my store"
+    command = other.sweep_record().command
+    assert command == ("+ablation=x,y", "scene.path=data/fern,horns", "threads=1")
 
 
 def test_the_records_are_those_of_the_sweeps_that_are_named(store: Store, tmp_path: Path) -> None:
     (first,) = store.sweep_ids()
-    second = store.write_sweep(["+ablation=x"], [{"cell_id": "c1", "scene": "fern", "label": "x"}])
-    cells = summaries(store)
+    second = store.write_sweep(["+ablation=x"], [row("c1", "x")])
+    store.write_sweep(["+ablation=x"], [row("of no packed cell", "x", seed=1)])
     for sweeps, ids in (((), {first, second}), ((second,), {second})):
+        cells = store.cell_folders()
         packed = pack(store, cells, tmp_path / "a.tar.xz", tmp_path, sweeps)
         assert (packed.cells, packed.sweeps) == (2, len(ids))
         other = unpacked(tmp_path / "a.tar.xz", tmp_path / f"of {len(ids)}")
@@ -145,41 +116,30 @@ def damage_scores(cell: Path) -> str:
     return "scores.csv: it has changed since the cell finished"
 
 
-def escape(cell: Path) -> str:
-    return change_files(
-        cell, {"../../sweeps/x": {"bytes": 1, "sha256": ""}}, "not a file of this cell"
-    )
-
-
-def malformed(cell: Path) -> str:
-    return change_files(cell, {"scores.csv": 3}, "a file is malformed")
-
-
-def change_files(cell: Path, files: dict[str, Any], message: str) -> str:
+def malform(cell: Path) -> str:
     status = json.loads((cell / "status.json").read_text())
-    write_json(cell / "status.json", status | {"files": status["files"] | files})
-    return message
+    write_json(cell / "status.json", status | {"files": {"scores.csv": 3}})
+    return "status.json: files[...]: Expected `object`, got `int`"
 
 
-@pytest.mark.parametrize("damage", [damage_scores, escape, malformed])
-def test_a_damaged_cell_is_left_out_and_named(store: Store, tmp_path: Path, damage: Any) -> None:
-    cells = summaries(store)
+@pytest.mark.parametrize("damage", [damage_scores, malform])
+def test_a_damaged_cell_is_left_out_and_named(
+    store: Store, tmp_path: Path, damage: Callable[[Path], str]
+) -> None:
     message = damage(store.cell("c1").path)
-    packed = pack(store, cells, tmp_path / "a.tar.xz", tmp_path)
+    packed = pack_all(store, tmp_path / "a.tar.xz")
     assert packed.cells == 1
     (line,) = packed.left_out
-    assert line.startswith("c1  fern / c1: ")
+    assert line.startswith("c1: ")
     assert message in line
     other = unpacked(tmp_path / "a.tar.xz", tmp_path / "other")
-    assert [cell.id for cell in other.cell_folders()] == ["c2"]
+    assert other.cell_folders() == [CellFolder(other.cells_folder / "c2")]
 
 
 def test_a_damaged_variant_or_record_is_left_out_and_named(store: Store, tmp_path: Path) -> None:
-    cells = summaries(store)
-    (variant_id,) = store.variants.names()
-    (store.variants / variant_id / frozen.POINTS).path.write_bytes(b"other points")
-    cells = [replace(cell, names=replace(cell.names, sweeps=("gone",))) for cell in cells]
-    packed = pack(store, cells, tmp_path / "a.tar.xz", tmp_path)
+    (variant_id,) = list_names(store.variants)
+    (store.variants / variant_id / frozen.POINTS).write_bytes(b"other points")
+    packed = pack(store, store.cell_folders(), tmp_path / "a.tar.xz", tmp_path, ["gone"])
     assert (packed.cells, packed.variants, packed.sweeps) == (2, 0, 0)
     variant, record = packed.left_out
     assert f"{frozen.POINTS}: it has changed" in variant
