@@ -200,7 +200,8 @@ BILLION = b"[" + b"[[]]," * 700_000 + b"[]]"
         ("config.json", b'{"scene": %s, "seed": "0"}' % SCENE_CONF, "config.json: seed"),
         (
             "config.json",
-            b'{"scene": %s, "components": {"plugins": {"os": 3}}}' % SCENE_CONF,
+            b'{"scene": %s, "lpips": {"fetch": true}, "components": {"plugins": {"os": 3}}}'
+            % SCENE_CONF,
             "components.plugins.os",
         ),
         ("scores.csv", b"view,psnr\n../a,3\n", "scores.csv"),
