@@ -61,8 +61,8 @@ def measure(folder: Path, cells: int) -> dict[str, tuple[float, float]]:
         "plan, nothing done": (first[0], first[1]),
         "plan, all done": (second[0], second[1]),
         "sweep, all done: plan, record and report": run(folder, "sweep", *axes)[1:],
-        "report": run(folder, "report", "store=store")[1:],
-        "status": run(folder, "status", "store=store")[1:],
+        "report": run(folder, "report", "--store=store")[1:],
+        "status": run(folder, "status", "--store=store")[1:],
     }
 
 

@@ -27,7 +27,6 @@ import torch
 
 from xrgs import composing, config
 from xrgs.capture.dataset import Dataset, LoadedView
-from xrgs.capture.download import http
 from xrgs.evaluation.lpips import weights
 from xrgs.splat.cameras import Camera
 
@@ -297,6 +296,8 @@ class _Handler(BaseHTTPRequestHandler):
 @pytest.fixture
 def pauses(monkeypatch: pytest.MonkeyPatch) -> list[float]:
     """Let downloads try again at once; return the seconds that they would have waited."""
+    from xrgs.capture.download import http
+
     waited: list[float] = []
     monkeypatch.setattr(http, "sleep", waited.append)
     return waited

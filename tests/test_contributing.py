@@ -148,3 +148,41 @@ def test_a_change_of_a_number_is_not_declared(copy: Copy) -> None:
     with pytest.raises(AssertionError, match="nothing is declared"):
         copy.run("store", "prove", "--store", "s", "--sample", "1")
     assert not (copy.root / "xrgs/experiment/refactorings.json").exists()
+
+
+def test_a_scene_kind(copy: Copy) -> None:
+    copy.follow("scene")
+    assert "2 cells, 2 done" in done_cells(copy)
+    photographs = sorted((copy.root / "s" / "variants").glob("*/images/test/*.png"))
+    (copy.root / "pair.txt").write_text("\n".join(map(str, photographs)))
+    arguments = ("scene=listed", "scene.path=pair.txt", "preset=smoke", "store=s", "dry_run=true")
+    printed = copy.run("sweep", *arguments)
+    assert "variant not built" in printed
+    assert "pair.txt / baseline" in printed
+
+
+def test_a_degradation(copy: Copy) -> None:
+    copy.follow("degradation")
+    assert "2 cells, 2 done" in done_cells(copy)
+    overrides = ("scene=motorcycle", "preset=smoke", "store=s", "variant.degradation=grey")
+    printed = copy.run("data", "inspect", *overrides)
+    assert "motorcycle_right" in printed
+
+
+def test_a_launcher(copy: Copy) -> None:
+    copy.follow("launcher")
+    (copy.root / "hydra_plugins" / "pool_launcher.py").write_text(
+        "from dataclasses import dataclass\n"
+        "from hydra._internal.core_plugins.basic_launcher import BasicLauncher\n"
+        "from hydra.core.config_store import ConfigStore\n\n\n"
+        "@dataclass\nclass Conf:\n"
+        "    _target_: str = 'hydra_plugins.pool_launcher.PoolLauncher'\n"
+        "    workers: int = 2\n\n\n"
+        "class PoolLauncher(BasicLauncher):\n"
+        "    def __init__(self, workers: int) -> None:\n"
+        "        super().__init__()\n\n\n"
+        "ConfigStore.instance().store(group='hydra/launcher', name='pool', node=Conf)\n"
+    )
+    printed = copy.run("sweep", *SMOKE[:2], "store=s", "train.steps=2", "hydra/launcher=pool")
+    assert "hydra/launcher=pool: 1 cell, threads=" in printed
+    assert "Written to" in printed

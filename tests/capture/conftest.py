@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import errno
+import io
 import os
 from collections.abc import Callable
 from dataclasses import replace
@@ -14,7 +16,25 @@ import pytest
 from xrgs.capture import variant
 from xrgs.capture.views import Variant
 from xrgs.config import Conf, SceneConf, SfmConf, VariantConf
-from xrgs.safeio.confined import ConfinedPath
+
+
+@pytest.fixture
+def unreadable(monkeypatch: pytest.MonkeyPatch) -> Callable[[str], None]:
+    """(end of a path) -> opening such a file fails from now on, as on a disk that fails."""
+
+    def fail(end: str) -> None:
+        def failing(opened: Callable[..., Any]) -> Callable[..., Any]:
+            def instead(path: Any, *args: Any, **options: Any) -> Any:
+                if str(path).endswith(end):
+                    raise OSError(errno.EIO, os.strerror(errno.EIO), str(path))
+                return opened(path, *args, **options)
+
+            return instead
+
+        monkeypatch.setattr(os, "open", failing(os.open))
+        monkeypatch.setattr(io, "open", failing(io.open))
+
+    return fail
 
 
 @pytest.fixture
@@ -88,8 +108,7 @@ def build_in(small_conf: Callable[..., VariantConf]) -> Callable[..., Variant]:
     def build(store: Path, scene: SceneConf, **changes: Any) -> Variant:
         conf = small_conf(scene, **changes)
         store.mkdir(exist_ok=True)
-        root = ConfinedPath(store)
-        return variant.build(scene, conf, root / "variants", root / "scenes")
+        return variant.build(scene, conf, store / "variants", store / "scenes")
 
     return build
 

@@ -12,12 +12,11 @@ from xrgs.capture.dataset import LoadedView
 from xrgs.capture.images import ImageError
 from xrgs.capture.views import Variant, View
 from xrgs.errors import XrgsError
-from xrgs.safeio.confined import ConfinedPath
 
 HR, LR = (40, 30), (20, 15)
 
 
-def make_view(folder: ConfinedPath, name: str, split: str, tag: str, size: tuple[int, int]) -> View:
+def make_view(folder: Path, name: str, split: str, tag: str, size: tuple[int, int]) -> View:
     """A view of one grey, whose pose depends on its name alone."""
     number = int(name[1:])
     grey = {"train": 0.1, "test": 0.2, "original": 0.3}[split] + number / 20
@@ -32,7 +31,7 @@ def make_view(folder: ConfinedPath, name: str, split: str, tag: str, size: tuple
 @pytest.fixture
 def variant(tmp_path: Path) -> Variant:
     """Five views: v0 is the test, v1 HR, v2 to v4 downsampled by 2, with their originals."""
-    folder = ConfinedPath(tmp_path)
+    folder = tmp_path
     views = [make_view(folder, f"v{i}", "original", "HR", HR) for i in (2, 3, 4)]
     views += [
         make_view(folder, "v0", "test", "HR", HR),

@@ -15,14 +15,14 @@ import pycolmap
 import pytest
 
 from xrgs import config
-from xrgs.capture import degrade, images, mixing, registration, scenes, sfm
+from xrgs.capture import images, mixing, registration, scenes, sfm
+from xrgs.capture.degradations import resolve_degradation
 from xrgs.capture.scenes import Scene, procedural
 from xrgs.capture.sfm import Reconstruction, SfmImage
 from xrgs.capture.split import check_variant_conf
 from xrgs.capture.views import SceneFailed, Variant, View
 from xrgs.config import SceneConf, VariantConf
 from xrgs.errors import XrgsError
-from xrgs.safeio.confined import ConfinedPath
 
 pytestmark = pytest.mark.slow
 
@@ -47,7 +47,7 @@ def rendered(tmp_path_factory: pytest.TempPathFactory, conf: VariantConf) -> Sce
     cache = tmp_path_factory.mktemp("scenes")
     return scenes.resolve(
         SceneConf(name="p", kind="procedural", path=None, views=VIEWS),
-        ConfinedPath(cache),
+        cache,
         conf.long_side,
     )
 
@@ -92,9 +92,9 @@ def mix(
     def run(scene: Scene | None = None, **changes: Any) -> Variant:
         work, out = tmp_path / "work", tmp_path / "out"
         work.mkdir()
-        out.mkdir()
+        (out / "images").mkdir(parents=True)
         scene = scene or replace(rendered, viewmats={})
-        return mixing.mix_resolutions(scene, configured(**changes), work, ConfinedPath(out))
+        return mixing.mix_resolutions(scene, configured(**changes), work, out)
 
     monkeypatch.setattr(sfm, "reconstruct", recall)
     return run
@@ -164,7 +164,7 @@ def test_by_distance_the_closest_are_hr(mix: Mix) -> None:
 def test_by_megapixels_the_larger_photographs_are_hr(
     mix: Mix, rendered: Scene, tmp_path: Path, given: list[list[str]]
 ) -> None:
-    files = {name: ConfinedPath(tmp_path / file.name) for name, file in rendered.files.items()}
+    files = {name: tmp_path / file.name for name, file in rendered.files.items()}
     for i, (name, file) in enumerate(rendered.files.items()):
         photo = images.read(file)
         images.save(files[name], images.resize(photo, 80, 60) if i % 3 else photo)
@@ -286,8 +286,8 @@ def test_a_refused_attempt_is_followed_by_the_next(
 ) -> None:
     results = iter([EMPTY, reconstruction])
     monkeypatch.setattr(sfm, "reconstruct", lambda *_: next(results))
-    (tmp_path / "out").mkdir()
-    made = mixing.mix_resolutions(rendered, conf, tmp_path, ConfinedPath(tmp_path / "out"))
+    (tmp_path / "out/images").mkdir(parents=True)
+    made = mixing.mix_resolutions(rendered, conf, tmp_path, tmp_path / "out")
     attempts = made.report["attempts"]
     assert [(a["attempt"], a["registered"]) for a in attempts] == [
         ("configured", 0),
@@ -302,9 +302,9 @@ def test_where_every_attempt_is_refused_the_report_has_them_all(
     conf: VariantConf, rendered: Scene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(sfm, "reconstruct", lambda *_: EMPTY)
-    (tmp_path / "out").mkdir()
+    (tmp_path / "out/images").mkdir(parents=True)
     with pytest.raises(SceneFailed, match="scene p failed: COLMAP registered 0 of 12") as caught:
-        mixing.mix_resolutions(rendered, conf, tmp_path, ConfinedPath(tmp_path / "out"))
+        mixing.mix_resolutions(rendered, conf, tmp_path, tmp_path / "out")
     tried = [a["attempt"] for a in caught.value.report["attempts"]]
     attempts = registration.sfm_attempts(conf.sfm, VIEWS, any_smaller=True)
     assert tried == [attempt.name for attempt in attempts]
@@ -330,7 +330,7 @@ def test_every_variant_in_conf_is_valid(
 ) -> None:
     conf = compose(*([f"variant={name}"] if name else [])).variant
     check_variant_conf(conf)
-    assert (conf.tags, degrade.resolve_degradation(conf)) == (tags, degradation)
+    assert (conf.tags, resolve_degradation(conf)) == (tags, degradation)
 
 
 def test_every_variant_in_conf_is_tested() -> None:
@@ -405,12 +405,12 @@ def test_a_collection_of_many_cameras_is_registered(
     sizes = [images.size(file) for file in files]
     few = {"max_num_features": 1500}
     conf = configured(long_side=320, tags="sampling_rate", factor=2, sfm=few)
-    (tmp_path / "out").mkdir()
+    (tmp_path / "out/images").mkdir(parents=True)
     made = mixing.mix_resolutions(
-        Scene("reichstag", "", {file.stem: ConfinedPath(file) for file in files}),
+        Scene("reichstag", "", {file.stem: file for file in files}),
         conf,
         tmp_path,
-        ConfinedPath(tmp_path / "out"),
+        tmp_path / "out",
     )
     assert made.report["registered"] >= 12
     assert made.report["cameras"] == 16

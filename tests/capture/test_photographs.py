@@ -13,7 +13,6 @@ from xrgs.capture.photographs import assign_cameras, prepare_hr_views
 from xrgs.capture.scenes import Scene
 from xrgs.composing import compose
 from xrgs.errors import UnreadableError, XrgsError
-from xrgs.safeio.confined import ConfinedPath
 
 CONF = compose("variant.long_side=0", "variant.factor=2").variant
 
@@ -24,7 +23,7 @@ def write_photograph(
     model: str = "",
     focal: float = 0,
     orientation: int = 1,
-) -> ConfinedPath:
+) -> Path:
     """Write a photograph as a camera does: `size` is that before the EXIF orientation."""
     exif = Image.Exif()
     exif[0x0112] = orientation
@@ -35,10 +34,10 @@ def write_photograph(
     ramp = np.linspace(0, 255, size[0]).astype(np.uint8)
     pixels = np.broadcast_to(ramp[None, :, None], (size[1], size[0], 3))
     Image.fromarray(np.ascontiguousarray(pixels)).save(file, exif=exif, quality=95)
-    return ConfinedPath(file)
+    return file
 
 
-def camera_numbers(files: list[ConfinedPath], how: str = "auto") -> list[int]:
+def camera_numbers(files: list[Path], how: str = "auto") -> list[int]:
     """The camera of each photograph, numbered by first use."""
     names = assign_cameras(files, [images.size(file) for file in files], how)
     return [list(dict.fromkeys(names)).index(name) for name in names]
@@ -108,7 +107,7 @@ def test_a_file_without_a_header_is_left_out_too(tmp_path: Path) -> None:
     (tmp_path / "b.png").write_text("no image")
     files = [
         write_photograph(tmp_path / "a.png"),
-        ConfinedPath(tmp_path / "b.png"),
+        tmp_path / "b.png",
         write_photograph(tmp_path / "c.png"),
     ]
     photos = prepare_hr_views(Scene("x", "", {file.stem: file for file in files}), CONF, tmp_path)
@@ -124,7 +123,7 @@ def test_a_photograph_that_cant_be_read_now_is_not_left_out(
     files = [write_photograph(tmp_path / f"{name}.png") for name in "abc"]
     reader = getattr(images, failing)
 
-    def fails(file: ConfinedPath) -> object:
+    def fails(file: Path) -> object:
         if file.name == "b.png":
             raise UnreadableError("b.png: Input/output error")
         return reader(file)

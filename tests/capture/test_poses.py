@@ -21,7 +21,6 @@ from xrgs.capture.photographs import PhotoCollection, prepare_hr_views
 from xrgs.capture.scenes import Scene
 from xrgs.config import VariantConf
 from xrgs.errors import XrgsError
-from xrgs.safeio.confined import ConfinedPath
 
 #: The camera of the whole photographs, of which the files are half as large.
 SIZE, PARAMS = (204, 152), (150.0, 150.0, 104.0, 75.0)
@@ -43,8 +42,9 @@ def photos(tmp_path: Path, configured: Callable[..., VariantConf]) -> PhotoColle
     for name in ("a", "b", "c"):
         pixels = np.random.default_rng(0).integers(0, 255, (76, 102, 3), dtype=np.uint8)
         Image.fromarray(pixels).save(tmp_path / f"{name}.png")
-        files[name] = ConfinedPath(tmp_path / f"{name}.png")
+        files[name] = tmp_path / f"{name}.png"
     conf = configured(long_side=0)
+    (tmp_path / "work").mkdir()
     return prepare_hr_views(Scene("x", "", files), conf, tmp_path / "work")
 
 

@@ -10,11 +10,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from xrgs.capture import degrade, images, registration, scenes, sfm
+from xrgs.capture import images, registration, scenes, sfm
 from xrgs.capture.photographs import PhotoCollection, prepare_hr_views, write_degraded
 from xrgs.capture.sfm import Reconstruction
 from xrgs.config import SceneConf, SfmConf, VariantConf
-from xrgs.safeio.confined import ConfinedPath
 
 Make = Callable[..., VariantConf]
 
@@ -23,7 +22,7 @@ Make = Callable[..., VariantConf]
 def photos(configured: Make, tmp_path: Path) -> PhotoCollection:
     """The stereo pair, and a degraded copy of the right view that is 5 times smaller."""
     scene = scenes.resolve(
-        SceneConf(name="motorcycle", kind="motorcycle", path=None, views=24), ConfinedPath(tmp_path)
+        SceneConf(name="motorcycle", kind="motorcycle", path=None, views=24), tmp_path
     )
     conf = configured(long_side=185, degradation="downsample")
     made = prepare_hr_views(scene, conf, tmp_path)
@@ -58,7 +57,8 @@ def test_attempts_follow_until_one_is_accepted(
     assert first["registered"] == 2
     assert first["seconds"] > 0
     assert done.model.report["min_inliers"] == 15
-    assert sorted(p.name for p in tmp_path.glob("sfm*")) == ["sfm", "sfm-finer"]
+    folders = sorted(path.name for path in tmp_path.glob("sfm*"))
+    assert folders == ["sfm-configured", "sfm-finer"]
     assert len(list((tmp_path / "sfm-finer").glob("models-*"))) == 2
     assert "SfM attempt finer: too few" in caplog.text
 
@@ -145,10 +145,9 @@ def test_a_degraded_copy_of_full_size_is_given_as_it_is(
     configured: Make, sfm_conf: SfmConf, tmp_path: Path
 ) -> None:
     scene = scenes.resolve(
-        SceneConf(name="motorcycle", kind="motorcycle", path=None, views=24), ConfinedPath(tmp_path)
+        SceneConf(name="motorcycle", kind="motorcycle", path=None, views=24), tmp_path
     )
     conf = configured(long_side=185, degradation="jpeg")
-    assert degrade.resolve_degradation(conf) == "jpeg"
     made = prepare_hr_views(scene, conf, tmp_path)
     write_degraded(made, [1], conf)
     for lr_images in ("upsampled", "native"):

@@ -11,9 +11,8 @@ import pytest
 
 from xrgs.capture import images, scenes, sfm
 from xrgs.capture.scenes import motorcycle
-from xrgs.capture.scenes.bundled import bundled_photograph
+from xrgs.capture.scenes.scene import bundled_photograph
 from xrgs.config import SceneConf, SfmConf
-from xrgs.safeio.confined import ConfinedPath
 
 StereoPair = tuple[Path, sfm.Reconstruction]
 
@@ -60,7 +59,7 @@ def stereo_pair(tmp_path_factory: pytest.TempPathFactory, sfm_conf: SfmConf) -> 
     """The motorcycle pair at its own size, intrinsics given."""
     work = tmp_path_factory.mktemp("pair")
     scene = scenes.resolve(
-        SceneConf(name="motorcycle", kind="motorcycle", path=None, views=24), ConfinedPath(work)
+        SceneConf(name="motorcycle", kind="motorcycle", path=None, views=24), work
     )
     inputs = []
     for file in scene.files.values():

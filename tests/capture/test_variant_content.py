@@ -14,7 +14,6 @@ from xrgs.capture import images, scenes
 from xrgs.capture.views import Variant, View
 from xrgs.config import SceneConf
 from xrgs.errors import XrgsError
-from xrgs.safeio.confined import ConfinedPath
 
 pytestmark = pytest.mark.slow
 
@@ -102,7 +101,7 @@ def test_the_report_says_how_sfm_went(procedural_variant: Variant) -> None:
     assert report["not_registered"] == report["unreadable"] == []
     assert report["hr_sizes"] == {"250x185": 24}
     assert report["seconds"] > 0
-    assert "Feature extraction" in (procedural_variant.path / "colmap.log").read_text()
+    assert "Feature extraction" in (procedural_variant.folder / "colmap.log").read_text()
 
 
 # the stereo pair, of which no view is held out
@@ -162,7 +161,7 @@ def photographs(tmp_path: Path, procedural_scene: SceneConf) -> Callable[[str, i
 
     def copied(name: str, count: int) -> SceneConf:
         (tmp_path / name).mkdir()
-        cache = ConfinedPath(tmp_path) / "scenes"
+        cache = tmp_path / "scenes"
         rendered = scenes.resolve(replace(procedural_scene, views=count), cache, 252)
         for i, file in enumerate(rendered.files.values()):
             shutil.copy(str(file), tmp_path / name / f"vue d'été {i}, x.png")

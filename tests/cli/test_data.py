@@ -18,7 +18,7 @@ from PIL import Image
 from plyfile import PlyData
 
 import xrgs
-import xrgs.report.variant
+import xrgs.capture.description
 from xrgs.capture import poses, variant
 from xrgs.sweep.jobs import worker
 
@@ -37,7 +37,7 @@ def test_inspect_builds_a_variant_that_the_store_lacks(
 
     monkeypatch.setattr(worker, "run_in_child", build)
     monkeypatch.setattr(variant, "find", lambda *_: SimpleNamespace(id="k-1") if built else None)
-    monkeypatch.setattr(xrgs.report.variant, "describe", lambda folder, out: f"{folder} {out}")
+    monkeypatch.setattr(xrgs.capture.description, "describe", lambda folder, out: f"{folder} {out}")
     code, out, err = xrgs_data("inspect", "scene=motorcycle", "store=s", "--out", "x.png")
     assert code == 0, err
     assert out.strip() == "s/variants/k-1 x.png"

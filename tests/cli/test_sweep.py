@@ -116,7 +116,7 @@ def test_a_cell_that_takes_a_count_from_another_is_trained_after_it(
     code, _, err = sweep_here(*control)
     assert code == 0, err
     store = Store(tmp_path / "s")
-    rows = {row.label.split()[0]: row.cell_id for row in store.sweep_record().cells}
+    rows = {row.label.split()[0]: str(row.cell_id) for row in store.sweep_record().cells}
     assert children.trained[-1] == rows["count_matched"]
     count = store.cell(rows["gradient_scaling"]).summary().gaussians
     identity = store.cell(rows["count_matched"]).identity()
@@ -135,7 +135,7 @@ def test_each_arm_and_replicate_has_a_control_and_a_count_out_of_reach_fails_one
     children.unreachable = children.gaussians + 6
     assert sweep_here(*arguments)[0] == 1
     store = Store(tmp_path / "s")
-    rows = {(row.label, row.seed): row.cell_id for row in store.sweep_record().cells}
+    rows = {(row.label, row.seed): str(row.cell_id) for row in store.sweep_record().cells}
     assert len(rows) == len(children.trained) == 10
     missing = []
     for arm in arms.split(","):

@@ -15,7 +15,6 @@ from PIL import Image
 from xrgs.capture.dataset import Dataset, LoadedView
 from xrgs.config import Conf, SplatConf
 from xrgs.evaluation import protocol
-from xrgs.safeio.confined import ConfinedPath
 from xrgs.splat.cameras import Camera
 from xrgs.splat.gaussians import Gaussians, from_points
 from xrgs.splat.rendering import rasterize_parameters
@@ -44,7 +43,7 @@ def test_scores_and_pngs_are_of_the_render_with_all_sh_degrees(
     gaussians: Gaussians, data: Dataset, baseline: Conf, tmp_path: Path
 ) -> None:
     conf = baseline.splat
-    renders = ConfinedPath(tmp_path) / "renders"
+    renders = tmp_path / "renders"
     (row,) = protocol.score_views(gaussians, data.test, conf, renders)
     view = data.test[0]
     images = {}
@@ -69,7 +68,7 @@ def test_scores_are_the_same_for_any_number_of_threads(
     scores = []
     for threads in (1, 2, 3):
         torch.set_num_threads(threads)
-        renders = ConfinedPath(tmp_path) / str(threads)
+        renders = tmp_path / str(threads)
         scores += protocol.score_views(gaussians, [view], baseline.splat, renders)
         assert torch.get_num_threads() == threads
     torch.set_num_threads(1)
@@ -81,7 +80,7 @@ def test_means_are_those_of_the_views(
     gaussians: Gaussians, data: Dataset, baseline: Conf, tmp_path: Path
 ) -> None:
     views = (*data.test, *data.train)
-    rows = protocol.score_views(gaussians, views, baseline.splat, ConfinedPath(tmp_path) / "r")
+    rows = protocol.score_views(gaussians, views, baseline.splat, tmp_path / "r")
     means = protocol.mean_scores(gaussians, views, baseline.splat)
     assert len(rows) > 1
     for name in ("psnr", "ssim"):

@@ -1,18 +1,24 @@
 """Stores made by writing files; no cell is trained."""
 
 import json
+from dataclasses import asdict
+from functools import cache
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import numpy as np
 import pytest
 from PIL import Image
 
-from xrgs.evaluation.metrics import METRICS
+from xrgs import composing
+from xrgs.evaluation.scoring import scoring_code
 from xrgs.experiment.attempts import begin_attempt
 from xrgs.experiment.cell_folder import CellFolder
+from xrgs.experiment.schema import Identity, Provenance, RecordedCell
 from xrgs.experiment.store import Store
 from xrgs.report.collect import Sweep, read_cells
+from xrgs.safeio.atomic import write_json
 
 SUMMARY = {
     "training_time_s": 100.0,
@@ -27,6 +33,48 @@ SCORES = {"psnr": 20.0, "ssim": 0.8, "lpips": 0.25}
 VIEWS = ("IMG_001", "IMG_009")
 _STEPS = [f"{step},{0.3 / (1 + step)},{100 * step}" for step in range(5)]
 HISTORY = "\n".join(["step,loss,gaussians", *_STEPS]) + "\n"
+PROVENANCE = Provenance(
+    xrgs="0.1.0",
+    git=None,
+    git_diff_sha256=None,
+    python="3.11",
+    packages={},
+    platform="a platform",
+    threads=2,
+    backend="torch",
+    started="now",
+    cpu="a processor",
+)
+
+
+@cache
+def baseline_config() -> dict[str, Any]:
+    """The baseline's config as it is in a cell's folder."""
+    return asdict(composing.compose())
+
+
+def configured(cell: CellFolder, **changes: dict[str, Any]) -> None:
+    """Give a cell the baseline's config with changes by group, and finish it again."""
+    config = {
+        name: _changed(values, changes.get(name, {})) for name, values in baseline_config().items()
+    }
+    write_json(cell.path / "config.json", config)
+    finish_again(cell)
+
+
+def _changed(values: Any, changes: dict[str, Any]) -> Any:
+    if not changes:
+        return values
+    return values | {
+        name: _changed(values[name], change) if isinstance(change, dict) else change
+        for name, change in changes.items()
+    }
+
+
+def finish_again(cell: CellFolder, views: tuple[str, ...] | None = None) -> None:
+    """Declare a done cell's files as they are now."""
+    status = cell.status()
+    cell.finish(views or status.views, status.scored_by)
 
 
 class MadeStore:
@@ -49,7 +97,7 @@ class MadeStore:
         factors: dict[str, float] | None = None,
         values: dict[str, Any] | None = None,
         variant: str | None = None,
-        protocol: int = 1,
+        scored_by: dict[str, str] | None = None,
         state: str = "done",
         pictures: bool = False,
         cpu: str = "a processor",
@@ -61,15 +109,18 @@ class MadeStore:
         """One cell: the made-up baseline's values times `factors`, or `values` outright.
 
         `provenance` and `summary` have more entries of its files, `quality` the scores during
-        training.
+        training, `scored_by` digests of other scoring code.
         """
         cell_id = f"cell{len(self.rows):05d}"
         variant = variant or f"variant-of-{len(scene)}-{scene[:3]}".replace("/", "_")
         found = SUMMARY | SCORES | (values or {})
         found |= {key: found[key] * factor for key, factor in (factors or {}).items()}
         folder = self.store.cell(cell_id)
-        train = {} if validation is None else {"train": {"validation": validation}}
-        begin_attempt(folder, {}, {"variant": variant, "seed": seed, "protocol": protocol} | train)
+        train = {} if validation is None else {"validation": validation}
+        identity = Identity(variant=variant, seed=seed, train=train, splat={}, components={})
+        folder.path.mkdir()
+        write_json(folder.path / "identity.json", msgspec.to_builtins(identity))
+        begin_attempt(folder)
         base = [
             row["cell_id"]
             for row in self.rows
@@ -99,7 +150,7 @@ class MadeStore:
         if pictures:
             split = "train" if validation else "test"
             self._draw(folder, f"{variant}/images/{split}", noise=0.02 * len(self.rows))
-        folder.finish(VIEWS, protocol)
+        folder.finish(VIEWS, scoring_code() | (scored_by or {}))
         return folder
 
     def add_error(self, scene: str, label: str = "baseline", seed: int = 0) -> None:
@@ -113,20 +164,20 @@ class MadeStore:
 
     def write(self, command: tuple[str, ...] = ("+ablation=consistency",)) -> str:
         """Record the sweep; returns its id."""
-        return self.store.write_sweep(command, self.rows)
+        return self.store.write_sweep(command, [RecordedCell(**row) for row in self.rows])
 
     def read(self) -> Sweep:
         """Record the sweep and read it, as a report does."""
         record = self.store.sweep_record(sweep_id := self.write())
-        commands = {sweep_id: tuple(record["command"])}
-        return read_cells(self.store, commands, record["cells"], METRICS)
+        return read_cells(self.store, {sweep_id: record.command}, record.cells)
 
     @staticmethod
     def _fill(folder: CellFolder, found: dict[str, Any], provenance: dict[str, Any]) -> None:
         summary = {key: value for key, value in found.items() if key not in SCORES}
+        summary |= {key: round(summary[key]) for key in ("gaussians", "steps")}
         (folder.path / "summary.json").write_text(json.dumps(summary))
-        same = {"threads": 2, "backend": "torch", "started": str(folder.path)}
-        (folder.path / "provenance.json").write_text(json.dumps(same | provenance))
+        made = msgspec.to_builtins(PROVENANCE) | {"started": str(folder.path)} | provenance
+        (folder.path / "provenance.json").write_text(json.dumps(made))
         # The views differ, their mean is the value asked for.
         lines = ["view,psnr,ssim,lpips"]
         for view, offset in zip(VIEWS, (0.05, -0.05), strict=True):

@@ -49,7 +49,7 @@ def add_nested(made: Any, changes: dict[str, tuple[float, ...]], metric: str = "
 NESTED = {"fern": (1.0, 3.0, 5.0), "room": (10.0, 12.0), "trex": (7.0,)}
 
 
-@pytest.mark.parametrize("metric", ["psnr", "gaussians"])
+@pytest.mark.parametrize("metric", ["psnr", "evaluations"])
 def test_replicates_scatter_within_scenes_and_scenes_by_their_means(made: Any, metric: str) -> None:
     """Sums of squares 8 and 2 of 2 + 1 degrees of freedom; means 3, 11, 7."""
     add_nested(made, NESTED, metric)

@@ -13,6 +13,7 @@ import pytest
 from numpy.typing import NDArray
 from PIL import Image
 from skimage.metrics import peak_signal_noise_ratio
+from xrgs.safeio.confined import ConfinedPath
 
 from xrgs.capture import frozen
 from xrgs.capture.views import Variant, View
@@ -20,7 +21,6 @@ from xrgs.report import build
 from xrgs.report.collect import ReportError
 from xrgs.report.external import External, parse, with_external
 from xrgs.report.joined import JoinedStore
-from xrgs.safeio.confined import ConfinedPath
 
 SIZE = (32, 24)
 VIEWS = ("IMG_001", "IMG_009")

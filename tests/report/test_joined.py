@@ -6,6 +6,7 @@ import shutil
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import pytest
 
 from xrgs.errors import StoreError
@@ -34,12 +35,12 @@ def two(made: Any, tmp_path: Path) -> tuple[Path, Path, str, str]:
     ids = []
     for name, scene, factor in (("a", "fern", 1.1), ("b", "room", 1.2)):
         made.rows.clear()
-        first = len(list(made.store.cells_folder.names()))
+        first = len(list(made.store.cells_folder.iterdir()))
         made.add(scene=scene)
         made.add("plus", scene=scene, factors={"psnr": factor})
         for number, row in enumerate(made.rows):  # ids of their own, as other scenes have
             new = f"cell{first + number}{name}"
-            made.store.cell(row["cell_id"]).folder.rename(made.store.cells_folder / new)
+            made.store.cell(row["cell_id"]).path.rename(made.store.cells_folder / new)
             row["cell_id"] = new
         for row in made.rows:
             row["baseline_id"] = made.rows[0]["cell_id"]
@@ -67,9 +68,7 @@ def test_a_cell_is_found_in_the_store_that_has_done_it(
 ) -> None:
     a, b, first, _ = two
     store = JoinedStore((Store(a), Store(b)))
-    (cell_id,) = [
-        row["cell_id"] for row in Store(a).sweep_record(first)["cells"] if row["label"] == "plus"
-    ]
+    (cell_id,) = [row.cell_id for row in Store(a).sweep_record(first).cells if row.label == "plus"]
     (a / "cells" / cell_id / "scores.csv").unlink()
     assert store.cell(cell_id).path == b / "cells" / cell_id
     shutil.rmtree(b / "cells" / cell_id)
@@ -94,7 +93,7 @@ def test_two_different_cells_in_one_place_are_refused(
 ) -> None:
     _, b, first, second = two
     store = Store(b)
-    rows = [row | {"scene": "fern"} for row in store.sweep_record(second)["cells"]]
+    rows = [msgspec.structs.replace(row, scene="fern") for row in store.sweep_record(second).cells]
     other = store.write_sweep([], rows)
     with pytest.raises(ReportError, match=rf"fern / baseline / seed 0 is cell .*{first} and"):
         build(b, [first, other], pictures=[])

@@ -1,15 +1,25 @@
-"""The paper's tables beside a comparison's own changes."""
+"""The paper's tables, its claim on texture and its figures beside a sweep's own results."""
 
+import csv
+import math
+from itertools import pairwise
+from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
+import torch
+from PIL import Image
+from scipy.stats import spearmanr
 
 from xrgs.evaluation.metrics import METRICS
 from xrgs.report.compare import compare
 from xrgs.report.context import Context
+from xrgs.report.joined import JoinedStore
 from xrgs.report.page import build
-from xrgs.report.paper import paper_tables
-from xrgs.report.render import TextTable
+from xrgs.report.paper import paper_tables, texture, texture_tables, with_texture
+from xrgs.runtime.text import TextTable
+from xrgs.training.components.texture import gradient_magnitude
 
 SCENES = ("fern", "flower", "horns")
 
@@ -93,3 +103,105 @@ def test_the_page_has_the_table_once(made: Any) -> None:
     title = "Beside the paper's Table 1: mean over 3 scenes"
     assert report.text.count(title) == 1
     assert (report.folder / "table.md").read_text().count(title) == 1
+
+
+BY_TEXTURE = ("room", "fern", "trex")  # from the flattest to the most textured, as drawn below
+TEXTURE_CONTEXTS = {"": Context(("500 steps",), ("a machine",))}
+
+
+def test_texture_is_the_mean_of_the_gradient_that_components_use() -> None:
+    image = np.random.default_rng(0).uniform(size=(37, 53, 3)).astype(np.float32)
+    magnitude = gradient_magnitude(torch.from_numpy(image).double())[:-1, :-1]
+    assert texture(image) == pytest.approx(float(magnitude.mean()), rel=1e-12)
+
+
+def test_texture_of_a_ramp_is_its_slope() -> None:
+    ramp = np.broadcast_to(np.linspace(0, 1, 11, dtype=np.float32)[None, :, None], (7, 11, 3))
+    assert texture(ramp) == pytest.approx(0.1, rel=1e-6)
+
+
+def test_an_image_one_pixel_wide_has_no_texture() -> None:
+    assert math.isnan(texture(np.zeros((9, 1, 3), np.float32)))
+
+
+def draw(made: Any, scene: str, amplitude: int) -> None:
+    """Give both scored photographs of a scene stripes of this amplitude, in steps of 1 / 255."""
+    for view in ("IMG_001", "IMG_009"):
+        image = np.full((20, 30, 3), 100, np.uint8)
+        image[:, ::2] += np.uint8(amplitude)
+        variant = made.rows[-1]["variant_id"]
+        folder = made.store.path / "variants" / variant / "images" / "test"
+        folder.mkdir(parents=True, exist_ok=True)
+        Image.fromarray(image).save(folder / f"{view}.png")
+
+
+def add_scenes(made: Any, scenes: tuple[str, ...] = BY_TEXTURE) -> None:
+    """Ablation `a` gains 1 dB in the flattest scene, 2 dB in the next, and so on."""
+    for place, scene in enumerate(scenes, 1):
+        made.add(scene=scene)
+        made.add("a", scene=scene, values={"psnr": 20.0 + place})
+        draw(made, scene, 10 * place)
+
+
+def tables_by_texture(made: Any) -> list[TextTable]:
+    sweep = made.read()
+    views = with_texture(JoinedStore((made.store,)), sweep.cells, sweep.views)
+    return texture_tables(compare(sweep.cells, METRICS), views, TEXTURE_CONTEXTS)
+
+
+def test_scenes_are_in_the_order_of_their_texture(made: Any) -> None:
+    add_scenes(made)
+    (table,) = tables_by_texture(made)
+    expected = [f"{scene} ({10 * place / 255:.4f})" for place, scene in enumerate(BY_TEXTURE, 1)]
+    assert table.columns == ("Ablation", "Metric", *expected, "rank correlation")
+    rows = {row[:2]: row[2:] for row in table.rows}
+    assert rows["a", "PSNR"] == ("+5.00 ↑", "+10.00 ↑", "+15.00 ↑", "+1.00")
+    assert rows["a", "LPIPS"] == ("0.00 =", "0.00 =", "0.00 =", "")
+    assert {metric for _, metric in rows} == {"LPIPS", "SSIM", "PSNR"}
+
+
+def test_the_table_says_how_its_scores_were_made(made: Any) -> None:
+    add_scenes(made)
+    assert tables_by_texture(made)[0].context == "500 steps"
+
+
+def test_the_correlation_is_one_of_ranks(made: Any) -> None:
+    gains = (3.0, 0.1, 0.2, 9.0)
+    for place, (scene, gain) in enumerate(zip(("aaa", "bbb", "ccc", "ddd"), gains, strict=True)):
+        made.add(scene=scene)
+        made.add("a", scene=scene, values={"psnr": 20.0 + gain})
+        draw(made, scene, 10 + place**3)
+    (table,) = tables_by_texture(made)
+    assert table.rows[-1][-1] == f"{spearmanr(range(4), gains).statistic:+.2f}"
+
+
+def test_two_scenes_have_no_table(made: Any) -> None:
+    add_scenes(made, BY_TEXTURE[:2])
+    assert tables_by_texture(made) == []
+
+
+@pytest.mark.parametrize("damage", ["missing", "malformed"])
+def test_a_scene_without_photographs_is_left_out(made: Any, damage: str) -> None:
+    add_scenes(made, (*BY_TEXTURE, "horn"))
+    images = made.store.path / "variants" / made.rows[-1]["variant_id"] / "images" / "test"
+    for file in images.iterdir():
+        file.unlink() if damage == "missing" else file.write_bytes(b"no PNG")
+    (table,) = tables_by_texture(made)
+    assert not any("horn" in column for column in table.columns)
+    assert len(table.columns) == 3 + len(BY_TEXTURE)
+
+
+def test_the_texture_of_each_view_is_in_views_csv_and_the_table_on_the_page(
+    made: Any, tmp_path: Path
+) -> None:
+    add_scenes(made)
+    made.write()
+    folder = build(made.store.path, out=tmp_path / "report", pictures=[]).folder
+    with (folder / "views.csv").open(newline="") as stream:
+        rows = list(csv.DictReader(stream))
+    found = sorted({float(row["texture"]) for row in rows})
+    assert found == pytest.approx([10 * place / 255 for place in range(1, 4)])
+    assert all(after > before for before, after in pairwise(found))
+    title = "Change from baseline by the texture of the scene"
+    assert title in (folder / "table.md").read_text()
+    assert title in (folder / "report.html").read_text()

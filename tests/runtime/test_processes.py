@@ -1,4 +1,4 @@
-"""Tests of what is known of other processes."""
+"""Tests of other processes: their starts, whether they live, and their memory."""
 
 from __future__ import annotations
 
@@ -7,8 +7,8 @@ import signal
 import subprocess
 import sys
 import time
-from pathlib import Path
 
+import psutil
 import pytest
 
 from xrgs.runtime import processes
@@ -17,29 +17,26 @@ from xrgs.runtime import processes
 def test_a_process_is_told_from_others_by_its_start_until_it_is_dead() -> None:
     with subprocess.Popen([sys.executable, "-c", "import time; time.sleep(600)"]) as child:
         began = processes.started(child.pid)
-        assert began is not None
-        assert began >= (processes.started(os.getpid()) or 0)
+        assert began >= processes.started(os.getpid())
         assert processes.started(child.pid) == began
+        assert not processes.lives(child.pid, began - 10)
         os.kill(child.pid, signal.SIGSTOP)
-        assert processes.started(child.pid) == began
+        assert processes.lives(child.pid, began)
         child.kill()
         end = time.monotonic() + 10
-        while processes.started(child.pid) is not None:  # nobody has waited for it
+        while processes.lives(child.pid, began):  # nobody has waited for it
             assert time.monotonic() < end
             time.sleep(0.01)
-    assert processes.started(child.pid) is None
+    assert not processes.lives(child.pid, began)
+    with pytest.raises(psutil.NoSuchProcess):
+        processes.started(child.pid)
 
 
-def test_without_proc_a_process_exists_or_does_not(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
-    with subprocess.Popen([sys.executable, "-c", ""]) as child:
-        pass
-    monkeypatch.setattr(processes, "_PROC", tmp_path)
-    assert not processes.proc_exists()
-    assert processes.started(os.getpid()) == 0
-    assert processes.started(child.pid) is None
-    assert processes.boot.__wrapped__() == ""
+def test_a_clock_that_is_set_changes_no_start(monkeypatch: pytest.MonkeyPatch) -> None:
+    began, booted = processes.started(os.getpid()), psutil.boot_time()
+    monkeypatch.setattr(psutil, "boot_time", lambda: booted + 3600)
+    monkeypatch.setattr(psutil._psplatform, "boot_time", lambda: booted + 3600)
+    assert processes.started(os.getpid()) == pytest.approx(began, abs=0.02)
 
 
 def test_memory_is_that_of_all_processes_of_a_session() -> None:

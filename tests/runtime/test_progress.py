@@ -9,8 +9,7 @@ from pathlib import Path
 import pytest
 
 from xrgs.runtime import progress
-from xrgs.runtime.progress import Progress, ProgressBar, format_duration, read, written_to
-from xrgs.safeio.confined import ConfinedPath
+from xrgs.runtime.progress import Progress, ProgressBar, read, written_to
 
 
 class Terminal(io.StringIO):
@@ -64,7 +63,7 @@ def test_a_line_replaces_a_bar(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_progress_in_a_file_is_shown_nowhere_and_removed_at_the_end(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    file = ConfinedPath(tmp_path) / "progress.json"
+    file = tmp_path / "progress.json"
     with written_to(file):
         for item in progress.progress(range(5, 8), "training", "step", 8, done=5):
             found = read(file)
@@ -86,7 +85,7 @@ def test_the_file_is_not_written_for_every_item(
 ) -> None:
     written: list[int] = []
     monkeypatch.setattr(progress, "_write", lambda _, now: written.append(now.done))
-    with written_to(ConfinedPath(tmp_path) / "progress.json"):
+    with written_to(tmp_path / "progress.json"):
         assert sum(progress.progress(range(10_000), "training", "step")) == 49_995_000
     assert written[0] == 0
     assert len(written) < 3
@@ -94,7 +93,7 @@ def test_the_file_is_not_written_for_every_item(
 
 @pytest.mark.usefixtures("quick")
 def test_a_file_that_cannot_be_written_stops_nothing(tmp_path: Path) -> None:
-    with written_to(ConfinedPath(tmp_path) / "gone/progress.json"):
+    with written_to(tmp_path / "gone/progress.json"):
         assert list(progress.progress([1, 2], "training", "step")) == [1, 2]
 
 
@@ -113,13 +112,13 @@ def test_a_file_that_cannot_be_written_stops_nothing(tmp_path: Path) -> None:
 )
 def test_an_invalid_file_is_no_progress(tmp_path: Path, text: str) -> None:
     (tmp_path / "progress.json").write_text(text)
-    assert read(ConfinedPath(tmp_path) / "progress.json") is None
+    assert read(tmp_path / "progress.json") is None
 
 
 def test_a_rate_that_is_not_finite_is_none(tmp_path: Path) -> None:
     found = {"what": "a", "unit": "b", "done": 1, "total": 2, "rate": float("nan")}
     (tmp_path / "progress.json").write_text(json.dumps(found))
-    assert read(ConfinedPath(tmp_path) / "progress.json") == Progress("a", "b", 1, 2, None)
+    assert read(tmp_path / "progress.json") == Progress("a", "b", 1, 2, None)
 
 
 def test_the_text_has_all_that_is_known() -> None:
@@ -128,21 +127,6 @@ def test_the_text_has_all_that_is_known() -> None:
     )
     assert str(Progress("training", "step", 0, 3000, None)) == "training 0 of 3,000 steps"
     assert str(Progress("a.zip", "byte", 7, None, 2.0)) == "a.zip 7 bytes, 2 bytes/s"
-
-
-@pytest.mark.parametrize(
-    ("seconds", "text"),
-    [
-        (None, "?"),
-        (0.4, "~0 s"),
-        (99, "~99 s"),
-        (100, "~2 min"),
-        (5400, "~90 min"),
-        (9000, "~2.5 h"),
-    ],
-)
-def test_duration(seconds: float | None, text: str) -> None:
-    assert format_duration(seconds) == text
 
 
 def test_a_line_is_one_line_whatever_it_names(capsys: pytest.CaptureFixture[str]) -> None:
@@ -154,7 +138,7 @@ def test_the_words_of_another_process_are_plain_and_short(tmp_path: Path) -> Non
     file = tmp_path / "progress.json"
     content = {"what": "\x1b[2J" + "x" * 999, "unit": "a\nb", "done": 1, "total": 2, "rate": None}
     file.write_text(json.dumps(content))
-    found = read(ConfinedPath(file))
+    found = read(file)
     assert found is not None
     assert found.what.startswith(" [2Jxxx")
     assert found.unit == "a b"

@@ -1,27 +1,41 @@
-"""Fixtures of the tests of sweeps: a store, a session, and cells that a plan hands over."""
+"""Fixtures of the tests of sweeps: a store, its cells, a session, and files that can't be read."""
 
 from __future__ import annotations
 
+import io
 import os
-from collections.abc import Callable
-from dataclasses import asdict, replace
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import hydra
+import msgspec
 import pytest
 from hydra.types import HydraContext
 from omegaconf import DictConfig
 
 from xrgs import config
 from xrgs.config import Conf
-from xrgs.experiment.identity import cell_identity
+from xrgs.experiment.attempts import begin_attempt, plan_cell
+from xrgs.experiment.cell_folder import CellFolder
+from xrgs.experiment.identity import cell_id, cell_identity
+from xrgs.experiment.schema import RecordedCell
 from xrgs.experiment.store import Store
-from xrgs.safeio.confined import ConfinedPath
-from xrgs.sweep.session import HandOver, SweepSession
+from xrgs.safeio.atomic import write_json
+from xrgs.sweep.session import SweepSession
 from xrgs.sweep.study import Study
 
 #: The id of a variant that is not built.
 VARIANT = "0123456789abcdef-0123456789abcdef"
+SUMMARY = {
+    "training_time_s": 1.5,
+    "render_time_ms": 2.0,
+    "gaussians": 7,
+    "memory_bytes": 1000,
+    "evaluations": 500,
+    "steps": 20,
+}
 
 
 @pytest.fixture
@@ -29,8 +43,65 @@ def store(tmp_path: Path) -> Store:
     """An empty store, with the folder of one variant."""
     store = Store(tmp_path / "s")
     store.prepare()
-    (store.variants / VARIANT).make_folder()
+    (store.variants / VARIANT).mkdir()
     return store
+
+
+@dataclass(frozen=True)
+class Cells:
+    """Plans, begins and finishes cells of a store, without any training."""
+
+    store: Store
+    conf: Conf
+
+    def plan(
+        self, name: str | None = None, identity: Mapping[str, Any] | None = None, **changes: Any
+    ) -> CellFolder:
+        """Plan a cell, as a sweep does.
+
+        `name` replaces its id, `identity` changes values of its identity, and `changes` are of its
+        config.
+        """
+        conf = replace(self.conf, **changes)
+        made = msgspec.structs.replace(cell_identity(conf, VARIANT), **(identity or {}))
+        cell = self.store.cell(name or cell_id(made))
+        plan_cell(cell, conf, made)
+        return cell
+
+    def begin(self, *given: Any, **changes: Any) -> CellFolder:
+        """Plan a cell and begin an attempt; arguments as for `plan`."""
+        cell = self.plan(*given, **changes)
+        assert begin_attempt(cell)
+        return cell
+
+    def finish(self, cell: CellFolder, gaussians: int = 7) -> CellFolder:
+        """Write the results of a cell that has begun."""
+        (cell.path / "scores.csv").write_text("view,psnr\na,20\n")
+        write_json(cell.path / "summary.json", SUMMARY | {"gaussians": gaussians})
+        cell.finish(["a"], {})
+        return cell
+
+    def done(self, *given: Any, **changes: Any) -> CellFolder:
+        """Plan, begin and finish a cell; arguments as for `plan`."""
+        return self.finish(self.begin(*given, **changes))
+
+    def record(self, *rows: tuple[str | None, str, str], **more: Any) -> str:
+        """Write the record of a sweep of cells (id, scene, label), and return the sweep's id."""
+        return self.store.write_sweep([], [self.row(*row, **more) for row in rows])
+
+    def row(self, cell_id: str | None, scene: str, label: str, **more: Any) -> RecordedCell:
+        """A cell in the record of a sweep."""
+        names = {"condition": "", "variant_seed": 0, "seed": 0}
+        ids = {"variant_id": None, "baseline_id": None}
+        given: dict[str, Any] = names | ids | more
+        return RecordedCell(cell_id=cell_id, scene=scene, label=label, **given)
+
+
+@pytest.fixture
+def cells(compose: Callable[..., Conf], store: Store) -> Cells:
+    """The cells of `store`, of a config on the torch backend."""
+    given = ("scene=motorcycle", "splat.backend=torch", f"store={store.path}", "threads=1")
+    return Cells(store, compose(*given))
 
 
 @pytest.fixture
@@ -39,15 +110,23 @@ def sick(monkeypatch: pytest.MonkeyPatch) -> Callable[[str, int], None]:
 
     The number 0 makes all files readable again.
     """
-    read = ConfinedPath._open_regular
+    opened, opened_io = os.open, io.open
 
     def sicken(end: str, number: int) -> None:
-        def fail(path: ConfinedPath, flags: int) -> int:
-            if number and str(path).endswith(end):
+        def check(path: object) -> None:
+            if number and isinstance(path, (str, Path)) and str(path).endswith(end):
                 raise OSError(number, os.strerror(number), str(path))
-            return read(path, flags)
 
-        monkeypatch.setattr(ConfinedPath, "_open_regular", fail)
+        def os_open(path: Any, *given: Any, **named: Any) -> int:
+            check(path)
+            return opened(path, *given, **named)
+
+        def io_open(path: Any, *given: Any, **named: Any) -> Any:
+            check(path)
+            return opened_io(path, *given, **named)
+
+        monkeypatch.setattr(os, "open", os_open)
+        monkeypatch.setattr(io, "open", io_open)
 
     return sicken
 
@@ -86,16 +165,3 @@ def session(tmp_path: Path) -> SweepSession:
     session = SweepSession(tmp_path / "session")
     session.begin()
     return session
-
-
-@pytest.fixture
-def hand_over_of(compose: Callable[..., Conf], store: Store) -> Callable[..., HandOver]:
-    """(**changes of the config) -> what a plan hands over for a cell with them."""
-    given = ("scene=motorcycle", "splat.backend=torch", f"store={store.path}", "threads=1")
-    conf = compose(*given)
-
-    def made(**changes: object) -> HandOver:
-        changed = replace(conf, **changes)  # type: ignore[arg-type]  # names of fields, as given
-        return HandOver("motorcycle / a", asdict(changed), cell_identity(changed, VARIANT))
-
-    return made

@@ -1,73 +1,70 @@
-"""Tests of what is removed from a store, what is left, and that locks are respected."""
+"""Tests of what is removed from a store, what is left, and that leases are respected."""
 
 from __future__ import annotations
 
 import os
 import time
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 from xrgs.errors import XrgsError
-from xrgs.experiment import identity
-from xrgs.experiment.attempts import begin_attempt, remove_cell
+from xrgs.experiment.attempts import remove_cell
 from xrgs.experiment.cell_folder import CellFolder
 from xrgs.experiment.store import Store
-from xrgs.sweep import locks
+from xrgs.runtime import lease
 from xrgs.sweep.cleaning import GARBAGE, Plan, carry_out, plan_gc, plan_removal, plan_trim
-from xrgs.sweep.inventory import summaries
-
-
-def add(store: Store, name: str, state: str, variant: str = "aa-used", **changes: str) -> None:
-    folder = store.cell(name)
-    code = dict(identity.training_code("torch")) | changes
-    what = {"splat": {"backend": "torch"}, "code": code, "seed": 0, "variant": variant}
-    begin_attempt(folder, {}, what)
-    if state == "failed":
-        folder.fail("out of luck")
-    if state == "done":
-        (folder.path / "renders").mkdir()
-        (folder.path / "renders" / "a.png").write_bytes(bytes(1000))
-        (folder.path / "splats.ply").write_bytes(bytes(2000))
-        (folder.path / "scores.csv").write_text("view,psnr\na,20\n")
-        folder.finish(["a"], 1)
 
 
 def add_variant(store: Store, name: str, age_s: float = 86400) -> None:
     images = store.variants / name / "images"
-    images.make_folder()
-    (images.path / "a.png").write_bytes(bytes(5000))
-    os.utime((store.variants / name).path, (0, time.time() - age_s))
+    images.mkdir(parents=True)
+    (images / "a.png").write_bytes(bytes(5000))
+    os.utime(store.variants / name, (0, time.time() - age_s))
+
+
+def add_done(cells: Any, name: str, **identity: Any) -> None:
+    cell = cells.begin(name, identity)
+    (cell.path / "renders").mkdir()
+    (cell.path / "renders" / "a.png").write_bytes(bytes(1000))
+    (cell.path / "splats.ply").write_bytes(bytes(2000))
+    cells.finish(cell)
 
 
 @pytest.fixture
 def store(tmp_path: Path) -> Store:
-    """A store with something of each kind."""
+    """An empty store."""
     store = Store(tmp_path / "s")
     store.prepare()
-    add(store, "done1", "done")
-    add(store, "half1", "unfinished")
-    add(store, "fail1", "failed")
-    add(store, "fail1", "failed")  # which sets the first try aside
-    add(store, "old1", "done", "aa-old", **{"splat/densify.py": "0"})
-    for name in ("aa-used", "aa-old", "trimmed-aa-orphan", "failed-aa"):
-        add_variant(store, name)
-    add_variant(store, "aa-new", age_s=60)
-    (store.variants / ".aa-used.aside-1").make_folder()
-    (store.cells_folder / "done1.rerun-1").make_folder()
-    (store.cells_folder / ".done1.old-0a").make_folder()
-    store.write_sweep([], [{"cell_id": name, "scene": "s", "label": "l"} for name in ("old1",)])
     return store
 
 
+@pytest.fixture(autouse=True)
+def _filled(store: Store, cells: Any) -> None:
+    """Something of each kind in the store."""
+    add_done(cells, "done1", variant="aa-used")
+    cells.begin("half1", {"variant": "aa-used"})
+    for _ in range(2):  # the second one sets the first try aside
+        cells.begin("fail1", {"variant": "aa-used"}).fail("out of luck")
+    add_done(cells, "old1", variant="aa-old", code={"core": "0"})
+    for name in ("aa-used", "aa-old", "trimmed-aa-orphan", "failed-aa"):
+        add_variant(store, name)
+    add_variant(store, "aa-new", age_s=60)
+    (store.variants / ".aa-used.aside-1").mkdir()
+    (store.cells_folder / "done1.rerun-1").mkdir()
+    (store.cells_folder / ".done1.old-0a").mkdir()
+    cells.record(("old1", "s", "l"))
+
+
 def names(store: Store) -> set[str]:
-    return {f"c/{n}" for n in store.cells_folder.names()} | {
-        f"v/{n}" for n in store.variants.names()
+    return {f"c/{path.name}" for path in store.cells_folder.iterdir()} | {
+        f"v/{path.name}" for path in store.variants.iterdir()
     }
 
 
 def gc(store: Store, *of: str) -> Plan:
-    return plan_gc(store, summaries(store), of or GARBAGE)
+    return plan_gc(store, store.cell_rows(), of or GARBAGE)
 
 
 def test_gc_says_what_it_removes_and_removes_that_alone(store: Store) -> None:
@@ -86,7 +83,7 @@ def test_gc_says_what_it_removes_and_removes_that_alone(store: Store) -> None:
         *("v/aa-old", "v/trimmed-aa-orphan", "v/failed-aa", "v/.aa-used.aside-1"),
     }
     assert names(store) < before
-    assert store.locks.names() == []
+    assert not list(store.leases.iterdir())
     assert gc(store).items == ()
 
 
@@ -111,10 +108,10 @@ def test_an_unknown_kind_is_refused(store: Store) -> None:
 
 
 def test_no_variant_is_removed_or_trimmed_while_a_cell_is_trained(store: Store) -> None:
-    assert locks.acquire(store.locks, "half1") is not None
+    assert lease.acquire(store.leases, "half1") is not None
     notes = ("variants are left alone: a sweep is running, and may need any of them",)
     assert gc(store, "variants") == Plan("remove", (), notes)
-    cells = summaries(store)
+    cells = store.cell_rows()
     assert plan_trim(store, cells, cells[:1], variants=True).notes[-1:] == notes
 
 
@@ -124,22 +121,22 @@ def test_no_variant_is_removed_where_an_identity_cannot_be_read(store: Store) ->
 
 
 def test_a_cell_that_is_trained_is_never_touched(store: Store) -> None:
-    chosen = summaries(store)
+    chosen = store.cell_rows()
     plan = plan_removal(store, chosen)
     assert len(plan.items) == 4
-    held = locks.acquire(store.locks, "half1")  # begun by another sweep after the plan
+    held = lease.acquire(store.leases, "half1")  # begun by another sweep after the plan
     assert held is not None
     _, left = carry_out(store, plan)
-    assert left == ["half1  ? / ?, unfinished: it is left: a sweep is training it"]
+    assert left == ["half1  motorcycle / ?, unfinished: it is left: a sweep is training it"]
     assert store.cell("half1").state().name == "unfinished"
     assert not store.cell("done1").path.exists()
-    plan = plan_removal(store, summaries(store))
+    plan = plan_removal(store, store.cell_rows())
     assert plan == Plan("remove", (), ("left alone, being trained: 1 cell",))
 
 
-def test_a_cell_that_has_changed_since_the_plan_is_left(store: Store) -> None:
-    plan = plan_removal(store, [cell for cell in summaries(store) if cell.id == "fail1"])
-    add(store, "fail1", "done")
+def test_a_cell_that_has_changed_since_the_plan_is_left(store: Store, cells: Any) -> None:
+    plan = plan_removal(store, [cell for cell in store.cell_rows() if cell.id == "fail1"])
+    cells.done("fail1")
     assert "it was failed, and is done now" in carry_out(store, plan)[1][0]
     assert store.cell("fail1").state().name == "done"
 
@@ -157,11 +154,11 @@ def test_what_cannot_be_removed_hides_no_other(
     assert len(left) == 1
     assert "Permission denied" in left[0]
     assert not store.cell("fail1").path.exists()
-    assert store.locks.names() == []
+    assert not list(store.leases.iterdir())
 
 
 def test_trimmed_cells_stay_done_and_variants_in_use_are_left(store: Store) -> None:
-    cells = summaries(store)
+    cells = store.cell_rows()
     plan = plan_trim(store, cells, cells, variants=True)
     assert plan.total == "cells (2), variants (1): 11 kB"
     assert "left alone, not done: 2 cells" in str(plan)
@@ -171,5 +168,5 @@ def test_trimmed_cells_stay_done_and_variants_in_use_are_left(store: Store) -> N
     assert not (store.cell("done1").path / "renders").exists()
     assert (store.variants / "trimmed-aa-old").is_dir()
     assert (store.variants / "aa-used/images/a.png").exists()
-    cells = summaries(store)
+    cells = store.cell_rows()
     assert plan_trim(store, cells, cells, variants=True).items == ()

@@ -4,53 +4,35 @@ from __future__ import annotations
 
 import os
 import time
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 from xrgs.errors import XrgsError
-from xrgs.experiment import identity
-from xrgs.experiment.attempts import begin_attempt
+from xrgs.experiment.listing import Selection
 from xrgs.experiment.store import Store
-from xrgs.sweep import locks
-from xrgs.sweep.inventory import Selection, list_cells, list_sweeps, summaries
-
-
-def add(store: Store, name: str, *, done: bool = True, code: dict[str, str] | None = None) -> None:
-    """Add a cell of the torch backend, of the installed code or of another one."""
-    folder = store.cell(name)
-    what = {"splat": {"backend": "torch"}, "arithmetic": "torch", "seed": 0, "variant": "v-w"}
-    begin_attempt(folder, {"scene": {"name": "statue"}}, what | {"code": code or installed()})
-    if done:
-        (folder.path / "splats.ply").write_bytes(bytes(3_000_000 if name == "abc1" else 10))
-        (folder.path / "scores.csv").write_text("view,psnr\na,20\n")
-        folder.finish(["a"], 1)
-
-
-def installed() -> dict[str, str]:
-    return dict(identity.training_code("torch"))
-
-
-def row(cell_id: str | None, scene: str, label: str, **more: object) -> dict[str, object]:
-    return {"cell_id": cell_id, "scene": scene, "label": label, "condition": ""} | more
+from xrgs.runtime import lease
+from xrgs.sweep.inventory import list_cells, list_sweeps, show
 
 
 @pytest.fixture
-def store(tmp_path: Path) -> Store:
+def store(tmp_path: Path, cells: Any) -> Store:
     """Three cells of a sweep, of which one is not begun, and a cell of no sweep, of old code."""
-    store = Store(tmp_path / "s")
-    store.prepare()
-    add(store, "abc1")
-    add(store, "abd2", done=False)
-    add(store, "old3", code=installed() | {"splat/densify.py": "0", "plugins/x/a.py": "1"})
-    os.utime(store.cell("old3").path / "status.json", (0, time.time() - 3 * 86400))
-    rows = [row("abc1", "fern", "baseline"), row("abd2", "fern", "mip"), row("gone", "room", "mip")]
-    store.write_sweep(["+ablation=mip"], rows)
+    store: Store = cells.store
+    large = cells.begin("abc1")
+    (large.path / "splats.ply").write_bytes(bytes(3_000_000))
+    cells.finish(large)
+    cells.begin("abd2")
+    old = cells.done("old3", {"code": {"core": "0"}})
+    os.utime(old.status_file, (0, time.time() - 3 * 86400))
+    cells.record(("abc1", "fern", "baseline"), ("abd2", "fern", "mip"), ("gone", "room", "mip"))
     return store
 
 
 def chosen(store: Store, **of: object) -> list[str]:
-    return [cell.id for cell in Selection(**of).of(summaries(store))]  # type: ignore[arg-type]
+    return [cell.id for cell in Selection(**of).of(store.cell_rows())]  # type: ignore[arg-type]
 
 
 def test_cells_are_chosen_by_name_state_age_and_size(store: Store) -> None:
@@ -70,7 +52,7 @@ def test_cells_are_chosen_by_name_state_age_and_size(store: Store) -> None:
     [
         ({"ids": ("ab",)}, "ab: several cells have such an id: abc1, abd2"),
         ({"ids": ("x",)}, "x: no cells have such an id"),
-        ({"scenes": ("frn",)}, "scenes=frn: no cell has that; choose from: fern, statue"),
+        ({"scenes": ("frn",)}, "scenes=frn: no cell has that; choose from: fern, motorcycle"),
         ({"states": ("dun",)}, "states=dun: .*choose from: done, running"),
         ({"sweeps": ("0",)}, "sweep=0: no cell has that; choose from: [0-9a-f]{16}$"),
     ],
@@ -83,36 +65,51 @@ def test_a_name_of_nothing_is_refused(
 
 
 def test_the_list_tells_states_and_old_code_and_sorts(store: Store) -> None:
-    text = list_cells(summaries(store), "size")
+    text = list_cells(store.cell_rows(), "size")
     lines = [line.split() for line in text.splitlines()]
     assert text.splitlines()[0].startswith("3 cells, 3 MB")
     assert lines[-1][:5] == ["abc1", "fern", "baseline", "0", "done"]
     assert lines[-1][-2:] == ["3", "MB"]
     (old,) = [line for line in lines if line[:1] == ["old3"]]
-    assert old[1:9] == ["statue", "?", "0", "done", "(old", "code)", "3", "d"]
-    assert list_cells(summaries(store), "age").splitlines()[-1].startswith("old3")
+    assert old[1:9] == ["motorcycle", "?", "0", "done", "(old", "code)", "3", "d"]
+    assert list_cells(store.cell_rows(), "age").splitlines()[-1].startswith("old3")
     with pytest.raises(XrgsError, match="sort=colour"):
-        list_cells(summaries(store), "colour")
+        list_cells(store.cell_rows(), "colour")
 
 
-def test_code_of_a_plugin_alone_is_no_old_code(store: Store) -> None:
-    add(store, "plugin", code=installed() | {"plugins/x/a.py": "1"})
-    found = {cell.id: cell for cell in summaries(store)}
-    assert found["plugin"].old_code == ()
-    assert found["plugin"].stale == ("plugins/x/a.py",)
-    assert found["old3"].old_code == ("splat/densify.py",)
-
-
-def test_sweeps_are_listed_with_what_is_done(store: Store) -> None:
+def test_sweeps_are_listed_with_what_is_done(store: Store, cells: Any) -> None:
     first = store.sweep_ids()[0]
-    lock = locks.acquire(store.locks, "abd2")
-    assert lock is not None
-    second = store.write_sweep([], [row("abc1", "a\nb", "x", error="no points")])
+    held = lease.acquire(store.leases, "abd2")
+    assert held is not None
+    second = cells.record(("abc1", "a\nb", "x"), error="no points")
     os.utime(store.path / "sweeps" / f"{second}.json", (0, 5e9))
-    lines = list_sweeps(store.path).splitlines()
+    lines = list_sweeps(store.sweep_rows()).splitlines()
     assert lines[0] == "2 sweeps"
     assert lines[-2].startswith(first)
     assert lines[-2].endswith("fern, room  baseline, mip  1 of 3 done, 1 running, 1 pending")
     assert lines[-1].endswith("a b         x              0 of 1 done, 1 failed")
-    lock.release()
-    assert "1 of 3 done, 2 pending" in list_sweeps(store.path)
+    held.release()
+    assert "1 of 3 done, 2 pending" in list_sweeps(store.sweep_rows())
+
+
+def test_a_cell_is_shown_with_what_differs_from_its_baseline(store: Store, cells: Any) -> None:
+    steps = replace(cells.conf.train, steps=7)
+    cell = cells.done(train=steps)
+    cells.record((cell.id, "fern", "fewer"), baseline_id="abc1")
+    (row,) = Selection(ids=(cell.id,)).of(store.cell_rows())
+    lines = show(store, row).splitlines()
+    assert lines[0] == f"cell {cell.id}  fern / fewer / seed 0"
+    at = lines.index("differs from its baseline abc1 in:")
+    assert lines[at + 1] == f"  train.steps: {cells.conf.train.steps} -> 7"
+    assert "  psnr: 20 dB" in lines
+    assert "  scores.csv  15 B" in lines
+
+
+def test_the_table_of_a_store_agrees_with_its_views(store: Store) -> None:
+    table = store.cells().set_index("cell_id")
+    rows = {row.id: row for row in store.cell_rows()}
+    assert set(table.index) == set(rows)
+    for name, row in rows.items():
+        assert table.loc[name, "state"] == row.state.name
+        assert table.loc[name, "seed"] == row.seed
+    assert table.loc["abc1", "scene"] == rows["abc1"].scene == "fern"

@@ -17,15 +17,14 @@ from hydra.core.utils import JobReturn, JobStatus
 from hydra.types import HydraContext
 from omegaconf import DictConfig, OmegaConf
 
-from xrgs import composing, config
+from xrgs import config
 from xrgs.cli.hydra_words import with_quotes
 from xrgs.errors import XrgsError
 from xrgs.experiment.attempts import begin_attempt
-from xrgs.experiment.identity import cell_identity
+from xrgs.experiment.identity import cell_id, cell_identity
 from xrgs.experiment.store import Store
-from xrgs.safeio.atomic import write_json
-from xrgs.safeio.hashing import digest
-from xrgs.sweep import launch, locks
+from xrgs.runtime import lease
+from xrgs.sweep import launch
 from xrgs.sweep.axes import CellSpec
 from xrgs.sweep.jobs.job import INTERRUPTED, UNKNOWN
 from xrgs.sweep.launch import LOST, Launches, capacity
@@ -121,9 +120,8 @@ class FakeLauncher:
 
     def launch(self, jobs: Sequence[Sequence[str]], first: int) -> list[JobReturn]:
         assert first == len(self.given)
-        session = SweepSession(Path(self.config.hydra.sweep.dir))
         ids = [job[0].removeprefix("cell=") for job in jobs]
-        names = [session.read(cell_id).name.split(" / ")[1] for cell_id in ids]
+        names = [job[2].removeprefix("name=").split(" / ")[1] for job in jobs]
         self.ids |= dict(zip(names, ids, strict=True))
         self.launches.append(names)
         self.given += jobs
@@ -132,7 +130,7 @@ class FakeLauncher:
             if "nothing" in self.fatal:
                 raise RuntimeError("no such cluster\nand more")
             for name in pair:
-                begin_attempt(self.store.cell(self.ids[name]), {}, {})
+                begin_attempt(self.store.cell(self.ids[name]))
             if self.fatal & set(pair):
                 raise RuntimeError("a worker was killed")
             for name in pair:
@@ -154,14 +152,13 @@ class FakeLauncher:
 def planned(conf: config.Conf, label: str) -> PlannedCell:
     """Return a cell whose variant is `v`."""
     identity = cell_identity(conf, "v")
-    return PlannedCell(CellSpec(label, "", (), ()), conf, "v", identity, digest(identity))
+    return PlannedCell(CellSpec(label, "", (), ()), conf, "v", identity, cell_id(identity))
 
 
-def finish(store: Store, cell_id: str) -> None:
-    cell = store.cell(cell_id)
+def finish(store: Store, name: str) -> None:
+    cell = store.cell(name)
     (cell.path / "scores.csv").write_text("view\na\n")
-    write_json(cell.path / "summary.json", {})
-    cell.finish(["a"], 1)
+    cell.finish(["a"], {})
 
 
 @pytest.fixture
@@ -240,8 +237,8 @@ def test_submitit_has_no_more_jobs_at_a_time_than_there_are_cores(
     local = ("hydra/launcher=submitit_local", "hydra.launcher.cpus_per_task=2")
     _, fake = launch_cells("abcde", set(), *local)
     assert fake.launches == [["a", "b"], ["c", "d"], ["e"]]
-    session = SweepSession(Path(fake.config.hydra.sweep.dir))
-    assert [session.read(cell_id).config["threads"] for cell_id in fake.ids.values()] == [2] * 5
+    threads = [fake.store.cell(name).config().threads for name in fake.ids.values()]
+    assert threads == [2] * 5
 
 
 @pytest.fixture
@@ -256,23 +253,28 @@ def test_a_job_finds_its_folders_wherever_it_runs(
     compose: Callable[..., config.Conf], odd: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     conf = compose("scene=folder", "scene.path=p", "store=s", "seed=1", "splat.backend=auto")
-    cell = planned(conf, "a")
+    cell, store = planned(conf, "a"), Store("s")
     monkeypatch.chdir(odd)
-    hand_over = launch._job_of(cell, threads=3)
+    store.prepare()
+    overrides = launch._hand_over(cell, 3, store)
     monkeypatch.chdir(odd.parent)
-    given = composing.from_dict(hand_over.config)
-    assert (given.store, given.scene.path) == (str(odd / "s"), str(odd / "p"))
-    assert (given.seed, given.threads) == (1, 3)
-    assert given.splat.backend in {"native", "torch"}
-    assert hand_over.cell_id == cell.cell_id == digest(cell_identity(given, "v"))
+    assert overrides == [f"cell={cell.cell_id}", f"store={odd / 's'}", f"name={cell.name}"]
+    given = Store(odd / "s").cell(str(cell.cell_id))
+    conf_given = given.config()
+    assert (conf_given.store, conf_given.scene.path) == (str(odd / "s"), str(odd / "p"))
+    assert (conf_given.seed, conf_given.threads) == (1, 3)
+    assert conf_given.splat.backend in {"native", "torch"}
+    assert cell_id(given.identity()) == cell.cell_id == cell_id(cell_identity(conf_given, "v"))
+    assert given.state().name == "planned"
     assert conf.store == "s"  # the plan's own config is not changed
 
 
 def test_a_number_of_threads_that_the_user_set_is_kept(
-    compose: Callable[..., config.Conf],
+    compose: Callable[..., config.Conf], store: Store
 ) -> None:
-    hand_over = launch._job_of(planned(compose("threads=5"), "a"), threads=3)
-    assert hand_over.config["threads"] == 5
+    cell = planned(compose("threads=5"), "a")
+    launch._hand_over(cell, 3, store)
+    assert store.cell(str(cell.cell_id)).config().threads == 5
 
 
 def test_two_calls_never_share_a_folder(
@@ -287,23 +289,16 @@ def test_two_calls_never_share_a_folder(
         assert (odd / name / "sweep").is_file()
 
 
-def test_a_job_is_told_which_locks_the_plan_has_watched(
-    composed: Callable[..., DictConfig],
-    compose: Callable[..., config.Conf],
-    store: Store,
-    monkeypatch: pytest.MonkeyPatch,
+def test_a_lease_that_the_plan_has_watched_long_enough_is_free_for_the_job(
+    compose: Callable[..., config.Conf], store: Store, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A job in a process of its own has watched nothing."""
-    cells = [planned(compose(f"seed={seed}"), "a") for seed in (0, 1)]
-    fake = FakeLauncher(store, set())
-    monkeypatch.setattr(Plugins, "instantiate_launcher", fake.configured)
-    dead = {str(cells[1].cell_id): ("x.0 stamp",)}
-    monkeypatch.setattr(locks, "confirmed", lambda _: dead)
-    context = HydraContext(None, None)  # type: ignore[arg-type]  # launches load no config
-    Launches(context, len, composed()).launch(cells, store)
-    session = SweepSession(Path(fake.config.hydra.sweep.dir))
-    told = [session.read(str(cell.cell_id)).dead_locks for cell in cells]
-    assert told == [(), ("x.0 stamp",)]
+    cell = planned(compose(), "a")
+    held = lease.acquire(store.leases, str(cell.cell_id))
+    assert held is not None
+    monkeypatch.setattr(lease.Owner, "lives", False)
+    launch._hand_over(cell, 1, store)
+    assert not lease.names(store.leases)
 
 
 def test_an_answer_that_is_lost_of_a_cell_that_can_not_be_read_blames_no_cell(
@@ -320,27 +315,16 @@ def test_an_answer_that_is_lost_of_a_cell_that_can_not_be_read_blames_no_cell(
     assert outcomes == {"a": UNKNOWN}
 
 
-def test_a_folder_of_a_sweep_in_a_store_leads_nowhere_else(
-    launch_cells: Callable[..., tuple[dict[str, str], FakeLauncher]], tmp_path: Path
-) -> None:
-    (tmp_path / "s").mkdir()
-    (tmp_path / "elsewhere").mkdir()
-    (tmp_path / "s" / "hydra").symlink_to(tmp_path / "elsewhere")
-    with pytest.raises(XrgsError, match=r"hydra\.sweep\.dir=.*s/hydra"):
-        launch_cells("a", set())
-    assert not list((tmp_path / "elsewhere").iterdir())
-
-
 def test_a_launcher_composes_nothing_for_a_job(
     launch_cells: Callable[..., tuple[dict[str, str], FakeLauncher]], tmp_path: Path
 ) -> None:
     """A launcher asks for a job's config where the job runs, to which the loader is pickled."""
     setting = "+hydra.job.env_set.NAME=value"
     _, fake = launch_cells("ab", set(), f"hydra.sweep.dir={tmp_path / 'out'}", setting)
-    assert fake.given == [[f"cell={cell_id}"] for cell_id in fake.ids.values()]
+    assert [job[0] for job in fake.given] == [f"cell={name}" for name in fake.ids.values()]
     loader = pickle.loads(pickle.dumps(fake.context.config_loader))  # noqa: S301
     job = loader.load_sweep_config(fake.config, list(fake.given[0]))
-    assert job.keys() == {"hydra", "cell"}
+    assert job.keys() == {"hydra", "cell", "store", "name"}
     assert job.cell == fake.ids["a"]
     assert job.hydra.sweep.dir == str(tmp_path / "out")
     assert job.hydra.job.env_set == {"NAME": "value"}
@@ -351,13 +335,13 @@ def test_a_launcher_composes_nothing_for_a_job(
     assert fake.config.hydra.job.get("num") != 7
 
 
-@pytest.mark.parametrize("cell_id", ["0123456789012345", "12e4567890123456", "1234567890abcdef"])
+@pytest.mark.parametrize("name", ["0123456789012345", "12e4567890123456", "1234567890abcdef"])
 def test_an_id_that_looks_like_a_number_stays_text(
-    composed: Callable[..., DictConfig], session: SweepSession, cell_id: str
+    composed: Callable[..., DictConfig], session: SweepSession, name: str
 ) -> None:
     given = composed(*with_quotes([f"hydra.sweep.dir={session.folder}"]))
-    job = launch._JobConfigLoader().load_sweep_config(given, [f"cell={cell_id}"])
-    assert job.cell == cell_id
+    job = launch._JobConfigLoader().load_sweep_config(given, [f"cell={name}"])
+    assert job.cell == name
 
 
 def test_a_job_of_a_sweep_whose_folder_is_gone_does_not_begin(
@@ -365,6 +349,6 @@ def test_a_job_of_a_sweep_whose_folder_is_gone_does_not_begin(
 ) -> None:
     """Hydra would make the folder again, and the store with it."""
     given = composed(*with_quotes([f"hydra.sweep.dir={session.folder}"]))
-    session.folder.path.rename(session.folder.path.with_name("elsewhere"))
+    session.folder.rename(session.folder.with_name("elsewhere"))
     with pytest.raises(XrgsError, match="is no longer there"):
         launch._JobConfigLoader().load_sweep_config(given, ["cell=a"])

@@ -5,19 +5,17 @@ from __future__ import annotations
 import importlib.util
 from collections.abc import Callable
 from dataclasses import replace
-from pathlib import Path
+from typing import Any
 
 import pytest
 
 from xrgs.config import Conf
-from xrgs.experiment.attempts import begin_attempt
 from xrgs.experiment.cell_folder import CellState
-from xrgs.experiment.store import BASELINE, Store
-from xrgs.runtime.progress import format_duration
-from xrgs.safeio.atomic import write_json
+from xrgs.experiment.store import BASELINE
+from xrgs.runtime.text import format_duration
 from xrgs.splat import backend
 from xrgs.sweep.axes import CellSpec
-from xrgs.sweep.estimate import TORCH_SLOWDOWN, CostEstimator
+from xrgs.sweep.estimate import TORCH_SLOWDOWN, Cost
 from xrgs.sweep.plan import (
     PlannedCell,
     describe,
@@ -41,9 +39,8 @@ def cell(compose: Callable[..., Conf]) -> Callable[..., PlannedCell]:
     ) -> PlannedCell:
         conf = compose(f"train.steps={steps}")
         spec = CellSpec(cell_id, "", (), ())
-        return PlannedCell(
-            spec, conf, "v", {"id": cell_id}, cell_id, CellState(state), seconds=seconds
-        )
+        cost = None if seconds is None else Cost(seconds, 0.0, 1e9, 1e6)
+        return PlannedCell(spec, conf, "v", None, cell_id, CellState(state), cost=cost)
 
     return planned
 
@@ -121,7 +118,9 @@ def test_the_plan_says_how_long_the_remaining_training_takes(
 def test_without_kernels_the_plan_says_how_long_torch_takes(
     cell: Callable[..., PlannedCell], no_kernels: None
 ) -> None:
-    unbuilt = replace(cell("a"), variant_id=None, cell_id=None, identity=None, seconds=4000.0)
+    unbuilt = replace(
+        cell("a"), variant_id=None, cell_id=None, identity=None, cost=Cost(4000.0, 0.0, 0.0, 0.0)
+    )
     plan = [
         unbuilt,
         cell("b", seconds=8000.0),
@@ -146,32 +145,30 @@ def test_with_kernels_the_plan_says_nothing_of_torch(
     assert without_kernels([cell("a", seconds=1e9)]) == ""
 
 
-def test_cells_that_are_not_done_are_estimated(
-    cell: Callable[..., PlannedCell], tmp_path: Path
-) -> None:
-    plan = [replace(cell("a"), variant_id=None, identity=None), cell("c", "done")]
-    first, done = estimated(plan, CostEstimator(Store(tmp_path)), threads=1)
-    assert first.seconds is not None
-    assert first.memory_bytes is not None
-    assert done.seconds is None
-    (faster,) = estimated(plan[:1], CostEstimator(Store(tmp_path)), threads=4)
-    assert faster.seconds is not None
-    assert faster.seconds < first.seconds
+def test_cells_that_are_not_done_are_estimated(cell: Callable[..., PlannedCell]) -> None:
+    class Past:
+        def cost(self, conf: Conf, _: str, threads: int) -> Cost:
+            return Cost(conf.train.steps / threads, 0.0, 1e9, 1e6)
+
+    plan = [cell("a"), cell("b", "done"), configured(cell("c"), "torch")]
+    plan[2] = replace(plan[2], conf=replace(plan[2].conf, threads=5))
+    made = estimated(plan, Past(), threads=2)  # type: ignore[arg-type]
+    assert [each.seconds for each in made] == [5, None, 2]
 
 
 def test_the_use_of_memory_and_disk_is_that_of_the_cells_that_are_left(
     cell: Callable[..., PlannedCell],
 ) -> None:
     plan = [
-        replace(cell("a"), memory_bytes=1.2e9, disk_bytes=30e6),
-        replace(cell("b"), memory_bytes=8e8, disk_bytes=40e6),
-        replace(cell("c", "done"), memory_bytes=9e9, disk_bytes=9e9),
+        replace(cell("a"), cost=Cost(1.0, 0.0, 1.2e9, 30e6)),
+        replace(cell("b"), cost=Cost(1.0, 0.0, 8e8, 40e6)),
+        replace(cell("c", "done"), cost=Cost(1.0, 0.0, 9e9, 9e9)),
     ]
-    line = expected_use(plan, 63)
-    assert "learned from 63 finished cells" in line
-    assert "up to ~1.2 GB of memory, all of them ~70 MB of disk" in line
-    assert "within a factor of 3" in expected_use(plan, 0)
-    assert expected_use(plan[2:], 63) == ""
+    assert expected_use(plan, 63) == (
+        "estimates from 63 finished cells of this store: a cell takes up to ~1.2 GB of memory, all"
+        " of them ~70 MB of disk"
+    )
+    assert expected_use(plan[2:], 63) == expected_use([cell("d")], 0) == ""
 
 
 def test_a_reason_that_cells_share_is_said_once(cell: Callable[..., PlannedCell]) -> None:
@@ -219,15 +216,12 @@ def test_a_dry_run_knows_whether_the_run_would_fail(
     assert will_fail([replace(plan[0], error="no photographs")])
 
 
-def test_a_cell_whose_lock_is_held_is_running_unless_it_is_done(
-    cell: Callable[..., PlannedCell], tmp_path: Path
+def test_a_cell_whose_lease_is_held_is_running_unless_it_is_done(
+    cell: Callable[..., PlannedCell], cells: Any
 ) -> None:
-    store = Store(tmp_path)
-    begin_attempt(store.cell("a"), {}, {})
-    assert identified(cell("a"), store, {"a": "process 1"}).state.name == "running"
-    assert identified(cell("a"), store, {}).state.name == "unfinished"
-    folder = store.cell("a")
-    (folder.path / "scores.csv").write_text("view\na\n")
-    write_json(folder.path / "summary.json", {})
-    folder.finish(["a"], 1)
-    assert identified(cell("a"), store, {"a": "process 1"}).state.name == "done"
+    own = cells.begin("a")
+    one = replace(cell("a"), identity=own.identity())
+    assert identified(one, cells.store, {"a": "process 1"}).state.name == "running"
+    assert identified(one, cells.store, {}).state.name == "unfinished"
+    cells.finish(own)
+    assert identified(one, cells.store, {"a": "process 1"}).state.name == "done"

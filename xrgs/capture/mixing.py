@@ -10,18 +10,20 @@ import logging
 import time
 from collections import Counter
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from xrgs.capture import degrade, images, poses, registration, tagging
+from xrgs.capture import images, poses, registration, sampling
 from xrgs.capture.alignment import pose_error
+from xrgs.capture.degradations import resolve_degradation
 from xrgs.capture.lens import undistort
 from xrgs.capture.photographs import PhotoCollection, prepare_hr_views, write_degraded
 from xrgs.capture.registration import Registration
 from xrgs.capture.split import Split, check_variant_conf, split_views
+from xrgs.capture.tags import POLICIES
 from xrgs.capture.views import SceneFailed, Variant, View
 from xrgs.runtime.progress import progress
 from xrgs.safeio.atomic import write_text
@@ -50,7 +52,7 @@ class _Inputs:
     @property
     def degraded(self) -> tuple[int, ...]:
         """Indices of the training views that the variant degrades."""
-        return () if degrade.resolve_degradation(self.conf) == "none" else self.split.lr
+        return () if resolve_degradation(self.conf) == "none" else self.split.lr
 
 
 def mix_resolutions(scene: Scene, conf: VariantConf, work: Path, out: Path) -> Variant:
@@ -81,9 +83,9 @@ def mix_resolutions(scene: Scene, conf: VariantConf, work: Path, out: Path) -> V
     if registered.refused:
         raise SceneFailed(f"scene {scene.name} failed: {registered.refused}", report)
     report |= _pose_report(inputs, model, work)
-    depths = tagging.median_depths(model)
-    if conf.tags in tagging.DEPTH_POLICIES:
-        inputs = replace(inputs, split=_split_by_depth(inputs, model, depths))
+    depths = sampling.median_depths(model)
+    if conf.tags in POLICIES and POLICIES[conf.tags].needs_depth:
+        inputs = replace(inputs, split=_split_by_score(photos, conf, model, depths))
         write_degraded(photos, inputs.degraded, conf)
     views = _write_undistorted(inputs, model, depths, out)
     report |= _tags_report(inputs, views)
@@ -109,18 +111,32 @@ def _register(inputs: _Inputs, work: Path) -> Registration:
 
 def _split_before_sfm(photos: PhotoCollection, conf: VariantConf) -> Split:
     """Split the views; where the tags depend on depth, all training views are HR for now."""
-    if conf.tags == "megapixels":
-        scores = tagging.megapixel_scores([photo.size for photo in photos.all])
-        return split_views(photos.names, conf, scores)
-    if conf.tags in tagging.DEPTH_POLICIES:
+    if conf.tags not in POLICIES:
+        return split_views(photos.names, conf)
+    if POLICIES[conf.tags].needs_depth:
         return split_views(photos.names, replace(conf, hr_fraction=1.0))
-    return split_views(photos.names, conf)
+    return _split_by_score(photos, conf)
 
 
-def _split_by_depth(inputs: _Inputs, model: Reconstruction, depths: Mapping[int, float]) -> Split:
-    lenses = {i: lens.undistorted() for i, lens in model.lenses.items()}
-    conf, names = inputs.conf, inputs.photos.names
-    return split_views(names, conf, tagging.depth_scores(conf.tags, len(names), lenses, depths))
+def _split_by_score(
+    photos: PhotoCollection,
+    conf: VariantConf,
+    model: Reconstruction | None = None,
+    depths: Mapping[int, float] | None = None,
+) -> Split:
+    """Split the views by the scores of `variant.tags`, as far as they are registered."""
+    unknown, lenses = np.full((3, 3), np.nan), model.lenses if model else {}
+    scores = [
+        POLICIES[conf.tags].score(
+            sampling.Measures(
+                photo.size,
+                lenses[i].undistorted().K if i in lenses else unknown,
+                depths[i] if depths and i in depths else float("nan"),
+            )
+        )
+        for i, photo in enumerate(photos.all)
+    ]
+    return split_views(photos.names, conf, sampling.relative_to_largest(scores))
 
 
 def _refusal(inputs: _Inputs, model: Reconstruction) -> str:
@@ -163,7 +179,7 @@ def _sfm_report(inputs: _Inputs, model: Reconstruction) -> dict[str, Any]:
         "cameras": len({photo.camera for photo in photos.all}),
         "unreadable": list(photos.unreadable),
         "not_registered": [n for i, n in enumerate(photos.names) if i not in model.viewmats],
-        "lenses": sorted({repr(lens) for lens in model.lenses.values()}),
+        "lenses": [asdict(lens) for lens in sorted(set(model.lenses.values()), key=repr)],
     }
 
 
@@ -199,7 +215,7 @@ def _tags_report(inputs: _Inputs, views: tuple[View, ...]) -> dict[str, Any]:
     return {
         "notes": _split_notes(inputs, rates),
         "tags": inputs.conf.tags,
-        "degradation": degrade.resolve_degradation(inputs.conf),
+        "degradation": resolve_degradation(inputs.conf),
         "tests": len(split.test),
         "hr": [names[i] for i in split.hr],
         "lr": [names[i] for i in split.lr],
@@ -245,7 +261,7 @@ def _write_undistorted(
         images.save(file, undistort(image, lens), durable=False)  # `freeze` syncs all
         K, name = lens.undistorted().K, photos.names[i]
         views.append(View(name, file, part, tag, width, height, K, model.viewmats[i], 1.0))
-        rates.append(tagging.sampling_rate(K, depths[i]))
-    rhos = tagging.relative_to_largest(rates)
+        rates.append(sampling.sampling_rate(K, depths[i]))
+    rhos = sampling.relative_to_largest(rates)
     views = [replace(view, rho=rho) for view, rho in zip(views, rhos, strict=True)]
     return tuple(sorted(views, key=lambda view: (view.split, view.name)))

@@ -11,7 +11,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from xrgs.capture import degrade, images
+from xrgs.capture import images
+from xrgs.capture.degradations import DEGRADATIONS, resolve_degradation
 from xrgs.capture.lens import Lens
 from xrgs.capture.split import HrGeometry, hr_geometry, shrink_factor
 from xrgs.errors import XrgsError
@@ -257,13 +258,10 @@ def assign_cameras(
 
 
 def write_degraded(photos: PhotoCollection, which: Sequence[int], conf: VariantConf) -> None:
-    """Degrade some HR views and write them as `lr` copies.
-
-    Args:
-        photos: The photographs, with their `hr` copies.
-        which: Indices of the views to degrade.
-        conf: The variant's config.
-    """
+    """Degrade the HR views of these indices, and write them as `lr` copies."""
+    if not which:
+        return
+    degrade = DEGRADATIONS[resolve_degradation(conf)]
     for i in progress(which, "LR views", "view"):
-        low = degrade.degrade(photos.read("hr", i), conf)
+        low = degrade(photos.read("hr", i), conf)
         images.save(photos.folder / photos.file("lr", i), low, durable=False)

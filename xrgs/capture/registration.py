@@ -4,15 +4,8 @@ With `sfm.lr_images: upsampled`, downsampled views are resized back to HR size f
 one camera serves both sizes, which makes the poses of the small images several times more accurate.
 With `native`, SfM gets the files as they are, and a camera of their own for the small ones.
 
-The attempts, in order; the first whose reconstruction is accepted is used. All but the first need
-`sfm.fallbacks`:
-
-1. `configured`: `variant.sfm` as it is.
-2. `finer`: twice the features, detected at twice the resolution.
-3. `relaxed`: the features of 2, a quarter of the triangulation angle for the first pair
-   (`init_min_tri_angle`), and half of the inliers per view (`abs_pose_min_num_inliers`).
-4. `native` (or `upsampled`, where native was configured): as 3, with the LR images given the other
-   way.
+The first attempt, `configured`, has the settings of `variant.sfm`. With `sfm.fallbacks`, those of
+`FALLBACKS` follow in their order until a reconstruction is accepted.
 """
 
 from __future__ import annotations
@@ -54,9 +47,30 @@ class Attempt:
     """One way to run SfM."""
 
     name: str
-    folder: str
-    """The name of its work folder; attempts with one folder share features and matches."""
     conf: SfmConf
+
+
+def finer(conf: SfmConf, images: int, *, any_smaller: bool) -> Attempt:  # noqa: ARG001
+    """Detect twice the features, at twice the resolution."""
+    features = 2 * sfm.features_per_image(images, conf.max_num_features)
+    return Attempt("finer", replace(conf, max_num_features=features, first_octave=-1))
+
+
+def relaxed(conf: SfmConf, images: int, *, any_smaller: bool) -> Attempt:  # noqa: ARG001
+    """Accept a quarter of the first pair's angle, and half of the inliers per view."""
+    angle, inliers = conf.init_min_tri_angle / 4, max(_MIN_INLIERS, conf.min_inliers // 2)
+    return Attempt("relaxed", replace(conf, init_min_tri_angle=angle, min_inliers=inliers))
+
+
+def other_size(conf: SfmConf, images: int, *, any_smaller: bool) -> Attempt | None:  # noqa: ARG001
+    """Give the LR images the other way: `native` instead of `upsampled`, or the reverse."""
+    other = "native" if conf.lr_images == "upsampled" else "upsampled"
+    return Attempt(other, replace(conf, lr_images=other)) if any_smaller else None
+
+
+#: The attempts after the first, in order. Each changes the settings of the attempt before it, and
+#: gets the number of images and whether any of them is smaller than its HR view; None skips it.
+FALLBACKS = (finer, relaxed, other_size)
 
 
 @dataclass(frozen=True)
@@ -94,9 +108,11 @@ def register(
     best: tuple[sfm.Reconstruction, str] | None = None
     reports: list[dict[str, Any]] = []
     any_smaller = any(_is_smaller(photos, i) for i in degraded)
+    folders: dict[tuple[object, ...], Path] = {}
     for attempt in sfm_attempts(conf, len(photos), any_smaller=any_smaller):
         start = time.perf_counter()
-        folder = work / attempt.folder
+        # Attempts with the same features and matches share a folder, where COLMAP finds them.
+        folder = folders.setdefault(_features_of(attempt.conf), work / f"sfm-{attempt.name}")
         folder.mkdir(exist_ok=True)
         model = sfm.reconstruct(
             sfm_images(photos, degraded, attempt.conf), photos.folder, folder, attempt.conf
@@ -127,21 +143,18 @@ def sfm_attempts(conf: SfmConf, images: int, *, any_smaller: bool) -> Iterator[A
     Yields:
         The attempts, see the module.
     """
-    yield Attempt("configured", "sfm", conf)
-    if not conf.fallbacks:
-        return
-    features = 2 * sfm.features_per_image(images, conf.max_num_features)
-    finer = replace(conf, max_num_features=features, first_octave=-1)
-    yield Attempt("finer", "sfm-finer", finer)
-    relaxed = replace(
-        finer,
-        init_min_tri_angle=conf.init_min_tri_angle / 4,
-        min_inliers=max(_MIN_INLIERS, conf.min_inliers // 2),
-    )
-    yield Attempt("relaxed", "sfm-finer", relaxed)
-    if any_smaller:
-        other = "native" if conf.lr_images == "upsampled" else "upsampled"
-        yield Attempt(other, f"sfm-{other}", replace(relaxed, lr_images=other))
+    attempt = Attempt("configured", conf)
+    yield attempt
+    for fallback in FALLBACKS if conf.fallbacks else ():
+        following = fallback(attempt.conf, images, any_smaller=any_smaller)
+        if following is not None:
+            attempt = following
+            yield attempt
+
+
+def _features_of(conf: SfmConf) -> tuple[object, ...]:
+    """Return the settings that decide features and matches."""
+    return conf.lr_images, conf.max_num_features, conf.first_octave
 
 
 def sfm_images(

@@ -9,6 +9,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from xrgs.capture.degradations import DEGRADATIONS
+from xrgs.capture.tags import POLICIES
 from xrgs.errors import XrgsError
 
 if TYPE_CHECKING:
@@ -63,11 +65,9 @@ def check_variant_conf(conf: VariantConf) -> None:
             "0 (none held out), or 2 or more",
         ),
         "selection": _one_of(conf.selection, "random", "uniform"),
-        "tags": _one_of(conf.tags, "flag", "megapixels", "distance", "sampling_rate"),
+        "tags": _one_of(conf.tags, "flag", *POLICIES),
         "hr_above": (0 <= conf.hr_above <= 1, "0 (use variant.hr_fraction) to 1"),
-        "degradation": _one_of(
-            conf.degradation, "auto", "none", "downsample", "digital_zoom", "jpeg"
-        ),
+        "degradation": _one_of(conf.degradation, "auto", "none", *DEGRADATIONS),
         "jpeg_quality": (1 <= conf.jpeg_quality <= 95, "1 to 95"),
         "sfm.lr_images": _one_of(conf.sfm.lr_images, "upsampled", "native"),
         "sfm.min_registered": (0 <= conf.sfm.min_registered <= 1, "0 to 1"),

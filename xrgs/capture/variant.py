@@ -11,8 +11,10 @@ from contextlib import suppress
 from typing import TYPE_CHECKING
 
 from xrgs.capture import poses, scenes, sealed, split
+from xrgs.capture.degradations import DEGRADATIONS, resolve_degradation
 from xrgs.capture.failures import FAILED_PREFIX, read_failure
 from xrgs.capture.frozen import CorruptVariant, freeze, load, verify
+from xrgs.capture.tags import POLICIES
 from xrgs.capture.views import SceneFailed, Variant
 from xrgs.config import identity_values
 from xrgs.errors import StoreError, UnreadableError
@@ -31,25 +33,24 @@ __all__ = ["CorruptVariant", "build", "failure", "find", "key", "load", "verify"
 
 _log = logging.getLogger(__name__)
 
-#: The source files that decide what a variant is: a change in one of them changes every key.
-_SOURCES = (
+#: The source files that decide what every variant is: a change in one of them changes every key.
+CORE = (
     "capture/alignment.py",
-    "capture/colmap.py",
-    "capture/degrade.py",
     "capture/frozen.py",
     "capture/images.py",
     "capture/lens.py",
     "capture/mixing.py",
     "capture/photographs.py",
-    "capture/poses.py",
     "capture/registration.py",
+    "capture/sampling.py",
     "capture/sealed.py",
     "capture/sfm.py",
     "capture/split.py",
-    "capture/tagging.py",
     "capture/variant.py",
     "capture/views.py",
 )
+#: The source files that read given poses.
+POSES = ("capture/colmap.py", "capture/poses.py")
 
 
 def key(scene: SceneConf, conf: VariantConf) -> str:
@@ -68,11 +69,27 @@ def key(scene: SceneConf, conf: VariantConf) -> str:
     """
     split.check_variant_conf(conf)
     split.check_test_names(scenes.names(scene, conf.long_side) if conf.test else (), conf)
-    settings = identity_values(conf)
+    settings = identity_values(conf) | {"degradation": resolve_degradation(conf)}
     if conf.poses is not None:
         settings["poses"] = poses.fingerprint(conf.poses)
-    fingerprint = scenes.fingerprint(scene, conf.long_side)
-    return digest([fingerprint, settings, code_digest(*_SOURCES)])
+    code = {part: code_digest(*files) for part, files in sources(conf).items()}
+    return digest([scenes.fingerprint(scene, conf.long_side), settings, code])
+
+
+def sources(conf: VariantConf) -> dict[str, tuple[str, ...]]:
+    """Return the source files that decide what a variant of this config is, by part of the code.
+
+    The code that reads given poses, degrades and tags views counts where the config uses it. A
+    scene has a fingerprint of its own.
+    """
+    files: dict[str, tuple[str, ...]] = {"core": CORE}
+    if conf.poses is not None:
+        files["poses"] = POSES
+    if (name := resolve_degradation(conf)) in DEGRADATIONS:
+        files["degradation"] = (f"capture/degradations/{name}.py",)
+    if conf.tags in POLICIES:
+        files["tags"] = (f"capture/tags/{conf.tags}.py",)
+    return files
 
 
 def find(variants: Path, wanted_key: str) -> Variant | None:

@@ -85,8 +85,8 @@ def inspect(
         out: The file of the sheet; by default it is named after the variant.
     """
     from xrgs import composing
+    from xrgs.capture.description import describe
     from xrgs.cli.hydra_words import explained, with_quotes
-    from xrgs.report.variant import describe
     from xrgs.sweep import variants
 
     if not variant:

@@ -13,7 +13,7 @@ from omegaconf import DictConfig
 from omegaconf.errors import ConfigAttributeError, ConfigKeyError, OmegaConfBaseException
 
 from xrgs import composing, config
-from xrgs.capture.scenes.folder import ALL_BELOW
+from xrgs.capture.scenes.scene import ALL_BELOW
 from xrgs.composing import escape_interpolations
 from xrgs.errors import XrgsError, did_you_mean
 from xrgs.safeio.paths import user_path

@@ -9,7 +9,7 @@ from tyro.conf import arg
 
 from xrgs.cli import options
 from xrgs.cli.options import STORE, Folder, Names, OptionalFolder, shown_as
-from xrgs.experiment.store import BASELINE
+from xrgs.experiment.store import BASELINE, Store
 from xrgs.runtime.streams import say
 
 _DESCRIPTION = """\
@@ -63,7 +63,7 @@ def list_sweeps(store: Folder = STORE) -> None:
     """
     from xrgs.sweep import inventory
 
-    say(inventory.list_sweeps(store))
+    say(inventory.list_sweeps(Store(store).sweep_rows()))
 
 
 def main() -> None:

@@ -1,4 +1,4 @@
-"""`xrgs-store`: lists, shows, removes, trims, packs, imports and verifies what a store keeps."""
+"""`xrgs-store`: lists, removes, packs, imports, scores anew and verifies what a store keeps."""
 
 from __future__ import annotations
 
@@ -13,6 +13,7 @@ from xrgs.cli import options
 from xrgs.cli.options import STORE, Cells, Flag, Folder, Names, shown_as
 from xrgs.errors import XrgsError
 from xrgs.experiment.store import Store
+from xrgs.runtime.machine import set_passive_openmp_wait
 from xrgs.runtime.signals import exit_on_signal
 from xrgs.runtime.streams import say
 from xrgs.safeio.sanitize import counted
@@ -20,8 +21,8 @@ from xrgs.safeio.sanitize import counted
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
+    from xrgs.experiment.listing import CellRow, Selection
     from xrgs.sweep.cleaning import Plan
-    from xrgs.sweep.inventory import CellSummary, Selection
 
 
 @dataclass(frozen=True)
@@ -47,16 +48,14 @@ class Filter:
 
     def selection(self) -> Selection:
         """Return the options as the functions of the store take them."""
-        from xrgs.sweep.inventory import Selection
+        from xrgs.experiment.listing import Selection
 
         names = self.ids, self.scenes, self.ablations, self.states, self.sweep
         return Selection(*names, self.older_days, self.larger_mb)
 
-    def chosen(self) -> tuple[list[CellSummary], list[CellSummary]]:
+    def chosen(self) -> tuple[list[CellRow], list[CellRow]]:
         """Return all cells of the store, and the cells that are meant."""
-        from xrgs.sweep.inventory import summaries
-
-        cells = summaries(Store(self.store))
+        cells = Store(self.store).cell_rows()
         return cells, self.selection().of(cells)
 
 
@@ -76,8 +75,8 @@ class Removal:
             XrgsError: It is not confirmed.
             SystemExit: With code 1, where something was left.
         """
+        from xrgs.runtime.text import format_size
         from xrgs.sweep.cleaning import carry_out
-        from xrgs.sweep.inventory import size_text
 
         say(str(plan))
         if self.dry_run or not plan.items:
@@ -85,7 +84,7 @@ class Removal:
         if not (self.yes or _confirmed(f"{plan.verb} {plan.total}?")):
             raise XrgsError("nothing was done; --yes does it without asking")
         freed, left = carry_out(store, plan)
-        say(f"freed {size_text(freed)}")
+        say(f"freed {format_size(freed)}")
         _say_left(left)
 
 
@@ -108,10 +107,11 @@ def show(cell: Positional[Annotated[str, arg(metavar="CELL")]], store: Folder = 
         cell: The cell's id, or the beginning of it.
         store: The store.
     """
-    from xrgs.sweep.inventory import one_cell, summaries
-    from xrgs.sweep.show import show as described
+    from xrgs.experiment.listing import Selection
+    from xrgs.sweep.inventory import show as described
 
-    say(described(Store(store), one_cell(cell, summaries(Store(store)))))
+    (chosen,) = Selection(ids=(cell,)).of(Store(store).cell_rows())
+    say(described(Store(store), chosen))
 
 
 def rm(cells: Filter, removal: Removal) -> None:
@@ -158,14 +158,14 @@ def pack(cells: Filter, out: Annotated[Path, arg(metavar="FILE.tar.xz")]) -> Non
         out: The archive to write.
     """
     from xrgs.experiment import archive
-    from xrgs.sweep.inventory import size_text
+    from xrgs.runtime.text import format_size
 
     if not out.name.endswith(".tar.xz"):
         raise XrgsError(f"--out {out}: name the archive to write, FILE.tar.xz")
     _, chosen = cells.chosen()
     done = [cell.folder for cell in chosen if cell.state.name == "done"]
     packed = archive.pack(Store(cells.store), done, out, Path.cwd(), cells.sweep)
-    say(f"{out}: {packed}; {size_text(packed.bytes)}")
+    say(f"{out}: {packed}; {format_size(packed.bytes)}")
     if len(done) < len(chosen):
         say(f"left out, not done: {counted(len(chosen) - len(done), 'cell')}")
     _say_left(packed.left_out)
@@ -205,9 +205,45 @@ def gc(
         store: The store.
     """
     from xrgs.sweep.cleaning import plan_gc
-    from xrgs.sweep.inventory import summaries
 
-    removal.carry_out(Store(store), plan_gc(Store(store), summaries(Store(store)), of))
+    removal.carry_out(Store(store), plan_gc(Store(store), Store(store).cell_rows(), of))
+
+
+def rescore(cells: Filter) -> None:
+    """Score done cells anew where a metric was added or changed; nothing is trained.
+
+    The cells' Gaussians are rendered and scored by the installed metrics. Cells whose scores are of
+    the installed code already are left as they are.
+
+    Args:
+        cells: The cells that pass all of these options.
+    """
+    from xrgs.experiment import rescoring
+
+    set_passive_openmp_wait()
+    _, chosen = cells.chosen()
+    done = [cell.folder for cell in chosen if cell.folder.status_file.exists()]
+    scored = rescoring.rescore(Store(cells.store), done)
+    say(str(scored))
+    if scored.left:
+        sys.exit(1)
+
+
+def prove(cells: Filter, sample: Annotated[int, shown_as("N")] = 2) -> None:
+    """Prove that a refactoring changes no number, so that finished cells keep their ids.
+
+    Some done cells, which the code before the refactoring has trained, are trained again with the
+    installed code. If all bits are equal, the new code is declared equal to the old one, in
+    xrgs/experiment/refactorings.json of the installed package.
+
+    Args:
+        cells: The cells that pass all of these options.
+        sample: Number of cells that are trained again for each part of the code that has changed.
+    """
+    from xrgs.sweep.refactoring import prove as proven
+
+    _, chosen = cells.chosen()
+    say(str(proven(Store(cells.store), [cell.folder for cell in chosen], sample)))
 
 
 def check(store: Folder = STORE) -> None:
@@ -249,7 +285,7 @@ def _confirmed(question: str) -> bool:
 def main() -> None:
     """Run `xrgs-store`."""
     description = (
-        "List, show, remove, trim, pack, import and verify what a store keeps. Cells that are being"
+        "List, remove, pack, import, score anew and verify what a store keeps. Cells that are being"
         " trained, here or on another machine, are never touched."
     )
     functions: dict[str, Callable[..., None]] = {
@@ -260,6 +296,8 @@ def main() -> None:
         "pack": pack,
         "import": import_,
         "gc": gc,
+        "rescore": rescore,
+        "prove": prove,
         "check": check,
     }
     with exit_on_signal("What was not removed yet is unchanged."):

@@ -170,21 +170,27 @@ def refactorings() -> dict[str, dict[str, str]]:
     return declared
 
 
-def changed_code(identity: Identity) -> list[str]:
+def changed_code(identity: Identity, *, cached: bool = False) -> list[str]:
     """Return the parts of the installed code that differ from those of an identity, sorted.
+
+    Args:
+        identity: The identity of a cell.
+        cached: Take the digests that this process has computed before. Otherwise every file is read
+            as it is now: it may have been edited while a sweep runs.
 
     Raises:
         XrgsError: A plugin is not installed.
     """
-    now = current_code(identity)
+    now = current_code(identity, cached=cached)
     parts = identity.code.keys() | now.keys()
     return sorted(part for part in parts if identity.code.get(part) != now.get(part))
 
 
-def current_code(identity: Identity) -> dict[str, str]:
+def current_code(identity: Identity, *, cached: bool = False) -> dict[str, str]:
     """Return the digests that the parts of an identity's code have in the installed package."""
     names = tuple(sorted(identity.components.get("plugins", {})))
-    return code_now(str(identity.splat["backend"]), tuple(identity.components), names)
+    code = training_code if cached else code_now
+    return code(str(identity.splat["backend"]), tuple(identity.components), names)
 
 
 def exact_code(identity: Identity) -> dict[str, str]:

@@ -7,6 +7,7 @@ described in `xrgs.experiment.cell_folder`.
 
 from __future__ import annotations
 
+import stat
 import tempfile
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,20 +17,23 @@ import msgspec
 
 from xrgs.capture.failures import FAILED_PREFIX
 from xrgs.errors import StoreError, UnreadableError
+from xrgs.experiment import listing
 from xrgs.experiment.cell_folder import CellFolder, CellState
 from xrgs.experiment.schema import SweepRecord
+from xrgs.runtime import lease
 from xrgs.runtime.progress import log_line
 from xrgs.safeio.atomic import write_json
-from xrgs.safeio.files import is_name, sync_name
+from xrgs.safeio.files import is_name, is_transient, sync_name
 from xrgs.safeio.hashing import digest
 from xrgs.safeio.records import list_folder, read_struct
 from xrgs.safeio.sanitize import for_line
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Mapping, Sequence
 
     import pandas as pd
 
+    from xrgs.experiment.listing import CellRow, SweepRow
     from xrgs.experiment.schema import RecordedCell
 
 
@@ -40,8 +44,10 @@ BASELINE = "baseline"
 MAX_RECORD_BYTES = 1 << 25
 #: Bytes that must be writable before a sweep starts; any cell needs more than that.
 _MIN_FREE_BYTES = 1 << 15
-#: The most ids of cells that a message lists.
-_MAX_LISTED = 6
+
+
+class StoreGoneError(StoreError):
+    """The store was moved, deleted or unmounted while a sweep used it."""
 
 
 @dataclass(frozen=True)
@@ -92,9 +98,43 @@ class Store:
             StoreError: It can't be told now; the message names the folder.
         """
         try:
-            return self.cells_folder.is_dir()
+            return stat.S_ISDIR(self.cells_folder.stat().st_mode)
         except OSError as error:
-            raise UnreadableError(f"store={self.path}: {error.strerror}; try again") from error
+            if is_transient(error):
+                raise UnreadableError(f"store={self.path}: {error.strerror}; try again") from error
+            return False
+
+    def check_exists(self) -> None:
+        """Refuse a folder that is not a store.
+
+        Raises:
+            StoreError: It is none, or it can't be told now.
+        """
+        if not self.exists:
+            raise StoreError(f"store={self.path} is not a store; xrgs-sweep makes one")
+
+    @property
+    def is_gone(self) -> bool:
+        """Whether a store that was prepared is no longer there; False where it can't be told now.
+
+        An empty folder in its place, as an unmounted disk leaves it, is no store.
+        """
+        try:
+            return not self.exists
+        except StoreError:
+            return False
+
+    def check_not_gone(self) -> None:
+        """Refuse to go on with a store that is gone: nothing may be created in its place.
+
+        Raises:
+            StoreGoneError: The message says what has become of the cells.
+        """
+        if self.is_gone:
+            raise StoreGoneError(
+                f"store={self.path}: it is no longer there (moved or deleted?); finished cells are"
+                " where the store went: run the same command again with store= naming that folder"
+            )
 
     def prepare(self) -> None:
         """Create the folder and its subfolders, and check that the disk has room.
@@ -193,19 +233,63 @@ class Store:
         """
         from xrgs.experiment.results import cell_columns, cell_metrics, cells_table
 
-        if not self.exists:
-            raise StoreError(f"{self.path}: no store; xrgs-sweep makes one with store={self.path}")
-        names, rows = self.cell_names(), []
-        for cell in self.cell_folders():
-            state, metrics = cell.state(verify=verify), {}
+        self.check_exists()
+        table = []
+        for row in self.cell_rows(verify=verify):
+            state, metrics = row.state, {}
             if state.name == "done":
                 try:
-                    metrics = cell_metrics(cell.summary(), cell.scores())
+                    metrics = cell_metrics(row.folder.summary(), row.folder.scores())
                 except (StoreError, OSError) as error:
                     state = CellState.of_error(error)
-            row: dict[str, Any] = cell_columns(cell, names.get(cell.id))
-            rows.append(row | metrics | {"state": state.name, "reason": for_line(state.reason)})
-        return cells_table(rows)
+            columns: dict[str, Any] = cell_columns(row.folder, row.recorded)
+            outcome = {"state": state.name, "reason": for_line(state.reason)}
+            table.append(columns | metrics | outcome)
+        return cells_table(table)
+
+    def cell_rows(
+        self, records: Mapping[str, SweepRecord] | None = None, *, verify: bool = False
+    ) -> list[CellRow]:
+        """List the cells: id, names, state, age and size, see `xrgs.experiment.listing`.
+
+        Args:
+            records: The records of sweeps, as `records` returns them; None to read them, where one
+                that can't be read is named on stderr.
+            verify: As for `cells`.
+
+        Raises:
+            StoreError: There is no store, or its cells can't be listed.
+        """
+        self.check_exists()
+        records = self._records_or_warnings() if records is None else records
+        holders = lease.holders(self.leases)
+        return listing.cell_rows(self.cell_folders(), records, holders, verify=verify)
+
+    def sweep_rows(self) -> list[SweepRow]:
+        """List the recorded sweeps, the latest last.
+
+        A record that can't be read is named on stderr, and left out.
+
+        Raises:
+            StoreError: There is no store, or it can't be listed.
+        """
+        records = self._records_or_warnings()
+        cells = {row.id: row for row in self.cell_rows(records)}
+        files = {sweep_id: self.sweeps / f"{sweep_id}.json" for sweep_id in records}
+        return listing.sweep_rows(files, records, cells)
+
+    def cell_names(self) -> dict[str, RecordedCell]:
+        """Return the row of the latest sweep that has each recorded cell, by the cell's id."""
+        return listing.latest_records(self._records_or_warnings())
+
+    def _records_or_warnings(self) -> dict[str, SweepRecord]:
+        try:
+            records, damaged = self.records()
+        except StoreError as error:
+            records, damaged = {}, (str(error),)
+        for message in damaged:
+            log_line(f"{message}; its names of cells are left out")
+        return records
 
     def find_cell(self, beginning: str) -> CellFolder:
         """Return the cell whose id begins with a text.
@@ -216,9 +300,8 @@ class Store:
         Raises:
             StoreError: There is no store, no id begins with it, or several do.
         """
-        if not self.exists:
-            raise StoreError(f"store={self.path} is not a store; xrgs-sweep makes one")
-        return self.cell(full_id(beginning, [cell.id for cell in self.cell_folders()]))
+        self.check_exists()
+        return self.cell(listing.full_id(beginning, [cell.id for cell in self.cell_folders()]))
 
     def find_folder(self, beginning: str) -> Path:
         """Return the folder of the cell or the variant whose id begins with a text.
@@ -229,8 +312,7 @@ class Store:
         Raises:
             StoreError: There is no store, no id begins with it, or several do.
         """
-        if not self.exists:
-            raise StoreError(f"store={self.path} is not a store; xrgs-sweep makes one")
+        self.check_exists()
         variants = [
             self.variant(name)
             for name in list_folder(self.variants)
@@ -238,7 +320,7 @@ class Store:
         ]
         folders = {folder.name: folder for folder in variants}
         folders |= {cell.id: cell.path for cell in self.cell_folders()}
-        return folders[full_id(beginning, list(folders), "cells or variants")]
+        return folders[listing.full_id(beginning, list(folders), "cells or variants")]
 
     def cell_folders(self) -> list[CellFolder]:
         """Return the cells, sorted by id; folders of earlier attempts, whose names have a dot, not.
@@ -250,20 +332,6 @@ class Store:
         """
         names = list_folder(self.cells_folder)
         return [self.cell(name) for name in names if "." not in name and is_name(name)]
-
-    def cell_names(self) -> dict[str, RecordedCell]:
-        """Return the row of the latest sweep that has each recorded cell, by the cell's id.
-
-        A sweep's record that can't be read is named on stderr, and left out.
-        """
-        try:
-            records, damaged = self.records()
-        except StoreError as error:
-            records, damaged = {}, (str(error),)
-        for message in damaged:
-            log_line(f"{message}; its names of cells are left out")
-        rows = (row for record in records.values() for row in record.cells)
-        return {row.cell_id: row for row in rows if row.cell_id is not None}
 
     def sweep_ids(self) -> list[str]:
         """Return the ids of the recorded sweeps, oldest first.
@@ -323,8 +391,7 @@ class Store:
         Raises:
             StoreError: There is no store, or it has no record of a sweep, or none that can be read.
         """
-        if not self.exists:
-            raise StoreError(f"store={self.path} is not a store; xrgs-sweep makes one")
+        self.check_exists()
         sweep_ids = self.sweep_ids()
         if not sweep_ids:
             raise StoreError(f"store={self.path} holds no sweep: run xrgs-sweep first")
@@ -375,22 +442,3 @@ def _modified_ns(file: Path) -> int:
         return file.stat().st_mtime_ns
     except OSError:
         return 0
-
-
-def full_id(beginning: str, ids: Sequence[str], kinds: str = "cells") -> str:
-    """Return the id that begins with a text.
-
-    Args:
-        beginning: The id, or so much of it that it is the only one.
-        ids: The ids of all that may be meant.
-        kinds: What these are, for messages.
-
-    Raises:
-        StoreError: No id begins with it, or several do.
-    """
-    found = [cell_id for cell_id in ids if cell_id.startswith(beginning)]
-    if beginning not in found and len(found) != 1:
-        some = ", ".join([*found[:_MAX_LISTED], *["..."] * (len(found) > _MAX_LISTED)])
-        why = f"several {kinds} have such an id: {some}" if found else f"no {kinds} have such an id"
-        raise StoreError(f"{beginning}: {why}; xrgs-store list shows them")
-    return beginning if beginning in found else found[0]

@@ -13,6 +13,7 @@ from xrgs.capture.failures import FAILED_PREFIX
 from xrgs.errors import StoreError
 from xrgs.experiment import trimming
 from xrgs.runtime.progress import ProgressBar
+from xrgs.runtime.text import format_size
 from xrgs.safeio.files import walk_files
 from xrgs.safeio.records import list_folder
 from xrgs.safeio.sanitize import for_line
@@ -82,7 +83,7 @@ def describe(verification: Verification) -> str:
     """
     damage = verification.damage
     lines = ["damaged, or can't be read now:", *(f"  {line}" for line in damage)] if damage else []
-    extent = f"{verification.files:,} files, {verification.bytes / 1e6:,.1f} MB"
+    extent = f"{verification.files:,} files, {format_size(verification.bytes)}"
     found = f"{len(damage)} damaged" if damage else "all of them as they were written"
     lines.append(f"hashed: {extent}, in {verification.seconds:.1f} s; {found}")
     return "\n".join(map(for_line, lines))

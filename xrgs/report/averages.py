@@ -1,7 +1,7 @@
 """Averages pairs over the replicates of each scene, then over scenes, with intervals and tests.
 
-The effect of a pair is the number that is averaged: log(value / base) for amounts, a percentage for
-all else. `xrgs.report.compare` says what the averages mean.
+Averages are taken of the effect of a pair: log(value / base) for amounts, a percentage for all
+else. `xrgs.report.compare` says what the averages mean.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ _EFFECTS = ["change", "low", "high", "scatter_replicates", "scatter_scenes"]
 
 
 def averaged(pairs: pd.DataFrame, ratios: Collection[str]) -> tuple[pd.DataFrame, pd.DataFrame]:
-    """Return the means of pairs over the replicates of each scene, and the means of those.
+    """Return means of pairs over the replicates of each scene, and means over scenes.
 
     Args:
         pairs: One row for each metric of each pair: `label`, `condition`, `scene`, `metric`,

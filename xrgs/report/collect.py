@@ -1,11 +1,13 @@
-"""Reads the cells of a sweep from the store into tables; nothing is computed again or trained.
+"""Reads the cells of a sweep from the store into tables. Nothing is trained or scored.
 
-Cells that are not done become rows with their state and reason, so that a report shows them.
+A cell that is not done becomes a row with its state and the reason, so that a report shows it.
 """
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field
+from statistics import fmean
 from typing import TYPE_CHECKING, Any, Protocol
 
 import msgspec
@@ -13,25 +15,24 @@ import numpy as np
 import pandas as pd
 
 from xrgs.errors import StoreError, XrgsError
-from xrgs.evaluation.scoring import PROTOCOL
+from xrgs.evaluation.metrics import METRICS, VIEW_METRICS
+from xrgs.evaluation.scoring import PROTOCOL, stale_scores
 from xrgs.experiment.cell_folder import CellState
 from xrgs.experiment.provenance import machine
-from xrgs.report.curves import cell_curve
-from xrgs.report.skipped import cell_work
-from xrgs.report.training import cell_totals
 from xrgs.runtime.progress import progress
+from xrgs.safeio.records import as_number, read_table
 from xrgs.safeio.sanitize import for_line
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
+    from collections.abc import Iterable, Mapping, Sequence
     from pathlib import Path
 
-    from xrgs.evaluation.metrics import Metric
+    from xrgs.config import Conf
     from xrgs.experiment.cell_folder import CellFolder
-    from xrgs.experiment.schema import Provenance
+    from xrgs.experiment.schema import Identity, Provenance, RecordedCell, Status, Summary
 
-#: Keys of each row of a sweep's record.
-RECORD_KEYS = (
+#: What a sweep's record says of each cell.
+RECORD_KEYS = [
     "scene",
     "condition",
     "label",
@@ -41,23 +42,46 @@ RECORD_KEYS = (
     "variant_id",
     "baseline_id",
     "error",
-)
-
+]
+#: The columns that name a cell in the tables of what cells did.
+CELL_KEYS = ["cell_id", "scene", "label", "condition", "variant_seed", "seed"]
+#: Columns of `quality.csv`: steps done, time and alpha evaluations so far, Gaussians, mean scores.
+CURVE_COLUMNS = ["step", "seconds", "evaluations", "gaussians", *VIEW_METRICS]
+#: Columns of a history that describe the logged step alone, not the training up to it.
+_SINGLE_STEP_COLUMNS = frozenset({"step", "loss", "gaussians"})
 
 #: Reasons of cells that are not done and did not fail, by the state of their folder. They do not
-#: say how far a cell is, which would be another text a second later.
+#: say how far a cell is: the report would be another one a second later.
 _PENDING = {
     "absent": "not trained yet",
     "planned": "not trained yet",
     "unfinished": "begun and not done yet: it is being trained, or was stopped",
 }
 _MAX_MACHINE = 120
-#: Values of keys that earlier records lack. Those had a swept `variant.seed` in the condition.
-_DEFAULTS = {"variant_seed": 0}
+_UNKNOWN_VARIANT = "a file could not be read when the sweep was planned: run the same sweep again"
 
 
 class ReportError(XrgsError):
     """A sweep can't be reported; the message names the cells or the file."""
+
+
+@dataclass(frozen=True)
+class DoneCell:
+    """What the files of a cell that is done say."""
+
+    status: Status
+    identity: Identity
+    summary: Summary
+    provenance: Provenance
+    config: Conf | None
+    """None where another version of xrgs has written it."""
+    scores: list[tuple[str, dict[str, float]]]
+    """The name and the scores of each view."""
+    totals: dict[str, float]
+    """The counts of its history over the whole training, and means of what components logged."""
+    curve: list[dict[str, float]]
+    """A row of `CURVE_COLUMNS` for each evaluation during training, and a last one of the trained
+    cell, which is the only row where the cell was not evaluated during training."""
 
 
 @dataclass(frozen=True)
@@ -67,19 +91,15 @@ class Sweep:
     commands: Mapping[str, tuple[str, ...]]
     """The arguments of `xrgs-sweep` by the sweep's id; several where sweeps are joined."""
     cells: pd.DataFrame
-    """One row for each entry of the record: its keys, `state`, `reason`, `protocol`, `validation`
-    (`train.validation`: 0 where scores are of test views), `machine` (what times depend on beside
-    the program, as a text; empty where it is not known), metrics."""
+    """One row for each entry of the record: `RECORD_KEYS`, `state`, `reason`; `protocol` and, for
+    each score, `<score>_code` (the digests of what computed it); `stale` (names of the scores that
+    the installed code would compute otherwise, or that are missing); `validation`
+    (`train.validation`: 0 where scores are of test views); `steps`, `long_side` and `factor` of the
+    config; `machine` (what times depend on beside the program; empty where unknown); metrics."""
     views: pd.DataFrame
     """One row for each cell and scored view: `cell_id`, `view` and the scores."""
-    training: dict[str, dict[str, float]]
-    """What training did in each done cell, by its id: `xrgs.report.training.cell_totals`."""
-    curves: dict[str, list[dict[str, float]]]
-    """Quality during training of each done cell, by its id: `xrgs.report.curves.cell_curve`."""
-    work: dict[str, dict[str, float]]
-    """What each done cell did in all, by its id: `xrgs.report.skipped.cell_work`."""
-    provenance: dict[str, list[str]]
-    """Provenance of the done cells: the distinct values of each entry, sorted."""
+    done: dict[str, DoneCell]
+    """The files of the cells that are done, by the cell's id."""
     renders: dict[str, Path] = field(default_factory=dict)
     """Folders of renders that another program made, by the ids of their rows, which are no cells
     of the store (`xrgs.report.external`)."""
@@ -89,23 +109,25 @@ class Sweep:
         """The id of the sweep; of several that are joined, all ids with a plus between them."""
         return "+".join(self.commands)
 
+    @property
+    def provenance(self) -> dict[str, list[str]]:
+        """Provenance of the done cells: the distinct values of each entry, sorted."""
+        distinct: dict[str, set[str]] = {}
+        for cell in self.done.values():
+            for key, value in _provenance_entries(cell.provenance):
+                distinct.setdefault(key, set()).add(value)
+        return {key: sorted(values) for key, values in sorted(distinct.items())}
+
 
 class CellSource(Protocol):
     """Where the cells of a sweep are: a store, or several."""
 
     def cell(self, cell_id: str) -> CellFolder:
-        """Return the folder of a cell, which need not exist.
-
-        Args:
-            cell_id: The cell's id.
-        """
+        """Return the folder of a cell, which need not exist."""
 
 
 def read_cells(
-    store: CellSource,
-    commands: Mapping[str, tuple[str, ...]],
-    rows: Sequence[Mapping[str, Any]],
-    metrics: Sequence[Metric],
+    store: CellSource, commands: Mapping[str, tuple[str, ...]], rows: Sequence[RecordedCell]
 ) -> Sweep:
     """Read every cell that rows of records name.
 
@@ -113,117 +135,160 @@ def read_cells(
         store: Where the cells are.
         commands: The arguments of `xrgs-sweep` by the ids of the sweeps that the rows are from.
         rows: The rows.
-        metrics: The metrics to read from each cell's scores or its summary.
-
-    Returns:
-        The sweep's tables.
 
     Raises:
-        ReportError: A row lacks a key, or contradicts a cell's identity.
+        ReportError: A row contradicts its cell's identity.
     """
-    sweep_id = "+".join(commands)
-    entries = [_entry(sweep_id, row) for row in rows]
-    ids = sorted({row["cell_id"] for row in entries if row["cell_id"] is not None})
-    bar = progress(ids, "reading cells", "cell")
-    cells = {cell_id: _read_cell(store.cell(cell_id), metrics) for cell_id in bar}
-    done = [cell for cell in cells.values() if cell.columns["state"] == "done"]
-    views = _views([row for cell in done for row in cell.scores], metrics)
-    provenance: dict[str, set[str]] = {}
-    for cell in done:
-        _add_provenance(provenance, cell.provenance)
-    columns = {cell_id: cell.columns for cell_id, cell in cells.items()}
-    return Sweep(
-        commands=commands,
-        cells=_cells(sweep_id, entries, columns, cell_means(views), metrics),
-        views=views,
-        training={cell_id: cell.training for cell_id, cell in cells.items()},
-        work={cell_id: cell.work for cell_id, cell in cells.items()},
-        curves={cell_id: cell.curve for cell_id, cell in cells.items()},
-        provenance={key: sorted(values) for key, values in sorted(provenance.items())},
-    )
+    ids = sorted({row.cell_id for row in rows if row.cell_id is not None})
+    done: dict[str, DoneCell] = {}
+    columns: dict[str, dict[str, Any]] = {}
+    for cell_id in progress(ids, "reading cells", "cell"):
+        found = _read_cell(store.cell(cell_id))
+        if isinstance(found, DoneCell):
+            done[cell_id] = found
+            columns[cell_id] = _done_columns(cell_id, found)
+        else:
+            columns[cell_id] = {"state": found.name, "reason": found.reason}
+    _check_identity("+".join(commands), rows, done)
+    views = _views(done)
+    return Sweep(commands, _cells(rows, columns, cell_means(views)), views, done)
 
 
-def _entry(sweep_id: str, row: Mapping[str, Any]) -> dict[str, Any]:
-    row = _DEFAULTS | dict(row)
-    missing = [key for key in RECORD_KEYS if key not in row]
-    if missing:
-        raise ReportError(f"sweeps/{sweep_id}.json: a cell lacks {', '.join(missing)}")
-    return {key: row[key] for key in RECORD_KEYS}
-
-
-@dataclass(frozen=True)
-class _CellContent:
-    """What the files of one cell say; of a cell that is not done, its state alone."""
-
-    columns: dict[str, Any]
-    """Columns of `Sweep.cells`."""
-    scores: list[dict[str, Any]] = field(default_factory=list)
-    """Rows of `Sweep.views`."""
-    training: dict[str, float] = field(default_factory=dict)
-    curve: list[dict[str, float]] = field(default_factory=list)
-    work: dict[str, float] = field(default_factory=dict)
-    provenance: dict[str, Any] = field(default_factory=dict)
-
-
-def _read_cell(cell: CellFolder, metrics: Sequence[Metric]) -> _CellContent:
-    """Read a cell. One whose files can't be read, or are malformed, is not done."""
+def _read_cell(cell: CellFolder) -> DoneCell | CellState:
+    """Read a cell; return the state of one that is not done, or has files that can't be read."""
     state = cell.state()
     if state.name == "done":
         try:
-            training, provenance = cell_totals(cell), cell.provenance()
-            return _CellContent(
-                _done_columns(cell, metrics) | {"machine": _machine(cell, provenance)},
-                _scores(cell, metrics),
-                training,
-                cell_curve(cell),
-                cell_work(cell, training),
-                msgspec.structs.asdict(provenance),
-            )
+            return _read_done(cell)
         except (StoreError, OSError) as error:
             state = CellState.of_error(error)
     if state.name in _PENDING:
-        return _CellContent({"state": "pending", "reason": _PENDING[state.name]})
+        return CellState("pending", _PENDING[state.name])
     # Without the store's path: the report is the same wherever the store is.
     reason = state.reason.replace(f"{cell.path}/", "")
-    return _CellContent({"state": state.name, "reason": reason or state.name})
+    return CellState(state.name, reason or state.name)
 
 
-def _done_columns(cell: CellFolder, metrics: Sequence[Metric]) -> dict[str, Any]:
-    """Return columns of a finished cell's summary, identity and config."""
-    identity, figures = cell.identity(), msgspec.structs.asdict(cell.summary())
-    values = {m.name: figures[m.name] for m in metrics if m.name in figures}
-    return values | {
+def _read_done(cell: CellFolder) -> DoneCell:
+    summary, scores = cell.summary(), cell.view_scores()
+    try:
+        config = cell.config()
+    except XrgsError:
+        config = None
+    return DoneCell(
+        status=cell.status(),
+        identity=cell.identity(),
+        summary=summary,
+        provenance=cell.provenance(),
+        config=config,
+        scores=scores,
+        totals=_totals(number_columns(cell.path / "history.csv")),
+        curve=_curve(cell.path / "quality.csv", summary, scores),
+    )
+
+
+def number_columns(file: Path) -> dict[str, list[float]]:
+    """Return the columns of a table of numbers, without the column `view`, which is text.
+
+    Raises:
+        StoreError: The file is missing or damaged, or a value is not a number.
+    """
+    header, rows = read_table(file)
+    places = [(place, name) for place, name in enumerate(header) if name != "view"]
+    try:
+        return {name: [as_number(row[place]) for row in rows] for place, name in places}
+    except ValueError as error:
+        raise StoreError(f"damaged: {file}: {error}") from error
+
+
+def _totals(history: Mapping[str, list[float]]) -> dict[str, float]:
+    """Return what training did: the counts of a history, and means of what components logged."""
+    totals = {}
+    for name, column in history.items():
+        if not column or name in _SINGLE_STEP_COLUMNS:
+            continue
+        if is_component_log(name):
+            known = [value for value in column if not math.isnan(value)]
+            if known:
+                totals[name] = fmean(known)
+        else:
+            totals[name] = column[-1]  # counts start at the first step
+    return totals
+
+
+def is_component_log(column: str) -> bool:
+    """Return whether a component logged a column: its name is before a dot."""
+    return "." in column
+
+
+def _curve(
+    file: Path, summary: Summary, views: list[tuple[str, dict[str, float]]]
+) -> list[dict[str, float]]:
+    """Return the quality of a cell during training, and at its end; NaN where a score is missing.
+
+    Raises:
+        StoreError: The file is damaged, or lacks a column.
+    """
+    last: dict[str, float] = {
+        "step": summary.steps,
+        "seconds": summary.training_time_s,
+        "evaluations": summary.evaluations,
+        "gaussians": summary.gaussians,
+    }
+    for name in VIEW_METRICS:
+        values = [scores.get(name, math.nan) for _, scores in views]
+        last[name] = fmean(values) if values else math.nan
+    if not file.is_file():
+        return [last]
+    columns = number_columns(file)
+    if missing := [name for name in CURVE_COLUMNS[:4] if name not in columns]:
+        raise StoreError(f"damaged: {file}: there is no column {', '.join(missing)}")
+    count = len(columns["step"])
+    unknown = [math.nan] * count
+    return [
+        {name: columns.get(name, unknown)[at] for name in CURVE_COLUMNS} for at in range(count)
+    ] + [last]
+
+
+def _done_columns(cell_id: str, cell: DoneCell) -> dict[str, Any]:
+    """Return the columns of `Sweep.cells` for a cell that is done, but for its scores."""
+    figures = msgspec.structs.asdict(cell.summary)
+    train, scored_by = cell.identity.train, cell.status.scored_by
+    size = cell.config.variant if cell.config else None
+    return {
+        **{metric.name: figures[metric.name] for metric in METRICS if metric.name in figures},
+        **{f"{name}_code": scored_by.get(name, "") for name in VIEW_METRICS},
         "state": "done",
         "reason": "",
-        "protocol": cell.status().scored_by.get(PROTOCOL, ""),
-        "validation": float(identity.train.get("validation", 0.0)),
-        "true_variant": identity.variant,
-        "true_seed": identity.seed,
+        "protocol": scored_by.get(PROTOCOL, ""),
+        "stale": " ".join(stale_scores(scored_by)),
+        "validation": train.get("validation", 0.0),
+        "steps": cell.summary.steps,
+        "long_side": size.long_side if size else None,
+        "factor": size.factor if size else None,
+        "machine": _machine(cell_id, cell.provenance),
     }
 
 
-def _machine(cell: CellFolder, made: Provenance) -> str:
+def _machine(cell_id: str, made: Provenance) -> str:
     """Return what a cell's times depend on.
 
     Several machines that trained a cell in turn get its id: its times are like those of no other.
     """
     turns = made.machines_in_turn
-    return for_line(f"cell {cell.id} in turn: {turns}" if turns else machine(made), _MAX_MACHINE)
+    return for_line(f"cell {cell_id} in turn: {turns}" if turns else machine(made), _MAX_MACHINE)
 
 
-def _scores(cell: CellFolder, metrics: Sequence[Metric]) -> list[dict[str, Any]]:
-    names = {metric.name for metric in metrics}
-    return [
-        {"cell_id": cell.id, "view": view} | {k: v for k, v in row.items() if k in names}
-        for view, row in cell.view_scores()
-    ]
-
-
-def _views(scores: list[dict[str, Any]], metrics: Sequence[Metric]) -> pd.DataFrame:
+def _views(done: Mapping[str, DoneCell]) -> pd.DataFrame:
     """Return the scores as a table, with a column for each score, whether a cell has it or not."""
-    names = [metric.name for metric in metrics if metric.score is not None]
-    views = pd.DataFrame(scores, columns=["cell_id", "view", *names])
-    return views.astype({"cell_id": object, "view": object} | dict.fromkeys(names, np.float64))
+    rows = [
+        {"cell_id": cell_id, "view": view} | scores
+        for cell_id, cell in done.items()
+        for view, scores in cell.scores
+    ]
+    views = pd.DataFrame(rows, columns=["cell_id", "view", *VIEW_METRICS])
+    texts: dict[str, Any] = {"cell_id": object, "view": object}
+    return views.astype(texts | dict.fromkeys(VIEW_METRICS, np.float64))
 
 
 def cell_means(views: pd.DataFrame) -> pd.DataFrame:
@@ -241,52 +306,56 @@ def cell_means(views: pd.DataFrame) -> pd.DataFrame:
 
 
 def _cells(
-    sweep_id: str,
-    entries: list[dict[str, Any]],
-    columns: dict[str, dict[str, Any]],
-    means: pd.DataFrame,
-    metrics: Sequence[Metric],
+    rows: Sequence[RecordedCell], columns: Mapping[str, dict[str, Any]], means: pd.DataFrame
 ) -> pd.DataFrame:
-    rows = [row | columns.get(row["cell_id"], _without_cell(row["error"])) for row in entries]
-    read = ["state", "reason", "protocol", "validation", "machine", "true_variant", "true_seed"]
-    names = [*RECORD_KEYS, *read, *(metric.name for metric in metrics)]
-    cells = pd.DataFrame(rows, columns=names)
-    for metric in metrics:
-        values = cells[metric.name]
-        if metric.name in means.columns:
-            values = cells["cell_id"].map(means[metric.name])
-        cells[metric.name] = pd.to_numeric(values).astype(np.float64)
-    cells["protocol"] = cells["protocol"].astype(object).fillna("")
-    cells["validation"] = cells["validation"].astype(np.float64)
-    cells["machine"] = cells["machine"].astype(object).fillna("")
-    _check_identity(sweep_id, cells)
-    return cells.drop(columns=["true_variant", "true_seed"])
+    """Return `Sweep.cells`: the rows of the record with the columns of their cells."""
+    texts = ["state", "reason", "protocol", *(f"{name}_code" for name in VIEW_METRICS)]
+    texts += ["stale", "machine"]
+    numbers = ["validation", "steps", "long_side", "factor", *(metric.name for metric in METRICS)]
+    entries = [
+        {key: getattr(row, key) for key in RECORD_KEYS}
+        | (columns[row.cell_id] if row.cell_id is not None else _without_cell(row))
+        for row in rows
+    ]
+    cells = pd.DataFrame(entries, columns=[*RECORD_KEYS, *texts, *numbers])
+    for name in means.columns:
+        cells[name] = cells["cell_id"].map(means[name])
+    cells[texts] = cells[texts].astype(object).fillna("")
+    return cells.astype(dict.fromkeys(numbers, np.float64))
 
 
-def _without_cell(error: str | None) -> dict[str, str]:
+def _without_cell(row: RecordedCell) -> dict[str, str]:
     """Return state and reason of a row that has no cell: it can't be trained, or not yet."""
-    if error:
-        return {"state": "failed", "reason": error}
+    if row.error:
+        return {"state": "failed", "reason": row.error}
+    if row.state == "unknown":
+        return {"state": "unknown", "reason": _UNKNOWN_VARIANT}
     return {"state": "pending", "reason": "not trained yet: it waits for another cell's count"}
 
 
-def _check_identity(sweep_id: str, cells: pd.DataFrame) -> None:
+def _check_identity(
+    sweep_id: str, rows: Iterable[RecordedCell], done: Mapping[str, DoneCell]
+) -> None:
     """Refuse a record that contradicts a cell: it would pair cells that do not belong together."""
-    done = cells[cells["state"] == "done"]
-    for key, true in (("variant_id", "true_variant"), ("seed", "true_seed")):
-        contradicted = done[done[key] != done[true]]
-        if not contradicted.empty:
-            row = contradicted.iloc[0]
-            raise ReportError(
-                f"sweeps/{sweep_id}.json says {key} {row[key]} of cell {row['cell_id']}, "
-                f"its identity.json says {row[true]}"
-            )
+    for row in rows:
+        if row.cell_id not in done:
+            continue
+        identity = done[row.cell_id].identity
+        for key, said, true in (
+            ("variant_id", row.variant_id, identity.variant),
+            ("seed", row.seed, identity.seed),
+        ):
+            if said != true:
+                raise ReportError(
+                    f"sweeps/{sweep_id}.json says {key} {said} of cell {row.cell_id}, "
+                    f"its identity.json says {true}"
+                )
 
 
-def _add_provenance(distinct: dict[str, set[str]], provenance: Mapping[str, Any]) -> None:
-    """Add a cell's provenance to the distinct values, but for the time at which it started."""
-    for key, value in provenance.items():
+def _provenance_entries(provenance: Provenance) -> Iterable[tuple[str, str]]:
+    """Yield the entries of a cell's provenance, but for the time at which it started."""
+    for key, value in msgspec.structs.asdict(provenance).items():
         if isinstance(value, dict):
-            _add_provenance(distinct, {f"{key}.{name}": inner for name, inner in value.items()})
+            yield from ((f"{key}.{name}", str(inner)) for name, inner in value.items())
         elif key != "started":
-            distinct.setdefault(key, set()).add(str(value))
+            yield key, str(value)

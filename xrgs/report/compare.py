@@ -1,30 +1,30 @@
 """Changes of each metric from a paired base, averaged by scene: the numbers of a report's tables.
 
 The base is the baseline, or any other label of the sweep. A pair is a cell and the base of the same
-scene, condition and replicate. A replicate is a pair of `variant.seed`, which draws the HR views,
-and `seed`, that of training: both cells are trained on the same variant with the same seed.
+scene, condition and replicate. A replicate is a value of `variant.seed`, which draws the HR views,
+and a value of `seed`, which training uses: both cells of a pair have the same variant and seed.
 
 Scores of views are compared by the change 100 (value - base) / |base|, as in the paper's Table 1.
-Amounts (times, counts, memory) are compared by log(value / base), and means and intervals of it are
-turned into percent at the end: 100 (exp(mean) - 1). A scene's change is the mean over its
-replicates, and the sweep's change is the mean over scenes, in which each scene counts once.
+Amounts (times, counts, memory) are compared by log(value / base). Their means and intervals become
+percent at the end: 100 (exp(mean) - 1). A scene's change is the mean over its replicates, and the
+sweep's change is the mean over scenes, in which each scene counts once.
 
-Times are compared where both cells were trained on the same machine, with as many threads: a pair
-of different machines has no change in them, and neither has a cell that several trained in turn.
+Times are compared where both cells were trained on the same machine, with as many threads, and no
+other machine continued either. A score is compared where the same code has computed both values.
 
-The 95 % interval is Student's t around that mean. With more than one scene it is taken over the
-scenes' means: it then says how far the mean would move with other scenes like these, and includes
-the noise between replicates. With one scene it is taken over replicates. One scene with one
-replicate has none. Beside it stand how many of the pairs changed in the direction of the mean, the
-standard deviation of replicates, pooled over the scenes, and that of the scenes' means. The p of
-the t-test that belongs to the interval gives Benjamini and Hochberg's q, over all ablations and
-metrics of a condition.
+The 95 % interval is Student's t around the mean. With several scenes it is over the scenes' means:
+it says how far the mean would move with other scenes like these, and includes the noise between
+replicates. With one scene it is over replicates. One scene with one replicate has no interval. The
+tables also say how many of the pairs changed in the direction of the mean, and the standard
+deviations of the replicates, pooled over the scenes, and of the scenes' means. The p of the t-test
+that belongs to the interval gives Benjamini and Hochberg's q, over all ablations and metrics of a
+condition.
 
-Where a condition has `all_hr`, which trains on the originals of the degraded photographs, the share
-of the gap that a pair closes is 100 (value - base) / (all_hr - base), of the three cells of
-one scene and replicate, averaged in the same way: 0 is the base, 100 is what no method can
-know. It needs all_hr to be better than the base. The scores of views have one; a gap in seconds
-or Gaussians would mean nothing.
+A condition may have `all_hr`, which trains on the originals of the degraded photographs. A pair
+then closes a share of the gap, 100 (value - base) / (all_hr - base), of the three cells of one
+scene and replicate: 0 is the base, 100 is what no method can know. The shares are averaged in the
+same way. A share needs all_hr to be better than the base, and is of scores of views alone: a gap in
+seconds or Gaussians would mean nothing.
 """
 
 from __future__ import annotations
@@ -40,6 +40,7 @@ from xrgs.report.averages import averaged
 from xrgs.report.collect import ReportError
 from xrgs.report.inference import (
     ALL_HR,
+    OTHER_CODE,
     OTHER_MACHINE,
     log_ratio,
     percent_change,
@@ -48,6 +49,8 @@ from xrgs.report.inference import (
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
+
+    from numpy.typing import NDArray
 
     from xrgs.evaluation.metrics import Metric
 
@@ -59,17 +62,13 @@ _PAIR = ["scene", "condition", "variant_seed", "seed"]
 
 
 def is_amount(metric: Metric) -> bool:
-    """Return whether a metric is an amount above zero, which is compared by ratio.
-
-    Args:
-        metric: The metric. All that are not scores of views are amounts: times, counts, memory.
-    """
+    """Return whether a metric is an amount above zero (time, count, memory): compared by ratio."""
     return metric.score is None
 
 
 @dataclass(frozen=True)
 class Comparison:
-    """Holds every number of a report's tables."""
+    """Every number of a report's tables."""
 
     base: str
     """The label that all others are compared with."""
@@ -77,25 +76,24 @@ class Comparison:
     scenes: tuple[str, ...]
     """Names of the scenes, sorted."""
     groups: tuple[tuple[str, str], ...]
-    """(label, condition) of each ablation, in the sweep's order; the baseline is one of them where
-    something else is the base."""
+    """(label, condition) of each label but the base, in the sweep's order."""
     cells: pd.DataFrame
     """`Sweep.cells` with `base_id`, the cell that each is compared with, and `elsewhere`, whether
-    that is of another machine as far as is known. An ablation without a finished base has that as
-    its reason."""
+    another machine has trained that cell, as far as is known. The reason of an ablation without a
+    finished base says so."""
     pairs: pd.DataFrame
     """One row for each metric of each ablation's cell: `base`, `value`, `effect` (the log of their
     ratio, or the change in %), `difference` (in the metric's unit) and `why` there is no effect."""
     per_scene: pd.DataFrame
-    """Means over replicates, indexed by label, condition, scene, metric: of
-    `xrgs.report.averages.averaged`."""
+    """Means over replicates, indexed by label, condition, scene, metric; its columns are described
+    in `xrgs.report.averages.averaged`."""
     means: pd.DataFrame
     """Means over scenes, indexed by label, condition, metric."""
     gaps_per_scene: pd.DataFrame
     """As `per_scene`, with the share of the gap to all_hr (%) as the `change`: a row for each score
-    of views and ablation in the conditions that have all_hr."""
+    and ablation in the conditions that have all_hr."""
     gaps: pd.DataFrame
-    """As `means`, with that share as the `change`."""
+    """As `means`, with the share of the gap as the `change`."""
 
     def missing(self) -> pd.DataFrame:
         """Return the cells without results, with `reason`, in the sweep's order."""
@@ -116,9 +114,9 @@ def compare(cells: pd.DataFrame, metrics: Sequence[Metric], against: str = BASEL
     Raises:
         ReportError: The sweep has no such label; a cell's baseline is of another scene, variant or
             seed, or is not in the sweep; cells of one scene, condition and `variant.seed` are of
-            different variants; the cells were scored by different evaluation protocols; or some of
-            a condition were scored on held-out training views and others not. The message names
-            both cells, or the labels.
+            different variants; the cells were scored by different evaluation protocols; or some
+            cells of a condition were scored on held-out training views and others were not. The
+            message names both cells, or the labels.
     """
     cells = _with_base(cells, against)
     _check_comparable(cells, against)
@@ -144,7 +142,7 @@ def compare(cells: pd.DataFrame, metrics: Sequence[Metric], against: str = BASEL
 def _with_base(cells: pd.DataFrame, against: str) -> pd.DataFrame:
     """Return the cells with `base_id` and `elsewhere`, as `Comparison.cells` has them.
 
-    The record names the baseline, a key finds another base.
+    The record names the baseline; any other base is found by scene, condition and replicate.
     """
     if against == BASELINE:
         base_id = cells["baseline_id"]
@@ -164,7 +162,7 @@ def _with_base(cells: pd.DataFrame, against: str) -> pd.DataFrame:
 
 
 def _check_comparable(cells: pd.DataFrame, against: str) -> None:
-    """Refuse cells that can't be compared, as `compare` says."""
+    """Raise ReportError for cells that can't be compared; `compare` lists the reasons."""
     done = cells[cells["state"] == "done"]
     _one_value(done, [], "protocol", "evaluation protocol")
     _one_value(done, ["condition"], "validation", "train.validation value")
@@ -187,7 +185,7 @@ def _check_comparable(cells: pd.DataFrame, against: str) -> None:
 
 
 def _check_pairs(ablations: pd.DataFrame, matched: pd.DataFrame, keys: Sequence[str]) -> None:
-    """Refuse an ablation that differs in a key from its base, the same row of `matched`."""
+    """Refuse an ablation that differs in a key from its base, the row of `matched` beside it."""
     for key in keys:
         differs = ablations[key].to_numpy() != matched[key].to_numpy()
         if differs.any():
@@ -221,7 +219,7 @@ def _name(cell: pd.Series) -> str:
 
 
 def _bases(cells: pd.DataFrame, against: str) -> pd.DataFrame:
-    """Return the cells to compare with that were planned, one row for each, indexed by its id."""
+    """Return the planned cells of the base, one row for each, indexed by its id."""
     planned = cells[(cells["label"] == against) & cells["cell_id"].notna()]
     return planned.drop_duplicates("cell_id").set_index("cell_id")
 
@@ -236,15 +234,14 @@ def _pairs(cells: pd.DataFrame, metrics: Sequence[Metric], against: str) -> pd.D
     cells.loc[reasons.index, "reason"] = f"no {against}: " + reasons
     paired = ablations[usable]
     matched = bases.loc[paired["base_id"]]
-    elsewhere = paired["elsewhere"].to_numpy()
     parts = []
     for metric in metrics:
         base = matched[metric.name].to_numpy(np.float64)
         value = paired[metric.name].to_numpy(np.float64)
         effect, why = (log_ratio if is_amount(metric) else percent_change)(base, value)
-        if metric.unit in _TIMES:
-            effect = np.where(elsewhere, np.nan, effect)
-            why = np.where(elsewhere & (why == ""), OTHER_MACHINE, why)
+        incomparable, reason = _incomparable(metric, paired, matched)
+        effect = np.where(incomparable, np.nan, effect)
+        why = np.where(incomparable & (why == ""), reason, why)
         with np.errstate(invalid="ignore"):  # inf - inf gives NaN, as it should
             difference = value - base
         part = paired[[*_GROUP, "scene", "variant_seed", "seed", "cell_id", "base_id"]]
@@ -261,21 +258,33 @@ def _pairs(cells: pd.DataFrame, metrics: Sequence[Metric], against: str) -> pd.D
     return pd.concat(parts, ignore_index=True)
 
 
+def _incomparable(
+    metric: Metric, paired: pd.DataFrame, matched: pd.DataFrame
+) -> tuple[NDArray[np.bool_], str]:
+    """Return which pairs have values of a metric that can't be compared, and why."""
+    if not is_amount(metric):
+        code = f"{metric.name}_code"
+        return paired[code].to_numpy(str) != matched[code].to_numpy(str), OTHER_CODE
+    return paired["elsewhere"].to_numpy(bool) & (metric.unit in _TIMES), OTHER_MACHINE
+
+
 def _gaps(
     pairs: pd.DataFrame, cells: pd.DataFrame, metrics: Sequence[Metric], against: str
 ) -> pd.DataFrame:
-    """Return the pairs of scores in conditions with all_hr, with the share of the gap as effect."""
+    """Return the pairs of scores in conditions with all_hr; the effect is the share of the gap."""
     scores = {m.name: m.higher_is_better for m in metrics if not is_amount(m)}
     conditions = cells.loc[cells["label"].isin({ALL_HR} - {against}), "condition"].unique()
     rows = pairs[pairs["metric"].isin(scores) & pairs["condition"].isin(conditions)]
     replicate = ["condition", "base_id", "metric"]
-    best = rows[rows["label"] == ALL_HR].drop_duplicates(replicate)[[*replicate, "value"]]
-    rows = rows[rows["label"] != ALL_HR].merge(
-        best.rename(columns={"value": ALL_HR}), on=replicate, how="left"
-    )
+    comparable = rows[rows["why"] != OTHER_CODE]
+    best = comparable[comparable["label"] == ALL_HR].drop_duplicates(replicate)
+    best = best[[*replicate, "value"]].rename(columns={"value": ALL_HR})
+    rows = rows[rows["label"] != ALL_HR].merge(best, on=replicate, how="left")
     for name, higher_is_better in scores.items():
         of = rows["metric"] == name
         values = (rows.loc[of, key].to_numpy(np.float64) for key in ("base", "value", ALL_HR))
         share, why = share_of_gap(*values, higher_is_better=higher_is_better)
-        rows.loc[of, "effect"], rows.loc[of, "why"] = share, why
+        scored_otherwise = rows.loc[of, "why"] == OTHER_CODE
+        rows.loc[of, "effect"] = np.where(scored_otherwise, np.nan, share)
+        rows.loc[of, "why"] = np.where(scored_otherwise, OTHER_CODE, why)
     return rows

@@ -1,37 +1,33 @@
-"""What a table of one condition has to be read with: how its cells were trained and scored.
+"""What a table has to be read with: how its cells were trained and scored, and cautions.
 
-Text, Markdown, LaTeX and the page all have it from here. It is read from the files of the cells,
-which anybody may have written: values are shown as they are, and a file that can't be read leaves
-out what it would have told.
+Text, Markdown, LaTeX and the page all show it.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
-from xrgs.errors import StoreError
-from xrgs.experiment.results import cell_columns
+import numpy as np
+import pandas as pd
+
+from xrgs.report.inference import OTHER_CODE
+from xrgs.report.writing import signed
 from xrgs.safeio.sanitize import counted, for_line
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping, Sequence
 
-    import pandas as pd
+    from xrgs.config import Conf, VariantConf
+    from xrgs.experiment.schema import Provenance
+    from xrgs.report.collect import Sweep
+    from xrgs.report.compare import Comparison
 
-    from xrgs.report.joined import JoinedStore
-
-#: Keys of a cell's config that the context names.
-_KEYS = (
-    *("train.steps", "train.validation", "variant.long_side", "variant.factor"),
-    *("variant.hr_fraction", "variant.degradation", "variant.tags"),
-    *("variant.test_every", "variant.test"),
-    "splat.densify.prune_scale3d",
-)
 #: Scores of fewer views than these say little: one more view may turn their order.
 _ENOUGH_VIEWS = 3
-#: The longest value of a config, a processor's name or a list that is shown, in characters.
+#: The longest value of a config, processor's name and sentence that is shown, in characters.
 _MAX_SHOWN = 120
+_MAX_SENTENCE = 240
 
 
 @dataclass(frozen=True)
@@ -62,129 +58,104 @@ class Context:
 
 
 def context_of(contexts: Mapping[str, Context], condition: str) -> Context:
-    """Return the context of a condition; an empty one where none is known.
-
-    Args:
-        contexts: What `contexts` returns.
-        condition: The condition.
-    """
+    """Return the context of a condition; an empty one where none is known."""
     return contexts.get(condition, Context())
 
 
-def contexts(store: JoinedStore, cells: pd.DataFrame, views: pd.DataFrame) -> dict[str, Context]:
-    """Read the context of each condition of a sweep.
-
-    Args:
-        store: The stores that have the cells.
-        cells: `Sweep.cells`.
-        views: `Sweep.views`.
-
-    Returns:
-        The context by the condition; empty for a condition without finished cells.
-    """
-    done = cells[(cells["state"] == "done") & ~cells["cell_id"].isin(store.external)]
-    counts = views.groupby("cell_id")["view"].nunique()
-    of_cells = {cell_id: _settings(store, cell_id) for cell_id in done["cell_id"].unique()}
+def contexts(sweep: Sweep) -> dict[str, Context]:
+    """Return the context of each condition; an empty one without finished cells."""
+    cells = sweep.cells
+    own = cells[cells["cell_id"].isin(sweep.done)]
+    counts = sweep.views.groupby("cell_id")["view"].nunique()
     found = {}
-    for condition, rows in done.groupby("condition", sort=False):
-        settings = [of_cells[cell_id] for cell_id in rows["cell_id"]]
+    for condition, rows in own.groupby("condition", sort=False):
         tests = {
             str(scene): int(counts.reindex(ids).fillna(0).min())
             for scene, ids in rows.groupby("scene")["cell_id"]
         }
+        made = [sweep.done[cell_id] for cell_id in rows["cell_id"]]
+        configs = [cell.config for cell in made]
+        held_out = bool((rows["validation"] > 0).any())
         found[str(condition)] = Context(
-            (*_training(settings, tests), *_prune_rule(rows["label"], settings)),
-            _machine(settings),
-            _cautions(rows["scene"], settings, tests),
+            (
+                *_sizes([config for config in configs if config]),
+                _scored_views(tests, held_out=held_out),
+                *_prune_rule(zip(rows["label"], configs, strict=True)),
+            ),
+            _machine([cell.provenance for cell in made]),
+            _cautions(zip(rows["scene"], configs, strict=True), tests),
         )
     return {name: found.get(name, Context()) for name in cells["condition"].unique()}
 
 
-def _settings(store: JoinedStore, cell_id: str) -> dict[str, Any]:
-    """Return what the context needs of one cell's config and provenance."""
-    cell = store.cell(cell_id)
-    columns = cell_columns(cell, None)
-    settings = {key: columns[key] for key in _KEYS if columns.get(key) is not None}
-    try:
-        provenance = cell.provenance()
-    except StoreError:
-        return settings
-    return settings | {key: getattr(provenance, key) for key in ("cpu", "threads", "backend")}
+def _distinct(values: Iterable[float | str | None]) -> str:
+    """Return the distinct values that are known as a text, in their order: `3,000 or 500`."""
+    return " or ".join(dict.fromkeys(_shown(value) for value in values if value is not None))
 
 
-def _distinct(settings: Iterable[Mapping[str, Any]], key: str) -> list[str]:
-    """Return the distinct values of a key as text, in the order in which they are found."""
-    values = (one[key] for one in settings if one.get(key) is not None)
-    return list(dict.fromkeys(map(_shown, values)))
+def _shown(value: float | str) -> str:
+    return for_line(value if isinstance(value, str) else f"{value:,g}", _MAX_SHOWN)
 
 
-def _shown(value: object) -> str:
-    """Return a value of a config as a text of one line, whatever it is."""
-    text = f"{value:,g}" if type(value) in {int, float} else str(value)
-    return for_line(text, _MAX_SHOWN)
+def _sizes(configs: Sequence[Conf]) -> list[str]:
+    """Return phrases on steps, size and mixture."""
+    if not configs:
+        return []
+    sizes = _distinct(config.variant.long_side for config in configs)
+    return [
+        f"{_distinct(config.train.steps for config in configs)} steps",
+        "HR views at the photographs' size" if sizes == "0" else f"HR views of at most {sizes} px",
+        " or ".join(dict.fromkeys(_mixture(config.variant) for config in configs)),
+    ]
 
 
-def _training(settings: Sequence[Mapping[str, Any]], tests: Mapping[str, int]) -> list[str]:
-    """Return phrases on steps, size, mixture and test views."""
-    phrases = []
-    for key, phrase in (
-        ("train.steps", "{} steps"),
-        ("variant.long_side", "HR views of at most {} px"),
-    ):
-        if values := _distinct(settings, key):
-            phrases.append(phrase.format(" or ".join(values)))
-    phrases = [text.replace("of at most 0 px", "at the photographs' size") for text in phrases]
-    mixtures = dict.fromkeys(filter(None, map(_mixture, settings)))
-    phrases += [" or ".join(mixtures)] if mixtures else []
+def _scored_views(tests: Mapping[str, int], *, held_out: bool) -> str:
     least, most = min(tests.values()), max(tests.values())
     count = f"{least}" if least == most else f"{least} to {most}"
-    held_out = any(one.get("train.validation") for one in settings)
     kind = "held-out training view" if held_out else "test view"
-    phrases.append(f"{count} {kind}{'s' * (most != 1)}{' a scene' * (len(tests) > 1)}")
-    return phrases
+    return f"{count} {kind}{'s' * (most != 1)}{' a scene' * (len(tests) > 1)}"
 
 
-def _mixture(one: Mapping[str, Any]) -> str:
-    """Return a phrase on what was done to the LR views of a cell; empty where that is not known."""
-    tags, kind = one.get("variant.tags"), one.get("variant.degradation")
-    made = tags == "flag"
-    if made and one.get("variant.hr_fraction") == 1:
+def _mixture(variant: VariantConf) -> str:
+    """Return a phrase on what was done to the LR views of a cell."""
+    chosen = variant.tags == "flag"  # and not by what the photographs are
+    if chosen and variant.hr_fraction == 1:
         return "all views HR"
-    if kind == "downsample" or (made and kind == "auto"):
-        factor = one.get("variant.factor")
-        return f"LR views {_shown(factor)} times smaller" if factor is not None else ""
-    if kind in ("auto", "none"):
-        return f"LR by {_shown(tags)} (nothing degraded)"
-    return f"LR views by {_shown(kind)}" if kind is not None else ""
+    if variant.degradation == "downsample" or (chosen and variant.degradation == "auto"):
+        return f"LR views {_shown(variant.factor)} times smaller"
+    if variant.degradation in ("auto", "none"):
+        return f"LR by {_shown(variant.tags)} (nothing degraded)"
+    return f"LR views by {_shown(variant.degradation)}"
 
 
-def _prune_rule(labels: Iterable[str], settings: Sequence[Mapping[str, Any]]) -> list[str]:
+def _prune_rule(configs: Iterable[tuple[str, Conf | None]]) -> list[str]:
     """Return a phrase on the rule against large Gaussians, with the labels where they differ."""
-    key = "splat.densify.prune_scale3d"
     by_value: dict[str, dict[str, None]] = {}  # with the labels in order
-    for label, one in zip(labels, settings, strict=True):
-        for value in _distinct([one], key):
+    for label, config in configs:
+        if config:
+            value = _shown(config.splat.densify.prune_scale3d)
             by_value.setdefault(value, {})[label] = None
     if not by_value:
         return []
     several = len(by_value) > 1
     each = (f"{v} ({', '.join(found)})" if several else v for v, found in by_value.items())
     phrase = f"Gaussians above {', '.join(each)} times the scene's scale are pruned"
-    return [for_line(phrase, 2 * _MAX_SHOWN)]
+    return [for_line(phrase, _MAX_SENTENCE)]
 
 
-def _machine(settings: Sequence[Mapping[str, Any]]) -> tuple[str, ...]:
+def _machine(made: Sequence[Provenance]) -> tuple[str, ...]:
     """Return phrases on what times depend on."""
-    phrases = [" or ".join(_distinct(settings, "cpu"))]
-    if threads := _distinct(settings, "threads"):
-        several = "s" * (threads != ["1"])
-        phrases.append(f"{' or '.join(threads)} thread{several}")
-    phrases.append(" or ".join(f"{name} backend" for name in _distinct(settings, "backend")))
-    return tuple(phrase for phrase in phrases if phrase)
+    threads = _distinct(one.threads for one in made)
+    phrases = (
+        _distinct(one.cpu for one in made),
+        f"{threads} thread{'s' * (threads != '1')}",
+        _distinct(f"{one.backend} backend" for one in made),
+    )
+    return tuple(filter(None, phrases))
 
 
 def _cautions(
-    scenes: Iterable[str], settings: Sequence[Mapping[str, Any]], tests: Mapping[str, int]
+    configs: Iterable[tuple[str, Conf | None]], tests: Mapping[str, int]
 ) -> tuple[str, ...]:
     """Return sentences on scores of too few views, and of views that were trained on."""
     few = [
@@ -195,18 +166,98 @@ def _cautions(
     trained_on = [
         f"{scene} has no view held out (variant.test_every=0): its scores are of views that were"
         " trained on"
-        for scene, one in zip(scenes, settings, strict=True)
-        if not _holds_out(one)
+        for scene, config in configs
+        if config and not _holds_out(config)
     ]
     return tuple(
-        for_line(f"Caution: {text}", 2 * _MAX_SHOWN) for text in dict.fromkeys((*few, *trained_on))
+        for_line(f"Caution: {text}", _MAX_SENTENCE) for text in dict.fromkeys((*few, *trained_on))
     )
 
 
-def _holds_out(settings: Mapping[str, Any]) -> bool:
-    """Return whether a cell is scored on views that it was not trained on, as far as is known."""
-    return bool(
-        settings.get("variant.test_every", 1)
-        or settings.get("variant.test")
-        or settings.get("train.validation")
+def _holds_out(config: Conf) -> bool:
+    """Return whether a cell is scored on views that it was not trained on."""
+    variant = config.variant
+    return bool(variant.test_every or variant.test or config.train.validation)
+
+
+_PAIR = ["label", "condition", "scene", "variant_seed", "seed"]
+#: A view decides where the mean change without it differs by more than this share of the mean and
+#: by more than these dB, and where the view is this many times as far from the median of the other
+#: views as the farthest of them. Our choice.
+_MIN_SHARE = 0.5
+_MIN_DB = 0.3
+_MIN_DISTANCE = 3.0
+
+
+def decided_by_one_view(
+    comparison: Comparison, views: pd.DataFrame
+) -> dict[tuple[str, str], list[str]]:
+    """Say of which pairs one view decides the change in PSNR.
+
+    A scene has few test views, and PSNR has no bound: a floater before one test camera can take 10
+    dB from its view, and so take more from the mean than all other views gain.
+
+    Args:
+        comparison: The pairs of cells.
+        views: `Sweep.views`.
+
+    Returns:
+        By label and condition a sentence for each such pair, which names the view and has the
+        change with it and without it.
+    """
+    changes = _changes_of_views(comparison, views)
+    pairs = _with_and_without(changes)
+    difference = (pairs["without"] - pairs["with_all"]).abs()
+    decided = pairs[
+        (pairs["n_views"] >= _ENOUGH_VIEWS)
+        & (difference > _MIN_SHARE * pairs["with_all"].abs())
+        & (difference > _MIN_DB)
+        & (pairs["distance"] > _MIN_DISTANCE * pairs["spread"])
+    ]
+    found: dict[tuple[str, str], list[str]] = {}
+    for row in decided.to_dict("records"):
+        text = (
+            f"Caution: one view decides: on {row['scene']} (replicate"
+            f" {row['variant_seed']}/{row['seed']}) PSNR changes by {signed(row['with_all'])} dB,"
+            f" and without {row['view']} by {signed(row['without'])} dB"
+        )
+        found.setdefault((row["label"], row["condition"]), []).append(for_line(text, _MAX_SENTENCE))
+    return found
+
+
+def _changes_of_views(comparison: Comparison, views: pd.DataFrame) -> pd.DataFrame:
+    """Return the change in PSNR of each view of each pair, dB, where it is finite."""
+    pairs = comparison.pairs[comparison.pairs["metric"] == "psnr"]
+    # A record may have a row twice.
+    pairs = pairs.loc[pairs["why"] != OTHER_CODE, [*_PAIR, "cell_id", "base_id"]].drop_duplicates()
+    scores = views[["cell_id", "view", "psnr"]]
+    of_base = scores.rename(columns={"cell_id": "base_id", "psnr": "base_psnr"})
+    rows = pairs.merge(scores, on="cell_id").merge(of_base, on=["base_id", "view"])
+    with np.errstate(invalid="ignore"):  # inf - inf gives NaN, as it should
+        rows["change"] = rows["psnr"] - rows["base_psnr"]
+    finite: pd.DataFrame = rows[np.isfinite(rows["change"])].reset_index(drop=True)
+    return finite
+
+
+def _with_and_without(changes: pd.DataFrame) -> pd.DataFrame:
+    """Return the mean change of each pair with and without its most distant view.
+
+    One row a pair: `view`, the one farthest from the median of all; `n_views`; `with_all`, the mean
+    over all; `without`, the mean over the others; `spread`, how far the farthest of the others is
+    from their median; `distance`, how far the view is from that median.
+    """
+    groups = changes.groupby(_PAIR, sort=False)["change"]
+    far = (changes["change"] - groups.transform("median")).abs()
+    alone = far.groupby([changes[key] for key in _PAIR], sort=False).idxmax()
+    others = changes.drop(index=list(alone))
+    rest = others.groupby(_PAIR, sort=False)["change"]
+    spread = (others["change"] - rest.transform("median")).abs()
+    pairs = changes.loc[alone].set_index(_PAIR)
+    pairs = pairs.assign(
+        n_views=groups.size(),
+        with_all=groups.mean(),
+        without=rest.mean(),
+        distance=(pairs["change"] - rest.median()).abs(),
+        spread=spread.groupby([others[key] for key in _PAIR], sort=False).max(),
     )
+    return pairs.reset_index()

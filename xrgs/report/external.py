@@ -1,9 +1,9 @@
 """Renders of the test views that another program made, as one more label of a sweep's report.
 
 They are scored by the metrics of the frozen protocol against the photographs of the variant, and
-compared by the same statistics. They are 8-bit PNGs, where our own cells are scored as float32
+compared by the same statistics. They are 8-bit PNGs, and our own cells are scored as float32
 images: the rounding costs PSNR 0.005 dB at 30 dB and 0.05 dB at 40 dB, and SSIM 0.0004 on the
-embedded scene. Nothing is known of time, Gaussians and memory: these are n/a.
+embedded scene. Time, Gaussians and memory are not known: these are n/a.
 """
 
 from __future__ import annotations
@@ -13,11 +13,12 @@ from typing import TYPE_CHECKING, Any
 
 import pandas as pd
 
-from xrgs.capture import images, variant
+from xrgs.capture import variant
 from xrgs.capture.images import ImageError
+from xrgs.evaluation.files import score_files
 from xrgs.evaluation.metrics import VIEW_METRICS
+from xrgs.evaluation.scoring import scoring_code
 from xrgs.report.collect import ReportError, Sweep, cell_means
-from xrgs.runtime.machine import single_torch_thread
 from xrgs.runtime.progress import progress
 from xrgs.safeio.files import is_inside
 from xrgs.safeio.paths import user_path
@@ -30,9 +31,10 @@ if TYPE_CHECKING:
     from xrgs.capture.views import View
     from xrgs.report.joined import JoinedStore
 
-#: What the cells that another program's renders are compared with have in common.
+#: Another program's renders become one row for each combination of these.
 _VARIANT = ["scene", "condition", "variant_seed"]
-_SHARED = ["variant_id", "baseline_id", "seed", "protocol", "validation"]
+#: What the row has in common with the cells that it is compared with.
+_SHARED = [*("variant_id", "baseline_id", "seed"), "validation", "long_side", "factor"]
 
 
 @dataclass(frozen=True)
@@ -77,7 +79,7 @@ def with_external(sweep: Sweep, store: JoinedStore, externals: Sequence[External
 
     Args:
         sweep: The sweep.
-        store: The stores that have its variants.
+        store: The stores that have the sweep's variants.
         externals: The programs' renders. A folder has `<view>.png` for each scored view, in
             `<scene>/<variant.seed>/`; where a scene has one draw of HR views, `<scene>/` will do,
             and where there is one scene too, the folder itself.
@@ -114,8 +116,10 @@ def _with_one(sweep: Sweep, store: JoinedStore, one: External) -> Sweep:
         scores += [{"cell_id": cell_id} | _score(folder, expected[name]) for name in bar]
         renders[cell_id] = folder
         rows.append(
-            {key: cell[key] for key in (*_VARIANT, *_SHARED)}
-            | {"cell_id": cell_id, "label": one.label, "state": "done", "reason": "", "machine": ""}
+            {key: cell[key] for key in (*_VARIANT, *_SHARED, "protocol")}
+            | {f"{name}_code": scoring_code()[name] for name in VIEW_METRICS}
+            | {"cell_id": cell_id, "label": one.label, "state": "done"}
+            | dict.fromkeys(("reason", "stale", "machine"), "")
         )
     means = cell_means(pd.DataFrame(scores, columns=list(sweep.views.columns)))
     added = pd.DataFrame(rows, columns=list(sweep.cells.columns))
@@ -156,16 +160,10 @@ def _expected(store: JoinedStore, variant_id: str, split: str) -> dict[str, View
 
 
 def _score(folder: Path, view: View) -> dict[str, Any]:
-    """Score the render of a view, as `xrgs.evaluation.protocol` does."""
-    import torch
-
+    """Score the render of a view against its photograph."""
     file, size = folder / f"{view.name}.png", (view.width, view.height)
     wanted = f"expected is an 8-bit RGB PNG of {view.width} x {view.height} px, the render of the"
     try:
-        image = torch.from_numpy(images.read_png(file, size))
+        return {"view": view.name} | score_files(file, view.file, size)
     except ImageError as error:
         raise ReportError(f"{error}; {wanted} view {view.name}") from error
-    photograph = torch.from_numpy(images.read_png(view.file, size))
-    with torch.no_grad(), single_torch_thread():
-        scores = {name: score(image, photograph) for name, score in VIEW_METRICS.items()}
-    return {"view": view.name} | scores

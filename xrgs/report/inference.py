@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 from scipy.special import stdtr, stdtrit
+from scipy.stats import false_discovery_control
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -24,13 +25,14 @@ MIN_VALUES = 3
 FALSE_DISCOVERIES = 0.05
 NOT_MEASURED = "not measured"
 OTHER_MACHINE = "timed on another machine"
+OTHER_CODE = "scored by other code"
 ZERO_BASE = "compared with zero"
 NOT_FINITE = "not finite"
 NOT_POSITIVE = "not above zero"
 
 #: Label of the cells that the share of the gap is measured by.
 ALL_HR = "all_hr"
-NO_ALL_HR = f"{ALL_HR} gave no number"
+NO_ALL_HR = f"{ALL_HR} gave no number to compare"
 NO_GAP = f"{ALL_HR} has the same value"
 WRONG_GAP = f"{ALL_HR} is worse"
 
@@ -98,7 +100,7 @@ def log_ratio(base: Floats, value: Floats) -> tuple[Floats, NDArray[np.str_]]:
 def share_of_gap(
     base: Floats, value: Floats, all_hr: Floats, *, higher_is_better: bool
 ) -> tuple[Floats, NDArray[np.str_]]:
-    """Return how much of the gap between the base and all_hr is closed, in percent.
+    """Return the share of the gap between the base and all_hr that is closed, in percent.
 
     Args:
         base: [N] values that are compared with.
@@ -174,7 +176,7 @@ def false_discovery_rates(p: Floats) -> Floats:
     Source: [benjamini1995].
 
     Args:
-        p: [N] values of p; NaN where there is no test, which then is none of the m.
+        p: [N] values of p; NaN where there is no test, which does not count among the m.
 
     Returns:
         [N], NaN where p is.
@@ -184,7 +186,7 @@ def false_discovery_rates(p: Floats) -> Floats:
         array([0.03, 0.9 ,  nan, 0.03])
     """
     q = np.full_like(p, np.nan)
-    order = np.argsort(p)[: np.count_nonzero(~np.isnan(p))]  # NaN is sorted behind all numbers
-    scaled = p[order] * len(order) / np.arange(1, len(order) + 1)
-    q[order] = np.minimum.accumulate(scaled[::-1])[::-1]
+    tested = ~np.isnan(p)
+    if tested.any():
+        q[tested] = false_discovery_control(p[tested])
     return q

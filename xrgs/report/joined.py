@@ -8,9 +8,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeVar
-
-import msgspec
+from typing import TYPE_CHECKING, TypeVar
 
 from xrgs.errors import StoreError
 from xrgs.experiment.store import BASELINE
@@ -21,12 +19,10 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Mapping, Sequence
 
     from xrgs.experiment.cell_folder import CellFolder
-    from xrgs.experiment.schema import SweepRecord
+    from xrgs.experiment.schema import RecordedCell, SweepRecord
     from xrgs.experiment.store import Store
 
 _T = TypeVar("_T")
-#: What tells one cell of a study from another.
-_CELL = ("scene", "condition", "label", "variant_seed", "seed")
 #: The most ids that the name of a report lists.
 _MAX_LISTED = 4
 
@@ -40,7 +36,7 @@ class Choice:
     ablations: tuple[str, ...] = ()
     """Labels of ablations and controls, beside what they are compared with; empty for all."""
 
-    def rows(self, rows: Sequence[dict[str, Any]], against: str) -> list[dict[str, Any]]:
+    def rows(self, rows: Sequence[RecordedCell], against: str) -> list[RecordedCell]:
         """Return the chosen rows of a record.
 
         Args:
@@ -51,23 +47,14 @@ class Choice:
             ReportError: No row has a scene or a label that is named; the message lists those that
                 there are.
         """
-        for key, name, wanted in (
-            ("scenes", "scene", self.scenes),
-            ("ablations", "label", self.ablations),
-        ):
-            known = list(dict.fromkeys(str(row.get(name)) for row in rows))
-            for value in wanted:
-                if value not in known:
-                    raise ReportError(
-                        f"{key}={value}: the sweep has none of that name; choose from:"
-                        f" {', '.join(known)}"
-                    )
-        labels = {*self.ablations, against, BASELINE} if self.ablations else None
+        _check_known("scenes", self.scenes, [row.scene for row in rows])
+        _check_known("ablations", self.ablations, [row.label for row in rows])
+        labels = {*self.ablations, against, BASELINE}
         return [
             row
             for row in rows
-            if (not self.scenes or row.get("scene") in self.scenes)
-            and (labels is None or row.get("label") in labels)
+            if (not self.scenes or row.scene in self.scenes)
+            and (not self.ablations or row.label in labels)
         ]
 
     @property
@@ -75,6 +62,15 @@ class Choice:
         """What the name of the report's folder says of the choice; empty where it is everything."""
         parts = (("scenes", self.scenes), ("ablations", self.ablations))
         return "".join(f".{key}-{for_file_name(','.join(names))}" for key, names in parts if names)
+
+
+def _check_known(key: str, wanted: Iterable[str], known: Sequence[str]) -> None:
+    for name in wanted:
+        if name not in known:
+            raise ReportError(
+                f"{key}={name}: the sweep has none of that name; choose from:"
+                f" {', '.join(dict.fromkeys(known))}"
+            )
 
 
 @dataclass(frozen=True)
@@ -89,9 +85,6 @@ class JoinedStore:
     def cell(self, cell_id: str) -> CellFolder:
         """Return the folder of a cell, in the store where it is done if there is one.
 
-        Args:
-            cell_id: The cell's id.
-
         Raises:
             StoreError: The id is not a valid name of a folder.
         """
@@ -100,14 +93,10 @@ class JoinedStore:
     def variant(self, variant_id: str) -> Path:
         """Return the folder of a variant, in a store that has it if there is one.
 
-        Args:
-            variant_id: The variant's id.
-
         Raises:
             StoreError: The id is not a valid name of a folder.
         """
-        folders = [store.variant(variant_id) for store in self.stores]
-        return _first(folders, Path.is_dir)
+        return _first([store.variant(variant_id) for store in self.stores], Path.is_dir)
 
     def render(self, cell_id: str, view: str) -> Path:
         """Return the file of the render of a view, which need not exist.
@@ -125,6 +114,12 @@ class JoinedStore:
         cell.check_not_trimmed(name)
         return cell.path / name
 
+    def without_paths(self, text: str) -> str:
+        """Return a text without the paths of the stores: a report is the same wherever they are."""
+        for store in self.stores:
+            text = text.replace(f"{store.path}/", "")
+        return text
+
     def latest_sweeps(self) -> tuple[str, ...]:
         """Return the id of each store's latest sweep, without repetitions.
 
@@ -133,32 +128,34 @@ class JoinedStore:
         """
         return tuple(dict.fromkeys(store.latest_sweep() for store in self.stores))
 
-    def sweep_record(self, sweep_ids: Sequence[str]) -> dict[str, Any]:
+    def sweep_records(
+        self, sweep_ids: Sequence[str]
+    ) -> tuple[dict[str, tuple[str, ...]], list[RecordedCell]]:
         """Join the records of sweeps.
 
         Args:
             sweep_ids: Their ids; each is a sweep of one of the stores, or of several.
 
         Returns:
-            `commands` (the arguments of `xrgs-sweep` of each record, by the sweep's id) and `cells`
-            (the rows, without repetitions).
+            The arguments of `xrgs-sweep` of each record, by the sweep's id, and the rows of all,
+            one for each scene, condition, label and replicate.
 
         Raises:
-            StoreError: No store has such a sweep, or its record is malformed.
+            StoreError: No store has such a sweep, or its record is damaged.
             ReportError: Two records have different cells for one scene, condition, label and
                 replicate; the message names both.
         """
         commands: dict[str, tuple[str, ...]] = {}
-        rows: dict[tuple[Any, ...], tuple[str, dict[str, Any]]] = {}
+        rows: dict[tuple[object, ...], tuple[str, RecordedCell]] = {}
         for sweep_id in sweep_ids:
             for record in self._records(sweep_id):
                 commands[sweep_id] = record.command
-                for row in msgspec.to_builtins(record.cells):
-                    key = tuple(row.get(name, 0) for name in _CELL)
+                for row in record.cells:
+                    key = (row.scene, row.condition, row.label, row.variant_seed, row.seed)
                     rows[key] = sweep_id, _same(rows.get(key), sweep_id, row)
-        return {"commands": commands, "cells": [row for _, row in rows.values()]}
+        return commands, [row for _, row in rows.values()]
 
-    def _records(self, sweep_id: str) -> Iterable[SweepRecord]:
+    def _records(self, sweep_id: str) -> list[SweepRecord]:
         having = [store for store in self.stores if sweep_id in store.sweep_ids()]
         if not having and len(self.stores) > 1:
             paths = ", ".join(str(store.path) for store in self.stores)
@@ -167,11 +164,8 @@ class JoinedStore:
 
 
 def _first(found: Sequence[_T], *wanted: Callable[[_T], bool]) -> _T:
-    """Return the first that satisfies the first condition, else the next one; else the first.
-
-    Of one alone nothing is asked.
-    """
-    conditions = wanted if len(found) > 1 else ()
+    """Return the first that satisfies the first condition, else the next one; else the first."""
+    conditions = wanted if len(found) > 1 else ()  # one alone is returned without a look at it
     fitting = (one for condition in conditions for one in found if condition(one))
     return next(fitting, found[0])
 
@@ -184,29 +178,23 @@ def _is_there(cell: CellFolder) -> bool:
     return cell.path.is_dir()
 
 
-def _same(
-    known: tuple[str, dict[str, Any]] | None, sweep_id: str, row: dict[str, Any]
-) -> dict[str, Any]:
+def _same(known: tuple[str, RecordedCell] | None, sweep_id: str, row: RecordedCell) -> RecordedCell:
     """Return the row that says more of two for the same cell; refuse two different cells."""
-    if known is None or known[1].get("cell_id") is None:
+    if known is None or known[1].cell_id is None:
         return row
     before, first = known
-    if row.get("cell_id") in {None, first["cell_id"]}:
+    if row.cell_id in {None, first.cell_id}:
         return first
-    name = " / ".join(str(row[key]) for key in ("scene", "label", "condition") if row.get(key))
+    name = " / ".join(filter(None, (row.scene, row.label, row.condition)))
     raise ReportError(
-        f"{name} / seed {row.get('seed')} is cell {first['cell_id']} in sweep {before} and"
-        f" {row['cell_id']} in sweep {sweep_id}: they differ in configuration, code or variant."
+        f"{name} / seed {row.seed} is cell {first.cell_id} in sweep {before} and"
+        f" {row.cell_id} in sweep {sweep_id}: they differ in configuration, code or variant."
         " Leave one of the sweeps out, or choose others with scenes= and ablations="
     )
 
 
 def report_name(sweep_ids: Sequence[str]) -> str:
-    """Return the name of the folder for the report of sweeps: their ids, joined by `+`.
-
-    Args:
-        sweep_ids: The ids.
-    """
+    """Return the name of the folder for the report of sweeps: their ids, joined by `+`."""
     more = len(sweep_ids) - _MAX_LISTED
     listed = "+".join(sweep_ids[:_MAX_LISTED])
     return f"{listed}+{for_file_name(' '.join(sweep_ids[_MAX_LISTED:]))}" if more > 0 else listed

@@ -9,29 +9,21 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from xrgs.evaluation.metrics import METRICS
+from xrgs.evaluation.scoring import PROTOCOL
 from xrgs.experiment.provenance import MACHINE_KEYS
 from xrgs.experiment.store import BASELINE, Store
-from xrgs.report import curves, skipped
-from xrgs.report.collect import (
-    RECORD_KEYS,
-    ReportError,
-    Sweep,
-    read_cells,
-)
+from xrgs.report import curves, work
+from xrgs.report.collect import CELL_KEYS, RECORD_KEYS, ReportError, Sweep, read_cells
 from xrgs.report.compare import compare
-from xrgs.report.context import contexts
+from xrgs.report.context import contexts, decided_by_one_view
 from xrgs.report.external import with_external
-from xrgs.report.gap import gap_tables
 from xrgs.report.html import write_document
 from xrgs.report.joined import Choice, JoinedStore, report_name
-from xrgs.report.paper import paper_tables
+from xrgs.report.markup import LATEX_PREAMBLE, to_latex, to_markdown
+from xrgs.report.paper import paper_tables, texture_tables, with_texture
 from xrgs.report.pictures import Picture, draw
-from xrgs.report.render import LATEX_PREAMBLE, TextTable, to_latex, to_markdown, to_text
-from xrgs.report.single_views import decided_by_one_view
 from xrgs.report.tables import Tables
-from xrgs.report.texture import texture_tables, with_texture
-from xrgs.report.training import table as training_table
-from xrgs.report.training import totals
+from xrgs.runtime.text import TextTable, to_text
 from xrgs.safeio.atomic import write_json, write_text
 from xrgs.safeio.sanitize import counted, for_csv, for_file_name, for_line, for_markdown
 
@@ -43,9 +35,7 @@ if TYPE_CHECKING:
     from xrgs.report.compare import Comparison
     from xrgs.report.external import External
 
-#: What a row of views.csv names its cell by.
-_VIEW_KEYS = ["cell_id", "scene", "label", "condition", "variant_seed", "seed"]
-#: Most ablations whose own tables are printed; the overview and the files have all.
+#: The most ablations that are printed with tables of their own; overview and files have all.
 _MAX_PRINTED_ABLATIONS = 6
 _MAX_PRINTED_MISSING = 20
 _PROVENANCE_KEYS = (
@@ -78,38 +68,38 @@ class Report:
 
 @dataclass(frozen=True)
 class Runs:
-    """What the report says of the trainings themselves, beside their results."""
+    """Tables of the trainings themselves, beside those of their results."""
 
     labels: dict[str, list[str]]
     """The labels of each condition's cells, in the sweep's order."""
     training: pd.DataFrame
-    """What training did in each cell: `xrgs.report.training.totals`."""
+    """What training did in each cell: `xrgs.report.work.totals`."""
     curves: pd.DataFrame
     """Quality during training: `xrgs.report.curves.joined`."""
     times: pd.DataFrame
     """Time and work to the base's final PSNR: `xrgs.report.curves.times`."""
     skipped: pd.DataFrame
-    """What each cell left out: `xrgs.report.skipped.skipped`."""
+    """What each cell left out: `xrgs.report.work.skipped`."""
 
     @classmethod
     def of(cls, sweep: Sweep, cells: pd.DataFrame) -> Runs:
-        """Gather the tables of a sweep whose compared cells are these."""
+        """Gather the tables of a sweep's compared cells."""
         cells = cells[~cells["cell_id"].isin(sweep.renders)]  # nothing is known of other programs
         labels = cells.groupby("condition", sort=False)["label"].unique()
         return cls(
             {str(name): list(of) for name, of in labels.items()},
-            totals(cells, sweep.training),
-            curves.joined(cells, sweep.curves),
-            curves.times(cells, sweep.curves),
-            skipped.skipped(cells, sweep.work),
+            work.totals(cells, sweep.done),
+            curves.joined(cells, sweep.done),
+            curves.times(cells, sweep.done),
+            work.skipped(cells, sweep.done),
         )
 
     def tables(self, base: str) -> list[TextTable]:
         """Return the tables of each condition, time to quality first."""
         kinds = (
             (partial(curves.table, base=base), self.times),
-            (partial(skipped.table, base=base), self.skipped),
-            (training_table, self.training),
+            (partial(work.skipped_table, base=base), self.skipped),
+            (work.totals_table, self.training),
         )
         return [make(found, of, name) for make, found in kinds for name, of in self.labels.items()]
 
@@ -151,13 +141,12 @@ def build(
     store = JoinedStore(tuple(map(Store, paths)))
     named = (sweep_ids,) if isinstance(sweep_ids, str) else sweep_ids
     ids = tuple(dict.fromkeys(named or store.latest_sweeps()))
-    record = store.sweep_record(ids)
-    rows = choice.rows(record["cells"], against)
-    sweep = read_cells(store, record["commands"], rows, METRICS)
+    commands, rows = store.sweep_records(ids)
+    sweep = read_cells(store, commands, choice.rows(rows, against))
     sweep = with_external(sweep, store, externals)
     store = replace(store, external=sweep.renders)
     sweep = replace(sweep, views=with_texture(store, sweep.cells, sweep.views))
-    tables = _tables(store, sweep, against)
+    tables = _tables(sweep, against)
     name = _folder_name(ids, choice, against, externals)
     folder = out if out else store.stores[0].reports / name
     try:
@@ -173,11 +162,10 @@ def build(
     return Report(text=text, folder=folder, files=tuple(sorted(written)))
 
 
-def _tables(store: JoinedStore, sweep: Sweep, against: str) -> Tables:
+def _tables(sweep: Sweep, against: str) -> Tables:
     """Compare the cells of a sweep."""
     comparison = compare(sweep.cells, METRICS, against)
-    context = contexts(store, sweep.cells, sweep.views)
-    return Tables(comparison, context, decided_by_one_view(comparison, sweep.views))
+    return Tables(comparison, contexts(sweep), decided_by_one_view(comparison, sweep.views))
 
 
 def _folder_name(
@@ -242,10 +230,11 @@ _FILES = (
 def _write_data(folder: Path, sweep: Sweep, comparison: Comparison, runs: Runs) -> None:
     """Write what was compared and measured, for other programs."""
     cells = comparison.cells
-    names = cells.drop_duplicates("cell_id")[_VIEW_KEYS]
+    names = cells.drop_duplicates("cell_id")[CELL_KEYS]
     views = names.merge(sweep.views, on="cell_id")
     metrics = [metric.name for metric in comparison.metrics]
-    order = [*RECORD_KEYS, "state", "reason", "protocol", "validation", "machine", *metrics]
+    order = [*RECORD_KEYS, "state", "reason", "steps", "long_side", "factor", "protocol"]
+    order += ["stale", "validation", "machine", *metrics]
     write_text(folder / "cells.csv", _csv(cells[order]))
     write_text(folder / "views.csv", _csv(views))
     write_text(folder / "training.csv", _csv(runs.training))
@@ -273,13 +262,9 @@ def _change_tables(tables: Tables) -> list[TextTable]:
 
 
 def _overviews(tables: Tables) -> list[TextTable]:
-    """Return the tables of all ablations: what changes, what the paper says, what gap is closed."""
-    comparison = tables.comparison
-    return [
-        *tables.overviews(),
-        *paper_tables(comparison, tables.contexts),
-        *gap_tables(comparison, tables.contexts),
-    ]
+    """Return the tables of all ablations: changes, the paper's numbers, shares of the gap."""
+    paper = paper_tables(tables.comparison, tables.contexts)
+    return [*tables.overviews(), *paper, *tables.gaps()]
 
 
 def _ablation_tables(tables: Tables) -> list[TextTable]:
@@ -323,7 +308,8 @@ def _picture_link(picture: Picture, folder: Path) -> str:
 
 
 def _provenance_table(sweep: Sweep) -> TextTable:
-    rows = tuple((key, "; ".join(sweep.provenance.get(key, ["n/a"]))) for key in _PROVENANCE_KEYS)
+    made = sweep.provenance
+    rows = tuple((key, "; ".join(made.get(key, ["n/a"]))) for key in _PROVENANCE_KEYS)
     return TextTable("Made with", ("", "values"), rows, "ll")
 
 
@@ -338,11 +324,12 @@ def _warnings(sweep: Sweep) -> list[str]:
     if others := ", ".join(_other_programs(sweep)):
         warnings.append(
             f"Renders of another program: {others}. Their PNGs are scored, and compared with the"
-            " cells of the lowest seed; of time, Gaussians and memory nothing is known."
+            " cells of the lowest seed; time, Gaussians and memory are not known."
         )
     unknown = sweep.cells.loc[sweep.cells["state"] == "unknown", "cell_id"].nunique()
     if unknown:
         warnings.append(f"{counted(unknown, 'cell')} can't be read now: run the report again.")
+    warnings += _stale_warning(sweep)
     shares = sorted({share for share in sweep.cells["validation"].dropna() if share > 0})
     if shares:
         listed = ", ".join(f"train.validation={share:g}" for share in shares)
@@ -359,10 +346,24 @@ def _warnings(sweep: Sweep) -> list[str]:
     arithmetics = sweep.provenance.get("arithmetic", ())
     if len(arithmetics) > 1:
         warnings.append(
-            f"The cells were trained with different arithmetic ({', '.join(arithmetics)}): beside"
-            " what is compared, they differ as cells of different seeds do."
+            f"The cells were trained with different arithmetic ({', '.join(arithmetics)}): they"
+            " differ as cells of different seeds do, beside what is compared."
         )
     return warnings
+
+
+def _stale_warning(sweep: Sweep) -> list[str]:
+    """Warn of scores that the installed code would compute otherwise, or that are missing."""
+    stale = sweep.cells.loc[sweep.cells["stale"] != "", ["cell_id", "stale"]].drop_duplicates()
+    if stale.empty:
+        return []
+    names = {name for text in stale["stale"] for name in text.split()}
+    scores = [m.label for m in METRICS if m.score and names & {m.name, PROTOCOL}]
+    return [
+        f"The scores of {counted(len(stale), 'cell')} are missing or of other code than is"
+        f" installed ({', '.join(scores)}): xrgs-store rescore computes them. A score is compared"
+        " between cells that the same code has scored."
+    ]
 
 
 def _other_programs(sweep: Sweep) -> list[str]:
@@ -372,7 +373,7 @@ def _other_programs(sweep: Sweep) -> list[str]:
 
 
 def _text(tables: Tables, warnings: list[str]) -> str:
-    """Return what a command prints: at most so many tables that they can be read."""
+    """Return the text that a command prints: no more tables than a terminal can show."""
     comparison = tables.comparison
     printed = _overviews(tables)
     if len(comparison.groups) <= _MAX_PRINTED_ABLATIONS:

@@ -1,14 +1,28 @@
-"""The paper's Tables 1 and 2 beside a comparison's own changes, sign by sign [xrgs, section 7]."""
+"""The paper's claims beside a sweep's own results: Tables 1 and 2, section 7.2, and the figures.
+
+Section 7.2 finds XR-GS better on textured scenes and the baseline better on simple ones, and does
+not say how texture is measured. Here it is the mean magnitude of the gradient of the scored
+photographs, which `xrgs.training.components.texture` defines [xrgs, section 7].
+"""
 
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING, NamedTuple
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, NamedTuple
 
+import numpy as np
+import pandas as pd
+
+from xrgs.capture import images
+from xrgs.capture.images import ImageError
+from xrgs.errors import StoreError, UnreadableError
 from xrgs.experiment.store import BASELINE
+from xrgs.experiment.trimming import check_images
+from xrgs.report.compare import is_amount
 from xrgs.report.context import context_of
 from xrgs.report.inference import MIN_VALUES
-from xrgs.report.render import TextTable, filled, titled
+from xrgs.report.markup import filled, titled
 from xrgs.report.writing import (
     ARROWS_NOTE,
     agreement,
@@ -17,15 +31,21 @@ from xrgs.report.writing import (
     interval,
     lacking,
     percent,
+    signed,
 )
+from xrgs.runtime.progress import progress
+from xrgs.runtime.text import TextTable
 from xrgs.safeio.sanitize import counted
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from collections.abc import Iterable, Mapping, Sequence
+
+    from numpy.typing import NDArray
 
     from xrgs.evaluation.metrics import Metric
     from xrgs.report.compare import Comparison
     from xrgs.report.context import Context
+    from xrgs.report.joined import JoinedStore
     from xrgs.report.writing import Change
 
 #: Labels of the full XR-GS, with one reading of section 5.4 each.
@@ -35,12 +55,13 @@ _LLFF = frozenset({"fern", "flower", "fortress", "horns", "orchids", "room", "tr
 
 
 class _Column(NamedTuple):
-    """A column of one of the paper's tables: changes in percent by the metric's name."""
+    """A column of one of the paper's tables."""
 
     title: str
     scenes: frozenset[str]
-    """The scene that it is of, and the one that takes its place here; those of Table 1."""
+    """The scenes of Table 1; for Table 2 the paper's scene, and the one in its place here."""
     changes: Mapping[str, float]
+    """Changes in percent by the metric's name."""
 
 
 _TABLE_1 = _Column(
@@ -86,13 +107,9 @@ _TABLE_2 = (
 def paper_tables(comparison: Comparison, contexts: Mapping[str, Context]) -> list[TextTable]:
     """Return the paper's tables beside the changes of full XR-GS from the baseline.
 
-    Args:
-        comparison: The pairs of cells.
-        contexts: How the cells of each condition were trained and scored.
-
     Returns:
-        A table for each condition and column of the paper of which the comparison has scenes: none
-        where nothing is full XR-GS, or the changes are from another label than the baseline.
+        A table for each condition and column of the paper with scenes that the comparison has. None
+        where no label is full XR-GS, or the changes are from another label than the baseline.
     """
     if comparison.base != BASELINE:
         return []
@@ -101,7 +118,7 @@ def paper_tables(comparison: Comparison, contexts: Mapping[str, Context]) -> lis
     for condition in dict.fromkeys(condition for _, condition in comparison.groups):
         context = context_of(contexts, condition).of_all
         if _LLFF.issuperset(comparison.scenes):
-            tables.append(_table(comparison, condition, _TABLE_1, means, "", context))
+            tables.append(_beside(comparison, condition, _TABLE_1, means, "", context))
         for column in _TABLE_2:
             for scene in sorted(column.scenes.intersection(comparison.scenes)):
                 here: dict[tuple[str, ...], Change] = {
@@ -109,11 +126,11 @@ def paper_tables(comparison: Comparison, contexts: Mapping[str, Context]) -> lis
                     for (label, of, name, metric), row in per_scene.items()
                     if name == scene
                 }
-                tables.append(_table(comparison, condition, column, here, scene, context))
+                tables.append(_beside(comparison, condition, column, here, scene, context))
     return [table for table in tables if table.rows]
 
 
-def _table(
+def _beside(
     comparison: Comparison,
     condition: str,
     column: _Column,
@@ -121,7 +138,7 @@ def _table(
     scene: str,
     context: str,
 ) -> TextTable:
-    """Return a column of the paper beside changes of one scene, or means over scenes."""
+    """Return a column of the paper beside the changes of a scene; of no scene, means over all."""
     scenes = 1 if scene else len(comparison.scenes)
     rows = [
         _row(label, metric, column.changes[metric.name], found, scenes)
@@ -163,16 +180,233 @@ def _row(label: str, metric: Metric, paper: float, found: Change, scenes: int) -
 
 
 def _verdict(found: Change, paper: float) -> str:
-    """Say whether a change has the sign that the paper gives.
-
-    Args:
-        found: The change with its interval.
-        paper: The paper's change in percent, which is not 0.
-
-    Returns:
-        `confirmed`, `refuted`, or `open`; the latter too where fewer than three values are behind
-        the interval.
-    """
+    """Say whether a change has the sign of the paper's: `confirmed`, `refuted` or `open`."""
     if math.isnan(found.low) or found.n < MIN_VALUES or found.low <= 0 <= found.high:
         return "open"
     return "confirmed" if (found.change > 0) == (paper > 0) else "refuted"
+
+
+_PHOTOGRAPH = ["variant_id", "split", "view"]
+
+
+def with_texture(store: JoinedStore, cells: pd.DataFrame, views: pd.DataFrame) -> pd.DataFrame:
+    """Return the scores of views with the texture of each view's photograph.
+
+    Args:
+        store: The stores that have the variants.
+        cells: `Sweep.cells`.
+        views: `Sweep.views`.
+
+    Returns:
+        The views, with `texture` in intensity per px of the photograph. It is NaN where the
+        photograph was removed on purpose or can't be read.
+    """
+    scored = cells.drop_duplicates("cell_id").set_index("cell_id")[["variant_id", "validation"]]
+    rows = views.join(scored, on="cell_id")
+    rows["split"] = np.where(rows["validation"] > 0, "train", "test")
+    photographs = rows[_PHOTOGRAPH].drop_duplicates()
+    bar = progress(photographs.to_numpy(), "reading photographs", "photograph", len(photographs))
+    photographs["texture"] = [_texture_of(store, *photograph) for photograph in bar]
+    found = rows.merge(photographs, on=_PHOTOGRAPH, how="left")["texture"]
+    return views.assign(texture=found.to_numpy(np.float64))
+
+
+def _texture_of(store: JoinedStore, variant_id: str, split: str, view: str) -> float:
+    """Return the mean magnitude of the gradient of one photograph; NaN where there is none."""
+    try:
+        variant = store.variant(variant_id)
+        check_images(variant.parent, variant.name)
+        return texture(images.read_png(variant / "images" / split / f"{view}.png"))
+    except (ImageError, StoreError, UnreadableError):
+        return math.nan
+
+
+def texture(image: NDArray[np.float32]) -> float:
+    """Return the mean magnitude of an image's gradient, in intensity per px.
+
+    It is the mean of `xrgs.training.components.texture.gradient_magnitude` without the last row and
+    column, which repeat others there. That function needs torch; this one does not.
+
+    Args:
+        image: [H, W, 3] in 0..1.
+
+    Returns:
+        The mean over the pixels, at most sqrt(2); NaN of an image that is one pixel high or wide.
+    """
+    if min(image.shape[:2]) < 2:
+        return math.nan
+    inner = image[:-1, :-1].astype(np.float64)
+    squared = (image[:-1, 1:] - inner) ** 2 + (image[1:, :-1] - inner) ** 2
+    return float(np.sqrt(squared.mean(axis=2)).mean())
+
+
+def texture_tables(
+    comparison: Comparison, views: pd.DataFrame, contexts: Mapping[str, Context]
+) -> list[TextTable]:
+    """Return a table for each condition that has at least three scenes of known texture.
+
+    Args:
+        comparison: The pairs of cells.
+        views: What `with_texture` returns.
+        contexts: How the cells of each condition were trained and scored.
+
+    Returns:
+        Tables with a row for each ablation and score: the change in percent of each scene, from the
+        least textured scene to the most textured one, and Spearman's rank correlation of texture
+        and change.
+    """
+    keys = comparison.cells.drop_duplicates("cell_id")[["cell_id", "condition", "scene"]]
+    rows = views[["cell_id", "view", "texture"]].merge(keys, on="cell_id")
+    by_scene = rows.groupby(["condition", "scene"], sort=False)["texture"].mean().dropna()
+    tables = []
+    for condition in by_scene.index.unique("condition"):
+        scenes = by_scene.loc[condition].sort_values(kind="stable")
+        if len(scenes) >= MIN_VALUES:
+            tables.append(_by_texture(comparison, contexts, condition, scenes))
+    return tables
+
+
+def _by_texture(
+    comparison: Comparison, contexts: Mapping[str, Context], condition: str, scenes: pd.Series
+) -> TextTable:
+    """Return the table of a condition; `scenes` has its textures by scene, in rising order."""
+    per_scene = by_key(comparison.per_scene)
+    rows: list[tuple[str, ...]] = []
+    metrics = [metric for metric in comparison.metrics if not is_amount(metric)]
+    for label in [name for name, of in comparison.groups if of == condition]:
+        for metric in metrics:
+            found = [per_scene.get((label, condition, name, metric.name)) for name in scenes.index]
+            values = [math.nan if row is None else row.change for row in found]
+            changes = pd.Series(values, scenes.index)
+            if changes.notna().any():
+                texts = (percent(change, metric) for change in changes)
+                rows.append((label, metric.label, *texts, _rank_correlation(scenes, changes)))
+    heads = tuple(f"{scene} ({value:.4f})" for scene, value in scenes.items())
+    return TextTable(
+        title=titled(f"Change from {comparison.base} by the texture of the scene, %", condition),
+        columns=("Ablation", "Metric", *heads, "rank correlation"),
+        rows=tuple(rows),
+        align="ll" + "r" * (len(scenes) + 1),
+        notes=(
+            "texture, in parentheses: mean magnitude of the gradient of the scored photographs,"
+            " intensity per px; the least textured scene first",
+            "rank correlation: Spearman's, of texture and change over the scenes; it describes"
+            " these scenes, and so few are no test",
+            ARROWS_NOTE,
+        ),
+        context=context_of(contexts, condition).of_scores,
+    )
+
+
+def _rank_correlation(textures: pd.Series, changes: pd.Series) -> str:
+    """Write the rank correlation over the scenes that have a change; empty of too few or equal."""
+    known = changes.notna()
+    if known.sum() < MIN_VALUES or changes[known].nunique() < 2 or textures[known].nunique() < 2:
+        return ""
+    return signed(textures[known].rank().corr(changes[known].rank()))
+
+
+class _Figure(NamedTuple):
+    """A figure of the paper: photograph, baseline and one ablation."""
+
+    name: str
+    shows: str
+    ablation: str
+    """The ablation that it shows, by its name in `conf/ablation/`."""
+    scenes: tuple[str, ...]
+    """The scene that it shows, and what it may be called here; empty for any."""
+    tag: str
+    """`LR` or `HR` for a training view; empty for a test view."""
+
+
+_FIGURES = (
+    _Figure(
+        "Figure 2",
+        "an LR training view, loss weighting and gradient scaling (fern)",
+        "loss_gradient",
+        ("fern",),
+        "LR",
+    ),
+    _Figure(
+        "Figure 3",
+        "an HR view, densification and pruning (orchids)",
+        "densify",
+        ("orchids",),
+        "HR",
+    ),
+    _Figure("Figure 4", "resolution-aware rendering", "render_scale", (), "LR"),
+    _Figure(
+        "Figure 5",
+        "an LR training view, consistency loss (dining room)",
+        "consistency",
+        ("dining", "dining_room"),
+        "LR",
+    ),
+    _Figure("Figure 6", "a novel view, consistency loss", "consistency", (), ""),
+    _Figure(
+        "Figure 7",
+        "the full method on a cluttered scene (dining room)",
+        "xrgs",
+        ("dining", "dining_room"),
+        "",
+    ),
+    _Figure(
+        "Figure 8",
+        "the full method on a single object (keychain)",
+        "xrgs",
+        ("keychain",),
+        "",
+    ),
+)
+
+
+@dataclass(frozen=True)
+class Counterpart:
+    """What the page has for a figure of the paper."""
+
+    name: str
+    shows: str
+    here: str
+    """What the page shows instead, or why it shows nothing."""
+    section: str = ""
+    """`views` or `training` where the page has it."""
+    place: int = 0
+    """The entry of that part of the content."""
+    label: str = ""
+    """The ablation to select there."""
+
+
+def counterparts(
+    labels: Iterable[str], views: Sequence[dict[str, Any]], training: Sequence[dict[str, Any]]
+) -> list[Counterpart]:
+    """Find for each figure of the paper what the page of a report shows of it.
+
+    Args:
+        labels: The ablations, as the page shows them.
+        views: The test views of the page, `xrgs.report.html.content.Content.views`.
+        training: Its training views.
+    """
+    known = set(labels)
+    return [_counterpart(figure, training if figure.tag else views, known) for figure in _FIGURES]
+
+
+def _counterpart(
+    figure: _Figure, entries: Sequence[dict[str, Any]], labels: set[str]
+) -> Counterpart:
+    if figure.ablation not in labels:
+        why = f"this sweep has no cell of it: xrgs-sweep +ablation={figure.ablation} trains it"
+        return Counterpart(figure.name, figure.shows, why)
+    fitting = [
+        place
+        for place, entry in enumerate(entries)
+        if entry.get("tag", "") == figure.tag
+        and any(arm["label"] == figure.ablation and "image" in arm for arm in entry["arms"])
+    ]
+    if not fitting:
+        return Counterpart(figure.name, figure.shows, "the page has no picture of it, see below")
+    own = [place for place in fitting if entries[place]["scene"] in figure.scenes]
+    place = (own or fitting)[0]
+    found = entries[place]
+    here = f"{found['scene']}, view {found['view']}, {figure.ablation}"
+    section = "training" if figure.tag else "views"
+    return Counterpart(figure.name, figure.shows, here, section, place, figure.ablation)

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from functools import partial
 from itertools import islice
 from typing import TYPE_CHECKING
 
+import numpy as np
 import pandas as pd
 
 from xrgs.capture import images
@@ -14,6 +16,7 @@ from xrgs.capture.images import ImageError
 from xrgs.errors import StoreError, UnreadableError
 from xrgs.experiment.trimming import check_images
 from xrgs.report.collect import ReportError
+from xrgs.report.compare import is_amount
 from xrgs.report.curves import means_over_runs, means_over_scenes
 from xrgs.report.figures import (
     MAX_ARMS,
@@ -25,17 +28,15 @@ from xrgs.report.figures import (
     side_by_side,
     trade_off,
 )
-from xrgs.report.render import titled
-from xrgs.report.sensitivity import sensitivities
+from xrgs.report.markup import titled
 from xrgs.runtime.progress import progress
 from xrgs.safeio.atomic import atomic_writer
 from xrgs.safeio.sanitize import for_file_name
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
+    from collections.abc import Callable, Iterable, Sequence
     from pathlib import Path
 
-    import numpy as np
     from numpy.typing import NDArray
 
     from xrgs.report.compare import Comparison
@@ -56,6 +57,10 @@ _CURVES = {"gaussians": "Gaussians", "loss": "loss of the step's view, as each r
 _MAX_PIXELS = 1 << 24
 #: The most pictures that are drawn without being asked for by name; each takes up to a second.
 _MAX_PICTURES = 100
+#: The fewest values of a setting that show how a change depends on it.
+_MIN_SETTINGS = 3
+#: The largest value of a setting that an axis can show: the space beside it needs more of float64.
+_MAX_SETTING = 1e100
 #: The most ablations that one figure of trade-offs can name.
 _MAX_ABLATIONS = 200
 
@@ -77,11 +82,12 @@ def draw(
     folder: Path,
     names: Sequence[str] | None = None,
 ) -> list[Picture]:
-    """Draw what each ablation trades, and views and training curves of each scene and ablation.
+    """Draw the pictures of a report.
 
-    For each condition the trade-offs are drawn where there are several ablations, quality during
-    training where it was evaluated, and changes over a setting that has three values. The other
-    pictures show the first condition and replicate, which their titles name.
+    Each condition has the trade-offs of its ablations where there are several, quality during
+    training where it was evaluated, and changes over each setting that has three values. Each scene
+    and ablation has views and training curves of the first condition and replicate, which the
+    titles name.
 
     Args:
         store: The stores with the photographs, renders and histories.
@@ -89,8 +95,8 @@ def draw(
         views: The table `Sweep.views`.
         quality: The table that `xrgs.report.curves.joined` returns.
         folder: The existing folder to write the files to.
-        names: Names of the pictures to draw, which are file names without suffix; None draws all,
-            but no more than the first 100.
+        names: File names without suffix of the pictures to draw; None draws all, but no more than
+            the first 100.
 
     Returns:
         The pictures, in the order of the tables.
@@ -126,7 +132,7 @@ def draw(
 
 
 def _same_views(base: pd.Series | None, ablation: pd.Series | None) -> tuple[pd.Series, pd.Series]:
-    """Return the PSNR of the views that both cells have, in their order; perhaps of none."""
+    """Return the PSNR of the views that both cells have, in their order; empty without any."""
     if base is None or ablation is None:
         return pd.Series(dtype=float), pd.Series(dtype=float)
     both = ablation.index[ablation.index.isin(base.index)]
@@ -178,11 +184,78 @@ def _sensitivities(comparison: Comparison) -> dict[str, _Drawing]:
     return drawings
 
 
+def sensitivities(comparison: Comparison, condition: str) -> dict[str, pd.DataFrame]:
+    """Return how the changes depend on each numeric setting that was swept.
+
+    The label of an ablation has the value of a swept setting in it: `consistency.weight=0.05`, and
+    `densify densify.lr_grow=2 densify.lr_prune=1` with two settings.
+
+    Args:
+        comparison: The pairs of cells and their means.
+        condition: The condition that the cells were run under.
+
+    Returns:
+        By the setting's key, for each that has at least three values: one row for each change in %,
+        with `level` (`pair`, `scene` or `mean`), `scene` (missing for a mean), `metric`, `change`,
+        `value` (of the setting) and `series` (the rest of the label: each is a curve).
+    """
+    changes = _changes(comparison, condition)
+    found = {}
+    for key, places in _settings(changes["label"].unique()).items():
+        rows = changes.merge(places, on="label")
+        values = rows.groupby("series")["value"].transform("nunique")
+        if (values >= _MIN_SETTINGS).any():
+            found[key] = rows[values >= _MIN_SETTINGS].sort_values("value", kind="stable")
+    return found
+
+
+def _changes(comparison: Comparison, condition: str) -> pd.DataFrame:
+    """Return the changes of pairs, of scenes and of the means in percent, in one table."""
+    pairs = comparison.pairs
+    amounts = {metric.name for metric in comparison.metrics if is_amount(metric)}
+    percent = np.where(
+        pairs["metric"].isin(amounts), 100 * np.expm1(pairs["effect"]), pairs["effect"]
+    )
+    levels = {
+        "pair": pairs.assign(change=percent),
+        "scene": comparison.per_scene.reset_index(),
+        "mean": comparison.means.reset_index().assign(scene=None),
+    }
+    columns = ["label", "scene", "metric", "change"]
+    tables = [
+        table.loc[table["condition"] == condition, columns].assign(level=level)
+        for level, table in levels.items()
+    ]
+    return pd.concat(tables, ignore_index=True)
+
+
+def _settings(labels: Iterable[str]) -> dict[str, pd.DataFrame]:
+    """Return the numeric settings of labels: by the key, `label`, `series` and `value`."""
+    found: dict[str, list[tuple[str, str, float]]] = {}
+    for label in labels:
+        words = label.split(" ")
+        for at, word in enumerate(words):
+            key, _, text = word.partition("=")
+            if abs(value := _number(text)) <= _MAX_SETTING:
+                rest = " ".join(words[:at] + words[at + 1 :])
+                found.setdefault(key, []).append((label, rest, value))
+    columns = ["label", "series", "value"]
+    return {key: pd.DataFrame(rows, columns=columns) for key, rows in found.items()}
+
+
+def _number(text: str) -> float:
+    """Return the number that a text is; NaN where it is none."""
+    try:
+        return float(text)
+    except ValueError:
+        return math.nan
+
+
 def _absolute(comparison: Comparison, condition: str) -> pd.DataFrame:
     """Return Gaussians and measured scores of each label and scene, as means over its runs.
 
-    The index is the label, the base's first. A cell that lacks a score, or the result of its base,
-    has no row; the tables say why.
+    The index is the label, and the base comes first. A cell that lacks a score or has no finished
+    base has no row; the tables say why.
     """
     cells = comparison.cells
     chosen = cells[(cells["condition"] == condition) & (cells["reason"] == "")]
@@ -232,7 +305,7 @@ def _not_drawn(title: str, why: str, _: Path) -> Picture:
 
 
 def median_view(base: pd.Series, ablation: pd.Series) -> str:
-    """Return the view whose change of PSNR is the median: neither the best nor the worst case.
+    """Return the view with the median change of PSNR: neither the best nor the worst case.
 
     Args:
         base: PSNR of the base in dB, indexed by view.
@@ -261,9 +334,9 @@ def _views(
     name = f"{view}.png"
     try:
         check_images(variant.parent, variant.name)
-        truth = _image(variant / "images" / split / name)
-        before = _image(store.render(pair["base_id"], view))
-        ablation = _image(store.render(pair["cell_id"], view))
+        truth = _image(store, variant / "images" / split / name)
+        before = _image(store, store.render(pair["base_id"], view))
+        ablation = _image(store, store.render(pair["cell_id"], view))
     except (ReportError, StoreError) as error:
         return Picture(title, None, str(error))
     panels = (
@@ -297,9 +370,8 @@ def _title(pair: pd.Series) -> str:
     return ", ".join(str(part) for part in parts if part)
 
 
-def _image(file: Path) -> NDArray[np.float32]:
+def _image(store: JoinedStore, file: Path) -> NDArray[np.float32]:
     try:
         return images.read_png(file, max_pixels=_MAX_PIXELS)
     except (UnreadableError, ImageError) as error:
-        # The path inside the store: the report is the same wherever the store is.
-        raise ReportError(f"{'/'.join(file.parts)} can't be read") from error
+        raise ReportError(f"{store.without_paths(str(file))} can't be read") from error

@@ -11,7 +11,8 @@ import pandas as pd
 
 from xrgs.report.compare import is_amount
 from xrgs.report.context import context_of
-from xrgs.report.render import TextTable, filled, titled
+from xrgs.report.inference import ALL_HR
+from xrgs.report.markup import filled, titled
 from xrgs.report.writing import (
     ARROWS_NOTE,
     LACKING_NOTE,
@@ -36,6 +37,7 @@ from xrgs.report.writing import (
     scatter_note,
     signed,
 )
+from xrgs.runtime.text import TextTable
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -44,21 +46,21 @@ if TYPE_CHECKING:
     from xrgs.report.compare import Comparison
     from xrgs.report.context import Context
 
-#: Metrics that differ between two runs of one program.
+#: Metrics that differ each time the same training is run.
 _NOISY = frozenset({"training_time_s", "render_time_ms", "peak_rss_bytes"})
-#: Longest list of replicates in a title; of more it has the number.
+#: The most replicates that a title lists; it has the number of more.
 _MAX_LISTED = 8
-#: The order of the scores in a compact table, and the arrows in its heads: those of papers.
+#: The order of the scores in a compact table and the arrows in its heads, as in papers.
 _PAPER_ORDER = {"psnr": 0, "ssim": 1, "lpips": 2}
 _DIRECTION = {True: "↑", False: "↓"}
 #: Keys of a row of the long table.
 _LEVEL = ["level", "label", "condition", "scene", "metric"]
-#: Columns of the long table that have the share of the gap to all_hr, by their names elsewhere.
+#: Columns of the long table with the share of the gap to all_hr, by their names in the averages.
 _GAP = {"change": "gap_closed_percent", "low": "gap_low", "high": "gap_high", "why": "gap_why"}
 
 
 class Tables:
-    """Builds every table of one comparison.
+    """Builds the tables of one comparison.
 
     Args:
         comparison: The pairs of cells and their means.
@@ -78,7 +80,7 @@ class Tables:
 
     @property
     def cautions(self) -> tuple[str, ...]:
-        """What is cautioned of any condition, each sentence once."""
+        """The cautions of all conditions, each sentence once."""
         return tuple(dict.fromkeys(text for one in self.contexts.values() for text in one.cautions))
 
     def _context(self, condition: str) -> Context:
@@ -141,13 +143,9 @@ class Tables:
     def unchanged(self, label: str, condition: str) -> str:
         """Say why an ablation has nothing to compare: it is the base, or gave the same results.
 
-        Args:
-            label: The ablation.
-            condition: The condition that it was run under.
-
         Returns:
             The end of a sentence that begins with the label; empty where something changed. Times
-            and the memory of the process always differ, and don't count.
+            and the memory of the process differ in every run, and don't count.
         """
         pairs, base = self.comparison.pairs, self.comparison.base
         here = pairs[(pairs["label"] == label) & (pairs["condition"] == condition)]
@@ -173,12 +171,7 @@ class Tables:
         )
 
     def mean(self, label: str, condition: str) -> TextTable:
-        """Return the paper's Table 1 for one ablation, with values, intervals and what they show.
-
-        Args:
-            label: The ablation.
-            condition: The condition that it was run under.
-        """
+        """Return the paper's Table 1 for one ablation, with values, intervals and readings."""
         base, scenes = self.comparison.base, len(self.scenes_of(label, condition))
         keys = ((label, condition, metric.name) for metric in self.comparison.metrics)
         found = [
@@ -240,12 +233,7 @@ class Tables:
         return interval_note(filter(None, found), one_each=counts == {1})
 
     def per_scene(self, label: str, condition: str) -> TextTable:
-        """Return a table with one column for each scene, failed ones too, and their mean.
-
-        Args:
-            label: The ablation.
-            condition: The condition that it was run under.
-        """
+        """Return a table with one column for each scene, failed ones too, and their mean."""
         scenes = self.comparison.scenes
         rows: list[tuple[str, ...]] = []
         for metric in () if self.unchanged(label, condition) else self.comparison.metrics:
@@ -272,11 +260,7 @@ class Tables:
         )
 
     def values(self, condition: str) -> TextTable:
-        """Return a table of each label's own values, means over the replicates that are done.
-
-        Args:
-            condition: The condition that the cells were run under.
-        """
+        """Return a table of each label's own values, means over the replicates that are done."""
         cells = self.comparison.cells
         done = cells[(cells["state"] == "done") & (cells["condition"] == condition)]
         labels = list(dict.fromkeys(cells.loc[cells["condition"] == condition, "label"]))
@@ -302,12 +286,8 @@ class Tables:
     def scores(self, condition: str) -> TextTable:
         """Return the compact table of papers: a row for each method, the scores scene by scene.
 
-        Args:
-            condition: The condition that the cells were run under.
-
-        Returns:
-            Means over the replicates that are done, and, of several scenes, the mean over all of
-            them, which a method that lacks one has not. The best of each column is bold.
+        The scores are means over the replicates that are done. With several scenes there is a mean
+        over all of them, n/a for a method that lacks one. The best of each column is bold.
         """
         cells = self.comparison.cells
         here = cells[cells["condition"] == condition]
@@ -349,6 +329,64 @@ class Tables:
         """Return the scores of views, in the order of papers."""
         known = [metric for metric in self.comparison.metrics if not is_amount(metric)]
         return sorted(known, key=lambda metric: _PAPER_ORDER.get(metric.name, len(_PAPER_ORDER)))
+
+    def gaps(self) -> list[TextTable]:
+        """Return a table for each condition that has all_hr and another ablation.
+
+        It has a row for each ablation and score: the share of the gap in percent, scene by scene
+        and in the mean over scenes, with Student's interval and how many pairs agree. Notes say why
+        a scene has no share, or a mean leaves out some of its pairs.
+        """
+        means, per_scene = by_key(self.comparison.gaps), by_key(self.comparison.gaps_per_scene)
+        conditions = dict.fromkeys(condition for _, condition, _ in means)
+        return [self._gap(condition, means, per_scene) for condition in conditions]
+
+    def _gap(
+        self,
+        condition: str,
+        means: dict[tuple[str, ...], Change],
+        per_scene: dict[tuple[str, ...], Change],
+    ) -> TextTable:
+        comparison, base, scenes = self.comparison, self.comparison.base, self.comparison.scenes
+        labels = [name for name, of in comparison.groups if of == condition and name != ALL_HR]
+        rows: list[tuple[str, ...]] = []
+        left_out: dict[str, list[str]] = {}  # each note, with the ablations that it is of
+        for label in labels:
+            for metric in comparison.metrics:
+                mean = means.get((label, condition, metric.name))
+                if mean is None:
+                    continue
+                found = [per_scene.get((label, condition, s, metric.name)) for s in scenes]
+                shares = [MISSING if row is None else signed(row.change) for row in found]
+                shares.append(f"{signed(mean.change)}{lacking(mean, len(scenes))}")
+                rows.append((label, metric.label, *shares, interval(mean), agreement(mean)))
+                for scene, row in zip(scenes, found, strict=True):
+                    if row is not None and row.why:
+                        what = "n/a" if math.isnan(row.change) else "pairs left out"
+                        note = f"{metric.label}, {scene}: {what} ({row.why})"
+                        left_out.setdefault(note, []).append(label)
+        here = [row for key, row in means.items() if key[1] == condition]
+        pairs = comparison.pairs[comparison.pairs["condition"] == condition]
+        one_each = set(pairs.groupby(["label", "scene"])["cell_id"].nunique()) == {1}
+        table = TextTable(
+            title=titled(f"Share of the gap from {base} to {ALL_HR} that is closed, %", condition),
+            columns=("Ablation", "Metric", *scenes, "mean", "95 % interval, %", "pairs that agree"),
+            rows=tuple(rows),
+            align="ll" + "r" * (len(scenes) + 3),
+            notes=(
+                f"100 (ablation - {base}) / ({ALL_HR} - {base}): 0 is {base}, 100 is {ALL_HR},"
+                " which trains on the originals of the degraded photographs",
+                *(
+                    note if len(of) == len(labels) else f"{note}: {', '.join(of)}"
+                    for note, of in left_out.items()
+                ),
+                *agreement_note(here),
+                *interval_note(here, one_each=one_each),
+                *[LACKING_NOTE] * any(lacking(row, len(scenes)) for row in here),
+            ),
+            context=self._context(condition).of_scores,
+        )
+        return filled(table)
 
     def missing(self) -> TextTable | None:
         """Return a table of the cells without results and why; None where there are none."""
@@ -411,9 +449,13 @@ def _best(values: list[float], metric: Metric) -> list[int]:
 
 
 def _mean_row(row: Change, metric: Metric, scenes: int, said: str) -> tuple[str, ...]:
-    """Return the row of a table of means that should be over so many scenes.
+    """Return the row of a change in the table of its ablation.
 
-    A reading that is said above the table is left out.
+    Args:
+        row: The change.
+        metric: The metric that changed.
+        scenes: How many scenes the mean should be over.
+        said: The reading that the table's context has, which is left out here.
     """
     read = reading(row, metric)
     return (
@@ -432,11 +474,9 @@ def _mean_row(row: Change, metric: Metric, scenes: int, said: str) -> tuple[str,
 
 
 def _listed(replicates: set[tuple[int, int]]) -> str:
-    """List the replicates of a mean; of many, say only how many there are.
+    """List the replicates of a mean, pairs (variant.seed, seed); count them where there are many.
 
-    Args:
-        replicates: Pairs (variant.seed, seed), which are named by `seed` where one draw of the HR
-            views, and so one variant, is all that a scene has.
+    They are named by `seed` alone where all have the same draw of HR views.
     """
     if len(replicates) > _MAX_LISTED:
         return f"{len(replicates)} replicates"

@@ -1,4 +1,4 @@
-"""How a change, its interval and what is known of them are written in a table."""
+"""Writes numbers, changes and intervals as tables show them, and the notes that explain them."""
 
 from __future__ import annotations
 
@@ -18,9 +18,9 @@ if TYPE_CHECKING:
 
 #: An arrow means improvement or degradation, as in the paper's tables, not larger or smaller.
 BETTER, WORSE, SAME = "↑", "↓", "="
-#: What stands for a number of cells of which none is done: they failed, or were not trained yet.
+#: The text of a number whose cells all failed, or were not trained yet.
 MISSING = "missing"
-#: What is said of a change without an interval.
+#: The reading of a change without an interval.
 NO_INTERVAL = "one replicate: no interval"
 ARROWS_NOTE = f"{BETTER} improvement, {WORSE} degradation, {SAME} no change at this precision"
 LACKING_NOTE = "(k of n): a mean over k of the n scenes"
@@ -30,7 +30,7 @@ _LARGE = 1e7
 
 
 class Change(NamedTuple):
-    """One row of `Comparison.means` or `Comparison.per_scene`: the fields are its columns."""
+    """One row of `Comparison.means` or `Comparison.per_scene`, whose columns are the fields."""
 
     base: float
     value: float
@@ -51,12 +51,10 @@ class Change(NamedTuple):
 
 
 def number(value: float, unit: str) -> str:
-    """Write a value with its unit, at a precision that fits its size.
+    """Write a value with its unit, at a precision that fits its size; NaN as n/a.
 
-    Args:
-        value: The value; NaN is written as n/a.
-        unit: Its unit, empty for none; bytes are written in MiB, and counts from ten million on
-            with three digits in units of 10^6 or 10^9: `17.9 G`.
+    Bytes are written in MiB, and counts from ten million on with three digits in units of 10^6 or
+    10^9: `17.9 G`.
     """
     if math.isnan(value):
         return "n/a"
@@ -75,11 +73,7 @@ def number(value: float, unit: str) -> str:
 
 
 def signed(value: float) -> str:
-    """Write a number with two decimals and a sign, zero without sign.
-
-    Args:
-        value: The number; NaN is written as n/a.
-    """
+    """Write a number with two decimals and a sign, zero without sign, NaN as n/a."""
     if math.isnan(value):
         return "n/a"
     text = f"{value:+,.2f}"
@@ -87,11 +81,7 @@ def signed(value: float) -> str:
 
 
 def arrow(change: float, metric: Metric) -> str:
-    """Return whether the printed change is an improvement, in the metric's own direction.
-
-    Args:
-        change: The change in percent.
-        metric: The metric that changed.
+    """Return whether a change in percent is an improvement, in the metric's own direction.
 
     Returns:
         `BETTER`, `WORSE`, `SAME` where the change is printed as 0.00, or a space for NaN.
@@ -104,21 +94,12 @@ def arrow(change: float, metric: Metric) -> str:
 
 
 def percent(change: float, metric: Metric) -> str:
-    """Write a change as the paper's tables do: `-44.57 ↑`.
-
-    Args:
-        change: The change in percent.
-        metric: The metric that changed.
-    """
+    """Write a change in percent as the paper's tables do: `-44.57 ↑`."""
     return f"{signed(change)} {arrow(change, metric)}"
 
 
 def reading(row: Change, metric: Metric) -> str:
-    """Say in words what the interval shows.
-
-    Args:
-        row: The change with its interval.
-        metric: The metric that changed.
+    """Say in words what the interval of a change shows.
 
     Returns:
         `better` or `worse` where the interval does not hold 0, `interval holds 0` where it does, or
@@ -147,8 +128,8 @@ def marked(row: Change | None, metric: Metric, scenes: int) -> str:
         scenes: How many scenes the mean should be over.
 
     Returns:
-        The change, a star where q is at most 0.05, and how many scenes the mean is over where some
-        are lacking.
+        The change, a star where q is at most 0.05, and the number of scenes behind the mean where
+        some are lacking.
     """
     if row is None:
         return MISSING
@@ -156,21 +137,12 @@ def marked(row: Change | None, metric: Metric, scenes: int) -> str:
 
 
 def lacking(row: Change, scenes: int) -> str:
-    """Write how many scenes a mean is over, ` (3 of 4)`; empty where it is over all or none.
-
-    Args:
-        row: The mean.
-        scenes: How many scenes it should be over.
-    """
+    """Write how many scenes a mean is over, ` (3 of 4)`; empty where it is over all or none."""
     return f" ({row.scenes} of {scenes})" if 0 < row.scenes < scenes else ""
 
 
 def false_discovery(row: Change) -> str:
-    """Write q of a change, `0.034 *`, with a star where it is at most 0.05; empty where it is NaN.
-
-    Args:
-        row: The change.
-    """
+    """Write q of a change, `0.034 *`, with a star where it is at most 0.05; empty for NaN."""
     if math.isnan(row.q):
         return ""
     return f"{'<0.001' if row.q < 0.001 else f'{row.q:.3f}'}{_star(row)}"
@@ -181,54 +153,34 @@ def _star(row: Change) -> str:
 
 
 def scatter(deviation: float) -> str:
-    """Write a standard deviation in percent, empty where there is none.
-
-    Args:
-        deviation: The deviation, or NaN.
-    """
+    """Write a standard deviation in percent; empty for NaN."""
     return "" if math.isnan(deviation) else f"{deviation:,.2f}"
 
 
 def interval(row: Change) -> str:
-    """Write the 95 % interval of a change in percent, empty where there is none.
-
-    Args:
-        row: The change with its interval.
-    """
+    """Write the 95 % interval of a change in percent; empty where there is none."""
     return "" if math.isnan(row.low) else f"{signed(row.low)} to {signed(row.high)}"
 
 
 def agreement(row: Change) -> str:
-    """Write how many of the pairs changed in the direction of their mean, `11 of 12`.
-
-    Args:
-        row: The change with the numbers of its pairs; one pair agrees with itself, which is empty.
-    """
+    """Write how many of several pairs changed in the direction of their mean, `11 of 12`."""
     return f"{row.agree} of {row.pairs}" if row.pairs > 1 else ""
 
 
 def agreement_note(rows: Iterable[Change]) -> tuple[str, ...]:
-    """Say what pairs that agree are; nothing where no row has several pairs.
-
-    Args:
-        rows: The changes in the table.
-    """
+    """Explain the column of pairs that agree; nothing where no row has several pairs."""
     if not any(map(agreement, rows)):
         return ()
     return ("pairs that agree: pairs of one scene and replicate that change as their mean does",)
 
 
 def scatter_note(rows: Iterable[Change]) -> tuple[str, ...]:
-    """Say what the standard deviations of a table are over; nothing where there are none.
-
-    Args:
-        rows: The changes in the table.
-    """
+    """Say what the standard deviations of a table are over; nothing where there are none."""
     if not any(scatter(row.scatter_replicates) or scatter(row.scatter_scenes) for row in rows):
         return ()
     return (
-        "sd replicates: standard deviation of the replicates, pooled within scenes; sd scenes: that"
-        " of the scenes' means",
+        "sd replicates: standard deviation of the replicates, pooled within scenes; sd scenes:"
+        " standard deviation of the scenes' means",
     )
 
 
@@ -249,11 +201,7 @@ def interval_note(rows: Iterable[Change], *, one_each: bool) -> tuple[str, ...]:
 
 
 def scale_note(comparison: Comparison) -> str:
-    """Say which metrics are compared by ratio and which by percentage.
-
-    Args:
-        comparison: The comparison with the metrics.
-    """
+    """Say which metrics are compared by ratio and which by percentage."""
     amounts = ", ".join(metric.label for metric in comparison.metrics if is_amount(metric))
     scores = ", ".join(metric.label for metric in comparison.metrics if not is_amount(metric))
     return (
@@ -263,12 +211,7 @@ def scale_note(comparison: Comparison) -> str:
 
 
 def false_discovery_note(comparison: Comparison, condition: str) -> tuple[str, ...]:
-    """Say what q is and which tests it is over; nothing where there are none.
-
-    Args:
-        comparison: The comparison.
-        condition: The condition of the table.
-    """
+    """Say what q is and which tests of a condition it is over; nothing where there are none."""
     of = comparison.means.index.get_level_values("condition") == condition
     tests = comparison.means.loc[of, "p"].count()
     if not tests:
@@ -281,10 +224,6 @@ def false_discovery_note(comparison: Comparison, condition: str) -> tuple[str, .
 
 
 def by_key(table: pd.DataFrame) -> dict[tuple[str, ...], Change]:
-    """Return the rows of a table of means by their keys.
-
-    Args:
-        table: One of the tables of means of a `Comparison`.
-    """
+    """Return the rows of one of a `Comparison`'s tables of means, by their keys."""
     rows = table[list(Change._fields)].itertuples(index=False)
     return {key: Change(*row) for key, row in zip(table.index, rows, strict=True)}

@@ -49,7 +49,7 @@ from typing import TYPE_CHECKING
 import msgspec
 
 from xrgs.runtime import processes
-from xrgs.runtime.progress import format_duration
+from xrgs.runtime.text import format_duration
 from xrgs.safeio.files import is_transient, read_bytes
 from xrgs.safeio.sanitize import for_line
 
@@ -94,14 +94,13 @@ class Owner(msgspec.Struct, frozen=True):
     boot: str
     """Id of the machine's boot and process namespace; process ids are valid within both."""
     pid: int
-    started: int
-    """Start of the process in clock ticks since boot, since process ids are reused; 0 if unknown.
-    """
+    started: float
+    """Seconds from the boot to the start of the process: process ids are given again."""
 
     @property
     def lives(self) -> bool:
         """Whether the process exists, suspended or not; only valid if it is `here`."""
-        return processes.started(self.pid) == self.started
+        return processes.lives(self.pid, self.started)
 
     @property
     def here(self) -> bool:
@@ -375,4 +374,4 @@ def _now(folder: Path) -> float:
 def _self() -> Owner:
     """Return this process as an owner. It is not cached, because a process may be forked."""
     pid = os.getpid()
-    return Owner(socket.gethostname(), processes.boot(), pid, processes.started(pid) or 0)
+    return Owner(socket.gethostname(), processes.boot(), pid, processes.started(pid))

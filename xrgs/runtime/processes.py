@@ -1,4 +1,4 @@
-"""What the system says of its processes, in /proc where it has that."""
+"""Processes of this machine: when they started, whether they live, and the memory they use."""
 
 from __future__ import annotations
 
@@ -7,76 +7,60 @@ from contextlib import suppress
 from functools import cache
 from pathlib import Path
 
-_PROC = Path("/proc")
-_STARTED, _SESSION = 19, 3  # fields of a process's `stat`, counted behind the name in brackets
+import psutil
 
-
-def proc_exists() -> bool:
-    """Tell whether this system has /proc."""
-    return (_PROC / "self" / "stat").exists()
+#: Seconds that two readings of one start may differ: boot times are rounded, and move with the
+#: clock. A process id is not given again so soon.
+_START_S = 2.0
 
 
 @cache
 def boot() -> str:
     """Return an id of this boot and this process namespace; empty where the system has none."""
     try:
-        boot_id = (_PROC / "sys/kernel/random/boot_id").read_text(encoding="ascii").strip()
-        return f"{boot_id} {(_PROC / 'self/ns/pid').readlink()}"
+        boot_id = Path("/proc/sys/kernel/random/boot_id").read_text(encoding="ascii").strip()
+        return f"{boot_id} {Path('/proc/self/ns/pid').readlink()}"
     except OSError:
         return ""
 
 
-def started(pid: int) -> int | None:
-    """Return when a process started, which tells it from others that had its id before.
+def started(pid: int) -> float:
+    """Return when a process started, in seconds after the boot.
 
-    A zombie (ended, and not waited for by its parent) is dead.
+    Raises:
+        psutil.NoSuchProcess: There is no such process.
+    """
+    # Not in seconds since the epoch: these change for a running process when the clock is set.
+    return round(float(psutil.Process(pid).create_time() - psutil.boot_time()), 2)
 
-    Args:
-        pid: The process's id.
 
-    Returns:
-        Clock ticks since the boot; 0 if the process exists and its start is unknown; None if it
-        does not exist or is dead.
+def lives(pid: int, start: float) -> bool:
+    """Return whether the process with this id and start exists, suspended or not.
+
+    A zombie, which has ended and whose parent has not waited for it, does not live.
     """
     try:
-        fields = _stat(_PROC / str(pid))
-    except OSError:
-        return None if proc_exists() else _start_unknown(pid)
-    return None if fields[0] in "ZX" else int(fields[_STARTED])
-
-
-def _start_unknown(pid: int) -> int | None:
-    try:
-        os.kill(pid, 0)
-    except ProcessLookupError:
-        return None
-    except PermissionError:
-        return 0
-    return 0
+        ended = psutil.Process(pid).status() in {psutil.STATUS_ZOMBIE, psutil.STATUS_DEAD}
+        return not ended and abs(started(pid) - start) < _START_S
+    except psutil.NoSuchProcess:
+        return False
 
 
 def resident_bytes(session: int) -> int:
     """Return the resident bytes of all processes of a session; shared pages count for each.
 
     Args:
-        session: The id of the session: that of the process that leads it.
+        session: The id of the session, which is the id of the process that leads it.
     """
-    page, total = os.sysconf("SC_PAGE_SIZE"), 0
-    for folder in _PROC.iterdir():
-        if folder.name.isdecimal():
-            with suppress(OSError, IndexError):  # it may end while it is read
-                if int(_stat(folder)[_SESSION]) == session:
-                    total += page * int((folder / "statm").read_text(encoding="ascii").split()[1])
+    total: int = 0
+    for pid in psutil.pids():
+        with suppress(ProcessLookupError, psutil.NoSuchProcess):  # it may end while it is read
+            if os.getsid(pid) == session:
+                total += psutil.Process(pid).memory_info().rss
     return total
-
-
-def _stat(process: Path) -> list[str]:
-    """Return the fields of a process's `stat` behind its name, which may contain anything."""
-    text = (process / "stat").read_text(encoding="utf-8", errors="replace")
-    return text.rpartition(")")[2].split()
 
 
 def offer_to_oom_killer() -> None:
     """Let the kernel kill this process before others when the machine runs out of memory."""
     with suppress(OSError):
-        (_PROC / "self" / "oom_score_adj").write_text("500", encoding="ascii")
+        Path("/proc/self/oom_score_adj").write_text("500", encoding="ascii")

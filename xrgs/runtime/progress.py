@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 from tqdm import tqdm
 
 from xrgs.runtime.streams import say
+from xrgs.runtime.text import format_duration
 from xrgs.safeio.atomic import write_json
 from xrgs.safeio.files import read_bytes
 from xrgs.safeio.sanitize import for_line
@@ -240,21 +241,3 @@ def log_line(text: str) -> None:
         text: The line, without its end; line breaks in it become spaces.
     """
     say(for_line(text), sys.stderr)
-
-
-def format_duration(seconds: float | None) -> str:
-    """Format a duration for people: `~40 s`, `~12 min`, `~3.5 h`, or `?`.
-
-    Args:
-        seconds: The duration; None where it is not known.
-
-    Returns:
-        The text.
-    """
-    if seconds is None:
-        return "?"
-    if seconds < 99.5:
-        return f"~{seconds:.0f} s"
-    if seconds < 99.5 * 60:
-        return f"~{seconds / 60:.0f} min"
-    return f"~{seconds / 3600:.1f} h"

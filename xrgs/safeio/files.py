@@ -106,7 +106,7 @@ def read_bytes(path: Path, max_bytes: int = MAX_BYTES) -> bytes:
         if status.st_size > max_bytes:
             why = f"{status.st_size} bytes, at most {max_bytes} are read"
             raise OSError(errno.EFBIG, why, str(path))
-        with open(descriptor, "rb", closefd=False) as stream:  # noqa: PTH123  of a descriptor
+        with open(descriptor, "rb", closefd=False) as stream:
             return stream.read(max_bytes)
     finally:
         os.close(descriptor)

@@ -1,8 +1,7 @@
-"""Removes cells and variants from a store, or their heavy files: plans first, then does it.
+"""Removes cells and variants from a store, or their heavy files, in two steps.
 
-A plan says what would be removed and how much it is; nothing is touched before `carry_out`. Each
-cell is removed or trimmed under its lock, so that a cell that is being trained, here or on another
-machine, is left alone.
+A plan lists what would be removed, with sizes. `carry_out` then removes it. Each cell is removed or
+trimmed under its lease, so that a cell in training, here or on another machine, is left alone.
 """
 
 from __future__ import annotations
@@ -18,25 +17,26 @@ from xrgs.capture.failures import FAILED_PREFIX
 from xrgs.errors import StoreError, XrgsError
 from xrgs.experiment import trimming
 from xrgs.experiment.attempts import remove_cell
+from xrgs.experiment.listing import size_of
 from xrgs.runtime import lease
+from xrgs.runtime.text import format_size
 from xrgs.safeio.files import is_name, remove_path
 from xrgs.safeio.records import list_folder
 from xrgs.safeio.sanitize import counted, for_line
-from xrgs.sweep.inventory import size_of, size_text
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator, Sequence
     from pathlib import Path
 
+    from xrgs.experiment.listing import CellRow
     from xrgs.experiment.store import Store
-    from xrgs.sweep.inventory import CellSummary
 
 #: What `gc` removes, by the names that choose it.
 GARBAGE = ("old_code", "failed", "aside", "variants")
-#: What an attempt leaves that was set aside, and what is left of a removal: names in `cells/` and
-#: `variants/`. The group is the name of the lock.
+#: Folders in `cells/` and `variants/` that were set aside, and that a killed removal has left. The
+#: groups are the name of the lease.
 _ASIDE = re.compile(r"\.?(?P<id>[^.]+)\.aside-\d+|\.(?P<rest>[^.]+)\.new-[0-9a-f]+")
-#: A variant that was built so few seconds ago may wait for the first cell of its sweep.
+#: Seconds for which a new variant is kept without a cell: a sweep may be about to begin one.
 _NEW_S = 3600.0
 _RUNNING = "variants are left alone: a sweep is running, and may need any of them"
 #: The most names that a plan lists of each kind.
@@ -52,10 +52,10 @@ class Item:
     name: str
     """Its name for people."""
     bytes: int
-    lock: str | None
-    """The name of the lock that it is done under; None where there is none to hold."""
+    lease: str | None
+    """The name of the lease to hold while it is removed; None for none."""
     act: Callable[[], str]
-    """Does it; returns why it was left, or nothing."""
+    """Removes it; returns why it was left, or an empty text."""
 
 
 @dataclass(frozen=True)
@@ -66,46 +66,41 @@ class Plan:
     """`remove` or `trim`."""
     items: tuple[Item, ...]
     notes: tuple[str, ...] = ()
-    """What is left alone, and what else there is to know."""
+    """Lines on what is left alone, and why."""
 
     @property
     def total(self) -> str:
-        """How much it is, for people: `cells of old code (12), variants (3): 340 MB`."""
+        """A line such as `cells of old code (12), variants (3): 340 MB`."""
         counts = Counter(item.kind for item in self.items)
-        size = size_text(sum(item.bytes for item in self.items))
+        size = format_size(sum(item.bytes for item in self.items))
         return f"{', '.join(f'{kind} ({count})' for kind, count in counts.items())}: {size}"
 
     def __str__(self) -> str:
         lines = [f"to {self.verb}: {self.total}" if self.items else f"nothing to {self.verb}"]
         for kind in dict.fromkeys(item.kind for item in self.items):
             of_kind = [item for item in self.items if item.kind == kind]
-            lines.append(f"{kind}: {size_text(sum(item.bytes for item in of_kind))}")
-            lines += [f"  {item.name}  {size_text(item.bytes)}" for item in of_kind[:_MAX_NAMED]]
+            lines.append(f"{kind}: {format_size(sum(item.bytes for item in of_kind))}")
+            lines += [f"  {item.name}  {format_size(item.bytes)}" for item in of_kind[:_MAX_NAMED]]
             more = len(of_kind) - _MAX_NAMED
             lines += [f"  and {more} more"] if more > 0 else []
         return "\n".join(map(for_line, [*lines, *self.notes]))
 
 
-def plan_removal(store: Store, cells: Sequence[CellSummary]) -> Plan:
-    """Plan to remove cells.
-
-    Args:
-        store: The store.
-        cells: The cells; those that are being trained are left alone.
-    """
+def plan_removal(store: Store, cells: Sequence[CellRow]) -> Plan:
+    """Plan to remove cells; cells in training are left alone."""
     chosen, notes = _without_running(cells)
     return Plan("remove", tuple(_removals(store, "cells", chosen)), (*notes, *_recorded(chosen)))
 
 
 def plan_trim(
-    store: Store, cells: Sequence[CellSummary], chosen: Sequence[CellSummary], *, variants: bool
+    store: Store, cells: Sequence[CellRow], chosen: Sequence[CellRow], *, variants: bool
 ) -> Plan:
     """Plan to remove the Gaussians and renders of done cells, and the images of their variants.
 
     Args:
         store: The store.
         cells: All cells of the store.
-        chosen: The cells to trim; those that are not done are left alone.
+        chosen: The cells to trim; unfinished ones are left alone.
         variants: Also remove the images of the chosen cells' variants, where all cells of the store
             that use them are done, and no sweep is running.
     """
@@ -134,7 +129,7 @@ def plan_trim(
     return Plan("trim", tuple(items), tuple(notes))
 
 
-def plan_gc(store: Store, cells: Sequence[CellSummary], of: Sequence[str]) -> Plan:
+def plan_gc(store: Store, cells: Sequence[CellRow], of: Sequence[str]) -> Plan:
     """Plan to remove what no sweep of the installed code needs.
 
     Args:
@@ -161,8 +156,8 @@ def plan_gc(store: Store, cells: Sequence[CellSummary], of: Sequence[str]) -> Pl
         names = [n for n in _names(store.variants) if n.startswith(FAILED_PREFIX)]
         items += _folders("failed scenes", store.variants, names)
     if "aside" in of:
-        items += _aside_items(store.cells_folder, locked=True)
-        items += _aside_items(store.variants, locked=False)
+        items += _aside_items(store.cells_folder, leased=True)
+        items += _aside_items(store.variants, leased=False)
     notes = [*_recorded([cell for cell in cells if cell.id in gone])]
     if "variants" in of:
         found, why = _orphans(store, cells, gone)
@@ -172,20 +167,16 @@ def plan_gc(store: Store, cells: Sequence[CellSummary], of: Sequence[str]) -> Pl
 
 
 def carry_out(store: Store, plan: Plan) -> tuple[int, list[str]]:
-    """Do what a plan says, each thing for itself.
-
-    Args:
-        store: The store.
-        plan: The plan.
+    """Remove what a plan lists; an item that can't be removed hides no other.
 
     Returns:
-        The number of bytes that were freed, and a line for each thing that was left, with the
+        The number of bytes that were freed, and a line for each item that was left, with the
         reason.
     """
     freed, left = 0, []
     for item in plan.items:
         try:
-            why = _under_lock(store, item)
+            why = _under_lease(store, item)
         except (OSError, StoreError) as error:
             why = str(error)
         if why:
@@ -195,19 +186,19 @@ def carry_out(store: Store, plan: Plan) -> tuple[int, list[str]]:
     return freed, left
 
 
-def _under_lock(store: Store, item: Item) -> str:
-    if item.lock is None:
+def _under_lease(store: Store, item: Item) -> str:
+    if item.lease is None:
         return item.act()
-    lock = lease.acquire(store.leases, item.lock)
-    if lock is None:
+    held = lease.acquire(store.leases, item.lease)
+    if held is None:
         return "it is left: a sweep is training it"
     try:
         return item.act()
     finally:
-        lock.release()
+        held.release()
 
 
-def _without_running(cells: Iterable[CellSummary]) -> tuple[list[CellSummary], list[str]]:
+def _without_running(cells: Iterable[CellRow]) -> tuple[list[CellRow], list[str]]:
     """Return the cells that are not being trained, and a note of the others."""
     cells = list(cells)
     idle = [cell for cell in cells if cell.state.name != "running"]
@@ -215,28 +206,25 @@ def _without_running(cells: Iterable[CellSummary]) -> tuple[list[CellSummary], l
     return idle, [f"left alone, being trained: {counted(running, 'cell')}"] if running else []
 
 
-def _recorded(cells: Sequence[CellSummary]) -> list[str]:
+def _recorded(cells: Sequence[CellRow]) -> list[str]:
     """Return a note of the done cells whose numbers reports of sweeps would lose."""
-    done = [cell for cell in cells if cell.state.name == "done" and cell.names.sweeps]
+    done = [cell for cell in cells if cell.state.name == "done" and cell.sweeps]
     if not done:
         return []
-    sweeps = {sweep_id for cell in done for sweep_id in cell.names.sweeps}
+    sweeps = {sweep_id for cell in done for sweep_id in cell.sweeps}
     return [
         f"done, and in reports of {counted(len(sweeps), 'sweep')}: {counted(len(done), 'cell')}"
     ]
 
 
-def _removals(store: Store, kind: str, cells: Iterable[CellSummary]) -> Iterator[Item]:
+def _removals(store: Store, kind: str, cells: Iterable[CellRow]) -> Iterator[Item]:
     for cell in cells:
         act = partial(_remove_cell, store, cell)
-        yield Item(kind, f"{cell.name}, {cell.state.name}", cell.bytes() or 0, cell.id, act)
+        yield Item(kind, f"{cell.name}, {cell.state.name}", cell.bytes or 0, cell.id, act)
 
 
-def _remove_cell(store: Store, cell: CellSummary) -> str:
-    """Remove a cell whose lock is held, unless another sweep has changed it since it was looked at.
-
-    The folder of a store that was moved since is looked for in vain, and nothing is made there.
-    """
+def _remove_cell(store: Store, cell: CellRow) -> str:
+    """Remove a cell whose lease is held, unless its state has changed since the plan."""
     state = store.cell(cell.id).state(verify=False).name
     if state == "absent":
         return "it is no longer there"
@@ -246,14 +234,14 @@ def _remove_cell(store: Store, cell: CellSummary) -> str:
     return ""
 
 
-def _heavy_bytes(cell: CellSummary) -> int:
+def _heavy_bytes(cell: CellRow) -> int:
     try:
         return cell.folder.heavy_bytes()
     except OSError:
         return 0
 
 
-def _trim_cell(cell: CellSummary) -> str:
+def _trim_cell(cell: CellRow) -> str:
     cell.folder.trim()
     return ""
 
@@ -279,21 +267,21 @@ def _folders(kind: str, above: Path, names: Iterable[str]) -> Iterator[Item]:
         yield Item(kind, f"{above.name}/{name}", size_of(folder) or 0, None, act)
 
 
-def _aside_items(above: Path, *, locked: bool) -> Iterator[Item]:
-    """Yield the folders that were set aside; those of cells are removed under the cell's lock."""
+def _aside_items(above: Path, *, leased: bool) -> Iterator[Item]:
+    """Yield the folders that were set aside; a cell's lease is held while its folder is removed."""
     for name in _names(above):
         found = _ASIDE.fullmatch(name)
         if found is None:
             continue
-        lock = (found["id"] or found["rest"]) if locked else None
+        held = (found["id"] or found["rest"]) if leased else None
         folder = above / name
         act = partial(_remove_folder, folder)
         shown = f"{above.name}/{name}"
-        yield Item("folders that were set aside", shown, size_of(folder) or 0, lock, act)
+        yield Item("folders that were set aside", shown, size_of(folder) or 0, held, act)
 
 
 def _orphans(
-    store: Store, cells: Sequence[CellSummary], gone: set[str]
+    store: Store, cells: Sequence[CellRow], gone: set[str]
 ) -> tuple[list[Item], list[str]]:
     """Return the variants of which no cell is left, and why others are left alone.
 

@@ -1,13 +1,14 @@
 """Estimates what a cell will take from the nearest finished cell of the store.
 
-The nearest cell is the one whose config differs in the fewest keys, on the same variant and kind of
-processor where there is one. Its seconds, memory and disk are scaled by steps, pixels and the
-budget of Gaussians. A store without finished cells gives no estimate.
+The config of the nearest cell differs in the fewest keys; another variant, processor or backend
+counts as several keys. Seconds, memory and disk are scaled by steps, pixels and the budget of
+Gaussians. A store without finished cells gives no estimate.
 """
 
 from __future__ import annotations
 
 import heapq
+from contextlib import suppress
 from dataclasses import asdict, dataclass
 from datetime import datetime
 from functools import cache
@@ -32,15 +33,14 @@ _MAX_CELLS = 500
 #: How many times longer the torch backend takes for a training step than the native one: rendering
 #: and loss, forward and backward, of 10,000 to 100,000 Gaussians took 32 to 69 times as long.
 TORCH_SLOWDOWN = 50.0
-#: Seconds beyond which the time of a cell beside its training is none: a store that was copied has
-#: other dates.
+#: The most seconds that count as loading and scoring. A store that was copied has other dates.
 _MAX_OVERHEAD_S = 600.0
 #: Keys that count as this many differing ones, in the distance of two cells.
 _OTHER_VARIANT, _OTHER_PROCESSOR, _OTHER_BACKEND = 3, 5, 100
 
 
 class _Sizes(NamedTuple):
-    """What the files of a variant tell of the views that a cell trains on."""
+    """Sizes of the training views of a cell."""
 
     pixels: float
     """Mean over the training views."""
@@ -55,7 +55,7 @@ class Cost:
     seconds: float
     """Time from its start to its end: training, loading and scoring."""
     scoring_s: float
-    """Those of its seconds that come after its last step."""
+    """Seconds of the final scoring."""
     memory_bytes: float
     """Resident memory of its process where that is largest."""
     disk_bytes: float
@@ -81,7 +81,7 @@ class _Finished:
 
 
 class CostEstimator:
-    """Estimates what cells will take from the finished cells of a store."""
+    """Estimates the cost of cells from the finished cells of a store."""
 
     def __init__(self, store: Store) -> None:
         """Read the newest finished cells; what can't be read is left out."""
@@ -99,12 +99,8 @@ class CostEstimator:
         return len(self._finished)
 
     def _read(self, cell: CellFolder) -> _Finished:
-        conf, status, summary, made = (
-            cell.config(),
-            cell.status(),
-            cell.summary(),
-            cell.provenance(),
-        )
+        conf, status = cell.config(), cell.status()
+        summary, made = cell.summary(), cell.provenance()
         variant_id = cell.identity().variant
         ended, started = cell.status_file.stat().st_mtime, datetime.fromisoformat(made.started)
         overhead = ended - started.timestamp() - summary.training_time_s
@@ -146,9 +142,10 @@ class CostEstimator:
             )
 
         past = min(self._finished, key=distance)
-        sizes = past.sizes
+        sizes = past.sizes  # of a variant that is not built yet, the nearest known ones
         if variant_id is not None:
-            sizes = _sizes(self._store.variants, variant_id, conf.train.views)
+            with suppress(StoreError):
+                sizes = _sizes(self._store.variants, variant_id, conf.train.views)
         return _scaled(past, conf, sizes, threads, backend)
 
 
@@ -165,9 +162,8 @@ def _scaled(past: _Finished, conf: Conf, sizes: _Sizes, threads: int, backend: s
     training = past.training_s * conf.train.steps / past.steps * step
     training *= max(1, past.threads) / max(1, threads)
     overhead = past.overhead_s * pixels
-    return Cost(
-        training + overhead, overhead, past.memory_bytes * step, past.disk_bytes * gaussians
-    )
+    seconds = training + overhead
+    return Cost(seconds, overhead, past.memory_bytes * step, past.disk_bytes * gaussians)
 
 
 def _settings(conf: Conf) -> frozenset[tuple[str, str]]:

@@ -1,9 +1,9 @@
-"""Hands a sweep's cells to Hydra's launcher, whichever is configured, and copes with its failures.
+"""Hands a sweep's cells to Hydra's launcher, and goes on when the launcher breaks.
 
-A launcher runs jobs here or elsewhere, in processes with a working folder of their own. A job is
+A launcher runs jobs here or elsewhere, in processes with working folders of their own. A job is
 given the session's folder, the store and the id of its cell. The cell's folder in the store holds
-the config, with full paths, the rasterizer and the job's share of the cores. What has become of a
-cell is read from the store: a launcher that breaks loses its answers, but not the sweep.
+the config, with full paths, the rasterizer and the job's share of the cores. The outcome of a cell
+is read from the store, so that a launcher that breaks loses its answers and nothing else.
 """
 
 from __future__ import annotations
@@ -12,6 +12,7 @@ import copy
 import os
 import time
 from collections import Counter
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
@@ -28,7 +29,6 @@ from xrgs.runtime.machine import usable_cores
 from xrgs.runtime.progress import log_line
 from xrgs.safeio.sanitize import counted, for_line
 from xrgs.splat.backend import resolve_backend
-from xrgs.sweep import presence
 from xrgs.sweep.jobs import worker
 from xrgs.sweep.jobs.job import INTERRUPTED, STOPPED, UNKNOWN
 from xrgs.sweep.plan import expected_length
@@ -45,11 +45,11 @@ if TYPE_CHECKING:
     from xrgs.experiment.store import Store
     from xrgs.sweep.plan import PlannedCell
 
-#: Outcome of a job whose launcher gave no answer; the cell may be launched again.
+#: Outcome of a job without an answer; the cell may be launched again.
 LOST = "lost"
-#: A cell that was begun and lost so many times is not launched again.
+#: A cell is not launched again after so many jobs that began it and gave no answer.
 _MAX_LOSSES = 3
-#: Seconds between two polls of jobs that a broken launcher has left behind.
+#: Seconds between two looks at the jobs that a broken launcher has left behind.
 _POLL_S = 2.0
 
 
@@ -60,66 +60,85 @@ class Capacity:
     at_once: int | None = None
     """Jobs that run at the same time on this machine; None if the launcher decides."""
     cores: int = 0
-    """Cores of a job; 0 divides this machine's cores among the jobs that run at the same time, or
-    leaves the number to the job."""
+    """Cores of a job. With 0, the jobs that run at the same time share the cores of this machine;
+    where the launcher decides how many run, a job takes every core that it finds."""
     batch: int | None = None
     """Jobs that may be given to the launcher at once; None for any number."""
     settings: Mapping[str, Any] = field(default_factory=dict)
-    """Settings of the launcher that follow from this, by their keys in `hydra.launcher`."""
+    """Settings to change in `hydra.launcher`, by their keys there."""
 
     def threads(self, jobs: int, machine: int) -> int:
-        """Return the threads of a job.
+        """Return the threads of each job of a batch; 0 for every core that the job finds.
 
         Args:
             jobs: Number of jobs of the batch.
             machine: Cores of this machine.
-
-        Returns:
-            Number of threads; 0 lets the job use every core that it finds.
         """
         if self.cores or self.at_once is None:
             return self.cores
         return max(1, machine // min(self.at_once, jobs))
 
 
+def _basic(_: DictConfig, threads: int, _machine: int) -> Capacity:
+    return Capacity(at_once=1, cores=threads)
+
+
+def _joblib(launcher: DictConfig, threads: int, machine: int) -> Capacity:
+    jobs = int(launcher["n_jobs"])
+    if jobs == 0:
+        raise XrgsError("hydra.launcher.n_jobs=0: give the number of cells to train at once")
+    if jobs < 0:  # joblib's -1 means one job per core, -2 one fewer
+        jobs = max(1, (machine + 1 + jobs) // max(1, threads))
+    # Cells that turn out to be done end at once. From such short jobs joblib would learn to hand
+    # several jobs to a worker in one batch, which then run one after another.
+    return Capacity(jobs, threads, settings={"n_jobs": jobs, "batch_size": 1})
+
+
+def _submitit_local(launcher: DictConfig, threads: int, machine: int) -> Capacity:
+    cores = launcher["cpus_per_task"] or threads
+    jobs = max(1, machine // max(1, cores))
+    return Capacity(jobs, cores, batch=jobs)  # submitit starts every job of a batch at once
+
+
+def _submitit_slurm(launcher: DictConfig, threads: int, _machine: int) -> Capacity:
+    cores = launcher["cpus_per_task"] or threads or 1
+    return Capacity(cores=cores, settings={"cpus_per_task": cores})
+
+
+def _ray(launcher: DictConfig, threads: int, _machine: int) -> Capacity:
+    cores = max(1, int(launcher["ray"]["remote"].get("num_cpus", threads or 1)))
+    settings: dict[str, Any] = {"ray.remote.num_cpus": cores}
+    if launcher["ray"]["init"].get("address") or os.environ.get("RAY_ADDRESS"):
+        # The launcher would fill this in, and Ray refuses it for a cluster that runs already.
+        settings["ray.init.object_store_memory"] = None
+    return Capacity(cores=cores, settings=settings)
+
+
+#: The capacity of each launcher, by its class: a function of `hydra.launcher`, the threads that a
+#: cell asks for (0 for no preference) and the cores of this machine. Another launcher is one
+#: function and one line.
+CAPACITIES: dict[str, Callable[[DictConfig, int, int], Capacity]] = {
+    "BasicLauncher": _basic,
+    "JoblibLauncher": _joblib,
+    "LocalLauncher": _submitit_local,
+    "SlurmLauncher": _submitit_slurm,
+    "RayLauncher": _ray,
+}
+
+
 def capacity(launcher: DictConfig, threads: int, machine: int) -> Capacity:
-    """Return how many jobs a launcher is to run at once, from its configuration.
+    """Return how many jobs a launcher runs at once, and with how many cores.
 
     Args:
-        launcher: `hydra.launcher`.
+        launcher: `hydra.launcher`. One that is not in `CAPACITIES` decides by itself.
         threads: Threads of a cell that the user asks for; 0 for no preference.
         machine: Cores that this process may use.
 
     Raises:
         XrgsError: The launcher's configuration is invalid.
     """
-    kind = str(launcher["_target_"]).rpartition(".")[2]
-    if kind == "BasicLauncher":
-        return Capacity(at_once=1, cores=threads)
-    if kind == "JoblibLauncher":
-        jobs = int(launcher["n_jobs"])
-        if jobs == 0:
-            raise XrgsError("hydra.launcher.n_jobs=0: give the number of cells to train at once")
-        if jobs < 0:  # joblib's -1 means one job per core, -2 one fewer
-            jobs = max(1, (machine + 1 + jobs) // max(1, threads))
-        # Cells that turn out to be done end at once; from such short jobs joblib would learn to
-        # hand several jobs to a worker in one batch, which then run one after another.
-        return Capacity(jobs, threads, settings={"n_jobs": jobs, "batch_size": 1})
-    if kind == "LocalLauncher":
-        cores = launcher["cpus_per_task"] or threads
-        jobs = max(1, machine // max(1, cores))
-        return Capacity(jobs, cores, batch=jobs)  # submitit starts every job of a batch at once
-    if kind == "SlurmLauncher":
-        cores = launcher["cpus_per_task"] or threads or 1
-        return Capacity(cores=cores, settings={"cpus_per_task": cores})
-    if kind == "RayLauncher":
-        cores = max(1, int(launcher["ray"]["remote"].get("num_cpus", threads or 1)))
-        settings: dict[str, Any] = {"ray.remote.num_cpus": cores}
-        if launcher["ray"]["init"].get("address") or os.environ.get("RAY_ADDRESS"):
-            # The launcher would fill this in, and Ray refuses it for a cluster that runs already.
-            settings["ray.init.object_store_memory"] = None
-        return Capacity(cores=cores, settings=settings)
-    return Capacity(cores=threads)
+    known = CAPACITIES.get(str(launcher["_target_"]).rpartition(".")[2])
+    return known(launcher, threads, machine) if known else Capacity(cores=threads)
 
 
 def check(config: DictConfig, cell: DictConfig | None = None) -> None:
@@ -147,8 +166,8 @@ def check(config: DictConfig, cell: DictConfig | None = None) -> None:
 class _JobConfigLoader:
     """Gives each job Hydra's own settings and what it trains, without composing any config.
 
-    Launchers ask the config loader for a job's config, on the machine that runs the job. The plan
-    has composed the cell's config already, so that Hydra's loader would compose it a second time.
+    Launchers ask the config loader for a job's config, on the machine that runs the job. Hydra's
+    loader would compose the cell's config a second time.
     """
 
     def load_sweep_config(self, master_config: DictConfig, overrides: list[str]) -> DictConfig:
@@ -184,13 +203,7 @@ class Launches:
     """The launches of one call of `xrgs-sweep`."""
 
     def __init__(self, context: HydraContext, task: TaskFunction, config: DictConfig) -> None:
-        """Prepare to launch; nothing is written before the first launch.
-
-        Args:
-            context: Hydra's context of this call.
-            task: The function that Hydra calls for each job.
-            config: The sweep's config, with its `hydra` node.
-        """
+        """Prepare to launch, as `Study`; nothing is written before the first launch."""
         self._name = str(config.hydra.runtime.choices["hydra/launcher"])
         loader = cast("ConfigLoader", _JobConfigLoader())  # launchers call nothing else of it
         self._context = HydraContext(loader, context.callbacks)
@@ -229,8 +242,8 @@ class Launches:
             store: The store.
 
         Returns:
-            The outcome of each cell's job by the cell's id: what `run_job` returned, or `LOST` if
-            the cell may be launched again, or the state in which its last loss left it.
+            The outcome of each cell's job by the cell's id: what `run_job` returned, `LOST` if the
+            cell may be launched again, or the cell's state after its last loss.
 
         Raises:
             XrgsError: The launcher can't be used, or begins no job; or the store is gone.
@@ -250,7 +263,7 @@ class Launches:
         return outcomes
 
     def _batches(self, cells: Sequence[PlannedCell], size: int) -> list[Sequence[PlannedCell]]:
-        """Divide cells into batches; suspects of having broken a launcher come last, alone."""
+        """Divide cells into batches; cells that may have broken a launcher come last, alone."""
         others = [cell for cell in cells if cell.cell_id not in self._suspects]
         suspects = [cell for cell in cells if cell.cell_id in self._suspects]
         return [
@@ -276,7 +289,7 @@ class Launches:
             )
             returned = launcher.launch(overrides, first)
         except Exception as error:
-            presence.check(store)
+            store.check_not_gone()
             return self._after_loss(cells, error, store)
         return {
             str(cell.cell_id): self._outcome(cell, job, store)
@@ -284,13 +297,10 @@ class Launches:
         }
 
     def _outcome(self, cell: PlannedCell, job: JobReturn, store: Store) -> str:
-        """Return what `run_job` returned. An exception in a job concerns its own cell alone.
-
-        submitit raises in a job that ran out of time, when it has been requeued often enough.
-        """
+        """Return what `run_job` returned. An exception in a job concerns its own cell alone."""
         try:
             answer = str(job.return_value)
-        except Exception as error:
+        except Exception as error:  # submitit raises for a job that was out of time too often
             log_line(f"{cell.name}: {_first_line(error)}")
         else:
             if answer == INTERRUPTED:
@@ -304,7 +314,7 @@ class Launches:
         return "done" if state == "done" else "failed"
 
     def _after_silence(self, cell_id: str, state: str) -> str:
-        """Return the outcome of a job that gave no answer, from the state it left its cell in."""
+        """Return the outcome of a job without an answer, from the state of its cell."""
         self._losses[cell_id] += state == "unfinished"
         ended = state in {"done", "failed"} or self._losses[cell_id] >= _MAX_LOSSES
         return state if ended else LOST
@@ -312,7 +322,7 @@ class Launches:
     def _after_loss(
         self, cells: Sequence[PlannedCell], error: Exception, store: Store
     ) -> dict[str, str]:
-        """Return the outcomes of a batch whose launcher broke, begun or not."""
+        """Return the outcome of each cell after the launcher raised."""
         reason = f"hydra/launcher={self._name}: {_first_line(error)}"
         before = {str(cell.cell_id): cell.state.name for cell in cells}
         while before.keys() & lease.holders(store.leases).keys():

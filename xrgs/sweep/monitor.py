@@ -1,6 +1,6 @@
-"""Shows a running sweep in one line: what is done, how fast it is, how long it will take.
+"""Shows a running sweep in one line: how many cells are done, the speed, and the time left.
 
-It reads the store's files alone, so that it works with any launcher, here or on other machines: a
+The monitor reads the store's files alone, so that it works with any launcher, on any machine: a
 cell that has ended has a status file, and a cell in training has a progress file.
 """
 
@@ -11,7 +11,7 @@ import sys
 import threading
 import time
 from contextlib import suppress
-from dataclasses import replace
+from dataclasses import dataclass
 from statistics import fmean
 from typing import TYPE_CHECKING, Any, Self
 
@@ -20,8 +20,8 @@ from tqdm import tqdm
 from xrgs.experiment.cell_folder import CellFolder
 from xrgs.runtime import progress
 from xrgs.runtime.progress import log_line
+from xrgs.runtime.text import format_duration
 from xrgs.safeio.files import list_names
-from xrgs.sweep.snapshot import RunningCell, SweepSnapshot
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
@@ -33,8 +33,8 @@ if TYPE_CHECKING:
 #: Seconds between two snapshots, at least; and the pause in multiples of the time that a snapshot
 #: takes, so that a slow store is not kept busy.
 _POLL_S, _PAUSE_FACTOR = 1.0, 20
-#: What a cell that took as long as was expected weighs beside those of a sweep.
-_CERTAIN = 0.2
+#: The least share of a cell's training from which its speed is judged: it has few Gaussians first.
+_JUDGED = 0.25
 #: A log gets a line when a cell has ended, and after so many seconds without one.
 _LINE_S = 600.0
 #: A cell whose progress file has not changed for so many seconds is not running: its process died
@@ -45,60 +45,138 @@ _SILENT_S = 120.0
 _FileStamp = tuple[int, int] | None
 
 
+@dataclass(frozen=True)
+class RunningCell:
+    """A cell in training or evaluation."""
+
+    cell: PlannedCell
+    progress: Progress
+    """The content of its progress file."""
+    share: float
+    """The share of its training steps that are done, 0 to 1."""
+
+    @property
+    def trains(self) -> bool:
+        """Whether the progress counts training steps."""
+        return self.progress.unit == "step"
+
+    @property
+    def pace(self) -> float | None:
+        """Recent seconds per step; None while the cell is not training or just began."""
+        return 1 / self.progress.rate if self.trains and self.progress.rate else None
+
+
+@dataclass(frozen=True)
+class SweepSnapshot:
+    """The states of a plan's cells at one moment."""
+
+    done: int
+    failed: int
+    running: tuple[RunningCell, ...]
+    elsewhere: tuple[RunningCell, ...]
+    """Cells that another sweep is training."""
+    waiting: tuple[PlannedCell, ...]
+    pace: float | None
+    """Mean seconds per step of this sweep's running cells; None before any is known."""
+    at_once: int = 1
+    """The most cells that this sweep was seen to train at once."""
+    slowness: float = 1.0
+    """The time that this sweep's cells took, relative to their estimates."""
+
+    @property
+    def ended(self) -> int:
+        """Number of cells that are done or failed."""
+        return self.done + self.failed
+
+    @property
+    def total(self) -> int:
+        """Number of all cells."""
+        return self.ended + len(self.running) + len(self.elsewhere) + len(self.waiting)
+
+    @property
+    def left_s(self) -> float | None:
+        """Expected seconds left, if as many cells run at once as did so far; None if unknown."""
+        own = [*map(self.whole_s, self.waiting), *map(self.rest_s, self.running)]
+        known = [seconds for seconds in own if seconds is not None]
+        if len(known) < len(own):
+            return None
+        others = [seconds for cell in self.elsewhere if (seconds := self.rest_s(cell))]
+        longest = max([*known, *others], default=None)
+        return longest and max(longest, sum(known) / self.at_once)
+
+    def whole_s(self, cell: PlannedCell) -> float | None:
+        """Return the expected seconds of a cell from its start to its end; None if unknown."""
+        if cell.cost is not None:
+            return cell.cost.seconds * self.slowness
+        return None if self.pace is None else cell.conf.train.steps * self.pace
+
+    def rest_s(self, running: RunningCell) -> float | None:
+        """Return the expected seconds to the end of a running cell; None if unknown."""
+        cost, whole = running.cell.cost, self.whole_s(running.cell)
+        scoring = cost.scoring_s * self.slowness if cost else 0.0
+        past = None if whole is None else (1 - running.share) * (whole - scoring) + scoring
+        own = running.progress.remaining_s if running.trains else None
+        if own is None or past is None or cost is None:
+            return past if own is None else own
+        # A cell's own pace says little at first, when it has few Gaussians, and all at the end.
+        return (1 - running.share) * past + running.share * (own + scoring)
+
+    def __str__(self) -> str:
+        parts = [f"{self.done} of {self.total} cells done"]
+        if self.failed:
+            parts.append(f"{self.failed} failed")
+        if self.elsewhere:
+            parts.append(f"{len(self.elsewhere)} in another sweep")
+        if len(self.running) == 1:
+            parts.append(self.running[0].progress.count)
+        elif self.running:
+            parts.append(f"{len(self.running)} in training")
+        if rate := sum(1 / cell.pace for cell in self.running if cell.pace):
+            parts.append(f"{rate:.3g} steps/s")
+        if self.left_s is not None:
+            parts.append(f"{format_duration(self.left_s)} left")
+        return ", ".join(parts)
+
+
 class _Slowness:
-    """How many times longer the cells of this sweep take than was expected of them."""
+    """Compares the times of this sweep's cells with their estimates."""
 
     def __init__(self) -> None:
-        """Start with a sweep of which no cell has begun."""
         self._begun: dict[str, tuple[float, float]] = {}
-        """When each cell was first seen to run, and what was left of it, 0 to 1."""
-        self._took, self._expected = 0.0, 0.0
-        """Seconds that the cells took that are done, and that they were expected to take."""
+        """When each cell was first seen in training, and the share that was done then."""
+        self._ended: list[tuple[float, float]] = []
+        """The seconds that each ended cell took, and its estimate of them."""
 
     def begin(self, running: RunningCell) -> None:
-        """Note a cell that runs; what is known of it already stays."""
-        self._begun.setdefault(str(running.cell.cell_id), (time.monotonic(), 1 - running.share))
+        """Note a cell in training, once."""
+        self._begun.setdefault(str(running.cell.cell_id), (time.monotonic(), running.share))
 
     def end(self, cell: PlannedCell) -> None:
-        """Note a cell that is done; one that was not seen to run tells nothing."""
-        begun = self._begun.get(str(cell.cell_id))
-        if begun is not None and cell.seconds is not None:
-            since, left = begun
-            self._took += time.monotonic() - since
-            self._expected += left * cell.seconds
+        """Note a cell that is done."""
+        self._ended.append(self._times(cell, 1.0, scored=True))
 
-    def ratio(self, plan: Sequence[PlannedCell], running: Sequence[RunningCell]) -> float:
-        """Return the ratio of both sums over the cells that are done and what is done of others.
+    def ratio(self, running: Sequence[RunningCell]) -> float:
+        """Return the time that cells took, relative to their estimates; 1 until it is known."""
+        times = [*self._ended, *(self._times(cell.cell, cell.share) for cell in running)]
+        took, expected = (sum(seconds) for seconds in zip((0.0, 0.0), *times, strict=True))
+        return took / expected if expected else 1.0
 
-        A part of a cell that took as long as was expected is added: the first steps of a cell,
-        which has few Gaussians then, say little.
-
-        Args:
-            plan: All cells of the sweep.
-            running: Those that run now, which have begun.
-        """
-        took, expected = self._took, self._expected
-        for cell in running:
-            since, left = self._begun[str(cell.cell.cell_id)]
-            if cell.cell.seconds is not None:
-                took += time.monotonic() - since
-                expected += (cell.share - (1 - left)) * cell.cell.seconds
-        known = [cell.seconds for cell in plan if cell.seconds is not None]
-        if not expected or not any(known):
-            return 1.0
-        certain = _CERTAIN * fmean(known)
-        return (took + certain) / (expected + certain)
+    def _times(
+        self, cell: PlannedCell, share: float, *, scored: bool = False
+    ) -> tuple[float, float]:
+        """Return the seconds that a cell took so far, and its estimate; zeros if not judged yet."""
+        begun, before = self._begun.get(str(cell.cell_id), (0.0, 1.0))
+        if cell.cost is None or share - before < _JUDGED:
+            return 0.0, 0.0
+        steps = (share - before) * (cell.cost.seconds - cell.cost.scoring_s)
+        return time.monotonic() - begun, steps + (cell.cost.scoring_s if scored else 0.0)
 
 
 class SweepMonitor:
     """Shows a sweep while a `with` block runs: a bar on a terminal, occasional lines in a log."""
 
     def __init__(self, cells: Path) -> None:
-        """Prepare to show; nothing is shown before `watch` is called.
-
-        Args:
-            cells: The folder that the cells' folders are in.
-        """
+        """Prepare to show the cells of a folder; nothing is shown before `watch` is called."""
         self._cells = cells
         self._plan: tuple[PlannedCell, ...] = ()
         self._retry = False
@@ -109,8 +187,8 @@ class SweepMonitor:
         self._moved: dict[str, tuple[_FileStamp, float]] = {}
         """The progress file of each cell, and when it was first seen like that."""
         self._pace: float | None = None
-        self._steps: dict[str, int] = {}
-        """The last count of steps of each cell that was seen to train."""
+        self._shares: dict[str, float] = {}
+        """The share of its steps that each cell has done, when it was last seen in training."""
         self._slowness = _Slowness()
         self._at_once = 1
         self._shown, self._shown_at = 0, time.monotonic()
@@ -120,11 +198,7 @@ class SweepMonitor:
         self._thread = threading.Thread(target=self._watch, name="xrgs-monitor", daemon=True)
 
     def watch(self, plan: Sequence[PlannedCell]) -> None:
-        """Set the plan to show; called again when it changes.
-
-        Args:
-            plan: All cells.
-        """
+        """Set the cells to show; called again when they change."""
         first = not self._plan
         self._retry = plan[0].conf.retry == "failed"
         self._plan = tuple({cell.cell_id or cell.spec: cell for cell in plan}.values())
@@ -182,8 +256,6 @@ class SweepMonitor:
             else:
                 in_other_sweep = cell.state.name == "running"
                 (elsewhere if in_other_sweep else running).append(self._running(cell, now))
-        slowness = self._slowness.ratio(self._plan, running)
-        running = [replace(cell, slowness=slowness) for cell in running]
         paces = [cell.pace for cell in running if cell.pace]
         self._pace = fmean(paces) if paces else self._pace
         self._at_once = max(self._at_once, len(running))
@@ -195,14 +267,14 @@ class SweepMonitor:
             tuple(waiting),
             self._pace,
             self._at_once,
-            slowness,
+            self._slowness.ratio(running),
         )
 
     def _running(self, cell: PlannedCell, now: Progress) -> RunningCell:
         name = str(cell.cell_id)
-        if now.unit == "step":
-            self._steps[name] = now.done
-        running = RunningCell(cell, now, self._steps.get(name, 0))
+        if now.unit == "step" and now.total:
+            self._shares[name] = min(1.0, now.done / now.total)
+        running = RunningCell(cell, now, self._shares.get(name, 0.0))
         if cell.state.name != "running":
             self._slowness.begin(running)
         return running

@@ -1,4 +1,4 @@
-"""The planned cells of a study: what each one is, its state, and what is left to do."""
+"""The planned cells of a study: their settings, their states, and what is left to do."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from xrgs.experiment.cell_folder import CellState
 from xrgs.experiment.identity import cell_id, cell_identity
 from xrgs.experiment.schema import RecordedCell
 from xrgs.experiment.store import BASELINE
-from xrgs.runtime.progress import format_duration
+from xrgs.runtime.text import format_duration, format_size
 from xrgs.safeio.hashing import digest, to_plain
 from xrgs.safeio.sanitize import counted, for_line
 from xrgs.splat.backend import resolve_backend
@@ -23,36 +23,35 @@ if TYPE_CHECKING:
     from xrgs.experiment.schema import Identity
     from xrgs.experiment.store import Store
     from xrgs.sweep.axes import CellSpec
-    from xrgs.sweep.estimate import CostEstimator
+    from xrgs.sweep.estimate import Cost, CostEstimator
 
-#: The part of a condition that says that no view is held out.
-TRAINING_VIEWS = "scored on the training views"
+#: The condition of cells that hold no view out.
+_TRAINING_VIEWS = "scored on the training views"
 
 
 @dataclass(frozen=True)
 class PlannedCell:
-    """A cell of the study: what it is and its state."""
+    """A cell of the study with its settings and its state."""
 
     spec: CellSpec
     conf: Conf
     variant_id: str | None = None
-    """The id of its frozen variant; None while that is not built."""
+    """The id of its frozen variant; None while the variant is not built."""
     identity: Identity | None = None
-    """What the cell's id is the digest of; None while the variant or a count is missing."""
+    """The cell's id is the digest of it; None while the variant or a count is missing."""
     cell_id: str | None = None
     state: CellState = field(default_factory=lambda: CellState("absent"))
     error: str | None = None
-    """Why the cell can't be trained: its scene failed, or the cell that it takes a count from."""
+    """Why the cell can't be trained: its scene or its reference failed."""
     remembered: bool = False
-    """Whether the store keeps the error of its scene, as it keeps that of a failed cell."""
-    seconds: float | None = None
-    """Expected seconds from its start to its end; None where nothing is known to go by."""
-    scoring_s: float | None = None
-    """Those of them that come after its last step."""
-    memory_bytes: float | None = None
-    """Expected resident memory where that is largest."""
-    disk_bytes: float | None = None
-    """Expected size of its files when it is done."""
+    """Whether the store keeps the error of its scene, so that the scene is not tried again."""
+    cost: Cost | None = None
+    """What the cell is expected to take; None without a finished cell to go by."""
+
+    @property
+    def seconds(self) -> float | None:
+        """Expected seconds from its start to its end; None if unknown."""
+        return self.cost.seconds if self.cost else None
 
     @property
     def name(self) -> str:
@@ -69,10 +68,10 @@ class PlannedCell:
 
     @property
     def reference(self) -> CellSpec | None:
-        """The cell whose number of Gaussians this one is to match; None if there is none.
+        """The cell with the number of Gaussians that this one is to match; None if there is none.
 
-        It has this cell's scene, replicate and condition. Its label is the name of an ablation, the
-        names of several joined by `+`, or `baseline`.
+        The reference has the scene, replicate and condition of this cell. Its label is the name of
+        an ablation, names of several ablations joined by `+`, or `baseline`.
         """
         label = self.conf.matched_to
         if label is None:
@@ -93,22 +92,17 @@ class PlannedCell:
 
 
 def planned(spec: CellSpec, conf: Conf) -> PlannedCell:
-    """Return a cell whose names say what its config has and its combination of axes does not.
+    """Return a planned cell; add to label and condition what only the config tells.
 
-    The label says which cell's number of Gaussians is matched. The condition says which views are
-    scored, where they are no test views, even if that is fixed for a whole sweep: so no table or
-    figure of scores of held-out training views is taken for one of test views.
-
-    Args:
-        spec: The cell's combination of axes.
-        conf: Its config.
+    The label names the cell whose number of Gaussians is matched. The condition names the scored
+    views if they are not test views, so that nobody takes their scores for scores of test views.
     """
     said = spec.condition
     if conf.train.validation:
         key = "train.validation="
         said = said if key in said else f"{said} {key}{conf.train.validation}"
-    elif conf.variant.test_every == 0 and not conf.variant.test and TRAINING_VIEWS not in said:
-        said = f"{said} {TRAINING_VIEWS}"
+    elif conf.variant.test_every == 0 and not conf.variant.test and _TRAINING_VIEWS not in said:
+        said = f"{said} {_TRAINING_VIEWS}"
     spec = replace(spec, condition=said.lstrip())
     if conf.matched_to is not None:
         spec = replace(spec, label=f"{spec.label} to {conf.matched_to}")
@@ -116,12 +110,10 @@ def planned(spec: CellSpec, conf: Conf) -> PlannedCell:
 
 
 def identified(cell: PlannedCell, store: Store, holders: Mapping[str, str]) -> PlannedCell:
-    """Return a cell with its identity, as soon as that is known, and its current state.
-
-    The identity is computed once; a cell that was done before stays so.
+    """Return a cell with its identity, as soon as it is known, and its current state.
 
     Args:
-        cell: The cell.
+        cell: The cell; one that is done is not looked at again.
         store: The store.
         holders: Descriptions of the processes that train cells now, by the cells' ids.
     """
@@ -136,38 +128,25 @@ def identified(cell: PlannedCell, store: Store, holders: Mapping[str, str]) -> P
 
 
 def estimated(plan: Sequence[PlannedCell], past: CostEstimator, threads: int) -> list[PlannedCell]:
-    """Return the cells with what they are expected to take, as far as that is known.
+    """Return the cells with what each one is expected to take, as far as that is known.
 
     Args:
         plan: The cells.
         past: Estimates from the store's finished cells.
         threads: Threads of a cell that asks for no number.
     """
-    return [cell if cell.state.name == "done" else _with_cost(cell, past, threads) for cell in plan]
-
-
-def _with_cost(cell: PlannedCell, past: CostEstimator, threads: int) -> PlannedCell:
-    """Return a cell with its cost; while it waits for a count, with the count it has."""
-    threads = cell.conf.threads or threads
-    cost = past.cost(cell.conf, cell.variant_id, threads)
-    if cost is None:
-        return cell
-    return replace(
-        cell,
-        seconds=cost.seconds,
-        scoring_s=cost.scoring_s,
-        memory_bytes=cost.memory_bytes,
-        disk_bytes=cost.disk_bytes,
-    )
+    return [
+        cell
+        if cell.state.name == "done"
+        else replace(cell, cost=past.cost(cell.conf, cell.variant_id, cell.conf.threads or threads))
+        for cell in plan
+    ]
 
 
 def expected_length(cell: PlannedCell) -> tuple[float, int]:
-    """Return the key by which cells are sorted, the longest last.
+    """Return a key that sorts cells by length, the longest last.
 
     Cells without an estimate count as longer than all others, and are sorted by their steps.
-
-    Args:
-        cell: The cell.
     """
     return (float("inf") if cell.seconds is None else cell.seconds, cell.conf.train.steps)
 
@@ -196,10 +175,7 @@ def ready(
 def describe(plan: Sequence[PlannedCell]) -> str:
     """Return the plan as text: one line per cell with its state, id, expected time and name.
 
-    The reason that several cells share is said once.
-
-    Args:
-        plan: All cells.
+    A reason that several cells share is written once.
     """
     done = sum(cell.state.name == "done" for cell in plan)
     lines = [f"plan: {counted(len(plan), 'cell')}, {done} done{_remaining(plan)}"]
@@ -223,7 +199,7 @@ def describe(plan: Sequence[PlannedCell]) -> str:
 
 
 def _shown_state(cell: PlannedCell) -> tuple[str, str]:
-    """Return the state of a cell and the reason for it, as the plan shows them."""
+    """Return the state of a cell and the reason for it, for the plan's text."""
     reason = cell.state.reason.partition("\n")[0]
     if cell.error:
         return "failed", cell.error.partition("\n")[0]
@@ -233,14 +209,7 @@ def _shown_state(cell: PlannedCell) -> tuple[str, str]:
 
 
 def without_kernels(plan: Sequence[PlannedCell]) -> str:
-    """Return a line that says how long torch takes where the kernels were not built.
-
-    Args:
-        plan: All cells, with their expected seconds.
-
-    Returns:
-        The line; empty where no cell that is left to train falls back to torch.
-    """
+    """Return a line on how long torch takes without the kernels; empty if no cell needs torch."""
     cells = [
         cell
         for cell in left_to_train(plan)
@@ -248,7 +217,7 @@ def without_kernels(plan: Sequence[PlannedCell]) -> str:
     ]
     if not cells:
         return ""
-    known = [cell.seconds for cell in cells if cell.seconds is not None]
+    known = [cell.cost.seconds for cell in cells if cell.cost]
     torch, native = (format_duration(sum(known) / ratio) for ratio in (1.0, TORCH_SLOWDOWN))
     complete = len(known) == len(cells)
     instead = f"{torch} instead of {native}" if complete else "30 to 60 times longer"
@@ -261,42 +230,29 @@ def without_kernels(plan: Sequence[PlannedCell]) -> str:
 
 
 def expected_use(plan: Sequence[PlannedCell], past: int) -> str:
-    """Return a line on the memory and the disk that the cells will take.
+    """Return a line on the memory and the disk that the cells will take; empty if unknown.
 
     Args:
-        plan: All cells, with what they are expected to take.
-        past: Number of finished cells that the estimates were learned from.
-
-    Returns:
-        The line; empty where no cell is left to train, or nothing is known of any.
+        plan: All cells, with what each one is expected to take.
+        past: Number of finished cells that the estimates are from.
     """
-    memory = [cell.memory_bytes for cell in left_to_train(plan) if cell.memory_bytes is not None]
-    disk = [cell.disk_bytes for cell in left_to_train(plan) if cell.disk_bytes is not None]
-    if not memory or not disk:
+    costs = [cell.cost for cell in left_to_train(plan) if cell.cost]
+    if not costs:
         return ""
+    memory, disk = max(cost.memory_bytes for cost in costs), sum(cost.disk_bytes for cost in costs)
     return (
-        f"estimates from {counted(past, 'finished cell')} of this store; a cell takes up to {_size(max(memory))} of memory, all of them"
-        f" {_size(sum(disk))} of disk"
+        f"estimates from {counted(past, 'finished cell')} of this store: a cell takes up to"
+        f" ~{format_size(memory)} of memory, all of them ~{format_size(disk)} of disk"
     )
 
 
-def _size(count: float) -> str:
-    """Write a number of bytes: `~300 MB`, `~1.2 GB`."""
-    return f"~{count / 1e9:.1f} GB" if count >= 1e9 else f"~{count / 1e6:.0f} MB"
-
-
 def unchanged(plan: Sequence[PlannedCell]) -> list[str]:
-    """Return a line for each label whose cells have the config of their baselines.
-
-    The config of a cell that waits for a count is not complete, so that nothing is said of it.
-
-    Args:
-        plan: All cells.
-    """
+    """Return a line for each label whose cells have the config of their baselines."""
     bases = {cell.spec.shared: cell.conf for cell in plan if cell.spec.label == BASELINE}
     differs: dict[str, bool] = {}
     for cell in plan:
         if cell.spec.label != BASELINE and (base := bases.get(cell.spec.shared)) is not None:
+            # The config of a cell that waits for a count is not complete.
             same = not cell.waits and all(
                 getattr(cell.conf, name) == getattr(base, name)
                 for name in ("splat", "train", "components", "variant", "scene", "seed")
@@ -310,11 +266,7 @@ def unchanged(plan: Sequence[PlannedCell]) -> list[str]:
 
 
 def will_fail(plan: Sequence[PlannedCell]) -> bool:
-    """Return whether a run of this plan would end with code 1, as far as can be told before it.
-
-    Args:
-        plan: All cells.
-    """
+    """Return whether a run of this plan is known to end with code 1."""
     retry = plan[0].conf.retry == "failed"
     return any(
         cell.error or cell.unknown or (cell.state.name == "failed" and not retry) for cell in plan
@@ -322,11 +274,7 @@ def will_fail(plan: Sequence[PlannedCell]) -> bool:
 
 
 def left_to_train(plan: Sequence[PlannedCell]) -> list[PlannedCell]:
-    """Return the cells that are to be trained, those whose variant or count is missing as well.
-
-    Args:
-        plan: All cells.
-    """
+    """Return the cells to train, with cells that still lack their variant or count."""
     retry = plan[0].conf.retry == "failed"
     unidentified = [
         cell for cell in plan if cell.cell_id is None and not cell.error and not cell.unknown
@@ -335,9 +283,9 @@ def left_to_train(plan: Sequence[PlannedCell]) -> list[PlannedCell]:
 
 
 def _remaining(plan: Sequence[PlannedCell]) -> str:
-    """Return how long the remaining training takes, as far as that is known."""
+    """Return the expected time of the remaining training, as far as known."""
     remaining = left_to_train(plan)
-    known = [cell.seconds for cell in remaining if cell.seconds is not None]
+    known = [cell.cost.seconds for cell in remaining if cell.cost]
     if not known:
         return ""
     unknown = len(remaining) - len(known)
@@ -346,11 +294,7 @@ def _remaining(plan: Sequence[PlannedCell]) -> str:
 
 
 def record(plan: Sequence[PlannedCell]) -> list[RecordedCell]:
-    """Return the rows that a report is made from: each cell with its matching baseline's id.
-
-    Args:
-        plan: All cells, with every baseline among them.
-    """
+    """Return the rows that reports are made from; every baseline must be in the plan."""
     baselines = {cell.spec.shared: cell.cell_id for cell in plan if cell.spec.label == BASELINE}
     return [
         RecordedCell(
@@ -363,7 +307,7 @@ def record(plan: Sequence[PlannedCell]) -> list[RecordedCell]:
             seed=cell.conf.seed,
             variant_id=cell.variant_id,
             baseline_id=baselines[cell.spec.shared],
-            # The state of a cell that has an id is read when a report is made.
+            # A report reads the state of a cell with an id itself.
             error=cell.state.reason if _lacks_id_for_now(cell) else cell.error,
             state="unknown" if _lacks_id_for_now(cell) else None,
         )
@@ -372,21 +316,19 @@ def record(plan: Sequence[PlannedCell]) -> list[RecordedCell]:
 
 
 def _lacks_id_for_now(cell: PlannedCell) -> bool:
-    """Return whether a file that could not be read is the reason why the cell has no id."""
+    """Return whether the cell has no id because a file can't be read now."""
     return cell.cell_id is None and cell.unknown
 
 
 def _planned_id(cell: PlannedCell) -> str:
-    """Return what the cell is asked to be, which is known before any cell is trained.
+    """Return an id that exists before training.
 
-    For most cells that is their id. The id of one that takes a count follows from another cell.
+    For most cells it is their id. The id of a count-matched cell depends on another cell's count.
     """
     if cell.cell_id is not None and cell.reference is None:
         return cell.cell_id
-    matched = cell.conf.components.count_matched
-    conf = replace(
-        cell.conf,
-        components=replace(cell.conf.components, count_matched=replace(matched, gaussians=0)),
-    )
-    parts = (conf.scene, conf.variant, conf.splat, conf.train, conf.components)
+    conf = cell.conf
+    matched = replace(conf.components.count_matched, gaussians=0)
+    components = replace(conf.components, count_matched=matched)
+    parts = (conf.scene, conf.variant, conf.splat, conf.train, components)
     return digest([*map(to_plain, parts), conf.seed, cell.variant_id])

@@ -1,9 +1,9 @@
 """Declares that a refactoring changes no number, after it was proven by training cells again.
 
 A cell's identity has the digest of each part of the code. Where code was changed so that every
-bit stays the same, a sample of done cells is trained again with the new code. If all bits are equal,
-the new digests are declared equal to the old ones in `xrgs/experiment/refactorings.json`, so that
-all cells keep their ids.
+bit stays the same, a sample of done cells is trained again with the new code. If all bits are
+equal, the new digests are declared equal to the old ones in `xrgs/experiment/refactorings.json`, so
+that all cells keep their ids.
 """
 
 from __future__ import annotations

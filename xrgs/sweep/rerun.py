@@ -30,6 +30,7 @@ from xrgs.safeio.sanitize import for_line
 from xrgs.splat.backend import resolve_backend
 from xrgs.sweep import variants
 from xrgs.sweep.axes import CellSpec
+from xrgs.sweep.estimate import Cost
 from xrgs.sweep.jobs import worker
 from xrgs.sweep.monitor import SweepMonitor
 from xrgs.sweep.plan import PlannedCell
@@ -306,7 +307,7 @@ def _train_again(
         variant.name,
         identity,
         repeated.id,
-        seconds=original.summary().training_time_s,
+        cost=Cost(original.summary().training_time_s, 0.0, 0.0, 0.0),
     )
     try:
         with SweepMonitor(repeated.path.parent) as monitor:

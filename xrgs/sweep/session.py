@@ -1,8 +1,7 @@
 """The folder of one call of `xrgs-sweep`, which the call shares with its jobs.
 
-The folder is in the store, so that jobs on other machines see it. It holds `sweep` (which process
-the call is) and `stopped` (why no further job may begin). What a job trains is in the store: the
-config and the identity of its cell.
+The folder is in the store, so that jobs on other machines see it. The file `sweep` names the call's
+process, and the file `stopped` says why no further job may begin.
 """
 
 from __future__ import annotations
@@ -21,17 +20,17 @@ _MAX_REASON = 1 << 12  # bytes of the file `stopped`
 
 @dataclass(frozen=True)
 class SweepSession:
-    """One call of `xrgs-sweep`, known to its jobs by a folder of its own."""
+    """One call of `xrgs-sweep`, whose jobs know it by its folder."""
 
     folder: Path
 
     @property
     def exists(self) -> bool:
-        """Whether the folder is there, and is that of a call."""
+        """Whether the folder is there and belongs to a call."""
         return (self.folder / "sweep").is_file()
 
     def begin(self) -> None:
-        """Write which process this call is.
+        """Sign the folder with this process.
 
         Raises:
             OSError: The folder can't be written, or belongs to another call.
@@ -39,7 +38,7 @@ class SweepSession:
         lease.sign(self.folder / "sweep")
 
     def stop(self, reason: str) -> None:
-        """Let no further job begin; of several reasons, for people, the first is kept."""
+        """Let no further job begin, for a reason that people can read; the first one is kept."""
         # A full disk may have room for the file's name and none for the reason in it.
         with suppress(OSError), (self.folder / "stopped").open("xb") as stream:
             stream.write(reason.encode())
@@ -50,7 +49,7 @@ class SweepSession:
 
     @property
     def owner_dead(self) -> bool:
-        """Whether the process of this call has ended; False on machines that can't know."""
+        """Whether the process of this call has ended; False if it ran on another machine."""
         return self._owner is not None and self._owner.here and not self._owner.lives
 
     @property

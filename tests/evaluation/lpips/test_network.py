@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from xrgs.capture import images
-from xrgs.capture.scenes.bundled import bundled_photograph
+from xrgs.capture.scenes.scene import bundled_photograph
 from xrgs.evaluation.lpips.network import MIN_SIDE, distance
 from xrgs.evaluation.lpips.weights import Weights
 

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from xrgs.safeio.confined import ConfinedPath
 
 from tests.report.conftest import MadeStore
 from xrgs.capture import dataset, frozen, images
@@ -20,7 +21,6 @@ from xrgs.capture.views import Variant, View
 from xrgs.config import Conf
 from xrgs.experiment.store import Store
 from xrgs.report import build
-from xrgs.safeio.confined import ConfinedPath
 from xrgs.splat.gaussians import Gaussians
 from xrgs.splat.ply import save_ply
 

@@ -14,15 +14,15 @@ import numpy as np
 import pytest
 import torch
 from PIL import Image
+from xrgs.report.html.album import Album, error_map
+from xrgs.report.html.trained import quantise
 
 from tests.report.conftest import MadeStore
 from tests.report.html.conftest import HOSTILE, TEST_VIEWS, data_of, make_gaussians, page_of
 from xrgs.experiment.store import Store
 from xrgs.report import build
 from xrgs.report.html import document
-from xrgs.report.html.album import Album, error_map
 from xrgs.report.html.content import LOG_SCALES
-from xrgs.report.html.trained import quantise
 from xrgs.splat.ply import save_ply
 
 

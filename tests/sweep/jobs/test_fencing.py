@@ -8,36 +8,37 @@ import signal
 import subprocess
 import sys
 from collections.abc import Callable
-from dataclasses import asdict
 from pathlib import Path
-from typing import Any
 
 import pytest
 
 from xrgs.capture import variant
 from xrgs.capture.views import Variant
 from xrgs.config import Conf
-from xrgs.experiment.attempts import begin_attempt
+from xrgs.experiment.attempts import begin_attempt, plan_cell
 from xrgs.experiment.cell_folder import CellFolder
+from xrgs.experiment.identity import cell_identity
 from xrgs.experiment.store import Store
-from xrgs.safeio.atomic import write_json, write_text
+from xrgs.safeio.atomic import write_json
 from xrgs.splat.backend import resolve_backend
 from xrgs.sweep.jobs import worker
 
 pytestmark = pytest.mark.slow
 
-#: Runs a worker that stops itself right before it calls a function of `os` for a file.
+#: Runs a worker that stops itself right before it renames a file to a name.
 STOPPED = """
 import os, signal, sys
-name, file, request, answer = sys.argv[1:]
-call = getattr(os, name)
+from pathlib import Path
+file, request, answer = sys.argv[1:]
+replace = Path.replace
 
-def stopping(*arguments, **named):
-    if any(str(argument).startswith(file) for argument in arguments):
+def stopping(path, target):
+    if str(target).endswith(file):
+        Path.replace = replace
         os.kill(os.getpid(), signal.SIGSTOP)
-    return call(*arguments, **named)
+    return replace(path, target)
 
-setattr(os, name, stopping)
+Path.replace = stopping
 from xrgs.sweep.jobs import worker
 worker.main("cell", request, answer)
 """
@@ -60,61 +61,70 @@ def built(conf: Conf, tmp_path_factory: pytest.TempPathFactory) -> Variant:
     return variant.build(conf.scene, conf.variant, store.variants, store.scenes)
 
 
+@pytest.fixture
+def cell(conf: Conf, built: Variant, tmp_path: Path) -> CellFolder:
+    """A planned cell of which an attempt has begun."""
+    store = Store(tmp_path / "s")
+    store.prepare()
+    cell = store.cell("c")
+    plan_cell(cell, conf, cell_identity(conf, built.id))
+    begin_attempt(cell)
+    return cell
+
+
 def files(folder: Path) -> dict[str, tuple[int, bytes]]:
     """Time and content of every file."""
     found = [file for file in folder.rglob("*") if file.is_file()]
     return {file.name: (file.stat().st_mtime_ns, file.read_bytes()) for file in found}
 
 
-@pytest.mark.parametrize(
-    ("call", "file", "done"),
-    [
-        ("open", ".status.json", False),
-        ("rename", ".status.json", True),  # its status is written, but does not have its name yet
-        ("rename", ".checkpoint.npz", False),
-    ],
-)
-def test_a_worker_that_wakes_up_after_a_takeover_changes_nothing_and_says_so(
-    conf: Conf, built: Variant, tmp_path: Path, call: str, file: str, done: bool
+@pytest.mark.parametrize(("file", "done"), [("status.json", True), ("checkpoint.npz", False)])
+def test_a_worker_that_wakes_up_after_a_takeover_writes_into_its_own_folder_alone(
+    cell: CellFolder, built: Variant, tmp_path: Path, file: str, done: bool
 ) -> None:
-    store, identity = Store(tmp_path), {"variant": built.id, "seed": 0}
-    store.prepare()
-    first = begin_attempt(store.cell("c"), asdict(conf), identity)
-    write_json(tmp_path / "request", worker.cell_request(asdict(conf), built.folder, first))
-    arguments = [call, file, str(tmp_path / "request"), str(tmp_path / "answer")]
+    write_json(tmp_path / "request", worker.cell_request(built.folder, cell))
+    arguments = [file, str(tmp_path / "request"), str(tmp_path / "answer")]
     child = subprocess.Popen([sys.executable, "-P", "-c", STOPPED, *arguments])
     assert os.WIFSTOPPED(os.waitpid(child.pid, os.WUNTRACED)[1])
 
-    second = begin_attempt(store.cell("c"), asdict(conf), identity)
+    own = tmp_path / "own"
+    cell.path.rename(own)  # a test can look into it; an attempt would remove it
+    plan_cell(cell, CellFolder(own).config(), CellFolder(own).identity())
+    begin_attempt(cell)
     if done:
-        finish(second)
-    before = files(second.path)
+        (cell.path / "scores.csv").write_text("view\na\n")
+        cell.finish(["a"], {})
+    before = files(cell.path)
     child.send_signal(signal.SIGCONT)
-    assert child.wait(60) == os.EX_TEMPFAIL
-    answer = json.loads((tmp_path / "answer").read_text())
-    assert answer["lost"] is True
-    assert f"{second.path}: it was replaced" in answer["error"]
-    assert "another attempt at the cell has begun" in answer["error"]
-    assert files(second.path) == before
-    assert second.state().name == ("done" if done else "unfinished")
-    assert store.cells_folder.names() == ["c"]
+    child.wait(60)
+    assert files(cell.path) == before
+    assert cell.state().name == ("done" if done else "unfinished")
+    assert CellFolder(own).state().name == "done"  # where nobody looks any more
 
 
-def finish(attempt: CellFolder) -> None:
-    write_text(attempt.folder / "scores.csv", "view\na\n")
-    attempt.finish(["a"], 1)
+def test_a_worker_whose_folder_was_removed_ends_and_creates_nothing(
+    cell: CellFolder, built: Variant, tmp_path: Path
+) -> None:
+    write_json(tmp_path / "request", worker.cell_request(built.folder, cell))
+    arguments = ["checkpoint.npz", str(tmp_path / "request"), str(tmp_path / "answer")]
+    child = subprocess.Popen([sys.executable, "-P", "-c", STOPPED, *arguments])
+    assert os.WIFSTOPPED(os.waitpid(child.pid, os.WUNTRACED)[1])
+    begin_attempt(cell)
+    before = files(cell.path)
+    child.send_signal(signal.SIGCONT)
+    child.wait(60)
+    assert json.loads((tmp_path / "answer").read_text())["error"]
+    assert files(cell.path) == before
+    assert [path.name for path in cell.path.parent.iterdir()] == ["c"]
 
 
 def test_a_worker_that_starts_after_a_takeover_does_nothing(
-    conf: Conf, built: Variant, tmp_path: Path
+    cell: CellFolder, built: Variant
 ) -> None:
     """Its parent was suspended between the beginning of the cell and the start of this worker."""
-    store, identity = Store(tmp_path), {"variant": built.id, "seed": 0}
-    store.prepare()
-    first = begin_attempt(store.cell("c"), asdict(conf), identity)
-    request: dict[str, Any] = worker.cell_request(asdict(conf), built.folder, first)
-    second = begin_attempt(store.cell("c"), asdict(conf), identity)
-    before = files(second.path)
+    request = worker.cell_request(built.folder, cell)
+    begin_attempt(cell)
+    before = files(cell.path)
     with pytest.raises(worker.AttemptLostError, match="another attempt at the cell has begun"):
         worker.run_in_child("cell", request)
-    assert files(second.path) == before
+    assert files(cell.path) == before

@@ -10,6 +10,7 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import pytest
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig, OmegaConf
@@ -17,9 +18,12 @@ from omegaconf import DictConfig, OmegaConf
 from xrgs.capture import scenes, variant
 from xrgs.cli import sweep as command
 from xrgs.errors import XrgsError
+from xrgs.experiment import identity
 from xrgs.experiment.attempts import begin_attempt
 from xrgs.experiment.store import Store
-from xrgs.sweep import locks
+from xrgs.runtime import lease
+from xrgs.safeio.atomic import write_json
+from xrgs.sweep.jobs import job as job_module
 from xrgs.sweep.jobs import worker
 from xrgs.sweep.jobs.job import (
     FAIL_FAST,
@@ -32,28 +36,45 @@ from xrgs.sweep.jobs.job import (
     UNWRITABLE,
     run_job,
 )
-from xrgs.sweep.session import HandOver, SweepSession
+from xrgs.sweep.session import SweepSession
 
-HandOverOf = Callable[..., HandOver]
+#: The `Cells` of tests/sweep/conftest.py.
+Cells = Any
+
+
+def run(session: SweepSession, cells: Cells, cell_id: str) -> str:
+    return run_job(session, cells.store, cell_id, "motorcycle / a")
 
 
 def ended(session: SweepSession) -> SweepSession:
     """Return the session as that of a process that has ended."""
-    file = session.folder.path / "sweep"
+    file = session.folder / "sweep"
     file.write_text(json.dumps(json.loads(file.read_text()) | {"started": 1}))
-    return SweepSession(session.folder.path)
+    return SweepSession(session.folder)
 
 
 @pytest.fixture
-def requests(monkeypatch: pytest.MonkeyPatch, store: Store) -> list[tuple[str, Mapping[str, Any]]]:
+def held(monkeypatch: pytest.MonkeyPatch) -> list[lease.Lease]:
+    """The leases that jobs of this process take."""
+    taken, acquire = [], lease.acquire
+
+    def acquired(folder: Path, name: str) -> lease.Lease | None:
+        if found := acquire(folder, name):
+            taken.append(found)
+        return found
+
+    monkeypatch.setattr(lease, "acquire", acquired)
+    return taken
+
+
+@pytest.fixture
+def requests(monkeypatch: pytest.MonkeyPatch, cells: Cells) -> list[tuple[str, Mapping[str, Any]]]:
     """What child processes were asked to do; none is started, and each cell is done at once."""
     requested: list[tuple[str, Mapping[str, Any]]] = []
 
     def finish(job: str, request: Mapping[str, Any], *_: object) -> dict[str, Any]:
         requested.append((job, request))
-        folder = store.cell(Path(request["cell"]).name)
-        (folder.path / "scores.csv").write_text("view\na\n")
-        folder.finish(["a"], 1)
+        cells.finish(cells.store.cell(request["id"]))
         return {}
 
     monkeypatch.setattr(worker, "run_in_child", finish)
@@ -62,13 +83,12 @@ def requests(monkeypatch: pytest.MonkeyPatch, store: Store) -> list[tuple[str, M
 
 def test_a_job_trains_what_was_planned_and_reads_no_photograph(
     session: SweepSession,
-    store: Store,
-    hand_over_of: HandOverOf,
+    cells: Cells,
     requests: list[tuple[str, Mapping[str, Any]]],
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    made = hand_over_of(seed=5)
-    cell_id = session.hand_over(made)
+    cell = cells.plan(seed=5)
+    planned = cell.config(), cell.identity()
 
     def unexpected(*_: object) -> None:
         raise AssertionError("a job composes, hashes and identifies nothing")
@@ -80,69 +100,77 @@ def test_a_job_trains_what_was_planned_and_reads_no_photograph(
         (variant, "load"),
     ):
         monkeypatch.setattr(module, name, unexpected)
-    assert run_job(session, cell_id) == "done"
-    folder = store.cell(cell_id)
-    assert requests == [
-        (
-            "cell",
-            {
-                "conf": made.config,
-                "variant": str(store.variants / made.variant_id),
-                "cell": str(folder.path),
-                "folder": folder.folder.identity(),
-            },
-        )
-    ]
-    assert folder.identity() == made.identity
-    assert json.loads((folder.path / "config.json").read_text()) == made.config
-    assert not list(store.locks.iterdir())
+    assert run(session, cells, cell.id) == "done"
+    given = {"variant": str(cells.store.variants / planned[1].variant), "cell": str(cell.path)}
+    given |= {"id": cell.id, "inode": cell.path.stat().st_ino}
+    assert requests == [("cell", given)]
+    assert (cell.config(), cell.identity()) == planned
+    assert not list(cells.store.leases.iterdir())
 
 
 def test_a_cell_that_is_done_meanwhile_is_not_trained_again(
     session: SweepSession,
-    hand_over_of: HandOverOf,
+    cells: Cells,
     requests: list[tuple[str, Mapping[str, Any]]],
 ) -> None:
-    cell_id = session.hand_over(hand_over_of())
-    assert run_job(session, cell_id) == run_job(session, cell_id) == "done"
+    cell_id = cells.plan().id
+    assert run(session, cells, cell_id) == run(session, cells, cell_id) == "done"
     assert len(requests) == 1
 
 
 def test_a_cell_that_another_process_trains_is_left_to_it(
     session: SweepSession,
-    store: Store,
-    hand_over_of: HandOverOf,
+    cells: Cells,
     requests: list[tuple[str, Mapping[str, Any]]],
 ) -> None:
-    cell_id = session.hand_over(hand_over_of())
-    assert locks.acquire(store.locks, cell_id) is not None
-    assert run_job(session, cell_id) == LOCKED
+    cell_id = cells.plan().id
+    assert lease.acquire(cells.store.leases, cell_id) is not None
+    assert run(session, cells, cell_id) == LOCKED
     assert not requests
 
 
 def test_a_job_of_other_code_trains_nothing_and_blames_no_cell(
     session: SweepSession,
-    store: Store,
-    hand_over_of: HandOverOf,
+    cells: Cells,
     requests: list[tuple[str, Mapping[str, Any]]],
 ) -> None:
-    made = hand_over_of()
-    planned = dict(made.identity) | {"code": {"splat/densify.py": "0"}}
-    cell_id = session.hand_over(HandOver(made.name, made.config, planned))
-    with pytest.raises(XrgsError, match="planned with other code"):
-        run_job(session, cell_id)
+    cell = cells.plan()
+    code = cell.identity().code | {"core": "0"}
+    planned = msgspec.structs.replace(cell.identity(), code=code)
+    write_json(cell.path / "identity.json", msgspec.to_builtins(planned))
+    with pytest.raises(XrgsError, match=r"planned with other code .*\(core\)\. Install the same"):
+        run(session, cells, cell.id)
     assert not requests
-    assert store.cell(cell_id).state().name == "absent"
-    assert not list(store.locks.iterdir())
+    assert cell.state().name == "planned"
+    assert not list(cells.store.leases.iterdir())
 
 
-def test_a_variant_that_was_removed_is_named(
-    session: SweepSession, store: Store, hand_over_of: HandOverOf
+def test_code_that_is_edited_while_a_sweep_runs_is_noticed(
+    session: SweepSession, cells: Cells, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    made = hand_over_of()
-    (store.variants / made.variant_id).remove()
-    with pytest.raises(XrgsError, match=f"its variant .*{made.variant_id} is missing"):
-        run_job(session, session.hand_over(made))
+    """The digests that this process has computed for its plan are not trusted."""
+    cell_id = cells.plan().id
+    edited = identity.training_code("torch") | {"core": "edited"}
+    monkeypatch.setattr(identity, "code_now", lambda *_: edited)
+    with pytest.raises(XrgsError, match=r"\(core\)"):
+        run(session, cells, cell_id)
+
+
+def test_a_job_on_a_machine_of_other_arithmetic_is_refused(
+    session: SweepSession, cells: Cells, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    cell_id = cells.plan().id
+    monkeypatch.setattr(job_module, "arithmetic", lambda _: "no-fma")
+    with pytest.raises(XrgsError, match=r"planned with the arithmetic .* this machine has no-fma"):
+        run(session, cells, cell_id)
+
+
+def test_a_variant_that_was_removed_is_named(session: SweepSession, cells: Cells) -> None:
+    cell = cells.plan()
+    variant_id = cell.identity().variant
+    (cells.store.variants / variant_id).rmdir()
+    with pytest.raises(XrgsError, match=f"its variant .*{variant_id} is missing"):
+        run(session, cells, cell.id)
 
 
 @pytest.mark.parametrize(
@@ -155,8 +183,7 @@ def test_a_variant_that_was_removed_is_named(
 )
 def test_a_job_that_stops_the_others_says_why(
     session: SweepSession,
-    store: Store,
-    hand_over_of: HandOverOf,
+    cells: Cells,
     monkeypatch: pytest.MonkeyPatch,
     error: worker.WorkerError,
     fail_fast: bool,
@@ -167,83 +194,74 @@ def test_a_job_that_stops_the_others_says_why(
         raise error
 
     monkeypatch.setattr(worker, "run_in_child", fail)
-    cell_id = session.hand_over(hand_over_of(fail_fast=fail_fast))
-    assert run_job(session, cell_id) == outcome
+    cell_id = cells.plan(fail_fast=fail_fast).id
+    assert run(session, cells, cell_id) == outcome
     assert session.stopped == reason
-    state = store.cell(cell_id).state()
+    state = cells.store.cell(cell_id).state()
     assert state.name == ("failed" if outcome == "failed" else "unfinished")
     if reason:
-        assert run_job(session, session.hand_over(hand_over_of(seed=1))) == STOPPED
+        assert run(session, cells, cells.plan(seed=1).id) == STOPPED
 
 
 def test_a_cell_whose_process_died_after_it_was_finished_is_done(
     session: SweepSession,
-    store: Store,
-    hand_over_of: HandOverOf,
+    cells: Cells,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     def die_at_exit(_: str, request: Mapping[str, Any], *__: object) -> None:
-        folder = store.cell(Path(request["cell"]).name)
-        (folder.path / "scores.csv").write_text("view\na\n")
-        folder.finish(["a"], 1)
+        cells.finish(cells.store.cell(request["id"]))
         raise worker.WorkerError("its process was ended by SIGSEGV")
 
     monkeypatch.setattr(worker, "run_in_child", die_at_exit)
-    assert run_job(session, session.hand_over(hand_over_of())) == "done"
+    assert run(session, cells, cells.plan().id) == "done"
 
 
 def test_no_job_begins_for_a_sweep_whose_process_has_ended(
-    session: SweepSession, store: Store, hand_over_of: HandOverOf
+    session: SweepSession, cells: Cells
 ) -> None:
-    cell_id = session.hand_over(hand_over_of())
-    assert run_job(ended(session), cell_id) == STOPPED
-    assert not list(store.cells_folder.iterdir())
+    cell_id = cells.plan().id
+    assert run(ended(session), cells, cell_id) == STOPPED
+    assert cells.store.cell(cell_id).state().name == "planned"
 
 
-@pytest.mark.parametrize(
-    ("owner", "attribute", "outcome"),
-    [(locks.Owner, "lives", STOPPED), (locks.Lock, "beat", LOCKED)],
-)
-def test_a_cell_ends_with_its_sweep_or_its_lock_and_is_unfinished(
+@pytest.mark.parametrize("outcome", [STOPPED, LOCKED])
+def test_a_cell_ends_with_its_sweep_or_its_lease_and_is_unfinished(
     session: SweepSession,
-    store: Store,
-    hand_over_of: HandOverOf,
+    cells: Cells,
+    held: list[lease.Lease],
     monkeypatch: pytest.MonkeyPatch,
-    owner: type,
-    attribute: str,
     outcome: str,
 ) -> None:
     def train(_: str, __: object, ___: object, on_poll: Callable[[int], None]) -> None:
         on_poll(0)
-        lost = False if outcome == STOPPED else lambda *_: False
-        monkeypatch.setattr(owner, attribute, lost)
+        if outcome == STOPPED:
+            monkeypatch.setattr(lease.Owner, "lives", False)
+        else:
+            held[0].lost = True  # as its heartbeat finds
         on_poll(0)
 
     monkeypatch.setattr(worker, "run_in_child", train)
-    assert run_job(session, session.hand_over(hand_over_of())) == outcome
-    (cell,) = store.cells_folder.iterdir()
-    assert store.cell(cell.name).state().name == "unfinished"
-    assert not list(store.locks.iterdir())
+    cell = cells.plan()
+    assert run(session, cells, cell.id) == outcome
+    assert cell.state().name == "unfinished"
+    assert not list(cells.store.leases.iterdir())
 
 
 def test_a_cell_that_was_taken_over_is_left_as_it_is(
     session: SweepSession,
-    store: Store,
-    hand_over_of: HandOverOf,
+    cells: Cells,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    made = hand_over_of()
+    cell = cells.plan()
 
-    def lose(_: str, request: Mapping[str, Any], *__: object) -> None:
-        folder = begin_attempt(store.cell(Path(request["cell"]).name), made.config, made.identity)
-        (folder.path / "scores.csv").write_text("view\na\n")
-        folder.finish(["a"], 1)
+    def lose(*_: object) -> None:
+        begin_attempt(cell)
+        cells.finish(cell)
         raise worker.AttemptLostError("another attempt at the cell has begun")
 
     monkeypatch.setattr(worker, "run_in_child", lose)
-    cell_id = session.hand_over(made)
-    assert run_job(session, cell_id) == LOCKED
-    assert store.cell(cell_id).state().name == "done"
+    assert run(session, cells, cell.id) == LOCKED
+    assert cell.state().name == "done"
 
 
 def content(folder: Path) -> dict[str, tuple[int, int, bytes]]:
@@ -255,11 +273,11 @@ def content(folder: Path) -> dict[str, tuple[int, int, bytes]]:
 
 def take_over(store: Store, cell_id: str) -> None:
     """Do what a sweep on another machine does that took this process for dead."""
-    successor = store.locks / f"{cell_id}.1"
-    locks.sign(successor)
+    successor = store.leases / f"{cell_id}.1"
+    lease.sign(successor)
     values = json.loads(successor.read_text())
-    successor.path.write_text(json.dumps(values | {"host": "elsewhere"}))
-    (store.locks / f"{cell_id}.0").unlink()
+    successor.write_text(json.dumps(values | {"host": "elsewhere"}))
+    (store.leases / f"{cell_id}.0").unlink()
     (store.cell(cell_id).path / "log.txt").write_text("of the successor")
 
 
@@ -272,107 +290,99 @@ def take_over(store: Store, cell_id: str) -> None:
         worker.PassingError("stale"),
     ],
 )
-def test_a_job_whose_lock_was_taken_over_writes_nothing_from_then_on(
+def test_a_job_whose_lease_was_taken_over_writes_nothing_from_then_on(
     session: SweepSession,
-    store: Store,
-    hand_over_of: HandOverOf,
+    cells: Cells,
+    held: list[lease.Lease],
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
     end: Exception | None,
 ) -> None:
     """Its process was stopped for long: it notices by a heartbeat, or its child has ended first."""
-    cell_id = session.hand_over(hand_over_of(fail_fast=True))
+    cell_id = cells.plan(fail_fast=True).id
     before = {}
 
     def train(_: str, __: object, ___: object, on_poll: Callable[[int], None]) -> None:
         on_poll(0)
-        take_over(store, cell_id)
+        take_over(cells.store, cell_id)
         before["cell"], before["locks"] = (
-            content(store.cell(cell_id).path),
-            content(store.path / "locks"),
+            content(cells.store.cell(cell_id).path),
+            content(cells.store.path / "locks"),
         )
         if end is not None:
             raise end
-        monkeypatch.setattr(locks, "BEAT_S", 0.0)
+        assert not held[-1].beat()  # as its thread does
         on_poll(0)
 
     monkeypatch.setattr(worker, "run_in_child", train)
-    assert run_job(session, cell_id) == LOCKED
-    assert content(store.cell(cell_id).path) == before["cell"]
-    assert content(store.path / "locks") == before["locks"]
+    assert run(session, cells, cell_id) == LOCKED
+    assert content(cells.store.cell(cell_id).path) == before["cell"]
+    assert content(cells.store.path / "locks") == before["locks"]
     assert not session.stopped
     assert "another has taken over" in capsys.readouterr().err
 
 
-def test_a_lock_that_is_lost_before_the_training_begins_is_noticed(
+def test_a_lease_that_is_lost_before_the_training_begins_is_noticed(
     session: SweepSession,
-    store: Store,
-    hand_over_of: HandOverOf,
+    cells: Cells,
     requests: list[tuple[str, Mapping[str, Any]]],
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    cell_id = session.hand_over(hand_over_of())
-
-    def check(_: HandOver) -> None:
-        store.cell(cell_id).folder.make_folder()
-        take_over(store, cell_id)
-
-    monkeypatch.setattr(HandOver, "check_code", check)
-    assert run_job(session, cell_id) == LOCKED
-    assert content(store.cell(cell_id).path).keys() == {"log.txt"}
+    cell = cells.plan()
+    monkeypatch.setattr(job_module, "_check_code", lambda *_: take_over(cells.store, cell.id))
+    assert run(session, cells, cell.id) == LOCKED
+    assert content(cell.path).keys() == {"config.json", "identity.json", "log.txt"}
     assert not requests
 
 
 @pytest.mark.parametrize("number", [errno.EACCES, errno.EIO, errno.ESTALE])
 def test_a_cell_whose_status_can_not_be_read_is_left_as_it_is(
     session: SweepSession,
-    store: Store,
-    hand_over_of: HandOverOf,
+    cells: Cells,
     requests: list[tuple[str, Mapping[str, Any]]],
     sick: Callable[[str, int], None],
     capsys: pytest.CaptureFixture[str],
     number: int,
 ) -> None:
-    cell_id = session.hand_over(hand_over_of())
-    assert run_job(session, cell_id) == "done"
-    before = content(store.path / "cells")
+    cell_id = cells.plan().id
+    assert run(session, cells, cell_id) == "done"
+    before = content(cells.store.path / "cells")
     for file in ("status.json", "scores.csv"):
         sick(file, number)
-        assert run_job(session, cell_id) == UNKNOWN
+        assert run(session, cells, cell_id) == UNKNOWN
         err = capsys.readouterr().err
         assert file in err
         assert os.strerror(number) in err
     sick("", 0)
-    assert content(store.path / "cells") == before
+    assert content(cells.store.path / "cells") == before
     assert len(requests) == 1
     assert not session.stopped
-    assert run_job(session, cell_id) == "done"
+    assert run(session, cells, cell_id) == "done"
 
 
 @pytest.mark.parametrize("number", [errno.EACCES, errno.EIO, errno.ESTALE])
 @pytest.mark.parametrize("end", ["stale", "raised"])
 def test_a_file_that_can_not_be_read_fails_no_cell(
     session: SweepSession,
-    store: Store,
-    hand_over_of: HandOverOf,
+    cells: Cells,
     sick: Callable[[str, int], None],
     monkeypatch: pytest.MonkeyPatch,
     number: int,
     end: str,
 ) -> None:
     """In the child, or in its parent when the child has failed."""
-    cell_id = session.hand_over(hand_over_of(fail_fast=True))
+    cell_id = cells.plan(fail_fast=True).id
 
     def train(*_: object) -> None:
         if end == "stale":
             raise worker.PassingError("stale")
-        (store.cell(cell_id).path / "status.json").write_text('{"state": "done"}')
+        (cells.store.cell(cell_id).path / "status.json").write_text('{"state": "done"}')
         sick("status.json", number)
         raise worker.WorkerError("it raised")
 
     monkeypatch.setattr(worker, "run_in_child", train)
-    assert run_job(session, cell_id) == UNKNOWN
-    assert not (store.cell(cell_id).path / "error.txt").exists()
+    assert run(session, cells, cell_id) == UNKNOWN
+    assert not (cells.store.cell(cell_id).path / "error.txt").exists()
     assert not session.stopped
 
 
@@ -380,8 +390,7 @@ def test_a_file_that_can_not_be_read_fails_no_cell(
 def test_a_cell_that_is_asked_to_end_is_unfinished_and_slurm_decides_on_its_job(
     session: SweepSession,
     job_config: DictConfig,
-    store: Store,
-    hand_over_of: HandOverOf,
+    cells: Cells,
     monkeypatch: pytest.MonkeyPatch,
     executor: str,
     ends: bool,
@@ -391,14 +400,14 @@ def test_a_cell_that_is_asked_to_end_is_unfinished_and_slurm_decides_on_its_job(
 
     monkeypatch.setattr(worker, "run_in_child", train)
     monkeypatch.setenv("SUBMITIT_EXECUTOR", executor)
-    job_config.cell = session.hand_over(hand_over_of(fail_fast=True))
+    job_config.cell = cells.plan(fail_fast=True).id
     if ends:
         with pytest.raises(SystemExit, match=str(os.EX_TEMPFAIL)):
             command._run_job(job_config)
     else:
         assert command._run_job(job_config) == INTERRUPTED
-    assert store.cell(job_config.cell).state().name == "unfinished"
-    assert not list(store.locks.iterdir())
+    assert cells.store.cell(job_config.cell).state().name == "unfinished"
+    assert not list(cells.store.leases.iterdir())
     assert not session.stopped
 
 
@@ -406,8 +415,7 @@ def test_a_cell_that_is_asked_to_end_is_unfinished_and_slurm_decides_on_its_job(
 @pytest.mark.parametrize("seen", ["by its parent", "by the child"])
 def test_a_store_that_vanishes_while_a_cell_trains_does_not_reappear(
     session: SweepSession,
-    store: Store,
-    hand_over_of: HandOverOf,
+    cells: Cells,
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
     tmp_path: Path,
@@ -416,21 +424,21 @@ def test_a_store_that_vanishes_while_a_cell_trains_does_not_reappear(
 ) -> None:
     def train(_: str, __: object, ___: object, on_poll: Callable[[int], None]) -> None:
         on_poll(0)
-        store.path.rename(tmp_path / "moved")
+        cells.store.path.rename(tmp_path / "moved")
         if how == "deleted":
             shutil.rmtree(tmp_path / "moved")
         elif how == "unmounted":
-            store.path.mkdir()
+            cells.store.path.mkdir()
         if seen == "by the child":
             raise worker.WorkerError("FileNotFoundError: no such file")
         on_poll(0)
 
     monkeypatch.setattr(worker, "run_in_child", train)
-    assert run_job(session, session.hand_over(hand_over_of(fail_fast=True))) == GONE
+    assert run(session, cells, cells.plan(fail_fast=True).id) == GONE
     assert "moved" not in capsys.readouterr().err  # the sweep says it once
     if how == "unmounted":
-        store.path.rmdir()  # empty
-    assert not store.path.exists()
+        cells.store.path.rmdir()  # empty
+    assert not cells.store.path.exists()
     assert not session.stopped
 
 
@@ -439,11 +447,13 @@ class ProcessEnded(Exception):  # noqa: N818
 
 
 @pytest.fixture
-def job_config(session: SweepSession, monkeypatch: pytest.MonkeyPatch) -> DictConfig:
+def job_config(
+    session: SweepSession, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> DictConfig:
     """The config that a launcher gives to a job."""
     hydra = OmegaConf.create({"hydra": {"sweep": {"dir": str(session.folder)}}})
     monkeypatch.setattr(HydraConfig.instance(), "cfg", hydra)
-    return OmegaConf.create({"cell": "x"})
+    return OmegaConf.create({"cell": "x", "store": str(tmp_path / "s"), "name": "a"})
 
 
 def test_a_launcher_s_worker_whose_sweep_has_ended_ends_without_an_answer(
@@ -461,9 +471,9 @@ def test_a_launcher_s_worker_whose_sweep_has_ended_ends_without_an_answer(
 def test_the_command_hands_a_cell_s_id_to_its_job(
     session: SweepSession,
     job_config: DictConfig,
-    hand_over_of: HandOverOf,
+    cells: Cells,
     requests: list[tuple[str, Mapping[str, Any]]],
 ) -> None:
-    job_config.cell = session.hand_over(hand_over_of())
+    job_config.cell = cells.plan().id
     assert command._run_job(job_config) == "done"
     assert len(requests) == 1

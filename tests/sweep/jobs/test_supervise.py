@@ -94,14 +94,6 @@ def test_memory_is_that_of_the_process_and_its_children(by: str) -> None:
     assert supervise.run_supervised(python(_HUNGRY), Limits(memory_gb=4)).reason == ""
 
 
-def test_a_system_that_does_not_say_how_much_memory_is_used_is_refused(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    monkeypatch.setattr(Path, "exists", lambda _: False)
-    with pytest.raises(XrgsError, match=r"limits\.memory_gb"):
-        supervise.run_supervised(python(""), Limits(memory_gb=1))
-
-
 def test_an_exception_of_on_poll_ends_the_process() -> None:
     polled = []
 

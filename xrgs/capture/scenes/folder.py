@@ -9,7 +9,6 @@ Images and videos that are not listed are counted in a warning, which says how t
 
 from __future__ import annotations
 
-import hashlib
 import logging
 import re
 import unicodedata
@@ -19,15 +18,16 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from xrgs.capture import images
+from xrgs.capture.scenes.scene import ALL_BELOW, Scene, files_digest, label
 from xrgs.errors import UnreadableError, XrgsError
-from xrgs.runtime.progress import progress
 from xrgs.safeio.files import is_name
-from xrgs.safeio.hashing import file_digest
 from xrgs.safeio.paths import user_path
 from xrgs.safeio.sanitize import for_line
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Mapping, Sequence
+    from collections.abc import Iterator, Sequence
+
+    from xrgs.config import SceneConf
 
 _log = logging.getLogger(__name__)
 
@@ -41,10 +41,24 @@ _OTHER_IMAGES = frozenset(
 )
 _VIDEOS = frozenset({".3gp", ".avi", ".m4v", ".mkv", ".mov", ".mp4", ".mpg", ".mts", ".webm"})
 _LLFF_FOLDER = re.compile(r"images(_\d+)?")
-#: The end of a path that stands for all folders below it.
-ALL_BELOW = "/**"
 #: The deepest nesting of folders that is searched.
 _MAX_DEPTH = 8
+
+
+class FolderScene:
+    """The photographs in a folder."""
+
+    def names(self, conf: SceneConf, long_side: int) -> list[str]:
+        """Return the names of the photographs, see `list_photographs`."""
+        return list(list_photographs(conf.path, long_side))
+
+    def digest(self, conf: SceneConf, long_side: int) -> str:
+        """Hash the names and bytes of the photographs."""
+        return files_digest(list_photographs(conf.path, long_side))
+
+    def resolve(self, conf: SceneConf, long_side: int, home: Path) -> Scene:
+        """List the photographs."""
+        return Scene(label(conf), home.name, list_photographs(conf.path, long_side))
 
 
 def list_photographs(path: str | None, long_side: int) -> dict[str, Path]:
@@ -121,30 +135,6 @@ def _check_heic(files: Sequence[Path]) -> None:
             f"{heic[0]}: {len(heic)} of {len(files)} photographs are HEIC, which needs "
             "pillow-heif: pip install 'xrgs[heic]'"
         )
-
-
-def files_digest(files: Mapping[str, Path]) -> str:
-    """Hash the names and bytes of files.
-
-    Args:
-        files: The files by their names; the hash depends on their order, and not on where they are.
-
-    Returns:
-        All 64 hexadecimal digits of a SHA-256.
-
-    Raises:
-        UnreadableError: A file can't be read now. It is not left out: the hash would be another one
-            whenever a disk or a server fails.
-    """
-    sha256 = hashlib.sha256()
-    for name, file in progress(files.items(), "hashing photographs", "file"):
-        try:
-            content = file_digest(file)
-        except OSError as error:
-            why = f"{error.strerror}; try again, or move it out of the folder"
-            raise UnreadableError(f"{file}: {why}") from error
-        sha256.update(f"{name}\0{content}\n".encode())
-    return sha256.hexdigest()
 
 
 def _is_llff_folder(folder: Path) -> bool:

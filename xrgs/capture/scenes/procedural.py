@@ -7,13 +7,21 @@ in `still_life`, which needs torch; nothing here does.
 
 from __future__ import annotations
 
-import hashlib
-from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
-from xrgs.capture.scenes.bundled import bundled_photograph
+from xrgs.capture.scenes import rendered
+from xrgs.capture.scenes.scene import Scene, bundled_photograph, check_views, label
+from xrgs.safeio.code import code_digest
+from xrgs.safeio.hashing import digest, file_digest
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from numpy.typing import NDArray
+
+    from xrgs.config import SceneConf
 
 #: The width of the views, px, where `variant.long_side` is 0.
 FULL_SIDE = 1008
@@ -41,29 +49,52 @@ TEXTURES: dict[str, tuple[str, tuple[float, float, float]]] = {
 }
 
 
+#: The source files that decide the pixels of the views, relative to the package.
+_SOURCES = (
+    "capture/images.py",
+    "capture/scenes/procedural.py",
+    "capture/scenes/raycast.py",
+    "capture/scenes/still_life.py",
+)
+
+
+class ProceduralScene:
+    """The embedded scene: its views are rendered once, and their exact cameras are known."""
+
+    def names(self, conf: SceneConf, long_side: int) -> list[str]:  # noqa: ARG002
+        """Return the names of the views."""
+        check_views(conf)
+        return names(conf.views)
+
+    def digest(self, conf: SceneConf, long_side: int) -> str:
+        """Hash the source code, the textures, and the size and number of the views."""
+        check_views(conf)
+        textures = [file_digest(bundled_photograph(name)) for name, _ in TEXTURES.values()]
+        return digest([camera_size(long_side), conf.views, textures, code_digest(*_SOURCES)])
+
+    def resolve(self, conf: SceneConf, long_side: int, home: Path) -> Scene:
+        """Render the views where they are not there."""
+
+        def render(folder: Path) -> None:
+            from xrgs.capture.scenes import still_life  # imports torch
+
+            still_life.render(folder, long_side, conf.views)
+
+        views = names(conf.views)
+        files = rendered.provide(home, views, render)
+        exact = dict(zip(views, viewmats(conf.views), strict=True))
+        # The intrinsics are known too, but SfM estimates them, as for a real capture.
+        return Scene(label(conf), home.name, files, viewmats=exact)
+
+
 def camera_size(long_side: int) -> tuple[int, int]:
-    """Compute the size of the views.
-
-    Args:
-        long_side: Their width, px; 0 for the full size.
-
-    Returns:
-        Width and height, px, at 4:3.
-    """
+    """Return width and height of the views, px, at 4:3; `long_side` 0 is the full size."""
     width = long_side or FULL_SIDE
     return width, max(1, round(width * 0.75))
 
 
 def intrinsics(width: int, height: int) -> NDArray[np.float64]:
-    """Compute the intrinsics of the views.
-
-    Args:
-        width: px.
-        height: px.
-
-    Returns:
-        [3, 3], px.
-    """
+    """Return the intrinsics [3, 3] of views of this size, px."""
     f = _FOCAL * width
     return np.array([[f, 0, width / 2], [0, f, height / 2], [0, 0, 1]])
 
@@ -74,9 +105,6 @@ def viewmats(views: int) -> NDArray[np.float64]:
     Positions follow the R3 sequence (Roberts 2018, "The unreasonable effectiveness of quasirandom
     sequences"), which fills the box evenly for any number of views. Its start is chosen so that
     every 8th of the first 24 views lies between others, and none at the box's border.
-
-    Args:
-        views: The number of views.
 
     Returns:
         World-to-camera matrices [views, 4, 4].
@@ -98,36 +126,5 @@ def _look_at(position: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def names(views: int) -> list[str]:
-    """Name the views.
-
-    Args:
-        views: The number of views.
-
-    Returns:
-        `view_000`, `view_001`, ...
-    """
+    """Name the views: `view_000`, `view_001`, ..."""
     return [f"view_{index:03d}" for index in range(views)]
-
-
-def digest(long_side: int, views: int) -> str:
-    """Hash everything that the rendered views depend on: source code, photographs, parameters.
-
-    Args:
-        long_side: As for `camera_size`.
-        views: The number of views.
-
-    Returns:
-        All 64 hexadecimal digits of a SHA-256.
-    """
-    sha256 = hashlib.sha256(repr((camera_size(long_side), views)).encode())
-    here = Path(__file__).parent
-    for file in (
-        here / "procedural.py",
-        here / "still_life.py",
-        here / "raycast.py",
-        here.parent / "images.py",
-    ):
-        sha256.update(file.read_bytes())
-    for name, _ in TEXTURES.values():
-        sha256.update(bundled_photograph(name).read_bytes())
-    return sha256.hexdigest()

@@ -21,7 +21,7 @@ from xrgs.safeio.records import read_struct
 from xrgs.safeio.sanitize import for_line
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Collection
+    from collections.abc import Callable, Sequence
     from pathlib import Path
 
 
@@ -37,7 +37,7 @@ class RenderedScene(Struct, frozen=True):
     """The SHA-256 of each image by its name."""
 
 
-def provide(home: Path, images: Collection[str], render: Callable[[Path], None]) -> None:
+def provide(home: Path, views: Sequence[str], render: Callable[[Path], None]) -> dict[str, Path]:
     """Verify rendered images, and render them where they are not there or damaged.
 
     Any number of processes may call this at once. A damaged folder is renamed, not removed.
@@ -45,12 +45,16 @@ def provide(home: Path, images: Collection[str], render: Callable[[Path], None])
     Args:
         home: The folder, named by the scene's fingerprint; the one above it is made where it is
             missing.
-        images: The names of the image files.
-        render: Writes them into the folder that it is given.
+        views: The names of the views.
+        render: Writes `<view>.png` for each view into the folder that it is given.
+
+    Returns:
+        The images by the names of the views.
 
     Raises:
         UnreadableError: The folder is there, but can't be read now.
     """
+    images = [f"{view}.png" for view in views]
     home.parent.mkdir(exist_ok=True)
     with lease.waited_for(home.parent, f".{home.name}.lock"):
         try:
@@ -65,9 +69,10 @@ def provide(home: Path, images: Collection[str], render: Callable[[Path], None])
             _log.warning("%s; renamed to %s, and rendered anew", damage, aside.name)
         if missing or damage is not None:
             _render(home, images, render)
+    return {view: home / f"{view}.png" for view in views}
 
 
-def _damage(home: Path, images: Collection[str]) -> StoreError | None:
+def _damage(home: Path, images: Sequence[str]) -> StoreError | None:
     """Return the first thing that is wrong with a rendered scene; None where it is intact."""
     try:
         files = _files(home)
@@ -91,7 +96,7 @@ def _files(home: Path) -> dict[str, str]:
     return content.files
 
 
-def _render(home: Path, images: Collection[str], render: Callable[[Path], None]) -> None:
+def _render(home: Path, images: Sequence[str], render: Callable[[Path], None]) -> None:
     """Render into another folder, after what a killed process left of it is removed."""
     work = home.with_name(f".{home.name}.rendering")
     remove_path(work)

@@ -1,20 +1,36 @@
-"""The dataclass of a scene: its photographs in order, and the cameras that are known."""
+"""What all kinds of scenes share: the dataclass, the protocol of a kind, and checks."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import hashlib
 from dataclasses import dataclass, field
+from importlib.util import find_spec
 from pathlib import Path
+from typing import TYPE_CHECKING, Protocol
 
-import numpy as np
-from numpy.typing import NDArray
+from xrgs.errors import UnreadableError, XrgsError
+from xrgs.runtime.progress import progress
+from xrgs.safeio.hashing import file_digest
+from xrgs.safeio.paths import user_path
+from xrgs.safeio.sanitize import for_line
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    import numpy as np
+    from numpy.typing import NDArray
+
+    from xrgs.config import SceneConf
+
+#: The end of a path that stands for all folders below it.
+ALL_BELOW = "/**"
 
 
 @dataclass(frozen=True)
 class Scene:
     """The photographs of a scene, and the cameras where they are known.
 
-    The key of all mappings is the name of a photograph, which its view gets.
+    The key of all mappings is the name of a photograph, which is also the name of its view.
     """
 
     name: str
@@ -22,10 +38,97 @@ class Scene:
     fingerprint: str
     """A hash of the photographs' names and bytes, or of what they are rendered from."""
     files: Mapping[str, Path]
-    """The photographs, sorted by name; one that a user named is a path by itself."""
+    """The photographs, sorted by name."""
     intrinsics: Mapping[str, NDArray[np.float64]] = field(default_factory=dict)
     """Exact intrinsics [3, 3] in px of the file, without distortion; SfM gets them, and does not
     refine them."""
     viewmats: Mapping[str, NDArray[np.float64]] = field(default_factory=dict)
     """Exact world-to-camera matrices [4, 4]. SfM never gets them: its poses are compared with
     them."""
+
+
+class SceneKind(Protocol):
+    """A source of photographs.
+
+    A new kind is one module of this folder and one line in `xrgs.capture.scenes.KINDS`. The key of
+    a variant has what `digest` returns, and none of the code of a kind.
+    """
+
+    def names(self, conf: SceneConf, long_side: int) -> list[str]:
+        """Return the names of the photographs, sorted, without reading or rendering them.
+
+        Args:
+            conf: The scene's config.
+            long_side: `variant.long_side`, px; 0 for the full size.
+
+        Raises:
+            XrgsError: The photographs are not there; the message names the key.
+        """
+
+    def digest(self, conf: SceneConf, long_side: int) -> str:
+        """Hash all that decides the photographs, without decoding or rendering them.
+
+        A kind that renders or extracts its photographs hashes the source code that does so, too.
+        """
+
+    def resolve(self, conf: SceneConf, long_side: int, home: Path) -> Scene:
+        """Find the photographs on disk.
+
+        Args:
+            conf: As for `names`.
+            long_side: As for `names`.
+            home: The folder for photographs that are rendered or extracted, see
+                `xrgs.capture.scenes.rendered`. Its name is the scene's fingerprint.
+        """
+
+
+def label(conf: SceneConf) -> str:
+    """Return the scene's name in tables: one printable line of at most 200 characters.
+
+    It is `scene.name`; where that is empty, the name of the folder or the video, or else the kind.
+    A folder called `images` has the name of the folder around it.
+    """
+    name = conf.name
+    if not name and conf.path:
+        path = user_path(conf.path.removesuffix(ALL_BELOW)).resolve()
+        name = path.parent.name if path.name == "images" else path.name
+    return for_line(name, 200).strip() or conf.kind
+
+
+def check_views(conf: SceneConf) -> None:
+    """Refuse fewer than two views of a kind that makes as many as `scene.views` says."""
+    if conf.views < 2:
+        raise XrgsError(f"scene.views={conf.views}: must be 2 or more")
+
+
+def files_digest(files: Mapping[str, Path]) -> str:
+    """Hash the names and bytes of files, in their order: 64 hexadecimal digits of a SHA-256.
+
+    Raises:
+        UnreadableError: A file can't be read now. It is not left out: the hash would be another one
+            whenever a disk or a server fails.
+    """
+    sha256 = hashlib.sha256()
+    for name, file in progress(files.items(), "hashing photographs", "file"):
+        try:
+            content = file_digest(file)
+        except OSError as error:
+            why = f"{error.strerror}; try again, or move it out of the folder"
+            raise UnreadableError(f"{file}: {why}") from error
+        sha256.update(f"{name}\0{content}\n".encode())
+    return sha256.hexdigest()
+
+
+def bundled_photograph(name: str) -> Path:
+    """Find a file in the `data` folder of scikit-image's wheel, without importing scikit-image.
+
+    Raises:
+        XrgsError: scikit-image, or the file in it, is not installed.
+    """
+    spec = find_spec("skimage")
+    if spec is None or spec.origin is None:
+        raise XrgsError("scikit-image is not installed: it holds the embedded scenes' photographs")
+    path = Path(spec.origin).parent / "data" / name
+    if not path.is_file():
+        raise XrgsError(f"{path}: missing from this scikit-image, which the embedded scenes need")
+    return path

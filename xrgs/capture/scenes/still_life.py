@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 
 from xrgs.capture import images
 from xrgs.capture.scenes import procedural, raycast
-from xrgs.capture.scenes.bundled import bundled_photograph
 from xrgs.capture.scenes.raycast import Ball, Pyramid, Quad, pyramid
+from xrgs.capture.scenes.scene import bundled_photograph
 from xrgs.runtime.machine import single_torch_thread
 from xrgs.runtime.progress import progress
 
@@ -55,11 +55,7 @@ def _box(
 
 
 def solids() -> list[Quad | Ball]:
-    """List the solids of the scene.
-
-    Returns:
-        The solids, in world units.
-    """
+    """Return the solids of the scene, in world units."""
     floor = 1.5
     result: list[Quad | Ball] = []
     # Mirrored tiles give fine texture without a period, which SfM could mistake for one place.
@@ -93,11 +89,7 @@ def solids() -> list[Quad | Ball]:
 
 
 def textures() -> dict[str, Pyramid]:
-    """Read the photographs that are the scene's textures.
-
-    Returns:
-        Pyramids of [3, h, w] in 0..1, tinted, by the name of the texture.
-    """
+    """Return the tinted textures: pyramids of [3, h, w] in 0..1 by the name of the texture."""
     return {
         name: pyramid(
             torch.from_numpy(

@@ -7,7 +7,6 @@ size, where the noise of the sensor counts little. Nothing here imports av befor
 
 from __future__ import annotations
 
-import hashlib
 import logging
 from importlib.util import find_spec
 from itertools import pairwise
@@ -17,18 +16,23 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from xrgs.capture import images
+from xrgs.capture.scenes import rendered
+from xrgs.capture.scenes.scene import Scene, check_views, label
 from xrgs.errors import UnreadableError, XrgsError
 from xrgs.runtime.progress import ProgressBar
+from xrgs.safeio.code import code_digest
 from xrgs.safeio.files import is_transient
-from xrgs.safeio.hashing import file_digest
+from xrgs.safeio.hashing import digest, file_digest
 from xrgs.safeio.paths import user_path
 from xrgs.safeio.sanitize import for_line
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Iterator, Sequence
 
     from av.video.frame import VideoFrame
     from numpy.typing import NDArray
+
+    from xrgs.config import SceneConf
 
 _log = logging.getLogger(__name__)
 
@@ -38,45 +42,41 @@ _SHARPNESS_SIDE = 640
 _CONTAINERS = "mov,mp4,m4a,3gp,3g2,mj2,matroska,webm,avi,mpegts,mpeg"
 
 
-def names(views: int) -> list[str]:
-    """Name the frames that are taken.
-
-    Args:
-        views: The number of frames.
-
-    Returns:
-        `frame_0000`, `frame_0001`, ...
-    """
-    return [f"frame_{index:04d}" for index in range(views)]
+#: The source files that decide the frames, relative to the package.
+_SOURCES = ("capture/images.py", "capture/scenes/video.py")
 
 
-def digest(path: str | None, views: int) -> str:
-    """Hash everything that the frames depend on: the video's bytes, their number, source code.
+class VideoScene:
+    """The sharpest frames of a video, which are extracted once."""
 
-    Args:
-        path: `scene.path`, the video.
-        views: The number of frames that are taken.
+    def names(self, conf: SceneConf, long_side: int) -> list[str]:  # noqa: ARG002
+        """Return the names of the frames: `frame_0000`, `frame_0001`, ..."""
+        check_views(conf)
+        return [f"frame_{index:04d}" for index in range(conf.views)]
 
-    Returns:
-        All 64 hexadecimal digits of a SHA-256.
+    def digest(self, conf: SceneConf, long_side: int) -> str:  # noqa: ARG002
+        """Hash the video's bytes, the number of frames and the source code.
 
-    Raises:
-        UnreadableError: The video can't be read now.
-        XrgsError: There is no such file, or the package that reads videos is not installed.
-    """
-    file = _file(path)
-    try:
-        content = file_digest(file)
-    except OSError as error:
-        kind = UnreadableError if is_transient(error) else XrgsError
-        raise kind(f"scene.path={file}: {error.strerror}") from error
-    if find_spec("av") is None:
-        raise XrgsError(f"scene.path={file}: a video needs PyAV: pip install 'xrgs[video]'")
-    sha256 = hashlib.sha256(repr((content, views)).encode())
-    here = Path(__file__)
-    for source in (here, here.parents[1] / "images.py"):
-        sha256.update(file_digest(source).encode())
-    return sha256.hexdigest()
+        Raises:
+            UnreadableError: The video can't be read now.
+            XrgsError: There is no such file, or the package that reads videos is not installed.
+        """
+        check_views(conf)
+        file = _file(conf.path)
+        try:
+            content = file_digest(file)
+        except OSError as error:
+            kind = UnreadableError if is_transient(error) else XrgsError
+            raise kind(f"scene.path={file}: {error.strerror}") from error
+        if find_spec("av") is None:
+            raise XrgsError(f"scene.path={file}: a video needs PyAV: pip install 'xrgs[video]'")
+        return digest([content, conf.views, code_digest(*_SOURCES)])
+
+    def resolve(self, conf: SceneConf, long_side: int, home: Path) -> Scene:
+        """Extract the frames where they are not there."""
+        views = self.names(conf, long_side)
+        files = rendered.provide(home, views, lambda work: extract(_file(conf.path), views, work))
+        return Scene(label(conf), home.name, files)
 
 
 def _file(path: str | None) -> Path:
@@ -85,32 +85,32 @@ def _file(path: str | None) -> Path:
     return user_path(path)
 
 
-def extract(path: str | None, views: int, folder: Path) -> None:
+def extract(file: Path, names: Sequence[str], folder: Path) -> None:
     """Write the sharpest frames of a video as `<name>.png`, as its player would show them.
 
     Args:
-        path: `scene.path`, the video.
-        views: The number of frames to take.
+        file: The video.
+        names: The names of the frames to take.
         folder: The folder to write to.
 
     Raises:
         ImageError: The file is not a video, or its frames are too large.
-        XrgsError: It has fewer frames than `views`.
+        XrgsError: It has fewer frames than names.
     """
-    file = _file(path)
     with ProgressBar("sharpness of frames", "frame", None) as bar:
         sharpness = []
         for frame in _frames(file):
             sharpness.append(measure_sharpness(_brightness(frame)))
             bar.update(1)
-    if len(sharpness) < views:
-        raise XrgsError(f"scene.views={views}: {file} has {len(sharpness)} frames")
-    chosen = sharpest(sharpness, views)
-    with ProgressBar("frames", "frame", views) as bar:
+    if len(sharpness) < len(names):
+        raise XrgsError(
+            f"scene.views={len(names)}: {file} has {len(sharpness)} frames; lower scene.views"
+        )
+    chosen = dict(zip(sharpest(sharpness, len(names)), names, strict=True))
+    with ProgressBar("frames", "frame", len(names)) as bar:
         for number, frame in enumerate(_frames(file)):
             if number in chosen:
-                name = names(views)[chosen.index(number)]
-                images.save(folder / f"{name}.png", _upright(frame), durable=False)
+                images.save(folder / f"{chosen[number]}.png", _upright(frame), durable=False)
                 bar.update(1)
 
 
@@ -129,14 +129,7 @@ def sharpest(sharpness: list[float], parts: int) -> list[int]:
 
 
 def measure_sharpness(brightness: NDArray[np.uint8]) -> float:
-    """Measure the sharpness of an image: the variance of its Laplacian.
-
-    Args:
-        brightness: [H, W] in 0..255.
-
-    Returns:
-        The variance over all pixels; 0 for an image without detail.
-    """
+    """Return the variance of the Laplacian of a brightness [H, W] in 0..255."""
     from scipy.ndimage import laplace
 
     return float(laplace(brightness.astype(np.float32)).var())

@@ -1,4 +1,4 @@
-"""What the page is made of, and how values from a store become values of its JSON."""
+"""What the page is made of: its answer, context and curves, and values of a store as JSON."""
 
 from __future__ import annotations
 
@@ -8,19 +8,27 @@ from typing import TYPE_CHECKING, Any
 
 import pandas as pd
 
-from xrgs.safeio.sanitize import MAX_CELL, for_line
+from xrgs.errors import StoreError
+from xrgs.evaluation.metrics import VIEW_METRICS
+from xrgs.report.collect import CURVE_COLUMNS, number_columns
+from xrgs.report.markup import titled
+from xrgs.report.writing import arrow, by_key, reading, signed
+from xrgs.safeio.sanitize import MAX_CELL, counted, for_line
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Mapping
+    from collections.abc import Iterable, Iterator, Mapping
+    from pathlib import Path
 
+    from xrgs.capture.views import Variant
+    from xrgs.evaluation.metrics import Metric
+    from xrgs.report.collect import Sweep
     from xrgs.report.compare import Comparison
+    from xrgs.report.context import Context
     from xrgs.report.joined import JoinedStore
+    from xrgs.report.writing import Change
 
-#: What the cells of one row of pictures have in common.
+#: What the cells have in common that the page shows side by side.
 RUN = ["scene", "condition", "variant_seed", "seed"]
-LOG_SCALES = (-9.0, 3.0)
-"""Natural logarithms of a model's scales that 8 bits cover, in the normalised world. A step is 5%,
-and what is smaller is far below a pixel."""
 
 
 @dataclass
@@ -53,16 +61,8 @@ def shown(text: object) -> str:
 
 
 def why(error: Exception, store: JoinedStore) -> str:
-    """Return what an error says, without the paths of the stores.
-
-    Args:
-        error: The error.
-        store: The stores; the page is the same wherever they are.
-    """
-    text = str(error)
-    for one in store.stores:
-        text = text.replace(f"{one.path}/", "")
-    return shown(text)
+    """Return the message of an error, without the paths of the stores."""
+    return shown(store.without_paths(str(error)))
 
 
 def finite(value: float) -> float | None:
@@ -72,11 +72,7 @@ def finite(value: float) -> float | None:
 
 
 def run_names(row: Mapping[str, Any] | pd.Series) -> dict[str, str]:
-    """Return the names of a run for the page: scene, condition and replicate.
-
-    Args:
-        row: A row with the keys `RUN`.
-    """
+    """Return scene, condition and replicate of a row with the keys `RUN`, for the page."""
     return {
         "scene": shown(row["scene"]),
         "condition": shown(row["condition"]),
@@ -89,22 +85,199 @@ def runs(comparison: Comparison) -> Iterator[pd.DataFrame]:
 
     The first replicates of all scenes and conditions come before the second ones.
 
-    Args:
-        comparison: The comparison.
-
     Yields:
         Rows of `Comparison.cells`, one for each label.
     """
     cells = comparison.cells
     done = cells[cells["state"] == "done"].drop_duplicates([*RUN, "label"])
-    order = done["label"] != comparison.base
-    done = done.assign(order=order).sort_values("order", kind="stable")
-    found = [rows for _, rows in done.groupby(RUN, sort=True)]
-    seen: dict[tuple[str, str], int] = {}
-    ranks = []
-    for rows in found:
-        key = (rows["scene"].iloc[0], rows["condition"].iloc[0])
-        seen[key] = seen.get(key, -1) + 1
-        ranks.append(seen[key])
-    for at in sorted(range(len(found)), key=lambda place: (ranks[place], place)):
-        yield found[at]
+    done = done.sort_values("label", key=lambda label: label != comparison.base, kind="stable")
+    groups = [rows for _, rows in done.groupby(RUN, sort=True)]
+    firsts = pd.concat([rows.iloc[:1] for rows in groups]) if groups else done
+    ranks = firsts.groupby(["scene", "condition"]).cumcount().to_numpy()
+    for place in ranks.argsort(kind="stable"):
+        yield groups[place]
+
+
+#: What a history counts, in the order of the page.
+RULES = (
+    "gaussians",
+    "duplicated",
+    "split",
+    "pruned_opacity",
+    "pruned_scale",
+    "pruned_by_components",
+    "pruned_non_finite",
+)
+#: The most rows of a history that are drawn, evenly spaced: a plot has few more pixels.
+_MAX_ROWS = 240
+
+
+def add_curves(content: Content, quality: pd.DataFrame) -> None:
+    """Add the quality during training of each cell that was evaluated during training.
+
+    Args:
+        content: The content of the page.
+        quality: The table that `xrgs.report.curves.joined` returns.
+    """
+    keys = [*RUN, "label"]
+    for _, rows in quality.groupby(keys, sort=False):
+        first = rows.iloc[0]
+        columns = {name: [finite(value) for value in rows[name]] for name in CURVE_COLUMNS}
+        content.curves.append(run_names(first) | {"label": shown(first["label"])} | columns)
+
+
+def add_history(content: Content, store: JoinedStore, comparison: Comparison) -> None:
+    """Add Gaussians over steps, and what each rule grew and pruned, of each finished cell."""
+    for rows in runs(comparison):
+        for _, row in rows[~rows["cell_id"].isin(store.external)].iterrows():
+            try:
+                columns = _history(store.cell(row["cell_id"]).path / "history.csv")
+            except StoreError as error:
+                label = f"{shown(row['scene'])}, {shown(row['label'])}"
+                content.notes.append(f"{label}: no history, {why(error, store)}")
+                continue
+            content.history.append(run_names(row) | {"label": shown(row["label"])} | columns)
+
+
+def _history(file: Path) -> dict[str, list[float | None]]:
+    columns = number_columns(file)
+    count = len(columns["step"])
+    step = max(1, -(-count // _MAX_ROWS))
+    kept = [*range(0, count, step)] + [count - 1] * ((count - 1) % step > 0)
+    names = [name for name in ("step", *RULES) if name in columns]
+    return {name: [finite(columns[name][at]) for at in kept] for name in names}
+
+
+def add_trade_offs(content: Content, comparison: Comparison) -> None:
+    """Add Gaussians and scores of each label and scene, as means over the replicates."""
+    cells = comparison.cells
+    done = cells[cells["state"] == "done"]
+    names = ["gaussians", *VIEW_METRICS]
+    means: Any = done.groupby(["condition", "scene", "label"], sort=False)[names].mean()
+    for (condition, scene, label), row in means.iterrows():
+        numbers: dict[str, Any] = {name: finite(row[name]) for name in names}
+        texts = {"condition": shown(condition), "scene": shown(scene), "label": shown(label)}
+        content.trade_offs.append(texts | numbers)
+
+
+#: Entries of the provenance that the context has.
+_MADE_WITH = {
+    "arithmetic": "Arithmetic",
+    "xrgs": "xrgs",
+    "git": "Commit",
+}
+
+
+@dataclass(frozen=True)
+class Answer:
+    """What one ablation changed."""
+
+    label: str
+    condition: str
+    pairs: str
+    """The numbers of scenes and pairs behind it, as a phrase."""
+    better: tuple[str, ...]
+    """The metrics whose interval shows an improvement, with their change."""
+    worse: tuple[str, ...]
+    undecided: tuple[tuple[str, tuple[str, ...]], ...]
+    """Readings that are no verdict, each with its metrics and their changes."""
+
+
+def answers(comparison: Comparison) -> list[Answer]:
+    """Return what each ablation changed, in the order of the tables."""
+    means = by_key(comparison.means)
+    found = []
+    for label, condition in comparison.groups:
+        rows = [
+            (metric, means[label, condition, metric.name])
+            for metric in comparison.metrics
+            if (label, condition, metric.name) in means
+        ]
+        readings: dict[str, list[str]] = {}
+        for metric, row in rows:
+            readings.setdefault(shown(reading(row, metric)), []).append(_change(metric, row))
+        better, worse = (tuple(readings.pop(verdict, ())) for verdict in ("better", "worse"))
+        scenes = max((row.scenes for _, row in rows), default=0)
+        pairs = max((row.pairs for _, row in rows), default=0)
+        found.append(
+            Answer(
+                label=shown(label),
+                condition=shown(condition),
+                pairs=f"{counted(scenes, 'scene')}, {counted(pairs, 'pair')} of cells",
+                better=better,
+                worse=worse,
+                undecided=tuple((why, tuple(texts)) for why, texts in readings.items()),
+            )
+        )
+    return found
+
+
+def _change(metric: Metric, row: Change) -> str:
+    if math.isnan(row.change):
+        return metric.label
+    absolute = f" ({signed(row.difference)} dB)" if metric.unit == "dB" else ""
+    return f"{metric.label} {signed(row.change)} % {arrow(row.change, metric)}{absolute}"
+
+
+def page_context(
+    sweep: Sweep,
+    comparison: Comparison,
+    contexts: Mapping[str, Context],
+    variants: Mapping[str, Variant],
+) -> list[tuple[str, str]]:
+    """Return names and values of the page's section on context.
+
+    Args:
+        sweep: The sweep.
+        comparison: The comparison of its cells.
+        contexts: How the cells of each condition were trained and scored.
+        variants: The variants of the cells that can be read, by their ids.
+    """
+    cells = comparison.cells
+    done = cells[cells["cell_id"].isin(sweep.done)].drop_duplicates("cell_id")
+    replicates = done.drop_duplicates(["variant_seed", "seed"])
+    rows = [
+        ("Compared with", shown(comparison.base)),
+        ("Scenes", ", ".join(map(shown, comparison.scenes))),
+        ("Replicates (variant.seed/seed)", _listed(_replicates(replicates))),
+        ("Cells", f"{len(done)} of {cells['cell_id'].nunique()} are done"),
+    ]
+    for condition, of in contexts.items():
+        rows.append((shown(titled("Training and scores", condition)), of.of_scores))
+        rows.append((shown(titled("Times", condition)), of.of_times))
+    rows += [(shown(scene), text) for scene, text in _views(done, variants)]
+    made = sweep.provenance
+    rows += [(name, _listed(made.get(key, ["n/a"]))) for key, name in _MADE_WITH.items()]
+    return [(name, text) for name, text in rows if text]
+
+
+def _replicates(rows: pd.DataFrame) -> list[str]:
+    return [f"{draw}/{seed}" for draw, seed in zip(rows["variant_seed"], rows["seed"], strict=True)]
+
+
+def _listed(values: Iterable[Any]) -> str:
+    """List distinct values in their order."""
+    return shown(", ".join(dict.fromkeys(str(value) for value in values)))
+
+
+def _views(done: pd.DataFrame, variants: Mapping[str, Variant]) -> list[tuple[str, str]]:
+    """Return the numbers and sizes of the views of each scene's first variant."""
+    rows = []
+    for scene, variant_id in done.drop_duplicates("scene")[["scene", "variant_id"]].to_numpy():
+        variant = variants.get(variant_id)
+        if variant is None:
+            continue
+        by_kind = {
+            "HR": [v for v in variant.views if v.split == "train" and v.tag == "HR"],
+            "LR": [v for v in variant.views if v.split == "train" and v.tag == "LR"],
+            "test": [v for v in variant.views if v.split == "test"],
+        }
+        sizes = {
+            kind: _listed(f"{view.width} × {view.height}" for view in views)
+            for kind, views in by_kind.items()
+        }
+        text = "; ".join(
+            f"{len(views)} {kind} ({sizes[kind]} px)" for kind, views in by_kind.items() if views
+        )
+        rows.append((f"Views of {scene}", text))
+    return rows

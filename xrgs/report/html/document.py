@@ -1,7 +1,7 @@
 """Writes the page: a template, its style and scripts, and the content, in one file.
 
-The page needs nothing but itself. Its Content-Security-Policy forbids the network, and runs the one
-script whose hash it names: what a store holds is text or JSON, and never markup or script.
+The page needs nothing but itself. Its Content-Security-Policy forbids the network, and allows one
+script by its hash: a text from a store is text or JSON, and never markup or script.
 """
 
 from __future__ import annotations
@@ -9,32 +9,30 @@ from __future__ import annotations
 import base64
 import hashlib
 from importlib import resources
-from itertools import islice
 from typing import TYPE_CHECKING, Any
 
 import pandas as pd
 from jinja2 import Environment, PackageLoader, StrictUndefined
 
 from xrgs.capture import variant
-from xrgs.capture.views import Variant
 from xrgs.errors import XrgsError
 from xrgs.evaluation.metrics import METRICS, VIEW_METRICS
-from xrgs.report.html import series, summary
-from xrgs.report.html.album import ERROR_RANGE
-from xrgs.report.html.content import LOG_SCALES, Content, finite, runs, shown, why
-from xrgs.report.html.figures import counterparts
-from xrgs.report.html.views import add_views
-from xrgs.report.render import (
-    TextTable,
-    filled,
-    filled_places,
-    heads,
-    titled,
-    to_latex,
-    to_markdown,
+from xrgs.report.html.content import (
+    Content,
+    add_curves,
+    add_history,
+    add_trade_offs,
+    answers,
+    finite,
+    page_context,
+    shown,
+    why,
 )
+from xrgs.report.html.images import ERROR_RANGE, add_trained, add_views
+from xrgs.report.markup import filled, filled_places, titled, to_latex, to_markdown
+from xrgs.report.paper import counterparts
 from xrgs.report.writing import NO_INTERVAL, number, signed
-from xrgs.runtime.machine import set_passive_openmp_wait
+from xrgs.runtime.text import TextTable
 from xrgs.safeio.atomic import write_text
 from xrgs.safeio.sanitize import for_csv
 
@@ -42,6 +40,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
     from pathlib import Path
 
+    from xrgs.capture.views import Variant
     from xrgs.report.collect import Sweep
     from xrgs.report.joined import JoinedStore
     from xrgs.report.tables import Tables
@@ -51,8 +50,6 @@ MAX_BYTES = 10_000_000
 _VIEW_BYTES, _TRAINING_BYTES, _MODEL_BYTES = 4_000_000, 1_500_000, 3_500_000
 #: The scripts, in the order that they need one another.
 _SCRIPTS = ("page.js", "tables.js", "views.js", "charts.js", "splats.js")
-#: The most runs of which training views and models are shown.
-_MAX_RUNS = 12
 
 
 def write_document(
@@ -75,7 +72,7 @@ def write_document(
         tables: The tables of its comparison.
         texts: Every table of the report, in order.
         quality: Quality during training, as `xrgs.report.curves.joined` returns it.
-        warnings: What a reader is warned of.
+        warnings: Sentences that a reader has to know.
         pictures: Whether to have photographs, renders and models.
 
     Raises:
@@ -84,19 +81,19 @@ def write_document(
     comparison, content = tables.comparison, Content()
     variants = _variants(store, comparison.cells, content)
     add_views(content, store, comparison, sweep.views, _VIEW_BYTES * pictures)
-    series.add_curves(content, quality)
-    series.add_history(content, store, comparison)
-    series.add_trade_offs(content, comparison)
+    add_curves(content, quality)
+    add_history(content, store, comparison)
+    add_trade_offs(content, comparison)
     if pictures:
-        _add_trained(content, store, list(runs(comparison)), variants)
+        add_trained(content, store, comparison, variants, _TRAINING_BYTES, _MODEL_BYTES)
     else:
         content.notes.append("Photographs, renders and models were left out: --pictures none.")
     head = {
         "id": shown(sweep.id),
         "commands": [shown(" ".join(("xrgs-sweep", *words))) for words in sweep.commands.values()],
         "base": shown(comparison.base),
-        "answers": summary.answers(comparison),
-        "context": summary.context(store, sweep, comparison, tables.contexts, variants),
+        "answers": answers(comparison),
+        "context": page_context(sweep, comparison, tables.contexts, variants),
         "warnings": [shown(text) for text in (*warnings, *tables.cautions)],
     }
     write_text(file, _fitting(head, content, tables, [table for table in texts if table.rows]))
@@ -113,26 +110,8 @@ def _variants(store: JoinedStore, cells: pd.DataFrame, content: Content) -> dict
     return found
 
 
-def _add_trained(
-    content: Content, store: JoinedStore, found: list[pd.DataFrame], variants: dict[str, Variant]
-) -> None:
-    """Add training views and models of the first replicate of each scene and condition."""
-    first = {(rows["scene"].iloc[0], rows["condition"].iloc[0]): rows for rows in reversed(found)}
-    chosen = list(islice(reversed(first.values()), _MAX_RUNS))
-    if not any(rows["variant_id"].iloc[0] in variants for rows in chosen):
-        return
-    set_passive_openmp_wait()  # before torch is imported
-    from xrgs.report.html.trained import add_trained
-
-    add_trained(content, store, chosen, variants, _TRAINING_BYTES, _MODEL_BYTES)
-    if len(first) > len(chosen):
-        content.notes.append(
-            f"Training views and models are of {len(chosen)} of {len(first)} scenes and conditions."
-        )
-
-
 def _fitting(head: dict[str, Any], content: Content, tables: Tables, texts: list[TextTable]) -> str:
-    """Return the page, without what would make it larger than `MAX_BYTES`."""
+    """Return the page; where it would be larger than `MAX_BYTES`, parts are left out."""
     long = tables.long()
     for part in ("history", "models", "curves", ""):
         text = _rendered(head, content, tables, texts, long)
@@ -161,6 +140,7 @@ def _rendered(
     changes = [*_changes(long, tables.comparison.scenes)]
     kept = filled_places([_texts(row) for row in changes])
     listed = filled(_changes_table(changes, head["base"]))
+    labels = [shown(label) for label, _ in tables.comparison.groups]
     style, script = _source("page.css"), "\n".join(map(_source, _SCRIPTS))
     return environment.get_template("page.html.jinja").render(
         head,
@@ -171,12 +151,11 @@ def _rendered(
         changes=[row | {"cells": [row["cells"][place] for place in kept]} for row in changes],
         change_columns=[*zip(listed.columns, listed.align, strict=True)],
         notes=list(dict.fromkeys(content.notes)),
-        figures=counterparts(content, tables.comparison),
+        figures=counterparts(labels, content.views, content.training),
         error_range=ERROR_RANGE,
         data=vars(content)
         | {
             "base": head["base"],
-            "log_scales": LOG_SCALES,
             "copies": [_copies(table) for table in texts],
             "changes": _lines(listed),
             "scores": [_score(name) for name in VIEW_METRICS if _is_measured(content, name)],
@@ -189,7 +168,7 @@ def _printable(table: TextTable) -> TextTable:
     notes = (table.context, *table.notes) if table.context else table.notes
     return TextTable(
         shown(table.title),
-        tuple(map(shown, heads(table))),
+        tuple(map(shown, table.heads)),
         tuple(tuple(map(shown, row)) for row in table.rows),
         table.align,
         tuple(map(shown, notes)),
@@ -197,7 +176,7 @@ def _printable(table: TextTable) -> TextTable:
 
 
 def _source(name: str) -> str:
-    """Return a file of the package. It has no `</`, which could end the element that it is in."""
+    """Return a file of the package, in which no `</` ends the page's element around it."""
     return resources.files("xrgs.report.html").joinpath(name).read_text(encoding="utf-8")
 
 
@@ -234,7 +213,7 @@ def _copies(table: TextTable) -> dict[str, str]:
     return {"latex": to_latex(table), "markdown": to_markdown(table), "csv": str(csv)}
 
 
-#: How many lines each form has before the first row of a table.
+#: The number of lines before the first row of a table, in each form.
 _HEAD_LINES = {"latex": 9, "markdown": 4, "csv": 1}
 
 
@@ -248,7 +227,8 @@ def _lines(table: TextTable) -> dict[str, dict[str, list[str]]]:
     return found
 
 
-#: The columns of the table of all changes, and their alignment; `{base}` is what is compared with.
+#: The columns of the table of all changes, and their alignment; `{base}` stands for the base's
+#: label.
 _CHANGE_COLUMNS = {
     "Ablation": "l", "Scene": "l", "Metric": "l", "Change, %": "r", "Reading": "l", "{base}": "r",
     "Value": "r", "From, %": "r", "To, %": "r", "q": "r", "Pairs that agree": "l",

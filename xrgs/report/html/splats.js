@@ -75,11 +75,11 @@ const FRUSTUM = 0.06; // of the distance between the cameras and what they look 
 const WIDTH = 720; // of a canvas, px
 const TEXTURE = 2048; // its width, texels; a Gaussian has four
 
-// Undoes `quantise` of xrgs/report/html/trained.py, and forms the covariances.
+// Undoes `quantise` of xrgs/viewer/trained.py, and forms the covariances.
 function decode(model) {
   const bytes = Uint8Array.from(atob(model.data), (char) => char.charCodeAt(0));
   const numbers = new DataView(bytes.buffer);
-  const [least, most] = data.log_scales;
+  const [least, most] = model.log_scales;
   const rows = Math.ceil((model.count * 4) / TEXTURE);
   const texels = new Float32Array(Math.max(1, rows) * TEXTURE * 4);
   const means = new Float32Array(model.count * 3);

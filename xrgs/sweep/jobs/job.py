@@ -14,7 +14,7 @@ from xrgs.runtime import lease
 from xrgs.runtime.progress import log_line
 from xrgs.safeio.files import is_transient
 from xrgs.splat.backend import arithmetic
-from xrgs.sweep import presence, variants
+from xrgs.sweep import variants
 from xrgs.sweep.jobs import worker
 from xrgs.sweep.jobs.supervise import Limits
 
@@ -27,15 +27,15 @@ if TYPE_CHECKING:
     from xrgs.experiment.store import Store
     from xrgs.sweep.session import SweepSession
 
-#: Outcomes of a job beside the states of a cell. LOCKED: another sweep is training the cell.
+#: Outcomes of a job other than the states of a cell. LOCKED: another sweep is training the cell.
 #: STOPPED: the sweep is over, or no further job may begin. UNWRITABLE: the store can't be written.
 #: GONE: the store is no longer there. UNKNOWN: a file can't be read now, and the cell was left.
 #: INTERRUPTED: a signal asked the cell's process to end, and the next sweep continues the cell.
 LOCKED, STOPPED, UNWRITABLE, GONE, UNKNOWN = "locked", "stopped", "unwritable", "gone", "unknown"
 INTERRUPTED = "interrupted"
-#: Reasons for which no further job of a sweep begins, see `SweepSession.stop`.
+#: Reasons to begin no further job of a sweep, see `SweepSession.stop`.
 FAIL_FAST, STORE_FULL = "fail_fast, and a cell failed", "the store can't be written"
-#: Outcomes of errors that are no fault of the cell: the next sweep trains it without `retry`.
+#: Outcomes of errors that are no fault of the cell: the next sweep trains the cell again.
 _NO_FAULT = {
     worker.InterruptedWorkError: INTERRUPTED,
     worker.UnwritableError: UNWRITABLE,
@@ -44,12 +44,11 @@ _NO_FAULT = {
 
 
 class _CellLeftError(XrgsError):
-    """This job has to leave its cell unfinished, which is no fault of the cell."""
+    """This job leaves its cell unfinished, through no fault of the cell."""
 
     def __init__(self, outcome: str) -> None:
         super().__init__(outcome)
         self.outcome = outcome
-        """The outcome of the job."""
 
 
 def run_job(session: SweepSession, store: Store, cell_id: str, name: str) -> str:
@@ -57,7 +56,7 @@ def run_job(session: SweepSession, store: Store, cell_id: str, name: str) -> str
 
     Args:
         session: The call of `xrgs-sweep` that the job belongs to.
-        store: The store, whose folder of the cell has its config and identity.
+        store: The store. The cell's folder in it has the cell's config and identity.
         cell_id: The cell's id.
         name: The cell's name for people.
 
@@ -92,8 +91,8 @@ def run_job(session: SweepSession, store: Store, cell_id: str, name: str) -> str
 
 
 def _outcome_of(error: OSError, store: Store) -> str:
-    """Return the outcome of a job that an error of the store ended; raise any other error again."""
-    if presence.is_gone(store):
+    """Return the outcome of a job after an error of the store; raise any other error again."""
+    if store.is_gone:
         return GONE
     if worker.unwritable(error):
         return UNWRITABLE
@@ -107,8 +106,8 @@ def _run_under_lease(
 ) -> str:
     """Train the cell unless another process is training it, or has finished it meanwhile."""
     identity = cell.identity()
-    # The plan has verified the variant's files, and the child process verifies them again. Of a
-    # trimmed variant the plan knows the id alone.
+    # The plan has verified the variant's files, and the child process verifies them again. The
+    # images of a trimmed variant are made again here.
     variant = store.variants / identity.variant
     if not variant.is_dir():
         variants.restore(conf, store, identity.variant)
@@ -122,7 +121,7 @@ def _run_under_lease(
         state = cell.state()
         if state.name == "unknown":
             log_line(f"{cell.id} is left: {state.reason}")
-        if state.name in {"done", "unknown"}:  # done by another sweep since this one was planned
+        if state.name in {"done", "unknown"}:  # another sweep has finished it meanwhile
             return state.name
         _check_code(name, cell.id, conf, identity)
         if not begin_attempt(cell, held.beat):
@@ -155,7 +154,7 @@ def _check_code(name: str, cell_id: str, conf: Conf, planned: Identity) -> None:
 
 
 def _lost(folder: CellFolder) -> str:
-    """Say that the lease is lost; from then on this job does not touch the cell's folder."""
+    """Say that the lease is lost; this job does not touch the cell's folder any more."""
     log_line(
         f"{folder.id} is left: this process gave no sign of life for too long, and another has"
         " taken over"
@@ -174,7 +173,7 @@ def _train_in_child(
     """Train the cell in a child process; return the job's outcome."""
 
     def on_poll(_: int) -> None:
-        presence.check(store)
+        store.check_not_gone()
         if held.lost:
             raise _CellLeftError(_lost(cell))
         if session.owner_dead:
@@ -192,10 +191,10 @@ def _train_in_child(
 
 
 def _after_error(error: XrgsError, store: Store, folder: CellFolder, held: lease.Lease) -> str:
-    """Return the outcome of a cell whose process failed, and write it where that is its fault."""
-    if presence.is_gone(store):
+    """Return the outcome after the cell's process failed; write the reason if the cell failed."""
+    if store.is_gone:
         return GONE
-    # The cell is another process's now, though its own may have failed before.
+    # Another process owns the cell now, and may have failed it or finished it.
     if isinstance(error, worker.AttemptLostError) or not held.beat():
         return _lost(folder)
     for kind, outcome in _NO_FAULT.items():
@@ -203,7 +202,7 @@ def _after_error(error: XrgsError, store: Store, folder: CellFolder, held: lease
             log_line(f"{folder.id} is left: {error}")
             return outcome
     state = folder.state().name
-    if state in {"done", "unknown"}:  # it may be finished although its process died at its exit
+    if state in {"done", "unknown"}:  # its process may have died after it had finished the cell
         return state
     folder.fail(str(error))
     log_line(f"{folder.id} failed: {error}")

@@ -1,4 +1,4 @@
-"""Runs a process under limits of time and memory, which never outlives the one that started it."""
+"""Runs a process under limits of time and memory; it never outlives its parent."""
 
 from __future__ import annotations
 
@@ -10,7 +10,6 @@ from contextlib import suppress
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from xrgs.errors import XrgsError
 from xrgs.runtime import processes
 from xrgs.runtime.progress import log_line
 
@@ -19,15 +18,15 @@ if TYPE_CHECKING:
 
 #: Seconds between two polls of the child.
 _POLL_S = 0.2
-#: Seconds that the child has after SIGTERM to write its checkpoint, or to finish what it is about
-#: to finish; and seconds that it has when it has exceeded a limit, or more of it would be harmful.
+#: Seconds that the child has after SIGTERM to write its checkpoint; fewer after it has exceeded a
+#: limit.
 _GRACE_S, _LIMIT_GRACE_S = 60.0, 5.0
-#: Seconds after which something is said of waiting for its end.
+#: Seconds of waiting for the child's end after which a message says so.
 _SILENT_S = 1.0
 #: A child that has registered it with `faulthandler` writes its stack at this signal.
 STACK_SIGNAL = signal.SIGUSR1
-#: Waits for the end of the pipe on its standard input, to which nothing is ever written, and then
-#: kills its process group. It ignores the signals that the group gets when it is asked to end.
+#: Waits for the end of its standard input, a pipe into which nothing is written, and then kills the
+#: process group. It ignores the signals that ask the group to end.
 _WATCHER = "trap '' TERM INT HUP; read -r _; kill -s KILL -- -$1"
 
 
@@ -38,8 +37,8 @@ class Limits:
     minutes: float = 0.0
     """Wall time, minutes."""
     memory_gb: float = 0.0
-    """Resident memory of all of them together, 10^9 bytes, read every 0.2 s. RLIMIT_AS would not
-    do: torch alone maps several times the memory that it uses."""
+    """Resident memory of all processes together, in 10^9 bytes, read every 0.2 s. RLIMIT_AS is no
+    substitute: torch alone maps several times the memory that it uses."""
 
 
 @dataclass(frozen=True)
@@ -49,7 +48,7 @@ class ProcessEnd:
     code: int
     """Its exit code, or minus the number of the signal that ended it."""
     reason: str = ""
-    """Which limit it exceeded and was ended for; empty if it ended by itself."""
+    """The limit that it exceeded; empty if it ended by itself."""
 
 
 def run_supervised(
@@ -64,14 +63,7 @@ def run_supervised(
         limits: The process and its children are ended when they exceed them.
         on_poll: Called repeatedly while the process runs, with its process id. An exception that
             it raises ends the process and is raised here.
-
-    Raises:
-        XrgsError: Memory is limited, on a system that does not say how much a process uses.
     """
-    if limits.memory_gb and not processes.proc_exists():
-        raise XrgsError(
-            f"limits.memory_gb={limits.memory_gb:g} can't be kept: this system has no /proc"
-        )
     child = subprocess.Popen(command, stdin=subprocess.PIPE, start_new_session=True)  # noqa: S603
     reason = ""
     try:
@@ -103,12 +95,9 @@ def _watch(child: subprocess.Popen[bytes], limits: Limits, on_poll: Callable[[in
 
 
 def _end(child: subprocess.Popen[bytes], *, exceeded: bool) -> None:
-    """End the child and all that it started, by SIGTERM first, so that it can end in order.
-
-    A child that has exceeded a limit is asked for its stack, which tells what took so long.
-    """
+    """End the child and its children, by SIGTERM first, so that they can end in order."""
     if child.poll() is None:
-        if exceeded:
+        if exceeded:  # its stack tells what took so long
             child.send_signal(STACK_SIGNAL)
         _signal(child, signal.SIGTERM)
         if exceeded:
@@ -138,11 +127,11 @@ def _signal(child: subprocess.Popen[bytes], number: int) -> None:
 
 
 def follow_parent() -> None:
-    """End this child and all its children when the process that started it has ended.
+    """End this child and its children when the parent has ended.
 
-    An orphan would go on writing to a cell whose lock is free. A separate shell process waits for
-    the end of the pipe on standard input, so that a child that hangs in native code is ended too: a
-    thread would need the interpreter's lock, and PR_SET_PDEATHSIG would spare the child's children.
+    An orphan would go on writing to a cell whose lease is free. A shell process waits for the end
+    of the pipe on standard input. A thread could not end a child that hangs in native code with the
+    interpreter's lock, and PR_SET_PDEATHSIG would spare the child's children.
     """
     if os.getpgrp() != os.getpid():
         return  # started by hand: the process group is the shell's

@@ -1,8 +1,8 @@
 """Does one piece of work in a child process: a kill or a segfault ends that work alone.
 
 The parent calls `run_in_child` and never imports torch. The child runs
-`python -m xrgs.sweep.jobs.worker JOB REQUEST ANSWER`: the name of the work, the file that says what
-to do, and the file for its answer.
+`python -m xrgs.sweep.jobs.worker JOB REQUEST ANSWER`: the name of the work, the file of its
+arguments, and the file for its answer.
 """
 
 from __future__ import annotations
@@ -27,7 +27,6 @@ from xrgs.runtime.signals import StopRequest, StopSignal, end_by_sigterm
 from xrgs.runtime.streams import ignore_broken_pipe, log_to_stderr, say
 from xrgs.safeio.atomic import write_json
 from xrgs.safeio.records import read_struct
-from xrgs.sweep import presence
 from xrgs.sweep.jobs import supervise
 
 if TYPE_CHECKING:
@@ -35,13 +34,13 @@ if TYPE_CHECKING:
 
     from xrgs.experiment.cell_folder import CellFolder
 
-#: Said to the user when the store can't be written any more.
+#: The message when the store can't be written any more.
 NOTHING_LOST = (
     "Finished cells are kept: when there is room to write, run the same command again to continue."
 )
-#: Errors by which a file system says that nothing more can be written to it.
+#: Errors of a file system that takes no more writes.
 _UNWRITABLE = frozenset({errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EIO})
-#: Errors that say nothing of the work, and may be gone when it is tried again.
+#: Errors that may be gone at the next try, and are no fault of the work.
 _PASSING = frozenset({errno.EACCES, errno.EPERM, errno.ESTALE, errno.ETIMEDOUT})
 #: Signals that ask a process to end: `scancel` and a cluster's time limits send them, and `kill`.
 _ASK_TO_END = frozenset(
@@ -55,10 +54,10 @@ class _LostError(Exception):
 
 
 class Answer(msgspec.Struct, frozen=True):
-    """What the child writes when its work has ended."""
+    """The child's answer when its work has ended."""
 
     result: dict[str, Any] = {}
-    """The answer of the work, as plain JSON values."""
+    """The result of the work, as plain JSON values."""
     error: str | None = None
     """Why the work failed."""
     errno: int | None = None
@@ -77,7 +76,7 @@ class AttemptLostError(WorkerError):
 
 
 class InterruptedWorkError(WorkerError):
-    """Somebody asked the child to end by a signal: nothing is known to be wrong with its work."""
+    """A signal asked the child to end; its work is not known to be faulty."""
 
 
 class UnwritableError(WorkerError):
@@ -85,7 +84,7 @@ class UnwritableError(WorkerError):
 
 
 class PassingError(WorkerError, UnreadableError):
-    """The child could not read a file now; nothing is known to be wrong with its work."""
+    """The child could not read a file now; its work is not known to be faulty."""
 
 
 def run_in_child(
@@ -110,7 +109,7 @@ def run_in_child(
     Raises:
         AttemptLostError: Another attempt at the cell has begun.
         InterruptedWorkError: A signal asked the child to end.
-        UnwritableError: The child could not write its files; nothing else is wrong with its work.
+        UnwritableError: The child could not write its files.
         PassingError: The child could not read a file now.
         WorkerError: The work failed; the message is the reason.
     """
@@ -143,22 +142,13 @@ def _kind(answer: Answer) -> type[WorkerError]:
 
 
 def cell_request(variant: Path, cell: CellFolder) -> dict[str, Any]:
-    """Return the request to train a cell, whose folder `begin_attempt` has just put in place.
-
-    Args:
-        variant: The folder of the cell's variant.
-        cell: The cell.
-    """
+    """Return the request to train a cell, after `begin_attempt` has put its folder in place."""
     paths = {"variant": str(variant.absolute()), "cell": str(cell.path.absolute())}
     return {**paths, "id": cell.id, "inode": cell.path.stat().st_ino}
 
 
 def unwritable(error: OSError) -> bool:
-    """Return whether an error says that nothing more can be written to a file system.
-
-    Args:
-        error: The error of a system call.
-    """
+    """Return whether an error says that a file system takes no more writes."""
     return error.errno in _UNWRITABLE
 
 
@@ -195,10 +185,7 @@ def _restore_variant(request: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _import_colmap() -> None:
-    """Import COLMAP, without the stack that it prints when its process is ended by SIGTERM.
-
-    It has no log of its own here: what it prints would be on the terminal of the sweep.
-    """
+    """Import COLMAP without its handler of SIGTERM, which prints a stack on the terminal."""
     signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGTERM})
     from xrgs.capture import sfm  # noqa: F401
 
@@ -211,20 +198,18 @@ def _run_cell(request: Mapping[str, Any]) -> dict[str, Any]:
     from xrgs.experiment import cell
     from xrgs.experiment.cell_folder import LOG, CellFolder
 
-    # The working directory stays this very folder, whatever folder gets its name: a process whose
-    # cell was taken over never writes into the files of the new owner.
+    # The working directory stays this very folder when another folder takes its name. So a process
+    # that has lost its cell never writes into the files of the new owner.
     os.chdir(request["cell"])
     if Path.cwd().stat().st_ino != request["inode"]:
         raise _LostError(f"{request['cell']}: another attempt at the cell has begun")
     folder = CellFolder(Path(), request["id"])
     with (folder.path / LOG).open("ab") as log:
-        # Everything that the cell, its libraries and its children print goes to the log. Progress
-        # goes to a file instead: on a terminal the bars of several cells would mix.
+        # All output of the cell, its libraries and its children goes to the log.
         for descriptor in (1, 2):
             os.dup2(log.fileno(), descriptor)
         stop = StopRequest()
         stop.watch()
-        # It is given the descriptor, which stays open when `log` is closed.
         faulthandler.register(supervise.STACK_SIGNAL, 2)
         log_to_stderr(logging.INFO)
         try:
@@ -238,7 +223,7 @@ def _run_cell(request: Mapping[str, Any]) -> dict[str, Any]:
 def _store_is_gone(request: Mapping[str, Any]) -> bool:
     from xrgs.experiment.store import Store
 
-    return "store" in request and presence.is_gone(Store(Path(request["store"])))
+    return "store" in request and Store(Path(request["store"])).is_gone
 
 
 _JOBS: dict[str, Callable[[Mapping[str, Any]], dict[str, Any]]] = {
@@ -272,7 +257,7 @@ def main(job: str, request: str, answer: str) -> None:
     except XrgsError as error:
         result = Answer(error=str(error))
     except Exception as error:
-        if not _store_is_gone(given):  # the sweep notices that by itself
+        if not _store_is_gone(given):  # the parent says so
             say(traceback.format_exc(), sys.stderr)
         number = error.errno if isinstance(error, OSError) else None
         result = Answer(error=f"{type(error).__name__}: {error}", errno=number)

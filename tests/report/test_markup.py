@@ -1,0 +1,116 @@
+"""Tables keep their shape whatever the names hold."""
+
+import re
+import shutil
+import subprocess
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from xrgs.report.markup import LATEX_PREAMBLE, to_latex, to_markdown
+from xrgs.runtime.text import TextTable, to_text, width
+
+TABLE = TextTable(
+    title="a_b & c",
+    columns=("Metric", "50% | x"),
+    rows=(("PSNR", "-0.80 ↓"), ("[odd]", "n/a")),
+    align="lr",
+    notes=("100 $",),
+)
+
+
+def test_text_is_aligned() -> None:
+    assert to_text(TABLE) == (
+        "a_b & c\n\nMetric  50% | x\n──────  ───────\nPSNR    -0.80 ↓\n[odd]       n/a\n100 $\n"
+    )
+
+
+def test_markdown_is_escaped_and_aligned() -> None:
+    assert to_markdown(TABLE) == (
+        "### a\\_b &amp; c\n"
+        "\n"
+        "| Metric  | 50% \\| x |\n"
+        "| ------- | -------: |\n"
+        "| PSNR    |  -0.80 ↓ |\n"
+        "| \\[odd\\] |      n/a |\n"
+        "\n"
+        "- 100 \\$\n"
+    )
+
+
+def test_latex_is_escaped() -> None:
+    text = to_latex(TABLE)
+    assert r"\caption{a\_b \& c}" in text
+    assert r"Metric & 50\% \textbar{} x \\" in text
+    assert r"PSNR & $-$0.80 $\downarrow$ \\" in text
+    assert r"{[}odd{]} & n/a \\" in text
+    assert r"\begin{tabular}{lr}" in text
+    assert r"100 \$" in text
+
+
+SPANNED = TextTable(
+    title="Scores",
+    columns=("Method", "PSNR ↑", "SSIM ↑"),
+    rows=(("a_b", "20.00", "0.800"), ("部屋", "21.00", "0.700")),
+    align="lrr",
+    context="3 steps & 2 views",
+    name="scores x",
+    spans=(("", 1), ("fern_1", 2)),
+    best=frozenset({(1, 1), (0, 2)}),
+)
+
+
+def test_context_and_headings_over_columns_are_in_every_form() -> None:
+    text = to_text(SPANNED).splitlines()
+    assert text[:2] == ["Scores", "3 steps & 2 views"]
+    assert text[3].split() == ["Method", "fern_1", "PSNR", "↑", "fern_1", "SSIM", "↑"]
+    page = to_markdown(SPANNED)
+    assert "3 steps &amp; 2 views\n" in page
+    assert "**21.00**" in page
+    assert "**20.00**" not in page
+
+
+def test_latex_has_a_caption_a_label_and_headings_over_columns() -> None:
+    text = to_latex(SPANNED)
+    assert r"\caption{Scores. 3 steps \& 2 views}" in text
+    assert r"\label{tab:scores-x-" in text
+    assert r"\multicolumn{1}{c}{} & \multicolumn{2}{c}{fern\_1} \\" in text
+    assert r"\cmidrule(lr){2-3}" in text
+    assert r"Method & PSNR $\uparrow$ & SSIM $\uparrow$ \\" in text
+    assert r"a\_b & 20.00 & \textbf{0.800} \\" in text
+    assert text.index(r"\caption") < text.index(r"\label") < text.index(r"\begin{tabular}")
+
+
+@pytest.mark.slow
+def test_latex_compiles(tmp_path: Path) -> None:
+    if (pdflatex := shutil.which("pdflatex")) is None:
+        pytest.skip("there is no pdflatex")
+    wide = TextTable("Wide", tuple("abcdefghij"), (("-0.80 ↓", *"123456789"),), "r" * 10)
+    latin = replace(SPANNED, rows=(("a_b%", "[1]", "~^"),))  # other scripts need xelatex
+    body = "\n".join(map(to_latex, (TABLE, latin, wide)))
+    packages = r"\usepackage{booktabs}\usepackage{graphicx}"
+    page = rf"\documentclass{{article}}{packages}\begin{{document}}{body}\end{{document}}"
+    (tmp_path / "x.tex").write_text(LATEX_PREAMBLE + page)
+    command = [pdflatex, "-interaction=nonstopmode", "-halt-on-error", "-draftmode", "x.tex"]
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stdout
+
+
+def test_wide_characters_keep_the_columns() -> None:
+    table = TextTable("t", ("a", "b"), (("部屋", "1"), ("cafe\u0301", "2"), ("plain", "3")), "lr")
+    lines = to_text(table).splitlines()[2:]
+    assert len({width(line) for line in lines}) == 1
+
+
+@given(st.text(max_size=30))
+def test_a_name_stays_in_its_cell(name: str) -> None:
+    table = TextTable("t", ("a", "b"), ((name, "1"),), "ll")
+    lines = to_markdown(table).split("\n")
+    assert len(lines) == 6
+    assert len(re.findall(r"(?<!\\)(?:\\\\)*\|", lines[4])) == 3
+    assert len(to_text(table).split("\n")) == 6
+    row = next(line for line in to_latex(table).split("\n") if line.endswith(r"1 \\"))
+    assert len(re.findall(r"(?<!\\)&", row)) == 1

@@ -1,0 +1,127 @@
+"""How changes depend on a setting: which labels are one curve, and what is drawn of them."""
+
+import math
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from xrgs.evaluation.metrics import METRICS
+from xrgs.report.compare import compare
+from xrgs.report.page import build
+from xrgs.report.pictures import sensitivities
+
+WEIGHTS = {"0.05": 21.0, "0.2": 22.0, "1": 19.0}
+
+
+def add_weights(made: Any, scenes: tuple[str, ...] = ("fern", "room"), values: Any = None) -> None:
+    """Each weight has its own PSNR, and twice the baseline's Gaussians."""
+    for scene in scenes:
+        made.add(scene=scene, values={"psnr": 20.0, "gaussians": 100})
+        for weight, psnr in (values or WEIGHTS).items():
+            label = f"consistency.weight={weight}"
+            made.add(label, scene=scene, values={"psnr": psnr, "gaussians": 200})
+
+
+def found(made: Any, condition: str = "") -> dict[str, Any]:
+    return sensitivities(compare(made.read().cells, METRICS), condition)
+
+
+def test_changes_are_in_the_order_of_the_values_at_each_level(made: Any) -> None:
+    add_weights(made)
+    ((key, changes),) = found(made).items()
+    assert key == "consistency.weight"
+    assert set(changes["series"]) == {""}
+    for level, scenes in (("pair", 2), ("scene", 2), ("mean", 1)):
+        rows = changes[(changes["level"] == level) & (changes["metric"] == "psnr")]
+        points = list(zip(rows["value"], rows["change"], strict=True))
+        assert points == [
+            (value, pytest.approx(change))
+            for value, change in ((0.05, 5.0), (0.2, 10.0), (1.0, -5.0))
+            for _ in range(scenes)
+        ]
+
+
+def test_amounts_are_in_percent_at_every_level(made: Any) -> None:
+    add_weights(made)
+    changes = found(made)["consistency.weight"]
+    gaussians = changes.loc[changes["metric"] == "gaussians", "change"]
+    assert gaussians.tolist() == pytest.approx([100.0] * len(gaussians))
+
+
+def test_two_settings_are_one_curve_for_each_value_of_the_other(made: Any) -> None:
+    made.add()
+    for grow in (1, 2, 4):
+        for prune in (1, 2):
+            made.add(f"densify densify.lr_grow={grow} densify.lr_prune={prune}")
+    by_key = found(made)
+    assert list(by_key) == ["densify.lr_grow"]  # lr_prune has two values
+    assert set(by_key["densify.lr_grow"]["series"]) == {
+        "densify densify.lr_prune=1",
+        "densify densify.lr_prune=2",
+    }
+
+
+@pytest.mark.parametrize(
+    "labels",
+    [
+        ("a", "b", "c"),
+        ("densify.decide=current_view", "densify.decide=per_class", "densify.decide=own_threshold"),
+        ("a.b=1", "a.b=2"),
+        ("a.b=1", "a.b=nan", "a.b=inf"),
+        ("a.b=1", "a.b=2", "a.b=1e300"),
+        ("a.b=1", "a.b=1.0", "a.b=2"),
+        ("a.b=1", "c a.b=2", "d a.b=3"),
+    ],
+)
+def test_names_and_fewer_than_three_values_are_no_curve(made: Any, labels: tuple[str, ...]) -> None:
+    made.add()
+    for label in labels:
+        made.add(label)
+    assert found(made) == {}
+
+
+def test_the_other_condition_has_its_own_changes(made: Any) -> None:
+    add_weights(made)
+    assert found(made, "train.steps=5") == {}
+
+
+def test_a_value_that_failed_is_left_out(made: Any) -> None:
+    add_weights(made, ("fern",))
+    made.add("consistency.weight=3", state="failed")
+    changes = found(made)["consistency.weight"]
+    assert set(changes["value"]) == {0.05, 0.2, 1.0}
+
+
+def test_the_report_has_the_figure_where_there_are_three_values(made: Any, tmp_path: Path) -> None:
+    add_weights(made)
+    made.write()
+    folder = build(made.store.path, out=tmp_path / "with").folder
+    assert (folder / "figures" / "sensitivity-consistency.weight.png").exists()
+    assert "Change from baseline over consistency.weight" in (folder / "table.md").read_text()
+
+
+def test_a_report_of_two_values_has_no_such_figure(made: Any, tmp_path: Path) -> None:
+    add_weights(made, values={"1": 21.0, "2": 22.0})
+    made.write()
+    folder = build(made.store.path, out=tmp_path / "without").folder
+    assert not list((folder / "figures").glob("sensitivity*"))
+
+
+def test_more_curves_than_colours_are_not_drawn_and_said(made: Any, tmp_path: Path) -> None:
+    made.add()
+    for other in range(8):
+        for value in (1, 2, 3):
+            made.add(f"a.b={value} c.d=x{other}")
+    made.write()
+    page = build(made.store.path, out=tmp_path / "many", pictures=["sensitivity-a.b"]).folder
+    said = (page / "table.md").read_text()
+    assert "8 curves, of which a figure can tell 7 apart" in said
+    assert not list((page / "figures").iterdir())
+
+
+def test_a_score_that_is_not_known_leaves_out_its_panel(made: Any) -> None:
+    add_weights(made, ("fern",), {"1": 21.0, "2": math.nan, "3": 22.0})
+    changes = found(made)["consistency.weight"]
+    psnr = changes[(changes["metric"] == "psnr") & (changes["level"] == "mean")]
+    assert psnr["change"].isna().tolist() == [False, True, False]

@@ -1,0 +1,492 @@
+"""Tests that a cell has one owner, though processes are killed and machines disappear."""
+
+from __future__ import annotations
+
+import errno
+import json
+import os
+import re
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from xrgs.runtime import lease
+
+_TAKE = """
+import sys, time
+from pathlib import Path
+from xrgs.runtime import lease
+print(lease.acquire(Path(sys.argv[1]), "cell") is not None, flush=True)
+time.sleep(600)
+"""
+_TAKE_AND_GIVE = """
+import sys, time
+from pathlib import Path
+from xrgs.runtime import lease
+folder, log = Path(sys.argv[1]), Path(sys.argv[2])
+end = time.monotonic() + 3
+while time.monotonic() < end:
+    held = lease.acquire(folder, "cell")
+    if held is not None:
+        start = time.monotonic_ns()
+        time.sleep(0.002)
+        with log.open("a") as stream:
+            stream.write(f"{start} {time.monotonic_ns()}\\n")
+        held.release()
+"""
+
+
+class Clock:
+    """Stands in for the monotonic clock of this process."""
+
+    def __init__(self) -> None:
+        self.now = 1000.0
+
+    def __call__(self) -> float:
+        return self.now
+
+
+@pytest.fixture
+def clock(monkeypatch: pytest.MonkeyPatch) -> Clock:
+    """A clock that stands still until it is set."""
+    clock = Clock()
+    monkeypatch.setattr(lease, "monotonic", clock)
+    monkeypatch.setattr(lease, "_watches", {})
+    return clock
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    """The folder of the leases."""
+    return tmp_path
+
+
+@pytest.fixture
+def owner(tmp_path: Path) -> Iterator[subprocess.Popen[str]]:
+    """Another process that holds the lease `cell`."""
+    command = [sys.executable, "-c", _TAKE, str(tmp_path)]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
+        assert process.stdout is not None
+        assert process.stdout.readline() == "True\n"
+        yield process
+        process.kill()
+
+
+def dated(file: Path, age: float) -> None:
+    """Set a file's time to what it was `age` seconds ago; in the future where that is negative."""
+    then = time.time() - age
+    os.utime(file, (then, then))
+
+
+def elsewhere(file: Path, age: float) -> None:
+    """Make a lease look like one of another machine, whose last heartbeat is `age` seconds old."""
+    values = json.loads(file.read_text())
+    file.write_text(json.dumps(values | {"host": "elsewhere", "pid": 1}))
+    dated(file, age)
+
+
+def beat_elsewhere(file: Path, age: float) -> None:
+    """Give a heartbeat on another machine, which a file server of a strange clock dates."""
+    values = json.loads(file.read_text())
+    file.write_text(json.dumps(values | {"beats": values["beats"] + 1}))
+    dated(file, age)
+
+
+def watch(folder: Path, clock: Clock, seconds: float, step: float = 5.0) -> None:
+    """Look at all leases again and again, as a sweep does."""
+    end = clock.now + seconds
+    while clock.now < end:
+        clock.now = min(end, clock.now + step)
+        lease.holders(folder)
+
+
+def test_a_lease_has_one_owner_until_it_is_released(folder: Path) -> None:
+    held = lease.acquire(folder, "cell")
+    assert held is not None
+    assert lease.acquire(folder, "cell") is None
+    assert lease.acquire(folder, "other") is not None
+    assert str(os.getpid()) in str(lease.holders(folder)["cell"])
+    held.release()
+    assert set(lease.holders(folder)) == lease.names(folder) == {"other"}
+    assert lease.acquire(folder, "cell") is not None
+
+
+def test_a_stopped_process_keeps_its_lease_and_a_killed_one_loses_it(
+    folder: Path, owner: subprocess.Popen[str]
+) -> None:
+    assert lease.acquire(folder, "cell") is None
+    assert lease.holders(folder)["cell"] is not None
+    os.kill(owner.pid, signal.SIGSTOP)
+    assert lease.acquire(folder, "cell") is None
+    owner.kill()  # and nobody waits for it: a zombie is dead
+    end = time.monotonic() + 10
+    while lease.holders(folder) and time.monotonic() < end:
+        time.sleep(0.01)
+    assert lease.acquire(folder, "cell") is not None
+    assert names(folder) == ["cell.1"]
+
+
+def test_a_process_id_that_is_reused_is_another_process(folder: Path) -> None:
+    held = lease.acquire(folder, "cell")
+    assert held is not None
+    file = held.path
+    owner = json.loads(file.read_text())
+    file.write_text(json.dumps(owner | {"started": owner["started"] - 10}))
+    assert not lease.holders(folder)
+    assert lease.acquire(folder, "cell") is not None
+
+
+@pytest.fixture
+def taken(folder: Path) -> Path:
+    """The file of the lease `cell`, which this process has taken."""
+    held = lease.acquire(folder, "cell")
+    assert held is not None
+    return held.path
+
+
+@pytest.mark.parametrize("age", [-4.0, 0.0, lease.SILENT_S - 60])
+def test_an_owner_on_another_machine_is_alive_while_its_file_is_young(
+    folder: Path, taken: Path, clock: Clock, age: float
+) -> None:
+    elsewhere(taken, age)
+    watch(folder, clock, 10 * lease.CONFIRM_S)
+    assert lease.acquire(folder, "cell") is None
+    assert lease.holders(folder) == {"cell": "process 1 on elsewhere"}
+
+
+#: Ages of a file whose owner may be dead: silent, of another era, or dated in the future.
+_STRANGE = [lease.SILENT_S + 60, 1e9, -60.0, -3600.0, -1e9]
+
+
+@pytest.mark.parametrize("age", _STRANGE)
+def test_a_dead_owner_of_any_date_is_taken_over_once_it_was_watched(
+    folder: Path, taken: Path, clock: Clock, age: float
+) -> None:
+    elsewhere(taken, age)
+    assert "it may be dead" in lease.holders(folder)["cell"]
+    watch(folder, clock, lease.CONFIRM_S - 1)
+    assert lease.acquire(folder, "cell") is None
+    assert lease.holders(folder)
+    watch(folder, clock, 1)
+    assert not lease.holders(folder)
+    held = lease.acquire(folder, "cell")
+    assert held is not None
+    assert names(folder) == ["cell.1"]
+
+
+@pytest.mark.parametrize("age", _STRANGE)
+def test_a_live_owner_with_a_strange_clock_is_never_robbed(
+    folder: Path, taken: Path, clock: Clock, age: float
+) -> None:
+    elsewhere(taken, age)
+    for _ in range(50):
+        watch(folder, clock, lease.BEAT_S)
+        beat_elsewhere(taken, age)  # the file has the same date after each heartbeat
+        assert lease.acquire(folder, "cell") is None
+    watch(folder, clock, lease.CONFIRM_S - 1)
+    assert lease.acquire(folder, "cell") is None  # it is watched from its last heartbeat on
+    watch(folder, clock, 1)
+    assert lease.acquire(folder, "cell") is not None
+
+
+@pytest.mark.parametrize("jump", [-1e6, -1000.0, 1000.0, 1e6])
+def test_a_server_clock_that_is_set_during_a_hold_robs_nobody_and_frees_the_dead(
+    folder: Path,
+    taken: Path,
+    clock: Clock,
+    monkeypatch: pytest.MonkeyPatch,
+    jump: float,
+) -> None:
+    elsewhere(taken, 10)
+    assert lease.acquire(folder, "cell") is None
+    monkeypatch.setattr(lease, "_now", lambda _: time.time() + jump)
+    for _ in range(10):
+        watch(folder, clock, lease.BEAT_S)
+        beat_elsewhere(taken, 10)  # it is dated by the old clock, as by a cache
+        assert lease.acquire(folder, "cell") is None
+    beat_elsewhere(taken, -jump)  # and by the new one
+    watch(folder, clock, 10 * lease.CONFIRM_S)
+    assert lease.acquire(folder, "cell") is None  # young, by the clock that was set
+    dated(taken, 10)
+    watch(folder, clock, lease.CONFIRM_S + 5)
+    assert lease.acquire(folder, "cell") is not None
+
+
+def test_a_heartbeat_that_moves_the_time_alone_is_a_sign_of_life(
+    folder: Path, taken: Path, clock: Clock
+) -> None:
+    """On a full disk the content may stay, and an older version counted no heartbeats."""
+    elsewhere(taken, 1e6)
+    for beats in range(20):
+        watch(folder, clock, lease.BEAT_S)
+        dated(taken, 1e6 - beats)
+        assert lease.acquire(folder, "cell") is None
+
+
+def test_time_in_which_nobody_looks_makes_no_owner_dead(
+    folder: Path, taken: Path, clock: Clock
+) -> None:
+    """A file server that answers nobody stops the owner's heartbeats and the observer alike."""
+    elsewhere(taken, 1e6)
+    lease.holders(folder)
+    clock.now += 1e5
+    assert lease.acquire(folder, "cell") is None
+    watch(folder, clock, lease.BEAT_S)
+    assert lease.acquire(folder, "cell") is None
+    watch(folder, clock, lease.BEAT_S)
+    assert lease.acquire(folder, "cell") is not None
+
+
+@pytest.mark.parametrize("text", ["", "{", "[]", "x" * 5])
+def test_a_lease_that_stays_unsigned_is_free_after_a_while(
+    folder: Path, clock: Clock, text: str
+) -> None:
+    file = folder / "cell.0"
+    file.write_text(text)
+    assert lease.acquire(folder, "cell") is None  # it may be about to be signed
+    assert "not signed" in lease.holders(folder)["cell"]
+    dated(file, -1e6)
+    assert lease.acquire(folder, "cell") is None
+    watch(folder, clock, lease.CONFIRM_S + 5)
+    held = lease.acquire(folder, "cell")
+    assert held is not None
+    held.release()
+    file.write_text(text)
+    dated(file, 31)
+    assert lease.acquire(folder, "cell") is not None
+
+
+def test_a_lease_that_can_not_be_read_now_is_held(
+    folder: Path, taken: Path, clock: Clock, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A disk that fails for a moment robs nobody."""
+    elsewhere(taken, 1e6)
+    watch(folder, clock, lease.CONFIRM_S + 5)
+    read = lease.read_bytes
+
+    def sick(path: Path, *given: int) -> bytes:
+        if path.name == "cell.0":
+            raise OSError(errno.EIO, os.strerror(errno.EIO), str(path))
+        return read(path, *given)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(lease, "read_bytes", sick)
+        assert lease.acquire(folder, "cell") is None
+        assert lease.holders(folder)
+    assert lease.acquire(folder, "cell") is not None
+
+
+@pytest.mark.parametrize("kind", ["link", "pipe", "folder", "too large"])
+def test_what_is_no_file_of_ours_is_no_lease(folder: Path, kind: str) -> None:
+    file = folder / "cell.0"
+    if kind == "link":
+        file.symlink_to(folder / "elsewhere")
+    elif kind == "pipe":
+        os.mkfifo(file)
+    elif kind == "folder":
+        file.mkdir()
+    else:
+        file.write_bytes(bytes(10_000))
+    assert lease.acquire(folder, "cell") is not None
+    assert not (folder / "elsewhere").exists()
+
+
+def test_a_name_of_a_machine_obeys_no_terminal(folder: Path, taken: Path) -> None:
+    values = json.loads(taken.read_text())
+    taken.write_text(json.dumps(values | {"host": "a\x1b[31mb\nc"}))
+    assert re.fullmatch(r"process \d+ on a \[31mb c", lease.holders(folder)["cell"])
+
+
+def test_an_interrupted_owner_leaves_no_unsigned_lease(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def interrupted(*_: object) -> str:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(json, "dumps", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        lease.acquire(folder, "cell")
+    assert not names(folder)
+
+
+def wait(what: Callable[[], bool]) -> None:
+    end = time.monotonic() + 20
+    while not what():
+        assert time.monotonic() < end
+        time.sleep(0.01)
+
+
+def names(folder: Path) -> list[str]:
+    return sorted(path.name for path in folder.iterdir())
+
+
+def beats(file: Path) -> int:
+    return int(json.loads(file.read_text())["beats"])
+
+
+def test_a_heartbeat_is_counted_in_the_same_file(folder: Path) -> None:
+    held = lease.acquire(folder, "cell")
+    assert held is not None
+    os.utime(held.path, (0, 0))
+    inode, size = held.path.stat().st_ino, held.path.stat().st_size
+    assert held.beat()
+    assert beats(held.path) == 1
+    assert held.path.stat().st_mtime > 0
+    assert held.beat()
+    assert beats(held.path) == 2
+    assert (held.path.stat().st_ino, held.path.stat().st_size) == (inode, size)
+
+
+def test_a_thread_gives_the_heartbeats_until_the_lease_is_released(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(lease, "BEAT_S", 0.01)
+    held = lease.acquire(folder, "cell")
+    assert held is not None
+    wait(lambda: held.beats > 2)
+    held.release()
+    assert not names(folder)
+    assert held._ended.is_set()
+
+
+def test_a_lease_that_was_taken_over_is_lost_and_its_successor_s_is_not_touched(
+    folder: Path, clock: Clock
+) -> None:
+    lost = lease.acquire(folder, "cell")
+    assert lost is not None
+    elsewhere(lost.path, 2 * lease.SILENT_S)  # suspended for long, as another machine sees it
+    watch(folder, clock, lease.CONFIRM_S + 5)
+    other = lease.acquire(folder, "cell")
+    assert other is not None
+    before = other.path.read_bytes()
+    assert not lost.beat()
+    assert lost.lost
+    lost.release()
+    assert names(folder) == ["cell.1"]
+    assert other.path.read_bytes() == before
+    assert other.beat()
+    other.release()
+    assert not other.beat()
+    assert not names(folder)
+
+
+def test_a_lost_lease_leaves_its_successor_s_file_alone(folder: Path) -> None:
+    """After a take-over and a release the first generation is free again, for a third owner."""
+    lost = lease.acquire(folder, "cell")
+    assert lost is not None
+    lost.path.unlink()
+    third = lease.acquire(folder, "cell")
+    assert third is not None
+    assert third.path == lost.path
+    elsewhere(third.path, 0)
+    signature = third.path.read_text()
+    assert not lost.beat()
+    lost.release()
+    assert third.path.read_text() == signature
+
+
+def test_a_heartbeat_notices_a_newer_generation(folder: Path) -> None:
+    """A successor creates its own file first, and deletes the lost one only then."""
+    lost = lease.acquire(folder, "cell")
+    assert lost is not None
+    assert lost.beat()
+    lease.sign(folder / "cell.1")
+    assert lost.path.exists()
+    assert not lost.beat()
+
+
+def test_a_heartbeat_into_a_store_out_of_reach_decides_nothing(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    held = lease.acquire(folder, "cell")
+    assert held is not None
+
+    def stale(path: Path, *_: object) -> None:
+        raise OSError(errno.ESTALE, os.strerror(errno.ESTALE), str(path))
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Path, "open", stale)
+        assert held.beat()
+    assert held.beat()
+
+
+def test_a_heartbeat_creates_nothing_where_the_store_is_gone(tmp_path: Path) -> None:
+    folder = tmp_path / "s" / "locks"
+    folder.mkdir(parents=True)
+    held = lease.acquire(folder, "cell")
+    assert held is not None
+    (tmp_path / "s").rename(tmp_path / "moved")
+    assert not held.beat()
+    held.release()
+    assert not lease.holders(folder)
+    with pytest.raises(FileNotFoundError):
+        lease.acquire(folder, "other")
+    assert [file.name for file in tmp_path.iterdir()] == ["moved"]
+
+
+def test_waiting_ends_when_the_owner_releases_its_lease(
+    folder: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    first = lease.acquire(folder, "scene")
+    assert first is not None
+    monkeypatch.setattr(time, "sleep", lambda _: first.release())
+    with lease.waited_for(folder, "scene") as second:
+        assert second.beat()
+    assert "scene: waiting until another process has finished" in caplog.text
+    assert not names(folder)
+
+
+def test_a_full_disk_leaves_no_lease_behind(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def full(*_: object) -> str:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(json, "dumps", full)
+    with pytest.raises(OSError, match="No space"):
+        lease.acquire(folder, "cell")
+    assert not names(folder)
+
+
+@pytest.mark.slow
+def test_of_many_contenders_one_has_the_lease(tmp_path: Path, owner: subprocess.Popen[str]) -> None:
+    """The first of them take over from a dead owner at the same time."""
+    owner.kill()
+    owner.wait()
+    log = tmp_path / "log"
+    command = [sys.executable, "-c", _TAKE_AND_GIVE, str(tmp_path), str(log)]
+    processes = [subprocess.Popen(command) for _ in range(6)]
+    assert [process.wait() for process in processes] == [0] * 6
+    spans = sorted(tuple(map(int, line.split())) for line in log.read_text().splitlines())
+    assert len(spans) > 20
+    for (_, end), (start, _) in pairwise(spans):
+        assert end <= start
+
+
+def test_a_lease_that_is_created_again_meanwhile_is_not_taken_for_the_dead_one(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """One contender gives way and another one comes, while a third looks for dead lease."""
+    contender, listed, look = folder / "cell.1", 0, lease._look
+
+    def generations(*_: object) -> dict[int, Path]:
+        nonlocal listed
+        listed += 1
+        return {1: contender} if listed == 2 else {}  # it has come and gone
+
+    def seen(file: Path, *given: Any) -> Any:
+        found = look(file, *given)
+        lease.sign(file)
+        return found
+
+    monkeypatch.setattr(lease, "_generations", generations)
+    monkeypatch.setattr(lease, "_look", seen)
+    held = lease.acquire(folder, "cell")
+    assert held is not None
+    assert held.path.name == "cell.0"
+    assert contender.exists()

@@ -1,0 +1,46 @@
+"""Sizes, ages and durations for people; tables have their tests in tests/report/test_render.py."""
+
+from __future__ import annotations
+
+import pytest
+
+from xrgs.runtime.text import format_age, format_duration, format_size
+
+
+@pytest.mark.parametrize(
+    ("seconds", "text"),
+    [
+        (None, "?"),
+        (0.4, "~0 s"),
+        (99, "~99 s"),
+        (100, "~2 min"),
+        (5400, "~90 min"),
+        (9000, "~2.5 h"),
+    ],
+)
+def test_duration(seconds: float | None, text: str) -> None:
+    assert format_duration(seconds) == text
+
+
+@pytest.mark.parametrize(
+    ("count", "text"),
+    [
+        (None, "unknown"),
+        (0, "0 B"),
+        (999, "999 B"),
+        (999.6, "1 kB"),
+        (12_345_678, "12 MB"),
+        (999_600_000, "1.0 GB"),
+        (2_500_000_000_000, "2500.0 GB"),
+    ],
+)
+def test_size(count: float | None, text: str) -> None:
+    assert format_size(count) == text
+
+
+@pytest.mark.parametrize(
+    ("seconds", "text"),
+    [(None, "?"), (59.4, "59 s"), (60, "1 min"), (7200, "2 h"), (3 * 86400, "3 d")],
+)
+def test_age(seconds: float | None, text: str) -> None:
+    assert format_age(seconds) == text

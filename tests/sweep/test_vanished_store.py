@@ -1,0 +1,125 @@
+"""Tests that a store which vanishes is noticed, and that nothing of it reappears."""
+
+from __future__ import annotations
+
+import errno
+import os
+import shutil
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from xrgs.experiment.store import Store, StoreGoneError
+
+#: Every cell's process reports that it has begun, and then writes into its folder for ever.
+WRITES_ON = """
+import sys
+if "xrgs.sweep.jobs.worker" in sys.orig_argv and "cell" in sys.orig_argv:
+    import os, time, types
+    from pathlib import Path
+
+    def run_cell(conf, variant, folder, stop):
+        from xrgs.safeio.atomic import write_json
+        (Path(os.environ["SWEEPS_OF"]) / "begun").touch()
+        while True:
+            write_json(folder.path / "provenance.json", {})
+            time.sleep(0.01)
+
+    sys.modules["xrgs.experiment.cell"] = types.ModuleType("xrgs.experiment.cell")
+    sys.modules["xrgs.experiment.cell"].run_cell = run_cell
+"""
+
+
+def rename(store: Path) -> None:
+    store.rename(store.with_name("moved"))
+
+
+def delete(store: Path) -> None:
+    rename(store)
+    shutil.rmtree(store.with_name("moved"))
+
+
+def unmount(store: Path) -> None:
+    """Leave an empty folder, as the place where a disk was mounted."""
+    rename(store)
+    store.mkdir()
+
+
+VANISHES = pytest.mark.parametrize("vanishes", [rename, delete, unmount])
+
+
+@VANISHES
+def test_a_store_that_was_moved_is_gone_and_says_where_its_cells_are(
+    store: Store, vanishes: Callable[[Path], None]
+) -> None:
+    store.check_not_gone()
+    vanishes(store.path)
+    assert store.is_gone
+    with pytest.raises(StoreGoneError, match=r"no longer there .*finished cells are where"):
+        store.check_not_gone()
+
+
+@pytest.mark.parametrize("number", [errno.EACCES, errno.EIO, errno.ESTALE])
+def test_a_store_that_can_not_be_looked_at_now_is_not_gone(
+    store: Store, monkeypatch: pytest.MonkeyPatch, number: int
+) -> None:
+    def fail(path: Path, **_: object) -> os.stat_result:
+        raise OSError(number, os.strerror(number), str(path))
+
+    monkeypatch.setattr(Path, "stat", fail)
+    store.check_not_gone()
+
+
+def wait_for(what: Callable[[], object], sweep: Any) -> None:
+    end = time.monotonic() + 60
+    while not what():
+        assert sweep.process.poll() is None
+        assert time.monotonic() < end
+        time.sleep(0.005)
+
+
+@pytest.mark.slow
+@VANISHES
+@pytest.mark.parametrize("launcher", ["basic", "joblib"])
+def test_a_sweep_whose_store_vanishes_ends_in_order(
+    sweeps_in: Callable[..., Any],
+    tmp_path: Path,
+    vanishes: Callable[[Path], None],
+    launcher: str,
+) -> None:
+    sweeps = sweeps_in(tmp_path, WRITES_ON)
+    given = ("scene=motorcycle", "preset=smoke", "seed=0,1", f"hydra/launcher={launcher}")
+    sweep = sweeps.start(*given)
+    wait_for((tmp_path / "begun").exists, sweep)
+    vanishes(tmp_path / "s")
+    ended_in_order(sweeps, sweep, tmp_path, vanishes)
+
+
+@pytest.mark.slow
+@VANISHES
+def test_a_sweep_whose_store_vanishes_while_a_variant_is_built_ends_in_order(
+    sweeps_in: Callable[..., Any], tmp_path: Path, vanishes: Callable[[Path], None]
+) -> None:
+    sweeps = sweeps_in(tmp_path)
+    sweep = sweeps.start("scene=motorcycle", "preset=smoke")
+    wait_for(lambda: list(tmp_path.glob("s/variants/.*.building")), sweep)
+    vanishes(tmp_path / "s")
+    ended_in_order(sweeps, sweep, tmp_path, vanishes)
+
+
+def ended_in_order(sweeps: Any, sweep: Any, folder: Path, vanishes: Callable[[Path], None]) -> None:
+    """Assert that a sweep says once what happened, leaves no process, and makes nothing again."""
+    code, out, err = sweep.end()
+    sweeps.leave_nothing_running()
+    assert code == 1, err
+    assert err.count("no longer there") == 1, err
+    assert "store=s: it is no longer there" in err
+    for noise in ("Traceback", "Error", "SIGTERM", "failed"):
+        assert noise not in out + err
+    if vanishes is unmount:
+        (folder / "s").rmdir()  # it is empty
+    assert not (folder / "s").exists()
+    assert not list((folder / "tmp").glob("xrgs-*"))

@@ -1,0 +1,17 @@
+"""Downsamples a view: `variant.factor` times fewer pixels per side (paper, section 4.1)."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from xrgs.capture import images
+
+if TYPE_CHECKING:
+    from xrgs.capture.images import ImageArray
+    from xrgs.config import VariantConf
+
+
+def downsample(high: ImageArray, conf: VariantConf) -> ImageArray:
+    """Return the view [H / factor, W / factor, 3]."""
+    height, width = high.shape[:2]
+    return images.resize(high, width // conf.factor, height // conf.factor)

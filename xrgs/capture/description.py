@@ -1,0 +1,155 @@
+"""Describes a variant for `xrgs-data inspect`: its views, how SfM went, and a contact sheet."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from msgspec import Struct
+
+from xrgs.capture import variant
+from xrgs.capture.contact_sheet import contact_sheet
+from xrgs.capture.failures import FAILED_PREFIX
+from xrgs.errors import XrgsError
+from xrgs.runtime.text import TextTable, to_text
+from xrgs.safeio.atomic import atomic_writer
+from xrgs.safeio.records import read_struct
+from xrgs.safeio.sanitize import for_line
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    from xrgs.capture.views import Variant
+
+
+class SfmAttempt(Struct):
+    """One attempt of SfM at a scene's views."""
+
+    attempt: str
+    """The name of the recipe."""
+    refused: str = ""
+    """Why its result was not taken; empty where it was."""
+    registered: int = 0
+
+
+class SfmReport(Struct):
+    """What is read of `report.json`: how SfM went, and what the views are."""
+
+    scene: str = "?"
+    images: int = 0
+    registered: int = 0
+    points: int = 0
+    reprojection_error_px: float | None = None
+    poses: str | None = None
+    """The digest of poses that were given; None where SfM has estimated them."""
+    lr_images: str | None = None
+    max_num_features: int | None = None
+    attempts: tuple[SfmAttempt, ...] = ()
+    tags: str | None = None
+    degradation: str | None = None
+    notes: tuple[str, ...] = ()
+    pose_error: dict[str, float] = {}
+    """`position_percent` of the extent, `rotation_degrees`, and `..._max` of each."""
+    pose_error_against: str = ""
+    rho: dict[str, tuple[float, ...]] = {}
+    """Least, median and most of the sampling rate, by tag."""
+    hr: tuple[str, ...] = ()
+    lr: tuple[str, ...] = ()
+    not_registered: tuple[str, ...] = ()
+    unreadable: tuple[str, ...] = ()
+
+
+def describe(folder: Path, out: Path | None = None) -> str:
+    """Describe a frozen variant and draw its contact sheet; for a failed one, say why it failed.
+
+    Args:
+        folder: The variant's folder in a store, or the `failed-...` folder of one that failed.
+        out: The PNG of the contact sheet; None writes `<variant id>.png` to the current folder.
+
+    Returns:
+        Tables and lines for a terminal. They name each image that can't be read.
+
+    Raises:
+        XrgsError: The folder is not a variant, or is damaged, or the sheet can't be written.
+    """
+    if not folder.is_dir():
+        raise XrgsError(f"{folder}: no such folder; variants are in <store>/variants/")
+    failed = folder.name.startswith(FAILED_PREFIX)
+    frozen = None if failed else variant.load(folder)
+    report = read_struct(folder / "report.json", SfmReport)
+    sfm = [for_line(line) for line in _sfm(report)]
+    if frozen is None:
+        return "\n".join([for_line(f"{report.scene}: failed, so there are no views"), *sfm])
+    table = to_text(views_table(frozen, report))
+    sheet, notes = contact_sheet(frozen)
+    file = out or Path(f"{frozen.id}.png")
+    try:
+        with atomic_writer(file) as stream:
+            sheet.save(stream, "PNG")
+    except OSError as error:
+        raise XrgsError(f"out={file}: can't be written ({error})") from error
+    more = [f"Contact sheet: {file}", *(f"  {note}" for note in notes)]
+    return "\n".join([table, *sfm, *map(for_line, more)])
+
+
+def views_table(frozen: Variant, report: SfmReport) -> TextTable:
+    """Return a table of the photographs that are trained on or held out, by name.
+
+    Photographs that SfM did not register are in the table too, by the names in the report.
+    """
+    rows = [
+        (v.name, v.split, v.tag, f"{v.width} x {v.height}", f"{v.rho:.3f}", "yes")
+        for v in frozen.views
+        if v.split != "original"
+    ]
+    for name in report.not_registered:
+        split = "train" if name in {*report.hr, *report.lr} else "test"
+        rows.append((name, split, "LR" if name in report.lr else "HR", "", "", "no"))
+    columns = ("View", "Split", "Tag", "Size, px", "rho", "Placed")
+    title = f"{frozen.scene}, variant {frozen.id}, factor {frozen.factor}"
+    return TextTable(title, columns, tuple(sorted(rows)), "lllrrl", tuple(_counts(frozen)))
+
+
+def _counts(frozen: Variant) -> Iterator[str]:
+    train = [view.tag for view in frozen.views if view.split == "train"]
+    tests = sum(view.split == "test" for view in frozen.views)
+    kind = "held out" if frozen.held_out else "tests, at the trained poses"
+    yield f"{train.count('HR')} HR and {train.count('LR')} LR to train on, {tests} {kind}"
+    if originals := sum(view.split == "original" for view in frozen.views):
+        yield f"originals of degraded views kept beside them: {originals}"
+
+
+def _sfm(report: SfmReport) -> Iterator[str]:
+    """Yield lines on how SfM went, as far as the report has them."""
+    error = report.reprojection_error_px
+    yield (
+        f"{'SfM' if report.poses is None else 'Poses given'}: {report.registered} of"
+        f" {report.images or '?'} views placed, {report.points} points"
+        + (f", {error:.2f} px" if error is not None else "")
+    )
+    if report.lr_images is not None:
+        yield f"  LR images {report.lr_images}, {report.max_num_features} features a view"
+    for attempt in report.attempts:
+        verdict = attempt.refused or f"accepted, {attempt.registered} placed"
+        yield f"  recipe {attempt.attempt}: {verdict}"
+    if report.tags is not None:
+        yield f"  tags by {report.tags}, degradation {report.degradation}"
+    yield from (f"  {note}" for note in report.notes)
+    if report.pose_error:
+        yield f"  poses against {report.pose_error_against}: " + "; ".join(_pose(report.pose_error))
+    for tag in ("HR", "LR"):
+        if rates := report.rho.get(tag):
+            numbers = ", ".join(f"{rate:.3f}" for rate in rates)
+            yield f"  rho of {tag}: {numbers} (least, median, most)"
+    for names, label in ((report.not_registered, "not placed"), (report.unreadable, "unreadable")):
+        if names:
+            yield f"  {label}: {', '.join(names)}"
+
+
+def _pose(error: dict[str, float]) -> Iterator[str]:
+    for name, label, unit in (
+        ("position_percent", "position", "% of the extent"),
+        ("rotation_degrees", "rotation", "degrees"),
+    ):
+        if name in error:
+            yield f"{label} {error[name]:.3f} {unit}, at most {error[f'{name}_max']:.3f}"

@@ -1,0 +1,409 @@
+"""The pictures of the page: test views and training views as WebP, error maps, and models for 3D.
+
+Images are kept in data URLs, within a number of bytes.
+"""
+
+from __future__ import annotations
+
+import base64
+import io
+from itertools import islice
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from matplotlib import colormaps
+from PIL import Image
+
+from xrgs.capture import images
+from xrgs.capture.images import ImageError
+from xrgs.errors import StoreError, UnreadableError, XrgsError
+from xrgs.evaluation.metrics import VIEW_METRICS
+from xrgs.report.html.content import finite, run_names, runs, shown, why
+from xrgs.runtime.machine import set_passive_openmp_wait
+from xrgs.runtime.progress import progress
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+    from pathlib import Path
+
+    import pandas as pd
+    from numpy.typing import NDArray
+
+    from xrgs.capture.views import Variant
+    from xrgs.report.compare import Comparison
+    from xrgs.report.html.content import Content
+    from xrgs.report.joined import JoinedStore
+    from xrgs.viewer.trained import TrainedScene, TrainingView
+
+#: The longer side that an image of the page has at most, px.
+_MAX_SIDE = 1008
+#: The mean absolute difference of the channels, in 0..1, from which an error map is brightest.
+ERROR_RANGE = 0.25
+#: Error maps are shrunk by this factor: they show where a render is wrong, not each pixel.
+_ERROR_SHRINK = 2
+#: Quality of WebP, and the bytes that a pixel of a photograph takes with it at most, best first.
+_QUALITIES = ((90, 0.40), (80, 0.22), (60, 0.13), (40, 0.09))
+
+
+#: The largest image that is read.
+_MAX_PIXELS = 1 << 24
+#: Scores by cell and view.
+_Scores = dict[tuple[str, str], dict[str, float | None]]
+#: About how many more pixels error maps add to those of renders.
+_WITH_ERROR_MAPS = 1.25
+
+
+#: The most runs with training views and models.
+_MAX_RUNS = 12
+#: The most Gaussians of a model, which a weak graphics processor can still sort and draw, and the
+#: fewest with which one can be recognised.
+_MAX_KEPT, _MIN_KEPT = 100_000, 8_000
+
+
+class Album:
+    """Collects the images of a page. The same image is kept once.
+
+    Args:
+        max_bytes: The most bytes that the data URLs may take together.
+        pixels: About how many pixels will be added in all, which decides the quality.
+    """
+
+    def __init__(self, max_bytes: int, pixels: int) -> None:
+        self.urls: list[str] = []
+        self._left = max_bytes
+        self._numbers: dict[str, int] = {}
+        fitting = (quality for quality, size in _QUALITIES if pixels * size * 4 / 3 <= max_bytes)
+        self._quality = next(fitting, _QUALITIES[-1][0])
+
+    def add(self, images: Sequence[Image.Image]) -> list[int] | None:
+        """Add images that belong together.
+
+        Args:
+            images: Images of mode RGB.
+
+        Returns:
+            The place of each in `urls`. Where they do not fit, none is added, and the result is
+            None.
+        """
+        urls = [data_url(image, self._quality) for image in images]
+        new = dict.fromkeys(url for url in urls if url not in self._numbers)
+        size = sum(map(len, new))
+        if size > self._left:
+            return None
+        self._left -= size
+        for url in new:
+            self._numbers[url] = len(self.urls)
+            self.urls.append(url)
+        return [self._numbers[url] for url in urls]
+
+
+def data_url(image: Image.Image, quality: int) -> str:
+    """Encode an image.
+
+    Args:
+        image: An image of mode RGB; a side of more than 1008 px is shrunk to it.
+        quality: 1 to 100, libwebp's scale.
+
+    Returns:
+        The data URL of a WebP.
+    """
+    if max(image.size) > _MAX_SIDE:
+        image = image.copy()
+        image.thumbnail((_MAX_SIDE, _MAX_SIDE), Image.Resampling.LANCZOS)
+    stream = io.BytesIO()
+    image.save(stream, "WEBP", quality=quality)
+    return f"data:image/webp;base64,{base64.b64encode(stream.getvalue()).decode('ascii')}"
+
+
+def to_image(array: NDArray[np.float32]) -> Image.Image:
+    """Convert an array [H, W, 3] to an image; values outside 0..1 are clamped."""
+    return Image.fromarray(np.round(np.clip(array, 0, 1) * 255).astype(np.uint8))
+
+
+def error_map(photograph: Image.Image, render: Image.Image) -> Image.Image:
+    """Draw where a render differs from its photograph.
+
+    Args:
+        photograph: An image of mode RGB.
+        render: An image of the same size.
+
+    Returns:
+        The mean absolute difference of the channels, from black at 0 to pale yellow at
+        `ERROR_RANGE` (matplotlib's magma), at half the size.
+
+    Raises:
+        ValueError: The sizes differ.
+    """
+    if photograph.size != render.size:
+        raise ValueError("photograph and render differ in size")
+    first, second = (np.asarray(image, dtype=np.float32) / 255 for image in (photograph, render))
+    difference = np.abs(first - second).mean(axis=2) / ERROR_RANGE
+    colored = colormaps["magma"](np.clip(difference, 0, 1), bytes=True)[..., :3]
+    width, height = (max(1, side // _ERROR_SHRINK) for side in photograph.size)
+    return Image.fromarray(np.ascontiguousarray(colored)).resize((width, height))
+
+
+def add_views(
+    content: Content,
+    store: JoinedStore,
+    comparison: Comparison,
+    views: pd.DataFrame,
+    max_bytes: int,
+) -> None:
+    """Add every scored view of every cell, with as many images as fit.
+
+    The first replicates of all scenes come first. A view without images has its scores, and the
+    notes say how many there are.
+
+    Args:
+        content: The content of the page, to which views, images and notes are added.
+        store: The store with photographs and renders.
+        comparison: The comparison of the cells.
+        views: The table `Sweep.views`.
+        max_bytes: The most bytes that the images may take; 0 for no images.
+    """
+    scores: _Scores = {
+        (row["cell_id"], row["view"]): {name: finite(row[name]) for name in VIEW_METRICS}
+        for row in views.to_dict("records")
+    }
+    names = {name: list(rows["view"]) for name, rows in views.groupby("cell_id")}
+    wanted = [
+        (cells, view)
+        for cells in runs(comparison)
+        for view in dict.fromkeys(v for name in cells["cell_id"] for v in names.get(name, ()))
+    ]
+    pixels = sum(_pixels(store, cells, view) for cells, view in wanted) if max_bytes else 0
+    album = Album(max_bytes, int(pixels * _WITH_ERROR_MAPS))
+    first, left_out = len(content.images), 0
+    for cells, view in progress(wanted, "encoding views", "view"):
+        entry = _entry(cells, view, scores)
+        content.views.append(entry)
+        if max_bytes:
+            found = _read(content, store, cells, view, _title(entry))
+            left_out += found is not None and not _add_images(entry, found, album, first)
+    content.images += album.urls
+    if left_out:
+        content.notes.append(
+            f"The images of {left_out} of {len(wanted)} test views are left out, for the page's"
+            " size; their scores are here, and their renders are in the store."
+        )
+
+
+def _title(entry: dict[str, Any]) -> str:
+    return ", ".join(filter(None, (entry[key] for key in ("scene", "condition", "view"))))
+
+
+def _photograph(store: JoinedStore, cells: pd.DataFrame, view: str) -> Path:
+    """Return the file of the photograph of a view that cells are scored on."""
+    first = cells.iloc[0]
+    split = "train" if first["validation"] > 0 else "test"
+    return store.variant(first["variant_id"]) / "images" / split / f"{view}.png"
+
+
+def _pixels(store: JoinedStore, cells: pd.DataFrame, view: str) -> int:
+    """Return the number of pixels of a view's images, 0 where its photograph can't be read."""
+    try:
+        width, height = images.size(_photograph(store, cells, view))
+    except (UnreadableError, ImageError):
+        return 0
+    return width * height * (1 + len(cells))
+
+
+def _entry(cells: pd.DataFrame, view: str, scores: _Scores) -> dict[str, Any]:
+    arms = [
+        {"label": shown(label), "scores": scores.get((cell_id, view), dict.fromkeys(VIEW_METRICS))}
+        for cell_id, label in zip(cells["cell_id"], cells["label"], strict=True)
+    ]
+    return run_names(cells.iloc[0]) | {"view": shown(view), "arms": arms}
+
+
+def _read(
+    content: Content, store: JoinedStore, cells: pd.DataFrame, view: str, title: str
+) -> tuple[Image.Image, dict[int, Image.Image]] | None:
+    """Read a view's photograph, and its renders by the place of their cell.
+
+    A render that can't be read, or has another size than the photograph, is left out and noted;
+    None without a photograph.
+    """
+    found: dict[int, Image.Image] = {}
+    try:
+        truth = images.read_png_pil(_photograph(store, cells, view), max_pixels=_MAX_PIXELS)
+    except (UnreadableError, ImageError) as error:
+        content.notes.append(f"{title}: no photograph, {why(error, store)}")
+        return None
+    for place, cell_id in enumerate(cells["cell_id"]):
+        try:
+            file = store.render(cell_id, view)
+            found[place] = images.read_png_pil(file, truth.size, _MAX_PIXELS)
+        except (StoreError, ImageError) as error:
+            label = shown(cells["label"].iloc[place])
+            content.notes.append(f"{title}: no render of {label}, {why(error, store)}")
+    return truth, found
+
+
+def _add_images(
+    entry: dict[str, Any],
+    found: tuple[Image.Image, dict[int, Image.Image]],
+    album: Album,
+    first: int,
+) -> bool:
+    """Add a view's images to its entry and to the album; return whether they fit."""
+    photograph, renders = found
+    errors = [error_map(photograph, render) for render in renders.values()]
+    places = album.add([photograph, *renders.values(), *errors])
+    if places is None:
+        return False
+    entry["photograph"], entry["size"] = first + places[0], list(photograph.size)
+    at_render, at_error = iter(places[1:]), iter(places[1 + len(renders) :])
+    for place in renders:
+        arm = entry["arms"][place]
+        arm["image"], arm["error"] = first + next(at_render), first + next(at_error)
+    return True
+
+
+def add_trained(
+    content: Content,
+    store: JoinedStore,
+    comparison: Comparison,
+    variants: dict[str, Variant],
+    max_image_bytes: int,
+    max_model_bytes: int,
+) -> None:
+    """Add training views with renders of them, models for 3D, and the cameras.
+
+    They are of the first replicate of each scene and condition, and of the variants that can be
+    read.
+
+    Args:
+        content: The content of the page, to which they and notes are added.
+        store: The store with the cells.
+        comparison: The comparison of the cells.
+        variants: The variants of the cells that can be read, by their ids.
+        max_image_bytes: The most bytes that the images may take.
+        max_model_bytes: The most bytes that the models may take as base64.
+    """
+    first: dict[tuple[str, str], pd.DataFrame] = {}
+    for rows in runs(comparison):
+        first.setdefault((rows["scene"].iloc[0], rows["condition"].iloc[0]), rows)
+    chosen = list(islice(first.values(), _MAX_RUNS))
+    if len(chosen) < len(first):
+        content.notes.append(
+            f"Training views and models are of {len(chosen)} of {len(first)} scenes and conditions."
+        )
+    readable = [rows for rows in chosen if rows["variant_id"].iloc[0] in variants]
+    count = sum(map(len, readable))
+    if not count:
+        return
+    set_passive_openmp_wait()  # before torch is imported
+    from xrgs.viewer.trained import GAUSSIAN_BYTES, SHOWN_OF_A_TAG
+
+    fitting = int(max_model_bytes * 3 / 4 / GAUSSIAN_BYTES)  # Gaussians of all models
+    kept = max(_MIN_KEPT, min(_MAX_KEPT, fitting // count))
+    models_left = min(count, fitting // kept)
+    shown_images = 2 * SHOWN_OF_A_TAG * (count + 2 * len(readable))
+    sizes = [view.width * view.height for v in variants.values() for view in v.views]
+    album = Album(max_image_bytes, shown_images * max(sizes))
+    place = len(content.images)
+    for rows in progress(readable, "rendering training views", "run"):
+        variant = variants[rows["variant_id"].iloc[0]]
+        try:
+            models_left -= _add_run(content, store, rows, variant, album, place, kept, models_left)
+        except (XrgsError, ValueError) as error:  # what can't be rendered is a ValueError
+            title = f"{shown(rows['scene'].iloc[0])}: training views and models"
+            content.notes.append(f"{title} are not shown, {why(error, store)}")
+    content.images += album.urls
+    if kept * count > fitting:
+        left_out = count - fitting // kept
+        content.notes.append(f"3D: {left_out} of {count} models are left out, for the page's size.")
+
+
+def _add_run(
+    content: Content,
+    store: JoinedStore,
+    rows: pd.DataFrame,
+    variant: Variant,
+    album: Album,
+    place: int,
+    kept: int,
+    models_left: int,
+) -> int:
+    """Add the training views and models of a scene, condition and replicate.
+
+    Args:
+        content: The content of the page.
+        store: The store with the cells.
+        rows: Rows of `Comparison.cells`, one for each label, the base first.
+        variant: The variant of the cells.
+        album: The images of training views.
+        place: The place in `content.images` of the album's first image.
+        kept: The most Gaussians of a model.
+        models_left: The most models that are added.
+
+    Returns:
+        How many models were added.
+
+    Raises:
+        XrgsError: The variant's images can't be read.
+        ValueError: A view can't be rendered.
+    """
+    from xrgs.viewer.trained import TrainedScene
+
+    scene, names = TrainedScene(variant), run_names(rows.iloc[0])
+    cameras = [camera | {"name": shown(camera["name"])} for camera in scene.cameras()]
+    content.cameras.append(names | {"cameras": cameras})
+    labels: dict[str, str] = {}
+    for cell_id, label in zip(rows["cell_id"], map(shown, rows["label"]), strict=True):
+        if cell_id in store.external:
+            continue
+        try:
+            scene.add(store.cell(cell_id))
+            labels[cell_id] = label
+        except XrgsError as error:
+            content.notes.append(
+                f"{names['scene']}, {label}: no training views and no model, {why(error, store)}"
+            )
+    _add_training_views(content, scene, names, labels, album, place)
+    models = list(islice(scene.models(kept), models_left))
+    for cell_id, model in models:
+        entry: dict[str, Any] = names | {"label": labels[cell_id]} | vars(model)
+        entry["data"] = base64.b64encode(entry.pop("content")).decode("ascii")
+        content.models.append(entry)
+    return len(models)
+
+
+def _add_training_views(
+    content: Content,
+    scene: TrainedScene,
+    names: dict[str, str],
+    labels: dict[str, str],
+    album: Album,
+    place: int,
+) -> None:
+    for view in scene.training_views():
+        places = album.add([to_image(image) for image in _images_of(view)])
+        if places is None:
+            content.notes.append(
+                f"{names['scene']}: the training view {shown(view.name)} is left out, for the"
+                " page's size."
+            )
+            continue
+        numbers = [place + at for at in places]
+        content.training.append(
+            names
+            | {"view": shown(view.name), "tag": view.tag, "size": list(view.size)}
+            | {"rendered": list(view.rendered)}
+            | {"photograph": numbers.pop(0)}
+            | {"original": None if view.original is None else numbers.pop(0)}
+            | {
+                "arms": [
+                    {"label": labels[cell_id], "image": number}
+                    for cell_id, number in zip(view.renders, numbers, strict=True)
+                ]
+            }
+        )
+
+
+def _images_of(view: TrainingView) -> list[NDArray[np.float32]]:
+    """Return photograph, original where there is one, and renders."""
+    before = [] if view.original is None else [view.original]
+    return [view.photograph, *before, *view.renders.values()]

@@ -1,0 +1,112 @@
+"""Writes tables as Markdown and LaTeX, whatever characters they hold."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+from xrgs.runtime.text import one_line, padded
+from xrgs.safeio.sanitize import MAX_CELL, for_file_name, for_latex, for_line, for_markdown
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from xrgs.runtime.text import TextTable
+
+#: Shrinks a table that is wider than the text.
+_LATEX_FITTED = r"\resizebox{\ifdim\width>\linewidth\linewidth\else\width\fi}{!}{%"
+#: What a document needs for the tables of `to_latex`.
+LATEX_PREAMBLE = "% The document needs \\usepackage{booktabs} and \\usepackage{graphicx}.\n"
+
+
+def titled(text: str, condition: str) -> str:
+    """Return a heading that names the condition, where there is one."""
+    return f"{text} ({condition})" if condition else text
+
+
+def filled_places(rows: Sequence[tuple[str, ...]]) -> list[int]:
+    """Return the places of the columns that have a text in any row."""
+    return [place for place, texts in enumerate(zip(*rows, strict=True)) if any(texts)]
+
+
+def filled(table: TextTable) -> TextTable:
+    """Return a table without the columns that are empty in every row; as it is without rows.
+
+    The table must have no `spans` and `best`, which name columns by their place.
+    """
+    if not table.rows:
+        return table
+    kept = filled_places(table.rows)
+    return replace(
+        table,
+        columns=tuple(table.columns[place] for place in kept),
+        rows=tuple(tuple(row[place] for place in kept) for row in table.rows),
+        align="".join(table.align[place] for place in kept),
+    )
+
+
+def to_markdown(table: TextTable) -> str:
+    """Write a table as GitHub-flavoured Markdown under a heading, aligned in the source as well."""
+    head, *body = (tuple(map(for_markdown, one_line(row))) for row in (table.heads, *table.rows))
+    lines, sizes = padded([head, *_marked(body, table.best, "**{}**")], table.align)
+    rule = [
+        "-" * (size - 1) + (":" if side == "r" else "-")
+        for size, side in zip(sizes, table.align, strict=True)
+    ]
+    lines.insert(1, rule)
+    body_lines = ["| " + " | ".join(line) + " |" for line in lines]
+    notes = [f"- {for_markdown(note)}" for note in table.notes]
+    context = [for_markdown(table.context)] if table.context else []
+    parts = [[f"### {for_markdown(table.title)}"], context, body_lines, notes]
+    return "\n\n".join("\n".join(part) for part in parts if part) + "\n"
+
+
+def _marked(
+    rows: list[tuple[str, ...]], best: frozenset[tuple[int, int]], form: str
+) -> list[tuple[str, ...]]:
+    """Return the rows with `form` around the cells that are best."""
+    return [
+        tuple(form.format(text) if (i, j) in best else text for j, text in enumerate(row))
+        for i, row in enumerate(rows)
+    ]
+
+
+def to_latex(table: TextTable) -> str:
+    """Write a table as LaTeX of the packages `booktabs` and `graphicx`, with caption and label."""
+    head, *body = (tuple(map(for_latex, one_line(row))) for row in (table.columns, *table.rows))
+    lines = [" & ".join(row) + r" \\" for row in _marked(body, table.best, r"\textbf{{{}}}")]
+    notes = [rf"\par\footnotesize {for_latex(note)}" for note in table.notes]
+    caption = ". ".join(for_latex(text) for text in (table.title, table.context) if text)
+    return "\n".join(
+        [
+            r"\begin{table}[htbp]",
+            r"\centering",
+            rf"\caption{{{caption}}}",
+            rf"\label{{tab:{for_file_name(table.name or table.title)}}}",
+            _LATEX_FITTED,
+            rf"\begin{{tabular}}{{{table.align}}}",
+            r"\toprule",
+            *_latex_spans(table),
+            " & ".join(head) + r" \\",
+            r"\midrule",
+            *lines,
+            r"\bottomrule",
+            r"\end{tabular}}",
+            *notes,
+            r"\end{table}",
+            "",
+        ]
+    )
+
+
+def _latex_spans(table: TextTable) -> list[str]:
+    """Return the row of headings over the columns, and the rules below them; nothing for none."""
+    if not table.spans:
+        return []
+    cells, rules, column = [], [], 1
+    for head, columns in table.spans:
+        cells.append(rf"\multicolumn{{{columns}}}{{c}}{{{for_latex(for_line(head, MAX_CELL))}}}")
+        if head:
+            rules.append(rf"\cmidrule(lr){{{column}-{column + columns - 1}}}")
+        column += columns
+    return [" & ".join(cells) + r" \\", " ".join(rules)]

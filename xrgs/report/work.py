@@ -1,0 +1,295 @@
+"""Tables of what each training did, what it left out, and what that would have cost.
+
+They show why a component changes nothing or makes results worse, and where a run saves time. Counts
+are of the history of a cell; the totals of `xrgs.training.work.StepWork` and the seconds of each
+stage are of its summary. The costs are estimated from the totals of the run itself, and not from
+another run.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING, NamedTuple
+
+import pandas as pd
+
+from xrgs.report.collect import CELL_KEYS, is_component_log
+from xrgs.report.markup import titled
+from xrgs.runtime.text import TextTable
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator, Mapping, Sequence
+
+    from xrgs.report.collect import DoneCell
+
+_LABELS = {
+    "steps_HR": "Steps on HR views",
+    "steps_LR": "Steps on LR views",
+    "duplicated": "Gaussians duplicated",
+    "split": "Gaussians split",
+    "pruned_opacity": "Pruned: transparent",
+    "pruned_scale": "Pruned: too large",
+    "pruned_non_finite": "Pruned: not finite",
+    "pruned_by_components": "Pruned: by components",
+    "reset": "Opacities reset",
+    "skipped_backward": "Steps without a backward pass",
+    "skipped_shN": "Steps that did not move shN",
+}
+_NUMBERS = ["number", "share", "cost", "cost_share"]
+#: Counts of a history that begin so are of steps that left something out.
+_PREFIX = "skipped_"
+_UNKNOWN = "unknown"
+
+
+class _Kind(NamedTuple):
+    """A kind of work that a run can leave out."""
+
+    label: str
+    """Its name in the table, where `{base}` stands for the label of the base."""
+    unit: str
+    """Unit of the cost: `s`, `evaluations` (of alpha), or empty where nothing is known of it."""
+    estimate: str
+    """How the cost is estimated."""
+
+
+_KINDS = {
+    "steps": _Kind("Steps that {base} takes", "s", "at the run's mean time of a step"),
+    "views": _Kind(
+        "Views that {base} trains on", "s", "none: these steps are taken on other views"
+    ),
+    "skipped_backward": _Kind(
+        "Backward passes and updates",
+        "s",
+        "at the mean time of those that the run did, of backward pass and optimizer",
+    ),
+    "pixels": _Kind(
+        "Pixels of the photographs that were not rendered",
+        "evaluations",
+        "at the run's evaluations of a rendered pixel",
+    ),
+    "gaussians": _Kind(
+        "Gaussians out of view or transparent, of all steps",
+        "evaluations",
+        "one for each pixel of the view",
+    ),
+    "tiles": _Kind(
+        "Pixels of tiles that a visible Gaussian does not reach",
+        "evaluations",
+        "one for each, which is exact but for the tiles at the edges",
+    ),
+    "blocks": _Kind(
+        "Pixels of such tiles in blocks that are not reached, or saturated",
+        "evaluations",
+        "one for each, which is exact; the two are not counted apart",
+    ),
+    "sh": _Kind(
+        "Harmonics of visible Gaussians in bands that were not on",
+        "",
+        "not estimated: the time of a band is not measured",
+    ),
+}
+
+
+def totals(cells: pd.DataFrame, done: Mapping[str, DoneCell]) -> pd.DataFrame:
+    """Return what training did in each cell that is done.
+
+    Args:
+        cells: The table `Comparison.cells`.
+        done: The cells that are done, by their ids.
+
+    Returns:
+        One row for each cell: `CELL_KEYS`, and a column for each count of its history (over the
+        whole training) and each value that a component logged (its mean over training); NaN where a
+        cell has none.
+    """
+    keys = cells.loc[cells["cell_id"].isin(done), CELL_KEYS].drop_duplicates("cell_id")
+    keys = keys.reset_index(drop=True)
+    return keys.join(pd.DataFrame([done[name].totals for name in keys["cell_id"]]))
+
+
+def totals_table(totals: pd.DataFrame, labels: Sequence[str], condition: str) -> TextTable:
+    """Return the table of `totals` of one condition, scene by scene, as means over seeds."""
+    chosen = totals[totals["condition"] == condition]
+    names = [name for name in _ordered(totals) if chosen[name].notna().any()]
+    means = chosen.groupby(["scene", "label"])[names].mean().to_dict("index")
+    rows = []
+    for scene in sorted(chosen["scene"].unique()):
+        of_scene = [means.get((scene, label), {}) for label in labels]
+        for name in names:
+            texts = [
+                _count(values.get(name), is_component_log=is_component_log(name))
+                for values in of_scene
+            ]
+            if any(texts):
+                rows.append((scene, _LABELS.get(name, name.replace("_", " ")), *texts))
+    return TextTable(
+        title=titled("What training did, means over the replicates that are done", condition),
+        columns=("Scene", "", *labels),
+        rows=tuple(rows),
+        align="ll" + "r" * len(labels),
+        notes=("names with a dot: values that a component logged, means over training",),
+    )
+
+
+def _ordered(totals: pd.DataFrame) -> list[str]:
+    """Return the columns of numbers: known ones, then the components', each in their own order."""
+    numbers = [name for name in totals.columns if name not in CELL_KEYS]
+    return sorted(numbers, key=lambda name: (name not in _LABELS, is_component_log(name)))
+
+
+def _count(value: float | None, *, is_component_log: bool) -> str:
+    if value is None or pd.isna(value):
+        return ""
+    return f"{value:.4g}" if is_component_log else f"{value:,.0f}"
+
+
+def _work(cell: DoneCell) -> dict[str, float]:
+    """Return the totals of a cell: its summary's, and the counts of steps that skipped something.
+
+    Cells of older versions have no `work` and no seconds of stages.
+    """
+    summary = cell.summary
+    return {
+        **summary.work,
+        **{f"seconds_{stage}": value for stage, value in summary.stage_seconds.items()},
+        "steps": float(summary.steps),
+        "evaluations": summary.evaluations,
+        "seconds": summary.training_time_s,
+        **{name: value for name, value in cell.totals.items() if name.startswith(_PREFIX)},
+    }
+
+
+def skipped(cells: pd.DataFrame, done: Mapping[str, DoneCell]) -> pd.DataFrame:
+    """Return what each cell left out.
+
+    Args:
+        cells: The table `Comparison.cells`.
+        done: The cells that are done, by their ids.
+
+    Returns:
+        One row for each cell and kind of work with known counts: `CELL_KEYS` and `kind`; the
+        `number` that was left out, and its `share` of what there was; its estimated `cost` in the
+        kind's `unit` (`s` or `evaluations`), and `cost_share` of what the run took itself. The
+        costs are NaN where they are not known.
+    """
+    rows = []
+    for _, cell in cells[cells["cell_id"].isin(done)].drop_duplicates(CELL_KEYS).iterrows():
+        own = done[cell["cell_id"]]
+        work = _work(own)
+        for kind, number, of, cost in _left_out(work, _work(done.get(cell["base_id"], own))):
+            if math.isnan(number) or not of > 0:
+                continue
+            unit = _kind(kind).unit
+            total = work["seconds" if unit == "s" else "evaluations"]
+            rows.append(
+                dict(cell[CELL_KEYS])
+                | {"kind": kind, "number": number, "share": number / of, "cost": cost}
+                | {"unit": unit, "cost_share": cost / total if total else math.nan}
+            )
+    columns = [*CELL_KEYS, "kind", "number", "share", "cost", "unit", "cost_share"]
+    return pd.DataFrame(rows, columns=columns)
+
+
+def _left_out(
+    work: Mapping[str, float], base: Mapping[str, float]
+) -> Iterator[tuple[str, float, float, float]]:
+    """Yield each kind: how many were left out, of how many, and their cost."""
+
+    def total(name: str) -> float:
+        return work.get(name, math.nan)
+
+    def of_base(name: str) -> float:
+        return base.get(name, math.nan)
+
+    steps, evaluations = total("steps"), total("evaluations")
+    fewer = _above_zero(of_base("steps") - steps)
+    yield "steps", fewer, of_base("steps"), _times(fewer, total("seconds"), steps)
+    yield "views", _above_zero(of_base("views") - total("views")), of_base("views"), 0.0
+    for name in [name for name in work if name.startswith(_PREFIX)]:
+        cost = math.nan
+        if name == "skipped_backward":
+            seconds = total("seconds_backward") + total("seconds_optimizer")
+            cost = _times(work[name], seconds, steps - work[name])
+        yield name, work[name], steps, cost
+    left_out, rendered = total("pixels_left_out"), total("pixels")
+    yield "pixels", left_out, total("pixels_photograph"), _times(left_out, evaluations, rendered)
+    yield (
+        "gaussians",
+        total("gaussians") - total("gaussians_visible"),
+        total("gaussians"),
+        total("pairs") - total("pairs_visible"),
+    )
+    in_tiles = total("pairs_in_tiles")
+    elsewhere = _above_zero(total("pairs_visible") - in_tiles)
+    yield "tiles", elsewhere, total("pairs_visible"), elsewhere
+    yield "blocks", in_tiles - evaluations, in_tiles, in_tiles - evaluations
+    yield "sh", total("sh_coefficients_left_out"), total("sh_coefficients"), math.nan
+
+
+def _above_zero(value: float) -> float:
+    """Return 0 for a number below it; NaN stays NaN."""
+    return 0.0 if value < 0 else value
+
+
+def _times(number: float, amount: float, of: float) -> float:
+    """Return what `number` takes at the mean of `amount` over `of`; NaN where `of` is 0 or NaN."""
+    return number * amount / of if of > 0 else math.nan
+
+
+def _kind(name: str) -> _Kind:
+    words = name.removeprefix(_PREFIX).replace("_", " ")
+    return _KINDS.get(name, _Kind(f"Steps without {words}", "", "not estimated"))
+
+
+def skipped_table(
+    found: pd.DataFrame, labels: Sequence[str], condition: str, base: str
+) -> TextTable:
+    """Return the table of `skipped` of one condition: means over a scene's runs, then over scenes.
+
+    It has no row for a kind of work that no run left out.
+    """
+    chosen = found[found["condition"] == condition]
+    by_scene = chosen.groupby(["kind", "label", "scene"], sort=False)[_NUMBERS].mean()
+    means = by_scene.groupby(level=["kind", "label"], sort=False).mean()
+    rows, notes = [], []
+    for name in dict.fromkeys(chosen["kind"]):
+        of_kind, kind = means.loc[name], _kind(name)
+        if not of_kind["number"].any():
+            continue
+        texts = [
+            _texts(of_kind.loc[label]) if label in of_kind.index else ("", "") for label in labels
+        ]
+        would = f"would have cost{kind.unit and f', {kind.unit}'}"
+        label = kind.label.replace("{base}", base)
+        rows.append((label, "number (share)", *(number for number, _ in texts)))
+        rows.append(("", f"{would} (of the run's own)", *(cost for _, cost in texts)))
+        notes.append(f"{label}: cost {kind.estimate}")
+    return TextTable(
+        title=titled("What each run left out, mean over scenes", condition),
+        columns=("Left out", "", *labels),
+        rows=tuple(rows),
+        align="ll" + "r" * len(labels),
+        notes=tuple(notes),
+    )
+
+
+def _texts(row: pd.Series) -> tuple[str, str]:
+    """Return the number that was left out, and what it would have cost."""
+    number = f"{_short(row['number'])} ({_share(row['share'])})"
+    if math.isnan(row["cost"]):
+        return number, _UNKNOWN
+    return number, f"{_short(row['cost'])} ({_share(row['cost_share'])})"
+
+
+def _short(value: float) -> str:
+    """Write a number with the prefix of the SI for thousands, millions and so on."""
+    if not math.isfinite(value):
+        return _UNKNOWN
+    size = min(4, int(math.log10(value)) // 3) if value >= 1000 else 0
+    return f"{value / 1000**size:,.4g} {('', 'k', 'M', 'G', 'T')[size]}".rstrip()
+
+
+def _share(value: float) -> str:
+    if value < 1:
+        return f"{value:.1%}"
+    return f"{value:,.1f} times" if value < 100 else f"{value:,.0f} times"
