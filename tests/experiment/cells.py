@@ -56,7 +56,12 @@ def write_variant(variants: Path, key: str = "0123456789abcdef") -> str:
         file = folder / "images" / split / f"{name}.png"
         file.parent.mkdir()
         file.write_bytes(b"image")
-        view = {"name": name, "split": split, "file": f"images/{split}/{name}.png", "tag": "HR"}
+        view: dict[str, object] = {
+            "name": name,
+            "split": split,
+            "file": f"images/{split}/{name}.png",
+            "tag": "HR",
+        }
         view |= {"width": 2, "height": 2, "K": [line[:3] for line in eye[:3]], "viewmat": eye}
         views.append(view | {"rho": 1.0})
     np.savez(folder / frozen.POINTS, points=np.ones((4, 3)), colors=np.zeros((4, 3), np.uint8))

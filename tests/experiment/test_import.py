@@ -67,7 +67,7 @@ def contents(store: Store) -> dict[str, bytes]:
     return {str(path.relative_to(store.path)): path.read_bytes() for path in files}
 
 
-def packed_as(store: Store, file: Path, mode: str) -> Path:
+def packed_as(store: Store, file: Path, mode: Any) -> Path:
     with tarfile.open(file, mode) as stream:
         stream.add(store.path, "." if mode == "w" else "xrgs-store")
     return file
@@ -83,11 +83,12 @@ def test_a_store_is_imported_whole(foreign: Store, mine: Store, kind: str) -> No
     for name in ("hydra/a/b.yaml", "reports/x/report.html", "locks/a.0", "cells/a.aside-1/log.txt"):
         (foreign.path / name).parent.mkdir(parents=True, exist_ok=True)
         (foreign.path / name).write_text("not imported")
-    source = {"folder": foreign.path, "around": foreign.path.parent / "around"}.get(kind)
+    source = foreign.path
     if kind == "around":
-        (foreign.path.parent / "around").mkdir()
-        foreign.path.rename(foreign.path.parent / "around/xrgs-store")
-    elif source is None:
+        source = foreign.path.parent / "around"
+        source.mkdir()
+        foreign.path.rename(source / "xrgs-store")
+    elif kind != "folder":
         mode = {".tar": "w"}.get(kind, f"w:{kind[5:]}")
         source = packed_as(foreign, foreign.path.parent / f"a{kind}", mode)
     found = import_store(source, mine)
@@ -431,7 +432,8 @@ def test_an_archive_that_breaks_off_gives_what_is_whole(
     """The random bytes at its end do not fit into what was compressed before."""
     (foreign.path / "zzz").write_bytes(os.urandom(1 << 20))
     source = tmp_path / "a.tar"
-    with tarfile.open(source, f"w{kind}") as stream:
+    mode: Any = f"w{kind}"
+    with tarfile.open(source, mode) as stream:
         for name in ("cells", "scenes", "sweeps", "variants", "zzz"):
             stream.add(foreign.path / name, name)
     os.truncate(source, source.stat().st_size - 100_000)

@@ -93,7 +93,7 @@ def test_an_empty_store_has_an_empty_table_and_no_store_is_an_error(
     table = store.cells()
     assert table.empty
     assert {"cell_id", "state", "psnr"} <= set(table.columns)
-    with pytest.raises(StoreError, match="nothing: no store; xrgs-sweep makes one"):
+    with pytest.raises(StoreError, match="nothing is not a store; xrgs-sweep makes one"):
         Store(tmp_path / "nothing").cells()
 
 

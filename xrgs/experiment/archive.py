@@ -471,7 +471,7 @@ def _members(source: Path) -> Iterator[_Member]:
             for name, status in walk_files(source):
                 wrong = "" if stat.S_ISREG(status.st_mode) else "not a regular file"
                 size, modified = status.st_size, status.st_mtime
-                yield _Member(name, size, modified, wrong, partial((source / name).open, "rb"))
+                yield _Member(name, size, modified, wrong, partial(_open, source / name))
         return
     with errors_named(source):
         content = source.open("rb")
@@ -485,13 +485,17 @@ def _members(source: Path) -> Iterator[_Member]:
                 header = archive.next()
             if header is None:
                 return
-            archive.members.clear()  # tarfile would keep each of them
+            archive.members.clear()  # type: ignore[attr-defined]  # tarfile would keep them all
             if header.isdir():
                 continue
             regular = header.type in (tarfile.REGTYPE, tarfile.AREGTYPE) and not header.issparse()
             wrong = "" if regular else "not a regular file"
             extracted = partial(archive.extractfile, header)
             yield _Member(header.name, header.size, float(header.mtime), wrong, extracted)
+
+
+def _open(file: Path) -> IO[bytes]:
+    return file.open("rb")
 
 
 @contextmanager

@@ -169,7 +169,11 @@ class CellFolder:
 
     def _decode(self, status: Status) -> None:
         """Raise `StoreError` where a JSON file of a done cell is not of its type."""
-        structs = {IDENTITY: Identity, "summary.json": Summary, "provenance.json": Provenance}
+        structs: dict[str, type[msgspec.Struct]] = {
+            IDENTITY: Identity,
+            "summary.json": Summary,
+            "provenance.json": Provenance,
+        }
         for name in structs.keys() & status.files.keys():
             read_struct(self.path / name, structs[name])
 

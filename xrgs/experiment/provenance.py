@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from collections.abc import Mapping
 
 _PACKAGES = ("torch", "numpy", "pycolmap", "kornia", "scikit-image", "hydra-core", "pandas")
-#: Entries that times depend on, beside the program.
+#: The fields that a cell's times depend on, beside the program.
 MACHINE_KEYS = ("cpu", "instruction_set", "threads", "backend")
 
 
@@ -57,7 +57,7 @@ def collect(threads: int, backend: str) -> Provenance:
     """Return the program, its libraries, the machine and the time.
 
     Args:
-        threads: Number of threads that the cell uses.
+        threads: The threads that the cell uses.
         backend: The rasterizer in use, `native` or `torch`.
 
     Raises:
@@ -117,11 +117,7 @@ class Machines:
     """The machines that train a cell in turn; its checkpoint hands their names on to the next."""
 
     def __init__(self, here: str) -> None:
-        """Begin with the machine of this process.
-
-        Args:
-            here: Its name, see `machine`.
-        """
+        """Begin with the machine of this process, `here`, see `machine`."""
         self.names = [here]
 
     def state_dict(self) -> dict[str, Any]:
@@ -129,16 +125,13 @@ class Machines:
         return {"names": self.names}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Put the machines that have trained before in front of this one.
-
-        Args:
-            state: What `state_dict` returned.
+        """Put the machines of a checkpoint, which trained before, in front of this one.
 
         Raises:
-            KeyError: It has no names.
-            TypeError: They are no texts.
+            KeyError: The state has no names.
+            TypeError: A name is not a text.
         """
         before = state["names"]
         if not isinstance(before, list) or not all(isinstance(name, str) for name in before):
-            raise TypeError(f"names: {before!r:.40} are no texts")
+            raise TypeError(f"names: {before!r:.40} must be a list of texts")
         self.names = list(dict.fromkeys([*before, *self.names]))
