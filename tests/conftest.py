@@ -214,11 +214,10 @@ class Sweeps:
         return command_lines
 
     def cells(self) -> dict[int, Path]:
-        """Return the folder of each cell by its seed."""
-        files = (self.folder / "s" / "cells").glob("*/identity.json")
-        return {
-            json.loads(f.read_text())["seed"]: f.parent for f in files if "." not in f.parent.name
-        }
+        """Return the folder of each cell that has begun by its seed."""
+        logs = (self.folder / "s" / "cells").glob("*/log.txt")
+        folders = [file.parent for file in logs if "." not in file.parent.name]
+        return {json.loads((of / "identity.json").read_text())["seed"]: of for of in folders}
 
 
 @pytest.fixture(scope="session")

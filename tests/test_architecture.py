@@ -69,7 +69,6 @@ LIGHT = (
     "sweep.monitor",
     "sweep.rerun",
     "sweep.session",
-    "sweep.show",
     "sweep.status",
     "sweep.study",
     "sweep.variants",
@@ -151,6 +150,13 @@ def test_the_model_knows_nothing_of_experiments() -> None:
         for other in own_imports(name)
     }
     assert used <= {"errors", "safeio", "splat"}
+
+
+def test_reports_have_no_torch_code() -> None:
+    """What needs torch for a report is in packages before it, and is called where it is needed."""
+    reports = {name: imports(path) for name, path in FILES.items() if package_of(name) == "report"}
+    found = {name for name, of in reports.items() if any(m.split(".")[0] == "torch" for m in of)}
+    assert not found
 
 
 def test_planning_and_reporting_run_without_torch() -> None:

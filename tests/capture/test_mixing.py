@@ -139,10 +139,6 @@ def test_photographs_of_one_resolution_are_said_to_make_no_mixture(
     assert note in caplog.text
 
 
-def test_a_mixture_is_not_said_to_be_none(mix: Mix) -> None:
-    assert mix(tags="flag").report["notes"] == []
-
-
 def test_a_threshold_of_the_rate_takes_those_above_it(mix: Mix) -> None:
     made = mix(tags="sampling_rate", hr_above=0.93)
     assert of(made, "train", "HR")
@@ -243,6 +239,7 @@ def test_the_poses_are_compared_with_those_of_the_undegraded(
     mix: Mix, given: list[list[str]]
 ) -> None:
     made = mix()
+    assert made.report["notes"] == []
     assert len(given) == 2
     assert sum(file.startswith("up/") for file in given[0]) == len(of(made, "train", "LR"))
     assert given[1] == [f"hr/{i:05d}.png" for i in range(VIEWS)]
@@ -259,12 +256,6 @@ def test_exact_cameras_need_no_second_run_of_sfm(
     assert len(given) == 1
     assert made.report["pose_error_against"] == "exact cameras"
     assert 0 < made.report["pose_error"]["position_percent"] < 5
-
-
-def test_the_reference_can_be_switched_off(mix: Mix, given: list[list[str]]) -> None:
-    made = mix(sfm={"reference": False})
-    assert len(given) == 1
-    assert made.report["pose_error"] == {}
 
 
 EMPTY = Reconstruction(
@@ -331,9 +322,6 @@ def test_every_variant_in_conf_is_valid(
     conf = compose(*([f"variant={name}"] if name else [])).variant
     check_variant_conf(conf)
     assert (conf.tags, resolve_degradation(conf)) == (tags, degradation)
-
-
-def test_every_variant_in_conf_is_tested() -> None:
     files = {file.stem for file in (config.CONF_DIR / "variant").iterdir()}
     assert files == {"digital_zoom", "distance", "jpeg", "megapixels", "sampling_rate"}
 

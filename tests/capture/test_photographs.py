@@ -103,8 +103,13 @@ def test_a_photograph_too_small_for_its_copy_is_named(tmp_path: Path) -> None:
         prepare_hr_views(Scene("x", "", {file.stem: file for file in files}), CONF, tmp_path)
 
 
-def test_a_file_without_a_header_is_left_out_too(tmp_path: Path) -> None:
-    (tmp_path / "b.png").write_text("no image")
+@pytest.mark.parametrize("damage", ["no header", "truncated"])
+def test_a_damaged_photograph_is_left_out_and_named(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture, damage: str
+) -> None:
+    write_photograph(tmp_path / "b.png")
+    content = (tmp_path / "b.png").read_bytes()
+    (tmp_path / "b.png").write_bytes(b"no image" if damage == "no header" else content[:-40])
     files = [
         write_photograph(tmp_path / "a.png"),
         tmp_path / "b.png",
@@ -112,7 +117,11 @@ def test_a_file_without_a_header_is_left_out_too(tmp_path: Path) -> None:
     ]
     photos = prepare_hr_views(Scene("x", "", {file.stem: file for file in files}), CONF, tmp_path)
     assert photos.names == ["a", "c"]
-    assert "b.png" in photos.unreadable[0]
+    assert f"{tmp_path / 'b.png'}: " in photos.unreadable[0]
+    assert f"{tmp_path / 'b.png'}: " in caplog.text
+    two = Scene("x", "", {file.stem: file for file in files[:2]})
+    with pytest.raises(XrgsError, match=r"scene x: 1 readable image.*b\.png"):
+        prepare_hr_views(two, CONF, tmp_path)
 
 
 @pytest.mark.parametrize("failing", ["size", "read"])

@@ -19,11 +19,9 @@ Make = Callable[..., VariantConf]
 
 
 @pytest.fixture
-def photos(configured: Make, tmp_path: Path) -> PhotoCollection:
+def photos(configured: Make, stereo_scene: SceneConf, tmp_path: Path) -> PhotoCollection:
     """The stereo pair, and a degraded copy of the right view that is 5 times smaller."""
-    scene = scenes.resolve(
-        SceneConf(name="motorcycle", kind="motorcycle", path=None, views=24), tmp_path
-    )
+    scene = scenes.resolve(stereo_scene, tmp_path)
     conf = configured(long_side=185, degradation="downsample")
     made = prepare_hr_views(scene, conf, tmp_path)
     write_degraded(made, [1], conf)
@@ -64,11 +62,16 @@ def test_attempts_follow_until_one_is_accepted(
 
 
 def test_an_accepted_first_attempt_is_the_only_one(
-    photos: PhotoCollection, sfm_conf: SfmConf, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    photos: PhotoCollection,
+    sfm_conf: SfmConf,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    caplog: pytest.LogCaptureFixture,
 ) -> None:
     monkeypatch.setattr(sfm, "reconstruct", lambda *_: registered(2))
     done = registration.register(photos, [1], sfm_conf, tmp_path, lambda _: "")
     assert [a["attempt"] for a in done.attempts] == ["configured"]
+    assert not [r for r in caplog.records if r.levelno >= logging.WARNING]
 
 
 @pytest.mark.parametrize("fallbacks", [True, False])
@@ -142,11 +145,9 @@ def test_small_images_are_upsampled_or_have_a_camera_of_their_own(
 
 
 def test_a_degraded_copy_of_full_size_is_given_as_it_is(
-    configured: Make, sfm_conf: SfmConf, tmp_path: Path
+    configured: Make, sfm_conf: SfmConf, stereo_scene: SceneConf, tmp_path: Path
 ) -> None:
-    scene = scenes.resolve(
-        SceneConf(name="motorcycle", kind="motorcycle", path=None, views=24), tmp_path
-    )
+    scene = scenes.resolve(stereo_scene, tmp_path)
     conf = configured(long_side=185, degradation="jpeg")
     made = prepare_hr_views(scene, conf, tmp_path)
     write_degraded(made, [1], conf)
@@ -154,15 +155,3 @@ def test_a_degraded_copy_of_full_size_is_given_as_it_is(
         given = registration.sfm_images(made, [1], replace(sfm_conf, lr_images=lr_images))
         assert [image.file for image in given] == ["hr/00000.png", "lr/00001.png"]
     assert not (tmp_path / "up").exists()
-
-
-def test_success_logs_no_warning(
-    photos: PhotoCollection,
-    sfm_conf: SfmConf,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    caplog: pytest.LogCaptureFixture,
-) -> None:
-    monkeypatch.setattr(sfm, "reconstruct", lambda *_: registered(2))
-    registration.register(photos, [1], sfm_conf, tmp_path, lambda _: "")
-    assert not [r for r in caplog.records if r.levelno >= logging.WARNING]

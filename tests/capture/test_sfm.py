@@ -55,12 +55,12 @@ def test_two_views_keep_the_points_that_only_two_see(sfm_conf: SfmConf) -> None:
 
 
 @pytest.fixture(scope="module")
-def stereo_pair(tmp_path_factory: pytest.TempPathFactory, sfm_conf: SfmConf) -> StereoPair:
+def stereo_pair(
+    tmp_path_factory: pytest.TempPathFactory, sfm_conf: SfmConf, stereo_scene: SceneConf
+) -> StereoPair:
     """The motorcycle pair at its own size, intrinsics given."""
     work = tmp_path_factory.mktemp("pair")
-    scene = scenes.resolve(
-        SceneConf(name="motorcycle", kind="motorcycle", path=None, views=24), work
-    )
+    scene = scenes.resolve(stereo_scene, work)
     inputs = []
     for file in scene.files.values():
         images.save(work / file.name, images.read(file))

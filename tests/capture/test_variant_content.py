@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shutil
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -10,10 +9,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from xrgs.capture import images, scenes
+from xrgs.capture import images
 from xrgs.capture.views import Variant, View
 from xrgs.config import SceneConf
-from xrgs.errors import XrgsError
 
 pytestmark = pytest.mark.slow
 
@@ -153,73 +151,6 @@ def test_native_gives_sfm_the_small_files_as_they_are(
 
 
 # photographs of users
-
-
-@pytest.fixture
-def photographs(tmp_path: Path, procedural_scene: SceneConf) -> Callable[[str, int], SceneConf]:
-    """(folder's name, count) -> views of the embedded scene as a user's folder, oddly named."""
-
-    def copied(name: str, count: int) -> SceneConf:
-        (tmp_path / name).mkdir()
-        cache = tmp_path / "scenes"
-        rendered = scenes.resolve(replace(procedural_scene, views=count), cache, 252)
-        for i, file in enumerate(rendered.files.values()):
-            shutil.copy(str(file), tmp_path / name / f"vue d'été {i}, x.png")
-        return SceneConf(name="", kind="folder", path=str(tmp_path / name), views=24)
-
-    return copied
-
-
-def test_an_unreadable_photograph_is_left_out_and_reported(
-    photographs: Callable[[str, int], SceneConf],
-    build: Build,
-    tmp_path: Path,
-    caplog: pytest.LogCaptureFixture,
-) -> None:
-    scene = photographs("photos à moi", 9)
-    broken = tmp_path / "photos à moi" / "vue d'été 3, x.png"
-    broken.write_bytes(broken.read_bytes()[:5000])
-    built = build(scene, test_every=4, hr_fraction=0.5)
-    assert built.scene == "photos à moi"
-    assert str(broken) in built.report["unreadable"][0]
-    assert f"{broken}: " in caplog.text
-    assert "truncated" in caplog.text
-    names = {view.name for view in built.views}
-    assert "vue d'été 3, x" not in names
-    assert {"vue d'été 0, x", "vue d'été 5, x"} <= names  # every 4th readable photograph
-    tests = {v.name for v in select(built, "test", "HR")}
-    assert tests == {"vue d'été 0, x", "vue d'été 5, x"}
-
-
-def test_one_readable_photograph_is_too_few(
-    photographs: Callable[[str, int], SceneConf], build: Build, store: Path, tmp_path: Path
-) -> None:
-    scene = photographs("x", 2)
-    (tmp_path / "x" / "vue d'été 1, x.png").write_bytes(b"no image")
-    with pytest.raises(XrgsError, match=r"x: 1 readable image.*été 1, x\.png"):
-        build(scene)
-    assert not list((store / "variants").glob("*-*"))
-
-
-def test_views_of_differing_sizes_keep_their_own_size_and_camera(
-    photographs: Callable[[str, int], SceneConf], build: Build, tmp_path: Path
-) -> None:
-    """Half of the photographs are cropped at both sides, which keeps their focal length."""
-    scene = photographs("x", 12)
-    cropped = [f"vue d'été {i}, x" for i in range(0, 12, 2)]
-    for name in cropped:
-        file = tmp_path / "x" / f"{name}.png"
-        images.save(file, images.read(file)[:, 25:-25])  # 202 x 189
-    built = build(scene, factor=1, test_every=3)
-    assert built.report["registered"] == 12
-    assert built.report["hr_sizes"] == {"202x189": 6, "252x189": 6}
-    assert built.report["cameras"] == 12  # without EXIF no two photographs share a camera
-    for view in built.views:
-        assert (view.width, view.height) == ((202, 189) if view.name in cropped else (252, 189))
-        assert images.size(view.file) == (view.width, view.height)
-        assert view.K[:2, 2].tolist() == [view.width / 2, view.height / 2]
-    focal = np.median([view.K[0, 0] for view in built.views])
-    assert focal == pytest.approx(0.9 * 252, rel=0.15)  # each was estimated from one view alone
 
 
 @pytest.mark.data

@@ -305,7 +305,7 @@ def test_a_folder_of_another_name_is_left_out(foreign: Store, mine: Store) -> No
     found = import_store(foreign.path, mine)
     assert (found.variants, found.scenes) == (0, 0)
     assert "another name than its variant" in found.left_out[0]
-    assert "another scene" in found.left_out[1]
+    assert "its fingerprint is not the name of its folder" in found.left_out[1]
 
 
 def test_a_record_that_has_changed_or_is_of_no_type_is_left_out(

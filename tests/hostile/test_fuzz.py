@@ -22,6 +22,7 @@ from functools import cache
 from pathlib import Path
 from random import Random
 
+import msgspec
 import numpy as np
 import pytest
 import torch
@@ -37,7 +38,7 @@ from tests.hostile.mutations import (
 )
 from xrgs import composing
 from xrgs.capture import colmap, frozen, images, poses
-from xrgs.capture.failures import read_failure
+from xrgs.capture.folders import read_failure
 from xrgs.capture.photographs import PhotoCollection, prepare_hr_views
 from xrgs.capture.scenes import Scene
 from xrgs.capture.scenes.rendered import RenderedScene
@@ -168,7 +169,7 @@ def read_npz(file: Path) -> object:
 
 
 def now(_: Path) -> bytes:
-    return json.dumps(vars(progress.Progress("training", "step", 5, 60, 3.5))).encode()
+    return msgspec.json.encode(progress.Progress("training", "step", 5, 60, 3.5))
 
 
 def scene(_: Path) -> bytes:

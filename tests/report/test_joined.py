@@ -68,7 +68,9 @@ def test_a_cell_is_found_in_the_store_that_has_done_it(
 ) -> None:
     a, b, first, _ = two
     store = JoinedStore((Store(a), Store(b)))
-    (cell_id,) = [row.cell_id for row in Store(a).sweep_record(first).cells if row.label == "plus"]
+    (cell_id,) = [
+        str(row.cell_id) for row in Store(a).sweep_record(first).cells if row.label == "plus"
+    ]
     (a / "cells" / cell_id / "scores.csv").unlink()
     assert store.cell(cell_id).path == b / "cells" / cell_id
     shutil.rmtree(b / "cells" / cell_id)

@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from xrgs.report.markup import LATEX_PREAMBLE, to_latex, to_markdown
-from xrgs.runtime.text import TextTable, to_text, width
+from xrgs.runtime.text import TextTable, to_text
 
 TABLE = TextTable(
     title="a_b & c",
@@ -20,12 +20,6 @@ TABLE = TextTable(
     align="lr",
     notes=("100 $",),
 )
-
-
-def test_text_is_aligned() -> None:
-    assert to_text(TABLE) == (
-        "a_b & c\n\nMetric  50% | x\n──────  ───────\nPSNR    -0.80 ↓\n[odd]       n/a\n100 $\n"
-    )
 
 
 def test_markdown_is_escaped_and_aligned() -> None:
@@ -97,12 +91,6 @@ def test_latex_compiles(tmp_path: Path) -> None:
     command = [pdflatex, "-interaction=nonstopmode", "-halt-on-error", "-draftmode", "x.tex"]
     done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stdout
-
-
-def test_wide_characters_keep_the_columns() -> None:
-    table = TextTable("t", ("a", "b"), (("部屋", "1"), ("cafe\u0301", "2"), ("plain", "3")), "lr")
-    lines = to_text(table).splitlines()[2:]
-    assert len({width(line) for line in lines}) == 1
 
 
 @given(st.text(max_size=30))

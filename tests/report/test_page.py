@@ -1,7 +1,9 @@
 """A report of a store: whole, the same each time, and made without torch."""
 
 import csv
+import errno
 import json
+import os
 import re
 import shutil
 import subprocess
@@ -13,11 +15,12 @@ import cmarkgfm
 import pytest
 
 import xrgs
-from tests.report.conftest import configured
+from tests.report.conftest import VIEWS, configured, finish_again
 from xrgs.errors import StoreError
 from xrgs.report import build
 from xrgs.report.collect import ReportError
 from xrgs.report.figures import trade_off
+from xrgs.safeio import files, records
 
 
 @pytest.fixture
@@ -74,7 +77,7 @@ def test_a_report_of_held_out_training_views_says_so_and_shows_them(made: Any) -
     for label in ("baseline", "consistency"):
         made.add(label, condition="train.validation=0.1", validation=0.1, pictures=True)
     made.write()
-    report = build(made.store.path)
+    report = build(made.store.path, pictures=["fern--consistency"])
     said = "Scores are of held-out training views where the tables say train.validation=0.1"
     assert said in report.text
     assert f"**{said}" in (report.folder / "table.md").read_text()
@@ -155,7 +158,7 @@ def test_every_file_is_there_and_named(study: Any) -> None:
 
 def test_the_terminal_has_table_failures_and_folder(study: Any) -> None:
     study.write()
-    report = build(study.store.path)
+    report = build(study.store.path, pictures=[])
     assert "consistency against baseline: 2 of 3 scenes, seed 0" in report.text
     assert "+2.00 ↑" in report.text
     assert "leaves: 3 of 24 views registered" in report.text
@@ -184,7 +187,7 @@ def test_times_of_different_machines_are_warned_of(made: Any) -> None:
     made.add()
     made.add("consistency", cpu="another processor")
     made.write()
-    report = build(made.store.path)
+    report = build(made.store.path, pictures=[])
     warning = (
         "The cells were trained on different machines (a processor, threads 2, torch; another"
         " processor, threads 2, torch): times are compared between cells of one machine alone."
@@ -205,7 +208,7 @@ def test_a_corrupt_cell_is_not_trusted(study: Any) -> None:
 def test_a_missing_render_costs_its_picture_alone(study: Any) -> None:
     study.write()
     shutil.rmtree(study.store.path / "variants")
-    report = build(study.store.path)
+    report = build(study.store.path, pictures=["fern--consistency"])
     page = (report.folder / "table.md").read_text()
     assert "No picture of fern, consistency, seed 0" in page
     assert "fern--consistency.png" not in page
@@ -250,7 +253,8 @@ def test_another_base_has_a_report_of_its_own_that_names_it(made: Any) -> None:
         made.add(label, factors=factors, pictures=True, quality=curve, summary=summary)
     sweep_id = made.write()
     plain = build(made.store.path, pictures=[])
-    report = build(made.store.path, against="a/b {x}")
+    names = ["trade-off", "time-to-quality", "fern--baseline", "fern--c"]
+    report = build(made.store.path, pictures=names, against="a/b {x}")
     assert plain.folder == made.store.path / "reports" / sweep_id
     assert report.folder.name.startswith(f"{sweep_id}.against-a-b-x-")
     assert {file.name for file in plain.files} < {file.name for file in report.files}
@@ -264,8 +268,7 @@ def test_another_base_has_a_report_of_its_own_that_names_it(made: Any) -> None:
     for title in ("at which a/b \\{x\\} ends", "% of a/b \\{x\\}'s", "c vs a/b \\{x\\}"):
         assert title in page
     assert "Steps that a/b \\{x\\} takes" in page
-    drawn = {file.stem for file in report.files if file.suffix == ".png"}
-    assert drawn >= {"trade-off", "time-to-quality", "fern--baseline", "fern--c"}
+    assert {file.stem for file in report.files if file.suffix == ".png"} == {*names}
     with (report.folder / "table.csv").open(newline="") as stream:
         rows = [row for row in csv.DictReader(stream) if row["metric"] == "psnr"]
     changes = {(row["label"], row["against"]): float(row["change_percent"]) for row in rows}
@@ -370,10 +373,10 @@ def test_stale_scores_are_said_once_with_what_computes_them(made: Any) -> None:
     )
     assert report.text.count(warning) == 1
     assert (report.folder / "table.md").read_text().count(warning) == 1
-    (stale, ablation, fresh) = csv.DictReader((report.folder / "cells.csv").open(newline=""))
-    assert (stale["stale"], ablation["stale"], fresh["stale"]) == ("lpips ssim", "lpips", "")
-    (row,) = [line for line in report.text.splitlines() if line.startswith("LPIPS")]
-    assert "n/a: not measured" in row
+    cells = csv.DictReader((report.folder / "cells.csv").read_text().splitlines())
+    assert [row["stale"] for row in cells] == ["lpips ssim", "lpips", ""]
+    (score,) = [line for line in report.text.splitlines() if line.startswith("LPIPS")][:1]
+    assert "n/a: not measured" in score
 
 
 def test_a_new_protocol_makes_every_score_stale(made: Any) -> None:
@@ -392,4 +395,48 @@ def test_cells_csv_has_steps_size_and_factor(made: Any) -> None:
         (row["steps"], row["long_side"], row["factor"])
         for row in csv.DictReader(file.read_text().splitlines())
     ]
-    assert rows == [("700.0", "250.0", "3.0"), ("500.0", "", "")]
+    assert rows == [("700", "250", "3"), ("500", "", "")]
+
+
+@pytest.mark.parametrize("value", ["inf", "nan", "1e30", "1e-320", "0"])
+def test_extreme_numbers_are_reported_without_a_warning(made: Any, value: str) -> None:
+    for label in ("baseline", "consistency"):
+        rows = f"0,{value},1,{value}\n1,{value},2,{value}\n"
+        cell = made.add(label, history=f"step,loss,gaussians,mip.value\n{rows}")
+        scores = ",".join([value] * 3)
+        lines = ["view,psnr,ssim,lpips", *(f"{view},{scores}" for view in VIEWS)]
+        (cell.path / "scores.csv").write_text("\n".join(lines) + "\n")
+        finish_again(cell)
+    made.write()
+    report = build(made.store.path, pictures=["fern--consistency--training"])
+    assert "of 2 cells" not in report.text, "both are done"
+
+
+def test_a_cell_that_cannot_be_read_now_is_a_row_with_the_reason(
+    made: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    made.add()
+    cell = made.add("consistency")
+    real = files.read_bytes
+
+    def failing(path: Path, max_bytes: int) -> bytes:
+        if path == cell.path / "summary.json":
+            raise OSError(errno.EIO, os.strerror(errno.EIO), str(path))
+        return real(path, max_bytes)
+
+    monkeypatch.setattr(records, "read_bytes", failing)
+    made.write()
+    report = build(made.store.path, pictures=[])
+    assert "1 cell can't be read now: run the report again" in report.text
+    (row,) = [line for line in report.text.splitlines() if "unknown" in line]
+    assert "summary.json: " in row
+    assert os.strerror(errno.EIO) in row
+
+
+def test_a_sweep_that_could_not_read_a_variant_says_so(made: Any) -> None:
+    made.add()
+    row = made.rows[0] | {"label": "consistency", "state": "unknown"}
+    made.rows.append(row | dict.fromkeys(("cell_id", "variant_id", "baseline_id")))
+    made.write()
+    text = build(made.store.path, pictures=[]).text
+    assert "unknown  a file could not be read when the sweep was planned" in text

@@ -7,6 +7,7 @@ from typing import Any
 import pytest
 
 from xrgs.evaluation.metrics import METRICS
+from xrgs.report import pictures
 from xrgs.report.compare import compare
 from xrgs.report.page import build
 from xrgs.report.pictures import sensitivities
@@ -96,16 +97,10 @@ def test_a_value_that_failed_is_left_out(made: Any) -> None:
 def test_the_report_has_the_figure_where_there_are_three_values(made: Any, tmp_path: Path) -> None:
     add_weights(made)
     made.write()
-    folder = build(made.store.path, out=tmp_path / "with").folder
+    pictures = ["sensitivity-consistency.weight"]
+    folder = build(made.store.path, out=tmp_path / "with", pictures=pictures).folder
     assert (folder / "figures" / "sensitivity-consistency.weight.png").exists()
     assert "Change from baseline over consistency.weight" in (folder / "table.md").read_text()
-
-
-def test_a_report_of_two_values_has_no_such_figure(made: Any, tmp_path: Path) -> None:
-    add_weights(made, values={"1": 21.0, "2": 22.0})
-    made.write()
-    folder = build(made.store.path, out=tmp_path / "without").folder
-    assert not list((folder / "figures").glob("sensitivity*"))
 
 
 def test_more_curves_than_colours_are_not_drawn_and_said(made: Any, tmp_path: Path) -> None:
@@ -116,7 +111,7 @@ def test_more_curves_than_colours_are_not_drawn_and_said(made: Any, tmp_path: Pa
     made.write()
     page = build(made.store.path, out=tmp_path / "many", pictures=["sensitivity-a.b"]).folder
     said = (page / "table.md").read_text()
-    assert "8 curves, of which a figure can tell 7 apart" in said
+    assert "8 curves, and a figure can tell 7 apart" in said
     assert not list((page / "figures").iterdir())
 
 
@@ -125,3 +120,17 @@ def test_a_score_that_is_not_known_leaves_out_its_panel(made: Any) -> None:
     changes = found(made)["consistency.weight"]
     psnr = changes[(changes["metric"] == "psnr") & (changes["level"] == "mean")]
     assert psnr["change"].isna().tolist() == [False, True, False]
+
+
+def test_of_many_pictures_the_first_are_drawn_and_the_rest_said(
+    made: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(pictures, "_MAX_PICTURES", 1)
+    made.add()
+    for label in ("a", "b"):
+        made.add(label)
+    made.write()
+    folder = build(made.store.path).folder
+    assert [file.stem for file in (folder / "figures").iterdir()] == ["trade-off"]
+    said = "No picture of 4 more: only the first 1 are drawn; --pictures NAMES draws others"
+    assert said in (folder / "table.md").read_text()

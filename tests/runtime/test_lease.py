@@ -18,6 +18,7 @@ from typing import Any
 import pytest
 
 from xrgs.runtime import lease
+from xrgs.safeio.files import read_bytes
 
 _TAKE = """
 import sys, time
@@ -269,7 +270,7 @@ def test_a_lease_that_can_not_be_read_now_is_held(
     """A disk that fails for a moment robs nobody."""
     elsewhere(taken, 1e6)
     watch(folder, clock, lease.CONFIRM_S + 5)
-    read = lease.read_bytes
+    read = read_bytes
 
     def sick(path: Path, *given: int) -> bytes:
         if path.name == "cell.0":

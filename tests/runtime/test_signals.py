@@ -16,7 +16,8 @@ if sys.argv[1] == "nohup":
 with exit_on_signal("Run it again."):
     try:
         print("ready", flush=True)
-        time.sleep(60 if sys.argv[1] != "nohup" else 0.5)
+        for _ in range(600 if sys.argv[1] != "nohup" else 5):
+            time.sleep(0.1)  # short: a signal right before a sleep is handled after it
     finally:
         print("tidied up", flush=True)
         if sys.argv[1] == "slow":

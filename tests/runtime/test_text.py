@@ -4,7 +4,14 @@ from __future__ import annotations
 
 import pytest
 
-from xrgs.runtime.text import format_age, format_duration, format_size
+from xrgs.runtime.text import (
+    TextTable,
+    format_age,
+    format_duration,
+    format_size,
+    to_text,
+    width,
+)
 
 
 @pytest.mark.parametrize(
@@ -44,3 +51,17 @@ def test_size(count: float | None, text: str) -> None:
 )
 def test_age(seconds: float | None, text: str) -> None:
     assert format_age(seconds) == text
+
+
+def test_text_is_aligned() -> None:
+    rows = (("PSNR", "-0.80 ↓"), ("[odd]", "n/a"))
+    table = TextTable("a_b & c", ("Metric", "50% | x"), rows, "lr", ("100 $",))
+    assert to_text(table) == (
+        "a_b & c\n\nMetric  50% | x\n──────  ───────\nPSNR    -0.80 ↓\n[odd]       n/a\n100 $\n"
+    )
+
+
+def test_wide_characters_keep_the_columns() -> None:
+    table = TextTable("t", ("a", "b"), (("部屋", "1"), ("cafe\u0301", "2"), ("plain", "3")), "lr")
+    lines = to_text(table).splitlines()[2:]
+    assert len({width(line) for line in lines}) == 1

@@ -33,11 +33,12 @@ os.sched_getaffinity = lambda pid: {0, 1}
 if "xrgs.sweep.jobs.worker" in sys.orig_argv and "cell" in sys.orig_argv:
     folder = Path(os.environ["SWEEPS_OF"])
     end = time.monotonic() + 240
-    while len(list((folder / "s" / "cells").glob("*/identity.json"))) < 2:
+    while len(list((folder / "s" / "cells").glob("*/log.txt"))) < 2:
         if time.monotonic() > end:
             os._exit(3)
         time.sleep(0.05)
-    if json.loads(Path(sys.orig_argv[-2]).read_text())["conf"]["seed"] == 1:
+    cell = Path(json.loads(Path(sys.orig_argv[-2]).read_text())["cell"])
+    if json.loads((cell / "config.json").read_text())["seed"] == 1:
         job = os.environ["SLURM_ARRAY_JOB_ID"] + "_" + os.environ["SLURM_ARRAY_TASK_ID"]
         (folder / "job.new").write_text(job)
         (folder / "job.new").rename(folder / "job")
@@ -50,7 +51,7 @@ from pathlib import Path
 
 if "xrgs.sweep.jobs.worker" in sys.orig_argv and "cell" in sys.orig_argv:
     end = time.monotonic() + 240
-    while len(list(Path({store!r}, "cells").glob("*/identity.json"))) < 2:
+    while len(list(Path({store!r}, "cells").glob("*/log.txt"))) < 2:
         if time.monotonic() > end:
             os._exit(3)
         time.sleep(0.05)

@@ -6,6 +6,7 @@ import os
 from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import msgspec
@@ -31,7 +32,8 @@ class Past:
         """The side of the views of each variant, in pixels."""
 
     def train(self, **changes: Any) -> Conf:
-        return replace(self.conf, train=replace(self.conf.train, **changes))
+        conf: Conf = replace(self.conf, train=replace(self.conf.train, **changes))
+        return conf
 
     def add(
         self,
@@ -158,10 +160,8 @@ def test_damaged_cells_are_left_out(past: Past, spoilt: str) -> None:
 def test_the_sizes_are_those_of_the_views_that_are_trained_on(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path, views: str, pixels: float
 ) -> None:
-    def view(name: str, split: str, tag: str, side: int) -> Any:
-        return type(
-            "View", (), {"name": name, "split": split, "tag": tag, "width": side, "height": side}
-        )
+    def view(name: str, split: str, tag: str, side: int) -> SimpleNamespace:
+        return SimpleNamespace(name=name, split=split, tag=tag, width=side, height=side)
 
     made = [
         view("a", "train", "HR", 200),
@@ -169,11 +169,11 @@ def test_the_sizes_are_those_of_the_views_that_are_trained_on(
         view("b", "original", "HR", 200),
         view("c", "test", "HR", 999),
     ]
-    folders: list[Path] = []
-    manifest = type("Manifest", (), {"views": made})
-    monkeypatch.setattr(frozen, "read_manifest", lambda of: folders.append(of) or manifest)
-    assert estimate._sizes(tmp_path, "k-1", views) == (
-        pixels,
-        40_000 if views != "lr_only" else 10_000,
-    )
-    assert folders == [tmp_path / "trimmed-k-1"]
+
+    def read(folder: Path) -> SimpleNamespace:
+        assert folder == tmp_path / "trimmed-k-1"
+        return SimpleNamespace(views=made)
+
+    monkeypatch.setattr(frozen, "read_manifest", read)
+    largest = 10_000 if views == "lr_only" else 40_000
+    assert estimate._sizes(tmp_path, "k-1", views) == (pixels, largest)

@@ -27,7 +27,7 @@ os.sched_getaffinity = lambda pid: {0, 1}
 if "xrgs.sweep.jobs.worker" in sys.orig_argv and "cell" in sys.orig_argv:
     folder = Path(os.environ["SWEEPS_OF"])
     end = time.monotonic() + 90
-    while len(list((folder / "s" / "cells").glob("*/identity.json"))) < 2:
+    while len(list((folder / "s" / "cells").glob("*/log.txt"))) < 2:
         if time.monotonic() > end:
             os._exit(3)
         time.sleep(0.05)

@@ -6,9 +6,10 @@ import errno
 import io
 import time
 from collections.abc import Callable
-from dataclasses import asdict, replace
+from dataclasses import replace
 from typing import Any
 
+import msgspec
 import pytest
 
 from xrgs.config import Conf
@@ -41,7 +42,7 @@ class Watched:
     def step(self, name: str, done: int, rate: float | None, what: str = "training") -> None:
         unit = "step" if what == "training" else "view"
         now = Progress(what, unit, done, 100, rate)
-        write_json(self.store.cell(name).progress, asdict(now))
+        write_json(self.store.cell(name).progress, msgspec.structs.asdict(now))
 
     def finish(self, name: str) -> None:
         self.store.cell(name).progress.unlink(missing_ok=True)

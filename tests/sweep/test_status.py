@@ -6,10 +6,11 @@ import errno
 import os
 import shutil
 from collections.abc import Callable, Iterator
-from dataclasses import asdict, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import pytest
 
 from xrgs.errors import XrgsError
@@ -35,7 +36,8 @@ def store(cells: Any) -> Store:
     cells.begin("stopped")
     cells.begin("failed").fail("ended by SIGKILL\nand more")
     busy = cells.begin("busy")
-    write_json(busy.progress, asdict(Progress("training", "step", 20, 80, 3.0)))
+    shown = Progress("training", "step", 20, 80, 3.0)
+    write_json(busy.progress, msgspec.structs.asdict(shown))
     assert lease.acquire(store.leases, "busy") is not None
     (store.variants / "failed-aa").mkdir()
     cells.record(

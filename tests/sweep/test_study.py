@@ -204,7 +204,7 @@ class Trainer:
         return self
 
     def launch(self, jobs: Sequence[Sequence[str]], _: int) -> list[JobReturn]:
-        for job, *_ in jobs:
+        for job in (overrides[0] for overrides in jobs):
             self.launched.append(job.removeprefix("cell="))
             finish(self.store, self.launched[-1])
         return [JobReturn(status=JobStatus.COMPLETED, _return_value="done") for _ in jobs]

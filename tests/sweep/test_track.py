@@ -5,7 +5,6 @@ from __future__ import annotations
 import csv
 import json
 import math
-from pathlib import Path
 from typing import Any
 
 import pytest
@@ -13,23 +12,17 @@ from mlflow import MlflowClient
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from xrgs.errors import XrgsError
-from xrgs.experiment.attempts import begin_attempt
+from xrgs.experiment.cell_folder import CellFolder
+from xrgs.experiment.results import cell_columns
 from xrgs.experiment.store import Store
 from xrgs.sweep import track
 
-CONFIG = {
-    "scene": {"name": "fern", "path": None},
-    "splat": {"raster": {"background": [0.0, 0.5, 0.0]}},
-    "train": {"steps": 20},
-    "seed": 3,
-    "store": "/elsewhere",
-}
-#: What is tracked of it: the groups that can change a number, lists and None as texts.
-SETTINGS = {
-    "scene.name": "fern",
-    "scene.path": "None",
-    "splat.raster.background": "[0.0, 0.5, 0.0]",
-    "train.steps": 20,
+SUMMARY = {
+    "training_time_s": 1.5,
+    "render_time_ms": 2.0,
+    "gaussians": 7,
+    "memory_bytes": 1000,
+    "evaluations": 500,
 }
 HISTORY = "step,view,loss,mip.sigma\n0,a,0.5,\n10,b,0.25,0.125\n"
 QUALITY = "step,seconds,psnr\n10,1.5,18.5\n"
@@ -38,35 +31,47 @@ EXPECTED = {
     "history/mip.sigma": [(10, 0.125)],
     "quality/seconds": [(10, 1.5)],
     "quality/psnr": [(10, 18.5)],
-    "score/gaussians": [(20, 7.0)],
+    **{
+        f"score/{name}": [(20, float(SUMMARY[name]))]
+        for name in (
+            "gaussians",
+            "training_time_s",
+            "render_time_ms",
+            "memory_bytes",
+            "evaluations",
+        )
+    },
     "score/psnr": [(20, 25.25)],
 }
 
 
-def add(store: Store, cell_id: str, label: str, *, quality: bool = True) -> dict[str, Any]:
-    cell = store.cell(cell_id)
-    begin_attempt(cell, CONFIG, {"variant": "v", "seed": 3})
-    (cell.path / "scores.csv").write_text("view,psnr,lpips\na,20.5,\nb,30.0,\n")
+def add(cells: Any, name: str, *, quality: bool = True) -> CellFolder:
+    cell: CellFolder = cells.begin(name, seed=3)
     (cell.path / "history.csv").write_text(HISTORY)
-    (cell.path / "summary.json").write_text('{"gaussians": 7, "steps": 20}')
     if quality:
         (cell.path / "quality.csv").write_text(QUALITY)
-    cell.finish(["a", "b"], 1)
-    names = {"cell_id": cell_id, "label": label, "condition": "", "scene": "fern"}
-    return names | {"variant_seed": 0, "seed": 3}
+    cells.finish(cell)
+    (cell.path / "scores.csv").write_text("view,psnr,lpips\na,20.5,\nb,30.0,\n")
+    cell.finish(["a", "b"], {})
+    return cell
 
 
 @pytest.fixture
-def swept(tmp_path: Path) -> tuple[Store, str]:
+def swept(cells: Any) -> tuple[Store, str]:
     """A store, and a sweep of two finished cells, a failed one and one that was never planned."""
-    store = Store(tmp_path / "s")
-    store.prepare()
-    rows = [add(store, "abc", "baseline"), add(store, "def", "=cmd|'x'\x1b", quality=False)]
-    failed = store.cell("bad")
-    begin_attempt(failed, CONFIG, {})
-    failed.fail("out of memory")
-    rows += [rows[0] | {"cell_id": "bad"}, rows[0] | {"cell_id": None}]
-    return store, store.write_sweep([], rows)
+    add(cells, "abc")
+    add(cells, "def", quality=False)
+    cells.begin("bad").fail("out of memory")
+    labels = {"abc": "baseline", "def": "=cmd|'x'\x1b", "bad": "baseline", None: "baseline"}
+    rows = [(name, "fern", label) for name, label in labels.items()]
+    return cells.store, cells.record(*rows, seed=3)
+
+
+def settings(store: Store) -> dict[str, Any]:
+    """What is tracked of a config: the groups that can change a number, lists and None as texts."""
+    columns = cell_columns(store.cell("abc"), None)
+    values = {key: value for key, value in columns.items() if "." in key}
+    return {k: v if isinstance(v, (str, float, int)) else str(v) for k, v in values.items()}
 
 
 def test_a_table_has_every_value(
@@ -123,7 +128,7 @@ def test_mlflow_reads_each_cell(swept: tuple[Store, str], monkeypatch: pytest.Mo
         for name in run.data.metrics
     }
     assert found == EXPECTED
-    assert run.data.params == {key: str(value) for key, value in SETTINGS.items()}
+    assert run.data.params == {key: str(value) for key, value in settings(store).items()}
     assert run.data.tags["label"] == "baseline"
     assert run.info.status == "FINISHED"
 
@@ -144,22 +149,6 @@ def test_a_failure_is_a_warning(
     track.track(kind, store, sweep_id)
     err = capsys.readouterr().err
     assert err == f"track={kind}: ConnectionError: no server [31m; the cells are in the store\n"
-
-
-def test_a_link_leads_nowhere(
-    swept: tuple[Store, str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    store, sweep_id = swept
-    (tmp_path / "outside").mkdir()
-    (store.path / "tracking").symlink_to(tmp_path / "outside")
-    track.track("tensorboard", store, sweep_id)
-    assert "track=tensorboard: " in capsys.readouterr().err
-    (store.path / "tracking").unlink()
-    (store.path / "tracking").mkdir()
-    (store.path / "tracking" / "mlflow.db").symlink_to(tmp_path / "outside" / "file")
-    track.track("mlflow", store, sweep_id)
-    assert "mlflow.db is not a regular file" in capsys.readouterr().err
-    assert not list((tmp_path / "outside").iterdir())
 
 
 def test_a_cell_that_can_not_be_read_is_left_out(
@@ -197,7 +186,7 @@ def test_what_can_not_be_tracked_is_said_before_training(monkeypatch: pytest.Mon
 
 def test_no_value_is_nan(swept: tuple[Store, str]) -> None:
     store, _ = swept
-    names = dict.fromkeys(track._NAMES, "x")
-    run = track.run_of(store.cell("abc"), names)
+    run = track.run_of(store.cell("abc"), store.sweep_record().cells[0])
     assert not any(math.isnan(point.value) for point in run.points)
-    assert run.config == SETTINGS
+    assert run.config == settings(store)
+    assert run.config["train.steps"] == store.cell("abc").config().train.steps

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import errno
 import os
-import tarfile
 import tempfile
 from collections.abc import Callable
 from pathlib import Path
@@ -260,29 +259,6 @@ def test_a_dry_run_reads_the_headers_of_photographs(
         assert planned.error is not None
         assert "scene scene: 1 readable image(s), two are needed: [" in planned.error
     assert not list(store.variants.iterdir())
-
-
-@pytest.mark.slow
-def test_a_sweep_goes_on_from_a_packed_store(
-    sweeps_in: Callable[..., Any], run_command: Callable[..., Any], tmp_path: Path
-) -> None:
-    smoke = ("scene=motorcycle", "preset=smoke", "train.steps=2")
-    assert sweeps_in(tmp_path).run(*smoke)[0] == 0
-    (built,) = names(tmp_path / "s" / "variants")
-    assert run_command("store", tmp_path, "pack", "--store=s", "--out=a.tar.xz")[0::2] == (0, "")
-    with tarfile.open(tmp_path / "a.tar.xz") as archive:
-        archive.extractall(tmp_path / "other", filter="data")
-    store = Store((tmp_path / "other" / "xrgs-store").rename(tmp_path / "other" / "s"))
-    assert names(store.variants) == [f"trimmed-{built}"]
-    (baseline,) = store.cell_folders()
-    code, table, err = sweeps_in(tmp_path / "other").run(*smoke, "+ablation=consistency")
-    assert code == 0
-    assert f"variant {built}: making the images again that xrgs-store trim has removed" in err
-    assert BUILDING not in err
-    assert f"training cell {baseline.id}" not in err
-    assert "consistency" in table
-    assert names(store.variants) == [built]
-    assert variant.verify(store.variants / built) == []
 
 
 def test_images_are_made_again_of_trimmed_variants_alone(

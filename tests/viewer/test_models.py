@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import pytest
 
@@ -25,12 +23,13 @@ def store(tmp_path: Path) -> Store:
     made.prepare()
     for cell_id in ("abc1", "abd2", "abd3"):
         cell = made.cell(cell_id)
-        begin_attempt(cell, {"splat": {"raster": {"antialiased": True}}}, {"variant": "v"})
+        cell.path.mkdir()
+        begin_attempt(cell)
         if cell_id == "abd3":
             cell.fail("out of memory")
         else:
             (cell.path / "scores.csv").write_text("view\na\n")
-            cell.finish(["a"], 1)
+            cell.finish(["a"], {})
     return made
 
 
@@ -59,30 +58,6 @@ def test_a_word_that_names_no_finished_cell_is_refused(
 def test_a_store_that_is_not_there_is_named(tmp_path: Path) -> None:
     with pytest.raises(StoreError, match=r"gone is not a store"):
         models.find_cell("a", Store(tmp_path / "gone"))
-
-
-def test_settings_are_the_trainings(store: Store) -> None:
-    assert models.raster_settings(store.cell("abc1")) == RasterSettings(antialiased=True)
-
-
-@pytest.mark.parametrize(
-    "raster",
-    [
-        {"antialiased": 1},
-        {"near": "0.01"},
-        {"eps2d": 1e300},
-        {"sh_degree": 2.0},
-        {"background": [0, 0]},
-        {"background": "abc"},
-        [],
-        None,
-    ],
-)
-def test_settings_of_a_wrong_type_are_refused(store: Store, raster: Any) -> None:
-    file = store.path / "cells" / "abc1" / "config.json"
-    file.write_text(json.dumps({"splat": {"raster": raster}}))
-    with pytest.raises(StoreError, match=r"config\.json: .*splat\.raster"):
-        models.raster_settings(store.cell("abc1"))
 
 
 def test_a_ply_file_has_the_default_settings(

@@ -18,7 +18,7 @@ def fit_similarity(source: Matrix, target: Matrix) -> tuple[float, Matrix, Matri
 
     Args:
         source: Points [N, 3].
-        target: The points that they correspond to, [N, 3].
+        target: The corresponding points [N, 3].
 
     Returns:
         The scale s, the rotation R [3, 3] with det R = +1, and the translation t [3].
@@ -33,18 +33,14 @@ def fit_similarity(source: Matrix, target: Matrix) -> tuple[float, Matrix, Matri
 
 
 def pose_error(estimated: Mapping[str, Matrix], exact: Mapping[str, Matrix]) -> dict[str, float]:
-    """Compare world-to-camera matrices with exact ones, over the names that both have.
-
-    Args:
-        estimated: Matrices [4, 4] by name.
-        exact: Matrices [4, 4] by name.
+    """Compare world-to-camera matrices [4, 4] with exact ones, over the names that both have.
 
     Returns:
         `position_percent` (mean) and `position_percent_max`: distances between camera centres
         after the best similarity, in % of the largest distance between two exact centres.
         `rotation_degrees` (mean) and `rotation_degrees_max`: angles after the rotation that all
         cameras have in common is removed. Positions are left out for fewer than three cameras,
-        which a similarity fits whatever they are; everything is left out for fewer than two.
+        which any similarity fits; everything is left out for fewer than two.
     """
     names = sorted(estimated.keys() & exact.keys())
     if len(names) < 2:

@@ -17,7 +17,7 @@ from xrgs.errors import XrgsError
 
 @dataclass(frozen=True)
 class PinholeImage:
-    """An image with a pinhole camera of its own, as it is written to a model."""
+    """An image with a pinhole camera of its own, for a model."""
 
     name: str
     """Its path below the folder of images."""
@@ -32,17 +32,14 @@ class PinholeImage:
 def read_model(
     folder: Path, match: Callable[[Sequence[str]], Mapping[str, int]]
 ) -> sfm.Reconstruction:
-    """Read COLMAP's model, binary or text.
+    """Read a model of COLMAP, binary or text: the cameras of wanted images, and all points.
 
     Args:
         folder: The folder of `cameras`, `images` and `points3D`.
-        match: Gives the index of each image that is wanted, from the names of all that have a pose.
-
-    Returns:
-        The cameras of these images, and all points.
+        match: Returns the index of each wanted image by its name, from all names that have a pose.
 
     Raises:
-        XrgsError: The files are no model, or a camera can't be served.
+        XrgsError: The files are no model, or a camera model is not supported.
     """
     try:
         model = pycolmap.Reconstruction(folder)
@@ -53,16 +50,10 @@ def read_model(
 
 
 def read_points(file: Path) -> tuple[NDArray[np.float64], NDArray[np.uint8]]:
-    """Read coloured points from a .ply file.
-
-    Args:
-        file: The file, ASCII or binary.
-
-    Returns:
-        Points [P, 3] and their colours [P, 3].
+    """Read points [P, 3] and their colours [P, 3] from a .ply file, ASCII or binary.
 
     Raises:
-        XrgsError: The file is no such .ply.
+        XrgsError: The file is not such a .ply.
     """
     model = pycolmap.Reconstruction()
     try:
@@ -86,9 +77,6 @@ def write_model(
         images: The images; each gets a PINHOLE camera of its own.
         points: Points [P, 3].
         colors: Their colours [P, 3].
-
-    Raises:
-        OSError: The files can't be written.
     """
     model = _with_points(points, colors)
     for number, image in enumerate(images, 1):
@@ -107,16 +95,7 @@ def write_model(
 
 
 def write_points(file: Path, points: NDArray[np.float64], colors: NDArray[np.uint8]) -> None:
-    """Write coloured points to a .ply file.
-
-    Args:
-        file: The file.
-        points: Points [P, 3].
-        colors: Their colours [P, 3].
-
-    Raises:
-        OSError: The file can't be written.
-    """
+    """Write points [P, 3] and their colours [P, 3] to a .ply file."""
     _with_points(points, colors).export_PLY(file)
 
 

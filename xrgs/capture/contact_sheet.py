@@ -26,7 +26,7 @@ _TILE = (_BOX[0] + _CENTRE + 3 * _BORDER, _BOX[1] + 2 * _BORDER + _TEXT + 4)
 #: The colour of each class's border, distinct in every kind of colour vision (Okabe and Ito).
 COLOURS: Mapping[str, str] = {"HR": "#0072b2", "LR": "#e69f00", "test": "#7f7f7f"}
 _BACKGROUND, _TEXT_COLOUR = "white", "black"
-#: Width over height of the sheet, about that of a screen.
+#: Width over height of the sheet, about as a screen has.
 _ASPECT = 1.6
 #: The most views that are drawn, by name; a tile takes 0.4 MB.
 _MAX_TILES = 500
@@ -36,15 +36,11 @@ def contact_sheet(variant: Variant) -> tuple[Image.Image, list[str]]:
     """Draw the training and test views, sorted by name, each in a border of its class's colour.
 
     Beside each image is its centre. The centre of a view that is smaller than the largest one is
-    magnified by the nearest whole factor, each pixel a square, so that the detail that it lacks can
-    be seen.
-
-    Args:
-        variant: The frozen variant.
+    magnified by the nearest whole factor, each pixel a square, so that its missing detail can be
+    seen.
 
     Returns:
-        An RGB image, and notes: why an image can't be read, whose tile then says so, or that there
-        are too many views to draw all.
+        An RGB image, and notes: why an image can't be read, or that some views are not drawn.
     """
     views = sorted(
         (view for view in variant.views if view.split != "original"),

@@ -45,8 +45,8 @@ class Dataset:
 
     train: tuple[LoadedView, ...]
     test: tuple[LoadedView, ...]
-    """What scores are of: the variant's test views, or with `train.validation` the HR training
-    views that are held out."""
+    """The views that are scored: the variant's test views, or with `train.validation` the HR
+    training views that are held out."""
     points: torch.Tensor
     """SfM points [P, 3], float32."""
     colors: torch.Tensor
@@ -62,10 +62,7 @@ class Dataset:
 
     @property
     def view_pixels(self) -> int:
-        """Number of pixels of the training view that has the most of them; 0 without views.
-
-        Budgets of Gaussians are in units of it.
-        """
+        """The most pixels of a training view, the unit of budgets of Gaussians; 0 without views."""
         return max((view.camera.width * view.camera.height for view in self.train), default=0)
 
 
@@ -74,14 +71,14 @@ def load(
 ) -> Dataset:
     """Read a variant's images and normalise its world.
 
-    Poses, points, world and the views that are scored do not depend on `use`: the controls differ
-    from `mixed` in the training views alone. Poses, points and world do not depend on `validation`
-    either: SfM has placed held-out training views among the others, as it has test views.
+    Poses, points and world depend neither on `use` nor on `validation`: SfM has placed held-out
+    training views among the others, as it has placed test views. The controls differ from `mixed`
+    in the training views alone.
 
     Args:
         variant: The frozen variant.
         use: Which training views to load: `mixed` for all as they are, `all_hr` with the originals
-            in the place of the degraded ones, `hr_only` and `lr_only` for those of one tag.
+            in the place of the degraded ones, `hr_only` and `lr_only` for views of one tag.
         validation: Share of the HR training views that are held out and scored in place of the
             test views, which are not read then: round(validation * n) of n, at least one. 0 scores
             the test views.
@@ -94,9 +91,8 @@ def load(
     Raises:
         UnreadableError: An image can't be read now.
         ImageError: An image is missing, unreadable or not of its view's size; the message names it.
-        XrgsError: `use` is none of these, or the variant has no such views; `validation` is not in
-            0..1, or leaves fewer than two HR training views; or the variant's cameras and points
-            can't be normalised.
+        XrgsError: The variant has no such views, too few HR training views are left, or its cameras
+            and points can't be normalised; the message names the key.
     """
     scored = _held_out(variant, validation, seed) or [v for v in variant.views if v.split == "test"]
     held_out = {view.name for view in scored if view.split == "train"}
@@ -125,7 +121,7 @@ def load(
 
 
 def _normalized(variant: Variant, posed: list[View]) -> NormalizedScene:
-    """Normalise the world of a variant, which anybody may have made up."""
+    """Normalise the world of a variant; given poses need not be of the points' world."""
     try:
         with np.errstate(divide="raise", over="raise", invalid="raise"):
             return normalize_scene(np.stack([view.viewmat for view in posed]), variant.points)

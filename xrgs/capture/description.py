@@ -9,7 +9,7 @@ from msgspec import Struct
 
 from xrgs.capture import variant
 from xrgs.capture.contact_sheet import contact_sheet
-from xrgs.capture.failures import FAILED_PREFIX
+from xrgs.capture.folders import is_failed
 from xrgs.errors import XrgsError
 from xrgs.runtime.text import TextTable, to_text
 from xrgs.safeio.atomic import atomic_writer
@@ -33,7 +33,7 @@ class SfmAttempt(Struct):
 
 
 class SfmReport(Struct):
-    """What is read of `report.json`: how SfM went, and what the views are."""
+    """The part of `report.json` that is shown: how SfM went, and the classes of the views."""
 
     scene: str = "?"
     images: int = 0
@@ -74,7 +74,7 @@ def describe(folder: Path, out: Path | None = None) -> str:
     """
     if not folder.is_dir():
         raise XrgsError(f"{folder}: no such folder; variants are in <store>/variants/")
-    failed = folder.name.startswith(FAILED_PREFIX)
+    failed = is_failed(folder.name)
     frozen = None if failed else variant.load(folder)
     report = read_struct(folder / "report.json", SfmReport)
     sfm = [for_line(line) for line in _sfm(report)]

@@ -1,8 +1,8 @@
 """Reads, resizes and saves photographs: float32 arrays [H, W, 3] in 0..1 in memory.
 
 Photographs of users are read in six formats, with their EXIF orientation; HEIC needs pillow-heif,
-which is an extra. The images of a store, which may come from anybody, are PNGs as `save` writes
-them, and are read by `read_png` alone. Nothing here imports torch before it is called.
+which is an extra. The images of a store are PNGs of `save`, and are read by `read_png` alone.
+Nothing here imports torch before `resize` is called.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ MAX_PIXELS = 1 << 28
 #: The largest image of a store that is read. In training it takes 800 MB.
 MAX_PNG_PIXELS = 1 << 26
 #: Deflate, the compression of PNGs, makes at most 1032 bytes of one, and no photograph of any
-#: format shrinks as much; a drawing may, but takes little memory up to so many pixels.
+#: format shrinks as much. A drawing may; up to so many pixels it takes little memory.
 _MAX_EXPANSION, _SMALL_PIXELS = 1032, 1 << 24
 _EXIF_ORIENTATION = 0x0112
 _EXIF_CAMERA = (0x010F, 0x0110)  # make, model
@@ -56,10 +56,7 @@ if Image.MAX_IMAGE_PIXELS is not None:
 def _opened(
     path: Path, formats: tuple[str, ...] = _FORMATS, max_pixels: int = MAX_PIXELS
 ) -> Iterator[Image.Image]:
-    """Open an image whose header declares at most so many pixels.
-
-    Every error of the block names the file.
-    """
+    """Open an image whose header declares at most so many pixels; every error names the file."""
     try:
         with (
             path.open("rb") as stream,
@@ -80,7 +77,7 @@ def _opened(
 
 
 def _known(formats: tuple[str, ...], stream: BinaryIO) -> tuple[str, ...]:
-    """Return the formats that PIL knows; of HEIF it is told where a file may be of it."""
+    """Return the formats that PIL knows; HEIF is registered where the file may be HEIF."""
     if "HEIF" not in formats:
         return formats
     start = stream.read(8)
@@ -96,17 +93,13 @@ def _known(formats: tuple[str, ...], stream: BinaryIO) -> tuple[str, ...]:
 
 
 def size(path: Path) -> tuple[int, int]:
-    """Read the size that `read` would give a photograph; most formats have it in the header.
+    """Return the width and height of a photograph, px, after the EXIF orientation is applied.
 
-    Args:
-        path: The image file.
-
-    Returns:
-        Width and height, px, after the EXIF orientation is applied.
+    Most formats have them in the header.
 
     Raises:
         UnreadableError: The file can't be read now.
-        ImageError: It is not an image, or is larger than `MAX_PIXELS`.
+        ImageError: The file is not an image, or is larger than `MAX_PIXELS`.
     """
     with _opened(path) as image:
         transposed = image.getexif().get(_EXIF_ORIENTATION, 1) >= 5
@@ -116,15 +109,12 @@ def size(path: Path) -> tuple[int, int]:
 def exif_camera(path: Path) -> str:
     """Read from EXIF which camera and focal length took a photograph.
 
-    Args:
-        path: The image file.
-
     Returns:
         `make/model/focal length/35 mm equivalent`; empty where EXIF has none of them.
 
     Raises:
         UnreadableError: The file can't be read now.
-        ImageError: It is not an image.
+        ImageError: The file is not an image.
     """
     with _opened(path) as image:
         exif, details = image.getexif(), {}
@@ -135,18 +125,12 @@ def exif_camera(path: Path) -> str:
 
 
 def read(path: Path) -> ImageArray:
-    """Read a photograph as RGB, with the EXIF orientation applied.
-
-    Args:
-        path: The image file.
-
-    Returns:
-        [H, W, 3], its 8-bit values / 255.
+    """Read a photograph as RGB [H, W, 3], with the EXIF orientation applied: 8-bit values / 255.
 
     Raises:
         UnreadableError: The file can't be read now.
-        ImageError: It is unreadable, truncated, larger than `MAX_PIXELS`, or has more than 8 bits
-            per channel.
+        ImageError: The file is unreadable, truncated, larger than `MAX_PIXELS`, or has more than 8
+            bits per channel.
     """
     with _opened(path) as image:
         if image.width * image.height > _SMALL_PIXELS:
@@ -162,20 +146,16 @@ def read_png(
     size: tuple[int, int] | None = None,
     max_pixels: int = MAX_PNG_PIXELS,
 ) -> ImageArray:
-    """Read an image of a store: a PNG as `save` writes it, whoever wrote this one.
+    """Read an image of a store, a PNG as `save` writes it: [H, W, 3], its 8-bit values / 255.
 
     Args:
-        path: The image file.
+        path: The file.
         size: The width and height that it must have, px; None admits any.
         max_pixels: The most pixels that it may have.
 
-    Returns:
-        [H, W, 3], its 8-bit values / 255.
-
     Raises:
         UnreadableError: The file can't be read now.
-        ImageError: It is not such a PNG; this is told before its pixels are decoded, unless they
-            are damaged.
+        ImageError: The file is not such a PNG.
     """
     return _to_array(read_png_pil(path, size, max_pixels))
 
@@ -185,19 +165,7 @@ def read_png_pil(
     size: tuple[int, int] | None = None,
     max_pixels: int = MAX_PNG_PIXELS,
 ) -> Image.Image:
-    """Read a PNG as `read_png` does, into PIL's own image.
-
-    Args:
-        path: The image file.
-        size: As for `read_png`.
-        max_pixels: As for `read_png`.
-
-    Returns:
-        An image of mode RGB.
-
-    Raises:
-        XrgsError: As `read_png`.
-    """
+    """Read a PNG as `read_png` does, into an image of PIL of mode RGB."""
     with _opened(path, ("PNG",), max_pixels) as image:
         if size is not None and image.size != size:
             raise ValueError(
@@ -229,9 +197,6 @@ def save(path: Path, image: ImageArray, *, durable: bool = True) -> None:
         path: The file, which is replaced atomically; its folder is made in an existing one.
         image: [H, W, 3].
         durable: As for `atomic_writer`.
-
-    Raises:
-        OSError: The file can't be written.
     """
     path.parent.mkdir(exist_ok=True)  # not parents: a store that vanished stays away
     with atomic_writer(path, durable=durable) as stream:
@@ -244,18 +209,10 @@ def to_8_bit(image: ImageArray) -> NDArray[np.uint8]:
 
 
 def resize(image: ImageArray, width: int, height: int) -> ImageArray:
-    """Resize an image by antialiased bicubic interpolation.
+    """Resize an image [H, W, 3] by antialiased bicubic interpolation; it is not clamped.
 
     It is torch's `interpolate(mode="bicubic", antialias=True)`, which agrees with PIL's BICUBIC to
-    5e-5.
-
-    Args:
-        image: [H, W, 3].
-        width: The exact new width, px.
-        height: The exact new height, px.
-
-    Returns:
-        [height, width, 3], not clamped; the image itself where it has that size.
+    5e-5. An image that has the size already is returned as it is.
     """
     import torch
     from torch.nn.functional import interpolate

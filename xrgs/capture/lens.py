@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from xrgs.capture.images import ImageArray
 
 UNDISTORT = "Undistort the photographs first, as `colmap image_undistorter` does"
-#: The parameters of those of COLMAP's camera models that can have no more than one radial term.
+#: The parameters of the camera models of COLMAP that a `Lens` can stand for.
 _MODELS = {
     "SIMPLE_PINHOLE": ("f", "cx", "cy"),
     "PINHOLE": ("fx", "fy", "cx", "cy"),
@@ -44,15 +44,7 @@ class Lens:
     """The radial term; 0 for a pinhole camera."""
 
     def resized(self, width: int, height: int) -> Lens:
-        """Return the camera of the same image after it was resized.
-
-        Args:
-            width: The new width, px.
-            height: The new height, px.
-
-        Returns:
-            A camera with the same rays.
-        """
+        """Return the camera of the same image after it was resized; its rays are the same."""
         sx, sy = width / self.width, height / self.height
         return Lens(width, height, self.fx * sx, self.fy * sy, self.cx * sx, self.cy * sy, self.k)
 
@@ -62,14 +54,11 @@ class Lens:
         return np.array([[self.fx, 0, self.cx], [0, self.fy, self.cy], [0, 0, 1]])
 
     def undistorted(self) -> Lens:
-        """Return the pinhole camera of the undistorted image.
+        """Return the pinhole camera (k = 0) of the undistorted image.
 
         It has the same size and principal point, and the smallest focal length with which every
         pixel has a source inside the photograph. The focal length depends on the image's border
         alone, so that an image and its resized copy are zoomed alike.
-
-        Returns:
-            A camera with k = 0.
         """
         if self.k == 0:
             return self
@@ -95,7 +84,7 @@ class Lens:
 
         Args:
             pixels: Pixel coordinates [..., 2] (x, y) of the pinhole camera.
-            zoom: The pinhole camera's focal lengths over those of this camera.
+            zoom: The ratio of the pinhole camera's focal length to this camera's.
 
         Returns:
             Pixel coordinates [..., 2] in the photograph.
@@ -143,15 +132,12 @@ def lens_of_model(model: str, size: tuple[int, int], params: Sequence[float]) ->
         size: Width and height of its images, px.
         params: The model's parameters, in COLMAP's order.
 
-    Returns:
-        The camera.
-
     Raises:
-        XrgsError: The model, or a distortion term that is not 0, is not served.
+        XrgsError: The model, or a distortion term that is not 0, is not supported.
     """
     if model not in _MODELS:
         served = ", ".join(_MODELS)
-        raise XrgsError(f"camera model {model} is not served, but {served}. {UNDISTORT}")
+        raise XrgsError(f"camera model {model}: must be one of {served}. {UNDISTORT}")
     return lens_of_terms(model, size, dict(zip(_MODELS[model], params, strict=True)))
 
 
@@ -159,12 +145,9 @@ def lens_of_terms(model: str, size: tuple[int, int], terms: Mapping[str, float])
     """Make a camera of the terms of OpenCV's model.
 
     Args:
-        model: What a message calls the camera.
+        model: The name of the camera in messages.
         size: Width and height of its images, px.
         terms: `f`, or `fx` and `fy`, and `cx`, `cy`, px; distortion terms by their names.
-
-    Returns:
-        The camera.
 
     Raises:
         XrgsError: A focal length is not above 0, a value is not finite, or a distortion term other
@@ -175,10 +158,12 @@ def lens_of_terms(model: str, size: tuple[int, int], terms: Mapping[str, float])
     values.pop("f", None)
     cx, cy, k = values.pop("cx"), values.pop("cy"), values.pop("k1", 0.0)
     if not np.isfinite([fx, fy, cx, cy, k]).all() or min(fx, fy, *size) <= 0:
-        raise XrgsError(f"camera {model}: its size, focal length or centre is no such number")
+        raise XrgsError(
+            f"camera {model}: its size and focal length must be above 0, and all values finite"
+        )
     if others := [f"{name}={value:g}" for name, value in values.items() if value != 0]:
         raise XrgsError(
-            f"camera {model} has distortion terms that are not served ({', '.join(others)}). "
+            f"camera {model}: distortion terms beside k1 must be 0 ({', '.join(others)}). "
             f"{UNDISTORT}"
         )
     return Lens(*size, fx, fy, cx, cy, k)

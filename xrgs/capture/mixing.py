@@ -56,16 +56,14 @@ class _Inputs:
 
 
 def mix_resolutions(scene: Scene, conf: VariantConf, work: Path, out: Path) -> Variant:
-    """Make the views, poses and points of a variant.
+    """Make the views, poses and points of a variant, whose id is empty.
 
     Args:
         scene: The photographs.
         conf: The variant's config.
         work: An existing folder for temporary files.
-        out: An existing folder for `images/<split>/<view>.png` and `colmap.log`.
-
-    Returns:
-        The variant, with an empty id.
+        out: A folder with an empty folder `images`; it gets `images/<split>/<view>.png` and
+            `colmap.log`.
 
     Raises:
         SceneFailed: Too few views are registered.
@@ -184,7 +182,7 @@ def _sfm_report(inputs: _Inputs, model: Reconstruction) -> dict[str, Any]:
 
 
 def _pose_report(inputs: _Inputs, model: Reconstruction, work: Path) -> dict[str, Any]:
-    """Compare the poses with exact ones, or else with those of the undegraded photographs."""
+    """Compare the poses with exact ones, or else with SfM of the undegraded photographs."""
     photos, exact = inputs.photos, inputs.scene.viewmats
     estimated = {photos.names[i]: matrix for i, matrix in model.viewmats.items()}
     if exact:

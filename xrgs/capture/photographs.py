@@ -51,11 +51,7 @@ class Photograph:
         return self.to_hr(Lens(*self.size, K[0, 0], K[1, 1], K[0, 2], K[1, 2]))
 
     def to_hr(self, lens: Lens) -> Lens:
-        """Return the camera of the HR view, after resize and crop.
-
-        Args:
-            lens: The camera of the whole photograph, at any size.
-        """
+        """Return the camera of the HR view; `lens` is of the whole photograph, at any size."""
         left, top = self.hr.crop_offset
         resized = lens.resized(*self.hr.resized)
         return replace(
@@ -92,47 +88,19 @@ class PhotoCollection:
         return [photo.name for photo in self.all]
 
     def file(self, kind: str, index: int) -> str:
-        """Return the path of a copy, relative to `folder`.
-
-        Args:
-            kind: `hr`, `lr` or `up`.
-            index: The photograph's index.
-
-        Returns:
-            The path; the copy need not exist.
-        """
+        """Return the path of a copy (`hr`, `lr` or `up`) in `folder`; the copy need not exist."""
         return f"{kind}/{self.all[index].number}.png"
 
     def size(self, kind: str, index: int) -> tuple[int, int]:
-        """Read the size of an existing copy.
-
-        Args:
-            kind: `hr`, `lr` or `up`.
-            index: The photograph's index.
-
-        Returns:
-            Width and height, px.
-        """
+        """Return width and height of an existing copy, px."""
         return images.size(self.folder / self.file(kind, index))
 
     def read(self, kind: str, index: int) -> images.ImageArray:
-        """Read an existing copy.
-
-        Args:
-            kind: `hr`, `lr` or `up`.
-            index: The photograph's index.
-
-        Returns:
-            [H, W, 3] in 0..1.
-        """
+        """Read an existing copy, [H, W, 3] in 0..1."""
         return images.read(self.folder / self.file(kind, index))
 
     def upsample(self, index: int) -> None:
-        """Make the `up` copy of a photograph from its `lr` copy, where it does not exist.
-
-        Args:
-            index: The photograph's index.
-        """
+        """Make the `up` copy of a photograph from its `lr` copy, where it does not exist."""
         file = self.folder / self.file("up", index)
         if not file.exists():
             target = self.all[index].hr
@@ -150,14 +118,11 @@ def prepare_hr_views(scene: Scene, conf: VariantConf, work: Path) -> PhotoCollec
         conf: The variant's config.
         work: An existing folder for the copies.
 
-    Returns:
-        The readable photographs, with their `hr` copies.
-
     Raises:
         UnreadableError: A photograph can't be read now. It is not left out: the variant would be
             another one whenever a disk or a server fails.
-        XrgsError: Fewer than two photographs can be read, or one is too small for its LR view, or
-            too large for a variant; the message names them.
+        XrgsError: Fewer than two photographs can be read, or a photograph is too small for its LR
+            view or too large for a variant; the message names the photographs.
     """
     sizes, unreadable = _read_sizes(scene.files)
     shrink = shrink_factor(list(sizes.values()), conf) if sizes else 1.0
@@ -227,12 +192,9 @@ def assign_cameras(
     Args:
         files: The photographs.
         sizes: Their width and height with the EXIF orientation applied, px: a camera held upright
-            is another camera to SfM.
+            is another camera to SfM. All photographs with one name have one size.
         policy: `variant.sfm.camera`: `single` for one camera, `per_image` for one each, `auto` for
             one per size and EXIF camera.
-
-    Returns:
-        One name per photograph; all photographs with one name have one size.
 
     Raises:
         XrgsError: The policy is `single`, but the sizes differ.

@@ -1,8 +1,8 @@
 """Takes cameras and points from a file of the user's in place of a new SfM: `variant.poses`.
 
-Two layouts are read: a folder of COLMAP's (`cameras`, `images` and `points3D`, binary or text), and
-the `transforms.json` of nerfstudio, whose `ply_file_path` has the points. A pose belongs to the
-photograph of the same name, whatever the suffix and the folders before it.
+Two layouts are read: a folder of COLMAP (`cameras`, `images` and `points3D`, binary or text), and
+the `transforms.json` of nerfstudio, in which `ply_file_path` names the points. A pose belongs to
+the photograph of the same name, whatever the suffix and the folders before it.
 
 Nothing here imports pycolmap before cameras are read.
 """
@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from xrgs.capture.lens import Lens, lens_of_terms
+from xrgs.capture.lens import UNDISTORT, Lens, lens_of_terms
 from xrgs.errors import StoreError, UnreadableError, XrgsError
 from xrgs.safeio.files import is_inside, is_transient, list_names
 from xrgs.safeio.hashing import file_digest
@@ -40,28 +40,25 @@ _REQUIRED, _OPTIONAL = ("cameras", "images", "points3D"), ("frames", "rigs")
 _MAX_JSON_BYTES = 1 << 26
 #: The fewest points: a Gaussian's first size is the distance of a point to its three nearest.
 _MIN_POINTS = 4
-#: How far the ratio of an image's sides may be from that of its photograph: both are whole numbers.
+#: The largest difference of the aspect ratios of an image and its photograph, which rounding of
+#: their sides to whole px explains.
 _MAX_ASPECT = 0.01
 #: nerfstudio's names of the terms of OpenCV's camera model.
 _TERMS = {"fl_x": "fx", "fl_y": "fy"} | {
     name: name for name in ("cx", "cy", "k1", "k2", "k3", "k4", "p1", "p2")
 }
-#: Camera axes of OpenGL (x right, y up, z backwards) in those of OpenCV.
+#: From camera axes of OpenGL (x right, y up, z backwards) to OpenCV's, and back.
 _OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
 
 
 def fingerprint(path: str) -> str:
-    """Hash the files that poses are read from.
+    """Hash the files that poses are read from: 64 hexadecimal digits of a SHA-256.
 
-    Args:
-        path: `variant.poses`.
-
-    Returns:
-        All 64 hexadecimal digits of a SHA-256, which does not depend on where the files are.
+    It does not depend on where the files are.
 
     Raises:
         UnreadableError: A file can't be read now.
-        XrgsError: They are missing, or neither of the layouts that are read.
+        XrgsError: Files are missing, or their layout is not one of the two.
     """
     sha256 = hashlib.sha256()
     try:
@@ -86,25 +83,18 @@ def _files(path: str) -> list[Path]:
             found = [f"{name}{suffix}" for name in (*_REQUIRED, *_OPTIONAL)]
             return [root / name for name in found if name in names]
     raise XrgsError(
-        f"variant.poses={path}: it has not cameras, images and points3D, all .bin or all .txt; "
+        f"variant.poses={path}: it must have cameras, images and points3D, all .bin or all .txt; "
         "COLMAP's folder is often called sparse/0"
     )
 
 
 def read_poses(path: str, photos: PhotoCollection) -> Reconstruction:
-    """Read the cameras of photographs, and points.
-
-    Args:
-        path: `variant.poses`.
-        photos: The photographs.
-
-    Returns:
-        The cameras of the HR views of those photographs that have a pose, and all points.
+    """Read the cameras of the HR views of photographs, and all points, from `variant.poses`.
 
     Raises:
         UnreadableError: A file can't be read now.
-        XrgsError: The files are malformed, a camera can't be served, no name is that of a
-            photograph, or there are no points.
+        XrgsError: The files are malformed, a camera model is not supported, no photograph has the
+            name of an image, or there are too few points.
     """
     root, content = user_path(path), fingerprint(path)
     try:
@@ -136,15 +126,14 @@ def _of_hr_view(lens: Lens, photos: PhotoCollection, index: int) -> Lens:
 
 
 def match_names(poses: Sequence[str], names: Sequence[str]) -> dict[str, int]:
-    """Find the photograph of each pose: that of the same path, or else of the same file name.
+    """Find the photograph of each pose: the one of the same path, or else of the same file name.
 
     Args:
-        poses: The names of images as a file of poses has them, with folders and suffix.
+        poses: The names of images in a file of poses, with folders and suffix.
         names: The names of the photographs.
 
     Returns:
-        The index of the photograph by the name of the pose. Poses without one are named in a
-        warning.
+        The index of the photograph by the name of the pose. A warning names the poses without one.
 
     Raises:
         XrgsError: No pose has a photograph, or two have the same.
@@ -160,7 +149,8 @@ def match_names(poses: Sequence[str], names: Sequence[str]) -> dict[str, int]:
     if not found:
         similar = get_close_matches(PurePosixPath(poses[0]).stem, names, 1, 0.0) if poses else []
         example = f": {poses[0]} is not {similar[0]}" if similar else ""
-        raise XrgsError(f"none of its {len(poses)} images has the name of a photograph{example}")
+        why = f"none of its {len(poses)} images has the name of a photograph{example}"
+        raise XrgsError(f"{why}; rename them")
     if len(set(found.values())) < len(found):
         values = list(found.values())
         twice = next(i for i in values if values.count(i) > 1)
@@ -212,7 +202,7 @@ def _transforms(file: Path) -> dict[str, Any]:
         and PurePosixPath(frame["file_path"]).name
         for frame in frames
     ):
-        raise XrgsError(f"{file}: no transforms.json: it has no frames with a file_path")
+        raise XrgsError(f"{file}: not a transforms.json: each of its frames must have a file_path")
     if len({frame["file_path"] for frame in frames}) < len(frames):
         raise XrgsError(f"{file}: two frames have one file_path")
     return content
@@ -233,14 +223,14 @@ def _points_file(file: Path, content: Mapping[str, Any]) -> Path:
 
 
 def _lens(entry: Mapping[str, Any], size: tuple[int, int]) -> Lens:
-    """Return the camera of a frame, whose values may be those of the whole file."""
+    """Return the camera of a frame; `entry` has its values, and the file's where it has none."""
     model = str(entry.get("camera_model", "OPENCV"))
     if "FISHEYE" in model.upper() or "EQUIRECT" in model.upper():
-        raise XrgsError(f"camera model {model} is not served; undistort the photographs first")
+        raise XrgsError(f"camera model {model} is not supported. {UNDISTORT}")
     width, height = (int(entry.get(key, side)) for key, side in zip("wh", size, strict=True))
     terms = {ours: as_number(entry[name]) for name, ours in _TERMS.items() if name in entry}
     if "fx" not in terms:
-        raise XrgsError("it has no focal length fl_x")
+        raise XrgsError("it has no focal length; set fl_x, in px")
     defaults = {"fy": terms["fx"], "cx": width / 2, "cy": height / 2}
     return lens_of_terms(model, (width, height), defaults | terms)
 
@@ -249,11 +239,11 @@ def _viewmat(rows: object) -> NDArray[np.float64]:
     """Invert a camera-to-world matrix [4, 4] of OpenGL's axes into a rigid viewmat."""
     matrix = np.array(rows, dtype=np.float64)
     if matrix.shape != (4, 4) or not np.isfinite(matrix).all():
-        raise ValueError("transform_matrix is not 4 x 4 finite numbers")
+        raise ValueError("transform_matrix must be 4 x 4 finite numbers")
     # Rounded digits make a rotation that is not quite one: the nearest rotation is taken.
     U, stretch, Vt = np.linalg.svd(matrix[:3, :3])
     if np.abs(stretch - 1).max() > 1e-3 or np.linalg.det(U @ Vt) < 0:
-        raise ValueError("transform_matrix is no rotation with a translation")
+        raise ValueError("transform_matrix must be a rotation with a translation, without scale")
     pose = np.eye(4)
     pose[:3, :3], pose[:3, 3] = U @ Vt, matrix[:3, 3]
     return np.linalg.inv(pose @ _OPENGL).astype(np.float64)

@@ -22,9 +22,6 @@ def build_dataset(conf: Conf) -> Dataset:
         conf: The config, as `compose` gives it; `scene`, `variant`, `store`, `seed`, `train.views`
             and `train.validation` are read.
 
-    Returns:
-        Photographs, cameras and points, in the normalised world that training takes place in.
-
     Raises:
         SceneFailed: COLMAP can't place enough views.
         XrgsError: A value of the config or a photograph is wrong; the message names it.
@@ -41,9 +38,6 @@ def load_dataset(folder: str | Path, views: str = "mixed") -> Dataset:
     Args:
         folder: The variant's folder, `<store>/variants/<variant id>`.
         views: Which training views: `mixed`, `all_hr`, `hr_only` or `lr_only` (`train.views`).
-
-    Returns:
-        Photographs, cameras and points, in the normalised world that training takes place in.
 
     Raises:
         CorruptVariant: The folder is not a variant, or a file in it has changed.

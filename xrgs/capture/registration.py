@@ -4,8 +4,8 @@ With `sfm.lr_images: upsampled`, downsampled views are resized back to HR size f
 one camera serves both sizes, which makes the poses of the small images several times more accurate.
 With `native`, SfM gets the files as they are, and a camera of their own for the small ones.
 
-The first attempt, `configured`, has the settings of `variant.sfm`. With `sfm.fallbacks`, those of
-`FALLBACKS` follow in their order until a reconstruction is accepted.
+The first attempt, `configured`, has the settings of `variant.sfm`. With `sfm.fallbacks`, the
+attempts of `FALLBACKS` follow in their order until a reconstruction is accepted.
 """
 
 from __future__ import annotations
@@ -98,8 +98,7 @@ def register(
         degraded: Indices of the views that SfM gets degraded.
         conf: The settings of the first attempt.
         work: An existing folder for SfM's own files.
-        refusal: The acceptance check: returns why a reconstruction is refused, and an empty text to
-            accept it.
+        refusal: Returns why a reconstruction is refused; an empty text accepts it.
 
     Returns:
         The first reconstruction that was accepted; where none was, the one with the most registered
@@ -137,11 +136,7 @@ def sfm_attempts(conf: SfmConf, images: int, *, any_smaller: bool) -> Iterator[A
     Args:
         conf: The settings of the first attempt; `fallbacks` says whether there are others.
         images: The number of images.
-        any_smaller: Whether any image is smaller than its HR view, so that it can be given
-            upsampled or native.
-
-    Yields:
-        The attempts, see the module.
+        any_smaller: Whether any image is smaller than its HR view.
     """
     attempt = Attempt("configured", conf)
     yield attempt
@@ -160,15 +155,12 @@ def _features_of(conf: SfmConf) -> tuple[object, ...]:
 def sfm_images(
     photos: PhotoCollection, degraded: Collection[int], conf: SfmConf
 ) -> list[sfm.SfmImage]:
-    """List the images that SfM gets, with the intrinsics that are known.
+    """Return the image of each photograph for SfM, with the intrinsics that are known.
 
     Args:
         photos: The photographs, with their copies; `up` copies are made where they are needed.
         degraded: Indices of the views that SfM gets degraded.
         conf: The settings; `lr_images` says how smaller views are given.
-
-    Returns:
-        One image per photograph, in order.
     """
     result = []
     for i, photo in enumerate(photos.all):
@@ -195,16 +187,7 @@ def _is_smaller(photos: PhotoCollection, index: int) -> bool:
 def reconstruct_undegraded(
     photos: PhotoCollection, conf: SfmConf, work: Path
 ) -> sfm.Reconstruction:
-    """Run SfM on the HR views alone, as a reference for the poses of the mixed-resolution scene.
-
-    Args:
-        photos: The photographs, with their `hr` copies.
-        conf: The settings; there is one attempt.
-        work: An existing folder for SfM's own files.
-
-    Returns:
-        The reconstruction, accepted or not.
-    """
+    """Run SfM once on the HR views alone, as a reference for the poses of the mixed scene."""
     folder = work / "sfm-reference"
     folder.mkdir()
     return sfm.reconstruct(sfm_images(photos, (), conf), photos.folder, folder, conf)

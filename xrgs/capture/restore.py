@@ -46,8 +46,8 @@ def restore_images(
         cache: The store's folder of rendered scenes.
 
     Raises:
-        StoreError: A file of the folder is damaged or names no photograph, or the images are not
-            those that were removed; the message names the first that differs.
+        StoreError: A file of the folder is damaged or names no photograph, or an image differs
+            from the removed one; the message names it.
         XrgsError: The photographs can't be read.
     """
     manifest = frozen.read_manifest(folder)

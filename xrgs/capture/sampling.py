@@ -52,7 +52,7 @@ def median_depth(
             its image are taken instead.
 
     Returns:
-        The depth along the optical axis, in world units; NaN where there is no such point.
+        The depth along the optical axis, in world units; NaN without a point.
     """
     camera = points @ viewmat[:3, :3].T + viewmat[:3, 3]  # [P, 3]
     depth = camera[:, 2]
@@ -82,7 +82,7 @@ def median_depths(model: Reconstruction) -> dict[int, float]:
     if np.isnan(list(depths.values())).all():
         raise XrgsError(
             "none of the points is in front of a camera and inside its image: poses and points "
-            "must be of one world, and the poses' axes those of their file format"
+            "must be of one world, and the poses must have the axes of their file format"
         )
     typical = float(np.nanmedian(list(depths.values())))
     return {i: typical if np.isnan(depth) else depth for i, depth in depths.items()}

@@ -20,7 +20,7 @@ def hashes(folder: Path, names: Iterable[str]) -> dict[str, str]:
 
 
 def changed(folder: Path, files: Mapping[str, str]) -> Iterator[StoreError]:
-    """Yield an error for each file that is missing or has changed.
+    """Yield an error for each file of a folder that is missing or has changed.
 
     Args:
         folder: The folder.

@@ -36,7 +36,7 @@ _MAX_FEATURES = 8192
 _SMALL_SIDE = 640
 #: The smallest triangulation angle for two views of a narrow baseline, degrees.
 _TWO_VIEW_ANGLE = 0.2
-#: Inliers that the first pair needs over those that a later view needs: COLMAP's defaults of
+#: The inliers of the first pair over the inliers of a later view: COLMAP's defaults of
 #: `init_min_num_inliers` and `abs_pose_min_num_inliers`.
 _FIRST_PAIR_RATIO = 100 / 30
 #: The entries of K that are the parameters of COLMAP's PINHOLE camera.
@@ -75,30 +75,23 @@ class Reconstruction:
 
 
 def features_per_image(images: int, configured: int) -> int:
-    """Choose `max_num_features`, the most features of one image.
+    """Return `variant.sfm.max_num_features`; where it is 0, choose the features of one image.
 
-    Args:
-        images: The number of images.
-        configured: `variant.sfm.max_num_features`; 0 for automatic.
-
-    Returns:
-        What was configured; else as many as keep exhaustive matching short, at most COLMAP's 8192.
+    The choice keeps exhaustive matching short, and is at most COLMAP's 8192.
     """
     return configured or min(_MAX_FEATURES, _TOTAL_FEATURES // max(images, 1))
 
 
 def first_octave(long_side: int, configured: int | None) -> int:
-    """Choose SIFT's `first_octave`: -1 detects features at twice the resolution.
+    """Return `variant.sfm.first_octave`; where it is None, choose it: -1 up to 640 px, 0 above.
 
-    For small images -1 is better: on the embedded scene with mixed resolution it gave 1.7 to 2
-    times the points and 3 to 21% less position error, at 250 px and at 500 px.
+    -1 detects features at twice the resolution. For small images it is better: on the embedded
+    scene with mixed resolution it gave 1.7 to 2 times the points and 3 to 21% less position error,
+    at 250 px and at 500 px.
 
     Args:
         long_side: The longest side of all images, px.
-        configured: `variant.sfm.first_octave`; None for automatic.
-
-    Returns:
-        What was configured; else -1 up to 640 px, and 0 above.
+        configured: The value of the key.
     """
     if configured is not None:
         return configured
@@ -157,7 +150,7 @@ def reconstruct(
 
 
 def bogus_cameras(model: Any, sfm_images: Sequence[SfmImage]) -> dict[str, str]:
-    """Find images whose camera can't be one, by COLMAP's own limits for its parameters.
+    """Find images whose camera is impossible, by COLMAP's own limits for its parameters.
 
     COLMAP drops such images after every bundle adjustment but the last, so that a model may end
     with a focal length below 0.
@@ -167,7 +160,7 @@ def bogus_cameras(model: Any, sfm_images: Sequence[SfmImage]) -> dict[str, str]:
         sfm_images: The images; the intrinsics of those with `K` are known, and are not judged.
 
     Returns:
-        What is wrong with the camera, by the `file` of its image.
+        A reason by the `file` of each such image.
     """
     limits = pycolmap.IncrementalMapperOptions()
     refined = {image.file for image in sfm_images if image.K is None}
@@ -284,15 +277,12 @@ def _map(
 
 
 def mapping_options(conf: SfmConf, count: int, *, known: bool) -> Any:
-    """Build the options of COLMAP's incremental mapping.
+    """Return pycolmap's `IncrementalPipelineOptions` for the incremental mapping.
 
     Args:
         conf: The settings.
-        count: The number of images. Of two, COLMAP's defaults would drop every point.
+        count: The number of images. With two, COLMAP's defaults would drop every point.
         known: Whether the intrinsics of all images are known; they are then not refined.
-
-    Returns:
-        pycolmap's `IncrementalPipelineOptions`.
     """
     options = pycolmap.IncrementalPipelineOptions()
     options.random_seed = conf.seed
@@ -316,18 +306,15 @@ def mapping_options(conf: SfmConf, count: int, *, known: bool) -> Any:
 
 
 def to_numpy(model: Any, index: Mapping[str, int], report: Mapping[str, Any]) -> Reconstruction:
-    """Convert pycolmap's model into numpy arrays, with the points in the order of their ids.
+    """Convert pycolmap's `Reconstruction` into numpy arrays, the points in the order of their ids.
 
     Args:
-        model: pycolmap's `Reconstruction`.
-        index: The index of each image by its name in the model; others are left out.
+        model: The model.
+        index: The index of each image by its name in the model; other images are left out.
         report: What is reported beside the results.
 
-    Returns:
-        The cameras of the images that have a pose, and all points.
-
     Raises:
-        XrgsError: A camera can't be served.
+        XrgsError: A camera model is not supported.
     """
     order = sorted(model.points3D)
     number = {point: p for p, point in enumerate(order)}
@@ -350,14 +337,7 @@ def to_numpy(model: Any, index: Mapping[str, int], report: Mapping[str, Any]) ->
 
 
 def points_of(model: Any) -> tuple[NDArray[np.float64], NDArray[np.uint8]]:
-    """Return the points of a model in the order of their ids, and their colours.
-
-    Args:
-        model: pycolmap's `Reconstruction`.
-
-    Returns:
-        Points [P, 3], in the model's world, and colours [P, 3].
-    """
+    """Return the points [P, 3] of pycolmap's `Reconstruction` by id, and their colours [P, 3]."""
     order = sorted(model.points3D)
     points = np.array([model.points3D[p].xyz for p in order], dtype=np.float64).reshape(-1, 3)
     colors = np.array([model.points3D[p].color for p in order], dtype=np.uint8).reshape(-1, 3)

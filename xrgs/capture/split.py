@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Split:
-    """Ascending indices into the views sorted by name; the three are disjoint and cover all."""
+    """Indices of the views in the order of their names; the three are disjoint and cover all."""
 
     test: tuple[int, ...]
     """The held-out views: never trained on, never degraded."""
@@ -48,9 +48,6 @@ class HrGeometry:
 
 def check_variant_conf(conf: VariantConf) -> None:
     """Refuse a config from which no variant can be made.
-
-    Args:
-        conf: The variant's config.
 
     Raises:
         XrgsError: A value is out of its range; the message names the key, the value and the range.
@@ -100,15 +97,15 @@ def check_test_names(names: Sequence[str], conf: VariantConf) -> None:
         conf: The variant's config.
 
     Raises:
-        XrgsError: A name in `variant.test` is none of these; the message has the most similar one.
+        XrgsError: A name in `variant.test` is not among them; the message has the most similar one.
     """
     for name in conf.test:
         if name not in names:
             similar = get_close_matches(name, names, n=1, cutoff=0.0)
             meant = f"did you mean {similar[0]}?" if similar else "it has none"
             raise XrgsError(
-                f"variant.test: the scene has no view {name}; {meant} The name of a view is that of"
-                " its file without the suffix"
+                f"variant.test: the scene has no view {name}; {meant} The name of a view is"
+                " its file's name without the suffix"
             )
 
 
@@ -121,12 +118,9 @@ def split_views(
         names: The names of the views, sorted.
         conf: The variant's config: HR is a fraction of the training views, at least `min_hr` of
             them, or every view that scores `hr_above` or more.
-        scores: One score per view in 0..1, higher for HR; NaN where it is not known, which makes
-            the view LR. Views of one score get one class, so that the fraction may be exceeded.
-            None draws the HR views by `variant.selection`.
-
-    Returns:
-        The indices of each class.
+        scores: One score per view in 0..1, higher for HR; a view of NaN is LR. Views of one score
+            get one class, so that the fraction may be exceeded. None draws the HR views by
+            `variant.selection`.
 
     Raises:
         XrgsError: The scores put all training views into one class though the config asks for two.
@@ -172,15 +166,13 @@ def _select_by_score(train: Sequence[int], scores: Sequence[float], conf: Varian
 
 
 def shrink_factor(sizes: Sequence[tuple[int, int]], conf: VariantConf) -> float:
-    """Compute the one factor by which all photographs of a scene are resized.
+    """Return the one factor in (0, 1] by which all photographs of a scene are resized.
+
+    It brings the longest side of all to `variant.long_side`; it is 1 where that is 0 or larger.
 
     Args:
         sizes: Width and height of each photograph, px.
         conf: The variant's config.
-
-    Returns:
-        A factor in (0, 1] that brings the longest side of all to `variant.long_side`; 1 where that
-        is 0 or larger.
     """
     largest = max(max(size) for size in sizes)
     return min(conf.long_side or largest, largest) / largest
@@ -191,11 +183,8 @@ def hr_geometry(size: tuple[int, int], shrink: float, conf: VariantConf) -> HrGe
 
     Args:
         size: Width and height of the photograph, px.
-        shrink: What `shrink_factor` gives for its scene.
+        shrink: The factor of `shrink_factor` for its scene.
         conf: The variant's config.
-
-    Returns:
-        The sizes before and after the crop.
 
     Raises:
         XrgsError: The LR view, `factor` times smaller, would be smaller than the SSIM window of the

@@ -10,9 +10,8 @@ import logging
 from contextlib import suppress
 from typing import TYPE_CHECKING
 
-from xrgs.capture import poses, scenes, sealed, split
+from xrgs.capture import folders, poses, scenes, sealed, split
 from xrgs.capture.degradations import DEGRADATIONS, resolve_degradation
-from xrgs.capture.failures import FAILED_PREFIX, read_failure
 from xrgs.capture.frozen import CorruptVariant, freeze, load, verify
 from xrgs.capture.tags import POLICIES
 from xrgs.capture.views import SceneFailed, Variant
@@ -21,8 +20,9 @@ from xrgs.errors import StoreError, UnreadableError
 from xrgs.runtime import lease
 from xrgs.safeio.atomic import write_json
 from xrgs.safeio.code import code_digest
-from xrgs.safeio.files import list_names, remove_path
+from xrgs.safeio.files import remove_path
 from xrgs.safeio.hashing import digest
+from xrgs.safeio.records import list_folder
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -54,11 +54,7 @@ POSES = ("capture/colmap.py", "capture/poses.py")
 
 
 def key(scene: SceneConf, conf: VariantConf) -> str:
-    """Hash what a variant is made from: photographs, poses, config and code, without running SfM.
-
-    Args:
-        scene: The scene's config.
-        conf: The variant's config.
+    """Hash the photographs, poses, config and code of a variant, without running SfM.
 
     Returns:
         16 hexadecimal digits.
@@ -95,10 +91,6 @@ def sources(conf: VariantConf) -> dict[str, tuple[str, ...]]:
 def find(variants: Path, wanted_key: str) -> Variant | None:
     """Find the frozen variant of a key, and verify it; a corrupt one is logged and passed over.
 
-    Args:
-        variants: The store's folder of variants.
-        wanted_key: What `key` gives.
-
     Returns:
         The variant; None where there is no intact one.
 
@@ -115,25 +107,13 @@ def find(variants: Path, wanted_key: str) -> Variant | None:
 
 def _of_key(variants: Path, wanted_key: str) -> list[Path]:
     """Return the folders of the variants of a key."""
-    return [variants / name for name in _names(variants) if name.startswith(f"{wanted_key}-")]
-
-
-def _names(variants: Path) -> list[str]:
-    try:
-        return list_names(variants)
-    except FileNotFoundError:  # nothing was built yet
-        return []
-    except OSError as error:
-        raise UnreadableError(f"{variants}: {error.strerror}; try again") from error
+    return [variants / name for name in list_folder(variants) if name.startswith(f"{wanted_key}-")]
 
 
 def failure(variants: Path, wanted_key: str) -> str | None:
     """Read why the scene of a key could not be made into a variant when it was last tried.
 
-    Args:
-        variants: The store's folder of variants.
-        wanted_key: What `key` gives. It covers photographs, config and code, so that a failure says
-            nothing about any others.
+    A key covers photographs, config and code, so that a failure says nothing about any others.
 
     Returns:
         The reason; None where the key did not fail, or its report is damaged.
@@ -141,9 +121,9 @@ def failure(variants: Path, wanted_key: str) -> str | None:
     Raises:
         UnreadableError: The report can't be read now.
     """
-    home, name = variants, f"{FAILED_PREFIX}{wanted_key}"
+    folder = folders.failed_folder(variants, wanted_key)
     try:
-        return read_failure(home / name)[1] if name in _names(home) else None
+        return folders.read_failure(folder)[1] if folder.name in list_folder(variants) else None
     except UnreadableError:
         raise
     except StoreError:
@@ -156,11 +136,8 @@ def build(scene: SceneConf, conf: VariantConf, variants: Path, cache: Path) -> V
     Args:
         scene: The scene's config.
         conf: The variant's config.
-        variants: The store's folder of variants; it is made where it is missing, but for the store.
+        variants: The store's folder of variants; it is made where the store exists.
         cache: The store's folder of rendered scenes.
-
-    Returns:
-        The frozen variant.
 
     Raises:
         UnreadableError: The variant is there, but can't be read now; it is left as it is.
@@ -169,7 +146,7 @@ def build(scene: SceneConf, conf: VariantConf, variants: Path, cache: Path) -> V
     """
     wanted_key = key(scene, conf)
     variants.mkdir(exist_ok=True)
-    report = variants / f"{FAILED_PREFIX}{wanted_key}" / "report.json"
+    report = folders.failed_folder(variants, wanted_key) / "report.json"
     report_before = _modified_ns(report)
     with lease.waited_for(variants, f".{wanted_key}.lock"):
         found = find(variants, wanted_key)
@@ -196,7 +173,7 @@ def _make(scene: scenes.Scene, conf: VariantConf, wanted_key: str, variants: Pat
     from xrgs.capture import mixing
 
     work = variants / f".{wanted_key}.building"
-    failed = variants / f"{FAILED_PREFIX}{wanted_key}"
+    failed = folders.failed_folder(variants, wanted_key)
     remove_path(work)
     remove_path(failed)
     frozen = work / "frozen"

@@ -45,7 +45,6 @@ _CONFIG = (
     FlagCreatePairsOff,  # no --no-dry-run beside --dry-run
     OmitArgPrefixes,  # --scenes, not --which.scenes, for an option in a dataclass
 )
-_WRONG_USAGE = 2  # as tyro and argparse end
 
 
 def run(
@@ -96,7 +95,7 @@ def _refuse_assignments(command: str, assignment: re.Pattern[str]) -> None:
             values = [] if found[2] == "true" else found[2].split(",")
             written = shlex.join([_option(found[1]), *values])
             say(for_line(f"{command}: {word}: options are written {written}"), sys.stderr)
-            sys.exit(_WRONG_USAGE)
+            sys.exit(2)  # as tyro and argparse end
 
 
 def _option(name: str) -> str:

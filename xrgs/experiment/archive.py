@@ -29,7 +29,7 @@ from typing import IO, TYPE_CHECKING, Any
 
 import msgspec
 
-from xrgs.capture import frozen, scenes, variant
+from xrgs.capture import folders, frozen, scenes, variant
 from xrgs.errors import StoreError, XrgsError
 from xrgs.experiment import trimming
 from xrgs.experiment.cell_folder import CONFIG, CellFolder, CellState
@@ -162,7 +162,7 @@ def _verified(folder: Path, name: str, sha256: str) -> bytes:
 
 def _variant(store: Store, variant_id: str) -> _Files:
     """Return the files of a variant as if it were trimmed, under a trimmed variant's name."""
-    trimmed = trimming.trimmed_folder(store.variants, variant_id)
+    trimmed = folders.trimmed_folder(store.variants, variant_id)
     folder = trimmed if trimmed.is_dir() else store.variants / variant_id
     if damage := trimming.verify_variant(folder):
         raise StoreError("; ".join(damage))
@@ -385,9 +385,10 @@ class _Border:
 
     def _is_present(self, kind: str, name: str) -> bool:
         home = self.homes()[kind]
-        variant_id = name.removeprefix(trimming.TRIMMED_PREFIX)
-        names = {name, variant_id, f"{trimming.TRIMMED_PREFIX}{variant_id}"}
-        return any((home / name).exists() for name in (names if kind == "variants" else {name}))
+        if kind != "variants":
+            return (home / name).exists()
+        variant_id = folders.id_of(name)  # of a variant, with its images or trimmed
+        return (home / variant_id).exists() or folders.trimmed_folder(home, variant_id).exists()
 
     def _staged(self, item: str, name: str = "") -> Path:
         """Return the hidden path of an item, or of a file in it."""
@@ -549,8 +550,8 @@ def _check_variant(folder: Path) -> None:
     names = (view.name for view in manifest.views)
     if not all(map(is_name, names)) or not all(map(is_inside, manifest.files)):
         raise StoreError("variant.json: the name of a view or a file is not valid")
-    is_trimmed = folder.name == f"{trimming.TRIMMED_PREFIX}{manifest.id}"
-    if not is_trimmed and folder.name != manifest.id:
+    is_trimmed = folders.is_trimmed(folder.name)
+    if folders.id_of(folder.name) != manifest.id:
         raise StoreError("variant.json: its id is not the name of the folder")
     if damage := (trimming.verify_variant if is_trimmed else variant.verify)(folder):
         raise StoreError("; ".join(damage))

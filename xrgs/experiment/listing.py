@@ -29,7 +29,7 @@ STATES = ("done", "running", "planned", "unfinished", "failed", "corrupt", "unkn
 _MAX_LISTED = 6
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class CellRow:
     """One cell of a store."""
 
@@ -268,7 +268,7 @@ def full_id(beginning: str, ids: Iterable[str], kinds: str = "cells") -> str:
     Args:
         beginning: An id, or the beginning of one id alone.
         ids: The ids to choose from.
-        kinds: What has these ids, for messages.
+        kinds: The things with these ids, for messages.
 
     Raises:
         StoreError: No id begins with it, or several do.

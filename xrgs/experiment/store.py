@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 
 import msgspec
 
-from xrgs.capture.failures import FAILED_PREFIX
+from xrgs.capture import folders as variant_folders
 from xrgs.errors import StoreError, UnreadableError
 from xrgs.experiment import listing
 from xrgs.experiment.cell_folder import CellFolder, CellState
@@ -313,12 +313,8 @@ class Store:
             StoreError: There is no store, no id begins with it, or several do.
         """
         self.check_exists()
-        variants = [
-            self.variant(name)
-            for name in list_folder(self.variants)
-            if "." not in name and not name.startswith(FAILED_PREFIX) and is_name(name)
-        ]
-        folders = {folder.name: folder for folder in variants}
+        variants = filter(variant_folders.is_variant, list_folder(self.variants))
+        folders = {name: self.variant(name) for name in variants}
         folders |= {cell.id: cell.path for cell in self.cell_folders()}
         return folders[listing.full_id(beginning, list(folders), "cells or variants")]
 

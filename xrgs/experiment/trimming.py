@@ -13,6 +13,7 @@ import stat
 from typing import TYPE_CHECKING
 
 from xrgs.capture import frozen, sealed
+from xrgs.capture.folders import id_of, is_trimmed, trimmed_folder
 from xrgs.errors import StoreError, UnreadableError, XrgsError
 from xrgs.runtime import lease
 from xrgs.safeio.files import remove_path, sync_name, sync_tree, walk_files
@@ -23,14 +24,7 @@ if TYPE_CHECKING:
 
     from xrgs.config import SceneConf, VariantConf
 
-#: The beginning of the name of a trimmed variant's folder; the variant's id follows.
-TRIMMED_PREFIX = "trimmed-"
 _IMAGES = "images"
-
-
-def trimmed_folder(variants: Path, variant_id: str) -> Path:
-    """Return the folder that a variant has when it is trimmed; it need not exist."""
-    return variants / f"{TRIMMED_PREFIX}{variant_id}"
 
 
 def trimmed_variant(variants: Path, key: str) -> str | None:
@@ -39,9 +33,8 @@ def trimmed_variant(variants: Path, key: str) -> str | None:
     Raises:
         StoreError: The folder of variants can't be listed.
     """
-    start = f"{TRIMMED_PREFIX}{key}-"
-    names = [name for name in list_folder(variants) if name.startswith(start)]
-    return names[0].removeprefix(TRIMMED_PREFIX) if names else None
+    ids = map(id_of, filter(is_trimmed, list_folder(variants)))
+    return next((variant_id for variant_id in ids if variant_id.startswith(f"{key}-")), None)
 
 
 def check_images(variants: Path, variant_id: str) -> None:

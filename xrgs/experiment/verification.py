@@ -8,8 +8,7 @@ from dataclasses import dataclass
 from functools import partial
 from typing import TYPE_CHECKING
 
-from xrgs.capture import scenes, variant
-from xrgs.capture.failures import FAILED_PREFIX
+from xrgs.capture import folders, scenes, variant
 from xrgs.errors import StoreError
 from xrgs.experiment import trimming
 from xrgs.runtime.progress import ProgressBar
@@ -107,10 +106,9 @@ def _cells(store: Store) -> _Checks:
 
 def _variants(store: Store) -> _Checks:
     for name in list_folder(store.variants):
-        if not name.startswith((".", FAILED_PREFIX)):
+        if folders.is_variant(name):
             folder = store.variants / name
-            is_trimmed = name.startswith(trimming.TRIMMED_PREFIX)
-            check = trimming.verify_variant if is_trimmed else variant.verify
+            check = trimming.verify_variant if folders.is_trimmed(name) else variant.verify
             yield folder, partial(check, folder)
 
 

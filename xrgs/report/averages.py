@@ -28,17 +28,18 @@ def averaged(pairs: pd.DataFrame, ratios: Collection[str]) -> tuple[pd.DataFrame
     Args:
         pairs: One row for each metric of each pair: `label`, `condition`, `scene`, `metric`,
             `base`, `value`, `difference`, `effect`, and `why` there is no effect.
-        ratios: Names of the metrics whose effect is the logarithm of a ratio.
+        ratios: Names of the metrics with the logarithm of a ratio as their effect.
 
     Returns:
         Two tables, indexed by label, condition, scene, metric, and by label, condition, metric.
         `base`, `value` and `difference` are means over the pairs that have an effect. `change`,
         its 95 % interval `low` to `high`, and the standard deviations `scatter_replicates` (pooled
         within scenes) and `scatter_scenes` (of the scenes' means) are in percent; a deviation of
-        logarithms is 100 (exp(deviation) - 1). The interval and `p` are of `n` values, which are
-        `unit` (`scenes`, or `replicates` where there is one scene); `scenes` counts the scenes that
+        logarithms is 100 (exp(deviation) - 1). The interval and `p` are of `n` values of the kind
+        `unit` (`scenes`, or `replicates` where there is one scene). `scenes` counts the scenes that
         have an effect. `q` is p corrected for all rows of a condition, and NaN in the first table.
-        `agree` of the `pairs` changed as their mean did, and `why` some have no effect.
+        `agree` counts the `pairs` that changed in the direction of their mean. `why` says why some
+        have no effect.
     """
     scenes = _means(pairs, _SCENE).assign(unit="replicates", q=np.nan)
     scenes = scenes.assign(
@@ -105,7 +106,7 @@ def _with_agreement(means: pd.DataFrame, pairs: pd.DataFrame) -> pd.DataFrame:
 
 
 def _in_percent(means: pd.DataFrame, ratios: Collection[str]) -> pd.DataFrame:
-    """Return the means with their effects in percent, also those that are logarithms of ratios."""
+    """Return the means with all effects in percent; some are logarithms of ratios before."""
     is_ratio = means.index.get_level_values("metric").isin(ratios)
     with np.errstate(over="ignore"):  # an interval of two values may end at infinity
         return means.assign(

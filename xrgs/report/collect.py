@@ -14,7 +14,7 @@ import msgspec
 import numpy as np
 import pandas as pd
 
-from xrgs.errors import StoreError, XrgsError
+from xrgs.errors import StoreError, UnreadableError, XrgsError
 from xrgs.evaluation.metrics import METRICS, VIEW_METRICS
 from xrgs.evaluation.scoring import PROTOCOL, stale_scores
 from xrgs.experiment.cell_folder import CellState
@@ -91,11 +91,16 @@ class Sweep:
     commands: Mapping[str, tuple[str, ...]]
     """The arguments of `xrgs-sweep` by the sweep's id; several where sweeps are joined."""
     cells: pd.DataFrame
-    """One row for each entry of the record: `RECORD_KEYS`, `state`, `reason`; `protocol` and, for
-    each score, `<score>_code` (the digests of what computed it); `stale` (names of the scores that
-    the installed code would compute otherwise, or that are missing); `validation`
-    (`train.validation`: 0 where scores are of test views); `steps`, `long_side` and `factor` of the
-    config; `machine` (what times depend on beside the program; empty where unknown); metrics."""
+    """One row for each entry of the record, with these columns:
+
+    - `RECORD_KEYS`, `state` and `reason`;
+    - `protocol` and `<score>_code`: digests of the code that has rendered and scored the views;
+    - `stale`: names of the scores that the installed code would compute otherwise, or that are
+      missing;
+    - `validation`: `train.validation`, 0 where scores are of test views;
+    - `steps`, `long_side` and `factor` of the config;
+    - `machine`: what times depend on beside the program, empty where that is unknown;
+    - each metric by its name."""
     views: pd.DataFrame
     """One row for each cell and scored view: `cell_id`, `view` and the scores."""
     done: dict[str, DoneCell]
@@ -173,6 +178,8 @@ def _read_done(cell: CellFolder) -> DoneCell:
     summary, scores = cell.summary(), cell.view_scores()
     try:
         config = cell.config()
+    except UnreadableError:
+        raise
     except XrgsError:
         config = None
     return DoneCell(
@@ -271,9 +278,10 @@ def _done_columns(cell_id: str, cell: DoneCell) -> dict[str, Any]:
 
 
 def _machine(cell_id: str, made: Provenance) -> str:
-    """Return what a cell's times depend on.
+    """Return the machine that a cell's times depend on.
 
-    Several machines that trained a cell in turn get its id: its times are like those of no other.
+    Where several machines have trained the cell in turn, its id makes the name unique: no other
+    cell's times can be compared.
     """
     turns = made.machines_in_turn
     return for_line(f"cell {cell_id} in turn: {turns}" if turns else machine(made), _MAX_MACHINE)
@@ -338,9 +346,10 @@ def _check_identity(
 ) -> None:
     """Refuse a record that contradicts a cell: it would pair cells that do not belong together."""
     for row in rows:
-        if row.cell_id not in done:
+        cell = done.get(row.cell_id or "")
+        if cell is None:
             continue
-        identity = done[row.cell_id].identity
+        identity = cell.identity
         for key, said, true in (
             ("variant_id", row.variant_id, identity.variant),
             ("seed", row.seed, identity.seed),

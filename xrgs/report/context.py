@@ -117,7 +117,7 @@ def _scored_views(tests: Mapping[str, int], *, held_out: bool) -> str:
 
 
 def _mixture(variant: VariantConf) -> str:
-    """Return a phrase on what was done to the LR views of a cell."""
+    """Return a phrase on how the LR views of a cell were made."""
     chosen = variant.tags == "flag"  # and not by what the photographs are
     if chosen and variant.hr_fraction == 1:
         return "all views HR"
@@ -192,7 +192,7 @@ _MIN_DISTANCE = 3.0
 def decided_by_one_view(
     comparison: Comparison, views: pd.DataFrame
 ) -> dict[tuple[str, str], list[str]]:
-    """Say of which pairs one view decides the change in PSNR.
+    """Warn of pairs where one view decides the change in PSNR.
 
     A scene has few test views, and PSNR has no bound: a floater before one test camera can take 10
     dB from its view, and so take more from the mean than all other views gain.

@@ -80,16 +80,16 @@ def with_external(sweep: Sweep, store: JoinedStore, externals: Sequence[External
     Args:
         sweep: The sweep.
         store: The stores that have the sweep's variants.
-        externals: The programs' renders. A folder has `<view>.png` for each scored view, in
-            `<scene>/<variant.seed>/`; where a scene has one draw of HR views, `<scene>/` will do,
-            and where there is one scene too, the folder itself.
+        externals: The programs' renders: `<view>.png` for each scored view, in the folder
+            `<scene>/<variant.seed>/`. Where a scene has one draw of HR views, `<scene>/` will do;
+            where the sweep also has one scene, the folder itself.
 
     Returns:
         The sweep with these rows in `cells` and `views`, and their folders in `renders`.
 
     Raises:
-        ReportError: A label is that of cells, a folder or a render is missing, or a render is not
-            an 8-bit RGB PNG of its view's size; the message names the file and what is expected.
+        ReportError: Cells have a label of the renders, a folder or a render is missing, or a render
+            is not an 8-bit RGB PNG of its view's size. The message names the file and the format.
         CorruptVariant: A variant is damaged.
     """
     for one in externals:
@@ -145,7 +145,10 @@ def _folder(one: External, cell: Mapping[Hashable, Any], done: pd.DataFrame) -> 
     except OSError as error:
         raise ReportError(f"external={one.label}: {one.folder}: {error.strerror}") from error
     if not found:
-        wanted = " or ".join(map(str, inside)) or "a folder of that scene, whose name can be none"
+        wanted = (
+            " or ".join(map(str, inside))
+            or "a folder of the scene, though its name can't be a folder's name,"
+        )
         raise ReportError(
             f"external={one.label}: there are no renders of {scene} with variant.seed={draw}: "
             f"{wanted} is expected, with <view>.png for each view that is scored"

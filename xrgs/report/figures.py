@@ -1,7 +1,8 @@
 """Draws a comparison: renders side by side, curves, number of Gaussians against quality.
 
-The same inputs give the same bytes: matplotlib's own style is used whatever the user's is, and no
-date or version is written. pyplot is not used, since it keeps figures in memory.
+Each function returns the bytes of a PNG. The same inputs give the same bytes: matplotlib's own
+style is used whatever the user's is, and no date or version is written. pyplot is not used, since
+it keeps figures in memory.
 """
 
 from __future__ import annotations
@@ -33,8 +34,8 @@ if TYPE_CHECKING:
 
 #: Okabe and Ito's orange and blue, which colour-blind readers can distinguish, also in grey.
 _ABLATION, _BASELINE, _FRAME = "#D55E00", "#0072B2", "#FFD400"
-#: Colour and mark of the baseline, and of up to seven ablations: more of Okabe and Ito's colours,
-#: without their yellow, which is faint on white.
+#: Colour and mark of the baseline, and of up to seven ablations: more of Okabe and Ito's colours.
+#: Their yellow is left out, since it is faint on white.
 _ARMS = (
     (_BASELINE, "o"),
     (_ABLATION, "s"),
@@ -50,7 +51,7 @@ MAX_ARMS = len(_ARMS)
 _DPI = 130
 _PANEL = 3.4  # inches
 _ZOOM = 5
-#: A setting whose largest value is this many times the smallest one has a logarithmic axis.
+#: An axis is logarithmic where the largest value is this many times the smallest one.
 _LOG_FROM = 4
 #: The longest name beside a figure's axes, in characters: a longer one would leave them no room.
 _MAX_NAME = 40
@@ -68,8 +69,8 @@ class Panel(NamedTuple):
 def _default_style() -> Iterator[None]:
     """Use matplotlib's own style, in which a name with dollar signs is not read as mathematics.
 
-    Nothing is said of characters that its font lacks, or of scripts that it can't shape: they are
-    drawn as boxes, or letter by letter; the tables of the report have the name.
+    Characters that its font lacks are drawn as boxes, and scripts that it can't shape letter by
+    letter, without a warning: the tables of the report have the name.
     """
     with style.context(["default", {"text.parse_math": False}]), warnings.catch_warnings():
         warnings.filterwarnings("ignore", message="Glyph .* missing from")
@@ -78,12 +79,12 @@ def _default_style() -> Iterator[None]:
 
 
 def differing_crop(first: Image, second: Image, zoom: int = _ZOOM) -> tuple[slice, slice]:
-    """Find the window, `zoom` times smaller than the images, in which they differ most.
+    """Find the window, `zoom` times smaller than two images, in which they differ most.
 
     Args:
         first: [H, W, 3] in 0..1.
         second: [H, W, 3] in 0..1.
-        zoom: How many times smaller the window's sides are than the images'.
+        zoom: The sides of the images over the sides of the window.
 
     Returns:
         The window's rows and columns; of equal windows, the topmost and then the leftmost.
@@ -105,14 +106,8 @@ def side_by_side(
 ) -> bytes:
     """Draw the panels in a row with `crop` framed, and each panel's crop enlarged below it.
 
-    Args:
-        title: The title of the figure.
-        panels: The images, of one size: photograph, baseline and ablation.
-        crop: The rows and columns of the crop, as `differing_crop` returns them.
-        note: What the crop shows, for example "where the two differ most".
-
-    Returns:
-        The bytes of a PNG.
+    The panels are photograph, baseline and ablation, of one size. `crop` is as `differing_crop`
+    returns it, and `note` says how it was chosen, for example "where the two differ most".
     """
     rows, columns = crop
     height, width = panels[0].image.shape[:2]
@@ -143,13 +138,8 @@ def curves(
 ) -> bytes:
     """Draw training curves over steps: one panel for each column, one line for each run.
 
-    Args:
-        title: The title of the figure.
-        runs: Label and history (with `step` and `columns`) of the baseline, then of the ablation.
-        columns: The columns to draw, with the title of each panel.
-
-    Returns:
-        The bytes of a PNG.
+    `runs` are label and history (with `step` and `columns`) of the baseline, then of the ablation.
+    `columns` has the title of the panel of each column.
     """
     figure = _figure(_PANEL * 1.5 * len(columns), _PANEL)
     figure.suptitle(for_line(title, MAX_CELL), fontsize=11)
@@ -176,18 +166,12 @@ def quality_curves(
     """Draw quality during training against time and against alpha evaluations.
 
     Better is up. Each label has a colour: a thick line with marks is its mean over scenes, thin
-    ones are its scenes. Horizontal lines are where the baseline ends.
+    ones are its scenes. Horizontal lines are where the baseline ends. Each of `axes` is a score,
+    and has a row of panels.
 
-    Args:
-        title: The title of the figure.
-        scenes: One row for each label, scene and evaluation: `label`, `scene`, `seconds`,
-            `evaluations`, and a column for each of `axes`. The first label is the baseline; there
-            are at most `MAX_ARMS`.
-        means: The means over scenes, with the same columns but `scene`.
-        axes: The scores to draw, a row of panels each.
-
-    Returns:
-        The bytes of a PNG.
+    `scenes` has one row for each label, scene and evaluation: `label`, `scene`, `seconds`,
+    `evaluations` and the scores. There are at most `MAX_ARMS` labels, and the first is the
+    baseline. `means` are over scenes, with the same columns but `scene`.
     """
     figure = _figure(_PANEL * 3 + 2.2, _PANEL * len(axes) + 0.6)
     figure.suptitle(for_line(title, MAX_CELL), fontsize=11)
@@ -252,16 +236,9 @@ def trade_off(
     Better is up and left. A numbered dot is a label's mean over scenes. Thin lines lead from the
     baseline to the ablations in each scene, and blue ones cross at the baseline's mean.
 
-    Args:
-        title: The title of the figure.
-        means: One row for each label, the baseline first: `gaussians`, `scenes` (how many the mean
-            is over), and a column for each of `axes`.
-        scenes: One row for each label and scene, indexed by the label: `scene`, `gaussians`, and
-            the same scores.
-        axes: The scores to draw.
-
-    Returns:
-        The bytes of a PNG.
+    `means` has one row for each label, the baseline first: `gaussians`, `scenes` (how many the mean
+    is over), and a column for each of `axes`, the scores. `scenes` has one row for each label and
+    scene, indexed by the label: `scene`, `gaussians` and the scores.
     """
     figure = _figure(_PANEL * 1.1 * len(axes) + 2, max(_PANEL, 0.2 * len(means)))
     figure.suptitle(for_line(title, MAX_CELL), fontsize=11)
@@ -318,15 +295,8 @@ def dependence(title: str, key: str, changes: pd.DataFrame, axes: Sequence[Metri
     Better is up, and the dashed line is the base. Each series has a colour: a thick line with marks
     is its mean over scenes, thin ones are its scenes, and dots are its pairs.
 
-    Args:
-        title: The title of the figure.
-        key: The key of the setting.
-        changes: What `xrgs.report.sensitivity.sensitivities` returns for it, of at most `MAX_ARMS`
-            series.
-        axes: The metrics to draw.
-
-    Returns:
-        The bytes of a PNG.
+    `changes` is what `xrgs.report.pictures.sensitivities` returns for the key of the setting, with
+    at most `MAX_ARMS - 1` series. Each of `axes` is a metric.
     """
     figure = _figure(_PANEL * len(axes), _PANEL + 0.6)
     figure.suptitle(for_line(title, MAX_CELL), fontsize=11)

@@ -1,7 +1,7 @@
 """The statistics of a report: changes of pairs, Student's intervals and tests, false discoveries.
 
-All functions take and return float64 arrays [N], one element for each pair or mean. What can't be
-computed is NaN, and a reason says why.
+All functions take and return float64 arrays [N], one element for each pair or mean. A number that
+can't be computed is NaN, and a reason says why.
 """
 
 from __future__ import annotations
@@ -44,12 +44,11 @@ def percent_change(base: Floats, value: Floats) -> tuple[Floats, NDArray[np.str_
     PSNR can be negative.
 
     Args:
-        base: [N] values that are compared with.
+        base: [N] values of the base.
         value: [N] values of the ablation, in the same unit.
 
     Returns:
-        The changes in percent [N], NaN where there is none, and the reasons why there is none [N],
-        empty where there is one.
+        The changes in percent [N], and why there is none [N], empty where there is one.
 
     Example:
         >>> percent_change(np.array([20.0, 0.0]), np.array([25.0, 1.0]))[0]
@@ -73,16 +72,16 @@ def percent_change(base: Floats, value: Floats) -> tuple[Floats, NDArray[np.str_
 def log_ratio(base: Floats, value: Floats) -> tuple[Floats, NDArray[np.str_]]:
     """Return log(value / base), the change of an amount that is above zero.
 
-    Halving and doubling are then changes of the same size, whose mean is no change, and an interval
-    never reaches below -100 %.
+    Halving and doubling are then changes of the same size with a mean of 0, and an interval never
+    reaches below -100 %.
 
     Args:
-        base: [N] amounts that are compared with.
+        base: [N] amounts of the base.
         value: [N] amounts of the ablation, in the same unit.
 
     Returns:
-        The logarithms [N], NaN where there is none, and the reasons why there is none [N], empty
-        where there is one. Equal amounts have 0, also where both are zero.
+        The logarithms [N], and why there is none [N], empty where there is one. Equal amounts have
+        0, also where both are zero.
 
     Example:
         >>> log_ratio(np.array([2.0, 2.0]), np.array([2.0, 0.0]))[0]
@@ -103,15 +102,14 @@ def share_of_gap(
     """Return the share of the gap between the base and all_hr that is closed, in percent.
 
     Args:
-        base: [N] values that are compared with.
+        base: [N] values of the base.
         value: [N] values of the ablation, in the same unit.
         all_hr: [N] values of all_hr, in the same unit; NaN where it gave none.
         higher_is_better: The direction of the metric.
 
     Returns:
-        The shares [N], NaN where there is none, and the reasons why there is none [N], empty where
-        there is one. A share is negative where the ablation is worse than the base, and above
-        100 where it is better than all_hr.
+        The shares [N], and why there is none [N], empty where there is one. A share is negative
+        where the ablation is worse than the base, and above 100 where it is better than all_hr.
 
     Example:
         >>> args = np.array([20.0]), np.array([23.0]), np.array([24.0])

@@ -189,7 +189,7 @@ def _same(known: tuple[str, RecordedCell] | None, sweep_id: str, row: RecordedCe
     raise ReportError(
         f"{name} / seed {row.seed} is cell {first.cell_id} in sweep {before} and"
         f" {row.cell_id} in sweep {sweep_id}: they differ in configuration, code or variant."
-        " Leave one of the sweeps out, or choose others with scenes= and ablations="
+        " Leave one of the sweeps out, or choose rows with --scenes and --ablations"
     )
 
 

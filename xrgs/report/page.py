@@ -68,7 +68,7 @@ class Report:
 
 @dataclass(frozen=True)
 class Runs:
-    """Tables of the trainings themselves, beside those of their results."""
+    """Tables of what the trainings of a sweep did."""
 
     labels: dict[str, list[str]]
     """The labels of each condition's cells, in the sweep's order."""
@@ -119,14 +119,14 @@ def build(
         store_paths: The store's folder, or the folders of the stores that have the cells.
         sweep_ids: The id of the sweep, or the ids of those to join; None takes the latest one of
             each store.
-        out: The folder to write to; None takes `reports/<sweep ids>` in the first store. The name
-            ends with `.scenes-`, `.ablations-` and what is chosen where that is not everything, and
-            with `.against-<label>` where another label than the baseline is compared with.
-        pictures: Names of the pictures to draw, as of `draw`; None draws all.
+        out: The folder to write to; None takes `reports/<sweep ids>` in the first store. To its
+            name `.scenes-<names>` and `.ablations-<names>` are added for a choice, and
+            `.against-<label>` for another base than the baseline.
+        pictures: Names of the pictures to draw, see `xrgs.report.pictures.draw`; None draws all.
         against: The label that all others are compared with.
         choice: Which scenes and ablations of the sweeps the report has.
-        externals: Renders of other programs, each of which becomes one more label. The default
-            folder's name then ends with `.with-<label>` for each.
+        externals: Renders of other programs; each becomes one more label. The default folder's name
+            then ends with `.with-<label>` for each.
 
     Returns:
         The report: its text and its files.
@@ -155,7 +155,7 @@ def build(
     except OSError as error:
         raise ReportError(
             f"the report can't be written to {folder}: {error.filename}: {error.strerror};"
-            " name another folder with out=..."
+            " name another folder with --out"
         ) from error
     written = {p.file for p in drawn if p.file} | {folder / name for name in _FILES}
     text = f"{_text(tables, _warnings(sweep))}\n{for_line(f'Written to {folder}')}"
@@ -171,7 +171,7 @@ def _tables(sweep: Sweep, against: str) -> Tables:
 def _folder_name(
     ids: Sequence[str], choice: Choice, against: str, externals: Sequence[External]
 ) -> str:
-    """Return the default name of a report's folder, which says what differs from all of a sweep."""
+    """Return the default name of a report's folder: the sweeps, and what was chosen of them."""
     base = "" if against == BASELINE else f".against-{for_file_name(against)}"
     others = "".join(f".with-{for_file_name(one.label)}" for one in externals)
     return f"{report_name(ids)}{choice.suffix}{base}{others}"
@@ -228,14 +228,15 @@ _FILES = (
 
 
 def _write_data(folder: Path, sweep: Sweep, comparison: Comparison, runs: Runs) -> None:
-    """Write what was compared and measured, for other programs."""
+    """Write the tables and the provenance that other programs read."""
     cells = comparison.cells
     names = cells.drop_duplicates("cell_id")[CELL_KEYS]
     views = names.merge(sweep.views, on="cell_id")
     metrics = [metric.name for metric in comparison.metrics]
-    order = [*RECORD_KEYS, "state", "reason", "steps", "long_side", "factor", "protocol"]
-    order += ["stale", "validation", "machine", *metrics]
-    write_text(folder / "cells.csv", _csv(cells[order]))
+    counts = ["steps", "long_side", "factor"]
+    order = [*RECORD_KEYS, "state", "reason", *counts, "protocol", "stale", "validation", "machine"]
+    whole = cells[[*order, *metrics]].astype(dict.fromkeys(counts, "Int64"))  # which may be missing
+    write_text(folder / "cells.csv", _csv(whole))
     write_text(folder / "views.csv", _csv(views))
     write_text(folder / "training.csv", _csv(runs.training))
     write_text(folder / "curves.csv", _csv(runs.curves))
@@ -319,7 +320,7 @@ def _warnings(sweep: Sweep) -> list[str]:
     if pending := int((states == "pending").sum()):
         warnings.append(
             f"{pending} of {len(states)} cells are not done yet: the same xrgs-sweep command trains"
-            " them, and the tables are of those that are done."
+            " them. The tables are of the cells that are done."
         )
     if others := ", ".join(_other_programs(sweep)):
         warnings.append(
@@ -346,8 +347,8 @@ def _warnings(sweep: Sweep) -> list[str]:
     arithmetics = sweep.provenance.get("arithmetic", ())
     if len(arithmetics) > 1:
         warnings.append(
-            f"The cells were trained with different arithmetic ({', '.join(arithmetics)}): they"
-            " differ as cells of different seeds do, beside what is compared."
+            f"The cells were trained with different arithmetic ({', '.join(arithmetics)}): that"
+            " alone makes cells differ as much as another seed does."
         )
     return warnings
 

@@ -212,7 +212,7 @@ def with_texture(store: JoinedStore, cells: pd.DataFrame, views: pd.DataFrame) -
 
 
 def _texture_of(store: JoinedStore, variant_id: str, split: str, view: str) -> float:
-    """Return the mean magnitude of the gradient of one photograph; NaN where there is none."""
+    """Return the texture of one photograph; NaN where it can't be read."""
     try:
         variant = store.variant(variant_id)
         check_images(variant.parent, variant.name)
@@ -303,7 +303,7 @@ def _rank_correlation(textures: pd.Series, changes: pd.Series) -> str:
     known = changes.notna()
     if known.sum() < MIN_VALUES or changes[known].nunique() < 2 or textures[known].nunique() < 2:
         return ""
-    return signed(textures[known].rank().corr(changes[known].rank()))
+    return signed(textures[known].corr(changes[known], method="spearman"))
 
 
 class _Figure(NamedTuple):
@@ -367,7 +367,7 @@ class Counterpart:
     name: str
     shows: str
     here: str
-    """What the page shows instead, or why it shows nothing."""
+    """The view that the page shows, or why it shows none."""
     section: str = ""
     """`views` or `training` where the page has it."""
     place: int = 0

@@ -44,16 +44,16 @@ if TYPE_CHECKING:
 
     _Drawing = Callable[[Path], "Picture"]  # draws into the file
 
-#: The scores whose curves are drawn.
+#: The scores that are drawn over time.
 _QUALITY = ("psnr", "lpips")
 _QUALITY_TITLE = "Quality during training: scenes thin, mean thick, level where {base} ends"
-#: The metrics whose changes over a setting are drawn.
+#: The metrics that are drawn over a setting.
 _DEPENDENT = frozenset({"gaussians", "lpips", "ssim", "psnr"})
 _SENSITIVITY_TITLE = (
     "Change from {base} over {key}: replicates as dots, scenes thin, mean thick, better is up"
 )
 _CURVES = {"gaussians": "Gaussians", "loss": "loss of the step's view, as each run weighs it"}
-#: Largest image that is drawn: three are in memory at a time, 12 bytes a pixel, and their drawing.
+#: The most pixels of an image: three are in memory at a time, with 12 bytes a pixel, and are drawn.
 _MAX_PIXELS = 1 << 24
 #: The most pictures that are drawn without being asked for by name; each takes up to a second.
 _MAX_PICTURES = 100
@@ -161,7 +161,7 @@ def _trade_offs(comparison: Comparison) -> dict[str, _Drawing]:
         if not 3 <= len(means) <= _MAX_ABLATIONS or not axes:
             continue
         title = titled("Quality against Gaussians, mean over scenes", condition)
-        name = f"trade-off{condition and f'.{for_file_name(condition)}'}"
+        name = _file_name("trade-off", condition)
         drawings[name] = partial(_drawn, title, partial(trade_off, title, means, scenes, axes))
     return drawings
 
@@ -176,10 +176,10 @@ def _sensitivities(comparison: Comparison) -> dict[str, _Drawing]:
             if not axes:
                 continue
             title = titled(_SENSITIVITY_TITLE.format(base=comparison.base, key=key), condition)
-            name = f"sensitivity-{for_file_name(key)}{condition and f'.{for_file_name(condition)}'}"
+            name = _file_name(f"sensitivity-{for_file_name(key)}", condition)
             drawings[name] = partial(_drawn, title, partial(dependence, title, key, changes, axes))
             if (count := changes["series"].nunique()) >= MAX_ARMS:
-                why = f"{count} curves, of which a figure can tell {MAX_ARMS - 1} apart"
+                why = f"{count} curves, and a figure can tell {MAX_ARMS - 1} apart"
                 drawings[name] = partial(_not_drawn, title, why)
     return drawings
 
@@ -244,7 +244,7 @@ def _settings(labels: Iterable[str]) -> dict[str, pd.DataFrame]:
 
 
 def _number(text: str) -> float:
-    """Return the number that a text is; NaN where it is none."""
+    """Return the number of a text; NaN where the text is not a number."""
     try:
         return float(text)
     except ValueError:
@@ -286,12 +286,16 @@ def _curves_of_quality(comparison: Comparison, curves: pd.DataFrame) -> dict[str
             scenes = rows[rows["label"].isin(shown)]
             means = means_over_scenes(scenes)
             title = titled(_QUALITY_TITLE.format(base=comparison.base), condition)
-            name = f"time-to-quality{condition and f'.{for_file_name(condition)}'}"
+            name = _file_name("time-to-quality", condition)
             name += f"-{at // (MAX_ARMS - 1) + 1}" * (at > 0)
             drawings[name] = partial(
                 _drawn, title, partial(quality_curves, title, scenes, means, axes)
             )
     return drawings
+
+
+def _file_name(kind: str, condition: str) -> str:
+    return f"{kind}.{for_file_name(condition)}" if condition else kind
 
 
 def _drawn(title: str, figure: Callable[[], bytes], file: Path) -> Picture:

@@ -152,12 +152,12 @@ class Tables:
         if here.empty:
             return ""
         if (here["cell_id"] == here["base_id"]).all():
-            return f"changes nothing: its cells are those of {base}"
+            return f"changes nothing: its cells are the cells of {base}"
         steady = here[~here["metric"].isin(_NOISY)]
         known = steady[steady["base"].notna() | steady["value"].notna()]
         if known.empty or not (known["base"] == known["value"]).all():
             return ""
-        return f"changes nothing: all its scores, counts and amounts of work are those of {base}"
+        return f"changes nothing: its scores, counts and amounts of work are those of {base}"
 
     def _mean_notes(self, labels: list[str], condition: str) -> tuple[str, ...]:
         """Say how means of these labels were made, and what their marks are."""
@@ -455,7 +455,7 @@ def _mean_row(row: Change, metric: Metric, scenes: int, said: str) -> tuple[str,
         row: The change.
         metric: The metric that changed.
         scenes: How many scenes the mean should be over.
-        said: The reading that the table's context has, which is left out here.
+        said: A reading that the table's context has, and that no row repeats.
     """
     read = reading(row, metric)
     return (

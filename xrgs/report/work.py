@@ -1,4 +1,4 @@
-"""Tables of what each training did, what it left out, and what that would have cost.
+"""Tables of what each training did, what work it left out, and the cost of that work.
 
 They show why a component changes nothing or makes results worse, and where a run saves time. Counts
 are of the history of a cell; the totals of `xrgs.training.work.StepWork` and the seconds of each
@@ -60,7 +60,7 @@ _KINDS = {
     "skipped_backward": _Kind(
         "Backward passes and updates",
         "s",
-        "at the mean time of those that the run did, of backward pass and optimizer",
+        "at the run's mean time of a backward pass and an update",
     ),
     "pixels": _Kind(
         "Pixels of the photographs that were not rendered",
@@ -75,12 +75,12 @@ _KINDS = {
     "tiles": _Kind(
         "Pixels of tiles that a visible Gaussian does not reach",
         "evaluations",
-        "one for each, which is exact but for the tiles at the edges",
+        "one for each, exact but for the tiles at the edges",
     ),
     "blocks": _Kind(
         "Pixels of such tiles in blocks that are not reached, or saturated",
         "evaluations",
-        "one for each, which is exact; the two are not counted apart",
+        "one for each, exact; the two are not counted apart",
     ),
     "sh": _Kind(
         "Harmonics of visible Gaussians in bands that were not on",
@@ -193,7 +193,7 @@ def skipped(cells: pd.DataFrame, done: Mapping[str, DoneCell]) -> pd.DataFrame:
 def _left_out(
     work: Mapping[str, float], base: Mapping[str, float]
 ) -> Iterator[tuple[str, float, float, float]]:
-    """Yield each kind: how many were left out, of how many, and their cost."""
+    """Yield the kinds of work: name, number left out, number in all, and cost."""
 
     def total(name: str) -> float:
         return work.get(name, math.nan)
@@ -274,7 +274,7 @@ def skipped_table(
 
 
 def _texts(row: pd.Series) -> tuple[str, str]:
-    """Return the number that was left out, and what it would have cost."""
+    """Return the number that was left out and its cost as texts."""
     number = f"{_short(row['number'])} ({_share(row['share'])})"
     if math.isnan(row["cost"]):
         return number, _UNKNOWN

@@ -30,7 +30,7 @@ _LARGE = 1e7
 
 
 class Change(NamedTuple):
-    """One row of `Comparison.means` or `Comparison.per_scene`, whose columns are the fields."""
+    """One row of `Comparison.means` or `Comparison.per_scene`: each field is a column."""
 
     base: float
     value: float

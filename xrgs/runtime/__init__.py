@@ -1,1 +1,1 @@
-"""Handles what concerns the process itself: cores, threads, signals, streams and progress."""
+"""The process and its surroundings: cores, threads, signals, streams, progress and leases."""

@@ -26,8 +26,8 @@ An owner is alive or dead by these rules:
   others.
 - The owner of a file that can't be read now counts as alive.
 
-Watching does not wait: `acquire` and `holders` look at a file, and what they saw counts at the
-next look of this process. Between two looks at most `BEAT_S` seconds are counted, so that an owner
+Watching does not wait: `acquire` and `holders` look at a file, and compare it with the last look of
+this process. Between two looks at most `BEAT_S` seconds are counted, so that an owner
 is not dead before its next heartbeat when a file server has answered nobody for a while.
 """
 
@@ -65,7 +65,7 @@ BEAT_S = 30.0
 SILENT_S = 600.0
 #: Seconds that a watched file has to stand still: two heartbeats, and a margin.
 CONFIRM_S = 65.0
-#: Seconds that a file may be dated in the future: file servers and caches are not exact.
+#: The most seconds into the future of a file's date that are an inexact clock or a cache.
 _AHEAD_S = 5.0
 #: Seconds that a lease may be without its owner's signature.
 _UNSIGNED_S = 30.0
@@ -77,11 +77,11 @@ _BYTES, _MAX_BYTES = 1024, 4096
 
 
 class _State(Enum):
-    """What is known of the owner of a lease's file."""
+    """The state of the owner of a lease's file."""
 
     ALIVE = 1
     WATCHED = 2
-    """Counts as alive until the file was watched for long enough."""
+    """Counts as alive until it was watched for long enough."""
     DEAD = 3
     RELEASED = 4
     """The file is gone, or is another owner's now."""
@@ -212,7 +212,7 @@ def waited_for(folder: Path, name: str) -> Iterator[Lease]:
 
 
 def free_if_dead(folder: Path, name: str) -> None:
-    """Remove what the dead owners of a lease have left, as far as this process has watched them."""
+    """Remove the files of dead owners of a lease, if this process has watched them long enough."""
     if any(_parts(file)[0] == name for file in _files(folder)):
         lease = acquire(folder, name)
         if lease is not None:
@@ -225,12 +225,9 @@ def names(folder: Path) -> set[str]:
 
 
 def holders(folder: Path) -> dict[str, str]:
-    """Describe the owner of each lease in a folder that is not known to be dead.
+    """Describe the owner of each lease in a folder, without owners that are known to be dead.
 
-    Owners that may be dead are watched from then on.
-
-    Args:
-        folder: The folder of the leases, which need not exist.
+    Owners that may be dead are watched from then on. The folder need not exist.
 
     Returns:
         Descriptions for people, by the name of the lease.
@@ -246,7 +243,7 @@ def holders(folder: Path) -> dict[str, str]:
 
 def _silent(age: float) -> str:
     if age < 0:
-        return f", whose lease is dated {format_duration(-age)} in the future; it may be dead"
+        return f"; its lease is dated {format_duration(-age)} in the future; it may be dead"
     return f", silent for {format_duration(age)}; it may be dead"
 
 
@@ -311,7 +308,7 @@ def _look(file: Path) -> tuple[_State, float]:
     except FileNotFoundError:
         return _State.RELEASED, 0.0
     except OSError as error:
-        # A folder or a pipe is no lease: no process holds anything by it.
+        # A folder or a pipe is not a lease of any process.
         return (_State.ALIVE if is_transient(error) else _State.DEAD), 0.0
     owner = _parse(content)
     if owner is None or not owner.here:
@@ -333,7 +330,7 @@ def _judged(owner: Owner | None, age: float, status: os.stat_result, content: by
 
 @dataclass
 class _Watch:
-    """What this process has seen of a file that does not say whether its owner is alive."""
+    """The looks of this process at a file that does not tell whether its owner is alive."""
 
     seen: tuple[int, bytes]
     """The file's time, in nanoseconds, and its content."""

@@ -10,12 +10,7 @@ from contextlib import contextmanager
 
 
 def usable_cores() -> int:
-    """Count the cores that this process may run on.
-
-    Returns:
-        The size of the process's CPU affinity, which can be smaller than the machine; the number
-        of cores of the machine on systems without affinity.
-    """
+    """Count the cores that this process may run on: its CPU affinity, if the system has that."""
     if hasattr(os, "sched_getaffinity"):
         return len(os.sched_getaffinity(0))
     return os.cpu_count() or 1
@@ -30,23 +25,15 @@ def peak_rss() -> int:
 def set_passive_openmp_wait() -> None:
     """Make OpenMP's threads sleep between parallel loops; call this before torch is imported.
 
-    torch's threads are OpenMP's. By default they spin for milliseconds after each loop, in case
-    another one follows, on cores that the threads of the native kernels need in that time: on two
-    busy cores a training step took three times as long. A value of OMP_WAIT_POLICY that is already
-    in the environment is kept.
+    A value of OMP_WAIT_POLICY that is already in the environment is kept.
     """
+    # torch's threads are OpenMP's. By default they spin for milliseconds after each loop, on cores
+    # that the native kernels need then: on two busy cores a step took three times as long.
     os.environ.setdefault("OMP_WAIT_POLICY", "passive")
 
 
 def set_torch_threads(threads: int) -> int:
-    """Set the number of torch's threads.
-
-    Args:
-        threads: The number of threads; 0 for every core that this process may use.
-
-    Returns:
-        The number that torch has now.
-    """
+    """Set the number of torch's threads, 0 for every usable core; return the number."""
     import torch
 
     torch.set_num_threads(threads or usable_cores())
@@ -55,11 +42,7 @@ def set_torch_threads(threads: int) -> int:
 
 @contextmanager
 def single_torch_thread() -> Iterator[int]:
-    """Limit torch to one thread for the length of a block.
-
-    Yields:
-        The number of threads that torch had before, and has again afterwards.
-    """
+    """Limit torch to one thread during a block; yield the number before and after it."""
     import torch
 
     threads = torch.get_num_threads()

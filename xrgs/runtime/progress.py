@@ -1,20 +1,20 @@
 """Shows the progress of long work: as a bar, as lines of a log, or in a file for another process.
 
-On a terminal progress is a tqdm bar. In a log, where a bar would be a page of carriage returns, it
-is one line a minute. Inside `written_to` it is kept in a small file instead, and nothing is shown:
-the cells of a sweep may run on other machines, and one line shows many of them.
+On a terminal progress is a tqdm bar, and in a log one line a minute. Inside `written_to` it is kept
+in a small file and not shown: the cells of a sweep may run on other machines, and one line of the
+sweep shows them all.
 """
 
 from __future__ import annotations
 
 import io
-import json
 import sys
 from contextlib import contextmanager, suppress
 from contextvars import ContextVar
-from dataclasses import asdict, dataclass
-from typing import TYPE_CHECKING, Any, TypeVar
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Annotated, Any, TypeVar
 
+import msgspec
 from tqdm import tqdm
 
 from xrgs.runtime.streams import say
@@ -41,8 +41,7 @@ _BAR_DELAY_S = 2.0
 _MAX_BYTES = 1 << 12
 #: The most characters of a bar's words that are shown.
 _MAX_WORD = 80
-#: Counts, and units a second, beyond this are not valid.
-_MAX_COUNT = 1 << 53
+_Count = Annotated[int, msgspec.Meta(ge=0, lt=1 << 53)]
 
 
 @dataclass
@@ -51,43 +50,43 @@ class ProgressFile:
 
     path: Path
     note: str = ""
-    """What else is to be shown of the work now; written with the next count."""
+    """More on the work, shown with the next count."""
 
 
 _file: ContextVar[ProgressFile | None] = ContextVar("file", default=None)
 
 
-@dataclass(frozen=True)
-class Progress:
+class Progress(msgspec.Struct, frozen=True):
     """How much of a piece of work is done."""
 
     what: str
     """The work, for example `training`."""
     unit: str
-    """What is counted, in the singular, for example `step`."""
-    done: int
-    total: int | None
-    """How many there are in all; None where that is not known."""
-    rate: float | None
-    """Recent units per second; None where that is not known yet."""
+    """The counted thing, in the singular, for example `step`."""
+    done: _Count
+    total: _Count | None
+    """How many there are in all; None if unknown."""
+    rate: Annotated[float, msgspec.Meta(gt=1e-15, lt=1e15)] | None
+    """Recent units per second; None if not known yet."""
     note: str = ""
-    """What else is known of the work, for example `84,000 Gaussians, loss 0.041`."""
+    """More on the work, for example `84,000 Gaussians, loss 0.041`."""
 
     @property
     def remaining_s(self) -> float | None:
-        """The estimated seconds to the end; None where total or rate are not known."""
+        """The estimated seconds to the end; None if total or rate are unknown."""
         return (self.total - self.done) / self.rate if self.total and self.rate else None
 
     @property
     def count(self) -> str:
         """A phrase such as `training 1,200 of 3,000 steps`, with the note."""
         of = "" if self.total is None else f" of {self.total:,}"
-        return f"{self.what} {self.done:,}{of} {self.unit}s" + (self.note and f", {self.note}")
+        what, unit, note = (for_line(text, _MAX_WORD) for text in (self.what, self.unit, self.note))
+        return f"{what} {self.done:,}{of} {unit}s" + (note and f", {note}")
 
     def __str__(self) -> str:
         parts = [self.count]
         if self.rate:
-            parts.append(f"{self.rate:.3g} {self.unit}s/s")
+            parts.append(f"{self.rate:.3g} {for_line(self.unit, _MAX_WORD)}s/s")
         if self.remaining_s is not None:
             parts.append(f"{format_duration(self.remaining_s)} left")
         return ", ".join(parts)
@@ -114,10 +113,10 @@ class ProgressBar(_Tqdm):
 
         Args:
             what: The work, for example `training`.
-            unit: What is counted, in the singular; `byte` is shown in kB and MB.
-            total: How many there are in all; by default the length of `items`, where they have one.
-            items: What to iterate over and count; None where `update` is called instead.
-            done: How many were done before; `items` are the others.
+            unit: The counted thing, in the singular; `byte` is shown in kB and MB.
+            total: How many there are in all; by default the length of `items`, if they have one.
+            items: Items to iterate over and count; None to call `update` instead.
+            done: How many were done before `items`.
         """
         self._file = _file.get()
         self._drawn = self._file is None and sys.stderr.isatty()
@@ -137,15 +136,7 @@ class ProgressBar(_Tqdm):
         )
 
     def display(self, msg: str | None = None, pos: int | None = None) -> Any:
-        """Show the count; tqdm calls this when an update is due, and at the end.
-
-        Args:
-            msg: tqdm's own text: None for the count, empty at the end.
-            pos: The line of the terminal, counted from the bar's own.
-
-        Returns:
-            On a terminal what tqdm returns, else None.
-        """
+        """Show the count; tqdm calls this when an update is due, and with a text at the end."""
         if self._drawn:
             draw: Callable[..., Any] = super().display
             return draw(msg, pos)
@@ -170,36 +161,22 @@ class ProgressBar(_Tqdm):
 def progress(
     items: Iterable[_T], what: str, unit: str, total: int | None = None, *, done: int = 0
 ) -> Iterator[_T]:
-    """Iterate over items while a `ProgressBar` counts them.
-
-    Args:
-        items: What to iterate over.
-        what: The work, for example `training`.
-        unit: What an item is, in the singular.
-        total: How many there are in all; by default the length of `items`, where they have one.
-        done: How many were done before; `items` are the others.
-
-    Returns:
-        An iterator over the same items.
-    """
+    """Iterate over items while a `ProgressBar`, which has the same arguments, counts them."""
     return iter(ProgressBar(what, unit, total, items=items, done=done))
 
 
 def _write(file: Path, now: Progress) -> None:
-    # Progress is no result: it does no harm that it can't be written, or is lost with the power.
+    # Progress is not a result: nothing is lost when it can't be written.
     with suppress(OSError):
-        write_json(file, asdict(now), durable=False)
+        write_json(file, msgspec.structs.asdict(now), durable=False)
 
 
 @contextmanager
 def written_to(file: Path) -> Iterator[ProgressFile]:
-    """Keep the progress of all bars made within a block in a file, and show none of them.
-
-    Args:
-        file: The file; it holds the latest state of the latest bar, and is removed at the end.
+    """Keep the latest state of the latest bar of a block in a file, and show no bar.
 
     Yields:
-        The file, whose note can be set.
+        The file, with a note that can be set. It is removed at the end.
     """
     target = ProgressFile(file)
     token = _file.set(target)
@@ -212,32 +189,13 @@ def written_to(file: Path) -> Iterator[ProgressFile]:
 
 
 def read(file: Path) -> Progress | None:
-    """Read the progress that another process keeps in a file.
-
-    Args:
-        file: The file given to `written_to` there.
-
-    Returns:
-        The progress; None where there is no such file or its content is not valid.
-    """
+    """Read the progress that another process keeps in a file; None if there is no valid one."""
     try:
-        content = json.loads(read_bytes(file, _MAX_BYTES))
-        texts = (content["what"], content["unit"], content.get("note", ""))
-        what, unit, note = (for_line(str(text), _MAX_WORD) for text in texts)
-        done, total, rate = content["done"], content["total"], content["rate"]
-        counts = (done,) if total is None else (done, total)
-        if not all(type(n) is int and 0 <= n < _MAX_COUNT for n in counts):
-            return None
-        known = rate is not None and 1 / _MAX_COUNT < rate < _MAX_COUNT
-        return Progress(what, unit, done, total, float(rate) if known else None, note)
-    except (OSError, ValueError, KeyError, TypeError):
+        return msgspec.json.decode(read_bytes(file, _MAX_BYTES), type=Progress)
+    except (OSError, msgspec.DecodeError, UnicodeDecodeError):
         return None
 
 
 def log_line(text: str) -> None:
-    """Print one line on stderr; on a terminal it replaces a bar on the current line.
-
-    Args:
-        text: The line, without its end; line breaks in it become spaces.
-    """
+    """Print a text as one line on stderr; on a terminal it replaces a bar on the current line."""
     say(for_line(text), sys.stderr)

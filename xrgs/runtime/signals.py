@@ -1,4 +1,4 @@
-"""Ends a command in order on Ctrl-C and SIGTERM, or lets its work choose the moment of the end."""
+"""Ends a command in order on Ctrl-C and SIGTERM, or lets its work choose when to end."""
 
 from __future__ import annotations
 
@@ -31,10 +31,7 @@ def exit_on_signal(hint: str) -> Iterator[None]:
     shell's `&`) stays ignored.
 
     Args:
-        hint: What to print after the name of the signal: what is kept, and how to continue.
-
-    Yields:
-        Nothing.
+        hint: Printed after the name of the signal: what is kept, and how to continue.
 
     Raises:
         SystemExit: A signal arrived; the exit code is 128 plus its number, as shells report it.
@@ -50,7 +47,7 @@ def exit_on_signal(hint: str) -> Iterator[None]:
 
 
 class StopRequest:
-    """Turns SIGTERM into an exception, which work can put off until it has kept its state."""
+    """Turns SIGTERM into an exception that work can put off until it has kept its state."""
 
     def __init__(self) -> None:
         self.received = False
@@ -63,11 +60,7 @@ class StopRequest:
 
     @contextmanager
     def deferred(self) -> Iterator[None]:
-        """Let the signal raise nothing during a block, which looks at `received` by itself.
-
-        Yields:
-            Nothing.
-        """
+        """Let the signal raise nothing during a block, which looks at `received` itself."""
         self._is_deferred = True
         try:
             yield

@@ -22,12 +22,11 @@ if TYPE_CHECKING:
 def say(text: str, stream: TextIO | None = None) -> None:
     """Print a text; on a terminal it replaces a bar on the current line.
 
-    Nothing in the text is obeyed by the terminal, and a character that the stream's encoding lacks
-    is written as its number.
+    The terminal obeys no code in the text. A character that the stream's encoding lacks is written
+    as its number.
 
     Args:
-        text: The text, without its end. In a text of several lines, names from elsewhere must have
-            gone through `for_line`.
+        text: The text. In a text of several lines, names must have gone through `for_line`.
         stream: Where to print it; None for stdout.
     """
     stream = sys.stdout if stream is None else stream
@@ -38,11 +37,7 @@ def say(text: str, stream: TextIO | None = None) -> None:
 
 
 def log_to_stderr(level: int = logging.WARNING) -> None:
-    """Write what this process logs to stderr, each message on one line, safe for a terminal.
-
-    Args:
-        level: The least severe level that is written.
-    """
+    """Write log messages of at least this level to stderr, each on one line."""
     handler = logging.StreamHandler()
     handler.setFormatter(_OneLineFormatter("%(asctime)s %(message)s"))
     logging.basicConfig(handlers=[handler], level=level)
@@ -62,7 +57,7 @@ class _WriteErrorsIgnored(io.FileIO):
     """A file descriptor that reports every write as complete, whether it succeeded or not."""
 
     def write(self, data: ReadableBuffer) -> int:
-        """Write what can be written, and return the size of all of it."""
+        """Write as much as possible, and return the size of all data."""
         with suppress(OSError):
             return super().write(data)
         return memoryview(data).nbytes
@@ -71,11 +66,11 @@ class _WriteErrorsIgnored(io.FileIO):
 def ignore_broken_pipe() -> None:
     """Make stdout and stderr ignore write errors from now on.
 
-    What is printed to a closed terminal, a pipe without a reader or a full disk is lost, and the
-    work goes on. A stream that something else has put in the place of Python's own is left alone.
+    Text to a closed terminal, a pipe without a reader or a full disk is lost, and the work goes on.
     """
     for name in ("stdout", "stderr"):
         stream = getattr(sys, name)
+        # A stream that something else has put in the place of Python's own is left alone.
         if stream is not None and stream is getattr(sys, f"__{name}__"):
             setattr(sys, name, _without_write_errors(stream))
 

@@ -58,7 +58,7 @@ class TextTable:
     context: str = ""
     """Subtitle: steps, sizes, machine."""
     name: str = ""
-    """What LaTeX's label is made of; the title where it is empty."""
+    """The text of LaTeX's label; the title where it is empty."""
     spans: tuple[tuple[str, int], ...] = ()
     """Headings over the columns, from the left, with how many each is over; empty for none."""
     best: frozenset[tuple[int, int]] = frozenset()

@@ -22,16 +22,15 @@ class CellSpec:
     """One combination of the command line's axes."""
 
     label: str
-    """What is compared: the ablation, component values that were set by hand, and the ablation
-    that it takes a number of Gaussians from."""
+    """The ablation, component values that were set by hand, and the reference of a count match."""
     condition: str
-    """Values of the other swept axes, except scene and replicate; equal for a label and its
-    baseline. A replicate is a pair of `variant.seed`, which draws the HR views, and `seed`."""
+    """Values of the other swept axes, equal for a label and its baseline. Scene and replicate (the
+    pair of `variant.seed`, which draws the HR views, and `seed`) are not among them."""
     shared: tuple[str, ...]
     """Overrides that the matching baseline has too."""
     changes: tuple[str, ...]
-    """Overrides that make this another program than the baseline; `matched_to` is among them only
-    where the ablation takes a number of Gaussians from another cell."""
+    """Overrides that the baseline lacks; `matched_to` is among them only if the ablation is
+    count-matched."""
 
     @property
     def matched_to(self) -> str | None:
@@ -41,7 +40,7 @@ class CellSpec:
 
     @property
     def without_match(self) -> CellSpec:
-        """The combination without `matched_to`; that of the baseline has no changes left."""
+        """The combination without `matched_to`; for the baseline, without any change."""
         kept = tuple(text for text in self.changes if _name(text) != "matched_to")
         return replace(self, changes=() if self.label == BASELINE else kept)
 
@@ -52,12 +51,9 @@ class CellSpec:
 
 
 def effective(arguments: Sequence[str]) -> list[str]:
-    """Return the arguments without those that a later one of the same key replaces.
+    """Return Hydra overrides without the ones that a later override of the same key replaces.
 
-    The axes of a sweep's file come first, and the command line may name some of them again.
-
-    Args:
-        arguments: Hydra overrides.
+    The axes of a sweep's file come first, and the command line may set some of them again.
     """
     overrides = OverridesParser.create().parse_overrides(list(arguments))
     last = {override.get_key_element(): override.input_line for override in overrides}
@@ -111,7 +107,7 @@ def _values(override: Override) -> list[str]:
 
 
 def _name(text: str) -> str:
-    """Return the key of an override, without what stands before it in Hydra's grammar."""
+    """Return the key of an override without the signs of Hydra's grammar before it."""
     return text.partition("=")[0].lstrip("+~")
 
 
@@ -121,13 +117,13 @@ def _is_change(name: str) -> bool:
 
 
 def _is_condition(name: str) -> bool:
-    """Return whether a swept key is part of the condition; scenes, replicates have own columns."""
+    """Return whether a swept key is part of the condition; tables have columns for the others."""
     group = name.partition(".")[0]
     return not _is_change(name) and group not in {"scene", "seed"} and name != "variant.seed"
 
 
 def _label(changes: Iterable[tuple[str, str]]) -> str:
-    """Return what changes as text; `matched_to` joins it where it turns out to have a meaning."""
+    """Return the changes as text; `xrgs.sweep.plan.planned` adds the reference of a count match."""
     parts = [
         value.strip("[]").replace(",", "+").replace(" ", "").replace("'", "")
         if key == "ablation"

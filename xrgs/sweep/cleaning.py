@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from functools import partial
 from typing import TYPE_CHECKING
 
-from xrgs.capture.failures import FAILED_PREFIX
+from xrgs.capture import folders
 from xrgs.errors import StoreError, XrgsError
 from xrgs.experiment import trimming
 from xrgs.experiment.attempts import remove_cell
@@ -48,19 +48,19 @@ class Item:
     """One thing that is removed or trimmed."""
 
     kind: str
-    """What it is, in the plural: `cells of old code`."""
+    """The kind of thing, in the plural: `cells of old code`."""
     name: str
     """Its name for people."""
     bytes: int
     lease: str | None
     """The name of the lease to hold while it is removed; None for none."""
-    act: Callable[[], str]
-    """Removes it; returns why it was left, or an empty text."""
+    act: Callable[[], str | None]
+    """Removes it; returns why it was left, if it was."""
 
 
 @dataclass(frozen=True)
 class Plan:
-    """What is to be removed or trimmed, and what is left alone."""
+    """Things to remove or trim, and notes on things that are left alone."""
 
     verb: str
     """`remove` or `trim`."""
@@ -108,7 +108,7 @@ def plan_trim(
     left = len(chosen) - len(done)
     notes = [f"left alone, not done: {counted(left, 'cell')}"] if left else []
     items = [
-        Item("cells", cell.name, size, cell.id, partial(_trim_cell, cell))
+        Item("cells", cell.name, size, cell.id, cell.folder.trim)
         for cell in done
         if (size := _heavy_bytes(cell))
     ]
@@ -122,7 +122,7 @@ def plan_trim(
                 f"left alone, with cells that are not done: {counted(len(kept), 'variant')}"
             )
         items += [
-            Item("variants", name, size, None, partial(_trim_variant, store, name))
+            Item("variants", name, size, None, partial(trimming.trim_variant, store.variants, name))
             for name in sorted(used - needed)
             if (size := trimming.image_bytes(store.variants, name))
         ]
@@ -130,16 +130,16 @@ def plan_trim(
 
 
 def plan_gc(store: Store, cells: Sequence[CellRow], of: Sequence[str]) -> Plan:
-    """Plan to remove what no sweep of the installed code needs.
+    """Plan to remove everything that no sweep of the installed code needs.
 
     Args:
         store: The store.
         cells: All cells of the store.
-        of: Names of `GARBAGE`: cells of old code, failed tries (of cells and of scenes), folders
-            that were set aside, and variants of which no cell is left.
+        of: Names of `GARBAGE`: cells of old code, failed cells and scenes, folders that were set
+            aside, and variants without a cell.
 
     Raises:
-        XrgsError: A name is none of these.
+        XrgsError: A name is not one of these.
         StoreError: A folder of the store can't be listed.
     """
     for name in of:
@@ -153,11 +153,13 @@ def plan_gc(store: Store, cells: Sequence[CellRow], of: Sequence[str]) -> Plan:
     items = [*_removals(store, "cells of old code", old)]
     items += _removals(store, "failed cells", failed)
     if "failed" in of:
-        names = [n for n in _names(store.variants) if n.startswith(FAILED_PREFIX)]
-        items += _folders("failed scenes", store.variants, names)
+        scenes = [path for path in _paths(store.variants) if folders.is_failed(path.name)]
+        items += _folders("failed scenes", scenes)
     if "aside" in of:
-        items += _aside_items(store.cells_folder, leased=True)
-        items += _aside_items(store.variants, leased=False)
+        for above in (store.cells_folder, store.variants):
+            aside = [path for path in _paths(above) if _ASIDE.fullmatch(path.name)]
+            leased = above == store.cells_folder
+            items += _folders("folders that were set aside", aside, leased=leased)
     notes = [*_recorded([cell for cell in cells if cell.id in gone])]
     if "variants" in of:
         found, why = _orphans(store, cells, gone)
@@ -173,7 +175,7 @@ def carry_out(store: Store, plan: Plan) -> tuple[int, list[str]]:
         The number of bytes that were freed, and a line for each item that was left, with the
         reason.
     """
-    freed, left = 0, []
+    freed, left = 0, list[str]()
     for item in plan.items:
         try:
             why = _under_lease(store, item)
@@ -186,7 +188,7 @@ def carry_out(store: Store, plan: Plan) -> tuple[int, list[str]]:
     return freed, left
 
 
-def _under_lease(store: Store, item: Item) -> str:
+def _under_lease(store: Store, item: Item) -> str | None:
     if item.lease is None:
         return item.act()
     held = lease.acquire(store.leases, item.lease)
@@ -207,7 +209,7 @@ def _without_running(cells: Iterable[CellRow]) -> tuple[list[CellRow], list[str]
 
 
 def _recorded(cells: Sequence[CellRow]) -> list[str]:
-    """Return a note of the done cells whose numbers reports of sweeps would lose."""
+    """Return a note on done cells that reports of sweeps would lose."""
     done = [cell for cell in cells if cell.state.name == "done" and cell.sweeps]
     if not done:
         return []
@@ -241,68 +243,35 @@ def _heavy_bytes(cell: CellRow) -> int:
         return 0
 
 
-def _trim_cell(cell: CellRow) -> str:
-    cell.folder.trim()
-    return ""
+def _paths(folder: Path) -> list[Path]:
+    return [folder / name for name in list_folder(folder) if is_name(name)]
 
 
-def _trim_variant(store: Store, variant_id: str) -> str:
-    trimming.trim_variant(store.variants, variant_id)
-    return ""
-
-
-def _remove_folder(folder: Path) -> str:
-    remove_path(folder)
-    return ""
-
-
-def _names(folder: Path) -> list[str]:
-    return [name for name in list_folder(folder) if is_name(name)]
-
-
-def _folders(kind: str, above: Path, names: Iterable[str]) -> Iterator[Item]:
-    for name in names:
-        folder = above / name
-        act = partial(_remove_folder, folder)
-        yield Item(kind, f"{above.name}/{name}", size_of(folder) or 0, None, act)
-
-
-def _aside_items(above: Path, *, leased: bool) -> Iterator[Item]:
-    """Yield the folders that were set aside; a cell's lease is held while its folder is removed."""
-    for name in _names(above):
-        found = _ASIDE.fullmatch(name)
-        if found is None:
-            continue
-        held = (found["id"] or found["rest"]) if leased else None
-        folder = above / name
-        act = partial(_remove_folder, folder)
-        shown = f"{above.name}/{name}"
-        yield Item("folders that were set aside", shown, size_of(folder) or 0, held, act)
+def _folders(kind: str, folders: Iterable[Path], *, leased: bool = False) -> Iterator[Item]:
+    """Yield folders to remove; with `leased`, each under the lease that its name contains."""
+    for folder in folders:
+        found = _ASIDE.fullmatch(folder.name) if leased else None
+        held = (found["id"] or found["rest"]) if found else None
+        name, size = f"{folder.parent.name}/{folder.name}", size_of(folder) or 0
+        yield Item(kind, name, size, held, partial(remove_path, folder))
 
 
 def _orphans(
     store: Store, cells: Sequence[CellRow], gone: set[str]
 ) -> tuple[list[Item], list[str]]:
-    """Return the variants of which no cell is left, and why others are left alone.
-
-    A running sweep has variants that none of its cells uses yet.
-    """
+    """Return the variants without a cell, and notes on variants that are left alone."""
+    # A running sweep has variants that none of its cells uses yet.
     if any(cell.state.name == "running" for cell in cells):
         return [], [_RUNNING]
     used = {cell.variant_id for cell in cells if cell.id not in gone}
     if None in used:
         return [], ["variants are left alone: the identity of a cell can't be read"]
     orphans, new = [], 0
-    for name in _names(store.variants):
-        if name.startswith((".", FAILED_PREFIX)) or "-" not in name:
+    for path in _paths(store.variants):
+        if not folders.is_variant(path.name) or folders.id_of(path.name) in used:
             continue
-        if name.removeprefix(trimming.TRIMMED_PREFIX) in used:
-            continue
-        try:
-            is_new = time.time() - (store.variants / name).lstat().st_mtime < _NEW_S
-        except OSError:
-            is_new = True
+        is_new = time.time() - path.stat().st_mtime < _NEW_S
         new += is_new
-        orphans += [] if is_new else [name]
+        orphans += [] if is_new else [path]
     notes = [f"left alone, new and without a cell: {counted(new, 'variant')}"] if new else []
-    return [*_folders("variants without a cell", store.variants, orphans)], notes
+    return [*_folders("variants without a cell", orphans)], notes

@@ -1,7 +1,7 @@
-"""Checks the cells of a plan that take a number of Gaussians from another cell, its reference.
+"""Checks the count-matched cells of a plan.
 
-Such a cell is a control for a claim of efficiency: the baseline, or another base, with as many
-Gaussians as the reference has (`xrgs.training.count_matching`).
+A count-matched cell is a control for a claim of efficiency: it has as many Gaussians as another
+cell, its reference (`xrgs.training.count_matching`).
 """
 
 from __future__ import annotations
@@ -18,15 +18,10 @@ if TYPE_CHECKING:
 
 
 def check_reference(cell: PlannedCell, reference: PlannedCell) -> None:
-    """Refuse a control whose count can't be known.
-
-    Args:
-        cell: A cell that takes a count.
-        reference: The cell that it takes it from.
+    """Refuse the baseline as a control, and a reference that is count-matched itself.
 
     Raises:
-        XrgsError: The control is the baseline itself, which every cell is compared with; or its
-            reference takes a count as well.
+        XrgsError: The message names the reference and says what to do.
     """
     key = f"matched_to={cell.conf.matched_to}"
     if not cell.spec.changes:
@@ -42,15 +37,14 @@ def check_reference(cell: PlannedCell, reference: PlannedCell) -> None:
 
 
 def check_effect(combinations: Iterable[CellSpec], plan: Iterable[PlannedCell]) -> None:
-    """Refuse a `matched_to` of the command line that nothing is matched to.
+    """Refuse a `matched_to` without effect, and a count-matched cell without a reference.
 
     Args:
         combinations: The combinations of the command line's axes, with `matched_to`.
         plan: The cells that are planned for them.
 
     Raises:
-        XrgsError: No planned cell takes its count from the cell that is named, or a planned cell
-            takes one and is given none.
+        XrgsError: The message names the value of `matched_to`.
     """
     plan = list(plan)
     for cell in plan:
@@ -70,16 +64,10 @@ def check_effect(combinations: Iterable[CellSpec], plan: Iterable[PlannedCell]) 
 
 
 def mixed_prune_rules(plan: Sequence[PlannedCell]) -> list[str]:
-    """Return a line for each kind of control whose rule against large Gaussians is another one.
+    """Return a line for each label whose controls prune by another rule than their references.
 
-    The rule (`splat.densify.prune_scale3d`) changes scores and counts more than most ablations do,
-    so that a difference between the two cells can't be laid to anything else.
-
-    Args:
-        plan: All cells.
-
-    Returns:
-        The lines, without those of further scenes, replicates and conditions.
+    The rule (`splat.densify.prune_scale3d`) changes scores and counts more than most ablations, and
+    would hide what is to be compared.
     """
     cells = {cell.spec: cell for cell in plan}
     lines: dict[str, None] = {}

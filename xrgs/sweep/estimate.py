@@ -1,4 +1,4 @@
-"""Estimates what a cell will take from the nearest finished cell of the store.
+"""Estimates the time, memory and disk of a cell from the nearest finished cell of the store.
 
 The config of the nearest cell differs in the fewest keys; another variant, processor or backend
 counts as several keys. Seconds, memory and disk are scaled by steps, pixels and the budget of
@@ -16,6 +16,7 @@ from statistics import fmean
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from xrgs.capture import frozen
+from xrgs.capture.folders import trimmed_folder
 from xrgs.errors import StoreError, XrgsError
 from xrgs.experiment.provenance import processor, this_processor
 from xrgs.splat.backend import resolve_backend
@@ -50,7 +51,7 @@ class _Sizes(NamedTuple):
 
 @dataclass(frozen=True)
 class Cost:
-    """What a cell is expected to take."""
+    """The expected time, memory and disk of a cell."""
 
     seconds: float
     """Time from its start to its end: training, loading and scoring."""
@@ -84,7 +85,7 @@ class CostEstimator:
     """Estimates the cost of cells from the finished cells of a store."""
 
     def __init__(self, store: Store) -> None:
-        """Read the newest finished cells; what can't be read is left out."""
+        """Read the newest finished cells; a cell that can't be read is left out."""
         self._store = store
         self._finished: list[_Finished] = []
         for cell in _newest(store):
@@ -121,7 +122,7 @@ class CostEstimator:
         )
 
     def cost(self, conf: Conf, variant_id: str | None, threads: int) -> Cost | None:
-        """Return what a cell is expected to take; None where no finished cell tells.
+        """Return the expected cost of a cell; None if the store has no finished cell.
 
         Args:
             conf: The cell's config.
@@ -189,7 +190,7 @@ def _sizes(variants: Path, variant_id: str, views: str) -> _Sizes:
     """
     folder = variants / variant_id
     if not folder.is_dir():
-        folder = variants / f"trimmed-{variant_id}"
+        folder = trimmed_folder(variants, variant_id)
     manifest = frozen.read_manifest(folder)
     tag = {"hr_only": "HR", "lr_only": "LR"}.get(views)
     splits = ("train", "original") if views == "all_hr" else ("train",)  # originals replace

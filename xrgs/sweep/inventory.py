@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
 #: The most names of scenes or labels that a line lists.
 _MAX_LISTED = 6
-#: What is shown of a cell's provenance; the rest is in `provenance.json`.
+#: Entries of a cell's provenance that are shown; the others are in `provenance.json`.
 _PROVENANCE = (
     *("started", "xrgs", "git", "git_diff_sha256", "backend", "threads", "cpu", "platform"),
     "machines_in_turn",
@@ -101,7 +101,7 @@ def _date(seconds: float | None) -> str:
 
 
 def show(store: Store, cell: CellRow) -> str:
-    """Describe one cell: what it is, how it differs from its baseline, and what it gave."""
+    """Describe one cell: its state, its differences from the baseline, scores and files."""
     base_id = cell.recorded.baseline_id if cell.recorded else None
     sections = {
         "": _head(cell),

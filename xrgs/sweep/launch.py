@@ -142,14 +142,10 @@ def capacity(launcher: DictConfig, threads: int, machine: int) -> Capacity:
 
 
 def check(config: DictConfig, cell: DictConfig | None = None) -> None:
-    """Refuse a launcher that is not installed, and one that is chosen for a single cell.
-
-    Args:
-        config: The sweep's config, composed from the command line.
-        cell: The config of one cell. Hydra would ignore a launcher that only this one names.
+    """Refuse a launcher that is not installed, and a cell with a launcher of its own.
 
     Raises:
-        XrgsError: The launcher is not installed, or the cell names another launcher.
+        XrgsError: The message says what to install, or where to choose the launcher.
     """
     launcher = OmegaConf.to_container(config.hydra.launcher, resolve=False)
     if isinstance(launcher, dict) and "install" in launcher:  # see hydra_plugins/xrgs_sweeper.py
@@ -164,21 +160,14 @@ def check(config: DictConfig, cell: DictConfig | None = None) -> None:
 
 
 class _JobConfigLoader:
-    """Gives each job Hydra's own settings and what it trains, without composing any config.
+    """Gives each job Hydra's own settings and the id of its cell, and composes no config.
 
     Launchers ask the config loader for a job's config, on the machine that runs the job. Hydra's
     loader would compose the cell's config a second time.
     """
 
     def load_sweep_config(self, master_config: DictConfig, overrides: list[str]) -> DictConfig:
-        """Return the config of one job.
-
-        Args:
-            master_config: The sweep's config.
-            overrides: `cell=<cell id>`, `store=<full path>` and `name=<for people>`.
-
-        Returns:
-            The sweep's `hydra` node, and these three.
+        """Return the sweep's `hydra` node with `cell` (its id), `store` and `name` of one job.
 
         Raises:
             XrgsError: The session's folder is no longer there. Hydra would make it again.
@@ -215,10 +204,7 @@ class Launches:
         self._suspects: set[str] = set()
 
     def _begin(self, store: Store) -> SweepSession:
-        """Create the session's folder, under a name that is the same for every job.
-
-        In a job on another machine `now` would be another time, and `.` another folder.
-        """
+        """Create the session's folder, and give its full path to every job."""
         folder = _create_unique(Path(self._config.hydra.sweep.dir).absolute(), store)
         self._set("sweep.dir", escape_interpolations(str(folder)))
         session = SweepSession(folder)
@@ -236,10 +222,6 @@ class Launches:
 
     def launch(self, cells: Iterable[PlannedCell], store: Store) -> dict[str, str]:
         """Launch cells that have an identity, the longest first, and wait for them.
-
-        Args:
-            cells: The cells.
-            store: The store.
 
         Returns:
             The outcome of each cell's job by the cell's id: what `run_job` returned, `LOST` if the
@@ -351,11 +333,7 @@ def _first_line(error: Exception) -> str:
 
 
 def _create_unique(preferred: Path, store: Store) -> Path:
-    """Create a folder, or one with a number appended if another call has it already.
-
-    Raises:
-        XrgsError: The folder that it is to be in can't be made.
-    """
+    """Create a folder, with a number appended to its name if another call has the name already."""
     home = store.path.absolute()
     try:
         # The store itself is not made again: it may have been moved since the plan.
@@ -378,10 +356,7 @@ def _create_unique(preferred: Path, store: Store) -> Path:
 
 
 def _hand_over(cell: PlannedCell, threads: int, store: Store) -> list[str]:
-    """Write what a job on any machine needs into the cell's folder; return the job's overrides.
-
-    Paths are written in full, the backend is chosen, and the job has its share of the cores.
-    """
+    """Write a cell's config for a job on any machine; return the overrides of the job."""
     if cell.identity is None or cell.cell_id is None:
         raise ValueError(f"{cell.name}: launched without an identity")
     home, scene = store.path.absolute(), cell.conf.scene
@@ -393,7 +368,7 @@ def _hand_over(cell: PlannedCell, threads: int, store: Store) -> list[str]:
         threads=cell.conf.threads or threads,
         scene=replace(scene, path=path),
     )
-    # What this process has watched for long enough need not be watched again by the job.
+    # The job need not watch a dead owner that this process has watched for long enough.
     lease.free_if_dead(store.leases, cell.cell_id)
     plan_cell(store.cell(cell.cell_id), conf, cell.identity)
     return [f"cell={cell.cell_id}", f"store={home}", f"name={cell.name}"]

@@ -337,7 +337,7 @@ class SweepMonitor:
 
 
 def _stamp(file: Path) -> _FileStamp:
-    """Return what changes when a file is written again; None if there is no file."""
+    """Return a stamp that changes when a file is written again; None if there is no file."""
     try:
         status = file.lstat()
     except OSError:

@@ -1,4 +1,4 @@
-"""The planned cells of a study: their settings, their states, and what is left to do."""
+"""The planned cells of a study: their settings, states and costs, and the cells left to train."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ class PlannedCell:
     remembered: bool = False
     """Whether the store keeps the error of its scene, so that the scene is not tried again."""
     cost: Cost | None = None
-    """What the cell is expected to take; None without a finished cell to go by."""
+    """The expected time, memory and disk; None if the store has no finished cell."""
 
     @property
     def seconds(self) -> float | None:
@@ -94,7 +94,7 @@ class PlannedCell:
 def planned(spec: CellSpec, conf: Conf) -> PlannedCell:
     """Return a planned cell; add to label and condition what only the config tells.
 
-    The label names the cell whose number of Gaussians is matched. The condition names the scored
+    The label names the reference of a count-matched cell. The condition names the scored
     views if they are not test views, so that nobody takes their scores for scores of test views.
     """
     said = spec.condition
@@ -128,7 +128,7 @@ def identified(cell: PlannedCell, store: Store, holders: Mapping[str, str]) -> P
 
 
 def estimated(plan: Sequence[PlannedCell], past: CostEstimator, threads: int) -> list[PlannedCell]:
-    """Return the cells with what each one is expected to take, as far as that is known.
+    """Return the cells with their costs, as far as known.
 
     Args:
         plan: The cells.
@@ -233,7 +233,7 @@ def expected_use(plan: Sequence[PlannedCell], past: int) -> str:
     """Return a line on the memory and the disk that the cells will take; empty if unknown.
 
     Args:
-        plan: All cells, with what each one is expected to take.
+        plan: All cells, with their costs.
         past: Number of finished cells that the estimates are from.
     """
     costs = [cell.cost for cell in left_to_train(plan) if cell.cost]

@@ -1,14 +1,13 @@
 """Trains a finished cell again from its folder alone, and compares the results.
 
 The cell's config says how to train, and its identity names the variant to train on. Differences of
-the program, its libraries and the machine are reported before the training; they are the cause if
-the numbers differ.
+the program, its libraries and the machine are reported before the training: they explain other
+numbers.
 """
 
 from __future__ import annotations
 
 import math
-import re
 from dataclasses import dataclass
 from itertools import count
 from pathlib import Path
@@ -21,7 +20,7 @@ from xrgs.errors import XrgsError
 from xrgs.experiment import provenance
 from xrgs.experiment.attempts import begin_attempt, plan_cell
 from xrgs.experiment.cell_folder import CellFolder
-from xrgs.experiment.identity import cell_id, cell_identity
+from xrgs.experiment.identity import cell_identity
 from xrgs.experiment.store import Store
 from xrgs.runtime.machine import usable_cores
 from xrgs.runtime.progress import log_line
@@ -47,8 +46,6 @@ _RESULTS = ("scores.csv", "history.csv", "splats.ply")
 _COUNTS = ("steps", "gaussians", "evaluations", "grow_grad2d")
 #: The most characters of a value that differs.
 _MAX_VALUE = 60
-_ID = re.compile(r"[0-9a-f]{16}")
-_VARIANT = re.compile(rf"{_ID.pattern}-{_ID.pattern}")
 
 
 @dataclass(frozen=True)
@@ -58,7 +55,7 @@ class RerunResult:
     folder: CellFolder
     """The folder of the cell that was trained again."""
     before: list[str]
-    """Differences that were known before the training: of code, libraries and machine."""
+    """Differences of code, libraries and machine, known before the training."""
     differences: list[str]
     """Differences of the results; none if they are equal bit for bit."""
 
@@ -86,21 +83,20 @@ def rerun(
     Args:
         folder: The cell's folder, in a store or elsewhere.
         out: Folder to write to; by default `<folder>.rerun-1`, or the next free number.
-        store: The store that has the cell's variant, or in which it is built; by default the store
-            that the folder is in. The config's own store is not used: the folder may come from
-            another person.
+        store: The store that has the cell's variant, or in which the variant is built; by default
+            the store that the folder is in.
         threads: Number of threads; by default as many as the cell was trained with. No result
             should depend on it.
         photographs: Replaces the config's `scene.path`, if the variant has to be built.
-        plugins: Names of the components of other packages that may be imported. A cell that was
-            trained with one that is not named is refused: a store must not decide what is imported.
+        plugins: Names of the components of other packages that may be imported. A cell that needs
+            another one is refused: a store must not decide what is imported.
 
     Returns:
         The comparison.
 
     Raises:
-        XrgsError: The folder holds no finished cell, or a config with keys that there are no more;
-            the variant is missing and can't be built again; or the training failed.
+        XrgsError: The folder has no finished cell, or a config with unknown keys; the variant is
+            missing and can't be built again; or the training failed.
     """
     try:
         return _rerun(folder, out, store, threads, photographs, plugins)
@@ -129,7 +125,7 @@ def _rerun(
     now = cell_identity(conf, identity.variant)
     before = [
         *_newer_keys(added),
-        *_own_contradictions(original, identity, now, added),
+        *_damage(original),
         *_other_program(original, conf, now),
     ]
     title = "differences from when the cell was trained"
@@ -141,10 +137,7 @@ def _rerun(
 
 
 def _read(original: CellFolder) -> tuple[Conf, Identity, dict[str, Any]]:
-    """Return the cell's config, its identity, and what was added to the config.
-
-    The config has the threads that the cell was trained with.
-    """
+    """Return the cell's config, with the threads of its training, its identity, and added keys."""
     if not original.path.is_dir():
         raise XrgsError(f"rerun={original.path}: there is no such folder")
     for name in ("config.json", "identity.json", "provenance.json", "status.json"):
@@ -162,11 +155,7 @@ def _read(original: CellFolder) -> tuple[Conf, Identity, dict[str, Any]]:
 
 
 def _check_plugins_allowed(original: CellFolder, conf: Conf, allowed: Sequence[str]) -> None:
-    """Refuse a cell whose config names a plugin that the user has not named.
-
-    Raises:
-        XrgsError: It names one; the message says what to add to the command.
-    """
+    """Refuse a cell with a plugin that the user has not named; the message says what to add."""
     names = set(conf.components.plugins)
     if not names <= set(allowed):
         text = ",".join(sorted(names))
@@ -178,31 +167,17 @@ def _check_plugins_allowed(original: CellFolder, conf: Conf, allowed: Sequence[s
 
 
 def _newer_keys(added: Mapping[str, Any]) -> Iterator[str]:
-    """Yield a line about the keys that the cell's config lacks, which is older than they are."""
+    """Yield a line on the keys that are newer than the cell's config."""
     if added:
         values = ", ".join(f"{key}={value}" for key, value in added.items())
         yield f"config.json lacks newer keys; their values in the baseline are taken: {values}"
 
 
-def _own_contradictions(
-    original: CellFolder, then: Identity, now: Identity, added: Mapping[str, Any]
-) -> Iterator[str]:
-    """Yield contradictions between the folder's own files, which somebody must have changed.
-
-    Its identity lacks the keys that were added to its config, too.
-    """
+def _damage(original: CellFolder) -> Iterator[str]:
+    """Yield a line on a folder with files that have changed since the cell finished."""
     state = original.state()
     if state.name != "done":
         yield f"the folder: {state.name}: {state.reason}"
-    named = original.id.partition(".")[0]
-    if _ID.fullmatch(named) and cell_id(then) != named:
-        yield f"the folder: identity.json is that of cell {cell_id(then)}, not of {named}"
-    not_in_config = {"arithmetic", "code", "variant"}
-    newer = {f"{key}: None -> {_short(value)}" for key, value in added.items()}
-    before, after = (_without(msgspec.to_builtins(one), not_in_config) for one in (then, now))
-    for line in _changes(before, after):
-        if line not in newer:
-            yield f"identity.json against config.json: {line}"
 
 
 def _other_program(original: CellFolder, conf: Conf, now: Identity) -> Iterator[str]:
@@ -241,7 +216,7 @@ def _short(value: object) -> str:
 
 
 def _store_of(folder: Path) -> Path:
-    cells = folder.resolve().parent
+    cells = folder.absolute().parent  # not resolved: `cells` may be a link to another disk
     if cells.name != "cells":
         raise XrgsError(
             f"rerun={folder} is not in a store; name the store that has its variant with store=..."
@@ -286,7 +261,7 @@ def _free_folder(out: Path | None, folder: Path) -> Path:
         XrgsError: `out` exists.
     """
     if out is None:
-        beside = folder.resolve()
+        beside = folder.absolute()
         names = (beside.with_name(f"{beside.name}.rerun-{number}") for number in count(1))
         return next(name for name in names if not name.exists())
     if out.exists():
@@ -325,12 +300,16 @@ def _differences(original: CellFolder, repeated: CellFolder) -> Iterator[str]:
         then, now = (getattr(cell.summary(), name) for cell in (original, repeated))
         if then != now:
             yield f"{name}: {_number(then)} -> {_number(now)}"
+    trimmed = original.status().trimmed
     for name in _RESULTS:
-        status = original.status()
-        then = status.files.get(name) or status.trimmed.get(name)
-        if then is None:
+        if name in trimmed:
+            then = trimmed[name].sha256
+        elif (original.path / name).is_file():
+            then = file_digest(original.path / name)
+        else:
             yield f"{name}: missing in {original.path}"
-        elif then.sha256 != file_digest(repeated.path / name):
+            continue
+        if then != file_digest(repeated.path / name):
             yield f"{name}: the bytes differ"
 
 

@@ -1,4 +1,4 @@
-"""Summarises a store: what is done, running, failed, and trained by another version of the code."""
+"""Summarises a store: its cells by state, cells of other code, failed scenes, and sizes."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from functools import partial
 from typing import TYPE_CHECKING, TypeVar
 
-from xrgs.capture.failures import FAILED_PREFIX, failed_scenes
+from xrgs.capture.folders import failed_scenes, is_variant
 from xrgs.errors import StoreError
 from xrgs.experiment.listing import STATES
 from xrgs.experiment.store import Store
@@ -29,7 +29,7 @@ _MAX_NAMED = 20
 
 @dataclass(frozen=True)
 class StoreStatus:
-    """What a store holds."""
+    """The content of a store."""
 
     path: Path
     """The store's folder."""
@@ -78,10 +78,10 @@ def read(path: Path) -> StoreStatus:
 
 
 class _Problems(list[str]):
-    """Lines that name what can't be read."""
+    """Lines that name files and folders that can't be read."""
 
     def unless(self, look: Callable[[], _T]) -> _T | None:
-        """Return what a function reads; where it can't be read, add a line and return None."""
+        """Return the result of a function; if it can't read a file, add a line and return None."""
         try:
             return look()
         except StoreError as error:
@@ -100,9 +100,8 @@ def _aside(store: Store, problems: _Problems) -> int:
 
 
 def _variants(store: Store, problems: _Problems) -> list[str]:
-    """Return the frozen variants, without those in the making and the reports of failed ones."""
-    names = [name for name in list_folder(store.variants) if "-" in name]
-    names = [name for name in names if not name.startswith((".", FAILED_PREFIX))]
+    """Return the frozen variants, without unfinished ones and reports of failed scenes."""
+    names = [name for name in list_folder(store.variants) if is_variant(name)]
     folders = {name for name in names if (store.variants / name).is_dir()}
     problems += [f"{store.variants}/{n}: not a folder" for n in names if n not in folders]
     return [name for name in names if name in folders]

@@ -94,7 +94,7 @@ class Study:
         """The store, once it is prepared."""
 
     def run(self, arguments: Sequence[str]) -> None:
-        """Plan the cells, build their variants, train what is not done, record and report.
+        """Plan the cells, build their variants, train unfinished cells, record and report.
 
         Args:
             arguments: Hydra overrides, with the axes among them.
@@ -213,10 +213,10 @@ class Study:
                 time.sleep(_POLL_S)
 
     def _plan(self, arguments: Sequence[str]) -> list[PlannedCell]:
-        """Return every cell that is asked for, each after the cell that it takes a count from.
+        """Return every cell of the command line; references come before count-matched cells.
 
         Raises:
-            XrgsError: `matched_to` has no effect, or names a cell whose count can't be known.
+            XrgsError: `matched_to` has no effect, or names a cell that is count-matched itself.
         """
         plan: dict[CellSpec, PlannedCell] = {}
         combinations = expand(arguments)
@@ -281,7 +281,7 @@ class Study:
             launch.check(self._config, composed)
             self._composed[bool(seeds), others] = composed
         elif seeds:
-            composed.seed = seeds[-1]  # what is set to ${seed} follows it
+            composed.seed = seeds[-1]  # keys that are set to ${seed} follow it
         return composed
 
     def _with_variants(

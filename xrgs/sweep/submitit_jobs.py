@@ -1,6 +1,6 @@
-"""Follows the jobs of submitit's launchers one by one, and those of SLURM by its queue.
+"""Follows the jobs of submitit's launchers one by one, and SLURM's jobs by its queue.
 
-submitit raises at the first job that ends without an answer, which loses those of all others. It
+submitit raises at the first job that ends without an answer, and loses all other answers. It
 learns the end of a SLURM job from `sacct`, up to ten minutes late; where SLURM has no accounting,
 `sacct` does not answer, and submitit would wait for a killed job without end.
 """
@@ -19,7 +19,7 @@ from xrgs.sweep.jobs.job import INTERRUPTED
 
 #: Seconds between two looks at SLURM's queue, which remembers ended jobs for five minutes.
 _LOOK_S = 30
-#: State of a job that SLURM no longer lists: it ended long ago, or was cancelled while it waited.
+#: State of a job that SLURM no longer lists: it has ended, or was cancelled while it waited.
 _NOT_LISTED = "not in the queue"
 #: States of SLURM jobs that have ended and will not run again; in others they may yet answer.
 _ENDED = frozenset(
@@ -43,35 +43,26 @@ class QueueWatcher(SlurmInfoWatcher):
         return ["squeue", user, "--array", "--states=all", "--noheader", "--format=%i %T"]
 
     def read_info(self, string: bytes | str) -> dict[str, dict[str, str]]:
-        """Return the states of the jobs that are followed, by their ids.
-
-        Args:
-            string: What `squeue` printed.
-        """
+        """Return the states of the followed jobs by their ids, from the output of `squeue`."""
         text = string if isinstance(string, str) else string.decode()
         states = dict(line.split() for line in text.splitlines())
         followed = self._registered - self._finished
         return {job: {"State": states.get(job, _NOT_LISTED)} for job in followed}
 
     def is_done(self, job_id: str, mode: str = "standard") -> bool:
-        """Return whether a job has ended and will not run again.
-
-        Args:
-            job_id: The job's id.
-            mode: `force` to look at the queue now, `cache` not to look at it.
-        """
+        """Return whether a job has ended and will not run again; `mode` as in submitit."""
         return self.get_state(job_id, mode=mode) in _ENDED
 
 
 def follow() -> None:
-    """Let every job of submitit's launchers in this process be followed by itself."""
+    """Make submitit follow each job of this process by itself."""
     SlurmJob.watcher = QueueWatcher(delay_s=_LOOK_S)
-    # The launcher calls nothing else. Its jobs return what Hydra makes of their answers.
+    # The launcher calls nothing else of a job. A job returns a `JobReturn` of Hydra.
     Job.results = _results  # type: ignore[assignment, method-assign]
 
 
 def _results(job: Job[Any], wait: Any = Job.results) -> list[JobReturn]:
-    """Return a job's answer; of one that gave none, what takes its place."""
+    """Return a job's answer, or an outcome in its place if the job gave none."""
     try:
         return list(wait(job))
     except Exception:

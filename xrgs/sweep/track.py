@@ -1,8 +1,7 @@
 """Writes the cells of a sweep to where people follow experiments: TensorBoard, MLflow or a table.
 
-Cells are read from the store when the sweep has ended, so that nothing of this takes time or memory
-from a training, whatever launcher runs it. What can't be written is a warning: the cells are in the
-store all the same.
+Cells are read from the store when the sweep has ended, so that tracking takes no time or memory
+from a training. A failure is a warning, because the cells are in the store.
 """
 
 from __future__ import annotations
@@ -30,11 +29,11 @@ if TYPE_CHECKING:
     from xrgs.experiment.schema import RecordedCell
     from xrgs.experiment.store import Store
 
-#: The folder of a store that has what is written here.
+#: The folder of a store for tracking.
 FOLDER = "tracking"
 #: The package that a kind needs; the extra has the kind's name.
 _PACKAGES = {"tensorboard": "tensorboard", "mlflow": "mlflow"}
-#: What a record of a sweep names a cell by.
+#: The names of a cell in the record of a sweep.
 _NAMES = ("scene", "label", "condition", "variant_seed", "seed")
 #: The most metrics and parameters that MLflow takes at once.
 _MAX_METRICS, _MAX_PARAMS = 1000, 100
@@ -53,7 +52,7 @@ class Point(NamedTuple):
 
 @dataclass(frozen=True)
 class Run:
-    """What is written of one finished cell."""
+    """The tracked values of one finished cell."""
 
     cell_id: str
     names: Mapping[str, str | int]
@@ -65,17 +64,14 @@ class Run:
 
     @property
     def name(self) -> str:
-        """Its name for people, and for a folder: different cells have different names."""
+        """The cell's name for people, and for a folder; unique to the cell."""
         words = (str(self.names[key]) for key in ("scene", "label", "condition"))
         seeds = f"seed-{self.names['variant_seed']}-{self.names['seed']}"
         return "--".join(map(for_file_name, filter(None, (*words, seeds, self.cell_id))))
 
 
 def check(kind: str) -> None:
-    """See, before anything is trained, that the cells can be written.
-
-    Args:
-        kind: `none`, `csv`, `tensorboard` or `mlflow`.
+    """Check, before anything is trained, that cells can be tracked with this value of `track`.
 
     Raises:
         XrgsError: There is no such kind, or its package is not installed.
@@ -87,13 +83,7 @@ def check(kind: str) -> None:
 
 
 def track(kind: str, store: Store, sweep_id: str) -> None:
-    """Write the finished cells of a sweep, and say where; a failure is a warning.
-
-    Args:
-        kind: As for `check`; `none` does nothing.
-        store: The store.
-        sweep_id: The id of the sweep's record.
-    """
+    """Write the finished cells of a sweep, and say where; a failure is a warning."""
     if kind == "none":
         return
     folder = store.path / FOLDER
@@ -107,11 +97,7 @@ def track(kind: str, store: Store, sweep_id: str) -> None:
 
 
 def run_of(cell: CellFolder, names: RecordedCell) -> Run:
-    """Read what is written of a finished cell.
-
-    Args:
-        cell: The cell.
-        names: The cell's row in a sweep's record.
+    """Read the tracked values of a finished cell, which the record of a sweep names.
 
     Raises:
         StoreError: A file can't be read; the message names it.
@@ -148,7 +134,7 @@ def _points(file: Path, group: str) -> list[Point]:
 
 
 def _runs(store: Store, sweep_id: str) -> Iterator[Run]:
-    """Yield the finished cells of a sweep, each once; one that can't be read is named."""
+    """Yield the finished cells of a sweep; name each cell that can't be read on stderr."""
     rows = {row.cell_id: row for row in store.sweep_record(sweep_id).cells}
     for cell_id, row in progress(rows.items(), "tracking", "cell", len(rows)):
         if cell_id is None or store.cell(cell_id).state(verify=False).name != "done":
@@ -156,7 +142,7 @@ def _runs(store: Store, sweep_id: str) -> Iterator[Run]:
         try:
             yield run_of(store.cell(cell_id), row)
         except (StoreError, OSError, ValueError) as error:
-            log_line(f"{cell_id}: it is left out of what is tracked: {error}")
+            log_line(f"{cell_id}: it is not tracked: {error}")
 
 
 def _to_csv(runs: Iterable[Run], folder: Path, sweep_id: str) -> str:
@@ -174,7 +160,7 @@ def _to_csv(runs: Iterable[Run], folder: Path, sweep_id: str) -> str:
 
 
 def _to_tensorboard(runs: Iterable[Run], folder: Path, _: str) -> str:
-    """Write a folder of events for each cell; one that is there already is left alone."""
+    """Write a folder of events for each cell that has none."""
     home = folder / "tensorboard"
     home.mkdir(exist_ok=True)
     for run in runs:
@@ -211,13 +197,11 @@ def _write_events(run: Run, folder: str) -> None:
 
 
 def _to_mlflow(runs: Iterable[Run], folder: Path, sweep_id: str) -> str:
-    """Log a run for each cell, on the server that the environment names or in the store."""
+    """Log a run for each cell that has none, on the environment's server or in the store."""
     from mlflow import MlflowClient
     from mlflow.entities import Metric, Param
 
     file = folder / "mlflow.db"
-    if file.exists() and not file.is_file():  # SQLite would follow a link out of the store
-        raise XrgsError(f"{file} is not a regular file")
     uri = os.environ.get(_SERVER) or f"sqlite:///{file.absolute()}"
     client = MlflowClient(uri)
     found = client.get_experiment_by_name(_EXPERIMENT)

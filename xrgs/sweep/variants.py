@@ -6,6 +6,7 @@ from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING
 
 from xrgs.capture import images, scenes, variant
+from xrgs.capture.folders import trimmed_folder
 from xrgs.capture.scenes import folder
 from xrgs.errors import StoreError, UnreadableError, XrgsError
 from xrgs.experiment import trimming
@@ -66,7 +67,7 @@ def restore(conf: Conf, store: Store, variant_id: str) -> None:
         StoreGoneError: The store is no longer there.
         XrgsError: The photographs are missing, or give other images.
     """
-    if not trimming.trimmed_folder(store.variants, variant_id).is_dir():
+    if not trimmed_folder(store.variants, variant_id).is_dir():
         return
     log_line(f"variant {variant_id}: making the images again that xrgs-store trim has removed")
     request = {"conf": asdict(conf), "store": str(store.path), "variant": variant_id}
@@ -137,7 +138,7 @@ def _find_or_build(conf: Conf, store: Store, *, allow_build: bool) -> PlannedVar
     except XrgsError as error:
         if allow_build:
             store.check_not_gone()
-            # COLMAP dies of a full disk without saying so, which is no fault of the scene.
+            # COLMAP dies of a full disk without saying so. The scene is not at fault then.
             store.check_room()
         # The reason that the store keeps: a sweep that is planned again has the same record then.
         remembered = variant.failure(store.variants, key) if key else None

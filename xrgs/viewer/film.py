@@ -1,7 +1,7 @@
 """Renders models along a path of cameras, side by side, into an MP4 film or PNG frames.
 
-The renderer is that of the evaluation protocol with the same settings, so that a frame at a test
-camera is the render that was scored, where that has the intrinsics of the first one.
+The renderer and its settings are those of evaluation: a frame at a test camera with the intrinsics
+of the first test view is the render that was scored.
 """
 
 from __future__ import annotations
@@ -48,7 +48,9 @@ def make_film(
     size: tuple[int, int] | None = None,
     fps: int = 30,
 ) -> str:
-    """Render models along a path that is fitted to the cameras of the first one that has any.
+    """Render models along a path through the scene.
+
+    The path is fitted to the cameras of the first model that has any.
 
     Args:
         models: One model, or several of one world, which are shown side by side with their names.
@@ -60,7 +62,7 @@ def make_film(
         fps: Frames a second of a film.
 
     Returns:
-        A line that says what was written.
+        A line on the file and the frames.
 
     Raises:
         XrgsError: An argument is out of its range, no model has cameras, PyAV is missing, or `out`
@@ -100,7 +102,7 @@ def _check(path: str, views: int, fps: int, size: tuple[int, int] | None) -> Non
 
 
 def _is_film(out: Path) -> bool:
-    """Tell a film from a folder of frames, and see that a film can be made."""
+    """Return whether `out` is a film, and not a folder of frames; check that films can be made."""
     if out.suffix.lower() != _MP4:
         if out.suffix:
             raise XrgsError(f"out={out}: must end with {_MP4}, or be a folder, without a suffix")

@@ -1,8 +1,8 @@
 """Shows models live in a browser: viser draws the splats, one frame a model under one camera.
 
 Each model has a server of its own, since a page of viser shows one scene. One page holds the frames
-of all of them, and whichever camera is moved moves the others. Everything listens on this machine's
-loopback interface alone.
+of all of them, and the camera that a user moves moves the others. All servers listen on this
+machine's loopback interface alone.
 """
 
 from __future__ import annotations
@@ -36,12 +36,11 @@ if TYPE_CHECKING:
     _Place = dict[str, Any]  # by the names of _PLACE
 
 HOST = "127.0.0.1"
-#: A camera that was not moved by the user follows the one that was; what it reports of that arrives
-#: within so many seconds.
+#: A camera that follows the user's reports its new place within so many seconds.
 _ECHO_S = 0.3
-#: How near to its place a camera is that has arrived there, world units.
+#: A camera has arrived where it is this near to its place, world units.
 _NEAR = 1e-3
-#: What a place is: attributes of viser's cameras.
+#: The attributes of viser's cameras that make up a place.
 _PLACE = ("position", "look_at", "up_direction", "fov")
 #: The size of a drawn camera, as a share of the cameras' median distance from what they look at.
 _FRUSTUM_SCALE = 0.04
@@ -111,7 +110,7 @@ def _stop(server: ViserServer) -> None:
 
 @contextmanager
 def _without_banners() -> Iterator[None]:
-    """Keep back what viser prints: addresses of single frames, which nobody should open."""
+    """Hide what viser prints: the addresses of single frames, which nobody should open."""
     with redirect_stdout(io.StringIO()):
         yield
 
@@ -171,12 +170,7 @@ def _fill(server: ViserServer, model: Model, world: Model | None, limit: int) ->
 
 
 def count_text(model: Model, limit: int) -> str:
-    """Say how many Gaussians of a model are drawn.
-
-    Args:
-        model: The model.
-        limit: The most Gaussians that are drawn.
-    """
+    """Say how many Gaussians of a model are drawn, at most `limit`."""
     count = len(model.gaussians)
     if count <= limit:
         return f"{count:,} Gaussians"
@@ -236,10 +230,10 @@ def _go_to(event: Any) -> None:
 class _SharedCamera:
     """Lets the cameras of all frames follow the one that the user moves.
 
-    A camera that follows reports its new place like one that is moved. So only one camera leads at
-    a time, and another one can lead when that has been at rest for a moment. A frame that is opened
-    first reports a place of the browser's own choice; it can lead once it has reported the place
-    that it was put to.
+    A camera that follows reports its new place just as the leading one does. So one camera leads
+    at a time, and another can lead once the leader has been at rest for a moment. A frame that
+    opens reports a place of the browser's own choice first. It can lead once it has reported the
+    place that it was put to.
     """
 
     def __init__(self, start: _Place | None) -> None:

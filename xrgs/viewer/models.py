@@ -1,4 +1,4 @@
-"""Loads what is looked at: the Gaussians of a cell with its cameras, or those of a .ply file."""
+"""Loads models to look at: the Gaussians of a cell with its cameras, or of a .ply file."""
 
 from __future__ import annotations
 
@@ -41,19 +41,19 @@ class PosedView:
 
 @dataclass(frozen=True)
 class Model:
-    """Gaussians to look at, and what is known of where they come from."""
+    """Gaussians to look at, with their cameras where these are known."""
 
     name: str
-    """What it is called for people: one printable line."""
+    """The name that people see: one printable line."""
     gaussians: Gaussians
     settings: RasterSettings
-    """How its Gaussians become pixels: those of its training; of a .ply file the default ones."""
+    """How its Gaussians become pixels: as in its training; the defaults for a .ply file."""
     views: tuple[PosedView, ...] = ()
-    """Its views, training views first; none of a .ply file."""
+    """Its views, training views first; none for a .ply file."""
     poses: Poses | None = None
-    """The same as arrays, for paths; None of a .ply file."""
+    """The cameras of the views as arrays, for paths; None for a .ply file."""
     variant: str = ""
-    """The id of its variant, which decides the world that it is in; empty of a .ply file."""
+    """The id of its variant, which decides its world; empty for a .ply file."""
 
 
 def load_models(words: Sequence[str], store: Store) -> list[Model]:
@@ -84,23 +84,12 @@ def load_models(words: Sequence[str], store: Store) -> list[Model]:
 
 
 def reference(models: Sequence[Model]) -> Model | None:
-    """Return the first model that has views; None where all are .ply files.
-
-    Args:
-        models: The models, all of one world.
-    """
+    """Return the first model that has views; None where all are .ply files."""
     return next((model for model in models if model.views), None)
 
 
 def find_cell(word: str, store: Store) -> CellFolder:
-    """Find a finished cell by its id or the beginning of it.
-
-    Args:
-        word: The id, or a beginning that no other cell's id has.
-        store: The store.
-
-    Returns:
-        The cell.
+    """Find a finished cell by its id, or by a beginning that no other cell's id has.
 
     Raises:
         StoreError: There is no such store or cell, several ids begin so, or it is not finished.

@@ -1,7 +1,7 @@
 """Paths of cameras through a scene, fitted to the cameras that it was photographed from.
 
-All computations are in float64, in the normalised world of `xrgs.splat.normalize`, whose unit is
-the median distance of the cameras from what they look at. Cameras have OpenCV axes.
+All computations are in float64, in the normalised world of `xrgs.splat.normalize`. Its unit is the
+median distance of the cameras from the point that they look at. Cameras have OpenCV axes.
 """
 
 from __future__ import annotations
@@ -53,9 +53,9 @@ def orbit(poses: Poses, views: int) -> Array:
     """Move on a circle around the point that the training cameras look at, and look at it.
 
     The circle is level, at the median height and the median distance of the cameras. Where they
-    surround the point, it is closed. Where they leave a gap of more than 90 degrees, as those of a
-    forward-facing scene, the path swings to and fro over the arc that they span: nothing is known
-    of how the scene looks from elsewhere.
+    surround the point, the circle is closed. Where they leave a gap of more than 90 degrees, as in
+    a forward-facing scene, the path swings to and fro over the arc that they span: nobody has
+    photographed the scene from elsewhere.
 
     Args:
         poses: What the path is fitted to.
@@ -84,10 +84,10 @@ def orbit(poses: Poses, views: int) -> Array:
 def spiral(poses: Poses, views: int) -> Array:
     """Move on LLFF's spiral around the mean training camera, and look at one point.
 
-    As `render_path_spiral` of [mildenhall2019]: two turns, whose radii along the axes of the mean
-    camera are the 90th percentiles of the cameras' offsets. All look at one point on the mean
-    camera's axis, at the harmonic mean of 0.9 times the nearest and 5 times the farthest depth of
-    the points, with weights 1/4 and 3/4.
+    As `render_path_spiral` of [mildenhall2019], it makes two turns. Their radii along the axes of
+    the mean camera are the 90th percentiles of the cameras' offsets. All cameras look at one point
+    on the mean camera's axis, at the harmonic mean of 0.9 times the nearest and 5 times the
+    farthest depth of the points, with weights 1/4 and 3/4.
 
     Args:
         poses: What the path is fitted to.
@@ -152,15 +152,9 @@ PATHS: dict[str, Callable[[Poses, int], Array]] = {
 def look_at_point(poses: Poses) -> Array:
     """Return the point that the training cameras look at.
 
-    It is the point of least squared distance from the optical axes, and, with a small weight, from
-    the points on the axes at the median depth of what each camera sees. The latter decides where
-    the axes are nearly parallel, and leave the depth open.
-
-    Args:
-        poses: The cameras and points.
-
-    Returns:
-        [3]
+    It is the point [3] of least squared distance from the optical axes, and, with a small weight,
+    from the points on the axes at the median depth of the SfM points. That weight decides where the
+    axes are nearly parallel, and leave the depth open.
     """
     positions, forward = camera_positions(poses.train), poses.train[:, 2, :3]
     targets = positions + np.median(_depths(poses)) * forward  # [C, 3]
@@ -182,7 +176,7 @@ def _up(viewmats: Array) -> Array:
 
 
 def _depths(poses: Poses) -> Array:
-    """Return the depths above 0 of the points in all training cameras; 1 where there is none."""
+    """Return the depths above 0 of the points in all training cameras; 1 without any."""
     viewmats = poses.train
     depths = (poses.points @ viewmats[:, 2, :3].T + viewmats[:, 2, 3]).ravel()  # [P C]
     in_front: Array = depths[depths > 0]

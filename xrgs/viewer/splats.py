@@ -1,7 +1,7 @@
 """Gaussians as the arrays that viewers in a browser draw: positions, covariances and flat colours.
 
-Such viewers sort and blend all Gaussians of a scene themselves. Beyond some hundred thousand that
-is slow, so the least opaque ones can be left out.
+Such viewers sort and blend all Gaussians of a scene themselves. That is slow for more than some
+hundred thousand, so the least opaque ones can be left out.
 """
 
 from __future__ import annotations
@@ -38,16 +38,7 @@ class Splats:
 
 @torch.no_grad()
 def to_splats(gaussians: Gaussians, limit: int) -> Splats:
-    """Return the Gaussians of a model, at most so many of them.
-
-    Args:
-        gaussians: The model.
-        limit: The most Gaussians that are kept: those of the highest opacity; of equal ones, the
-            first.
-
-    Returns:
-        The Gaussians that are kept.
-    """
+    """Return the `limit` most opaque Gaussians of a model; of equal ones, the first."""
     kept = gaussians.opacities.argsort(descending=True, stable=True)[:limit].sort().values
     rotations, scales = rotation_matrices(gaussians.quats[kept]), gaussians.scales[kept].exp()
     factor = rotations * scales[:, None, :]  # [N, 3, 3], each axis times its length

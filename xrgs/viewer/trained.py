@@ -37,7 +37,7 @@ if TYPE_CHECKING:
 SHOWN_OF_A_TAG = 2
 LOG_SCALES = (-9.0, 3.0)
 """Natural logarithms of a model's scales that 8 bits cover, in the normalised world. A step is 5%,
-and what is smaller is far below a pixel."""
+and smaller scales are far below a pixel."""
 GAUSSIAN_BYTES = 17
 """Bytes of a quantised Gaussian: 3 coordinates of 16 bits, and 8 bits for each of 3 scales, 4
 components of the quaternion, 3 colours and the opacity."""
@@ -58,7 +58,7 @@ class TrainingView:
     original: Image | None
     """The photograph before it was degraded; None where it was not."""
     rendered: tuple[int, int]
-    """Width and height of the renders, px: those of the original where there is one."""
+    """Width and height of the renders, px: as of the original where there is one."""
     renders: dict[str, Image]
     """The renders by the cell's id."""
 
@@ -150,7 +150,7 @@ class TrainedScene:
             )
 
     def models(self, most: int) -> Iterator[tuple[str, PageModel]]:
-        """Yield the id and the model of each cell, of at most so many Gaussians."""
+        """Yield the id and the model of each cell, with at most `most` Gaussians."""
         views = self._data.train
         step = max(1, -(-len(views) // _MAX_DECIDING))
         cameras = [view.camera for view in views[::step]]

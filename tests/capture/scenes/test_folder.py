@@ -17,6 +17,10 @@ from xrgs.errors import UnreadableError, XrgsError
 Fill = Callable[..., SceneConf]
 
 
+def scene_of(path: object) -> SceneConf:
+    return SceneConf(name="", kind="folder", path=str(path), views=24)
+
+
 @pytest.mark.parametrize(
     ("long_side", "width"), [(0, 400), (20, 50), (50, 50), (51, 100), (999, 400)]
 )
@@ -27,7 +31,7 @@ def test_an_llff_scene_gives_the_smallest_copies_that_suffice(
         fill(tmp_path / folder, "a.png", "b.png", size=(size, size * 3 // 4))
     (tmp_path / "poses_bounds.npy").write_bytes(b"never read")
     scene = scenes.resolve(
-        SceneConf(name="fern", kind="folder", path=str(tmp_path), views=24),
+        scene_of(tmp_path),
         tmp_path,
         long_side,
     )
@@ -41,7 +45,7 @@ def test_copies_are_measured_by_their_largest_photograph(fill: Fill, tmp_path: P
     fill(tmp_path / "images_4", "b.png", size=(100, 75))
     (tmp_path / "images_4" / "c.png").write_text("no image")
     scene = scenes.resolve(
-        SceneConf(name="x", kind="folder", path=str(tmp_path), views=24),
+        scene_of(tmp_path),
         tmp_path,
         100,
     )
@@ -74,7 +78,7 @@ def test_a_folder_without_a_scene_is_refused(
 def test_a_missing_folder_or_path_names_the_key(tmp_path: Path) -> None:
     with pytest.raises(XrgsError, match=r"scene\.path=.*nowhere: no such folder"):
         scenes.resolve(
-            SceneConf(name="x", kind="folder", path=str(tmp_path / "nowhere"), views=24),
+            scene_of(tmp_path / "nowhere"),
             tmp_path,
         )
     with pytest.raises(XrgsError, match=r"scene\.path is empty"):
@@ -106,7 +110,7 @@ def test_a_link_to_a_photograph_is_one(fill: Fill, tmp_path: Path) -> None:
     for name in ("a.png", "b.png"):
         (tmp_path / "x" / name).symlink_to(tmp_path / "originals" / name)
     scene = scenes.resolve(
-        SceneConf(name="", kind="folder", path=str(tmp_path / "x"), views=24),
+        scene_of(tmp_path / "x"),
         tmp_path,
     )
     assert [images.read(file).shape for file in scene.files.values()] == [(30, 40, 3)] * 2
@@ -129,12 +133,12 @@ def test_all_folders_below_are_taken_where_the_path_asks_for_them(
     fill(tmp_path / "x" / "day" / "one", "a.png")
     fill(tmp_path / "x" / ".cache", "z.png")
     (tmp_path / "x" / "loop").symlink_to(tmp_path / "x")
-    flat = SceneConf(name="", kind="folder", path=str(tmp_path / "x"), views=24)
+    flat = scene_of(tmp_path / "x")
     assert list(scenes.resolve(flat, tmp_path).files) == ["a", "b"]
     assert "images left out: 1 in day/one" in caplog.text
-    assert f"scene.path={tmp_path / 'x'}/** takes those of all folders" in caplog.text
+    assert f"scene.path={tmp_path / 'x'}/** takes the images of all folders" in caplog.text
     caplog.clear()
-    nested = SceneConf(name="", kind="folder", path=f"{tmp_path / 'x'}/**", views=24)
+    nested = scene_of(f"{tmp_path / 'x'}/**")
     scene = scenes.resolve(nested, tmp_path)
     assert {n: f.relative_to(tmp_path / "x").as_posix() for n, f in scene.files.items()} == {
         "a": "a.png",
@@ -148,14 +152,14 @@ def test_all_folders_below_are_taken_where_the_path_asks_for_them(
 def test_a_folder_of_folders_says_how_to_read_them(fill: Fill, tmp_path: Path) -> None:
     fill(tmp_path / "x" / "one", "a.png", "b.png")
     with pytest.raises(XrgsError, match=r"no image in it.*images left out: 2 in one .*/\*\* takes"):
-        scenes.fingerprint(SceneConf(name="", kind="folder", path=str(tmp_path / "x"), views=24))
+        scenes.fingerprint(scene_of(tmp_path / "x"))
 
 
 def test_names_that_nested_folders_share_are_refused(fill: Fill, tmp_path: Path) -> None:
     fill(tmp_path / "x" / "a_b", "c.png")
     fill(tmp_path / "x" / "a", "b_c.png")
     with pytest.raises(XrgsError, match=r"two images of one name"):
-        scenes.fingerprint(SceneConf(name="", kind="folder", path=f"{tmp_path / 'x'}/**", views=24))
+        scenes.fingerprint(scene_of(f"{tmp_path / 'x'}/**"))
 
 
 def test_what_is_not_read_is_named(
@@ -172,7 +176,7 @@ def test_what_is_not_read_is_named(
     fill(tmp_path / "y" / "one", "a.png", "b.png")
     (tmp_path / "y" / "films").mkdir()
     (tmp_path / "y" / "films" / "e.mp4").write_bytes(b"content")
-    scenes.fingerprint(SceneConf(name="", kind="folder", path=f"{tmp_path / 'y'}/**", views=24))
+    scenes.fingerprint(scene_of(f"{tmp_path / 'y'}/**"))
     assert "films/e.mp4" in caplog.text
 
 

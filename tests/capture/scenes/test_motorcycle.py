@@ -13,11 +13,11 @@ from xrgs.capture.scenes.scene import bundled_photograph
 from xrgs.config import SceneConf
 
 
-def test_the_motorcycle_calibration_fits_its_disparity(tmp_path: Path) -> None:
+def test_the_motorcycle_calibration_fits_its_disparity(
+    tmp_path: Path, stereo_scene: SceneConf
+) -> None:
     """With depth = baseline f / (disparity + cx_right - cx_left), left pixels reproject right."""
-    scene = scenes.resolve(
-        SceneConf(name="motorcycle", kind="motorcycle", path=None, views=24), tmp_path
-    )
+    scene = scenes.resolve(stereo_scene, tmp_path)
     assert list(scene.files) == ["motorcycle_left", "motorcycle_right"]
     assert images.size(next(iter(scene.files.values()))) == (741, 500)
     disparity = np.load(bundled_photograph("motorcycle_disp.npz"))["arr_0"]

@@ -86,21 +86,13 @@ def test_other_images_do_not_become_the_procedural_scene(
 
 
 def test_a_label_is_one_printable_line(tmp_path: Path) -> None:
-    assert (
-        scenes.label(SceneConf(name="a\n\x1b[31mb", kind="procedural", path=None, views=24))
-        == "a  [31mb"
-    )
-    assert (
-        scenes.label(SceneConf(name="\n", kind="procedural", path=None, views=24)) == "procedural"
-    )
-    assert (
-        scenes.label(SceneConf(name="", kind="folder", path=str(tmp_path / "a\tb"), views=24))
-        == "a b"
-    )
-    assert (
-        len(scenes.label(SceneConf(name="x" * 9_999, kind="procedural", path=None, views=24)))
-        == 200
-    )
+    for name, path, shown in (
+        ("a\n\x1b[31mb", None, "a  [31mb"),
+        ("\n", None, "procedural"),
+        ("", str(tmp_path / "a\tb"), "a b"),
+    ):
+        assert scenes.label(replace(PROCEDURAL, name=name, path=path)) == shown
+    assert len(scenes.label(replace(PROCEDURAL, name="x" * 9_999))) == 200
 
 
 def test_two_processes_that_render_at_once_get_one_complete_scene(tmp_path: Path) -> None:

@@ -5,22 +5,19 @@ from __future__ import annotations
 import json
 import re
 import shutil
-from collections.abc import Callable
-from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 import torch
-from xrgs.safeio.confined import ConfinedPath
 
-from tests.report.conftest import MadeStore
+from tests.report.conftest import MadeStore, baseline_config, finish_again
 from xrgs.capture import dataset, frozen, images
 from xrgs.capture.views import Variant, View
-from xrgs.config import Conf
 from xrgs.experiment.store import Store
 from xrgs.report import build
+from xrgs.safeio.atomic import write_json
 from xrgs.splat.gaussians import Gaussians
 from xrgs.splat.ply import save_ply
 
@@ -37,11 +34,12 @@ HISTORY = "step,loss,gaussians,duplicated,split,pruned_opacity,pruned_scale\n" +
 )
 
 
-def _view(folder: ConfinedPath, name: str, split: str, tag: str, number: int) -> View:
+def _view(folder: Path, name: str, split: str, tag: str, number: int) -> View:
     """A view of coloured noise; the cameras stand in a row, three units before the origin."""
     width, height = HR if tag == "HR" else LR
     file = folder / f"images/{split}/{name}.png"
     rng = np.random.default_rng(number)
+    file.parent.mkdir(parents=True, exist_ok=True)
     images.save(file, np.kron(rng.random((6, 8, 3)), np.ones((height // 6, width // 8, 1))))
     viewmat = np.eye(4)
     viewmat[:3, 3] = (-0.4 * number, 0.1 * (number % 2), 3.0)
@@ -51,7 +49,7 @@ def _view(folder: ConfinedPath, name: str, split: str, tag: str, number: int) ->
 
 def make_variant(store: Store) -> Variant:
     """Freeze a variant of two test views and three training views into a store."""
-    folder = store.folder / "source"
+    folder = store.path / "source"
     views = [_view(folder, name, "test", "HR", at) for at, name in enumerate(TEST_VIEWS)]
     for at, (name, tag) in enumerate(TRAINING_VIEWS.items(), 2):
         views.append(_view(folder, name, "train", tag, at))
@@ -86,34 +84,28 @@ def data_of(page: Path) -> dict[str, Any]:
     return dict(json.loads(found[1]))
 
 
-def plain(value: Any) -> Any:
-    """A config as JSON values."""
-    return json.loads(json.dumps(asdict(value), default=str))
-
-
 def page_of(store: Path, out: Path | None = None) -> Path:
     """The page of a store's report, of whose figures the fewest are drawn."""
     return build(store, out=out, pictures=["trade-off"]).folder / "report.html"
 
 
 @pytest.fixture(scope="session")
-def pictured(tmp_path_factory: pytest.TempPathFactory, compose: Callable[..., Conf]) -> Path:
+def pictured(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A store of one scene, with everything that a page shows, and a hostile label."""
     made = MadeStore(tmp_path_factory.mktemp("pictured") / "store")
     variant = make_variant(made.store)
-    config = plain(compose())
     for seed, label in enumerate(("baseline", "consistency", HOSTILE)):
         factors = {"gaussians": 1 - 0.2 * seed, "psnr": 1 + 0.01 * seed}
         cell = made.add(
             label, variant=variant.id, factors=factors, quality=QUALITY, history=HISTORY
         )
-        (cell.path / "config.json").write_text(json.dumps(config))
+        write_json(cell.path / "config.json", baseline_config())
         save_ply(cell.path / "splats.ply", make_gaussians(seed))
         for number, view in enumerate(TEST_VIEWS):
             photograph = images.read_png(variant.folder / f"images/test/{view}.png")
             noise = np.random.default_rng(seed + number).normal(0, 0.05 * seed, photograph.shape)
-            images.save(cell.folder / f"renders/{view}.png", (photograph + noise).astype("f4"))
-        cell.finish(TEST_VIEWS, 1)
+            images.save(cell.path / f"renders/{view}.png", (photograph + noise).astype("f4"))
+        finish_again(cell)
     made.write(("+ablation=consistency", f"scene.name={HOSTILE}"))
     return made.store.path
 

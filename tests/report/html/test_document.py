@@ -5,24 +5,20 @@ from __future__ import annotations
 import base64
 import hashlib
 import html
-import json
 import re
 from html.parser import HTMLParser
 from pathlib import Path
 
 import numpy as np
 import pytest
-import torch
 from PIL import Image
-from xrgs.report.html.album import Album, error_map
-from xrgs.report.html.trained import quantise
 
-from tests.report.conftest import MadeStore
-from tests.report.html.conftest import HOSTILE, TEST_VIEWS, data_of, make_gaussians, page_of
+from tests.report.conftest import MadeStore, configured
+from tests.report.html.conftest import HOSTILE, data_of, make_gaussians, page_of
 from xrgs.experiment.store import Store
 from xrgs.report import build
 from xrgs.report.html import document
-from xrgs.report.html.content import LOG_SCALES
+from xrgs.report.html.images import Album, error_map
 from xrgs.splat.ply import save_ply
 
 
@@ -177,7 +173,7 @@ def test_a_page_that_is_too_large_says_what_it_left_out(
     data = data_of(page_of(copied))
     assert data["history"] == []
     assert data["models"]
-    assert data["notes"] == ["The page would be too large with its history, which is left out."]
+    assert data["notes"] == ["The page has no history: with it, it would be too large."]
 
 
 def test_images_that_do_not_fit_are_counted(copied: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -189,11 +185,12 @@ def test_images_that_do_not_fit_are_counted(copied: Path, monkeypatch: pytest.Mo
 
 def test_an_album_keeps_an_image_once_and_its_size() -> None:
     red, blue = (Image.new("RGB", (20, 10), name) for name in ("red", "blue"))
-    album = Album(10_000, 400)
-    assert album.add([red, blue]) == [0, 1]
-    assert album.add([blue, red]) == [1, 0]
-    assert len(album.urls) == 2
-    assert Album(10, 400).add([red]) is None
+    urls = ["data:another"]
+    album = Album(urls, 10_000, 400)
+    assert album.add([red, blue]) == [1, 2]
+    assert album.add([blue, red]) == [2, 1]
+    assert len(urls) == 3
+    assert Album(urls, 10, 400).add([red]) is None
 
 
 def test_an_error_map_is_brightest_where_the_render_is_wrong() -> None:
@@ -206,29 +203,9 @@ def test_an_error_map_is_brightest_where_the_render_is_wrong() -> None:
         error_map(Image.fromarray(photograph), Image.new("RGB", (4, 4)))
 
 
-def test_quantised_gaussians_are_close_to_the_original_ones() -> None:
-    gaussians = make_gaussians(0, 50)
-    activated = gaussians.activated()
-    kept = torch.arange(5, 25)
-    content = quantise(activated, kept)
-    assert len(content) == 20 * 17
-    bounded = np.frombuffer(content[: 20 * 6], "<u2").reshape(20, 3) / 65535 * 2 - 1
-    means = bounded / (1 - np.abs(bounded))
-    np.testing.assert_allclose(means, activated.means[kept].numpy(), atol=2e-4)
-    rest = np.frombuffer(content[20 * 6 :], "u1").reshape(20, 11) / 255
-    scales = np.exp(LOG_SCALES[0] + rest[:, :3] * (LOG_SCALES[1] - LOG_SCALES[0]))
-    np.testing.assert_allclose(scales, activated.scales[kept].numpy(), rtol=0.024)
-    np.testing.assert_allclose(rest[:, 10], activated.opacities[kept].numpy(), atol=1 / 255)
-
-
 def test_the_context_says_which_arm_differs(copied: Path) -> None:
-    """The prune rule of one arm is changed in its config, whose hash is declared anew."""
-    cell = Store(copied).cell("cell00001")
-    file = cell.path / "config.json"
-    config = json.loads(file.read_text())
-    config["splat"]["densify"]["prune_scale3d"] = 10.0
-    file.write_text(json.dumps(config))
-    cell.finish(TEST_VIEWS, 1)
+    densify = {"prune_scale3d": 10.0}
+    configured(Store(copied).cell("cell00001"), splat={"densify": densify})
     text = html.unescape(build(copied, pictures=[]).folder.joinpath("report.html").read_text())
     assert f"Gaussians above 0.1 (baseline, {HOSTILE}), 10 (consistency) times" in text
     assert "<td>1 HR (48 × 36 px); 2 LR (24 × 18 px); 2 test (48 × 36 px)</td>" in text

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -118,13 +119,17 @@ def test_a_worker_whose_folder_was_removed_ends_and_creates_nothing(
     assert [path.name for path in cell.path.parent.iterdir()] == ["c"]
 
 
+@pytest.mark.parametrize("gone", [False, True])
 def test_a_worker_that_starts_after_a_takeover_does_nothing(
-    cell: CellFolder, built: Variant
+    cell: CellFolder, built: Variant, gone: bool
 ) -> None:
     """Its parent was suspended between the beginning of the cell and the start of this worker."""
     request = worker.cell_request(built.folder, cell)
     begin_attempt(cell)
+    if gone:
+        shutil.rmtree(cell.path)
     before = files(cell.path)
     with pytest.raises(worker.AttemptLostError, match="another attempt at the cell has begun"):
         worker.run_in_child("cell", request)
     assert files(cell.path) == before
+    assert cell.path.exists() != gone

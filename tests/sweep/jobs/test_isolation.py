@@ -44,7 +44,7 @@ if "xrgs.sweep.jobs.worker" in sys.orig_argv and "cell" in sys.orig_argv:
 
     def hangs(*_):
         child = subprocess.Popen([sys.executable, "-S", "-c", "import time; time.sleep(600)"])
-        Path("hangs").touch()
+        Path(os.environ["SWEEPS_OF"], "hangs").touch()
         time.sleep(600)
 
     def eats(*_):

@@ -442,6 +442,20 @@ def test_a_store_that_vanishes_while_a_cell_trains_does_not_reappear(
     assert not session.stopped
 
 
+@pytest.mark.parametrize("gone", [True, False])
+def test_a_cell_without_its_config_is_the_store_s_loss_or_an_error(
+    session: SweepSession, cells: Cells, tmp_path: Path, gone: bool
+) -> None:
+    cell = cells.plan()
+    if gone:
+        cells.store.path.rename(tmp_path / "moved")
+        assert run(session, cells, cell.id) == GONE
+        return
+    (cell.path / "config.json").unlink()
+    with pytest.raises(XrgsError, match=r"config\.json: No such file"):
+        run(session, cells, cell.id)
+
+
 class ProcessEnded(Exception):  # noqa: N818
     """Stands in for the end of the process."""
 

@@ -209,8 +209,8 @@ class _Download:
 
     def _check_size(self, size: int) -> None:
         if size > self._max_bytes:
-            most = f"max_bytes={self._max_bytes}"
-            raise DownloadError(f"{self._url}: {size} bytes or more; at most {most} are allowed")
+            most = f"{self._max_bytes} are allowed (xrgs-data download --max-bytes)"
+            raise DownloadError(f"{self._url}: {size} bytes or more; at most {most}")
 
 
 class _RedirectHandler(HTTPRedirectHandler):

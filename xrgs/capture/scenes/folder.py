@@ -70,13 +70,13 @@ def list_photographs(path: str | None, long_side: int) -> dict[str, Path]:
             has at least so many px are taken; the largest where none has, or where this is 0.
 
     Returns:
-        At least two files by the names of their views, sorted by these: the name of the file
-        without its suffix. With `/**` the folders on the way come before it, joined by `_`.
+        At least two files by the names of their views, sorted by name: the name of the file without
+        its suffix. With `/**` the folders on the way come before it, joined by `_`.
 
     Raises:
         UnreadableError: The folder can't be read now.
-        XrgsError: There is no such folder, it holds fewer than two images or two of one name, a
-            name can't be used, or images are HEIC and the package that reads it is not installed.
+        XrgsError: The folder is missing, has fewer than two images or two of one name, a name can't
+            be used, or images are HEIC and the package that reads it is not installed.
     """
     if not path:
         raise XrgsError("scene.path is empty: give the folder of photographs, scene.path=...")
@@ -147,7 +147,7 @@ def _images_in(folder: Path) -> tuple[Path, ...]:
 
 
 def _with_suffix(folder: Path, suffixes: frozenset[str]) -> list[Path]:
-    """List what has one of these suffixes in a folder, sorted; hidden files are none."""
+    """List the files of these suffixes in a folder, sorted, without hidden files."""
     files = sorted(folder.iterdir(), key=lambda file: file.name)
     return [f for f in files if f.suffix.lower() in suffixes and not f.name.startswith(".")]
 
@@ -163,7 +163,7 @@ def _all_below(folder: Path) -> tuple[Path, ...]:
 
 
 def _folders(folder: Path, depth: int = 0) -> Iterator[Path]:
-    """Yield a folder and all that are below it; hidden ones and links are not followed."""
+    """Yield a folder and all folders below it, without hidden folders and links."""
     if depth > _MAX_DEPTH:
         raise XrgsError(f"{folder}: folders are nested more than {_MAX_DEPTH} deep")
     yield folder
@@ -184,7 +184,7 @@ def _in_other_folders(folder: Path, taken: Sequence[Path]) -> list[str]:
     inside = Counter(file.parent for file in others if not _is_llff_folder(file.parent))
     return [
         f"images left out: {count} in {parent.relative_to(folder) if parent != folder else 'it'}"
-        f" (scene.path={folder}{ALL_BELOW} takes those of all folders)"
+        f" (scene.path={folder}{ALL_BELOW} takes the images of all folders)"
         for parent, count in sorted(inside.items())
     ]
 

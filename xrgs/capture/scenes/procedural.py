@@ -74,15 +74,15 @@ class ProceduralScene:
 
     def resolve(self, conf: SceneConf, long_side: int, home: Path) -> Scene:
         """Render the views where they are not there."""
+        exact = dict(zip(names(conf.views), viewmats(conf.views), strict=True))
 
         def render(folder: Path) -> None:
             from xrgs.capture.scenes import still_life  # imports torch
 
-            still_life.render(folder, long_side, conf.views)
+            size = camera_size(long_side)
+            still_life.render(folder, TEXTURES, intrinsics(*size), size, exact)
 
-        views = names(conf.views)
-        files = rendered.provide(home, views, render)
-        exact = dict(zip(views, viewmats(conf.views), strict=True))
+        files = rendered.provide(home, list(exact), render)
         # The intrinsics are known too, but SfM estimates them, as for a real capture.
         return Scene(label(conf), home.name, files, viewmats=exact)
 

@@ -49,14 +49,7 @@ class Ball:
 
 
 def pyramid(texture: Tensor) -> Pyramid:
-    """Halve a texture repeatedly, down to 2 texels.
-
-    Args:
-        texture: [3, h, w].
-
-    Returns:
-        The levels, finest first.
-    """
+    """Halve a texture [3, h, w] repeatedly, down to 2 texels; the finest level is first."""
     levels = [texture]
     while min(levels[-1].shape[1:]) >= 4:
         levels.append(avg_pool2d(levels[-1][None], 2)[0])
@@ -197,7 +190,9 @@ def render(
     height: int,
     supersample: int = 3,
 ) -> Tensor:
-    """Render the image that a pinhole camera takes of solids.
+    """Render the image [height, width, 3] in 0..1 that a pinhole camera takes of solids.
+
+    It is black where no solid is hit.
 
     Args:
         solids: The solids, in world units.
@@ -207,9 +202,6 @@ def render(
         width: px.
         height: px.
         supersample: The number of evenly spaced samples per pixel along each axis.
-
-    Returns:
-        [height, width, 3] in 0..1, black where no solid is hit.
     """
     K, viewmat = K.float(), viewmat.float()
     samples = _Samples(K, width, height, supersample)

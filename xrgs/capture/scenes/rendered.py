@@ -92,7 +92,7 @@ def _files(home: Path) -> dict[str, str]:
     file = home / _MANIFEST
     content = read_struct(file, RenderedScene)
     if content.fingerprint not in {home.name, home.resolve().name}:
-        raise StoreError(f"{file}: it is of another scene than its folder's name says")
+        raise StoreError(f"{file}: its fingerprint is not the name of its folder")
     return content.files
 
 
@@ -115,14 +115,9 @@ def _render(home: Path, images: Sequence[str], render: Callable[[Path], None]) -
 
 
 def verify(home: Path) -> list[str]:
-    """Say everything that is wrong with the files of a rendered scene.
+    """Return a line for each file of a rendered scene that is wrong; none for an intact scene.
 
-    Args:
-        home: The scene's folder in the store's `scenes/`.
-
-    Returns:
-        A line for each file that is missing, has changed, can't be read now or does not belong
-        there; empty for an intact scene.
+    A file is wrong that is missing, has changed, can't be read now or does not belong there.
     """
     try:
         files = _files(home)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
@@ -13,7 +13,7 @@ import torch
 from numpy.typing import NDArray
 
 from xrgs.capture import images
-from xrgs.capture.scenes import procedural, raycast
+from xrgs.capture.scenes import raycast
 from xrgs.capture.scenes.raycast import Ball, Pyramid, Quad, pyramid
 from xrgs.capture.scenes.scene import bundled_photograph
 from xrgs.runtime.machine import single_torch_thread
@@ -88,38 +88,37 @@ def solids() -> list[Quad | Ball]:
     return result
 
 
-def textures() -> dict[str, Pyramid]:
-    """Return the tinted textures: pyramids of [3, h, w] in 0..1 by the name of the texture."""
-    return {
-        name: pyramid(
-            torch.from_numpy(
-                images.read(bundled_photograph(file)) * np.array(tint, np.float32)
-            ).movedim(-1, 0)
-        )
-        for name, (file, tint) in procedural.TEXTURES.items()
-    }
-
-
-def render(folder: Path, long_side: int, views: int) -> None:
-    """Render every view and write it as `<name>.png`; nothing waits for the disk.
+def render(
+    folder: Path,
+    textures: Mapping[str, tuple[str, tuple[float, float, float]]],
+    K: NDArray[np.float64],
+    size: tuple[int, int],
+    viewmats: Mapping[str, NDArray[np.float64]],
+) -> None:
+    """Render every view and write it as `<name>.png`, without waiting for the disk.
 
     Args:
-        folder: The folder for the images; it is made where it is missing.
-        long_side: The width of the views, px; 0 for the full size.
-        views: The number of views.
+        folder: An existing folder for the images.
+        textures: The bundled photograph and the RGB tint of each texture, by the texture's name.
+        K: Intrinsics [3, 3] of every view, px.
+        size: Width and height of the views, px.
+        viewmats: World-to-camera matrix [4, 4] of each view, by the view's name.
     """
-    width, height = procedural.camera_size(long_side)
-    K = torch.from_numpy(procedural.intrinsics(width, height))
-    scene, pyramids = solids(), textures()
+    scene, pyramids = solids(), {name: _pyramid(*of) for name, of in textures.items()}
 
-    def render_view(name: str, viewmat: NDArray[np.float64]) -> None:
-        pose = torch.from_numpy(viewmat)
-        image = raycast.render(scene, pyramids, K, pose, width, height, SUPERSAMPLE)
+    def render_view(name: str) -> None:
+        pose = torch.from_numpy(viewmats[name])
+        image = raycast.render(scene, pyramids, torch.from_numpy(K), pose, *size, SUPERSAMPLE)
         images.save(folder / f"{name}.png", image.numpy(), durable=False)
 
-    names, poses = procedural.names(views), procedural.viewmats(views)
     # One thread per view, and none within: on a busy machine torch's threads wait for each other.
     with single_torch_thread() as threads, ThreadPoolExecutor(threads) as pool:
-        done = pool.map(render_view, names, poses)
-        for _ in progress(done, "rendering the scene", "view", views):
+        done = pool.map(render_view, viewmats)
+        for _ in progress(done, "rendering the scene", "view", len(viewmats)):
             pass
+
+
+def _pyramid(photograph: str, tint: tuple[float, float, float]) -> Pyramid:
+    """Build the pyramid of a bundled photograph whose channels are multiplied by a tint."""
+    tinted = images.read(bundled_photograph(photograph)) * np.array(tint, np.float32)
+    return pyramid(torch.from_numpy(tinted).movedim(-1, 0))

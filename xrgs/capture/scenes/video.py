@@ -86,12 +86,7 @@ def _file(path: str | None) -> Path:
 
 
 def extract(file: Path, names: Sequence[str], folder: Path) -> None:
-    """Write the sharpest frames of a video as `<name>.png`, as its player would show them.
-
-    Args:
-        file: The video.
-        names: The names of the frames to take.
-        folder: The folder to write to.
+    """Write the sharpest frames of a video as `<name>.png` to a folder, as a player shows them.
 
     Raises:
         ImageError: The file is not a video, or its frames are too large.
@@ -115,14 +110,9 @@ def extract(file: Path, names: Sequence[str], folder: Path) -> None:
 
 
 def sharpest(sharpness: list[float], parts: int) -> list[int]:
-    """Choose the sharpest of each of some equal parts of a row.
+    """Return the index of the largest value of each of some equal parts of a list.
 
-    Args:
-        sharpness: One value for each frame, at least as many as `parts`.
-        parts: The number of parts; their sizes differ by one at most.
-
-    Returns:
-        Ascending indices, one for each part; the first where several are equal.
+    The sizes of the parts differ by one at most. The first is taken where several are equal.
     """
     ends = [round(part * len(sharpness) / parts) for part in range(parts + 1)]
     return [max(range(a, b), key=lambda i: sharpness[i]) for a, b in pairwise(ends)]

@@ -177,7 +177,7 @@ class Answer:
     pairs: str
     """The numbers of scenes and pairs behind it, as a phrase."""
     better: tuple[str, ...]
-    """The metrics whose interval shows an improvement, with their change."""
+    """The metrics that the intervals show to be better, with their change."""
     worse: tuple[str, ...]
     undecided: tuple[tuple[str, tuple[str, ...]], ...]
     """Readings that are no verdict, each with its metrics and their changes."""

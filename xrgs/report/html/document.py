@@ -69,7 +69,7 @@ def write_document(
         file: The file to write.
         store: The store with photographs, renders, histories and Gaussians.
         sweep: The sweep.
-        tables: The tables of its comparison.
+        tables: Builds the tables of the sweep's comparison.
         texts: Every table of the report, in order.
         quality: Quality during training, as `xrgs.report.curves.joined` returns it.
         warnings: Sentences that a reader has to know.
@@ -118,7 +118,7 @@ def _fitting(head: dict[str, Any], content: Content, tables: Tables, texts: list
         if len(text.encode()) <= MAX_BYTES or not part:
             break
         setattr(content, part, [])
-        content.notes.append(f"The page would be too large with its {part}, which is left out.")
+        content.notes.append(f"The page has no {part}: with it, it would be too large.")
     return text
 
 
@@ -164,7 +164,7 @@ def _rendered(
 
 
 def _printable(table: TextTable) -> TextTable:
-    """Return a table whose texts are lines of bounded length."""
+    """Return a table with its texts as printable lines of bounded length."""
     notes = (table.context, *table.notes) if table.context else table.notes
     return TextTable(
         shown(table.title),
@@ -236,7 +236,7 @@ _CHANGE_COLUMNS = {
 
 
 def _changes_table(rows: Sequence[dict[str, Any]], base: str) -> TextTable:
-    """Return the table of all changes, whose texts are those of `_changes`."""
+    """Return the table of all changes, with the texts of `_changes`."""
     columns = tuple(name.format(base=base) for name in _CHANGE_COLUMNS)
     texts = tuple(map(_texts, rows))
     return TextTable(f"Changes from {base}", columns, texts, "".join(_CHANGE_COLUMNS.values()))

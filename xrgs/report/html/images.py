@@ -49,7 +49,7 @@ _QUALITIES = ((90, 0.40), (80, 0.22), (60, 0.13), (40, 0.09))
 _MAX_PIXELS = 1 << 24
 #: Scores by cell and view.
 _Scores = dict[tuple[str, str], dict[str, float | None]]
-#: About how many more pixels error maps add to those of renders.
+#: The pixels of photographs and renders, times this, are about those of error maps as well.
 _WITH_ERROR_MAPS = 1.25
 
 
@@ -61,29 +61,27 @@ _MAX_KEPT, _MIN_KEPT = 100_000, 8_000
 
 
 class Album:
-    """Collects the images of a page. The same image is kept once.
+    """Adds images to those of a page, each image once.
 
     Args:
-        max_bytes: The most bytes that the data URLs may take together.
+        urls: The images of the page, as data URLs.
+        max_bytes: The most bytes that the data URLs which are added may take together.
         pixels: About how many pixels will be added in all, which decides the quality.
     """
 
-    def __init__(self, max_bytes: int, pixels: int) -> None:
-        self.urls: list[str] = []
+    def __init__(self, urls: list[str], max_bytes: int, pixels: int) -> None:
+        self._urls = urls
         self._left = max_bytes
         self._numbers: dict[str, int] = {}
         fitting = (quality for quality, size in _QUALITIES if pixels * size * 4 / 3 <= max_bytes)
         self._quality = next(fitting, _QUALITIES[-1][0])
 
     def add(self, images: Sequence[Image.Image]) -> list[int] | None:
-        """Add images that belong together.
-
-        Args:
-            images: Images of mode RGB.
+        """Add RGB images that belong together.
 
         Returns:
-            The place of each in `urls`. Where they do not fit, none is added, and the result is
-            None.
+            The place of each in the page's images. Where they do not fit, none is added, and the
+            result is None.
         """
         urls = [data_url(image, self._quality) for image in images]
         new = dict.fromkeys(url for url in urls if url not in self._numbers)
@@ -92,20 +90,15 @@ class Album:
             return None
         self._left -= size
         for url in new:
-            self._numbers[url] = len(self.urls)
-            self.urls.append(url)
+            self._numbers[url] = len(self._urls)
+            self._urls.append(url)
         return [self._numbers[url] for url in urls]
 
 
 def data_url(image: Image.Image, quality: int) -> str:
-    """Encode an image.
+    """Encode an RGB image as WebP in a data URL; a side of more than 1008 px is shrunk to that.
 
-    Args:
-        image: An image of mode RGB; a side of more than 1008 px is shrunk to it.
-        quality: 1 to 100, libwebp's scale.
-
-    Returns:
-        The data URL of a WebP.
+    `quality` is on libwebp's scale, 1 to 100.
     """
     if max(image.size) > _MAX_SIDE:
         image = image.copy()
@@ -150,17 +143,10 @@ def add_views(
     views: pd.DataFrame,
     max_bytes: int,
 ) -> None:
-    """Add every scored view of every cell, with as many images as fit.
+    """Add every scored view of every cell, with as many images as fit into `max_bytes`.
 
-    The first replicates of all scenes come first. A view without images has its scores, and the
-    notes say how many there are.
-
-    Args:
-        content: The content of the page, to which views, images and notes are added.
-        store: The store with photographs and renders.
-        comparison: The comparison of the cells.
-        views: The table `Sweep.views`.
-        max_bytes: The most bytes that the images may take; 0 for no images.
+    The first replicates of all scenes come first. A view whose images do not fit has its scores
+    alone, and the notes count such views.
     """
     scores: _Scores = {
         (row["cell_id"], row["view"]): {name: finite(row[name]) for name in VIEW_METRICS}
@@ -173,15 +159,14 @@ def add_views(
         for view in dict.fromkeys(v for name in cells["cell_id"] for v in names.get(name, ()))
     ]
     pixels = sum(_pixels(store, cells, view) for cells, view in wanted) if max_bytes else 0
-    album = Album(max_bytes, int(pixels * _WITH_ERROR_MAPS))
-    first, left_out = len(content.images), 0
+    album = Album(content.images, max_bytes, int(pixels * _WITH_ERROR_MAPS))
+    left_out = 0
     for cells, view in progress(wanted, "encoding views", "view"):
         entry = _entry(cells, view, scores)
         content.views.append(entry)
         if max_bytes:
             found = _read(content, store, cells, view, _title(entry))
-            left_out += found is not None and not _add_images(entry, found, album, first)
-    content.images += album.urls
+            left_out += found is not None and not _add_images(entry, found, album)
     if left_out:
         content.notes.append(
             f"The images of {left_out} of {len(wanted)} test views are left out, for the page's"
@@ -245,7 +230,6 @@ def _add_images(
     entry: dict[str, Any],
     found: tuple[Image.Image, dict[int, Image.Image]],
     album: Album,
-    first: int,
 ) -> bool:
     """Add a view's images to its entry and to the album; return whether they fit."""
     photograph, renders = found
@@ -253,11 +237,11 @@ def _add_images(
     places = album.add([photograph, *renders.values(), *errors])
     if places is None:
         return False
-    entry["photograph"], entry["size"] = first + places[0], list(photograph.size)
+    entry["photograph"], entry["size"] = places[0], list(photograph.size)
     at_render, at_error = iter(places[1:]), iter(places[1 + len(renders) :])
     for place in renders:
         arm = entry["arms"][place]
-        arm["image"], arm["error"] = first + next(at_render), first + next(at_error)
+        arm["image"], arm["error"] = next(at_render), next(at_error)
     return True
 
 
@@ -271,14 +255,13 @@ def add_trained(
 ) -> None:
     """Add training views with renders of them, models for 3D, and the cameras.
 
-    They are of the first replicate of each scene and condition, and of the variants that can be
-    read.
+    They are of the first replicate of each scene and condition, where its variant can be read.
 
     Args:
-        content: The content of the page, to which they and notes are added.
+        content: The content of the page.
         store: The store with the cells.
         comparison: The comparison of the cells.
-        variants: The variants of the cells that can be read, by their ids.
+        variants: The variants that can be read, by their ids.
         max_image_bytes: The most bytes that the images may take.
         max_model_bytes: The most bytes that the models may take as base64.
     """
@@ -295,62 +278,41 @@ def add_trained(
     if not count:
         return
     set_passive_openmp_wait()  # before torch is imported
-    from xrgs.viewer.trained import GAUSSIAN_BYTES, SHOWN_OF_A_TAG
+    from xrgs.viewer.trained import GAUSSIAN_BYTES, SHOWN_OF_A_TAG, TrainedScene
 
     fitting = int(max_model_bytes * 3 / 4 / GAUSSIAN_BYTES)  # Gaussians of all models
     kept = max(_MIN_KEPT, min(_MAX_KEPT, fitting // count))
     models_left = min(count, fitting // kept)
     shown_images = 2 * SHOWN_OF_A_TAG * (count + 2 * len(readable))
     sizes = [view.width * view.height for v in variants.values() for view in v.views]
-    album = Album(max_image_bytes, shown_images * max(sizes))
-    place = len(content.images)
+    album = Album(content.images, max_image_bytes, shown_images * max(sizes))
     for rows in progress(readable, "rendering training views", "run"):
-        variant = variants[rows["variant_id"].iloc[0]]
+        names = run_names(rows.iloc[0])
         try:
-            models_left -= _add_run(content, store, rows, variant, album, place, kept, models_left)
+            scene = TrainedScene(variants[rows["variant_id"].iloc[0]])
+            cameras = [camera | {"name": shown(camera["name"])} for camera in scene.cameras()]
+            content.cameras.append(names | {"cameras": cameras})
+            labels = _load_models(content, store, rows, scene)
+            _add_training_views(content, scene, names, labels, album)
+            models = list(islice(scene.models(kept), models_left))
         except (XrgsError, ValueError) as error:  # what can't be rendered is a ValueError
-            title = f"{shown(rows['scene'].iloc[0])}: training views and models"
+            title = f"{names['scene']}: training views and models"
             content.notes.append(f"{title} are not shown, {why(error, store)}")
-    content.images += album.urls
+            continue
+        models_left -= len(models)
+        for cell_id, model in models:
+            entry: dict[str, Any] = names | {"label": labels[cell_id]} | vars(model)
+            entry["data"] = base64.b64encode(entry.pop("content")).decode("ascii")
+            content.models.append(entry)
     if kept * count > fitting:
         left_out = count - fitting // kept
         content.notes.append(f"3D: {left_out} of {count} models are left out, for the page's size.")
 
 
-def _add_run(
-    content: Content,
-    store: JoinedStore,
-    rows: pd.DataFrame,
-    variant: Variant,
-    album: Album,
-    place: int,
-    kept: int,
-    models_left: int,
-) -> int:
-    """Add the training views and models of a scene, condition and replicate.
-
-    Args:
-        content: The content of the page.
-        store: The store with the cells.
-        rows: Rows of `Comparison.cells`, one for each label, the base first.
-        variant: The variant of the cells.
-        album: The images of training views.
-        place: The place in `content.images` of the album's first image.
-        kept: The most Gaussians of a model.
-        models_left: The most models that are added.
-
-    Returns:
-        How many models were added.
-
-    Raises:
-        XrgsError: The variant's images can't be read.
-        ValueError: A view can't be rendered.
-    """
-    from xrgs.viewer.trained import TrainedScene
-
-    scene, names = TrainedScene(variant), run_names(rows.iloc[0])
-    cameras = [camera | {"name": shown(camera["name"])} for camera in scene.cameras()]
-    content.cameras.append(names | {"cameras": cameras})
+def _load_models(
+    content: Content, store: JoinedStore, rows: pd.DataFrame, scene: TrainedScene
+) -> dict[str, str]:
+    """Load the Gaussians of the cells of a run; return the labels of those that can be read."""
     labels: dict[str, str] = {}
     for cell_id, label in zip(rows["cell_id"], map(shown, rows["label"]), strict=True):
         if cell_id in store.external:
@@ -359,16 +321,10 @@ def _add_run(
             scene.add(store.cell(cell_id))
             labels[cell_id] = label
         except XrgsError as error:
-            content.notes.append(
-                f"{names['scene']}, {label}: no training views and no model, {why(error, store)}"
-            )
-    _add_training_views(content, scene, names, labels, album, place)
-    models = list(islice(scene.models(kept), models_left))
-    for cell_id, model in models:
-        entry: dict[str, Any] = names | {"label": labels[cell_id]} | vars(model)
-        entry["data"] = base64.b64encode(entry.pop("content")).decode("ascii")
-        content.models.append(entry)
-    return len(models)
+            title = f"{shown(rows['scene'].iloc[0])}, {label}"
+            text = f"{title}: no training views and no model, {why(error, store)}"
+            content.notes.append(text)
+    return labels
 
 
 def _add_training_views(
@@ -377,7 +333,6 @@ def _add_training_views(
     names: dict[str, str],
     labels: dict[str, str],
     album: Album,
-    place: int,
 ) -> None:
     for view in scene.training_views():
         places = album.add([to_image(image) for image in _images_of(view)])
@@ -387,17 +342,15 @@ def _add_training_views(
                 " page's size."
             )
             continue
-        numbers = [place + at for at in places]
         content.training.append(
             names
             | {"view": shown(view.name), "tag": view.tag, "size": list(view.size)}
-            | {"rendered": list(view.rendered)}
-            | {"photograph": numbers.pop(0)}
-            | {"original": None if view.original is None else numbers.pop(0)}
+            | {"rendered": list(view.rendered), "photograph": places.pop(0)}
+            | {"original": None if view.original is None else places.pop(0)}
             | {
                 "arms": [
-                    {"label": labels[cell_id], "image": number}
-                    for cell_id, number in zip(view.renders, numbers, strict=True)
+                    {"label": labels[cell_id], "image": place}
+                    for cell_id, place in zip(view.renders, places, strict=True)
                 ]
             }
         )

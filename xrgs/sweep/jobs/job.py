@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from xrgs.errors import UnreadableError, XrgsError
+from xrgs.errors import StoreError, UnreadableError, XrgsError
 from xrgs.experiment.attempts import begin_attempt
 from xrgs.experiment.identity import changed_code
 from xrgs.runtime import lease
@@ -75,12 +75,12 @@ def run_job(session: SweepSession, store: Store, cell_id: str, name: str) -> str
         return GONE
     if session.stopped:
         return STOPPED
-    cell = store.cell(cell_id)
+    cell, conf = store.cell(cell_id), None
     try:
         conf = cell.config()
         outcome = _run_under_lease(cell, name, conf, store, session)
-    except OSError as error:
-        outcome, conf = _outcome_of(error, store), None
+    except (OSError, StoreError) as error:
+        outcome = _outcome_of(error, store)
         if outcome != GONE:
             log_line(f"store={store.path}: {error}")
     if outcome == UNWRITABLE:
@@ -90,10 +90,14 @@ def run_job(session: SweepSession, store: Store, cell_id: str, name: str) -> str
     return outcome
 
 
-def _outcome_of(error: OSError, store: Store) -> str:
+def _outcome_of(error: OSError | StoreError, store: Store) -> str:
     """Return the outcome of a job after an error of the store; raise any other error again."""
     if store.is_gone:
         return GONE
+    if isinstance(error, UnreadableError):
+        return UNKNOWN
+    if isinstance(error, StoreError):
+        raise error
     if worker.unwritable(error):
         return UNWRITABLE
     if not is_transient(error):
@@ -148,8 +152,8 @@ def _check_code(name: str, cell_id: str, conf: Conf, planned: Identity) -> None:
     if planned.arithmetic != here:
         raise XrgsError(
             f"{name}: cell {cell_id} was planned with the arithmetic {planned.arithmetic}, and this"
-            f" machine has {here}, which gives other last digits. Start the sweep on a machine like"
-            " those that train, or set splat.backend=torch"
+            f" machine has {here}, which gives other last digits. Start the sweep on a machine of"
+            " the same kind as the training ones, or set splat.backend=torch"
         )
 
 

@@ -21,6 +21,7 @@ from typing import TYPE_CHECKING, Any
 import msgspec
 
 from xrgs.errors import UnreadableError, XrgsError
+from xrgs.experiment.cell_folder import LOG
 from xrgs.runtime import processes
 from xrgs.runtime.machine import set_passive_openmp_wait
 from xrgs.runtime.signals import StopRequest, StopSignal, end_by_sigterm
@@ -194,30 +195,43 @@ def _import_colmap() -> None:
 
 
 def _run_cell(request: Mapping[str, Any]) -> dict[str, Any]:
+    _enter_folder(Path(request["cell"]), request["inode"])
     from xrgs.capture import variant
     from xrgs.experiment import cell
-    from xrgs.experiment.cell_folder import LOG, CellFolder
+    from xrgs.experiment.cell_folder import CellFolder
 
-    # The working directory stays this very folder when another folder takes its name. So a process
-    # that has lost its cell never writes into the files of the new owner.
-    os.chdir(request["cell"])
-    if Path.cwd().stat().st_ino != request["inode"]:
-        raise _LostError(f"{request['cell']}: another attempt at the cell has begun")
+    stop = StopRequest()
+    stop.watch()
+    faulthandler.register(supervise.STACK_SIGNAL, 2)
+    log_to_stderr(logging.INFO)
     folder = CellFolder(Path(), request["id"])
-    with (folder.path / LOG).open("ab") as log:
-        # All output of the cell, its libraries and its children goes to the log.
-        for descriptor in (1, 2):
-            os.dup2(log.fileno(), descriptor)
-        stop = StopRequest()
-        stop.watch()
-        faulthandler.register(supervise.STACK_SIGNAL, 2)
-        log_to_stderr(logging.INFO)
-        try:
-            frozen = variant.load(Path(request["variant"]))
-            cell.run_cell(folder.config(), frozen, folder, stop)
-        except StopSignal:
-            end_by_sigterm()
+    try:
+        cell.run_cell(folder.config(), variant.load(Path(request["variant"])), folder, stop)
+    except StopSignal:
+        end_by_sigterm()
     return {}
+
+
+def _enter_folder(folder: Path, inode: int) -> None:
+    """Make an attempt's folder the working directory, and its log the target of all output.
+
+    The working directory stays this very folder when another folder takes its name. So a process
+    that has lost its cell never writes into the files of the new owner.
+
+    Raises:
+        _LostError: Another folder has the name already, or none has.
+    """
+    lost = _LostError(f"{folder}: another attempt at the cell has begun")
+    try:
+        os.chdir(folder)
+        if Path.cwd().stat().st_ino != inode:
+            raise lost
+        log = os.open(LOG, os.O_WRONLY | os.O_APPEND)
+    except FileNotFoundError as error:
+        raise lost from error
+    for descriptor in (1, 2):
+        os.dup2(log, descriptor)
+    os.close(log)
 
 
 def _store_is_gone(request: Mapping[str, Any]) -> bool:

@@ -1,11 +1,11 @@
-"""Reports of failed scenes, whoever wrote them."""
+"""Names of the folders of variants, and reports of failed scenes."""
 
 from __future__ import annotations
 
 import json
 from pathlib import Path
 
-from xrgs.capture.failures import failed_scenes
+from xrgs.capture.folders import failed_scenes, id_of, is_variant
 
 
 def test_reports_are_listed_by_key_and_damaged_ones_say_what_is_wrong(tmp_path: Path) -> None:
@@ -27,3 +27,10 @@ def test_reports_are_listed_by_key_and_damaged_ones_say_what_is_wrong(tmp_path: 
         scene, reason = listed[key]
         assert scene == "?"
         assert f"{tmp_path}/failed-{key}/report.json: " in reason
+
+
+def test_names_tell_variants_from_other_folders() -> None:
+    variants = ["key-hash", "trimmed-key-hash"]
+    others = ["failed-key", ".key.building", ".key-hash.aside-1", "notes"]
+    assert [name for name in variants + others if is_variant(name)] == variants
+    assert [id_of(name) for name in variants] == ["key-hash"] * 2
