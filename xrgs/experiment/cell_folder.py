@@ -99,7 +99,9 @@ class CellFolder:
             verify: Hash the files that reports are made from; otherwise only sizes are compared.
         """
         try:
-            if not self.status_file.exists():
+            try:
+                self.status_file.stat()  # `exists` hides errors that pass, from Python 3.14 on
+            except (FileNotFoundError, NotADirectoryError):
                 return self._state_without_status()
             status = self.status()
             if status.state == "failed":
