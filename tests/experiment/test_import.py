@@ -499,3 +499,13 @@ def test_a_cell_that_a_sweep_begins_meanwhile_is_the_sweeps(
     monkeypatch.setattr(archive._Border, "admit", begun)
     assert import_store(foreign.path, mine) == Imported(0, 1, 1, 1, 1, ())
     assert list_names(cell.path) == ["log.txt"]
+
+
+def test_the_command_says_what_was_imported_and_what_was_left_out(
+    foreign: Store, call_command: Callable[..., tuple[int, str, str]]
+) -> None:
+    code, said, _ = call_command("store", "import", str(foreign.path), "--store", "mine")
+    assert (code, said.count("imported: 1 cell, 1 variant, ")) == (0, 1)
+    (the_cell(foreign).path / "extra.py").touch()
+    code, said, _ = call_command("store", "import", str(foreign.path), "--store", "mine")
+    assert (code, said.count("already there: 4")) == (1, 1)
