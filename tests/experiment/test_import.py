@@ -407,9 +407,7 @@ def test_a_header_that_would_fill_the_memory_is_not_read(mine: Store, tmp_path: 
     header = tarfile.TarInfo("x")
     header.type, header.size = tarfile.GNUTYPE_LONGNAME, 1 << 36
     (tmp_path / "a.tar").write_bytes(header.tobuf(tarfile.GNU_FORMAT) + bytes(10_000))
-    with pytest.raises(
-        StoreError, match=r"a\.tar: not an archive of a store \(.*68719476736 bytes"
-    ):
+    with pytest.raises(StoreError, match=r"a\.tar: not an archive of a store"):
         import_store(tmp_path / "a.tar", mine)
 
 

@@ -380,7 +380,9 @@ class CellFolder:
         try:
             for name in header:
                 if name != "view":
-                    table[name] = pd.to_numeric(table[name].map(as_number), downcast="integer")
+                    numbers = table[name].map(as_number).astype(float)
+                    whole = numbers.map(float.is_integer).all()
+                    table[name] = numbers.astype(int) if whole else numbers
         except ValueError as error:
             raise StoreError(f"damaged: {file}: {name}: {error}") from error
         return table
