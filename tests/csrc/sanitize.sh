@@ -29,7 +29,7 @@ PYTHON
 
 # Python leaks at exit by design. A limit of memory leaves no room for shadow memory.
 export ASAN_OPTIONS=detect_leaks=0:allocator_may_return_null=1 UBSAN_OPTIONS=print_stacktrace=1
-export PYTHONSAFEPATH=1 PYTHONPATH=$folder/package
+export PYTHONSAFEPATH=1 PYTHONPATH=$folder/package:$root
 compiler=${CXX:-c++}
 cd "$root"
 LD_PRELOAD="$("$compiler" -print-file-name=libasan.so) $("$compiler" -print-file-name=libubsan.so)"
@@ -37,5 +37,5 @@ export LD_PRELOAD
 "$python" -c "
 from xrgs import _native
 assert _native.__file__.startswith('$folder'), f'{_native.__file__} is not the sanitized module'"
-"$python" tests/splat/native/fuzz_rasterizer.py --count 1000  # pytest's 10,000 would take too long
+"$python" -m tests.splat.native.fuzz_rasterizer --count 1000  # pytest's 10,000 would take too long
 "$python" -m pytest tests/splat/native -p no:cacheprovider -k "not beyond_memory and not fuzzing" "$@"

@@ -14,6 +14,7 @@ COMPILER = os.environ.get("CXX", "c++")
 
 
 @pytest.mark.slow
+@pytest.mark.exhaustive  # compiles all kernels; test_determinism.py runs those that are there
 @pytest.mark.skipif(
     shutil.which("cmake") is None or shutil.which(COMPILER) is None,
     reason="needs cmake and a compiler",

@@ -3,22 +3,17 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 
 import numpy as np
 import pytest
 import torch
 from torch import Tensor
 
+from tests.splat.scenes import Scene, draw, make_camera, make_scene
 from xrgs.splat.attribution import attribute_pixels
 from xrgs.splat.cameras import Camera
 from xrgs.splat.gaussians import ActivatedGaussians
-from xrgs.splat.rendering import Render
 from xrgs.splat.settings import RasterSettings
-
-Scene = dict[str, Tensor]
-MakeCamera = Callable[..., Camera]
-MakeScene = Callable[..., Scene]
 
 
 @pytest.fixture
@@ -57,9 +52,7 @@ def blending_weights(scene: Scene, camera: Camera, x: float, y: float) -> list[f
     return weights
 
 
-def test_it_is_the_sum_over_pixels_of_map_times_blending_weight(
-    make_camera: MakeCamera, in_a_row: Scene
-) -> None:
+def test_it_is_the_sum_over_pixels_of_map_times_blending_weight(in_a_row: Scene) -> None:
     camera = make_camera()
     pixels = random_map(camera)
     expected = torch.zeros(3, dtype=torch.float64)
@@ -73,9 +66,7 @@ def test_it_is_the_sum_over_pixels_of_map_times_blending_weight(
     assert (expected > 0.2).all()
 
 
-def test_a_map_of_ones_comes_to_the_alpha_of_the_image(
-    make_camera: MakeCamera, make_scene: MakeScene, draw: Callable[..., Render]
-) -> None:
+def test_a_map_of_ones_comes_to_the_alpha_of_the_image() -> None:
     camera = make_camera(turned=True)
     scene = make_scene(40, camera)
     render = draw(scene, camera)
@@ -86,7 +77,7 @@ def test_a_map_of_ones_comes_to_the_alpha_of_the_image(
     assert (found.sums[~render.visible] == 0).all()
 
 
-def test_native_attributes_as_torch_does(make_camera: MakeCamera, make_scene: MakeScene) -> None:
+def test_native_attributes_as_torch_does() -> None:
     pytest.importorskip("xrgs._native")
     camera = make_camera(40, 30, turned=True)
     scene = make_scene(200, camera, dtype=torch.float32)
@@ -98,7 +89,7 @@ def test_native_attributes_as_torch_does(make_camera: MakeCamera, make_scene: Ma
     assert expected.std() > 0.1
 
 
-def test_nothing_of_the_gaussians_is_changed(make_camera: MakeCamera, in_a_row: Scene) -> None:
+def test_nothing_of_the_gaussians_is_changed(in_a_row: Scene) -> None:
     camera = make_camera()
     leaves = {name: value.requires_grad_() for name, value in in_a_row.items()}
     found = attribute_pixels(
@@ -108,7 +99,7 @@ def test_nothing_of_the_gaussians_is_changed(make_camera: MakeCamera, in_a_row: 
     assert all(leaf.grad is None for leaf in leaves.values())
 
 
-def test_a_map_of_another_size_is_refused(make_camera: MakeCamera, in_a_row: Scene) -> None:
+def test_a_map_of_another_size_is_refused(in_a_row: Scene) -> None:
     with pytest.raises(ValueError, match=r"pixels must be \[14, 20\]"):
         attribute_pixels(
             torch.ones(20, 14).double(),

@@ -1,17 +1,15 @@
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import Any
 
 import pytest
 import torch
 
+from tests.splat.scenes import make_camera
 from xrgs.splat.cameras import Camera
 
-MakeCamera = Callable[..., Camera]
 
-
-def test_the_position_has_camera_coordinates_of_zero(make_camera: MakeCamera) -> None:
+def test_the_position_has_camera_coordinates_of_zero() -> None:
     camera = make_camera(turned=True)
     seen = camera.viewmat[:3, :3] @ camera.position + camera.viewmat[:3, 3]
     torch.testing.assert_close(seen, torch.zeros(3, dtype=torch.float64), atol=1e-14, rtol=0)

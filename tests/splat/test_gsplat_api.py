@@ -11,7 +11,7 @@ import torch
 from gsplat.cuda import _torch_impl
 from torch import Tensor
 
-from xrgs.splat.gsplat_api import RasterizeMode, RenderMode, rasterization
+from xrgs.splat.gsplat_api import RenderMode, rasterization
 
 WIDTH, HEIGHT = 37, 29
 MODES: tuple[RenderMode, ...] = ("RGB", "D", "ED", "RGB+D", "RGB+ED")
@@ -162,69 +162,46 @@ def tracked(scene: Scene) -> Scene:
     return scene._replace(**{n: getattr(scene, n).detach().requires_grad_() for n in names})
 
 
-@pytest.mark.parametrize("antialiased", [False, True])
-@pytest.mark.parametrize("mode", MODES)
-def test_images_alphas_and_gradients_are_gsplats(mode: RenderMode, antialiased: bool) -> None:
-    ours, theirs = tracked(scene()), tracked(scene())
-    rasterize_mode: RasterizeMode = "antialiased" if antialiased else "classic"
-    colors, alphas, _ = rasterization(
-        **ours.arguments(), render_mode=mode, rasterize_mode=rasterize_mode
-    )
-    true_colors, true_alphas, _ = reference(theirs, mode, sh_degree=None, antialiased=antialiased)
-    assert colors.shape == true_colors.shape
-    torch.testing.assert_close(colors, true_colors, rtol=0, atol=1e-10)
-    torch.testing.assert_close(alphas, true_alphas, rtol=0, atol=1e-10)
-    true_gradients = gradients(theirs, true_colors, true_alphas)
-    for found, expected in zip(gradients(ours, colors, alphas), true_gradients, strict=True):
-        torch.testing.assert_close(found, expected, rtol=1e-7, atol=1e-8)
-
-
-@pytest.mark.parametrize("per_camera", [False, True])
-@pytest.mark.parametrize("sh_degree", [0, 2, 3])
-def test_spherical_harmonics_are_gsplats(sh_degree: int, per_camera: bool) -> None:
-    made = scene(per_camera=per_camera, sh_degree=3)
-    ours, theirs = tracked(made), tracked(made)
-    colors, alphas, _ = rasterization(
-        **ours.arguments(), sh_degree=sh_degree, render_mode="RGB+ED", backend="torch"
-    )
-    true_colors, true_alphas, _ = reference(theirs, "RGB+ED", sh_degree=sh_degree)
-    torch.testing.assert_close(colors, true_colors, rtol=0, atol=1e-10)
-    for found, expected in zip(
-        gradients(ours, colors, alphas), gradients(theirs, true_colors, true_alphas), strict=True
-    ):
-        torch.testing.assert_close(found, expected, rtol=1e-7, atol=1e-8)
-
-
-@pytest.mark.parametrize("backend", ["torch", "native"])
-def test_bands_above_degree_3_are_left_out(backend: str) -> None:
+@pytest.mark.parametrize(
+    ("mode", "antialiased", "sh_degree", "per_camera"),
+    [
+        *((mode, antialiased, None, False) for mode in MODES for antialiased in (False, True)),
+        *(("RGB+ED", False, degree, each) for degree in (0, 2, 3) for each in (False, True)),
+    ],
+)
+def test_images_alphas_and_gradients_are_gsplats(
+    backend: str, mode: RenderMode, antialiased: bool, sh_degree: int | None, per_camera: bool
+) -> None:
+    made = scene(per_camera=per_camera, sh_degree=None if sh_degree is None else 3)
     if backend == "native":
-        pytest.importorskip("xrgs._native")
+        made = made.to(torch.float32)
+    ours, theirs = tracked(made), tracked(made.to(torch.float64))
+    colors, alphas, _ = rasterization(
+        **ours.arguments(),
+        sh_degree=sh_degree,
+        render_mode=mode,
+        rasterize_mode="antialiased" if antialiased else "classic",
+        backend=backend,
+    )
+    expected = reference(theirs, mode, sh_degree=sh_degree, antialiased=antialiased)[:2]
+    relative, absolute = (2e-5, 2e-5) if backend == "native" else (0, 1e-10)
+    for mine, true in zip((colors, alphas), expected, strict=True):
+        torch.testing.assert_close(mine, true.to(mine.dtype), rtol=relative, atol=absolute)
+    true_gradients = gradients(theirs, *expected)
+    for mine, true in zip(gradients(ours, colors, alphas), true_gradients, strict=True):
+        if backend == "native":
+            assert (mine - true).norm() <= 1e-4 * true.norm()
+        else:
+            torch.testing.assert_close(mine, true, rtol=1e-7, atol=1e-8)
+
+
+def test_bands_above_degree_3_are_left_out(backend: str) -> None:
     made = scene(sh_degree=3).to(torch.float32)
     wide = made._replace(colors=torch.cat([made.colors, torch.ones(80, 9, 3)], dim=1))
     expected, found = (
         rasterization(**each.arguments(), sh_degree=3, backend=backend)[0] for each in (made, wide)
     )
     assert torch.equal(found, expected)
-
-
-@pytest.mark.parametrize("mode", MODES)
-@pytest.mark.parametrize("sh_degree", [None, 3])
-def test_the_native_backend_gives_gsplats_images_and_gradients(
-    mode: RenderMode, sh_degree: int | None
-) -> None:
-    pytest.importorskip("xrgs._native")
-    made = scene(sh_degree=sh_degree).to(torch.float32)
-    ours, theirs = tracked(made), tracked(made.to(torch.float64))
-    colors, alphas, _ = rasterization(
-        **ours.arguments(), sh_degree=sh_degree, render_mode=mode, backend="native"
-    )
-    true_colors, true_alphas, _ = reference(theirs, mode, sh_degree=sh_degree)
-    torch.testing.assert_close(colors, true_colors.float(), rtol=2e-5, atol=2e-5)
-    torch.testing.assert_close(alphas, true_alphas.float(), rtol=2e-5, atol=2e-5)
-    for found, expected in zip(
-        gradients(ours, colors, alphas), gradients(theirs, true_colors, true_alphas), strict=True
-    ):
-        assert (found - expected).norm() <= 1e-4 * expected.norm()
 
 
 def test_the_projections_in_meta_are_gsplats() -> None:

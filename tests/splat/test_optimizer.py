@@ -2,21 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from math import inf, nan
+from typing import Any
 
 import pytest
 import torch
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from xrgs.splat.cameras import Camera
+from tests.splat.scenes import make_camera, normal_parameters
 from xrgs.splat.gaussians import PARAMETERS, Gaussians
 from xrgs.splat.optimizer import SplatOptimizer
 from xrgs.splat.settings import OptimizerSettings
 from xrgs.splat.sh import C0, sh_basis
-
-MakeCamera = Callable[..., Camera]
-MakeScene = Callable[..., dict[str, Tensor]]
 
 # gsplat 1.5.3, examples/simple_trainer.py; means before the scene's scale.
 GSPLAT_RATES = {
@@ -27,22 +25,6 @@ GSPLAT_RATES = {
     "sh0": 2.5e-3,
     "shN": 2.5e-3 / 20,
 }
-SHAPES: dict[str, tuple[int, ...]] = {
-    "means": (3,),
-    "quats": (4,),
-    "scales": (3,),
-    "opacities": (),
-    "sh0": (1, 3),
-    "shN": (15, 3),
-}
-
-
-def random_values(count: int, seed: int, dtype: torch.dtype = torch.float64) -> dict[str, Tensor]:
-    generator = torch.Generator().manual_seed(seed)
-    return {
-        name: torch.randn((count, *shape), generator=generator, dtype=dtype)
-        for name, shape in SHAPES.items()
-    }
 
 
 def gaussians_of(values: dict[str, Tensor]) -> Gaussians:
@@ -57,13 +39,15 @@ def optimizer_of(
     backend: str = "torch",
     settings: OptimizerSettings | None = None,
 ) -> SplatOptimizer:
-    gaussians = gaussians_of(random_values(count, 0, dtype))
+    gaussians = gaussians_of(normal_parameters(count, 0, dtype=dtype))
     settings = settings or OptimizerSettings()
     return SplatOptimizer(gaussians, settings, scene_scale=2.0, steps=steps, backend=backend)
 
 
 def take_step(optimizer: SplatOptimizer, seed: int) -> dict[str, Tensor]:
-    gradients = random_values(len(optimizer.gaussians), seed, optimizer.gaussians.means.dtype)
+    gradients = normal_parameters(
+        len(optimizer.gaussians), seed, dtype=optimizer.gaussians.means.dtype
+    )
     optimizer.zero_grad()
     for name in PARAMETERS:
         optimizer.gaussians[name].grad = gradients[name].clone()
@@ -83,7 +67,7 @@ def moments(optimizer: SplatOptimizer, name: str) -> tuple[Tensor, Tensor]:
 def test_it_is_one_adam_a_parameter(dtype: torch.dtype, fused: bool, tolerance: float) -> None:
     steps = 40
     optimizer = optimizer_of(steps=steps, dtype=dtype)
-    expected = gaussians_of(random_values(5, 0, dtype))
+    expected = gaussians_of(normal_parameters(5, 0, dtype=dtype))
     theirs = {
         name: torch.optim.Adam(
             [expected[name]],
@@ -103,7 +87,7 @@ def test_it_is_one_adam_a_parameter(dtype: torch.dtype, fused: bool, tolerance: 
             adam.step()
         decay.step()
     for name in PARAMETERS:
-        start = random_values(5, 0, dtype)[name]
+        start = normal_parameters(5, 0, dtype=dtype)[name]
         ours, reference = optimizer.gaussians[name].detach(), expected[name].detach()
         assert (ours != start).all()
         torch.testing.assert_close(ours, reference, rtol=tolerance, atol=tolerance)
@@ -145,17 +129,14 @@ def test_a_skipped_step_moves_nothing_and_the_rate_goes_on() -> None:
     assert skipping.adam.state[skipping.gaussians.means]["step"] == 1  # of Adam's own steps
 
 
-@pytest.mark.parametrize("backend", ["torch", "native"])
-def test_the_harmonics_move_at_every_third_step(backend: str, make_camera: MakeCamera) -> None:
+def test_the_harmonics_move_at_every_third_step(backend: str) -> None:
     """Against an Adam of three times the rate that steps as often, on the same gradients."""
-    if backend == "native":
-        pytest.importorskip("xrgs._native")
     camera, dtype = make_camera(), torch.float32
     optimizer = optimizer_of(dtype=dtype, backend=backend, settings=OptimizerSettings(shN_every=3))
-    expected = random_values(5, 0, dtype)["shN"].requires_grad_()
+    expected = normal_parameters(5, 0, dtype=dtype)["shN"].requires_grad_()
     theirs = torch.optim.Adam([expected], lr=3 * GSPLAT_RATES["shN"], eps=1e-15)
     for step in range(7):
-        values = random_values(5, 10 + step, dtype)
+        values = normal_parameters(5, 10 + step, dtype=dtype)
         optimizer.zero_grad()
         optimizer.gaussians.sh0.grad = values["sh0"].clone()
         before = optimizer.gaussians.shN.detach().clone()
@@ -180,12 +161,22 @@ def test_schedules_without_meaning_are_refused(name: str, value: int) -> None:
         optimizer_of(settings=settings)
 
 
+@pytest.mark.parametrize(
+    ("name", "value"), [("steps", 0), *(("scene_scale", v) for v in (0.0, -1.0, nan, inf))]
+)
+def test_a_run_without_meaning_is_refused(name: str, value: float) -> None:
+    options: dict[str, Any] = {"scene_scale": 1.0, "steps": 10, name: value}
+    gaussians = gaussians_of(normal_parameters(2, 0))
+    with pytest.raises(ValueError, match=name):
+        SplatOptimizer(gaussians, OptimizerSettings(), **options)
+
+
 def test_appended_gaussians_start_without_momentum() -> None:
     optimizer = optimizer_of(5)
     take_step(optimizer, 1)
     old = {name: optimizer.gaussians[name].detach().clone() for name in PARAMETERS}
     before = {name: [m.clone() for m in moments(optimizer, name)] for name in PARAMETERS}
-    new = random_values(3, 2)
+    new = normal_parameters(3, 2, dtype=torch.float64)
     optimizer.append(new)
     assert len(optimizer.gaussians) == 8
     for name in PARAMETERS:
@@ -225,7 +216,7 @@ def test_a_reset_touches_one_parameter() -> None:
 def test_training_goes_on_after_a_change() -> None:
     optimizer = optimizer_of(5)
     take_step(optimizer, 1)
-    optimizer.append(random_values(2, 3))
+    optimizer.append(normal_parameters(2, 3, dtype=torch.float64))
     optimizer.keep(torch.tensor([6, 1]))
     first = optimizer.gaussians.scales.detach().clone()
     gradients = take_step(optimizer, 4)
@@ -239,20 +230,21 @@ def test_training_goes_on_after_a_change() -> None:
 def test_changes_before_the_first_step() -> None:
     optimizer = optimizer_of(5)
     optimizer.keep(torch.tensor([1, 2]))
-    optimizer.append(random_values(1, 1))
+    optimizer.append(normal_parameters(1, 1, dtype=torch.float64))
     optimizer.reset("opacities", torch.zeros(3, dtype=torch.float64))
     assert optimizer.state_bytes() == 0
     take_step(optimizer, 2)
     assert moments(optimizer, "means")[0].shape == (3, 3)
 
 
-def test_no_gaussians_left() -> None:
-    optimizer = optimizer_of(5)
+def test_no_gaussians_left(backend: str) -> None:
+    optimizer = optimizer_of(5, dtype=torch.float32, backend=backend)
     take_step(optimizer, 1)
     optimizer.keep(torch.zeros(5, dtype=torch.bool))
     take_step(optimizer, 2)
     assert len(optimizer.gaussians) == 0
-    optimizer.append(random_values(2, 3))
+    assert optimizer.adam.state[optimizer.gaussians.means]["step"] == 2
+    optimizer.append(normal_parameters(2, 3))
     take_step(optimizer, 4)
     assert optimizer.gaussians.means.isfinite().all()
 
@@ -264,26 +256,3 @@ def test_state_is_counted_in_bytes() -> None:
     assert optimizer.state_bytes() == 2 * 5 * (3 + 4 + 3 + 1 + 3 + 45) * 4 + steps
     optimizer.keep(torch.arange(3))
     assert optimizer.state_bytes() == 2 * 3 * (3 + 4 + 3 + 1 + 3 + 45) * 4 + steps
-
-
-def test_zero_grad_forgets() -> None:
-    optimizer = optimizer_of(5)
-    take_step(optimizer, 1)
-    optimizer.zero_grad()
-    assert all(optimizer.gaussians[name].grad is None for name in PARAMETERS)
-
-
-@pytest.mark.parametrize("scene_scale", [0.0, -1.0, float("nan"), float("inf")])
-def test_a_scale_without_meaning_is_refused(scene_scale: float) -> None:
-    with pytest.raises(ValueError, match="scene_scale"):
-        SplatOptimizer(
-            gaussians_of(random_values(2, 0)),
-            OptimizerSettings(),
-            scene_scale=scene_scale,
-            steps=10,
-        )
-
-
-def test_no_steps_are_refused() -> None:
-    with pytest.raises(ValueError, match="steps"):
-        optimizer_of(steps=0)

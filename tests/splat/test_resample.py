@@ -2,17 +2,13 @@
 
 from __future__ import annotations
 
-import importlib.util
-from collections.abc import Iterator
-
 import pytest
 import torch
 from torch import Tensor
 from torch.nn.functional import interpolate
 
+from tests.splat.scenes import noise
 from xrgs.splat.resample import resize
-
-NATIVE = importlib.util.find_spec("xrgs._native") is not None
 
 #: (from, to), [H, W]: up and down, one axis each way, the same, one pixel, whole vectors and not.
 SIZES = [
@@ -28,11 +24,6 @@ SIZES = [
 ]
 
 
-def noise(height: int, width: int, seed: int = 0) -> Tensor:
-    generator = torch.Generator().manual_seed(seed)
-    return torch.rand(height, width, 3, generator=generator, dtype=torch.float64)
-
-
 def torchs(image: Tensor, size: tuple[int, int]) -> Tensor:
     planes = image.permute(2, 0, 1)[None]
     resized = interpolate(planes, size=size, mode="bicubic", antialias=True)
@@ -46,29 +37,6 @@ def value_and_gradient(image: Tensor, slope: Tensor, backend: str) -> tuple[Tens
     return resized.detach(), gradient
 
 
-@pytest.fixture
-def backend(request: pytest.FixtureRequest) -> Iterator[str]:
-    """`torch`, or `native` on one of the machine's instruction sets."""
-    if request.param == "torch":
-        yield "torch"
-        return
-    from xrgs import _native
-
-    before = _native.isa()
-    _native.set_isa(request.param)
-    yield "native"
-    _native.set_isa(before)
-
-
-def backends() -> list[str]:
-    if not NATIVE:
-        return ["torch"]
-    from xrgs import _native
-
-    return ["torch", *_native.available_isas()]
-
-
-@pytest.mark.parametrize("backend", backends(), indirect=True)
 @pytest.mark.parametrize(("old", "new"), SIZES)
 def test_it_is_torchs_interpolation(
     backend: str, old: tuple[int, int], new: tuple[int, int]
@@ -90,7 +58,6 @@ def test_in_double_it_is_exact(old: tuple[int, int], new: tuple[int, int]) -> No
     torch.testing.assert_close(resize(image, *new), torchs(image, new), rtol=0, atol=1e-12)
 
 
-@pytest.mark.parametrize("backend", backends(), indirect=True)
 def test_one_column_is_resized_as_a_column_of_many(backend: str) -> None:
     # Against a wide image: torch 2.13's interpolate reads one column as if it were something else.
     image = noise(40, 1).float()

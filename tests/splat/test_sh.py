@@ -73,17 +73,17 @@ def test_gradient(dirs: Tensor) -> None:
     assert torch.autograd.gradcheck(lambda *args: sh_to_colors(3, *args), inputs)
 
 
-@pytest.mark.parametrize("degree", [-1, 4])
-def test_degree_out_of_range(dirs: Tensor, degree: int) -> None:
-    with pytest.raises(ValueError, match="sh_degree must be 0 to 3"):
-        sh_basis(degree, dirs)
-
-
-def test_too_few_bands(dirs: Tensor) -> None:
-    with pytest.raises(ValueError, match=r"sh_degree 2 needs shN of \[N, 8, 3\]"):
-        sh_to_colors(2, dirs, torch.zeros(len(dirs), 1, 3), torch.zeros(len(dirs), 3, 3))
-
-
-def test_too_many_bands(dirs: Tensor) -> None:
-    with pytest.raises(ValueError, match=r"shN must be \[N, K - 1, 3\] with K - 1 of at most 15"):
-        sh_to_colors(3, dirs, torch.zeros(len(dirs), 1, 3), torch.zeros(len(dirs), 16, 3))
+@pytest.mark.parametrize(
+    ("degree", "bands", "message"),
+    [
+        (-1, 15, "sh_degree must be 0 to 3"),
+        (4, 15, "sh_degree must be 0 to 3"),
+        (2, 3, r"sh_degree 2 needs shN of \[N, 8, 3\]"),
+        (3, 16, r"shN must be \[N, K - 1, 3\] with K - 1 of at most 15"),
+    ],
+)
+def test_degrees_and_bands_that_do_not_fit(
+    dirs: Tensor, degree: int, bands: int, message: str
+) -> None:
+    with pytest.raises(ValueError, match=message):
+        sh_to_colors(degree, dirs, torch.zeros(len(dirs), 1, 3), torch.zeros(len(dirs), bands, 3))

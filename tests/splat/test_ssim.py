@@ -1,13 +1,18 @@
-"""The window of the SSIM against scipy's Gaussian filter."""
+"""The SSIM of the training loss against kornia, scikit-image and scipy's Gaussian filter."""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
 import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from scipy.ndimage import gaussian_filter
+from torch import Tensor
 
-from xrgs.splat.ssim import SIGMA, WINDOW, window_mean, window_moments
+from tests.splat.scenes import noise, similar_pair
+from xrgs.splat.loss import photometric_loss, prepare_target
+from xrgs.splat.ssim import SIGMA, WINDOW, Target, window_mean, window_moments
 
 
 @pytest.mark.parametrize("size", [(11, 11), (11, 30), (25, 17)])
@@ -30,8 +35,71 @@ def test_moments_are_those_of_a_distribution() -> None:
     np.testing.assert_allclose(variance[0, 0], weights @ (samples - mean) ** 2, rtol=1e-10)
 
 
-def test_a_flat_image_has_no_variance_below_zero() -> None:
-    # E[x^2] - E[x]^2 in float32 is below 0 for about half of these levels.
-    for level in torch.linspace(0.1, 300, 40):
-        _, variance = window_moments(torch.full((12, 12, 3), level.item()))
-        assert (variance >= 0).all()
+def structural_similarity(image: Tensor, target: Target) -> Tensor:
+    """The mean SSIM over pixels and channels."""
+    return 1 - photometric_loss(image, target, l1=0.0, ssim=1.0, backend="torch")
+
+
+@pytest.mark.parametrize("size", [(11, 11), (11, 30), (40, 13), (52, 67)])
+def test_ssim_is_kornias(size: tuple[int, int]) -> None:
+    from kornia.losses import ssim_loss
+    from kornia.metrics import ssim
+
+    image, target = similar_pair(*size)
+    batch, reference = (x.permute(2, 0, 1)[None] for x in (image, target))
+    # eps: kornia adds it to the denominator.
+    expected = ssim(batch, reference, 11, eps=0.0, padding="valid").mean()
+    value = structural_similarity(image, prepare_target(target))
+    torch.testing.assert_close(value, expected, rtol=1e-12, atol=0)
+    half = ssim_loss(batch, reference, 11, eps=0.0, padding="valid")
+    torch.testing.assert_close(1 - value, 2 * half, rtol=1e-12, atol=0)
+
+
+def test_ssim_is_scikit_images() -> None:
+    from skimage.metrics import structural_similarity as skimage_ssim
+
+    image, target = similar_pair(52, 67)
+    # Its mean leaves out the border that the window doesn't fit in.
+    expected = skimage_ssim(
+        image.numpy(),
+        target.numpy(),
+        gaussian_weights=True,
+        sigma=1.5,
+        use_sample_covariance=False,
+        data_range=1.0,
+        channel_axis=-1,
+    )
+    value = structural_similarity(image, prepare_target(target))
+    assert 0.2 < expected < 0.9
+    assert value.item() == pytest.approx(expected, rel=1e-10)
+
+
+@settings(max_examples=25, deadline=None)
+@given(
+    size=st.tuples(st.integers(11, 24), st.integers(11, 24)),
+    seeds=st.tuples(st.integers(0, 10**6), st.integers(0, 10**6)),
+)
+def test_ssim_is_symmetric_and_bounded(size: tuple[int, int], seeds: tuple[int, int]) -> None:
+    a, b = noise(*size, seeds[0]), noise(*size, seeds[1])
+    ab = structural_similarity(a, prepare_target(b)).item()
+    assert ab == pytest.approx(structural_similarity(b, prepare_target(a)).item(), abs=1e-12)
+    assert abs(ab) <= 1 + 1e-12
+    assert structural_similarity(a, prepare_target(a)).item() == pytest.approx(1, abs=1e-12)
+
+
+def test_a_variance_below_zero_counts_as_zero() -> None:
+    # At these levels E[x^2] - E[x]^2 in float32 is as often below -C2 as above C2.
+    target = prepare_target(torch.ones(12, 15, 3))
+    for level in torch.linspace(200, 400, 100):
+        image = torch.full((12, 15, 3), level.item())
+        luminance = (2 * level + 1e-4) / (level**2 + 1 + 1e-4)
+        value = structural_similarity(image, target)
+        assert 0 <= value <= 1.2 * luminance
+
+
+def test_flat_images_have_the_ssim_of_their_levels() -> None:
+    image, target = torch.full((2, 12, 15, 3), 0.0, dtype=torch.float64)
+    image, target = image + 0.25, target + 0.5
+    expected = (2 * 0.25 * 0.5 + 1e-4) / (0.25**2 + 0.5**2 + 1e-4)
+    value = structural_similarity(image, prepare_target(target)).item()
+    assert value == pytest.approx(expected, rel=1e-9)

@@ -16,39 +16,34 @@ from xrgs.splat.gaussians import PARAMETERS, Gaussians
 from xrgs.training.recorder import TrainingResult
 
 
-def _same(first: Gaussians, second: Gaussians) -> bool:
+def same(first: Gaussians, second: Gaussians) -> bool:
+    """Whether two models are equal bit for bit."""
     return all(torch.equal(first[name], second[name]) for name in PARAMETERS)
 
 
-def _comparable(result: TrainingResult) -> dict[str, Any]:
+def comparable(result: TrainingResult) -> dict[str, Any]:
+    """Everything in a result but the training time, as values that `==` compares exactly."""
     parameters = {name: result.gaussians[name].detach().numpy().tobytes() for name in PARAMETERS}
     others = {name: value for name, value in vars(result).items() if name != "gaussians"}
     columns = [list(row) for row in result.history]
     return parameters | others | {"seconds": None, "stage_seconds": None, "columns": columns}
 
 
-@pytest.fixture(scope="session")
-def same() -> Callable[[Gaussians, Gaussians], bool]:
-    """(first, second) -> whether two models are equal bit for bit."""
-    return _same
-
-
-@pytest.fixture(scope="session")
-def comparable() -> Callable[[TrainingResult], dict[str, Any]]:
-    """(result) -> everything in it but the training time, as values that `==` compares exactly."""
-    return _comparable
-
-
 _composed = functools.cache(composing.compose)
 
 
-@pytest.fixture(scope="session")
-def compose() -> Callable[..., Conf]:
-    """(*overrides) -> a copy of the config: Hydra composes the same overrides once."""
-    return lambda *overrides: copy.deepcopy(_composed(*overrides))
+def compose(*overrides: str) -> Conf:
+    """A copy of the config: Hydra composes the same overrides once."""
+    return copy.deepcopy(_composed(*overrides))
+
+
+@pytest.fixture(scope="session", name="compose")
+def composed() -> Callable[..., Conf]:
+    """`compose` in the place of the root's fixture, for `baseline`."""
+    return compose
 
 
 @pytest.fixture
-def short(compose: Callable[..., Conf]) -> Conf:
+def short() -> Conf:
     """The baseline's config, 40 steps with the fastest renderer that is installed."""
     return compose("train.steps=40", "splat.backend=auto")

@@ -19,14 +19,12 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
+from tests.training.conftest import comparable
 from xrgs.capture.dataset import Dataset
 from xrgs.config import Conf
 from xrgs.training import checkpoint
 from xrgs.training.checkpoint import Checkpoint, CheckpointError
 from xrgs.training.loop import train
-from xrgs.training.recorder import TrainingResult
-
-Comparable = Callable[[TrainingResult], dict[str, Any]]
 
 #: Seconds between two checkpoints that are so few that one is written at every step.
 EVERY_STEP = 1e-9
@@ -223,13 +221,7 @@ def test_a_missing_state_is_refused(tmp_path: Path) -> None:
     ],
 )
 def test_a_state_that_does_not_fit_is_refused_by_its_object(
-    data: Dataset,
-    few_steps: Conf,
-    tmp_path: Path,
-    comparable: Comparable,
-    member: str,
-    value: NDArray[Any],
-    named: str,
+    data: Dataset, few_steps: Conf, tmp_path: Path, member: str, value: NDArray[Any], named: str
 ) -> None:
     file = tmp_path / "c.npz"
     train(data, few_steps, Checkpoint(file, "cell", EVERY_STEP))
@@ -254,7 +246,6 @@ def test_a_full_disk_costs_the_checkpoint_and_not_the_run(
     data: Dataset,
     few_steps: Conf,
     tmp_path: Path,
-    comparable: Comparable,
     monkeypatch: pytest.MonkeyPatch,
     caplog: pytest.LogCaptureFixture,
 ) -> None:

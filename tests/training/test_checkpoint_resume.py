@@ -16,6 +16,7 @@ import torch
 from hypothesis import Phase, example, given, settings
 from hypothesis import strategies as st
 
+from tests.training.conftest import comparable, compose
 from xrgs.capture.dataset import Dataset
 from xrgs.config import Conf
 from xrgs.splat.loss import photometric_loss
@@ -50,9 +51,6 @@ CASES = {
     # Without the reset, after which too few Gaussians are left for numbers to be matched.
     "count_matched": ["splat.densify.reset_every=50000"],
 }
-
-Compose = Callable[..., Conf]
-Comparable = Callable[[TrainingResult], dict[str, Any]]
 
 
 class Kill(BaseException):
@@ -119,7 +117,7 @@ def losses(monkeypatch: pytest.MonkeyPatch) -> Losses:
 
 
 @pytest.fixture
-def conf(compose: Compose) -> Conf:
+def conf() -> Conf:
     """The baseline's config, `STEPS` steps with the renderer that is installed everywhere."""
     return compose(*SHORT, "splat.backend=torch")
 
@@ -139,13 +137,7 @@ def train_with_checkpoints(
 )
 @pytest.mark.parametrize("case", CASES)
 def test_a_killed_run_ends_as_one_never_killed(
-    case: str,
-    backend: str,
-    data: Dataset,
-    compose: Compose,
-    comparable: Comparable,
-    losses: Losses,
-    tmp_path: Path,
+    case: str, backend: str, data: Dataset, losses: Losses, tmp_path: Path
 ) -> None:
     if backend == "native":
         pytest.importorskip("xrgs._native")
@@ -188,7 +180,7 @@ def test_a_killed_run_ends_as_one_never_killed(
 
 
 def test_a_run_killed_after_its_last_step_trains_no_step_again(
-    data: Dataset, conf: Conf, comparable: Comparable, losses: Losses, tmp_path: Path
+    data: Dataset, conf: Conf, losses: Losses, tmp_path: Path
 ) -> None:
     file = tmp_path / "checkpoint.npz"
     first = train_with_checkpoints(file, 1, losses, data, conf)

@@ -10,6 +10,7 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
+from tests.training.conftest import same
 from xrgs.capture.dataset import Dataset
 from xrgs.config import Conf
 from xrgs.errors import XrgsError
@@ -186,9 +187,7 @@ def test_the_count_is_checked_once_densification_has_stopped(
             checked()
 
 
-def test_the_matched_run_is_the_plain_run_with_its_threshold(
-    data: Dataset, short: Conf, same: Callable[[Gaussians, Gaussians], bool]
-) -> None:
+def test_the_matched_run_is_the_plain_run_with_its_threshold(data: Dataset, short: Conf) -> None:
     plain = train_cell(data, short)
     target = round(0.8 * len(plain.gaussians))
     short.components.count_matched.gaussians = target
@@ -216,9 +215,7 @@ def test_more_gaussians_than_growing_can_give_are_an_error_that_names_what_it_ga
     assert all(0 < int(count) < 10**6 for _, count in tried)
 
 
-def test_one_training_does_not_read_the_count(
-    data: Dataset, short: Conf, same: Callable[[Gaussians, Gaussians], bool]
-) -> None:
+def test_one_training_does_not_read_the_count(data: Dataset, short: Conf) -> None:
     short.train.steps = 10
     plain = loop.train(data, short)
     short.components.count_matched.gaussians = 1

@@ -10,6 +10,7 @@ from pathlib import Path
 import pytest
 import torch
 
+from tests.training.conftest import compose
 from xrgs.capture.dataset import Dataset
 from xrgs.composing import from_dict
 from xrgs.config import Conf
@@ -218,7 +219,7 @@ def test_settings_that_are_no_mapping_are_refused(settings: object, baseline: Co
         from_dict(values)
 
 
-def test_settings_come_from_the_command_line(compose: Callable[..., Conf]) -> None:
+def test_settings_come_from_the_command_line() -> None:
     conf = compose("+components.plugins.one.weight=0.5", "+components.plugins.one.deep={a: [1, 2]}")
     assert conf.components.plugins == {"one": {"weight": 0.5, "deep": {"a": [1, 2]}}}
     assert from_dict(asdict(conf)) == conf

@@ -39,14 +39,6 @@ def test_every_view_is_sampled_once_an_epoch_in_a_new_order(data: Dataset) -> No
     assert len(set(orders)) > 1
 
 
-def test_the_order_depends_on_the_seed_alone(data: Dataset) -> None:
-    names = sampled_names(data, 40, always)
-    assert sampled_names(data, 40, always) == names
-    assert sampled_names(data, 40, always, seed=1) != names
-    torch.rand(7)  # the global generator is not used
-    assert sampled_names(data, 20, always) == names[:20]
-
-
 def test_an_epoch_is_a_permutation_drawn_from_the_seeds_generator(data: Dataset) -> None:
     generator = seeded_generator(5, "views")
     orders = [torch.randperm(4, generator=generator).flip(0).tolist() for _ in range(3)]

@@ -11,6 +11,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from tests.splat.scenes import normal_parameters
 from xrgs.splat.gaussians import Gaussians
 
 native = pytest.importorskip("xrgs._native")
@@ -105,10 +106,7 @@ def test_all_instruction_sets_with_fused_multiply_add_give_the_same_bits(name: s
 @pytest.mark.usefixtures("threads")
 def test_threads_change_no_bit() -> None:
     """100,003 Gaussians: torch divides its own work among threads from 32,768 elements on."""
-    generator = torch.Generator().manual_seed(0)
-    shapes = {"means": (3,), "quats": (4,), "scales": (3,), "opacities": ()}
-    shapes |= {"sh0": (1, 3), "shN": (0, 3)}
-    raw = {name: torch.randn(100_003, *s, generator=generator) for name, s in shapes.items()}
+    raw = normal_parameters(100_003, 0)
     results = []
     for count in (1, 2, 3):
         torch.set_num_threads(count)

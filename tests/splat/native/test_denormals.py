@@ -6,13 +6,14 @@ leave that of the caller as it is.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 
 import numpy as np
 import pytest
 import torch
 from torch import Tensor
 
+from tests.splat.scenes import make_camera, make_scene
 from xrgs.splat.cameras import Camera
 from xrgs.splat.gaussians import ActivatedGaussians
 from xrgs.splat.rendering import rasterize_parameters
@@ -20,8 +21,6 @@ from xrgs.splat.settings import RasterSettings
 
 native = pytest.importorskip("xrgs._native")
 
-MakeCamera = Callable[..., Camera]
-MakeScene = Callable[..., dict[str, Tensor]]
 
 BETAS = (0.9, 0.999)
 SMALLEST_NORMAL = float(np.finfo(np.float32).tiny)
@@ -109,9 +108,7 @@ def gradients(
 
 
 @pytest.mark.usefixtures("threads")
-def test_a_render_does_not_depend_on_what_its_caller_flushes(
-    isa: str, make_camera: MakeCamera, make_scene: MakeScene
-) -> None:
+def test_a_render_does_not_depend_on_what_its_caller_flushes(isa: str) -> None:
     camera = make_camera(70, 50, turned=True)
     scene = make_scene(200, camera, seed=3, dtype=torch.float32)
     v = torch.full((50, 70, 3), 1e-37)
@@ -127,9 +124,7 @@ def test_a_render_does_not_depend_on_what_its_caller_flushes(
 
 @pytest.mark.parametrize("flush", [False, True])
 @pytest.mark.parametrize("threads", [1, 2])
-def test_the_state_of_the_caller_is_left_as_it_is(
-    make_camera: MakeCamera, make_scene: MakeScene, flush: bool, threads: int
-) -> None:
+def test_the_state_of_the_caller_is_left_as_it_is(flush: bool, threads: int) -> None:
     camera = make_camera()
     scene = make_scene(10, camera, dtype=torch.float32)
     torch.set_flush_denormal(flush)

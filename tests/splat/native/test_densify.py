@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
 import pytest
 import torch
 from torch import Tensor
 
+from tests.splat.scenes import make_strategy, normal_parameters
 from xrgs.splat.strategy.default import DefaultStrategy
-
-MakeStrategy = Callable[..., DefaultStrategy]
 
 native = pytest.importorskip("xrgs._native")
 
@@ -24,23 +21,12 @@ def step(count: int, seed: int = 0) -> tuple[Tensor, Tensor]:
     return gradient, torch.rand(count, generator=generator) < 0.6
 
 
-@pytest.fixture
-def strategy(make_strategy: MakeStrategy) -> MakeStrategy:
-    def make(count: int, backend: str, dtype: torch.dtype = torch.float32) -> DefaultStrategy:
-        generator = torch.Generator().manual_seed(1)
-        shapes = {"means": (3,), "quats": (4,), "scales": (3,), "opacities": ()}
-        shapes |= {"sh0": (1, 3), "shN": (15, 3)}
-        values = {
-            name: torch.randn(count, *shape, generator=generator).to(dtype)
-            for name, shape in shapes.items()
-        }
-        return make_strategy(values, backend=backend)
-
-    return make
+def strategy(count: int, backend: str, dtype: torch.dtype = torch.float32) -> DefaultStrategy:
+    return make_strategy(normal_parameters(count, 1, dtype=dtype), backend=backend)
 
 
 @pytest.mark.parametrize("count", COUNTS)
-def test_sums_are_those_in_double(strategy: MakeStrategy, isa: str, count: int) -> None:
+def test_sums_are_those_in_double(isa: str, count: int) -> None:
     ours, exact = strategy(count, "native"), strategy(count, "torch", torch.float64)
     for number in range(3):
         gradient, visible = step(count, number)
@@ -51,10 +37,10 @@ def test_sums_are_those_in_double(strategy: MakeStrategy, isa: str, count: int) 
     torch.testing.assert_close(ours.grad2d_sum.double(), exact.grad2d_sum, rtol=4e-7, atol=0)
 
 
-def test_what_is_not_visible_adds_nothing(strategy: MakeStrategy, isa: str) -> None:
+def test_what_is_not_visible_adds_nothing(backend: str) -> None:
     gradient, visible = step(50)
     gradient[~visible] = torch.nan
-    ours = strategy(50, "native")
+    ours = strategy(50, backend)
     ours.after_step(1, gradient, visible, width=9, height=9)
     assert ours.grad2d_sum.isfinite().all()
     assert not ours.grad2d_sum[:, ~visible].any()
@@ -62,7 +48,7 @@ def test_what_is_not_visible_adds_nothing(strategy: MakeStrategy, isa: str) -> N
 
 
 @pytest.mark.usefixtures("threads")
-def test_threads_change_no_bit(strategy: MakeStrategy) -> None:
+def test_threads_change_no_bit() -> None:
     gradient, visible = step(40_000)
     results = []
     for count in (1, 2, 3, 4):
@@ -74,14 +60,8 @@ def test_threads_change_no_bit(strategy: MakeStrategy) -> None:
 
 
 def test_shapes_that_do_not_fit_are_refused() -> None:
-    gradient, visible = step(20)
-    sums = torch.zeros(20), torch.zeros(20)
-    for wrong in (
-        (gradient[:19], visible, *sums),
-        (gradient, visible[:19], *sums),
-        (gradient, visible, sums[0][:19], sums[1]),
-        (gradient, visible, sums[0], sums[1][:19]),
-    ):
-        slope, seen_now, total, seen = wrong
+    good = [*step(20), torch.zeros(20), torch.zeros(20)]
+    for place in range(4):
+        slope, visible, total, seen = (t[: 19 if i == place else 20] for i, t in enumerate(good))
         with pytest.raises(ValueError, match="shapes that do not fit"):
-            native.accumulate_grad2d(slope, seen_now, 1.0, 1.0, total, seen, 1)
+            native.accumulate_grad2d(slope, visible, 1.0, 1.0, total, seen, 1)

@@ -16,15 +16,12 @@ import pytest
 import torch
 from torch import Tensor
 
-from xrgs.splat.cameras import Camera
+from tests.splat.scenes import make_camera, make_scene
 from xrgs.splat.gaussians import PARAMETERS
 from xrgs.splat.native.rasterizer import render_config
 from xrgs.splat.native.resample import banded_matrix
 from xrgs.splat.settings import CullingOptions, RasterSettings
 
-Scene = dict[str, Tensor]
-MakeCamera = Callable[..., Camera]
-MakeScene = Callable[..., Scene]
 Results = list[Tensor]
 
 native = pytest.importorskip("xrgs._native")
@@ -62,7 +59,7 @@ def assert_every_failure_is_an_error(run: Callable[[], Results], at_least: int) 
 
 
 @pytest.fixture
-def view(make_camera: MakeCamera, make_scene: MakeScene) -> tuple[Any, Results]:
+def view() -> tuple[Any, Results]:
     """A small scene, and behind it enough opaque Gaussians for a second segment of tile lists.
 
     A segment holds some 65,000 pairs: 700 Gaussians in each of 100 tiles are more.

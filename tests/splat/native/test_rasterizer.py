@@ -1,48 +1,31 @@
-"""The compiled rasterizer against the torch one in double, whose own tests are in ../torch.
-
-Both read the same float32 numbers. A pixel where some alpha or transmittance is within 1e-4 of a
-threshold may fall on either side of it: these pixels (the band) are found by moving the thresholds
-in the oracle. Outside it images must agree to rounding, and gradients are compared with no weight
-on it.
-"""
+"""The compiled rasterizer against the torch one in double, whose own tests are in ../torch."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
-from copy import copy
+from collections import defaultdict
+from collections.abc import Iterable
 from dataclasses import replace
 from statistics import median
+from typing import Any
 
 import pytest
 import torch
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from torch import Tensor
 
+from tests.splat.native.oracle import compare, run
+from tests.splat.scenes import Scene, make_camera, make_scene
 from xrgs.splat.cameras import Camera
-from xrgs.splat.gaussians import ActivatedGaussians
-from xrgs.splat.rendering import Render, rasterize_parameters
+from xrgs.splat.gaussians import PARAMETERS
+from xrgs.splat.rendering import Render
 from xrgs.splat.settings import RasterSettings
 
-Scene = dict[str, Tensor]
-MakeCamera = Callable[..., Camera]
-MakeScene = Callable[..., dict[str, Tensor]]
+pytest.importorskip("xrgs._native")
 
-native = pytest.importorskip("xrgs._native")
-
-NAMES = ("means", "quats", "scales", "opacities", "sh0", "shN")
-BAND = 1e-4
-GRADIENT_FACTOR = 5.0
-"""Gradients may err by this much more than torch's own float32 (norms over all Gaussians)."""
 GRADIENT_FLOOR = 2e-6
 """Of a gradient's norm: below this an error is rounding, whoever makes it."""
-CANCELLED_FLOOR = {"scales": 1e-3, "quats": 1e-3}
-"""The same where few pixels or Gaussians are left to cancel: first and second moments are summed
-about the tile's centre, in float32, and what is asked for is about the mean. In 1,500 scenes like
-those of `test_random_scenes` 1.2e-4 was needed for scales and 3e-5 for quaternions."""
-CANCELLED_FLOOR_ELSE = 1e-4
-"""Of all others: 2.4e-5 was needed, and below 1e-6 in 99 of 100 scenes."""
 
 
 def rounded(camera: Camera) -> Camera:
@@ -54,98 +37,15 @@ def single(scene: Scene) -> Scene:
     return {name: value.float() for name, value in scene.items()}
 
 
-def run(
-    scene: Scene,
-    camera: Camera,
-    raster: RasterSettings,
-    backend: str,
-    dtype: torch.dtype,
-    v: tuple[Tensor, Tensor] | None = None,
-    *,
-    sh_degree: int = 3,
-) -> tuple[Render, Scene]:
-    """The render, and with v the gradients of <image, v[0]> + <alpha, v[1]> by name."""
-    leaves = {name: scene[name].detach().to(dtype, copy=True).requires_grad_() for name in NAMES}
-    offset = torch.zeros(len(leaves["means"]), 2, dtype=dtype, requires_grad=True)
-    render = rasterize_parameters(
-        *ActivatedGaussians(**leaves),
-        camera,
-        raster,
-        sh_degree=sh_degree,
-        means2d_offset=offset,
-        backend=backend,
-    )
-    if v is None:
-        return render, {}
-    v_image, v_alpha = (each.to(dtype) for each in v)
-    value = (render.image * v_image).sum() + (render.alpha * v_alpha).sum()
-    if value.requires_grad:
-        torch.autograd.backward(value)
-    leaves["means2d_offset"] = offset
-    return render, {name: leaf.grad for name, leaf in leaves.items() if leaf.grad is not None}
-
-
-def band_of(
-    scene: Scene, camera: Camera, raster: RasterSettings, exact: Tensor, sh_degree: int
-) -> Tensor:
-    """Pixels [H, W] that a small move of a threshold changes."""
-    band = torch.zeros(camera.height, camera.width, dtype=torch.bool)
-    for factor in (1 - BAND, 1 + BAND):
-        for name in ("alpha_min", "transmittance_min"):
-            moved = copy(raster)
-            setattr(moved, name, getattr(raster, name) * factor)
-            render, _ = run(scene, camera, moved, "torch", torch.float64, sh_degree=sh_degree)
-            band |= (render.image != exact).any(-1)
-        # Uncapped or not, an image hardly changes, but its gradient does.
-        capped = replace(raster, alpha_max=raster.alpha_max * factor)
-        render, _ = run(scene, camera, capped, "torch", torch.float64, sh_degree=sh_degree)
-        band |= (render.image - exact).abs().amax(-1) > 1e-9
-    return band
-
-
 def check(
-    scene: Scene,
-    camera: Camera,
-    raster: RasterSettings | None = None,
-    *,
-    sh_degree: int = 3,
-    seed: int = 0,
-    floor: float | None = None,
+    scene: Scene, camera: Camera, raster: RasterSettings | None = None, **options: Any
 ) -> tuple[Render, Scene, Tensor]:
     """Compare image, alpha, visibility and gradients with the oracle's."""
     raster = raster or RasterSettings()
-    camera, scene = rounded(camera), single(scene)
-    exact, _ = run(scene, camera, raster, "torch", torch.float64, sh_degree=sh_degree)
-    band = band_of(scene, camera, raster, exact.image, sh_degree)
-    generator = torch.Generator().manual_seed(seed)
-    outside = (~band).float()
-    v_image = torch.randn(camera.height, camera.width, 3, generator=generator) * outside[..., None]
-    v_alpha = torch.randn(camera.height, camera.width, generator=generator) * outside
-    v = v_image, v_alpha
-    results = {
-        dtype: run(scene, camera, raster, backend, dtype, v, sh_degree=sh_degree)
-        for backend, dtype in (("torch", torch.float64), ("torch", torch.float32))
-    }
-    theirs, exact_gradients = results[torch.float64]
-    _, single_gradients = results[torch.float32]
-    ours, gradients = run(scene, camera, raster, "native", torch.float32, v, sh_degree=sh_degree)
-
-    error = (ours.image.double() - theirs.image).abs().detach()
-    scale = max(1.0, float(theirs.image.detach().max()))
-    assert error.mean() <= 1e-6 * scale
-    assert error.max() <= raster.alpha_min * scale + 1e-5  # one Gaussian more or less
-    assert (error.amax(-1)[~band] <= 1e-5 * scale).all()
-    assert ((ours.alpha.double() - theirs.alpha).abs().detach()[~band] <= 1e-5).all()
-    assert torch.equal(ours.visible, theirs.visible)
-    for name, expected in exact_gradients.items():
-        got = gradients[name]
-        share = floor or CANCELLED_FLOOR.get(name, CANCELLED_FLOOR_ELSE)
-        assert torch.isfinite(got).all(), name
-        allowed = (
-            GRADIENT_FACTOR * (single_gradients[name] - expected).norm() + share * expected.norm()
-        )
-        assert (got - expected).norm() <= allowed, name
-        assert (got[~ours.visible] == 0).all(), name
+    ours, gradients, exact, band = compare(single(scene), rounded(camera), raster, **options)
+    error = (ours.image.double() - exact.image).abs().detach()
+    assert error.mean() <= 1e-6 * max(1.0, float(exact.image.detach().max()))
+    assert torch.equal(ours.visible, exact.visible)
     return ours, gradients, band
 
 
@@ -153,31 +53,20 @@ def check(
 
 
 @pytest.mark.parametrize("sh_degree", [0, 1, 2, 3])
-def test_a_scene_of_every_degree(
-    isa: str, make_camera: MakeCamera, make_scene: MakeScene, sh_degree: int
-) -> None:
+def test_a_scene_of_every_degree(isa: str, sh_degree: int) -> None:
     camera = make_camera(50, 37, turned=True)
     scene = make_scene(300, camera, seed=1)
-    ours, _, band = check(scene, camera, sh_degree=sh_degree, floor=GRADIENT_FLOOR)
+    ours, gradients, band = check(scene, camera, sh_degree=sh_degree, floor=GRADIENT_FLOOR)
+    on = (sh_degree + 1) ** 2 - 1
+    assert (gradients["shN"][:, on:] == 0).all()
+    assert (gradients["shN"][:, :on] != 0).any() == (sh_degree > 0)
     assert band.float().mean() < 0.1
     assert ours.image.max() > 0.3
     assert 0 < ours.evaluations < 300 * 50 * 37
     assert ours.buffer_bytes > 300 * 64
 
 
-def test_bands_above_the_degree_have_no_gradient(
-    isa: str, make_camera: MakeCamera, make_scene: MakeScene
-) -> None:
-    camera = make_camera()
-    scene = make_scene(40, camera, degree=3)
-    _, gradients, _ = check(scene, camera, sh_degree=1)
-    assert (gradients["shN"][:, 3:] == 0).all()
-    assert (gradients["shN"][:, :3] != 0).any()
-
-
-def test_antialiased_before_a_background(
-    isa: str, make_camera: MakeCamera, make_scene: MakeScene
-) -> None:
+def test_antialiased_before_a_background(isa: str) -> None:
     camera = make_camera(40, 30)
     raster = RasterSettings(antialiased=True, background=(0.2, 0.5, 0.9))
     scene = make_scene(300, camera, seed=2, size=0.7)
@@ -186,9 +75,7 @@ def test_antialiased_before_a_background(
 
 
 @pytest.mark.parametrize("opacity", [0.02, 0.9, 1.0])
-def test_many_layers(
-    isa: str, make_camera: MakeCamera, make_scene: MakeScene, opacity: float
-) -> None:
+def test_many_layers(isa: str, opacity: float) -> None:
     # More than two batches of Gaussians in a tile; where opaque, pixels end and alphas are capped.
     camera = make_camera(16, 16, focal=15.0)
     scene = make_scene(600, camera, seed=3, size=4.0)
@@ -196,23 +83,13 @@ def test_many_layers(
     check(scene, camera)
 
 
-def test_without_cuts(isa: str, make_camera: MakeCamera, make_scene: MakeScene) -> None:
+def test_without_cuts(isa: str) -> None:
     camera = make_camera()
     raster = RasterSettings(alpha_min=0.0, alpha_max=1.0, transmittance_min=0.0)
     check(make_scene(30, camera, seed=4), camera, raster)
 
 
-def test_near_and_behind(isa: str, make_camera: MakeCamera, make_scene: MakeScene) -> None:
-    camera = make_camera()
-    scene = make_scene(60, camera, seed=5)
-    depths = torch.tensor([-2.0, -1e-3, 0.0, 0.0099, 0.0101, 0.02], dtype=torch.float64)
-    scene["means"][: len(depths), 2] = depths
-    scene["means"][: len(depths), :2] *= 0.01
-    ours, _, _ = check(scene, camera)
-    assert not ours.visible[:4].any()
-
-
-def test_beyond_the_field_of_view(isa: str, make_camera: MakeCamera, make_scene: MakeScene) -> None:
+def test_beyond_the_field_of_view(isa: str) -> None:
     # Large ones whose centres are far outside, where the Jacobian is held.
     camera = make_camera(turned=True)
     scene = make_scene(200, camera, seed=6, size=12.0)
@@ -223,9 +100,7 @@ def test_beyond_the_field_of_view(isa: str, make_camera: MakeCamera, make_scene:
 
 
 @pytest.mark.parametrize("antialiased", [False, True])
-def test_beyond_the_field_of_view_at_the_near_plane(
-    isa: str, make_camera: MakeCamera, make_scene: MakeScene, antialiased: bool
-) -> None:
+def test_beyond_the_field_of_view_at_the_near_plane(isa: str, antialiased: bool) -> None:
     # Small ones whose slopes are held, where a step towards the camera changes them most.
     camera = make_camera(turned=True)
     scene = make_scene(200, camera, seed=16, size=1.0)
@@ -245,9 +120,7 @@ def test_beyond_the_field_of_view_at_the_near_plane(
 
 
 @pytest.mark.parametrize("near", [0.0, -1.0])
-def test_a_near_plane_at_the_camera_or_behind(
-    isa: str, make_camera: MakeCamera, make_scene: MakeScene, near: float
-) -> None:
+def test_a_near_plane_at_the_camera_or_behind(isa: str, near: float) -> None:
     camera = make_camera()
     scene = make_scene(60, camera, seed=5)
     depths = torch.tensor([-2.0, -0.5, -0.1, 0.0, 1e-4, 1e-3, 0.02], dtype=torch.float64)
@@ -260,7 +133,7 @@ def test_a_near_plane_at_the_camera_or_behind(
 
 
 @pytest.mark.parametrize("stretch", [30.0, 3000.0])
-def test_needles(isa: str, make_camera: MakeCamera, make_scene: MakeScene, stretch: float) -> None:
+def test_needles(isa: str, stretch: float) -> None:
     camera = make_camera(60, 40, turned=True)
     scene = make_scene(60, camera, seed=7, size=1.0)
     scene["scales"][:, 0] *= stretch
@@ -268,9 +141,7 @@ def test_needles(isa: str, make_camera: MakeCamera, make_scene: MakeScene, stret
     check(scene, camera)
 
 
-def test_quaternions_of_any_length(
-    isa: str, make_camera: MakeCamera, make_scene: MakeScene
-) -> None:
+def test_quaternions_of_any_length(isa: str) -> None:
     camera = make_camera()
     scene = make_scene(50, camera, seed=8)
     scene["quats"][::5] = 0
@@ -281,7 +152,7 @@ def test_quaternions_of_any_length(
     assert (gradients["quats"][::5] == 0).all()
 
 
-def test_flat_and_huge(isa: str, make_camera: MakeCamera, make_scene: MakeScene) -> None:
+def test_flat_and_huge(isa: str) -> None:
     camera = make_camera()
     scene = make_scene(50, camera, seed=9)
     scene["scales"][::4] = 0
@@ -290,26 +161,7 @@ def test_flat_and_huge(isa: str, make_camera: MakeCamera, make_scene: MakeScene)
     check(scene, camera)
 
 
-def test_a_covariance_that_overflows_is_dropped(
-    isa: str, make_camera: MakeCamera, make_scene: MakeScene
-) -> None:
-    camera = rounded(make_camera())
-    scene = single(make_scene(50, camera, seed=9))
-    scene["scales"][1::8] = 1e25
-    v_image = torch.ones(camera.height, camera.width, 3)
-    ours, gradients = run(
-        scene, camera, RasterSettings(), "native", torch.float32, (v_image, v_image[..., 0])
-    )
-    assert not ours.visible[1::8].any()
-    keep = torch.ones(50, dtype=torch.bool)
-    keep[1::8] = False
-    others = {name: value[keep] for name, value in scene.items()}
-    without, _ = run(others, camera, RasterSettings(), "native", torch.float32)
-    assert torch.equal(ours.image, without.image)
-    assert all((gradients[name][1::8] == 0).all() for name in NAMES)
-
-
-def test_beyond_the_largest_depth(isa: str, make_camera: MakeCamera, make_scene: MakeScene) -> None:
+def test_beyond_the_largest_depth(isa: str) -> None:
     camera = rounded(make_camera())
     scene = single(make_scene(50, camera, seed=9))
     scene["means"][1::8] = torch.tensor([1e37, -1e37, 1.5e38])
@@ -320,128 +172,114 @@ def test_beyond_the_largest_depth(isa: str, make_camera: MakeCamera, make_scene:
         scene, camera, RasterSettings(), "native", torch.float32, (v_image, v_image[..., 0])
     )
     assert not ours.visible[1::8].any()
-    assert all((gradients[name][1::8] == 0).all() for name in NAMES)
+    assert all((gradients[name][1::8] == 0).all() for name in PARAMETERS)
     scene["means"][1::8] = torch.tensor([0.0, 0.0, -1.0])
     without, _ = run(scene, camera, RasterSettings(), "native", torch.float32)
     assert torch.equal(ours.image, without.image)
 
 
-def test_equal_depths_go_by_index(isa: str, make_camera: MakeCamera, make_scene: MakeScene) -> None:
+def test_equal_depths_go_by_index(isa: str) -> None:
     camera = make_camera()
     scene = make_scene(80, camera, seed=10)
     scene["means"][:, 2] = 3.0
     check(scene, camera)
 
 
-@pytest.mark.parametrize("count", [0, 5])
-def test_none_visible(isa: str, make_camera: MakeCamera, make_scene: MakeScene, count: int) -> None:
-    camera = make_camera()
-    scene = make_scene(count, camera)
-    scene["means"][:, 2] = -5
-    raster = RasterSettings(background=(0.1, 0.2, 0.3))
-    ours, gradients, _ = check(scene, camera, raster)
-    assert torch.equal(ours.image, torch.tensor(raster.background).expand(14, 20, 3))
-    assert not ours.alpha.any()
-    assert ours.evaluations == 0
-    assert all((gradient == 0).all() for gradient in gradients.values())
-
-
 @pytest.mark.parametrize(("width", "height"), [(1, 1), (1, 33), (33, 1), (16, 16), (17, 15)])
 @pytest.mark.parametrize("count", [1, 15, 16, 17])
-def test_sizes(
-    isa: str, make_camera: MakeCamera, make_scene: MakeScene, width: int, height: int, count: int
-) -> None:
+def test_sizes(isa: str, width: int, height: int, count: int) -> None:
     camera = make_camera(width, height)
     check(make_scene(count, camera, seed=width + count), camera)
 
 
 @pytest.mark.parametrize("antialiased", [False, True])
-def test_absgrad(
-    isa: str, make_camera: MakeCamera, make_scene: MakeScene, antialiased: bool
-) -> None:
+def test_absgrad(isa: str, antialiased: bool) -> None:
     camera = make_camera(50, 37, turned=True)
     scene = make_scene(300, camera, seed=13, size=3.0)
     raster = RasterSettings(antialiased=antialiased, background=(0.3, 0.6, 0.1))
     _, plain, _ = check(scene, camera, raster)
     _, absolute, _ = check(scene, camera, replace(raster, absgrad=True))
-    for name in NAMES:
+    for name in PARAMETERS:
         assert torch.equal(absolute[name], plain[name]), name
     offset = plain["means2d_offset"].abs()
     assert (absolute["means2d_offset"] >= offset - 1e-4 * offset.max()).all()
     assert absolute["means2d_offset"].sum() > 1.5 * offset.sum()
 
 
+def errors_of(
+    cases: Iterable[tuple[Scene, Camera, int]], raster: RasterSettings
+) -> dict[str, dict[str, float]]:
+    """The median error of each gradient of some scenes, by backend, of a random loss by a seed."""
+    errors: dict[str, defaultdict[str, list[float]]] = {
+        backend: defaultdict(list) for backend in ("native", "torch")
+    }
+    for scene, camera, seed in cases:
+        generator = torch.Generator().manual_seed(seed)
+        v_image = torch.randn(camera.height, camera.width, 3, generator=generator)
+        v = v_image, torch.randn(camera.height, camera.width, generator=generator)
+        _, expected = run(scene, camera, raster, "torch", torch.float64, v)
+        for backend, of_backend in errors.items():
+            _, got = run(scene, camera, raster, backend, torch.float32, v)
+            for name, value in expected.items():
+                error = (got[name] - value).norm() / value.norm().clamp_min(1e-30)
+                of_backend[name].append(float(error))
+    return {
+        backend: {name: median(of_name) for name, of_name in of_backend.items()}
+        for backend, of_backend in errors.items()
+    }
+
+
+def needle(length: float, width: float, seed: int) -> tuple[Scene, Camera, int]:
+    """One Gaussian of this size in px, in the middle of an image of 320 px."""
+    size, depth = 320, 2.0
+    K = torch.tensor([[size, 0, size / 2], [0, size, size / 2], [0, 0, 1]])
+    generator = torch.Generator().manual_seed(seed)
+    half_angle = 0.15 + 0.5 * torch.rand(1, generator=generator).item()
+    scene = {
+        "means": torch.tensor([[0.03, 0.02, depth]]),
+        "quats": torch.tensor([[math.cos(half_angle), 0.02, 0.01, math.sin(half_angle)]]),
+        "scales": torch.tensor([[length, width, width]]) * depth / size,
+        "opacities": torch.tensor([0.9]),
+        "sh0": torch.randn(1, 1, 3, generator=generator),
+        "shN": torch.zeros(1, 15, 3),
+    }
+    return scene, Camera(torch.eye(4), K, size, size), seed
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("antialiased", [False, True])
-def test_gradients_of_needles_are_as_exact_as_float32_in_torch(antialiased: bool) -> None:
+@pytest.mark.parametrize(("length", "width"), [(100, 0.3), (1000, 0.05)])
+def test_gradients_of_needles_are_as_exact_as_float32_in_torch(
+    length: float, width: float, antialiased: bool
+) -> None:
     """Gaussians of up to 1,000 px, three times as long as the image is wide, in many directions.
 
     In the median at most twice torch's error, which is about 1e-5 for all parameters.
     """
-    size = 320
-    focal, depth = float(size), 2.0
-    K = torch.tensor([[focal, 0, size / 2], [0, focal, size / 2], [0, 0, 1]])
-    camera = Camera(torch.eye(4), K, size, size)
     raster = RasterSettings(
         antialiased=antialiased, alpha_min=1e-6, alpha_max=1.0, transmittance_min=0.0
     )
-    for length, width in ((100, 0.3), (1000, 0.05)):
-        errors: dict[str, dict[str, list[float]]] = {"native": {}, "torch": {}}
-        for seed in range(20):
-            generator = torch.Generator().manual_seed(seed)
-            half_angle = 0.15 + 0.5 * torch.rand(1, generator=generator).item()
-            scene = single(
-                {
-                    "means": torch.tensor([[0.03, 0.02, depth]]),
-                    "quats": torch.tensor(
-                        [[math.cos(half_angle), 0.02, 0.01, math.sin(half_angle)]]
-                    ),
-                    "scales": torch.tensor([[length, width, width]]) * depth / focal,
-                    "opacities": torch.tensor([0.9]),
-                    "sh0": torch.randn(1, 1, 3, generator=generator),
-                    "shN": torch.zeros(1, 15, 3),
-                    "means2d_offset": torch.zeros(1, 2),
-                }
-            )
-            v_image = torch.randn(size, size, 3, generator=generator)
-            v = v_image, torch.randn(size, size, generator=generator)
-            _, expected = run(scene, camera, raster, "torch", torch.float64, v)
-            for backend, of_backend in errors.items():
-                _, got = run(scene, camera, raster, backend, torch.float32, v)
-                for name in ("means", "quats", "scales", "opacities", "sh0"):
-                    error = (got[name] - expected[name]).norm() / expected[name].norm()
-                    of_backend.setdefault(name, []).append(float(error))
-        for name, native in errors["native"].items():
-            assert median(native) <= 2 * median(errors["torch"][name]), (length, width, name)
+    errors = errors_of((needle(length, width, seed) for seed in range(20)), raster)
+    for name in ("means", "quats", "scales", "opacities", "sh0"):
+        assert errors["native"][name] <= 2 * errors["torch"][name], name
 
 
 @pytest.mark.slow
-def test_gradients_are_nearly_as_exact_as_float32_in_torch(
-    make_camera: MakeCamera, make_scene: MakeScene
-) -> None:
+def test_gradients_are_nearly_as_exact_as_float32_in_torch() -> None:
     """In the median of many small scenes: 2.5 times torch's for scales, up to 1.9 for others.
 
     Random scenes differ from processor to processor. With 200 of them the ratio of the medians for
     scales is 2.3 to 2.5 with vector instructions and 2.9 without; with 40 it was 2.3 to 3.6.
     """
     raster = RasterSettings(alpha_min=0.0, alpha_max=1.0, transmittance_min=0.0)  # has no band
-    errors: dict[str, dict[str, list[float]]] = {"native": {}, "torch": {}}
+    cases = []
     for seed in range(200):
         camera = rounded(make_camera(9 + seed % 30, 7 + seed % 20, turned=bool(seed % 2)))
-        scene = single(make_scene(1 + seed % 12, camera, seed=seed, size=0.3 * (1 + seed % 20)))
-        generator = torch.Generator().manual_seed(seed)
-        shape = camera.height, camera.width
-        v_image = torch.randn(*shape, 3, generator=generator)
-        v = v_image, torch.randn(*shape, generator=generator)
-        _, expected = run(scene, camera, raster, "torch", torch.float64, v)
-        for backend, of_backend in errors.items():
-            _, got = run(scene, camera, raster, backend, torch.float32, v)
-            for name, value in expected.items():
-                error = (got[name] - value).norm() / value.norm().clamp_min(1e-30)
-                of_backend.setdefault(name, []).append(float(error))
-    for name in (*NAMES, "means2d_offset"):
-        native_error, torch_error = (median(errors[backend][name]) for backend in errors)
-        assert native_error <= 3 * torch_error, name
+        scene = make_scene(1 + seed % 12, camera, seed=seed, size=0.3 * (1 + seed % 20))
+        cases.append((single(scene), camera, seed))
+    errors = errors_of(cases, raster)
+    for name in (*PARAMETERS, "means2d_offset"):
+        assert errors["native"][name] <= 3 * errors["torch"][name], name
 
 
 @given(
@@ -453,17 +291,10 @@ def test_gradients_are_nearly_as_exact_as_float32_in_torch(
     stretch=st.floats(0.05, 20.0),
     antialiased=st.booleans(),
 )
+@example(seed=1, count=1, width=1, height=1, size=3.25, stretch=2.25, antialiased=False)  # cancels
 @settings(max_examples=25, deadline=None)
 def test_random_scenes(
-    make_camera: MakeCamera,
-    make_scene: MakeScene,
-    seed: int,
-    count: int,
-    width: int,
-    height: int,
-    size: float,
-    stretch: float,
-    antialiased: bool,
+    seed: int, count: int, width: int, height: int, size: float, stretch: float, antialiased: bool
 ) -> None:
     camera = make_camera(width, height, turned=bool(seed % 2))
     scene = make_scene(count, camera, seed=seed, size=size)
@@ -472,7 +303,7 @@ def test_random_scenes(
     check(scene, camera, RasterSettings(antialiased=antialiased, background=(0.3, 0.6, 0.1)))
 
 
-def test_a_large_scene_is_within_the_bounds(make_camera: MakeCamera, make_scene: MakeScene) -> None:
+def test_a_large_scene_is_within_the_bounds() -> None:
     camera = rounded(make_camera(150, 110, focal=120.0, turned=True))
     scene = single(make_scene(20_000, camera, seed=12, size=2.0))
     images = [

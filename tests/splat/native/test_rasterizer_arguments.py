@@ -17,14 +17,12 @@ import pytest
 import torch
 from torch import Tensor
 
+from tests.splat.scenes import Scene, make_camera, make_scene
 from xrgs.splat.cameras import Camera
 from xrgs.splat.gaussians import ActivatedGaussians
+from xrgs.splat.native.rasterizer import render_config
 from xrgs.splat.rendering import Render, rasterize_parameters
-from xrgs.splat.settings import RasterSettings
-
-Scene = dict[str, Tensor]
-MakeCamera = Callable[..., Camera]
-MakeScene = Callable[..., dict[str, Tensor]]
+from xrgs.splat.settings import CullingOptions, RasterSettings
 
 native = pytest.importorskip("xrgs._native")
 
@@ -46,6 +44,10 @@ def render(scene: Scene, camera: Camera) -> tuple[Render, list[Tensor]]:
     return made, [*leaves.values(), offset]
 
 
+def config_of(camera: Camera, sh_degree: int = 3) -> Any:
+    return render_config(camera, RasterSettings(), sh_degree, CullingOptions())
+
+
 def gradient(leaf: Tensor) -> Tensor:
     assert leaf.grad is not None
     return leaf.grad
@@ -55,7 +57,7 @@ def gradient(leaf: Tensor) -> Tensor:
 
 
 @pytest.fixture(scope="module")
-def large(make_camera: MakeCamera, make_scene: MakeScene) -> tuple[Scene, Camera]:
+def large() -> tuple[Scene, Camera]:
     """Enough Gaussians and tiles for every stage to be cut into several tasks."""
     camera = make_camera(150, 110, focal=120.0, turned=True)
     return make_scene(20_000, camera, seed=12, size=2.0, dtype=torch.float32), camera
@@ -80,22 +82,7 @@ def test_any_number_of_threads_gives_the_same_bits(
         assert again.evaluations == first.evaluations
 
 
-def test_instruction_sets_agree(large: tuple[Scene, Camera]) -> None:
-    before = native.isa()
-    images = []
-    try:
-        for name in native.available_isas():
-            native.set_isa(name)
-            images.append(everything(large, 1)[0].image)
-    finally:
-        native.set_isa(before)
-    for image in images[1:]:
-        error = (image - images[0]).abs()
-        assert error.mean() < 1e-6
-        assert error.max() < 2e-3
-
-
-def test_renders_alive_at_once_keep_apart(make_camera: MakeCamera, make_scene: MakeScene) -> None:
+def test_renders_alive_at_once_keep_apart() -> None:
     camera = make_camera(40, 30)
     scenes = [make_scene(100, camera, seed=seed, dtype=torch.float32) for seed in range(3)]
 
@@ -109,23 +96,7 @@ def test_renders_alive_at_once_keep_apart(make_camera: MakeCamera, make_scene: M
         assert torch.equal(gradient_of_means(*rendered), expected)
 
 
-def test_gradients_are_handed_over_without_a_copy(
-    make_camera: MakeCamera, make_scene: MakeScene
-) -> None:
-    camera = make_camera()
-    scene = make_scene(50, camera, dtype=torch.float32)
-    places = []
-    for _ in range(3):
-        made, leaves = render(scene, camera)
-        torch.autograd.backward(made.image.sum())
-        places.append(gradient(leaves[NAMES.index("shN")]).data_ptr())
-    # A copy would lie where torch's allocator puts it; ours are on cache lines, and come again.
-    assert all(place % 64 == 0 for place in places)
-
-
-def test_harmonics_whose_gradient_is_not_wanted_is_not_computed(
-    isa: str, make_camera: MakeCamera, make_scene: MakeScene
-) -> None:
+def test_harmonics_whose_gradient_is_not_wanted_is_not_computed(isa: str) -> None:
     camera = make_camera(turned=True)
     scene = make_scene(45, camera, dtype=torch.float32)
     gradients: dict[bool, dict[str, Tensor | None]] = {}
@@ -150,7 +121,7 @@ def test_harmonics_whose_gradient_is_not_wanted_is_not_computed(
 
 def test_a_forked_child_renders(large: tuple[Scene, Camera]) -> None:
     scene, camera = large
-    values, view = [scene[name] for name in NAMES], make_view(camera)
+    values, view = [scene[name] for name in NAMES], config_of(camera)
 
     def image() -> bytes:
         # Only our threads: torch's own do not outlive a fork.
@@ -168,77 +139,20 @@ def test_a_forked_child_renders(large: tuple[Scene, Camera]) -> None:
 # --- bad input ----------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("bad", [float("nan"), float("inf"), -float("inf")])
-@pytest.mark.parametrize("name", [*NAMES, "means2d_offset"])
-def test_a_value_that_is_not_finite_is_named(
-    isa: str, make_camera: MakeCamera, make_scene: MakeScene, name: str, bad: float
-) -> None:
-    camera = make_camera()
-    scene = make_scene(40, camera, dtype=torch.float32)
-    scene["means2d_offset"] = torch.zeros(40, 2)
-    scene["means"][33] = torch.tensor([0.0, 0.0, 3.0])  # in view: its harmonics are read
-    scene[name][33] = bad
-    frame, view = native.Frame(), make_view(camera)
-    values = [scene[key] for key in (*NAMES, "means2d_offset")]
-    with pytest.raises(ValueError, match=f"^{name} has values that are not finite"):
-        frame.forward(view, *values, 1)
-
-
-@pytest.mark.parametrize(
-    ("name", "bad", "says"),
-    [
-        ("scales", -1e-3, "scales has values below 0"),
-        ("opacities", 1.01, "opacities has values outside 0..1"),
-        ("opacities", -0.01, "opacities has values outside 0..1"),
-    ],
-)
-def test_a_value_out_of_range_is_named(
-    isa: str, make_camera: MakeCamera, make_scene: MakeScene, name: str, bad: float, says: str
-) -> None:
-    camera = make_camera()
-    scene = make_scene(21, camera, dtype=torch.float32)
-    scene[name][20] = bad
-    with pytest.raises(ValueError, match=f"^{says}"):
-        render(scene, camera)
-
-
-def make_view(camera: Camera, **changes: Any) -> Any:
-    options: dict[str, Any] = {
-        "viewmat": camera.viewmat.flatten().tolist(),
-        "intrinsics": [camera.K[0, 0], camera.K[1, 1], camera.K[0, 2], camera.K[1, 2]],
-        "width": camera.width,
-        "height": camera.height,
-        "near": 0.01,
-        "eps2d": 0.3,
-        "alpha_min": 1 / 255,
-        "alpha_max": 0.99,
-        "transmittance_min": 1e-4,
-        "antialiased": False,
-        "absgrad": False,
-        "background": (0.0, 0.0, 0.0),
-        "sh_degree": 3,
-        "culling": (True,) * 5,
-    }
-    options["intrinsics"] = [float(value) for value in options["intrinsics"]]
-    return native.RenderConfig(**(options | changes))
-
-
-def test_shapes_are_checked(make_camera: MakeCamera, make_scene: MakeScene) -> None:
+def test_shapes_are_checked() -> None:
     camera = make_camera()
     scene = make_scene(10, camera, dtype=torch.float32)
     values = [scene[key] for key in NAMES]
     frame = native.Frame()
     with pytest.raises(ValueError, match="opacities must have 10 rows, got 9"):
-        frame.forward(make_view(camera), *values[:3], values[3][:9], *values[4:], None, 1)
+        frame.forward(config_of(camera), *values[:3], values[3][:9], *values[4:], None, 1)
     with pytest.raises(ValueError, match="shN has fewer bands"):
-        frame.forward(make_view(camera), *values[:5], values[5][:, :8].contiguous(), None, 1)
+        frame.forward(config_of(camera), *values[:5], values[5][:, :8].contiguous(), None, 1)
     with pytest.raises(ValueError, match="shN must have at most 15 bands, got 24"):
-        frame.forward(make_view(camera), *values[:5], torch.zeros(10, 24, 3), None, 1)
+        frame.forward(config_of(camera), *values[:5], torch.zeros(10, 24, 3), None, 1)
     with pytest.raises(ValueError, match="sh_degree"):
-        make_view(camera, sh_degree=4)
-    with pytest.raises(ValueError, match="at least 1"):
-        make_view(camera, width=0)
-    frame.forward(make_view(camera), *values, None, 1)
+        config_of(camera, sh_degree=4)
+    frame.forward(config_of(camera), *values, None, 1)
     with pytest.raises(ValueError, match="image's size"):
         frame.backward(torch.zeros(3, 3, 3), torch.zeros(3, 3), *values, None, True, 1)
     v_image, v_alpha = torch.zeros(camera.height, camera.width, 3), torch.zeros(camera.height, 20)
@@ -248,9 +162,7 @@ def test_shapes_are_checked(make_camera: MakeCamera, make_scene: MakeScene) -> N
             frame.backward(v_image, v_alpha, *values, None, True, 1)
 
 
-def test_a_frame_without_a_render_is_refused(
-    make_camera: MakeCamera, make_scene: MakeScene
-) -> None:
+def test_a_frame_without_a_render_is_refused() -> None:
     camera = make_camera()
     scene = make_scene(10, camera, dtype=torch.float32)
     values = [scene[key] for key in NAMES]
@@ -271,25 +183,20 @@ def test_a_frame_without_a_render_is_refused(
                 use()
 
     assert_all_refused()
-    frame.forward(make_view(camera), *values, None, 1)
+    frame.forward(config_of(camera), *values, None, 1)
     for use in uses:
         use()
     values[0] = torch.full((10, 3), torch.nan)
     with pytest.raises(ValueError, match="means has values that are not finite"):
-        frame.forward(make_view(camera), *values, None, 1)
+        frame.forward(config_of(camera), *values, None, 1)
     values[0] = scene["means"]
     assert_all_refused()
-
-
-def test_float64_is_refused(make_camera: MakeCamera, make_scene: MakeScene) -> None:
-    camera = make_camera()
-    with pytest.raises(ValueError, match="float32"):
-        render(make_scene(3, camera), camera)
 
 
 AFTER_FAILURE = """
 import resource, torch
 from xrgs.splat.cameras import Camera
+from xrgs.splat.native.rasterizer import render_config
 from xrgs.splat.rendering import rasterize_parameters
 from xrgs.splat.settings import RasterSettings
 

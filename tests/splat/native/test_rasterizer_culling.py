@@ -2,22 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import fields
 from typing import Any
 
 import pytest
 import torch
-from torch import Tensor
 
+from tests.splat.scenes import Scene, make_camera, make_scene
 from xrgs.splat.cameras import Camera
 from xrgs.splat.gaussians import PARAMETERS, ActivatedGaussians
 from xrgs.splat.rendering import Render, rasterize_parameters
 from xrgs.splat.settings import CullingOptions, RasterSettings
-
-Scene = dict[str, Tensor]
-MakeCamera = Callable[..., Camera]
-MakeScene = Callable[..., dict[str, Tensor]]
 
 pytest.importorskip("xrgs._native")
 
@@ -48,7 +43,7 @@ def render_with(
 NAMES = [*(field.name for field in fields(CullingOptions)), "all"]
 
 
-def crowd(make_scene: MakeScene, camera: Camera, count: int, size: float) -> tuple[Scene, Camera]:
+def crowd(camera: Camera, count: int, size: float) -> tuple[Scene, Camera]:
     """Gaussians of which each kind of culling leaves out some, and their camera in float32."""
     camera = Camera(camera.viewmat.float(), camera.K.float(), camera.width, camera.height)
     scene = make_scene(count, camera, seed=14, size=size, dtype=torch.float32)
@@ -61,30 +56,24 @@ def crowd(make_scene: MakeScene, camera: Camera, count: int, size: float) -> tup
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_culling_makes_no_difference(
-    isa: str, make_camera: MakeCamera, make_scene: MakeScene, name: str
-) -> None:
-    scene, camera = crowd(make_scene, make_camera(60, 50, focal=60.0, turned=True), 1500, 3.0)
+def test_culling_makes_no_difference(isa: str, name: str) -> None:
+    scene, camera = crowd(make_camera(60, 50, focal=60.0, turned=True), 1500, 3.0)
     check_culling(scene, camera, name)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", NAMES)
-def test_culling_makes_no_difference_thousands_of_pixels_away(
-    isa: str, make_camera: MakeCamera, make_scene: MakeScene, name: str
-) -> None:
+def test_culling_makes_no_difference_thousands_of_pixels_away(isa: str, name: str) -> None:
     # The image of 500 px at the right end of one of 4,500, where float32 coordinates are coarse.
-    scene, camera = crowd(make_scene, make_camera(500, 20, focal=60.0), 1500, 3.0)
+    scene, camera = crowd(make_camera(500, 20, focal=60.0), 1500, 3.0)
     K = camera.K.clone()
     K[0, 2] += 4000
     check_culling(scene, Camera(camera.viewmat, K, 4500, 20), name)
 
 
-def test_tile_evaluations_are_those_without_the_culling_inside_tiles(
-    make_camera: MakeCamera, make_scene: MakeScene
-) -> None:
+def test_tile_evaluations_are_those_without_the_culling_inside_tiles() -> None:
     # The image has whole tiles: pixels beyond its edge are counted and never computed.
-    scene, camera = crowd(make_scene, make_camera(64, 48, focal=60.0, turned=True), 1500, 3.0)
+    scene, camera = crowd(make_camera(64, 48, focal=60.0, turned=True), 1500, 3.0)
     every_pixel, _, _ = render_with(CullingOptions(blocks=False, saturated=False), scene, camera)
     usual, _, _ = render_with(CullingOptions(), scene, camera)
     assert usual.tile_evaluations == every_pixel.tile_evaluations == every_pixel.evaluations

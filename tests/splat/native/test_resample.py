@@ -8,6 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor
 
+from tests.splat.scenes import noise
 from xrgs.splat.bicubic import bicubic_matrix
 from xrgs.splat.native.resample import banded_matrix
 from xrgs.splat.resample import resize
@@ -15,11 +16,6 @@ from xrgs.splat.resample import resize
 native = pytest.importorskip("xrgs._native")
 
 side = st.integers(1, 70)
-
-
-def noise(height: int, width: int, seed: int = 0) -> Tensor:
-    generator = torch.Generator().manual_seed(seed)
-    return torch.rand(height, width, 3, generator=generator, dtype=torch.float64)
 
 
 def value_and_gradient(image: Tensor, slope: Tensor) -> tuple[Tensor, Tensor]:

@@ -9,6 +9,7 @@ import pytest
 import torch
 from torch import Tensor
 
+from tests.splat.scenes import SHAPES
 from xrgs.splat.cameras import Camera
 from xrgs.splat.gaussians import PARAMETERS, Gaussians
 from xrgs.splat.native.densify import accumulate_statistics
@@ -19,7 +20,6 @@ from xrgs.splat.settings import CullingOptions, OptimizerSettings, RasterSetting
 
 native = pytest.importorskip("xrgs._native")
 
-SHAPES = ((3,), (4,), (3,), (), (1, 3), (15, 3))  # of PARAMETERS
 N = 20
 
 
@@ -53,7 +53,7 @@ def forward(*parameters: Tensor) -> Any:
 
 
 def backward(v_image: Tensor, v_alpha: Tensor, *parameters: Tensor) -> None:
-    forward(*(torch.ones(N, *shape) for shape in (*SHAPES, (2,)))).backward(
+    forward(*(torch.ones(N, *shape) for shape in (*SHAPES.values(), (2,)))).backward(
         v_image, v_alpha, *parameters, True, 1
     )
 
@@ -74,7 +74,7 @@ def ones(*shapes: tuple[int, ...]) -> list[Tensor]:
     return [torch.ones(shape) for shape in shapes]
 
 
-PARAMETER_SHAPES = [(N, *shape) for shape in (*SHAPES, (2,))]
+PARAMETER_SHAPES = [(N, *shape) for shape in (*SHAPES.values(), (2,))]
 CALLS: dict[str, tuple[Callable[..., object], list[Tensor]]] = {
     "adam_step": (adam_step, ones((N,), (N,), (N,), (N,))),
     "adam_step_sh_rest": (adam_step_sh_rest, ones(*[(N, 15, 3)] * 3, (N, 3), (N, 3))),
@@ -103,37 +103,11 @@ def test_nothing_is_converted(name: str) -> None:
                 call(*changed)
 
 
-def test_a_group_of_adam_that_is_no_tuple_is_refused() -> None:
-    with pytest.raises(TypeError, match="groups must be tuples"):
-        native.adam_step([torch.ones(3)], 0.9, 0.999, 1e-15, 1)
-
-
-def test_statistics_of_another_type_are_named() -> None:
-    good: dict[str, Any] = {
-        "means2d_grad": torch.ones(N, 2),
-        "visible": torch.ones(N, dtype=torch.bool),
-        "half_size": (1.0, 1.0),
-        "grad2d_sum": torch.zeros(N),
-        "visible_count": torch.zeros(N),
-    }
-    accumulate_statistics(**good)
-    for name, wrong, says in (
-        ("means2d_grad", torch.ones(N, 2).double(), "float32"),
-        ("visible", torch.ones(N), "bool"),
-        ("grad2d_sum", torch.zeros(N).double(), "float32"),
-        ("visible_count", torch.zeros(N).double(), "float32"),
-        ("grad2d_sum", torch.zeros(2 * N)[::2], "contiguous"),
-        ("visible_count", torch.zeros(2 * N)[::2], "contiguous"),
-    ):
-        with pytest.raises(ValueError, match=f"^{name} must be {says}"):
-            accumulate_statistics(**(good | {name: wrong}))
-
-
 # --- autograd notices changes in place -----------------------------------------------------------
 
 
 def optimizer() -> SplatOptimizer:
-    values = [torch.ones(N, *shape).requires_grad_() for shape in SHAPES]
+    values = [torch.ones(N, *shape).requires_grad_() for shape in SHAPES.values()]
     gaussians = Gaussians(**dict(zip(PARAMETERS, values, strict=True)))
     settings = OptimizerSettings()
     return SplatOptimizer(gaussians, settings, scene_scale=1.0, steps=10, backend="native")

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Callable
 from dataclasses import dataclass
 from types import SimpleNamespace
 from typing import Any
@@ -16,12 +15,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor
 
+from tests.splat.scenes import make_strategy
 from xrgs.splat.gaussians import PARAMETERS
 from xrgs.splat.settings import DensifySettings, OptimizerSettings
 from xrgs.splat.strategy.default import DefaultStrategy
 from xrgs.splat.strategy.refinement import Refinement
-
-MakeBoth = Callable[..., tuple["Ours", "Theirs"]]
 
 SCENE_SCALE = 1.7
 WIDTH, HEIGHT = 40, 30
@@ -144,13 +142,9 @@ class Theirs:
             reset_opa(self.params, self.optimizers, self.state, value)
 
 
-@pytest.fixture(scope="session")
-def make_both(make_strategy: Callable[..., DefaultStrategy]) -> MakeBoth:
-    def make(values: dict[str, Tensor], config: DensifySettings, seed: int) -> tuple[Ours, Theirs]:
-        ours = Ours(make_strategy(values, config, scene_scale=SCENE_SCALE, seed=seed))
-        return ours, Theirs(values, config, seed)
-
-    return make
+def make_both(values: dict[str, Tensor], config: DensifySettings, seed: int) -> tuple[Ours, Theirs]:
+    ours = Ours(make_strategy(values, config, scene_scale=SCENE_SCALE, seed=seed))
+    return ours, Theirs(values, config, seed)
 
 
 def assert_same(ours: Ours, theirs: Theirs) -> None:
@@ -177,9 +171,7 @@ def assert_same(ours: Ours, theirs: Theirs) -> None:
     step=st.sampled_from([0, 400, 500, 550, 600, 2900, 3000, 3100, 6000, 14_900, 15_000, 15_100]),
     seed=st.integers(0, 2**32 - 1),
 )
-def test_a_refinement_is_gsplats(
-    make_both: MakeBoth, count: int, views: int, step: int, seed: int
-) -> None:
+def test_a_refinement_is_gsplats(count: int, views: int, step: int, seed: int) -> None:
     rng = np.random.default_rng(seed)
     values, config = random_values(count, rng), DensifySettings()
     ours, theirs = make_both(values, config, seed)
@@ -200,7 +192,7 @@ def test_a_refinement_is_gsplats(
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_with_absgrad_a_refinement_is_gsplats(make_both: MakeBoth, seed: int) -> None:
+def test_with_absgrad_a_refinement_is_gsplats(seed: int) -> None:
     """Its recommended threshold, on what `RasterSettings.absgrad` makes the offset's gradient."""
     rng = np.random.default_rng(seed)
     values, config = random_values(80, rng), DensifySettings(grow_grad2d=8e-4)
@@ -222,7 +214,7 @@ def test_with_absgrad_a_refinement_is_gsplats(make_both: MakeBoth, seed: int) ->
 
 
 @pytest.mark.slow
-def test_a_run_of_3000_steps_is_gsplats(make_both: MakeBoth) -> None:
+def test_a_run_of_3000_steps_is_gsplats() -> None:
     steps = 3000
     config = DensifySettings().scaled(steps)
     rng = np.random.default_rng(0)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable
 from dataclasses import dataclass
 from types import SimpleNamespace
 from typing import Any
@@ -15,11 +14,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor
 
+from tests.splat.scenes import make_strategy
 from xrgs.splat.gaussians import PARAMETERS, Gaussians
-from xrgs.splat.strategy.default import DefaultStrategy
 from xrgs.splat.strategy.refinement import Groups, Refinement, Thresholds
-
-Refine = Callable[..., tuple[Gaussians, Refinement]]
 
 SCENE_SCALE = 1.7
 #: LR views are five times smaller; gradients in normalised device units do not depend on it.
@@ -63,28 +60,24 @@ def views_of(groups: str, count: int, rng: np.random.Generator) -> list[View]:
     return [view_of({"h": "HR", "l": "LR"}[letter], count, rng) for letter in groups]
 
 
-@pytest.fixture(scope="session")
-def ours(make_strategy: Callable[..., DefaultStrategy]) -> Refine:
-    def refine(
-        values: dict[str, Tensor], views: list[View], groups: Groups | None, step: int = 600
-    ) -> tuple[Gaussians, Refinement]:
-        """The Gaussians after steps on some views, at the last of which they are refined."""
-        strategy = make_strategy(values, scene_scale=SCENE_SCALE, groups=groups)
-        refinement = Refinement()
-        for view in views:
-            width, height = SIZES[view.group]
-            assert refinement == Refinement()
-            refinement = strategy.after_step(
-                step if view is views[-1] else 1,
-                view.gradient,
-                view.visible,
-                width=width,
-                height=height,
-                group=view.group,
-            )
-        return strategy.gaussians, refinement
-
-    return refine
+def ours(
+    values: dict[str, Tensor], views: list[View], groups: Groups | None, step: int = 600
+) -> tuple[Gaussians, Refinement]:
+    """The Gaussians after steps on some views, at the last of which they are refined."""
+    strategy = make_strategy(values, scene_scale=SCENE_SCALE, groups=groups)
+    refinement = Refinement()
+    for view in views:
+        width, height = SIZES[view.group]
+        assert refinement == Refinement()
+        refinement = strategy.after_step(
+            step if view is views[-1] else 1,
+            view.gradient,
+            view.visible,
+            width=width,
+            height=height,
+            group=view.group,
+        )
+    return strategy.gaussians, refinement
 
 
 def numbers(gaussians: Gaussians) -> Counter[int]:
@@ -132,7 +125,7 @@ def gsplats(
     seed=st.integers(0, 2**32 - 1),
 )
 def test_each_group_grows_by_its_own_statistics(
-    ours: Refine, count: int, order: str, absgrad: bool, seed: int
+    count: int, order: str, absgrad: bool, seed: int
 ) -> None:
     rng = np.random.default_rng(seed)
     values, views = values_of(count, rng), views_of(order, count, rng)
@@ -160,7 +153,7 @@ def test_each_group_grows_by_its_own_statistics(
     seed=st.integers(0, 2**32 - 1),
 )
 def test_an_hr_views_gaussian_is_pruned_by_the_hr_threshold(
-    ours: Refine, count: int, order: str, seed: int
+    count: int, order: str, seed: int
 ) -> None:
     rng = np.random.default_rng(seed)
     values, views = values_of(count, rng), views_of(order, count, rng)
@@ -179,7 +172,7 @@ def test_an_hr_views_gaussian_is_pruned_by_the_hr_threshold(
     assert refinement.pruned_opacity == count - len(expected)
 
 
-def test_each_group_has_thresholds_of_its_own(ours: Refine) -> None:
+def test_each_group_has_thresholds_of_its_own() -> None:
     """What the two properties above compare does differ, group by group."""
     rng = np.random.default_rng(0)
     values, views = values_of(300, rng), views_of("hlhl", 300, rng)
@@ -191,7 +184,7 @@ def test_each_group_has_thresholds_of_its_own(ours: Refine) -> None:
     assert refinement.pruned_opacity < swapped.pruned_opacity
 
 
-def test_copies_and_halves_are_pruned_by_their_parents_threshold(ours: Refine) -> None:
+def test_copies_and_halves_are_pruned_by_their_parents_threshold() -> None:
     values = values_of(4, np.random.default_rng(0))
     values["opacities"] = torch.logit(torch.full((4,), 0.01))  # between the two thresholds
     values["scales"] = torch.tensor([0.005, 0.005, 0.1, 0.1]).log()[:, None].repeat(1, 3)
@@ -205,7 +198,7 @@ def test_copies_and_halves_are_pruned_by_their_parents_threshold(ours: Refine) -
 
 
 @pytest.mark.parametrize("order", ["hlh", "hll"])
-def test_pooled_the_last_view_decides_for_all(ours: Refine, order: str) -> None:
+def test_pooled_the_last_view_decides_for_all(order: str) -> None:
     rng = np.random.default_rng(1)
     values, views = values_of(200, rng), views_of(order, 200, rng)
     thresholds = {"HR": FINE, "LR": COARSE}
@@ -220,9 +213,7 @@ def test_pooled_the_last_view_decides_for_all(ours: Refine, order: str) -> None:
 
 @pytest.mark.parametrize("step", [600, 3100])
 @pytest.mark.parametrize("order", ["h", "hlhll"])
-def test_pooled_groups_with_the_same_thresholds_are_as_none(
-    ours: Refine, step: int, order: str
-) -> None:
+def test_pooled_groups_with_the_same_thresholds_are_as_none(step: int, order: str) -> None:
     rng = np.random.default_rng(2)
     values, views = values_of(200, rng), views_of(order, 200, rng)
     same = Groups({"HR": FINE, "LR": FINE}, "current_view")
@@ -242,9 +233,7 @@ def test_pooled_groups_with_the_same_thresholds_are_as_none(
     order=st.text("hl", min_size=1, max_size=6),
     seed=st.integers(0, 2**32 - 1),
 )
-def test_by_own_thresholds_all_views_share_one_mean(
-    ours: Refine, count: int, order: str, seed: int
-) -> None:
+def test_by_own_thresholds_all_views_share_one_mean(count: int, order: str, seed: int) -> None:
     """As gsplat with a threshold of 1, and each gradient divided by its view's threshold."""
     rng = np.random.default_rng(seed)
     values, views = values_of(count, rng), views_of(order, count, rng)
@@ -259,7 +248,7 @@ def test_by_own_thresholds_all_views_share_one_mean(
     assert numbers(gaussians) == gsplats(values, scaled, Thresholds(1.0, 0.0))
 
 
-def test_by_own_thresholds_the_last_view_decides_nothing(ours: Refine) -> None:
+def test_by_own_thresholds_the_last_view_decides_nothing() -> None:
     rng = np.random.default_rng(5)
     values, (first, second, third) = values_of(200, rng), views_of("hlh", 200, rng)
     groups = Groups({"HR": FINE, "LR": COARSE}, "own_threshold")
@@ -273,7 +262,7 @@ def test_an_unknown_way_to_decide_is_refused() -> None:
         Groups({"HR": FINE}, "everybody")
 
 
-def test_the_reset_is_above_every_threshold(ours: Refine) -> None:
+def test_the_reset_is_above_every_threshold() -> None:
     values = values_of(50, np.random.default_rng(3))
     values["opacities"] += 6
     for thresholds in ({"HR": FINE, "LR": COARSE}, {"HR": COARSE, "LR": FINE}):
@@ -284,7 +273,7 @@ def test_the_reset_is_above_every_threshold(ours: Refine) -> None:
         assert highest == pytest.approx(2 * COARSE.prune_opacity)
 
 
-def test_a_view_of_no_group_is_an_error(ours: Refine) -> None:
+def test_a_view_of_no_group_is_an_error() -> None:
     rng = np.random.default_rng(4)
     with pytest.raises(KeyError, match="LR"):
         ours(values_of(3, rng), views_of("l", 3, rng), Groups({"HR": NOTHING}, "per_class"))

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 
 import numpy as np
 import pytest
@@ -12,13 +11,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 from torch import Tensor
 
+from tests.splat.scenes import make_strategy
 from xrgs.splat.gaussians import PARAMETERS, Gaussians
 from xrgs.splat.settings import DensifySettings
 from xrgs.splat.strategy.default import DefaultStrategy
 from xrgs.splat.strategy.ops import Budget, split_along_longest_axis, top_k
 from xrgs.splat.strategy.refinement import Refinement, StrategyHooks
-
-MakeStrategy = Callable[..., DefaultStrategy]
 
 SIDE = 20
 
@@ -98,9 +96,7 @@ def test_an_extreme_opacity_stays_finite(opacity: float) -> None:
     torch.testing.assert_close(logits, torch.full((2,), expected))
 
 
-def test_all_that_grow_are_split_and_no_random_number_is_drawn(
-    make_strategy: MakeStrategy,
-) -> None:
+def test_all_that_grow_are_split_and_no_random_number_is_drawn() -> None:
     values = random_values(6)
     strategy = make_strategy(values, DensifySettings(split="long_axis"))
     state = strategy.generator.get_state()
@@ -157,16 +153,14 @@ def test_the_best_are_those_of_a_sorted_list(
     assert chosen.nonzero()[:, 0].tolist() == sorted(ranked[:count])
 
 
-def strategy_within(
-    make_strategy: MakeStrategy, budget: float, count: int = 8, **settings: float
-) -> DefaultStrategy:
+def strategy_within(budget: float, count: int = 8, **settings: float) -> DefaultStrategy:
     """A budget for each of 400 pixels, with refinements at steps 600, 700, 800 and 900."""
     schedule = DensifySettings(stop=1000, budget=budget, split="long_axis", **settings)  # type: ignore[arg-type]
     return make_strategy(random_values(count), schedule, view_pixels=SIDE * SIDE)
 
 
-def test_the_best_candidates_grow_within_the_budget(make_strategy: MakeStrategy) -> None:
-    strategy = strategy_within(make_strategy, budget=12 / 400)
+def test_the_best_candidates_grow_within_the_budget() -> None:
+    strategy = strategy_within(budget=12 / 400)
     before = strategy.gaussians.sh0.detach().clone()
     # A quarter of densification has passed: there may be 8 + 4 / 2, so two of the four grow.
     norms = [3e-4, 9e-4, 0.0, 5e-4, 1e-5, 7e-4, 0.0, 0.0]
@@ -174,8 +168,8 @@ def test_the_best_candidates_grow_within_the_budget(make_strategy: MakeStrategy)
     assert torch.equal(strategy.gaussians.sh0[6:8].detach(), before[[1, 5]])
 
 
-def test_scores_take_the_place_of_the_gradient(make_strategy: MakeStrategy) -> None:
-    strategy = strategy_within(make_strategy, budget=12 / 400)
+def test_scores_take_the_place_of_the_gradient() -> None:
+    strategy = strategy_within(budget=12 / 400)
     before = strategy.gaussians.sh0.detach().clone()
     scores = torch.tensor([4.0, 1, 9, 3, 9, 2, 9, 9])
     norms = [3e-4, 9e-4, 0.0, 5e-4, 1e-5, 7e-4, 0.0, 0.0]
@@ -184,10 +178,8 @@ def test_scores_take_the_place_of_the_gradient(make_strategy: MakeStrategy) -> N
     assert torch.equal(strategy.gaussians.sh0[6:8].detach(), before[[0, 3]])
 
 
-def test_gaussians_that_are_not_finite_are_dropped_before_scores_are_asked_for(
-    make_strategy: MakeStrategy,
-) -> None:
-    strategy = strategy_within(make_strategy, budget=8 / 400)
+def test_gaussians_that_are_not_finite_are_dropped_before_scores_are_asked_for() -> None:
+    strategy = strategy_within(budget=8 / 400)
     strategy.gaussians.means.data[0] = torch.nan
     before = strategy.gaussians.sh0.detach().clone()
 
@@ -200,34 +192,34 @@ def test_gaussians_that_are_not_finite_are_dropped_before_scores_are_asked_for(
     assert torch.equal(strategy.gaussians.sh0[-1].detach(), before[6])
 
 
-def test_scores_are_asked_for_where_they_decide(make_strategy: MakeStrategy) -> None:
+def test_scores_are_asked_for_where_they_decide() -> None:
     asked = []
     hooks = StrategyHooks(growth_scores=lambda gaussians: asked.append(len(gaussians)))
     for budget, norms in ((0.0, [1.0] * 8), (1.0, [1.0] * 8), (12 / 400, [0.0] * 8)):
-        refine(strategy_within(make_strategy, budget), 600, norms, hooks)
-    refine(strategy_within(make_strategy, 4 / 400), 600, [1.0] * 8, hooks)  # there is no room
+        refine(strategy_within(budget), 600, norms, hooks)
+    refine(strategy_within(4 / 400), 600, [1.0] * 8, hooks)  # there is no room
     assert asked == []
-    refine(strategy_within(make_strategy, 12 / 400), 600, [1.0] * 8, hooks)
+    refine(strategy_within(12 / 400), 600, [1.0] * 8, hooks)
     assert asked == [8]
 
 
-def test_pruning_makes_room_for_the_next_refinement(make_strategy: MakeStrategy) -> None:
-    strategy = strategy_within(make_strategy, budget=24 / 400)
+def test_pruning_makes_room_for_the_next_refinement() -> None:
+    strategy = strategy_within(budget=24 / 400)
     counts = []
     for step in (600, 700, 800, 900):
         refine(strategy, step, [1.0] * len(strategy.gaussians))
         counts.append(len(strategy.gaussians))
     # 8 + 16 sqrt(1/4, 2/4, 3/4, 1); all 8 may grow in the first.
     assert counts == [16, 19, 21, 24]
-    strategy = strategy_within(make_strategy, budget=24 / 400)
+    strategy = strategy_within(budget=24 / 400)
     refine(strategy, 600, [1.0] * 8)
     strategy.gaussians.opacities.data[:10] = -9.0
     assert refine(strategy, 700, [0.0] * 16) == Refinement(pruned_opacity=10)
     assert refine(strategy, 800, [1.0] * 6) == Refinement(split=6)
 
 
-def test_more_gaussians_than_the_budget_stay_and_do_not_grow(make_strategy: MakeStrategy) -> None:
-    strategy = strategy_within(make_strategy, budget=5 / 400)
+def test_more_gaussians_than_the_budget_stay_and_do_not_grow() -> None:
+    strategy = strategy_within(budget=5 / 400)
     for step in (600, 900):
         assert refine(strategy, step, [1.0] * 8) == Refinement()
     strategy.remove(torch.arange(8) >= 4)
@@ -235,7 +227,7 @@ def test_more_gaussians_than_the_budget_stay_and_do_not_grow(make_strategy: Make
     assert refine(strategy, 1000, [1.0] * 4) == Refinement(split=1)
 
 
-def test_a_budget_that_is_never_reached_changes_nothing(make_strategy: MakeStrategy) -> None:
+def test_a_budget_that_is_never_reached_changes_nothing() -> None:
     runs = []
     for budget in (0.0, 1e3):
         settings = DensifySettings(budget=budget)

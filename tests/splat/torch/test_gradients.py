@@ -2,30 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
 import pytest
 import torch
 from torch import Tensor
 
+from tests.splat.scenes import Scene, draw, gradients_of, make_camera, make_scene, with_gradients
 from xrgs.splat.cameras import Camera
 from xrgs.splat.gaussians import PARAMETERS, ActivatedGaussians
-from xrgs.splat.rendering import Render, rasterize_parameters
+from xrgs.splat.rendering import rasterize_parameters
 from xrgs.splat.settings import RasterSettings
-
-Scene = dict[str, Tensor]
-MakeCamera = Callable[..., Camera]
-MakeScene = Callable[..., dict[str, Tensor]]
-Draw = Callable[..., Render]
 
 
 @pytest.mark.parametrize("antialiased", [False, True])
-def test_gradients_are_finite_differences_with_the_cuts_off(
-    with_gradients: Callable[[Scene], Scene],
-    make_camera: MakeCamera,
-    make_scene: MakeScene,
-    antialiased: bool,
-) -> None:
+def test_gradients_are_finite_differences_with_the_cuts_off(antialiased: bool) -> None:
     camera = make_camera(6, 5, turned=True)
     raster = RasterSettings(
         alpha_min=0.0,
@@ -51,13 +40,7 @@ def test_gradients_are_finite_differences_with_the_cuts_off(
     assert torch.autograd.gradcheck(outputs, inputs)
 
 
-def test_gradients_with_the_cuts_on_are_directional_differences(
-    draw: Draw,
-    with_gradients: Callable[[Scene], Scene],
-    gradients_of: Callable[[Scene], Scene],
-    make_camera: MakeCamera,
-    make_scene: MakeScene,
-) -> None:
+def test_gradients_with_the_cuts_on_are_directional_differences() -> None:
     camera = make_camera()
     raster = RasterSettings(background=(0.9, 0.2, 0.5))
     scene = make_scene(60, camera, seed=7, size=3.0)
@@ -79,35 +62,7 @@ def test_gradients_with_the_cuts_on_are_directional_differences(
         torch.testing.assert_close(exact, difference, rtol=1e-5, atol=1e-6)
 
 
-def test_background_reaches_the_gradients_of_what_stands_before_it(
-    draw: Draw,
-    with_gradients: Callable[[Scene], Scene],
-    make_camera: MakeCamera,
-    make_scene: MakeScene,
-) -> None:
-    """Only the background's term of alpha's gradient: black Gaussians before a bright one."""
-    camera = make_camera()
-    raster = RasterSettings(background=(1.0, 2.0, 3.0))
-    scene = make_scene(10, camera, seed=2)
-    scene["sh0"][:] = -10
-    leaves = with_gradients(scene)
-    value = draw(leaves, camera, raster, sh_degree=0).image.sum()
-    (gradient,) = torch.autograd.grad(value, leaves["opacities"])
-    for i in range(10):
-        step = torch.zeros(10, dtype=torch.float64)
-        step[i] = 1e-7
-        ahead, behind = (
-            draw(scene | {"opacities": scene["opacities"] + s}, camera, raster, sh_degree=0)
-            for s in (step, -step)
-        )
-        difference = (ahead.image.sum() - behind.image.sum()) / 2e-7
-        torch.testing.assert_close(gradient[i], difference, rtol=1e-5, atol=1e-5)
-    assert gradient.min() < -1
-
-
-def test_offset_moves_the_means_and_gathers_the_image_plane_gradient(
-    draw: Draw, make_camera: MakeCamera, make_scene: MakeScene
-) -> None:
+def test_offset_moves_the_means_and_gathers_the_image_plane_gradient() -> None:
     camera = make_camera()
     scene = make_scene(30, camera, seed=4)
     # Specks, whose shape does not depend on where the Jacobian is clamped: then an offset of the
@@ -125,13 +80,7 @@ def test_offset_moves_the_means_and_gathers_the_image_plane_gradient(
     assert (gradient[~by_offset.visible] == 0).all()
 
 
-def test_absgrad_sums_the_absolute_gradients_of_single_pixels(
-    draw: Draw,
-    with_gradients: Callable[[Scene], Scene],
-    gradients_of: Callable[[Scene], Scene],
-    make_camera: MakeCamera,
-    make_scene: MakeScene,
-) -> None:
+def test_absgrad_sums_the_absolute_gradients_of_single_pixels() -> None:
     camera = make_camera(11, 9)  # two tiles by two
     scene = make_scene(12, camera, seed=5, size=3.0)
     generator = torch.Generator().manual_seed(0)

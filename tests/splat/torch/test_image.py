@@ -2,26 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
 import numpy as np
 import pytest
 import torch
 from numpy.typing import NDArray
 from scipy.special import sph_harm_y
-from torch import Tensor
 
+from tests.splat.scenes import Scene, draw, make_camera, make_scene
 from xrgs.splat.cameras import Camera
-from xrgs.splat.rendering import Render
 from xrgs.splat.settings import RasterSettings
 
 Array = NDArray[np.float64]
 #: Depth, index, mean, inverse covariance, opacity and colour.
 Splat = tuple[float, int, Array, Array, float, Array]
-Scene = dict[str, Tensor]
-MakeCamera = Callable[..., Camera]
-MakeScene = Callable[..., dict[str, Tensor]]
-Draw = Callable[..., Render]
 
 NO_CUTS = RasterSettings(alpha_min=0.0, alpha_max=1.0, transmittance_min=0.0)
 
@@ -109,9 +102,7 @@ def naive(scene: Scene, camera: Camera, raster: RasterSettings) -> tuple[Array, 
     ],
     ids=["default", "background", "antialiased", "hard cuts", "no cuts"],
 )
-def test_image_is_the_naive_splatters(
-    draw: Draw, make_camera: MakeCamera, make_scene: MakeScene, raster: RasterSettings, seed: int
-) -> None:
+def test_image_is_the_naive_splatters(raster: RasterSettings, seed: int) -> None:
     camera = make_camera(turned=bool(seed))
     scene = make_scene(40, camera, seed=seed, size=2.5)
     scene["opacities"][::3] = 1.0
@@ -125,20 +116,9 @@ def test_image_is_the_naive_splatters(
 
 
 @pytest.mark.parametrize(("width", "height"), [(1, 1), (1, 9), (17, 1), (8, 8), (9, 7), (16, 24)])
-def test_sizes_that_are_no_multiple_of_a_tile(
-    draw: Draw, make_camera: MakeCamera, make_scene: MakeScene, width: int, height: int
-) -> None:
+def test_sizes_that_are_no_multiple_of_a_tile(width: int, height: int) -> None:
     camera = make_camera(width, height)
     scene = make_scene(12, camera, seed=width, size=3.0)
     render = draw(scene, camera)
     assert render.image.shape == (height, width, 3)
     np.testing.assert_allclose(render.image, naive(scene, camera, RasterSettings())[0], atol=1e-10)
-
-
-def test_pixel_centres_are_at_a_half(draw: Draw, single_pixel: MakeScene) -> None:
-    camera = Camera(torch.eye(4), torch.tensor([[10.0, 0, 3.5], [0, 10, 2.5], [0, 0, 1]]), 8, 6)
-    scene = single_pixel(1, opacity=0.5)
-    alpha = draw(scene, camera, sh_degree=0).alpha
-    assert alpha[2, 3] == alpha.max()
-    torch.testing.assert_close(alpha[2, 2], alpha[2, 4])
-    torch.testing.assert_close(alpha[1, 3], alpha[3, 3])

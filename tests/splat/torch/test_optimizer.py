@@ -2,26 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
 import pytest
 import torch
-from torch import Tensor
 
-from xrgs.splat.cameras import Camera
+from tests.splat.scenes import make_camera, make_scene
 from xrgs.splat.gaussians import PARAMETERS, ActivatedGaussians, Gaussians
 from xrgs.splat.optimizer import SplatOptimizer
 from xrgs.splat.rendering import rasterize_parameters
 from xrgs.splat.settings import OptimizerSettings, RasterSettings
 
-MakeCamera = Callable[..., Camera]
-MakeScene = Callable[..., dict[str, Tensor]]
-
 
 @pytest.mark.parametrize("sh_degree", [0, 1, 2, 3])
-def test_the_gradient_of_harmonics_follows_from_that_of_sh0(
-    make_camera: MakeCamera, make_scene: MakeScene, sh_degree: int
-) -> None:
+def test_the_gradient_of_harmonics_follows_from_that_of_sh0(sh_degree: int) -> None:
     camera = make_camera(turned=True)
     scene = make_scene(30, camera)
     gaussians = Gaussians(**{name: value.requires_grad_() for name, value in scene.items()})
@@ -38,9 +30,7 @@ def test_the_gradient_of_harmonics_follows_from_that_of_sh0(
     torch.testing.assert_close(gaussians.shN.grad, expected, rtol=1e-12, atol=1e-14)
 
 
-def test_without_a_gradient_of_sh0_harmonics_stay(
-    make_camera: MakeCamera, make_scene: MakeScene
-) -> None:
+def test_without_a_gradient_of_sh0_harmonics_stay() -> None:
     camera = make_camera()
     scene = make_scene(5, camera)
     gaussians = Gaussians(**{name: value.requires_grad_() for name, value in scene.items()})

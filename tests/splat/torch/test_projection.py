@@ -2,20 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 
 import pytest
 import torch
 from gsplat.cuda._torch_impl import _fully_fused_projection, _quat_scale_to_covar_preci
 from torch import Tensor
 
+from tests.splat.scenes import Scene, make_camera, make_scene
 from xrgs.splat.cameras import Camera
 from xrgs.splat.settings import RasterSettings
 from xrgs.splat.torch.projection import conic_cholesky, depths, project, visible_by_depth
 
-Scene = dict[str, Tensor]
-MakeCamera = Callable[..., Camera]
-MakeScene = Callable[..., dict[str, Tensor]]
 Outputs = tuple[Tensor, Tensor, Tensor, Tensor]
 
 SHAPE = ("means", "quats", "scales", "opacities")
@@ -51,9 +49,7 @@ def gsplats(scene: Scene, camera: Camera, settings: RasterSettings) -> Outputs:
 
 @pytest.mark.parametrize("antialiased", [False, True])
 @pytest.mark.parametrize("turned", [False, True])
-def test_projection_and_its_gradient_are_gsplats(
-    make_camera: MakeCamera, make_scene: MakeScene, antialiased: bool, turned: bool
-) -> None:
+def test_projection_and_its_gradient_are_gsplats(antialiased: bool, turned: bool) -> None:
     camera = make_camera(turned=turned)
     settings = RasterSettings(antialiased=antialiased)
     scene = make_scene(200, camera, size=3.0)
@@ -80,27 +76,22 @@ def test_projection_and_its_gradient_are_gsplats(
         torch.testing.assert_close(mine, theirs, rtol=1e-7, atol=1e-8)
 
 
-@pytest.fixture
-def one() -> MakeScene:
+def one(
+    mean: Sequence[float],
+    scales: Sequence[float] = (0.1, 0.2, 0.3),
+    quat: Sequence[float] = (1.0, 0.2, -0.3, 0.4),
+    dtype: torch.dtype = torch.float64,
+) -> Scene:
     """One Gaussian's parameters, at a place and of a shape."""
-
-    def make(
-        mean: Sequence[float],
-        scales: Sequence[float] = (0.1, 0.2, 0.3),
-        quat: Sequence[float] = (1.0, 0.2, -0.3, 0.4),
-        dtype: torch.dtype = torch.float64,
-    ) -> Scene:
-        values = {"means": mean, "quats": quat, "scales": scales}
-        scene = {name: torch.tensor([value], dtype=dtype) for name, value in values.items()}
-        return scene | {"opacities": torch.tensor([0.5], dtype=dtype)}
-
-    return make
+    values = {"means": mean, "quats": quat, "scales": scales}
+    scene = {name: torch.tensor([value], dtype=dtype) for name, value in values.items()}
+    return scene | {"opacities": torch.tensor([0.5], dtype=dtype)}
 
 
 @pytest.mark.parametrize("side", [-1, 1])
 @pytest.mark.parametrize("axis", [0, 1])
 def test_jacobian_is_clamped_at_1_3_of_the_field_around_the_principal_point(
-    make_camera: MakeCamera, one: MakeScene, axis: int, side: int
+    axis: int, side: int
 ) -> None:
     camera = make_camera()
     focal = camera.K[axis, axis]
@@ -120,9 +111,7 @@ def test_jacobian_is_clamped_at_1_3_of_the_field_around_the_principal_point(
 
 @pytest.mark.parametrize("antialiased", [False, True])
 @pytest.mark.parametrize("slope", [-4.0, -0.1, 0.2, 3.0])
-def test_gradient_within_and_beyond_the_clamp(
-    make_camera: MakeCamera, one: MakeScene, slope: float, antialiased: bool
-) -> None:
+def test_gradient_within_and_beyond_the_clamp(slope: float, antialiased: bool) -> None:
     camera = make_camera(turned=False)
     settings = RasterSettings(antialiased=antialiased)
     scene = one([2 * slope, -1.5 * slope, 2.0])
@@ -132,7 +121,7 @@ def test_gradient_within_and_beyond_the_clamp(
     )
 
 
-def test_needle_determinant_does_not_cancel(make_camera: MakeCamera, one: MakeScene) -> None:
+def test_needle_determinant_does_not_cancel() -> None:
     camera = make_camera(width=1000, height=800, focal=900.0)
     needle = one([0.1, 0.2, 1.5], scales=(8.0, 1e-4, 1e-4), quat=(0.9, 0.1, 0.2, 0.35))
     exact = project(*shape_of(needle), camera, RasterSettings())
@@ -149,7 +138,7 @@ def test_needle_determinant_does_not_cancel(make_camera: MakeCamera, one: MakeSc
 @pytest.mark.parametrize("scales", [(0.0, 0.0, 0.0), (1.0, 0.0, 0.0), (1e-30, 1e-30, 1e-30)])
 @pytest.mark.parametrize("antialiased", [False, True])
 def test_projected_gaussians_have_finite_gradients(
-    make_camera: MakeCamera, one: MakeScene, scales: tuple[float, float, float], antialiased: bool
+    scales: tuple[float, float, float], antialiased: bool
 ) -> None:
     scene = one([0.1, 0.1, 2.0], scales=scales, dtype=torch.float32)
     inputs = [value.requires_grad_() for value in shape_of(scene)]
@@ -160,7 +149,7 @@ def test_projected_gaussians_have_finite_gradients(
     assert all(gradient.isfinite().all() for gradient in torch.autograd.grad(total, inputs))
 
 
-def test_visible_is_the_bounding_box_against_the_image(make_camera: MakeCamera) -> None:
+def test_visible_is_the_bounding_box_against_the_image() -> None:
     camera = make_camera()
     settings = RasterSettings()
     generator = torch.Generator().manual_seed(0)
@@ -190,9 +179,7 @@ def test_visible_is_the_bounding_box_against_the_image(make_camera: MakeCamera) 
     assert 100 < len(expected) < count - 100
 
 
-def test_the_cholesky_factor_is_of_half_the_conic(
-    make_camera: MakeCamera, make_scene: MakeScene
-) -> None:
+def test_the_cholesky_factor_is_of_half_the_conic() -> None:
     camera = make_camera()
     projected = project(*shape_of(make_scene(50, camera)), camera, RasterSettings())
     xx, xy, yy = projected.cov.unbind(-1)
@@ -205,14 +192,3 @@ def test_the_cholesky_factor_is_of_half_the_conic(
         rtol=1e-9,
         atol=1e-12,
     )
-
-
-def test_equal_depths_keep_their_order(make_camera: MakeCamera) -> None:
-    camera = Camera(torch.eye(4), torch.diag(torch.tensor([9.0, 9.0, 1.0])), 40, 40)
-    generator = torch.Generator().manual_seed(0)
-    means = torch.rand(100, 3, generator=generator)
-    means[:, 2] = torch.arange(100) % 3 + 1.0
-    scales, quats = torch.full((100, 3), 0.1), torch.ones(100, 4)
-    projected = project(means, quats, scales, torch.ones(100), camera, RasterSettings())
-    order = visible_by_depth(projected, camera, RasterSettings()).tolist()
-    assert order == sorted(range(100), key=lambda i: (i % 3, i))

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
 import numpy as np
 import pytest
 import torch
@@ -11,27 +9,23 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor
 
+from tests.splat.scenes import (
+    draw,
+    gradients_of,
+    make_camera,
+    make_scene,
+    single_pixel,
+    with_gradients,
+)
 from xrgs.splat.cameras import Camera
 from xrgs.splat.gaussians import ActivatedGaussians
-from xrgs.splat.rendering import Render
 from xrgs.splat.settings import RasterSettings
 from xrgs.splat.torch import rasterizer as torch_rasterizer
-
-Scene = dict[str, Tensor]
-MakeCamera = Callable[..., Camera]
-MakeScene = Callable[..., dict[str, Tensor]]
-Draw = Callable[..., Render]
 
 # --- tiles and batches change nothing ------------------------------------------------------------
 
 
-def test_tiles_and_batches_make_no_difference(
-    with_gradients: Callable[[Scene], Scene],
-    gradients_of: Callable[[Scene], Scene],
-    make_camera: MakeCamera,
-    make_scene: MakeScene,
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_tiles_and_batches_make_no_difference(monkeypatch: pytest.MonkeyPatch) -> None:
     camera = make_camera(33, 21)
     scene = make_scene(80, camera, seed=9, size=3.0)
     renders = []
@@ -48,9 +42,7 @@ def test_tiles_and_batches_make_no_difference(
             torch.testing.assert_close(ours, theirs, rtol=1e-11, atol=1e-11)
 
 
-def test_float32_is_float64_outside_a_band_around_the_thresholds(
-    draw: Draw, make_camera: MakeCamera, make_scene: MakeScene
-) -> None:
+def test_float32_is_float64_outside_a_band_around_the_thresholds() -> None:
     camera = make_camera(40, 30, turned=True)
     scene = make_scene(300, camera, seed=11, size=3.0)
     scene["scales"][::9, 0] *= 20
@@ -69,24 +61,6 @@ def test_float32_is_float64_outside_a_band_around_the_thresholds(
     assert error.max() < 2 * base.alpha_min * exact.max()
 
 
-def test_render_is_the_same_twice(
-    draw: Draw,
-    with_gradients: Callable[[Scene], Scene],
-    gradients_of: Callable[[Scene], Scene],
-    make_camera: MakeCamera,
-    make_scene: MakeScene,
-) -> None:
-    camera = make_camera()
-    scene = make_scene(50, camera, dtype=torch.float32)
-    results = []
-    for _ in range(2):
-        leaves = with_gradients(scene)
-        render = draw(leaves, camera)
-        torch.autograd.backward(render.image.sum())
-        results.append([render.image, *gradients_of(leaves).values()])
-    assert all(torch.equal(a, b) for a, b in zip(*results, strict=True))
-
-
 @given(
     seed=st.integers(0, 2**31),
     count=st.integers(0, 30),
@@ -98,11 +72,6 @@ def test_render_is_the_same_twice(
 )
 @settings(max_examples=40, deadline=None)
 def test_random_scenes(
-    draw: Draw,
-    with_gradients: Callable[[Scene], Scene],
-    gradients_of: Callable[[Scene], Scene],
-    make_camera: MakeCamera,
-    make_scene: MakeScene,
     seed: int,
     count: int,
     width: int,
@@ -135,9 +104,7 @@ def test_random_scenes(
 # --- work and memory -----------------------------------------------------------------------------
 
 
-def test_evaluations_are_list_lengths_times_pixels(
-    draw: Draw, single_pixel: MakeScene, pixel: Camera
-) -> None:
+def test_evaluations_are_list_lengths_times_pixels(pixel: Camera) -> None:
     render = draw(single_pixel(3, opacity=0.5), pixel, sh_degree=0)
     assert render.evaluations == 3 * torch_rasterizer.TILE**2
 
@@ -161,9 +128,7 @@ def test_bytes_of_a_batch_are_what_autograd_keeps(dtype: torch.dtype, absgrad: b
     assert sum(kept.values()) == 3 * 50 * 64 * per_alpha
 
 
-def test_buffer_bytes_grow_with_the_lists(
-    draw: Draw, make_camera: MakeCamera, make_scene: MakeScene
-) -> None:
+def test_buffer_bytes_grow_with_the_lists() -> None:
     camera = make_camera()
     few, many = (
         draw(make_scene(count, camera, dtype=torch.float32), camera) for count in (10, 400)

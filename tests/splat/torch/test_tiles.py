@@ -2,41 +2,31 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
 import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from torch import Tensor
 
-from xrgs.splat.cameras import Camera
+from tests.splat.scenes import make_camera, make_scene
 from xrgs.splat.settings import RasterSettings
 from xrgs.splat.torch import tiles
 from xrgs.splat.torch.projection import ProjectedGaussians, project, visible_by_depth
 from xrgs.splat.torch.tiles import TileGrid, build_tile_batches, intersect_tiles
 
-MakeCamera = Callable[..., Camera]
-MakeScene = Callable[..., dict[str, Tensor]]
-MakeProjected = Callable[..., ProjectedGaussians]
 
-
-@pytest.fixture
-def make_projected(make_camera: MakeCamera, make_scene: MakeScene) -> MakeProjected:
+def make_projected(
+    width: int, height: int, *, count: int = 60, seed: int = 0
+) -> ProjectedGaussians:
     """Projected Gaussians in depth order, of all shapes from specks to needles."""
-
-    def make(width: int, height: int, *, count: int = 60, seed: int = 0) -> ProjectedGaussians:
-        camera = make_camera(width, height)
-        scene = make_scene(count, camera, seed=seed, size=2.0)
-        scene["scales"][::4, 0] *= 20
-        scene["scales"][1::4] *= 0.01
-        scene["opacities"][::5] *= 0.1
-        shape = scene["means"], scene["quats"], scene["scales"], scene["opacities"]
-        projected = project(*shape, camera, RasterSettings())
-        order = visible_by_depth(projected, camera, RasterSettings())
-        return projected._replace(**{k: v[order] for k, v in projected._asdict().items()})
-
-    return make
+    camera = make_camera(width, height)
+    scene = make_scene(count, camera, seed=seed, size=2.0)
+    scene["scales"][::4, 0] *= 20
+    scene["scales"][1::4] *= 0.01
+    scene["opacities"][::5] *= 0.1
+    shape = scene["means"], scene["quats"], scene["scales"], scene["opacities"]
+    projected = project(*shape, camera, RasterSettings())
+    order = visible_by_depth(projected, camera, RasterSettings())
+    return projected._replace(**{k: v[order] for k, v in projected._asdict().items()})
 
 
 def contributing(projected: ProjectedGaussians, grid: TileGrid) -> set[tuple[int, int]]:
@@ -57,7 +47,7 @@ def contributing(projected: ProjectedGaussians, grid: TileGrid) -> set[tuple[int
 @pytest.mark.parametrize("tile", [4, 8, 16])
 @pytest.mark.parametrize(("width", "height"), [(40, 30), (64, 48), (1, 1), (33, 1), (3, 50)])
 def test_lists_hold_all_that_contributes_and_little_else(
-    make_projected: MakeProjected, width: int, height: int, tile: int
+    width: int, height: int, tile: int
 ) -> None:
     grid = TileGrid(width, height, tile)
     projected = make_projected(width, height)
@@ -69,7 +59,7 @@ def test_lists_hold_all_that_contributes_and_little_else(
     assert len(pairs) <= 1.1 * len(needed) + 10
 
 
-def test_without_a_cut_every_tile_lists_every_gaussian(make_projected: MakeProjected) -> None:
+def test_without_a_cut_every_tile_lists_every_gaussian() -> None:
     grid = TileGrid(40, 30, 8)
     projected = make_projected(40, 30)
     tile, gaussian = intersect_tiles(projected, grid, RasterSettings(alpha_min=0.0))
@@ -79,9 +69,7 @@ def test_without_a_cut_every_tile_lists_every_gaussian(make_projected: MakeProje
     assert set(gaussian.tolist()) == set(range(len(projected.depths)))
 
 
-def test_too_many_pairs_is_an_error_before_they_are_made(
-    make_projected: MakeProjected, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_too_many_pairs_is_an_error_before_they_are_made(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(tiles, "MAX_PAIRS", 10)
     with pytest.raises(MemoryError, match=r"pairs in one view, more than 10"):
         intersect_tiles(make_projected(40, 30), TileGrid(40, 30, 8), RasterSettings())

@@ -8,22 +8,19 @@ import pytest
 import torch
 from torch import Tensor
 
+from tests.splat.scenes import noise
 from xrgs.capture.dataset import Dataset, LoadedView
 from xrgs.config import ComponentsConf, Conf
 from xrgs.splat.cameras import Camera
 from xrgs.splat.gaussians import PARAMETERS, Gaussians
 from xrgs.training import components
-from xrgs.training.components import Components, Step, TrainingView
+from xrgs.training.components import Components, Step
 
 FACTOR = 5
 
 
-def _noise(height: int, width: int, seed: int) -> Tensor:
-    generator = torch.Generator().manual_seed(seed)
-    return torch.rand(height, width, 3, generator=generator, dtype=torch.float64)
-
-
-def _view(tag: str, image: Tensor) -> LoadedView:
+def make_view(tag: str, image: Tensor) -> LoadedView:
+    """A view named as its tag in small letters."""
     height, width = image.shape[:2]
     K = torch.tensor([[1.2 * width, 0, width / 2], [0, 1.2 * width, height / 2], [0, 0, 1]])
     camera = Camera(torch.eye(4), K, width, height)
@@ -31,21 +28,9 @@ def _view(tag: str, image: Tensor) -> LoadedView:
 
 
 @pytest.fixture
-def noise() -> Callable[[int, int, int], Tensor]:
-    """(height, width, seed) -> a float64 image [H, W, 3] in 0..1."""
-    return _noise
-
-
-@pytest.fixture
-def make_view() -> Callable[[str, Tensor], TrainingView]:
-    """(tag, image) -> a view named as its tag in small letters."""
-    return _view
-
-
-@pytest.fixture
 def views() -> dict[str, LoadedView]:
     """A view of each tag by its tag; the LR view is 5 times smaller."""
-    both = (_view("HR", _noise(60, 75, 0)), _view("LR", _noise(12, 15, 1)))
+    both = (make_view("HR", noise(60, 75, 0)), make_view("LR", noise(12, 15, 1)))
     return {view.tag: view for view in both}
 
 

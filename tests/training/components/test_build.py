@@ -6,7 +6,6 @@ import dataclasses
 import subprocess
 import sys
 from collections.abc import Callable, Mapping
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -14,14 +13,13 @@ import pytest
 import torch
 from torch import Tensor
 
-from xrgs.capture.dataset import LoadedView
 from xrgs.config import ComponentsConf, DensifyConf, identity_values, is_on
 from xrgs.errors import XrgsError
-from xrgs.splat.gaussians import PARAMETERS, Gaussians
+from xrgs.splat.gaussians import Gaussians
 from xrgs.splat.settings import DensifySettings
 from xrgs.splat.strategy.refinement import Groups, Thresholds
 from xrgs.training import components
-from xrgs.training.components import Component, Components, Step, TrainingSetup
+from xrgs.training.components import Component, Components, Step
 from xrgs.training.components.consistency import Consistency
 from xrgs.training.components.curriculum import Curriculum
 from xrgs.training.components.densify import Densify
@@ -33,7 +31,7 @@ from xrgs.training.components.resolution_schedule import ResolutionSchedule
 from xrgs.training.components.skip_backward import SkipBackward
 from xrgs.training.components.supersampled import Supersampled
 from xrgs.training.components.view_scores import ErrorScore, MultiviewScore
-from xrgs.training.components.weighting import Weighting, weight_by_tag
+from xrgs.training.components.weighting import Weighting
 from xrgs.training.registry import BUILT_IN, modules_of
 
 Build = Callable[..., Components]
@@ -96,11 +94,6 @@ def test_every_setting_has_a_component() -> None:
     assert not read & set(BUILT_IN)
 
 
-def test_the_weight_of_a_view_multiplies_its_consistency_loss() -> None:
-    order = list(BUILT_IN)
-    assert order.index("consistency") < order.index("loss_weighting")
-
-
 def test_every_module_implements_a_component_or_is_shared() -> None:
     folder = Path(components.__file__).parent
     shared = {"__init__", "base", "combined"}
@@ -110,29 +103,6 @@ def test_every_module_implements_a_component_or_is_shared() -> None:
     assert paths == {f"training/components/{name}.py" for name in modules}
     assert "training/components/weighting.py" in modules_of("hybrid_schedule")
     assert modules_of("count_matched") == modules_of("plugins") == ()
-
-
-@pytest.mark.parametrize("tag", ["HR", "LR"])
-def test_at_the_value_that_is_off_each_changes_nothing(
-    tag: str,
-    steps: dict[str, Step],
-    views: dict[str, LoadedView],
-    off: ComponentsConf,
-    gaussians: Gaussians,
-    gradients: dict[str, Tensor],
-) -> None:
-    """Built at its off value, which `build` does not do, a component is the identity too."""
-    step, loss = steps[tag], torch.tensor(0.3)
-    weighting = Weighting(partial(weight_by_tag, lr_weight=off.loss_weighting.lr_weight))
-    assert weighting.modify_loss(loss, step.view.image, gaussians, step) is loss
-    scaling = GradientScaling(off.gradient_scaling)
-    scaling.after_backward(gaussians, step)
-    assert gaussians.scales.grad is not None
-    assert torch.equal(gaussians.scales.grad, gradients["scales"])
-    activated = gaussians.activated()
-    scale = RenderScale(off.render_scale, list(views.values()))
-    assert torch.equal(scale.before_render(activated, step).scales, activated.scales)
-    assert Curriculum(off.curriculum, list(views.values())).allows_view(step)
 
 
 def test_two_components_with_thresholds_are_refused() -> None:
@@ -199,45 +169,6 @@ def test_the_answers_of_components_are_combined(hr: Step, gaussians: Gaussians) 
     assert may_grow.tolist() == [False, True, False, True, False, True]
     assert scores.tolist() == [0, 3, 0, 3, 0, 5]
     assert pruned.tolist() == [True, True, False, True, False, True]
-
-
-def test_a_component_without_from_settings_says_so() -> None:
-    with pytest.raises(NotImplementedError, match="Other does not define from_settings"):
-        Other.from_settings(None, TrainingSetup(None, None, None, "torch"))  # type: ignore[arg-type]
-
-
-@pytest.mark.parametrize("parts", [Components(), Components([Component()])])
-@pytest.mark.parametrize("tag", ["HR", "LR"])
-def test_a_component_that_overrides_nothing_is_the_identity(
-    parts: Components,
-    tag: str,
-    steps: dict[str, Step],
-    gaussians: Gaussians,
-    gradients: dict[str, Tensor],
-) -> None:
-    step = steps[tag]
-    values = {name: gaussians[name].clone() for name in PARAMETERS}
-    loss = torch.tensor(0.3, requires_grad=True)
-    gradient = torch.rand(6, 2)
-    activated = gaussians.activated()
-    assert parts.allows_view(step)
-    assert parts.before_render(activated, step) is activated
-    assert parts.pixel_weights(step) is None
-    assert parts.modify_loss(loss, step.view.image, gaussians, step) is loss
-    assert parts.densification_grad2d(gradient, step) is gradient
-    assert parts.densification_groups(DensifySettings()) is None
-    assert parts.may_grow(gaussians, step) is None
-    assert parts.growth_scores(gaussians, step) is None
-    assert parts.to_prune(gaussians, step) is None
-    parts.after_backward(gaussians, step)
-    parts.on_gaussians_changed(gaussians)
-    parts.bake(gaussians)
-    parts.after_training(gaussians)
-    for name, value in values.items():
-        gradient_now = gaussians[name].grad
-        assert gradient_now is not None
-        assert torch.equal(gaussians[name], value), name
-        assert torch.equal(gradient_now, gradients[name]), name
 
 
 @pytest.mark.parametrize("key", ON)
@@ -329,6 +260,29 @@ def test_what_is_imported(module: str, unused: set[str]) -> None:
         ("continuous_weighting.gamma", -0.43),
         ("mip.variance", -0.2),
         ("mip.every", 0),
+        ("multiview_score.views", -1),
+        ("multiview_score.error", -0.1),
+        ("multiview_score.error", 1.0),
+        ("multiview_score.pixels", float("nan")),
+        ("error_score.views", 0),
+        ("error_score.of", "all"),
+        ("natural_selection.budget", -1.0),
+        ("natural_selection.budget", float("nan")),
+        ("natural_selection.until", 16_000),
+        ("natural_selection.until", 30_001),
+        ("skip_backward.share", -0.1),
+        ("skip_backward.share", 1.1),
+        ("skip_backward.decay", 1.0),
+        ("skip_backward.decay", -1.0),
+        ("skip_backward.tolerance", -0.1),
+        ("resolution_schedule.start_share", 0.0),
+        ("resolution_schedule.start_share", 1.5),
+        ("resolution_schedule.until", 0),
+        ("supersampled.factor", 0),
+        ("supersampled.late_factor", 0),
+        ("loss_weighting.stat_from", "both"),
+        ("consistency.lr_mode", "folded"),
+        ("densify.decide", "everybody"),
     ],
 )
 def test_a_value_out_of_range_names_its_key(
@@ -346,3 +300,9 @@ def test_a_value_out_of_range_names_its_key(
 def test_where_a_step_is_in_the_nominal_run(hr: Step) -> None:
     assert Step(300, 3000, hr.view).nominal == 3000
     assert hr.nominal == 0
+
+
+def test_own_thresholds_of_zero_are_refused(build: Build, off: ComponentsConf) -> None:
+    off.densify.decide, off.densify.lr_grow = "own_threshold", 0.0
+    with pytest.raises(XrgsError, match=r"^components\.densify\.lr_grow=0"):
+        build(off)

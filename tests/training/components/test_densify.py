@@ -7,7 +7,6 @@ from collections.abc import Callable
 import pytest
 
 from xrgs.config import ComponentsConf
-from xrgs.errors import XrgsError
 from xrgs.splat.settings import DensifySettings
 from xrgs.splat.strategy.refinement import DECIDE, Groups, Thresholds
 from xrgs.training.components import Components
@@ -45,15 +44,3 @@ def test_the_baseline_has_no_groups_of_views(build: Build, off: ComponentsConf) 
     assert build(off).densification_groups(DensifySettings()) is None
     off.loss_weighting.lr_weight = 0.25
     assert build(off).densification_groups(DensifySettings()) is None
-
-
-def test_an_unknown_value_of_decide_is_refused(build: Build, on: ComponentsConf) -> None:
-    on.densify.decide = "everybody"
-    with pytest.raises(XrgsError, match=r"^components\.densify\.decide=everybody"):
-        build(on)
-
-
-def test_own_thresholds_of_zero_are_refused(build: Build, on: ComponentsConf) -> None:
-    on.densify.decide, on.densify.lr_grow = "own_threshold", 0.0
-    with pytest.raises(XrgsError, match=r"^components\.densify\.lr_grow=0"):
-        build(on)

@@ -135,16 +135,6 @@ def test_gaussians_that_no_view_sees_are_not_filtered() -> None:
     assert torch.equal(filtered.opacities, plain.opacities)
 
 
-@pytest.mark.parametrize("tag", ["HR", "LR"])
-def test_every_view_is_rendered_with_the_same_filter(tag: str) -> None:
-    gaussians = splats((0.0, 0.0, 0.0))
-    mip = on(FAR, CLOSE)
-    mip.on_gaussians_changed(gaussians)
-    step = Step(1, 30_000, view(tag, FAR if tag == "HR" else CLOSE))
-    first = mip.before_render(gaussians.activated(), STEP)
-    assert torch.equal(mip.before_render(gaussians.activated(), step).scales, first.scales)
-
-
 def test_rates_follow_the_means_every_so_often() -> None:
     gaussians = splats((0.0, 0.0, 0.0))
     mip = on(FAR, every=100)
@@ -156,17 +146,6 @@ def test_rates_follow_the_means_every_so_often() -> None:
     assert torch.equal(mip.variance, before)
     mip.before_render(gaussians.activated(), Step(200, 30_000, STEP.view))
     torch.testing.assert_close(mip.variance, 4 * before)
-
-
-def test_mass_is_kept() -> None:
-    generator = torch.Generator().manual_seed(0)
-    scales, opacities, variance = (
-        torch.rand(*shape, generator=generator, dtype=torch.float64)
-        for shape in ((9, 3), (9,), (9,))
-    )
-    wider, weaker = smooth(scales, opacities, variance)
-    assert (wider > scales).all()
-    torch.testing.assert_close(weaker * wider.prod(-1), opacities * scales.prod(-1))
 
 
 def test_its_gradient_is_that_of_finite_differences() -> None:

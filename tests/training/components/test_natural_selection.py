@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 from dataclasses import replace
 
@@ -10,9 +9,9 @@ import pytest
 import torch
 from torch import Tensor
 
+from tests.training.conftest import compose
 from xrgs.capture.dataset import Dataset
-from xrgs.config import ComponentsConf, Conf
-from xrgs.errors import XrgsError
+from xrgs.config import ComponentsConf
 from xrgs.splat.gaussians import Gaussians
 from xrgs.training.components import Components, Step
 from xrgs.training.components.natural_selection import NaturalSelection
@@ -135,7 +134,7 @@ def test_fewer_than_the_budget_are_not_pushed(
     assert selection.to_prune(gaussians, at(UNTIL)) is None
 
 
-def test_a_run_ends_with_the_budget(data: Dataset, compose: Callable[..., Conf]) -> None:
+def test_a_run_ends_with_the_budget(data: Dataset) -> None:
     # Without resets, which would leave no more than the budget, and with a rate of the opacities at
     # which they can fade in 16 steps.
     without_resets = ("train.steps=60", "splat.backend=auto", "splat.densify.reset_every=50000")
@@ -150,16 +149,3 @@ def test_a_run_ends_with_the_budget(data: Dataset, compose: Callable[..., Conf])
     # The push fades opacities before anything is removed at once, at step 46.
     faded = [row["pruned_by_components"] for row in result.history if row["step"] < 46]
     assert faded[-1] > 0
-
-
-@pytest.mark.parametrize(
-    ("key", "value"),
-    [("budget", -1.0), ("budget", math.nan), ("until", 16_000), ("until", 30_001)],
-)
-def test_a_value_out_of_range_is_named(
-    build: Build, off: ComponentsConf, key: str, value: float
-) -> None:
-    off.natural_selection.budget = 0.1
-    setattr(off.natural_selection, key, value)
-    with pytest.raises(XrgsError, match=f"components.natural_selection.{key}={value}: must be"):
-        build(off)

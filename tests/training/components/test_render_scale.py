@@ -6,11 +6,11 @@ from collections.abc import Callable
 
 import pytest
 import torch
-from torch import Tensor
 
+from tests.training.components.conftest import make_view
 from xrgs.config import ComponentsConf
 from xrgs.splat.gaussians import PARAMETERS, Gaussians
-from xrgs.training.components import Components, Step, TrainingView
+from xrgs.training.components import Components, Step
 
 Build = Callable[..., Components]
 
@@ -46,10 +46,7 @@ def test_the_trained_scales_stay_and_gradients_reach_them(
 
 
 def test_resolution_is_the_longer_side_of_the_largest_view(
-    build: Build,
-    on: ComponentsConf,
-    gaussians: Gaussians,
-    make_view: Callable[[str, Tensor], TrainingView],
+    build: Build, on: ComponentsConf, gaussians: Gaussians
 ) -> None:
     on.render_scale.gamma = 1.0
     turned, wide = make_view("LR", torch.zeros(40, 20, 3)), make_view("HR", torch.zeros(30, 80, 3))
@@ -61,10 +58,7 @@ def test_resolution_is_the_longer_side_of_the_largest_view(
 
 
 def test_an_lr_view_of_full_size_stays_as_it_is(
-    build: Build,
-    on: ComponentsConf,
-    gaussians: Gaussians,
-    make_view: Callable[[str, Tensor], TrainingView],
+    build: Build, on: ComponentsConf, gaussians: Gaussians
 ) -> None:
     blurred, sharp = (make_view(tag, torch.zeros(40, 60, 3)) for tag in ("LR", "HR"))
     step, plain = Step(0, 1, blurred), gaussians.activated()

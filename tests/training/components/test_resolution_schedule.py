@@ -9,9 +9,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from torch import Tensor
 from torch.nn.functional import interpolate
 
+from tests.splat.scenes import noise
+from tests.training.conftest import compose, same
 from xrgs.capture.dataset import Dataset, LoadedView
 from xrgs.config import ComponentsConf, Conf
 from xrgs.errors import XrgsError
@@ -21,8 +22,6 @@ from xrgs.training.components.resolution_schedule import ResolutionSchedule, kep
 from xrgs.training.loop import train
 
 Build = Callable[..., Components]
-Compose = Callable[..., Conf]
-Same = Callable[[Gaussians, Gaussians], bool]
 
 
 @pytest.fixture
@@ -57,7 +56,7 @@ def test_waves_are_kept_up_to_their_frequency() -> None:
     assert shares == pytest.approx(expected, abs=1e-6)
 
 
-def test_images_add_their_magnitudes(noise: Callable[[int, int, int], Tensor]) -> None:
+def test_images_add_their_magnitudes() -> None:
     images = [noise(20, 30, 0), noise(15, 11, 1)]
     kept = total = 0.0
     for image in images:
@@ -129,17 +128,6 @@ def test_every_view_keeps_the_window_of_ssim(build: Build, on: ComponentsConf) -
     assert list(_component(build(on)).kept) == [1, 2, 3, 4, 5]  # of 60 px, 11 px and more
 
 
-@pytest.mark.parametrize(
-    ("name", "value"), [("start_share", 0.0), ("start_share", 1.5), ("until", 0)]
-)
-def test_settings_without_meaning_are_refused(
-    build: Build, on: ComponentsConf, name: str, value: float
-) -> None:
-    setattr(on.resolution_schedule, name, value)
-    with pytest.raises(XrgsError, match=rf"^components\.resolution_schedule\.{name}={value}"):
-        build(on)
-
-
 def test_without_hr_views_it_is_an_error(build: Build, on: ComponentsConf, lr: Step) -> None:
     with pytest.raises(XrgsError, match="no HR view"):
         build(on, lr.view)
@@ -163,9 +151,7 @@ def _after_20_steps(data: Dataset, conf: Conf, *extra: ResolutionSchedule) -> Ga
     return seen[0]
 
 
-def test_the_start_is_a_training_on_small_photographs(
-    data: Dataset, compose: Compose, same: Same
-) -> None:
+def test_the_start_is_a_training_on_small_photographs(data: Dataset) -> None:
     conf = compose("train.steps=40", "splat.backend=auto", "train.evaluate_every=20")
     component = HalvedFirst(conf.components.resolution_schedule, data.train, "auto")
     own = {view.name: view for view in data.train}
@@ -178,9 +164,7 @@ def test_the_start_is_a_training_on_small_photographs(
 
 
 @pytest.mark.parametrize("with_", ["+ablation=supersampled", "+ablation=consistency"])
-def test_it_goes_with_what_compares_at_other_sizes(
-    data: Dataset, compose: Compose, same: Same, with_: str
-) -> None:
+def test_it_goes_with_what_compares_at_other_sizes(data: Dataset, with_: str) -> None:
     overrides = ["train.steps=20", "splat.backend=auto", "splat.densify.stop=0", with_]
     overrides.append("components.resolution_schedule.until=15000")
     plain = train(data, compose(*overrides))

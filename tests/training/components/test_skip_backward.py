@@ -9,17 +9,15 @@ from dataclasses import replace
 import pytest
 import torch
 
+from tests.training.conftest import compose, same
 from xrgs.capture.dataset import Dataset
 from xrgs.config import ComponentsConf, Conf
-from xrgs.errors import XrgsError
 from xrgs.splat.gaussians import Gaussians
 from xrgs.training.components import Component, Components, Step
 from xrgs.training.components.skip_backward import SkipBackward
 from xrgs.training.loop import train
 
 Build = Callable[..., Components]
-Compose = Callable[..., Conf]
-Same = Callable[[Gaussians, Gaussians], bool]
 
 
 @pytest.fixture
@@ -98,18 +96,6 @@ def test_a_loss_that_is_not_finite_needs_a_backward_pass(
     ]
 
 
-@pytest.mark.parametrize(
-    ("name", "value"),
-    [("share", -0.1), ("share", 1.1), ("decay", 1.0), ("decay", -1.0), ("tolerance", -0.1)],
-)
-def test_settings_without_meaning_are_refused(
-    build: Build, on: ComponentsConf, name: str, value: float
-) -> None:
-    setattr(on.skip_backward, name, value)
-    with pytest.raises(XrgsError, match=rf"^components\.skip_backward\.{name}={value}"):
-        build(on)
-
-
 class Counter(Component):
     """Answers that no backward pass is needed at some steps, and counts the calls of the hooks."""
 
@@ -147,7 +133,7 @@ def test_without_a_skipped_step_the_history_has_no_such_column(data: Dataset, sh
     assert "skipped_backward" not in train(data, short).history[-1]
 
 
-def test_the_last_steps_can_be_left_out(data: Dataset, short: Conf, same: Same) -> None:
+def test_the_last_steps_can_be_left_out(data: Dataset, short: Conf) -> None:
     """Training whose last 20 steps are all skipped ends with what it had after 20 steps."""
     seen: list[Gaussians] = []
 
@@ -161,7 +147,7 @@ def test_the_last_steps_can_be_left_out(data: Dataset, short: Conf, same: Same) 
     assert not same(train(data, short).gaussians, seen[0])
 
 
-def test_training_skips_at_most_what_the_share_allows(data: Dataset, compose: Compose) -> None:
+def test_training_skips_at_most_what_the_share_allows(data: Dataset) -> None:
     conf = compose("train.steps=40", "splat.backend=auto", "+ablation=skip_backward")
     skipped = train(data, conf).history[-1]["skipped_backward"]
     assert 0 < skipped <= 10  # half of the 20 steps after densification

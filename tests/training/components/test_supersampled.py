@@ -9,6 +9,8 @@ import torch
 from torch import Tensor
 from torch.nn.functional import avg_pool2d, interpolate
 
+from tests.splat.scenes import noise
+from tests.training.components.conftest import make_view
 from xrgs.capture.dataset import Dataset, LoadedView
 from xrgs.config import ComponentsConf, Conf
 from xrgs.errors import XrgsError
@@ -59,7 +61,7 @@ def test_an_hr_view_is_untouched(build: Build, on: ComponentsConf, hr: Step) -> 
 
 
 def test_a_downsampled_view_is_brought_down_by_the_kernel_that_made_it(
-    build: Build, on: ComponentsConf, lr: Step, noise: Callable[[int, int, int], Tensor]
+    build: Build, on: ComponentsConf, lr: Step
 ) -> None:
     render = noise(24, 30, 3)
     torch.testing.assert_close(
@@ -68,10 +70,7 @@ def test_a_downsampled_view_is_brought_down_by_the_kernel_that_made_it(
 
 
 def test_a_zoomed_view_is_brought_down_to_what_it_resolves_and_up_again(
-    on: ComponentsConf,
-    baseline: Conf,
-    noise: Callable[[int, int, int], Tensor],
-    make_view: Callable[[str, Tensor], LoadedView],
+    on: ComponentsConf, baseline: Conf
 ) -> None:
     view = make_view("LR", noise(60, 75, 1))
     parts, step = _built(on, baseline, "digital_zoom", view), Step(0, 1, view)
@@ -83,10 +82,7 @@ def test_a_zoomed_view_is_brought_down_to_what_it_resolves_and_up_again(
 
 
 def test_a_view_that_a_camera_took_averages_over_the_area_of_its_pixels(
-    on: ComponentsConf,
-    baseline: Conf,
-    noise: Callable[[int, int, int], Tensor],
-    make_view: Callable[[str, Tensor], LoadedView],
+    on: ComponentsConf, baseline: Conf
 ) -> None:
     on.supersampled.factor = 3
     view = make_view("LR", noise(12, 15, 1))
@@ -109,16 +105,7 @@ def test_the_factor_changes_at_its_step(build: Build, on: ComponentsConf, lr: St
     assert parts.to_photograph(image, Step(149, 300, view)) is image
 
 
-@pytest.mark.parametrize("name", ["factor", "late_factor"])
-def test_a_factor_below_one_is_refused(build: Build, on: ComponentsConf, name: str) -> None:
-    setattr(on.supersampled, name, 0)
-    with pytest.raises(XrgsError, match=rf"components.supersampled.{name}=0"):
-        build(on)
-
-
-def test_compressed_views_have_nothing_to_supersample(
-    on: ComponentsConf, baseline: Conf, make_view: Callable[[str, Tensor], LoadedView]
-) -> None:
+def test_compressed_views_have_nothing_to_supersample(on: ComponentsConf, baseline: Conf) -> None:
     view = make_view("LR", torch.zeros(60, 75, 3))
     with pytest.raises(XrgsError, match="jpeg"):
         _built(on, baseline, "jpeg", view)

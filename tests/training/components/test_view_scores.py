@@ -11,9 +11,10 @@ import torch
 from scipy.ndimage import correlate
 from torch import Tensor
 
+from tests.splat.scenes import noise
+from tests.training.conftest import compose
 from xrgs.capture.dataset import Dataset, LoadedView
-from xrgs.config import ComponentsConf, Conf
-from xrgs.errors import XrgsError
+from xrgs.config import ComponentsConf
 from xrgs.splat.attribution import attribute_pixels
 from xrgs.splat.gaussians import ActivatedGaussians, Gaussians
 from xrgs.splat.rendering import rasterize_parameters
@@ -92,7 +93,7 @@ def edges_in_scipy(image: Tensor) -> Tensor:
     return torch.from_numpy(np.abs(correlate(image.sum(dim=-1).numpy(), kernel, mode="nearest")))
 
 
-def test_edges_are_scipys_laplacian(noise: Callable[[int, int, int], Tensor]) -> None:
+def test_edges_are_scipys_laplacian() -> None:
     image = noise(9, 13, 5)
     torch.testing.assert_close(edges(image), edges_in_scipy(image))
 
@@ -150,7 +151,7 @@ def test_views_are_rendered_with_all_components(
     assert renderer.recorder.evaluations == 2 * render.evaluations
 
 
-def test_the_work_counts_as_the_runs(data: Dataset, compose: Callable[..., Conf]) -> None:
+def test_the_work_counts_as_the_runs(data: Dataset) -> None:
     every_third_step = ("train.steps=20", "splat.backend=auto", "splat.densify.every=5000")
     over = (*every_third_step, "splat.densify.grow_grad2d=1")  # nothing grows
     plain = train(data, compose(*over))
@@ -174,24 +175,3 @@ def test_views_follow_from_the_seed_and_the_step(
     )
     assert torch.equal(first, again)
     assert not (torch.equal(first, second) and torch.equal(first, third))
-
-
-@pytest.mark.parametrize(
-    ("key", "value"),
-    [
-        ("multiview_score.views", -1),
-        ("multiview_score.error", -0.1),
-        ("multiview_score.error", 1.0),
-        ("multiview_score.pixels", float("nan")),
-        ("error_score.views", 0),
-        ("error_score.of", "all"),
-    ],
-)
-def test_a_value_out_of_range_is_named(
-    build: Build, off: ComponentsConf, key: str, value: float
-) -> None:
-    off.multiview_score.views, off.error_score.of = 2, "edges"
-    name, field = key.split(".")
-    setattr(getattr(off, name), field, value)
-    with pytest.raises(XrgsError, match=f"components.{key}={value}: must be"):
-        build(off)

@@ -12,9 +12,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from torch import Tensor
 
+from tests.training.components.conftest import make_view
 from xrgs.capture.dataset import Dataset, LoadedView
 from xrgs.config import ComponentsConf, Conf
-from xrgs.errors import XrgsError
 from xrgs.splat.cameras import Camera
 from xrgs.splat.gaussians import Gaussians
 from xrgs.splat.loss import photometric_loss, prepare_target
@@ -29,7 +29,6 @@ from xrgs.training.components.weighting import (
 )
 
 Build = Callable[..., Components]
-MakeView = Callable[[str, Tensor], TrainingView]
 
 #: The losses of these tests do not depend on the Gaussians.
 NO_GAUSSIANS = Gaussians(*[torch.empty(0)] * 6)
@@ -124,25 +123,6 @@ def test_densification_can_read_the_gradient_without_the_weight(base: float) -> 
     assert weighting(base, stat_from="weighted").densification_grad2d(gradient, STEP) is gradient
 
 
-@pytest.mark.parametrize(
-    ("key", "value"),
-    [
-        ("adaptive_weighting.texture", 0.07),
-        ("region_weighting.texture", 0.07),
-        ("hybrid_schedule.ramp", 5000),
-    ],
-)
-def test_attenuating_a_weight_that_is_off_is_refused(
-    key: str, value: float, build: Build, off: ComponentsConf
-) -> None:
-    group, name = key.split(".")
-    setattr(getattr(off, group), name, value)
-    with pytest.raises(XrgsError, match=rf"components\.{key}={value}: .*loss_weighting\.lr_weight"):
-        build(off)
-    off.loss_weighting.lr_weight = 0.25
-    assert [type(component) for component in build(off)] == [Weighting]
-
-
 # By tag (section 5.2).
 
 
@@ -174,12 +154,6 @@ def test_unweighted_densification_reads_the_gradient_of_the_plain_loss(
         (found,) = torch.autograd.grad(weighted, means2d, retain_graph=True)
         assert torch.equal(found, expected) == (step is hr)
         assert torch.equal(parts.densification_grad2d(found, step), expected)
-
-
-def test_an_unknown_statistic_is_refused(build: Build, off: ComponentsConf) -> None:
-    off.loss_weighting.lr_weight, off.loss_weighting.stat_from = 0.25, "both"
-    with pytest.raises(XrgsError, match=r"^components\.loss_weighting\.stat_from=both"):
-        build(off)
 
 
 # By sampling rate (conclusion).
@@ -258,7 +232,7 @@ def test_the_gradient_is_the_root_mean_square_over_channels() -> None:
     ],
 )
 def test_the_weight_falls_to_lr_weight_as_texture_rises(
-    slopes: list[float], expected: float, off: ComponentsConf, build: Build, make_view: MakeView
+    slopes: list[float], expected: float, off: ComponentsConf, build: Build
 ) -> None:
     off.loss_weighting.lr_weight, off.adaptive_weighting.texture = 0.25, 0.1
     low, high = [make_view("LR", ramp(slope)) for slope in slopes], make_view("HR", ramp(0.2))

@@ -1,4 +1,8 @@
-"""The public API as a user's type checker sees it; checked by mypy and never run."""
+"""The public API as a user's type checker sees it; checked by mypy and never run.
+
+The lines with `type: ignore` are wrong on purpose: `mypy --strict` reports an ignore that is not
+needed, so each of them says that mypy finds an error of this code there.
+"""
 
 from typing import Any, assert_type
 
@@ -51,3 +55,13 @@ data = xrgs.build_dataset(conf)
 assert_type(data.test[0].image, Tensor)
 assert_type(xrgs.train(data, conf).gaussians, Gaussians)
 assert_type(xrgs.train(xrgs.load_dataset("variant", "hr_only"), conf).seconds, float)
+
+xrgs.rasterise(gaussians)  # type: ignore[attr-defined]
+load_ply(3)  # type: ignore[arg-type]
+rasterize(camera, gaussians)  # type: ignore[arg-type]
+rasterize(gaussians, camera, degree=3)  # type: ignore[call-arg]
+image = rasterize(gaussians, camera).colors  # type: ignore[attr-defined]
+RasterSettings(near="0.01")  # type: ignore[arg-type]
+rasterization(gaussians.means)  # type: ignore[call-arg]
+store.cells(verified=True)  # type: ignore[call-arg]
+xrgs.train(gaussians, conf)  # type: ignore[arg-type]

@@ -2,32 +2,26 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
 import pytest
 import torch
-from torch import Tensor
 
+from tests.splat.scenes import (
+    draw,
+    gradients_of,
+    make_camera,
+    make_scene,
+    single_pixel,
+    with_gradients,
+)
 from xrgs.splat.cameras import Camera
-from xrgs.splat.rendering import Render
 from xrgs.splat.settings import RasterSettings
-
-Scene = dict[str, Tensor]
-MakeCamera = Callable[..., Camera]
-MakeScene = Callable[..., dict[str, Tensor]]
-Draw = Callable[..., Render]
 
 # --- compositing, on one pixel --------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_a_pixel_ends_before_the_gaussian_that_leaves_too_little(
-    draw: Draw,
-    with_gradients: Callable[[Scene], Scene],
-    gradients_of: Callable[[Scene], Scene],
-    single_pixel: MakeScene,
-    pixel: Camera,
-    dtype: torch.dtype,
+    pixel: Camera, dtype: torch.dtype
 ) -> None:
     scene = single_pixel(6, opacity=0.95, dtype=dtype)
     scene["opacities"][4:] = 0.01  # these would leave enough, but the pixel has ended
@@ -43,7 +37,7 @@ def test_a_pixel_ends_before_the_gaussian_that_leaves_too_little(
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_a_transmittance_of_exactly_the_least_ends_the_pixel(
-    draw: Draw, single_pixel: MakeScene, pixel: Camera, dtype: torch.dtype
+    pixel: Camera, dtype: torch.dtype
 ) -> None:
     # Three alphas of exactly 1/2: the third would leave a transmittance of exactly 1/8.
     scene = single_pixel(3, opacity=0.5, dtype=dtype)
@@ -53,9 +47,7 @@ def test_a_transmittance_of_exactly_the_least_ends_the_pixel(
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_an_alpha_of_exactly_the_least_is_composited(
-    draw: Draw, single_pixel: MakeScene, pixel: Camera, dtype: torch.dtype
-) -> None:
+def test_an_alpha_of_exactly_the_least_is_composited(pixel: Camera, dtype: torch.dtype) -> None:
     scene = single_pixel(1, opacity=0.5, dtype=dtype)
     for least, alpha in ((0.5, 0.5), (0.5001, 0.0)):
         render = draw(scene, pixel, RasterSettings(alpha_min=least), sh_degree=0)
@@ -63,13 +55,7 @@ def test_an_alpha_of_exactly_the_least_is_composited(
         assert render.visible.tolist() == [alpha > 0]
 
 
-def test_a_capped_alpha_has_no_gradient(
-    draw: Draw,
-    with_gradients: Callable[[Scene], Scene],
-    gradients_of: Callable[[Scene], Scene],
-    single_pixel: MakeScene,
-    pixel: Camera,
-) -> None:
+def test_a_capped_alpha_has_no_gradient(pixel: Camera) -> None:
     leaves = with_gradients(single_pixel(2, opacity=0.995, dtype=torch.float64))
     with torch.no_grad():
         leaves["opacities"][1] = 0.5
@@ -85,31 +71,25 @@ def test_a_capped_alpha_has_no_gradient(
 
 @pytest.mark.parametrize(("opacity", "seen"), [(0.99 / 255, False), (1.01 / 255, True)])
 def test_a_contribution_below_the_cut_is_skipped(
-    draw: Draw, single_pixel: MakeScene, pixel: Camera, opacity: float, seen: bool
+    backend: str, pixel: Camera, opacity: float, seen: bool
 ) -> None:
-    render = draw(single_pixel(1, opacity=opacity), pixel, sh_degree=0)
+    render = draw(single_pixel(1, opacity=opacity), pixel, sh_degree=0, backend=backend)
     assert (render.alpha > 0).item() == seen
     assert render.visible.tolist() == [seen]
 
 
 @pytest.mark.parametrize("order", [(0, 1), (1, 0)])
 def test_of_equal_depths_the_lower_index_is_in_front(
-    draw: Draw, single_pixel: MakeScene, pixel: Camera, order: tuple[int, int]
+    backend: str, pixel: Camera, order: tuple[int, int]
 ) -> None:
     scene = single_pixel(2, opacity=0.9)
     scene["means"][:, 2] = 2.0
     scene["sh0"] = torch.tensor([[[1.0, 0, -9]], [[-9.0, 0, 1]]])[list(order)]
-    red, _, blue = draw(scene, pixel, sh_degree=0).image[0, 0]
+    red, _, blue = draw(scene, pixel, sh_degree=0, backend=backend).image[0, 0]
     assert (red > 5 * blue) if order == (0, 1) else (blue > 5 * red)
 
 
-def test_opacity_one_without_a_cap_is_opaque(
-    draw: Draw,
-    with_gradients: Callable[[Scene], Scene],
-    gradients_of: Callable[[Scene], Scene],
-    single_pixel: MakeScene,
-    pixel: Camera,
-) -> None:
+def test_opacity_one_without_a_cap_is_opaque(pixel: Camera) -> None:
     leaves = with_gradients(single_pixel(3, opacity=1.0, dtype=torch.float64))
     raster = RasterSettings(alpha_max=1.0, transmittance_min=-1.0)
     render = draw(leaves, pixel, raster, sh_degree=0)
@@ -121,21 +101,15 @@ def test_opacity_one_without_a_cap_is_opaque(
 # --- what is not seen ---------------------------------------------------------------------------
 
 
-def test_behind_or_nearer_than_near_is_not_seen_and_has_no_gradient(
-    draw: Draw,
-    with_gradients: Callable[[Scene], Scene],
-    gradients_of: Callable[[Scene], Scene],
-    make_camera: MakeCamera,
-    make_scene: MakeScene,
-) -> None:
+def test_behind_or_nearer_than_near_is_not_seen_and_has_no_gradient(backend: str) -> None:
     camera = make_camera()
     scene = make_scene(8, camera, seed=1, dtype=torch.float32)
     depths = torch.tensor([-3.0, -1e-3, 0.0, 1e-30, 0.009, 0.01])
     scene["means"][:6] = depths[:, None] * torch.tensor([0.01, 0.01, 1.0])
     leaves = with_gradients(scene)
-    render = draw(leaves, camera)
+    render = draw(leaves, camera, backend=backend)
     assert not render.visible[:6].any()
-    expected = draw({name: value[6:] for name, value in scene.items()}, camera)
+    expected = draw({name: value[6:] for name, value in scene.items()}, camera, backend=backend)
     assert torch.equal(render.image, expected.image)
     torch.autograd.backward(render.image.sum())
     for gradient in gradients_of(leaves).values():
@@ -143,13 +117,7 @@ def test_behind_or_nearer_than_near_is_not_seen_and_has_no_gradient(
         assert gradient.isfinite().all()
 
 
-def test_a_covariance_that_overflows_is_dropped(
-    draw: Draw,
-    with_gradients: Callable[[Scene], Scene],
-    gradients_of: Callable[[Scene], Scene],
-    make_camera: MakeCamera,
-    make_scene: MakeScene,
-) -> None:
+def test_a_covariance_that_overflows_is_dropped(backend: str) -> None:
     camera = make_camera()
     scene = make_scene(8, camera, seed=1, dtype=torch.float32)
     scene["scales"][0] = 1e30
@@ -157,27 +125,23 @@ def test_a_covariance_that_overflows_is_dropped(
     scene["means"][2] = torch.tensor([3e38, 3e38, 3e38])
     scene["scales"][3] = 1e12  # the covariance has room, its determinant has not
     leaves = with_gradients(scene)
-    render = draw(leaves, camera)
+    render = draw(leaves, camera, backend=backend)
     assert not render.visible[:4].any()
     torch.autograd.backward(render.image.sum())
     assert all(gradient.isfinite().all() for gradient in gradients_of(leaves).values())
-    expected = draw({name: value[4:] for name, value in scene.items()}, camera)
+    expected = draw({name: value[4:] for name, value in scene.items()}, camera, backend=backend)
     assert torch.equal(render.image, expected.image)
 
 
-def test_a_singular_covariance_is_dropped(
-    draw: Draw, single_pixel: MakeScene, pixel: Camera
-) -> None:
+def test_a_singular_covariance_is_dropped(backend: str, pixel: Camera) -> None:
     scene = single_pixel(2, opacity=0.5)
     scene["scales"][0] = 0  # a point, which without dilation has no inverse covariance
-    render = draw(scene, pixel, RasterSettings(eps2d=0.0), sh_degree=0)
+    render = draw(scene, pixel, RasterSettings(eps2d=0.0), sh_degree=0, backend=backend)
     assert render.visible.tolist() == [False, True]
     assert render.alpha.item() == 0.5
 
 
-def test_a_box_that_only_touches_the_image_is_not_visible(
-    draw: Draw, single_pixel: MakeScene, pixel: Camera
-) -> None:
+def test_a_box_that_only_touches_the_image_is_not_visible(pixel: Camera) -> None:
     # At an opacity of exactly alpha_min the box is the mean itself, px; the image is 1 x 1 px.
     scene = single_pixel(1, opacity=0.5)
     for x, y, visible in (
@@ -193,19 +157,12 @@ def test_a_box_that_only_touches_the_image_is_not_visible(
 
 
 @pytest.mark.parametrize("count", [0, 5])
-def test_none_or_none_visible_shows_the_background(
-    draw: Draw,
-    with_gradients: Callable[[Scene], Scene],
-    gradients_of: Callable[[Scene], Scene],
-    make_camera: MakeCamera,
-    make_scene: MakeScene,
-    count: int,
-) -> None:
+def test_none_or_none_visible_shows_the_background(backend: str, count: int) -> None:
     camera = make_camera()
     scene = with_gradients(make_scene(count, camera, dtype=torch.float32))
     with torch.no_grad():
         scene["means"][:, 2] = -1
-    render = draw(scene, camera, RasterSettings(background=(0.1, 0.2, 0.3)))
+    render = draw(scene, camera, RasterSettings(background=(0.1, 0.2, 0.3)), backend=backend)
     assert torch.equal(render.image, torch.tensor([0.1, 0.2, 0.3]).expand(14, 20, 3))
     assert torch.equal(render.alpha, torch.zeros(14, 20))
     assert render.visible.tolist() == [False] * count
