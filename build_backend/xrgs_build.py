@@ -5,14 +5,19 @@ and the C++ library, are added to what the build requires, and CMake is given th
 the variable CXX names a compiler, that one is used or none: CXX=/nonexistent installs the package
 without kernels. A build that fails, for whatever reason, leaves a package that renders with torch
 (`if.failed` in pyproject.toml).
+
+An sdist or a wheel that is built from a checkout has `xrgs/_commit.json`: the commit, and a hash of
+what differs from it. A wheel that is built from an sdist has the file of the sdist.
 """
 
 from __future__ import annotations
 
 import contextlib
 import importlib.util
+import json
 import os
 import platform
+import runpy
 import shlex
 import shutil
 import subprocess
@@ -57,7 +62,8 @@ _TARGET = "{machine}-linux-gnu.2.28"
 #: where CMake tries the compiler, Zig adds checks that need a library of their own.
 _CLANG_OPTIONS = ("-mcpu=baseline", "-idirafter", "/usr/include", "-fno-sanitize=undefined")
 
-build_sdist = _scikit_build.build_sdist
+_ROOT = Path(__file__).resolve().parents[1]
+
 get_requires_for_build_sdist = _scikit_build.get_requires_for_build_sdist
 
 
@@ -71,13 +77,19 @@ def get_requires_for_build_editable(config_settings: dict[str, Any] | None = Non
     return [*_scikit_build.get_requires_for_build_editable(config_settings), *_required_compiler()]
 
 
+def build_sdist(sdist_directory: str, config_settings: dict[str, Any] | None = None) -> str:
+    """Build an sdist and return its name: see PEP 517."""
+    with _commit_file():
+        return str(_scikit_build.build_sdist(sdist_directory, config_settings))
+
+
 def build_wheel(
     wheel_directory: str,
     config_settings: dict[str, Any] | None = None,
     metadata_directory: str | None = None,
 ) -> str:
     """Build a wheel and return its name: see PEP 517."""
-    with _compiler():
+    with _compiler(), _commit_file():
         return str(_scikit_build.build_wheel(wheel_directory, config_settings, metadata_directory))
 
 
@@ -91,6 +103,23 @@ def build_editable(
         return str(
             _scikit_build.build_editable(wheel_directory, config_settings, metadata_directory)
         )
+
+
+@contextlib.contextmanager
+def _commit_file() -> Iterator[None]:
+    """Write the commit of the checkout into the package for a while; do nothing elsewhere."""
+    source = _ROOT / "xrgs" / "experiment" / "commit.py"
+    commit = runpy.run_path(str(source))  # the package itself needs what a build does not have
+    found = commit["of_checkout"](_ROOT)
+    if found is None:
+        yield
+        return
+    file = _ROOT / "xrgs" / commit["FILE"]
+    try:
+        file.write_text(json.dumps(found), "utf-8")
+        yield
+    finally:
+        file.unlink(missing_ok=True)
 
 
 def find_compiler() -> str | None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib.machinery
 import importlib.util
+import json
 import os
 import platform
 import shutil
@@ -39,6 +40,7 @@ class ScikitBuild:
     build_editable = build_wheel
 
     def build_sdist(self, *_: object) -> str:
+        self.inside()
         return "xrgs.tar.gz"
 
     def get_requires_for_build_wheel(self, _: object) -> list[str]:
@@ -228,6 +230,75 @@ def test_a_build_that_raises_leaves_the_environment_as_it_was(
     with pytest.raises(RuntimeError, match="CMake failed"):
         backend.build_wheel("dist")
     assert "CXX" not in os.environ
+
+
+# The commit
+
+
+@pytest.fixture
+def checkout(backend: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A checkout of the file that reads commits, which the backend takes for its own."""
+    monkeypatch.setenv("PATH", os.defpath)
+    package = tmp_path / "checkout" / "xrgs"
+    (package / "experiment").mkdir(parents=True)
+    shutil.copy(FILE.parents[1] / "xrgs/experiment/commit.py", package / "experiment")
+    (package.parent / ".gitignore").write_text("/xrgs/_commit.json\n__pycache__/\n")
+    monkeypatch.setattr(backend, "_ROOT", package.parent)
+    git(package.parent, "init", "--quiet")
+    git(package.parent, "add", ".")
+    git(package.parent, "commit", "--quiet", "-m", "all")
+    return package.parent
+
+
+def git(folder: Path, *arguments: str) -> str:
+    names = ("-c", "user.name=a", "-c", "user.email=a@b.c")
+    command = ["git", "-C", str(folder), *names, *arguments]
+    return subprocess.run(command, check=True, capture_output=True, text=True).stdout.strip()
+
+
+@pytest.mark.parametrize("build", ["build_wheel", "build_sdist"])
+def test_a_build_carries_the_commit_and_leaves_no_file(
+    backend: Any, scikit_build: ScikitBuild, checkout: Path, build: str
+) -> None:
+    built: list[dict[str, Any]] = []
+    file = checkout / "xrgs" / "_commit.json"
+    scikit_build.inside = lambda: built.append(json.loads(file.read_text()))
+    getattr(backend, build)("dist")
+    assert git(checkout, "status", "--porcelain", "--ignored") == ""
+    (checkout / "xrgs" / "new.py").write_text("1")
+    getattr(backend, build)("dist")
+    commit = git(checkout, "rev-parse", "HEAD")
+    clean, changed = built
+    assert clean == {"git": commit, "git_diff_sha256": None}
+    assert changed["git"] == commit
+    assert len(changed["git_diff_sha256"]) == 64
+    assert not file.exists()
+
+
+def test_a_wheel_of_an_sdist_has_the_commit_of_the_sdist(
+    backend: Any, scikit_build: ScikitBuild, checkout: Path
+) -> None:
+    """An unpacked sdist has the file and is no checkout, even inside one."""
+    shutil.rmtree(checkout / ".git")
+    git(checkout.parent, "init", "--quiet")
+    file = checkout / "xrgs" / "_commit.json"
+    file.write_text('{"git": "0123", "git_diff_sha256": null}')
+    built: list[str] = []
+    scikit_build.inside = lambda: built.append(file.read_text())
+    backend.build_wheel("dist")
+    assert built == [file.read_text()] == ['{"git": "0123", "git_diff_sha256": null}']
+
+
+def test_a_build_that_raises_leaves_no_commit_file(
+    backend: Any, scikit_build: ScikitBuild, checkout: Path
+) -> None:
+    def fail() -> None:
+        raise RuntimeError("CMake failed")
+
+    scikit_build.inside = fail
+    with pytest.raises(RuntimeError, match="CMake failed"):
+        backend.build_sdist("dist")
+    assert not (checkout / "xrgs" / "_commit.json").exists()
 
 
 @pytest.mark.skipif(shutil.which("c++") is None, reason="this machine has no compiler")

@@ -180,7 +180,7 @@ def test_an_image_too_small_to_mirror_is_refused() -> None:
 
 
 def test_the_examples_in_the_docstrings() -> None:
-    result = doctest.testmod(metrics)
+    result = doctest.testmod(sys.modules["xrgs.evaluation.metrics.psnr"])
     assert result.attempted > 0
     assert result.failed == 0
 

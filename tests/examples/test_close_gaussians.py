@@ -12,7 +12,7 @@ import pytest
 import torch
 from PIL import Image
 
-from tests.hostile import reference
+from tests import reference_store as reference
 from xrgs import Gaussians, Store, rasterize, save_ply
 from xrgs.evaluation.protocol import mean_scores
 

@@ -5,13 +5,17 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 import msgspec
+import numpy as np
 
 from xrgs import composing
+from xrgs.capture import frozen, sealed
 from xrgs.experiment.attempts import begin_attempt, plan_cell
 from xrgs.experiment.schema import Identity, Provenance, RecordedCell, Summary
 from xrgs.safeio.atomic import write_json
 
 if TYPE_CHECKING:
+    from pathlib import Path
+
     from xrgs.config import Conf
     from xrgs.experiment.cell_folder import CellFolder
 
@@ -40,6 +44,36 @@ def row(
 ) -> RecordedCell:
     """A cell in the record of a sweep."""
     return RecordedCell(cell_id, label, "", scene, 0, seed, "key-hash", None)
+
+
+def write_variant(variants: Path, key: str = "0123456789abcdef") -> str:
+    """Write a frozen variant of two views without photographs; return its id."""
+    folder = variants / "new"
+    (folder / "images").mkdir(parents=True)
+    eye = [[1.0 * (row == column) for column in range(4)] for row in range(4)]
+    views = []
+    for split, name in (("train", "a"), ("test", "b")):
+        file = folder / "images" / split / f"{name}.png"
+        file.parent.mkdir()
+        file.write_bytes(b"image")
+        view: dict[str, object] = {
+            "name": name,
+            "split": split,
+            "file": f"images/{split}/{name}.png",
+            "tag": "HR",
+        }
+        view |= {"width": 2, "height": 2, "K": [line[:3] for line in eye[:3]], "viewmat": eye}
+        views.append(view | {"rho": 1.0})
+    np.savez(folder / frozen.POINTS, points=np.ones((4, 3)), colors=np.zeros((4, 3), np.uint8))
+    write_json(folder / frozen.REPORT, {"registered": 2})
+    content = {"key": key, "scene": "fern", "factor": 4, "held_out": False, "views": views}
+    files = [frozen.POINTS, *(str(view["file"]) for view in views)]
+    content["files"] = sealed.hashes(folder, files)
+    manifest = msgspec.convert(content, frozen.Manifest)
+    manifest = msgspec.structs.replace(manifest, id=manifest.computed_id())
+    write_json(folder / frozen.MANIFEST, msgspec.to_builtins(manifest))
+    folder.rename(variants / manifest.id)
+    return manifest.id
 
 
 def begun(cell: CellFolder, conf: Conf | None = None, what: Identity | None = None) -> CellFolder:

@@ -105,7 +105,8 @@ def test_a_log_that_is_still_written_to_is_not_the_log_of_the_next_attempt(tmp_p
 def test_a_process_that_lost_the_lease_meanwhile_changes_nothing(
     stopped: CellFolder, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    before, synced = list_names(stopped.path), []
+    before = list_names(stopped.path)
+    synced: list[Path] = []
 
     def is_owner() -> bool:
         return not synced  # the lease is lost while the new folder is synced

@@ -59,6 +59,23 @@ def test_a_source_that_is_not_committed_is_a_difference(checkout: Path, name: st
     assert made_with().git_diff_sha256 is not None
 
 
+def test_a_package_inside_the_repository_of_somebody_else_has_no_commit(
+    checkout: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As in a virtual environment in the folder of a project."""
+    package = checkout / ".venv" / "site-packages" / "xrgs"
+    package.mkdir(parents=True)
+    monkeypatch.setattr(xrgs, "__file__", str(package / "__init__.py"))
+    assert (made_with().git, made_with().git_diff_sha256) == (None, None)
+    (package / "_commit.json").write_text('{"git": "0123", "git_diff_sha256": null}')
+    assert (made_with().git, made_with().git_diff_sha256) == ("0123", None)
+
+
+def test_a_checkout_is_asked_and_not_the_file_of_a_build_that_was_killed(checkout: Path) -> None:
+    (checkout / "xrgs" / "_commit.json").write_text('{"git": "0123", "git_diff_sha256": null}')
+    assert made_with().git == git(checkout, "rev-parse", "HEAD").strip()
+
+
 def test_without_git_there_is_no_commit(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(xrgs, "__file__", str(tmp_path / "xrgs/__init__.py"))
     assert (made_with().git, made_with().git_diff_sha256) == (None, None)

@@ -6,18 +6,16 @@ import json
 from collections.abc import Callable
 from pathlib import Path
 
-import msgspec
 import pytest
 
-from tests.experiment.cells import finished
-from xrgs.capture import frozen, restore
+from tests.experiment.cells import finished, write_variant
+from xrgs.capture import restore
 from xrgs.config import Conf
 from xrgs.errors import StoreError, UnreadableError
 from xrgs.experiment import trimming
 from xrgs.experiment.attempts import remove_cell
 from xrgs.experiment.cell_folder import CellFolder
 from xrgs.experiment.store import Store
-from xrgs.safeio.atomic import write_json
 from xrgs.safeio.files import list_names
 from xrgs.safeio.hashing import file_digest
 
@@ -94,24 +92,7 @@ def variants(tmp_path: Path) -> Path:
     """The folder of the variants of a store, with one."""
     store = Store(tmp_path)
     store.prepare()
-    folder = store.variants / "new"
-    (folder / "images").mkdir(parents=True)
-    for name in ("a", "b"):
-        (folder / "images" / f"{name}.png").write_bytes(b"image")
-    (folder / "points.npz").write_bytes(b"points")
-    eye = [[1.0 * (row == column) for column in range(4)] for row in range(4)]
-    views = [
-        {"name": name, "split": split, "file": f"images/{name}.png", "tag": "HR"}
-        | {"width": 2, "height": 2, "K": [row[:3] for row in eye[:3]], "viewmat": eye, "rho": 1.0}
-        for name, split in (("a", "train"), ("b", "test"))
-    ]
-    files = {"points.npz": file_digest(folder / "points.npz")}
-    files |= {f"images/{name}.png": "0" for name in ("a", "b")}
-    content = {"key": "key", "scene": "fern", "factor": 4, "held_out": False}
-    manifest = msgspec.convert(content | {"views": views, "files": files}, frozen.Manifest)
-    manifest = msgspec.structs.replace(manifest, id=manifest.computed_id())
-    write_json(folder / "variant.json", msgspec.to_builtins(manifest))
-    folder.rename(folder.with_name(manifest.id))
+    write_variant(store.variants, "key")
     return store.variants
 
 
@@ -124,7 +105,7 @@ def test_a_trimmed_variant_keeps_its_list_and_is_found_by_its_key(variants: Path
     trimming.trim_variant(variants, name)
     assert list_names(variants) == [f"trimmed-{name}"]
     folder = variants / f"trimmed-{name}"
-    assert list_names(folder) == ["points.npz", "variant.json"]
+    assert list_names(folder) == ["points.npz", "report.json", "variant.json"]
     assert trimming.verify_variant(folder) == []
     assert trimming.trimmed_variant(variants, "key") == name
     assert trimming.image_bytes(variants, name) == 0
@@ -200,10 +181,18 @@ def test_images_that_cant_be_made_again_leave_the_variant_trimmed(
     with pytest.raises(StoreError, match=rf"variant {trimmed}: .* made again: another image\. Rem"):
         again(trimmed, StoreError("another image"))
     assert names(variants) == [f"trimmed-{trimmed}"]
-    assert list_names(variants / f"trimmed-{trimmed}") == ["points.npz", "variant.json"]
+    assert list_names(variants / f"trimmed-{trimmed}") == [
+        "points.npz",
+        "report.json",
+        "variant.json",
+    ]
     with pytest.raises(UnreadableError, match="a server is away"):
         again(trimmed, UnreadableError("a server is away"))
-    assert list_names(variants / f"trimmed-{trimmed}") == ["points.npz", "variant.json"]
+    assert list_names(variants / f"trimmed-{trimmed}") == [
+        "points.npz",
+        "report.json",
+        "variant.json",
+    ]
 
 
 def test_a_restoration_that_was_killed_midway_is_begun_again(

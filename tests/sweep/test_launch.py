@@ -301,6 +301,23 @@ def test_a_lease_that_the_plan_has_watched_long_enough_is_free_for_the_job(
     assert not lease.names(store.leases)
 
 
+@pytest.mark.parametrize("how", ["done", "training"])
+def test_a_cell_that_another_sweep_has_begun_since_the_plan_is_left_as_it_is(
+    compose: Callable[..., config.Conf], store: Store, how: str
+) -> None:
+    ours, theirs = (planned(compose(f"threads={n}"), "a") for n in (1, 2))
+    launch._hand_over(theirs, 1, store)
+    cell = store.cell(str(theirs.cell_id))
+    begin_attempt(cell)
+    if how == "done":
+        finish(store, cell.id)
+    else:
+        assert lease.acquire(store.leases, cell.id) is not None
+    assert launch._hand_over(ours, 1, store)[0] == f"cell={cell.id}"
+    assert cell.config().threads == 2
+    assert cell.state().name == ("done" if how == "done" else "unfinished")
+
+
 def test_an_answer_that_is_lost_of_a_cell_that_can_not_be_read_blames_no_cell(
     launch_cells: Callable[..., tuple[dict[str, str], FakeLauncher]],
     sick: Callable[[str, int], None],

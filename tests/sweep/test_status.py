@@ -111,6 +111,20 @@ def test_a_cell_that_cannot_be_read_now_is_listed_with_the_reason(
     assert cells["reason"].str.contains(os.strerror(number)).all()
 
 
+def test_a_cell_whose_disk_gives_no_answer_is_unknown_and_not_unfinished(
+    intact: Store, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    stat = Path.stat
+
+    def failing(path: Path, **given: bool) -> os.stat_result:
+        if path.name == "status.json":
+            raise OSError(errno.EIO, os.strerror(errno.EIO), str(path))
+        return stat(path, **given)
+
+    monkeypatch.setattr(Path, "stat", failing)
+    assert {cell.state().name for cell in intact.cell_folders()} == {"unknown"}
+
+
 @pytest.mark.parametrize("folder", ["cells", "sweeps", "variants", "locks"])
 @pytest.mark.parametrize("kind", ["pipe", "unreadable"])
 def test_a_folder_that_cannot_be_listed_is_named_and_hides_no_other(

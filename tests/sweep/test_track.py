@@ -161,7 +161,7 @@ def test_a_cell_that_can_not_be_read_is_left_out(
     history.write_text(text)
     assert json.loads(status.read_text())["files"]["history.csv"]["bytes"] == len(text)
     track.track("csv", store, sweep_id)
-    assert "abc: it is left out of what is tracked: " in capsys.readouterr().err
+    assert "abc: it is not tracked: " in capsys.readouterr().err
     rows = (store.path / "tracking" / f"{sweep_id}.csv").read_text()
     assert "def" in rows
     assert "abc" not in rows

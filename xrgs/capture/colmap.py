@@ -58,7 +58,8 @@ def read_points(file: Path) -> tuple[NDArray[np.float64], NDArray[np.uint8]]:
     model = pycolmap.Reconstruction()
     try:
         model.import_PLY(file)
-    except (RuntimeError, ValueError, IndexError) as error:
+    # MemoryError: COLMAP makes room for as many points as the header declares.
+    except (RuntimeError, ValueError, IndexError, MemoryError) as error:
         raise XrgsError(f"not a .ply of points with colours ({error})") from error
     return sfm.points_of(model)
 

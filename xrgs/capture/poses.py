@@ -180,7 +180,7 @@ def _read_transforms(file: Path, photos: PhotoCollection) -> Reconstruction:
         try:
             lenses[i] = _lens({**content, **frames[name]}, photos[i].size)
             viewmats[i] = _viewmat(frames[name].get("transform_matrix"))
-        except (ValueError, TypeError) as error:
+        except (ValueError, TypeError, OverflowError) as error:
             raise XrgsError(f"the camera of {name} is malformed ({error})") from error
     observed: dict[int, NDArray[np.intp]] = {i: np.zeros(0, np.intp) for i in viewmats}
     report = {"registered": len(viewmats), "points": len(points)}
@@ -197,7 +197,10 @@ def _transforms(file: Path) -> dict[str, Any]:
         raise XrgsError(f"{error}; a folder of COLMAP's or a transforms.json is needed") from error
     frames = content.get("frames")
     if not isinstance(frames, list) or not all(
-        isinstance(frame, dict) and isinstance(frame.get("file_path"), str) for frame in frames
+        isinstance(frame, dict)
+        and isinstance(frame.get("file_path"), str)
+        and PurePosixPath(frame["file_path"]).name
+        for frame in frames
     ):
         raise XrgsError(f"{file}: not a transforms.json: each of its frames must have a file_path")
     if len({frame["file_path"] for frame in frames}) < len(frames):

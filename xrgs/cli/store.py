@@ -1,4 +1,4 @@
-"""`xrgs-store`: lists, removes, packs, scores anew and verifies what a store keeps."""
+"""`xrgs-store`: lists, removes, packs, imports, scores anew and verifies what a store keeps."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ class Filter:
     ablations: Names = ()
     """Only cells of these ablations."""
     states: Names = ()
-    """Only cells in these states: done, running, unfinished, failed, corrupt, unknown."""
+    """Only cells in these states: done, running, planned, unfinished, failed, corrupt, unknown."""
     sweep: Annotated[tuple[str, ...], shown_as("ID ...")] = ()
     """Only cells of these sweeps; xrgs-report list has the ids."""
     older_days: Annotated[float, shown_as("DAYS")] = 0.0
@@ -157,18 +157,37 @@ def pack(cells: Filter, out: Annotated[Path, arg(metavar="FILE.tar.xz")]) -> Non
         cells: The cells that pass all of these options.
         out: The archive to write.
     """
+    from xrgs.experiment import archive
     from xrgs.runtime.text import format_size
-    from xrgs.sweep import packing
 
     if not out.name.endswith(".tar.xz"):
         raise XrgsError(f"--out {out}: name the archive to write, FILE.tar.xz")
     _, chosen = cells.chosen()
-    done = [cell for cell in chosen if cell.state.name == "done"]
-    packed = packing.pack(Store(cells.store), done, out, Path.cwd(), cells.sweep)
+    done = [cell.folder for cell in chosen if cell.state.name == "done"]
+    packed = archive.pack(Store(cells.store), done, out, Path.cwd(), cells.sweep)
     say(f"{out}: {packed}; {format_size(packed.bytes)}")
     if len(done) < len(chosen):
         say(f"left out, not done: {counted(len(chosen) - len(done), 'cell')}")
     _say_left(packed.left_out)
+
+
+def import_(
+    source: Positional[Annotated[Path, arg(metavar="ARCHIVE|FOLDER")]], store: Folder = STORE
+) -> None:
+    """Copy the store of somebody else into this one, after every file is checked.
+
+    Cells that are not done, checkpoints, logs and reports are not imported. What is damaged is left
+    out and named. An import that was stopped goes on when it is run again.
+
+    Args:
+        source: An archive (.tar, .tar.xz, .tar.gz), or the folder of a store.
+        store: The store to copy to.
+    """
+    from xrgs.experiment import archive
+
+    imported = archive.import_store(source, Store(store))
+    say(f"{source}: {imported}")
+    _say_left(imported.left_out)
 
 
 def gc(
@@ -266,7 +285,7 @@ def _confirmed(question: str) -> bool:
 def main() -> None:
     """Run `xrgs-store`."""
     description = (
-        "List, remove, pack, score anew and verify what a store keeps. Cells that are being"
+        "List, remove, pack, import, score anew and verify what a store keeps. Cells that are being"
         " trained, here or on another machine, are never touched."
     )
     functions: dict[str, Callable[..., None]] = {
@@ -275,6 +294,7 @@ def main() -> None:
         "rm": rm,
         "trim": trim,
         "pack": pack,
+        "import": import_,
         "gc": gc,
         "rescore": rescore,
         "prove": prove,

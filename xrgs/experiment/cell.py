@@ -42,23 +42,23 @@ if TYPE_CHECKING:
 
 _log = logging.getLogger(__name__)
 
-#: The loss that is shown is the mean of so many rows of the history: each row is that of one view.
+#: Rows of the history that the shown loss is the mean of. Each row is the loss of one view.
 _SHOWN_ROWS = 10
 
 
 class CellCheckpoint(Checkpoint):
-    """Writes the checkpoint of a cell, shows how far it is, and ends it when that is asked for."""
+    """Writes the checkpoint of a cell, shows its progress, and stops it on request."""
 
     def __init__(
         self, folder: CellFolder, every_s: float, shown: ProgressFile, stop: StopRequest
     ) -> None:
-        """Set where the state is written, and what is looked at after every step.
+        """Prepare the checkpoint of a cell; nothing is written yet.
 
         Args:
             folder: The cell's folder.
-            every_s: Seconds between two writes; 0 never writes, not even when the cell is ended.
-            shown: Its note gets the number of Gaussians and the loss.
-            stop: Whether the process was asked to end.
+            every_s: Seconds between two writes; 0 never writes, not even when the cell is stopped.
+            shown: The progress, whose note gets the number of Gaussians and the loss.
+            stop: Whether the process was asked to end; read after every step.
         """
         super().__init__(folder.checkpoint, folder.id, every_s)
         self._shown = shown
@@ -66,25 +66,21 @@ class CellCheckpoint(Checkpoint):
         self._recorder: TrainingRecorder | None = None
 
     def register(self, **objects: Stateful) -> None:
-        """Add objects whose state is to be written, as `Checkpoint.register`.
-
-        Args:
-            objects: Each by its name; the `recorder` is read after every step.
-        """
+        """Add objects to the checkpoint by name; the `recorder` is also read after every step."""
         super().register(**objects)
         self._recorder = cast("TrainingRecorder | None", objects.get("recorder", self._recorder))
 
     def save_if_due(self, step: int) -> float:
-        """Write the file if the interval has passed or the process is to end.
+        """Write the checkpoint if the interval has passed or the process is to end.
 
         Args:
-            step: The number of the step that is done, from 0.
+            step: The step that has just ended, from 0.
 
         Returns:
-            The seconds that it took.
+            The seconds that writing took.
 
         Raises:
-            StopSignal: The process was asked to end, and the file is written.
+            StopSignal: The process was asked to end; the checkpoint is written.
         """
         if self._recorder is not None and self._recorder.history:
             rows = self._recorder.history[-_SHOWN_ROWS:]
@@ -108,15 +104,14 @@ def run_cell(
 
     Args:
         conf: The cell's config.
-        variant: The frozen variant that it trains on.
-        folder: The cell's folder, in which `begin_attempt` has written config and identity.
-        stop: Whether this process was asked to end, which ends the cell after a step of training.
-            A cell that is being evaluated goes on: it is nearly done, and has nothing to resume
-            from but the checkpoint before.
+        variant: The frozen variant that the cell trains on.
+        folder: The cell's folder, with the config and the identity of `begin_attempt`.
+        stop: A request to end: the cell stops after the current step of training. An evaluation is
+            not stopped, since it is nearly done and would begin again from the last checkpoint.
 
     Raises:
-        StopSignal: It was ended like this; its checkpoint is written.
-        Exception: Whatever went wrong, after its traceback was written to `error.txt`.
+        StopSignal: The cell was stopped; its checkpoint is written.
+        Exception: Any error of the cell; its traceback is in `error.txt`.
     """
     stop = stop or StopRequest()
     try:
@@ -133,9 +128,9 @@ def run_cell(
 def _train_and_score(
     conf: Conf, variant: Variant, folder: CellFolder, shown: ProgressFile, stop: StopRequest
 ) -> list[str]:
-    """Write every file but the status; return the names of the views that were scored.
+    """Write every file but the status; return the names of the scored views.
 
-    None of the files is waited for until it is on the disk: `CellFolder.finish` does that.
+    The files are not synced here: `CellFolder.finish` syncs all of them.
     """
     threads = set_torch_threads(conf.threads)
     backend = resolve_backend(conf.splat.backend)
@@ -186,7 +181,7 @@ def _train_or_resume(
 ) -> tuple[TrainingResult, list[str]]:
     """Train from the cell's checkpoint, or from the start if there is no usable one.
 
-    Returns the result and the names of the machines that it comes from; `here` is the last.
+    Returns the result, and the names of the machines that trained, of which the last is `here`.
     """
 
     def evaluate(gaussians: Gaussians) -> dict[str, float | None]:

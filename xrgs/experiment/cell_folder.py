@@ -99,7 +99,9 @@ class CellFolder:
             verify: Hash the files that reports are made from; otherwise only sizes are compared.
         """
         try:
-            if not self.status_file.exists():
+            try:
+                self.status_file.stat()  # `exists` hides errors that pass, from Python 3.14 on
+            except (FileNotFoundError, NotADirectoryError):
                 return self._state_without_status()
             status = self.status()
             if status.state == "failed":
@@ -145,11 +147,11 @@ class CellFolder:
             raise StoreError("scores.csv does not have one row for each view that was to be scored")
 
     def verify(self) -> list[str]:
-        """Hash every file of a finished cell.
+        """Hash every file of a finished cell, and decode its JSON.
 
         Returns:
-            A line for each file that is missing, has changed, can't be read now or does not belong
-            there; empty for an intact cell.
+            A line for each file that is missing, damaged, has changed, can't be read now or does
+            not belong there; empty for an intact cell.
         """
         try:
             status = self.status()
@@ -160,9 +162,22 @@ class CellFolder:
                 for name, _ in walk_files(self.path)
                 if name not in listed
             ]
+            if not wrong:
+                self._decode(status)
         except (StoreError, OSError) as error:
-            return [f"{self.status_file}: {CellState.of_error(error).reason}"]
+            reason = CellState.of_error(error).reason.replace(f"{self.path}/", "")
+            return [f"{self.path}: {reason}"]
         return wrong
+
+    def _decode(self, status: Status) -> None:
+        """Raise `StoreError` where a JSON file of a done cell is not of its type."""
+        structs: dict[str, type[msgspec.Struct]] = {
+            IDENTITY: Identity,
+            "summary.json": Summary,
+            "provenance.json": Provenance,
+        }
+        for name in structs.keys() & status.files.keys():
+            read_struct(self.path / name, structs[name])
 
     def _wrong(self, name: str, entry: FileEntry) -> str:
         """Return what is wrong with one of the cell's files; empty where nothing is."""
@@ -365,7 +380,9 @@ class CellFolder:
         try:
             for name in header:
                 if name != "view":
-                    table[name] = pd.to_numeric(table[name].map(as_number), downcast="integer")
+                    numbers = table[name].map(as_number).astype(float)
+                    whole = numbers.map(float.is_integer).all()
+                    table[name] = numbers.astype(int) if whole else numbers
         except ValueError as error:
             raise StoreError(f"damaged: {file}: {name}: {error}") from error
         return table

@@ -1,8 +1,8 @@
 """Writes a variant or a cell in the layouts that other programs read: COLMAP's and nerfstudio's.
 
-All that is written is in one world, the normalised one of training: cameras, points and splats.
-`transform.json` leads to it from the world of SfM. Images are undistorted, each with a pinhole
-camera of its own.
+Cameras, points and splats are in the normalised world of training. `transform.json` has the
+similarity from the world of SfM to that world. Images are undistorted, and each has its own pinhole
+camera.
 """
 
 from __future__ import annotations
@@ -32,24 +32,24 @@ _SPLATS = "splats.ply"
 def export(path: Path, layout: str, out: Path) -> str:
     """Write a cell or a variant for another program.
 
-    The folder gets `images/`, named `<split>_<view>.png`; `split.json`, which says of each image
-    its view, split and tag; `transform.json`, a similarity from the world of SfM to that of all
-    other files; and of a cell `splats.ply`. Cameras and points are in `sparse/0` (`colmap`), or in
+    The folder gets `images/<split>_<view>.png`; `split.json`, with the view, split and tag of each
+    image; `transform.json`, the similarity from the world of SfM to the world of all other files;
+    and, for a cell, `splats.ply`. Cameras and points are in `sparse/0` (`colmap`), or in
     `transforms.json` and `points.ply` (`nerfstudio`).
 
-    Of a cell, the images are those that it was trained on and scored with.
+    The images of a cell are its training views and its scored views.
 
     Args:
         path: The folder of a finished cell, or of a variant, in its store.
         layout: `colmap` or `nerfstudio`.
-        out: The folder to write to, which is made; it may exist if it is empty.
+        out: The folder to write to; it may exist if it is empty.
 
     Returns:
-        A line that says what was written.
+        A line with the numbers of views and points that were written.
 
     Raises:
-        XrgsError: The folder is neither, or damaged; there is no such layout; or `out` can't be
-            written, or holds something.
+        XrgsError: The folder is not a finished cell or a variant, or is damaged; there is no such
+            layout; or `out` can't be written, or is not empty.
     """
     if layout not in _LAYOUTS:
         raise XrgsError(f"format={layout}: must be one of {', '.join(_LAYOUTS)}")
@@ -58,7 +58,7 @@ def export(path: Path, layout: str, out: Path) -> str:
     try:
         out.mkdir(parents=True, exist_ok=True)
         if any(out.iterdir()):
-            raise XrgsError(f"out={out}: it holds files; name a new folder")
+            raise XrgsError(f"out={out}: is not empty; name a new folder")
         images = _write_images(data, out)
         write_json(out / "transform.json", {"sfm_to_export": transform(variant).tolist()})
         _LAYOUTS[layout](data, images, out)
@@ -74,11 +74,8 @@ def export(path: Path, layout: str, out: Path) -> str:
 def transform(variant: Variant) -> NDArray[np.float64]:
     """Compute the similarity from the world of SfM to the normalised world of training.
 
-    Args:
-        variant: The variant.
-
     Returns:
-        [4, 4]; its upper left part is a rotation times the scale.
+        [4, 4]; the upper left [3, 3] is a rotation times the scale.
     """
     from xrgs.splat.normalize import normalize_scene
 

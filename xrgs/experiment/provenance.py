@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import hashlib
 import platform
-import subprocess
 import sys
 from datetime import UTC, datetime
 from functools import cache
@@ -14,38 +12,27 @@ from typing import TYPE_CHECKING, Any
 
 import xrgs
 from xrgs.evaluation.lpips import weights
+from xrgs.experiment import commit
 from xrgs.experiment.schema import Provenance
 from xrgs.runtime.machine import usable_cores
+from xrgs.safeio.records import read_struct
 from xrgs.splat.backend import arithmetic
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
 _PACKAGES = ("torch", "numpy", "pycolmap", "kornia", "scikit-image", "hydra-core", "pandas")
-#: Entries that times depend on, beside the program.
+#: The fields that a cell's times depend on, beside the program.
 MACHINE_KEYS = ("cpu", "instruction_set", "threads", "backend")
-#: What a cell's numbers come from, in the root of a checkout: `git_diff_sha256` covers it.
-_SOURCES = ("xrgs", "conf", "sweeps", "hydra_plugins")
 
 
-def _git(*arguments: str) -> str | None:
-    root = Path(xrgs.__file__).parents[1]
-    command = ["git", "-C", str(root), *arguments]
-    try:
-        done = subprocess.run(command, capture_output=True, text=True, timeout=10, check=True)  # noqa: S603
-    except (OSError, subprocess.SubprocessError):
-        return None
-    return done.stdout
-
-
-def _uncommitted() -> str:
-    """Return what differs from the commit: the diff of tracked sources, new files with hashes."""
-    new = (_git("ls-files", "--others", "--exclude-standard", "-z", "--", *_SOURCES) or "").split(
-        "\0"
-    )
-    names = [name for name in new if name]
-    hashes = _git("hash-object", "--", *names) if names else ""
-    return "\n".join([_git("diff", "HEAD", "--", *_SOURCES) or "", *names, hashes or ""]).strip()
+def _commit() -> Mapping[str, str | None]:
+    """Return `git` and `git_diff_sha256` of the package: of its checkout, or of its build."""
+    package = Path(xrgs.__file__).parent
+    found = commit.of_checkout(package.parent)
+    if found is None and (package / commit.FILE).is_file():
+        found = read_struct(package / commit.FILE, dict[str, str | None])
+    return found or {}
 
 
 def _cpu() -> str:
@@ -70,7 +57,7 @@ def collect(threads: int, backend: str) -> Provenance:
     """Return the program, its libraries, the machine and the time.
 
     Args:
-        threads: Number of threads that the cell uses.
+        threads: The threads that the cell uses.
         backend: The rasterizer in use, `native` or `torch`.
 
     Raises:
@@ -78,12 +65,12 @@ def collect(threads: int, backend: str) -> Provenance:
             can't be scored is better stopped here than after its training.
         XrgsError: The backend is not available on this machine.
     """
-    diff = _uncommitted()
+    built_from = _commit()
     published = weights.load_published()
     return Provenance(
         xrgs=xrgs.__version__,
-        git=(_git("rev-parse", "HEAD") or "").strip() or None,
-        git_diff_sha256=hashlib.sha256(diff.encode()).hexdigest() if diff else None,
+        git=built_from.get("git"),
+        git_diff_sha256=built_from.get("git_diff_sha256"),
         python=sys.version.split()[0],
         packages={name: metadata.version(name) for name in _PACKAGES},
         platform=platform.platform(),
@@ -130,11 +117,7 @@ class Machines:
     """The machines that train a cell in turn; its checkpoint hands their names on to the next."""
 
     def __init__(self, here: str) -> None:
-        """Begin with the machine of this process.
-
-        Args:
-            here: Its name, see `machine`.
-        """
+        """Begin with the machine of this process, `here`, see `machine`."""
         self.names = [here]
 
     def state_dict(self) -> dict[str, Any]:
@@ -142,16 +125,13 @@ class Machines:
         return {"names": self.names}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Put the machines that have trained before in front of this one.
-
-        Args:
-            state: What `state_dict` returned.
+        """Put the machines of a checkpoint, which trained before, in front of this one.
 
         Raises:
-            KeyError: It has no names.
-            TypeError: They are no texts.
+            KeyError: The state has no names.
+            TypeError: A name is not a text.
         """
         before = state["names"]
         if not isinstance(before, list) or not all(isinstance(name, str) for name in before):
-            raise TypeError(f"names: {before!r:.40} are no texts")
+            raise TypeError(f"names: {before!r:.40} must be a list of texts")
         self.names = list(dict.fromkeys([*before, *self.names]))

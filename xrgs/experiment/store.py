@@ -41,7 +41,7 @@ if TYPE_CHECKING:
 BASELINE = "baseline"
 
 #: The largest record of a sweep that is read, in bytes: 100,000 cells take 30 MB.
-_MAX_RECORD_BYTES = 1 << 25
+MAX_RECORD_BYTES = 1 << 25
 #: Bytes that must be writable before a sweep starts; any cell needs more than that.
 _MIN_FREE_BYTES = 1 << 15
 
@@ -412,7 +412,7 @@ class Store:
         sweep_id = sweep_id or self.latest_sweep()
         if not is_name(sweep_id):
             raise StoreError(f"{sweep_id!r:.80} is not the id of a sweep")
-        return read_struct(self.sweeps / f"{sweep_id}.json", SweepRecord, _MAX_RECORD_BYTES)
+        return read_struct(self.sweeps / f"{sweep_id}.json", SweepRecord, MAX_RECORD_BYTES)
 
     def verify_sweep(self, sweep_id: str) -> None:
         """Check that a sweep's record is the one that was written, by the hash in it.

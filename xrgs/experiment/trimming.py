@@ -1,10 +1,10 @@
-"""Removes the heavy files of done cells and of variants on purpose, and tells that they were.
+"""Removes the heavy files of done cells and of variants, and records what was removed.
 
-A trimmed cell stays done: everything that tables are made of is kept, and its `status.json` lists
-what was removed, with sizes and hashes. A trimmed variant keeps its list of views, cameras, points
-and SfM report, in the folder `variants/trimmed-<id>`. Its cells are still found and reported.
-Before a new cell is trained on it, its images are made again from the photographs: another SfM
-would give another variant.
+A trimmed cell stays done: the files that tables are made of stay, and its `status.json` lists the
+removed files with their sizes and hashes. A trimmed variant keeps its list of views, cameras,
+points and SfM report, in the folder `variants/trimmed-<id>`. Its cells are still found and
+reported. Before a new cell is trained on it, its images are made again from the photographs. SfM is
+not run again, since another run would give another variant.
 """
 
 from __future__ import annotations
@@ -28,11 +28,7 @@ _IMAGES = "images"
 
 
 def trimmed_variant(variants: Path, key: str) -> str | None:
-    """Return the id of the trimmed variant of a key; None where there is none.
-
-    Args:
-        variants: The store's folder of variants.
-        key: What `xrgs.capture.variant.key` gives.
+    """Return the id of the trimmed variant of a key (`xrgs.capture.variant.key`), or None.
 
     Raises:
         StoreError: The folder of variants can't be listed.
@@ -42,15 +38,7 @@ def trimmed_variant(variants: Path, key: str) -> str | None:
 
 
 def check_images(variants: Path, variant_id: str) -> None:
-    """Refuse a variant whose images were removed on purpose.
-
-    Args:
-        variants: The store's folder of variants.
-        variant_id: The variant's id.
-
-    Raises:
-        StoreError: It is trimmed; the message says what can be done.
-    """
+    """Raise `StoreError` where a variant is trimmed; the message says what can be done."""
     folder = trimmed_folder(variants, variant_id)
     if folder.is_dir():
         raise StoreError(
@@ -62,15 +50,10 @@ def check_images(variants: Path, variant_id: str) -> None:
 def trim_variant(variants: Path, variant_id: str) -> None:
     """Remove the images of a variant, and mark it as trimmed by the name of its folder.
 
-    Nothing happens to a variant that is trimmed already, except that a removal that was stopped
-    midway is completed.
-
-    Args:
-        variants: The store's folder of variants.
-        variant_id: The variant's id.
+    Trimming a trimmed variant completes a removal that was stopped, and else changes nothing.
 
     Raises:
-        OSError: It can't be renamed, or its images can't be removed.
+        OSError: The folder can't be renamed, or the images can't be removed.
     """
     folder, trimmed = variants / variant_id, trimmed_folder(variants, variant_id)
     if folder.is_dir():
@@ -93,8 +76,8 @@ def restore_variant(
     Args:
         variants: The store's folder of variants.
         variant_id: The variant's id.
-        scene: The config of its scene.
-        conf: The config that it was built with.
+        scene: The config of the variant's scene.
+        conf: The config that the variant was built with.
         cache: The store's folder of rendered scenes.
 
     Raises:
@@ -131,12 +114,7 @@ def restore_variant(
 
 
 def image_bytes(variants: Path, variant_id: str) -> int:
-    """Return the bytes of a variant's images, which trimming it would free.
-
-    Args:
-        variants: The store's folder of variants.
-        variant_id: The variant's id.
-    """
+    """Return the bytes of a variant's images, which trimming it would free."""
     homes = (variants / variant_id, trimmed_folder(variants, variant_id))
     images = [home / _IMAGES for home in homes if (home / _IMAGES).is_dir()]
     found = [status for folder in images for _, status in walk_files(folder)]
@@ -144,14 +122,7 @@ def image_bytes(variants: Path, variant_id: str) -> int:
 
 
 def verify_variant(folder: Path) -> list[str]:
-    """Say what is wrong with what a trimmed variant has kept.
-
-    Args:
-        folder: Its folder.
-
-    Returns:
-        A line for each file that is missing, has changed or can't be read now.
-    """
+    """Return a line for each file of a trimmed variant that is missing, changed or unreadable."""
     try:
         content = frozen.read_manifest(folder)
     except StoreError as error:

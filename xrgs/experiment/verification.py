@@ -28,19 +28,19 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Verification:
-    """What was hashed, and what is wrong with it."""
+    """How much was hashed, and what is damaged."""
 
     files: int
     bytes: int
     seconds: float
     damage: tuple[str, ...]
-    """A line for each file that is missing, has changed, can't be read now or does not belong where
-    it is; the line begins with its path."""
+    """A line for each file that is missing, damaged, changed, unreadable or not listed. The line
+    begins with the path."""
 
 
 @dataclass(frozen=True)
 class _Part:
-    """A file or a folder that is verified as one: a cell, a variant, a scene or a record."""
+    """A cell, a variant, a scene or a record, with its check."""
 
     path: Path
     files: int
@@ -50,12 +50,6 @@ class _Part:
 
 def verify(store: Store) -> Verification:
     """Hash every file of the finished cells, the frozen variants, the scenes and the records.
-
-    Args:
-        store: The store; nothing is written to it.
-
-    Returns:
-        What was hashed, and what is wrong.
 
     Raises:
         StoreError: There is no such store, or it can't be read now.
@@ -75,11 +69,7 @@ def verify(store: Store) -> Verification:
 
 
 def describe(verification: Verification) -> str:
-    """Return what was hashed, and every damaged file, as lines for a terminal.
-
-    Args:
-        verification: What `verify` returns.
-    """
+    """Return the damaged files and the extent of a verification, as lines for a terminal."""
     damage = verification.damage
     lines = ["damaged, or can't be read now:", *(f"  {line}" for line in damage)] if damage else []
     extent = f"{verification.files:,} files, {format_size(verification.bytes)}"
@@ -89,7 +79,7 @@ def describe(verification: Verification) -> str:
 
 
 def _parts(store: Store, damage: list[str]) -> Iterator[_Part]:
-    """Yield what is to be verified; add to `damage` what can't be looked at."""
+    """Yield the parts of a store; add a line to `damage` for each that can't be listed."""
     for kind in (_cells, _variants, _scenes, _records):
         try:
             checks = list(kind(store))

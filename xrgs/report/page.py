@@ -235,8 +235,8 @@ def _write_data(folder: Path, sweep: Sweep, comparison: Comparison, runs: Runs) 
     metrics = [metric.name for metric in comparison.metrics]
     counts = ["steps", "long_side", "factor"]
     order = [*RECORD_KEYS, "state", "reason", *counts, "protocol", "stale", "validation", "machine"]
-    whole = cells[[*order, *metrics]].astype(dict.fromkeys(counts, "Int64"))  # which may be missing
-    write_text(folder / "cells.csv", _csv(whole))
+    whole = cells[counts].astype("Int64").astype(object)  # without a decimal point, or missing
+    write_text(folder / "cells.csv", _csv(cells[[*order, *metrics]].assign(**whole)))
     write_text(folder / "views.csv", _csv(views))
     write_text(folder / "training.csv", _csv(runs.training))
     write_text(folder / "curves.csv", _csv(runs.curves))

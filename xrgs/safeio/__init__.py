@@ -1,1 +1,1 @@
-"""Reads files that anybody may have written, and writes files atomically."""
+"""Reads and writes files: typed, bounded and atomic; makes texts safe for their outputs."""

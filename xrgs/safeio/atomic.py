@@ -49,38 +49,16 @@ def atomic_writer(path: Path, *, durable: bool = True) -> Iterator[IO[bytes]]:
 
 
 def write_text(path: Path, text: str, *, durable: bool = True) -> None:
-    """Write a UTF-8 text file atomically.
-
-    Args:
-        path: The file to replace or create; its folder must exist.
-        text: The whole content.
-        durable: As for `atomic_writer`.
-
-    Raises:
-        OSError: The file can't be written.
-    """
+    """Write a UTF-8 text file atomically, see `atomic_writer`."""
     with atomic_writer(path, durable=durable) as stream:
         stream.write(text.encode("utf-8"))
 
 
 def write_json(path: Path, value: object, *, durable: bool = True) -> None:
-    """Write a value atomically as indented JSON with sorted keys.
-
-    Args:
-        path: The file to replace or create; its folder must exist.
-        value: Anything that `json.dumps` accepts.
-        durable: As for `atomic_writer`.
-
-    Raises:
-        OSError: The file can't be written.
-    """
+    """Write a value atomically as indented JSON with sorted keys, see `atomic_writer`."""
     write_text(path, json_text(value), durable=durable)
 
 
 def json_text(value: object) -> str:
-    """Return the JSON that `write_json` writes.
-
-    Args:
-        value: Anything that `json.dumps` accepts.
-    """
+    """Return the JSON that `write_json` writes."""
     return json.dumps(value, indent=1, sort_keys=True, ensure_ascii=False) + "\n"

@@ -19,8 +19,8 @@ if TYPE_CHECKING:
 
 #: The largest file that is read whole, in bytes. A sweep's record of ten thousand cells has 3 MB.
 MAX_BYTES = 1 << 26
-#: Errors that say what is there, or that nothing is. Every other error may be gone at the next try:
-#: permissions, a disk or a server that fails, too many open files.
+#: Errors about what a path leads to. All others may be gone at the next try: permissions, a disk or
+#: a server that fails, too many open files.
 _CONCLUSIVE = frozenset(
     {
         errno.ENOENT,

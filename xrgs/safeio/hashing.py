@@ -13,26 +13,12 @@ _CHUNK = 1 << 16  # bytes
 
 
 def canonical_json(value: object) -> str:
-    """Serialise a value so that equal values give equal text: sorted keys, no spaces.
-
-    Args:
-        value: Anything that `json.dumps` accepts.
-
-    Returns:
-        One line of JSON.
-    """
+    """Return one line of JSON, the same for equal values: keys are sorted, there are no spaces."""
     return json.dumps(value, sort_keys=True, separators=(",", ":"), ensure_ascii=False)
 
 
 def digest(value: object) -> str:
-    """Hash a value.
-
-    Args:
-        value: Anything that `json.dumps` accepts.
-
-    Returns:
-        The first 16 hexadecimal digits of the SHA-256 of `canonical_json(value)`.
-    """
+    """Return the first 16 hexadecimal digits of the SHA-256 of `canonical_json(value)`."""
     return hashlib.sha256(canonical_json(value).encode()).hexdigest()[:16]
 
 
@@ -54,13 +40,7 @@ def to_plain(value: Any) -> Any:
 
 
 def file_digest(path: Path) -> str:
-    """Hash a regular file's bytes.
-
-    Args:
-        path: The file.
-
-    Returns:
-        All 64 hexadecimal digits of the SHA-256.
+    """Return all 64 hexadecimal digits of the SHA-256 of a regular file.
 
     Raises:
         OSError: The file can't be read, or is not a regular file.

@@ -1,4 +1,4 @@
-"""Reads an untrusted .npz archive into numeric arrays, without running or decompressing anything.
+"""Reads an .npz archive of unknown origin into numeric arrays; nothing in it is run or inflated.
 
 `np.load` allocates the size that an array's header declares before it checks how many bytes follow,
 and decompresses a thousand bytes out of one. This reader accepts only stored members, as `np.savez`
@@ -41,7 +41,7 @@ def read(stream: IO[bytes]) -> dict[str, NDArray[Any]]:
         return _read(stream)
     except OSError:
         raise
-    except Exception as error:  # zipfile and numpy raise nearly anything on untrusted bytes
+    except Exception as error:  # zipfile and numpy raise nearly anything for damaged bytes
         raise ValueError(str(error) or type(error).__name__) from error
 
 

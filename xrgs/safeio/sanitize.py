@@ -1,11 +1,11 @@
-"""Makes text that somebody else may have written safe for an output: one function a target.
+"""Makes texts of others safe for an output: one function for each kind of output.
 
 Names of scenes, labels, reasons and messages may come from a store, an archive or a server of
 somebody else. They may hold codes that a terminal obeys, formulas that a spreadsheet runs, markup
 that Markdown and LaTeX obey, or a megabyte of letters. Every script, accent and emoji passes.
 
-What is written for people goes through here. Files that this package reads back, such as a cell's
-`scores.csv`, keep each text exactly: whoever shows what was read from them calls this module.
+Everything that is written for people goes through here. Files that this package reads back, such as
+a cell's `scores.csv`, keep each text exactly; code that shows their content calls this module.
 """
 
 from __future__ import annotations
@@ -72,21 +72,14 @@ def for_line(text: str, limit: int = MAX_LINE) -> str:
 
 
 def counted(number: int, noun: str) -> str:
-    """Write a number with its noun: `1 cell`, `2 cells`.
-
-    Args:
-        number: How many there are.
-        noun: What they are, in the singular; its plural has an s more.
-    """
+    """Return a number with its noun: `1 cell`, `2 cells`. The noun is given in the singular."""
     return f"{number} {noun}{'s' * (number != 1)}"
 
 
 def for_terminal(text: str) -> str:
     """Make a whole text safe for a terminal or a log; its line breaks are kept.
 
-    Args:
-        text: Lines that are our own: a name in them may hold a line break, and goes through
-            `for_line` before.
+    A name in the text may have a line break of its own: it must have gone through `for_line`.
     """
     return "\n".join(for_line(line, _MAX_TERMINAL_LINE) for line in text.split("\n"))
 
@@ -95,11 +88,11 @@ def for_csv(value: object) -> object:
     """Make a value safe for a cell of a table that is opened in a spreadsheet.
 
     Args:
-        value: The value; all but texts are returned unchanged.
+        value: The value; anything but a text is returned unchanged.
 
     Returns:
-        The text as one line. Where a spreadsheet would read a formula, it has an apostrophe before
-        it; numbers with a sign are numbers.
+        The text as one line, with an apostrophe where a spreadsheet would read a formula. Numbers
+        with a sign are not formulas.
     """
     if not isinstance(value, str):
         return value
@@ -111,7 +104,7 @@ def for_markdown(text: str) -> str:
     """Escape a text so that GitHub's Markdown shows it as it is, without links or HTML.
 
     Args:
-        text: Any text; it is shown on one line.
+        text: Any text; the result is one line.
     """
     escaped = for_line(text).strip().translate(_MARKDOWN)
     return _MARKDOWN_LINK.sub(r"\\\g<0>", _MARKDOWN_START.sub(r"\1\\\2", escaped))

@@ -247,9 +247,9 @@ def _paths(folder: Path) -> list[Path]:
     return [folder / name for name in list_folder(folder) if is_name(name)]
 
 
-def _folders(kind: str, folders: Iterable[Path], *, leased: bool = False) -> Iterator[Item]:
+def _folders(kind: str, paths: Iterable[Path], *, leased: bool = False) -> Iterator[Item]:
     """Yield folders to remove; with `leased`, each under the lease that its name contains."""
-    for folder in folders:
+    for folder in paths:
         found = _ASIDE.fullmatch(folder.name) if leased else None
         held = (found["id"] or found["rest"]) if found else None
         name, size = f"{folder.parent.name}/{folder.name}", size_of(folder) or 0

@@ -78,7 +78,7 @@ def list_sweeps(sweeps: Sequence[SweepRow]) -> str:
         for row in sweeps
     ]
     columns = ("sweep", "recorded", "scenes", "labels", "cells")
-    return to_text(TextTable(f"{len(rows)} sweeps", columns, tuple(rows), "lllll")).rstrip()
+    return to_text(TextTable(counted(len(rows), "sweep"), columns, tuple(rows), "lllll")).rstrip()
 
 
 def _counts(sweep: SweepRow) -> str:

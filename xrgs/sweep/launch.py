@@ -368,7 +368,13 @@ def _hand_over(cell: PlannedCell, threads: int, store: Store) -> list[str]:
         threads=cell.conf.threads or threads,
         scene=replace(scene, path=path),
     )
-    # The job need not watch a dead owner that this process has watched for long enough.
-    lease.free_if_dead(store.leases, cell.cell_id)
-    plan_cell(store.cell(cell.cell_id), conf, cell.identity)
+    # Under the lease: another sweep may be training the cell, or have finished it, since the plan.
+    # A dead owner that this process has watched for long enough need not be watched by the job.
+    held = lease.acquire(store.leases, cell.cell_id)
+    if held is not None:
+        try:
+            if store.cell(cell.cell_id).state(verify=False).name not in {"done", "unknown"}:
+                plan_cell(store.cell(cell.cell_id), conf, cell.identity)
+        finally:
+            held.release()
     return [f"cell={cell.cell_id}", f"store={home}", f"name={cell.name}"]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import fcntl
 import hashlib
+import io
 import random
 import socket
 from pathlib import Path
@@ -299,7 +300,8 @@ def test_five_redirects_are_followed_and_no_more(server: Any, target: Path) -> N
 )
 def test_where_a_redirect_may_lead(url: str, location: str, why: str | None) -> None:
     handler = http._RedirectHandler("http://a.org/x", ["C.org:8"])
-    arguments: Any = (Request(url), None, 302, "Found", {}, location)  # noqa: S310  nothing is opened
+    request = Request(url)  # noqa: S310  nothing is opened
+    arguments: Any = (request, io.BytesIO(), 302, "Found", {}, location)
     if why is None:
         followed = handler.redirect_request(*arguments)
         assert followed is not None

@@ -231,5 +231,6 @@ class _RedirectHandler(HTTPRedirectHandler):
         if not is_safe or target.netloc.lower() not in hosts:
             why = "another host, which --redirect-hosts does not name" if is_safe else "less safe"
             where = for_line(newurl, _MAX_WORDS)
+            fp.close()
             raise DownloadError(f"{self._url}: the redirect to {where} is not followed ({why})")
         return super().redirect_request(req, fp, code, msg, headers, newurl)

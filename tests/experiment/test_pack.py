@@ -4,68 +4,42 @@ from __future__ import annotations
 
 import json
 import tarfile
-from dataclasses import replace
+from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
-import msgspec
-import numpy as np
 import pytest
 
+from tests.experiment.cells import finished, identity, row, write_variant
+from xrgs import composing
 from xrgs.capture import frozen
-from xrgs.capture.frozen import Manifest, ViewEntry
 from xrgs.errors import StoreError
+from xrgs.experiment.archive import Packed, pack
+from xrgs.experiment.cell_folder import CellFolder
 from xrgs.experiment.store import Store
 from xrgs.safeio.atomic import write_json
-from xrgs.safeio.hashing import file_digest
-from xrgs.sweep.packing import Packed, pack
+from xrgs.safeio.files import list_names
 
 CELLS = ("c1", "c2")
 
 
 @pytest.fixture
-def store(cells: Any, tmp_path: Path) -> Store:
+def store(tmp_path: Path) -> Store:
     """A store of two done cells on one variant, and the record of their sweep."""
-    store: Store = cells.store
-    next(store.variants.iterdir()).rmdir()
-    variant_id = freeze(store)
-    for name in CELLS:
-        path = f"{tmp_path}/data/fern" if name == "c1" else "/elsewhere/horns"
-        scene = replace(cells.conf.scene, path=path, name="a/b")
-        cell = cells.begin(name, {"variant": variant_id}, scene=scene)
-        (cell.path / "renders").mkdir()
-        (cell.path / "renders" / "a.png").write_bytes(b"render")
-        (cell.path / "splats.ply").write_bytes(b"Gaussians")
+    store = Store(tmp_path / "my store")
+    store.prepare()
+    variant_id = write_variant(store.variants)
+    (store.variants / variant_id / frozen.LOG).write_text(f"{tmp_path}: matched")
+    for name, path in zip(CELLS, (f"{tmp_path}/data/fern", "/elsewhere/horns"), strict=True):
+        conf = composing.compose("scene=folder", f"scene.path={path}", f"store='{store.path}'")
+        cell = finished(store.cell(name), conf, identity(0, variant_id))
         (cell.path / "log.txt").write_text(f"{tmp_path}: begun")
-        cells.finish(cell)
     command = ["+ablation=x,y", f"scene.path={tmp_path}/data/fern,/elsewhere/horns", "threads=1"]
-    store.write_sweep(command, [cells.row(name, "fern", name) for name in CELLS])
+    store.write_sweep(command, [row(name) for name in CELLS])
     return store
 
 
-def freeze(store: Store) -> str:
-    """Freeze a variant of two photographs; return its id."""
-    folder = store.variants / "new"
-    (folder / "images").mkdir(parents=True)
-    (folder / frozen.LOG).write_text("/home: matched")
-    for name in (frozen.POINTS, frozen.REPORT):
-        (folder / name).write_text(name)
-    views = []
-    for split in ("train", "test"):
-        (folder / "images" / f"{split}.png").write_bytes(b"photograph")
-        size, eye = (60, 40), np.eye(4).tolist()
-        file = f"images/{split}.png"
-        views.append(ViewEntry(split, split, file, "HR", *size, np.eye(3).tolist(), eye, 1.0))
-    files = {name: file_digest(folder / name) for name in (frozen.POINTS, *(v.file for v in views))}
-    manifest = Manifest("0123456789abcdef", "fern", 5, False, tuple(views), files)
-    manifest = msgspec.structs.replace(manifest, id=manifest.computed_id())
-    write_json(folder / frozen.MANIFEST, msgspec.to_builtins(manifest))
-    folder.rename(store.variants / manifest.id)
-    return manifest.id
-
-
 def pack_all(store: Store, out: Path) -> Packed:
-    return pack(store, store.cell_rows(), out, out.parent)
+    return pack(store, store.cell_folders(), out, out.parent)
 
 
 def unpacked(archive: Path, folder: Path) -> Store:
@@ -96,15 +70,10 @@ def test_an_unpacked_store_is_the_store_trimmed(store: Store, tmp_path: Path) ->
     other.verify_sweep(other.sweep_ids()[0])
     columns = ["cell_id", "psnr", "gaussians"]
     assert other.cells()[columns].equals(store.cells()[columns])
-    kept = set(contents(other))
-    (variant,) = (path.name for path in other.variants.iterdir())
-    assert kept == {
-        *(
-            f"cells/{cell}/{file}"
-            for cell in CELLS
-            for file in store.cell(cell).trimmed_status().files
-        ),
-        *(f"cells/{cell}/status.json" for cell in CELLS),
+    (variant,) = list_names(other.variants)
+    assert set(contents(other)) == {
+        *(f"cells/{name}/{file}" for name in CELLS for file in store.cell(name).status().files),
+        *(f"cells/{name}/status.json" for name in CELLS),
         *(f"variants/{variant}/{file}" for file in (frozen.MANIFEST, frozen.POINTS, frozen.REPORT)),
         f"sweeps/{store.sweep_ids()[0]}.json",
     }
@@ -118,23 +87,19 @@ def test_full_paths_become_relative(store: Store, tmp_path: Path) -> None:
     pack_all(store, tmp_path / "a.tar.xz")
     other = unpacked(tmp_path / "a.tar.xz", tmp_path / "other")
     assert not any(str(tmp_path).encode() in content for content in contents(other).values())
-    confs = [other.cell(name).config() for name in CELLS]
-    assert [(conf.store, conf.scene.path, conf.scene.name) for conf in confs] == [
-        ("s", "data/fern", "a/b"),
-        ("s", "horns", "a/b"),
-    ]
+    assert [other.cell(name).config().scene.path for name in CELLS] == ["data/fern", "horns"]
+    assert other.cell("c1").config().store == "my store"
     command = other.sweep_record().command
     assert command == ("+ablation=x,y", "scene.path=data/fern,horns", "threads=1")
 
 
-def test_the_records_are_those_of_the_sweeps_that_are_named(
-    store: Store, cells: Any, tmp_path: Path
-) -> None:
+def test_the_records_are_those_of_the_sweeps_that_are_named(store: Store, tmp_path: Path) -> None:
     (first,) = store.sweep_ids()
-    second = cells.record(("c1", "fern", "x"))
-    rows = store.cell_rows()
+    second = store.write_sweep(["+ablation=x"], [row("c1", "x")])
+    store.write_sweep(["+ablation=x"], [row("of no packed cell", "x", seed=1)])
     for sweeps, ids in (((), {first, second}), ((second,), {second})):
-        packed = pack(store, rows, tmp_path / "a.tar.xz", tmp_path, sweeps)
+        cells = store.cell_folders()
+        packed = pack(store, cells, tmp_path / "a.tar.xz", tmp_path, sweeps)
         assert (packed.cells, packed.sweeps) == (2, len(ids))
         other = unpacked(tmp_path / "a.tar.xz", tmp_path / f"of {len(ids)}")
         assert {*other.sweep_ids()} == ids
@@ -151,31 +116,30 @@ def damage_scores(cell: Path) -> str:
     return "scores.csv: it has changed since the cell finished"
 
 
-def malformed(cell: Path) -> str:
+def malform(cell: Path) -> str:
     status = json.loads((cell / "status.json").read_text())
-    write_json(cell / "status.json", status | {"files": status["files"] | {"../x": 3}})
-    return "damaged: "
+    write_json(cell / "status.json", status | {"files": {"scores.csv": 3}})
+    return "status.json: files[...]: Expected `object`, got `int`"
 
 
-@pytest.mark.parametrize("damage", [damage_scores, malformed])
-def test_a_damaged_cell_is_left_out_and_named(store: Store, tmp_path: Path, damage: Any) -> None:
-    cells = store.cell_rows()
+@pytest.mark.parametrize("damage", [damage_scores, malform])
+def test_a_damaged_cell_is_left_out_and_named(
+    store: Store, tmp_path: Path, damage: Callable[[Path], str]
+) -> None:
     message = damage(store.cell("c1").path)
-    packed = pack(store, cells, tmp_path / "a.tar.xz", tmp_path)
+    packed = pack_all(store, tmp_path / "a.tar.xz")
     assert packed.cells == 1
     (line,) = packed.left_out
-    assert line.startswith("c1  fern / c1: ")
+    assert line.startswith("c1: ")
     assert message in line
     other = unpacked(tmp_path / "a.tar.xz", tmp_path / "other")
-    assert [cell.id for cell in other.cell_folders()] == ["c2"]
+    assert other.cell_folders() == [CellFolder(other.cells_folder / "c2")]
 
 
 def test_a_damaged_variant_or_record_is_left_out_and_named(store: Store, tmp_path: Path) -> None:
-    cells = store.cell_rows()
-    (folder,) = store.variants.iterdir()
-    (folder / frozen.POINTS).write_bytes(b"other points")
-    cells = [replace(cell, sweeps=("gone",)) for cell in cells]
-    packed = pack(store, cells, tmp_path / "a.tar.xz", tmp_path)
+    (variant_id,) = list_names(store.variants)
+    (store.variants / variant_id / frozen.POINTS).write_bytes(b"other points")
+    packed = pack(store, store.cell_folders(), tmp_path / "a.tar.xz", tmp_path, ["gone"])
     assert (packed.cells, packed.variants, packed.sweeps) == (2, 0, 0)
     variant, record = packed.left_out
     assert f"{frozen.POINTS}: it has changed" in variant
@@ -197,4 +161,4 @@ def test_what_can_not_be_written_is_named_and_an_old_archive_is_kept(
     with pytest.raises(StoreError, match=r"a\.tar\.xz: No space left on device"):
         pack_all(store, out)
     assert out.read_bytes() == b"old"
-    assert {path.name for path in tmp_path.iterdir()} == {"a.tar.xz", "s"}
+    assert {path.name for path in tmp_path.iterdir()} == {"a.tar.xz", "my store"}
