@@ -21,8 +21,12 @@ SCENE["means"][:2] = torch.tensor([0.0, 0.0, 3.0])  # in view: their harmonics a
 
 def draw(**changes: Any) -> Render:
     """Render `SCENE` with some of its parameters or some options changed."""
-    options = {"camera": make_camera(), "settings": RasterSettings(), "sh_degree": 3}
-    return rasterize_parameters(**(SCENE | options | changes))
+    options: dict[str, Any] = {
+        "camera": make_camera(),
+        "settings": RasterSettings(),
+        "sh_degree": 3,
+    }
+    return rasterize_parameters(**{**SCENE, **options, **changes})
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])

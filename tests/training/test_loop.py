@@ -118,7 +118,6 @@ class HookRecorder(components.Component):
         self.sizes: list[int] = []
 
     def before_render(self, activated: ActivatedGaussians, step: Step) -> ActivatedGaussians:
-        del step
         assert len(activated.means) == self.sizes[-1]
         return activated
 
@@ -128,21 +127,17 @@ class HookRecorder(components.Component):
     def modify_loss(
         self, loss: torch.Tensor, image: torch.Tensor, gaussians: Gaussians, step: Step
     ) -> torch.Tensor:
-        del gaussians
         assert image.shape == step.view.image.shape
         return loss
 
     def needs_backward(self, loss: torch.Tensor, step: Step) -> bool:
-        del step
         assert loss.requires_grad
         return True
 
     def after_backward(self, gaussians: Gaussians, step: Step) -> None:
-        del step
         assert gaussians.scales.grad is not None
 
     def densification_grad2d(self, gradient: torch.Tensor, step: Step) -> torch.Tensor:
-        del step
         assert len(gradient) == self.sizes[-1]
         return gradient
 
@@ -239,11 +234,9 @@ def test_the_time_of_an_evaluation_is_no_training_time(
 
     class Clock(components.Component):
         def after_backward(self, gaussians: Gaussians, step: Step) -> None:
-            del gaussians, step
             now[0] += 1.0
 
     def evaluate(gaussians: Gaussians) -> dict[str, float | None]:
-        del gaussians
         now[0] += 1000.0
         return {}
 
@@ -257,7 +250,6 @@ def test_extra_components_run_behind_those_of_the_config(data: Dataset, short: C
         def modify_loss(
             self, loss: torch.Tensor, image: torch.Tensor, gaussians: Gaussians, step: Step
         ) -> torch.Tensor:
-            del image, gaussians
             step.log["loss.before"] = loss.item()
             return 2 * loss
 
@@ -272,7 +264,6 @@ def test_extra_components_run_behind_those_of_the_config(data: Dataset, short: C
 def test_a_gradient_of_zero_grows_nothing(data: Dataset, short: Conf) -> None:
     class Zero(components.Component):
         def densification_grad2d(self, gradient: torch.Tensor, step: Step) -> torch.Tensor:
-            del step
             return torch.zeros_like(gradient)
 
     last = train(data, short, extra_components=[Zero()]).history[-1]

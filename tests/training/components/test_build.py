@@ -119,7 +119,6 @@ class Other(Component):
         self.count = 0
 
     def densification_groups(self, settings: DensifySettings) -> Groups:
-        del settings
         return Groups({"HR": Thresholds(1.0, 1.0), "LR": Thresholds(1.0, 1.0)}, "per_class")
 
     def state_dict(self) -> dict[str, Any]:
@@ -146,15 +145,12 @@ class Choosing(Component):
         self.numbers = torch.tensor(numbers)
 
     def may_grow(self, gaussians: Gaussians, step: Step) -> Tensor:
-        del gaussians, step
         return self.numbers > 0
 
     def growth_scores(self, gaussians: Gaussians, step: Step) -> Tensor:
-        del gaussians, step
         return self.numbers
 
     def to_prune(self, gaussians: Gaussians, step: Step) -> Tensor:
-        del gaussians, step
         return self.numbers > 2
 
 

@@ -121,7 +121,6 @@ class Lowered(Component):
     """Lowers all opacities, so that a component that renders without it has other scores."""
 
     def before_render(self, activated: ActivatedGaussians, step: Step) -> ActivatedGaussians:
-        del step
         return activated._replace(opacities=activated.opacities * 0.1)
 
 
