@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib.util
 from collections.abc import Iterator
+from typing import Any
 
 import pytest
 import torch
@@ -18,13 +19,17 @@ def pixel() -> Camera:
     return Camera(torch.eye(4, dtype=torch.float64), K, 1, 1)
 
 
-def _isas() -> list[str]:
-    """The instruction sets that the compiled backend can use on this machine."""
+def _isas() -> list[Any]:
+    """The instruction sets of this machine; those that are not chosen by default are slow."""
     if importlib.util.find_spec("xrgs._native") is None:
         return []
     from xrgs import _native
 
-    return list(_native.available_isas())
+    chosen = _native.isa()
+    return [
+        pytest.param(name, marks=() if name == chosen else pytest.mark.slow)
+        for name in _native.available_isas()
+    ]
 
 
 @pytest.fixture(params=_isas())
@@ -40,7 +45,7 @@ def isa(request: pytest.FixtureRequest) -> Iterator[str]:
 
 @pytest.fixture
 def threads() -> Iterator[None]:
-    """Restores torch's number of threads after the test."""
+    """Restore torch's number of threads after the test."""
     before = torch.get_num_threads()
     yield
     torch.set_num_threads(before)
