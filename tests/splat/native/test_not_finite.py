@@ -190,10 +190,14 @@ def test_a_camera_that_float32_does_not_hold_is_named() -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("count", [500, pytest.param(10000, marks=pytest.mark.exhaustive)])
 def test_fuzzing(count: int) -> None:
-    # In a process of its own, so that a crash is a failure of this test alone.
+    # In a process of its own, so that a crash is a failure of this test alone. The repository comes
+    # last on its path, so that the installed package is tested.
+    code = (
+        "import sys; sys.path.append(sys.argv.pop())\n"
+        "from tests.splat.native.fuzz_rasterizer import main; sys.exit(main(sys.argv[1:]))"
+    )
     result = subprocess.run(
-        [sys.executable, "-m", "tests.splat.native.fuzz_rasterizer", "--count", str(count)],
-        cwd=Path(__file__).parents[3],
+        [sys.executable, "-P", "-c", code, "--count", str(count), str(Path(__file__).parents[3])],
         capture_output=True,
         text=True,
         check=False,
