@@ -31,6 +31,14 @@ from xrgs.evaluation.lpips import weights
 from xrgs.splat.cameras import Camera
 
 
+@pytest.hookimpl(tryfirst=True)
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Mark exhaustive tests as slow too: `-m "not slow"` replaces the `-m` of pyproject.toml."""
+    for item in items:
+        if item.get_closest_marker("exhaustive"):
+            item.add_marker("slow")
+
+
 @pytest.fixture(scope="session", autouse=True)
 def _one_torch_thread() -> None:
     """Let torch use one thread: a second one costs more than it gives on small tensors."""

@@ -55,6 +55,7 @@ def delta(conf: Conf, baseline: Conf) -> dict[str, Any]:
     return {key: value for key, value in flat(asdict(conf)).items() if value != expected[key]}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ABLATIONS)
 def test_each_ablation_is_another_cell(name: str, composed: Compose) -> None:
     baseline, ablation = composed(), composed(f"+ablation={name}")
@@ -98,6 +99,7 @@ def test_ablations_can_be_combined(
         assert combined == composed(f"+ablation={whole}")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", SENSITIVITY)
 def test_a_sweep_of_sensitivity_varies_one_ablation_around_its_value(
     name: str, composed: Compose

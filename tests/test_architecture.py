@@ -8,6 +8,7 @@ from __future__ import annotations
 import ast
 import subprocess
 import sys
+from functools import cache
 from pathlib import Path
 
 import pytest
@@ -90,6 +91,7 @@ def module_of(imported: str) -> str:
     return "__init__"
 
 
+@cache
 def imports(path: Path) -> set[str]:
     """Every dotted name that a file imports, at its top, inside a function or for types alone."""
     found: set[str] = set()

@@ -221,6 +221,7 @@ def test_texts_are_taken_literally(baseline: Conf, text: str) -> None:
     assert from_dict(asdict(conf)) == conf
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("group", ["ablation", "preset", "variant"])
 def test_every_config_is_read_back_from_json(group: str, compose: Compose) -> None:
     plus = "+" if group == "ablation" else ""
@@ -292,6 +293,7 @@ def test_a_file_from_before_a_key_was_added_takes_the_baselines_value(
     }
 
 
+@pytest.mark.slow
 def test_the_process_of_a_cell_reads_its_config_without_hydra(
     baseline: Conf, tmp_path: Path
 ) -> None:

@@ -58,6 +58,7 @@ def test_an_installation_is_compared_with_itself(tmp_path: Path) -> None:
         assert word in text
 
 
+@pytest.mark.slow
 def test_an_installation_that_cannot_run_is_named_with_its_reason(
     load: Load, tmp_path: Path
 ) -> None:

@@ -81,6 +81,7 @@ def test_a_single_load_shows_no_growth(results: dict[str, Any]) -> None:
     assert len(plot.draw_figure(results).axes) == 4
 
 
+@pytest.mark.slow
 def test_a_plot_is_a_png_and_the_same_each_time(results: dict[str, Any]) -> None:
     drawn = plot.draw(results)
     assert drawn.startswith(b"\x89PNG")

@@ -185,6 +185,7 @@ def test_names_that_are_too_long_or_of_another_script_are_drawn(
     assert sheet.size == contact_sheet(mixed)[0].size
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("damage", "why"),
     [

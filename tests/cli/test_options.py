@@ -20,6 +20,7 @@ RunCommand = Callable[..., tuple[int, str, str]]
 COMMANDS = ("bench", "data", "render", "report", "status", "store", "view")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("command", ["sweep", *COMMANDS])
 def test_help_answers_at_once(
     run_command: RunCommand, tmp_path: Path, without_heavy: str, command: str

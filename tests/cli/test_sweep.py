@@ -79,6 +79,7 @@ def test_photographs_are_hashed_once_for_all_cells_of_a_scene(
     assert len(calls) == 1
 
 
+@pytest.mark.slow
 def test_a_cell_that_fails_leaves_the_others_and_is_not_tried_again(
     sweep_here: SweepHere, children: Any, tmp_path: Path
 ) -> None:
@@ -211,6 +212,7 @@ def test_a_launcher_named_in_an_ablation_is_refused(sweep_here: SweepHere, tmp_p
     assert "a launcher is chosen once for a sweep" in err
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("arguments", "named"),
     [
@@ -296,6 +298,7 @@ def test_a_dry_run_plans_without_torch_and_writes_nothing(
     assert not list(tmp_path.iterdir())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [

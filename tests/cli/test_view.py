@@ -9,12 +9,14 @@ import sys
 import urllib.request
 from pathlib import Path
 
+import pytest
 import torch
 
 from xrgs.splat.gaussians import Gaussians
 from xrgs.splat.ply import save_ply
 
 
+@pytest.mark.slow
 def test_ctrl_c_ends_it_in_order(tmp_path: Path) -> None:
     points = torch.rand(9, 3, generator=torch.Generator().manual_seed(0))
     save_ply(tmp_path / "a.ply", Gaussians.from_points(points, points))

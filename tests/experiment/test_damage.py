@@ -73,6 +73,7 @@ def damage_file(file: Path, damage: str, field: str) -> None:
         file.write_text(json.dumps(content))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("kind", "damage", "field"), CASES)
 def test_a_damaged_file_is_named_by_every_command_and_raises_nothing(
     intact: Path,

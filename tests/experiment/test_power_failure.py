@@ -434,12 +434,14 @@ def recorded_run(attempts: Attempts) -> Recorder:
     return recorder
 
 
+@pytest.mark.slow
 def test_a_cell_is_done_with_all_its_files_or_begins_again(attempts: Attempts) -> None:
     recorder = recorded_run(attempts)
     assert len(recorder.events) > 80
     assert not set(attempts.faults(recorder))
 
 
+@pytest.mark.slow
 def test_a_stopped_cell_loses_no_checkpoint_while_it_is_resumed(
     attempts: Attempts, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -448,6 +450,7 @@ def test_a_stopped_cell_loses_no_checkpoint_while_it_is_resumed(
     assert not set(attempts.faults(recorded_run(attempts), steps=2))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("without", "found"),
     [
@@ -490,6 +493,7 @@ def results(folder: Path) -> Tree:
     }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("damaged", [False, True])
 def test_what_a_cell_had_is_kept_when_it_is_set_aside(attempts: Attempts, damaged: bool) -> None:
     attempts.store.prepare()

@@ -81,6 +81,7 @@ def test_an_interrupted_write_leaves_the_old_file(
     assert list(tmp_path.iterdir()) == [file]
 
 
+@pytest.mark.slow
 def test_the_bounds_of_a_record(tmp_path: Path) -> None:
     store = Store(tmp_path)
     store.prepare()

@@ -230,6 +230,7 @@ def store(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", PARSERS)
 def test_mutated_files_are_read_or_refused(store: Path, tmp_path: Path, name: str) -> None:
     try_files(name, PARSERS[name], store, tmp_path, range(PARSERS[name].count))

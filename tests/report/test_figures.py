@@ -215,6 +215,7 @@ ODD_NAMES = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ODD_NAMES.values(), ids=ODD_NAMES)
 def test_any_name_is_drawn_without_a_warning(name: str) -> None:
     history = pd.DataFrame({"step": [0, 1], "loss": [1.0, 0.5], "gaussians": [1, 2]})

@@ -245,6 +245,7 @@ def test_a_folder_that_cannot_be_written_is_named(made: Any, tmp_path: Path) -> 
         build(made.store.path, out=tmp_path / "file" / "out")
 
 
+@pytest.mark.slow
 def test_another_base_has_a_report_of_its_own_that_names_it(made: Any) -> None:
     for label, psnr in (("baseline", 1.0), ("a/b {x}", 1.25), ("c", 1.5)):
         factors = {"psnr": psnr}
@@ -329,6 +330,7 @@ EVIL = (
 )
 
 
+@pytest.mark.slow
 def test_words_of_a_foreign_store_are_not_obeyed(made: Any) -> None:
     for label in ("baseline", EVIL, f"-{EVIL}"):
         made.add(label, scene=EVIL, condition=EVIL, variant="v", pictures=True, cpu=EVIL)
@@ -398,6 +400,7 @@ def test_cells_csv_has_steps_size_and_factor(made: Any) -> None:
     assert rows == [("700", "250", "3"), ("500", "", "")]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("value", ["inf", "nan", "1e30", "1e-320", "0"])
 def test_extreme_numbers_are_reported_without_a_warning(made: Any, value: str) -> None:
     for label in ("baseline", "consistency"):

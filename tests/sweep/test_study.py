@@ -64,6 +64,7 @@ def planned_cell(conf: config.Conf, seed: int) -> PlannedCell:
     return PlannedCell(spec, conf, "v", identity, cell_id(identity))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("reason", "fail_fast", "said"),
     [

@@ -112,6 +112,7 @@ def test_tensorboard_reads_each_cell(swept: tuple[Store, str]) -> None:
     assert {file: file.stat().st_mtime_ns for file in home.rglob("*")} == before
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore::DeprecationWarning")  # MLflow's own, of SQLAlchemy 2.1
 def test_mlflow_reads_each_cell(swept: tuple[Store, str], monkeypatch: pytest.MonkeyPatch) -> None:
     store, sweep_id = swept

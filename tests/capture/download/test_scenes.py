@@ -176,6 +176,7 @@ def test_a_folder_in_the_way_is_left_alone(
     assert server.asked == []
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("arguments", "named"),
     [

@@ -40,6 +40,7 @@ class Parsed(HTMLParser):
         self.texts.setdefault(self._open, []).append(data)
 
 
+@pytest.mark.slow
 def test_the_same_store_gives_the_same_bytes(copied: Path, page: Path) -> None:
     again = page_of(copied)
     assert again.read_bytes() == page.read_bytes()
@@ -137,6 +138,7 @@ def test_pictures_none_has_the_tables_alone(copied: Path) -> None:
     assert "--pictures none" in page.read_text()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("damaged", "said"),
     [

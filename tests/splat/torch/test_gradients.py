@@ -13,6 +13,7 @@ from xrgs.splat.rendering import rasterize_parameters
 from xrgs.splat.settings import RasterSettings
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("antialiased", [False, True])
 def test_gradients_are_finite_differences_with_the_cuts_off(antialiased: bool) -> None:
     camera = make_camera(6, 5, turned=True)

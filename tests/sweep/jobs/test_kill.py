@@ -183,7 +183,7 @@ def test_a_sweep_killed_again_and_again_ends_as_if_it_had_not_been(
     sweeps_in: Callable[[Path], Any], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     seed = int(os.environ.get("XRGS_KILL_SEED", random.randrange(10**6)))
-    moments = drawn(int(os.environ.get("XRGS_KILLS", "4")), random.Random(seed))
+    moments = drawn(int(os.environ.get("XRGS_KILLS", "2")), random.Random(seed))
     with capsys.disabled():  # whether the test passes or not
         print(f"\nXRGS_KILLS={len(moments)} XRGS_KILL_SEED={seed}", flush=True)  # noqa: T201
     (tmp_path / "killed").mkdir()
