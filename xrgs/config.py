@@ -124,7 +124,7 @@ class GradientScalingConf:
 class DensifyConf:
     """Resolution-aware densification and pruning (paper, section 5.4)."""
 
-    decide: str = off("nobody")
+    decide: str = off("shared")
     lr_grow: float
     lr_prune: float
 

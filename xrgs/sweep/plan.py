@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from xrgs.sweep.estimate import Cost, CostEstimator
 
 #: The condition of cells that hold no view out.
-_TRAINING_VIEWS = "scored on the training views"
+_ON_TRAINING_VIEWS = "scored on the training views"
 
 
 @dataclass(frozen=True)
@@ -101,8 +101,8 @@ def planned(spec: CellSpec, conf: Conf) -> PlannedCell:
     if conf.train.validation:
         key = "train.validation="
         said = said if key in said else f"{said} {key}{conf.train.validation}"
-    elif conf.variant.test_every == 0 and not conf.variant.test and _TRAINING_VIEWS not in said:
-        said = f"{said} {_TRAINING_VIEWS}"
+    elif conf.variant.test_every == 0 and not conf.variant.test and _ON_TRAINING_VIEWS not in said:
+        said = f"{said} {_ON_TRAINING_VIEWS}"
     spec = replace(spec, condition=said.lstrip())
     if conf.matched_to is not None:
         spec = replace(spec, label=f"{spec.label} to {conf.matched_to}")

@@ -48,20 +48,20 @@ class Densify(Component):
         """Take the factors and the rule from the settings; XrgsError if `decide` is unknown."""
         if settings.decide not in DECIDE:
             raise XrgsError(
-                f"components.densify.decide={settings.decide}: must be one of nobody,"
+                f"components.densify.decide={settings.decide}: must be one of shared,"
                 f" {', '.join(DECIDE)}"
             )
         self.settings = settings
 
     @classmethod
     def from_settings(cls, settings: DensifyConf, setup: TrainingSetup) -> Self | None:
-        """Build the component; `decide: nobody` leaves it off."""
+        """Build the component; `decide: shared` leaves it off."""
         del setup
         check_not_negative("components.densify.lr_grow", settings.lr_grow)
         check_not_negative("components.densify.lr_prune", settings.lr_prune)
         if settings.decide == "own_threshold" and settings.lr_grow == 0:
             raise XrgsError("components.densify.lr_grow=0.0: must be above 0 with own_threshold")
-        return None if settings.decide == "nobody" else cls(settings)
+        return None if settings.decide == "shared" else cls(settings)
 
     def densification_groups(self, settings: DensifySettings) -> Groups:
         """Return the thresholds of HR and LR views; HR comes first, and so takes precedence."""
