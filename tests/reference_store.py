@@ -15,7 +15,7 @@ import msgspec
 import numpy as np
 from PIL import Image
 
-from xrgs import composing
+from tests.conftest import composed
 from xrgs.capture import frozen, sealed, variant
 from xrgs.config import Conf
 from xrgs.evaluation.scoring import scoring_code
@@ -90,7 +90,7 @@ def build(path: Path) -> None:
 
 def _conf(label: str, seed: int) -> Conf:
     ablation = () if label == "baseline" else (f"+ablation={label}",)
-    return composing.compose(*ablation, "scene=motorcycle", "preset=smoke", f"seed={seed}")
+    return composed(*ablation, "scene=motorcycle", "preset=smoke", f"seed={seed}")
 
 
 def picture(seed: int, width: int, height: int) -> Image.Image:

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import msgspec
 import numpy as np
 
-from xrgs import composing
+from tests.conftest import composed
 from xrgs.capture import frozen, sealed
 from xrgs.experiment.attempts import begin_attempt, plan_cell
 from xrgs.experiment.schema import Identity, Provenance, RecordedCell, Summary
@@ -79,7 +79,7 @@ def write_variant(variants: Path, key: str = "0123456789abcdef") -> str:
 def begun(cell: CellFolder, conf: Conf | None = None, what: Identity | None = None) -> CellFolder:
     """Begin an attempt at a cell, as a sweep does."""
     cell.path.parent.mkdir(parents=True, exist_ok=True)
-    plan_cell(cell, conf or composing.compose("scene=motorcycle"), what or identity())
+    plan_cell(cell, conf or composed("scene=motorcycle"), what or identity())
     assert begin_attempt(cell)
     return cell
 

@@ -9,8 +9,8 @@ from pathlib import Path
 
 import pytest
 
+from tests.conftest import composed
 from tests.experiment.cells import finished, identity, row, write_variant
-from xrgs import composing
 from xrgs.capture import frozen
 from xrgs.errors import StoreError
 from xrgs.experiment.archive import Packed, pack
@@ -30,7 +30,7 @@ def store(tmp_path: Path) -> Store:
     variant_id = write_variant(store.variants)
     (store.variants / variant_id / frozen.LOG).write_text(f"{tmp_path}: matched")
     for name, path in zip(CELLS, (f"{tmp_path}/data/fern", "/elsewhere/horns"), strict=True):
-        conf = composing.compose("scene=folder", f"scene.path={path}", f"store='{store.path}'")
+        conf = composed("scene=folder", f"scene.path={path}", f"store='{store.path}'")
         cell = finished(store.cell(name), conf, identity(0, variant_id))
         (cell.path / "log.txt").write_text(f"{tmp_path}: begun")
     command = ["+ablation=x,y", f"scene.path={tmp_path}/data/fern,/elsewhere/horns", "threads=1"]

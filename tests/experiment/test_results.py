@@ -12,8 +12,8 @@ import msgspec
 import pytest
 import torch
 
+from tests.conftest import composed
 from tests.experiment.cells import SCORES, begun, finished, identity, row
-from xrgs import composing
 from xrgs.capture import dataset, variant
 from xrgs.capture.variant import CorruptVariant
 from xrgs.errors import StoreError, XrgsError
@@ -24,7 +24,7 @@ from xrgs.splat.ply import save_ply
 
 
 def finished_in(store: Store, cell_id: str, *overrides: str, seed: int = 0) -> CellFolder:
-    conf = composing.compose("scene=motorcycle", f"seed={seed}", *overrides)
+    conf = composed("scene=motorcycle", f"seed={seed}", *overrides)
     return finished(store.cell(cell_id), conf, identity(seed))
 
 

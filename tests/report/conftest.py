@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from xrgs import composing
+from tests.conftest import composed
 from xrgs.evaluation.scoring import scoring_code
 from xrgs.experiment.attempts import begin_attempt
 from xrgs.experiment.cell_folder import CellFolder
@@ -50,7 +50,7 @@ PROVENANCE = Provenance(
 @cache
 def baseline_config() -> dict[str, Any]:
     """The baseline's config as it is in a cell's folder."""
-    return asdict(composing.compose())
+    return asdict(composed())
 
 
 def configured(cell: CellFolder, **changes: dict[str, Any]) -> None:

@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-import copy
-import functools
-from collections.abc import Callable
 from typing import Any
 
 import pytest
 import torch
 
-from xrgs import composing
+from tests.conftest import composed as compose
 from xrgs.config import Conf
 from xrgs.splat.gaussians import PARAMETERS, Gaussians
 from xrgs.training.recorder import TrainingResult
@@ -27,20 +24,6 @@ def comparable(result: TrainingResult) -> dict[str, Any]:
     others = {name: value for name, value in vars(result).items() if name != "gaussians"}
     columns = [list(row) for row in result.history]
     return parameters | others | {"seconds": None, "stage_seconds": None, "columns": columns}
-
-
-_composed = functools.cache(composing.compose)
-
-
-def compose(*overrides: str) -> Conf:
-    """A copy of the config: Hydra composes the same overrides once."""
-    return copy.deepcopy(_composed(*overrides))
-
-
-@pytest.fixture(scope="session", name="compose")
-def composed() -> Callable[..., Conf]:
-    """`compose` in the place of the root's fixture, for `baseline`."""
-    return compose
 
 
 @pytest.fixture
