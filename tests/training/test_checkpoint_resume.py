@@ -16,7 +16,8 @@ import torch
 from hypothesis import Phase, example, given, settings
 from hypothesis import strategies as st
 
-from tests.training.conftest import comparable, compose
+from tests.conftest import composed as compose
+from tests.training.conftest import comparable
 from xrgs.capture.dataset import Dataset
 from xrgs.config import Conf
 from xrgs.splat.loss import photometric_loss

@@ -12,7 +12,8 @@ from typing import Any
 import pytest
 import torch
 
-from tests.training.conftest import compose, same
+from tests.conftest import composed as compose
+from tests.training.conftest import same
 from xrgs.capture.dataset import USES, Dataset
 from xrgs.config import CONF_DIR, Conf
 from xrgs.splat.gaussians import ActivatedGaussians, Gaussians, from_points

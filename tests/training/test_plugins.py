@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from tests.training.conftest import compose
+from tests.conftest import composed as compose
 from xrgs.capture.dataset import Dataset
 from xrgs.composing import from_dict
 from xrgs.config import Conf

@@ -8,7 +8,7 @@ from types import SimpleNamespace
 import pytest
 import torch
 
-from tests.training.conftest import compose
+from tests.conftest import composed as compose
 from xrgs.capture.dataset import Dataset
 from xrgs.config import Conf
 from xrgs.splat.gaussians import Gaussians, from_points

@@ -9,7 +9,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from tests.training.conftest import compose
+from tests.conftest import composed as compose
 from xrgs.capture.dataset import Dataset
 from xrgs.config import ComponentsConf
 from xrgs.splat.gaussians import Gaussians

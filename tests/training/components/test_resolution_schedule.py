@@ -11,8 +11,9 @@ import pytest
 import torch
 from torch.nn.functional import interpolate
 
+from tests.conftest import composed as compose
 from tests.splat.scenes import noise
-from tests.training.conftest import compose, same
+from tests.training.conftest import same
 from xrgs.capture.dataset import Dataset, LoadedView
 from xrgs.config import ComponentsConf, Conf
 from xrgs.errors import XrgsError

@@ -9,7 +9,8 @@ from dataclasses import replace
 import pytest
 import torch
 
-from tests.training.conftest import compose, same
+from tests.conftest import composed as compose
+from tests.training.conftest import same
 from xrgs.capture.dataset import Dataset
 from xrgs.config import ComponentsConf, Conf
 from xrgs.splat.gaussians import Gaussians

@@ -11,8 +11,8 @@ import torch
 from scipy.ndimage import correlate
 from torch import Tensor
 
+from tests.conftest import composed as compose
 from tests.splat.scenes import noise
-from tests.training.conftest import compose
 from xrgs.capture.dataset import Dataset, LoadedView
 from xrgs.config import ComponentsConf
 from xrgs.splat.attribution import attribute_pixels
