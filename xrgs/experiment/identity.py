@@ -133,17 +133,11 @@ def code_now(
     backend: str, components: tuple[str, ...] = (), plugin_names: tuple[str, ...] = ()
 ) -> dict[str, str]:
     """Return `training_code` of the files as they are now, edited meanwhile or not."""
-    exact = _exact(backend, components)
-    code = {part: canonical(part, of_part) for part, of_part in exact.items()}
-    return code | {f"plugins/{name}": plugins.code_digest(name) for name in plugin_names}
-
-
-def _exact(backend: str, components: tuple[str, ...]) -> dict[str, str]:
-    """Return the digest of each part of the code, and the order of the components' hooks."""
     files = _files(backend, components)
-    code = {part: code_digest(*names) for part, names in files.items()}
-    order = order_of(components)
-    return code | {"order": order} if order else code
+    code = {part: canonical(part, code_digest(*names)) for part, names in files.items()}
+    if order := order_of(components):  # of the components' hooks
+        code["order"] = order
+    return code | {f"plugins/{name}": plugins.code_digest(name) for name in plugin_names}
 
 
 def _files(backend: str, components: tuple[str, ...]) -> dict[str, tuple[str, ...]]:
@@ -182,8 +176,9 @@ def changed_code(identity: Identity, *, cached: bool = False) -> list[str]:
         XrgsError: A plugin is not installed.
     """
     now = current_code(identity, cached=cached)
-    parts = identity.code.keys() | now.keys()
-    return sorted(part for part in parts if identity.code.get(part) != now.get(part))
+    trained = {part: canonical(part, code) for part, code in identity.code.items()}
+    parts = trained.keys() | now.keys()
+    return sorted(part for part in parts if trained.get(part) != now.get(part))
 
 
 def current_code(identity: Identity, *, cached: bool = False) -> dict[str, str]:
@@ -191,8 +186,3 @@ def current_code(identity: Identity, *, cached: bool = False) -> dict[str, str]:
     names = tuple(sorted(identity.components.get("plugins", {})))
     code = training_code if cached else code_now
     return code(str(identity.splat["backend"]), tuple(identity.components), names)
-
-
-def exact_code(identity: Identity) -> dict[str, str]:
-    """Return `current_code` without declared refactorings and plugins."""
-    return _exact(str(identity.splat["backend"]), tuple(identity.components))

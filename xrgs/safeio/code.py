@@ -85,7 +85,7 @@ def meaning(text: str, suffix: str) -> str:
 
     Args:
         text: The source code.
-        suffix: `.py`, `.cpp`, `.h`, `.cu` or `.txt` (CMake); other text is returned as it is.
+        suffix: `.py`, `.cpp`, `.h` or `.txt` (CMake); other text is returned as it is.
     """
     if suffix == ".py":
         text = _cut(text, _python_spans(text))

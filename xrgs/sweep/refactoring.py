@@ -82,13 +82,12 @@ def prove(store: Store, cells: Sequence[CellFolder], sample: int = 2) -> Proof:
 def _changes(cell: CellFolder) -> list[_Change]:
     """Return the parts of the code that a cell was trained with and that have changed since."""
     trained = cell.identity()
-    now, exact = identity.current_code(trained), identity.exact_code(trained)
-    changed = identity.changed_code(trained)
+    now, changed = identity.current_code(trained), identity.changed_code(trained)
     if any(part.startswith("plugins/") for part in changed):
         raise XrgsError(f"{cell.id}: a plugin has changed, which is no part of this package")
     if new := [part for part in changed if part not in trained.code or part not in now]:
         raise XrgsError(f"{cell.id}: {', '.join(new)} is not in both versions of the code")
-    return [(part, trained.code[part], exact[part]) for part in changed]
+    return [(part, trained.code[part], now[part]) for part in changed]
 
 
 def _train_again(store: Store, cell: CellFolder) -> None:
