@@ -27,16 +27,21 @@ _MIN_HR_LEFT = 2
 
 @dataclass(frozen=True)
 class LoadedView:
-    """One view in memory."""
+    """One view in memory, with its photograph in 8 bits: a quarter of what float32 takes."""
 
     name: str
     tag: str
     """`HR` or `LR`."""
     camera: Camera
-    image: torch.Tensor
-    """[H, W, 3] float32 in 0..1."""
+    pixels: torch.Tensor
+    """[H, W, 3], uint8 as the file has them; floats are taken as they are, in 0..1."""
     rho: float = 1.0
     """The relative sampling rate in (0, 1], see `xrgs.capture.views.View`."""
+
+    @property
+    def image(self) -> torch.Tensor:
+        """The photograph [H, W, 3] in 0..1: a new float32 tensor of `pixels` / 255."""
+        return self.pixels if self.pixels.is_floating_point() else self.pixels.float() / 255
 
 
 @dataclass(frozen=True)
@@ -176,5 +181,6 @@ def _load_view(view: View, viewmat: NDArray[np.float64]) -> LoadedView:
         width=view.width,
         height=view.height,
     )
-    image = torch.from_numpy(images.read_png(view.file, (view.width, view.height)))
-    return LoadedView(view.name, view.tag, camera, image, view.rho)
+    # A copy, since the array of PIL's memory is read-only.
+    pixels = np.array(images.read_png_pil(view.file, (view.width, view.height)))
+    return LoadedView(view.name, view.tag, camera, torch.from_numpy(pixels), view.rho)
