@@ -45,6 +45,10 @@ class Scene:
     viewmats: Mapping[str, NDArray[np.float64]] = field(default_factory=dict)
     """Exact world-to-camera matrices [4, 4]. SfM never gets them: its poses are compared with
     them."""
+    masks: Mapping[str, Path] = field(default_factory=dict)
+    """The mask of each photograph that has one; white is used."""
+    notes: tuple[str, ...] = ()
+    """Sentences on what was left out of the scene, for the variant's report."""
 
 
 class SceneKind(Protocol):
