@@ -10,11 +10,12 @@ from __future__ import annotations
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import IO, TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, ImageOps
+from PIL.PngImagePlugin import PngInfo
 
 from xrgs.errors import UnreadableError, XrgsError
 from xrgs.safeio.atomic import atomic_writer
@@ -28,6 +29,10 @@ ImageArray = NDArray[np.float32]  # [H, W, 3]
 #: The formats that are read. PIL goes by the content of a file and not by its suffix, and it hands
 #: some of the other formats that it knows to external programs.
 _FORMATS = ("BMP", "HEIF", "JPEG", "PNG", "TIFF", "WEBP")
+#: The suffixes of HEIC files, in lower case.
+HEIC = frozenset({".heic", ".heif", ".hif"})
+#: What the PNGs of this package have in their text chunk `Software`.
+SOFTWARE = "xrgs"
 #: What a HEIC file has after its first four bytes, as other files of its container do.
 _HEIF_MAGIC = b"ftyp"
 #: The largest photograph that is read: cameras give 200 megapixels, and PIL takes 1 GB for this.
@@ -104,6 +109,41 @@ def size(path: Path) -> tuple[int, int]:
     with _opened(path) as image:
         transposed = image.getexif().get(_EXIF_ORIENTATION, 1) >= 5
         return (image.height, image.width) if transposed else (image.width, image.height)
+
+
+def is_own(path: Path) -> bool:
+    """Return whether a file is a PNG that this package wrote: a render, a film's frame, a figure.
+
+    Raises:
+        UnreadableError: The file can't be read now.
+        ImageError: The file is not a PNG.
+    """
+    with _opened(path, ("PNG",)) as image:
+        return image.info.get("Software") == SOFTWARE
+
+
+def has_colour(path: Path) -> bool:
+    """Return whether a file's pixels have three channels or more; masks and depth maps have one.
+
+    Raises:
+        UnreadableError: The file can't be read now.
+        ImageError: The file is not an image.
+    """
+    with _opened(path) as image:
+        return len(image.getbands()) >= 3
+
+
+def thumbnail(path: Path, side: int) -> NDArray[np.uint8]:
+    """Read a small grey picture of a photograph, [side, side], upright by its EXIF orientation.
+
+    Raises:
+        UnreadableError: The file can't be read now.
+        ImageError: The file is unreadable or truncated.
+    """
+    with _opened(path) as image:
+        image.draft("RGB", (8 * side, 8 * side))  # JPEGs are decoded at down to an eighth
+        upright = ImageOps.exif_transpose(image).convert("RGB").convert("L")
+        return np.asarray(upright.resize((side, side), Image.Resampling.BOX))
 
 
 def exif_camera(path: Path) -> str:
@@ -200,7 +240,14 @@ def save(path: Path, image: ImageArray, *, durable: bool = True) -> None:
     """
     path.parent.mkdir(exist_ok=True)  # not parents: a store that vanished stays away
     with atomic_writer(path, durable=durable) as stream:
-        Image.fromarray(to_8_bit(image)).save(stream, "PNG", compress_level=4)
+        write_png(stream, Image.fromarray(to_8_bit(image)))
+
+
+def write_png(stream: IO[bytes], image: Image.Image) -> None:
+    """Write a PNG that `is_own` recognises, so that no render is taken for a photograph."""
+    text = PngInfo()
+    text.add_text("Software", SOFTWARE)
+    image.save(stream, "PNG", compress_level=4, pnginfo=text)
 
 
 def to_8_bit(image: ImageArray) -> NDArray[np.uint8]:
