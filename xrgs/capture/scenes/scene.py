@@ -45,6 +45,14 @@ class Scene:
     viewmats: Mapping[str, NDArray[np.float64]] = field(default_factory=dict)
     """Exact world-to-camera matrices [4, 4]. SfM never gets them: its poses are compared with
     them."""
+    masks: Mapping[str, Path] = field(default_factory=dict)
+    """The mask of each photograph that has one; white is used."""
+    alpha: str = "composite"
+    """What transparent pixels are: laid over `background`, or outside a `mask`."""
+    background: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    """RGB in 0..1."""
+    notes: tuple[str, ...] = ()
+    """Sentences on what was left out of the scene, for the variant's report."""
 
 
 class SceneKind(Protocol):
