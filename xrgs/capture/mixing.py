@@ -212,7 +212,7 @@ def _tags_report(inputs: _Inputs, views: tuple[View, ...]) -> dict[str, Any]:
         for tag in ("HR", "LR")
     }
     return {
-        "notes": [*inputs.scene.notes, *_split_notes(inputs, rates)],
+        "notes": _split_notes(inputs, rates),
         "tags": inputs.conf.tags,
         "degradation": resolve_degradation(inputs.conf),
         "tests": len(split.test),

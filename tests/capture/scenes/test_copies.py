@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import io
 import shutil
-from collections.abc import Callable
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -243,7 +242,7 @@ def test_of_heic_and_jpeg_of_one_name_one_is_taken(
     heif.from_pillow(picture(0)).save(tmp_path / "IMG_0.HEIC", quality=60)
     if not readable:
         monkeypatch.setattr(folder, "find_spec", lambda _: None)
-        monkeypatch.setitem(__import__("sys").modules, "pillow_heif", None)
+        monkeypatch.setitem(sys.modules, "pillow_heif", None)
     found = folder.look(str(tmp_path), 0)
     assert names(tmp_path, found) == ORIGINALS
     assert "IMG_0.HEIC (as IMG_0.jpg)" in found.notes[0]
