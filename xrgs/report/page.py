@@ -164,7 +164,9 @@ def build(
 
 def _tables(sweep: Sweep, against: str) -> Tables:
     """Compare the cells of a sweep."""
-    comparison = compare(sweep.cells, METRICS, against)
+    cells = sweep.cells
+    metrics = [m for m in METRICS if not m.optional or cells[m.name].notna().any()]
+    comparison = compare(cells, metrics, against)
     return Tables(comparison, contexts(sweep), decided_by_one_view(comparison, sweep.views))
 
 
