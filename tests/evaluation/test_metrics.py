@@ -45,7 +45,7 @@ def pair(height: int = 40, width: int = 53) -> tuple[Tensor, Tensor]:
 
 
 def ssim_map_by_definition(image: Tensor, target: Tensor) -> np.ndarray:
-    """Wang et al. 2004 in float64: 11 taps, sigma 1.5, data range 1, borders mirrored; [H, W, 3]."""
+    """[H, W, 3] of Wang et al. 2004 in float64: 11 taps, sigma 1.5, range 1, borders mirrored."""
     taps = np.exp(-(np.arange(-5, 6) ** 2) / (2 * 1.5**2))
     window = np.outer(taps, taps) / taps.sum() ** 2
 

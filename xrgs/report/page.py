@@ -164,9 +164,7 @@ def build(
 
 def _tables(sweep: Sweep, against: str) -> Tables:
     """Compare the cells of a sweep."""
-    cells = sweep.cells
-    metrics = [m for m in METRICS if not m.optional or cells[m.name].notna().any()]
-    comparison = compare(cells, metrics, against)
+    comparison = compare(sweep.cells, METRICS, against)
     return Tables(comparison, contexts(sweep), decided_by_one_view(comparison, sweep.views))
 
 
@@ -361,7 +359,8 @@ def _stale_warning(sweep: Sweep) -> list[str]:
     if stale.empty:
         return []
     names = {name for text in stale["stale"] for name in text.split()}
-    scores = [m.label for m in METRICS if m.score and names & {m.name, PROTOCOL}]
+    always = [m for m in METRICS if m.score and not m.optional]
+    scores = [m.label for m in always if names & {m.name, PROTOCOL}]
     return [
         f"The scores of {counted(len(stale), 'cell')} are missing or of other code than is"
         f" installed ({', '.join(scores)}): xrgs-store rescore computes them. A score is compared"

@@ -81,5 +81,7 @@ def score_view(
         Each score by its metric's name; None where it can't be computed or does not apply.
     """
     if masked and mask is None:
-        mask = target.new_ones(target.shape[:2], dtype=bool)
+        import torch
+
+        mask = torch.ones(target.shape[:2], dtype=torch.bool)
     return {name: score(image, target, mask) for name, score in VIEW_METRICS.items()}
