@@ -281,19 +281,36 @@ def read_png(
     return _to_array(read_png_pil(path, size, max_pixels))
 
 
+def read_mask(path: Path, size: tuple[int, int]) -> NDArray[np.bool_]:
+    """Read a mask of a store, a PNG as `save_mask` writes it: [H, W], True for a used pixel.
+
+    Args:
+        path: The file.
+        size: The width and height that it must have, px.
+
+    Raises:
+        UnreadableError: The file can't be read now.
+        ImageError: The file is not such a PNG.
+    """
+    mask: NDArray[np.bool_] = np.asarray(read_png_pil(path, size, mode="L")) > 127
+    return mask
+
+
 def read_png_pil(
     path: Path,
     size: tuple[int, int] | None = None,
     max_pixels: int = MAX_PNG_PIXELS,
+    mode: str = "RGB",
 ) -> Image.Image:
-    """Read a PNG as `read_png` does, into an image of PIL of mode RGB."""
+    """Read a PNG as `read_png` does, into an image of PIL of mode RGB, or L for grey."""
     with _opened(path, ("PNG",), max_pixels) as image:
         if size is not None and image.size != size:
             raise ValueError(
                 f"it has {image.width} x {image.height} pixels, not {size[0]} x {size[1]}"
             )
-        if image.mode != "RGB":
-            raise ValueError(f"its pixels are {image.mode}, not 8-bit RGB")
+        if image.mode != mode:
+            kind = "RGB" if mode == "RGB" else "grey"
+            raise ValueError(f"its pixels are {image.mode}, not 8-bit {kind}")
         _check_expansion(path, image)
         image.load()
         return image
@@ -329,6 +346,13 @@ def write_png(stream: IO[bytes], image: Image.Image) -> None:
     text = PngInfo()
     text.add_text("Software", SOFTWARE)
     image.save(stream, "PNG", compress_level=4, pnginfo=text)
+
+
+def save_mask(path: Path, mask: NDArray[np.bool_], *, durable: bool = True) -> None:
+    """Write a mask [H, W] as `save` writes an image: 8-bit grey, 255 where it is True."""
+    path.parent.mkdir(exist_ok=True)
+    with atomic_writer(path, durable=durable) as stream:
+        Image.fromarray(mask.astype(np.uint8) * 255).save(stream, "PNG", compress_level=4)
 
 
 def to_8_bit(image: ImageArray) -> NDArray[np.uint8]:
