@@ -97,15 +97,16 @@ class Lens:
         return source
 
 
-def undistort(image: ImageArray, lens: Lens) -> ImageArray:
-    """Resample a photograph to the image of `lens.undistorted()`, by cubic spline interpolation.
+def undistort(image: ImageArray, lens: Lens, order: int = 3) -> ImageArray:
+    """Resample a photograph to the image of `lens.undistorted()`, by spline interpolation.
 
     Args:
-        image: The photograph, [H, W, 3] in 0..1.
+        image: The photograph, [H, W, C] in 0..1.
         lens: Its camera, of the same size.
+        order: The order of the spline: 3 for photographs, 1 for masks.
 
     Returns:
-        The undistorted image [H, W, 3], not clamped; the image itself where the lens has k = 0.
+        The undistorted image [H, W, C], not clamped; the image itself where the lens has k = 0.
 
     Raises:
         ValueError: The image and the lens differ in size.
@@ -120,7 +121,7 @@ def undistort(image: ImageArray, lens: Lens) -> ImageArray:
     zoom = lens.undistorted().fx / lens.fx
     source = lens.source_pixels(np.stack([columns, rows], -1), zoom) - 0.5  # [H, W, 2]
     coords = source[..., ::-1].transpose(2, 0, 1)  # [2, H, W] row, column
-    bands = [warp(image[..., c], coords, order=3, mode="edge") for c in range(3)]
+    bands = [warp(image[..., c], coords, order=order, mode="edge") for c in range(image.shape[2])]
     return np.stack(bands, axis=-1).astype(np.float32)
 
 

@@ -13,7 +13,7 @@ import numpy as np
 from msgspec import Struct
 
 from xrgs.capture import frozen, images, scenes, sealed
-from xrgs.capture.lens import Lens, undistort
+from xrgs.capture.lens import Lens
 from xrgs.capture.photographs import prepare_hr_views, write_degraded
 from xrgs.errors import StoreError
 from xrgs.runtime.progress import progress
@@ -79,15 +79,18 @@ def _write_images(
     for entry in progress(entries, "undistorting", "view"):
         number = numbers[entry.name]
         is_low = entry.split == "train" and number in degraded
-        image = photos.read("lr" if is_low else "hr", number)
-        size = image.shape[1], image.shape[0]
+        kind = "lr" if is_low else "hr"
+        size = photos.size(kind, number)
         if size not in by_size:
             by_size[size] = _by_intrinsics([lens.resized(*size) for lens in lenses])
         lens = by_size[size].get(np.array(entry.K, dtype=np.float64).tobytes())
         if lens is None:
             file = folder / frozen.REPORT
             raise StoreError(f"damaged: {file}: lenses: none is of view {entry.name}")
-        images.save(folder / entry.file, undistort(image, lens), durable=False)
+        image, used = photos.undistorted(kind, number, lens)
+        images.save(folder / entry.file, image, durable=False)
+        if used is not None and entry.mask is not None:
+            images.save_mask(folder / entry.mask, used, durable=False)
 
 
 def _by_intrinsics(lenses: Sequence[Lens]) -> dict[bytes, Lens]:

@@ -154,7 +154,7 @@ def _check_headers(conf: Conf) -> None:
     """
     if conf.scene.kind != "folder":
         return
-    files = folder.list_photographs(conf.scene.path, conf.variant.long_side)
+    files = folder.list_photographs(conf.scene.path, conf.variant.long_side, conf.scene.masks)
     reasons = []
     for file in files.values():
         try:
