@@ -121,7 +121,7 @@ def test_the_core_changes_every_key_and_poses_those_of_given_poses(
         (tmp_path / f"{name}.txt").write_text("")
     given = configured(poses=str(tmp_path))
     before, before_given = keys(), variant.key(SCENE, given)
-    with (package / "capture/poses.py").open("a") as stream:
+    with (package / "capture/poses/colmap.py").open("a") as stream:
         stream.write("LATER = 1\n")
     assert keys() == before
     assert variant.key(SCENE, given) != before_given

@@ -1,9 +1,9 @@
-"""Reads and writes COLMAP's models, and points as .ply, with pycolmap."""
+"""Writes COLMAP's models with pycolmap; reads and writes points as .ply."""
 
 from __future__ import annotations
 
 import zlib  # noqa: F401  pycolmap 4.2.1 corrupts the heap where it is imported before zlib
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -13,6 +13,9 @@ from numpy.typing import NDArray
 
 from xrgs.capture import sfm
 from xrgs.errors import XrgsError
+
+#: The colour of points without one.
+GREY = 128
 
 
 @dataclass(frozen=True)
@@ -27,26 +30,6 @@ class PinholeImage:
     """Intrinsics [3, 3], px."""
     viewmat: NDArray[np.float64]
     """World to camera [4, 4], OpenCV axes."""
-
-
-def read_model(
-    folder: Path, match: Callable[[Sequence[str]], Mapping[str, int]]
-) -> sfm.Reconstruction:
-    """Read a model of COLMAP, binary or text: the cameras of wanted images, and all points.
-
-    Args:
-        folder: The folder of `cameras`, `images` and `points3D`.
-        match: Returns the index of each wanted image by its name, from all names that have a pose.
-
-    Raises:
-        XrgsError: The files are no model, or a camera model is not supported.
-    """
-    try:
-        model = pycolmap.Reconstruction(folder)
-    except (RuntimeError, ValueError, IndexError) as error:
-        raise XrgsError(f"not a model of COLMAP ({error})") from error
-    names = [image.name for image in model.images.values() if image.has_pose]
-    return sfm.to_numpy(model, match(names), {})
 
 
 def read_points(file: Path) -> tuple[NDArray[np.float64], NDArray[np.uint8]]:

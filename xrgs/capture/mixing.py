@@ -19,7 +19,7 @@ import numpy as np
 from xrgs.capture import images, poses, registration, sampling
 from xrgs.capture.alignment import pose_error
 from xrgs.capture.degradations import resolve_degradation
-from xrgs.capture.lens import undistort
+from xrgs.capture.lens import Lens, undistort
 from xrgs.capture.photographs import PhotoCollection, prepare_hr_views, write_degraded
 from xrgs.capture.registration import Registration
 from xrgs.capture.split import Split, check_variant_conf, split_views
@@ -87,6 +87,7 @@ def mix_resolutions(scene: Scene, conf: VariantConf, work: Path, out: Path) -> V
         write_degraded(photos, inputs.degraded, conf)
     views = _write_undistorted(inputs, model, depths, out)
     report |= _tags_report(inputs, views)
+    report["notes"] = [*model.report.get("notes", ()), *report["notes"]]
     for note in report["notes"]:
         _log.warning("scene %s: %s", scene.name, note)
     report["seconds"] = round(time.perf_counter() - start, 1)
@@ -177,8 +178,16 @@ def _sfm_report(inputs: _Inputs, model: Reconstruction) -> dict[str, Any]:
         "cameras": len({photo.camera for photo in photos.all}),
         "unreadable": list(photos.unreadable),
         "not_registered": [n for i, n in enumerate(photos.names) if i not in model.viewmats],
-        "lenses": [asdict(lens) for lens in sorted(set(model.lenses.values()), key=repr)],
+        "lenses": _lens_report(photos, model),
     }
+
+
+def _lens_report(photos: PhotoCollection, model: Reconstruction) -> list[dict[str, Any]]:
+    """Report each camera once, with the names of its photographs."""
+    names: dict[Lens, list[str]] = {}
+    for i, lens in sorted(model.lenses.items()):
+        names.setdefault(lens, []).append(photos.names[i])
+    return [{"lens": asdict(lens), "views": views} for lens, views in names.items()]
 
 
 def _pose_report(inputs: _Inputs, model: Reconstruction, work: Path) -> dict[str, Any]:

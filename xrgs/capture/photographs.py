@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from xrgs.capture import images
 from xrgs.capture.degradations import DEGRADATIONS, resolve_degradation
-from xrgs.capture.lens import Lens
+from xrgs.capture.lens import Lens, lens_of_model
 from xrgs.capture.split import HrGeometry, hr_geometry, shrink_factor
 from xrgs.errors import XrgsError
 from xrgs.runtime.progress import progress
@@ -41,6 +41,8 @@ class Photograph:
     """The name of its camera; photographs with one name share the camera in SfM."""
     K: NDArray[np.float64] | None
     """Intrinsics [3, 3] of the file, px, where they are known; then there is no distortion."""
+    path: Path
+    """The file."""
 
     @property
     def lens(self) -> Lens | None:
@@ -48,18 +50,13 @@ class Photograph:
         if self.K is None:
             return None
         K = self.K
-        return self.to_hr(Lens(*self.size, K[0, 0], K[1, 1], K[0, 2], K[1, 2]))
+        params = (K[0, 0], K[1, 1], K[0, 2], K[1, 2])
+        return self.to_hr(lens_of_model("PINHOLE", self.size, params))
 
     def to_hr(self, lens: Lens) -> Lens:
         """Return the camera of the HR view; `lens` is of the whole photograph, at any size."""
-        left, top = self.hr.crop_offset
-        resized = lens.resized(*self.hr.resized)
-        return replace(
-            resized,
-            width=self.hr.width,
-            height=self.hr.height,
-            cx=resized.cx - left,
-            cy=resized.cy - top,
+        return lens.resized(*self.hr.resized).cropped(
+            *self.hr.crop_offset, self.hr.width, self.hr.height
         )
 
 
@@ -149,8 +146,10 @@ def prepare_hr_views(scene: Scene, conf: VariantConf, work: Path) -> PhotoCollec
     files = [scene.files[name] for name in geometries]
     cameras = assign_cameras(files, [sizes[name] for name in geometries], conf.sfm.camera)
     photos = (
-        Photograph(name, f"{i:05d}", sizes[name], hr, camera, scene.intrinsics.get(name))
-        for i, ((name, hr), camera) in enumerate(zip(geometries.items(), cameras, strict=True))
+        Photograph(name, f"{i:05d}", sizes[name], hr, camera, scene.intrinsics.get(name), path)
+        for i, ((name, hr), camera, path) in enumerate(
+            zip(geometries.items(), cameras, files, strict=True)
+        )
     )
     return PhotoCollection(tuple(photos), work, messages)
 
