@@ -43,6 +43,8 @@ class SceneConf:
     kind: str
     path: str | None
     views: int
+    alpha: str
+    background: tuple[float, float, float]
 
 
 @dataclass(kw_only=True)

@@ -215,5 +215,7 @@ def test_a_camera_that_is_not_served_is_named(
 
 
 def test_a_lens_that_folds_at_every_zoom_is_refused() -> None:
-    with pytest.raises(XrgsError, match="SIMPLE_RADIAL: it can't be undistorted, because its distortion folds"):
+    with pytest.raises(
+        XrgsError, match="SIMPLE_RADIAL: it can't be undistorted, because its distortion folds"
+    ):
         simple(-500.0).undistorted()

@@ -13,6 +13,7 @@ import pytest
 from PIL import Image
 from plyfile import PlyData, PlyElement
 
+from tests.capture.scene_confs import scene_conf
 from xrgs.capture import frozen, restore
 from xrgs.capture.scenes import procedural
 from xrgs.capture.views import Variant
@@ -110,8 +111,8 @@ def test_photographs_that_changed_and_are_missing_are_named(
 ) -> None:
     photographs = tmp_path / "photographs"
     photographs.mkdir()
-    scene = SceneConf(name="motorcycle", kind="folder", path=str(photographs), views=24)
-    conf = small_conf(SceneConf(name="motorcycle", kind="motorcycle", path=None, views=24))
+    scene = scene_conf("folder", photographs, name="motorcycle")
+    conf = small_conf(scene_conf("motorcycle", name="motorcycle"))
     folder = without_images(stereo_variant, tmp_path / stereo_variant.id)
     with pytest.raises(XrgsError, match="photographs"):
         made_again(folder, scene, conf)

@@ -11,15 +11,16 @@ from typing import TYPE_CHECKING
 
 import pytest
 
+from tests.capture.scene_confs import scene_conf
 from xrgs.capture import degradations, scenes, tags, variant
-from xrgs.config import SceneConf, VariantConf
+from xrgs.config import VariantConf
 from xrgs.safeio import code
 
 if TYPE_CHECKING:
     from xrgs.capture.images import ImageArray
 
 Make = Callable[..., VariantConf]
-SCENE = SceneConf(name="motorcycle", kind="motorcycle", path=None, views=24)
+SCENE = scene_conf("motorcycle", name="motorcycle")
 #: Settings that use each part of the code once or not at all.
 CHANGES = {
     "downsample": {"degradation": "downsample"},

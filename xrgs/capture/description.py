@@ -56,7 +56,6 @@ class SfmReport(Struct):
     hr: tuple[str, ...] = ()
     lr: tuple[str, ...] = ()
     not_registered: tuple[str, ...] = ()
-    unreadable: tuple[str, ...] = ()
 
 
 def describe(folder: Path, out: Path | None = None) -> str:
@@ -141,9 +140,8 @@ def _sfm(report: SfmReport) -> Iterator[str]:
         if rates := report.rho.get(tag):
             numbers = ", ".join(f"{rate:.3f}" for rate in rates)
             yield f"  rho of {tag}: {numbers} (least, median, most)"
-    for names, label in ((report.not_registered, "not placed"), (report.unreadable, "unreadable")):
-        if names:
-            yield f"  {label}: {', '.join(names)}"
+    if report.not_registered:
+        yield f"  not placed: {', '.join(report.not_registered)}"
 
 
 def _pose(error: dict[str, float]) -> Iterator[str]:

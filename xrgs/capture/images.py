@@ -7,8 +7,9 @@ Nothing here imports torch before `resize` is called.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -37,6 +38,10 @@ MAX_PNG_PIXELS = 1 << 26
 #: Deflate, the compression of PNGs, makes at most 1032 bytes of one, and no photograph of any
 #: format shrinks as much. A drawing may; up to so many pixels it takes little memory.
 _MAX_EXPANSION, _SMALL_PIXELS = 1032, 1 << 24
+#: With `scene.alpha=mask`, pixels of a lower alpha are outside. Our choice.
+OPAQUE_FROM = 0.5
+#: The formats that PIL turns upright by itself. The tag of a TIFF stays until it is loaded.
+_UPRIGHT = ("HEIF", "TIFF")
 _EXIF_ORIENTATION = 0x0112
 _EXIF_CAMERA = (0x010F, 0x0110)  # make, model
 _EXIF_DETAILS = 0x8769
@@ -92,18 +97,64 @@ def _known(formats: tuple[str, ...], stream: BinaryIO) -> tuple[str, ...]:
     return formats
 
 
-def size(path: Path) -> tuple[int, int]:
-    """Return the width and height of a photograph, px, after the EXIF orientation is applied.
+@dataclass(frozen=True)
+class Header:
+    """What a file says of its photograph before the pixels are decoded."""
 
-    Most formats have them in the header.
+    size: tuple[int, int]
+    """Width and height with the EXIF orientation applied, px."""
+    orientation: int
+    """The EXIF orientation, 1 to 8; 1 where the tag is missing or invalid."""
+    is_deep_grey: bool
+    """Whether it has one channel of more than 8 bits, as depth maps have."""
+
+
+@dataclass(frozen=True)
+class Picture:
+    """A decoded photograph."""
+
+    pixels: ImageArray
+    """[H, W, 3] sRGB in 0..1, upright; not multiplied by alpha."""
+    alpha: NDArray[np.float32] | None
+    """[H, W] in 0..1; None where every pixel is opaque."""
+    orientation: int
+    """The EXIF orientation that was applied, as in `Header`."""
+    notes: tuple[str, ...]
+    """What was done to it, as in `converted from Display P3`."""
+
+
+def header(path: Path) -> Header:
+    """Read the header of a photograph; `decode` gives pixels of its size.
 
     Raises:
         UnreadableError: The file can't be read now.
         ImageError: The file is not an image, or is larger than `MAX_PIXELS`.
     """
     with _opened(path) as image:
-        transposed = image.getexif().get(_EXIF_ORIENTATION, 1) >= 5
-        return (image.height, image.width) if transposed else (image.width, image.height)
+        return _header(image)
+
+
+def size(path: Path) -> tuple[int, int]:
+    """Return the width and height of a photograph, px, as `header` does."""
+    return header(path).size
+
+
+def _header(image: Image.Image) -> Header:
+    orientation, (width, height) = _orientation(image), image.size
+    turns = orientation >= 5 and image.format not in _UPRIGHT
+    return Header(
+        size=(height, width) if turns else (width, height),
+        orientation=orientation,
+        is_deep_grey=image.mode[0] in "IF",
+    )
+
+
+def _orientation(image: Image.Image) -> int:
+    """Read the EXIF orientation; a value of another type than a number of 1 to 8 is ignored."""
+    with suppress(Exception):  # PIL raises nearly anything on damaged EXIF
+        value = image.getexif().get(_EXIF_ORIENTATION, 1)
+        return int(value) if value in range(1, 9) else 1
+    return 1
 
 
 def exif_camera(path: Path) -> str:
@@ -124,8 +175,8 @@ def exif_camera(path: Path) -> str:
     return "/".join("" if value is None else str(value).strip("\0 ") for value in values).strip("/")
 
 
-def read(path: Path) -> ImageArray:
-    """Read a photograph as RGB [H, W, 3], with the EXIF orientation applied: 8-bit values / 255.
+def decode(path: Path) -> Picture:
+    """Decode a photograph: 8-bit values / 255.
 
     Raises:
         UnreadableError: The file can't be read now.
@@ -133,12 +184,42 @@ def read(path: Path) -> ImageArray:
             bits per channel.
     """
     with _opened(path) as image:
+        head = _header(image)
         if image.width * image.height > _SMALL_PIXELS:
             _check_expansion(path, image)
         image.load()
         if image.mode[0] in "IF":
             raise ValueError(f"{image.mode} pixels; only 8 bits per channel are read")
-        return _to_array(ImageOps.exif_transpose(image).convert("RGB"))
+        turned = ImageOps.exif_transpose(image)
+        alpha = None
+        if turned.has_transparency_data:
+            turned = turned.convert("RGBA")
+            opacity = np.asarray(turned.getchannel("A"), dtype=np.float32)
+            if opacity.min() < 255:
+                alpha = opacity / np.float32(255)
+        return Picture(_to_array(turned.convert("RGB")), alpha, head.orientation, ())
+
+
+def composite(
+    pixels: ImageArray, alpha: NDArray[np.float32], background: Sequence[float]
+) -> ImageArray:
+    """Lay pixels [H, W, 3] of an alpha [H, W] over one colour, RGB in 0..1."""
+    share = alpha[:, :, np.newaxis]
+    composited: ImageArray = pixels * share + np.asarray(background, np.float32) * (1 - share)
+    return composited
+
+
+def read(path: Path, background: Sequence[float] = (0, 0, 0)) -> ImageArray:
+    """Decode a photograph, and lay it over a background where it is transparent: [H, W, 3].
+
+    Raises:
+        UnreadableError: The file can't be read now.
+        ImageError: As for `decode`.
+    """
+    picture = decode(path)
+    if picture.alpha is None:
+        return picture.pixels
+    return composite(picture.pixels, picture.alpha, background)
 
 
 def read_png(

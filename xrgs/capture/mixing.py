@@ -86,8 +86,8 @@ def mix_resolutions(scene: Scene, conf: VariantConf, work: Path, out: Path) -> V
         inputs = replace(inputs, split=_split_by_score(photos, conf, model, depths))
         write_degraded(photos, inputs.degraded, conf)
     views = _write_undistorted(inputs, model, depths, out)
-    report |= _tags_report(inputs, views)
-    report["notes"] = [*model.report.get("notes", ()), *report["notes"]]
+    tags = _tags_report(inputs, views)
+    report |= tags | {"notes": [*report["notes"], *tags["notes"]]}
     for note in report["notes"]:
         _log.warning("scene %s: %s", scene.name, note)
     report["seconds"] = round(time.perf_counter() - start, 1)
@@ -176,7 +176,7 @@ def _sfm_report(inputs: _Inputs, model: Reconstruction) -> dict[str, Any]:
         "fingerprint": scene.fingerprint,
         "hr_sizes": dict(sizes),
         "cameras": len({photo.camera for photo in photos.all}),
-        "unreadable": list(photos.unreadable),
+        "notes": [*scene.notes, *photos.notes, *model.report.get("notes", ())],
         "not_registered": [n for i, n in enumerate(photos.names) if i not in model.viewmats],
         "lenses": _lens_report(photos, model),
     }

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-import logging
-from collections.abc import Mapping, Sequence
+from collections import defaultdict
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -14,20 +14,19 @@ from numpy.typing import NDArray
 from xrgs.capture import images
 from xrgs.capture.degradations import DEGRADATIONS, resolve_degradation
 from xrgs.capture.lens import Lens, lens_of_model
-from xrgs.capture.split import HrGeometry, hr_geometry, shrink_factor
-from xrgs.errors import XrgsError
+from xrgs.capture.split import HrGeometry, TooSmallError, hr_geometry, shrink_factor
+from xrgs.errors import UnreadableError, XrgsError
 from xrgs.runtime.progress import progress
+from xrgs.runtime.text import listed
 
 if TYPE_CHECKING:
     from xrgs.capture.scenes import Scene
     from xrgs.config import VariantConf
 
-_log = logging.getLogger(__name__)
-
 
 @dataclass(frozen=True)
 class Photograph:
-    """One readable photograph of a scene."""
+    """A photograph of a scene."""
 
     name: str
     """The name that its view gets."""
@@ -35,6 +34,8 @@ class Photograph:
     """The name of its copies on disk, because COLMAP need not accept people's file names."""
     size: tuple[int, int]
     """Width and height of the file, with the EXIF orientation applied, px."""
+    orientation: int
+    """The EXIF orientation that was applied, 1 to 8; 1 is upright."""
     hr: HrGeometry
     """The size of its HR view."""
     camera: str
@@ -62,7 +63,7 @@ class Photograph:
 
 @dataclass(frozen=True)
 class PhotoCollection:
-    """The readable photographs of a scene, sorted by name, and their copies in a work folder.
+    """The usable photographs of a scene, sorted by name, and their copies in a work folder.
 
     A copy is of one of three kinds: `hr` is the HR view, `lr` the degraded view, and `up` the
     degraded view resized back to the size of the HR view, for SfM.
@@ -70,8 +71,8 @@ class PhotoCollection:
 
     all: tuple[Photograph, ...]
     folder: Path
-    unreadable: tuple[str, ...] = ()
-    """One message for each photograph that was left out."""
+    notes: tuple[str, ...] = ()
+    """Sentences on what was left out, turned, converted and composited."""
 
     def __len__(self) -> int:
         return len(self.all)
@@ -106,9 +107,10 @@ class PhotoCollection:
 
 
 def prepare_hr_views(scene: Scene, conf: VariantConf, work: Path) -> PhotoCollection:
-    """Read every photograph, leave out the unreadable ones, and write the others as HR views.
+    """Decode every photograph once, and write each that can be used as an HR view.
 
     All are resized by one factor, so that a camera that resolved more than another still does.
+    Photographs that can't be used are left out, and named in the notes.
 
     Args:
         scene: The scene.
@@ -118,40 +120,94 @@ def prepare_hr_views(scene: Scene, conf: VariantConf, work: Path) -> PhotoCollec
     Raises:
         UnreadableError: A photograph can't be read now. It is not left out: the variant would be
             another one whenever a disk or a server fails.
-        XrgsError: Fewer than two photographs can be read, or a photograph is too small for its LR
-            view or too large for a variant; the message names the photographs.
+        XrgsError: Fewer than two photographs can be used, or one is too large for a variant; the
+            message names the photographs.
     """
-    sizes, unreadable = _read_sizes(scene.files)
-    shrink = shrink_factor(list(sizes.values()), conf) if sizes else 1.0
+    headers, left_out = _read_headers(scene.files)
+    # Largest first: the first that can be decoded sets the factor, a damaged file never does.
+    order = sorted(headers, key=lambda name: max(headers[name].size), reverse=True)
+    numbers = {name: f"{i:05d}" for i, name in enumerate(scene.files)}
     geometries: dict[str, HrGeometry] = {}
-    for name, size in progress(sizes.items(), "HR views", "view"):
-        file = scene.files[name]
+    phrases: dict[str, list[str]] = defaultdict(list)
+    shrink: float | None = None
+    for name in progress(order, "HR views", "view"):
+        file, size = scene.files[name], headers[name].size
         try:
-            image = images.read(file)
-        except images.ImageError as error:
-            unreadable[name] = str(error)
+            picture = images.decode(file)
+            shrink = shrink or shrink_factor([size], conf)
+            hr = _checked_geometry(size, shrink, conf)
+        except (images.ImageError, TooSmallError) as error:
+            left_out[name] = str(error).removeprefix(f"{file}: ")
             continue
-        try:
-            geometries[name] = hr = _checked_geometry(size, shrink, conf)
+        except UnreadableError:
+            raise
         except XrgsError as error:
             raise XrgsError(f"{file}: {error}") from None
-        copy = work / "hr" / f"{len(geometries) - 1:05d}.png"
-        images.save(copy, _resize_and_crop(image, hr), durable=False)
-    messages = tuple(unreadable[name] for name in scene.files if name in unreadable)
-    for message in messages:
-        _log.warning("%s; left out", message)
+        copy = work / "hr" / f"{numbers[name]}.png"
+        images.save(copy, _resize_and_crop(_visible(picture, scene), hr), durable=False)
+        geometries[name] = hr
+        for phrase in _phrases(picture, scene):
+            phrases[phrase].append(name)
     if len(geometries) < 2:
-        count = f"{len(geometries)} readable image(s), two are needed"
-        raise XrgsError(f"scene {scene.name}: {count}: {list(messages)}")
-    files = [scene.files[name] for name in geometries]
-    cameras = assign_cameras(files, [sizes[name] for name in geometries], conf.sfm.camera)
+        reasons = [f"{scene.files[name]}: {why}" for name, why in sorted(left_out.items())]
+        count = f"{len(geometries)} photograph(s) can be used, two are needed"
+        raise XrgsError(f"scene {scene.name}: {count}: {'; '.join(reasons)}")
+    names = sorted(geometries)
+    sizes = [headers[name].size for name in names]
+    cameras = assign_cameras([scene.files[name] for name in names], sizes, conf.sfm.camera)
     photos = (
-        Photograph(name, f"{i:05d}", sizes[name], hr, camera, scene.intrinsics.get(name), path)
-        for i, ((name, hr), camera, path) in enumerate(
-            zip(geometries.items(), cameras, files, strict=True)
+        Photograph(
+            name=name,
+            number=numbers[name],
+            size=headers[name].size,
+            orientation=headers[name].orientation,
+            hr=geometries[name],
+            camera=camera,
+            K=scene.intrinsics.get(name),
+            path=scene.files[name],
         )
+        for name, camera in zip(names, cameras, strict=True)
     )
-    return PhotoCollection(tuple(photos), work, messages)
+    return PhotoCollection(tuple(photos), work, tuple(_notes(scene, left_out, phrases)))
+
+
+def _notes(
+    scene: Scene, left_out: Mapping[str, str], phrases: Mapping[str, Sequence[str]]
+) -> Iterator[str]:
+    """Yield a sentence on what was left out, and one on each thing that was done."""
+    if left_out:
+        reasons = [f"{_own_name(scene, name)} ({why})" for name, why in sorted(left_out.items())]
+        yield f"left out: {listed(reasons)}"
+    for phrase, names in sorted(phrases.items()):
+        yield f"{phrase}: {listed([_own_name(scene, name) for name in sorted(names)])}"
+
+
+def _own_name(scene: Scene, name: str) -> str:
+    return f"{name}{scene.files[name].suffix}"
+
+
+def _visible(picture: images.Picture, scene: Scene) -> images.ImageArray:
+    """Return a picture over the background; edges keep their colour where alpha is a mask."""
+    if picture.alpha is None:
+        return picture.pixels
+    alpha = picture.alpha
+    if scene.alpha == "mask":
+        alpha = (alpha >= images.OPAQUE_FROM).astype(np.float32)
+    return images.composite(picture.pixels, alpha, scene.background)
+
+
+def _phrases(picture: images.Picture, scene: Scene) -> Iterator[str]:
+    """Say what was done to a picture."""
+    if picture.orientation > 1:
+        yield "turned upright by EXIF"
+    yield from picture.notes
+    if picture.alpha is not None:
+        colour = ", ".join(f"{value:g}" for value in scene.background)
+        yield (
+            f"masked where alpha is below {images.OPAQUE_FROM:g} (scene.alpha=mask)"
+            if scene.alpha == "mask"
+            else f"transparent pixels laid over the colour [{colour}] of scene.background"
+        )
 
 
 def _checked_geometry(size: tuple[int, int], shrink: float, conf: VariantConf) -> HrGeometry:
@@ -169,18 +225,25 @@ def _resize_and_crop(image: images.ImageArray, hr: HrGeometry) -> images.ImageAr
     return images.resize(image, *hr.resized)[top : top + hr.height, left : left + hr.width]
 
 
-def _read_sizes(
+def _read_headers(
     files: Mapping[str, Path],
-) -> tuple[dict[str, tuple[int, int]], dict[str, str]]:
-    """Read the size of each file, or the message that says why it has none, by its name."""
-    sizes: dict[str, tuple[int, int]] = {}
-    unreadable: dict[str, str] = {}
+) -> tuple[dict[str, images.Header], dict[str, str]]:
+    """Read the header of each file that may be a photograph, and say why each other is none."""
+    headers: dict[str, images.Header] = {}
+    left_out: dict[str, str] = {}
     for name, file in files.items():
         try:
-            sizes[name] = images.size(file)
+            headers[name] = images.header(file)
         except images.ImageError as error:
-            unreadable[name] = str(error)
-    return sizes, unreadable
+            left_out[name] = str(error).removeprefix(f"{file}: ")
+    depth = [name for name, header in headers.items() if header.is_deep_grey]
+    if len(depth) < len(headers):
+        for name in depth:
+            del headers[name]
+            left_out[name] = (
+                "taken for a depth map: one channel of 16 bits, where others have colour or 8 bits"
+            )
+    return headers, left_out
 
 
 def assign_cameras(

@@ -17,6 +17,10 @@ if TYPE_CHECKING:
     from xrgs.config import VariantConf
 
 
+class TooSmallError(XrgsError):
+    """A photograph is too small for an LR view."""
+
+
 @dataclass(frozen=True)
 class Split:
     """Indices of the views in the order of their names; the three are disjoint and cover all."""
@@ -187,8 +191,8 @@ def hr_geometry(size: tuple[int, int], shrink: float, conf: VariantConf) -> HrGe
         conf: The variant's config.
 
     Raises:
-        XrgsError: The LR view, `factor` times smaller, would be smaller than the SSIM window of the
-            training loss.
+        TooSmallError: The LR view, `factor` times smaller, would be smaller than the SSIM window of
+            the training loss; the message says which key can help.
     """
     from xrgs.splat.ssim import WINDOW  # imports torch, which a plan must not wait for
 
@@ -196,9 +200,13 @@ def hr_geometry(size: tuple[int, int], shrink: float, conf: VariantConf) -> HrGe
     # The crop makes x and y shrink by the same whole factor; else they differ by up to 0.6%.
     lr = resized[0] // conf.factor, resized[1] // conf.factor
     if min(lr) < WINDOW:
-        raise XrgsError(
+        helps = []
+        if min(resized) >= WINDOW:
+            helps.append(f"lower variant.factor to {min(resized) // WINDOW}")
+        if shrink < 1 and min(size) // conf.factor >= WINDOW:
+            helps.append(f"raise variant.long_side={conf.long_side}")
+        raise TooSmallError(
             f"variant.factor={conf.factor}: LR views of {lr[0]}x{lr[1]} px are smaller than the "
-            f"SSIM window of {WINDOW} px; lower variant.factor, or raise "
-            f"variant.long_side={conf.long_side}"
+            f"SSIM window of {WINDOW} px; {' or '.join(helps) or 'the photograph is too small'}"
         )
     return HrGeometry(resized, lr[0] * conf.factor, lr[1] * conf.factor)

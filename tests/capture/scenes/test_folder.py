@@ -9,6 +9,7 @@ from pathlib import Path
 
 import pytest
 
+from tests.capture.scene_confs import scene_conf
 from xrgs.capture import images, scenes
 from xrgs.capture.scenes import folder as scenes_folder
 from xrgs.config import SceneConf
@@ -18,7 +19,7 @@ Fill = Callable[..., SceneConf]
 
 
 def scene_of(path: object) -> SceneConf:
-    return SceneConf(name="", kind="folder", path=str(path), views=24)
+    return scene_conf("folder", path)
 
 
 @pytest.mark.parametrize(
@@ -82,7 +83,7 @@ def test_a_missing_folder_or_path_names_the_key(tmp_path: Path) -> None:
             tmp_path,
         )
     with pytest.raises(XrgsError, match=r"scene\.path is empty"):
-        scenes.resolve(SceneConf(name="x", kind="folder", path=None, views=24), tmp_path)
+        scenes.resolve(scene_conf("folder", name="x"), tmp_path)
 
 
 def test_what_is_no_regular_file_is_left_out_with_a_warning(

@@ -6,6 +6,7 @@ Nothing here imports torch before an embedded scene is rendered.
 from __future__ import annotations
 
 import hashlib
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 from xrgs.capture.scenes.folder import FolderScene
@@ -32,6 +33,8 @@ KINDS: dict[str, SceneKind] = {
     "folder": FolderScene(),
     "video": VideoScene(),
 }
+#: The values of `scene.alpha`; the first changes no fingerprint.
+ALPHA = ("composite", "mask")
 
 
 def check_labels(confs: Iterable[SceneConf]) -> None:
@@ -69,8 +72,12 @@ def fingerprint(conf: SceneConf, long_side: int = 0) -> str:
     Raises:
         XrgsError: The kind is unknown, or the photographs are not there.
     """
-    content = _kind(conf).digest(conf, long_side)
-    return hashlib.sha256(f"{conf.kind}\0{content}".encode()).hexdigest()[:16]
+    content = f"{conf.kind}\0{_kind(conf).digest(conf, long_side)}"
+    if conf.alpha not in ALPHA:
+        raise XrgsError(f"scene.alpha={conf.alpha}: must be one of {', '.join(ALPHA)}")
+    if (conf.alpha, *conf.background) != (ALPHA[0], 0, 0, 0):
+        content += f"\0{conf.alpha}\0{list(conf.background)}"
+    return hashlib.sha256(content.encode()).hexdigest()[:16]
 
 
 def resolve(conf: SceneConf, cache: Path, long_side: int = 0) -> Scene:
@@ -86,7 +93,8 @@ def resolve(conf: SceneConf, cache: Path, long_side: int = 0) -> Scene:
         UnreadableError: The photographs are there, but can't be read now.
         XrgsError: The kind is unknown, or the photographs are not there.
     """
-    return _kind(conf).resolve(conf, long_side, cache / fingerprint(conf, long_side))
+    found = _kind(conf).resolve(conf, long_side, cache / fingerprint(conf, long_side))
+    return replace(found, alpha=conf.alpha, background=conf.background)
 
 
 def _kind(conf: SceneConf) -> SceneKind:

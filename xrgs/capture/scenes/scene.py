@@ -47,6 +47,10 @@ class Scene:
     them."""
     masks: Mapping[str, Path] = field(default_factory=dict)
     """The mask of each photograph that has one; white is used."""
+    alpha: str = "composite"
+    """What transparent pixels are: laid over `background`, or outside a `mask`."""
+    background: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    """RGB in 0..1."""
     notes: tuple[str, ...] = ()
     """Sentences on what was left out of the scene, for the variant's report."""
 
