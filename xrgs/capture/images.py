@@ -11,11 +11,12 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import IO, TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, ImageOps
+from PIL.PngImagePlugin import PngInfo
 
 from xrgs.errors import UnreadableError, XrgsError
 from xrgs.safeio.atomic import atomic_writer
@@ -29,6 +30,10 @@ ImageArray = NDArray[np.float32]  # [H, W, 3]
 #: The formats that are read. PIL goes by the content of a file and not by its suffix, and it hands
 #: some of the other formats that it knows to external programs.
 _FORMATS = ("BMP", "HEIF", "JPEG", "PNG", "TIFF", "WEBP")
+#: The suffixes of HEIC files, in lower case.
+HEIC = frozenset({".heic", ".heif", ".hif"})
+#: What the PNGs of this package have in their text chunk `Software`.
+SOFTWARE = "xrgs"
 #: What a HEIC file has after its first four bytes, as other files of its container do.
 _HEIF_MAGIC = b"ftyp"
 #: The largest photograph that is read: cameras give 200 megapixels, and PIL takes 1 GB for this.
@@ -157,6 +162,41 @@ def _orientation(image: Image.Image) -> int:
     return 1
 
 
+def is_own(path: Path) -> bool:
+    """Return whether a file is a PNG that this package wrote: a render, a film's frame, a figure.
+
+    Raises:
+        UnreadableError: The file can't be read now.
+        ImageError: The file is not a PNG.
+    """
+    with _opened(path, ("PNG",)) as image:
+        return image.info.get("Software") == SOFTWARE
+
+
+def has_colour(path: Path) -> bool:
+    """Return whether a file's pixels have three channels or more; masks and depth maps have one.
+
+    Raises:
+        UnreadableError: The file can't be read now.
+        ImageError: The file is not an image.
+    """
+    with _opened(path) as image:
+        return len(image.getbands()) >= 3
+
+
+def thumbnail(path: Path, side: int) -> NDArray[np.uint8]:
+    """Read a small grey picture of a photograph, [side, side], upright by its EXIF orientation.
+
+    Raises:
+        UnreadableError: The file can't be read now.
+        ImageError: The file is unreadable or truncated.
+    """
+    with _opened(path) as image:
+        image.draft("RGB", (8 * side, 8 * side))  # JPEGs are decoded at down to an eighth
+        upright = ImageOps.exif_transpose(image).convert("RGB").convert("L")
+        return np.asarray(upright.resize((side, side), Image.Resampling.BOX))
+
+
 def exif_camera(path: Path) -> str:
     """Read from EXIF which camera and focal length took a photograph.
 
@@ -241,19 +281,36 @@ def read_png(
     return _to_array(read_png_pil(path, size, max_pixels))
 
 
+def read_mask(path: Path, size: tuple[int, int]) -> NDArray[np.bool_]:
+    """Read a mask of a store, a PNG as `save_mask` writes it: [H, W], True for a used pixel.
+
+    Args:
+        path: The file.
+        size: The width and height that it must have, px.
+
+    Raises:
+        UnreadableError: The file can't be read now.
+        ImageError: The file is not such a PNG.
+    """
+    mask: NDArray[np.bool_] = np.asarray(read_png_pil(path, size, mode="L")) > 127
+    return mask
+
+
 def read_png_pil(
     path: Path,
     size: tuple[int, int] | None = None,
     max_pixels: int = MAX_PNG_PIXELS,
+    mode: str = "RGB",
 ) -> Image.Image:
-    """Read a PNG as `read_png` does, into an image of PIL of mode RGB."""
+    """Read a PNG as `read_png` does, into an image of PIL of mode RGB, or L for grey."""
     with _opened(path, ("PNG",), max_pixels) as image:
         if size is not None and image.size != size:
             raise ValueError(
                 f"it has {image.width} x {image.height} pixels, not {size[0]} x {size[1]}"
             )
-        if image.mode != "RGB":
-            raise ValueError(f"its pixels are {image.mode}, not 8-bit RGB")
+        if image.mode != mode:
+            kind = "RGB" if mode == "RGB" else "grey"
+            raise ValueError(f"its pixels are {image.mode}, not 8-bit {kind}")
         _check_expansion(path, image)
         image.load()
         return image
@@ -281,7 +338,21 @@ def save(path: Path, image: ImageArray, *, durable: bool = True) -> None:
     """
     path.parent.mkdir(exist_ok=True)  # not parents: a store that vanished stays away
     with atomic_writer(path, durable=durable) as stream:
-        Image.fromarray(to_8_bit(image)).save(stream, "PNG", compress_level=4)
+        write_png(stream, Image.fromarray(to_8_bit(image)))
+
+
+def write_png(stream: IO[bytes], image: Image.Image) -> None:
+    """Write a PNG that `is_own` recognises, so that no render is taken for a photograph."""
+    text = PngInfo()
+    text.add_text("Software", SOFTWARE)
+    image.save(stream, "PNG", compress_level=4, pnginfo=text)
+
+
+def save_mask(path: Path, mask: NDArray[np.bool_], *, durable: bool = True) -> None:
+    """Write a mask [H, W] as `save` writes an image: 8-bit grey, 255 where it is True."""
+    path.parent.mkdir(exist_ok=True)
+    with atomic_writer(path, durable=durable) as stream:
+        Image.fromarray(mask.astype(np.uint8) * 255).save(stream, "PNG", compress_level=4)
 
 
 def to_8_bit(image: ImageArray) -> NDArray[np.uint8]:
