@@ -59,9 +59,10 @@ def imported_modules(file: Path) -> set[str]:
             for alias in node.names:
                 parts = f"{node.module}.{alias.name}".split(".")[1:]
                 while not (code.PACKAGE / "/".join(parts)).with_suffix(".py").is_file():
-                    parts.pop()
                     if (code.PACKAGE / "/".join(parts) / "__init__.py").is_file():
                         parts.append("__init__")
+                    else:
+                        parts.pop()
                 found.add("/".join(parts) + ".py")
     return found
 

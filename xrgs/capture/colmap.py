@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import zlib  # noqa: F401  pycolmap 4.2.1 corrupts the heap where it is imported before zlib
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -11,8 +11,8 @@ import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
-from xrgs.capture import sfm
 from xrgs.errors import XrgsError
+from xrgs.safeio import ply
 
 #: The colour of points without one.
 GREY = 128
@@ -33,18 +33,35 @@ class PinholeImage:
 
 
 def read_points(file: Path) -> tuple[NDArray[np.float64], NDArray[np.uint8]]:
-    """Read points [P, 3] and their colours [P, 3] from a .ply file, ASCII or binary.
+    """Read points [P, 3] and their colours [P, 3] from a .ply file; without colours they are grey.
+
+    Colours are `red`, `green` and `blue`, or `diffuse_red` and so on: integers of 0 to 255, or of 0
+    to 65535 where they have 16 bits, or floats of 0 to 1, or of 0 to 255 where one is above 1.
 
     Raises:
-        XrgsError: The file is not such a .ply.
+        XrgsError: The file is no .ply, or its vertices have no x, y and z.
     """
-    model = pycolmap.Reconstruction()
-    try:
-        model.import_PLY(file)
-    # MemoryError: COLMAP makes room for as many points as the header declares.
-    except (RuntimeError, ValueError, IndexError, MemoryError) as error:
-        raise XrgsError(f"not a .ply of points with colours ({error})") from error
-    return sfm.points_of(model)
+    vertices = ply.read(file)
+    names = [name for name in "xyz" if name not in vertices.names]
+    if names:
+        raise XrgsError(f"{file}: its vertices have no property {names[0]}")
+    points = vertices.columns("xyz", np.float64)
+    for prefix in ("", "diffuse_"):
+        channels = [f"{prefix}{name}" for name in ("red", "green", "blue")]
+        if set(channels) <= set(vertices.names):
+            return points, _as_8_bit(vertices, channels)
+    return points, np.full(points.shape, GREY, np.uint8)
+
+
+def _as_8_bit(vertices: ply.Ply, channels: Sequence[str]) -> NDArray[np.uint8]:
+    colors = vertices.columns(channels, np.float64)
+    kind = vertices.vertices.dtype[channels[0]]
+    if kind.kind == "f":
+        scale = 255.0 if not (colors > 1).any() else 1.0
+    else:
+        scale = 255.0 / np.iinfo(kind).max if kind.itemsize == 2 else 1.0
+    whole: NDArray[np.uint8] = np.round(np.nan_to_num(colors) * scale).clip(0, 255).astype(np.uint8)
+    return whole
 
 
 def write_model(

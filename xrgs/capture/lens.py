@@ -163,8 +163,8 @@ class Lens:
         """Return the camera after the pixels of the image were mapped."""
         own, own_shift = self._affine()
         rows = np.concatenate([linear @ own, (linear @ own_shift + shift)[:, None]], axis=1)
-        a, b = (tuple(map(float, row)) for row in rows + 0.0)  # + 0.0: no negative zeros
-        return replace(self, width=size[0], height=size[1], from_camera=(a, b))
+        (a, b, c), (d, e, f) = (rows + 0.0).tolist()  # + 0.0: no negative zeros
+        return replace(self, width=size[0], height=size[1], from_camera=((a, b, c), (d, e, f)))
 
 
 def lens_of_model(model: str, size: tuple[int, int], params: Sequence[float]) -> Lens:

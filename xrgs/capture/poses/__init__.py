@@ -99,6 +99,7 @@ def read_poses(path: str, photos: PhotoCollection) -> Reconstruction:
     content = fingerprint(path)
     try:
         root = _root(path)
+        in_folder = [f"variant.poses: {root.name} is read"] if root != user_path(path) else []
         given = colmap.read(root) if root.is_dir() else transforms.read(root)
         points = given.points[np.isfinite(given.points).all(axis=1)]
         if len(points) < max(_MIN_POINTS, len(given.points)):
@@ -136,7 +137,11 @@ def read_poses(path: str, photos: PhotoCollection) -> Reconstruction:
             "registered": len(lenses),
             "points": len(points),
             **given.report,
-            "notes": [*given.notes, *_notes(given.names, found, photos, lenses, kept, turned)],
+            "notes": [
+                *in_folder,
+                *given.notes,
+                *_notes(given.names, found, photos, lenses, kept, turned),
+            ],
         },
     )
 

@@ -89,8 +89,8 @@ def read(root: Path) -> GivenPoses:
     images: dict[str, _Image] = {}
     for image in (_binary_images if binary else _text_images)(images_file):
         if image.name in images:
-            numbers = f"{images[image.name].number} and {image.number}"
-            raise XrgsError(f"{images_file}: the images {numbers} both have the name {image.name}")
+            both = f"{images[image.name].number} and {image.number}"
+            raise XrgsError(f"{images_file}: the images {both} have one name, {image.name}")
         images[image.name] = image
     points = (_binary_points if binary else _text_points)(points_file)
     order = np.argsort(points.numbers, kind="stable")
@@ -214,8 +214,9 @@ class _Binary:
         """Take the features of an image, and return the numbers of their points."""
         count = self.count(_FEATURE.itemsize)
         start = self._advance(count * _FEATURE.itemsize)
-        points = np.frombuffer(self._data, _FEATURE, count, start)["point"]
-        return points[points != _NO_POINT]
+        features = np.frombuffer(self._data, _FEATURE, count, start)
+        points: NDArray[np.uint64] = features["point"][features["point"] != _NO_POINT]
+        return points
 
     def skip(self, size: int) -> None:
         """Pass over bytes."""

@@ -28,7 +28,7 @@ _MAX_SKEW = 0.01
 _FOCAL = ("fl_x", "fl_y", "camera_angle_x", "camera_angle_y", "x_fov", "y_fov")
 #: Names of models that OpenCV's terms describe, whichever of them the file has.
 _OPENCV = ("PERSPECTIVE", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV")
-_TERM = re.compile(r"(k|p|s|sx|sy)\d+|omega|alpha|beta")
+_TERM = re.compile(r"(k|p|s|sx|sy)\d+|k|omega|alpha|beta")
 #: Keys of a camera that is not served, where they are neither 0, false nor empty.
 _NOT_SERVED = re.compile(
     r"ftheta_\w+|latlong|equirectangular|rolling_shutter|from_mitsuba|distortion_params"
@@ -139,21 +139,24 @@ def _lens(content: Mapping[str, Any], frame: Mapping[str, Any], stored: tuple[in
         stored: Width and height that the photograph is stored with, px, where the file has none.
     """
     own_focal = any(key in frame for key in _FOCAL)
-    entry = {k: v for k, v in content.items() if not (own_focal and k in _FOCAL)} | frame
+    entry = {k: v for k, v in content.items() if not (own_focal and k in _FOCAL)} | dict(frame)
     if others := [key for key in entry if _NOT_SERVED.fullmatch(key) and np.any(entry[key])]:
         raise XrgsError(f"{others[0]} is not served: undistort the images, or use another camera")
     size = tuple(int(as_number(entry.get(key, s))) for key, s in zip("wh", stored, strict=True))
     fx, fy = (_focal(entry, axis, side) for axis, side in zip("xy", size, strict=True))
-    if fx is None and fy is None:
+    focal = fy if fx is None else fx
+    if focal is None:
         raise XrgsError("it has no focal length; set fl_x, in px, or camera_angle_x, in radians")
     values = {key: as_number(entry[key]) for key in entry if _TERM.fullmatch(key)}
     model = _model(entry, values)
-    values |= {"fx": fx or fy, "fy": fy or fx, "f": fx or fy, "k": values.get("k1", 0.0)}
+    values |= {"f": focal, "fx": focal, "fy": focal if fy is None else fy}
     values |= {
         key: as_number(entry.get(key, side / 2))
         for key, side in zip(("cx", "cy"), size, strict=True)
     }
     names = MODELS.get(model, ())
+    if "k" in names:  # the name of the only radial term
+        values.setdefault("k", values.pop("k1", 0.0))
     unserved = [key for key in values if _TERM.fullmatch(key) and values[key] and key not in names]
     if unserved and model in MODELS:
         raise XrgsError(
