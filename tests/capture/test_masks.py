@@ -331,7 +331,7 @@ def prepared(
     return photos
 
 
-LENS = Lens(60, 40, 50.0, 50.0, 30.0, 20.0, 0.1)
+LENS = Lens("SIMPLE_RADIAL", (50.0, 30.0, 20.0, 0.1), 60, 40)
 HIDDEN = st.integers(0, 2**32 - 1).map(lambda seed: noise((60, 40), seed))
 
 
@@ -368,7 +368,7 @@ def test_what_is_hidden_changes_no_bit_of_what_is_trained_and_scored(
 def test_under_its_mask_an_hr_view_shows_the_photograph(tmp_path: Path) -> None:
     photograph = noise((60, 40), 7)
     photos = prepared(tmp_path / "x", photograph, USED)
-    image, used = photos.undistorted("hr", 0, Lens(60, 40, 50.0, 50.0, 30.0, 20.0))
+    image, used = photos.undistorted("hr", 0, Lens("PINHOLE", (50.0, 50.0, 30.0, 20.0), 60, 40))
     assert used is not None
     assert (used == USED).all()
     assert (images.to_8_bit(image)[~used] == photograph[~used]).all()

@@ -19,6 +19,7 @@ import numpy as np
 from xrgs.capture import images, poses, registration, sampling
 from xrgs.capture.alignment import pose_error
 from xrgs.capture.degradations import resolve_degradation
+from xrgs.capture.lens import Lens
 from xrgs.capture.photographs import PhotoCollection, prepare_hr_views, write_degraded
 from xrgs.capture.registration import Registration
 from xrgs.capture.split import (
@@ -164,8 +165,16 @@ def _sfm_report(inputs: _Inputs, model: Reconstruction) -> dict[str, Any]:
         "cameras": len({photo.camera for photo in photos.all}),
         "notes": [*scene.notes, *photos.notes, *model.report.get("notes", ())],
         "not_registered": [n for i, n in enumerate(photos.names) if i not in model.viewmats],
-        "lenses": [asdict(lens) for lens in sorted(set(model.lenses.values()), key=repr)],
+        "lenses": _lens_report(photos, model),
     }
+
+
+def _lens_report(photos: PhotoCollection, model: Reconstruction) -> list[dict[str, Any]]:
+    """Report each camera once, with the names of its photographs."""
+    names: dict[Lens, list[str]] = {}
+    for i, lens in sorted(model.lenses.items()):
+        names.setdefault(lens, []).append(photos.names[i])
+    return [{"lens": asdict(lens), "views": views} for lens, views in names.items()]
 
 
 def _pose_report(inputs: _Inputs, model: Reconstruction, work: Path) -> dict[str, Any]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, TypeVar
 
@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from xrgs.capture import images, masks
 from xrgs.capture.degradations import DEGRADATIONS, resolve_degradation
-from xrgs.capture.lens import Lens, undistort
+from xrgs.capture.lens import Lens, lens_of_model, undistort
 from xrgs.capture.masks import MASKS, Mask, Masks, copy_mask
 from xrgs.capture.split import HrGeometry, TooSmallError, hr_geometry, shrink_factor
 from xrgs.errors import UnreadableError, XrgsError
@@ -48,6 +48,8 @@ class Photograph:
     """The name of its camera; photographs with one name share the camera in SfM."""
     K: NDArray[np.float64] | None
     """Intrinsics [3, 3] of the file, px, where they are known; then there is no distortion."""
+    path: Path
+    """The file."""
 
     @property
     def lens(self) -> Lens | None:
@@ -55,18 +57,13 @@ class Photograph:
         if self.K is None:
             return None
         K = self.K
-        return self.to_hr(Lens(*self.size, K[0, 0], K[1, 1], K[0, 2], K[1, 2]))
+        params = (K[0, 0], K[1, 1], K[0, 2], K[1, 2])
+        return self.to_hr(lens_of_model("PINHOLE", self.size, params))
 
     def to_hr(self, lens: Lens) -> Lens:
         """Return the camera of the HR view; `lens` is of the whole photograph, at any size."""
-        left, top = self.hr.crop_offset
-        resized = lens.resized(*self.hr.resized)
-        return replace(
-            resized,
-            width=self.hr.width,
-            height=self.hr.height,
-            cx=resized.cx - left,
-            cy=resized.cy - top,
+        return lens.resized(*self.hr.resized).cropped(
+            *self.hr.crop_offset, self.hr.width, self.hr.height
         )
 
 
@@ -263,6 +260,7 @@ def _photographs(
             hr=geometries[name],
             camera=camera,
             K=scene.intrinsics.get(name),
+            path=scene.files[name],
         )
         for name, camera in zip(names, cameras, strict=True)
     )
