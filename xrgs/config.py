@@ -43,6 +43,9 @@ class SceneConf:
     kind: str
     path: str | None
     views: int
+    masks: str | None
+    alpha: str
+    background: tuple[float, float, float]
 
 
 @dataclass(kw_only=True)

@@ -13,6 +13,7 @@ from typing import Any
 
 import pytest
 
+from tests.capture.scene_confs import scene_conf
 from xrgs.capture import variant
 from xrgs.capture.views import Variant
 from xrgs.config import Conf, SceneConf, SfmConf, VariantConf
@@ -79,13 +80,13 @@ def sfm_conf(configured: Callable[..., VariantConf]) -> SfmConf:
 @pytest.fixture(scope="session")
 def procedural_scene() -> SceneConf:
     """The embedded multi-view scene, 24 views."""
-    return SceneConf(name="procedural", kind="procedural", path=None, views=24)
+    return scene_conf("procedural", name="procedural")
 
 
 @pytest.fixture(scope="session")
 def stereo_scene() -> SceneConf:
     """The embedded stereo pair."""
-    return SceneConf(name="motorcycle", kind="motorcycle", path=None, views=24)
+    return scene_conf("motorcycle", name="motorcycle")
 
 
 @pytest.fixture(scope="session")

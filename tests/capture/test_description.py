@@ -124,7 +124,6 @@ def test_a_failed_variant_says_what_was_tried(tmp_path: Path) -> None:
         "degradation": "none",
         "rho": {"LR": [0.1, 0.2, 0.3]},
         "not_registered": ["x", "y"],
-        "unreadable": ["z.png: truncated"],
     }
     (folder / "report.json").write_text(json.dumps(report))
     text = describe(folder)
@@ -137,7 +136,6 @@ def test_a_failed_variant_says_what_was_tried(tmp_path: Path) -> None:
         "tags by megapixels, degradation none",
         "rho of LR: 0.100, 0.200, 0.300",
         "not placed: x, y",
-        "unreadable: z.png: truncated",
     ):
         assert line in text
     assert "position" not in text
@@ -269,7 +267,7 @@ def test_nothing_of_a_report_reaches_the_terminal_as_an_escape(tmp_path: Path) -
         "scene": evil,
         "lr_images": evil,
         "tags": evil,
-        "unreadable": [evil],
+        "notes": [evil],
         "attempts": [{"attempt": evil, "refused": evil}],
     }
     (folder / "report.json").write_text(json.dumps(report))

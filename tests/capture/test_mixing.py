@@ -14,6 +14,7 @@ import numpy as np
 import pycolmap
 import pytest
 
+from tests.capture.scene_confs import scene_conf
 from xrgs import config
 from xrgs.capture import images, mixing, registration, scenes, sfm
 from xrgs.capture.degradations import resolve_degradation
@@ -21,7 +22,7 @@ from xrgs.capture.scenes import Scene, procedural
 from xrgs.capture.sfm import Reconstruction, SfmImage
 from xrgs.capture.split import check_variant_conf
 from xrgs.capture.views import SceneFailed, Variant, View
-from xrgs.config import SceneConf, VariantConf
+from xrgs.config import VariantConf
 from xrgs.errors import XrgsError
 
 pytestmark = pytest.mark.slow
@@ -46,7 +47,7 @@ def conf(configured: Make) -> VariantConf:
 def rendered(tmp_path_factory: pytest.TempPathFactory, conf: VariantConf) -> Scene:
     cache = tmp_path_factory.mktemp("scenes")
     return scenes.resolve(
-        SceneConf(name="p", kind="procedural", path=None, views=VIEWS),
+        scene_conf("procedural", name="p", views=VIEWS),
         cache,
         conf.long_side,
     )

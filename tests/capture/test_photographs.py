@@ -97,34 +97,68 @@ def test_all_are_shrunk_by_one_scale(tmp_path: Path) -> None:
     assert photos.size("hr", 3) == (24, 24)
 
 
-def test_a_photograph_too_small_for_its_copy_is_named(tmp_path: Path) -> None:
-    files = [write_photograph(tmp_path / "a.png"), write_photograph(tmp_path / "b.png", (60, 21))]
-    with pytest.raises(XrgsError, match=r"b\.png: variant\.factor=2: LR views of 30x10 px"):
-        prepare_hr_views(Scene("x", "", {file.stem: file for file in files}), CONF, tmp_path)
+def scene_of(*files: Path) -> Scene:
+    return Scene("x", "", {file.stem: file for file in files})
+
+
+def test_a_photograph_too_small_for_its_copy_is_left_out(tmp_path: Path) -> None:
+    small = write_photograph(tmp_path / "small.png", (60, 21))
+    files = [write_photograph(tmp_path / f"{name}.png") for name in "ab"]
+    photos = prepare_hr_views(scene_of(*files, small), CONF, tmp_path)
+    assert photos.names == ["a", "b"]
+    (note,) = photos.notes
+    assert note.startswith("left out: small.png (variant.factor=2: LR views of 30x10 px are")
+
+
+@pytest.mark.parametrize(
+    ("long_side", "factor", "helps"),
+    [
+        (0, 4, "lower variant.factor to 3"),
+        (30, 2, "lower variant.factor to 1 or raise variant.long_side=30"),
+        (40, 3, "lower variant.factor to 2 or raise variant.long_side=40"),
+        (0, 60, "lower variant.factor to 3"),
+    ],
+)
+def test_where_all_are_too_small_the_error_names_the_keys_that_help(
+    tmp_path: Path, long_side: int, factor: int, helps: str
+) -> None:
+    files = [write_photograph(tmp_path / f"{name}.png", (60, 34)) for name in "ab"]
+    conf = replace(CONF, long_side=long_side, factor=factor)
+    with pytest.raises(
+        XrgsError, match=r"scene x: 0 photograph.*a\.png, b\.png \(variant"
+    ) as error:
+        prepare_hr_views(scene_of(*files), conf, tmp_path)
+    assert str(error.value).endswith(f"11 px); {helps}")
+
+
+def test_a_photograph_that_no_key_makes_large_enough_is_called_too_small(tmp_path: Path) -> None:
+    files = [write_photograph(tmp_path / f"{name}.png", (60, 10)) for name in "ab"]
+    with pytest.raises(XrgsError, match=r"SSIM window of 11 px\); the photograph is too small"):
+        prepare_hr_views(scene_of(*files), CONF, tmp_path)
 
 
 @pytest.mark.parametrize("damage", ["no header", "truncated"])
-def test_a_damaged_photograph_is_left_out_and_named(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture, damage: str
-) -> None:
-    write_photograph(tmp_path / "b.png")
+def test_a_damaged_photograph_is_left_out_and_sets_no_size(tmp_path: Path, damage: str) -> None:
+    write_photograph(tmp_path / "b.png", (600, 400))
     content = (tmp_path / "b.png").read_bytes()
-    (tmp_path / "b.png").write_bytes(b"no image" if damage == "no header" else content[:-40])
+    (tmp_path / "b.png").write_bytes(b"no image" if damage == "no header" else content[:-400])
     files = [
         write_photograph(tmp_path / "a.png"),
         tmp_path / "b.png",
         write_photograph(tmp_path / "c.png"),
     ]
-    photos = prepare_hr_views(Scene("x", "", {file.stem: file for file in files}), CONF, tmp_path)
+    conf = replace(CONF, long_side=60)
+    photos = prepare_hr_views(scene_of(*files), conf, tmp_path)
     assert photos.names == ["a", "c"]
-    assert f"{tmp_path / 'b.png'}: " in photos.unreadable[0]
-    assert f"{tmp_path / 'b.png'}: " in caplog.text
-    two = Scene("x", "", {file.stem: file for file in files[:2]})
-    with pytest.raises(XrgsError, match=r"scene x: 1 readable image.*b\.png"):
-        prepare_hr_views(two, CONF, tmp_path)
+    assert [photo.hr.resized for photo in photos.all] == [(60, 40)] * 2
+    assert photos.size("hr", 1) == (60, 40)
+    (note,) = photos.notes
+    assert note.startswith("left out: b.png (unreadable or truncated")
+    with pytest.raises(XrgsError, match=r"scene x: 1 photograph.*needed: b\.png \(unreadable"):
+        prepare_hr_views(scene_of(*files[:2]), CONF, tmp_path)
 
 
-@pytest.mark.parametrize("failing", ["size", "read"])
+@pytest.mark.parametrize("failing", ["header", "decode"])
 def test_a_photograph_that_cant_be_read_now_is_not_left_out(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, failing: str
 ) -> None:
@@ -139,7 +173,49 @@ def test_a_photograph_that_cant_be_read_now_is_not_left_out(
 
     monkeypatch.setattr(images, failing, fails)
     with pytest.raises(UnreadableError, match=r"b\.png"):
-        prepare_hr_views(Scene("x", "", {file.stem: file for file in files}), CONF, tmp_path)
+        prepare_hr_views(scene_of(*files), CONF, tmp_path)
+
+
+def test_a_depth_map_is_left_out_beside_photographs(tmp_path: Path) -> None:
+    files = [write_photograph(tmp_path / f"{name}.png") for name in "ab"]
+    depth = tmp_path / "depth.png"
+    Image.fromarray(np.zeros((400, 600), np.uint16)).save(depth)
+    photos = prepare_hr_views(scene_of(*files, depth), replace(CONF, long_side=60), tmp_path)
+    assert [photo.hr.resized for photo in photos.all] == [(60, 40)] * 2
+    (note,) = photos.notes
+    assert note.startswith("left out: depth.png (taken for a depth map: one channel of 16 bits")
+
+
+def test_what_was_done_is_said_once_for_each_kind(tmp_path: Path) -> None:
+    files = [write_photograph(tmp_path / f"{name}.png", orientation=6) for name in "ab"]
+    photos = prepare_hr_views(scene_of(*files), CONF, tmp_path)
+    assert photos.notes == ("turned upright by EXIF: a.png, b.png",)
+    assert [photo.orientation for photo in photos.all] == [6, 6]
+
+
+def write_cutout(file: Path, hidden: int) -> Path:
+    """White, with a quarter of alpha 0 on the left and one of 0.6 on the right."""
+    pixels = np.full((40, 60, 4), 255, np.uint8)
+    pixels[:, :15] = (hidden, hidden, hidden, 0)
+    pixels[:, 45:, 3] = 153
+    Image.fromarray(pixels).save(file)
+    return file
+
+
+@pytest.mark.parametrize("alpha", ["composite", "mask"])
+def test_transparent_pixels_get_the_background_alone(tmp_path: Path, alpha: str) -> None:
+    files = [write_cutout(tmp_path / f"{hidden}.png", hidden) for hidden in (20, 230)]
+    scene = replace(scene_of(*files), alpha=alpha, background=(0.2, 0.2, 0.2))
+    photos = prepare_hr_views(scene, CONF, tmp_path)
+    for i in (0, 1):
+        view = photos.read("hr" if alpha == "composite" else "shown", i)
+        assert np.abs(view[:, :15] - 0.2).max() < 0.003
+        assert (view[:, 15:45] == 1).all()
+        assert np.abs(view[:, 45:] - (0.6 + 0.4 * 0.2)).max() < 0.003
+        assert alpha == "composite" or (photos.read("hr", i) == 1).all()
+    (note,) = photos.notes
+    assert note.endswith(": 20.png, 230.png")
+    assert ("[0.2, 0.2, 0.2]" if alpha == "composite" else "scene.alpha=mask") in note
 
 
 def test_an_hr_view_that_no_variant_may_have_names_the_key(

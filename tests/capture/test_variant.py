@@ -13,6 +13,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from tests.capture.scene_confs import scene_conf
 from xrgs.capture import images, variant
 from xrgs.capture.folders import failed_scenes
 from xrgs.capture.variant import CorruptVariant
@@ -172,7 +173,7 @@ def test_unrelated_photographs_fail_as_a_scene(
     rng = np.random.default_rng(0)
     for i in range(5):
         images.save(tmp_path / "x" / f"{i}.png", rng.random((90, 120, 3), dtype=np.float32))
-    scene = SceneConf(name="leaves", kind="folder", path=str(tmp_path / "x"), views=24)
+    scene = scene_conf("folder", tmp_path / "x", name="leaves")
     with pytest.raises(SceneFailed) as caught:
         build(scene)
     message = str(caught.value)
@@ -199,6 +200,6 @@ def test_too_few_registered_views_fail_whatever_fraction_is_required(
 ) -> None:
     images.save(tmp_path / "x" / "a.png", np.zeros((90, 120, 3), np.float32))
     images.save(tmp_path / "x" / "b.png", np.ones((90, 120, 3), np.float32))
-    scene = SceneConf(name="flat", kind="folder", path=str(tmp_path / "x"), views=24)
+    scene = scene_conf("folder", tmp_path / "x", name="flat")
     with pytest.raises(SceneFailed, match="0 HR, 0 LR and 0 test views; at least one of each"):
         build(scene, sfm={"min_registered": 0.0})

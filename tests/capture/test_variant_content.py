@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from tests.capture.scene_confs import scene_conf
 from xrgs.capture import images
 from xrgs.capture.views import Variant, View
 from xrgs.config import SceneConf
@@ -159,7 +160,7 @@ def test_fern_is_registered_at_a_reduced_size(build: Build, data_root: Path) -> 
     if not path.is_dir():
         pytest.skip(f"{path} is not there")
     built = build(
-        SceneConf(name="fern", kind="folder", path=str(path), views=24),
+        scene_conf("folder", path, name="fern"),
         sfm={"max_num_features": 2000},
     )
     assert built.report["registered"] == 20

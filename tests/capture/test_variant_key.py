@@ -11,15 +11,16 @@ from typing import TYPE_CHECKING
 
 import pytest
 
+from tests.capture.scene_confs import scene_conf
 from xrgs.capture import degradations, scenes, tags, variant
-from xrgs.config import SceneConf, VariantConf
+from xrgs.config import VariantConf
 from xrgs.safeio import code
 
 if TYPE_CHECKING:
     from xrgs.capture.images import ImageArray
 
 Make = Callable[..., VariantConf]
-SCENE = SceneConf(name="motorcycle", kind="motorcycle", path=None, views=24)
+SCENE = scene_conf("motorcycle", name="motorcycle")
 #: Settings that use each part of the code once or not at all.
 CHANGES = {
     "downsample": {"degradation": "downsample"},
@@ -58,9 +59,10 @@ def imported_modules(file: Path) -> set[str]:
             for alias in node.names:
                 parts = f"{node.module}.{alias.name}".split(".")[1:]
                 while not (code.PACKAGE / "/".join(parts)).with_suffix(".py").is_file():
-                    parts.pop()
                     if (code.PACKAGE / "/".join(parts) / "__init__.py").is_file():
                         parts.append("__init__")
+                    else:
+                        parts.pop()
                 found.add("/".join(parts) + ".py")
     return found
 
@@ -121,7 +123,7 @@ def test_the_core_changes_every_key_and_poses_those_of_given_poses(
         (tmp_path / f"{name}.txt").write_text("")
     given = configured(poses=str(tmp_path))
     before, before_given = keys(), variant.key(SCENE, given)
-    with (package / "capture/poses.py").open("a") as stream:
+    with (package / "capture/poses/colmap.py").open("a") as stream:
         stream.write("LATER = 1\n")
     assert keys() == before
     assert variant.key(SCENE, given) != before_given

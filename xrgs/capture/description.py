@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 from msgspec import Struct
 
-from xrgs.capture import variant
+from xrgs.capture import images, variant
 from xrgs.capture.contact_sheet import contact_sheet
 from xrgs.capture.folders import is_failed
 from xrgs.errors import XrgsError
@@ -56,7 +56,6 @@ class SfmReport(Struct):
     hr: tuple[str, ...] = ()
     lr: tuple[str, ...] = ()
     not_registered: tuple[str, ...] = ()
-    unreadable: tuple[str, ...] = ()
 
 
 def describe(folder: Path, out: Path | None = None) -> str:
@@ -85,7 +84,7 @@ def describe(folder: Path, out: Path | None = None) -> str:
     file = out or Path(f"{frozen.id}.png")
     try:
         with atomic_writer(file) as stream:
-            sheet.save(stream, "PNG")
+            images.write_png(stream, sheet)
     except OSError as error:
         raise XrgsError(f"out={file}: can't be written ({error})") from error
     more = [f"Contact sheet: {file}", *(f"  {note}" for note in notes)]
@@ -141,9 +140,8 @@ def _sfm(report: SfmReport) -> Iterator[str]:
         if rates := report.rho.get(tag):
             numbers = ", ".join(f"{rate:.3f}" for rate in rates)
             yield f"  rho of {tag}: {numbers} (least, median, most)"
-    for names, label in ((report.not_registered, "not placed"), (report.unreadable, "unreadable")):
-        if names:
-            yield f"  {label}: {', '.join(names)}"
+    if report.not_registered:
+        yield f"  not placed: {', '.join(report.not_registered)}"
 
 
 def _pose(error: dict[str, float]) -> Iterator[str]:

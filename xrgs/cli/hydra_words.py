@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 #: How Hydra says that a key of an override is unknown.
 _NOT_OVERRIDDEN = re.compile(r"Could not override '([^']+)'")
 #: Keys whose values are paths.
-_PATHS = frozenset({"scene.path", "store", "data_root", "variant.poses"})
+_PATHS = frozenset({"scene.path", "store", "data_root", "variant.poses", "scene.masks"})
 
 
 @contextmanager

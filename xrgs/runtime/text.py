@@ -44,6 +44,12 @@ def format_duration(seconds: float | None) -> str:
     return f"~{seconds / 3600:.1f} h"
 
 
+def listed(names: Sequence[str], most: int = 6) -> str:
+    """Write names for a sentence: `a, b, c`, or the first `most` of them, then `and 12 more`."""
+    more = f" and {len(names) - most} more" if len(names) > most else ""
+    return ", ".join(names[:most]) + more
+
+
 @dataclass(frozen=True)
 class TextTable:
     """A titled table of plain text, in which every row is as long as `columns`."""

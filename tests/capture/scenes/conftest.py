@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from tests.capture.scene_confs import scene_conf
 from xrgs.config import SceneConf
 
 
@@ -22,6 +23,6 @@ def fill() -> Callable[..., SceneConf]:
         for name in names:
             pixels = rng.integers(0, 255, (size[1], size[0], 3), dtype=np.uint8)
             Image.fromarray(pixels).save(folder / name)
-        return SceneConf(name="", kind="folder", path=str(folder), views=24)
+        return scene_conf("folder", folder)
 
     return filled

@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from tests.capture.scene_confs import scene_conf
 from xrgs.capture import images, scenes
 from xrgs.capture.scenes import procedural
 from xrgs.capture.scenes.scene import bundled_photograph
@@ -19,7 +20,7 @@ from xrgs.config import SceneConf
 from xrgs.errors import XrgsError
 
 Fill = Callable[..., SceneConf]
-PROCEDURAL = SceneConf(name="procedural", kind="procedural", path=None, views=3)
+PROCEDURAL = scene_conf("procedural", name="procedural", views=3)
 
 
 def stems(scene: scenes.Scene) -> list[str]:
@@ -59,7 +60,7 @@ def test_the_fingerprint_follows_names_and_bytes_alone(fill: Fill, tmp_path: Pat
 
 def test_an_unknown_kind_names_the_key(tmp_path: Path) -> None:
     with pytest.raises(XrgsError, match=r"scene.kind=llff: must be one of procedural"):
-        scenes.resolve(SceneConf(name="x", kind="llff", path=str(tmp_path), views=24), tmp_path)
+        scenes.resolve(scene_conf("llff", tmp_path, name="x"), tmp_path)
 
 
 def test_the_procedural_scene_is_rendered_once(tmp_path: Path) -> None:
@@ -118,9 +119,7 @@ def test_size_and_number_of_views_are_in_the_fingerprint() -> None:
         scenes.fingerprint(PROCEDURAL, 60),
         scenes.fingerprint(PROCEDURAL, 64),
         scenes.fingerprint(replace(PROCEDURAL, views=4), 60),
-        scenes.fingerprint(
-            SceneConf(name="motorcycle", kind="motorcycle", path=None, views=24), 60
-        ),
+        scenes.fingerprint(scene_conf("motorcycle", name="motorcycle"), 60),
     }
     assert len(marks) == 4
     full = scenes.fingerprint(PROCEDURAL, procedural.FULL_SIDE)
@@ -134,9 +133,9 @@ def test_one_view_is_too_few(tmp_path: Path) -> None:
 
 def test_fingerprints_need_neither_torch_nor_scikit_image() -> None:
     script = (
-        "import sys; from xrgs.capture import scenes; from xrgs.config import SceneConf;"
-        "scenes.fingerprint(SceneConf(name='p', kind='procedural', path=None, views=24), 100);"
-        "scenes.fingerprint(SceneConf(name='m', kind='motorcycle', path=None, views=24));"
+        "import sys; from xrgs.capture import scenes; from xrgs.composing import compose;"
+        "scenes.fingerprint(compose('scene=procedural').scene, 100);"
+        "scenes.fingerprint(compose('scene=motorcycle').scene);"
         "print(sorted({'torch', 'skimage', 'pycolmap'} & set(sys.modules)))"
     )
     done = subprocess.run(
@@ -150,9 +149,7 @@ def test_folders_called_images_have_the_name_of_the_folder_around_them(tmp_path:
         (tmp_path / path).mkdir(parents=True)
 
     def confs(*paths: str) -> list[SceneConf]:
-        return [
-            SceneConf(name="", kind="folder", path=str(tmp_path / path), views=24) for path in paths
-        ]
+        return [scene_conf("folder", tmp_path / path) for path in paths]
 
     assert [scenes.label(conf) for conf in confs("pa/images", "pb/images")] == ["pa", "pb"]
     scenes.check_labels(confs("pa/images", "pb/images", "pa/images"))

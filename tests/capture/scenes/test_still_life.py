@@ -6,10 +6,10 @@ from pathlib import Path
 
 import torch
 
+from tests.capture.scene_confs import scene_conf
 from xrgs.capture import scenes
 from xrgs.capture.scenes import procedural, still_life
 from xrgs.capture.scenes.raycast import pyramid, render
-from xrgs.config import SceneConf
 
 
 def test_every_pixel_shows_a_solid() -> None:
@@ -22,7 +22,7 @@ def test_every_pixel_shows_a_solid() -> None:
 
 
 def test_the_same_scene_is_rendered_to_the_same_bytes(tmp_path: Path) -> None:
-    conf = SceneConf(name="procedural", kind="procedural", path=None, views=3)
+    conf = scene_conf("procedural", name="procedural", views=3)
     a = scenes.resolve(conf, tmp_path / "a", 60)
     b = scenes.resolve(conf, tmp_path / "b", 60)
     assert [f.read_bytes() for f in a.files.values()] == [f.read_bytes() for f in b.files.values()]

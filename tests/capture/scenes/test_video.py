@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from tests.capture.scene_confs import scene_conf
 from xrgs.capture import images, scenes
 from xrgs.capture.images import ImageError
 from xrgs.capture.scenes import video
@@ -41,7 +42,7 @@ def write_video(file: Path, frames: Sequence[NDArray[np.uint8]]) -> None:
 
 
 def conf(file: Path, views: int) -> SceneConf:
-    return SceneConf(name="", kind="video", path=str(file), views=views)
+    return scene_conf("video", file, views=views)
 
 
 def test_the_sharpest_frame_of_each_part_is_taken(tmp_path: Path) -> None:
@@ -91,9 +92,7 @@ def test_too_few_frames_no_video_and_no_package_are_named(
     with pytest.raises(XrgsError, match=r"scene\.path=.*gone\.mp4: No such file"):
         scenes.fingerprint(conf(tmp_path / "gone.mp4", 2))
     with pytest.raises(XrgsError, match=r"not a folder; .*scene=video"):
-        scenes.fingerprint(
-            SceneConf(name="", kind="folder", path=str(tmp_path / "a.mp4"), views=24)
-        )
+        scenes.fingerprint(scene_conf("folder", tmp_path / "a.mp4"))
     monkeypatch.setattr(video, "find_spec", lambda _: None)
     with pytest.raises(XrgsError, match=r"pip install 'xrgs\[video\]'"):
         scenes.fingerprint(conf(tmp_path / "a.mp4", 2))
