@@ -38,7 +38,7 @@ _DEPTH = dict.fromkeys("([{", 1) | dict.fromkeys(")]}", -1)
 #: Keys whose values are lists of names.
 _NAMES = frozenset({"variant.test"})
 #: Keys whose values are paths.
-_PATHS = frozenset({"scene.path", "store", "data_root", "variant.poses"})
+_PATHS = frozenset({"scene.path", "store", "data_root", "variant.poses", "scene.masks"})
 
 
 @contextmanager
