@@ -75,7 +75,7 @@ class StepRenderer:
         camera = self.components.render_camera(step.view.camera, step)
         render = self.render(gaussians, step, camera)
         self.recorder.record_evaluations(render.evaluations)
-        return self.components.to_photograph(render.image, step)
+        return self.components.match_colors(self.components.to_photograph(render.image, step), step)
 
     @torch.no_grad()
     def attribute(self, pixels: Tensor, gaussians: Gaussians, step: Step) -> Tensor:
