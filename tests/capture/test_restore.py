@@ -85,9 +85,9 @@ def test_a_lens_for_each_photograph_has_the_same_images(
 @pytest.mark.parametrize(
     ("old", "new", "message"),
     [
-        ('"fx": ', '"fx": 1', "report.json: lenses: none is of view motorcycle_"),
+        ('"motorcycle_', '"x_', "report.json: lenses: none is of view motorcycle_"),
         ('"lenses"', '"lens"', "report.json: .*missing required field `lenses`"),
-        ('"fx"', '"unknown"', r"report.json: lenses\[0\]: .*missing required field `fx`"),
+        ('"model"', '"x"', r"report.json: lenses\[0\].lens: .*missing required field `model`"),
     ],
 )
 def test_a_damaged_report_is_named(

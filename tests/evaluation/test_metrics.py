@@ -11,6 +11,8 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from numpy.lib.stride_tricks import sliding_window_view
 from torch import Tensor
 
@@ -27,6 +29,7 @@ MORE_IS_BETTER = {
     "lpips": False,
     "ssim": True,
     "psnr": True,
+    "psnr_plain": True,
     "evaluations": False,
 }
 
@@ -41,8 +44,8 @@ def pair(height: int = 40, width: int = 53) -> tuple[Tensor, Tensor]:
     return first, second
 
 
-def ssim_by_definition(image: Tensor, target: Tensor) -> float:
-    """Wang et al. 2004 in float64, borders mirrored: 11 taps, sigma 1.5, data range 1."""
+def ssim_map_by_definition(image: Tensor, target: Tensor) -> np.ndarray:
+    """[H, W, 3] of Wang et al. 2004 in float64: 11 taps, sigma 1.5, range 1, borders mirrored."""
     taps = np.exp(-(np.arange(-5, 6) ** 2) / (2 * 1.5**2))
     window = np.outer(taps, taps) / taps.sum() ** 2
 
@@ -57,18 +60,17 @@ def ssim_by_definition(image: Tensor, target: Tensor) -> float:
         np.einsum("hwcij,ij->hwc", product, window) for product in (da * da, db * db, da * db)
     )
     c1, c2 = 0.01**2, 0.03**2
-    return float(
-        np.mean(
-            (2 * mean_a * mean_b + c1)
-            * (2 * cov + c2)
-            / ((mean_a**2 + mean_b**2 + c1) * (var_a + var_b + c2))
-        )
+    values: np.ndarray = (
+        (2 * mean_a * mean_b + c1)
+        * (2 * cov + c2)
+        / ((mean_a**2 + mean_b**2 + c1) * (var_a + var_b + c2))
     )
+    return values
 
 
 def test_ssim_is_its_definition() -> None:
     image, target = pair()
-    expected = ssim_by_definition(image, target)
+    expected = ssim_map_by_definition(image, target).mean()
     assert 0.2 < expected < 0.9
     assert metrics.ssim(image, target) == pytest.approx(expected, abs=1e-6)
 
@@ -130,7 +132,7 @@ def test_lpips_is_the_networks_distance_where_there_are(
     monkeypatch.setattr(weights, "load_published", lambda: random_weights)
     image, target = pair()
     tensors = {name: torch.from_numpy(array) for name, array in random_weights.items()}
-    value = metrics.VIEW_METRICS["lpips"](image, target)
+    value = metrics.VIEW_METRICS["lpips"](image, target, None)
     assert isinstance(value, float)
     assert value == distance(image, target, tensors).item() > 0.01
     # The network shrinks an image to nothing: a cell of tiny views is no failed cell.
@@ -140,7 +142,7 @@ def test_lpips_is_the_networks_distance_where_there_are(
 def test_the_rows_of_the_tables() -> None:
     better_high = {metric.name: metric.higher_is_better for metric in metrics.METRICS}
     assert better_high == MORE_IS_BETTER
-    assert list(metrics.VIEW_METRICS) == ["lpips", "ssim", "psnr"]
+    assert list(metrics.VIEW_METRICS) == ["lpips", "ssim", "psnr", "psnr_plain"]
     units = {metric.name: metric.unit for metric in metrics.METRICS if metric.unit}
     assert units == {
         "training_time_s": "s",
@@ -148,6 +150,7 @@ def test_the_rows_of_the_tables() -> None:
         "memory_bytes": "bytes",
         "peak_rss_bytes": "bytes",
         "psnr": "dB",
+        "psnr_plain": "dB",
     }
 
 
@@ -157,8 +160,8 @@ def test_directions_are_true(name: str) -> None:
     metric = next(metric for metric in metrics.METRICS if metric.name == name)
     assert metric.score is not None
     image, target = pair()
-    near = metric.score(target + 0.1 * (image - target), target)
-    far = metric.score(image, target)
+    near = metric.score(target + 0.1 * (image - target), target, None)
+    far = metric.score(image, target, None)
     assert near is not None
     assert far is not None
     assert (near > far) == metric.higher_is_better
@@ -167,10 +170,79 @@ def test_directions_are_true(name: str) -> None:
 @pytest.mark.parametrize("score", metrics.VIEW_METRICS.values(), ids=metrics.VIEW_METRICS)
 @pytest.mark.parametrize("shapes", [((9, 9, 3), (9, 8, 3)), ((9, 9), (9, 9)), ((3, 9, 9),) * 2])
 def test_wrong_shapes_are_refused(
-    score: Callable[[Tensor, Tensor], float | None], shapes: tuple[tuple[int, ...], tuple[int, ...]]
+    score: Callable[[Tensor, Tensor, Tensor | None], float | None],
+    shapes: tuple[tuple[int, ...], tuple[int, ...]],
 ) -> None:
+    mask = torch.ones(shapes[1][:2], dtype=torch.bool)
     with pytest.raises(ValueError, match=r"must be the same \[H, W, 3\]"):
-        score(torch.zeros(shapes[0]), torch.zeros(shapes[1]))
+        score(torch.zeros(shapes[0]), torch.zeros(shapes[1]), mask)
+
+
+@pytest.mark.parametrize("score", [metrics.psnr, metrics.ssim, metrics.lpips])
+def test_a_mask_of_another_size_is_refused(
+    score: Callable[[Tensor, Tensor, Tensor | None], float | None],
+) -> None:
+    image, target = pair()
+    with pytest.raises(ValueError, match=r"mask \[40, 40\] must be \[40, 53\]"):
+        score(image, target, torch.ones(40, 40, dtype=torch.bool))
+
+
+def half_mask() -> Tensor:
+    """The left half of `pair` and a single pixel on the right are used."""
+    mask = torch.zeros(40, 53, dtype=torch.bool)
+    mask[:, :26] = True
+    mask[3, 40] = True
+    return mask
+
+
+@settings(max_examples=20, deadline=None)
+@given(st.integers(0, 2**32 - 1))
+def test_what_is_hidden_by_a_mask_changes_no_score(seed: int) -> None:
+    (image, target), mask = pair(), half_mask()
+    hidden = torch.rand(image.shape, generator=torch.Generator().manual_seed(seed))
+    painted = image.where(mask[..., None], hidden)
+    for score in (metrics.psnr, metrics.ssim):
+        assert score(painted, target, mask) == score(image, target, mask)
+    assert metrics.psnr(painted, target) != metrics.psnr(image, target)
+
+
+def test_psnr_inside_a_mask_is_of_its_pixels() -> None:
+    (image, target), mask = pair(), half_mask()
+    error = (image.double() - target.double())[mask].square().mean().item()
+    assert metrics.psnr(image, target, mask) == pytest.approx(-10 * math.log10(error), rel=1e-12)
+    assert metrics.psnr_plain(image, target, mask) == metrics.psnr(image, target)
+    assert metrics.psnr_plain(image, target, None) is None
+
+
+def test_ssim_inside_a_mask_is_the_mean_of_the_definition_there() -> None:
+    (image, target), mask = pair(), half_mask()
+    composed = image.where(mask[..., None], target)
+    values = ssim_map_by_definition(composed, target)
+    expected = values[mask.numpy()].mean()
+    assert metrics.ssim(image, target, mask) == pytest.approx(expected, abs=1e-6)
+    assert abs(expected - values.mean()) > 0.1
+
+
+def test_a_mask_of_all_pixels_changes_no_bit_and_one_of_none_has_no_score() -> None:
+    image, target = pair()
+    every = torch.ones(40, 53, dtype=torch.bool)
+    for score in (metrics.psnr, metrics.ssim):
+        assert score(image, target, every) == score(image, target)
+        assert score(image, target, ~every) is None
+
+
+def test_views_that_are_scored_together_have_the_same_scores() -> None:
+    image, target = pair()
+    plain = metrics.score_view(image, target, None, masked=False)
+    assert plain == {
+        "lpips": None,
+        "ssim": metrics.ssim(image, target),
+        "psnr": metrics.psnr(image, target),
+        "psnr_plain": None,
+    }
+    assert metrics.score_view(image, target, None, masked=True) == plain | {
+        "psnr_plain": plain["psnr"]
+    }
 
 
 def test_an_image_too_small_to_mirror_is_refused() -> None:

@@ -12,6 +12,7 @@ import pytest
 from PIL import Image
 
 from tests.conftest import composed
+from xrgs.evaluation.metrics import VIEW_METRICS
 from xrgs.evaluation.scoring import scoring_code
 from xrgs.experiment.attempts import begin_attempt
 from xrgs.experiment.cell_folder import CellFolder
@@ -173,15 +174,16 @@ class MadeStore:
 
     @staticmethod
     def _fill(folder: CellFolder, found: dict[str, Any], provenance: dict[str, Any]) -> None:
-        summary = {key: value for key, value in found.items() if key not in SCORES}
+        names = [*SCORES, *(name for name in VIEW_METRICS if name in found and name not in SCORES)]
+        summary = {key: value for key, value in found.items() if key not in names}
         summary |= {key: round(summary[key]) for key in ("gaussians", "steps")}
         (folder.path / "summary.json").write_text(json.dumps(summary))
         made = msgspec.to_builtins(PROVENANCE) | {"started": str(folder.path)} | provenance
         (folder.path / "provenance.json").write_text(json.dumps(made))
         # The views differ, their mean is the value asked for.
-        lines = ["view,psnr,ssim,lpips"]
+        lines = [",".join(["view", *names])]
         for view, offset in zip(VIEWS, (0.05, -0.05), strict=True):
-            scores = ["" if found[key] is None else repr(found[key] + offset) for key in SCORES]
+            scores = ["" if found[key] is None else repr(found[key] + offset) for key in names]
             lines.append(",".join([view, *scores]))
         (folder.path / "scores.csv").write_text("\n".join(lines) + "\n")
 

@@ -89,6 +89,15 @@ def test_times_counts_and_memory_are_compared_by_ratio_and_scores_are_not() -> N
     assert not any(is_amount(metric) for metric in METRICS if metric.name in {*GAP})
 
 
+def test_an_optional_score_is_compared_where_a_cell_has_it(made: Any) -> None:
+    made.add()
+    made.add("consistency")
+    assert "psnr_plain" not in [metric.name for metric in compared(made).metrics]
+    made.add(seed=1, values={"psnr_plain": 20.0})
+    made.add("consistency", seed=1, values={"psnr_plain": 22.0})
+    assert mean_of(compared(made), "psnr_plain")["change"] == pytest.approx(10)
+
+
 def test_scenes_count_once_however_many_seeds_they_have(made: Any) -> None:
     for seed, factor in enumerate((1.1, 1.2, 1.3)):
         made.add(seed=seed)

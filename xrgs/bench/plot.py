@@ -19,6 +19,7 @@ from xrgs.bench.growth import ALL_LOADS
 from xrgs.bench.rendering import TORCH_FLOAT64, total_ms
 from xrgs.bench.timing import Row
 from xrgs.bench.training import STEP_PARTS
+from xrgs.capture.images import SOFTWARE
 
 _DPI = 150
 _SIZE = (4.6, 4.2)  # of a panel, inches
@@ -34,7 +35,7 @@ def draw(results: Mapping[str, Any]) -> bytes:
         The bytes of a PNG.
     """
     stream = io.BytesIO()
-    draw_figure(results).savefig(stream, format="png", dpi=_DPI, metadata={"Software": None})
+    draw_figure(results).savefig(stream, format="png", dpi=_DPI, metadata={"Software": SOFTWARE})
     return stream.getvalue()
 
 

@@ -37,6 +37,8 @@ class LoadedView:
     """[H, W, 3] float32 in 0..1."""
     rho: float = 1.0
     """The relative sampling rate in (0, 1], see `xrgs.capture.views.View`."""
+    mask: torch.Tensor | None = None
+    """[H, W] bool, True for a pixel that is used; None uses all."""
 
 
 @dataclass(frozen=True)

@@ -89,7 +89,12 @@ class Tiff:
     @property
     def is_deep(self) -> bool:
         """Whether Pillow can't be trusted with it: more than 8 bits, signed or float."""
-        return self._page.bitspersample > 8 or self._page.sampleformat in (_SIGNED, _FLOAT)
+        return self.bits > 8 or self._page.sampleformat in (_SIGNED, _FLOAT)
+
+    @property
+    def bits(self) -> int:
+        """How many bits a sample has."""
+        return int(self._page.bitspersample)
 
     @property
     def size(self) -> tuple[int, int]:
@@ -118,7 +123,7 @@ class Tiff:
                 another kind than grey, RGB and CMYK.
         """
         page = self._page
-        bits, photometric = int(page.bitspersample), int(page.photometric)
+        bits, photometric = self.bits, int(page.photometric)
         if page.sampleformat in (_SIGNED, _FLOAT) or bits > 16:
             kind = {_SIGNED: "signed", _FLOAT: "float"}.get(page.sampleformat, "unsigned")
             raise DepthError(

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 from msgspec import Struct
 
-from xrgs.capture import variant
+from xrgs.capture import images, variant
 from xrgs.capture.contact_sheet import contact_sheet
 from xrgs.capture.folders import is_failed
 from xrgs.errors import XrgsError
@@ -84,7 +84,7 @@ def describe(folder: Path, out: Path | None = None) -> str:
     file = out or Path(f"{frozen.id}.png")
     try:
         with atomic_writer(file) as stream:
-            sheet.save(stream, "PNG")
+            images.write_png(stream, sheet)
     except OSError as error:
         raise XrgsError(f"out={file}: can't be written ({error})") from error
     more = [f"Contact sheet: {file}", *(f"  {note}" for note in notes)]

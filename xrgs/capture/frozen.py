@@ -1,8 +1,9 @@
 """Writes, verifies and reads the folder of a frozen variant. Nothing here imports torch.
 
 The folder is named by the variant's id. `variant.json` (`Manifest`) lists the views and the hash
-of every other file that decides a number: `images/<split>/<view>.png` and `points.npz`, the SfM
-points. `report.json` says how SfM went, and `colmap.log` is COLMAP's log.
+of every other file that decides a number: `images/<split>/<view>.png`, the masks
+`images/<split>-masks/<view>.png` of the views that have one, and `points.npz`, the SfM points.
+`report.json` says how SfM went, and `colmap.log` is COLMAP's log.
 """
 
 from __future__ import annotations
@@ -25,7 +26,7 @@ from xrgs.safeio.records import errors_named, read_struct
 from xrgs.safeio.sanitize import for_line
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Iterable, Iterator
     from pathlib import Path
 
     from numpy.typing import NDArray
@@ -41,7 +42,7 @@ _Row3 = Annotated[list[float], Meta(min_length=3, max_length=3)]
 _Row4 = Annotated[list[float], Meta(min_length=4, max_length=4)]
 
 
-class ViewEntry(Struct, frozen=True, forbid_unknown_fields=True):
+class ViewEntry(Struct, frozen=True, forbid_unknown_fields=True, omit_defaults=True):
     """A view in `variant.json`; see `xrgs.capture.views.View`."""
 
     name: Annotated[str, Meta(min_length=1)]
@@ -53,6 +54,7 @@ class ViewEntry(Struct, frozen=True, forbid_unknown_fields=True):
     K: Annotated[list[_Row3], Meta(min_length=3, max_length=3)]
     viewmat: Annotated[list[_Row4], Meta(min_length=4, max_length=4)]
     rho: Annotated[float, Meta(gt=0, le=1)]
+    mask: str | None = None
 
 
 class Manifest(Struct, frozen=True, forbid_unknown_fields=True):
@@ -95,14 +97,14 @@ def freeze(made: Variant, key: str, folder: Path, variants: Path) -> Variant:
     with atomic_writer(folder / POINTS, durable=False) as stream:
         np.savez(stream, points=made.points, colors=made.colors)
     write_json(folder / REPORT, made.report, durable=False)
-    images = {view.file.relative_to(folder).as_posix() for view in made.views}
+    views = tuple(_entry(folder, view) for view in made.views)
     manifest = Manifest(
         key=key,
         scene=made.scene,
         factor=made.factor,
         held_out=made.held_out,
-        views=tuple(_entry(folder, view) for view in made.views),
-        files=sealed.hashes(folder, [POINTS, *sorted(images)]),
+        views=views,
+        files=sealed.hashes(folder, [POINTS, *_pictures(views)]),
     )
     manifest = msgspec.structs.replace(manifest, id=manifest.computed_id())
     write_json(folder / MANIFEST, msgspec.to_builtins(manifest), durable=False)
@@ -157,7 +159,7 @@ def read_manifest(folder: Path) -> Manifest:
     names = {(view.split, view.name) for view in manifest.views}
     if len(names) < len(manifest.views):
         raise StoreError(f"damaged: {file}: views: two of a split have one name")
-    if manifest.files.keys() != {POINTS, *(view.file for view in manifest.views)}:
+    if manifest.files.keys() != {POINTS, *_pictures(manifest.views)}:
         raise StoreError(f"damaged: {file}: files: they are not the views' files and {POINTS}")
     if missing := {"train", "test"} - {view.split for view in manifest.views}:
         raise StoreError(f"damaged: {file}: views: none is to {min(missing)}")
@@ -215,10 +217,18 @@ def _assembled(folder: Path, manifest: Manifest) -> Variant:
     )
 
 
+def _pictures(views: Iterable[ViewEntry]) -> list[str]:
+    """Return the images and masks of views by their paths in the folder, sorted."""
+    return sorted({name for view in views for name in (view.file, view.mask) if name is not None})
+
+
 def _entry(folder: Path, view: View) -> ViewEntry:
-    file = view.file.relative_to(folder).as_posix()
+    files = {
+        key: None if path is None else path.relative_to(folder).as_posix()
+        for key, path in (("file", view.file), ("mask", view.mask))
+    }
     arrays = {"K": view.K.tolist(), "viewmat": view.viewmat.tolist()}
-    return ViewEntry(**(vars(view) | {"file": file} | arrays))
+    return ViewEntry(**(vars(view) | files | arrays))
 
 
 def _view(folder: Path, entry: ViewEntry) -> View:
@@ -226,4 +236,5 @@ def _view(folder: Path, entry: ViewEntry) -> View:
         "K": np.array(entry.K, dtype=np.float64),
         "viewmat": np.array(entry.viewmat, dtype=np.float64),
     }
-    return View(**(msgspec.structs.asdict(entry) | {"file": folder / entry.file} | arrays))
+    files = {"file": folder / entry.file, "mask": entry.mask and folder / entry.mask}
+    return View(**(msgspec.structs.asdict(entry) | files | arrays))

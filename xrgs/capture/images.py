@@ -13,11 +13,12 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import IO, TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
-from PIL import Image, UnidentifiedImageError
+from PIL import Image, ImageOps, UnidentifiedImageError
+from PIL.PngImagePlugin import PngInfo
 
 from xrgs.capture import colour, deep
 from xrgs.errors import UnreadableError, XrgsError
@@ -32,6 +33,10 @@ ImageArray = NDArray[np.float32]  # [H, W, 3]
 #: The formats that are read. PIL goes by the content of a file and not by its suffix, and it hands
 #: some of the other formats that it knows to external programs.
 _FORMATS = ("BMP", "HEIF", "JPEG", "PNG", "TIFF", "WEBP")
+#: The suffixes of HEIC files, in lower case.
+HEIC = frozenset({".heic", ".heif", ".hif"})
+#: What the PNGs of this package have in their text chunk `Software`.
+SOFTWARE = "xrgs"
 #: How files begin that people take for photographs of these formats, and what they are.
 _OTHER_FORMATS = {
     b"\xff\x0a": "JPEG XL",
@@ -47,6 +52,10 @@ _TIFF_MAGIC = (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")
 _PNG_MAGIC = b"\x89PNG\r\n\x1a\n"
 #: The chunks of a PNG that may hold EXIF or XMP.
 _PNG_TEXT = (b"eXIf", b"iTXt", b"tEXt", b"zTXt")
+#: The longest chunk that is kept, bytes: those of headers and colours are shorter.
+_SHORT_CHUNK = 64
+#: The channels of a PNG's colour types: grey, RGB, palette, grey with alpha, RGBA.
+_PNG_CHANNELS = {0: 1, 2: 3, 3: 1, 4: 2, 6: 4}
 #: The largest photograph that is read: cameras give 200 megapixels, and PIL takes 1 GB for this.
 MAX_PIXELS = 1 << 28
 #: The largest image of a store that is read. In training it takes 800 MB.
@@ -153,8 +162,15 @@ class Header:
     orientation: int
     """The EXIF orientation that is applied, 1 to 8; 1 where the tag is missing or invalid. It is 1
     of HEIC, which has its own transformations."""
-    is_deep_grey: bool
-    """Whether it has one channel of more than 8 bits, as depth maps have."""
+    channels: int
+    """How many values a pixel has; 1 also of a palette's."""
+    bits: int
+    """How many bits a value has."""
+
+    @property
+    def is_deep_grey(self) -> bool:
+        """Whether it has one channel of more than 8 bits, as depth maps have."""
+        return self.channels == 1 and self.bits > 8
 
 
 @dataclass(frozen=True)
@@ -188,7 +204,8 @@ class _File(Protocol):
     size: tuple[int, int]
     """Width and height of the pixels as they are stored, px."""
     orientation: int
-    is_deep_grey: bool
+    channels: int
+    bits: int
     exif: Image.Exif
     profile: bytes | None
     frames: int
@@ -205,16 +222,21 @@ class _PilFile:
 
     def __init__(self, stream: BinaryIO, start: bytes) -> None:
         self._stream = stream
-        self._image = image = Image.open(stream, formats=_formats(start))
+        self.image = image = Image.open(stream, formats=_formats(start))
         _check_size(stream, image.size, MAX_PIXELS)
-        self._chunks = _png_chunks(stream) if image.format == "PNG" else {}
-        is_heif = image.format == "HEIF"
-        self._bits = int(image.info.get("bit_depth", 8)) if is_heif else self._png_bits()
-        self.is_deep_grey = self._bits > 8 and image.mode[0] in "LI"
+        is_heif, is_png = image.format == "HEIF", image.format == "PNG"
+        self._chunks, has_late_exif = _png_chunks(stream) if is_png else ({}, False)
+        self.channels, self.bits = len(image.getbands()), int(image.info.get("bit_depth", 8))
+        if is_png:
+            self.bits, colour_type = self._chunks[b"IHDR"][8:10]
+            self.channels = _PNG_CHANNELS[colour_type]
         self.profile: bytes | None = image.info.get("icc_profile")
         if b"cICP" in self._chunks:  # PNG's third edition puts it above the profile
             self.profile = None
-        self.exif = self._read_exif()
+        self.exif = Image.Exif()
+        with suppress(Exception):  # PIL raises nearly anything on damaged EXIF
+            # A PNG's own method decodes the pixels, to look for EXIF behind them.
+            self.exif = image.getexif() if has_late_exif else Image.Image.getexif(image)
         # TIFFs are turned when they are loaded, and say so before; a HEIC file's tag is no order.
         self.orientation = 1 if is_heif else _orientation(self.exif.get(_EXIF_ORIENTATION))
         self.size = image.size
@@ -223,19 +245,8 @@ class _PilFile:
         # The others of a JPEG are gain maps, depth, or the other half of a stereo pair.
         self.frames = 1 if image.format in ("JPEG", "MPO") else getattr(image, "n_frames", 1)
 
-    def _png_bits(self) -> int:
-        return self._chunks[b"IHDR"][8] if self._chunks else 8
-
-    def _read_exif(self) -> Image.Exif:
-        # PIL decodes a PNG to look for EXIF behind the pixels.
-        if self._chunks and not any(name in self._chunks for name in _PNG_TEXT):
-            return Image.Exif()
-        with suppress(Exception):  # PIL raises nearly anything on damaged EXIF
-            return self._image.getexif()
-        return Image.Exif()
-
     def encoding(self) -> colour.Encoding | None:
-        info = self._image.info
+        info = self.image.info
         if cicp := self._chunks.get(b"cICP"):
             return colour.from_h273(cicp[0], cicp[1])
         if self._chunks:
@@ -246,14 +257,14 @@ class _PilFile:
             return colour.from_h273(
                 int(nclx["color_primaries"]), int(nclx["transfer_characteristics"])
             )
-        with suppress(Exception):  # as for `_read_exif`
+        with suppress(Exception):  # as for EXIF itself
             if self.exif.get_ifd(_EXIF_INTEROPERABILITY).get(1, "").startswith("R03"):
                 return colour.adobe_rgb()
         return None
 
     def load(self) -> _Samples:
-        image: Image.Image = self._image
-        if self._bits > 8:
+        image: Image.Image = self.image
+        if self.bits > 8:
             self._stream.seek(0)
             if image.format == "HEIF":
                 found = deep.decode_heif(self._stream)
@@ -286,11 +297,11 @@ class _DeepTiff:
         self.size = tiff.size
         _check_size(stream, self.size, MAX_PIXELS)
         self.orientation = _orientation(tiff.value(_EXIF_ORIENTATION))
-        self.is_deep_grey = tiff.channels == 1
+        self.channels, self.bits = tiff.channels, tiff.bits
         self.profile: bytes | None = tiff.value(_TIFF_PROFILE)
         self.frames = tiff.frames
         self.exif = Image.Exif()
-        with suppress(Exception):  # as for `_PilFile`
+        with suppress(Exception):  # PIL raises nearly anything on damaged EXIF
             stream.seek(0)
             self.exif.load_from_fp(stream)
 
@@ -317,16 +328,17 @@ def _file(stream: BinaryIO) -> _File:
     return _PilFile(stream, start)
 
 
-def _png_chunks(stream: BinaryIO) -> dict[bytes, bytes]:
-    """Read the chunks of a PNG by name, the last of each; those of pixels and texts are empty."""
+def _png_chunks(stream: BinaryIO) -> tuple[dict[bytes, bytes], bool]:
+    """Read the short chunks of a PNG by name, and whether EXIF or text is behind the pixels."""
     chunks: dict[bytes, bytes] = {}
+    is_late = False
     stream.seek(len(_PNG_MAGIC))
     while len(head := stream.read(8)) == 8:
         length, name = int.from_bytes(head[:4], "big"), head[4:]
-        short = length <= 64
-        chunks[name] = stream.read(length) if short else b""
-        stream.seek(4 if short else length + 4, 1)
-    return chunks
+        chunks[name] = stream.read(length) if length <= _SHORT_CHUNK else b""
+        stream.seek(4 if length <= _SHORT_CHUNK else length + 4, 1)
+        is_late |= b"IDAT" in chunks and name in _PNG_TEXT
+    return chunks, is_late
 
 
 def _orientation(value: object) -> int:
@@ -359,12 +371,53 @@ def header(path: Path) -> Header:
 def _header(file: _File) -> Header:
     width, height = file.size
     size = (height, width) if file.orientation >= 5 else (width, height)
-    return Header(size, file.orientation, file.is_deep_grey)
+    return Header(size, file.orientation, file.channels, file.bits)
 
 
 def size(path: Path) -> tuple[int, int]:
     """Return the width and height of a photograph, px, as `header` does."""
     return header(path).size
+
+
+def is_own(path: Path) -> bool:
+    """Return whether a file is a PNG that this package wrote: a render, a film's frame, a figure.
+
+    Raises:
+        UnreadableError: The file can't be read now.
+        ImageError: The file is not a PNG.
+    """
+    with _stream(path) as stream, Image.open(stream, formats=("PNG",)) as image:
+        return image.info.get("Software") == SOFTWARE
+
+
+def has_colour(path: Path) -> bool:
+    """Return whether a file's pixels have three channels or more; masks and depth maps have one.
+
+    Raises:
+        UnreadableError: The file can't be read now.
+        ImageError: The file is not an image.
+    """
+    return header(path).channels >= 3
+
+
+def thumbnail(path: Path, side: int) -> NDArray[np.uint8]:
+    """Read a small grey picture of a photograph, [side, side], upright by its EXIF orientation.
+
+    Raises:
+        UnreadableError: The file can't be read now.
+        ImageError: The file is unreadable or truncated.
+    """
+    with _stream(path) as stream:
+        file = _file(stream)
+        if isinstance(file, _PilFile) and file.bits <= 8:
+            file.image.draft("RGB", (8 * side, 8 * side))  # JPEGs are decoded at down to an eighth
+            upright = ImageOps.exif_transpose(file.image).convert("RGB")
+            return _small(upright, side)
+    return _small(Image.fromarray(to_8_bit(decode(path).pixels)), side)
+
+
+def _small(image: Image.Image, side: int) -> NDArray[np.uint8]:
+    return np.asarray(image.convert("L").resize((side, side), Image.Resampling.BOX))
 
 
 def exif_camera(path: Path) -> str:
@@ -455,19 +508,36 @@ def read_png(
     return _to_array(read_png_pil(path, size, max_pixels))
 
 
+def read_mask(path: Path, size: tuple[int, int]) -> NDArray[np.bool_]:
+    """Read a mask of a store, a PNG as `save_mask` writes it: [H, W], True for a used pixel.
+
+    Args:
+        path: The file.
+        size: The width and height that it must have, px.
+
+    Raises:
+        UnreadableError: The file can't be read now.
+        ImageError: The file is not such a PNG.
+    """
+    mask: NDArray[np.bool_] = np.asarray(read_png_pil(path, size, mode="L")) > 127
+    return mask
+
+
 def read_png_pil(
     path: Path,
     size: tuple[int, int] | None = None,
     max_pixels: int = MAX_PNG_PIXELS,
+    mode: str = "RGB",
 ) -> Image.Image:
-    """Read a PNG as `read_png` does, into an image of PIL of mode RGB."""
+    """Read a PNG as `read_png` does, into an image of PIL of mode RGB, or L for grey."""
     with _stream(path) as stream, Image.open(stream, formats=("PNG",)) as image:
         if size is not None and image.size != size:
             raise _RefusedError(
                 f"it has {image.width} x {image.height} pixels, not {size[0]} x {size[1]}"
             )
-        if image.mode != "RGB":
-            raise _RefusedError(f"its pixels are {image.mode}, not 8-bit RGB")
+        if image.mode != mode:
+            kind = "RGB" if mode == "RGB" else "grey"
+            raise _RefusedError(f"its pixels are {image.mode}, not 8-bit {kind}")
         _check_size(stream, image.size, max_pixels, drawing=False)
         image.load()
         return image
@@ -488,7 +558,21 @@ def save(path: Path, image: ImageArray, *, durable: bool = True) -> None:
     """
     path.parent.mkdir(exist_ok=True)  # not parents: a store that vanished stays away
     with atomic_writer(path, durable=durable) as stream:
-        Image.fromarray(to_8_bit(image)).save(stream, "PNG", compress_level=4)
+        write_png(stream, Image.fromarray(to_8_bit(image)))
+
+
+def write_png(stream: IO[bytes], image: Image.Image) -> None:
+    """Write a PNG that `is_own` recognises, so that no render is taken for a photograph."""
+    text = PngInfo()
+    text.add_text("Software", SOFTWARE)
+    image.save(stream, "PNG", compress_level=4, pnginfo=text)
+
+
+def save_mask(path: Path, mask: NDArray[np.bool_], *, durable: bool = True) -> None:
+    """Write a mask [H, W] as `save` writes an image: 8-bit grey, 255 where it is True."""
+    path.parent.mkdir(exist_ok=True)
+    with atomic_writer(path, durable=durable) as stream:
+        Image.fromarray(mask.astype(np.uint8) * 255).save(stream, "PNG", compress_level=4)
 
 
 def to_8_bit(image: ImageArray) -> NDArray[np.uint8]:

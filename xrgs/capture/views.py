@@ -43,6 +43,9 @@ class View:
     """The relative sampling rate, in (0, 1]: focal length (px) / median depth of the SfM points
     that the view observes, over the largest such ratio of the variant. Downsampling a view by
     `factor` divides it by `factor`."""
+    mask: Path | None = None
+    """An 8-bit grey PNG of the same size: 255 where a pixel is used, 0 elsewhere. None uses all.
+    Below it the file has the photograph, or what a degradation made of its neighbours."""
 
 
 @dataclass(frozen=True)

@@ -5,24 +5,30 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from xrgs.capture import images
-from xrgs.evaluation.metrics import VIEW_METRICS
+from xrgs.evaluation.metrics import score_view
 from xrgs.runtime.machine import single_torch_thread
 
 if TYPE_CHECKING:
     from pathlib import Path
 
+    from xrgs.capture.views import View
 
-def score_files(render: Path, photograph: Path, size: tuple[int, int]) -> dict[str, float | None]:
-    """Score a render against its photograph, both 8-bit RGB PNGs of `size` (width, height), px.
 
-    Returns:
-        Each score by its metric's name; None where it can't be computed on this machine.
+def score_file(render: Path, view: View, *, masked: bool) -> dict[str, float | None]:
+    """Score a render, an 8-bit RGB PNG, against the photograph of a view.
+
+    Args:
+        render: The file, of the view's size.
+        view: The view.
+        masked: As for `xrgs.evaluation.metrics.score_view`.
 
     Raises:
         ImageError: A file is missing, damaged or of another size or mode; the message names it.
     """
     import torch
 
-    image, target = (torch.from_numpy(images.read_png(file, size)) for file in (render, photograph))
+    size = view.width, view.height
+    image, target = (torch.from_numpy(images.read_png(file, size)) for file in (render, view.file))
+    mask = torch.from_numpy(images.read_mask(view.mask, size)) if view.mask else None
     with torch.no_grad(), single_torch_thread():
-        return {name: score(image, target) for name, score in VIEW_METRICS.items()}
+        return score_view(image, target, mask, masked=masked)

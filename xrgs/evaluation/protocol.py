@@ -2,7 +2,7 @@
 
 Each view is rendered with the settings of the training and all SH bands, and clamped to 0..1. The
 float32 image is scored against the 8-bit photograph / 255 with every metric of
-`xrgs.evaluation.metrics.VIEW_METRICS`.
+`xrgs.evaluation.metrics.VIEW_METRICS`, inside the view's mask.
 
 LPIPS needs weights that are not shipped. Only the published ones are accepted, so whether a machine
 has them is not in a cell's identity: a cell scored without them is complete, and has no LPIPS.
@@ -46,9 +46,9 @@ def score_views(
     from xrgs.runtime.progress import progress
 
     renders.mkdir(exist_ok=True)
-    rows = []
+    rows, masked = [], _any_mask(views)
     for view in progress(views, "evaluating", "view"):
-        image, scores = _score(gaussians, view, conf)
+        image, scores = _score(gaussians, view, conf, masked=masked)
         rows.append({"view": view.name} | scores)
         images.save(renders / f"{view.name}.png", image.numpy(), durable=False)
     return rows
@@ -67,7 +67,8 @@ def mean_scores(
     Returns:
         The mean of each metric over the views; None where it is not available.
     """
-    rows = [_score(gaussians, view, conf)[1] for view in views]
+    masked = _any_mask(views)
+    rows = [_score(gaussians, view, conf, masked=masked)[1] for view in views]
     means: dict[str, float | None] = {}
     for name in rows[0]:
         values = [row[name] for row in rows]
@@ -118,16 +119,20 @@ def _render(gaussians: Gaussians, view: LoadedView, conf: SplatConf) -> Tensor:
         ).image
 
 
+def _any_mask(views: Sequence[LoadedView]) -> bool:
+    return any(view.mask is not None for view in views)
+
+
 def _score(
-    gaussians: Gaussians, view: LoadedView, conf: SplatConf
+    gaussians: Gaussians, view: LoadedView, conf: SplatConf, *, masked: bool
 ) -> tuple[Tensor, dict[str, float | None]]:
     """Return the clamped render [H, W, 3] of a view, and its scores by name."""
     import torch
 
-    from xrgs.evaluation import metrics
+    from xrgs.evaluation.metrics import score_view
     from xrgs.runtime.machine import single_torch_thread
 
     image = _render(gaussians, view, conf).clamp(0.0, 1.0)
     with torch.no_grad(), single_torch_thread():  # sums over several threads differ in a digit
-        scores = {name: fn(image, view.image) for name, fn in metrics.VIEW_METRICS.items()}
+        scores = score_view(image, view.image, view.mask, masked=masked)
     return image, scores

@@ -151,7 +151,12 @@ def _train_and_score(
     count = len(trained.gaussians)
     _log.info("trained %d steps in %.1f s: %d Gaussians", conf.train.steps, trained.seconds, count)
     peak_rss_bytes = peak_rss()  # read before evaluation, which may load the network of LPIPS
-    save_ply(folder.path / "splats.ply", trained.gaussians, durable=False)
+    save_ply(
+        folder.path / "splats.ply",
+        trained.gaussians,
+        antialiased=conf.splat.raster.antialiased,
+        durable=False,
+    )
     write_text(folder.path / "history.csv", table_text(trained.history), durable=False)
     if trained.scores:
         write_text(folder.path / "quality.csv", table_text(trained.scores), durable=False)

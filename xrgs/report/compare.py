@@ -105,7 +105,8 @@ def compare(cells: pd.DataFrame, metrics: Sequence[Metric], against: str = BASEL
 
     Args:
         cells: The table `Sweep.cells`.
-        metrics: The metrics to compare, in the order of the tables' rows.
+        metrics: The metrics to compare, in the order of the tables' rows. An optional one that no
+            cell has is left out.
         against: The label that all others are compared with.
 
     Returns:
@@ -118,6 +119,7 @@ def compare(cells: pd.DataFrame, metrics: Sequence[Metric], against: str = BASEL
             cells of a condition were scored on held-out training views and others were not. The
             message names both cells, or the labels.
     """
+    metrics = [m for m in metrics if not m.optional or cells[m.name].notna().any()]
     cells = _with_base(cells, against)
     _check_comparable(cells, against)
     pairs = _pairs(cells, metrics, against)

@@ -15,7 +15,7 @@ import pandas as pd
 
 from xrgs.capture import variant
 from xrgs.capture.images import ImageError
-from xrgs.evaluation.files import score_files
+from xrgs.evaluation.files import score_file
 from xrgs.evaluation.metrics import VIEW_METRICS
 from xrgs.evaluation.scoring import scoring_code
 from xrgs.report.collect import ReportError, Sweep, cell_means
@@ -113,7 +113,8 @@ def _with_one(sweep: Sweep, store: JoinedStore, one: External) -> Sweep:
         split = "train" if cell["validation"] > 0 else "test"
         expected = _expected(store, str(cell["variant_id"]), split)
         bar = progress(list(views), f"scoring {one.label}", "view")
-        scores += [{"cell_id": cell_id} | _score(folder, expected[name]) for name in bar]
+        masked = any(expected[name].mask for name in views)
+        scores += [{"cell_id": cell_id} | _score(folder, expected[name], masked) for name in bar]
         renders[cell_id] = folder
         rows.append(
             {key: cell[key] for key in (*_VARIANT, *_SHARED, "protocol")}
@@ -162,11 +163,11 @@ def _expected(store: JoinedStore, variant_id: str, split: str) -> dict[str, View
     return {view.name: view for view in frozen.views if view.split == split}
 
 
-def _score(folder: Path, view: View) -> dict[str, Any]:
+def _score(folder: Path, view: View, masked: bool) -> dict[str, Any]:
     """Score the render of a view against its photograph."""
-    file, size = folder / f"{view.name}.png", (view.width, view.height)
+    file = folder / f"{view.name}.png"
     wanted = f"expected is an 8-bit RGB PNG of {view.width} x {view.height} px, the render of the"
     try:
-        return {"view": view.name} | score_files(file, view.file, size)
+        return {"view": view.name} | score_file(file, view, masked=masked)
     except ImageError as error:
         raise ReportError(f"{error}; {wanted} view {view.name}") from error

@@ -18,6 +18,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 from matplotlib.ticker import EngFormatter, LogLocator, NullLocator
 
+from xrgs.capture.images import SOFTWARE
 from xrgs.safeio.sanitize import MAX_CELL, for_line
 
 if TYPE_CHECKING:
@@ -360,5 +361,5 @@ def _show(axes: Axes, image: Image, interpolation: str) -> None:
 
 def _png(figure: Figure) -> bytes:
     stream = io.BytesIO()
-    figure.savefig(stream, format="png", metadata={"Software": None})
+    figure.savefig(stream, format="png", metadata={"Software": SOFTWARE})
     return stream.getvalue()

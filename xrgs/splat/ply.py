@@ -1,46 +1,70 @@
 """Gaussians as .ply files in the layout of INRIA, which viewers of 3D Gaussian Splatting open.
 
-A file is binary little endian float32 with one vertex for each Gaussian and its raw parameters
-(logit opacities, log scales). The harmonics above band 0 are stored by channel: all coefficients of
-red, then green, then blue.
+A file has one vertex for each Gaussian with its raw parameters (logit opacities, log scales). The
+harmonics above band 0 are stored by channel: all coefficients of red, then green, then blue.
 """
 
 from __future__ import annotations
 
-import os
+import logging
+import re
 from pathlib import Path
-from typing import BinaryIO
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 
 from xrgs.errors import XrgsError
+from xrgs.safeio import ply
 from xrgs.safeio.atomic import atomic_writer
-from xrgs.splat.gaussians import Gaussians
+from xrgs.splat.saved import (
+    CERTAIN_LOGIT,
+    FLAT_LOG_SCALE,
+    SavedGaussians,
+    check_finite,
+    check_is_read,
+    converted_by,
+    to_gaussians,
+)
 from xrgs.splat.sh import MAX_DEGREE, bases
 
-MAX_HEADER_LINES = 512
-MAX_LINE_BYTES = 1024
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from numpy.typing import NDArray
+
+    from xrgs.splat.gaussians import Gaussians
+
+    Table = NDArray[np.float32]
+
+_log = logging.getLogger(__name__)
+
 _NORMALS = ("nx", "ny", "nz")
-_MAGIC = b"ply\n"
-_FORMAT = "format binary_little_endian 1.0"
+#: The comment of Brush, SuperSplat and LichtFeld Studio for antialiased Gaussians.
+_ANTIALIASED = "SplatRenderMode: mip"
+#: How comments say it, in lower case: `SplatRenderMode: mip`, or Postshot's `antialiased 1`.
+_RENDER_MODE = re.compile(r"splatrendermode:\s*(\S+)|antialiased\s+([01])")
+#: Harmonics of more bands are in no file that a trainer writes.
+_HIGHEST = 16
 
 
-def save_ply(path: str | Path, gaussians: Gaussians, *, durable: bool = True) -> None:
+def save_ply(
+    path: str | Path, gaussians: Gaussians, *, antialiased: bool = False, durable: bool = True
+) -> None:
     """Write Gaussians to a .ply file, which is replaced atomically.
 
     Args:
         path: The file to write.
-        gaussians: The N Gaussians; they are written as float32, in raw parameters (logarithms of
-            scales, logits of opacities).
+        gaussians: The N Gaussians; they are written as little-endian float32, in raw parameters
+            (logarithms of scales, logits of opacities).
+        antialiased: Whether they were trained with `RasterSettings.antialiased`. The header then
+            has the comment `SplatRenderMode: mip`, by which viewers know how to draw them.
         durable: Whether to wait until the content and the name are on the disk.
 
     Raises:
         OSError: The file can't be written.
     """
     path = Path(path) if isinstance(path, str) else path
-    count = len(gaussians)
     columns = [
         gaussians.means,
         torch.zeros_like(gaussians.means),  # normals, which viewers expect and do not use
@@ -51,44 +75,72 @@ def save_ply(path: str | Path, gaussians: Gaussians, *, durable: bool = True) ->
         gaussians.quats,
     ]
     table = torch.cat([column.detach().float() for column in columns], dim=1)
-    names = _properties(gaussians.shN.shape[1])
-    header = [_FORMAT, f"element vertex {count}", *(f"property float {n}" for n in names)]
+    header = [
+        "ply",
+        "format binary_little_endian 1.0",
+        *([f"comment {_ANTIALIASED}"] if antialiased else []),
+        f"element vertex {len(gaussians)}",
+        *(f"property float {name}" for name in _properties(gaussians.shN.shape[1])),
+        "end_header",
+    ]
     with atomic_writer(path, durable=durable) as file:
-        file.write(_MAGIC + "".join(f"{line}\n" for line in [*header, "end_header"]).encode())
+        file.write("".join(f"{line}\n" for line in header).encode())
         file.write(table.numpy().astype("<f4").tobytes())
 
 
 def load_ply(path: str | Path) -> Gaussians:
     """Read Gaussians that `save_ply`, or any 3D Gaussian Splatting trainer, wrote.
 
+    Properties may come in any order and of any type, among others, in text or binary. Bands of the
+    harmonics above 3 are left out, with a warning. An infinite logit of an opacity and a
+    logarithm of a scale of -inf become finite values that render the same. The filter of
+    Mip-Splatting (`filter_3D`) is applied to the scales and opacities.
+
     Args:
-        path: The .ply file; its properties may come in any order, all of them float32.
+        path: The .ply file.
 
     Returns:
-        float32 leaf tensors with gradients on.
+        float32 leaf tensors with gradients on. `load_gaussians` also says how to render them.
 
     Raises:
-        XrgsError: the file is missing, truncated or not such a .ply; the message names it.
+        XrgsError: The file is missing, damaged or no such .ply; the message names it.
     """
-    path = Path(path) if isinstance(path, str) else path
-    try:
-        with path.open("rb") as file:
-            count, names = _read_header(file, path)
-            body_bytes = os.fstat(file.fileno()).st_size - file.tell()
-            if body_bytes != count * len(names) * 4:  # before reading: the file may be huge
-                raise XrgsError(
-                    f"{path}: {count} vertices of {len(names)} floats need "
-                    f"{count * len(names) * 4} bytes, {body_bytes} follow the header"
-                )
-            body = file.read(body_bytes)
-    except OSError as error:
-        raise XrgsError(f"{path}: cannot be read: {error.strerror}") from error
-    if len(body) != body_bytes:
-        raise XrgsError(f"{path}: grew shorter while it was read")
-    table = np.frombuffer(body, dtype="<f4").reshape(count, len(names))
-    if not np.isfinite(table).all():
-        raise XrgsError(f"{path}: has values that are not finite")
-    return _gaussians(table, names, path)
+    return read_ply(Path(path) if isinstance(path, str) else path).gaussians
+
+
+def read_ply(path: Path) -> SavedGaussians:
+    """Read Gaussians as `load_ply` does, and whether they are to be rendered antialiased."""
+    check_is_read(path)
+    file = ply.read(path)
+    names = _columns(path, file.names)
+    table = file.columns(names, np.float32)
+    opacities, scales = table[:, -8], table[:, -7:-4]
+    opacities[np.isposinf(opacities)] = CERTAIN_LOGIT
+    opacities[np.isneginf(opacities)] = -CERTAIN_LOGIT
+    scales[np.isneginf(scales)] = FLAT_LOG_SCALE
+    check_finite(path, table, names)
+    antialiased = _is_antialiased(file.comments)
+    if "filter_3D" in file.names:
+        _log.warning("%s: the 3D filter of Mip-Splatting (filter_3D) is applied", path)
+        sizes = file.columns(["filter_3D"], np.float64)
+        check_finite(path, sizes, ["filter_3D"])
+        scales[:], opacities[:] = _filtered(scales, opacities, sizes)
+        antialiased = True  # Mip-Splatting renders so
+    values = {
+        "means": table[:, :3],
+        "sh0": table[:, None, 3:6],
+        # By channel in the file, and by band in memory.
+        "shN": table[:, 6:-8].reshape(len(table), 3, (len(names) - 14) // 3).swapaxes(1, 2),
+        "opacities": opacities,
+        "scales": scales,
+        "quats": table[:, -4:],
+    }
+    return SavedGaussians(to_gaussians(values), antialiased)
+
+
+def _is_antialiased(comments: Sequence[str]) -> bool:
+    found = [match for text in comments if (match := _RENDER_MODE.fullmatch(text.lower()))]
+    return bool(found) and (found[-1][1] == "mip" or found[-1][2] == "1")
 
 
 def _properties(rest: int) -> list[str]:
@@ -104,55 +156,54 @@ def _properties(rest: int) -> list[str]:
     ]
 
 
-def _read_header(file: BinaryIO, path: Path) -> tuple[int, list[str]]:
-    """Return the number of vertices and their columns; leave `file` at the first vertex."""
-    if file.readline(len(_MAGIC)) != _MAGIC:
-        raise XrgsError(f"{path}: is not a .ply file")
-    count = -1
-    names: list[str] = []
-    for _ in range(MAX_HEADER_LINES):
-        line = file.readline(MAX_LINE_BYTES)
-        words = line.decode("ascii", errors="replace").split()
-        match words:
-            case ["end_header"] if count >= 0:
-                if len(set(names)) != len(names):
-                    raise XrgsError(f"{path}: the header names a property twice")
-                return count, names
-            case ["comment" | "obj_info", *_]:
-                pass
-            case ["format", *_] if " ".join(words) == _FORMAT:
-                pass
-            case ["element", "vertex", digits] if count < 0 and _is_count(digits):
-                count = int(digits)
-            case ["property", "float" | "float32", name] if count >= 0:
-                names.append(name)
-            case _:
-                shown = line[:80].decode("ascii", errors="replace").rstrip()
-                raise XrgsError(f"{path}: unexpected line in the .ply header: {shown!r}")
-    raise XrgsError(f"{path}: the .ply header has no end")
+def _columns(path: Path, names: Sequence[str]) -> list[str]:
+    """Return the properties that hold the parameters, in the order of `_properties`.
 
-
-def _is_count(digits: str) -> bool:
-    """Return whether a string is a number of vertices that memory could hold."""
-    return digits.isascii() and digits.isdigit() and len(digits) <= 12
-
-
-def _gaussians(table: NDArray[np.float32], names: list[str], path: Path) -> Gaussians:
-    """Return the parameters in a table [N, columns] of named columns."""
-    stored = sum(name.startswith("f_rest_") for name in names)
-    if stored not in {3 * (bases(degree) - 1) for degree in range(MAX_DEGREE + 1)}:
-        raise XrgsError(f"{path}: {stored} f_rest properties are not a whole number of SH bands")
-    required = [name for name in _properties(stored // 3) if name not in _NORMALS]
+    Raises:
+        XrgsError: Some are missing; the message says what the file seems to be instead.
+    """
+    if "packed_position" in names:
+        raise XrgsError(
+            f"{path}: a compressed .ply of SuperSplat, which is not read; {converted_by(path)}"
+        )
+    rest = sum(re.fullmatch(r"f_rest_[0-9]+", name) is not None for name in names)
+    degree = next((d for d in range(_HIGHEST) if 3 * (bases(d) - 1) == rest), None)
+    if degree is None:
+        raise XrgsError(f"{path}: {rest} f_rest properties are not a whole number of SH bands")
+    required = [name for name in _properties(rest // 3) if name not in _NORMALS]
     missing = [name for name in required if name not in names]
+    if missing == ["scale_2"]:
+        raise XrgsError(
+            f"{path}: has no scale_2: these are the flat Gaussians of 2D Gaussian Splatting, "
+            "which is not served"
+        )
     if missing:
-        raise XrgsError(f"{path}: properties are missing: {', '.join(missing)}")
-    # In a fixed order whatever the file's, so that the parameters can be split off one by one.
-    ordered = torch.from_numpy(table[:, [names.index(name) for name in required]])
-    widths = {"means": 3, "sh0": 3, "shN": stored, "opacities": 1, "scales": 3, "quats": 4}
-    values = dict(zip(widths, ordered.split(list(widths.values()), dim=1), strict=True))
-    values["opacities"] = values["opacities"][:, 0]  # [N]
-    values["sh0"] = values["sh0"][:, None]  # [N, 1, 3]
-    values["shN"] = values["shN"].reshape(len(table), 3, stored // 3).transpose(1, 2)
-    contiguous = torch.contiguous_format
-    leaves = {name: value.clone(memory_format=contiguous) for name, value in values.items()}
-    return Gaussians(**{name: value.requires_grad_() for name, value in leaves.items()})
+        kind = "" if "opacity" in names else "a point cloud and no Gaussians: "
+        raise XrgsError(f"{path}: {kind}properties are missing: {', '.join(missing)}")
+    if degree > MAX_DEGREE:
+        _log.warning(
+            "%s: has spherical harmonics of degree %d; bands above %d are left out",
+            *(path, degree, MAX_DEGREE),
+        )
+        kept = bases(MAX_DEGREE) - 1
+        left_out = {
+            f"f_rest_{channel * rest // 3 + k}"
+            for channel in range(3)
+            for k in range(kept, rest // 3)
+        }
+        required = [name for name in required if name not in left_out]
+    return required
+
+
+def _filtered(scales: Table, opacities: Table, sizes: NDArray[np.float64]) -> tuple[Any, Any]:
+    """Convolve Gaussians with isotropic ones of standard deviation `sizes` [N, 1], as in training.
+
+    `xrgs.training.components.mip` has the formula.
+    """
+    variances = np.exp(2 * scales.astype(np.float64))
+    filtered = variances + sizes**2
+    alpha = 1 / (1 + np.exp(-opacities.astype(np.float64)))
+    alpha *= np.sqrt(variances / filtered).prod(axis=1)
+    bounds = np.finfo(np.float32)
+    alpha = alpha.clip(bounds.tiny, 1 - bounds.eps)
+    return np.log(filtered) / 2, np.log(alpha / (1 - alpha))

@@ -13,6 +13,7 @@ import torch
 from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
 
+from xrgs.capture.images import write_png
 from xrgs.errors import XrgsError
 from xrgs.runtime.progress import progress
 from xrgs.safeio.atomic import atomic_writer
@@ -181,4 +182,4 @@ def _write_pngs(frames: Iterable[Frame], out: Path, _: int) -> None:
         raise XrgsError(f"out={out}: the folder is not empty; name a new one")
     for number, frame in enumerate(frames):
         with atomic_writer(folder / f"{number:04}.png", durable=False) as stream:
-            Image.fromarray(frame).save(stream, "PNG", compress_level=4)
+            write_png(stream, Image.fromarray(frame))

@@ -4,45 +4,79 @@ LLFF's layout ([mildenhall2019], "Local light field fusion") has the photographs
 copies that are smaller by a factor N in `images_N/`, and poses in `poses_bounds.npy`, which are not
 read. The photographs of all folders below one are listed where its path ends with `/**`.
 
-Images and videos that are not listed are counted in a warning, which says how to get them.
+Images and videos that are not listed are counted in notes, which say how to get them.
 """
 
 from __future__ import annotations
 
-import logging
+import os
 import re
 import unicodedata
-from collections import Counter
+from collections import defaultdict
+from dataclasses import dataclass
 from importlib.util import find_spec
 from pathlib import Path
+from statistics import median
 from typing import TYPE_CHECKING
 
 from xrgs.capture import images
-from xrgs.capture.scenes.scene import ALL_BELOW, Scene, files_digest, label
+from xrgs.capture.scenes.copies import SIZES, one_of_each_size, size, without_copies
+from xrgs.capture.scenes.scene import ALL_BELOW, Scene, files_digest, label, remembered
 from xrgs.errors import UnreadableError, XrgsError
+from xrgs.runtime.text import listed
 from xrgs.safeio.files import is_name
 from xrgs.safeio.paths import user_path
-from xrgs.safeio.sanitize import for_line
+from xrgs.safeio.sanitize import counted
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Sequence
+    from collections.abc import Iterable, Iterator, Mapping, Sequence
 
     from xrgs.config import SceneConf
 
-_log = logging.getLogger(__name__)
-
-_HEIC = frozenset({".heic", ".heif"})
 #: The suffixes of files that are read as photographs, in lower case.
-SUFFIXES = _HEIC | {".bmp", ".jpeg", ".jpg", ".png", ".tif", ".tiff", ".webp"}
+SUFFIXES = images.HEIC | {".bmp", ".jpeg", ".jpg", ".png", ".tif", ".tiff", ".webp"}
 #: Those of images that are not read: raw files, and formats that no camera of today writes.
 _OTHER_IMAGES = frozenset(
-    {".arw", ".avif", ".cr2", ".cr3", ".dng", ".exr", ".gif", ".hdr", ".jp2", ".jxl", ".nef"}
-    | {".orf", ".pef", ".raf", ".rw2", ".srw"}
+    {".3fr", ".arw", ".cr2", ".cr3", ".dng", ".nef", ".nrw", ".orf", ".pef", ".raf", ".rw2"}
+    | {".srw", ".x3f", ".avif", ".exr", ".gif", ".hdr", ".insp", ".jfif", ".jp2", ".jxl", ".psd"}
 )
 _VIDEOS = frozenset({".3gp", ".avi", ".m4v", ".mkv", ".mov", ".mp4", ".mpg", ".mts", ".webm"})
-_LLFF_FOLDER = re.compile(r"images(_\d+)?")
+#: What programs make around photographs, by the entries of the folder that tell it.
+_MADE = {
+    "a store of xrgs": ("cells", "variants"),
+    "a variant of xrgs": ("variant.json",),
+    "a cell of xrgs": ("config.json", "identity.json"),
+    "a report of xrgs": ("cells.csv", "table.md"),
+    "an export of xrgs": ("split.json", "transform.json"),
+    "photographs that COLMAP undistorted": ("images", "sparse", "stereo"),
+}
+_MASKS = "masks"
+_MASK = r"masks?|segmentations?|seg|segments|mattes?|silhouettes?"
+#: The names of folders of masks, and of other images that programs make of photographs.
+_OF_MASKS = re.compile(rf"(?:.*[\W_])?(?:{_MASK})(?:[\W_\d].*)?", re.IGNORECASE)
+_OF_OTHERS = re.compile(
+    r"(?:.*[\W_])?(?:depths?|depth_?maps?|disparity|normals|normal_?maps?|thumbs?|thumbnails?)"
+    r"(?:[\W_\d].*)?",
+    re.IGNORECASE,
+)
+#: What a name has before or after the name of the photograph that an image was made of.
+_ADDED = rf"(?:{_MASK}|depth|disparity|normals?|thumb|thumbnail)"
+_ADDED_BEFORE, _ADDED_AFTER = re.compile(rf"^{_ADDED}[\W_]?"), re.compile(rf"[\W_]?{_ADDED}$")
 #: The deepest nesting of folders that is searched.
 _MAX_DEPTH = 8
+#: A picture that is longer for its width than this, or this many times longer than the others, is
+#: called a panorama.
+_PANORAMA, _TIMES_OTHERS = 2.2, 1.6
+
+
+@dataclass(frozen=True)
+class Listing:
+    """The photographs of a folder."""
+
+    files: dict[str, Path]
+    """At least two files by the names of their views, sorted by name."""
+    notes: tuple[str, ...]
+    """Sentences on what was left out, and on which of several copies was taken."""
 
 
 class FolderScene:
@@ -58,11 +92,17 @@ class FolderScene:
 
     def resolve(self, conf: SceneConf, long_side: int, home: Path) -> Scene:
         """List the photographs."""
-        return Scene(label(conf), home.name, list_photographs(conf.path, long_side))
+        found = look(conf.path, long_side)
+        return Scene(label(conf), home.name, found.files, notes=found.notes)
 
 
 def list_photographs(path: str | None, long_side: int) -> dict[str, Path]:
-    """List the image files of a scene's folder.
+    """List the image files of a scene's folder; see `look`."""
+    return look(path, long_side).files
+
+
+def look(path: str | None, long_side: int) -> Listing:
+    """List the image files of a scene's folder, and say what is not among them.
 
     Args:
         path: `scene.path`, the folder; with `/**` at its end, all folders below it too.
@@ -70,40 +110,252 @@ def list_photographs(path: str | None, long_side: int) -> dict[str, Path]:
             has at least so many px are taken; the largest where none has, or where this is 0.
 
     Returns:
-        At least two files by the names of their views, sorted by name: the name of the file without
-        its suffix. With `/**` the folders on the way come before it, joined by `_`.
+        The files and the notes. The name of a view is the name of the file without its suffix; with
+        `/**` the folders on the way come before it, joined by `_`.
 
     Raises:
-        UnreadableError: The folder can't be read now.
+        UnreadableError: The folder or a file in it can't be read now.
         XrgsError: The folder is missing, has fewer than two images or two of one name, a name can't
             be used, or images are HEIC and the package that reads it is not installed.
     """
     if not path:
         raise XrgsError("scene.path is empty: give the folder of photographs, scene.path=...")
-    folder = user_path(path.removesuffix(ALL_BELOW))
+    folder, nested = user_path(path.removesuffix(ALL_BELOW)), path.endswith(ALL_BELOW)
     try:
         if not folder.is_dir():
             why = "no such folder (scenes of llff/ and captures/ are looked for in data_root)"
             if folder.is_file():
                 why = "not a folder; for the frames of a video: scene=video scene.path=..."
             raise XrgsError(f"scene.path={folder}: {why}")
-        nested = path.endswith(ALL_BELOW)
-        taken = _all_below(folder) if nested else _select(folder, long_side)
-        left_out = [] if nested else _in_other_folders(folder, taken)
-        looked_in = _folders(folder) if nested else {folder, *(file.parent for file in taken)}
-        for parent in sorted(looked_in):
-            left_out += _not_read(parent)
+        taken, notes = (_all_below if nested else _inside)(folder, long_side)
+        files = [file for inside in taken.values() for file in inside]
+        for choose in (_photographs, without_copies):
+            files, more = choose(files, folder)
+            notes += more
+        notes += _not_read({folder, *taken}, files)
+        notes += _panoramas(files, folder)
     except OSError as error:
         raise UnreadableError(f"{error.filename}: {error.strerror}; try again") from error
-    if len(taken) < 2:
-        count = f"only {taken[0].name}" if taken else "no image"
+    if len(files) < 2:
+        count = f"only {files[0].name}" if files else "no image"
         suffixes = " ".join(sorted(SUFFIXES))
         why = f"{count} in it; two or more are needed ({suffixes})"
-        raise XrgsError("; ".join([f"scene.path={folder}: {why}", *left_out]))
-    for line in left_out:
-        _log.warning("%s", for_line(f"{folder}: {line}"))
-    _check_heic(taken)
-    return _by_name([(_view_name(file, folder if nested else file.parent), file) for file in taken])
+        raise XrgsError("; ".join([f"scene.path={folder}: {why}", *notes]))
+    _check_heic(files)
+    named = [(_view_name(file, folder if nested else file.parent), file) for file in files]
+    return Listing(_by_name(named), tuple(notes))
+
+
+#: Photographs by their folder.
+_Tree = dict[Path, list[Path]]
+
+
+def _inside(folder: Path, long_side: int) -> tuple[_Tree, list[str]]:
+    """List the photographs in a folder itself, or one of the sizes of an LLFF scene."""
+    sizes = [_images_in(inside) for inside in sorted(folder.iterdir()) if _is_size(inside)]
+    taken, notes = one_of_each_size([files for files in sizes if files], long_side)
+    names = [files[0].parent.name for files in taken]
+    # Without a folder images/, folders that are not sizes of each other are no LLFF scene.
+    which = names.index("images") if "images" in names else 0
+    if len(taken) == 1 or "images" in names:
+        tree = {taken[which][0].parent: list(taken[which])}
+    else:
+        tree, notes = {folder: _images_in(folder)}, []
+    known = {file for files in sizes for file in files if files[0].parent not in tree}
+    return tree, notes + _in_other_folders(folder, tree, known if len(taken) == 1 else set())
+
+
+def _all_below(folder: Path, long_side: int) -> tuple[_Tree, list[str]]:
+    """List the photographs in a folder and all below it, of LLFF scenes those of one size."""
+    passed: dict[str, list[Path]] = defaultdict(list)
+    tree = {inside: _images_in(inside) for inside in _folders(folder, passed)}
+    tree, notes = _of_sizes(tree, long_side)
+    root = folder.resolve()
+    for what, folders in passed.items():
+        searched = {inside for inside in folders if _is_link_into(inside, root)}
+        counts = {inside: _count_anywhere(inside) for inside in folders if inside not in searched}
+        use = f"; scene.masks={folders[0]} uses them" if what == _MASKS else ""
+        notes += _left_out(counts, folder, f"{what}{use}")
+    return tree, notes
+
+
+def _of_sizes(tree: _Tree, long_side: int) -> tuple[_Tree, list[str]]:
+    """Take one of the sizes of each LLFF scene among folders."""
+    groups = defaultdict(list)
+    for inside, files in tree.items():
+        if files and SIZES.fullmatch(inside.name):
+            groups[inside.parent].append(files)
+    dropped, notes = set[Path](), []
+    for group in groups.values():
+        taken, more = one_of_each_size(group, long_side)
+        dropped |= {files[0].parent for files in group if files not in taken}
+        notes += more
+    return {inside: files for inside, files in tree.items() if inside not in dropped}, notes
+
+
+def _folders(folder: Path, passed: dict[str, list[Path]], depth: int = 0) -> Iterator[Path]:
+    """Yield a folder and all below it that may hold photographs; add the others to `passed`.
+
+    Hidden folders are passed over in silence.
+    """
+    if depth > _MAX_DEPTH:
+        raise XrgsError(f"{folder}: folders are nested more than {_MAX_DEPTH} deep")
+    yield folder
+    for inside in sorted(folder.iterdir()):
+        if inside.name.startswith(".") or not inside.is_dir():
+            continue
+        if inside.is_symlink():
+            passed["links to folders are not followed"].append(inside)
+        elif what := _made_by_programs(inside):
+            passed[what].append(inside)
+        else:
+            yield from _folders(inside, passed, depth + 1)
+
+
+def _made_by_programs(folder: Path) -> str:
+    """Say what a folder holds in place of photographs; empty where it may hold photographs."""
+    if _OF_MASKS.fullmatch(folder.name):
+        return _MASKS
+    if _OF_OTHERS.fullmatch(folder.name):
+        return "made of photographs, by the folder's name"
+    found = (what for what, names in _MADE.items() if all((folder / n).exists() for n in names))
+    return next(found, "")
+
+
+def _is_link_into(inside: Path, root: Path) -> bool:
+    return inside.is_symlink() and inside.resolve().is_relative_to(root)
+
+
+def _count_anywhere(folder: Path) -> int:
+    """Count the images in a folder and below it, as far as they can be listed now."""
+    names = (name for _, _, names in os.walk(folder) for name in names)
+    return sum(1 for name in names if Path(name).suffix.lower() in SUFFIXES)
+
+
+def _in_other_folders(folder: Path, taken: _Tree, known: set[Path]) -> list[str]:
+    """Say which images in and below a folder are not taken, and how to get them.
+
+    Args:
+        folder: The folder.
+        taken: What is taken of it.
+        known: Images that show what is taken in other sizes, which are no loss.
+    """
+    passed: dict[str, list[Path]] = defaultdict(list)
+    try:
+        below = [inside for inside in _folders(folder, passed) if inside not in taken]
+        counts = {inside: len(set(_images_in(inside)) - known) for inside in below}
+    except (OSError, XrgsError) as error:
+        return [f"the folders below can't be searched for more images ({error})"]
+    masks = {inside: _count_anywhere(inside) for inside in passed[_MASKS]}
+    all_below = f"scene.path={folder}{ALL_BELOW} takes the images of all folders"
+    use = f"{_MASKS}; scene.masks={next(iter(masks), folder)} uses them"
+    return _left_out(counts, folder, all_below) + _left_out(masks, folder, use)
+
+
+def _left_out(counts: Mapping[Path, int], folder: Path, why: str) -> list[str]:
+    """Say how many images are left out in which folders; nothing where there are none."""
+    where = [
+        f"{count} in {inside.relative_to(folder) if inside != folder else 'it'}"
+        for inside, count in sorted(counts.items())
+        if count
+    ]
+    return [f"images left out: {listed(where)} ({why})"] if where else []
+
+
+def _photographs(files: Sequence[Path], folder: Path) -> tuple[list[Path], list[str]]:
+    """Leave out images that were made of photographs, and say so."""
+    own = [file for file in files if _is_own(file)]
+    if len(own) == len(files):
+        own = []  # somebody asks for just these
+    made = _made_of_others([file for file in files if file not in own])
+    notes = [
+        f"{counted(len(left), 'image')} left out, {why}: "
+        + listed([str(file.relative_to(folder)) for file in sorted(left)])
+        for left, why in (
+            (own, "which xrgs made"),
+            (made, "which are masks, depth maps or thumbnails by name or channels"),
+        )
+        if left
+    ]
+    return [file for file in files if file not in {*own, *made}], notes
+
+
+@remembered
+def _is_own(file: Path) -> bool:
+    try:
+        return file.suffix.lower() == ".png" and images.is_own(file)
+    except images.ImageError:
+        return False
+
+
+@remembered
+def _has_colour(file: Path) -> bool:
+    try:
+        return images.has_colour(file)
+    except images.ImageError:
+        return True
+
+
+def _made_of_others(files: Sequence[Path]) -> set[Path]:
+    """Find masks, depth maps and thumbnails that lie beside the photographs, or have their names.
+
+    These are `a.jpg.png` and `a_mask.png` beside `a.jpg`, and an image of one channel where another
+    one of the same name has colours.
+    """
+    there = {(file.parent, name.casefold()) for file in files for name in (file.name, file.stem)}
+    named = defaultdict(list)
+    for file in files:
+        named[file.stem.casefold()].append(file)
+    made = set()
+    for stem, group in named.items():
+        others = {stem, _ADDED_BEFORE.sub("", stem), _ADDED_AFTER.sub("", stem)} - {stem}
+        if Path(stem).suffix in SUFFIXES:
+            others.add(stem)
+        made |= {file for file in group if any((file.parent, name) in there for name in others)}
+        if len(group) > 1 and any(map(_has_colour, group)):
+            made |= {file for file in group if not _has_colour(file)}
+    return made
+
+
+def _not_read(folders: Iterable[Path], taken: Sequence[Path]) -> list[str]:
+    """Say which images and videos in folders can't be taken as they are, and what to do."""
+    shown = {file.with_suffix("") for file in taken}
+    videos, others, irregular = (
+        [file for folder in sorted(folders) for file in _with_suffix(folder, suffixes)]
+        for suffixes in (_VIDEOS, _OTHER_IMAGES, SUFFIXES)
+    )
+    lines = []
+    if alone := [file for file in videos if file.with_suffix("") not in shown]:
+        how = f"scene=video scene.path={alone[0]} takes frames of one"
+        lines.append(f"videos left out: {len(alone)} ({how})")
+    if alone := [file for file in others if file.with_suffix("") not in shown]:
+        lines.append(
+            f"images left out: {len(alone)} of a format that is not read "
+            f"({listed([file.name for file in alone])}); convert them to PNG or JPEG"
+        )
+    if beside := [file for file in (*videos, *others) if file.with_suffix("") in shown]:
+        names = listed([file.name for file in beside])
+        lines.append(f"not read, beside photographs of the same names: {names}")
+    if pipes := [file for file in irregular if not file.is_file() and not file.is_dir()]:
+        names = listed([file.name for file in pipes])
+        lines.append(f"left out, neither regular files nor links to one (pipes?): {names}")
+    return lines
+
+
+def _panoramas(files: Sequence[Path], folder: Path) -> list[str]:
+    """Name the pictures that are far longer for their width than the others."""
+    aspects = {file: max(size(file)) / min(size(file)) for file in files if min(size(file))}
+    if not aspects:
+        return []
+    usual = median(aspects.values())
+    least = max(1.1 * usual, min(_PANORAMA, _TIMES_OTHERS * usual))
+    if not (found := [file for file, aspect in aspects.items() if aspect > least]):
+        return []
+    names = listed([str(file.relative_to(folder)) for file in sorted(found)])
+    return [
+        f"longer than the other photographs: {names}. A panorama, a screenshot or a crop has"
+        " another camera than SfM expects; move it out of the folder if it is one"
+    ]
 
 
 def _view_name(file: Path, folder: Path) -> str:
@@ -123,13 +375,16 @@ def _by_name(named: Sequence[tuple[str, Path]]) -> dict[str, Path]:
         # On some file systems A and a, or an accent as one or two characters, are one name.
         key = unicodedata.normalize("NFC", name).casefold()
         if key in seen:
-            raise XrgsError(f"{seen[key]} and {file.name}: two images of one name; rename one")
+            raise XrgsError(
+                f"{seen[key]} and {file}: two images of one name, {name}; rename one, or move it"
+                " out of the folder"
+            )
         seen[key] = file
     return dict(sorted(named))
 
 
 def _check_heic(files: Sequence[Path]) -> None:
-    heic = [file for file in files if file.suffix.lower() in _HEIC]
+    heic = [file for file in files if file.suffix.lower() in images.HEIC]
     if heic and find_spec("pillow_heif") is None:
         raise XrgsError(
             f"{heic[0]}: {len(heic)} of {len(files)} photographs are HEIC, which needs "
@@ -137,90 +392,16 @@ def _check_heic(files: Sequence[Path]) -> None:
         )
 
 
-def _is_llff_folder(folder: Path) -> bool:
-    return folder.is_dir() and _LLFF_FOLDER.fullmatch(folder.name) is not None
+def _is_size(folder: Path) -> bool:
+    return SIZES.fullmatch(folder.name) is not None and folder.is_dir()
 
 
-def _images_in(folder: Path) -> tuple[Path, ...]:
+def _images_in(folder: Path) -> list[Path]:
     """List the regular files that are photographs by their suffix, and the links to such files."""
-    return tuple(file for file in _with_suffix(folder, SUFFIXES) if file.is_file())
+    return [file for file in _with_suffix(folder, SUFFIXES) if file.is_file()]
 
 
 def _with_suffix(folder: Path, suffixes: frozenset[str]) -> list[Path]:
     """List the files of these suffixes in a folder, sorted, without hidden files."""
     files = sorted(folder.iterdir(), key=lambda file: file.name)
     return [f for f in files if f.suffix.lower() in suffixes and not f.name.startswith(".")]
-
-
-def _select(folder: Path, long_side: int) -> tuple[Path, ...]:
-    """Select the photographs in a folder, or the copies of an LLFF scene."""
-    copies = [_images_in(f) for f in sorted(folder.iterdir()) if _is_llff_folder(f)]
-    return _select_copies([c for c in copies if c], long_side) or _images_in(folder)
-
-
-def _all_below(folder: Path) -> tuple[Path, ...]:
-    return tuple(file for inside in _folders(folder) for file in _images_in(inside))
-
-
-def _folders(folder: Path, depth: int = 0) -> Iterator[Path]:
-    """Yield a folder and all folders below it, without hidden folders and links."""
-    if depth > _MAX_DEPTH:
-        raise XrgsError(f"{folder}: folders are nested more than {_MAX_DEPTH} deep")
-    yield folder
-    for inside in sorted(folder.iterdir()):
-        if inside.is_dir() and not inside.is_symlink() and not inside.name.startswith("."):
-            yield from _folders(inside, depth + 1)
-
-
-def _in_other_folders(folder: Path, taken: Sequence[Path]) -> list[str]:
-    """Say which images in and below a folder are not taken, and how to get them.
-
-    The copies of an LLFF scene show what is taken in other sizes, and are no loss.
-    """
-    try:
-        others = set(_all_below(folder)) - set(taken)
-    except (OSError, XrgsError) as error:
-        return [f"the folders below can't be searched for more images ({error})"]
-    inside = Counter(file.parent for file in others if not _is_llff_folder(file.parent))
-    return [
-        f"images left out: {count} in {parent.relative_to(folder) if parent != folder else 'it'}"
-        f" (scene.path={folder}{ALL_BELOW} takes the images of all folders)"
-        for parent, count in sorted(inside.items())
-    ]
-
-
-def _not_read(folder: Path) -> list[str]:
-    """Say which images and videos in a folder can't be taken as they are, and what to do."""
-    lines = []
-    if videos := _with_suffix(folder, _VIDEOS):
-        how = f"scene=video scene.path={videos[0]} takes frames of one"
-        lines.append(f"videos left out: {len(videos)} ({how})")
-    if images := _with_suffix(folder, _OTHER_IMAGES):
-        names = ", ".join(file.name for file in images[:3])
-        lines.append(
-            f"images left out: {len(images)} of a format that is not read ({names}); convert them "
-            "to PNG or JPEG"
-        )
-    others = [f for f in _with_suffix(folder, SUFFIXES) if not f.is_file() and not f.is_dir()]
-    why = "not a regular file, nor a link to one (a pipe?); left out"
-    return lines + [f"{file}: {why}" for file in others]
-
-
-def _select_copies(copies: list[tuple[Path, ...]], long_side: int) -> tuple[Path, ...]:
-    """Select the copies of an LLFF scene to read; empty where there are none."""
-    sides = sorted(((_long_side(files), files) for files in copies), key=lambda c: c[0])
-    if not sides:
-        return ()
-    sufficient = [files for side, files in sides if long_side and side >= long_side]
-    return sufficient[0] if sufficient else sides[-1][1]
-
-
-def _long_side(files: tuple[Path, ...]) -> int:
-    """Find the longest side of photographs, px; unreadable ones are reported when they are read."""
-    sides = [0]
-    for file in files:
-        try:
-            sides.append(max(images.size(file)))
-        except images.ImageError:
-            continue
-    return max(sides)

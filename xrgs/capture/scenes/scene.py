@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import hashlib
+import time
 from dataclasses import dataclass, field
+from functools import lru_cache
 from importlib.util import find_spec
 from pathlib import Path
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING, Protocol, TypeVar
 
 from xrgs.errors import UnreadableError, XrgsError
 from xrgs.runtime.progress import progress
@@ -15,15 +17,20 @@ from xrgs.safeio.paths import user_path
 from xrgs.safeio.sanitize import for_line
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from collections.abc import Callable, Mapping
 
     import numpy as np
     from numpy.typing import NDArray
 
     from xrgs.config import SceneConf
 
+_Read = TypeVar("_Read")
+
 #: The end of a path that stands for all folders below it.
 ALL_BELOW = "/**"
+#: What is read of a file is remembered once the file is unchanged for so long; FAT's times have a
+#: resolution of two seconds.
+_SETTLED_NS = 2 * 10**9
 
 
 @dataclass(frozen=True)
@@ -113,18 +120,49 @@ def files_digest(files: Mapping[str, Path]) -> str:
     """Hash the names and bytes of files, in their order: 64 hexadecimal digits of a SHA-256.
 
     Raises:
-        UnreadableError: A file can't be read now. It is not left out: the hash would be another one
-            whenever a disk or a server fails.
+        UnreadableError: A file can't be read now, see `content`.
     """
     sha256 = hashlib.sha256()
     for name, file in progress(files.items(), "hashing photographs", "file"):
-        try:
-            content = file_digest(file)
-        except OSError as error:
-            why = f"{error.strerror}; try again, or move it out of the folder"
-            raise UnreadableError(f"{file}: {why}") from error
-        sha256.update(f"{name}\0{content}\n".encode())
+        sha256.update(f"{name}\0{content(file)}\n".encode())
     return sha256.hexdigest()
+
+
+def content(file: Path) -> str:
+    """Hash the bytes of a photograph: 64 hexadecimal digits of a SHA-256.
+
+    Raises:
+        UnreadableError: The file can't be read now. It is not left out: the scene would be another
+            one whenever a disk or a server fails.
+    """
+    try:
+        return _digest(file)
+    except OSError as error:
+        why = f"{error.strerror}; try again, or move it out of the folder"
+        raise UnreadableError(f"{file}: {why}") from error
+
+
+def remembered(read: Callable[[Path], _Read]) -> Callable[[Path], _Read]:
+    """Make a function of a file remember its results while the file's size and times stay.
+
+    A sweep asks several times for names, hashes and sizes of the same photographs.
+    """
+
+    @lru_cache(maxsize=1 << 16)
+    def of(file: Path, *_: int) -> _Read:
+        return read(file)
+
+    def get(file: Path) -> _Read:
+        status = file.stat()
+        # A file may change twice within the resolution of its times.
+        if time.time_ns() - max(status.st_mtime_ns, status.st_ctime_ns) < _SETTLED_NS:
+            return read(file)
+        return of(file, status.st_size, status.st_mtime_ns, status.st_ctime_ns)
+
+    return get
+
+
+_digest = remembered(file_digest)
 
 
 def bundled_photograph(name: str) -> Path:

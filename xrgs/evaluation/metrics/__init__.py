@@ -8,16 +8,32 @@ without them.
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 from xrgs.evaluation.metrics.base import Metric
 from xrgs.evaluation.metrics.lpips import lpips
-from xrgs.evaluation.metrics.psnr import psnr
+from xrgs.evaluation.metrics.psnr import psnr, psnr_plain
 from xrgs.evaluation.metrics.ssim import SSIM_WINDOW, ssim
 
-__all__ = ["METRICS", "SSIM_WINDOW", "VIEW_METRICS", "Metric", "lpips", "psnr", "ssim"]
+if TYPE_CHECKING:
+    from torch import Tensor
 
-_PSNR = ("evaluation/metrics/psnr.py",)
-_SSIM = ("evaluation/metrics/ssim.py",)
+__all__ = [
+    "METRICS",
+    "SSIM_WINDOW",
+    "VIEW_METRICS",
+    "Metric",
+    "lpips",
+    "psnr",
+    "psnr_plain",
+    "ssim",
+]
+
+_BASE = "evaluation/metrics/base.py"
+_PSNR = (_BASE, "evaluation/metrics/psnr.py")
+_SSIM = (_BASE, "evaluation/metrics/ssim.py")
 _LPIPS = (
+    _BASE,
     "evaluation/metrics/lpips.py",
     "evaluation/lpips/network.py",
     "evaluation/lpips/weights.py",
@@ -32,9 +48,40 @@ METRICS = (
     Metric("lpips", "LPIPS", "", higher_is_better=False, score=lpips, sources=_LPIPS),
     Metric("ssim", "SSIM", "", higher_is_better=True, score=ssim, sources=_SSIM),
     Metric("psnr", "PSNR", "dB", higher_is_better=True, score=psnr, sources=_PSNR),
+    Metric(
+        "psnr_plain",
+        "PSNR without masks",
+        "dB",
+        higher_is_better=True,
+        score=psnr_plain,
+        sources=_PSNR,
+        optional=True,
+    ),
     Metric("evaluations", "Alpha evaluations", "", higher_is_better=False),
 )
 """All metrics, in the order of the tables' rows."""
 
 VIEW_METRICS = {metric.name: metric.score for metric in METRICS if metric.score is not None}
-"""The functions that evaluation calls for each test view, by metric name."""
+"""The functions that `score_view` calls for each test view, by metric name."""
+
+
+def score_view(
+    image: Tensor, target: Tensor, mask: Tensor | None, *, masked: bool
+) -> dict[str, float | None]:
+    """Score a render against its photograph by every metric.
+
+    Args:
+        image: The render, [H, W, 3] in 0..1.
+        target: The photograph, [H, W, 3] in 0..1.
+        mask: [H, W] bool, True for a pixel that is used; None where the view has no mask.
+        masked: Whether any of the views that are scored together has a mask. A view without one is
+            then scored with a mask of all pixels: a score that one view lacks has no mean.
+
+    Returns:
+        Each score by its metric's name; None where it can't be computed or does not apply.
+    """
+    if masked and mask is None:
+        import torch
+
+        mask = torch.ones(target.shape[:2], dtype=torch.bool)
+    return {name: score(image, target, mask) for name, score in VIEW_METRICS.items()}

@@ -1,4 +1,4 @@
-"""What metrics share: their description, and the check of their arguments."""
+"""What metrics share: their description, and the comparison inside a mask."""
 
 from __future__ import annotations
 
@@ -21,16 +21,32 @@ class Metric:
     unit: str
     """`s`, `ms`, `bytes`, `dB`, or empty for a number without a unit."""
     higher_is_better: bool
-    score: Callable[[Tensor, Tensor], float | None] | None = None
-    """The function that scores a render and its photograph, both [H, W, 3] in 0..1; None for a
-    figure of the whole cell."""
+    score: Callable[[Tensor, Tensor, Tensor | None], float | None] | None = None
+    """The function that scores a render and its photograph, both [H, W, 3] in 0..1, inside a mask
+    [H, W] bool, True for a pixel that is used, or None; None for a figure of the whole cell."""
     sources: tuple[str, ...] = ()
     """The source files of a score, relative to the package: a change in them makes scores stale."""
+    optional: bool = False
+    """Whether it applies to some views alone. It is a row only of tables in which a cell has it."""
 
 
-def check_pair(image: Tensor, target: Tensor) -> None:
-    """Raise ValueError unless both images are [H, W, 3] of one size."""
+def composed(image: Tensor, target: Tensor, mask: Tensor | None) -> Tensor:
+    """Return the image with the target's pixels outside the mask, where nothing is compared.
+
+    Args:
+        image: The render, [H, W, 3].
+        target: The photograph, [H, W, 3].
+        mask: [H, W] bool, True for a pixel that is used; None uses all.
+
+    Raises:
+        ValueError: The shapes differ or are not [H, W, 3].
+    """
     if image.shape != target.shape or image.ndim != 3 or image.shape[2] != 3:
         raise ValueError(
             f"image {list(image.shape)} and target {list(target.shape)} must be the same [H, W, 3]"
         )
+    if mask is None:
+        return image
+    if mask.shape != image.shape[:2]:
+        raise ValueError(f"mask {list(mask.shape)} must be {list(image.shape[:2])} [H, W]")
+    return image.where(mask[..., None], target)

@@ -5,21 +5,23 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from xrgs.evaluation.lpips import weights
-from xrgs.evaluation.metrics.base import check_pair
+from xrgs.evaluation.metrics.base import composed
 
 if TYPE_CHECKING:
     from torch import Tensor
 
 
-def lpips(image: Tensor, target: Tensor) -> float | None:
+def lpips(image: Tensor, target: Tensor, mask: Tensor | None = None) -> float | None:
     """Compute the perceptual distance LPIPS, version 0.1, with AlexNet (`alex` in gsplat).
 
     Source: [zhang2018] "The unreasonable effectiveness of deep features as a perceptual
-    metric"; see `xrgs.evaluation.lpips.network`.
+    metric"; see `xrgs.evaluation.lpips.network`. Outside the mask the render has the pixels of the
+    photograph. The distance is still the mean over the whole picture.
 
     Args:
         image: The render, [H, W, 3] in 0..1.
         target: The photograph, [H, W, 3] in 0..1.
+        mask: [H, W] bool, True for a pixel that is used; None uses all.
 
     Returns:
         The distance, 0 where the images are identical; None (n/a in the tables) where this machine
@@ -29,7 +31,7 @@ def lpips(image: Tensor, target: Tensor) -> float | None:
         ValueError: The shapes differ or are not [H, W, 3].
         WeightsError: This machine's weights are not the published ones.
     """
-    check_pair(image, target)
+    image = composed(image, target, mask)
     published = weights.load_published()
     if published is None:
         return None

@@ -5,24 +5,25 @@ from __future__ import annotations
 import math
 from typing import TYPE_CHECKING
 
-from xrgs.evaluation.metrics.base import check_pair
+from xrgs.evaluation.metrics.base import composed
 
 if TYPE_CHECKING:
     from torch import Tensor
 
 
-def psnr(image: Tensor, target: Tensor) -> float:
+def psnr(image: Tensor, target: Tensor, mask: Tensor | None = None) -> float | None:
     """Compute the peak signal-to-noise ratio 10 log10(1 / mean((image - target)²)).
 
-    The mean is taken in float64 over all pixels and channels.
+    The mean is taken in float64 over the used pixels and all channels.
 
     Args:
         image: The render, [H, W, 3] in 0..1.
         target: The photograph, [H, W, 3] in 0..1.
+        mask: [H, W] bool, True for a pixel that is used; None uses all.
 
     Returns:
         The ratio in dB; infinity where the images are identical, as in scikit-image (tables show
-        no percentage change from or to infinity).
+        no percentage change from or to infinity). None where no pixel is used.
 
     Raises:
         ValueError: The shapes differ or are not [H, W, 3].
@@ -32,6 +33,13 @@ def psnr(image: Tensor, target: Tensor) -> float:
         >>> round(psnr(torch.zeros(2, 2, 3), torch.full((2, 2, 3), 0.5)), 4)
         6.0206
     """
-    check_pair(image, target)
-    error = float((image.double() - target.double()).square().mean())
-    return 10 * math.log10(1 / error) if error else math.inf
+    total = float((composed(image, target, mask).double() - target.double()).square().sum())
+    count = target.numel() if mask is None else 3 * int(mask.sum())
+    if count == 0:
+        return None
+    return 10 * math.log10(1 / (total / count)) if total else math.inf
+
+
+def psnr_plain(image: Tensor, target: Tensor, mask: Tensor | None = None) -> float | None:
+    """Compute `psnr` of the whole picture where a mask is given; None where none is."""
+    return None if mask is None else psnr(image, target)

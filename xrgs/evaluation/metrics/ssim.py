@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from xrgs.evaluation.metrics.base import check_pair
+from xrgs.evaluation.metrics.base import composed
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -14,8 +14,11 @@ if TYPE_CHECKING:
 SSIM_WINDOW = 11
 
 
-def ssim(image: Tensor, target: Tensor) -> float:
-    """Compute the structural similarity, averaged over channels and pixels.
+def ssim(image: Tensor, target: Tensor, mask: Tensor | None = None) -> float | None:
+    """Compute the structural similarity, averaged over channels and used pixels.
+
+    Outside the mask the render has the pixels of the photograph, so that a window across the border
+    of the mask compares equal pixels there.
 
     It is `kornia.metrics.ssim`: a Gaussian window of 11 x 11 px and sigma 1.5, data range 1,
     borders reflected. gsplat's evaluation gives the same to the fourth digit.
@@ -26,16 +29,17 @@ def ssim(image: Tensor, target: Tensor) -> float:
     Args:
         image: The render, [H, W, 3] in 0..1.
         target: The photograph, [H, W, 3] in 0..1.
+        mask: [H, W] bool, True for a pixel that is used; None uses all.
 
     Returns:
-        A value in -1..1; 1 where the images are identical.
+        A value in -1..1; 1 where the images are identical. None where no pixel is used.
 
     Raises:
         ValueError: The shapes differ, are not [H, W, 3], or a side is too short to be reflected.
     """
     from kornia import metrics
 
-    check_pair(image, target)
+    image = composed(image, target, mask)
     height, width = image.shape[:2]
     if min(height, width) <= SSIM_WINDOW // 2:
         raise ValueError(
@@ -43,4 +47,7 @@ def ssim(image: Tensor, target: Tensor) -> float:
             f"than {SSIM_WINDOW // 2} px"
         )
     planes, reference = (x.permute(2, 0, 1)[None] for x in (image, target))  # [1, 3, H, W]
-    return float(metrics.ssim(planes, reference, window_size=SSIM_WINDOW).mean())
+    values = metrics.ssim(planes, reference, window_size=SSIM_WINDOW)  # [1, 3, H, W]
+    if mask is None:
+        return float(values.mean())
+    return float(values[..., mask].mean()) if mask.any() else None

@@ -1,0 +1,277 @@
+"""One photograph is taken once, however often a folder has it; two photographs are both taken."""
+
+from __future__ import annotations
+
+import shutil
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from xrgs.capture import images
+from xrgs.capture.scenes import folder
+from xrgs.capture.scenes.folder import Listing
+from xrgs.safeio.atomic import atomic_writer
+
+
+def picture(number: int, size: tuple[int, int] = (160, 120)) -> Image.Image:
+    """Return the photograph of a number in a size: smooth colours, which resizing keeps."""
+    colours = np.random.default_rng(number).integers(0, 255, (6, 8, 3), dtype=np.uint8)
+    large = Image.fromarray(colours).resize((320, 240), Image.Resampling.BICUBIC)
+    return large.resize(size, Image.Resampling.LANCZOS)
+
+
+def write(file: Path, number: int, size: tuple[int, int] = (160, 120)) -> Path:
+    file.parent.mkdir(parents=True, exist_ok=True)
+    picture(number, size).save(file)
+    return file
+
+
+def shoot(path: Path, count: int = 6, size: tuple[int, int] = (160, 120), first: int = 0) -> Path:
+    """Fill a folder with photographs `IMG_0.jpg` and so on."""
+    for number in range(count):
+        write(path / f"IMG_{number}.jpg", first + number, size)
+    return path
+
+
+def names(path: Path, found: Listing) -> list[str]:
+    return sorted(file.relative_to(path).as_posix() for file in found.files.values())
+
+
+def below(path: Path, long_side: int = 0) -> Listing:
+    return folder.look(f"{path}/**", long_side)
+
+
+ORIGINALS = [f"IMG_{number}.jpg" for number in range(6)]
+
+
+def test_files_of_the_same_bytes_are_taken_once(tmp_path: Path) -> None:
+    shoot(tmp_path)
+    shutil.copy(tmp_path / "IMG_0.jpg", tmp_path / "IMG_0 (1).jpg")
+    shutil.copy(tmp_path / "IMG_1.jpg", tmp_path / "Copy of IMG_1.jpg")
+    shutil.copy(tmp_path / "IMG_2.jpg", tmp_path / "DSC_0817.jpg")
+    found = folder.look(str(tmp_path), 0)
+    assert names(tmp_path, found) == ORIGINALS
+    assert found.notes == (
+        "3 left out, the same bytes as another photograph: Copy of IMG_1.jpg (as IMG_1.jpg),"
+        " DSC_0817.jpg (as IMG_2.jpg), IMG_0 (1).jpg (as IMG_0.jpg)",
+    )
+
+
+def test_empty_files_are_no_copies_of_each_other(tmp_path: Path) -> None:
+    shoot(tmp_path)
+    for name in ("a.jpg", "b.jpg"):
+        (tmp_path / name).touch()
+    found = folder.look(str(tmp_path), 0)
+    assert names(tmp_path, found) == [*ORIGINALS, "a.jpg", "b.jpg"]
+    assert not found.notes
+
+
+@pytest.mark.parametrize("name", ["IMG_3_small.jpg", "small-IMG_3.png", "IMG_3.png", "IMG_3 2.jpg"])
+def test_a_resized_copy_in_the_folder_is_left_out(tmp_path: Path, name: str) -> None:
+    shoot(tmp_path)
+    write(tmp_path / name, 3, (80, 60))
+    found = folder.look(str(tmp_path), 0)
+    assert names(tmp_path, found) == ORIGINALS
+    (note,) = found.notes
+    assert f"the same picture as another photograph: {name} (as IMG_3.jpg)" in note
+
+
+def test_other_photographs_with_related_names_stay(tmp_path: Path) -> None:
+    shoot(tmp_path)
+    write(tmp_path / "IMG_3_b.jpg", 77)
+    write(tmp_path / "IMG_3-c.jpg", 78, (80, 60))
+    found = folder.look(str(tmp_path), 0)
+    assert len(found.files) == 8
+    assert not found.notes
+
+
+def test_photographs_of_one_name_in_two_folders_stay(tmp_path: Path) -> None:
+    shoot(tmp_path / "day0")
+    shoot(tmp_path / "day1", first=50)
+    shoot(tmp_path / "night", first=100, size=(80, 60))
+    found = below(tmp_path)
+    assert len(found.files) == 18
+    assert list(found.files)[::6] == ["day0_IMG_0", "day1_IMG_0", "night_IMG_0"]
+    assert not found.notes
+
+
+@pytest.mark.parametrize("size", [(80, 60), (160, 120)])
+def test_a_folder_of_resized_copies_is_left_out(tmp_path: Path, size: tuple[int, int]) -> None:
+    shoot(tmp_path)
+    for number in range(6):
+        write(tmp_path / "resized" / f"img_{number}.PNG", number, size)
+    found = below(tmp_path)
+    assert names(tmp_path, found) == ORIGINALS
+    (note,) = found.notes
+    assert note.startswith("6 left out, the same picture as another photograph: resized/img_0.PNG")
+
+
+@pytest.mark.parametrize(("long_side", "taken"), [(0, "images"), (80, "images_2"), (100, "images")])
+def test_of_the_sizes_of_an_llff_scene_one_is_taken(
+    tmp_path: Path, long_side: int, taken: str
+) -> None:
+    shoot(tmp_path / "scene" / "images")
+    for number in range(6):  # LLFF's own copies have other names
+        write(tmp_path / "scene" / "images_2" / f"image{number:03}.png", number, (80, 60))
+        write(tmp_path / "scene" / "images_4" / f"image{number:03}.png", number, (40, 30))
+    for found in (below(tmp_path, long_side), folder.look(str(tmp_path / "scene"), long_side)):
+        assert {file.parent.name for file in found.files.values()} == {taken}
+        assert found.notes == (
+            f"images, images_2, images_4 are copies in several sizes: {taken} is taken",
+        )
+
+
+def test_folders_that_are_numbered_and_of_one_size_are_no_copies(tmp_path: Path) -> None:
+    for number in range(1, 4):
+        shoot(tmp_path / f"images_{number}", first=10 * number)
+    found = below(tmp_path)
+    assert len(found.files) == 18
+    assert not found.notes
+    with pytest.raises(Exception, match=r"no image in it.*6 in images_1, 6 in images_2"):
+        folder.look(str(tmp_path), 0)
+
+
+@pytest.mark.parametrize("fault", ["missing", "truncated", "empty"])
+def test_sizes_that_lack_photographs_are_not_taken(tmp_path: Path, fault: str) -> None:
+    shoot(tmp_path / "images")
+    shoot(tmp_path / "images_2", size=(80, 60))
+    for number in range(4, 6):
+        file = tmp_path / "images_2" / f"IMG_{number}.jpg"
+        content = file.read_bytes()
+        file.write_bytes(content[: len(content) // 2] if fault == "truncated" else b"")
+        if fault == "missing":
+            file.unlink()
+    for found in (below(tmp_path, 80), folder.look(str(tmp_path), 80)):
+        assert {file.parent.name for file in found.files.values()} == {"images"}
+        assert "images_2 has 4 of the 6 photographs of images" in found.notes[0]
+
+
+def test_a_store_and_all_that_xrgs_writes_are_left_out(tmp_path: Path) -> None:
+    shoot(tmp_path / "day")
+    for part in ("cells", "variants", "sweeps"):
+        (tmp_path / "my results" / part).mkdir(parents=True)
+    shoot(tmp_path / "my results" / "variants" / "k-1" / "images" / "train")
+    for made, files in (
+        ("copied variant", ["variant.json"]),
+        ("copied cell", ["config.json", "identity.json"]),
+        ("an export", ["split.json", "transform.json"]),
+        ("a report", ["cells.csv", "table.md"]),
+    ):
+        shoot(tmp_path / "out" / made / "images", 2)
+        for name in files:
+            (tmp_path / "out" / made / name).touch()
+    found = below(tmp_path)
+    assert names(tmp_path, found) == [f"day/{name}" for name in ORIGINALS]
+    assert "images left out: 6 in my results (a store of xrgs)" in found.notes
+    assert "images left out: 2 in out/an export (an export of xrgs)" in found.notes
+    assert len(found.notes) == 5
+    assert len(folder.look(str(tmp_path / "out" / "an export" / "images"), 0).files) == 2
+
+
+def test_pngs_of_xrgs_beside_photographs_are_left_out(tmp_path: Path) -> None:
+    shoot(tmp_path / "day")
+    for name in ("film/0000.png", "film/0001.png", "day/k-1.png"):
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        with atomic_writer(tmp_path / name) as stream:
+            images.write_png(stream, picture(9))
+    write(tmp_path / "day" / "screenshot.png", 33)
+    found = below(tmp_path)
+    assert names(tmp_path, found)[5:] == ["day/IMG_5.jpg", "day/screenshot.png"]
+    assert found.notes == (
+        "3 images left out, which xrgs made: day/k-1.png, film/0000.png, film/0001.png",
+    )
+
+
+def test_a_folder_of_renders_alone_is_taken(tmp_path: Path) -> None:
+    for number in range(2):
+        images.save(tmp_path / f"{number}.png", np.full((30, 40, 3), number, np.float32))
+    assert len(folder.look(str(tmp_path), 0).files) == 2
+
+
+@pytest.mark.parametrize("name", ["masks", "Mask", "person_masks", "masks_2", "segmentation"])
+def test_folders_of_masks_are_named_with_the_key_that_uses_them(tmp_path: Path, name: str) -> None:
+    shoot(tmp_path)
+    shoot(tmp_path / name, 4, first=90)
+    for found in (below(tmp_path), folder.look(str(tmp_path), 0)):
+        assert names(tmp_path, found) == ORIGINALS
+        assert found.notes == (
+            f"images left out: 4 in {name} (masks; scene.masks={tmp_path / name} uses them)",
+        )
+
+
+@pytest.mark.parametrize(
+    "name",
+    ["IMG_1_mask.png", "mask_IMG_1.png", "IMG_1.jpg.png", "IMG_1.mask.png", "IMG_1_depth.png"],
+)
+def test_masks_beside_their_photographs_are_left_out(tmp_path: Path, name: str) -> None:
+    shoot(tmp_path)
+    write(tmp_path / name, 66)
+    found = folder.look(str(tmp_path), 0)
+    assert names(tmp_path, found) == ORIGINALS
+    assert found.notes[0].startswith("1 image left out")
+    assert name in found.notes[0]
+
+
+def test_images_of_one_channel_with_the_names_of_photographs_are_left_out(tmp_path: Path) -> None:
+    shoot(tmp_path / "rgb")
+    for number in range(6):
+        file = tmp_path / "labels" / f"IMG_{number}.png"
+        write(file, number)
+        picture(number + 20).convert("L").save(file)
+    found = below(tmp_path)
+    assert {file.parent.name for file in found.files.values()} == {"rgb"}
+    assert "6 images left out" in found.notes[0]
+
+
+def test_grey_photographs_stay(tmp_path: Path) -> None:
+    for number in range(4):
+        write(tmp_path / f"{number}.png", number)
+        picture(number).convert("L").save(tmp_path / f"{number}.png")
+    assert len(folder.look(str(tmp_path), 0).files) == 4
+
+
+@pytest.mark.parametrize("readable", [True, False])
+def test_of_heic_and_jpeg_of_one_name_one_is_taken(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, readable: bool
+) -> None:
+    heif = pytest.importorskip("pillow_heif")
+    shoot(tmp_path)
+    heif.from_pillow(picture(0)).save(tmp_path / "IMG_0.HEIC", quality=60)
+    if not readable:
+        monkeypatch.setattr(folder, "find_spec", lambda _: None)
+        monkeypatch.setitem(sys.modules, "pillow_heif", None)
+    found = folder.look(str(tmp_path), 0)
+    assert names(tmp_path, found) == ORIGINALS
+    assert "IMG_0.HEIC (as IMG_0.jpg)" in found.notes[0]
+
+
+def test_raw_files_and_films_of_the_photographs_names_are_said_once(tmp_path: Path) -> None:
+    shoot(tmp_path)
+    for name in ("IMG_0.DNG", "IMG_1.MOV", "IMG_2.ARW"):
+        (tmp_path / name).write_bytes(b"content")
+    assert folder.look(str(tmp_path), 0).notes == (
+        "not read, beside photographs of the same names: IMG_1.MOV, IMG_0.DNG, IMG_2.ARW",
+    )
+
+
+def test_panoramas_and_screenshots_are_named(tmp_path: Path) -> None:
+    shoot(tmp_path)
+    write(tmp_path / "pano.jpg", 40, (400, 120))
+    write(tmp_path / "screenshot.png", 41, (73, 158))
+    (note,) = folder.look(str(tmp_path), 0).notes
+    assert "longer than the other photographs: pano.jpg, screenshot.png" in note
+    shoot(tmp_path / "wide", size=(320, 130), first=20)
+    assert not folder.look(str(tmp_path / "wide"), 0).notes
+
+
+def test_links_to_folders_elsewhere_are_named(tmp_path: Path) -> None:
+    shoot(tmp_path / "elsewhere", first=30)
+    shoot(tmp_path / "here" / "day")
+    (tmp_path / "here" / "more").symlink_to(tmp_path / "elsewhere")
+    (tmp_path / "here" / "day" / "again").symlink_to(tmp_path / "here")
+    assert below(tmp_path / "here").notes == (
+        "images left out: 6 in more (links to folders are not followed)",
+    )

@@ -1,0 +1,274 @@
+"""Reads the vertices of a .ply file: ASCII or binary, any properties, among any other elements.
+
+The file may come from anybody. Nothing is allocated for what the header declares before the size of
+the file shows that it is there.
+"""
+
+from __future__ import annotations
+
+import io
+import os
+import re
+from collections import deque
+from dataclasses import dataclass, field
+from itertools import islice
+from typing import TYPE_CHECKING, Any, BinaryIO, Literal
+
+import numpy as np
+
+from xrgs.errors import XrgsError
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Iterator, Sequence
+    from pathlib import Path
+
+    from numpy.typing import NDArray
+
+MAX_HEADER_BYTES = 1 << 20
+_NAMES = {
+    "i1": ("char", "int8"),
+    "u1": ("uchar", "uint8"),
+    "i2": ("short", "int16"),
+    "u2": ("ushort", "uint16"),
+    "i4": ("int", "int32"),
+    "u4": ("uint", "uint32"),
+    "f4": ("float", "float32"),
+    "f8": ("double", "float64"),
+}
+_TYPES = {name: kind for kind, names in _NAMES.items() for name in names}
+_BYTE_ORDERS = {"ascii": "=", "binary_little_endian": "<", "binary_big_endian": ">"}
+#: The first line, and the last one of the header: lines end with LF, CR LF or, in old files, CR.
+_MAGIC = re.compile(rb"ply[ \t]*(\r\n|\n|\r)")
+_END = re.compile(rb"\r?\nend_header[ \t]*\r?\n")
+_OLD_END = re.compile(rb"\rend_header[ \t]*\r")
+
+
+@dataclass(frozen=True)
+class Ply:
+    """What a .ply file says of its vertices."""
+
+    vertices: NDArray[np.void]
+    """[V] with a field for each property of the element `vertex` that is not a list, in the file's
+    types and byte order."""
+    comments: tuple[str, ...]
+    """The comments of the header, without surrounding spaces."""
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """The names of the properties, in the order of the file."""
+        return self.vertices.dtype.names or ()
+
+    def columns(self, names: Sequence[str], kind: type[np.floating[Any]]) -> NDArray[Any]:
+        """Return properties as an array [V, len(names)]; values that `kind` can't hold are inf."""
+        table = np.empty((len(self.vertices), len(names)), kind)
+        with np.errstate(over="ignore"):
+            for column, name in enumerate(names):
+                table[:, column] = self.vertices[name]
+        return table
+
+
+@dataclass(frozen=True)
+class _Property:
+    name: str
+    kind: str
+    """Type code of numpy without the byte order; for a list, the type of its entries."""
+    length: str = ""
+    """For a list, the type of its length."""
+
+
+@dataclass(frozen=True)
+class _Element:
+    name: str
+    count: int
+    properties: list[_Property] = field(default_factory=list)
+
+    @property
+    def has_lists(self) -> bool:
+        return any(of.length for of in self.properties)
+
+    def record(self, order: str) -> np.dtype[np.void]:
+        """Return the type of the properties that are no lists."""
+        return np.dtype([(of.name, order + of.kind) for of in self.properties if not of.length])
+
+
+def read(path: Path) -> Ply:
+    """Read the vertices of a .ply file.
+
+    Elements before the vertices are skipped; what follows the vertices is not read. Properties that
+    are lists are left out.
+
+    Raises:
+        XrgsError: The file can't be read, is no .ply, or is shorter than its header says; the
+            message names it.
+    """
+    try:
+        with path.open("rb") as file:
+            return _read(file, os.fstat(file.fileno()).st_size)
+    except OSError as error:
+        raise XrgsError(f"{path}: cannot be read: {error.strerror}") from error
+    except ValueError as error:
+        raise XrgsError(f"{path}: {error}") from error
+
+
+def _read(file: BinaryIO, size: int) -> Ply:
+    start = file.read(MAX_HEADER_BYTES)
+    magic = _MAGIC.match(start)
+    if magic is None:
+        raise ValueError("is not a .ply file")
+    end = (_OLD_END if magic[1] == b"\r" else _END).search(start, magic.end() - 1)
+    if end is None:
+        raise ValueError(f"the .ply header has no end in its first {MAX_HEADER_BYTES} bytes")
+    header = start[magic.end() : end.start()].decode("utf-8", errors="replace")
+    form, elements, comments = _parse_header(re.split(r"\r\n|\n|\r", header) if header else [])
+    file.seek(end.end())
+    before, vertex = _up_to_vertices(elements)
+    if form == "ascii":
+        vertices = _read_ascii(file, before, vertex)
+    else:
+        vertices = _read_binary(file, before, vertex, size, _BYTE_ORDERS[form])
+    return Ply(vertices, comments)
+
+
+def _parse_header(lines: Iterable[str]) -> tuple[str, list[_Element], tuple[str, ...]]:
+    """Return the format, the elements and the comments."""
+    form, comments = "", []
+    elements: list[_Element] = []
+    for line in lines:
+        match line.split():
+            case ["comment" | "obj_info", *_]:
+                comments.append(" ".join(line.split(maxsplit=1)[1:]).rstrip())
+            case ["format", known, "1.0"] if known in _BYTE_ORDERS and not form:
+                form = known
+            case ["element", name, count] if re.fullmatch("[0-9]{1,12}", count):
+                elements.append(_Element(name, int(count)))
+            case ["property", "list", length, kind, name] if (
+                elements and kind in _TYPES and _TYPES.get(length, "f")[0] != "f"
+            ):
+                elements[-1].properties.append(_Property(name, _TYPES[kind], _TYPES[length]))
+            case ["property", kind, name] if elements and kind in _TYPES:
+                elements[-1].properties.append(_Property(name, _TYPES[kind]))
+            case _:
+                raise ValueError(f"unexpected line in the .ply header: {line[:80]!r}")
+    if not form:
+        raise ValueError("the .ply header names no format")
+    return form, elements, tuple(comments)
+
+
+def _up_to_vertices(elements: list[_Element]) -> tuple[list[_Element], _Element]:
+    """Return the elements before the vertices, and the vertices."""
+    names = [element.name for element in elements]
+    if names.count("vertex") != 1:
+        has = ", ".join(names)[:80] or "none"
+        raise ValueError(f"the .ply header must have one element vertex, its elements are: {has}")
+    at = names.index("vertex")
+    properties = [of.name for of in elements[at].properties]
+    if len(set(properties)) != len(properties):
+        raise ValueError("the .ply header names a property of vertex twice")
+    if all(of.length for of in elements[at].properties):
+        raise ValueError("the .ply header names no properties of vertex")
+    return elements[:at], elements[at]
+
+
+def _read_binary(
+    file: BinaryIO, before: list[_Element], vertex: _Element, size: int, order: str
+) -> NDArray[np.void]:
+    for element in before:
+        if element.has_lists:
+            deque(_rows_without_lists(file, element, order), maxlen=0)
+        else:
+            file.seek(_checked_bytes(file, element, size), os.SEEK_CUR)
+    if vertex.has_lists:
+        content = b"".join(_rows_without_lists(file, vertex, order))
+        if file.tell() > size:
+            raise ValueError("ends within a list of its last vertex")
+    else:
+        content = _exactly(file, _checked_bytes(file, vertex, size))
+    return np.frombuffer(content, vertex.record(order))
+
+
+def _checked_bytes(file: BinaryIO, element: _Element, size: int) -> int:
+    """Return the number of bytes of an element without lists, which must be in the file."""
+    needed, left = element.count * element.record("=").itemsize, size - file.tell()
+    if needed > left:
+        raise ValueError(
+            f"its {element.count} rows of the element {element.name} need {needed} bytes, "
+            f"{left} are left in the file"
+        )
+    return needed
+
+
+def _rows_without_lists(file: BinaryIO, element: _Element, order: str) -> Iterator[bytes]:
+    """Yield the bytes of each row without its lists; each row must have one list at least."""
+    runs, scalars = [], 0  # bytes of the properties before a list, the bytes of its length, ...
+    for of in element.properties:
+        if of.length:
+            runs.append((scalars, int(of.length[1]), of.length[0] == "i", int(of.kind[1])))
+            scalars = 0
+        else:
+            scalars += int(of.kind[1])
+    byte_order: Literal["big", "little"] = "big" if order == ">" else "little"
+    for _ in range(element.count):
+        row = b""
+        for before, length, signed, entry in runs:
+            row += _exactly(file, before)
+            entries = int.from_bytes(_exactly(file, length), byte_order, signed=signed)
+            if entries < 0:
+                raise ValueError(f"a list of the element {element.name} has a length below 0")
+            file.seek(entries * entry, os.SEEK_CUR)
+        yield row + _exactly(file, scalars)
+
+
+def _exactly(file: BinaryIO, count: int) -> bytes:
+    content = file.read(count)
+    if len(content) != count:
+        raise ValueError("ends before its last vertex")
+    return content
+
+
+def _read_ascii(file: BinaryIO, before: list[_Element], vertex: _Element) -> NDArray[np.void]:
+    record = vertex.record("=")
+    with io.TextIOWrapper(file, "ascii", errors="replace") as text:
+        lines = (line for line in text if not line.isspace())
+        for element in before:
+            if element.properties:
+                deque(islice(lines, element.count), maxlen=0)
+        rows = list(islice(lines, vertex.count))
+    if len(rows) < vertex.count:
+        raise ValueError(f"has {len(rows)} of its {vertex.count} vertices")
+    if vertex.has_lists:
+        rows = [_line_without_lists(vertex, line) for line in rows]
+    # float64 holds every value of every type of .ply. loadtxt warns where there are no lines.
+    width = len(record.names or ())
+    values = np.loadtxt(rows, ndmin=2, comments=None) if rows else np.empty((0, width))
+    if values.shape[1] != width:
+        raise ValueError(f"vertices have {values.shape[1]} values, not {width}")
+    return _typed(values, record)
+
+
+def _line_without_lists(element: _Element, line: str) -> str:
+    words, kept = iter(line.split()), []
+    try:
+        for of in element.properties:
+            if of.length:
+                deque(islice(words, int(next(words))), maxlen=0)
+            else:
+                kept.append(next(words))
+    except StopIteration:
+        raise ValueError(f"a line of the element {element.name} is too short") from None
+    return " ".join([*kept, *words])  # words that are left are too many: they are found as such
+
+
+def _typed(values: NDArray[np.float64], record: np.dtype[np.void]) -> NDArray[np.void]:
+    """Return the rows of numbers [V, fields] in the types of a record."""
+    vertices = np.empty(len(values), record)
+    for name, column in zip(record.names or (), values.T, strict=True):
+        kind = record[name]
+        if kind.kind in "iu":
+            limits = np.iinfo(kind)
+            is_whole = (column >= limits.min) & (column <= limits.max) & (column == column.round())
+            if not is_whole.all():
+                row = int(np.argmin(is_whole))
+                raise ValueError(f"vertex {row}: {name} is {column[row]:g}, which is no {kind}")
+        with np.errstate(over="ignore"):  # a number that float32 can't hold is inf
+            vertices[name] = column
+    return vertices
