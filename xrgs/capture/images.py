@@ -58,11 +58,14 @@ _SHORT_CHUNK = 64
 _PNG_CHANNELS = {0: 1, 2: 3, 3: 1, 4: 2, 6: 4}
 #: The largest photograph that is read: cameras give 200 megapixels, and PIL takes 1 GB for this.
 MAX_PIXELS = 1 << 28
-#: The largest image of a store that is read. In training it takes 800 MB.
+#: The largest image of a store that is read. In training it takes 200 MB, and 2.4 GB more while a
+#: step compares a render with it.
 MAX_PNG_PIXELS = 1 << 26
 #: Deflate, the compression of PNGs, makes at most 1032 bytes of one, and no photograph of any
 #: format shrinks as much. A drawing may; up to so many pixels it takes little memory.
 _MAX_EXPANSION, _SMALL_PIXELS = 1032, 1 << 24
+#: The fewest bits of a pixel in a file by PIL's modes, as masks and palettes have them; others 24.
+_BITS = {"1": 1, "P": 1, "L": 8}
 #: With `scene.alpha=mask`, pixels of a lower alpha are outside. Our choice.
 OPAQUE_FROM = 0.5
 _EXIF_ORIENTATION = 0x0112
@@ -117,11 +120,11 @@ def _unidentified(path: Path) -> str:
 
 
 def _check_size(
-    stream: BinaryIO, size: tuple[int, int], max_pixels: int, *, drawing: bool = True
+    stream: BinaryIO, size: tuple[int, int], max_pixels: int, mode: str, *, drawing: bool = True
 ) -> None:
     """Refuse an image that is too large, or that no file of these bytes can hold.
 
-    Its memory is not taken yet. A `drawing`, which compresses without end, may be small.
+    Its memory is not taken yet. A small `drawing` may compress without end. `mode` is PIL's.
     """
     width, height = size
     if width * height > max_pixels:
@@ -132,7 +135,7 @@ def _check_size(
     stream.seek(0)
     if drawing and width * height <= _SMALL_PIXELS:
         return
-    if 3 * width * height > _MAX_EXPANSION * file_bytes:
+    if _BITS.get(mode, 24) * width * height > 8 * _MAX_EXPANSION * file_bytes:
         raise _RefusedError(f"{file_bytes} bytes are too few for {width} x {height} px")
 
 
@@ -223,7 +226,7 @@ class _PilFile:
     def __init__(self, stream: BinaryIO, start: bytes) -> None:
         self._stream = stream
         self.image = image = Image.open(stream, formats=_formats(start))
-        _check_size(stream, image.size, MAX_PIXELS)
+        _check_size(stream, image.size, MAX_PIXELS, image.mode)
         is_heif, is_png = image.format == "HEIF", image.format == "PNG"
         self._chunks, has_late_exif = _png_chunks(stream) if is_png else ({}, False)
         self.channels, self.bits = len(image.getbands()), int(image.info.get("bit_depth", 8))
@@ -295,7 +298,7 @@ class _DeepTiff:
     def __init__(self, stream: BinaryIO, tiff: deep.Tiff) -> None:
         self._tiff = tiff
         self.size = tiff.size
-        _check_size(stream, self.size, MAX_PIXELS)
+        _check_size(stream, self.size, MAX_PIXELS, "L")
         self.orientation = _orientation(tiff.value(_EXIF_ORIENTATION))
         self.channels, self.bits = tiff.channels, tiff.bits
         self.profile: bytes | None = tiff.value(_TIFF_PROFILE)
@@ -538,7 +541,7 @@ def read_png_pil(
         if image.mode != mode:
             kind = "RGB" if mode == "RGB" else "grey"
             raise _RefusedError(f"its pixels are {image.mode}, not 8-bit {kind}")
-        _check_size(stream, image.size, max_pixels, drawing=False)
+        _check_size(stream, image.size, max_pixels, image.mode, drawing=False)
         image.load()
         return image
 

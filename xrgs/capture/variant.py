@@ -41,6 +41,7 @@ CORE = (
     "capture/frozen.py",
     "capture/images.py",
     "capture/lens.py",
+    "capture/masks.py",
     "capture/mixing.py",
     "capture/photographs.py",
     "capture/registration.py",
