@@ -38,7 +38,8 @@ SOFTWARE = "xrgs"
 _HEIF_MAGIC = b"ftyp"
 #: The largest photograph that is read: cameras give 200 megapixels, and PIL takes 1 GB for this.
 MAX_PIXELS = 1 << 28
-#: The largest image of a store that is read. In training it takes 800 MB.
+#: The largest image of a store that is read. In training it takes 200 MB, and 2.4 GB more while a
+#: step compares a render with it.
 MAX_PNG_PIXELS = 1 << 26
 #: Deflate, the compression of PNGs, makes at most 1032 bytes of one, and no photograph of any
 #: format shrinks as much. A drawing may; up to so many pixels it takes little memory.
