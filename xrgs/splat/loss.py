@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from torch import Tensor
 
-from xrgs.runtime.machine import single_torch_thread
 from xrgs.splat.backend import implementation
 from xrgs.splat.ssim import WINDOW, Target, window_moments
 
@@ -40,13 +39,11 @@ def prepare_target(image: Tensor) -> Target:
         )
     image = image.detach().contiguous()
     mean, variance = (image.new_empty(height - WINDOW + 1, width - WINDOW + 1, 3) for _ in range(2))
-    # On one thread: a second one is slower where another program has the core.
-    with single_torch_thread():
-        for row in range(0, len(mean), _ROWS):
-            rows = slice(row, row + _ROWS)
-            # In double, since a variance is a small difference of squares.
-            moments = window_moments(image[row : row + _ROWS + WINDOW - 1].double())
-            mean[rows], variance[rows] = moments
+    for row in range(0, len(mean), _ROWS):
+        rows = slice(row, row + _ROWS)
+        # In double, since a variance is a small difference of squares.
+        moments = window_moments(image[row : row + _ROWS + WINDOW - 1].double())
+        mean[rows], variance[rows] = moments
     return Target(image, mean, variance)
 
 

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 import torch
 
+from xrgs.runtime.machine import single_torch_thread
 from xrgs.runtime.progress import progress
 from xrgs.splat.backend import resolve_backend
 from xrgs.splat.gaussians import PARAMETERS, Gaussians, from_points
@@ -117,7 +118,9 @@ class _Views:
 
 def _moments(view: TrainingView) -> tuple[Tensor, Tensor]:
     """The moments of a view's photograph that the loss needs (`Target`)."""
-    target = prepare_target(view.image)
+    # More threads are slower where another program has a core, since the blocks of rows are small.
+    with single_torch_thread():
+        target = prepare_target(view.image)
     return target.mean, target.variance
 
 
