@@ -209,15 +209,16 @@ def quarter_turn(quarters: int) -> NDArray[np.float64]:
     return np.linalg.matrix_power(np.array([[0.0, -1.0], [1.0, 0.0]]), quarters)
 
 
-def undistort(image: ImageArray, lens: Lens) -> ImageArray:
-    """Resample a photograph to the image of `lens.undistorted()`, by cubic spline interpolation.
+def undistort(image: ImageArray, lens: Lens, order: int = 3) -> ImageArray:
+    """Resample a photograph to the image of `lens.undistorted()`, by spline interpolation.
 
     Args:
-        image: The photograph, [H, W, 3] in 0..1.
+        image: The photograph, [H, W, C] in 0..1.
         lens: Its camera, of the same size.
+        order: The order of the spline: 3 for photographs, 1 for masks.
 
     Returns:
-        The undistorted image [H, W, 3], not clamped; the image itself where the lens is a pinhole.
+        The undistorted image [H, W, C], not clamped; the image itself where the lens is a pinhole.
 
     Raises:
         ValueError: The image and the lens differ in size.
@@ -232,7 +233,7 @@ def undistort(image: ImageArray, lens: Lens) -> ImageArray:
     pixels = np.stack([columns.ravel(), rows.ravel()], -1)
     source = lens.project(_rays(pixels, lens.undistorted().K)) - 0.5
     coords = source.T[::-1].reshape(2, lens.height, lens.width)  # row, column
-    bands = [warp(image[..., c], coords, order=3, mode="edge") for c in range(3)]
+    bands = [warp(image[..., c], coords, order=order, mode="edge") for c in range(image.shape[2])]
     return np.stack(bands, axis=-1).astype(np.float32)
 
 

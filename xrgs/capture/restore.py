@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 from msgspec import Struct
 
 from xrgs.capture import frozen, images, scenes, sealed
-from xrgs.capture.lens import Lens, undistort
+from xrgs.capture.lens import Lens
 from xrgs.capture.photographs import prepare_hr_views, write_degraded
 from xrgs.errors import StoreError
 from xrgs.runtime.progress import progress
@@ -85,9 +85,12 @@ def _write_images(
     for entry in progress(entries, "undistorting", "view"):
         number = numbers[entry.name]
         is_low = entry.split == "train" and number in degraded
-        image = photos.read("lr" if is_low else "hr", number)
         if entry.name not in lenses:
             file = folder / frozen.REPORT
             raise StoreError(f"damaged: {file}: lenses: none is of view {entry.name}")
-        lens = lenses[entry.name].resized(image.shape[1], image.shape[0])
-        images.save(folder / entry.file, undistort(image, lens), durable=False)
+        kind = "lr" if is_low else "hr"
+        lens = lenses[entry.name].resized(*photos.size(kind, number))
+        image, used = photos.undistorted(kind, number, lens)
+        images.save(folder / entry.file, image, durable=False)
+        if used is not None and entry.mask is not None:
+            images.save_mask(folder / entry.mask, used, durable=False)
