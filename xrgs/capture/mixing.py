@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from xrgs.capture import images, poses, registration, sampling
+from xrgs.capture import images, poses, registration, sampling, triangulation
 from xrgs.capture.alignment import pose_error
 from xrgs.capture.degradations import resolve_degradation
 from xrgs.capture.lens import Lens
@@ -112,6 +112,8 @@ def _register(inputs: _Inputs, work: Path) -> Registration:
     photos, conf = inputs.photos, inputs.conf
     if conf.poses is not None:
         model = poses.read_poses(conf.poses, photos)
+        if not len(model.points):
+            model = triangulation.with_points(model, photos, inputs.degraded, conf.sfm, work)
         return Registration(model, _refusal(inputs, model), [])
     return registration.register(
         photos, inputs.degraded, conf.sfm, work, lambda model: _refusal(inputs, model)
