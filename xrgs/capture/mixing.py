@@ -71,9 +71,8 @@ def mix_resolutions(scene: Scene, conf: VariantConf, work: Path, out: Path) -> V
     """
     check_variant_conf(conf)
     start = time.perf_counter()
-    photos = prepare_hr_views(scene, conf, work)
+    photos = prepare_hr_views(scene, conf, work, for_sfm=conf.poses is None)
     inputs = _Inputs(scene, conf, photos, _split_before_sfm(photos, conf))
-    write_degraded(photos, inputs.degraded, conf)
     registered = _register(inputs, work)
     model = registered.model
     _write_log(work, out)
@@ -84,7 +83,7 @@ def mix_resolutions(scene: Scene, conf: VariantConf, work: Path, out: Path) -> V
     depths = sampling.median_depths(model)
     if conf.tags in POLICIES and POLICIES[conf.tags].needs_depth:
         inputs = replace(inputs, split=_split_by_score(photos, conf, model, depths))
-        write_degraded(photos, inputs.degraded, conf)
+    write_degraded(photos, inputs.degraded, conf)
     views = _write_undistorted(inputs, model, depths, out)
     tags = _tags_report(inputs, views)
     report |= tags | {"notes": [*report["notes"], *tags["notes"]]}
@@ -103,6 +102,7 @@ def _register(inputs: _Inputs, work: Path) -> Registration:
     if conf.poses is not None:
         model = poses.read_poses(conf.poses, photos)
         return Registration(model, _refusal(inputs, model), [])
+    write_degraded(photos, inputs.degraded, conf, "sfm_lr")
     return registration.register(
         photos, inputs.degraded, conf.sfm, work, lambda model: _refusal(inputs, model)
     )

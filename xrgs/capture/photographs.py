@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections import defaultdict
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -23,6 +24,10 @@ if TYPE_CHECKING:
     from xrgs.capture.scenes import Scene
     from xrgs.config import VariantConf
 
+#: Photographs without EXIF of a size are taken to be by one camera where so many have a size, on
+#: average. Our choice.
+_LEAST_OF_SIZE = 5
+
 
 @dataclass(frozen=True)
 class Photograph:
@@ -38,18 +43,22 @@ class Photograph:
     """The EXIF orientation that was applied, 1 to 8; 1 is upright."""
     hr: HrGeometry
     """The size of its HR view."""
+    sfm: tuple[int, int]
+    """Width and height at which SfM gets the whole photograph, px."""
     camera: str
     """The name of its camera; photographs with one name share the camera in SfM."""
     K: NDArray[np.float64] | None
     """Intrinsics [3, 3] of the file, px, where they are known; then there is no distortion."""
+    focal_35mm: float | None = None
+    """The focal length that EXIF gives, for a film of 36 x 24 mm, mm."""
 
     @property
     def lens(self) -> Lens | None:
-        """The camera of the HR view, after resize and crop; None where it is not known."""
+        """The camera of the file; None where it is not known."""
         if self.K is None:
             return None
         K = self.K
-        return self.to_hr(Lens(*self.size, K[0, 0], K[1, 1], K[0, 2], K[1, 2]))
+        return Lens(*self.size, K[0, 0], K[1, 1], K[0, 2], K[1, 2])
 
     def to_hr(self, lens: Lens) -> Lens:
         """Return the camera of the HR view; `lens` is of the whole photograph, at any size."""
@@ -68,8 +77,11 @@ class Photograph:
 class PhotoCollection:
     """The usable photographs of a scene, sorted by name, and their copies in a work folder.
 
-    A copy is of one of three kinds: `hr` is the HR view, `lr` the degraded view, and `up` the
-    degraded view resized back to the size of the HR view, for SfM.
+    A copy has one of these kinds:
+
+    - `hr` is the HR view, and `lr` the degraded view.
+    - `sfm` is the whole photograph for SfM, and `sfm_lr` is that copy degraded.
+    - `sfm_up` and `sfm_lr_up` are these two resized to `Photograph.sfm`.
     """
 
     all: tuple[Photograph, ...]
@@ -89,7 +101,7 @@ class PhotoCollection:
         return [photo.name for photo in self.all]
 
     def file(self, kind: str, index: int) -> str:
-        """Return the path of a copy (`hr`, `lr` or `up`) in `folder`; the copy need not exist."""
+        """Return the path of a copy in `folder`; the copy need not exist."""
         return f"{kind}/{self.all[index].number}.png"
 
     def size(self, kind: str, index: int) -> tuple[int, int]:
@@ -100,16 +112,20 @@ class PhotoCollection:
         """Read an existing copy, [H, W, 3] in 0..1."""
         return images.read(self.folder / self.file(kind, index))
 
-    def upsample(self, index: int) -> None:
-        """Make the `up` copy of a photograph from its `lr` copy, where it does not exist."""
-        file = self.folder / self.file("up", index)
+    def upsampled(self, kind: str, index: int) -> str:
+        """Resize a copy to `Photograph.sfm`; return the kind of the copy that has this size."""
+        target = self.all[index].sfm
+        if self.size(kind, index) == target:
+            return kind
+        file = self.folder / self.file(f"{kind}_up", index)
         if not file.exists():
-            target = self.all[index].hr
-            up = images.resize(self.read("lr", index), target.width, target.height)
-            images.save(file, up, durable=False)
+            images.save(file, images.resize(self.read(kind, index), *target), durable=False)
+        return f"{kind}_up"
 
 
-def prepare_hr_views(scene: Scene, conf: VariantConf, work: Path) -> PhotoCollection:
+def prepare_hr_views(
+    scene: Scene, conf: VariantConf, work: Path, *, for_sfm: bool = False
+) -> PhotoCollection:
     """Decode every photograph once, and write each that can be used as an HR view.
 
     All are resized by one factor, so that a camera that resolved more than another still does.
@@ -119,6 +135,7 @@ def prepare_hr_views(scene: Scene, conf: VariantConf, work: Path) -> PhotoCollec
         scene: The scene.
         conf: The variant's config.
         work: An existing folder for the copies.
+        for_sfm: Whether the `sfm` copies are written, too.
 
     Raises:
         UnreadableError: A photograph can't be read now. It is not left out: the variant would be
@@ -132,13 +149,13 @@ def prepare_hr_views(scene: Scene, conf: VariantConf, work: Path) -> PhotoCollec
     numbers = {name: f"{i:05d}" for i, name in enumerate(scene.files)}
     geometries: dict[str, HrGeometry] = {}
     phrases: dict[str, list[str]] = defaultdict(list)
-    shrink: float | None = None
+    largest = 0
     for name in progress(order, "HR views", "view"):
         file, size = scene.files[name], headers[name].size
         try:
             picture = images.decode(file)
-            shrink = shrink or shrink_factor([size], conf)
-            hr = _checked_geometry(size, shrink, conf)
+            largest = largest or max(size)
+            hr = _checked_geometry(size, shrink_factor(largest, conf.long_side), conf)
         except (images.ImageError, TooSmallError) as error:
             left_out[name] = str(error).removeprefix(f"{file}: ")
             continue
@@ -146,8 +163,11 @@ def prepare_hr_views(scene: Scene, conf: VariantConf, work: Path) -> PhotoCollec
             raise
         except XrgsError as error:
             raise XrgsError(f"{file}: {error}") from None
-        copy = work / "hr" / f"{numbers[name]}.png"
-        images.save(copy, _resize_and_crop(_visible(picture, scene), hr), durable=False)
+        visible, copy = _visible(picture, scene), f"{numbers[name]}.png"
+        images.save(work / "hr" / copy, _resize_and_crop(visible, hr), durable=False)
+        if for_sfm:
+            own = _scaled(size, shrink_factor(largest, conf.sfm.long_side))
+            images.save(work / "sfm" / copy, images.resize(visible, *own), durable=False)
         geometries[name] = hr
         for phrase in _phrases(picture, scene):
             phrases[phrase].append(name)
@@ -156,8 +176,8 @@ def prepare_hr_views(scene: Scene, conf: VariantConf, work: Path) -> PhotoCollec
         count = f"{len(geometries)} photograph(s) can be used, two are needed"
         raise XrgsError(f"scene {scene.name}: {count}: {'; '.join(reasons)}")
     names = sorted(geometries)
-    sizes = [headers[name].size for name in names]
-    cameras = assign_cameras([scene.files[name] for name in names], sizes, conf.sfm.camera)
+    sizes, files = [headers[name].size for name in names], [scene.files[name] for name in names]
+    shapes = largest_of_shape(sizes)
     photos = (
         Photograph(
             name=name,
@@ -165,10 +185,14 @@ def prepare_hr_views(scene: Scene, conf: VariantConf, work: Path) -> PhotoCollec
             size=headers[name].size,
             orientation=headers[name].orientation,
             hr=geometries[name],
+            sfm=_scaled(shape, shrink_factor(largest, conf.sfm.long_side)),
             camera=camera,
             K=scene.intrinsics.get(name),
+            focal_35mm=images.exif_focal(scene.files[name]),
         )
-        for name, camera in zip(names, cameras, strict=True)
+        for name, shape, camera in zip(
+            names, shapes, assign_cameras(files, sizes, conf.sfm.camera), strict=True
+        )
     )
     return PhotoCollection(tuple(photos), work, tuple(_notes(scene, left_out, phrases)))
 
@@ -222,6 +246,10 @@ def _checked_geometry(size: tuple[int, int], shrink: float, conf: VariantConf) -
     return hr
 
 
+def _scaled(size: tuple[int, int], scale: float) -> tuple[int, int]:
+    return max(1, round(size[0] * scale)), max(1, round(size[1] * scale))
+
+
 def _resize_and_crop(image: images.ImageArray, hr: HrGeometry) -> images.ImageArray:
     left, top = hr.crop_offset
     return images.resize(image, *hr.resized)[top : top + hr.height, left : left + hr.width]
@@ -248,6 +276,19 @@ def _read_headers(
     return headers, left_out
 
 
+def largest_of_shape(sizes: Sequence[tuple[int, int]]) -> list[tuple[int, int]]:
+    """Return for each width and height the largest of `sizes` that has its aspect ratio.
+
+    Resized copies round their sides, so that ratios agree where one px explains the difference.
+    """
+    distinct = sorted(set(sizes), key=math.prod, reverse=True)
+
+    def largest(width: int, height: int) -> tuple[int, int]:
+        return next(s for s in distinct if abs(width * s[1] / s[0] - height) <= 1)
+
+    return [largest(*size) for size in sizes]
+
+
 def assign_cameras(
     files: Sequence[Path], sizes: Sequence[tuple[int, int]], policy: str
 ) -> list[str]:
@@ -256,38 +297,62 @@ def assign_cameras(
     Args:
         files: The photographs.
         sizes: Their width and height with the EXIF orientation applied, px: a camera held upright
-            is another camera to SfM. All photographs with one name have one size.
+            is another camera to SfM. All photographs with one name have one aspect ratio.
         policy: `variant.sfm.camera`: `single` for one camera, `per_image` for one each, `auto` for
-            one per size and EXIF camera.
+            one per aspect ratio and EXIF camera.
 
     Raises:
-        XrgsError: The policy is `single`, but the sizes differ.
+        XrgsError: The policy is `single`, but the aspect ratios differ.
     """
-    one_size = len(set(sizes)) == 1
+    shapes = largest_of_shape(sizes)
     if policy == "single":
-        if not one_size:
-            other = next(i for i, size in enumerate(sizes) if size != sizes[0])
+        if len(set(shapes)) > 1:
+            other = next(i for i, shape in enumerate(shapes) if shape != shapes[0])
             a, b = (f"{files[i]} is {sizes[i][0]}x{sizes[i][1]}" for i in (0, other))
             raise XrgsError(
-                f"variant.sfm.camera=single, but sizes differ: {a}, {b}; use auto or per_image"
+                f"variant.sfm.camera=single, but shapes differ: {a}, {b}; use auto or per_image"
             )
         return ["all"] * len(files)
+    own = [f"{i:05d}" for i in range(len(files))]
     if policy == "per_image":
-        return [f"{i:05d}" for i in range(len(files))]
+        return own
+    exifs = [images.exif_camera(file) for file in files]
+    unknown = [size for size, exif in zip(sizes, exifs, strict=True) if not exif]
+    # Two tourists' photographs of one size are a coincidence; a camera takes many of its size.
+    by_size = len(set(unknown)) == 1 or len(unknown) >= _LEAST_OF_SIZE * len(set(unknown))
     names = []
-    for i, (file, size) in enumerate(zip(files, sizes, strict=True)):
-        exif = images.exif_camera(file)
-        # Where EXIF names no camera and the sizes differ, two equal sizes are a coincidence.
-        own = not exif and not one_size
-        names.append(f"{i:05d}" if own else f"{size[0]}x{size[1]} {exif}")
+    for i, (size, shape, exif) in enumerate(zip(sizes, shapes, exifs, strict=True)):
+        if exif:
+            names.append(f"{shape[0]}x{shape[1]} {exif}")
+        else:
+            names.append(f"{size[0]}x{size[1]}" if by_size else own[i])
     return names
 
 
-def write_degraded(photos: PhotoCollection, which: Sequence[int], conf: VariantConf) -> None:
-    """Degrade the HR views of these indices, and write them as `lr` copies."""
+def write_degraded(
+    photos: PhotoCollection, which: Sequence[int], conf: VariantConf, kind: str = "lr"
+) -> None:
+    """Degrade views of these indices: the HR views into `lr`, or the `sfm` copies into `sfm_lr`."""
     if not which:
         return
     degrade = DEGRADATIONS[resolve_degradation(conf)]
     for i in progress(which, "LR views", "view"):
-        low = degrade(photos.read("hr", i), conf)
-        images.save(photos.folder / photos.file("lr", i), low, durable=False)
+        if kind == "lr":
+            high = photos.read("hr", i)
+        else:
+            high = photos.read("sfm", i)
+            high = images.resize(high, *_divisible(high.shape[1], high.shape[0], conf.factor))
+        images.save(photos.folder / photos.file(kind, i), degrade(high, conf), durable=False)
+
+
+def _divisible(width: int, height: int, factor: int) -> tuple[int, int]:
+    """Return a size with sides that are multiples of `factor`, a little smaller than this one.
+
+    Of a few such sizes it has the aspect ratio that is closest to the given one.
+    """
+    most = max(1, width // factor)
+    columns = min(
+        range(most, max(0, most - 8), -1),
+        key=lambda c: abs(c * height / width - round(c * height / width)),
+    )
+    return columns * factor, max(1, round(columns * height / width)) * factor

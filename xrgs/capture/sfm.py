@@ -49,11 +49,15 @@ class SfmImage:
 
     file: str
     """Its path, relative to the folder of all images."""
+    name: str
+    """The photograph's name, for messages."""
     camera: str
     """The name of its camera; images with one name share the camera."""
     K: NDArray[np.float64] | None = None
     """Intrinsics [3, 3], px, where they are known: then there is no distortion, and they are not
     refined."""
+    focal: float | None = None
+    """The focal length that EXIF gives, px: refinement begins with it."""
 
 
 @dataclass(frozen=True)
@@ -209,6 +213,9 @@ def _extract(
                 K = batch[0].K
                 reader.camera_model = "PINHOLE"
                 reader.camera_params = ",".join(repr(float(K[i, j])) for i, j in _PINHOLE_ENTRIES)
+            elif batch[0].focal is not None:
+                width, height = images.size(folder / batch[0].file)
+                reader.camera_params = f"{float(batch[0].focal)},{width / 2},{height / 2},0"
             pycolmap.extract_features(
                 database,
                 folder,
