@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import math
 from collections import defaultdict
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,6 +27,8 @@ if TYPE_CHECKING:
 #: Photographs without EXIF of a size are taken to be by one camera where so many have a size, on
 #: average. Our choice.
 _LEAST_OF_SIZE = 5
+
+_Content = TypeVar("_Content")
 
 
 @dataclass(frozen=True)
@@ -144,57 +146,107 @@ def prepare_hr_views(
             message names the photographs.
     """
     headers, left_out = _read_headers(scene.files)
-    # Largest first: the first that can be decoded sets the factor, a damaged file never does.
-    order = sorted(headers, key=lambda name: max(headers[name].size), reverse=True)
     numbers = {name: f"{i:05d}" for i, name in enumerate(scene.files)}
     geometries: dict[str, HrGeometry] = {}
     phrases: dict[str, list[str]] = defaultdict(list)
-    largest = 0
-    for name in progress(order, "HR views", "view"):
+    usable = _usable(scene, conf, headers, left_out, images.decode)
+    sizes: list[tuple[int, int]] = []  # the largest is the first
+    for name, hr, picture in progress(usable, "HR views", "view", len(headers)):
+        visible, copy = _visible(picture, scene), f"{numbers[name]}.png"
+        images.save(work / "hr" / copy, _resize_and_crop(visible, hr), durable=False)
+        if for_sfm:
+            sizes.append(headers[name].size)
+            size = _sfm_size(sizes[-1], sizes, conf)
+            images.save(work / "sfm" / copy, images.resize(visible, *size), durable=False)
+        geometries[name] = hr
+        for phrase in _phrases(picture, scene):
+            phrases[phrase].append(name)
+    photos = _photographs(scene, conf, headers, left_out, geometries)
+    return PhotoCollection(photos, work, tuple(_notes(scene, left_out, phrases)))
+
+
+def expected_photographs(scene: Scene, conf: VariantConf) -> PhotoCollection:
+    """Say from headers alone what `prepare_hr_views` will make, as far as the files can be decoded.
+
+    Returns:
+        The photographs, without copies, and a note on those that will be left out.
+
+    Raises:
+        UnreadableError: A header can't be read now.
+        XrgsError: As `prepare_hr_views`.
+    """
+    headers, left_out = _read_headers(scene.files)
+    usable = _usable(scene, conf, headers, left_out, lambda _: None)
+    geometries = {name: hr for name, hr, _ in usable}
+    photos = _photographs(scene, conf, headers, left_out, geometries)
+    return PhotoCollection(photos, Path(), tuple(_notes(scene, left_out, {})))
+
+
+def _usable(
+    scene: Scene,
+    conf: VariantConf,
+    headers: Mapping[str, images.Header],
+    left_out: dict[str, str],
+    read: Callable[[Path], _Content],
+) -> Iterator[tuple[str, HrGeometry, _Content]]:
+    """Yield name, HR view and content of each photograph that can be used; fill `left_out`."""
+    shrink: float | None = None
+    # Largest first: the first that can be read sets the factor, a damaged file never does.
+    for name in sorted(headers, key=lambda name: max(headers[name].size), reverse=True):
         file, size = scene.files[name], headers[name].size
         try:
-            picture = images.decode(file)
-            largest = largest or max(size)
-            hr = _checked_geometry(size, shrink_factor(largest, conf.long_side), conf)
-        except (images.ImageError, TooSmallError) as error:
+            content = read(file)
+            shrink = shrink or shrink_factor([size], conf.long_side)
+            hr = _checked_geometry(size, shrink, conf)
+        except images.ImageError as error:
             left_out[name] = str(error).removeprefix(f"{file}: ")
+            continue
+        except TooSmallError as error:
+            left_out[name] = error.why
             continue
         except UnreadableError:
             raise
         except XrgsError as error:
             raise XrgsError(f"{file}: {error}") from None
-        visible, copy = _visible(picture, scene), f"{numbers[name]}.png"
-        images.save(work / "hr" / copy, _resize_and_crop(visible, hr), durable=False)
-        if for_sfm:
-            own = _scaled(size, shrink_factor(largest, conf.sfm.long_side))
-            images.save(work / "sfm" / copy, images.resize(visible, *own), durable=False)
-        geometries[name] = hr
-        for phrase in _phrases(picture, scene):
-            phrases[phrase].append(name)
+        yield name, hr, content
+
+
+def _photographs(
+    scene: Scene,
+    conf: VariantConf,
+    headers: Mapping[str, images.Header],
+    left_out: Mapping[str, str],
+    geometries: Mapping[str, HrGeometry],
+) -> tuple[Photograph, ...]:
+    """Describe the photographs that can be used, sorted by name; refuse fewer than two."""
     if len(geometries) < 2:
-        reasons = [f"{scene.files[name]}: {why}" for name, why in sorted(left_out.items())]
         count = f"{len(geometries)} photograph(s) can be used, two are needed"
-        raise XrgsError(f"scene {scene.name}: {count}: {'; '.join(reasons)}")
+        reasons = f"{scene.name}: {count}: {_reasons(scene, left_out)}"
+        sizes = [header.size for header in headers.values()]
+        try:
+            for size in sizes:
+                hr_geometry(size, shrink_factor(sizes, conf.long_side), conf)
+        except TooSmallError as error:
+            reasons += f"; {error.advice}"
+        raise XrgsError(f"scene {reasons}")
+    numbers = {name: f"{i:05d}" for i, name in enumerate(scene.files)}
     names = sorted(geometries)
-    sizes, files = [headers[name].size for name in names], [scene.files[name] for name in names]
-    shapes = largest_of_shape(sizes)
-    photos = (
+    files, sizes = [scene.files[name] for name in names], [headers[name].size for name in names]
+    shapes, cameras = largest_of_shape(sizes), assign_cameras(files, sizes, conf.sfm.camera)
+    return tuple(
         Photograph(
             name=name,
             number=numbers[name],
             size=headers[name].size,
             orientation=headers[name].orientation,
             hr=geometries[name],
-            sfm=_scaled(shape, shrink_factor(largest, conf.sfm.long_side)),
+            sfm=_sfm_size(shape, sizes, conf),
             camera=camera,
             K=scene.intrinsics.get(name),
             focal_35mm=images.exif_focal(scene.files[name]),
         )
-        for name, shape, camera in zip(
-            names, shapes, assign_cameras(files, sizes, conf.sfm.camera), strict=True
-        )
+        for name, shape, camera in zip(names, shapes, cameras, strict=True)
     )
-    return PhotoCollection(tuple(photos), work, tuple(_notes(scene, left_out, phrases)))
 
 
 def _notes(
@@ -202,10 +254,17 @@ def _notes(
 ) -> Iterator[str]:
     """Yield a sentence on what was left out, and one on each thing that was done."""
     if left_out:
-        reasons = [f"{_own_name(scene, name)} ({why})" for name, why in sorted(left_out.items())]
-        yield f"left out: {listed(reasons)}"
+        yield f"left out: {_reasons(scene, left_out)}"
     for phrase, names in sorted(phrases.items()):
         yield f"{phrase}: {listed([_own_name(scene, name) for name in sorted(names)])}"
+
+
+def _reasons(scene: Scene, left_out: Mapping[str, str]) -> str:
+    """Name the photographs that are left out for each reason."""
+    names = defaultdict(list)
+    for name, why in sorted(left_out.items()):
+        names[why].append(_own_name(scene, name))
+    return "; ".join(f"{listed(own)} ({why})" for why, own in names.items())
 
 
 def _own_name(scene: Scene, name: str) -> str:
@@ -246,8 +305,11 @@ def _checked_geometry(size: tuple[int, int], shrink: float, conf: VariantConf) -
     return hr
 
 
-def _scaled(size: tuple[int, int], scale: float) -> tuple[int, int]:
-    return max(1, round(size[0] * scale)), max(1, round(size[1] * scale))
+def _sfm_size(
+    size: tuple[int, int], sizes: Sequence[tuple[int, int]], conf: VariantConf
+) -> tuple[int, int]:
+    shrink = shrink_factor(sizes, conf.sfm.long_side)
+    return max(1, round(size[0] * shrink)), max(1, round(size[1] * shrink))
 
 
 def _resize_and_crop(image: images.ImageArray, hr: HrGeometry) -> images.ImageArray:

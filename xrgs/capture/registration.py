@@ -1,9 +1,10 @@
 """Registers the views of a mixed-resolution scene, with further attempts where too few register.
 
-SfM gets whole photographs at `sfm.long_side`, whatever the size that is trained; those that the
-variant degrades are degraded at that size. With `sfm.lr_images: upsampled`, a smaller image is resized to the
-size of the largest of its shape, and one camera serves both, which makes the poses of small images
-several times more accurate. With `native`, SfM gets them as they are, with a camera of their own.
+SfM gets whole photographs at `sfm.long_side`, whatever the size that is trained. Photographs that
+the variant degrades are degraded at that size. With `sfm.lr_images: upsampled`, a smaller image is
+resized to the size of the largest of its shape, and one camera serves both. This makes the poses
+of small images several times more accurate. With `native`, SfM gets a smaller image as it is, with
+a camera of its size.
 
 The first attempt, `configured`, has the settings of `variant.sfm`. With `sfm.fallbacks`, the
 attempts of `FALLBACKS` follow in their order until a reconstruction is accepted.

@@ -27,6 +27,7 @@ from xrgs.experiment.attempts import plan_cell
 from xrgs.runtime import lease
 from xrgs.runtime.machine import usable_cores
 from xrgs.runtime.progress import log_line
+from xrgs.safeio.paths import user_path
 from xrgs.safeio.sanitize import counted, for_line
 from xrgs.splat.backend import resolve_backend
 from xrgs.sweep.jobs import worker
@@ -360,7 +361,7 @@ def _hand_over(cell: PlannedCell, threads: int, store: Store) -> list[str]:
     if cell.identity is None or cell.cell_id is None:
         raise ValueError(f"{cell.name}: launched without an identity")
     home, scene = store.path.absolute(), cell.conf.scene
-    path = str(Path(scene.path).expanduser().absolute()) if scene.path else scene.path
+    path = str(user_path(scene.path).absolute()) if scene.path else scene.path
     conf = replace(
         cell.conf,
         store=str(home),
