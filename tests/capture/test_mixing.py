@@ -62,7 +62,7 @@ def reconstruction(
     inputs = []
     for file in rendered.files.values():
         shutil.copy(str(file), work / file.name)
-        inputs.append(SfmImage(file.name, "all"))
+        inputs.append(SfmImage(file.name, file.stem, "all"))
     return sfm.reconstruct(inputs, work, work, conf.sfm)
 
 

@@ -381,7 +381,7 @@ def assign_cameras(
     exifs = [images.exif_camera(file) for file in files]
     unknown = [size for size, exif in zip(sizes, exifs, strict=True) if not exif]
     # Two tourists' photographs of one size are a coincidence; a camera takes many of its size.
-    by_size = len(set(unknown)) == 1 or len(unknown) >= _LEAST_OF_SIZE * len(set(unknown))
+    by_size = len(set(sizes)) == 1 or len(unknown) >= _LEAST_OF_SIZE * len(set(unknown))
     names = []
     for i, (size, shape, exif) in enumerate(zip(sizes, shapes, exifs, strict=True)):
         if exif:
