@@ -175,15 +175,13 @@ def test_the_lens_of_an_image_for_sfm_is_mapped_to_the_hr_view(
     """The right view is 741 x 500 px: 185 x 125 for SfM, and 504 x 340 cropped to 500 x 340."""
     hr = photos[1].hr
     assert (hr.resized, hr.width, hr.height) == ((504, 340), 500, 340)
-    seen = Lens(185, 125, 185.0, 185.0, 92.5, 62.5, 0.1)
+    seen = Lens("SIMPLE_RADIAL", (185.0, 92.5, 62.5, 0.1), 185, 125)
     model = replace(registered(1), lenses={1: seen})
     monkeypatch.setattr(sfm, "reconstruct", lambda *_: model)
     done = registration.register(photos, [1], sfm_conf, tmp_path, lambda _: "")
     made = done.model.lenses[1]
-    assert (made.width, made.height, made.k) == (500, 340, 0.1)
-    assert made.fx == pytest.approx(504)
-    assert made.fy == pytest.approx(185 * 340 / 125)
-    assert (made.cx, made.cy) == pytest.approx((250, 170))
+    assert (made.width, made.height, made.params) == (500, 340, seen.params)
+    assert pytest.approx(np.array([[504, 0, 250], [0, 185 * 340 / 125, 170], [0, 0, 1]])) == made.K
 
 
 def test_exif_gives_the_focal_length_to_begin_with(

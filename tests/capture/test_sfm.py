@@ -74,7 +74,7 @@ def test_the_stereo_pair_is_registered_with_its_known_intrinsics(stereo_pair: St
     assert len(model.points) == len(model.colors) > 500
     for i, K in enumerate(motorcycle.intrinsics().values()):
         assert np.array_equal(model.lenses[i].K, K)
-        assert model.lenses[i].k == 0
+        assert model.lenses[i].is_pinhole
 
 
 def test_its_cameras_are_parallel_and_side_by_side(stereo_pair: StereoPair) -> None:

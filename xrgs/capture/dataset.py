@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import torch
 
-from xrgs.capture import images
+from xrgs.capture import images, masks
 from xrgs.errors import XrgsError
 from xrgs.runtime.progress import progress
 from xrgs.splat.cameras import Camera
@@ -108,8 +108,8 @@ def load(
     # An original has the pose of the training view that it replaces.
     entries = [("train", view) for view in training] + [(view.split, view) for view in scored]
     loaded = tuple(
-        _load_view(view, viewmats[split, view.name])
-        for split, view in progress(entries, "loading", "view")
+        _load_view(view, viewmats[split, view.name], hide=place < len(training))
+        for place, (split, view) in enumerate(progress(entries, "loading", "view"))
     )
     return Dataset(
         train=loaded[: len(training)],
@@ -171,12 +171,19 @@ def _training_views(variant: Variant, use: str) -> list[View]:
     return views
 
 
-def _load_view(view: View, viewmat: NDArray[np.float64]) -> LoadedView:
+def _load_view(view: View, viewmat: NDArray[np.float64], *, hide: bool) -> LoadedView:
+    """Load a view; with `hide`, what is outside its mask is not loaded (`masks.filled`)."""
     camera = Camera(
         viewmat=torch.from_numpy(viewmat).float(),
         K=torch.from_numpy(view.K).float(),
         width=view.width,
         height=view.height,
     )
-    image = torch.from_numpy(images.read_png(view.file, (view.width, view.height)))
-    return LoadedView(view.name, view.tag, camera, image, view.rho)
+    size = view.width, view.height
+    image = images.read_png(view.file, size)
+    if view.mask is None:
+        return LoadedView(view.name, view.tag, camera, torch.from_numpy(image), view.rho)
+    mask = images.read_mask(view.mask, size)
+    image = masks.filled(image, mask) if hide else image
+    tensors = torch.from_numpy(image), torch.from_numpy(mask)
+    return LoadedView(view.name, view.tag, camera, tensors[0], view.rho, tensors[1])

@@ -43,6 +43,8 @@ MAX_PNG_PIXELS = 1 << 26
 #: Deflate, the compression of PNGs, makes at most 1032 bytes of one, and no photograph of any
 #: format shrinks as much. A drawing may; up to so many pixels it takes little memory.
 _MAX_EXPANSION, _SMALL_PIXELS = 1032, 1 << 24
+#: The fewest bits of a pixel in a file by PIL's modes, as masks and palettes have them; others 24.
+_BITS = {"1": 1, "P": 1, "L": 8}
 #: With `scene.alpha=mask`, pixels of a lower alpha are outside. Our choice.
 OPAQUE_FROM = 0.5
 #: The formats that PIL turns upright by itself. The tag of a TIFF stays until it is loaded.
@@ -333,7 +335,8 @@ def read_png_pil(
 def _check_expansion(path: Path, image: Image.Image) -> None:
     """Refuse an image that no file of these bytes can hold, before memory is taken for it."""
     file_bytes = path.lstat().st_size
-    if 3 * image.width * image.height > _MAX_EXPANSION * file_bytes:
+    bits = _BITS.get(image.mode, 24)
+    if bits * image.width * image.height > 8 * _MAX_EXPANSION * file_bytes:
         raise ValueError(f"{file_bytes} bytes are too few for {image.width} x {image.height} px")
 
 

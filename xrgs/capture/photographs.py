@@ -5,16 +5,17 @@ from __future__ import annotations
 import math
 from collections import defaultdict
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-from xrgs.capture import images
+from xrgs.capture import images, masks
 from xrgs.capture.degradations import DEGRADATIONS, resolve_degradation
-from xrgs.capture.lens import Lens
+from xrgs.capture.lens import Lens, lens_of_model, undistort
+from xrgs.capture.masks import MASKS, Mask, Masks, copy_mask
 from xrgs.capture.split import HrGeometry, TooSmallError, hr_geometry, shrink_factor
 from xrgs.errors import UnreadableError, XrgsError
 from xrgs.runtime.progress import progress
@@ -29,6 +30,7 @@ if TYPE_CHECKING:
 _LEAST_OF_SIZE = 5
 
 _Content = TypeVar("_Content")
+_T = TypeVar("_T", np.float32, np.bool_)
 
 
 @dataclass(frozen=True)
@@ -51,8 +53,10 @@ class Photograph:
     """The name of its camera; photographs with one name share the camera in SfM."""
     K: NDArray[np.float64] | None
     """Intrinsics [3, 3] of the file, px, where they are known; then there is no distortion."""
-    focal_35mm: float | None = None
+    focal_35mm: float | None
     """The focal length that EXIF gives, for a film of 36 x 24 mm, mm."""
+    path: Path
+    """The file."""
 
     @property
     def lens(self) -> Lens | None:
@@ -60,18 +64,12 @@ class Photograph:
         if self.K is None:
             return None
         K = self.K
-        return Lens(*self.size, K[0, 0], K[1, 1], K[0, 2], K[1, 2])
+        return lens_of_model("PINHOLE", self.size, (K[0, 0], K[1, 1], K[0, 2], K[1, 2]))
 
     def to_hr(self, lens: Lens) -> Lens:
         """Return the camera of the HR view; `lens` is of the whole photograph, at any size."""
-        left, top = self.hr.crop_offset
-        resized = lens.resized(*self.hr.resized)
-        return replace(
-            resized,
-            width=self.hr.width,
-            height=self.hr.height,
-            cx=resized.cx - left,
-            cy=resized.cy - top,
+        return lens.resized(*self.hr.resized).cropped(
+            *self.hr.crop_offset, self.hr.width, self.hr.height
         )
 
 
@@ -84,6 +82,10 @@ class PhotoCollection:
     - `hr` is the HR view, and `lr` the degraded view.
     - `sfm` is the whole photograph for SfM, and `sfm_lr` is that copy degraded.
     - `sfm_up` and `sfm_lr_up` are these two resized to `Photograph.sfm`.
+    - `shown`, of photographs with a mask alone, is the HR view with the pixels that the mask hides.
+
+    A copy may have a mask. In all kinds but `shown`, pixels that the mask of a photograph hides
+    have the colour of the nearest other one.
     """
 
     all: tuple[Photograph, ...]
@@ -114,15 +116,48 @@ class PhotoCollection:
         """Read an existing copy, [H, W, 3] in 0..1."""
         return images.read(self.folder / self.file(kind, index))
 
+    def mask(self, kind: str, index: int) -> Mask | None:
+        """Read the mask of an existing copy, [H, W]; None where all of its pixels are used."""
+        file = copy_mask(self.folder, self.file(kind, index))
+        return images.read_mask(file, self.size(kind, index)) if file.exists() else None
+
+    def save_mask(self, kind: str, index: int, mask: Mask | None) -> None:
+        """Write the mask of a copy; None writes nothing."""
+        if mask is not None:
+            images.save_mask(copy_mask(self.folder, self.file(kind, index)), mask, durable=False)
+
     def upsampled(self, kind: str, index: int) -> str:
         """Resize a copy to `Photograph.sfm`; return the kind of the copy that has this size."""
-        target = self.all[index].sfm
+        target, up = self.all[index].sfm, f"{kind}_up"
         if self.size(kind, index) == target:
             return kind
-        file = self.folder / self.file(f"{kind}_up", index)
+        file = self.folder / self.file(up, index)
         if not file.exists():
             images.save(file, images.resize(self.read(kind, index), *target), durable=False)
-        return f"{kind}_up"
+            self.save_mask(up, index, masks.resized(self.mask(kind, index), *target))
+        return up
+
+    def undistorted(
+        self, kind: str, index: int, lens: Lens
+    ) -> tuple[images.ImageArray, Mask | None]:
+        """Undistort a copy, and its mask.
+
+        Args:
+            kind: `hr` or `lr`.
+            index: The photograph.
+            lens: The camera of the copy.
+
+        Returns:
+            The image [H, W, 3], not clamped. In an HR view, pixels outside the mask are as in the
+            photograph. The mask [H, W], or None where all pixels are used.
+        """
+        image, mask = undistort(self.read(kind, index), lens), self.mask(kind, index)
+        if mask is None:
+            return image, None
+        used = masks.undistorted(mask, lens)
+        if kind == "hr":
+            image = np.where(used[..., None], image, undistort(self.read("shown", index), lens))
+        return image, used
 
 
 def prepare_hr_views(
@@ -143,26 +178,30 @@ def prepare_hr_views(
         UnreadableError: A photograph can't be read now. It is not left out: the variant would be
             another one whenever a disk or a server fails.
         XrgsError: Fewer than two photographs can be used, or one is too large for a variant; the
-            message names the photographs.
+            message names the photographs. A mask can't be read, or is of another picture.
     """
+    (work / MASKS).mkdir(exist_ok=True)
     headers, left_out = _read_headers(scene.files)
+    given = Masks.fitted(scene.masks, headers)
     numbers = {name: f"{i:05d}" for i, name in enumerate(scene.files)}
     geometries: dict[str, HrGeometry] = {}
     phrases: dict[str, list[str]] = defaultdict(list)
     usable = _usable(scene, conf, headers, left_out, images.decode)
     sizes: list[tuple[int, int]] = []  # the largest is the first
     for name, hr, picture in progress(usable, "HR views", "view", len(headers)):
-        visible, copy = _visible(picture, scene), f"{numbers[name]}.png"
-        images.save(work / "hr" / copy, _resize_and_crop(visible, hr), durable=False)
+        file, mask = f"{numbers[name]}.png", _used(picture, given.read(name, headers[name]), scene)
+        image, shown = _layers(picture, mask, scene)
+        if not _save_hr(work, file, image, shown, mask, hr):
+            left_out[name] = "its mask leaves no pixel"
+            continue
         if for_sfm:
             sizes.append(headers[name].size)
-            size = _sfm_size(sizes[-1], sizes, conf)
-            images.save(work / "sfm" / copy, images.resize(visible, *size), durable=False)
+            _save_sfm(work, file, image, mask, _sfm_size(sizes[-1], sizes, conf))
         geometries[name] = hr
         for phrase in _phrases(picture, scene):
             phrases[phrase].append(name)
     photos = _photographs(scene, conf, headers, left_out, geometries)
-    return PhotoCollection(photos, work, tuple(_notes(scene, left_out, phrases)))
+    return PhotoCollection(photos, work, (*given.notes, *_notes(scene, left_out, phrases)))
 
 
 def expected_photographs(scene: Scene, conf: VariantConf) -> PhotoCollection:
@@ -179,7 +218,8 @@ def expected_photographs(scene: Scene, conf: VariantConf) -> PhotoCollection:
     usable = _usable(scene, conf, headers, left_out, lambda _: None)
     geometries = {name: hr for name, hr, _ in usable}
     photos = _photographs(scene, conf, headers, left_out, geometries)
-    return PhotoCollection(photos, Path(), tuple(_notes(scene, left_out, {})))
+    notes = (*Masks.fitted(scene.masks, headers).notes, *_notes(scene, left_out, {}))
+    return PhotoCollection(photos, Path(), notes)
 
 
 def _usable(
@@ -244,9 +284,59 @@ def _photographs(
             camera=camera,
             K=scene.intrinsics.get(name),
             focal_35mm=images.exif_focal(scene.files[name]),
+            path=scene.files[name],
         )
         for name, shape, camera in zip(names, shapes, cameras, strict=True)
     )
+
+
+def _used(picture: images.Picture, given: Mask | None, scene: Scene) -> Mask | None:
+    """Return which pixels of a photograph are used, by its mask and alpha; None where all are."""
+    used = np.ones(picture.pixels.shape[:2], np.bool_) if given is None else given
+    if scene.alpha == "mask" and picture.alpha is not None:
+        used = used & (picture.alpha >= images.OPAQUE_FROM)
+    return None if used.all() else used
+
+
+def _layers(
+    picture: images.Picture, mask: Mask | None, scene: Scene
+) -> tuple[images.ImageArray, images.ImageArray]:
+    """Return a photograph without the pixels that its mask hides, and as it is shown."""
+    shown = picture.pixels
+    if picture.alpha is not None:
+        shown = images.composite(shown, picture.alpha, scene.background)
+    image = picture.pixels if scene.alpha == "mask" else shown
+    return masks.filled(image, mask), shown
+
+
+def _save_hr(
+    work: Path,
+    file: str,
+    image: images.ImageArray,
+    shown: images.ImageArray,
+    mask: Mask | None,
+    hr: HrGeometry,
+) -> bool:
+    """Write the HR view of a photograph, with its mask; return whether any pixel is used."""
+    if mask is not None:
+        small = _crop(masks.resized(mask, *hr.resized), hr)
+        if not small.any():
+            return False
+        if not small.all():
+            images.save(work / "shown" / file, _resize_and_crop(shown, hr), durable=False)
+            images.save_mask(copy_mask(work, f"hr/{file}"), small, durable=False)
+    images.save(work / "hr" / file, _resize_and_crop(image, hr), durable=False)
+    return True
+
+
+def _save_sfm(
+    work: Path, file: str, image: images.ImageArray, mask: Mask | None, size: tuple[int, int]
+) -> None:
+    """Write the copy of a photograph for SfM, with its mask."""
+    images.save(work / "sfm" / file, images.resize(image, *size), durable=False)
+    small = masks.resized(mask, *size)
+    if small is not None and not small.all():
+        images.save_mask(copy_mask(work, f"sfm/{file}"), small, durable=False)
 
 
 def _notes(
@@ -269,16 +359,6 @@ def _reasons(scene: Scene, left_out: Mapping[str, str]) -> str:
 
 def _own_name(scene: Scene, name: str) -> str:
     return f"{name}{scene.files[name].suffix}"
-
-
-def _visible(picture: images.Picture, scene: Scene) -> images.ImageArray:
-    """Return a picture over the background; edges keep their colour where alpha is a mask."""
-    if picture.alpha is None:
-        return picture.pixels
-    alpha = picture.alpha
-    if scene.alpha == "mask":
-        alpha = (alpha >= images.OPAQUE_FROM).astype(np.float32)
-    return images.composite(picture.pixels, alpha, scene.background)
 
 
 def _phrases(picture: images.Picture, scene: Scene) -> Iterator[str]:
@@ -313,8 +393,12 @@ def _sfm_size(
 
 
 def _resize_and_crop(image: images.ImageArray, hr: HrGeometry) -> images.ImageArray:
+    return _crop(images.resize(image, *hr.resized), hr)
+
+
+def _crop(image: NDArray[_T], hr: HrGeometry) -> NDArray[_T]:
     left, top = hr.crop_offset
-    return images.resize(image, *hr.resized)[top : top + hr.height, left : left + hr.width]
+    return image[top : top + hr.height, left : left + hr.width]
 
 
 def _read_headers(
@@ -399,12 +483,14 @@ def write_degraded(
         return
     degrade = DEGRADATIONS[resolve_degradation(conf)]
     for i in progress(which, "LR views", "view"):
-        if kind == "lr":
-            high = photos.read("hr", i)
-        else:
-            high = photos.read("sfm", i)
-            high = images.resize(high, *_divisible(high.shape[1], high.shape[0], conf.factor))
-        images.save(photos.folder / photos.file(kind, i), degrade(high, conf), durable=False)
+        source = "hr" if kind == "lr" else "sfm"
+        high, mask = photos.read(source, i), photos.mask(source, i)
+        if kind == "sfm_lr":  # an HR view has been cropped to such a size
+            size = _divisible(*photos.size("sfm", i), conf.factor)
+            high, mask = images.resize(high, *size), masks.resized(mask, *size)
+        low = degrade(high, conf)
+        images.save(photos.folder / photos.file(kind, i), low, durable=False)
+        photos.save_mask(kind, i, masks.degraded(mask, low.shape[:2], conf.factor))
 
 
 def _divisible(width: int, height: int, factor: int) -> tuple[int, int]:

@@ -20,6 +20,7 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 from xrgs.capture import sfm
+from xrgs.capture.masks import copy_mask
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -178,7 +179,8 @@ def sfm_images(
         # Where the intrinsics are known, each image has a camera of its own, with its own K.
         camera = photo.name if lens else f"{photo.camera} {width}x{height}"
         file, K = photos.file(kind, i), lens.K if lens else None
-        result.append(sfm.SfmImage(file, photo.name, camera, K, focal))
+        masked = copy_mask(photos.folder, file).exists()
+        result.append(sfm.SfmImage(file, photo.name, camera, K, focal, masked))
     return result
 
 

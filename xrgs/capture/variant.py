@@ -39,6 +39,7 @@ CORE = (
     "capture/frozen.py",
     "capture/images.py",
     "capture/lens.py",
+    "capture/masks.py",
     "capture/mixing.py",
     "capture/photographs.py",
     "capture/registration.py",
@@ -50,7 +51,13 @@ CORE = (
     "capture/views.py",
 )
 #: The source files that read given poses.
-POSES = ("capture/colmap.py", "capture/poses.py")
+POSES = (
+    "capture/colmap.py",
+    "capture/poses/__init__.py",
+    "capture/poses/colmap.py",
+    "capture/poses/given.py",
+    "capture/poses/transforms.py",
+)
 
 
 def key(scene: SceneConf, conf: VariantConf) -> str:

@@ -84,30 +84,31 @@ class FolderScene:
 
     def names(self, conf: SceneConf, long_side: int) -> list[str]:
         """Return the names of the photographs, see `list_photographs`."""
-        return list(list_photographs(conf.path, long_side))
+        return list(list_photographs(conf.path, long_side, conf.masks))
 
     def digest(self, conf: SceneConf, long_side: int) -> str:
         """Hash the names and bytes of the photographs."""
-        return files_digest(list_photographs(conf.path, long_side))
+        return files_digest(list_photographs(conf.path, long_side, conf.masks))
 
     def resolve(self, conf: SceneConf, long_side: int, home: Path) -> Scene:
         """List the photographs."""
-        found = look(conf.path, long_side)
+        found = look(conf.path, long_side, conf.masks)
         return Scene(label(conf), home.name, found.files, notes=found.notes)
 
 
-def list_photographs(path: str | None, long_side: int) -> dict[str, Path]:
+def list_photographs(path: str | None, long_side: int, masks: str | None = None) -> dict[str, Path]:
     """List the image files of a scene's folder; see `look`."""
-    return look(path, long_side).files
+    return look(path, long_side, masks).files
 
 
-def look(path: str | None, long_side: int) -> Listing:
+def look(path: str | None, long_side: int, masks: str | None = None) -> Listing:
     """List the image files of a scene's folder, and say what is not among them.
 
     Args:
         path: `scene.path`, the folder; with `/**` at its end, all folders below it too.
         long_side: `variant.long_side`, px. Of an LLFF scene the smallest copies whose longer side
             has at least so many px are taken; the largest where none has, or where this is 0.
+        masks: `scene.masks`, a folder that is not looked into; None where there is none.
 
     Returns:
         The files and the notes. The name of a view is the name of the file without its suffix; with
@@ -128,6 +129,10 @@ def look(path: str | None, long_side: int) -> Listing:
                 why = "not a folder; for the frames of a video: scene=video scene.path=..."
             raise XrgsError(f"scene.path={folder}: {why}")
         taken, notes = (_all_below if nested else _inside)(folder, long_side)
+        if masks is not None:
+            root = user_path(masks).resolve()
+            taken = {f: files for f, files in taken.items() if f == folder or not _is_in(f, root)}
+            notes = [note for note in notes if "scene.masks=" not in note]
         files = [file for inside in taken.values() for file in inside]
         for choose in (_photographs, without_copies):
             files, more = choose(files, folder)
@@ -144,6 +149,10 @@ def look(path: str | None, long_side: int) -> Listing:
     _check_heic(files)
     named = [(_view_name(file, folder if nested else file.parent), file) for file in files]
     return Listing(_by_name(named), tuple(notes))
+
+
+def _is_in(folder: Path, root: Path) -> bool:
+    return folder.resolve().is_relative_to(root)
 
 
 #: Photographs by their folder.
