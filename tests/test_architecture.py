@@ -49,6 +49,8 @@ ONLY_IN = {
     "gsplat": (),
     "tqdm": ("runtime/progress", "sweep/monitor"),
     "av": ("capture/scenes/video", "viewer/film"),
+    "imagecodecs": ("capture/colour", "capture/deep"),
+    "tifffile": ("capture/deep",),
     "viser": ("viewer/live",),
     "tensorboard": ("sweep/track",),
     "mlflow": ("sweep/track",),

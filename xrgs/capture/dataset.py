@@ -27,18 +27,23 @@ _MIN_HR_LEFT = 2
 
 @dataclass(frozen=True)
 class LoadedView:
-    """One view in memory."""
+    """One view in memory, with its photograph in 8 bits: a quarter of what float32 takes."""
 
     name: str
     tag: str
     """`HR` or `LR`."""
     camera: Camera
-    image: torch.Tensor
-    """[H, W, 3] float32 in 0..1."""
+    pixels: torch.Tensor
+    """[H, W, 3], uint8 as the file has them; floats are taken as they are, in 0..1."""
     rho: float = 1.0
     """The relative sampling rate in (0, 1], see `xrgs.capture.views.View`."""
     mask: torch.Tensor | None = None
     """[H, W] bool, True for a pixel that is used; None uses all."""
+
+    @property
+    def image(self) -> torch.Tensor:
+        """The photograph [H, W, 3] in 0..1: a new float32 tensor of `pixels` / 255."""
+        return self.pixels if self.pixels.is_floating_point() else self.pixels.float() / 255
 
 
 @dataclass(frozen=True)
@@ -180,10 +185,11 @@ def _load_view(view: View, viewmat: NDArray[np.float64], *, hide: bool) -> Loade
         height=view.height,
     )
     size = view.width, view.height
-    image = images.read_png(view.file, size)
+    # A copy, since the array of PIL's memory is read-only.
+    pixels = np.array(images.read_png_pil(view.file, size))
     if view.mask is None:
-        return LoadedView(view.name, view.tag, camera, torch.from_numpy(image), view.rho)
+        return LoadedView(view.name, view.tag, camera, torch.from_numpy(pixels), view.rho)
     mask = images.read_mask(view.mask, size)
-    image = masks.filled(image, mask) if hide else image
-    tensors = torch.from_numpy(image), torch.from_numpy(mask)
+    pixels = masks.filled(pixels, mask) if hide else pixels
+    tensors = torch.from_numpy(pixels), torch.from_numpy(mask)
     return LoadedView(view.name, view.tag, camera, tensors[0], view.rho, tensors[1])
