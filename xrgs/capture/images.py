@@ -449,8 +449,8 @@ def exif_focal(path: Path) -> float | None:
         UnreadableError: The file can't be read now.
         ImageError: The file is not an image.
     """
-    with _opened(path) as image, suppress(Exception):  # PIL raises nearly anything on damaged EXIF
-        focal = float(image.getexif().get_ifd(_EXIF_DETAILS)[_EXIF_FOCAL_35MM])
+    with _stream(path) as stream, suppress(Exception):  # PIL raises nearly anything on damaged EXIF
+        focal = float(_file(stream).exif.get_ifd(_EXIF_DETAILS)[_EXIF_FOCAL_35MM])
         return focal if 1 < focal < 10_000 else None
     return None
 

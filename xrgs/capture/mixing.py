@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from xrgs.capture import images, poses, registration, sampling
+from xrgs.capture import images, poses, registration, sampling, triangulation
 from xrgs.capture.alignment import pose_error
 from xrgs.capture.degradations import resolve_degradation
 from xrgs.capture.lens import Lens
@@ -33,6 +33,7 @@ from xrgs.capture.split import (
 from xrgs.capture.tags import POLICIES
 from xrgs.capture.views import SceneFailed, Variant, View
 from xrgs.runtime.progress import progress
+from xrgs.runtime.text import listed
 from xrgs.safeio.atomic import write_text
 
 if TYPE_CHECKING:
@@ -92,9 +93,9 @@ def mix_resolutions(scene: Scene, conf: VariantConf, work: Path, out: Path) -> V
     if conf.tags in POLICIES and POLICIES[conf.tags].needs_depth:
         inputs = replace(inputs, split=_split_by_depth(photos, conf, model, depths))
     write_degraded(photos, inputs.degraded, conf)
-    views = _write_undistorted(inputs, model, depths, out)
+    views, hidden = _write_undistorted(inputs, model, depths, out)
     tags, masked = _tags_report(inputs, views), _mask_report(views)
-    notes = [*report["notes"], *tags["notes"], *masked["notes"]]
+    notes = [*report["notes"], *tags["notes"], *hidden, *masked["notes"]]
     report |= tags | masked | {"notes": notes}
     for note in report["notes"]:
         _log.warning("scene %s: %s", scene.name, note)
@@ -110,6 +111,9 @@ def _register(inputs: _Inputs, work: Path) -> Registration:
     photos, conf = inputs.photos, inputs.conf
     if conf.poses is not None:
         model = poses.read_poses(conf.poses, photos)
+        if not len(model.points):
+            write_degraded(photos, inputs.degraded, conf)
+            model = triangulation.with_points(model, photos, inputs.degraded, conf.sfm, work)
         return Registration(model, _refusal(inputs, model), [])
     write_degraded(photos, inputs.degraded, conf, "sfm_lr")
     return registration.register(
@@ -258,20 +262,23 @@ def _mask_report(views: tuple[View, ...]) -> dict[str, Any]:
 
 def _write_undistorted(
     inputs: _Inputs, model: Reconstruction, depths: Mapping[int, float], out: Path
-) -> tuple[View, ...]:
-    """Undistort every registered view at its own size, and write it."""
+) -> tuple[tuple[View, ...], list[str]]:
+    """Undistort every registered view at its own size, and write it; say which are left out."""
     photos, split = inputs.photos, inputs.split
     degraded, low = set(inputs.degraded), set(split.lr)
     train = [("train", i, "LR" if i in low else "HR") for i in sorted((*split.hr, *split.lr))]
     test = [("test", i, "HR") for i in (split.test or range(len(photos)))]
     original = [("original", i, "HR") for i in sorted(degraded)]
     registered = [entry for entry in (*train, *test, *original) if entry[1] in model.viewmats]
-    views, rates = [], []
+    views, rates, hidden = [], [], []
     for part, i, tag in progress(registered, "undistorting", "view"):
         kind, name = "lr" if part == "train" and i in degraded else "hr", photos.names[i]
         width, height = photos.size(kind, i)
         lens = model.lenses[i].resized(width, height)
         image, used = photos.undistorted(kind, i, lens)
+        if used is not None and not used.any():
+            hidden.append(f"{name} ({part})")
+            continue
         file = out / "images" / part / f"{name}.png"
         mask = None if used is None else out / "images" / f"{part}-masks" / f"{name}.png"
         images.save(file, image, durable=False)  # `freeze` syncs all
@@ -281,5 +288,6 @@ def _write_undistorted(
         views.append(View(name, file, part, tag, width, height, K, model.viewmats[i], 1.0, mask))
         rates.append(sampling.sampling_rate(K, depths[i]))
     rhos = sampling.relative_to_largest(rates)
+    notes = [f"views left out, whose masks leave no pixel: {listed(hidden)}"] if hidden else []
     views = [replace(view, rho=rho) for view, rho in zip(views, rhos, strict=True)]
-    return tuple(sorted(views, key=lambda view: (view.split, view.name)))
+    return tuple(sorted(views, key=lambda view: (view.split, view.name))), notes

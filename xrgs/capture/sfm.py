@@ -154,6 +154,44 @@ def reconstruct(
     return to_numpy(largest, index, report)
 
 
+def triangulate(
+    sfm_images: Sequence[SfmImage],
+    viewmats: Sequence[NDArray[np.float64]],
+    folder: Path,
+    work: Path,
+    conf: SfmConf,
+) -> Reconstruction:
+    """Find the points that images of known cameras and poses show, by exhaustive matching.
+
+    Args:
+        sfm_images: The images, each with `K` and a camera of its own.
+        viewmats: World to camera [4, 4] of each.
+        folder: The folder that `SfmImage.file` is relative to.
+        work: An existing folder for COLMAP's database and logs.
+        conf: The settings.
+    """
+    _log_to(work)
+    pycolmap.set_random_seed(conf.seed)
+    database, threads = work / "database.db", usable_cores()
+    max_features = features_per_image(len(sfm_images), conf.max_num_features)
+    longest = max(max(images.size(folder / image.file)) for image in sfm_images)
+    octave = first_octave(longest, conf.first_octave)
+    _extract(sfm_images, folder, database, max_features, octave, threads)
+    _match(sfm_images, database, work, threads)
+    index = {image.file: i for i, image in enumerate(sfm_images)}
+    posed = pycolmap.Reconstruction()
+    with pycolmap.Database.open(database) as opened:
+        for camera in opened.read_all_cameras():
+            posed.add_camera_with_trivial_rig(camera)
+        for image in opened.read_all_images():
+            pose = pycolmap.Rigid3d(viewmats[index[image.name]][:3])
+            posed.add_image_with_trivial_frame(image, pose)
+    options = mapping_options(conf, len(sfm_images), known=True)
+    options.num_threads = threads
+    model = pycolmap.triangulate_points(posed, database, folder, work, options=options)
+    return to_numpy(model, index, {"first_octave": octave, "max_num_features": max_features})
+
+
 def bogus_cameras(model: Any, sfm_images: Sequence[SfmImage]) -> dict[int, str]:
     """Find images whose camera is impossible, by COLMAP's own limits for its parameters.
 

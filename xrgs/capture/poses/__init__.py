@@ -17,6 +17,7 @@ import numpy as np
 
 from xrgs.capture.lens import Lens, quarter_turn
 from xrgs.capture.poses import colmap, transforms
+from xrgs.capture.poses.given import MIN_POINTS
 from xrgs.errors import UnreadableError, XrgsError
 from xrgs.runtime.text import listed
 from xrgs.safeio.files import is_transient, list_names
@@ -31,8 +32,6 @@ if TYPE_CHECKING:
     from xrgs.capture.photographs import PhotoCollection, Photograph
     from xrgs.capture.sfm import Reconstruction
 
-#: The fewest points: a Gaussian's first size is the distance of a point to its three nearest.
-_MIN_POINTS = 4
 #: The largest difference of the aspect ratios of an image and its photograph, which rounding of
 #: their sides to whole px explains.
 _MAX_ASPECT = 0.01
@@ -92,7 +91,7 @@ def read_poses(path: str, photos: PhotoCollection) -> Reconstruction:
     Raises:
         UnreadableError: A file can't be read now.
         XrgsError: The files are malformed, a camera model is not supported, no photograph has the
-            name of an image, or there are too few points.
+            name of an image, or there are too few points. No points at all are no error.
     """
     from xrgs.capture.sfm import Reconstruction
 
@@ -102,9 +101,9 @@ def read_poses(path: str, photos: PhotoCollection) -> Reconstruction:
         in_folder = [f"variant.poses: {root.name} is read"] if root != user_path(path) else []
         given = colmap.read(root) if root.is_dir() else transforms.read(root)
         points = given.points[np.isfinite(given.points).all(axis=1)]
-        if len(points) < max(_MIN_POINTS, len(given.points)):
+        if len(given.points) and len(points) < max(MIN_POINTS, len(given.points)):
             raise XrgsError(
-                f"{len(points)} of {len(given.points)} points are usable; at least {_MIN_POINTS} "
+                f"{len(points)} of {len(given.points)} points are usable; at least {MIN_POINTS} "
                 "points, all of them finite, are needed to begin training with"
             )
         found = match_names(given.names, [(photo.name, photo.path) for photo in photos.all])

@@ -38,7 +38,7 @@ _NOT_SERVED = re.compile(
 _KNOWN = {
     *("frames", "file_path", "transform_matrix", "ply_file_path", "camera_model", "is_fisheye"),
     *("w", "h", "cx", "cy", *_FOCAL, "applied_transform", "applied_scale", "aabb_scale"),
-    *("scale", "offset", "sharpness", "colmap_im_id"),
+    *("scale", "offset", "sharpness", "colmap_im_id", "rotation"),
 }
 
 
@@ -47,9 +47,10 @@ def files(file: Path) -> list[Path]:
 
     Raises:
         UnreadableError: The file can't be read now.
-        XrgsError: The file is malformed, or names no points.
+        XrgsError: The file is malformed.
     """
-    return [file, _points_file(file, _content(file))]
+    points = _points_file(file, _content(file))
+    return [file] if points is None else [file, points]
 
 
 def read(file: Path) -> GivenPoses:
@@ -62,8 +63,6 @@ def read(file: Path) -> GivenPoses:
     from xrgs.capture import colmap
 
     content = _content(file)
-    points_file = _points_file(file, content)
-    points, colors = colmap.read_points(points_file)
     frames = {frame["file_path"]: frame for frame in content["frames"]}
 
     def camera(name: str, stored: tuple[int, int]) -> tuple[Lens, NDArray[np.float64]]:
@@ -73,7 +72,11 @@ def read(file: Path) -> GivenPoses:
         except (ValueError, TypeError, OverflowError, XrgsError) as error:
             raise XrgsError(f"{file}: the camera of {name}: {error}") from error
 
-    notes = _notes(file, content)
+    notes, points_file = _notes(file, content), _points_file(file, content)
+    if points_file is None:
+        none = np.zeros((0, 3))
+        return GivenPoses(list(frames), camera, none, none.astype(np.uint8), notes=notes)
+    points, colors = colmap.read_points(points_file)
     if (colors == colmap.GREY).all():
         notes.append(f"{points_file.name} has no colours: the splats begin grey")
     return GivenPoses(list(frames), camera, points, colors, notes=notes)
@@ -101,14 +104,11 @@ def _content(file: Path) -> dict[str, Any]:
     return content
 
 
-def _points_file(file: Path, content: Mapping[str, Any]) -> Path:
-    """Return the .ply of points that a transforms.json names, which lies in or below its folder."""
+def _points_file(file: Path, content: Mapping[str, Any]) -> Path | None:
+    """Return the .ply of points that a transforms.json names, in or below its folder, or None."""
     name = content.get("ply_file_path")
     if name is None:
-        raise XrgsError(
-            f"{file}: it has no ply_file_path: training begins with points, so name a .ply of"
-            " coloured points there, as ns-process-data does (sparse_pc.ply)"
-        )
+        return None
     inside = str(PurePosixPath(name)) if isinstance(name, str) else ""
     if not is_inside(inside):
         raise XrgsError(f"{file}: ply_file_path must be a path below the folder of this file")
@@ -194,7 +194,7 @@ def _viewmat(rows: object) -> NDArray[np.float64]:
     # Rounded digits make a rotation that is not quite one: the nearest rotation is taken. A scale
     # of the camera's own axes changes no projection.
     U, stretch, Vt = np.linalg.svd(matrix[:3, :3])
-    if stretch[0] - stretch[2] > _MAX_SKEW * stretch[0] or np.linalg.det(U @ Vt) < 0:
+    if not stretch[2] > (1 - _MAX_SKEW) * stretch[0] or np.linalg.det(U @ Vt) < 0:
         raise ValueError("transform_matrix must be a rotation with a translation, not mirrored")
     pose = np.eye(4)
     pose[:3, :3], pose[:3, 3] = U @ Vt, matrix[:3, 3]
