@@ -50,6 +50,7 @@ ONLY_IN = {
     "tqdm": ("runtime/progress", "sweep/monitor"),
     "av": ("capture/scenes/video", "viewer/film"),
     "viser": ("viewer/live",),
+    "zstandard": ("splat/spz",),
     "tensorboard": ("sweep/track",),
     "mlflow": ("sweep/track",),
 }
