@@ -85,7 +85,7 @@ def write_spz(path: Path, gaussians: Gaussians, *, antialiased: bool = False) ->
         _to_bytes(shN * 128 + 128).tobytes(),
     ]
     with atomic_writer(path) as file:
-        file.write(gzip.compress(b"".join(content), mtime=0))
+        file.write(gzip.compress(b"".join(content), compresslevel=6, mtime=0))
 
 
 def _fraction_bits(largest: float) -> int:
