@@ -47,6 +47,14 @@ def _one_torch_thread() -> None:
 
 
 @pytest.fixture(scope="session", autouse=True)
+def _terminals_draw() -> Iterator[None]:
+    """Let the terminals of tests draw lines anew, also where the tests run in one that can't."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("TERM", "xterm")
+        yield
+
+
+@pytest.fixture(scope="session", autouse=True)
 def _default_signal_handlers() -> Iterator[None]:
     """Restore SIGINT and SIGHUP where they are ignored, as after a shell's `&`: tests send them."""
     ignored = [n for n in (signal.SIGINT, signal.SIGHUP) if signal.getsignal(n) is signal.SIG_IGN]

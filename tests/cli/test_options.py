@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import shutil
 import subprocess
 from collections.abc import Callable
@@ -47,25 +48,44 @@ def test_every_command_says_the_version_of_xrgs(call_command: RunCommand, comman
 
 
 @pytest.mark.parametrize(
-    ("words", "written"),
+    ("words", "options"),
     [
-        ("report out=FOLDER", "out=FOLDER: options are written --out FOLDER"),
-        ("report --store s scenes=a,b", "scenes=a,b: options are written --scenes a b"),
-        ("store rm dry_run=true", "dry_run=true: options are written --dry-run"),
-        ("data export 0123 format=colmap", "options are written --format colmap"),
-        ("data inspect scene=motorcycle out=a.png", "options are written --out a.png"),
-        ("bench against=PYTHON", "options are written --against PYTHON"),
+        ("report out=FOLDER", "report --out FOLDER"),
+        ("report store=s scenes=a,b", "report --store s --scenes a b"),
+        ("report store=a,b", "report --store a,b"),  # there is a folder of that name
+        ("store rm dry_run=true", "store rm --dry-run"),
+        ("store rm scenes=a 0123 yes=false store=gone", "store rm 0123 --scenes a --store gone"),
+        ("data export 0123 format=colmap", "data export 0123 --format colmap"),
+        ("data inspect scene=video out=a.png", "data inspect scene=video --out a.png"),
+        ("bench against=PYTHON repeats=0", "bench --against PYTHON --repeats 0"),
+        ("status stroe=s", "status --stroe s"),
     ],
 )
-def test_a_word_of_hydra_s_syntax_is_answered_with_the_option(
-    call_command: RunCommand, words: str, written: str
+def test_options_are_taken_in_hydra_s_syntax_too(
+    call_command: RunCommand, tmp_path: Path, words: str, options: str
 ) -> None:
-    command, *arguments = words.split()
-    code, out, err = call_command(command, *arguments)
-    assert (code, out) == (2, "")
-    assert err.startswith(f"xrgs-{command}: ")
-    assert err.endswith(f"{written}\n")
-    assert len(err.splitlines()) == 1
+    (tmp_path / "a,b").mkdir()
+    assert call_command(*words.split()) == call_command(*options.split())
+
+
+def test_a_current_folder_that_was_removed_is_named(
+    call_command: RunCommand, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def gone() -> Path:
+        raise FileNotFoundError(errno.ENOENT, "No such file or directory")
+
+    monkeypatch.setattr(Path, "cwd", gone)
+    code, _, err = call_command("status", "--store", str(tmp_path))
+    assert code == 1
+    assert err.startswith("xrgs-status: the current folder can't be found")
+
+
+def test_a_value_behind_an_option_may_have_an_equals_sign(
+    call_command: RunCommand, tmp_path: Path
+) -> None:
+    code, _, err = call_command("report", "--scenes", "a=b", "c=d", f"store={tmp_path / 'gone'}")
+    assert code == 1
+    assert "gone is not a store" in err
 
 
 @pytest.mark.parametrize(

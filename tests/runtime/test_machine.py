@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 import resource
 import subprocess
@@ -11,6 +12,7 @@ from pathlib import Path
 import pytest
 import torch
 
+from xrgs.runtime import machine
 from xrgs.runtime.machine import (
     peak_rss,
     set_passive_openmp_wait,
@@ -29,7 +31,79 @@ def test_the_cores_are_those_of_the_affinity() -> None:
         assert usable_cores() == 1
     finally:
         os.sched_setaffinity(0, allowed)
-    assert usable_cores() == len(allowed)
+    assert usable_cores() <= len(allowed)
+
+
+@pytest.mark.parametrize(("given", "cores"), [("1", 1), ("0", 1), ("default", None), ("", None)])
+def test_the_cores_are_at_most_those_that_python_is_told(
+    monkeypatch: pytest.MonkeyPatch, given: str, cores: int | None
+) -> None:
+    monkeypatch.delenv("PYTHON_CPU_COUNT", raising=False)
+    before = usable_cores()
+    monkeypatch.setenv("PYTHON_CPU_COUNT", given)
+    assert usable_cores() == (cores or before)
+
+
+def test_the_cores_are_at_most_the_quota_rounded_up(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv("PYTHON_CPU_COUNT", raising=False)
+    monkeypatch.setattr(os, "cpu_count", lambda: 64)
+    monkeypatch.setattr(os, "sched_getaffinity", lambda _: range(64), raising=False)
+    for quota, cores in ((math.inf, 64), (2.5, 3), (2.0, 2), (0.1, 1), (100.0, 64)):
+        monkeypatch.setattr(machine, "cpu_quota", lambda quota=quota: quota)
+        assert usable_cores() == cores
+
+
+#: What control groups say, by version and place: the file `/proc/self/cgroup`, the other files
+#: below `/sys/fs/cgroup`, and the quota.
+GROUPS = {
+    "a container of version 2": ("0::/", {"cpu.max": "150000 100000"}, 1.5),
+    "no quota": ("0::/", {"cpu.max": "max 100000"}, math.inf),
+    "a quota above": (
+        "0::/user/job/step",
+        {"user/cpu.max": "200000 100000", "user/job/cpu.max": "max 100000"},
+        2.0,
+    ),
+    "the least of several": (
+        "0::/user/job",
+        {"user/cpu.max": "400000 100000", "user/job/cpu.max": "50000 100000"},
+        0.5,
+    ),
+    "a container of version 1": (
+        "4:cpu,cpuacct:/docker/abc\n2:memory:/docker/abc",
+        {"cpu,cpuacct/cpu.cfs_quota_us": "300000", "cpu,cpuacct/cpu.cfs_period_us": "100000"},
+        3.0,
+    ),
+    "a group of version 1": (
+        "1:cpu:/a/b:c",
+        {"cpu/a/b:c/cpu.cfs_quota_us": "25000", "cpu/a/b:c/cpu.cfs_period_us": "50000"},
+        0.5,
+    ),
+    "version 1 without a quota": (
+        "1:cpu:/",
+        {"cpu/cpu.cfs_quota_us": "-1", "cpu/cpu.cfs_period_us": "100000"},
+        math.inf,
+    ),
+    "both versions": (
+        "1:cpu:/x\n0::/y",
+        {"cpu/x/cpu.cfs_quota_us": "100000", "cpu/x/cpu.cfs_period_us": "100000"},
+        1.0,
+    ),
+    "another controller": ("1:cpuset:/", {"cpuset/cpu.max": "100000 100000"}, math.inf),
+    "a group outside of the container": ("0::/../other", {"cpu.max": "100000 100000"}, 1.0),
+    "not Linux": (None, {}, math.inf),
+}
+
+
+@pytest.mark.parametrize("case", GROUPS)
+def test_the_quota_is_the_least_of_the_control_groups(tmp_path: Path, case: str) -> None:
+    own, files, quota = GROUPS[case]
+    if own is not None:
+        files = {f"sys/fs/cgroup/{name}": text for name, text in files.items()}
+        files["proc/self/cgroup"] = own
+    for name, text in files.items():
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / name).write_text(f"{text}\n")
+    assert machine.cpu_quota(tmp_path) == quota
 
 
 def test_torch_gets_the_threads_or_every_usable_core() -> None:

@@ -1,4 +1,4 @@
-"""Printing to a closed terminal, a pipe without a reader and a full disk."""
+"""Printing to a closed terminal, a pipe without a reader, a full disk, and no stream at all."""
 
 from __future__ import annotations
 
@@ -18,9 +18,9 @@ from xrgs.runtime.streams import say
 _SCRIPT = """
 import sys
 from pathlib import Path
-if sys.argv[1] == "ignore":
-    from xrgs.runtime.streams import ignore_broken_pipe
-    ignore_broken_pipe()
+if sys.argv[1] == "guard":
+    from xrgs.runtime.streams import guard_streams
+    guard_streams()
 for stream in (sys.stdout, sys.stderr):
     print("text", file=stream, flush=True)
 Path("done").write_text(f"{sys.stdout.isatty()} {sys.stdout.encoding}")
@@ -50,7 +50,7 @@ def _full_disk() -> Iterator[int]:
 
 
 @pytest.mark.parametrize("gone", [_terminal, _pipe, _full_disk])
-@pytest.mark.parametrize("how", ["ignore", "default"])
+@pytest.mark.parametrize("how", ["guard", "default"])
 def test_the_work_goes_on_without_a_reader(
     tmp_path: Path, gone: Callable[[], AbstractContextManager[int]], how: str
 ) -> None:
@@ -62,13 +62,71 @@ def test_the_work_goes_on_without_a_reader(
             stderr=descriptor,
             check=False,
         )
-    assert (done.returncode == 0) == (how == "ignore")
-    assert (tmp_path / "done").exists() == (how == "ignore")
+    assert (done.returncode == 0) == (how == "guard")
+    assert (tmp_path / "done").exists() == (how == "guard")
+
+
+@pytest.mark.parametrize("closed", [(0,), (1,), (2,), (0, 1, 2)])
+def test_a_file_never_gets_the_text_for_a_closed_stream(
+    tmp_path: Path, closed: tuple[int, ...]
+) -> None:
+    script = """
+import os, sys
+from xrgs.runtime.streams import guard_streams, say
+guard_streams()
+with open("file", "w") as file:
+    for stream in (sys.stdout, sys.stderr):
+        say("text", stream)
+    os.system("echo of a child; echo of a child >&2")  # as a library prints
+    file.write(f"{sys.stdin.isatty()} {sys.stdin.read()!r}")
+"""
+
+    def close() -> None:
+        for descriptor in closed:
+            os.close(descriptor)
+
+    done = subprocess.run(
+        [sys.executable, "-c", script],
+        cwd=tmp_path,
+        stdin=subprocess.DEVNULL,
+        capture_output=True,
+        text=True,
+        check=True,
+        preexec_fn=close,
+    )
+    assert (tmp_path / "file").read_text() == "False ''"
+    said = "text\nof a child\n"
+    assert (done.stdout, done.stderr) == ("" if 1 in closed else said, "" if 2 in closed else said)
+
+
+def test_text_is_printed_whatever_the_encoding_of_the_stream(tmp_path: Path) -> None:
+    script = (
+        "import sys\n"
+        "from xrgs.runtime.streams import guard_streams\n"
+        "guard_streams()\n"
+        "print('é ┃')\n"  # as help and bars, which do not go through `say`
+        "print('é ┃', file=sys.stderr)\n"
+    )
+    environment = os.environ | {"PYTHONIOENCODING": "ascii:strict"}
+    command = [sys.executable, "-c", script]
+    done = subprocess.run(command, capture_output=True, env=environment, check=True)
+    assert done.stdout == done.stderr == b"\\xe9 \\u2503\n"
+
+
+def test_a_terminal_that_draws_over_nothing_gets_lines(monkeypatch: pytest.MonkeyPatch) -> None:
+    class Terminal(io.StringIO):
+        def isatty(self) -> bool:
+            return True
+
+    for term, said in (("xterm", "\r\x1b[Ka\n"), ("dumb", "a\n")):
+        monkeypatch.setenv("TERM", term)
+        say("a", terminal := Terminal())
+        assert terminal.getvalue() == said
 
 
 def test_output_with_a_reader_is_complete(tmp_path: Path) -> None:
     done = subprocess.run(
-        [sys.executable, "-c", _SCRIPT, "ignore"],
+        [sys.executable, "-c", _SCRIPT, "guard"],
         cwd=tmp_path,
         capture_output=True,
         text=True,

@@ -16,16 +16,24 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from xrgs.capture import images, poses, registration, sampling
+from xrgs.capture import images, poses, registration, sampling, triangulation
 from xrgs.capture.alignment import pose_error
 from xrgs.capture.degradations import resolve_degradation
-from xrgs.capture.lens import undistort
+from xrgs.capture.lens import Lens
 from xrgs.capture.photographs import PhotoCollection, prepare_hr_views, write_degraded
 from xrgs.capture.registration import Registration
-from xrgs.capture.split import Split, check_variant_conf, split_views
+from xrgs.capture.split import (
+    Split,
+    check_variant_conf,
+    shortage,
+    split_before_sfm,
+    split_by_score,
+    split_notes,
+)
 from xrgs.capture.tags import POLICIES
 from xrgs.capture.views import SceneFailed, Variant, View
 from xrgs.runtime.progress import progress
+from xrgs.runtime.text import listed
 from xrgs.safeio.atomic import write_text
 
 if TYPE_CHECKING:
@@ -72,7 +80,8 @@ def mix_resolutions(scene: Scene, conf: VariantConf, work: Path, out: Path) -> V
     check_variant_conf(conf)
     start = time.perf_counter()
     photos = prepare_hr_views(scene, conf, work)
-    inputs = _Inputs(scene, conf, photos, _split_before_sfm(photos, conf))
+    sizes = [photo.size for photo in photos.all]
+    inputs = _Inputs(scene, conf, photos, split_before_sfm(photos.names, sizes, conf))
     write_degraded(photos, inputs.degraded, conf)
     registered = _register(inputs, work)
     model = registered.model
@@ -83,11 +92,12 @@ def mix_resolutions(scene: Scene, conf: VariantConf, work: Path, out: Path) -> V
     report |= _pose_report(inputs, model, work)
     depths = sampling.median_depths(model)
     if conf.tags in POLICIES and POLICIES[conf.tags].needs_depth:
-        inputs = replace(inputs, split=_split_by_score(photos, conf, model, depths))
+        inputs = replace(inputs, split=_split_by_depth(photos, conf, model, depths))
         write_degraded(photos, inputs.degraded, conf)
-    views = _write_undistorted(inputs, model, depths, out)
-    tags = _tags_report(inputs, views)
-    report |= tags | {"notes": [*report["notes"], *tags["notes"]]}
+    views, hidden = _write_undistorted(inputs, model, depths, out)
+    tags, masked = _tags_report(inputs, views), _mask_report(views)
+    notes = [*report["notes"], *tags["notes"], *hidden, *masked["notes"]]
+    report |= tags | masked | {"notes": notes}
     for note in report["notes"]:
         _log.warning("scene %s: %s", scene.name, note)
     report["seconds"] = round(time.perf_counter() - start, 1)
@@ -102,48 +112,31 @@ def _register(inputs: _Inputs, work: Path) -> Registration:
     photos, conf = inputs.photos, inputs.conf
     if conf.poses is not None:
         model = poses.read_poses(conf.poses, photos)
+        if not len(model.points):
+            model = triangulation.with_points(model, photos, inputs.degraded, conf.sfm, work)
         return Registration(model, _refusal(inputs, model), [])
     return registration.register(
         photos, inputs.degraded, conf.sfm, work, lambda model: _refusal(inputs, model)
     )
 
 
-def _split_before_sfm(photos: PhotoCollection, conf: VariantConf) -> Split:
-    """Split the views; where the tags depend on depth, all training views are HR for now."""
-    if conf.tags not in POLICIES:
-        return split_views(photos.names, conf)
-    if POLICIES[conf.tags].needs_depth:
-        return split_views(photos.names, replace(conf, hr_fraction=1.0))
-    return _split_by_score(photos, conf)
-
-
-def _split_by_score(
-    photos: PhotoCollection,
-    conf: VariantConf,
-    model: Reconstruction | None = None,
-    depths: Mapping[int, float] | None = None,
+def _split_by_depth(
+    photos: PhotoCollection, conf: VariantConf, model: Reconstruction, depths: Mapping[int, float]
 ) -> Split:
     """Split the views by the scores of `variant.tags`, as far as they are registered."""
-    unknown, lenses = np.full((3, 3), np.nan), model.lenses if model else {}
-    scores = [
-        POLICIES[conf.tags].score(
-            sampling.Measures(
-                photo.size,
-                lenses[i].undistorted().K if i in lenses else unknown,
-                depths[i] if depths and i in depths else float("nan"),
-            )
-        )
-        for i, photo in enumerate(photos.all)
+    measures = [
+        replace(measured, K=model.lenses[i].undistorted().K, depth=depths.get(i, measured.depth))
+        if i in model.lenses
+        else measured
+        for i, measured in enumerate(sampling.not_placed(photo.size) for photo in photos.all)
     ]
-    return split_views(photos.names, conf, sampling.relative_to_largest(scores))
+    return split_by_score(photos.names, measures, conf)
 
 
 def _refusal(inputs: _Inputs, model: Reconstruction) -> str:
     """Say why too few views are registered to train and to test on; empty where they are enough."""
     split, names, conf = inputs.split, inputs.photos.names, inputs.conf
     registered = model.viewmats.keys()
-    hr, lr = registered & set(split.hr), registered & set(split.lr)
-    tests = registered & set(split.test) if conf.test or split.test else registered
     missing = [name for i, name in enumerate(names) if i not in registered]
     source = "COLMAP registered" if conf.poses is None else "variant.poses has"
     summary = f"{source} {len(registered)} of {len(names)} views"
@@ -153,11 +146,8 @@ def _refusal(inputs: _Inputs, model: Reconstruction) -> str:
     fraction = conf.sfm.min_registered
     if len(registered) < fraction * len(names):
         return f"{summary}; variant.sfm.min_registered={fraction} requires more."
-    class_lost = (split.hr and not hr) or (split.lr and not lr)
-    if class_lost or len(hr) + len(lr) < 2 or not tests:
-        counts = f"{len(hr)} HR, {len(lr)} LR and {len(tests)} test views"
-        return f"{summary}: {counts}; at least one of each class and two training views are needed."
-    return ""
+    lacking = shortage(split, registered, conf)
+    return f"{summary}: {lacking}." if lacking else ""
 
 
 def _write_log(work: Path, out: Path) -> None:
@@ -178,8 +168,16 @@ def _sfm_report(inputs: _Inputs, model: Reconstruction) -> dict[str, Any]:
         "cameras": len({photo.camera for photo in photos.all}),
         "notes": [*scene.notes, *photos.notes, *model.report.get("notes", ())],
         "not_registered": [n for i, n in enumerate(photos.names) if i not in model.viewmats],
-        "lenses": [asdict(lens) for lens in sorted(set(model.lenses.values()), key=repr)],
+        "lenses": _lens_report(photos, model),
     }
+
+
+def _lens_report(photos: PhotoCollection, model: Reconstruction) -> list[dict[str, Any]]:
+    """Report each camera once, with the names of its photographs."""
+    names: dict[Lens, list[str]] = {}
+    for i, lens in sorted(model.lenses.items()):
+        names.setdefault(lens, []).append(photos.names[i])
+    return [{"lens": asdict(lens), "views": views} for lens, views in names.items()]
 
 
 def _pose_report(inputs: _Inputs, model: Reconstruction, work: Path) -> dict[str, Any]:
@@ -212,7 +210,7 @@ def _tags_report(inputs: _Inputs, views: tuple[View, ...]) -> dict[str, Any]:
         for tag in ("HR", "LR")
     }
     return {
-        "notes": _split_notes(inputs, rates),
+        "notes": [*split_notes(split, inputs.conf), *_class_notes(inputs, rates)],
         "tags": inputs.conf.tags,
         "degradation": resolve_degradation(inputs.conf),
         "tests": len(split.test),
@@ -226,7 +224,7 @@ def _tags_report(inputs: _Inputs, views: tuple[View, ...]) -> dict[str, Any]:
     }
 
 
-def _split_notes(inputs: _Inputs, rates: Mapping[str, list[float]]) -> list[str]:
+def _class_notes(inputs: _Inputs, rates: Mapping[str, list[float]]) -> list[str]:
     """Say where photographs that are not degraded differ too little to be told HR and LR."""
     if inputs.degraded or not rates["HR"] or not rates["LR"]:
         return []
@@ -241,26 +239,54 @@ def _split_notes(inputs: _Inputs, rates: Mapping[str, list[float]]) -> list[str]
     ]
 
 
+def _mask_report(views: tuple[View, ...]) -> dict[str, Any]:
+    """Report the share of the pixels of each class that masks hide."""
+    shares = {}
+    for kind, split, tag in (("HR", "train", "HR"), ("LR", "train", "LR"), ("test", "test", "HR")):
+        of_kind = [view for view in views if (view.split, view.tag) == (split, tag)]
+        hidden = [
+            np.count_nonzero(~images.read_mask(view.mask, (view.width, view.height)))
+            for view in of_kind
+            if view.mask is not None
+        ]
+        if hidden:
+            pixels = sum(view.width * view.height for view in of_kind)
+            shares[kind] = float(sum(hidden) / pixels)
+    said = ", ".join(f"{100 * share:.3g} % of {kind} views" for kind, share in shares.items())
+    return {
+        "masked": shares,
+        "notes": [f"masks hide so much of the pixels: {said}"] if said else [],
+    }
+
+
 def _write_undistorted(
     inputs: _Inputs, model: Reconstruction, depths: Mapping[int, float], out: Path
-) -> tuple[View, ...]:
-    """Undistort every registered view at its own size, and write it."""
+) -> tuple[tuple[View, ...], list[str]]:
+    """Undistort every registered view at its own size, and write it; say which are left out."""
     photos, split = inputs.photos, inputs.split
     degraded, low = set(inputs.degraded), set(split.lr)
     train = [("train", i, "LR" if i in low else "HR") for i in sorted((*split.hr, *split.lr))]
     test = [("test", i, "HR") for i in (split.test or range(len(photos)))]
     original = [("original", i, "HR") for i in sorted(degraded)]
     registered = [entry for entry in (*train, *test, *original) if entry[1] in model.viewmats]
-    views, rates = [], []
+    views, rates, hidden = [], [], []
     for part, i, tag in progress(registered, "undistorting", "view"):
-        image = photos.read("lr" if part == "train" and i in degraded else "hr", i)
-        height, width = image.shape[:2]
+        kind, name = "lr" if part == "train" and i in degraded else "hr", photos.names[i]
+        width, height = photos.size(kind, i)
         lens = model.lenses[i].resized(width, height)
-        file = out / "images" / part / f"{photos.names[i]}.png"
-        images.save(file, undistort(image, lens), durable=False)  # `freeze` syncs all
-        K, name = lens.undistorted().K, photos.names[i]
-        views.append(View(name, file, part, tag, width, height, K, model.viewmats[i], 1.0))
+        image, used = photos.undistorted(kind, i, lens)
+        if used is not None and not used.any():
+            hidden.append(f"{name} ({part})")
+            continue
+        file = out / "images" / part / f"{name}.png"
+        mask = None if used is None else out / "images" / f"{part}-masks" / f"{name}.png"
+        images.save(file, image, durable=False)  # `freeze` syncs all
+        if used is not None and mask is not None:
+            images.save_mask(mask, used, durable=False)
+        K = lens.undistorted().K
+        views.append(View(name, file, part, tag, width, height, K, model.viewmats[i], 1.0, mask))
         rates.append(sampling.sampling_rate(K, depths[i]))
     rhos = sampling.relative_to_largest(rates)
+    notes = [f"views left out, whose masks leave no pixel: {listed(hidden)}"] if hidden else []
     views = [replace(view, rho=rho) for view, rho in zip(views, rhos, strict=True)]
-    return tuple(sorted(views, key=lambda view: (view.split, view.name)))
+    return tuple(sorted(views, key=lambda view: (view.split, view.name))), notes

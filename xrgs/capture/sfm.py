@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 
 from xrgs.capture import images
 from xrgs.capture.lens import Lens, lens_of_model
+from xrgs.capture.masks import MASKS
 from xrgs.runtime.machine import usable_cores
 from xrgs.runtime.progress import ProgressBar
 from xrgs.safeio.sanitize import for_line
@@ -54,6 +55,8 @@ class SfmImage:
     K: NDArray[np.float64] | None = None
     """Intrinsics [3, 3], px, where they are known: then there is no distortion, and they are not
     refined."""
+    masked: bool = False
+    """Whether it has a mask, `xrgs.capture.masks.copy_mask` of its file: no features outside."""
 
 
 @dataclass(frozen=True)
@@ -149,6 +152,44 @@ def reconstruct(
     return to_numpy(largest, index, report)
 
 
+def triangulate(
+    sfm_images: Sequence[SfmImage],
+    viewmats: Sequence[NDArray[np.float64]],
+    folder: Path,
+    work: Path,
+    conf: SfmConf,
+) -> Reconstruction:
+    """Find the points that images of known cameras and poses show, by exhaustive matching.
+
+    Args:
+        sfm_images: The images, each with `K` and a camera of its own.
+        viewmats: World to camera [4, 4] of each.
+        folder: The folder that `SfmImage.file` is relative to.
+        work: An existing folder for COLMAP's database and logs.
+        conf: The settings.
+    """
+    _log_to(work)
+    pycolmap.set_random_seed(conf.seed)
+    database, threads = work / "database.db", usable_cores()
+    max_features = features_per_image(len(sfm_images), conf.max_num_features)
+    longest = max(max(images.size(folder / image.file)) for image in sfm_images)
+    octave = first_octave(longest, conf.first_octave)
+    _extract(sfm_images, folder, database, max_features, octave, threads)
+    _match(sfm_images, database, work, threads)
+    index = {image.file: i for i, image in enumerate(sfm_images)}
+    posed = pycolmap.Reconstruction()
+    with pycolmap.Database.open(database) as opened:
+        for camera in opened.read_all_cameras():
+            posed.add_camera_with_trivial_rig(camera)
+        for image in opened.read_all_images():
+            pose = pycolmap.Rigid3d(viewmats[index[image.name]][:3])
+            posed.add_image_with_trivial_frame(image, pose)
+    options = mapping_options(conf, len(sfm_images), known=True)
+    options.num_threads = threads
+    model = pycolmap.triangulate_points(posed, database, folder, work, options=options)
+    return to_numpy(model, index, {"first_octave": octave, "max_num_features": max_features})
+
+
 def bogus_cameras(model: Any, sfm_images: Sequence[SfmImage]) -> dict[str, str]:
     """Find images whose camera is impossible, by COLMAP's own limits for its parameters.
 
@@ -203,6 +244,8 @@ def _extract(
     with ProgressBar("SfM: features", "view", len(sfm_images)) as bar:
         for camera, batch in _batches(sfm_images, 2 * threads):
             reader = pycolmap.ImageReaderOptions()
+            if batch[0].masked:  # COLMAP drops an image whose mask it does not find
+                reader.mask_path = folder / MASKS
             if camera in cameras:
                 reader.existing_camera_id = cameras[camera]
             elif batch[0].K is not None:
@@ -225,11 +268,14 @@ def _extract(
 
 
 def _batches(sfm_images: Sequence[SfmImage], size: int) -> Iterator[tuple[str, list[SfmImage]]]:
-    """Yield images of one camera, a few at a time, so that progress can be shown in between."""
-    cameras: dict[str, list[SfmImage]] = {}
+    """Yield images of one camera, a few at a time, so that progress can be shown in between.
+
+    Either all or none of them have masks.
+    """
+    groups: dict[tuple[str, bool], list[SfmImage]] = {}
     for image in sfm_images:
-        cameras.setdefault(image.camera, []).append(image)
-    for camera, group in cameras.items():
+        groups.setdefault((image.camera, image.masked), []).append(image)
+    for (camera, _), group in groups.items():
         for start in range(0, len(group), size):
             yield camera, group[start : start + size]
 

@@ -7,23 +7,25 @@ docstrings. `xrgs-sweep` takes Hydra's overrides instead, see `hydra_words`.
 from __future__ import annotations
 
 import inspect
+import os
 import re
-import shlex
 import sys
 from contextlib import contextmanager
+from dataclasses import fields, is_dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, TypeAlias
+from typing import TYPE_CHECKING, Annotated, TypeAlias, get_type_hints
 
 import tyro
 from tyro.conf import CascadeSubcommandArgs, DisallowNone, FlagCreatePairsOff, OmitArgPrefixes, arg
 
 import xrgs
 from xrgs.errors import XrgsError
-from xrgs.runtime.streams import ignore_broken_pipe, say
+from xrgs.runtime.streams import guard_streams, say
+from xrgs.safeio.paths import user_path
 from xrgs.safeio.sanitize import for_line
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator, Mapping
+    from collections.abc import Callable, Container, Iterator, Mapping, Sequence
 
 STORE = Path("xrgs-store")
 
@@ -67,19 +69,22 @@ def run(
     Raises:
         SystemExit: With code 1 on an `XrgsError`, and with code 2 on wrong usage.
     """
+    guard_streams()
     answer_version(command)
     # Of a subcommand with overrides, `out` alone is an option that is no key of Hydra's config.
     name = "out" if sys.argv[1:2] == [overrides] else "[a-z][a-z_]*"
     assignment = re.compile(f"({name})=(.*)", re.DOTALL)
+    functions = [target] if callable(target) else target.values()
+    known = frozenset(name for function in functions for name in _names(function))
+    words = _with_options(sys.argv[1:], assignment, known)
     with errors_as_messages(command, assignment):
-        _refuse_assignments(command, assignment)
         if callable(target):
-            tyro.cli(_unwrapped(target), prog=command, config=_CONFIG)
+            tyro.cli(_unwrapped(target), prog=command, args=words, config=_CONFIG)
             return
         app = tyro.extras.SubcommandApp()
         for name, function in target.items():
             app.command(name=name, is_default=name == default)(_unwrapped(function))
-        app.cli(prog=command, description=description, config=_CONFIG)
+        app.cli(prog=command, description=description, args=words, config=_CONFIG)
 
 
 def _unwrapped(function: Callable[..., None]) -> Callable[..., None]:
@@ -88,14 +93,37 @@ def _unwrapped(function: Callable[..., None]) -> Callable[..., None]:
     return function
 
 
-def _refuse_assignments(command: str, assignment: re.Pattern[str]) -> None:
-    """End a command that was given `KEY=VALUE`, and say how its options are written."""
-    for word in sys.argv[1:]:
-        if found := assignment.fullmatch(word):
-            values = [] if found[2] == "true" else found[2].split(",")
-            written = shlex.join([_option(found[1]), *values])
-            say(for_line(f"{command}: {word}: options are written {written}"), sys.stderr)
-            sys.exit(2)  # as tyro and argparse end
+def _names(function: Callable[..., None]) -> Iterator[str]:
+    """Yield the names of a function's options, those of its dataclasses among them."""
+    for name, hint in get_type_hints(function, include_extras=True).items():
+        if is_dataclass(hint):
+            yield from (field.name for field in fields(hint))
+        given = (getattr(mark, "name", None) for mark in getattr(hint, "__metadata__", ()))
+        yield next(filter(None, given), name)
+
+
+def _with_options(
+    words: Sequence[str], assignment: re.Pattern[str], known: Container[str]
+) -> list[str]:
+    """Return a command line with each `KEY=VALUE`, as `xrgs-sweep` takes it, as an option.
+
+    `true` sets a flag. Commas separate values, unless there is a file of that name. Behind an
+    option, a word whose key is not known is a value, as the name of the scene `a=b`.
+    """
+    others, options = [], []  # options come last: one of several values ends where another begins
+    for number, word in enumerate(words):
+        found = assignment.fullmatch(word)
+        is_value = found and found[1] not in known and any(w[:2] == "--" for w in words[:number])
+        if not found or is_value:
+            others.append(word)
+            continue
+        option, value = _option(found[1]), found[2]
+        if value == "true":
+            options.append(option)
+        elif value != "false":
+            is_file = os.access(user_path(value), os.F_OK)
+            options += [option, *([value] if is_file else value.split(","))]
+    return others + options
 
 
 def _option(name: str) -> str:
@@ -106,8 +134,6 @@ def _option(name: str) -> str:
 def errors_as_messages(command: str, argument: re.Pattern[str] | None = None) -> Iterator[None]:
     """End the command with a message and code 1 on errors that the user can correct.
 
-    A reader of its output that ends first, as `head` does, is no error.
-
     Args:
         command: Name of the command, which begins the message.
         argument: Finds the name and the rest of a message about a function's argument, as
@@ -116,14 +142,21 @@ def errors_as_messages(command: str, argument: re.Pattern[str] | None = None) ->
     Raises:
         SystemExit: With the message, in place of the error.
     """
-    ignore_broken_pipe()
     try:
+        _check_current_folder()
         yield
     except XrgsError as error:
         message = str(error)
         if argument and (found := argument.fullmatch(message)):
             message = f"{_option(found[1])} {found[2]}"
         sys.exit(for_line(f"{command}: {message}"))
+
+
+def _check_current_folder() -> None:
+    try:
+        Path.cwd()
+    except OSError as error:
+        raise XrgsError(f"the current folder can't be found ({error}): cd to another") from error
 
 
 def answer_version(command: str) -> None:

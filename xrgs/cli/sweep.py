@@ -20,7 +20,7 @@ from xrgs.cli.key_help import explain
 from xrgs.cli.options import answer_version, errors_as_messages
 from xrgs.composing import escape_interpolations
 from xrgs.runtime.signals import exit_on_signal
-from xrgs.runtime.streams import ignore_broken_pipe, say
+from xrgs.runtime.streams import guard_streams, say
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
@@ -96,12 +96,12 @@ def _run_job(cfg: DictConfig) -> str:
 
 def main() -> None:
     """Run `xrgs-sweep [+ablation=NAME] [KEY=VALUE[,VALUE]...]...`."""
+    guard_streams()
     arguments = sys.argv[1:]
     if {"-h", "--help"} & set(arguments):  # Hydra's own help takes seconds to list its groups
         groups = ("ablation", "scene", "preset", "sweeps")
         say(_HELP.format(**{group: ", ".join(files(group)) for group in groups}).rstrip())
         return
-    ignore_broken_pipe()
     answer_version("xrgs-sweep")
     if len(arguments) == 1 and arguments[0].startswith("help="):
         with errors_as_messages("xrgs-sweep"):

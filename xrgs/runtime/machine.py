@@ -2,18 +2,76 @@
 
 from __future__ import annotations
 
+import math
 import os
 import resource
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
+from pathlib import Path, PurePosixPath
 
 
 def usable_cores() -> int:
-    """Count the cores that this process may run on: its CPU affinity, if the system has that."""
+    """Count the cores that this process may use, at least one.
+
+    It is the least of the CPU affinity, the CPU quota of the container, rounded up, and the number
+    that PYTHON_CPU_COUNT gives.
+    """
+    counts: list[float] = [os.cpu_count() or 1, cpu_quota()]
     if hasattr(os, "sched_getaffinity"):
-        return len(os.sched_getaffinity(0))
-    return os.cpu_count() or 1
+        counts.append(len(os.sched_getaffinity(0)))
+    if (given := os.environ.get("PYTHON_CPU_COUNT", "")).isdecimal():
+        counts.append(int(given))
+    return max(1, math.ceil(min(counts)))
+
+
+def cpu_quota(root: Path = Path("/")) -> float:
+    """Return the CPU quota of this process's control groups, in cores; infinite without one.
+
+    Args:
+        root: The root of the file system.
+    """
+    quotas = [math.inf]
+    for folder in _control_groups(root, "cpu"):
+        # Version 2 writes `max` for no quota, version 1 writes -1.
+        both = _words(folder / "cpu.max") or (
+            _words(folder / "cpu.cfs_quota_us") + _words(folder / "cpu.cfs_period_us")
+        )
+        if len(both) == 2 and all(word.isdecimal() for word in both):
+            quotas.append(int(both[0]) / int(both[1]))
+    return min(quotas)
+
+
+def _control_groups(root: Path, controller: str) -> Iterator[Path]:
+    """Yield the folders of the control groups of this process, each group before the one above it.
+
+    A limit of a group holds for all groups below it. Version 2 has one tree of groups, and version
+    1 has one for each controller; a machine can have both.
+    """
+    try:
+        lines = (root / "proc/self/cgroup").read_text(encoding="utf-8").splitlines()
+    except OSError:  # not Linux
+        return
+    for line in lines:
+        _, controllers, own = line.split(":", 2)
+        if not controllers:
+            mounts = ("", "unified")
+        elif controller in controllers.split(","):
+            mounts = (controllers, controller)
+        else:
+            continue
+        # In a container the group may have the path that it has outside: then no folder but the
+        # mount itself is there, and is the container's group.
+        for group in (PurePosixPath(own), *PurePosixPath(own).parents):
+            for mount in mounts:
+                yield root / "sys/fs/cgroup" / mount / group.relative_to("/")
+
+
+def _words(file: Path) -> list[str]:
+    try:
+        return file.read_text(encoding="ascii").split()
+    except OSError:
+        return []
 
 
 def peak_rss() -> int:

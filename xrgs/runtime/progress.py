@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Annotated, Any, TypeVar
 import msgspec
 from tqdm import tqdm
 
-from xrgs.runtime.streams import say
+from xrgs.runtime.streams import is_terminal, say
 from xrgs.runtime.text import format_duration
 from xrgs.safeio.atomic import write_json
 from xrgs.safeio.files import read_bytes
@@ -119,7 +119,7 @@ class ProgressBar(_Tqdm):
             done: How many were done before `items`.
         """
         self._file = _file.get()
-        self._drawn = self._file is None and sys.stderr.isatty()
+        self._drawn = self._file is None and is_terminal(sys.stderr)
         every, delay = (_BAR_S, _BAR_DELAY_S) if self._drawn else (_LINE_S, _LINE_S)
         super().__init__(
             items,

@@ -1,12 +1,14 @@
 """Writes text for people to stdout, stderr and logs: the only place of the package that prints.
 
-It keeps the program running when its terminal is closed or the reader of its pipe has ended.
+It keeps the program running when its terminal is closed, when the reader of its pipe has ended, and
+when it was started without streams.
 """
 
 from __future__ import annotations
 
 import io
 import logging
+import os
 import sys
 from contextlib import suppress
 from typing import TYPE_CHECKING
@@ -32,8 +34,13 @@ def say(text: str, stream: TextIO | None = None) -> None:
     stream = sys.stdout if stream is None else stream
     encoding = stream.encoding or "utf-8"  # a stream in memory has none
     text = for_terminal(text).encode(encoding, "backslashreplace").decode(encoding)
-    clear = "\r\x1b[K" if stream.isatty() else ""
+    clear = "\r\x1b[K" if is_terminal(stream) else ""
     print(f"{clear}{text}", file=stream, flush=True)
+
+
+def is_terminal(stream: TextIO) -> bool:
+    """Return whether a stream is a terminal that can draw over a line; TERM=dumb says it can't."""
+    return stream.isatty() and os.environ.get("TERM") != "dumb"
 
 
 def log_to_stderr(level: int = logging.WARNING) -> None:
@@ -63,23 +70,35 @@ class _WriteErrorsIgnored(io.FileIO):
         return memoryview(data).nbytes
 
 
-def ignore_broken_pipe() -> None:
-    """Make stdout and stderr ignore write errors from now on.
+def guard_streams() -> None:
+    """Give this process three standard streams, of which stdout and stderr never fail.
 
-    Text to a closed terminal, a pipe without a reader or a full disk is lost, and the work goes on.
+    A stream that was closed at the start, as below some daemons, becomes /dev/null. Text to a
+    closed terminal, a pipe without a reader or a full disk is lost, and the work goes on.
+
+    Every command calls this before it opens a file: a file gets the lowest free descriptor, and
+    what libraries print to a closed stdout would be written into it.
     """
-    for name in ("stdout", "stderr"):
+    for descriptor in range(3):
+        try:
+            os.fstat(descriptor)
+        except OSError:  # it is closed, so that the lowest free descriptor is this one
+            os.set_inheritable(os.open(os.devnull, os.O_RDWR), True)
+    if sys.stdin is None:
+        sys.stdin = io.TextIOWrapper(io.BufferedReader(io.FileIO(0, closefd=False)))
+    for descriptor, name in ((1, "stdout"), (2, "stderr")):
         stream = getattr(sys, name)
         # A stream that something else has put in the place of Python's own is left alone.
-        if stream is not None and stream is getattr(sys, f"__{name}__"):
-            setattr(sys, name, _without_write_errors(stream))
+        if stream is getattr(sys, f"__{name}__"):
+            encoding = "utf-8" if stream is None else stream.encoding
+            setattr(sys, name, _without_write_errors(descriptor, encoding))
 
 
-def _without_write_errors(stream: TextIO) -> TextIO:
-    raw = _WriteErrorsIgnored(stream.fileno(), "w", closefd=False)
+def _without_write_errors(descriptor: int, encoding: str) -> TextIO:
+    raw = _WriteErrorsIgnored(descriptor, "w", closefd=False)
     return io.TextIOWrapper(
         io.BufferedWriter(raw),
-        encoding=stream.encoding,
-        errors=stream.errors,
+        encoding=encoding,
+        errors="backslashreplace",  # help and bars have characters that ASCII lacks
         line_buffering=True,
     )

@@ -12,7 +12,8 @@ def user_path(text: str) -> Path:
         text: The path as it was typed.
 
     Returns:
-        The expanded path; the path as it stands where there is no user of that name.
+        The expanded path; the path as it stands where there is no user of that name, or no home
+        folder, as for a user of a container without HOME.
     """
     try:
         return Path(text).expanduser()

@@ -20,6 +20,7 @@ from tqdm import tqdm
 from xrgs.experiment.cell_folder import CellFolder
 from xrgs.runtime import progress
 from xrgs.runtime.progress import log_line
+from xrgs.runtime.streams import is_terminal
 from xrgs.runtime.text import format_duration
 from xrgs.safeio.files import list_names
 
@@ -321,7 +322,7 @@ class SweepMonitor:
                 pause = max(_POLL_S, _PAUSE_FACTOR * (time.monotonic() - start))
 
     def _show(self, snapshot: SweepSnapshot) -> None:
-        if sys.stderr.isatty():
+        if is_terminal(sys.stderr):
             self._draw(snapshot)
         elif snapshot.ended != self._shown or time.monotonic() - self._shown_at > _LINE_S:
             log_line(str(snapshot))

@@ -127,7 +127,8 @@ def test_redirects_are_followed_to_the_named_hosts_alone(
     server.answers = [f"HTTP/1.1 302 Found\r\nLocation: {elsewhere}\r\n\r\n".encode()]
     code, _, err = xrgs_data(*arguments)
     assert code == 1
-    assert "another host, which --redirect-hosts does not name" in err
+    assert "(another host)" in err
+    assert "--redirect-hosts" in err
     assert len(err.splitlines()) == 1
     server.answers = [f"HTTP/1.1 302 Found\r\nLocation: {elsewhere}\r\n\r\n".encode()]
     host = elsewhere.split("/")[2]

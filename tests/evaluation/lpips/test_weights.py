@@ -11,7 +11,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from xrgs.evaluation.lpips import weights
+from xrgs.errors import XrgsError
+from xrgs.evaluation.lpips import download, weights
 from xrgs.evaluation.lpips.weights import Weights, WeightsError
 from xrgs.experiment import provenance
 
@@ -162,6 +163,20 @@ def test_the_cache_is_where_the_system_says(monkeypatch: pytest.MonkeyPatch) -> 
     assert weights.cache_folder() == Path.home() / ".cache" / "xrgs"
     monkeypatch.setenv("XRGS_CACHE", "~/mine")
     assert weights.cache_folder() == Path.home() / "mine"
+
+
+def test_a_user_without_a_home_folder_has_no_weights_and_is_told_what_to_set(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    def no_home() -> Path:
+        raise RuntimeError("Could not determine home directory.")
+
+    for variable in ("XRGS_CACHE", "XDG_CACHE_HOME"):
+        monkeypatch.delenv(variable, raising=False)
+    monkeypatch.setattr(Path, "home", no_home)
+    assert weights.load_published() is None
+    with pytest.raises(XrgsError, match="set XRGS_CACHE"):
+        download.fetch_weights()
 
 
 def test_a_cells_provenance_has_the_hash_of_the_weights(nowhere: Path, known: Weights) -> None:

@@ -7,6 +7,7 @@ import faulthandler
 import json
 import os
 import signal
+import tempfile
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
@@ -81,6 +82,15 @@ def test_what_went_wrong_in_the_child_is_raised(
     assert type(caught.value) is error
 
 
+def test_a_machine_without_a_folder_for_temporary_files_is_told_what_to_set(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(tempfile, "tempdir", None)
+    monkeypatch.setattr(tempfile, "_candidate_tempdir_list", lambda: ["/gone"])
+    with pytest.raises(UnwritableError, match="set TMPDIR"):
+        run_in_child("cell", {"number": 1})
+
+
 @pytest.fixture
 def in_this_process(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
@@ -88,7 +98,7 @@ def in_this_process(
     """(work) -> the answer that the child's `main` writes when it does this work."""
     monkeypatch.setattr(supervise, "follow_parent", lambda: None)
     monkeypatch.setattr(processes, "offer_to_oom_killer", lambda: None)
-    for name in ("ignore_broken_pipe", "set_passive_openmp_wait"):
+    for name in ("guard_streams", "set_passive_openmp_wait"):
         monkeypatch.setattr(worker, name, lambda: None)
     monkeypatch.setattr(faulthandler, "enable", lambda: None)
 

@@ -38,6 +38,10 @@ class DownloadError(XrgsError):
     """A file can't be downloaded; the message names the address or the file."""
 
 
+class NotAllowedError(DownloadError):
+    """The server sends more bytes than the caller allows, or redirects to another host."""
+
+
 class _LostError(Exception):
     """This try failed, and another one may succeed."""
 
@@ -209,8 +213,8 @@ class _Download:
 
     def _check_size(self, size: int) -> None:
         if size > self._max_bytes:
-            most = f"{self._max_bytes} are allowed (xrgs-data download --max-bytes)"
-            raise DownloadError(f"{self._url}: {size} bytes or more; at most {most}")
+            most = f"at most {self._max_bytes} are allowed"
+            raise NotAllowedError(f"{self._url}: {size} bytes or more; {most}")
 
 
 class _RedirectHandler(HTTPRedirectHandler):
@@ -229,8 +233,8 @@ class _RedirectHandler(HTTPRedirectHandler):
         is_safe = target.scheme in ("https", urlsplit(req.full_url).scheme)
         hosts = [host.lower() for host in (urlsplit(self._url).netloc, *self._hosts)]
         if not is_safe or target.netloc.lower() not in hosts:
-            why = "another host, which --redirect-hosts does not name" if is_safe else "less safe"
+            why = "another host" if is_safe else "less safe"
             where = for_line(newurl, _MAX_WORDS)
             fp.close()
-            raise DownloadError(f"{self._url}: the redirect to {where} is not followed ({why})")
+            raise NotAllowedError(f"{self._url}: the redirect to {where} is not followed ({why})")
         return super().redirect_request(req, fp, code, msg, headers, newurl)

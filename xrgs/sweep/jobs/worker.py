@@ -25,7 +25,7 @@ from xrgs.experiment.cell_folder import LOG
 from xrgs.runtime import processes
 from xrgs.runtime.machine import set_passive_openmp_wait
 from xrgs.runtime.signals import StopRequest, StopSignal, end_by_sigterm
-from xrgs.runtime.streams import ignore_broken_pipe, log_to_stderr, say
+from xrgs.runtime.streams import guard_streams, log_to_stderr, say
 from xrgs.safeio.atomic import write_json
 from xrgs.safeio.records import read_struct
 from xrgs.sweep.jobs import supervise
@@ -114,7 +114,11 @@ def run_in_child(
         PassingError: The child could not read a file now.
         WorkerError: The work failed; the message is the reason.
     """
-    with tempfile.TemporaryDirectory(prefix="xrgs-") as name:
+    try:
+        temporary = tempfile.TemporaryDirectory(prefix="xrgs-")
+    except FileNotFoundError as error:  # /tmp can't be written, nor any other usual place
+        raise UnwritableError(f"{error.strerror}: set TMPDIR to a folder for them") from error
+    with temporary as name:
         files = Path(name)
         request_file, answer_file = files / "request.json", files / "answer.json"
         write_json(request_file, dict(request))
@@ -255,8 +259,8 @@ def main(job: str, request: str, answer: str) -> None:
         request: JSON file with the arguments.
         answer: File for the answer.
     """
+    guard_streams()
     faulthandler.enable()
-    ignore_broken_pipe()
     supervise.follow_parent()
     processes.offer_to_oom_killer()
     set_passive_openmp_wait()
