@@ -49,7 +49,7 @@ def with_points(
         image = undistort(images.resize(image, lens.width, lens.height), lens)
         file = f"{photos[i].number}.png"
         images.save(folder / file, image, durable=False)
-        given.append(sfm.SfmImage(file, photos[i].name, lens.undistorted().K))
+        given.append(sfm.SfmImage(file, photos[i].name, photos[i].name, lens.undistorted().K))
     found = sfm.triangulate(given, [model.viewmats[i] for i in order], folder, folder, conf)
     count = len(found.points)
     if count < MIN_POINTS:
