@@ -165,7 +165,7 @@ def test_cmyk_without_a_profile_is_said(tmp_path: Path, suffix: str) -> None:
     assert stored.mode == "CMYK"
     picture = images.decode(tmp_path / f"a.{suffix}")
     assert np.array_equal(np.round(picture.pixels * 255), np.asarray(stored.convert("RGB")))
-    assert picture.notes == ("CMYK without a profile converted",)
+    assert picture.notes == ("converted from CMYK without a profile",)
 
 
 def test_cmyk_of_16_bits_is_as_its_8_bits(tmp_path: Path) -> None:

@@ -122,7 +122,7 @@ def convert(
             return _to_float(converted), note
         return _to_float(_plain_rgb(samples)), note
     if samples.shape[2] == 4:
-        return _to_float(_plain_rgb(samples)), "CMYK without a profile converted"
+        return _to_float(_plain_rgb(samples)), "converted from CMYK without a profile"
     rgb = _to_float(_plain_rgb(samples))
     if encoding is None:
         return rgb, ""
@@ -130,7 +130,8 @@ def convert(
 
 
 def _to_float(samples: Samples) -> NDArray[np.float32]:
-    return samples.astype(np.float32) / np.float32(np.iinfo(samples.dtype).max)
+    most = np.float32(np.iinfo(samples.dtype).max)
+    return np.divide(samples, most, dtype=np.float32)
 
 
 def _plain_rgb(samples: Samples) -> Samples:
