@@ -24,8 +24,8 @@ Samples = NDArray[Any]
 
 _INTENT = ImageCms.Intent.RELATIVE_COLORIMETRIC
 _BLACK_POINT = ImageCms.Flags.BLACKPOINTCOMPENSATION
-#: Without it, LittleCMS interpolates all but 8 bits of a matrix or of grey between 33 values, and is
-#: wrong by up to 14 of 255 at the edges of the gamut. It takes ten times as long.
+#: Without it, LittleCMS interpolates between 33 values, and is wrong by up to 14 of 255 at
+#: the gamut's edges; not for 8 bits of a matrix or of grey. With it, it takes ten times as long.
 _EXACT = ImageCms.Flags.NOOPTIMIZE
 #: Pillow's mode of so many channels.
 _MODES = {1: "L", 3: "RGB", 4: "CMYK"}
@@ -139,10 +139,11 @@ def _to_float(samples: Samples) -> NDArray[np.float32]:
 
 def _plain_rgb(samples: Samples) -> Samples:
     """Convert grey and CMYK to RGB [H, W, 3] as Pillow does."""
-    if samples.shape[2] == 4:
-        white = np.iinfo(samples.dtype).max
-        light = (white - samples).astype(np.float64)
-        return np.round(light[..., :3] * light[..., 3:] / white).astype(samples.dtype)
+    if samples.shape[2] == 4 and samples.dtype == np.uint8:
+        return np.asarray(_image(samples, "CMYK").convert("RGB"))
+    if samples.shape[2] == 4:  # Pillow's formula
+        light = 1 - samples / 65535
+        return np.round(light[..., :3] * light[..., 3:] * 65535).astype(np.uint16)
     return np.broadcast_to(samples, (*samples.shape[:2], 3))
 
 
@@ -196,9 +197,12 @@ def _transform(profile: bytes, mode: str) -> tuple[Any, str]:
 
 
 def _applied(transform: Any, samples: Samples, mode: str) -> NDArray[np.uint8]:
+    return np.asarray(ImageCms.applyTransform(_image(samples, mode), transform))
+
+
+def _image(samples: Samples, mode: str) -> Image.Image:
     pixels = np.ascontiguousarray(samples[..., 0] if mode == "L" else samples)
-    image = Image.frombuffer(mode, (samples.shape[1], samples.shape[0]), pixels)
-    return np.asarray(ImageCms.applyTransform(image, transform))
+    return Image.frombuffer(mode, (samples.shape[1], samples.shape[0]), pixels)
 
 
 def _probe(mode: str) -> NDArray[np.uint8]:
