@@ -62,7 +62,7 @@ def reconstruction(
     inputs = []
     for file in rendered.files.values():
         shutil.copy(str(file), work / file.name)
-        inputs.append(SfmImage(file.name, "all"))
+        inputs.append(SfmImage(file.name, file.stem, "all"))
     return sfm.reconstruct(inputs, work, work, conf.sfm)
 
 
@@ -122,7 +122,7 @@ def test_by_sampling_rate_the_highest_are_hr_and_nothing_is_degraded(
     assert min(v.rho for v in high) >= max(v.rho for v in low)
     assert not of(made, "original", "HR")
     assert {(v.width, v.height) for v in made.views} == {(160, 120)}
-    assert given == [[f"hr/{i:05d}.png" for i in range(VIEWS)]]
+    assert given == [[f"sfm/{i:05d}.png" for i in range(VIEWS)]]
     assert made.report["degradation"] == "none"
     assert made.report["pose_error"] == {}
     assert made.report["rho"]["HR"][0] == min(v.rho for v in high)
@@ -222,12 +222,12 @@ def test_a_degradation_may_keep_the_size(mix: Mix, given: list[list[str]], how: 
         assert 0.005 < np.abs(before - after).mean() < 0.1
         assert view.rho == originals[view.name].rho  # px per unit; not what is in them
     low = {number(v) for v in of(made, "train", "LR")}
-    assert given[0] == [f"{'lr' if i in low else 'hr'}/{i:05d}.png" for i in range(VIEWS)]
+    assert given[0] == [f"{'sfm_lr' if i in low else 'sfm'}/{i:05d}.png" for i in range(VIEWS)]
 
 
 def test_views_tagged_after_sfm_can_be_degraded_after_it(mix: Mix, given: list[list[str]]) -> None:
     made = mix(tags="distance", degradation="downsample")
-    assert given == [[f"hr/{i:05d}.png" for i in range(VIEWS)]]
+    assert given == [[f"sfm/{i:05d}.png" for i in range(VIEWS)]]
     low = of(made, "train", "LR")
     assert {(v.width, v.height) for v in low} == {(32, 24)}
     assert [v.name for v in of(made, "original", "HR")] == [v.name for v in low]
@@ -242,8 +242,8 @@ def test_the_poses_are_compared_with_those_of_the_undegraded(
     made = mix()
     assert made.report["notes"] == []
     assert len(given) == 2
-    assert sum(file.startswith("up/") for file in given[0]) == len(of(made, "train", "LR"))
-    assert given[1] == [f"hr/{i:05d}.png" for i in range(VIEWS)]
+    assert sum(file.startswith("sfm_lr_up/") for file in given[0]) == len(of(made, "train", "LR"))
+    assert given[1] == [f"sfm/{i:05d}.png" for i in range(VIEWS)]
     assert made.report["pose_error"]["position_percent"] == pytest.approx(0, abs=1e-6)
     assert made.report["pose_error_against"] == "SfM of the undegraded photographs"
     assert made.report["reference"]["registered"] == VIEWS

@@ -71,7 +71,8 @@ OPAQUE_FROM = 0.5
 _EXIF_ORIENTATION = 0x0112
 _EXIF_CAMERA = (0x010F, 0x0110)  # make, model
 _EXIF_DETAILS, _EXIF_INTEROPERABILITY = 0x8769, 0xA005
-_EXIF_FOCAL = (0x920A, 0xA405)  # focal length in mm, and its equivalent on 35 mm film
+_EXIF_FOCAL_35MM = 0xA405  # the focal length that has this field of view on 35 mm film
+_EXIF_FOCAL = (0x920A, _EXIF_FOCAL_35MM)  # in mm
 _TIFF_PROFILE = 34675
 
 
@@ -450,6 +451,19 @@ def exif_camera(path: Path) -> str:
             details = exif.get_ifd(_EXIF_DETAILS)
         values = [exif.get(tag) for tag in _EXIF_CAMERA] + [details.get(t) for t in _EXIF_FOCAL]
     return "/".join("" if value is None else str(value).strip("\0 ") for value in values).strip("/")
+
+
+def exif_focal(path: Path) -> float | None:
+    """Read from EXIF the focal length for a film of 36 x 24 mm, mm; None where it is not there.
+
+    Raises:
+        UnreadableError: The file can't be read now.
+        ImageError: The file is not an image.
+    """
+    with _stream(path) as stream, suppress(Exception):  # PIL raises nearly anything on damaged EXIF
+        focal = float(_file(stream).exif.get_ifd(_EXIF_DETAILS)[_EXIF_FOCAL_35MM])
+        return focal if 1 < focal < 10_000 else None
+    return None
 
 
 def decode(path: Path) -> Picture:

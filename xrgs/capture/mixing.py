@@ -79,10 +79,10 @@ def mix_resolutions(scene: Scene, conf: VariantConf, work: Path, out: Path) -> V
     """
     check_variant_conf(conf)
     start = time.perf_counter()
-    photos = prepare_hr_views(scene, conf, work)
+    scene = poses.with_masks(scene, conf.poses)
+    photos = prepare_hr_views(scene, conf, work, for_sfm=conf.poses is None)
     sizes = [photo.size for photo in photos.all]
     inputs = _Inputs(scene, conf, photos, split_before_sfm(photos.names, sizes, conf))
-    write_degraded(photos, inputs.degraded, conf)
     registered = _register(inputs, work)
     model = registered.model
     _write_log(work, out)
@@ -93,7 +93,7 @@ def mix_resolutions(scene: Scene, conf: VariantConf, work: Path, out: Path) -> V
     depths = sampling.median_depths(model)
     if conf.tags in POLICIES and POLICIES[conf.tags].needs_depth:
         inputs = replace(inputs, split=_split_by_depth(photos, conf, model, depths))
-        write_degraded(photos, inputs.degraded, conf)
+    write_degraded(photos, inputs.degraded, conf)
     views, hidden = _write_undistorted(inputs, model, depths, out)
     tags, masked = _tags_report(inputs, views), _mask_report(views)
     notes = [*report["notes"], *tags["notes"], *hidden, *masked["notes"]]
@@ -113,8 +113,10 @@ def _register(inputs: _Inputs, work: Path) -> Registration:
     if conf.poses is not None:
         model = poses.read_poses(conf.poses, photos)
         if not len(model.points):
+            write_degraded(photos, inputs.degraded, conf)
             model = triangulation.with_points(model, photos, inputs.degraded, conf.sfm, work)
         return Registration(model, _refusal(inputs, model), [])
+    write_degraded(photos, inputs.degraded, conf, "sfm_lr")
     return registration.register(
         photos, inputs.degraded, conf.sfm, work, lambda model: _refusal(inputs, model)
     )
