@@ -396,7 +396,7 @@ def test_an_error_of_the_store_has_no_traceback(
     [
         ("variant.factor=0", "variant.factor=0: must be 1 or more"),
         ("variant.sfm.camera=two", "variant.sfm.camera=two"),
-        ("variant.long_side=29", "variant.long_side=29: must be 0 .* or at least 30"),
+        ("variant.long_side=54", "variant.long_side=54: must be 0 .* or at least 55"),
     ],
 )
 def test_what_no_variant_can_be_made_of_is_refused(
@@ -411,8 +411,8 @@ def test_what_no_variant_can_be_made_of_is_refused(
     [
         (),
         ("variant.long_side=0",),
-        ("variant.long_side=30",),
-        ("variant.long_side=6", "variant.degradation=jpeg"),
+        ("variant.long_side=55",),
+        ("variant.long_side=22", "variant.factor=2"),
     ],
 )
 def test_what_may_succeed_is_let_through(

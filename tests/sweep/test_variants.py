@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 import os
+import re
 import tempfile
 from collections.abc import Callable
 from pathlib import Path
@@ -237,28 +238,69 @@ def test_a_folder_that_is_missing_is_looked_for_again_without_retry(
     assert HINT not in err
 
 
-@pytest.mark.parametrize("readable", [1, 2])
+@pytest.mark.parametrize("readable", [1, 4])
 def test_a_dry_run_reads_the_headers_of_photographs(
     compose: Callable[..., Conf],
     store: Store,
     tmp_path: Path,
     readable: int,
-    capsys: pytest.CaptureFixture[str],
 ) -> None:
-    scene = tmp_path / "scene"
-    scene.mkdir()
-    for number in range(readable):
-        Image.new("RGB", (60, 40), (number, 0, 0)).save(scene / f"{number}.png")
+    scene = photographs(tmp_path / "scene", readable)
     (scene / "x.jpg").write_bytes(b"xx")
     conf = compose("scene=folder", f"scene.path={scene}")
     planned = variants.plan(conf, store, allow_build=False)
-    assert "x.jpg: unreadable or truncated image" in capsys.readouterr().err
-    if readable == 2:
-        assert planned == PlannedVariant()
+    if readable == 4:
+        (note,) = planned.notes
+        assert note.startswith("left out: x.jpg (unreadable or truncated image")
+        assert planned == PlannedVariant(notes=planned.notes)
     else:
         assert planned.error is not None
-        assert "scene scene: 1 readable image(s), two are needed: [" in planned.error
+        assert "scene scene: 1 photograph(s) can be used, two are needed: x.jpg" in planned.error
     assert not list(store.variants.iterdir())
+
+
+def photographs(folder: Path, count: int, size: tuple[int, int] = (120, 80)) -> Path:
+    folder.mkdir()
+    for number in range(count):
+        Image.new("RGB", size, (number, 0, 0)).save(folder / f"{number}.png")
+    return folder
+
+
+@pytest.mark.parametrize(
+    ("count", "size", "changes", "error"),
+    [
+        (2, (120, 80), (), "1 HR, 0 LR and 1 test views; at least one of each class and two"),
+        (5, (40, 30), (), "0 photograph(s) can be used.*lower variant.factor to 2"),
+        (5, (120, 80), ("variant.test=[1,2,3,4]",), "1 HR, 0 LR and 4 test views"),
+        (5, (120, 80), ("variant.tags=megapixels",), "every training view is HR"),
+    ],
+)
+def test_a_plan_says_what_no_variant_can_be_made_of(
+    compose: Callable[..., Conf],
+    store: Store,
+    tmp_path: Path,
+    count: int,
+    size: tuple[int, int],
+    changes: tuple[str, ...],
+    error: str,
+) -> None:
+    scene = photographs(tmp_path / "scene", count, size)
+    conf = compose("scene=folder", f"scene.path={scene}", *changes)
+    planned = variants.plan(conf, store, allow_build=False)
+    assert re.search(error.replace("(s)", r"\(s\)"), planned.error or "")
+    with pytest.raises(XrgsError):  # the build says the same, or asks more of SfM
+        variant.build(conf.scene, conf.variant, store.variants, store.scenes)
+
+
+def test_a_plan_says_that_no_view_is_lr(
+    compose: Callable[..., Conf], store: Store, tmp_path: Path
+) -> None:
+    conf = compose("scene=folder", f"scene.path={photographs(tmp_path / 'scene', 3)}")
+    assert variants.plan(conf, store, allow_build=False).notes == (
+        "no LR view: 2 training photographs are all HR by variant.min_hr=2; nothing is mixed",
+    )
+    conf.variant.hr_fraction = 1.0  # asked for
+    assert variants.plan(conf, store, allow_build=False).notes == ()
 
 
 def test_images_are_made_again_of_trimmed_variants_alone(

@@ -22,7 +22,14 @@ from xrgs.capture.degradations import resolve_degradation
 from xrgs.capture.lens import undistort
 from xrgs.capture.photographs import PhotoCollection, prepare_hr_views, write_degraded
 from xrgs.capture.registration import Registration
-from xrgs.capture.split import Split, check_variant_conf, split_views
+from xrgs.capture.split import (
+    Split,
+    check_variant_conf,
+    shortage,
+    split_before_sfm,
+    split_by_score,
+    split_notes,
+)
 from xrgs.capture.tags import POLICIES
 from xrgs.capture.views import SceneFailed, Variant, View
 from xrgs.runtime.progress import progress
@@ -72,7 +79,8 @@ def mix_resolutions(scene: Scene, conf: VariantConf, work: Path, out: Path) -> V
     check_variant_conf(conf)
     start = time.perf_counter()
     photos = prepare_hr_views(scene, conf, work)
-    inputs = _Inputs(scene, conf, photos, _split_before_sfm(photos, conf))
+    sizes = [photo.size for photo in photos.all]
+    inputs = _Inputs(scene, conf, photos, split_before_sfm(photos.names, sizes, conf))
     write_degraded(photos, inputs.degraded, conf)
     registered = _register(inputs, work)
     model = registered.model
@@ -83,7 +91,7 @@ def mix_resolutions(scene: Scene, conf: VariantConf, work: Path, out: Path) -> V
     report |= _pose_report(inputs, model, work)
     depths = sampling.median_depths(model)
     if conf.tags in POLICIES and POLICIES[conf.tags].needs_depth:
-        inputs = replace(inputs, split=_split_by_score(photos, conf, model, depths))
+        inputs = replace(inputs, split=_split_by_depth(photos, conf, model, depths))
         write_degraded(photos, inputs.degraded, conf)
     views = _write_undistorted(inputs, model, depths, out)
     tags = _tags_report(inputs, views)
@@ -108,42 +116,23 @@ def _register(inputs: _Inputs, work: Path) -> Registration:
     )
 
 
-def _split_before_sfm(photos: PhotoCollection, conf: VariantConf) -> Split:
-    """Split the views; where the tags depend on depth, all training views are HR for now."""
-    if conf.tags not in POLICIES:
-        return split_views(photos.names, conf)
-    if POLICIES[conf.tags].needs_depth:
-        return split_views(photos.names, replace(conf, hr_fraction=1.0))
-    return _split_by_score(photos, conf)
-
-
-def _split_by_score(
-    photos: PhotoCollection,
-    conf: VariantConf,
-    model: Reconstruction | None = None,
-    depths: Mapping[int, float] | None = None,
+def _split_by_depth(
+    photos: PhotoCollection, conf: VariantConf, model: Reconstruction, depths: Mapping[int, float]
 ) -> Split:
     """Split the views by the scores of `variant.tags`, as far as they are registered."""
-    unknown, lenses = np.full((3, 3), np.nan), model.lenses if model else {}
-    scores = [
-        POLICIES[conf.tags].score(
-            sampling.Measures(
-                photo.size,
-                lenses[i].undistorted().K if i in lenses else unknown,
-                depths[i] if depths and i in depths else float("nan"),
-            )
-        )
-        for i, photo in enumerate(photos.all)
+    measures = [
+        replace(measured, K=model.lenses[i].undistorted().K, depth=depths.get(i, measured.depth))
+        if i in model.lenses
+        else measured
+        for i, measured in enumerate(sampling.not_placed(photo.size) for photo in photos.all)
     ]
-    return split_views(photos.names, conf, sampling.relative_to_largest(scores))
+    return split_by_score(photos.names, measures, conf)
 
 
 def _refusal(inputs: _Inputs, model: Reconstruction) -> str:
     """Say why too few views are registered to train and to test on; empty where they are enough."""
     split, names, conf = inputs.split, inputs.photos.names, inputs.conf
     registered = model.viewmats.keys()
-    hr, lr = registered & set(split.hr), registered & set(split.lr)
-    tests = registered & set(split.test) if conf.test or split.test else registered
     missing = [name for i, name in enumerate(names) if i not in registered]
     source = "COLMAP registered" if conf.poses is None else "variant.poses has"
     summary = f"{source} {len(registered)} of {len(names)} views"
@@ -153,11 +142,8 @@ def _refusal(inputs: _Inputs, model: Reconstruction) -> str:
     fraction = conf.sfm.min_registered
     if len(registered) < fraction * len(names):
         return f"{summary}; variant.sfm.min_registered={fraction} requires more."
-    class_lost = (split.hr and not hr) or (split.lr and not lr)
-    if class_lost or len(hr) + len(lr) < 2 or not tests:
-        counts = f"{len(hr)} HR, {len(lr)} LR and {len(tests)} test views"
-        return f"{summary}: {counts}; at least one of each class and two training views are needed."
-    return ""
+    lacking = shortage(split, registered, conf)
+    return f"{summary}: {lacking}." if lacking else ""
 
 
 def _write_log(work: Path, out: Path) -> None:
@@ -212,7 +198,7 @@ def _tags_report(inputs: _Inputs, views: tuple[View, ...]) -> dict[str, Any]:
         for tag in ("HR", "LR")
     }
     return {
-        "notes": _split_notes(inputs, rates),
+        "notes": [*split_notes(split, inputs.conf), *_class_notes(inputs, rates)],
         "tags": inputs.conf.tags,
         "degradation": resolve_degradation(inputs.conf),
         "tests": len(split.test),
@@ -226,7 +212,7 @@ def _tags_report(inputs: _Inputs, views: tuple[View, ...]) -> dict[str, Any]:
     }
 
 
-def _split_notes(inputs: _Inputs, rates: Mapping[str, list[float]]) -> list[str]:
+def _class_notes(inputs: _Inputs, rates: Mapping[str, list[float]]) -> list[str]:
     """Say where photographs that are not degraded differ too little to be told HR and LR."""
     if inputs.degraded or not rates["HR"] or not rates["LR"]:
         return []

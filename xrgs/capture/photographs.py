@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,6 +22,8 @@ from xrgs.runtime.text import listed
 if TYPE_CHECKING:
     from xrgs.capture.scenes import Scene
     from xrgs.config import VariantConf
+
+_Content = TypeVar("_Content")
 
 
 @dataclass(frozen=True)
@@ -127,38 +129,89 @@ def prepare_hr_views(scene: Scene, conf: VariantConf, work: Path) -> PhotoCollec
             message names the photographs.
     """
     headers, left_out = _read_headers(scene.files)
-    # Largest first: the first that can be decoded sets the factor, a damaged file never does.
-    order = sorted(headers, key=lambda name: max(headers[name].size), reverse=True)
     numbers = {name: f"{i:05d}" for i, name in enumerate(scene.files)}
     geometries: dict[str, HrGeometry] = {}
     phrases: dict[str, list[str]] = defaultdict(list)
-    shrink: float | None = None
-    for name in progress(order, "HR views", "view"):
-        file, size = scene.files[name], headers[name].size
-        try:
-            picture = images.decode(file)
-            shrink = shrink or shrink_factor([size], conf)
-            hr = _checked_geometry(size, shrink, conf)
-        except (images.ImageError, TooSmallError) as error:
-            left_out[name] = str(error).removeprefix(f"{file}: ")
-            continue
-        except UnreadableError:
-            raise
-        except XrgsError as error:
-            raise XrgsError(f"{file}: {error}") from None
+    usable = _usable(scene, conf, headers, left_out, images.decode)
+    for name, hr, picture in progress(usable, "HR views", "view", len(headers)):
         copy = work / "hr" / f"{numbers[name]}.png"
         images.save(copy, _resize_and_crop(_visible(picture, scene), hr), durable=False)
         geometries[name] = hr
         for phrase in _phrases(picture, scene):
             phrases[phrase].append(name)
+    photos = _photographs(scene, conf, headers, left_out, geometries)
+    return PhotoCollection(photos, work, tuple(_notes(scene, left_out, phrases)))
+
+
+def expected_photographs(scene: Scene, conf: VariantConf) -> PhotoCollection:
+    """Say from headers alone what `prepare_hr_views` will make, as far as the files can be decoded.
+
+    Returns:
+        The photographs, without copies, and a note on those that will be left out.
+
+    Raises:
+        UnreadableError: A header can't be read now.
+        XrgsError: As `prepare_hr_views`.
+    """
+    headers, left_out = _read_headers(scene.files)
+    usable = _usable(scene, conf, headers, left_out, lambda _: None)
+    geometries = {name: hr for name, hr, _ in usable}
+    photos = _photographs(scene, conf, headers, left_out, geometries)
+    return PhotoCollection(photos, Path(), tuple(_notes(scene, left_out, {})))
+
+
+def _usable(
+    scene: Scene,
+    conf: VariantConf,
+    headers: Mapping[str, images.Header],
+    left_out: dict[str, str],
+    read: Callable[[Path], _Content],
+) -> Iterator[tuple[str, HrGeometry, _Content]]:
+    """Yield name, HR view and content of each photograph that can be used; fill `left_out`."""
+    shrink: float | None = None
+    # Largest first: the first that can be read sets the factor, a damaged file never does.
+    for name in sorted(headers, key=lambda name: max(headers[name].size), reverse=True):
+        file, size = scene.files[name], headers[name].size
+        try:
+            content = read(file)
+            shrink = shrink or shrink_factor([size], conf)
+            hr = _checked_geometry(size, shrink, conf)
+        except images.ImageError as error:
+            left_out[name] = str(error).removeprefix(f"{file}: ")
+            continue
+        except TooSmallError as error:
+            left_out[name] = error.why
+            continue
+        except UnreadableError:
+            raise
+        except XrgsError as error:
+            raise XrgsError(f"{file}: {error}") from None
+        yield name, hr, content
+
+
+def _photographs(
+    scene: Scene,
+    conf: VariantConf,
+    headers: Mapping[str, images.Header],
+    left_out: Mapping[str, str],
+    geometries: Mapping[str, HrGeometry],
+) -> tuple[Photograph, ...]:
+    """Describe the photographs that can be used, sorted by name; refuse fewer than two."""
     if len(geometries) < 2:
-        reasons = [f"{scene.files[name]}: {why}" for name, why in sorted(left_out.items())]
         count = f"{len(geometries)} photograph(s) can be used, two are needed"
-        raise XrgsError(f"scene {scene.name}: {count}: {'; '.join(reasons)}")
+        reasons = f"{scene.name}: {count}: {_reasons(scene, left_out)}"
+        sizes = [header.size for header in headers.values()]
+        try:
+            for size in sizes:
+                hr_geometry(size, shrink_factor(sizes, conf), conf)
+        except TooSmallError as error:
+            reasons += f"; {error.advice}"
+        raise XrgsError(f"scene {reasons}")
+    numbers = {name: f"{i:05d}" for i, name in enumerate(scene.files)}
     names = sorted(geometries)
     sizes = [headers[name].size for name in names]
     cameras = assign_cameras([scene.files[name] for name in names], sizes, conf.sfm.camera)
-    photos = (
+    return tuple(
         Photograph(
             name=name,
             number=numbers[name],
@@ -170,7 +223,6 @@ def prepare_hr_views(scene: Scene, conf: VariantConf, work: Path) -> PhotoCollec
         )
         for name, camera in zip(names, cameras, strict=True)
     )
-    return PhotoCollection(tuple(photos), work, tuple(_notes(scene, left_out, phrases)))
 
 
 def _notes(
@@ -178,10 +230,17 @@ def _notes(
 ) -> Iterator[str]:
     """Yield a sentence on what was left out, and one on each thing that was done."""
     if left_out:
-        reasons = [f"{_own_name(scene, name)} ({why})" for name, why in sorted(left_out.items())]
-        yield f"left out: {listed(reasons)}"
+        yield f"left out: {_reasons(scene, left_out)}"
     for phrase, names in sorted(phrases.items()):
         yield f"{phrase}: {listed([_own_name(scene, name) for name in sorted(names)])}"
+
+
+def _reasons(scene: Scene, left_out: Mapping[str, str]) -> str:
+    """Name the photographs that are left out for each reason."""
+    names = defaultdict(list)
+    for name, why in sorted(left_out.items()):
+        names[why].append(_own_name(scene, name))
+    return "; ".join(f"{listed(own)} ({why})" for why, own in names.items())
 
 
 def _own_name(scene: Scene, name: str) -> str:

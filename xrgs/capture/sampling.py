@@ -38,6 +38,11 @@ class Measures:
     """Median depth of the view's points, in world units; NaN where it is not known."""
 
 
+def not_placed(size: tuple[int, int]) -> Measures:
+    """Return the measures of a view without a camera, of which the size alone is known."""
+    return Measures(size, np.full((3, 3), np.nan), float("nan"))
+
+
 def median_depth(
     points: Array, viewmat: Array, lens: Lens, observed: Sequence[int] | NDArray[np.intp] = ()
 ) -> float:

@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Sequence, Set
+from dataclasses import dataclass, replace
 from difflib import get_close_matches
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from xrgs.capture.degradations import DEGRADATIONS
+from xrgs.capture.sampling import Measures, not_placed, relative_to_largest
 from xrgs.capture.tags import POLICIES
 from xrgs.errors import XrgsError
+from xrgs.splat.settings import SSIM_WINDOW
 
 if TYPE_CHECKING:
     from xrgs.config import VariantConf
@@ -19,6 +21,10 @@ if TYPE_CHECKING:
 
 class TooSmallError(XrgsError):
     """A photograph is too small for an LR view."""
+
+    def __init__(self, why: str, advice: str) -> None:
+        super().__init__(f"{why}; {advice}")
+        self.why, self.advice = why, advice
 
 
 @dataclass(frozen=True)
@@ -140,6 +146,62 @@ def split_views(
     return Split(test, hr, tuple(i for i in train if i not in chosen))
 
 
+def split_before_sfm(
+    names: Sequence[str], sizes: Sequence[tuple[int, int]], conf: VariantConf
+) -> Split:
+    """Split the views as far as is known before SfM.
+
+    Args:
+        names: The names of the views, sorted.
+        sizes: Width and height of each photograph, px.
+        conf: The variant's config. Where the tags depend on depth, all training views are HR.
+
+    Raises:
+        XrgsError: As for `split_views`.
+    """
+    if conf.tags not in POLICIES:
+        return split_views(names, conf)
+    if POLICIES[conf.tags].needs_depth:
+        return split_views(names, replace(conf, hr_fraction=1.0))
+    return split_by_score(names, [not_placed(size) for size in sizes], conf)
+
+
+def split_by_score(names: Sequence[str], measures: Sequence[Measures], conf: VariantConf) -> Split:
+    """Split the views by the scores of `variant.tags`, see `split_views`."""
+    scores = [POLICIES[conf.tags].score(measured) for measured in measures]
+    return split_views(names, conf, relative_to_largest(scores))
+
+
+def shortage(split: Split, registered: Set[int], conf: VariantConf) -> str:
+    """Say which views are too few to train and to test on; empty where there are enough.
+
+    Args:
+        split: All views.
+        registered: Indices of those that have a camera.
+        conf: The variant's config. Without a test view, tests are on the training views.
+    """
+    hr, lr, tests = (registered & set(part) for part in (split.hr, split.lr, split.test))
+    if not (conf.test or split.test):
+        tests = set(registered)
+    class_lost = (split.hr and not hr) or (split.lr and not lr)
+    if not class_lost and len(hr) + len(lr) >= 2 and tests:
+        return ""
+    return (
+        f"{len(hr)} HR, {len(lr)} LR and {len(tests)} test views; at least one of each class and"
+        " two training views are needed"
+    )
+
+
+def split_notes(split: Split, conf: VariantConf) -> list[str]:
+    """Say where no view is LR though the config asks for some."""
+    views = len(split.hr)
+    if split.lr or conf.tags != "flag" or conf.hr_fraction == 1:
+        return []
+    least = conf.min_hr >= views
+    why = f"variant.min_hr={conf.min_hr}" if least else f"variant.hr_fraction={conf.hr_fraction}"
+    return [f"no LR view: {views} training photographs are all HR by {why}; nothing is mixed"]
+
+
 def _hr_count(views: int, conf: VariantConf) -> int:
     return min(views, max(conf.min_hr, round(conf.hr_fraction * views)))
 
@@ -194,19 +256,18 @@ def hr_geometry(size: tuple[int, int], shrink: float, conf: VariantConf) -> HrGe
         TooSmallError: The LR view, `factor` times smaller, would be smaller than the SSIM window of
             the training loss; the message says which key can help.
     """
-    from xrgs.splat.ssim import WINDOW  # imports torch, which a plan must not wait for
-
     resized = round(size[0] * shrink), round(size[1] * shrink)
     # The crop makes x and y shrink by the same whole factor; else they differ by up to 0.6%.
     lr = resized[0] // conf.factor, resized[1] // conf.factor
-    if min(lr) < WINDOW:
+    if min(lr) < SSIM_WINDOW:
         helps = []
-        if min(resized) >= WINDOW:
-            helps.append(f"lower variant.factor to {min(resized) // WINDOW}")
-        if shrink < 1 and min(size) // conf.factor >= WINDOW:
+        if min(resized) >= SSIM_WINDOW:
+            helps.append(f"lower variant.factor to {min(resized) // SSIM_WINDOW}")
+        if shrink < 1 and min(size) // conf.factor >= SSIM_WINDOW:
             helps.append(f"raise variant.long_side={conf.long_side}")
         raise TooSmallError(
-            f"variant.factor={conf.factor}: LR views of {lr[0]}x{lr[1]} px are smaller than the "
-            f"SSIM window of {WINDOW} px; {' or '.join(helps) or 'the photograph is too small'}"
+            f"variant.factor={conf.factor}: LR views of {lr[0]}x{lr[1]} px are smaller than the"
+            f" SSIM window of {SSIM_WINDOW} px",
+            " or ".join(helps) or "the photograph is too small",
         )
     return HrGeometry(resized, lr[0] * conf.factor, lr[1] * conf.factor)

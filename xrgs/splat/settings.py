@@ -13,6 +13,9 @@ from typing import Any
 NOMINAL_STEPS = 30_000
 """Length of the run that step counts in settings are written for."""
 
+SSIM_WINDOW = 11
+"""The side of the window of SSIM in the training loss, px; an image must not be smaller."""
+
 SPLITS = ("random", "long_axis")
 """The values of `DensifySettings.split`."""
 

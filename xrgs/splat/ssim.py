@@ -12,7 +12,9 @@ import torch
 from torch import Tensor
 from torch.nn.functional import conv2d
 
-WINDOW = 11
+from xrgs.splat.settings import SSIM_WINDOW
+
+WINDOW = SSIM_WINDOW
 """Taps of the window along each axis."""
 SIGMA = 1.5
 """Standard deviation of the window, px."""

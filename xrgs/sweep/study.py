@@ -21,12 +21,10 @@ from hydra.errors import CompactHydraException
 from omegaconf.errors import OmegaConfBaseException
 
 from xrgs.capture import scenes
-from xrgs.capture.degradations import resolve_degradation
 from xrgs.capture.split import check_variant_conf
 from xrgs.composing import to_conf
 from xrgs.errors import StoreError, UnreadableError, XrgsError
 from xrgs.evaluation.lpips import weights
-from xrgs.evaluation.metrics import SSIM_WINDOW
 from xrgs.experiment.cell_folder import CellState
 from xrgs.experiment.store import Store, StoreGoneError
 from xrgs.runtime import lease
@@ -36,6 +34,7 @@ from xrgs.runtime.streams import say
 from xrgs.safeio.files import is_transient
 from xrgs.safeio.hashing import digest, to_plain
 from xrgs.safeio.sanitize import for_line
+from xrgs.splat.settings import SSIM_WINDOW
 from xrgs.sweep import controls, launch, track, variants
 from xrgs.sweep.axes import CellSpec, effective, expand
 from xrgs.sweep.estimate import CostEstimator
@@ -70,8 +69,6 @@ _SEED = re.compile(r"seed=(\d+)")
 _POLL_S = 2.0
 #: Number of looks at cells with a file that can't be read now, before they are left alone.
 _UNKNOWN_LOOKS = 5
-#: The shortest side of an image of which SSIM can be computed, in px.
-_MIN_SIDE = SSIM_WINDOW // 2 + 1
 
 
 class Study:
@@ -289,6 +286,7 @@ class Study:
     ) -> list[PlannedCell]:
         """Return the cells with their variants, or with the reasons why there are none."""
         results: dict[str, variants.PlannedVariant] = {}
+        said: dict[str, None] = {}
         cells = []
         for cell in plan:
             key = digest([to_plain(cell.conf.scene), to_plain(cell.conf.variant)])
@@ -305,6 +303,9 @@ class Study:
                     state=state,
                 )
             )
+            said |= dict.fromkeys(f"{scenes.label(cell.conf.scene)}: {n}" for n in found.notes)
+        for line in said:
+            log_line(line)
         return cells
 
     def _looked_again(self, plan: Sequence[PlannedCell], store: Store) -> list[PlannedCell]:
@@ -321,13 +322,11 @@ def check_sizes(conf: Conf) -> None:
         XrgsError: A value is out of its range; the message names the key.
     """
     check_variant_conf(conf.variant)
-    side, smaller = conf.variant.long_side, 1
-    if resolve_degradation(conf.variant) == "downsample":
-        smaller = conf.variant.factor
-    if 0 < side < smaller * _MIN_SIDE:
+    side, least = conf.variant.long_side, conf.variant.factor * SSIM_WINDOW
+    if 0 < side < least:
         raise XrgsError(
-            f"variant.long_side={side}: must be 0 (the photographs' size) or at least"
-            f" {smaller * _MIN_SIDE}, so that LR views have {_MIN_SIDE} px a side"
+            f"variant.long_side={side}: must be 0 (the photographs' size) or at least {least}, so"
+            f" that LR views have the {SSIM_WINDOW} px a side that SSIM needs"
         )
 
 

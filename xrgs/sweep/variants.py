@@ -5,9 +5,8 @@ from __future__ import annotations
 from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING
 
-from xrgs.capture import images, scenes, variant
+from xrgs.capture import photographs, scenes, split, variant
 from xrgs.capture.folders import trimmed_folder
-from xrgs.capture.scenes import folder
 from xrgs.errors import StoreError, UnreadableError, XrgsError
 from xrgs.experiment import trimming
 from xrgs.experiment.store import StoreGoneError
@@ -32,6 +31,8 @@ class PlannedVariant:
     """Whether the store keeps the error, so that only `retry=failed` tries the scene again."""
     unknown: str | None = None
     """The file that can't be read now."""
+    notes: tuple[str, ...] = ()
+    """Of a dry run: what the report of the variant that would be built would say."""
 
 
 def build(conf: Conf, store: Store) -> str:
@@ -131,8 +132,7 @@ def _find_or_build(conf: Conf, store: Store, *, allow_build: bool) -> PlannedVar
             return PlannedVariant(error=failure, remembered=True)
         if allow_build:
             return PlannedVariant(build(conf, store))
-        _check_headers(conf)
-        return PlannedVariant()
+        return PlannedVariant(notes=_expected_notes(conf, store))
     except (UnreadableError, worker.UnwritableError, StoreGoneError):
         raise
     except XrgsError as error:
@@ -145,24 +145,22 @@ def _find_or_build(conf: Conf, store: Store, *, allow_build: bool) -> PlannedVar
         return PlannedVariant(error=remembered or str(error), remembered=remembered is not None)
 
 
-def _check_headers(conf: Conf) -> None:
-    """Check that a folder has two photographs with readable headers, without decoding any.
+def _expected_notes(conf: Conf, store: Store) -> tuple[str, ...]:
+    """Say what a variant of photographs would leave out, from their names and headers alone.
 
     Raises:
         UnreadableError: A photograph can't be read now.
-        XrgsError: Fewer than two headers can be read; the message says why.
+        XrgsError: No variant can be made, even if SfM places every photograph.
     """
-    if conf.scene.kind != "folder":
-        return
-    files = folder.list_photographs(conf.scene.path, conf.variant.long_side)
-    reasons = []
-    for file in files.values():
-        try:
-            images.size(file)
-        except images.ImageError as error:
-            reasons.append(str(error))
-    for reason in reasons:
-        log_line(f"{reason}; it would be left out")
-    if len(files) - len(reasons) < 2:
-        count = f"{len(files) - len(reasons)} readable image(s), two are needed"
-        raise XrgsError(f"scene {scenes.label(conf.scene)}: {count}: {reasons}")
+    names = scenes.names(conf.scene, conf.variant.long_side)
+    sizes, notes = [(1, 1)] * len(names), list[str]()  # other kinds make views of one size
+    if conf.scene.kind == "folder":
+        scene = scenes.resolve(conf.scene, store.scenes, conf.variant.long_side)
+        photos = photographs.expected_photographs(scene, conf.variant)
+        names, sizes = photos.names, [photo.size for photo in photos.all]
+        notes = [*scene.notes, *photos.notes]
+    parts = split.split_before_sfm(names, sizes, conf.variant)
+    if lacking := split.shortage(parts, set(range(len(names))), conf.variant):
+        where = f"scene {scenes.label(conf.scene)} of {len(names)} photographs"
+        raise XrgsError("; ".join([f"{where}: {lacking}", *notes]))
+    return *notes, *split.split_notes(parts, conf.variant)
