@@ -1,4 +1,4 @@
-"""Describes a variant: its report for sweeps and their reports, and all of it for `xrgs-data inspect`.
+"""Says how a variant was made: notes for sweeps and reports, and all for `xrgs-data inspect`.
 
 Nothing here imports torch.
 """
@@ -37,9 +37,11 @@ class SfmAttempt(Struct):
 
 
 class SfmReport(Struct):
-    """The part of `report.json` that is shown: notes, how SfM went, and the classes of the views."""
+    """The part of `report.json` that is shown: notes, how SfM went, the classes of the views."""
 
     scene: str = "?"
+    reason: str = ""
+    """Why the scene failed; empty where it did not."""
     images: int = 0
     registered: int = 0
     points: int = 0
@@ -82,6 +84,8 @@ class SfmReport(Struct):
         Args:
             most: The most names in such a sentence.
         """
+        if not (self.hr or self.lr):  # of a scene that failed: the reason names the views
+            return self.notes
         lost = (("trained on", self.not_trained), ("scored", self.not_scored))
         unplaced = [
             f"not placed, and so not {done}: {listed(names, most)}" for done, names in lost if names
@@ -118,7 +122,8 @@ def describe(folder: Path, out: Path | None = None) -> str:
     report = read_report(folder)
     sfm = [for_line(line) for line in _sfm(report)]
     if frozen is None:
-        return "\n".join([for_line(f"{report.scene}: failed, so there are no views"), *sfm])
+        why = report.reason or f"{report.scene}: failed"
+        return "\n".join([for_line(f"{why} So there are no views."), *sfm])
     table = to_text(views_table(frozen, report))
     sheet, notes = contact_sheet(frozen)
     file = out or Path(f"{frozen.id}.png")

@@ -13,11 +13,13 @@ import pandas as pd
 
 from xrgs.report.inference import OTHER_CODE
 from xrgs.report.writing import signed
+from xrgs.runtime.text import listed
 from xrgs.safeio.sanitize import counted, for_line
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping, Sequence
 
+    from xrgs.capture.description import SfmReport
     from xrgs.config import Conf, VariantConf
     from xrgs.experiment.schema import Provenance
     from xrgs.report.collect import Sweep
@@ -28,6 +30,7 @@ _ENOUGH_VIEWS = 3
 #: The longest value of a config, processor's name and sentence that is shown, in characters.
 _MAX_SHOWN = 120
 _MAX_SENTENCE = 240
+_ALL_HR = "all views HR"
 
 
 @dataclass(frozen=True)
@@ -83,7 +86,10 @@ def contexts(sweep: Sweep) -> dict[str, Context]:
                 *_prune_rule(zip(rows["label"], configs, strict=True)),
             ),
             _machine([cell.provenance for cell in made]),
-            _cautions(zip(rows["scene"], configs, strict=True), tests),
+            (
+                *_cautions(zip(rows["scene"], configs, strict=True), tests),
+                *_cautions_of_photographs(rows.assign(config=configs), sweep.variants),
+            ),
         )
     return {name: found.get(name, Context()) for name in cells["condition"].unique()}
 
@@ -120,7 +126,7 @@ def _mixture(variant: VariantConf) -> str:
     """Return a phrase on how the LR views of a cell were made."""
     chosen = variant.tags == "flag"  # and not by what the photographs are
     if chosen and variant.hr_fraction == 1:
-        return "all views HR"
+        return _ALL_HR
     if variant.degradation == "downsample" or (chosen and variant.degradation == "auto"):
         return f"LR views {_shown(variant.factor)} times smaller"
     if variant.degradation in ("auto", "none"):
@@ -172,6 +178,35 @@ def _cautions(
     return tuple(
         for_line(f"Caution: {text}", _MAX_SENTENCE) for text in dict.fromkeys((*few, *trained_on))
     )
+
+
+def _cautions_of_photographs(
+    rows: pd.DataFrame, variants: Mapping[str, SfmReport]
+) -> tuple[str, ...]:
+    """Return sentences on test views that have no score, and on mixtures without an LR view.
+
+    Args:
+        rows: Rows of `Sweep.cells`, with the `config` of each.
+        variants: `Sweep.variants`.
+    """
+    found = []
+    for scene, of in rows[rows["variant_id"].isin(variants)].groupby("scene", sort=False):
+        unscored = [
+            name
+            for variant in of.loc[of["validation"] == 0, "variant_id"].unique()
+            for name in variants[variant].not_scored
+        ]
+        if unscored:
+            names = listed([*dict.fromkeys(unscored)])
+            found.append(f"{scene} is scored without test views that are not placed: {names}")
+        mixed = [c is None or _mixture(c.variant) != _ALL_HR for c in of["config"]]
+        if any(map(_lacks_lr, map(variants.get, of.loc[mixed, "variant_id"]))):
+            found.append(f"{scene} has no LR view: nothing is mixed")
+    return tuple(for_line(f"Caution: {text}", _MAX_SENTENCE) for text in found)
+
+
+def _lacks_lr(report: SfmReport | None) -> bool:
+    return report is not None and bool(report.hr) and not report.lr
 
 
 def _holds_out(config: Conf) -> bool:
