@@ -43,6 +43,7 @@ class SceneConf:
     kind: str
     path: str | None
     views: int
+    masks: str | None
     alpha: str
     background: tuple[float, float, float]
 

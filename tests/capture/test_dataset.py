@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from PIL import Image
 
 from xrgs.capture import dataset, images
 from xrgs.capture.dataset import LoadedView
@@ -61,6 +62,16 @@ def test_mixed_is_the_default_and_takes_the_views_as_they_are(variant: Variant) 
         size = HR if view.tag == "HR" else LR
         assert view.image.shape == (size[1], size[0], 3)
         assert (view.camera.width, view.camera.height) == size
+
+
+def test_a_photograph_is_8_bits_in_memory_and_read_png_on_demand(variant: Variant) -> None:
+    every = np.arange(40 * 30 * 3, dtype=np.uint8).reshape(30, 40, 3)
+    Image.fromarray(every).save(variant.views[3].file)
+    (view,) = dataset.load(variant).test
+    assert view.pixels.dtype == torch.uint8
+    np.testing.assert_array_equal(view.pixels, every)
+    np.testing.assert_array_equal(view.image, images.read_png(variant.views[3].file))
+    assert view.image.dtype == torch.float32
 
 
 def test_all_hr_takes_originals_from_the_same_poses(variant: Variant) -> None:

@@ -14,7 +14,7 @@ from PIL import Image
 from plyfile import PlyData, PlyElement
 
 from tests.capture.scene_confs import scene_conf
-from xrgs.capture import frozen, restore
+from xrgs.capture import frozen, images, restore
 from xrgs.capture.scenes import procedural
 from xrgs.capture.views import Variant
 from xrgs.config import SceneConf, VariantConf
@@ -60,7 +60,7 @@ def test_the_stereo_pair_has_the_same_images(
     assert hashes(folder) == hashes(stereo_variant.folder)
 
 
-def test_a_lens_for_each_photograph_has_the_same_images(
+def test_a_lens_for_each_photograph_has_the_same_images_and_masks(
     procedural_scene: SceneConf, build: Build, small_conf: Conf, made_again: Restore, tmp_path: Path
 ) -> None:
     """The lenses are given with the poses, so that no SfM is run."""
@@ -74,9 +74,22 @@ def test_a_lens_for_each_photograph_has_the_same_images(
     PlyData([PlyElement.describe(points, "vertex")]).write(tmp_path / "points.ply")
     file = tmp_path / "transforms.json"
     file.write_text(json.dumps({"fl_x": 230.0, "ply_file_path": "points.ply", "frames": frames}))
-    scene, changes = replace(procedural_scene, views=4), {"poses": str(file), "factor": 2}
+    (tmp_path / "masks").mkdir()
+    for i in (0, 1, 2):
+        mask = Image.new("L", (40, 30), 255)
+        mask.paste(0, (0, 0, 10, 30))
+        mask.save(tmp_path / "masks" / f"view_{i:03d}.png.png")
+    scene = replace(procedural_scene, views=4, masks=str(tmp_path / "masks"))
+    changes = {"poses": str(file), "factor": 2}
     built = build(scene, **changes)
     assert len(built.report["lenses"]) == 4
+    assert {view.name for view in built.views if view.mask is None} == {"view_003"}
+    for view in built.views:
+        if view.mask is not None:
+            assert 0.7 < images.read_mask(view.mask, (view.width, view.height)).mean() < 0.76
+    assert 0.24 < built.report["masked"]["test"] < 0.3
+    assert "no mask in scene.masks, so that all pixels are used: view_003" in built.report["notes"]
+    assert any(note.startswith("masks hide so much") for note in built.report["notes"])
     folder = without_images(built, tmp_path / built.id)
     made_again(folder, scene, small_conf(scene, **changes))
     assert hashes(folder) == hashes(built.folder)
@@ -85,9 +98,9 @@ def test_a_lens_for_each_photograph_has_the_same_images(
 @pytest.mark.parametrize(
     ("old", "new", "message"),
     [
-        ('"fx": ', '"fx": 1', "report.json: lenses: none is of view motorcycle_"),
+        ('"motorcycle_', '"x_', "report.json: lenses: none is of view motorcycle_"),
         ('"lenses"', '"lens"', "report.json: .*missing required field `lenses`"),
-        ('"fx"', '"unknown"', r"report.json: lenses\[0\]: .*missing required field `fx`"),
+        ('"model"', '"x"', r"report.json: lenses\[0\].lens: .*missing required field `model`"),
     ],
 )
 def test_a_damaged_report_is_named(

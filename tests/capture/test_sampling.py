@@ -4,15 +4,21 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from xrgs.capture import sampling
-from xrgs.capture.lens import Lens
+from xrgs.capture.lens import lens_of_model
 from xrgs.capture.sampling import Measures
 from xrgs.capture.sfm import Reconstruction
 from xrgs.capture.tags import POLICIES
 from xrgs.errors import XrgsError
 
-LENS = Lens(100, 80, 90.0, 90.0, 50.0, 40.0)
+
+def K_of(fx: float, fy: float) -> NDArray[np.float64]:  # noqa: N802
+    return lens_of_model("PINHOLE", (100, 80), (fx, fy, 50.0, 40.0)).K
+
+
+LENS = lens_of_model("PINHOLE", (100, 80), (90.0, 90.0, 50.0, 40.0))
 
 
 def column(*depths: float) -> np.ndarray:
@@ -66,11 +72,11 @@ def test_a_view_without_points_gets_the_median_of_the_others() -> None:
 
 def test_the_rate_is_focal_length_over_depth() -> None:
     """300 px at depth 4 are 75 px per unit, and 100 px at depth 2 are 50, which is 2/3 of it."""
-    K = {f: Lens(100, 80, f, f, 50, 40).K for f in (100.0, 300.0)}
+    K = {f: K_of(f, f) for f in (100.0, 300.0)}
     rates = [sampling.sampling_rate(K[300.0], 4), sampling.sampling_rate(K[100.0], 2)]
     assert rates == pytest.approx([75, 50])
     assert sampling.relative_to_largest(rates) == pytest.approx([1, 2 / 3])
-    assert sampling.sampling_rate(Lens(100, 80, 40, 90, 50, 40).K, 3) == pytest.approx(20)
+    assert sampling.sampling_rate(K_of(40, 90), 3) == pytest.approx(20)
 
 
 def test_a_smaller_copy_has_a_lower_rate_by_its_factor() -> None:
@@ -83,9 +89,9 @@ def test_a_smaller_copy_has_a_lower_rate_by_its_factor() -> None:
 def test_distance_and_sampling_rate_can_disagree() -> None:
     """A far telephoto view has the higher sampling rate, a near wide-angle view the closer one."""
     views = [
-        Measures((40, 30), Lens(100, 80, 300, 300, 50, 40).K, 4.0),
+        Measures((40, 30), K_of(300, 300), 4.0),
         Measures((30, 40), np.full((3, 3), np.nan), np.nan),
-        Measures((20, 15), Lens(100, 80, 100, 100, 50, 40).K, 2.0),
+        Measures((20, 15), K_of(100, 100), 2.0),
     ]
     relative = {
         name: sampling.relative_to_largest([policy.score(view) for view in views])

@@ -59,9 +59,10 @@ def imported_modules(file: Path) -> set[str]:
             for alias in node.names:
                 parts = f"{node.module}.{alias.name}".split(".")[1:]
                 while not (code.PACKAGE / "/".join(parts)).with_suffix(".py").is_file():
-                    parts.pop()
                     if (code.PACKAGE / "/".join(parts) / "__init__.py").is_file():
                         parts.append("__init__")
+                    else:
+                        parts.pop()
                 found.add("/".join(parts) + ".py")
     return found
 
@@ -122,7 +123,7 @@ def test_the_core_changes_every_key_and_poses_those_of_given_poses(
         (tmp_path / f"{name}.txt").write_text("")
     given = configured(poses=str(tmp_path))
     before, before_given = keys(), variant.key(SCENE, given)
-    with (package / "capture/poses.py").open("a") as stream:
+    with (package / "capture/poses/colmap.py").open("a") as stream:
         stream.write("LATER = 1\n")
     assert keys() == before
     assert variant.key(SCENE, given) != before_given

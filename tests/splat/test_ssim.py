@@ -35,6 +35,16 @@ def test_moments_are_those_of_a_distribution() -> None:
     np.testing.assert_allclose(variance[0, 0], weights @ (samples - mean) ** 2, rtol=1e-10)
 
 
+@pytest.mark.parametrize("height", [31, 42, 43, 100])
+def test_a_target_has_the_moments_of_the_whole_image(height: int) -> None:
+    """It computes them in blocks of rows, and in double."""
+    image = noise(height, 15, seed=height).float()
+    target = prepare_target(image)
+    mean, variance = window_moments(image.double())
+    assert torch.equal(target.mean, mean.float())
+    assert torch.equal(target.variance, variance.float())
+
+
 def structural_similarity(image: Tensor, target: Target) -> Tensor:
     """The mean SSIM over pixels and channels."""
     return 1 - photometric_loss(image, target, l1=0.0, ssim=1.0, backend="torch")

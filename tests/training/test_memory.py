@@ -1,19 +1,23 @@
-"""The memory of training: every tensor once, and what autograd saves."""
+"""The memory of training: what is kept, every tensor once, and what autograd saves."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from types import SimpleNamespace
 
+import pytest
 import torch
 
+from tests.conftest import composed
+from tests.training.conftest import same
 from xrgs.capture.dataset import Dataset
 from xrgs.config import Conf
 from xrgs.splat.gaussians import PARAMETERS
 from xrgs.splat.rendering import Render
-from xrgs.training.components import Step
+from xrgs.training import memory
+from xrgs.training.components import Step, TrainingView
 from xrgs.training.loop import train
-from xrgs.training.memory import TrainingMemory, tensors_in
+from xrgs.training.memory import OnDemand, TrainingMemory, tensors_in
 
 
 @dataclass
@@ -43,47 +47,47 @@ def test_tensors_are_found_in_items_and_attributes_all_the_way() -> None:
 
 def test_tensors_that_share_memory_count_once_and_buffers_are_added(data: Dataset) -> None:
     base = torch.zeros(100)
-    memory = TrainingMemory([base, base[10:20], base.view(10, 10)], torch.zeros(5).double())
-    with memory.of_forward(step(data), 1, 0):
+    counted = TrainingMemory([base, base[10:20], base.view(10, 10)], torch.zeros(5).double())
+    with counted.of_forward(step(data), 1, 0):
         pass
-    memory.record(render(1000))
-    assert memory.largest_bytes == 400 + 40 + 1000
+    counted.record(render(1000))
+    assert counted.largest_bytes == 400 + 40 + 1000
 
 
 def test_what_autograd_saves_counts(data: Dataset) -> None:
     x = torch.rand(50, requires_grad=True)
-    memory = TrainingMemory(x)
-    with memory.of_forward(step(data), 1, 0):
+    counted = TrainingMemory(x)
+    with counted.of_forward(step(data), 1, 0):
         y = x.exp()  # saves its result
         z = y * 2.0 + 1  # saves nothing
         loss = (z * z).sum()  # saves z
     torch.autograd.backward(loss)
-    memory.record(render(0))
-    assert memory.largest_bytes == 4 * 50 * (1 + 1 + 2)  # x, its gradient; y and z
+    counted.record(render(0))
+    assert counted.largest_bytes == 4 * 50 * (1 + 1 + 2)  # x, its gradient; y and z
 
 
 def test_what_a_forward_pass_drops_does_not_count(data: Dataset) -> None:
     """Or a count would depend on which of its addresses are used again."""
     x = torch.rand(50, requires_grad=True)
-    memory = TrainingMemory(x)
-    with memory.of_forward(step(data), 1, 0):
+    counted = TrainingMemory(x)
+    with counted.of_forward(step(data), 1, 0):
         (x.exp() * x.cos()).sum()
         loss = x.exp().sum()
     torch.autograd.backward(loss)
-    memory.record(render(0))
-    assert memory.largest_bytes == 4 * 50 * (1 + 1 + 1)  # x, its gradient, one exponential
+    counted.record(render(0))
+    assert counted.largest_bytes == 4 * 50 * (1 + 1 + 1)  # x, its gradient, one exponential
 
 
 def test_steps_alike_are_counted_once_until_the_gaussians_change(data: Dataset) -> None:
     held: list[torch.Tensor] = []
-    memory = TrainingMemory(held)
+    counted = TrainingMemory(held)
 
     def count(gaussians: int, view: int, elements: int) -> int:
         held[:] = [torch.zeros(elements)]
-        with memory.of_forward(step(data, view), gaussians, 0):
+        with counted.of_forward(step(data, view), gaussians, 0):
             pass
-        memory.record(render(0))
-        return memory.largest_bytes
+        counted.record(render(0))
+        return counted.largest_bytes
 
     assert count(10, 0, 100) == 400
     assert count(10, 0, 200) == 400  # taken for the same
@@ -93,21 +97,58 @@ def test_steps_alike_are_counted_once_until_the_gaussians_change(data: Dataset) 
 
 def test_a_step_without_backward_does_not_stand_for_its_kind(data: Dataset) -> None:
     held: list[torch.Tensor] = []
-    memory = TrainingMemory(held)
-    with memory.of_forward(step(data), 1, 0):
+    counted = TrainingMemory(held)
+    with counted.of_forward(step(data), 1, 0):
         pass  # and no `record`
     held.append(torch.zeros(100))
-    with memory.of_forward(step(data), 1, 0):
+    with counted.of_forward(step(data), 1, 0):
         pass
-    memory.record(render(0))
-    assert memory.largest_bytes == 400
+    counted.record(render(0))
+    assert counted.largest_bytes == 400
 
 
 def test_training_counts_model_photographs_and_loss(data: Dataset, short: Conf) -> None:
     result = train(data, short)
     model = sum(result.gaussians[name].nbytes for name in PARAMETERS)
-    photographs = sum(view.image.nbytes for view in (*data.train, *data.test))
+    photographs = sum(view.pixels.nbytes for view in (*data.train, *data.test))
     assert result.memory_bytes > 4 * model + photographs  # gradients and two moments
+
+
+def test_values_are_kept_as_far_as_the_bytes_go(
+    data: Dataset, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    made: list[str] = []
+
+    def make(view: TrainingView) -> torch.Tensor:
+        made.append(view.name)
+        return view.image * 2
+
+    monkeypatch.setattr(memory, "KEPT_BYTES", 4 * 3 * (60 * 60 + 12 * 12))  # of v0 and v1
+    values = OnDemand(make, data.train)
+    assert list(values.kept) == ["v0", "v1"]
+    made.clear()
+    for view in data.train:
+        assert torch.equal(values[view.name], view.image * 2)
+    assert made == ["v2", "v3"]
+    assert [id(tensor) for tensor in tensors_in(values)] == [
+        id(values["v1"]),
+        id(values["v0"]),
+    ]
+
+
+@pytest.mark.parametrize(
+    "ablation", ["baseline", "consistency", "region_weighting", "resolution_schedule"]
+)
+def test_what_is_not_kept_changes_no_bit_and_takes_less_memory(
+    data: Dataset, monkeypatch: pytest.MonkeyPatch, ablation: str
+) -> None:
+    conf = composed("train.steps=20", "splat.backend=torch", f"+ablation={ablation}")
+    kept = train(data, conf)
+    monkeypatch.setattr(memory, "KEPT_BYTES", 0)
+    anew = train(data, conf)
+    assert same(kept.gaussians, anew.gaussians)
+    assert kept.history == anew.history
+    assert anew.memory_bytes < kept.memory_bytes
 
 
 def test_a_component_that_holds_more_counts_more(data: Dataset, short: Conf) -> None:

@@ -1,9 +1,9 @@
-"""Reads and writes COLMAP's models, and points as .ply, with pycolmap."""
+"""Writes COLMAP's models with pycolmap; reads and writes points as .ply."""
 
 from __future__ import annotations
 
 import zlib  # noqa: F401  pycolmap 4.2.1 corrupts the heap where it is imported before zlib
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -11,8 +11,11 @@ import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
-from xrgs.capture import sfm
 from xrgs.errors import XrgsError
+from xrgs.safeio import ply
+
+#: The colour of points without one.
+GREY = 128
 
 
 @dataclass(frozen=True)
@@ -29,39 +32,36 @@ class PinholeImage:
     """World to camera [4, 4], OpenCV axes."""
 
 
-def read_model(
-    folder: Path, match: Callable[[Sequence[str]], Mapping[str, int]]
-) -> sfm.Reconstruction:
-    """Read a model of COLMAP, binary or text: the cameras of wanted images, and all points.
-
-    Args:
-        folder: The folder of `cameras`, `images` and `points3D`.
-        match: Returns the index of each wanted image by its name, from all names that have a pose.
-
-    Raises:
-        XrgsError: The files are no model, or a camera model is not supported.
-    """
-    try:
-        model = pycolmap.Reconstruction(folder)
-    except (RuntimeError, ValueError, IndexError) as error:
-        raise XrgsError(f"not a model of COLMAP ({error})") from error
-    names = [image.name for image in model.images.values() if image.has_pose]
-    return sfm.to_numpy(model, match(names), {})
-
-
 def read_points(file: Path) -> tuple[NDArray[np.float64], NDArray[np.uint8]]:
-    """Read points [P, 3] and their colours [P, 3] from a .ply file, ASCII or binary.
+    """Read points [P, 3] and their colours [P, 3] from a .ply file; without colours they are grey.
+
+    Colours are `red`, `green` and `blue`, or `diffuse_red` and so on: integers of 0 to 255, or of 0
+    to 65535 where they have 16 bits, or floats of 0 to 1, or of 0 to 255 where one is above 1.
 
     Raises:
-        XrgsError: The file is not such a .ply.
+        XrgsError: The file is no .ply, or its vertices have no x, y and z.
     """
-    model = pycolmap.Reconstruction()
-    try:
-        model.import_PLY(file)
-    # MemoryError: COLMAP makes room for as many points as the header declares.
-    except (RuntimeError, ValueError, IndexError, MemoryError) as error:
-        raise XrgsError(f"not a .ply of points with colours ({error})") from error
-    return sfm.points_of(model)
+    vertices = ply.read(file)
+    names = [name for name in "xyz" if name not in vertices.names]
+    if names:
+        raise XrgsError(f"{file}: its vertices have no property {names[0]}")
+    points = vertices.columns("xyz", np.float64)
+    for prefix in ("", "diffuse_"):
+        channels = [f"{prefix}{name}" for name in ("red", "green", "blue")]
+        if set(channels) <= set(vertices.names):
+            return points, _as_8_bit(vertices, channels)
+    return points, np.full(points.shape, GREY, np.uint8)
+
+
+def _as_8_bit(vertices: ply.Ply, channels: Sequence[str]) -> NDArray[np.uint8]:
+    colors = vertices.columns(channels, np.float64)
+    kind = vertices.vertices.dtype[channels[0]]
+    if kind.kind == "f":
+        scale = 255.0 if not (colors > 1).any() else 1.0
+    else:
+        scale = 255.0 / np.iinfo(kind).max if kind.itemsize == 2 else 1.0
+    whole: NDArray[np.uint8] = np.round(np.nan_to_num(colors) * scale).clip(0, 255).astype(np.uint8)
+    return whole
 
 
 def write_model(

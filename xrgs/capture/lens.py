@@ -1,8 +1,12 @@
-"""The camera model of photographs before undistortion, and undistortion itself."""
+"""The camera of a photograph before undistortion, and undistortion itself.
+
+Nothing here imports pycolmap before a lens with distortion is used.
+"""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import cache
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -11,117 +15,156 @@ from numpy.typing import NDArray
 from xrgs.errors import XrgsError
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
+    from collections.abc import Sequence
 
     from xrgs.capture.images import ImageArray
 
-UNDISTORT = "Undistort the photographs first, as `colmap image_undistorter` does"
-#: The parameters of the camera models of COLMAP that a `Lens` can stand for.
-_MODELS = {
+#: The parameters of COLMAP's camera models, whose numbers in binary files count from 0 in this
+#: order. Beside the focal length and the principal point they are terms of distortion.
+MODELS = {
     "SIMPLE_PINHOLE": ("f", "cx", "cy"),
     "PINHOLE": ("fx", "fy", "cx", "cy"),
-    "SIMPLE_RADIAL": ("f", "cx", "cy", "k1"),
+    "SIMPLE_RADIAL": ("f", "cx", "cy", "k"),
     "RADIAL": ("f", "cx", "cy", "k1", "k2"),
     "OPENCV": ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2"),
+    "OPENCV_FISHEYE": ("fx", "fy", "cx", "cy", "k1", "k2", "k3", "k4"),
+    "FULL_OPENCV": (*("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6"),),
+    "FOV": ("fx", "fy", "cx", "cy", "omega"),
+    "SIMPLE_RADIAL_FISHEYE": ("f", "cx", "cy", "k"),
+    "RADIAL_FISHEYE": ("f", "cx", "cy", "k1", "k2"),
+    "THIN_PRISM_FISHEYE": (
+        *("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3", "k4", "sx1", "sy1"),
+    ),
+    "RAD_TAN_THIN_PRISM_FISHEYE": (
+        *("fx", "fy", "cx", "cy", "k0", "k1", "k2", "k3", "k4", "k5"),
+        *("p0", "p1", "s0", "s1", "s2", "s3"),
+    ),
+    "SIMPLE_DIVISION": ("f", "cx", "cy", "k"),
+    "DIVISION": ("fx", "fy", "cx", "cy", "k"),
+    "SIMPLE_FISHEYE": ("f", "cx", "cy"),
+    "FISHEYE": ("fx", "fy", "cx", "cy"),
+    "EUCM": ("fx", "fy", "cx", "cy", "alpha", "beta"),
+    "EQUIRECTANGULAR": ("w", "h"),
 }
+_PINHOLES = ("SIMPLE_PINHOLE", "PINHOLE")
+#: The models that are a pinhole camera where all terms of distortion are 0.
+_PERSPECTIVE = ("SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV", "SIMPLE_DIVISION", "DIVISION")
+#: The angle from the optical axis to a side of the undistorted image is at most 60 degrees: beyond,
+#: a pinhole camera stretches the picture more than 4 times, 1 / cos², and shrinks its centre.
+_MAX_TANGENT = np.tan(np.radians(60.0))
+#: The longest focal length of an undistorted image, over the focal length of the photograph.
+_MAX_ZOOM = 8.0
+_Row = tuple[float, float, float]
 
 
 @dataclass(frozen=True)
 class Lens:
-    """A camera with one radial distortion term, in px; pixel centres are at +0.5.
+    """The camera of an image: a camera of COLMAP, and where its pixels are in the image.
 
-    It is COLMAP's SIMPLE_RADIAL with a focal length per axis: a point (x, y) on the plane z = 1
-    projects to the pixel (fx x (1 + k r²) + cx, fy y (1 + k r²) + cy), with r² = x² + y².
+    The image may have been turned by quarters, resized and cropped since COLMAP saw it. Pixel
+    centres are at +0.5.
     """
 
+    model: str
+    """The name of COLMAP's camera model."""
+    params: tuple[float, ...]
+    """Its parameters in COLMAP's order, in px of the image that COLMAP saw."""
     width: int
+    """Width of the image now, px."""
     height: int
-    fx: float
-    fy: float
-    cx: float
-    cy: float
-    k: float = 0.0
-    """The radial term; 0 for a pinhole camera."""
+    """Height of the image now, px."""
+    from_camera: tuple[_Row, _Row] = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0))
+    """The affine map [2, 3] from pixels that COLMAP saw to pixels of the image."""
 
-    def resized(self, width: int, height: int) -> Lens:
-        """Return the camera of the same image after it was resized; its rays are the same."""
-        sx, sy = width / self.width, height / self.height
-        return Lens(width, height, self.fx * sx, self.fy * sy, self.cx * sx, self.cy * sy, self.k)
+    @property
+    def is_pinhole(self) -> bool:
+        """Whether the image has no distortion."""
+        return self.model in _PINHOLES
 
     @property
     def K(self) -> NDArray[np.float64]:  # noqa: N802
         """The intrinsics [3, 3], px, without the distortion."""
-        return np.array([[self.fx, 0, self.cx], [0, self.fy, self.cy], [0, 0, 1]])
+        focal, centre = (2, 4) if MODELS[self.model][0] == "fx" else (1, 3)
+        linear, shift = self._affine()
+        K = np.eye(3)
+        K[:2, :2] = linear * self.params[:focal] @ np.sign(linear).T
+        K[:2, 2] = linear @ self.params[focal:centre] + shift
+        return K
+
+    def resized(self, width: int, height: int) -> Lens:
+        """Return the camera of the same image after it was resized; its rays are the same."""
+        scale = np.diag([width / self.width, height / self.height])
+        return self._moved(scale, np.zeros(2), (width, height))
+
+    def cropped(self, left: int, top: int, width: int, height: int) -> Lens:
+        """Return the camera of a part of the image; the arguments are in px."""
+        return self._moved(np.eye(2), np.array([-left, -top], np.float64), (width, height))
+
+    def turned(self, quarters: int) -> Lens:
+        """Return the camera of the image after it was turned clockwise by 1, 2 or 3 quarters.
+
+        A ray (x, y, 1) of this camera is (R (x, y), 1) of the new one, with R of `quarter_turn`.
+        """
+        R, size = quarter_turn(quarters), np.array([self.width, self.height])
+        shift = -np.minimum(R @ size, 0)  # the turned image begins at 0 again
+        width, height = np.abs(R @ size).astype(int).tolist()
+        return self._moved(R, shift, (width, height))
 
     def undistorted(self) -> Lens:
-        """Return the pinhole camera (k = 0) of the undistorted image.
+        """Return the pinhole camera of the undistorted image.
 
         It has the same size and principal point, and the smallest focal length with which every
-        pixel has a source inside the photograph. The focal length depends on the image's border
-        alone, so that an image and its resized copy are zoomed alike.
-        """
-        if self.k == 0:
-            return self
-        t = np.linspace(0.0, 1.0, 257)
-        edge = np.concatenate(
-            [np.stack([t, 0 * t + s], -1) for s in (0.0, 1.0)]
-            + [np.stack([0 * t + s, t], -1) for s in (0.0, 1.0)]
-        )  # [B, 2] in fractions of the image
-        border = edge * (self.width, self.height)
-        low, high = 0.25, 8.0
-        for _ in range(50):
-            zoom = (low + high) / 2
-            source = self.source_pixels(border, zoom)
-            inside = np.all((source >= -1e-9) & (source <= (self.width, self.height)))
-            # Where d/dr (r + k r³) < 0, beyond this radius, a barrel lens would fold the image.
-            x = (border - (self.cx, self.cy)) / (self.fx * zoom, self.fy * zoom)
-            inside &= np.all(1 + 3 * self.k * np.sum(x**2, axis=-1) > 0)
-            low, high = (low, zoom) if inside else (zoom, high)
-        return Lens(self.width, self.height, self.fx * high, self.fy * high, self.cx, self.cy)
+        pixel has a source inside the photograph and no side is more than 60 degrees from the axis.
 
-    def source_pixels(self, pixels: NDArray[np.float64], zoom: float) -> NDArray[np.float64]:
-        """Map pixels of a pinhole camera to where the photograph shows the same rays.
+        Raises:
+            XrgsError: There is no such camera.
+        """
+        if self.is_pinhole:
+            return self
+        K = self.K
+        zoom = _zoom(self)
+        params = (K[0, 0] * zoom, K[1, 1] * zoom, K[0, 2], K[1, 2])
+        return Lens("PINHOLE", tuple(map(float, params)), self.width, self.height)
+
+    def kept(self) -> float:
+        """Return the share of the photograph that the undistorted image shows, 0 to 1."""
+        if self.is_pinhole:
+            return 1.0
+        x, y = self.project(_rays(_border(self), self.undistorted().K)).T
+        enclosed = 0.5 * abs(np.sum(x * np.roll(y, -1) - y * np.roll(x, -1)))
+        return float(enclosed / (self.width * self.height))
+
+    def project(self, rays: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Project rays to pixels by pycolmap.
 
         Args:
-            pixels: Pixel coordinates [..., 2] (x, y) of the pinhole camera.
-            zoom: The ratio of the pinhole camera's focal length to this camera's.
+            rays: Points [N, 2] on the plane z = 1, in the axes of the image.
 
         Returns:
-            Pixel coordinates [..., 2] in the photograph.
+            Pixels [N, 2] of the image; NaN where the camera model projects no such ray.
         """
-        centre = np.array([self.cx, self.cy])
-        focal = np.array([self.fx, self.fy])
-        x = (pixels - centre) / (focal * zoom)
-        r2 = np.sum(x**2, axis=-1, keepdims=True)
-        source: NDArray[np.float64] = focal * x * (1 + self.k * r2) + centre
-        return source
+        import zlib  # noqa: F401  pycolmap 4.2.1 corrupts the heap where it is imported before zlib
 
+        import pycolmap
 
-def undistort(image: ImageArray, lens: Lens) -> ImageArray:
-    """Resample a photograph to the image of `lens.undistorted()`, by cubic spline interpolation.
+        camera = pycolmap.Camera(model=self.model, width=1, height=1, params=self.params)
+        linear, shift = self._affine()
+        own = rays @ np.sign(linear)  # in the axes of the image that COLMAP saw
+        seen = camera.img_from_cam(np.concatenate([own, np.ones((len(own), 1))], axis=1))
+        return np.asarray(seen @ linear.T + shift, np.float64)
 
-    Args:
-        image: The photograph, [H, W, 3] in 0..1.
-        lens: Its camera, of the same size.
+    def _affine(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        matrix = np.array(self.from_camera)
+        return matrix[:, :2], matrix[:, 2]
 
-    Returns:
-        The undistorted image [H, W, 3], not clamped; the image itself where the lens has k = 0.
-
-    Raises:
-        ValueError: The image and the lens differ in size.
-    """
-    if image.shape[:2] != (lens.height, lens.width):
-        raise ValueError(f"image {image.shape[:2]}, lens {(lens.height, lens.width)}")
-    if lens.k == 0:
-        return image
-    from skimage.transform import warp
-
-    columns, rows = np.meshgrid(np.arange(lens.width) + 0.5, np.arange(lens.height) + 0.5)
-    zoom = lens.undistorted().fx / lens.fx
-    source = lens.source_pixels(np.stack([columns, rows], -1), zoom) - 0.5  # [H, W, 2]
-    coords = source[..., ::-1].transpose(2, 0, 1)  # [2, H, W] row, column
-    bands = [warp(image[..., c], coords, order=3, mode="edge") for c in range(3)]
-    return np.stack(bands, axis=-1).astype(np.float32)
+    def _moved(
+        self, linear: NDArray[np.float64], shift: NDArray[np.float64], size: tuple[int, int]
+    ) -> Lens:
+        """Return the camera after the pixels of the image were mapped."""
+        own, own_shift = self._affine()
+        rows = np.concatenate([linear @ own, (linear @ own_shift + shift)[:, None]], axis=1)
+        (a, b, c), (d, e, f) = (rows + 0.0).tolist()  # + 0.0: no negative zeros
+        return replace(self, width=size[0], height=size[1], from_camera=((a, b, c), (d, e, f)))
 
 
 def lens_of_model(model: str, size: tuple[int, int], params: Sequence[float]) -> Lens:
@@ -133,37 +176,108 @@ def lens_of_model(model: str, size: tuple[int, int], params: Sequence[float]) ->
         params: The model's parameters, in COLMAP's order.
 
     Raises:
-        XrgsError: The model, or a distortion term that is not 0, is not supported.
+        XrgsError: The model is not served, or a value is out of its range.
     """
-    if model not in _MODELS:
-        served = ", ".join(_MODELS)
-        raise XrgsError(f"camera model {model}: must be one of {served}. {UNDISTORT}")
-    return lens_of_terms(model, size, dict(zip(_MODELS[model], params, strict=True)))
+    if model == "EQUIRECTANGULAR":
+        raise XrgsError(
+            f"camera model {model}: a panorama has no pinhole camera; cut it into perspective views"
+            " first, as COLMAP's example panorama_sfm.py does"
+        )
+    if model not in MODELS:
+        served = ", ".join(name for name in MODELS if name != "EQUIRECTANGULAR")
+        raise XrgsError(f"camera model {model}: must be one of {served}")
+    names, values = MODELS[model], tuple(map(float, params))
+    if len(values) != len(names):
+        raise XrgsError(
+            f"camera model {model}: it has {len(values)} parameters; {len(names)} are needed "
+            f"({', '.join(names)})"
+        )
+    focal = values[: 2 if names[0] == "fx" else 1]
+    if not np.isfinite(values).all() or min(*focal, *size) <= 0:
+        raise XrgsError(
+            f"camera model {model}: its size and focal length must be above 0, and all values "
+            f"finite: {size[0]}x{size[1]} px, {', '.join(f'{v:g}' for v in values)}"
+        )
+    if model in _PERSPECTIVE and not any(values[len(focal) + 2 :]):
+        values = (focal[0], focal[-1], *values[len(focal) : len(focal) + 2])
+        return Lens("PINHOLE", values, *size)
+    return Lens(model, values, *size)
 
 
-def lens_of_terms(model: str, size: tuple[int, int], terms: Mapping[str, float]) -> Lens:
-    """Make a camera of the terms of OpenCV's model.
+def quarter_turn(quarters: int) -> NDArray[np.float64]:
+    """Return the rotation [2, 2] of pixels when an image is turned clockwise by quarters."""
+    return np.linalg.matrix_power(np.array([[0.0, -1.0], [1.0, 0.0]]), quarters)
+
+
+def undistort(image: ImageArray, lens: Lens, order: int = 3) -> ImageArray:
+    """Resample a photograph to the image of `lens.undistorted()`, by spline interpolation.
 
     Args:
-        model: The name of the camera in messages.
-        size: Width and height of its images, px.
-        terms: `f`, or `fx` and `fy`, and `cx`, `cy`, px; distortion terms by their names.
+        image: The photograph, [H, W, C] in 0..1.
+        lens: Its camera, of the same size.
+        order: The order of the spline: 3 for photographs, 1 for masks.
+
+    Returns:
+        The undistorted image [H, W, C], not clamped; the image itself where the lens is a pinhole.
 
     Raises:
-        XrgsError: A focal length is not above 0, a value is not finite, or a distortion term other
-            than `k1` is not 0.
+        ValueError: The image and the lens differ in size.
     """
-    values = dict(terms)
-    fx, fy = (values.pop(name, values.get("f", 0.0)) for name in ("fx", "fy"))
-    values.pop("f", None)
-    cx, cy, k = values.pop("cx"), values.pop("cy"), values.pop("k1", 0.0)
-    if not np.isfinite([fx, fy, cx, cy, k]).all() or min(fx, fy, *size) <= 0:
+    if image.shape[:2] != (lens.height, lens.width):
+        raise ValueError(f"image {image.shape[:2]}, lens {(lens.height, lens.width)}")
+    if lens.is_pinhole:
+        return image
+    from skimage.transform import warp
+
+    columns, rows = np.meshgrid(np.arange(lens.width) + 0.5, np.arange(lens.height) + 0.5)
+    pixels = np.stack([columns.ravel(), rows.ravel()], -1)
+    source = lens.project(_rays(pixels, lens.undistorted().K)) - 0.5
+    coords = source.T[::-1].reshape(2, lens.height, lens.width)  # row, column
+    bands = [warp(image[..., c], coords, order=order, mode="edge") for c in range(image.shape[2])]
+    return np.stack(bands, axis=-1).astype(np.float32)
+
+
+def _rays(pixels: NDArray[np.float64], K: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the rays [N, 2] of pixels [N, 2] of a pinhole camera."""
+    rays: NDArray[np.float64] = (pixels - K[:2, 2]) / (K[0, 0], K[1, 1])
+    return rays
+
+
+def _border(lens: Lens) -> NDArray[np.float64]:
+    """Return points [1024, 2] around the border of an image, in order, px."""
+    t = np.arange(256) / 256
+    sides = [(t, 0 * t), (0 * t + 1, t), (1 - t, 0 * t + 1), (0 * t, 1 - t)]
+    return np.concatenate([np.stack(side, -1) for side in sides]) * (lens.width, lens.height)
+
+
+@cache
+def _zoom(lens: Lens) -> float:
+    """Find the focal length of the undistorted image, over the focal length of the photograph.
+
+    It depends on the border of the image alone, so that an image and its resized copy are zoomed
+    alike.
+    """
+    rays = _rays(_border(lens), lens.K)
+    low, high = float(np.abs(rays).max() / _MAX_TANGENT), _MAX_ZOOM
+    if _fills(lens, rays / low):
+        return low
+    if not _fills(lens, rays / high):
         raise XrgsError(
-            f"camera {model}: its size and focal length must be above 0, and all values finite"
+            f"camera model {lens.model}: it can't be undistorted, because its distortion folds the "
+            "picture or its principal point is outside of the picture: "
+            f"{', '.join(f'{value:g}' for value in lens.params)}"
         )
-    if others := [f"{name}={value:g}" for name, value in values.items() if value != 0]:
-        raise XrgsError(
-            f"camera {model}: distortion terms beside k1 must be 0 ({', '.join(others)}). "
-            f"{UNDISTORT}"
-        )
-    return Lens(*size, fx, fy, cx, cy, k)
+    for _ in range(50):
+        zoom = (low + high) / 2
+        low, high = (low, zoom) if _fills(lens, rays / zoom) else (zoom, high)
+    return high
+
+
+def _fills(lens: Lens, rays: NDArray[np.float64]) -> bool:
+    """Return whether all inside a border of rays [N, 2] has a source inside the photograph."""
+    steps = np.append(np.linspace(0, 1, 17), 1.001)  # from the axis to the border, and just beyond
+    path = lens.project((steps[:, None, None] * rays).reshape(-1, 2)).reshape(len(steps), -1, 2)
+    # Where the radius falls on the way out, the lens would fold the image.
+    radius = np.linalg.norm(path - path[0], axis=-1)
+    inside = (path[-2] >= -1e-9) & (path[-2] <= np.array([lens.width, lens.height]) + 1e-9)
+    return bool(inside.all() and (np.diff(radius, axis=0) > 0).all())

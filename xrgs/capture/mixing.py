@@ -18,7 +18,7 @@ import numpy as np
 from xrgs.capture import images, poses, registration, sampling
 from xrgs.capture.alignment import pose_error
 from xrgs.capture.degradations import resolve_degradation
-from xrgs.capture.lens import undistort
+from xrgs.capture.lens import Lens
 from xrgs.capture.photographs import PhotoCollection, prepare_hr_views, write_degraded
 from xrgs.capture.registration import Registration
 from xrgs.capture.split import (
@@ -91,8 +91,9 @@ def mix_resolutions(scene: Scene, conf: VariantConf, work: Path, out: Path) -> V
         inputs = replace(inputs, split=_split_by_depth(photos, conf, model, depths))
         write_degraded(photos, inputs.degraded, conf)
     views = _write_undistorted(inputs, model, depths, out)
-    tags = _tags_report(inputs, views)
-    report |= tags | {"notes": [*report["notes"], *tags["notes"]]}
+    tags, masked = _tags_report(inputs, views), _mask_report(views)
+    notes = [*report["notes"], *tags["notes"], *masked["notes"]]
+    report |= tags | masked | {"notes": notes}
     report["seconds"] = round(time.perf_counter() - start, 1)
     held_out = bool(inputs.split.test)
     return Variant(
@@ -159,8 +160,16 @@ def _sfm_report(inputs: _Inputs, model: Reconstruction) -> dict[str, Any]:
         "cameras": len({photo.camera for photo in photos.all}),
         "notes": [*scene.notes, *photos.notes, *model.report.get("notes", ())],
         "not_registered": [n for i, n in enumerate(photos.names) if i not in model.viewmats],
-        "lenses": [asdict(lens) for lens in sorted(set(model.lenses.values()), key=repr)],
+        "lenses": _lens_report(photos, model),
     }
+
+
+def _lens_report(photos: PhotoCollection, model: Reconstruction) -> list[dict[str, Any]]:
+    """Report each camera once, with the names of its photographs."""
+    names: dict[Lens, list[str]] = {}
+    for i, lens in sorted(model.lenses.items()):
+        names.setdefault(lens, []).append(photos.names[i])
+    return [{"lens": asdict(lens), "views": views} for lens, views in names.items()]
 
 
 def _pose_report(inputs: _Inputs, model: Reconstruction, work: Path) -> dict[str, Any]:
@@ -222,6 +231,26 @@ def _class_notes(inputs: _Inputs, rates: Mapping[str, list[float]]) -> list[str]
     ]
 
 
+def _mask_report(views: tuple[View, ...]) -> dict[str, Any]:
+    """Report the share of the pixels of each class that masks hide."""
+    shares = {}
+    for kind, split, tag in (("HR", "train", "HR"), ("LR", "train", "LR"), ("test", "test", "HR")):
+        of_kind = [view for view in views if (view.split, view.tag) == (split, tag)]
+        hidden = [
+            np.count_nonzero(~images.read_mask(view.mask, (view.width, view.height)))
+            for view in of_kind
+            if view.mask is not None
+        ]
+        if hidden:
+            pixels = sum(view.width * view.height for view in of_kind)
+            shares[kind] = float(sum(hidden) / pixels)
+    said = ", ".join(f"{100 * share:.3g} % of {kind} views" for kind, share in shares.items())
+    return {
+        "masked": shares,
+        "notes": [f"masks hide so much of the pixels: {said}"] if said else [],
+    }
+
+
 def _write_undistorted(
     inputs: _Inputs, model: Reconstruction, depths: Mapping[int, float], out: Path
 ) -> tuple[View, ...]:
@@ -234,13 +263,17 @@ def _write_undistorted(
     registered = [entry for entry in (*train, *test, *original) if entry[1] in model.viewmats]
     views, rates = [], []
     for part, i, tag in progress(registered, "undistorting", "view"):
-        image = photos.read("lr" if part == "train" and i in degraded else "hr", i)
-        height, width = image.shape[:2]
+        kind, name = "lr" if part == "train" and i in degraded else "hr", photos.names[i]
+        width, height = photos.size(kind, i)
         lens = model.lenses[i].resized(width, height)
-        file = out / "images" / part / f"{photos.names[i]}.png"
-        images.save(file, undistort(image, lens), durable=False)  # `freeze` syncs all
-        K, name = lens.undistorted().K, photos.names[i]
-        views.append(View(name, file, part, tag, width, height, K, model.viewmats[i], 1.0))
+        image, used = photos.undistorted(kind, i, lens)
+        file = out / "images" / part / f"{name}.png"
+        mask = None if used is None else out / "images" / f"{part}-masks" / f"{name}.png"
+        images.save(file, image, durable=False)  # `freeze` syncs all
+        if used is not None and mask is not None:
+            images.save_mask(mask, used, durable=False)
+        K = lens.undistorted().K
+        views.append(View(name, file, part, tag, width, height, K, model.viewmats[i], 1.0, mask))
         rates.append(sampling.sampling_rate(K, depths[i]))
     rhos = sampling.relative_to_largest(rates)
     views = [replace(view, rho=rho) for view, rho in zip(views, rhos, strict=True)]

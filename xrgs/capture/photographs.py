@@ -4,16 +4,17 @@ from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-from xrgs.capture import images
+from xrgs.capture import images, masks
 from xrgs.capture.degradations import DEGRADATIONS, resolve_degradation
-from xrgs.capture.lens import Lens
+from xrgs.capture.lens import Lens, lens_of_model, undistort
+from xrgs.capture.masks import MASKS, Mask, Masks, copy_mask
 from xrgs.capture.split import HrGeometry, TooSmallError, hr_geometry, shrink_factor
 from xrgs.errors import UnreadableError, XrgsError
 from xrgs.runtime.progress import progress
@@ -24,6 +25,9 @@ if TYPE_CHECKING:
     from xrgs.config import VariantConf
 
 _Content = TypeVar("_Content")
+
+
+_T = TypeVar("_T", np.float32, np.bool_)
 
 
 @dataclass(frozen=True)
@@ -44,6 +48,8 @@ class Photograph:
     """The name of its camera; photographs with one name share the camera in SfM."""
     K: NDArray[np.float64] | None
     """Intrinsics [3, 3] of the file, px, where they are known; then there is no distortion."""
+    path: Path
+    """The file."""
 
     @property
     def lens(self) -> Lens | None:
@@ -51,18 +57,13 @@ class Photograph:
         if self.K is None:
             return None
         K = self.K
-        return self.to_hr(Lens(*self.size, K[0, 0], K[1, 1], K[0, 2], K[1, 2]))
+        params = (K[0, 0], K[1, 1], K[0, 2], K[1, 2])
+        return self.to_hr(lens_of_model("PINHOLE", self.size, params))
 
     def to_hr(self, lens: Lens) -> Lens:
         """Return the camera of the HR view; `lens` is of the whole photograph, at any size."""
-        left, top = self.hr.crop_offset
-        resized = lens.resized(*self.hr.resized)
-        return replace(
-            resized,
-            width=self.hr.width,
-            height=self.hr.height,
-            cx=resized.cx - left,
-            cy=resized.cy - top,
+        return lens.resized(*self.hr.resized).cropped(
+            *self.hr.crop_offset, self.hr.width, self.hr.height
         )
 
 
@@ -70,8 +71,10 @@ class Photograph:
 class PhotoCollection:
     """The usable photographs of a scene, sorted by name, and their copies in a work folder.
 
-    A copy is of one of three kinds: `hr` is the HR view, `lr` the degraded view, and `up` the
-    degraded view resized back to the size of the HR view, for SfM.
+    A copy is of one of these kinds: `hr` is the HR view, `lr` the degraded view, and `up` the
+    degraded view resized back to the size of the HR view, for SfM. A copy may have a mask. Pixels
+    that the mask of a photograph hides have the colour of the nearest other one in all of them.
+    `shown`, only there for photographs with a mask, is the HR view with the hidden pixels.
     """
 
     all: tuple[Photograph, ...]
@@ -102,13 +105,45 @@ class PhotoCollection:
         """Read an existing copy, [H, W, 3] in 0..1."""
         return images.read(self.folder / self.file(kind, index))
 
+    def mask(self, kind: str, index: int) -> Mask | None:
+        """Read the mask of an existing copy, [H, W]; None where all of its pixels are used."""
+        file = copy_mask(self.folder, self.file(kind, index))
+        return images.read_mask(file, self.size(kind, index)) if file.exists() else None
+
+    def save_mask(self, kind: str, index: int, mask: Mask | None) -> None:
+        """Write the mask of a copy; None writes nothing."""
+        if mask is not None:
+            images.save_mask(copy_mask(self.folder, self.file(kind, index)), mask, durable=False)
+
     def upsample(self, index: int) -> None:
         """Make the `up` copy of a photograph from its `lr` copy, where it does not exist."""
         file = self.folder / self.file("up", index)
         if not file.exists():
-            target = self.all[index].hr
-            up = images.resize(self.read("lr", index), target.width, target.height)
-            images.save(file, up, durable=False)
+            width, height = self.all[index].hr.width, self.all[index].hr.height
+            images.save(file, images.resize(self.read("lr", index), width, height), durable=False)
+            self.save_mask("up", index, masks.resized(self.mask("lr", index), width, height))
+
+    def undistorted(
+        self, kind: str, index: int, lens: Lens
+    ) -> tuple[images.ImageArray, Mask | None]:
+        """Undistort a copy, and its mask.
+
+        Args:
+            kind: `hr` or `lr`.
+            index: The photograph.
+            lens: The camera of the copy.
+
+        Returns:
+            The image [H, W, 3], not clamped. In an HR view, pixels outside the mask are as in the
+            photograph. The mask [H, W], or None where all pixels are used.
+        """
+        image, mask = undistort(self.read(kind, index), lens), self.mask(kind, index)
+        if mask is None:
+            return image, None
+        used = masks.undistorted(mask, lens)
+        if kind == "hr":
+            image = np.where(used[..., None], image, undistort(self.read("shown", index), lens))
+        return image, used
 
 
 def prepare_hr_views(scene: Scene, conf: VariantConf, work: Path) -> PhotoCollection:
@@ -126,21 +161,25 @@ def prepare_hr_views(scene: Scene, conf: VariantConf, work: Path) -> PhotoCollec
         UnreadableError: A photograph can't be read now. It is not left out: the variant would be
             another one whenever a disk or a server fails.
         XrgsError: Fewer than two photographs can be used, or one is too large for a variant; the
-            message names the photographs.
+            message names the photographs. A mask can't be read, or is of another picture.
     """
+    (work / MASKS).mkdir(exist_ok=True)
     headers, left_out = _read_headers(scene.files)
+    given = Masks.fitted(scene.masks, headers)
     numbers = {name: f"{i:05d}" for i, name in enumerate(scene.files)}
     geometries: dict[str, HrGeometry] = {}
     phrases: dict[str, list[str]] = defaultdict(list)
     usable = _usable(scene, conf, headers, left_out, images.decode)
     for name, hr, picture in progress(usable, "HR views", "view", len(headers)):
-        copy = work / "hr" / f"{numbers[name]}.png"
-        images.save(copy, _resize_and_crop(_visible(picture, scene), hr), durable=False)
+        mask = _used(picture, given.read(name, headers[name]), scene)
+        if not _save_hr(work, f"{numbers[name]}.png", picture, mask, hr, scene):
+            left_out[name] = "its mask leaves no pixel"
+            continue
         geometries[name] = hr
         for phrase in _phrases(picture, scene):
             phrases[phrase].append(name)
     photos = _photographs(scene, conf, headers, left_out, geometries)
-    return PhotoCollection(photos, work, tuple(_notes(scene, left_out, phrases)))
+    return PhotoCollection(photos, work, (*given.notes, *_notes(scene, left_out, phrases)))
 
 
 def expected_photographs(scene: Scene, conf: VariantConf) -> PhotoCollection:
@@ -157,7 +196,8 @@ def expected_photographs(scene: Scene, conf: VariantConf) -> PhotoCollection:
     usable = _usable(scene, conf, headers, left_out, lambda _: None)
     geometries = {name: hr for name, hr, _ in usable}
     photos = _photographs(scene, conf, headers, left_out, geometries)
-    return PhotoCollection(photos, Path(), tuple(_notes(scene, left_out, {})))
+    notes = (*Masks.fitted(scene.masks, headers).notes, *_notes(scene, left_out, {}))
+    return PhotoCollection(photos, Path(), notes)
 
 
 def _usable(
@@ -220,9 +260,38 @@ def _photographs(
             hr=geometries[name],
             camera=camera,
             K=scene.intrinsics.get(name),
+            path=scene.files[name],
         )
         for name, camera in zip(names, cameras, strict=True)
     )
+
+
+def _used(picture: images.Picture, given: Mask | None, scene: Scene) -> Mask | None:
+    """Return which pixels of a photograph are used, by its mask and alpha; None where all are."""
+    used = np.ones(picture.pixels.shape[:2], np.bool_) if given is None else given
+    if scene.alpha == "mask" and picture.alpha is not None:
+        used = used & (picture.alpha >= images.OPAQUE_FROM)
+    return None if used.all() else used
+
+
+def _save_hr(
+    work: Path, file: str, picture: images.Picture, mask: Mask | None, hr: HrGeometry, scene: Scene
+) -> bool:
+    """Write the HR view of a photograph, with its mask; return whether any pixel is used."""
+    shown = picture.pixels
+    if picture.alpha is not None:
+        shown = images.composite(shown, picture.alpha, scene.background)
+    image = picture.pixels if scene.alpha == "mask" else shown
+    if mask is not None:
+        small = _crop(masks.resized(mask, *hr.resized), hr)
+        if not small.any():
+            return False
+        if not small.all():
+            images.save(work / "shown" / file, _resize_and_crop(shown, hr), durable=False)
+            images.save_mask(copy_mask(work, f"hr/{file}"), small, durable=False)
+        image = masks.filled(image, mask)
+    images.save(work / "hr" / file, _resize_and_crop(image, hr), durable=False)
+    return True
 
 
 def _notes(
@@ -245,16 +314,6 @@ def _reasons(scene: Scene, left_out: Mapping[str, str]) -> str:
 
 def _own_name(scene: Scene, name: str) -> str:
     return f"{name}{scene.files[name].suffix}"
-
-
-def _visible(picture: images.Picture, scene: Scene) -> images.ImageArray:
-    """Return a picture over the background; edges keep their colour where alpha is a mask."""
-    if picture.alpha is None:
-        return picture.pixels
-    alpha = picture.alpha
-    if scene.alpha == "mask":
-        alpha = (alpha >= images.OPAQUE_FROM).astype(np.float32)
-    return images.composite(picture.pixels, alpha, scene.background)
 
 
 def _phrases(picture: images.Picture, scene: Scene) -> Iterator[str]:
@@ -282,8 +341,12 @@ def _checked_geometry(size: tuple[int, int], shrink: float, conf: VariantConf) -
 
 
 def _resize_and_crop(image: images.ImageArray, hr: HrGeometry) -> images.ImageArray:
+    return _crop(images.resize(image, *hr.resized), hr)
+
+
+def _crop(image: NDArray[_T], hr: HrGeometry) -> NDArray[_T]:
     left, top = hr.crop_offset
-    return images.resize(image, *hr.resized)[top : top + hr.height, left : left + hr.width]
+    return image[top : top + hr.height, left : left + hr.width]
 
 
 def _read_headers(
@@ -350,3 +413,4 @@ def write_degraded(photos: PhotoCollection, which: Sequence[int], conf: VariantC
     for i in progress(which, "LR views", "view"):
         low = degrade(photos.read("hr", i), conf)
         images.save(photos.folder / photos.file("lr", i), low, durable=False)
+        photos.save_mask("lr", i, masks.degraded(photos.mask("hr", i), low.shape[:2], conf.factor))

@@ -17,6 +17,7 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 from xrgs.capture import sfm
+from xrgs.capture.masks import copy_mask
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -175,7 +176,9 @@ def sfm_images(
                 lens = lens and lens.resized(*photos.size("lr", i))
         # Where the intrinsics are known, each image has a camera of its own, with its own K.
         name = photo.name if lens else camera
-        result.append(sfm.SfmImage(photos.file(kind, i), name, lens.K if lens else None))
+        file, K = photos.file(kind, i), lens.K if lens else None
+        masked = copy_mask(photos.folder, file).exists()
+        result.append(sfm.SfmImage(file, name, K, masked))
     return result
 
 

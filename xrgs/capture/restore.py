@@ -9,28 +9,34 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-import numpy as np
 from msgspec import Struct
 
 from xrgs.capture import frozen, images, scenes, sealed
-from xrgs.capture.lens import Lens, undistort
+from xrgs.capture.lens import Lens
 from xrgs.capture.photographs import prepare_hr_views, write_degraded
 from xrgs.errors import StoreError
 from xrgs.runtime.progress import progress
 from xrgs.safeio.records import read_struct
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Mapping, Sequence
     from pathlib import Path
 
     from xrgs.capture.photographs import PhotoCollection
     from xrgs.config import SceneConf, VariantConf
 
 
+class _Camera(Struct):
+    """A camera, and the names of the photographs that have it."""
+
+    lens: Lens
+    views: list[str]
+
+
 class _Report(Struct):
     """The part of `report.json` that is read here."""
 
-    lenses: list[Lens]
+    lenses: list[_Camera]
 
 
 def restore_images(
@@ -51,7 +57,8 @@ def restore_images(
         XrgsError: The photographs can't be read.
     """
     manifest = frozen.read_manifest(folder)
-    lenses = read_struct(folder / frozen.REPORT, _Report).lenses
+    cameras = read_struct(folder / frozen.REPORT, _Report).lenses
+    lenses = {name: camera.lens for camera in cameras for name in camera.views}
     photos = prepare_hr_views(scenes.resolve(scene, cache, conf.long_side), conf, work)
     _write_images(folder, manifest.views, photos, lenses, conf)
     for wrong in sealed.changed(folder, manifest.files):
@@ -65,7 +72,7 @@ def _write_images(
     folder: Path,
     entries: Sequence[frozen.ViewEntry],
     photos: PhotoCollection,
-    lenses: Sequence[Lens],
+    lenses: Mapping[str, Lens],
     conf: VariantConf,
 ) -> None:
     (folder / "images").mkdir()
@@ -75,21 +82,15 @@ def _write_images(
     # Each view that was degraded is also there as it was before.
     degraded = {numbers[entry.name] for entry in entries if entry.split == "original"}
     write_degraded(photos, sorted(degraded), conf)
-    by_size: dict[tuple[int, int], dict[bytes, Lens]] = {}
     for entry in progress(entries, "undistorting", "view"):
         number = numbers[entry.name]
         is_low = entry.split == "train" and number in degraded
-        image = photos.read("lr" if is_low else "hr", number)
-        size = image.shape[1], image.shape[0]
-        if size not in by_size:
-            by_size[size] = _by_intrinsics([lens.resized(*size) for lens in lenses])
-        lens = by_size[size].get(np.array(entry.K, dtype=np.float64).tobytes())
-        if lens is None:
+        if entry.name not in lenses:
             file = folder / frozen.REPORT
             raise StoreError(f"damaged: {file}: lenses: none is of view {entry.name}")
-        images.save(folder / entry.file, undistort(image, lens), durable=False)
-
-
-def _by_intrinsics(lenses: Sequence[Lens]) -> dict[bytes, Lens]:
-    """Return lenses by the intrinsics of their undistorted images, which a variant's views have."""
-    return {lens.undistorted().K.tobytes(): lens for lens in lenses}
+        kind = "lr" if is_low else "hr"
+        lens = lenses[entry.name].resized(*photos.size(kind, number))
+        image, used = photos.undistorted(kind, number, lens)
+        images.save(folder / entry.file, image, durable=False)
+        if used is not None and entry.mask is not None:
+            images.save_mask(folder / entry.mask, used, durable=False)

@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 
 from xrgs.capture import images
 from xrgs.capture.lens import Lens, lens_of_model
+from xrgs.capture.masks import MASKS
 from xrgs.runtime.machine import usable_cores
 from xrgs.runtime.progress import ProgressBar
 from xrgs.safeio.sanitize import for_line
@@ -54,6 +55,8 @@ class SfmImage:
     K: NDArray[np.float64] | None = None
     """Intrinsics [3, 3], px, where they are known: then there is no distortion, and they are not
     refined."""
+    masked: bool = False
+    """Whether it has a mask, `xrgs.capture.masks.copy_mask` of its file: no features outside."""
 
 
 @dataclass(frozen=True)
@@ -203,6 +206,8 @@ def _extract(
     with ProgressBar("SfM: features", "view", len(sfm_images)) as bar:
         for camera, batch in _batches(sfm_images, 2 * threads):
             reader = pycolmap.ImageReaderOptions()
+            if batch[0].masked:  # COLMAP drops an image whose mask it does not find
+                reader.mask_path = folder / MASKS
             if camera in cameras:
                 reader.existing_camera_id = cameras[camera]
             elif batch[0].K is not None:
@@ -225,11 +230,14 @@ def _extract(
 
 
 def _batches(sfm_images: Sequence[SfmImage], size: int) -> Iterator[tuple[str, list[SfmImage]]]:
-    """Yield images of one camera, a few at a time, so that progress can be shown in between."""
-    cameras: dict[str, list[SfmImage]] = {}
+    """Yield images of one camera, a few at a time, so that progress can be shown in between.
+
+    Either all or none of them have masks.
+    """
+    groups: dict[tuple[str, bool], list[SfmImage]] = {}
     for image in sfm_images:
-        cameras.setdefault(image.camera, []).append(image)
-    for camera, group in cameras.items():
+        groups.setdefault((image.camera, image.masked), []).append(image)
+    for (camera, _), group in groups.items():
         for start in range(0, len(group), size):
             yield camera, group[start : start + size]
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+import shlex
 from collections.abc import Sequence, Set
 from dataclasses import dataclass, replace
 from difflib import get_close_matches
@@ -111,12 +113,24 @@ def check_test_names(names: Sequence[str], conf: VariantConf) -> None:
     """
     for name in conf.test:
         if name not in names:
-            similar = get_close_matches(name, names, n=1, cutoff=0.0)
-            meant = f"did you mean {similar[0]}?" if similar else "it has none"
+            # A name with commas is several names where it has no quotes.
+            similar = [whole for whole in (",".join(conf.test),) if whole in names]
+            similar += get_close_matches(name, names, n=1, cutoff=0.0)
+            meant = f"did you mean {similar[0]}?{_word(similar[0])}" if similar else "it has none"
             raise XrgsError(
                 f"variant.test: the scene has no view {name}; {meant} The name of a view is"
                 " its file's name without the suffix"
             )
+
+
+def _word(name: str) -> str:
+    """Say how a name is written on a command line or in YAML, where it can't be as it is."""
+    is_a_value = name.casefold() in {"true", "false", "null", "yes", "no", "on", "off"}
+    if re.fullmatch(r"[A-Za-z][\w.-]*", name) and not is_a_value:
+        return ""
+    escaped = name.replace("\\", r"\\").replace('"', r"\"")
+    word = shlex.quote(f'variant.test=["{escaped}"]')
+    return f' On a command line it is {word}, in a file of YAML test: ["{escaped}"].'
 
 
 def split_views(

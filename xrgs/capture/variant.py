@@ -36,9 +36,12 @@ _log = logging.getLogger(__name__)
 #: The source files that decide what every variant is: a change in one of them changes every key.
 CORE = (
     "capture/alignment.py",
+    "capture/colour.py",
+    "capture/deep.py",
     "capture/frozen.py",
     "capture/images.py",
     "capture/lens.py",
+    "capture/masks.py",
     "capture/mixing.py",
     "capture/photographs.py",
     "capture/registration.py",
@@ -50,7 +53,13 @@ CORE = (
     "capture/views.py",
 )
 #: The source files that read given poses.
-POSES = ("capture/colmap.py", "capture/poses.py")
+POSES = (
+    "capture/colmap.py",
+    "capture/poses/__init__.py",
+    "capture/poses/colmap.py",
+    "capture/poses/given.py",
+    "capture/poses/transforms.py",
+)
 
 
 def key(scene: SceneConf, conf: VariantConf) -> str:

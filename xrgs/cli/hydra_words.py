@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import re
+import shlex
 from contextlib import contextmanager, suppress
+from itertools import accumulate, pairwise
 from typing import TYPE_CHECKING
 
 from hydra.core.override_parser.overrides_parser import OverridesParser
@@ -21,10 +23,22 @@ from xrgs.safeio.paths import user_path
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
 
+    from hydra.core.override_parser.types import Override
+
 #: How Hydra says that a key of an override is unknown.
 _NOT_OVERRIDDEN = re.compile(r"Could not override '([^']+)'")
+#: A text in quotes, and such a text where it is a whole value of a list.
+_IN_QUOTES = r"""(['"])(?:\\.|(?!\1).)*\1"""
+_QUOTED, _QUOTED_PART = (
+    re.compile(_IN_QUOTES),
+    re.compile(rf"(?:^|(?<=[\[,]))\s*{_IN_QUOTES}(?=\s*(?:[\],]|$))"),
+)
+#: By how much a bracket changes the depth of what is behind it.
+_DEPTH = dict.fromkeys("([{", 1) | dict.fromkeys(")]}", -1)
+#: Keys whose values are lists of names.
+_NAMES = frozenset({"variant.test"})
 #: Keys whose values are paths.
-_PATHS = frozenset({"scene.path", "store", "data_root", "variant.poses"})
+_PATHS = frozenset({"scene.path", "store", "data_root", "variant.poses", "scene.masks"})
 
 
 @contextmanager
@@ -71,16 +85,20 @@ def _missing_file(file: str, options: Sequence[str]) -> str:
     name = file.removeprefix(f"{group}/")
     if not (known := sorted({*files(group), *options})):
         return f"{group}: there is no such key{did_you_mean(group, config.known_keys())}"
+    if group == "scene" and user_path(name).is_dir():
+        word = shlex.quote(f"scene.path={name}")
+        return f"scene={name}: a folder of photographs is given as scene=folder {word}"
     offered = did_you_mean(name, known) or f"; choose from: {', '.join(known)}"
     return f"{group}={name}: there is no such choice{offered}"
 
 
 def with_quotes(words: Sequence[str]) -> list[str]:
-    """Return Hydra overrides, with quotes around paths that Hydra's grammar would refuse or change.
+    """Return Hydra overrides, with quotes around paths and names that Hydra would read otherwise.
 
-    Paths that Hydra reads as they are written, or that are in quotes already, stay unchanged.
-    Commas in `scene.path` separate scenes, unless there is a folder of that name; a sweep has one
-    store, so that commas in `store` are part of the path.
+    Paths and names may have any character; a value that is in quotes already stays as it is. Commas
+    in `scene.path` and in groups of files separate the values of an axis, unless there is a folder
+    of that name. A list of names is `[a,b]`, or `a,b`; `[a,b],[c]` is an axis of two lists. Hydra
+    reads all other keys.
 
     Args:
         words: Arguments of the command line.
@@ -95,25 +113,82 @@ def with_quotes(words: Sequence[str]) -> list[str]:
 
 
 def _with_quotes(word: str) -> str:
-    key, _, value = word.partition("=")
-    if key not in _PATHS or not value or value[0] in "'\"":
+    signed, _, value = word.partition("=")
+    key = signed.lstrip("+")
+    if not value:
         return word
-    exists = user_path(value.removesuffix(ALL_BELOW)).exists()
-    if exists or key != "scene.path":
-        return f"{key}={_quoted(key, escape_interpolations(value) if exists else value)}"
-    return f"{key}={','.join(_quoted(key, part) for part in value.split(','))}"
+    if key in _NAMES:
+        quoted = _quoted_lists(value)
+    elif (value[0] in "'\"" or key in config.GROUPS) and _parsed(word):
+        quoted = value
+    elif key in config.GROUPS:
+        parts = _parts(value)
+        quoted = ",".join(part if part[:1] == "[" else _quoted(key, part) for part in parts)
+    elif key == "scene.name":
+        quoted = _quoted(key, escape_interpolations(value))
+    elif key in _PATHS:
+        parts = value.split(",") if key == "scene.path" and not _exists(value) else [value]
+        quoted = ",".join(_quoted_path(key, part) for part in parts)
+    else:
+        quoted = value
+    return f"{signed}={quoted}"
+
+
+def _exists(path: str) -> bool:
+    return user_path(path.removesuffix(ALL_BELOW)).exists()
+
+
+def _parsed(word: str) -> Override | None:
+    """Return what Hydra reads from a word; None where its grammar refuses the word."""
+    with suppress(HydraException):
+        (override,) = OverridesParser.create().parse_overrides([word])
+        return override
+    return None
+
+
+def _quoted_path(key: str, value: str) -> str:
+    if _exists(value):
+        return _quoted(key, escape_interpolations(value))
+    override = _parsed(f"{key}={value}")
+    # The word null, and the escapes of Hydra's grammar, where there is no file of that name.
+    if override and (override.value() is None or "\\" in value):
+        return value
+    return _quoted(key, value)
 
 
 def _quoted(key: str, value: str) -> str:
-    """Return a path in quotes, or as it is if Hydra reads it as it is written."""
-    with suppress(HydraException):
-        (override,) = OverridesParser.create().parse_overrides([f"{key}={value}"])
-        parsed = override.value()
-        if parsed == value and not override.is_sweep_override():
-            return value
-        if (parsed is None or "\\" in value) and not user_path(value).exists():
-            return value
+    """Return a text in quotes, or as it is if Hydra reads it as it is written."""
+    override = _parsed(f"{key}={value}")
+    if override and not override.is_sweep_override() and override.value() == value:
+        return value
     return QuotedString(value, Quote.single).with_quotes()
+
+
+def _quoted_lists(value: str) -> str:
+    """Return one list of names, or several that are an axis, with quotes around each name."""
+    if value.startswith("${"):
+        return value
+    lists = [part.strip() for part in _parts(value)]
+    if not all(part.startswith("[") and part.endswith("]") for part in lists):
+        lists = [value if value[0] == "[" and value[-1] == "]" else f"[{value}]"]
+    return ",".join(f"[{','.join(map(_quoted_name, _parts(names[1:-1])))}]" for names in lists)
+
+
+def _quoted_name(text: str) -> str:
+    name = text.strip()
+    if not name or _QUOTED.fullmatch(name):
+        return name
+    return QuotedString(escape_interpolations(name), Quote.single).with_quotes()
+
+
+def _parts(text: str) -> list[str]:
+    """Split a text at its commas, but for those in quotes and, where they balance, in brackets."""
+    shape = _QUOTED_PART.sub(lambda quoted: "'" * len(quoted[0]), text)
+    depths = list(accumulate(_DEPTH.get(char, 0) for char in shape))
+    if depths and (min(depths) < 0 or depths[-1]):
+        depths = [0] * len(text)
+    cuts = [i for i, char in enumerate(shape) if char == "," and depths[i] == 0]
+    return [text[begin + 1 : end] for begin, end in pairwise([-1, *cuts, len(text)])]
 
 
 def files(group: str) -> list[str]:

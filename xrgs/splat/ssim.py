@@ -79,8 +79,10 @@ def _weights() -> list[float]:
 
 def _weighted_sum(image: Tensor, axis: int) -> Tensor:
     """Return the weighted sum of the window around each place that it fits around along an axis."""
+    first, *others = _weights()
     length = image.shape[axis] - WINDOW + 1
-    total = torch.zeros_like(image.narrow(axis, 0, length))
-    for tap, weight in enumerate(_weights()):
-        total += weight * image.narrow(axis, tap, length)
+    total = image.narrow(axis, 0, length) * first
+    term = torch.empty_like(total)
+    for tap, weight in enumerate(others, 1):
+        total += torch.mul(image.narrow(axis, tap, length), weight, out=term)
     return total

@@ -361,13 +361,15 @@ def _hand_over(cell: PlannedCell, threads: int, store: Store) -> list[str]:
     if cell.identity is None or cell.cell_id is None:
         raise ValueError(f"{cell.name}: launched without an identity")
     home, scene = store.path.absolute(), cell.conf.scene
-    path = str(user_path(scene.path).absolute()) if scene.path else scene.path
+    path, masks = (
+        str(user_path(text).absolute()) if text else text for text in (scene.path, scene.masks)
+    )
     conf = replace(
         cell.conf,
         store=str(home),
         splat=replace(cell.conf.splat, backend=resolve_backend(cell.conf.splat.backend)),
         threads=cell.conf.threads or threads,
-        scene=replace(scene, path=path),
+        scene=replace(scene, path=path, masks=masks),
     )
     # Under the lease: another sweep may be training the cell, or have finished it, since the plan.
     # A dead owner that this process has watched for long enough need not be watched by the job.

@@ -7,10 +7,11 @@ from typing import TYPE_CHECKING
 
 import torch
 
+from xrgs.runtime.machine import single_torch_thread
 from xrgs.runtime.progress import progress
 from xrgs.splat.backend import resolve_backend
 from xrgs.splat.gaussians import PARAMETERS, Gaussians, from_points
-from xrgs.splat.loss import photometric_loss, prepare_target
+from xrgs.splat.loss import Target, photometric_loss, prepare_target
 from xrgs.splat.optimizer import SplatOptimizer
 from xrgs.splat.settings import NOMINAL_STEPS
 from xrgs.splat.strategy.default import DefaultStrategy
@@ -18,7 +19,7 @@ from xrgs.splat.strategy.refinement import Refinement
 from xrgs.training.checkpoint import Checkpoint
 from xrgs.training.components import Components
 from xrgs.training.components import build as build_components
-from xrgs.training.memory import TrainingMemory
+from xrgs.training.memory import OnDemand, TrainingMemory
 from xrgs.training.recorder import TrainingRecorder, TrainingResult
 from xrgs.training.rendering import StepRenderer
 from xrgs.training.sampler import EpochSampler
@@ -32,7 +33,6 @@ if TYPE_CHECKING:
     from xrgs.capture.dataset import Dataset
     from xrgs.config import Conf, SplatConf
     from xrgs.splat.cameras import Camera
-    from xrgs.splat.loss import Target
     from xrgs.splat.rendering import Render
     from xrgs.splat.strategy.base import Strategy
     from xrgs.training.components import Component, Step, TrainingView
@@ -97,24 +97,31 @@ class _Views:
 
     def __init__(self, views: Iterable[TrainingView]) -> None:
         self.own: Mapping[str, TrainingView] = {view.name: view for view in views}
-        self.present: Mapping[str, TrainingView] = self.own
-        self.targets = {name: prepare_target(view.image) for name, view in self.own.items()}
+        self.present: Mapping[str, TrainingView] = {}
+        self.drawn: Target | None = None
+        """The target of the last step's view."""
+        self.change_to(self.own)
 
     def change_to(self, views: Mapping[str, TrainingView]) -> None:
-        """Use other views, and prepare the targets of the photographs that changed."""
-        if views is self.present:
-            return
-        self.targets = {
-            name: self.targets[name]
-            if view.image is self.present[name].image
-            else prepare_target(view.image)
-            for name, view in views.items()
-        }
-        self.present = views
+        """Use other views, with the moments of their photographs."""
+        if views is not self.present:
+            self.present = views
+            self.moments = OnDemand(_moments, views.values())
 
-    def target(self, step: Step) -> Target:
-        """Return the target of the step's view."""
-        return self.targets[step.view.name]
+    def target(self, view: TrainingView) -> Target:
+        """Return the target of a present view; its photograph is a new tensor where 8 bits are."""
+        # First, so that no two targets exist at once.
+        self.drawn = None
+        self.drawn = Target(view.image, *self.moments[view.name])
+        return self.drawn
+
+
+def _moments(view: TrainingView) -> tuple[Tensor, Tensor]:
+    """The moments of a view's photograph that the loss needs (`Target`)."""
+    # More threads are slower where another program has a core, since the blocks of rows are small.
+    with single_torch_thread():
+        target = prepare_target(view.image)
+    return target.mean, target.variance
 
 
 @dataclass(frozen=True)
@@ -197,10 +204,11 @@ def _forward(run: _Run, step: Step) -> _Forward:
     camera = components.render_camera(step.view.camera, step)
     sh_degree = run.renderer.sh_degree(step)
     means2d_offset = torch.zeros(len(gaussians), 2, requires_grad=True)
-    with run.memory.of_forward(step, len(gaussians), sh_degree):
+    target, kept = run.views.target(step.view), step.view.name in run.views.moments.kept
+    with run.memory.of_forward(step, len(gaussians), sh_degree, kept=kept):
         render = run.renderer.render(gaussians, step, camera, means2d_offset)
         # Loss: L1 and SSIM against the photograph, then terms and weights of the components.
-        image, target = components.to_photograph(render.image, step), run.views.target(step)
+        image = components.to_photograph(render.image, step)
         weights = components.pixel_weights(step)
         loss = photometric_loss(
             image, target, l1=1 - ssim, ssim=ssim, pixel_weight=weights, backend=run.backend

@@ -1,12 +1,12 @@
-"""Counts the memory that training holds: every tensor once, and the renderer's buffers."""
+"""The memory of training: bounds what is kept of the photographs, and counts what is held."""
 
 from __future__ import annotations
 
 import weakref
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from types import FunctionType, ModuleType
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import torch
 from torch import Tensor
@@ -14,23 +14,68 @@ from torch import Tensor
 if TYPE_CHECKING:
     from xrgs.splat.rendering import Render
     from xrgs.training.checkpoint import State
-    from xrgs.training.components import Step
+    from xrgs.training.components.base import Step, TrainingView
 
+T = TypeVar("T")
+
+#: The most bytes that one `OnDemand` keeps: the moments of 58 photographs of 504 x 378 px, or of 14
+#: of 1,008 x 756 px.
+KEPT_BYTES = 1 << 28
 
 _CODE = (type, ModuleType, FunctionType)
+
+
+class OnDemand(Mapping[str, T]):
+    """Tensors of training views by the views' names, made anew where they are not kept.
+
+    The values of the first views are kept, as far as `KEPT_BYTES` go. Which views are first does
+    not matter, since they are drawn in random order.
+
+    Attributes:
+        make: What makes a value; `TrainingMemory` counts its tensors too.
+        kept: The values that are kept.
+    """
+
+    def __init__(self, make: Callable[[TrainingView], T], views: Iterable[TrainingView]) -> None:
+        """Make the values that are kept.
+
+        Args:
+            make: Returns the value of a view: a tensor, or an object that has some.
+            views: The views, with unique names.
+        """
+        self.make = make
+        self._views = {view.name: view for view in views}
+        self.kept: dict[str, T] = {}
+        room = KEPT_BYTES
+        for name, view in self._views.items():
+            value = make(view)
+            room -= sum(_storages(tensors_in(value)).values())
+            if room < 0:
+                break
+            self.kept[name] = value
+
+    def __getitem__(self, name: str) -> T:
+        return self.kept[name] if name in self.kept else self.make(self._views[name])
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._views)
+
+    def __len__(self) -> int:
+        return len(self._views)
 
 
 class TrainingMemory:
     """The largest number of bytes that a step of training held.
 
     A step holds the model, its gradients and the optimizer's state, the statistics of
-    densification, the photographs and their targets for the loss, the tensors of the components,
-    what autograd saves between forward and backward, and the buffers of the renderer. All count as
-    if they existed at once; tensors that share their memory count once. What backward allocates and
-    frees in between does not count.
+    densification, the photographs (8 bits), the moments that are kept of them and the target of the
+    step's view for the loss, the tensors of the components, what autograd saves between forward and
+    backward, and the buffers of the renderer. All count as if they existed at once; tensors that
+    share their memory count once. What forward and backward allocate and free in between does not
+    count.
 
-    Steps with the same number of Gaussians and harmonics, on views of one size and class, hold the
-    same. Only the first of them is counted.
+    Steps with the same number of Gaussians and harmonics, on views of one size and class whose
+    moments are all kept or all not, hold the same. Only the first of them is counted.
 
     Attributes:
         largest_bytes: The largest count so far.
@@ -49,16 +94,20 @@ class TrainingMemory:
         """The kind of a step whose forward pass was noted, and the bytes that autograd saved."""
 
     @contextmanager
-    def of_forward(self, step: Step, gaussians: int, sh_degree: int) -> Iterator[None]:
+    def of_forward(
+        self, step: Step, gaussians: int, sh_degree: int, *, kept: bool = True
+    ) -> Iterator[None]:
         """Note what autograd saves in the forward pass of a step that has not been counted.
 
         Args:
             step: The step.
             gaussians: The number of Gaussians.
             sh_degree: Highest band of the spherical harmonics that is rendered.
+            kept: Whether the moments of the view's photograph are kept.
         """
-        size, logged = list(step.view.image.shape), sorted(step.log.items())
-        kind = f"{gaussians} {sh_degree} {step.view.tag} {size} {logged}"
+        camera, logged = step.view.camera, sorted(step.log.items())
+        size = f"{camera.width} x {camera.height} px"
+        kind = f"{gaussians} {sh_degree} {step.view.tag} {size} {kept} {logged}"
         self._noted = None
         if kind in self._counted:
             yield
@@ -112,6 +161,8 @@ def tensors_in(value: object) -> Iterator[Tensor]:
             yield inner
             if inner.is_leaf and inner.grad is not None:
                 yield inner.grad
+        elif isinstance(inner, OnDemand):
+            waiting += [inner.kept, inner.make]
         elif isinstance(inner, Mapping):
             waiting += inner.values()
         elif isinstance(inner, (list, tuple, set, frozenset)):
@@ -122,5 +173,5 @@ def tensors_in(value: object) -> Iterator[Tensor]:
 
 def _storages(tensors: Iterable[Tensor]) -> dict[int, int]:
     """Return the bytes of the memory of tensors by its address."""
-    storages = (tensor.untyped_storage() for tensor in tensors)
-    return {storage.data_ptr(): storage.nbytes() for storage in storages}
+    found = (tensor.untyped_storage() for tensor in tensors)
+    return {storage.data_ptr(): storage.nbytes() for storage in found}

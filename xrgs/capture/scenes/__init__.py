@@ -7,20 +7,21 @@ from __future__ import annotations
 
 import hashlib
 from dataclasses import replace
+from pathlib import Path
 from typing import TYPE_CHECKING
 
-from xrgs.capture.scenes.folder import FolderScene
+from xrgs.capture import masks
+from xrgs.capture.scenes.folder import FolderScene, list_photographs
 from xrgs.capture.scenes.motorcycle import Motorcycle
 from xrgs.capture.scenes.procedural import ProceduralScene
 from xrgs.capture.scenes.rendered import verify
-from xrgs.capture.scenes.scene import Scene, SceneKind, label
+from xrgs.capture.scenes.scene import Scene, SceneKind, files_digest, label
 from xrgs.capture.scenes.video import VideoScene
 from xrgs.errors import XrgsError
 from xrgs.safeio.paths import user_path
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
-    from pathlib import Path
 
     from xrgs.config import SceneConf
 
@@ -77,6 +78,8 @@ def fingerprint(conf: SceneConf, long_side: int = 0) -> str:
         raise XrgsError(f"scene.alpha={conf.alpha}: must be one of {', '.join(ALPHA)}")
     if (conf.alpha, *conf.background) != (ALPHA[0], 0, 0, 0):
         content += f"\0{conf.alpha}\0{list(conf.background)}"
+    if conf.masks is not None:
+        content += f"\0{files_digest(_masks(conf, long_side)[0])}"
     return hashlib.sha256(content.encode()).hexdigest()[:16]
 
 
@@ -91,10 +94,26 @@ def resolve(conf: SceneConf, cache: Path, long_side: int = 0) -> Scene:
 
     Raises:
         UnreadableError: The photographs are there, but can't be read now.
-        XrgsError: The kind is unknown, or the photographs are not there.
+        XrgsError: The kind is unknown, or the photographs or their masks are not there.
     """
     found = _kind(conf).resolve(conf, long_side, cache / fingerprint(conf, long_side))
-    return replace(found, alpha=conf.alpha, background=conf.background)
+    given, notes = _masks(conf, long_side)
+    return replace(
+        found,
+        alpha=conf.alpha,
+        background=conf.background,
+        masks=given,
+        notes=(*found.notes, *notes),
+    )
+
+
+def _masks(conf: SceneConf, long_side: int) -> tuple[dict[str, Path], tuple[str, ...]]:
+    """Find the masks by the names of the photographs, and what is said of them."""
+    if conf.masks is None:
+        return {}, ()
+    if conf.kind == "folder":
+        return masks.find(conf.masks, list_photographs(conf.path, long_side, conf.masks))
+    return masks.find(conf.masks, dict.fromkeys(names(conf, long_side), Path()))
 
 
 def _kind(conf: SceneConf) -> SceneKind:

@@ -84,30 +84,31 @@ class FolderScene:
 
     def names(self, conf: SceneConf, long_side: int) -> list[str]:
         """Return the names of the photographs, see `list_photographs`."""
-        return list(list_photographs(conf.path, long_side))
+        return list(list_photographs(conf.path, long_side, conf.masks))
 
     def digest(self, conf: SceneConf, long_side: int) -> str:
         """Hash the names and bytes of the photographs."""
-        return files_digest(list_photographs(conf.path, long_side))
+        return files_digest(list_photographs(conf.path, long_side, conf.masks))
 
     def resolve(self, conf: SceneConf, long_side: int, home: Path) -> Scene:
         """List the photographs."""
-        found = look(conf.path, long_side)
+        found = look(conf.path, long_side, conf.masks)
         return Scene(label(conf), home.name, found.files, notes=found.notes)
 
 
-def list_photographs(path: str | None, long_side: int) -> dict[str, Path]:
+def list_photographs(path: str | None, long_side: int, masks: str | None = None) -> dict[str, Path]:
     """List the image files of a scene's folder; see `look`."""
-    return look(path, long_side).files
+    return look(path, long_side, masks).files
 
 
-def look(path: str | None, long_side: int) -> Listing:
+def look(path: str | None, long_side: int, masks: str | None = None) -> Listing:
     """List the image files of a scene's folder, and say what is not among them.
 
     Args:
         path: `scene.path`, the folder; with `/**` at its end, all folders below it too.
         long_side: `variant.long_side`, px. Of an LLFF scene the smallest copies whose longer side
             has at least so many px are taken; the largest where none has, or where this is 0.
+        masks: `scene.masks`, a folder that is not looked into; None where there is none.
 
     Returns:
         The files and the notes. The name of a view is the name of the file without its suffix; with
@@ -127,7 +128,8 @@ def look(path: str | None, long_side: int) -> Listing:
             if folder.is_file():
                 why = "not a folder; for the frames of a video: scene=video scene.path=..."
             raise XrgsError(f"scene.path={folder}: {why}")
-        taken, notes = (_all_below if nested else _inside)(folder, long_side)
+        known = None if masks is None else user_path(masks).resolve()
+        taken, notes = (_all_below if nested else _inside)(folder, long_side, known)
         files = [file for inside in taken.values() for file in inside]
         for choose in (_photographs, without_copies):
             files, more = choose(files, folder)
@@ -150,7 +152,7 @@ def look(path: str | None, long_side: int) -> Listing:
 _Tree = dict[Path, list[Path]]
 
 
-def _inside(folder: Path, long_side: int) -> tuple[_Tree, list[str]]:
+def _inside(folder: Path, long_side: int, masks: Path | None) -> tuple[_Tree, list[str]]:
     """List the photographs in a folder itself, or one of the sizes of an LLFF scene."""
     sizes = [_images_in(inside) for inside in sorted(folder.iterdir()) if _is_size(inside)]
     taken, notes = one_of_each_size([files for files in sizes if files], long_side)
@@ -161,22 +163,21 @@ def _inside(folder: Path, long_side: int) -> tuple[_Tree, list[str]]:
         tree = {taken[which][0].parent: list(taken[which])}
     else:
         tree, notes = {folder: _images_in(folder)}, []
-    known = {file for files in sizes for file in files if files[0].parent not in tree}
-    return tree, notes + _in_other_folders(folder, tree, known if len(taken) == 1 else set())
+    if len(taken) == 1:  # copies in other sizes are no loss
+        tree |= {files[0].parent: [] for files in sizes if files and files[0].parent not in tree}
+    return tree, notes + _in_other_folders(folder, tree, masks)
 
 
-def _all_below(folder: Path, long_side: int) -> tuple[_Tree, list[str]]:
+def _all_below(folder: Path, long_side: int, masks: Path | None) -> tuple[_Tree, list[str]]:
     """List the photographs in a folder and all below it, of LLFF scenes those of one size."""
     passed: dict[str, list[Path]] = defaultdict(list)
-    tree = {inside: _images_in(inside) for inside in _folders(folder, passed)}
+    tree = {inside: _images_in(inside) for inside in _folders(folder, passed, masks)}
     tree, notes = _of_sizes(tree, long_side)
     root = folder.resolve()
-    for what, folders in passed.items():
-        searched = {inside for inside in folders if _is_link_into(inside, root)}
-        counts = {inside: _count_anywhere(inside) for inside in folders if inside not in searched}
-        use = f"; scene.masks={folders[0]} uses them" if what == _MASKS else ""
-        notes += _left_out(counts, folder, f"{what}{use}")
-    return tree, notes
+    for what in sorted(passed.keys() - {_MASKS}):
+        own = [inside for inside in passed[what] if not _is_link_into(inside, root)]
+        notes += _left_out({inside: _count_anywhere(inside) for inside in own}, folder, what)
+    return tree, notes + _masks_left_out(passed, folder)
 
 
 def _of_sizes(tree: _Tree, long_side: int) -> tuple[_Tree, list[str]]:
@@ -193,23 +194,25 @@ def _of_sizes(tree: _Tree, long_side: int) -> tuple[_Tree, list[str]]:
     return {inside: files for inside, files in tree.items() if inside not in dropped}, notes
 
 
-def _folders(folder: Path, passed: dict[str, list[Path]], depth: int = 0) -> Iterator[Path]:
+def _folders(
+    folder: Path, passed: dict[str, list[Path]], masks: Path | None, depth: int = 0
+) -> Iterator[Path]:
     """Yield a folder and all below it that may hold photographs; add the others to `passed`.
 
-    Hidden folders are passed over in silence.
+    Hidden folders and the folder of `scene.masks` are passed over in silence.
     """
     if depth > _MAX_DEPTH:
         raise XrgsError(f"{folder}: folders are nested more than {_MAX_DEPTH} deep")
     yield folder
     for inside in sorted(folder.iterdir()):
-        if inside.name.startswith(".") or not inside.is_dir():
+        if inside.name.startswith(".") or not inside.is_dir() or inside.resolve() == masks:
             continue
         if inside.is_symlink():
             passed["links to folders are not followed"].append(inside)
         elif what := _made_by_programs(inside):
             passed[what].append(inside)
         else:
-            yield from _folders(inside, passed, depth + 1)
+            yield from _folders(inside, passed, masks, depth + 1)
 
 
 def _made_by_programs(folder: Path) -> str:
@@ -232,24 +235,22 @@ def _count_anywhere(folder: Path) -> int:
     return sum(1 for name in names if Path(name).suffix.lower() in SUFFIXES)
 
 
-def _in_other_folders(folder: Path, taken: _Tree, known: set[Path]) -> list[str]:
-    """Say which images in and below a folder are not taken, and how to get them.
-
-    Args:
-        folder: The folder.
-        taken: What is taken of it.
-        known: Images that show what is taken in other sizes, which are no loss.
-    """
+def _in_other_folders(folder: Path, taken: _Tree, masks: Path | None) -> list[str]:
+    """Say which images in and below a folder are not taken, and how to get them."""
     passed: dict[str, list[Path]] = defaultdict(list)
     try:
-        below = [inside for inside in _folders(folder, passed) if inside not in taken]
-        counts = {inside: len(set(_images_in(inside)) - known) for inside in below}
+        below = [inside for inside in _folders(folder, passed, masks) if inside not in taken]
+        counts = {inside: len(_images_in(inside)) for inside in below}
     except (OSError, XrgsError) as error:
         return [f"the folders below can't be searched for more images ({error})"]
-    masks = {inside: _count_anywhere(inside) for inside in passed[_MASKS]}
     all_below = f"scene.path={folder}{ALL_BELOW} takes the images of all folders"
-    use = f"{_MASKS}; scene.masks={next(iter(masks), folder)} uses them"
-    return _left_out(counts, folder, all_below) + _left_out(masks, folder, use)
+    return _left_out(counts, folder, all_below) + _masks_left_out(passed, folder)
+
+
+def _masks_left_out(passed: Mapping[str, Sequence[Path]], folder: Path) -> list[str]:
+    counts = {inside: _count_anywhere(inside) for inside in passed.get(_MASKS, ())}
+    use = f"{_MASKS}; scene.masks={next(iter(counts), folder)} uses them"
+    return _left_out(counts, folder, use)
 
 
 def _left_out(counts: Mapping[Path, int], folder: Path, why: str) -> list[str]:

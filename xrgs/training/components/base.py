@@ -68,7 +68,7 @@ class TrainingView(Protocol):
 
     @property
     def image(self) -> Tensor:
-        """The photograph [H, W, 3] in 0..1."""
+        """The photograph [H, W, 3] in 0..1. It may be a new tensor at each access."""
 
 
 @dataclass(frozen=True)
@@ -181,7 +181,7 @@ class Component:
         Returns:
             Views of the same names and tags, each with a photograph of its camera's size: `views`
             itself if nothing is changed, the same object as at the step before if nothing has
-            changed since. The loss prepares a photograph anew if its tensor is another one.
+            changed since. The loss prepares the photographs anew if it is another object.
         """
         del step
         return views

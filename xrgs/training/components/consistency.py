@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from xrgs.errors import XrgsError
+from xrgs.runtime.machine import single_torch_thread
 from xrgs.splat.loss import WINDOW, Target, photometric_loss, prepare_target
 from xrgs.splat.resample import resize
 from xrgs.training.components.base import (
@@ -19,6 +20,7 @@ from xrgs.training.components.base import (
     TrainingView,
     check_not_negative,
 )
+from xrgs.training.memory import OnDemand
 
 if TYPE_CHECKING:
     from xrgs.config import ConsistencyConf
@@ -35,7 +37,7 @@ class Consistency(Component):
         L_cons = w (lambda_1 |phi(I_rend) - I_pair|_1 + lambda_2 (1 - SSIM(phi(I_rend), I_pair)))
 
     where phi is bicubic resampling to the opposite resolution and I_pair = phi(I) is the paired
-    image, computed once for each photograph I. Here w is `weight`, lambda_1 is `l1` and lambda_2 is
+    image of photograph I. Here w is `weight`, lambda_1 is `l1` and lambda_2 is
     `ssim`; the L1 term is a mean over pixels and channels, SSIM is as in the photometric loss
     [wang2004].
 
@@ -72,7 +74,7 @@ class Consistency(Component):
         factor: int,
         backend: str = "torch",
     ) -> None:
-        """Compute the paired images.
+        """Compute the sizes of the paired images, and those images that are kept.
 
         Args:
             settings: `components.consistency` of the config.
@@ -90,13 +92,13 @@ class Consistency(Component):
         self.weight, self.l1, self.ssim = settings.weight, settings.l1, settings.ssim
         self.lr_mode = settings.lr_mode
         self.backend = backend
-        hr_sides = (max(view.image.shape) for view in views if view.tag == "HR")
+        hr_sides = (
+            max(view.camera.width, view.camera.height) for view in views if view.tag == "HR"
+        )
         hr_long_side = max(hr_sides, default=math.inf)
-        self.paired_targets = {
-            view.name: _paired_target(view, factor, hr_long_side, backend)
-            for view in views
-            if view.tag == "HR" or settings.lr_mode == "exact"
-        }
+        paired = [view for view in views if view.tag == "HR" or settings.lr_mode == "exact"]
+        self.sizes = {view.name: _opposite_size(view, factor, hr_long_side) for view in paired}
+        self.paired_targets = OnDemand(self._paired_target, paired)
 
     @classmethod
     def from_settings(cls, settings: ConsistencyConf, setup: TrainingSetup) -> Self | None:
@@ -131,10 +133,16 @@ class Consistency(Component):
             return self.weight * self.l1 * difference.to(image)
         return None
 
+    def _paired_target(self, view: TrainingView) -> Target:
+        """The photograph of a view at the opposite resolution."""
+        image = resize(view.image, *self.sizes[view.name], backend=self.backend)
+        with single_torch_thread():  # as the loop prepares photographs
+            return prepare_target(image)
 
-def _paired_target(view: TrainingView, factor: int, hr_long_side: float, backend: str) -> Target:
-    """The photograph at the opposite resolution; `hr_long_side` is of the largest HR view, px."""
-    height, width = view.image.shape[:2]
+
+def _opposite_size(view: TrainingView, factor: int, hr_long_side: float) -> tuple[int, int]:
+    """The height and width of a paired image; `hr_long_side` is of the largest HR view, px."""
+    height, width = view.camera.height, view.camera.width
     if view.tag == "HR" or max(height, width) > hr_long_side / math.sqrt(factor):
         height, width = round(height / factor), round(width / factor)
     else:
@@ -145,4 +153,4 @@ def _paired_target(view: TrainingView, factor: int, hr_long_side: float, backend
             f" px, smaller than the SSIM window of {WINDOW} px of the consistency loss; use larger"
             " photographs or a smaller factor"
         )
-    return prepare_target(resize(view.image, height, width, backend=backend))
+    return height, width

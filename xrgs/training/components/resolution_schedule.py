@@ -93,7 +93,7 @@ class ResolutionSchedule(Component):
         self.backend = backend
         shortest = min(min(view.camera.width, view.camera.height) for view in high)
         largest = min(_LARGEST_FACTOR, max(1, shortest // WINDOW))
-        self.kept = kept_shares([view.image for view in high], range(1, largest + 1))
+        self.kept = kept_shares((view.image for view in high), range(1, largest + 1))
         self.factor = 1
         self.reduced: Mapping[str, TrainingView] = {}
         """The views at the present factor; empty where it is 1."""
@@ -150,7 +150,7 @@ class ResolutionSchedule(Component):
         return _ReducedView(view.name, view.tag, view.rho, camera, image)
 
 
-def kept_shares(images: Sequence[Tensor], factors: Iterable[int]) -> dict[int, float]:
+def kept_shares(images: Iterable[Tensor], factors: Iterable[int]) -> dict[int, float]:
     """Compute the share of the spectra's magnitude that downsampling keeps.
 
     Args:

@@ -132,11 +132,9 @@ class ErrorScore(_ViewScores):
     """
 
     def __init__(self, settings: ErrorScoreConf, views: Sequence[TrainingView], seed: int) -> None:
-        """Take the settings, all training views and the seed of the run; compute the edges."""
+        """Take the settings, all training views and the seed of the run."""
         super().__init__(views, settings.views, seed)
-        self.edges: dict[str, Tensor] | None = None
-        if settings.of == "edges":
-            self.edges = {view.name: _in_unit_range(edges(view.image)) for view in views}
+        self.of = settings.of
 
     @classmethod
     def from_settings(cls, settings: ErrorScoreConf, setup: TrainingSetup) -> Self | None:
@@ -159,8 +157,8 @@ class ErrorScore(_ViewScores):
 
     def score_in_view(self, gaussians: Gaussians, step: Step) -> Tensor:
         """Return the sums [N] over the view's map, relative to their mean where above 0."""
-        if self.edges is not None:
-            pixels = self.edges[step.view.name]
+        if self.of == "edges":
+            pixels = _in_unit_range(edges(step.view.image))
         else:
             pixels = _mean_error(self.renderer.photograph(gaussians, step), step.view.image)
         # Bringing a render down weighs some pixels with less than 0.

@@ -7,6 +7,7 @@ one for each key of the config that `Weighting` reads.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from functools import partial
 from math import prod
 from typing import TYPE_CHECKING, Self
@@ -26,6 +27,7 @@ from xrgs.training.components.base import (
     check_not_negative,
 )
 from xrgs.training.components.texture import gradient_magnitude
+from xrgs.training.memory import OnDemand
 
 if TYPE_CHECKING:
     from xrgs.config import ComponentsConf, LossWeightingConf
@@ -249,7 +251,7 @@ def scheduled_attenuation(step: Step, start: float, ramp: float) -> float:
 
 def region_attenuations(
     views: Sequence[TrainingView], points: Tensor, *, texture: float, near: float
-) -> dict[str, Tensor]:
+) -> Mapping[str, Tensor]:
     """Attenuate textured parts of LR views that an HR view covers [xrgs, 7.2, proposal 2].
 
     Region weighting: the attenuation of a pixel is `min(1, g / texture)` where an HR view covers it
@@ -271,13 +273,22 @@ def region_attenuations(
         Attenuations [H, W] in 0..1, by the name of each LR view.
     """
     hr_cameras = [view.camera for view in views if view.tag == "HR"]
-    attenuations = {}
-    for view in views:
-        if view.tag == "LR":
-            share = _box_mean(gradient_magnitude(view.image)) / texture
-            covered = coverage(view.camera, hr_cameras, points, near)
-            attenuations[view.name] = share.clamp_max(1.0) * covered
-    return attenuations
+    low = [view for view in views if view.tag == "LR"]
+    covered = {view.name: coverage(view.camera, hr_cameras, points, near) for view in low}
+    return OnDemand(_RegionAttenuation(covered, texture), low)
+
+
+@dataclass(frozen=True)
+class _RegionAttenuation:
+    """Computes the attenuation of a view from what is slow to find out."""
+
+    covered: Mapping[str, Tensor]
+    """Whether an HR view covers each pixel [H, W], by the names of the views."""
+    texture: float
+
+    def __call__(self, view: TrainingView) -> Tensor:
+        share = _box_mean(gradient_magnitude(view.image)) / self.texture
+        return share.clamp_max(1.0) * self.covered[view.name]
 
 
 def coverage(camera: Camera, others: Sequence[Camera], points: Tensor, near: float) -> Tensor:

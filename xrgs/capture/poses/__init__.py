@@ -1,0 +1,285 @@
+"""Takes cameras and points from files of the user's in place of a new SfM: `variant.poses`.
+
+A model of COLMAP is read, or a transforms.json. A pose belongs to the photograph whose path ends
+with the same folders and name, whatever the suffix.
+
+Nothing here imports pycolmap before cameras are read.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from difflib import get_close_matches
+from pathlib import Path, PurePosixPath
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from xrgs.capture.lens import Lens, quarter_turn
+from xrgs.capture.poses import colmap, transforms
+from xrgs.errors import UnreadableError, XrgsError
+from xrgs.runtime.text import listed
+from xrgs.safeio.files import is_transient, list_names
+from xrgs.safeio.hashing import file_digest
+from xrgs.safeio.paths import user_path
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+
+    from numpy.typing import NDArray
+
+    from xrgs.capture.photographs import PhotoCollection, Photograph
+    from xrgs.capture.sfm import Reconstruction
+
+#: The fewest points: a Gaussian's first size is the distance of a point to its three nearest.
+_MIN_POINTS = 4
+#: The largest difference of the aspect ratios of an image and its photograph, which rounding of
+#: their sides to whole px explains.
+_MAX_ASPECT = 0.01
+#: The clockwise quarters that EXIF's orientation turns stored pixels by; the others mirror them.
+_QUARTERS = {1: 0, 3: 2, 6: 1, 8: 3}
+#: A photograph of which undistortion keeps less is named.
+_LEAST_KEPT = 0.9
+
+
+def fingerprint(path: str) -> str:
+    """Hash the files that poses are read from: 64 hexadecimal digits of a SHA-256.
+
+    It does not depend on where the files are.
+
+    Raises:
+        UnreadableError: A file can't be read now.
+        XrgsError: Files are missing, or their layout is not one of the two.
+    """
+    sha256 = hashlib.sha256()
+    try:
+        root = _root(path)
+        for file in colmap.files(root) if root.is_dir() else transforms.files(root):
+            sha256.update(f"{file.name}\0{file_digest(file)}\n".encode())
+    except OSError as error:
+        kind = UnreadableError if is_transient(error) else XrgsError
+        raise kind(f"variant.poses={path}: {error.filename}: {error.strerror}") from error
+    except UnreadableError:
+        raise
+    except XrgsError as error:
+        raise XrgsError(f"variant.poses={path}: {error}") from error
+    return sha256.hexdigest()
+
+
+def _root(path: str) -> Path:
+    """Return the folder of COLMAP, or the transforms.json."""
+    root = user_path(path)
+    if not root.exists():
+        raise XrgsError("no such folder or file")
+    if not root.is_dir():
+        return root
+    names = list_names(root)
+    if "transforms.json" in names:
+        return root / "transforms.json"
+    if colmap.files(root):
+        return root
+    if splits := [name for name in names if name.startswith("transforms") and ".json" in name]:
+        raise XrgsError(f"name one file of it: {', '.join(splits)}")
+    raise XrgsError(
+        "it must have a transforms.json, or cameras, images and points3D, all .bin or all .txt; "
+        "COLMAP's folder is often called sparse/0"
+    )
+
+
+def read_poses(path: str, photos: PhotoCollection) -> Reconstruction:
+    """Read the cameras of the HR views of photographs, and all points, from `variant.poses`.
+
+    Raises:
+        UnreadableError: A file can't be read now.
+        XrgsError: The files are malformed, a camera model is not supported, no photograph has the
+            name of an image, or there are too few points.
+    """
+    from xrgs.capture.sfm import Reconstruction
+
+    content = fingerprint(path)
+    try:
+        root = _root(path)
+        in_folder = [f"variant.poses: {root.name} is read"] if root != user_path(path) else []
+        given = colmap.read(root) if root.is_dir() else transforms.read(root)
+        points = given.points[np.isfinite(given.points).all(axis=1)]
+        if len(points) < max(_MIN_POINTS, len(given.points)):
+            raise XrgsError(
+                f"{len(points)} of {len(given.points)} points are usable; at least {_MIN_POINTS} "
+                "points, all of them finite, are needed to begin training with"
+            )
+        found = match_names(given.names, [(photo.name, photo.path) for photo in photos.all])
+        lenses: dict[int, Lens] = {}
+        viewmats: dict[int, NDArray[np.float64]] = {}
+        turned = []
+        for name, i in found.items():
+            photo = photos[i]
+            lens, viewmats[i] = given.camera(name, _stored(photo))
+            if _is_turned(lens, photo):
+                lens, viewmats[i] = _upright(lens, viewmats[i], photo)
+                turned.append(photo.name)
+            _check_shape(lens, photo)
+            lenses[i] = photo.to_hr(lens)
+        kept = {i: lens.kept() for i, lens in lenses.items()}
+    except UnreadableError:
+        raise
+    except XrgsError as error:
+        raise XrgsError(f"variant.poses={path}: {error}") from error
+    none = np.zeros(0, np.intp)
+    return Reconstruction(
+        lenses,
+        viewmats,
+        points,
+        given.colors,
+        {i: given.observed.get(name, none) for name, i in found.items()},
+        {
+            "poses": content,
+            "images": len(photos),
+            "registered": len(lenses),
+            "points": len(points),
+            **given.report,
+            "notes": [
+                *in_folder,
+                *given.notes,
+                *_notes(given.names, found, photos, lenses, kept, turned),
+            ],
+        },
+    )
+
+
+def _stored(photo: Photograph) -> tuple[int, int]:
+    """Return the width and height that a photograph is stored with, before EXIF turns it."""
+    width, height = photo.size
+    return (height, width) if photo.orientation >= 5 else (width, height)
+
+
+def _is_turned(lens: Lens, photo: Photograph) -> bool:
+    """Return whether EXIF turns the photograph away from the pixels of its camera.
+
+    COLMAP, nerfstudio and instant-ngp take pixels as they are stored. A camera of the other shape
+    was made with a copy that is upright already. Where the shape does not tell, as with a square,
+    the pixels are taken to be as stored.
+    """
+    return photo.orientation != 1 and _same_shape((lens.width, lens.height), _stored(photo))
+
+
+def _same_shape(a: tuple[int, int], b: tuple[int, int]) -> bool:
+    return abs(a[0] * b[1] / (a[1] * b[0]) - 1) <= _MAX_ASPECT
+
+
+def _upright(
+    lens: Lens, viewmat: NDArray[np.float64], photo: Photograph
+) -> tuple[Lens, NDArray[np.float64]]:
+    """Turn a camera and its pose as EXIF turns the photograph."""
+    quarters = _QUARTERS.get(photo.orientation)
+    if quarters is None:
+        raise XrgsError(
+            f"EXIF's orientation {photo.orientation} mirrors {photo.name}, and no camera shows a "
+            "mirrored picture: remove the tag, or place upright copies of the photographs"
+        )
+    turn = np.eye(4)
+    turn[:2, :2] = quarter_turn(quarters)
+    return lens.turned(quarters), turn @ viewmat
+
+
+def _check_shape(lens: Lens, photo: Photograph) -> None:
+    if not _same_shape((lens.width, lens.height), photo.size):
+        raise XrgsError(
+            f"the camera of {photo.name} is for images of {lens.width}x{lens.height} px, and the "
+            f"photograph has {photo.size[0]}x{photo.size[1]}: these are not the same picture"
+        )
+
+
+def _notes(
+    names: Sequence[str],
+    found: Mapping[str, int],
+    photos: PhotoCollection,
+    lenses: Mapping[int, Lens],
+    kept: Mapping[int, float],
+    turned: Sequence[str],
+) -> list[str]:
+    notes = []
+    if unused := [name for name in names if name not in found]:
+        notes.append(f"{len(unused)} poses fit no photograph, or several: {listed(unused)}")
+    if missing := [name for i, name in enumerate(photos.names) if i not in lenses]:
+        notes.append(f"{len(missing)} photographs have no pose and are left out: {listed(missing)}")
+    if turned:
+        notes.append(
+            f"EXIF turns {len(turned)} photographs, and their poses were turned with them, since "
+            f"the pixels that were posed are taken to be as stored: {listed(sorted(turned))}"
+        )
+    if cut := sorted(i for i, share in kept.items() if share < _LEAST_KEPT):
+        models = ", ".join(sorted({lenses[i].model for i in cut}))
+        shares = [kept[i] for i in cut]
+        notes.append(
+            f"undistortion keeps {min(shares):.0%} to {max(shares):.0%} of {len(cut)} photographs "
+            f"with cameras {models}: {listed([photos.names[i] for i in cut])}"
+        )
+    return notes
+
+
+def match_names(poses: Sequence[str], photographs: Sequence[tuple[str, Path]]) -> dict[str, int]:
+    """Find the photograph of each pose, by the end of its path.
+
+    Args:
+        poses: The names of images in a file of poses, with folders and suffix.
+        photographs: The name and the file of each photograph.
+
+    Returns:
+        The index of the photograph by the name of the pose. Of several poses that fit a photograph,
+        the one that shares most folders with it has it; poses that fit several are left out.
+
+    Raises:
+        XrgsError: No pose has a photograph, or two poses fit one photograph alike.
+    """
+    ends: dict[str, set[int]] = {}  # the photographs by how their paths may end
+    for i, (name, file) in enumerate(photographs):
+        for end in (name, file.stem):
+            ends.setdefault(end, set()).add(i)
+    fits: dict[int, list[tuple[int, str]]] = {}
+    for pose in poses:
+        parts = _parts(pose)
+        same_end = set().union(*(ends.get("_".join(parts[n:]), ()) for n in range(len(parts))))
+        scores = {i: score for i in same_end if (score := _shared(parts, *photographs[i]))}
+        best = [i for i, score in scores.items() if score == max(scores.values())]
+        if len(best) == 1:
+            fits.setdefault(best[0], []).append((scores[best[0]], pose))
+    if not fits:
+        names = [name for name, _ in photographs]
+        similar = [m for p in poses[:1] for m in get_close_matches(Path(p).stem, names, 1, 0.0)]
+        example = f": {poses[0]} is not {similar[0]}" if similar else ""
+        why = f"none of its {len(poses)} images has the name of a photograph{example}"
+        raise XrgsError(f"{why}; rename them")
+    found = {}
+    for i, claims in fits.items():
+        most = max(score for score, _ in claims)
+        first, *others = [pose for score, pose in claims if score == most]
+        if others:
+            raise XrgsError(
+                f"two of its images, {first} and {others[0]}, have the name of the photograph "
+                f"{photographs[i][0]}; rename them, or remove one"
+            )
+        found[first] = i
+    return found
+
+
+def _parts(path: str) -> tuple[str, ...]:
+    """Return the folders and the name, without suffix, of a path of any system."""
+    pure = PurePosixPath(path.replace("\\", "/"))
+    # Blender and other programs leave the suffix out: the end of frame.0001 is none.
+    return pure.parts if pure.suffix[1:].isdigit() or not pure.name else pure.with_suffix("").parts
+
+
+def _shared(pose: Sequence[str], name: str, file: Path) -> int:
+    """Return how many parts at its end the path of a pose shares with a photograph.
+
+    The folders below `scene.path` are in the name of a photograph: the view of rig1/0004.jpg is
+    rig1_0004. They must agree as far as the pose has folders.
+    """
+    own = file.with_suffix("").parts
+    shared = 0
+    while shared < min(len(own), len(pose)) and own[-1 - shared] == pose[-1 - shared]:
+        shared += 1
+    below = next((n for n in range(1, len(own)) if "_".join(own[-n:]) == name), 1)
+    if shared >= min(below, len(pose)):
+        return shared
+    return next((n for n in range(len(pose), 0, -1) if "_".join(pose[-n:]) == name), 0)
