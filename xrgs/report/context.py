@@ -19,7 +19,6 @@ from xrgs.safeio.sanitize import counted, for_line
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping, Sequence
 
-    from xrgs.capture.description import SfmReport
     from xrgs.config import Conf, VariantConf
     from xrgs.experiment.schema import Provenance
     from xrgs.report.collect import Sweep
@@ -88,7 +87,7 @@ def contexts(sweep: Sweep) -> dict[str, Context]:
             _machine([cell.provenance for cell in made]),
             (
                 *_cautions(zip(rows["scene"], configs, strict=True), tests),
-                *_cautions_of_photographs(rows.assign(config=configs), sweep.variants),
+                *_cautions_of_photographs(rows, sweep),
             ),
         )
     return {name: found.get(name, Context()) for name in cells["condition"].unique()}
@@ -180,33 +179,31 @@ def _cautions(
     )
 
 
-def _cautions_of_photographs(
-    rows: pd.DataFrame, variants: Mapping[str, SfmReport]
-) -> tuple[str, ...]:
+def _cautions_of_photographs(rows: pd.DataFrame, sweep: Sweep) -> list[str]:
     """Return sentences on test views that have no score, and on mixtures without an LR view.
 
     Args:
-        rows: Rows of `Sweep.cells`, with the `config` of each.
-        variants: `Sweep.variants`.
+        rows: The rows of finished cells in `Sweep.cells`.
+        sweep: The sweep.
     """
     found = []
-    for scene, of in rows[rows["variant_id"].isin(variants)].groupby("scene", sort=False):
-        unscored = [
-            name
-            for variant in of.loc[of["validation"] == 0, "variant_id"].unique()
-            for name in variants[variant].not_scored
-        ]
+    for scene, of in rows.groupby("scene", sort=False):
+        unscored: dict[str, None] = {}
+        unmixed = False
+        for row in of.to_dict("records"):
+            if (report := sweep.variants.get(row["variant_id"])) is None:
+                continue
+            config = sweep.done[row["cell_id"]].config
+            wants_lr = config is None or _mixture(config.variant) != _ALL_HR
+            unmixed |= wants_lr and bool(report.hr) and not report.lr
+            if row["validation"] == 0:
+                unscored |= dict.fromkeys(report.not_scored)
         if unscored:
-            names = listed([*dict.fromkeys(unscored)])
+            names = listed([*unscored])
             found.append(f"{scene} is scored without test views that are not placed: {names}")
-        mixed = [c is None or _mixture(c.variant) != _ALL_HR for c in of["config"]]
-        if any(map(_lacks_lr, map(variants.get, of.loc[mixed, "variant_id"]))):
+        if unmixed:
             found.append(f"{scene} has no LR view: nothing is mixed")
-    return tuple(for_line(f"Caution: {text}", _MAX_SENTENCE) for text in found)
-
-
-def _lacks_lr(report: SfmReport | None) -> bool:
-    return report is not None and bool(report.hr) and not report.lr
+    return [for_line(f"Caution: {text}", _MAX_SENTENCE) for text in found]
 
 
 def _holds_out(config: Conf) -> bool:
