@@ -80,6 +80,7 @@ def mix_resolutions(scene: Scene, conf: VariantConf, work: Path, out: Path) -> V
     """
     check_variant_conf(conf)
     start = time.perf_counter()
+    scene = poses.with_masks(scene, conf.poses)
     photos = prepare_hr_views(scene, conf, work, for_sfm=conf.poses is None)
     sizes = [photo.size for photo in photos.all]
     inputs = _Inputs(scene, conf, photos, split_before_sfm(photos.names, sizes, conf))
