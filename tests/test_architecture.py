@@ -52,6 +52,7 @@ ONLY_IN = {
     "imagecodecs": ("capture/colour", "capture/deep"),
     "tifffile": ("capture/deep",),
     "viser": ("viewer/live",),
+    "zstandard": ("splat/spz",),
     "tensorboard": ("sweep/track",),
     "mlflow": ("sweep/track",),
 }

@@ -262,7 +262,7 @@ def test_of_several_images_the_first_is_read_and_said(tmp_path: Path, suffix: st
     first.save(tmp_path / f"a.{suffix}", save_all=True, append_images=[other], **options)
     picture = images.decode((tmp_path / f"a.{suffix}").rename(tmp_path / "b.jpg"))
     assert picture.pixels.min() == 1
-    several = ("the first of several images in a file read",)
+    several = ("only the first image of the file read",)
     assert picture.notes == (() if suffix == "mpo" else several)
 
 

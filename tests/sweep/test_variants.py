@@ -239,17 +239,17 @@ def test_sweeps_of_a_scene_that_sfm_can_not_place(
     code, table, err = sweeps.run(*scene)
     assert code == 1
     assert BUILDING in err
-    assert "COLMAP registered 0 of 2 views" in table
+    assert "0 of 2 photographs are placed" in table
     code, second_table, err = sweeps.run(*scene)
     assert code == 1
     assert second_table == table
     assert BUILDING not in err
     assert "  failed     variant not built" in err
-    assert "COLMAP registered 0 of 2 views" in err
+    assert "0 of 2 photographs are placed" in err
     assert HINT in err
     text = describe(read(tmp_path / "s"))
     assert "failed scenes, not tried again; retry=failed tries them again" in text
-    assert "  leaves  scene leaves failed: COLMAP registered 0 of 2 views" in text
+    assert "  leaves  scene leaves failed: 0 of 2 photographs are placed" in text
     code, table, err = sweeps.run(*scene, "retry=failed", "fail_fast=true")
     assert code == 1
     assert BUILDING in err

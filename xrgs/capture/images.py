@@ -71,7 +71,8 @@ OPAQUE_FROM = 0.5
 _EXIF_ORIENTATION = 0x0112
 _EXIF_CAMERA = (0x010F, 0x0110)  # make, model
 _EXIF_DETAILS, _EXIF_INTEROPERABILITY = 0x8769, 0xA005
-_EXIF_FOCAL = (0x920A, 0xA405)  # focal length in mm, and its equivalent on 35 mm film
+_EXIF_FOCAL_35MM = 0xA405  # the focal length that has this field of view on 35 mm film
+_EXIF_FOCAL = (0x920A, _EXIF_FOCAL_35MM)  # in mm
 _TIFF_PROFILE = 34675
 
 
@@ -120,11 +121,18 @@ def _unidentified(path: Path) -> str:
 
 
 def _check_size(
-    stream: BinaryIO, size: tuple[int, int], max_pixels: int, mode: str, *, drawing: bool = True
+    stream: BinaryIO, size: tuple[int, int], max_pixels: int, bits: int, *, drawing: bool = True
 ) -> None:
     """Refuse an image that is too large, or that no file of these bytes can hold.
 
-    Its memory is not taken yet. A small `drawing` may compress without end. `mode` is PIL's.
+    Its memory is not taken yet. A small `drawing` may compress without end.
+
+    Args:
+        stream: The file.
+        size: Width and height, px.
+        max_pixels: The most pixels that it may have.
+        bits: The bits of a pixel.
+        drawing: Whether it may be one.
     """
     width, height = size
     if width * height > max_pixels:
@@ -135,7 +143,7 @@ def _check_size(
     stream.seek(0)
     if drawing and width * height <= _SMALL_PIXELS:
         return
-    if _BITS.get(mode, 24) * width * height > 8 * _MAX_EXPANSION * file_bytes:
+    if bits * width * height > 8 * _MAX_EXPANSION * file_bytes:
         raise _RefusedError(f"{file_bytes} bytes are too few for {width} x {height} px")
 
 
@@ -226,13 +234,14 @@ class _PilFile:
     def __init__(self, stream: BinaryIO, start: bytes) -> None:
         self._stream = stream
         self.image = image = Image.open(stream, formats=_formats(start))
-        _check_size(stream, image.size, MAX_PIXELS, image.mode)
         is_heif, is_png = image.format == "HEIF", image.format == "PNG"
         self._chunks, has_late_exif = _png_chunks(stream) if is_png else ({}, False)
         self.channels, self.bits = len(image.getbands()), int(image.info.get("bit_depth", 8))
         if is_png:
             self.bits, colour_type = self._chunks[b"IHDR"][8:10]
             self.channels = _PNG_CHANNELS[colour_type]
+        deep_bits = self.channels * self.bits if self.bits > 8 else 0
+        _check_size(stream, image.size, MAX_PIXELS, deep_bits or _BITS.get(image.mode, 24))
         self.profile: bytes | None = image.info.get("icc_profile")
         if b"cICP" in self._chunks:  # PNG's third edition puts it above the profile
             self.profile = None
@@ -298,9 +307,9 @@ class _DeepTiff:
     def __init__(self, stream: BinaryIO, tiff: deep.Tiff) -> None:
         self._tiff = tiff
         self.size = tiff.size
-        _check_size(stream, self.size, MAX_PIXELS, "L")
         self.orientation = _orientation(tiff.value(_EXIF_ORIENTATION))
         self.channels, self.bits = tiff.channels, tiff.bits
+        _check_size(stream, self.size, MAX_PIXELS, self.channels * self.bits)
         self.profile: bytes | None = tiff.value(_TIFF_PROFILE)
         self.frames = tiff.frames
         self.exif = Image.Exif()
@@ -338,9 +347,12 @@ def _png_chunks(stream: BinaryIO) -> tuple[dict[bytes, bytes], bool]:
     stream.seek(len(_PNG_MAGIC))
     while len(head := stream.read(8)) == 8:
         length, name = int.from_bytes(head[:4], "big"), head[4:]
-        chunks[name] = stream.read(length) if length <= _SHORT_CHUNK else b""
+        content = stream.read(length) if length <= _SHORT_CHUNK else b""
         stream.seek(4 if length <= _SHORT_CHUNK else length + 4, 1)
+        chunks.setdefault(name, content)
         is_late |= b"IDAT" in chunks and name in _PNG_TEXT
+        if name == b"IEND":
+            break
     return chunks, is_late
 
 
@@ -441,6 +453,19 @@ def exif_camera(path: Path) -> str:
     return "/".join("" if value is None else str(value).strip("\0 ") for value in values).strip("/")
 
 
+def exif_focal(path: Path) -> float | None:
+    """Read from EXIF the focal length for a film of 36 x 24 mm, mm; None where it is not there.
+
+    Raises:
+        UnreadableError: The file can't be read now.
+        ImageError: The file is not an image.
+    """
+    with _stream(path) as stream, suppress(Exception):  # PIL raises nearly anything on damaged EXIF
+        focal = float(_file(stream).exif.get_ifd(_EXIF_DETAILS)[_EXIF_FOCAL_35MM])
+        return focal if 1 < focal < 10_000 else None
+    return None
+
+
 def decode(path: Path) -> Picture:
     """Decode a photograph: upright, in sRGB, with alpha apart. 8-bit sRGB values are over 255.
 
@@ -466,7 +491,7 @@ def decode(path: Path) -> Picture:
             )
         notes = [note for note in (samples.note, colour_note) if note]
         if file.frames > 1:
-            notes.append("the first of several images in a file read")
+            notes.append("only the first image of the file read")
         return Picture(np.ascontiguousarray(pixels), alpha, head.orientation, tuple(notes))
 
 
@@ -541,7 +566,7 @@ def read_png_pil(
         if image.mode != mode:
             kind = "RGB" if mode == "RGB" else "grey"
             raise _RefusedError(f"its pixels are {image.mode}, not 8-bit {kind}")
-        _check_size(stream, image.size, max_pixels, image.mode, drawing=False)
+        _check_size(stream, image.size, max_pixels, _BITS.get(image.mode, 24), drawing=False)
         image.load()
         return image
 

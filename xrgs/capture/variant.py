@@ -59,6 +59,7 @@ POSES = (
     "capture/poses/colmap.py",
     "capture/poses/given.py",
     "capture/poses/transforms.py",
+    "capture/triangulation.py",
 )
 
 

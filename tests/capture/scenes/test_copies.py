@@ -124,6 +124,26 @@ def test_of_the_sizes_of_an_llff_scene_one_is_taken(
         )
 
 
+def test_copies_of_the_sizes_that_are_not_taken_are_left_out(tmp_path: Path) -> None:
+    shoot(tmp_path / "images")
+    shoot(tmp_path / "images_2", size=(80, 60))
+    for number in range(6):
+        backup = tmp_path / "backup" / f"photo {number}.jpg"
+        backup.parent.mkdir(exist_ok=True)
+        shutil.copy(tmp_path / "images" / f"IMG_{number}.jpg", backup)
+    found = below(tmp_path, 80)
+    assert {file.parent.name for file in found.files.values()} == {"images_2"}
+    assert "backup/photo 0.jpg (as images/IMG_0.jpg)" in found.notes[1]
+
+
+def test_a_folder_of_copies_with_other_names_is_left_out(tmp_path: Path) -> None:
+    shoot(tmp_path / "card")
+    shoot(tmp_path / "another day", first=20)
+    for number in range(6):
+        write(tmp_path / "web" / f"{number:03}.jpg", number, (120, 90))
+    assert {file.parent.name for file in below(tmp_path).files.values()} == {"card", "another day"}
+
+
 def test_folders_that_are_numbered_and_of_one_size_are_no_copies(tmp_path: Path) -> None:
     for number in range(1, 4):
         shoot(tmp_path / f"images_{number}", first=10 * number)

@@ -131,16 +131,24 @@ def _long_side(files: Iterable[Path]) -> int:
     return max(max(size(file)) for file in files)
 
 
-def without_copies(files: Sequence[Path], folder: Path) -> tuple[list[Path], list[str]]:
+def without_copies(
+    files: Sequence[Path], folder: Path, other_sizes: Sequence[Path] = ()
+) -> tuple[list[Path], list[str]]:
     """Leave out files that show the same photograph as another one.
 
     These are compared: files of the same bytes; files of one folder with names such as `a.jpg`,
-    `a.png`, `a_small.jpg` and `a (1).jpg`; and files of one name in two folders.
+    `a.png`, `a_small.jpg` and `a (1).jpg`; files of one name in two folders; and the files of two
+    folders in their order, where the folders have as many.
+
+    Args:
+        files: The files.
+        folder: The folder from which notes name the files.
+        other_sizes: Files that are taken in another size; their copies are left out, too.
 
     Returns:
-        The files in their order, and notes with their paths from `folder`.
+        The files in their order, and notes.
     """
-    same = _identical(files)
+    same = _identical(files, other_sizes)
     left = [file for file in files if file not in same]
     alike: dict[Path, Path] = {}
     for a, b in (*_of_one_folder(left), *_of_two_folders(left)):
@@ -158,10 +166,10 @@ def without_copies(files: Sequence[Path], folder: Path) -> tuple[list[Path], lis
     return [file for file in left if file not in alike], notes
 
 
-def _identical(files: Sequence[Path]) -> dict[Path, Path]:
-    """Return the files that have the bytes of another one, with that one."""
+def _identical(files: Sequence[Path], known: Sequence[Path]) -> dict[Path, Path]:
+    """Return the files that have the bytes of another or of a known one, with that one."""
     by_length = defaultdict(list)
-    for file in files:
+    for file in (*known, *files):
         try:
             by_length[file.stat().st_size].append(file)
         except OSError as error:
@@ -172,11 +180,11 @@ def _identical(files: Sequence[Path]) -> dict[Path, Path]:
     for group in by_length.values():
         for file in group if len(group) > 1 else ():
             by_content[content(file)].append(file)
-    return {
-        copy: original
-        for original, *copies in (sorted(g, key=_shortest) for g in by_content.values())
-        for copy in copies
-    }
+    found: dict[Path, Path] = {}
+    for group in by_content.values():
+        original, *copies = sorted(group, key=lambda file: (file not in known, *_shortest(file)))
+        found |= {copy: original for copy in copies if copy not in known}
+    return found
 
 
 def _shortest(file: Path) -> tuple[int, str]:
@@ -209,9 +217,10 @@ def _of_one_folder(files: Sequence[Path]) -> list[tuple[Path, Path]]:
 
 
 def _of_two_folders(files: Sequence[Path]) -> list[tuple[Path, Path]]:
-    """Pair the files of one name in folders of which some pairs show the same.
+    """Pair the files of one name, or of one place in the order, in folders of the same photographs.
 
-    Cameras number their photographs alike, and such folders differ in all pairs.
+    Cameras number their photographs alike: folders whose first, middle and last pairs differ have
+    other photographs.
     """
     folders: dict[Path, dict[str, Path]] = defaultdict(dict)
     for file in files:
@@ -221,6 +230,10 @@ def _of_two_folders(files: Sequence[Path]) -> list[tuple[Path, Path]]:
         both = [(a[stem], b[stem]) for stem in a if stem in b]
         if any(_show_the_same(*pair) for pair in _samples(both)):
             pairs += both
+        elif not both and len(a) == len(b):
+            ordered = list(zip(a.values(), b.values(), strict=True))
+            if all(_show_the_same(*pair) for pair in _samples(ordered)):
+                pairs += ordered
     return pairs
 
 

@@ -29,7 +29,7 @@ from xrgs.safeio.paths import user_path
 from xrgs.safeio.sanitize import counted
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Iterator, Mapping, Sequence
+    from collections.abc import Iterable, Iterator, Mapping, Sequence, Set
 
     from xrgs.config import SceneConf
 
@@ -129,13 +129,12 @@ def look(path: str | None, long_side: int, masks: str | None = None) -> Listing:
                 why = "not a folder; for the frames of a video: scene=video scene.path=..."
             raise XrgsError(f"scene.path={folder}: {why}")
         known = None if masks is None else user_path(masks).resolve()
-        taken, notes = (_all_below if nested else _inside)(folder, long_side, known)
-        files = [file for inside in taken.values() for file in inside]
-        for choose in (_photographs, without_copies):
-            files, more = choose(files, folder)
-            notes += more
-        notes += _not_read({folder, *taken}, files)
-        notes += _panoramas(files, folder)
+        found = (_all_below if nested else _inside)(folder, long_side, known)
+        listed_files = [file for inside in found.folders.values() for file in inside]
+        photographs, made = _photographs(listed_files, folder)
+        files, copies = without_copies(photographs, folder, found.other_sizes)
+        not_read = _not_read({folder, *found.folders}, files)
+        notes = (*found.notes, *made, *copies, *not_read, *_panoramas(files, folder))
     except OSError as error:
         raise UnreadableError(f"{error.filename}: {error.strerror}; try again") from error
     if len(files) < 2:
@@ -145,53 +144,61 @@ def look(path: str | None, long_side: int, masks: str | None = None) -> Listing:
         raise XrgsError("; ".join([f"scene.path={folder}: {why}", *notes]))
     _check_heic(files)
     named = [(_view_name(file, folder if nested else file.parent), file) for file in files]
-    return Listing(_by_name(named), tuple(notes))
+    return Listing(_by_name(named), notes)
 
 
-#: Photographs by their folder.
-_Tree = dict[Path, list[Path]]
+@dataclass(frozen=True)
+class _Found:
+    """The images of folders, before copies of other names are left out."""
+
+    folders: Mapping[Path, list[Path]]
+    notes: list[str]
+    other_sizes: list[Path]
+    """Images in folders of an LLFF scene of which another size is taken."""
 
 
-def _inside(folder: Path, long_side: int, masks: Path | None) -> tuple[_Tree, list[str]]:
+def _inside(folder: Path, long_side: int, masks: Path | None) -> _Found:
     """List the photographs in a folder itself, or one of the sizes of an LLFF scene."""
-    sizes = [_images_in(inside) for inside in sorted(folder.iterdir()) if _is_size(inside)]
-    taken, notes = one_of_each_size([files for files in sizes if files], long_side)
-    names = [files[0].parent.name for files in taken]
+    inside = filter(_is_size, sorted(folder.iterdir()))
+    sizes = {one: files for one in inside if (files := _images_in(one))}
+    taken, notes = one_of_each_size([*sizes.values()], long_side)
+    by_name = {files[0].parent.name: list(files) for files in taken}
     # Without a folder images/, folders that are not sizes of each other are no LLFF scene.
-    which = names.index("images") if "images" in names else 0
-    if len(taken) == 1 or "images" in names:
-        tree = {taken[which][0].parent: list(taken[which])}
-    else:
-        tree, notes = {folder: _images_in(folder)}, []
-    if len(taken) == 1:  # copies in other sizes are no loss
-        tree |= {files[0].parent: [] for files in sizes if files and files[0].parent not in tree}
-    return tree, notes + _in_other_folders(folder, tree, masks)
+    choice = by_name.get("images") or (next(iter(by_name.values())) if len(taken) == 1 else None)
+    tree = {choice[0].parent: choice} if choice else {folder: _images_in(folder)}
+    no_loss = {*tree, *sizes} if len(taken) == 1 else {*tree}
+    others = _in_other_folders(folder, no_loss, masks)
+    return _Found(tree, [*(notes if choice else ()), *others], [])
 
 
-def _all_below(folder: Path, long_side: int, masks: Path | None) -> tuple[_Tree, list[str]]:
+def _all_below(folder: Path, long_side: int, masks: Path | None) -> _Found:
     """List the photographs in a folder and all below it, of LLFF scenes those of one size."""
     passed: dict[str, list[Path]] = defaultdict(list)
     tree = {inside: _images_in(inside) for inside in _folders(folder, passed, masks)}
-    tree, notes = _of_sizes(tree, long_side)
+    dropped, notes = _other_sizes(tree, long_side)
     root = folder.resolve()
     for what in sorted(passed.keys() - {_MASKS}):
         own = [inside for inside in passed[what] if not _is_link_into(inside, root)]
         notes += _left_out({inside: _count_anywhere(inside) for inside in own}, folder, what)
-    return tree, notes + _masks_left_out(passed, folder)
+    return _Found(
+        {inside: files for inside, files in tree.items() if inside not in dropped},
+        notes + _masks_left_out(passed, folder),
+        [file for inside in dropped for file in tree[inside]],
+    )
 
 
-def _of_sizes(tree: _Tree, long_side: int) -> tuple[_Tree, list[str]]:
-    """Take one of the sizes of each LLFF scene among folders."""
+def _other_sizes(tree: Mapping[Path, list[Path]], long_side: int) -> tuple[list[Path], list[str]]:
+    """Return the folders of the LLFF scenes among folders of which another size is taken."""
     groups = defaultdict(list)
     for inside, files in tree.items():
         if files and SIZES.fullmatch(inside.name):
             groups[inside.parent].append(files)
-    dropped, notes = set[Path](), []
+    dropped, notes = [], []
     for group in groups.values():
         taken, more = one_of_each_size(group, long_side)
-        dropped |= {files[0].parent for files in group if files not in taken}
+        dropped += [files[0].parent for files in group if files not in taken]
         notes += more
-    return {inside: files for inside, files in tree.items() if inside not in dropped}, notes
+    return dropped, notes
 
 
 def _folders(
@@ -235,7 +242,7 @@ def _count_anywhere(folder: Path) -> int:
     return sum(1 for name in names if Path(name).suffix.lower() in SUFFIXES)
 
 
-def _in_other_folders(folder: Path, taken: _Tree, masks: Path | None) -> list[str]:
+def _in_other_folders(folder: Path, taken: Set[Path], masks: Path | None) -> list[str]:
     """Say which images in and below a folder are not taken, and how to get them."""
     passed: dict[str, list[Path]] = defaultdict(list)
     try:
