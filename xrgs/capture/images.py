@@ -70,7 +70,7 @@ _BITS = {"1": 1, "P": 1, "L": 8}
 OPAQUE_FROM = 0.5
 _EXIF_ORIENTATION = 0x0112
 _EXIF_CAMERA = (0x010F, 0x0110)  # make, model
-_EXIF_DETAILS, _EXIF_INTEROPERABILITY = 0x8769, 0xA005
+_EXIF_DETAILS, _EXIF_COLOUR_SPACE, _EXIF_INTEROPERABILITY = 0x8769, 0xA001, 0xA005
 _EXIF_FOCAL_35MM = 0xA405  # the focal length that has this field of view on 35 mm film
 _EXIF_FOCAL = (0x920A, _EXIF_FOCAL_35MM)  # in mm
 _TIFF_PROFILE = 34675
@@ -220,6 +220,7 @@ class _File(Protocol):
     exif: Image.Exif
     profile: bytes | None
     frames: int
+    note: str
 
     def encoding(self) -> colour.Encoding | None:
         """Return the colours that the file names in place of an ICC profile."""
@@ -231,8 +232,8 @@ class _File(Protocol):
 class _PilFile:
     """A photograph that PIL opens; `deep` decodes the PNGs and HEIC files of more than 8 bits."""
 
-    def __init__(self, stream: BinaryIO, start: bytes) -> None:
-        self._stream = stream
+    def __init__(self, stream: BinaryIO, start: bytes, note: str = "") -> None:
+        self._stream, self.note = stream, note
         self.image = image = Image.open(stream, formats=_formats(start))
         is_heif, is_png = image.format == "HEIF", image.format == "PNG"
         self._chunks, has_late_exif = _png_chunks(stream) if is_png else ({}, False)
@@ -270,7 +271,9 @@ class _PilFile:
                 int(nclx["color_primaries"]), int(nclx["transfer_characteristics"])
             )
         with suppress(Exception):  # as for EXIF itself
-            if self.exif.get_ifd(_EXIF_INTEROPERABILITY).get(1, "").startswith("R03"):
+            interoperability = self.exif.get_ifd(_EXIF_INTEROPERABILITY).get(1, "")
+            space = self.exif.get_ifd(_EXIF_DETAILS).get(_EXIF_COLOUR_SPACE)
+            if interoperability.startswith("R03") or space == 2:
                 return colour.adobe_rgb()
         return None
 
@@ -311,7 +314,7 @@ class _DeepTiff:
         self.channels, self.bits = tiff.channels, tiff.bits
         _check_size(stream, self.size, MAX_PIXELS, self.channels * self.bits)
         self.profile: bytes | None = tiff.value(_TIFF_PROFILE)
-        self.frames = tiff.frames
+        self.frames, self.note = tiff.frames, tiff.note
         self.exif = Image.Exif()
         with suppress(Exception):  # PIL raises nearly anything on damaged EXIF
             stream.seek(0)
@@ -332,12 +335,13 @@ def _with_channels(samples: NDArray[Any]) -> NDArray[Any]:
 def _file(stream: BinaryIO) -> _File:
     start = stream.read(16)
     stream.seek(0)
-    if start[:4] in _TIFF_MAGIC:
-        tiff = deep.Tiff(stream)
-        if tiff.is_deep:
-            return _DeepTiff(stream, tiff)
-        stream.seek(0)
-    return _PilFile(stream, start)
+    if start[:4] not in _TIFF_MAGIC:
+        return _PilFile(stream, start)
+    tiff = deep.Tiff(stream)
+    if tiff.is_deep:
+        return _DeepTiff(stream, tiff)
+    stream.seek(0)
+    return _PilFile(stream, start, tiff.note)
 
 
 def _png_chunks(stream: BinaryIO) -> tuple[dict[bytes, bytes], bool]:
@@ -489,7 +493,7 @@ def decode(path: Path) -> Picture:
             raise ValueError(
                 f"it has {pixels.shape[1]} x {pixels.shape[0]} pixels, not {head.size}"
             )
-        notes = [note for note in (samples.note, colour_note) if note]
+        notes = [note for note in (file.note, samples.note, colour_note) if note]
         if file.frames > 1:
             notes.append("only the first image of the file read")
         return Picture(np.ascontiguousarray(pixels), alpha, head.orientation, tuple(notes))
