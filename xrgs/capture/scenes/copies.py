@@ -180,7 +180,7 @@ def _identical(files: Sequence[Path], known: Sequence[Path]) -> dict[Path, Path]
     for group in by_length.values():
         for file in group if len(group) > 1 else ():
             by_content[content(file)].append(file)
-    found = {}
+    found: dict[Path, Path] = {}
     for group in by_content.values():
         original, *copies = sorted(group, key=lambda file: (file not in known, *_shortest(file)))
         found |= {copy: original for copy in copies if copy not in known}

@@ -159,10 +159,8 @@ class _Found:
 
 def _inside(folder: Path, long_side: int, masks: Path | None) -> _Found:
     """List the photographs in a folder itself, or one of the sizes of an LLFF scene."""
-    images_in = {
-        inside: _images_in(inside) for inside in sorted(folder.iterdir()) if _is_size(inside)
-    }
-    sizes = {inside: files for inside, files in images_in.items() if files}
+    inside = filter(_is_size, sorted(folder.iterdir()))
+    sizes = {one: files for one in inside if (files := _images_in(one))}
     taken, notes = one_of_each_size([*sizes.values()], long_side)
     by_name = {files[0].parent.name: list(files) for files in taken}
     # Without a folder images/, folders that are not sizes of each other are no LLFF scene.
