@@ -6,8 +6,7 @@ from collections.abc import Collection
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
-from xrgs.capture import images, sfm
-from xrgs.capture.lens import undistort
+from xrgs.capture import images, masks, sfm
 from xrgs.capture.poses.given import MIN_POINTS
 from xrgs.errors import XrgsError
 from xrgs.runtime.progress import progress
@@ -41,15 +40,18 @@ def with_points(
         XrgsError: Too few points are found.
     """
     folder, order = work / "triangulation", sorted(model.viewmats)
-    folder.mkdir()
+    (folder / masks.MASKS).mkdir(parents=True)
     given = []
     for i in progress(order, "undistorting", "view"):
-        lens = model.lenses[i]
-        image = photos.read("lr" if i in degraded else "hr", i)
-        image = undistort(images.resize(image, lens.width, lens.height), lens)
+        lens, kind = model.lenses[i], "lr" if i in degraded else "hr"
+        image, mask = photos.undistorted(kind, i, lens.resized(*photos.size(kind, i)))
         file = f"{photos[i].number}.png"
-        images.save(folder / file, image, durable=False)
-        given.append(sfm.SfmImage(file, photos[i].name, photos[i].name, lens.undistorted().K))
+        images.save(folder / file, images.resize(image, lens.width, lens.height), durable=False)
+        if mask is not None:
+            resized = masks.resized(mask, lens.width, lens.height)
+            images.save_mask(masks.copy_mask(folder, file), resized, durable=False)
+        name, K = photos[i].name, lens.undistorted().K
+        given.append(sfm.SfmImage(file, name, name, K, masked=mask is not None))
     found = sfm.triangulate(given, [model.viewmats[i] for i in order], folder, folder, conf)
     count = len(found.points)
     if count < MIN_POINTS:

@@ -24,7 +24,7 @@ STORED = (102, 76)
 
 def read(folder: Path, changes: dict[str, Any], frame: dict[str, Any] | None = None) -> Lens:
     """The camera of the first frame."""
-    given = transforms.read(write_transforms(folder / "poses", changes, frame))
+    given = transforms.read([write_transforms(folder / "poses", changes, frame)])
     lens, matrix = given.camera(FIRST, STORED)
     assert np.allclose(matrix, viewmat(0), atol=1e-9)
     return lens
@@ -33,10 +33,10 @@ def read(folder: Path, changes: dict[str, Any], frame: dict[str, Any] | None = N
 def test_what_nerfstudio_writes_is_read_without_a_word(tmp_path: Path) -> None:
     frame = {"colmap_im_id": 1}
     file = write_transforms(tmp_path / "a", {"applied_transform": np.eye(4)[:3].tolist()}, frame)
-    given = transforms.read(file)
+    given = transforms.read([file])
     assert given.notes == []
     assert np.allclose(given.points, POINTS, atol=1e-6)
-    assert transforms.files(file) == [file, tmp_path / "a" / "points.ply"]
+    assert transforms.files([file]) == [file, tmp_path / "a" / "points.ply"]
     for i, name in enumerate(NAMES):
         lens, matrix = given.camera(f"./images/{name}", STORED)
         assert (lens.model, lens.params, (lens.width, lens.height)) == ("PINHOLE", PARAMS, SIZE)
@@ -160,7 +160,7 @@ def test_the_nearest_rotation_is_taken(
         ({"frames": [{"file_path": 3}]}, "each of its frames must have a file_path"),
         ({"frames": "none"}, "not a transforms.json"),
         (
-            {"frames": [{"file_path": "a.png"}, {"file_path": "a.png"}]},
+            {"frames": 2 * [{"file_path": "a.png"}]},
             r"two frames have the file_path a\.png",
         ),
         ({"ply_file_path": "../points.ply"}, "must be a path below"),
@@ -195,23 +195,59 @@ def test_a_matrix_that_is_no_pose_is_named(
     rows = None if matrix is None else matrix.tolist()
     file = write_transforms(tmp_path / "a", {}, {"transform_matrix": rows})
     with pytest.raises(XrgsError, match=f"camera of {FIRST}: transform_matrix must be"):
-        transforms.read(file).camera(FIRST, STORED)
+        transforms.read([file]).camera(FIRST, STORED)
 
 
 def test_keys_that_are_not_read_are_named(tmp_path: Path) -> None:
     changes = {"aabb_scale": 16, "k4": 0.0, "rolling_shutter": [0, 0, 0, 0], "enable_depth": True}
-    frame = {"mask_path": "masks/a.png", "sharpness": 1.0, "depth_file_path": "depth/a.png"}
-    given = transforms.read(write_transforms(tmp_path / "a", changes, frame))
+    frame = {"sharpness": 1.0, "depth_file_path": "depth/a.png"}
+    given = transforms.read([write_transforms(tmp_path / "a", changes, frame)])
     assert given.notes == [
-        "mask_path of 3 images in transforms.json is not read; scene.masks=FOLDER takes masks",
-        "keys of transforms.json that are not read: enable_depth, depth_file_path",
+        "keys of transforms.json that are not read: enable_depth, depth_file_path"
     ]
+
+
+def test_focal_lengths_without_a_size_are_named(tmp_path: Path) -> None:
+    given = transforms.read([write_transforms(tmp_path / "a", {"w": None})])
+    assert given.notes == [
+        "transforms.json has no w and h: its focal lengths are of the photographs' own size"
+    ]
+
+
+def test_the_parts_of_blender_are_read_as_one(tmp_path: Path) -> None:
+    """Each part has an angle of its own; the first points that any of them names are taken."""
+    parts = []
+    for i, split in enumerate(("test", "train")):
+        names = [f"{split}/{name}" for name in NAMES]
+        changes = NO_FOCAL | {"camera_angle_x": 1.0 + i, "ply_file_path": None}
+        file = write_transforms(tmp_path / split, changes, names=names)
+        parts.append(file.rename(tmp_path / f"transforms_{split}.json"))
+    (tmp_path / "transforms_notes.txt").touch()
+    assert transforms.in_folder(tmp_path) == parts == transforms.files(parts)
+    given = transforms.read(parts)
+    assert len(given.names) == 6
+    for i, split in enumerate(("test", "train")):
+        lens, matrix = given.camera(f"./images/{split}/{NAMES[2]}", STORED)
+        assert lens.params[0] == pytest.approx(102 / math.tan((1 + i) / 2))
+        assert np.allclose(matrix, viewmat(2), atol=1e-9)
+    (tmp_path / "transforms.json").write_bytes(parts[0].read_bytes())
+    assert transforms.in_folder(tmp_path) == [tmp_path / "transforms.json"]
+
+
+def test_masks_are_named_by_image(tmp_path: Path) -> None:
+    file = write_transforms(tmp_path / "a", {}, {"mask_path": "./masks/a.png"})
+    mask = tmp_path / "a" / "masks" / "a.png"
+    assert transforms.masks([file]) == {f"./images/{name}": mask for name in NAMES}
+    assert mask in transforms.files([file])
+    file = write_transforms(tmp_path / "b", {}, {"mask_path": "../a.png"})
+    with pytest.raises(XrgsError, match="mask_path must be a path below the folder"):
+        transforms.masks([file])
 
 
 def test_a_file_without_points_has_none(tmp_path: Path) -> None:
     file = write_transforms(tmp_path / "a", {"ply_file_path": None})
-    assert transforms.files(file) == [file]
-    assert transforms.read(file).points.shape == (0, 3)
+    assert transforms.files([file]) == [file]
+    assert transforms.read([file]).points.shape == (0, 3)
 
 
 # points
@@ -256,7 +292,7 @@ def test_colours_of_any_type_are_read(
 def test_points_without_colours_are_grey_with_a_word(tmp_path: Path) -> None:
     file = write_transforms(tmp_path / "a")
     write_points(tmp_path / "a" / "points.ply", "u1", (), np.zeros((len(POINTS), 0)))
-    given = transforms.read(file)
+    given = transforms.read([file])
     assert (given.colors == 128).all()
     assert given.notes == ["points.ply has no colours: the splats begin grey"]
 
