@@ -33,8 +33,8 @@ _SAMPLES = 3
 #: The side of the thumbnails that are compared, px, and the least correlation of those of one
 #: photograph. In five captures, photographs that were resized to 80 px and compressed anew have
 #: 0.993 or more (0.9994 in their own size), and neighbouring views 0.980 or less. Files of one size
-#: in two folders must be more alike: two cameras of a rig see nearly the same. Of two formats of one
-#: name in one folder, one may be edited.
+#: in two folders must be more alike: two cameras of a rig see nearly the same. Of two formats of
+#: one name in one folder, one may be edited.
 _THUMBNAIL, _LEAST_ALIKE, _LEAST_ALIKE_SIZE, _LEAST_ALIKE_TWINS = 16, 0.985, 0.999, 0.9
 #: What an iPhone adds to the name of a photograph that was edited on it.
 _EDITED = re.compile(r"(?<=^img_)e(?=\d)")
