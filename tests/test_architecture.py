@@ -49,7 +49,10 @@ ONLY_IN = {
     "gsplat": (),
     "tqdm": ("runtime/progress", "sweep/monitor"),
     "av": ("capture/scenes/video", "viewer/film"),
+    "imagecodecs": ("capture/colour", "capture/deep"),
+    "tifffile": ("capture/deep",),
     "viser": ("viewer/live",),
+    "zstandard": ("splat/spz",),
     "tensorboard": ("sweep/track",),
     "mlflow": ("sweep/track",),
 }

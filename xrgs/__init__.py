@@ -5,7 +5,8 @@ ablations of Cross-Resolution Gaussian Splatting, and reports percentage-change 
 
 From Python, `import xrgs` gives:
 
-- `load_ply`, `save_ply`, `Gaussians`, `Camera`: Gaussians in and out, and views of them.
+- `load_ply`, `save_ply`, `Gaussians`, `Camera`: Gaussians in and out, and views of them;
+  `load_gaussians` and `save_gaussians` for .ply, .glb and .spz, and whether they are antialiased.
 - `rasterize`: render Gaussians with a camera, with settings in `RasterSettings`; gives a `Render`.
 - `rasterization`: the same with gsplat's signature and results.
 - `compose`: the config of a command line; `build_dataset` or `load_dataset`: what it is trained on;
@@ -26,6 +27,7 @@ if TYPE_CHECKING:
     from xrgs.errors import XrgsError
     from xrgs.experiment.store import Store
     from xrgs.splat.cameras import Camera
+    from xrgs.splat.files import load_gaussians, save_gaussians
     from xrgs.splat.gaussians import Gaussians
     from xrgs.splat.gsplat_api import rasterization
     from xrgs.splat.ply import load_ply, save_ply
@@ -45,9 +47,11 @@ __all__ = [
     "build_dataset",
     "compose",
     "load_dataset",
+    "load_gaussians",
     "load_ply",
     "rasterization",
     "rasterize",
+    "save_gaussians",
     "save_ply",
     "train",
 ]
@@ -65,9 +69,11 @@ _MODULES = {
     "build_dataset": "xrgs.capture.prepare",
     "compose": "xrgs.composing",
     "load_dataset": "xrgs.capture.prepare",
+    "load_gaussians": "xrgs.splat.files",
     "load_ply": "xrgs.splat.ply",
     "rasterization": "xrgs.splat.gsplat_api",
     "rasterize": "xrgs.splat.rendering",
+    "save_gaussians": "xrgs.splat.files",
     "save_ply": "xrgs.splat.ply",
     "train": "xrgs.training.count_matching",
 }

@@ -52,6 +52,7 @@ class SceneConf:
 class SfmConf:
     """Structure from motion of the mixed images, by COLMAP."""
 
+    long_side: int
     lr_images: str
     max_num_features: int
     init_min_tri_angle: float

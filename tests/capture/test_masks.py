@@ -326,8 +326,9 @@ def prepared(
         alpha="mask" if alpha else "composite",
     )
     conf = replace(CONF, **changes)
-    photos = prepare_hr_views(scene, conf, folder)
+    photos = prepare_hr_views(scene, conf, folder, for_sfm=True)
     write_degraded(photos, [0, 1], conf)
+    write_degraded(photos, [0, 1], conf, "sfm_lr")
     return photos
 
 
@@ -393,10 +394,11 @@ def test_a_photograph_whose_mask_is_black_is_left_out_by_name(tmp_path: Path) ->
 
 def test_an_upsampled_copy_has_a_mask_where_colmap_looks_for_it(tmp_path: Path) -> None:
     photos = prepared(tmp_path / "x", noise((60, 40)), USED)
-    photos.upsample(0)
-    used = photos.mask("up", 0)
+    kind = photos.upsampled("sfm_lr", 0)
+    used = photos.mask(kind, 0)
     assert used is not None
-    assert (tmp_path / "x" / "masks" / f"{photos.file('up', 0)}.png").is_file()
+    assert used.shape == (40, 60)
+    assert (tmp_path / "x" / "masks" / f"{photos.file(kind, 0)}.png").is_file()
     assert not used[:, :30].any()
     assert used[:, 34:].all()
 
@@ -406,11 +408,11 @@ def test_an_upsampled_copy_has_a_mask_where_colmap_looks_for_it(tmp_path: Path) 
 
 def test_sfm_finds_no_features_outside_a_mask(tmp_path: Path, sfm_conf: SfmConf) -> None:
     photos = prepared(tmp_path / "x", noise((60, 40)), USED, factor=1)
-    smooth = [images.resize(photos.read("hr", i), 480, 320) for i in (0, 1)]
+    smooth = [images.resize(photos.read("sfm", i), 480, 320) for i in (0, 1)]
     for i, image in enumerate(smooth):
-        images.save(tmp_path / "x" / photos.file("hr", i), image)
-    photos.save_mask("hr", 0, np.kron(USED, np.ones((8, 8), np.bool_)))
-    given_images = registration.sfm_images(photos, (), sfm_conf)
+        images.save(tmp_path / "x" / photos.file("sfm", i), image)
+    photos.save_mask("sfm", 0, np.kron(USED, np.ones((8, 8), np.bool_)))
+    given_images = registration.sfm_images(photos, (), replace(sfm_conf, lr_images="native"))
     assert [image.masked for image in given_images] == [True, False]
     sfm.reconstruct(given_images, tmp_path / "x", tmp_path, sfm_conf)
     with pycolmap.Database.open(tmp_path / "database.db") as database:

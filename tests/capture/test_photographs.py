@@ -9,7 +9,7 @@ import pytest
 from PIL import Image
 
 from xrgs.capture import images
-from xrgs.capture.photographs import assign_cameras, prepare_hr_views
+from xrgs.capture.photographs import assign_cameras, largest_of_shape, prepare_hr_views
 from xrgs.capture.scenes import Scene
 from xrgs.composing import compose
 from xrgs.errors import UnreadableError, XrgsError
@@ -58,6 +58,32 @@ def test_without_exif_and_of_differing_sizes_each_has_its_own(tmp_path: Path) ->
         camera_numbers(files, "single")
 
 
+def test_without_exif_a_size_that_many_photographs_have_is_a_camera(tmp_path: Path) -> None:
+    """One odd photograph among nine does not take the camera from the others."""
+    sizes = [(60, 40)] * 9 + [(50, 40)]
+    files = [write_photograph(tmp_path / f"{i}.png", size) for i, size in enumerate(sizes)]
+    assert camera_numbers(files) == [0] * 9 + [1]
+    assert camera_numbers(files[1:]) == list(range(9)), "nine of two sizes are too few"
+
+
+@pytest.mark.parametrize("size", [(30, 20), (31, 20), (13, 9), (600, 401)])
+def test_a_resized_copy_has_the_shape_and_the_camera_of_the_largest(
+    tmp_path: Path, size: tuple[int, int]
+) -> None:
+    """Sides are rounded to whole px, or cut to them."""
+    assert largest_of_shape([(60, 40), size]) == [max((60, 40), size)] * 2
+    files = [
+        write_photograph(tmp_path / "0.jpg", model="A", focal=35.0),
+        write_photograph(tmp_path / "1.jpg", size, model="A", focal=35.0),
+    ]
+    assert camera_numbers(files) == camera_numbers(files, "single") == [0, 0]
+
+
+@pytest.mark.parametrize("size", [(40, 60), (30, 22), (300, 190)])
+def test_another_shape_is_another_camera(tmp_path: Path, size: tuple[int, int]) -> None:
+    assert largest_of_shape([(60, 40), size]) == [(60, 40), size]
+
+
 def test_exif_tells_cameras_lenses_and_how_they_were_held(tmp_path: Path) -> None:
     files = [
         write_photograph(tmp_path / "0.jpg", model="A", focal=35.0),
@@ -70,7 +96,7 @@ def test_exif_tells_cameras_lenses_and_how_they_were_held(tmp_path: Path) -> Non
         write_photograph(tmp_path / "7.jpg"),
         write_photograph(tmp_path / "8.jpg"),
     ]
-    assert camera_numbers(files) == [0, 0, 1, 2, 3, 4, 0, 5, 6]
+    assert camera_numbers(files) == [0, 0, 1, 2, 3, 0, 0, 4, 5]
 
 
 def test_a_photograph_taken_sideways_is_prepared_upright(tmp_path: Path) -> None:

@@ -9,8 +9,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from PIL import Image
 
 from xrgs.capture import images, registration, scenes, sfm
+from xrgs.capture.lens import Lens
 from xrgs.capture.photographs import PhotoCollection, prepare_hr_views, write_degraded
 from xrgs.capture.sfm import Reconstruction
 from xrgs.config import SceneConf, SfmConf, VariantConf
@@ -22,9 +24,9 @@ Make = Callable[..., VariantConf]
 def photos(configured: Make, stereo_scene: SceneConf, tmp_path: Path) -> PhotoCollection:
     """The stereo pair, and a degraded copy of the right view that is 5 times smaller."""
     scene = scenes.resolve(stereo_scene, tmp_path)
-    conf = configured(long_side=185, degradation="downsample")
-    made = prepare_hr_views(scene, conf, tmp_path)
-    write_degraded(made, [1], conf)
+    conf = configured(degradation="downsample", sfm={"long_side": 185})
+    made = prepare_hr_views(scene, conf, tmp_path, for_sfm=True)
+    write_degraded(made, [1], conf, "sfm_lr")
     return made
 
 
@@ -55,7 +57,7 @@ def test_attempts_follow_until_one_is_accepted(
     assert first["registered"] == 2
     assert first["seconds"] > 0
     assert done.model.report["min_inliers"] == 15
-    folders = sorted(path.name for path in tmp_path.glob("sfm*"))
+    folders = sorted(path.name for path in tmp_path.glob("sfm-*"))
     assert folders == ["sfm-configured", "sfm-finer"]
     assert len(list((tmp_path / "sfm-finer").glob("models-*"))) == 2
     assert "SfM attempt finer: too few" in caplog.text
@@ -133,25 +135,78 @@ def test_small_images_are_upsampled_or_have_a_camera_of_their_own(
     photos: PhotoCollection, sfm_conf: SfmConf
 ) -> None:
     upsampled = registration.sfm_images(photos, [1], sfm_conf)
-    assert [image.file for image in upsampled] == ["hr/00000.png", "up/00001.png"]
-    assert images.size(photos.folder / "up/00001.png") == photos.size("hr", 1)
+    assert [image.file for image in upsampled] == ["sfm/00000.png", "sfm_lr_up/00001.png"]
+    assert images.size(photos.folder / "sfm_lr_up/00001.png") == photos.size("sfm", 1)
     native = registration.sfm_images(photos, [1], replace(sfm_conf, lr_images="native"))
-    assert [image.file for image in native] == ["hr/00000.png", "lr/00001.png"]
+    assert [image.file for image in native] == ["sfm/00000.png", "sfm_lr/00001.png"]
     assert pytest.approx(upsampled[0].K) == native[0].K
     native_K, upsampled_K = native[1].K, upsampled[1].K
     assert native_K is not None
     assert upsampled_K is not None
-    assert native_K[:2] * 5 == pytest.approx(upsampled_K[:2])
+    assert native_K[:2] * 5 == pytest.approx(upsampled_K[:2], rel=0.01)
+
+
+def test_photographs_that_are_smaller_from_the_start_are_upsampled_for_one_camera(
+    configured: Make, sfm_conf: SfmConf, tmp_path: Path
+) -> None:
+    """With the size of the trained views, and of SfM, smaller than the photographs."""
+    sizes = [(400, 300), (81, 61), (400, 300), (81, 61)] * 4 + [(200, 300)]
+    for i, (width, height) in enumerate(sizes):
+        images.save(tmp_path / f"IMG_{i:02d}.png", np.full((height, width, 3), 0.5, np.float32))
+    files = {file.stem: file for file in sorted(tmp_path.iterdir())}
+    conf = configured(long_side=300, factor=2, sfm={"long_side": 200})
+    made = prepare_hr_views(scenes.Scene("x", "", files), conf, tmp_path, for_sfm=True)
+    given = registration.sfm_images(made, (), sfm_conf)
+    assert [image.name for image in given] == list(files)
+    assert [made.size("sfm", i) for i in (0, 1, 16)] == [(200, 150), (40, 30), (100, 150)]
+    wanted = {(400, 300): (200, 150), (81, 61): (200, 150), (200, 300): (100, 150)}
+    assert [images.size(tmp_path / image.file) for image in given] == [wanted[s] for s in sizes]
+    # Without EXIF, a size that several photographs have is a camera's.
+    cameras = [image.camera for image in given]
+    assert len(set(cameras)) == 3
+    assert cameras[:2] * 8 == cameras[:16]
+    native = registration.sfm_images(made, (), replace(sfm_conf, lr_images="native"))
+    assert images.size(tmp_path / native[1].file) == (40, 30)
+
+
+def test_the_lens_of_an_image_for_sfm_is_mapped_to_the_hr_view(
+    photos: PhotoCollection, sfm_conf: SfmConf, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The right view is 741 x 500 px: 185 x 125 for SfM, and 504 x 340 cropped to 500 x 340."""
+    hr = photos[1].hr
+    assert (hr.resized, hr.width, hr.height) == ((504, 340), 500, 340)
+    seen = Lens("SIMPLE_RADIAL", (185.0, 92.5, 62.5, 0.1), 185, 125)
+    model = replace(registered(1), lenses={1: seen})
+    monkeypatch.setattr(sfm, "reconstruct", lambda *_: model)
+    done = registration.register(photos, [1], sfm_conf, tmp_path, lambda _: "")
+    made = done.model.lenses[1]
+    assert (made.width, made.height, made.params) == (500, 340, seen.params)
+    assert pytest.approx(np.array([[504, 0, 250], [0, 185 * 340 / 125, 170], [0, 0, 1]])) == made.K
+
+
+def test_exif_gives_the_focal_length_to_begin_with(
+    configured: Make, sfm_conf: SfmConf, tmp_path: Path
+) -> None:
+    """43.27 mm is the diagonal of the film, and so the focal length as long as the diagonal."""
+    exif = Image.Exif()
+    exif.get_ifd(0x8769)[0xA405] = 28
+    for name in ("a", "b"):
+        Image.new("RGB", (400, 300)).save(tmp_path / f"{name}.jpg", exif=exif)
+    files = {name: tmp_path / f"{name}.jpg" for name in ("a", "b")}
+    conf = configured(sfm={"long_side": 200})
+    made = prepare_hr_views(scenes.Scene("x", "", files), conf, tmp_path, for_sfm=True)
+    for image in registration.sfm_images(made, (), sfm_conf):
+        assert image.focal == pytest.approx(250 * 28 / 43.2666, rel=1e-4)
 
 
 def test_a_degraded_copy_of_full_size_is_given_as_it_is(
     configured: Make, sfm_conf: SfmConf, stereo_scene: SceneConf, tmp_path: Path
 ) -> None:
     scene = scenes.resolve(stereo_scene, tmp_path)
-    conf = configured(long_side=185, degradation="jpeg")
-    made = prepare_hr_views(scene, conf, tmp_path)
-    write_degraded(made, [1], conf)
+    conf = configured(factor=1, degradation="jpeg", sfm={"long_side": 185})
+    made = prepare_hr_views(scene, conf, tmp_path, for_sfm=True)
+    write_degraded(made, [1], conf, "sfm_lr")
     for lr_images in ("upsampled", "native"):
         given = registration.sfm_images(made, [1], replace(sfm_conf, lr_images=lr_images))
-        assert [image.file for image in given] == ["hr/00000.png", "lr/00001.png"]
-    assert not (tmp_path / "up").exists()
+        assert [image.file for image in given] == ["sfm/00000.png", "sfm_lr/00001.png"]
+    assert not (tmp_path / "sfm_lr_up").exists()

@@ -64,7 +64,7 @@ def stereo_pair(
     inputs = []
     for file in scene.files.values():
         images.save(work / file.name, images.read(file))
-        inputs.append(sfm.SfmImage(file.name, file.stem, scene.intrinsics[file.stem]))
+        inputs.append(sfm.SfmImage(file.name, file.stem, file.stem, scene.intrinsics[file.stem]))
     return work, sfm.reconstruct(inputs, work, work, sfm_conf)
 
 
@@ -74,7 +74,7 @@ def test_the_stereo_pair_is_registered_with_its_known_intrinsics(stereo_pair: St
     assert len(model.points) == len(model.colors) > 500
     for i, K in enumerate(motorcycle.intrinsics().values()):
         assert np.array_equal(model.lenses[i].K, K)
-        assert model.lenses[i].k == 0
+        assert model.lenses[i].is_pinhole
 
 
 def test_its_cameras_are_parallel_and_side_by_side(stereo_pair: StereoPair) -> None:
@@ -126,7 +126,7 @@ def test_unrelated_images_give_an_empty_model(
     rng = np.random.default_rng(0)
     for i in range(3):
         images.save(tmp_path / f"{i}.png", rng.random((90, 120, 3), dtype=np.float32))
-    inputs = [sfm.SfmImage(f"{i}.png", "all") for i in range(3)]
+    inputs = [sfm.SfmImage(f"{i}.png", str(i), "all") for i in range(3)]
     model = sfm.reconstruct(inputs, tmp_path, tmp_path, sfm_conf)
     assert model.viewmats == {}
     assert model.points.shape == model.colors.shape == (0, 3)
@@ -139,14 +139,13 @@ def test_an_image_whose_camera_came_out_impossible_is_left_out_alone(
     sfm_conf: SfmConf,
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
-    caplog: pytest.LogCaptureFixture,
 ) -> None:
     """COLMAP's last adjustment of 16 tourists' photographs once ended with f = -29,911 px."""
     options = pycolmap.SyntheticDatasetOptions()
     options.num_rigs, options.num_frames_per_rig = 4, 1
     model = pycolmap.synthesize_dataset(options)
     files = sorted(image.name for image in model.images.values())
-    inputs = [sfm.SfmImage(file, file) for file in files]
+    inputs = [sfm.SfmImage(file, f"IMG_{i}", file) for i, file in enumerate(files)]
     for file in files:
         (tmp_path / file).parent.mkdir(parents=True, exist_ok=True)
         images.save(tmp_path / file, np.zeros((36, 48, 3), dtype=np.float32))
@@ -158,8 +157,7 @@ def test_an_image_whose_camera_came_out_impossible_is_left_out_alone(
     made = sfm.reconstruct(inputs, tmp_path, tmp_path, sfm_conf)
     assert sorted(made.viewmats) == sorted(made.lenses) == sorted(made.observed) == [0, 1, 3]
     assert made.report["registered"] == 3
-    (line,) = (record.getMessage() for record in caplog.records)
-    assert line.startswith(f"SfM: {files[2]}: its camera came out as -29911")
-    assert line.endswith("; the image is left out")
+    (note,) = made.report["notes"]
+    assert note.startswith("not placed, because SfM made an impossible camera: IMG_2 (-29911")
     given = replace(inputs[2], K=np.eye(3))
     assert sfm.bogus_cameras(model, [given]) == {}, "known intrinsics are not judged"

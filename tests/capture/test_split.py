@@ -132,9 +132,9 @@ def test_a_threshold_of_the_score_is_inclusive(by_rate: Make) -> None:
 
 def test_one_factor_brings_the_longest_side_to_long_side(configured: Make) -> None:
     sizes = [(2000, 1500), (1000, 4000), (640, 480)]
-    assert shrink_factor(sizes, configured(long_side=1000)) == 0.25
-    assert shrink_factor(sizes, configured(long_side=0)) == 1
-    assert shrink_factor(sizes, configured(long_side=9000)) == 1
+    assert shrink_factor(sizes, 1000) == 0.25
+    assert shrink_factor(sizes, 0) == 1
+    assert shrink_factor(sizes, 9000) == 1
 
 
 @given(st.integers(60, 5000), st.integers(60, 5000), st.integers(0, 3000), st.integers(1, 8))
@@ -145,9 +145,9 @@ def test_an_hr_view_is_a_whole_number_of_lr_pixels_and_never_enlarged(
     shrink = min(1, (side or max(width, height)) / max(width, height))
     if min(round(width * shrink), round(height * shrink)) // factor < WINDOW:
         with pytest.raises(XrgsError, match=r"variant\.factor"):
-            hr_geometry((width, height), shrink_factor([(width, height)], conf), conf)
+            hr_geometry((width, height), shrink_factor([(width, height)], conf.long_side), conf)
         return
-    made = hr_geometry((width, height), shrink_factor([(width, height)], conf), conf)
+    made = hr_geometry((width, height), shrink_factor([(width, height)], conf.long_side), conf)
     assert made.width % factor == made.height % factor == 0
     assert made.width <= made.resized[0] <= width
     assert made.height <= made.resized[1] <= height

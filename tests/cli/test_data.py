@@ -16,10 +16,12 @@ import torch
 from numpy.typing import NDArray
 from PIL import Image
 from plyfile import PlyData
+from scipy.spatial.transform import Rotation
 
 import xrgs
 import xrgs.capture.description
 from xrgs.capture import poses, variant
+from xrgs.experiment.cell_folder import CellFolder
 from xrgs.sweep.jobs import worker
 
 XrgsData = Callable[..., tuple[int, str, str]]
@@ -137,6 +139,56 @@ def test_a_variant_is_exported_without_splats_and_read_as_poses(
         assert not (tmp_path / layout / "splats.ply").exists()
     poses.fingerprint(str(tmp_path / "colmap" / "sparse" / "0"))
     poses.fingerprint(str(tmp_path / "nerfstudio" / "transforms.json"))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("form", "tolerance"), [("ply", 0.0), ("glb", 1e-5), ("spz", 0.05)])
+def test_the_splats_of_a_cell_render_the_same_from_every_format(
+    xrgs_data: XrgsData, store: Path, tmp_path: Path, form: str, tolerance: float
+) -> None:
+    folder = sorted((store / "cells").iterdir())[0]
+    code, said, err = xrgs_data("export", folder.name[:8], "--format", form, "--store", str(store))
+    assert code == 0, err
+    assert said.endswith(f"Gaussians: written to {folder.name}.{form}\n")
+    cell = CellFolder(folder)
+    gaussians, antialiased = xrgs.load_gaussians(tmp_path / f"{folder.name}.{form}")
+    assert antialiased == cell.config().splat.raster.antialiased
+    for view in cell.dataset().test:
+        got, wanted = (
+            xrgs.rasterize(of, view.camera, settings=cell.config().splat.raster).image.detach()
+            for of in (gaussians, cell.gaussians())
+        )
+        assert wanted.std() > 0.005
+        assert (got - wanted).abs().mean() <= tolerance * wanted.mean()
+    if form == "glb":  # the cameras' mean up direction is glTF's +y
+        description = (tmp_path / f"{folder.name}.glb").read_bytes()[20:].split(b'"rotation":')[1]
+        turn = Rotation.from_quat(json.loads(description.split(b"]")[0] + b"]"))
+        ups = [-view.camera.viewmat[1, :3].numpy() for view in cell.dataset().train]
+        up = np.mean(ups, axis=0)
+        assert np.allclose(turn.apply(up / np.linalg.norm(up)), [0, 1, 0], atol=1e-6)
+
+
+def test_files_of_gaussians_are_converted(xrgs_data: XrgsData, tmp_path: Path) -> None:
+    points = torch.rand(9, 3, generator=torch.Generator().manual_seed(0))
+    gaussians = xrgs.Gaussians.from_points(points, points)
+    xrgs.save_ply(tmp_path / "a.b.ply", gaussians, antialiased=True)
+    for source, form, made in (("a.b.ply", "glb", "a.b.glb"), ("./a.b.glb", "spz", "a.b.spz")):
+        code, said, err = xrgs_data("export", source, "--format", form)
+        assert code == 0, err
+        assert said == f"9 antialiased Gaussians: written to {made}\n"
+    read = xrgs.load_gaussians(tmp_path / "a.b.spz")
+    assert read.antialiased
+    assert torch.allclose(read.gaussians.means, gaussians.means, atol=1e-6)
+    for arguments, message in (
+        (["a.b.ply", "--format", "glb"], "--out a.b.glb: it exists; name a new file"),
+        (["a.b.ply", "--format", "glb", "--out", "x"], "must end with .glb"),
+        (["a.b.ply", "--format", "glb", "--out", "no/x.glb"], "--out no/x.glb: No such file"),
+        (["none.ply", "--format", "glb"], "none.ply: cannot be read"),
+        (["a.b.ply"], "a.b.ply: Not a directory; give the folder"),
+    ):
+        code, out, err = xrgs_data("export", *arguments)
+        assert (code, out) == (1, "")
+        assert message in err
 
 
 def test_what_cant_be_exported_is_named(xrgs_data: XrgsData, tmp_path: Path) -> None:

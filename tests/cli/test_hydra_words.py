@@ -16,6 +16,7 @@ from xrgs.capture.scenes import motorcycle
 from xrgs.cli.hydra_words import explained, with_quotes
 from xrgs.cli.sweep import texts
 from xrgs.errors import XrgsError
+from xrgs.sweep.axes import expand
 
 RunCommand = Callable[..., tuple[int, str, str]]
 ACCENT = "e\N{COMBINING ACUTE ACCENT}"
@@ -47,6 +48,55 @@ def test_a_word_that_hydra_reads_otherwise_is_a_path_if_it_exists(
     monkeypatch.chdir(tmp_path)
     (tmp_path / name).mkdir()
     assert compose(*with_quotes([f"scene.path={name}"])).scene.path == name
+
+
+@pytest.mark.parametrize("name", [*ODD, "100_7100", "null", "it's, that's", "${y}", "IMG(1)", "+p"])
+def test_names_of_views_are_read_as_they_were_written(
+    name: str, compose: Callable[..., config.Conf]
+) -> None:
+    name = name.strip()
+    if "," not in name:
+        for value in (f"[{name}]", f"[IMG_1, {name}]", f"IMG_1,{name}"):
+            given = compose(*with_quotes([f"variant.test={value}"])).variant.test
+            assert given == [*["IMG_1"] * ("IMG_1" in value), name]
+    assert compose(*with_quotes([f"scene.name={name}"])).scene.name == name
+
+
+@pytest.mark.parametrize(
+    ("value", "lists"),
+    [
+        ("[]", [[]]),
+        ("[a,b],[c]", [["a", "b"], ["c"]]),
+        ("['a,b',\"c\"]", [["a,b", "c"]]),
+        ("[IMG(1,2),x]", [["IMG(1,2)", "x"]]),
+        ("[IMG[1,x]", [["IMG[1", "x"]]),
+        ("[it's,that's]", [["it's", "that's"]]),
+    ],
+)
+def test_lists_of_names_are_lists_and_axes(value: str, lists: list[list[str]]) -> None:
+    specs = expand(with_quotes([f"variant.test={value}"]))
+    found = [OverridesParser.create().parse_override(*spec.overrides).value() for spec in specs]
+    assert found == lists
+
+
+def test_files_of_groups_may_have_any_name(tmp_path: Path, sweep_here: RunCommand) -> None:
+    (tmp_path / "scene").mkdir()
+    for name in ("é (1)", "a=b"):
+        (tmp_path / "scene" / f"{name}.yaml").write_text("name: x\nkind: motorcycle\n")
+    code, _, err = sweep_here(
+        f"--config-dir={tmp_path}", "scene=é (1),a=b", "dry_run=true", "variant.test_every=0"
+    )
+    assert code == 0, err
+    assert "plan: 2 cells" in err
+
+
+def test_a_folder_in_place_of_a_scene_is_answered_with_the_words_to_type(
+    tmp_path: Path, sweep_here: RunCommand
+) -> None:
+    (tmp_path / "my photos").mkdir()
+    code, _, err = sweep_here(f"scene={tmp_path}/my photos", "dry_run=true")
+    assert code == 1
+    assert f"is given as scene=folder 'scene.path={tmp_path}/my photos'" in err
 
 
 def test_lists_quotes_and_other_keys_stay_as_they_are() -> None:

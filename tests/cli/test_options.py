@@ -80,6 +80,14 @@ def test_a_current_folder_that_was_removed_is_named(
     assert err.startswith("xrgs-status: the current folder can't be found")
 
 
+def test_a_value_behind_an_option_may_have_an_equals_sign(
+    call_command: RunCommand, tmp_path: Path
+) -> None:
+    code, _, err = call_command("report", "--scenes", "a=b", "c=d", f"store={tmp_path / 'gone'}")
+    assert code == 1
+    assert "gone is not a store" in err
+
+
 @pytest.mark.parametrize(
     ("words", "named"),
     [

@@ -35,7 +35,7 @@ NO_NUMBERS = {
     "splat/__init__.py",
     "splat/gsplat_api.py",  # gsplat's signature, for users
     "splat/ply.py",  # saves the trained Gaussians, exactly as its own tests say
-    "splat/saved.py",  # what files of Gaussians share
+    *(f"splat/{name}.py" for name in ("files", "glb", "saved", "spz", "similarity")),  # the same
     "training/__init__.py",
     "training/registry.py",  # identities have the order of the components that are on
     "training/plugins.py",

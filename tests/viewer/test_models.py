@@ -10,6 +10,7 @@ import pytest
 from xrgs.errors import StoreError, XrgsError
 from xrgs.experiment.attempts import begin_attempt
 from xrgs.experiment.store import Store
+from xrgs.splat.files import save_gaussians
 from xrgs.splat.ply import save_ply
 from xrgs.splat.settings import RasterSettings
 from xrgs.viewer import models
@@ -69,6 +70,37 @@ def test_a_ply_file_has_the_default_settings(
     assert loaded.settings == RasterSettings()
     assert len(loaded.gaussians) == 40
     assert models.reference([loaded]) is None
+
+
+@pytest.mark.parametrize("suffix", ["ply", "glb", "spz"])
+def test_a_file_says_whether_it_is_antialiased_and_an_option_wins_with_a_word(
+    model: Callable[..., Model],
+    store: Store,
+    tmp_path: Path,
+    caplog: pytest.LogCaptureFixture,
+    suffix: str,
+) -> None:
+    for tagged in (True, False):
+        file = tmp_path / f"a.{suffix}"
+        save_gaussians(file, model().gaussians, antialiased=tagged)
+        for asked in (None, True, False):
+            caplog.clear()
+            (loaded,) = models.load_models([str(file)], store, asked)
+            wanted = tagged if asked is None else asked
+            assert loaded.settings == RasterSettings(antialiased=wanted)
+            said = {
+                (True, False): f"a.{suffix} is antialiased; it is rendered without antialiasing",
+                (False, True): f"a.{suffix} is without a word about antialiasing; it is rendered",
+            }.get((tagged, wanted), "")
+            assert said in caplog.text
+            assert bool(caplog.text) == bool(said)
+
+
+def test_a_file_in_another_format_is_named(store: Store) -> None:
+    with pytest.raises(XrgsError, match=r"a\.txt: its name must end with one of \.ply"):
+        models.load_models(["a.txt"], store)
+    with pytest.raises(XrgsError, match="npx @playcanvas/splat-transform"):
+        models.load_models(["a.splat"], store)
 
 
 @pytest.mark.parametrize("words", [[], ["a", "b", "c"]])

@@ -187,9 +187,8 @@ def _load_view(view: View, viewmat: NDArray[np.float64], *, hide: bool) -> Loade
     size = view.width, view.height
     # A copy, since the array of PIL's memory is read-only.
     pixels = np.array(images.read_png_pil(view.file, size))
-    if view.mask is None:
-        return LoadedView(view.name, view.tag, camera, torch.from_numpy(pixels), view.rho)
-    mask = images.read_mask(view.mask, size)
-    pixels = masks.filled(pixels, mask) if hide else pixels
-    tensors = torch.from_numpy(pixels), torch.from_numpy(mask)
-    return LoadedView(view.name, view.tag, camera, tensors[0], view.rho, tensors[1])
+    mask = None if view.mask is None else images.read_mask(view.mask, size)
+    if hide:
+        pixels = masks.filled(pixels, mask)
+    used = None if mask is None else torch.from_numpy(mask)
+    return LoadedView(view.name, view.tag, camera, torch.from_numpy(pixels), view.rho, used)

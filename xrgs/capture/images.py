@@ -1,7 +1,9 @@
 """Reads, resizes and saves photographs: float32 arrays [H, W, 3] in 0..1 in memory.
 
-Photographs of users are read in six formats, with their EXIF orientation; HEIC needs pillow-heif,
-which is an extra. The images of a store are PNGs of `save`, and are read by `read_png` alone.
+Photographs of users are read in six formats, upright by their EXIF orientation, in sRGB by their
+ICC profile, and with all of their bits. HEIC needs pillow-heif, which is an extra. Of a file of
+several images the first is read (the primary one of HEIC, and of the JPEGs that phones write with
+gain maps or depth). The images of a store are PNGs of `save`, and are read by `read_png` alone.
 Nothing here imports torch before `resize` is called.
 """
 
@@ -11,13 +13,14 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import IO, TYPE_CHECKING
+from typing import IO, TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
-from PIL import Image, ImageOps
+from PIL import Image, ImageOps, UnidentifiedImageError
 from PIL.PngImagePlugin import PngInfo
 
+from xrgs.capture import colour, deep
 from xrgs.errors import UnreadableError, XrgsError
 from xrgs.safeio.atomic import atomic_writer
 from xrgs.safeio.files import is_transient
@@ -34,8 +37,25 @@ _FORMATS = ("BMP", "HEIF", "JPEG", "PNG", "TIFF", "WEBP")
 HEIC = frozenset({".heic", ".heif", ".hif"})
 #: What the PNGs of this package have in their text chunk `Software`.
 SOFTWARE = "xrgs"
+#: How files begin that people take for photographs of these formats, and what they are.
+_OTHER_FORMATS = {
+    b"\xff\x0a": "JPEG XL",
+    b"\0\0\0\x0cJXL ": "JPEG XL",
+    b"\0\0\0\x0cjP  ": "JPEG 2000",
+    b"GIF8": "GIF",
+    b"8BPS": "a Photoshop document",
+}
+_AVIF_BRANDS = (b"avif", b"avis")
 #: What a HEIC file has after its first four bytes, as other files of its container do.
 _HEIF_MAGIC = b"ftyp"
+_TIFF_MAGIC = (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")
+_PNG_MAGIC = b"\x89PNG\r\n\x1a\n"
+#: The chunks of a PNG that may hold EXIF or XMP.
+_PNG_TEXT = (b"eXIf", b"iTXt", b"tEXt", b"zTXt")
+#: The longest chunk that is kept, bytes: those of headers and colours are shorter.
+_SHORT_CHUNK = 64
+#: The channels of a PNG's colour types: grey, RGB, palette, grey with alpha, RGBA.
+_PNG_CHANNELS = {0: 1, 2: 3, 3: 1, 4: 2, 6: 4}
 #: The largest photograph that is read: cameras give 200 megapixels, and PIL takes 1 GB for this.
 MAX_PIXELS = 1 << 28
 #: The largest image of a store that is read. In training it takes 200 MB, and 2.4 GB more while a
@@ -48,16 +68,20 @@ _MAX_EXPANSION, _SMALL_PIXELS = 1032, 1 << 24
 _BITS = {"1": 1, "P": 1, "L": 8}
 #: With `scene.alpha=mask`, pixels of a lower alpha are outside. Our choice.
 OPAQUE_FROM = 0.5
-#: The formats that PIL turns upright by itself. The tag of a TIFF stays until it is loaded.
-_UPRIGHT = ("HEIF", "TIFF")
 _EXIF_ORIENTATION = 0x0112
 _EXIF_CAMERA = (0x010F, 0x0110)  # make, model
-_EXIF_DETAILS = 0x8769
-_EXIF_FOCAL = (0x920A, 0xA405)  # focal length in mm, and its equivalent on 35 mm film
+_EXIF_DETAILS, _EXIF_COLOUR_SPACE, _EXIF_INTEROPERABILITY = 0x8769, 0xA001, 0xA005
+_EXIF_FOCAL_35MM = 0xA405  # the focal length that has this field of view on 35 mm film
+_EXIF_FOCAL = (0x920A, _EXIF_FOCAL_35MM)  # in mm
+_TIFF_PROFILE = 34675
 
 
 class ImageError(XrgsError):
     """A file can't be read as a photograph; the message begins with its path."""
+
+
+class _RefusedError(ValueError):
+    """A sound file that is not read; the message says why."""
 
 
 # PIL's limit holds for the whole process, and refuses photographs that `MAX_PIXELS` admits.
@@ -66,43 +90,78 @@ if Image.MAX_IMAGE_PIXELS is not None:
 
 
 @contextmanager
-def _opened(
-    path: Path, formats: tuple[str, ...] = _FORMATS, max_pixels: int = MAX_PIXELS
-) -> Iterator[Image.Image]:
-    """Open an image whose header declares at most so many pixels; every error names the file."""
+def _stream(path: Path) -> Iterator[BinaryIO]:
+    """Open a file; every error of reading it as an image names it."""
     try:
-        with (
-            path.open("rb") as stream,
-            Image.open(stream, formats=_known(formats, stream)) as image,
-        ):
-            if image.width * image.height > max_pixels:
-                size = f"{image.width} x {image.height}"
-                raise ValueError(f"it has {size} pixels; at most {max_pixels} in all are read")
-            yield image
+        with path.open("rb") as stream:
+            yield stream
     except MemoryError:
         raise
+    except (_RefusedError, colour.ColourError, deep.DepthError) as error:
+        raise ImageError(f"{path}: {error}") from error
+    except UnidentifiedImageError as error:
+        raise ImageError(
+            f"{path}: unreadable or truncated image ({_unidentified(path)})"
+        ) from error
     except Exception as error:  # PIL raises nearly anything on a damaged file
         # PIL's own OSErrors, of truncated files, have no number.
         if isinstance(error, OSError) and error.errno is not None and is_transient(error):
             raise UnreadableError(f"{path}: {error.strerror}; try again") from error
-        why = error.strerror if isinstance(error, OSError) and error.strerror else error
+        why = (
+            error.strerror if isinstance(error, OSError) and error.strerror else str(error).strip()
+        )
         raise ImageError(f"{path}: unreadable or truncated image ({why})") from error
 
 
-def _known(formats: tuple[str, ...], stream: BinaryIO) -> tuple[str, ...]:
-    """Return the formats that PIL knows; HEIF is registered where the file may be HEIF."""
-    if "HEIF" not in formats:
-        return formats
-    start = stream.read(8)
+def _unidentified(path: Path) -> str:
+    """Say what a file is that PIL can't identify."""
+    if path.stat().st_size == 0:
+        return "the file is empty"
+    return f"cannot identify it as one of {', '.join(_FORMATS)}"
+
+
+def _check_size(
+    stream: BinaryIO, size: tuple[int, int], max_pixels: int, bits: int, *, drawing: bool = True
+) -> None:
+    """Refuse an image that is too large, or that no file of these bytes can hold.
+
+    Its memory is not taken yet. A small `drawing` may compress without end.
+
+    Args:
+        stream: The file.
+        size: Width and height, px.
+        max_pixels: The most pixels that it may have.
+        bits: The bits of a pixel.
+        drawing: Whether it may be one.
+    """
+    width, height = size
+    if width * height > max_pixels:
+        raise _RefusedError(
+            f"it has {width} x {height} pixels; at most {max_pixels} in all are read"
+        )
+    file_bytes = stream.seek(0, 2)
     stream.seek(0)
-    if start[4:] != _HEIF_MAGIC:
-        return tuple(name for name in formats if name != "HEIF")
+    if drawing and width * height <= _SMALL_PIXELS:
+        return
+    if bits * width * height > 8 * _MAX_EXPANSION * file_bytes:
+        raise _RefusedError(f"{file_bytes} bytes are too few for {width} x {height} px")
+
+
+def _formats(start: bytes) -> tuple[str, ...]:
+    """Return the formats that a file which begins so may have; HEIF is registered for HEIF."""
+    for magic, name in _OTHER_FORMATS.items():
+        if start.startswith(magic):
+            raise _RefusedError(f"it is {name}, which is not read; convert it to PNG or JPEG")
+    if start[4:8] != _HEIF_MAGIC:
+        return tuple(name for name in _FORMATS if name != "HEIF")
+    if start[8:12] in _AVIF_BRANDS:
+        raise _RefusedError("it is AVIF, which is not read; convert it to PNG or JPEG")
     try:
         from pillow_heif import register_heif_opener
     except ImportError as error:
-        raise ValueError("HEIC needs pillow-heif: pip install 'xrgs[heic]'") from error
+        raise _RefusedError("HEIC needs pillow-heif: pip install 'xrgs[heic]'") from error
     register_heif_opener()
-    return formats
+    return _FORMATS
 
 
 @dataclass(frozen=True)
@@ -112,9 +171,17 @@ class Header:
     size: tuple[int, int]
     """Width and height with the EXIF orientation applied, px."""
     orientation: int
-    """The EXIF orientation, 1 to 8; 1 where the tag is missing or invalid."""
-    is_deep_grey: bool
-    """Whether it has one channel of more than 8 bits, as depth maps have."""
+    """The EXIF orientation that is applied, 1 to 8; 1 where the tag is missing or invalid. It is 1
+    of HEIC, which has its own transformations."""
+    channels: int
+    """How many values a pixel has; 1 also of a palette's."""
+    bits: int
+    """How many bits a value has."""
+
+    @property
+    def is_deep_grey(self) -> bool:
+        """Whether it has one channel of more than 8 bits, as depth maps have."""
+        return self.channels == 1 and self.bits > 8
 
 
 @dataclass(frozen=True)
@@ -128,7 +195,192 @@ class Picture:
     orientation: int
     """The EXIF orientation that was applied, as in `Header`."""
     notes: tuple[str, ...]
-    """What was done to it, as in `converted from Display P3`."""
+    """What was done to it, as in `converted from Display P3 to sRGB`."""
+
+
+@dataclass
+class _Samples:
+    """The pixels of a file, as `Picture` has them but for colour and orientation."""
+
+    colours: NDArray[np.uint8] | NDArray[np.uint16]
+    """[H, W, 1, 3 or 4]: grey, RGB or CMYK."""
+    alpha: NDArray[np.float32] | None
+    note: str = ""
+    is_upright: bool = False
+
+
+class _File(Protocol):
+    """An opened photograph."""
+
+    size: tuple[int, int]
+    """Width and height of the pixels as they are stored, px."""
+    orientation: int
+    channels: int
+    bits: int
+    exif: Image.Exif
+    profile: bytes | None
+    note: str
+
+    @property
+    def frames(self) -> int:
+        """Return how many images the file has, but for those that belong to one."""
+
+    def encoding(self) -> colour.Encoding | None:
+        """Return the colours that the file names in place of an ICC profile."""
+
+    def load(self) -> _Samples:
+        """Decode the pixels."""
+
+
+class _PilFile:
+    """A photograph that PIL opens; `deep` decodes the PNGs and HEIC files of more than 8 bits."""
+
+    def __init__(self, stream: BinaryIO, start: bytes, note: str = "") -> None:
+        self._stream, self.note = stream, note
+        self.image = image = Image.open(stream, formats=_formats(start))
+        is_heif, is_png = image.format == "HEIF", image.format == "PNG"
+        self._chunks, has_late_exif = _png_chunks(stream) if is_png else ({}, False)
+        self.channels, self.bits = len(image.getbands()), int(image.info.get("bit_depth", 8))
+        if is_png:
+            self.bits, colour_type = self._chunks[b"IHDR"][8:10]
+            self.channels = _PNG_CHANNELS[colour_type]
+        deep_bits = self.channels * self.bits if self.bits > 8 else 0
+        _check_size(stream, image.size, MAX_PIXELS, deep_bits or _BITS.get(image.mode, 24))
+        self.profile: bytes | None = image.info.get("icc_profile")
+        if b"cICP" in self._chunks:  # PNG's third edition puts it above the profile
+            self.profile = None
+        self.exif = Image.Exif()
+        with suppress(Exception):  # PIL raises nearly anything on damaged EXIF
+            # A PNG's own method decodes the pixels, to look for EXIF behind them.
+            self.exif = image.getexif() if has_late_exif else Image.Image.getexif(image)
+        # TIFFs are turned when they are loaded, and say so before; a HEIC file's tag is no order.
+        self.orientation = 1 if is_heif else _orientation(self.exif.get(_EXIF_ORIENTATION))
+        self.size = image.size
+        if image.format == "TIFF":
+            self.size = image.tag_v2[256], image.tag_v2[257]  # type: ignore[attr-defined]
+
+    @property
+    def frames(self) -> int:
+        # The others of a JPEG are gain maps, depth, or the other half of a stereo pair.
+        is_jpeg = self.image.format in ("JPEG", "MPO")
+        return 1 if is_jpeg else getattr(self.image, "n_frames", 1)
+
+    def encoding(self) -> colour.Encoding | None:
+        info = self.image.info
+        if cicp := self._chunks.get(b"cICP"):
+            return colour.from_h273(cicp[0], cicp[1])
+        if self._chunks:
+            known = "srgb" in info
+            xy = info.get("chromaticity")
+            return None if known else colour.from_png(info.get("gamma"), xy)
+        if nclx := info.get("nclx_profile"):
+            return colour.from_h273(
+                int(nclx["color_primaries"]), int(nclx["transfer_characteristics"])
+            )
+        with suppress(Exception):  # as for EXIF itself
+            interoperability = self.exif.get_ifd(_EXIF_INTEROPERABILITY).get(1, "")
+            space = self.exif.get_ifd(_EXIF_DETAILS).get(_EXIF_COLOUR_SPACE)
+            if interoperability.startswith("R03") or space == 2:
+                return colour.adobe_rgb()
+        return None
+
+    def load(self) -> _Samples:
+        image: Image.Image = self.image
+        if self.bits > 8:
+            self._stream.seek(0)
+            if image.format == "HEIF":
+                found = deep.decode_heif(self._stream)
+            else:
+                significant = max(self._chunks.get(b"sBIT", b"\x10"))
+                found = deep.decode_png(self._stream.read(), significant)
+            upright = image.format == "HEIF"
+            return _Samples(found.colours, found.alpha, found.note, upright)
+        image.load()
+        upright = image.format in ("HEIF", "TIFF")
+        if image.mode == "LAB":
+            self.profile = None  # it is of LAB, and so is the conversion
+            return _Samples(colour.from_lab(image), None, "converted from CIELAB to sRGB", upright)
+        if image.has_transparency_data:
+            # PIL converts premultiplied colours (La, RGBa) and palettes with alpha.
+            with_alpha = image.convert("LA" if image.mode in ("1", "L", "LA", "La") else "RGBA")
+            samples = np.asarray(with_alpha)
+            alpha = samples[..., -1].astype(np.float32) / np.float32(255)
+            return _Samples(samples[..., :-1], alpha, is_upright=upright)
+        if image.mode not in ("L", "RGB", "CMYK"):
+            image = image.convert("L" if image.mode == "1" else "RGB")
+        return _Samples(np.atleast_3d(np.asarray(image)), None, is_upright=upright)
+
+
+class _DeepTiff:
+    """A TIFF of more than 8 bits per channel."""
+
+    def __init__(self, stream: BinaryIO, tiff: deep.Tiff) -> None:
+        self._tiff = tiff
+        self.size = tiff.size
+        self.orientation = _orientation(tiff.value(_EXIF_ORIENTATION))
+        self.channels, self.bits = tiff.channels, tiff.bits
+        _check_size(stream, self.size, MAX_PIXELS, self.channels * self.bits)
+        self.profile: bytes | None = tiff.value(_TIFF_PROFILE)
+        self.note = tiff.note
+        self.exif = Image.Exif()
+        with suppress(Exception):  # PIL raises nearly anything on damaged EXIF
+            stream.seek(0)
+            self.exif.load_from_fp(stream)
+
+    @property
+    def frames(self) -> int:
+        return self._tiff.frames
+
+    def encoding(self) -> colour.Encoding | None:
+        return None
+
+    def load(self) -> _Samples:
+        found = self._tiff.decode()
+        return _Samples(found.colours, found.alpha, found.note)
+
+
+def _file(stream: BinaryIO) -> _File:
+    start = stream.read(16)
+    stream.seek(0)
+    if start[:4] not in _TIFF_MAGIC:
+        return _PilFile(stream, start)
+    tiff = deep.Tiff(stream)
+    if tiff.is_deep:
+        return _DeepTiff(stream, tiff)
+    stream.seek(0)
+    return _PilFile(stream, start, tiff.note)
+
+
+def _png_chunks(stream: BinaryIO) -> tuple[dict[bytes, bytes], bool]:
+    """Read the short chunks of a PNG by name, and whether EXIF or text is behind the pixels."""
+    chunks: dict[bytes, bytes] = {}
+    is_late = False
+    stream.seek(len(_PNG_MAGIC))
+    while len(head := stream.read(8)) == 8:
+        length, name = int.from_bytes(head[:4], "big"), head[4:]
+        content = stream.read(length) if length <= _SHORT_CHUNK else b""
+        stream.seek(4 if length <= _SHORT_CHUNK else length + 4, 1)
+        chunks.setdefault(name, content)
+        is_late |= b"IDAT" in chunks and name in _PNG_TEXT
+        if name == b"IEND":
+            break
+    return chunks, is_late
+
+
+def _orientation(value: object) -> int:
+    """Return an EXIF orientation; 1 for all that is no number of 1 to 8."""
+    return int(value) if value in range(1, 9) else 1  # type: ignore[call-overload]
+
+
+def _turned(array: NDArray[Any], orientation: int) -> NDArray[Any]:
+    """Turn an array [H, W, ...] upright by its EXIF orientation."""
+    if orientation >= 5:  # 5 to 8 are mirrored at the diagonal, then as 1, 2, 4 and 3
+        array = array.swapaxes(0, 1)
+    if orientation in (2, 3, 6, 7):
+        array = array[:, ::-1]
+    if orientation in (3, 4, 7, 8):
+        array = array[::-1]
+    return array
 
 
 def header(path: Path) -> Header:
@@ -138,31 +390,19 @@ def header(path: Path) -> Header:
         UnreadableError: The file can't be read now.
         ImageError: The file is not an image, or is larger than `MAX_PIXELS`.
     """
-    with _opened(path) as image:
-        return _header(image)
+    with _stream(path) as stream:
+        return _header(_file(stream))
+
+
+def _header(file: _File) -> Header:
+    width, height = file.size
+    size = (height, width) if file.orientation >= 5 else (width, height)
+    return Header(size, file.orientation, file.channels, file.bits)
 
 
 def size(path: Path) -> tuple[int, int]:
     """Return the width and height of a photograph, px, as `header` does."""
     return header(path).size
-
-
-def _header(image: Image.Image) -> Header:
-    orientation, (width, height) = _orientation(image), image.size
-    turns = orientation >= 5 and image.format not in _UPRIGHT
-    return Header(
-        size=(height, width) if turns else (width, height),
-        orientation=orientation,
-        is_deep_grey=image.mode[0] in "IF",
-    )
-
-
-def _orientation(image: Image.Image) -> int:
-    """Read the EXIF orientation; a value of another type than a number of 1 to 8 is ignored."""
-    with suppress(Exception):  # PIL raises nearly anything on damaged EXIF
-        value = image.getexif().get(_EXIF_ORIENTATION, 1)
-        return int(value) if value in range(1, 9) else 1
-    return 1
 
 
 def is_own(path: Path) -> bool:
@@ -172,7 +412,7 @@ def is_own(path: Path) -> bool:
         UnreadableError: The file can't be read now.
         ImageError: The file is not a PNG.
     """
-    with _opened(path, ("PNG",)) as image:
+    with _stream(path) as stream, Image.open(stream, formats=("PNG",)) as image:
         return image.info.get("Software") == SOFTWARE
 
 
@@ -183,8 +423,7 @@ def has_colour(path: Path) -> bool:
         UnreadableError: The file can't be read now.
         ImageError: The file is not an image.
     """
-    with _opened(path) as image:
-        return len(image.getbands()) >= 3
+    return header(path).channels >= 3
 
 
 def thumbnail(path: Path, side: int) -> NDArray[np.uint8]:
@@ -194,10 +433,18 @@ def thumbnail(path: Path, side: int) -> NDArray[np.uint8]:
         UnreadableError: The file can't be read now.
         ImageError: The file is unreadable or truncated.
     """
-    with _opened(path) as image:
-        image.draft("RGB", (8 * side, 8 * side))  # JPEGs are decoded at down to an eighth
-        upright = ImageOps.exif_transpose(image).convert("RGB").convert("L")
-        return np.asarray(upright.resize((side, side), Image.Resampling.BOX))
+    with _stream(path) as stream:
+        file = _file(stream)
+        if isinstance(file, _PilFile) and file.bits <= 8:
+            # JPEGs are decoded at down to an eighth of their size.
+            file.image.draft("RGB", (16 * side, 16 * side))
+            upright = ImageOps.exif_transpose(file.image).convert("RGB")
+            return _small(upright, side)
+    return _small(Image.fromarray(to_8_bit(decode(path).pixels)), side)
+
+
+def _small(image: Image.Image, side: int) -> NDArray[np.uint8]:
+    return np.asarray(image.convert("L").resize((side, side), Image.Resampling.BOX))
 
 
 def exif_camera(path: Path) -> str:
@@ -210,37 +457,55 @@ def exif_camera(path: Path) -> str:
         UnreadableError: The file can't be read now.
         ImageError: The file is not an image.
     """
-    with _opened(path) as image:
-        exif, details = image.getexif(), {}
+    with _stream(path) as stream:
+        exif, details = _file(stream).exif, {}
         with suppress(Exception):  # PIL raises nearly anything on damaged EXIF
             details = exif.get_ifd(_EXIF_DETAILS)
         values = [exif.get(tag) for tag in _EXIF_CAMERA] + [details.get(t) for t in _EXIF_FOCAL]
     return "/".join("" if value is None else str(value).strip("\0 ") for value in values).strip("/")
 
 
-def decode(path: Path) -> Picture:
-    """Decode a photograph: 8-bit values / 255.
+def exif_focal(path: Path) -> float | None:
+    """Read from EXIF the focal length for a film of 36 x 24 mm, mm; None where it is not there.
 
     Raises:
         UnreadableError: The file can't be read now.
-        ImageError: The file is unreadable, truncated, larger than `MAX_PIXELS`, or has more than 8
-            bits per channel.
+        ImageError: The file is not an image.
     """
-    with _opened(path) as image:
-        head = _header(image)
-        if image.width * image.height > _SMALL_PIXELS:
-            _check_expansion(path, image)
-        image.load()
-        if image.mode[0] in "IF":
-            raise ValueError(f"{image.mode} pixels; only 8 bits per channel are read")
-        turned = ImageOps.exif_transpose(image)
-        alpha = None
-        if turned.has_transparency_data:
-            turned = turned.convert("RGBA")
-            opacity = np.asarray(turned.getchannel("A"), dtype=np.float32)
-            if opacity.min() < 255:
-                alpha = opacity / np.float32(255)
-        return Picture(_to_array(turned.convert("RGB")), alpha, head.orientation, ())
+    with _stream(path) as stream, suppress(Exception):  # PIL raises nearly anything on damaged EXIF
+        focal = float(_file(stream).exif.get_ifd(_EXIF_DETAILS)[_EXIF_FOCAL_35MM])
+        return focal if 1 < focal < 10_000 else None
+    return None
+
+
+def decode(path: Path) -> Picture:
+    """Decode a photograph: upright, in sRGB, with alpha apart. 8-bit sRGB values are over 255.
+
+    Raises:
+        UnreadableError: The file can't be read now.
+        ImageError: The file is unreadable, truncated, larger than `MAX_PIXELS`, or its values have
+            no known white.
+    """
+    with _stream(path) as stream:
+        file = _file(stream)
+        head, several = _header(file), file.frames > 1
+        samples = file.load()
+        encoding = None if file.profile else file.encoding()
+        pixels, colour_note = colour.convert(samples.colours, file.profile, encoding)
+        alpha = samples.alpha
+        if alpha is not None and alpha.min() >= 1:
+            alpha = None
+        if not samples.is_upright:
+            pixels = _turned(pixels, head.orientation)
+            alpha = None if alpha is None else _turned(alpha, head.orientation)
+        if pixels.shape[1::-1] != head.size:
+            raise ValueError(
+                f"it has {pixels.shape[1]} x {pixels.shape[0]} pixels, not {head.size}"
+            )
+        notes = [note for note in (file.note, samples.note, colour_note) if note]
+        if several:
+            notes.append("only the first image of the file read")
+        return Picture(np.ascontiguousarray(pixels), alpha, head.orientation, tuple(notes))
 
 
 def composite(
@@ -306,25 +571,17 @@ def read_png_pil(
     mode: str = "RGB",
 ) -> Image.Image:
     """Read a PNG as `read_png` does, into an image of PIL of mode RGB, or L for grey."""
-    with _opened(path, ("PNG",), max_pixels) as image:
+    with _stream(path) as stream, Image.open(stream, formats=("PNG",)) as image:
         if size is not None and image.size != size:
-            raise ValueError(
+            raise _RefusedError(
                 f"it has {image.width} x {image.height} pixels, not {size[0]} x {size[1]}"
             )
         if image.mode != mode:
             kind = "RGB" if mode == "RGB" else "grey"
-            raise ValueError(f"its pixels are {image.mode}, not 8-bit {kind}")
-        _check_expansion(path, image)
+            raise _RefusedError(f"its pixels are {image.mode}, not 8-bit {kind}")
+        _check_size(stream, image.size, max_pixels, _BITS.get(image.mode, 24), drawing=False)
         image.load()
         return image
-
-
-def _check_expansion(path: Path, image: Image.Image) -> None:
-    """Refuse an image that no file of these bytes can hold, before memory is taken for it."""
-    file_bytes = path.lstat().st_size
-    bits = _BITS.get(image.mode, 24)
-    if bits * image.width * image.height > 8 * _MAX_EXPANSION * file_bytes:
-        raise ValueError(f"{file_bytes} bytes are too few for {image.width} x {image.height} px")
 
 
 def _to_array(image: Image.Image) -> ImageArray:

@@ -244,8 +244,8 @@ def _rays(pixels: NDArray[np.float64], K: NDArray[np.float64]) -> NDArray[np.flo
 
 
 def _border(lens: Lens) -> NDArray[np.float64]:
-    """Return points [1024, 2] around the border of an image, in order, px."""
-    t = np.arange(256) / 256
+    """Return points [256, 2] around the border of an image, in order, px."""
+    t = np.arange(64) / 64
     sides = [(t, 0 * t), (0 * t + 1, t), (1 - t, 0 * t + 1), (0 * t, 1 - t)]
     return np.concatenate([np.stack(side, -1) for side in sides]) * (lens.width, lens.height)
 
@@ -267,7 +267,7 @@ def _zoom(lens: Lens) -> float:
             "picture or its principal point is outside of the picture: "
             f"{', '.join(f'{value:g}' for value in lens.params)}"
         )
-    for _ in range(50):
+    for _ in range(40):
         zoom = (low + high) / 2
         low, high = (low, zoom) if _fills(lens, rays / zoom) else (zoom, high)
     return high
@@ -275,7 +275,7 @@ def _zoom(lens: Lens) -> float:
 
 def _fills(lens: Lens, rays: NDArray[np.float64]) -> bool:
     """Return whether all inside a border of rays [N, 2] has a source inside the photograph."""
-    steps = np.append(np.linspace(0, 1, 17), 1.001)  # from the axis to the border, and just beyond
+    steps = np.append(np.linspace(0, 1, 9), 1.001)  # from the axis to the border, and just beyond
     path = lens.project((steps[:, None, None] * rays).reshape(-1, 2)).reshape(len(steps), -1, 2)
     # Where the radius falls on the way out, the lens would fold the image.
     radius = np.linalg.norm(path - path[0], axis=-1)

@@ -6,17 +6,17 @@ they are known only after SfM, which then gets the photographs as they are.
 
 from __future__ import annotations
 
-import logging
+import math
 import time
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from xrgs.capture import images, poses, registration, sampling
+from xrgs.capture import images, poses, registration, sampling, triangulation
 from xrgs.capture.alignment import pose_error
 from xrgs.capture.degradations import resolve_degradation
 from xrgs.capture.lens import Lens
@@ -33,14 +33,13 @@ from xrgs.capture.split import (
 from xrgs.capture.tags import POLICIES
 from xrgs.capture.views import SceneFailed, Variant, View
 from xrgs.runtime.progress import progress
+from xrgs.runtime.text import listed
 from xrgs.safeio.atomic import write_text
 
 if TYPE_CHECKING:
     from xrgs.capture.scenes import Scene
     from xrgs.capture.sfm import Reconstruction
     from xrgs.config import VariantConf
-
-_log = logging.getLogger(__name__)
 
 #: How much finer HR views must sample the scene than LR views for the two to be called so, in their
 #: medians; our choice. The paper has 5.
@@ -78,27 +77,25 @@ def mix_resolutions(scene: Scene, conf: VariantConf, work: Path, out: Path) -> V
     """
     check_variant_conf(conf)
     start = time.perf_counter()
-    photos = prepare_hr_views(scene, conf, work)
+    scene = poses.with_masks(scene, conf.poses)
+    photos = prepare_hr_views(scene, conf, work, for_sfm=conf.poses is None)
     sizes = [photo.size for photo in photos.all]
     inputs = _Inputs(scene, conf, photos, split_before_sfm(photos.names, sizes, conf))
-    write_degraded(photos, inputs.degraded, conf)
     registered = _register(inputs, work)
     model = registered.model
     _write_log(work, out)
     report = _sfm_report(inputs, model) | {"attempts": registered.attempts}
     if registered.refused:
-        raise SceneFailed(f"scene {scene.name} failed: {registered.refused}", report)
+        raise _failure(inputs, registered, report, work)
     report |= _pose_report(inputs, model, work)
     depths = sampling.median_depths(model)
     if conf.tags in POLICIES and POLICIES[conf.tags].needs_depth:
         inputs = replace(inputs, split=_split_by_depth(photos, conf, model, depths))
-        write_degraded(photos, inputs.degraded, conf)
-    views = _write_undistorted(inputs, model, depths, out)
+    write_degraded(photos, inputs.degraded, conf)
+    views, hidden = _write_undistorted(inputs, model, depths, out)
     tags, masked = _tags_report(inputs, views), _mask_report(views)
-    notes = [*report["notes"], *tags["notes"], *masked["notes"]]
+    notes = [*report["notes"], *tags["notes"], *hidden, *masked["notes"]]
     report |= tags | masked | {"notes": notes}
-    for note in report["notes"]:
-        _log.warning("scene %s: %s", scene.name, note)
     report["seconds"] = round(time.perf_counter() - start, 1)
     held_out = bool(inputs.split.test)
     return Variant(
@@ -111,7 +108,11 @@ def _register(inputs: _Inputs, work: Path) -> Registration:
     photos, conf = inputs.photos, inputs.conf
     if conf.poses is not None:
         model = poses.read_poses(conf.poses, photos)
+        if not len(model.points):
+            write_degraded(photos, inputs.degraded, conf)
+            model = triangulation.with_points(model, photos, inputs.degraded, conf.sfm, work)
         return Registration(model, _refusal(inputs, model), [])
+    write_degraded(photos, inputs.degraded, conf, "sfm_lr")
     return registration.register(
         photos, inputs.degraded, conf.sfm, work, lambda model: _refusal(inputs, model)
     )
@@ -132,19 +133,61 @@ def _split_by_depth(
 
 def _refusal(inputs: _Inputs, model: Reconstruction) -> str:
     """Say why too few views are registered to train and to test on; empty where they are enough."""
-    split, names, conf = inputs.split, inputs.photos.names, inputs.conf
-    registered = model.viewmats.keys()
-    missing = [name for i, name in enumerate(names) if i not in registered]
-    source = "COLMAP registered" if conf.poses is None else "variant.poses has"
-    summary = f"{source} {len(registered)} of {len(names)} views"
+    names, conf = inputs.photos.names, inputs.conf
+    missing = [name for i, name in enumerate(names) if i not in model.viewmats]
+    source = "" if conf.poses is None else "variant.poses: "
+    summary = f"{source}{_placed(model, names)}, {len(model.points)} points"
     if missing:
-        summary += f" (not {', '.join(missing[:6])}{', ...' if len(missing) > 6 else ''})"
-    summary += f" and {'found ' if conf.poses is None else ''}{len(model.points)} points"
+        summary += f"; not placed: {listed(missing)}"
     fraction = conf.sfm.min_registered
-    if len(registered) < fraction * len(names):
-        return f"{summary}; variant.sfm.min_registered={fraction} requires more."
-    lacking = shortage(split, registered, conf)
-    return f"{summary}: {lacking}." if lacking else ""
+    if len(model.viewmats) < fraction * len(names):
+        return f"{summary}; variant.sfm.min_registered={fraction} requires more"
+    lacking = shortage(inputs.split, model.viewmats.keys(), conf)
+    return f"{summary}; {lacking}" if lacking else ""
+
+
+def _placed(model: Reconstruction, names: Sequence[str]) -> str:
+    return f"{len(model.viewmats)} of {len(names)} photographs are placed"
+
+
+def _failure(
+    inputs: _Inputs, registered: Registration, report: dict[str, Any], work: Path
+) -> SceneFailed:
+    """Say which photographs are not placed, whether the undegraded ones are, and what to try."""
+    conf, photos, model = inputs.conf, inputs.photos, registered.model
+    said = [registered.refused]
+    undegraded = None
+    if conf.poses is None and inputs.degraded:
+        undegraded = registration.reconstruct_undegraded(photos, conf.sfm, work)
+        report = report | {"reference": _results(undegraded)}
+        said.append(f"undegraded, {_placed(undegraded, photos.names)}")
+    advice = ", ".join(_advice(inputs, model, undegraded))
+    text = f"scene {inputs.scene.name} failed: {'; '.join(said)}. To try: {advice}."
+    return SceneFailed(text, report)
+
+
+def _advice(
+    inputs: _Inputs, model: Reconstruction, undegraded: Reconstruction | None
+) -> Iterator[str]:
+    """Yield what may place more photographs, or accept as many as there are."""
+    conf, placed = inputs.conf, len(model.viewmats)
+    if conf.poses is None:
+        if undegraded is not None and len(undegraded.viewmats) > placed and conf.factor > 2:
+            yield f"variant.factor={math.ceil(conf.factor / 2)}"
+        largest = max(max(photo.size) for photo in inputs.photos.all)
+        if 0 < conf.sfm.long_side < largest:
+            yield f"variant.sfm.long_side=0 (the photographs have {largest} px)"
+        parts = model.report["models"]
+        if len(parts) > 1:
+            yield f"photographs between the separate parts of {' and '.join(map(str, parts))}"
+        else:
+            yield "photographs that overlap more"
+        yield "variant.poses=FOLDER with cameras of another program"
+    else:
+        yield "poses of the others"
+    if placed and not shortage(inputs.split, model.viewmats.keys(), conf):
+        share = math.floor(100 * placed / len(inputs.photos)) / 100
+        yield f"variant.sfm.min_registered={share} to go on without the others"
 
 
 def _write_log(work: Path, out: Path) -> None:
@@ -189,14 +232,17 @@ def _pose_report(inputs: _Inputs, model: Reconstruction, work: Path) -> dict[str
     start = time.perf_counter()
     reference = registration.reconstruct_undegraded(photos, inputs.conf.sfm, work)
     exact = {photos.names[i]: matrix for i, matrix in reference.viewmats.items()}
-    keys = ("registered", "points", "reprojection_error_px")
-    results = {key: reference.report[key] for key in keys if key in reference.report}
     seconds = round(time.perf_counter() - start, 1)
     return {
         "pose_error": pose_error(estimated, exact),
         "pose_error_against": "SfM of the undegraded photographs",
-        "reference": results | {"seconds": seconds},
+        "reference": _results(reference) | {"seconds": seconds},
     }
+
+
+def _results(reference: Reconstruction) -> dict[str, Any]:
+    keys = ("registered", "points", "reprojection_error_px")
+    return {key: reference.report[key] for key in keys if key in reference.report}
 
 
 def _tags_report(inputs: _Inputs, views: tuple[View, ...]) -> dict[str, Any]:
@@ -258,20 +304,23 @@ def _mask_report(views: tuple[View, ...]) -> dict[str, Any]:
 
 def _write_undistorted(
     inputs: _Inputs, model: Reconstruction, depths: Mapping[int, float], out: Path
-) -> tuple[View, ...]:
-    """Undistort every registered view at its own size, and write it."""
+) -> tuple[tuple[View, ...], list[str]]:
+    """Undistort every registered view at its own size, and write it; say which are left out."""
     photos, split = inputs.photos, inputs.split
     degraded, low = set(inputs.degraded), set(split.lr)
     train = [("train", i, "LR" if i in low else "HR") for i in sorted((*split.hr, *split.lr))]
     test = [("test", i, "HR") for i in (split.test or range(len(photos)))]
     original = [("original", i, "HR") for i in sorted(degraded)]
     registered = [entry for entry in (*train, *test, *original) if entry[1] in model.viewmats]
-    views, rates = [], []
+    views, rates, hidden = [], [], []
     for part, i, tag in progress(registered, "undistorting", "view"):
         kind, name = "lr" if part == "train" and i in degraded else "hr", photos.names[i]
         width, height = photos.size(kind, i)
         lens = model.lenses[i].resized(width, height)
         image, used = photos.undistorted(kind, i, lens)
+        if used is not None and not used.any():
+            hidden.append(f"{name} ({part})")
+            continue
         file = out / "images" / part / f"{name}.png"
         mask = None if used is None else out / "images" / f"{part}-masks" / f"{name}.png"
         images.save(file, image, durable=False)  # `freeze` syncs all
@@ -281,5 +330,6 @@ def _write_undistorted(
         views.append(View(name, file, part, tag, width, height, K, model.viewmats[i], 1.0, mask))
         rates.append(sampling.sampling_rate(K, depths[i]))
     rhos = sampling.relative_to_largest(rates)
+    notes = [f"views left out, whose masks leave no pixel: {listed(hidden)}"] if hidden else []
     views = [replace(view, rho=rho) for view, rho in zip(views, rhos, strict=True)]
-    return tuple(sorted(views, key=lambda view: (view.split, view.name)))
+    return tuple(sorted(views, key=lambda view: (view.split, view.name))), notes

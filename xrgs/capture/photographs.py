@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections import defaultdict
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -24,9 +25,11 @@ if TYPE_CHECKING:
     from xrgs.capture.scenes import Scene
     from xrgs.config import VariantConf
 
+#: Photographs without EXIF of a size are taken to be by one camera where so many have a size, on
+#: average. Our choice.
+_LEAST_OF_SIZE = 5
+
 _Content = TypeVar("_Content")
-
-
 _T = TypeVar("_T", np.float32, np.bool_)
 
 
@@ -44,21 +47,24 @@ class Photograph:
     """The EXIF orientation that was applied, 1 to 8; 1 is upright."""
     hr: HrGeometry
     """The size of its HR view."""
+    sfm: tuple[int, int]
+    """Width and height at which SfM gets the whole photograph, px."""
     camera: str
     """The name of its camera; photographs with one name share the camera in SfM."""
     K: NDArray[np.float64] | None
     """Intrinsics [3, 3] of the file, px, where they are known; then there is no distortion."""
+    focal_35mm: float | None
+    """The focal length that EXIF gives, for a film of 36 x 24 mm, mm."""
     path: Path
     """The file."""
 
     @property
     def lens(self) -> Lens | None:
-        """The camera of the HR view, after resize and crop; None where it is not known."""
+        """The camera of the file; None where it is not known."""
         if self.K is None:
             return None
         K = self.K
-        params = (K[0, 0], K[1, 1], K[0, 2], K[1, 2])
-        return self.to_hr(lens_of_model("PINHOLE", self.size, params))
+        return lens_of_model("PINHOLE", self.size, (K[0, 0], K[1, 1], K[0, 2], K[1, 2]))
 
     def to_hr(self, lens: Lens) -> Lens:
         """Return the camera of the HR view; `lens` is of the whole photograph, at any size."""
@@ -71,10 +77,15 @@ class Photograph:
 class PhotoCollection:
     """The usable photographs of a scene, sorted by name, and their copies in a work folder.
 
-    A copy is of one of these kinds: `hr` is the HR view, `lr` the degraded view, and `up` the
-    degraded view resized back to the size of the HR view, for SfM. A copy may have a mask. Pixels
-    that the mask of a photograph hides have the colour of the nearest other one in all of them.
-    `shown`, only there for photographs with a mask, is the HR view with the hidden pixels.
+    A copy has one of these kinds:
+
+    - `hr` is the HR view, and `lr` the degraded view.
+    - `sfm` is the whole photograph for SfM, and `sfm_lr` is that copy degraded.
+    - `sfm_up` and `sfm_lr_up` are these two resized to `Photograph.sfm`.
+    - `shown`, of photographs with a mask alone, is the HR view with the pixels that the mask hides.
+
+    A copy may have a mask. In all kinds but `shown`, pixels that the mask of a photograph hides
+    have the colour of the nearest other one.
     """
 
     all: tuple[Photograph, ...]
@@ -94,7 +105,7 @@ class PhotoCollection:
         return [photo.name for photo in self.all]
 
     def file(self, kind: str, index: int) -> str:
-        """Return the path of a copy (`hr`, `lr` or `up`) in `folder`; the copy need not exist."""
+        """Return the path of a copy in `folder`; the copy need not exist."""
         return f"{kind}/{self.all[index].number}.png"
 
     def size(self, kind: str, index: int) -> tuple[int, int]:
@@ -115,13 +126,16 @@ class PhotoCollection:
         if mask is not None:
             images.save_mask(copy_mask(self.folder, self.file(kind, index)), mask, durable=False)
 
-    def upsample(self, index: int) -> None:
-        """Make the `up` copy of a photograph from its `lr` copy, where it does not exist."""
-        file = self.folder / self.file("up", index)
+    def upsampled(self, kind: str, index: int) -> str:
+        """Resize a copy to `Photograph.sfm`; return the kind of the copy that has this size."""
+        target, up = self.all[index].sfm, f"{kind}_up"
+        if self.size(kind, index) == target:
+            return kind
+        file = self.folder / self.file(up, index)
         if not file.exists():
-            width, height = self.all[index].hr.width, self.all[index].hr.height
-            images.save(file, images.resize(self.read("lr", index), width, height), durable=False)
-            self.save_mask("up", index, masks.resized(self.mask("lr", index), width, height))
+            images.save(file, images.resize(self.read(kind, index), *target), durable=False)
+            self.save_mask(up, index, masks.resized(self.mask(kind, index), *target))
+        return up
 
     def undistorted(
         self, kind: str, index: int, lens: Lens
@@ -146,7 +160,9 @@ class PhotoCollection:
         return image, used
 
 
-def prepare_hr_views(scene: Scene, conf: VariantConf, work: Path) -> PhotoCollection:
+def prepare_hr_views(
+    scene: Scene, conf: VariantConf, work: Path, *, for_sfm: bool = False
+) -> PhotoCollection:
     """Decode every photograph once, and write each that can be used as an HR view.
 
     All are resized by one factor, so that a camera that resolved more than another still does.
@@ -156,6 +172,7 @@ def prepare_hr_views(scene: Scene, conf: VariantConf, work: Path) -> PhotoCollec
         scene: The scene.
         conf: The variant's config.
         work: An existing folder for the copies.
+        for_sfm: Whether the `sfm` copies are written, too.
 
     Raises:
         UnreadableError: A photograph can't be read now. It is not left out: the variant would be
@@ -170,11 +187,16 @@ def prepare_hr_views(scene: Scene, conf: VariantConf, work: Path) -> PhotoCollec
     geometries: dict[str, HrGeometry] = {}
     phrases: dict[str, list[str]] = defaultdict(list)
     usable = _usable(scene, conf, headers, left_out, images.decode)
+    sizes: list[tuple[int, int]] = []  # the largest is the first
     for name, hr, picture in progress(usable, "HR views", "view", len(headers)):
-        mask = _used(picture, given.read(name, headers[name]), scene)
-        if not _save_hr(work, f"{numbers[name]}.png", picture, mask, hr, scene):
+        file, mask = f"{numbers[name]}.png", _used(picture, given.read(name, headers[name]), scene)
+        image, shown = _layers(picture, mask, scene)
+        if not _save_hr(work, file, image, shown, mask, hr):
             left_out[name] = "its mask leaves no pixel"
             continue
+        if for_sfm:
+            sizes.append(headers[name].size)
+            _save_sfm(work, file, image, mask, _sfm_size(sizes[-1], sizes, conf))
         geometries[name] = hr
         for phrase in _phrases(picture, scene):
             phrases[phrase].append(name)
@@ -214,7 +236,7 @@ def _usable(
         file, size = scene.files[name], headers[name].size
         try:
             content = read(file)
-            shrink = shrink or shrink_factor([size], conf)
+            shrink = shrink or shrink_factor([size], conf.long_side)
             hr = _checked_geometry(size, shrink, conf)
         except images.ImageError as error:
             left_out[name] = str(error).removeprefix(f"{file}: ")
@@ -243,14 +265,14 @@ def _photographs(
         sizes = [header.size for header in headers.values()]
         try:
             for size in sizes:
-                hr_geometry(size, shrink_factor(sizes, conf), conf)
+                hr_geometry(size, shrink_factor(sizes, conf.long_side), conf)
         except TooSmallError as error:
             reasons += f"; {error.advice}"
         raise XrgsError(f"scene {reasons}")
     numbers = {name: f"{i:05d}" for i, name in enumerate(scene.files)}
     names = sorted(geometries)
-    sizes = [headers[name].size for name in names]
-    cameras = assign_cameras([scene.files[name] for name in names], sizes, conf.sfm.camera)
+    files, sizes = [scene.files[name] for name in names], [headers[name].size for name in names]
+    shapes, cameras = largest_of_shape(sizes), assign_cameras(files, sizes, conf.sfm.camera)
     return tuple(
         Photograph(
             name=name,
@@ -258,11 +280,13 @@ def _photographs(
             size=headers[name].size,
             orientation=headers[name].orientation,
             hr=geometries[name],
+            sfm=_sfm_size(shape, sizes, conf),
             camera=camera,
             K=scene.intrinsics.get(name),
+            focal_35mm=images.exif_focal(scene.files[name]),
             path=scene.files[name],
         )
-        for name, camera in zip(names, cameras, strict=True)
+        for name, shape, camera in zip(names, shapes, cameras, strict=True)
     )
 
 
@@ -274,14 +298,26 @@ def _used(picture: images.Picture, given: Mask | None, scene: Scene) -> Mask | N
     return None if used.all() else used
 
 
-def _save_hr(
-    work: Path, file: str, picture: images.Picture, mask: Mask | None, hr: HrGeometry, scene: Scene
-) -> bool:
-    """Write the HR view of a photograph, with its mask; return whether any pixel is used."""
+def _layers(
+    picture: images.Picture, mask: Mask | None, scene: Scene
+) -> tuple[images.ImageArray, images.ImageArray]:
+    """Return a photograph without the pixels that its mask hides, and as it is shown."""
     shown = picture.pixels
     if picture.alpha is not None:
         shown = images.composite(shown, picture.alpha, scene.background)
     image = picture.pixels if scene.alpha == "mask" else shown
+    return masks.filled(image, mask), shown
+
+
+def _save_hr(
+    work: Path,
+    file: str,
+    image: images.ImageArray,
+    shown: images.ImageArray,
+    mask: Mask | None,
+    hr: HrGeometry,
+) -> bool:
+    """Write the HR view of a photograph, with its mask; return whether any pixel is used."""
     if mask is not None:
         small = _crop(masks.resized(mask, *hr.resized), hr)
         if not small.any():
@@ -289,9 +325,18 @@ def _save_hr(
         if not small.all():
             images.save(work / "shown" / file, _resize_and_crop(shown, hr), durable=False)
             images.save_mask(copy_mask(work, f"hr/{file}"), small, durable=False)
-        image = masks.filled(image, mask)
     images.save(work / "hr" / file, _resize_and_crop(image, hr), durable=False)
     return True
+
+
+def _save_sfm(
+    work: Path, file: str, image: images.ImageArray, mask: Mask | None, size: tuple[int, int]
+) -> None:
+    """Write the copy of a photograph for SfM, with its mask."""
+    images.save(work / "sfm" / file, images.resize(image, *size), durable=False)
+    small = masks.resized(mask, *size)
+    if small is not None and not small.all():
+        images.save_mask(copy_mask(work, f"sfm/{file}"), small, durable=False)
 
 
 def _notes(
@@ -340,6 +385,13 @@ def _checked_geometry(size: tuple[int, int], shrink: float, conf: VariantConf) -
     return hr
 
 
+def _sfm_size(
+    size: tuple[int, int], sizes: Sequence[tuple[int, int]], conf: VariantConf
+) -> tuple[int, int]:
+    shrink = shrink_factor(sizes, conf.sfm.long_side)
+    return max(1, round(size[0] * shrink)), max(1, round(size[1] * shrink))
+
+
 def _resize_and_crop(image: images.ImageArray, hr: HrGeometry) -> images.ImageArray:
     return _crop(images.resize(image, *hr.resized), hr)
 
@@ -370,6 +422,19 @@ def _read_headers(
     return headers, left_out
 
 
+def largest_of_shape(sizes: Sequence[tuple[int, int]]) -> list[tuple[int, int]]:
+    """Return for each width and height the largest of `sizes` that has its aspect ratio.
+
+    Resized copies round their sides, so that ratios agree where one px explains the difference.
+    """
+    distinct = sorted(set(sizes), key=math.prod, reverse=True)
+
+    def largest(width: int, height: int) -> tuple[int, int]:
+        return next(s for s in distinct if abs(width * s[1] / s[0] - height) <= 1)
+
+    return [largest(*size) for size in sizes]
+
+
 def assign_cameras(
     files: Sequence[Path], sizes: Sequence[tuple[int, int]], policy: str
 ) -> list[str]:
@@ -378,39 +443,64 @@ def assign_cameras(
     Args:
         files: The photographs.
         sizes: Their width and height with the EXIF orientation applied, px: a camera held upright
-            is another camera to SfM. All photographs with one name have one size.
+            is another camera to SfM. All photographs with one name have one aspect ratio.
         policy: `variant.sfm.camera`: `single` for one camera, `per_image` for one each, `auto` for
-            one per size and EXIF camera.
+            one per aspect ratio and EXIF camera.
 
     Raises:
-        XrgsError: The policy is `single`, but the sizes differ.
+        XrgsError: The policy is `single`, but the aspect ratios differ.
     """
-    one_size = len(set(sizes)) == 1
+    shapes = largest_of_shape(sizes)
     if policy == "single":
-        if not one_size:
-            other = next(i for i, size in enumerate(sizes) if size != sizes[0])
+        if len(set(shapes)) > 1:
+            other = next(i for i, shape in enumerate(shapes) if shape != shapes[0])
             a, b = (f"{files[i]} is {sizes[i][0]}x{sizes[i][1]}" for i in (0, other))
             raise XrgsError(
-                f"variant.sfm.camera=single, but sizes differ: {a}, {b}; use auto or per_image"
+                f"variant.sfm.camera=single, but shapes differ: {a}, {b}; use auto or per_image"
             )
         return ["all"] * len(files)
+    own = [f"{i:05d}" for i in range(len(files))]
     if policy == "per_image":
-        return [f"{i:05d}" for i in range(len(files))]
+        return own
+    exifs = [images.exif_camera(file) for file in files]
+    unknown = [size for size, exif in zip(sizes, exifs, strict=True) if not exif]
+    # Two tourists' photographs of one size are a coincidence; a camera takes many of its size.
+    by_size = len(set(sizes)) == 1 or len(unknown) >= _LEAST_OF_SIZE * len(set(unknown))
     names = []
-    for i, (file, size) in enumerate(zip(files, sizes, strict=True)):
-        exif = images.exif_camera(file)
-        # Where EXIF names no camera and the sizes differ, two equal sizes are a coincidence.
-        own = not exif and not one_size
-        names.append(f"{i:05d}" if own else f"{size[0]}x{size[1]} {exif}")
+    for i, (size, shape, exif) in enumerate(zip(sizes, shapes, exifs, strict=True)):
+        if exif:
+            names.append(f"{shape[0]}x{shape[1]} {exif}")
+        else:
+            names.append(f"{size[0]}x{size[1]}" if by_size else own[i])
     return names
 
 
-def write_degraded(photos: PhotoCollection, which: Sequence[int], conf: VariantConf) -> None:
-    """Degrade the HR views of these indices, and write them as `lr` copies."""
+def write_degraded(
+    photos: PhotoCollection, which: Sequence[int], conf: VariantConf, kind: str = "lr"
+) -> None:
+    """Degrade views of these indices: the HR views into `lr`, or the `sfm` copies into `sfm_lr`."""
     if not which:
         return
     degrade = DEGRADATIONS[resolve_degradation(conf)]
     for i in progress(which, "LR views", "view"):
-        low = degrade(photos.read("hr", i), conf)
-        images.save(photos.folder / photos.file("lr", i), low, durable=False)
-        photos.save_mask("lr", i, masks.degraded(photos.mask("hr", i), low.shape[:2], conf.factor))
+        source = "hr" if kind == "lr" else "sfm"
+        high, mask = photos.read(source, i), photos.mask(source, i)
+        if kind == "sfm_lr":  # an HR view has been cropped to such a size
+            size = _divisible(*photos.size("sfm", i), conf.factor)
+            high, mask = images.resize(high, *size), masks.resized(mask, *size)
+        low = degrade(high, conf)
+        images.save(photos.folder / photos.file(kind, i), low, durable=False)
+        photos.save_mask(kind, i, masks.degraded(mask, low.shape[:2], conf.factor))
+
+
+def _divisible(width: int, height: int, factor: int) -> tuple[int, int]:
+    """Return a size with sides that are multiples of `factor`, a little smaller than this one.
+
+    Of a few such sizes it has the aspect ratio that is closest to the given one.
+    """
+    most = max(1, width // factor)
+    columns = min(
+        range(most, max(0, most - 8), -1),
+        key=lambda c: abs(c * height / width - round(c * height / width)),
+    )
+    return columns * factor, max(1, round(columns * height / width)) * factor

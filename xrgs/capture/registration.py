@@ -1,8 +1,10 @@
 """Registers the views of a mixed-resolution scene, with further attempts where too few register.
 
-With `sfm.lr_images: upsampled`, downsampled views are resized back to HR size for SfM alone, and
-one camera serves both sizes, which makes the poses of the small images several times more accurate.
-With `native`, SfM gets the files as they are, and a camera of their own for the small ones.
+SfM gets whole photographs at `sfm.long_side`, whatever the size that is trained. Photographs that
+the variant degrades are degraded at that size. With `sfm.lr_images: upsampled`, a smaller image is
+resized to the size of the largest of its shape, and one camera serves both. This makes the poses
+of small images several times more accurate. With `native`, SfM gets a smaller image as it is, with
+a camera of its size.
 
 The first attempt, `configured`, has the settings of `variant.sfm`. With `sfm.fallbacks`, the
 attempts of `FALLBACKS` follow in their order until a reconstruction is accepted.
@@ -11,6 +13,7 @@ attempts of `FALLBACKS` follow in their order until a reconstruction is accepted
 from __future__ import annotations
 
 import logging
+import math
 import time
 from collections.abc import Callable, Collection, Iterator
 from dataclasses import dataclass, replace
@@ -29,6 +32,8 @@ _log = logging.getLogger(__name__)
 
 #: The fewest inliers that COLMAP itself accepts for an absolute pose.
 _MIN_INLIERS = 6
+#: The diagonal of 35 mm film, mm: CIPA defines equal focal lengths by it.
+_FILM_DIAGONAL = math.hypot(36, 24)
 #: The report's values that are kept for each attempt.
 _ATTEMPT_KEYS = (
     "lr_images",
@@ -95,7 +100,7 @@ def register(
     """Run SfM on the mixed-resolution images, until a reconstruction is accepted.
 
     Args:
-        photos: The photographs, with their `hr` copies and the `lr` copies of the degraded ones.
+        photos: The photographs, with their `sfm` copies, and `sfm_lr` copies of the degraded ones.
         degraded: Indices of the views that SfM gets degraded.
         conf: The settings of the first attempt.
         work: An existing folder for SfM's own files.
@@ -107,16 +112,15 @@ def register(
     """
     best: tuple[sfm.Reconstruction, str] | None = None
     reports: list[dict[str, Any]] = []
-    any_smaller = any(_is_smaller(photos, i) for i in degraded)
+    any_smaller = any(
+        photos.size(_kind(i, degraded), i) != photo.sfm for i, photo in enumerate(photos.all)
+    )
     folders: dict[tuple[object, ...], Path] = {}
     for attempt in sfm_attempts(conf, len(photos), any_smaller=any_smaller):
         start = time.perf_counter()
         # Attempts with the same features and matches share a folder, where COLMAP finds them.
         folder = folders.setdefault(_features_of(attempt.conf), work / f"sfm-{attempt.name}")
-        folder.mkdir(exist_ok=True)
-        model = sfm.reconstruct(
-            sfm_images(photos, degraded, attempt.conf), photos.folder, folder, attempt.conf
-        )
+        model = _reconstruct(photos, degraded, attempt.conf, folder)
         reason = refusal(model)
         seconds = round(time.perf_counter() - start, 1)
         results = {key: model.report[key] for key in _ATTEMPT_KEYS if key in model.report}
@@ -159,38 +163,43 @@ def sfm_images(
     """Return the image of each photograph for SfM, with the intrinsics that are known.
 
     Args:
-        photos: The photographs, with their copies; `up` copies are made where they are needed.
+        photos: The photographs, with their `sfm` copies, and `sfm_lr` copies of the degraded ones;
+            upsampled copies are made where they are needed.
         degraded: Indices of the views that SfM gets degraded.
-        conf: The settings; `lr_images` says how smaller views are given.
+        conf: The settings; `lr_images` says how smaller images are given.
     """
     result = []
     for i, photo in enumerate(photos.all):
-        kind, camera, lens = "hr", photo.camera, photo.lens
-        if i in degraded:
-            kind = "lr"
-            if _is_smaller(photos, i) and conf.lr_images == "upsampled":
-                kind = "up"
-                photos.upsample(i)
-            elif _is_smaller(photos, i):
-                camera = f"{camera} lr"
-                lens = lens and lens.resized(*photos.size("lr", i))
+        kind = _kind(i, degraded)
+        if conf.lr_images == "upsampled":
+            kind = photos.upsampled(kind, i)
+        width, height = photos.size(kind, i)
+        lens = photo.lens and photo.lens.resized(width, height)
+        focal = photo.focal_35mm and photo.focal_35mm * math.hypot(width, height) / _FILM_DIAGONAL
         # Where the intrinsics are known, each image has a camera of its own, with its own K.
-        name = photo.name if lens else camera
+        camera = photo.name if lens else f"{photo.camera} {width}x{height}"
         file, K = photos.file(kind, i), lens.K if lens else None
         masked = copy_mask(photos.folder, file).exists()
-        result.append(sfm.SfmImage(file, name, K, masked))
+        result.append(sfm.SfmImage(file, photo.name, camera, K, focal, masked))
     return result
 
 
-def _is_smaller(photos: PhotoCollection, index: int) -> bool:
-    hr = photos[index].hr
-    return photos.size("lr", index) != (hr.width, hr.height)
+def _kind(index: int, degraded: Collection[int]) -> str:
+    return "sfm_lr" if index in degraded else "sfm"
+
+
+def _reconstruct(
+    photos: PhotoCollection, degraded: Collection[int], conf: SfmConf, work: Path
+) -> sfm.Reconstruction:
+    """Run SfM once; the cameras of the result are the HR views'."""
+    work.mkdir(exist_ok=True)
+    model = sfm.reconstruct(sfm_images(photos, degraded, conf), photos.folder, work, conf)
+    lenses = {i: photos[i].to_hr(lens) for i, lens in model.lenses.items()}
+    return replace(model, lenses=lenses)
 
 
 def reconstruct_undegraded(
     photos: PhotoCollection, conf: SfmConf, work: Path
 ) -> sfm.Reconstruction:
-    """Run SfM once on the HR views alone, as a reference for the poses of the mixed scene."""
-    folder = work / "sfm-reference"
-    folder.mkdir()
-    return sfm.reconstruct(sfm_images(photos, (), conf), photos.folder, folder, conf)
+    """Run SfM once on the undegraded photographs."""
+    return _reconstruct(photos, (), conf, work / "sfm-reference")

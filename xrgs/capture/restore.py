@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 
 from msgspec import Struct
 
-from xrgs.capture import frozen, images, scenes, sealed
+from xrgs.capture import frozen, images, poses, scenes, sealed
 from xrgs.capture.lens import Lens
 from xrgs.capture.photographs import prepare_hr_views, write_degraded
 from xrgs.errors import StoreError
@@ -59,7 +59,8 @@ def restore_images(
     manifest = frozen.read_manifest(folder)
     cameras = read_struct(folder / frozen.REPORT, _Report).lenses
     lenses = {name: camera.lens for camera in cameras for name in camera.views}
-    photos = prepare_hr_views(scenes.resolve(scene, cache, conf.long_side), conf, work)
+    given = poses.with_masks(scenes.resolve(scene, cache, conf.long_side), conf.poses)
+    photos = prepare_hr_views(given, conf, work)
     _write_images(folder, manifest.views, photos, lenses, conf)
     for wrong in sealed.changed(folder, manifest.files):
         raise StoreError(

@@ -51,7 +51,7 @@ def median_depth(
     Args:
         points: SfM points [P, 3].
         viewmat: World to camera [4, 4].
-        lens: The view's camera; its distortion is ignored.
+        lens: The view's camera; the undistorted image is the one that counts.
         observed: Indices of the points that SfM found in the view. Points behind the camera do not
             count. Where fewer than 8 are left, all points in front of the camera that project into
             its image are taken instead.
@@ -65,7 +65,7 @@ def median_depth(
     own = own[own > 0]
     if len(own) < _MIN_OBSERVED:
         front = camera[depth > 0]
-        pixels = front @ lens.K.T
+        pixels = front @ lens.undistorted().K.T
         pixels = pixels[:, :2] / pixels[:, 2:]
         inside = ((pixels >= 0) & (pixels <= (lens.width, lens.height))).all(axis=1)
         own = front[inside, 2]

@@ -5,7 +5,6 @@ COLMAP's own log goes to files in the work folder; the user sees one progress ba
 
 from __future__ import annotations
 
-import logging
 import tempfile
 import zlib  # noqa: F401  pycolmap 4.2.1 corrupts the heap where it is imported before zlib
 from collections.abc import Iterator, Mapping, Sequence
@@ -22,12 +21,10 @@ from xrgs.capture.lens import Lens, lens_of_model
 from xrgs.capture.masks import MASKS
 from xrgs.runtime.machine import usable_cores
 from xrgs.runtime.progress import ProgressBar
-from xrgs.safeio.sanitize import for_line
+from xrgs.runtime.text import listed
 
 if TYPE_CHECKING:
     from xrgs.config import SfmConf
-
-_log = logging.getLogger(__name__)
 
 #: The number of features in all images with which exhaustive matching takes minutes on two cores.
 _TOTAL_FEATURES = 100_000
@@ -50,11 +47,15 @@ class SfmImage:
 
     file: str
     """Its path, relative to the folder of all images."""
+    name: str
+    """The photograph's name, for messages."""
     camera: str
     """The name of its camera; images with one name share the camera."""
     K: NDArray[np.float64] | None = None
     """Intrinsics [3, 3], px, where they are known: then there is no distortion, and they are not
     refined."""
+    focal: float | None = None
+    """The focal length that EXIF gives, px: refinement begins with it."""
     masked: bool = False
     """Whether it has a mask, `xrgs.capture.masks.copy_mask` of its file: no features outside."""
 
@@ -145,14 +146,53 @@ def reconstruct(
         no_points = np.zeros((0, 3))
         return Reconstruction({}, {}, no_points, no_points.astype(np.uint8), {}, report)
     largest = max(models, key=lambda m: (m.num_reg_images(), m.num_points3D()))
-    index = {image.file: i for i, image in enumerate(sfm_images)}
-    for file, reason in bogus_cameras(largest, sfm_images).items():
-        del index[file]
-        _log.warning("SfM: %s", for_line(f"{file}: {reason}; the image is left out"))
+    bogus = bogus_cameras(largest, sfm_images)
+    if bogus:
+        cameras = [f"{image.name} ({bogus[i]})" for i, image in enumerate(sfm_images) if i in bogus]
+        report["notes"] = [f"not placed, because SfM made an impossible camera: {listed(cameras)}"]
+    index = {image.file: i for i, image in enumerate(sfm_images) if i not in bogus}
     return to_numpy(largest, index, report)
 
 
-def bogus_cameras(model: Any, sfm_images: Sequence[SfmImage]) -> dict[str, str]:
+def triangulate(
+    sfm_images: Sequence[SfmImage],
+    viewmats: Sequence[NDArray[np.float64]],
+    folder: Path,
+    work: Path,
+    conf: SfmConf,
+) -> Reconstruction:
+    """Find the points that images of known cameras and poses show, by exhaustive matching.
+
+    Args:
+        sfm_images: The images, each with `K` and a camera of its own.
+        viewmats: World to camera [4, 4] of each.
+        folder: The folder that `SfmImage.file` is relative to.
+        work: An existing folder for COLMAP's database and logs.
+        conf: The settings.
+    """
+    _log_to(work)
+    pycolmap.set_random_seed(conf.seed)
+    database, threads = work / "database.db", usable_cores()
+    max_features = features_per_image(len(sfm_images), conf.max_num_features)
+    longest = max(max(images.size(folder / image.file)) for image in sfm_images)
+    octave = first_octave(longest, conf.first_octave)
+    _extract(sfm_images, folder, database, max_features, octave, threads)
+    _match(sfm_images, database, work, threads)
+    index = {image.file: i for i, image in enumerate(sfm_images)}
+    posed = pycolmap.Reconstruction()
+    with pycolmap.Database.open(database) as opened:
+        for camera in opened.read_all_cameras():
+            posed.add_camera_with_trivial_rig(camera)
+        for image in opened.read_all_images():
+            pose = pycolmap.Rigid3d(viewmats[index[image.name]][:3])
+            posed.add_image_with_trivial_frame(image, pose)
+    options = mapping_options(conf, len(sfm_images), known=True)
+    options.num_threads = threads
+    model = pycolmap.triangulate_points(posed, database, folder, work, options=options)
+    return to_numpy(model, index, {"first_octave": octave, "max_num_features": max_features})
+
+
+def bogus_cameras(model: Any, sfm_images: Sequence[SfmImage]) -> dict[int, str]:
     """Find images whose camera is impossible, by COLMAP's own limits for its parameters.
 
     COLMAP drops such images after every bundle adjustment but the last, so that a model may end
@@ -163,10 +203,10 @@ def bogus_cameras(model: Any, sfm_images: Sequence[SfmImage]) -> dict[str, str]:
         sfm_images: The images; the intrinsics of those with `K` are known, and are not judged.
 
     Returns:
-        A reason by the `file` of each such image.
+        The parameters of the camera by the index of each such image.
     """
     limits = pycolmap.IncrementalMapperOptions()
-    refined = {image.file for image in sfm_images if image.K is None}
+    refined = {image.file: i for i, image in enumerate(sfm_images) if image.K is None}
     found = {}
     for image in model.images.values():
         camera = model.cameras[image.camera_id]
@@ -177,7 +217,7 @@ def bogus_cameras(model: Any, sfm_images: Sequence[SfmImage]) -> dict[str, str]:
                 limits.min_focal_length_ratio, limits.max_focal_length_ratio, limits.max_extra_param
             )
         ):
-            found[image.name] = f"its camera came out as {camera.params_to_string()}"
+            found[refined[image.name]] = camera.params_to_string()
     return found
 
 
@@ -214,6 +254,9 @@ def _extract(
                 K = batch[0].K
                 reader.camera_model = "PINHOLE"
                 reader.camera_params = ",".join(repr(float(K[i, j])) for i, j in _PINHOLE_ENTRIES)
+            elif batch[0].focal is not None:
+                width, height = images.size(folder / batch[0].file)
+                reader.camera_params = f"{float(batch[0].focal)},{width / 2},{height / 2},0"
             pycolmap.extract_features(
                 database,
                 folder,

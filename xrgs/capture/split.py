@@ -79,6 +79,7 @@ def check_variant_conf(conf: VariantConf) -> None:
         "degradation": _one_of(conf.degradation, "auto", "none", *DEGRADATIONS),
         "jpeg_quality": (1 <= conf.jpeg_quality <= 95, "1 to 95"),
         "sfm.lr_images": _one_of(conf.sfm.lr_images, "upsampled", "native"),
+        "sfm.long_side": (conf.sfm.long_side >= 0, "0 (the photographs' size) or more"),
         "sfm.min_registered": (0 <= conf.sfm.min_registered <= 1, "0 to 1"),
         "sfm.max_num_features": (conf.sfm.max_num_features >= 0, "0 (automatic) or more"),
         "sfm.camera": _one_of(conf.sfm.camera, "auto", "single", "per_image"),
@@ -245,17 +246,17 @@ def _select_by_score(train: Sequence[int], scores: Sequence[float], conf: Varian
     return chosen
 
 
-def shrink_factor(sizes: Sequence[tuple[int, int]], conf: VariantConf) -> float:
+def shrink_factor(sizes: Sequence[tuple[int, int]], long_side: int) -> float:
     """Return the one factor in (0, 1] by which all photographs of a scene are resized.
 
-    It brings the longest side of all to `variant.long_side`; it is 1 where that is 0 or larger.
+    It brings the longest side of all to `long_side`; it is 1 where that is 0 or larger.
 
     Args:
         sizes: Width and height of each photograph, px.
-        conf: The variant's config.
+        long_side: `variant.long_side` or `variant.sfm.long_side`, px.
     """
     largest = max(max(size) for size in sizes)
-    return min(conf.long_side or largest, largest) / largest
+    return min(long_side or largest, largest) / largest
 
 
 def hr_geometry(size: tuple[int, int], shrink: float, conf: VariantConf) -> HrGeometry:

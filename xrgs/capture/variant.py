@@ -36,6 +36,8 @@ _log = logging.getLogger(__name__)
 #: The source files that decide what every variant is: a change in one of them changes every key.
 CORE = (
     "capture/alignment.py",
+    "capture/colour.py",
+    "capture/deep.py",
     "capture/frozen.py",
     "capture/images.py",
     "capture/lens.py",
@@ -57,6 +59,7 @@ POSES = (
     "capture/poses/colmap.py",
     "capture/poses/given.py",
     "capture/poses/transforms.py",
+    "capture/triangulation.py",
 )
 
 

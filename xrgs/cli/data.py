@@ -101,25 +101,34 @@ def inspect(
 
 
 def export(
-    name: Positional[Annotated[str, arg(metavar="CELL|VARIANT")]],
-    layout: Annotated[Literal["colmap", "nerfstudio"], arg(name="format")] = "colmap",
-    out: OptionalFolder = None,
+    name: Positional[Annotated[str, arg(metavar="CELL|VARIANT|FILE")]],
+    layout: Annotated[
+        Literal["colmap", "nerfstudio", "ply", "glb", "spz"], arg(name="format")
+    ] = "colmap",
+    out: Annotated[Path | None, shown_as("FOLDER|FILE")] = None,
     store: Folder = STORE,
 ) -> None:
-    """Write images, cameras, points and split, and the splats of a cell, for other programs.
+    """Write a cell or a variant for other programs, or convert a file of Gaussians.
 
     Args:
-        name: A cell or a variant: its folder, or its id in the store or the beginning of the id.
-        layout: The program that is to read it.
-        out: A new folder to write to; by default it is named after the cell or variant.
+        name: A cell or a variant: its folder, or its id in the store or the beginning of the id. A
+            .ply, .glb or .spz file is converted to another of these.
+        layout: `colmap` and `nerfstudio`: a folder of images, cameras, points and split, and the
+            splats of a cell. `ply`, `glb` (glTF with KHR_gaussian_splatting) and `spz` (8 bits a
+            value): one file of Gaussians.
+        out: The new folder or file to write; by default it is named after what is exported.
         store: The store.
     """
+    from xrgs.experiment.export import SPLAT_FORMATS, export_splats
     from xrgs.experiment.export import export as write
 
     path = Path(name)
-    if not path.exists() and path.name == name:
+    if not path.exists() and path.name == name and path.suffix[1:] not in SPLAT_FORMATS:
         path = Store(store).find_folder(name)
-    say(write(path, layout, out or Path(f"{path.name}-{layout}")))
+    if layout in SPLAT_FORMATS:
+        say(export_splats(path, layout, out or Path(f"{path.stem}.{layout}")))
+    else:
+        say(write(path, layout, out or Path(f"{path.name}-{layout}")))
 
 
 def main() -> None:

@@ -11,8 +11,9 @@ import os
 import re
 import sys
 from contextlib import contextmanager
+from dataclasses import fields, is_dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, TypeAlias
+from typing import TYPE_CHECKING, Annotated, TypeAlias, get_type_hints
 
 import tyro
 from tyro.conf import CascadeSubcommandArgs, DisallowNone, FlagCreatePairsOff, OmitArgPrefixes, arg
@@ -24,7 +25,7 @@ from xrgs.safeio.paths import user_path
 from xrgs.safeio.sanitize import for_line
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator, Mapping, Sequence
+    from collections.abc import Callable, Container, Iterator, Mapping, Sequence
 
 STORE = Path("xrgs-store")
 
@@ -73,7 +74,9 @@ def run(
     # Of a subcommand with overrides, `out` alone is an option that is no key of Hydra's config.
     name = "out" if sys.argv[1:2] == [overrides] else "[a-z][a-z_]*"
     assignment = re.compile(f"({name})=(.*)", re.DOTALL)
-    words = _with_options(sys.argv[1:], assignment)
+    functions = [target] if callable(target) else target.values()
+    known = frozenset(name for function in functions for name in _names(function))
+    words = _with_options(sys.argv[1:], assignment, known)
     with errors_as_messages(command, assignment):
         if callable(target):
             tyro.cli(_unwrapped(target), prog=command, args=words, config=_CONFIG)
@@ -90,14 +93,28 @@ def _unwrapped(function: Callable[..., None]) -> Callable[..., None]:
     return function
 
 
-def _with_options(words: Sequence[str], assignment: re.Pattern[str]) -> list[str]:
+def _names(function: Callable[..., None]) -> Iterator[str]:
+    """Yield the names of a function's options, those of its dataclasses among them."""
+    for name, hint in get_type_hints(function, include_extras=True).items():
+        if is_dataclass(hint):
+            yield from (field.name for field in fields(hint))
+        given = (getattr(mark, "name", None) for mark in getattr(hint, "__metadata__", ()))
+        yield next(filter(None, given), name)
+
+
+def _with_options(
+    words: Sequence[str], assignment: re.Pattern[str], known: Container[str]
+) -> list[str]:
     """Return a command line with each `KEY=VALUE`, as `xrgs-sweep` takes it, as an option.
 
-    `true` sets a flag. Commas separate values, unless there is a file of that name.
+    `true` sets a flag. Commas separate values, unless there is a file of that name. Behind an
+    option, a word whose key is not known is a value, as the name of the scene `a=b`.
     """
     others, options = [], []  # options come last: one of several values ends where another begins
-    for word in words:
-        if not (found := assignment.fullmatch(word)):
+    for number, word in enumerate(words):
+        found = assignment.fullmatch(word)
+        is_value = found and found[1] not in known and any(w[:2] == "--" for w in words[:number])
+        if not found or is_value:
             others.append(word)
             continue
         option, value = _option(found[1]), found[2]

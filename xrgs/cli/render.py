@@ -14,6 +14,9 @@ from xrgs.runtime.machine import set_passive_openmp_wait
 from xrgs.runtime.signals import exit_on_signal
 from xrgs.runtime.streams import say
 
+#: The values of --antialiased.
+_CHOICES = {"yes": True, "no": False, None: None}
+
 
 def render(
     cells: Positional[Cells],
@@ -22,12 +25,14 @@ def render(
     out: Annotated[Path, arg(metavar="FILE.mp4|FOLDER")] = Path("film.mp4"),
     size: Annotated[tuple[int, int] | None, shown_as("WIDTH HEIGHT")] = None,
     fps: int = 30,
+    antialiased: Annotated[Literal["yes", "no"] | None, shown_as("yes|no")] = None,
     store: Folder = STORE,
 ) -> None:
     """Render trained cells along a path of cameras; two of them side by side with their names.
 
     Args:
-        cells: One cell or two, each by its id, the beginning of its id, or a .ply file.
+        cells: One cell or two, each by its id, the beginning of its id, or a file: .ply, .glb or
+            .spz.
         path: The path, fitted to the training cameras. `orbit` circles around the point that they
             look at; where they see it from one side alone, it swings over the arc that they span.
             `spiral` is LLFF's, for forward-facing scenes. `test` goes through the test cameras in
@@ -38,13 +43,15 @@ def render(
         size: Size of one cell's picture in pixels, both even; by default the size of the test
             views.
         fps: Frames a second.
+        antialiased: Whether to compensate opacities for the blur of a pixel, as Mip-Splatting does;
+            by default as the cell was trained, or as the file says.
         store: The store that has the cells.
     """
     from xrgs.viewer.film import make_film
     from xrgs.viewer.models import load_models
 
     with exit_on_signal("A film that is not complete is not kept; single frames are."):
-        models = load_models(cells, Store(store))
+        models = load_models(cells, Store(store), _CHOICES[antialiased])
         line = make_film(models, out, path=path, views=views, size=size, fps=fps)
     say(line)
 

@@ -25,14 +25,15 @@ def view(
     viser: pip install 'xrgs[view]'.
 
     Args:
-        cells: One cell or two, each by its id, the beginning of its id, or a .ply file.
+        cells: One cell or two, each by its id, the beginning of its id, or a file: .ply, .glb or
+            .spz.
         port: Port of the page on 127.0.0.1; the next ones are used too. 0 takes any that is free.
         limit: The most Gaussians of a cell that are drawn: the most opaque ones.
         store: The store that has the cells.
     """
     if limit < 1:
         raise XrgsError(f"--limit {limit}: must be at least 1")
-    from xrgs.viewer.live import count_text, shown
+    from xrgs.viewer.live import NOT_ANTIALIASED, count_text, shown
     from xrgs.viewer.models import load_models
 
     with exit_on_signal("Nothing was changed."):
@@ -40,6 +41,8 @@ def view(
         with shown(models, port, limit) as address:
             for model in models:
                 say(for_line(f"{model.name}: {count_text(model, limit)}"))
+                if model.settings.antialiased:
+                    say(for_line(f"{model.name}: {NOT_ANTIALIASED}"))
             say(f"Open {address} in a browser; Ctrl-C ends.")
             with suppress(StopSignal):
                 threading.Event().wait()

@@ -1,4 +1,4 @@
-"""Writes a variant or a cell in the layouts that other programs read: COLMAP's and nerfstudio's.
+"""Writes a variant or a cell for other programs: COLMAP's or nerfstudio's data, or Gaussians alone.
 
 Cameras, points and splats are in the normalised world of training. `transform.json` has the
 similarity from the world of SfM to that world. Images are undistorted, and each has its own pinhole
@@ -7,7 +7,6 @@ camera.
 
 from __future__ import annotations
 
-import shutil
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -27,6 +26,8 @@ if TYPE_CHECKING:
     from xrgs.capture.views import Variant
 
 _SPLATS = "splats.ply"
+#: Formats of one file with the Gaussians alone; it is named so.
+SPLAT_FORMATS = ("ply", "glb", "spz")
 
 
 def export(path: Path, layout: str, out: Path) -> str:
@@ -53,6 +54,8 @@ def export(path: Path, layout: str, out: Path) -> str:
     """
     if layout not in _LAYOUTS:
         raise XrgsError(f"format={layout}: must be one of {', '.join(_LAYOUTS)}")
+    from xrgs.splat.ply import save_ply
+
     cell = _cell(path)
     variant, data = _load(path, cell)
     try:
@@ -63,12 +66,56 @@ def export(path: Path, layout: str, out: Path) -> str:
         write_json(out / "transform.json", {"sfm_to_export": transform(variant).tolist()})
         _LAYOUTS[layout](data, images, out)
         if cell is not None:
-            shutil.copyfile(cell.path / _SPLATS, out / _SPLATS)
+            # Not a copy: cells of older versions have no tag of antialiased Gaussians.
+            antialiased = cell.config().splat.raster.antialiased
+            save_ply(out / _SPLATS, cell.gaussians(), antialiased=antialiased)
     except OSError as error:
         raise XrgsError(f"out={out}: {error.filename}: {error.strerror}") from error
     splats = "" if cell is None else f", {_SPLATS}"
     counts = f"{len(data.train)} training and {len(data.test)} test views"
     return f"{counts}, {len(data.points)} points{splats}: written to {out}"
+
+
+def export_splats(path: Path, form: str, out: Path) -> str:
+    """Write the Gaussians of a cell, or of a file, to one file.
+
+    They stay in the normalised world of training. A .glb of a cell is shown with the cameras' mean
+    up direction upwards.
+
+    Args:
+        path: The folder of a finished cell, or a .ply, .glb or .spz file.
+        form: One of `SPLAT_FORMATS`.
+        out: The new file.
+
+    Returns:
+        A line with the number of Gaussians that were written.
+
+    Raises:
+        XrgsError: The cell or the file can't be read, or `out` exists, ends otherwise or can't be
+            written.
+    """
+    from xrgs.splat.files import load_gaussians, save_gaussians
+
+    if out.suffix.lower() != f".{form}":
+        raise XrgsError(f"out={out}: the name of a {form} file must end with .{form}")
+    if out.exists():
+        raise XrgsError(f"out={out}: it exists; name a new file")
+    up = {}
+    if path.suffix and not path.is_dir():
+        gaussians, antialiased = load_gaussians(path)
+    else:
+        cell = _cell(path)
+        if cell is None:
+            raise XrgsError(f"{path}: a variant has no Gaussians; give a cell, or another format")
+        gaussians, antialiased = cell.gaussians(), cell.config().splat.raster.antialiased
+        viewmats = np.stack([view.camera.viewmat.numpy() for view in cell.dataset().train])
+        up = {"up": -viewmats[:, 1, :3].mean(axis=0)}  # y of a camera points down
+    try:
+        save_gaussians(out, gaussians, antialiased=antialiased, **up)
+    except OSError as error:
+        raise XrgsError(f"out={out}: {error.strerror}") from error
+    kind = "antialiased Gaussians" if antialiased else "Gaussians"
+    return f"{len(gaussians)} {kind}: written to {out}"
 
 
 def transform(variant: Variant) -> NDArray[np.float64]:

@@ -216,28 +216,35 @@ def _texture_of(store: JoinedStore, variant_id: str, split: str, view: str) -> f
     try:
         variant = store.variant(variant_id)
         check_images(variant.parent, variant.name)
-        return texture(images.read_png(variant / "images" / split / f"{view}.png"))
+        image = images.read_png(variant / "images" / split / f"{view}.png")
+        file = variant / "images" / f"{split}-masks" / f"{view}.png"
+        size = image.shape[1], image.shape[0]
+        return texture(image, images.read_mask(file, size) if file.exists() else None)
     except (ImageError, StoreError, UnreadableError):
         return math.nan
 
 
-def texture(image: NDArray[np.float32]) -> float:
+def texture(image: NDArray[np.float32], mask: NDArray[np.bool_] | None = None) -> float:
     """Return the mean magnitude of an image's gradient, in intensity per px.
 
-    It is the mean of `xrgs.training.components.texture.gradient_magnitude` without the last row and
-    column, which repeat others there. That function needs torch; this one does not.
+    It is `xrgs.training.components.texture.mean_gradient`, always without the last row and column,
+    which repeat others there. That function needs torch; this one does not.
 
     Args:
         image: [H, W, 3] in 0..1.
+        mask: [H, W], True for a pixel that is used; None uses all.
 
     Returns:
-        The mean over the pixels, at most sqrt(2); NaN of an image that is one pixel high or wide.
+        The mean over the pixels, at most sqrt(2); NaN where there is none.
     """
     if min(image.shape[:2]) < 2:
         return math.nan
     inner = image[:-1, :-1].astype(np.float64)
     squared = (image[:-1, 1:] - inner) ** 2 + (image[1:, :-1] - inner) ** 2
-    return float(np.sqrt(squared.mean(axis=2)).mean())
+    magnitude = np.sqrt(squared.mean(axis=2))
+    if mask is not None:
+        magnitude = magnitude[mask[:-1, :-1] & mask[:-1, 1:] & mask[1:, :-1]]
+    return float(magnitude.mean()) if magnitude.size else math.nan
 
 
 def texture_tables(

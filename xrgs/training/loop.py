@@ -21,7 +21,7 @@ from xrgs.training.components import Components
 from xrgs.training.components import build as build_components
 from xrgs.training.memory import OnDemand, TrainingMemory
 from xrgs.training.recorder import TrainingRecorder, TrainingResult
-from xrgs.training.rendering import StepRenderer
+from xrgs.training.rendering import StepRenderer, inside_mask
 from xrgs.training.sampler import EpochSampler
 from xrgs.training.seeding import seeded_generator
 
@@ -209,6 +209,7 @@ def _forward(run: _Run, step: Step) -> _Forward:
         render = run.renderer.render(gaussians, step, camera, means2d_offset)
         # Loss: L1 and SSIM against the photograph, then terms and weights of the components.
         image = components.match_colors(components.to_photograph(render.image, step), step)
+        image = inside_mask(image, target.image, step.view.mask)
         weights = components.pixel_weights(step)
         loss = photometric_loss(
             image, target, l1=1 - ssim, ssim=ssim, pixel_weight=weights, backend=run.backend
@@ -233,12 +234,15 @@ def _densify(run: _Run, step: Step, forward: _Forward) -> Refinement:
     """Densify, prune and reset; return the counts of what was done."""
     # None without a backward pass, or if the render shows no Gaussian.
     grad2d, camera = forward.means2d_offset.grad, forward.camera
+    visible = forward.render.visible
     if grad2d is not None:
+        if step.view.mask is not None:  # a view shows only what is inside its mask
+            visible = visible & (grad2d != 0).any(dim=1)
         grad2d = run.components.densification_grad2d(grad2d, step)
     refinement = run.strategy.after_step(
         step.number,
         grad2d,
-        forward.render.visible,
+        visible,
         width=camera.width,
         height=camera.height,
         group=step.view.tag,

@@ -19,6 +19,21 @@ if TYPE_CHECKING:
     from xrgs.training.recorder import TrainingRecorder
 
 
+def inside_mask(image: Tensor, photograph: Tensor, mask: Tensor | None) -> Tensor:
+    """Return a render with the pixels of the photograph outside the mask.
+
+    There is no loss then, and no gradient. A window of SSIM across the border of the mask compares
+    equal pixels there, so that the loss stays a mean over all pixels, and the gradients of the used
+    pixels are as without a mask.
+
+    Args:
+        image: The render, [H, W, 3].
+        photograph: [H, W, 3].
+        mask: [H, W] bool, True for a pixel that is used; None uses all.
+    """
+    return image if mask is None else image.where(mask[..., None], photograph)
+
+
 @dataclass(frozen=True)
 class StepRenderer:
     """Renders any training view as a step on that view does, with all components.
@@ -67,7 +82,7 @@ class StepRenderer:
 
     @torch.no_grad()
     def photograph(self, gaussians: Gaussians, step: Step) -> Tensor:
-        """Render the step's view as it is compared with its photograph.
+        """Render the step's view as it is compared with its photograph, inside the mask.
 
         Returns:
             [H, W, 3] at the photograph's size, not clamped to 0..1, without a graph.
@@ -75,7 +90,9 @@ class StepRenderer:
         camera = self.components.render_camera(step.view.camera, step)
         render = self.render(gaussians, step, camera)
         self.recorder.record_evaluations(render.evaluations)
-        return self.components.match_colors(self.components.to_photograph(render.image, step), step)
+        image, view = self.components.to_photograph(render.image, step), step.view
+        image = self.components.match_colors(image, step)
+        return image if view.mask is None else inside_mask(image, view.image, view.mask)
 
     @torch.no_grad()
     def attribute(self, pixels: Tensor, gaussians: Gaussians, step: Step) -> Tensor:

@@ -36,6 +36,11 @@ if TYPE_CHECKING:
     _Place = dict[str, Any]  # by the names of _PLACE
 
 HOST = "127.0.0.1"
+NOT_ANTIALIASED = (
+    "it is antialiased, which viser can't draw: small and far Gaussians look thicker here than "
+    "in xrgs-render and in the report"
+)
+"""What is said of an antialiased model."""
 #: A camera that follows the user's reports its new place within so many seconds.
 _ECHO_S = 0.3
 #: A camera has arrived where it is this near to its place, world units.

@@ -1,8 +1,10 @@
-"""Loads models to look at: the Gaussians of a cell with its cameras, or of a .ply file."""
+"""Loads models to look at: the Gaussians of a cell with its cameras, or of a file."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import logging
+from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -10,7 +12,7 @@ import numpy as np
 from xrgs.errors import StoreError, XrgsError
 from xrgs.safeio.paths import user_path
 from xrgs.safeio.sanitize import for_line
-from xrgs.splat.ply import load_ply
+from xrgs.splat.files import load_gaussians
 from xrgs.splat.settings import RasterSettings
 from xrgs.viewer.paths import Poses
 
@@ -22,9 +24,10 @@ if TYPE_CHECKING:
     from xrgs.splat.cameras import Camera
     from xrgs.splat.gaussians import Gaussians
 
+_log = logging.getLogger(__name__)
+
 #: The most models that are shown beside each other.
 MAX_MODELS = 2
-_PLY = ".ply"
 #: The longest name of a model, in characters.
 _MAX_NAME = 60
 
@@ -47,22 +50,25 @@ class Model:
     """The name that people see: one printable line."""
     gaussians: Gaussians
     settings: RasterSettings
-    """How its Gaussians become pixels: as in its training; the defaults for a .ply file."""
+    """How its Gaussians become pixels: as in its training. For a file, the defaults, antialiased
+    where the file says so."""
     views: tuple[PosedView, ...] = ()
-    """Its views, training views first; none for a .ply file."""
+    """Its views, training views first; none for a file."""
     poses: Poses | None = None
-    """The cameras of the views as arrays, for paths; None for a .ply file."""
+    """The cameras of the views as arrays, for paths; None for a file."""
     variant: str = ""
-    """The id of its variant, which decides its world; empty for a .ply file."""
+    """The id of its variant, which decides its world; empty for a file."""
 
 
-def load_models(words: Sequence[str], store: Store) -> list[Model]:
+def load_models(words: Sequence[str], store: Store, antialiased: bool | None = None) -> list[Model]:
     """Load one model, or two of one world.
 
     Args:
         words: The cells, each as its id, the beginning of its id that no other cell shares, or the
-            path of a .ply file.
+            path of a .ply, .glb or .spz file.
         store: The store that has the cells.
+        antialiased: Whether to render antialiased; None renders each as it was trained. Where a
+            model says otherwise, a warning names it.
 
     Returns:
         The models, in the order of the words.
@@ -72,8 +78,8 @@ def load_models(words: Sequence[str], store: Store) -> list[Model]:
             damaged, or the cells are of different variants; the message names the word or the file.
     """
     if not 1 <= len(words) <= MAX_MODELS:
-        raise XrgsError(f"give one cell or {MAX_MODELS}, each by its id or as a .ply file")
-    models = [_load(word, store) for word in words]
+        raise XrgsError(f"give one cell or {MAX_MODELS}, each by its id or as a file")
+    models = [_with(_load(word, store), antialiased) for word in words]
     variants = sorted({model.variant for model in models if model.variant})
     if len(variants) > 1:
         raise XrgsError(
@@ -84,7 +90,7 @@ def load_models(words: Sequence[str], store: Store) -> list[Model]:
 
 
 def reference(models: Sequence[Model]) -> Model | None:
-    """Return the first model that has views; None where all are .ply files."""
+    """Return the first model that has views; None where all are files."""
     return next((model for model in models if model.views), None)
 
 
@@ -101,10 +107,25 @@ def find_cell(word: str, store: Store) -> CellFolder:
     return cell
 
 
+def _with(model: Model, antialiased: bool | None) -> Model:
+    if antialiased is None or antialiased == model.settings.antialiased:
+        return model
+    own = "antialiased" if model.settings.antialiased else "not antialiased"
+    if not model.views and not model.settings.antialiased:
+        own = "without a word about antialiasing"
+    _log.warning(
+        "%s is %s; it is rendered %s, as asked",
+        *(model.name, own, "antialiased" if antialiased else "without antialiasing"),
+    )
+    return replace(model, settings=replace(model.settings, antialiased=antialiased))
+
+
 def _load(word: str, store: Store) -> Model:
-    if word.lower().endswith(_PLY):
+    if Path(word).suffix:  # ids have no dots
         file = user_path(word)
-        return Model(for_line(file.name, _MAX_NAME), load_ply(file), RasterSettings())
+        gaussians, antialiased = load_gaussians(file)
+        settings = RasterSettings(antialiased=antialiased)
+        return Model(for_line(file.name, _MAX_NAME), gaussians, settings)
     cell = find_cell(word, store)
     data = cell.dataset()
     train = [PosedView(view.name, view.tag, view.camera) for view in data.train]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -19,6 +20,7 @@ from tests.capture.poses.written import (
 )
 from xrgs.capture import poses
 from xrgs.capture.photographs import PhotoCollection
+from xrgs.capture.scenes import Scene
 from xrgs.capture.sfm import Reconstruction
 from xrgs.errors import XrgsError
 
@@ -179,6 +181,17 @@ def test_what_is_not_there_is_named(tmp_path: Path) -> None:
     (tmp_path / "empty").mkdir()
     with pytest.raises(XrgsError, match=r"cameras, images and points3D.*sparse/0"):
         poses.fingerprint(str(tmp_path / "empty"))
-    (tmp_path / "empty" / "transforms_train.json").touch()
-    with pytest.raises(XrgsError, match=r"name one file of it: transforms_train\.json"):
-        poses.fingerprint(str(tmp_path / "empty"))
+
+
+def test_masks_of_a_file_are_those_of_the_photographs(tmp_path: Path) -> None:
+    path = str(write_transforms(tmp_path / "poses", {}, {"mask_path": "m.png"}))
+    scene = Scene("x", "", {name: tmp_path / f"{name}.png" for name in ("a", "b", "z")})
+    made = poses.with_masks(scene, path)
+    assert made.masks == dict.fromkeys(("a", "b"), tmp_path / "poses" / "m.png")
+    assert made.notes == ("the masks of 2 photographs are those of mask_path in variant.poses",)
+    masked = replace(scene, masks={"a": tmp_path / "own.png"})
+    made = poses.with_masks(masked, path)
+    assert made.masks == masked.masks
+    assert made.notes == ("mask_path of variant.poses is not read, since scene.masks has masks",)
+    for none in (None, str(write_transforms(tmp_path / "b")), str(write_colmap(tmp_path / "c"))):
+        assert poses.with_masks(scene, none) is scene

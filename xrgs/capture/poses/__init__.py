@@ -9,6 +9,8 @@ Nothing here imports pycolmap before cameras are read.
 from __future__ import annotations
 
 import hashlib
+from contextlib import contextmanager
+from dataclasses import replace
 from difflib import get_close_matches
 from pathlib import Path, PurePosixPath
 from typing import TYPE_CHECKING
@@ -17,22 +19,23 @@ import numpy as np
 
 from xrgs.capture.lens import Lens, quarter_turn
 from xrgs.capture.poses import colmap, transforms
+from xrgs.capture.poses.given import MIN_POINTS
 from xrgs.errors import UnreadableError, XrgsError
 from xrgs.runtime.text import listed
-from xrgs.safeio.files import is_transient, list_names
+from xrgs.safeio.files import is_transient
 from xrgs.safeio.hashing import file_digest
 from xrgs.safeio.paths import user_path
+from xrgs.safeio.sanitize import for_line
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
+    from collections.abc import Iterator, Mapping, Sequence
 
     from numpy.typing import NDArray
 
     from xrgs.capture.photographs import PhotoCollection, Photograph
+    from xrgs.capture.scenes import Scene
     from xrgs.capture.sfm import Reconstruction
 
-#: The fewest points: a Gaussian's first size is the distance of a point to its three nearest.
-_MIN_POINTS = 4
 #: The largest difference of the aspect ratios of an image and its photograph, which rounding of
 #: their sides to whole px explains.
 _MAX_ASPECT = 0.01
@@ -52,10 +55,19 @@ def fingerprint(path: str) -> str:
         XrgsError: Files are missing, or their layout is not one of the two.
     """
     sha256 = hashlib.sha256()
-    try:
-        root = _root(path)
-        for file in colmap.files(root) if root.is_dir() else transforms.files(root):
+    with _errors_named(path):
+        source = _source(path)
+        found = colmap.files(source) if isinstance(source, Path) else transforms.files(source)
+        for file in found:
             sha256.update(f"{file.name}\0{file_digest(file)}\n".encode())
+    return sha256.hexdigest()
+
+
+@contextmanager
+def _errors_named(path: str) -> Iterator[None]:
+    """Begin each error with the key; an error of a file may be transient."""
+    try:
+        yield
     except OSError as error:
         kind = UnreadableError if is_transient(error) else XrgsError
         raise kind(f"variant.poses={path}: {error.filename}: {error.strerror}") from error
@@ -63,27 +75,45 @@ def fingerprint(path: str) -> str:
         raise
     except XrgsError as error:
         raise XrgsError(f"variant.poses={path}: {error}") from error
-    return sha256.hexdigest()
 
 
-def _root(path: str) -> Path:
-    """Return the folder of COLMAP, or the transforms.json."""
+def _source(path: str) -> Path | list[Path]:
+    """Return the folder of COLMAP's models, or the transforms.json, or its parts."""
     root = user_path(path)
     if not root.exists():
         raise XrgsError("no such folder or file")
     if not root.is_dir():
-        return root
-    names = list_names(root)
-    if "transforms.json" in names:
-        return root / "transforms.json"
+        return [root]
+    if parts := transforms.in_folder(root):
+        return parts
     if colmap.files(root):
         return root
-    if splits := [name for name in names if name.startswith("transforms") and ".json" in name]:
-        raise XrgsError(f"name one file of it: {', '.join(splits)}")
     raise XrgsError(
         "it must have a transforms.json, or cameras, images and points3D, all .bin or all .txt; "
         "COLMAP's folder is often called sparse/0"
     )
+
+
+def with_masks(scene: Scene, path: str | None) -> Scene:
+    """Return a scene with the masks that `variant.poses` names, where it has no masks itself.
+
+    Raises:
+        As `read_poses`.
+    """
+    if path is None:
+        return scene
+    with _errors_named(path):
+        source = _source(path)
+        masks = {} if isinstance(source, Path) else transforms.masks(source)
+        if not masks:
+            return scene
+        if scene.masks:
+            note = "mask_path of variant.poses is not read, since scene.masks has masks"
+            return replace(scene, notes=(*scene.notes, note))
+        found, names = match_names(list(masks), list(scene.files.items())), list(scene.files)
+    given = {names[i]: masks[pose] for pose, i in found.items()}
+    note = f"the masks of {len(given)} photographs are those of mask_path in variant.poses"
+    return replace(scene, masks=given, notes=(*scene.notes, note))
 
 
 def read_poses(path: str, photos: PhotoCollection) -> Reconstruction:
@@ -92,19 +122,23 @@ def read_poses(path: str, photos: PhotoCollection) -> Reconstruction:
     Raises:
         UnreadableError: A file can't be read now.
         XrgsError: The files are malformed, a camera model is not supported, no photograph has the
-            name of an image, or there are too few points.
+            name of an image, or there are too few points. No points at all are no error.
     """
     from xrgs.capture.sfm import Reconstruction
 
     content = fingerprint(path)
-    try:
-        root = _root(path)
-        in_folder = [f"variant.poses: {root.name} is read"] if root != user_path(path) else []
-        given = colmap.read(root) if root.is_dir() else transforms.read(root)
+    with _errors_named(path):
+        source = _source(path)
+        if isinstance(source, Path):
+            given, in_folder = colmap.read(source), []
+        else:
+            given = transforms.read(source)
+            names = listed([file.name for file in source])
+            in_folder = [f"variant.poses: {names} is read"] if user_path(path).is_dir() else []
         points = given.points[np.isfinite(given.points).all(axis=1)]
-        if len(points) < max(_MIN_POINTS, len(given.points)):
+        if len(given.points) and len(points) < max(MIN_POINTS, len(given.points)):
             raise XrgsError(
-                f"{len(points)} of {len(given.points)} points are usable; at least {_MIN_POINTS} "
+                f"{len(points)} of {len(given.points)} points are usable; at least {MIN_POINTS} "
                 "points, all of them finite, are needed to begin training with"
             )
         found = match_names(given.names, [(photo.name, photo.path) for photo in photos.all])
@@ -120,10 +154,7 @@ def read_poses(path: str, photos: PhotoCollection) -> Reconstruction:
             _check_shape(lens, photo)
             lenses[i] = photo.to_hr(lens)
         kept = {i: lens.kept() for i, lens in lenses.items()}
-    except UnreadableError:
-        raise
-    except XrgsError as error:
-        raise XrgsError(f"variant.poses={path}: {error}") from error
+    notes = _notes(given.names, found, photos, lenses, kept, turned)
     none = np.zeros(0, np.intp)
     return Reconstruction(
         lenses,
@@ -137,11 +168,7 @@ def read_poses(path: str, photos: PhotoCollection) -> Reconstruction:
             "registered": len(lenses),
             "points": len(points),
             **given.report,
-            "notes": [
-                *in_folder,
-                *given.notes,
-                *_notes(given.names, found, photos, lenses, kept, turned),
-            ],
+            "notes": [for_line(note) for note in (*in_folder, *given.notes, *notes)],
         },
     )
 

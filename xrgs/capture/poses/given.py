@@ -11,6 +11,8 @@ from numpy.typing import NDArray
 
 from xrgs.capture.lens import Lens
 
+#: The fewest points: a Gaussian's first size is the distance of a point to its three nearest.
+MIN_POINTS = 4
 #: (the name of an image, width and height in px that its photograph is stored with) -> its camera,
 #: in px of the image, and its pose, world to camera [4, 4] with OpenCV axes.
 CameraOf = Callable[[str, tuple[int, int]], tuple[Lens, NDArray[np.float64]]]
@@ -25,7 +27,7 @@ class GivenPoses:
     camera: CameraOf
     """Reads one camera; it raises XrgsError where that one is malformed."""
     points: NDArray[np.float64]
-    """Points [P, 3]."""
+    """Points [P, 3]; none where the file has none."""
     colors: NDArray[np.uint8]
     """Their colours [P, 3]."""
     observed: Mapping[str, NDArray[np.intp]] = field(default_factory=dict)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path, PurePosixPath
 from typing import Any
 
@@ -15,9 +15,11 @@ from xrgs.capture.lens import MODELS, Lens, lens_of_model
 from xrgs.capture.poses.given import GivenPoses
 from xrgs.errors import StoreError, UnreadableError, XrgsError
 from xrgs.runtime.text import listed
-from xrgs.safeio.files import is_inside
+from xrgs.safeio.files import is_inside, list_names
 from xrgs.safeio.records import as_number, read_struct
 
+#: The files of a folder: one has all images, or one has those of each split, as Blender's.
+_WHOLE, _NAME = "transforms.json", re.compile(r"transforms(_\w+)?\.json")
 #: The largest file that is read, in bytes: a thousand views take one MB.
 _MAX_BYTES = 1 << 26
 #: From camera axes of OpenGL (x right, y up, z backwards) to OpenCV's, and back.
@@ -36,24 +38,40 @@ _NOT_SERVED = re.compile(
 #: Keys that are read, and keys that change neither a camera nor the points beside it: the scale and
 #: the place of the whole scene, which poses and points share, and how sharp a picture is.
 _KNOWN = {
-    *("frames", "file_path", "transform_matrix", "ply_file_path", "camera_model", "is_fisheye"),
+    *("file_path", "transform_matrix", "ply_file_path", "camera_model", "is_fisheye"),
     *("w", "h", "cx", "cy", *_FOCAL, "applied_transform", "applied_scale", "aabb_scale"),
-    *("scale", "offset", "sharpness", "colmap_im_id"),
+    *("scale", "offset", "sharpness", "colmap_im_id", "rotation", "mask_path"),
 }
 
 
-def files(file: Path) -> list[Path]:
-    """Return the files that are read: the transforms.json and the points that it names.
+def in_folder(folder: Path) -> list[Path]:
+    """Return the transforms.json of a folder, or else its parts, as transforms_train.json."""
+    names = [name for name in list_names(folder) if _NAME.fullmatch(name)]
+    return [folder / name for name in names if name == _WHOLE or _WHOLE not in names]
+
+
+def files(parts: Sequence[Path]) -> list[Path]:
+    """Return the files that are read: of transforms.json or its parts, and what these name.
 
     Raises:
-        UnreadableError: The file can't be read now.
-        XrgsError: The file is malformed, or names no points.
+        UnreadableError: A file can't be read now.
+        XrgsError: A file is malformed.
     """
-    return [file, _points_file(file, _content(file))]
+    contents = _contents(parts)
+    return [*parts, *_points_files(contents)[:1], *_masks(_frames(contents)).values()]
 
 
-def read(file: Path) -> GivenPoses:
-    """Read a transforms.json and its points.
+def masks(parts: Sequence[Path]) -> dict[str, Path]:
+    """Return the mask of each image that has one in `mask_path`, by the name of the image.
+
+    Raises:
+        As `files`.
+    """
+    return _masks(_frames(_contents(parts)))
+
+
+def read(parts: Sequence[Path]) -> GivenPoses:
+    """Read a transforms.json, or its parts, and its points.
 
     Raises:
         UnreadableError: A file can't be read now.
@@ -61,26 +79,49 @@ def read(file: Path) -> GivenPoses:
     """
     from xrgs.capture import colmap
 
-    content = _content(file)
-    points_file = _points_file(file, content)
-    points, colors = colmap.read_points(points_file)
-    frames = {frame["file_path"]: frame for frame in content["frames"]}
+    contents = _contents(parts)
+    frames = _frames(contents)
 
     def camera(name: str, stored: tuple[int, int]) -> tuple[Lens, NDArray[np.float64]]:
-        frame = frames[name]
+        file, entry = frames[name]
         try:
-            return _lens(content, frame, stored), _viewmat(frame.get("transform_matrix"))
+            return _lens(entry, stored), _viewmat(entry.get("transform_matrix"))
         except (ValueError, TypeError, OverflowError, XrgsError) as error:
             raise XrgsError(f"{file}: the camera of {name}: {error}") from error
 
-    notes = _notes(file, content)
-    if (colors == colmap.GREY).all():
-        notes.append(f"{points_file.name} has no colours: the splats begin grey")
+    points, notes = np.zeros((0, 3)), _notes(parts, frames)
+    colors = points.astype(np.uint8)
+    for file in _points_files(contents)[:1]:
+        points, colors = colmap.read_points(file)
+        if (colors == colmap.GREY).all():
+            notes.append(f"{file.name} has no colours: the splats begin grey")
     return GivenPoses(list(frames), camera, points, colors, notes=notes)
 
 
+def _frames(contents: Mapping[Path, dict[str, Any]]) -> dict[str, tuple[Path, dict[str, Any]]]:
+    """Return for each image the file that it is in, and its values.
+
+    Where a frame lacks a value, it has that of its file.
+    """
+    frames: dict[str, tuple[Path, dict[str, Any]]] = {}
+    for file, content in contents.items():
+        for frame in content["frames"]:
+            name = frame["file_path"]
+            if name in frames:
+                raise XrgsError(f"{file}: two frames have the file_path {name}")
+            has_focal = any(key in frame for key in _FOCAL)
+            shared = {k: v for k, v in content.items() if not (has_focal and k in _FOCAL)}
+            entry = {k: v for k, v in (shared | frame).items() if v is not None and k != "frames"}
+            frames[name] = file, entry
+    return frames
+
+
+def _contents(parts: Sequence[Path]) -> dict[Path, dict[str, Any]]:
+    return {file: _content(file) for file in parts}
+
+
 def _content(file: Path) -> dict[str, Any]:
-    """Read the file, and check that its frames have names."""
+    """Read a file, and check that its frames have names."""
     try:
         content = read_struct(file, dict[str, Any], _MAX_BYTES)
     except UnreadableError:
@@ -95,51 +136,54 @@ def _content(file: Path) -> dict[str, Any]:
         for frame in frames
     ):
         raise XrgsError(f"{file}: not a transforms.json: each of its frames must have a file_path")
-    names = [frame["file_path"] for frame in frames]
-    if twice := [name for i, name in enumerate(names) if name in names[:i]]:
-        raise XrgsError(f"{file}: two frames have the file_path {twice[0]}")
     return content
 
 
-def _points_file(file: Path, content: Mapping[str, Any]) -> Path:
-    """Return the .ply of points that a transforms.json names, which lies in or below its folder."""
-    name = content.get("ply_file_path")
-    if name is None:
-        raise XrgsError(
-            f"{file}: it has no ply_file_path: training begins with points, so name a .ply of"
-            " coloured points there, as ns-process-data does (sparse_pc.ply)"
-        )
+def _points_files(contents: Mapping[Path, Mapping[str, Any]]) -> list[Path]:
+    """Return the .ply files of points that the parts name; the first of them is read."""
+    named = [(file, content.get("ply_file_path")) for file, content in contents.items()]
+    return [_below(file, "ply_file_path", name) for file, name in named if name is not None]
+
+
+def _masks(frames: Mapping[str, tuple[Path, Mapping[str, Any]]]) -> dict[str, Path]:
+    return {
+        name: _below(file, "mask_path", entry["mask_path"])
+        for name, (file, entry) in frames.items()
+        if entry.get("mask_path")
+    }
+
+
+def _below(file: Path, key: str, name: object) -> Path:
+    """Return a file that a transforms.json names, which must lie in or below its folder."""
     inside = str(PurePosixPath(name)) if isinstance(name, str) else ""
     if not is_inside(inside):
-        raise XrgsError(f"{file}: ply_file_path must be a path below the folder of this file")
+        raise XrgsError(f"{file}: {key} must be a path below the folder of this file")
     return file.parent / inside
 
 
-def _notes(file: Path, content: Mapping[str, Any]) -> list[str]:
-    """Name the keys that are not read."""
-    notes, frames = [], content["frames"]
-    keys = dict.fromkeys([*content, *(key for frame in frames for key in frame)])
-    terms = {key for key in keys if _TERM.fullmatch(key) or _NOT_SERVED.fullmatch(key)}
-    if masked := [frame["file_path"] for frame in frames if frame.get("mask_path")]:
-        notes.append(
-            f"mask_path of {len(masked)} images in {file.name} is not read; "
-            "scene.masks=FOLDER takes masks"
-        )
-    if unread := [key for key in keys if key not in {*_KNOWN, *terms, "mask_path"}]:
-        notes.append(f"keys of {file.name} that are not read: {listed(unread)}")
+def _notes(
+    parts: Sequence[Path], frames: Mapping[str, tuple[Path, Mapping[str, Any]]]
+) -> list[str]:
+    """Name the keys that are not read, and say whose size is taken."""
+    entries = [entry for _, entry in frames.values()]
+    keys = dict.fromkeys(key for entry in entries for key in entry)
+    files, notes = listed([file.name for file in parts]), []
+    known = (_TERM, _NOT_SERVED)
+    unread = [k for k in keys if k not in _KNOWN and not any(form.fullmatch(k) for form in known)]
+    if unread:
+        notes.append(f"keys of {files} that are not read: {listed(unread)}")
+    if any(("fl_x" in e or "fl_y" in e) and not ("w" in e and "h" in e) for e in entries):
+        notes.append(f"{files} has no w and h: its focal lengths are of the photographs' own size")
     return notes
 
 
-def _lens(content: Mapping[str, Any], frame: Mapping[str, Any], stored: tuple[int, int]) -> Lens:
-    """Return the camera of a frame, with the values of the whole file where it has none.
+def _lens(entry: Mapping[str, Any], stored: tuple[int, int]) -> Lens:
+    """Return the camera of a frame.
 
     Args:
-        content: The whole file.
-        frame: The frame.
-        stored: Width and height that the photograph is stored with, px, where the file has none.
+        entry: The values of the frame.
+        stored: Width and height that the photograph is stored with, px, where the frame has none.
     """
-    own_focal = any(key in frame for key in _FOCAL)
-    entry = {k: v for k, v in content.items() if not (own_focal and k in _FOCAL)} | dict(frame)
     if others := [key for key in entry if _NOT_SERVED.fullmatch(key) and np.any(entry[key])]:
         raise XrgsError(f"{others[0]} is not served: undistort the images, or use another camera")
     size = tuple(int(as_number(entry.get(key, s))) for key, s in zip("wh", stored, strict=True))
@@ -194,7 +238,7 @@ def _viewmat(rows: object) -> NDArray[np.float64]:
     # Rounded digits make a rotation that is not quite one: the nearest rotation is taken. A scale
     # of the camera's own axes changes no projection.
     U, stretch, Vt = np.linalg.svd(matrix[:3, :3])
-    if stretch[0] - stretch[2] > _MAX_SKEW * stretch[0] or np.linalg.det(U @ Vt) < 0:
+    if not stretch[2] > (1 - _MAX_SKEW) * stretch[0] or np.linalg.det(U @ Vt) < 0:
         raise ValueError("transform_matrix must be a rotation with a translation, not mirrored")
     pose = np.eye(4)
     pose[:3, :3], pose[:3, 3] = U @ Vt, matrix[:3, 3]

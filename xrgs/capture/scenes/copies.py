@@ -30,10 +30,14 @@ SIZES = re.compile(r"images(?:_(\d+))?")
 _RATIO_TOLERANCE = 0.05
 #: Pairs of one name that are compared to find out how two folders are related.
 _SAMPLES = 3
-#: The side of the thumbnails that are compared, px, and the largest mean difference of those of one
-#: photograph in 0..255. Resized to 80 px and compressed anew, photographs of five captures differ
-#: by up to 2.5, and neighbouring views by 3.2 or more. HEIC and JPEG may be of two colour spaces.
-_THUMBNAIL, _MOST_DIFFERENT, _MOST_DIFFERENT_TWINS = 16, 2.6, 12.0
+#: The side of the thumbnails that are compared, px, and the least correlation of those of one
+#: photograph. In five captures, photographs that were resized to 80 px and compressed anew have
+#: 0.993 or more (0.9994 in their own size), and neighbouring views 0.980 or less. Files of one size
+#: in two folders must be more alike: two cameras of a rig see nearly the same. Of two formats of
+#: one name in one folder, one may be edited.
+_THUMBNAIL, _LEAST_ALIKE, _LEAST_ALIKE_SIZE, _LEAST_ALIKE_TWINS = 16, 0.985, 0.999, 0.9
+#: What an iPhone adds to the name of a photograph that was edited on it.
+_EDITED = re.compile(r"(?<=^img_)e(?=\d)")
 #: The largest deviation of the aspect ratio of a resized copy.
 _ASPECT_TOLERANCE = 0.02
 #: The bytes at the end of a file among which the mark of its end is looked for.
@@ -60,11 +64,14 @@ def _is_whole(file: Path) -> bool:
 
 
 @remembered
-def _thumbnail(file: Path) -> NDArray[np.int16] | None:
+def _thumbnail(file: Path) -> NDArray[np.float64] | None:
+    """Return a grey thumbnail of mean 0 and length 1; None where it is flat, or can't be read."""
     try:
-        return images.thumbnail(file, _THUMBNAIL).astype(np.int16)
+        grey = images.thumbnail(file, _THUMBNAIL).astype(np.float64)
     except images.ImageError:
         return None
+    grey -= grey.mean()
+    return grey / np.linalg.norm(grey) if grey.any() else None
 
 
 def one_of_each_size(
@@ -131,16 +138,24 @@ def _long_side(files: Iterable[Path]) -> int:
     return max(max(size(file)) for file in files)
 
 
-def without_copies(files: Sequence[Path], folder: Path) -> tuple[list[Path], list[str]]:
+def without_copies(
+    files: Sequence[Path], folder: Path, other_sizes: Sequence[Path] = ()
+) -> tuple[list[Path], list[str]]:
     """Leave out files that show the same photograph as another one.
 
     These are compared: files of the same bytes; files of one folder with names such as `a.jpg`,
-    `a.png`, `a_small.jpg` and `a (1).jpg`; and files of one name in two folders.
+    `a.png`, `a_small.jpg` and `a (1).jpg`; files of one name in two folders; and the files of two
+    folders in their order, where the folders have as many.
+
+    Args:
+        files: The files.
+        folder: The folder from which notes name the files.
+        other_sizes: Files that are taken in another size; their copies are left out, too.
 
     Returns:
-        The files in their order, and notes with their paths from `folder`.
+        The files in their order, and notes.
     """
-    same = _identical(files)
+    same = _identical(files, other_sizes)
     left = [file for file in files if file not in same]
     alike: dict[Path, Path] = {}
     for a, b in (*_of_one_folder(left), *_of_two_folders(left)):
@@ -158,10 +173,10 @@ def without_copies(files: Sequence[Path], folder: Path) -> tuple[list[Path], lis
     return [file for file in left if file not in alike], notes
 
 
-def _identical(files: Sequence[Path]) -> dict[Path, Path]:
-    """Return the files that have the bytes of another one, with that one."""
+def _identical(files: Sequence[Path], known: Sequence[Path]) -> dict[Path, Path]:
+    """Return the files that have the bytes of another or of a known one, with that one."""
     by_length = defaultdict(list)
-    for file in files:
+    for file in (*known, *files):
         try:
             by_length[file.stat().st_size].append(file)
         except OSError as error:
@@ -172,11 +187,11 @@ def _identical(files: Sequence[Path]) -> dict[Path, Path]:
     for group in by_length.values():
         for file in group if len(group) > 1 else ():
             by_content[content(file)].append(file)
-    return {
-        copy: original
-        for original, *copies in (sorted(g, key=_shortest) for g in by_content.values())
-        for copy in copies
-    }
+    found: dict[Path, Path] = {}
+    for group in by_content.values():
+        original, *copies = sorted(group, key=lambda file: (file not in known, *_shortest(file)))
+        found |= {copy: original for copy in copies if copy not in known}
+    return found
 
 
 def _shortest(file: Path) -> tuple[int, str]:
@@ -202,16 +217,18 @@ def _of_one_folder(files: Sequence[Path]) -> list[tuple[Path, Path]]:
     for (parent, stem), group in named.items():
         # An addition begins or ends with a character between words: `IMG_1` is none of `IMG_10`.
         cuts = [i for i in range(1, len(stem)) if not (stem[i - 1].isalnum() and stem[i].isalnum())]
-        parts = {part for i in cuts for part in (stem[:i], stem[i:])}
+        parts = {part for i in cuts for part in (stem[:i], stem[i:])} | {_EDITED.sub("", stem)}
+        parts.discard(stem)
         for part in parts & stems[parent]:
             pairs += [(a, b) for a in named[parent, part] for b in group]
     return pairs
 
 
 def _of_two_folders(files: Sequence[Path]) -> list[tuple[Path, Path]]:
-    """Pair the files of one name in folders of which some pairs show the same.
+    """Pair the files of one name, or of one place in the order, in folders of the same photographs.
 
-    Cameras number their photographs alike, and such folders differ in all pairs.
+    Cameras number their photographs alike: folders whose first, middle and last pairs differ have
+    other photographs.
     """
     folders: dict[Path, dict[str, Path]] = defaultdict(dict)
     for file in files:
@@ -221,6 +238,10 @@ def _of_two_folders(files: Sequence[Path]) -> list[tuple[Path, Path]]:
         both = [(a[stem], b[stem]) for stem in a if stem in b]
         if any(_show_the_same(*pair) for pair in _samples(both)):
             pairs += both
+        elif not both and len(a) == len(b):
+            ordered = list(zip(a.values(), b.values(), strict=True))
+            if all(_show_the_same(*pair) for pair in _samples(ordered)):
+                pairs += ordered
     return pairs
 
 
@@ -241,8 +262,10 @@ def _show_the_same(a: Path, b: Path) -> bool:
     first, second = _thumbnail(a), _thumbnail(b)
     if first is None or second is None:
         return False
-    most = _MOST_DIFFERENT_TWINS if twins else _MOST_DIFFERENT
-    return bool(np.abs(first - second).mean() < most)
+    least = _LEAST_ALIKE_TWINS if twins else _LEAST_ALIKE
+    if a.parent != b.parent and size(a) == size(b):
+        least = _LEAST_ALIKE_SIZE
+    return bool((first * second).sum() > least)
 
 
 def _is_heic(file: Path) -> bool:

@@ -29,7 +29,7 @@ from xrgs.safeio.paths import user_path
 from xrgs.safeio.sanitize import counted
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Iterator, Mapping, Sequence
+    from collections.abc import Iterable, Iterator, Mapping, Sequence, Set
 
     from xrgs.config import SceneConf
 
@@ -48,9 +48,14 @@ _MADE = {
     "a cell of xrgs": ("config.json", "identity.json"),
     "a report of xrgs": ("cells.csv", "table.md"),
     "an export of xrgs": ("split.json", "transform.json"),
-    "photographs that COLMAP undistorted": ("images", "sparse", "stereo"),
 }
-_MASKS = "masks"
+#: What else is not taken with `/**`, in words for people.
+_MASKS, _LINKS, _SYSTEM = "masks", "links to folders are not followed", "folders of the system"
+_UNDISTORTED = "copies that COLMAP undistorted"
+#: Folders of thumbnails, of what was deleted, and of other files that systems keep beside files.
+_OF_SYSTEM = frozenset(
+    {"#recycle", "$recycle.bin", "@eadir", "__macosx", "lost+found", "system volume information"}
+)
 _MASK = r"masks?|segmentations?|seg|segments|mattes?|silhouettes?"
 #: The names of folders of masks, and of other images that programs make of photographs.
 _OF_MASKS = re.compile(rf"(?:.*[\W_])?(?:{_MASK})(?:[\W_\d].*)?", re.IGNORECASE)
@@ -128,17 +133,13 @@ def look(path: str | None, long_side: int, masks: str | None = None) -> Listing:
             if folder.is_file():
                 why = "not a folder; for the frames of a video: scene=video scene.path=..."
             raise XrgsError(f"scene.path={folder}: {why}")
-        taken, notes = (_all_below if nested else _inside)(folder, long_side)
-        if masks is not None:
-            root = user_path(masks).resolve()
-            taken = {f: files for f, files in taken.items() if f == folder or not _is_in(f, root)}
-            notes = [note for note in notes if "scene.masks=" not in note]
-        files = [file for inside in taken.values() for file in inside]
-        for choose in (_photographs, without_copies):
-            files, more = choose(files, folder)
-            notes += more
-        notes += _not_read({folder, *taken}, files)
-        notes += _panoramas(files, folder)
+        known = None if masks is None else user_path(masks).resolve()
+        found = (_all_below if nested else _inside)(folder, long_side, known)
+        listed_files = [file for inside in found.folders.values() for file in inside]
+        photographs, made = _photographs(listed_files, folder)
+        files, copies = without_copies(photographs, folder, found.other_sizes)
+        not_read = _not_read({folder, *found.folders}, files)
+        notes = (*found.notes, *made, *copies, *not_read, *_panoramas(files, folder))
     except OSError as error:
         raise UnreadableError(f"{error.filename}: {error.strerror}; try again") from error
     if len(files) < 2:
@@ -148,81 +149,94 @@ def look(path: str | None, long_side: int, masks: str | None = None) -> Listing:
         raise XrgsError("; ".join([f"scene.path={folder}: {why}", *notes]))
     _check_heic(files)
     named = [(_view_name(file, folder if nested else file.parent), file) for file in files]
-    return Listing(_by_name(named), tuple(notes))
+    return Listing(_by_name(named), notes)
 
 
-def _is_in(folder: Path, root: Path) -> bool:
-    return folder.resolve().is_relative_to(root)
+@dataclass(frozen=True)
+class _Found:
+    """The images of folders, before copies of other names are left out."""
+
+    folders: Mapping[Path, list[Path]]
+    notes: list[str]
+    other_sizes: list[Path]
+    """Images in folders of an LLFF scene of which another size is taken."""
 
 
-#: Photographs by their folder.
-_Tree = dict[Path, list[Path]]
-
-
-def _inside(folder: Path, long_side: int) -> tuple[_Tree, list[str]]:
+def _inside(folder: Path, long_side: int, masks: Path | None) -> _Found:
     """List the photographs in a folder itself, or one of the sizes of an LLFF scene."""
-    sizes = [_images_in(inside) for inside in sorted(folder.iterdir()) if _is_size(inside)]
-    taken, notes = one_of_each_size([files for files in sizes if files], long_side)
-    names = [files[0].parent.name for files in taken]
+    inside = filter(_is_size, sorted(folder.iterdir()))
+    sizes = {one: files for one in inside if (files := _images_in(one))}
+    taken, notes = one_of_each_size([*sizes.values()], long_side)
+    by_name = {files[0].parent.name: list(files) for files in taken}
     # Without a folder images/, folders that are not sizes of each other are no LLFF scene.
-    which = names.index("images") if "images" in names else 0
-    if len(taken) == 1 or "images" in names:
-        tree = {taken[which][0].parent: list(taken[which])}
-    else:
-        tree, notes = {folder: _images_in(folder)}, []
-    known = {file for files in sizes for file in files if files[0].parent not in tree}
-    return tree, notes + _in_other_folders(folder, tree, known if len(taken) == 1 else set())
+    choice = by_name.get("images") or (next(iter(by_name.values())) if len(taken) == 1 else None)
+    tree = {choice[0].parent: choice} if choice else {folder: _images_in(folder)}
+    no_loss = {*tree, *sizes} if len(taken) == 1 else {*tree}
+    others = _in_other_folders(folder, no_loss, masks)
+    return _Found(tree, [*(notes if choice else ()), *others], [])
 
 
-def _all_below(folder: Path, long_side: int) -> tuple[_Tree, list[str]]:
+def _all_below(folder: Path, long_side: int, masks: Path | None) -> _Found:
     """List the photographs in a folder and all below it, of LLFF scenes those of one size."""
     passed: dict[str, list[Path]] = defaultdict(list)
-    tree = {inside: _images_in(inside) for inside in _folders(folder, passed)}
-    tree, notes = _of_sizes(tree, long_side)
+    tree = {inside: _images_in(inside) for inside in _folders(folder, passed, masks)}
+    if not any(tree.values()):  # the undistorted ones are all there is
+        tree |= {inside: _images_in(inside) for inside in passed.pop(_UNDISTORTED, ())}
+    dropped, notes = _other_sizes(tree, long_side)
     root = folder.resolve()
-    for what, folders in passed.items():
-        searched = {inside for inside in folders if _is_link_into(inside, root)}
-        counts = {inside: _count_anywhere(inside) for inside in folders if inside not in searched}
-        use = f"; scene.masks={folders[0]} uses them" if what == _MASKS else ""
-        notes += _left_out(counts, folder, f"{what}{use}")
-    return tree, notes
+    for what in sorted(passed.keys() - {_MASKS}):
+        own = [inside for inside in passed[what] if not _is_link_into(inside, root)]
+        notes += _left_out({inside: _count_anywhere(inside) for inside in own}, folder, what)
+    return _Found(
+        {inside: files for inside, files in tree.items() if inside not in dropped},
+        notes + _masks_left_out(passed, folder),
+        [file for inside in dropped for file in tree[inside]],
+    )
 
 
-def _of_sizes(tree: _Tree, long_side: int) -> tuple[_Tree, list[str]]:
-    """Take one of the sizes of each LLFF scene among folders."""
+def _other_sizes(tree: Mapping[Path, list[Path]], long_side: int) -> tuple[list[Path], list[str]]:
+    """Return the folders of the LLFF scenes among folders of which another size is taken."""
     groups = defaultdict(list)
     for inside, files in tree.items():
         if files and SIZES.fullmatch(inside.name):
             groups[inside.parent].append(files)
-    dropped, notes = set[Path](), []
+    dropped, notes = [], []
     for group in groups.values():
         taken, more = one_of_each_size(group, long_side)
-        dropped |= {files[0].parent for files in group if files not in taken}
+        dropped += [files[0].parent for files in group if files not in taken]
         notes += more
-    return {inside: files for inside, files in tree.items() if inside not in dropped}, notes
+    return dropped, notes
 
 
-def _folders(folder: Path, passed: dict[str, list[Path]], depth: int = 0) -> Iterator[Path]:
+def _folders(
+    folder: Path, passed: dict[str, list[Path]], masks: Path | None, depth: int = 0
+) -> Iterator[Path]:
     """Yield a folder and all below it that may hold photographs; add the others to `passed`.
 
-    Hidden folders are passed over in silence.
+    Hidden folders and the folder of `scene.masks` are passed over in silence.
     """
     if depth > _MAX_DEPTH:
         raise XrgsError(f"{folder}: folders are nested more than {_MAX_DEPTH} deep")
     yield folder
     for inside in sorted(folder.iterdir()):
-        if inside.name.startswith(".") or not inside.is_dir():
+        if inside.name.startswith(".") or not inside.is_dir() or inside.resolve() == masks:
             continue
         if inside.is_symlink():
-            passed["links to folders are not followed"].append(inside)
+            passed[_LINKS].append(inside)
         elif what := _made_by_programs(inside):
             passed[what].append(inside)
         else:
-            yield from _folders(inside, passed, depth + 1)
+            yield from _folders(inside, passed, masks, depth + 1)
 
 
 def _made_by_programs(folder: Path) -> str:
     """Say what a folder holds in place of photographs; empty where it may hold photographs."""
+    if folder.name.casefold() in _OF_SYSTEM:
+        return _SYSTEM
+    # `image_undistorter` makes stereo/; 3DGS's script keeps the photographs in input/.
+    beside = {name for name in ("input", "sparse", "stereo") if (folder.parent / name).is_dir()}
+    if SIZES.fullmatch(folder.name) and "sparse" in beside and len(beside) > 1:
+        return _UNDISTORTED
     if _OF_MASKS.fullmatch(folder.name):
         return _MASKS
     if _OF_OTHERS.fullmatch(folder.name):
@@ -241,24 +255,22 @@ def _count_anywhere(folder: Path) -> int:
     return sum(1 for name in names if Path(name).suffix.lower() in SUFFIXES)
 
 
-def _in_other_folders(folder: Path, taken: _Tree, known: set[Path]) -> list[str]:
-    """Say which images in and below a folder are not taken, and how to get them.
-
-    Args:
-        folder: The folder.
-        taken: What is taken of it.
-        known: Images that show what is taken in other sizes, which are no loss.
-    """
+def _in_other_folders(folder: Path, taken: Set[Path], masks: Path | None) -> list[str]:
+    """Say which images in and below a folder are not taken, and how to get them."""
     passed: dict[str, list[Path]] = defaultdict(list)
     try:
-        below = [inside for inside in _folders(folder, passed) if inside not in taken]
-        counts = {inside: len(set(_images_in(inside)) - known) for inside in below}
+        below = [inside for inside in _folders(folder, passed, masks) if inside not in taken]
+        counts = {inside: len(_images_in(inside)) for inside in below}
     except (OSError, XrgsError) as error:
         return [f"the folders below can't be searched for more images ({error})"]
-    masks = {inside: _count_anywhere(inside) for inside in passed[_MASKS]}
     all_below = f"scene.path={folder}{ALL_BELOW} takes the images of all folders"
-    use = f"{_MASKS}; scene.masks={next(iter(masks), folder)} uses them"
-    return _left_out(counts, folder, all_below) + _left_out(masks, folder, use)
+    return _left_out(counts, folder, all_below) + _masks_left_out(passed, folder)
+
+
+def _masks_left_out(passed: Mapping[str, Sequence[Path]], folder: Path) -> list[str]:
+    counts = {inside: _count_anywhere(inside) for inside in passed.get(_MASKS, ())}
+    use = f"{_MASKS}; scene.masks={next(iter(counts), folder)} uses them"
+    return _left_out(counts, folder, use)
 
 
 def _left_out(counts: Mapping[Path, int], folder: Path, why: str) -> list[str]:
@@ -306,22 +318,21 @@ def _has_colour(file: Path) -> bool:
 
 
 def _made_of_others(files: Sequence[Path]) -> set[Path]:
-    """Find masks, depth maps and thumbnails that lie beside the photographs, or have their names.
+    """Find masks, depth maps and thumbnails by the names of their photographs.
 
-    These are `a.jpg.png` and `a_mask.png` beside `a.jpg`, and an image of one channel where another
-    one of the same name has colours.
+    These are `a.jpg.png` and `a_mask.png` where there is an `a.jpg`, and an image of one channel
+    where another one of the same name has colours.
     """
-    there = {(file.parent, name.casefold()) for file in files for name in (file.name, file.stem)}
+    names = {file.name.casefold() for file in files}
     named = defaultdict(list)
     for file in files:
         named[file.stem.casefold()].append(file)
     made = set()
     for stem, group in named.items():
-        others = {stem, _ADDED_BEFORE.sub("", stem), _ADDED_AFTER.sub("", stem)} - {stem}
-        if Path(stem).suffix in SUFFIXES:
-            others.add(stem)
-        made |= {file for file in group if any((file.parent, name) in there for name in others)}
-        if len(group) > 1 and any(map(_has_colour, group)):
+        plain = {_ADDED_BEFORE.sub("", stem), _ADDED_AFTER.sub("", stem)} - {stem}
+        if stem in names or plain & named.keys():
+            made |= {*group}
+        elif len(group) > 1 and any(map(_has_colour, group)):
             made |= {file for file in group if not _has_colour(file)}
     return made
 

@@ -69,7 +69,14 @@ class TrainingView(Protocol):
 
     @property
     def image(self) -> Tensor:
-        """The photograph [H, W, 3] in 0..1. It may be a new tensor at each access."""
+        """The photograph [H, W, 3] in 0..1. It may be a new tensor at each access.
+
+        Outside the mask it has colours of the inside, never what the mask hides.
+        """
+
+    @property
+    def mask(self) -> Tensor | None:
+        """The pixels that are used [H, W] bool, at least one; None where all are."""
 
 
 @dataclass(frozen=True)
@@ -256,7 +263,7 @@ class Component:
         Args:
             loss: Scalar; the photometric loss, as the components before this one changed it.
             image: [H, W, 3] render of the view as it is compared with the photograph, not clamped
-                to 0..1.
+                to 0..1. Outside the view's mask it is the photograph.
             gaussians: The N trained Gaussians; a term may depend on their parameters.
             step: The step with its view.
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from itertools import zip_longest
 from typing import TYPE_CHECKING, Any, Self
 
 import torch
@@ -59,7 +60,7 @@ class Mip(Component):
     """
 
     def __init__(self, settings: MipConf, views: Sequence[TrainingView], near: float) -> None:
-        """Take the cameras; `on_gaussians_changed` computes the filter.
+        """Take the cameras and masks; `on_gaussians_changed` computes the filter.
 
         Args:
             settings: `components.mip` of the config.
@@ -68,6 +69,7 @@ class Mip(Component):
         """
         self.strength, self.every = settings.variance, settings.every
         self.cameras = [view.camera for view in views]
+        self.masks = [view.mask for view in views]
         self.near = near
         self.variance = torch.empty(0)
         self.unseen_count = 0
@@ -131,7 +133,7 @@ class Mip(Component):
         self.variance = state["variance"]
 
     def _update_variance(self, means: Tensor) -> None:
-        rates = sampling_rates(means.detach(), self.cameras, self.near)
+        rates = sampling_rates(means.detach(), self.cameras, self.near, self.masks)
         seen = rates > 0
         self.unseen_count = int((~seen).sum())
         lowest = rates[seen].min() if seen.any() else rates.new_tensor(torch.inf)
@@ -158,22 +160,27 @@ def smooth(scales: Tensor, opacities: Tensor, variance: Tensor) -> tuple[Tensor,
     return wider, opacities * ratio[:, 0] * ratio[:, 1] * ratio[:, 2]
 
 
-def sampling_rates(means: Tensor, cameras: Sequence[Camera], near: float) -> Tensor:
+def sampling_rates(
+    means: Tensor, cameras: Sequence[Camera], near: float, masks: Sequence[Tensor | None] = ()
+) -> Tensor:
     """Compute the highest sampling rate of each point among the views that see it.
 
     A view sees a point whose depth is above `near` and whose projection lies on the image or within
-    15% of the image's size outside it. The rate is the larger of fx and fy over the depth.
+    15% of the image's size outside it. The pixel nearest to the projection must be one that the
+    view's mask uses. The rate is the larger of fx and fy over the depth.
 
     Args:
         means: [N, 3] points, world units.
         cameras: The cameras of the views.
         near: Depth below which a point is not seen, world units.
+        masks: The masks of the views [H, W] bool, None for a view without one; empty where no view
+            has one.
 
     Returns:
         [N] rates in px per world unit, 0 where no view sees the point.
     """
     highest = means.new_zeros(len(means))
-    for camera in cameras:
+    for camera, mask in zip_longest(cameras, masks):
         K = camera.K.to(means)
         x, y, depth = camera.to_camera(means)  # [N] each
         seen = depth > near
@@ -181,6 +188,17 @@ def sampling_rates(means: Tensor, cameras: Sequence[Camera], near: float) -> Ten
             # Homogeneous pixels: compared before the division by depth, which may be 0.
             pixels = K[axis, axis] * place + K[axis, 2] * depth
             seen &= (pixels >= -MARGIN * size * depth) & (pixels <= (1 + MARGIN) * size * depth)
+        if mask is not None:
+            seen[seen.clone()] = _shown(mask, K, x[seen], y[seen], depth[seen])
         rate = torch.maximum(K[0, 0], K[1, 1]) / depth
         highest = torch.where(seen, torch.maximum(highest, rate), highest)
     return highest
+
+
+def _shown(mask: Tensor, K: Tensor, x: Tensor, y: Tensor, depth: Tensor) -> Tensor:
+    """Whether the pixels nearest to the projections of points [N] are used."""
+    row, column = (
+        (K[axis, axis] * place / depth + K[axis, 2]).floor().long().clamp(0, size - 1)
+        for axis, place, size in ((1, y, mask.shape[0]), (0, x, mask.shape[1]))
+    )
+    return mask[row, column]

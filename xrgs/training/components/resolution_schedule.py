@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Self
 import torch
 from torch import Tensor
 
+from xrgs.capture import masks
 from xrgs.errors import XrgsError
 from xrgs.splat.cameras import Camera
 from xrgs.splat.loss import WINDOW
@@ -32,6 +33,8 @@ class _ReducedView:
     camera: Camera
     image: Tensor
     """[h, w, 3] at the camera's size."""
+    mask: Tensor | None
+    """[h, w] bool, True for a pixel that is used; None uses all."""
 
 
 class ResolutionSchedule(Component):
@@ -147,7 +150,10 @@ class ResolutionSchedule(Component):
         width, height = round(view.camera.width / factor), round(view.camera.height / factor)
         image = resize(view.image, height, width, backend=self.backend)
         camera = view.camera.resized(width, height)
-        return _ReducedView(view.name, view.tag, view.rho, camera, image)
+        mask = None
+        if view.mask is not None:
+            mask = torch.from_numpy(masks.resized(view.mask.numpy(), width, height))
+        return _ReducedView(view.name, view.tag, view.rho, camera, image, mask)
 
 
 def kept_shares(images: Iterable[Tensor], factors: Iterable[int]) -> dict[int, float]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from torch import Tensor
 from torch.nn.functional import pad
 
-from xrgs.splat.rounding import rounded_sqrt
+from xrgs.splat.rounding import rounded_mean, rounded_sqrt
 
 
 def gradient_magnitude(image: Tensor) -> Tensor:
@@ -31,3 +31,22 @@ def gradient_magnitude(image: Tensor) -> Tensor:
     red, green, blue = squared.unbind(-1)
     magnitude = rounded_sqrt((red + green + blue) / 3)  # [H - 1, W - 1]
     return pad(magnitude[None], (0, 1, 0, 1), mode="replicate")[0]
+
+
+def mean_gradient(image: Tensor, mask: Tensor | None) -> float:
+    """Average `gradient_magnitude` over an image [H, W, 3], or over the used pixels of a mask.
+
+    Of these count the pixels whose two neighbours are used too, since their differences are known.
+
+    Args:
+        image: [H, W, 3] in 0..1, at least 2 x 2 px.
+        mask: [H, W] bool, True for a pixel that is used; None uses all.
+
+    Returns:
+        Intensity per px; 0 where no pixel counts.
+    """
+    magnitude = gradient_magnitude(image)
+    if mask is None:
+        return rounded_mean(magnitude)
+    known = mask[:-1, :-1] & mask[:-1, 1:] & mask[1:, :-1]
+    return rounded_mean(magnitude[:-1, :-1][known]) if known.any() else 0.0

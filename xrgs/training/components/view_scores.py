@@ -104,7 +104,7 @@ class MultiviewScore(_ViewScores):
     def score_in_view(self, gaussians: Gaussians, step: Step) -> Tensor:
         """Return the weighted number [N] of pixels with a high error, px^2 of the finest view."""
         error = _mean_error(self.renderer.photograph(gaussians, step), step.view.image)
-        high = _in_unit_range(error) > self.error
+        high = _in_unit_range(error, step.view.mask) > self.error
         sums = self.renderer.attribute(high.to(error), gaussians, step)
         return sums / step.view.rho**2
 
@@ -158,7 +158,7 @@ class ErrorScore(_ViewScores):
     def score_in_view(self, gaussians: Gaussians, step: Step) -> Tensor:
         """Return the sums [N] over the view's map, relative to their mean where above 0."""
         if self.of == "edges":
-            pixels = _in_unit_range(edges(step.view.image))
+            pixels = _in_unit_range(edges(step.view.image), step.view.mask)
         else:
             pixels = _mean_error(self.renderer.photograph(gaussians, step), step.view.image)
         # Bringing a render down weighs some pixels with less than 0.
@@ -197,7 +197,12 @@ def _mean_error(image: Tensor, photograph: Tensor) -> Tensor:
     return (error[..., 0] + error[..., 1] + error[..., 2]) / 3
 
 
-def _in_unit_range(values: Tensor) -> Tensor:
-    """Values brought to 0..1 by the smallest and the largest; all 0 where they are equal."""
-    low, high = values.min(), values.max()
-    return (values - low) / (high - low).clamp_min(torch.finfo(values.dtype).tiny)
+def _in_unit_range(values: Tensor, mask: Tensor | None) -> Tensor:
+    """Values [H, W] brought to 0..1 by the smallest and the largest; all 0 where they are equal.
+
+    Values outside the mask are 0, and are neither of the two.
+    """
+    used = values if mask is None else values[mask]
+    low, high = used.min(), used.max()
+    scaled = (values - low) / (high - low).clamp_min(torch.finfo(values.dtype).tiny)
+    return scaled if mask is None else scaled.where(mask, scaled.new_zeros(()))

@@ -26,7 +26,7 @@ from xrgs.training.components.base import (
     TrainingView,
     check_not_negative,
 )
-from xrgs.training.components.texture import gradient_magnitude
+from xrgs.training.components.texture import gradient_magnitude, mean_gradient
 from xrgs.training.memory import OnDemand
 
 if TYPE_CHECKING:
@@ -212,7 +212,7 @@ def scene_attenuation(views: Sequence[TrainingView], texture: float) -> float:
     """Attenuate LR views in proportion to the texture of the scene [xrgs, 7.2, proposal 1].
 
     Adaptive weighting: the attenuation is `min(1, g / texture)`, where g is the mean of
-    `gradient_magnitude` over all pixels of all LR views. A flat scene, whose LR views lack no
+    `gradient_magnitude` over all used pixels of all LR views. A flat scene, whose LR views lack no
     detail, is not attenuated at all; from `texture` on the attenuation is complete.
 
     Our choice where the paper is silent: section 7.2 proposes to "estimate image texture (e.g., via
@@ -226,9 +226,9 @@ def scene_attenuation(views: Sequence[TrainingView], texture: float) -> float:
         views: All training views.
         texture: Intensity per px, above 0.
     """
-    magnitudes = [rounded_mean(gradient_magnitude(v.image)) for v in views if v.tag == "LR"]
-    mean_gradient = sum(magnitudes) / len(magnitudes) if magnitudes else 0.0
-    return min(1.0, mean_gradient / texture)
+    magnitudes = [mean_gradient(v.image, v.mask) for v in views if v.tag == "LR"]
+    mean = sum(magnitudes) / len(magnitudes) if magnitudes else 0.0
+    return min(1.0, mean / texture)
 
 
 def scheduled_attenuation(step: Step, start: float, ramp: float) -> float:
@@ -287,8 +287,14 @@ class _RegionAttenuation:
     texture: float
 
     def __call__(self, view: TrainingView) -> Tensor:
-        share = _box_mean(gradient_magnitude(view.image)) / self.texture
-        return share.clamp_max(1.0) * self.covered[view.name]
+        share = _box_mean(gradient_magnitude(view.image), view.mask) / self.texture
+        attenuation = share.clamp_max(1.0) * self.covered[view.name]
+        if view.mask is None:
+            return attenuation
+        # Outside there is no loss to attenuate; with the mean of the inside, the mean of the view
+        # is the mean over its used pixels.
+        inside = rounded_mean(attenuation[view.mask])
+        return attenuation.where(view.mask, attenuation.new_tensor(inside))
 
 
 def coverage(camera: Camera, others: Sequence[Camera], points: Tensor, near: float) -> Tensor:
@@ -359,8 +365,11 @@ def _inside(pixels: Tensor, camera: Camera) -> Tensor:
     return ((pixels > 0) & (pixels < pixels.new_tensor([camera.width, camera.height]))).all(dim=-1)
 
 
-def _box_mean(values: Tensor) -> Tensor:
-    """The mean [H, W] over the window around each pixel, over the part inside the image."""
+def _box_mean(values: Tensor, mask: Tensor | None = None) -> Tensor:
+    """The mean [H, W] over the window around each pixel, over the part inside image and mask."""
+    if mask is not None:
+        used = mask.to(values)
+        return _box_mean(values * used) / _box_mean(used).clamp_min(torch.finfo(values.dtype).tiny)
     pooled = avg_pool2d(
         values[None, None], WINDOW, stride=1, padding=WINDOW // 2, count_include_pad=False
     )

@@ -1,0 +1,257 @@
+"""Converts photographs to sRGB: by their ICC profile, or by the primaries and curve they name.
+
+An ICC profile is applied by LittleCMS, relative colorimetric with black point compensation, as
+photo editors do. 8-bit pixels go through Pillow's ImageCms, deeper ones through imagecodecs, since
+Pillow has no RGB of 16 bits. A profile that changes no 8-bit colour by more than one step is sRGB's
+own, and is not applied.
+"""
+
+from __future__ import annotations
+
+import io
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image, ImageCms
+
+from xrgs.safeio.sanitize import for_line
+
+Samples = NDArray[Any]
+"""Pixels [H, W, 1, 3 or 4] of uint8 or uint16: grey, RGB or CMYK."""
+
+_INTENT = ImageCms.Intent.RELATIVE_COLORIMETRIC
+_BLACK_POINT = ImageCms.Flags.BLACKPOINTCOMPENSATION
+#: Without it, LittleCMS interpolates between 33 values, and is wrong by up to 14 of 255 at
+#: the gamut's edges; not for 8 bits of a matrix or of grey. With it, it takes ten times as long.
+_EXACT = ImageCms.Flags.NOOPTIMIZE
+#: Pillow's mode of so many channels.
+_MODES = {1: "L", 3: "RGB", 4: "CMYK"}
+#: The most that sRGB's own profiles, which round differently, change an 8-bit colour.
+_ROUNDING = 1
+
+Chromaticities = tuple[float, float, float, float, float, float, float, float]
+"""x and y of white, red, green and blue, as in a PNG's cHRM."""
+SRGB: Chromaticities = (0.3127, 0.329, 0.64, 0.33, 0.3, 0.6, 0.15, 0.06)
+_ADOBE: Chromaticities = (0.3127, 0.329, 0.64, 0.33, 0.21, 0.71, 0.15, 0.06)
+_P3: Chromaticities = (0.3127, 0.329, 0.68, 0.32, 0.265, 0.69, 0.15, 0.06)
+_BT2020: Chromaticities = (0.3127, 0.329, 0.708, 0.292, 0.17, 0.797, 0.131, 0.046)
+#: Colour spaces by ITU-T H.273's number of their primaries.
+_H273_PRIMARIES = {9: ("BT.2020", _BT2020), 12: ("Display P3", _P3)}
+#: The curves of H.273 that are treated as sRGB's, which they differ from by little. 2 is unknown.
+_H273_SRGB = (1, 2, 6, 13, 14, 15)
+_H273_HDR = {16: "PQ", 18: "HLG"}
+#: Differences in x and y, and of a curve's exponent in proportion, that are sRGB rounded.
+_SAME_XY, _SAME_GAMMA = 0.005, 0.05
+
+_BRADFORD = np.array(
+    [[0.8951, 0.2664, -0.1614], [-0.7502, 1.7135, 0.0367], [0.0389, -0.0685, 1.0296]]
+)
+
+
+class ColourError(ValueError):
+    """The colours of a photograph can't be converted."""
+
+
+@dataclass(frozen=True)
+class Encoding:
+    """The colours of a file that names its primaries and curve, and has no ICC profile."""
+
+    name: str
+    primaries: Chromaticities = SRGB
+    gamma: float | None = None
+    """The exponent that decodes a value; None is sRGB's curve."""
+
+
+def from_h273(primaries: int, transfer: int) -> Encoding | None:
+    """Return the encoding of a HEIC file or of a PNG's cICP, by the numbers of ITU-T H.273.
+
+    Returns:
+        None where it is sRGB's, or where the numbers are unknown or reserved.
+
+    Raises:
+        ColourError: The curve is that of HDR, which has no white to scale by.
+    """
+    if transfer in _H273_HDR:
+        raise ColourError(f"its brightness is HDR ({_H273_HDR[transfer]}); save it as SDR")
+    linear = transfer == 8
+    if primaries not in _H273_PRIMARIES:
+        return Encoding("linear sRGB", gamma=1.0) if linear else None
+    name, xy = _H273_PRIMARIES[primaries]
+    return Encoding(f"linear {name}" if linear else name, xy, 1.0 if linear else None)
+
+
+def adobe_rgb() -> Encoding:
+    """Return Adobe RGB (1998), which cameras name by EXIF's index `R03`, and some by number 2."""
+    return Encoding("Adobe RGB", _ADOBE, 563 / 256)
+
+
+def from_png(gamma: float | None, chromaticities: Chromaticities | None) -> Encoding | None:
+    """Return the encoding of a PNG's gAMA and cHRM; None where it is about sRGB's or invalid."""
+    xy = chromaticities or SRGB
+    if np.abs(np.subtract(xy, SRGB)).max() < _SAME_XY or not _is_triangle(xy):
+        xy = SRGB
+    if gamma is None or not 0.1 < gamma < 5 or abs(gamma * 2.2 - 1) < _SAME_GAMMA:
+        return None if xy == SRGB else Encoding("the primaries of cHRM", xy)
+    return Encoding(f"gamma {gamma:.3g}", xy, 1 / gamma)
+
+
+def _is_triangle(xy: Chromaticities) -> bool:
+    """Return whether the primaries span colours and the white is one."""
+    _, (ax, ay), (bx, by), (cx, cy) = zip(xy[::2], xy[1::2], strict=True)
+    area = abs((bx - ax) * (cy - ay) - (cx - ax) * (by - ay)) / 2
+    return min(xy[1::2]) > 0 and area > 0.01
+
+
+def convert(
+    samples: Samples, profile: bytes | None, encoding: Encoding | None
+) -> tuple[NDArray[np.float32], str]:
+    """Convert the pixels of a photograph to sRGB.
+
+    Args:
+        samples: Grey, RGB or CMYK [H, W, 1, 3 or 4]; uint8, or uint16 whose white is 65535. CMYK
+            has the largest value for full ink.
+        profile: The file's ICC profile.
+        encoding: What the file says in place of a profile.
+
+    Returns:
+        RGB [H, W, 3] in 0..1, and what was done; empty where nothing was.
+    """
+    if profile:
+        converted, note = _by_profile(samples, profile)
+        if converted is not None:
+            return _to_float(converted), note
+        return _to_float(_plain_rgb(samples)), note
+    if samples.shape[2] == 4:
+        return _to_float(_plain_rgb(samples)), "converted from CMYK without a profile"
+    rgb = _to_float(_plain_rgb(samples))
+    if encoding is None:
+        return rgb, ""
+    return _by_encoding(rgb, encoding), f"converted from {encoding.name} to sRGB"
+
+
+def _to_float(samples: Samples) -> NDArray[np.float32]:
+    most = np.float32(np.iinfo(samples.dtype).max)
+    return np.divide(samples, most, dtype=np.float32)
+
+
+def _plain_rgb(samples: Samples) -> Samples:
+    """Convert grey and CMYK to RGB [H, W, 3] as Pillow does."""
+    if samples.shape[2] == 4 and samples.dtype == np.uint8:
+        return np.asarray(_image(samples, "CMYK").convert("RGB"))
+    if samples.shape[2] == 4:  # Pillow's formula
+        light = 1 - samples / 65535
+        return np.round(light[..., :3] * light[..., 3:] * 65535).astype(np.uint16)
+    return np.broadcast_to(samples, (*samples.shape[:2], 3))
+
+
+def _by_profile(samples: Samples, profile: bytes) -> tuple[Samples | None, str]:
+    """Convert by an ICC profile; None where it is sRGB's own or can't be used."""
+    mode = _MODES[samples.shape[2]]
+    transform, note = _transform(profile, mode)
+    if transform is None:
+        return None, note
+    if samples.dtype == np.uint8:
+        return _applied(transform, samples, mode), note
+    import imagecodecs
+
+    converted: NDArray[np.uint16] = imagecodecs.cms_transform(
+        np.ascontiguousarray(samples[..., 0] if mode == "L" else samples),
+        profile,
+        _srgb().tobytes(),
+        colorspace={"L": "gray"}.get(mode, mode.lower()),
+        outcolorspace="rgb",
+        intent=int(_INTENT),
+        flags=int(_BLACK_POINT | _EXACT),
+    )
+    return converted, note
+
+
+@lru_cache(maxsize=8)
+def _transform(profile: bytes, mode: str) -> tuple[Any, str]:
+    """Return Pillow's transform from a profile to sRGB and a note.
+
+    The transform is None where the profile is sRGB's own, is damaged, or is of another space than
+    the image.
+    """
+    try:
+        source = ImageCms.ImageCmsProfile(io.BytesIO(profile))
+        grey_of_rgb = mode == "L" and source.profile.xcolor_space == "RGB "
+        input_mode = "RGB" if grey_of_rgb else mode
+        is_quick = source.profile.is_matrix_shaper or mode == "L"
+        flags = _BLACK_POINT if is_quick else _BLACK_POINT | _EXACT
+        transform = ImageCms.buildTransform(source, _srgb(), input_mode, "RGB", _INTENT, flags)
+        name = for_line(ImageCms.getProfileDescription(source), 60).strip() or "its profile"
+    except (ImageCms.PyCMSError, OSError, ValueError, TypeError):
+        return None, "ICC profile ignored, since it is damaged or of another colour space"
+    if input_mode != "CMYK":
+        probe = _probe(input_mode)
+        change = _applied(transform, probe, input_mode) - probe.astype(np.float32)
+        if np.abs(change).max() <= _ROUNDING:
+            return None, ""
+    if grey_of_rgb:
+        return None, f"ICC profile {name} ignored, since it is of RGB and the image is grey"
+    return transform, f"converted from {name} to sRGB"
+
+
+def _applied(transform: Any, samples: Samples, mode: str) -> NDArray[np.uint8]:
+    return np.asarray(ImageCms.applyTransform(_image(samples, mode), transform))
+
+
+def _image(samples: Samples, mode: str) -> Image.Image:
+    pixels = np.ascontiguousarray(samples[..., 0] if mode == "L" else samples)
+    return Image.frombuffer(mode, (samples.shape[1], samples.shape[0]), pixels)
+
+
+def _probe(mode: str) -> NDArray[np.uint8]:
+    """Return the colours of a grid, between which profiles are smooth: [1, N, 1 or 3]."""
+    if mode == "L":
+        return np.arange(256, dtype=np.uint8)[None, :, None]
+    steps = np.linspace(0, 255, 17).astype(np.uint8)
+    return np.stack(np.meshgrid(steps, steps, steps), -1).reshape(1, -1, 3)
+
+
+@lru_cache(maxsize=1)
+def _srgb() -> ImageCms.ImageCmsProfile:
+    return ImageCms.ImageCmsProfile(ImageCms.createProfile("sRGB"))
+
+
+def from_lab(image: Image.Image) -> NDArray[np.uint8]:
+    """Convert an image of Pillow's mode LAB to RGB [H, W, 3]."""
+    lab = ImageCms.createProfile("LAB")
+    flags = _BLACK_POINT | _EXACT
+    transform = ImageCms.buildTransform(lab, _srgb(), "LAB", "RGB", _INTENT, flags)
+    return np.asarray(ImageCms.applyTransform(image, transform))
+
+
+def _by_encoding(rgb: NDArray[np.float32], encoding: Encoding) -> NDArray[np.float32]:
+    """Decode by the curve, change the primaries, encode by sRGB's curve, and clip to 0..1."""
+    if encoding.gamma is None:
+        linear = np.where(rgb <= 0.04045, rgb / 12.92, ((rgb + 0.055) / 1.055) ** 2.4)
+    else:
+        linear = rgb**encoding.gamma
+    matrix = np.linalg.inv(_to_xyz(SRGB)) @ _to_xyz(encoding.primaries)
+    linear = np.clip(linear @ matrix.T.astype(np.float32), 0, 1)
+    dark = linear <= 0.0031308
+    encoded: NDArray[np.float32] = np.where(
+        dark, 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055
+    )
+    return encoded.astype(np.float32)
+
+
+def _to_xyz(xy: Chromaticities) -> NDArray[np.float64]:
+    """Return the matrix [3, 3] from linear RGB to XYZ, adapted to sRGB's white (Bradford)."""
+    white, *primaries = (_xyz(x, y) for x, y in zip(xy[::2], xy[1::2], strict=True))
+    columns = np.stack(primaries, axis=1)
+    matrix = columns * np.linalg.solve(columns, white)
+    cones, target = _BRADFORD @ white, _BRADFORD @ _xyz(*SRGB[:2])
+    adaptation: NDArray[np.float64] = np.linalg.solve(
+        _BRADFORD, (target / cones)[:, None] * _BRADFORD
+    )
+    return adaptation @ matrix
+
+
+def _xyz(x: float, y: float) -> NDArray[np.float64]:
+    return np.array([x / y, 1, (1 - x - y) / y])

@@ -1,0 +1,190 @@
+"""Decodes images of more than 8 bits per channel, which Pillow cuts to 8: PNG, TIFF and HEIC.
+
+Values are scaled to 16 bits: the largest that the file's depth admits becomes 65535. Files whose
+values use the low bits of 16 alone, as raw sensor data of 12 bits does, are refused, unless the
+file says how many bits are significant (PNG's sBIT, TIFF's MaxSampleValue).
+"""
+
+from __future__ import annotations
+
+import logging
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+if TYPE_CHECKING:
+    from typing import BinaryIO
+
+_WHITE = 65535
+#: Where no value of 16 bits is larger, 14 bits or fewer are used, as cameras' sensors have.
+_LARGEST_OF_14_BITS = (1 << 14) - 1
+_MAX_SAMPLE_VALUE = 281
+#: TIFF's photometric interpretations that are read: white is zero, black is zero, RGB, CMYK.
+_MIN_IS_WHITE, _MIN_IS_BLACK, _RGB, _CMYK = 0, 1, 2, 5
+_COLOURS = {_MIN_IS_WHITE: 1, _MIN_IS_BLACK: 1, _RGB: 3, _CMYK: 4}
+_UNSPECIFIED, _ASSOCIATED = 0, 1  # of TIFF's ExtraSamples; alpha is straight otherwise
+_SIGNED, _FLOAT = 2, 3  # of TIFF's SampleFormat
+
+
+class DepthError(ValueError):
+    """The values of an image have no known white."""
+
+
+@dataclass(frozen=True)
+class DeepPixels:
+    """The pixels of an image, as they are stored."""
+
+    colours: NDArray[np.uint16]
+    """[H, W, 1, 3 or 4]: grey, RGB or CMYK, white (or full ink) is 65535."""
+    alpha: NDArray[np.float32] | None
+    """[H, W] in 0..1."""
+    note: str = ""
+
+
+def decode_png(content: bytes, significant: int) -> DeepPixels:
+    """Decode a PNG of 16 bits; `significant` is the largest number of its sBIT, or 16."""
+    import imagecodecs
+
+    samples: NDArray[np.uint16] = imagecodecs.png_decode(content)
+    samples = np.atleast_3d(samples)
+    count = samples.shape[2]
+    has_alpha = count in (2, 4)
+    colours = samples[..., : count - has_alpha]
+    alpha = _share(samples[..., -1], _WHITE) if has_alpha else None
+    scaled, note = _scaled(colours, _WHITE, (1 << significant) - 1)
+    return DeepPixels(scaled, alpha, note)
+
+
+def decode_heif(stream: BinaryIO) -> DeepPixels:
+    """Decode the primary image of a HEIC file of 10 or 12 bits, upright."""
+    import pillow_heif
+
+    image = pillow_heif.open_heif(stream, convert_hdr_to_8bit=False, hdr_to_16bit=False)
+    samples = np.atleast_3d(np.asarray(image))
+    white = (1 << int(image.info["bit_depth"])) - 1
+    count = samples.shape[2]
+    has_alpha = count in (2, 4)
+    colours = samples[..., : count - has_alpha]
+    alpha = _share(samples[..., -1], white) if has_alpha else None
+    if alpha is not None and image.premultiplied_alpha:
+        colours = _unmultiplied(colours, alpha, white)
+    return DeepPixels(_scaled(colours, white, white)[0], alpha)
+
+
+class Tiff:
+    """The first page of a TIFF."""
+
+    def __init__(self, stream: BinaryIO) -> None:
+        """Read its tags; the stream must stay open."""
+        import tifffile
+
+        # Its warnings are of tags, and would reach the terminal.
+        logging.getLogger("tifffile").addHandler(logging.NullHandler())
+        self._pages = tifffile.TiffFile(stream).pages
+        self._page: tifffile.TiffPage = self._pages.first
+        self._stream = stream
+
+    @property
+    def is_deep(self) -> bool:
+        """Whether Pillow can't be trusted with it: more than 8 bits, signed or float."""
+        return self.bits > 8 or self._page.sampleformat in (_SIGNED, _FLOAT)
+
+    @property
+    def note(self) -> str:
+        """A word where a channel is ignored that may be alpha."""
+        ignored = self.extra == _UNSPECIFIED
+        return "a channel ignored, which the file does not call alpha" if ignored else ""
+
+    @property
+    def bits(self) -> int:
+        """How many bits a sample has."""
+        return int(self._page.bitspersample)
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """Width and height, not turned, px."""
+        return self._page.imagewidth, self._page.imagelength
+
+    @property
+    def channels(self) -> int:
+        """The number of samples of a pixel."""
+        return int(self._page.samplesperpixel)
+
+    @property
+    def extra(self) -> int | None:
+        """What the first channel beside the colours is; None where the file doesn't say."""
+        return next((int(kind) for kind in self._page.extrasamples), None)
+
+    @property
+    def frames(self) -> int:
+        """The number of pages."""
+        return len(self._pages)
+
+    def value(self, tag: int, default: Any = None) -> Any:
+        """Return the value of a tag."""
+        return self._page.tags.valueof(tag, default=default)
+
+    def decode(self) -> DeepPixels:
+        """Decode the pixels, not turned.
+
+        Raises:
+            DepthError: Its values are float, signed or of more than 16 bits, or its colours of
+                another kind than grey, RGB and CMYK.
+        """
+        page = self._page
+        bits, photometric = self.bits, int(page.photometric)
+        if page.sampleformat in (_SIGNED, _FLOAT) or bits > 16:
+            kind = {_SIGNED: "signed", _FLOAT: "float"}.get(page.sampleformat, "unsigned")
+            raise DepthError(
+                f"{kind} values of {bits} bits have no white; save it with 8 or 16 bits"
+            )
+        if photometric not in _COLOURS:
+            name = getattr(page.photometric, "name", photometric)
+            raise DepthError(f"{name} colours of {bits} bits are not read; save it as RGB")
+        ends = [a + b for a, b in zip(page.dataoffsets, page.databytecounts, strict=True)]
+        if not all(page.databytecounts) or max(ends) > self._stream.seek(0, 2):
+            raise ValueError("image file is truncated")
+        samples: NDArray[Any] = page.asarray()
+        if page.axes == "SYX":
+            samples = samples.transpose(1, 2, 0)
+        samples = np.atleast_3d(samples)
+        white, count = (1 << bits) - 1, _COLOURS[photometric]
+        colours, alpha = samples[..., :count], None
+        if samples.shape[2] > count and self.extra != _UNSPECIFIED:
+            alpha = _share(samples[..., count], white)
+            if self.extra == _ASSOCIATED:
+                colours = _unmultiplied(colours, alpha, white)
+        largest = int(np.max(self.value(_MAX_SAMPLE_VALUE, white)))
+        scaled, note = _scaled(colours, white, largest)
+        return DeepPixels(_WHITE - scaled if photometric == _MIN_IS_WHITE else scaled, alpha, note)
+
+
+def _share(values: NDArray[Any], white: int) -> NDArray[np.float32]:
+    return values.astype(np.float32) / np.float32(white)
+
+
+def _unmultiplied(
+    colours: NDArray[Any], alpha: NDArray[np.float32], white: int
+) -> NDArray[np.uint16]:
+    """Divide colours by their alpha."""
+    divided = colours / np.maximum(alpha, np.float32(1 / white))[..., None]
+    return np.round(np.minimum(divided, white)).astype(np.uint16)
+
+
+def _scaled(colours: NDArray[Any], white: int, largest: int) -> tuple[NDArray[np.uint16], str]:
+    """Scale values to 65535, from `white` or from the `largest` that the file declares."""
+    most = int(colours.max())
+    note = ""
+    if white == _WHITE and most <= _LARGEST_OF_14_BITS:
+        if not most <= largest < white:
+            raise DepthError(
+                f"its largest value is {most} of {white}, so that it has {most.bit_length()} bits "
+                "in 16 and would be too dark; scale its values to 16 bits"
+            )
+        white, note = largest, f"scaled from {largest.bit_length()} bits in 16"
+    if white == _WHITE:
+        return np.ascontiguousarray(colours, dtype=np.uint16), note
+    scaled = (colours.astype(np.uint32) * _WHITE + white // 2) // white
+    return scaled.astype(np.uint16), note
