@@ -6,6 +6,7 @@ import struct
 import zlib
 from typing import Any
 
+import numpy as np
 from numpy.typing import NDArray
 from PIL import ImageCms
 
@@ -65,10 +66,6 @@ DISPLAY_P3 = (
 ADOBE_RGB = ((0.60974, 0.31111, 0.01947), (0.20528, 0.62567, 0.06087), (0.14919, 0.06322, 0.74457))
 
 
-def _tag(name: bytes, data: bytes, entries: list[tuple[bytes, bytes]]) -> None:
-    entries.append((name, data + bytes(-len(data) % 4)))
-
-
 def _description(text: bytes) -> bytes:
     body = b"desc" + bytes(4) + struct.pack(">I", len(text) + 1) + text + b"\0"
     return body + bytes(78)
@@ -86,21 +83,41 @@ def profile(
     name: str, gamma: float, primaries: tuple[tuple[float, float, float], ...] | None = None
 ) -> bytes:
     """An ICC profile of version 2: of RGB with these primaries, or of grey without."""
-    tags: list[tuple[bytes, bytes]] = []
-    _tag(b"desc", _description(name.encode()), tags)
-    _tag(b"wtpt", b"XYZ " + bytes(4) + _numbers(0.9642, 1, 0.8249), tags)
+    white = b"XYZ " + bytes(4) + _numbers(0.9642, 1, 0.8249)
+    tags = [(b"desc", _description(name.encode())), (b"wtpt", white)]
     if primaries is None:
-        _tag(b"kTRC", _curve(gamma), tags)
-    for letter, xyz in zip("rgb", primaries or (), strict=False):
-        _tag(f"{letter}XYZ".encode(), b"XYZ " + bytes(4) + _numbers(*xyz), tags)
-        _tag(f"{letter}TRC".encode(), _curve(gamma), tags)
+        tags.append((b"kTRC", _curve(gamma)))
+    for letter, xyz in zip((b"r", b"g", b"b"), primaries or (), strict=False):
+        tags.append((letter + b"XYZ", b"XYZ " + bytes(4) + _numbers(*xyz)))
+        tags.append((letter + b"TRC", _curve(gamma)))
+    space = b"GRAY" if primaries is None else b"RGB "
+    return _assembled(b"mntr", space, b"XYZ ", tags)
+
+
+def _assembled(
+    kind: bytes, space: bytes, connection: bytes, tags: list[tuple[bytes, bytes]]
+) -> bytes:
     start = 128 + 4 + 12 * len(tags)
     table, body = b"", b""
     for tag, data in tags:
         table += tag + struct.pack(">II", start + len(body), len(data))
-        body += data
-    space = b"GRAY" if primaries is None else b"RGB "
-    head = bytes(4) + b"\x02\x10\0\0" + b"mntr" + space + b"XYZ " + bytes(12) + b"acsp"
-    head = struct.pack(">I", start + len(body)) + bytes(4) + head[4:].ljust(60, b"\0")
-    head = head[:68] + _numbers(0.9642, 1, 0.8249)
+        body += data + bytes(-len(data) % 4)
+    head = struct.pack(">I", start + len(body)) + bytes(4) + b"\x02\x10\0\0" + kind + space
+    head += connection + bytes(12) + b"acsp"
+    head = head.ljust(68, b"\0") + _numbers(0.9642, 1, 0.8249)
     return head.ljust(128, b"\0") + struct.pack(">I", len(tags)) + table + body
+
+
+def cmyk_profile(lab: NDArray[Any]) -> bytes:
+    """An ICC profile of CMYK with the colours of all solid inks.
+
+    Args:
+        lab: CIELAB in 0..255 [2, 2, 2, 2, 3], by whether there is cyan, magenta, yellow, black.
+    """
+    ramp = bytes(range(256))
+    identity = _numbers(1, 0, 0, 0, 1, 0, 0, 0, 1)
+    table = b"mft1" + bytes(4) + bytes([4, 3, 2, 0]) + identity + 4 * ramp
+    table += lab.astype(np.uint8).tobytes() + 3 * ramp
+    return _assembled(
+        b"prtr", b"CMYK", b"Lab ", [(b"desc", _description(b"inks")), (b"A2B0", table)]
+    )

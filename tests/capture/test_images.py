@@ -123,6 +123,11 @@ def test_exif_behind_the_pixels_of_a_png_is_found(tmp_path: Path) -> None:
     (tmp_path / "a.png").write_bytes(content[:last] + late + content[last:])
     assert images.size(tmp_path / "a.png") == (40, 60)
     assert images.read(tmp_path / "a.png").shape == (60, 40, 3)
+    place = content.index(b"IDAT") + 8
+    damaged = content[:place] + bytes(8) + content[place + 8 : last] + late + content[last:]
+    (tmp_path / "a.png").write_bytes(damaged)
+    with pytest.raises(ImageError, match=r"a\.png: unreadable or truncated"):
+        images.read(tmp_path / "a.png")
 
 
 def test_the_header_of_a_png_is_read_without_its_pixels(tmp_path: Path) -> None:
@@ -262,7 +267,7 @@ def test_of_several_images_the_first_is_read_and_said(tmp_path: Path, suffix: st
     first.save(tmp_path / f"a.{suffix}", save_all=True, append_images=[other], **options)
     picture = images.decode((tmp_path / f"a.{suffix}").rename(tmp_path / "b.jpg"))
     assert picture.pixels.min() == 1
-    several = ("the first of several images in a file read",)
+    several = ("only the first image of the file read",)
     assert picture.notes == (() if suffix == "mpo" else several)
 
 

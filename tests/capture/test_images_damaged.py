@@ -7,19 +7,25 @@ import io
 import os
 import tracemalloc
 import zlib
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 from unittest.mock import Mock
 
+import numpy as np
+import pillow_heif
 import pytest
+import tifffile
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from PIL import Image
 
+from tests.capture.made_files import DISPLAY_P3, SRGB, png, profile
 from xrgs.capture import images
 from xrgs.capture.images import ImageError
 from xrgs.errors import UnreadableError
 
+pillow_heif.register_heif_opener()
 FAST = settings(
     max_examples=100, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
 )
@@ -37,11 +43,27 @@ def photograph(kind: str) -> bytes:
     stream = io.BytesIO()
     exif = Image.Exif()
     exif[0x0112], exif[0x0110] = 6, "a camera"
-    Image.linear_gradient("L").resize((40, 30)).convert("RGB").save(stream, kind, exif=exif)
+    picture = Image.linear_gradient("L").resize((40, 30)).convert("RGB")
+    picture.save(stream, kind, exif=exif.tobytes(), icc_profile=profile("p", 2.2, DISPLAY_P3))
     return stream.getvalue()
 
 
-PHOTOGRAPHS = {kind: photograph(kind) for kind in ("PNG", "JPEG", "TIFF", "WEBP")}
+def deep_tiff() -> bytes:
+    stream = io.BytesIO()
+    ramp = np.linspace(0, 65535, 30 * 40 * 3).astype(np.uint16).reshape(30, 40, 3)
+    tifffile.imwrite(stream, ramp, photometric="rgb", compression="lzw", iccprofile=SRGB)
+    return stream.getvalue()
+
+
+PHOTOGRAPHS = {kind: photograph(kind) for kind in ("PNG", "JPEG", "TIFF", "WEBP", "HEIF")} | {
+    "PNG of 16 bits": png(
+        np.linspace(0, 65535, 30 * 40 * 4).reshape(30, 40, 4),
+        (b"gAMA", (100_000).to_bytes(4, "big")),
+        (b"sBIT", bytes([12] * 4)),
+        (b"cICP", bytes([12, 13, 0, 1])),
+    ),
+    "TIFF of 16 bits": deep_tiff(),
+}
 
 
 @FAST
@@ -55,6 +77,8 @@ def test_a_damaged_photograph_is_read_or_refused(tmp_path: Path, kind: str, chan
             reader(file)
         except ImageError as error:
             assert str(file) in str(error)  # noqa: PT017 - or it is read
+    with suppress(ImageError):
+        assert images.decode(file).pixels.shape[1::-1] == images.size(file)
 
 
 def test_an_encapsulated_postscript_program_is_not_run(tmp_path: Path) -> None:

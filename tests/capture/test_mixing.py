@@ -128,16 +128,13 @@ def test_by_sampling_rate_the_highest_are_hr_and_nothing_is_degraded(
     assert made.report["rho"]["HR"][0] == min(v.rho for v in high)
 
 
-def test_photographs_of_one_resolution_are_said_to_make_no_mixture(
-    mix: Mix, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_photographs_of_one_resolution_are_said_to_make_no_mixture(mix: Mix) -> None:
     """The embedded scene's cameras are all about as far away: rho differs by 15 % at most."""
     made = mix(tags="sampling_rate")
     (note,) = made.report["notes"]
     rho = [view.rho for view in made.views if view.split == "train"]
     assert "variant.tags=sampling_rate is meaningless" in note
     assert f"rho is {min(rho):.3f} to {max(rho):.3f}" in note
-    assert note in caplog.text
 
 
 def test_a_threshold_of_the_rate_takes_those_above_it(mix: Mix) -> None:
@@ -285,7 +282,7 @@ def test_a_refused_attempt_is_followed_by_the_next(
         ("configured", 0),
         ("finer", VIEWS),
     ]
-    assert "COLMAP registered 0 of 12 views" in attempts[0]["refused"]
+    assert "0 of 12 photographs are placed" in attempts[0]["refused"]
     assert attempts[1]["refused"] == ""
     assert made.report["registered"] == len({v.name for v in made.views}) == VIEWS
 
@@ -295,12 +292,63 @@ def test_where_every_attempt_is_refused_the_report_has_them_all(
 ) -> None:
     monkeypatch.setattr(sfm, "reconstruct", lambda *_: EMPTY)
     (tmp_path / "out/images").mkdir(parents=True)
-    with pytest.raises(SceneFailed, match="scene p failed: COLMAP registered 0 of 12") as caught:
+    with pytest.raises(
+        SceneFailed, match="scene p failed: 0 of 12 photographs are placed"
+    ) as caught:
         mixing.mix_resolutions(rendered, conf, tmp_path, tmp_path / "out")
     tried = [a["attempt"] for a in caught.value.report["attempts"]]
     attempts = registration.sfm_attempts(conf.sfm, VIEWS, any_smaller=True)
     assert tried == [attempt.name for attempt in attempts]
     assert tried[-1] == "native"
+
+
+def part(model: Reconstruction, views: int) -> Reconstruction:
+    """The first views of a model."""
+    first = {i: model.viewmats[i] for i in range(views)}
+    return replace(
+        model, viewmats=first, report=model.report | {"models": [views, 3], "registered": views}
+    )
+
+
+@pytest.mark.parametrize(
+    ("undegraded", "degradation", "said"),
+    [
+        (10, "downsample", "undegraded, 10 of 12 photographs are placed. To try: variant.factor=3"),
+        (5, "downsample", "undegraded, 5 of 12 photographs are placed. To try: variant.sfm.long"),
+        (10, "none", "requires more. To try: variant.sfm.long_side=0 (the photographs have 160"),
+    ],
+)
+def test_a_failed_scene_says_who_is_missing_why_and_what_to_try(
+    configured: Make,
+    rendered: Scene,
+    reconstruction: Reconstruction,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    undegraded: int,
+    degradation: str,
+    said: str,
+) -> None:
+    def reconstruct(inputs: Sequence[SfmImage], *_: object) -> Reconstruction:
+        mixed = degradation == "none" or any("lr" in image.file for image in inputs)
+        return part(reconstruction, 5 if mixed else undegraded)
+
+    monkeypatch.setattr(sfm, "reconstruct", reconstruct)
+    (tmp_path / "out/images").mkdir(parents=True)
+    split = {"selection": "uniform", "hr_fraction": 0.5}
+    conf = configured(degradation=degradation, sfm={"long_side": 100}, **split)
+    with pytest.raises(SceneFailed) as caught:
+        mixing.mix_resolutions(rendered, conf, tmp_path, tmp_path / "out")
+    message = str(caught.value)
+    points = len(reconstruction.points)
+    assert message.startswith(
+        f"scene p failed: 5 of 12 photographs are placed, {points} points; not placed: view_005, "
+        "view_006, view_007, view_008, view_009, view_010 and 1 more; variant.sfm.min_registered"
+    )
+    assert said in message
+    assert "photographs between the separate parts of 5 and 3, variant.poses=FOLDER" in message
+    assert message.endswith("variant.sfm.min_registered=0.41 to go on without the others.")
+    expected = undegraded if degradation == "downsample" else None
+    assert caught.value.report.get("reference", {}).get("registered") == expected
 
 
 # the choices in conf/
@@ -368,7 +416,10 @@ def test_given_poses_replace_sfm_and_are_scaled_for_lr_views(
 
 def test_too_few_given_poses_are_refused(mix: Mix, rendered: Scene, tmp_path: Path) -> None:
     write_poses(tmp_path / "poses", list(rendered.files)[:5])
-    with pytest.raises(SceneFailed, match=r"variant\.poses has 5 of 12 views .* and 20 points"):
+    with pytest.raises(
+        SceneFailed,
+        match=r"variant\.poses: 5 of 12 photographs are placed, 20 points; not placed: view_005",
+    ):
         mix(poses=str(tmp_path / "poses"))
 
 

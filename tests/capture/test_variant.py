@@ -177,7 +177,9 @@ def test_unrelated_photographs_fail_as_a_scene(
     with pytest.raises(SceneFailed) as caught:
         build(scene)
     message = str(caught.value)
-    assert "scene leaves failed: COLMAP registered 0 of 5 views (not 0, 1, 2, 3, 4)" in message
+    assert "scene leaves failed: 0 of 5 photographs are placed, 0 points" in message
+    assert "; not placed: 0, 1, 2, 3, 4; " in message
+    assert "; undegraded, 0 of 5 photographs are placed. To try: photographs that over" in message
     assert "variant.sfm.min_registered=0.75" in message
     key = variant.key(scene, small_conf(scene))
     variants = store / "variants"

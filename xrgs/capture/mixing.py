@@ -6,10 +6,10 @@ they are known only after SfM, which then gets the photographs as they are.
 
 from __future__ import annotations
 
-import logging
+import math
 import time
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -40,8 +40,6 @@ if TYPE_CHECKING:
     from xrgs.capture.scenes import Scene
     from xrgs.capture.sfm import Reconstruction
     from xrgs.config import VariantConf
-
-_log = logging.getLogger(__name__)
 
 #: How much finer HR views must sample the scene than LR views for the two to be called so, in their
 #: medians; our choice. The paper has 5.
@@ -88,7 +86,7 @@ def mix_resolutions(scene: Scene, conf: VariantConf, work: Path, out: Path) -> V
     _write_log(work, out)
     report = _sfm_report(inputs, model) | {"attempts": registered.attempts}
     if registered.refused:
-        raise SceneFailed(f"scene {scene.name} failed: {registered.refused}", report)
+        raise _failure(inputs, registered, report, work)
     report |= _pose_report(inputs, model, work)
     depths = sampling.median_depths(model)
     if conf.tags in POLICIES and POLICIES[conf.tags].needs_depth:
@@ -98,8 +96,6 @@ def mix_resolutions(scene: Scene, conf: VariantConf, work: Path, out: Path) -> V
     tags, masked = _tags_report(inputs, views), _mask_report(views)
     notes = [*report["notes"], *tags["notes"], *hidden, *masked["notes"]]
     report |= tags | masked | {"notes": notes}
-    for note in report["notes"]:
-        _log.warning("scene %s: %s", scene.name, note)
     report["seconds"] = round(time.perf_counter() - start, 1)
     held_out = bool(inputs.split.test)
     return Variant(
@@ -137,19 +133,61 @@ def _split_by_depth(
 
 def _refusal(inputs: _Inputs, model: Reconstruction) -> str:
     """Say why too few views are registered to train and to test on; empty where they are enough."""
-    split, names, conf = inputs.split, inputs.photos.names, inputs.conf
-    registered = model.viewmats.keys()
-    missing = [name for i, name in enumerate(names) if i not in registered]
-    source = "COLMAP registered" if conf.poses is None else "variant.poses has"
-    summary = f"{source} {len(registered)} of {len(names)} views"
+    names, conf = inputs.photos.names, inputs.conf
+    missing = [name for i, name in enumerate(names) if i not in model.viewmats]
+    source = "" if conf.poses is None else "variant.poses: "
+    summary = f"{source}{_placed(model, names)}, {len(model.points)} points"
     if missing:
-        summary += f" (not {', '.join(missing[:6])}{', ...' if len(missing) > 6 else ''})"
-    summary += f" and {'found ' if conf.poses is None else ''}{len(model.points)} points"
+        summary += f"; not placed: {listed(missing)}"
     fraction = conf.sfm.min_registered
-    if len(registered) < fraction * len(names):
-        return f"{summary}; variant.sfm.min_registered={fraction} requires more."
-    lacking = shortage(split, registered, conf)
-    return f"{summary}: {lacking}." if lacking else ""
+    if len(model.viewmats) < fraction * len(names):
+        return f"{summary}; variant.sfm.min_registered={fraction} requires more"
+    lacking = shortage(inputs.split, model.viewmats.keys(), conf)
+    return f"{summary}; {lacking}" if lacking else ""
+
+
+def _placed(model: Reconstruction, names: Sequence[str]) -> str:
+    return f"{len(model.viewmats)} of {len(names)} photographs are placed"
+
+
+def _failure(
+    inputs: _Inputs, registered: Registration, report: dict[str, Any], work: Path
+) -> SceneFailed:
+    """Say which photographs are not placed, whether the undegraded ones are, and what to try."""
+    conf, photos, model = inputs.conf, inputs.photos, registered.model
+    said = [registered.refused]
+    undegraded = None
+    if conf.poses is None and inputs.degraded:
+        undegraded = registration.reconstruct_undegraded(photos, conf.sfm, work)
+        report = report | {"reference": _results(undegraded)}
+        said.append(f"undegraded, {_placed(undegraded, photos.names)}")
+    advice = ", ".join(_advice(inputs, model, undegraded))
+    text = f"scene {inputs.scene.name} failed: {'; '.join(said)}. To try: {advice}."
+    return SceneFailed(text, report)
+
+
+def _advice(
+    inputs: _Inputs, model: Reconstruction, undegraded: Reconstruction | None
+) -> Iterator[str]:
+    """Yield what may place more photographs, or accept as many as there are."""
+    conf, placed = inputs.conf, len(model.viewmats)
+    if conf.poses is None:
+        if undegraded is not None and len(undegraded.viewmats) > placed and conf.factor > 2:
+            yield f"variant.factor={math.ceil(conf.factor / 2)}"
+        largest = max(max(photo.size) for photo in inputs.photos.all)
+        if 0 < conf.sfm.long_side < largest:
+            yield f"variant.sfm.long_side=0 (the photographs have {largest} px)"
+        parts = model.report["models"]
+        if len(parts) > 1:
+            yield f"photographs between the separate parts of {' and '.join(map(str, parts))}"
+        else:
+            yield "photographs that overlap more"
+        yield "variant.poses=FOLDER with cameras of another program"
+    else:
+        yield "poses of the others"
+    if placed and not shortage(inputs.split, model.viewmats.keys(), conf):
+        share = math.floor(100 * placed / len(inputs.photos)) / 100
+        yield f"variant.sfm.min_registered={share} to go on without the others"
 
 
 def _write_log(work: Path, out: Path) -> None:
@@ -194,14 +232,17 @@ def _pose_report(inputs: _Inputs, model: Reconstruction, work: Path) -> dict[str
     start = time.perf_counter()
     reference = registration.reconstruct_undegraded(photos, inputs.conf.sfm, work)
     exact = {photos.names[i]: matrix for i, matrix in reference.viewmats.items()}
-    keys = ("registered", "points", "reprojection_error_px")
-    results = {key: reference.report[key] for key in keys if key in reference.report}
     seconds = round(time.perf_counter() - start, 1)
     return {
         "pose_error": pose_error(estimated, exact),
         "pose_error_against": "SfM of the undegraded photographs",
-        "reference": results | {"seconds": seconds},
+        "reference": _results(reference) | {"seconds": seconds},
     }
+
+
+def _results(reference: Reconstruction) -> dict[str, Any]:
+    keys = ("registered", "points", "reprojection_error_px")
+    return {key: reference.report[key] for key in keys if key in reference.report}
 
 
 def _tags_report(inputs: _Inputs, views: tuple[View, ...]) -> dict[str, Any]:
