@@ -169,9 +169,10 @@ def _viewmat(image: _Image) -> NDArray[np.float64]:
         raise XrgsError("its pose must have finite numbers")
     if not any(image.quaternion):
         raise XrgsError("its quaternion must not be 0; run COLMAP again, or remove the image")
-    w, *xyz = image.quaternion
+    # Rotation takes a quaternion of any length that can be computed.
+    w, *xyz = np.array(image.quaternion) / np.abs(image.quaternion).max()
     matrix = np.eye(4)
-    matrix[:3, :3] = Rotation.from_quat([*xyz, w]).as_matrix()  # of unit length
+    matrix[:3, :3] = Rotation.from_quat([*xyz, w]).as_matrix()
     matrix[:3, 3] = image.translation
     return matrix
 
@@ -320,7 +321,7 @@ def _text_points(file: Path) -> _Points:
         if line:
             with _line(file, number, "POINT3D_ID X Y Z R G B ERROR TRACK"):
                 own, *values = line.split(maxsplit=8)[:8]
-                numbers.append(int(own))
+                numbers.append(np.uint64(int(own)))
                 x, y, z, r, g, b, error = map(float, values)
                 rows.append((x, y, z, r, g, b, error))
     table = np.array(rows, np.float64).reshape(-1, 7)
