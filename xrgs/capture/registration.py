@@ -86,6 +86,8 @@ class Registration:
     model: sfm.Reconstruction
     refused: str
     """Why even the best reconstruction is not accepted; empty where it is."""
+    conf: SfmConf
+    """The settings of its attempt."""
     attempts: list[dict[str, Any]]
     """For each attempt its name, why it was refused, its seconds, settings and results."""
 
@@ -110,7 +112,7 @@ def register(
         The first reconstruction that was accepted; where none was, the one with the most registered
         views, and the earlier one of two with equally many.
     """
-    best: tuple[sfm.Reconstruction, str] | None = None
+    best: tuple[sfm.Reconstruction, str, SfmConf] | None = None
     reports: list[dict[str, Any]] = []
     any_smaller = any(
         photos.size(_kind(i, degraded), i) != photo.sfm for i, photo in enumerate(photos.all)
@@ -126,7 +128,7 @@ def register(
         results = {key: model.report[key] for key in _ATTEMPT_KEYS if key in model.report}
         reports.append({"attempt": attempt.name, "refused": reason, "seconds": seconds} | results)
         if best is None or len(model.viewmats) > len(best[0].viewmats) or not reason:
-            best = model, reason
+            best = model, reason, attempt.conf
         if not reason:
             break
         _log.warning("SfM attempt %s: %s", attempt.name, reason)
