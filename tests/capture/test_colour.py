@@ -298,14 +298,20 @@ def test_hdr_is_refused_by_name(tmp_path: Path, transfer: int, name: str) -> Non
         images.decode(tmp_path / "a.png")
 
 
-@pytest.mark.parametrize("exif_says", ["R03", "R98"])
-def test_a_camera_set_to_adobe_rgb_says_so_in_exif(tmp_path: Path, exif_says: str) -> None:
+@pytest.mark.parametrize(
+    ("index", "space"), [("R03", 0xFFFF), ("R98", 1), (None, 2), (None, 0xFFFF)]
+)
+def test_a_camera_set_to_adobe_rgb_says_so_in_exif(
+    tmp_path: Path, index: str | None, space: int
+) -> None:
     exif = Image.Exif()
-    exif.get_ifd(0x8769)[0xA005] = {1: exif_says}
+    exif.get_ifd(0x8769)[0xA001] = space
+    if index is not None:
+        exif.get_ifd(0x8769)[0xA005] = {1: index}
     Image.fromarray(smooth()).save(tmp_path / "a.jpg", quality=100, subsampling=0, exif=exif)
     stored = np.asarray(Image.open(tmp_path / "a.jpg")) / 255
     picture = images.decode(tmp_path / "a.jpg")
-    if exif_says == "R98":
+    if index != "R03" and space != 2:
         assert np.array_equal(picture.pixels, stored.astype(np.float32))
         return
     truth = encoded(stored ** (563 / 256) @ ADOBE_MATRIX.T)

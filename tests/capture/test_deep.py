@@ -126,12 +126,32 @@ def test_colours_of_associated_alpha_are_divided_by_it(tmp_path: Path) -> None:
     check(tmp_path / "a.tif", samples, error=0.6 / 1000)
 
 
-def test_channels_that_are_no_alpha_are_no_alpha(tmp_path: Path) -> None:
-    samples = np.random.default_rng(0).integers(0, 65536, (40, 60, 5)).astype(np.uint16)
+@pytest.mark.parametrize("kind", [np.uint8, np.uint16])
+def test_channels_that_are_not_called_alpha_are_ignored_with_a_word(
+    tmp_path: Path, kind: type[np.unsignedinteger[Any]]
+) -> None:
+    white = np.iinfo(kind).max
+    samples = np.random.default_rng(0).integers(0, white, (40, 60, 5)).astype(kind)
     tifffile.imwrite(
         tmp_path / "a.tif", samples, photometric="rgb", extrasamples=["unspecified"] * 2
     )
-    check(tmp_path / "a.tif", samples[..., :3])
+    check(tmp_path / "a.tif", samples[..., :3], white)
+    said = ("a channel ignored, which the file does not call alpha",)
+    assert images.decode(tmp_path / "a.tif").notes == said
+
+
+@pytest.mark.parametrize("kind", [np.uint8, np.uint16])
+def test_a_fourth_channel_without_a_word_is_alpha(
+    tmp_path: Path, kind: type[np.unsignedinteger[Any]]
+) -> None:
+    white = np.iinfo(kind).max
+    samples = np.random.default_rng(0).integers(0, white, (40, 60, 4)).astype(kind)
+    tifffile.imwrite(tmp_path / "a.tif", samples, photometric="rgb", extrasamples=["unassalpha"])
+    content = (tmp_path / "a.tif").read_bytes()
+    entry = struct.pack("<HHI", 338, 3, 1)
+    assert content.count(entry) == 1
+    (tmp_path / "a.tif").write_bytes(content.replace(entry, struct.pack("<HHI", 337, 3, 1)))
+    check(tmp_path / "a.tif", samples, white)
 
 
 @pytest.mark.parametrize("orientation", range(10))

@@ -61,6 +61,23 @@ def rgb(colour: str) -> list[int]:
     return [int(colour[i : i + 2], 16) for i in (1, 3, 5)]
 
 
+def test_views_that_are_not_placed_are_named_by_what_they_lack() -> None:
+    """Without held-out views, the training views are scored."""
+    report = SfmReport(notes=("n",), tests=2, hr=("a",), lr=("b", "c"), not_registered=("b", "t"))
+    untrained, unscored = "not placed, and so not trained on: b", "not placed, and so not scored: "
+    assert report.all_notes() == ("n", untrained, f"{unscored}t")
+    report.tests = 0
+    assert report.all_notes() == ("n", untrained, f"{unscored}b, t")
+    report.not_registered = tuple(f"v{i}" for i in range(9))
+    report.tests = 1
+    assert report.all_notes()[1:] == (f"{unscored}v0, v1, v2, v3, v4, v5 and 3 more",)
+    assert report.all_notes(9)[1].endswith("v7, v8")
+
+
+def test_of_a_scene_that_failed_the_notes_are_all_there_is() -> None:
+    assert SfmReport(notes=("n",), not_registered=("a",)).all_notes() == ("n",)
+
+
 @pytest.mark.slow
 def test_a_variant_is_built_described_and_drawn(xrgs_data: Run, tmp_path: Path) -> None:
     arguments = ("scene=motorcycle", "preset=smoke", "store=s", "--out", "sheet.png")

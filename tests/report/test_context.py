@@ -14,6 +14,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from tests.report.conftest import configured, finish_again
+from xrgs.capture.description import SfmReport
 from xrgs.evaluation.metrics import METRICS
 from xrgs.report.compare import Comparison, compare
 from xrgs.report.context import Context, contexts, decided_by_one_view
@@ -76,6 +77,28 @@ def test_scores_of_views_that_were_trained_on_are_cautioned(
     configured(made.add(), **changes)
     text = " ".join(found(made)[""].cautions)
     assert ("fern has no view held out (variant.test_every=0)" in text) == cautioned
+
+
+def test_views_that_are_not_placed_are_named_beside_the_scores(made: Any) -> None:
+    configured(made.add(variant="v"))
+    configured(made.add("chosen", condition="train.validation=0.1", variant="v", validation=0.1))
+    report = SfmReport(tests=3, hr=("a",), lr=("b",), not_registered=("b", "IMG_8", "x\ny"))
+    found = contexts(replace(made.read(), variants={"v": report}))
+    said = "Caution: fern is scored without test views that are not placed: IMG_8, x y"
+    assert said in found[""].cautions
+    assert said not in found["train.validation=0.1"].cautions
+
+
+@pytest.mark.parametrize(
+    ("lr", "hr_fraction", "said"), [((), 0.5, True), (("b",), 0.5, False), ((), 1.0, False)]
+)
+def test_a_mixture_without_lr_views_is_cautioned(
+    made: Any, lr: tuple[str, ...], hr_fraction: float, said: bool
+) -> None:
+    configured(made.add(variant="v"), variant={"hr_fraction": hr_fraction})
+    report = SfmReport(tests=1, hr=("a",), lr=lr)
+    cautions = contexts(replace(made.read(), variants={"v": report}))[""].cautions
+    assert ("Caution: fern has no LR view: nothing is mixed" in cautions) == said
 
 
 def test_scenes_whose_lr_views_differ_are_both_said(made: Any) -> None:

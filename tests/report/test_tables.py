@@ -90,6 +90,22 @@ def test_failed_scenes_are_shown_as_failed(made: Any) -> None:
     )
 
 
+def test_a_long_reason_is_whole_below_the_table(made: Any) -> None:
+    """A scene that failed is told what to try, by the names of its photographs."""
+    reason = "scene fern failed: " + "try more photographs, " * 40
+    for label in ("baseline", "consistency"):
+        made.add_error("fern", label)
+        made.rows[-1]["error"] = reason
+    table = tables(made).missing()
+    assert table is not None
+    assert [row[-1] for row in table.rows] == ["see (1)"] * 2
+    assert table.notes == (f"(1) {reason}",)
+    report = build(made.store.path)
+    page = (report.folder / "report.html").read_text()
+    for text in (report.text, (report.folder / "table.md").read_text(), page):
+        assert reason.strip() in text
+
+
 def test_nothing_missing_is_no_table(made: Any) -> None:
     made.add()
     assert tables(made).missing() is None

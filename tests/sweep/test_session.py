@@ -58,3 +58,20 @@ def test_a_reason_that_can_not_be_read_now_stops_nothing(
 def test_something_else_with_the_name_of_the_reason_stops_the_jobs(session: SweepSession) -> None:
     (session.folder / "stopped").mkdir()
     assert session.stopped == f"{session.folder / 'stopped'} exists"
+
+
+def test_the_folder_of_a_session_that_is_over_is_removed(session: SweepSession) -> None:
+    (session.folder / "0").mkdir()
+    session.stop("a cell failed")
+    session.end()
+    assert not session.folder.exists()
+    session.end()
+
+
+def test_the_logs_of_a_launcher_stay_and_the_session_with_them(session: SweepSession) -> None:
+    log = session.folder / ".submitit" / "log"
+    log.parent.mkdir()
+    log.touch()
+    session.end()
+    assert log.exists()
+    assert session.exists

@@ -18,6 +18,7 @@ from hydra.errors import CompactHydraException
 from omegaconf import DictConfig
 
 from xrgs import config
+from xrgs.capture import scenes
 from xrgs.capture.dataset import USES
 from xrgs.errors import XrgsError
 from xrgs.evaluation.lpips import download, weights
@@ -319,6 +320,21 @@ def test_a_variant_that_can_not_be_read_makes_its_cells_unknown_until_it_can(
     final = made._run_until_complete(plan, store, monitor)
     assert [cell.state.name for cell in final] == ["done"] * 2
     assert len(trainer.launched) == 1
+
+
+def test_the_notes_of_a_variant_are_said_once_for_all_of_its_cells(
+    planned: tuple[Store, Trainer, list[PlannedCell]],
+    study: Callable[..., Study],
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    store, _, plan = planned
+    found = variants.PlannedVariant("v", notes=("icon.png left out", "not placed: IMG_1"))
+    monkeypatch.setattr(variants, "plan", lambda *_, **__: found)
+    study("store=s")._with_variants(plan, store, allow_build=True)
+    scene = scenes.label(plan[0].conf.scene)
+    said = f"{scene}: icon.png left out\n{scene}: not placed: IMG_1\n"
+    assert capsys.readouterr().err == said
 
 
 def test_a_count_that_can_not_be_read_is_unknown(

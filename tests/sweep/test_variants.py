@@ -63,17 +63,44 @@ def remember_failure(conf: Conf, store: Store) -> None:
     write_json(folder / "report.json", {"scene": "motorcycle", "reason": "no first pair"})
 
 
+@pytest.fixture
+def reported(store: Store) -> PlannedVariant:
+    """The variant `k-1`, of which the store has the report alone."""
+    report = {"notes": ["icon.png left out"], "hr": ["a"], "tests": 1, "not_registered": ["b"]}
+    (store.variants / "k-1").mkdir()
+    write_json(store.variants / "k-1" / "report.json", report)
+    notes = ("icon.png left out", "not placed, and so not scored: b")
+    return PlannedVariant("k-1", notes=notes)
+
+
 def test_a_frozen_variant_is_found_and_not_built(
-    conf: Conf, store: Store, monkeypatch: pytest.MonkeyPatch
+    conf: Conf, store: Store, monkeypatch: pytest.MonkeyPatch, reported: PlannedVariant
 ) -> None:
     monkeypatch.setattr(variant, "find", lambda *_: SimpleNamespace(id="k-1"))
     monkeypatch.setattr(worker, "run_in_child", unexpected)
     assert variants.find_or_build(conf, store) == "k-1"
-    assert variants.plan(conf, store, allow_build=True) == PlannedVariant("k-1")
+    assert variants.plan(conf, store, allow_build=True) == reported
+
+
+def test_a_trimmed_variant_has_its_notes(
+    conf: Conf, store: Store, monkeypatch: pytest.MonkeyPatch, reported: PlannedVariant
+) -> None:
+    monkeypatch.setattr(variant, "key", lambda *_: "k")
+    (store.variants / "k-1").rename(store.variants / "trimmed-k-1")
+    assert variants.plan(conf, store, allow_build=False) == reported
+
+
+def test_a_report_that_is_damaged_is_named(
+    conf: Conf, store: Store, monkeypatch: pytest.MonkeyPatch, reported: PlannedVariant
+) -> None:
+    monkeypatch.setattr(variant, "find", lambda *_: SimpleNamespace(id="k-1"))
+    (store.variants / "k-1" / "report.json").write_text('{"notes": 3}')
+    (note,) = variants.plan(conf, store, allow_build=True).notes
+    assert "k-1/report.json" in note
 
 
 def test_a_variant_that_the_store_lacks_is_built_in_a_child(
-    conf: Conf, store: Store, monkeypatch: pytest.MonkeyPatch
+    conf: Conf, store: Store, monkeypatch: pytest.MonkeyPatch, reported: PlannedVariant
 ) -> None:
     requests = []
 
@@ -84,7 +111,7 @@ def test_a_variant_that_the_store_lacks_is_built_in_a_child(
     monkeypatch.setattr(worker, "run_in_child", build)
     assert variants.plan(conf, store, allow_build=False) == PlannedVariant()
     assert not requests
-    assert variants.plan(conf, store, allow_build=True) == PlannedVariant("k-1")
+    assert variants.plan(conf, store, allow_build=True) == reported
     assert variants.find_or_build(conf, store) == "k-1"
     assert requests == [("variant", "motorcycle", str(store.path))] * 2
 
@@ -304,7 +331,7 @@ def test_a_plan_says_that_no_view_is_lr(
 
 
 def test_images_are_made_again_of_trimmed_variants_alone(
-    conf: Conf, store: Store, monkeypatch: pytest.MonkeyPatch
+    conf: Conf, store: Store, monkeypatch: pytest.MonkeyPatch, reported: PlannedVariant
 ) -> None:
     requests = []
     monkeypatch.setattr(worker, "run_in_child", lambda *given: requests.append(given[:2]))

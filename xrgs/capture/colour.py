@@ -84,7 +84,7 @@ def from_h273(primaries: int, transfer: int) -> Encoding | None:
 
 
 def adobe_rgb() -> Encoding:
-    """Return Adobe RGB (1998), which cameras name by EXIF's interoperability index `R03`."""
+    """Return Adobe RGB (1998), which cameras name by EXIF's index `R03`, and some by number 2."""
     return Encoding("Adobe RGB", _ADOBE, 563 / 256)
 
 

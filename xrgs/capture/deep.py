@@ -24,7 +24,7 @@ _MAX_SAMPLE_VALUE = 281
 #: TIFF's photometric interpretations that are read: white is zero, black is zero, RGB, CMYK.
 _MIN_IS_WHITE, _MIN_IS_BLACK, _RGB, _CMYK = 0, 1, 2, 5
 _COLOURS = {_MIN_IS_WHITE: 1, _MIN_IS_BLACK: 1, _RGB: 3, _CMYK: 4}
-_ASSOCIATED, _STRAIGHT = 1, 2  # of TIFF's ExtraSamples
+_UNSPECIFIED, _ASSOCIATED = 0, 1  # of TIFF's ExtraSamples; alpha is straight otherwise
 _SIGNED, _FLOAT = 2, 3  # of TIFF's SampleFormat
 
 
@@ -92,6 +92,12 @@ class Tiff:
         return self.bits > 8 or self._page.sampleformat in (_SIGNED, _FLOAT)
 
     @property
+    def note(self) -> str:
+        """A word where a channel is ignored that may be alpha."""
+        ignored = self.extra == _UNSPECIFIED
+        return "a channel ignored, which the file does not call alpha" if ignored else ""
+
+    @property
     def bits(self) -> int:
         """How many bits a sample has."""
         return int(self._page.bitspersample)
@@ -105,6 +111,11 @@ class Tiff:
     def channels(self) -> int:
         """The number of samples of a pixel."""
         return int(self._page.samplesperpixel)
+
+    @property
+    def extra(self) -> int | None:
+        """What the first channel beside the colours is; None where the file doesn't say."""
+        return next((int(kind) for kind in self._page.extrasamples), None)
 
     @property
     def frames(self) -> int:
@@ -141,10 +152,9 @@ class Tiff:
         samples = np.atleast_3d(samples)
         white, count = (1 << bits) - 1, _COLOURS[photometric]
         colours, alpha = samples[..., :count], None
-        extra = [int(kind) for kind in page.extrasamples[:1]]
-        if extra and extra[0] in (_ASSOCIATED, _STRAIGHT):
+        if samples.shape[2] > count and self.extra != _UNSPECIFIED:
             alpha = _share(samples[..., count], white)
-            if extra[0] == _ASSOCIATED:
+            if self.extra == _ASSOCIATED:
                 colours = _unmultiplied(colours, alpha, white)
         largest = int(np.max(self.value(_MAX_SAMPLE_VALUE, white)))
         scaled, note = _scaled(colours, white, largest)

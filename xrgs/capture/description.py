@@ -1,4 +1,7 @@
-"""Describes a variant for `xrgs-data inspect`: its views, how SfM went, and a contact sheet."""
+"""Says how a variant was made: notes for sweeps and reports, and all for `xrgs-data inspect`.
+
+Nothing here imports torch.
+"""
 
 from __future__ import annotations
 
@@ -10,8 +13,9 @@ from msgspec import Struct
 from xrgs.capture import images, variant
 from xrgs.capture.contact_sheet import contact_sheet
 from xrgs.capture.folders import is_failed
+from xrgs.capture.frozen import REPORT
 from xrgs.errors import XrgsError
-from xrgs.runtime.text import TextTable, to_text
+from xrgs.runtime.text import TextTable, listed, to_text
 from xrgs.safeio.atomic import atomic_writer
 from xrgs.safeio.records import read_struct
 from xrgs.safeio.sanitize import for_line
@@ -33,9 +37,11 @@ class SfmAttempt(Struct):
 
 
 class SfmReport(Struct):
-    """The part of `report.json` that is shown: how SfM went, and the classes of the views."""
+    """The part of `report.json` that is shown: notes, how SfM went, the classes of the views."""
 
     scene: str = "?"
+    reason: str = ""
+    """Why the scene failed; empty where it did not."""
     images: int = 0
     registered: int = 0
     points: int = 0
@@ -48,14 +54,52 @@ class SfmReport(Struct):
     tags: str | None = None
     degradation: str | None = None
     notes: tuple[str, ...] = ()
+    """Sentences on what was taken, left out, turned, converted or masked, by photographs' names."""
     pose_error: dict[str, float] = {}
     """`position_percent` of the extent, `rotation_degrees`, and `..._max` of each."""
     pose_error_against: str = ""
     rho: dict[str, tuple[float, ...]] = {}
     """Least, median and most of the sampling rate, by tag."""
+    tests: int = 0
+    """Number of views that are held out; 0 where the training views are scored."""
     hr: tuple[str, ...] = ()
     lr: tuple[str, ...] = ()
     not_registered: tuple[str, ...] = ()
+
+    @property
+    def not_trained(self) -> tuple[str, ...]:
+        """Names of the training views that are not placed."""
+        training = {*self.hr, *self.lr}
+        return tuple(name for name in self.not_registered if name in training)
+
+    @property
+    def not_scored(self) -> tuple[str, ...]:
+        """Names of the views that would be scored and are not placed."""
+        training = {*self.hr, *self.lr} if self.tests else ()
+        return tuple(name for name in self.not_registered if name not in training)
+
+    def all_notes(self, most: int = 6) -> tuple[str, ...]:
+        """Return the notes, and sentences on the views that are not placed.
+
+        Args:
+            most: The most names in such a sentence.
+        """
+        if not (self.hr or self.lr):  # of a scene that failed: the reason names the views
+            return self.notes
+        lost = (("trained on", self.not_trained), ("scored", self.not_scored))
+        unplaced = [
+            f"not placed, and so not {done}: {listed(names, most)}" for done, names in lost if names
+        ]
+        return (*self.notes, *unplaced)
+
+
+def read_report(folder: Path) -> SfmReport:
+    """Read how a variant was made, from its folder; it may be trimmed.
+
+    Raises:
+        StoreError: The report is missing or damaged, or can't be read now.
+    """
+    return read_struct(folder / REPORT, SfmReport)
 
 
 def describe(folder: Path, out: Path | None = None) -> str:
@@ -75,10 +119,11 @@ def describe(folder: Path, out: Path | None = None) -> str:
         raise XrgsError(f"{folder}: no such folder; variants are in <store>/variants/")
     failed = is_failed(folder.name)
     frozen = None if failed else variant.load(folder)
-    report = read_struct(folder / "report.json", SfmReport)
+    report = read_report(folder)
     sfm = [for_line(line) for line in _sfm(report)]
     if frozen is None:
-        return "\n".join([for_line(f"{report.scene}: failed, so there are no views"), *sfm])
+        why = report.reason or f"{report.scene}: failed"
+        return "\n".join([for_line(f"{why} So there are no views."), *sfm])
     table = to_text(views_table(frozen, report))
     sheet, notes = contact_sheet(frozen)
     file = out or Path(f"{frozen.id}.png")

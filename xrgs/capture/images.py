@@ -70,7 +70,7 @@ _BITS = {"1": 1, "P": 1, "L": 8}
 OPAQUE_FROM = 0.5
 _EXIF_ORIENTATION = 0x0112
 _EXIF_CAMERA = (0x010F, 0x0110)  # make, model
-_EXIF_DETAILS, _EXIF_INTEROPERABILITY = 0x8769, 0xA005
+_EXIF_DETAILS, _EXIF_COLOUR_SPACE, _EXIF_INTEROPERABILITY = 0x8769, 0xA001, 0xA005
 _EXIF_FOCAL_35MM = 0xA405  # the focal length that has this field of view on 35 mm film
 _EXIF_FOCAL = (0x920A, _EXIF_FOCAL_35MM)  # in mm
 _TIFF_PROFILE = 34675
@@ -115,7 +115,7 @@ def _stream(path: Path) -> Iterator[BinaryIO]:
 
 def _unidentified(path: Path) -> str:
     """Say what a file is that PIL can't identify."""
-    if path.lstat().st_size == 0:
+    if path.stat().st_size == 0:
         return "the file is empty"
     return f"cannot identify it as one of {', '.join(_FORMATS)}"
 
@@ -219,7 +219,11 @@ class _File(Protocol):
     bits: int
     exif: Image.Exif
     profile: bytes | None
-    frames: int
+    note: str
+
+    @property
+    def frames(self) -> int:
+        """Return how many images the file has, but for those that belong to one."""
 
     def encoding(self) -> colour.Encoding | None:
         """Return the colours that the file names in place of an ICC profile."""
@@ -231,8 +235,8 @@ class _File(Protocol):
 class _PilFile:
     """A photograph that PIL opens; `deep` decodes the PNGs and HEIC files of more than 8 bits."""
 
-    def __init__(self, stream: BinaryIO, start: bytes) -> None:
-        self._stream = stream
+    def __init__(self, stream: BinaryIO, start: bytes, note: str = "") -> None:
+        self._stream, self.note = stream, note
         self.image = image = Image.open(stream, formats=_formats(start))
         is_heif, is_png = image.format == "HEIF", image.format == "PNG"
         self._chunks, has_late_exif = _png_chunks(stream) if is_png else ({}, False)
@@ -254,8 +258,12 @@ class _PilFile:
         self.size = image.size
         if image.format == "TIFF":
             self.size = image.tag_v2[256], image.tag_v2[257]  # type: ignore[attr-defined]
+
+    @property
+    def frames(self) -> int:
         # The others of a JPEG are gain maps, depth, or the other half of a stereo pair.
-        self.frames = 1 if image.format in ("JPEG", "MPO") else getattr(image, "n_frames", 1)
+        is_jpeg = self.image.format in ("JPEG", "MPO")
+        return 1 if is_jpeg else getattr(self.image, "n_frames", 1)
 
     def encoding(self) -> colour.Encoding | None:
         info = self.image.info
@@ -270,7 +278,9 @@ class _PilFile:
                 int(nclx["color_primaries"]), int(nclx["transfer_characteristics"])
             )
         with suppress(Exception):  # as for EXIF itself
-            if self.exif.get_ifd(_EXIF_INTEROPERABILITY).get(1, "").startswith("R03"):
+            interoperability = self.exif.get_ifd(_EXIF_INTEROPERABILITY).get(1, "")
+            space = self.exif.get_ifd(_EXIF_DETAILS).get(_EXIF_COLOUR_SPACE)
+            if interoperability.startswith("R03") or space == 2:
                 return colour.adobe_rgb()
         return None
 
@@ -298,7 +308,7 @@ class _PilFile:
             return _Samples(samples[..., :-1], alpha, is_upright=upright)
         if image.mode not in ("L", "RGB", "CMYK"):
             image = image.convert("L" if image.mode == "1" else "RGB")
-        return _Samples(_with_channels(np.asarray(image)), None, is_upright=upright)
+        return _Samples(np.atleast_3d(np.asarray(image)), None, is_upright=upright)
 
 
 class _DeepTiff:
@@ -311,11 +321,15 @@ class _DeepTiff:
         self.channels, self.bits = tiff.channels, tiff.bits
         _check_size(stream, self.size, MAX_PIXELS, self.channels * self.bits)
         self.profile: bytes | None = tiff.value(_TIFF_PROFILE)
-        self.frames = tiff.frames
+        self.note = tiff.note
         self.exif = Image.Exif()
         with suppress(Exception):  # PIL raises nearly anything on damaged EXIF
             stream.seek(0)
             self.exif.load_from_fp(stream)
+
+    @property
+    def frames(self) -> int:
+        return self._tiff.frames
 
     def encoding(self) -> colour.Encoding | None:
         return None
@@ -325,19 +339,16 @@ class _DeepTiff:
         return _Samples(found.colours, found.alpha, found.note)
 
 
-def _with_channels(samples: NDArray[Any]) -> NDArray[Any]:
-    return samples[..., None] if samples.ndim == 2 else samples
-
-
 def _file(stream: BinaryIO) -> _File:
     start = stream.read(16)
     stream.seek(0)
-    if start[:4] in _TIFF_MAGIC:
-        tiff = deep.Tiff(stream)
-        if tiff.is_deep:
-            return _DeepTiff(stream, tiff)
-        stream.seek(0)
-    return _PilFile(stream, start)
+    if start[:4] not in _TIFF_MAGIC:
+        return _PilFile(stream, start)
+    tiff = deep.Tiff(stream)
+    if tiff.is_deep:
+        return _DeepTiff(stream, tiff)
+    stream.seek(0)
+    return _PilFile(stream, start, tiff.note)
 
 
 def _png_chunks(stream: BinaryIO) -> tuple[dict[bytes, bytes], bool]:
@@ -425,7 +436,8 @@ def thumbnail(path: Path, side: int) -> NDArray[np.uint8]:
     with _stream(path) as stream:
         file = _file(stream)
         if isinstance(file, _PilFile) and file.bits <= 8:
-            file.image.draft("RGB", (8 * side, 8 * side))  # JPEGs are decoded at down to an eighth
+            # JPEGs are decoded at down to an eighth of their size.
+            file.image.draft("RGB", (16 * side, 16 * side))
             upright = ImageOps.exif_transpose(file.image).convert("RGB")
             return _small(upright, side)
     return _small(Image.fromarray(to_8_bit(decode(path).pixels)), side)
@@ -476,7 +488,8 @@ def decode(path: Path) -> Picture:
     """
     with _stream(path) as stream:
         file = _file(stream)
-        head, samples = _header(file), file.load()
+        head, several = _header(file), file.frames > 1
+        samples = file.load()
         encoding = None if file.profile else file.encoding()
         pixels, colour_note = colour.convert(samples.colours, file.profile, encoding)
         alpha = samples.alpha
@@ -489,8 +502,8 @@ def decode(path: Path) -> Picture:
             raise ValueError(
                 f"it has {pixels.shape[1]} x {pixels.shape[0]} pixels, not {head.size}"
             )
-        notes = [note for note in (samples.note, colour_note) if note]
-        if file.frames > 1:
+        notes = [note for note in (file.note, samples.note, colour_note) if note]
+        if several:
             notes.append("only the first image of the file read")
         return Picture(np.ascontiguousarray(pixels), alpha, head.orientation, tuple(notes))
 

@@ -6,7 +6,6 @@ they are known only after SfM, which then gets the photographs as they are.
 
 from __future__ import annotations
 
-import logging
 import math
 import time
 from collections import Counter
@@ -41,8 +40,6 @@ if TYPE_CHECKING:
     from xrgs.capture.scenes import Scene
     from xrgs.capture.sfm import Reconstruction
     from xrgs.config import VariantConf
-
-_log = logging.getLogger(__name__)
 
 #: How much finer HR views must sample the scene than LR views for the two to be called so, in their
 #: medians; our choice. The paper has 5.
@@ -99,8 +96,6 @@ def mix_resolutions(scene: Scene, conf: VariantConf, work: Path, out: Path) -> V
     tags, masked = _tags_report(inputs, views), _mask_report(views)
     notes = [*report["notes"], *tags["notes"], *hidden, *masked["notes"]]
     report |= tags | masked | {"notes": notes}
-    for note in report["notes"]:
-        _log.warning("scene %s: %s", scene.name, note)
     report["seconds"] = round(time.perf_counter() - start, 1)
     held_out = bool(inputs.split.test)
     return Variant(

@@ -2,21 +2,26 @@
 
 from __future__ import annotations
 
+import logging
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from xrgs.capture import dataset, variant
+from xrgs.capture.description import read_report
 
 if TYPE_CHECKING:
     from xrgs.capture.dataset import Dataset
     from xrgs.config import Conf
+
+_log = logging.getLogger(__name__)
 
 
 def build_dataset(conf: Conf) -> Dataset:
     """Load the views of a config, building their variant in its store where it is missing.
 
     Building takes minutes: COLMAP places the views. A variant is built once; the next call, and any
-    sweep with the same scene and variant, finds it.
+    sweep with the same scene and variant, finds it. What was left out of it, or changed, is logged
+    as warnings.
 
     Args:
         conf: The config, as `compose` gives it; `scene`, `variant`, `store`, `seed`, `train.views`
@@ -29,6 +34,8 @@ def build_dataset(conf: Conf) -> Dataset:
     store = Path(conf.store)
     store.mkdir(parents=True, exist_ok=True)
     built = variant.build(conf.scene, conf.variant, store / "variants", store / "scenes")
+    for note in read_report(built.folder).all_notes():
+        _log.warning("scene %s: %s", built.scene, note)
     return dataset.load(built, conf.train.views, validation=conf.train.validation, seed=conf.seed)
 
 

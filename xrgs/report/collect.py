@@ -27,6 +27,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping, Sequence
     from pathlib import Path
 
+    from xrgs.capture.description import SfmReport
     from xrgs.config import Conf
     from xrgs.experiment.cell_folder import CellFolder
     from xrgs.experiment.schema import Identity, Provenance, RecordedCell, Status, Summary
@@ -108,6 +109,9 @@ class Sweep:
     renders: dict[str, Path] = field(default_factory=dict)
     """Folders of renders that another program made, by the ids of their rows, which are no cells
     of the store (`xrgs.report.external`)."""
+    variants: dict[str, SfmReport] = field(default_factory=dict)
+    """How the variants of the cells that are done were made, by the variant's id
+    (`xrgs.report.photographs`)."""
 
     @property
     def id(self) -> str:

@@ -13,6 +13,7 @@ import pandas as pd
 
 from xrgs.report.inference import OTHER_CODE
 from xrgs.report.writing import signed
+from xrgs.runtime.text import listed
 from xrgs.safeio.sanitize import counted, for_line
 
 if TYPE_CHECKING:
@@ -28,6 +29,7 @@ _ENOUGH_VIEWS = 3
 #: The longest value of a config, processor's name and sentence that is shown, in characters.
 _MAX_SHOWN = 120
 _MAX_SENTENCE = 240
+_ALL_HR = "all views HR"
 
 
 @dataclass(frozen=True)
@@ -83,7 +85,10 @@ def contexts(sweep: Sweep) -> dict[str, Context]:
                 *_prune_rule(zip(rows["label"], configs, strict=True)),
             ),
             _machine([cell.provenance for cell in made]),
-            _cautions(zip(rows["scene"], configs, strict=True), tests),
+            (
+                *_cautions(zip(rows["scene"], configs, strict=True), tests),
+                *_cautions_of_photographs(rows, sweep),
+            ),
         )
     return {name: found.get(name, Context()) for name in cells["condition"].unique()}
 
@@ -120,7 +125,7 @@ def _mixture(variant: VariantConf) -> str:
     """Return a phrase on how the LR views of a cell were made."""
     chosen = variant.tags == "flag"  # and not by what the photographs are
     if chosen and variant.hr_fraction == 1:
-        return "all views HR"
+        return _ALL_HR
     if variant.degradation == "downsample" or (chosen and variant.degradation == "auto"):
         return f"LR views {_shown(variant.factor)} times smaller"
     if variant.degradation in ("auto", "none"):
@@ -172,6 +177,33 @@ def _cautions(
     return tuple(
         for_line(f"Caution: {text}", _MAX_SENTENCE) for text in dict.fromkeys((*few, *trained_on))
     )
+
+
+def _cautions_of_photographs(rows: pd.DataFrame, sweep: Sweep) -> list[str]:
+    """Return sentences on test views that have no score, and on mixtures without an LR view.
+
+    Args:
+        rows: The rows of finished cells in `Sweep.cells`.
+        sweep: The sweep.
+    """
+    found = []
+    for scene, of in rows.groupby("scene", sort=False):
+        unscored: dict[str, None] = {}
+        unmixed = False
+        for row in of.to_dict("records"):
+            if (report := sweep.variants.get(row["variant_id"])) is None:
+                continue
+            config = sweep.done[row["cell_id"]].config
+            wants_lr = config is None or _mixture(config.variant) != _ALL_HR
+            unmixed |= wants_lr and bool(report.hr) and not report.lr
+            if row["validation"] == 0:
+                unscored |= dict.fromkeys(report.not_scored)
+        if unscored:
+            names = listed([*unscored])
+            found.append(f"{scene} is scored without test views that are not placed: {names}")
+        if unmixed:
+            found.append(f"{scene} has no LR view: nothing is mixed")
+    return [for_line(f"Caution: {text}", _MAX_SENTENCE) for text in found]
 
 
 def _holds_out(config: Conf) -> bool:

@@ -10,6 +10,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, TypeVar
 
+from xrgs.capture.description import read_report
+from xrgs.capture.folders import trimmed_folder
 from xrgs.errors import StoreError
 from xrgs.experiment.store import BASELINE
 from xrgs.report.collect import ReportError
@@ -18,6 +20,7 @@ from xrgs.safeio.sanitize import for_file_name
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Mapping, Sequence
 
+    from xrgs.capture.description import SfmReport
     from xrgs.experiment.cell_folder import CellFolder
     from xrgs.experiment.schema import RecordedCell, SweepRecord
     from xrgs.experiment.store import Store
@@ -97,6 +100,19 @@ class JoinedStore:
             StoreError: The id is not a valid name of a folder.
         """
         return _first([store.variant(variant_id) for store in self.stores], Path.is_dir)
+
+    def variant_report(self, variant_id: str) -> SfmReport:
+        """Read how a variant was made, also where its images were removed on purpose.
+
+        Raises:
+            StoreError: No store has the variant, or its report is damaged or can't be read now.
+        """
+        homes = [
+            home
+            for store in self.stores
+            for home in (store.variant(variant_id), trimmed_folder(store.variants, variant_id))
+        ]
+        return read_report(_first(homes, Path.is_dir))
 
     def render(self, cell_id: str, view: str) -> Path:
         """Return the file of the render of a view, which need not exist.

@@ -21,6 +21,7 @@ from xrgs.report.html import write_document
 from xrgs.report.joined import Choice, JoinedStore, report_name
 from xrgs.report.markup import LATEX_PREAMBLE, to_latex, to_markdown
 from xrgs.report.paper import paper_tables, texture_tables, with_texture
+from xrgs.report.photographs import photographs, with_variants
 from xrgs.report.pictures import Picture, draw
 from xrgs.report.tables import Tables
 from xrgs.runtime.text import TextTable, to_text
@@ -143,6 +144,7 @@ def build(
     ids = tuple(dict.fromkeys(named or store.latest_sweeps()))
     commands, rows = store.sweep_records(ids)
     sweep = read_cells(store, commands, choice.rows(rows, against))
+    sweep = with_variants(sweep, store)
     sweep = with_external(sweep, store, externals)
     store = replace(store, external=sweep.renders)
     sweep = replace(sweep, views=with_texture(store, sweep.cells, sweep.views))
@@ -291,6 +293,7 @@ def _markdown_page(
         *(_command_line(sweep_id, command) for sweep_id, command in sweep.commands.items()),
         *(f"**{for_markdown(line)}**\n" for line in _warnings(sweep)),
         *(to_markdown(table) for table in tables if table.rows),
+        *_photographs(sweep),
         *(_picture_link(picture, folder) for picture in pictures),
     ]
     return "\n".join(parts)
@@ -299,6 +302,13 @@ def _markdown_page(
 def _command_line(sweep_id: str, command: Sequence[str]) -> str:
     words = " ".join(for_markdown(shlex.quote(word)) for word in ("xrgs-sweep", *command))
     return f"Sweep {for_markdown(sweep_id)}: {words}\n"
+
+
+def _photographs(sweep: Sweep) -> list[str]:
+    """Return a list of Markdown of what became of the photographs of each scene."""
+    found = photographs(sweep)
+    lines = [f"- {for_markdown(f'{scene}: {note}')}\n" for scene, notes in found for note in notes]
+    return ["## Photographs\n", *lines] if lines else []
 
 
 def _picture_link(picture: Picture, folder: Path) -> str:
@@ -385,7 +395,7 @@ def _text(tables: Tables, warnings: list[str]) -> str:
     missing = tables.missing()
     if missing:
         more = len(missing.rows) - _MAX_PRINTED_MISSING
-        notes = (f"and {more} more, in table.md",) if more > 0 else ()
+        notes = (*missing.notes, *([f"and {more} more, in table.md"] if more > 0 else []))
         printed.append(replace(missing, rows=missing.rows[:_MAX_PRINTED_MISSING], notes=notes))
     return "\n".join(
         [*(to_text(table) for table in printed if table.rows), *map(for_line, warnings)]

@@ -48,6 +48,8 @@ if TYPE_CHECKING:
 
 #: Metrics that differ each time the same training is run.
 _NOISY = frozenset({"training_time_s", "render_time_ms", "peak_rss_bytes"})
+#: The longest reason in a cell of a table, in characters.
+_MAX_REASON = 100
 #: The most replicates that a title lists; it has the number of more.
 _MAX_LISTED = 8
 #: The order of the scores in a compact table and the arrows in its heads, as in papers.
@@ -389,16 +391,23 @@ class Tables:
         return filled(table)
 
     def missing(self) -> TextTable | None:
-        """Return a table of the cells without results and why; None where there are none."""
+        """Return a table of the cells without results and why; None where there are none.
+
+        A long reason, as of a scene that COLMAP could not place, is a note below the table.
+        """
         rows = self.comparison.missing()
         if rows.empty:
             return None
+        long = [text for text in rows["reason"].unique() if len(text) > _MAX_REASON]
+        marks = {text: f"see ({number})" for number, text in enumerate(long, 1)}
+        rows = rows.assign(reason=rows["reason"].replace(marks))
         keys = ["scene", "label", "condition", "variant_seed", "seed", "state", "reason"]
         return TextTable(
             title=f"{len(rows)} of {len(self.comparison.cells)} cells gave no number",
             columns=("Scene", "Label", "Condition", "variant.seed", "seed", "State", "Reason"),
             rows=tuple(tuple(map(str, row)) for row in rows[keys].itertuples(index=False)),
             align="lllrrll",
+            notes=tuple(f"({number}) {text}" for number, text in enumerate(long, 1)),
         )
 
     def long(self) -> pd.DataFrame:

@@ -212,6 +212,11 @@ class Launches:
         session.begin()
         return session
 
+    def end(self) -> None:
+        """Tidy up after the last launch, whose jobs have all ended."""
+        if self._session is not None:
+            self._session.end()
+
     def _set(self, key: str, value: Any) -> None:
         with flag_override(self._config.hydra, ["readonly", "struct"], False):
             OmegaConf.update(self._config.hydra, key, value)

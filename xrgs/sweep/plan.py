@@ -202,7 +202,7 @@ def _shown_state(cell: PlannedCell) -> tuple[str, str]:
     """Return the state of a cell and the reason for it, for the plan's text."""
     reason = cell.state.reason.partition("\n")[0]
     if cell.error:
-        return "failed", cell.error.partition("\n")[0]
+        return "failed", cell.error
     if cell.unknown:
         return "unknown", f"{reason}; run the same command again"
     return "waits" if cell.waits else cell.state.name, reason

@@ -43,6 +43,16 @@ class SweepSession:
         with suppress(OSError), (self.folder / "stopped").open("xb") as stream:
             stream.write(reason.encode())
 
+    def end(self) -> None:
+        """Remove the folder when no job is left, unless a launcher has left its logs in it."""
+        own = {self.folder / "sweep", self.folder / "stopped"}
+        with suppress(OSError):  # it disturbs nobody
+            for of_job in set(self.folder.iterdir()) - own:
+                of_job.rmdir()  # fails where there are logs: then all of the folder stays
+            for file in own:
+                file.unlink(missing_ok=True)
+            self.folder.rmdir()
+
     @cached_property
     def _owner(self) -> lease.Owner | None:
         return lease.signature(self.folder / "sweep")

@@ -134,7 +134,7 @@ def describe(status: StoreStatus) -> str:
     for state in ("running", "failed", "corrupt", "unknown", "unfinished"):
         of_state = [cell for cell in status.cells if cell.state.name == state]
         lines += _named(f"{state}:", [_reason(cell) for cell in of_state])
-    failed = [f"{key}  {scene}  {_first_line(why)}" for key, scene, why in status.failed_scenes]
+    failed = [f"{key}  {scene}  {why}" for key, scene, why in status.failed_scenes]
     lines += _named("failed scenes, not tried again; retry=failed tries them again", failed)
     changed = Counter(part for cell in stale for part in cell.stale)
     title = f"stale: {counted(len(stale), 'done cell')} of other code or arithmetic than here"

@@ -188,6 +188,7 @@ class Study:
             elsewhere = [cell for cell in plan if cell.state.name == "running"]
             unknown = any(cell.unknown for cell in plan) and looks < _UNKNOWN_LOOKS
             if not to_train and not elsewhere and not unknown:
+                launches.end()
                 return list(plan)
             outcomes = launches.launch(to_train.values(), store) if to_train else {}
             not_begun = {LOCKED, launch.LOST}
@@ -201,6 +202,7 @@ class Study:
             failed = conf.fail_fast and "failed" in outcomes.values()
             if reason := launches.stopped or (FAIL_FAST if failed else ""):
                 log_line(f"no further cell is started: {reason}")
+                launches.end()
                 return list(plan)
             if elsewhere and not to_train and not waiting_said:
                 first = elsewhere[0]

@@ -6,7 +6,8 @@ from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING
 
 from xrgs.capture import photographs, scenes, split, variant
-from xrgs.capture.folders import trimmed_folder
+from xrgs.capture.description import read_report
+from xrgs.capture.folders import failed_folder, trimmed_folder
 from xrgs.errors import StoreError, UnreadableError, XrgsError
 from xrgs.experiment import trimming
 from xrgs.experiment.store import StoreGoneError
@@ -16,6 +17,8 @@ from xrgs.sweep.jobs import worker
 from xrgs.sweep.jobs.supervise import Limits
 
 if TYPE_CHECKING:
+    from pathlib import Path
+
     from xrgs.config import Conf
     from xrgs.experiment.store import Store
 
@@ -32,7 +35,7 @@ class PlannedVariant:
     unknown: str | None = None
     """The file that can't be read now."""
     notes: tuple[str, ...] = ()
-    """Of a dry run: what the report of the variant that would be built would say."""
+    """What its report says, or in a dry run what the report of a new variant would say."""
 
 
 def build(conf: Conf, store: Store) -> str:
@@ -122,16 +125,18 @@ def _find_or_build(conf: Conf, store: Store, *, allow_build: bool) -> PlannedVar
         key = variant.key(conf.scene, conf.variant)
         frozen = variant.find(store.variants, key)
         if frozen is not None:
-            return PlannedVariant(frozen.id)
+            return PlannedVariant(frozen.id, notes=_notes(store.variants / frozen.id))
         # The done cells of a trimmed variant are found by its id; a job that trains another cell
         # makes the images again.
         if trimmed := trimming.trimmed_variant(store.variants, key):
-            return PlannedVariant(trimmed)
+            return PlannedVariant(trimmed, notes=_notes(trimmed_folder(store.variants, trimmed)))
         failure = None if conf.retry == "failed" else variant.failure(store.variants, key)
         if failure:
-            return PlannedVariant(error=failure, remembered=True)
+            notes = _notes(failed_folder(store.variants, key))
+            return PlannedVariant(error=failure, remembered=True, notes=notes)
         if allow_build:
-            return PlannedVariant(build(conf, store))
+            built = build(conf, store)
+            return PlannedVariant(built, notes=_notes(store.variants / built))
         return PlannedVariant(notes=_expected_notes(conf, store))
     except (UnreadableError, worker.UnwritableError, StoreGoneError):
         raise
@@ -142,7 +147,24 @@ def _find_or_build(conf: Conf, store: Store, *, allow_build: bool) -> PlannedVar
             store.check_room()
         # The reason that the store keeps: a sweep that is planned again has the same record then.
         remembered = variant.failure(store.variants, key) if key else None
-        return PlannedVariant(error=remembered or str(error), remembered=remembered is not None)
+        notes = _notes(failed_folder(store.variants, key)) if key and remembered else ()
+        return PlannedVariant(
+            error=remembered or str(error), remembered=remembered is not None, notes=notes
+        )
+
+
+def _notes(folder: Path) -> tuple[str, ...]:
+    """Return what the report of a variant, or of a scene that failed, says of its photographs.
+
+    Raises:
+        UnreadableError: The report can't be read now.
+    """
+    try:
+        return read_report(folder).all_notes()
+    except UnreadableError:
+        raise
+    except StoreError as error:
+        return (str(error),)
 
 
 def _expected_notes(conf: Conf, store: Store) -> tuple[str, ...]:

@@ -31,10 +31,11 @@ from xrgs.report.html.content import (
 from xrgs.report.html.images import ERROR_RANGE, add_trained, add_views
 from xrgs.report.markup import filled, filled_places, titled, to_latex, to_markdown
 from xrgs.report.paper import counterparts
+from xrgs.report.photographs import photographs
 from xrgs.report.writing import NO_INTERVAL, number, signed
 from xrgs.runtime.text import TextTable
 from xrgs.safeio.atomic import write_text
-from xrgs.safeio.sanitize import for_csv
+from xrgs.safeio.sanitize import for_csv, for_line
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
@@ -94,6 +95,10 @@ def write_document(
         "base": shown(comparison.base),
         "answers": answers(comparison),
         "context": page_context(sweep, comparison, tables.contexts, variants),
+        "photographs": [
+            (shown(scene), [for_line(note) for note in notes])
+            for scene, notes in photographs(sweep)
+        ],
         "warnings": [shown(text) for text in (*warnings, *tables.cautions)],
     }
     write_text(file, _fitting(head, content, tables, [table for table in texts if table.rows]))
@@ -164,14 +169,14 @@ def _rendered(
 
 
 def _printable(table: TextTable) -> TextTable:
-    """Return a table with its texts as printable lines of bounded length."""
+    """Return a table with its texts as printable lines of bounded length, the notes long ones."""
     notes = (table.context, *table.notes) if table.context else table.notes
     return TextTable(
         shown(table.title),
         tuple(map(shown, table.heads)),
         tuple(tuple(map(shown, row)) for row in table.rows),
         table.align,
-        tuple(map(shown, notes)),
+        tuple(map(for_line, notes)),
     )
 
 
