@@ -13,8 +13,10 @@ import pickle
 import resource
 import shutil
 import tarfile
+import tempfile
 import time
 import warnings
+import zlib  # noqa: F401  pycolmap corrupts the heap where it is imported before zlib
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -24,6 +26,7 @@ from random import Random
 
 import msgspec
 import numpy as np
+import pycolmap
 import pytest
 import torch
 
@@ -110,6 +113,40 @@ def poses_of(file: Path) -> object:
     return poses.read_poses(str(file), photographs(file.parent))
 
 
+#: A model of COLMAP, of two images and five points.
+TEXT_MODEL = {
+    "cameras.txt": "1 OPENCV 40 30 50 50 20 15 0.1 0 0.01 0\n",
+    "images.txt": "".join(
+        f"{i} 1 0 0 0 {i} 0 4 1 {name}.png\n3 4 1 5 6 -1\n" for i, name in enumerate("ab", 1)
+    ),
+    "points3D.txt": "".join(
+        f"{i} {i} 0 1 90 80 70 0.5{' 1 0 2 0' * (i == 1)}\n" for i in range(1, 6)
+    ),
+}
+
+
+def model_of(file: Path) -> object:
+    """Read the poses of a model, of which one file may be mutated."""
+    names = [name.replace(".txt", file.suffix) for name in TEXT_MODEL]
+    for name in set(names) - {file.name}:
+        if not (file.parent / name).exists():
+            (file.parent / name).write_bytes(colmap_file(name)(file.parent))
+    return poses.read_poses(str(file.parent), photographs(file.parent))
+
+
+def colmap_file(name: str) -> Callable[[Path], bytes]:
+    def content(_: Path) -> bytes:
+        if name in TEXT_MODEL:
+            return TEXT_MODEL[name].encode()
+        with tempfile.TemporaryDirectory() as folder:
+            for text_name, text in TEXT_MODEL.items():
+                (Path(folder) / text_name).write_text(text)
+            pycolmap.Reconstruction(folder).write_binary(folder)
+            return (Path(folder) / name).read_bytes()
+
+    return content
+
+
 @cache
 def photographs(folder: Path) -> PhotoCollection:
     """Two photographs, and the points that `transforms` names."""
@@ -194,6 +231,11 @@ PARSERS = {
     "splats.ply": Parser(of_store("cells/*/splats.ply"), mutate_bytes, load_ply),
     "points.ply": Parser(points, mutate_bytes, colmap.read_points),
     "transforms.json": Parser(transforms, mutate_json, poses_of),
+    **{
+        name: Parser(colmap_file(name), mutate_bytes, model_of)
+        for text_name in TEXT_MODEL
+        for name in (text_name, text_name.replace(".txt", ".bin"))
+    },
     "weights.pickle": Parser(
         pickled, mutate_bytes, lambda file: weights.read_pickle(file.read_bytes(), "file")
     ),

@@ -436,7 +436,8 @@ def thumbnail(path: Path, side: int) -> NDArray[np.uint8]:
     with _stream(path) as stream:
         file = _file(stream)
         if isinstance(file, _PilFile) and file.bits <= 8:
-            file.image.draft("RGB", (8 * side, 8 * side))  # JPEGs are decoded at down to an eighth
+            # JPEGs are decoded at down to an eighth of their size.
+            file.image.draft("RGB", (16 * side, 16 * side))
             upright = ImageOps.exif_transpose(file.image).convert("RGB")
             return _small(upright, side)
     return _small(Image.fromarray(to_8_bit(decode(path).pixels)), side)

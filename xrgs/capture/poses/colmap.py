@@ -300,6 +300,8 @@ def _text_images(file: Path) -> Iterator[_Image]:
         with _line(file, number, "IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME"):
             own, *pose, camera, name = line.split(maxsplit=9)  # a name may have spaces
             values = [float(value) for value in pose]
+            if len(values) != 7:
+                raise ValueError("not a pose")
             image = _Image(
                 int(own), name, values[:4], values[4:], int(camera), np.zeros(0, np.uint64)
             )
