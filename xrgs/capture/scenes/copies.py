@@ -15,11 +15,10 @@ import numpy as np
 
 from xrgs.capture import images
 from xrgs.capture.scenes.scene import content, remembered
-from xrgs.errors import UnreadableError
 from xrgs.runtime.text import listed
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Sequence
+    from collections.abc import Iterable, Sequence, Set
     from pathlib import Path
 
     from numpy.typing import NDArray
@@ -155,7 +154,7 @@ def without_copies(
     Returns:
         The files in their order, and notes.
     """
-    same = _identical(files, other_sizes)
+    same = _identical(files, frozenset(other_sizes))
     left = [file for file in files if file not in same]
     alike: dict[Path, Path] = {}
     for a, b in (*_of_one_folder(left), *_of_two_folders(left)):
@@ -173,15 +172,11 @@ def without_copies(
     return [file for file in left if file not in alike], notes
 
 
-def _identical(files: Sequence[Path], known: Sequence[Path]) -> dict[Path, Path]:
+def _identical(files: Sequence[Path], known: Set[Path]) -> dict[Path, Path]:
     """Return the files that have the bytes of another or of a known one, with that one."""
     by_length = defaultdict(list)
     for file in (*known, *files):
-        try:
-            by_length[file.stat().st_size].append(file)
-        except OSError as error:
-            why = f"{error.strerror}; try again, or move it out of the folder"
-            raise UnreadableError(f"{file}: {why}") from error
+        by_length[file.stat().st_size].append(file)
     by_length.pop(0, None)  # an empty file is no photograph, and is named when it is read
     by_content = defaultdict(list)
     for group in by_length.values():
