@@ -2,7 +2,7 @@
 
     python examples/render_ply.py splats.ply image.png --azimuth 30 --elevation 15
 
-The .ply may be a cell's `splats.ply`, or any other trainer's.
+The .ply may be a cell's `splats.ply`, or any other trainer's; a .glb or .spz will do too.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ import xrgs
 def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
     """Read the command line."""
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
-    parser.add_argument("ply", help="the .ply file to render")
+    parser.add_argument("ply", help="the .ply, .glb or .spz file to render")
     parser.add_argument("png", help="the image to write")
     parser.add_argument("--width", type=int, default=640, help="px (default: %(default)s)")
     parser.add_argument("--height", type=int, default=480, help="px (default: %(default)s)")
@@ -61,9 +61,10 @@ def orbit_camera(gaussians: xrgs.Gaussians, options: argparse.Namespace) -> xrgs
 def main(arguments: Sequence[str] | None = None) -> None:
     """Render the .ply of the command line."""
     options = parse(arguments)
-    gaussians = xrgs.load_ply(options.ply)
+    gaussians, antialiased = xrgs.load_gaussians(options.ply)
+    settings = xrgs.RasterSettings(antialiased=antialiased)
     with torch.no_grad():
-        image = xrgs.rasterize(gaussians, orbit_camera(gaussians, options)).image
+        image = xrgs.rasterize(gaussians, orbit_camera(gaussians, options), settings=settings).image
     pixels = (image.clamp(0, 1) * 255).round().to(torch.uint8)
     Image.fromarray(pixels.numpy()).save(options.png)
     print(f"{options.png}: {len(gaussians)} Gaussians, {options.width} x {options.height} px")

@@ -123,6 +123,11 @@ def test_exif_behind_the_pixels_of_a_png_is_found(tmp_path: Path) -> None:
     (tmp_path / "a.png").write_bytes(content[:last] + late + content[last:])
     assert images.size(tmp_path / "a.png") == (40, 60)
     assert images.read(tmp_path / "a.png").shape == (60, 40, 3)
+    place = content.index(b"IDAT") + 8
+    damaged = content[:place] + bytes(8) + content[place + 8 : last] + late + content[last:]
+    (tmp_path / "a.png").write_bytes(damaged)
+    with pytest.raises(ImageError, match=r"a\.png: unreadable or truncated"):
+        images.read(tmp_path / "a.png")
 
 
 def test_the_header_of_a_png_is_read_without_its_pixels(tmp_path: Path) -> None:

@@ -7,8 +7,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 from PIL import Image
 
+import xrgs
 from xrgs.experiment.store import Store
 
 RunCommand = Callable[..., tuple[int, str, str]]
@@ -38,3 +40,21 @@ def test_a_frame_at_the_first_test_view_is_the_render_that_was_scored(
     code, out, err = run_command("render", store.parent, *cells, *both)
     assert code == 0, err
     assert out == "both.mp4: 3 frames of 128 x 48 px, 0.1 s\n"
+    gaussians = Store(store).cell(cell_id).gaussians()
+    # Small and opaque ones, which the filter makes fainter.
+    gaussians.scales = torch.full_like(gaussians.scales, -6)
+    gaussians.opacities = torch.full_like(gaussians.opacities, 3)
+    xrgs.save_gaussians(store.parent / "small.glb", gaussians, antialiased=True)
+    pairs = []
+    for asked in ((), ("--antialiased", "no")):
+        out = f"pair{len(asked)}"
+        pair = (cell_id, "small.glb", "--path", "test", "--views", "1", "--out", out)
+        code, _, err = run_command("render", store.parent, *pair, "--store", "s", *asked)
+        assert code == 0, err
+        said = "small.glb is antialiased; it is rendered without antialiasing, as asked"
+        assert (said in err) == bool(asked)
+        (frame,) = (store.parent / out).iterdir()
+        pairs.append(np.asarray(Image.open(frame)).astype(int))
+    own, other = np.split(np.abs(pairs[0] - pairs[1]), 2, axis=1)
+    assert own.max() == 0
+    assert other.max() > 3

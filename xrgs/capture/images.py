@@ -115,7 +115,7 @@ def _stream(path: Path) -> Iterator[BinaryIO]:
 
 def _unidentified(path: Path) -> str:
     """Say what a file is that PIL can't identify."""
-    if path.lstat().st_size == 0:
+    if path.stat().st_size == 0:
         return "the file is empty"
     return f"cannot identify it as one of {', '.join(_FORMATS)}"
 
@@ -219,8 +219,11 @@ class _File(Protocol):
     bits: int
     exif: Image.Exif
     profile: bytes | None
-    frames: int
     note: str
+
+    @property
+    def frames(self) -> int:
+        """Return how many images the file has, but for those that belong to one."""
 
     def encoding(self) -> colour.Encoding | None:
         """Return the colours that the file names in place of an ICC profile."""
@@ -255,8 +258,12 @@ class _PilFile:
         self.size = image.size
         if image.format == "TIFF":
             self.size = image.tag_v2[256], image.tag_v2[257]  # type: ignore[attr-defined]
+
+    @property
+    def frames(self) -> int:
         # The others of a JPEG are gain maps, depth, or the other half of a stereo pair.
-        self.frames = 1 if image.format in ("JPEG", "MPO") else getattr(image, "n_frames", 1)
+        is_jpeg = self.image.format in ("JPEG", "MPO")
+        return 1 if is_jpeg else getattr(self.image, "n_frames", 1)
 
     def encoding(self) -> colour.Encoding | None:
         info = self.image.info
@@ -301,7 +308,7 @@ class _PilFile:
             return _Samples(samples[..., :-1], alpha, is_upright=upright)
         if image.mode not in ("L", "RGB", "CMYK"):
             image = image.convert("L" if image.mode == "1" else "RGB")
-        return _Samples(_with_channels(np.asarray(image)), None, is_upright=upright)
+        return _Samples(np.atleast_3d(np.asarray(image)), None, is_upright=upright)
 
 
 class _DeepTiff:
@@ -314,11 +321,15 @@ class _DeepTiff:
         self.channels, self.bits = tiff.channels, tiff.bits
         _check_size(stream, self.size, MAX_PIXELS, self.channels * self.bits)
         self.profile: bytes | None = tiff.value(_TIFF_PROFILE)
-        self.frames, self.note = tiff.frames, tiff.note
+        self.note = tiff.note
         self.exif = Image.Exif()
         with suppress(Exception):  # PIL raises nearly anything on damaged EXIF
             stream.seek(0)
             self.exif.load_from_fp(stream)
+
+    @property
+    def frames(self) -> int:
+        return self._tiff.frames
 
     def encoding(self) -> colour.Encoding | None:
         return None
@@ -326,10 +337,6 @@ class _DeepTiff:
     def load(self) -> _Samples:
         found = self._tiff.decode()
         return _Samples(found.colours, found.alpha, found.note)
-
-
-def _with_channels(samples: NDArray[Any]) -> NDArray[Any]:
-    return samples[..., None] if samples.ndim == 2 else samples
 
 
 def _file(stream: BinaryIO) -> _File:
@@ -429,7 +436,8 @@ def thumbnail(path: Path, side: int) -> NDArray[np.uint8]:
     with _stream(path) as stream:
         file = _file(stream)
         if isinstance(file, _PilFile) and file.bits <= 8:
-            file.image.draft("RGB", (8 * side, 8 * side))  # JPEGs are decoded at down to an eighth
+            # JPEGs are decoded at down to an eighth of their size.
+            file.image.draft("RGB", (16 * side, 16 * side))
             upright = ImageOps.exif_transpose(file.image).convert("RGB")
             return _small(upright, side)
     return _small(Image.fromarray(to_8_bit(decode(path).pixels)), side)
@@ -480,7 +488,8 @@ def decode(path: Path) -> Picture:
     """
     with _stream(path) as stream:
         file = _file(stream)
-        head, samples = _header(file), file.load()
+        head, several = _header(file), file.frames > 1
+        samples = file.load()
         encoding = None if file.profile else file.encoding()
         pixels, colour_note = colour.convert(samples.colours, file.profile, encoding)
         alpha = samples.alpha
@@ -494,7 +503,7 @@ def decode(path: Path) -> Picture:
                 f"it has {pixels.shape[1]} x {pixels.shape[0]} pixels, not {head.size}"
             )
         notes = [note for note in (file.note, samples.note, colour_note) if note]
-        if file.frames > 1:
+        if several:
             notes.append("only the first image of the file read")
         return Picture(np.ascontiguousarray(pixels), alpha, head.orientation, tuple(notes))
 

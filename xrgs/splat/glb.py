@@ -42,6 +42,7 @@ if TYPE_CHECKING:
     Json = dict[str, Any]
 
 EXTENSION = "KHR_gaussian_splatting"
+_READ_EXTENSIONS = {EXTENSION, "KHR_mesh_quantization"}  # of those that a file may require
 _MAGIC, _VERSION, _JSON, _BINARY = 0x46546C67, 2, 0x4E4F534A, 0x004E4942
 _MAX_JSON = 1 << 24  # bytes
 _POINTS = 0
@@ -224,6 +225,8 @@ def read_glb(path: Path) -> SavedGaussians:
 
 def _read(path: Path, content: bytes) -> SavedGaussians:
     description, binary = _chunks(content)
+    if needed := set(description.get("extensionsRequired", ())) - _READ_EXTENSIONS:
+        raise ValueError(f"{', '.join(sorted(needed))} is not read")
     node, primitive = _model(description)
     extension = primitive["extensions"][EXTENSION]
     if "extensions" in extension:
@@ -301,15 +304,16 @@ def _array(description: Json, binary: bytes, number: int) -> NDArray[np.float64]
 
 
 def _gaussians(arrays: Mapping[str, NDArray[np.float64]]) -> Gaussians:
-    names = next(
-        names
-        for degree in range(MAX_DEGREE, -1, -1)
-        if (names := _harmonics(bases(degree))).keys() <= arrays.keys() or degree == 0
-    )
+    bands = [_harmonics(bases(degree)) for degree in range(MAX_DEGREE + 1)]
+    names = max((of for of in bands if of.keys() <= arrays.keys()), key=len, default=bands[0])
     widths = {"POSITION": 3, **dict.fromkeys(names, 3)}
     widths |= {
-        f"{EXTENSION}:{name}": n for name, n in (("ROTATION", 4), ("SCALE", 3), ("OPACITY", 1))
+        f"{EXTENSION}:{name}": width
+        for name, width in (("ROTATION", 4), ("SCALE", 3), ("OPACITY", 1))
     }
+    # A draft of the extension had other names; a band that is not whole would be left out.
+    if differing := sorted(widths.keys() ^ arrays.keys()):
+        raise ValueError(f"has too few or too many attributes: {', '.join(differing)}")
     for name, width in widths.items():
         if arrays[name].shape != (len(arrays["POSITION"]), width):
             raise ValueError(f"{name} is {list(arrays[name].shape)}, which does not fit")

@@ -6,6 +6,7 @@ argument that is not served raises an error that names it.
 
 from __future__ import annotations
 
+import operator
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple, get_args
 
 import torch
@@ -149,8 +150,11 @@ def rasterization(
 
     Raises:
         NotImplementedError: An argument has a value that is not served; the message names it.
-        ValueError: A tensor has a wrong shape or type, or values that are not finite; a camera is
-            not rigid or has skew. The message names the argument.
+        TypeError: An argument is no tensor, as a numpy array or None, or `width`, `height` or
+            `sh_degree` is no whole number. The message names the argument.
+        ValueError: A tensor has a wrong shape, is not float32 or float64, or has values that are
+            not finite; opacities are outside 0..1; a camera is not rigid or has skew. The message
+            names the argument.
     """
     _refuse(
         sparse_grad=sparse_grad,
@@ -168,10 +172,16 @@ def rasterization(
     )
     _check_choice("render_mode", render_mode, get_args(RenderMode))
     _check_choice("rasterize_mode", rasterize_mode, get_args(RasterizeMode))
-    backend = backend_for(means, backend)
     shapes = _Shapes(means, quats, scales, opacities)
+    _check_tensors({**shapes._asdict(), "colors": colors, "viewmats": viewmats, "Ks": Ks})
+    if backgrounds is not None:
+        _check_tensors({"means": means, "backgrounds": backgrounds})
+    width, height = _whole("width", width), _whole("height", height)
+    sh_degree = None if sh_degree is None else _whole("sh_degree", sh_degree)
+    backend = backend_for(means, backend)
     cameras = _cameras(viewmats, Ks, width, height)
     _check_shapes(shapes, colors, len(cameras), sh_degree, backgrounds)
+    _check_values(shapes, colors)
     settings = RasterSettings(
         near=near_plane,
         eps2d=eps2d,
@@ -214,11 +224,56 @@ def _check_choice(name: str, value: str, choices: tuple[str, ...]) -> None:
         raise ValueError(f"{name} must be one of {', '.join(choices)}, got {value!r}")
 
 
+def _check_tensors(values: dict[str, Tensor]) -> None:
+    """Check that values are float tensors on the CPU; those of Gaussians of the type of means."""
+    for name, value in values.items():
+        if not isinstance(value, torch.Tensor):
+            got = "None" if value is None else type(value).__name__
+            raise TypeError(f"{name} must be a torch.Tensor, got {got}")
+        if value.device.type != "cpu":
+            raise ValueError(
+                f"{name} is on {value.device}: xrgs renders on the CPU, use {name}.cpu()"
+            )
+        if value.dtype not in {torch.float32, torch.float64}:
+            raise ValueError(
+                f"{name} must be float32 or float64, got {value.dtype}; use {name}.float()"
+            )
+        of_camera = name in {"viewmats", "Ks"}
+        if not of_camera and value.dtype != values["means"].dtype:
+            raise ValueError(
+                f"{name} must be of the type of means, {values['means'].dtype}, got {value.dtype}"
+            )
+
+
+def _whole(name: str, value: int) -> int:
+    try:
+        return operator.index(value)
+    except TypeError:
+        raise TypeError(f"{name} must be a whole number, got {value!r}") from None
+
+
+def _check_values(shapes: _Shapes, colors: Tensor) -> None:
+    """Check the values of all Gaussians: the rasterizer sees those alone that are drawn."""
+    for name, value in (*shapes._asdict().items(), ("colors", colors)):
+        if not torch.isfinite(value).all():
+            raise ValueError(f"{name} has values that are not finite")
+    if (shapes.scales < 0).any():
+        raise ValueError(
+            "scales has values below 0; gsplat takes them as positive, use scales.abs()"
+        )
+    if ((shapes.opacities < 0) | (shapes.opacities > 1)).any():
+        raise ValueError("opacities has values outside 0..1; are these logits? use .sigmoid()")
+
+
 def _check_shapes(
     shapes: _Shapes, colors: Tensor, cameras: int, sh_degree: int | None, backgrounds: Tensor | None
 ) -> None:
     """Check the shapes that the code below relies on."""
-    count = len(shapes.means) if shapes.means.ndim else 0
+    if shapes.means.ndim != 2:
+        raise ValueError(
+            f"means must be [N, 3], without a batch before it, got {list(shapes.means.shape)}"
+        )
+    count = len(shapes.means)
     for (name, value), tail in zip(shapes._asdict().items(), ((3,), (4,), (3,), ()), strict=True):
         if value.shape != (count, *tail):
             raise ValueError(f"{name} must be {[count, *tail]}, got {list(value.shape)}")
@@ -229,7 +284,9 @@ def _check_shapes(
         if not 0 <= sh_degree <= MAX_DEGREE:
             raise ValueError(f"sh_degree must be 0 to {MAX_DEGREE}, or None, got {sh_degree}")
         tail_ndim, expected = 2, f"[N, K, 3] or [C, N, K, 3] with K of at least {bases(sh_degree)}"
-        is_wide_enough = colors.shape[-1] == 3 and colors.shape[-2] >= bases(sh_degree)
+        is_wide_enough = (
+            colors.ndim > 2 and colors.shape[-1] == 3 and colors.shape[-2] >= bases(sh_degree)
+        )
     prefix = colors.shape[: max(0, colors.ndim - tail_ndim)]
     if prefix not in {(count,), (cameras, count)} or not is_wide_enough:
         raise ValueError(

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from PIL import Image
+from PIL import Image, ImageEnhance
 
 from xrgs.capture import images
 from xrgs.capture.scenes import folder
@@ -244,6 +244,48 @@ def test_images_of_one_channel_with_the_names_of_photographs_are_left_out(tmp_pa
     found = below(tmp_path)
     assert {file.parent.name for file in found.files.values()} == {"rgb"}
     assert "6 images left out" in found.notes[0]
+
+
+@pytest.mark.parametrize("sibling", ["input", "stereo"])
+def test_of_photographs_and_what_colmap_undistorted_the_photographs_are_taken(
+    tmp_path: Path, sibling: str
+) -> None:
+    for name in ("sparse/0", "stereo" if sibling == "stereo" else "input"):
+        (tmp_path / name).mkdir(parents=True)
+    shoot(tmp_path / "images", size=(158, 119), first=30)
+    shoot(tmp_path / "images_2", size=(79, 60), first=30)
+    assert {file.parent.name for file in below(tmp_path, 80).files.values()} == {"images"}
+    shoot(tmp_path / "input")
+    found = below(tmp_path)
+    assert {file.parent.name for file in found.files.values()} == {"input"}
+    assert "6 in images, 6 in images_2 (copies that COLMAP undistorted)" in found.notes[0]
+
+
+def test_folders_of_the_system_are_left_out(tmp_path: Path) -> None:
+    shoot(tmp_path / "day")
+    shoot(tmp_path / "@eaDir" / "IMG_0.jpg", 2, first=40)
+    shoot(tmp_path / ".thumbnails", first=50)
+    (tmp_path / "day" / "._IMG_0.jpg").write_bytes(b"AppleDouble")
+    found = below(tmp_path)
+    assert names(tmp_path, found) == [f"day/{name}" for name in ORIGINALS]
+    assert found.notes == ("images left out: 2 in @eaDir (folders of the system)",)
+
+
+def test_a_photograph_that_was_edited_is_taken_once(tmp_path: Path) -> None:
+    shoot(tmp_path)
+    for name, number in (("IMG_E1.jpg", 1), ("IMG_2-edited.jpg", 2)):
+        ImageEnhance.Brightness(picture(number)).enhance(0.9).save(tmp_path / name)
+    assert names(tmp_path, folder.look(str(tmp_path), 0)) == ORIGINALS
+
+
+def test_dark_photographs_of_one_name_stay(tmp_path: Path) -> None:
+    for day in range(2):
+        for number in range(3):
+            file = tmp_path / f"night{day}" / f"{number}.png"
+            file.parent.mkdir(exist_ok=True)
+            dark = ImageEnhance.Brightness(picture(10 * day + number)).enhance(0.02)
+            dark.resize((160 - 40 * day, 120 - 30 * day)).save(file)
+    assert len(below(tmp_path).files) == 6
 
 
 def test_grey_photographs_stay(tmp_path: Path) -> None:

@@ -48,9 +48,14 @@ _MADE = {
     "a cell of xrgs": ("config.json", "identity.json"),
     "a report of xrgs": ("cells.csv", "table.md"),
     "an export of xrgs": ("split.json", "transform.json"),
-    "photographs that COLMAP undistorted": ("images", "sparse", "stereo"),
 }
-_MASKS = "masks"
+#: What else is not taken with `/**`, in words for people.
+_MASKS, _LINKS, _SYSTEM = "masks", "links to folders are not followed", "folders of the system"
+_UNDISTORTED = "copies that COLMAP undistorted"
+#: Folders of thumbnails, of what was deleted, and of other files that systems keep beside files.
+_OF_SYSTEM = frozenset(
+    {"#recycle", "$recycle.bin", "@eadir", "__macosx", "lost+found", "system volume information"}
+)
 _MASK = r"masks?|segmentations?|seg|segments|mattes?|silhouettes?"
 #: The names of folders of masks, and of other images that programs make of photographs.
 _OF_MASKS = re.compile(rf"(?:.*[\W_])?(?:{_MASK})(?:[\W_\d].*)?", re.IGNORECASE)
@@ -175,6 +180,8 @@ def _all_below(folder: Path, long_side: int, masks: Path | None) -> _Found:
     """List the photographs in a folder and all below it, of LLFF scenes those of one size."""
     passed: dict[str, list[Path]] = defaultdict(list)
     tree = {inside: _images_in(inside) for inside in _folders(folder, passed, masks)}
+    if not any(tree.values()):  # the undistorted ones are all there is
+        tree |= {inside: _images_in(inside) for inside in passed.pop(_UNDISTORTED, ())}
     dropped, notes = _other_sizes(tree, long_side)
     root = folder.resolve()
     for what in sorted(passed.keys() - {_MASKS}):
@@ -215,7 +222,7 @@ def _folders(
         if inside.name.startswith(".") or not inside.is_dir() or inside.resolve() == masks:
             continue
         if inside.is_symlink():
-            passed["links to folders are not followed"].append(inside)
+            passed[_LINKS].append(inside)
         elif what := _made_by_programs(inside):
             passed[what].append(inside)
         else:
@@ -224,6 +231,12 @@ def _folders(
 
 def _made_by_programs(folder: Path) -> str:
     """Say what a folder holds in place of photographs; empty where it may hold photographs."""
+    if folder.name.casefold() in _OF_SYSTEM:
+        return _SYSTEM
+    # `image_undistorter` makes stereo/; 3DGS's script keeps the photographs in input/.
+    beside = {name for name in ("input", "sparse", "stereo") if (folder.parent / name).is_dir()}
+    if SIZES.fullmatch(folder.name) and "sparse" in beside and len(beside) > 1:
+        return _UNDISTORTED
     if _OF_MASKS.fullmatch(folder.name):
         return _MASKS
     if _OF_OTHERS.fullmatch(folder.name):
@@ -305,22 +318,21 @@ def _has_colour(file: Path) -> bool:
 
 
 def _made_of_others(files: Sequence[Path]) -> set[Path]:
-    """Find masks, depth maps and thumbnails that lie beside the photographs, or have their names.
+    """Find masks, depth maps and thumbnails by the names of their photographs.
 
-    These are `a.jpg.png` and `a_mask.png` beside `a.jpg`, and an image of one channel where another
-    one of the same name has colours.
+    These are `a.jpg.png` and `a_mask.png` where there is an `a.jpg`, and an image of one channel
+    where another one of the same name has colours.
     """
-    there = {(file.parent, name.casefold()) for file in files for name in (file.name, file.stem)}
+    names = {file.name.casefold() for file in files}
     named = defaultdict(list)
     for file in files:
         named[file.stem.casefold()].append(file)
     made = set()
     for stem, group in named.items():
-        others = {stem, _ADDED_BEFORE.sub("", stem), _ADDED_AFTER.sub("", stem)} - {stem}
-        if Path(stem).suffix in SUFFIXES:
-            others.add(stem)
-        made |= {file for file in group if any((file.parent, name) in there for name in others)}
-        if len(group) > 1 and any(map(_has_colour, group)):
+        plain = {_ADDED_BEFORE.sub("", stem), _ADDED_AFTER.sub("", stem)} - {stem}
+        if stem in names or plain & named.keys():
+            made |= {*group}
+        elif len(group) > 1 and any(map(_has_colour, group)):
             made |= {file for file in group if not _has_colour(file)}
     return made
 
