@@ -298,11 +298,10 @@ def _text_images(file: Path) -> Iterator[_Image]:
         if not line:
             continue
         with _line(file, number, "IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME"):
-            own, *pose, camera, name = line.split(maxsplit=9)  # a name may have spaces
-            values = [float(value) for value in pose]
-            image = _Image(
-                int(own), name, values[:4], values[4:], int(camera), np.zeros(0, np.uint64)
-            )
+            # A name may have spaces.
+            own, qw, qx, qy, qz, tx, ty, tz, camera, name = line.split(maxsplit=9)
+            turn, place = [*map(float, (qw, qx, qy, qz))], [*map(float, (tx, ty, tz))]
+            image = _Image(int(own), name, turn, place, int(camera), np.zeros(0, np.uint64))
         below, features = next(lines, (number + 1, ""))
         with _line(file, below, f"X Y POINT3D_ID of each feature of {name}, or empty"):
             words = features.split()
@@ -318,11 +317,11 @@ def _text_points(file: Path) -> _Points:
         if line:
             with _line(file, number, "POINT3D_ID X Y Z R G B ERROR TRACK"):
                 own, *values = line.split(maxsplit=8)[:8]
-                numbers.append(int(own))
+                numbers.append(np.uint64(int(own)))
                 x, y, z, r, g, b, error = map(float, values)
                 rows.append((x, y, z, r, g, b, error))
     table = np.array(rows, np.float64).reshape(-1, 7)
-    colors = np.clip(table[:, 3:6], 0, 255).astype(np.uint8)
+    colors = np.nan_to_num(table[:, 3:6]).clip(0, 255).astype(np.uint8)
     return _Points(np.array(numbers, np.uint64), table[:, :3], colors, table[:, 6])
 
 
