@@ -69,7 +69,9 @@ def test_empty_files_are_no_copies_of_each_other(tmp_path: Path) -> None:
     assert not found.notes
 
 
-@pytest.mark.parametrize("name", ["IMG_3_small.jpg", "small-IMG_3.png", "IMG_3.png", "IMG_3 2.jpg"])
+@pytest.mark.parametrize(
+    "name", ["IMG_3_small.jpg", "small-IMG_3.png", "IMG_3.png", "IMG_3 2.jpg", "IMG_3half.jpg"]
+)
 def test_a_resized_copy_in_the_folder_is_left_out(tmp_path: Path, name: str) -> None:
     shoot(tmp_path)
     write(tmp_path / name, 3, (80, 60))
@@ -235,15 +237,22 @@ def test_masks_beside_their_photographs_are_left_out(tmp_path: Path, name: str) 
     assert name in found.notes[0]
 
 
-def test_images_of_one_channel_with_the_names_of_photographs_are_left_out(tmp_path: Path) -> None:
-    shoot(tmp_path / "rgb")
+@pytest.mark.parametrize("mode", ["L", "RGB"])
+def test_masks_with_the_names_of_photographs_are_left_out_in_any_folder(
+    tmp_path: Path, mode: str
+) -> None:
+    shoot(tmp_path)
+    (tmp_path / "labels").mkdir()
     for number in range(6):
-        file = tmp_path / "labels" / f"IMG_{number}.png"
-        write(file, number)
-        picture(number + 20).convert("L").save(file)
+        mask = picture(number + 20).convert("L")
+        mask = mask if mode == "L" else mask.point(lambda grey: 255 * (grey > 99)).convert("RGB")
+        mask.save(tmp_path / "labels" / f"IMG_{number}.png")
     found = below(tmp_path)
-    assert {file.parent.name for file in found.files.values()} == {"rgb"}
+    assert names(tmp_path, found) == ORIGINALS
     assert "6 images left out" in found.notes[0]
+    assert folder.look(str(tmp_path), 0).notes == (
+        f"images left out: 6 in labels (masks; scene.masks={tmp_path / 'labels'} uses them)",
+    )
 
 
 @pytest.mark.parametrize("sibling", ["input", "stereo"])
