@@ -100,12 +100,21 @@ def load_ply(path: str | Path) -> Gaussians:
         path: The .ply file.
 
     Returns:
-        float32 leaf tensors with gradients on. `load_gaussians` also says how to render them.
+        float32 leaf tensors with gradients on. A warning says that they are antialiased where the
+        file does; `load_gaussians` returns it.
 
     Raises:
         XrgsError: The file is missing, damaged or no such .ply; the message names it.
     """
-    return read_ply(Path(path) if isinstance(path, str) else path).gaussians
+    path = Path(path) if isinstance(path, str) else path
+    gaussians, antialiased = read_ply(path)
+    if antialiased:
+        _log.warning(
+            "%s says that its Gaussians are antialiased: render them with "
+            "RasterSettings(antialiased=True). xrgs.load_gaussians returns this, without a warning",
+            path,
+        )
+    return gaussians
 
 
 def read_ply(path: Path) -> SavedGaussians:
