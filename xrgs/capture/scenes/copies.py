@@ -168,13 +168,16 @@ def without_copies(
         if copy not in alike and original not in alike and _show_the_same(a, b):
             alike[copy] = original
     notes = []
-    for what, pairs in (("the same bytes", same), ("the same picture", alike)):
+    for what, pairs in (
+        ("identical copies (the same bytes)", same),
+        ("copies in another size or format (the same picture)", alike),
+    ):
         if pairs:
             names = [
-                f"{copy.relative_to(folder)} (as {original.relative_to(folder)})"
+                f"{copy.relative_to(folder)} (of {original.relative_to(folder)})"
                 for copy, original in sorted(pairs.items())
             ]
-            notes.append(f"{len(pairs)} left out, {what} as another photograph: {listed(names)}")
+            notes.append(f"{len(pairs)} left out as {what}: {listed(names)}")
     return [file for file in left if file not in alike], notes
 
 
