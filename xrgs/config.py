@@ -246,6 +246,16 @@ class NaturalSelectionConf:
 
 
 @dataclass(kw_only=True)
+class ExposureConf:
+    """A learned colour map of each photograph; not in the paper."""
+
+    mode: str = off("none")
+    lr: float
+    lr_final: float
+    prior: float
+
+
+@dataclass(kw_only=True)
 class CountMatchedConf:
     """A cell with as many Gaussians as another one (`xrgs.training.count_matching`)."""
 
@@ -274,6 +284,7 @@ class ComponentsConf:
     multiview_score: MultiviewScoreConf
     error_score: ErrorScoreConf
     natural_selection: NaturalSelectionConf
+    exposure: ExposureConf
     count_matched: CountMatchedConf
     # `off` declares no default, so that instances share no dict.
     plugins: dict[str, Any] = off({})  # noqa: RUF009

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from tests.capture.made_files import DISPLAY_P3, profile
 from xrgs.capture import images
 from xrgs.capture.photographs import assign_cameras, largest_of_shape, prepare_hr_views
 from xrgs.capture.scenes import Scene
@@ -202,21 +203,43 @@ def test_a_photograph_that_cant_be_read_now_is_not_left_out(
         prepare_hr_views(scene_of(*files), CONF, tmp_path)
 
 
-def test_a_depth_map_is_left_out_beside_photographs(tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("suffix", "kind"), [("png", np.uint16), ("tif", np.uint16), ("tif", np.float32)]
+)
+def test_a_depth_map_is_left_out_beside_photographs(
+    tmp_path: Path, suffix: str, kind: type[np.generic]
+) -> None:
     files = [write_photograph(tmp_path / f"{name}.png") for name in "ab"]
-    depth = tmp_path / "depth.png"
-    Image.fromarray(np.zeros((400, 600), np.uint16)).save(depth)
+    depth = tmp_path / f"depth.{suffix}"
+    Image.fromarray(np.zeros((400, 600), kind)).save(depth)
     photos = prepare_hr_views(scene_of(*files, depth), replace(CONF, long_side=60), tmp_path)
     assert [photo.hr.resized for photo in photos.all] == [(60, 40)] * 2
     (note,) = photos.notes
-    assert note.startswith("left out: depth.png (taken for a depth map: one channel of 16 bits")
+    assert note.startswith(f"left out: depth.{suffix} (taken for a depth map: it has one channel")
+
+
+def test_photographs_that_are_all_grey_of_16_bits_are_photographs(tmp_path: Path) -> None:
+    files = [tmp_path / f"{name}.png" for name in "ab"]
+    grey = np.tile(np.linspace(0, 65535, 60).astype(np.uint16), (40, 1))
+    for file in files:
+        Image.fromarray(grey).save(file)
+    photos = prepare_hr_views(scene_of(*files), CONF, tmp_path)
+    assert photos.notes == ()
+    assert np.abs(photos.read("hr", 0) - (grey / 65535)[..., None]).max() <= 0.5 / 255 + 1e-6
 
 
 def test_what_was_done_is_said_once_for_each_kind(tmp_path: Path) -> None:
     files = [write_photograph(tmp_path / f"{name}.png", orientation=6) for name in "ab"]
+    for name in "cd":
+        files.append(tmp_path / f"{name}.png")
+        icc = profile("A phone's", 2.2, DISPLAY_P3)
+        Image.new("RGB", (60, 40), "red").save(files[-1], icc_profile=icc)
     photos = prepare_hr_views(scene_of(*files), CONF, tmp_path)
-    assert photos.notes == ("turned upright by EXIF: a.png, b.png",)
-    assert [photo.orientation for photo in photos.all] == [6, 6]
+    assert photos.notes == (
+        "converted from A phone's to sRGB: c.png, d.png",
+        "turned upright by EXIF: a.png, b.png",
+    )
+    assert [photo.orientation for photo in photos.all] == [6, 6, 1, 1]
 
 
 def write_cutout(file: Path, hidden: int) -> Path:

@@ -30,6 +30,7 @@ MORE_IS_BETTER = {
     "ssim": True,
     "psnr": True,
     "psnr_plain": True,
+    "psnr_fitted": True,
     "evaluations": False,
 }
 
@@ -142,7 +143,7 @@ def test_lpips_is_the_networks_distance_where_there_are(
 def test_the_rows_of_the_tables() -> None:
     better_high = {metric.name: metric.higher_is_better for metric in metrics.METRICS}
     assert better_high == MORE_IS_BETTER
-    assert list(metrics.VIEW_METRICS) == ["lpips", "ssim", "psnr", "psnr_plain"]
+    assert list(metrics.VIEW_METRICS) == ["lpips", "ssim", "psnr", "psnr_plain", "psnr_fitted"]
     units = {metric.name: metric.unit for metric in metrics.METRICS if metric.unit}
     assert units == {
         "training_time_s": "s",
@@ -151,6 +152,7 @@ def test_the_rows_of_the_tables() -> None:
         "peak_rss_bytes": "bytes",
         "psnr": "dB",
         "psnr_plain": "dB",
+        "psnr_fitted": "dB",
     }
 
 
@@ -214,6 +216,32 @@ def test_psnr_inside_a_mask_is_of_its_pixels() -> None:
     assert metrics.psnr_plain(image, target, None) is None
 
 
+@pytest.mark.parametrize("mask", [None, half_mask()])
+def test_psnr_after_a_fit_is_that_of_least_squares(mask: Tensor | None) -> None:
+    image, target = pair()
+    used = slice(None) if mask is None else mask.flatten().numpy()
+    rows = image.double().reshape(-1, 3).numpy()[used]
+    rows = np.concatenate([rows, np.ones((len(rows), 1))], axis=1)
+    wanted = target.double().reshape(-1, 3).numpy()[used]
+    found = (rows @ np.linalg.lstsq(rows, wanted, rcond=None)[0]).clip(0, 1)
+    expected = -10 * math.log10(((found - wanted) ** 2).mean())
+    assert metrics.psnr_fitted(image, target, mask) == pytest.approx(expected, rel=1e-9)
+    plain = metrics.psnr(image, target, mask)
+    assert plain is not None
+    assert expected > plain + 0.1
+
+
+def test_a_colour_map_of_the_photograph_costs_nothing_after_a_fit() -> None:
+    _, target = pair()
+    colors = torch.tensor([[0.6, 0.1, 0.0], [0.0, 0.8, 0.1], [0.1, 0.0, 0.7]])
+    fitted = metrics.psnr_fitted(target @ colors + 0.1, target)
+    assert fitted is not None
+    assert fitted > 120
+    flat = metrics.psnr_fitted(torch.full_like(target, 0.5), target)  # no unique map
+    centred = target - target.mean(dim=(0, 1))
+    assert flat == pytest.approx(-10 * math.log10(centred.square().mean()), abs=1e-4)
+
+
 def test_ssim_inside_a_mask_is_the_mean_of_the_definition_there() -> None:
     (image, target), mask = pair(), half_mask()
     composed = image.where(mask[..., None], target)
@@ -239,6 +267,7 @@ def test_views_that_are_scored_together_have_the_same_scores() -> None:
         "ssim": metrics.ssim(image, target),
         "psnr": metrics.psnr(image, target),
         "psnr_plain": None,
+        "psnr_fitted": metrics.psnr_fitted(image, target),
     }
     assert metrics.score_view(image, target, None, masked=True) == plain | {
         "psnr_plain": plain["psnr"]

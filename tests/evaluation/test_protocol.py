@@ -36,7 +36,7 @@ def view(data: Dataset) -> LoadedView:
     width, height = 240, 180
     noise = torch.rand(height, width, 3, generator=torch.Generator().manual_seed(1))
     K = torch.tensor([[width, 0.0, width / 2], [0.0, width, height / 2], [0.0, 0.0, 1.0]])
-    return replace(data.test[0], camera=Camera(torch.eye(4), K, width, height), image=noise)
+    return replace(data.test[0], camera=Camera(torch.eye(4), K, width, height), pixels=noise)
 
 
 def test_scores_and_pngs_are_of_the_render_with_all_sh_degrees(

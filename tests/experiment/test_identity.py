@@ -268,7 +268,7 @@ def test_a_metric_makes_scores_stale_and_no_training(package: Path, confs: dict[
     edit = edited(package / "evaluation/metrics/psnr.py", "10 *", "11 *")
     assert ids_after(edit, confs)[1] == set()
     scoring.scoring_code.cache_clear()
-    assert scoring.stale_scores(before) == ["psnr"]
+    assert scoring.stale_scores(before) == ["psnr", "psnr_plain", "psnr_fitted"]
 
 
 def test_scores_that_are_missing_or_of_other_code_are_stale(

@@ -7,7 +7,6 @@ random, or cut at every place. A parser may not raise another error, take 2 CPU 
 
 from __future__ import annotations
 
-import atexit
 import io
 import json
 import pickle
@@ -17,7 +16,7 @@ import tarfile
 import tempfile
 import time
 import warnings
-import zlib
+import zlib  # pycolmap corrupts the heap where it is imported before zlib
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -27,12 +26,12 @@ from random import Random
 
 import msgspec
 import numpy as np
+import pycolmap
 import pytest
 import torch
 
 from tests import reference_store
 from tests.capture.made_files import DISPLAY_P3, png, profile
-from tests.capture.poses.test_colmap import with_features
 from tests.hostile.mutations import (
     Mutation,
     mutate_bytes,
@@ -45,7 +44,6 @@ from xrgs import composing
 from xrgs.capture import colmap, frozen, images, poses
 from xrgs.capture.folders import read_failure
 from xrgs.capture.photographs import PhotoCollection, prepare_hr_views
-from xrgs.capture.poses import colmap as given_colmap
 from xrgs.capture.scenes import Scene
 from xrgs.capture.scenes.rendered import RenderedScene
 from xrgs.errors import StoreError, XrgsError
@@ -115,28 +113,6 @@ def points(_: Path) -> bytes:
     return (header + "end_header\n").encode() + bytes(75)
 
 
-@cache
-def colmap_model(form: str) -> Path:
-    """A model of COLMAP whose images observe its points; the folder is removed at exit."""
-    home = tempfile.TemporaryDirectory()
-    atexit.register(home.cleanup)
-    return with_features(Path(home.name), form=form)
-
-
-def colmap_file(name: str) -> Parser:
-    """One file of a model, whose other files are whole."""
-    form = "text" if name.endswith(".txt") else "binary"
-
-    def read(file: Path) -> object:
-        for other in colmap_model(form).glob("*.*"):
-            if other.name != name:
-                shutil.copy(other, file.with_name(other.name))
-        given = given_colmap.read(file.parent)
-        return [given.camera(image, (102, 76)) for image in given.names]
-
-    return Parser(lambda _: (colmap_model(form) / name).read_bytes(), mutate_bytes, read)
-
-
 def gaussians(suffix: str) -> Parser:
     """A file of Gaussians that `xrgs-data export` writes."""
 
@@ -156,6 +132,40 @@ def transforms(_: Path) -> bytes:
 
 def poses_of(file: Path) -> object:
     return poses.read_poses(str(file), photographs(file.parent))
+
+
+#: A model of COLMAP, of two images and five points.
+TEXT_MODEL = {
+    "cameras.txt": "1 OPENCV 40 30 50 50 20 15 0.1 0 0.01 0\n",
+    "images.txt": "".join(
+        f"{i} 1 0 0 0 {i} 0 4 1 {name}.png\n3 4 1 5 6 -1\n" for i, name in enumerate("ab", 1)
+    ),
+    "points3D.txt": "".join(
+        f"{i} {i} 0 1 90 80 70 0.5{' 1 0 2 0' * (i == 1)}\n" for i in range(1, 6)
+    ),
+}
+
+
+def model_of(file: Path) -> object:
+    """Read the poses of a model, of which one file may be mutated."""
+    names = [name.replace(".txt", file.suffix) for name in TEXT_MODEL]
+    for name in set(names) - {file.name}:
+        if not (file.parent / name).exists():
+            (file.parent / name).write_bytes(colmap_file(name)(file.parent))
+    return poses.read_poses(str(file.parent), photographs(file.parent))
+
+
+def colmap_file(name: str) -> Callable[[Path], bytes]:
+    def content(_: Path) -> bytes:
+        if name in TEXT_MODEL:
+            return TEXT_MODEL[name].encode()
+        with tempfile.TemporaryDirectory() as folder:
+            for text_name, text in TEXT_MODEL.items():
+                (Path(folder) / text_name).write_text(text)
+            pycolmap.Reconstruction(folder).write_binary(folder)
+            return (Path(folder) / name).read_bytes()
+
+    return content
 
 
 @cache
@@ -242,15 +252,15 @@ PARSERS = {
         for form in ("PNG", "JPEG", "BMP", "TIFF", "WEBP")
     },
     "deep.png": Parser(deep, mutate_image, look, (images.ImageError,)),
-    **{
-        f"colmap/{name}{suffix}": colmap_file(f"{name}{suffix}")
-        for name in ("cameras", "images", "points3D")
-        for suffix in (".bin", ".txt")
-    },
     **{f"splats{suffix}": gaussians(suffix) for suffix in (".glb", ".spz")},
     "splats.ply": Parser(of_store("cells/*/splats.ply"), mutate_bytes, load_ply),
     "points.ply": Parser(points, mutate_bytes, colmap.read_points),
     "transforms.json": Parser(transforms, mutate_json, poses_of),
+    **{
+        name: Parser(colmap_file(name), mutate_bytes, model_of)
+        for text_name in TEXT_MODEL
+        for name in (text_name, text_name.replace(".txt", ".bin"))
+    },
     "weights.pickle": Parser(
         pickled, mutate_bytes, lambda file: weights.read_pickle(file.read_bytes(), "file")
     ),

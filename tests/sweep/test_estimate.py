@@ -20,6 +20,8 @@ from xrgs.safeio.atomic import write_json
 from xrgs.sweep import estimate
 from xrgs.sweep.estimate import TORCH_SLOWDOWN, Cost, CostEstimator
 
+#: The bytes that training holds of the photographs of each variant.
+HELD = {"v": 200_000_000, "large": 3_200_000_000}
 START = datetime(2026, 1, 1, tzinfo=UTC)
 
 
@@ -80,7 +82,7 @@ def past(cells: Any, monkeypatch: pytest.MonkeyPatch) -> Past:
     def sizes(_: Path, variant: str, __: str) -> estimate._Sizes:
         if variant not in made.sides:
             raise StoreError("damaged")
-        return estimate._Sizes(made.sides[variant] ** 2, made.sides[variant] ** 2)
+        return estimate._Sizes(made.sides[variant] ** 2, made.sides[variant] ** 2, HELD[variant])
 
     monkeypatch.setattr(estimate, "_sizes", sizes)
     return made
@@ -113,7 +115,8 @@ def test_pixels_scale_the_time_and_the_memory(past: Past) -> None:
     past.add(100.0)
     found = past.cost(variant="large")
     assert found.seconds == pytest.approx(100 * (4 + 1) / 2)
-    assert found.memory_bytes == pytest.approx(1e9 * (4 + 1) / 2)
+    # The photographs of that variant take 3 GB more, whatever the size of one.
+    assert found.memory_bytes == pytest.approx((1e9 - 2e8) * (4 + 1) / 2 + 32e8)
     # Of a variant that is not built, or can't be read, the nearest known sizes are taken.
     assert past.cost(variant=None) == past.cost(variant="unreadable") == past.cost()
 
@@ -157,9 +160,13 @@ def test_damaged_cells_are_left_out(past: Past, spoilt: str) -> None:
     ("views", "pixels"),
     [("mixed", 1000 * (10 + 40) / 2), ("hr_only", 40_000), ("lr_only", 10_000), ("all_hr", 40_000)],
 )
+@pytest.mark.parametrize("kept", [500_000, 1 << 28])
 def test_the_sizes_are_those_of_the_views_that_are_trained_on(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, views: str, pixels: float
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, views: str, pixels: float, kept: int
 ) -> None:
+    monkeypatch.setattr(estimate, "KEPT_BYTES", kept)
+    estimate._sizes.cache_clear()
+
     def view(name: str, split: str, tag: str, side: int) -> SimpleNamespace:
         return SimpleNamespace(name=name, split=split, tag=tag, width=side, height=side)
 
@@ -176,4 +183,7 @@ def test_the_sizes_are_those_of_the_views_that_are_trained_on(
 
     monkeypatch.setattr(frozen, "read_manifest", read)
     largest = 10_000 if views == "lr_only" else 40_000
-    assert estimate._sizes(tmp_path, "k-1", views) == (pixels, largest)
+    sizes = estimate._sizes(tmp_path, "k-1", views)
+    assert (sizes.pixels, sizes.largest) == (pixels, largest)
+    trained = {"mixed": 50_000, "all_hr": 80_000}.get(views, largest)
+    assert sizes.held_bytes == 3 * (trained + 999**2) + min(kept, 24 * trained)

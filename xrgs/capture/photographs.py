@@ -417,7 +417,7 @@ def _read_headers(
         for name in depth:
             del headers[name]
             left_out[name] = (
-                "taken for a depth map: one channel of 16 bits, where others have colour or 8 bits"
+                "taken for a depth map: it has one channel of more than 8 bits, and others have not"
             )
     return headers, left_out
 

@@ -2,7 +2,8 @@
 
 The config of the nearest cell differs in the fewest keys; another variant, processor or backend
 counts as several keys. Seconds, memory and disk are scaled by steps, pixels and the budget of
-Gaussians. A store without finished cells gives no estimate.
+Gaussians; the memory of the photographs is computed. A store without finished cells gives no
+estimate.
 """
 
 from __future__ import annotations
@@ -12,7 +13,6 @@ from contextlib import suppress
 from dataclasses import asdict, dataclass
 from datetime import datetime
 from functools import cache
-from statistics import fmean
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from xrgs.capture import frozen
@@ -20,6 +20,7 @@ from xrgs.capture.folders import trimmed_folder
 from xrgs.errors import StoreError, XrgsError
 from xrgs.experiment.provenance import processor, this_processor
 from xrgs.splat.backend import resolve_backend
+from xrgs.splat.settings import KEPT_BYTES
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping
@@ -36,6 +37,8 @@ _MAX_CELLS = 500
 TORCH_SLOWDOWN = 50.0
 #: The most seconds that count as loading and scoring. A store that was copied has other dates.
 _MAX_OVERHEAD_S = 600.0
+#: Bytes of a pixel in 8 bits, and in float32.
+_RGB_BYTES, _FLOAT_RGB_BYTES = 3, 12
 #: Keys that count as this many differing ones, in the distance of two cells.
 _OTHER_VARIANT, _OTHER_PROCESSOR, _OTHER_BACKEND = 3, 5, 100
 
@@ -47,6 +50,8 @@ class _Sizes(NamedTuple):
     """Mean over the training views."""
     largest: int
     """Pixels of the largest training view, the unit of budgets of Gaussians."""
+    held_bytes: int
+    """What training holds of all photographs: 8 bits of them, and moments up to `KEPT_BYTES`."""
 
 
 @dataclass(frozen=True)
@@ -164,7 +169,9 @@ def _scaled(past: _Finished, conf: Conf, sizes: _Sizes, threads: int, backend: s
     training *= max(1, past.threads) / max(1, threads)
     overhead = past.overhead_s * pixels
     seconds = training + overhead
-    return Cost(seconds, overhead, past.memory_bytes * step, past.disk_bytes * gaussians)
+    # A cell of an older version held more of its photographs; then this is too much.
+    memory = (past.memory_bytes - past.sizes.held_bytes) * step + sizes.held_bytes
+    return Cost(seconds, overhead, memory, past.disk_bytes * gaussians)
 
 
 def _settings(conf: Conf) -> frozenset[tuple[str, str]]:
@@ -202,7 +209,11 @@ def _sizes(variants: Path, variant_id: str, views: str) -> _Sizes:
     }
     if not pixels:
         raise StoreError(f"{folder}: no training view for train.views={views}")
-    return _Sizes(fmean(pixels.values()), max(pixels.values()))
+    trained = sum(pixels.values())
+    tested = sum(view.width * view.height for view in manifest.views if view.split == "test")
+    moments = min(KEPT_BYTES, 2 * _FLOAT_RGB_BYTES * trained)  # mean and variance
+    held = _RGB_BYTES * (trained + tested) + moments
+    return _Sizes(trained / len(pixels), max(pixels.values()), held)
 
 
 def _newest(store: Store) -> list[CellFolder]:

@@ -208,7 +208,7 @@ def _forward(run: _Run, step: Step) -> _Forward:
     with run.memory.of_forward(step, len(gaussians), sh_degree, kept=kept):
         render = run.renderer.render(gaussians, step, camera, means2d_offset)
         # Loss: L1 and SSIM against the photograph, then terms and weights of the components.
-        image = components.to_photograph(render.image, step)
+        image = components.match_colors(components.to_photograph(render.image, step), step)
         image = inside_mask(image, target.image, step.view.mask)
         weights = components.pixel_weights(step)
         loss = photometric_loss(

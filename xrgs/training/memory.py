@@ -11,6 +11,8 @@ from typing import TYPE_CHECKING, Any, TypeVar
 import torch
 from torch import Tensor
 
+from xrgs.splat.settings import KEPT_BYTES
+
 if TYPE_CHECKING:
     from xrgs.splat.rendering import Render
     from xrgs.training.checkpoint import State
@@ -18,9 +20,6 @@ if TYPE_CHECKING:
 
 T = TypeVar("T")
 
-#: The most bytes that one `OnDemand` keeps: the moments of 58 photographs of 504 x 378 px, or of 14
-#: of 1,008 x 756 px.
-KEPT_BYTES = 1 << 28
 
 _CODE = (type, ModuleType, FunctionType)
 

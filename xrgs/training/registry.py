@@ -52,6 +52,7 @@ BUILT_IN: Mapping[str, ComponentEntry] = {
     "multiview_score": ComponentEntry("view_scores", "MultiviewScore"),
     "error_score": ComponentEntry("view_scores", "ErrorScore"),
     "natural_selection": ComponentEntry("natural_selection", "NaturalSelection"),
+    "exposure": ComponentEntry("exposure", "Exposure"),
 }
 
 

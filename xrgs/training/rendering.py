@@ -91,6 +91,7 @@ class StepRenderer:
         render = self.render(gaussians, step, camera)
         self.recorder.record_evaluations(render.evaluations)
         image, view = self.components.to_photograph(render.image, step), step.view
+        image = self.components.match_colors(image, step)
         return image if view.mask is None else inside_mask(image, view.image, view.mask)
 
     @torch.no_grad()

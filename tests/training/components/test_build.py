@@ -23,6 +23,7 @@ from xrgs.training.components import Component, Components, Step
 from xrgs.training.components.consistency import Consistency
 from xrgs.training.components.curriculum import Curriculum
 from xrgs.training.components.densify import Densify
+from xrgs.training.components.exposure import Exposure
 from xrgs.training.components.gradient_scaling import GradientScaling
 from xrgs.training.components.mip import Mip
 from xrgs.training.components.natural_selection import NaturalSelection
@@ -52,6 +53,7 @@ ON: dict[str, tuple[Any, type[Component]]] = {
     "multiview_score.views": (2, MultiviewScore),
     "error_score.of": ("edges", ErrorScore),
     "natural_selection.budget": (0.5, NaturalSelection),
+    "exposure.mode": ("gain", Exposure),
     "continuous_weighting.gamma": (1.0, Weighting),
 }
 #: Keys that `off` declares too, with another value: they build no component by themselves. The

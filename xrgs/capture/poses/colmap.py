@@ -298,10 +298,13 @@ def _text_images(file: Path) -> Iterator[_Image]:
         if not line:
             continue
         with _line(file, number, "IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME"):
-            # A name may have spaces.
-            own, qw, qx, qy, qz, tx, ty, tz, camera, name = line.split(maxsplit=9)
-            turn, place = [*map(float, (qw, qx, qy, qz))], [*map(float, (tx, ty, tz))]
-            image = _Image(int(own), name, turn, place, int(camera), np.zeros(0, np.uint64))
+            own, *pose, camera, name = line.split(maxsplit=9)  # a name may have spaces
+            values = [float(value) for value in pose]
+            if len(values) != 7:
+                raise ValueError("not a pose")
+            image = _Image(
+                int(own), name, values[:4], values[4:], int(camera), np.zeros(0, np.uint64)
+            )
         below, features = next(lines, (number + 1, ""))
         with _line(file, below, f"X Y POINT3D_ID of each feature of {name}, or empty"):
             words = features.split()

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING
 from xrgs.evaluation.metrics.base import Metric
 from xrgs.evaluation.metrics.lpips import lpips
 from xrgs.evaluation.metrics.psnr import psnr, psnr_plain
+from xrgs.evaluation.metrics.psnr_fitted import psnr_fitted
 from xrgs.evaluation.metrics.ssim import SSIM_WINDOW, ssim
 
 if TYPE_CHECKING:
@@ -25,6 +26,7 @@ __all__ = [
     "Metric",
     "lpips",
     "psnr",
+    "psnr_fitted",
     "psnr_plain",
     "ssim",
 ]
@@ -55,6 +57,15 @@ METRICS = (
         higher_is_better=True,
         score=psnr_plain,
         sources=_PSNR,
+        optional=True,
+    ),
+    Metric(
+        "psnr_fitted",
+        "PSNR after a colour fit",
+        "dB",
+        higher_is_better=True,
+        score=psnr_fitted,
+        sources=(*_PSNR, "evaluation/metrics/psnr_fitted.py"),
         optional=True,
     ),
     Metric("evaluations", "Alpha evaluations", "", higher_is_better=False),

@@ -9,19 +9,20 @@ order:
 3. `render_camera`: the camera of the render,
 4. `before_render`: the Gaussians of the render, which follows,
 5. `to_photograph`: the render at the size of the photograph,
-6. `pixel_weights`: the weights of the pixels in the photometric loss, which follows,
-7. `modify_loss`: further terms and factors of the loss,
-8. `needs_backward`: is the loss worth a backward pass? It follows.
-9. `after_backward`: the gradients of the parameters, before the optimizer's step, which follows,
-10. `densification_grad2d`: the image-plane gradient that densification reads,
-11. `may_grow`: at a refinement, which Gaussians may grow,
-12. `growth_scores`: at a refinement with a budget, which Gaussians grow first,
-13. `opacity_attenuation`: at a reset of the opacities,
-14. `on_gaussians_changed`: after a refinement or a reset that changed anything,
-15. `to_prune`: further Gaussians to remove,
-16. `on_gaussians_changed`: after that has removed any.
+6. `match_colors`: its colours,
+7. `pixel_weights`: the weights of the pixels in the photometric loss, which follows,
+8. `modify_loss`: further terms and factors of the loss,
+9. `needs_backward`: is the loss worth a backward pass? It follows.
+10. `after_backward`: the gradients of the parameters, before the optimizer's step, which follows,
+11. `densification_grad2d`: the image-plane gradient that densification reads,
+12. `may_grow`: at a refinement, which Gaussians may grow,
+13. `growth_scores`: at a refinement with a budget, which Gaussians grow first,
+14. `opacity_attenuation`: at a reset of the opacities,
+15. `on_gaussians_changed`: after a refinement or a reset that changed anything,
+16. `to_prune`: further Gaussians to remove,
+17. `on_gaussians_changed`: after that has removed any.
 
-A step without a backward pass leaves out 9 and 10. After the last step training calls `bake` and
+A step without a backward pass leaves out 10 and 11. After the last step training calls `bake` and
 `after_training`; `bake` also runs on a copy of the Gaussians wherever they are evaluated.
 """
 
@@ -230,7 +231,23 @@ class Component:
             step: The step with its view.
 
         Returns:
-            The image [H, W, 3] that is compared with the photograph, linear in `image`.
+            The image [H, W, 3] at the photograph's size, linear in `image`.
+        """
+        del step
+        return image
+
+    def match_colors(self, image: Tensor, step: Step) -> Tensor:
+        """Bring the colours of a render to those that its photograph has been taken with.
+
+        Training calls it for the render of the step with gradients enabled, and for renders of
+        other views that components ask for without.
+
+        Args:
+            image: [H, W, 3] after `to_photograph`.
+            step: The step with its view.
+
+        Returns:
+            The image [H, W, 3] that is compared with the photograph, made pixel by pixel.
         """
         del step
         return image
@@ -245,8 +262,8 @@ class Component:
 
         Args:
             loss: Scalar; the photometric loss, as the components before this one changed it.
-            image: [H, W, 3] render of the view at the photograph's size, not clamped to 0..1.
-                Outside the view's mask it is the photograph.
+            image: [H, W, 3] render of the view as it is compared with the photograph, not clamped
+                to 0..1. Outside the view's mask it is the photograph.
             gaussians: The N trained Gaussians; a term may depend on their parameters.
             step: The step with its view.
 

@@ -62,6 +62,12 @@ class Components(tuple[Component, ...]):
             image = component.to_photograph(image, step)
         return image
 
+    def match_colors(self, image: Tensor, step: Step) -> Tensor:
+        """Apply `Component.match_colors` of each component in turn."""
+        for component in self:
+            image = component.match_colors(image, step)
+        return image
+
     def pixel_weights(self, step: Step) -> Tensor | None:
         """The product [H, W] of the components' pixel weights; None where none has any."""
         return _combined(operator.mul, (c.pixel_weights(step) for c in self))

@@ -1,0 +1,148 @@
+"""Colour maps of photographs: against numpy, torch's Adam and finite differences."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+from tests.conftest import composed
+from tests.splat.scenes import noise
+from tests.training.components.conftest import make_view
+from xrgs.capture.dataset import Dataset, LoadedView
+from xrgs.config import ComponentsConf, ExposureConf
+from xrgs.splat.gaussians import Gaussians
+from xrgs.training.components import Components, Step
+from xrgs.training.components.exposure import Exposure, apply_map
+from xrgs.training.loop import train
+
+Build = Callable[..., Components]
+
+
+@pytest.fixture
+def on(off: ComponentsConf) -> ComponentsConf:
+    off.exposure.mode = "affine"
+    return off
+
+
+def exposure(mode: str = "affine", count: int = 2, prior: float = 0.01) -> Exposure:
+    """Of `count` HR views `h0`, `h1`, ... and one LR view `low`."""
+    views = [make_view("HR", noise(12, 15, 0)) for _ in range(count)]
+    views = [replace(view, name=f"h{i}") for i, view in enumerate(views)]
+    views.append(replace(make_view("LR", noise(12, 15, 1)), name="low"))
+    conf = ExposureConf(mode=mode, lr=0.02, lr_final=0.05, prior=prior)
+    return Exposure(conf, views)
+
+
+def on_view(name: str, number: int = 0) -> Step:
+    view: LoadedView = replace(make_view("HR", noise(12, 15, 2)), name=name)
+    return Step(number, 100, view)
+
+
+def teach(component: Exposure, name: str, number: int = 0, brighter: float = 1.3) -> None:
+    """Take a step on a view whose photograph is so many times as bright as the render."""
+    step, render = on_view(name, number), noise(12, 15, 3)
+    mapped = component.match_colors(render, step)
+    torch.autograd.backward((mapped - brighter * render).square().mean())
+    component.after_backward(Gaussians(*[torch.empty(0)] * 6), step)
+
+
+def test_a_map_is_a_matrix_and_an_offset() -> None:
+    image, colors = noise(7, 5, 0), noise(3, 4, 1)[..., 0]
+    expected = np.einsum("ij,hwj->hwi", colors[:, :3], image) + colors[:, 3].numpy()
+    np.testing.assert_allclose(apply_map(image, colors), expected, rtol=1e-14)
+
+
+def test_gradients_are_those_of_finite_differences() -> None:
+    image, colors = noise(4, 5, 0).requires_grad_(), noise(3, 4, 1)[..., 0].requires_grad_()
+    assert torch.autograd.gradcheck(apply_map, (image, colors))
+
+
+def test_the_maps_begin_as_the_identity(build: Build, on: ComponentsConf, hr: Step) -> None:
+    image = noise(60, 75, 4)
+    assert torch.equal(build(on).match_colors(image, hr), image)
+
+
+@pytest.mark.parametrize("mode", ["affine", "gain"])
+def test_an_update_is_adams_on_the_loss_with_its_prior(mode: str) -> None:
+    """Of an LR view, which the mean over HR views leaves alone."""
+    component, render = exposure(mode, prior=0.1), noise(12, 15, 3)
+    learned = torch.eye(3, 4).double() if mode == "gain" else torch.ones(3, 4).double()
+    deviation = torch.zeros(3, 4, dtype=torch.float64, requires_grad=True)
+    adam = torch.optim.Adam([deviation], lr=0.02)
+    for number in (0, 3, 10, 50):
+        teach(component, "low", number)
+        adam.zero_grad()
+        mapped = apply_map(render, torch.eye(3, 4).double() + deviation * learned)
+        loss = (mapped - 1.3 * render).square().mean() + 0.1 * deviation.square().sum()
+        torch.autograd.backward(loss)
+        adam.param_groups[0]["lr"] = 0.02 * 0.05 ** (number / 100)
+        adam.step()
+        expected = torch.eye(3, 4).double() + deviation * learned
+        torch.testing.assert_close(component.map_of("low").double(), expected, atol=1e-6, rtol=0)
+    gain = component.map_of("low")[:, :3].sum(dim=1)
+    assert (gain > 1.02).all()
+
+
+def mean_of_hr(component: Exposure) -> Tensor:
+    return torch.stack([component.map_of(name) for name in component.names[:-1]]).mean(dim=0)
+
+
+@pytest.mark.parametrize("count", [1, 2, 5])
+def test_the_mean_map_of_the_hr_views_is_the_identity(count: int) -> None:
+    component = exposure(count=count)
+    for number, name in enumerate(component.names * 2):
+        teach(component, name, number, brighter=1 + 0.1 * number)
+        torch.testing.assert_close(mean_of_hr(component), torch.eye(3, 4), atol=1e-6, rtol=0)
+    assert not torch.allclose(component.map_of("low"), torch.eye(3, 4), atol=1e-3)
+    if count == 1:
+        assert torch.equal(component.map_of("h0"), torch.eye(3, 4))
+
+
+def test_without_hr_views_the_mean_is_over_all(build: Build, on: ComponentsConf) -> None:
+    views = [replace(make_view("LR", noise(12, 15, 1)), name=name) for name in ("a", "b")]
+    (component,) = build(on, *views)
+    assert isinstance(component, Exposure)
+    teach(component, "a")
+    total = component.map_of("a") + component.map_of("b")
+    torch.testing.assert_close(total, 2 * torch.eye(3, 4))
+    assert not torch.equal(component.map_of("a"), torch.eye(3, 4))
+
+
+def test_a_render_without_gradients_teaches_nothing() -> None:
+    component, step = exposure(), on_view("low")
+    with torch.no_grad():
+        component.match_colors(noise(12, 15, 3), on_view("h0"))
+    component.after_backward(Gaussians(*[torch.empty(0)] * 6), step)
+    assert torch.equal(component.map_of("low"), torch.eye(3, 4))
+    assert step.log == {}
+
+
+def test_the_gain_is_recorded_and_its_extremes_are_named(caplog: pytest.LogCaptureFixture) -> None:
+    component, step = exposure(), on_view("low")
+    component.deviations[2, :, :3] = torch.tensor([[0.2, 0, 0], [0, 0.3, 0.1], [0, 0, 0]])
+    component.deviations[0] = -0.1 * torch.eye(3, 4)
+    component.match_colors(noise(12, 15, 3), step)
+    assert step.log["exposure.gain"] == pytest.approx(1.2)
+    with caplog.at_level(logging.INFO):
+        component.after_training(Gaussians(*[torch.empty(0)] * 6))
+    assert "0.900 (h0) to 1.200 (low)" in caplog.text
+
+
+def test_training_finds_the_gains_of_photographs(data: Dataset) -> None:
+    """Photographs of one scene, one in four of them darker; the splats keep the others' colours."""
+    views = [replace(view, camera=data.train[0].camera, tag="HR") for view in data.train]
+    image = data.train[0].image
+    views = [replace(v, pixels=image * (0.6 if v.name == "v2" else 1.0)) for v in views]
+    lr = "components.exposure.lr=0.04"
+    conf = composed("train.steps=200", "splat.backend=auto", "+ablation=exposure_gain", lr)
+    history = train(replace(data, train=tuple(views)), conf).history
+    last = {row["view"]: row["exposure.gain"] for row in history if row["step"] > 150}
+    others = (last["v0"] + last["v1"] + last["v3"]) / 3
+    assert last["v2"] / others == pytest.approx(0.6, abs=0.05)
+    assert (last["v2"] + 3 * others) / 4 == pytest.approx(1, abs=0.02)
