@@ -376,7 +376,7 @@ def write_scene(folder: Path) -> None:
 
 @pytest.mark.slow
 def test_with_masks_a_moving_object_costs_next_to_nothing(tmp_path: Path) -> None:
-    """From photographs to scores: an object in half of the training photographs, 0.4 times as wide."""
+    """From photographs to scores, with an object in half of the training photographs."""
     write_scene(tmp_path)
     conf = compose(
         "train.steps=250", "train.views=all_hr", "splat.densify.stop=0", "variant.long_side=0",
