@@ -198,6 +198,9 @@ def test_the_filter_of_mip_splatting_is_applied(
     read = read_ply(written(tmp_path / "a.ply", np.asarray(table)))
     assert read.antialiased
     assert "filter_3D" in caplog.text
+    table["scale_1"][2] = 500
+    with pytest.raises(XrgsError, match=r"of Gaussian 2 .* must be finite"):
+        read_ply(written(tmp_path / "b.ply", np.asarray(table)))
     raw = load_ply(saved)
     scales, opacities = smooth(
         raw.scales.double().exp(),
