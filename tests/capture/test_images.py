@@ -156,6 +156,20 @@ def test_the_camera_is_read_from_exif(tmp_path: Path) -> None:
         images.exif_camera(tmp_path / "no.jpg")
 
 
+@pytest.mark.parametrize(
+    ("value", "expected"), [(28, 28.0), (0, None), (65535, None), ("28", 28.0), ("wide", None)]
+)
+def test_the_focal_length_on_film_is_read_where_it_is_one(
+    tmp_path: Path, value: object, expected: float | None
+) -> None:
+    exif = Image.Exif()
+    exif.get_ifd(0x8769)[0xA405] = value
+    Image.new("RGB", (4, 3)).save(tmp_path / "exif.jpg", exif=exif)
+    Image.new("RGB", (4, 3)).save(tmp_path / "no_exif.jpg")
+    assert images.exif_focal(tmp_path / "exif.jpg") == expected
+    assert images.exif_focal(tmp_path / "no_exif.jpg") is None
+
+
 def test_a_truncated_file_is_named(tmp_path: Path, noise: images.ImageArray) -> None:
     images.save(tmp_path / "a b.png", noise)
     whole = (tmp_path / "a b.png").read_bytes()

@@ -77,6 +77,26 @@ def test_the_stereo_pair_is_registered_with_its_known_intrinsics(stereo_pair: St
         assert model.lenses[i].is_pinhole
 
 
+@pytest.mark.parametrize(("focal", "expected"), [(995.0, 995.0), (None, 1.2 * 741)])
+def test_two_views_keep_the_focal_length_that_exif_gives(
+    sfm_conf: SfmConf,
+    stereo_scene: SceneConf,
+    tmp_path: Path,
+    focal: float | None,
+    expected: float,
+) -> None:
+    """From two views it can't be told apart from the depth."""
+    scene = scenes.resolve(stereo_scene, tmp_path)
+    inputs = []
+    for file in scene.files.values():
+        images.save(tmp_path / file.name, images.read(file))
+        inputs.append(sfm.SfmImage(file.name, file.stem, "all", None, focal))
+    model = sfm.reconstruct(inputs, tmp_path, tmp_path, sfm_conf)
+    assert [lens.params[0] for lens in model.lenses.values()] == pytest.approx([expected] * 2)
+    guessed = any("focal length is a guess" in note for note in model.report["notes"])
+    assert guessed == (focal is None)
+
+
 def test_its_cameras_are_parallel_and_side_by_side(stereo_pair: StereoPair) -> None:
     a, b = (stereo_pair[1].viewmats[i] for i in range(2))
     turn = b[:3, :3] @ a[:3, :3].T

@@ -141,17 +141,27 @@ def reconstruct(
         "pycolmap": pycolmap.__version__,
         "registered": 0,
         "models": sorted((model.num_reg_images() for model in models), reverse=True),
+        "notes": [],
     }
     if not models:
         no_points = np.zeros((0, 3))
         return Reconstruction({}, {}, no_points, no_points.astype(np.uint8), {}, report)
     largest = max(models, key=lambda m: (m.num_reg_images(), m.num_points3D()))
     bogus = bogus_cameras(largest, sfm_images)
-    if bogus:
-        cameras = [f"{image.name} ({bogus[i]})" for i, image in enumerate(sfm_images) if i in bogus]
-        report["notes"] = [f"not placed, because SfM made an impossible camera: {listed(cameras)}"]
+    report["notes"] = list(_notes(sfm_images, bogus))
     index = {image.file: i for i, image in enumerate(sfm_images) if i not in bogus}
     return to_numpy(largest, index, report)
+
+
+def _notes(sfm_images: Sequence[SfmImage], bogus: Mapping[int, str]) -> Iterator[str]:
+    if bogus:
+        cameras = [f"{sfm_images[i].name} ({params})" for i, params in sorted(bogus.items())]
+        yield f"not placed, because SfM made an impossible camera: {listed(cameras)}"
+    if len(sfm_images) == 2 and all(i.K is None and i.focal is None for i in sfm_images):
+        yield (
+            "the focal length is a guess, 1.2 times the longer side: two photographs do not tell "
+            "it, and EXIF does not give it"
+        )
 
 
 def triangulate(
