@@ -330,12 +330,16 @@ def test_raw_files_and_films_of_the_photographs_names_are_said_once(tmp_path: Pa
     )
 
 
-def test_panoramas_and_screenshots_are_named(tmp_path: Path) -> None:
+def test_panoramas_are_left_out_and_screenshots_are_named(tmp_path: Path) -> None:
     shoot(tmp_path)
     write(tmp_path / "pano.jpg", 40, (400, 120))
     write(tmp_path / "screenshot.png", 41, (73, 158))
-    (note,) = folder.look(str(tmp_path), 0).notes
-    assert "longer than the other photographs: pano.jpg, screenshot.png" in note
+    found = folder.look(str(tmp_path), 0)
+    assert names(tmp_path, found) == [*ORIGINALS, "screenshot.png"]
+    assert found.notes == (
+        "left out as panoramas, by their shape: pano.jpg",
+        "longer for their width than others (screenshots, crops?): screenshot.png",
+    )
     shoot(tmp_path / "wide", size=(320, 130), first=20)
     assert not folder.look(str(tmp_path / "wide"), 0).notes
 
