@@ -494,13 +494,13 @@ def write_degraded(
 
 
 def _divisible(width: int, height: int, factor: int) -> tuple[int, int]:
-    """Return a size with sides that are multiples of `factor`, a little smaller than this one.
+    """Return a size with sides that are multiples of `factor`, at most 2% smaller than this one.
 
-    Of a few such sizes it has the aspect ratio that is closest to the given one.
+    Of these sizes it has the aspect ratio that is closest to the given one.
     """
     most = max(1, width // factor)
     columns = min(
-        range(most, max(0, most - 8), -1),
+        range(most, most - 1 - most // 50, -1),
         key=lambda c: abs(c * height / width - round(c * height / width)),
     )
     return columns * factor, max(1, round(columns * height / width)) * factor

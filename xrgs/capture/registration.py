@@ -80,7 +80,9 @@ def other_size(conf: SfmConf, images: int, *, any_smaller: bool) -> Attempt | No
 
 
 #: The attempts after the first, in order. Each changes the settings of the attempt before it, and
-#: gets the number of images and whether any of them is smaller than its HR view; None skips it.
+#: gets the number of images and whether any of them is smaller than the largest; None skips it.
+#: ALIKED and LightGlue are none of them: pycolmap's wheels are built without ONNX, and abort the
+#: process where these are asked for.
 FALLBACKS = (relaxed, finer, narrower, other_size)
 
 

@@ -320,11 +320,11 @@ def _text_points(file: Path) -> _Points:
         if line:
             with _line(file, number, "POINT3D_ID X Y Z R G B ERROR TRACK"):
                 own, *values = line.split(maxsplit=8)[:8]
-                numbers.append(int(own))
+                numbers.append(np.uint64(int(own)))
                 x, y, z, r, g, b, error = map(float, values)
                 rows.append((x, y, z, r, g, b, error))
     table = np.array(rows, np.float64).reshape(-1, 7)
-    colors = np.clip(table[:, 3:6], 0, 255).astype(np.uint8)
+    colors = np.nan_to_num(table[:, 3:6]).clip(0, 255).astype(np.uint8)
     return _Points(np.array(numbers, np.uint64), table[:, :3], colors, table[:, 6])
 
 

@@ -270,12 +270,12 @@ def _in_other_folders(folder: Path, taken: _Tree, masks: Path | None) -> list[st
     try:
         below = [inside for inside in _folders(folder, passed, masks) if inside not in taken]
         images_in = {inside: files for inside in below if (files := _images_in(inside))}
+        stems = {file.stem.casefold() for files in taken.values() for file in files}
+        for inside, files in images_in.items():
+            if files[0].stem.casefold() in stems and _is_mask(files[0]):
+                passed[_MASKS].append(inside)
     except (OSError, XrgsError) as error:
         return [f"the folders below can't be searched for more images ({error})"]
-    stems = {file.stem.casefold() for files in taken.values() for file in files}
-    for inside, files in images_in.items():
-        if files[0].stem.casefold() in stems and _is_mask(files[0]):
-            passed[_MASKS].append(inside)
     counts = {f: len(files) for f, files in images_in.items() if f not in passed[_MASKS]}
     all_below = f"scene.path={folder}{ALL_BELOW} takes the images of all folders"
     return _left_out(counts, folder, all_below) + _masks_left_out(passed, folder)
@@ -298,10 +298,10 @@ def _left_out(counts: Mapping[Path, int], folder: Path, why: str) -> list[str]:
 
 
 def _photographs(files: Sequence[Path], folder: Path) -> tuple[list[Path], list[str]]:
-    """Leave out images that were made of photographs, and say so."""
-    own = [file for file in files if _is_own(file)]
+    """Leave out images that were made of photographs, and say so; images of xrgs alone are kept."""
+    own = {file for file in files if _is_own(file)}
     if len(own) == len(files):
-        own = []  # somebody asks for just these
+        own = set()
     made = _made_of_others([file for file in files if file not in own])
     notes = [
         f"{counted(len(left), 'image')} left out, {why}: "
@@ -312,7 +312,8 @@ def _photographs(files: Sequence[Path], folder: Path) -> tuple[list[Path], list[
         )
         if left
     ]
-    return [file for file in files if file not in {*own, *made}], notes
+    made |= own
+    return [file for file in files if file not in made], notes
 
 
 @remembered
