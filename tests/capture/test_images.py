@@ -97,7 +97,6 @@ def test_exif_orientation_is_applied_once_to_image_and_size(
         (SHORT, 0, b"\6\0", 1),
     ],
 )
-@pytest.mark.filterwarnings("ignore:Metadata Warning:UserWarning:PIL")
 def test_an_orientation_of_another_type_turns_all_or_nothing(
     tmp_path: Path, suffix: str, kind: int, count: int, value: bytes, applied: int
 ) -> None:

@@ -173,6 +173,13 @@ def test_sizes_that_lack_photographs_are_not_taken(tmp_path: Path, fault: str) -
         assert "images_2 has 4 of the 6 photographs of images" in found.notes[0]
 
 
+def test_photographs_with_films_behind_them_are_whole(tmp_path: Path) -> None:
+    for file in shoot(tmp_path / "images").iterdir():
+        file.write_bytes(file.read_bytes() + bytes(5000))
+    shoot(tmp_path / "images_2", size=(80, 60))
+    assert folder.look(str(tmp_path), 0).files["IMG_0"].parent.name == "images"
+
+
 def test_a_store_and_all_that_xrgs_writes_are_left_out(tmp_path: Path) -> None:
     shoot(tmp_path / "day")
     for part in ("cells", "variants", "sweeps"):
@@ -330,12 +337,16 @@ def test_raw_files_and_films_of_the_photographs_names_are_said_once(tmp_path: Pa
     )
 
 
-def test_panoramas_and_screenshots_are_named(tmp_path: Path) -> None:
+def test_panoramas_are_left_out_and_screenshots_are_named(tmp_path: Path) -> None:
     shoot(tmp_path)
     write(tmp_path / "pano.jpg", 40, (400, 120))
     write(tmp_path / "screenshot.png", 41, (73, 158))
-    (note,) = folder.look(str(tmp_path), 0).notes
-    assert "longer than the other photographs: pano.jpg, screenshot.png" in note
+    found = folder.look(str(tmp_path), 0)
+    assert names(tmp_path, found) == [*ORIGINALS, "screenshot.png"]
+    assert found.notes == (
+        "left out as panoramas, by their shape: pano.jpg",
+        "longer for their width than others (screenshots, crops?): screenshot.png",
+    )
     shoot(tmp_path / "wide", size=(320, 130), first=20)
     assert not folder.look(str(tmp_path / "wide"), 0).notes
 

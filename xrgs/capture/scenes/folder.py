@@ -73,9 +73,9 @@ _ADDED = rf"(?:{_MASK}|depth|disparity|normals?|thumb|thumbnail)"
 _ADDED_BEFORE, _ADDED_AFTER = re.compile(rf"^{_ADDED}[\W_]?"), re.compile(rf"[\W_]?{_ADDED}$")
 #: The deepest nesting of folders that is searched.
 _MAX_DEPTH = 8
-#: A picture that is longer for its width than this, or this many times longer than the others, is
-#: called a panorama.
-_PANORAMA, _TIMES_OTHERS = 2.2, 1.6
+#: A picture that is longer for its width than this, and so many times longer than the others, is
+#: called a panorama. It would set the size of all others, and SfM can't place it. Our choice.
+_PANORAMA, _TIMES = 2.2, 1.6
 #: The least share of the values of a mask of three channels that is 0 or 1.
 _SHARE_OF_ENDS = 0.95
 
@@ -143,9 +143,10 @@ def look(path: str | None, long_side: int, masks: str | None = None) -> Listing:
         found = (_all_below if nested else _inside)(folder, long_side, known)
         listed_files = [file for inside in found.folders.values() for file in inside]
         photographs, made = _photographs(listed_files, folder)
-        files, copies = without_copies(photographs, folder, found.other_sizes)
+        single, copies = without_copies(photographs, folder, found.other_sizes)
+        files, shapes = _without_panoramas(single, folder)
         not_read = _not_read({folder, *found.folders}, files)
-        notes = (*found.notes, *made, *copies, *not_read, *_panoramas(files, folder))
+        notes = (*found.notes, *made, *copies, *shapes, *not_read)
     except OSError as error:
         raise UnreadableError(f"{error.filename}: {error.strerror}; try again") from error
     if len(files) < 2:
@@ -383,20 +384,21 @@ def _not_read(folders: Iterable[Path], taken: Sequence[Path]) -> list[str]:
     return lines
 
 
-def _panoramas(files: Sequence[Path], folder: Path) -> list[str]:
-    """Name the pictures that are far longer for their width than the others."""
+def _without_panoramas(files: Sequence[Path], folder: Path) -> tuple[list[Path], list[str]]:
+    """Leave out panoramas, which no pinhole camera took, and name other pictures of their shape."""
     aspects = {file: max(size(file)) / min(size(file)) for file in files if min(size(file))}
-    if not aspects:
-        return []
-    usual = median(aspects.values())
-    least = max(1.1 * usual, min(_PANORAMA, _TIMES_OTHERS * usual))
-    if not (found := [file for file, aspect in aspects.items() if aspect > least]):
-        return []
-    names = listed([str(file.relative_to(folder)) for file in sorted(found)])
-    return [
-        f"longer than the other photographs: {names}. A panorama, a screenshot or a crop has"
-        " another camera than SfM expects; move it out of the folder if it is one"
+    usual = median(aspects.values()) if aspects else 1.0
+    longer = {f for f, a in aspects.items() if a > max(1.1 * usual, min(_PANORAMA, _TIMES * usual))}
+    panoramas = {f for f in longer if aspects[f] > max(_PANORAMA, _TIMES * usual)}
+    notes = [
+        f"{why}: {listed([str(file.relative_to(folder)) for file in sorted(those)])}"
+        for why, those in (
+            ("left out as panoramas, by their shape", panoramas),
+            ("longer for their width than others (screenshots, crops?)", longer - panoramas),
+        )
+        if those
     ]
+    return [file for file in files if file not in panoramas], notes
 
 
 def _view_name(file: Path, folder: Path) -> str:
