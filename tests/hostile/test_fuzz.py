@@ -1,8 +1,8 @@
 """Mutated files: each parser reads them, or refuses them by the error that it documents.
 
 Foreign files (photographs, .ply, poses, weights, archives) and the store's own files are changed at
-random. A parser may not raise another error, take 2 CPU seconds, or need 1.5 GB. `-m
-exhaustive` tries a hundred times as many files.
+random, or cut at every place. A parser may not raise another error, take 2 CPU seconds, or need
+1 GB. `-m exhaustive` tries a hundred times as many files.
 """
 
 from __future__ import annotations
@@ -16,8 +16,8 @@ import tarfile
 import tempfile
 import time
 import warnings
-import zlib  # noqa: F401  pycolmap corrupts the heap where it is imported before zlib
-from collections.abc import Callable, Iterator
+import zlib  # pycolmap corrupts the heap where it is imported before zlib
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cache
@@ -31,6 +31,7 @@ import pytest
 import torch
 
 from tests import reference_store
+from tests.capture.made_files import DISPLAY_P3, png, profile
 from tests.hostile.mutations import (
     Mutation,
     mutate_bytes,
@@ -53,12 +54,15 @@ from xrgs.experiment.store import Store
 from xrgs.runtime import lease, progress
 from xrgs.safeio import npz
 from xrgs.safeio.records import read_struct, read_table
+from xrgs.splat.files import load_gaussians, save_gaussians
 from xrgs.splat.ply import load_ply
 from xrgs.training.checkpoint import Checkpoint
 
 MAX_CPU_S = 2.0
 #: Address space, in bytes, beyond what the process has; a file that needs more gets a MemoryError.
-_ADDRESS_SPACE = 3 << 29
+_ADDRESS_SPACE = 1 << 30
+#: The most cuts of a file that are tried: at every byte of a small one, evenly spaced in others.
+_MAX_CUTS = 60
 
 
 @dataclass(frozen=True)
@@ -84,6 +88,12 @@ def photograph(form: str) -> Callable[[Path], bytes]:
     return valid
 
 
+def deep(_: Path) -> bytes:
+    """A PNG of 16 bits and alpha, with a profile."""
+    samples = np.random.default_rng(0).integers(0, 65536, (7, 9, 4))
+    return png(samples, (b"iCCP", b"P3\0\0" + zlib.compress(profile("P3", 2.2, DISPLAY_P3))))
+
+
 def look(file: Path) -> object:
     return images.size(file), images.exif_camera(file), images.read(file)
 
@@ -101,6 +111,17 @@ def points(_: Path) -> bytes:
     header += "".join(f"property float {axis}\n" for axis in "xyz")
     header += "".join(f"property uchar {name}\n" for name in ("red", "green", "blue"))
     return (header + "end_header\n").encode() + bytes(75)
+
+
+def gaussians(suffix: str) -> Parser:
+    """A file of Gaussians that `xrgs-data export` writes."""
+
+    def valid(store: Path) -> bytes:
+        read = load_gaussians(next(store.glob("cells/*/splats.ply")))
+        save_gaussians(store / f"splats{suffix}", read.gaussians)
+        return (store / f"splats{suffix}").read_bytes()
+
+    return Parser(valid, mutate_bytes, load_gaussians)
 
 
 def transforms(_: Path) -> bytes:
@@ -218,8 +239,10 @@ def failure(_: Path) -> bytes:
 
 
 def owner(store: Path) -> bytes:
-    lease.sign(store / "owner.0")
-    return (store / "owner.0").read_bytes()
+    file = store / "owner.0"
+    file.unlink(missing_ok=True)
+    lease.sign(file)
+    return file.read_bytes()
 
 
 PARSERS = {
@@ -228,6 +251,8 @@ PARSERS = {
         form: Parser(photograph(form), mutate_image, look, (images.ImageError,))
         for form in ("PNG", "JPEG", "BMP", "TIFF", "WEBP")
     },
+    "deep.png": Parser(deep, mutate_image, look, (images.ImageError,)),
+    **{f"splats{suffix}": gaussians(suffix) for suffix in (".glb", ".spz")},
     "splats.ply": Parser(of_store("cells/*/splats.ply"), mutate_bytes, load_ply),
     "points.ply": Parser(points, mutate_bytes, colmap.read_points),
     "transforms.json": Parser(transforms, mutate_json, poses_of),
@@ -291,13 +316,29 @@ def test_a_parser_with_another_error_is_found(store: Path, tmp_path: Path) -> No
         try_files("scene.json", careless, store, tmp_path, range(100))
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize("name", PARSERS)
+def test_cut_files_are_read_or_refused(store: Path, tmp_path: Path, name: str) -> None:
+    valid = PARSERS[name].valid(store)
+    cuts = range(0, len(valid), max(1, len(valid) // _MAX_CUTS))
+    try_contents(name, PARSERS[name], store, tmp_path, ((f"cut {n}", valid[:n]) for n in cuts))
+
+
 def try_files(name: str, parser: Parser, store: Path, folder: Path, seeds: range) -> None:
-    """Fail at the first file that a parser neither reads nor refuses; `seed` makes it again."""
-    valid, file = parser.valid(store), folder / Path(name).name.replace("*", "x")
-    file.write_bytes(valid)
+    """Fail at the first mutated file that is neither read nor refused; `seed` makes it again."""
+    valid = parser.valid(store)
+    contents = ((f"seed {seed}", parser.mutate(Random(f"{name} {seed}"), valid)) for seed in seeds)
+    try_contents(name, parser, store, folder, contents)
+
+
+def try_contents(
+    name: str, parser: Parser, store: Path, folder: Path, contents: Iterable[tuple[str, bytes]]
+) -> None:
+    """Fail at the first of the named contents that a parser neither reads nor refuses."""
+    file = folder / Path(name).name.replace("*", "x")
+    file.write_bytes(parser.valid(store))
     parser.parse(file)
-    for seed in seeds:
-        content = parser.mutate(Random(f"{name} {seed}"), valid)
+    for how, content in contents:
         file.write_bytes(content)
         began = time.process_time()
         try:
@@ -307,13 +348,13 @@ def try_files(name: str, parser: Parser, store: Path, folder: Path, seeds: range
         except parser.errors:
             pass
         except Exception as error:
-            raise AssertionError(f"seed {seed}: {error!r:.200}; {content[:100]!a}") from error
-        assert time.process_time() - began < MAX_CPU_S, f"seed {seed}: {content[:100]!a}"
+            raise AssertionError(f"{how}: {error!r:.200}; {content[:100]!a}") from error
+        assert time.process_time() - began < MAX_CPU_S, f"{how}: {content[:100]!a}"
 
 
 @contextmanager
 def bounded_memory() -> Iterator[None]:
-    """Let memory beyond what this process has and 1.5 GB be refused."""
+    """Let memory beyond what this process has and 1 GB be refused."""
     before = resource.getrlimit(resource.RLIMIT_AS)
     pages = int(Path("/proc/self/statm").read_text(encoding="ascii").split()[0])
     resource.setrlimit(
