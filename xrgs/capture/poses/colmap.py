@@ -107,13 +107,15 @@ def read(root: Path) -> GivenPoses:
             raise XrgsError(f"{images_file}: {name}: {error}") from error
 
     known = points.errors[points.errors >= 0]
+    with np.errstate(over="ignore"):
+        report = {"reprojection_error_px": float(known.mean())} if len(known) else {}
     return GivenPoses(
         list(images),
         camera,
         points.xyz[order],
         points.colors[order],
         {name: _indices(image.points, numbers) for name, image in images.items()},
-        {"reprojection_error_px": float(known.mean())} if len(known) else {},
+        report,
         _notes(root, models),
     )
 
@@ -167,8 +169,12 @@ def _viewmat(image: _Image) -> NDArray[np.float64]:
 
     if not np.isfinite([*image.quaternion, *image.translation]).all():
         raise XrgsError("its pose must have finite numbers")
-    if not any(image.quaternion):
-        raise XrgsError("its quaternion must not be 0; run COLMAP again, or remove the image")
+    with np.errstate(over="ignore"):
+        length = np.linalg.norm(image.quaternion)
+    if not 0 < length < np.inf:
+        raise XrgsError(
+            "its quaternion must have a length above 0; run COLMAP again, or remove the image"
+        )
     w, *xyz = image.quaternion
     matrix = np.eye(4)
     matrix[:3, :3] = Rotation.from_quat([*xyz, w]).as_matrix()  # of unit length
