@@ -173,6 +173,13 @@ def test_sizes_that_lack_photographs_are_not_taken(tmp_path: Path, fault: str) -
         assert "images_2 has 4 of the 6 photographs of images" in found.notes[0]
 
 
+def test_photographs_with_films_behind_them_are_whole(tmp_path: Path) -> None:
+    for file in shoot(tmp_path / "images").iterdir():
+        file.write_bytes(file.read_bytes() + bytes(5000))
+    shoot(tmp_path / "images_2", size=(80, 60))
+    assert folder.look(str(tmp_path), 0).files["IMG_0"].parent.name == "images"
+
+
 def test_a_store_and_all_that_xrgs_writes_are_left_out(tmp_path: Path) -> None:
     shoot(tmp_path / "day")
     for part in ("cells", "variants", "sweeps"):

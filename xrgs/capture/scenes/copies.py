@@ -56,16 +56,16 @@ def size(file: Path) -> tuple[int, int]:
 
 @remembered
 def _is_whole(file: Path) -> bool:
-    """Return whether a file is not cut off; JPEG and PNG are not decoded for it."""
-    mark = _END_MARKS.get(file.suffix.lower())
-    if mark is None:
-        with suppress(images.ImageError):
-            images.thumbnail(file, _THUMBNAIL)
-            return True
-        return False
+    """Return whether a file is not cut off; it is decoded where no mark is at its end."""
     with file.open("rb") as stream:
         stream.seek(max(0, file.stat().st_size - _TAIL_BYTES))
-        return mark in stream.read() and size(file) != (0, 0)
+        tail = stream.read()
+    if (mark := _END_MARKS.get(file.suffix.lower())) and mark in tail:
+        return size(file) != (0, 0)
+    with suppress(images.ImageError):  # telephones append films to JPEGs
+        images.thumbnail(file, _THUMBNAIL)
+        return True
+    return False
 
 
 @remembered
@@ -99,22 +99,22 @@ def one_of_each_size(
         groups.append([files]) if group is None else group.append(files)
     taken, notes = [], []
     for group in groups:
-        count = {files[0].parent: sum(map(_is_whole, files)) for files in group}
-        complete = [files for files in group if count[files[0].parent] == max(count.values())]
+        counts = {files[0].parent.name: sum(map(_is_whole, files)) for files in group}
+        most = max(counts.values())
+        complete = [files for files in group if counts[files[0].parent.name] == most]
         by_side = sorted(((_long_side(files), files) for files in complete), key=lambda c: c[0])
         sufficient = [files for side, files in by_side if long_side and side >= long_side]
         choice = sufficient[0] if sufficient else by_side[-1][1]
         taken.append(choice)
-        of = {name.name: number for name, number in count.items()}
         name = choice[0].parent.name
-        for other, number in of.items():
-            if number < of[name]:
-                notes.append(
-                    f"{other} has {number} of the {of[name]} photographs of {name}, so that it is"
-                    " not taken: was its conversion interrupted?"
-                )
+        notes += [
+            f"{other} has {count} of the {most} photographs of {name}, so that it is not taken: was"
+            " its conversion interrupted?"
+            for other, count in counts.items()
+            if count < most
+        ]
         if len(group) > 1:
-            notes.append(f"{listed(list(of))} are copies in several sizes: {name} is taken")
+            notes.append(f"{listed([*counts])} are copies in several sizes: {name} is taken")
     return taken, notes
 
 
