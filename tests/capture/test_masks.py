@@ -164,6 +164,11 @@ FORMS: dict[str, tuple[Image.Image, str]] = {
     "RGBA": (GREY.convert("RGBA"), "png"),
     "transparent where it is not used": (as_rgba(255), "png"),
     "palette": (GREY.convert("RGB").convert("P", palette=Image.Palette.ADAPTIVE), "png"),
+    "a colour": (
+        Image.merge("RGB", [Image.new("L", (60, 40)), GREY, Image.new("L", (60, 40))]),
+        "png",
+    ),
+    "16 bits": (Image.fromarray(USED * np.uint16(65535)), "png"),
     "labels 0 and 1": (Image.fromarray(USED.astype(np.uint8)), "png"),
     "labels 0 and 1 as RGB": (Image.fromarray(USED.astype(np.uint8)).convert("RGB"), "png"),
     "JPEG": (GREY, "jpg"),

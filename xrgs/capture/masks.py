@@ -196,7 +196,7 @@ class Masks:
         if name not in self.files:
             return None, ""
         picture = images.decode(self.files[name])
-        bright = picture.pixels.mean(axis=-1)
+        bright = picture.pixels.max(axis=-1)  # a colour is as white as its brightest channel
         if picture.alpha is not None:
             bright *= picture.alpha
         largest = float(bright.max())

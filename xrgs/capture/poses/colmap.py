@@ -107,13 +107,15 @@ def read(root: Path) -> GivenPoses:
             raise XrgsError(f"{images_file}: {name}: {error}") from error
 
     known = points.errors[points.errors >= 0]
+    with np.errstate(over="ignore"):
+        report = {"reprojection_error_px": float(known.mean())} if len(known) else {}
     return GivenPoses(
         list(images),
         camera,
         points.xyz[order],
         points.colors[order],
         {name: _indices(image.points, numbers) for name, image in images.items()},
-        {"reprojection_error_px": float(known.mean())} if len(known) else {},
+        report,
         _notes(root, models),
     )
 
