@@ -97,7 +97,6 @@ def test_exif_orientation_is_applied_once_to_image_and_size(
         (SHORT, 0, b"\6\0", 1),
     ],
 )
-@pytest.mark.filterwarnings("ignore:Metadata Warning:UserWarning:PIL")
 def test_an_orientation_of_another_type_turns_all_or_nothing(
     tmp_path: Path, suffix: str, kind: int, count: int, value: bytes, applied: int
 ) -> None:
@@ -155,6 +154,20 @@ def test_the_camera_is_read_from_exif(tmp_path: Path) -> None:
     (tmp_path / "no.jpg").write_text("hello")
     with pytest.raises(ImageError, match=r"no\.jpg"):
         images.exif_camera(tmp_path / "no.jpg")
+
+
+@pytest.mark.parametrize(
+    ("value", "expected"), [(28, 28.0), (0, None), (65535, None), ("28", 28.0), ("wide", None)]
+)
+def test_the_focal_length_on_film_is_read_where_it_is_one(
+    tmp_path: Path, value: object, expected: float | None
+) -> None:
+    exif = Image.Exif()
+    exif.get_ifd(0x8769)[0xA405] = value
+    Image.new("RGB", (4, 3)).save(tmp_path / "exif.jpg", exif=exif)
+    Image.new("RGB", (4, 3)).save(tmp_path / "no_exif.jpg")
+    assert images.exif_focal(tmp_path / "exif.jpg") == expected
+    assert images.exif_focal(tmp_path / "no_exif.jpg") is None
 
 
 def test_a_truncated_file_is_named(tmp_path: Path, noise: images.ImageArray) -> None:

@@ -68,7 +68,6 @@ PHOTOGRAPHS = {kind: photograph(kind) for kind in ("PNG", "JPEG", "TIFF", "WEBP"
 
 @FAST
 @given(kind=st.sampled_from(sorted(PHOTOGRAPHS)), change=CHANGES)
-@pytest.mark.filterwarnings("ignore:.*:UserWarning:PIL")
 def test_a_damaged_photograph_is_read_or_refused(tmp_path: Path, kind: str, change: Any) -> None:
     file = tmp_path / "a.png"
     file.write_bytes(changed(PHOTOGRAPHS[kind], change))

@@ -280,7 +280,7 @@ def test_a_refused_attempt_is_followed_by_the_next(
     attempts = made.report["attempts"]
     assert [(a["attempt"], a["registered"]) for a in attempts] == [
         ("configured", 0),
-        ("finer", VIEWS),
+        ("relaxed", VIEWS),
     ]
     assert "0 of 12 photographs are placed" in attempts[0]["refused"]
     assert attempts[1]["refused"] == ""

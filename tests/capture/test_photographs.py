@@ -10,7 +10,12 @@ from PIL import Image
 
 from tests.capture.made_files import DISPLAY_P3, profile
 from xrgs.capture import images
-from xrgs.capture.photographs import assign_cameras, largest_of_shape, prepare_hr_views
+from xrgs.capture.photographs import (
+    assign_cameras,
+    largest_of_shape,
+    prepare_hr_views,
+    write_degraded,
+)
 from xrgs.capture.scenes import Scene
 from xrgs.composing import compose
 from xrgs.errors import UnreadableError, XrgsError
@@ -83,6 +88,22 @@ def test_a_resized_copy_has_the_shape_and_the_camera_of_the_largest(
 @pytest.mark.parametrize("size", [(40, 60), (30, 22), (300, 190)])
 def test_another_shape_is_another_camera(tmp_path: Path, size: tuple[int, int]) -> None:
     assert largest_of_shape([(60, 40), size]) == [(60, 40), size]
+
+
+@pytest.mark.parametrize(
+    ("size", "expected"), [((150, 100), (30, 20)), ((154, 103), (30, 20)), ((77, 152), (15, 30))]
+)
+def test_a_degraded_copy_for_sfm_keeps_the_aspect_ratio(
+    tmp_path: Path, size: tuple[int, int], expected: tuple[int, int]
+) -> None:
+    """154 x 103 px at a fifth are 31 x 21, whose pixels are no squares of the photograph."""
+    files = {name: write_photograph(tmp_path / f"{name}.png", size) for name in "ab"}
+    conf = replace(CONF, factor=5)
+    photos = prepare_hr_views(Scene("x", "", files), conf, tmp_path, for_sfm=True)
+    write_degraded(photos, [0], conf, "sfm_lr")
+    assert photos.size("sfm_lr", 0) == expected
+    assert photos.size(photos.upsampled("sfm_lr", 0), 0) == photos[0].sfm == size
+    assert photos.upsampled("sfm", 0) == "sfm"
 
 
 def test_exif_tells_cameras_lenses_and_how_they_were_held(tmp_path: Path) -> None:

@@ -44,22 +44,22 @@ def registered(views: int, points: int = 0) -> Reconstruction:
 def test_attempts_follow_until_one_is_accepted(
     photos: PhotoCollection, sfm_conf: SfmConf, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
-    """The first two are refused, whatever they found; the third reuses the second's features."""
-    refusals = iter(["too few", "too few", "", "never read"])
+    """Three are refused, whatever they found; the same features and matches are reused."""
+    refusals = iter(["too few", "too few", "too few", "", "never read"])
     done = registration.register(photos, [1], sfm_conf, tmp_path, lambda _: next(refusals))
     assert done.refused == ""
-    assert [a["attempt"] for a in done.attempts] == ["configured", "finer", "relaxed"]
-    assert [a["refused"] for a in done.attempts] == ["too few", "too few", ""]
-    first, finer, relaxed = done.attempts
-    assert finer["max_num_features"] == relaxed["max_num_features"] == 2 * 8192
-    assert [a["init_min_tri_angle"] for a in done.attempts] == [4, 4, 1]
-    assert [a["min_inliers"] for a in done.attempts] == [30, 30, 15]
-    assert first["registered"] == 2
-    assert first["seconds"] > 0
-    assert done.model.report["min_inliers"] == 15
-    folders = sorted(path.name for path in tmp_path.glob("sfm-*"))
-    assert folders == ["sfm-configured", "sfm-finer"]
-    assert len(list((tmp_path / "sfm-finer").glob("models-*"))) == 2
+    names = ["configured", "relaxed", "finer", "narrower"]
+    assert [a["attempt"] for a in done.attempts] == names
+    assert [a["refused"] for a in done.attempts] == ["too few", "too few", "too few", ""]
+    assert [a["max_num_features"] for a in done.attempts] == [8192, 8192, 2 * 8192, 2 * 8192]
+    assert [a["init_min_tri_angle"] for a in done.attempts] == [4, 4, 4, 1]
+    assert [a["min_inliers"] for a in done.attempts] == [30, 15, 15, 15]
+    assert done.attempts[0]["registered"] == 2
+    assert done.attempts[0]["seconds"] > 0
+    assert done.model.report["init_min_tri_angle"] == done.conf.init_min_tri_angle == 1
+    for name in ("configured", "finer"):
+        assert len(list((tmp_path / f"sfm-{name}").glob("models-*"))) == 2
+    assert not (tmp_path / "sfm-relaxed").exists()
     assert "SfM attempt finer: too few" in caplog.text
 
 
@@ -76,6 +76,25 @@ def test_an_accepted_first_attempt_is_the_only_one(
     assert not [r for r in caplog.records if r.levelno >= logging.WARNING]
 
 
+@pytest.mark.parametrize(("second", "refused"), [(2, ""), (1, ""), (2, "no")])
+def test_an_accepted_attempt_that_lacks_a_view_is_followed_by_one_more(
+    photos: PhotoCollection,
+    sfm_conf: SfmConf,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    second: int,
+    refused: str,
+) -> None:
+    results, refusals = iter([registered(1), registered(second)]), iter(["", refused])
+    monkeypatch.setattr(sfm, "reconstruct", lambda *_: next(results))
+    done = registration.register(photos, [1], sfm_conf, tmp_path, lambda _: next(refusals))
+    assert [a["attempt"] for a in done.attempts] == ["configured", "relaxed"]
+    assert done.refused == ""
+    better = second == 2 and not refused
+    assert len(done.model.viewmats) == (2 if better else 1)
+    assert done.conf.min_inliers == (15 if better else 30)
+
+
 @pytest.mark.parametrize("fallbacks", [True, False])
 def test_where_all_are_refused_the_one_with_most_views_is_returned(
     photos: PhotoCollection,
@@ -84,7 +103,7 @@ def test_where_all_are_refused_the_one_with_most_views_is_returned(
     monkeypatch: pytest.MonkeyPatch,
     fallbacks: bool,
 ) -> None:
-    results = iter([registered(0), registered(2), registered(1), registered(0)])
+    results = iter([registered(views) for views in (0, 2, 1, 0, 2)])
     monkeypatch.setattr(sfm, "reconstruct", lambda *_: next(results))
     done = registration.register(
         photos,
@@ -93,19 +112,19 @@ def test_where_all_are_refused_the_one_with_most_views_is_returned(
         tmp_path,
         lambda model: f"{len(model.viewmats)} are too few",
     )
-    assert [a["registered"] for a in done.attempts] == ([0, 2, 1, 0] if fallbacks else [0])
+    assert [a["registered"] for a in done.attempts] == ([0, 2, 1, 0, 2] if fallbacks else [0])
     assert done.refused == ("2 are too few" if fallbacks else "0 are too few")
 
 
 def test_of_refused_attempts_with_equally_many_views_the_first_is_returned(
     photos: PhotoCollection, sfm_conf: SfmConf, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    results = iter([registered(1, 10), registered(1, 40), registered(1, 20), registered(1, 30)])
+    results = iter([registered(1, points) for points in (10, 40, 20, 30, 50)])
     monkeypatch.setattr(sfm, "reconstruct", lambda *_: next(results))
     done = registration.register(
         photos, [1], sfm_conf, tmp_path, lambda model: f"{model.report['points']} points"
     )
-    assert len(done.attempts) == 4
+    assert len(done.attempts) == 5
     assert done.refused == "10 points"
     assert done.model.report["points"] == 10
 
@@ -116,10 +135,11 @@ def test_the_last_attempt_gives_small_images_the_other_way(
 ) -> None:
     conf = replace(sfm_conf, lr_images=given)
     attempts = list(registration.sfm_attempts(conf, 20, any_smaller=True))
-    assert [attempt.name for attempt in attempts] == ["configured", "finer", "relaxed", other]
+    names = ["configured", "relaxed", "finer", "narrower"]
+    assert [attempt.name for attempt in attempts] == [*names, other]
     assert attempts[-1].conf.lr_images == other
     same_size = registration.sfm_attempts(conf, 20, any_smaller=False)
-    assert [attempt.name for attempt in same_size] == ["configured", "finer", "relaxed"]
+    assert [attempt.name for attempt in same_size] == names
 
 
 @pytest.mark.parametrize(("inliers", "relaxed"), [(30, 15), (14, 7), (12, 6), (11, 6), (6, 6)])
@@ -128,7 +148,7 @@ def test_half_of_the_inliers_are_never_fewer_than_colmaps_six(
 ) -> None:
     conf = replace(sfm_conf, min_inliers=inliers)
     attempts = list(registration.sfm_attempts(conf, 20, any_smaller=True))
-    assert [attempt.conf.min_inliers for attempt in attempts] == [inliers, inliers, *[relaxed] * 2]
+    assert [attempt.conf.min_inliers for attempt in attempts] == [inliers, *[relaxed] * 4]
 
 
 def test_small_images_are_upsampled_or_have_a_camera_of_their_own(

@@ -26,7 +26,8 @@ def test_features_fall_with_the_number_of_images(count: int, asked: int, expecte
 
 def test_features_of_small_images_are_detected_at_twice_the_resolution() -> None:
     assert sfm.first_octave(252, None) == -1
-    assert sfm.first_octave(1008, None) == 0
+    assert sfm.first_octave(800, None) == -1
+    assert sfm.first_octave(801, None) == 0
     assert sfm.first_octave(252, 0) == 0
     assert sfm.first_octave(1008, -1) == -1
 
@@ -75,6 +76,26 @@ def test_the_stereo_pair_is_registered_with_its_known_intrinsics(stereo_pair: St
     for i, K in enumerate(motorcycle.intrinsics().values()):
         assert np.array_equal(model.lenses[i].K, K)
         assert model.lenses[i].is_pinhole
+
+
+@pytest.mark.parametrize(("focal", "expected"), [(995.0, 995.0), (None, 1.2 * 741)])
+def test_two_views_keep_the_focal_length_that_exif_gives(
+    sfm_conf: SfmConf,
+    stereo_scene: SceneConf,
+    tmp_path: Path,
+    focal: float | None,
+    expected: float,
+) -> None:
+    """From two views it can't be told apart from the depth."""
+    scene = scenes.resolve(stereo_scene, tmp_path)
+    inputs = []
+    for file in scene.files.values():
+        images.save(tmp_path / file.name, images.read(file))
+        inputs.append(sfm.SfmImage(file.name, file.stem, "all", None, focal))
+    model = sfm.reconstruct(inputs, tmp_path, tmp_path, sfm_conf)
+    assert [lens.params[0] for lens in model.lenses.values()] == pytest.approx([expected] * 2)
+    guessed = any("focal length is a guess" in note for note in model.report["notes"])
+    assert guessed == (focal is None)
 
 
 def test_its_cameras_are_parallel_and_side_by_side(stereo_pair: StereoPair) -> None:

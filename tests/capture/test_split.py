@@ -241,3 +241,21 @@ def test_an_unknown_test_view_is_refused_with_the_nearest_name(configured: Make)
     message = r"variant\.test: the scene has no view view_04\.png; did you mean view_004\?"
     with pytest.raises(XrgsError, match=message):
         check_test_names(names(9), configured(test=["view_003", "view_04.png"]))
+
+
+@pytest.mark.parametrize(
+    ("given", "names", "word"),
+    [
+        (["a", "b"], ["a,b", "c"], "'variant.test=[\"a,b\"]'"),
+        (["c", "a", "b", "d"], ["a, b", "c", "d"], '\'variant.test=["c","a, b","d"]\''),
+        (["1007100"], ["100_7100"], "'variant.test=[\"100_7100\"]'"),
+        (["q"], ["aq", "'q'"], """'variant.test=["'"'"'q'"'"'"]'"""),
+        (["True"], ["true", "a"], "'variant.test=[\"true\"]'"),
+    ],
+)
+def test_a_name_that_needs_quotes_is_answered_with_the_word_to_type(
+    configured: Make, given: list[str], names: list[str], word: str
+) -> None:
+    with pytest.raises(XrgsError) as caught:
+        check_test_names(names, configured(test=given))
+    assert f" On a command line it is {word}, in a file of YAML test: [" in str(caught.value)

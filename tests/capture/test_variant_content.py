@@ -97,7 +97,7 @@ def test_the_report_says_how_sfm_went(procedural_variant: Variant) -> None:
     assert report["points"] == len(procedural_variant.points) > 300
     assert len(procedural_variant.points) == len(procedural_variant.colors)
     assert 0 < report["reprojection_error_px"] < 1.5
-    assert report["not_registered"] == report["unreadable"] == []
+    assert report["not_registered"] == []
     assert report["hr_sizes"] == {"250x185": 24}
     assert report["seconds"] > 0
     assert "Feature extraction" in (procedural_variant.folder / "colmap.log").read_text()

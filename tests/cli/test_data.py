@@ -73,7 +73,11 @@ def test_exported_splats_cameras_and_points_are_in_one_frame(
             render = rendered(gaussians, viewmat, K, size)
             with Image.open(cell / "renders" / f"{entry['view']}.png") as stored:
                 expected = torch.from_numpy(np.array(stored)) / 255.0
-            assert (render - expected).abs().max() < 0.6 / 255
+            errors = (render - expected).abs().amax(dim=-1) * 255
+            # pycolmap stores quaternions. The last digits of a camera can move an alpha across
+            # alpha_min, 1/255, in single pixels.
+            assert (errors < 0.51).double().mean() > 0.999
+            assert errors.max() < 1.51
             viewmat[0, 3] += 0.05  # an empty render would look the same from anywhere
             assert (rendered(gaussians, viewmat, K, size) - expected).abs().max() > 2 / 255
     variant = next((store / "variants").glob("*-*"))

@@ -178,10 +178,15 @@ def test_the_tag_of_antialiased_gaussians(
     assert read_ply(file).antialiased == antialiased
 
 
-def test_an_own_tag_is_a_comment_that_is_read_back(tmp_path: Path) -> None:
+def test_an_own_tag_is_a_comment_that_is_read_back(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
     save_ply(tmp_path / "a.ply", make(), antialiased=True)
     assert PlyData.read(tmp_path / "a.ply").comments == ["SplatRenderMode: mip"]
     assert read_ply(tmp_path / "a.ply").antialiased
+    assert not caplog.text
+    load_ply(tmp_path / "a.ply")
+    assert "a.ply says that its Gaussians are antialiased: render them with" in caplog.text
     save_ply(tmp_path / "a.ply", make())
     assert PlyData.read(tmp_path / "a.ply").comments == []
 
@@ -193,6 +198,9 @@ def test_the_filter_of_mip_splatting_is_applied(
     read = read_ply(written(tmp_path / "a.ply", np.asarray(table)))
     assert read.antialiased
     assert "filter_3D" in caplog.text
+    table["scale_1"][2] = 500
+    with pytest.raises(XrgsError, match=r"of Gaussian 2 .* must be finite"):
+        read_ply(written(tmp_path / "b.ply", np.asarray(table)))
     raw = load_ply(saved)
     scales, opacities = smooth(
         raw.scales.double().exp(),

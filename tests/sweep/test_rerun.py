@@ -21,6 +21,7 @@ from xrgs.experiment.cell_folder import CellFolder
 from xrgs.experiment.identity import cell_id, cell_identity
 from xrgs.experiment.store import Store
 from xrgs.safeio.atomic import write_json
+from xrgs.splat.ply import ANTIALIASED_LINE
 from xrgs.sweep.jobs import worker
 from xrgs.sweep.rerun import RerunResult, rerun
 
@@ -280,6 +281,16 @@ def test_a_file_that_can_not_be_read_now_is_named(
     with pytest.raises(XrgsError, match=os.strerror(errno.EIO)) as caught:
         rerun(cell.path)
     assert f"{cell.id}/{name}" in str(caught.value)
+
+
+def test_a_tag_of_antialiased_gaussians_is_no_other_number(
+    cell: CellFolder, train: Callable[..., None]
+) -> None:
+    """Cells of 0.1.0 have none."""
+    train(("splats.ply", "ply", f"ply{ANTIALIASED_LINE.decode()}"))
+    assert rerun(cell.path).differences == []
+    train(("splats.ply", "ply", f"plx{ANTIALIASED_LINE.decode()}"))
+    assert rerun(cell.path).differences == ["splats.ply: the bytes differ"]
 
 
 def test_fewer_threads_than_none_are_refused(cell: CellFolder) -> None:

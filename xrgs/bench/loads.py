@@ -202,7 +202,6 @@ def load_from_cell(folder: Path, view_name: str) -> Load:
         XrgsError: The cell isn't done, its variant isn't in the store, or it has no such view.
     """
     from xrgs.experiment.cell_folder import CellFolder
-    from xrgs.splat.ply import load_ply
 
     cell = CellFolder(folder)
     state = cell.state()
@@ -213,7 +212,7 @@ def load_from_cell(folder: Path, view_name: str) -> Load:
     if view_name not in views:
         raise XrgsError(f"view={view_name}: must be one of {', '.join(sorted(views))}")
     means, quats, scales, opacities, sh0, rest = (
-        value.detach() for value in load_ply(folder / "splats.ply").activated()
+        value.detach() for value in cell.gaussians().activated()
     )
     sh = torch.zeros(len(means), 16, 3)
     sh[:, : 1 + rest.shape[1]] = torch.cat([sh0, rest], dim=1)

@@ -9,6 +9,7 @@ Nothing here imports torch before `resize` is called.
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
@@ -93,7 +94,8 @@ if Image.MAX_IMAGE_PIXELS is not None:
 def _stream(path: Path) -> Iterator[BinaryIO]:
     """Open a file; every error of reading it as an image names it."""
     try:
-        with path.open("rb") as stream:
+        with path.open("rb") as stream, warnings.catch_warnings():
+            warnings.filterwarnings("ignore", module="PIL")  # they name no file
             yield stream
     except MemoryError:
         raise

@@ -54,6 +54,9 @@ _PERSPECTIVE = ("SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV", "SIMPLE_DIVI
 _MAX_TANGENT = np.tan(np.radians(60.0))
 #: The longest focal length of an undistorted image, over the focal length of the photograph.
 _MAX_ZOOM = 8.0
+#: The shortest focal length of a camera, over the longer side of its image, and the largest value
+#: of a parameter: no camera comes near them, and powers of such numbers stay finite.
+_LEAST_FOCAL, _MAX_VALUE = 1e-3, 1e9
 _Row = tuple[float, float, float]
 
 
@@ -193,7 +196,12 @@ def lens_of_model(model: str, size: tuple[int, int], params: Sequence[float]) ->
             f"({', '.join(names)})"
         )
     focal = values[: 2 if names[0] == "fx" else 1]
-    if not np.isfinite(values).all() or min(*focal, *size) <= 0:
+    has_size = 0 < min(size) <= max(size) < _MAX_VALUE
+    if (
+        not has_size
+        or not (np.abs(values) < _MAX_VALUE).all()
+        or min(focal) < _LEAST_FOCAL * max(size)
+    ):
         raise XrgsError(
             f"camera model {model}: its size and focal length must be above 0, and all values "
             f"finite: {size[0]}x{size[1]} px, {', '.join(f'{v:g}' for v in values)}"

@@ -111,7 +111,7 @@ def _register(inputs: _Inputs, work: Path) -> Registration:
         if not len(model.points):
             write_degraded(photos, inputs.degraded, conf)
             model = triangulation.with_points(model, photos, inputs.degraded, conf.sfm, work)
-        return Registration(model, _refusal(inputs, model), [])
+        return Registration(model, _refusal(inputs, model), conf.sfm, [])
     write_degraded(photos, inputs.degraded, conf, "sfm_lr")
     return registration.register(
         photos, inputs.degraded, conf.sfm, work, lambda model: _refusal(inputs, model)
@@ -158,7 +158,7 @@ def _failure(
     said = [registered.refused]
     undegraded = None
     if conf.poses is None and inputs.degraded:
-        undegraded = registration.reconstruct_undegraded(photos, conf.sfm, work)
+        undegraded = registration.reconstruct_undegraded(photos, registered.conf, work)
         report = report | {"reference": _results(undegraded)}
         said.append(f"undegraded, {_placed(undegraded, photos.names)}")
     advice = ", ".join(_advice(inputs, model, undegraded))

@@ -7,7 +7,8 @@ of small images several times more accurate. With `native`, SfM gets a smaller i
 a camera of its size.
 
 The first attempt, `configured`, has the settings of `variant.sfm`. With `sfm.fallbacks`, the
-attempts of `FALLBACKS` follow in their order until a reconstruction is accepted.
+attempts of `FALLBACKS` follow in their order until a reconstruction is accepted. The first of them
+also follows where a reconstruction is accepted that lacks views.
 """
 
 from __future__ import annotations
@@ -56,16 +57,20 @@ class Attempt:
     conf: SfmConf
 
 
+def relaxed(conf: SfmConf, images: int, *, any_smaller: bool) -> Attempt:  # noqa: ARG001
+    """Accept half of the inliers per view; features and matches stay, so that it is quick."""
+    return Attempt("relaxed", replace(conf, min_inliers=max(_MIN_INLIERS, conf.min_inliers // 2)))
+
+
 def finer(conf: SfmConf, images: int, *, any_smaller: bool) -> Attempt:  # noqa: ARG001
     """Detect twice the features, at twice the resolution."""
     features = 2 * sfm.features_per_image(images, conf.max_num_features)
     return Attempt("finer", replace(conf, max_num_features=features, first_octave=-1))
 
 
-def relaxed(conf: SfmConf, images: int, *, any_smaller: bool) -> Attempt:  # noqa: ARG001
-    """Accept a quarter of the first pair's angle, and half of the inliers per view."""
-    angle, inliers = conf.init_min_tri_angle / 4, max(_MIN_INLIERS, conf.min_inliers // 2)
-    return Attempt("relaxed", replace(conf, init_min_tri_angle=angle, min_inliers=inliers))
+def narrower(conf: SfmConf, images: int, *, any_smaller: bool) -> Attempt:  # noqa: ARG001
+    """Accept a quarter of the first pair's angle."""
+    return Attempt("narrower", replace(conf, init_min_tri_angle=conf.init_min_tri_angle / 4))
 
 
 def other_size(conf: SfmConf, images: int, *, any_smaller: bool) -> Attempt | None:  # noqa: ARG001
@@ -75,8 +80,10 @@ def other_size(conf: SfmConf, images: int, *, any_smaller: bool) -> Attempt | No
 
 
 #: The attempts after the first, in order. Each changes the settings of the attempt before it, and
-#: gets the number of images and whether any of them is smaller than its HR view; None skips it.
-FALLBACKS = (finer, relaxed, other_size)
+#: gets the number of images and whether any of them is smaller than the largest; None skips it.
+#: ALIKED and LightGlue are none of them: pycolmap's wheels are built without ONNX, and abort the
+#: process where these are asked for.
+FALLBACKS = (relaxed, finer, narrower, other_size)
 
 
 @dataclass(frozen=True)
@@ -86,6 +93,8 @@ class Registration:
     model: sfm.Reconstruction
     refused: str
     """Why even the best reconstruction is not accepted; empty where it is."""
+    conf: SfmConf
+    """The settings of its attempt."""
     attempts: list[dict[str, Any]]
     """For each attempt its name, why it was refused, its seconds, settings and results."""
 
@@ -107,10 +116,10 @@ def register(
         refusal: Returns why a reconstruction is refused; an empty text accepts it.
 
     Returns:
-        The first reconstruction that was accepted; where none was, the one with the most registered
-        views, and the earlier one of two with equally many.
+        The reconstruction with the most registered views of those that were accepted, or of all
+        where none was; the earlier one of two with equally many.
     """
-    best: tuple[sfm.Reconstruction, str] | None = None
+    best: tuple[sfm.Reconstruction, str, SfmConf] | None = None
     reports: list[dict[str, Any]] = []
     any_smaller = any(
         photos.size(_kind(i, degraded), i) != photo.sfm for i, photo in enumerate(photos.all)
@@ -125,14 +134,19 @@ def register(
         seconds = round(time.perf_counter() - start, 1)
         results = {key: model.report[key] for key in _ATTEMPT_KEYS if key in model.report}
         reports.append({"attempt": attempt.name, "refused": reason, "seconds": seconds} | results)
-        if best is None or len(model.viewmats) > len(best[0].viewmats) or not reason:
-            best = model, reason
-        if not reason:
+        if best is None or _rank(model, reason) > _rank(*best[:2]):
+            best = model, reason, attempt.conf
+        if reason:
+            _log.warning("SfM attempt %s: %s", attempt.name, reason)
+        if not best[1] and (len(best[0].viewmats) == len(photos) or len(reports) > 1):
             break
-        _log.warning("SfM attempt %s: %s", attempt.name, reason)
     if best is None:
         raise RuntimeError("there is always a first attempt")
     return Registration(*best, reports)
+
+
+def _rank(model: sfm.Reconstruction, refused: str) -> tuple[bool, int]:
+    return not refused, len(model.viewmats)
 
 
 def sfm_attempts(conf: SfmConf, images: int, *, any_smaller: bool) -> Iterator[Attempt]:

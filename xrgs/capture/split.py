@@ -112,26 +112,49 @@ def check_test_names(names: Sequence[str], conf: VariantConf) -> None:
     Raises:
         XrgsError: A name in `variant.test` is not among them; the message has the most similar one.
     """
-    for name in conf.test:
-        if name not in names:
-            # A name with commas is several names where it has no quotes.
-            similar = [whole for whole in (",".join(conf.test),) if whole in names]
-            similar += get_close_matches(name, names, n=1, cutoff=0.0)
-            meant = f"did you mean {similar[0]}?{_word(similar[0])}" if similar else "it has none"
-            raise XrgsError(
-                f"variant.test: the scene has no view {name}; {meant} The name of a view is"
-                " its file's name without the suffix"
-            )
+    missing = [name for name in conf.test if name not in names]
+    if not missing:
+        return
+    meant = _meant(conf.test, names)
+    similar = next((name for name in meant if name not in conf.test), None)
+    hint = f"did you mean {similar}?{_words(meant)}" if similar else "it has none"
+    raise XrgsError(
+        f"variant.test: the scene has no view {missing[0]}; {hint} The name of a view is its file's"
+        " name without the suffix"
+    )
 
 
-def _word(name: str) -> str:
-    """Say how a name is written on a command line or in YAML, where it can't be as it is."""
-    is_a_value = name.casefold() in {"true", "false", "null", "yes", "no", "on", "off"}
-    if re.fullmatch(r"[A-Za-z][\w.-]*", name) and not is_a_value:
+def _meant(given: Sequence[str], names: Sequence[str]) -> list[str]:
+    """Replace each name that a scene lacks by the most similar one.
+
+    A name with commas was taken for several, and the quotes of a name for those of a text.
+    """
+    meant, rest = [], list(given)
+    while rest:
+        wholes = [
+            (joined, count)
+            for count in range(len(rest), 0, -1)
+            for joined in (", ".join(rest[:count]), ",".join(rest[:count]))
+        ]
+        similar = get_close_matches(rest[0], names, n=1, cutoff=0.0)
+        single = [(name, 1) for name in (f"'{rest[0]}'", f'"{rest[0]}"', *similar)]
+        known = (guess for guess in (*wholes, *single) if guess[0] in names)
+        name, count = next(known, (rest[0], 1))
+        meant.append(name)
+        rest = rest[count:]
+    return meant
+
+
+def _words(names: Sequence[str]) -> str:
+    """Say how views are named on a command line and in YAML, where a name needs quotes there."""
+    values = {"true", "false", "null", "yes", "no", "on", "off"}
+    plain = (re.fullmatch(r"[A-Za-z][\w.-]*", n) and n.casefold() not in values for n in names)
+    if all(plain):
         return ""
-    escaped = name.replace("\\", r"\\").replace('"', r"\"")
-    word = shlex.quote(f'variant.test=["{escaped}"]')
-    return f' On a command line it is {word}, in a file of YAML test: ["{escaped}"].'
+    escaped = (name.replace("\\", r"\\").replace('"', r"\"") for name in names)
+    test = ",".join(f'"{name}"' for name in escaped)
+    word = shlex.quote(f"variant.test=[{test}]")
+    return f" On a command line it is {word}, in a file of YAML test: [{test}]."
 
 
 def split_views(

@@ -35,6 +35,8 @@ _QUOTED, _QUOTED_PART = (
 )
 #: By how much a bracket changes the depth of what is behind it.
 _DEPTH = dict.fromkeys("([{", 1) | dict.fromkeys(")]}", -1)
+#: The key or the resolver of an interpolation.
+_INTERPOLATED = re.compile(r"\$\{([^:}]*)")
 #: Keys whose values are lists of names.
 _NAMES = frozenset({"variant.test"})
 #: Keys whose values are paths.
@@ -138,6 +140,13 @@ def _exists(path: str) -> bool:
     return user_path(path.removesuffix(ALL_BELOW)).exists()
 
 
+def _literal(text: str) -> str:
+    """Escape `${` in a text, unless each interpolation in it names a key or a resolver."""
+    named = _INTERPOLATED.findall(text)
+    known = (name.startswith(("oc.", "hydra")) or name in config.known_keys() for name in named)
+    return text if named and all(known) else escape_interpolations(text)
+
+
 def _parsed(word: str) -> Override | None:
     """Return what Hydra reads from a word; None where its grammar refuses the word."""
     with suppress(HydraException):
@@ -149,6 +158,7 @@ def _parsed(word: str) -> Override | None:
 def _quoted_path(key: str, value: str) -> str:
     if _exists(value):
         return _quoted(key, escape_interpolations(value))
+    value = _literal(value)
     override = _parsed(f"{key}={value}")
     # The word null, and the escapes of Hydra's grammar, where there is no file of that name.
     if override and (override.value() is None or "\\" in value):
@@ -166,17 +176,17 @@ def _quoted(key: str, value: str) -> str:
 
 def _quoted_lists(value: str) -> str:
     """Return one list of names, or several that are an axis, with quotes around each name."""
-    if value.startswith("${"):
+    if value.startswith("${") and value == _literal(value):
         return value
     lists = [part.strip() for part in _parts(value)]
     if not all(part.startswith("[") and part.endswith("]") for part in lists):
         lists = [value if value[0] == "[" and value[-1] == "]" else f"[{value}]"]
-    return ",".join(f"[{','.join(map(_quoted_name, _parts(names[1:-1])))}]" for names in lists)
+    names = ([part.strip() for part in _parts(inside[1:-1])] for inside in lists)
+    return ",".join(f"[{','.join(map(_quoted_name, filter(None, some)))}]" for some in names)
 
 
-def _quoted_name(text: str) -> str:
-    name = text.strip()
-    if not name or _QUOTED.fullmatch(name):
+def _quoted_name(name: str) -> str:
+    if _QUOTED.fullmatch(name):
         return name
     return QuotedString(escape_interpolations(name), Quote.single).with_quotes()
 

@@ -393,10 +393,10 @@ class CellFolder:
         Raises:
             XrgsError: `splats.ply` is missing or damaged, or was removed on purpose.
         """
-        from xrgs.splat.ply import load_ply
+        from xrgs.splat.ply import read_ply
 
         self.check_not_trimmed("splats.ply")
-        return load_ply(self.path / "splats.ply")
+        return read_ply(self.path / "splats.ply").gaussians
 
     def variant(self) -> Variant:
         """Load the variant that the cell was trained on, from the store that the cell is in.

@@ -40,8 +40,8 @@ if TYPE_CHECKING:
 _log = logging.getLogger(__name__)
 
 _NORMALS = ("nx", "ny", "nz")
-#: The comment of Brush, SuperSplat and LichtFeld Studio for antialiased Gaussians.
-_ANTIALIASED = "SplatRenderMode: mip"
+ANTIALIASED_LINE = b"comment SplatRenderMode: mip\n"
+"""The line of Brush and of SuperSplat's converter for antialiased Gaussians."""
 #: How comments say it, in lower case: `SplatRenderMode: mip`, or Postshot's `antialiased 1`.
 _RENDER_MODE = re.compile(r"splatrendermode:\s*(\S+)|antialiased\s+([01])")
 #: Harmonics of more bands are in no file that a trainer writes.
@@ -76,14 +76,13 @@ def save_ply(
     ]
     table = torch.cat([column.detach().float() for column in columns], dim=1)
     header = [
-        "ply",
-        "format binary_little_endian 1.0",
-        *([f"comment {_ANTIALIASED}"] if antialiased else []),
         f"element vertex {len(gaussians)}",
         *(f"property float {name}" for name in _properties(gaussians.shN.shape[1])),
         "end_header",
     ]
     with atomic_writer(path, durable=durable) as file:
+        file.write(b"ply\nformat binary_little_endian 1.0\n")
+        file.write(ANTIALIASED_LINE if antialiased else b"")
         file.write("".join(f"{line}\n" for line in header).encode())
         file.write(table.numpy().astype("<f4").tobytes())
 
@@ -100,12 +99,21 @@ def load_ply(path: str | Path) -> Gaussians:
         path: The .ply file.
 
     Returns:
-        float32 leaf tensors with gradients on. `load_gaussians` also says how to render them.
+        float32 leaf tensors with gradients on. A warning says that they are antialiased where the
+        file does; `load_gaussians` returns it.
 
     Raises:
         XrgsError: The file is missing, damaged or no such .ply; the message names it.
     """
-    return read_ply(Path(path) if isinstance(path, str) else path).gaussians
+    path = Path(path) if isinstance(path, str) else path
+    gaussians, antialiased = read_ply(path)
+    if antialiased:
+        _log.warning(
+            "%s says that its Gaussians are antialiased: render them with "
+            "RasterSettings(antialiased=True). xrgs.load_gaussians returns this, without a warning",
+            path,
+        )
+    return gaussians
 
 
 def read_ply(path: Path) -> SavedGaussians:
@@ -118,7 +126,6 @@ def read_ply(path: Path) -> SavedGaussians:
     opacities[np.isposinf(opacities)] = CERTAIN_LOGIT
     opacities[np.isneginf(opacities)] = -CERTAIN_LOGIT
     scales[np.isneginf(scales)] = FLAT_LOG_SCALE
-    check_finite(path, table, names)
     antialiased = _is_antialiased(file.comments)
     if "filter_3D" in file.names:
         _log.warning("%s: the 3D filter of Mip-Splatting (filter_3D) is applied", path)
@@ -126,6 +133,7 @@ def read_ply(path: Path) -> SavedGaussians:
         check_finite(path, sizes, ["filter_3D"])
         scales[:], opacities[:] = _filtered(scales, opacities, sizes)
         antialiased = True  # Mip-Splatting renders so
+    check_finite(path, table, names)
     values = {
         "means": table[:, :3],
         "sh0": table[:, None, 3:6],
@@ -200,10 +208,11 @@ def _filtered(scales: Table, opacities: Table, sizes: NDArray[np.float64]) -> tu
 
     `xrgs.training.components.mip` has the formula.
     """
-    variances = np.exp(2 * scales.astype(np.float64))
-    filtered = variances + sizes**2
-    alpha = 1 / (1 + np.exp(-opacities.astype(np.float64)))
-    alpha *= np.sqrt(variances / filtered).prod(axis=1)
+    with np.errstate(over="ignore", invalid="ignore"):  # what is not finite is refused later
+        variances = np.exp(2 * scales.astype(np.float64))
+        filtered = variances + sizes**2
+        alpha = 1 / (1 + np.exp(-opacities.astype(np.float64)))
+        alpha *= np.sqrt(variances / filtered).prod(axis=1)
     bounds = np.finfo(np.float32)
     alpha = alpha.clip(bounds.tiny, 1 - bounds.eps)
     return np.log(filtered) / 2, np.log(alpha / (1 - alpha))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 from collections.abc import Callable, Sequence
 from dataclasses import replace
@@ -93,6 +94,23 @@ def test_a_pose_of_upright_pixels_stays_as_it_is(
     for i in range(3):
         assert pixels(model, i) == pytest.approx(project(i))
     assert model.report["notes"] == []
+
+
+@pytest.mark.parametrize("upright_copies", [False, True])
+def test_one_photograph_decides_for_those_that_fit_both_ways(
+    photographs: Callable[..., PhotoCollection], tmp_path: Path, upright_copies: bool
+) -> None:
+    """EXIF turns one photograph by a quarter and two by half: the cameras are of one kind."""
+    photos = photographs(size=(100, 75), orientation={"a": 6, "b": 3, "c": 3})
+    file = write_transforms(tmp_path / "poses", {"w": 100, "h": 75})
+    content = json.loads(file.read_text())
+    if upright_copies:
+        content["frames"][0] |= {"w": 75, "h": 100}
+        file.write_text(json.dumps(content))
+    model = poses.read_poses(str(file), photos)
+    for i, orientation in enumerate((6, 3, 3)):
+        seen = project(i) if upright_copies else upright(orientation, (100, 75), project(i))
+        assert pixels(model, i) == pytest.approx(seen, abs=1e-4)  # the points are float32
 
 
 @pytest.mark.parametrize("orientation", [2, 4, 5, 7])

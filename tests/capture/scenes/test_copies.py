@@ -55,8 +55,8 @@ def test_files_of_the_same_bytes_are_taken_once(tmp_path: Path) -> None:
     found = folder.look(str(tmp_path), 0)
     assert names(tmp_path, found) == ORIGINALS
     assert found.notes == (
-        "3 left out, the same bytes as another photograph: Copy of IMG_1.jpg (as IMG_1.jpg),"
-        " DSC_0817.jpg (as IMG_2.jpg), IMG_0 (1).jpg (as IMG_0.jpg)",
+        "3 left out as identical copies (the same bytes): Copy of IMG_1.jpg (of IMG_1.jpg),"
+        " DSC_0817.jpg (of IMG_2.jpg), IMG_0 (1).jpg (of IMG_0.jpg)",
     )
 
 
@@ -69,14 +69,16 @@ def test_empty_files_are_no_copies_of_each_other(tmp_path: Path) -> None:
     assert not found.notes
 
 
-@pytest.mark.parametrize("name", ["IMG_3_small.jpg", "small-IMG_3.png", "IMG_3.png", "IMG_3 2.jpg"])
+@pytest.mark.parametrize(
+    "name", ["IMG_3_small.jpg", "small-IMG_3.png", "IMG_3.png", "IMG_3 2.jpg", "IMG_3half.jpg"]
+)
 def test_a_resized_copy_in_the_folder_is_left_out(tmp_path: Path, name: str) -> None:
     shoot(tmp_path)
     write(tmp_path / name, 3, (80, 60))
     found = folder.look(str(tmp_path), 0)
     assert names(tmp_path, found) == ORIGINALS
     (note,) = found.notes
-    assert f"the same picture as another photograph: {name} (as IMG_3.jpg)" in note
+    assert f"(the same picture): {name} (of IMG_3.jpg)" in note
 
 
 def test_other_photographs_with_related_names_stay(tmp_path: Path) -> None:
@@ -106,7 +108,9 @@ def test_a_folder_of_resized_copies_is_left_out(tmp_path: Path, size: tuple[int,
     found = below(tmp_path)
     assert names(tmp_path, found) == ORIGINALS
     (note,) = found.notes
-    assert note.startswith("6 left out, the same picture as another photograph: resized/img_0.PNG")
+    assert note.startswith(
+        "6 left out as copies in another size or format (the same picture): resized"
+    )
 
 
 @pytest.mark.parametrize(("long_side", "taken"), [(0, "images"), (80, "images_2"), (100, "images")])
@@ -133,7 +137,7 @@ def test_copies_of_the_sizes_that_are_not_taken_are_left_out(tmp_path: Path) -> 
         shutil.copy(tmp_path / "images" / f"IMG_{number}.jpg", backup)
     found = below(tmp_path, 80)
     assert {file.parent.name for file in found.files.values()} == {"images_2"}
-    assert "backup/photo 0.jpg (as images/IMG_0.jpg)" in found.notes[1]
+    assert "backup/photo 0.jpg (of images/IMG_0.jpg)" in found.notes[1]
 
 
 def test_a_folder_of_copies_with_other_names_is_left_out(tmp_path: Path) -> None:
@@ -167,6 +171,13 @@ def test_sizes_that_lack_photographs_are_not_taken(tmp_path: Path, fault: str) -
     for found in (below(tmp_path, 80), folder.look(str(tmp_path), 80)):
         assert {file.parent.name for file in found.files.values()} == {"images"}
         assert "images_2 has 4 of the 6 photographs of images" in found.notes[0]
+
+
+def test_photographs_with_films_behind_them_are_whole(tmp_path: Path) -> None:
+    for file in shoot(tmp_path / "images").iterdir():
+        file.write_bytes(file.read_bytes() + bytes(5000))
+    shoot(tmp_path / "images_2", size=(80, 60))
+    assert folder.look(str(tmp_path), 0).files["IMG_0"].parent.name == "images"
 
 
 def test_a_store_and_all_that_xrgs_writes_are_left_out(tmp_path: Path) -> None:
@@ -235,15 +246,22 @@ def test_masks_beside_their_photographs_are_left_out(tmp_path: Path, name: str) 
     assert name in found.notes[0]
 
 
-def test_images_of_one_channel_with_the_names_of_photographs_are_left_out(tmp_path: Path) -> None:
-    shoot(tmp_path / "rgb")
+@pytest.mark.parametrize("mode", ["L", "RGB"])
+def test_masks_with_the_names_of_photographs_are_left_out_in_any_folder(
+    tmp_path: Path, mode: str
+) -> None:
+    shoot(tmp_path)
+    (tmp_path / "labels").mkdir()
     for number in range(6):
-        file = tmp_path / "labels" / f"IMG_{number}.png"
-        write(file, number)
-        picture(number + 20).convert("L").save(file)
+        mask = picture(number + 20).convert("L")
+        mask = mask if mode == "L" else mask.point(lambda grey: 255 * (grey > 99)).convert("RGB")
+        mask.save(tmp_path / "labels" / f"IMG_{number}.png")
     found = below(tmp_path)
-    assert {file.parent.name for file in found.files.values()} == {"rgb"}
+    assert names(tmp_path, found) == ORIGINALS
     assert "6 images left out" in found.notes[0]
+    assert folder.look(str(tmp_path), 0).notes == (
+        f"images left out: 6 in labels (masks; scene.masks={tmp_path / 'labels'} uses them)",
+    )
 
 
 @pytest.mark.parametrize("sibling", ["input", "stereo"])
@@ -307,7 +325,7 @@ def test_of_heic_and_jpeg_of_one_name_one_is_taken(
         monkeypatch.setitem(sys.modules, "pillow_heif", None)
     found = folder.look(str(tmp_path), 0)
     assert names(tmp_path, found) == ORIGINALS
-    assert "IMG_0.HEIC (as IMG_0.jpg)" in found.notes[0]
+    assert "IMG_0.HEIC (of IMG_0.jpg)" in found.notes[0]
 
 
 def test_raw_files_and_films_of_the_photographs_names_are_said_once(tmp_path: Path) -> None:
@@ -319,12 +337,16 @@ def test_raw_files_and_films_of_the_photographs_names_are_said_once(tmp_path: Pa
     )
 
 
-def test_panoramas_and_screenshots_are_named(tmp_path: Path) -> None:
+def test_panoramas_are_left_out_and_screenshots_are_named(tmp_path: Path) -> None:
     shoot(tmp_path)
     write(tmp_path / "pano.jpg", 40, (400, 120))
     write(tmp_path / "screenshot.png", 41, (73, 158))
-    (note,) = folder.look(str(tmp_path), 0).notes
-    assert "longer than the other photographs: pano.jpg, screenshot.png" in note
+    found = folder.look(str(tmp_path), 0)
+    assert names(tmp_path, found) == [*ORIGINALS, "screenshot.png"]
+    assert found.notes == (
+        "left out as panoramas, by their shape: pano.jpg",
+        "longer for their width than others (screenshots, crops?): screenshot.png",
+    )
     shoot(tmp_path / "wide", size=(320, 130), first=20)
     assert not folder.look(str(tmp_path / "wide"), 0).notes
 

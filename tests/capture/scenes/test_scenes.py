@@ -131,6 +131,22 @@ def test_one_view_is_too_few(tmp_path: Path) -> None:
         scenes.resolve(replace(PROCEDURAL, views=1), tmp_path)
 
 
+def test_what_becomes_of_alpha_is_in_the_fingerprint() -> None:
+    mask = replace(PROCEDURAL, alpha="mask")
+    white = replace(PROCEDURAL, background=(1.0, 1.0, 1.0))
+    assert len({scenes.fingerprint(conf, 60) for conf in (PROCEDURAL, mask, white)}) == 3
+    with pytest.raises(XrgsError, match=r"scene\.alpha=none: must be one of composite, mask"):
+        scenes.fingerprint(replace(PROCEDURAL, alpha="none"))
+    with pytest.raises(XrgsError, match=r"scene\.background=\[0, 0, 255\]: values must be 0 to 1"):
+        scenes.fingerprint(replace(PROCEDURAL, background=(0, 0, 255)))
+
+
+def test_alpha_and_background_reach_the_scene(fill: Fill, tmp_path: Path) -> None:
+    conf = replace(fill(tmp_path / "x", "a.png", "b.png"), alpha="mask", background=(1, 0, 0.5))
+    scene = scenes.resolve(conf, tmp_path)
+    assert (scene.alpha, scene.background) == ("mask", (1, 0, 0.5))
+
+
 def test_fingerprints_need_neither_torch_nor_scikit_image() -> None:
     script = (
         "import sys; from xrgs.capture import scenes; from xrgs.composing import compose;"

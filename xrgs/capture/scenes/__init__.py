@@ -71,11 +71,14 @@ def fingerprint(conf: SceneConf, long_side: int = 0) -> str:
             folder may hold copies of several sizes, and the procedural scene is rendered in it.
 
     Raises:
-        XrgsError: The kind is unknown, or the photographs are not there.
+        XrgsError: The kind is unknown, a value is out of its range, or the photographs are not
+            there.
     """
-    content = f"{conf.kind}\0{_kind(conf).digest(conf, long_side)}"
     if conf.alpha not in ALPHA:
         raise XrgsError(f"scene.alpha={conf.alpha}: must be one of {', '.join(ALPHA)}")
+    if not all(0 <= value <= 1 for value in conf.background):
+        raise XrgsError(f"scene.background={list(conf.background)}: values must be 0 to 1")
+    content = f"{conf.kind}\0{_kind(conf).digest(conf, long_side)}"
     if (conf.alpha, *conf.background) != (ALPHA[0], 0, 0, 0):
         content += f"\0{conf.alpha}\0{list(conf.background)}"
     if conf.masks is not None:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import re
 from collections import defaultdict
+from contextlib import suppress
 from itertools import combinations
 from typing import TYPE_CHECKING
 
@@ -15,11 +16,10 @@ import numpy as np
 
 from xrgs.capture import images
 from xrgs.capture.scenes.scene import content, remembered
-from xrgs.errors import UnreadableError
 from xrgs.runtime.text import listed
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Sequence
+    from collections.abc import Iterable, Sequence, Set
     from pathlib import Path
 
     from numpy.typing import NDArray
@@ -56,11 +56,16 @@ def size(file: Path) -> tuple[int, int]:
 
 @remembered
 def _is_whole(file: Path) -> bool:
-    """Return whether a file has a header and is not cut off; it is not decoded."""
-    mark = _END_MARKS.get(file.suffix.lower(), b"")
+    """Return whether a file is not cut off; it is decoded where no mark is at its end."""
     with file.open("rb") as stream:
         stream.seek(max(0, file.stat().st_size - _TAIL_BYTES))
-        return mark in stream.read() and size(file) != (0, 0)
+        tail = stream.read()
+    if (mark := _END_MARKS.get(file.suffix.lower())) and mark in tail:
+        return size(file) != (0, 0)
+    with suppress(images.ImageError):  # telephones append films to JPEGs
+        images.thumbnail(file, _THUMBNAIL)
+        return True
+    return False
 
 
 @remembered
@@ -94,22 +99,22 @@ def one_of_each_size(
         groups.append([files]) if group is None else group.append(files)
     taken, notes = [], []
     for group in groups:
-        count = {files[0].parent: sum(map(_is_whole, files)) for files in group}
-        complete = [files for files in group if count[files[0].parent] == max(count.values())]
+        counts = {files[0].parent.name: sum(map(_is_whole, files)) for files in group}
+        most = max(counts.values())
+        complete = [files for files in group if counts[files[0].parent.name] == most]
         by_side = sorted(((_long_side(files), files) for files in complete), key=lambda c: c[0])
         sufficient = [files for side, files in by_side if long_side and side >= long_side]
         choice = sufficient[0] if sufficient else by_side[-1][1]
         taken.append(choice)
-        of = {name.name: number for name, number in count.items()}
         name = choice[0].parent.name
-        for other, number in of.items():
-            if number < of[name]:
-                notes.append(
-                    f"{other} has {number} of the {of[name]} photographs of {name}, so that it is"
-                    " not taken: was its conversion interrupted?"
-                )
+        notes += [
+            f"{other} has {count} of the {most} photographs of {name}, so that it is not taken: was"
+            " its conversion interrupted?"
+            for other, count in counts.items()
+            if count < most
+        ]
         if len(group) > 1:
-            notes.append(f"{listed(list(of))} are copies in several sizes: {name} is taken")
+            notes.append(f"{listed([*counts])} are copies in several sizes: {name} is taken")
     return taken, notes
 
 
@@ -155,7 +160,7 @@ def without_copies(
     Returns:
         The files in their order, and notes.
     """
-    same = _identical(files, other_sizes)
+    same = _identical(files, frozenset(other_sizes))
     left = [file for file in files if file not in same]
     alike: dict[Path, Path] = {}
     for a, b in (*_of_one_folder(left), *_of_two_folders(left)):
@@ -163,25 +168,24 @@ def without_copies(
         if copy not in alike and original not in alike and _show_the_same(a, b):
             alike[copy] = original
     notes = []
-    for what, pairs in (("the same bytes", same), ("the same picture", alike)):
+    for what, pairs in (
+        ("identical copies (the same bytes)", same),
+        ("copies in another size or format (the same picture)", alike),
+    ):
         if pairs:
             names = [
-                f"{copy.relative_to(folder)} (as {original.relative_to(folder)})"
+                f"{copy.relative_to(folder)} (of {original.relative_to(folder)})"
                 for copy, original in sorted(pairs.items())
             ]
-            notes.append(f"{len(pairs)} left out, {what} as another photograph: {listed(names)}")
+            notes.append(f"{len(pairs)} left out as {what}: {listed(names)}")
     return [file for file in left if file not in alike], notes
 
 
-def _identical(files: Sequence[Path], known: Sequence[Path]) -> dict[Path, Path]:
+def _identical(files: Sequence[Path], known: Set[Path]) -> dict[Path, Path]:
     """Return the files that have the bytes of another or of a known one, with that one."""
     by_length = defaultdict(list)
     for file in (*known, *files):
-        try:
-            by_length[file.stat().st_size].append(file)
-        except OSError as error:
-            why = f"{error.strerror}; try again, or move it out of the folder"
-            raise UnreadableError(f"{file}: {why}") from error
+        by_length[file.stat().st_size].append(file)
     by_length.pop(0, None)  # an empty file is no photograph, and is named when it is read
     by_content = defaultdict(list)
     for group in by_length.values():
@@ -215,13 +219,17 @@ def _of_one_folder(files: Sequence[Path]) -> list[tuple[Path, Path]]:
     for parent, stem in named:
         stems[parent].add(stem)
     for (parent, stem), group in named.items():
-        # An addition begins or ends with a character between words: `IMG_1` is none of `IMG_10`.
-        cuts = [i for i in range(1, len(stem)) if not (stem[i - 1].isalnum() and stem[i].isalnum())]
+        # A name is cut between words and numbers alone: `IMG_1` is no part of `IMG_10`.
+        cuts = [i for i in range(1, len(stem)) if _kind(stem[i - 1]) != _kind(stem[i])]
         parts = {part for i in cuts for part in (stem[:i], stem[i:])} | {_EDITED.sub("", stem)}
         parts.discard(stem)
         for part in parts & stems[parent]:
             pairs += [(a, b) for a in named[parent, part] for b in group]
     return pairs
+
+
+def _kind(char: str) -> tuple[bool, bool]:
+    return char.isalpha(), char.isdigit()
 
 
 def _of_two_folders(files: Sequence[Path]) -> list[tuple[Path, Path]]:

@@ -13,11 +13,15 @@ import os
 import re
 import unicodedata
 from collections import defaultdict
+from collections.abc import Mapping
 from dataclasses import dataclass
 from importlib.util import find_spec
+from itertools import chain
 from pathlib import Path
 from statistics import median
 from typing import TYPE_CHECKING
+
+import numpy as np
 
 from xrgs.capture import images
 from xrgs.capture.scenes.copies import SIZES, one_of_each_size, size, without_copies
@@ -29,7 +33,7 @@ from xrgs.safeio.paths import user_path
 from xrgs.safeio.sanitize import counted
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Iterator, Mapping, Sequence, Set
+    from collections.abc import Iterable, Iterator, Sequence
 
     from xrgs.config import SceneConf
 
@@ -69,9 +73,11 @@ _ADDED = rf"(?:{_MASK}|depth|disparity|normals?|thumb|thumbnail)"
 _ADDED_BEFORE, _ADDED_AFTER = re.compile(rf"^{_ADDED}[\W_]?"), re.compile(rf"[\W_]?{_ADDED}$")
 #: The deepest nesting of folders that is searched.
 _MAX_DEPTH = 8
-#: A picture that is longer for its width than this, or this many times longer than the others, is
-#: called a panorama.
-_PANORAMA, _TIMES_OTHERS = 2.2, 1.6
+#: A picture that is longer for its width than this, and so many times longer than the others, is
+#: called a panorama. It would set the size of all others, and SfM can't place it. Our choice.
+_PANORAMA, _TIMES = 2.2, 1.6
+#: The least share of the values of a mask of three channels that is 0 or 1.
+_SHARE_OF_ENDS = 0.95
 
 
 @dataclass(frozen=True)
@@ -137,9 +143,10 @@ def look(path: str | None, long_side: int, masks: str | None = None) -> Listing:
         found = (_all_below if nested else _inside)(folder, long_side, known)
         listed_files = [file for inside in found.folders.values() for file in inside]
         photographs, made = _photographs(listed_files, folder)
-        files, copies = without_copies(photographs, folder, found.other_sizes)
+        single, copies = without_copies(photographs, folder, found.other_sizes)
+        files, shapes = _without_panoramas(single, folder)
         not_read = _not_read({folder, *found.folders}, files)
-        notes = (*found.notes, *made, *copies, *not_read, *_panoramas(files, folder))
+        notes = (*found.notes, *made, *copies, *shapes, *not_read)
     except OSError as error:
         raise UnreadableError(f"{error.filename}: {error.strerror}; try again") from error
     if len(files) < 2:
@@ -152,11 +159,15 @@ def look(path: str | None, long_side: int, masks: str | None = None) -> Listing:
     return Listing(_by_name(named), notes)
 
 
+#: Images by their folder.
+_Tree = Mapping[Path, list[Path]]
+
+
 @dataclass(frozen=True)
 class _Found:
     """The images of folders, before copies of other names are left out."""
 
-    folders: Mapping[Path, list[Path]]
+    folders: _Tree
     notes: list[str]
     other_sizes: list[Path]
     """Images in folders of an LLFF scene of which another size is taken."""
@@ -171,8 +182,7 @@ def _inside(folder: Path, long_side: int, masks: Path | None) -> _Found:
     # Without a folder images/, folders that are not sizes of each other are no LLFF scene.
     choice = by_name.get("images") or (next(iter(by_name.values())) if len(taken) == 1 else None)
     tree = {choice[0].parent: choice} if choice else {folder: _images_in(folder)}
-    no_loss = {*tree, *sizes} if len(taken) == 1 else {*tree}
-    others = _in_other_folders(folder, no_loss, masks)
+    others = _in_other_folders(folder, {**sizes, **tree} if len(taken) == 1 else tree, masks)
     return _Found(tree, [*(notes if choice else ()), *others], [])
 
 
@@ -194,7 +204,7 @@ def _all_below(folder: Path, long_side: int, masks: Path | None) -> _Found:
     )
 
 
-def _other_sizes(tree: Mapping[Path, list[Path]], long_side: int) -> tuple[list[Path], list[str]]:
+def _other_sizes(tree: _Tree, long_side: int) -> tuple[list[Path], list[str]]:
     """Return the folders of the LLFF scenes among folders of which another size is taken."""
     groups = defaultdict(list)
     for inside, files in tree.items():
@@ -255,14 +265,19 @@ def _count_anywhere(folder: Path) -> int:
     return sum(1 for name in names if Path(name).suffix.lower() in SUFFIXES)
 
 
-def _in_other_folders(folder: Path, taken: Set[Path], masks: Path | None) -> list[str]:
+def _in_other_folders(folder: Path, taken: _Tree, masks: Path | None) -> list[str]:
     """Say which images in and below a folder are not taken, and how to get them."""
     passed: dict[str, list[Path]] = defaultdict(list)
     try:
         below = [inside for inside in _folders(folder, passed, masks) if inside not in taken]
-        counts = {inside: len(_images_in(inside)) for inside in below}
+        images_in = {inside: files for inside in below if (files := _images_in(inside))}
+        stems = {file.stem.casefold() for files in taken.values() for file in files}
+        for inside, files in images_in.items():
+            if files[0].stem.casefold() in stems and _is_mask(files[0]):
+                passed[_MASKS].append(inside)
     except (OSError, XrgsError) as error:
         return [f"the folders below can't be searched for more images ({error})"]
+    counts = {f: len(files) for f, files in images_in.items() if f not in passed[_MASKS]}
     all_below = f"scene.path={folder}{ALL_BELOW} takes the images of all folders"
     return _left_out(counts, folder, all_below) + _masks_left_out(passed, folder)
 
@@ -284,10 +299,10 @@ def _left_out(counts: Mapping[Path, int], folder: Path, why: str) -> list[str]:
 
 
 def _photographs(files: Sequence[Path], folder: Path) -> tuple[list[Path], list[str]]:
-    """Leave out images that were made of photographs, and say so."""
-    own = [file for file in files if _is_own(file)]
+    """Leave out images that were made of photographs, and say so; images of xrgs alone are kept."""
+    own = {file for file in files if _is_own(file)}
     if len(own) == len(files):
-        own = []  # somebody asks for just these
+        own = set()
     made = _made_of_others([file for file in files if file not in own])
     notes = [
         f"{counted(len(left), 'image')} left out, {why}: "
@@ -298,7 +313,8 @@ def _photographs(files: Sequence[Path], folder: Path) -> tuple[list[Path], list[
         )
         if left
     ]
-    return [file for file in files if file not in {*own, *made}], notes
+    made |= own
+    return [file for file in files if file not in made], notes
 
 
 @remembered
@@ -310,18 +326,21 @@ def _is_own(file: Path) -> bool:
 
 
 @remembered
-def _has_colour(file: Path) -> bool:
+def _is_mask(file: Path) -> bool:
+    """Return whether an image has one channel, or hardly another value than 0 and the largest."""
     try:
-        return images.has_colour(file)
+        pixels = None if not images.has_colour(file) else images.decode(file).pixels
     except images.ImageError:
-        return True
+        return False
+    return pixels is None or bool(np.mean((pixels == 0) | (pixels == 1)) > _SHARE_OF_ENDS)
 
 
 def _made_of_others(files: Sequence[Path]) -> set[Path]:
     """Find masks, depth maps and thumbnails by the names of their photographs.
 
     These are `a.jpg.png` and `a_mask.png` where there is an `a.jpg`, and an image of one channel
-    where another one of the same name has colours.
+    or of two values where another one of the same name is a photograph. The first image of a folder
+    stands for all.
     """
     names = {file.name.casefold() for file in files}
     named = defaultdict(list)
@@ -332,9 +351,12 @@ def _made_of_others(files: Sequence[Path]) -> set[Path]:
         plain = {_ADDED_BEFORE.sub("", stem), _ADDED_AFTER.sub("", stem)} - {stem}
         if stem in names or plain & named.keys():
             made |= {*group}
-        elif len(group) > 1 and any(map(_has_colour, group)):
-            made |= {file for file in group if not _has_colour(file)}
-    return made
+    by_folder = defaultdict(list)
+    for file in files:
+        if len(named[file.stem.casefold()]) > 1 and file not in made:
+            by_folder[file.parent, file.suffix.lower()].append(file)
+    masks = {file for group in by_folder.values() if _is_mask(group[0]) for file in group}
+    return made if masks == {*chain(*by_folder.values())} else made | masks
 
 
 def _not_read(folders: Iterable[Path], taken: Sequence[Path]) -> list[str]:
@@ -362,20 +384,21 @@ def _not_read(folders: Iterable[Path], taken: Sequence[Path]) -> list[str]:
     return lines
 
 
-def _panoramas(files: Sequence[Path], folder: Path) -> list[str]:
-    """Name the pictures that are far longer for their width than the others."""
+def _without_panoramas(files: Sequence[Path], folder: Path) -> tuple[list[Path], list[str]]:
+    """Leave out panoramas, which no pinhole camera took, and name other pictures of their shape."""
     aspects = {file: max(size(file)) / min(size(file)) for file in files if min(size(file))}
-    if not aspects:
-        return []
-    usual = median(aspects.values())
-    least = max(1.1 * usual, min(_PANORAMA, _TIMES_OTHERS * usual))
-    if not (found := [file for file, aspect in aspects.items() if aspect > least]):
-        return []
-    names = listed([str(file.relative_to(folder)) for file in sorted(found)])
-    return [
-        f"longer than the other photographs: {names}. A panorama, a screenshot or a crop has"
-        " another camera than SfM expects; move it out of the folder if it is one"
+    usual = median(aspects.values()) if aspects else 1.0
+    longer = {f for f, a in aspects.items() if a > max(1.1 * usual, min(_PANORAMA, _TIMES * usual))}
+    panoramas = {f for f in longer if aspects[f] > max(_PANORAMA, _TIMES * usual)}
+    notes = [
+        f"{why}: {listed([str(file.relative_to(folder)) for file in sorted(those)])}"
+        for why, those in (
+            ("left out as panoramas, by their shape", panoramas),
+            ("longer for their width than others (screenshots, crops?)", longer - panoramas),
+        )
+        if those
     ]
+    return [file for file in files if file not in panoramas], notes
 
 
 def _view_name(file: Path, folder: Path) -> str:

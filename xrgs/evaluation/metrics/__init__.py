@@ -31,11 +31,11 @@ __all__ = [
     "ssim",
 ]
 
-_BASE = "evaluation/metrics/base.py"
-_PSNR = (_BASE, "evaluation/metrics/psnr.py")
-_SSIM = (_BASE, "evaluation/metrics/ssim.py")
+_BASE = ("evaluation/metrics/base.py", "capture/masks.py")
+_PSNR = (*_BASE, "evaluation/metrics/psnr.py")
+_SSIM = (*_BASE, "evaluation/metrics/ssim.py")
 _LPIPS = (
-    _BASE,
+    *_BASE,
     "evaluation/metrics/lpips.py",
     "evaluation/lpips/network.py",
     "evaluation/lpips/weights.py",

@@ -6,6 +6,8 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
+from xrgs.capture import masks
+
 if TYPE_CHECKING:
     from torch import Tensor
 
@@ -30,8 +32,11 @@ class Metric:
     """Whether it applies to some views alone. It is a row only of tables in which a cell has it."""
 
 
-def composed(image: Tensor, target: Tensor, mask: Tensor | None) -> Tensor:
-    """Return the image with the target's pixels outside the mask, where nothing is compared.
+def inside(image: Tensor, target: Tensor, mask: Tensor | None) -> tuple[Tensor, Tensor]:
+    """Return the image and the target without what is outside the mask.
+
+    Both have the colours of the target's nearest used pixels there, so that nothing is compared,
+    and what the mask hides is in no window.
 
     Args:
         image: The render, [H, W, 3].
@@ -46,7 +51,8 @@ def composed(image: Tensor, target: Tensor, mask: Tensor | None) -> Tensor:
             f"image {list(image.shape)} and target {list(target.shape)} must be the same [H, W, 3]"
         )
     if mask is None:
-        return image
+        return image, target
     if mask.shape != image.shape[:2]:
         raise ValueError(f"mask {list(mask.shape)} must be {list(image.shape[:2])} [H, W]")
-    return image.where(mask[..., None], target)
+    filled = target.new_tensor(masks.filled(target.numpy(), mask.numpy()))
+    return image.where(mask[..., None], filled), filled

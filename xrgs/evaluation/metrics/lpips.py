@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from xrgs.evaluation.lpips import weights
-from xrgs.evaluation.metrics.base import composed
+from xrgs.evaluation.metrics.base import inside
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -15,8 +15,8 @@ def lpips(image: Tensor, target: Tensor, mask: Tensor | None = None) -> float | 
     """Compute the perceptual distance LPIPS, version 0.1, with AlexNet (`alex` in gsplat).
 
     Source: [zhang2018] "The unreasonable effectiveness of deep features as a perceptual
-    metric"; see `xrgs.evaluation.lpips.network`. Outside the mask the render has the pixels of the
-    photograph. The distance is still the mean over the whole picture.
+    metric"; see `xrgs.evaluation.lpips.network`. Outside the mask both pictures are the same. The
+    distance is still the mean over the whole picture.
 
     Args:
         image: The render, [H, W, 3] in 0..1.
@@ -31,7 +31,7 @@ def lpips(image: Tensor, target: Tensor, mask: Tensor | None = None) -> float | 
         ValueError: The shapes differ or are not [H, W, 3].
         WeightsError: This machine's weights are not the published ones.
     """
-    image = composed(image, target, mask)
+    image, target = inside(image, target, mask)
     published = weights.load_published()
     if published is None:
         return None

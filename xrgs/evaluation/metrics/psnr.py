@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from typing import TYPE_CHECKING
 
-from xrgs.evaluation.metrics.base import composed
+from xrgs.evaluation.metrics.base import inside
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -33,7 +33,8 @@ def psnr(image: Tensor, target: Tensor, mask: Tensor | None = None) -> float | N
         >>> round(psnr(torch.zeros(2, 2, 3), torch.full((2, 2, 3), 0.5)), 4)
         6.0206
     """
-    total = float((composed(image, target, mask).double() - target.double()).square().sum())
+    image, target = inside(image, target, mask)
+    total = float((image.double() - target.double()).square().sum())
     count = target.numel() if mask is None else 3 * int(mask.sum())
     if count == 0:
         return None

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from xrgs.evaluation.metrics.base import composed
+from xrgs.evaluation.metrics.base import inside
 from xrgs.evaluation.metrics.psnr import psnr
 
 if TYPE_CHECKING:
@@ -34,7 +34,7 @@ def psnr_fitted(image: Tensor, target: Tensor, mask: Tensor | None = None) -> fl
     """
     import torch
 
-    composed(image, target, mask)  # checks the shapes
+    inside(image, target, mask)  # checks the shapes
     used = torch.ones(image.shape[:2], dtype=torch.bool) if mask is None else mask
     colors = torch.cat([image.double(), image.new_ones(*image.shape[:2], 1).double()], dim=-1)
     inputs, outputs = colors[used], target.double()[used]  # [N, 4], [N, 3]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from xrgs.evaluation.metrics.base import composed
+from xrgs.evaluation.metrics.base import inside
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -17,8 +17,7 @@ SSIM_WINDOW = 11
 def ssim(image: Tensor, target: Tensor, mask: Tensor | None = None) -> float | None:
     """Compute the structural similarity, averaged over channels and used pixels.
 
-    Outside the mask the render has the pixels of the photograph, so that a window across the border
-    of the mask compares equal pixels there.
+    A window across the border of the mask compares equal pixels outside of it.
 
     It is `kornia.metrics.ssim`: a Gaussian window of 11 x 11 px and sigma 1.5, data range 1,
     borders reflected. gsplat's evaluation gives the same to the fourth digit.
@@ -39,7 +38,7 @@ def ssim(image: Tensor, target: Tensor, mask: Tensor | None = None) -> float | N
     """
     from kornia import metrics
 
-    image = composed(image, target, mask)
+    image, target = inside(image, target, mask)
     height, width = image.shape[:2]
     if min(height, width) <= SSIM_WINDOW // 2:
         raise ValueError(

@@ -1,0 +1,402 @@
+"""Training inside masks: closed forms, and the same bits whatever a mask hides."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from numpy.typing import NDArray
+from PIL import Image
+from plyfile import PlyData, PlyElement
+from torch import Tensor
+
+from tests.capture.scene_confs import scene_conf
+from tests.conftest import composed as compose
+from tests.splat.scenes import noise
+from tests.training.components.conftest import make_view
+from tests.training.conftest import comparable
+from xrgs.capture import dataset, images, variant
+from xrgs.capture.dataset import Dataset, LoadedView
+from xrgs.capture.scenes import procedural, raycast, still_life
+from xrgs.capture.views import Variant, View
+from xrgs.config import ResolutionScheduleConf
+from xrgs.evaluation import protocol
+from xrgs.report.paper import texture
+from xrgs.splat.attribution import attribute_pixels
+from xrgs.splat.cameras import Camera
+from xrgs.splat.gaussians import from_points
+from xrgs.splat.loss import photometric_loss, prepare_target
+from xrgs.splat.rendering import rasterize_parameters
+from xrgs.splat.strategy.default import DefaultStrategy
+from xrgs.training.components import Step
+from xrgs.training.components.mip import sampling_rates
+from xrgs.training.components.resolution_schedule import ResolutionSchedule
+from xrgs.training.components.texture import gradient_magnitude, mean_gradient
+from xrgs.training.components.view_scores import _in_unit_range
+from xrgs.training.components.weighting import _box_mean, region_attenuations
+from xrgs.training.loop import train
+from xrgs.training.rendering import inside_mask
+from xrgs.training.seeding import seeded_generator
+
+SIZES = {"HR": (36, 28), "LR": (18, 14)}
+BACKENDS = [
+    "torch",
+    pytest.param(
+        "native", marks=pytest.mark.skipif(find_spec("xrgs._native") is None, reason="no kernels")
+    ),
+]
+
+
+def left_half(view_size: tuple[int, int]) -> NDArray[np.bool_]:
+    """The left half is used, and one pixel on the right."""
+    width, height = view_size
+    mask = np.zeros((height, width), np.bool_)
+    mask[:, : width // 2] = True
+    mask[2, width - 3] = True
+    return mask
+
+
+# what a mask hides
+
+
+def frozen(folder: Path, seed: int) -> Variant:
+    """Two HR and two LR views and a test view, of which most have noise of `seed` under a mask."""
+    rng, hidden = np.random.default_rng(0), np.random.default_rng(seed)
+    folder.mkdir()
+    views = []
+    for number, (split, tag) in enumerate(
+        [("train", "HR"), ("train", "LR"), ("train", "HR"), ("train", "LR"), ("test", "HR")]
+    ):
+        (width, height), mask = SIZES[tag], None
+        smooth = Image.fromarray(rng.integers(0, 255, (6, 8, 3), dtype=np.uint8))
+        pixels = np.asarray(smooth.resize((width, height), Image.Resampling.BICUBIC))
+        if number != 2:
+            used = left_half((width, height))
+            mask = folder / "masks" / f"v{number}.png"
+            images.save_mask(mask, used)
+            noise_under = hidden.integers(0, 255, pixels.shape, dtype=np.uint8)
+            pixels = np.where(used[..., None], pixels, noise_under)
+        file = folder / "images" / f"v{number}.png"
+        images.save(file, pixels.astype(np.float32) / np.float32(255))
+        viewmat = np.eye(4)
+        viewmat[:2, 3] = 0.1 * number, 0.05 * (number % 2)
+        K = np.array([[width, 0, width / 2], [0, width, height / 2], [0, 0, 1.0]])
+        rho = width / 36
+        views.append(View(f"v{number}", file, split, tag, width, height, K, viewmat, rho, mask))
+    points = rng.uniform((-1, -1, 2), (1, 1, 4), (80, 3))
+    colors = rng.integers(0, 255, (80, 3), dtype=np.uint8)
+    return Variant("id", folder, "x", 2, True, tuple(views), points, colors, {})
+
+
+#: Every component that reads photographs, errors or gradients.
+COMPONENTS = (
+    "components.loss_weighting.lr_weight=0.5",
+    "components.adaptive_weighting.texture=0.3",
+    "components.region_weighting.texture=0.3",
+    "components.consistency.weight=0.1",
+    "components.mip.variance=0.2",
+    "components.multiview_score.views=2",
+    "components.error_score.of=edges",
+    "components.supersampled.factor=2",
+    "components.resolution_schedule.start_share=0.3",
+    "splat.densify.budget=0.05",
+)
+
+
+@pytest.mark.parametrize("components", [(), COMPONENTS], ids=["baseline", "components"])
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_hidden_pixels_change_no_bit_of_training_and_no_score(
+    tmp_path: Path, backend: str, components: tuple[str, ...]
+) -> None:
+    conf = compose(
+        f"splat.backend={backend}",
+        *("train.steps=9", "splat.densify.start=0", "splat.densify.every=10000"),
+        *("splat.densify.grow_grad2d=1e-4", *components),
+    )
+    results, scores = [], []
+    for seed in (1, 2):
+        data = dataset.load(frozen(tmp_path / str(seed), seed))
+        results.append(train(data, conf))
+        scores.append(protocol.mean_scores(results[-1].gaussians, data.test, conf.splat))
+    assert len(results[0].gaussians) != 80  # densification took part
+    assert comparable(results[0]) == comparable(results[1])
+    assert scores[0]["psnr"] == scores[1]["psnr"]
+    assert scores[0]["ssim"] == scores[1]["ssim"]
+    assert scores[0]["psnr_plain"] != scores[1]["psnr_plain"]
+
+
+# loss and statistics
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_a_mask_takes_the_loss_outside_and_changes_no_gradient_far_inside(backend: str) -> None:
+    photograph, mask = noise(48, 60).float(), torch.from_numpy(left_half((60, 48)))
+    gradients, losses = [], []
+    for used in (None, mask):
+        image = noise(48, 60, 1).float().requires_grad_()
+        composed = inside_mask(image, photograph, used)
+        target = prepare_target(photograph)
+        loss = photometric_loss(composed, target, l1=0.8, ssim=0.2, backend=backend)
+        torch.autograd.backward(loss)
+        assert image.grad is not None
+        gradients.append(image.grad)
+        losses.append(loss.item())
+    whole, masked = gradients
+    assert (masked[~mask] == 0).all()
+    assert torch.equal(masked[:, :19], whole[:, :19])  # 11 px from the border
+    assert (masked[:, 29] != whole[:, 29]).any()
+    assert masked[2, 57].abs().min() > 0
+    assert losses[1] < losses[0]
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_the_loss_of_a_mask_is_a_mean_over_all_pixels(backend: str) -> None:
+    photograph, mask = noise(48, 60).float(), torch.from_numpy(left_half((60, 48)))
+    image = noise(48, 60, 1).float()
+    composed = inside_mask(image, photograph, mask)
+    loss = photometric_loss(composed, prepare_target(photograph), l1=1, ssim=0, backend=backend)
+    expected = (image.double() - photograph.double())[mask].abs().sum() / photograph.numel()
+    assert loss.item() == pytest.approx(expected.item(), rel=1e-6)
+
+
+@pytest.mark.parametrize("absgrad", ["false", "true"])
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_a_view_counts_for_the_gaussians_that_it_shows_inside_its_mask(
+    data: Dataset, monkeypatch: pytest.MonkeyPatch, backend: str, absgrad: str
+) -> None:
+    """Against the sums of the Gaussians' weights in the used pixels, in the first step."""
+    mask = torch.from_numpy(left_half((60, 60)))
+    conf = compose("train.steps=1", f"splat.backend={backend}", f"splat.raster.absgrad={absgrad}")
+    seen: list[tuple[Tensor, Tensor]] = []
+    after_step = DefaultStrategy.after_step
+
+    def watched(self: Any, step: int, grad2d: Tensor, visible: Tensor, **others: Any) -> Any:
+        used = attribute_pixels(
+            mask.float(),
+            start.activated(backend=backend),
+            view.camera,
+            conf.splat.raster,
+            backend=backend,
+        ).sums
+        seen.append((visible.clone(), used > 0))
+        return after_step(self, step, grad2d, visible, **others)
+
+    view = replace(data.train[0], mask=mask, pixels=noise(60, 60).float())
+    points = 0.8 * (torch.rand(2000, 3, generator=torch.Generator().manual_seed(4)) - 0.5)
+    points[:, 2] += 2
+    only = replace(data, train=(view,), points=points, colors=points.abs().clamp(0, 1))
+    start = from_points(
+        only.points,
+        only.colors,
+        init_opacity=conf.splat.init_opacity,
+        sh_degree=3,
+        generator=seeded_generator(conf.seed, "init"),
+    )
+    monkeypatch.setattr(DefaultStrategy, "after_step", watched)
+    train(only, conf)
+    ((visible, expected),) = seen
+    assert torch.equal(visible, expected)
+    assert 0.2 < visible.float().mean() < 0.8
+    plain = rasterize_parameters(
+        *start.activated(backend=backend),
+        view.camera,
+        conf.splat.raster,
+        sh_degree=0,
+        backend=backend,
+    ).visible
+    assert plain.sum() > visible.sum()
+
+
+# components
+
+
+def test_the_texture_inside_a_mask_is_the_texture_of_the_part() -> None:
+    image, mask = noise(20, 30), torch.zeros(20, 30, dtype=torch.bool)
+    mask[4:14, 5:25] = True
+    part = image[4:14, 5:25].numpy()
+    assert mean_gradient(image, mask) == pytest.approx(texture(part), rel=1e-6)
+    assert texture(image.numpy(), mask.numpy()) == pytest.approx(texture(part), rel=1e-12)
+    assert mean_gradient(image, torch.zeros_like(mask)) == 0
+    assert np.isnan(texture(image.numpy(), np.zeros((20, 30), np.bool_)))
+
+
+def test_the_mean_of_a_window_is_over_its_used_pixels() -> None:
+    values, mask = noise(12, 15)[..., 0], torch.from_numpy(left_half((15, 12)))
+    means = _box_mean(values, mask)
+    for row in range(12):
+        for column in range(15):
+            window = (
+                slice(max(0, row - 2), row + 3),
+                slice(max(0, column - 2), column + 3),
+            )
+            if mask[window].any():
+                expected = values[window][mask[window]].mean()
+                assert means[row, column].item() == pytest.approx(expected.item(), rel=1e-5)
+
+
+def test_the_attenuation_of_a_view_has_the_mean_of_its_used_pixels(
+    views: Mapping[str, LoadedView],
+) -> None:
+    mask = torch.from_numpy(left_half((15, 12)))
+    low = replace(views["LR"], mask=mask)
+    points = torch.rand(50, 3, generator=torch.Generator().manual_seed(2)) - 0.5
+    points[:, 2] += 2
+    given_views = [views["HR"], low]
+    (region,) = region_attenuations(given_views, points, texture=5.0, near=0.01).values()
+    assert 0 < region[mask].mean() < 1
+    assert region.mean().item() == pytest.approx(region[mask].mean().item(), rel=1e-6)
+    gradient = gradient_magnitude(low.image)
+    assert region[mask].max().item() <= _box_mean(gradient, mask)[mask].max().item() / 5
+
+
+@pytest.fixture
+def views() -> dict[str, LoadedView]:
+    """A view of each tag by its tag; the LR view is 5 times smaller."""
+    both = (make_view("HR", noise(60, 75).float()), make_view("LR", noise(12, 15, 1).float()))
+    return {view.tag: view for view in both}
+
+
+def test_scores_are_scaled_by_the_used_pixels_and_0_outside() -> None:
+    values = torch.tensor([[1.0, 2.0, 9.0], [3.0, 5.0, -4.0]])
+    mask = torch.tensor([[True, True, False], [True, True, False]])
+    expected = torch.tensor([[0.0, 0.25, 0.0], [0.5, 1.0, 0.0]])
+    assert torch.equal(_in_unit_range(values, mask), expected)
+
+
+def test_a_masked_pixel_sets_no_sampling_rate() -> None:
+    far, close = (
+        Camera(
+            torch.tensor(
+                [[1.0, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, depth], [0, 0, 0, 1]], dtype=torch.float32
+            ),
+            torch.tensor([[focal, 0, 20.0], [0, focal, 20], [0, 0, 1]]),
+            40,
+            40,
+        )
+        for focal, depth in ((100.0, 4.0), (20.0, 1.0))
+    )
+    mask = torch.ones(40, 40, dtype=torch.bool)
+    mask[:, 25:] = False  # 0.2 and more to the right of the axis of `far`
+    means = torch.tensor([[0.0, 0.0, 0.0], [0.19, 0.3, 0.0], [0.21, 0.3, 0.0], [0.85, 0.0, 0.0]])
+    rates = sampling_rates(means, [far, close], 0.01, [mask, None])
+    assert rates.tolist() == [25.0, 25.0, 20.0, 20.0]
+    assert sampling_rates(means, [far], 0.01, [~mask]).tolist() == [0.0, 0.0, 25.0, 25.0]
+
+
+def test_a_reduced_view_has_a_reduced_mask(views: Mapping[str, LoadedView]) -> None:
+    mask = torch.zeros(60, 75, dtype=torch.bool)
+    mask[:, :40] = True
+    high = replace(views["HR"], mask=mask)
+    schedule = ResolutionSchedule(
+        ResolutionScheduleConf(start_share=0.2, until=15_000), [high, views["LR"]]
+    )
+    step = Step(0, 100, high)
+    reduced = schedule.training_views({"hr": high, "lr": views["LR"]}, step)
+    factor = schedule.factor_at(step)
+    assert factor > 1
+    small = reduced["hr"].mask
+    assert small is not None
+    assert small.shape == reduced["hr"].image.shape[:2]
+    assert small[:, : 40 // factor - 1].all()
+    assert not small[:, 40 // factor + 1 :].any()
+    assert reduced["lr"].mask is None
+
+
+# a moving object
+
+VIEWS, SIDE = 24, 96
+
+
+def surface(folder: Path, number: int) -> NDArray[Any]:
+    """The points of the embedded scene that every other pixel of a view shows, as of a .ply."""
+    size = width, height = procedural.camera_size(SIDE)
+    K, viewmat = procedural.intrinsics(*size), procedural.viewmats(VIEWS)[number]
+    samples = raycast._Samples(torch.from_numpy(K).float(), width, height, 1)
+    for index, solid in enumerate(still_life.solids()):
+        intersect: Callable[..., None] = (
+            raycast._intersect_quad if isinstance(solid, raycast.Quad) else raycast._intersect_ball
+        )
+        intersect(samples, index, solid, torch.from_numpy(viewmat).float())
+    depth = samples.depth.double().numpy()[::2, ::2]
+    rows, columns = np.mgrid[0:height:2, 0:width:2] + 0.5
+    x, y = (columns - K[0, 2]) / K[0, 0], (rows - K[1, 2]) / K[1, 1]
+    inside = np.isfinite(depth)
+    at_depth = (np.stack([x, y, np.ones_like(x)], -1) * depth[..., None])[inside]
+    points = (at_depth - viewmat[:3, 3]) @ viewmat[:3, :3]
+    photograph = images.to_8_bit(images.read_png(folder / f"view_{number:03d}.png"))
+    rgb = [(name, "u1") for name in ("red", "green", "blue")]
+    table = np.zeros(len(points), [(axis, "f4") for axis in "xyz"] + rgb)
+    for axis, values in zip("xyz", points.T, strict=True):
+        table[axis] = values
+    for (name, _), values in zip(rgb, photograph[::2, ::2][inside].T, strict=True):
+        table[name] = values
+    return table
+
+
+def write_scene(folder: Path) -> None:
+    """Write photographs, others with an object in every second one, its masks, and cameras."""
+    size = procedural.camera_size(SIDE)
+    K, viewmats = procedural.intrinsics(*size), procedural.viewmats(VIEWS)
+    poses = dict(zip(procedural.names(VIEWS), viewmats, strict=True))
+    for name in ("clean", "moving", "masks"):
+        (folder / name).mkdir()
+    still_life.render(folder / "clean", procedural.TEXTURES, K, size, poses)
+    rng = np.random.default_rng(0)
+    for number, name in enumerate(poses):
+        with Image.open(folder / "clean" / f"{name}.png") as picture:
+            if number % 2:  # a test view has an even number
+                left, top = (
+                    side // 4 + int(rng.integers(-side // 10, side // 10)) for side in size
+                )
+                box = (left, top, left + 2 * size[0] // 5, top + 2 * size[1] // 5)
+                picture.paste((230, 30, 200), box)
+                mask = Image.new("1", size, 1)
+                mask.paste(0, box)
+                mask.save(folder / "masks" / f"{name}.png")
+            picture.save(folder / "moving" / f"{name}.png")
+    points = np.concatenate([surface(folder / "clean", number) for number in (0, 5, 9)])
+    PlyData([PlyElement.describe(points, "vertex")]).write(folder / "points.ply")
+    frames = [
+        {
+            "file_path": f"{name}.png",
+            "transform_matrix": (np.linalg.inv(pose) @ np.diag([1, -1, -1, 1])).tolist(),
+        }
+        for name, pose in poses.items()
+    ]
+    content = {"fl_x": K[0, 0], "ply_file_path": "points.ply", "frames": frames}
+    (folder / "transforms.json").write_text(json.dumps(content))
+
+
+@pytest.mark.slow
+def test_with_masks_a_moving_object_costs_next_to_nothing(tmp_path: Path) -> None:
+    """From photographs to scores, with an object in half of the training photographs."""
+    write_scene(tmp_path)
+    conf = compose(
+        "train.steps=250", "train.views=all_hr", "splat.densify.stop=0", "variant.long_side=0",
+        "variant.factor=2", f"variant.poses={tmp_path}/transforms.json",
+    )  # fmt: skip
+    psnr = {}
+    for photographs, masks in (("clean", None), ("moving", None), ("moving", "masks")):
+        scene = scene_conf("folder", tmp_path / photographs)
+        if masks:
+            scene = replace(scene, masks=str(tmp_path / masks))
+        store = tmp_path / f"store-{photographs}-{masks}"
+        store.mkdir()
+        built = variant.build(scene, conf.variant, store / "variants", store / "scenes")
+        data = dataset.load(built, conf.train.views)
+        trained = train(data, conf).gaussians
+        psnr[photographs, masks] = protocol.mean_scores(trained, data.test, conf.splat)["psnr"]
+        assert (0.05 < built.report["masked"].get("HR", 0) < 0.25) == bool(masks)
+    clean, moving, masked = psnr.values()
+    assert clean is not None
+    assert moving is not None
+    assert masked is not None
+    assert moving < clean - 0.5
+    assert masked > clean - 0.2
