@@ -9,6 +9,7 @@ import subprocess
 import sys
 from pathlib import Path
 
+import psutil
 import pytest
 import torch
 
@@ -104,6 +105,26 @@ def test_the_quota_is_the_least_of_the_control_groups(tmp_path: Path, case: str)
         (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
         (tmp_path / name).write_text(f"{text}\n")
     assert machine.cpu_quota(tmp_path) == quota
+
+
+@pytest.mark.parametrize(
+    ("own", "files", "limit"),
+    [
+        ("0::/a/b", {"a/b/memory.max": "max", "a/memory.max": "1000000"}, 1_000_000),
+        ("3:memory:/docker/x", {"memory/memory.limit_in_bytes": "2000000"}, 2_000_000),
+        ("3:memory:/", {"memory/memory.limit_in_bytes": "9223372036854771712"}, None),
+        ("0::/", {"memory.max": "max"}, None),
+    ],
+)
+def test_the_memory_is_the_least_of_the_machine_and_its_control_groups(
+    tmp_path: Path, own: str, files: dict[str, str], limit: int | None
+) -> None:
+    for name, text in files.items():
+        (tmp_path / "sys/fs/cgroup" / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / "sys/fs/cgroup" / name).write_text(f"{text}\n")
+    (tmp_path / "proc/self").mkdir(parents=True)
+    (tmp_path / "proc/self/cgroup").write_text(own)
+    assert machine.usable_memory(tmp_path) == (limit or psutil.virtual_memory().total)
 
 
 def test_torch_gets_the_threads_or_every_usable_core() -> None:

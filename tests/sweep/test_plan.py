@@ -14,6 +14,7 @@ from xrgs.experiment.cell_folder import CellState
 from xrgs.experiment.store import BASELINE
 from xrgs.runtime.text import format_duration
 from xrgs.splat import backend
+from xrgs.sweep import plan as plan_module
 from xrgs.sweep.axes import CellSpec
 from xrgs.sweep.estimate import TORCH_SLOWDOWN, Cost
 from xrgs.sweep.plan import (
@@ -157,8 +158,9 @@ def test_cells_that_are_not_done_are_estimated(cell: Callable[..., PlannedCell])
 
 
 def test_the_use_of_memory_and_disk_is_that_of_the_cells_that_are_left(
-    cell: Callable[..., PlannedCell],
+    cell: Callable[..., PlannedCell], monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    monkeypatch.setattr(plan_module, "usable_memory", lambda: int(2e9))
     plan = [
         replace(cell("a"), cost=Cost(1.0, 0.0, 1.2e9, 30e6)),
         replace(cell("b"), cost=Cost(1.0, 0.0, 8e8, 40e6)),
@@ -169,6 +171,8 @@ def test_the_use_of_memory_and_disk_is_that_of_the_cells_that_are_left(
         " of them ~70 MB of disk"
     )
     assert expected_use(plan[2:], 63) == expected_use([cell("d")], 0) == ""
+    monkeypatch.setattr(plan_module, "usable_memory", lambda: int(1e9))
+    assert "~1.2 GB of memory (more than the 1.0 GB here)," in expected_use(plan, 63)
 
 
 def test_a_reason_that_cells_share_is_said_once(cell: Callable[..., PlannedCell]) -> None:

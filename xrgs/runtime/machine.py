@@ -10,6 +10,8 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path, PurePosixPath
 
+import psutil
+
 
 def usable_cores() -> int:
     """Count the cores that this process may use, at least one.
@@ -40,6 +42,22 @@ def cpu_quota(root: Path = Path("/")) -> float:
         if len(both) == 2 and all(word.isdecimal() for word in both):
             quotas.append(int(both[0]) / int(both[1]))
     return min(quotas)
+
+
+def usable_memory(root: Path = Path("/")) -> int:
+    """Return the memory that this process may use at most, in bytes.
+
+    It is the least of the machine's memory and the memory limits of the process's control groups.
+
+    Args:
+        root: The root of the file system.
+    """
+    limits = [int(psutil.virtual_memory().total)]
+    for folder in _control_groups(root, "memory"):
+        # Version 2 writes `max` for no limit, version 1 a number beyond any memory.
+        for name in ("memory.max", "memory.limit_in_bytes"):
+            limits += [int(word) for word in _words(folder / name) if word.isdecimal()]
+    return min(limits)
 
 
 def _control_groups(root: Path, controller: str) -> Iterator[Path]:

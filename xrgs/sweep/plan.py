@@ -10,6 +10,7 @@ from xrgs.experiment.cell_folder import CellState
 from xrgs.experiment.identity import cell_id, cell_identity
 from xrgs.experiment.schema import RecordedCell
 from xrgs.experiment.store import BASELINE
+from xrgs.runtime.machine import usable_memory
 from xrgs.runtime.text import format_duration, format_size
 from xrgs.safeio.hashing import digest, to_plain
 from xrgs.safeio.sanitize import counted, for_line
@@ -240,9 +241,11 @@ def expected_use(plan: Sequence[PlannedCell], past: int) -> str:
     if not costs:
         return ""
     memory, disk = max(cost.memory_bytes for cost in costs), sum(cost.disk_bytes for cost in costs)
+    has = usable_memory()
+    too_little = f" (more than the {format_size(has)} here)" if memory > has else ""
     return (
         f"estimates from {counted(past, 'finished cell')} of this store: a cell takes up to"
-        f" ~{format_size(memory)} of memory, all of them ~{format_size(disk)} of disk"
+        f" ~{format_size(memory)} of memory{too_little}, all of them ~{format_size(disk)} of disk"
     )
 
 
