@@ -15,6 +15,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from xrgs.capture import images
 from xrgs.capture.contact_sheet import COLOURS, contact_sheet
 from xrgs.capture.description import SfmReport, describe, views_table
 from xrgs.capture.views import Variant, View
@@ -239,6 +240,19 @@ def test_one_image_that_cant_be_read_does_not_take_the_sheet(
     assert len(np.unique(high[4:196, 4:456])) > 1  # it says so
     assert held_out[4:196, 4:260].std() > 20  # the others are drawn as ever
     assert low[4:196, 4:260].std() > 20
+
+
+def test_what_is_outside_a_mask_is_dark(mixed: Variant, tmp_path: Path) -> None:
+    used = np.zeros((300, 400), np.bool_)
+    used[:, 200:] = True
+    images.save_mask(tmp_path / "mask.png", used)
+    view = replace(mixed.views[2], mask=tmp_path / "mask.png")
+    plain, _ = contact_sheet(mixed)
+    masked, notes = contact_sheet(replace(mixed, views=(*mixed.views[:2], view, mixed.views[3])))
+    before, after = (tiles(sheet)[0][4:196, 4:260].astype(float) for sheet in (plain, masked))
+    assert notes == []
+    assert (after[:, 130:] == before[:, 130:]).all()
+    assert after[:, :126].mean() == pytest.approx(before[:, :126].mean() / 4, rel=0.02)
 
 
 def flat_png(width: int, height: int) -> bytes:

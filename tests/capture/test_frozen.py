@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import errno
 import json
 import os
@@ -15,7 +16,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from xrgs.capture import frozen, sealed
+from xrgs.capture import frozen, images, sealed
 from xrgs.capture.frozen import CorruptVariant
 from xrgs.capture.views import Variant, View
 from xrgs.errors import UnreadableError
@@ -83,6 +84,22 @@ def test_an_intact_variant_is_loaded(write: Write) -> None:
     assert frozen.verify(folder) == []
 
 
+def test_a_mask_is_hashed_and_a_variant_without_masks_has_no_word_of_them(tmp_path: Path) -> None:
+    plain, masked = (make(tmp_path / name) for name in ("plain", "masked"))
+    file = masked.folder / "images/test-masks/a.png"
+    images.save_mask(file, np.ones((3, 4), np.bool_))
+    views = (dataclasses.replace(masked.views[0], mask=file), masked.views[1])
+    masked = dataclasses.replace(masked, views=views)
+    first, second = (frozen.freeze(made, "key", made.folder, tmp_path) for made in (plain, masked))
+    assert "mask" not in (first.folder / "variant.json").read_text()
+    assert first.id != second.id
+    mask = second.folder / "images/test-masks/a.png"
+    assert [view.mask for view in frozen.load(second.folder).views] == [mask, None]
+    images.save_mask(mask, np.zeros((3, 4), np.bool_))
+    with pytest.raises(CorruptVariant, match=r"test-masks/a\.png: it has changed"):
+        frozen.load(second.folder)
+
+
 def first_view(**changes: Any) -> Edit:
     return lambda content: content["views"][0].update(changes)
 
@@ -95,6 +112,7 @@ def first_view(**changes: Any) -> Edit:
         (first_view(tag="x"), r"views\[0\]\.tag: Invalid enum value"),
         (first_view(rho=0), r"views\[0\]\.rho: Expected `float` > 0"),
         (first_view(K=[[1, 2], [3]]), r"views\[0\]\.K\[0\]: Expected `array` of length >= 3"),
+        (first_view(mask="images/test-masks/a.png"), "files: they are not the view"),
         (first_view(more=1), r"views\[0\]: Object contains unknown field `more`"),
         (lambda content: content.pop("key"), "missing required field `key`"),
         (lambda content: content["files"].pop("images/test/a.png"), "files: they are not the view"),

@@ -164,6 +164,11 @@ FORMS: dict[str, tuple[Image.Image, str]] = {
     "RGBA": (GREY.convert("RGBA"), "png"),
     "transparent where it is not used": (as_rgba(255), "png"),
     "palette": (GREY.convert("RGB").convert("P", palette=Image.Palette.ADAPTIVE), "png"),
+    "a colour": (
+        Image.merge("RGB", [Image.new("L", (60, 40)), GREY, Image.new("L", (60, 40))]),
+        "png",
+    ),
+    "16 bits": (Image.fromarray(USED * np.uint16(65535)), "png"),
     "labels 0 and 1": (Image.fromarray(USED.astype(np.uint8)), "png"),
     "labels 0 and 1 as RGB": (Image.fromarray(USED.astype(np.uint8)).convert("RGB"), "png"),
     "JPEG": (GREY, "jpg"),
@@ -175,7 +180,7 @@ FORMS: dict[str, tuple[Image.Image, str]] = {
 
 
 def read_a(given_masks: Masks, photograph: images.Header) -> Mask:
-    mask = given_masks.read("a", photograph)
+    mask, _ = given_masks.read("a", photograph)
     assert mask is not None
     return mask
 
@@ -191,6 +196,17 @@ def test_white_is_used_in_every_kind_of_image(tmp_path: Path, form: str) -> None
     picture.save(tmp_path / f"a.{suffix}")
     photograph = save(tmp_path / "photo.png", noise((60, 40)))
     assert (read(tmp_path / f"a.{suffix}", photograph) == USED).all()
+
+
+def test_a_mask_that_may_be_a_photograph_is_said(tmp_path: Path) -> None:
+    files = {name: save(tmp_path / f"{name}.png", noise((60, 40))) for name in "ab"}
+    given_masks = {
+        "a": save(tmp_path / "photo.png", noise((60, 40), 5)),
+        "b": save(tmp_path / "blurred.png", GREY.resize((59, 39)).resize((60, 40))),
+    }
+    photos = prepare_hr_views(Scene("x", "", files, masks=given_masks), CONF, tmp_path)
+    said = "masks that are not black and white, of which what is brighter than grey is used"
+    assert photos.notes == (f"{said}: a.png",)
 
 
 @pytest.mark.parametrize("size", [(50, 33), (50, 34), (1000, 667), (7, 5)])

@@ -129,7 +129,7 @@ def test_photographs_that_changed_and_are_missing_are_named(
     folder = without_images(stereo_variant, tmp_path / stereo_variant.id)
     with pytest.raises(XrgsError, match="photographs"):
         made_again(folder, scene, conf)
-    for name in ("motorcycle_left", "motorcycle_right"):
-        Image.new("RGB", (741, 500), (90, 90, 90)).save(photographs / f"{name}.png")
+    for name, grey in (("motorcycle_left", 80), ("motorcycle_right", 90)):
+        Image.new("RGB", (741, 500), (grey, grey, grey)).save(photographs / f"{name}.png")
     with pytest.raises(StoreError, match=r"images/\w+/motorcycle_\w+\.png: .* it is another image"):
         made_again(folder, scene, conf)

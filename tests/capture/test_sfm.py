@@ -26,7 +26,8 @@ def test_features_fall_with_the_number_of_images(count: int, asked: int, expecte
 
 def test_features_of_small_images_are_detected_at_twice_the_resolution() -> None:
     assert sfm.first_octave(252, None) == -1
-    assert sfm.first_octave(1008, None) == 0
+    assert sfm.first_octave(800, None) == -1
+    assert sfm.first_octave(801, None) == 0
     assert sfm.first_octave(252, 0) == 0
     assert sfm.first_octave(1008, -1) == -1
 

@@ -26,6 +26,8 @@ _TILE = (_BOX[0] + _CENTRE + 3 * _BORDER, _BOX[1] + 2 * _BORDER + _TEXT + 4)
 #: The colour of each class's border, distinct in every kind of colour vision (Okabe and Ito).
 COLOURS: Mapping[str, str] = {"HR": "#0072b2", "LR": "#e69f00", "test": "#7f7f7f"}
 _BACKGROUND, _TEXT_COLOUR = "white", "black"
+#: How many times darker pixels outside a mask are.
+_DIMMED = 4
 #: Width over height of the sheet, about as a screen has.
 _ASPECT = 1.6
 #: The most views that are drawn, by name; a tile takes 0.4 MB.
@@ -37,7 +39,7 @@ def contact_sheet(variant: Variant) -> tuple[Image.Image, list[str]]:
 
     Beside each image is its centre. The centre of a view that is smaller than the largest one is
     magnified by the nearest whole factor, each pixel a square, so that its missing detail can be
-    seen.
+    seen. What is outside a mask is dark.
 
     Returns:
         An RGB image, and notes: why an image can't be read, or that some views are not drawn.
@@ -59,12 +61,22 @@ def contact_sheet(variant: Variant) -> tuple[Image.Image, list[str]]:
         row, column = divmod(index, columns)
         image = None
         try:
-            image = images.read_png_pil(view.file, (view.width, view.height))
+            image = _read(view)
         except (ImageError, UnreadableError) as error:
             notes.append(str(error))
         tile = _tile(view, image, largest)
         sheet.paste(tile, (_GAP + column * step[0], top + row * step[1]))
     return sheet, notes
+
+
+def _read(view: View) -> Image.Image:
+    """Read the image of a view, dark outside its mask."""
+    size = view.width, view.height
+    image = images.read_png_pil(view.file, size)
+    if view.mask is None:
+        return image
+    used = Image.fromarray(images.read_mask(view.mask, size))
+    return Image.composite(image, image.point(lambda value: value // _DIMMED), used)
 
 
 def _view_class(view: View) -> str:

@@ -196,8 +196,12 @@ def lens_of_model(model: str, size: tuple[int, int], params: Sequence[float]) ->
             f"({', '.join(names)})"
         )
     focal = values[: 2 if names[0] == "fx" else 1]
-    ratios = [value / max(size) for value in focal] if min(size) > 0 else [0.0]
-    if not (np.abs(values) < _MAX_VALUE).all() or min(ratios) < _LEAST_FOCAL:
+    has_size = 0 < min(size) <= max(size) < _MAX_VALUE
+    if (
+        not has_size
+        or not (np.abs(values) < _MAX_VALUE).all()
+        or min(focal) < _LEAST_FOCAL * max(size)
+    ):
         raise XrgsError(
             f"camera model {model}: its size and focal length must be above 0, and all values "
             f"finite: {size[0]}x{size[1]} px, {', '.join(f'{v:g}' for v in values)}"

@@ -40,6 +40,9 @@ _AFFIX = re.compile(r"^masks?[\W_]|[\W_]masks?$", re.IGNORECASE)
 _WHITE = 0.5
 #: The brightness of 1 in an 8-bit mask, in which programs that write labels have 0 and 1.
 _LABEL = 1 / 255
+#: A mask of which more than this share is neither black nor white may be another picture.
+_MOST_BETWEEN, _BLACK_BELOW = 0.05, 0.1
+_GREY = "masks that are not black and white, of which what is brighter than grey is used"
 #: A pixel is used if at least this share of what it is made of is used.
 _NEARLY_ALL = 0.99
 
@@ -179,28 +182,34 @@ class Masks:
             )
         return cls(files, frozenset(stored), tuple(notes))
 
-    def read(self, name: str, photograph: Header) -> Mask | None:
-        """Read the mask of a photograph, at the photograph's size; None where it has none.
+    def read(self, name: str, photograph: Header) -> tuple[Mask | None, str]:
+        """Read the mask of a photograph.
+
+        Returns:
+            The mask at the photograph's size, None where it has none, and what is to be said of it:
+            empty for a black and white one.
 
         Raises:
             UnreadableError: The mask can't be read now.
             ImageError: The mask can't be decoded.
         """
         if name not in self.files:
-            return None
+            return None, ""
         picture = images.decode(self.files[name])
-        bright = picture.pixels.mean(axis=-1)
+        bright = picture.pixels.max(axis=-1)  # a colour is as white as its brightest channel
         if picture.alpha is not None:
             bright *= picture.alpha
         largest = float(bright.max())
         mask: Mask = bright > 0 if largest < 1.5 * _LABEL else bright >= _WHITE
+        is_between = (bright > _BLACK_BELOW) & (bright < 1 - _BLACK_BELOW)
+        note = _GREY if largest >= 1.5 * _LABEL and is_between.mean() > _MOST_BETWEEN else ""
         if name in self.turned:
             mask = turned(mask, photograph.orientation)
         nearest = [
             ((np.arange(wanted) + 0.5) * given / wanted).astype(int)
             for wanted, given in zip(photograph.size[::-1], mask.shape, strict=True)
         ]
-        return mask[np.ix_(*nearest)]
+        return mask[np.ix_(*nearest)], note
 
 
 def copy_mask(folder: Path, file: str) -> Path:

@@ -189,7 +189,9 @@ def prepare_hr_views(
     usable = _usable(scene, conf, headers, left_out, images.decode)
     sizes: list[tuple[int, int]] = []  # the largest is the first
     for name, hr, picture in progress(usable, "HR views", "view", len(headers)):
-        file, mask = f"{numbers[name]}.png", _used(picture, given.read(name, headers[name]), scene)
+        file = f"{numbers[name]}.png"
+        own_mask, of_mask = given.read(name, headers[name])
+        mask = _used(picture, own_mask, scene)
         image, shown = _layers(picture, mask, scene)
         if not _save_hr(work, file, image, shown, mask, hr):
             left_out[name] = "its mask leaves no pixel"
@@ -198,7 +200,7 @@ def prepare_hr_views(
             sizes.append(headers[name].size)
             _save_sfm(work, file, image, mask, _sfm_size(sizes[-1], sizes, conf))
         geometries[name] = hr
-        for phrase in _phrases(picture, scene):
+        for phrase in (*_phrases(picture, scene), *filter(None, [of_mask])):
             phrases[phrase].append(name)
     photos = _photographs(scene, conf, headers, left_out, geometries)
     return PhotoCollection(photos, work, (*given.notes, *_notes(scene, left_out, phrases)))

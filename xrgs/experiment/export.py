@@ -38,7 +38,8 @@ def export(path: Path, layout: str, out: Path) -> str:
     and, for a cell, `splats.ply`. Cameras and points are in `sparse/0` (`colmap`), or in
     `transforms.json` and `points.ply` (`nerfstudio`).
 
-    The images of a cell are its training views and its scored views.
+    The images of a cell are its training views and its scored views. Where a view has a mask, each
+    image has one: `masks/<image>.png`, white where a pixel is used.
 
     Args:
         path: The folder of a finished cell, or of a variant, in its store.
@@ -168,11 +169,16 @@ def _views(data: Dataset) -> Iterator[tuple[str, str, LoadedView]]:
 def _write_images(data: Dataset, target: Path) -> list[PinholeImage]:
     """Write the images and `split.json`; return the cameras."""
     from xrgs.capture.colmap import PinholeImage
-    from xrgs.capture.images import save
+    from xrgs.capture.images import save, save_mask
 
     images, entries = [], []
+    is_masked = any(view.mask is not None for *_, view in _views(data))
     for name, split, view in _views(data):
         save(target / "images" / name, view.image.numpy(), durable=False)
+        if is_masked:  # COLMAP and nerfstudio want a mask of every image, or none
+            used = np.ones(view.image.shape[:2], np.bool_)
+            mask = used if view.mask is None else view.mask.numpy()
+            save_mask(target / _mask_name(name), mask, durable=False)
         entries.append({"file": name, "view": view.name, "split": split, "tag": view.tag})
         camera = view.camera
         K, viewmat = camera.K.double().numpy(), camera.viewmat.double().numpy()
@@ -206,16 +212,23 @@ def _write_nerfstudio(data: Dataset, images: list[PinholeImage], target: Path) -
         "train_filenames": files["train"],
         "val_filenames": files["test"],
         "test_filenames": files["test"],
-        "frames": [_frame(image) for image in images],
+        "frames": [_frame(image, target) for image in images],
     }
     write_json(target / "transforms.json", content)
 
 
-def _frame(image: PinholeImage) -> dict[str, Any]:
+def _mask_name(name: str) -> str:
+    """Return the path of an image's mask, as COLMAP's `mask_path=masks` expects it."""
+    return f"masks/{name}.png"
+
+
+def _frame(image: PinholeImage, target: Path) -> dict[str, Any]:
     """Return a frame of transforms.json, whose cameras look along -z with y up."""
     camera_to_world = np.linalg.inv(image.viewmat) @ np.diag([1.0, -1.0, -1.0, 1.0])
+    mask = _mask_name(image.name)
     return {
         "file_path": f"images/{image.name}",
+        **({"mask_path": mask} if (target / mask).exists() else {}),
         "w": image.width,
         "h": image.height,
         "fl_x": float(image.K[0, 0]),

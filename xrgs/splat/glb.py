@@ -295,9 +295,10 @@ def _array(description: Json, binary: bytes, number: int) -> NDArray[np.float64]
     end = start + stride * (count - 1) + width * kind.itemsize
     if view["buffer"] != 0 or min(start, count - 1, stride - 1) < 0 or end > len(binary):
         raise ValueError(f"accessor {number} reaches beyond the binary chunk")
-    values = np.ndarray(
-        (count, width), kind, binary, offset=start, strides=(stride, kind.itemsize)
-    ).astype(np.float64)
+    strides = (stride, kind.itemsize)
+    stored = np.ndarray((count, width), kind, binary, offset=start, strides=strides)
+    with np.errstate(invalid="ignore"):  # numpy warns of NaN of some bits
+        values = stored.astype(np.float64)
     if accessor.get("normalized"):
         values = np.maximum(values / np.iinfo(kind).max, -1.0)
     return values

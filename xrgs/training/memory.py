@@ -160,10 +160,9 @@ def tensors_in(value: object) -> Iterator[Tensor]:
             yield inner
             if inner.is_leaf and inner.grad is not None:
                 yield inner.grad
-        elif isinstance(inner, OnDemand):
-            waiting += [inner.kept, inner.make]
         elif isinstance(inner, Mapping):
-            waiting += inner.values()
+            # Other values of `OnDemand` do not exist; to go through its items would make them.
+            waiting += [inner.kept, inner.make] if isinstance(inner, OnDemand) else inner.values()
         elif isinstance(inner, (list, tuple, set, frozenset)):
             waiting += inner
         elif hasattr(inner, "__dict__") and not isinstance(inner, _CODE):

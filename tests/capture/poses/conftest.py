@@ -1,6 +1,6 @@
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -21,11 +21,11 @@ def photographs(tmp_path: Path, configured: Callable[..., VariantConf]) -> Photo
     def make(
         names: Sequence[str] = ("a", "b", "c"),
         size: tuple[int, int] = (102, 76),
-        orientation: int = 1,
+        orientation: int | Mapping[str, int] = 1,
     ) -> PhotoCollection:
         files, exif = {}, Image.Exif()
-        exif[0x112] = orientation
         for name in names:
+            exif[0x112] = orientation if isinstance(orientation, int) else orientation[name]
             pixels = np.random.default_rng(0).integers(0, 255, (*size[::-1], 3), dtype=np.uint8)
             file = tmp_path / "photographs" / f"{name}.png"
             file.parent.mkdir(parents=True, exist_ok=True)

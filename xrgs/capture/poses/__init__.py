@@ -28,7 +28,7 @@ from xrgs.safeio.paths import user_path
 from xrgs.safeio.sanitize import for_line
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Mapping, Sequence
+    from collections.abc import Collection, Iterator, Mapping, Sequence
 
     from numpy.typing import NDArray
 
@@ -142,23 +142,18 @@ def read_poses(path: str, photos: PhotoCollection) -> Reconstruction:
                 "points, all of them finite, are needed to begin training with"
             )
         found = match_names(given.names, [(photo.name, photo.path) for photo in photos.all])
-        lenses: dict[int, Lens] = {}
-        viewmats: dict[int, NDArray[np.float64]] = {}
-        turned = []
-        for name, i in found.items():
-            photo = photos[i]
-            lens, viewmats[i] = given.camera(name, _stored(photo))
-            if _is_turned(lens, photo):
-                lens, viewmats[i] = _upright(lens, viewmats[i], photo)
-                turned.append(photo.name)
-            _check_shape(lens, photo)
-            lenses[i] = photo.to_hr(lens)
+        cameras = {i: given.camera(name, _stored(photos[i])) for name, i in found.items()}
+        turned = _turned_by_exif({i: lens for i, (lens, _) in cameras.items()}, photos)
+        cameras |= {i: _upright(*cameras[i], photos[i]) for i in turned}
+        for i, (lens, _) in cameras.items():
+            _check_shape(lens, photos[i])
+        lenses = {i: photos[i].to_hr(lens) for i, (lens, _) in cameras.items()}
         kept = {i: lens.kept() for i, lens in lenses.items()}
     notes = _notes(given.names, found, photos, lenses, kept, turned)
     none = np.zeros(0, np.intp)
     return Reconstruction(
         lenses,
-        viewmats,
+        {i: viewmat for i, (_, viewmat) in cameras.items()},
         points,
         given.colors,
         {i: given.observed.get(name, none) for name, i in found.items()},
@@ -179,14 +174,22 @@ def _stored(photo: Photograph) -> tuple[int, int]:
     return (height, width) if photo.orientation >= 5 else (width, height)
 
 
-def _is_turned(lens: Lens, photo: Photograph) -> bool:
-    """Return whether EXIF turns the photograph away from the pixels of its camera.
+def _turned_by_exif(lenses: Mapping[int, Lens], photos: PhotoCollection) -> set[int]:
+    """Return the photographs that EXIF turns away from the pixels of their cameras.
 
-    COLMAP, nerfstudio and instant-ngp take pixels as they are stored. A camera of the other shape
-    was made with a copy that is upright already. Where the shape does not tell, as with a square,
-    the pixels are taken to be as stored.
+    COLMAP, nerfstudio and instant-ngp take pixels as they are stored, but may have got copies that
+    were upright already. A camera that has the shape of one alone decides for itself, and for those
+    that fit both ways: of square photographs, and of ones that EXIF turns by 180 degrees. Where all
+    fit both ways, the pixels are taken to be as stored.
     """
-    return photo.orientation != 1 and _same_shape((lens.width, lens.height), _stored(photo))
+    stored, upright, either = set[int](), set[int](), set[int]()
+    for i, lens in lenses.items():
+        shape, photo = (lens.width, lens.height), photos[i]
+        if photo.orientation != 1 and _same_shape(shape, _stored(photo)):
+            (either if _same_shape(shape, photo.size) else stored).add(i)
+        elif photo.orientation != 1:
+            upright.add(i)
+    return stored if upright and not stored else stored | either
 
 
 def _same_shape(a: tuple[int, int], b: tuple[int, int]) -> bool:
@@ -222,17 +225,16 @@ def _notes(
     photos: PhotoCollection,
     lenses: Mapping[int, Lens],
     kept: Mapping[int, float],
-    turned: Sequence[str],
+    turned: Collection[int],
 ) -> list[str]:
     notes = []
     if unused := [name for name in names if name not in found]:
         notes.append(f"{len(unused)} poses fit no photograph, or several: {listed(unused)}")
-    if missing := [name for i, name in enumerate(photos.names) if i not in lenses]:
-        notes.append(f"{len(missing)} photographs have no pose and are left out: {listed(missing)}")
     if turned:
+        names_of_turned = [photos.names[i] for i in sorted(turned)]
         notes.append(
             f"EXIF turns {len(turned)} photographs, and their poses were turned with them, since "
-            f"the pixels that were posed are taken to be as stored: {listed(sorted(turned))}"
+            f"the pixels that were posed are taken to be as stored: {listed(names_of_turned)}"
         )
     if cut := sorted(i for i, share in kept.items() if share < _LEAST_KEPT):
         models = ", ".join(sorted({lenses[i].model for i in cut}))

@@ -107,13 +107,15 @@ def read(root: Path) -> GivenPoses:
             raise XrgsError(f"{images_file}: {name}: {error}") from error
 
     known = points.errors[points.errors >= 0]
+    with np.errstate(over="ignore"):
+        report = {"reprojection_error_px": float(known.mean())} if len(known) else {}
     return GivenPoses(
         list(images),
         camera,
         points.xyz[order],
         points.colors[order],
         {name: _indices(image.points, numbers) for name, image in images.items()},
-        {"reprojection_error_px": float(known.mean())} if len(known) else {},
+        report,
         _notes(root, models),
     )
 
@@ -169,9 +171,10 @@ def _viewmat(image: _Image) -> NDArray[np.float64]:
         raise XrgsError("its pose must have finite numbers")
     if not any(image.quaternion):
         raise XrgsError("its quaternion must not be 0; run COLMAP again, or remove the image")
-    w, *xyz = image.quaternion
+    # Rotation takes a quaternion of any length that can be computed.
+    w, *xyz = np.array(image.quaternion) / np.abs(image.quaternion).max()
     matrix = np.eye(4)
-    matrix[:3, :3] = Rotation.from_quat([*xyz, w]).as_matrix()  # of unit length
+    matrix[:3, :3] = Rotation.from_quat([*xyz, w]).as_matrix()
     matrix[:3, 3] = image.translation
     return matrix
 
@@ -315,17 +318,21 @@ def _text_images(file: Path) -> Iterator[_Image]:
 
 
 def _text_points(file: Path) -> _Points:
-    numbers, rows = [], []
+    numbers, positions, colors, errors = [], [], [], []
     for number, line in _lines(file):
         if line:
             with _line(file, number, "POINT3D_ID X Y Z R G B ERROR TRACK"):
-                own, *values = line.split(maxsplit=8)[:8]
+                own, x, y, z, r, g, b, error = line.split(maxsplit=8)[:8]
                 numbers.append(np.uint64(int(own)))
-                x, y, z, r, g, b, error = map(float, values)
-                rows.append((x, y, z, r, g, b, error))
-    table = np.array(rows, np.float64).reshape(-1, 7)
-    colors = np.nan_to_num(table[:, 3:6]).clip(0, 255).astype(np.uint8)
-    return _Points(np.array(numbers, np.uint64), table[:, :3], colors, table[:, 6])
+                positions.append((float(x), float(y), float(z)))
+                colors.append([np.uint8(int(value)) for value in (r, g, b)])
+                errors.append(float(error))
+    return _Points(
+        np.array(numbers, np.uint64),
+        np.array(positions, np.float64).reshape(-1, 3),
+        np.array(colors, np.uint8).reshape(-1, 3),
+        np.array(errors, np.float64),
+    )
 
 
 def _lines(file: Path) -> Iterator[tuple[int, str]]:

@@ -1,0 +1,73 @@
+"""The masks of an exported variant, where other programs look for them."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+from PIL import Image
+
+from xrgs.capture import images
+from xrgs.capture.frozen import freeze
+from xrgs.capture.views import Variant, View
+from xrgs.experiment.export import export
+
+
+def masked_variant(folder: Path) -> Variant:
+    """Two training views, of which the first has a mask, and a test view."""
+    made, variants = folder / "made", folder / "variants"
+    (made / "images").mkdir(parents=True)
+    variants.mkdir()
+    used = np.zeros((15, 20), np.bool_)
+    used[:, 5:] = True
+    views = []
+    for number, split in enumerate(("train", "train", "test")):
+        file, mask = made / "images" / split / f"v{number}.png", None
+        images.save(file, np.full((15, 20, 3), 0.5, np.float32))
+        if number == 0:
+            mask = made / "images" / f"{split}-masks" / f"v{number}.png"
+            images.save_mask(mask, used)
+        viewmat = np.eye(4)
+        viewmat[:3, 3] = (0.1 * number, 0.2 * (number % 2), 0.05 * number)
+        K = np.array([[20, 0, 10], [0, 20, 7.5], [0, 0, 1.0]])
+        views.append(View(f"v{number}", file, split, "HR", 20, 15, K, viewmat, 1.0, mask))
+    points = np.random.default_rng(0).uniform((-1, -1, 2), (1, 1, 4), (20, 3))
+    colors = np.zeros((20, 3), np.uint8)
+    variant = Variant("", made, "x", 2, True, tuple(views), points, colors, {})
+    return freeze(variant, "0" * 16, made, variants)
+
+
+def test_each_image_has_a_mask_where_one_has(tmp_path: Path) -> None:
+    variant = masked_variant(tmp_path)
+    for layout in ("colmap", "nerfstudio"):
+        out = tmp_path / layout
+        export(variant.folder, layout, out)
+        names = {file.name for file in (out / "images").iterdir()}
+        assert {file.name for file in (out / "masks").iterdir()} == {f"{n}.png" for n in names}
+        shares = {
+            name: np.asarray(Image.open(out / "masks" / f"{name}.png")).mean() / 255
+            for name in names
+        }
+        assert shares == {"train_v0.png": 0.75, "train_v1.png": 1.0, "test_v2.png": 1.0}
+    frames = json.loads((tmp_path / "nerfstudio" / "transforms.json").read_text())["frames"]
+    assert len(frames) == 3
+    for frame in frames:
+        assert (tmp_path / "nerfstudio" / frame["mask_path"]).is_file()
+        assert frame["mask_path"] == frame["file_path"].replace("images/", "masks/") + ".png"
+
+
+def test_without_masks_none_is_written(tmp_path: Path) -> None:
+    variant = masked_variant(tmp_path)
+    plain = tmp_path / "plain"
+    (plain / "images").mkdir(parents=True)
+    views = []
+    for view in variant.views:
+        file = plain / "images" / view.split / f"{view.name}.png"
+        images.save(file, images.read_png(view.file))
+        views.append(View(**(vars(view) | {"file": file, "mask": None})))
+    made = Variant(**(vars(variant) | {"id": "", "folder": plain, "views": tuple(views)}))
+    frozen = freeze(made, "1" * 16, plain, tmp_path / "variants")
+    export(frozen.folder, "nerfstudio", tmp_path / "out")
+    assert not (tmp_path / "out" / "masks").exists()
+    assert "mask_path" not in (tmp_path / "out" / "transforms.json").read_text()
