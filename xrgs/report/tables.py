@@ -256,7 +256,10 @@ class Tables:
             columns=("Metric", *scenes, "mean"),
             rows=tuple(rows),
             align="l" + "r" * (len(scenes) + 1),
-            notes=(ARROWS_NOTE, *self._mean_notes([label], condition)),
+            notes=(
+                *(*self._context(condition).cautions, ARROWS_NOTE),
+                *self._mean_notes([label], condition),
+            ),
             context=self._context(condition).of_all,
             name=f"scenes {label} {condition}".strip(),
         )
@@ -376,6 +379,7 @@ class Tables:
             rows=tuple(rows),
             align="ll" + "r" * (len(scenes) + 3),
             notes=(
+                *self._context(condition).cautions,
                 f"100 (ablation - {base}) / ({ALL_HR} - {base}): 0 is {base}, 100 is {ALL_HR},"
                 " which trains on the originals of the degraded photographs",
                 *(

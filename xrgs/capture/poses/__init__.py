@@ -230,8 +230,6 @@ def _notes(
     notes = []
     if unused := [name for name in names if name not in found]:
         notes.append(f"{len(unused)} poses fit no photograph, or several: {listed(unused)}")
-    if missing := [name for i, name in enumerate(photos.names) if i not in lenses]:
-        notes.append(f"{len(missing)} photographs have no pose and are left out: {listed(missing)}")
     if turned:
         names_of_turned = [photos.names[i] for i in sorted(turned)]
         notes.append(
