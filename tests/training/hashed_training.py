@@ -46,6 +46,7 @@ _OVERRIDES = (
     "components.consistency.weight=0.1",
     "components.consistency.lr_mode=fold",
     "components.mip.variance=0.2",
+    "components.exposure.mode=affine",
     "components.densify.decide=per_class",
     "components.densify.lr_prune=1.01",
 )
