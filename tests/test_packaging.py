@@ -57,7 +57,7 @@ def test_every_action_is_pinned_to_a_commit() -> None:
 
 def test_the_version_is_the_same_everywhere() -> None:
     version = PROJECT["version"]
-    assert metadata.version("xrgs") == version
+    assert metadata.version("xrgs") == xrgs.__version__ == version
     changes = (ROOT / "CHANGELOG.md").read_text("utf-8")
     releases = re.findall(r"^## \[?(\d[\d.]*)\]? - \d{4}-\d{2}-\d{2}$", changes, re.MULTILINE)
     if Version(version).is_devrelease:
