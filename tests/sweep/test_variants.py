@@ -330,6 +330,23 @@ def test_a_plan_says_that_no_view_is_lr(
     assert variants.plan(conf, store, allow_build=False).notes == ()
 
 
+def test_a_variant_that_is_found_says_what_the_folder_has_got_since(
+    compose: Callable[..., Conf],
+    store: Store,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    reported: PlannedVariant,
+) -> None:
+    scene = photographs(tmp_path / "scene", 4)
+    photographs(scene / "store", 1)
+    for name in ("cells", "variants"):  # as the store of a sweep in this folder
+        (scene / "store" / name).mkdir()
+    monkeypatch.setattr(variant, "find", lambda *_: SimpleNamespace(id="k-1"))
+    conf = compose("scene=folder", f"scene.path={scene}/**")
+    notes = variants.plan(conf, store, allow_build=True).notes
+    assert notes == ("images left out: 1 in store (a store of xrgs)", *reported.notes)
+
+
 def test_images_are_made_again_of_trimmed_variants_alone(
     conf: Conf, store: Store, monkeypatch: pytest.MonkeyPatch, reported: PlannedVariant
 ) -> None:

@@ -125,11 +125,11 @@ def _find_or_build(conf: Conf, store: Store, *, allow_build: bool) -> PlannedVar
         key = variant.key(conf.scene, conf.variant)
         frozen = variant.find(store.variants, key)
         if frozen is not None:
-            return PlannedVariant(frozen.id, notes=_notes(store.variants / frozen.id))
+            return _found(conf, store, frozen.id, store.variants / frozen.id)
         # The done cells of a trimmed variant are found by its id; a job that trains another cell
         # makes the images again.
         if trimmed := trimming.trimmed_variant(store.variants, key):
-            return PlannedVariant(trimmed, notes=_notes(trimmed_folder(store.variants, trimmed)))
+            return _found(conf, store, trimmed, trimmed_folder(store.variants, trimmed))
         failure = None if conf.retry == "failed" else variant.failure(store.variants, key)
         if failure:
             notes = _notes(failed_folder(store.variants, key))
@@ -151,6 +151,20 @@ def _find_or_build(conf: Conf, store: Store, *, allow_build: bool) -> PlannedVar
         return PlannedVariant(
             error=remembered or str(error), remembered=remembered is not None, notes=notes
         )
+
+
+def _found(conf: Conf, store: Store, variant_id: str, folder: Path) -> PlannedVariant:
+    """Return a variant that was built before, with the notes of its report.
+
+    Files that came into the scene's folder since then, as a store, are left out and said too.
+    """
+    now = _scene(conf, store).notes if conf.scene.kind == "folder" else ()
+    return PlannedVariant(variant_id, notes=tuple(dict.fromkeys((*now, *_notes(folder)))))
+
+
+def _scene(conf: Conf, store: Store) -> scenes.Scene:
+    """List the photographs of a folder."""
+    return scenes.resolve(conf.scene, store.scenes, conf.variant.long_side)
 
 
 def _notes(folder: Path) -> tuple[str, ...]:
@@ -177,7 +191,7 @@ def _expected_notes(conf: Conf, store: Store) -> tuple[str, ...]:
     names = scenes.names(conf.scene, conf.variant.long_side)
     sizes, notes = [(1, 1)] * len(names), list[str]()  # other kinds make views of one size
     if conf.scene.kind == "folder":
-        scene = scenes.resolve(conf.scene, store.scenes, conf.variant.long_side)
+        scene = _scene(conf, store)
         photos = photographs.expected_photographs(scene, conf.variant)
         names, sizes = photos.names, [photo.size for photo in photos.all]
         notes = [*scene.notes, *photos.notes]
