@@ -23,6 +23,7 @@ from xrgs.capture.dataset import Dataset
 from xrgs.capture.views import Variant
 from xrgs.config import Conf
 from xrgs.evaluation import protocol
+from xrgs.evaluation.metrics import VIEW_METRICS
 from xrgs.experiment import cell
 from xrgs.experiment.cell_folder import CellFolder
 from xrgs.experiment.identity import cell_id, cell_identity
@@ -239,7 +240,7 @@ def test_the_test_views_are_scored_during_training_and_nothing_else_changes(
     cell.run_cell(conf, VARIANT, scored)
     assert results(scored) == results(plain)
     header, rows = read_table(scored.path / "quality.csv")
-    assert header == ["step", "seconds", "evaluations", "gaussians", "lpips", "ssim", "psnr"]
+    assert header == ["step", "seconds", "evaluations", "gaussians", *VIEW_METRICS]
     table = [dict(zip(header, row, strict=True)) for row in rows]
     assert [row["step"] for row in table] == ["5", "10"]
     assert all(float(row["psnr"]) > 0 for row in table)

@@ -99,7 +99,8 @@ def test_joblib_runs_two_cells_at_once_and_a_killed_worker_costs_nothing(
     assert not (folder / "kill").exists()
     assert "TerminatedWorkerError" in err
     assert "of its 2 cells these are not finished:" in err
-    assert err.count("training cell") == 4
+    # Both begin and both begin again; the pool may break before the second has begun.
+    assert err.count("training cell") in (3, 4)
     assert results(folder) == results(basic)
 
 
