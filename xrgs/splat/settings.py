@@ -16,9 +16,9 @@ NOMINAL_STEPS = 30_000
 SSIM_WINDOW = 11
 """The side of the window of SSIM in the training loss, px; an image must not be smaller."""
 
-KEPT_BYTES = 288 * 2**20
-"""The most bytes of moments that training keeps of its photographs (`Target`): of 69 photographs of
-504 x 378 px, or of 16 of 1,008 x 756 px. Those of others are computed at every step on them."""
+KEPT_BYTES = 264 * 2**20
+"""The most bytes of moments that training keeps of its photographs (`Target`): of 63 photographs of
+504 x 378 px, or of 15 of 1,008 x 756 px. Those of others are computed at every step on them."""
 
 SPLITS = ("random", "long_axis")
 """The values of `DensifySettings.split`."""
