@@ -134,11 +134,11 @@ def _find_or_build(conf: Conf, store: Store, *, allow_build: bool) -> PlannedVar
         if failure:
             notes = _notes(failed_folder(store.variants, key))
             return PlannedVariant(error=failure, remembered=True, notes=notes)
-        expected = _expected_notes(conf, store)  # raises before minutes of SfM
+        # Not before a build: a header may be of a file that can't be decoded, and is left out.
         if allow_build:
             built = build(conf, store)
             return PlannedVariant(built, notes=_notes(store.variants / built))
-        return PlannedVariant(notes=expected)
+        return PlannedVariant(notes=_expected_notes(conf, store))
     except (UnreadableError, worker.UnwritableError, StoreGoneError):
         raise
     except XrgsError as error:
