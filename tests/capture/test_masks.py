@@ -255,7 +255,7 @@ CORNER[:10, :30] = True
 
 @pytest.mark.parametrize("orientation", range(1, 9))
 def test_a_mask_is_turned_as_its_photograph(orientation: int) -> None:
-    assert (masks.turned(CORNER, orientation) == by_pil(CORNER, orientation)).all()
+    assert (images.turned(CORNER, orientation) == by_pil(CORNER, orientation)).all()
 
 
 @pytest.mark.parametrize("stored", [True, False])

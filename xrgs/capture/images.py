@@ -36,6 +36,8 @@ ImageArray = NDArray[np.float32]  # [H, W, 3]
 _FORMATS = ("BMP", "HEIF", "JPEG", "PNG", "TIFF", "WEBP")
 #: The suffixes of HEIC files, in lower case.
 HEIC = frozenset({".heic", ".heif", ".hif"})
+#: The suffixes of files that are read as photographs and as masks, in lower case.
+SUFFIXES = HEIC | {".bmp", ".jpeg", ".jpg", ".png", ".tif", ".tiff", ".webp"}
 #: What the PNGs of this package have in their text chunk `Software`.
 SOFTWARE = "xrgs"
 #: How files begin that people take for photographs of these formats, and what they are.
@@ -374,7 +376,7 @@ def _orientation(value: object) -> int:
     return int(value) if value in range(1, 9) else 1  # type: ignore[call-overload]
 
 
-def _turned(array: NDArray[Any], orientation: int) -> NDArray[Any]:
+def turned(array: NDArray[Any], orientation: int) -> NDArray[Any]:
     """Turn an array [H, W, ...] upright by its EXIF orientation."""
     if orientation >= 5:  # 5 to 8 are mirrored at the diagonal, then as 1, 2, 4 and 3
         array = array.swapaxes(0, 1)
@@ -498,8 +500,8 @@ def decode(path: Path) -> Picture:
         if alpha is not None and alpha.min() >= 1:
             alpha = None
         if not samples.is_upright:
-            pixels = _turned(pixels, head.orientation)
-            alpha = None if alpha is None else _turned(alpha, head.orientation)
+            pixels = turned(pixels, head.orientation)
+            alpha = None if alpha is None else turned(alpha, head.orientation)
         if pixels.shape[1::-1] != head.size:
             raise ValueError(
                 f"it has {pixels.shape[1]} x {pixels.shape[0]} pixels, not {head.size}"

@@ -30,8 +30,6 @@ if TYPE_CHECKING:
 Mask = NDArray[np.bool_]  # [H, W], True for a pixel that is used
 
 _T = TypeVar("_T", np.float32, np.uint8)
-#: The suffixes of files that are read as masks, and that may stand before a mask's own suffix.
-SUFFIXES = images.HEIC | {".bmp", ".jpeg", ".jpg", ".png", ".tif", ".tiff", ".webp"}
 #: The folder of the masks of copies.
 MASKS = "masks"
 #: What programs write before or after the name of the photograph.
@@ -109,7 +107,8 @@ def _images_below(root: Path) -> list[Path]:
     return sorted(
         path
         for path in inside
-        if path.suffix.lower() in SUFFIXES and not any(part.startswith(".") for part in path.parts)
+        if path.suffix.lower() in images.SUFFIXES
+        and not any(part.startswith(".") for part in path.parts)
     )
 
 
@@ -117,7 +116,7 @@ def _keys(inside: Path) -> Iterator[str]:
     """Yield the keys of the names of the photographs that a file may be the mask of."""
     for stem in dict.fromkeys((inside.stem, _AFFIX.sub("", inside.stem))):
         yield _key("_".join([*inside.parent.parts, stem]))
-        if Path(stem).suffix.lower() in SUFFIXES:
+        if Path(stem).suffix.lower() in images.SUFFIXES:
             yield _key("_".join([*inside.parent.parts, Path(stem).stem]))
 
 
@@ -204,7 +203,7 @@ class Masks:
         is_between = (bright > _BLACK_BELOW) & (bright < 1 - _BLACK_BELOW)
         note = _GREY if largest >= 1.5 * _LABEL and is_between.mean() > _MOST_BETWEEN else ""
         if name in self.turned:
-            mask = turned(mask, photograph.orientation)
+            mask = images.turned(mask, photograph.orientation)
         nearest = [
             ((np.arange(wanted) + 0.5) * given / wanted).astype(int)
             for wanted, given in zip(photograph.size[::-1], mask.shape, strict=True)
@@ -221,17 +220,6 @@ def _same_shape(one: tuple[int, int], other: tuple[int, int]) -> bool:
     """Return whether one size is the other at another scale, up to the rounding of a side."""
     (w, h), (width, height) = one, other
     return abs(h - height * w / width) < 1 or abs(w - width * h / height) < 1
-
-
-def turned(mask: Mask, orientation: int) -> Mask:
-    """Turn an array [h, w] as EXIF says that stored pixels are turned: [H, W]."""
-    if orientation >= 5:
-        mask = mask.T
-    if orientation in {3, 4, 7, 8}:
-        mask = mask[::-1]
-    if orientation in {2, 3, 6, 7}:
-        mask = mask[:, ::-1]
-    return mask
 
 
 @overload

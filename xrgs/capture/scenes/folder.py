@@ -37,8 +37,6 @@ if TYPE_CHECKING:
 
     from xrgs.config import SceneConf
 
-#: The suffixes of files that are read as photographs, in lower case.
-SUFFIXES = images.HEIC | {".bmp", ".jpeg", ".jpg", ".png", ".tif", ".tiff", ".webp"}
 #: Those of images that are not read: raw files, and formats that no camera of today writes.
 _OTHER_IMAGES = frozenset(
     {".3fr", ".arw", ".cr2", ".cr3", ".dng", ".nef", ".nrw", ".orf", ".pef", ".raf", ".rw2"}
@@ -151,7 +149,7 @@ def look(path: str | None, long_side: int, masks: str | None = None) -> Listing:
         raise UnreadableError(f"{error.filename}: {error.strerror}; try again") from error
     if len(files) < 2:
         count = f"only {files[0].name}" if files else "no image"
-        suffixes = " ".join(sorted(SUFFIXES))
+        suffixes = " ".join(sorted(images.SUFFIXES))
         why = f"{count} in it; two or more are needed ({suffixes})"
         raise XrgsError("; ".join([f"scene.path={folder}: {why}", *notes]))
     _check_heic(files)
@@ -262,7 +260,7 @@ def _is_link_into(inside: Path, root: Path) -> bool:
 def _count_anywhere(folder: Path) -> int:
     """Count the images in a folder and below it, as far as they can be listed now."""
     names = (name for _, _, names in os.walk(folder) for name in names)
-    return sum(1 for name in names if Path(name).suffix.lower() in SUFFIXES)
+    return sum(1 for name in names if Path(name).suffix.lower() in images.SUFFIXES)
 
 
 def _in_other_folders(folder: Path, taken: _Tree, masks: Path | None) -> list[str]:
@@ -364,7 +362,7 @@ def _not_read(folders: Iterable[Path], taken: Sequence[Path]) -> list[str]:
     shown = {file.with_suffix("") for file in taken}
     videos, others, irregular = (
         [file for folder in sorted(folders) for file in _with_suffix(folder, suffixes)]
-        for suffixes in (_VIDEOS, _OTHER_IMAGES, SUFFIXES)
+        for suffixes in (_VIDEOS, _OTHER_IMAGES, images.SUFFIXES)
     )
     lines = []
     if alone := [file for file in videos if file.with_suffix("") not in shown]:
@@ -441,7 +439,7 @@ def _is_size(folder: Path) -> bool:
 
 def _images_in(folder: Path) -> list[Path]:
     """List the regular files that are photographs by their suffix, and the links to such files."""
-    return [file for file in _with_suffix(folder, SUFFIXES) if file.is_file()]
+    return [file for file in _with_suffix(folder, images.SUFFIXES) if file.is_file()]
 
 
 def _with_suffix(folder: Path, suffixes: frozenset[str]) -> list[Path]:
