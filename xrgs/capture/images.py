@@ -387,6 +387,11 @@ def turned(array: NDArray[Any], orientation: int) -> NDArray[Any]:
     return array
 
 
+def turned_size(size: tuple[int, int], orientation: int) -> tuple[int, int]:
+    """Return width and height as EXIF turns stored pixels, or back: 5 to 8 exchange the two."""
+    return size[::-1] if orientation >= 5 else size
+
+
 def header(path: Path) -> Header:
     """Read the header of a photograph; `decode` gives pixels of its size.
 
@@ -399,8 +404,7 @@ def header(path: Path) -> Header:
 
 
 def _header(file: _File) -> Header:
-    width, height = file.size
-    size = (height, width) if file.orientation >= 5 else (width, height)
+    size = turned_size(file.size, file.orientation)
     return Header(size, file.orientation, file.channels, file.bits)
 
 

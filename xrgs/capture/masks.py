@@ -156,7 +156,7 @@ class Masks:
         for name, file in files.items():
             photograph, mask = headers[name], images.header(file)
             width, height = photograph.size
-            as_stored = (height, width) if photograph.orientation >= 5 else (width, height)
+            as_stored = images.turned_size(photograph.size, photograph.orientation)
             fits_seen = _same_shape(mask.size, (width, height))
             if not fits_seen and not _same_shape(mask.size, as_stored):
                 raise XrgsError(

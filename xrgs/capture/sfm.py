@@ -125,19 +125,12 @@ def reconstruct(
     pycolmap.set_random_seed(conf.seed)
     database = work / "database.db"
     threads = usable_cores()
-    max_features = features_per_image(len(sfm_images), conf.max_num_features)
-    longest = max(max(images.size(folder / image.file)) for image in sfm_images)
-    octave = first_octave(longest, conf.first_octave)
-    if not database.exists():
-        _extract(sfm_images, folder, database, max_features, octave, threads)
-        _match(sfm_images, database, work, threads)
+    features = _find_matches(sfm_images, folder, work, conf, threads)
     models = _map(sfm_images, folder, database, work, conf, threads)
-    report = {
-        "first_octave": octave,
+    report = features | {
         "images": len(sfm_images),
         "init_min_tri_angle": conf.init_min_tri_angle,
         "lr_images": conf.lr_images,
-        "max_num_features": max_features,
         "min_inliers": conf.min_inliers,
         "points": 0,
         "pycolmap": pycolmap.__version__,
@@ -185,11 +178,7 @@ def triangulate(
     _log_to(work)
     pycolmap.set_random_seed(conf.seed)
     database, threads = work / "database.db", usable_cores()
-    max_features = features_per_image(len(sfm_images), conf.max_num_features)
-    longest = max(max(images.size(folder / image.file)) for image in sfm_images)
-    octave = first_octave(longest, conf.first_octave)
-    _extract(sfm_images, folder, database, max_features, octave, threads)
-    _match(sfm_images, database, work, threads)
+    features = _find_matches(sfm_images, folder, work, conf, threads)
     index = {image.file: i for i, image in enumerate(sfm_images)}
     posed = pycolmap.Reconstruction()
     with pycolmap.Database.open(database) as opened:
@@ -201,7 +190,21 @@ def triangulate(
     options = mapping_options(conf, len(sfm_images), known=True)
     options.num_threads = threads
     model = pycolmap.triangulate_points(posed, database, folder, work, options=options)
-    return to_numpy(model, index, {"first_octave": octave, "max_num_features": max_features})
+    return to_numpy(model, index, features)
+
+
+def _find_matches(
+    sfm_images: Sequence[SfmImage], folder: Path, work: Path, conf: SfmConf, threads: int
+) -> dict[str, Any]:
+    """Fill the database in `work`, unless an earlier call has; return the settings of SIFT."""
+    database = work / "database.db"
+    max_features = features_per_image(len(sfm_images), conf.max_num_features)
+    longest = max(max(images.size(folder / image.file)) for image in sfm_images)
+    octave = first_octave(longest, conf.first_octave)
+    if not database.exists():
+        _extract(sfm_images, folder, database, max_features, octave, threads)
+        _match(sfm_images, database, work, threads)
+    return {"first_octave": octave, "max_num_features": max_features}
 
 
 def bogus_cameras(model: Any, sfm_images: Sequence[SfmImage]) -> dict[int, str]:

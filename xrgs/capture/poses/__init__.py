@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from xrgs.capture import images
 from xrgs.capture.lens import Lens, quarter_turn
 from xrgs.capture.poses import colmap, transforms
 from xrgs.capture.poses.given import MIN_POINTS
@@ -170,8 +171,7 @@ def read_poses(path: str, photos: PhotoCollection) -> Reconstruction:
 
 def _stored(photo: Photograph) -> tuple[int, int]:
     """Return the width and height that a photograph is stored with, before EXIF turns it."""
-    width, height = photo.size
-    return (height, width) if photo.orientation >= 5 else (width, height)
+    return images.turned_size(photo.size, photo.orientation)
 
 
 def _turned_by_exif(lenses: Mapping[int, Lens], photos: PhotoCollection) -> set[int]:
