@@ -155,6 +155,16 @@ def rasterize_parameters(
     return render
 
 
+def zero_means2d_offset(count: int) -> Tensor:
+    """Return a `means2d_offset` of zeros that gathers the image-plane gradient of N Gaussians.
+
+    Returns:
+        [N, 2] leaf that requires a gradient, float32. All its elements are one number in memory:
+        the native backend knows them for zeros and does not read them.
+    """
+    return torch.zeros(()).expand(count, 2).requires_grad_()
+
+
 def backend_for(means: Tensor, backend: str) -> str:
     """Choose the backend that can render parameters of this floating type.
 
