@@ -80,12 +80,13 @@ def rasterize(
         sh_degree = min(settings.sh_degree, stored)
     backend = backend_for(gaussians.means, backend)
     # Not `Gaussians.activated`, which cuts shN off from its gradient.
-    activations = implementation("activations", backend)
+    activate = implementation("activations", backend).activate
+    scales, opacities = activate(gaussians.scales, gaussians.opacities)
     return rasterize_parameters(
         gaussians.means,
         gaussians.quats,
-        activations.exp(gaussians.scales),
-        activations.logistic(gaussians.opacities),
+        scales,
+        opacities,
         gaussians.sh0,
         gaussians.shN,
         camera,

@@ -98,10 +98,10 @@ def render_config(
     Raises:
         ValueError: float32 cannot hold a number of the camera or the settings.
     """
-    K = camera.K
+    K = camera.K.tolist()
     return _native.RenderConfig(
         viewmat=camera.viewmat.flatten().tolist(),
-        intrinsics=[K[0, 0].item(), K[1, 1].item(), K[0, 2].item(), K[1, 2].item()],
+        intrinsics=[K[0][0], K[1][1], K[0][2], K[1][2]],
         width=camera.width,
         height=camera.height,
         near=settings.near,
