@@ -36,7 +36,8 @@ def step(adam: torch.optim.Adam, camera: Camera | None = None, sh_degree: int = 
         ValueError: A parameter, gradient or moment is not float32 on the CPU and contiguous.
     """
     groups = {group["name"]: group for group in adam.param_groups}
-    harmonics, moved = None, []
+    harmonics: tuple[Any, ...] | None = None
+    moved: list[Tensor] = []
     if camera is not None and groups["sh0"]["params"][0].grad is not None:
         harmonics, *moved = _harmonics(adam, groups, camera, sh_degree)
     entries = []
@@ -51,8 +52,9 @@ def step(adam: torch.optim.Adam, camera: Camera | None = None, sh_degree: int = 
         number = state["step"].add_(1).item()
         entries.append((values, gradient, exp_avg, exp_avg_sq, group["lr"], number))
         moved += changing
-    constants = (*adam.defaults["betas"], adam.defaults["eps"])
-    _native.adam_step(entries, *constants, torch.get_num_threads(), harmonics)
+    beta1, beta2 = adam.defaults["betas"]
+    threads = torch.get_num_threads()
+    _native.adam_step(entries, beta1, beta2, adam.defaults["eps"], threads, harmonics)
     # So that a backward pass refuses to use the values from before.
     for tensor in moved:
         torch.autograd.graph.increment_version(tensor)
