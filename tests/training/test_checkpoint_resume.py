@@ -45,6 +45,7 @@ CASES = {
     "harmonics_every": ["+ablation=harmonics_every"],
     "multiview_score": ["+ablation=multiview_score"],
     "exposure": ["+ablation=exposure"],
+    "mcmc": ["+ablation=mcmc", "splat.densify.budget=0.03"],
     "natural_selection": [
         "+ablation=natural_selection",
         "components.natural_selection.budget=0.003",
