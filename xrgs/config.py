@@ -106,6 +106,7 @@ class TrainConf:
     views: str
     evaluate_every: int = off(0)
     validation: float = off(0.0)
+    hr_share: float = off(0.0)
 
 
 @dataclass(kw_only=True)
