@@ -66,8 +66,8 @@ class Dataset:
     factor: int
     """How many times fewer pixels per side the method takes LR views to have."""
     degradation: str = "downsample"
-    """How LR views were made of HR ones: `downsample`, `digital_zoom`, `jpeg`, or `none` where a
-    camera took them."""
+    """How LR views were made of HR ones, a key of `xrgs.capture.degradations.DEGRADATIONS`, or
+    `none` where a camera took them."""
 
     @property
     def view_pixels(self) -> int:
