@@ -66,6 +66,15 @@ class SfmConf:
 
 
 @dataclass(kw_only=True)
+class PhoneConf:
+    """The degradation `phone`; not in the paper."""
+
+    blur: float
+    noise: float
+    jpeg_quality: int
+
+
+@dataclass(kw_only=True)
 class VariantConf:
     """The mixed-resolution dataset that is made of a scene (paper, section 4.1)."""
 
@@ -82,6 +91,7 @@ class VariantConf:
     hr_above: float
     degradation: str
     jpeg_quality: int
+    phone: PhoneConf
     sfm: SfmConf
 
 
@@ -106,6 +116,7 @@ class TrainConf:
     views: str
     evaluate_every: int = off(0)
     validation: float = off(0.0)
+    hr_share: float = off(0.0)
 
 
 @dataclass(kw_only=True)

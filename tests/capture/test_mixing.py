@@ -17,10 +17,12 @@ import pytest
 from tests.capture.scene_confs import scene_conf
 from xrgs import config
 from xrgs.capture import images, mixing, registration, scenes, sfm
-from xrgs.capture.degradations import resolve_degradation
+from xrgs.capture.degradations import DEGRADATIONS, resolve_degradation
+from xrgs.capture.photographs import prepare_hr_views, write_degraded
 from xrgs.capture.scenes import Scene, procedural
 from xrgs.capture.sfm import Reconstruction, SfmImage
 from xrgs.capture.split import check_variant_conf
+from xrgs.capture.tags import POLICIES
 from xrgs.capture.views import SceneFailed, Variant, View
 from xrgs.config import VariantConf
 from xrgs.errors import XrgsError
@@ -232,6 +234,39 @@ def test_a_degradation_may_keep_the_size(mix: Mix, given: list[list[str]], how: 
     assert given[0] == [f"{'sfm_lr' if i in low else 'sfm'}/{i:05d}.png" for i in range(VIEWS)]
 
 
+@pytest.mark.parametrize("how", ["box", "lanczos", "phone"])
+def test_lr_views_of_other_kernels_are_smaller(mix: Mix, given: list[list[str]], how: str) -> None:
+    made = mix(degradation=how, hr_fraction=0.5)
+    low = of(made, "train", "LR")
+    originals = {v.name: v for v in of(made, "original", "HR")}
+    assert {v.name for v in low} == originals.keys()
+    for view in low:
+        assert (view.width, view.height) == (32, 24)
+        assert view.rho == pytest.approx(originals[view.name].rho / 5)
+        high = images.read(originals[view.name].file)
+        assert 0 < np.abs(images.resize(high, 32, 24) - images.read(view.file)).mean() < 0.1
+    numbers = {number(v) for v in low}
+    expected = [f"{'sfm_lr_up' if i in numbers else 'sfm'}/{i:05d}.png" for i in range(VIEWS)]
+    assert given[0] == expected
+
+
+def test_noise_depends_on_a_views_name_and_on_the_seed_alone(
+    rendered: Scene, configured: Make, tmp_path: Path
+) -> None:
+    """In another order, and beside other views, a view has the same bytes."""
+    conf = configured(degradation="phone", factor=2)
+    photos = prepare_hr_views(rendered, conf, tmp_path)
+
+    def written(which: Sequence[int], **changes: Any) -> dict[int, bytes]:
+        write_degraded(photos, which, replace(conf, **changes))
+        return {i: (photos.folder / photos.file("lr", i)).read_bytes() for i in which}
+
+    first = written([0, 1, 2])
+    assert len(set(first.values())) == 3
+    assert written([2, 0]) == {i: first[i] for i in (0, 2)}
+    assert written([0], seed=1)[0] != first[0]
+
+
 def test_views_tagged_after_sfm_can_be_degraded_after_it(mix: Mix, given: list[list[str]]) -> None:
     made = mix(tags="distance", degradation="downsample")
     assert given == [[f"sfm/{i:05d}.png" for i in range(VIEWS)]]
@@ -367,10 +402,13 @@ def test_a_failed_scene_says_who_is_missing_why_and_what_to_try(
 @pytest.mark.parametrize(
     ("name", "tags", "degradation"),
     [
+        ("box", "flag", "box"),
         ("digital_zoom", "flag", "digital_zoom"),
         ("distance", "distance", "none"),
         ("jpeg", "flag", "jpeg"),
+        ("lanczos", "flag", "lanczos"),
         ("megapixels", "megapixels", "none"),
+        ("phone", "flag", "phone"),
         ("sampling_rate", "sampling_rate", "none"),
         ("", "flag", "downsample"),
     ],
@@ -381,8 +419,11 @@ def test_every_variant_in_conf_is_valid(
     conf = compose(*([f"variant={name}"] if name else [])).variant
     check_variant_conf(conf)
     assert (conf.tags, resolve_degradation(conf)) == (tags, degradation)
+
+
+def test_every_tag_and_degradation_has_a_variant_in_conf() -> None:
     files = {file.stem for file in (config.CONF_DIR / "variant").iterdir()}
-    assert files == {"digital_zoom", "distance", "jpeg", "megapixels", "sampling_rate"}
+    assert files == POLICIES.keys() | DEGRADATIONS.keys() - {"downsample"}  # the default
 
 
 # what the user gives

@@ -36,6 +36,7 @@ CASES = {
     "groups": ["+ablation=densify_per_class"],
     "xrgs": ["+ablation=xrgs"],
     "curriculum": ["+ablation=curriculum"],
+    "hr_share": ["+ablation=hr_share"],
     # 60 Gaussians of at most 180: a limit that began with those at the restart would be another.
     "budget": ["+ablation=budget", "splat.densify.budget=0.05"],
     # Its rates are found anew between refinements too, or they would be new at every restart.

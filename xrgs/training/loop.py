@@ -301,7 +301,9 @@ def _set_up(data: Dataset, conf: Conf, extra_components: Iterable[Component]) ->
         optimizer=optimizer,
         components=components,
         strategy=strategy,
-        sampler=EpochSampler(data.train, conf.seed, steps, components.allows_view),
+        sampler=EpochSampler(
+            data.train, conf.seed, steps, components.allows_view, conf.train.hr_share
+        ),
         recorder=recorder,
         renderer=StepRenderer(components, splat.raster, sh_every, backend, recorder),
         memory=TrainingMemory(optimizer, strategy, components, views, data),
