@@ -268,6 +268,14 @@ class ExposureConf:
 
 
 @dataclass(kw_only=True)
+class FloatersConf:
+    """Guards against Gaussians in the empty space close to cameras."""
+
+    near_share: float = off(0.0)
+    gradient_share: float = off(0.0)
+
+
+@dataclass(kw_only=True)
 class CountMatchedConf:
     """A cell with as many Gaussians as another one (`xrgs.training.count_matching`)."""
 
@@ -297,6 +305,7 @@ class ComponentsConf:
     error_score: ErrorScoreConf
     natural_selection: NaturalSelectionConf
     exposure: ExposureConf
+    floaters: FloatersConf
     count_matched: CountMatchedConf
     # `off` declares no default, so that instances share no dict.
     plugins: dict[str, Any] = off({})  # noqa: RUF009

@@ -47,6 +47,7 @@ CASES = {
     "harmonics_every": ["+ablation=harmonics_every"],
     "multiview_score": ["+ablation=multiview_score"],
     "exposure": ["+ablation=exposure"],
+    "floaters": ["+ablation=[near_limit,near_gradients]", "components.floaters.near_share=1"],
     "natural_selection": [
         "+ablation=natural_selection",
         "components.natural_selection.budget=0.003",
