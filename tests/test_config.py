@@ -358,9 +358,9 @@ class NewComponentsConf(ComponentsConf):
 def test_what_is_added_and_off_changes_no_identity(
     baseline: Conf, variance: float, every: int, late_from: int
 ) -> None:
-    old = replace(baseline.components, mip=MipConf(variance=variance, every=every))
+    old = replace(baseline.components, mip=MipConf(variance=variance, every=every, until=30_000))
     new = NewComponentsConf(
-        **vars(old) | {"mip": NewMipConf(variance=variance, every=every, added=3)},
+        **vars(old) | {"mip": NewMipConf(**vars(old.mip), added=3)},
         added=SupersampledConf(factor=1, late_factor=1, late_from=late_from),
     )
     assert identity_values(new) == identity_values(old)

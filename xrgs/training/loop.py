@@ -192,6 +192,7 @@ def _run_steps(run: _Run, checkpoint: Checkpoint, evaluate: Evaluate | None) -> 
             recorder.record_skipped("backward")
         recorder.record_step(step, forward.loss, forward.render, gaussians, forward.sh_degree)
         recorder.record_refinement(_densify(run, step, forward))
+        components.after_step(gaussians, step)
         # Evaluation and checkpoints do not count as training time.
         if evaluate is not None and run.evaluates_after(step.number):
             recorder.record_scores(step.number + 1, len(gaussians), run.score(evaluate))

@@ -60,10 +60,11 @@ ON: dict[str, tuple[Any, type[Component]]] = {
     "continuous_weighting.gamma": (1.0, Weighting),
 }
 #: Keys that `off` declares too, with another value: they build no component by themselves. The
-#: first changes a weight that another key switches on, as do those of `ATTENUATIONS`, which are
-#: refused without one; the last is read by `xrgs.training.count_matching`.
+#: first two change what another key switches on, as do those of `ATTENUATIONS`, which are refused
+#: without one; the last is read by `xrgs.training.count_matching`.
 OTHERS: dict[str, Any] = {
     "loss_weighting.stat_from": "unweighted",
+    "mip.until": 20_000,
     "count_matched.gaussians": 100,
 }
 ATTENUATIONS: dict[str, Any] = {
@@ -262,6 +263,8 @@ def test_what_is_imported(module: str, unused: set[str]) -> None:
         ("continuous_weighting.gamma", -0.43),
         ("mip.variance", -0.2),
         ("mip.every", 0),
+        ("mip.until", 0),
+        ("mip.until", 30_001),
         ("multiview_score.views", -1),
         ("multiview_score.error", -0.1),
         ("multiview_score.error", 1.0),
