@@ -12,7 +12,7 @@ from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, get_type_hints
 
-from xrgs.splat.settings import DensifySettings, OptimizerSettings, RasterSettings
+from xrgs.splat.settings import NOMINAL_STEPS, DensifySettings, OptimizerSettings, RasterSettings
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping
@@ -116,6 +116,7 @@ class TrainConf:
     views: str
     evaluate_every: int = off(0)
     validation: float = off(0.0)
+    hr_share: float = off(0.0)
 
 
 @dataclass(kw_only=True)
@@ -228,6 +229,7 @@ class MipConf:
 
     variance: float = off(0.0)
     every: int
+    until: int = off(NOMINAL_STEPS)
 
 
 @dataclass(kw_only=True)
@@ -266,6 +268,14 @@ class ExposureConf:
 
 
 @dataclass(kw_only=True)
+class FloatersConf:
+    """Guards against Gaussians in the empty space close to cameras."""
+
+    near_share: float = off(0.0)
+    gradient_share: float = off(0.0)
+
+
+@dataclass(kw_only=True)
 class CountMatchedConf:
     """A cell with as many Gaussians as another one (`xrgs.training.count_matching`)."""
 
@@ -295,6 +305,7 @@ class ComponentsConf:
     error_score: ErrorScoreConf
     natural_selection: NaturalSelectionConf
     exposure: ExposureConf
+    floaters: FloatersConf
     count_matched: CountMatchedConf
     # `off` declares no default, so that instances share no dict.
     plugins: dict[str, Any] = off({})  # noqa: RUF009

@@ -133,10 +133,14 @@ def test_by_sampling_rate_the_highest_are_hr_and_nothing_is_degraded(
 def test_photographs_of_one_resolution_are_said_to_make_no_mixture(mix: Mix) -> None:
     """The embedded scene's cameras are all about as far away: rho differs by 15 % at most."""
     made = mix(tags="sampling_rate")
-    (note,) = made.report["notes"]
+    note, need = made.report["notes"]
     rho = [view.rho for view in made.views if view.split == "train"]
     assert "variant.tags=sampling_rate is meaningless" in note
     assert f"rho is {min(rho):.3f} to {max(rho):.3f}" in note
+    assert need == (
+        "sampling rates of training views differ by 1.1 where they show the same points:"
+        " components.supersampled, where it is on, renders none of the views larger"
+    )
 
 
 def test_a_threshold_of_the_rate_takes_those_above_it(mix: Mix) -> None:
@@ -170,6 +174,8 @@ def test_by_megapixels_the_larger_photographs_are_hr(
     assert all((v.width, v.height) == (80, 60) for v in of(made, "train", "LR"))
     assert not of(made, "original", "HR")
     assert made.report["rho"]["LR"][1] == pytest.approx(0.5, abs=0.1)
+    assert round(min(view.need for view in of(made, "train", "LR"))) == 2
+    assert made.report["notes"][-1].endswith("renders 6 of 9 of the views larger")
     for view in of(made, "test", "HR"):  # at its own full size
         assert (view.width, view.height) == ((160, 120) if number(view) % 3 == 0 else (80, 60))
 
@@ -206,6 +212,8 @@ def test_each_degraded_view_has_its_original_from_the_same_pose(mix: Mix) -> Non
         assert np.array_equal(high.viewmat, view.viewmat)
         assert (high.width, high.height) == (160, 120) == (view.width * 5, view.height * 5)
         assert high.K[:2] == pytest.approx(view.K[:2] * 5)
+        assert view.need == pytest.approx(5 * high.need, rel=0.01)
+        assert high.need == pytest.approx(1, rel=0.2)
         shrunk = images.resize(images.read(high.file), view.width, view.height)
         # The lens is nearly a pinhole, so that undistortion and downsampling commute.
         assert np.abs(shrunk - images.read(view.file)).mean() < 0.01
@@ -220,6 +228,8 @@ def test_a_degradation_may_keep_the_size(mix: Mix, given: list[list[str]], how: 
         before, after = images.read(originals[view.name].file), images.read(view.file)
         assert 0.005 < np.abs(before - after).mean() < 0.1
         assert view.rho == originals[view.name].rho  # px per unit; not what is in them
+        resolved = {"jpeg": 1, "digital_zoom": 5}[how]
+        assert view.need == pytest.approx(resolved * originals[view.name].need)
     low = {number(v) for v in of(made, "train", "LR")}
     assert given[0] == [f"{'sfm_lr' if i in low else 'sfm'}/{i:05d}.png" for i in range(VIEWS)]
 
