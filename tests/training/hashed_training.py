@@ -50,6 +50,8 @@ _DEFAULT = (
     "components.consistency.lr_mode=fold",
     "components.mip.variance=0.2",
     "components.exposure.mode=affine",
+    "components.floaters.near_share=0.95",
+    "components.floaters.gradient_share=0.8",
     "components.densify.decide=per_class",
     "components.densify.lr_prune=1.01",
 )
