@@ -224,6 +224,14 @@ class ContinuousWeightingConf:
 
 
 @dataclass(kw_only=True)
+class NoiseWeightingConf:
+    """A weight of an LR view by its own residual; not in the paper."""
+
+    floor: float = off(1.0)
+    begin: int
+
+
+@dataclass(kw_only=True)
 class MipConf:
     """Mip-Splatting's 3D smoothing filter; not in the paper."""
 
@@ -300,6 +308,7 @@ class ComponentsConf:
     region_weighting: RegionWeightingConf
     hybrid_schedule: HybridScheduleConf
     continuous_weighting: ContinuousWeightingConf
+    noise_weighting: NoiseWeightingConf
     mip: MipConf
     multiview_score: MultiviewScoreConf
     error_score: ErrorScoreConf

@@ -26,8 +26,8 @@ class ComponentEntry:
     """Further modules of `xrgs.training.components` that only this component uses."""
 
 
-#: In the order in which hooks run. `loss_weighting` comes after `consistency`, since the weight of
-#: a view multiplies its consistency loss as well.
+#: In the order in which hooks run. The weights come after `consistency`, since the weight of a view
+#: multiplies its consistency loss as well.
 BUILT_IN: Mapping[str, ComponentEntry] = {
     "consistency": ComponentEntry("consistency", "Consistency"),
     "loss_weighting": ComponentEntry(
@@ -41,6 +41,7 @@ BUILT_IN: Mapping[str, ComponentEntry] = {
         ),
         helpers=("texture",),
     ),
+    "noise_weighting": ComponentEntry("noise_weighting", "NoiseWeighting"),
     "gradient_scaling": ComponentEntry("gradient_scaling", "GradientScaling"),
     "floaters": ComponentEntry("floaters", "Floaters"),
     "densify": ComponentEntry("densify", "Densify"),
