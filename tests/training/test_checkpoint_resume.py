@@ -47,6 +47,7 @@ CASES = {
     "harmonics_every": ["+ablation=harmonics_every"],
     "multiview_score": ["+ablation=multiview_score"],
     "exposure": ["+ablation=exposure"],
+    "mcmc": ["+ablation=mcmc", "splat.densify.budget=0.03"],
     "floaters": ["+ablation=[near_limit,near_gradients]", "components.floaters.near_share=1"],
     "natural_selection": [
         "+ablation=natural_selection",
