@@ -44,6 +44,7 @@ CASES = {
     "resolution_schedule": ["+ablation=resolution_schedule"],
     "harmonics_every": ["+ablation=harmonics_every"],
     "multiview_score": ["+ablation=multiview_score"],
+    "formation": ["+ablation=formation"],
     "exposure": ["+ablation=exposure"],
     "natural_selection": [
         "+ablation=natural_selection",
