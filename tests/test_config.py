@@ -186,11 +186,12 @@ def test_a_value_below_its_least_names_its_key(compose: Compose, override: str) 
         compose(override)
 
 
+@pytest.mark.parametrize("name", ["validation", "hr_share"])
 @pytest.mark.parametrize("value", ["-0.1", "1", "nan"])
-def test_a_share_of_held_out_views_is_from_0_to_below_1(compose: Compose, value: str) -> None:
-    with pytest.raises(XrgsError, match=r"^train\.validation=.*: must be from 0 to below 1"):
-        compose(f"train.validation={value}")
-    assert compose("train.validation=0.999").train.validation == 0.999
+def test_a_share_of_views_is_from_0_to_below_1(compose: Compose, name: str, value: str) -> None:
+    with pytest.raises(XrgsError, match=rf"^train\.{name}=.*: must be from 0 to below 1"):
+        compose(f"train.{name}={value}")
+    assert getattr(compose(f"train.{name}=0.999").train, name) == 0.999
 
 
 @pytest.mark.parametrize("override", ["splat.backend=cuda", "retry=all"])
@@ -357,9 +358,9 @@ class NewComponentsConf(ComponentsConf):
 def test_what_is_added_and_off_changes_no_identity(
     baseline: Conf, variance: float, every: int, late_from: int
 ) -> None:
-    old = replace(baseline.components, mip=MipConf(variance=variance, every=every))
+    old = replace(baseline.components, mip=MipConf(variance=variance, every=every, until=30_000))
     new = NewComponentsConf(
-        **vars(old) | {"mip": NewMipConf(variance=variance, every=every, added=3)},
+        **vars(old) | {"mip": NewMipConf(**vars(old.mip), added=3)},
         added=SupersampledConf(factor=1, late_factor=1, late_from=late_from),
     )
     assert identity_values(new) == identity_values(old)

@@ -104,8 +104,9 @@ def _check_ranges(conf: Conf) -> None:
     for key, value, least in least_values:
         if not value >= least:
             raise XrgsError(f"{key}={value}: must be at least {least}")
-    if not 0 <= conf.train.validation < 1:
-        raise XrgsError(f"train.validation={conf.train.validation}: must be from 0 to below 1")
+    for name in ("validation", "hr_share"):
+        if not 0 <= (share := getattr(conf.train, name)) < 1:
+            raise XrgsError(f"train.{name}={share}: must be from 0 to below 1")
     if (begin := conf.splat.optimizer.means_decay_from) >= NOMINAL_STEPS:
         key = "splat.optimizer.means_decay_from"
         raise XrgsError(f"{key}={begin}: must be below {NOMINAL_STEPS}, the length of a run")

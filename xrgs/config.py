@@ -12,7 +12,7 @@ from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, get_type_hints
 
-from xrgs.splat.settings import DensifySettings, OptimizerSettings, RasterSettings
+from xrgs.splat.settings import NOMINAL_STEPS, DensifySettings, OptimizerSettings, RasterSettings
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping
@@ -66,6 +66,15 @@ class SfmConf:
 
 
 @dataclass(kw_only=True)
+class PhoneConf:
+    """The degradation `phone`; not in the paper."""
+
+    blur: float
+    noise: float
+    jpeg_quality: int
+
+
+@dataclass(kw_only=True)
 class VariantConf:
     """The mixed-resolution dataset that is made of a scene (paper, section 4.1)."""
 
@@ -82,6 +91,7 @@ class VariantConf:
     hr_above: float
     degradation: str
     jpeg_quality: int
+    phone: PhoneConf
     sfm: SfmConf
 
 
@@ -106,6 +116,7 @@ class TrainConf:
     views: str
     evaluate_every: int = off(0)
     validation: float = off(0.0)
+    hr_share: float = off(0.0)
 
 
 @dataclass(kw_only=True)
@@ -227,6 +238,7 @@ class MipConf:
 
     variance: float = off(0.0)
     every: int
+    until: int = off(NOMINAL_STEPS)
 
 
 @dataclass(kw_only=True)
@@ -265,6 +277,14 @@ class ExposureConf:
 
 
 @dataclass(kw_only=True)
+class FloatersConf:
+    """Guards against Gaussians in the empty space close to cameras."""
+
+    near_share: float = off(0.0)
+    gradient_share: float = off(0.0)
+
+
+@dataclass(kw_only=True)
 class CountMatchedConf:
     """A cell with as many Gaussians as another one (`xrgs.training.count_matching`)."""
 
@@ -295,6 +315,7 @@ class ComponentsConf:
     error_score: ErrorScoreConf
     natural_selection: NaturalSelectionConf
     exposure: ExposureConf
+    floaters: FloatersConf
     count_matched: CountMatchedConf
     # `off` declares no default, so that instances share no dict.
     plugins: dict[str, Any] = off({})  # noqa: RUF009

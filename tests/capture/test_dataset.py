@@ -26,7 +26,8 @@ def make_view(folder: Path, name: str, split: str, tag: str, size: tuple[int, in
     viewmat = np.eye(4)
     viewmat[:3, 3] = (-0.3 * number, 0.1 * (number % 2), 0.05 * number)
     K = np.array([[size[0], 0, size[0] / 2], [0, size[0], size[1] / 2], [0, 0, 1.0]])
-    return View(name, file, split, tag, *size, K, viewmat, size[0] / HR[0])
+    finer = HR[0] / size[0]
+    return View(name, file, split, tag, *size, K, viewmat, 1 / finer, need=finer)
 
 
 @pytest.fixture
@@ -58,6 +59,7 @@ def test_mixed_is_the_default_and_takes_the_views_as_they_are(variant: Variant) 
     ]
     assert [v.name for v in data.test] == ["v0"]
     assert [v.rho for v in data.train] == [1, 0.5, 0.5, 0.5]
+    assert [v.need for v in data.train] == [1, 2, 2, 2]
     for view in data.train:
         size = HR if view.tag == "HR" else LR
         assert view.image.shape == (size[1], size[0], 3)

@@ -47,6 +47,8 @@ _OVERRIDES = (
     "components.consistency.lr_mode=fold",
     "components.mip.variance=0.2",
     "components.exposure.mode=affine",
+    "components.floaters.near_share=0.95",
+    "components.floaters.gradient_share=0.8",
     "components.densify.decide=per_class",
     "components.densify.lr_prune=1.01",
 )

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import inspect
+import math
 import re
 from collections.abc import Callable
 from types import SimpleNamespace
@@ -338,6 +339,22 @@ def test_each_ablation_changes_the_result(data: Dataset, ablation: str) -> None:
     if ablation == "natural_selection":  # its budget is for more Gaussians than there are here
         conf.components.natural_selection.budget = 0.01
     assert not same(plain.gaussians, train_cell(data, conf).gaussians)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("ablation", ABLATIONS)
+def test_each_ablation_trains_with_plus_exposure_and_masks(data: Dataset, ablation: str) -> None:
+    """Its 20 steps go through densification, selection and the late factor of `supersampled`."""
+    conf = compose("train.steps=20", "splat.backend=auto", f"+ablation=[plus,exposure,{ablation}]")
+    masked = [
+        dataclasses.replace(
+            view, mask=(torch.arange(view.image.shape[1]) > 3).repeat(len(view.image), 1)
+        )
+        for view in data.train
+    ]
+    result = train(dataclasses.replace(data, train=tuple(masked)), conf)
+    assert all(math.isfinite(row["loss"]) for row in result.history)
+    assert len({row["exposure.gain"] for row in result.history}) > 1
 
 
 @pytest.mark.parametrize(

@@ -39,6 +39,8 @@ class LoadedView:
     """The relative sampling rate in (0, 1], see `xrgs.capture.views.View`."""
     mask: torch.Tensor | None = None
     """[H, W] bool, True for a pixel that is used; None uses all."""
+    need: float = 1.0
+    """How many times as many px a side the view needs, see `xrgs.capture.views.View`."""
 
     @property
     def image(self) -> torch.Tensor:
@@ -66,8 +68,8 @@ class Dataset:
     factor: int
     """How many times fewer pixels per side the method takes LR views to have."""
     degradation: str = "downsample"
-    """How LR views were made of HR ones: `downsample`, `digital_zoom`, `jpeg`, or `none` where a
-    camera took them."""
+    """How LR views were made of HR ones, a key of `xrgs.capture.degradations.DEGRADATIONS`, or
+    `none` where a camera took them."""
 
     @property
     def view_pixels(self) -> int:
@@ -195,4 +197,6 @@ def _load_view(view: View, viewmat: NDArray[np.float64], *, hide: bool) -> Loade
     if hide:
         pixels = masks.filled(pixels, mask)
     used = None if mask is None else torch.from_numpy(mask)
-    return LoadedView(view.name, view.tag, camera, torch.from_numpy(pixels), view.rho, used)
+    return LoadedView(
+        view.name, view.tag, camera, torch.from_numpy(pixels), view.rho, used, view.need
+    )

@@ -18,6 +18,7 @@ import numpy as np
 
 from xrgs.capture import images, poses, registration, sampling, triangulation
 from xrgs.capture.alignment import pose_error
+from xrgs.capture.blur import blur_notes, lr_blur
 from xrgs.capture.degradations import resolve_degradation
 from xrgs.capture.lens import Lens
 from xrgs.capture.photographs import PhotoCollection, prepare_hr_views, write_degraded
@@ -44,6 +45,8 @@ if TYPE_CHECKING:
 #: How much finer HR views must sample the scene than LR views for the two to be called so, in their
 #: medians; our choice. The paper has 5.
 _LEAST_RATIO = 1.25
+#: Views are compared at no more points than this, so that a thousand views take little memory.
+_MOST_COMPARED = 10_000
 
 
 @dataclass(frozen=True)
@@ -93,9 +96,11 @@ def mix_resolutions(scene: Scene, conf: VariantConf, work: Path, out: Path) -> V
         inputs = replace(inputs, split=_split_by_depth(photos, conf, model, depths))
     write_degraded(photos, inputs.degraded, conf)
     views, hidden = _write_undistorted(inputs, model, depths, out)
+    views = _with_needs(inputs, views, model.points)
     tags, masked = _tags_report(inputs, views), _mask_report(views)
-    notes = [*report["notes"], *tags["notes"], *hidden, *masked["notes"]]
-    report |= tags | masked | {"notes": notes}
+    blur = lr_blur(views)
+    notes = [*report["notes"], *tags["notes"], *hidden, *masked["notes"], *blur_notes(blur)]
+    report |= tags | masked | {"lr_blur": blur, "notes": notes}
     report["seconds"] = round(time.perf_counter() - start, 1)
     held_out = bool(inputs.split.test)
     return Variant(
@@ -253,7 +258,11 @@ def _tags_report(inputs: _Inputs, views: tuple[View, ...]) -> dict[str, Any]:
         for tag in ("HR", "LR")
     }
     return {
-        "notes": [*split_notes(split, inputs.conf), *_class_notes(inputs, rates)],
+        "notes": [
+            *split_notes(split, inputs.conf),
+            *_class_notes(inputs, rates),
+            *_need_notes(inputs, views),
+        ],
         "tags": inputs.conf.tags,
         "degradation": resolve_degradation(inputs.conf),
         "tests": len(split.test),
@@ -279,6 +288,39 @@ def _class_notes(inputs: _Inputs, rates: Mapping[str, list[float]]) -> list[str]
         f"the split by variant.tags={inputs.conf.tags} is meaningless: rho is {min(both):.3f} to "
         f"{max(both):.3f}, and its median in HR views {ratio:.2f} times that in LR views, so that "
         "all show the scene at about one resolution; variant.tags=flag makes a mixture"
+    ]
+
+
+def _with_needs(
+    inputs: _Inputs, views: tuple[View, ...], points: sampling.Array
+) -> tuple[View, ...]:
+    """Return the views with the factors by which they need more px (`View.need`)."""
+    zooms = resolve_degradation(inputs.conf) == "digital_zoom"
+    points = points[:: math.ceil(len(points) / _MOST_COMPARED)]
+    rates = []
+    for view in views:
+        size = (view.width, view.height)
+        used = None if view.mask is None else images.read_mask(view.mask, size)
+        at_points = sampling.point_rates(points, view.viewmat, view.K, size, used)
+        degraded = view.split == "train" and view.tag == "LR"
+        # A digital zoom resolves fewer px than it has.
+        rates.append(at_points / inputs.conf.factor if zooms and degraded else at_points)
+    trained = np.array([view.split == "train" for view in views])
+    needs = sampling.needed_factors(np.stack(rates), trained)
+    return tuple(replace(view, need=need) for view, need in zip(views, needs, strict=True))
+
+
+def _need_notes(inputs: _Inputs, views: tuple[View, ...]) -> list[str]:
+    """Say which training views are supersampled, where they are not the degraded ones."""
+    training = [view for view in views if view.split == "train"]
+    larger = [round(view.need) > 1 for view in training]
+    if inputs.degraded and larger == [view.tag == "LR" for view in training]:
+        return []
+    largest = max(view.need for view in training)
+    which = f"{sum(larger)} of {len(training)}" if any(larger) else "none"
+    return [
+        f"sampling rates of training views differ by {largest:.1f} where they show the same points:"
+        f" components.supersampled, where it is on, renders {which} of the views larger"
     ]
 
 

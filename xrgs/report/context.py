@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import pandas as pd
 
+from xrgs.capture.degradations import DEGRADATIONS, resolve_degradation
 from xrgs.report.inference import OTHER_CODE
 from xrgs.report.writing import signed
 from xrgs.runtime.text import listed
@@ -126,11 +127,14 @@ def _mixture(variant: VariantConf) -> str:
     chosen = variant.tags == "flag"  # and not by what the photographs are
     if chosen and variant.hr_fraction == 1:
         return _ALL_HR
-    if variant.degradation == "downsample" or (chosen and variant.degradation == "auto"):
-        return f"LR views {_shown(variant.factor)} times smaller"
-    if variant.degradation in ("auto", "none"):
+    degradation = resolve_degradation(variant)
+    if degradation == "none":
         return f"LR by {_shown(variant.tags)} (nothing degraded)"
-    return f"LR views by {_shown(variant.degradation)}"
+    way = f"by {_shown(degradation)}"
+    if degradation not in DEGRADATIONS or not DEGRADATIONS[degradation].smaller:
+        return f"LR views {way}"
+    smaller = f"LR views {_shown(variant.factor)} times smaller"
+    return smaller if degradation == "downsample" else f"{smaller}, {way}"
 
 
 def _prune_rule(configs: Iterable[tuple[str, Conf | None]]) -> list[str]:

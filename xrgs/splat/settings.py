@@ -108,13 +108,15 @@ class DensifySettings:
     """When Gaussians are grown, pruned and reset (gsplat's `DefaultStrategy`).
 
     A step that is a multiple of `every`, above `start` and below `stop` refines; one that is a
-    multiple of `reset_every`, above 0 and below `stop`, resets opacities.
+    multiple of `reset_every`, above 0 and below `stop`, resets opacities if `resets` is true.
     """
 
     start: int = 500
     stop: int = 15_000
     every: int = 100
     reset_every: int = 3_000
+    resets: bool = off_by_default(True)
+    """Whether opacities are reset; gsplat 1.5.3 never does (`xrgs.splat.strategy.default`)."""
     grow_grad2d: float = 2e-4
     """A Gaussian grows if the mean norm of its image-plane gradient (normalised device units) is
     above this."""

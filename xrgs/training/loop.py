@@ -192,6 +192,7 @@ def _run_steps(run: _Run, checkpoint: Checkpoint, evaluate: Evaluate | None) -> 
             recorder.record_skipped("backward")
         recorder.record_step(step, forward.loss, forward.render, gaussians, forward.sh_degree)
         recorder.record_refinement(_densify(run, step, forward))
+        components.after_step(gaussians, step)
         # Evaluation and checkpoints do not count as training time.
         if evaluate is not None and run.evaluates_after(step.number):
             recorder.record_scores(step.number + 1, len(gaussians), run.score(evaluate))
@@ -301,7 +302,9 @@ def _set_up(data: Dataset, conf: Conf, extra_components: Iterable[Component]) ->
         optimizer=optimizer,
         components=components,
         strategy=strategy,
-        sampler=EpochSampler(data.train, conf.seed, steps, components.allows_view),
+        sampler=EpochSampler(
+            data.train, conf.seed, steps, components.allows_view, conf.train.hr_share
+        ),
         recorder=recorder,
         renderer=StepRenderer(components, splat.raster, sh_every, backend, recorder),
         memory=TrainingMemory(optimizer, strategy, components, views, data),

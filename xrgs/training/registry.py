@@ -42,6 +42,7 @@ BUILT_IN: Mapping[str, ComponentEntry] = {
         helpers=("texture",),
     ),
     "gradient_scaling": ComponentEntry("gradient_scaling", "GradientScaling"),
+    "floaters": ComponentEntry("floaters", "Floaters"),
     "densify": ComponentEntry("densify", "Densify"),
     "curriculum": ComponentEntry("curriculum", "Curriculum"),
     "mip": ComponentEntry("mip", "Mip"),

@@ -61,6 +61,7 @@ class Theirs:
             refine_every=config.every,
         )
         self.state = self.strategy.initialize_state(SCENE_SCALE)
+        self.resets = config.resets
         # It draws from torch's global generator, whose state is ours between its calls.
         self.random = torch.Generator().manual_seed(seed).get_state()
 
@@ -69,7 +70,7 @@ class Theirs:
             self.params[name].grad = gradients[name].clone()
             optimizer.step()
 
-    def densify(self, step: int, view: View, *, with_reset: bool = True) -> None:
+    def densify(self, step: int, view: View) -> None:
         width, height = SIZES[view.group]
         info: dict[str, Any] = {
             "width": width,
@@ -87,6 +88,7 @@ class Theirs:
             self.random = torch.get_rng_state()
         # 1.5.3's own never happens; this is the condition that its pull request 776 restores.
         strategy = self.strategy
-        if with_reset and 0 < step < strategy.refine_stop_iter and step % strategy.reset_every == 0:
+        is_due = 0 < step < strategy.refine_stop_iter and step % strategy.reset_every == 0
+        if self.resets and is_due:
             value = strategy.prune_opa * 2.0
             reset_opa(self.params, self.optimizers, self.state, value)

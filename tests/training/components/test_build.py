@@ -24,6 +24,7 @@ from xrgs.training.components.consistency import Consistency
 from xrgs.training.components.curriculum import Curriculum
 from xrgs.training.components.densify import Densify
 from xrgs.training.components.exposure import Exposure
+from xrgs.training.components.floaters import Floaters
 from xrgs.training.components.gradient_scaling import GradientScaling
 from xrgs.training.components.mip import Mip
 from xrgs.training.components.natural_selection import NaturalSelection
@@ -55,13 +56,16 @@ ON: dict[str, tuple[Any, type[Component]]] = {
     "error_score.of": ("edges", ErrorScore),
     "natural_selection.budget": (0.5, NaturalSelection),
     "exposure.mode": ("gain", Exposure),
+    "floaters.near_share": (0.5, Floaters),
+    "floaters.gradient_share": (0.5, Floaters),
     "continuous_weighting.gamma": (1.0, Weighting),
 }
 #: Keys that `off` declares too, with another value: they build no component by themselves. The
-#: first changes a weight that another key switches on, as do those of `ATTENUATIONS`, which are
-#: refused without one; the last is read by `xrgs.training.count_matching`.
+#: first two change what another key switches on, as do those of `ATTENUATIONS`, which are refused
+#: without one; the last is read by `xrgs.training.count_matching`.
 OTHERS: dict[str, Any] = {
     "loss_weighting.stat_from": "unweighted",
+    "mip.until": 20_000,
     "count_matched.gaussians": 100,
 }
 ATTENUATIONS: dict[str, Any] = {
@@ -260,6 +264,8 @@ def test_what_is_imported(module: str, unused: set[str]) -> None:
         ("continuous_weighting.gamma", -0.43),
         ("mip.variance", -0.2),
         ("mip.every", 0),
+        ("mip.until", 0),
+        ("mip.until", 30_001),
         ("multiview_score.views", -1),
         ("multiview_score.error", -0.1),
         ("multiview_score.error", 1.0),
@@ -270,6 +276,8 @@ def test_what_is_imported(module: str, unused: set[str]) -> None:
         ("natural_selection.budget", float("nan")),
         ("natural_selection.until", 16_000),
         ("natural_selection.until", 30_001),
+        ("floaters.near_share", -0.5),
+        ("floaters.gradient_share", float("inf")),
         ("skip_backward.share", -0.1),
         ("skip_backward.share", 1.1),
         ("skip_backward.decay", 1.0),

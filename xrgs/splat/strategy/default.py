@@ -2,8 +2,8 @@
 
 Given the same inputs, the results are those of `DefaultStrategy` of gsplat [ye2025] 1.5.3, with two
 exceptions. Opacities are reset; gsplat 1.5.3 means to, but its `step % reset_every == 0 & step > 0`
-compares with `0 & step`, which pull request 776 mends. And a split draws its random numbers in
-double.
+compares with `0 & step`, which pull request 776 mends. With `DensifySettings.resets` of False there
+are no resets, as in 1.5.3. And a split draws its random numbers in double.
 
 On the native backend the results do not depend on the number of threads or on the processor.
 """
@@ -52,7 +52,7 @@ class DefaultStrategy(Strategy):
     - Then it prunes Gaussians with an opacity below `prune_opacity` and, after step `reset_every`,
       those with a scale above `prune_scale3d * scene_scale`.
     - At the steps above 0 and below `stop` that `reset_every` divides, it caps opacities at
-      `reset_opacity * prune_opacity`.
+      `reset_opacity * prune_opacity`, unless `resets` is False.
 
     gsplat has no counterpart of three options:
 
@@ -136,7 +136,7 @@ class DefaultStrategy(Strategy):
         refinement = Refinement()
         if step > settings.start and step % settings.every == 0:
             refinement = self._refine(step, self._deciding_thresholds(group), hooks)
-        if step > 0 and step % settings.reset_every == 0:
+        if settings.resets and step > 0 and step % settings.reset_every == 0:
             refinement = replace(refinement, reset=self._reset_opacities(hooks))
         return refinement
 

@@ -125,6 +125,11 @@ class Components(tuple[Component, ...]):
         """Which Gaussians [N] any component removes; None where all of them stay."""
         return _combined(operator.or_, (c.to_prune(gaussians, step) for c in self))
 
+    def after_step(self, gaussians: Gaussians, step: Step) -> None:
+        """Call `Component.after_step` of each component in turn."""
+        for component in self:
+            component.after_step(gaussians, step)
+
     def opacity_attenuation(self, gaussians: Gaussians) -> Tensor | None:
         """The product [N] of the components' attenuations; None where none has any."""
         return _combined(operator.mul, (c.opacity_attenuation(gaussians) for c in self))
