@@ -102,8 +102,10 @@ class SplatConf:
     raster: RasterSettings
     optimizer: OptimizerSettings
     densify: DensifySettings
+    strategy: str = off("default")
     sh_every: int
     init_opacity: float
+    init_scale: float = off(1.0)
     ssim_weight: float
     backend: str
 
@@ -285,6 +287,14 @@ class FloatersConf:
 
 
 @dataclass(kw_only=True)
+class RegularizationConf:
+    """Penalties on opacities and scales (3DGS-MCMC); not in the paper."""
+
+    opacity: float = off(0.0)
+    scale: float = off(0.0)
+
+
+@dataclass(kw_only=True)
 class CountMatchedConf:
     """A cell with as many Gaussians as another one (`xrgs.training.count_matching`)."""
 
@@ -316,6 +326,7 @@ class ComponentsConf:
     natural_selection: NaturalSelectionConf
     exposure: ExposureConf
     floaters: FloatersConf
+    regularization: RegularizationConf
     count_matched: CountMatchedConf
     # `off` declares no default, so that instances share no dict.
     plugins: dict[str, Any] = off({})  # noqa: RUF009

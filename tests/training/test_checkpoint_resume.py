@@ -48,6 +48,7 @@ CASES = {
     "multiview_score": ["+ablation=multiview_score"],
     "formation": ["+ablation=formation"],
     "exposure": ["+ablation=exposure"],
+    "mcmc": ["+ablation=mcmc", "splat.densify.budget=0.03"],
     "floaters": ["+ablation=[near_limit,near_gradients]", "components.floaters.near_share=1"],
     "natural_selection": [
         "+ablation=natural_selection",

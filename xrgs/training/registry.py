@@ -27,7 +27,8 @@ class ComponentEntry:
 
 
 #: In the order in which hooks run. `loss_weighting` comes after `consistency`, since the weight of
-#: a view multiplies its consistency loss as well.
+#: a view multiplies its consistency loss as well, and before `regularization`, whose penalties have
+#: no weight of a view.
 BUILT_IN: Mapping[str, ComponentEntry] = {
     "consistency": ComponentEntry("consistency", "Consistency"),
     "loss_weighting": ComponentEntry(
@@ -56,6 +57,7 @@ BUILT_IN: Mapping[str, ComponentEntry] = {
     "error_score": ComponentEntry("view_scores", "ErrorScore"),
     "natural_selection": ComponentEntry("natural_selection", "NaturalSelection"),
     "exposure": ComponentEntry("exposure", "Exposure", helpers=("adam",)),
+    "regularization": ComponentEntry("regularization", "Regularization"),
 }
 
 
