@@ -170,6 +170,15 @@ class SupersampledConf:
 
 
 @dataclass(kw_only=True)
+class FormationConf:
+    """How LR photographs were made, learned: the width of their blur; not in the paper."""
+
+    widths: str = off("none")
+    lr: float
+    prior: float
+
+
+@dataclass(kw_only=True)
 class ResolutionScheduleConf:
     """HR views at a reduced resolution early in training (DashGaussian); not in the paper."""
 
@@ -303,6 +312,7 @@ class ComponentsConf:
     curriculum: CurriculumConf
     render_scale: RenderScaleConf
     supersampled: SupersampledConf
+    formation: FormationConf
     resolution_schedule: ResolutionScheduleConf
     skip_backward: SkipBackwardConf
     consistency: ConsistencyConf

@@ -52,6 +52,7 @@ ON: dict[str, tuple[Any, type[Component]]] = {
     "mip.variance": (0.2, Mip),
     "supersampled.factor": (2, Supersampled),
     "supersampled.late_factor": (2, Supersampled),
+    "formation.widths": ("tag", Supersampled),
     "resolution_schedule.start_share": (0.5, ResolutionSchedule),
     "skip_backward.share": (0.5, SkipBackward),
     "multiview_score.views": (2, MultiviewScore),
