@@ -102,8 +102,10 @@ class SplatConf:
     raster: RasterSettings
     optimizer: OptimizerSettings
     densify: DensifySettings
+    strategy: str = off("default")
     sh_every: int
     init_opacity: float
+    init_scale: float = off(1.0)
     ssim_weight: float
     backend: str
 
@@ -165,6 +167,15 @@ class SupersampledConf:
     factor: int = off(1)
     late_factor: int = off(1)
     late_from: int
+
+
+@dataclass(kw_only=True)
+class FormationConf:
+    """How LR photographs were made, learned: the width of their blur; not in the paper."""
+
+    widths: str = off("none")
+    lr: float
+    prior: float
 
 
 @dataclass(kw_only=True)
@@ -284,6 +295,14 @@ class FloatersConf:
 
 
 @dataclass(kw_only=True)
+class RegularizationConf:
+    """Penalties on opacities and scales (3DGS-MCMC); not in the paper."""
+
+    opacity: float = off(0.0)
+    scale: float = off(0.0)
+
+
+@dataclass(kw_only=True)
 class CountMatchedConf:
     """A cell with as many Gaussians as another one (`xrgs.training.count_matching`)."""
 
@@ -301,6 +320,7 @@ class ComponentsConf:
     curriculum: CurriculumConf
     render_scale: RenderScaleConf
     supersampled: SupersampledConf
+    formation: FormationConf
     resolution_schedule: ResolutionScheduleConf
     skip_backward: SkipBackwardConf
     consistency: ConsistencyConf
@@ -315,6 +335,7 @@ class ComponentsConf:
     natural_selection: NaturalSelectionConf
     exposure: ExposureConf
     floaters: FloatersConf
+    regularization: RegularizationConf
     count_matched: CountMatchedConf
     # `off` declares no default, so that instances share no dict.
     plugins: dict[str, Any] = off({})  # noqa: RUF009

@@ -47,7 +47,9 @@ CASES = {
     "resolution_schedule": ["+ablation=resolution_schedule"],
     "harmonics_every": ["+ablation=harmonics_every"],
     "multiview_score": ["+ablation=multiview_score"],
+    "formation": ["+ablation=formation"],
     "exposure": ["+ablation=exposure"],
+    "mcmc": ["+ablation=mcmc", "splat.densify.budget=0.03"],
     "floaters": ["+ablation=[near_limit,near_gradients]", "components.floaters.near_share=1"],
     "natural_selection": [
         "+ablation=natural_selection",
