@@ -26,8 +26,8 @@ class ComponentEntry:
     """Further modules of `xrgs.training.components` that the class uses."""
 
 
-#: In the order in which hooks run. The weights of views come after `consistency`, since they multiply
-#: its loss as well, and before `regularization`, whose penalties have no weight of a view.
+#: In the order in which hooks run. The weights of views come after `consistency`, since they
+#: multiply its loss as well, and before `regularization`, whose penalties have no weight of a view.
 BUILT_IN: Mapping[str, ComponentEntry] = {
     "consistency": ComponentEntry("consistency", "Consistency"),
     "loss_weighting": ComponentEntry(
