@@ -170,6 +170,15 @@ class SupersampledConf:
 
 
 @dataclass(kw_only=True)
+class FormationConf:
+    """How LR photographs were made, learned: the width of their blur; not in the paper."""
+
+    widths: str = off("none")
+    lr: float
+    prior: float
+
+
+@dataclass(kw_only=True)
 class ResolutionScheduleConf:
     """HR views at a reduced resolution early in training (DashGaussian); not in the paper."""
 
@@ -223,6 +232,14 @@ class ContinuousWeightingConf:
     """A weight by a view's sampling rate in place of loss weighting's (paper, conclusion)."""
 
     gamma: float = off(0.0)
+
+
+@dataclass(kw_only=True)
+class NoiseWeightingConf:
+    """A weight of an LR view by its own residual; not in the paper."""
+
+    floor: float = off(1.0)
+    begin: int
 
 
 @dataclass(kw_only=True)
@@ -303,6 +320,7 @@ class ComponentsConf:
     curriculum: CurriculumConf
     render_scale: RenderScaleConf
     supersampled: SupersampledConf
+    formation: FormationConf
     resolution_schedule: ResolutionScheduleConf
     skip_backward: SkipBackwardConf
     consistency: ConsistencyConf
@@ -310,6 +328,7 @@ class ComponentsConf:
     region_weighting: RegionWeightingConf
     hybrid_schedule: HybridScheduleConf
     continuous_weighting: ContinuousWeightingConf
+    noise_weighting: NoiseWeightingConf
     mip: MipConf
     multiview_score: MultiviewScoreConf
     error_score: ErrorScoreConf

@@ -30,6 +30,7 @@ from xrgs.training.components.floaters import Floaters
 from xrgs.training.components.gradient_scaling import GradientScaling
 from xrgs.training.components.mip import Mip
 from xrgs.training.components.natural_selection import NaturalSelection
+from xrgs.training.components.noise_weighting import NoiseWeighting
 from xrgs.training.components.regularization import Regularization
 from xrgs.training.components.render_scale import RenderScale
 from xrgs.training.components.resolution_schedule import ResolutionSchedule
@@ -49,9 +50,11 @@ ON: dict[str, tuple[Any, type[Component]]] = {
     "curriculum.lr_only": (5000, Curriculum),
     "render_scale.gamma": (0.25, RenderScale),
     "consistency.weight": (0.1, Consistency),
+    "noise_weighting.floor": (0.25, NoiseWeighting),
     "mip.variance": (0.2, Mip),
     "supersampled.factor": (2, Supersampled),
     "supersampled.late_factor": (2, Supersampled),
+    "formation.widths": ("tag", Supersampled),
     "resolution_schedule.start_share": (0.5, ResolutionSchedule),
     "skip_backward.share": (0.5, SkipBackward),
     "multiview_score.views": (2, MultiviewScore),
@@ -285,6 +288,9 @@ def test_what_is_imported(module: str, unused: set[str]) -> None:
         ("region_weighting.texture", float("nan")),
         ("hybrid_schedule.ramp", -1),
         ("continuous_weighting.gamma", -0.43),
+        ("noise_weighting.floor", -0.1),
+        ("noise_weighting.floor", 1.1),
+        ("noise_weighting.begin", -1),
         ("mip.variance", -0.2),
         ("mip.every", 0),
         ("mip.until", 0),
