@@ -196,6 +196,7 @@ class Sweeps:
     folder: Path
     faults: str = ""
     """Python code that every process of the sweep runs at its start, the cells' included."""
+    started: list[Sweep] = field(default_factory=list)
 
     def start(self, *arguments: str, faults: bool = True) -> Sweep:
         """Start a sweep with these arguments and return at once."""
@@ -215,7 +216,9 @@ class Sweeps:
                 stdout=out,
                 stderr=err,
             )
-        return Sweep(process, printed)
+        # Kept: a process that is forgotten while it runs is a warning in whichever test is next.
+        self.started.append(Sweep(process, printed))
+        return self.started[-1]
 
     def run(self, *arguments: str, faults: bool = True) -> tuple[int, str, str]:
         """Run a sweep to its end; return the exit code, stdout and stderr."""
@@ -249,9 +252,21 @@ class Sweeps:
 
 
 @pytest.fixture(scope="session")
-def sweeps_in() -> Callable[..., Sweeps]:
+def sweeps_in() -> Iterator[Callable[..., Sweeps]]:
     """Return the function (folder, faults) -> `Sweeps` in that folder."""
-    return Sweeps
+    made: list[Sweeps] = []
+
+    def sweeps_in(*arguments: Any) -> Sweeps:
+        made.append(Sweeps(*arguments))
+        return made[-1]
+
+    yield sweeps_in
+    # What a failed test has left running.
+    for sweep in (sweep for sweeps in made for sweep in sweeps.started):
+        sweep.process.kill()
+        sweep.process.wait()
+    for process_id in (process_id for sweeps in made for process_id in sweeps.processes()):
+        os.kill(process_id, signal.SIGKILL)
 
 
 @pytest.fixture(scope="session")

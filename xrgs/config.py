@@ -12,7 +12,7 @@ from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, get_type_hints
 
-from xrgs.splat.settings import DensifySettings, OptimizerSettings, RasterSettings
+from xrgs.splat.settings import NOMINAL_STEPS, DensifySettings, OptimizerSettings, RasterSettings
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping
@@ -66,6 +66,15 @@ class SfmConf:
 
 
 @dataclass(kw_only=True)
+class PhoneConf:
+    """The degradation `phone`; not in the paper."""
+
+    blur: float
+    noise: float
+    jpeg_quality: int
+
+
+@dataclass(kw_only=True)
 class VariantConf:
     """The mixed-resolution dataset that is made of a scene (paper, section 4.1)."""
 
@@ -82,6 +91,7 @@ class VariantConf:
     hr_above: float
     degradation: str
     jpeg_quality: int
+    phone: PhoneConf
     sfm: SfmConf
 
 
@@ -92,8 +102,10 @@ class SplatConf:
     raster: RasterSettings
     optimizer: OptimizerSettings
     densify: DensifySettings
+    strategy: str = off("default")
     sh_every: int
     init_opacity: float
+    init_scale: float = off(1.0)
     ssim_weight: float
     backend: str
 
@@ -106,6 +118,7 @@ class TrainConf:
     views: str
     evaluate_every: int = off(0)
     validation: float = off(0.0)
+    hr_share: float = off(0.0)
 
 
 @dataclass(kw_only=True)
@@ -154,6 +167,15 @@ class SupersampledConf:
     factor: int = off(1)
     late_factor: int = off(1)
     late_from: int
+
+
+@dataclass(kw_only=True)
+class FormationConf:
+    """How LR photographs were made, learned: the width of their blur; not in the paper."""
+
+    widths: str = off("none")
+    lr: float
+    prior: float
 
 
 @dataclass(kw_only=True)
@@ -213,11 +235,20 @@ class ContinuousWeightingConf:
 
 
 @dataclass(kw_only=True)
+class NoiseWeightingConf:
+    """A weight of an LR view by its own residual; not in the paper."""
+
+    floor: float = off(1.0)
+    begin: int
+
+
+@dataclass(kw_only=True)
 class MipConf:
     """Mip-Splatting's 3D smoothing filter; not in the paper."""
 
     variance: float = off(0.0)
     every: int
+    until: int = off(NOMINAL_STEPS)
 
 
 @dataclass(kw_only=True)
@@ -256,6 +287,22 @@ class ExposureConf:
 
 
 @dataclass(kw_only=True)
+class FloatersConf:
+    """Guards against Gaussians in the empty space close to cameras."""
+
+    near_share: float = off(0.0)
+    gradient_share: float = off(0.0)
+
+
+@dataclass(kw_only=True)
+class RegularizationConf:
+    """Penalties on opacities and scales (3DGS-MCMC); not in the paper."""
+
+    opacity: float = off(0.0)
+    scale: float = off(0.0)
+
+
+@dataclass(kw_only=True)
 class CountMatchedConf:
     """A cell with as many Gaussians as another one (`xrgs.training.count_matching`)."""
 
@@ -273,6 +320,7 @@ class ComponentsConf:
     curriculum: CurriculumConf
     render_scale: RenderScaleConf
     supersampled: SupersampledConf
+    formation: FormationConf
     resolution_schedule: ResolutionScheduleConf
     skip_backward: SkipBackwardConf
     consistency: ConsistencyConf
@@ -280,11 +328,14 @@ class ComponentsConf:
     region_weighting: RegionWeightingConf
     hybrid_schedule: HybridScheduleConf
     continuous_weighting: ContinuousWeightingConf
+    noise_weighting: NoiseWeightingConf
     mip: MipConf
     multiview_score: MultiviewScoreConf
     error_score: ErrorScoreConf
     natural_selection: NaturalSelectionConf
     exposure: ExposureConf
+    floaters: FloatersConf
+    regularization: RegularizationConf
     count_matched: CountMatchedConf
     # `off` declares no default, so that instances share no dict.
     plugins: dict[str, Any] = off({})  # noqa: RUF009

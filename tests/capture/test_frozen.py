@@ -111,6 +111,7 @@ def first_view(**changes: Any) -> Edit:
         (first_view(split="else"), r"views\[0\]\.split: Invalid enum value"),
         (first_view(tag="x"), r"views\[0\]\.tag: Invalid enum value"),
         (first_view(rho=0), r"views\[0\]\.rho: Expected `float` > 0"),
+        (first_view(need=0), r"views\[0\]\.need: Expected `float` > 0"),
         (first_view(K=[[1, 2], [3]]), r"views\[0\]\.K\[0\]: Expected `array` of length >= 3"),
         (first_view(mask="images/test-masks/a.png"), "files: they are not the view"),
         (first_view(more=1), r"views\[0\]: Object contains unknown field `more`"),

@@ -17,10 +17,12 @@ import pytest
 from tests.capture.scene_confs import scene_conf
 from xrgs import config
 from xrgs.capture import images, mixing, registration, scenes, sfm
-from xrgs.capture.degradations import resolve_degradation
+from xrgs.capture.degradations import DEGRADATIONS, resolve_degradation
+from xrgs.capture.photographs import prepare_hr_views, write_degraded
 from xrgs.capture.scenes import Scene, procedural
 from xrgs.capture.sfm import Reconstruction, SfmImage
 from xrgs.capture.split import check_variant_conf
+from xrgs.capture.tags import POLICIES
 from xrgs.capture.views import SceneFailed, Variant, View
 from xrgs.config import VariantConf
 from xrgs.errors import XrgsError
@@ -131,10 +133,14 @@ def test_by_sampling_rate_the_highest_are_hr_and_nothing_is_degraded(
 def test_photographs_of_one_resolution_are_said_to_make_no_mixture(mix: Mix) -> None:
     """The embedded scene's cameras are all about as far away: rho differs by 15 % at most."""
     made = mix(tags="sampling_rate")
-    (note,) = made.report["notes"]
+    note, need = made.report["notes"]
     rho = [view.rho for view in made.views if view.split == "train"]
     assert "variant.tags=sampling_rate is meaningless" in note
     assert f"rho is {min(rho):.3f} to {max(rho):.3f}" in note
+    assert need == (
+        "sampling rates of training views differ by 1.1 where they show the same points:"
+        " components.supersampled, where it is on, renders none of the views larger"
+    )
 
 
 def test_a_threshold_of_the_rate_takes_those_above_it(mix: Mix) -> None:
@@ -168,6 +174,8 @@ def test_by_megapixels_the_larger_photographs_are_hr(
     assert all((v.width, v.height) == (80, 60) for v in of(made, "train", "LR"))
     assert not of(made, "original", "HR")
     assert made.report["rho"]["LR"][1] == pytest.approx(0.5, abs=0.1)
+    assert round(min(view.need for view in of(made, "train", "LR"))) == 2
+    assert made.report["notes"][-1].endswith("renders 6 of 9 of the views larger")
     for view in of(made, "test", "HR"):  # at its own full size
         assert (view.width, view.height) == ((160, 120) if number(view) % 3 == 0 else (80, 60))
 
@@ -204,6 +212,8 @@ def test_each_degraded_view_has_its_original_from_the_same_pose(mix: Mix) -> Non
         assert np.array_equal(high.viewmat, view.viewmat)
         assert (high.width, high.height) == (160, 120) == (view.width * 5, view.height * 5)
         assert high.K[:2] == pytest.approx(view.K[:2] * 5)
+        assert view.need == pytest.approx(5 * high.need, rel=0.01)
+        assert high.need == pytest.approx(1, rel=0.2)
         shrunk = images.resize(images.read(high.file), view.width, view.height)
         # The lens is nearly a pinhole, so that undistortion and downsampling commute.
         assert np.abs(shrunk - images.read(view.file)).mean() < 0.01
@@ -218,8 +228,58 @@ def test_a_degradation_may_keep_the_size(mix: Mix, given: list[list[str]], how: 
         before, after = images.read(originals[view.name].file), images.read(view.file)
         assert 0.005 < np.abs(before - after).mean() < 0.1
         assert view.rho == originals[view.name].rho  # px per unit; not what is in them
+        resolved = {"jpeg": 1, "digital_zoom": 5}[how]
+        assert view.need == pytest.approx(resolved * originals[view.name].need)
     low = {number(v) for v in of(made, "train", "LR")}
     assert given[0] == [f"{'sfm_lr' if i in low else 'sfm'}/{i:05d}.png" for i in range(VIEWS)]
+
+
+@pytest.mark.parametrize("how", ["box", "lanczos", "phone"])
+def test_lr_views_of_other_kernels_are_smaller(mix: Mix, given: list[list[str]], how: str) -> None:
+    made = mix(degradation=how, hr_fraction=0.5)
+    low = of(made, "train", "LR")
+    originals = {v.name: v for v in of(made, "original", "HR")}
+    assert {v.name for v in low} == originals.keys()
+    for view in low:
+        assert (view.width, view.height) == (32, 24)
+        assert view.rho == pytest.approx(originals[view.name].rho / 5)
+        high = images.read(originals[view.name].file)
+        assert 0 < np.abs(images.resize(high, 32, 24) - images.read(view.file)).mean() < 0.1
+    numbers = {number(v) for v in low}
+    expected = [f"{'sfm_lr_up' if i in numbers else 'sfm'}/{i:05d}.png" for i in range(VIEWS)]
+    assert given[0] == expected
+
+
+@pytest.mark.parametrize(("degradation", "said"), [("auto", True), ("digital_zoom", False)])
+def test_the_blur_of_lr_views_is_in_the_report_and_said(
+    mix: Mix, monkeypatch: pytest.MonkeyPatch, degradation: str, *, said: bool
+) -> None:
+    """A view that was zoomed on purpose is blurry on purpose."""
+    monkeypatch.setattr(mixing, "lr_blur", lambda _: 0.87)
+    made = mix(hr_fraction=0.5, degradation=degradation)
+    assert made.report["lr_blur"] == 0.87
+    if not said:
+        assert made.report["notes"] == []
+        return
+    (note,) = made.report["notes"]
+    assert note.startswith("LR photographs are blurrier than their pixels: by a Gaussian of 0.87")
+
+
+def test_noise_depends_on_a_views_name_and_on_the_seed_alone(
+    rendered: Scene, configured: Make, tmp_path: Path
+) -> None:
+    """In another order, and beside other views, a view has the same bytes."""
+    conf = configured(degradation="phone", factor=2)
+    photos = prepare_hr_views(rendered, conf, tmp_path)
+
+    def written(which: Sequence[int], **changes: Any) -> dict[int, bytes]:
+        write_degraded(photos, which, replace(conf, **changes))
+        return {i: (photos.folder / photos.file("lr", i)).read_bytes() for i in which}
+
+    first = written([0, 1, 2])
+    assert len(set(first.values())) == 3
+    assert written([2, 0]) == {i: first[i] for i in (0, 2)}
+    assert written([0], seed=1)[0] != first[0]
 
 
 def test_views_tagged_after_sfm_can_be_degraded_after_it(mix: Mix, given: list[list[str]]) -> None:
@@ -357,10 +417,13 @@ def test_a_failed_scene_says_who_is_missing_why_and_what_to_try(
 @pytest.mark.parametrize(
     ("name", "tags", "degradation"),
     [
+        ("box", "flag", "box"),
         ("digital_zoom", "flag", "digital_zoom"),
         ("distance", "distance", "none"),
         ("jpeg", "flag", "jpeg"),
+        ("lanczos", "flag", "lanczos"),
         ("megapixels", "megapixels", "none"),
+        ("phone", "flag", "phone"),
         ("sampling_rate", "sampling_rate", "none"),
         ("", "flag", "downsample"),
     ],
@@ -371,8 +434,11 @@ def test_every_variant_in_conf_is_valid(
     conf = compose(*([f"variant={name}"] if name else [])).variant
     check_variant_conf(conf)
     assert (conf.tags, resolve_degradation(conf)) == (tags, degradation)
+
+
+def test_every_tag_and_degradation_has_a_variant_in_conf() -> None:
     files = {file.stem for file in (config.CONF_DIR / "variant").iterdir()}
-    assert files == {"digital_zoom", "distance", "jpeg", "megapixels", "sampling_rate"}
+    assert files == POLICIES.keys() | DEGRADATIONS.keys() - {"downsample"}  # the default
 
 
 # what the user gives

@@ -121,3 +121,63 @@ def test_each_view_has_the_depth_of_the_points_that_it_observes() -> None:
         dict.fromkeys(poses, LENS), poses, points, np.zeros((56, 3), np.uint8), observed, {}
     )
     assert sampling.median_depths(model) == {0: 4, 3: 6}
+
+
+def rates_of(*cameras: tuple[float, float], points: np.ndarray) -> np.ndarray:
+    """Rates [V, P] of views along the z axis, by (focal length, z of the camera)."""
+    rates = []
+    for focal, place in cameras:
+        viewmat = np.eye(4)
+        viewmat[2, 3] = -place
+        rates.append(sampling.point_rates(points, viewmat, K_of(focal, focal), (100, 80)))
+    return np.stack(rates)
+
+
+def test_the_rate_at_a_point_is_focal_length_over_its_depth() -> None:
+    """An anisotropic camera has the geometric mean of its focal lengths."""
+    points = column(2, 5, -1)
+    moved = np.eye(4)
+    moved[2, 3] = 3
+    rates = sampling.point_rates(points, moved, K_of(40, 90), (100, 80))
+    assert rates.tolist() == pytest.approx([60 / 5, 60 / 8, 60 / 2])
+    assert sampling.point_rates(points, np.eye(4), K_of(40, 90), (100, 80))[2] == 0
+
+
+def test_a_view_sees_what_is_inside_its_image_and_its_mask() -> None:
+    """At depth 1 the 100 x 80 px of 90 px focal length show 5/9 and 4/9 to each side."""
+    points = np.array([[-0.55, 0, 1], [0.55, 0, 1], [0, 0.44, 1], [0.56, 0, 1], [0, -0.45, 1]])
+    seen = sampling.point_rates(points, np.eye(4), LENS.K, (100, 80)) > 0
+    assert seen.tolist() == [True, True, True, False, False]
+    used = np.ones((80, 100), dtype=bool)
+    used[40, 0] = False  # the pixel of the first point
+    seen = sampling.point_rates(points, np.eye(4), LENS.K, (100, 80), used) > 0
+    assert seen.tolist() == [False, True, True, False, False]
+
+
+def test_a_view_needs_the_ratio_of_the_rates_at_the_points_that_it_shares() -> None:
+    """Of a plane at depth 4: 100 px are 25 px per unit, 300 px are 75, and from depth 2 are 150."""
+    plane = np.array([[x, y, 4.0] for x in (-0.1, 0, 0.1) for y in (-0.1, 0, 0.1)])
+    rates = rates_of((100, 0), (300, 0), (300, 2), points=plane)
+    trained = np.ones(3, dtype=bool)
+    assert sampling.needed_factors(rates, trained) == pytest.approx([6, 2, 1])
+    # Test views are measured against training views, and are no reason for more px.
+    assert sampling.needed_factors(rates, np.array([True, True, False])) == pytest.approx(
+        [3, 1, 0.5]
+    )
+
+
+def test_a_view_that_alone_sees_its_points_needs_nothing_whatever_its_rate() -> None:
+    """Global rates differ by 10, but no point is seen by both views; rho alone can't tell."""
+    apart = np.array([[10.0, 10.0, 0, 0], [0, 0, 1.0, 1.0]])
+    assert sampling.needed_factors(apart, np.ones(2, dtype=bool)) == [1, 1]
+    # Two thirds of the coarse view's points are shown ten times as finely.
+    shared = np.array([[10.0, 10.0, 0.0], [1.0, 1.0, 1.0]])
+    assert sampling.needed_factors(shared, np.ones(2, dtype=bool)) == [1, 10]
+    unseen = np.array([[10.0, 10.0], [0.0, 0.0]])
+    assert sampling.needed_factors(unseen, np.ones(2, dtype=bool)) == [1, 1]
+
+
+@pytest.mark.parametrize(("fine", "need"), [(0, 1), (1, 1), (3, 1), (4, 8), (12, 8)])
+def test_a_tenth_of_the_views_makes_the_finest_rate(fine: int, need: float) -> None:
+    rates = np.array([8.0] * fine + [1.0] * (40 - fine))[:, None] * np.ones(5)
+    assert sampling.needed_factors(rates, np.ones(40, dtype=bool))[-1] == need

@@ -2,12 +2,14 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import partial
+from math import nan
 from typing import Any
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from xrgs.capture.degradations import DEGRADATIONS
 from xrgs.capture.split import (
     check_test_names,
     check_variant_conf,
@@ -15,7 +17,7 @@ from xrgs.capture.split import (
     shrink_factor,
     split_views,
 )
-from xrgs.config import VariantConf
+from xrgs.config import PhoneConf, VariantConf
 from xrgs.errors import XrgsError
 from xrgs.splat.ssim import WINDOW
 
@@ -178,6 +180,10 @@ def test_a_factor_too_large_for_the_ssim_window_is_named(configured: Make) -> No
         ({"degradation": "blur"}, "variant.degradation=blur"),
         ({"jpeg_quality": 0}, "variant.jpeg_quality=0"),
         ({"jpeg_quality": 96}, "variant.jpeg_quality=96"),
+        ({"phone": PhoneConf(blur=-0.1, noise=0, jpeg_quality=75)}, "variant.phone.blur=-0.1"),
+        ({"phone": PhoneConf(blur=nan, noise=0, jpeg_quality=75)}, "variant.phone.blur=nan"),
+        ({"phone": PhoneConf(blur=0, noise=256, jpeg_quality=75)}, "variant.phone.noise=256"),
+        ({"phone": PhoneConf(blur=0, noise=0, jpeg_quality=0)}, "variant.phone.jpeg_quality=0"),
         ({"sfm": {"camera": "both"}}, "variant.sfm.camera=both"),
         ({"sfm": {"first_octave": -2}}, "variant.sfm.first_octave=-2"),
         ({"sfm": {"min_inliers": 5}}, "variant.sfm.min_inliers=5"),
@@ -210,7 +216,9 @@ def test_an_invalid_config_is_refused_by_its_key(
         {"tags": "megapixels", "hr_above": 0.5},
         {"tags": "distance", "hr_above": 1.0},
         {"tags": "sampling_rate"},
-        *({"degradation": d} for d in ("auto", "none", "downsample", "digital_zoom", "jpeg")),
+        *({"degradation": d} for d in ("auto", "none", *DEGRADATIONS)),
+        {"phone": PhoneConf(blur=0, noise=0, jpeg_quality=1)},
+        {"phone": PhoneConf(blur=10, noise=255, jpeg_quality=95)},
         {"jpeg_quality": 1},
         {"jpeg_quality": 95},
         {"sfm": {"lr_images": "upsampled"}},

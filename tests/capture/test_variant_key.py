@@ -7,8 +7,9 @@ import shutil
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
+import numpy as np
 import pytest
 
 from tests.capture.scene_confs import scene_conf
@@ -26,6 +27,9 @@ CHANGES = {
     "downsample": {"degradation": "downsample"},
     "jpeg": {"degradation": "jpeg"},
     "digital_zoom": {"degradation": "digital_zoom"},
+    "box": {"degradation": "box"},
+    "lanczos": {"degradation": "lanczos"},
+    "phone": {"degradation": "phone"},
     "megapixels": {"tags": "megapixels", "degradation": "none"},
     "distance": {"tags": "distance", "degradation": "none"},
     "sampling_rate": {"tags": "sampling_rate", "degradation": "none"},
@@ -68,9 +72,10 @@ def imported_modules(file: Path) -> set[str]:
 
 
 def test_the_code_of_a_key_is_all_that_making_a_variant_imports(configured: Make) -> None:
-    """Scenes have fingerprints, registries decide no number, nor do reports of failed scenes."""
+    """Scenes have fingerprints; registries, notes and reports of failed scenes decide no image."""
     not_covered = {
         "capture/__init__.py",
+        "capture/blur.py",
         "capture/degradations/__init__.py",
         "capture/folders.py",
         "capture/tags/__init__.py",
@@ -141,12 +146,12 @@ def test_what_is_added_changes_no_key(
     """A scene kind, a degradation and a policy: a file and a line each, and they can be used."""
     before = keys()
 
-    def blur(high: ImageArray, conf: VariantConf) -> ImageArray:
+    def blur(high: ImageArray, conf: VariantConf, rng: np.random.Generator) -> ImageArray:
         return high
 
     (package / "capture/degradations/blur.py").write_text("def blur(): ...")
     (package / "capture/tags/age.py").write_text("class Age: ...")
-    monkeypatch.setitem(degradations.DEGRADATIONS, "blur", blur)
+    monkeypatch.setitem(degradations.DEGRADATIONS, "blur", degradations.Degradation(blur))
     monkeypatch.setitem(tags.POLICIES, "age", tags.POLICIES["megapixels"])
     monkeypatch.setitem(scenes.KINDS, "another", scenes.KINDS["motorcycle"])
     assert keys() == before
@@ -157,6 +162,23 @@ def test_what_is_added_changes_no_key(
     }
     assert len(added) == 3
     assert not added & set(before.values())
+
+
+def test_settings_of_a_degradation_are_in_the_keys_that_use_it(configured: Make) -> None:
+    phone = configured().phone
+    changes: dict[str, dict[str, Any]] = {
+        "jpeg": {"jpeg_quality": 11},
+        "phone": {"phone": replace(phone, blur=1.0)},
+    }
+    for used, change in changes.items():
+        for name in degradations.DEGRADATIONS:
+            before, after = (
+                variant.key(SCENE, configured(degradation=name, **more)) for more in ({}, change)
+            )
+            assert (before != after) == (name == used)
+    for other in (replace(phone, noise=0.0), replace(phone, jpeg_quality=90)):
+        changed = configured(degradation="phone", phone=other)
+        assert variant.key(SCENE, changed) != variant.key(SCENE, configured(degradation="phone"))
 
 
 def test_automatic_and_named_degradations_are_one_variant(configured: Make) -> None:

@@ -164,7 +164,7 @@ def test_an_error_of_hydra_is_one_line_with_a_hint(kind: type[Exception]) -> Non
     ("words", "message"),
     [
         (["scene=fern"], "scene=fern: there is no such choice; did you mean llff/fern?"),
-        (["scene=q"], "choose from: captures/ollie"),
+        (["scene=q"], "choose from: captures/bonsai, captures/monstree, captures/ollie"),
         (["steps=100"], "steps: there is no such key; did you mean train.steps"),
         (["+steps=100"], "steps: there is no such key; did you mean train.steps"),
         (["+train.stesp=4"], "train.stesp: there is no such key; did you mean train.steps?"),

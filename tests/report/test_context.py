@@ -42,10 +42,12 @@ def test_what_differs_among_cells_is_listed(made: Any) -> None:
     configured(made.add())
     other = {"densify": {"prune_scale3d": 10.0}}
     configured(made.add("keep_large"), splat=other)
+    configured(made.add("mcmc"), splat={"strategy": "mcmc"})
     configured(made.add(scene="leaves"), train={"steps": 500})
     text = found(made)[""].of_scores
     assert "3,000 or 500 steps" in text
     assert "0.1 (baseline), 10 (keep_large) times the scene's scale" in text
+    assert "are pruned, and none for their size in mcmc" in text
     assert "2 test views a scene" in text
 
 
@@ -106,6 +108,22 @@ def test_scenes_whose_lr_views_differ_are_both_said(made: Any) -> None:
     configured(made.add(scene="leaves"), variant={"tags": "sampling_rate", "factor": 2})
     text = found(made)[""].of_scores
     assert "LR views 5 times smaller or LR by sampling_rate (nothing degraded)" in text
+
+
+@pytest.mark.parametrize(
+    ("variant", "said"),
+    [
+        ({"degradation": "downsample", "factor": 3}, "LR views 3 times smaller;"),
+        ({"degradation": "phone"}, "LR views 5 times smaller, by phone;"),
+        ({"degradation": "box", "tags": "distance"}, "LR views 5 times smaller, by box;"),
+        ({"degradation": "jpeg"}, "LR views by jpeg;"),
+        ({"degradation": "digital_zoom"}, "LR views by digital_zoom;"),
+        ({"degradation": "of another version"}, "LR views by of another version;"),
+    ],
+)
+def test_how_lr_views_were_made_is_said(made: Any, variant: dict[str, Any], said: str) -> None:
+    configured(made.add(), variant=variant)
+    assert said in found(made)[""].of_scores
 
 
 def test_a_sweep_without_lr_views_names_none(made: Any) -> None:

@@ -79,7 +79,7 @@ def past(cells: Any, monkeypatch: pytest.MonkeyPatch) -> Past:
     made = Past(cells, {"v": 300, "large": 600})
     made.conf = made.train(steps=100)
 
-    def sizes(_: Path, variant: str, __: str) -> estimate._Sizes:
+    def sizes(_: Path, variant: str, *__: Any) -> estimate._Sizes:
         if variant not in made.sides:
             raise StoreError("damaged")
         return estimate._Sizes(made.sides[variant] ** 2, made.sides[variant] ** 2, HELD[variant])
@@ -157,12 +157,24 @@ def test_damaged_cells_are_left_out(past: Past, spoilt: str) -> None:
 
 
 @pytest.mark.parametrize(
-    ("views", "pixels"),
-    [("mixed", 1000 * (10 + 40) / 2), ("hr_only", 40_000), ("lr_only", 10_000), ("all_hr", 40_000)],
+    ("views", "hr_share", "pixels"),
+    [
+        ("mixed", 0, 1000 * (10 + 40) / 2),
+        ("mixed", 0.8, 1000 * (0.2 * 10 + 0.8 * 40)),
+        ("hr_only", 0, 40_000),
+        ("lr_only", 0, 10_000),
+        ("lr_only", 0.8, 10_000),
+        ("all_hr", 0, 40_000),
+    ],
 )
 @pytest.mark.parametrize("kept", [500_000, 1 << 28])
 def test_the_sizes_are_those_of_the_views_that_are_trained_on(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, views: str, pixels: float, kept: int
+    monkeypatch: pytest.MonkeyPatch,
+    tmp_path: Path,
+    views: str,
+    hr_share: float,
+    pixels: float,
+    kept: int,
 ) -> None:
     monkeypatch.setattr(estimate, "KEPT_BYTES", kept)
     estimate._sizes.cache_clear()
@@ -183,7 +195,8 @@ def test_the_sizes_are_those_of_the_views_that_are_trained_on(
 
     monkeypatch.setattr(frozen, "read_manifest", read)
     largest = 10_000 if views == "lr_only" else 40_000
-    sizes = estimate._sizes(tmp_path, "k-1", views)
-    assert (sizes.pixels, sizes.largest) == (pixels, largest)
+    sizes = estimate._sizes(tmp_path, "k-1", views, hr_share)
+    assert sizes.pixels == pytest.approx(pixels)
+    assert sizes.largest == largest
     trained = {"mixed": 50_000, "all_hr": 80_000}.get(views, largest)
     assert sizes.held_bytes == 3 * (trained + 999**2) + min(kept, 24 * trained)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import errno
 import os
 import shutil
@@ -39,7 +40,11 @@ def rename(store: Path) -> None:
 
 def delete(store: Path) -> None:
     rename(store)
-    shutil.rmtree(store.with_name("moved"))
+    moved = store.with_name("moved")
+    while moved.exists():
+        # A process may write a file between the listing of a folder and its removal.
+        with contextlib.suppress(OSError):
+            shutil.rmtree(moved)
 
 
 def unmount(store: Path) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import inspect
+import math
 import re
 from collections.abc import Callable
 from types import SimpleNamespace
@@ -16,6 +17,7 @@ from tests.conftest import composed as compose
 from tests.training.conftest import same
 from xrgs.capture.dataset import USES, Dataset
 from xrgs.config import CONF_DIR, Conf
+from xrgs.errors import XrgsError
 from xrgs.splat.gaussians import ActivatedGaussians, Gaussians, from_points
 from xrgs.splat.loss import photometric_loss, prepare_target
 from xrgs.splat.optimizer import SplatOptimizer
@@ -33,6 +35,10 @@ from xrgs.training.seeding import seeded_generator
 ABLATIONS = sorted(
     {path.stem for path in (CONF_DIR / "ablation").glob("*.yaml")} - {"baseline"} - set(USES)
 )
+
+
+#: The ablations that `plus` refuses, and the key that the message begins with.
+NOT_WITH_PLUS = {"mcmc": "splat.raster.absgrad"}
 
 
 @pytest.mark.parametrize("backend", ["torch", "native"])
@@ -331,6 +337,9 @@ def test_the_budget_counts_by_pixels_of_the_largest_view(data: Dataset) -> None:
 @pytest.mark.parametrize("ablation", ABLATIONS)
 def test_each_ablation_changes_the_result(data: Dataset, ablation: str) -> None:
     overrides = ["train.steps=20", "splat.backend=auto"]
+    if ablation == "noise_weighting":  # it lowers no weight where all photographs fit alike
+        white = dataclasses.replace(data.train[1], pixels=torch.ones(12, 12, 3))
+        data = dataclasses.replace(data, train=(data.train[0], white, *data.train[2:]))
     plain = train_cell(data, compose(*overrides))
     conf = compose(*overrides, f"+ablation={ablation}")
     if conf.matched_to is not None:  # as a sweep does
@@ -338,6 +347,28 @@ def test_each_ablation_changes_the_result(data: Dataset, ablation: str) -> None:
     if ablation == "natural_selection":  # its budget is for more Gaussians than there are here
         conf.components.natural_selection.budget = 0.01
     assert not same(plain.gaussians, train_cell(data, conf).gaussians)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("ablation", sorted({*ABLATIONS} - {*NOT_WITH_PLUS}))
+def test_each_ablation_trains_with_plus_exposure_and_masks(data: Dataset, ablation: str) -> None:
+    """Its 20 steps go through densification, selection and the late factor of `supersampled`."""
+    conf = compose("train.steps=20", "splat.backend=auto", f"+ablation=[plus,exposure,{ablation}]")
+    masked = [
+        dataclasses.replace(
+            view, mask=(torch.arange(view.image.shape[1]) > 3).repeat(len(view.image), 1)
+        )
+        for view in data.train
+    ]
+    result = train(dataclasses.replace(data, train=tuple(masked)), conf)
+    assert all(math.isfinite(row["loss"]) for row in result.history)
+    assert len({row["exposure.gain"] for row in result.history}) > 1
+
+
+@pytest.mark.parametrize(("ablation", "key"), NOT_WITH_PLUS.items())
+def test_what_does_not_go_with_plus_names_the_key(ablation: str, key: str) -> None:
+    with pytest.raises(XrgsError, match=f"^{re.escape(key)}="):
+        compose(f"+ablation=[plus,{ablation}]")
 
 
 @pytest.mark.parametrize(

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 
+import numpy as np
 import pytest
 import torch
 
@@ -21,10 +23,14 @@ def always(step: Step) -> bool:
 
 
 def sampled_names(
-    data: Dataset, steps: int, allows_view: Callable[[Step], bool], seed: int = 0
+    data: Dataset,
+    steps: int,
+    allows_view: Callable[[Step], bool],
+    seed: int = 0,
+    hr_share: float = 0.0,
 ) -> list[str]:
     """The view of each step, after a check that the steps are numbered in turn."""
-    sampled = list(EpochSampler(data.train, seed, steps, allows_view))
+    sampled = list(EpochSampler(data.train, seed, steps, allows_view, hr_share))
     assert [(step.number, step.total) for step in sampled] == [(n, steps) for n in range(steps)]
     return [step.view.name for step in sampled]
 
@@ -74,3 +80,62 @@ def test_a_view_that_is_no_longer_allowed_is_skipped_within_the_epoch(data: Data
 def test_it_is_an_error_where_no_view_is_allowed(data: Dataset) -> None:
     with pytest.raises(XrgsError, match=r"step 7: the components .* leave no view to train on"):
         sampled_names(data, 40, lambda step: step.number < 7)
+
+
+#: HR views of `data`.
+HIGH = {"v0", "v2"}
+
+
+@pytest.mark.parametrize("share", [0.1, 0.3, 0.5, 0.9])
+@pytest.mark.parametrize("seed", [0, 7])
+def test_a_share_of_hr_views_holds_in_every_window(data: Dataset, share: float, seed: int) -> None:
+    steps = 30_000
+    names = sampled_names(data, steps, always, seed, share)
+    high = np.array([name in HIGH for name in names])
+    excess = np.cumsum(high) - share * np.arange(1, steps + 1)
+    assert excess.max() - excess.min() < 5
+    for every in (2, 4, 100):  # where shN moves, where Gaussians are refined
+        excess = np.cumsum(high[::every] - share)
+        assert excess.max() - excess.min() < 7
+
+
+def test_each_class_has_epochs_of_its_own(data: Dataset) -> None:
+    names = sampled_names(data, 4000, always, hr_share=0.2)
+    for members in (HIGH, {"v1", "v3"}):
+        orders = epochs([name for name in names if name in members], 2)[:-1]
+        assert all(set(order) == members for order in orders)
+        assert len(set(orders)) == 2
+
+
+def test_the_seed_decides_which_steps_draw_hr_views(data: Dataset) -> None:
+    drawn = [sampled_names(data, 400, always, seed, 0.5) for seed in (0, 0, 1)]
+    assert drawn[0] == drawn[1]
+    classes = [[name in HIGH for name in names] for names in drawn]
+    assert classes[0] != classes[2]
+
+
+def test_a_class_that_is_not_allowed_leaves_its_draws_to_the_other(data: Dataset) -> None:
+    names = sampled_names(
+        data, 2000, lambda step: step.number >= 999 or step.view.tag == "LR", hr_share=0.6
+    )
+    assert all(set(order) == {"v1", "v3"} for order in epochs(names[:998], 2))
+    assert sum(name in HIGH for name in names[999:]) == pytest.approx(0.6 * 1001, abs=4)
+
+
+@pytest.mark.parametrize("tag", ["HR", "LR"])
+def test_views_of_one_tag_have_the_epochs_that_they_have_without_a_share(
+    data: Dataset, tag: str
+) -> None:
+    of_tag = replace(data, train=tuple(replace(view, tag=tag) for view in data.train))
+    assert sampled_names(of_tag, 50, always, hr_share=0.5) == sampled_names(of_tag, 50, always)
+
+
+@pytest.mark.parametrize("share", [0.0, 0.5])
+def test_a_sampler_continues_from_its_state(data: Dataset, share: float) -> None:
+    first, second = (EpochSampler(data.train, 3, 50, always, share) for _ in range(2))
+    for _ in range(17):
+        next(first)
+    second.load_state_dict(first.state_dict())
+    assert list(first) == list(second)
+    with pytest.raises(ValueError, match="zip"):  # not the epochs of the other share
+        EpochSampler(data.train, 3, 50, always, 0.5 - share).load_state_dict(first.state_dict())

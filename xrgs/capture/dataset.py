@@ -39,6 +39,8 @@ class LoadedView:
     """The relative sampling rate in (0, 1], see `xrgs.capture.views.View`."""
     mask: torch.Tensor | None = None
     """[H, W] bool, True for a pixel that is used; None uses all."""
+    need: float = 1.0
+    """How many times as many px a side the view needs, see `xrgs.capture.views.View`."""
 
     @property
     def image(self) -> torch.Tensor:
@@ -66,8 +68,8 @@ class Dataset:
     factor: int
     """How many times fewer pixels per side the method takes LR views to have."""
     degradation: str = "downsample"
-    """How LR views were made of HR ones: `downsample`, `digital_zoom`, `jpeg`, or `none` where a
-    camera took them."""
+    """How LR views were made of HR ones, a key of `xrgs.capture.degradations.DEGRADATIONS`, or
+    `none` where a camera took them."""
 
     @property
     def view_pixels(self) -> int:
@@ -91,8 +93,9 @@ def load(
         validation: Share of the HR training views that are held out and scored in place of the
             test views, which are not read then: round(validation * n) of n, at least one. 0 scores
             the test views.
-        seed: The cell's seed, which draws the held-out views. The draw depends on the variant,
-            `validation` and `seed` alone.
+        seed: The cell's seed, which chooses the held-out views: the seeds 0, 1, ... hold out one
+            part of the HR views after another, so that 1 / `validation` seeds are the folds of a
+            cross-validation. The choice depends on the variant, `validation` and `seed` alone.
 
     Returns:
         The dataset, with views in the order of the variant.
@@ -140,7 +143,7 @@ def _normalized(variant: Variant, posed: list[View]) -> NormalizedScene:
 
 
 def _held_out(variant: Variant, share: float, seed: int) -> list[View]:
-    """Draw the HR training views that are scored and not trained on, in the variant's order."""
+    """Choose the HR training views that are scored and not trained on, in the variant's order."""
     if share == 0:
         return []
     views = [view for view in variant.views if view.split == "train" and view.tag == "HR"]
@@ -150,8 +153,9 @@ def _held_out(variant: Variant, share: float, seed: int) -> list[View]:
             f"train.validation={share}: must be 0, or a share below 1 that leaves at least "
             f"{_MIN_HR_LEFT} HR training views; variant {variant.id} has {len(views)}"
         )
-    drawn = np.random.default_rng(seed).choice(len(views), count, replace=False)
-    return [views[i] for i in sorted(drawn)]
+    order = np.random.default_rng(0).permutation(len(views))
+    fold = [int(order[(seed * count + i) % len(views)]) for i in range(count)]
+    return [views[i] for i in sorted(fold)]
 
 
 def _training_views(variant: Variant, use: str) -> list[View]:
@@ -193,4 +197,6 @@ def _load_view(view: View, viewmat: NDArray[np.float64], *, hide: bool) -> Loade
     if hide:
         pixels = masks.filled(pixels, mask)
     used = None if mask is None else torch.from_numpy(mask)
-    return LoadedView(view.name, view.tag, camera, torch.from_numpy(pixels), view.rho, used)
+    return LoadedView(
+        view.name, view.tag, camera, torch.from_numpy(pixels), view.rho, used, view.need
+    )

@@ -55,6 +55,7 @@ class ViewEntry(Struct, frozen=True, forbid_unknown_fields=True, omit_defaults=T
     viewmat: Annotated[list[_Row4], Meta(min_length=4, max_length=4)]
     rho: Annotated[float, Meta(gt=0, le=1)]
     mask: str | None = None
+    need: Annotated[float, Meta(gt=0)] = 1.0
 
 
 class Manifest(Struct, frozen=True, forbid_unknown_fields=True):

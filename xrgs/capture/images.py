@@ -9,6 +9,7 @@ Nothing here imports torch before `resize` is called.
 
 from __future__ import annotations
 
+import io
 import warnings
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
@@ -627,6 +628,23 @@ def save_mask(path: Path, mask: NDArray[np.bool_], *, durable: bool = True) -> N
 def to_8_bit(image: ImageArray) -> NDArray[np.uint8]:
     """Clamp an image to 0..1, and round it to the nearest of 256 values."""
     return np.round(np.clip(image, 0, 1) * 255).astype(np.uint8)
+
+
+def through_jpeg(image: ImageArray, quality: int) -> ImageArray:
+    """Compress an image [H, W, 3] by JPEG with halved chroma (4:2:0), and decode it again."""
+    stream = io.BytesIO()
+    encoded = Image.fromarray(to_8_bit(image))
+    encoded.save(stream, "JPEG", quality=quality, subsampling="4:2:0")
+    with Image.open(stream) as decoded:
+        return _to_array(decoded)
+
+
+def block_means(image: NDArray[np.floating[Any]], side: int) -> ImageArray:
+    """Average blocks of `side` x `side` pixels of an image [side * H, side * W, 3], in double."""
+    height, width = image.shape[0] // side, image.shape[1] // side
+    blocks = image.reshape(height, side, width, side, 3)
+    means: ImageArray = blocks.mean(axis=(1, 3), dtype=np.float64).astype(np.float32)
+    return means
 
 
 def resize(image: ImageArray, width: int, height: int) -> ImageArray:

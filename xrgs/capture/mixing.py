@@ -18,7 +18,8 @@ import numpy as np
 
 from xrgs.capture import images, poses, registration, sampling, triangulation
 from xrgs.capture.alignment import pose_error
-from xrgs.capture.degradations import resolve_degradation
+from xrgs.capture.blur import blur_notes, lr_blur
+from xrgs.capture.degradations import DEGRADATIONS, resolve_degradation
 from xrgs.capture.lens import Lens
 from xrgs.capture.photographs import PhotoCollection, prepare_hr_views, write_degraded
 from xrgs.capture.registration import Registration
@@ -44,6 +45,8 @@ if TYPE_CHECKING:
 #: How much finer HR views must sample the scene than LR views for the two to be called so, in their
 #: medians; our choice. The paper has 5.
 _LEAST_RATIO = 1.25
+#: Views are compared at no more points than this, so that a thousand views take little memory.
+_MOST_COMPARED = 10_000
 
 
 @dataclass(frozen=True)
@@ -93,9 +96,11 @@ def mix_resolutions(scene: Scene, conf: VariantConf, work: Path, out: Path) -> V
         inputs = replace(inputs, split=_split_by_depth(photos, conf, model, depths))
     write_degraded(photos, inputs.degraded, conf)
     views, hidden = _write_undistorted(inputs, model, depths, out)
+    views = _with_needs(inputs, views, model.points)
     tags, masked = _tags_report(inputs, views), _mask_report(views)
-    notes = [*report["notes"], *tags["notes"], *hidden, *masked["notes"]]
-    report |= tags | masked | {"notes": notes}
+    blurred = _blur_report(conf, views)
+    notes = [*report["notes"], *tags["notes"], *hidden, *masked["notes"], *blurred["notes"]]
+    report |= tags | masked | blurred | {"notes": notes}
     report["seconds"] = round(time.perf_counter() - start, 1)
     held_out = bool(inputs.split.test)
     return Variant(
@@ -253,7 +258,11 @@ def _tags_report(inputs: _Inputs, views: tuple[View, ...]) -> dict[str, Any]:
         for tag in ("HR", "LR")
     }
     return {
-        "notes": [*split_notes(split, inputs.conf), *_class_notes(inputs, rates)],
+        "notes": [
+            *split_notes(split, inputs.conf),
+            *_class_notes(inputs, rates),
+            *_need_notes(inputs, views),
+        ],
         "tags": inputs.conf.tags,
         "degradation": resolve_degradation(inputs.conf),
         "tests": len(split.test),
@@ -282,6 +291,39 @@ def _class_notes(inputs: _Inputs, rates: Mapping[str, list[float]]) -> list[str]
     ]
 
 
+def _with_needs(
+    inputs: _Inputs, views: tuple[View, ...], points: sampling.Array
+) -> tuple[View, ...]:
+    """Return the views with the factors by which they need more px (`View.need`)."""
+    zooms = resolve_degradation(inputs.conf) == "digital_zoom"
+    points = points[:: math.ceil(len(points) / _MOST_COMPARED)]
+    rates = []
+    for view in views:
+        size = (view.width, view.height)
+        used = None if view.mask is None else images.read_mask(view.mask, size)
+        at_points = sampling.point_rates(points, view.viewmat, view.K, size, used)
+        degraded = view.split == "train" and view.tag == "LR"
+        # A digital zoom resolves fewer px than it has.
+        rates.append(at_points / inputs.conf.factor if zooms and degraded else at_points)
+    trained = np.array([view.split == "train" for view in views])
+    needs = sampling.needed_factors(np.stack(rates), trained)
+    return tuple(replace(view, need=need) for view, need in zip(views, needs, strict=True))
+
+
+def _need_notes(inputs: _Inputs, views: tuple[View, ...]) -> list[str]:
+    """Say which training views are supersampled, where they are not the degraded ones."""
+    training = [view for view in views if view.split == "train"]
+    larger = [round(view.need) > 1 for view in training]
+    if inputs.degraded and larger == [view.tag == "LR" for view in training]:
+        return []
+    largest = max(view.need for view in training)
+    which = f"{sum(larger)} of {len(training)}" if any(larger) else "none"
+    return [
+        f"sampling rates of training views differ by {largest:.1f} where they show the same points:"
+        f" components.supersampled, where it is on, renders {which} of the views larger"
+    ]
+
+
 def _mask_report(views: tuple[View, ...]) -> dict[str, Any]:
     """Report the share of the pixels of each class that masks hide."""
     shares = {}
@@ -300,6 +342,14 @@ def _mask_report(views: tuple[View, ...]) -> dict[str, Any]:
         "masked": shares,
         "notes": [f"masks hide so much of the pixels: {said}"] if said else [],
     }
+
+
+def _blur_report(conf: VariantConf, views: tuple[View, ...]) -> dict[str, Any]:
+    """Report the blur of LR views, and whether they are blurrier than their pixels."""
+    blur, degradation = lr_blur(views), DEGRADATIONS.get(resolve_degradation(conf))
+    # A degradation that keeps the size of views takes their detail on purpose.
+    expected = degradation is not None and not degradation.smaller
+    return {"lr_blur": blur, "notes": [] if expected else blur_notes(blur)}
 
 
 def _write_undistorted(

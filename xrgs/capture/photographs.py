@@ -20,6 +20,7 @@ from xrgs.capture.split import HrGeometry, TooSmallError, hr_geometry, shrink_fa
 from xrgs.errors import UnreadableError, XrgsError
 from xrgs.runtime.progress import progress
 from xrgs.runtime.text import listed
+from xrgs.safeio.hashing import digest
 
 if TYPE_CHECKING:
     from xrgs.capture.scenes import Scene
@@ -483,16 +484,21 @@ def write_degraded(
     """Degrade views of these indices: the HR views into `lr`, or the `sfm` copies into `sfm_lr`."""
     if not which:
         return
-    degrade = DEGRADATIONS[resolve_degradation(conf)]
+    degrade = DEGRADATIONS[resolve_degradation(conf)].function
     for i in progress(which, "LR views", "view"):
         source = "hr" if kind == "lr" else "sfm"
         high, mask = photos.read(source, i), photos.mask(source, i)
         if kind == "sfm_lr":  # an HR view has been cropped to such a size
             size = _divisible(*photos.size("sfm", i), conf.factor)
             high, mask = images.resize(high, *size), masks.resized(mask, *size)
-        low = degrade(high, conf)
+        low = degrade(high, conf, _random(photos.names[i], conf))
         images.save(photos.folder / photos.file(kind, i), low, durable=False)
         photos.save_mask(kind, i, masks.degraded(mask, low.shape[:2], conf.factor))
+
+
+def _random(name: str, conf: VariantConf) -> np.random.Generator:
+    """Return a source of random numbers for a view, whatever the order of the views."""
+    return np.random.default_rng(int(digest([conf.seed, name]), 16))
 
 
 def _divisible(width: int, height: int, factor: int) -> tuple[int, int]:

@@ -21,9 +21,13 @@ if TYPE_CHECKING:
     from xrgs.capture.sfm import Reconstruction
 
 Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
 
 #: A view that observes fewer points takes the depth of all points inside its image instead.
 _MIN_OBSERVED = 8
+#: The share of the training views that see a point whose rates count as finest there; our choice.
+#: One photograph by a long lens among forty is no reason to render all others larger.
+_FINEST_SHARE = 0.1
 
 
 @dataclass(frozen=True)
@@ -107,3 +111,63 @@ def relative_to_largest(values: Sequence[float]) -> list[float]:
     """Divide positive numbers by the largest of them; NaN stays NaN."""
     largest = np.nanmax(values)
     return [float(value / largest) for value in values]
+
+
+def point_rates(
+    points: Array, viewmat: Array, K: Array, size: tuple[int, int], used: Mask | None = None
+) -> Array:
+    """Compute the sampling rate of a view at each point, px per world unit.
+
+    A view sees a point that is in front of the camera and inside the image, at a pixel that the
+    mask uses. Other points that may hide it are not known.
+
+    Args:
+        points: [P, 3] in world units.
+        viewmat: World to camera [4, 4].
+        K: Intrinsics [3, 3], px.
+        size: Width and height of the image, px.
+        used: The view's mask [H, W], True for a pixel that is used; None uses all.
+
+    Returns:
+        [P] sqrt(fx fy) / z at depth z; 0 where the view does not see the point.
+    """
+    camera = points @ viewmat[:3, :3].T + viewmat[:3, 3]  # [P, 3]
+    rates = np.zeros(len(points))
+    front = np.flatnonzero(camera[:, 2] > 0)
+    pixels = camera[front] @ K.T
+    pixels = pixels[:, :2] / pixels[:, 2:]
+    inside = np.flatnonzero(((pixels >= 0) & (pixels < size)).all(axis=1))
+    if used is not None:
+        column, row = pixels[inside].astype(np.intp).T
+        inside = inside[used[row, column]]
+    seen = front[inside]
+    rates[seen] = np.sqrt(K[0, 0] * K[1, 1]) / camera[seen, 2]
+    return rates
+
+
+def needed_factors(rates: Array, trained: Mask) -> list[float]:
+    """Compute how many times as many px a side each view needs to be as fine as the finest views.
+
+    With r_v(p) the rate of view v at point p,
+
+        need_v = median over the points p that v sees of r*(p) / r_v(p),
+
+    where r*(p) is a rate that a tenth of the training views that see p reach, and at least one of
+    them. Our choice: the whole measure. The maximum in place of that rate would let a single
+    close-up of a large scene decide for all other views.
+
+    Args:
+        rates: `point_rates` [V, P] of all views at the same points.
+        trained: [V], True for a training view.
+
+    Returns:
+        The factor of each view; 1 for a view that sees no point that a training view sees.
+    """
+    descending = -np.sort(-rates[trained], axis=0)
+    rank = np.ceil(_FINEST_SHARE * (descending > 0).sum(axis=0)).astype(np.intp) - 1
+    finest = np.take_along_axis(descending, np.maximum(rank, 0)[None], axis=0)[0]  # [P]
+    needs = []
+    for rate in rates:
+        both = (rate > 0) & (finest > 0)
+        needs.append(float(np.median(finest[both] / rate[both])) if both.any() else 1.0)
+    return needs

@@ -7,6 +7,7 @@ import shlex
 from collections.abc import Sequence, Set
 from dataclasses import dataclass, replace
 from difflib import get_close_matches
+from operator import attrgetter
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -19,6 +20,9 @@ from xrgs.splat.settings import SSIM_WINDOW
 
 if TYPE_CHECKING:
     from xrgs.config import VariantConf
+
+#: The largest `variant.phone.blur`, LR px: more than a lens or a hand gives. Our choice.
+_MOST_BLUR = 10
 
 
 class TooSmallError(XrgsError):
@@ -78,6 +82,9 @@ def check_variant_conf(conf: VariantConf) -> None:
         "hr_above": (0 <= conf.hr_above <= 1, "0 (use variant.hr_fraction) to 1"),
         "degradation": _one_of(conf.degradation, "auto", "none", *DEGRADATIONS),
         "jpeg_quality": (1 <= conf.jpeg_quality <= 95, "1 to 95"),
+        "phone.blur": (0 <= conf.phone.blur <= _MOST_BLUR, f"0 to {_MOST_BLUR}"),
+        "phone.noise": (0 <= conf.phone.noise <= 255, "0 to 255"),
+        "phone.jpeg_quality": (1 <= conf.phone.jpeg_quality <= 95, "1 to 95"),
         "sfm.lr_images": _one_of(conf.sfm.lr_images, "upsampled", "native"),
         "sfm.long_side": (conf.sfm.long_side >= 0, "0 (the photographs' size) or more"),
         "sfm.min_registered": (0 <= conf.sfm.min_registered <= 1, "0 to 1"),
@@ -88,9 +95,7 @@ def check_variant_conf(conf: VariantConf) -> None:
     }
     for key, (valid, accepted) in rules.items():
         if not valid:
-            owner = conf.sfm if key.startswith("sfm.") else conf
-            value = getattr(owner, key.removeprefix("sfm."))
-            raise XrgsError(f"variant.{key}={value}: must be {accepted}")
+            raise XrgsError(f"variant.{key}={attrgetter(key)(conf)}: must be {accepted}")
     if conf.tags == "flag" and conf.hr_above:
         raise XrgsError(
             f"variant.hr_above={conf.hr_above}: not read with variant.tags=flag, whose share of HR "

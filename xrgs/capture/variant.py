@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import logging
 from contextlib import suppress
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from xrgs.capture import folders, poses, scenes, sealed, split
 from xrgs.capture.degradations import DEGRADATIONS, resolve_degradation
@@ -75,11 +75,19 @@ def key(scene: SceneConf, conf: VariantConf) -> str:
     """
     split.check_variant_conf(conf)
     split.check_test_names(scenes.names(scene, conf.long_side) if conf.test else (), conf)
-    settings = identity_values(conf) | {"degradation": resolve_degradation(conf)}
+    settings = _settings(conf)
     if conf.poses is not None:
         settings["poses"] = poses.fingerprint(conf.poses)
     code = {part: code_digest(*files) for part, files in sources(conf).items()}
     return digest([scenes.fingerprint(scene, conf.long_side), settings, code])
+
+
+def _settings(conf: VariantConf) -> dict[str, Any]:
+    """Return the settings that decide what a variant is, without those of other degradations."""
+    used = resolve_degradation(conf)
+    unused = {key for name, way in DEGRADATIONS.items() if name != used for key in way.keys}
+    values = {key: value for key, value in identity_values(conf).items() if key not in unused}
+    return values | {"degradation": used}
 
 
 def sources(conf: VariantConf) -> dict[str, tuple[str, ...]]:

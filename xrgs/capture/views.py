@@ -46,6 +46,10 @@ class View:
     mask: Path | None = None
     """An 8-bit grey PNG of the same size: 255 where a pixel is used, 0 elsewhere. None uses all.
     Below it the file has the photograph, or what a degradation made of its neighbours."""
+    need: float = 1.0
+    """How many times as many px a side the view needs to show what it sees as finely as the finest
+    training views (`xrgs.capture.sampling.needed_factors`): about 1 for an HR view and about
+    `factor` for a degraded one. A digital zoom counts with the pixels that it resolves."""
 
 
 @dataclass(frozen=True)

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import pandas as pd
 
+from xrgs.capture.degradations import DEGRADATIONS, resolve_degradation
 from xrgs.report.inference import OTHER_CODE
 from xrgs.report.writing import signed
 from xrgs.runtime.text import listed
@@ -126,25 +127,33 @@ def _mixture(variant: VariantConf) -> str:
     chosen = variant.tags == "flag"  # and not by what the photographs are
     if chosen and variant.hr_fraction == 1:
         return _ALL_HR
-    if variant.degradation == "downsample" or (chosen and variant.degradation == "auto"):
-        return f"LR views {_shown(variant.factor)} times smaller"
-    if variant.degradation in ("auto", "none"):
+    degradation = resolve_degradation(variant)
+    if degradation == "none":
         return f"LR by {_shown(variant.tags)} (nothing degraded)"
-    return f"LR views by {_shown(variant.degradation)}"
+    way = f"by {_shown(degradation)}"
+    if degradation not in DEGRADATIONS or not DEGRADATIONS[degradation].smaller:
+        return f"LR views {way}"
+    smaller = f"LR views {_shown(variant.factor)} times smaller"
+    return smaller if degradation == "downsample" else f"{smaller}, {way}"
 
 
 def _prune_rule(configs: Iterable[tuple[str, Conf | None]]) -> list[str]:
     """Return a phrase on the rule against large Gaussians, with the labels where they differ."""
     by_value: dict[str, dict[str, None]] = {}  # with the labels in order
+    without_rule: dict[str, None] = {}
     for label, config in configs:
-        if config:
+        if config and config.splat.strategy == "default":
             value = _shown(config.splat.densify.prune_scale3d)
             by_value.setdefault(value, {})[label] = None
+        elif config:
+            without_rule[label] = None
     if not by_value:
         return []
     several = len(by_value) > 1
     each = (f"{v} ({', '.join(found)})" if several else v for v, found in by_value.items())
     phrase = f"Gaussians above {', '.join(each)} times the scene's scale are pruned"
+    if without_rule:
+        phrase += f", and none for their size in {', '.join(without_rule)}"
     return [for_line(phrase, _MAX_SENTENCE)]
 
 

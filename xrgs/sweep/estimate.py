@@ -13,6 +13,7 @@ from contextlib import suppress
 from dataclasses import asdict, dataclass
 from datetime import datetime
 from functools import cache
+from statistics import fmean
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from xrgs.capture import frozen
@@ -47,7 +48,7 @@ class _Sizes(NamedTuple):
     """Sizes of the training views of a cell."""
 
     pixels: float
-    """Mean over the training views."""
+    """Mean over the training steps."""
     largest: int
     """Pixels of the largest training view, the unit of budgets of Gaussians."""
     held_bytes: int
@@ -114,7 +115,7 @@ class CostEstimator:
         return _Finished(
             settings=_settings(conf),
             variant_id=variant_id,
-            sizes=_sizes(self._store.variants, variant_id, conf.train.views),
+            sizes=_sizes(self._store.variants, variant_id, conf.train.views, conf.train.hr_share),
             steps=summary.steps,
             threads=made.threads,
             backend=made.backend,
@@ -151,7 +152,8 @@ class CostEstimator:
         sizes = past.sizes  # of a variant that is not built yet, the nearest known ones
         if variant_id is not None:
             with suppress(StoreError):
-                sizes = _sizes(self._store.variants, variant_id, conf.train.views)
+                train = conf.train
+                sizes = _sizes(self._store.variants, variant_id, train.views, train.hr_share)
         return _scaled(past, conf, sizes, threads, backend)
 
 
@@ -189,7 +191,7 @@ def _flat(values: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, st
 
 
 @cache
-def _sizes(variants: Path, variant_id: str, views: str) -> _Sizes:
+def _sizes(variants: Path, variant_id: str, views: str, hr_share: float) -> _Sizes:
     """Return the sizes of a cell's training views, from the list of a variant, trimmed or not.
 
     Raises:
@@ -201,19 +203,27 @@ def _sizes(variants: Path, variant_id: str, views: str) -> _Sizes:
     manifest = frozen.read_manifest(folder)
     tag = {"hr_only": "HR", "lr_only": "LR"}.get(views)
     splits = ("train", "original") if views == "all_hr" else ("train",)  # originals replace
-    pixels = {
-        view.name: view.width * view.height
+    trained_views = {
+        view.name: view
         for split in splits
         for view in manifest.views
         if view.split == split and tag in (None, view.tag)
     }
-    if not pixels:
+    if not trained_views:
         raise StoreError(f"{folder}: no training view for train.views={views}")
+    pixels = {name: view.width * view.height for name, view in trained_views.items()}
     trained = sum(pixels.values())
     tested = sum(view.width * view.height for view in manifest.views if view.split == "test")
     moments = min(KEPT_BYTES, 2 * _FLOAT_RGB_BYTES * trained)  # mean and variance
     held = _RGB_BYTES * (trained + tested) + moments
-    return _Sizes(trained / len(pixels), max(pixels.values()), held)
+    by_tag = {
+        tag: [pixels[name] for name, view in trained_views.items() if view.tag == tag]
+        for tag in ("HR", "LR")
+    }
+    mean = trained / len(pixels)
+    if hr_share and all(by_tag.values()):
+        mean = hr_share * fmean(by_tag["HR"]) + (1 - hr_share) * fmean(by_tag["LR"])
+    return _Sizes(mean, max(pixels.values()), held)
 
 
 def _newest(store: Store) -> list[CellFolder]:

@@ -16,6 +16,7 @@ from xrgs.splat.optimizer import SplatOptimizer
 from xrgs.splat.rendering import zero_means2d_offset
 from xrgs.splat.settings import NOMINAL_STEPS
 from xrgs.splat.strategy.default import DefaultStrategy
+from xrgs.splat.strategy.mcmc import MCMCStrategy
 from xrgs.splat.strategy.refinement import Refinement
 from xrgs.training.checkpoint import Checkpoint
 from xrgs.training.components import Components
@@ -41,8 +42,8 @@ if TYPE_CHECKING:
     #: Scores of Gaussians by name; None where one is not available.
     Evaluate = Callable[[Gaussians], Mapping[str, float | None]]
 
-#: The strategies of densification, by the names of gsplat's.
-STRATEGIES: Mapping[str, type[Strategy]] = {"default": DefaultStrategy}
+#: The strategies of densification, by the names in `xrgs.splat.settings.STRATEGIES`.
+STRATEGIES: Mapping[str, type[Strategy]] = {"default": DefaultStrategy, "mcmc": MCMCStrategy}
 
 
 def train(
@@ -193,6 +194,7 @@ def _run_steps(run: _Run, checkpoint: Checkpoint, evaluate: Evaluate | None) -> 
             recorder.record_skipped("backward")
         recorder.record_step(step, forward.loss, forward.render, gaussians, forward.sh_degree)
         recorder.record_refinement(_densify(run, step, forward))
+        components.after_step(gaussians, step)
         # Evaluation and checkpoints do not count as training time.
         if evaluate is not None and run.evaluates_after(step.number):
             recorder.record_scores(step.number + 1, len(gaussians), run.score(evaluate))
@@ -273,6 +275,7 @@ def _set_up(data: Dataset, conf: Conf, extra_components: Iterable[Component]) ->
         data.points,
         data.colors,
         init_opacity=splat.init_opacity,
+        init_scale=splat.init_scale,
         sh_degree=splat.raster.sh_degree,
         generator=seeded_generator(conf.seed, "init"),
     )
@@ -281,7 +284,8 @@ def _set_up(data: Dataset, conf: Conf, extra_components: Iterable[Component]) ->
     )
     built = build_components(conf.components, data, splat, backend, conf.seed)
     components = Components([*built, *extra_components])
-    strategy = STRATEGIES["default"](
+    components.check_strategy(splat.strategy, STRATEGIES[splat.strategy])
+    strategy = STRATEGIES[splat.strategy](
         optimizer,
         splat.densify.scaled(steps),
         scene_scale=data.scene_scale,
@@ -302,7 +306,9 @@ def _set_up(data: Dataset, conf: Conf, extra_components: Iterable[Component]) ->
         optimizer=optimizer,
         components=components,
         strategy=strategy,
-        sampler=EpochSampler(data.train, conf.seed, steps, components.allows_view),
+        sampler=EpochSampler(
+            data.train, conf.seed, steps, components.allows_view, conf.train.hr_share
+        ),
         recorder=recorder,
         renderer=StepRenderer(components, splat.raster, sh_every, backend, recorder),
         memory=TrainingMemory(optimizer, strategy, components, views, data),

@@ -90,11 +90,14 @@ def assert_same(ours: Ours, theirs: Theirs) -> None:
     count=st.integers(1, 60),
     views=st.integers(1, 4),
     step=st.sampled_from([0, 400, 500, 550, 600, 2900, 3000, 3100, 6000, 14_900, 15_000, 15_100]),
+    resets=st.booleans(),
     seed=st.integers(0, 2**32 - 1),
 )
-def test_a_refinement_is_gsplats(count: int, views: int, step: int, seed: int) -> None:
+def test_a_refinement_is_gsplats(
+    count: int, views: int, step: int, resets: bool, seed: int
+) -> None:
     rng = np.random.default_rng(seed)
-    values, config = random_values(count, rng), DensifySettings()
+    values, config = random_values(count, rng), DensifySettings(resets=resets)
     ours, theirs = make_both(values, config, seed)
     gradients = random_values(count, rng)
     ours.descend(gradients)
@@ -135,9 +138,10 @@ def test_with_absgrad_a_refinement_is_gsplats(seed: int) -> None:
 
 
 @pytest.mark.slow
-def test_a_run_of_3000_steps_is_gsplats() -> None:
+@pytest.mark.parametrize("resets", [True, False])
+def test_a_run_of_3000_steps_is_gsplats(resets: bool) -> None:
     steps = 3000
-    config = DensifySettings().scaled(steps)
+    config = DensifySettings(resets=resets).scaled(steps)
     rng = np.random.default_rng(0)
     values = random_values(150, rng)
     ours, theirs = make_both(values, config, 1)
@@ -165,15 +169,17 @@ def test_a_run_of_3000_steps_is_gsplats() -> None:
     assert_same(ours, theirs)
     assert all(torch.equal(ours.gaussians[name], frozen[name]) for name in PARAMETERS)
     # The run went through every rule, many times.
-    assert all(n > 50 for name, n in total.items() if name != "pruned_non_finite"), total
+    assert total.pop("pruned_non_finite") == 0
+    assert (total.pop("reset") > 50) == resets
+    assert all(n > 50 for n in total.values()), total
 
 
 def test_gsplat_153_itself_never_resets() -> None:
     """The one difference from the release that is our oracle: were it gone, so would this be."""
     rng = np.random.default_rng(0)
     values = random_values(20, rng)
-    theirs = Theirs(values, DensifySettings(start=5000), 0)
+    theirs = Theirs(values, DensifySettings(start=5000, resets=False), 0)
     theirs.descend(random_values(20, rng))
     before = theirs.params["opacities"].detach().clone()
-    theirs.densify(3000, random_view(20, rng), with_reset=False)
+    theirs.densify(3000, random_view(20, rng))
     assert torch.equal(theirs.params["opacities"], before)

@@ -1,30 +1,50 @@
 """The ways to degrade HR views into LR views, by `variant.degradation`.
 
 A new way is one module of this folder, named after the value of the key, and one line in
-`DEGRADATIONS`. The key of a variant has the code of the degradation that it uses, and not the code
-of the others.
+`DEGRADATIONS`. The key of a variant has the code and the settings of the degradation that it uses,
+and not those of the others.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
+from xrgs.capture.degradations.box import box
 from xrgs.capture.degradations.digital_zoom import digital_zoom
 from xrgs.capture.degradations.downsample import downsample
 from xrgs.capture.degradations.jpeg import jpeg
+from xrgs.capture.degradations.lanczos import lanczos
+from xrgs.capture.degradations.phone import phone
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    import numpy as np
 
     from xrgs.capture.images import ImageArray
     from xrgs.config import VariantConf
 
-#: Each takes an HR view [H, W, 3] in 0..1, its sides multiples of `variant.factor`, and returns the
-#: LR view, which need not be clamped.
-DEGRADATIONS: dict[str, Callable[[ImageArray, VariantConf], ImageArray]] = {
-    "downsample": downsample,
-    "digital_zoom": digital_zoom,
-    "jpeg": jpeg,
+
+@dataclass(frozen=True)
+class Degradation:
+    """One way to make an LR view from an HR view."""
+
+    function: Callable[[ImageArray, VariantConf, np.random.Generator], ImageArray]
+    """Takes an HR view [H, W, 3] in 0..1, its sides multiples of `variant.factor`, and a source of
+    random numbers that depends on the view. Returns the LR view, which need not be clamped."""
+    smaller: bool = False
+    """Whether LR views have `variant.factor` times fewer px a side; else they keep their size."""
+    keys: tuple[str, ...] = ()
+    """The keys of `variant` that no other degradation reads."""
+
+
+DEGRADATIONS: dict[str, Degradation] = {
+    "downsample": Degradation(downsample, smaller=True),
+    "box": Degradation(box, smaller=True),
+    "lanczos": Degradation(lanczos, smaller=True),
+    "phone": Degradation(phone, smaller=True, keys=("phone",)),
+    "digital_zoom": Degradation(digital_zoom),
+    "jpeg": Degradation(jpeg, keys=("jpeg_quality",)),
 }
 
 

@@ -7,11 +7,13 @@ from typing import TYPE_CHECKING
 from xrgs.capture import images
 
 if TYPE_CHECKING:
+    import numpy as np
+
     from xrgs.capture.images import ImageArray
     from xrgs.config import VariantConf
 
 
-def digital_zoom(high: ImageArray, conf: VariantConf) -> ImageArray:
+def digital_zoom(high: ImageArray, conf: VariantConf, _rng: np.random.Generator) -> ImageArray:
     """Return the view [H, W, 3] after it was downsampled by `factor` and resized back."""
     height, width = high.shape[:2]
     small = images.resize(high, width // conf.factor, height // conf.factor)

@@ -7,11 +7,13 @@ from typing import TYPE_CHECKING
 from xrgs.capture import images
 
 if TYPE_CHECKING:
+    import numpy as np
+
     from xrgs.capture.images import ImageArray
     from xrgs.config import VariantConf
 
 
-def downsample(high: ImageArray, conf: VariantConf) -> ImageArray:
+def downsample(high: ImageArray, conf: VariantConf, _rng: np.random.Generator) -> ImageArray:
     """Return the view [H / factor, W / factor, 3]."""
     height, width = high.shape[:2]
     return images.resize(high, width // conf.factor, height // conf.factor)

@@ -2,8 +2,8 @@
 
 Given the same inputs, the results are those of `DefaultStrategy` of gsplat [ye2025] 1.5.3, with two
 exceptions. Opacities are reset; gsplat 1.5.3 means to, but its `step % reset_every == 0 & step > 0`
-compares with `0 & step`, which pull request 776 mends. And a split draws its random numbers in
-double.
+compares with `0 & step`, which pull request 776 mends. With `DensifySettings.resets` of False there
+are no resets, as in 1.5.3. And a split draws its random numbers in double.
 
 On the native backend the results do not depend on the number of threads or on the processor.
 """
@@ -13,7 +13,6 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import replace
-from types import ModuleType
 from typing import Any
 
 import torch
@@ -52,7 +51,7 @@ class DefaultStrategy(Strategy):
     - Then it prunes Gaussians with an opacity below `prune_opacity` and, after step `reset_every`,
       those with a scale above `prune_scale3d * scene_scale`.
     - At the steps above 0 and below `stop` that `reset_every` divides, it caps opacities at
-      `reset_opacity * prune_opacity`.
+      `reset_opacity * prune_opacity`, unless `resets` is False.
 
     gsplat has no counterpart of three options:
 
@@ -136,7 +135,7 @@ class DefaultStrategy(Strategy):
         refinement = Refinement()
         if step > settings.start and step % settings.every == 0:
             refinement = self._refine(step, self._deciding_thresholds(group), hooks)
-        if step > 0 and step % settings.reset_every == 0:
+        if settings.resets and step > 0 and step % settings.reset_every == 0:
             refinement = replace(refinement, reset=self._reset_opacities(hooks))
         return refinement
 
@@ -245,13 +244,6 @@ class DefaultStrategy(Strategy):
         self.grad2d_sum = self.gaussians.opacities.new_zeros(count, len(self.gaussians))
         self.visible_count = torch.zeros_like(self.grad2d_sum)
 
-    def _finite(self) -> Tensor:
-        """Return which Gaussians [N] are finite in all parameters and largest scale."""
-        finite = torch.isfinite(self._largest_scale())  # [N]
-        for name in PARAMETERS:
-            finite &= torch.isfinite(self.gaussians[name][..., None]).flatten(1).all(dim=1)
-        return finite
-
     def _deciding_row(self) -> Tensor:
         """Return the first of the G statistics in which each Gaussian [N] is not 0, or the last."""
         has_gradient = self.grad2d_sum > 0  # [G, N]
@@ -329,18 +321,3 @@ class DefaultStrategy(Strategy):
         cap = torch.logit(cap_opacity).to(opacities)
         self.optimizer.reset("opacities", torch.minimum(opacities, cap))
         return int((opacities > cap).sum())
-
-    @property
-    def _activations(self) -> ModuleType:
-        """The activation functions of the optimizer's backend."""
-        return implementation("activations", self.optimizer.backend)
-
-    def _largest_scale(self) -> Tensor:
-        """Return the largest scale [N] of each Gaussian, world units."""
-        largest: Tensor = self._activations.exp(self.gaussians.scales.amax(dim=-1))
-        return largest
-
-    def _keep(self, mask: Tensor) -> None:
-        """Keep the Gaussians of `mask` [N] and remove all others."""
-        if not mask.all():  # else nothing needs to be copied
-            self.optimizer.keep(mask)

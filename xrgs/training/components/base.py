@@ -20,7 +20,8 @@ order:
 14. `opacity_attenuation`: at a reset of the opacities,
 15. `on_gaussians_changed`: after a refinement or a reset that changed anything,
 16. `to_prune`: further Gaussians to remove,
-17. `on_gaussians_changed`: after that has removed any.
+17. `on_gaussians_changed`: after that has removed any,
+18. `after_step`: the Gaussians as the next step gets them.
 
 A step without a backward pass leaves out 10 and 11. After the last step training calls `bake` and
 `after_training`; `bake` also runs on a copy of the Gaussians wherever they are evaluated.
@@ -356,6 +357,12 @@ class Component:
         """
         del gaussians, step
         return None
+
+    def after_step(self, gaussians: Gaussians, step: Step) -> None:
+        """Change the values of the Gaussians in place, when all else of the step is done.
+
+        The optimizer's moments stay as they are.
+        """
 
     def opacity_attenuation(self, gaussians: Gaussians) -> Tensor | None:
         """Tell by which factors `before_render` lowers opacities in every view.
