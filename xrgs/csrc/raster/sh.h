@@ -122,7 +122,7 @@ XRGS_INLINE Vector3 view_direction(const Vector3& mean, const float* camera_posi
 // and higher for each, with zeros behind them, and the gradients of the colours before the clamp,
 // one Gaussian after the other.
 struct ShGradientFactors {
-  alignas(64) float basis[16][16];
+  alignas(64) float basis[16][16];  // repeat_thrice of the last row reads one float of v_color
   alignas(64) float v_color[16 * 3 + 16];
 };
 

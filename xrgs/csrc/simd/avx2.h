@@ -174,13 +174,13 @@ XRGS_INLINE Floats broadcast_row(Floats a) {
   const __m256 row = _mm256_permute2f128_ps(half, half, (R & 1) * 0x11);
   return {row, row};
 }
-// The lanes k of p[(16 C + k) / 3] and p[(16 C + k) % 3]: both read sixteen floats or fewer.
+// The lanes k of p[(16 C + k) / 3], which may read up to p[16], and of p[(16 C + k) % 3], which may
+// read up to p[3]. C is 0 to 2.
 template <int K>  // eight lanes from K on
 XRGS_INLINE __m256 repeat_thrice8(const float* p) {
   constexpr int first = K / 3, r = K % 3;
   const __m256i at = _mm256_setr_epi32(0, (r + 1) / 3, (r + 2) / 3, (r + 3) / 3, (r + 4) / 3,
                                        (r + 5) / 3, (r + 6) / 3, (r + 7) / 3);
-  // At most four floats are read, p[14] among them at the most.
   return _mm256_permutevar_ps(_mm256_broadcast_ps(reinterpret_cast<const __m128*>(p + first)), at);
 }
 template <int C>
