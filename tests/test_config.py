@@ -143,11 +143,38 @@ def test_the_splat_librarys_defaults_are_the_baselines(group: str, compose: Comp
         "splat.densify.budget=-0.1",
         "splat.densify.budget=nan",
         "splat.densify.budget=inf",
+        "splat.densify.noise=-1",
+        "splat.strategy=mc",
+        "splat.init_scale=0",
+        "splat.init_scale=nan",
     ],
 )
-def test_an_unknown_split_or_a_wrong_budget_is_refused(compose: Compose, override: str) -> None:
+def test_a_wrong_value_of_densification_is_refused(compose: Compose, override: str) -> None:
     with pytest.raises(XrgsError, match=f"^{override.split('=', maxsplit=1)[0]}=.*: must be "):
         compose(override)
+
+
+@pytest.mark.parametrize(
+    ("key", "overrides"),
+    [
+        ("splat.densify.noise=1.0", ["splat.densify.noise=1"]),
+        ("splat.densify.budget=0", ["splat.strategy=mcmc"]),
+        ("splat.densify.split=long_axis", ["+ablation=[mcmc,long_axis]"]),
+        ("splat.raster.absgrad=True", ["+ablation=[mcmc,absgrad]"]),
+    ],
+)
+def test_a_setting_that_the_strategy_does_not_read_is_refused(
+    compose: Compose, key: str, overrides: list[str]
+) -> None:
+    with pytest.raises(XrgsError, match=f"^{re.escape(key)}: must be "):
+        compose(*overrides)
+
+
+def test_mcmc_takes_the_rendering_of_other_arms(compose: Compose) -> None:
+    conf = compose("+ablation=[mcmc,antialiased,supersampled]")
+    assert (conf.splat.strategy, conf.splat.raster.antialiased) == ("mcmc", True)
+    assert (conf.splat.raster.eps2d, conf.components.supersampled.factor) == (0.1, 2)
+    assert conf.splat.densify.noise == 5e5
 
 
 def test_numbers_are_numbers_to_any_reader_of_yaml() -> None:

@@ -20,7 +20,7 @@ from xrgs.config import CONF_DIR, TRAINING_VIEWS, Conf, known_keys, types_of
 from xrgs.errors import XrgsError, did_you_mean
 from xrgs.safeio.records import read_struct
 from xrgs.splat.backend import CHOICES
-from xrgs.splat.settings import NOMINAL_STEPS, SPLITS
+from xrgs.splat.settings import NOMINAL_STEPS, SPLITS, STRATEGIES
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -84,6 +84,7 @@ def to_conf(cfg: DictConfig) -> Conf:
     conf = from_dict({name: plain(name) for name in map(str, cfg) if name != "hydra"})
     _check_ranges(conf)
     _check_choices(conf)
+    _check_strategy(conf)
     return conf
 
 
@@ -110,9 +111,12 @@ def _check_ranges(conf: Conf) -> None:
     if (begin := conf.splat.optimizer.means_decay_from) >= NOMINAL_STEPS:
         key = "splat.optimizer.means_decay_from"
         raise XrgsError(f"{key}={begin}: must be below {NOMINAL_STEPS}, the length of a run")
-    budget = conf.splat.densify.budget
-    if not (math.isfinite(budget) and budget >= 0):
-        raise XrgsError(f"splat.densify.budget={budget}: must be a finite number, 0 or more")
+    if not (math.isfinite(scale := conf.splat.init_scale) and scale > 0):
+        raise XrgsError(f"splat.init_scale={scale}: must be finite and above 0")
+    for name in ("budget", "noise"):
+        value = getattr(conf.splat.densify, name)
+        if not (math.isfinite(value) and value >= 0):
+            raise XrgsError(f"splat.densify.{name}={value}: must be a finite number, 0 or more")
 
 
 def _check_choices(conf: Conf) -> None:
@@ -120,11 +124,38 @@ def _check_choices(conf: Conf) -> None:
     for key, value, accepted in (
         ("train.views", conf.train.views, TRAINING_VIEWS),
         ("splat.backend", conf.splat.backend, CHOICES),
+        ("splat.strategy", conf.splat.strategy, STRATEGIES),
         ("splat.densify.split", conf.splat.densify.split, SPLITS),
         ("retry", conf.retry, _RETRY),
     ):
         if value not in accepted:
             raise XrgsError(f"{key}={value}: must be one of {', '.join(accepted)}")
+
+
+def _check_strategy(conf: Conf) -> None:
+    """Raise `XrgsError` where a setting has no meaning for the strategy of densification."""
+    densify = conf.splat.densify
+    if conf.splat.strategy == "default":
+        if densify.noise:
+            raise XrgsError(
+                f"splat.densify.noise={densify.noise}: must be 0 with splat.strategy=default, which"
+                " adds no noise"
+            )
+        return
+    if densify.budget == 0:
+        raise XrgsError(
+            "splat.densify.budget=0: must be above 0 with splat.strategy=mcmc, which adds Gaussians"
+            " up to it; +ablation=mcmc has a budget"
+        )
+    for key, value, accepted in (
+        ("splat.densify.split", densify.split, "random"),
+        ("splat.raster.absgrad", conf.splat.raster.absgrad, False),
+    ):
+        if value != accepted:
+            raise XrgsError(
+                f"{key}={value}: must be {accepted} with splat.strategy=mcmc, which splits nothing"
+                " and reads no image-plane gradient"
+            )
 
 
 def from_dict(values: Any) -> Conf:

@@ -102,8 +102,10 @@ class SplatConf:
     raster: RasterSettings
     optimizer: OptimizerSettings
     densify: DensifySettings
+    strategy: str = off("default")
     sh_every: int
     init_opacity: float
+    init_scale: float = off(1.0)
     ssim_weight: float
     backend: str
 
@@ -168,6 +170,15 @@ class SupersampledConf:
 
 
 @dataclass(kw_only=True)
+class FormationConf:
+    """How LR photographs were made, learned: the width of their blur; not in the paper."""
+
+    widths: str = off("none")
+    lr: float
+    prior: float
+
+
+@dataclass(kw_only=True)
 class ResolutionScheduleConf:
     """HR views at a reduced resolution early in training (DashGaussian); not in the paper."""
 
@@ -224,6 +235,14 @@ class ContinuousWeightingConf:
 
 
 @dataclass(kw_only=True)
+class NoiseWeightingConf:
+    """A weight of an LR view by its own residual; not in the paper."""
+
+    floor: float = off(1.0)
+    begin: int
+
+
+@dataclass(kw_only=True)
 class MipConf:
     """Mip-Splatting's 3D smoothing filter; not in the paper."""
 
@@ -276,6 +295,14 @@ class FloatersConf:
 
 
 @dataclass(kw_only=True)
+class RegularizationConf:
+    """Penalties on opacities and scales (3DGS-MCMC); not in the paper."""
+
+    opacity: float = off(0.0)
+    scale: float = off(0.0)
+
+
+@dataclass(kw_only=True)
 class CountMatchedConf:
     """A cell with as many Gaussians as another one (`xrgs.training.count_matching`)."""
 
@@ -293,6 +320,7 @@ class ComponentsConf:
     curriculum: CurriculumConf
     render_scale: RenderScaleConf
     supersampled: SupersampledConf
+    formation: FormationConf
     resolution_schedule: ResolutionScheduleConf
     skip_backward: SkipBackwardConf
     consistency: ConsistencyConf
@@ -300,12 +328,14 @@ class ComponentsConf:
     region_weighting: RegionWeightingConf
     hybrid_schedule: HybridScheduleConf
     continuous_weighting: ContinuousWeightingConf
+    noise_weighting: NoiseWeightingConf
     mip: MipConf
     multiview_score: MultiviewScoreConf
     error_score: ErrorScoreConf
     natural_selection: NaturalSelectionConf
     exposure: ExposureConf
     floaters: FloatersConf
+    regularization: RegularizationConf
     count_matched: CountMatchedConf
     # `off` declares no default, so that instances share no dict.
     plugins: dict[str, Any] = off({})  # noqa: RUF009

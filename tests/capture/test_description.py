@@ -141,6 +141,7 @@ def test_a_failed_variant_says_what_was_tried(tmp_path: Path) -> None:
         "tags": "megapixels",
         "degradation": "none",
         "rho": {"LR": [0.1, 0.2, 0.3]},
+        "lr_blur": 0.314,
         "not_registered": ["x", "y"],
     }
     (folder / "report.json").write_text(json.dumps(report))
@@ -153,6 +154,7 @@ def test_a_failed_variant_says_what_was_tried(tmp_path: Path) -> None:
         "against SfM of the undegraded photographs: rotation 0.250 degrees, at most 1.500",
         "tags by megapixels, degradation none",
         "rho of LR: 0.100, 0.200, 0.300",
+        "blur of LR: 0.31 px, estimated (a pixel's area has 0.29)",
         "not placed: x, y",
     ):
         assert line in text

@@ -250,6 +250,16 @@ def test_lr_views_of_other_kernels_are_smaller(mix: Mix, given: list[list[str]],
     assert given[0] == expected
 
 
+def test_the_blur_of_lr_views_is_in_the_report_and_said(
+    mix: Mix, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(mixing, "lr_blur", lambda _: 0.87)
+    made = mix(hr_fraction=0.5)
+    assert made.report["lr_blur"] == 0.87
+    (note,) = made.report["notes"]
+    assert note.startswith("LR photographs are blurrier than their pixels: by a Gaussian of 0.87")
+
+
 def test_noise_depends_on_a_views_name_and_on_the_seed_alone(
     rendered: Scene, configured: Make, tmp_path: Path
 ) -> None:

@@ -131,6 +131,20 @@ def gradients_of(leaves: Scene) -> Scene:
     return gradients
 
 
+def make_optimizer(
+    values: Scene, *, scene_scale: float = 1.0, backend: str = "torch"
+) -> SplatOptimizer:
+    """An optimizer of Gaussians with these raw parameters, whose rates stay as they are."""
+    leaves = {name: values[name].clone().requires_grad_() for name in PARAMETERS}
+    return SplatOptimizer(
+        Gaussians(**leaves),
+        OptimizerSettings(means_final=1.0),
+        scene_scale=scene_scale,
+        steps=1,
+        backend=backend,
+    )
+
+
 def make_strategy(
     values: Scene,
     settings: DensifySettings | None = None,
@@ -142,16 +156,8 @@ def make_strategy(
     view_pixels: int = 0,
 ) -> DefaultStrategy:
     """A strategy of Gaussians with these raw parameters, whose optimizer took no step."""
-    leaves = {name: values[name].clone().requires_grad_() for name in PARAMETERS}
-    optimizer = SplatOptimizer(
-        Gaussians(**leaves),
-        OptimizerSettings(means_final=1.0),
-        scene_scale=scene_scale,
-        steps=1,
-        backend=backend,
-    )
     return DefaultStrategy(
-        optimizer,
+        make_optimizer(values, scene_scale=scene_scale, backend=backend),
         settings or DensifySettings(),
         scene_scale=scene_scale,
         generator=torch.Generator().manual_seed(seed),

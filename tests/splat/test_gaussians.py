@@ -23,11 +23,21 @@ def cloud() -> Cloud:
 
 
 def start(
-    points: Any, colors: Any, *, init_opacity: float = 0.1, sh_degree: int = 3, seed: int = 0
+    points: Any,
+    colors: Any,
+    *,
+    init_opacity: float = 0.1,
+    init_scale: float = 1.0,
+    sh_degree: int = 3,
+    seed: int = 0,
 ) -> Gaussians:
-    generator = torch.Generator().manual_seed(seed)
     return from_points(
-        points, colors, init_opacity=init_opacity, sh_degree=sh_degree, generator=generator
+        points,
+        colors,
+        init_opacity=init_opacity,
+        init_scale=init_scale,
+        sh_degree=sh_degree,
+        generator=torch.Generator().manual_seed(seed),
     )
 
 
@@ -46,6 +56,16 @@ def test_start_is_gsplats(cloud: Cloud) -> None:
     assert not shN.requires_grad  # the optimizer has its gradient from sh0's
     dirs = torch.nn.functional.normalize(means, dim=-1)
     np.testing.assert_allclose(sh_to_colors(3, dirs, sh0, shN).detach(), colors / 255.0, atol=1e-6)
+
+
+def test_the_factor_of_the_scales_changes_nothing_else(cloud: Cloud) -> None:
+    whole, tenth = start(*cloud), start(*cloud, init_scale=0.1)
+    torch.testing.assert_close(tenth.scales, whole.scales + np.log(0.1), rtol=0, atol=1e-6)
+    for name in set(PARAMETERS) - {"scales"}:
+        assert torch.equal(tenth[name], whole[name])
+    for wrong in (0.0, -1.0, float("inf"), float("nan")):
+        with pytest.raises(ValueError, match=r"^init_scale must be finite and above 0"):
+            start(*cloud, init_scale=wrong)
 
 
 def test_parameters_are_leaves_reached_by_name(cloud: Cloud) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import pytest
 import torch
+from scipy.ndimage import gaussian_filter
 from torch import Tensor
 from torch.nn.functional import interpolate
 
@@ -63,6 +64,64 @@ def test_one_column_is_resized_as_a_column_of_many(backend: str) -> None:
     image = noise(40, 1).float()
     wide = resize(image.expand(-1, 4, -1), 7, 4, backend=backend)
     torch.testing.assert_close(resize(image, 7, 1, backend=backend), wide[:, :1])
+
+
+def blurred(image: Tensor, size: tuple[int, int], variances: Tensor) -> Tensor:
+    """The blur as the exponential of half the second difference, then `resize`."""
+    for axis, variance in enumerate(variances):
+        count = image.shape[axis]
+        steps = torch.eye(count).double().diff(dim=0)  # none across a border: it reflects
+        matrix = torch.linalg.matrix_exp(-0.5 * variance * steps.T @ steps)
+        image = torch.tensordot(matrix, image, ([1], [axis])).movedim(0, axis)
+    return torchs(image, size)
+
+
+#: Variances down and across, px^2: none, far below 1, a few px, and beyond a small image's borders.
+VARIANCES = [(0.0, 0.0), (1e-3, 0.1), (2.9, 18.0), (300.0, 0.5)]
+
+
+@pytest.mark.parametrize("variances", VARIANCES)
+@pytest.mark.parametrize(("old", "new"), SIZES)
+def test_a_blur_of_a_variance_is_the_exponential_of_the_second_difference(
+    backend: str, old: tuple[int, int], new: tuple[int, int], variances: tuple[float, float]
+) -> None:
+    """Its value, and its gradients by the image and by the variances."""
+    image, slope, exact = noise(*old), noise(*new, seed=1) - 0.5, torch.tensor(variances).double()
+    kind = torch.float32 if backend == "native" else torch.float64
+    leaves = image.to(kind).requires_grad_(), exact.clone().requires_grad_()
+    found = resize(leaves[0], *new, variances=leaves[1], backend=backend)
+    image.requires_grad_()
+    exact.requires_grad_()
+    expected = blurred(image, new, exact)
+    tolerance = 2e-6 if backend == "native" else 1e-11
+    torch.testing.assert_close(found.double(), expected, rtol=0, atol=tolerance)
+    gradients = torch.autograd.grad(found, leaves, slope.to(kind))
+    for value, truth in zip(
+        gradients, torch.autograd.grad(expected, (image, exact), slope), strict=True
+    ):
+        scale = slope.abs().sum().item() if truth.shape == (2,) else truth.abs().max().item()
+        torch.testing.assert_close(value.double(), truth, rtol=0, atol=tolerance * scale)
+
+
+def test_the_gradient_by_the_variances_is_that_of_finite_differences() -> None:
+    image, variances = noise(9, 7).requires_grad_(), torch.tensor([0.3, 4.0]).double()
+    variances.requires_grad_()
+    assert torch.autograd.gradcheck(lambda i, v: resize(i, 5, 3, variances=v), (image, variances))
+
+
+def test_a_wide_blur_is_scipys_gaussian_filter() -> None:
+    """The excess kurtosis of the discrete analogue is 1 / variance, at most 1/225 here."""
+    image, sigma = noise(300, 400), (50 * 0.85, 50 * 0.3)
+    smooth = gaussian_filter(image.numpy(), (*sigma, 0), mode="reflect", truncate=9)
+    found = resize(image, 6, 8, variances=torch.tensor(sigma).double().square())
+    expected = resize(torch.from_numpy(smooth), 6, 8)
+    torch.testing.assert_close(found, expected, rtol=0, atol=5e-4 * float(expected.std()))
+
+
+def test_a_blur_keeps_what_is_constant(backend: str) -> None:
+    image = torch.full((40, 30, 3), 0.25)
+    found = resize(image, 8, 6, variances=torch.tensor([18.0, 0.01]).double(), backend=backend)
+    torch.testing.assert_close(found, torch.full((8, 6, 3), 0.25), rtol=1e-6, atol=0)
 
 
 @pytest.mark.parametrize(

@@ -111,6 +111,14 @@ def test_a_count_to_match_of_every_cell_of_a_file_is_refused(study: Callable[...
         made._plan(["+ablation=plus"])
 
 
+def test_a_strategy_without_the_prune_rule_is_no_control_with_another_one(
+    study: Callable[..., Study],
+) -> None:
+    plan = study()._plan(["+ablation=[mcmc,count_matched]", "matched_to=keep_large"])
+    assert "mcmc+count_matched to keep_large" in {cell.spec.label for cell in plan}
+    assert mixed_prune_rules(plan) == []
+
+
 def test_a_control_with_another_prune_rule_is_named_once(study: Callable[..., Study]) -> None:
     base = "count_matched,[keep_large,count_matched]"
     plan = study()._plan([f"+ablation={base}", "matched_to=keep_large", "seed=0,1"])

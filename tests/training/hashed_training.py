@@ -1,7 +1,8 @@
 """A short training on the native backend, and the SHA-256 of all that it computes.
 
 A program, because `XRGS_ISA` and `ATEN_CPU_CAPABILITY` are read when a process starts. Its
-arguments are numbers of threads; it prints a line with the hash for each.
+arguments are a strategy of densification and numbers of threads; it prints a line with the hash for
+each number.
 """
 
 from __future__ import annotations
@@ -22,12 +23,15 @@ from xrgs.training.loop import train
 GAUSSIANS = 60_001
 """Above 32,768, from which on torch divides a tensor among its threads; of no round number, so that
 the parts have tails."""
-_OVERRIDES = (
+_BOTH = (
     "splat.backend=native",
+    "splat.sh_every=6000",
     # 9 steps stand for 30,000: Gaussians are refined at steps 1 to 6, and reset at 3 and 6.
     "train.steps=9",
     "splat.densify.start=0",
     "splat.densify.every=3000",
+)
+_DEFAULT = (
     "splat.densify.reset_every=12000",
     "splat.densify.stop=24000",
     # Thresholds that some Gaussians are on either side of.
@@ -36,7 +40,6 @@ _OVERRIDES = (
     "splat.densify.prune_opacity=0.0935",
     "splat.densify.prune_scale3d=0.03",
     "splat.densify.reset_opacity=1.08",
-    "splat.sh_every=6000",
     # Every component whose own code computes more than single products.
     "components.loss_weighting.lr_weight=0.5",
     "components.adaptive_weighting.texture=0.9",
@@ -45,6 +48,8 @@ _OVERRIDES = (
     "components.render_scale.gamma=0.25",
     "components.consistency.weight=0.1",
     "components.consistency.lr_mode=fold",
+    "components.noise_weighting.floor=0.25",
+    "components.noise_weighting.begin=12000",
     "components.mip.variance=0.2",
     "components.exposure.mode=affine",
     "components.floaters.near_share=0.95",
@@ -52,14 +57,26 @@ _OVERRIDES = (
     "components.densify.decide=per_class",
     "components.densify.lr_prune=1.01",
 )
+_MCMC = (
+    "+ablation=mcmc",
+    # Opacities begin where some die and many move by noise.
+    "splat.init_opacity=0.05",
+    "splat.densify.prune_opacity=0.045",
+    "splat.densify.budget=28",  # 64,512 Gaussians
+)
+#: What each strategy is trained with, and the counts of a refinement that must not be 0.
+_CASES = {
+    "default": (_DEFAULT, ("split", "duplicated", "pruned_opacity", "pruned_scale", "reset")),
+    "mcmc": (_MCMC, ("relocated", "added")),
+}
 
 
-def training_hash() -> str:
+def training_hash(strategy: str) -> str:
     """Train, and return the SHA-256 of the Gaussians and of the history, in hexadecimal digits."""
-    data, conf = _dataset(), composing.compose(*_OVERRIDES)
+    overrides, rules = _CASES[strategy]
+    data, conf = _dataset(), composing.compose(*_BOTH, *overrides)
     result = train(data, conf)
     counts = result.history[-1]
-    rules = ("split", "duplicated", "pruned_opacity", "pruned_scale", "reset")
     if not all(counts[rule] for rule in rules):
         raise AssertionError(f"the training does not go through every rule: {counts}")
     digest = hashlib.sha256()
@@ -94,6 +111,6 @@ def _smooth(image: Tensor) -> Tensor:
 
 
 if __name__ == "__main__":
-    for threads in sys.argv[1:]:
+    for threads in sys.argv[2:]:
         torch.set_num_threads(int(threads))
-        sys.stdout.write(f"{training_hash()}\n")
+        sys.stdout.write(f"{training_hash(sys.argv[1])}\n")

@@ -10,6 +10,7 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
+from tests.conftest import composed as compose
 from tests.training.conftest import same
 from xrgs.capture.dataset import Dataset
 from xrgs.config import Conf
@@ -192,6 +193,16 @@ def test_more_gaussians_than_growing_can_give_are_an_error_that_names_what_it_ga
     assert thresholds == sorted(thresholds, reverse=True)
     assert len(tried) == 10
     assert all(0 < int(count) < 10**6 for _, count in tried)
+
+
+def test_mcmc_takes_the_count_as_its_budget(data: Dataset) -> None:
+    overrides = "train.steps=60", "splat.densify.every=1500", "splat.backend=torch"
+    conf = compose("+ablation=mcmc", *overrides)
+    conf.components.count_matched.gaussians = 100
+    assert len(train_cell(data, conf).gaussians) == 100
+    conf.components.count_matched.gaussians = 10**6
+    with pytest.raises(XrgsError, match=r"gaussians=1000000: splat\.strategy=mcmc ended with \d+;"):
+        train_cell(data, conf)
 
 
 def test_one_training_does_not_read_the_count(data: Dataset, short: Conf) -> None:

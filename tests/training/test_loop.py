@@ -17,6 +17,7 @@ from tests.conftest import composed as compose
 from tests.training.conftest import same
 from xrgs.capture.dataset import USES, Dataset
 from xrgs.config import CONF_DIR, Conf
+from xrgs.errors import XrgsError
 from xrgs.splat.gaussians import ActivatedGaussians, Gaussians, from_points
 from xrgs.splat.loss import photometric_loss, prepare_target
 from xrgs.splat.optimizer import SplatOptimizer
@@ -34,6 +35,10 @@ from xrgs.training.seeding import seeded_generator
 ABLATIONS = sorted(
     {path.stem for path in (CONF_DIR / "ablation").glob("*.yaml")} - {"baseline"} - set(USES)
 )
+
+
+#: The ablations that `plus` refuses, and the key that the message begins with.
+NOT_WITH_PLUS = {"mcmc": "splat.raster.absgrad"}
 
 
 @pytest.mark.parametrize("backend", ["torch", "native"])
@@ -342,7 +347,7 @@ def test_each_ablation_changes_the_result(data: Dataset, ablation: str) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("ablation", ABLATIONS)
+@pytest.mark.parametrize("ablation", sorted({*ABLATIONS} - {*NOT_WITH_PLUS}))
 def test_each_ablation_trains_with_plus_exposure_and_masks(data: Dataset, ablation: str) -> None:
     """Its 20 steps go through densification, selection and the late factor of `supersampled`."""
     conf = compose("train.steps=20", "splat.backend=auto", f"+ablation=[plus,exposure,{ablation}]")
@@ -355,6 +360,12 @@ def test_each_ablation_trains_with_plus_exposure_and_masks(data: Dataset, ablati
     result = train(dataclasses.replace(data, train=tuple(masked)), conf)
     assert all(math.isfinite(row["loss"]) for row in result.history)
     assert len({row["exposure.gain"] for row in result.history}) > 1
+
+
+@pytest.mark.parametrize(("ablation", "key"), NOT_WITH_PLUS.items())
+def test_what_does_not_go_with_plus_names_the_key(ablation: str, key: str) -> None:
+    with pytest.raises(XrgsError, match=f"^{re.escape(key)}="):
+        compose(f"+ablation=[plus,{ablation}]")
 
 
 @pytest.mark.parametrize(

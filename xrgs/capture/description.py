@@ -60,6 +60,8 @@ class SfmReport(Struct):
     pose_error_against: str = ""
     rho: dict[str, tuple[float, ...]] = {}
     """Least, median and most of the sampling rate, by tag."""
+    lr_blur: float | None = None
+    """The estimated blur of LR training views, LR px; None where it is not known."""
     tests: int = 0
     """Number of views that are held out; 0 where the training views are scored."""
     hr: tuple[str, ...] = ()
@@ -185,6 +187,8 @@ def _sfm(report: SfmReport) -> Iterator[str]:
         if rates := report.rho.get(tag):
             numbers = ", ".join(f"{rate:.3f}" for rate in rates)
             yield f"  rho of {tag}: {numbers} (least, median, most)"
+    if report.lr_blur is not None:
+        yield f"  blur of LR: {report.lr_blur:.2f} px, estimated (a pixel's area has 0.29)"
     if report.not_registered:
         yield f"  not placed: {', '.join(report.not_registered)}"
 

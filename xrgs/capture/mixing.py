@@ -18,6 +18,7 @@ import numpy as np
 
 from xrgs.capture import images, poses, registration, sampling, triangulation
 from xrgs.capture.alignment import pose_error
+from xrgs.capture.blur import blur_notes, lr_blur
 from xrgs.capture.degradations import resolve_degradation
 from xrgs.capture.lens import Lens
 from xrgs.capture.photographs import PhotoCollection, prepare_hr_views, write_degraded
@@ -97,8 +98,9 @@ def mix_resolutions(scene: Scene, conf: VariantConf, work: Path, out: Path) -> V
     views, hidden = _write_undistorted(inputs, model, depths, out)
     views = _with_needs(inputs, views, model.points)
     tags, masked = _tags_report(inputs, views), _mask_report(views)
-    notes = [*report["notes"], *tags["notes"], *hidden, *masked["notes"]]
-    report |= tags | masked | {"notes": notes}
+    blur = lr_blur(views)
+    notes = [*report["notes"], *tags["notes"], *hidden, *masked["notes"], *blur_notes(blur)]
+    report |= tags | masked | {"lr_blur": blur, "notes": notes}
     report["seconds"] = round(time.perf_counter() - start, 1)
     held_out = bool(inputs.split.test)
     return Variant(

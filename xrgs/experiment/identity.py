@@ -61,6 +61,7 @@ CORE = (
     "splat/strategy/__init__.py",
     "splat/strategy/base.py",
     "splat/strategy/default.py",
+    "splat/strategy/mcmc.py",
     "splat/strategy/ops.py",
     "splat/strategy/refinement.py",
     "splat/torch",

@@ -32,6 +32,8 @@ _LABELS = {
     "pruned_non_finite": "Pruned: not finite",
     "pruned_by_components": "Pruned: by components",
     "reset": "Opacities reset",
+    "relocated": "Gaussians relocated",
+    "added": "Gaussians added",
     "skipped_backward": "Steps without a backward pass",
     "skipped_shN": "Steps that did not move shN",
 }

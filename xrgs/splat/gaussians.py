@@ -124,18 +124,21 @@ def from_points(
     colors: Tensor | NDArray[np.uint8],
     *,
     init_opacity: float,
+    init_scale: float = 1.0,
     sh_degree: int,
     generator: torch.Generator,
 ) -> Gaussians:
     """Place a Gaussian on each SfM point (`create_splats_with_optimizers`, gsplat's trainer).
 
-    Each is isotropic, with the RMS distance to its three nearest neighbours as its scale. The
-    quaternions are random. Band 0 of the harmonics gives the point's colour, the others are 0.
+    Each is isotropic, with `init_scale` times the RMS distance to its three nearest neighbours as
+    its scale. The quaternions are random. Band 0 of the harmonics gives the point's colour, the
+    others are 0.
 
     Args:
         points: [P, 3] world units.
         colors: [P, 3], 8-bit, or floats in 0..1.
         init_opacity: Opacity of every Gaussian, above 0 and below 1.
+        init_scale: Factor of the scale of every Gaussian, above 0.
         sh_degree: Highest band of the spherical harmonics that is stored, 0 to 3.
         generator: Random generator that draws the quaternions.
 
@@ -144,7 +147,8 @@ def from_points(
 
     Raises:
         ValueError: There are fewer than 4 points, shapes do not fit, values are not finite, the
-            opacity is not above 0 and below 1, or the degree is not 0 to 3.
+            opacity is not above 0 and below 1, the factor is not above 0, or the degree is not 0 to
+            3.
     """
     check_degree(sh_degree)
     means = torch.as_tensor(points, dtype=torch.float32)
@@ -162,12 +166,14 @@ def from_points(
             raise ValueError(f"{name} has values that are not finite")
     if not 0.0 < init_opacity < 1.0:
         raise ValueError(f"init_opacity must be between 0 and 1, got {init_opacity}")
+    if not (math.isfinite(init_scale) and init_scale > 0.0):
+        raise ValueError(f"init_scale must be finite and above 0, got {init_scale}")
 
-    log_spacing = torch.from_numpy(np.log(_spacing(means))).float()  # [P]
+    log_scales = torch.from_numpy(np.log(_spacing(means) * init_scale)).float()  # [P]
     tensors = {
         "means": means.clone(),
         "quats": torch.rand((count, 4), generator=generator),
-        "scales": log_spacing[:, None].repeat(1, 3),
+        "scales": log_scales[:, None].repeat(1, 3),
         "opacities": torch.full((count,), math.log(init_opacity / (1 - init_opacity))),
         "sh0": colors_to_sh0(rgb),
         "shN": torch.zeros((count, bases(sh_degree) - 1, 3)),

@@ -128,6 +128,11 @@ class SplatOptimizer:
         decay: float = self.means_final ** (decaying / (self.steps - self.means_decay_from))
         self._group("means")["lr"] = self.means_rate * decay
 
+    def rate(self, name: str) -> float:
+        """Return the present learning rate of the parameter `name`."""
+        rate: float = self._group(name)["lr"]
+        return rate
+
     def zero_grad(self) -> None:
         """Drop the gradients of all parameters."""
         self.adam.zero_grad()
@@ -204,6 +209,13 @@ class SplatOptimizer:
         """Give the parameter `name` new values [N, ...] and moments of zero."""
         self._replace(name, value, torch.zeros_like)
 
+    def forget(self, index: Tensor) -> None:
+        """Give the Gaussians `index` [M] moments of zero in every parameter."""
+        for name in PARAMETERS:
+            state = self.adam.state.get(self.gaussians[name], {})
+            for key in state.keys() & {"exp_avg", "exp_avg_sq"}:
+                state[key][index] = 0
+
     def _replace(self, name: str, value: Tensor, moment: Callable[[Tensor], Tensor]) -> None:
         """Replace a parameter by `value`, and each of its Adam moments m by `moment(m)`."""
         state = self.adam.state.pop(self.gaussians[name], {})
@@ -214,5 +226,5 @@ class SplatOptimizer:
             moments = {key: moment(state[key]) for key in ("exp_avg", "exp_avg_sq")}
             self.adam.state[leaf] = state | moments
 
-    def _group(self, name: str) -> dict[str, object]:
+    def _group(self, name: str) -> dict[str, Any]:
         return self.adam.param_groups[PARAMETERS.index(name)]

@@ -7,8 +7,19 @@ from torch import Tensor
 from xrgs.splat.backend import implementation
 
 
-def resize(image: Tensor, height: int, width: int, *, backend: str = "torch") -> Tensor:
+def resize(
+    image: Tensor,
+    height: int,
+    width: int,
+    *,
+    variances: Tensor | None = None,
+    backend: str = "torch",
+) -> Tensor:
     """Resample an image to another size with an antialiased bicubic filter, unclamped.
+
+    With `variances`, the image is blurred first, by the discrete analogue of a Gaussian
+    [lindeberg1990] for each axis. It has this variance to the last digit however small that is, and
+    becomes a sampled Gaussian where it is large. Borders reflect the image.
 
     The result is torch's `interpolate(mode="bicubic", antialias=True)` to rounding, computed as a
     product with one matrix for each axis: forward and backward take a quarter of the time of
@@ -18,11 +29,14 @@ def resize(image: Tensor, height: int, width: int, *, backend: str = "torch") ->
         image: [H, W, 3], of any strides.
         height: Height of the result, px.
         width: Width of the result, px.
+        variances: [2] variances of the blur down and across, px^2 of `image`, at least 0; None does
+            not blur.
         backend: `torch`, `native` or `auto` (`resolve_backend`). The native backend takes float32
             on the CPU only.
 
     Returns:
-        [height, width, 3]. Differentiable; once only on the native backend.
+        [height, width, 3]. Differentiable in `image` and `variances`; once only on the native
+        backend.
 
     Raises:
         ValueError: `image` is not [H, W, 3], has no pixel or is not float32 on the CPU for the
@@ -32,5 +46,5 @@ def resize(image: Tensor, height: int, width: int, *, backend: str = "torch") ->
         raise ValueError(f"image must be [H, W, 3] with H and W above 0, got {list(image.shape)}")
     if height < 1 or width < 1:
         raise ValueError(f"height and width must be at least 1, got {height} and {width}")
-    resized: Tensor = implementation("resample", backend).resize(image, height, width)
+    resized: Tensor = implementation("resample", backend).resize(image, height, width, variances)
     return resized

@@ -20,6 +20,9 @@ KEPT_BYTES = 264 * 2**20
 """The most bytes of moments that training keeps of its photographs (`Target`): of 63 photographs of
 504 x 378 px, or of 15 of 1,008 x 756 px. Those of others are computed at every step on them."""
 
+STRATEGIES = ("default", "mcmc")
+"""The strategies of densification, by the names of gsplat's (`xrgs.training.loop`)."""
+
 SPLITS = ("random", "long_axis")
 """The values of `DensifySettings.split`."""
 
@@ -105,7 +108,9 @@ class OptimizerSettings:
 
 @dataclass
 class DensifySettings:
-    """When Gaussians are grown, pruned and reset (gsplat's `DefaultStrategy`).
+    """When Gaussians are grown, pruned and reset (gsplat's `DefaultStrategy` and `MCMCStrategy`).
+
+    `MCMCStrategy` reads `start`, `stop`, `every`, `prune_opacity`, `budget` and `noise` alone.
 
     A step that is a multiple of `every`, above `start` and below `stop` refines; one that is a
     multiple of `reset_every`, above 0 and below `stop`, resets opacities if `resets` is true.
@@ -137,6 +142,9 @@ class DensifySettings:
     budget: float = off_by_default(0.0)
     """The largest number of Gaussians to which growth may lead, for each pixel of the largest
     training view (`xrgs.splat.strategy.ops.Budget`); 0 sets no limit. The unit is our choice."""
+    noise: float = off_by_default(0.0)
+    """Multiplied by the learning rate of means: the size of the noise on the means that
+    `MCMCStrategy` adds at every step. gsplat's is 5e5."""
 
     @property
     def last_refinement(self) -> int:

@@ -75,8 +75,9 @@ def mixed_prune_rules(plan: Sequence[PlannedCell]) -> list[str]:
         reference = cells.get(cell.reference) if cell.reference else None
         if reference is None:
             continue
-        own, other = (c.conf.splat.densify.prune_scale3d for c in (cell, reference))
-        if own != other:
+        splats = [c.conf.splat for c in (cell, reference)]
+        own, other = (splat.densify.prune_scale3d for splat in splats)
+        if own != other and all(splat.strategy == "default" for splat in splats):
             line = (
                 f"{cell.spec.label}: splat.densify.prune_scale3d is {own:g} here and {other:g} in"
                 f" {reference.spec.label}, so that they differ in more than what is to be"

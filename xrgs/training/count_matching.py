@@ -3,8 +3,9 @@
 A method that ends with fewer Gaussians has to be better than the baseline with as few. The control
 changes one value of the baseline: `splat.densify.grow_grad2d`, the gradient above which
 densification grows a Gaussian. Training runs with one threshold, ends as soon as densification has
-stopped at too many or too few Gaussians, and starts again with another threshold. The paper has no
-such control.
+stopped at too many or too few Gaussians, and starts again with another threshold. With
+`splat.strategy=mcmc` the number is the budget, and one training is enough. The paper has no such
+control.
 """
 
 from __future__ import annotations
@@ -24,6 +25,7 @@ if TYPE_CHECKING:
     from xrgs.capture.dataset import Dataset
     from xrgs.config import Conf
     from xrgs.splat.gaussians import Gaussians
+    from xrgs.splat.settings import DensifySettings
     from xrgs.training.loop import Evaluate
     from xrgs.training.recorder import TrainingResult
 
@@ -76,24 +78,39 @@ def train_count_matched(
 ) -> TrainingResult:
     """Train until the number of Gaussians is `components.count_matched.gaussians`, above 0.
 
-    `splat.densify.grow_grad2d` is the first threshold. The arguments are as for `train`;
-    the checkpoint has the state of the search too.
+    `splat.densify.grow_grad2d` is the first threshold; `splat.strategy=mcmc` has none, and takes
+    the number as its budget. The arguments are as for `train`; the checkpoint has the state of the
+    search too.
 
     Returns:
         The result of the run that matched; its `grow_grad2d` is the threshold that was found.
 
     Raises:
         CheckpointError: The state that was read does not fit this config and data.
-        XrgsError: Ten thresholds gave other numbers of Gaussians, or as for `train`.
+        XrgsError: Ten thresholds or the budget gave other numbers of Gaussians, or as for `train`.
     """
     checkpoint = checkpoint or Checkpoint()
     count_matched, densify = conf.components.count_matched, conf.splat.densify
     count_check = CountCheck(count_matched.gaussians, count_matched.tolerance, densify.stop)
 
-    def train_at(threshold: float) -> TrainingResult:
-        splat = replace(conf.splat, densify=replace(densify, grow_grad2d=threshold))
+    def train_with(changed: DensifySettings) -> TrainingResult:
+        splat = replace(conf.splat, densify=changed)
         return train(data, replace(conf, splat=splat), checkpoint, [count_check], evaluate)
 
+    def train_at(threshold: float) -> TrainingResult:
+        return train_with(replace(densify, grow_grad2d=threshold))
+
+    if conf.splat.strategy == "mcmc":  # its budget is the number itself
+        try:
+            budget = count_matched.gaussians / data.view_pixels
+            return train_with(replace(densify, budget=budget))
+        except CountMismatchError as mismatch:
+            raise XrgsError(
+                f"components.count_matched.gaussians={count_matched.gaussians}:"
+                f" splat.strategy=mcmc ended with {mismatch.count}; it grows by at most 5% every"
+                f" splat.densify.every={densify.every} steps, and removes nothing of the first"
+                " Gaussians"
+            ) from mismatch
     search = ThresholdSearch(densify.grow_grad2d, count_matched.gaussians)
     checkpoint.register(search=search)
     return search.run(train_at)

@@ -15,6 +15,7 @@ from xrgs.splat.loss import Target, photometric_loss, prepare_target
 from xrgs.splat.optimizer import SplatOptimizer
 from xrgs.splat.settings import NOMINAL_STEPS
 from xrgs.splat.strategy.default import DefaultStrategy
+from xrgs.splat.strategy.mcmc import MCMCStrategy
 from xrgs.splat.strategy.refinement import Refinement
 from xrgs.training.checkpoint import Checkpoint
 from xrgs.training.components import Components
@@ -40,8 +41,8 @@ if TYPE_CHECKING:
     #: Scores of Gaussians by name; None where one is not available.
     Evaluate = Callable[[Gaussians], Mapping[str, float | None]]
 
-#: The strategies of densification, by the names of gsplat's.
-STRATEGIES: Mapping[str, type[Strategy]] = {"default": DefaultStrategy}
+#: The strategies of densification, by the names in `xrgs.splat.settings.STRATEGIES`.
+STRATEGIES: Mapping[str, type[Strategy]] = {"default": DefaultStrategy, "mcmc": MCMCStrategy}
 
 
 def train(
@@ -273,6 +274,7 @@ def _set_up(data: Dataset, conf: Conf, extra_components: Iterable[Component]) ->
         data.points,
         data.colors,
         init_opacity=splat.init_opacity,
+        init_scale=splat.init_scale,
         sh_degree=splat.raster.sh_degree,
         generator=seeded_generator(conf.seed, "init"),
     )
@@ -281,7 +283,8 @@ def _set_up(data: Dataset, conf: Conf, extra_components: Iterable[Component]) ->
     )
     built = build_components(conf.components, data, splat, backend, conf.seed)
     components = Components([*built, *extra_components])
-    strategy = STRATEGIES["default"](
+    components.check_strategy(splat.strategy, STRATEGIES[splat.strategy])
+    strategy = STRATEGIES[splat.strategy](
         optimizer,
         splat.densify.scaled(steps),
         scene_scale=data.scene_scale,

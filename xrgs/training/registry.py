@@ -23,11 +23,11 @@ class ComponentEntry:
     reads: tuple[str, ...] = ()
     """Further keys of `components` that the class reads."""
     helpers: tuple[str, ...] = ()
-    """Further modules of `xrgs.training.components` that only this component uses."""
+    """Further modules of `xrgs.training.components` that the class uses."""
 
 
-#: In the order in which hooks run. `loss_weighting` comes after `consistency`, since the weight of
-#: a view multiplies its consistency loss as well.
+#: In the order in which hooks run. The weights of views come after `consistency`, since they
+#: multiply its loss as well, and before `regularization`, whose penalties have no weight of a view.
 BUILT_IN: Mapping[str, ComponentEntry] = {
     "consistency": ComponentEntry("consistency", "Consistency"),
     "loss_weighting": ComponentEntry(
@@ -41,19 +41,23 @@ BUILT_IN: Mapping[str, ComponentEntry] = {
         ),
         helpers=("texture",),
     ),
+    "noise_weighting": ComponentEntry("noise_weighting", "NoiseWeighting"),
     "gradient_scaling": ComponentEntry("gradient_scaling", "GradientScaling"),
     "floaters": ComponentEntry("floaters", "Floaters"),
     "densify": ComponentEntry("densify", "Densify"),
     "curriculum": ComponentEntry("curriculum", "Curriculum"),
     "mip": ComponentEntry("mip", "Mip"),
     "render_scale": ComponentEntry("render_scale", "RenderScale"),
-    "supersampled": ComponentEntry("supersampled", "Supersampled"),
+    "supersampled": ComponentEntry(
+        "supersampled", "Supersampled", reads=("formation",), helpers=("formation", "adam")
+    ),
     "resolution_schedule": ComponentEntry("resolution_schedule", "ResolutionSchedule"),
     "skip_backward": ComponentEntry("skip_backward", "SkipBackward"),
     "multiview_score": ComponentEntry("view_scores", "MultiviewScore"),
     "error_score": ComponentEntry("view_scores", "ErrorScore"),
     "natural_selection": ComponentEntry("natural_selection", "NaturalSelection"),
-    "exposure": ComponentEntry("exposure", "Exposure"),
+    "exposure": ComponentEntry("exposure", "Exposure", helpers=("adam",)),
+    "regularization": ComponentEntry("regularization", "Regularization"),
 }
 
 

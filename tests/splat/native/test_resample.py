@@ -67,6 +67,21 @@ def test_threads_change_no_bit(isa: str, old: tuple[int, int], new: tuple[int, i
         assert torch.equal(gradient, results[0][1])
 
 
+@pytest.mark.usefixtures("threads")
+def test_threads_change_no_bit_of_a_blur(isa: str) -> None:
+    image, slope, results = noise(150, 200).float(), noise(75, 100, seed=1).float() - 0.5, []
+    for count in (1, 2, 3, 4, 1):
+        torch.set_num_threads(count)
+        variances = torch.tensor([2.9, 1.7], dtype=torch.float64, requires_grad=True)
+        leaf = image.clone().requires_grad_()
+        blurred = resize(leaf, 75, 100, variances=variances, backend="native")
+        gradient, by_variance = torch.autograd.grad(blurred, (leaf, variances), slope)
+        # In double, the order of a sum decides the last digits, which float32 does not hold.
+        results.append((blurred.detach(), gradient, by_variance.float()))
+    for result in results[1:]:
+        assert all(map(torch.equal, result, results[0]))
+
+
 def test_any_strides_give_the_same() -> None:
     planes = noise(3, 20).expand(-1, -1, 3).permute(2, 1, 0).float()  # [3, 20, 3] of odd strides
     assert not planes.is_contiguous()

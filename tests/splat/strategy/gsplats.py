@@ -1,14 +1,18 @@
-"""gsplat's `DefaultStrategy` on the inputs of ours: the oracle of densification."""
+"""gsplat's strategies on the inputs of ours: the oracles of densification."""
 
 from __future__ import annotations
 
+import math
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from types import SimpleNamespace
 from typing import Any
 from unittest.mock import patch
 
 import torch
-from gsplat.strategy import DefaultStrategy
+from gsplat.cuda._torch_impl import _quat_scale_to_covar_preci
+from gsplat.strategy import DefaultStrategy, MCMCStrategy
 from gsplat.strategy.ops import reset_opa
 from torch import Tensor
 
@@ -35,10 +39,10 @@ def randn_in_double(*size: int, device: torch.device) -> Tensor:
     return torch.normal(torch.zeros(size, dtype=torch.float64, device=device), 1.0).float()
 
 
-class Theirs:
-    """gsplat's strategy with an Adam a parameter, as its trainer has them."""
+class Trainer:
+    """An Adam a parameter, as gsplat's trainer has them, and the state of torch's generator."""
 
-    def __init__(self, values: dict[str, Tensor], config: DensifySettings, seed: int = 0) -> None:
+    def __init__(self, values: dict[str, Tensor], seed: int) -> None:
         self.params = {name: torch.nn.Parameter(value.clone()) for name, value in values.items()}
         rates = OptimizerSettings()
         self.optimizers = {
@@ -50,6 +54,28 @@ class Theirs:
             )
             for name in PARAMETERS
         }
+        # gsplat draws from torch's global generator, whose state is ours between its calls.
+        self.random = torch.Generator().manual_seed(seed).get_state()
+
+    def descend(self, gradients: dict[str, Tensor]) -> None:
+        for name, optimizer in self.optimizers.items():
+            self.params[name].grad = gradients[name].clone()
+            optimizer.step()
+
+    @contextmanager
+    def drawing(self) -> Iterator[None]:
+        """Let torch's global generator draw the numbers of `random`."""
+        with torch.random.fork_rng(devices=[]):
+            torch.set_rng_state(self.random)
+            yield
+            self.random = torch.get_rng_state()
+
+
+class Theirs(Trainer):
+    """gsplat's default strategy."""
+
+    def __init__(self, values: dict[str, Tensor], config: DensifySettings, seed: int = 0) -> None:
+        super().__init__(values, seed)
         self.strategy = DefaultStrategy(
             prune_opa=config.prune_opacity,
             grow_grad2d=config.grow_grad2d,
@@ -62,13 +88,6 @@ class Theirs:
         )
         self.state = self.strategy.initialize_state(SCENE_SCALE)
         self.resets = config.resets
-        # It draws from torch's global generator, whose state is ours between its calls.
-        self.random = torch.Generator().manual_seed(seed).get_state()
-
-    def descend(self, gradients: dict[str, Tensor]) -> None:
-        for name, optimizer in self.optimizers.items():
-            self.params[name].grad = gradients[name].clone()
-            optimizer.step()
 
     def densify(self, step: int, view: View) -> None:
         width, height = SIZES[view.group]
@@ -82,13 +101,74 @@ class Theirs:
         }
         if view.absgrad is not None:
             info["means2d"].absgrad = view.absgrad[None]
-        with torch.random.fork_rng(devices=[]), patch("torch.randn", randn_in_double):
-            torch.set_rng_state(self.random)
+        with self.drawing(), patch("torch.randn", randn_in_double):
             self.strategy.step_post_backward(self.params, self.optimizers, self.state, step, info)
-            self.random = torch.get_rng_state()
         # 1.5.3's own never happens; this is the condition that its pull request 776 restores.
         strategy = self.strategy
         is_due = 0 < step < strategy.refine_stop_iter and step % strategy.reset_every == 0
         if self.resets and is_due:
             value = strategy.prune_opa * 2.0
             reset_opa(self.params, self.optimizers, self.state, value)
+
+
+def relocation(opacity: float, shares: int) -> tuple[float, float]:
+    """gsplat's kernel of relocation (`cuda/csrc/RelocationCUDA.cu`) in double, which needs a GPU.
+
+    Returns:
+        The opacity of each of the Gaussians, and the factor of their scales.
+    """
+    shared = 1 - (1 - opacity) ** (1 / shares)
+    terms = (
+        math.comb(i - 1, k) * (-1) ** k / math.sqrt(k + 1) * shared ** (k + 1)
+        for i in range(1, shares + 1)
+        for k in range(i)
+    )
+    return shared, opacity / math.fsum(terms)
+
+
+class TheirsMCMC(Trainer):
+    """gsplat's MCMC strategy, with kernels in torch, which draws as ours does."""
+
+    def __init__(
+        self, values: dict[str, Tensor], config: DensifySettings, most: int, seed: int = 0
+    ) -> None:
+        super().__init__(values, seed)
+        self.strategy = MCMCStrategy(
+            cap_max=most,
+            noise_lr=config.noise,
+            refine_start_iter=config.start,
+            refine_stop_iter=config.stop,
+            refine_every=config.every,
+            min_opacity=config.prune_opacity,
+        )
+        self.state = self.strategy.initialize_state()
+
+    def densify(self, step: int) -> None:
+        rate = self.optimizers["means"].param_groups[0]["lr"]
+        with (
+            self.drawing(),
+            patch("gsplat.strategy.ops.compute_relocation", _compute_relocation),
+            patch("gsplat.strategy.ops.quat_scale_to_covar_preci", _quat_scale_to_covar_preci),
+            patch("gsplat.strategy.ops._multinomial_sample", _draw_in_double),
+            patch("torch.randn_like", _randn_like_in_double),
+        ):
+            self.strategy.step_post_backward(
+                self.params, self.optimizers, self.state, step, {}, lr=rate
+            )
+
+
+def _randn_like_in_double(like: Tensor) -> Tensor:
+    return randn_in_double(*like.shape, device=like.device)
+
+
+def _compute_relocation(
+    opacities: Tensor, scales: Tensor, ratios: Tensor, binoms: Tensor
+) -> tuple[Tensor, Tensor]:
+    shares = ratios.clamp(min=1, max=len(binoms)).tolist()
+    made = [relocation(*pair) for pair in zip(opacities.tolist(), shares, strict=True)]
+    shared, factors = torch.tensor(made, dtype=torch.float64).T
+    return shared.float(), (factors[:, None] * scales).float()
+
+
+def _draw_in_double(weights: Tensor, n: int, replacement: bool) -> Tensor:
+    return torch.multinomial(weights.double(), n, replacement=replacement)

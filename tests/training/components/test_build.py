@@ -17,6 +17,8 @@ from xrgs.config import ComponentsConf, DensifyConf, identity_values, is_on
 from xrgs.errors import XrgsError
 from xrgs.splat.gaussians import Gaussians
 from xrgs.splat.settings import DensifySettings
+from xrgs.splat.strategy.default import DefaultStrategy
+from xrgs.splat.strategy.mcmc import MCMCStrategy
 from xrgs.splat.strategy.refinement import Groups, Thresholds
 from xrgs.training import components
 from xrgs.training.components import Component, Components, Step
@@ -28,6 +30,8 @@ from xrgs.training.components.floaters import Floaters
 from xrgs.training.components.gradient_scaling import GradientScaling
 from xrgs.training.components.mip import Mip
 from xrgs.training.components.natural_selection import NaturalSelection
+from xrgs.training.components.noise_weighting import NoiseWeighting
+from xrgs.training.components.regularization import Regularization
 from xrgs.training.components.render_scale import RenderScale
 from xrgs.training.components.resolution_schedule import ResolutionSchedule
 from xrgs.training.components.skip_backward import SkipBackward
@@ -46,15 +50,19 @@ ON: dict[str, tuple[Any, type[Component]]] = {
     "curriculum.lr_only": (5000, Curriculum),
     "render_scale.gamma": (0.25, RenderScale),
     "consistency.weight": (0.1, Consistency),
+    "noise_weighting.floor": (0.25, NoiseWeighting),
     "mip.variance": (0.2, Mip),
     "supersampled.factor": (2, Supersampled),
     "supersampled.late_factor": (2, Supersampled),
+    "formation.widths": ("tag", Supersampled),
     "resolution_schedule.start_share": (0.5, ResolutionSchedule),
     "skip_backward.share": (0.5, SkipBackward),
     "multiview_score.views": (2, MultiviewScore),
     "error_score.of": ("edges", ErrorScore),
     "natural_selection.budget": (0.5, NaturalSelection),
     "exposure.mode": ("gain", Exposure),
+    "regularization.opacity": (0.01, Regularization),
+    "regularization.scale": (0.01, Regularization),
     "floaters.near_share": (0.5, Floaters),
     "floaters.gradient_share": (0.5, Floaters),
     "continuous_weighting.gamma": (1.0, Weighting),
@@ -116,6 +124,25 @@ def test_two_components_with_thresholds_are_refused() -> None:
     assert Components([Component(), densify]).densification_groups(DensifySettings()) is not None
     with pytest.raises(XrgsError, match=r"^components: Densify and Other both set thresholds"):
         Components([densify, Other()]).densification_groups(DensifySettings())
+
+
+def test_components_that_decide_what_grows_are_refused_by_a_strategy_that_draws() -> None:
+    densify = Densify(DensifyConf(decide="per_class", lr_grow=2.0, lr_prune=2.0))
+    ranked = Components([Component(), densify, Other()])
+    ranked.check_strategy("default", DefaultStrategy)
+    Components([Component()]).check_strategy("mcmc", MCMCStrategy)
+    with pytest.raises(XrgsError, match=r"^splat\.strategy=mcmc: .* Densify and Other would"):
+        ranked.check_strategy("mcmc", MCMCStrategy)
+
+
+@pytest.mark.parametrize("key", ["multiview_score.views", "error_score.of"])
+def test_each_component_that_chooses_or_ranks_is_refused_by_name(
+    key: str, build: Build, off: ComponentsConf
+) -> None:
+    value, kind = ON[key]
+    put(off, key, value)
+    with pytest.raises(XrgsError, match=kind.__name__):
+        build(off).check_strategy("mcmc", MCMCStrategy)
 
 
 class Other(Component):
@@ -261,6 +288,9 @@ def test_what_is_imported(module: str, unused: set[str]) -> None:
         ("region_weighting.texture", float("nan")),
         ("hybrid_schedule.ramp", -1),
         ("continuous_weighting.gamma", -0.43),
+        ("noise_weighting.floor", -0.1),
+        ("noise_weighting.floor", 1.1),
+        ("noise_weighting.begin", -1),
         ("mip.variance", -0.2),
         ("mip.every", 0),
         ("mip.until", 0),
@@ -271,6 +301,8 @@ def test_what_is_imported(module: str, unused: set[str]) -> None:
         ("multiview_score.pixels", float("nan")),
         ("error_score.views", 0),
         ("error_score.of", "all"),
+        ("regularization.opacity", -0.01),
+        ("regularization.scale", float("inf")),
         ("natural_selection.budget", -1.0),
         ("natural_selection.budget", float("nan")),
         ("natural_selection.until", 16_000),

@@ -125,8 +125,8 @@ def test_a_render_without_gradients_teaches_nothing() -> None:
 
 def test_the_gain_is_recorded_and_its_extremes_are_named(caplog: pytest.LogCaptureFixture) -> None:
     component, step = exposure(), on_view("low")
-    component.deviations[2, :, :3] = torch.tensor([[0.2, 0, 0], [0, 0.3, 0.1], [0, 0, 0]])
-    component.deviations[0] = -0.1 * torch.eye(3, 4)
+    component.deviations.values[2, :, :3] = torch.tensor([[0.2, 0, 0], [0, 0.3, 0.1], [0, 0, 0]])
+    component.deviations.values[0] = -0.1 * torch.eye(3, 4)
     component.match_colors(noise(12, 15, 3), step)
     assert step.log["exposure.gain"] == pytest.approx(1.2)
     with caplog.at_level(logging.INFO):

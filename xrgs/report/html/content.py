@@ -103,6 +103,8 @@ RULES = (
     "gaussians",
     "duplicated",
     "split",
+    "added",
+    "relocated",
     "pruned_opacity",
     "pruned_scale",
     "pruned_by_components",

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 from functools import cache
+from math import ceil, sqrt
 from typing import Any, NamedTuple
 
 import torch
+from scipy.special import ive
 from torch import Tensor
 
 from xrgs import _native
@@ -20,7 +22,7 @@ class BandedMatrix(NamedTuple):
     weights: Tensor  # [new, taps] float32
 
 
-def resize(image: Tensor, height: int, width: int) -> Tensor:
+def resize(image: Tensor, height: int, width: int, variances: Tensor | None = None) -> Tensor:
     """Resample an image as `xrgs.splat.resample.resize` does; once differentiable.
 
     The gradient is the product with the exact transpose. Image and gradient have the same bits for
@@ -31,6 +33,7 @@ def resize(image: Tensor, height: int, width: int) -> Tensor:
         image: [H, W, 3] float32 on the CPU, of any strides.
         height: Height of the result, px.
         width: Width of the result, px.
+        variances: [2] variances of the blur, down and across, px^2 of `image`; None does not blur.
 
     Returns:
         [height, width, 3]
@@ -39,7 +42,11 @@ def resize(image: Tensor, height: int, width: int) -> Tensor:
         ValueError: `image` is not float32 on the CPU.
     """
     require_float32("image", image)
-    resized: Tensor = _Resize.apply(image, height, width)
+    resized: Tensor
+    if variances is None:
+        resized = _Resize.apply(image, height, width)
+    else:
+        resized = _BlurredResize.apply(image, variances, height, width)
     return resized
 
 
@@ -67,6 +74,65 @@ def banded_matrix(old: int, new: int, *, transposed: bool = False) -> BandedMatr
     return BandedMatrix(first.int(), weights.float().contiguous())
 
 
+class _BlurredAxis:
+    """Blurs an axis and resamples it: `bicubic_matrix(old, new)` times the matrix of the blur.
+
+    The matrices are new for each variance, so they are made as bands, and not kept.
+    """
+
+    def __init__(self, old: int, new: int, variance: float) -> None:
+        """Sample the blur.
+
+        Args:
+            old: Number of samples along the axis before resampling.
+            new: Number of samples after it.
+            variance: Variance of the blur, px^2 before resampling.
+        """
+        self.old, self.new = old, new
+        # exp(-t) I_n(t) at n px, for the variance t. Beyond five standard deviations float32 does
+        # not hold it; a variance far below 1 has longer tails.
+        half = torch.from_numpy(ive(range(ceil(5 * sqrt(variance)) + 4), variance))
+        kernel = torch.cat([half.flip(0)[:-1], half])
+        self.kernel = kernel / kernel.sum()
+        self.matrix = self._resampled(self.kernel)
+
+    def transposed(self) -> BandedMatrix:
+        """Return the transpose [old, new], which the gradient is multiplied by."""
+        first, weights = self.matrix
+        taps = weights.shape[1]
+        column = torch.arange(self.old, dtype=first.dtype)
+        above = torch.searchsorted(first + taps, column, right=True)  # first row with the column
+        below = torch.searchsorted(first, column, right=True)
+        count = int((below - above).max())
+        above = above.clamp_max(self.new - count)
+        row = above[:, None] + torch.arange(count)  # [old, count]
+        tap = column[:, None] - first[row]
+        inside = (tap >= 0) & (tap < taps)
+        transposed = torch.where(inside, weights[row, tap.clamp(0, taps - 1)], 0)
+        return BandedMatrix(above.int(), transposed)
+
+    def slope(self) -> BandedMatrix:
+        """Return the derivative of the matrix by the variance."""
+        # The blur solves the heat equation: its derivative is half its second difference.
+        return self._resampled(torch.nn.functional.pad(self.kernel, (2, 2)).diff(n=2) / 2)
+
+    def _resampled(self, kernel: Tensor) -> BandedMatrix:
+        """The product of resampling and the convolution with a kernel, whose borders reflect."""
+        first, weights = banded_matrix(self.old, self.new)
+        taps, size = weights.shape[1], len(kernel)
+        lag = torch.arange(taps + size - 1) - torch.arange(taps)[:, None]
+        inside = (lag >= 0) & (lag < size)
+        shifted = torch.where(inside, kernel[lag.clamp(0, size - 1)], 0)
+        wide = weights.double() @ shifted  # [new, taps + size - 1]
+        start = first[:, None] - size // 2
+        column = (start + torch.arange(wide.shape[1])) % (2 * self.old)  # the reflections' period
+        column = torch.where(column < self.old, column, 2 * self.old - 1 - column)
+        band = min(wide.shape[1], self.old)
+        start = start.clamp(0, self.old - band)
+        folded = wide.new_zeros(self.new, band).scatter_add_(1, column - start, wide)
+        return BandedMatrix(start[:, 0].int(), folded.float())
+
+
 class _Resize(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, image: Tensor, height: int, width: int) -> Tensor:
@@ -79,6 +145,28 @@ class _Resize(torch.autograd.Function):
     def backward(ctx: Any, v_resized: Tensor) -> tuple[Tensor, None, None]:
         rows, columns = (banded_matrix(*sizes, transposed=True) for sizes in ctx.sizes)
         return _resample(v_resized, rows, columns), None, None
+
+
+class _BlurredResize(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, image: Tensor, variances: Tensor, height: int, width: int) -> Tensor:
+        sizes = zip(image.shape, (height, width), variances.tolist(), strict=False)
+        ctx.axes = [_BlurredAxis(*size) for size in sizes]
+        ctx.save_for_backward(image)
+        return _resample(image, *(axis.matrix for axis in ctx.axes))
+
+    @staticmethod
+    @torch.autograd.function.once_differentiable
+    def backward(ctx: Any, v_resized: Tensor) -> tuple[Tensor, Tensor, None, None]:
+        (image,), (rows, columns) = ctx.saved_tensors, ctx.axes
+        v_image = _resample(v_resized, rows.transposed(), columns.transposed())
+        slopes = (
+            _resample(image, rows.slope(), columns.matrix),
+            _resample(image, rows.matrix, columns.slope()),
+        )
+        # In double: the order in which torch adds depends on the processor and on the threads.
+        sums = [(v_resized * slope).sum(dtype=torch.float64) for slope in slopes]
+        return v_image, torch.stack(sums), None, None
 
 
 def _resample(image: Tensor, rows: BandedMatrix, columns: BandedMatrix) -> Tensor:

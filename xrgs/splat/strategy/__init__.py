@@ -1,5 +1,6 @@
-"""Strategies of densification: what grows, prunes and resets Gaussians during training.
+"""Strategies of densification: what grows, prunes, resets and moves Gaussians during training.
 
-`base.Strategy` is what the training loop calls. `default.DefaultStrategy` is gsplat's default.
-`refinement` has what a strategy is told and what it reports, `ops` what strategies share.
+`base.Strategy` is what the training loop calls. `default.DefaultStrategy` is gsplat's default, and
+`mcmc.MCMCStrategy` its other one. `refinement` has what a strategy is told and what it reports,
+`ops` what strategies share.
 """

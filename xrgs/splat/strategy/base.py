@@ -4,11 +4,14 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
-from typing import Any
+from types import ModuleType
+from typing import Any, ClassVar
 
 import torch
 from torch import Tensor
 
+from xrgs.splat.backend import implementation
+from xrgs.splat.gaussians import PARAMETERS
 from xrgs.splat.optimizer import SplatOptimizer
 from xrgs.splat.settings import DensifySettings
 from xrgs.splat.strategy.refinement import Groups, Refinement, StrategyHooks
@@ -23,12 +26,18 @@ class Strategy(ABC):
 
     - the statistics of the steps since the last refinement,
     - the growth of Gaussians,
-    - pruning and opacity resets,
+    - pruning, opacity resets and other changes that are no steps of the optimizer,
     - the part of a checkpoint that holds all of these.
 
     It adds and removes Gaussians through the optimizer alone, so that Adam's moments follow.
     `DefaultStrategy` shows the loop that calls it.
+
+    Attributes:
+        asks_components: Whether components decide what grows: by `groups`, `StrategyHooks.may_grow`
+            and `StrategyHooks.growth_scores`.
     """
+
+    asks_components: ClassVar[bool] = True
 
     def __init__(
         self,
@@ -81,7 +90,7 @@ class Strategy(ABC):
             width: Width of the render, px.
             height: Height of the render, px.
             group: Group of the view; only read where there are groups.
-            hooks: What components of training decide at this step.
+            hooks: What components of training decide at this step, where `asks_components`.
 
         Returns:
             The counts of what was done.
@@ -113,3 +122,25 @@ class Strategy(ABC):
             KeyError: An entry is missing.
             ValueError: An entry does not fit the groups or the Gaussians.
         """
+
+    @property
+    def _activations(self) -> ModuleType:
+        """The activation functions of the optimizer's backend."""
+        return implementation("activations", self.optimizer.backend)
+
+    def _largest_scale(self) -> Tensor:
+        """Return the largest scale [N] of each Gaussian, world units."""
+        largest: Tensor = self._activations.exp(self.gaussians.scales.amax(dim=-1))
+        return largest
+
+    def _finite(self) -> Tensor:
+        """Return which Gaussians [N] are finite in all parameters and largest scale."""
+        finite = torch.isfinite(self._largest_scale())  # [N]
+        for name in PARAMETERS:
+            finite &= torch.isfinite(self.gaussians[name][..., None]).flatten(1).all(dim=1)
+        return finite
+
+    def _keep(self, mask: Tensor) -> None:
+        """Keep the Gaussians of `mask` [N] and remove all others."""
+        if not mask.all():  # else nothing needs to be copied
+            self.optimizer.keep(mask)

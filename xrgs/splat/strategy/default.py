@@ -13,7 +13,6 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import replace
-from types import ModuleType
 from typing import Any
 
 import torch
@@ -245,13 +244,6 @@ class DefaultStrategy(Strategy):
         self.grad2d_sum = self.gaussians.opacities.new_zeros(count, len(self.gaussians))
         self.visible_count = torch.zeros_like(self.grad2d_sum)
 
-    def _finite(self) -> Tensor:
-        """Return which Gaussians [N] are finite in all parameters and largest scale."""
-        finite = torch.isfinite(self._largest_scale())  # [N]
-        for name in PARAMETERS:
-            finite &= torch.isfinite(self.gaussians[name][..., None]).flatten(1).all(dim=1)
-        return finite
-
     def _deciding_row(self) -> Tensor:
         """Return the first of the G statistics in which each Gaussian [N] is not 0, or the last."""
         has_gradient = self.grad2d_sum > 0  # [G, N]
@@ -329,18 +321,3 @@ class DefaultStrategy(Strategy):
         cap = torch.logit(cap_opacity).to(opacities)
         self.optimizer.reset("opacities", torch.minimum(opacities, cap))
         return int((opacities > cap).sum())
-
-    @property
-    def _activations(self) -> ModuleType:
-        """The activation functions of the optimizer's backend."""
-        return implementation("activations", self.optimizer.backend)
-
-    def _largest_scale(self) -> Tensor:
-        """Return the largest scale [N] of each Gaussian, world units."""
-        largest: Tensor = self._activations.exp(self.gaussians.scales.amax(dim=-1))
-        return largest
-
-    def _keep(self, mask: Tensor) -> None:
-        """Keep the Gaussians of `mask` [N] and remove all others."""
-        if not mask.all():  # else nothing needs to be copied
-            self.optimizer.keep(mask)

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 DECIDE = ("current_view", "per_class", "own_threshold")
 """The values of `Groups.decide`."""
 
-_OPTIONAL = "pruned_by_components"
+_OPTIONAL = ("pruned_by_components", "relocated", "added")
 
 
 @dataclass(frozen=True)
@@ -23,7 +23,7 @@ class Refinement:
     """What a strategy did after a step; all counts are 0 at most steps.
 
     A removed Gaussian is counted once, by the first rule that holds in the order below. So the
-    number of Gaussians grows by exactly `duplicated + split - removed`.
+    number of Gaussians grows by exactly `duplicated + split + added - removed`.
     """
 
     duplicated: int = 0
@@ -41,6 +41,10 @@ class Refinement:
     """Gaussians that components of training chose (`Component.to_prune`)."""
     reset: int = 0
     """Gaussians whose opacity was lowered to the cap."""
+    relocated: int = 0
+    """Transparent Gaussians that were moved to others (`MCMCStrategy`)."""
+    added: int = 0
+    """Gaussians that were added at others (`MCMCStrategy`)."""
     by_group: Mapping[str, int] = field(default_factory=dict)
     """Counts for each group of views, where there are groups. `grown_<group>`: Gaussians above the
     group's growth threshold; one above the thresholds of two groups counts in both.
@@ -54,9 +58,12 @@ class Refinement:
 
     def counts(self) -> dict[str, int]:
         """Return the counts of the rules by their names, then the counts of the groups."""
-        # `pruned_by_components` only where it is not 0: other runs have no column for it.
-        left_out = {"by_group"} if self.pruned_by_components else {"by_group", _OPTIONAL}
-        rules = {name: value for name, value in vars(self).items() if name not in left_out}
+        # Some only where they are not 0: other runs have no column for them.
+        rules = {
+            name: value
+            for name, value in vars(self).items()
+            if name != "by_group" and (value or name not in _OPTIONAL)
+        }
         return rules | dict(self.by_group)
 
 

@@ -2,14 +2,40 @@
 
 from __future__ import annotations
 
+import math
+from functools import cache
+
 import torch
 from torch import Tensor
 
 from xrgs.splat.bicubic import bicubic_matrix
 
 
-def resize(image: Tensor, height: int, width: int) -> Tensor:
+def resize(image: Tensor, height: int, width: int, variances: Tensor | None = None) -> Tensor:
     """Resample as `xrgs.splat.resample.resize` does, in any floating type."""
-    rows = bicubic_matrix(image.shape[0], height).to(image.dtype)  # [height, H]
-    columns = bicubic_matrix(image.shape[1], width).to(image.dtype)  # [width, W]
-    return torch.einsum("ih,hwc,jw->ijc", rows, image, columns)
+    rows = bicubic_matrix(image.shape[0], height)  # [height, H]
+    columns = bicubic_matrix(image.shape[1], width)  # [width, W]
+    if variances is not None:
+        rows, columns = rows @ _blur(rows, variances[0]), columns @ _blur(columns, variances[1])
+    return torch.einsum("ih,hwc,jw->ijc", rows.to(image.dtype), image, columns.to(image.dtype))
+
+
+def _blur(resampled: Tensor, variance: Tensor) -> Tensor:
+    """The blur [size, size] of an axis that a matrix [., size] resamples.
+
+    A blur of the discrete analogue of the Gaussian is the exponential of half the second difference
+    [lindeberg1990], whose eigenvectors are cosines where the borders reflect.
+    """
+    size = resampled.shape[1]
+    frequencies = torch.arange(size, dtype=torch.float64) * (math.pi / size)
+    decay = torch.exp(-variance.double() * (1 - frequencies.cos()))
+    cosines = _cosines(size)
+    return (cosines.T * decay) @ cosines
+
+
+@cache
+def _cosines(size: int) -> Tensor:
+    """The orthonormal discrete cosine transform [frequencies, samples], float64."""
+    frequency, sample = torch.meshgrid(*2 * [torch.arange(size).double()], indexing="ij")
+    waves = torch.cos(math.pi / size * frequency * (sample + 0.5)) * math.sqrt(2 / size)
+    return torch.where(frequency == 0, math.sqrt(1 / size), waves)

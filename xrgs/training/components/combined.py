@@ -18,8 +18,13 @@ if TYPE_CHECKING:
     from xrgs.splat.cameras import Camera
     from xrgs.splat.gaussians import ActivatedGaussians, Gaussians
     from xrgs.splat.settings import DensifySettings
+    from xrgs.splat.strategy.base import Strategy
     from xrgs.splat.strategy.refinement import Groups
     from xrgs.training.components.base import Step, TrainingView, ViewRenderer
+
+
+#: The hooks by which components decide what densification grows.
+_GROWTH = ("densification_groups", "may_grow", "growth_scores")
 
 
 class Components(tuple[Component, ...]):
@@ -112,6 +117,29 @@ class Components(tuple[Component, ...]):
                 " one of them off"
             )
         return next(iter(groups.values()), None)
+
+    def check_strategy(self, name: str, strategy: type[Strategy]) -> None:
+        """Refuse components that decide what grows, for a strategy that does not ask them.
+
+        Args:
+            name: The strategy's name, `splat.strategy` of the config.
+            strategy: Its class.
+
+        Raises:
+            XrgsError: The message names the components.
+        """
+        kinds = [type(component) for component in self]
+        deciding = [
+            kind.__name__
+            for kind in kinds
+            if any(getattr(kind, hook) is not getattr(Component, hook) for hook in _GROWTH)
+        ]
+        if deciding and not strategy.asks_components:
+            raise XrgsError(
+                f"splat.strategy={name}: it draws the Gaussians that grow, which"
+                f" {' and '.join(deciding)} would decide; switch that off, or use"
+                " splat.strategy=default"
+            )
 
     def may_grow(self, gaussians: Gaussians, step: Step) -> Tensor | None:
         """Which Gaussians [N] every component lets grow; None where all of them may."""

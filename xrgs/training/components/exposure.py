@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from xrgs.errors import XrgsError
+from xrgs.training.components.adam import RowAdam
 from xrgs.training.components.base import (
     Component,
     Step,
@@ -24,9 +25,6 @@ if TYPE_CHECKING:
     from xrgs.splat.gaussians import Gaussians
 
 _log = logging.getLogger(__name__)
-
-_BETA1, _BETA2, _EPS = 0.9, 0.999, 1e-8
-"""Adam's decay rates and the term in its denominator, torch's defaults."""
 
 
 class Exposure(Component):
@@ -76,11 +74,8 @@ class Exposure(Component):
         """The views over which the mean map is the identity."""
         self.learned = torch.ones(3, 4) if settings.mode == "affine" else torch.eye(3, 4)
         """1 for a number that is learned, 0 for another [3, 4]."""
-        # In double: the last digits of an update must not depend on the processor.
-        self.deviations, self.first, self.second = torch.zeros(3, len(views), 3, 4).double()
-        """Map less identity, and Adam's two moments of it: [V, 3, 4] each."""
-        self.updates = torch.zeros(len(views), dtype=torch.int64)
-        """The number of updates of each map [V]."""
+        self.deviations = RowAdam(torch.zeros(len(views), 3, 4))
+        """Map less identity."""
         self.drawn: Tensor | None = None
         """The map of the step's view [3, 4], which gets the gradient."""
 
@@ -104,7 +99,7 @@ class Exposure(Component):
 
     def map_of(self, name: str) -> Tensor:
         """Return the map [3, 4] of a photograph, float32."""
-        colors: Tensor = torch.eye(3, 4) + self.deviations[self.names.index(name)]
+        colors: Tensor = torch.eye(3, 4) + self.deviations.values[self.names.index(name)]
         return colors.float()
 
     def match_colors(self, image: Tensor, step: Step) -> Tensor:
@@ -121,18 +116,12 @@ class Exposure(Component):
         if self.drawn is None or self.drawn.grad is None:
             return
         at, settings = self.names.index(step.view.name), self.settings
-        gradient = self.drawn.grad.double() + 2 * settings.prior * self.deviations[at]
-        gradient *= self.learned
-        self.updates[at] += 1
-        count = int(self.updates[at])
-        first, second = self.first[at], self.second[at]
-        first += (1 - _BETA1) * (gradient - first)
-        second += (1 - _BETA2) * (gradient * gradient - second)
+        maps = self.deviations.values
+        gradient = self.drawn.grad.double() + 2 * settings.prior * maps[at]
         rate = settings.lr * settings.lr_final ** (step.number / step.total)
-        spread = (second / (1 - _BETA2**count)).sqrt() + _EPS
-        self.deviations[at] -= rate / (1 - _BETA1**count) * first / spread
+        self.deviations.update(at, gradient * self.learned, rate)
         # Written out: the order in which torch adds depends on the processor.
-        self.deviations -= sum(self.deviations[i] for i in self.reference) / len(self.reference)
+        maps -= sum(maps[i] for i in self.reference) / len(self.reference)
         self.drawn = None
 
     def after_training(self, gaussians: Gaussians) -> None:
@@ -146,16 +135,12 @@ class Exposure(Component):
         )
 
     def state_dict(self) -> dict[str, Any]:
-        """Return the maps, Adam's moments of them, and the numbers of updates."""
-        return {name: getattr(self, name) for name in _STATE}
+        """Return the maps and the state of their optimizer."""
+        return self.deviations.state_dict()
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Restore what `state_dict` returned."""
-        for name in _STATE:
-            getattr(self, name).copy_(state[name])
-
-
-_STATE = ("deviations", "first", "second", "updates")
+        self.deviations.load_state_dict(state)
 
 
 def apply_map(image: Tensor, colors: Tensor) -> Tensor:

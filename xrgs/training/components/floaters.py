@@ -34,38 +34,39 @@ depth of an outlier of SfM."""
 class Floaters(Component):
     """Keeps Gaussians out of the empty space between the cameras and the scene.
 
-    A Gaussian close to a camera covers much of its image and little of any other. Training may put
-    one there to mend errors of that view alone, and it hides the scene in test views from near by.
-    Let z_iv be the depth of Gaussian i in training view v. The SfM points that project into the
-    image of v have a 1st percentile q_v and a median m_v of their depths. There are two guards, and
-    each is off at 0:
+    A Gaussian close to a camera covers much of the camera's image and little of any other image.
+    Training may put one there to lower the loss of that view alone, and it hides the scene from
+    test views near by. Let z_iv be the depth of Gaussian i in training view v. The depths of the
+    SfM points that project into the image of v have the 1st percentile q_v and the median m_v.
+    There are two guards. Each is off where its setting is 0.
 
-    - `near_share`, a: Gaussian i is removed if its mean projects into the image of any training
-      view v with
+    `near_share`, a: Gaussian i is removed if its mean projects into the image of any training view
+    v with
 
-          0 < z_iv < a q_v.
+        0 < z_iv < a q_v.
 
-      This happens at step 0, at every multiple of `splat.densify.every`, after densification too,
-      and at the last step. A near plane for each training view would hide such a Gaussian from that
-      view alone: it would stay in the saved model, where test views, which have no limit of their
-      own, show it. A removed Gaussian is in no view.
-    - `gradient_share`, b: at a step on view v, the gradients of all parameters of Gaussian i and
-      the image-plane gradient, which densification reads, are multiplied by
+    Gaussians are removed at step 0, at every multiple of `splat.densify.every`, after densification
+    too, and at the last step. They are removed from the model rather than left out of the renders
+    of v, because test views have no limit of their own: they would still show them. The training
+    views guard a test view among them, since their near spaces overlap.
 
-          min(1, (z_iv / (b m_v))^2).
+    `gradient_share`, b: at a step on view v, the gradients of all parameters of Gaussian i, and the
+    image-plane gradient that densification reads, are multiplied by
 
-      Gradient scaling for radiance fields [philip2023] multiplies the gradients of each sample of a
-      ray by min(1, d^2), where d is the distance to the camera in units of the scene. Rays sample
-      the space close to a camera more densely, by the inverse of that factor.
+        min(1, (z_iv / (b m_v))^2).
+
+    Gradient scaling for radiance fields [philip2023] multiplies the gradients of each sample on a
+    ray by min(1, d^2), where d is the distance from the camera in units of the scene. The density
+    of a camera's rays falls with d^2, so that the space close to a camera gets the most gradients.
 
     Our choice: the whole of the first guard; in the second, the depth in place of the distance, and
-    b m_v as the unit, so that no unit of the scene has to be tuned. Adam's steps do not depend on
-    the size of a gradient. So the second guard hardly slows a Gaussian that one view alone sees. It
-    leaves a Gaussian that several views see to the farther ones, and densification grows fewer
-    Gaussians close to a camera.
+    the unit b m_v, which follows from each view. Adam's steps do not depend on the size of
+    gradients, so that the second guard hardly slows a Gaussian that one view alone sees. Where
+    several views see a Gaussian, the farther views move it most. Densification, whose threshold is
+    absolute, grows fewer Gaussians close to cameras.
 
     Masks are not read: the space before the scene is empty at hidden pixels too. A view without an
-    SfM point in its image guards nothing.
+    SfM point in its image has no limit and lessens no gradient.
     """
 
     def __init__(
@@ -111,8 +112,7 @@ class Floaters(Component):
     def after_backward(self, gaussians: Gaussians, step: Step) -> None:
         """Multiply the gradients of Gaussians close to the step's camera.
 
-        `floaters.near` records the number of Gaussians that the step would move by a smaller
-        gradient.
+        `floaters.near` records the number of Gaussians with smaller gradients than before.
         """
         if self.settings.gradient_share == 0:
             return

@@ -2,19 +2,27 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Self
+from typing import TYPE_CHECKING, Any, Self
 
 from torch import Tensor
 
 from xrgs.errors import XrgsError
 from xrgs.splat.cameras import Camera
 from xrgs.splat.resample import resize
-from xrgs.training.components.base import Component, Step, TrainingSetup, TrainingView
+from xrgs.training.components.base import (
+    Component,
+    Step,
+    TrainingSetup,
+    TrainingView,
+    check_not_negative,
+)
+from xrgs.training.components.formation import BlurWidths
 
 if TYPE_CHECKING:
-    from xrgs.config import SupersampledConf
+    from xrgs.config import FormationConf, SupersampledConf
+    from xrgs.splat.gaussians import Gaussians
 
 
 @dataclass(frozen=True)
@@ -49,6 +57,9 @@ class Supersampled(Component):
 
     `jpeg` has all the pixels of an HR view, and nothing to supersample.
 
+    With `components.formation`, D is learned in place of that (`BlurWidths`), and acts where k is 1
+    too; a digital zoom comes after it.
+
     k is `factor` before step `late_from` and `late_factor` from there on, so that a run may begin
     or end with direct renders (k = 1). Densification reads the image-plane gradients of the larger
     render in normalised device units, which do not depend on its size. HR views and the evaluation
@@ -65,6 +76,8 @@ class Supersampled(Component):
         degradation: str,
         zoom: int,
         backend: str = "torch",
+        *,
+        blur: FormationConf,
     ) -> None:
         """Find out how the photograph of each LR view was formed.
 
@@ -74,6 +87,7 @@ class Supersampled(Component):
             degradation: What was done to LR views: `downsample`, `digital_zoom`, `none`.
             zoom: With `digital_zoom`, how many times fewer px per side a photograph resolves.
             backend: `torch` or `native`: the implementation of the resampling.
+            blur: `components.formation` of the config.
         """
         self.settings = settings
         self.backend = backend
@@ -88,31 +102,40 @@ class Supersampled(Component):
             for view in views
             if view.tag == "LR"
         }
+        low = [view for view in views if view.tag == "LR"]
+        self.blur = BlurWidths(blur, low) if blur.widths != "none" else None
 
     @classmethod
     def from_settings(cls, settings: SupersampledConf, setup: TrainingSetup) -> Self | None:
-        """Build the component; `factor` and `late_factor` of 1 leave it off.
+        """Build the component; factors of 1 with no `formation.widths` leave it off.
 
         Raises:
-            XrgsError: A factor is below 1, or the variant's LR views are compressed ones.
+            XrgsError: A value is out of its range, or LR views of the variant that are compressed
+                ones shall be supersampled.
         """
+        blur = setup.components.formation
+        if blur.widths not in ("none", "tag", "view"):
+            raise XrgsError(f"components.formation.widths={blur.widths}: must be none, tag or view")
+        for name in ("lr", "prior"):
+            check_not_negative(f"components.formation.{name}", getattr(blur, name))
         for name in ("factor", "late_factor"):
             if (value := getattr(settings, name)) < 1:
                 raise XrgsError(f"components.supersampled.{name}={value}: must be 1 or more")
-        if settings.factor == settings.late_factor == 1:
+        supersamples = not settings.factor == settings.late_factor == 1
+        if not supersamples and blur.widths == "none":
             return None
-        if setup.data.degradation == "jpeg":
+        if supersamples and setup.data.degradation == "jpeg":
             raise XrgsError(
                 "components.supersampled: the LR views of variant.degradation=jpeg have as many"
                 " pixels as HR views; there is nothing to supersample"
             )
         data = setup.data
-        return cls(settings, data.train, data.degradation, data.factor, setup.backend)
+        return cls(settings, data.train, data.degradation, data.factor, setup.backend, blur=blur)
 
     def render_camera(self, camera: Camera, step: Step) -> Camera:
         """Return the camera at k times the size that an LR photograph resolves."""
         formation, factor = self.formations.get(step.view.name), self._factor(step)
-        if formation is None or factor == 1:
+        if formation is None or (factor == 1 and self.blur is None):
             return camera
         step.log["supersampled.factor"] = factor
         small = formation.camera
@@ -121,15 +144,37 @@ class Supersampled(Component):
     def to_photograph(self, image: Tensor, step: Step) -> Tensor:
         """Bring the render [kH, kW, 3] of an LR view down to its photograph's size [H, W, 3]."""
         formation, factor = self.formations.get(step.view.name), self._factor(step)
-        if formation is None or factor == 1:
+        if formation is None or (factor == 1 and self.blur is None):
             return image
-        if self.averages:
+        if self.averages and self.blur is None:
             return _block_means(image, factor)
         small = formation.camera
-        image = resize(image, small.height, small.width, backend=self.backend)
+        variances = None if self.blur is None else self.blur.variances(step, factor)
+        image = resize(image, small.height, small.width, variances=variances, backend=self.backend)
         if (formation.height, formation.width) == (small.height, small.width):
             return image
         return resize(image, formation.height, formation.width, backend=self.backend)
+
+    def after_backward(self, gaussians: Gaussians, step: Step) -> None:
+        """Move the widths of the blur of the step's photograph."""
+        del gaussians
+        if self.blur is not None:
+            self.blur.learn(step)
+
+    def after_training(self, gaussians: Gaussians) -> None:
+        """Log the widths of the blur."""
+        del gaussians
+        if self.blur is not None:
+            self.blur.report()
+
+    def state_dict(self) -> dict[str, Any]:
+        """Return the state of the blur; empty without one."""
+        return {} if self.blur is None else self.blur.state_dict()
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Restore what `state_dict` returned."""
+        if self.blur is not None:
+            self.blur.load_state_dict(state)
 
     def _factor(self, step: Step) -> int:
         late = step.nominal >= self.settings.late_from

@@ -1,0 +1,268 @@
+"""3DGS-MCMC against gsplat's `MCMCStrategy` on the same inputs, and its formulas in float64."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+import torch
+from scipy.integrate import quad
+from torch import Tensor
+
+from tests.splat.scenes import make_optimizer
+from tests.splat.strategy.gsplats import SCENE_SCALE, TheirsMCMC, relocation
+from xrgs.splat.backend import NATIVE_MODULE
+from xrgs.splat.gaussians import PARAMETERS
+from xrgs.splat.settings import STRATEGIES, DensifySettings
+from xrgs.splat.strategy.mcmc import MOST_SHARES, MCMCStrategy, share_out
+from xrgs.splat.strategy.refinement import Groups, Refinement, Thresholds
+from xrgs.training import loop
+
+SETTINGS = DensifySettings(stop=25_000, budget=1.0, noise=5e5)
+NOTHING = torch.zeros(0, dtype=torch.bool)
+
+
+def strategy_of(
+    values: dict[str, Tensor],
+    settings: DensifySettings = SETTINGS,
+    *,
+    most: int = 1000,
+    seed: int = 0,
+    backend: str = "torch",
+) -> MCMCStrategy:
+    """A strategy that adds Gaussians until there are `most`."""
+    return MCMCStrategy(
+        make_optimizer(values, scene_scale=SCENE_SCALE, backend=backend),
+        settings,
+        scene_scale=SCENE_SCALE,
+        generator=torch.Generator().manual_seed(seed),
+        view_pixels=most,
+    )
+
+
+def after_step(strategy: MCMCStrategy, step: int) -> Refinement:
+    return strategy.after_step(step, None, NOTHING, width=40, height=30)
+
+
+def random_values(count: int, rng: np.random.Generator) -> dict[str, Tensor]:
+    """Gaussians of which about a fifth are dead."""
+    values = {
+        "means": rng.normal(size=(count, 3)),
+        "quats": rng.normal(size=(count, 4)),
+        "scales": rng.uniform(np.log(0.003), np.log(0.1), size=(count, 3)),
+        "opacities": rng.uniform(-8, 5, size=count),
+        "sh0": rng.normal(size=(count, 1, 3)),
+        "shN": rng.normal(size=(count, 3, 3)),
+    }
+    return {name: torch.from_numpy(value).float() for name, value in values.items()}
+
+
+def descend(strategy: MCMCStrategy, gradients: dict[str, Tensor]) -> None:
+    for name in PARAMETERS:
+        strategy.gaussians[name].grad = gradients[name].clone()
+    strategy.optimizer.step()
+
+
+def assert_same(ours: MCMCStrategy, theirs: TheirsMCMC) -> None:
+    for name in PARAMETERS:
+        mine, reference = ours.gaussians[name].detach(), theirs.params[name].detach()
+        # Theirs go through float32 between the formulas.
+        torch.testing.assert_close(mine, reference, rtol=1e-5, atol=1e-5)
+        mine_state = ours.optimizer.adam.state[ours.gaussians[name]]
+        for key, value in theirs.optimizers[name].state[theirs.params[name]].items():
+            assert torch.equal(mine_state[key], value), (name, key)
+
+
+@pytest.mark.parametrize("step", [0, 500, 550, 600, 24_900, 25_000, 29_999])
+@pytest.mark.parametrize(("count", "most"), [(4, 5), (100, 1000), (300, 303), (300, 200)])
+def test_a_step_is_gsplats(step: int, count: int, most: int) -> None:
+    rng = np.random.default_rng(step + count)
+    values = random_values(count, rng)
+    ours, theirs = strategy_of(values, most=most), TheirsMCMC(values, SETTINGS, most)
+    gradients = random_values(count, rng)
+    descend(ours, gradients)
+    theirs.descend(gradients)
+    dead = int((torch.sigmoid(ours.gaussians.opacities) <= 0.005).sum())
+    refinement = after_step(ours, step)
+    theirs.densify(step)
+    assert_same(ours, theirs)
+    refines = step in {600, 24_900}
+    added = max(0, min(most, int(1.05 * count)) - count)
+    assert refinement == (Refinement(relocated=dead, added=added) if refines else Refinement())
+    assert len(ours.gaussians) == count + refinement.added
+
+
+@pytest.mark.slow
+def test_a_run_of_600_steps_is_gsplats() -> None:
+    settings = SETTINGS.scaled(600)
+    rng = np.random.default_rng(0)
+    values = random_values(100, rng)
+    ours, theirs = strategy_of(values, settings, most=300), TheirsMCMC(values, settings, 300)
+    relocated = 0
+    for step in range(600):
+        gradients = random_values(len(ours.gaussians), rng)
+        gradients["opacities"] += 3.0  # they fade, and some die
+        gradients["scales"] += 4.0  # about as many grow as shrink
+        descend(ours, gradients)
+        theirs.descend(gradients)
+        relocated += after_step(ours, step).relocated
+        theirs.densify(step)
+        # From the same values again: here steps are compared, not how roundings add up.
+        for name in PARAMETERS:
+            mine, reference = ours.gaussians[name].data, theirs.params[name].data
+            torch.testing.assert_close(mine, reference, rtol=1e-4, atol=1e-4)
+            mine.copy_(reference)
+    assert len(ours.gaussians) == 300
+    assert relocated > 500
+
+
+@pytest.mark.parametrize("opacity", [1e-6, 0.005, 0.1, 0.5, 0.9, 0.999, 1 - 2**-22])
+def test_shares_are_those_of_gsplats_kernel(opacity: float) -> None:
+    shares = torch.arange(1, MOST_SHARES + 1)
+    shared, factors = share_out(torch.full((MOST_SHARES,), opacity).double(), shares)
+    exact = [relocation(torch.tensor(opacity).item(), n) for n in shares.tolist()]
+    expected = torch.tensor(exact, dtype=torch.float64).T
+    torch.testing.assert_close(torch.stack([shared, factors]), expected, rtol=1e-8, atol=0)
+
+
+@pytest.mark.parametrize("opacity", [0.01, 0.3, 0.8, 0.99])
+@pytest.mark.parametrize("shares", [2, 3, 10, 51])
+def test_shares_are_as_opaque_as_the_gaussian_and_have_its_integral(
+    opacity: float, shares: int
+) -> None:
+    of_one = torch.tensor([opacity], dtype=torch.float64)
+    shared, factor = (value.item() for value in share_out(of_one, torch.tensor([shares])))
+
+    def composite(x: float) -> float:
+        return 1 - (1 - shared * math.exp(-0.5 * (x / factor) ** 2)) ** shares
+
+    assert composite(0.0) == pytest.approx(opacity, rel=1e-12)
+    integral, _ = quad(composite, -40, 40, points=[0.0], limit=200)
+    assert integral == pytest.approx(opacity * math.sqrt(2 * math.pi), rel=1e-7)
+
+
+def test_many_shares_and_full_opacity_stay_finite() -> None:
+    opacities = torch.tensor([1.0, 1.0, 0.0, 0.5], dtype=torch.float64)
+    shared, factors = share_out(opacities, torch.tensor([1, 51, 1, 1000]))
+    assert (shared[[0, 1, 3]] > 0).all()
+    assert (shared < 1).all()
+    assert (factors[[0, 1, 3]] > 0).all()
+    assert shared[3] == share_out(opacities[3:], torch.tensor([MOST_SHARES]))[0]
+
+
+@pytest.mark.parametrize("backend", ["torch", "native"])
+def test_noise_is_the_formula_in_float64(backend: str) -> None:
+    if backend == "native":
+        pytest.importorskip(NATIVE_MODULE)
+    values = random_values(500, np.random.default_rng(1))
+    strategy = strategy_of(values, backend=backend, seed=3)
+    after_step(strategy, 1)
+    generator = torch.Generator().manual_seed(3)
+    normal = torch.randn(500, 3, generator=generator, dtype=torch.float64)
+    exact = {name: value.double() for name, value in values.items()}
+    w, x, y, z = torch.nn.functional.normalize(exact["quats"], dim=-1).unbind(-1)
+    # The matrix of v -> q v q*, as two products of quaternions.
+    left = torch.stack([w, -x, -y, -z, x, w, -z, y, y, z, w, -x, z, -y, x, w], -1).view(-1, 4, 4)
+    right = torch.stack([w, x, y, z, -x, w, -z, y, -y, z, w, -x, -z, -y, x, w], -1).view(-1, 4, 4)
+    rotation = (left @ right)[:, 1:, 1:]
+    covariance = rotation @ torch.diag_embed(torch.exp(2 * exact["scales"])) @ rotation.mT
+    opacity = torch.sigmoid(exact["opacities"])
+    size = 5e5 * 1.6e-4 * SCENE_SCALE / (1 + torch.exp(-100 * ((1 - opacity) - 0.995)))
+    expected = exact["means"] + size[:, None] * (covariance @ normal[:, :, None])[..., 0]
+    torch.testing.assert_close(
+        strategy.gaussians.means.detach().double(), expected, rtol=2e-6, atol=2e-6
+    )
+    assert (strategy.gaussians.means != values["means"]).any(dim=1).sum() > 100
+
+
+def test_without_noise_nothing_moves_and_nothing_is_drawn() -> None:
+    values = random_values(20, np.random.default_rng(0))
+    strategy = strategy_of(values, DensifySettings(budget=1.0))
+    before = strategy.generator.get_state()
+    assert after_step(strategy, 1) == Refinement()
+    assert all(torch.equal(strategy.gaussians[name], values[name]) for name in PARAMETERS)
+    assert torch.equal(strategy.generator.get_state(), before)
+
+
+def test_noise_follows_the_rate_of_the_means() -> None:
+    values = random_values(50, np.random.default_rng(0))
+    moves = []
+    for rate in (1.0, 0.25):
+        strategy = strategy_of(values)
+        strategy.optimizer.adam.param_groups[0]["lr"] *= rate
+        after_step(strategy, 1)
+        moves.append((strategy.gaussians.means - values["means"]).norm().item())
+    assert moves[1] == pytest.approx(moves[0] / 4, rel=1e-3)
+
+
+def test_gaussians_that_are_not_finite_are_removed_before_any_is_drawn() -> None:
+    values = random_values(100, np.random.default_rng(0))
+    values["means"][0] = math.nan
+    values["opacities"][1] = math.nan
+    values["scales"][2] = math.inf
+    strategy = strategy_of(values, most=100)
+    refinement = after_step(strategy, 600)
+    assert (refinement.pruned_non_finite, refinement.added) == (3, 3)
+    assert refinement.removed == 3
+    assert all(torch.isfinite(strategy.gaussians[name]).all() for name in PARAMETERS)
+
+
+@pytest.mark.parametrize("opacity", [-8.0, -200.0])
+def test_where_all_are_dead_there_is_nobody_to_move_to(opacity: float) -> None:
+    values = random_values(100, np.random.default_rng(0))
+    values["opacities"].fill_(opacity)
+    refinement = after_step(strategy_of(values), 600)
+    assert refinement.relocated == 0
+    assert refinement.added == (5 if opacity > -100 else 0)
+
+
+def test_without_gaussians_nothing_happens() -> None:
+    values = random_values(0, np.random.default_rng(0))
+    assert after_step(strategy_of(values), 600) == Refinement()
+
+
+def test_removed_gaussians_leave_the_others_as_they_are() -> None:
+    values = random_values(10, np.random.default_rng(0))
+    strategy = strategy_of(values)
+    mask = torch.arange(10) % 3 == 0
+    assert strategy.remove(mask) == 4
+    assert torch.equal(strategy.gaussians.means, values["means"][~mask])
+
+
+def test_a_restored_strategy_draws_what_the_first_one_would() -> None:
+    values = random_values(60, np.random.default_rng(0))
+    first = strategy_of(values, seed=1)
+    after_step(first, 600)
+    again = strategy_of({name: first.gaussians[name].detach() for name in PARAMETERS}, seed=2)
+    again.load_state_dict(first.state_dict())
+    for strategy in (first, again):
+        after_step(strategy, 700)
+    assert all(torch.equal(first.gaussians[name], again.gaussians[name]) for name in PARAMETERS)
+
+
+def test_groups_and_a_missing_budget_are_refused() -> None:
+    optimizer = make_optimizer(random_values(5, np.random.default_rng(0)))
+    with pytest.raises(ValueError, match=r"^settings\.budget must be above 0"):
+        MCMCStrategy(optimizer, DensifySettings(), scene_scale=1.0, generator=torch.Generator())
+    with pytest.raises(ValueError, match=r"^groups: "):
+        MCMCStrategy(
+            optimizer,
+            SETTINGS,
+            scene_scale=1.0,
+            generator=torch.Generator(),
+            groups=Groups({"HR": Thresholds(1.0, 1.0)}, "per_class"),
+        )
+
+
+def test_the_defaults_are_gsplats() -> None:
+    from gsplat.strategy import MCMCStrategy as Reference
+
+    theirs = Reference()
+    assert (theirs.refine_start_iter, theirs.refine_stop_iter) == (SETTINGS.start, SETTINGS.stop)
+    assert (theirs.refine_every, theirs.noise_lr) == (SETTINGS.every, SETTINGS.noise)
+    assert theirs.min_opacity == SETTINGS.prune_opacity
+
+
+def test_every_name_of_a_strategy_has_a_class() -> None:
+    assert tuple(loop.STRATEGIES) == STRATEGIES

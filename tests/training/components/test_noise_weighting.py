@@ -1,0 +1,163 @@
+"""Weights by residuals: against numpy, torch's bicubic kernel in float64 and the likelihood."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from scipy.optimize import minimize_scalar
+from torch import Tensor
+from torch.nn.functional import interpolate
+
+from tests.conftest import composed
+from tests.splat.scenes import noise
+from tests.training.components.conftest import make_view
+from tests.training.conftest import same
+from xrgs.capture.dataset import Dataset, LoadedView
+from xrgs.config import ComponentsConf, NoiseWeightingConf
+from xrgs.errors import XrgsError
+from xrgs.splat.gaussians import Gaussians
+from xrgs.training.components import Components, Step
+from xrgs.training.components.noise_weighting import NoiseWeighting
+from xrgs.training.loop import train
+
+Build = Callable[..., Components]
+NO_GAUSSIANS = Gaussians(*[torch.empty(0)] * 6)
+
+
+def view(name: str, tag: str) -> LoadedView:
+    """A black view of 60 x 75 px, or of 12 x 15."""
+    size, rho = ((60, 75), 1.0) if tag == "HR" else ((12, 15), 0.2)
+    return replace(make_view(tag, torch.zeros(*size, 3).double()), name=name, rho=rho)
+
+
+VIEWS = {
+    v.name: v for v in (view("h0", "HR"), view("h1", "HR"), view("l0", "LR"), view("l1", "LR"))
+}
+
+
+def weighting(floor: float = 0.1) -> NoiseWeighting:
+    return NoiseWeighting(NoiseWeightingConf(floor=floor, begin=15_000), [*VIEWS.values()])
+
+
+def take(
+    component: NoiseWeighting, name: str, residual: Tensor | float, number: int = 0
+) -> tuple[float, dict[str, float]]:
+    """The factor of the loss at a step of 100 with that residual, and the step's log."""
+    step = Step(number, 100, VIEWS[name])
+    image = torch.as_tensor(residual).expand(*step.view.image.shape)
+    loss = component.modify_loss(torch.tensor(2.0), image, NO_GAUSSIANS, step)
+    return loss.item() / 2, step.log
+
+
+def test_the_weight_is_the_ratio_of_mean_squared_residuals() -> None:
+    component = weighting()
+    for name, residual in (("h0", 0.1), ("h1", 0.3), ("l0", 0.5), ("l1", 0.2)):
+        factor, log = take(component, name, residual)
+        assert factor == 1  # before `begin`
+        tag = VIEWS[name].tag
+        assert log == {f"noise_weighting.residual_{tag}": pytest.approx(residual)}
+    # (0.1^2 + 0.3^2) / 2 is 0.05, over 0.25 and over 0.04.
+    assert component.weight("l0") == pytest.approx(0.2)
+    assert component.weight("l1") == 1
+    factor, log = take(component, "l0", 0.5, number=50)
+    assert factor == pytest.approx(0.2)
+    assert log["noise_weighting.LR"] == pytest.approx(0.2)
+    assert take(component, "h1", 0.3, number=50)[0] == 1
+    take(component, "l0", 50.0, number=50)
+    assert component.weight("l0") == 0.1  # the floor
+
+
+def test_the_mean_squared_residual_is_the_variance_of_the_highest_likelihood() -> None:
+    residual = noise(12, 15, 3) - 0.4
+    squares = residual.square().sum().item()
+    count = residual.numel()
+    best = minimize_scalar(
+        lambda s: count / 2 * np.log(s) + squares / (2 * s), bounds=(1e-3, 1.0), method="bounded"
+    )
+    component = weighting()
+    take(component, "l0", residual)
+    assert component.residuals["l0"] == pytest.approx(best.x, rel=1e-4)
+
+
+def test_residuals_are_compared_at_the_lowest_sampling_rate() -> None:
+    component, residual = weighting(), noise(60, 75, 4) - 0.5
+    take(component, "h0", residual)
+    small = interpolate(residual.permute(2, 0, 1)[None], (12, 15), mode="bicubic", antialias=True)
+    assert component.residuals["h0"] == pytest.approx(small.square().mean().item(), rel=1e-9)
+    assert component.residuals["h0"] < 0.1 * residual.square().mean().item()
+
+
+def test_a_reduced_view_is_compared_at_the_same_rate() -> None:
+    """As `resolution_schedule` makes them early."""
+    component = weighting()
+    reduced = replace(make_view("HR", torch.zeros(30, 38, 3).double()), name="h0")
+    image = torch.full((30, 38, 3), 0.3).double()
+    component.modify_loss(torch.tensor(1.0), image, NO_GAUSSIANS, Step(0, 100, reduced))
+    assert component.residuals["h0"] == pytest.approx(0.09)
+
+
+def test_the_mean_is_over_about_ten_steps_on_the_view() -> None:
+    component = weighting()
+    expected = 0.0
+    for count in range(1, 31):
+        residual = 1 / count
+        take(component, "l0", residual)
+        take(component, "l1", 0.7)
+        expected += (residual**2 - expected) * max(1 / count, 0.1)
+        assert component.residuals["l0"] == pytest.approx(expected)
+    assert component.residuals["l1"] == pytest.approx(0.49)
+
+
+def test_pixels_outside_the_mask_do_not_count() -> None:
+    component = weighting()
+    mask = torch.zeros(12, 15, dtype=torch.bool)
+    mask[:4] = True
+    masked = replace(VIEWS["l0"], mask=mask)
+    # The render is the photograph there.
+    image = torch.where(mask[..., None], 0.3, 0.0).expand(12, 15, 3).double()
+    component.modify_loss(torch.tensor(1.0), image, NO_GAUSSIANS, Step(0, 100, masked))
+    assert component.residuals["l0"] == pytest.approx(0.09)
+
+
+def test_a_perfect_render_and_a_view_before_any_hr_view_weigh_1() -> None:
+    component = weighting()
+    take(component, "l0", 0.0)
+    take(component, "l1", 0.5)
+    assert component.weight("l0") == component.weight("l1") == 1
+
+
+def test_it_needs_an_hr_view(build: Build, off: ComponentsConf) -> None:
+    off.noise_weighting.floor = 0.25
+    with pytest.raises(
+        XrgsError, match=r"^components\.noise_weighting\.floor=0\.25: .* no HR view"
+    ):
+        build(off, view("l0", "LR"))
+
+
+@pytest.fixture
+def noisy(data: Dataset) -> Dataset:
+    """The views of `data`, with an LR view of noise."""
+    *others, last = data.train
+    return replace(data, train=(*others, replace(last, pixels=noise(12, 12, 5).float())))
+
+
+def test_a_noisy_photograph_weighs_less_in_training(
+    noisy: Dataset, caplog: pytest.LogCaptureFixture
+) -> None:
+    settings = ("train.steps=300", "splat.backend=auto", "splat.densify.stop=15000")
+    with caplog.at_level(logging.INFO):
+        result = train(noisy, composed(*settings, "+ablation=noise_weighting"))
+    assert (
+        "noise_weighting: the weights of the LR photographs are 0.250 (v3) to 1.000 (v1)"
+        in caplog.text
+    )
+    before, after = result.history[:150], result.history[150:]
+    assert {row["noise_weighting.LR"] for row in before} == {None}
+    weights = {row["view"]: row["noise_weighting.LR"] for row in after}
+    assert weights == {"v0": None, "v1": 1, "v2": None, "v3": 0.25}
+    assert not same(result.gaussians, train(noisy, composed(*settings)).gaussians)
