@@ -250,12 +250,17 @@ def test_lr_views_of_other_kernels_are_smaller(mix: Mix, given: list[list[str]],
     assert given[0] == expected
 
 
+@pytest.mark.parametrize(("degradation", "said"), [("auto", True), ("digital_zoom", False)])
 def test_the_blur_of_lr_views_is_in_the_report_and_said(
-    mix: Mix, monkeypatch: pytest.MonkeyPatch
+    mix: Mix, monkeypatch: pytest.MonkeyPatch, degradation: str, *, said: bool
 ) -> None:
+    """A view that was zoomed on purpose is blurry on purpose."""
     monkeypatch.setattr(mixing, "lr_blur", lambda _: 0.87)
-    made = mix(hr_fraction=0.5)
+    made = mix(hr_fraction=0.5, degradation=degradation)
     assert made.report["lr_blur"] == 0.87
+    if not said:
+        assert made.report["notes"] == []
+        return
     (note,) = made.report["notes"]
     assert note.startswith("LR photographs are blurrier than their pixels: by a Gaussian of 0.87")
 

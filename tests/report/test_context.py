@@ -42,10 +42,12 @@ def test_what_differs_among_cells_is_listed(made: Any) -> None:
     configured(made.add())
     other = {"densify": {"prune_scale3d": 10.0}}
     configured(made.add("keep_large"), splat=other)
+    configured(made.add("mcmc"), splat={"strategy": "mcmc"})
     configured(made.add(scene="leaves"), train={"steps": 500})
     text = found(made)[""].of_scores
     assert "3,000 or 500 steps" in text
     assert "0.1 (baseline), 10 (keep_large) times the scene's scale" in text
+    assert "are pruned, and none for their size in mcmc" in text
     assert "2 test views a scene" in text
 
 

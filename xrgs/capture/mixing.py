@@ -19,7 +19,7 @@ import numpy as np
 from xrgs.capture import images, poses, registration, sampling, triangulation
 from xrgs.capture.alignment import pose_error
 from xrgs.capture.blur import blur_notes, lr_blur
-from xrgs.capture.degradations import resolve_degradation
+from xrgs.capture.degradations import DEGRADATIONS, resolve_degradation
 from xrgs.capture.lens import Lens
 from xrgs.capture.photographs import PhotoCollection, prepare_hr_views, write_degraded
 from xrgs.capture.registration import Registration
@@ -98,9 +98,9 @@ def mix_resolutions(scene: Scene, conf: VariantConf, work: Path, out: Path) -> V
     views, hidden = _write_undistorted(inputs, model, depths, out)
     views = _with_needs(inputs, views, model.points)
     tags, masked = _tags_report(inputs, views), _mask_report(views)
-    blur = lr_blur(views)
-    notes = [*report["notes"], *tags["notes"], *hidden, *masked["notes"], *blur_notes(blur)]
-    report |= tags | masked | {"lr_blur": blur, "notes": notes}
+    blurred = _blur_report(conf, views)
+    notes = [*report["notes"], *tags["notes"], *hidden, *masked["notes"], *blurred["notes"]]
+    report |= tags | masked | blurred | {"notes": notes}
     report["seconds"] = round(time.perf_counter() - start, 1)
     held_out = bool(inputs.split.test)
     return Variant(
@@ -342,6 +342,14 @@ def _mask_report(views: tuple[View, ...]) -> dict[str, Any]:
         "masked": shares,
         "notes": [f"masks hide so much of the pixels: {said}"] if said else [],
     }
+
+
+def _blur_report(conf: VariantConf, views: tuple[View, ...]) -> dict[str, Any]:
+    """Report the blur of LR views, and whether they are blurrier than their pixels."""
+    blur, degradation = lr_blur(views), DEGRADATIONS.get(resolve_degradation(conf))
+    # A degradation that keeps the size of views takes their detail on purpose.
+    expected = degradation is not None and not degradation.smaller
+    return {"lr_blur": blur, "notes": [] if expected else blur_notes(blur)}
 
 
 def _write_undistorted(

@@ -140,15 +140,20 @@ def _mixture(variant: VariantConf) -> str:
 def _prune_rule(configs: Iterable[tuple[str, Conf | None]]) -> list[str]:
     """Return a phrase on the rule against large Gaussians, with the labels where they differ."""
     by_value: dict[str, dict[str, None]] = {}  # with the labels in order
+    without_rule: dict[str, None] = {}
     for label, config in configs:
-        if config:
+        if config and config.splat.strategy == "default":
             value = _shown(config.splat.densify.prune_scale3d)
             by_value.setdefault(value, {})[label] = None
+        elif config:
+            without_rule[label] = None
     if not by_value:
         return []
     several = len(by_value) > 1
     each = (f"{v} ({', '.join(found)})" if several else v for v, found in by_value.items())
     phrase = f"Gaussians above {', '.join(each)} times the scene's scale are pruned"
+    if without_rule:
+        phrase += f", and none for their size in {', '.join(without_rule)}"
     return [for_line(phrase, _MAX_SENTENCE)]
 
 

@@ -1,4 +1,4 @@
-"""Rotation matrices of quaternions."""
+"""Rotations by quaternions."""
 
 from __future__ import annotations
 
@@ -37,3 +37,10 @@ def rotation_matrices(quats: Tensor) -> Tensor:
         *(2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)),
     ]
     return torch.stack(entries, dim=-1).reshape(-1, 3, 3)
+
+
+def rotate(quats: Tensor, vectors: Tensor) -> Tensor:
+    """Rotate vectors [..., M, 3] by quaternions [M, 4] of any length."""
+    # Written out, since the order in which torch adds depends on the processor.
+    first, second, third = (rotation_matrices(quats) * vectors[..., None, :]).unbind(-1)
+    return first + second + third

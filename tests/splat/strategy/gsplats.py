@@ -14,6 +14,7 @@ import torch
 from gsplat.cuda._torch_impl import _quat_scale_to_covar_preci
 from gsplat.strategy import DefaultStrategy, MCMCStrategy
 from gsplat.strategy.ops import reset_opa
+from gsplat.utils import normalized_quat_to_rotmat
 from torch import Tensor
 
 from xrgs.splat.gaussians import PARAMETERS
@@ -150,15 +151,21 @@ class TheirsMCMC(Trainer):
             patch("gsplat.strategy.ops.compute_relocation", _compute_relocation),
             patch("gsplat.strategy.ops.quat_scale_to_covar_preci", _quat_scale_to_covar_preci),
             patch("gsplat.strategy.ops._multinomial_sample", _draw_in_double),
-            patch("torch.randn_like", _randn_like_in_double),
+            patch("torch.randn_like", self._noise),
         ):
             self.strategy.step_post_backward(
                 self.params, self.optimizers, self.state, step, {}, lr=rate
             )
 
-
-def _randn_like_in_double(like: Tensor) -> Tensor:
-    return randn_in_double(*like.shape, device=like.device)
+    def _noise(self, means: Tensor) -> Tensor:
+        """As ours: only where it matters, and drawn along the axes of the Gaussians."""
+        exponents = -100 * ((1 - torch.sigmoid(self.params["opacities"])) - 0.995)
+        moving = 1 / (1 + torch.exp(exponents)) > 2**-24
+        noise = torch.zeros_like(means)
+        drawn = randn_in_double(int(moving.sum()), 3, device=means.device)
+        quats = torch.nn.functional.normalize(self.params["quats"][moving], dim=-1)
+        noise[moving] = torch.einsum("nij,nj->ni", normalized_quat_to_rotmat(quats), drawn)
+        return noise
 
 
 def _compute_relocation(

@@ -13,8 +13,11 @@ from xrgs.capture.dataset import Dataset, LoadedView
 from xrgs.config import ComponentsConf, Conf
 from xrgs.splat.cameras import Camera
 from xrgs.splat.gaussians import PARAMETERS, Gaussians
+from xrgs.splat.settings import RasterSettings
 from xrgs.training import components
 from xrgs.training.components import Components, Step
+from xrgs.training.recorder import TrainingRecorder
+from xrgs.training.rendering import StepRenderer
 
 FACTOR = 5
 
@@ -25,6 +28,12 @@ def make_view(tag: str, image: Tensor) -> LoadedView:
     K = torch.tensor([[1.2 * width, 0, width / 2], [0, 1.2 * width, height / 2], [0, 0, 1]])
     camera = Camera(torch.eye(4), K, width, height)
     return LoadedView(tag.lower(), tag, camera, image, need=FACTOR if tag == "LR" else 1)
+
+
+def renderer_of(parts: Components) -> StepRenderer:
+    """Renders as training does, on the torch backend."""
+    recorder = TrainingRecorder(30_000, 0.0, [])
+    return StepRenderer(parts, RasterSettings(sh_degree=0), 1000, "torch", recorder)
 
 
 @pytest.fixture
@@ -87,3 +96,19 @@ def gradients(gaussians: Gaussians) -> dict[str, Tensor]:
     """A copy of the gradients of `gaussians`, by parameter."""
     parameters = {name: gaussians[name] for name in PARAMETERS}
     return {name: p.grad.clone() for name, p in parameters.items() if p.grad is not None}
+
+
+@pytest.fixture
+def shown() -> Gaussians:
+    """Eight small Gaussians in front of the cameras of `views`, float64."""
+    generator = torch.Generator().manual_seed(4)
+    means = torch.rand(8, 3, generator=generator).double() * torch.tensor([1.4, 1.0, 0.5])
+    values = {
+        "means": means + torch.tensor([-0.7, -0.5, 2.0]),
+        "quats": torch.randn(8, 4, generator=generator).double(),
+        "scales": torch.rand(8, 3, generator=generator).double() - 3,
+        "opacities": torch.randn(8, generator=generator).double() + 1,
+        "sh0": torch.randn(8, 1, 3, generator=generator).double(),
+        "shN": torch.zeros(8, 0, 3).double(),
+    }
+    return Gaussians(**values)

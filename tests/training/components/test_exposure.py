@@ -13,7 +13,7 @@ from torch import Tensor
 
 from tests.conftest import composed
 from tests.splat.scenes import noise
-from tests.training.components.conftest import make_view
+from tests.training.components.conftest import make_view, renderer_of
 from xrgs.capture.dataset import Dataset, LoadedView
 from xrgs.config import ComponentsConf, ExposureConf
 from xrgs.splat.gaussians import Gaussians
@@ -121,6 +121,34 @@ def test_a_render_without_gradients_teaches_nothing() -> None:
     component.after_backward(Gaussians(*[torch.empty(0)] * 6), step)
     assert torch.equal(component.map_of("low"), torch.eye(3, 4))
     assert step.log == {}
+
+
+@pytest.mark.parametrize("tag", ["HR", "LR"])
+def test_all_that_compares_colours_sees_them_as_the_photograph_has_them(
+    build: Build, on: ComponentsConf, views: dict[str, LoadedView], shown: Gaussians, tag: str
+) -> None:
+    """A photograph that is a render in other colours has no loss under its own map."""
+    on.consistency.weight, on.noise_weighting.floor = 1.0, 0.1
+    on.supersampled.factor = on.supersampled.late_factor = 2
+    colors = torch.eye(3, 4) + 0.2 * torch.randn(3, 4, generator=torch.Generator().manual_seed(6))
+    render = renderer_of(build(on)).photograph(shown, Step(0, 100, views[tag]))
+    image = torch.einsum("ij,hwj->hwi", colors[:, :3].double(), render) + colors[:, 3]
+    views[tag] = replace(views[tag], pixels=image)
+    parts = build(on, *views.values())
+    (component,) = (part for part in parts if isinstance(part, Exposure))
+    for learned in (True, False):
+        step = Step(0, 100, views[tag])
+        component.deviations.values[:] = (colors - torch.eye(3, 4)) * learned
+        mapped = renderer_of(parts).photograph(shown, step)
+        assert ((mapped - image).abs().max() < 1e-6) == learned
+        loss = parts.modify_loss(torch.zeros(()).double(), mapped, shown, step).item()
+        residual = step.log[f"noise_weighting.residual_{tag}"]
+        if learned:
+            assert loss < 1e-5
+            assert residual < 1e-6
+        else:
+            assert loss > 0.01
+            assert residual > 0.01
 
 
 def test_the_gain_is_recorded_and_its_extremes_are_named(caplog: pytest.LogCaptureFixture) -> None:

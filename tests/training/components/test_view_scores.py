@@ -13,6 +13,7 @@ from torch import Tensor
 
 from tests.conftest import composed as compose
 from tests.splat.scenes import noise
+from tests.training.components.conftest import renderer_of
 from xrgs.capture.dataset import Dataset, LoadedView
 from xrgs.config import ComponentsConf
 from xrgs.splat.attribution import attribute_pixels
@@ -22,38 +23,15 @@ from xrgs.splat.settings import RasterSettings
 from xrgs.training.components import Component, Components, Step
 from xrgs.training.components.view_scores import ErrorScore, edges
 from xrgs.training.loop import train
-from xrgs.training.recorder import TrainingRecorder
-from xrgs.training.rendering import StepRenderer
 
 Build = Callable[..., Components]
 Scores = Callable[..., Tensor]
 
 
 @pytest.fixture
-def shown() -> Gaussians:
-    """Eight small Gaussians in front of the cameras of `views`, float64."""
-    generator = torch.Generator().manual_seed(4)
-    means = torch.rand(8, 3, generator=generator).double() * torch.tensor([1.4, 1.0, 0.5])
-    values = {
-        "means": means + torch.tensor([-0.7, -0.5, 2.0]),
-        "quats": torch.randn(8, 4, generator=generator).double(),
-        "scales": torch.rand(8, 3, generator=generator).double() - 3,
-        "opacities": torch.randn(8, generator=generator).double() + 1,
-        "sh0": torch.randn(8, 1, 3, generator=generator).double(),
-        "shN": torch.zeros(8, 0, 3).double(),
-    }
-    return Gaussians(**values)
-
-
-@pytest.fixture
 def fine(views: dict[str, LoadedView]) -> list[LoadedView]:
     """The HR view, and the LR view with its sampling rate."""
     return [views["HR"], replace(views["LR"], rho=0.2)]
-
-
-def renderer_of(parts: Components) -> StepRenderer:
-    recorder = TrainingRecorder(30_000, 0.0, [])
-    return StepRenderer(parts, RasterSettings(sh_degree=0), 1000, "torch", recorder)
 
 
 def ready(parts: Components) -> Components:

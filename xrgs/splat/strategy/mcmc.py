@@ -16,7 +16,7 @@ from torch import Tensor
 
 from xrgs.splat.gaussians import PARAMETERS
 from xrgs.splat.optimizer import SplatOptimizer
-from xrgs.splat.quaternions import rotation_matrices
+from xrgs.splat.quaternions import rotate
 from xrgs.splat.settings import DensifySettings
 from xrgs.splat.strategy.base import NO_HOOKS, Strategy
 from xrgs.splat.strategy.ops import gaussians_of
@@ -30,6 +30,8 @@ _OPAQUE = 1 - 2**-23
 """Gaussians with a higher opacity are shared out as if they had this one."""
 _NOISE_STEEPNESS, _NOISE_OPACITY = 100, 0.995
 """Noise falls off around an opacity of 1 - 0.995, as a logistic function with this slope."""
+_LEAST_NOISE = 2**-24
+"""Gaussians with a smaller share of the noise, of an opacity above 0.17, stay where they are."""
 
 _COEFFICIENTS = torch.tensor(
     [
@@ -66,7 +68,8 @@ class MCMCStrategy(Strategy):
     (`xrgs.training.components.regularization`), without which few Gaussians die.
 
     Ours: the budget is in Gaussians for each pixel of the largest training view, where gsplat has a
-    number. Gaussians that are not finite are removed at refinements, and grow again.
+    number. Gaussians that are not finite are removed at refinements, and grow again. Gaussians with
+    an opacity above 0.17 get no noise, where gsplat's is below 6e-8 of s C e, which saves time.
     """
 
     asks_components: ClassVar[bool] = False
@@ -189,18 +192,15 @@ class MCMCStrategy(Strategy):
         if not size:
             return
         gaussians, activations = self.gaussians, self._activations
-        # In double, since the numbers that torch draws in float32 depend on the processor.
-        normal = torch.randn(len(gaussians), 3, generator=self.generator, dtype=torch.float64)
-        exponent = _NOISE_STEEPNESS * ((1 - self._opacities()) - _NOISE_OPACITY)
-        sizes = activations.logistic(exponent) * size  # [N]
-        noise = normal.to(gaussians.means) * sizes[:, None]
-        axes = rotation_matrices(gaussians.quats)  # [N, 3, 3]
-        variances = activations.exp(gaussians.scales).square()  # [N, 3]
-        # C e = R diag(variances) R^T e. Sums are written out, since the order in which torch adds
-        # depends on the processor.
-        x, y, z = (axes * noise[:, :, None]).unbind(1)  # [N, 3] each
-        first, second, third = (axes * ((x + y + z) * variances)[:, None, :]).unbind(2)
-        gaussians.means += first + second + third
+        exponents = _NOISE_STEEPNESS * ((1 - self._opacities()) - _NOISE_OPACITY)
+        shares = activations.logistic(exponents)  # [N]
+        moving = (shares > _LEAST_NOISE).nonzero()[:, 0]  # [M]
+        # In double, since the numbers that torch draws in float32 depend on the processor. C e is
+        # R S^2 (R' e), and R' e is as normal as e: it is drawn along the axes of the Gaussian.
+        normal = torch.randn(len(moving), 3, generator=self.generator, dtype=torch.float64)
+        variances = activations.exp(gaussians.scales[moving]).square()  # [M, 3]
+        noise = normal.to(variances) * variances * (shares[moving] * size)[:, None]
+        gaussians.means[moving] += rotate(gaussians.quats[moving], noise)
 
     def _opacities(self) -> Tensor:
         """Return the opacity [N] of each Gaussian."""

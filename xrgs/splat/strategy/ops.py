@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from xrgs.splat.quaternions import rotation_matrices
+from xrgs.splat.quaternions import rotate, rotation_matrices
 
 SPLIT_SHRINK = 1.6
 """The scales of a Gaussian split at random are divided by this in its two halves [kerbl2023,
@@ -97,10 +97,7 @@ def split_at_random(
     """
     # In double, since the numbers that torch draws in float32 depend on the processor.
     noise = torch.randn(2, len(scales), 3, generator=generator, dtype=torch.float64)
-    along_axes = (noise.to(scales) * scales)[..., None, :]  # [2, M, 1, 3]
-    # [2, M, 3] each; written out, since the order in which torch adds depends on the processor.
-    first, second, third = (rotation_matrices(old["quats"]) * along_axes).unbind(-1)
-    offsets = first + second + third
+    offsets = rotate(old["quats"], noise.to(scales) * scales)  # [2, M, 3]
     halves = {name: torch.cat([value, value]) for name, value in old.items()}
     halves["means"] = (old["means"] + offsets).reshape(-1, 3)
     halves["scales"] = (old["scales"] - math.log(SPLIT_SHRINK)).repeat(2, 1)

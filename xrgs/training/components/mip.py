@@ -56,12 +56,13 @@ class Mip(Component):
     seen, nothing is filtered. The filter becomes part of the scales and opacities that are
     evaluated and saved.
 
-    The rates are those of the photographs. `supersampled` and `resolution_schedule` render other
-    sizes, which changes nothing in what a photograph resolves, and nothing in the filter.
+    The rates are those of the photographs. `supersampled`, `formation` and `resolution_schedule`
+    render other sizes, which changes nothing in what a photograph resolves, and nothing in the
+    filter.
 
-    Ours: before step `until` the filter becomes part of the trained scales and opacities, and
-    training goes on without it. The render is the same before and after. Without the opacities'
-    factor every Gaussian would become more opaque at that step.
+    Ours: training goes on without the filter from step `until` on. Just before that step the filter
+    becomes part of the trained scales and opacities, and the render stays the same. If the filter
+    were dropped, every Gaussian would become smaller and more opaque at that step.
 
     Attributes:
         variance: [N] variance of each Gaussian's filter, s / nu_k^2, in world units squared.
@@ -137,6 +138,8 @@ class Mip(Component):
     def after_step(self, gaussians: Gaussians, step: Step) -> None:
         """Make the filter part of the Gaussians before step `until`."""
         if not self.baked and replace(step, number=step.number + 1).nominal >= self.until:
+            # Adam's moments stay as they are. Scaled by the chain rule they gave no better result
+            # (fern, 252 px, 500 steps, keep_large and mip, one seed: 23.28 dB against 23.37).
             self.bake(gaussians)
             self.baked = True
 
