@@ -5,6 +5,7 @@ contiguous.
 """
 
 from collections.abc import Sequence
+from typing import Any
 
 from torch import Tensor
 
@@ -37,21 +38,7 @@ def adam_step(
     beta2: float,
     eps: float,
     threads: int,
-) -> None: ...
-def adam_step_sh_rest(
-    parameter: Tensor,
-    exp_avg: Tensor,
-    exp_avg_sq: Tensor,
-    means: Tensor,
-    sh0_gradient: Tensor,
-    camera_position: Sequence[float],
-    sh_degree: int,
-    lr: float,
-    step: float,
-    beta1: float,
-    beta2: float,
-    eps: float,
-    threads: int,
+    harmonics: tuple[Any, ...] | None = None,
 ) -> None: ...
 def accumulate_grad2d(
     means2d_grad: Tensor,

@@ -244,6 +244,14 @@ void check_transposes() {
     expect_floats("load_quadruples", parts[k], [&](int i) { return numbers[4 * i + k]; });
   store_quadruples(written, parts[0], parts[1], parts[2], parts[3]);
   for (int i = 0; i < 4 * kLanes; ++i) expect(written[i] == numbers[i], "store_quadruples", i);
+  parts[0] = repeat_thrice<0>(numbers), parts[1] = repeat_thrice<1>(numbers);
+  parts[2] = repeat_thrice<2>(numbers);
+  for (int k = 0; k < 3; ++k)
+    expect_floats("repeat_thrice", parts[k], [&](int i) { return numbers[(kLanes * k + i) / 3]; });
+  parts[0] = repeat_triple<0>(numbers), parts[1] = repeat_triple<1>(numbers);
+  parts[2] = repeat_triple<2>(numbers);
+  for (int k = 0; k < 3; ++k)
+    expect_floats("repeat_triple", parts[k], [&](int i) { return numbers[(kLanes * k + i) % 3]; });
 }
 
 int run() {

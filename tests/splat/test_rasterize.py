@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from tests.splat.scenes import make_camera, make_scene
-from xrgs.splat.rendering import Render, rasterize_parameters
+from xrgs.splat.rendering import Render, rasterize_parameters, zero_means2d_offset
 from xrgs.splat.settings import RasterSettings
 
 NAMES = ("means", "quats", "scales", "opacities", "sh0", "shN")
@@ -49,6 +49,16 @@ def test_an_offset_of_zero_changes_nothing(backend: str) -> None:
     assert torch.equal(
         draw(backend=backend, means2d_offset=torch.zeros(6, 2)).image, draw(backend=backend).image
     )
+
+
+def test_an_offset_of_zeros_without_memory_gathers_the_same_gradient(backend: str) -> None:
+    offsets = zero_means2d_offset(6), torch.zeros(6, 2, requires_grad=True)
+    for offset in offsets:
+        torch.autograd.backward(draw(backend=backend, means2d_offset=offset).image.square().sum())
+    assert offsets[0].grad is not None
+    assert offsets[1].grad is not None
+    assert offsets[0].grad.any()
+    assert torch.equal(offsets[0].grad, offsets[1].grad)
 
 
 @pytest.mark.parametrize("name", [*NAMES, "means2d_offset"])

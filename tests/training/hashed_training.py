@@ -51,6 +51,7 @@ _DEFAULT = (
     "components.noise_weighting.floor=0.25",
     "components.noise_weighting.begin=12000",
     "components.mip.variance=0.2",
+    "components.formation.widths=tag",
     "components.exposure.mode=affine",
     "components.floaters.near_share=0.95",
     "components.floaters.gradient_share=0.8",

@@ -18,7 +18,7 @@ from xrgs.bench.timing import Row, time_interleaved, use_threads
 from xrgs.splat.gaussians import PARAMETERS, Gaussians
 from xrgs.splat.loss import photometric_loss, prepare_target
 from xrgs.splat.optimizer import SplatOptimizer
-from xrgs.splat.rendering import rasterize_parameters
+from xrgs.splat.rendering import rasterize_parameters, zero_means2d_offset
 from xrgs.splat.settings import DensifySettings, OptimizerSettings, RasterSettings
 from xrgs.splat.strategy.default import DefaultStrategy
 
@@ -59,7 +59,7 @@ class TrainingStep:
         """Activate the parameters and render."""
         with use_threads(self.threads):
             self.optimizer.zero_grad()
-            self.offset = torch.zeros(len(self.gaussians), 2, requires_grad=True)
+            self.offset = zero_means2d_offset(len(self.gaussians))
             self.rendered = rasterize_parameters(
                 *self.gaussians.activated(backend=self.backend),
                 self.camera,

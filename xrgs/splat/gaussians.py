@@ -108,14 +108,10 @@ class Gaussians:
         Raises:
             ValueError: The parameters are not float32 on the CPU for the native backend.
         """
-        activations = implementation("activations", backend)
+        activate = implementation("activations", backend).activate
+        scales, opacities = activate(self.scales, self.opacities)
         return ActivatedGaussians(
-            self.means,
-            self.quats,
-            activations.exp(self.scales),
-            activations.logistic(self.opacities),
-            self.sh0,
-            self.shN.detach(),
+            self.means, self.quats, scales, opacities, self.sh0, self.shN.detach()
         )
 
 

@@ -135,7 +135,8 @@ class SplatOptimizer:
 
     def zero_grad(self) -> None:
         """Drop the gradients of all parameters."""
-        self.adam.zero_grad()
+        for name in PARAMETERS:
+            self.gaussians[name].grad = None
 
     def state_bytes(self) -> int:
         """Return the number of bytes of Adam's state."""

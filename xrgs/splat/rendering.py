@@ -80,12 +80,13 @@ def rasterize(
         sh_degree = min(settings.sh_degree, stored)
     backend = backend_for(gaussians.means, backend)
     # Not `Gaussians.activated`, which cuts shN off from its gradient.
-    activations = implementation("activations", backend)
+    activate = implementation("activations", backend).activate
+    scales, opacities = activate(gaussians.scales, gaussians.opacities)
     return rasterize_parameters(
         gaussians.means,
         gaussians.quats,
-        activations.exp(gaussians.scales),
-        activations.logistic(gaussians.opacities),
+        scales,
+        opacities,
         gaussians.sh0,
         gaussians.shN,
         camera,
@@ -153,6 +154,16 @@ def rasterize_parameters(
         gaussians, camera, settings, sh_degree, means2d_offset
     )
     return render
+
+
+def zero_means2d_offset(count: int) -> Tensor:
+    """Return a `means2d_offset` of zeros that gathers the image-plane gradient of N Gaussians.
+
+    Returns:
+        [N, 2] leaf that requires a gradient, float32. All its elements are one number in memory:
+        the native backend knows them for zeros and does not read them.
+    """
+    return torch.zeros(()).expand(count, 2).requires_grad_()
 
 
 def backend_for(means: Tensor, backend: str) -> str:

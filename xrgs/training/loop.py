@@ -13,6 +13,7 @@ from xrgs.splat.backend import resolve_backend
 from xrgs.splat.gaussians import PARAMETERS, Gaussians, from_points
 from xrgs.splat.loss import Target, photometric_loss, prepare_target
 from xrgs.splat.optimizer import SplatOptimizer
+from xrgs.splat.rendering import zero_means2d_offset
 from xrgs.splat.settings import NOMINAL_STEPS
 from xrgs.splat.strategy.default import DefaultStrategy
 from xrgs.splat.strategy.mcmc import MCMCStrategy
@@ -205,7 +206,7 @@ def _forward(run: _Run, step: Step) -> _Forward:
     components, gaussians, ssim = run.components, run.optimizer.gaussians, run.splat.ssim_weight
     camera = components.render_camera(step.view.camera, step)
     sh_degree = run.renderer.sh_degree(step)
-    means2d_offset = torch.zeros(len(gaussians), 2, requires_grad=True)
+    means2d_offset = zero_means2d_offset(len(gaussians))
     target, kept = run.views.target(step.view), step.view.name in run.views.moments.kept
     with run.memory.of_forward(step, len(gaussians), sh_degree, kept=kept):
         render = run.renderer.render(gaussians, step, camera, means2d_offset)

@@ -136,3 +136,20 @@ def test_lengths_that_do_not_fit_are_refused() -> None:
     for backward in (native.exp_backward, native.logistic_backward):
         with pytest.raises(ValueError, match="shapes that do not fit"):
             backward(torch.zeros(3), torch.zeros(4), 1)
+
+
+def test_activate_is_both_functions_and_gives_no_gradient_that_there_is_none_of() -> None:
+    x = normal_parameters(37, 0)
+    scales, opacities = (x[name].requires_grad_() for name in ("scales", "opacities"))
+    both = activations.activate(scales, opacities)
+    alone = activations.exp(scales), activations.logistic(opacities)
+    for of_both, of_one, leaf in zip(both, alone, (scales, opacities), strict=True):
+        assert torch.equal(of_both, of_one)
+        seed = torch.randn(of_one.shape, generator=torch.Generator().manual_seed(1))
+        gradients = torch.autograd.grad(
+            of_both, (scales, opacities), seed, retain_graph=True, allow_unused=True
+        )
+        (expected,) = torch.autograd.grad(of_one, leaf, seed)
+        found = [gradient for gradient in gradients if gradient is not None]
+        assert len(found) == 1
+        assert torch.equal(found[0], expected)

@@ -32,8 +32,8 @@ def adam_step(*tensors: Tensor) -> None:
     native.adam_step([(*tensors, 0.1, 1.0)], 0.9, 0.999, 1e-15, 1)
 
 
-def adam_step_sh_rest(*tensors: Tensor) -> None:
-    native.adam_step_sh_rest(*tensors, [0.0, 0.0, 9.0], 3, 0.1, 1.0, 0.9, 0.999, 1e-15, 1)
+def adam_step_of_harmonics(*tensors: Tensor) -> None:
+    native.adam_step([], 0.9, 0.999, 1e-15, 1, (*tensors, [0.0, 0.0, 9.0], 3, 0.1, 1.0))
 
 
 def accumulate(means2d_grad: Tensor, visible: Tensor, *sums: Tensor) -> None:
@@ -77,7 +77,10 @@ def ones(*shapes: tuple[int, ...]) -> list[Tensor]:
 PARAMETER_SHAPES = [(N, *shape) for shape in (*SHAPES.values(), (2,))]
 CALLS: dict[str, tuple[Callable[..., object], list[Tensor]]] = {
     "adam_step": (adam_step, ones((N,), (N,), (N,), (N,))),
-    "adam_step_sh_rest": (adam_step_sh_rest, ones(*[(N, 15, 3)] * 3, (N, 3), (N, 3))),
+    "adam_step of harmonics": (
+        adam_step_of_harmonics,
+        ones(*[(N, 15, 3)] * 3, (N, 3), (N, 1, 3)),
+    ),
     "accumulate_grad2d": (accumulate, [*ones((N, 2)), torch.ones(N).bool(), *ones((N,), (N,))]),
     "forward": (forward, ones(*PARAMETER_SHAPES)),
     "backward": (backward, ones((20, 20, 3), (20, 20), *PARAMETER_SHAPES)),

@@ -24,6 +24,7 @@ struct AdamGroup {
 // step, so that it is never written to memory.
 struct ShNAdamGroup {
   AdamGroup adam;             // gradient is unused; size is count * rest_count * 3
+  std::int64_t count;         // Gaussians
   const float* means;         // [count, 3], the values that were rendered
   const float* sh0_gradient;  // [count, 3]
   float camera_position[3];

@@ -54,29 +54,39 @@ void step(const AdamGroup& group, std::int64_t first, std::int64_t last) {
   if (i < last) update_at(i, static_cast<int>(last - i));
 }
 
+// The gradient of a row is made while the values of rows before it are updated, so that its
+// permutations fill the gaps that divisions and roots leave.
 template <int Degree>
 void step_shN_degree(const ShNAdamGroup& group, std::int64_t first, std::int64_t last) {
   const AdamGroup& adam = group.adam;
   const Constants k(adam);
   const std::int64_t width = std::int64_t{group.rest_count} * 3;
+  ShGradientFactors factors;
   ShGradientRows gradient;
   for (std::int64_t i = first; i < last; i += kLanes) {
     const int lanes = last - i < kLanes ? static_cast<int>(last - i) : kLanes;
     PaddedRows padded_means, padded_gradients;
-    Vector3 mean, v_sh0;
+    Vector3 mean;
     load_triples(padded_means.of(group.means, i, lanes, 3), mean.x, mean.y, mean.z);
-    load_triples(padded_gradients.of(group.sh0_gradient, i, lanes, 3), v_sh0.x, v_sh0.y, v_sh0.z);
     Floats inv_distance;
-    const Vector3 direction = view_direction(mean, group.camera_position, inv_distance);
-    sh_coefficient_gradient<Degree>(direction, times(broadcast(1.0f / kC0), v_sh0),
-                                    group.rest_count, gradient);
+    store_basis<Degree>(view_direction(mean, group.camera_position, inv_distance), factors);
+    const float* v_sh0 = padded_gradients.of(group.sh0_gradient, i, lanes, 3);
+    for (int at = 0; at < 3 * kLanes; at += kLanes)
+      store(factors.v_color + at, broadcast(1.0f / kC0) * load(v_sh0 + at));
     const std::int64_t begin = i * width, size = lanes * width;
-    for (std::int64_t at = 0; at < size; at += kLanes) {
-      const int count = size - at < kLanes ? static_cast<int>(size - at) : kLanes;
+    std::int64_t at = 0;
+    const auto update_next = [&](int count) {
       const std::int64_t index = begin + at;
       update(k, adam.parameter + index, gradient.rows + at, adam.exp_avg + index,
              adam.exp_avg_sq + index, count);
+      at += count;
+    };
+    for (int row = 0; row < lanes; ++row) {
+      store_gradient_row<Degree>(factors, row, width, gradient);
+      while (at + kLanes <= row * width) update_next(kLanes);
     }
+    while (at + kLanes <= size) update_next(kLanes);
+    if (at < size) update_next(static_cast<int>(size - at));
   }
 }
 

@@ -10,7 +10,9 @@
 #include <algorithm>
 #include <array>
 #include <cmath>
+#include <cstdint>
 #include <cstdio>
+#include <cstring>
 #include <limits>
 #include <memory>
 #include <optional>
@@ -188,7 +190,7 @@ GradientTensors backward(FrameHandle& handle, const Image& v_image, const Plane&
                          const Vectors& means, const Quaternions& quats, const Vectors& scales,
                          const Scalars& opacities, const ShCoefficients& sh0,
                          const ShCoefficients& shN, const std::optional<Offsets>& means2d_offset,
-                         bool with_shN, int threads) {
+                         bool with_shN, int threads, bool with_means2d_offset) {
   const ParameterTensors tensors{means, quats, scales, opacities, sh0, shN, means2d_offset};
   Frame& frame = rendered(handle);
   const GaussianParameters parameters = tensors.checked(frame.config.sh_degree);
@@ -208,7 +210,8 @@ GradientTensors backward(FrameHandle& handle, const Image& v_image, const Plane&
                       std::nullopt,
                       true};
   if (with_shN) std::get<5>(out) = new_array<float>({n, rest_count, 3});
-  if (means2d_offset) std::get<6>(out) = new_array<float>({n, 2});
+  with_means2d_offset = with_means2d_offset || means2d_offset;
+  if (with_means2d_offset) std::get<6>(out) = new_array<float>({n, 2});
   const auto pointer = [](Output& array) { return static_cast<float*>(array.data()); };
   const ParameterGradients gradients{pointer(std::get<0>(out)),
                                      pointer(std::get<1>(out)),
@@ -216,7 +219,7 @@ GradientTensors backward(FrameHandle& handle, const Image& v_image, const Plane&
                                      pointer(std::get<3>(out)),
                                      pointer(std::get<4>(out)),
                                      with_shN ? pointer(*std::get<5>(out)) : nullptr,
-                                     means2d_offset ? pointer(*std::get<6>(out)) : nullptr};
+                                     with_means2d_offset ? pointer(*std::get<6>(out)) : nullptr};
   bool allocation_ok = true;
   {
     nb::gil_scoped_release release;
@@ -303,12 +306,21 @@ RenderConfig make_config(const Matrix4& viewmat, const std::array<float, 4>& int
   return config;
 }
 
+// The eight bits of a byte as eight bytes of 0 or 1, the lowest bit in the lowest byte.
+std::uint64_t spread_bits(std::uint64_t byte) {
+  const std::uint64_t one_bit_each = byte * 0x0101010101010101u & 0x8040201008040201u;
+  return (one_bit_each + 0x7f7f7f7f7f7f7f7fu) >> 7 & 0x0101010101010101u;
+}
+
 Output visible_mask(FrameHandle& handle) {
   const Frame& frame = rendered(handle);
   const auto count = static_cast<std::size_t>(frame.gaussian_count);
   Output out = new_array<bool>({count});
-  bool* visible = static_cast<bool*>(out.data());
-  for (std::size_t i = 0; i < count; ++i) visible[i] = (frame.visible[i / 16] >> (i % 16) & 1) != 0;
+  auto* visible = static_cast<std::uint8_t*>(out.data());
+  for (std::size_t i = 0; i < count; i += 8) {
+    const std::uint64_t bytes = spread_bits(frame.visible[i / 16] >> (i % 16) & 255u);
+    std::memcpy(visible + i, &bytes, std::min<std::size_t>(8, count - i));
+  }
   return out;
 }
 
@@ -347,9 +359,12 @@ void bind_raster(nb::module_& m) {
            "means"_a.noconvert(), "quats"_a.noconvert(), "scales"_a.noconvert(),
            "opacities"_a.noconvert(), "sh0"_a.noconvert(), "shN"_a.noconvert(),
            "means2d_offset"_a.none().noconvert(), "with_shN"_a, "threads"_a,
+           "with_means2d_offset"_a = false,
            "Compute the gradients of the parameters, in their order, from those of image and "
            "alpha.\n"
-           "shN's is None unless with_shN, that of means2d_offset is None where there is none.\n"
+           "shN's is None unless with_shN. That of means2d_offset is None where there is none, "
+           "unless\n"
+           "with_means2d_offset: offsets of zeros need not be passed.\n"
            "The last value says whether all of them are finite.")
       .def("visible", &visible_mask, "Return which Gaussians are visible: [N] bool.")
       .def_prop_ro(

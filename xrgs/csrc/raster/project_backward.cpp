@@ -208,7 +208,11 @@ XRGS_INLINE Vector3 color_backward(const GaussianParameters& p, const RenderConf
     v_mean = times(inv_distance, add_scaled(v_d, -dot(v_d, d), d));
   }
   if (out.shN == nullptr) return v_mean;
-  sh_coefficient_gradient<Degree>(d, v, p.rest_count, sh_rows);
+  ShGradientFactors factors;
+  store_basis<Degree>(d, factors);
+  store_triples(factors.v_color, v.x, v.y, v.z);
+  const std::int64_t stride = std::int64_t{p.rest_count} * 3;
+  for (int i = 0; i < 16; ++i) store_gradient_row<Degree>(factors, i, stride, sh_rows);
   float* target = out.shN + group * p.rest_count * 3;
   const int count = lanes * p.rest_count * 3;
   if (lanes == 16)  // on a 64-byte boundary, as the array and sixteen rows of any width are

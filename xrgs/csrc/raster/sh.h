@@ -118,40 +118,51 @@ XRGS_INLINE Vector3 view_direction(const Vector3& mean, const float* camera_posi
   return times(inv_distance, from_camera);
 }
 
+// What the gradients of shN of sixteen Gaussians are made of: a row of basis functions of degree 1
+// and higher for each, with zeros behind them, and the gradients of the colours before the clamp,
+// one Gaussian after the other.
+struct ShGradientFactors {
+  alignas(64) float basis[16][16];
+  alignas(64) float v_color[16 * 3 + 16];
+};
+
+template <int Degree>
+XRGS_INLINE void store_basis(const Vector3& direction, ShGradientFactors& out) {
+  constexpr int kRest = rest_basis_count(Degree);
+  Floats rows[16];
+  sh_basis<Degree>(direction, rows);
+  for (int k = kRest; k < 16; ++k) rows[k] = broadcast(0.0f);
+  transpose(rows);
+  for (int i = 0; i < 16; ++i) store(out.basis[i], rows[i]);
+}
+
 // The gradients of shN of sixteen Gaussians, row by row. Those of degrees above Degree stay zero.
 struct ShGradientRows {
   alignas(64) float rows[16 * 3 * rest_basis_count(3) + 16] = {};
 };
 
-// Stores columns as rows that are `stride` apart. Each row is rounded up to a multiple of sixteen
-// floats with zeros; where these lie in the next row, that row overwrites them.
-template <int Width>
-XRGS_INLINE void store_columns(const Floats* columns, std::int64_t stride, ShGradientRows& out) {
-  Floats r[(Width + 15) / 16][16];
-  for (int c = 0; c < Width; c += 16) {
-    for (int i = 0; i < 16; ++i) r[c / 16][i] = c + i < Width ? columns[c + i] : broadcast(0.0f);
-    transpose(r[c / 16]);
+// Writes floats 16 C to 16 C + 15 of a Gaussian's row, with zeros behind its last band.
+template <int Degree, int C>
+XRGS_INLINE void store_gradient_part(const float* basis, const float* v_color, float* row) {
+  constexpr int kLeft = 3 * rest_basis_count(Degree) - 16 * C;
+  if constexpr (kLeft > 0) {
+    const Floats part = repeat_thrice<C>(basis) * repeat_triple<C>(v_color);
+    store(row + 16 * C,
+          kLeft >= 16 ? part : select_or_zero(mask_from_bits((1u << (kLeft & 15)) - 1u), part));
   }
-  for (int i = 0; i < 16; ++i)
-    for (int c = 0; c < Width; c += 16) store(out.rows + i * stride + c, r[c / 16][i]);
 }
 
-// The gradient of the `rest_count` coefficients above degree 0, given the gradient v_color of the
-// colours before the clamp: the basis times v_color (Eq. 31).
+// Writes the gradient of Gaussian i of sixteen, whose rows are `stride` floats apart: the basis
+// times the gradient of the colour (Eq. 31). Zeros fill up the last vector: where they lie in the
+// next row, this must be written later.
 template <int Degree>
-XRGS_INLINE void sh_coefficient_gradient(const Vector3& direction, const Vector3& v_color,
-                                         int rest_count, ShGradientRows& out) {
-  constexpr int kRest = rest_basis_count(Degree);
-  if constexpr (kRest > 0) {
-    Floats basis[kRest], columns[3 * kRest];
-    sh_basis<Degree>(direction, basis);
-    for (int k = 0; k < kRest; ++k) {
-      columns[3 * k] = basis[k] * v_color.x;
-      columns[3 * k + 1] = basis[k] * v_color.y;
-      columns[3 * k + 2] = basis[k] * v_color.z;
-    }
-    store_columns<3 * kRest>(columns, std::int64_t{rest_count} * 3, out);
-  }
+XRGS_INLINE void store_gradient_row(const ShGradientFactors& factors, int i, std::int64_t stride,
+                                    ShGradientRows& out) {
+  const float *basis = factors.basis[i], *v_color = factors.v_color + 3 * i;
+  float* row = out.rows + i * stride;
+  store_gradient_part<Degree, 0>(basis, v_color, row);
+  store_gradient_part<Degree, 1>(basis, v_color, row);
+  store_gradient_part<Degree, 2>(basis, v_color, row);
 }
 
 }  // namespace XRGS_NS

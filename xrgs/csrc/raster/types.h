@@ -70,7 +70,7 @@ struct GaussianParameters {
 struct ParameterGradients {
   float *means, *quats, *scales, *opacities, *sh0;
   float* shN;             // null where it is not needed
-  float* means2d_offset;  // null where there is no offset
+  float* means2d_offset;  // null where it is not needed
 };
 
 // A visible Gaussian in the image plane: one cache line. With d = pixel centre - mean2d,

@@ -174,6 +174,29 @@ XRGS_INLINE Floats broadcast_row(Floats a) {
   const __m256 row = _mm256_permute2f128_ps(half, half, (R & 1) * 0x11);
   return {row, row};
 }
+// The lanes k of p[(16 C + k) / 3] and p[(16 C + k) % 3]: both read sixteen floats or fewer.
+template <int K>  // eight lanes from K on
+XRGS_INLINE __m256 repeat_thrice8(const float* p) {
+  constexpr int first = K / 3, r = K % 3;
+  const __m256i at = _mm256_setr_epi32(0, (r + 1) / 3, (r + 2) / 3, (r + 3) / 3, (r + 4) / 3,
+                                       (r + 5) / 3, (r + 6) / 3, (r + 7) / 3);
+  // At most four floats are read, p[14] among them at the most.
+  return _mm256_permutevar_ps(_mm256_broadcast_ps(reinterpret_cast<const __m128*>(p + first)), at);
+}
+template <int C>
+XRGS_INLINE Floats repeat_thrice(const float* p) {
+  return {repeat_thrice8<16 * C>(p), repeat_thrice8<16 * C + 8>(p)};
+}
+template <int K>
+XRGS_INLINE __m256 repeat_triple8(__m256 triple) {
+  constexpr int a = K % 3, b = (K + 1) % 3, c = (K + 2) % 3;
+  return _mm256_permutevar_ps(triple, _mm256_setr_epi32(a, b, c, a, b, c, a, b));
+}
+template <int C>
+XRGS_INLINE Floats repeat_triple(const float* p) {
+  const __m256 triple = _mm256_broadcast_ps(reinterpret_cast<const __m128*>(p));
+  return {repeat_triple8<16 * C>(triple), repeat_triple8<16 * C + 8>(triple)};
+}
 XRGS_INLINE Floats sum_rows(Floats a) {
   const __m256 pairs = _mm256_add_ps(a.lo, a.hi);
   const __m256 all = _mm256_add_ps(pairs, _mm256_permute2f128_ps(pairs, pairs, 0x01));

@@ -119,6 +119,24 @@ template <int R>
 XRGS_INLINE Floats broadcast_row(Floats a) {
   return {_mm512_shuffle_f32x4(a.v, a.v, R * 0x55)};
 }
+// The lanes k of p[(16 C + k) / 3] and p[(16 C + k) % 3]: both read sixteen floats or fewer.
+template <int C>
+XRGS_INLINE Floats repeat_thrice(const float* p) {
+  constexpr int k = 16 * C;
+  const __m512i at = _mm512_setr_epi32(k / 3, (k + 1) / 3, (k + 2) / 3, (k + 3) / 3, (k + 4) / 3,
+                                       (k + 5) / 3, (k + 6) / 3, (k + 7) / 3, (k + 8) / 3,
+                                       (k + 9) / 3, (k + 10) / 3, (k + 11) / 3, (k + 12) / 3,
+                                       (k + 13) / 3, (k + 14) / 3, (k + 15) / 3);
+  return {_mm512_permutexvar_ps(at, _mm512_loadu_ps(p))};
+}
+template <int C>
+XRGS_INLINE Floats repeat_triple(const float* p) {
+  constexpr int k = C % 3;  // as 16 C % 3
+  const __m512i at =
+      _mm512_setr_epi32(k, (k + 1) % 3, (k + 2) % 3, k, (k + 1) % 3, (k + 2) % 3, k, (k + 1) % 3,
+                        (k + 2) % 3, k, (k + 1) % 3, (k + 2) % 3, k, (k + 1) % 3, (k + 2) % 3, k);
+  return {_mm512_permutexvar_ps(at, _mm512_broadcast_f32x4(_mm_loadu_ps(p)))};
+}
 XRGS_INLINE Floats sum_rows(Floats a) {
   a = {_mm512_add_ps(a.v, _mm512_shuffle_f32x4(a.v, a.v, 0x4e))};
   return {_mm512_add_ps(a.v, _mm512_shuffle_f32x4(a.v, a.v, 0xb1))};

@@ -246,6 +246,17 @@ template <int R>
 XRGS_INLINE Floats broadcast_row(Floats a) {
   return {a.v[R], a.v[R], a.v[R], a.v[R]};
 }
+// The lanes k of p[(16 C + k) / 3] and p[(16 C + k) % 3]: both read sixteen floats or fewer.
+template <int C>
+XRGS_INLINE Floats repeat_thrice(const float* p) {
+  const auto at = [p](int k) { return p[(16 * C + k) / 3]; };
+  XRGS_EACH(Floats, (Float4{at(4 * i), at(4 * i + 1), at(4 * i + 2), at(4 * i + 3)}));
+}
+template <int C>
+XRGS_INLINE Floats repeat_triple(const float* p) {
+  const auto at = [p](int k) { return p[(16 * C + k) % 3]; };
+  XRGS_EACH(Floats, (Float4{at(4 * i), at(4 * i + 1), at(4 * i + 2), at(4 * i + 3)}));
+}
 XRGS_INLINE Floats sum_rows(Floats a) {
   const Float4 sum = (a.v[0] + a.v[2]) + (a.v[1] + a.v[3]);
   return {sum, sum, sum, sum};

@@ -52,6 +52,44 @@ def logistic(x: Tensor) -> Tensor:
     return _activate(x, _native.logistic, _native.logistic_backward)
 
 
+def activate(scales: Tensor, opacities: Tensor) -> tuple[Tensor, Tensor]:
+    """Return `exp(scales)` and `logistic(opacities)`, in one node of the graph.
+
+    Raises:
+        ValueError: A tensor is not float32 on the CPU.
+    """
+    require_float32("scales", scales)
+    require_float32("opacities", opacities)
+    activated: tuple[Tensor, Tensor] = _ScalesAndOpacities.apply(scales, opacities)
+    return activated
+
+
+class _ScalesAndOpacities(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, scales: Tensor, opacities: Tensor) -> tuple[Tensor, Tensor]:
+        ctx.set_materialize_grads(False)  # Adam leaves alone what has no gradient, not zeros
+        threads = torch.get_num_threads()
+        exp = _native.exp(scales.detach().reshape(-1), threads).view(scales.shape)
+        logistic = _native.logistic(opacities.detach().contiguous(), threads)
+        ctx.save_for_backward(exp, logistic)
+        return exp, logistic
+
+    @staticmethod
+    @once_differentiable
+    def backward(
+        ctx: Any, v_exp: Tensor | None, v_logistic: Tensor | None
+    ) -> tuple[Tensor | None, Tensor | None]:
+        exp, logistic = ctx.saved_tensors
+        threads = torch.get_num_threads()
+        v_scales = v_opacities = None
+        if v_exp is not None:
+            flat = _native.exp_backward(v_exp.reshape(-1), exp.view(-1), threads)
+            v_scales = flat.view(exp.shape)
+        if v_logistic is not None:
+            v_opacities = _native.logistic_backward(v_logistic.contiguous(), logistic, threads)
+        return v_scales, v_opacities
+
+
 _Forward = Callable[[Tensor, int], Tensor]
 _Backward = Callable[[Tensor, Tensor, int], Tensor]
 

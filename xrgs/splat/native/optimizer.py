@@ -35,56 +35,48 @@ def step(adam: torch.optim.Adam, camera: Camera | None = None, sh_degree: int = 
     Raises:
         ValueError: A parameter, gradient or moment is not float32 on the CPU and contiguous.
     """
-    beta1, beta2 = adam.defaults["betas"]
     groups = {group["name"]: group for group in adam.param_groups}
+    harmonics: tuple[Any, ...] | None = None
+    moved: list[Tensor] = []
     if camera is not None and groups["sh0"]["params"][0].grad is not None:
-        # Before the means move: the directions of view must be the render's.
-        _step_harmonics(adam, groups, camera, sh_degree)
-    entries, changed = [], []
+        harmonics, *moved = _harmonics(adam, groups, camera, sh_degree)
+    entries = []
     for name, group in groups.items():
         (parameter,) = group["params"]
         if parameter.grad is None:
             continue
         state = _adam_state(adam, parameter)
-        state["step"] += 1
-        tensors = (parameter, parameter.grad, state["exp_avg"], state["exp_avg_sq"])
-        flat = [_require_plain(name, tensor).view(-1) for tensor in tensors]
-        entries.append((*flat, group["lr"], state["step"].item()))
-        changed += [parameter, state["exp_avg"], state["exp_avg_sq"]]
-    _native.adam_step(entries, beta1, beta2, adam.defaults["eps"], torch.get_num_threads())
-    _mark_changed(*changed)
-
-
-def _step_harmonics(
-    adam: torch.optim.Adam, groups: dict[str, dict[str, Any]], camera: Camera, sh_degree: int
-) -> None:
-    """Move shN by the gradient that sh0's implies."""
-    means, sh0, shN = (groups[name]["params"][0] for name in ("means", "sh0", "shN"))
+        changing = (parameter, state["exp_avg"], state["exp_avg_sq"])
+        values, exp_avg, exp_avg_sq = (_require_plain(name, tensor) for tensor in changing)
+        gradient = _require_plain(name, parameter.grad)
+        number = state["step"].add_(1).item()
+        entries.append((values, gradient, exp_avg, exp_avg_sq, group["lr"], number))
+        moved += changing
     beta1, beta2 = adam.defaults["betas"]
+    threads = torch.get_num_threads()
+    _native.adam_step(entries, beta1, beta2, adam.defaults["eps"], threads, harmonics)
+    # So that a backward pass refuses to use the values from before.
+    for tensor in moved:
+        torch.autograd.graph.increment_version(tensor)
+
+
+def _harmonics(
+    adam: torch.optim.Adam, groups: dict[str, dict[str, Any]], camera: Camera, sh_degree: int
+) -> tuple[tuple[Any, ...], Tensor, Tensor, Tensor]:
+    """Return the argument that moves shN by the gradient that sh0's implies, and what it moves."""
+    means, sh0, shN = (groups[name]["params"][0] for name in ("means", "sh0", "shN"))
     state = _adam_state(adam, shN)
-    state["step"] += 1
-    _native.adam_step_sh_rest(
-        _require_plain("shN", shN),
-        _require_plain("shN", state["exp_avg"]),
-        _require_plain("shN", state["exp_avg_sq"]),
+    moved = (shN, state["exp_avg"], state["exp_avg_sq"])
+    argument = (
+        *(_require_plain("shN", tensor) for tensor in moved),
         _require_plain("means", means),
-        _require_plain("sh0", sh0.grad).view(-1, 3),
+        _require_plain("sh0", sh0.grad),
         camera.position.tolist(),
         sh_degree,
         groups["shN"]["lr"],
-        state["step"].item(),
-        beta1,
-        beta2,
-        adam.defaults["eps"],
-        torch.get_num_threads(),
+        state["step"].add_(1).item(),
     )
-    _mark_changed(shN, state["exp_avg"], state["exp_avg_sq"])
-
-
-def _mark_changed(*tensors: Tensor) -> None:
-    """Count a change in place, so that a backward pass refuses to use the values from before."""
-    for tensor in tensors:
-        torch.autograd.graph.increment_version(tensor)
+    return argument, *moved
 
 
 def _adam_state(adam: torch.optim.Adam, parameter: Tensor) -> dict[str, Tensor]:

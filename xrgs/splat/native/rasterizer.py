@@ -98,10 +98,10 @@ def render_config(
     Raises:
         ValueError: float32 cannot hold a number of the camera or the settings.
     """
-    K = camera.K
+    K = camera.K.tolist()
     return _native.RenderConfig(
         viewmat=camera.viewmat.flatten().tolist(),
-        intrinsics=[K[0, 0].item(), K[1, 1].item(), K[0, 2].item(), K[1, 2].item()],
+        intrinsics=[K[0][0], K[1][1], K[0][2], K[1][2]],
         width=camera.width,
         height=camera.height,
         near=settings.near,
@@ -121,6 +121,11 @@ def _contiguous(tensor: Tensor | None) -> Tensor | None:
     return None if tensor is None else tensor.detach().contiguous()
 
 
+def _is_zero_offset(offset: Tensor | None) -> bool:
+    """Whether an offset is one number in memory that is zero, as `zero_means2d_offset` makes it."""
+    return offset is not None and offset.stride() == (0, 0) and not offset[:1, :1].any()
+
+
 class _Rasterize(torch.autograd.Function):
     """Image [H, W, 3] and alpha [H, W] of a frame, view, the six parameters and the offset."""
 
@@ -128,6 +133,8 @@ class _Rasterize(torch.autograd.Function):
     def forward(
         ctx: Any, frame: _native.Frame, view: _native.RenderConfig, *inputs: Tensor | None
     ) -> tuple[Tensor, Tensor]:
+        if _is_zero_offset(inputs[-1]):  # its gradient needs no pass over zeros
+            inputs = (*inputs[:-1], None)
         contiguous = [_contiguous(tensor) for tensor in inputs]
         ctx.frame = frame
         ctx.save_for_backward(*contiguous)
@@ -143,6 +150,7 @@ class _Rasterize(torch.autograd.Function):
             *ctx.saved_tensors,
             ctx.needs_input_grad[_SHN_INPUT],  # three quarters of all gradients
             torch.get_num_threads(),
+            ctx.needs_input_grad[-1],
         )
         if not all_finite:
             needed = ctx.needs_input_grad[_FIRST_PARAMETER:]

@@ -14,3 +14,8 @@ def exp(x: Tensor) -> Tensor:
 def logistic(x: Tensor) -> Tensor:
     """Return 1 / (1 + e^-x): opacities from their logits."""
     return torch.sigmoid(x)
+
+
+def activate(scales: Tensor, opacities: Tensor) -> tuple[Tensor, Tensor]:
+    """Return `exp(scales)` and `logistic(opacities)`."""
+    return torch.exp(scales), torch.sigmoid(opacities)

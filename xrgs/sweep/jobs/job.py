@@ -186,11 +186,14 @@ def _train_in_child(
 
     limits = Limits(conf.limits.minutes, conf.limits.memory_gb)
     try:
-        worker.run_in_child("cell", worker.cell_request(variant, cell), limits, on_poll)
+        request = worker.cell_request(variant, cell)
+        answer = worker.run_in_child("cell", request, limits, on_poll)
     except _CellLeftError as error:
         return error.outcome
     except XrgsError as error:
         return _after_error(error, store, cell, held)
+    for line in answer["found"]:
+        log_line(f"{cell.id}: {line}")
     return cell.state().name
 
 

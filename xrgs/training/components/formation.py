@@ -69,7 +69,7 @@ class BlurWidths:
 
     def of(self, name: str) -> tuple[float, float]:
         """Return the widths of a view, down and across, px of its photograph."""
-        down, across = self.logs.values[self.rows[name]].exp().tolist()
+        down, across = self.logs.values[self.rows[name]].exp().float().tolist()
         return down, across
 
     def variances(self, step: Step, factor: int) -> Tensor:

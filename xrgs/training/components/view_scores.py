@@ -79,8 +79,8 @@ class MultiviewScore(_ViewScores):
     FastGS's pruning is left out. Four times after densification it removes Gaussians with an
     opacity below 0.1, and those with more than 0.9 of the largest sum of such scores, each times
     the view's loss. In our trials the score chose one or two Gaussians at a time, and a lower share
-    than 0.9 cost quality. The opacity chose nearly all of them, and `natural_selection` kept more
-    quality with as many Gaussians.
+    than 0.9 cost quality. The opacity chose nearly all; to remove transparent Gaussians after
+    densification is what `natural_selection` is for.
     """
 
     def __init__(
