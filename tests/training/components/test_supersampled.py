@@ -1,8 +1,9 @@
-"""LR views are rendered larger and brought down as their photographs were; nothing else changes."""
+"""Coarse views are rendered larger and brought down as their photographs were, and no others."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 
 import pytest
 import torch
@@ -13,7 +14,6 @@ from tests.splat.scenes import noise
 from tests.training.components.conftest import make_view
 from xrgs.capture.dataset import Dataset, LoadedView
 from xrgs.config import ComponentsConf, Conf
-from xrgs.errors import XrgsError
 from xrgs.splat.gaussians import from_points
 from xrgs.splat.rendering import rasterize_parameters
 from xrgs.training import components
@@ -105,10 +105,82 @@ def test_the_factor_changes_at_its_step(build: Build, on: ComponentsConf, lr: St
     assert parts.to_photograph(image, Step(149, 300, view)) is image
 
 
+@pytest.mark.parametrize(
+    ("need", "early", "late"),
+    [(0.6, 1, 1), (1.4, 1, 1), (1.6, 2, 2), (3.4, 2, 3), (5.2, 2, 5), (9.0, 2, 5)],
+)
+@pytest.mark.parametrize("tag", ["HR", "LR"])
+def test_a_view_is_rendered_larger_by_its_need_and_not_by_its_tag(
+    on: ComponentsConf, baseline: Conf, tag: str, need: float, early: int, late: int
+) -> None:
+    on.supersampled.late_factor, on.supersampled.late_from = 5, 15_000
+    view = replace(make_view(tag, noise(12, 15, 1)), need=need)
+    parts = _built(on, baseline, "none", view)
+    for number, factor in ((0, early), (15_000, late)):
+        step = Step(number, 30_000, view)
+        camera = parts.render_camera(view.camera, step)
+        assert (camera.width, camera.height) == (15 * factor, 12 * factor)
+        assert step.log == ({"supersampled.factor": factor} if factor > 1 else {})
+        render = noise(camera.height, camera.width, 3)
+        photograph = parts.to_photograph(render, step)
+        pooled = avg_pool2d(render.movedim(-1, 0), factor).movedim(0, -1)
+        torch.testing.assert_close(photograph, pooled, rtol=0, atol=1e-12)
+        assert factor > 1 or photograph is render
+
+
+def test_a_coarse_hr_view_beside_degraded_ones_averages_over_its_pixels(
+    on: ComponentsConf, baseline: Conf
+) -> None:
+    """No kernel of the variant has made it; nor does it resolve less than its pixels."""
+    view = replace(make_view("HR", noise(12, 15, 1)), need=2.0)
+    for degradation in ("downsample", "digital_zoom"):
+        parts, step = _built(on, baseline, degradation, view), Step(0, 1, view)
+        assert parts.render_camera(view.camera, step).width == 30
+        render = noise(24, 30, 3)
+        pooled = avg_pool2d(render.movedim(-1, 0), 2).movedim(0, -1)
+        torch.testing.assert_close(parts.to_photograph(render, step), pooled, rtol=0, atol=1e-12)
+
+
 def test_compressed_views_have_nothing_to_supersample(on: ComponentsConf, baseline: Conf) -> None:
-    view = make_view("LR", torch.zeros(60, 75, 3))
-    with pytest.raises(XrgsError, match="jpeg"):
-        _built(on, baseline, "jpeg", view)
+    """They have all the pixels of an HR view, and so its need."""
+    view = replace(make_view("LR", torch.zeros(60, 75, 3)), need=1.0)
+    parts, step = _built(on, baseline, "jpeg", view), Step(0, 1, view)
+    assert parts.render_camera(view.camera, step) is view.camera
+
+
+def test_a_reduced_view_is_rendered_larger_than_its_reduced_photograph(
+    on: ComponentsConf, baseline: Conf
+) -> None:
+    on.resolution_schedule.start_share = 0.01
+    view = replace(make_view("HR", noise(60, 75, 1).float()), need=2.0)
+    parts = _built(on, baseline, "none", view)
+    step = Step(0, 30_000, view)
+    (small,) = parts.training_views({"hr": view}, step).values()
+    assert small.camera.width < 75
+    step = replace(step, view=small)
+    camera = parts.render_camera(small.camera, step)
+    assert (camera.width, camera.height) == (2 * small.camera.width, 2 * small.camera.height)
+    render = torch.rand(camera.height, camera.width, 3)
+    assert parts.to_photograph(render, step).shape == small.image.shape
+
+
+def test_the_number_of_views_with_each_factor_is_logged(
+    on: ComponentsConf, baseline: Conf, caplog: pytest.LogCaptureFixture
+) -> None:
+    caplog.set_level("INFO")
+    needs = (1.0, 1.2, 2.0, 4.8)
+    views = [
+        replace(make_view("LR", torch.zeros(12, 15, 3)), name=f"{need}", need=need)
+        for need in needs
+    ]
+    _built(on, baseline, "none", *views)
+    assert caplog.messages == ["supersampled: views at k times their size: 2 at 1, 2 at 2"]
+    on.supersampled.late_factor, on.supersampled.late_from = 5, 22_000
+    _built(on, baseline, "none", *views)
+    assert caplog.messages[1] == (
+        "supersampled: views at k times their size: 2 at 1, 2 at 2;"
+        " from step 22000 on 2 at 1, 1 at 2, 1 at 5"
+    )
 
 
 def test_gradients_reach_the_gaussians_through_the_larger_render(

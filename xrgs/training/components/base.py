@@ -65,6 +65,10 @@ class TrainingView(Protocol):
         """The sampling rate of the view over the highest rate of all views, in (0, 1]."""
 
     @property
+    def need(self) -> float:
+        """How many times as many px a side the view needs to be as fine as the finest views."""
+
+    @property
     def camera(self) -> Camera:
         """The camera in the normalised world."""
 

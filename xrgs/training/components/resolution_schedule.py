@@ -35,6 +35,8 @@ class _ReducedView:
     """[h, w, 3] at the camera's size."""
     mask: Tensor | None
     """[h, w] bool, True for a pixel that is used; None uses all."""
+    need: float
+    """The need of the view with all its pixels."""
 
 
 class ResolutionSchedule(Component):
@@ -153,7 +155,7 @@ class ResolutionSchedule(Component):
         mask = None
         if view.mask is not None:
             mask = torch.from_numpy(masks.resized(view.mask.numpy(), width, height))
-        return _ReducedView(view.name, view.tag, view.rho, camera, image, mask)
+        return _ReducedView(view.name, view.tag, view.rho, camera, image, mask, view.need)
 
 
 def kept_shares(images: Iterable[Tensor], factors: Iterable[int]) -> dict[int, float]:

@@ -1,9 +1,10 @@
-"""LR views rendered as their photographs were formed: larger, and then brought down."""
+"""Views rendered as their photographs were formed: larger, and then brought down."""
 
 from __future__ import annotations
 
+import logging
+from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Self
 
 from torch import Tensor
@@ -25,45 +26,40 @@ if TYPE_CHECKING:
     from xrgs.splat.gaussians import Gaussians
 
 
-@dataclass(frozen=True)
-class _Formation:
-    """How the photograph of an LR view was formed from a finer image of the same camera."""
-
-    camera: Camera
-    """The camera at the size of the pixels that the photograph resolves."""
-    width: int
-    """Width of the photograph, px; a digital zoom has more pixels than it resolves."""
-    height: int
-    """Height of the photograph, px."""
+_log = logging.getLogger(__name__)
 
 
 class Supersampled(Component):
-    """Renders LR views at a larger size, and brings the render down as the photograph was.
+    """Renders coarse views at a larger size, and brings the render down as the photograph was.
 
-    An LR photograph is I = D(S): a finer image S of the same camera, brought down by a kernel D.
-    gsplat [ye2025] renders the view at the size of I, where the filter of `splat.raster.eps2d`,
-    0.3 px^2 of that size, is `factor`^2 times as large in pixels of an HR view. Here the view is
-    rendered at k times the width and height, and
+    The photograph of a coarse view is I = D(S): a finer image S of the same camera, brought down by
+    a kernel D. gsplat [ye2025] renders the view at the size of I, where the filter of
+    `splat.raster.eps2d`, 0.3 px^2 of that size, is many times as large in pixels of a finer view.
+    Here the view v is rendered at k_v times the width and height, and
 
-        loss = L(D(render_k), I)
+        loss = L(D(render_k), I),    k_v = clamp(round(need_v), 1, factor)
 
-    is the loss of the view, with D the kernel by which the variant has made its LR views:
+    is the loss of the view. need_v says how many times as many pixels a side the view would need to
+    be as fine as the finest views of what it sees (`xrgs.capture.sampling.needed_factors`): about 1
+    for an HR view, which stays as it is, and about `variant.factor` for a degraded one. The view's
+    tag does not count: photographs that are hardly a mixture are all rendered at their own size.
 
-    - `downsample`: antialiased bicubic to the size of I;
+    D is the kernel by which the variant has made its LR views:
+
+    - `downsample`, and other degradations that make a view smaller: antialiased bicubic to the size
+      of I;
     - `digital_zoom`: the same to the size between, which is the size that I resolves, and bicubic
-      up again; the render is k times as large as the size between;
-    - `none`, for LR views that a camera took: the mean of k x k pixels, since a pixel of a sensor
-      averages over its area.
+      up again; the render is k times as large as the size between.
 
-    `jpeg` has all the pixels of an HR view, and nothing to supersample.
+    For all other views it is the mean of k x k pixels, since a pixel of a sensor averages over its
+    area.
 
-    With `components.formation`, D is learned in place of that (`BlurWidths`), and acts where k is 1
-    too; a digital zoom comes after it.
+    With `components.formation`, D is learned for LR views in place of that (`BlurWidths`), and acts
+    where k is 1 too; a digital zoom comes after it.
 
-    k is `factor` before step `late_from` and `late_factor` from there on, so that a run may begin
-    or end with direct renders (k = 1). Densification reads the image-plane gradients of the larger
-    render in normalised device units, which do not depend on its size. HR views and the evaluation
-    are untouched.
+    `late_factor` takes the place of `factor` from step `late_from` on, so that a run may begin or
+    end with direct renders. Densification reads the image-plane gradients of the larger render in
+    normalised device units, which do not depend on its size. The evaluation is untouched.
 
     Our choice: the whole component; super-resolution of 3D Gaussian Splatting trains through a
     downsampled render too [feng2024srgs], but on LR views alone.
@@ -79,39 +75,31 @@ class Supersampled(Component):
         *,
         blur: FormationConf,
     ) -> None:
-        """Find out how the photograph of each LR view was formed.
+        """Find out how photographs were formed, and log how many views have each k.
 
         Args:
             settings: `components.supersampled` of the config.
             views: All training views.
-            degradation: What was done to LR views: `downsample`, `digital_zoom`, `none`.
+            degradation: What was done to LR views, `Dataset.degradation`.
             zoom: With `digital_zoom`, how many times fewer px per side a photograph resolves.
             backend: `torch` or `native`: the implementation of the resampling.
             blur: `components.formation` of the config.
         """
         self.settings = settings
         self.backend = backend
-        self.averages = degradation == "none"
-        resolved = zoom if degradation == "digital_zoom" else 1
-        self.formations = {
-            view.name: _Formation(
-                view.camera.resized(view.camera.width // resolved, view.camera.height // resolved),
-                view.camera.width,
-                view.camera.height,
-            )
-            for view in views
-            if view.tag == "LR"
-        }
+        self.shrinks = degradation not in ("jpeg", "none")
+        """Whether LR views resolve fewer pixels than the photographs that they were made of."""
+        self.zoom = zoom if degradation == "digital_zoom" else 1
         low = [view for view in views if view.tag == "LR"]
         self.blur = BlurWidths(blur, low) if blur.widths != "none" else None
+        self._log_factors([view.need for view in views])
 
     @classmethod
     def from_settings(cls, settings: SupersampledConf, setup: TrainingSetup) -> Self | None:
         """Build the component; factors of 1 with no `formation.widths` leave it off.
 
         Raises:
-            XrgsError: A value is out of its range, or LR views of the variant that are compressed
-                ones shall be supersampled.
+            XrgsError: A value is out of its range.
         """
         blur = setup.components.formation
         if blur.widths not in ("none", "tag", "view"):
@@ -121,39 +109,34 @@ class Supersampled(Component):
         for name in ("factor", "late_factor"):
             if (value := getattr(settings, name)) < 1:
                 raise XrgsError(f"components.supersampled.{name}={value}: must be 1 or more")
-        supersamples = not settings.factor == settings.late_factor == 1
-        if not supersamples and blur.widths == "none":
+        if settings.factor == settings.late_factor == 1 and blur.widths == "none":
             return None
-        if supersamples and setup.data.degradation == "jpeg":
-            raise XrgsError(
-                "components.supersampled: the LR views of variant.degradation=jpeg have as many"
-                " pixels as HR views; there is nothing to supersample"
-            )
         data = setup.data
         return cls(settings, data.train, data.degradation, data.factor, setup.backend, blur=blur)
 
     def render_camera(self, camera: Camera, step: Step) -> Camera:
-        """Return the camera at k times the size that an LR photograph resolves."""
-        formation, factor = self.formations.get(step.view.name), self._factor(step)
-        if formation is None or (factor == 1 and self.blur is None):
+        """Return the camera at k times the size that the photograph resolves."""
+        factor = self._factor(step)
+        if factor == 1 and not self._is_blurred(step):
             return camera
         step.log["supersampled.factor"] = factor
-        small = formation.camera
+        small = self._resolved(camera, step)
         return small.resized(small.width * factor, small.height * factor)
 
     def to_photograph(self, image: Tensor, step: Step) -> Tensor:
-        """Bring the render [kH, kW, 3] of an LR view down to its photograph's size [H, W, 3]."""
-        formation, factor = self.formations.get(step.view.name), self._factor(step)
-        if formation is None or (factor == 1 and self.blur is None):
+        """Bring the render [kH, kW, 3] of a view down to its photograph's size [H, W, 3]."""
+        factor, blur = self._factor(step), self.blur if self._is_blurred(step) else None
+        if factor == 1 and blur is None:
             return image
-        if self.averages and self.blur is None:
+        if blur is None and not (self.shrinks and step.view.tag == "LR"):
             return _block_means(image, factor)
-        small = formation.camera
-        variances = None if self.blur is None else self.blur.variances(step, factor)
+        camera = step.view.camera
+        small = self._resolved(camera, step)
+        variances = None if blur is None else blur.variances(step, factor)
         image = resize(image, small.height, small.width, variances=variances, backend=self.backend)
-        if (formation.height, formation.width) == (small.height, small.width):
+        if (camera.height, camera.width) == (small.height, small.width):
             return image
-        return resize(image, formation.height, formation.width, backend=self.backend)
+        return resize(image, camera.height, camera.width, backend=self.backend)
 
     def after_backward(self, gaussians: Gaussians, step: Step) -> None:
         """Move the widths of the blur of the step's photograph."""
@@ -177,8 +160,36 @@ class Supersampled(Component):
             self.blur.load_state_dict(state)
 
     def _factor(self, step: Step) -> int:
+        """Return k at a step on a view."""
         late = step.nominal >= self.settings.late_from
-        return self.settings.late_factor if late else self.settings.factor
+        settings = self.settings
+        return _clamped(step.view.need, settings.late_factor if late else settings.factor)
+
+    def _is_blurred(self, step: Step) -> bool:
+        return self.blur is not None and step.view.tag == "LR"
+
+    def _resolved(self, camera: Camera, step: Step) -> Camera:
+        """Return the camera of a view at the size of the pixels that its photograph resolves."""
+        if self.zoom == 1 or step.view.tag == "HR":
+            return camera
+        return camera.resized(camera.width // self.zoom, camera.height // self.zoom)
+
+    def _log_factors(self, needs: Sequence[float]) -> None:
+        """Log how many views have each k, and from `late_from` on, where that differs."""
+        settings = self.settings
+        early, late = (
+            ", ".join(f"{count} at {k}" for k, count in sorted(counts.items()))
+            for counts in (
+                Counter(_clamped(need, factor) for need in needs)
+                for factor in (settings.factor, settings.late_factor)
+            )
+        )
+        later = "" if late == early else f"; from step {settings.late_from} on {late}"
+        _log.info("supersampled: views at k times their size: %s%s", early, later)
+
+
+def _clamped(need: float, factor: int) -> int:
+    return min(max(1, round(need)), factor)
 
 
 def _block_means(image: Tensor, side: int) -> Tensor:
