@@ -12,7 +12,7 @@ from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, get_type_hints
 
-from xrgs.splat.settings import NOMINAL_STEPS, DensifySettings, OptimizerSettings, RasterSettings
+from xrgs.splat.settings import DensifySettings, OptimizerSettings, RasterSettings
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping
@@ -248,7 +248,7 @@ class MipConf:
 
     variance: float = off(0.0)
     every: int
-    until: int = off(NOMINAL_STEPS)
+    until: int = off(30_000)
 
 
 @dataclass(kw_only=True)

@@ -146,7 +146,7 @@ def test_two_processes_at_once_share_one_variant(
 ) -> None:
     script = (
         "from pathlib import Path; from xrgs.capture import variant;"
-        "from xrgs.config import SceneConf, SfmConf, VariantConf;"
+        "from xrgs.config import PhoneConf, SceneConf, SfmConf, VariantConf;"
         f"conf = {small_conf(stereo_scene)!r}; root = Path({str(store)!r});"
         f"print(variant.build({stereo_scene!r}, conf, root / 'variants', root / 'scenes').id)"
     )

@@ -12,7 +12,6 @@ from torch import Tensor
 
 from xrgs.errors import XrgsError
 from xrgs.splat.rounding import rounded_mean, rounded_sqrt
-from xrgs.splat.settings import NOMINAL_STEPS
 from xrgs.training.components.base import (
     Component,
     Step,
@@ -94,13 +93,9 @@ class Mip(Component):
             XrgsError: A setting is out of its range.
         """
         check_not_negative("components.mip.variance", settings.variance)
-        if settings.every < 1:
-            raise XrgsError(f"components.mip.every={settings.every}: must be at least 1")
-        if not 0 < settings.until <= NOMINAL_STEPS:
-            raise XrgsError(
-                f"components.mip.until={settings.until}: must be above 0 and at most"
-                f" {NOMINAL_STEPS}, which never ends the filter"
-            )
+        for name in ("every", "until"):
+            if (value := getattr(settings, name)) < 1:
+                raise XrgsError(f"components.mip.{name}={value}: must be at least 1")
         if settings.variance == 0:
             return None
         return cls(settings, setup.data.train, setup.splat.raster.near)
