@@ -84,6 +84,28 @@ class Camera:
         )
         return first, second, third
 
+    def in_image(
+        self, points: Tensor, *, near: float = 0.0, margin: float = 0.0
+    ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """Find the points that project into the image.
+
+        Args:
+            points: [P, 3] world units, float32 or float64.
+            near: Points of this depth and less are not in the image, world units.
+            margin: Fraction of the image's size by which a point may lie outside.
+
+        Returns:
+            x, y and z [P] each as `to_camera` has them, and which points are in the image [P] bool.
+        """
+        K = self.K.to(points)
+        x, y, depth = self.to_camera(points)
+        inside = depth > near
+        for axis, place, size in ((0, x, self.width), (1, y, self.height)):
+            # Homogeneous pixels: compared before the division by depth, which may be 0.
+            pixels = K[axis, axis] * place + K[axis, 2] * depth
+            inside &= (pixels >= -margin * size * depth) & (pixels <= (1 + margin) * size * depth)
+        return x, y, depth, inside
+
     @classmethod
     def look_at(
         cls,

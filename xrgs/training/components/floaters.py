@@ -141,7 +141,7 @@ class Floaters(Component):
         means = gaussians.means.detach()
         too_near = torch.zeros(len(gaussians), dtype=torch.bool)
         for name, camera in self.cameras.items():
-            depth, inside = _in_image(means, camera)
+            _, _, depth, inside = camera.in_image(means)
             too_near |= inside & (depth < self.settings.near_share * self.near[name])
         self.removed += int(too_near.sum())
         return too_near
@@ -163,22 +163,10 @@ class Floaters(Component):
 
 def _near_and_median(points: Tensor, camera: Camera) -> tuple[float, float]:
     """The 1st percentile and the median depth of the points [P, 3] in a view's image; 0 of none."""
-    depth, inside = _in_image(points, camera)
+    _, _, depth, inside = camera.in_image(points)
     if not inside.any():
         return 0.0, 0.0
     shares = depth.new_tensor([_NEAREST, 0.5])
     # One of the depths, since the last digits of an interpolation may depend on the processor.
     near, median = torch.quantile(depth[inside], shares, interpolation="lower").tolist()
     return near, median
-
-
-def _in_image(points: Tensor, camera: Camera) -> tuple[Tensor, Tensor]:
-    """The depths [P] of points [P, 3], and which of them project into a view's image [P] bool."""
-    K = camera.K.to(points)
-    x, y, depth = camera.to_camera(points)
-    inside = depth > 0
-    for axis, place, size in ((0, x, camera.width), (1, y, camera.height)):
-        # Homogeneous pixels: compared before the division by depth, which may be 0.
-        pixels = K[axis, axis] * place + K[axis, 2] * depth
-        inside &= (pixels >= 0) & (pixels <= size * depth)
-    return depth, inside

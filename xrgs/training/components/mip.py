@@ -214,12 +214,7 @@ def sampling_rates(
     highest = means.new_zeros(len(means))
     for camera, mask in zip_longest(cameras, masks):
         K = camera.K.to(means)
-        x, y, depth = camera.to_camera(means)  # [N] each
-        seen = depth > near
-        for axis, (place, size) in enumerate(((x, camera.width), (y, camera.height))):
-            # Homogeneous pixels: compared before the division by depth, which may be 0.
-            pixels = K[axis, axis] * place + K[axis, 2] * depth
-            seen &= (pixels >= -MARGIN * size * depth) & (pixels <= (1 + MARGIN) * size * depth)
+        x, y, depth, seen = camera.in_image(means, near=near, margin=MARGIN)  # [N] each
         if mask is not None:
             seen[seen.clone()] = _shown(mask, K, x[seen], y[seen], depth[seen])
         rate = torch.maximum(K[0, 0], K[1, 1]) / depth
