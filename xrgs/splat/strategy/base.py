@@ -59,6 +59,9 @@ class Strategy(ABC):
             groups: Thresholds of groups of views; None takes the ones in `settings` for all views.
             view_pixels: Number of pixels of the largest training view, which `settings.budget` is
                 multiplied by; only read where there is a budget.
+
+        Raises:
+            ValueError: The strategy has no groups and got some, or it needs a budget.
         """
         self.optimizer = optimizer
         self.gaussians = optimizer.gaussians
@@ -67,6 +70,11 @@ class Strategy(ABC):
         self.generator = generator
         self.groups = groups
         self.view_pixels = view_pixels
+        self._begin()
+
+    @abstractmethod
+    def _begin(self) -> None:
+        """Set what the strategy has of its own, when all arguments are set."""
 
     @abstractmethod
     def after_step(

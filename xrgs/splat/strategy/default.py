@@ -20,8 +20,6 @@ from torch import Tensor
 
 from xrgs.splat.backend import implementation
 from xrgs.splat.gaussians import PARAMETERS
-from xrgs.splat.optimizer import SplatOptimizer
-from xrgs.splat.settings import DensifySettings
 from xrgs.splat.strategy.base import NO_HOOKS, Strategy
 from xrgs.splat.strategy.ops import (
     Budget,
@@ -30,7 +28,7 @@ from xrgs.splat.strategy.ops import (
     split_at_random,
     top_k,
 )
-from xrgs.splat.strategy.refinement import Groups, Refinement, StrategyHooks, Thresholds
+from xrgs.splat.strategy.refinement import Refinement, StrategyHooks, Thresholds
 
 _OPAQUE = 1 - 2**-24
 """The largest opacity whose logit is finite in float32."""
@@ -78,27 +76,11 @@ class DefaultStrategy(Strategy):
         ...     strategy.after_step(step, offset.grad, render.visible, width=w, height=h)
     """
 
-    def __init__(
-        self,
-        optimizer: SplatOptimizer,
-        settings: DensifySettings,
-        *,
-        scene_scale: float,
-        generator: torch.Generator,
-        groups: Groups | None = None,
-        view_pixels: int = 0,
-    ) -> None:
-        """Start with empty statistics; `Strategy` explains the arguments."""
-        super().__init__(
-            optimizer,
-            settings,
-            scene_scale=scene_scale,
-            generator=generator,
-            groups=groups,
-            view_pixels=view_pixels,
-        )
+    def _begin(self) -> None:
+        """Start with empty statistics."""
+        settings, groups = self.settings, self.groups
         self.budget = (
-            Budget(len(self.gaussians), gaussians_of(settings.budget, view_pixels))
+            Budget(len(self.gaussians), gaussians_of(settings.budget, self.view_pixels))
             if settings.budget
             else None
         )

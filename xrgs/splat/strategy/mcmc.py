@@ -15,12 +15,10 @@ import torch
 from torch import Tensor
 
 from xrgs.splat.gaussians import PARAMETERS
-from xrgs.splat.optimizer import SplatOptimizer
 from xrgs.splat.quaternions import rotate
-from xrgs.splat.settings import DensifySettings
 from xrgs.splat.strategy.base import NO_HOOKS, Strategy
 from xrgs.splat.strategy.ops import gaussians_of
-from xrgs.splat.strategy.refinement import Groups, Refinement, StrategyHooks
+from xrgs.splat.strategy.refinement import Refinement, StrategyHooks
 
 GROWTH = 1.05
 """Factor by which a refinement raises the number of Gaussians."""
@@ -74,34 +72,17 @@ class MCMCStrategy(Strategy):
 
     asks_components: ClassVar[bool] = False
 
-    def __init__(
-        self,
-        optimizer: SplatOptimizer,
-        settings: DensifySettings,
-        *,
-        scene_scale: float,
-        generator: torch.Generator,
-        groups: Groups | None = None,
-        view_pixels: int = 0,
-    ) -> None:
-        """Find the largest number of Gaussians; `Strategy` explains the arguments.
+    def _begin(self) -> None:
+        """Find the largest number of Gaussians.
 
         Raises:
             ValueError: There are groups, or no budget.
         """
-        super().__init__(
-            optimizer,
-            settings,
-            scene_scale=scene_scale,
-            generator=generator,
-            groups=groups,
-            view_pixels=view_pixels,
-        )
-        if groups is not None:
+        if self.groups is not None:
             raise ValueError("groups: there are no thresholds of growth")
-        if not settings.budget:
+        if not self.settings.budget:
             raise ValueError("settings.budget must be above 0: Gaussians are added up to it")
-        self.most = gaussians_of(settings.budget, view_pixels)
+        self.most = gaussians_of(self.settings.budget, self.view_pixels)
 
     @torch.no_grad()
     def after_step(
