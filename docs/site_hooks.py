@@ -133,11 +133,11 @@ def keys_page() -> str:
     """Return the page of every key of conf/config.yaml: its value and its comment."""
     parts = [
         "# Every key",
-        "The baseline is gsplat's default training, with every component present and off. A key is"
-        " set on the command line as `KEY=VALUE`; `xrgs-sweep help=KEY` prints what stands here, and"
-        " `xrgs-sweep --cfg job` the values in effect. Presets, scenes, variants and ablations set"
-        " [other values](files.md). Numbers of steps are of a run of 30,000 steps, and shrink with"
-        " `train.steps`, unless a key says otherwise.",
+        "The baseline is gsplat's default training, with every component present and off."
+        " `KEY=VALUE` on the command line sets a key. `xrgs-sweep help=KEY` prints what stands"
+        " here, and `xrgs-sweep --cfg job` the values in effect. Presets, scenes, variants and"
+        " ablations set [other values](files.md). Numbers of steps are of a run of 30,000 steps,"
+        " and shrink with `train.steps`, unless a key says otherwise.",
     ]
     titles: dict[str, list[str]] = {"": ["## The run"]}  # a group's title and keys, by its name
     for key, (value, comment) in key_help.entries().items():
@@ -154,8 +154,8 @@ def files_page() -> str:
     """Return the page of the other files of conf/ and of sweeps/: what each sets, and why."""
     parts = [
         "# Ablations, presets, studies",
-        "Each is a YAML file that changes keys of [the baseline](config.md). The name of the file is"
-        " what the command line calls it. `--config-dir FOLDER` adds files of your own.",
+        "Each is a YAML file that changes keys of [the baseline](config.md); the command line calls"
+        " it by its name. `--config-dir FOLDER` adds [your own](../study.md#files-of-your-own).",
     ]
     for group, title in GROUPS.items():
         folder = ROOT / group if group == "sweeps" else ROOT / "conf" / group
@@ -193,19 +193,18 @@ def components_page() -> str:
     """Return the page of every component: the docstring of its class."""
     parts = [
         "# Components",
-        "A component is one change to training. It is off unless its settings, the keys of"
-        " [`components`](conf/config.md#components), switch it on. Each is described by the docstring"
-        " of its class, in the order in which their hooks run. [The method](method.md) has the"
-        " paper's formulas on one page, and [Add a component](add_component.md) says how to write one.",
+        "A component is one change to training. It is off unless its settings, keys of"
+        " [`components`](conf/config.md#components), switch it on. The docstring of its class says"
+        " what it does. They stand in the order in which their hooks run."
+        " [The method](method.md) has the paper's formulas on one page, and"
+        " [Add a component](add_component.md) says how to write one.",
     ]
-    options = "\n".join(
-        f"      {name}: {value}"
-        for name, value in {"members": "[]", "show_root_heading": "false", "show_bases": "false"}.items()
-    )
+    options = ("members: []", "show_root_heading: false", "show_bases: false")
+    lines = "".join(f"\n      {option}" for option in options)
     for key, entry in BUILT_IN.items():
         parts.append(f"## {', '.join(f'`{name}`' for name in (key, *entry.reads))}")
         path = f"xrgs.training.components.{entry.module}.{entry.name}"
-        parts.append(f"::: {path}\n    options:\n{options}")
+        parts.append(f"::: {path}\n    options:{lines}")
     parts += ["## The interface", "::: xrgs.training.components.base.Component"]
     return "\n\n".join(parts)
 
@@ -251,7 +250,8 @@ def _targets(page: Path) -> Iterator[Path]:
 
 def _mathml(latex: str, element: str) -> str:
     number = _NUMBER.search(latex)
-    formula = convert(_NUMBER.sub("", latex).strip(), display="inline" if element == "span" else "block")
+    display = "inline" if element == "span" else "block"
+    formula = convert(_NUMBER.sub("", latex).strip(), display=display)
     if element == "span":
         return formula
     return f'<div class="equation">{formula}{f"<span>({number[1]})</span>" if number else ""}</div>'
