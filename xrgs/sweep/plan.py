@@ -6,6 +6,7 @@ from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
 
 from xrgs.capture import scenes
+from xrgs.capture.download.scenes import how_to_get
 from xrgs.experiment.cell_folder import CellState
 from xrgs.experiment.identity import cell_id, cell_identity
 from xrgs.experiment.schema import RecordedCell
@@ -196,6 +197,8 @@ def describe(plan: Sequence[PlannedCell]) -> str:
     failed = any(cell.remembered or cell.state.name == "failed" for cell in plan)
     if plan[0].conf.retry != "failed" and failed:
         lines.append("failed cells are not trained again; retry=failed trains them again")
+    if hint := how_to_get([cell.conf.scene for cell in plan if cell.error]):
+        lines.append(hint)
     return "\n".join(map(for_line, lines))
 
 

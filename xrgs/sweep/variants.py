@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 from xrgs.capture import photographs, scenes, split, variant
 from xrgs.capture.description import read_report
+from xrgs.capture.download.scenes import how_to_get
 from xrgs.capture.folders import failed_folder, trimmed_folder
 from xrgs.errors import StoreError, UnreadableError, XrgsError
 from xrgs.experiment import trimming
@@ -84,6 +85,8 @@ def find_or_build(conf: Conf, store: Store) -> str:
     Raises:
         XrgsError: The photographs are missing, or can't be made into a variant.
     """
+    if hint := how_to_get([conf.scene]):
+        raise XrgsError(f"scene.path={conf.scene.path}: no such folder; {hint}")
     frozen = variant.find(store.variants, variant.key(conf.scene, conf.variant))
     if frozen is not None:
         return frozen.id
