@@ -10,7 +10,7 @@ import time
 import traceback
 from contextlib import suppress
 from statistics import fmean
-from typing import TYPE_CHECKING, Any, cast
+from typing import TYPE_CHECKING, Any, Self, cast
 
 import msgspec
 
@@ -198,7 +198,8 @@ def _train_and_score(
     # A search for a threshold trains several times, and only the last training is the cell's.
     searches = conf.components.count_matched.gaussians > 0
     checkpoint = CellCheckpoint(folder, conf.checkpoint_s, shown, stop, curves=not searches)
-    trained, machines = _train_or_resume(data, conf, checkpoint, provenance.machine(what))
+    with _Found() as found:
+        trained, machines = _train_or_resume(data, conf, checkpoint, provenance.machine(what))
     if len(machines) > 1:
         what = msgspec.structs.replace(what, machines_in_turn="; ".join(machines))
         _write_struct(folder.path / "provenance.json", what)
@@ -229,9 +230,29 @@ def _train_and_score(
         grow_grad2d=trained.grow_grad2d,
         work=dict(trained.work),
         stage_seconds=dict(trained.stage_seconds),
+        found=tuple(dict.fromkeys(found.lines)),
     )
     _write_struct(folder.path / "summary.json", summary)
     return [view.name for view in data.test]
+
+
+class _Found(logging.Handler):
+    """Keeps what components log while a `with` block runs: what they found out."""
+
+    def __init__(self) -> None:
+        super().__init__(logging.INFO)
+        self.lines: list[str] = []
+        self._logger = logging.getLogger("xrgs.training.components")
+
+    def emit(self, record: logging.LogRecord) -> None:
+        self.lines.append(record.getMessage())
+
+    def __enter__(self) -> Self:
+        self._logger.addHandler(self)
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._logger.removeHandler(self)
 
 
 def _train_or_resume(
