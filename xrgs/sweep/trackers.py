@@ -78,7 +78,7 @@ class _Table:
         self._cell = [run.cell_id, *(for_csv(run.names[key]) for key in NAMES)]
         self._rows: list[list[object]] = []
         if self._file.exists():
-            self._rows += read_table(self._file)[1]
+            self._rows.extend([*row] for row in read_table(self._file)[1])
         self.sent = max((int(str(row[-2])) for row in self._rows), default=-1)
 
     def write(self, step: int, values: Mapping[str, float]) -> None:
@@ -208,7 +208,8 @@ class _Wandb:
     """
 
     def __init__(self, run: Run, folder: Path) -> None:
-        self._run, self._folder, self._opened = run, folder, None
+        self._run, self._folder = run, folder
+        self._opened: Any = None
         self._mark = folder / f"{run.cell_id}.json"
         self.sent = -1
         with suppress(StoreError):  # there is none yet

@@ -154,7 +154,7 @@ def add_views(
         (row["cell_id"], row["view"]): {name: finite(row[name]) for name in VIEW_METRICS}
         for row in views.to_dict("records")
     }
-    names = {name: list(rows["view"]) for name, rows in views.groupby("cell_id")}
+    names = {str(name): list(rows["view"]) for name, rows in views.groupby("cell_id")}
     wanted = [
         (cells, view)
         for cells in runs(comparison)
