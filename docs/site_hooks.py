@@ -142,6 +142,7 @@ def keys_page() -> str:
     titles: dict[str, list[str]] = {"": ["## The run"]}  # a group's title and keys, by its name
     for key, (value, comment) in key_help.entries().items():
         text = html.escape(" ".join(comment), quote=False)
+        text = text[:1].upper() + text[1:]  # of a comment behind a value
         if not value:
             titles[key] = [f"## `{key}` {{ #{key} }}", text]
         else:

@@ -155,6 +155,16 @@ def rasterization(
         ValueError: A tensor has a wrong shape, is not float32 or float64, or has values that are
             not finite; opacities are outside 0..1; a camera is not rigid or has skew. The message
             names the argument.
+
+    Examples:
+        >>> means, quats = torch.rand(50, 3) + torch.tensor([0.0, 0.0, 2.0]), torch.rand(50, 4)
+        >>> scales, opacities, colors = torch.full((50, 3), 0.1), torch.rand(50), torch.rand(50, 3)
+        >>> image, alpha, meta = rasterization(
+        ...     means, quats, scales, opacities, colors,
+        ...     viewmats=camera.viewmat[None], Ks=camera.K[None], width=48, height=32,
+        ... )
+        >>> image.shape, alpha.shape
+        (torch.Size([1, 32, 48, 3]), torch.Size([1, 32, 48, 1]))
     """
     _refuse(
         sparse_grad=sparse_grad,
