@@ -138,11 +138,11 @@ def rasterization(
             else torch. gsplat has no such argument.
 
     Returns:
-        The colours [C, H, W, X], X the channels of the render mode; alpha [C, H, W, 1]; and `meta`:
-        `radii` (int32, px; 0 where not drawn), `means2d` (px), `depths`, `conics` and `opacities`,
-        with `camera_ids`, `gaussian_ids` and `batch_ids` if packed (else None), and `width`,
-        `height`, `tile_size`, `n_cameras`, `n_batches`. The intersections with tiles (`isect_ids`,
-        `isect_offsets`, `flatten_ids`, `tiles_per_gauss`) are not in it.
+        The colours [C, H, W, X], X the channels of the render mode; alpha [C, H, W, 1]; and `meta`.
+        `meta` has `radii` (int32, px; 0 where not drawn), `means2d` (px), `depths`, `conics` and
+        `opacities`, with `camera_ids`, `gaussian_ids` and `batch_ids` if packed (else None), and
+        `width`, `height`, `tile_size`, `n_cameras`, `n_batches`. The intersections with tiles
+        (`isect_ids`, `isect_offsets`, `flatten_ids`, `tiles_per_gauss`) are not in it.
 
         `meta["means2d"]` is a leaf: after the backward pass its `.grad` is the image-plane gradient
         that gsplat's `DefaultStrategy` reads, so the strategy runs on this function. No gradient

@@ -66,8 +66,8 @@ def rasterize(
             else torch.
 
     Returns:
-        The render: `image` [H, W, 3], which starts at 0 and is not clamped at 1, `alpha` [H, W] in
-        0..1, and `visible` [N] bool.
+        The render, with `image` [H, W, 3], which starts at 0 and is not clamped at 1, `alpha`
+        [H, W] in 0..1, and `visible` [N] bool.
 
     Raises:
         ValueError: A parameter has a wrong shape or type, or values that are not finite, or
