@@ -16,6 +16,8 @@ import os
 import posixpath
 import re
 import sys
+import textwrap
+import tomllib
 from contextlib import redirect_stdout
 from importlib import import_module
 from pathlib import Path
@@ -46,7 +48,7 @@ PAGES = {
 }
 #: Files that are shown as a page, with the language that they are highlighted as.
 SOURCES = {".py": "python", ".yaml": "yaml", ".bib": "bibtex", ".cff": "yaml", ".toml": "toml"}
-COMMANDS = ("sweep", "status", "report", "store", "data", "view", "render", "bench")
+_COLUMNS = 100  # of the help of commands
 FILES_PAGE = "conf/files.md"
 #: Folders of conf/ and their titles, in the order of the page.
 GROUPS = {
@@ -142,6 +144,7 @@ def keys_page() -> str:
     titles: dict[str, list[str]] = {"": ["## The run"]}  # a group's title and keys, by its name
     for key, (value, comment) in key_help.entries().items():
         text = html.escape(" ".join(comment), quote=False)
+        text = text[:1].upper() + text[1:]  # of a comment behind a value
         if not value:
             titles[key] = [f"## `{key}` {{ #{key} }}", text]
         else:
@@ -176,16 +179,14 @@ def files_page() -> str:
 def commands_page() -> str:
     """Return the page of every command and subcommand: what `--help` prints."""
     parts = ["# Commands", "What each command prints for `--help`."]
-    for command in COMMANDS:
-        text = _help(command)
-        parts.append(f"## `xrgs-{command}`\n\n```text\n{text}\n```")
-        if command == "sweep":
-            continue
-        usage = text.partition("\n\n")[0]
-        if names := re.search(r"\{([a-z,]+)\}", usage):
-            for name in names[1].split(","):
-                parts.append(f"### `xrgs-{command} {name}`")
-                parts.append(f"```text\n{_help(command, name)}\n```")
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    for command in project["scripts"]:
+        usage = _help(command).partition("\n\n")[0]
+        subcommands = re.search(r"\{([a-z,]+)\}", usage)
+        names = subcommands[1].split(",") if subcommands else []
+        parts += [f"## `{command}`", f"```text\n{_help(command)}\n```"]
+        for name in names:
+            parts += [f"### `{command} {name}`", f"```text\n{_help(command, name)}\n```"]
     return "\n\n".join(parts)
 
 
@@ -210,10 +211,10 @@ def components_page() -> str:
 
 
 def _help(command: str, *words: str) -> str:
-    """Return what a command prints for `--help`, 100 columns wide and without colours."""
-    main = import_module(f"xrgs.cli.{command}").main
-    argv = [f"xrgs-{command}", *words, "--help"]
-    environment = {"COLUMNS": "100", "NO_COLOR": "1", "TERM": "dumb"}
+    """Return what a command prints for `--help`, without colours."""
+    main = import_module(command.replace("xrgs-", "xrgs.cli.")).main
+    argv = [command, *words, "--help"]
+    environment = {"COLUMNS": str(_COLUMNS), "NO_COLOR": "1", "TERM": "dumb"}
     with (
         patch.object(sys, "argv", argv),
         patch.dict(os.environ, environment),
@@ -224,7 +225,14 @@ def _help(command: str, *words: str) -> str:
         except SystemExit as end:
             if end.code:
                 raise
-    return "\n".join(line.rstrip() for line in printed.getvalue().strip().splitlines())
+    return "\n".join(_wrapped(line) for line in printed.getvalue().strip().splitlines())
+
+
+def _wrapped(line: str) -> str:
+    """Break a line of help that is too long, and indent what follows as its second column."""
+    margin = " " * len(re.findall(r"^ *\S+ {2,}|^ *", line)[0])
+    wrapped = textwrap.wrap(line, _COLUMNS, subsequent_indent=margin)
+    return "\n".join(wrapped) if len(line) > _COLUMNS else line.rstrip()
 
 
 def _add(files: Files, config: MkDocsConfig, path: Path) -> None:

@@ -6,7 +6,6 @@ from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
 
 from xrgs.capture import scenes
-from xrgs.capture.download.scenes import how_to_get
 from xrgs.experiment.cell_folder import CellState
 from xrgs.experiment.identity import cell_id, cell_identity
 from xrgs.experiment.schema import RecordedCell
@@ -17,6 +16,7 @@ from xrgs.safeio.hashing import digest, to_plain
 from xrgs.safeio.sanitize import counted, for_line
 from xrgs.splat.backend import resolve_backend
 from xrgs.sweep.estimate import TORCH_SLOWDOWN
+from xrgs.sweep.variants import how_to_get
 
 if TYPE_CHECKING:
     from collections.abc import Container, Mapping, Sequence

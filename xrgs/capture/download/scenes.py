@@ -2,23 +2,19 @@
 
 from __future__ import annotations
 
-import shlex
 from dataclasses import dataclass
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 from xrgs.capture.download.http import DownloadError, NotAllowedError, download
 from xrgs.capture.download.unpack import UnpackError, unpack
 from xrgs.capture.scenes.folder import list_photographs
-from xrgs.config import CONF_DIR
 from xrgs.errors import XrgsError
 from xrgs.safeio.atomic import write_text
 from xrgs.safeio.hashing import file_digest
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
-
-    from xrgs.config import SceneConf
+    from pathlib import Path
 
 #: The folder in the root for archives, complete or partly downloaded.
 _DOWNLOADS = ".downloads"
@@ -78,26 +74,6 @@ def fetch_scenes(conf: DatasetConf, names: Iterable[str], root: Path) -> str:
     else:
         lines.append(f"{archive}: sha256 verified: {digest}")
     return "\n".join([*lines, f"{archive} is no longer needed for these"])
-
-
-def how_to_get(scenes: Iterable[SceneConf]) -> str:
-    """Return the command that downloads published scenes which are missing; empty if none is."""
-    from omegaconf import OmegaConf
-
-    missing: dict[tuple[str, Path], dict[str, None]] = {}
-    for file in sorted((CONF_DIR / "data").glob("*.yaml")):
-        published = OmegaConf.load(file).scenes
-        for scene in scenes:
-            path = Path(scene.path or "")
-            if scene.name in published and path.name == scene.name and not path.exists():
-                missing.setdefault((file.stem, path.parent), {})[scene.name] = None
-    usual = Path(OmegaConf.load(CONF_DIR / "config.yaml").data_root)
-    commands = [
-        f"xrgs-data download {dataset} {' '.join(names)}"
-        + ("" if root == usual else f" --data-root {shlex.quote(str(root))}")
-        for (dataset, root), names in missing.items()
-    ]
-    return f"to download what is missing: {'; '.join(commands)}" if commands else ""
 
 
 def _has_photographs(scene: Path) -> bool:
