@@ -10,7 +10,7 @@ import msgspec
 import pandas as pd
 
 from xrgs.errors import StoreError, XrgsError
-from xrgs.evaluation.metrics import METRICS
+from xrgs.evaluation.metrics import METRICS, over_views
 from xrgs.safeio.sanitize import for_line
 
 if TYPE_CHECKING:
@@ -88,10 +88,9 @@ def cell_metrics(summary: Summary, scores: pd.DataFrame) -> dict[str, float]:
         scores: The scores of its views, as `CellFolder.scores` returns them.
 
     Returns:
-        Figures of the whole cell, and the means of scores over the views; a score that one view
-        lacks has no mean (NaN).
+        Figures of the whole cell, and `xrgs.evaluation.metrics.over_views` of its scores.
     """
-    means = scores.mean(skipna=False)
+    means = over_views(scores.assign(cell_id="")).iloc[0]
     figures = msgspec.structs.asdict(summary)
     whole = {m.name: float(figures[m.name]) for m in METRICS if figures.get(m.name) is not None}
     return whole | {m.name: float(means[m.name]) for m in METRICS if m.name in means}
