@@ -118,7 +118,7 @@ def add_random(made: Any, labels: tuple[str, ...], conditions: dict[str, int]) -
                 made.add(label, scene=scene, condition=condition, factors=of)
 
 
-def p_of(comparison: Comparison, condition: str) -> dict[tuple[str, str], float]:
+def p_of(comparison: Comparison, condition: str) -> dict[Any, float]:
     """The p of each label and metric of a condition, by scipy."""
     pairs = comparison.pairs[comparison.pairs["condition"] == condition]
     effects = pairs.groupby(["label", "metric"])["effect"]

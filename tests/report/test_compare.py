@@ -128,8 +128,11 @@ def test_outcomes_come_first_in_their_own_order(made: Any) -> None:
 @pytest.mark.parametrize(
     ("design", "message"),
     [
-        (Design(outcomes=("psnr", "nice")), r"outcomes=nice: choose from: training_time_s, .*psnr"),
-        (Design(headline=("plus",)), r"headline=plus: choose from: baseline, consistency"),
+        (Design(outcomes=("psnr", "nice")), r"outcomes=nice: .* metric; choose from: .*psnr"),
+        (
+            Design(headline=("plus",)),
+            r"headline=plus: .* label; choose from: baseline, c",
+        ),
     ],
 )
 def test_an_unknown_outcome_or_headline_is_refused(made: Any, design: Design, message: str) -> None:

@@ -160,7 +160,7 @@ def test_the_terminal_has_table_failures_and_folder(study: Any) -> None:
     study.write()
     report = build(study.store.path, pictures=[])
     assert "consistency against baseline: 2 of 3 scenes, seed 0" in report.text
-    assert "+2.00 ↑" in report.text
+    assert "+0.40 ↑" in report.text
     assert "leaves: 3 of 24 views registered" in report.text
     assert report.text.endswith(f"Written to {report.folder}")
 
@@ -212,7 +212,7 @@ def test_a_missing_render_costs_its_picture_alone(study: Any) -> None:
     page = (report.folder / "table.md").read_text()
     assert "No picture of fern, consistency, seed 0" in page
     assert "fern--consistency.png" not in page
-    assert "+2.00 ↑" in page
+    assert "+0.40 ↑" in page
 
 
 def test_baselines_alone_have_their_values(made: Any) -> None:

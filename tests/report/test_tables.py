@@ -30,6 +30,10 @@ def rows_of(table: TextTable) -> dict[str, dict[str, str]]:
     return {row[0]: dict(zip(table.columns, row, strict=True)) for row in table.rows}
 
 
+def meanings(comparison: Comparison) -> dict[str, str]:
+    return {row[0]: row[1] for row in legend(comparison).rows}
+
+
 def test_psnr_changes_by_decibels_and_all_else_by_percent(made: Any) -> None:
     made.add()
     made.add("consistency", factors={"psnr": 0.99, "lpips": 0.5})
@@ -323,15 +327,15 @@ def test_a_headline_label_has_holms_p_and_a_line_in_the_legend(made: Any) -> Non
     assert (row["p (Holm)"], row["verdict"]) == ("0.010", "better")
     assert "q" not in row
     assert "q" in rows_of(built.mean("b", ""))["PSNR, dB"]
-    lines = dict(legend(built.comparison).rows)
+    lines = meanings(built.comparison)
     assert lines["p (Holm)"].startswith("the p of a, corrected by Holm")
-    assert "p (Holm)" not in dict(legend(tables(made).comparison).rows)
+    assert "p (Holm)" not in meanings(tables(made).comparison)
 
 
 def test_the_legend_has_the_outcomes_and_margins(made: Any) -> None:
     add_three(made, "a")
     design = Design(outcomes=("lpips", "ssim"), margin_psnr=0.3, margin_lpips=7)
-    lines = dict(legend(tables(made, design=design).comparison).rows)
+    lines = meanings(tables(made, design=design).comparison)
     assert lines["descriptive"].endswith("the outcomes of this report are LPIPS, SSIM")
     assert "0.3 dB of PSNR or 7 % of LPIPS" in lines["equivalent ≈"]
 

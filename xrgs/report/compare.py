@@ -194,12 +194,13 @@ def compare(
 
 def _check_design(design: Design, metrics: Sequence[Metric], cells: pd.DataFrame) -> None:
     """Raise ReportError for an outcome that is no metric, and a headline that is no label."""
-    for key, wanted, known in (
-        ("outcomes", design.outcomes, [metric.name for metric in metrics]),
-        ("headline", design.headline, list(dict.fromkeys(cells["label"]))),
+    for key, kind, wanted, known in (
+        ("outcomes", "metric", design.outcomes, [metric.name for metric in metrics]),
+        ("headline", "label", design.headline, list(dict.fromkeys(cells["label"]))),
     ):
         if unknown := [name for name in wanted if name not in known]:
-            raise ReportError(f"{key}={unknown[0]}: choose from: {', '.join(known)}")
+            names = ", ".join(known)
+            raise ReportError(f"{key}={unknown[0]}: there is no such {kind}; choose from: {names}")
 
 
 def _tested(means: pd.DataFrame, metrics: Sequence[Metric], design: Design) -> pd.DataFrame:
@@ -211,7 +212,7 @@ def _tested(means: pd.DataFrame, metrics: Sequence[Metric], design: Design) -> p
     amount = np.array([not scored_by(metric) for metric in of], dtype=bool)
     families = [means.index.get_level_values("condition"), amount]
     margin = np.array([design.margin(metric) for metric in of], dtype=np.float64)
-    numbers = (means[name].to_numpy(np.float64) for name in ("effect", "spread", "n"))
+    effect, spread, n = (means[name].to_numpy(np.float64) for name in ("effect", "spread", "n"))
 
     def corrected(chosen: NDArray[np.bool_], correct: Callable[[Floats], Floats]) -> pd.Series:
         p = means["p"].where(chosen)
@@ -221,7 +222,7 @@ def _tested(means: pd.DataFrame, metrics: Sequence[Metric], design: Design) -> p
         outcome=outcome,
         q=corrected(outcome, false_discovery_rates),
         holm=corrected(outcome & headline, holm),
-        p_equivalent=np.where(outcome, equivalence(*numbers, margin), np.nan),
+        p_equivalent=np.where(outcome, equivalence(effect, spread, n, margin), np.nan),
     )
 
 

@@ -217,5 +217,8 @@ def legend(comparison: Comparison) -> TextTable:
 def by_key(table: pd.DataFrame) -> dict[tuple[str, ...], Change]:
     """Return the rows of one of a `Comparison`'s tables of means, by their keys."""
     columns = [name for name in Change._fields if name in table]
-    rows = table[columns].to_dict("records")
-    return {key: Change(**row) for key, row in zip(table.index, rows, strict=True)}
+    rows = table[columns].itertuples(index=False)
+    return {
+        key: Change(**dict(zip(columns, row, strict=True)))
+        for key, row in zip(table.index, rows, strict=True)
+    }

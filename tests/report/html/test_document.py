@@ -102,7 +102,7 @@ def test_the_page_has_each_tables_context_and_headings(made: MadeStore) -> None:
 def test_a_copy_of_some_changes_has_whole_rows(page: Path, form: str) -> None:
     changes = data_of(page)["changes"][form]
     rows = re.findall(r'data-label="(.*?)" data-scene=".*?" data-metric="(.*?)"', page.read_text())
-    assert len(rows) == len(changes["rows"]) == 18
+    assert len(rows) == len(changes["rows"]) == 22
     for (label, metric), line in zip(rows, changes["rows"], strict=True):
         assert metric in line
         assert label in line or label != "consistency"
