@@ -15,10 +15,11 @@ import numpy as np
 import pandas as pd
 
 from xrgs.errors import StoreError, UnreadableError, XrgsError
-from xrgs.evaluation.metrics import METRICS, VIEW_METRICS, over_views
+from xrgs.evaluation.metrics import METRICS, VIEW_METRICS
 from xrgs.evaluation.scoring import PROTOCOL, stale_scores
 from xrgs.experiment.cell_folder import CellState
 from xrgs.experiment.provenance import machine
+from xrgs.experiment.results import over_views
 from xrgs.runtime.progress import progress
 from xrgs.safeio.records import as_number, read_table
 from xrgs.safeio.sanitize import for_line

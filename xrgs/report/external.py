@@ -16,8 +16,9 @@ import pandas as pd
 from xrgs.capture import variant
 from xrgs.capture.images import ImageError
 from xrgs.evaluation.files import score_file
-from xrgs.evaluation.metrics import VIEW_METRICS, over_views
+from xrgs.evaluation.metrics import VIEW_METRICS
 from xrgs.evaluation.scoring import scoring_code
+from xrgs.experiment.results import over_views
 from xrgs.report.collect import ReportError, Sweep
 from xrgs.runtime.progress import progress
 from xrgs.safeio.files import is_inside

@@ -2,8 +2,8 @@
 
 To add a score of views, add a file with its function, and an entry to `METRICS`; `xrgs-store
 rescore` then computes it for cells that are done. Any other entry is a figure of the cell's
-summary, or follows from the PSNR of its views (`over_views`). torch and kornia are imported where
-they are used, because plans and reports are made without them.
+summary, or follows from the PSNR of its views (`xrgs.experiment.results.over_views`). torch and
+kornia are imported where they are used, because plans and reports are made without them.
 """
 
 from __future__ import annotations
@@ -12,7 +12,6 @@ from typing import TYPE_CHECKING
 
 from xrgs.evaluation.metrics.base import Metric
 from xrgs.evaluation.metrics.lpips import lpips
-from xrgs.evaluation.metrics.over_views import over_views
 from xrgs.evaluation.metrics.psnr import psnr, psnr_plain
 from xrgs.evaluation.metrics.psnr_fitted import psnr_fitted
 from xrgs.evaluation.metrics.ssim import SSIM_WINDOW, ssim
@@ -26,7 +25,6 @@ __all__ = [
     "VIEW_METRICS",
     "Metric",
     "lpips",
-    "over_views",
     "psnr",
     "psnr_fitted",
     "psnr_plain",

@@ -7,7 +7,8 @@ import pandas as pd
 import pytest
 import torch
 
-from xrgs.evaluation.metrics import over_views, psnr
+from xrgs.evaluation.metrics import psnr
+from xrgs.experiment.results import over_views
 
 
 def test_pooled_psnr_is_that_of_all_pixels_together() -> None:
