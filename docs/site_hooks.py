@@ -96,6 +96,8 @@ def on_page_markdown(markdown: str, page: Page, config: MkDocsConfig, files: Fil
         return markdown
     folder = Path(source).resolve().parent
     here = posixpath.dirname(page.file.src_uri)
+    if page.file.name == "table":  # the numbers of studies: 2 MB that nobody searches for
+        page.meta["search"] = {"exclude": True}
 
     def moved(link: re.Match[str]) -> str:
         target = (folder / link[2]).resolve()
