@@ -71,14 +71,14 @@ def test_everything_of_the_store_is_there(page: Path) -> None:
 def test_the_table_of_changes_has_no_column_that_is_empty_in_every_row(
     made: MadeStore, page: Path
 ) -> None:
-    assert _heads(page) == ["Ablation", "Metric", "Change, %", "baseline", "Value"]
+    assert _heads(page) == ["Ablation", "Metric", "Change", "baseline", "Value"]
     for scene, factor in (("fern", 1.1), ("leaves", 1.3)):
         made.add(scene=scene)
         made.add("consistency", scene=scene, factors={"psnr": factor})
     made.write()
     several = build(made.store.path, pictures=[]).folder / "report.html"
-    assert _heads(several)[:5] == ["Ablation", "Scene", "Metric", "Change, %", "Reading"]
-    assert _heads(several)[7:] == ["From, %", "To, %", "Pairs that agree"]  # two values have no q
+    assert _heads(several)[:5] == ["Ablation", "Scene", "Metric", "Change", "Verdict"]
+    assert _heads(several)[7:] == ["From", "To", "Same sign"]  # two values have no q
     scenes = re.findall(r'data-scene="(.*?)"', page.read_text())
     assert set(scenes) == {"fern"}  # the filter of scenes finds the only one
 
@@ -103,7 +103,7 @@ def test_the_page_has_each_tables_context_and_headings(made: MadeStore) -> None:
 def test_a_copy_of_some_changes_has_whole_rows(page: Path, form: str) -> None:
     changes = data_of(page)["changes"][form]
     rows = re.findall(r'data-label="(.*?)" data-scene=".*?" data-metric="(.*?)"', page.read_text())
-    assert len(rows) == len(changes["rows"]) == 18
+    assert len(rows) == len(changes["rows"]) == 22
     for (label, metric), line in zip(rows, changes["rows"], strict=True):
         assert metric in line
         assert label in line or label != "consistency"
