@@ -5,6 +5,8 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -12,6 +14,17 @@ from torch import Tensor
 ORTHONORMAL_TOLERANCE = 1e-3
 """Largest entry of R R^T - I for the rotation R of a viewmat. The float32 exports of SfM are at
 1e-6; a matrix with a scale is far above."""
+
+
+class CameraNumbers(NamedTuple):
+    """A camera as plain numbers, which a kernel takes without a torch operation."""
+
+    viewmat: list[float]
+    """The 16 numbers of `Camera.viewmat`, row by row."""
+    intrinsics: list[float]
+    """fx, fy, cx, cy, px."""
+    position: list[float]
+    """`Camera.position`, world units."""
 
 
 @dataclass(frozen=True)
@@ -61,6 +74,13 @@ class Camera:
         first, second, third = (row[:3] * row[3] for row in self.viewmat[:3])
         position: Tensor = -(first + second + third)  # [3]
         return position
+
+    @cached_property
+    def numbers(self) -> CameraNumbers:
+        """The camera as plain numbers, computed once: a training renders a view many times."""
+        (fx, _, cx), (_, fy, cy), _ = self.K.tolist()
+        viewmat = self.viewmat.flatten().tolist()
+        return CameraNumbers(viewmat, [fx, fy, cx, cy], self.position.tolist())
 
     def resized(self, width: int, height: int) -> Camera:
         """Return this camera with the same view at another size, px."""
