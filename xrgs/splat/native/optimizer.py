@@ -40,7 +40,8 @@ def step(adam: torch.optim.Adam, camera: Camera | None = None, sh_degree: int = 
     harmonics: tuple[Any, ...] | None = None
     moved: list[Tensor] = []
     if camera is not None and groups["sh0"]["params"][0].grad is not None:
-        harmonics, *moved = _harmonics(adam, groups, camera, sh_degree)
+        harmonics = _harmonics(adam, groups, camera, sh_degree)
+        moved.append(groups["shN"]["params"][0])
     entries = []
     for name, group in groups.items():
         (parameter,) = group["params"]
@@ -52,7 +53,7 @@ def step(adam: torch.optim.Adam, camera: Camera | None = None, sh_degree: int = 
         gradient = _plain_handle(name, parameter.grad)
         number = state["step"].add_(1).item()
         entries.append((values, gradient, exp_avg, exp_avg_sq, group["lr"], number))
-        moved += changing
+        moved.append(parameter)
     beta1, beta2 = adam.defaults["betas"]
     threads = torch.get_num_threads()
     _native.adam_step(entries, beta1, beta2, adam.defaults["eps"], threads, harmonics)
@@ -63,13 +64,12 @@ def step(adam: torch.optim.Adam, camera: Camera | None = None, sh_degree: int = 
 
 def _harmonics(
     adam: torch.optim.Adam, groups: dict[str, dict[str, Any]], camera: Camera, sh_degree: int
-) -> tuple[tuple[Any, ...], Tensor, Tensor, Tensor]:
-    """Return the argument that moves shN by the gradient that sh0's implies, and what it moves."""
+) -> tuple[Any, ...]:
+    """Return the argument that moves shN by the gradient that sh0's implies."""
     means, sh0, shN = (groups[name]["params"][0] for name in ("means", "sh0", "shN"))
     state = _adam_state(adam, shN)
-    moved = (shN, state["exp_avg"], state["exp_avg_sq"])
-    argument = (
-        *(_plain_handle("shN", tensor) for tensor in moved),
+    return (
+        *(_plain_handle("shN", x) for x in (shN, state["exp_avg"], state["exp_avg_sq"])),
         _plain_handle("means", means),
         _plain_handle("sh0", sh0.grad),
         camera.numbers.position,
@@ -77,7 +77,6 @@ def _harmonics(
         groups["shN"]["lr"],
         state["step"].add_(1).item(),
     )
-    return argument, *moved
 
 
 def _adam_state(adam: torch.optim.Adam, parameter: Tensor) -> dict[str, Tensor]:

@@ -8,7 +8,7 @@ memory again.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import astuple
+from dataclasses import fields
 from typing import Any
 
 import torch
@@ -24,6 +24,8 @@ from xrgs.splat.settings import CullingOptions, RasterSettings
 
 _TILE = 16
 """Side of a tile, px: `kTileSize` of `xrgs/csrc/raster/types.h`."""
+_CULLING = [field.name for field in fields(CullingOptions)]
+"""The options in the order in which `RenderConfig` takes them."""
 _FIRST_PARAMETER = 2
 """Place of the first parameter among the arguments of `_Rasterize.forward`."""
 _SHN_INPUT = _FIRST_PARAMETER + PARAMETERS.index("shN")
@@ -136,7 +138,7 @@ def render_config(
         absgrad=settings.absgrad,
         background=settings.background,
         sh_degree=sh_degree,
-        culling=astuple(culling),
+        culling=[getattr(culling, name) for name in _CULLING],
         raw=raw,
     )
 
