@@ -97,7 +97,9 @@ XRGS_INLINE void load_columns(const float* p, std::int64_t stride, std::uint32_t
     Floats r[16];
     for (int i = 0; i < 16; ++i) {
       const float* row = p + i * stride + first;
-      r[i] = (rows >> i & 1u) == 0 ? broadcast(0.0f) : Width < 16 ? load_first(row, Width) : load(row);
+      r[i] = (rows >> i & 1u) == 0 ? broadcast(0.0f)
+             : Width < 16          ? load_first(row, Width)
+                                   : load(row);
     }
     transpose(r);
     for (int i = 0; i < 16 && first + i < Width; ++i) out[first + i] = r[i];

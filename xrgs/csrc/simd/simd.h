@@ -170,9 +170,9 @@ XRGS_INLINE Floats exp(Floats x) {
 
 // 1 / (1 + e^-x): 0 where it is below 2^-126, NaN for NaN.
 //
-// It is e^-|x| / (1 + e^-|x|) for negative x and 1 / (1 + e^-|x|) for others: nothing overflows, and
-// no value is below the normal numbers, so that it is the same where the processor flushes those to
-// 0.
+// It is e^-|x| / (1 + e^-|x|) for negative x and 1 / (1 + e^-|x|) for others: nothing overflows,
+// and no value is below the normal numbers, so that it is the same where the processor flushes
+// those to 0.
 XRGS_INLINE Floats logistic(Floats x) {
   const Floats one = broadcast(1.0f);
   const Floats e = exp(-abs(x));
