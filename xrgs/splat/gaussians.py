@@ -92,7 +92,7 @@ class Gaussians:
             points, colors, init_opacity=init_opacity, sh_degree=sh_degree, generator=generator
         )
 
-    def raw(self) -> tuple[Tensor, ...]:
+    def raw(self) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]:
         """Return the parameters in the order of `PARAMETERS`, with shN detached.
 
         The gradient of shN, three quarters of all gradients, is then never computed. The optimizer

@@ -81,9 +81,9 @@ def rasterize(
     if sh_degree is None:
         stored = math.isqrt(gaussians.shN.shape[1] + 1) - 1  # K = (degree + 1)^2
         sh_degree = min(settings.sh_degree, stored)
-    # Not `Gaussians.raw`, which cuts shN off from its gradient.
     return rasterize_parameters(
-        *(gaussians[name] for name in PARAMETERS),
+        *gaussians.raw()[:-1],
+        gaussians.shN,  # which `raw` cuts off from its gradient
         camera,
         settings,
         sh_degree=sh_degree,
