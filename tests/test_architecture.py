@@ -53,8 +53,9 @@ ONLY_IN = {
     "tifffile": ("capture/deep",),
     "viser": ("viewer/live",),
     "zstandard": ("splat/spz",),
-    "tensorboard": ("sweep/track",),
-    "mlflow": ("sweep/track",),
+    "tensorboard": ("sweep/trackers",),
+    "mlflow": ("sweep/trackers",),
+    "wandb": ("sweep/trackers",),
 }
 #: Modules that must load without torch, pycolmap, kornia and scikit-image: planning, reporting.
 LIGHT = (

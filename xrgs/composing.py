@@ -49,7 +49,7 @@ def compose(*overrides: str) -> Conf:
         OmegaConfBaseException: A value is missing or of another type; the message names its key.
         XrgsError: A value is out of its range; the message names its key.
 
-    Example:
+    Examples:
         >>> compose("preset=smoke", "train.steps=100").train.steps
         100
     """

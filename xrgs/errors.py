@@ -14,7 +14,15 @@ _MAX_OFFERED = 3
 
 
 class XrgsError(Exception):
-    """Something outside the program is wrong; the message names the file, key or parameter."""
+    """Something outside the program is wrong; the message names the file, key or parameter.
+
+    Examples:
+        >>> try:
+        ...     load_ply("missing.ply")
+        ... except XrgsError as error:
+        ...     print(error)
+        missing.ply: cannot be read: No such file or directory
+    """
 
 
 class StoreError(XrgsError):

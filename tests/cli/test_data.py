@@ -27,6 +27,13 @@ from xrgs.sweep.jobs import worker
 XrgsData = Callable[..., tuple[int, str, str]]
 
 
+def test_inspect_of_a_missing_scene_says_how_to_download_it(xrgs_data: XrgsData) -> None:
+    code, _, err = xrgs_data("inspect", "scene=llff/fern", "data_root=none")
+    assert code == 1
+    assert "scene.path=none/fern: no such folder; to download what is missing:" in err
+    assert "xrgs-data download llff fern --data-root none" in err
+
+
 @pytest.mark.parametrize("built", [True, False])
 def test_inspect_builds_a_variant_that_the_store_lacks(
     xrgs_data: XrgsData, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, built: bool

@@ -334,6 +334,20 @@ def test_a_dry_run_fails_where_photographs_are_missing_and_says_so_once(
     assert list(tmp_path.iterdir()) == []
 
 
+def test_a_dry_run_says_once_how_to_download_missing_scenes(
+    sweep_here: SweepHere, tmp_path: Path
+) -> None:
+    study = ("+sweeps=table1", "scene=llff/fern,llff/flower", "dry_run=true")
+    code, _, err = sweep_here(*study)
+    assert code == 1
+    assert err.count("to download what is missing: xrgs-data download llff fern flower\n") == 1
+    code, _, err = sweep_here(*study, "data_root=x/my photographs")
+    assert err.count("xrgs-data download llff fern flower --data-root 'x/my photographs'\n") == 1
+    (tmp_path / "data/llff/fern").mkdir(parents=True)
+    code, _, err = sweep_here(*study)
+    assert err.count("xrgs-data download llff flower\n") == 1
+
+
 def test_captures_are_looked_for_in_data_root(sweep_here: SweepHere, tmp_path: Path) -> None:
     code, _, err = sweep_here("scene=captures/ollie", "data_root=x/y", "dry_run=true")
     assert code == 1

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import doctest
 import math
 import subprocess
 import sys
@@ -279,12 +278,6 @@ def test_an_image_too_small_to_mirror_is_refused() -> None:
     with pytest.raises(ValueError, match="20 x 5 px is too small for SSIM"):
         metrics.ssim(torch.zeros(5, 20, 3), torch.zeros(5, 20, 3))
     assert metrics.ssim(torch.zeros(6, 20, 3), torch.zeros(6, 20, 3)) == pytest.approx(1, abs=1e-4)
-
-
-def test_the_examples_in_the_docstrings() -> None:
-    result = doctest.testmod(sys.modules["xrgs.evaluation.metrics.psnr"])
-    assert result.attempted > 0
-    assert result.failed == 0
 
 
 def test_plans_and_reports_need_no_torch() -> None:

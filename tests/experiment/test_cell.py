@@ -247,6 +247,37 @@ def test_the_test_views_are_scored_during_training_and_nothing_else_changes(
     assert "quality.csv" in scored.status().files
 
 
+@pytest.mark.parametrize("searches", [False, True])
+def test_the_curves_are_written_while_a_cell_trains(
+    conf: Conf, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, searches: bool
+) -> None:
+    """Though not of a search, of whose trainings the last one alone is the cell's."""
+    monkeypatch.setattr(cell, "_CURVES_S", 0.0)
+    conf.train.evaluate_every = 4
+    if searches:
+        conf.components.count_matched.gaussians = 10
+    folder = killed(conf, tmp_path, 6)
+    assert (folder.path / "history.csv").exists() == (not searches)
+    if not searches:
+        header, rows = read_table(folder.path / "history.csv")
+        assert [row[header.index("step")] for row in rows] == [str(step) for step in range(6)]
+        header, rows = read_table(folder.path / "quality.csv")
+        assert [row[header.index("step")] for row in rows] == ["4"]
+        assert folder.state().name == "unfinished"
+
+
+def test_what_components_found_is_in_the_summary(
+    conf: Conf, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    conf.components.exposure.mode = "gain"
+    folder = begin(conf, tmp_path)
+    with caplog.at_level(logging.INFO):
+        cell.run_cell(conf, VARIANT, folder)
+    (found,) = folder.summary().found
+    assert found.startswith("exposure: the gains of the photographs are ")
+    assert found in caplog.text
+
+
 def test_a_cell_that_is_asked_to_end_keeps_every_step_and_says_what_happened(
     conf: Conf, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:

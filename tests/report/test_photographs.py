@@ -6,7 +6,10 @@ import html
 from typing import Any
 
 import pytest
+from msgspec import to_builtins
+from msgspec.structs import replace
 
+from tests.report.conftest import finish_again
 from xrgs.report.page import build
 from xrgs.safeio.atomic import write_json
 
@@ -47,3 +50,19 @@ def test_a_variant_without_a_report_leaves_a_report_that_says_so(
     assert said in (report.folder / "report.html").read_text()
     assert said in (text := (report.folder / "table.md").read_text())
     assert str(made.store.path) not in text
+
+
+def test_a_report_says_what_each_training_found(made: Any) -> None:
+    for seed in (0, 1):
+        made.add("baseline", seed=seed)
+        cell = made.add("formation", seed=seed)
+        line = f"formation: LR views: 0.8{seed} px of blur across, 0.79 <b>down</b>"
+        write_json(cell.path / "summary.json", to_builtins(replace(cell.summary(), found=(line,))))
+        finish_again(cell)
+    made.write()
+    report = build(made.store.path, pictures=[])
+    page = (report.folder / "report.html").read_text()
+    for seed in (0, 1):
+        found = f"formation, replicate 0/{seed}: formation: LR views: 0.8{seed} px of blur across"
+        assert f"<li>{found}, 0.79 &lt;b&gt;down&lt;/b&gt;</li>" in page
+        assert found in (report.folder / "table.md").read_text()

@@ -160,6 +160,7 @@ def test_damaged_cells_are_left_out(past: Past, spoilt: str) -> None:
     ("views", "hr_share", "pixels"),
     [
         ("mixed", 0, 1000 * (10 + 40) / 2),
+        ("mixed", 0.5, 1000 * (10 + 40) / 2),
         ("mixed", 0.8, 1000 * (0.2 * 10 + 0.8 * 40)),
         ("hr_only", 0, 40_000),
         ("lr_only", 0, 10_000),

@@ -80,7 +80,8 @@ def test_states_are_read_from_the_cells_files_alone(watched: Watched) -> None:
     assert [cell.cell.cell_id for cell in snapshot.running] == ["a"]
     # 80 steps of a, and 100 of b and of c, which nothing else is known of
     assert str(snapshot) == (
-        "1 of 6 cells done, 2 failed, training 20 of 100 steps, 10 steps/s, ~28 s left"
+        "1 of 6 cells done, 2 failed, 10 steps/s, ~28 s left,"
+        " procedural / a / seed 0: training 20 of 100 steps"
     )
     watched.begin("b")
     watched.step("b", 50, 5.0)
@@ -100,7 +101,7 @@ def test_another_sweeps_cell_is_waited_for(watched: Watched) -> None:
     assert str(monitor.snapshot()) == "0 of 2 cells done, 1 in another sweep"
     watched.begin("a")
     watched.step("a", 0, 10.0)
-    assert str(monitor.snapshot()).endswith("~2 min left")  # b's ten steps, not a's ten seconds
+    assert "~2 min left, " in str(monitor.snapshot())  # b's ten steps, not a's ten seconds
     watched.finish("b")
     assert monitor.snapshot().done == 1
 
@@ -207,7 +208,7 @@ def test_a_terminal_shows_one_line_which_is_removed_at_the_end(
             time.sleep(0.01)
         watched.finish("a")
     output = terminal.getvalue()
-    assert "0 of 2 cells done, training 50 of 100 steps, 1 steps/s" in output
+    assert "0 of 2 cells done, 1 steps/s, ~2 min left, procedural / a" in output
     *_, last = output.split("\r")
     assert last.startswith("\x1b[K1 of 2 cells done")
     assert output.count("\n") == 1

@@ -4,7 +4,11 @@ from __future__ import annotations
 
 import errno
 import os
+import pty
 import shutil
+import signal
+import subprocess
+import sys
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -19,7 +23,8 @@ from xrgs.experiment.store import Store
 from xrgs.runtime import lease
 from xrgs.runtime.progress import Progress
 from xrgs.safeio.atomic import write_json
-from xrgs.sweep.status import describe, read
+from xrgs.safeio.files import walk_files
+from xrgs.sweep.status import describe, read, running
 
 
 @pytest.fixture
@@ -218,3 +223,34 @@ def test_a_long_name_leaves_the_table_its_columns(store: Store, cells: Any) -> N
     cells.begin("long", scene=replace(cells.conf.scene, name="x" * 10**6))
     row = next(line for line in describe(read(store.path)).split("\n") if line.startswith("xxx"))
     assert row.split()[1:] == ["?", "1"]
+
+
+def test_a_watch_shows_the_cells_in_training(store: Store) -> None:
+    (sweep_id,) = store.sweep_ids()
+    clock, *lines = running(store).splitlines()
+    assert clock.endswith("  1 cell in training")
+    assert lines == [
+        f"sweep {sweep_id}: 2 of 4 cells done",
+        "  statue / mip / replicate 0/0: training 20 of 80 steps, 3 steps/s, ~20 s left",
+    ]
+
+
+def test_ctrl_c_ends_a_watch_and_changes_nothing(store: Store) -> None:
+    def files() -> dict[str, int]:
+        return {name: status.st_mtime_ns for name, status in walk_files(store.path)}
+
+    before = files()
+    reader, writer = pty.openpty()
+    command = [sys.executable, "-P", "-c", "from xrgs.cli.status import main; main()"]
+    watch = subprocess.Popen(
+        [*command, "--store", str(store.path), "--watch"], stdout=writer, stderr=writer
+    )
+    os.close(writer)
+    shown = b""
+    while b"training 20 of 80" not in shown:
+        shown += os.read(reader, 1 << 16)
+    watch.send_signal(signal.SIGINT)
+    assert watch.wait(60) == 0
+    assert b"Traceback" not in shown
+    assert files() == before
+    os.close(reader)

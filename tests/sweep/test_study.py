@@ -91,7 +91,7 @@ def test_a_sweep_that_starts_nothing_more_says_why(
     given = ("store=s", f"fail_fast={fail_fast}")
     plan = [planned_cell(compose(*given, f"seed={seed}"), seed) for seed in range(3)]
     with SweepMonitor(store.cells_folder) as monitor:
-        final = study(*given)._run_until_complete(plan, store, monitor)
+        final = study(*given)._run_until_complete(plan, store, [monitor])
     assert [cell.state.name for cell in final] == ["planned"] * 3
     assert launcher.launched == 3
     lines = [line for line in capsys.readouterr().err.splitlines() if "no further cell" in line]
@@ -254,7 +254,7 @@ def test_a_cell_that_can_not_be_read_is_left_alone_and_the_others_are_trained(
     with SweepMonitor(store.cells_folder) as monitor:
         made = study("store=s")
         plan = made._identified(plan, store)
-        final = made._run_until_complete(plan, store, monitor)
+        final = made._run_until_complete(plan, store, [monitor])
     assert trainer.launched == [plan[1].cell_id]
     assert [cell.state.name for cell in final] == ["unknown", "done"]
     text = describe(final)
@@ -290,7 +290,7 @@ def test_an_error_that_passes_is_waited_for_a_while(
     finish(store, str(plan[1].cell_id))
     monkeypatch.setattr(study_module, "_POLL_S", 2.0)
     monkeypatch.setattr(time, "sleep", sleep)
-    final = made._run_until_complete(plan[:1], store, SweepMonitor(store.cells_folder))
+    final = made._run_until_complete(plan[:1], store, [SweepMonitor(store.cells_folder)])
     passes = looks < study_module._UNKNOWN_LOOKS
     assert final[0].state.name == ("done" if passes else "unknown")
     assert slept == [2.0] * min(looks + 1, study_module._UNKNOWN_LOOKS)
@@ -309,7 +309,7 @@ def test_a_variant_that_can_not_be_read_makes_its_cells_unknown_until_it_can(
     plan = [replace(cell, variant_id=None, identity=None, cell_id=None) for cell in plan]
     plan = made._identified(made._with_variants(plan, store, allow_build=True), store)
     monitor = SweepMonitor(store.cells_folder)
-    final = made._run_until_complete(plan, store, monitor)
+    final = made._run_until_complete(plan, store, [monitor])
     assert not trainer.launched
     assert [cell.state.name for cell in final] == ["unknown"] * 2
     assert "variant unknown" in describe(final)
@@ -317,7 +317,7 @@ def test_a_variant_that_can_not_be_read_makes_its_cells_unknown_until_it_can(
         ("unknown", "its variant can't be read now: points.npz")
     }
     found.append(variants.PlannedVariant("v"))
-    final = made._run_until_complete(plan, store, monitor)
+    final = made._run_until_complete(plan, store, [monitor])
     assert [cell.state.name for cell in final] == ["done"] * 2
     assert len(trainer.launched) == 1
 
@@ -380,7 +380,7 @@ def test_a_store_that_vanishes_ends_the_study_with_one_line(
     def train(_: object) -> bool:
         made._store = store
         with SweepMonitor(store.cells_folder) as monitor:
-            made._run_until_complete(made._identified(plan, store), store, monitor)
+            made._run_until_complete(made._identified(plan, store), store, [monitor])
         return True
 
     monkeypatch.setattr(made, "_plan_and_train", train)

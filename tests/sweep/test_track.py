@@ -1,10 +1,17 @@
-"""What is tracked, against the readers of TensorBoard, MLflow and Python's csv."""
+"""Curves of cells that train, against the readers of TensorBoard, W&B, MLflow and Python's csv."""
 
 from __future__ import annotations
 
 import csv
-import json
-import math
+import errno
+import os
+import struct
+import subprocess
+import sys
+import threading
+from collections import defaultdict
+from collections.abc import Callable, Iterator
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -12,182 +19,357 @@ from mlflow import MlflowClient
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from xrgs.errors import XrgsError
-from xrgs.experiment.cell_folder import CellFolder
+from xrgs.experiment.cell_folder import CellFolder, CellState
 from xrgs.experiment.results import cell_columns
 from xrgs.experiment.store import Store
-from xrgs.sweep import track
+from xrgs.sweep import track, trackers
+from xrgs.sweep.axes import CellSpec
+from xrgs.sweep.plan import PlannedCell
 
-SUMMARY = {
-    "training_time_s": 1.5,
-    "render_time_ms": 2.0,
-    "gaussians": 7,
-    "memory_bytes": 1000,
-    "evaluations": 500,
-}
-HISTORY = "step,view,loss,mip.sigma\n0,a,0.5,\n10,b,0.25,0.125\n"
-QUALITY = "step,seconds,psnr\n10,1.5,18.5\n"
-EXPECTED = {
-    "history/loss": [(0, 0.5), (10, 0.25)],
-    "history/mip.sigma": [(10, 0.125)],
-    "quality/seconds": [(10, 1.5)],
-    "quality/psnr": [(10, 18.5)],
-    **{
-        f"score/{name}": [(20, float(SUMMARY[name]))]
-        for name in (
-            "gaussians",
-            "training_time_s",
-            "render_time_ms",
-            "memory_bytes",
-            "evaluations",
-        )
-    },
+#: The values of each series by their steps.
+Series = dict[str, list[tuple[int, float]]]
+
+HISTORY = ["step,view,loss,mip.sigma", "0,a,0.5,", "10,b,0.25,0.125", "19,a,0.125,0.5"]
+QUALITY = ["step,seconds,psnr", "5,0.75,16.5", "15,1.5,18.5"]
+EXPECTED: Series = {
+    "history/loss": [(0, 0.5), (10, 0.25), (19, 0.125)],
+    "history/mip.sigma": [(10, 0.125), (19, 0.5)],
+    "quality/seconds": [(5, 0.75), (15, 1.5)],
+    "quality/psnr": [(5, 16.5), (15, 18.5)],
+    "score/gaussians": [(20, 7.0)],
+    "score/training_time_s": [(20, 1.5)],
+    "score/render_time_ms": [(20, 2.0)],
+    "score/memory_bytes": [(20, 1000.0)],
+    "score/evaluations": [(20, 500.0)],
     "score/psnr": [(20, 25.25)],
 }
 
 
-def add(cells: Any, name: str, *, quality: bool = True) -> CellFolder:
-    cell: CellFolder = cells.begin(name, seed=3)
-    (cell.path / "history.csv").write_text(HISTORY)
-    if quality:
-        (cell.path / "quality.csv").write_text(QUALITY)
-    cells.finish(cell)
-    (cell.path / "scores.csv").write_text("view,psnr,lpips\na,20.5,\nb,30.0,\n")
-    cell.finish(["a", "b"], {})
-    return cell
+class Swept:
+    """Cells that train, and the trackers that follow them."""
+
+    def __init__(self, cells: Any) -> None:
+        self.cells, self.store = cells, cells.store
+        self.cells.conf.train.steps = 20
+
+    def planned(self, name: str, state: str = "absent", label: str = "baseline") -> PlannedCell:
+        conf = self.cells.conf
+        return PlannedCell(CellSpec(label, "", (), ()), conf, "v", None, name, CellState(state))
+
+    def begin(self, name: str) -> CellFolder:
+        cell: CellFolder = self.cells.begin(name)
+        return cell
+
+    def train(self, cell: CellFolder, rows: int, evaluations: int = 0) -> None:
+        """Write the first rows of the history and of the quality, as a training cell does."""
+        if evaluations:
+            (cell.path / "quality.csv").write_text("\n".join(QUALITY[: evaluations + 1]) + "\n")
+        (cell.path / "history.csv").write_text("\n".join(HISTORY[: rows + 1]) + "\n")
+
+    def finish(self, cell: CellFolder) -> None:
+        self.train(cell, 3, 2)
+        self.cells.finish(cell)
+        (cell.path / "scores.csv").write_text("view,psnr,lpips\na,20.5,\nb,30.0,\n")
+        cell.finish(["a", "b"], {})
+
+    def tracker(self, kind: str, *plan: PlannedCell) -> track.Tracker:
+        tracker = track.Tracker(kind, self.store)
+        tracker.watch(plan)
+        return tracker
 
 
 @pytest.fixture
-def swept(cells: Any) -> tuple[Store, str]:
-    """A store, and a sweep of two finished cells, a failed one and one that was never planned."""
-    add(cells, "abc")
-    add(cells, "def", quality=False)
-    cells.begin("bad").fail("out of memory")
-    labels = {"abc": "baseline", "def": "=cmd|'x'\x1b", "bad": "baseline", None: "baseline"}
-    rows = [(name, "fern", label) for name, label in labels.items()]
-    return cells.store, cells.record(*rows, seed=3)
+def swept(cells: Any, monkeypatch: pytest.MonkeyPatch) -> Swept:
+    """An empty store, and no tracker's server in the environment."""
+    monkeypatch.delenv("MLFLOW_TRACKING_URI", raising=False)
+    monkeypatch.setenv("WANDB_MODE", "offline")
+    return Swept(cells)
 
 
-def settings(store: Store) -> dict[str, Any]:
+def settings(store: Store, name: str) -> dict[str, Any]:
     """What is tracked of a config: the groups that can change a number, lists and None as texts."""
-    columns = cell_columns(store.cell("abc"), None)
+    columns = cell_columns(store.cell(name), None)
     values = {key: value for key, value in columns.items() if "." in key}
     return {k: v if isinstance(v, (str, float, int)) else str(v) for k, v in values.items()}
 
 
-def test_a_table_has_every_value(
-    swept: tuple[Store, str], capsys: pytest.CaptureFixture[str]
-) -> None:
-    store, sweep_id = swept
-    track.track("csv", store, sweep_id)
-    file = store.path / "tracking" / f"{sweep_id}.csv"
-    assert capsys.readouterr().err == f"track=csv: {file}\n"
-    rows = list(csv.DictReader(file.read_text().splitlines()))
-    assert {row["cell_id"] for row in rows} == {"abc", "def"}
-    found: dict[str, list[tuple[int, float]]] = {}
-    for row in rows:
-        if row["cell_id"] == "abc":
-            found.setdefault(row["series"], []).append((int(row["step"]), float(row["value"])))
-    assert found == EXPECTED
-    assert rows[0].keys() == {"cell_id", *track._NAMES, "series", "step", "value"}
-    assert {row["label"] for row in rows} == {"baseline", "'=cmd|'x'"}, "no formula, no escape"
+def in_tables(folder: Path, cell_id: str) -> Series:
+    (file,) = folder.glob(f"*--{cell_id}.csv")
+    found: Series = defaultdict(list)
+    for row in csv.DictReader(file.read_text().splitlines()):
+        found[row["series"]].append((int(row["step"]), float(row["value"])))
+    return found
 
 
-def test_tensorboard_reads_each_cell(swept: tuple[Store, str]) -> None:
-    store, sweep_id = swept
-    track.track("tensorboard", store, sweep_id)
-    home = store.path / "tracking" / "tensorboard"
-    runs = sorted(home.iterdir())
-    assert len(runs) == 2
-    (run,) = [run for run in runs if run.name == "fern--baseline--seed-0-3--abc"]
+def in_tensorboard(folder: Path, cell_id: str) -> Series:
+    (run,) = folder.glob(f"*--{cell_id}")
     events = EventAccumulator(str(run)).Reload()
-    found = {
+    plugin = events.summary_metadata["_hparams_/session_start_info"].plugin_data.content
+    assert b"train.steps" in plugin
+    return {
         name: [(event.step, event.value) for event in events.Scalars(name)]
         for name in events.Tags()["scalars"]
     }
-    assert found == EXPECTED
-    plugin = events.summary_metadata["_hparams_/session_start_info"].plugin_data.content
-    assert b"train.steps" in plugin
-    before = {file: file.stat().st_mtime_ns for file in home.rglob("*")}
-    track.track("tensorboard", store, sweep_id)
-    assert {file: file.stat().st_mtime_ns for file in home.rglob("*")} == before
+
+
+def in_mlflow(folder: Path, cell_id: str) -> Series:
+    client = MlflowClient(f"sqlite:///{folder}/mlflow.db")
+    (experiment,) = [e for e in client.search_experiments() if e.name == "xrgs"]
+    found = client.search_runs([experiment.experiment_id], f"tags.cell_id = '{cell_id}'")
+    (run,) = found
+    assert run.data.params["train.steps"] == "20"
+    return {
+        name: [(m.step, m.value) for m in client.get_metric_history(run.info.run_id, name)]
+        for name in run.data.metrics
+    }
+
+
+def in_wandb(folder: Path, cell_id: str) -> Series:
+    """Read W&B's own records, in the order in which `wandb sync` sends the parts of a run."""
+    from wandb.proto.wandb_internal_pb2 import Record
+
+    found: Series = defaultdict(list)
+    parts = sorted(folder.glob(f"offline-run-*-{cell_id}"))
+    command = [sys.executable, "-m", "wandb", "sync", "--dry-run", *map(str, parts)]
+    said = subprocess.run(command, capture_output=True, text=True, check=True).stderr
+    assert f"Would sync {len(parts)} run(s)" in said
+    for part in parts:
+        for content in leveldb_records((part / f"run-{cell_id}.wandb").read_bytes()):
+            record = Record.FromString(content)
+            if record.WhichOneof("record_type") == "history":
+                for item in record.history.item:
+                    name = item.nested_key[0]
+                    if not name.startswith("_"):
+                        row = record.history.step.num, float(item.value_json)
+                        found[name].append(row)
+    return found
+
+
+def leveldb_records(content: bytes, block: int = 1 << 15) -> Iterator[bytes]:
+    """The records of a LevelDB log behind W&B's header of 7 bytes."""
+    at, record = 7, b""
+    while at + 7 <= len(content):
+        if block - at % block < 7:
+            at += block - at % block
+            continue
+        _, size, kind = struct.unpack_from("<IHB", content, at)
+        record += content[at + 7 : at + 7 + size]
+        at += 7 + size
+        if kind in {1, 4}:  # whole, or the last part
+            yield record
+            record = b""
+
+
+READERS: dict[str, Callable[[Path, str], Series]] = {
+    "csv": in_tables,
+    "tensorboard": in_tensorboard,
+    "mlflow": in_mlflow,
+    "wandb": in_wandb,
+}
+SLOW = {"mlflow", "wandb"}
+EACH_KIND = pytest.mark.parametrize(
+    "kind", [pytest.param(kind, marks=[pytest.mark.slow] * (kind in SLOW)) for kind in READERS]
+)
+
+
+@EACH_KIND
+@pytest.mark.filterwarnings("ignore::DeprecationWarning")  # MLflow's own, of SQLAlchemy 2.1
+def test_a_resumed_cell_continues_its_curve(swept: Swept, kind: str) -> None:
+    cell, folder = swept.begin("abc"), swept.store.path / "tracking" / kind
+    planned = swept.planned("abc", label="=cmd|'x'\x1b")
+    tracker = swept.tracker(kind, planned)
+    tracker.look()
+    assert not list(folder.iterdir()), "nothing is sent before the first row"
+    swept.train(cell, 1)
+    tracker.look()
+    swept.train(cell, 2, 2)  # step 15 was evaluated; a history's row before it may follow
+    tracker.look()
+    tracker.close()
+    live = READERS[kind](folder, "abc")
+    assert live["history/loss"] == [(0, 0.5), (10, 0.25)]
+    assert live["quality/psnr"] == [(5, 16.5)]
+    # Another process goes on, from a checkpoint before the last row.
+    tracker = swept.tracker(kind, planned)
+    for rows in (1, 2, 3):
+        swept.train(cell, rows, min(rows, 2))
+        tracker.look()
+    swept.finish(cell)
+    tracker.look()
+    tracker.close()
+    assert READERS[kind](folder, "abc") == EXPECTED
+    swept.tracker(kind, planned).look()  # of a later sweep, which finds it complete
+    assert READERS[kind](folder, "abc") == EXPECTED
+
+
+def test_a_table_has_the_names_of_its_cell(swept: Swept) -> None:
+    swept.finish(swept.begin("abc"))
+    swept.tracker("csv", swept.planned("abc", label="=cmd|'x'\x1b")).look()
+    (file,) = (swept.store.path / "tracking" / "csv").iterdir()
+    rows = list(csv.DictReader(file.read_text().splitlines()))
+    assert rows[0].keys() == {"cell_id", *trackers.NAMES, "series", "step", "value"}
+    assert {row["label"] for row in rows} == {"'=cmd|'x'"}, "no formula, no escape"
+    assert {row["cell_id"] for row in rows} == {"abc"}
+
+
+def test_a_record_that_a_kill_cut_off_is_written_again(swept: Swept) -> None:
+    cell, folder = swept.begin("abc"), swept.store.path / "tracking" / "tensorboard"
+    swept.train(cell, 2)
+    swept.tracker("tensorboard", swept.planned("abc")).look()
+    (file,) = folder.glob("*/*")
+    os.truncate(file, file.stat().st_size - 5)
+    swept.finish(cell)
+    swept.tracker("tensorboard", swept.planned("abc")).look()
+    assert in_tensorboard(folder, "abc") == EXPECTED
 
 
 @pytest.mark.slow
 @pytest.mark.filterwarnings("ignore::DeprecationWarning")  # MLflow's own, of SQLAlchemy 2.1
-def test_mlflow_reads_each_cell(swept: tuple[Store, str], monkeypatch: pytest.MonkeyPatch) -> None:
-    store, sweep_id = swept
-    monkeypatch.delenv("MLFLOW_TRACKING_URI", raising=False)
-    for _ in range(2):  # the second time finds them
-        track.track("mlflow", store, sweep_id)
-    client = MlflowClient(f"sqlite:///{store.path}/tracking/mlflow.db")
-    (experiment,) = [e for e in client.search_experiments() if e.name == "xrgs"]
-    runs = {run.data.tags["cell_id"]: run for run in client.search_runs([experiment.experiment_id])}
-    assert runs.keys() == {"abc", "def"}
-    run = runs["abc"]
-    found = {
-        name: [(m.step, m.value) for m in client.get_metric_history(run.info.run_id, name)]
-        for name in run.data.metrics
-    }
-    assert found == EXPECTED
-    assert run.data.params == {key: str(value) for key, value in settings(store).items()}
-    assert run.data.tags["label"] == "baseline"
-    assert run.info.status == "FINISHED"
+def test_mlflow_shows_how_a_cell_ended(swept: Swept) -> None:
+    names = ("done", "failed", "stopped")
+    cells = {name: swept.begin(name) for name in names}
+    for cell in cells.values():
+        swept.train(cell, 1)
+    tracker = swept.tracker("mlflow", *map(swept.planned, names))
+    tracker.look()
+    client = MlflowClient(f"sqlite:///{swept.store.path}/tracking/mlflow/mlflow.db")
+
+    def states() -> dict[str, str]:
+        (experiment,) = [e for e in client.search_experiments() if e.name == "xrgs"]
+        runs = client.search_runs([experiment.experiment_id])
+        return {run.data.tags["cell_id"]: run.info.status for run in runs}
+
+    assert states() == dict.fromkeys(names, "RUNNING")
+    swept.finish(cells["done"])
+    cells["failed"].fail("out of memory")
+    tracker.look()
+    tracker.close()
+    assert states() == {"done": "FINISHED", "failed": "FAILED", "stopped": "KILLED"}
 
 
-@pytest.mark.parametrize("kind", ["csv", "tensorboard", "mlflow"])
-def test_a_failure_is_a_warning(
-    swept: tuple[Store, str],
-    kind: str,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
+class Broken:
+    """A tracker that is away for a while."""
+
+    away = True
+
+    def __init__(self, run: trackers.Run, folder: Path) -> None:
+        self.sent, self.run = -1, run
+        self.check()
+
+    def check(self) -> None:
+        if self.away:
+            raise ConnectionError("no server\x1b[31m")
+
+    def write(self, step: int, values: Any) -> None:
+        self.check()
+
+    def flush(self) -> None:
+        self.check()
+
+    def close(self, state: str) -> None:
+        self.check()
+
+
+@pytest.mark.parametrize("again", [False, True])
+def test_a_failure_is_said_once(
+    swept: Swept, again: bool, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    store, sweep_id = swept
+    monkeypatch.setitem(trackers.SINKS, "csv", Broken)
+    monkeypatch.setattr(Broken, "away", True)
+    for name in ("abc", "def"):
+        swept.finish(swept.begin(name))
+    with swept.tracker("csv", *map(swept.planned, ("abc", "def"))) as tracker:
+        tracker.look()
+        Broken.away = not again
+    said = capsys.readouterr().err.splitlines()
+    assert said[:2] == [
+        f"track=csv: {swept.store.path}/tracking/csv",
+        "track=csv: ConnectionError: no server [31m; the cells train on, and it is tried again"
+        " every 30 s",
+    ]
+    rest = "track=csv: it failed, and the curves there are not complete; the cells are in the"
+    assert [line.startswith(rest) for line in said[2:]] == [True] * (not again)
 
-    def fail(*_: object) -> str:
-        raise ConnectionError("no server\x1b[31m")
 
-    monkeypatch.setitem(track._WRITERS, kind, fail)
-    track.track(kind, store, sweep_id)
-    err = capsys.readouterr().err
-    assert err == f"track={kind}: ConnectionError: no server [31m; the cells are in the store\n"
-
-
-def test_a_cell_that_can_not_be_read_is_left_out(
-    swept: tuple[Store, str], capsys: pytest.CaptureFixture[str]
+def test_an_end_does_not_wait_for_a_server_that_hangs(
+    swept: Swept, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    store, sweep_id = swept
-    status = store.path / "cells" / "abc" / "status.json"
-    history = store.path / "cells" / "abc" / "history.csv"
-    text = HISTORY.replace("0.25", "1e99")  # of the same size, so that the cell is still done
+    free = threading.Event()
+    monkeypatch.setattr(track, "_END_S", 0.05)
+    monkeypatch.setitem(trackers.SINKS, "csv", lambda *_: free.wait())
+    swept.finish(swept.begin("abc"))
+    with swept.tracker("csv", swept.planned("abc")):
+        pass
+    free.set()
+    assert "track=csv: no answer for 0 s, and the curves" in capsys.readouterr().err
+
+
+def test_a_full_disk_is_a_warning(
+    swept: Swept, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def full(*_: Any, **__: Any) -> None:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr(trackers, "write_text", full)
+    cell = swept.begin("abc")
+    swept.train(cell, 1)
+    tracker = swept.tracker("csv", swept.planned("abc"))
+    tracker.look()
+    assert "No space left on device; the cells train on" in capsys.readouterr().err
+    monkeypatch.undo()
+    swept.finish(cell)
+    tracker.look()
+    assert in_tables(swept.store.path / "tracking" / "csv", "abc") == EXPECTED
+
+
+def test_a_finished_cell_that_can_not_be_read_is_left_out(
+    swept: Swept, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for name in ("abc", "def"):
+        swept.finish(swept.begin(name))
+    history = swept.store.cell("abc").path / "history.csv"
+    text = history.read_text().replace("0.25", "1e99")  # as long, so that the cell is still done
     history.write_text(text)
-    assert json.loads(status.read_text())["files"]["history.csv"]["bytes"] == len(text)
-    track.track("csv", store, sweep_id)
-    assert "abc: it is not tracked: " in capsys.readouterr().err
-    rows = (store.path / "tracking" / f"{sweep_id}.csv").read_text()
-    assert "def" in rows
-    assert "abc" not in rows
+    tracker = swept.tracker("csv", *map(swept.planned, ("abc", "def")))
+    tracker.look()
+    tracker.look()
+    assert capsys.readouterr().err.count("abc: it is not tracked: ") == 1
+    (file,) = (swept.store.path / "tracking" / "csv").iterdir()
+    assert "--def.csv" in file.name
 
 
-def test_no_tracking_writes_nothing(swept: tuple[Store, str]) -> None:
-    store, sweep_id = swept
-    track.track("none", store, sweep_id)
-    assert not (store.path / "tracking").exists()
+def test_a_cell_of_another_sweep_is_followed_there(swept: Swept) -> None:
+    cell, folder = swept.begin("abc"), swept.store.path / "tracking" / "csv"
+    swept.train(cell, 1)
+    tracker = swept.tracker("csv", swept.planned("abc", "running"))
+    swept.finish(cell)
+    tracker.watch([swept.planned("abc", "done")])
+    tracker.look()
+    assert not folder.exists()
+    tracker.watch([swept.planned("abc", "unfinished")])  # the other sweep has died
+    tracker.look()
+    assert in_tables(folder, "abc") == EXPECTED
+
+
+def test_no_tracking_writes_nothing(swept: Swept) -> None:
+    swept.finish(swept.begin("abc"))
+    with swept.tracker("none", swept.planned("abc")):
+        pass
+    assert not (swept.store.path / "tracking").exists()
 
 
 def test_what_can_not_be_tracked_is_said_before_training(monkeypatch: pytest.MonkeyPatch) -> None:
     for kind in track.KINDS:
         track.check(kind)
-    with pytest.raises(XrgsError, match="track=wandb: must be one of none, csv, tensorboard, mlf"):
-        track.check("wandb")
+    with pytest.raises(XrgsError, match="track=neptune: must be one of none, csv, tensorboard, ml"):
+        track.check("neptune")
     monkeypatch.setattr(track, "find_spec", lambda _: None)
-    with pytest.raises(XrgsError, match=r"track=mlflow: .* pip install 'xrgs\[mlflow\]'"):
-        track.check("mlflow")
+    with pytest.raises(XrgsError, match=r"track=wandb: .* pip install 'xrgs\[wandb\]'"):
+        track.check("wandb")
     track.check("csv")
 
 
-def test_no_value_is_nan(swept: tuple[Store, str]) -> None:
-    store, _ = swept
-    run = track.run_of(store.cell("abc"), store.sweep_record().cells[0])
-    assert not any(math.isnan(point.value) for point in run.points)
-    assert run.config == settings(store)
-    assert run.config["train.steps"] == store.cell("abc").config().train.steps
+def test_a_run_has_the_settings_of_its_cell(swept: Swept) -> None:
+    run = track.run_of(swept.planned("abc"), swept.begin("abc"))
+    assert run.config == settings(swept.store, "abc")
+    assert run.config["train.steps"] == run.steps == 20
+    assert run.name == "motorcycle--baseline--seed-0-0--abc"

@@ -30,6 +30,11 @@ def build_dataset(conf: Conf) -> Dataset:
     Raises:
         SceneFailed: COLMAP can't place enough views.
         XrgsError: A value of the config or a photograph is wrong; the message names it.
+
+    Examples:
+        >>> data = build_dataset(compose("scene=motorcycle", "preset=smoke"))
+        >>> len(data.train), len(data.test)
+        (3, 2)
     """
     store = Path(conf.store)
     store.mkdir(parents=True, exist_ok=True)
@@ -49,5 +54,10 @@ def load_dataset(folder: str | Path, views: str = "mixed") -> Dataset:
     Raises:
         CorruptVariant: The folder is not a variant, or a file in it has changed.
         XrgsError: `views` is none of these, or the variant has no such views.
+
+    Examples:
+        >>> data = load_dataset(f"xrgs-store/variants/{variant_id}")
+        >>> [view.tag for view in data.train]
+        ['HR', 'HR', 'LR']
     """
     return dataset.load(variant.load(Path(folder)), views)

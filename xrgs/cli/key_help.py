@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from typing import NamedTuple
 
 from xrgs import config
 from xrgs.errors import XrgsError, did_you_mean
@@ -16,6 +17,15 @@ _WHERE = (
 )
 
 
+class Entry(NamedTuple):
+    """A key of `conf/config.yaml`."""
+
+    value: str
+    """Its value in the baseline, as it is written there; empty for a group of keys."""
+    comment: tuple[str, ...]
+    """The lines of the comments above it and behind it."""
+
+
 def explain(key: str) -> str:
     """Return a key's value in the baseline and its comment; of a group also those of its keys.
 
@@ -25,20 +35,24 @@ def explain(key: str) -> str:
     Raises:
         XrgsError: There is no such key; the message offers similar ones.
     """
-    texts = _texts()
-    found = [text for name, text in texts.items() if f"{name}.".startswith(f"{key}.")]
+    known = entries()
+    found = [
+        "\n  ".join([f"{name}={entry.value}" if entry.value else name, *entry.comment])
+        for name, entry in known.items()
+        if f"{name}.".startswith(f"{key}.")
+    ]
     if not found:
-        raise XrgsError(f"help={key}: there is no such key{did_you_mean(key, texts)}")
+        raise XrgsError(f"help={key}: there is no such key{did_you_mean(key, known)}")
     return "\n\n".join([*found, _WHERE])
 
 
-def _texts() -> dict[str, str]:
-    """Return what `conf/config.yaml` says of each key: its value, and the comment above or behind.
+def entries() -> dict[str, Entry]:
+    """Return what `conf/config.yaml` says of each key and each group of keys, in its order.
 
     Of YAML only what the file uses is read: a key with its value on one line, and two more spaces
     before each key of a group.
     """
-    texts: dict[str, str] = {}
+    known: dict[str, Entry] = {}
     path: list[str] = []
     above: list[str] = []
     content = read_file(config.CONF_DIR / "config.yaml").decode()
@@ -50,7 +64,6 @@ def _texts() -> dict[str, str]:
             indent, name, value, behind = entry.groups()
             path = [*path[: len(indent) // 2], name]
             key = ".".join(path)
-            first = f"{key}={value.strip()}" if value.strip() else key
-            texts[key] = "\n  ".join([first, *above, *([behind] if behind else [])])
+            known[key] = Entry(value.strip(), (*above, *([behind] if behind else [])))
         above = []
-    return texts
+    return known

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from xrgs.cli import options
-from xrgs.cli.options import STORE, Folder
+from xrgs.cli.options import STORE, Flag, Folder
 from xrgs.runtime.streams import say
 
 
-def status(store: Folder = STORE) -> None:
+def status(store: Folder = STORE, watch: Flag = False) -> None:
     """Print what a store holds: cells by state, why cells failed, which are stale, and sizes.
 
     It also says which cell is trained now, and for which sweep. `xrgs-store list` lists single
@@ -15,10 +15,15 @@ def status(store: Folder = STORE) -> None:
 
     Args:
         store: The store.
+        watch: Show the cells in training, again and again until Ctrl-C, which ends no training.
     """
     from xrgs.sweep.status import describe, read
+    from xrgs.sweep.status import watch as watch_store
 
-    say(describe(read(store)))
+    if watch:
+        watch_store(store)
+    else:
+        say(describe(read(store)))
 
 
 def main() -> None:

@@ -6,9 +6,11 @@ import logging
 import math
 import signal
 import sys
+import time
 import traceback
+from contextlib import suppress
 from statistics import fmean
-from typing import TYPE_CHECKING, cast
+from typing import TYPE_CHECKING, Any, Self, cast
 
 import msgspec
 
@@ -29,6 +31,7 @@ from xrgs.training.checkpoint import Checkpoint, CheckpointError
 from xrgs.training.count_matching import train_cell
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
     from pathlib import Path
 
     from xrgs.capture.dataset import Dataset
@@ -44,25 +47,41 @@ _log = logging.getLogger(__name__)
 
 #: Rows of the history that the shown loss is the mean of. Each row is the loss of one view.
 _SHOWN_ROWS = 10
+#: Seconds between two writes of the history while a cell trains.
+_CURVES_S = 5.0
 
 
 class CellCheckpoint(Checkpoint):
-    """Writes the checkpoint of a cell, shows its progress, and stops it on request."""
+    """Writes the checkpoint of a cell, shows its progress, and stops it on request.
+
+    It also writes `history.csv` and `quality.csv` as the training goes on, for those who follow it.
+    """
 
     def __init__(
-        self, folder: CellFolder, every_s: float, shown: ProgressFile, stop: StopRequest
+        self,
+        folder: CellFolder,
+        every_s: float,
+        shown: ProgressFile,
+        stop: StopRequest,
+        *,
+        curves: bool = True,
     ) -> None:
         """Prepare the checkpoint of a cell; nothing is written yet.
 
         Args:
             folder: The cell's folder.
             every_s: Seconds between two writes; 0 never writes, not even when the cell is stopped.
-            shown: The progress, whose note gets the number of Gaussians and the loss.
+            shown: The progress, whose note gets the number of Gaussians, the loss and the PSNR.
             stop: Whether the process was asked to end; read after every step.
+            curves: Whether the history is written during training, too.
         """
         super().__init__(folder.checkpoint, folder.id, every_s)
+        self._folder = folder
         self._shown = shown
         self._stop = stop
+        self._curves = curves
+        self._rows, self._curves_due = 0, 0.0
+        """Rows of the history in its file, and when the file may be written again."""
         self._recorder: TrainingRecorder | None = None
 
     def register(self, **objects: Stateful) -> None:
@@ -83,9 +102,7 @@ class CellCheckpoint(Checkpoint):
             StopSignal: The process was asked to end; the checkpoint is written.
         """
         if self._recorder is not None and self._recorder.history:
-            rows = self._recorder.history[-_SHOWN_ROWS:]
-            loss = fmean(row["loss"] for row in rows)
-            self._shown.note = f"{rows[-1]['gaussians']:,} Gaussians, loss {loss:.3g}"
+            self._shown.note = _note(self._recorder)
         if self._stop.received and self.every_s > 0:
             self.every_s = sys.float_info.min  # due now, whatever the interval
         seconds = super().save_if_due(step)
@@ -94,7 +111,43 @@ class CellCheckpoint(Checkpoint):
         if self._stop.received:
             _log.info("stopped after %d steps", step + 1)
             raise StopSignal(signal.SIGTERM)
-        return seconds
+        return seconds + self._write_curves_if_due()
+
+    def _write_curves_if_due(self) -> float:
+        """Write what the recorder has where there are new rows; return the seconds that it took."""
+        start, recorder = time.monotonic(), self._recorder
+        if recorder is None or not self._curves or start < self._curves_due:
+            return 0.0
+        if len(recorder.history) == self._rows:
+            return 0.0
+        with suppress(OSError):  # they are written again at the end, where an error counts
+            # In this order: what was evaluated before the history's last row is in the other file.
+            write_curves(self._folder, recorder.history, recorder.scores)
+        self._rows, end = len(recorder.history), time.monotonic()
+        self._curves_due = end + _CURVES_S
+        return end - start
+
+
+def _note(recorder: TrainingRecorder) -> str:
+    """Return what people want to know of a training, for example `84,000 Gaussians, loss 0.041`."""
+    rows = recorder.history[-_SHOWN_ROWS:]
+    loss = fmean(row["loss"] for row in rows)
+    parts = [f"{rows[-1]['gaussians']:,} Gaussians", f"loss {loss:.3g}"]
+    if recorder.scores and (psnr := recorder.scores[-1].get("psnr")) is not None:
+        parts.append(f"PSNR {psnr:.2f} dB at step {recorder.scores[-1]['step']:,}")
+    return ", ".join(parts)
+
+
+def write_curves(
+    folder: CellFolder, history: Sequence[Mapping[str, Any]], scores: Sequence[Mapping[str, Any]]
+) -> None:
+    """Write the record of a training: `history.csv`, and `quality.csv` if it was evaluated.
+
+    They are not synced here: `CellFolder.finish` syncs all files.
+    """
+    if scores:
+        write_text(folder.path / "quality.csv", table_text(scores), durable=False)
+    write_text(folder.path / "history.csv", table_text(history), durable=False)
 
 
 def run_cell(
@@ -142,8 +195,11 @@ def _train_and_score(
         *(folder.id, variant.id, len(data.train), len(data.points)),
         *(what.xrgs, backend, threads),
     )
-    checkpoint = CellCheckpoint(folder, conf.checkpoint_s, shown, stop)
-    trained, machines = _train_or_resume(data, conf, checkpoint, provenance.machine(what))
+    # A search for a threshold trains several times, and only the last training is the cell's.
+    searches = conf.components.count_matched.gaussians > 0
+    checkpoint = CellCheckpoint(folder, conf.checkpoint_s, shown, stop, curves=not searches)
+    with _Found() as found:
+        trained, machines = _train_or_resume(data, conf, checkpoint, provenance.machine(what))
     if len(machines) > 1:
         what = msgspec.structs.replace(what, machines_in_turn="; ".join(machines))
         _write_struct(folder.path / "provenance.json", what)
@@ -157,9 +213,7 @@ def _train_and_score(
         antialiased=conf.splat.raster.antialiased,
         durable=False,
     )
-    write_text(folder.path / "history.csv", table_text(trained.history), durable=False)
-    if trained.scores:
-        write_text(folder.path / "quality.csv", table_text(trained.scores), durable=False)
+    write_curves(folder, trained.history, trained.scores)
     render_time_ms = protocol.render_time(trained.gaussians, data.test, conf.splat)
     scores = protocol.score_views(trained.gaussians, data.test, conf.splat, folder.path / "renders")
     write_text(folder.path / "scores.csv", table_text(scores), durable=False)
@@ -176,9 +230,29 @@ def _train_and_score(
         grow_grad2d=trained.grow_grad2d,
         work=dict(trained.work),
         stage_seconds=dict(trained.stage_seconds),
+        found=tuple(dict.fromkeys(found.lines)),
     )
     _write_struct(folder.path / "summary.json", summary)
     return [view.name for view in data.test]
+
+
+class _Found(logging.Handler):
+    """Keeps what components log while a `with` block runs: what they found out."""
+
+    def __init__(self) -> None:
+        super().__init__(logging.INFO)
+        self.lines: list[str] = []
+        self._logger = logging.getLogger("xrgs.training.components")
+
+    def emit(self, record: logging.LogRecord) -> None:
+        self.lines.append(record.getMessage())
+
+    def __enter__(self) -> Self:
+        self._logger.addHandler(self)
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._logger.removeHandler(self)
 
 
 def _train_or_resume(

@@ -80,6 +80,8 @@ class Summary(Struct, frozen=True):
     work: dict[str, Number] = {}
     """What the steps rendered and left out, see `xrgs.training.work`."""
     stage_seconds: dict[str, Number] = {}
+    found: tuple[str, ...] = ()
+    """What components found out about the photographs, for example `formation: LR views: ...`."""
 
 
 class Provenance(Struct, frozen=True):

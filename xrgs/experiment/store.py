@@ -52,7 +52,15 @@ class StoreGoneError(StoreError):
 
 @dataclass(frozen=True)
 class Store:
-    """A store: everything that sweeps keep, in one folder."""
+    """A store: everything that sweeps keep, in one folder.
+
+    Examples:
+        >>> cells = Store("xrgs-store").cells()
+        >>> sorted(cells["label"])
+        ['baseline', 'baseline', 'consistency', 'consistency']
+        >>> store = Store("xrgs-store")
+        >>> gaussians = load_ply(store.cell(cells["cell_id"][0]).path / "splats.ply")
+    """
 
     path: Path
     """The folder."""

@@ -87,7 +87,7 @@ def first_reaches(quality: Sequence[float], amounts: Sequence[float], target: fl
         and the one before it. Where the first evaluation has reached it, its amount; NaN where none
         has.
 
-    Example:
+    Examples:
         >>> first_reaches([20.0, 22.0, 21.0], [10.0, 20.0, 30.0], 21.5)
         17.5
     """

@@ -50,7 +50,7 @@ def percent_change(base: Floats, value: Floats) -> tuple[Floats, NDArray[np.str_
     Returns:
         The changes in percent [N], and why there is none [N], empty where there is one.
 
-    Example:
+    Examples:
         >>> percent_change(np.array([20.0, 0.0]), np.array([25.0, 1.0]))[0]
         array([25., nan])
     """
@@ -83,7 +83,7 @@ def log_ratio(base: Floats, value: Floats) -> tuple[Floats, NDArray[np.str_]]:
         The logarithms [N], and why there is none [N], empty where there is one. Equal amounts have
         0, also where both are zero.
 
-    Example:
+    Examples:
         >>> log_ratio(np.array([2.0, 2.0]), np.array([2.0, 0.0]))[0]
         array([ 0., nan])
     """
@@ -111,7 +111,7 @@ def share_of_gap(
         The shares [N], and why there is none [N], empty where there is one. A share is negative
         where the ablation is worse than the base, and above 100 where it is better than all_hr.
 
-    Example:
+    Examples:
         >>> args = np.array([20.0]), np.array([23.0]), np.array([24.0])
         >>> share_of_gap(*args, higher_is_better=True)[0]
         array([75.])
@@ -179,7 +179,7 @@ def false_discovery_rates(p: Floats) -> Floats:
     Returns:
         [N], NaN where p is.
 
-    Example:
+    Examples:
         >>> false_discovery_rates(np.array([0.02, 0.9, np.nan, 0.01]))
         array([0.03, 0.9 ,  nan, 0.03])
     """

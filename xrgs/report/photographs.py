@@ -1,4 +1,4 @@
-"""What became of the photographs of each scene, as the reports of its variants say it."""
+"""What became of the photographs of each scene, and what trainings found out about them."""
 
 from __future__ import annotations
 
@@ -9,6 +9,10 @@ from xrgs.capture.description import SfmReport
 from xrgs.errors import StoreError
 
 if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    import pandas as pd
+
     from xrgs.report.collect import Sweep
     from xrgs.report.joined import JoinedStore
 
@@ -35,11 +39,22 @@ def with_variants(sweep: Sweep, store: JoinedStore) -> Sweep:
 def photographs(sweep: Sweep) -> list[tuple[str, tuple[str, ...]]]:
     """Return the name of each scene with finished cells, and sentences on its photographs.
 
-    A scene has several variants where HR views are drawn more than once.
+    A scene has several variants where HR views are drawn more than once. What a training found
+    (blur, exposure) comes after the label of its cell.
     """
     done = sweep.cells[sweep.cells["variant_id"].isin(sweep.variants)]
     found = []
-    for scene, ids in done.groupby("scene", sort=False)["variant_id"]:
-        notes = [n for name in ids.unique() for n in sweep.variants[name].all_notes(_MAX_NAMES)]
-        found.append((str(scene), tuple(dict.fromkeys(notes))))
+    for scene, rows in done.groupby("scene", sort=False):
+        variants = [sweep.variants[name] for name in rows["variant_id"].unique()]
+        notes = [note for variant in variants for note in variant.all_notes(_MAX_NAMES)]
+        found.append((str(scene), tuple(dict.fromkeys([*notes, *_found(sweep, rows)]))))
     return [(scene, notes) for scene, notes in found if notes]
+
+
+def _found(sweep: Sweep, rows: pd.DataFrame) -> Iterator[str]:
+    """Yield what the cells of a scene found, behind their labels and, if several, replicates."""
+    replicates = len(rows[["variant_seed", "seed"]].drop_duplicates())
+    for row in rows[rows["cell_id"].isin(sweep.done)].to_dict("records"):
+        replicate = f"replicate {row['variant_seed']}/{row['seed']}" * (replicates > 1)
+        name = ", ".join(filter(None, (row["label"], row["condition"], replicate)))
+        yield from (f"{name}: {line}" for line in sweep.done[row["cell_id"]].summary.found)

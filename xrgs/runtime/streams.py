@@ -9,6 +9,7 @@ from __future__ import annotations
 import io
 import logging
 import os
+import shutil
 import sys
 from contextlib import suppress
 from typing import TYPE_CHECKING
@@ -36,6 +37,26 @@ def say(text: str, stream: TextIO | None = None) -> None:
     text = for_terminal(text).encode(encoding, "backslashreplace").decode(encoding)
     clear = "\r\x1b[K" if is_terminal(stream) else ""
     print(f"{clear}{text}", file=stream, flush=True)
+
+
+def redraw(text: str, above: int, terminal: TextIO) -> int:
+    """Print a text on a terminal over the last lines that this function printed.
+
+    Args:
+        text: The text. Names in it must have gone through `for_line`. A line is cut at the
+            terminal's width, and lines that do not fit below one another are left out.
+        above: The number of lines to print over, as the last call returned it; 0 at first.
+        terminal: Where to print it.
+
+    Returns:
+        The number of lines of the text.
+    """
+    width, height = shutil.get_terminal_size()
+    lines = [line[: width - 1] for line in text.split("\n")][: height - 1]
+    up = f"\x1b[{above}A" if above else ""
+    body = "".join(f"{for_terminal(line)}\x1b[K\n" for line in lines)
+    print(f"{up}\r{body}\x1b[J", end="", file=terminal, flush=True)
+    return len(lines)
 
 
 def is_terminal(stream: TextIO) -> bool:

@@ -43,6 +43,12 @@ class Camera:
         ValueError: A matrix has the wrong shape or values that are not finite, `viewmat` is not
             rigid, `K` has skew or a focal length that is not above 0, or the image has no pixel.
             The message names the field.
+
+    Examples:
+        >>> K = torch.tensor([[40.0, 0.0, 24.0], [0.0, 40.0, 16.0], [0.0, 0.0, 1.0]])
+        >>> camera = Camera(viewmat=torch.eye(4), K=K, width=48, height=32)
+        >>> camera.resized(96, 64).K[0, 0]
+        tensor(80.)
     """
 
     viewmat: Tensor  # [4, 4]

@@ -42,9 +42,9 @@ def load_gaussians(path: str | Path) -> SavedGaussians:
     Raises:
         XrgsError: The file is missing, damaged or of another format; the message names it.
 
-    Example:
-        >>> gaussians, antialiased = load_gaussians("splats.ply")  # doctest: +SKIP
-        >>> settings = RasterSettings(antialiased=antialiased)  # doctest: +SKIP
+    Examples:
+        >>> gaussians, antialiased = load_gaussians("splats.ply")
+        >>> render = rasterize(gaussians, camera, settings=RasterSettings(antialiased=antialiased))
     """
     path = Path(path)
     return READERS[_suffix(path)](path)
@@ -70,6 +70,11 @@ def save_gaussians(
     Raises:
         XrgsError: The name ends otherwise, or the format can't hold the Gaussians.
         OSError: The file can't be written.
+
+    Examples:
+        >>> save_gaussians("splats.glb", gaussians)
+        >>> len(load_gaussians("splats.glb").gaussians)
+        50
     """
     path = Path(path)
     writers: dict[str, Callable[..., None]]

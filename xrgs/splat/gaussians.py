@@ -38,14 +38,26 @@ class Gaussians:
     """N Gaussians as raw parameters: leaf tensors, on which gradients accumulate.
 
     A parameter is also read and replaced by its name: `gaussians["means"]`.
+
+    Examples:
+        >>> points = torch.rand(50, 3) + torch.tensor([0.0, 0.0, 2.0])
+        >>> gaussians = Gaussians.from_points(points, colors=torch.rand(50, 3))
+        >>> len(gaussians), gaussians.shN.shape
+        (50, torch.Size([50, 15, 3]))
     """
 
-    means: Tensor  # [N, 3] world units
-    quats: Tensor  # [N, 4] wxyz, any length
-    scales: Tensor  # [N, 3] natural log of world units
-    opacities: Tensor  # [N] logit
-    sh0: Tensor  # [N, 1, 3]
-    shN: Tensor  # [N, K - 1, 3], K = (degree + 1)^2  # noqa: N815 - the field's name
+    means: Tensor
+    """[N, 3] world units."""
+    quats: Tensor
+    """[N, 4] wxyz, any length."""
+    scales: Tensor
+    """[N, 3] natural logarithms of world units."""
+    opacities: Tensor
+    """[N] logits."""
+    sh0: Tensor
+    """[N, 1, 3] coefficients of band 0 of the spherical harmonics."""
+    shN: Tensor  # noqa: N815 - the field's name
+    """[N, K - 1, 3] coefficients of the higher bands, K = (degree + 1)^2."""
 
     def __len__(self) -> int:
         """Return the number of Gaussians."""

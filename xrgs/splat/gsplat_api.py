@@ -138,11 +138,11 @@ def rasterization(
             else torch. gsplat has no such argument.
 
     Returns:
-        The colours [C, H, W, X], X the channels of the render mode; alpha [C, H, W, 1]; and `meta`:
-        `radii` (int32, px; 0 where not drawn), `means2d` (px), `depths`, `conics` and `opacities`,
-        with `camera_ids`, `gaussian_ids` and `batch_ids` if packed (else None), and `width`,
-        `height`, `tile_size`, `n_cameras`, `n_batches`. The intersections with tiles (`isect_ids`,
-        `isect_offsets`, `flatten_ids`, `tiles_per_gauss`) are not in it.
+        The colours [C, H, W, X], X the channels of the render mode; alpha [C, H, W, 1]; and `meta`.
+        `meta` has `radii` (int32, px; 0 where not drawn), `means2d` (px), `depths`, `conics` and
+        `opacities`, with `camera_ids`, `gaussian_ids` and `batch_ids` if packed (else None), and
+        `width`, `height`, `tile_size`, `n_cameras`, `n_batches`. The intersections with tiles
+        (`isect_ids`, `isect_offsets`, `flatten_ids`, `tiles_per_gauss`) are not in it.
 
         `meta["means2d"]` is a leaf: after the backward pass its `.grad` is the image-plane gradient
         that gsplat's `DefaultStrategy` reads, so the strategy runs on this function. No gradient
@@ -155,6 +155,16 @@ def rasterization(
         ValueError: A tensor has a wrong shape, is not float32 or float64, or has values that are
             not finite; opacities are outside 0..1; a camera is not rigid or has skew. The message
             names the argument.
+
+    Examples:
+        >>> means, quats = torch.rand(50, 3) + torch.tensor([0.0, 0.0, 2.0]), torch.rand(50, 4)
+        >>> scales, opacities, colors = torch.full((50, 3), 0.1), torch.rand(50), torch.rand(50, 3)
+        >>> image, alpha, meta = rasterization(
+        ...     means, quats, scales, opacities, colors,
+        ...     viewmats=camera.viewmat[None], Ks=camera.K[None], width=48, height=32,
+        ... )
+        >>> image.shape, alpha.shape
+        (torch.Size([1, 32, 48, 3]), torch.Size([1, 32, 48, 1]))
     """
     _refuse(
         sparse_grad=sparse_grad,

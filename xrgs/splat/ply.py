@@ -63,6 +63,9 @@ def save_ply(
 
     Raises:
         OSError: The file can't be written.
+
+    Examples:
+        >>> save_ply("splats.ply", gaussians)
     """
     path = Path(path) if isinstance(path, str) else path
     columns = [
@@ -104,6 +107,11 @@ def load_ply(path: str | Path) -> Gaussians:
 
     Raises:
         XrgsError: The file is missing, damaged or no such .ply; the message names it.
+
+    Examples:
+        >>> gaussians = load_ply("splats.ply")
+        >>> gaussians.means.requires_grad
+        True
     """
     path = Path(path) if isinstance(path, str) else path
     gaussians, antialiased = read_ply(path)

@@ -32,9 +32,12 @@ _ZERO = torch.zeros((), dtype=torch.float32)
 class Render:
     """A rendered image, and the work and memory that it took."""
 
-    image: Tensor  # [H, W, 3], 0 and up: not clamped at 1
-    alpha: Tensor  # [H, W], 1 - transmittance
-    visible: Tensor  # [N] bool
+    image: Tensor
+    """[H, W, 3], 0 and up: not clamped at 1."""
+    alpha: Tensor
+    """[H, W], 1 - transmittance."""
+    visible: Tensor
+    """[N] bool, whether each Gaussian has a pixel in the image."""
     evaluations: int
     """Number of (pixel, Gaussian) pairs whose alpha was computed."""
     buffer_bytes: int
@@ -66,16 +69,21 @@ def rasterize(
             else torch.
 
     Returns:
-        The render: `image` [H, W, 3], which starts at 0 and is not clamped at 1, `alpha` [H, W] in
-        0..1, and `visible` [N] bool.
+        The render, with `image` [H, W, 3], which starts at 0 and is not clamped at 1, `alpha`
+        [H, W] in 0..1, and `visible` [N] bool.
 
     Raises:
         ValueError: A parameter has a wrong shape or type, or values that are not finite, or
             `sh_degree` is above the bands that are stored. The message names the parameter.
         XrgsError: The native backend is named and was not built.
 
-    Example:
-        >>> image = rasterize(load_ply("splats.ply"), camera).image  # doctest: +SKIP
+    Examples:
+        >>> render = rasterize(gaussians, camera)
+        >>> render.image.shape
+        torch.Size([32, 48, 3])
+        >>> render.image.mean().backward()
+        >>> gaussians.means.grad.shape
+        torch.Size([50, 3])
     """
     settings = settings or RasterSettings()
     if sh_degree is None:

@@ -34,7 +34,12 @@ def off_by_default(value: Any) -> Any:
 
 @dataclass
 class RasterSettings:
-    """How Gaussians become pixels (arguments of gsplat's `rasterization`)."""
+    """How Gaussians become pixels (arguments of gsplat's `rasterization`).
+
+    Examples:
+        >>> RasterSettings(antialiased=True).eps2d
+        0.3
+    """
 
     sh_degree: int = 3
     """Highest band of the spherical harmonics, 0 to 3."""

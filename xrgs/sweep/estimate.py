@@ -221,7 +221,7 @@ def _sizes(variants: Path, variant_id: str, views: str, hr_share: float) -> _Siz
         for tag in ("HR", "LR")
     }
     mean = trained / len(pixels)
-    if hr_share and all(by_tag.values()):
+    if all(by_tag.values()) and len(by_tag["HR"]) < hr_share * len(pixels):
         mean = hr_share * fmean(by_tag["HR"]) + (1 - hr_share) * fmean(by_tag["LR"])
     return _Sizes(mean, max(pixels.values()), held)
 

@@ -23,6 +23,7 @@ from xrgs.runtime.progress import log_line
 from xrgs.runtime.streams import is_terminal
 from xrgs.runtime.text import format_duration
 from xrgs.safeio.files import list_names
+from xrgs.safeio.sanitize import for_line
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
@@ -128,14 +129,14 @@ class SweepSnapshot:
             parts.append(f"{self.failed} failed")
         if self.elsewhere:
             parts.append(f"{len(self.elsewhere)} in another sweep")
-        if len(self.running) == 1:
-            parts.append(self.running[0].progress.count)
-        elif self.running:
+        if len(self.running) > 1:
             parts.append(f"{len(self.running)} in training")
         if rate := sum(1 / cell.pace for cell in self.running if cell.pace):
             parts.append(f"{rate:.3g} steps/s")
         if self.left_s is not None:
             parts.append(f"{format_duration(self.left_s)} left")
+        if len(self.running) == 1:  # last: a narrow terminal cuts it off
+            parts.append(f"{for_line(self.running[0].cell.name)}: {self.running[0].progress.count}")
         return ", ".join(parts)
 
 

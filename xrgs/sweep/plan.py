@@ -16,6 +16,7 @@ from xrgs.safeio.hashing import digest, to_plain
 from xrgs.safeio.sanitize import counted, for_line
 from xrgs.splat.backend import resolve_backend
 from xrgs.sweep.estimate import TORCH_SLOWDOWN
+from xrgs.sweep.variants import how_to_get
 
 if TYPE_CHECKING:
     from collections.abc import Container, Mapping, Sequence
@@ -196,6 +197,8 @@ def describe(plan: Sequence[PlannedCell]) -> str:
     failed = any(cell.remembered or cell.state.name == "failed" for cell in plan)
     if plan[0].conf.retry != "failed" and failed:
         lines.append("failed cells are not trained again; retry=failed trains them again")
+    if hint := how_to_get([cell.conf.scene for cell in plan if cell.error]):
+        lines.append(hint)
     return "\n".join(map(for_line, lines))
 
 

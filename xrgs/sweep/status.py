@@ -2,15 +2,20 @@
 
 from __future__ import annotations
 
+import sys
+import time
 from collections import Counter
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
 from typing import TYPE_CHECKING, TypeVar
 
 from xrgs.capture.folders import failed_scenes, is_variant
 from xrgs.errors import StoreError
-from xrgs.experiment.listing import STATES
+from xrgs.experiment.listing import STATES, latest_records
 from xrgs.experiment.store import Store
+from xrgs.runtime import lease, progress
+from xrgs.runtime.streams import is_terminal, redraw, say
 from xrgs.runtime.text import TextTable, format_size, to_text
 from xrgs.safeio.files import file_bytes, is_name
 from xrgs.safeio.records import list_folder
@@ -21,10 +26,14 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from xrgs.experiment.listing import CellRow
+    from xrgs.experiment.schema import RecordedCell
 
 _T = TypeVar("_T")
 #: The most cells, scenes or problems that are listed by name under one heading.
 _MAX_NAMED = 20
+#: Seconds between two looks of `watch`, at least, and the pause in multiples of the time of a look,
+#: so that a slow store is not kept busy; and seconds between two looks that a log gets.
+_WATCH_S, _PAUSE_FACTOR, _LOG_S = 2.0, 20, 60.0
 
 
 @dataclass(frozen=True)
@@ -180,3 +189,56 @@ def _named(heading: str, names: Sequence[str]) -> list[str]:
         return []
     more = [f"  and {len(names) - _MAX_NAMED} more"] if len(names) > _MAX_NAMED else []
     return ["", heading, *(f"  {name}" for name in names[:_MAX_NAMED]), *more]
+
+
+def watch(path: Path) -> None:
+    """Show the cells that are in training until Ctrl-C, on a terminal in place. It only reads.
+
+    Raises:
+        StoreError: There is no such store, or it can't be read now.
+    """
+    store, drawn, pause = Store(path), 0, _WATCH_S
+    store.check_exists()
+    with suppress(KeyboardInterrupt):
+        while True:
+            start = time.monotonic()
+            text = running(store)
+            if is_terminal(sys.stdout):
+                drawn = redraw(text, drawn, sys.stdout)
+                pause = max(_WATCH_S, _PAUSE_FACTOR * (time.monotonic() - start))
+            else:
+                say(text)
+                pause = _LOG_S
+            time.sleep(pause)
+
+
+def running(store: Store) -> str:
+    """Return the time, how far the sweeps of the cells in training are, and these cells.
+
+    Raises:
+        StoreError: The store can't be read now.
+    """
+    records, _ = store.records()
+    now = {}
+    for cell_id in lease.holders(store.leases):
+        if found := progress.read(store.cell(cell_id).progress):
+            now[cell_id] = found
+    lines = [f"{time.strftime('%H:%M:%S')}  {counted(len(now), 'cell')} in training"]
+    # A cell of several sweeps is trained by the latest one.
+    sweeps = {row.cell_id: name for name, record in records.items() for row in record.cells}
+    for name in sorted({sweeps[cell_id] for cell_id in now if cell_id in sweeps}):
+        rows = records[name].cells
+        ids = {row.cell_id for row in rows if row.cell_id}
+        done = sum(store.cell(cell_id).state(verify=False).name == "done" for cell_id in ids)
+        lines.append(f"sweep {name}: {done} of {counted(len(rows), 'cell')} done")
+    names = latest_records(records)
+    lines += [f"  {_name(cell_id, names.get(cell_id))}: {now[cell_id]}" for cell_id in sorted(now)]
+    return "\n".join(map(for_line, lines))
+
+
+def _name(cell_id: str, row: RecordedCell | None) -> str:
+    """Return scene, label, condition and replicate of a cell; its id where no sweep has it."""
+    if row is None:
+        return cell_id
+    replicate = f"replicate {row.variant_seed}/{row.seed}"
+    return " / ".join(filter(None, (row.scene, row.label, row.condition, replicate)))

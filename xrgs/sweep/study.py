@@ -155,14 +155,14 @@ class Study:
         _tidy({cell.cell_id for cell in plan if cell.cell_id and cell.state.name == "done"}, store)
         # At the start, so that a report can be made while it runs, and after it was stopped.
         sweep_id = store.write_sweep(arguments, record(plan))
-        with SweepMonitor(store.cells_folder) as monitor:
-            plan = self._run_until_complete(plan, store, monitor)
-        plan = [_without_reference(cell) for cell in plan]
-        store.write_sweep(arguments, record(plan), sweep_id)
-        from xrgs.report import build
+        with track.Tracker(plan[0].conf.track, store) as tracker:
+            with SweepMonitor(store.cells_folder) as monitor:
+                plan = self._run_until_complete(plan, store, [monitor, tracker])
+            plan = [_without_reference(cell) for cell in plan]
+            store.write_sweep(arguments, record(plan), sweep_id)
+            from xrgs.report import build
 
-        say(build(store.path, sweep_id).text)
-        track.track(plan[0].conf.track, store, sweep_id)
+            say(build(store.path, sweep_id).text)
         return all(cell.error is None and cell.state.name == "done" for cell in plan)
 
     def _threads(self, cells: int) -> int:
@@ -171,7 +171,10 @@ class Study:
         return launch.capacity(launcher, 0, machine).threads(cells, machine) or machine
 
     def _run_until_complete(
-        self, plan: Sequence[PlannedCell], store: Store, monitor: SweepMonitor
+        self,
+        plan: Sequence[PlannedCell],
+        store: Store,
+        watchers: Sequence[SweepMonitor | track.Tracker],
     ) -> list[PlannedCell]:
         """Launch cells until none is left to do, here or in another sweep; return the final plan.
 
@@ -183,7 +186,8 @@ class Study:
         launches = launch.Launches(self._context, self._task, self._config)
         while True:
             store.check_not_gone()
-            monitor.watch(plan)
+            for watcher in watchers:
+                watcher.watch(plan)
             to_train = ready(plan, tried, retry=conf.retry == "failed")
             elsewhere = [cell for cell in plan if cell.state.name == "running"]
             unknown = any(cell.unknown for cell in plan) and looks < _UNKNOWN_LOOKS

@@ -1,73 +1,47 @@
-"""Writes the cells of a sweep to where people follow experiments: TensorBoard, MLflow or a table.
+"""Writes the curves of a sweep's cells to where people follow trainings, while the cells train.
 
-Cells are read from the store when the sweep has ended, so that tracking takes no time or memory
-from a training. A failure is a warning, because the cells are in the store.
+A cell writes `history.csv` and `quality.csv` as it trains, wherever its launcher runs it. A thread
+of the sweep reads these files as they grow. So tracking takes no time and no memory from a
+training, and no cell can fail by it.
 """
 
 from __future__ import annotations
 
-import csv
-import io
 import math
-import os
-from dataclasses import dataclass
+import threading
+from contextlib import suppress
 from importlib.util import find_spec
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Self
 
+from xrgs.capture import scenes
 from xrgs.errors import StoreError, XrgsError
-from xrgs.runtime.progress import log_line, progress
-from xrgs.safeio.atomic import atomic_writer
-from xrgs.safeio.files import remove_path
+from xrgs.runtime.progress import log_line
 from xrgs.safeio.records import as_number, read_table
-from xrgs.safeio.sanitize import for_csv, for_file_name, for_line
+from xrgs.sweep.trackers import SINKS, Run, mlflow_uri
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Iterator, Mapping
+    from collections.abc import Iterator, Sequence
     from pathlib import Path
 
     from xrgs.experiment.cell_folder import CellFolder
-    from xrgs.experiment.schema import RecordedCell
     from xrgs.experiment.store import Store
+    from xrgs.sweep.plan import PlannedCell
+    from xrgs.sweep.trackers import Sink
 
-#: The folder of a store for tracking.
+#: The folder of a store for tracking; each kind has a folder in it.
 FOLDER = "tracking"
+#: The values of `track`.
+KINDS = ("none", *SINKS)
 #: The package that a kind needs; the extra has the kind's name.
-_PACKAGES = {"tensorboard": "tensorboard", "mlflow": "mlflow"}
-#: The names of a cell in the record of a sweep.
-_NAMES = ("scene", "label", "condition", "variant_seed", "seed")
-#: The most metrics and parameters that MLflow takes at once.
-_MAX_METRICS, _MAX_PARAMS = 1000, 100
-#: The variable that names MLflow's server, and the name of the experiment there.
-_SERVER, _EXPERIMENT = "MLFLOW_TRACKING_URI", "xrgs"
+_PACKAGES = {"tensorboard": "tensorboard", "mlflow": "mlflow", "wandb": "wandb"}
+#: Seconds between two looks at the cells, and from a failure to the next look.
+_POLL_S, _PAUSE_S = 2.0, 30.0
+#: Seconds that the end of a sweep waits for a tracker, for example for a server that is away.
+_END_S = 60.0
 
-
-class Point(NamedTuple):
-    """One value of a series."""
-
-    series: str
-    """`history/<column>`, `quality/<score>` (during training) or `score/<metric>` (of the end)."""
-    step: int
-    value: float
-
-
-@dataclass(frozen=True)
-class Run:
-    """The tracked values of one finished cell."""
-
-    cell_id: str
-    names: Mapping[str, str | int]
-    """Scene, label, condition and seeds, as the sweep names them."""
-    config: Mapping[str, str | float]
-    """The values of its config by dotted keys."""
-    points: tuple[Point, ...]
-    """Its history, its quality during training and its scores; no NaN."""
-
-    @property
-    def name(self) -> str:
-        """The cell's name for people, and for a folder; unique to the cell."""
-        words = (str(self.names[key]) for key in ("scene", "label", "condition"))
-        seeds = f"seed-{self.names['variant_seed']}-{self.names['seed']}"
-        return "--".join(map(for_file_name, filter(None, (*words, seeds, self.cell_id))))
+#: The values of each step by the names of their series: `history/<column>`, `quality/<score>`
+#: (during training) and `score/<metric>` (of the end).
+Curves = dict[int, dict[str, float]]
 
 
 def check(kind: str) -> None:
@@ -82,147 +56,216 @@ def check(kind: str) -> None:
         raise XrgsError(f"track={kind}: it is not installed: pip install 'xrgs[{kind}]'")
 
 
-def track(kind: str, store: Store, sweep_id: str) -> None:
-    """Write the finished cells of a sweep, and say where; a failure is a warning."""
-    if kind == "none":
-        return
-    folder = store.path / FOLDER
-    try:
-        folder.mkdir(exist_ok=True)
-        where = _WRITERS[kind](_runs(store, sweep_id), folder, sweep_id)
-    except Exception as error:  # of a package, a server or a disk: no cell may fail by it
-        log_line(f"track={kind}: {type(error).__name__}: {error}; the cells are in the store")
-    else:
-        log_line(f"track={kind}: {where}")
+def curves(cell: CellFolder, *, done: bool) -> Curves:
+    """Read what a cell has written so far.
 
-
-def run_of(cell: CellFolder, names: RecordedCell) -> Run:
-    """Read the tracked values of a finished cell, which the record of a sweep names.
+    Args:
+        cell: The cell, which has written its first row.
+        done: Whether the cell is done. Otherwise the curves end with the last row of the history:
+            what was evaluated after that row may not be complete.
 
     Raises:
         StoreError: A file can't be read; the message names it.
         ValueError: A value is not a number.
     """
-    from xrgs.experiment.results import cell_columns, cell_metrics  # pandas is slow to load
-
-    points = _points(cell.path / "history.csv", "history")
-    if (cell.path / "quality.csv").is_file():
-        points += _points(cell.path / "quality.csv", "quality")
-    summary = cell.summary()
-    steps = summary.steps
-    scores = cell_metrics(summary, cell.scores())
-    points += [Point(f"score/{name}", steps, value) for name, value in scores.items()]
-    config = {key: value for key, value in cell_columns(cell, None).items() if "." in key}
-    return Run(
-        cell.id,
-        {key: getattr(names, key) for key in _NAMES},
-        {k: v if isinstance(v, (str, float, int)) else str(v) for k, v in config.items()},
-        tuple(point for point in points if not math.isnan(point.value)),
-    )
+    history = _table(cell.path / "history.csv", "history")
+    quality = cell.path / "quality.csv"
+    found = [*history, *(_table(quality, "quality") if quality.is_file() else ())]
+    if done:
+        found.append(_scores(cell))
+    else:
+        found = [(step, values) for step, values in found if step <= history[-1][0]]
+    by_step: Curves = {}
+    for step, values in sorted(found, key=lambda row: row[0]):
+        known = {name: value for name, value in values.items() if not math.isnan(value)}
+        by_step.setdefault(step, {}).update(known)
+    return by_step
 
 
-def _points(file: Path, group: str) -> list[Point]:
-    """Return the numbers of a table with a column `step`."""
+def _table(file: Path, group: str) -> list[tuple[int, dict[str, float]]]:
+    """Return the step and the numbers of each row of a table."""
     header, rows = read_table(file)
     table = [dict(zip(header, row, strict=True)) for row in rows]
+    others = [name for name in header if name not in {"step", "view"}]
     return [
-        Point(f"{group}/{name}", int(row["step"]), as_number(value))
+        (int(row["step"]), {f"{group}/{name}": as_number(row[name]) for name in others})
         for row in table
-        for name, value in row.items()
-        if name not in {"step", "view"}
     ]
 
 
-def _runs(store: Store, sweep_id: str) -> Iterator[Run]:
-    """Yield the finished cells of a sweep; name each cell that can't be read on stderr."""
-    rows = {row.cell_id: row for row in store.sweep_record(sweep_id).cells}
-    for cell_id, row in progress(rows.items(), "tracking", "cell", len(rows)):
-        if cell_id is None or store.cell(cell_id).state(verify=False).name != "done":
-            continue
+def _scores(cell: CellFolder) -> tuple[int, dict[str, float]]:
+    """Return the number of steps of a finished cell, and its scores."""
+    from xrgs.experiment.results import cell_metrics  # pandas is slow to load
+
+    summary = cell.summary()
+    metrics = cell_metrics(summary, cell.scores())
+    return summary.steps, {f"score/{name}": value for name, value in metrics.items()}
+
+
+def run_of(planned: PlannedCell, cell: CellFolder) -> Run:
+    """Return how trackers name a planned cell, whose folder has its config."""
+    from xrgs.experiment.results import cell_columns  # pandas is slow to load
+
+    conf, spec = planned.conf, planned.spec
+    config = {key: value for key, value in cell_columns(cell, None).items() if "." in key}
+    return Run(
+        cell.id,
+        {
+            "scene": scenes.label(conf.scene),
+            "label": spec.label,
+            "condition": spec.condition,
+            "variant_seed": conf.variant.seed,
+            "seed": conf.seed,
+        },
+        {k: v if isinstance(v, (str, float, int)) else str(v) for k, v in config.items()},
+        conf.train.steps,
+    )
+
+
+class _Followed:
+    """One cell, and what of it was sent."""
+
+    def __init__(self, planned: PlannedCell, cell: CellFolder) -> None:
+        self.cell = cell
+        self._planned = planned
+        self._sink: Sink | None = None
+        self._seen: tuple[float, ...] = ()
+        """When the files were written that were read last."""
+        self.ended = False
+        """Whether nothing more is to be sent: the cell is done, or can't be read."""
+
+    def send(self, kind: str, folder: Path) -> None:
+        """Send what is new.
+
+        Raises:
+            Exception: Whatever a package, a server or a disk raises. The next call goes on from
+                what has arrived.
+        """
+        written = tuple(self._written())
+        if self.ended or not written or written == self._seen:
+            return
         try:
-            yield run_of(store.cell(cell_id), row)
-        except (StoreError, OSError, ValueError) as error:
-            log_line(f"{cell_id}: it is not tracked: {error}")
+            state = self.cell.state(verify=False).name
+            found = curves(self.cell, done=state == "done")
+        except (StoreError, ValueError) as error:
+            # A file that a new attempt is replacing is read again.
+            self.ended = self.cell.state(verify=False).name == "done"
+            if self.ended:
+                log_line(f"{self.cell.id}: it is not tracked: {error}")
+            return
+        try:
+            self._send(found, kind, folder)
+            if state in {"done", "failed"}:
+                self.close(state)
+        except BaseException:
+            self._sink = None  # the next one asks what has arrived
+            raise
+        self._seen, self.ended = written, state == "done"
+
+    def _written(self) -> Iterator[float]:
+        for name in ("history.csv", "status.json"):
+            with suppress(OSError):
+                yield (self.cell.path / name).stat().st_mtime_ns
+
+    def _send(self, found: Curves, kind: str, folder: Path) -> None:
+        if self._sink is None:
+            self._sink = SINKS[kind](run_of(self._planned, self.cell), folder)
+        new = [step for step in found if step > self._sink.sent]
+        for step in new:
+            self._sink.write(step, found[step])
+        if new:
+            self._sink.flush()
+            self._sink.sent = new[-1]
+
+    def close(self, state: str) -> None:
+        """End the run of a cell that is `done`, `failed` or `stopped`."""
+        if self._sink is not None:
+            self._sink.close(state)
+            self._sink = None
 
 
-def _to_csv(runs: Iterable[Run], folder: Path, sweep_id: str) -> str:
-    """Write one row for each value of each cell."""
-    file = folder / f"{sweep_id}.csv"
-    with atomic_writer(file) as stream:
-        text = io.TextIOWrapper(stream, encoding="utf-8", newline="", write_through=True)
-        writer = csv.writer(text, lineterminator="\n")
-        writer.writerow(["cell_id", *_NAMES, *Point._fields])
-        for run in runs:
-            names = [for_csv(run.names[key]) for key in _NAMES]
-            writer.writerows([run.cell_id, *names, *map(for_csv, point)] for point in run.points)
-        text.detach()
-    return str(file)
+class Tracker:
+    """Follows the cells of a sweep in a thread while a `with` block runs."""
 
+    def __init__(self, kind: str, store: Store) -> None:
+        """Prepare to follow cells of a store; `kind` is a value of `track`."""
+        self._kind = kind
+        self._store = store
+        self._folder = store.path / FOLDER / kind
+        self._cells: dict[str, _Followed] = {}
+        self._elsewhere: set[str] = set()
+        """Cells that another sweep trains, and follows."""
+        self._failed = self._said = False
+        self._stop = threading.Event()
+        self._thread = threading.Thread(target=self._follow, name="xrgs-track", daemon=True)
 
-def _to_tensorboard(runs: Iterable[Run], folder: Path, _: str) -> str:
-    """Write a folder of events for each cell that has none."""
-    home = folder / "tensorboard"
-    home.mkdir(exist_ok=True)
-    for run in runs:
-        done, new = home / run.name, home / f".{run.name}.new"
-        if done.exists():
-            continue
-        remove_path(new)
-        new.mkdir(exist_ok=True)
-        _write_events(run, str(new))
-        new.rename(done)
-    return f"tensorboard --logdir {home}"
+    def watch(self, plan: Sequence[PlannedCell]) -> None:
+        """Set the cells to follow; called again when they change."""
+        cells = dict(self._cells)
+        for cell in plan:
+            if cell.cell_id is None:
+                continue
+            if cell.state.name == "running":
+                self._elsewhere.add(cell.cell_id)
+            elif cell.state.name != "done":  # its other sweep has left it
+                self._elsewhere.discard(cell.cell_id)
+            if cell.cell_id not in cells and cell.cell_id not in self._elsewhere:
+                cells[cell.cell_id] = _Followed(cell, self._store.cell(cell.cell_id))
+        self._cells = cells  # the thread goes over the cells before or after this call
 
+    def __enter__(self) -> Self:
+        if self._kind != "none":
+            log_line(f"track={self._kind}: {self._hint()}")
+            self._thread.start()
+        return self
 
-def _write_events(run: Run, folder: str) -> None:
-    from tensorboard.compat.proto.event_pb2 import Event
-    from tensorboard.compat.proto.summary_pb2 import Summary
-    from tensorboard.plugins.hparams import summary_v2
-    from tensorboard.summary.writer.event_file_writer import EventFileWriter
+    def __exit__(self, *_: object) -> None:
+        self._stop.set()
+        if self._kind == "none":
+            return
+        self._thread.join(_END_S)
+        late = self._thread.is_alive()
+        if late or self._failed:
+            why = f"no answer for {_END_S:.0f} s" if late else "it failed"
+            log_line(
+                f"track={self._kind}: {why}, and the curves there are not complete; the cells are"
+                " in the store, and the same command sends the rest"
+            )
 
-    names = sorted({point.series for point in run.points if point.series.startswith("score/")})
-    config = {**run.config, **run.names}
-    writer = EventFileWriter(folder)
-    metrics = [summary_v2.Metric(name) for name in names]
-    parameters = [summary_v2.HParam(name) for name in config]
-    for summary in (
-        summary_v2.hparams_config_pb(parameters, metrics),
-        summary_v2.hparams_pb(config, trial_id=run.cell_id),
-    ):
-        writer.add_event(Event(summary=summary))
-    for point in run.points:
-        value = Summary.Value(tag=point.series, simple_value=point.value)
-        writer.add_event(Event(step=point.step, summary=Summary(value=[value])))
-    writer.close()
+    def _hint(self) -> str:
+        """Return where to look."""
+        if self._kind == "tensorboard":
+            return f"tensorboard --logdir {self._folder}"
+        if self._kind == "mlflow":
+            return f"mlflow ui --backend-store-uri {mlflow_uri(self._folder)}"
+        if self._kind == "wandb":
+            return f"with WANDB_MODE=offline, `wandb sync {self._folder}/offline-run-*` sends it"
+        return str(self._folder)
 
+    def _follow(self) -> None:
+        while not self._stop.wait(_PAUSE_S if self._failed else _POLL_S):
+            self.look()
+        self.look()
+        self.close()
 
-def _to_mlflow(runs: Iterable[Run], folder: Path, sweep_id: str) -> str:
-    """Log a run for each cell that has none, on the environment's server or in the store."""
-    from mlflow import MlflowClient
-    from mlflow.entities import Metric, Param
+    def look(self) -> None:
+        """Send what is new of each cell; say once if that fails."""
+        self._failed = False
+        for cell in self._cells.values():
+            try:
+                self._folder.mkdir(parents=True, exist_ok=True)
+                cell.send(self._kind, self._folder)
+            except Exception as error:  # of a package, a server or a disk
+                self._failed = True
+                if not self._said:
+                    log_line(
+                        f"track={self._kind}: {type(error).__name__}: {error}; the cells train on,"
+                        f" and it is tried again every {_PAUSE_S:.0f} s"
+                    )
+                self._said = True
 
-    file = folder / "mlflow.db"
-    uri = os.environ.get(_SERVER) or f"sqlite:///{file.absolute()}"
-    client = MlflowClient(uri)
-    found = client.get_experiment_by_name(_EXPERIMENT)
-    experiment = found.experiment_id if found else client.create_experiment(_EXPERIMENT)
-    for run in runs:
-        tag = f"tags.cell_id = '{run.cell_id}' and attributes.status = 'FINISHED'"
-        if client.search_runs([experiment], tag, max_results=1):
-            continue
-        tags = {key: for_line(str(value)) for key, value in run.names.items()}
-        tags |= {"cell_id": run.cell_id, "sweep": sweep_id}
-        run_id = client.create_run(experiment, tags=tags, run_name=run.name).info.run_id
-        parameters = [Param(key, str(value)) for key, value in run.config.items()]
-        for at in range(0, len(parameters), _MAX_PARAMS):
-            client.log_batch(run_id, params=parameters[at : at + _MAX_PARAMS])
-        metrics = [Metric(p.series, p.value, 0, p.step) for p in run.points]
-        for at in range(0, len(metrics), _MAX_METRICS):
-            client.log_batch(run_id, metrics=metrics[at : at + _MAX_METRICS])
-        client.set_terminated(run_id)
-    return f"mlflow ui --backend-store-uri {uri}"
-
-
-_WRITERS = {"csv": _to_csv, "tensorboard": _to_tensorboard, "mlflow": _to_mlflow}
-KINDS = ("none", *_WRITERS)
-"""The values of `track`."""
+    def close(self) -> None:
+        """End the runs that are still open: their cells were stopped."""
+        for cell in self._cells.values():
+            with suppress(Exception):  # what was sent is there
+                cell.close("stopped")

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import shlex
 from dataclasses import asdict, dataclass
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 from xrgs.capture import photographs, scenes, split, variant
 from xrgs.capture.description import read_report
 from xrgs.capture.folders import failed_folder, trimmed_folder
+from xrgs.config import CONF_DIR
 from xrgs.errors import StoreError, UnreadableError, XrgsError
 from xrgs.experiment import trimming
 from xrgs.experiment.store import StoreGoneError
@@ -17,9 +20,9 @@ from xrgs.sweep.jobs import worker
 from xrgs.sweep.jobs.supervise import Limits
 
 if TYPE_CHECKING:
-    from pathlib import Path
+    from collections.abc import Iterable
 
-    from xrgs.config import Conf
+    from xrgs.config import Conf, SceneConf
     from xrgs.experiment.store import Store
 
 
@@ -78,12 +81,34 @@ def restore(conf: Conf, store: Store, variant_id: str) -> None:
     worker.run_in_child("restore", request, Limits(), lambda _: store.check_not_gone())
 
 
+def how_to_get(scenes: Iterable[SceneConf]) -> str:
+    """Return the command that downloads published scenes which are missing; empty if none is."""
+    from omegaconf import OmegaConf
+
+    missing: dict[tuple[str, Path], dict[str, None]] = {}
+    for file in sorted((CONF_DIR / "data").glob("*.yaml")):
+        published = OmegaConf.load(file).scenes
+        for scene in scenes:
+            path = Path(scene.path or "")
+            if scene.name in published and path.name == scene.name and not path.exists():
+                missing.setdefault((file.stem, path.parent), {})[scene.name] = None
+    usual = Path(OmegaConf.load(CONF_DIR / "config.yaml").data_root)
+    commands = [
+        f"xrgs-data download {dataset} {' '.join(names)}"
+        + ("" if root == usual else f" --data-root {shlex.quote(str(root))}")
+        for (dataset, root), names in missing.items()
+    ]
+    return f"to download what is missing: {'; '.join(commands)}" if commands else ""
+
+
 def find_or_build(conf: Conf, store: Store) -> str:
     """Return the id of the frozen variant of a config, and build it if the store lacks it.
 
     Raises:
         XrgsError: The photographs are missing, or can't be made into a variant.
     """
+    if hint := how_to_get([conf.scene]):
+        raise XrgsError(f"scene.path={conf.scene.path}: no such folder; {hint}")
     frozen = variant.find(store.variants, variant.key(conf.scene, conf.variant))
     if frozen is not None:
         return frozen.id

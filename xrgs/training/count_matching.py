@@ -61,6 +61,10 @@ def train_cell(
         CheckpointError: The state that was read does not fit this config and data.
         XrgsError: A component's value is out of range, the components leave no view to train on,
             or no threshold gives the number of Gaussians.
+
+    Examples:
+        >>> result = train(data, compose("+ablation=loss_weighting", "train.steps=5"))
+        >>> save_ply("trained.ply", result.gaussians)
     """
     count_matched = conf.components.count_matched
     check_not_negative("components.count_matched.gaussians", count_matched.gaussians)

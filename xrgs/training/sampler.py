@@ -30,7 +30,8 @@ class EpochSampler:
     view that is no longer allowed at its turn is skipped. A view that becomes allowed during an
     epoch takes part from the next epoch on.
 
-    With `hr_share`, HR views and LR views have epochs of their own, and step t draws an HR view if
+    If fewer than `hr_share` of the views are HR, HR and LR views have epochs of their own, and step
+    t draws an HR view if
 
         (offset + t GOLDEN) mod 1 < hr_share,
 
@@ -59,7 +60,7 @@ class EpochSampler:
             seed: `seed` of the config; the order of the views depends on it alone.
             steps: Number of steps of the whole run.
             allows_view: Whether a step may train on its view.
-            hr_share: Share of the steps that draw an HR view; 0 draws every view once an epoch.
+            hr_share: Least share of the steps that draw an HR view.
         """
         self.views = views
         self.steps = steps
@@ -70,8 +71,9 @@ class EpochSampler:
         self.generator = seeded_generator(seed, "views")
         offset = torch.rand((), generator=seeded_generator(seed, "classes"), dtype=torch.float64)
         self.offset = offset.item()
-        classes = [[v for v in views if v.tag == tag] for tag in ("HR", "LR")]
-        self.classes = [_Class(members) for members in (classes if hr_share else [views])]
+        high, low = ([view for view in views if view.tag == tag] for tag in ("HR", "LR"))
+        apart = len(high) < hr_share * len(views)
+        self.classes = [_Class(members) for members in ([high, low] if apart else [views])]
         """The views that have epochs of their own: HR and LR views, or all views together."""
 
     def __iter__(self) -> Iterator[Step]:

@@ -94,13 +94,13 @@ def test_a_step_is_gsplats(step: int, count: int, most: int) -> None:
 
 
 @pytest.mark.slow
-def test_a_run_of_600_steps_is_gsplats() -> None:
-    settings = SETTINGS.scaled(600)
+def test_a_run_of_300_steps_is_gsplats() -> None:
+    settings = SETTINGS.scaled(300)
     rng = np.random.default_rng(0)
     values = random_values(100, rng)
     ours, theirs = strategy_of(values, settings, most=300), TheirsMCMC(values, settings, 300)
     relocated = 0
-    for step in range(600):
+    for step in range(300):
         gradients = random_values(len(ours.gaussians), rng)
         gradients["opacities"] += 3.0  # they fade, and some die
         gradients["scales"] += 4.0  # about as many grow as shrink

@@ -133,7 +133,7 @@ def look(path: str | None, long_side: int, masks: str | None = None) -> Listing:
     folder, nested = user_path(path.removesuffix(ALL_BELOW)), path.endswith(ALL_BELOW)
     try:
         if not folder.is_dir():
-            why = "no such folder (scenes of llff/ and captures/ are looked for in data_root)"
+            why = "no such folder"
             if folder.is_file():
                 why = "not a folder; for the frames of a video: scene=video scene.path=..."
             raise XrgsError(f"scene.path={folder}: {why}")

@@ -28,7 +28,7 @@ def psnr(image: Tensor, target: Tensor, mask: Tensor | None = None) -> float | N
     Raises:
         ValueError: The shapes differ or are not [H, W, 3].
 
-    Example:
+    Examples:
         >>> import torch
         >>> round(psnr(torch.zeros(2, 2, 3), torch.full((2, 2, 3), 0.5)), 4)
         6.0206

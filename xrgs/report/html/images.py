@@ -7,7 +7,9 @@ from __future__ import annotations
 
 import base64
 import io
+import math
 from itertools import islice
+from statistics import fmean
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -145,18 +147,18 @@ def add_views(
 ) -> None:
     """Add every scored view of every cell, with as many images as fit into `max_bytes`.
 
-    The first replicates of all scenes come first. A view whose images do not fit has its scores
-    alone, and the notes count such views.
+    The first replicates of all scenes come first, each with its worst view first. A view whose
+    images do not fit has its scores alone, and the notes count such views.
     """
     scores: _Scores = {
         (row["cell_id"], row["view"]): {name: finite(row[name]) for name in VIEW_METRICS}
         for row in views.to_dict("records")
     }
-    names = {name: list(rows["view"]) for name, rows in views.groupby("cell_id")}
+    names = {str(name): list(rows["view"]) for name, rows in views.groupby("cell_id")}
     wanted = [
         (cells, view)
         for cells in runs(comparison)
-        for view in dict.fromkeys(v for name in cells["cell_id"] for v in names.get(name, ()))
+        for view in _worst_first(list(cells["cell_id"]), names, scores)
     ]
     pixels = sum(_pixels(store, cells, view) for cells, view in wanted) if max_bytes else 0
     album = Album(content.images, max_bytes, int(pixels * _WITH_ERROR_MAPS))
@@ -172,6 +174,16 @@ def add_views(
             f"The images of {left_out} of {len(wanted)} test views are left out, for the page's"
             " size; their scores are here, and their renders are in the store."
         )
+
+
+def _worst_first(cell_ids: list[str], names: dict[str, list[str]], scores: _Scores) -> list[str]:
+    """Return the views of the cells of a run, the one with the least mean PSNR first."""
+    found: dict[str, list[float]] = {}
+    for cell_id in cell_ids:
+        for view in names.get(cell_id, ()):
+            psnr = scores[cell_id, view]["psnr"]
+            found.setdefault(view, []).extend([] if psnr is None else [psnr])
+    return sorted(found, key=lambda view: fmean(found[view] or [math.inf]))
 
 
 def _title(entry: dict[str, Any]) -> str:

@@ -64,7 +64,7 @@ class DefaultStrategy(Strategy):
             units; G statistics, 1 unless each group has its own.
         visible_count: [G, N] number of views that were summed.
 
-    Example:
+    Examples:
         >>> strategy = DefaultStrategy(  # doctest: +SKIP
         ...     optimizer, settings, scene_scale=1.0, generator=torch.Generator()
         ... )

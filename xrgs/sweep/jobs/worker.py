@@ -208,25 +208,12 @@ def _run_cell(request: Mapping[str, Any]) -> dict[str, Any]:
     stop.watch()
     faulthandler.register(supervise.STACK_SIGNAL, 2)
     log_to_stderr(logging.INFO)
-    found = _Found(logging.INFO)
-    logging.getLogger("xrgs.training.components").addHandler(found)
     folder = CellFolder(Path(), request["id"])
     try:
         cell.run_cell(folder.config(), variant.load(Path(request["variant"])), folder, stop)
     except StopSignal:
         end_by_sigterm()
-    return {"found": found.lines}
-
-
-class _Found(logging.Handler):
-    """Keeps what components log at the end of a training, for the log of the sweep."""
-
-    def __init__(self, level: int) -> None:
-        super().__init__(level)
-        self.lines: list[str] = []
-
-    def emit(self, record: logging.LogRecord) -> None:
-        self.lines.append(record.getMessage())
+    return {"found": folder.summary().found}
 
 
 def _enter_folder(folder: Path, inode: int) -> None:

@@ -192,9 +192,9 @@ class Component:
             step: The step with the sampled view.
 
         Returns:
-            Views of the same names and tags, each with a photograph of its camera's size: `views`
-            itself if nothing is changed, the same object as at the step before if nothing has
-            changed since. The loss prepares the photographs anew if it is another object.
+            Views of the same names and tags, each with a photograph of its camera's size. They are
+            `views` itself if nothing is changed, and the same object as at the step before if
+            nothing has changed since. The loss prepares the photographs anew for another object.
         """
         del step
         return views

@@ -49,20 +49,18 @@ class NoiseWeighting(Component):
     Ours:
 
     - Residuals are compared at one sampling rate. An HR photograph has detail that no LR photograph
-      has, and with it larger residuals: at the photographs' own sizes r_HR / r_v of the LR views of
-      fern is 1.9 to 4.4 with `plus`. So the residual of each view is first brought down
-      (antialiased bicubic) to the lowest sampling rate of all views, where the ratio is 0.6 to 1.8,
-      and 1 in the mean.
+      has, and with it larger residuals: at the photographs' own sizes r_HR / r_v is far above 1. So
+      the residual of each view is first brought down (antialiased bicubic) to the lowest sampling
+      rate of all views.
     - r_v is a running mean over about the last ten steps on the view, of the pixels inside its
       mask. It is measured from the first step on.
     - The likelihood is of squared residuals. Most of the loss is their absolute value, for which
       the best weight would be the root of w_v.
 
     What the render cannot explain counts as noise, whatever it is. What the splats imitate does not
-    count, and they imitate much. On fern (252 px, 500 steps) all weights stay near 1 where LR views
-    have a blur that training knows nothing of, and even where their noise is 16/255 and their JPEG
-    quality 30: twelve LR views are fitted more closely than five HR views. So this is a guard
-    against single photographs that fit nothing else, and not a measure of noise.
+    count, and they imitate much: a blur that training knows nothing of, and noise where views are
+    few. So this is a guard against single photographs that fit nothing else, and not a measure of
+    noise.
 
     Adam [kingma2015] divides a gradient by its recent size, so that a weight acts only where LR and
     HR views reach the same Gaussian.

@@ -1,4 +1,4 @@
-"""Follows each recipe of CONTRIBUTING.md to the letter, in a copy of the package.
+"""Follows each recipe of docs/add_*.md to the letter, in a copy of the package.
 
 A comment before a block of the document says where the block goes. The copy comes first on the path
 of the commands that are then run as a contributor would run them.
@@ -37,7 +37,7 @@ class Copy:
 
     def follow(self, recipe: str) -> None:
         """Put every block of a recipe where its comment says."""
-        text = (ROOT / "CONTRIBUTING.md").read_text(encoding="utf-8")
+        text = (ROOT / "docs" / f"add_{recipe}.md").read_text(encoding="utf-8")
         blocks = [(where, block) for name, where, block in BLOCK.findall(text) if name == recipe]
         assert blocks, recipe
         for where, block in blocks:
